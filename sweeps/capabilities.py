@@ -45,10 +45,10 @@ def has_battery(robot: Robot) -> bool:
     if robot.rig.inherits:
         return True
     nothing, other = Battery(), "battery.current_other"  # `rig_file.DEFAULTS` states that one
-    own = any(
+    has_own = any(
         getattr(robot.battery, name) != value for name, value in vars(nothing).items() if not eqx.is_array(value)
     )
-    return own or any(
+    return has_own or any(
         robot.knows([f"battery.{p.name}"]) for p in params.walk_parameters(nothing) if f"battery.{p.name}" != other
     )
 
@@ -63,17 +63,17 @@ def unknown_numbers_sentence(robot: Robot) -> list[str]:
 
 def idle_columns(robot: Robot) -> set[str]:
     """Columns of runs and histories that mean nothing for a robot."""
-    found: set[str] = set()
+    idle: set[str] = set()
     if not robot.has_ground:
-        found |= {*OF_GROUND}
+        idle |= {*OF_GROUND}
     if not robot.shows_travel:
-        found |= {*OF_TRAVEL}
-    found |= {column for column, names in RESTS_ON.items() if not robot.knows(names)}
-    warm = [column.removesuffix("_C") for column in found if RESTS_ON.get(column) == WARMING]
-    found |= {f"{name}_{side}_C" for name in warm for side in SIDES}
+        idle |= {*OF_TRAVEL}
+    idle |= {column for column, names in RESTS_ON.items() if not robot.knows(names)}
+    warm = [column.removesuffix("_C") for column in idle if RESTS_ON.get(column) == WARMING]
+    idle |= {f"{name}_{side}_C" for name in warm for side in SIDES}
     if not has_battery(robot):
-        found |= {"voltage_cell_V"}
-    return found
+        idle |= {"voltage_cell_V"}
+    return idle
 
 
 def without_idle(robot: Robot, table: Columns) -> Columns:
@@ -87,20 +87,20 @@ def without_idle(robot: Robot, table: Columns) -> Columns:
 def rig_parameters(file: RobotFile) -> list[tuple[str, float, str, str, str]]:
     """Parameters that a rig's file states, and others with an effect: name, value, unit, meaning, source."""
     robot = file.robot
-    nothing, found = _nothing(robot), []
+    nothing, stated_parameters = _nothing(robot), []
     for p in params.walk_parameters(robot):
         head = p.name.partition(".")[0]
         load = head in robot.configurations
-        own = p.name in file.stated and head not in file.linear
+        is_own = p.name in file.stated and head not in file.linear
         moved = p.name not in nothing or float(p.value) != nothing[p.name]
-        if not own and not moved and not (load and float(p.value) != 0):
+        if not is_own and not moved and not (load and float(p.value) != 0):
             continue
-        if not own and (p.name in rig_file.DEFAULTS or (p.name.endswith(".radius") and not robot.shows_travel)):
+        if not is_own and (p.name in rig_file.DEFAULTS or (p.name.endswith(".radius") and not robot.shows_travel)):
             continue
-        of_file = own or head in file.linear
+        of_file = is_own or head in file.linear
         source = f"stated in {file.name}" if of_file else "default" if not moved or load else "changed"
-        found.append((p.name, float(p.value), p.spec.unit, p.spec.meaning, source))
-    return found
+        stated_parameters.append((p.name, float(p.value), p.spec.unit, p.spec.meaning, source))
+    return stated_parameters
 
 
 def changed_parameters(robot: Robot, nominal: Robot) -> list[tuple[Any, ...]]:

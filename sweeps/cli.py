@@ -43,7 +43,7 @@ _Config = Annotated[
     Path | None, typer.Option("--config", help="TOML file with the keys of a config.resolved.toml; options win.")
 ]
 _Trust = Annotated[
-    bool, typer.Option("--trust", help="Let --config name what is executed: effects, and a scheduler.")
+    bool, typer.Option("--trust", help="Allow --config to name code that is run: effects and a scheduler.")
 ]
 _Effects = Annotated[
     list[str] | None, typer.Option("--effects", help="A Python file with effects of your own, repeatable.")
@@ -91,12 +91,12 @@ def _command(
             stated, others = made.take_options(kind, given), made.take_options(beside, given)
             aside = config.resolve_beside(beside, file, others, trust)
             if resolve is None:
-                found = config.resolve_configuration(kind, file, stated, beside, trust)
+                resolved = config.resolve_configuration(kind, file, stated, beside, trust)
             else:
-                found = resolve(file, stated, trust)
+                resolved = resolve(file, stated, trust)
             with report_working(name):
-                _prepare(found, given["no_cache"])
-                code: int = importlib.import_module(f"sweeps.commands.{room or name}").execute(found, aside)
+                _prepare(resolved, given["no_cache"])
+                code: int = importlib.import_module(f"sweeps.commands.{room or name}").execute(resolved, aside)
                 return code
 
         keyword = functools.partial(inspect.Parameter, kind=inspect.Parameter.KEYWORD_ONLY)
@@ -409,7 +409,7 @@ def new(
         Path | None, typer.Option("--from", help="A URDF or a model of MuJoCo with the driven joint.")
     ] = None,
     joint: Annotated[
-        str | None, typer.Option(help="Name of that joint; it turns.  \\[default: the only driven one]")
+        str | None, typer.Option(help="Name of the revolute joint.  \\[default: the only driven one]")
     ] = None,
     from_sheet: Annotated[
         bool,
@@ -669,8 +669,8 @@ def _no_number(error: Any) -> str:
     option = getattr(error, "param", None)
     if option is None or not re.search(r"valid (number|float|integer)", str(getattr(error, "message", ""))):
         return ""
-    told = " ".join(str(option.help or "").replace("\\[", "[").split())
-    return f"{option.opts[0]}: got no number; expected one without its unit. {told}"
+    help_text = " ".join(str(option.help or "").replace("\\[", "[").split())
+    return f"{option.opts[0]}: got no number; expected one without its unit. {help_text}"
 
 
 def _fail(message: str, code: int) -> int:

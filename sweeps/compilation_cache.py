@@ -28,7 +28,7 @@ LIMIT = 4 * 2**30
 
 
 def cache_location(path: Path | None = None) -> Path | None:
-    """Folder of the cache, which need not exist yet, None where it is switched off or no place for it is known.
+    """Folder of the cache, which may not exist yet, None if it is switched off or has no known place.
 
     Args:
         path: folder to hold caches. None takes it from the environment.
@@ -52,10 +52,10 @@ def cache_location(path: Path | None = None) -> Path | None:
 def _processor() -> str:
     """Short hash of the processor features that native code depends on."""
     try:
-        known = re.findall(r"^(?:flags|Features)\s*:.*", Path("/proc/cpuinfo").read_text(encoding="utf-8"), re.M)[:1]
+        flags = re.findall(r"^(?:flags|Features)\s*:.*", Path("/proc/cpuinfo").read_text(encoding="utf-8"), re.M)[:1]
     except OSError:
-        known = []
-    kind = " ".join([platform.machine(), platform.processor(), *known])
+        flags = []
+    kind = " ".join([platform.machine(), platform.processor(), *flags])
     return f"{platform.machine()}-{hashlib.sha256(kind.encode()).hexdigest()[:8]}"
 
 
@@ -83,12 +83,12 @@ def keep_programs() -> Path | None:
     os.environ.setdefault("EQX_ON_ERROR", "nan")
     import jax
 
-    own = jax.config.values["jax_compilation_cache_dir"]
-    if own is not None:
-        if "://" not in own and _refused(own):
+    own_folder = jax.config.values["jax_compilation_cache_dir"]
+    if own_folder is not None:
+        if "://" not in own_folder and _refused(own_folder):
             jax.config.update("jax_enable_compilation_cache", False)
             return None
-        return Path(own)
+        return Path(own_folder)
     try:
         folder.mkdir(parents=True, exist_ok=True, mode=0o700)
     except OSError:
@@ -119,15 +119,15 @@ def _refused(folder: str) -> bool:
 
 def _entries(folder: Path) -> list[tuple[float, int, Path]]:
     """Time of writing, size [bytes] and path of every entry."""
-    found = []
+    entries = []
     for path in folder.iterdir() if folder.is_dir() else ():
         try:
             state = path.stat()
         except OSError:  # dropped by another process meanwhile
             continue
         if stat.S_ISREG(state.st_mode):  # XLA has a folder of its own there, with a GPU
-            found.append((state.st_mtime, state.st_size, path))
-    return found
+            entries.append((state.st_mtime, state.st_size, path))
+    return entries
 
 
 def _prune(caches: Path) -> None:

@@ -166,9 +166,9 @@ def _most(option: str) -> float:
 
 def _usual(option: str, shown: float = math.inf) -> str:
     """Default of a fidelity's option by fidelity. Of `simulate` at most `shown`."""
-    found = {name: o.default for name, o in _having(option).items()}
-    capped = {name: f"{v:g}" + (f", simulate {shown:g}" if v > shown else "") for name, v in found.items()}
-    return "; ".join([f"{name} {text}" for name, text in capped.items()] if len(found) > 1 else capped.values())
+    defaults = {name: o.default for name, o in _having(option).items()}
+    capped = {name: f"{v:g}" + (f", simulate {shown:g}" if v > shown else "") for name, v in defaults.items()}
+    return "; ".join([f"{name} {text}" for name, text in capped.items()] if len(defaults) > 1 else capped.values())
 
 
 Duration = Annotated[float, positive(_most("duration"))]
@@ -188,7 +188,7 @@ class FidelityPart(ModelPart):
             value, having = getattr(self, f"{name}_s"), _having(name)
             usual = {option.default for option in having.values()}
             if value is not None and self.model not in having and value not in usual:
-                raise PydanticCustomError("idle", f"`{name}_s` acts with `model` {_either(having)} only")
+                raise PydanticCustomError("idle", f"`{name}_s` acts only with `model` {_either(having)}")
             if value is not None and self.model in having and value > having[self.model].most:
                 most = having[self.model]
                 raise PydanticCustomError(
@@ -225,10 +225,10 @@ class SupplyPart(Part):
     @model_validator(mode="after")
     def _feeds(self) -> Self:
         if self.discharge_mAh and not self.battery:
-            raise PydanticCustomError("idle", "`discharge_mAh` acts with `battery` only")
+            raise PydanticCustomError("idle", "`discharge_mAh` acts only with `battery`")
         if self.battery and getattr(self, "voltages_V", None) is not None:
             raise PydanticCustomError(
-                "idle", "`voltages_V` acts without `battery` only, whose voltage is that of its charge"
+                "idle", "`voltages_V` acts only without `battery`, whose charge sets the voltage"
             )
         return self
 
@@ -309,7 +309,7 @@ class Picture(OneRun):
     end: float | None = option_field(None, "Last instant of a film (s)", usual="begin + 0.1")
     slow: Annotated[float, Field(ge=0.01)] | None = option_field(None, "Slow-motion factor of a film", usual="20")
     climb: Path | None = option_field(
-        None, "A folder of mmrjax climb to draw in its place, by default whole and at half speed"
+        None, "Folder of mmrjax climb to draw instead, by default whole and at half speed"
     )
     force: bool = option_field(False, "Replace an existing file")
 
@@ -333,7 +333,7 @@ class AxesPart(Part):
         None, "Additional load masses (kg), of a rig 0", usual=_shown(PAYLOADS_KG)
     )
     slopes_deg: Several[Slope] | None = option_field(
-        None, "Slopes, positive uphill (deg), of a rig 0", usual=_shown(SLOPES_DEG)
+        None, "Slopes (deg), positive uphill; 0 for a rig", usual=_shown(SLOPES_DEG)
     )
     surface: str | None = option_field(None, SURFACE, usual=f"{BENCH}; of a rig none")
 
@@ -371,7 +371,7 @@ class MembersPart(Part):
     """Folder in which a population keeps its runs. It changes no number."""
 
     members: Path | None = option_field(
-        None, "File that keeps the population's runs; the same command with it goes on from there", solver=True
+        None, "File for the population's runs, from which the same command resumes", solver=True
     )
 
 
@@ -398,14 +398,12 @@ class LoopBeside(FittedRuns):
 class TurnPart(Part):
     """Different drive of the two sides of one run. None: the same."""
 
-    left_V: Voltage | None = option_field(
-        None, "Voltage of the left motor (V); with --right the robot is free to turn"
-    )
+    left_V: Voltage | None = option_field(None, "Voltage of the left motor (V); with --right the robot can turn")
     right_V: Voltage | None = option_field(None, "Voltage of the right motor (V)")
     duty_left: Duty | None = option_field(None, "Share of the supply's voltage at the left motor, in place of --left")
     duty_right: Duty | None = option_field(None, "Share of the supply's voltage at the right motor")
     speed_m_s: Annotated[float, between(-100, 100)] | None = option_field(
-        None, "Speed of the settled turn (m/s), in place of --left and --right, which are found; with --yaw-rate"
+        None, "Speed of the settled turn (m/s), with --yaw-rate, from which --left and --right are computed"
     )
     yaw_rate_rad_s: Annotated[float, between(-100, 100)] | None = option_field(
         None, "Yaw rate of the settled turn (rad/s), positive to the left; with --speed"
@@ -426,7 +424,7 @@ class TurnPart(Part):
         """Refuse volts of either side where a battery decides them."""
         if battery and self.left_V is not None:
             raise PydanticCustomError(
-                "idle", "`left_V` acts without `battery` only; state `duty_left` and `duty_right`"
+                "idle", "`left_V` acts only without `battery`; state `duty_left` and `duty_right`"
             )
 
     @model_validator(mode="after")
@@ -435,12 +433,12 @@ class TurnPart(Part):
         for left, right in pairs:
             if (getattr(self, left) is None) != (getattr(self, right) is None):
                 one, other = (left, right) if getattr(self, right) is None else (right, left)
-                raise PydanticCustomError("idle", f"`{one}` acts with `{other}` only; state both")
+                raise PydanticCustomError("idle", f"`{one}` acts only with `{other}`; state both")
         stated = [one for one, _ in pairs if getattr(self, one) is not None]
         if len(stated) > 1:
             raise PydanticCustomError(
                 "idle",
-                f"`{stated[0]}` acts without `{stated[1]}` only; state voltages, duties, or speed and yaw rate",
+                f"`{stated[0]}` acts only without `{stated[1]}`; state voltages, duties, or speed and yaw rate",
             )
         return self
 
@@ -457,7 +455,7 @@ class OutputPart(Part):
     """Files written in addition to the numbers."""
 
     report: bool = option_field(True, "Write report.html")
-    table: Literal["csv", "parquet"] = option_field("csv", "Tables of the folder: CSV, or Parquet too")
+    table: Literal["csv", "parquet"] = option_field("csv", "Format of the tables: CSV, or also Parquet")
 
 
 class ProfilePart(FidelityPart):
@@ -485,10 +483,10 @@ class ProfilePart(FidelityPart):
             return self
         if self.model != PROFILED:
             raise PydanticCustomError(
-                "idle", f"`profile` acts with `model` {PROFILED} only, which follows one; got `model` {self.model}"
+                "idle", f"`profile` acts only with `model` {PROFILED}, which follows one; got `model` {self.model}"
             )
         if self.duration_s is not None:
-            raise PydanticCustomError("idle", "`duration_s` acts without `profile` only, whose last row ends the run")
+            raise PydanticCustomError("idle", "`duration_s` acts only without `profile`, which sets the duration")
         return self
 
     @property
@@ -506,10 +504,10 @@ class Simulate(RobotPart, DataPart, ProfilePart, SupplyPart, TurnPart, Posterior
             beside = [name for name in ("profile", "posterior") if getattr(self, name) is not None]
             if beside:
                 stated = next(name for name in TurnPart.model_fields if getattr(self, name) is not None)
-                raise PydanticCustomError("idle", f"`{stated}` acts without `{beside[0]}` only")
+                raise PydanticCustomError("idle", f"`{stated}` acts only without `{beside[0]}`")
             self.refuse_volts(self.battery)
         if self.profile is not None and self.posterior is not None:
-            raise PydanticCustomError("idle", "`posterior` acts without `profile` only")
+            raise PydanticCustomError("idle", "`posterior` acts only without `profile`")
         return self
 
     @property
@@ -541,7 +539,7 @@ class Render(RobotPart, FidelityPart, SupplyPart, TurnPart):
     @model_validator(mode="after")
     def _driven(self) -> Self:
         if self.demands:
-            raise PydanticCustomError("idle", "`speed_m_s` acts with simulate only; state `left_V` and `right_V`")
+            raise PydanticCustomError("idle", "`speed_m_s` acts only with simulate; state `left_V` and `right_V`")
         self.refuse_volts(self.battery)
         return self
 
@@ -621,16 +619,16 @@ class Climb(RobotPart, SupplyPart, OutputPart):
                 "idle", "no obstacle is stated; state `step_mm`, `stairs`, `gap_mm` or `terrain`, or `find`"
             )
         if self.find == "stairs" and self.stairs is None:
-            raise PydanticCustomError("idle", "`find` stairs needs `stairs`, whose tread and count stay")
+            raise PydanticCustomError("idle", "`find` stairs needs `stairs`, which sets tread and count")
         if self.find is not None and given and not given[0].startswith(self.find):
             raise PydanticCustomError("idle", f"`find` {self.find} acts without `{given[0]}`")
         if self.nose_mm and (self.gap_mm is not None or self.terrain is not None or self.find == "gap"):
-            raise PydanticCustomError("idle", "`nose_mm` acts with steps and stairs only")
+            raise PydanticCustomError("idle", "`nose_mm` acts only with steps and stairs")
         if self.battery and self.supply_voltage_V is not None:
-            raise PydanticCustomError("idle", "`supply_voltage_V` acts without `battery` only")
+            raise PydanticCustomError("idle", "`supply_voltage_V` acts only without `battery`")
         for name in ("film", "derivatives"):
             if getattr(self, name) and self.find is not None:
-                raise PydanticCustomError("idle", f"`{name}` acts without `find` only")
+                raise PydanticCustomError("idle", f"`{name}` acts only without `find`")
         return self
 
 
@@ -640,20 +638,40 @@ class Reproduce(RobotPart, ModelPart):
     model: str = option_field(fidelities.NAMES[0], "steady, or track for Figs. 23-27 too")
 
 
-class Calibrate(RobotPart, DataPart, InferencePart, OutputPart):
+class FeedforwardPart(Part):
+    """Constants kS, kV, kA in the place of a robot's parameters."""
+
+    feedforward: Literal["simple", "elevator", "arm"] | None = option_field(
+        None, "Fit kS, kV, kA (kG) of this mechanism instead, and feedback gains (docs/howto/wpilib.md)", usual="no"
+    )
+    unit: Literal["rotation", "rad", "degree", "m"] | None = option_field(
+        None, "Unit of position that kV and kA are for, with --feedforward", usual="rotation; m of a travel"
+    )
+    position_error: Annotated[float, positive(1e6)] = option_field(
+        1.0, "Tolerance of the position's regulator [unit]"
+    )
+    velocity_error: Annotated[float, positive(1e6)] = option_field(1.5, "Tolerance of velocity [unit/s]")
+    effort_V: Annotated[float, positive(1e4)] = option_field(7.0, "Voltage that the gains may use (V)")
+    period_s: Annotated[float, positive(10)] = option_field(0.02, "Period of the controller (s)")
+    measurement_delay_s: Annotated[float, between(0, 10)] | None = option_field(
+        None, "Delay of its measurement (s)", usual="what the log shows"
+    )
+
+
+class Calibrate(RobotPart, DataPart, InferencePart, FeedforwardPart, OutputPart):
     """Options of a calibration. For None the fidelity or the data decide."""
 
     model: Annotated[str, AfterValidator(_fidelity)] | None = option_field(
         None, f"Fidelity: {', '.join(fidelities.NAMES)}", usual="drive for a log over time, else steady"
     )
-    free: Names = option_field((), "Parameters to free, comma-separated; default is the default set, motor.* a group")
+    free: Names = option_field((), "Parameters to free, comma-separated, or a group such as motor.*")
     fix: Names = option_field((), "Parameters to hold, comma-separated")
     starts: Annotated[int, Field(ge=1, le=100_000)] | None = option_field(
         None, "Searches", usual="64; histories 8; settled turns 4; rows with drive or track 1"
     )
     population: Annotated[int, Field(ge=0, le=1_000_000)] | None = option_field(
         None,
-        "Members of each generation of a search without gradients, with which one with drive or track begins",
+        "Members of each generation of the gradient-free search before a fit with drive or track",
         usual="256 where the running gear is free, else 0",
         solver=True,
     )
@@ -678,7 +696,7 @@ class Settle(RobotPart, DataPart, OutputPart):
         None, "Shortest stretch that is taken for settled", usual="0.3, and at least 20 samples"
     )
     drift: Annotated[float, Field(gt=0, le=0.5)] = option_field(
-        0.02, "Largest change of a channel's mean within a stretch, as a share of it"
+        0.02, "Largest change of a channel's mean within a stretch, as a share of the mean"
     )
 
 
@@ -712,8 +730,8 @@ class Loop(RobotPart, DataPart, InferencePart, OutputPart):
     )
     prefer: Literal["fit", "held-out"] = option_field(
         "fit",
-        "By what one of several effects that these data cannot tell apart comes first, held-out being errors of "
-        "blocks that a fit has not seen",
+        "Criterion for the first of several effects that these data cannot distinguish; held-out takes the errors on "
+        "blocks left out of the fit",
     )
     forbid: Names = option_field(
         (), "An experiment that cannot be done, repeatable: stall, lifted, 'one motor', or a configuration"
@@ -724,7 +742,7 @@ class Loop(RobotPart, DataPart, InferencePart, OutputPart):
         "tens of minutes on two cores",
     )
     population: Annotated[int, Field(ge=4, le=1_000_000)] | None = option_field(
-        None, "Members of a generation of --resolve", usual="128", solver=True
+        None, "Members of each generation of the search for --resolve", usual="128", solver=True
     )
     generations: Annotated[int, Field(ge=1, le=10_000)] | None = option_field(
         None, "Of --resolve, at most", usual="20", solver=True
@@ -747,7 +765,7 @@ class RequirementsPart(Part):
 class Check(RequirementsPart, RobotPart, OutputPart):
     """A robot held against requirements."""
 
-    changes: bool = option_field(True, "Look for what would meet what is missed")
+    changes: bool = option_field(True, "Search for changes that meet the missed requirements")
 
 
 class Size(RequirementsPart, RobotPart, OutputPart):
@@ -769,7 +787,7 @@ class Sensitivity(RobotPart, DataPart, FidelityPart, SupplyPart, AxesPart, Outpu
         usual="sobol; with --posterior local",
     )
     parameters: Names = option_field(
-        (), "Uncertain parameters, comma-separated, motor.* a group", usual="all that have a prior"
+        (), "Uncertain parameters, comma-separated, or a group such as motor.*", usual="all that have a prior"
     )
     vary: Names = option_field((), "A condition that is uncertain too, repeatable: voltage=22:26, slope_deg=0:5")
     outputs: Names = option_field(
@@ -823,14 +841,14 @@ def _keys(kind: type[Part], file: Path, beside: type[Part] | None) -> Json:
     table = values.pop("solver", {})
     if not isinstance(table, dict):
         raise BadConfiguration(f"{file.name}, solver: got {table!r}; expected a table, [solver]")
-    own, others = fields_with(kind, "solver"), [] if beside is None else fields_with(beside, "solver")
+    own_fields, others = fields_with(kind, "solver"), [] if beside is None else fields_with(beside, "solver")
     for key in table:
-        if key not in own + others:
-            known = allowed_words(key, own + others) if own + others else "this command has none"
-            raise BadConfiguration(f"{file.name}, solver.{key}: no such key; {known}")
+        if key not in own_fields + others:
+            allowed = allowed_words(key, own_fields + others) if own_fields + others else "this command has none"
+            raise BadConfiguration(f"{file.name}, solver.{key}: no such key; {allowed}")
         if key in values:
             raise BadConfiguration(f"{file.name}, solver.{key}: the file states {key} too; expected it once")
-    return {**values, **{key: value for key, value in table.items() if key in own}}
+    return {**values, **{key: value for key, value in table.items() if key in own_fields}}
 
 
 def resolve_beside(kind: type[C], file: Path | None, options: Json, trust: bool = False) -> C:
@@ -893,8 +911,8 @@ def _sentence(kind: type[Part], error: ValidationError, file: Path | None, given
         return options.get(name, name) if file is None or name in given else name
 
     if first["type"] == "idle":  # whose message has fields between backticks
-        said = re.sub(r"`(\w+)`", lambda found: called(found[1]), first["msg"])
-        return said if file is None else f"{file.name}: {said}"
+        message = re.sub(r"`(\w+)`", lambda found: called(found[1]), first["msg"])
+        return message if file is None else f"{file.name}: {message}"
     key = str(first["loc"][0])
     place = ".".join(str(part) for part in first["loc"])
     where = f"{file.name}, {place}" if file is not None and key not in given else called(key)

@@ -59,7 +59,7 @@ class Obstacle(Part):
     def _of_its_kind(self) -> Self:
         for name, kinds in {"tread_mm": ("stairs",), "count": ("stairs",), "nose_mm": ("step", "stairs")}.items():
             if getattr(self, name) != type(self).model_fields[name].default and self.kind not in kinds:
-                raise PydanticCustomError("idle", f"`{name}` acts with `kind` {' or '.join(kinds)} only")
+                raise PydanticCustomError("idle", f"`{name}` acts only with `kind` {' or '.join(kinds)}")
         return self
 
 
@@ -92,11 +92,11 @@ class StoreOptions(FolderPart):
     plan: Path | None = option_field(
         None, "TOML file with [axes] or [samples] (docs/reference/plans.md)", argument=True, metavar="[CONFIG.toml]"
     )
-    zarr: bool = option_field(False, "Write a Zarr store, also of a small grid of options")
+    zarr: bool = option_field(False, "Write a Zarr store, even for a small grid")
     outputs: Names = option_field(
         (), "Comma-separated, what a store holds of each point", usual="what its instruments show"
     )
-    dry_run: bool = option_field(False, "Say points, chunks, bytes and time; write nothing")
+    dry_run: bool = option_field(False, "Print points, chunks, bytes and expected time without writing files")
     export: tuple[Literal["csv", "parquet"], ...] = option_field(
         (), "Write the store as csv or parquet too, repeatable"
     )
@@ -104,7 +104,10 @@ class StoreOptions(FolderPart):
         None, "Simulate the i-th of n shares, as 3/8: a process of a job array each", solver=True
     )
     scheduler: str | None = option_field(
-        None, "Address of a dask scheduler whose workers simulate, as tcp://host:8786", solver=True, executes=True
+        None,
+        "Address of a dask scheduler, such as tcp://host:8786",
+        solver=True,
+        executes=True,
     )
 
     @model_validator(mode="after")
@@ -117,7 +120,7 @@ class StoreOptions(FolderPart):
             )
         if self.shard is not None and self.scheduler is not None:
             raise PydanticCustomError(
-                "idle", "`shard`: not allowed with `scheduler`, which shares out the chunks; give one of them"
+                "idle", "`shard`: not allowed with `scheduler`, which distributes the chunks; give one of them"
             )
         return self
 
@@ -151,7 +154,7 @@ def resolve_campaign(file: Path | None, options: Json, trust: bool = False) -> C
         for name in GRID:
             if options.get(name) is not None:
                 raise BadConfiguration(
-                    f"{options_of_fields(Sweep)[name]}: acts with a grid of options only; expected it in "
+                    f"{options_of_fields(Sweep)[name]}: acts only with a grid of options; expected it in "
                     f"{file.name}, among its "
                     "axes or conditions"
                 )
@@ -172,11 +175,11 @@ def of_grid(grid: Sweep) -> Campaign:
         "slope_deg": grid.slopes_deg,
     }
     # every run of the grid with every robot drawn, which the store keeps along its last dimension
-    drawn = {"design": "random", "number": grid.posterior, "posterior": str(Path(grid.robot).parent)}
+    sampled = {"design": "random", "number": grid.posterior, "posterior": str(Path(grid.robot).parent)}
     names = "all" if grid.configurations is None else list(grid.configurations)
     return Campaign(
         **{key: getattr(grid, key) for key in Sweep.model_fields if key in Campaign.model_fields},
-        samples=drawn if grid.posterior is not None else {},
+        samples=sampled if grid.posterior is not None else {},
         axes={"configuration": names, **{name: list(values) for name, values in axes.items() if values is not None}},
         conditions={
             **({} if grid.surface is None else {"surface": grid.surface}),

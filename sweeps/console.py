@@ -140,7 +140,7 @@ def step_reporter(
 
     from calibration.words.step_words import still_running_sentence
 
-    compiled, said = 0, [(doing, time.monotonic(), 0)]
+    compiled, state = 0, [(doing, time.monotonic(), 0)]
     spoke, over = threading.Event(), threading.Event()
 
     def count(event: str, duration_secs: float, **_: Any) -> None:
@@ -148,7 +148,7 @@ def step_reporter(
         compiled += event.endswith("backend_compile_duration")
 
     def say_it(text: str) -> None:
-        said[:] = [(text, time.monotonic(), compiled)]
+        state[:] = [(text, time.monotonic(), compiled)]
         spoke.set()
         tell(text)
 
@@ -157,7 +157,7 @@ def step_reporter(
             heard = spoke.wait(silence)
             spoke.clear()
             if not heard and not over.is_set():
-                text, since, before = said[0]
+                text, since, before = state[0]
                 again(still_running_sentence(text, time.monotonic() - since, compiled - before))
 
     jax.monitoring.register_event_duration_secs_listener(count)
@@ -197,7 +197,7 @@ class RateColumn(ProgressColumn):
 def progress_bar(
     total: int, quiet: bool, doing: str = "simulating", done: int = 0, rate: bool = False
 ) -> Iterator[Callable[[float], None]]:
-    """A bar on stderr. Gives a function that is called with how much more is done.
+    """A progress bar on stderr. Yields a function to call with the number of newly finished items.
 
     Args:
         done: of the total already.

@@ -65,8 +65,8 @@ def _unlike(name: str, robot: Robot) -> Names:
     if why := turn_error(robot, robot.configurations):
         return (turn_words.unlike_sides_note(name, robot.unlike, f"how it would turn is not known: {why}"),)
     value = imposed.imposed_example(robot)
-    found = turns_under_equal_commands(robot, value * RPM if robot.rig.imposed == "motor_speed" else value)
-    turns = turn_words.by_itself(robot, found, value)
+    turn_rows = turns_under_equal_commands(robot, value * RPM if robot.rig.imposed == "motor_speed" else value)
+    turns = turn_words.by_itself(robot, turn_rows, value)
     return (turn_words.unlike_sides_note(name, robot.unlike, turns),) if turns else ()
 
 
@@ -82,9 +82,9 @@ def beside_robot(file: RobotFile) -> Posterior:
             f"--posterior: {file.source} has none; expected --robot FOLDER/robot.toml of calibrate or loop"
         )
     path = Path(file.source).with_name(posterior_file.FILE)
-    found = posterior_file.read_posterior(path)
-    found.check(file.robot, str(path))
-    return found
+    posterior = posterior_file.read_posterior(path)
+    posterior.check(file.robot, str(path))
+    return posterior
 
 
 def fit_of(file: RobotFile, runs: records.Runs) -> str:
@@ -116,8 +116,8 @@ def check_surface(robot: Robot, names: Collection[str], surface: str | None, whe
     Raises:
         BadConfiguration: the message has `where` and the known surfaces.
     """
-    known = surface is None or surface in SURFACES or not robot.rig.scales_adhesion
-    if not known and not all(
+    is_allowed = surface is None or surface in SURFACES or not robot.rig.scales_adhesion
+    if not is_allowed and not all(
         surface_labels.configuration_on_surface(name, str(surface)) in robot.configurations for name in names
     ):
         raise BadConfiguration(
@@ -205,7 +205,7 @@ def one_run(robot: Robot, cells: Json, battery: bool = False, elsewhere: Collect
         given = {**bench, "payload_kg": 0.0, "slope_deg": 0.0, **given}
         check_surface(robot, (name,), given.get("surface"), "--surface")
     run = records.single_run({**given, "configuration": name}, layout)
-    if found := misplaced_levers(run, robot):
-        _, column, why = found
+    if misplaced := misplaced_levers(run, robot):
+        _, column, why = misplaced
         raise BadConfiguration(f"{OPTIONS[column]}: {why}")
     return run

@@ -33,15 +33,15 @@ UNITS = {
 def schema_facts(kind: type[BaseModel]) -> dict[str, Json]:
     """Schema of each field of a configuration, in the order of its parts, its own first."""
     schema = kind.model_json_schema()["properties"]
-    own = [
+    own_metadata = [
         name for part in kind.__mro__ if issubclass(part, BaseModel) for name in vars(part).get("__annotations__", {})
     ]
-    found = {}
-    for name in dict.fromkeys(n for n in own if n in schema):
+    facts = {}
+    for name in dict.fromkeys(n for n in own_metadata if n in schema):
         stated = schema[name]
         given: Json = next((a for a in stated.get("anyOf", ()) if a.get("type") != "null"), {})
-        found[name] = {**given, **stated}
-    return found
+        facts[name] = {**given, **stated}
+    return facts
 
 
 def option_of_field(name: str, fact: Json) -> str:
@@ -106,16 +106,16 @@ def option_parameters(kind: type[BaseModel]) -> Iterator[inspect.Parameter]:
             continue
         default, annotation = None, _type(fact) | None
         if fact.get("argument"):
-            told: Any = typer.Argument(metavar=fact.get("metavar"), help=option_help(name, fact))
+            declared: Any = typer.Argument(metavar=fact.get("metavar"), help=option_help(name, fact))
             if "default" not in fact:
                 default, annotation = inspect.Parameter.empty, _type(fact)
         else:
             word = option_of_field(name, fact)
             pair = fact.get("type") == "boolean" and fact.get("default") is not False
             names = f"{word}/--no-{word.removeprefix('--')}" if pair else word
-            told = typer.Option(names, help=option_help(name, fact), hidden=bool(fact.get("solver")))
+            declared = typer.Option(names, help=option_help(name, fact), hidden=bool(fact.get("solver")))
         keyword = inspect.Parameter.KEYWORD_ONLY
-        yield inspect.Parameter(name, keyword, default=default, annotation=Annotated[annotation, told])
+        yield inspect.Parameter(name, keyword, default=default, annotation=Annotated[annotation, declared])
 
 
 def _type(fact: Json) -> Any:
@@ -125,7 +125,7 @@ def _type(fact: Json) -> Any:
 
 
 def take_options(kind: type[BaseModel], values: Json) -> Json:
-    """Takes what was given for the fields of a configuration out of the values of a command, and reads their texts.
+    """Removes the options of a configuration from a command's values and parses them.
 
     Raises:
         BadConfiguration: an axis or a change that cannot be read.
@@ -158,21 +158,21 @@ def help_all(kinds: tuple[type[BaseModel], ...]) -> Iterator[inspect.Parameter]:
         if fact.get("solver")
     ]
     if hidden:
-        told = typer.Option(
+        option = typer.Option(
             "--help-all", is_eager=True, callback=_show_all,
             help=f"Show this with {', '.join(hidden)} too, which \\[solver] of --config may state.",
         )  # fmt: skip
         kind = inspect.Parameter.KEYWORD_ONLY
-        yield inspect.Parameter("help_all", kind, default=False, annotation=Annotated[bool, told])
+        yield inspect.Parameter("help_all", kind, default=False, annotation=Annotated[bool, option])
 
 
 def _show_all(context: typer.Context, wanted: bool) -> None:
     if wanted:
-        shown = copy.copy(context.command)
-        shown.params = [copy.copy(p) for p in shown.params]
-        for p in shown.params:
+        shown_context = copy.copy(context.command)
+        shown_context.params = [copy.copy(p) for p in shown_context.params]
+        for p in shown_context.params:
             p.hidden = False  # type: ignore[attr-defined]  # of an option
-        typer.echo(shown.get_help(context))
+        typer.echo(shown_context.get_help(context))
         raise typer.Exit
 
 

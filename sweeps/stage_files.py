@@ -65,8 +65,8 @@ def read_stage(file: Path) -> Any:
         Unreadable: it cannot be read, or names what it may not.
     """
     try:
-        found = read_arrays(file)
-        return _Reader(found["data"].tobytes()).decoded(json.loads(found["tree"].tobytes()))
+        arrays = read_arrays(file)
+        return _Reader(arrays["data"].tobytes()).decoded(json.loads(arrays["tree"].tobytes()))
     except Exception as error:  # whatever a damaged or a made-up file comes to
         raise Unreadable(f"{type(error).__name__}: {error}") from error
 
@@ -97,10 +97,10 @@ class _Writer:
             return ["float", str(x)]
         if id(x) in self._number:
             return ["again", self._number[id(x)]]
-        made = self._compound(x)
+        encoding = self._compound(x)
         self._number[id(x)] = len(self._alive)
         self._alive.append(x)
-        return made
+        return encoding
 
     def _compound(self, x: Any) -> list[Any]:
         import jax
@@ -157,9 +157,9 @@ class _Reader:
             return float(rest[0])
         if kind == "again":
             return self._known[rest[0]]
-        made = self._compound(kind, *rest)
-        self._known.append(made)
-        return made
+        instance = self._compound(kind, *rest)
+        self._known.append(instance)
+        return instance
 
     def _compound(self, kind: str, *rest: Any) -> Any:
         if kind == "channel":
@@ -195,9 +195,9 @@ class _Reader:
 
     def _array(self, dtype: str, shape: list[int], *rest: Any) -> np.ndarray:
         if dtype == "O":
-            made = np.empty(math.prod(shape), object)
-            made[:] = [self.decoded(item) for item in rest[0]]
-            return made.reshape(shape)
+            filled = np.empty(math.prod(shape), object)
+            filled[:] = [self.decoded(item) for item in rest[0]]
+            return filled.reshape(shape)
         order, at = rest
         kind = np.dtype(dtype)
         if kind.kind not in KINDS:
@@ -208,10 +208,10 @@ class _Reader:
         kind = _class(module, name, factors)
         if not dataclasses.is_dataclass(kind) or not all(_holds(kind, name) for name in fields):
             raise Unreadable(f"{module}.{name} has other fields")
-        made: Any = object.__new__(kind)
+        instance: Any = object.__new__(kind)
         for field, value in fields.items():
-            object.__setattr__(made, field, self.decoded(value))
-        return made
+            object.__setattr__(instance, field, self.decoded(value))
+        return instance
 
 
 def _holds(kind: type, name: str) -> bool:
@@ -224,9 +224,9 @@ def _holds(kind: type, name: str) -> bool:
 def _named_class(kind: type) -> tuple[str, str, list[float] | None]:
     """Module and name of a class, and the factors of an effect that differs from it by its priors alone."""
     plain = getattr(kind, "plain", None)
-    known, factors = (kind, None) if plain is None else (plain, list(vars(kind)["factors"]))
-    name = known.__module__, known.__qualname__
-    if _class(*name, None) is not known:
+    base, factors = (kind, None) if plain is None else (plain, list(vars(kind)["factors"]))
+    name = base.__module__, base.__qualname__
+    if _class(*name, None) is not base:
         raise Unwritable(".".join(name))
     return *name, factors
 
@@ -238,20 +238,20 @@ def _class(module: str, name: str, factors: list[float] | None) -> type:
         Unreadable: no such class there.
     """
     if module.partition(".")[0] in PACKAGES:
-        found: Any = importlib.import_module(module)
+        target: Any = importlib.import_module(module)
     elif module.startswith(OWN_MODULE) and module in sys.modules:
-        found = sys.modules[module]
+        target = sys.modules[module]
     else:
         raise Unreadable(f"a class of {module}")
     for part in name.split("."):
-        found = getattr(found, part)
-    if not isinstance(found, type) or found.__module__ != module:
+        target = getattr(target, part)
+    if not isinstance(target, type) or target.__module__ != module:
         raise Unreadable(f"{module}.{name} is no class there")
-    return found if factors is None else scaled_effect(found, tuple(factors))
+    return target if factors is None else scaled_effect(target, tuple(factors))
 
 
 def _function(module: str, name: str) -> types.FunctionType:
-    found = getattr(importlib.import_module(module), name) if module in FUNCTIONS else None
-    if not isinstance(found, types.FunctionType) or found.__module__ != module:
+    function = getattr(importlib.import_module(module), name) if module in FUNCTIONS else None
+    if not isinstance(function, types.FunctionType) or function.__module__ != module:
         raise Unreadable(f"{module}.{name} is no function of a stage")
-    return found
+    return function

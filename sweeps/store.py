@@ -186,10 +186,10 @@ class Folder:
 
         Before the results are written these are all but `PARTS`. Later the lock's file lists them.
         """
-        found = {p.name for p in self.partial.iterdir()} - PARTS
+        foreign = {p.name for p in self.partial.iterdir()} - PARTS
         listed = _json(self.partial / LOCK).get(FOREIGN)
         kept = (self.partial / CHUNKS).glob("*")
-        return (found & set(map(str, listed)) if isinstance(listed, list) else found) | {
+        return (foreign & set(map(str, listed)) if isinstance(listed, list) else foreign) | {
             f"{CHUNKS}/{p.name}" for p in kept if p.suffix not in KEPT
         }
 
@@ -241,7 +241,7 @@ class Folder:
         writing.write_table(self.results() / name, columns, self.tables)
 
     def finish(self, manifest: Json, runs: Runs | None = None) -> Path:
-        """Write the manifest and move the folder into place, returns its path.
+        """Write the manifest and move the folder into place. Returns its path.
 
         Hashes of the folder's `robot.toml` and of the file that `runs` came from, if any, are added, and the names of
         all that the folder holds: `--force` deletes nothing else.
@@ -284,9 +284,9 @@ class Folder:
 
 def listed_names(folder: Path) -> list[str] | None:
     """Names that the manifest of a run folder lists, None if it is no run folder of ours."""
-    found = _json(folder / "manifest.json")
-    names = found.get("contents")
-    if found.get("schema") != MANIFEST or not isinstance(names, list):
+    manifest = _json(folder / "manifest.json")
+    names = manifest.get("contents")
+    if manifest.get("schema") != MANIFEST or not isinstance(names, list):
         return None
     return [name for name in names if isinstance(name, str)]
 
@@ -348,10 +348,10 @@ def _json(file: Path) -> Json:
     """Object of a small JSON file, empty if it cannot be read."""
     try:
         with file.open("rb") as stream:
-            found = json.loads(stream.read(LARGEST))
+            content = json.loads(stream.read(LARGEST))
     except (OSError, ValueError, RecursionError):
         return {}
-    return found if isinstance(found, dict) else {}
+    return content if isinstance(content, dict) else {}
 
 
 class RunFolder(Folder):
@@ -492,10 +492,10 @@ class RunFolder(Folder):
                 return kept
             except stage_files.Unreadable:
                 print_message(f"{file}: damaged; computed again")
-        made = make()
+        result = make()
         with contextlib.suppress(OSError, stage_files.Unwritable), writing.replacing(file) as aside:
-            stage_files.write_stage(aside, made)
-        return made
+            stage_files.write_stage(aside, result)
+        return result
 
     def keeps(self, name: str) -> bool:
         """True if the result of a stage is kept."""
@@ -554,8 +554,8 @@ def open_folder(
 
 def rows_of_fit(robot: Path) -> frozenset[str]:
     """Hashes of the tables that a robot was fitted to, from the manifest in its folder, may be empty."""
-    found = _json(robot.parent / "manifest.json") if robot.is_file() else {}
-    hashes, arguments = found.get("hashes"), found.get("arguments")
+    manifest = _json(robot.parent / "manifest.json") if robot.is_file() else {}
+    hashes, arguments = manifest.get("hashes"), manifest.get("arguments")
     if not isinstance(hashes, dict) or not isinstance(arguments, list) or arguments[:1] not in FITS:
         return frozenset()
     fitted = robot.name != "robot.toml" or hashes.get("robot") == sha256_hex(robot.read_bytes())

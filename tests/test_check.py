@@ -476,4 +476,4 @@ def test_what_a_quantity_does_not_depend_on_is_refused_beside_it(tmp_path, capsy
     asked = tmp_path / "asked.toml"
     asked.write_text("turn_in_place_rad_s = { least = 2, slope_deg = 5 }\n")
     assert command(["check", asked, "--out", tmp_path / "run"]) == 2
-    assert "slope_deg: yaw rate on the spot does not depend on it; leave it out" in capsys.readouterr().err
+    assert "slope_deg: yaw rate on the spot does not depend on it; remove it" in capsys.readouterr().err

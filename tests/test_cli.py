@@ -98,12 +98,12 @@ USAGE = {
     "NaN for one run": ("simulate --voltage nan", r"option, supply_voltage_V: got nan"),
     "duration without a history": (
         "sweep --duration 2",
-        r"--duration acts with --model drive or track only",
+        r"--duration acts only with --model drive or track",
     ),
     "unknown model of the paper": ("reproduce --model magic", r"--model: got 'magic'"),
-    "step without the track model": ("simulate --step 1e-5", r"--step acts with --model track only"),
+    "step without the track model": ("simulate --step 1e-5", r"--step acts only with --model track"),
     "duration without end": ("simulate --model track --duration inf", r"--duration: got inf"),
-    "discharge without battery": ("sweep --discharge 100", r"--discharge acts with --battery only"),
+    "discharge without battery": ("sweep --discharge 100", r"--discharge acts only with --battery"),
     "duration of zero": ("simulate --duration 0", r"--duration: got 0"),
 }
 

@@ -86,7 +86,7 @@ def test_the_command_prints_80_columns_and_every_meaning_of_a_name(mmrjax):
     [
         ("resistance", "is one of these meant? battery.resistance, motor.resistance"),
         ("slidez", "did you mean slides"),
-        ("xyzzy", "explain: got xyzzy; mmrjax explain lists the names"),
+        ("xyzzy", "explain: got xyzzy; mmrjax explain lists all names"),
     ],
 )
 def test_an_unknown_name_is_answered_by_what_is_near(name, says, mmrjax):

@@ -161,10 +161,10 @@ def test_no_message_of_what_was_stated_by_options_names_a_field(tmp_path):
     fields = {n for kinds in KINDS.values() for k in kinds for n in options.options_of_fields(k) if "_" in n}
     assert len(rules) > 15 and [r for r in rules for n in fields if re.search(rf"(?<![`\w]){n}(?![`\w])", r)] == []
     given = {"left_V": 5.0, "battery": True}
-    with pytest.raises(BadConfiguration, match=r"^--left acts with --right only; state both$"):
+    with pytest.raises(BadConfiguration, match=r"^--left acts only with --right; state both$"):
         config.resolve_configuration(config.Simulate, None, given)
     (tmp_path / "a.toml").write_text("left_V = 5.0\n")
-    with pytest.raises(BadConfiguration, match=r"^a\.toml: left_V acts with right_V only; state both$"):
+    with pytest.raises(BadConfiguration, match=r"^a\.toml: left_V acts only with right_V; state both$"):
         config.resolve_configuration(config.Simulate, tmp_path / "a.toml", {})
     with pytest.raises(BadConfiguration, match=r"^--left: got 50000\.0; "):
         config.resolve_configuration(config.Simulate, None, {"left_V": 50000.0, "right_V": 1.0})

@@ -93,6 +93,12 @@ def test_rows_that_nothing_was_recorded_in_are_left_out(tmp_path):
     assert (np.diff(read["time_s"]) > 0).all() and read["time_s"][-1] == pytest.approx(399 * 0.00625, rel=0.05)
 
 
+#: Records whose search ends before it converges, as the page says: level ground does not determine the adhesion.
+UNSETTLED = {"drivetrain", "car"}
+#: Largest rms error of the fit of each, in percent of the channel's rms reading.
+MISSED = {"odrive": 0.5, "emps": 1.0, "drivetrain": 1.0, "car": 6.0, "neo_dyno": 1.0, "micromouse": 2.0}
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", RECORDS)
 def test_a_record_is_checked_and_calibrated(name, tmp_path, capsys, monkeypatch):
@@ -100,5 +106,8 @@ def test_a_record_is_checked_and_calibrated(name, tmp_path, capsys, monkeypatch)
     data, file = made(name, tmp_path)
     assert command(["rig", "check", file, data]) == 0
     assert "These data determine" in capsys.readouterr().out
-    assert command(["calibrate", data, "--robot", file, "--out", "fit"]) == 0
-    assert json.loads((tmp_path / "fit" / "result.json").read_text("utf-8"))["converged"]
+    assert command(["calibrate", data, "--robot", file, "--out", "fit"]) == (3 if name in UNSETTLED else 0)
+    found = json.loads((tmp_path / "fit" / "result.json").read_text("utf-8"))
+    assert found["optimizer"]["status"] == ("not_converged" if name in UNSETTLED else "converged")
+    errors = {channel: e["rms_percent"] for channel, e in found["errors"]["after"]["fitted"].items()}
+    assert errors and max(errors.values()) < MISSED[name], errors

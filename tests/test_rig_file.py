@@ -412,7 +412,7 @@ REFUSED = {
     "signed in words": (BENCH + '[instruments.total_current]\nsigned = "no"', r"signed: got 'no'; expected true, false: shows magnitude"),
     "± nothing": (BENCH.replace("0.1 ± 0.05", "0.1 ± "), r"bench\.loss_coulomb: got '0\.1 ± '; expected a number, or one with"),
     "± less than zero": (BENCH.replace("0.1 ± 0.05", "0.1 ± -1"), r"the standard deviation must be 0 \(exact\) or more"),
-    "percent of zero": (BENCH.replace("0.1 ± 0.05", "0 ± 5 %"), r"a share of 0 is 0: state the standard deviation"),
+    "percent of zero": (BENCH.replace("0.1 ± 0.05", "0 ± 5 %"), r"0 has no percentage: state the standard deviation"),
     "± out of bounds": (BENCH.replace("0.8 +- 0.03", "1.8 ± 0.1"), r"efficiency_load: got 1\.8; expected 0\.05 to 1"),
     "± of a rating": (BENCH + '[motor.x]\ny = 1\n', r"motor\.x\.y: no such parameter"),
     "two travels": (

@@ -13,7 +13,7 @@ from calibration.data.input_errors import BadConfiguration
 from mmrjax.model import params
 from mmrjax.model.signals import GRAVITY
 from sweeps.commands import rig_from_mujoco, rig_new
-from sweeps.commands.rig_template import example_numbers
+from sweeps.commands.rig_template import example_numbers, is_example, rig_template
 from tests.commands import ends
 
 DIFFBOT = Path(__file__).parent / "data" / "diffbot.urdf"
@@ -193,3 +193,12 @@ def test_robots_with_a_mistake_are_refused_in_a_sentence(old, new, joint, messag
 def test_rig_new_that_is_refused_leaves_nothing_behind(mmrjax, tmp_path, options, message):
     ends(mmrjax("rig new r.toml", *options), message)
     assert not list(tmp_path.iterdir())
+
+
+def test_a_replaced_number_is_no_example_even_with_its_comment():
+    line = next(x for x in rig_template("dyno").splitlines() if x.startswith("torque_constant"))
+    assert (
+        is_example(line)
+        and not is_example(line.replace("0.05", "0.031"))
+        and not is_example("torque_constant = 0.05")
+    )

@@ -160,3 +160,13 @@ def test_replicates_are_drawn_with_sds_that_an_estimate_might_have_been_of():
     assert np.var(factors[:, 0] ** -2) == pytest.approx(2 / 7.45, rel=0.05)
     assert factors.min() >= UNSURE[0] and factors.max() <= UNSURE[1]
     assert np.all(_factors(None, 3, 5, seed=0) == 1.0)
+
+
+def test_readings_of_motors_at_rest_do_not_tell_the_noise_of_those_that_turn():
+    """A driver's dead band: half of the speeds are exactly 0. A pure share gave the slowest rows a far too small sd."""
+    runs = table(0.05, slopes=np.linspace(0, 20, 121), payloads=(0.0,), volts=(15.0,))
+    turning = np.maximum(600 - 57 * runs["slope_deg"], 0.0)
+    speed = turning + np.where(turning > 0, 3.0, 0.0) * np.random.default_rng(4).standard_normal(121)
+    runs = dataclasses.replace(runs, columns={**runs.columns, "motor_speed_rpm": speed})
+    _, motor, _ = found(runs)
+    assert_allclose(motor.sd(quantities.RPM * np.array([30.0, 600.0])) / quantities.RPM, 3.0, rtol=0.35)

@@ -70,7 +70,7 @@ def test_sweeps_that_cannot_be_climbed_are_refused_in_one_sentence(case):
     [("tread_mm", 300, "step", "stairs"), ("count", 2, "gap", "stairs"), ("nose_mm", 5, "gap", "step or stairs")],
 )
 def test_keys_of_another_obstacle_are_refused(key, value, kind, kinds):
-    with pytest.raises(ValidationError, match=f"`{key}` acts with `kind` {kinds} only"):
+    with pytest.raises(ValidationError, match=f"`{key}` acts only with `kind` {kinds}"):
         Obstacle(kind=kind, **{key: value})
     # as a file of all keys has them
     assert Obstacle(**Obstacle(kind=kind).model_dump()) == Obstacle(kind=kind)

@@ -874,7 +874,7 @@ REFUSED = {
     "share in words": (CONFIG, ["--shard", "first"], "--shard: got first; expected i/n"),
     "shares of a cluster": (CONFIG, ["--shard", "1/2", "--scheduler", "tcp://x:1"], "--shard: not allowed with --scheduler"),
     "unknown export": (CONFIG, ["--export", "xls"], "--export: got 'xls'; expected 'csv' or 'parquet'"),
-    "option of a grid": (CONFIG, ["--slopes", "3"], "--slopes: acts with a grid of options only"),
+    "option of a grid": (CONFIG, ["--slopes", "3"], "--slopes: acts only with a grid of options"),
     "two configurations": (CONFIG, ["--config", "plan.toml"], "--config: got plan.toml beside plan.toml"),
     "not a scheduler": (CONFIG, ["--scheduler", "nonsense"], "--scheduler: got nonsense; no scheduler answers there"),
     "axes are no table": ("axes = 3\nreport = false\n", [], "plan.toml, axes: got 3"),

@@ -125,11 +125,11 @@ def test_a_voltage_beside_the_battery_is_refused(mmrjax, tmp_path):
         code, _, err = mmrjax(command, "--battery", "--voltage", "15")
         assert code == 2
         assert err == ("mmrjax: --voltage: got 15 with --battery, whose charge sets the voltage; give one of them\n")
-    ends(mmrjax("sweep --battery --voltages 15,24"), "--voltages acts without --battery only")
-    ends(mmrjax("sensitivity --battery --vary voltage=15:24"), "--vary voltage: acts without --battery only")
+    ends(mmrjax("sweep --battery --voltages 15,24"), "--voltages acts only without --battery")
+    ends(mmrjax("sensitivity --battery --vary voltage=15:24"), "--vary voltage: acts only without --battery")
     (tmp_path / "plan.toml").write_text("[axes]\nvoltage = [15, 24]\n[conditions]\nbattery = true\n")
     code, _, err = mmrjax("sweep plan.toml")
-    assert code == 2 and err.startswith("mmrjax: plan.toml, voltage: acts without battery only")
+    assert code == 2 and err.startswith("mmrjax: plan.toml, voltage: acts only without battery")
     (tmp_path / "runs.csv").write_text("configuration,supply_voltage_V,payload_kg,slope_deg\n6T2A,24,0,0\n")
     code, _, err = mmrjax("simulate --battery --runs runs.csv")
     assert code == 4

@@ -137,19 +137,19 @@ def test_a_turn_that_is_not_found_though_it_is_within_reach_is_friction_s():
 
 
 REFUSED = {
-    "one side": (("--left", "33"), "--left acts with --right only"),
+    "one side": (("--left", "33"), "--left acts only with --right"),
     "volts and duties": (
         ("--left", "3", "--right", "1", "--duty-left", "1", "--duty-right", "1"),
-        "--left acts without --duty-left only",
+        "--left acts only without --duty-left",
     ),
-    "speed alone": (("--speed", "0.3"), "--speed acts with --yaw-rate only"),
+    "speed alone": (("--speed", "0.3"), "--speed acts only with --yaw-rate"),
     "volts and a demand": (
         ("--left", "3", "--right", "1", "--speed", "0.3", "--yaw-rate", "1"),
-        "--left acts without --speed",
+        "--left acts only without --speed",
     ),
     "volts on the battery": (("--left", "3", "--right", "1", "--battery"), "state --duty-left and --duty-right"),
-    "track, one side": (("--left", "3", "--model", "track"), "--left acts with --right only"),
-    "profile": (("--left", "3", "--right", "1", "--profile", "patrol"), "--left acts without --profile only"),
+    "track, one side": (("--left", "3", "--model", "track"), "--left acts only with --right"),
+    "profile": (("--left", "3", "--right", "1", "--profile", "patrol"), "--left acts only without --profile"),
     "supply too low": (("--left", "33", "--right", "1", "--voltage", "20"), "expected at least 33 V"),
     "slope": (("--left", "33", "--right", "1", "--slope", "5"), "its heading changes there continuously"),
     "one motor": (("--left", "3", "--right", "1", "--robot", "ONE"), "expected sides = 2"),

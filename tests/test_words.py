@@ -39,6 +39,18 @@ from sweeps.pages.words import FILES
 ROOT = Path(__file__).resolve().parents[1]
 #: Notes of every kind; their sentences are in `tests/record/pages/notes.txt`, which `python tests/test_words.py` writes.
 SAMPLES = [
+    Remark("feedforward_sign"),
+    Remark("feedforward_speed_sign"),
+    Remark("feedforward_unit", ratio=60.1, near=60.0),
+    Remark("feedforward_delay", delay=0.04),
+    Remark("feedforward_filter", lag=0.06),
+    Remark("feedforward_limit", level=3.2, current=40.0),
+    Remark("feedforward_skid", level=3.2),
+    Remark("feedforward_direction", forward=0.3, backward=0.2),
+    Remark("feedforward_sag", rest=12.5, low=9.8),
+    Remark("feedforward_missing", tests=("dynamic-forward", "dynamic-reverse")),
+    Remark("feedforward_no_kA", share=0.8, missing=["dynamic-forward"]),
+    Remark("feedforward_gains_delayed", delay=0.04, slow=0.5, prompt=1.2),
     Remark("held_by_prior", names=("a",)),
     Remark(
         "only_together",

@@ -36,18 +36,18 @@ def convert_column(meaning: Column, raw: Raw, layout: Layout) -> tuple[np.ndarra
         words = column_texts(raw)
         wrong = [word for word in dict.fromkeys(words) if _allowed_words(meaning.column, word, layout)]
         return np.array(words), np.isin(words, wrong)
-    found, (low, high) = column_numbers(raw), meaning.limits()
+    numbers, (low, high) = column_numbers(raw), meaning.limits()
     beyond = ROUNDED_FACTOR if meaning.factor != 1.0 else ROUNDED
-    above = found > low if meaning.column in layout.deviation_columns else found >= low - beyond * abs(low)
-    refused = ~(above & (found <= high + beyond * abs(high)))
+    above = numbers > low if meaning.column in layout.deviation_columns else numbers >= low - beyond * abs(low)
+    refused = ~(above & (numbers <= high + beyond * abs(high)))
     if meaning.column != layout.imposed_column and meaning.column in (
         *layout.measured_columns,
         *layout.deviation_columns,
         *DUTY,
     ):
         refused[refused] = ~missing_readings(raw, np.flatnonzero(refused))
-    np.clip(found, low, high, out=found)
-    return found if meaning.as_named else _in_its_unit(meaning, found), refused
+    np.clip(numbers, low, high, out=numbers)
+    return numbers if meaning.as_named else _in_its_unit(meaning, numbers), refused
 
 
 def _in_its_unit(meaning: Column, written: np.ndarray) -> np.ndarray:
@@ -101,8 +101,8 @@ def _hint(meaning: Column, cell: str, units: bool, readings: Names) -> str:
     try:
         value = parse_number(cell)
     except ValueError:
-        found = _WITH_UNIT.fullmatch(cell)
-        return "" if found is None else _unit_hint(found[1], found[2], mine, named)
+        match = _WITH_UNIT.fullmatch(cell)
+        return "" if match is None else _unit_hint(match[1], match[2], mine, named)
     far = abs(value) > FAR * max(map(abs, quantity.limits(mine)))
     if far and meaning.column in DUTY:
         return "a command of another size? divide by its largest, of a log by [columns] duty = {column, factor}; "
@@ -156,23 +156,23 @@ def _in_case(name: str, header: Sequence[str], layout: Layout, inferred: bool) -
     spelled: dict[str, set[str]] = {}
     for column in known.spellings():
         spelled.setdefault(column.casefold(), set()).add(column)
-    found, said = [], []
+    columns_found, notes = [], []
     for column in header:
         meant = spelled.get(column.casefold(), set())
         if column not in meant and len(meant) == 1 and not meant & set(header):
             (right,) = meant
-            said.append(f"{name}: column {column} is read as {right}")
+            notes.append(f"{name}: column {column} is read as {right}")
             column = right
-        found.append(column)
-    return found, tuple(said)
+        columns_found.append(column)
+    return columns_found, tuple(notes)
 
 
 def _with_channels(name: str, header: list[str], layout: Layout, more: Sequence[Channel]) -> Layout:
     """`layout` with each of `more` for which the file has a column."""
     meanings = dataclasses.replace(layout, channels=channels.EVERY).meanings(name, header)
     stated = {m.column for m in meanings if m is not None}
-    found = tuple(c for c in channels.EVERY if c in layout.channels or (c in more and c.column in stated))
-    return dataclasses.replace(layout, channels=found)
+    with_channels = tuple(c for c in channels.EVERY if c in layout.channels or (c in more and c.column in stated))
+    return dataclasses.replace(layout, channels=with_channels)
 
 
 def check_header(
@@ -236,9 +236,9 @@ def _other_names(strange: list[str], column: str) -> str:
         return ""
     unit = column.rpartition("_")[2]
     guess = next((c for c in strange if re.search(rf"\b{unit}\b", c)), "...")
-    shown = ", ".join(strange[:NAMED]) + (", ..." if len(strange) > NAMED else "")
+    listed = ", ".join(strange[:NAMED]) + (", ..." if len(strange) > NAMED else "")
     return (
-        f"; other columns: {shown}; if one of them is it, state it in the robot's file, with the factor from its "
+        f"; other columns: {listed}; if one of them is it, state it in the robot's file, with the factor from its "
         f'unit: [columns] {column} = {{column = "{guess}", factor = 1.0}} (mmrjax inspect proposes such lines)'
     )
 

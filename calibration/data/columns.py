@@ -209,10 +209,12 @@ class Layout:
 
     def quantities(self) -> dict[str, Quantity]:
         """Quantities of the columns of its tables, by column, including conditions that do not act on its load."""
-        shown = [c for c in channels.EVERY if c in self.channels or c.column in (self.imposed_column, *self.sides)]
-        rows = (*quantities.LABELS, *quantities.SET, *(q for c in shown for q in _of_channel(c)))
-        known = {*self.known(), *ON_GROUND, *ON_SHAFT}
-        return {q.column: q for q in rows if q.column in known}
+        shown_channels = [
+            c for c in channels.EVERY if c in self.channels or c.column in (self.imposed_column, *self.sides)
+        ]
+        rows = (*quantities.LABELS, *quantities.SET, *(q for c in shown_channels for q in _of_channel(c)))
+        known_columns = {*self.known(), *ON_GROUND, *ON_SHAFT}
+        return {q.column: q for q in rows if q.column in known_columns}
 
     def meanings(self, source: str, header: list[str]) -> list[Column | None]:
         """Returns the quantity of each column of a file, None for an unknown column. Names may state another unit.
@@ -223,7 +225,7 @@ class Layout:
         by_name = self._by_name()
         theirs = {column: (mine, factor) for mine, column, factor in self.mapped if column in header}
         taken = {_standard(by_name, mine) for mine, _ in theirs.values()}
-        found: list[Column | None] = []
+        meanings_found: list[Column | None] = []
         for column in header:
             if column in theirs:
                 mine, factor = theirs[column]
@@ -231,22 +233,22 @@ class Layout:
                 if meant is None and mine in {
                     name for channel in channels.EVERY for q in _of_channel(channel) for name in q.columns()
                 }:  # a channel that is not read
-                    found.append(None)
+                    meanings_found.append(None)
                     continue
                 if meant is None:
                     raise BadData(
                         f"{source}: the robot's file reads {mine} from column {column}; this program has no column "
                         f"{mine} for it (known: {', '.join(self.known())})"
                     )
-                found.append(dataclasses.replace(meant, shown=column, factor=factor))
+                meanings_found.append(dataclasses.replace(meant, shown=column, factor=factor))
             else:
                 meant = by_name.get(column)
-                found.append(None if meant is None or meant.column in taken else meant)
-        for k, meaning in enumerate(found):
-            twin = next((m for m in found[:k] if m and meaning and m.column == meaning.column), None)
+                meanings_found.append(None if meant is None or meant.column in taken else meant)
+        for k, meaning in enumerate(meanings_found):
+            twin = next((m for m in meanings_found[:k] if m and meaning and m.column == meaning.column), None)
             if meaning and twin and meaning.shown != twin.shown:
                 raise BadData(f"{source}: columns {twin.shown} and {meaning.shown} state the same; keep one of them")
-        return found
+        return meanings_found
 
     def _by_name(self) -> Mapping[str, Column]:
         """Every name of a column, in any unit, with its quantity."""

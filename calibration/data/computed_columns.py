@@ -36,9 +36,9 @@ def without_computed_torques(runs: Runs, robot: Robot) -> Runs:
         BadData: a computed load of a log, of a table of an imposed current, or without another channel.
     """
     columns, notes = dict(runs.columns), list(runs.notes)
-    shown = {c.column: c.name for c in runs.channels if runs.has(c.column)}
+    shown_columns = {c.column: c.name for c in runs.channels if runs.has(c.column)}
     for torque, current in ((t, c) for t in (LOAD, TORQUE) for c in CURRENTS if runs.has(t) and runs.has(c)):
-        if torque not in columns or (torque == TORQUE and len(shown) < 2):
+        if torque not in columns or (torque == TORQUE and len(shown_columns) < 2):
             continue
         line = None if len(np.unique(runs[current])) < FEWEST else line_through(runs[current], runs[torque])
         if line is None or line[0] != 0.0:
@@ -48,12 +48,12 @@ def without_computed_torques(runs: Runs, robot: Robot) -> Runs:
         if torque == TORQUE:
             columns.pop(torque)
             notes.append(f"{computed}; it is left out")
-        elif runs.sampled or set(shown) <= {current, TORQUE} or current not in shown:
+        elif runs.sampled or set(shown_columns) <= {current, TORQUE} or current not in shown_columns:
             raise BadData(
                 f"{computed}; remove the column and keep rows without a load, or give a torque that was set"
             )
         else:
-            columns[torque] = _load_at(runs, robot, shown[current], runs[current])
+            columns[torque] = _load_at(runs, robot, shown_columns[current], runs[current])
             columns.pop(current)
             notes.append(
                 f"{computed}; it is left out. The load of each row follows from {current} and the robot's file, "

@@ -64,15 +64,15 @@ def loads_from_tables(base: Robot | None, content: Json, sds: dict[str, float], 
             no configuration. `load`, `like` or `movers` is unknown, contradicts another one, or all are missing.
             A file has both shafts and vehicles. A robot with a base lacks a parameter without default.
     """
-    found = [n for n, table in content.items() if n not in TAKEN and isinstance(table, dict)]
-    usual = found if base is None else list(base.configurations)
+    load_names = [n for n, table in content.items() if n not in TAKEN and isinstance(table, dict)]
+    usual = load_names if base is None else list(base.configurations)
     if not usual and "configurations" not in content:
         raise BadConfiguration(
             f"{where}: no load; expected a table such as [bench] with load = one of {', '.join(rig_file.LOADS)}"
         )
     names = _names(content.pop("configurations", usual), where)
     nothing = f', or state base = "{rig_file.NONE}" for a rig that starts from nothing'
-    for name in found:
+    for name in load_names:
         if name not in names and set(_KINDS) & set(content[name]):
             raise BadConfiguration(
                 f"{where}, {name}: not among the configurations, {', '.join(names)}; add it to configurations = [...]"
@@ -96,7 +96,7 @@ def loads_from_tables(base: Robot | None, content: Json, sds: dict[str, float], 
         else:
             by_name[name], lacking = _chassis(base, name, table, here), []
         if lacking and base is not None:
-            raise BadConfiguration(f"{here}: load starts from nothing; {_listed(lacking)} missing")
+            raise BadConfiguration(f"{here}: load has no base to start from; {_listed(lacking)} missing")
         missing += [f"{name}.{key}" for key in lacking]
     shafts = [name for name, load in by_name.items() if isinstance(load, Shaft)]
     vehicles = [name for name in names if name not in shafts]
@@ -114,12 +114,12 @@ def resolved_likes(content: Json, where: str) -> None:
         BadConfiguration: a `like` that names no other table, or a table with a `like` of its own.
     """
     tables = {n: dict(table) for n, table in content.items() if n not in TAKEN and isinstance(table, dict)}
-    own = [name for name, table in tables.items() if "like" not in table]
+    own_names = [name for name, table in tables.items() if "like" not in table]
     for name, table in tables.items():
         if "like" in table:
             like = table.pop("like")
-            if like not in own:
-                raise BadConfiguration(f"{where}, {name}.like: got {like}; {allowed_words(str(like), own)}")
+            if like not in own_names:
+                raise BadConfiguration(f"{where}, {name}.like: got {like}; {allowed_words(str(like), own_names)}")
             content[name] = _over(tables[like], table)
 
 
@@ -178,9 +178,15 @@ def _vehicle(table: Json, where: str, sides: float) -> tuple[Chassis, list[str]]
         radius=0.0,
         inertia=0.0,
     )
-    known = rig_file.vehicle_defaults(on_tracks > 0.5, table, sides)
-    missing = [p.name for p in params.walk_parameters(nothing) if p.name not in known and not _states(table, p.name)]
-    return params.replace(nothing, {name: params.as_float(value) for name, value in known.items()}), missing
+    defaults_of_kind = rig_file.vehicle_defaults(on_tracks > 0.5, table, sides)
+    missing = [
+        p.name
+        for p in params.walk_parameters(nothing)
+        if p.name not in defaults_of_kind and not _states(table, p.name)
+    ]
+    return params.replace(
+        nothing, {name: params.as_float(value) for name, value in defaults_of_kind.items()}
+    ), missing
 
 
 def _movers(stated: Any, where: str) -> float:
@@ -235,8 +241,8 @@ def _blank(pattern: Chassis, on_tracks: float, table: Mapping[str, Any], where: 
     missing = [name for name, default in defaults.items() if default is None and not _states(table, name)]
     if missing:
         raise BadConfiguration(f"{where}: movers without like starts from nothing; {_listed(missing)} missing")
-    known = {name: params.as_float(default) for name, default in defaults.items() if default is not None}
-    return params.replace(dataclasses.replace(pattern, on_tracks=on_tracks), known)
+    known_values = {name: params.as_float(default) for name, default in defaults.items() if default is not None}
+    return params.replace(dataclasses.replace(pattern, on_tracks=on_tracks), known_values)
 
 
 def _defaults(component: eqx.Module, prefix: str = "") -> Iterator[tuple[str, float | None]]:

@@ -85,28 +85,30 @@ def inspect_source(source: str | Path | Any) -> Contents:
     Raises:
         BadData: no such file, an unreadable one, or one without columns.
     """
-    found = _source(source)
+    contents_found = _source(source)
     times: dict[int, tuple[np.ndarray, str] | str] = {}
-    table = _clock_of_table(found)
+    table = _clock_of_table(contents_found)
     facts = tuple(
         _facts(signal, signal.clock or (None if signal is table else _clock(table)), times)
-        for signal in found.signals
+        for signal in contents_found.signals
     )
-    clocks = {id(s.clock) for s in found.signals if s.clock is not None}
-    notes = list(found.notes)
-    for signal in found.signals:
+    clocks = {id(s.clock) for s in contents_found.signals if s.clock is not None}
+    notes = list(contents_found.notes)
+    for signal in contents_found.signals:
         time = times.get(id(signal.clock)) if signal.clock is not None else None
-        if isinstance(time, str) and f"{found.name}: {time}" not in notes:
-            notes.append(f"{found.name}: {time}")
-    preset = presets_file.recognise_preset([s.path for s in found.signals])
+        if isinstance(time, str) and f"{contents_found.name}: {time}" not in notes:
+            notes.append(f"{contents_found.name}: {time}")
+    preset = presets_file.recognise_preset([s.path for s in contents_found.signals])
     if len(clocks) > 1:
-        notes.append(f"{found.name}: signals have {len(clocks)} clocks; rows become those of the densest channel")
+        notes.append(
+            f"{contents_found.name}: signals have {len(clocks)} clocks; rows become those of the densest channel"
+        )
     still = {fact.path for fact in facts if fact.least == fact.greatest}
-    read = (dataclasses.replace(s, refused=f.refused) for s, f in zip(found.signals, facts, strict=True))
+    read = (dataclasses.replace(s, refused=f.refused) for s, f in zip(contents_found.signals, facts, strict=True))
     moving = sorted(read, key=lambda signal: signal.path in still)  # of several, the first that changes
     lines = dict(_proposed(moving))
-    proposed = tuple(lines[s.path] for s in found.signals if s.path in lines)
-    return Contents(found.name, found.kind, facts, tuple(notes), preset, () if preset else proposed)
+    proposed = tuple(lines[s.path] for s in contents_found.signals if s.path in lines)
+    return Contents(contents_found.name, contents_found.kind, facts, tuple(notes), preset, () if preset else proposed)
 
 
 def _source(source: Any) -> Source:
@@ -158,52 +160,52 @@ def _unit_of_time(name: str) -> str | None:
 
 
 def _facts(signal: Signal, clock: Clock | None, times: dict[int, tuple[np.ndarray, str] | str]) -> SignalFacts:
-    found = SignalFacts(
+    facts = SignalFacts(
         signal.path, signal.unit, signal.length, signal.refused, clock="" if clock is None else clock.name
     )
     if signal.refused or not signal.length:
-        return found
+        return facts
     try:
         values = signal.load()
     except BadData as error:
-        return dataclasses.replace(found, refused=str(error).partition(f"{signal.path}: ")[2] or str(error))
+        return dataclasses.replace(facts, refused=str(error).partition(f"{signal.path}: ")[2] or str(error))
     if values.dtype.kind in "US":
-        return dataclasses.replace(found, words=tuple(map(str, dict.fromkeys(values[:10_000].tolist())))[:5])
+        return dataclasses.replace(facts, words=tuple(map(str, dict.fromkeys(values[:10_000].tolist())))[:5])
     if values.dtype.kind in "mM":
         values = values.astype(np.int64)
     values = np.asarray(values, float)
     finite = np.isfinite(values)
     ends = (float(values[finite].min()), float(values[finite].max())) if finite.any() else (np.nan, np.nan)
-    found = dataclasses.replace(found, least=ends[0], greatest=ends[1], missing=int((~finite).sum()))
+    facts = dataclasses.replace(facts, least=ends[0], greatest=ends[1], missing=int((~finite).sum()))
     if clock is None:
-        return found
+        return facts
     if id(clock) not in times:
         times[id(clock)] = _seconds(clock)
     time = times[id(clock)]
     if isinstance(time, str) or len(time[0]) != len(values):
-        return found
+        return facts
     steps = np.diff(time[0])
     usual = float(np.median(steps[steps > 0])) if (steps > 0).any() else np.nan
-    return dataclasses.replace(found, rate=1 / usual, gaps=float((steps > GAP * usual).sum()))
+    return dataclasses.replace(facts, rate=1 / usual, gaps=float((steps > GAP * usual).sum()))
 
 
 def _seconds(clock: Clock) -> tuple[np.ndarray, str] | str:
     try:
-        found = one_clock.clock_seconds(clock)
+        seconds_found = one_clock.clock_seconds(clock)
     except BadData as error:
         return str(error)
-    back = np.flatnonzero(np.diff(found.time) < 0)
+    back = np.flatnonzero(np.diff(seconds_found.time) < 0)
     if back.size:
         return f"{clock.name} goes back at sample {back[0] + 2}"
-    return found.time, found.unit
+    return seconds_found.time, seconds_found.unit
 
 
 def _proposed(signals: Sequence[Signal]) -> Iterator[tuple[str, str]]:
     """Paths of signals that may be columns, each with its line of a table `[columns]`: the time, then the others."""
     spelled = set(Layout(channels=channels.EVERY).spellings())
-    own = [s for s in signals if s.clock is None and not s.refused]
-    named = next((s for s in own if _unit_of_time(s.name) is not None), None)
-    clock = named or next((s for s in own if _rises(s)), None)
+    row_signals = [s for s in signals if s.clock is None and not s.refused]
+    named = next((s for s in row_signals if _unit_of_time(s.name) is not None), None)
+    clock = named or next((s for s in row_signals if _rises(s)), None)
     rest = [s for s in signals if _unit_of_time(s.name) is None and s is not clock]
     elapsed = None
     if clock is not None:

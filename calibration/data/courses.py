@@ -63,23 +63,23 @@ def applied_drive(runs: Runs) -> np.ndarray:
 def rows_of_varying_runs(runs: Runs, columns: Names | None = None) -> np.ndarray:
     """True for rows in whose run one of these columns changes, shape (rows,). By default the columns that may."""
     columns = changing_columns(runs) if columns is None else columns
-    found = np.zeros(len(runs), bool)
+    varies = np.zeros(len(runs), bool)
     if not runs.sampled:
-        return found
+        return varies
     _, run = np.unique(runs.run_names, return_inverse=True)
     first = np.unique(run, return_index=True)[1][run]
     for column in (c for c in columns if runs.has(c)):
         differs = runs[column] != runs[column][first]
-        found |= np.bincount(run, differs)[run] > 0
-    return found
+        varies |= np.bincount(run, differs)[run] > 0
+    return varies
 
 
 def differs_from_row_before(rows: np.ndarray, conditions: Iterable[np.ndarray]) -> np.ndarray:
     """True for rows with a condition that differs from the row before, shape (rows,)."""
-    found = np.zeros(len(rows), bool)
+    differs_here = np.zeros(len(rows), bool)
     for condition in conditions:
-        found[1:] |= condition[rows][1:] != condition[rows][:-1]
-    return found
+        differs_here[1:] |= condition[rows][1:] != condition[rows][:-1]
+    return differs_here
 
 
 def divide_run(
@@ -101,20 +101,20 @@ def divide_run(
 
 def course_stretches(runs: Runs) -> list[list[Stretch]]:
     """The stretches of every run, runs in the order of their names."""
-    found = []
+    stretches = []
     time, volts = runs["time_s"], applied_drive(runs)
     columns = [runs[c] for c in changing_columns(runs)]
     for name in np.unique(runs.run_names):
-        found.append(divide_run(runs.in_order(name), time, columns, volts))
-    return found
+        stretches.append(divide_run(runs.in_order(name), time, columns, volts))
+    return stretches
 
 
 def course_of_each_row(runs: Runs) -> np.ndarray:
     """For every row the course of its run's conditions, empty where they do not change, shape (rows,)."""
-    found = np.full(len(runs), "", dtype=object)
+    courses = np.full(len(runs), "", dtype=object)
     if rows_of_varying_runs(runs).any():
         columns = changing_columns(runs)
         for run in (r for r in course_stretches(runs) if len(r) > 1):
             said = [f"{s.begin:g}: {', '.join(str(runs[c][s.rows[0]]) for c in columns)}" for s in run]
-            found[np.concatenate([s.rows for s in run])] = "; ".join(said)
-    return found.astype(str)
+            courses[np.concatenate([s.rows for s in run])] = "; ".join(said)
+    return courses.astype(str)

@@ -112,10 +112,14 @@ def _plain(name: str, content: bytes) -> NamedArrays | None:
         blank = compute.equal(column, "")
         empty = blank if empty is None else compute.and_(empty, blank)
         try:
-            found = column.cast(pa.float64()).to_numpy()
+            column_values = column.cast(pa.float64()).to_numpy()
         except pa.ArrowInvalid:  # some cell states no number
-            found = np.full(1, np.nan)
-        values.append([cell_word(cell.strip()) for cell in column.to_pylist()] if np.isnan(found).any() else found)
+            column_values = np.full(1, np.nan)
+        values.append(
+            [cell_word(cell.strip()) for cell in column.to_pylist()]
+            if np.isnan(column_values).any()
+            else column_values
+        )
     if empty is None or compute.any(empty).as_py():  # rows of separators alone
         return None
     return NamedArrays(name, tuple(header), tuple(values), digest=hashlib.sha256(content).hexdigest())
@@ -127,8 +131,10 @@ def row_of_units(header: Sequence[str], first: Sequence[str]) -> Names:
     if len(first) != len(header) or any(math.isfinite(cell_number(cell)) for cell in first):
         return ()
     units = tuple(quantities.unit_in_column(cell.strip("[]()")).strip("-") for cell in first)
-    known = {unit for quantity in (*quantities.SET, *channels.EVERY) for unit in quantity.columns().values()} - {""}
-    stated = any(unit in known for column, unit in zip(header, units, strict=True) if column not in WORDS)
+    known_units = {
+        unit for quantity in (*quantities.SET, *channels.EVERY) for unit in quantity.columns().values()
+    } - {""}
+    stated = any(unit in known_units for column, unit in zip(header, units, strict=True) if column not in WORDS)
     return units if stated else ()
 
 
@@ -202,7 +208,7 @@ def split_cells(name: str, lines: Sequence[str]) -> tuple[list[list[str]], Names
         rows = [row[:named] for row in rows]
     if mark == ",":
         return rows, ()
-    said = f"{name}: columns are separated by {SEPARATORS[mark]}"
+    note = f"{name}: columns are separated by {SEPARATORS[mark]}"
     comma: dict[int, list[str]] = {}
     point: dict[int, list[str]] = {}
     whole: set[int] = set()
@@ -226,7 +232,7 @@ def split_cells(name: str, lines: Sequence[str]) -> tuple[list[list[str]], Names
                     f"{name}, {_column(rows, j)}: got {written[0]} next to "
                     f"{beside or 'whole numbers below a thousand'}; {wanted}"
                 )
-    return rows, (f"{said}, and numbers have decimal commas; read so" if comma else f"{said}; read so",)
+    return rows, (f"{note}, and numbers have decimal commas; read so" if comma else f"{note}; read so",)
 
 
 def _column(rows: list[list[str]], j: int) -> str:

@@ -102,20 +102,20 @@ def effect_library(paths: Sequence[Path | str] = ()) -> Library:
     Raises:
         BadConfiguration: as `read_effect_file`. A repeated name. An effect that settles to an unknown effect.
     """
-    known = dict(effects.BY_NAME)
-    own = [(path, effect) for path in map(Path, paths) for effect in read_effect_file(path)]
-    for path, effect in own:
-        if effect.name in {**effects.BESIDE, **known}:
+    library = dict(effects.BY_NAME)
+    own_effects = [(path, effect) for path in map(Path, paths) for effect in read_effect_file(path)]
+    for path, effect in own_effects:
+        if effect.name in {**effects.BESIDE, **library}:
             raise BadConfiguration(f"{_where(path, effect)}, name: {effect.name} is taken; choose another")
-        known[effect.name] = effect
-    for path, effect in own:
-        others = [name for name in known if name != effect.name]
+        library[effect.name] = effect
+    for path, effect in own_effects:
+        others = [name for name in library if name != effect.name]
         if effect.settles_to and effect.settles_to not in others:
             raise BadConfiguration(
                 f"{_where(path, effect)}, settles_to: got {effect.settles_to}; "
                 f"{allowed_words(effect.settles_to, others)}"
             )
-    return known
+    return library
 
 
 class _FromSource(importlib.machinery.SourceFileLoader):
@@ -147,8 +147,8 @@ def read_effect_file(path: Path) -> tuple[type[Effect], ...]:
         raise BadConfiguration(f"{path.name}: its code fails ({type(error).__name__}: {error})") from error
     concrete = effects.effects_of_module(module)
     if not concrete:
-        own = [v for v in vars(module).values() if inspect.isclass(v) and v.__module__ == name]
-        partial = [v.__name__ for v in own if issubclass(v, Effect)]
+        own_classes = [v for v in vars(module).values() if inspect.isclass(v) and v.__module__ == name]
+        partial = [v.__name__ for v in own_classes if issubclass(v, Effect)]
         missing = f"; {partial[0]} defines no term" if partial else ""
         raise BadConfiguration(
             f"{path.name}: holds no effect; expected a class derived from mmrjax.effects.Effect{missing}"
@@ -176,11 +176,13 @@ def _check(path: Path, effect: type[Effect]) -> None:
         raise refuse(f", name: got {effect.name!r}; expected lower-case words joined by underscores")
     if effect.balance not in BALANCES:
         raise refuse(f", balance: got {effect.balance}; {allowed_words(effect.balance, BALANCES)}")
-    known = channels.channel_names(channels.EVERY)
+    channel_names = channels.channel_names(channels.EVERY)
     if (effect.balance == "sensor") != bool(effect.channel):
-        raise refuse(f", channel: got {effect.channel!r}; expected one of {', '.join(known)} for sensor, else none")
-    if effect.channel and effect.channel not in known:
-        raise refuse(f", channel: got {effect.channel}; {allowed_words(effect.channel, known)}")
+        raise refuse(
+            f", channel: got {effect.channel!r}; expected one of {', '.join(channel_names)} for sensor, else none"
+        )
+    if effect.channel and effect.channel not in channel_names:
+        raise refuse(f", channel: got {effect.channel}; {allowed_words(effect.channel, channel_names)}")
     if effect.movers and effect.movers not in _MOVERS:
         raise refuse(f", movers: got {effect.movers}; {allowed_words(effect.movers, _MOVERS)}, or none for both")
     size = effect.memory_size

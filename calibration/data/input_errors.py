@@ -52,8 +52,8 @@ def rows_text(rows: Sequence[int], most: int, rest: str = ", ...") -> str:
 
     `rest` stands for rows after the first `most`. `{}` in it is their number.
     """
-    shown = ", ".join(str(k + 1) for k in rows[:most]) + rest.format(len(rows) - most) * (len(rows) > most)
-    return f"row{'s' * (len(rows) > 1)} {shown}"
+    listed = ", ".join(str(k + 1) for k in rows[:most]) + rest.format(len(rows) - most) * (len(rows) > most)
+    return f"row{'s' * (len(rows) > 1)} {listed}"
 
 
 def bound_text(value: float) -> str:

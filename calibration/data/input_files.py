@@ -72,14 +72,14 @@ def first_bytes(path: Path, where: str | Path, kind: type[InputError] = BadData,
 @contextlib.contextmanager
 def _opened(path: Path, where: str | Path, kind: type[InputError], largest: float = math.inf) -> Iterator[BinaryIO]:
     try:
-        found = path.stat()
-        if not stat.S_ISREG(found.st_mode):
-            what = next((word for is_kind, word in _KINDS.items() if is_kind(found.st_mode)), "a device")
+        status = path.stat()
+        if not stat.S_ISREG(status.st_mode):
+            what = next((word for is_kind, word in _KINDS.items() if is_kind(status.st_mode)), "a device")
             raise kind(f"{where}: is {what}; expected a file")
-        if found.st_size > largest:
-            raise kind(f"{where}: has {found.st_size / 1e6:,.0f} MB; expected at most {largest / 1e6:,.0f} MB")
+        if status.st_size > largest:
+            raise kind(f"{where}: has {status.st_size / 1e6:,.0f} MB; expected at most {largest / 1e6:,.0f} MB")
         if math.isfinite(largest):
-            check_memory(where, found.st_size)
+            check_memory(where, status.st_size)
         with path.open("rb") as stream:
             yield stream
     except (OSError, ValueError) as error:  # a name with a null byte
@@ -151,16 +151,16 @@ def csv_bytes(path: Path, where: str | Path) -> bytes:
     Raises:
         BadData: as `file_bytes`, or another format, which the message names.
     """
-    found = file_bytes(path, where)
-    what = next((word for begin, word in BINARY.items() if found.startswith(begin)), None)
-    what = what or next((word for begin, word in TEXTS.items() if begin.match(found)), None)
+    content = file_bytes(path, where)
+    what = next((word for begin, word in BINARY.items() if content.startswith(begin)), None)
+    what = what or next((word for begin, word in TEXTS.items() if begin.match(content)), None)
     if what is not None:
         raise BadData(
             f"{where}: is {what}; expected CSV (a header line with the columns' names, then one line for each "
             "row), Parquet, or another format of docs/howto/formats.md; export it as CSV, from Python with "
             "pandas.DataFrame(...).to_csv(..., index=False)"
         )
-    return found
+    return content
 
 
 def toml_text(path: Path, where: str | Path) -> str:
@@ -190,13 +190,13 @@ def toml_content(text: str, where: str | Path, kind: type[InputError] = BadConfi
             of more than 64 bits.
     """
     try:
-        found = tomllib.loads(text)
+        content = tomllib.loads(text)
     except (tomllib.TOMLDecodeError, ValueError) as error:  # a number of more digits than Python reads
         raise kind(f"{where}: not a readable TOML file ({error})") from error
     except RecursionError as error:
         raise kind(f"{where}: tables or lists are nested too deep; expected at most {DEEPEST} levels") from error
     keys = 0
-    left: list[tuple[Json | list[Any], int]] = [(found, 1)]
+    left: list[tuple[Json | list[Any], int]] = [(content, 1)]
     while left:
         value, depth = left.pop()
         if depth > DEEPEST:
@@ -210,4 +210,4 @@ def toml_content(text: str, where: str | Path, kind: type[InputError] = BadConfi
                 left.append((each, depth + 1))
             elif isinstance(each, int) and not -WHOLE <= each < WHOLE:
                 raise kind(f"{where}: got a whole number beyond 64 bits; expected numbers of at most 18 digits")
-    return found
+    return content

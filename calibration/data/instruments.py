@@ -31,16 +31,16 @@ def step_of(readings: np.ndarray) -> float:
     levels = np.unique(readings[np.isfinite(readings)])
     if levels.size < FEWEST:
         return 0.0
-    found, largest = 0.0, float(np.ptp(levels))
+    step, largest = 0.0, float(np.ptp(levels))
     for apart in np.diff(levels):
-        a, b = float(apart), found
+        a, b = float(apart), step
         while b > ROUNDING * largest:
             rest = a - b * round(a / b)
             a, b = b, abs(rest)
-        found = a
-        if found < SMALLEST * largest:
+        step = a
+        if step < SMALLEST * largest:
             return 0.0
-    return found
+    return step
 
 
 def display_step(readings: np.ndarray, channel: Channel) -> float:
@@ -73,7 +73,7 @@ def infer_instruments(
         columns: of the table, in their units.
     """
     back = any((columns[c] < 0).any() for c in ("supply_voltage_V", "motor_speed_rpm", "duty") if c in columns)
-    found = []
+    inferred = []
     for instrument in instruments:
         channel = channels.find_channel(instrument.channel)
         shown = columns.get(channel.column, np.zeros(0))
@@ -82,16 +82,16 @@ def infer_instruments(
             signed = not back or bool((shown < 0).any())
         if quantum is None:
             quantum = step_of(shown) * channel.factor
-        found.append(Instrument(instrument.channel, signed, quantum))
-    return tuple(found)
+        inferred.append(Instrument(instrument.channel, signed, quantum))
+    return tuple(inferred)
 
 
 def with_inferred_instruments(robot: Robot, runs: Runs) -> Robot:
     """Returns `robot` with the instruments that its table shows."""
     mine = robot.rig.instruments
-    found = runs.layout.instruments if any(i.free for i in mine) else mine
-    named = {i.channel for i in found}
-    found = (*found, *(i for i in runs.layout.instruments if i.channel not in named))
-    if found == mine:
+    all_instruments = runs.layout.instruments if any(i.free for i in mine) else mine
+    named = {i.channel for i in all_instruments}
+    all_instruments = (*all_instruments, *(i for i in runs.layout.instruments if i.channel not in named))
+    if all_instruments == mine:
         return robot
-    return dataclasses.replace(robot, rig=dataclasses.replace(robot.rig, instruments=found))
+    return dataclasses.replace(robot, rig=dataclasses.replace(robot.rig, instruments=all_instruments))

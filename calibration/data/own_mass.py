@@ -53,11 +53,11 @@ def stated_masses(robot: Robot, runs: Runs) -> dict[str, StatedMass]:
     if not runs.has("total_mass_kg"):
         return {}
     which = runs.configurations(robot)
-    own = runs["total_mass_kg"] - runs["payload_kg"]
+    own_masses = runs["total_mass_kg"] - runs["payload_kg"]
     low, high = next(
         p for p in params.walk_parameters(robot.configurations.members[0]) if p.name == "mass"
     ).spec.bounds
-    wrong = np.flatnonzero((own < low) | (own > high))
+    wrong = np.flatnonzero((own_masses < low) | (own_masses > high))
     if wrong.size:
         row = int(wrong[0])
         raise BadData(
@@ -66,14 +66,14 @@ def stated_masses(robot: Robot, runs: Runs) -> dict[str, StatedMass]:
             f"{bound_text(runs['payload_kg'][row])} kg; expected a robot of {bound_text(low)} to "
             f"{bound_text(high)} kg without it"
         )
-    found = {}
+    masses = {}
     for index in np.unique(which):
         mine = which == index
-        m = own[mine]
+        m = own_masses[mine]
         constant = bool(np.ptp(runs["total_mass_kg"][mine]) <= ROUNDING)
         median = round(float(np.median(m)), 6)
-        found[robot.configurations.names[index]] = StatedMass(median, float(m.min()), float(m.max()), constant)
-    return found
+        masses[robot.configurations.names[index]] = StatedMass(median, float(m.min()), float(m.max()), constant)
+    return masses
 
 
 def with_table_mass(robot: Robot, runs: Runs) -> Robot:
@@ -82,8 +82,8 @@ def with_table_mass(robot: Robot, runs: Runs) -> Robot:
     Raises:
         BadData: as `stated_masses`.
     """
-    own = {name: float(chassis.mass) for name, chassis in robot.configurations.items()}
-    masses = {n: s.median for n, s in stated_masses(robot, runs).items() if abs(s.median - own[n]) > ROUNDING}
+    own_masses = {name: float(chassis.mass) for name, chassis in robot.configurations.items()}
+    masses = {n: s.median for n, s in stated_masses(robot, runs).items() if abs(s.median - own_masses[n]) > ROUNDING}
     return params.replace(robot, {f"{name}.mass": jnp.asarray(mass, float) for name, mass in masses.items()})
 
 
@@ -93,19 +93,19 @@ def mass_notes(robot: Robot, runs: Runs) -> list[str]:
     Args:
         robot: as given, before `with_table_mass`.
     """
-    said = []
+    notes = []
     for name, stated in stated_masses(robot, runs).items():
-        own = float(robot.configurations[name].mass)
+        mass = float(robot.configurations[name].mass)
         if stated.varies:
             why = "; does total_mass_kg leave the payload out?" if stated.unladen else ""
-            said.append(
+            notes.append(
                 f"{name}: total_mass_kg less payload_kg varies from {stated.low:.4g} to {stated.high:.4g} kg: the "
                 f"fit used the table's, row by row; {stated.median:.4g} kg, their median, is written, and with it "
                 f"rows of another mass are not as fitted{why}"
             )
-        elif abs(stated.median - own) > ROUNDING:
-            said.append(
-                f"{name}: the table states {stated.median:.6g} kg without payload, the robot's file {own:.6g} kg; "
+        elif abs(stated.median - mass) > ROUNDING:
+            notes.append(
+                f"{name}: the table states {stated.median:.6g} kg without payload, the robot's file {mass:.6g} kg; "
                 f"{stated.median:.6g} kg is used, and written to robot.toml"
             )
     of_table5 = np.zeros(len(runs), bool)
@@ -113,11 +113,11 @@ def mass_notes(robot: Robot, runs: Runs) -> list[str]:
         of_table5 = rows_of_scaled_adhesion(robot, runs["configuration"], runs["surface"])
     others = [s for s in np.unique(runs["surface"][of_table5]) if s != BENCH] if of_table5.any() else []
     if others:
-        said.append(
+        notes.append(
             f"the table has runs on {', '.join(others)}: the written friction is for {BENCH}; simulate "
             f"with --surface {others[0]} to meet what was fitted"
         )
-    return said
+    return notes
 
 
 def check_priors(stated: Iterable[str], robot: Robot, runs: Runs) -> None:

@@ -111,21 +111,21 @@ class Posterior:
         """
         from mmrjax.model import params
 
-        known = {p.name: float(p.value) for p in params.walk_parameters(robot)}
+        values = {p.name: float(p.value) for p in params.walk_parameters(robot)}
         for name in self.names:
-            if name not in known:
-                alike = [n for n in known if n.rpartition(".")[2] == name.rpartition(".")[2]]
+            if name not in values:
+                alike = [n for n in values if n.rpartition(".")[2] == name.rpartition(".")[2]]
                 raise BadData(
                     f"{where}: a posterior of {name}, which this robot does not have, so it is of another robot; "
-                    f"{allowed_words(name, alike or known)}"
+                    f"{allowed_words(name, alike or values)}"
                 )
         with np.errstate(invalid="ignore"):  # of a file with NaN, refused below
             at = self.at(np.asarray(self.mean))
         sd = np.asarray(self.sd)
         for name, value, width in zip(self.names, at, sd, strict=True):
-            if not abs(known[name] - value) <= APART * width + 1e-6 * abs(value):  # also where one is NaN
+            if not abs(values[name] - value) <= APART * width + 1e-6 * abs(value):  # also where one is NaN
                 raise BadData(
-                    f"{where}: {name} is {known[name]:.6g} in the robot; expected {value:.6g}, the centre of its "
+                    f"{where}: {name} is {values[name]:.6g} in the robot; expected {value:.6g}, the centre of its "
                     "posterior: take the robot.toml from the same folder, without changes to fitted parameters"
                 )
 
@@ -197,25 +197,27 @@ def read_posterior(path: Path | str) -> Posterior:
     try:
         with xr.open_dataset(path, engine="scipy") as data:
             data.load()
-        found = _of(data)
+        posterior = _of(data)
     except Exception as error:  # whatever a damaged file makes the reader raise
         why = f"{type(error).__name__}: {error}".splitlines()[0]
         raise BadData(f"{path}: not a posterior that can be read ({why})") from error
-    size = len(found)
+    size = len(posterior)
     sound = (
-        found.covariance.shape == (size, size)
-        and all(np.isfinite(x).all() for x in (found.covariance, found.mean, found.location, found.spread))
-        and np.isfinite(found.softness).all()
-        and not (np.isnan(found.low).any() or np.isnan(found.high).any())
-        and all(0 <= k < size and np.isfinite(ratio) for _, k, ratio in found.tied)
-        and np.linalg.eigvalsh(found.covariance).min() >= -1e-9 * max(np.abs(found.covariance).max(), 1e-300)
-        and set(found.kinds) <= {NORMAL, LOG, ANGLE}
+        posterior.covariance.shape == (size, size)
+        and all(
+            np.isfinite(x).all() for x in (posterior.covariance, posterior.mean, posterior.location, posterior.spread)
+        )
+        and np.isfinite(posterior.softness).all()
+        and not (np.isnan(posterior.low).any() or np.isnan(posterior.high).any())
+        and all(0 <= k < size and np.isfinite(ratio) for _, k, ratio in posterior.tied)
+        and np.linalg.eigvalsh(posterior.covariance).min() >= -1e-9 * max(np.abs(posterior.covariance).max(), 1e-300)
+        and set(posterior.kinds) <= {NORMAL, LOG, ANGLE}
     )
     if not sound:
         raise BadData(
             f"{path}: the covariance is not one, or a number is missing or out of range; write the file anew"
         )
-    return found
+    return posterior
 
 
 def _words(values: Any) -> Names:

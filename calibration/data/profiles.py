@@ -262,10 +262,10 @@ def _settings(name: str, comments: list[str]) -> Json:
         if not re.match(r"[\w-]+\s*=", text):
             continue
         try:
-            found = tomllib.loads(text)
+            settings = tomllib.loads(text)
         except (ValueError, RecursionError) as error:
             raise BadData(f"{name}: got the line # {text}; expected TOML such as # cycles = 40 ({error})") from error
-        for key, value in found.items():
+        for key, value in settings.items():
             if key not in SETTINGS:
                 raise BadData(f"{name}: got the setting {key}; {allowed_words(key, SETTINGS)}")
             if key in stated:
@@ -293,25 +293,25 @@ def _columns(name: str, header: list[str]) -> dict[str, tuple[str, str]]:
     Raises:
         BadData: an unknown column or unit, a field twice, no time.
     """
-    known: dict[str, tuple[str, str]] = {
+    columns_known: dict[str, tuple[str, str]] = {
         column: (field, unit) for field, quantity in QUANTITIES.items() for column, unit in quantity.columns().items()
     }
-    found: dict[str, tuple[str, str]] = {}
+    columns_found: dict[str, tuple[str, str]] = {}
     for column in header:
         if column in (MODE, SURFACE):
             field, unit = column, ""
-        elif column in known:
-            field, unit = known[column]
+        elif column in columns_known:
+            field, unit = columns_known[column]
         else:
             _refuse_column(name, column)
-        if field in found:
-            first = found[field][0]
+        if field in columns_found:
+            first = columns_found[field][0]
             both = f"column {column} twice" if column == first else f"columns {first} and {column}"
             raise BadData(f"{name}: got {both}; expected one of them")
-        found[field] = (column, unit)
-    if "time" not in found:
+        columns_found[field] = (column, unit)
+    if "time" not in columns_found:
         raise BadData(f"{name}: column time_s is missing; other columns: {', '.join(_standard())}")
-    return found
+    return columns_found
 
 
 def _standard() -> list[str]:
@@ -374,24 +374,24 @@ class _Cells:
     def held(self, field: str) -> np.ndarray:
         """A column that every row needs. The last row of a profile whose values are held needs none."""
         last = len(self) - 1
-        found: list[float] = []
+        held_values: list[float] = []
         for row in range(len(self)):
             ends = row == last and not self.linear and not self.text(field, row)
-            found.append(found[-1] if ends else self.value(field, row))
-        return np.array(found)
+            held_values.append(held_values[-1] if ends else self.value(field, row))
+        return np.array(held_values)
 
     def surfaces(self) -> Names | None:
         if not self.has(SURFACE):
             return None
-        found: list[str] = []
+        labels_found: list[str] = []
         for row in range(len(self)):
             name = self.text(SURFACE, row)
             if not name and row == len(self) - 1 and not self.linear:
-                name = found[-1]
+                name = labels_found[-1]
             if name not in SURFACES:
                 self.refuse(SURFACE, row, f"one of these; {allowed_words(name, SURFACES)}")
-            found.append(name)
-        return tuple(found)
+            labels_found.append(name)
+        return tuple(labels_found)
 
 
 def _time(cells: _Cells) -> np.ndarray:
@@ -411,7 +411,7 @@ def _driven(cells: _Cells) -> tuple[Names, Columns]:
     shares = [field for field in DEMANDS if DEMANDS[field] == MODES[VOLTAGE] and cells.has(field)]
     wholes = ["demand", *([YAW_RATE] if cells.has(YAW_RATE) else [])]
     full = {name: 1.0 if name == "duty" else 0.0 for name in shares}
-    found = {name: np.full(len(cells), full.get(name, 0.0)) for name in (*shares, *wholes)}
+    shares_found = {name: np.full(len(cells), full.get(name, 0.0)) for name in (*shares, *wholes)}
     for row in range(len(cells)):
         before = modes[-1] if modes else ""
         filled = [field for field in DEMANDS if cells.text(field, row)]
@@ -422,11 +422,11 @@ def _driven(cells: _Cells) -> tuple[Names, Columns]:
         modes.append(mode)
         if row and cells.linear:  # default end of the ramp that leads here
             for name in wholes:
-                found[name][row] = 0.0 if mode in CONTROLLED else found[name][row - 1]
+                shares_found[name][row] = 0.0 if mode in CONTROLLED else shares_found[name][row - 1]
             for name in shares:
-                found[name][row] = full[name] if mode == MODES[VOLTAGE] else found[name][row - 1]
+                shares_found[name][row] = full[name] if mode == MODES[VOLTAGE] else shares_found[name][row - 1]
         for field in (*(f for f in ends if f not in own), *own):
-            found["demand" if field in CONTROLLED else field][row] = cells.value(field, row)
+            shares_found["demand" if field in CONTROLLED else field][row] = cells.value(field, row)
         speed, stated = MODES[SPEED], bool(cells.text(YAW_RATE, row))
         if stated and mode != speed and not (cells.linear and before == speed):
             cells.refuse(
@@ -435,8 +435,8 @@ def _driven(cells: _Cells) -> tuple[Names, Columns]:
         if cells.has(YAW_RATE) and not stated and mode == speed and (cells.linear or row < len(cells) - 1):
             cells.refuse(YAW_RATE, row, "the demanded yaw rate, 0 for straight travel")
         if stated:
-            found[YAW_RATE][row] = cells.value(YAW_RATE, row)
-    return tuple(modes), found
+            shares_found[YAW_RATE][row] = cells.value(YAW_RATE, row)
+    return tuple(modes), shares_found
 
 
 def _mode(cells: _Cells, row: int, before: str, filled: list[str]) -> str:

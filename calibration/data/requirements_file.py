@@ -219,33 +219,33 @@ def _range(value: Any, where: str, low: float, high: float, unit: str) -> Range:
 
 def _envelope(base: Envelope, stated: Mapping[str, Any], where: str) -> Envelope:
     """`base` with the stated values in place of its own."""
-    found: Json = {}
+    envelope: Json = {}
     for key, value in stated.items():
         place = f"{where}.{key}"
         if key not in KEYS:
             raise BadConfiguration(f"{where}, {_unknown(key, KEYS)}")
         if key in RANGES:
-            found[key] = _range(value, place, *RANGES[key])
+            envelope[key] = _range(value, place, *RANGES[key])
         elif key == "battery":
             if not isinstance(value, bool):
                 raise BadConfiguration(f"{place}: got {value!r}; expected true or false")
-            found[key] = value
+            envelope[key] = value
         elif key == "surface" and value not in SURFACES:
             raise BadConfiguration(f"{place}: got {value!r}; {allowed_words(str(value), SURFACES)}")
         elif not isinstance(value, str):
             raise BadConfiguration(f"{place}: got {value!r}; expected the name of a configuration")
         else:
-            found[key] = value
-    if "supply_voltage_V" in found:
-        if found.setdefault("battery", False):
+            envelope[key] = value
+    if "supply_voltage_V" in envelope:
+        if envelope.setdefault("battery", False):
             raise BadConfiguration(f"{where}: battery and supply_voltage_V contradict each other; state one of them")
-        if "state_of_charge" in found:
+        if "state_of_charge" in envelope:
             raise BadConfiguration(
                 f"{where}: state_of_charge and supply_voltage_V contradict each other; state one of them"
             )
-    elif "state_of_charge" in found and not found.setdefault("battery", True):
+    elif "state_of_charge" in envelope and not envelope.setdefault("battery", True):
         raise BadConfiguration(f"{where}: state_of_charge needs the battery; got battery = false")
-    merged = dataclasses.replace(base, **found)
+    merged = dataclasses.replace(base, **envelope)
     if not merged.battery and merged.supply_voltage_V is None:
         raise BadConfiguration(f"{where}: battery = false needs supply_voltage_V, which is not stated")
     return merged
@@ -265,7 +265,7 @@ def _requirements(name: str, value: Any, envelope: Envelope, where: str) -> list
             raise BadConfiguration(f"{where}, {_unknown(key, known)}")
     for key in table:
         if key in AXES and key not in quantity.axes:
-            raise BadConfiguration(f"{where}, {key}: {quantity.label} does not depend on it; leave it out")
+            raise BadConfiguration(f"{where}, {key}: {quantity.label} does not depend on it; remove it")
     if not limits:
         raise BadConfiguration(f"{where}: states neither least nor most; expected one of them [{quantity.unit}]")
     if not isinstance(source, str):
@@ -277,17 +277,22 @@ def _requirements(name: str, value: Any, envelope: Envelope, where: str) -> list
             f"{where}: stairs without a tread; expected a table such as {{ least = 170, {TREAD} = 290 }}"
         )
     depth = 0.0 if tread is None else stated_number(tread, f"{where}, {TREAD}", *TREADS, "mm")
-    own = _envelope(envelope, table, where)
-    if name == "endurance_min" and not own.battery:
+    own_envelope = _envelope(envelope, table, where)
+    if name == "endurance_min" and not own_envelope.battery:
         raise BadConfiguration(f"{where}: endurance needs the battery, and the envelope states supply_voltage_V")
     if name == "speed_end_of_charge_m_s":
-        if not own.battery:
+        if not own_envelope.battery:
             raise BadConfiguration(
                 f"{where}: an end of charge needs the battery, and the envelope states another supply"
             )
-        own = dataclasses.replace(own, state_of_charge=(own.charge_end, own.charge_end))
+        own_envelope = dataclasses.replace(
+            own_envelope, state_of_charge=(own_envelope.charge_end, own_envelope.charge_end)
+        )
     driven = _share(duty, share, where)
-    return [Requirement(name, limit, sense == "least", own, driven, source, depth) for sense, limit in limits.items()]
+    return [
+        Requirement(name, limit, sense == "least", own_envelope, driven, source, depth)
+        for sense, limit in limits.items()
+    ]
 
 
 def _limit(value: Any, where: str, quantity: Quantity) -> float | None:
@@ -306,10 +311,10 @@ def _share(duty: Any, share: Any, where: str) -> float:
         raise BadConfiguration(f"{where}, duty: got {duty!r}; {allowed_words(str(duty), DUTIES)}")
     if share is None:
         return 1.0 if duty == "driving" else 0.0
-    found = stated_number(share, f"{where}, share", 0.0, 1.0, "")
-    if duty == "standing" and found > 0:
-        raise BadConfiguration(f"{where}: duty standing and a share of {found:g} contradict each other")
-    return found
+    share_value = stated_number(share, f"{where}, share", 0.0, 1.0, "")
+    if duty == "standing" and share_value > 0:
+        raise BadConfiguration(f"{where}: duty standing and a share of {share_value:g} contradict each other")
+    return share_value
 
 
 #: Quantities that equal another quantity at some point of the envelope.

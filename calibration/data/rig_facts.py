@@ -47,10 +47,10 @@ class Fact:
 
 def derived_facts(robot: Robot) -> list[Fact]:
     """Returns facts that follow from the numbers of a robot's motor, gearbox and loads."""
-    found = [*_motor(robot), *_gearbox(robot)]
+    facts = [*_motor(robot), *_gearbox(robot)]
     for name, load in robot.configurations.items():
-        found += _shaft(robot, name, load) if isinstance(load, Shaft) else _vehicle(robot, name)
-    return found
+        facts += _shaft(robot, name, load) if isinstance(load, Shaft) else _vehicle(robot, name)
+    return facts
 
 
 def _within(value: float, low: float, high: float, why: str) -> str:
@@ -374,15 +374,15 @@ def doubtful_speed(runs: Runs, robot: Robot) -> str:
         return ""
     ratio = float(robot.gearbox.ratio) if column == OUTPUT_SPEED else 1.0
     reached = np.abs(applied_drive(runs)) / float(robot.motor.torque_constant) / RPM / ratio
-    read, shown = runs[column], np.isfinite(runs[column]) & (reached > 0)
-    shown &= np.abs(np.nan_to_num(read)) > 0
-    if not shown.any():
+    read, is_shown = runs[column], np.isfinite(runs[column]) & (reached > 0)
+    is_shown &= np.abs(np.nan_to_num(read)) > 0
+    if not is_shown.any():
         return ""
-    share = float(np.median(np.abs(read[shown]) / reached[shown]))
+    share = float(np.median(np.abs(read[is_shown]) / reached[is_shown]))
     braked = runs.has(LOAD) and bool((runs[LOAD] != 0).all())
     if share < OTHER_UNIT and (braked or robot.has_ground or share > 1 / OTHER_UNIT / 100):
         return ""
-    row = int(np.flatnonzero(shown)[0])
+    row = int(np.flatnonzero(is_shown)[0])
     theirs, supply = (runs.headings.get(c, c) for c in (column, SUPPLY))
     return (
         f"{runs.source} row {row + 1}, {theirs}: got {three_digits(abs(read[row]))} rpm, where the file's torque "
@@ -518,17 +518,17 @@ def number_origins(file: RobotFile) -> list[Origin]:
     """Returns the origin of each number of a robot. In each part, numbers that no file states come last."""
     robot, stated = file.robot, file.stated
     priors = {name: sd for name, _, sd in robot.rig.priors}
-    found = []
+    origins = []
     for p in params.walk_parameters(robot):
         head, _, rest = p.name.partition(".")
         mine = head in robot.configurations
-        shown = p.name in stated or mine or p.name.startswith(("motor.friction", "gearbox."))
-        shown |= p.name == rig_file.CENTRE and rig_file.WHEELBASE in stated
-        shown |= head == BATTERY and any(name.startswith(f"{BATTERY}.") for name in stated)
+        is_shown = p.name in stated or mine or p.name.startswith(("motor.friction", "gearbox."))
+        is_shown |= p.name == rig_file.CENTRE and rig_file.WHEELBASE in stated
+        is_shown |= head == BATTERY and any(name.startswith(f"{BATTERY}.") for name in stated)
         assumed = not robot.rig.inherits and (
             p.name == "motor.inertia" or (p.name == "motor.inductance" and "motor.resistance" in stated)
         )
-        if not shown and not assumed:
+        if not is_shown and not assumed:
             continue
         if p.name in stated:
             why = "the file, by mass and travel of the linear unit" if head in file.linear else "the file"
@@ -538,8 +538,8 @@ def number_origins(file: RobotFile) -> list[Origin]:
             why = "not stated: an example's; results on the battery depend on it"
         else:
             why = _default(p.name, rest if mine else "")
-        found.append(Origin(p.name, float(p.value), p.spec.unit, priors.get(p.name), why))
-    return found
+        origins.append(Origin(p.name, float(p.value), p.spec.unit, priors.get(p.name), why))
+    return origins
 
 
 def _default(name: str, rest: str) -> str:

@@ -163,9 +163,9 @@ def vehicle_defaults(on_tracks: bool, table: Mapping[str, Any], sides: float) ->
             at = at.get(key) if isinstance(at, Mapping) else None
         return float(at) if is_number(at) else 0.0  # a value that is no number is refused later
 
-    found = {name: value for name, (value, _) in VEHICLE.items() if not (on_tracks and name in _OF_TRACKS)}
+    defaults = {name: value for name, (value, _) in VEHICLE.items() if not (on_tracks and name in _OF_TRACKS)}
     wheels = 0.5 * WHEELS * stated("mass") * stated("radius") ** 2 / sides
-    return found | {DYNAMIC: DYNAMIC_SHARE * stated(*DYNAMIC.split(".")[:-1], "static"), "inertia": wheels}
+    return defaults | {DYNAMIC: DYNAMIC_SHARE * stated(*DYNAMIC.split(".")[:-1], "static"), "inertia": wheels}
 
 
 def parse_rig(content: Json, where: str, loads: Sequence[str], *, travels: bool, inherits: bool) -> Rig:
@@ -242,7 +242,7 @@ def _instruments(stated: Any, names: Sequence[str], where: str) -> tuple[Instrum
     here = f"{where}, instruments"
     if not isinstance(stated, dict):
         raise BadConfiguration(f"{here}: got {stated!r}; expected tables such as [instruments.{names[0]}]")
-    found = []
+    instruments = []
     for name, table in stated.items():
         if name not in names:
             raise BadConfiguration(f"{here}.{name}: the rig has no such channel; {allowed_words(name, names)}")
@@ -266,8 +266,8 @@ def _instruments(stated: Any, names: Sequence[str], where: str) -> tuple[Instrum
                 f"{channel.unit}, or {FREE!r}: the table tells"
             )
         step = None if quantum == FREE else float(quantum) * channel.factor
-        found.append(Instrument(name, None if signed == FREE else signed, step))
-    return tuple(found)
+        instruments.append(Instrument(name, None if signed == FREE else signed, step))
+    return tuple(instruments)
 
 
 def _columns(stated: Any, where: str) -> tuple[tuple[str, str, float], ...]:
@@ -276,10 +276,10 @@ def _columns(stated: Any, where: str) -> tuple[tuple[str, str, float], ...]:
     if not isinstance(stated, dict):
         raise BadConfiguration(f"{here}: got {stated!r}; expected a table [columns]")
     layout, found = Layout(channels=channels.EVERY), []
-    known = layout.spellings()
+    spellings = layout.spellings()
     for mine, theirs in stated.items():
-        if mine not in known:
-            listed = allowed_words(mine, known, shown=layout.known())
+        if mine not in spellings:
+            listed = allowed_words(mine, spellings, shown=layout.known())
             raise BadConfiguration(f"{here}.{mine}: no such column of a table; {listed}; also in other units")
         table = {"column": theirs} if isinstance(theirs, str) else theirs
         if not isinstance(table, dict) or not isinstance(table.get("column"), str) or {*table} - {"column", "factor"}:
@@ -347,11 +347,11 @@ def with_priors(robot: Robot, sds: Mapping[str, float], where: str) -> Robot:
     Raises:
         BadConfiguration: an sd of a name that is no parameter.
     """
-    known = {p.name: p for p in params.walk_parameters(robot)}
+    parameters = {p.name: p for p in params.walk_parameters(robot)}
     for name in sds:
-        if name not in known:
+        if name not in parameters:
             raise BadConfiguration(f"{where}, {name}: only parameters may have a ±; state the number")
-    priors = tuple((name, float(p.value), sds[name]) for name, p in known.items() if name in sds)
+    priors = tuple((name, float(p.value), sds[name]) for name, p in parameters.items() if name in sds)
     return dataclasses.replace(robot, rig=dataclasses.replace(robot.rig, priors=priors))
 
 
@@ -364,7 +364,7 @@ def moved_priors(robot: Robot, values: Mapping[str, float]) -> Robot:
 
 
 def rig_lines(rig: Rig) -> tuple[list[str], dict[str, list[str]]]:
-    """Lines of a robot file that state a rig: of its head, and by table."""
+    """Lines of a robot file that state a rig: those of its head, then those of each table."""
     head = [
         f'imposed = "{rig.imposed}"  # on the drives: voltage, motor_speed or motor_current',
         f"channels = {toml_value(list(rig.channels))}  # what its instruments show",

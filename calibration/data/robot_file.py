@@ -203,25 +203,25 @@ def _without_parameters(
         resolved_likes(content, where)
     tables = {key: value for key, value in content.items() if key not in rig_file.KEYS and isinstance(value, dict)}
     sds = stated.taken_apart(tables, where)
-    found = loads_from_tables(base, content, sds, where)
-    rig = rig_file.parse_rig(content, where, list(found.by_name), travels=found.travels, inherits=base is not None)
+    loads = loads_from_tables(base, content, sds, where)
+    rig = rig_file.parse_rig(content, where, list(loads.by_name), travels=loads.travels, inherits=base is not None)
     if base is not None:
-        return dataclasses.replace(base, configurations=Configurations(found.by_name), rig=rig), sds, found.linear
-    robot = paper_robots.blank_robot(Configurations(found.by_name), rig=rig)
+        return dataclasses.replace(base, configurations=Configurations(loads.by_name), rig=rig), sds, loads.linear
+    robot = paper_robots.blank_robot(Configurations(loads.by_name), rig=rig)
     robot = params.replace(robot, {name: jnp.asarray(value) for name, (value, _) in rig_file.DEFAULTS.items()})
     given = dict(_flatten(content))
-    known = {p.name: p for p in params.walk_parameters(robot)}
+    parameters = {p.name: p for p in params.walk_parameters(robot)}
     resistance = given.get("motor.resistance")
     if isinstance(resistance, int | float):
         robot = params.replace(robot, {"motor.inductance": params.as_float(rig_file.WINDING * resistance)})
     for name in given:
         if "." not in name and name not in COUNTS:
-            raise BadConfiguration(f"{where}, {name}: no such parameter; {_parameters(name, known)}")
+            raise BadConfiguration(f"{where}, {name}: no such parameter; {_parameters(name, parameters)}")
     missing = [name for name in rig_file.needed_parameters(rig, given.items()) if name not in given]
-    if not found.travels and "speed" in rig.channels:
-        missing += [f"{name}.radius" for name in found.by_name if f"{name}.radius" not in given]
-    rig_file.refuse_missing([*missing, *found.missing], known, where, given)
-    return robot, sds, found.linear
+    if not loads.travels and "speed" in rig.channels:
+        missing += [f"{name}.radius" for name in loads.by_name if f"{name}.radius" not in given]
+    rig_file.refuse_missing([*missing, *loads.missing], parameters, where, given)
+    return robot, sds, loads.linear
 
 
 def _of_size(library: Library, name: str, factors: Any, where: str) -> type[effects.Effect]:
@@ -258,10 +258,10 @@ def with_effects(
     Raises:
         BadConfiguration: an effect's configurations are no list of names, or are not in the robot.
     """
-    known = {**effects.BESIDE, **library}
+    library_with_built_in = {**effects.BESIDE, **library}
     present = []
     for name in names:
-        effect = known[name]()
+        effect = library_with_built_in[name]()
         acting = (configurations or {}).get(name, effect.configurations)
         here = f"{where}, effects.{name}.configurations"
         if not isinstance(acting, list | tuple) or not all(isinstance(c, str) for c in acting):
@@ -291,10 +291,10 @@ def change_robot(robot: Robot, values: Mapping[str, Any], where: str, notes: lis
         ratings.setdefault("battery.capacity_curve", stated["battery.capacity"])
     ratings |= {name: _switch(where, name, stated.pop(name)) for name in SWITCHES if name in stated}
     ratings |= {name: _choice(where, name, stated.pop(name)) for name in CHOICES if name in stated}
-    known = {p.name: p for p in params.walk_parameters(robot)}
+    parameters = {p.name: p for p in params.walk_parameters(robot)}
     refused: dict[str, list[str]] = {}
     for name, value in stated.items():
-        if why := _refused(name, value, known):
+        if why := _refused(name, value, parameters):
             refused.setdefault(why, []).append(name)
     if refused:
         sentences = [f"{list_some(names, 80)}: {why}" for why, names in refused.items()]

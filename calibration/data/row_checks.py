@@ -82,10 +82,10 @@ def used_once(values: np.ndarray, time: np.ndarray, run: np.ndarray | None = Non
     recordings = np.split(order, np.flatnonzero(np.diff(names[order])) + 1)
     periods = [reading_period(values[rows]) for rows in recordings]
     of_period = sum(len(rows) for rows, p in zip(recordings, periods, strict=True) if p)
-    found = [p for p in periods if p]
-    if not found or min(found) < ALIKE * max(found) or of_period < 0.5 * len(values):
+    true_periods = [p for p in periods if p]
+    if not true_periods or min(true_periods) < ALIKE * max(true_periods) or of_period < 0.5 * len(values):
         return values, 0.0
-    rows_apart = float(np.median(found))
+    rows_apart = float(np.median(true_periods))
     kept = np.full(len(values), np.nan)
     for rows in recordings:
         shown = rows[np.isfinite(values[rows])]
@@ -142,8 +142,8 @@ def without_copies(name: str, columns: Columns) -> tuple[np.ndarray, Names]:
         if again.size
         else ""
     )
-    said = f"{name}: {which} the row before once more, with its time; left out, rows are counted without them"
-    return kept, (said,) if again.size else ()
+    note = f"{name}: {which} the row before once more, with its time; left out, rows are counted without them"
+    return kept, (note,) if again.size else ()
 
 
 def _fill(name: str, columns: Columns, rows: int, layout: Layout) -> None:
@@ -152,12 +152,12 @@ def _fill(name: str, columns: Columns, rows: int, layout: Layout) -> None:
         return
     if "configuration" not in columns and layout.configurations:
         labels = np.unique(columns.get("surface", np.zeros(0, str)))
-        found = surfaces.common_configuration(layout.configurations, labels)
-        if found is None:
+        configuration = surfaces.common_configuration(layout.configurations, labels)
+        if configuration is None:
             raise BadData(
                 f"{name}: column configuration is missing, and the robot has {', '.join(layout.configurations)}"
             )
-        columns["configuration"] = np.full(rows, found)
+        columns["configuration"] = np.full(rows, configuration)
     if layout.imposed_column == SPEED and set(SPEEDS) <= set(columns):
         columns[SPEED] = np.mean([columns[c] for c in SPEEDS], 0)
     for column, value in DEFAULTS.items():
@@ -250,9 +250,9 @@ def settled_points(name: str, columns: Columns, layout: Layout, robot: Robot) ->
         return kept, ()
     for column in (*TIME, "run_id"):
         kept.pop(column, None)
-    said = f"rows are {three_digits(apart)} s apart or more, most at another setting"
+    note = f"rows are {three_digits(apart)} s apart or more, most at another setting"
     settle = f", and the motors settle in about {three_digits(CONSTANTS_APART * constant)} s" if constant > 0 else ""
-    why = "the output is held in every row" if clamped else f"{said}{settle}"
+    why = "the output is held in every row" if clamped else f"{note}{settle}"
     return kept, (f"{name}: {why}: each row is read as a settled run, without its time",)
 
 

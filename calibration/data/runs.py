@@ -90,8 +90,8 @@ def read_runs(
         named = isinstance(source, str | Path) and not opening.files_of_group(str(source))
         if named and not opening.split_source(str(source))[0].exists():
             raise BadData(f"{source}: no such file and no packaged table; packaged: {', '.join(PACKAGED)}")
-        found = reading.read_columns(source, layout, preset, between)
-        arrays, mapped = found.arrays, found.mapped
+        reading_found = reading.read_columns(source, layout, preset, between)
+        arrays, mapped = reading_found.arrays, reading_found.mapped
     if preset is None:
         _refuse_a_loggers_names(arrays, layout)
     return of_arrays(arrays, measured=measured, battery=battery, robot=robot, of_turns=of_turns, mapped=mapped)
@@ -273,17 +273,17 @@ def _configurations_in_case(name: str, cells: list[str], layout: Layout) -> tupl
         return cells, []
     others = [c for c in dict.fromkeys(cells) if c not in layout.configurations]
     odd = {c: meant[c.casefold()] for c in others if c.casefold() in meant}
-    said = [f"{name}: configuration {c} is read as {right}" for c, right in odd.items()]
-    return [odd.get(c, c) for c in cells] if odd else cells, said
+    notes = [f"{name}: configuration {c} is read as {right}" for c, right in odd.items()]
+    return [odd.get(c, c) for c in cells] if odd else cells, notes
 
 
 def _extra(raw: Raw) -> np.ndarray:
     """A column without a role: numbers where every cell that has a reading is one, else words."""
     if isinstance(raw, np.ndarray):
         return raw
-    found = column_numbers(raw)
-    lost = np.flatnonzero(np.isnan(found))
-    return found if missing_readings(raw, lost).all() else np.array(raw)
+    numbers = column_numbers(raw)
+    lost = np.flatnonzero(np.isnan(numbers))
+    return numbers if missing_readings(raw, lost).all() else np.array(raw)
 
 
 def _refuse_idle(arrays: NamedArrays, meaning: Column, raw: Raw, layout: Layout) -> None:

@@ -175,7 +175,7 @@ class Settled:
     def table(self) -> Columns:
         """The settled runs, a column each as tables of runs have them."""
         kept = self.kept
-        found: Columns = {}
+        columns: Columns = {}
         means = dict(self.runs.columns) | {k: v for k, v in self.runs.extras.items() if v.dtype.kind == "f"}
         read = {c.column for s in self.signals for c in (s.channel,)} | {"time_s", "order", "run_id"}
         read |= {c.sd_column for c in channels.EVERY} | {angle for angle, _, _ in RATES}
@@ -183,18 +183,18 @@ class Settled:
             if name in read or name == "mode" or (name == SPEED and self.runs.turns):
                 continue
             if column.dtype.kind == "f":
-                found[name] = np.array([_digits(_plain(column[s.rows])) for s in kept])
+                columns[name] = np.array([_digits(_plain(column[s.rows])) for s in kept])
             else:
-                found[name] = np.array([str(column[s.rows[0]]) for s in kept])
+                columns[name] = np.array([str(column[s.rows[0]]) for s in kept])
         for signal in self.signals:
             name = signal.channel.name
             if not any(math.isfinite(s.mean[name]) for s in kept):
                 continue
-            found[signal.channel.column] = np.array([_digits(s.mean[name]) for s in kept])
-            found[signal.channel.sd_column] = np.array([_digits(s.sd[name], 3) for s in kept])
-        found["run_id"] = np.array([f"{s.run or 'log'} {s.begin:.6g}-{s.end:.6g} s" for s in kept])
-        found["order"] = np.arange(1.0, len(kept) + 1)
-        return found
+            columns[signal.channel.column] = np.array([_digits(s.mean[name]) for s in kept])
+            columns[signal.channel.sd_column] = np.array([_digits(s.sd[name], 3) for s in kept])
+        columns["run_id"] = np.array([f"{s.run or 'log'} {s.begin:.6g}-{s.end:.6g} s" for s in kept])
+        columns["order"] = np.arange(1.0, len(kept) + 1)
+        return columns
 
 
 def _digits(x: float, digits: int = 7) -> float:
@@ -284,9 +284,11 @@ def _divided(runs: Runs, shortest: float | None, drift: float, inertia: Mapping[
     for signal in signals:
         _check_alive(runs, signal)
     stuck = {s.channel.name: _stuck(s, each) for s in signals}
-    found = [_settled(runs, signals, drives, level, shortest, drift, step, stuck, inertia or {}) for level in levels]
-    scatter = _scatter(runs, found, signals, float(np.max(np.abs(drives))))
-    return Settled(runs, tuple(found), signals, shortest, drift, tuple(gaps), scatter)
+    stretches = [
+        _settled(runs, signals, drives, level, shortest, drift, step, stuck, inertia or {}) for level in levels
+    ]
+    scatter = _scatter(runs, stretches, signals, float(np.max(np.abs(drives))))
+    return Settled(runs, tuple(stretches), signals, shortest, drift, tuple(gaps), scatter)
 
 
 # --- time and channels ----------------------------------------------------------------------------------
@@ -331,13 +333,13 @@ def _signals(
 ) -> tuple[Signal, ...]:
     """Returns the settled readings of each channel of a log. Of an angle its rate, if no channel reads the rate."""
     none, width = np.zeros(0), min(max(6 * half, BESIDE[0]), BESIDE[1])
-    found = []
+    signals = []
     for c in runs.channels:
         if c.settled and runs.has(c.column) and np.isfinite(runs[c.column]).any():
             off = find_glitches(runs[c.column], levels, width, _step(runs, c, runs[c.column]), drift)
             shown = np.where(off, np.nan, runs[c.column])
-            found.append(Signal(c, shown, none, _step(runs, c, shown), _size(shown), off))
-    have = {s.channel.name for s in found}
+            signals.append(Signal(c, shown, none, _step(runs, c, shown), _size(shown), off))
+    have = {s.channel.name for s in signals}
     for angle, rate, factor in RATES:
         if angle in runs.layout.measured_columns and runs.has(angle) and rate not in have:
             whole = np.full(len(runs), np.nan)
@@ -347,10 +349,10 @@ def _signals(
             for rows in each:
                 whole[rows] = np.where(off[rows], np.nan, runs[angle][rows] * factor)
                 shown[rows] = _rate(runs["time_s"][rows], whole[rows], half)
-            found.append(Signal(channels.find_channel(rate), shown, whole, 0.0, _size(shown), off))
-    if not found:
+            signals.append(Signal(channels.find_channel(rate), shown, whole, 0.0, _size(shown), off))
+    if not signals:
         raise BadData(f"{runs.source}: no channel with readings that settled travel shows")
-    return tuple(found)
+    return tuple(signals)
 
 
 def find_glitches(
@@ -374,7 +376,7 @@ def find_glitches(
     """
     from scipy.ndimage import binary_opening, median_filter
 
-    found, largest = np.zeros(len(shown), bool), _size(shown)
+    is_glitch, largest = np.zeros(len(shown), bool), _size(shown)
     for rows in levels:
         rows = rows[np.isfinite(shown[rows])]
         if len(rows) < FEWEST:
@@ -394,8 +396,8 @@ def find_glitches(
             allowed = np.maximum(noise, np.maximum(drift * np.abs(middle), FINE * largest))
             off = (apart > allowed) & (np.abs(middle) > STILL * largest)
         off[:size] &= ~binary_opening(off[:size], np.ones(PART))
-        found[rows] = off
-    return found
+        is_glitch[rows] = off
+    return is_glitch
 
 
 #: Columns of angles, the channel of their rate, and its unit's value of one of the angle's a second.
@@ -408,8 +410,8 @@ def _step(runs: Runs, channel: Channel, shown: np.ndarray) -> float:
     If neither has one, it is the smallest difference of readings that mostly repeat.
     """
     stated = (i.quantum or 0.0 for i in runs.layout.instruments if i.channel == channel.name)
-    if found := step_of(shown) or next(stated, 0.0) / channel.factor:
-        return found
+    if step := step_of(shown) or next(stated, 0.0) / channel.factor:
+        return step
     levels = np.unique(shown[np.isfinite(shown)])
     coarse = 1 < len(levels) < COARSE * np.isfinite(shown).sum()
     return float(np.median(np.diff(levels)[np.diff(levels) < 1.5 * np.diff(levels).min()])) if coarse else 0.0
@@ -423,9 +425,9 @@ def _rate(time: np.ndarray, x: np.ndarray, half: int) -> np.ndarray:
 
 
 def _check_alive(runs: Runs, signal: Signal) -> None:
-    shown = signal.shown[np.isfinite(signal.shown)]
-    if len(shown) > STUCK and np.ptp(shown) == 0:
-        column, value, unit = signal.channel.column, shown[0], signal.channel.unit
+    finite_values = signal.shown[np.isfinite(signal.shown)]
+    if len(finite_values) > STUCK and np.ptp(finite_values) == 0:
+        column, value, unit = signal.channel.column, finite_values[0], signal.channel.unit
         if len(signal.angle):
             column, _, factor = next(x for x in RATES if x[1] == signal.channel.name)
             value, unit = signal.angle[np.isfinite(signal.angle)][0] / factor, column.rpartition("_")[2]
@@ -441,16 +443,16 @@ def _stuck(signal: Signal, each: list[np.ndarray]) -> np.ndarray:
     if len(signal.angle):
         return held
     for rows in each:
-        shown = signal.shown[rows]
-        same = np.diff(shown) == 0
+        readings = signal.shown[rows]
+        same = np.diff(readings) == 0
         if not len(same) or same.mean() > CHANCE:
-            limits = (np.nanmin(shown), np.nanmax(shown))  # an instrument of coarse steps, or one at its limit
-            inside = same & ~np.isin(shown[1:], limits)
+            limits = (np.nanmin(readings), np.nanmax(readings))  # an instrument of coarse steps, or one at its limit
+            inside = same & ~np.isin(readings[1:], limits)
             if not len(same) or inside.mean() > CHANCE:
                 continue
         edges = np.flatnonzero(np.diff(np.concatenate([[0], same.astype(int), [0]])))
         for low, high in edges.reshape(-1, 2):
-            if high - low >= STUCK and shown[low] != 0:
+            if high - low >= STUCK and readings[low] != 0:
                 held[rows[low : high + 1]] = True
     return held
 
@@ -712,9 +714,13 @@ def _plain(x: np.ndarray) -> float:
 
 def _noise_of_mean(signal: Signal, rows: np.ndarray, ends: list[tuple[int, int]]) -> float:
     """Sd of a reading about the end of a level, times the root of its autocorrelation time."""
-    shown = signal.shown[rows[ends[0][0] :]]
-    shown = shown[np.isfinite(shown)]
-    return float(np.std(shown) * math.sqrt(_correlation_time(shown - np.mean(shown)))) if len(shown) > 2 else 0.0
+    readings = signal.shown[rows[ends[0][0] :]]
+    readings = readings[np.isfinite(readings)]
+    return (
+        float(np.std(readings) * math.sqrt(_correlation_time(readings - np.mean(readings))))
+        if len(readings) > 2
+        else 0.0
+    )
 
 
 def _correlation_time(x: np.ndarray) -> float:
@@ -736,11 +742,11 @@ def _correlation_time(x: np.ndarray) -> float:
 
 def _mean(signal: Signal, time: np.ndarray, rows: np.ndarray) -> tuple[float, float, float]:
     """Mean of a channel over a stretch, sd of that mean, and its change from end to end by a straight line."""
-    shown = signal.shown[rows]
-    finite = np.isfinite(shown)
+    readings = signal.shown[rows]
+    finite = np.isfinite(readings)
     if finite.sum() < max(FEWEST, 0.5 * signal.filled * len(rows)):
         return math.nan, math.nan, math.nan
-    t, x = time[finite] - time[finite].mean(), shown[finite]
+    t, x = time[finite] - time[finite].mean(), readings[finite]
     if len(signal.angle):
         angle = signal.angle[rows][finite]
         slope = float(t @ (angle - angle.mean()) / (t @ t))
@@ -755,7 +761,7 @@ def _mean(signal: Signal, time: np.ndarray, rows: np.ndarray) -> tuple[float, fl
     sd = spread * math.sqrt(_correlation_time(rest) / len(x))
     if signal.step > 0:  # without noise readings round alike; with it their mean is off by less
         # Two readings alone do not show how often noise carries one to the other.
-        within = max(spread**2 / signal.step**2 - 1 / 12, 0.0) if len(np.unique(shown[finite])) > 2 else 0.0
+        within = max(spread**2 / signal.step**2 - 1 / 12, 0.0) if len(np.unique(readings[finite])) > 2 else 0.0
         rounding = min(1 / math.sqrt(12), math.exp(-2 * math.pi**2 * within) / (math.pi * math.sqrt(2)))
         sd = math.hypot(sd, rounding * signal.step)
     return mean, max(sd, 1e-6 * abs(mean), 1e-9 * signal.largest), slope * float(np.ptp(t))
@@ -934,13 +940,13 @@ def rolling_readings(robot: Robot) -> dict[str, dict[str, float]]:
 
     By channel. Only speeds of shafts for a vehicle, which slips.
     """
-    found = {}
+    readings = {}
     for k, (name, load) in enumerate(robot.configurations.items()):
         none, turns = jnp.zeros(()), float(load.radius) / float(robot.gearbox.ratio)
         state = State(none, jnp.ones(()), jnp.asarray(turns), none)
         speeds = {c.name: _shown(robot, k, c, state) for c in settled_channels(robot) if c.zero_at_rest}
-        found[name] = {n: x for n, x in speeds.items() if n != "speed" or not robot.has_ground}
-    return found
+        readings[name] = {n: x for n, x in speeds.items() if n != "speed" or not robot.has_ground}
+    return readings
 
 
 def acceleration_currents(robot: Robot) -> dict[str, Inertia]:

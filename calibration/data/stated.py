@@ -39,7 +39,9 @@ def stated_number(text: str, where: str) -> tuple[float, float]:
         raise BadConfiguration(f"{where}: got {text!r}; the standard deviation must be 0 (exact) or more; {FORM}")
     if sd.strip().endswith("%"):
         if mean == 0 and size > 0:
-            raise BadConfiguration(f"{where}: got {text!r}; a share of 0 is 0: state the standard deviation; {FORM}")
+            raise BadConfiguration(
+                f"{where}: got {text!r}; 0 has no percentage: state the standard deviation; {FORM}"
+            )
         size *= abs(mean) / 100
     return mean, float(f"{size:.12g}")  # a percentage leaves digits of rounding
 
@@ -50,11 +52,11 @@ def taken_apart(table: Json, where: str, prefix: str = "") -> dict[str, float]:
     Raises:
         BadConfiguration: as `stated_number`.
     """
-    found: dict[str, float] = {}
+    sds: dict[str, float] = {}
     for key, value in table.items():
         name = f"{prefix}{key}"
         if isinstance(value, dict):
-            found |= taken_apart(value, where, f"{name}.")
+            sds |= taken_apart(value, where, f"{name}.")
         elif is_stated(value):
-            table[key], found[name] = stated_number(value, f"{where}, {name}")
-    return found
+            table[key], sds[name] = stated_number(value, f"{where}, {name}")
+    return sds

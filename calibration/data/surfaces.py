@@ -87,10 +87,10 @@ def with_surface_configurations(robot: Robot, runs: Runs) -> Robot:
         first = configuration if stays else names[0]
         leaders |= {n: first for n in names if n != first}
     rig = dataclasses.replace(robot.rig, surfaces=tuple(leaders.items()))
-    found = dataclasses.replace(robot, configurations=Configurations(members), rig=rig)
-    priors = of_surfaces({name: (mean, sd) for name, mean, sd in rig.priors}, found, runs)
+    with_surfaces = dataclasses.replace(robot, configurations=Configurations(members), rig=rig)
+    priors = of_surfaces({name: (mean, sd) for name, mean, sd in rig.priors}, with_surfaces, runs)
     rig = dataclasses.replace(rig, priors=tuple((name, *value) for name, value in priors.items()))
-    return dataclasses.replace(found, rig=rig)
+    return dataclasses.replace(with_surfaces, rig=rig)
 
 
 def of_surfaces(stated: Mapping[str, V], robot: Robot, runs: Runs) -> dict[str, V]:
@@ -99,11 +99,11 @@ def of_surfaces(stated: Mapping[str, V], robot: Robot, runs: Runs) -> dict[str, 
     Args:
         robot: as from `with_surface_configurations`.
     """
-    found: dict[str, V] = {}
+    by_name: dict[str, V] = {}
     for name, value in stated.items():
         for new in names_of_surfaces([name], robot, runs):
-            found[new] = value
-    return found
+            by_name[new] = value
+    return by_name
 
 
 def names_of_surfaces(names: Iterable[str], robot: Robot, runs: Runs) -> list[str]:

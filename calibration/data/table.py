@@ -194,20 +194,20 @@ class Runs:
 
     def _stacked(self, columns: Names) -> np.ndarray:
         nothing = np.full(len(self), np.nan)
-        found = [self.columns.get(column, nothing) for column in columns]
-        return np.stack(found, 1) * np.asarray([c.factor for c in self.channels])
+        stacked = [self.columns.get(column, nothing) for column in columns]
+        return np.stack(stacked, 1) * np.asarray([c.factor for c in self.channels])
 
     def missing(self) -> list[str]:
         """Returns a note on each channel with missing readings."""
-        said = []
+        notes = []
         for k, channel in enumerate(self.channels):
             lost = np.flatnonzero(np.isnan(self.measured()[:, k]))
             if not self.has(channel.column) or lost.size == len(self):
-                said.append(f"{channel.column}: no readings; parameters that only they show are not fitted")
+                notes.append(f"{channel.column}: no readings; parameters that only they show are not fitted")
             elif lost.size:
                 rows = rows_text(lost.tolist(), 8)
-                said.append(f"{channel.column}: {lost.size} of {len(self)} readings are missing ({rows})")
-        return said
+                notes.append(f"{channel.column}: {lost.size} of {len(self)} readings are missing ({rows})")
+        return notes
 
     def configurations(self, robot: Robot) -> np.ndarray:
         """Index of each row's configuration in `robot`, shape (rows,).

@@ -66,17 +66,17 @@ def _read(path: Path, option: str, wanted: Rows[Rows[str]]) -> tuple[Columns, Ro
             raise BadData(
                 f"{path.name}: got columns {', '.join(both)} and {ours}; expected one kind, remove the other"
             )
-    found: dict[str, list[float]] = {name: [] for name in names}
+    columns: dict[str, list[float]] = {name: [] for name in names}
     for k, row in enumerate(rows[1:], 2):
         for name in names:
             j = header.index(name)
             cell = row[j] if j < len(row) else ""
             if not np.isfinite(value := named_arrays.cell_number(cell)):
                 raise BadData(f"{path.name} row {k}, {name}: got {cell!r}; expected a number")
-            found[name].append(value)
+            columns[name].append(value)
     if len(rows) < 2:
         raise BadData(f"{path.name}: has no rows; expected at least one")
-    return {name: np.array(values) for name, values in found.items()}, names
+    return {name: np.array(values) for name, values in columns.items()}, names
 
 
 def read_terrain(path: Path) -> Terrain:
@@ -91,13 +91,13 @@ def read_terrain(path: Path) -> Terrain:
     unit = names[0].rpartition("_")[2]
     x, z = (columns[name] * _LENGTHS[unit] for name in names)
     try:
-        found = terrain.polyline(x - x[0], z - z[0])
+        outline = terrain.polyline(x - x[0], z - z[0])
     except ValueError as error:
         raise BadData(f"{path.name}: {error}") from error
     across, up = np.abs(np.diff(x)), np.abs(np.diff(z))
     largest, wall = max(np.ptp(x), np.ptp(z)), np.max(up, where=up > across, initial=0.0)
     if SMALLEST <= largest <= LARGEST and wall <= WALL:
-        return found
+        return outline
     wrong, other, word = f"is {largest:g} m large; expected at most {LARGEST:g} m", "mm", "millimetres"
     if largest < SMALLEST:
         wrong, other, word = f"is {1e3 * largest:g} mm large; expected at least {1e3 * SMALLEST:g} mm", "m", "metres"

@@ -86,9 +86,9 @@ class ActiveSet(eqx.Module):
 def _parts(space: ActiveSet, z: Array) -> tuple[Array, tuple[Array, ...], tuple[Array, ...]]:
     """Coordinates of the base, and amplitude and shape of each effect."""
     base, amplitude, shape = space.parts(z)
-    held = space.held()
-    amplitudes = space.sd * (amplitude @ held)
-    shapes = shape_at(space.scales, shape @ held)
+    held_vector = space.held()
+    amplitudes = space.sd * (amplitude @ held_vector)
+    shapes = shape_at(space.scales, shape @ held_vector)
     return base, params.split_numbers(amplitudes), params.split_numbers(shapes)
 
 
@@ -126,14 +126,14 @@ class ScoredLibrary:
 
     def largest(self, instances: np.ndarray) -> np.ndarray:
         """Maximum of a non-negative number over each effect's instances, shape (effects,)."""
-        whole = np.zeros(len(self))
-        np.maximum.at(whole, self.of, instances)
-        return whole
+        largest_scores = np.zeros(len(self))
+        np.maximum.at(largest_scores, self.of, instances)
+        return largest_scores
 
     def best_instance(self, name: str, single: np.ndarray) -> int:
         """The instance of an effect with the largest |score|."""
-        mine = np.flatnonzero(self.of == self.names.index(name))
-        return int(mine[np.argmax(np.abs(np.asarray(single)[mine]))])
+        instances = np.flatnonzero(self.of == self.names.index(name))
+        return int(instances[np.argmax(np.abs(np.asarray(single)[instances]))])
 
 
 @dataclasses.dataclass(frozen=True)
@@ -203,20 +203,20 @@ class CandidateSpace:
         sets = [tuple(names) for names in sets]
         if not self.bare.observe.long:
             return self.equipped, [self.library.indices(names) for names in sets]
-        wanted = {*self.room, *(n for names in sets for n in names if n)} or {*self.library.names[:1]}
-        chosen = [k for k, n in enumerate(self.library.names) if n in wanted]
-        names, every = tuple(self.library.names[k] for k in chosen), self.coordinates
-        value, spread, sd, low, high = (x[np.asarray(chosen)] for x in every.scales)
+        effects_to_place = {*self.room, *(n for names in sets for n in names if n)} or {*self.library.names[:1]}
+        chosen = [k for k, n in enumerate(self.library.names) if n in effects_to_place]
+        names, all_coordinates = tuple(self.library.names[k] for k in chosen), self.coordinates
+        value, spread, sd, low, high = (x[np.asarray(chosen)] for x in all_coordinates.scales)
         coordinates = dataclasses.replace(
-            every,
-            sd=every.sd[np.asarray(chosen)],
+            all_coordinates,
+            sd=all_coordinates.sd[np.asarray(chosen)],
             scales=(value, spread, sd, low, high),
             names=names,
-            shapes=tuple(every.shapes[k] for k in chosen),
+            shapes=tuple(all_coordinates.shapes[k] for k in chosen),
         )
         robot = self.equipped.base
-        kept = {e.name for e in self.bare.base.effects} | wanted
-        robot = dataclasses.replace(robot, effects=tuple(e for e in robot.effects if e.name in kept))
+        effect_names = {e.name for e in self.bare.base.effects} | effects_to_place
+        robot = dataclasses.replace(robot, effects=tuple(e for e in robot.effects if e.name in effect_names))
         index = {n: k for k, n in enumerate(names)} | {"": -1}
         problem = dataclasses.replace(self.equipped, base=robot, coordinates=coordinates)
         return problem, [tuple(index[n] for n in each) for each in sets]

@@ -148,11 +148,11 @@ def fit_base(space: CandidateSpace, settings: Settings, where: str, near: Candid
     unusable = tuple(map(int, np.flatnonzero(lost)))
     space = space.without(lost) if unusable else space
     while True:
-        optima, seen = _base_searches(space, settings, near)
+        optima, observations = _base_searches(space, settings, near)
         # The first of those that end in one place, because rounding decides which of them is the lowest.
         cost = np.where(np.isfinite(optima.cost), optima.cost, np.inf)
         k = int(np.argmax(cost <= np.min(cost) + ALIKE))
-        lost = space.bare.observe.unreachable(np.asarray(seen.status[k])) & space.included
+        lost = space.bare.observe.unreachable(np.asarray(observations.status[k])) & space.included
         if not lost.any():
             slots = np.zeros(2 * settings.slots)
             best = jax.tree.map(lambda x: x[k], optima)  # noqa: B023
@@ -160,7 +160,7 @@ def fit_base(space: CandidateSpace, settings: Settings, where: str, near: Candid
             best = dataclasses.replace(best, z=z, sd=sd)
             return BaseFit(
                 candidate_of_fit(space, empty_slots(settings), best, settings),
-                np.asarray(seen.reading[k]),
+                np.asarray(observations.reading[k]),
                 space,
                 unusable,
             )
@@ -180,8 +180,8 @@ def _beyond_adhesion(space: CandidateSpace) -> np.ndarray:
     if problem.observe.long:
         return np.zeros(len(space.included), bool)
     ground = [name.endswith("ground.friction.static") for name in problem.coordinates.names]
-    seen = observe_at(problem, jnp.where(jnp.asarray(ground), ADHESION, 0.0))
-    return (np.asarray(seen.status) == SLIDES) & space.included
+    observation = observe_at(problem, jnp.where(jnp.asarray(ground), ADHESION, 0.0))
+    return (np.asarray(observation.status) == SLIDES) & space.included
 
 
 def _base_searches(space: CandidateSpace, settings: Settings, near: Candidate | None) -> tuple[Optimum, Observation]:
@@ -204,9 +204,9 @@ def _base_searches(space: CandidateSpace, settings: Settings, near: Candidate | 
         problem, (empty,) = space.fitted_by([empty_slots(settings)])
         starts = np.pad(starts, ((0, 0), (0, 2 * settings.slots)))
         which = np.repeat(np.asarray(empty)[None], len(starts), 0)
-    given = jnp.asarray(starts), jnp.asarray(weights), which
+    search_inputs = jnp.asarray(starts), jnp.asarray(weights), which
     most = FEW if few else None
-    return jax.device_get(observe.search(problem, *given, rivals=not few, most=most, scanned=bare))
+    return jax.device_get(observe.search(problem, *search_inputs, rivals=not few, most=most, scanned=bare))
 
 
 Proposal = tuple[tuple[str, ...], np.ndarray]
@@ -217,17 +217,19 @@ def fit_candidates(space: CandidateSpace, proposals: Sequence[Proposal], setting
     if not proposals:
         return []
     problem, active = space.fitted_by(names for names, _ in proposals)
-    made: dict[int, Candidate] = {}
+    candidates: dict[int, Candidate] = {}
     for most in (None, FEW):
-        mine = [k for k, (names, _) in enumerate(proposals) if (names in space.near) == (most is not None)]
-        if not mine:
+        positions = [k for k, (names, _) in enumerate(proposals) if (names in space.near) == (most is not None)]
+        if not positions:
             continue
-        starts = [space.near.get(*proposals[k]) for k in mine]
-        optima, _ = search_each(problem, starts, [space.weight] * len(mine), [active[k] for k in mine], most)
-        for j, k in enumerate(mine):
+        starts = [space.near.get(*proposals[k]) for k in positions]
+        optima, _ = search_each(
+            problem, starts, [space.weight] * len(positions), [active[k] for k in positions], most
+        )
+        for j, k in enumerate(positions):
             one = jax.tree.map(lambda x: x[j], optima)  # noqa: B023
-            made[k] = candidate_of_fit(space, proposals[k][0], one, settings)
-    return [made[k] for k in range(len(proposals))]
+            candidates[k] = candidate_of_fit(space, proposals[k][0], one, settings)
+    return [candidates[k] for k in range(len(proposals))]
 
 
 def fit_in_addition(
@@ -242,15 +244,15 @@ def fit_in_addition(
     Args:
         wanted: (active effects, the other fit, scores of its residuals). All of its effects are active.
     """
-    found = fit_candidates(space, [(w, start_of_fit(space, at, w, settings, by)) for w, at, by in wanted], settings)
-    stuck = [k for k, (_, at, _) in enumerate(wanted) if not found[k].cost <= at.cost + STUCK]
-    again = [(k, start_of_fit(space, wanted[k][1], wanted[k][0], settings)) for k in stuck]
-    for k in sorted(range(len(found)), key=lambda k: found[k].cost)[:1]:
-        again.append((k, np.where(np.arange(len(found[k].z)) < space.free, 0.0, found[k].z)))
-    others = fit_candidates(space, [(wanted[k][0], z) for k, z in again], settings)
-    for (k, _), other in zip(again, others, strict=True):
-        found[k] = other if other.cost < found[k].cost - STUCK else found[k]
-    return found
+    fits = fit_candidates(space, [(w, start_of_fit(space, at, w, settings, by)) for w, at, by in wanted], settings)
+    stuck = [k for k, (_, at, _) in enumerate(wanted) if not fits[k].cost <= at.cost + STUCK]
+    restarts = [(k, start_of_fit(space, wanted[k][1], wanted[k][0], settings)) for k in stuck]
+    for k in sorted(range(len(fits)), key=lambda k: fits[k].cost)[:1]:
+        restarts.append((k, np.where(np.arange(len(fits[k].z)) < space.free, 0.0, fits[k].z)))
+    refits = fit_candidates(space, [(wanted[k][0], z) for k, z in restarts], settings)
+    for (k, _), refit in zip(restarts, refits, strict=True):
+        fits[k] = refit if refit.cost < fits[k].cost - STUCK else fits[k]
+    return fits
 
 
 def start_of_fit(

@@ -50,9 +50,9 @@ class Classes:
 def signature_cosines(space: CandidateSpace, scores: ScoreTable) -> np.ndarray:
     """Largest |cos| between the projected signatures of two effects, over their shapes, (effects, effects)."""
     cosine, effect, count = np.abs(np.asarray(scores.cosine)), space.library.of, len(space.library)
-    whole = np.zeros((count, count))
-    np.maximum.at(whole, (effect[:, None], effect[None, :]), cosine)
-    return whole
+    cosines = np.zeros((count, count))
+    np.maximum.at(cosines, (effect[:, None], effect[None, :]), cosine)
+    return cosines
 
 
 def find_classes(
@@ -76,15 +76,15 @@ def find_classes(
     cosine, names = signature_cosines(space, left.scores), space.library.names
     fewer = [base] if len(best.effects) == 1 else without_each(space, best, settings, ladder)
     gains = [2 * (c.cost - best.cost) for c in fewer]
-    wanted: list[tuple[int, str, Names]] = []
+    requests: list[tuple[int, str, Names]] = []
     for slot, name in enumerate(best.effects):
         k = names.index(name)
         for j in np.argsort(-cosine[k])[:TRIED]:
             if cosine[k, j] > settings.alike and names[j] not in best.effects:
                 active = tuple(names[j] if s == slot else n for s, n in enumerate(best.active))
-                wanted.append((slot, names[j], active))
+                requests.append((slot, names[j], active))
     simulated = {c.key: c for c in ladder if c.simulated}
-    new = [active for _, _, active in wanted if frozenset(n for n in active if n) not in simulated]
+    new = [active for _, _, active in requests if frozenset(n for n in active if n) not in simulated]
     fitted = []
     if space.bare.observe.long:
         fitted = fit_by_regression(space, [(w, best, after) for w in new], settings)
@@ -100,7 +100,7 @@ def find_classes(
         same = [name]
         within = {f: max(settings.same, f**2 * gain) for f in (settings.form, settings.form_family)}
         family = space.library[name].family()
-        for s, other, active in wanted:
+        for s, other, active in requests:
             rival = simulated[frozenset(n for n in active if n)]
             parallel = cosine[names.index(name), names.index(other)] > settings.parallel
             akin = space.library[other].family() == family
@@ -114,8 +114,10 @@ def find_classes(
         stated.append(tuple(s for s in shifts if 2 * (s.fit.cost - best.cost) <= within[settings.form]))
     by_regression = [c for c in (*ladder, *fitted) if not c.simulated and c.key not in simulated]
     latest = {c.key: c for c in by_regression} | {k: c for k, c in simulated.items() if not c.simulated}
-    whole = (*latest.values(), *(c for c in (*ladder, *fitted) if c.simulated))
-    return Classes(tuple(members), tuple(stated), tuple(families_of_members(space, same) for same in members), whole)
+    all_fits = (*latest.values(), *(c for c in (*ladder, *fitted) if c.simulated))
+    return Classes(
+        tuple(members), tuple(stated), tuple(families_of_members(space, same) for same in members), all_fits
+    )
 
 
 def families_of_members(space: CandidateSpace, members: Sequence[str]) -> Names:

@@ -61,11 +61,11 @@ def find_cluster(
         seed: random seed of the permutations.
     """
     pool = np.flatnonzero(outliers | included)
-    mine = np.flatnonzero(outliers)
-    if len(mine) < FEWEST:
+    outlier_rows = np.flatnonzero(outliers)
+    if len(outlier_rows) < FEWEST:
         return None
-    clusters = [_cluster_along_axis(name, np.asarray(x, float), mine, pool, seed) for name, x in axes.items()]
-    clusters += [c for name, x in levels.items() for c in _at_levels(name, np.asarray(x), mine, pool)]
+    clusters = [_cluster_along_axis(name, np.asarray(x, float), outlier_rows, pool, seed) for name, x in axes.items()]
+    clusters += [c for name, x in levels.items() for c in _at_levels(name, np.asarray(x), outlier_rows, pool)]
     if not clusters:
         return None
     best = min(clusters, key=lambda c: c.p)
@@ -77,12 +77,12 @@ def _cluster_along_axis(name: str, x: np.ndarray, mine: np.ndarray, pool: np.nda
     """The fullest window of an axis, compared with random draws of as many rows."""
     low, high = x[pool].min(), x[pool].max()
     random = np.random.default_rng(seed)
-    drawn = np.stack([random.choice(pool, len(mine), replace=False) for _ in range(PERMUTATIONS)])
+    permutations = np.stack([random.choice(pool, len(mine), replace=False) for _ in range(PERMUTATIONS)])
     clusters: list[Cluster] = []
     for share in WINDOWS:
         width = share * (high - low)
         count, first = _fullest_window(x[mine][None], width)
-        null, _ = _fullest_window(x[drawn], width)
+        null, _ = _fullest_window(x[permutations], width)
         p = (1 + int(np.sum(null >= count[0]))) / (1 + PERMUTATIONS)
         if p == 1 / (1 + PERMUTATIONS):  # beyond the resolution of permutations: a normal approximation
             p = min(p, float(ndtr((null.mean() - count[0]) / max(null.std(), 0.3))))

@@ -28,14 +28,14 @@ def missed_channels(space: CandidateSpace, runs: Runs, noise: Noise, refit: Line
     Args:
         refit: the fit without effects, linearised.
     """
-    stated = np.array([source not in UNSTATED for source in noise.source])
+    has_stated_sd = np.array([source not in UNSTATED for source in noise.source])
     share, sigma = _error_shares(space, runs, noise, refit)
-    large = (share > UNDESCRIBED) & ~(stated & (sigma <= EXPLAINED))
+    large = (share > UNDESCRIBED) & ~(has_stated_sd & (sigma <= EXPLAINED))
     counts = space.weight[: len(runs)] > 0
-    measured = np.where(counts, runs.measured(), np.nan)
+    measured_values = np.where(counts, runs.measured(), np.nan)
     with np.errstate(invalid="ignore"):
-        noisy = np.sqrt(np.nansum(np.where(counts, noise.sd, 0.0) ** 2, 0) / np.nansum(measured**2, 0))
-    noisy = np.where(stated, 0.0, noisy)
+        noisy = np.sqrt(np.nansum(np.where(counts, noise.sd, 0.0) ** 2, 0) / np.nansum(measured_values**2, 0))
+    noisy = np.where(has_stated_sd, 0.0, noisy)
     return tuple(
         Missed(c.name, float(share[k]), float(noisy[k]))
         for k, c in enumerate(runs.channels)
@@ -68,14 +68,14 @@ def remaining_errors(
 def _unseen_errors(space: CandidateSpace, runs: Runs, *scores: HeldOutScore) -> np.ndarray:
     """rms error of each fit on unseen runs over each channel's measured rms [-], over the readings that all predict,
     NaN without any, shape (fits, channels)."""
-    measured = runs.measured()
+    measured_values = runs.measured()
     counts = space.weight[: len(runs)] > 0
-    off = [[np.where(counts, reading - measured, np.nan) for reading in s.reading.values()] for s in scores]
-    each: np.ndarray = np.array(off).reshape(len(scores), -1, measured.shape[1])
-    each = np.where(np.isfinite(each).all(0), each, np.nan)
+    off = [[np.where(counts, reading - measured_values, np.nan) for reading in s.reading.values()] for s in scores]
+    errors: np.ndarray = np.array(off).reshape(len(scores), -1, measured_values.shape[1])
+    errors = np.where(np.isfinite(errors).all(0), errors, np.nan)
     with np.errstate(invalid="ignore"):
-        size = np.nansum(np.where(counts, measured, np.nan) ** 2, 0) / counts.sum(0)
-        return np.sqrt(np.nansum(each**2, 1) / np.isfinite(each).sum(1) / size)
+        size = np.nansum(np.where(counts, measured_values, np.nan) ** 2, 0) / counts.sum(0)
+        return np.sqrt(np.nansum(errors**2, 1) / np.isfinite(errors).sum(1) / size)
 
 
 def _error_shares(

@@ -159,7 +159,7 @@ def discover(
     silent = channels.channel_names(known.silent)
     factors = FACTORS.get(known.word, ())
     # Verdicts at other noises use the programs of the first one, so they run in parallel on other cores.
-    others = Threads(2)
+    threads = Threads(2)
     sensitivity, outstanding = list[Sensitivity](), list[float]()
     try:
         if factors:
@@ -169,7 +169,7 @@ def discover(
             noise = known.scaled(dict.fromkeys(silent, factor))
             return keep(f"noise {factor:g}", lambda: ready.trace(noise, known=traced))
 
-        verdicts = {f: others.submit(other, f) for f in factors}
+        verdicts = {f: threads.submit(other, f) for f in factors}
         found = keep(
             "result",
             lambda: assemble_result(traced, distinct, ready.numbers, ready.settings, ready.library, tell),
@@ -182,7 +182,7 @@ def discover(
             except concurrent.futures.TimeoutError:
                 outstanding.append(f)
     finally:  # an interruption or the time limit waits for none of them
-        others.shutdown(wait=False, cancel_futures=True)
+        threads.shutdown(wait=False, cancel_futures=True)
     if outstanding:
         notes = (Remark("outstanding", factors=tuple(outstanding), word=known.word), *notes)
     assumed = [c for c in known.silent if c not in {s.channel for s in known.along_series}]
@@ -271,17 +271,19 @@ def prepare_loop(
         if note.code == "nothing_varies" or not note.tied:
             raise BadData(describe(note))
     at_first = (*ready.foreign, *ready.doubted, *with_codes(ready.checked, "lost_motion"))
-    said: Notes = (*notes, *ready.checked, *ready.begins, *ready.weighed, *ready.foreign, *ready.doubted)
+    notes_so_far: Notes = (*notes, *ready.checked, *ready.begins, *ready.weighed, *ready.foreign, *ready.doubted)
     turned = scales.output_rotation(distinct, ready.robot)
-    own = {name: e for name, e in effects.OF_CHANNELS.items() if e.channel in ready.robot.rig.channels}
-    library = {**library, **kind.library, **own}
+    channel_effects = {name: e for name, e in effects.OF_CHANNELS.items() if e.channel in ready.robot.rig.channels}
+    library = {**library, **kind.library, **channel_effects}
     library = scales.library_of_size(ready.robot, distinct.conditions(ready.robot), library, turned)
     settings = dataclasses.replace(
         settings_for(kind, replicates, seed, prefer),
         forbidden=tuple(forbidden),
         silent=tuple(c.name for c in ready.noise.silent),
     )
-    return LoopInput(distinct, numbers, ready.robot, ready.noise, ready.stated, settings, library, said, at_first)
+    return LoopInput(
+        distinct, numbers, ready.robot, ready.noise, ready.stated, settings, library, notes_so_far, at_first
+    )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -387,8 +389,8 @@ class LoopStages:
     @property
     def simulated(self) -> dict[tuple[str, ...], np.ndarray]:
         """Coordinates of each simulated fit, by its effects."""
-        every = (self.screened.base.candidate, *(() if self.searched is None else self.searched.ladder))
-        return {c.active: c.z for c in reversed(every) if c.simulated and np.isfinite(c.cost)}
+        all_candidates = (self.screened.base.candidate, *(() if self.searched is None else self.searched.ladder))
+        return {c.active: c.z for c in reversed(all_candidates) if c.simulated and np.isfinite(c.cost)}
 
     @property
     def best(self) -> Candidate:
@@ -490,12 +492,12 @@ class _Task:
     def windows(self, space: CandidateSpace, ranked: list[Ranking]) -> tuple[CandidateSpace, Candidate | None]:
         """Program and start of the base fit from a log's equations in weak form. Their ranking of the library is
         appended to `ranked`."""
-        found = screen_by_weak_form(space, self.settings)
-        if found is None:
+        ranking = screen_by_weak_form(space, self.settings)
+        if ranking is None:
             return space, None
-        make = functools.partial(findings.rank_by_weak_form, space, found, self.settings)
+        make = functools.partial(findings.rank_by_weak_form, space, ranking, self.settings)
         ranked.append(self.keep("ranking", make))
-        return space.with_room(found.room), found.base
+        return space.with_room(ranking.room), ranking.base
 
 
 def _fit_base_and_noise(task: _Task, ranked: list[Ranking]) -> tuple[Screening, Sds]:
@@ -527,9 +529,9 @@ def _test_base(task: _Task, sds: Sds, screened: Screening) -> tuple[Screening, D
 def _search_effects(task: _Task, screened: Screening, left: Diagnosis) -> tuple[Screening, Diagnosis, Search]:
     """Search for effects that explain the residuals of the base."""
     base = screened.base
-    found = search_effects(base.space, base.candidate, left, screened.bases, task.settings, task.progress)
-    base = dataclasses.replace(base, space=base.space.with_room(found.room))
-    return dataclasses.replace(screened, base=base), left, found
+    searched = search_effects(base.space, base.candidate, left, screened.bases, task.settings, task.progress)
+    base = dataclasses.replace(base, space=base.space.with_room(searched.room))
+    return dataclasses.replace(screened, base=base), left, searched
 
 
 def _search_until_clean(
@@ -579,30 +581,32 @@ def _verdict(task: _Task, screened: Screening, left: Diagnosis, sds: Sds, search
         else:
             return stages("undescribed", screened, left, sds, searched, missed=missed, unused=unused_inputs(runs))
         stages = functools.partial(stages, missed=leaves)
-    named = [] if model is None else [stood.established(e) for e in model[0].effects]
-    level, found = "", None
-    if not any(named):
+    established_names = [] if model is None else [stood.established(e) for e in model[0].effects]
+    level, mechanism = "", None
+    if not any(established_names):
         progress(next_step("mechanism"))
         ladder = [c for c in (*searched.ladder, *([] if model is None else model[:1]))]
-        found = find_mechanism(space, runs, base, left, ladder, bases, beside, predicted, settings)
-        level = "place" if found is None or found.fails else "mechanism"
+        mechanism = find_mechanism(space, runs, base, left, ladder, bases, beside, predicted, settings)
+        level = "place" if mechanism is None or mechanism.fails else "mechanism"
     if model is None:
-        return stages(level, screened, left, sds, searched, where=where, standing=stood, mechanism=found)
+        return stages(level, screened, left, sds, searched, where=where, standing=stood, mechanism=mechanism)
 
     searched = dataclasses.replace(searched, best=model[0], diagnosis=model[1])
     best, after = model
     progress(next_step("alike", best.effects))
     alike = find_classes(space, base, best, searched.ladder, left, after, settings)
-    if not any(named):
-        return stages(level, screened, left, sds, searched, alike, where, standing=stood, mechanism=found)
+    if not any(established_names):
+        return stages(level, screened, left, sds, searched, alike, where, standing=stood, mechanism=mechanism)
     compared: tuple[HeldOutAlternative, ...] = ()
     if settings.prefer == HELD_OUT:
         progress(next_step("held out"))
         searched, alike, compared = preference.prefer_by_held_out(space, runs, searched, alike, bases, settings)
         after = searched.diagnosis or after
         stood = stood.renamed(dict(zip(best.active, (searched.best or best).active, strict=True)))
-    alone = [len(m) + len(v) == 1 for m, v in zip(alike.members, alike.stated, strict=True)]
-    verdict = "named" if all(one for one, name in zip(alone, named, strict=True) if name) else "class"
+    single_members = [len(m) + len(v) == 1 for m, v in zip(alike.members, alike.stated, strict=True)]
+    verdict = (
+        "named" if all(one for one, name in zip(single_members, established_names, strict=True) if name) else "class"
+    )
     remains = locate_discrepancy(after, bases, space.included) if after.test.rejected_with_margin else None
     return stages(verdict, screened, left, sds, searched, alike, remains, standing=stood, held_out=compared)
 
@@ -635,8 +639,10 @@ def choose_effects(
     adequate = not after.test.rejected_with_margin
     kinds = blocks_room.predictable_blocks(runs, space.bare)
     blocks = [mask for by in kinds.values() for mask in by.values()]
-    asked = functools.partial(judge_names, space, base, searched, left, bases, settings, blocks=blocks, beside=beside)
-    stood = asked() if adequate or long else None
+    support_of = functools.partial(
+        judge_names, space, base, searched, left, bases, settings, blocks=blocks, beside=beside
+    )
+    stood = support_of() if adequate or long else None
     if stood is not None and all(stood.established(e) for e in best.effects):
         return (best, after), searched, stood
     few = None
@@ -649,23 +655,27 @@ def choose_effects(
             judged,
             after if judged is best else diagnose_candidate(space, judged, bases, left.test.null, settings),
         )
-        stood = asked(proposed=proposed)
+        stood = support_of(proposed=proposed)
     else:
         proposed = best, after
     names = [e for e in proposed[0].effects if stood.established(e)]
-    further = [e for e in (() if few is None else few.effects) if e not in names and not stood.stands_in(e)]
-    names += further[: settings.slots - len(names)]
+    added_effects = [e for e in (() if few is None else few.effects) if e not in names and not stood.stands_in(e)]
+    names += added_effects[: settings.slots - len(names)]
     if not names:
         return None, searched, stood
-    every = (proposed[0], best, *(c for c in searched.ladder if c.simulated))
-    known = [c for c in every if c.key == frozenset(names)]
-    if not known:
+    simulated_fits = (proposed[0], best, *(c for c in searched.ladder if c.simulated))
+    fits_of_names = [c for c in simulated_fits if c.key == frozenset(names)]
+    if not fits_of_names:
         active = fill_slots(names, settings)
         begins = start_of_fit(space, proposed[0], active, settings, left.scores)
-        known = fit_candidates(space, [(active, begins)], settings)
-        searched = dataclasses.replace(searched, ladder=(*searched.ladder, *known))
-    seen = next((d for c, d in (proposed, (best, after)) if c is known[0]), None)
-    return (known[0], seen or diagnose_candidate(space, known[0], bases, left.test.null, settings)), searched, stood
+        fits_of_names = fit_candidates(space, [(active, begins)], settings)
+        searched = dataclasses.replace(searched, ladder=(*searched.ladder, *fits_of_names))
+    diagnosis = next((d for c, d in (proposed, (best, after)) if c is fits_of_names[0]), None)
+    return (
+        (fits_of_names[0], diagnosis or diagnose_candidate(space, fits_of_names[0], bases, left.test.null, settings)),
+        searched,
+        stood,
+    )
 
 
 # --- stages without a module of their own ---------------------------------------------------------------
@@ -694,8 +704,8 @@ def pose_candidates(
     names = tuple(n for n in names if n not in unread)
     coordinates = priors.parameter_coordinates(robot, names, dict(stated or {}), any_surface=True)
     bare = observers.pose_problem(runs.where(index), robot, coordinates, sd[index])
-    shown = visible_effects(library, robot, kind, goes_both_ways(runs), has_pulses(runs))
-    space = candidate_space(bare, shown, library, settings.slots, settings.width)
+    visible = visible_effects(library, robot, kind, goes_both_ways(runs), has_pulses(runs))
+    space = candidate_space(bare, visible, library, settings.slots, settings.width)
     return space.without(~real)
 
 
@@ -734,8 +744,8 @@ def goes_both_ways(runs: Runs) -> bool:
     """True if runs go both forward and backward, by any speed that they state or by their drive."""
     moved = [c.column for c in channels.EVERY if c.zero_at_rest and c.directed]
     columns = [runs[name] for name in (*moved, runs.layout.imposed_column, "duty") if runs.has(name)]
-    found = [x[np.isfinite(x)] for x in columns]
-    return any(min(x.max(), -x.min()) > EITHER_WAY * np.abs(x).max() for x in found if x.size)
+    finite_columns = [x[np.isfinite(x)] for x in columns]
+    return any(min(x.max(), -x.min()) > EITHER_WAY * np.abs(x).max() for x in finite_columns if x.size)
 
 
 def padded_rows(rows: int, sizes: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
@@ -768,13 +778,13 @@ def diagnosis_of_base(
         null: replicates, if known.
     """
     space, base = screened.base.space, screened.base.candidate
-    linear, scores, found = screened.diagnosed
+    linear, scores, statistics = screened.diagnosed
     if null is None:
         null = bootstrap(
             space.bare, base.z[: space.free], linear, space.library.scored, screened.bases, settings.replicates,
             settings.seed, freedom,
         )  # fmt: skip
-    return Diagnosis(linear, scores, AdequacyTest(found, null, settings))
+    return Diagnosis(linear, scores, AdequacyTest(statistics, null, settings))
 
 
 def _rows_until_repeat(columns: Sequence[np.ndarray]) -> int:
@@ -790,17 +800,17 @@ def without_copies(runs: Runs) -> tuple[Runs, np.ndarray, list[Remark]]:
     display. They are copies only if the whole table repeats: the same rows in the same sequence, several times.
     """
     columns = [*(runs[c] for c in observers.observer_kind(runs).identity(runs)), *runs.extras.values()]
-    seen: set[tuple[str, ...]] = set()
+    seen_columns: set[tuple[str, ...]] = set()
     keep: list[int] = []
     copies: list[int] = []
     if runs.sampled or {"run_id", *WHEN} & set(runs.headings):
         for k in range(len(runs)):
             row = tuple(str(column[k]) for column in columns)
-            (copies if row in seen else keep).append(k)
-            seen.add(row)
+            (copies if row in seen_columns else keep).append(k)
+            seen_columns.add(row)
     else:
-        once = _rows_until_repeat(columns)
-        keep, copies = list(range(once)), list(range(once, len(runs)))
+        first_rows = _rows_until_repeat(columns)
+        keep, copies = list(range(first_rows)), list(range(first_rows, len(runs)))
     if not copies:
         return runs, np.arange(1, len(runs) + 1), []
     return runs.where(np.asarray(keep)), np.asarray(keep) + 1, [Remark("copies", rows=tuple(k + 1 for k in copies))]
@@ -933,14 +943,14 @@ def _claims(
     space, base, best = screened.base.space, screened.base.candidate, traced.best
     if alike is None:
         return (), None, ()
-    found = findings.found_effects(space, base, best, alike, left.test, settings)
+    found_effects = findings.found_effects(space, base, best, alike, left.test, settings)
     if traced.verdict in WITHOUT_NAME:
-        return found, None, ()
+        return found_effects, None, ()
     ask = space.bare.observe.menu and not space.bare.observe.long
     concealed = findings.hidden_effects(
         space, find_hidden_effects(space, best, alike, left, traced.ends, settings, ask=ask)
     )
-    return found, traced.where, concealed
+    return found_effects, traced.where, concealed
 
 
 def assemble_result(
@@ -956,28 +966,34 @@ def assemble_result(
     space, base, best = screened.base.space, screened.base.candidate, traced.best
     included = space.included[: len(runs)]
     numbers = np.arange(1, len(runs) + 1) if numbers is None else numbers
-    written = _fit_of_verdict(traced, progress)
+    fit_to_write = _fit_of_verdict(traced, progress)
     progress(next_step("errors"))
-    known = [traced.predicted.get(prediction.candidate_key(c)) for c in (base, best)]
+    predictions = [traced.predicted.get(prediction.candidate_key(c)) for c in (base, best)]
     kinds = blocks_room.predictable_blocks(runs, space.bare)
-    seen = findings.readings_of_rows(
-        runs, noise.sd, kinds, written.before, written.after, known[0], None if best is base else known[1]
+    readings_of_rows = findings.readings_of_rows(
+        runs,
+        noise.sd,
+        kinds,
+        fit_to_write.before,
+        fit_to_write.after,
+        predictions[0],
+        None if best is base else predictions[1],
     )
     compared = traced.held_out
     nameless = traced.verdict in WITHOUT_NAME
     if traced.alike is not None and not nameless and not compared and not space.bare.observe.long:
         compared = preference.compare_alternatives(space, runs, best, traced.alike)
-    gain = _gain(space, runs, seen)
-    kept = _predicts_well(traced, written, gain)
-    written = written.or_refit(traced, kept)
+    gain = _gain(space, runs, readings_of_rows)
+    keeps_fit = _predicts_well(traced, fit_to_write, gain)
+    fit_to_write = fit_to_write.or_refit(traced, keeps_fit)
     progress(next_step("next"))
-    remaining = _residuals(space, runs, written.ends.linear, seen.after, written.z)
-    found = _ResultInput(traced, written, seen, compared, gain, kept, remaining)
-    result = _result(found, runs, numbers, settings, library)
+    remaining = _residuals(space, runs, fit_to_write.ends.linear, readings_of_rows.after, fit_to_write.z)
+    result_input = _ResultInput(traced, fit_to_write, readings_of_rows, compared, gain, keeps_fit, remaining)
+    result = _result(result_input, runs, numbers, settings, library)
     # A temporary change is not uniform.
     of_noise = noise_remarks_before_verdict(traced.sds, remaining) if traced.sds.factors or not traced.events else ()
     return dataclasses.replace(
-        result, remarks=(*of_noise, *refit_worse(seen, noise, included), *loop_remarks(result))
+        result, remarks=(*of_noise, *refit_worse(readings_of_rows, noise, included), *loop_remarks(result))
     )
 
 
@@ -1032,12 +1048,12 @@ def _result(
     near, too_large = _alternatives(about, settings)
     found, remains, concealed = _claims(traced, settings)
     listed = findings.effect_scores(space, left.scores, settings)
-    shown = space.library.indices([s.name for s in listed])
-    said = verdict_summary(traced, numbers)
+    library_places = space.library.indices([s.name for s in listed])
+    summary = verdict_summary(traced, numbers)
     kind = type(observe)
     return DiscoveryResult(
         verdict=traced.verdict,
-        summary=said,
+        summary=summary,
         robot=written.robot,
         refit=findings.proposed_robot(space, base),
         gain=about.gain,
@@ -1061,7 +1077,7 @@ def _result(
         alternatives=near,
         implausible=too_large,
         hidden=concealed,
-        support=said.support,
+        support=summary.support,
         cluster=screened.cluster,
         residual_clusters=residual_clusters(about.remaining, settings.seed),
         before=findings.evidence_of_test(left.test, adequate=not left.test.rejected),
@@ -1070,7 +1086,7 @@ def _result(
         readings=int(np.sum(space.weight > 0)),
         base_shift=findings.base_shift(space, base.z, written.z, written.sd),
         scores=listed,
-        cosine=signature_cosines(space, left.scores)[np.ix_(shown, shown)],
+        cosine=signature_cosines(space, left.scores)[np.ix_(library_places, library_places)],
         detail=observe.detail(screened.bases, included, left, ends),
         readings_of_rows=seen,
         errors_as_stated=error(seen.as_stated),
@@ -1093,7 +1109,7 @@ def refit_worse(seen: ReadingsOfRows, noise: Noise, included: np.ndarray) -> lis
     Args:
         included: True for included rows, shape (rows,).
     """
-    found = []
+    worse_channels = []
     for k, channel in enumerate(noise.channels):
         rows = included & np.isfinite(seen.measured[:, k] + seen.as_stated[:, k] + seen.before[:, k])
         if noise.source[k] not in noise_room.UNSTATED or not rows.any():
@@ -1103,7 +1119,7 @@ def refit_worse(seen: ReadingsOfRows, noise: Noise, included: np.ndarray) -> lis
             for x in (seen.as_stated - seen.measured, seen.before - seen.measured, seen.measured, noise.sd)
         )
         if refit > WORSE * stated and refit - stated > sd:
-            found.append(
+            worse_channels.append(
                 Remark(
                     "refit_worse",
                     channel=channel.name,
@@ -1112,15 +1128,15 @@ def refit_worse(seen: ReadingsOfRows, noise: Noise, included: np.ndarray) -> lis
                     word=noise_room.UNSTATED[noise.source[k]],
                 )
             )
-    return found
+    return worse_channels
 
 
 def on_same_rows(
     before: np.ndarray, after: np.ndarray, error: Callable[[np.ndarray], Errors]
 ) -> tuple[Errors, Errors]:
     """Errors of readings before and after, over the rows that both fits predict."""
-    both = np.isfinite(before) & np.isfinite(after)
-    return error(np.where(both, before, np.nan)), error(np.where(both, after, np.nan))
+    in_both = np.isfinite(before) & np.isfinite(after)
+    return error(np.where(in_both, before, np.nan)), error(np.where(in_both, after, np.nan))
 
 
 def noise_remarks_before_verdict(sds: Sds, remaining: Residuals) -> tuple[Remark, ...]:
@@ -1194,38 +1210,38 @@ def _noise(runs: Runs, noise: Noise, kind: type[observers.Observer]) -> dict[str
 
 def loop_remarks(found: DiscoveryResult) -> Notes:
     """Remarks of a careful engineer on a result."""
-    said: list[Remark] = []
+    remarks: list[Remark] = []
     for rows, why in ((found.unusable, "unusable"), (found.outliers, "outliers")):
         if rows:
-            said.append(Remark("kept_out", rows=rows, why=why))
+            remarks.append(Remark("kept_out", rows=rows, why=why))
     far = {name: abs(p.shift_after) for name, p in found.base_shift.items() if abs(p.shift_after) > FAR}
-    said += [Remark("far_from_prior", name=name, sds=x, kind="loop") for name, x in far.items()]
-    held = tuple(name for name in undetermined_names(found.held_by_prior, found.together) if name not in far)
-    said += [Remark("held_by_prior", names=held)] * bool(held)
-    said += [Remark("only_together", pairs=found.together)] * bool(found.together)
-    said += [Remark("not_predictable", kinds=found.held_out_unpredictable)] * bool(found.held_out_unpredictable)
-    said += [Remark("residual_cluster", cluster=c) for c in found.residual_clusters]
+    remarks += [Remark("far_from_prior", name=name, sds=x, kind="loop") for name, x in far.items()]
+    undetermined = tuple(name for name in undetermined_names(found.held_by_prior, found.together) if name not in far)
+    remarks += [Remark("held_by_prior", names=undetermined)] * bool(undetermined)
+    remarks += [Remark("only_together", pairs=found.together)] * bool(found.together)
+    remarks += [Remark("not_predictable", kinds=found.held_out_unpredictable)] * bool(found.held_out_unpredictable)
+    remarks += [Remark("residual_cluster", cluster=c) for c in found.residual_clusters]
     wave = found.unnamed
     if wave is not None and wave.score_free_in_each_run and wave.score < 0.5 * wave.score_free_in_each_run:
-        said.append(Remark("phases_differ", free=wave.score_free_in_each_run, held=wave.score))
+        remarks.append(Remark("phases_differ", free=wave.score_free_in_each_run, held=wave.score))
     delay = found.base_shift.get(priors.DELAY)
     if delay is not None and priors.DELAY not in found.robot.rig.stated and abs(delay.after) > LATE * delay.sd_after:
-        said.append(Remark("late", delay=delay.after, sd=delay.sd_after))
+        remarks.append(Remark("late", delay=delay.after, sd=delay.sd_after))
     if found.remains is not None:
-        said.append(Remark("still_lacks", place=found.remains.place, variable=found.remains.variable))
+        remarks.append(Remark("still_lacks", place=found.remains.place, variable=found.remains.variable))
     names = [e.name for e in found.effects]
     for t in () if found.support is None else found.support.tests:
         if t.rests_on is not None and t.effect in names:
-            said.append(_rests_on(found, t))
+            remarks.append(_rests_on(found, t))
     if not found.written and found.gain is not None:
-        said.append(Remark("unwritten", curve=not found.effects, gain=found.gain.mean, se=found.gain.se))
-    said += preference.leader_remarks(found.alternatives_held_out, found.settings.prefer)
+        remarks.append(Remark("unwritten", curve=not found.effects, gain=found.gain.mean, se=found.gain.se))
+    remarks += preference.leader_remarks(found.alternatives_held_out, found.settings.prefer)
     settled, asked = found.replicates, found.settings.replicates
     if settled < 0.9 * asked:
-        said.append(Remark("lost_replicates", settled=settled, asked=asked))
+        remarks.append(Remark("lost_replicates", settled=settled, asked=asked))
     if 1 / (1 + settled) > min(found.settings.shares.values()):
-        said.append(Remark("too_few_replicates", settled=settled))
-    return tuple(said)
+        remarks.append(Remark("too_few_replicates", settled=settled))
+    return tuple(remarks)
 
 
 def _rests_on(found: DiscoveryResult, test: NameTest) -> Remark:
@@ -1236,14 +1252,14 @@ def _rests_on(found: DiscoveryResult, test: NameTest) -> Remark:
         return Remark("rests_on", test=test)
     row = int(np.flatnonzero(found.numbers == test.row)[0])
     columns = [c for c in ("configuration", *runs.axes) if runs.has(c)]
-    at = {c: str(runs[c][row]) if runs[c].dtype.kind == "U" else float(runs[c][row]) for c in columns}
+    conditions_there = {c: str(runs[c][row]) if runs[c].dtype.kind == "U" else float(runs[c][row]) for c in columns}
     for axis in sorted(runs.axes, key=lambda axis: axis != series_noise.FIRST):
         series = next((rows for rows in series_noise.series_along(runs, axis) if row in rows), None)
-        x, here = runs[axis][row if series is None else series], float(runs[axis][row])
-        beside = neighbouring_levels(np.asarray(x, float), here)
+        x, value_of_row = runs[axis][row if series is None else series], float(runs[axis][row])
+        beside = neighbouring_levels(np.asarray(x, float), value_of_row)
         if beside:
-            return Remark("rests_on", test=test, conditions=at, axis=axis, beside=beside)
-    return Remark("rests_on", test=test, conditions=at)
+            return Remark("rests_on", test=test, conditions=conditions_there, axis=axis, beside=beside)
+    return Remark("rests_on", test=test, conditions=conditions_there)
 
 
 def neighbouring_levels(x: np.ndarray, here: float) -> tuple[float, ...]:
@@ -1256,9 +1272,9 @@ def neighbouring_levels(x: np.ndarray, here: float) -> tuple[float, ...]:
         here: level of the row.
     """
     apart = np.abs(x - here)
-    others = apart[apart > LEVEL * np.ptp(x)]
-    if not others.size:
+    other_levels = apart[apart > LEVEL * np.ptp(x)]
+    if not other_levels.size:
         return ()
-    unit = 10.0 ** math.floor(math.log10(others.min() / 2))
-    step, at = round(others.min() / 2 / unit) * unit, round(here / unit) * unit
+    unit = 10.0 ** math.floor(math.log10(other_levels.min() / 2))
+    step, at = round(other_levels.min() / 2 / unit) * unit, round(here / unit) * unit
     return tuple(float(f"{v:.6g}") for v in (at - step, at + step))

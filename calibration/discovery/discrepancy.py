@@ -68,20 +68,20 @@ def locate_discrepancy(left: Diagnosis, bases: Bases, included: np.ndarray) -> D
     happens = np.array([bases_room.window_from_name(n[1]) is not None for n in names])
     # A smooth curve responds to a temporary change too, and a window to a smooth curve.
     for_a_while = bool(np.max(deviate[happens], initial=-np.inf) > np.max(deviate[~happens]) + ALIKE)
-    those = [j for j in range(len(names)) if happens[j] == for_a_while]
-    k = max(those, key=lambda j: deviate[j])
+    same_kind = [j for j in range(len(names)) if happens[j] == for_a_while]
+    k = max(same_kind, key=lambda j: deviate[j])
     # A balance takes precedence over an instrument with a similar score, which is listed as an alternative.
-    lacks = [j for j in those if not bases_room.is_channel_place(names[j][0]) and deviate[j] > deviate[k] - ALIKE]
+    lacks = [j for j in same_kind if not bases_room.is_channel_place(names[j][0]) and deviate[j] > deviate[k] - ALIKE]
     k = max(lacks, key=lambda j: deviate[j]) if lacks else k
     place = names[k][0]
-    over = [j for j in those if names[j][0] == place and names[j][1] != bases_room.CONDITIONS]
+    over = [j for j in same_kind if names[j][0] == place and names[j][1] != bases_room.CONDITIONS]
     j = k if for_a_while else max(over, key=lambda j: deviate[j])
     if names[j][1] in bases_room.VARIABLES:
         smoothly = [i for i in over if bases_room.window_from_name(names[i][1]) is None]
         evidence = {i: smooth_curve(left.linear, *names[i], included).evidence for i in smoothly}
         j = max(smoothly, key=lambda i: evidence[i] - INDIRECT * (names[i][1] == "voltage"))
-    every = dict.fromkeys(names[i][0] for i in those)
-    best = {b: max(deviate[i] for i in those if names[i][0] == b) for b in every}
+    places = dict.fromkeys(names[i][0] for i in same_kind)
+    best = {b: max(deviate[i] for i in same_kind if names[i][0] == b) for b in places}
     alike = [(b, *bases_room.STANDS_FOR.get(b, ())) for b, d in best.items() if d > deviate[k] - ALIKE]
     variable, strength = names[j][1], float(explained[j])
     happening = bases_room.window_from_name(variable)
@@ -133,8 +133,12 @@ def refine_window(
     rows = np.append(0, np.add.reduceat(counts, np.arange(0, len(levels), merged)).cumsum())
     first, last = np.triu_indices(len(edges) + 1, 1)
     norm2 = sums[last, last] - 2 * sums[first, last] + sums[first, first]
-    held = rows[last] - rows[first]
-    fair = (held >= bases_room.FEWEST) & (held <= 0.5 * rows[-1]) & (norm2 > 1e-9 * max(float(a.max()), 1e-300))
+    rows_in_window = rows[last] - rows[first]
+    fair = (
+        (rows_in_window >= bases_room.FEWEST)
+        & (rows_in_window <= 0.5 * rows[-1])
+        & (norm2 > 1e-9 * max(float(a.max()), 1e-300))
+    )
     gain = np.where(fair, (pull[last] - pull[first]) ** 2 / np.where(fair, norm2, 1.0), -np.inf)
     k = int(np.argmax(gain))
     inside = included & (index >= first[k]) & (index < last[k])
@@ -230,7 +234,7 @@ def fit_discrepancy(
     starts = np.zeros((STARTS, len(problem.coordinates)))
     starts[:, :inner] = base.z[:inner]
     starts[:, inner:] = np.linspace(1.0, 0.0, STARTS)[:, None] * at_base.start
-    optima, seen = search_each(problem, list(starts), [space.weight] * STARTS)
+    optima, observations = search_each(problem, list(starts), [space.weight] * STARTS)
     k = int(np.argmin(np.where(np.isfinite(optima.cost), optima.cost, np.inf)))
     z = np.asarray(optima.z[k])
     covariance = np.asarray(optima.covariance[k])
@@ -251,7 +255,7 @@ def fit_discrepancy(
         z=z,
         covariance=covariance,
         problem=problem,
-        reading=np.asarray(seen.reading[k]),
+        reading=np.asarray(observations.reading[k]),
         converged=bool(optima.converged[k]),
         proposal=propose_formula(linear, balance, included, at_base, voltage=space.bare.base.rig.shows_voltage),
     )
@@ -299,9 +303,9 @@ def _with_curve(space: CandidateSpace, base: Candidate, curve: Smooth) -> Proble
     """Problem of the base and a curve. The coordinates of the curve's ordinates come last."""
     problem = space.problem(base.active) if base.effects else space.bare
     # A curve of this name from an earlier round is replaced, because its parameters have the same names.
-    kept = tuple(e for e in problem.base.effects if e.name != curve.effect)
+    other_effects = tuple(e for e in problem.base.effects if e.name != curve.effect)
     added = params.replace(UNNAMED[curve.effect](), {n: jnp.asarray(v) for n, v in curve.values.items()})
-    robot = dataclasses.replace(problem.base, effects=(*kept, added))
+    robot = dataclasses.replace(problem.base, effects=(*other_effects, added))
     names = tuple(f"effects.{curve.effect}.{n}" for n in curve.ordinates)
     shaped = Shaped(problem.coordinates, jnp.asarray(curve.root), names)
     data = dataclasses.replace(problem.data, centre=jnp.zeros(len(shaped)))

@@ -43,8 +43,8 @@ def supplying_effects(space: CandidateSpace, active: Sequence[str], amplitude: n
     power = _dissipated_power(space.bare.observe, space.problem(active).robot(jnp.asarray(z)))
     if power is None:
         return tuple(negative)
-    taken = dict(zip(SINK, np.asarray(power)[:, space.included], strict=True))
-    return tuple(n for n in negative if not _dissipates(taken.get(space.library[n].balance)))
+    power_by_balance = dict(zip(SINK, np.asarray(power)[:, space.included], strict=True))
+    return tuple(n for n in negative if not _dissipates(power_by_balance.get(space.library[n].balance)))
 
 
 def _dissipates(power: np.ndarray | None) -> bool:

@@ -164,16 +164,16 @@ def alternatives_of_class(best: Candidate, found: Classes, *, stated: bool = Tru
         stated: True to include stated values that may be wrong instead of an effect, by their names.
     """
     fitted = {c.key: c for c in sorted(found.ladder, key=lambda c: -c.cost)}
-    kept = {best.active: best}
+    alternatives = {best.active: best}
     for slot, members in enumerate(found.members):
         for name in members[1:]:
             active = tuple(name if s == slot else n for s, n in enumerate(best.active))
-            kept[active] = fitted[frozenset(n for n in active if n)]
-    named = {" + ".join(c.effects): c for c in kept.values()}
+            alternatives[active] = fitted[frozenset(n for n in active if n)]
+    by_name = {" + ".join(c.effects): c for c in alternatives.values()}
     if stated:
         for shifts in found.stated:
-            named |= {" + ".join((s.name, *s.fit.effects)): s.fit for s in shifts}
-    return named
+            by_name |= {" + ".join((s.name, *s.fit.effects)): s.fit for s in shifts}
+    return by_name
 
 
 # --- predictions ------------------------------------------------------------------------------------
@@ -195,11 +195,11 @@ def _predicted(
     """
 
     def one(w: Array, z: Float[Array, " coordinates"], informed: Array) -> tuple[predicted.Predicted, Array]:
-        here = problem.coordinates.with_effects(w)
+        coordinates = problem.coordinates.with_effects(w)
 
         def robot(x: Array) -> Robot:
             base = problem.base if other is None else other.robot(problem.base, x[z.size :])
-            return here.robot(base, x[: z.size])
+            return coordinates.robot(base, x[: z.size])
 
         wide = jnp.concatenate([z, jnp.zeros(0 if other is None else len(other))])
         unknowns, solved = predicted.map_over_runs(IMPLICIT.solve, robot(wide), batch)
@@ -224,32 +224,34 @@ def predict_menu(space: CandidateSpace, candidates: Mapping[str, Candidate], set
     The menu has the experiments within reach of the table that the robots of all alternatives can do and that
     are not forbidden.
     """
-    names, those = list(candidates), list(candidates.values())
-    those += [those[0]] * (-len(those) % PAD)
+    names, alternatives = list(candidates), list(candidates.values())
+    alternatives += [alternatives[0]] * (-len(alternatives) % PAD)
     robot = space.bare.base
-    whole = priors.free_names(robot, robot.configurations.names)
-    more = [n for n in whole if n not in space.coordinates.base.names]
+    all_parameters = priors.free_names(robot, robot.configurations.names)
+    more = [n for n in all_parameters if n not in space.coordinates.base.names]
     other = priors.parameter_coordinates(robot, more) if more else None
-    equipped, indices = space.fitted_by(c.active for c in those)
+    equipped, indices = space.fitted_by(c.active for c in alternatives)
     active = jnp.asarray(indices)
-    z = jnp.asarray(np.stack([c.z for c in those]))
+    z = jnp.asarray(np.stack([c.z for c in alternatives]))
     informed = jnp.stack(
         [
             equipped.observe.at(equipped, c.z, mine)[1][informative_residuals(equipped.data)]
-            for c, mine in zip(those, indices, strict=True)
+            for c, mine in zip(alternatives, indices, strict=True)
         ]
     )
-    within = reach_of_space(space, space.bare.robot(jnp.asarray(those[0].z[: space.free])))
-    everything, shown = menu.experiment_menu(within), channels.channel_names(space.bare.channels)
-    found, half = jax.device_get(
-        _predicted(equipped, other, predicted.batch_experiments(everything, shown), active, z, informed)
+    within = reach_of_space(space, space.bare.robot(jnp.asarray(alternatives[0].z[: space.free])))
+    all_experiments, shown_channels = menu.experiment_menu(within), channels.channel_names(space.bare.channels)
+    predictions, half = jax.device_get(
+        _predicted(equipped, other, predicted.batch_experiments(all_experiments, shown_channels), active, z, informed)
     )
-    found, half = jax.tree.map(lambda x: np.asarray(x)[: len(names)], (found, half))
-    experiments, kept = _possible(everything, found, within, settings)
+    predictions, half = jax.tree.map(lambda x: np.asarray(x)[: len(names)], (predictions, half))
+    experiments, kept = _possible(all_experiments, predictions, within, settings)
     medians = np.median(np.asarray(space.equipped.data.sd), 0)
-    sd = predicted.reading_sds(experiments, dict(zip(shown, medians, strict=True)))
-    value, half = np.nan_to_num(found.value[:, kept]), np.nan_to_num(half[:, kept])
-    return PredictedReadings(tuple(names), experiments, value, half, sd, np.all(found.exists, 0)[kept], settings)
+    sd = predicted.reading_sds(experiments, dict(zip(shown_channels, medians, strict=True)))
+    value, half = np.nan_to_num(predictions.value[:, kept]), np.nan_to_num(half[:, kept])
+    return PredictedReadings(
+        tuple(names), experiments, value, half, sd, np.all(predictions.exists, 0)[kept], settings
+    )
 
 
 def _possible(
@@ -262,24 +264,24 @@ def _possible(
     """
     runs = [e for e in experiments if isinstance(e, menu.Run)]
     ends = dict(zip((r.name for r in runs), np.cumsum([len(r.voltage) for r in runs]).tolist(), strict=True))
-    left: list[menu.Experiment] = []
+    possible_experiments: list[menu.Experiment] = []
     kept: list[np.ndarray] = []
     for e in experiments:
         rows = np.ones(predicted.reading_count(e), bool)
         if isinstance(e, menu.Run):
             span = slice(ends[e.name] - len(e.voltage), ends[e.name])
             grips = np.abs(found.grip[:, span]) < np.where(np.asarray(e.slope) > e.beyond, menu.GRIP, np.inf)
-            done = menu.possible_runs(e, np.all(found.does[:, span] & grips, 0))
-            if done.any():
+            possible_runs = menu.possible_runs(e, np.all(found.does[:, span] & grips, 0))
+            if possible_runs.any():
                 hot, fast = np.asarray(found.temperature)[0, span], np.asarray(found.speed)[0, span]
-                e = menu.restrict_run(e, done, hot, fast, within)
-            rows = np.repeat(done, len(e.channels))
+                e = menu.restrict_run(e, possible_runs, hot, fast, within)
+            rows = np.repeat(possible_runs, len(e.channels))
         if set(e.kinds) & set(settings.forbidden):
             rows = np.zeros(len(rows), bool)
         if rows.any():
-            left.append(e)
+            possible_experiments.append(e)
         kept.append(rows)
-    return tuple(left), np.concatenate(kept)
+    return tuple(possible_experiments), np.concatenate(kept)
 
 
 # --- the choice -------------------------------------------------------------------------------------
@@ -288,8 +290,8 @@ def _possible(
 def _rank_experiment(seen: PredictedReadings, *experiments: str) -> Ranked:
     pairs = itertools.combinations(range(len(seen.names)), 2)
     sigma = tuple(seen.apart(a, b, *experiments) for a, b in pairs)
-    others = zip(seen.names[1:], sigma, strict=False)  # the pairs of the best fit come first
-    return Ranked(experiments, sigma, tuple(n for n, s in others if s >= seen.settings.apart), seen.settings)
+    separations = zip(seen.names[1:], sigma, strict=False)  # the pairs of the best fit come first
+    return Ranked(experiments, sigma, tuple(n for n, s in separations if s >= seen.settings.apart), seen.settings)
 
 
 def _usefulness(r: Ranked) -> tuple[bool, float]:
@@ -310,14 +312,14 @@ def choose_experiment(seen: PredictedReadings) -> Proposal:
         return Proposal((NONE,), NothingPossible(), (), 0.0, False, ())
     plan = table[0]
     (first,) = plan.experiments
-    both = (_rank_experiment(seen, first, e.name) for e in seen.experiments if e.name != first)
-    more = max(both, key=_usefulness, default=plan)
+    rankings = (_rank_experiment(seen, first, e.name) for e in seen.experiments if e.name != first)
+    more = max(rankings, key=_usefulness, default=plan)
     if more.told and (not plan.told or _usefulness(more)[1] > _usefulness(plan)[1] + seen.settings.gain):
         plan = more
     if not plan.told:
         return Proposal((NONE,), NothingTells(seen.names, seen.settings.worth), (), 0.0, False, table)
-    named = {e.name: e for e in seen.experiments}
-    what = CarryOut(tuple(named[name] for name in plan.experiments))
+    by_name = {e.name: e for e in seen.experiments}
+    what = CarryOut(tuple(by_name[name] for name in plan.experiments))
     return Proposal(
         plan.experiments, what, plan.separates, min(plan.told), plan.smallest >= seen.settings.apart, table
     )
@@ -367,5 +369,5 @@ def propose_nothing(space: CandidateSpace) -> Proposal:
 
 def propose_separating(space: CandidateSpace, best: Candidate, found: Classes, settings: Settings) -> Proposal | None:
     """Experiment that separates the alternatives of a class, None if each effect has one name."""
-    left = alternatives_of_class(best, found)
-    return choose_experiment(predict_menu(space, left, settings)) if len(left) > 1 else None
+    alternatives = alternatives_of_class(best, found)
+    return choose_experiment(predict_menu(space, alternatives, settings)) if len(alternatives) > 1 else None

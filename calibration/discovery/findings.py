@@ -109,17 +109,19 @@ def _parameters(space: CandidateSpace, best: Candidate, slot: int, settings: Set
     effect, p = space.library[best.active[slot]], space.free
     amplitude, unit = amplitude_of(effect), amplitude_unit(effect)
     sd = settings.width * best.sd[p + slot] * unit
-    held = held_by_prior(best.sd)
+    held_names = held_by_prior(best.sd)
     values = {
         amplitude.name: Estimate(
-            float(best.amplitude[slot] * unit), float(sd), amplitude.spec.unit, bool(held[p + slot])
+            float(best.amplitude[slot] * unit), float(sd), amplitude.spec.unit, bool(held_names[p + slot])
         )
     }
     shape = shape_of(effect)
     if shape is not None:
         k, scales = p + settings.slots + slot, shape_scales(shape)
         value, slope = _shaped(scales, best.z[k])
-        values[shape.name] = Estimate(float(value), float(slope) * float(best.sd[k]), shape.spec.unit, bool(held[k]))
+        values[shape.name] = Estimate(
+            float(value), float(slope) * float(best.sd[k]), shape.spec.unit, bool(held_names[k])
+        )
     return values
 
 
@@ -128,8 +130,8 @@ _shaped = jax.jit(jax.value_and_grad(shape_at, argnums=1))
 
 def _member(space: CandidateSpace, best: Candidate, found: Classes, slot: int, name: str) -> Member:
     """An effect of a class in place of the leader."""
-    wanted = frozenset(name if s == slot else n for s, n in enumerate(best.active)) - {""}
-    other = next(c for c in (best, *found.ladder) if c.key == wanted)
+    active_names = frozenset(name if s == slot else n for s, n in enumerate(best.active)) - {""}
+    other = next(c for c in (best, *found.ladder) if c.key == active_names)
     position = other.active.index(name)
     amplitude = other.amplitude[position] * amplitude_unit(space.library[name])
     return Member(float(amplitude), float(other.size[position]), float(2 * (other.cost - best.cost)))
@@ -245,9 +247,9 @@ def _alternative(space: CandidateSpace, c: Candidate, rise: float, settings: Set
 
 def proposed_robot(space: CandidateSpace, best: Candidate) -> Robot:
     """Fitted base with the effects of the proposal and no other."""
-    whole = space.problem(best.active).robot(jnp.asarray(best.z))
+    robot = space.problem(best.active).robot(jnp.asarray(best.z))
     keep = set(best.effects) | {e.name for e in space.bare.base.effects}
-    return dataclasses.replace(whole, effects=tuple(e for e in whole.effects if e.name in keep))
+    return dataclasses.replace(robot, effects=tuple(e for e in robot.effects if e.name in keep))
 
 
 def next_experiment(proposal: Proposal | None) -> NextExperiment | None:
@@ -289,7 +291,7 @@ def base_shift(space: CandidateSpace, before: np.ndarray, after: np.ndarray, sd:
     z = [np.asarray(x[:p]) for x in (before, after)]
     value = [coordinates.value(np.asarray(x)) for x in (np.zeros(p), *z)]
     slope = np.asarray(coordinates.slope(jnp.asarray(z[1])))
-    fields, held = priors.parameters_by_name(space.bare.base), held_by_prior(sd)
+    fields, held_names = priors.parameters_by_name(space.bare.base), held_by_prior(sd)
     return {
         name: BaseShift(
             prior=float(value[0][k]),
@@ -300,7 +302,7 @@ def base_shift(space: CandidateSpace, before: np.ndarray, after: np.ndarray, sd:
             meaning=fields[name].spec.meaning,
             shift_before=float(z[0][k]),
             shift_after=float(z[1][k]),
-            held_by_prior=bool(held[k]),
+            held_by_prior=bool(held_names[k]),
         )
         for k, name in enumerate(coordinates.names)
     }
@@ -365,10 +367,10 @@ def _plausible_score(
 
 def invisible_effects(space: CandidateSpace, scores: ScoreTable, settings: Settings) -> tuple[str, ...]:
     """Effects that the data cannot show: even the largest plausible amplitude changes the readings too little."""
-    left = space.library.largest(np.asarray(scores.left))
+    largest_scores = space.library.largest(np.asarray(scores.left))
     return tuple(
         e.name
-        for e, x in zip(space.library.effects, left, strict=True)
+        for e, x in zip(space.library.effects, largest_scores, strict=True)
         if settings.plausible * x < settings.visible
         and _plausible_score(space, e, scores, settings)[1] < settings.visible**2
     )

@@ -23,8 +23,10 @@ def headline(said: Summary, others: Sequence[tuple[float, Summary]] = ()) -> Hea
     laws, _ = _shared_claims([[m.names for m in s.missing if m.established] for s in every])
     if laws:
         alone = all(len(names) == 1 for names in laws) and not any(m.values for s in every for m in s.missing)
-        found = [next(m for m in said.missing if m.established and set(m.names) & set(names)) for names in laws]
-        families, values = tuple(m.families for m in found), tuple(m.values for m in found)
+        effects_of_laws = [
+            next(m for m in said.missing if m.established and set(m.names) & set(names)) for names in laws
+        ]
+        families, values = tuple(m.families for m in effects_of_laws), tuple(m.values for m in effects_of_laws)
         return Headline("named" if alone else "class", laws, factors, (), families, values)
     mechanisms, shared = _shared_claims([_mechanisms(s) for s in every])
     if mechanisms:
@@ -70,8 +72,8 @@ def _shared_claims(
         if all(alike):
             every = dict.fromkeys([*claim, *(n for those in alike for other in those for n in other)])
             shared = [n for n in claim if all(any(n in o for o in those) for those in alike)]
-            whole = (*shared, *(n for n in every if n not in shared))
-            if not any(set(whole) <= set(other) for other in counts):
-                counts[whole] = len(shared)
-    kept = {c: n for c, n in counts.items() if not any(set(c) < set(other) for other in counts)}
-    return tuple(kept), tuple(kept.values())
+            ordered_names = (*shared, *(n for n in every if n not in shared))
+            if not any(set(ordered_names) <= set(other) for other in counts):
+                counts[ordered_names] = len(shared)
+    largest_claims = {c: n for c, n in counts.items() if not any(set(c) < set(other) for other in counts)}
+    return tuple(largest_claims), tuple(largest_claims.values())

@@ -61,9 +61,9 @@ def find_hidden_effects(
         after: diagnosis of that fit.
         ask: True to look for experiments that would show the effects.
     """
-    found, named = [], {n for members in alike.members for n in members}
+    hidden_effects, named_effects = [], {n for members in alike.members for n in members}
     for effect in space.library.effects:
-        if effect.name in named:
+        if effect.name in named_effects:
             continue
         m = space.library.best_instance(effect.name, np.asarray(left.scores.left))
         alone, beside = float(left.scores.left[m]), float(after.scores.left[m])
@@ -75,11 +75,13 @@ def find_hidden_effects(
             ends = np.maximum(ends, 0.0)
         size = float(ends[np.argmax(np.abs(ends))])
         if abs(size) * alone >= settings.needed and abs(size) * beside <= 2 * np.sqrt(SAME):
-            found.append(Hidden(effect.name, size, abs(size) * alone))
-    found = sorted(found, key=lambda h: -h.sigmas)[:MOST]
+            hidden_effects.append(Hidden(effect.name, size, abs(size) * alone))
+    hidden_effects = sorted(hidden_effects, key=lambda h: -h.sigmas)[:MOST]
     if not ask or len(best.effects) >= settings.slots:
-        return tuple(found)
-    return tuple(_with_experiment(space, best, h, after, settings) if k < ASKED else h for k, h in enumerate(found))
+        return tuple(hidden_effects)
+    return tuple(
+        _with_experiment(space, best, h, after, settings) if k < ASKED else h for k, h in enumerate(hidden_effects)
+    )
 
 
 def _with_experiment(
@@ -99,10 +101,10 @@ def _with_experiment(
     move = what.amplitude / settings.width - joint.z[k]
     z = joint.z + covariance[:, k] / covariance[k, k] * move
     moved = dataclasses.replace(joint, z=z, cost=joint.cost + 0.5 * move**2 / covariance[k, k])
-    seen = experiments.predict_menu(space, {"without": best, "with": moved}, settings)
-    if not seen.experiments:
+    predicted_menu = experiments.predict_menu(space, {"without": best, "with": moved}, settings)
+    if not predicted_menu.experiments:
         return what
-    first = experiments.rank_experiments(seen)[0]
+    first = experiments.rank_experiments(predicted_menu)[0]
     if first.smallest < settings.worth:
         return what
     return dataclasses.replace(what, experiment=first.experiments[0], separation=float(first.smallest))

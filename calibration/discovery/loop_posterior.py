@@ -41,12 +41,12 @@ def posterior_of_curve(space: CandidateSpace, active: Names, curve: Discrepancy)
     inner = len(shaped.base)
     turn = np.eye(len(shaped))
     turn[inner:, inner:] = np.asarray(shaped.root)
-    base, kept = _parts(shaped.base, space, active, curve.z[:inner])
+    base, kept_places = _parts(shaped.base, space, active, curve.z[:inner])
     spec = {p.name: p.spec for p in params.walk_parameters(curve.problem.base)}
     ordinates = _clipped_parameters(
         shaped.names, [spec[n] for n in shaped.names], np.asarray(shaped.root) @ curve.z[inner:]
     )
-    places = [*kept, *range(inner, len(shaped))]
+    places = [*kept_places, *range(inner, len(shaped))]
     covariance = (turn @ curve.covariance @ turn.T)[np.ix_(places, places)]
     return join_posteriors([*base, ordinates], covariance)
 
@@ -58,8 +58,8 @@ def _of(
     z: np.ndarray,
     covariance: np.ndarray,
 ) -> Posterior:
-    parts, kept = _parts(coordinates, space, active, z)
-    return join_posteriors(parts, covariance[np.ix_(kept, kept)])
+    parts, kept_places = _parts(coordinates, space, active, z)
+    return join_posteriors(parts, covariance[np.ix_(kept_places, kept_places)])
 
 
 def _parts(
@@ -69,7 +69,7 @@ def _parts(
     if not isinstance(coordinates, ActiveSet):
         return [posterior_of_coordinates(coordinates, z, np.eye(len(z)))], list(range(len(z)))
     p, slots = len(coordinates.base), coordinates.slots
-    parts, kept = [posterior_of_coordinates(coordinates.base, z[:p], np.eye(p))], list(range(p))
+    parts, kept_places = [posterior_of_coordinates(coordinates.base, z[:p], np.eye(p))], list(range(p))
     for slot, name in enumerate(active):
         if not name:
             continue
@@ -80,7 +80,7 @@ def _parts(
             (f"effects.{name}.amplitude",), [amplitude.spec], np.array([sd * z[p + slot]])
         )
         parts.append(dataclasses.replace(of_amplitude, mean=z[p + slot, None], spread=np.array([sd])))
-        kept.append(p + slot)
+        kept_places.append(p + slot)
         shape = shape_of(effect)
         if shape is None:
             continue
@@ -95,8 +95,8 @@ def _parts(
                 kinds=(LOG if log else ANGLE,),
             )
         )  # fmt: skip
-        kept.append(p + slots + slot)
-    return parts, kept
+        kept_places.append(p + slots + slot)
+    return parts, kept_places
 
 
 def _clipped_parameters(names: Names, specs: list[Spec], mean: np.ndarray) -> Posterior:

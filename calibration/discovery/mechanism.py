@@ -113,8 +113,8 @@ def simulate_leading_families(
         near = [c for c in best if not c.simulated and 2 * (c.cost - lowest) <= within]
         if not near:
             return candidates
-        made = fit_candidates(space, [(c.active, c.z) for c in near], settings)
-        candidates = [*(c for c in candidates if not any(c is x for x in near)), *made]
+        fits = fit_candidates(space, [(c.active, c.z) for c in near], settings)
+        candidates = [*(c for c in candidates if not any(c is x for x in near)), *fits]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -205,9 +205,9 @@ def _families_of(where: DiscrepancyLocation) -> Names:
 
 def _gain_of(space: CandidateSpace, runs: Runs, pair: Pair, predicted: Predicted) -> Gain:
     """Hold-out gain by the effects of a mechanism, over the readings that they change."""
-    seen, before = (scored_once(space, runs, c, predicted) for c in (pair.having, pair.without))
+    scores, before = (scored_once(space, runs, c, predicted) for c in (pair.having, pair.without))
     changed = _changed_readings(space, runs, _reading(space, pair.without), _reading(space, pair.having))
-    return _gain_over_changed(seen, before, changed)
+    return _gain_over_changed(scores, before, changed)
 
 
 def _gain_over_changed(score: HeldOutScore, over: HeldOutScore, changed: np.ndarray) -> Gain:
@@ -221,10 +221,12 @@ def _gain_over_changed(score: HeldOutScore, over: HeldOutScore, changed: np.ndar
         return Gain(0.0, np.inf)
     by_kind = {k: score.only(k).gain(over.only(k), changed, BLOCKS) for k in kinds}
     weight = {k: float(np.sum(changed & np.isfinite(kinds[k] - over.by_kind[k]))) for k in kinds}
-    whole = sum(weight.values())
-    if not whole:
+    total_weight = sum(weight.values())
+    if not total_weight:
         return Gain(0.0, np.inf)
-    mean, se = (sum(weight[k] / whole * getattr(by_kind[k], x) for k in kinds if weight[k]) for x in ("mean", "se"))
+    mean, se = (
+        sum(weight[k] / total_weight * getattr(by_kind[k], x) for k in kinds if weight[k]) for x in ("mean", "se")
+    )
     return Gain(mean, se, {k: gain.se for k, gain in by_kind.items()})
 
 
@@ -236,11 +238,13 @@ def _gain_of_curve(
     A curve does not extrapolate.
     """
     curve, kinds = beside.curve, blocks_room.predictable_blocks(runs, space.bare)
-    told = {kind: predict_unseen(curve.problem, curve.z, list(by.values())).reading for kind, by in kinds.items()}
+    predictions = {
+        kind: predict_unseen(curve.problem, curve.z, list(by.values())).reading for kind, by in kinds.items()
+    }
     changed = _changed_readings(space, runs, _reading(space, base), curve.reading)
-    score = _scored(space, runs, told)
-    seen = {kind: _within_seen_range(space, beside, list(by.values())) for kind, by in kinds.items()}
-    inside = {kind: np.where(seen[kind][:, None], x, np.nan) for kind, x in score.by_kind.items()}
+    score = _scored(space, runs, predictions)
+    in_seen_range = {kind: _within_seen_range(space, beside, list(by.values())) for kind, by in kinds.items()}
+    inside = {kind: np.where(in_seen_range[kind][:, None], x, np.nan) for kind, x in score.by_kind.items()}
     score = dataclasses.replace(score, by_kind=inside)
     return _gain_over_changed(score, scored_once(space, runs, base, predicted), changed)
 
@@ -252,17 +256,17 @@ def _within_seen_range(space: CandidateSpace, beside: CurveBeside, masks: Sequen
         masks: of the rows of each block.
     """
     where, linear, rows = beside.where, beside.left.linear, len(masks[0])
-    seen = np.ones(rows, bool)
+    in_range = np.ones(rows, bool)
     if where.variable not in bases_room.VARIABLES:
-        return seen
+        return in_range
     x = np.asarray(linear.in_travel(where.place, where.variable)[0], float)
     if len(x) != len(space.included):  # turns, with different sides
-        return seen
+        return in_range
     for mask in masks:
         others = x[:rows][space.included[:rows] & ~mask]
         if len(others):
-            seen[mask] = (x[:rows][mask] >= others.min()) & (x[:rows][mask] <= others.max())
-    return seen
+            in_range[mask] = (x[:rows][mask] >= others.min()) & (x[:rows][mask] <= others.max())
+    return in_range
 
 
 def scored_once(space: CandidateSpace, runs: Runs, candidate: Candidate, predicted: Predicted) -> HeldOutScore:
@@ -321,34 +325,40 @@ def _curve_again(
     """
     linear, names = left.linear, bases_room.family_names(bases)
     smooth = [k for k, (_, v) in enumerate(names) if v in bases_room.VARIABLES]
-    here = DiscrepancyLocation("", "", (), (), 0.0, 0.0)
-    akin = [dataclasses.replace(here, place=names[k][0], variable=names[k][1]).family in families for k in smooth]
+    no_location = DiscrepancyLocation("", "", (), (), 0.0, 0.0)
+    akin = [
+        dataclasses.replace(no_location, place=names[k][0], variable=names[k][1]).family in families for k in smooth
+    ]
     columns = [family_columns(linear, bases, k) for k in smooth]
     jacobian, residual = np.asarray(linear.jacobian), np.asarray(linear.residual)
     explains = _explained_by(jacobian, residual)
-    known = [explains(c)[1] for c, mine in zip(columns, akin, strict=True) if mine]
+    explained_before = [
+        explains(c)[1] for c, explained_by_akin in zip(columns, akin, strict=True) if explained_by_akin
+    ]
     again = []
     for out in blocks:
         rows = np.concatenate([out, np.zeros(len(space.included) - len(out), bool)])
-        kept = np.repeat(~rows, linear.readings // len(rows))
-        whole = np.concatenate([kept, np.ones(len(residual) - len(kept), bool)])
-        found = [_explained_by(jacobian[whole], residual[whole])(c[kept]) for c in columns]
-        mine = [f for f, a in zip(found, akin, strict=True) if a]
-        if not mine or max(told for _, told in mine) < 0.5 * max(known):
+        kept_readings = np.repeat(~rows, linear.readings // len(rows))
+        kept_residuals = np.concatenate([kept_readings, np.ones(len(residual) - len(kept_readings), bool)])
+        explained = [
+            _explained_by(jacobian[kept_residuals], residual[kept_residuals])(c[kept_readings]) for c in columns
+        ]
+        explained_by_akin = [f for f, a in zip(explained, akin, strict=True) if a]
+        if not explained_by_akin or max(told for _, told in explained_by_akin) < 0.5 * max(explained_before):
             continue
-        most = max(gain for gain, _ in found)
-        again.append(max(gain for gain, _ in mine) >= most - max(settings.same, settings.form**2 * most))
+        most = max(gain for gain, _ in explained)
+        again.append(max(gain for gain, _ in explained_by_akin) >= most - max(settings.same, settings.form**2 * most))
     return float(np.mean(again)) if again else 1.0
 
 
 def _explained_by(jacobian: np.ndarray, residual: np.ndarray) -> Callable[[np.ndarray], tuple[float, float]]:
     """Function of columns over the readings: decrease of χ² and remaining sensitivity of all columns [σ²]."""
     half = np.linalg.solve(np.linalg.cholesky(jacobian.T @ jacobian), jacobian.T)
-    left = residual - half.T @ (half @ residual)
+    projected_residual = residual - half.T @ (half @ residual)
 
     def of(columns: np.ndarray) -> tuple[float, float]:
         inside = half[:, : len(columns)] @ columns
-        inner, told = columns.T @ columns - inside.T @ inside, columns.T @ left[: len(columns)]
+        inner, told = columns.T @ columns - inside.T @ inside, columns.T @ projected_residual[: len(columns)]
         return float(told @ np.linalg.lstsq(inner, told, rcond=1e-9)[0]), float(np.trace(inner))
 
     return of

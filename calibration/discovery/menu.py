@@ -207,8 +207,8 @@ def calibration_acts(reach: Reach) -> tuple[Act, ...]:
     amperes = round_significant(0.15 * total, 1), round_significant(0.75 * total, 1)
     turning = round_significant(0.25 * reach.motor_speed), round_significant(0.65 * reach.motor_speed)
     paces = round_significant(0.35 * reach.speed), round_significant(0.8 * reach.speed)
-    at = tuple((float(u.index), m) for u in reach.used for m in loads)
-    weighing = Act("weigh", ("weigh",), _weighed, at, 0.02, repeats=1)
+    settings = tuple((float(u.index), m) for u in reach.used for m in loads)
+    weighing = Act("weigh", ("weigh",), _weighed, settings, 0.02, repeats=1)
     ammeter = [
         Act("zero current", ("zero current",), _shunted, ((0.0,),), 0.02),
         Act("shunt", ("shunt",), _shunted, _one_tuple_each(amperes), 0.02),
@@ -256,11 +256,12 @@ def _runs(
     """Runs under every combination of slopes, voltages and, with a brake, its torques."""
     each = list(itertools.product(dict.fromkeys(slopes), dict.fromkeys(voltages), dict.fromkeys(torques)))
     slope, voltage, torque = (tuple(x) for x in zip(*each, strict=True))
-    own = (at.configuration,) if at is not None else ()
+    stated = (at.configuration,) if at is not None else ()
     return Run(
-        ", ".join((name, *own)), (*(kinds or (name,)), *own), doing, setup, voltage, slope, (payload,) * len(each),
+        ", ".join((name, *stated)), (*(kinds or (name,)), *stated), doing, setup, voltage, slope,
+        (payload,) * len(each),
         tuple(c for c in (read or reach.measured) if c in reach.measured), 0 if at is None else at.index, sides,
-        brake, math.inf if at is None else at.steepest, steepest, where=", ".join(own), motors=reach.motors,
+        brake, math.inf if at is None else at.steepest, steepest, where=", ".join(stated), motors=reach.motors,
         torque=torque if reach.torques else (),
     )  # fmt: skip
 
@@ -399,15 +400,15 @@ def possible_runs(run: Run, does: np.ndarray) -> np.ndarray:
     Args:
         does: True for runs that the robot can do, shape (runs,).
     """
-    kept = np.ones(len(does), bool)
+    possible = np.ones(len(does), bool)
     axes = [np.asarray(x) for x in (run.slope, run.voltage, run.payload, run.torque) if len(x)]
-    while kept.any() and not does[kept].all():
-        levels = [(axis, level) for axis in axes for level in np.unique(axis[kept])]
-        axis, level = max(levels, key=lambda at: float(np.mean(~does[kept & (at[0] == at[1])])))
-        kept &= axis != level
-    if run.steepest and kept.any():
-        kept &= axes[0] == axes[0][kept].max()
-    return kept
+    while possible.any() and not does[possible].all():
+        levels = [(axis, level) for axis in axes for level in np.unique(axis[possible])]
+        axis, level = max(levels, key=lambda at: float(np.mean(~does[possible & (at[0] == at[1])])))
+        possible &= axis != level
+    if run.steepest and possible.any():
+        possible &= axes[0] == axes[0][possible].max()
+    return possible
 
 
 def restrict_run(run: Run, kept: np.ndarray, temperature: np.ndarray, speed: np.ndarray, reach: Reach) -> Run:

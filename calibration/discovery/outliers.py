@@ -103,14 +103,14 @@ def screen_outliers(base: BaseFit, bases_at: Callable[[BaseFit], Bases], runs: R
         runs: the table.
     """
     where = runs.source
-    found = _exclude_outliers(base, bases_at, settings, where)
-    mine = np.zeros(len(base.space.included), bool)
-    mine[list(found.outliers)] = True
-    together = _common_property(found, mine, runs, settings)
+    screened = _exclude_outliers(base, bases_at, settings, where)
+    cluster_rows = np.zeros(len(base.space.included), bool)
+    cluster_rows[list(screened.outliers)] = True
+    together = _common_property(screened, cluster_rows, runs, settings)
     if together is None:
-        return found
-    bases, seen = _diagnose_base(base, bases_at, settings)
-    return Screening(base, (), bases, seen, together)
+        return screened
+    bases, diagnosis = _diagnose_base(base, bases_at, settings)
+    return Screening(base, (), bases, diagnosis, together)
 
 
 def screen_known_rows(
@@ -176,15 +176,15 @@ def _exclude_outliers(
     """Base fit without rows whose own shift is more significant than any effect or curve."""
     allowed = settings.outliers(int(base.space.included.sum()))
     base, outliers = _set_gross_aside(base, settings, where)
-    bases, seen = _diagnose_base(base, bases_at, settings)
+    bases, diagnosis = _diagnose_base(base, bases_at, settings)
     while len(outliers) < allowed:
-        far = _isolated_rows(base, seen[1], bases, allowed - len(outliers), settings)
+        far = _isolated_rows(base, diagnosis[1], bases, allowed - len(outliers), settings)
         if not far.size:
             break
         outliers = (*outliers, *map(int, far))
         base = _refit_without(base, far, settings, where)
-        bases, seen = _diagnose_base(base, bases_at, settings)
-    return Screening(base, outliers, bases, seen)
+        bases, diagnosis = _diagnose_base(base, bases_at, settings)
+    return Screening(base, outliers, bases, diagnosis)
 
 
 def _diagnose_base(
@@ -220,8 +220,8 @@ def _set_gross_aside(base: BaseFit, settings: Settings, where: str) -> tuple[Bas
         return base, ()
     for _ in range(settings.reweightings):
         robust = space.weight / np.sqrt(1 + (far / settings.cauchy) ** 2)[:, None]
-        optima, seen = search_each(problem, [start], [robust], None if active is None else [active])
-        far, start = off(np.asarray(seen.reading[0])), np.asarray(optima.z[0])
+        optima, observations = search_each(problem, [start], [robust], None if active is None else [active])
+        far, start = off(np.asarray(observations.reading[0])), np.asarray(optima.z[0])
     gross = included & (far > settings.gross * max(1.0, float(np.median(far[included]))))
     if not gross.any() or gross.sum() > settings.outliers(int(included.sum())):
         return base, ()

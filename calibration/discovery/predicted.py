@@ -132,18 +132,18 @@ def predict_readings(
     there, (runs, unknowns), and all predictions."""
     acts = tuple(act(robot, at) for act, at in zip(experiments.acts, experiments.at, strict=True))
     result, _, left = map_over_runs(IMPLICIT.shown, robot, experiments, unknowns, found)
-    every = jnp.stack([result.reading[c] for c in channels.channel_names(robot.channels)], -1)
-    held = np.array([experiments.set_up[k][0] is setups.blocked for k in experiments.which])
-    does = jnp.where(jnp.asarray(held), result.status == STALLED, is_done(result.status))
+    all_readings = jnp.stack([result.reading[c] for c in channels.channel_names(robot.channels)], -1)
+    is_held = np.array([experiments.set_up[k][0] is setups.blocked for k in experiments.which])
+    does = jnp.where(jnp.asarray(is_held), result.status == STALLED, is_done(result.status))
     exists = arrange_readings(
-        experiments, [jnp.ones(a.shape, bool) for a in acts], jnp.broadcast_to(does[:, None], every.shape)
+        experiments, [jnp.ones(a.shape, bool) for a in acts], jnp.broadcast_to(does[:, None], all_readings.shape)
     )
-    speed = jnp.where(jnp.asarray(held), 0.0, result.reading["motor_speed"])
-    shown = Predicted(
-        arrange_readings(experiments, acts, every), exists, does, jnp.asarray(result.adhesion_used),
+    speed = jnp.where(jnp.asarray(is_held), 0.0, result.reading["motor_speed"])
+    predicted_readings = Predicted(
+        arrange_readings(experiments, acts, all_readings), exists, does, jnp.asarray(result.adhesion_used),
         jnp.asarray(result.winding_settled), speed,
     )  # fmt: skip
-    return (acts, every, left), shown
+    return (acts, all_readings, left), predicted_readings
 
 
 def arrange_readings(experiments: Batch, acts: Sequence[Array], every: Float[Array, "runs channels ..."]) -> Array:

@@ -58,17 +58,17 @@ class HeldOutScore:
         """
         if not self.by_kind:
             return Gain(0.0, np.inf)
-        each = np.stack([x - over.by_kind[kind] for kind, x in self.by_kind.items()])
-        each = each if where is None else np.where(where, each, np.nan)
-        scored = np.isfinite(each)
+        gains = np.stack([x - over.by_kind[kind] for kind, x in self.by_kind.items()])
+        gains = gains if where is None else np.where(where, gains, np.nan)
+        scored = np.isfinite(gains)
         counts = scored.sum((0, 2))
         rows = counts > 0
         total = int(counts.sum())
         if not total:
             return Gain(0.0, np.inf)
-        mean = float(np.nansum(each) / total)
+        mean = float(np.nansum(gains) / total)
         # Errors by row, and by block of each kind, because readings of a block share the rows that were left out.
-        off = np.nansum(each, (0, 2)) - mean * counts
+        off = np.nansum(gains, (0, 2)) - mean * counts
         several = [by for by in self.blocks.values() if len(np.unique(by[by >= 0])) >= fewest]
         groups = [np.arange(len(rows)), *several]
         return Gain(mean, max(_clustered_standard_error(off[rows], by[rows]) for by in groups) / total)

@@ -39,8 +39,8 @@ def worse_predictions(
     """
     worse = []
     for kind, (before, after) in readings.items():
-        both = np.isfinite(before) & np.isfinite(after)
-        was, now = (errors(np.where(both, x, np.nan)) for x in (before, after))
+        in_both = np.isfinite(before) & np.isfinite(after)
+        was, now = (errors(np.where(in_both, x, np.nan)) for x in (before, after))
         for channel, e in now.items():
             old, new = float(was[channel]["rms_percent"]), float(e["rms_percent"])
             if new > (1 + TOLD) * old:
@@ -58,11 +58,11 @@ def compare_alternatives(
 
     Members that are not plausible cannot lead, and are omitted. Empty for a single one, or without blocks.
     """
-    others = [c for c in experiments.alternatives_of_class(best, alike, stated=False).values() if c.plausible]
+    alternatives = [c for c in experiments.alternatives_of_class(best, alike, stated=False).values() if c.plausible]
     data, rows = space.equipped.data, len(runs)
     measured, sd, counts = (np.asarray(x)[:rows] for x in (data.measured, data.sd, space.weight > 0))
     kinds = blocks_room.predictable_blocks(runs, space.bare)
-    if len(others) < 2 or not kinds:
+    if len(alternatives) < 2 or not kinds:
         return ()
 
     def sigma(c: Candidate, masks: list[np.ndarray]) -> np.ndarray:
@@ -70,8 +70,8 @@ def compare_alternatives(
         reading = predict_unseen(problem, z, masks, active).reading
         return np.where(counts, (reading - measured) / sd, np.nan)
 
-    errors = [{kind: sigma(c, list(by.values())) for kind, by in kinds.items()} for c in others]
-    held = {kind: counts & np.any(list(by.values()), 0)[:, None] for kind, by in kinds.items()}
+    errors = [{kind: sigma(c, list(by.values())) for kind, by in kinds.items()} for c in alternatives]
+    held_out = {kind: counts & np.any(list(by.values()), 0)[:, None] for kind, by in kinds.items()}
     common = {kind: np.all([np.isfinite(e[kind]) for e in errors], 0) for kind in kinds}
 
     def rms(e: Mapping[str, np.ndarray], blocks: Sequence[str]) -> float:
@@ -82,12 +82,12 @@ def compare_alternatives(
         HeldOutAlternative(
             effects=c.effects,
             leads=c is best,
-            rise_chi2=float(2 * (c.cost - min(x.cost for x in others))),
+            rise_chi2=float(2 * (c.cost - min(x.cost for x in alternatives))),
             rms_sigma=rms(e, list(kinds)),
             by_kind={kind: rms(e, [kind]) for kind in kinds},
-            lost=int(sum(np.sum(held[kind] & ~np.isfinite(e[kind])) for kind in kinds)),
+            lost=int(sum(np.sum(held_out[kind] & ~np.isfinite(e[kind])) for kind in kinds)),
         )
-        for c, e in zip(others, errors, strict=True)
+        for c, e in zip(alternatives, errors, strict=True)
     )
 
 
@@ -150,12 +150,12 @@ def _classes_of_leader(
     stated = dict(zip(best.effects, alike.stated, strict=True))
     stated[new] = stated.pop(old)
     keys = {best.key, *(c.key for c in alike.ladder)}
-    wanted = [
+    missing_fits = [
         tuple(other if n == name else n for n in leader.active)
         for name in leader.effects
         for other in members[name][1:]
     ]
-    missing = [w for w in wanted if frozenset(n for n in w if n) not in keys]
+    missing = [w for w in missing_fits if frozenset(n for n in w if n) not in keys]
     fitted = fit_candidates(space, [(w, start_of_fit(space, leader, w, settings)) for w in missing], settings)
     return Classes(
         tuple(members[name] for name in leader.effects),

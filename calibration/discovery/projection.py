@@ -57,9 +57,9 @@ def defect_by_row(linear: Linearization, place: str) -> Defect:
     shapes[places, np.arange(len(places))] = 1.0
     columns = place_signature(linear, place, shapes)
     a, b = Projection(linear)(columns)
-    norm2, whole = np.diag(a), np.sum(columns**2, 0)
-    seen = norm2 > 1e-6 * np.maximum(whole, 1e-300)
-    norm2 = np.where(seen, norm2, np.nan)
+    norm2, total_norm = np.diag(a), np.sum(columns**2, 0)
+    is_visible = norm2 > 1e-6 * np.maximum(total_norm, 1e-300)
+    norm2 = np.where(is_visible, norm2, np.nan)
     value, sd = np.full(linear.rows, np.nan), np.full(linear.rows, np.nan)
     value[places], sd[places] = b / norm2, 1 / np.sqrt(norm2)
     return Defect(value, sd)

@@ -116,8 +116,8 @@ def reach_of_table(robot: Robot, conditions: Conditions, measured: Names) -> Rea
         for x in (conditions.configuration, conditions.voltage, conditions.slope_deg, conditions.payload)
     )
     masses = np.asarray([float(c.mass) for c in robot.configurations.members])
-    stated = conditions.total_mass
-    mass = masses[which] + payload if stated is None else np.asarray(stated)
+    total_mass = conditions.total_mass
+    mass = masses[which] + payload if total_mass is None else np.asarray(total_mass)
     used = tuple(
         Used(name, k, _levels(volts[rows]), _levels(slope[rows]), _levels(payload[rows]), float(mass[rows].max()))
         for k, name in enumerate(robot.configurations)
@@ -134,11 +134,12 @@ def reach_of_table(robot: Robot, conditions: Conditions, measured: Names) -> Rea
     radius = max(float(c.radius) for c in robot.configurations.members)
     speed = largest["speed"] or motor_speed * radius / float(robot.gearbox.ratio)
     voltage = max(highest, motor.voltage_limit or 0.0)
-    alone = max(motor.speed_limit, motor_speed)
+    free_speed = max(motor.speed_limit, motor_speed)
     geared = max(min(motor.speed_limit, robot.gearbox.speed_limit), motor_speed)
     return Reach(
-        used, measured, voltage, min(voltage, constant * geared), min(voltage, constant * alone), current,
-        motor_speed, speed, geared, alone, motors, resistance, constant, motor.temperature_limit, robot.rig.imposed,
+        used, measured, voltage, min(voltage, constant * geared), min(voltage, constant * free_speed), current,
+        motor_speed, speed, geared, free_speed, motors, resistance, constant, motor.temperature_limit,
+        robot.rig.imposed,
         _levels(np.asarray(getattr(conditions, robot.rig.imposed))) if conditions.voltage_follows else (),
         robot.has_ground, _levels(np.abs(np.asarray(conditions.duty))),
         () if conditions.load_torque is None else _levels(np.abs(np.asarray(conditions.load_torque))),
@@ -148,5 +149,7 @@ def reach_of_table(robot: Robot, conditions: Conditions, measured: Names) -> Rea
 def reach_of_space(space: CandidateSpace, robot: Robot | None = None) -> Reach:
     """Limits of the next experiments with the robot of a space, or with a fitted one if given."""
     weight = space.weight
-    measured = tuple(c for k, c in enumerate(channels.channel_names(space.bare.channels)) if weight[:, k].any())
-    return reach_of_table(space.bare.base if robot is None else robot, space.bare.observe.driven, measured)
+    measured_channels = tuple(
+        c for k, c in enumerate(channels.channel_names(space.bare.channels)) if weight[:, k].any()
+    )
+    return reach_of_table(space.bare.base if robot is None else robot, space.bare.observe.driven, measured_channels)

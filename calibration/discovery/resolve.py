@@ -44,9 +44,9 @@ def question_of_verdict(found: DiscoveryResult) -> Asked | None:
         for balance in (place.balance, *place.balances_alike):
             if balance in BALANCES:
                 return Asked("missing", balance, place.variable)
-    named = [e.name for e in found.effects if e.balance in BALANCES]
-    if named:
-        return Asked("found", effects=tuple(named))
+    balance_effects = [e.name for e in found.effects if e.balance in BALANCES]
+    if balance_effects:
+        return Asked("found", effects=tuple(balance_effects))
     weighed = [a for a in found.alternatives if any(enters_gear_balance(name, found) for name in a.effects)]
     if weighed:
         return Asked("near", effects=tuple(n for n in weighed[0].effects if enters_gear_balance(n, found)))
@@ -102,8 +102,10 @@ def resolve(
         return None
     present = {str(c) for c in rows["configuration"]}
     lumped = {f.name for f in found.effects if f.balance in BALANCES} | set(UNNAMED)
-    kept = tuple(e for e in robot.effects if not (e.resolved or (e.name in lumped and e.balance in BALANCES)))
-    robot = dataclasses.replace(robot, effects=kept)
+    other_effects = tuple(
+        e for e in robot.effects if not (e.resolved or (e.name in lumped and e.balance in BALANCES))
+    )
+    robot = dataclasses.replace(robot, effects=other_effects)
     friction = tuple(f"{name}.{part}" for name in tracked if name in present for part in FRICTION)
     gear = tuple(f"running_gear.{name}" for name in GEAR)
     sds = _noise(found, noise)
@@ -118,10 +120,10 @@ def resolve(
         )  # fmt: skip
 
     tell(next_step("gear stated"))
-    stated = fit(friction)
+    fitted_robot = fit(friction)
     tell(next_step("gear free"))
     free = fit((*friction, *gear), members)
-    fall = 2 * (stated.objective - free.objective)
+    fall = 2 * (fitted_robot.objective - free.objective)
     return Resolved(
         asked=reason,
         rows=len(rows),
@@ -129,16 +131,16 @@ def resolve(
         constants={n: Estimate(p.value, p.sd, p.unit, p.held_by_prior) for n, p in free.parameters.items()},
         alike=tuple(free.identifiability.correlated()),
         outside=tuple(n for n, p in free.parameters.items() if n in gear and abs(p.shift) > PLAUSIBLE),
-        settled=stated.converged and free.converged,
+        settled=fitted_robot.converged and free.converged,
         fall=float(fall),
         p=float(chdtrc(len(gear), max(fall, 0.0))),
-        chi2=(stated.chi_square.value, free.chi_square.value),
+        chi2=(fitted_robot.chi_square.value, free.chi_square.value),
         readings=int(np.isfinite(rows.measured()).sum()),
         rms_percent={
-            c.name: (stated.errors_after[c.name].rms_percent, free.errors_after[c.name].rms_percent)
+            c.name: (fitted_robot.errors_after[c.name].rms_percent, free.errors_after[c.name].rms_percent)
             for c in found.channels
         },
-        slip_rms=(_slip_rms(stated, robot), _slip_rms(free, robot)),
+        slip_rms=(_slip_rms(fitted_robot, robot), _slip_rms(free, robot)),
         remarks=free.remarks,
     )
 

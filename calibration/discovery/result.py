@@ -615,10 +615,14 @@ class DiscoveryResult:
 
         `chi2` also contains the parameters' distances from their priors, and penalties.
         """
-        seen = self.readings_of_rows
+        readings = self.readings_of_rows
         before, after = (
-            float(np.nansum(np.where(self.included[:, None], (simulated - seen.measured) / seen.sd, np.nan) ** 2))
-            for simulated in (seen.before, seen.after)
+            float(
+                np.nansum(
+                    np.where(self.included[:, None], (simulated - readings.measured) / readings.sd, np.nan) ** 2
+                )
+            )
+            for simulated in (readings.before, readings.after)
         )
         return before, after
 
@@ -643,15 +647,15 @@ class DiscoveryResult:
     def held_by_prior(self) -> tuple[str, ...]:
         """Names of the fitted parameters of the proposed robot that are held by their priors."""
         base = [name for name, p in self.base_shift.items() if p.held_by_prior]
-        each = [(f"effects.{e.name}.{name}", p) for e in self.effects for name, p in e.parameters.items()]
-        return (*base, *(name for name, p in each if p.held_by_prior))
+        parameters = [(f"effects.{e.name}.{name}", p) for e in self.effects for name, p in e.parameters.items()]
+        return (*base, *(name for name, p in parameters if p.held_by_prior))
 
     @property
     def together(self) -> tuple[Pair, ...]:
         """Pairs of base parameters and effects' parameters that the data determine only in combination."""
-        own = {*self.base_shift, *(f"effects.{e.name}.{name}" for e in self.effects for name in e.parameters)}
+        shown_names = {*self.base_shift, *(f"effects.{e.name}.{name}" for e in self.effects for name in e.parameters)}
         pairs = determined_together(self.posterior, self.held_by_prior)
-        return tuple(pair for pair in pairs if own >= {pair.one, pair.other})
+        return tuple(pair for pair in pairs if shown_names >= {pair.one, pair.other})
 
     def to_json(self) -> dict[str, Any]:
         """Everything as JSON-able data, as docs/schemas/loop.schema.json describes it."""
@@ -741,21 +745,24 @@ class DiscoveryResult:
 
     def rows_table(self) -> dict[str, np.ndarray]:
         """Table by row: conditions, readings measured, simulated before and after and held out, defects if known."""
-        seen = self.readings_of_rows
-        known = ("run_id", *WHEN, "configuration", *self.runs.axes, *DRIVING)
-        table = {"row": self.numbers, **{k: self.runs[k] for k in known if self.runs.has(k)}}
-        main = next(iter(seen.held_out.values()), None)
+        readings = self.readings_of_rows
+        known_columns = ("run_id", *WHEN, "configuration", *self.runs.axes, *DRIVING)
+        table = {"row": self.numbers, **{k: self.runs[k] for k in known_columns if self.runs.has(k)}}
+        main = next(iter(readings.held_out.values()), None)
         for k, channel in enumerate(self.channels):
             column, unit = channel.column, channel.factor
-            table[column] = seen.measured[:, k] / unit
-            table[channel.sd_column] = seen.sd[:, k] / unit
-            table[f"before_{column}"], table[f"after_{column}"] = seen.before[:, k] / unit, seen.after[:, k] / unit
+            table[column] = readings.measured[:, k] / unit
+            table[channel.sd_column] = readings.sd[:, k] / unit
+            table[f"before_{column}"], table[f"after_{column}"] = (
+                readings.before[:, k] / unit,
+                readings.after[:, k] / unit,
+            )
             if main is not None:
                 table[f"held_out_before_{column}"] = main[0][:, k] / unit
                 table[f"held_out_after_{column}"] = main[1][:, k] / unit
-            for when, simulated in (("before", seen.before), ("after", seen.after)):
+            for when, simulated in (("before", readings.before), ("after", readings.after)):
                 name = f"residual_{when}_{channel.name}_sigma"
-                table[name] = (simulated[:, k] - seen.measured[:, k]) / seen.sd[:, k]
+                table[name] = (simulated[:, k] - readings.measured[:, k]) / readings.sd[:, k]
         table |= self.detail.columns()
         use = np.full(len(self.runs), "used", dtype="<U8")
         use[np.isin(self.numbers, self.outliers)] = "outlier"
@@ -777,8 +784,8 @@ class DiscoveryResult:
         folder.mkdir(parents=True, exist_ok=True)
         write_json(folder / "result.json", self.to_json())
         write_table(folder / "rows.csv", self.rows_table(), tables)
-        held = [describe(Remark("held_by_prior", names=self.held_by_prior))] if self.held_by_prior else []
-        note = "\n".join([describe(self, "header", robot_name), *held])
+        held_sentence = [describe(Remark("held_by_prior", names=self.held_by_prior))] if self.held_by_prior else []
+        note = "\n".join([describe(self, "header", robot_name), *held_sentence])
         robot_file.write_robot(self.robot, folder / "robot.toml", note=note)
         robot_file.write_robot(self.refit, folder / REFIT_FILE, note=describe(self, "refit header", robot_name))
         posterior.write_posterior(self.posterior, folder / posterior.FILE)
@@ -809,8 +816,8 @@ class Sensitivity:
 
     def to_json(self) -> dict[str, Any]:
         """Entry of result.json."""
-        found = {n: getattr(self, n) for n in ("factor", "verdict", "statement", "classes", "adequate_after")}
-        return found | ({"near": True} if self.near else {})
+        entries = {n: getattr(self, n) for n in ("factor", "verdict", "statement", "classes", "adequate_after")}
+        return entries | ({"near": True} if self.near else {})
 
 
 def _effect(e: FoundEffect, support: NameSupport | None) -> dict[str, Any]:

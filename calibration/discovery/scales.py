@@ -97,14 +97,14 @@ def library_of_size(robot: Robot, conditions: Conditions, library: Library, turn
     """
     if robot.rig.inherits:
         return library
-    mine = _signals(robot, _steady(robot, conditions))
+    signals = _signals(robot, _steady(robot, conditions))
     nominal, theirs = _nominal()
     sized = {}
     for name, kind in library.items():
         if not effect_applies(kind, robot):
             continue
         sized[name] = _scale_effect(
-            kind, (robot, _at_position(mine, kind, turned)), (nominal, _at_position(theirs, kind))
+            kind, (robot, _at_position(signals, kind, turned)), (nominal, _at_position(theirs, kind))
         )
     return sized
 
@@ -123,9 +123,9 @@ def nominal_ahead(robot: Robot) -> Iterator[None]:
 
 def output_rotation(runs: Runs, robot: Robot) -> float:
     """Root mean square of the output's angles in a table [rad], NaN without such a channel."""
-    measured = runs.measured()
+    measured_values = runs.measured()
     for k, channel in enumerate(runs.channels):
-        if channel.name in PLACED and math.isfinite(size := _size(measured[:, k])):
+        if channel.name in PLACED and math.isfinite(size := _size(measured_values[:, k])):
             return size / (float(robot.configurations.members[0].radius) if channel.name == "position" else 1.0)
     return math.nan
 
@@ -239,12 +239,14 @@ def _at_rated_load(robot: Robot, signals: Signals) -> Signals:
 def _unit_share(effect: Effect, robot: Robot, signals: Signals) -> float:
     """Share of a term of amplitude one in its balance [1/unit of the amplitude]."""
     one = params.replace(effect, {amplitude_of(effect).name: jnp.asarray(1.0)})
-    alone = dataclasses.replace(robot, effects=(one,))
+    robot_with_effect = dataclasses.replace(robot, effects=(one,))
 
     def share(s: Signals) -> tuple[jax.Array, jax.Array]:
-        shown = next((c.read(robot, s) for c in channels.EVERY if c.name == effect.channel), None)
-        whole = WHOLE[effect.balance](robot, s) if shown is None else shown
-        return jnp.asarray(effects_sum(alone, s, effect.balance, effect.channel), float), jnp.asarray(whole, float)
+        reading = next((c.read(robot, s) for c in channels.EVERY if c.name == effect.channel), None)
+        whole = WHOLE[effect.balance](robot, s) if reading is None else reading
+        return jnp.asarray(effects_sum(robot_with_effect, s, effect.balance, effect.channel), float), jnp.asarray(
+            whole, float
+        )
 
     term, total = jax.vmap(share)(signals)
     return _size(term) / _size(total)

@@ -85,8 +85,8 @@ class Fit(eqx.Module):
     def of(linear: Linearization) -> Fit:
         """Factors of a linearisation."""
         jacobian, e, readings = linear.jacobian, linear.residual, linear.readings
-        asked = jnp.concatenate([jacobian[:readings].T, (jacobian.T @ e)[:, None]], 1)
-        solved = solve_lower(jacobian.T @ jacobian, asked)
+        right_sides = jnp.concatenate([jacobian[:readings].T, (jacobian.T @ e)[:, None]], 1)
+        solved = solve_lower(jacobian.T @ jacobian, right_sides)
         half, step = solved[:, :-1], solved[:, -1]
         return Fit(half, step, e[:readings] - half.T @ step)
 
@@ -100,23 +100,25 @@ def score_tests(linear: Linearization, bases: Bases) -> ScoreTable:
     """Scores of each instance, pair, curve and reading."""
     g, fit = linear.signatures, Fit.of(linear)
     dots, products = fit.projected(g)
-    whole = jnp.sum(g**2, 0)
+    total_norm = jnp.sum(g**2, 0)
     norm2 = jnp.maximum(jnp.diag(products), 0.0)
-    seen = norm2 > ABSORBED**2 * jnp.maximum(whole, 1e-300)
-    norm = jnp.sqrt(jnp.where(seen, norm2, 1.0))
-    single = jnp.where(seen, -dots / norm, 0.0)
-    both_seen = seen[:, None] & seen
+    is_visible = norm2 > ABSORBED**2 * jnp.maximum(total_norm, 1e-300)
+    norm = jnp.sqrt(jnp.where(is_visible, norm2, 1.0))
+    single = jnp.where(is_visible, -dots / norm, 0.0)
+    both_seen = is_visible[:, None] & is_visible
     cosine = jnp.where(both_seen, products / (norm[:, None] * norm), 0.0)
     apart = jnp.where(both_seen, 1 - cosine**2, 0.0)
-    both = (single[:, None] ** 2 + single**2 - 2 * cosine * single[:, None] * single) / jnp.maximum(apart, 1e-9)
-    pair = jnp.where(apart > 1e-2, both, 0.0)
+    pair_scores = (single[:, None] ** 2 + single**2 - 2 * cosine * single[:, None] * single) / jnp.maximum(
+        apart, 1e-9
+    )
+    pair = jnp.where(apart > 1e-2, pair_scores, 0.0)
 
     leverage = jnp.sum(fit.half**2, 0)
     row = jnp.where(leverage < 1 - 1e-6, fit.left / jnp.sqrt(jnp.maximum(1 - leverage, 1e-12)), 0.0)
 
     scores = [jax.vmap(lambda c: _curve_score(fit, c))(basis.signatures(linear)) for basis in bases]
     deviate, explained = (jnp.concatenate([f[k] for f in scores] or [jnp.zeros(0)]) for k in (0, 1))
-    amplitude = jnp.where(seen, -dots / norm**2, 0.0)
+    amplitude = jnp.where(is_visible, -dots / norm**2, 0.0)
     row = row.reshape(linear.rows, -1)
     fall = 0.5 * jnp.sum(fit.step**2)
     return ScoreTable(single, amplitude, jnp.sqrt(norm2), pair, cosine, deviate, explained, row, fall)
@@ -129,17 +131,17 @@ def _curve_score(fit: Fit, columns: Array) -> tuple[Array, Array]:
     """
     dots, products = fit.projected(columns)
     norm2 = jnp.diag(products)
-    seen = norm2 > ABSORBED**2 * jnp.maximum(jnp.sum(columns**2, 0), 1e-300)
-    scale = jnp.where(seen, 10.0 / jnp.sqrt(jnp.where(seen, norm2, 1.0)), 0.0)
+    is_visible = norm2 > ABSORBED**2 * jnp.maximum(jnp.sum(columns**2, 0), 1e-300)
+    scale = jnp.where(is_visible, 10.0 / jnp.sqrt(jnp.where(is_visible, norm2, 1.0)), 0.0)
     products = products * scale[:, None] * scale
     dots = dots * scale
-    asked = jnp.concatenate([dots[:, None], jnp.eye(dots.size)], 1)
-    half = solve_lower(products + jnp.eye(dots.size), asked)
+    right_sides = jnp.concatenate([dots[:, None], jnp.eye(dots.size)], 1)
+    half = solve_lower(products + jnp.eye(dots.size), right_sides)
     explained = jnp.sum(half[:, 0] ** 2)
     # E = tr(A (A + I)⁻¹) under the null: degrees of freedom.
     freedom = dots.size - jnp.sum(half[:, 1:] ** 2)
     deviate = normal_deviate(explained, jnp.maximum(freedom, 1e-3))
-    return jnp.where(jnp.any(seen), deviate, -1.0 / ABSORBED), explained
+    return jnp.where(jnp.any(is_visible), deviate, -1.0 / ABSORBED), explained
 
 
 def normal_deviate(chi2: Array, freedom: Array) -> Array:
@@ -252,11 +254,11 @@ def augment_with_columns(linear: Linearization, extra: np.ndarray) -> tuple[np.n
     """
     jacobian, (readings, wide) = np.asarray(linear.jacobian), extra.shape
     total, free = jacobian.shape
-    whole = np.zeros((total + wide, free + wide))
-    whole[:total, :free] = jacobian
-    whole[:readings, free:] = extra
-    whole[total:, free:] = np.eye(wide)
-    return whole, np.concatenate([np.asarray(linear.residual), np.zeros(wide)])
+    augmented = np.zeros((total + wide, free + wide))
+    augmented[:total, :free] = jacobian
+    augmented[:readings, free:] = extra
+    augmented[total:, free:] = np.eye(wide)
+    return augmented, np.concatenate([np.asarray(linear.residual), np.zeros(wide)])
 
 
 def statistics_with_columns(
@@ -314,22 +316,22 @@ def bootstrap(
             Each table is drawn with random true sds, given such estimates.
     """
     count = -(-replicates // CHUNK)
-    drawn = problem.observe.draws(
+    draws = problem.observe.draws(
         problem, jnp.asarray(z), linear, _keys(jnp.asarray(seed), count, replicates),
         _factors(freedom, len(problem.channels), replicates, seed),
     )  # fmt: skip
     # Padded to whole batches by repeats, which are cut off later.
-    drawn = jax.tree.map(lambda x: np.resize(np.asarray(x), (count, CHUNK, *x.shape[1:])), drawn)
+    draws = jax.tree.map(lambda x: np.resize(np.asarray(x), (count, CHUNK, *x.shape[1:])), draws)
 
     def part(k: int) -> Statistics:
-        mine = jax.tree.map(lambda x: x[k], drawn)
-        return jax.device_get(_replicates(problem, linear, effects, bases, mine))
+        draws_of_part = jax.tree.map(lambda x: x[k], draws)
+        return jax.device_get(_replicates(problem, linear, effects, bases, draws_of_part))
 
     # The first batch compiles the program of the others; a batch keeps one core busy.
     with Threads(CORES) as cores:
         parts = [part(0), *cores.map(part, range(1, count))]
-    whole = jax.tree.map(lambda *x: np.concatenate(x)[:replicates], *parts)
-    return jax.tree.map(lambda x: x[whole.settled], whole)
+    statistics = jax.tree.map(lambda *x: np.concatenate(x)[:replicates], *parts)
+    return jax.tree.map(lambda x: x[statistics.settled], statistics)
 
 
 def _factors(freedom: np.ndarray | None, channels: int, replicates: int, seed: int) -> np.ndarray:
@@ -349,7 +351,7 @@ def _replicates(
     """A batch of a bootstrap, from the observer's draws."""
 
     def one(drawn: Any) -> Statistics:
-        again = problem.observe.replicate(problem, problem.data, effects, linear, drawn)
-        return strongest_statistics(score_tests(again, bases), again)
+        replicate = problem.observe.replicate(problem, problem.data, effects, linear, drawn)
+        return strongest_statistics(score_tests(replicate, bases), replicate)
 
     return jax.vmap(one)(drawn)

@@ -82,7 +82,7 @@ class Regression:
         """Candidate with these effects in the slots. New ones have the shape of their grid with the best score."""
         p, s, at = self.space.free, self.settings.slots, self.at
         size = self.jacobian.shape[1]  # residuals of the priors come last, in the order of the coordinates
-        slopes, residual, own = self.jacobian[:-size], self.residual[:-size].copy(), self.residual[-size:]
+        slopes, residual, prior_residual = self.jacobian[:-size], self.residual[:-size].copy(), self.residual[-size:]
         for old, name in enumerate(at.active):
             if name and name not in active:  # at amplitude 0
                 residual -= slopes[:, p + old] * at.z[p + old]
@@ -90,28 +90,28 @@ class Regression:
         for slot, name in enumerate(active):
             if not name:
                 continue
-            here = [p + slot, p + s + slot]
+            slot_places = [p + slot, p + s + slot]
             if name in at.active:
-                known = [p + at.active.index(name), p + s + at.active.index(name)]
-                columns.append(slopes[:, known])
-                z[here] = at.z[known]
+                former_places = [p + at.active.index(name), p + s + at.active.index(name)]
+                columns.append(slopes[:, former_places])
+                z[slot_places] = at.z[former_places]
             else:
                 m = self.space.library.best_instance(name, np.asarray(self.scores.single))
                 columns.append(np.zeros((len(slopes), 2)))
                 columns[-1][: len(self.signatures), 0] = self.settings.width * self.signatures[:, m]
-                z[here[1]] = self.space.library.at[m]
-            places += here
-        whole = np.concatenate([np.concatenate(columns, 1), np.eye(len(places))])
-        left = np.concatenate([residual, own[:p], z[places[p:]]])
-        covariance = np.linalg.inv(whole.T @ whole)
-        step = -covariance @ (whole.T @ left)
+                z[slot_places[1]] = self.space.library.at[m]
+            places += slot_places
+        columns_and_prior = np.concatenate([np.concatenate(columns, 1), np.eye(len(places))])
+        target = np.concatenate([residual, prior_residual[:p], z[places[p:]]])
+        covariance = np.linalg.inv(columns_and_prior.T @ columns_and_prior)
+        step = -covariance @ (columns_and_prior.T @ target)
         z[places] += step
         sd = np.ones(len(z))
         sd[places] = np.sqrt(np.diag(covariance))
-        cost = np.asarray(0.5 * np.sum((left + whole @ step) ** 2))
+        cost = np.asarray(0.5 * np.sum((target + columns_and_prior @ step) ** 2))
         parts: tuple[Any, ...] = (z, sd, covariance, cost, np.asarray(0.0), np.asarray(True), np.asarray(0))
-        found = Optimum(*parts)
-        return dataclasses.replace(candidate_of_fit(self.space, active, found, self.settings), simulated=False)
+        optimum = Optimum(*parts)
+        return dataclasses.replace(candidate_of_fit(self.space, active, optimum, self.settings), simulated=False)
 
 
 def confirm_by_simulation(space: CandidateSpace, screened: Sequence[Candidate], settings: Settings) -> Confirmed:
@@ -131,12 +131,12 @@ def confirm_by_simulation(space: CandidateSpace, screened: Sequence[Candidate], 
     order = sorted(screened, key=lambda c: c.cost + (0.0 if fits(c) else more))
     order = [c for c in order if np.isfinite(c.cost)]
     within = [c for c in order if fits(c)] if order and fits(order[0]) else order
-    first, found = _first_to_simulate(space, within), dict[tuple[str, ...], Candidate]()
+    first, simulated = _first_to_simulate(space, within), dict[tuple[str, ...], Candidate]()
     space = space.with_room([*space.room, *(n for c in first for n in c.effects)])  # one program for all of them
-    said = {c.active: c for c in order}
+    by_regression = {c.active: c for c in order}
 
     def less(c: Candidate) -> bool:
-        return 2 * (c.cost - said[c.active].cost) > settings.same
+        return 2 * (c.cost - by_regression[c.active].cost) > settings.same
 
     def simulate(those: Sequence[Candidate]) -> None:
         """Simulate from the regression's coordinates.
@@ -144,26 +144,26 @@ def confirm_by_simulation(space: CandidateSpace, screened: Sequence[Candidate], 
         Sets that explain less there are repeated from the prior mean: a model error may have led the fit without the
         effect elsewhere.
         """
-        made = fit_candidates(space, [(c.active, _start_of_simulation(space, c)) for c in those], settings)
-        found.update({c.active: c for c in made})
+        fits = fit_candidates(space, [(c.active, _start_of_simulation(space, c)) for c in those], settings)
+        simulated.update({c.active: c for c in fits})
         new = [c for c in those if c.active not in space.near]
-        doubted = [c for c in new if less(found[c.active])]
+        doubted = [c for c in new if less(simulated[c.active])]
         at_mean = [np.where(np.arange(len(c.z)) < space.free, 0.0, _start_of_simulation(space, c)) for c in doubted]
-        again = fit_candidates(space, [(c.active, z) for c, z in zip(doubted, at_mean, strict=True)], settings)
-        found.update({c.active: c for c in again if c.cost < found[c.active].cost})
+        refits = fit_candidates(space, [(c.active, z) for c, z in zip(doubted, at_mean, strict=True)], settings)
+        simulated.update({c.active: c for c in refits if c.cost < simulated[c.active].cost})
 
     simulate(first)
     leader = first[0] if first else None
     for _ in range(FURTHER):
-        best = min((c.cost for c in found.values() if c.plausible), default=np.inf)
-        rest = [c for c in order if c.active not in found and c.plausible]
-        further = [c for c in rest if c.cost < best or fits(c)]
-        if leader is None or not less(found[leader.active]) or not further:
+        best = min((c.cost for c in simulated.values() if c.plausible), default=np.inf)
+        not_simulated = [c for c in order if c.active not in simulated and c.plausible]
+        promising = [c for c in not_simulated if c.cost < best or fits(c)]
+        if leader is None or not less(simulated[leader.active]) or not promising:
             break
-        leader = further[0]
+        leader = promising[0]
         simulate([leader])
-    every = tuple(found.get(c.active, c) for c in screened)
-    return Confirmed(every, len(found), sum(less(c) for c in found.values()), space.room)
+    confirmed = tuple(simulated.get(c.active, c) for c in screened)
+    return Confirmed(confirmed, len(simulated), sum(less(c) for c in simulated.values()), space.room)
 
 
 def _start_of_simulation(space: CandidateSpace, screened: Candidate) -> np.ndarray:
@@ -209,34 +209,34 @@ def screen_by_weak_form(space: CandidateSpace, settings: Settings) -> Beforehand
     """Base parameters and effects by regression on a log's equations in weak form, None if it does not show its
     states (`weak_form`)."""
     problem = space.bare
-    found = weak_form(problem, space.library.scored) if problem.observe.long else None
-    if found is None:
+    equations = weak_form(problem, space.library.scored) if problem.observe.long else None
+    if equations is None:
         return None
-    q = np.linalg.qr(found.jacobian)[0]
-    whole = np.concatenate([found.signatures, np.zeros((space.free, found.signatures.shape[1]))])
-    left = whole - q @ (q.T @ whole)
-    norm = np.linalg.norm(left, axis=0)
-    seen = norm > ABSORBED * np.maximum(np.linalg.norm(whole, axis=0), 1e-300)
-    ways = np.where(seen, left / np.where(seen, norm, 1.0), 0.0)
-    single = -ways.T @ found.residual
+    q = np.linalg.qr(equations.jacobian)[0]
+    columns = np.concatenate([equations.signatures, np.zeros((space.free, equations.signatures.shape[1]))])
+    projected = columns - q @ (q.T @ columns)
+    norm = np.linalg.norm(projected, axis=0)
+    is_visible = norm > ABSORBED * np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
+    ways = np.where(is_visible, projected / np.where(is_visible, norm, 1.0), 0.0)
+    single = -ways.T @ equations.residual
     none = np.zeros(0)
-    amplitude = np.where(seen, single / np.where(seen, norm, 1.0), 0.0)
+    amplitude = np.where(is_visible, single / np.where(is_visible, norm, 1.0), 0.0)
     parts: tuple[Any, ...] = (single, amplitude, norm, none, ways.T @ ways, *[none] * 4)
     scores = ScoreTable(*parts)
     random = np.random.default_rng(settings.seed)
     null = np.max(np.abs(random.standard_normal((settings.replicates, len(ways))) @ ways), 1)
     slots = np.zeros(2 * settings.slots)
-    sd = np.sqrt(np.diag(np.linalg.inv(found.jacobian.T @ found.jacobian)))
-    z, sd = np.concatenate([found.z, slots]), np.concatenate([sd, slots + 1])
-    cost = np.asarray(0.5 * np.sum(found.residual**2))
+    sd = np.sqrt(np.diag(np.linalg.inv(equations.jacobian.T @ equations.jacobian)))
+    z, sd = np.concatenate([equations.z, slots]), np.concatenate([sd, slots + 1])
+    cost = np.asarray(0.5 * np.sum(equations.residual**2))
     of_fit: tuple[Any, ...] = (z, sd, np.zeros((0, 0)), cost, np.asarray(0.0), np.asarray(True), np.asarray(0))
-    at = Optimum(*of_fit)
-    base = dataclasses.replace(candidate_of_fit(space, empty_slots(settings), at, settings), simulated=False)
+    optimum = Optimum(*of_fit)
+    base = dataclasses.replace(candidate_of_fit(space, empty_slots(settings), optimum, settings), simulated=False)
     slides = problem.base.has_ground and problem.base.rig.imposed == "voltage"
     missing = np.mean(null >= np.max(np.abs(single))) < settings.family_wise_error
     brief = problem.observe.times.size <= BRIEF  # type: ignore[attr-defined]  # of histories
-    room = _program_room(space, base, found, scores, settings) if missing and brief else ()
-    return Beforehand(None if slides else base, room, scores, found.windows, null)
+    room = _program_room(space, base, equations, scores, settings) if missing and brief else ()
+    return Beforehand(None if slides else base, room, scores, equations.windows, null)
 
 
 def fit_by_regression(
@@ -247,8 +247,8 @@ def fit_by_regression(
     Args:
         wanted: (active effects, the other fit, its diagnosis).
     """
-    known = {id(left): Regression(space, at, left.linear, left.scores, settings) for _, at, left in wanted}
-    return [known[id(left)](active) for active, _, left in wanted]
+    regressions = {id(left): Regression(space, at, left.linear, left.scores, settings) for _, at, left in wanted}
+    return [regressions[id(left)](active) for active, _, left in wanted]
 
 
 def with_program_room(
@@ -274,5 +274,5 @@ def _program_room(
     alike = library.largest(cosine)
     near = [library.names[k] for k in np.argsort(-alike) if alike[k] > settings.alike]
     best = {library[c.active[0]].family(): c for c in reversed(order)}  # of each family
-    others = [c.active[0] for c in sorted(best.values(), key=lambda c: c.cost)]
-    return tuple(dict.fromkeys((*first, *near[:NEAR], *others)))[:ROOM]
+    first_effects = [c.active[0] for c in sorted(best.values(), key=lambda c: c.cost)]
+    return tuple(dict.fromkeys((*first, *near[:NEAR], *first_effects)))[:ROOM]

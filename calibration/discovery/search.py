@@ -49,9 +49,9 @@ def diagnose_candidate(
 ) -> Diagnosis:
     """Diagnosis of a fit."""
     z = jnp.asarray(fitted.z)
-    seen = diagnose_fit(space.problem(fitted.active), z, space.library.scored, bases)
-    linear, scores, found = jax.device_get(seen)
-    return Diagnosis(linear, scores, AdequacyTest(found, null, settings))
+    diagnosis = diagnose_fit(space.problem(fitted.active), z, space.library.scored, bases)
+    linear, scores, statistics = jax.device_get(diagnosis)
+    return Diagnosis(linear, scores, AdequacyTest(statistics, null, settings))
 
 
 def search_effects(
@@ -75,11 +75,11 @@ def search_effects(
     space = space.with_room(rounds[0].room)
     ladder = list(rounds[0].candidates)
     null = np.asarray(left.test.null.single)
-    best, diagnosis, seen = _best(ladder), None, None
+    best, diagnosis, diagnosed = _best(ladder), None, None
     if best is not None and single_p_value(2 * (base.cost - best.cost), null) > settings.family_wise_error:
         best = None
     while best is not None:
-        seen = best
+        diagnosed = best
         diagnosis = diagnose_candidate(space, best, bases, left.test.null, settings)
         if not diagnosis.test.rejected_with_margin or len(best.effects) == int(
             min(settings.slots, max(1, space.included.sum() // settings.rows_per_effect))
@@ -96,8 +96,8 @@ def search_effects(
             gains = [2 * (c.cost - best.cost) for c in fewer]
             if any(single_p_value(gain, null) > settings.family_wise_error for gain in gains):
                 best = None
-    asked, otherwise = (sum(getattr(r, name) for r in rounds) for name in ("asked", "otherwise"))
-    return Search(tuple(ladder), seen, diagnosis, asked, otherwise, space.room)
+    simulated_count, otherwise = (sum(getattr(r, name) for r in rounds) for name in ("asked", "otherwise"))
+    return Search(tuple(ladder), diagnosed, diagnosis, simulated_count, otherwise, space.room)
 
 
 def best_of_each_size(found: Search) -> list[Candidate]:
@@ -170,8 +170,8 @@ def _extend(
     sources = {fill_slots([*best.effects, name], settings): (best, left_by_best) for name in names}
     if len(best.effects) == 1:
         for pair in _pairs(space, left.scores):
-            one, other = fill_slots(pair, settings), fill_slots(pair[::-1], settings)
-            if one not in sources and other not in sources:
+            one, swapped = fill_slots(pair, settings), fill_slots(pair[::-1], settings)
+            if one not in sources and swapped not in sources:
                 sources[one] = (base, left)
     return _fit_sets(space, [(w, at, by) for w, (at, by) in sources.items()], settings)
 

@@ -123,8 +123,8 @@ def smooth_curve(linear: Linearization, balance: str, variable: str, counts: np.
         evidence = 0.5 * pull @ z - 0.5 * np.linalg.slogdet(information)[1]
         if evidence > best[0]:
             explained = 2 * pull @ z - z @ inner @ z
-            taken = float(np.trace(np.linalg.solve(information, inner)))
-            best = evidence, (scale, root, z, float(explained), taken, 2 * float(evidence))
+            degrees_taken = float(np.trace(np.linalg.solve(information, inner)))
+            best = evidence, (scale, root, z, float(explained), degrees_taken, 2 * float(evidence))
     name = f"wave_{balance}" if variable in ORDERS else f"curve_{balance}_{axis}"
     return Smooth(name, variable, low, high, *best[1])
 

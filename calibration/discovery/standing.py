@@ -79,16 +79,16 @@ def judge_names(
     if len(best.effects) == 1 and adequate and better:
         return NameSupport(False, "larger", better[0].effects)
     if adequate:
-        found = _against_curves(space, base, best, left.linear, bases, settings)
+        support = _against_curves(space, base, best, left.linear, bases, settings)
     else:
         beside = CurveBeside(space, base, left, bases) if beside is None else beside
-        found = _one_curve(space, best, left, bases, settings, beside)
+        support = _one_curve(space, best, left, bases, settings, beside)
     fits = dataclasses.replace(searched, ladder=(base, *searched.ladder))
     tests = name_tests(space, best, fits, bases, after, settings, blocks, better)
-    if found.stands:
-        found = NameSupport(any(t.established for t in tests))
-        found = dataclasses.replace(found, why="beside" if found.stands else "none by itself")
-    return dataclasses.replace(found, tests=tests)
+    if support.stands:
+        support = NameSupport(any(t.established for t in tests))
+        support = dataclasses.replace(support, why="beside" if support.stands else "none by itself")
+    return dataclasses.replace(support, tests=tests)
 
 
 def _ruled_out(
@@ -136,14 +136,14 @@ def _against_curves(
     equations = [equation_of_place(space.library[e].channel or space.library[e].balance) for e in best.effects]
     places = {place for place, _ in bases_room.family_names(bases)}
     crowded = {e for e in equations if equations.count(e) > 1 and e in places}
-    tried = _curves(space, linear, bases, crowded)
-    if not tried:
+    curves = _curves(space, linear, bases, crowded)
+    if not curves:
         return NameSupport(True)
-    curve, over = max(tried)
+    curve, over = max(curves)
     # Curves are linear at the base, so names get the better of their fit and of their linear gain there.
     fall = max(2 * (base.cost - best.cost), _linearly(space, best, linear, settings))
     names = fall - cost_of_names(space, best, settings)
-    if curve - 2 * math.log(len(tried)) > names + settings.preferred:
+    if curve - 2 * math.log(len(curves)) > names + settings.preferred:
         return NameSupport(False, "better curve", best.effects, (over,))
     return NameSupport(True)
 
@@ -153,22 +153,22 @@ def _curves(
 ) -> list[tuple[float, CurveOver]]:
     """Evidence of each smooth curve and wave: of one variable in any place, of two in the crowded ones."""
     included, offered = space.included, dict.fromkeys(bases_room.family_names(bases))
-    known = [
+    known_curves = [
         v
         for v in (*bases_room.VARIABLES, *bases_room.ORDERS)
         if any(v == over for _, over in offered) and _varies(linear, v, included)
     ]
-    tried = []
+    curves = []
     for place, variable in offered:
-        if variable in known:
+        if variable in known_curves:
             curve = smooth_curve(linear, place, variable, included)
-            tried.append((curve.evidence, CurveOver(place, (variable,))))
+            curves.append((curve.evidence, CurveOver(place, (variable,))))
     project = Projection(linear)
     for place in sorted(crowded):
-        for pair in itertools.combinations([v for v in VARIABLES if v in known], 2):
+        for pair in itertools.combinations([v for v in VARIABLES if v in known_curves], 2):
             over = smooth_surface(linear, place, pair, included, project)
-            tried.append((over.evidence, CurveOver(place, pair)))
-    return tried
+            curves.append((over.evidence, CurveOver(place, pair)))
+    return curves
 
 
 def _curve_over(place: str, variable: str) -> CurveOver:
@@ -186,8 +186,8 @@ def _linearly(space: CandidateSpace, best: Candidate, linear: Linearization, set
     chosen = []
     for slot, name in enumerate(best.active):
         if name:
-            mine = np.flatnonzero(space.library.of == space.library.names.index(name))
-            chosen.append(int(mine[np.argmin(np.abs(space.library.at[mine] - best.z[p + s + slot]))]))
+            instances = np.flatnonzero(space.library.of == space.library.names.index(name))
+            chosen.append(int(instances[np.argmin(np.abs(space.library.at[instances] - best.z[p + s + slot]))]))
     a, b = Projection(linear)(np.asarray(linear.signatures)[:, chosen])
     return float(b @ np.linalg.lstsq(a, b, rcond=1e-9)[0])
 
@@ -209,8 +209,10 @@ def _one_curve(
     """Test whether a single curve is adequate where the names of a candidate are not."""
     names = bases_room.family_names(bases)
     for k in _strongest(left, names):
-        found, _ = statistics_with_columns(left.linear, bases, family_columns(left.linear, bases, k), [names[k][0]])
-        if not AdequacyTest(found, left.test.null, settings).rejected_with_margin:
+        statistics, _ = statistics_with_columns(
+            left.linear, bases, family_columns(left.linear, bases, k), [names[k][0]]
+        )
+        if not AdequacyTest(statistics, left.test.null, settings).rejected_with_margin:
             return NameSupport(False, "curve alone", curves=(_curve_over(*names[k]),))
     where = beside.where
     if equation_of_place(where.place) in {_equation(space, e) for e in best.effects}:
@@ -248,8 +250,8 @@ def _curves_beside(
     while test.rejected_with_margin and len(chosen) < most:
         chosen.append(int(np.argmax(np.where(barred, -np.inf, deviate))))
         columns = np.concatenate([columns, family_columns(linear, bases, chosen[-1])], 1)
-        found, deviate = statistics_with_columns(linear, bases, columns, [places[k] for k in chosen])
-        test = AdequacyTest(found, seen.test.null, settings)
+        statistics, deviate = statistics_with_columns(linear, bases, columns, [places[k] for k in chosen])
+        test = AdequacyTest(statistics, seen.test.null, settings)
     return chosen, test
 
 
@@ -283,12 +285,14 @@ def name_tests(
     most = searched.diagnosis or after
     lacks = _deficient_equations(space, most, bases)
     fewer = dict(zip(largest.effects, without_each(space, largest, settings, searched.ladder), strict=True))
-    each = without_each(space, best, settings, searched.ladder)
-    fits = {c.active: c for c in (*each, *(c for e, c in fewer.items() if e in best.effects))}
-    seen = {at: diagnose_candidate(space, c, bases, after.test.null, settings).linear for at, c in fits.items()}
-    for effect, without in zip(best.effects, each, strict=True):
+    without_effect = without_each(space, best, settings, searched.ladder)
+    fits = {c.active: c for c in (*without_effect, *(c for e, c in fewer.items() if e in best.effects))}
+    linearizations = {
+        at: diagnose_candidate(space, c, bases, after.test.null, settings).linear for at, c in fits.items()
+    }
+    for effect, without in zip(best.effects, without_effect, strict=True):
         equation = _equation(space, effect)
-        linear = seen[without.active]
+        linear = linearizations[without.active]
         chosen, _ = _curves_beside(after.linear, after, bases, {equation}, CURVES, settings)
         beside = _with_curves(space, linear, bases, chosen, effect)
         promised = _root(np.asarray(linear.jacobian), np.asarray(linear.residual), beside[2]) ** 2
@@ -297,7 +301,7 @@ def name_tests(
             judged = _put_back(space, best, effect, _with_curves(space, after.linear, bases, chosen, effect))
             signatures = after.linear.signatures
         run, root_without = _weakest_run(space, linear.runs(), *beside, differ=space.bare.observe.long)
-        whole, others = (largest, fewer[effect]) if effect in fewer else (best, without)
+        full_fit, other_fit = (largest, fewer[effect]) if effect in fewer else (best, without)
         beside_all = most.linear if effect in fewer else after.linear
         tests.append(
             NameTest(
@@ -305,7 +309,9 @@ def name_tests(
                 _root(*beside),
                 after.test.threshold("single"),
                 tuple(_curve_over(*names[k]) for k in chosen),
-                _evidence_over_curves(space, whole, others, effect, seen[others.active], bases, settings),
+                _evidence_over_curves(
+                    space, full_fit, other_fit, effect, linearizations[other_fit.active], bases, settings
+                ),
                 run,
                 root_without,
                 _chosen_again(
@@ -314,7 +320,7 @@ def name_tests(
                 next((c.effects for c in better if effect not in c.effects), ()),
                 equation in lacks,
                 "run" if space.bare.observe.long else "row",
-                *_varies_most(space, whole, effect, beside_all, settings.shares["single"]),
+                *_varies_most(space, full_fit, effect, beside_all, settings.shares["single"]),
                 offset=_offset_share(space, best, effect, settings),
             )
         )
@@ -326,9 +332,11 @@ def _offset_share(space: CandidateSpace, best: Candidate, effect: str, settings:
     kind = space.library[effect]
     if kind.channel not in settings.silent or not getattr(kind, "of_zero", False):
         return math.inf
-    shown = np.asarray(space.bare.data.measured)[:, [c.name for c in space.bare.channels].index(kind.channel)]
+    measured_values = np.asarray(space.bare.data.measured)[
+        :, [c.name for c in space.bare.channels].index(kind.channel)
+    ]
     amplitude = abs(float(best.amplitude[best.active.index(effect)])) * amplitude_of(kind).spec.prior_sd(0.0)
-    return amplitude / max(float(np.sqrt(np.nanmean(shown[space.included] ** 2))), 1e-300)
+    return amplitude / max(float(np.sqrt(np.nanmean(measured_values[space.included] ** 2))), 1e-300)
 
 
 def _deficient_equations(space: CandidateSpace, seen: Diagnosis, bases: Bases) -> set[str]:
@@ -370,9 +378,9 @@ def _varies_most(
         values = linear.in_travel(bases_room.SHAFTS, variable)[0].reshape(-1, linear.rows).mean(0)
         x = bases_room.scale_to_unit_range(np.nan_to_num(values), space.included.astype(float))
         changed = np.stack([(of_row * shape[:, None]).ravel() for shape in (x, 2 * x**2 - 1)], 1)
-        left, told = _projected_columns(jacobian, residual, changed)
+        projected_residual, scores = _projected_columns(jacobian, residual, changed)
         for k, root in enumerate(_roots(jacobian, residual, changed)):
-            spread = abs(told[k] / max(left[k], 1e-300) / best.z[slot]) if best.z[slot] else math.inf
+            spread = abs(scores[k] / max(projected_residual[k], 1e-300) / best.z[slot]) if best.z[slot] else math.inf
             most = max(most, (float(root), variable, float(spread)))
     chance = NormalDist().inv_cdf(1 - share / (4 * max(len(variables), 1)))  # two shapes, either sign
     return *most[:2], chance, most[2]
@@ -398,8 +406,15 @@ def _evidence_over_curves(
     equation = _equation(space, effect)
     offered = sum(_equation(space, name) == equation for name in space.library.names)
     cost = _cost_of(space, best, best.active.index(effect), settings) + 2 * math.log(offered)
-    tried = [e for e, over in _curves(space, linear, bases, set()) if equation_of_place(over.place) == equation]
-    return 2 * (without.cost - best.cost) - cost - max(tried, default=-math.inf) + 2 * math.log(max(len(tried), 1))
+    same_equation = [
+        e for e, over in _curves(space, linear, bases, set()) if equation_of_place(over.place) == equation
+    ]
+    return (
+        2 * (without.cost - best.cost)
+        - cost
+        - max(same_equation, default=-math.inf)
+        + 2 * math.log(max(len(same_equation), 1))
+    )
 
 
 def _root(jacobian: np.ndarray, residual: np.ndarray, signatures: np.ndarray) -> float:
@@ -409,9 +424,9 @@ def _root(jacobian: np.ndarray, residual: np.ndarray, signatures: np.ndarray) ->
 
 def _roots(jacobian: np.ndarray, residual: np.ndarray, signatures: np.ndarray) -> np.ndarray:
     """Root of the score of each column, 0 for columns that the fit imitates."""
-    left, told = _projected_columns(jacobian, residual, signatures)
-    root = np.abs(told) / np.sqrt(np.maximum(left, 1e-12))
-    return np.where(left > ABSORBED**2 * np.sum(signatures**2, 0), root, 0.0)
+    projected_residual, scores = _projected_columns(jacobian, residual, signatures)
+    root = np.abs(scores) / np.sqrt(np.maximum(projected_residual, 1e-12))
+    return np.where(projected_residual > ABSORBED**2 * np.sum(signatures**2, 0), root, 0.0)
 
 
 def _projected_columns(
@@ -419,8 +434,8 @@ def _projected_columns(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Squared norm of columns over the readings after projection, and their product with the residual."""
     half = np.linalg.solve(np.linalg.cholesky(jacobian.T @ jacobian), jacobian.T)
-    left, inside = residual - half.T @ (half @ residual), half[:, : len(signatures)] @ signatures
-    return np.sum(signatures**2, 0) - np.sum(inside**2, 0), signatures.T @ left[: len(signatures)]
+    projected_residual, inside = residual - half.T @ (half @ residual), half[:, : len(signatures)] @ signatures
+    return np.sum(signatures**2, 0) - np.sum(inside**2, 0), signatures.T @ projected_residual[: len(signatures)]
 
 
 def _with_curves(
@@ -442,8 +457,8 @@ def _put_back(
     """
     jacobian, residual, signatures = beside
     k = space.free + best.active.index(effect)
-    left = residual - jacobian[:, k] * best.z[k]
-    return np.delete(jacobian, [k, k + len(best.active)], 1), left, signatures
+    residual_without = residual - jacobian[:, k] * best.z[k]
+    return np.delete(jacobian, [k, k + len(best.active)], 1), residual_without, signatures
 
 
 def chosen_again(
@@ -487,19 +502,19 @@ def _chosen_again(
         beside: Jacobian, residual and the effect's own signatures, as for `_root`.
         signatures: of the library, there.
     """
-    library, again = space.library, []
+    library, chosen_effects = space.library, []
     akin = np.array([library[name].family() in families for name in library.names])[library.of]
-    whole = _projected_columns(*beside)[0].max()
+    best_score = _projected_columns(*beside)[0].max()
     for out in blocks:
-        kept = _kept_readings(space, out, len(signatures))
-        every = signatures[kept]
-        j, e, own = _restrict_readings(kept, *beside)
-        if _projected_columns(j, e, own)[0].max() < 0.5 * whole:
+        kept_readings = _kept_readings(space, out, len(signatures))
+        kept_signatures = signatures[kept_readings]
+        j, e, kept_parts = _restrict_readings(kept_readings, *beside)
+        if _projected_columns(j, e, kept_parts)[0].max() < 0.5 * best_score:
             continue
-        roots = _roots(j, e, every)
+        roots = _roots(j, e, kept_signatures)
         most = np.max(roots) ** 2
-        again.append(np.max(roots[akin]) ** 2 >= most - max(settings.same, settings.form**2 * most))
-    return float(np.mean(again)) if again else 1.0
+        chosen_effects.append(np.max(roots[akin]) ** 2 >= most - max(settings.same, settings.form**2 * most))
+    return float(np.mean(chosen_effects)) if chosen_effects else 1.0
 
 
 def _weakest_run(
@@ -518,14 +533,14 @@ def _weakest_run(
             information of all runs.
     """
     least: tuple[int | None, float] = None, math.inf
-    known = np.max(_projected_columns(jacobian, residual, signatures)[0]) if differ else 1.0
+    full_score = np.max(_projected_columns(jacobian, residual, signatures)[0]) if differ else 1.0
     counting = [(k, rows) for k, rows in enumerate(runs) if space.included[rows].any()]
     for k, rows in counting if len(counting) > 2 else ():
         out = np.zeros(len(space.included), bool)
         out[rows] = True
-        rest = _restrict_readings(_kept_readings(space, out, len(signatures)), jacobian, residual, signatures)
-        told = math.sqrt(np.max(_projected_columns(*rest)[0]) / known) if differ else 1.0
-        root = _root(*rest) / max(told, 1e-9)
+        remaining = _restrict_readings(_kept_readings(space, out, len(signatures)), jacobian, residual, signatures)
+        information = math.sqrt(np.max(_projected_columns(*remaining)[0]) / full_score) if differ else 1.0
+        root = _root(*remaining) / max(information, 1e-9)
         least = (k + 1, root) if root < least[1] else least
     return least
 
@@ -540,5 +555,5 @@ def _restrict_readings(
     kept: np.ndarray, jacobian: np.ndarray, residual: np.ndarray, signatures: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Jacobian, residual and signatures of the remaining readings, and of all further residuals."""
-    whole = np.concatenate([kept, np.ones(len(residual) - len(kept), bool)])
-    return jacobian[whole], residual[whole], signatures[kept]
+    kept_residuals = np.concatenate([kept, np.ones(len(residual) - len(kept), bool)])
+    return jacobian[kept_residuals], residual[kept_residuals], signatures[kept]

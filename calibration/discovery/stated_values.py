@@ -47,10 +47,12 @@ def prior_shift_scores(jacobian: np.ndarray, residual: np.ndarray) -> tuple[np.n
     half = np.linalg.solve(np.linalg.cholesky(jacobian.T @ jacobian), jacobian.T)
     prior_rows = np.arange(len(residual) - jacobian.shape[1], len(residual))
     leverage = np.sum(half[:, prior_rows] ** 2, 0)
-    left = residual[prior_rows] - half[:, prior_rows].T @ (half @ residual)
+    projected_residual = residual[prior_rows] - half[:, prior_rows].T @ (half @ residual)
     free = np.maximum(1 - leverage, 1e-9)
-    seen = leverage < 1 - 1e-6
-    return np.where(seen, left**2 / free, 0.0), np.where(seen, residual[prior_rows] / free, 0.0)
+    is_visible = leverage < 1 - 1e-6
+    return np.where(is_visible, projected_residual**2 / free, 0.0), np.where(
+        is_visible, residual[prior_rows] / free, 0.0
+    )
 
 
 def find_prior_shifts(

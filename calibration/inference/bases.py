@@ -101,8 +101,8 @@ class Basis(eqx.Module):
         Families are computed one at a time, because each takes a copy of a balance's defects for histories.
         """
         of_channels = is_channel_place(self.places[0])
-        known, change = (linear.channels, linear.shown) if of_channels else (linear.probed, linear.columns)
-        places = jnp.asarray([known.index(place) for place in self.places])
+        places_known, change = (linear.channels, linear.shown) if of_channels else (linear.probed, linear.columns)
+        places = jnp.asarray([places_known.index(place) for place in self.places])
         return jax.lax.map(lambda family: change(*family), (places, self.columns))
 
 
@@ -227,10 +227,14 @@ def curve_families(
         )
 
     names = [(balance, variable) for variable in over.values() for balance in balances]
-    shown = [(c.name, v) for c in channels_of(robot) for v in over if v in AXES or v == READ_BY.get(c.name)]
-    new = [n for n in shown if over[n[1]] == n[1]]
+    channel_variables = [
+        (c.name, v) for c in channels_of(robot) for v in over if v in AXES or v == READ_BY.get(c.name)
+    ]
+    new = [n for n in channel_variables if over[n[1]] == n[1]]
     # As above: a skipped curve is replaced by another of its channel, or else by the first.
-    read = [n if n in new else next((m for m in new if m[0] == n[0]), new[0]) for n in shown] if new else []
+    read = (
+        [n if n in new else next((m for m in new if m[0] == n[0]), new[0]) for n in channel_variables] if new else []
+    )
     groups = [
         (names, [curve(*n) for n in names]),
         (
@@ -324,8 +328,8 @@ def window_families(
     for condition, (factor, _) in LEVELS.items():
         if VARIABLES[condition] not in scope.axes:
             continue
-        told = factor * np.asarray(columns[VARIABLES[condition]], float)
-        x, _ = in_travel_frame(SHAFTS, condition, told, facing.__getitem__)
+        values = factor * np.asarray(columns[VARIABLES[condition]], float)
+        x, _ = in_travel_frame(SHAFTS, condition, values, facing.__getitem__)
         levels = np.unique(x[counts])
         levels = levels if 2 < len(levels) <= MOST_LEVELS else levels[:0]
         offered += [(condition, x, counts & (x == level)) for level in levels]
@@ -389,20 +393,20 @@ def order_collinearity(
     terms = np.concatenate([np.zeros((len(x), 1)), *each], 1)
     # Without the means of each level: a matrix with a column for each level would be rows times rows.
     count = np.bincount(level)
-    inner, left = (v - (_level_sums(level, v) / count[:, None])[level] for v in (terms, x[:, None]))
+    inner, terms_left = (v - (_level_sums(level, v) / count[:, None])[level] for v in (terms, x[:, None]))
     ways, size, _ = np.linalg.svd(inner, full_matrices=False)
     ways = ways[:, size > len(x) * np.finfo(float).eps * np.linalg.norm(terms)]
-    left = left - ways @ (ways.T @ left)
+    terms_left = terms_left - ways @ (ways.T @ terms_left)
     terms_used = len(count) + ways.shape[1]
     freedom = (len(x) - 1) / max(len(x) - terms_used, 1)
-    return float(1 - freedom * np.sum(left**2) / np.sum((x - x.mean()) ** 2))
+    return float(1 - freedom * np.sum(terms_left**2) / np.sum((x - x.mean()) ** 2))
 
 
 def _level_sums(level: np.ndarray, values: np.ndarray) -> np.ndarray:
     """Sum of the rows of each level, shape (levels, columns)."""
-    found = np.zeros((int(level.max()) + 1, values.shape[1]))
-    np.add.at(found, level, values)
-    return found
+    sums = np.zeros((int(level.max()) + 1, values.shape[1]))
+    np.add.at(sums, level, values)
+    return sums
 
 
 def wave_families(
@@ -425,17 +429,17 @@ def wave_families(
     for word, (order, belted) in ORDERS.items():
         wave, pieces = np.zeros((2, len(angle), 2 * len(rows)))
         for k, row in enumerate(rows):
-            mine = row[row >= 0]
-            if len(mine) < 8 or (belted and not on_tracks[mine[0]]):
+            rows_of_wave = row[row >= 0]
+            if len(rows_of_wave) < 8 or (belted and not on_tracks[rows_of_wave[0]]):
                 continue
-            turned = order * angle[mine]
+            turned = order * angle[rows_of_wave]
             step = np.abs(np.diff(order * angle[knots[k]]))
             if not step.any() or np.median(step[step > 0]) > RESOLVED:
                 continue
             shape = np.stack([np.cos(turned), np.sin(turned)], 1)
-            pieces[mine, :2] = shape
+            pieces[rows_of_wave, :2] = shape
             if np.ptp(turned) >= 4 * np.pi:
-                wave[mine, 2 * k : 2 * k + 2] = shape
+                wave[rows_of_wave, 2 * k : 2 * k + 2] = shape
         if pieces.any():
             bases.append(wave if wave.any() else pieces)
             words.append(word)

@@ -123,7 +123,7 @@ def predictable_blocks(runs: Runs, problem: Problem) -> dict[str, Columns]:
         informs[k].add(_configuration_of_parameter(follower, names))
     owned = [np.isin(names, list(owners)) for owners in informs if "" not in owners]
     kinds = {
-        kind: {label: m for label, m in by.items() if not any(m[mine].all() for mine in owned)}
+        kind: {label: m for label, m in by.items() if not any(m[block_rows].all() for block_rows in owned)}
         for kind, by in distinct_blocks(runs, problem.observe.blocks).items()
     }
     return {kind: by for kind, by in kinds.items() if by}
@@ -131,8 +131,8 @@ def predictable_blocks(runs: Runs, problem: Problem) -> dict[str, Columns]:
 
 def unpredictable_kinds(runs: Runs, problem: Problem) -> Names:
     """Kinds with at least one block that the other rows cannot predict."""
-    every, told = distinct_blocks(runs, problem.observe.blocks), predictable_blocks(runs, problem)
-    return tuple(kind for kind, by in every.items() if len(told.get(kind, {})) < len(by))
+    all_blocks, predictable = distinct_blocks(runs, problem.observe.blocks), predictable_blocks(runs, problem)
+    return tuple(kind for kind, by in all_blocks.items() if len(predictable.get(kind, {})) < len(by))
 
 
 def _configuration_of_parameter(parameter: str, configurations: np.ndarray) -> str:
@@ -175,6 +175,8 @@ def hold_out_by_kind(problem: Problem, start: np.ndarray, masks: dict[str, Colum
     for kind, by in masks.items():
         if by:
             parts = tuple(m.tobytes() for m in by.values())
-            seen = fits[parts] = fits.get(parts) or refits.hold_out_blocks(problem, start, list(by.values()))
-            answers[kind] = HeldOut(tuple(by), seen.block, seen.reading, seen.status, seen.z, seen.converged)
+            held_out = fits[parts] = fits.get(parts) or refits.hold_out_blocks(problem, start, list(by.values()))
+            answers[kind] = HeldOut(
+                tuple(by), held_out.block, held_out.reading, held_out.status, held_out.z, held_out.converged
+            )
     return answers

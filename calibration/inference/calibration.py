@@ -122,22 +122,22 @@ def calibrate(
         if value is not None:
             stated_count(value, name, low, LARGEST[name])
     solver = solvers.solver_by_name(solver) if isinstance(solver, str) else solver
-    runs, told = used_rows(runs, robot, rows), in_words(tell)
+    runs, progress = used_rows(runs, robot, rows), in_words(tell)
     plan = _make_plan(runs, model, starts, profiles, blocks)
     choose = functools.partial(_free_names, runs, plan, free, fix)
     ready = prepare(runs, robot, noise, stated, assume=False, choose=choose)
     for note in (*ready.foreign, *ready.doubted):
-        told(note)
+        progress(note)
     base, of_product = _with_guide_priors(runs, ready, plan)
     setting = _Setting(runs, plan, ready, base, of_product)
     posed = setting.problem()
     evolved = _population_options(posed, ready.names, runs, population, generations, members)
-    found, beside = _search(runs, base, posed, ready.noise, plan.starts, evolved, seed, told, solver)
-    optimum = _optimum(setting, found)
-    if found.problem.observe.long:
+    search, beside = _search(runs, base, posed, ready.noise, plan.starts, evolved, seed, progress, solver)
+    optimum = _optimum(setting, search)
+    if search.problem.observe.long:
         doing = ["the linear analysis", *["profiles"] * plan.profiles, *["blocks held out"] * bool(plan.kinds)]
-        told(next_step("optimum", ", ".join(doing)))
-    return _result(setting, found, optimum, _analyse(setting, found, optimum), beside, seed)
+        progress(next_step("optimum", ", ".join(doing)))
+    return _result(setting, search, optimum, _analyse(setting, search, optimum), beside, seed)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -243,15 +243,17 @@ class _Setting:
 def _with_guide_priors(runs: Runs, ready: Prepared, plan: _Plan) -> tuple[Robot, dict[str, tuple[float, float]]]:
     """Robot with the guides' share that the fidelity computes, and priors of the free guide frictions without a
     stated prior."""
-    robot, known = ready.robot, dict[str, tuple[float, float]]()
+    robot, guide_priors = ready.robot, dict[str, tuple[float, float]]()
     if priors.GUIDE_SHARE not in observers.fidelity_facts(plan.fidelity).computes:
-        return robot, known
+        return robot, guide_priors
     present = _present(runs, robot)
     for name, chassis in ready.robot.configurations.items():
         if name in present and float(chassis.on_tracks) > 0.5:
             robot, more = priors.with_guide_share(robot, name)
-            known |= more
-    return robot, {name: prior for name, prior in known.items() if name in ready.names and name not in ready.stated}
+            guide_priors |= more
+    return robot, {
+        name: prior for name, prior in guide_priors.items() if name in ready.names and name not in ready.stated
+    }
 
 
 def _population_options(
@@ -322,22 +324,22 @@ def _search(
         members, population.member_objective(posed, known), beside, covariance, size=evolved.size,
         generations=evolved.generations, seed=seed, beside=points, tell=tell,
     )  # fmt: skip
-    at = int(everyone.order[0])
-    if not np.isfinite(everyone.cost[at]):
-        ended = population.Searched(everyone, at, (), None, np.nan).outcomes()
-        said = ", ".join(f"{count} {word.replace('_', ' ')}" for word, count in ended.items())
+    best_member = int(everyone.order[0])
+    if not np.isfinite(everyone.cost[best_member]):
+        ended = population.Searched(everyone, best_member, (), None, np.nan).outcomes()
+        endings = ", ".join(f"{count} {word.replace('_', ' ')}" for word, count in ended.items())
         raise BadConfiguration(
             f"--population: none of {len(everyone.z)} members can be run in every row (members with a row that ended "
-            f"in: {said or 'none'}); begin from another robot, or free fewer parameters"
+            f"in: {endings or 'none'}); begin from another robot, or free fewer parameters"
         )
-    posed, shares = multistart.reestimate_noise_at(posed, known, everyone, at)
+    posed, shares = multistart.reestimate_noise_at(posed, known, everyone, best_member)
     tell(next_step("derivatives"))
-    about = identifiability.analyse_identifiability(posed, jnp.asarray(everyone.z[at]))
-    off = population.unreliable_derivatives(posed, members, everyone.z[at], about.jacobian, about.sd)
+    about = identifiability.analyse_identifiability(posed, jnp.asarray(everyone.z[best_member]))
+    off = population.unreliable_derivatives(posed, members, everyone.z[best_member], about.jacobian, about.sd)
     names = tuple(n for n, apart in zip(posed.coordinates.names, off, strict=True) if apart)
-    slope, left = population.local_regression(posed, everyone, at) if names else (None, np.nan)
-    edge = population.parameters_at_edge(posed.coordinates, everyone.z[at])
-    searched = population.Searched(everyone, at, names, slope, left, edge)
+    slope, left = population.local_regression(posed, everyone, best_member) if names else (None, np.nan)
+    edge = population.parameters_at_edge(posed.coordinates, everyone.z[best_member])
+    searched = population.Searched(everyone, best_member, names, slope, left, edge)
     return multistart.optimum_of_population(posed, known, shares, searched, tell, solver), beside
 
 
@@ -396,11 +398,11 @@ def _optimum(setting: _Setting, found: SearchResult) -> _Optimum:
     lost = multistart.unreachable_rows(posed, status)
     if lost.any():
         raise checks.infeasible_error(setting.runs, fitted, status, lost, setting.ready.names)
-    seen, seen_before = (
+    observation, seen_before = (
         _reached_readings(posed, status, after.reading),
         _reached_readings(posed, status_before, before.reading),
     )
-    return _Optimum(z, fitted, after, status, status_before, seen, seen_before)
+    return _Optimum(z, fitted, after, status, status_before, observation, seen_before)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -461,13 +463,13 @@ def _result(
     seed: int,
 ) -> CalibrationResult:
     """The result of a calibration. `beside` is the optimum of `steady` that the search began from, if any."""
-    runs, known, posed, about = setting.runs, setting.ready.noise, found.problem, analysis.about
-    z, seen, seen_before, observe = optimum.z, optimum.seen, optimum.seen_before, setting.plan.observe
+    runs, noise, posed, about = setting.runs, setting.ready.noise, found.problem, analysis.about
+    z, observation, seen_before, observe = optimum.z, optimum.seen, optimum.seen_before, setting.plan.observe
     measured, sd, converged = runs.measured(), np.asarray(posed.data.sd), bool(found.best.converged)
-    finite = np.isfinite(measured) & np.isfinite(seen)
-    whitened = np.where(finite, (seen - measured) / sd, 0.0)
-    left = lack_of_fit.Residuals(observe, runs, seen, whitened, finite, about.jacobian, z)
-    notes = [*setting.remarks(), *analysis.notes, *([] if known.estimated.any() else noise_remarks(left))]
+    finite = np.isfinite(measured) & np.isfinite(observation)
+    whitened = np.where(finite, (observation - measured) / sd, 0.0)
+    residuals = lack_of_fit.Residuals(observe, runs, observation, whitened, finite, about.jacobian, z)
+    notes = [*setting.remarks(), *analysis.notes, *([] if noise.estimated.any() else noise_remarks(residuals))]
     sources = {name: "product" for name in setting.of_product} | {name: "stated" for name in setting.ready.stated}
     result = CalibrationResult(
         robot=optimum.robot,
@@ -479,13 +481,13 @@ def _result(
             posed, setting.base, z, about, analysis.profile, beside, sources, analysis.scanned
         ),
         tied=estimates.tied_parameters(posed),
-        noise=estimates.channel_noise(posed, known, found.shares, measured),
+        noise=estimates.channel_noise(posed, noise, found.shares, measured),
         axis=observe.axis,
         errors_before=estimates.errors_by_channel(runs.channels, seen_before, measured, sd),
-        errors_after=estimates.errors_by_channel(runs.channels, seen, measured, sd),
+        errors_after=estimates.errors_by_channel(runs.channels, observation, measured, sd),
         held_out={kind: estimates.hold_out_errors(posed, h, measured, sd) for kind, h in analysis.held.items()},
         conditions=estimates.condition_columns(observe, runs),
-        readings=estimates.readings_by_channel(runs.channels, measured, sd, seen_before, seen),
+        readings=estimates.readings_by_channel(runs.channels, measured, sd, seen_before, observation),
         status_before=np.array(STATUSES)[optimum.status_before],
         status=np.array(STATUSES)[optimum.status],
         adhesion_used=np.asarray(optimum.after.adhesion_used),
@@ -493,9 +495,11 @@ def _result(
         converged=converged and not analysis.elsewhere,
         starts=found.starts,
         searched=found.searched,
-        chi_square=estimates.chi_square(seen, measured, sd, about, known),
-        adequacy=lack_of_fit.judge_adequacy(left, seen_before, sd, estimated=known.estimated, converged=converged),
-        residual_clusters=residual_clusters(left, seed),
+        chi_square=estimates.chi_square(observation, measured, sd, about, noise),
+        adequacy=lack_of_fit.judge_adequacy(
+            residuals, seen_before, sd, estimated=noise.estimated, converged=converged
+        ),
+        residual_clusters=residual_clusters(residuals, seed),
         identifiability=about,
         posterior=posterior_of_coordinates(posed.coordinates, z, about.covariance),
         remarks=(*notes, *checks.unmeasured_notes(setting.ready.names, about.sensitivity)),

@@ -41,15 +41,15 @@ def check_data(runs: Runs, robot: Robot, names: Sequence[str], noise: Noise) -> 
             )
     _check_enough_readings(runs, names, noise)
     _check_motion(runs, noise)
-    said = [
+    remarks = [
         *runs.missing(),
         *_check_stuck_channels(runs),
         *observers.observer_kind(runs).check(runs, noise),
         *_constant_conditions(runs),
     ]
-    said += [*unused_notes(runs), *unexplained_torque_notes(runs)]
-    said += [*check_ranges(runs, robot), *_uninformative(runs, robot, noise)]
-    return [*said, *conduct_notes(runs, robot), *lost_motion_notes(runs, robot)]
+    remarks += [*unused_notes(runs), *unexplained_torque_notes(runs)]
+    remarks += [*check_ranges(runs, robot), *_uninformative(runs, robot, noise)]
+    return [*remarks, *conduct_notes(runs, robot), *lost_motion_notes(runs, robot)]
 
 
 #: Scatter of a speed over the scatter of its changes from row to row, up to which the speed is only noise.
@@ -63,9 +63,9 @@ def _check_motion(runs: Runs, noise: Noise) -> None:
         return
     driven = bool(applied_drive(runs).any())
     for k, channel in speeds:
-        shown = runs[channel.column][np.isfinite(runs[channel.column])]
-        scatter = float(np.std(np.diff(shown))) / 2**0.5 if len(shown) > 2 else 0.0
-        if np.std(shown) > WHITE * scatter or abs(np.mean(shown)) > WHITE * scatter:
+        readings = runs[channel.column][np.isfinite(runs[channel.column])]
+        scatter = float(np.std(np.diff(readings))) / 2**0.5 if len(readings) > 2 else 0.0
+        if np.std(readings) > WHITE * scatter or abs(np.mean(readings)) > WHITE * scatter:
             return
         if driven and scatter <= WHITE * float(np.nanmax(noise.sd[:, k])) / channel.factor:
             return
@@ -93,16 +93,20 @@ def _uninformative(runs: Runs, robot: Robot, noise: Noise) -> list[Remark]:
 def _check_enough_readings(runs: Runs, names: Sequence[str], noise: Noise) -> None:
     levels = int(noise.estimated.sum())
     readings = int(np.isfinite(runs.measured()).sum())
-    shown = sum(word != "no readings" for word in noise.source)
-    needed = max(2, -(-(len(names) + levels) // max(shown, 1)) + (levels > 0))
-    if readings >= needed * shown:
+    channels_with_readings = sum(word != "no readings" for word in noise.source)
+    needed = max(2, -(-(len(names) + levels) // max(channels_with_readings, 1)) + (levels > 0))
+    if readings >= needed * channels_with_readings:
         return
     also = f" and estimate {levels} noise levels" if levels else ""
     cure = "fix some with --fix, or state --noise" if levels else "fix some with --fix"
-    whole = readings == len(runs) * shown
+    is_complete = readings == len(runs) * channels_with_readings
     rows = count_noun(len(runs), "row")
-    have = f"{rows} of {shown} channels" if whole else f"{count_noun(readings, 'reading')} in {rows}"
-    least = f"{needed} rows" if whole else f"{needed * shown} readings"
+    have = (
+        f"{rows} of {channels_with_readings} channels"
+        if is_complete
+        else f"{count_noun(readings, 'reading')} in {rows}"
+    )
+    least = f"{needed} rows" if is_complete else f"{needed * channels_with_readings} readings"
     what = f"cannot fit {count_noun(len(names), 'parameter')}{also}" if names else "cannot be fitted"
     raise BadData(f"{runs.source}: {have} {what}; at least {least} are needed{f', or {cure}' if names else ''}")
 

@@ -42,17 +42,23 @@ def conduct_notes(runs: Runs, robot: Robot) -> list[Remark]:
     early = (lasts < UNDER_WAY) & (slow | ~measured)
     slides = (lasts >= UNDER_WAY) & measured & np.isfinite(movers) & (movers > 0) & (speed < SLIDING * movers)
     slides &= ~np.isin(names, runs.run_names[rows_of_varying_runs(runs)])  # their settled ends are only parts of them
-    said: list[Remark] = []
+    remarks: list[Remark] = []
     if early.any():
-        seen = slow & early
-        share = float(np.nanmedian(speed[seen] / steady[seen])) if seen.any() else float("nan")
-        said.append(Remark("ends_early", runs=_run_names(names, early), lasts=float(lasts[early].max()), share=share))
+        slow_and_early = slow & early
+        share = (
+            float(np.nanmedian(speed[slow_and_early] / steady[slow_and_early]))
+            if slow_and_early.any()
+            else float("nan")
+        )
+        remarks.append(
+            Remark("ends_early", runs=_run_names(names, early), lasts=float(lasts[early].max()), share=share)
+        )
     if slides.any():
         share = max(float(np.median(speed[slides] / movers[slides])), 0.0)
-        said.append(Remark("never_grips", runs=_run_names(names, slides), share=share))
+        remarks.append(Remark("never_grips", runs=_run_names(names, slides), share=share))
     if slides.any() and (slides | early).all():
-        said.append(Remark("no_grip"))
-    return said
+        remarks.append(Remark("no_grip"))
+    return remarks
 
 
 def _run_names(names: np.ndarray, which: np.ndarray) -> Names:

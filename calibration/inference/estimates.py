@@ -62,11 +62,11 @@ def parameter_estimates(
         scans: of the scanned coordinates, whose intervals are those of their profiles.
     """
     coordinates = posed.coordinates
-    at, sd = np.asarray(z), np.asarray(about.sd)
-    value, slope = coordinates.value(at), np.asarray(coordinates.slope(at))
-    linear = np.stack([coordinates.value(at + side * Z95 * sd) for side in (-1, 1)], 1)
-    median = coordinates.value(np.zeros_like(at))
-    wide = np.stack([coordinates.value(np.full_like(at, side * Z95)) for side in (-1, 1)], 1)
+    point, sd = np.asarray(z), np.asarray(about.sd)
+    value, slope = coordinates.value(point), np.asarray(coordinates.slope(point))
+    linear = np.stack([coordinates.value(point + side * Z95 * sd) for side in (-1, 1)], 1)
+    median = coordinates.value(np.zeros_like(point))
+    wide = np.stack([coordinates.value(np.full_like(point, side * Z95)) for side in (-1, 1)], 1)
     other = None if beside is None else coordinates.value(np.asarray(beside))
     bound, fields = coordinates.beyond(z), priors.parameters_by_name(base)
     estimates = {}
@@ -78,7 +78,7 @@ def parameter_estimates(
             is_open = (bool(profile.open[k, 0]), bool(profile.open[k, 1]))
         if k in scans:
             shift, is_open = np.array(scans[k].interval()), scans[k].open()
-            ends = [np.where(np.arange(len(z)) == k, x, at) for x in shift]
+            ends = [np.where(np.arange(len(z)) == k, x, point) for x in shift]
             interval = np.array([coordinates.value(end)[k] for end in ends])
         estimates[name] = Estimate(
             value=float(value[k]),

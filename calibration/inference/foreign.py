@@ -29,7 +29,7 @@ def inherited_priors(robot: Robot, stated: Collection[str] = ()) -> list[Remark]
     """
     if not robot.rig.inherits:
         return []
-    mine, nominal = (
+    own_friction, nominal = (
         {name: float(p.value) for name, p in parameters_by_name(r).items()} for r in (robot, paper_robots.nominal())
     )
     pairs = [(part, part, *DRIVE[part]) for part in DRIVE]
@@ -38,16 +38,16 @@ def inherited_priors(robot: Robot, stated: Collection[str] = ()) -> list[Remark]
     for part, other, sheet, friction in pairs:
         on_tracks = part in robot.configurations and float(robot.configurations[part].on_tracks) > 0.5
         guides = GUIDES if on_tracks else ()
-        kept = tuple(
+        kept_priors = tuple(
             f"{part}.{name}"
             for name in (*friction, *guides)
-            if mine[f"{part}.{name}"] == nominal[f"{other}.{name}"] != 0 and f"{part}.{name}" not in stated
+            if own_friction[f"{part}.{name}"] == nominal[f"{other}.{name}"] != 0 and f"{part}.{name}" not in stated
         )
         changed = tuple(
-            (name, mine[f"{part}.{name}"], nominal[f"{other}.{name}"])
+            (name, own_friction[f"{part}.{name}"], nominal[f"{other}.{name}"])
             for name in sheet
-            if abs(mine[f"{part}.{name}"] / nominal[f"{other}.{name}"] - 1) > DIFFERS
+            if abs(own_friction[f"{part}.{name}"] / nominal[f"{other}.{name}"] - 1) > DIFFERS
         )
-        if len(kept) > len(inherited[part].kept if part in inherited else ()):
-            inherited[part] = Remark("inherited_priors", part=part, changed=changed, kept=kept)
+        if len(kept_priors) > len(inherited[part].kept if part in inherited else ()):
+            inherited[part] = Remark("inherited_priors", part=part, changed=changed, kept=kept_priors)
     return [note for note in inherited.values() if note.changed]

@@ -85,7 +85,7 @@ def predict_identifiability(runs: Runs, robot: Robot, noise: str | None = None, 
     """
     runs = used_rows(runs, robot, rows)
     ready = prepare(runs, robot, noise)
-    observe, robot, known = ready.observe, ready.robot, ready.noise
+    observe, robot, table_noise = ready.observe, ready.robot, ready.noise
     present = {robot.configurations.names[k] for k in runs.configurations(robot)}
     names = priors.free_names(robot, present, *observe.free(), () if observe.axis else priors.OVER_TIME)
     if not observe.axis:
@@ -93,23 +93,25 @@ def predict_identifiability(runs: Runs, robot: Robot, noise: str | None = None, 
     if not names:
         raise BadConfiguration("nothing to determine: every loss is zero, so it is held; state yours with a ±")
     coordinates = priors.parameter_coordinates(robot, names, any_surface=robot.rig.inherits)
-    posed = observers.pose_problem(runs, robot, coordinates, known.sd)
+    posed = observers.pose_problem(runs, robot, coordinates, table_noise.sd)
     z = jnp.zeros(len(names))
-    seen = optimizers.observe_at(posed, z)
-    reached = np.isfinite(np.asarray(seen.reading)).all(1) & ~posed.observe.unreachable(np.asarray(seen.status))
+    observation = optimizers.observe_at(posed, z)
+    reached = np.isfinite(np.asarray(observation.reading)).all(1) & ~posed.observe.unreachable(
+        np.asarray(observation.status)
+    )
     data = dataclasses.replace(posed.data, weight=posed.data.weight * jnp.asarray(reached, float)[:, None])
     about = identifiability.analyse_identifiability(posed, z, data)
     held = identifiability.held_by_prior(about.sd)
     fields = priors.parameters_by_name(robot)
     width = coordinates.prior_sd
-    found = tuple(
+    estimates = tuple(
         Determined(n, fields[n].spec.unit, float(fields[n].value), float(width[k]), float(about.sd[k]), bool(held[k]))
         for k, n in enumerate(names)
     )
-    statuses = tuple(STATUSES[int(s)] for s in np.asarray(seen.status))
+    statuses = tuple(STATUSES[int(s)] for s in np.asarray(observation.status))
     doubts = tuple(with_codes(ready.checked, *DOUBTS))
-    priors_hold = [p.name for p in found if p.held]
+    priors_hold = [p.name for p in estimates if p.held]
     together = determined_together(
         posterior_of_coordinates(coordinates, np.asarray(z), about.covariance), priors_hold
     )
-    return Foresight(found, statuses, known.source, tuple(about.correlated()), together, robot, doubts)
+    return Foresight(estimates, statuses, table_noise.source, tuple(about.correlated()), together, robot, doubts)

@@ -69,13 +69,13 @@ def hold_out_blocks(
     rows, weight = len(masks[0]), np.asarray(problem.data.weight)
     out = [np.concatenate([m, np.zeros(len(weight) - rows, bool)]) for m in masks]
     which = None if active is None else [active] * len(masks)
-    optima, seen = search_each(problem, [start] * len(masks), [weight * ~m[:, None] for m in out], which)
+    optima, observations = search_each(problem, [start] * len(masks), [weight * ~m[:, None] for m in out], which)
     reading, status = np.full((rows, weight.shape[1]), np.nan), np.full(rows, -1)
     block = np.full(rows, -1)
     for k, mask in enumerate(masks):
-        lost = problem.observe.unreachable(np.asarray(seen.status[k]))[:rows, None]
-        reading[mask] = np.where(lost, np.nan, seen.reading[k][:rows])[mask]
-        status[mask], block[mask] = seen.status[k][:rows][mask], k
+        lost = problem.observe.unreachable(np.asarray(observations.status[k]))[:rows, None]
+        reading[mask] = np.where(lost, np.nan, observations.reading[k][:rows])[mask]
+        status[mask], block[mask] = observations.status[k][:rows][mask], k
     return HeldOutFits(reading, status, block, np.asarray(optima.z), np.asarray(optima.converged))
 
 
@@ -91,22 +91,24 @@ def predict_unseen(
     rows, start_values = len(masks[0]), np.asarray(start)
     out = [np.concatenate([m, np.zeros(len(problem.data.weight) - rows, bool)]) for m in masks]
     data = problem.data
-    residual, jacobian, seen = problem.observe.at(problem, start_values, active)
-    residual, jacobian, read = np.asarray(residual), np.asarray(jacobian), np.asarray(seen.reading)
+    residual, jacobian, observation = problem.observe.at(problem, start_values, active)
+    residual, jacobian, read = np.asarray(residual), np.asarray(jacobian), np.asarray(observation.reading)
     scale = np.asarray(data.weight / data.sd)
     count, size = scale.shape[1], scale.size
     slopes = jacobian[:size].reshape(*scale.shape, -1)
     with np.errstate(invalid="ignore", divide="ignore"):
         per_unit = np.where(scale[..., None] > 0, slopes / scale[..., None], 0.0)
-    lost = problem.observe.unreachable(np.asarray(seen.status))
+    lost = problem.observe.unreachable(np.asarray(observation.status))
     reading, status = np.full((rows, count), np.nan), np.full(rows, -1)
     block, z = np.full(rows, -1), np.tile(start_values, (len(out), 1))
     for k, mask in enumerate(out):
-        kept = np.concatenate([np.repeat(~mask, count), ~mask, np.ones(len(residual) - size - len(mask), bool)])
-        j = jacobian[kept]
-        step = -np.linalg.solve(j.T @ j, j.T @ residual[kept])
+        kept_residuals = np.concatenate(
+            [np.repeat(~mask, count), ~mask, np.ones(len(residual) - size - len(mask), bool)]
+        )
+        j = jacobian[kept_residuals]
+        step = -np.linalg.solve(j.T @ j, j.T @ residual[kept_residuals])
         z[k] += step
-        mine = mask[:rows]
-        reading[mine] = np.where(lost[:, None], np.nan, read + per_unit @ step)[:rows][mine]
-        status[mine], block[mine] = np.asarray(seen.status)[:rows][mine], k
+        held_rows = mask[:rows]
+        reading[held_rows] = np.where(lost[:, None], np.nan, read + per_unit @ step)[:rows][held_rows]
+        status[held_rows], block[held_rows] = np.asarray(observation.status)[:rows][held_rows], k
     return HeldOutFits(reading, status, block, z, np.ones(len(out), bool))

@@ -99,11 +99,11 @@ def separate_directions(directions: np.ndarray) -> np.ndarray:
     Args:
         directions: orthonormal, shape (directions, parameters), as the result.
     """
-    left, separated = directions.T @ directions, np.zeros_like(directions)
+    projector, separated = directions.T @ directions, np.zeros_like(directions)
     for row in separated:
-        k = int(np.argmax(np.round(np.diag(left), 6)))
-        row[:] = left[k] / np.sqrt(left[k, k])
-        left = left - np.outer(row, row)
+        k = int(np.argmax(np.round(np.diag(projector), 6)))
+        row[:] = projector[k] / np.sqrt(projector[k, k])
+        projector = projector - np.outer(row, row)
     return separated
 
 
@@ -123,13 +123,13 @@ def analyse_identifiability(
     """
     data = problem.data if data is None else data
     if slope is not None:
-        whole, readings = np.concatenate([slope, np.eye(len(z))]), slope
+        all_slopes, readings = np.concatenate([slope, np.eye(len(z))]), slope
     elif problem.observe.long:
         jacobian = np.asarray(optimizers.linearise(problem, z, data)[1])
-        whole, readings = jacobian[optimizers.informative_residuals(data)], jacobian[: data.measured.size]
+        all_slopes, readings = jacobian[optimizers.informative_residuals(data)], jacobian[: data.measured.size]
     else:
-        whole, readings = (np.asarray(j) for j in _jacobians(optimizers.with_roots(problem, z), z, data))
-    _, s, v = np.linalg.svd(whole, full_matrices=False)
+        all_slopes, readings = (np.asarray(j) for j in _jacobians(optimizers.with_roots(problem, z), z, data))
+    _, s, v = np.linalg.svd(all_slopes, full_matrices=False)
     covariance = (v.T / s**2) @ v
     _, singular, directions = np.linalg.svd(readings, full_matrices=False)
     rank = int(np.sum(singular > 1e-8 * singular.max()))

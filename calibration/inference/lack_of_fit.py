@@ -167,7 +167,7 @@ def judge_adequacy(
         converged: True if the search converged.
     """
     misses = fit.misses(as_stated, ~estimated)
-    found = adequacy_of_residuals(fit, known=not estimated.any())
+    adequacy = adequacy_of_residuals(fit, known=not estimated.any())
     both = fit.counts & np.isfinite(as_stated)
     before = np.sum(((as_stated - fit.runs.measured()) / sd) ** 2, where=both)
     obstacle = (
@@ -176,8 +176,8 @@ def judge_adequacy(
         else "worse" if np.sum(fit.whitened**2, where=both) > before + WORSE
         else ""
     )  # fmt: skip
-    adequate = found.adequate if not obstacle else None if obstacle == "not converged" else False
-    return dataclasses.replace(found, adequate=adequate, obstacle=obstacle, misses=misses)
+    adequate = adequacy.adequate if not obstacle else None if obstacle == "not converged" else False
+    return dataclasses.replace(adequacy, adequate=adequate, obstacle=obstacle, misses=misses)
 
 
 def adequacy_of_residuals(fit: Residuals, *, known: bool) -> Adequacy:
@@ -187,25 +187,25 @@ def adequacy_of_residuals(fit: Residuals, *, known: bool) -> Adequacy:
         known: True if the noise of every channel is known, not estimated from the misfit.
     """
     chi2, freedom = float(fit.chi2.sum()), float(fit.freedom.sum())
-    found = structure_tests(fit, known=known)
+    tests = structure_tests(fit, known=known)
     if known and freedom > 0:
-        found.append((float(chdtrc(freedom, chi2)), Shown(what="stated")))
-    if not found:
+        tests.append((float(chdtrc(freedom, chi2)), Shown(what="stated")))
+    if not tests:
         return Adequacy(None, chi2, freedom, None, Shown(), known)
-    p, shown = min(found)
-    p = min(1.0, p * len(found))
-    return Adequacy(p > LEVEL, chi2, freedom, p, shown, known)
+    p, finding = min(tests)
+    p = min(1.0, p * len(tests))
+    return Adequacy(p > LEVEL, chi2, freedom, p, finding, known)
 
 
 def structure_tests(fit: Residuals, *, known: bool) -> list[tuple[float, Shown]]:
     """Tests of structure: p-value and finding of curves over the conditions, memory and replicates."""
-    families = {shown: _p_value(fit, columns, known) for shown, columns in _curve_columns(fit).items()}
-    tested = [(p, shown) for shown, p in families.items() if p is not None]
-    found = []
+    families = {finding: _p_value(fit, columns, known) for finding, columns in _curve_columns(fit).items()}
+    tested = [(p, finding) for finding, p in families.items() if p is not None]
+    tests = []
     if tested:
-        p, shown = min(tested)
-        found.append((min(1.0, p * len(tested)), shown))
-    return [*found, *(made for made in (_autocorrelation_test(fit), _replicate_test(fit)) if made is not None)]
+        p, finding = min(tested)
+        tests.append((min(1.0, p * len(tested)), finding))
+    return [*tests, *(test for test in (_autocorrelation_test(fit), _replicate_test(fit)) if test is not None)]
 
 
 def _p_value(fit: Residuals, columns: np.ndarray, known: bool) -> float | None:
@@ -214,8 +214,8 @@ def _p_value(fit: Residuals, columns: np.ndarray, known: bool) -> float | None:
     wide = np.concatenate([columns, np.zeros((parameters, columns.shape[1]))])
     size = np.linalg.norm(wide, axis=0)
     wide = wide[:, size > 0] / size[size > 0]
-    left = wide - fit.taken @ (fit.taken.T @ wide)
-    directions, scale, _ = np.linalg.svd(left, full_matrices=False)
+    projected = wide - fit.taken @ (fit.taken.T @ wide)
+    directions, scale, _ = np.linalg.svd(projected, full_matrices=False)
     directions = directions[:, scale > CLEAR]
     terms, freedom = directions.shape[1], float(fit.freedom.sum())
     if terms == 0 or freedom - terms < LEAST:
@@ -249,9 +249,9 @@ def _curve_columns(fit: Residuals) -> dict[Shown, np.ndarray]:
                 continue
             scaled = 2 * (x - x[rows].min()) / np.ptp(x[rows]) - 1
             curve = legendre.legvander(np.nan_to_num(scaled), min(terms, len(np.unique(x[rows])) - 1))
-            own = [curve * ((which == c) & rows)[:, None] for c in np.unique(which)]
-            columns = np.zeros((*counts.shape, sum(o.shape[1] for o in own)))
-            columns[:, k] = np.concatenate(own, 1)
+            own_curves = [curve * ((which == c) & rows)[:, None] for c in np.unique(which)]
+            columns = np.zeros((*counts.shape, sum(o.shape[1] for o in own_curves)))
+            columns[:, k] = np.concatenate(own_curves, 1)
             families[Shown(channel.name, "follow", name)] = columns.reshape(counts.size, -1)
     return families
 
@@ -264,18 +264,18 @@ def _autocorrelation_test(fit: Residuals) -> tuple[float, Shown] | None:
     run = runs.run_names
     order = np.lexsort((runs[observe.axis], run))
     follows = run[order][1:] == run[order][:-1]
-    found = []
+    tests = []
     for k, channel in enumerate(fit.runs.channels):
         e, ok = residual[order, k], counts[order, k]
         both = follows & ok[1:] & ok[:-1]
         power = float(np.sum(e[ok] ** 2))
         if both.sum() >= 20 and power > 0:
             r = float(np.sum(e[1:][both] * e[:-1][both])) / power
-            found.append((float(ndtr(-r * np.sqrt(both.sum()))), Shown(channel.name, "remember")))
-    if not found:
+            tests.append((float(ndtr(-r * np.sqrt(both.sum()))), Shown(channel.name, "remember")))
+    if not tests:
         return None
-    p, shown = min(found)
-    return min(1.0, p * len(found)), shown
+    p, finding = min(tests)
+    return min(1.0, p * len(tests)), finding
 
 
 def _replicate_test(fit: Residuals) -> tuple[float, Shown] | None:

@@ -90,9 +90,9 @@ def one_sided_step(r: Array, jacobian: Array, one_sided: slice, damping: Array |
         turns, active, _, best, lowest = carry
         counts = edge * active[:, None]
         d = -solve(normal + counts.T @ counts, gradient + counts.T @ height)
-        beyond, here = height + edge @ d > 0, value(d)
-        better = here < lowest
-        return turns + 1, beyond, active, jnp.where(better, d, best), jnp.where(better, here, lowest)
+        beyond, values = height + edge @ d > 0, value(d)
+        better = values < lowest
+        return turns + 1, beyond, active, jnp.where(better, d, best), jnp.where(better, values, lowest)
 
     still = jnp.zeros(jacobian.shape[1])
 

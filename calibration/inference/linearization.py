@@ -41,8 +41,8 @@ def balance_probe(whose: str) -> Effect:
         )
 
         def term(self, robot: Robot, signals: Signals) -> Scalar:
-            own = jnp.asarray(self.amplitude)
-            return jnp.where(signals.side > 0, own[0], own[1]) if own.ndim else own
+            amplitude = jnp.asarray(self.amplitude)
+            return jnp.where(signals.side > 0, amplitude[0], amplitude[1]) if amplitude.ndim else amplitude
 
     return Probe()
 
@@ -243,8 +243,8 @@ class Linearization(eqx.Module):
             channel: position in the table of channels.
             shapes: shape (points, terms).
         """
-        mine = self.scale * (np.arange(self.scale.shape[1]) == channel)
-        return (mine[:, :, None] * shapes[:, None, :]).reshape(-1, shapes.shape[1])
+        channel_scale = self.scale * (np.arange(self.scale.shape[1]) == channel)
+        return (channel_scale[:, :, None] * shapes[:, None, :]).reshape(-1, shapes.shape[1])
 
     def places(self) -> np.ndarray:
         """Indices of the rows with an identifiable defect of a single row."""

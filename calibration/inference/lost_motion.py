@@ -30,10 +30,10 @@ def lost_motion_notes(runs: Runs, robot: Robot) -> list[Remark]:
         return []
     if not turning and runs.layout.imposed_column != SUPPLY:
         return []
-    channel, shown = runs.channels[placed[0]], runs.measured()
-    drive = shown[:, turning[0]] if turning else applied_drive(runs)
+    channel, measured_values = runs.channels[placed[0]], runs.measured()
+    drive = measured_values[:, turning[0]] if turning else applied_drive(runs)
     changes = [
-        _changes_between_contacts(runs["time_s"][rows], shown[rows, placed[0]], drive[rows])
+        _changes_between_contacts(runs["time_s"][rows], measured_values[rows, placed[0]], drive[rows])
         for rows in map(runs.in_order, np.unique(runs.run_names))
     ]
     moved, integral, clipped, faster, driven, reversed_ = (np.concatenate(x, -1) for x in zip(*changes, strict=True))
@@ -60,8 +60,8 @@ def _changes_between_contacts(time: np.ndarray, angle: np.ndarray, drive: np.nda
         Of the angle. Of the time integral of the drive, and of the drive clipped to each of `FRICTIONS`, of the
         speed, of the drive, and of the direction, 1 or -1 for a reversal.
     """
-    known = np.isfinite(angle) & np.isfinite(drive)
-    time, angle, drive = time[known], angle[known], drive[known]
+    has_both = np.isfinite(angle) & np.isfinite(drive)
+    time, angle, drive = time[has_both], angle[has_both], drive[has_both]
     count = len(time)
     if count < 4 * AROUND:
         return tuple(np.zeros((*shape, 0)) for shape in ((), (), FRICTIONS.shape, (), (), ()))
@@ -95,7 +95,7 @@ def _lost(moved: np.ndarray, reversed_: np.ndarray, others: np.ndarray) -> tuple
     causes = terms[:, :-1]
     fitted = np.linalg.lstsq(terms, moved)[0]
     with_it, without = moved - terms @ fitted, moved - causes @ np.linalg.lstsq(causes, moved)[0]
-    left, before = float(with_it @ with_it), float(without @ without)
-    variance = left / max(len(moved) - terms.shape[1], 1)
+    rest_with, before = float(with_it @ with_it), float(without @ without)
+    variance = rest_with / max(len(moved) - terms.shape[1], 1)
     sd = np.sqrt(variance * np.linalg.pinv(terms.T @ terms)[-1, -1])
-    return left, float(fitted[-1]), float(sd), 1 - left / max(before, 1e-300)
+    return rest_with, float(fitted[-1]), float(sd), 1 - rest_with / max(before, 1e-300)

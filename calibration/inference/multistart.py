@@ -115,8 +115,8 @@ def search_from_starts(
     z = points[0]
     shares = initial_noise_shares(noise)
     for _ in range(ROUNDS):
-        posed, found, feasible = _search_until_feasible(posed, np.concatenate([points, z[None]]), by)
-        best = _pick_member(found, int(np.nanargmin(found.cost)))
+        posed, optima, feasible = _search_until_feasible(posed, np.concatenate([points, z[None]]), by)
+        best = _pick_member(optima, int(np.nanargmin(optima.cost)))
         z = np.asarray(best.z)
         new = _reestimate_shares(posed, noise, z, shares)
         if new is None:
@@ -124,7 +124,7 @@ def search_from_starts(
         shares = new
         posed = _with_noise_shares(posed, noise, shares)
     return SearchResult(
-        posed, best, _outcome_of_searches(jax.tree.map(lambda x: x[:-1], found), feasible[:-1]), shares
+        posed, best, _outcome_of_searches(jax.tree.map(lambda x: x[:-1], optima), feasible[:-1]), shares
     )
 
 
@@ -158,36 +158,38 @@ def search_one_by_one(
                 posed, jnp.asarray(z), data, tell=lambda *done: tell(next_step("search", *done, minutes()))
             )
 
-        found, start, end = one(points[0])
-        found, end = scans.search_lower_basins(posed, (found, end), data, lambda z: one(z)[::2], tell)
-        found, start, end = jax.tree.map(lambda x: jnp.asarray(x)[None], (found, start, end))
-        return found, start.status, end.status
+        optima, start, end = one(points[0])
+        optima, end = scans.search_lower_basins(posed, (optima, end), data, lambda z: one(z)[::2], tell)
+        optima, start, end = jax.tree.map(lambda x: jnp.asarray(x)[None], (optima, start, end))
+        return optima, start.status, end.status
 
     first = points[0]
     for _ in range(len(points)):
         z = first
         for round_ in range(1, ROUNDS + 1):
-            posed, found, feasible = _search_until_feasible(posed, z[None], step)
-            z = np.asarray(found.z[0])
-            tell(next_step("round", round_, found.cost[0], found.steps[0], minutes()))
+            posed, optima, feasible = _search_until_feasible(posed, z[None], step)
+            z = np.asarray(optima.z[0])
+            tell(next_step("round", round_, optima.cost[0], optima.steps[0], minutes()))
             new = _reestimate_shares(posed, noise, z, shares)
             if new is None:
                 break
             shares = new
             posed = _with_noise_shares(posed, noise, shares)
-        ends, feasibles = [found], [feasible]
+        ends, feasibles = [optima], [feasible]
         for k, point in enumerate(points[1:], 2):
             end, status, _ = step(posed, point[None], posed.data)
             ends.append(end)
             feasibles.append(~np.any(unreachable_rows(posed, status), axis=1))
             tell(next_step("start", k, len(points), end.cost[0], end.steps[0], minutes()))
-        found = jax.tree.map(lambda *x: jnp.concatenate(x), *ends)
-        k = int(np.nanargmin(found.cost))
-        if not found.cost[k] < found.cost[0] - AGREE * (1 + found.cost[0]):
+        optima = jax.tree.map(lambda *x: jnp.concatenate(x), *ends)
+        k = int(np.nanargmin(optima.cost))
+        if not optima.cost[k] < optima.cost[0] - AGREE * (1 + optima.cost[0]):
             k = 0
             break
-        first = np.asarray(found.z[k])
-    return SearchResult(posed, _pick_member(found, k), _outcome_of_searches(found, np.concatenate(feasibles)), shares)
+        first = np.asarray(optima.z[k])
+    return SearchResult(
+        posed, _pick_member(optima, k), _outcome_of_searches(optima, np.concatenate(feasibles)), shares
+    )
 
 
 def starts_from_posterior(easy: Problem, z: np.ndarray, rng: np.random.Generator, count: int) -> np.ndarray:
@@ -223,12 +225,12 @@ def optimum_of_population(
     """What a population found, its best member searched on by gradients where those are to be trusted."""
     z = searched.found.z[searched.at]
     if searched.slope is None:
-        found = search_one_by_one(posed, noise, z[None], shares, tell, solver)
-        return dataclasses.replace(found, searched=searched)
-    seen = Observation(*(jnp.asarray(x[searched.at]) for x in (
+        optima = search_one_by_one(posed, noise, z[None], shares, tell, solver)
+        return dataclasses.replace(optima, searched=searched)
+    observation = Observation(*(jnp.asarray(x[searched.at]) for x in (
         searched.found.reading, searched.found.adhesion_used, searched.found.status, searched.found.flags,
     )))  # fmt: skip
-    error = np.concatenate([np.asarray(posed.whitened(seen, posed.data)), z - np.asarray(posed.data.centre)])
+    error = np.concatenate([np.asarray(posed.whitened(observation, posed.data)), z - np.asarray(posed.data.centre)])
     rows = np.zeros((posed.data.measured.shape[0], len(z)))  # of the penalty on adhesion
     best = optimizers.optimum_at_point(np.concatenate([searched.slope, rows, np.eye(len(z))]), error, z, posed.data)
     settled = np.array([searched.found.settled])
@@ -279,13 +281,13 @@ def _search_until_feasible(
         The problem, the searches, and True for feasible starts.
     """
     for _ in range(TIGHTENINGS + 1):
-        found, status_start, status_end = search(posed, jnp.asarray(points), posed.data)
-        k = int(np.nanargmin(found.cost))
+        optima, status_start, status_end = search(posed, jnp.asarray(points), posed.data)
+        k = int(np.nanargmin(optima.cost))
         if not unreachable_rows(posed, status_end)[k].any():
             break
         data = dataclasses.replace(posed.data, stiffness=posed.data.stiffness / 10)
         posed = dataclasses.replace(posed, data=data)
-    return posed, found, ~np.any(unreachable_rows(posed, status_start), axis=1)
+    return posed, optima, ~np.any(unreachable_rows(posed, status_start), axis=1)
 
 
 def _estimate_shares(posed: Problem, noise: Noise, z: np.ndarray) -> np.ndarray:
@@ -300,6 +302,6 @@ def _estimate_shares(posed: Problem, noise: Noise, z: np.ndarray) -> np.ndarray:
     error = np.asarray(optimizers.observe_at(posed, jnp.asarray(z)).reading - data.measured) / size
     error = np.where(weight > 0, error, 0.0)
     leverage = identifiability.analyse_identifiability(posed, jnp.asarray(z)).leverage
-    left = np.maximum(weight.sum(0) - leverage.sum(0), 1.0)
-    shares = np.maximum(np.sqrt(np.sum(error**2, 0) / left), series_noise.FLOOR)
+    freedom = np.maximum(weight.sum(0) - leverage.sum(0), 1.0)
+    shares = np.maximum(np.sqrt(np.sum(error**2, 0) / freedom), series_noise.FLOOR)
     return np.where(noise.estimated, shares, np.nan)

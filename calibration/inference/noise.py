@@ -168,13 +168,13 @@ def infer_noise(runs: Runs, sizes: np.ndarray, stated: str | None = None) -> Noi
         return given
     sd, words, series = given.sd.copy(), list(given.source), []
     guess = noise_from_table(runs, sizes, default_noise(runs.channels))
-    shown = (None,) * len(words) if runs.sampled else series_noise.estimate_noise(runs, sizes)
+    from_series = (None,) * len(words) if runs.sampled else series_noise.estimate_noise(runs, sizes)
     for k in np.flatnonzero(given.estimated):
-        found = shown[k]
-        if found is None:
+        estimate = from_series[k]
+        if estimate is None:
             sd[:, k], words[k] = guess.sd[:, k], "assumed"
         else:
-            sd[:, k] = np.where(np.isfinite(runs.measured()[:, k]), found.sd(sizes[:, k]), 1.0)
+            sd[:, k] = np.where(np.isfinite(runs.measured()[:, k]), estimate.sd(sizes[:, k]), 1.0)
             words[k] = "series"
-            series.append(found)
+            series.append(estimate)
     return Noise(runs.channels, sd, np.zeros(len(words), bool), tuple(words), tuple(series))

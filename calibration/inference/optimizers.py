@@ -117,17 +117,17 @@ def _evaluated(problem: Problem, data: Data, pin: Pin, z: Z) -> tuple[Array, Arr
 
     One evaluation gives all three.
     """
-    r, jacobian, seen, _ = problem.linearised(lambda x: problem.robot(pin.apply(x)), z, data)
+    r, jacobian, observation, _ = problem.linearised(lambda x: problem.robot(pin.apply(x)), z, data)
     prior = jnp.where(pin.held, z - pin.at, z - data.centre)
-    return jnp.concatenate([r, prior]), jnp.concatenate([jacobian, jnp.eye(z.size)]), seen
+    return jnp.concatenate([r, prior]), jnp.concatenate([jacobian, jnp.eye(z.size)]), observation
 
 
 def residual_function(problem: Problem, data: Data, pin: Pin) -> Function:
     """Residual function of optimistix with the residuals of `_evaluated`, and the observation as auxiliary output."""
 
     def function(z: Z, args: Any) -> tuple[Array, Observation]:
-        r, jacobian, seen = _evaluated(problem, data, pin, jax.lax.stop_gradient(z))
-        return with_slope(z, r, jacobian), seen
+        r, jacobian, observation = _evaluated(problem, data, pin, jax.lax.stop_gradient(z))
+        return with_slope(z, r, jacobian), observation
 
     return function
 
@@ -307,9 +307,9 @@ def _roots(problem: Problem, z: Numbers, active: Numbers | None) -> tuple[Array,
         coordinates = problem.coordinates if active is None else problem.coordinates.with_effects(active)
         return problem.observe.solve(coordinates.robot(problem.base, z))
 
-    found = jax.vmap(one)(z, active)
-    assert found is not None  # of an observer that is `apart`
-    return found
+    solutions = jax.vmap(one)(z, active)
+    assert solutions is not None  # of an observer that is `apart`
+    return solutions
 
 
 @functools.partial(compiled, options=OVER_TIME)
@@ -334,9 +334,9 @@ def _go_on_apart(
     """`_go_on` for observers with a separate program for roots (`Observer.apart`)."""
     at = _admitted(problem, members, fresh, at)
     while True:
-        at, found = _further(problem, members, at, _roots(problem, at[1].ahead, members.active), max_steps)
+        at, results = _further(problem, members, at, _roots(problem, at[1].ahead, members.active), max_steps)
         if np.asarray(at[1].over).sum() >= enough:
-            return at, found
+            return at, results
 
 
 def with_roots(problem: Problem, z: Z) -> Problem:
@@ -433,27 +433,27 @@ def _refilled(problem: Problem, members: Member, max_steps: int, places: int) ->
     go_on = _go_on_apart if problem.observe.apart else go_on
 
     def some(core: int) -> dict[int, Any]:
-        mine, at = Places(range(core, count, cores), places), idle
-        while mine:
-            fresh = np.isin(np.arange(places), mine.fill())
-            own = jax.tree.map(lambda x: x[mine.member], members)
-            running = int(mine.taken.sum())
-            enough = places - running + (max(1, places // 4) if mine.waiting else running)
-            at, found = go_on(problem, own, fresh, at, np.asarray(enough), most)
-            mine.leave(*jax.device_get((at[1].over, (found, at[1]))))
-        return mine.ended
+        assigned, at = Places(range(core, count, cores), places), idle
+        while assigned:
+            fresh = np.isin(np.arange(places), assigned.fill())
+            own_members = jax.tree.map(lambda x: x[assigned.member], members)
+            running = int(assigned.taken.sum())
+            enough = places - running + (max(1, places // 4) if assigned.waiting else running)
+            at, results = go_on(problem, own_members, fresh, at, np.asarray(enough), most)
+            assigned.leave(*jax.device_get((at[1].over, (results, at[1]))))
+        return assigned.ended
 
     if cores > 1:  # compiles the program once, by a call that takes no step
         go_on(problem, first, np.zeros(places, bool), idle, np.asarray(0), most)
     with Threads(cores) as pool:
-        ended = {k: found for part in pool.map(some, range(cores)) for k, found in part.items()}
+        ended = {k: result for part in pool.map(some, range(cores)) for k, result in part.items()}
     return jax.tree.map(lambda *x: np.stack(x), *(ended[k] for k in range(count)))
 
 
 def linearise(problem: Problem, z: Z, data: Data) -> tuple[Array, Array, Observation]:
     """Residuals (misfit, then prior) at z, their Jacobian, and the observation."""
-    r, jacobian, seen = (linearise_rollout if problem.observe.long else _first_step)(problem, z, data)
-    return *_clip_penalties(r, jacobian, data), seen
+    r, jacobian, observation = (linearise_rollout if problem.observe.long else _first_step)(problem, z, data)
+    return *_clip_penalties(r, jacobian, data), observation
 
 
 def _first_step(problem: Problem, z: Z, data: Data) -> tuple[Array, Array, Observation]:
@@ -498,14 +498,14 @@ def linearise_rollout(problem: Problem, z: Z, data: Data) -> tuple[Array, Array,
     derivative grows without limit. Such a reading counts as not computed if it has a weight.
     """
 
-    r, jacobian, seen = _evaluated(problem, data, no_pin(z.size), z)
-    return *mask_uncomputed(r, jacobian, data), seen
+    r, jacobian, observation = _evaluated(problem, data, no_pin(z.size), z)
+    return *mask_uncomputed(r, jacobian, data), observation
 
 
 def evaluate_residuals(problem: Problem, z: Z, data: Data) -> Array:
     """Residuals of `linearise` without the Jacobian, by the program of `observe_robot`, which saves a compilation."""
-    seen = observe_robot(problem, problem.robot(z))
-    return jnp.concatenate([problem.whitened(seen, data), z - data.centre])
+    observation = observe_robot(problem, problem.robot(z))
+    return jnp.concatenate([problem.whitened(observation, data), z - data.centre])
 
 
 @eqx.filter_jit
@@ -536,12 +536,12 @@ def search_rollout(
         # A step after a rejected one is often rejected too; that needs no Jacobian, so the previous one remains.
         r = evaluate_residuals(problem, ahead, data) if progress[1].rejected > 0 else None
         if r is None or best is None or 0.5 * jnp.sum(r**2) < best.cost:
-            r, jacobian, seen = linearise_rollout(problem, ahead, data)
-        first = seen if first is None else first
+            r, jacobian, observation = linearise_rollout(problem, ahead, data)
+        first = observation if first is None else first
         progress = _stepped(solver, progress, r, jacobian)
         done = bool(progress[1].over)
         if progress[1].rejected == 0:
-            best, last = _optimum(jacobian, r, progress[0], data, pin, jnp.asarray(steps)), seen
+            best, last = _optimum(jacobian, r, progress[0], data, pin, jnp.asarray(steps)), observation
             done |= bool(best.decrement < 0.1 * (DECREMENT + DECREMENT_SHARE * best.cost))
         assert best is not None  # the first step only evaluates the start, and accepts it
         tell(steps, float(best.cost))
@@ -595,44 +595,44 @@ def search_rollouts(
         End of each search, and the observation there.
     """
     starts, weights, solver = np.asarray(starts), np.asarray(weights), _solver(data, long=True)
-    mine = Places(range(len(starts)), max(places, len(starts) * rivals))
-    cost, ahead = np.full(len(starts), np.inf), starts[mine.member]
-    trail = np.full((LATELY, len(mine.member)), np.nan)
+    assigned = Places(range(len(starts)), max(places, len(starts) * rivals))
+    cost, ahead = np.full(len(starts), np.inf), starts[assigned.member]
+    trail = np.full((LATELY, len(assigned.member)), np.nan)
     progress: Progress | None = None
-    while mine:
-        fresh, going = mine.fill(), np.flatnonzero(mine.taken)
+    while assigned:
+        fresh, going = assigned.fill(), np.flatnonzero(assigned.taken)
         # A step accepts or rejects the point to which the last one led; an accepted point becomes y.
-        ahead = _with_values(ahead, fresh, starts[mine.holds[fresh]])
-        evaluated = evaluate(ahead[going], mine.holds[going])
-        found = jax.tree.map(
+        ahead = _with_values(ahead, fresh, starts[assigned.holds[fresh]])
+        evaluated = evaluate(ahead[going], assigned.holds[going])
+        optima = jax.tree.map(
             lambda x: _with_values(np.zeros((len(ahead), *x.shape[1:]), x.dtype), going, x),  # noqa: B023
             evaluated,
         )
         if len(fresh):
-            aux = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), found[2])
-            begin = functools.partial(_begin, solver, size=found[0].shape[1], aux=aux)
+            aux = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), optima[2])
+            begin = functools.partial(_begin, solver, size=optima[0].shape[1], aux=aux)
             begun = jax.device_get(jax.vmap(begin)(jnp.asarray(ahead)))
             put = lambda old, new: _with_values(old, fresh, new[fresh])  # noqa: B023, E731
             progress = begun if progress is None else jax.tree.map(put, progress, begun)
         assert progress is not None  # the first searches are fresh
-        progress, ends = jax.device_get(_steps(progress, found, data, weights[mine.member]))
+        progress, ends = jax.device_get(_steps(progress, optima, data, weights[assigned.member]))
         state = progress[1]
-        ahead, seen = state.ahead, state.aux
+        ahead, observation = state.ahead, state.aux
         small = 0.1 * (DECREMENT + DECREMENT_SHARE * ends.cost)
         over = state.over | (state.steps >= max_steps) | ((state.rejected == 0) & (ends.decrement < small))
-        cost[mine.holds[going]] = ends.cost[going]
+        cost[assigned.holds[going]] = ends.cost[going]
         if rivals:
-            done = np.r_[[*mine.ended], mine.holds[over & mine.taken]].astype(int)
+            done = np.r_[[*assigned.ended], assigned.holds[over & assigned.taken]].astype(int)
             lowest = np.min(cost[done], initial=np.inf)
-            lower = mine.taken & ~over & (ends.cost < lowest - SAME)
+            lower = assigned.taken & ~over & (ends.cost < lowest - SAME)
             agree = np.sum(cost[done] < lowest + SAME) >= AGREE and not lower.any()
-            so_far = min(lowest, np.min(ends.cost[mine.taken]))
+            so_far = min(lowest, np.min(ends.cost[assigned.taken]))
             with np.errstate(invalid="ignore"):  # NaN of runs that cannot be simulated yet
                 hope = HOPELESS * np.fmin(ends.decrement, trail[0] - ends.cost)
             over = over | (ends.cost - hope > so_far + SAME) | agree
             trail = np.concatenate([trail[1:], ends.cost[None]])
-        mine.leave(over, (ends, seen))
-    return jax.tree.map(lambda *x: np.stack(x), *(mine.ended[k] for k in range(len(starts))))
+        assigned.leave(over, (ends, observation))
+    return jax.tree.map(lambda *x: np.stack(x), *(assigned.ended[k] for k in range(len(starts))))
 
 
 def _with_values(x: np.ndarray, places: np.ndarray, values: np.ndarray) -> np.ndarray:
@@ -670,8 +670,8 @@ def search_starts(
 @compiled
 def _search_starts(problem: Problem, starts: Array | np.ndarray, data: Data) -> tuple[Optimum, Array, Array]:
     def search(z: Any) -> tuple[Optimum, Array, Array]:
-        optimum, seen = levenberg_marquardt(problem, z, data)
-        return optimum, problem.observation(z).status, seen.status
+        optimum, observation = levenberg_marquardt(problem, z, data)
+        return optimum, problem.observation(z).status, observation.status
 
     return jax.vmap(search)(starts)
 
@@ -696,10 +696,10 @@ def search_with_solver(
     def search(start: Z) -> tuple[Optimum, Observation, Observation]:
         solved: optx.Solution = optx.least_squares(residual, solver, start, max_steps=most, throw=False)
         z, pin = solved.value, no_pin(start.size)
-        r, jacobian, seen = _evaluated(problem, data, pin, z)
+        r, jacobian, observation = _evaluated(problem, data, pin, z)
         r, jacobian = mask_uncomputed(r, jacobian, data)
         optimum = _optimum(jacobian, r, z, data, pin, solved.stats["num_steps"])
-        return optimum, problem.observation(start), seen
+        return optimum, problem.observation(start), observation
 
     return jax.lax.map(search, starts)
 

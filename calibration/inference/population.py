@@ -133,7 +133,7 @@ def saved_members(file: Path) -> tuple[str, list[np.ndarray]]:
     """
     try:
         with file.open("rb") as bytes_, np.load(bytes_, allow_pickle=False) as saved:
-            own, arrays = str(saved["identity"]), [saved[k] for k in KEPT]
+            own_identity, arrays = str(saved["identity"]), [saved[k] for k in KEPT]
         if len({len(array) for array in arrays}) != 1:
             raise ValueError("its arrays have different lengths")
     except Exception as error:  # a damaged file can make the reader raise anything
@@ -141,7 +141,7 @@ def saved_members(file: Path) -> tuple[str, list[np.ndarray]]:
             f"--members {file}: not a readable file of members ({type(error).__name__}); remove it, or name "
             "another file"
         ) from error
-    return own, arrays
+    return own_identity, arrays
 
 
 class Members:
@@ -166,8 +166,8 @@ class Members:
             self._load(file)
 
     def _load(self, file: Path) -> None:
-        own, arrays = saved_members(file)
-        if own != self._own:
+        own_identity, arrays = saved_members(file)
+        if own_identity != self._own:
             raise BadConfiguration(
                 f"--members {file}: its members belong to another calibration (data, robot, parameters or model); "
                 "remove it, or name another file"
@@ -178,10 +178,10 @@ class Members:
         if self._file is None:
             return
         z = np.array([np.frombuffer(key) for key in self._kept])
-        kept: Json = dict(zip(KEPT, (z, *map(np.array, zip(*self._kept.values(), strict=True))), strict=True))
+        arrays: Json = dict(zip(KEPT, (z, *map(np.array, zip(*self._kept.values(), strict=True))), strict=True))
         try:
             with replacing(self._file) as aside, aside.open("wb") as out:
-                np.savez(out, **kept, identity=np.array(self._own))
+                np.savez(out, **arrays, identity=np.array(self._own))
                 out.flush()
                 os.fsync(out.fileno())
         except OSError as error:
@@ -199,8 +199,8 @@ class Members:
         for first in range(0, len(new), together):
             part = np.array(new[first : first + together])
             filled = np.concatenate([part, np.repeat(part[-1:], together - len(part), 0)])
-            seen = jax.device_get(_observed(self._posed, jnp.asarray(filled)))
-            for z, *row in zip(part, *(getattr(seen, name) for name in Rows._fields), strict=False):
+            observed = jax.device_get(_observed(self._posed, jnp.asarray(filled)))
+            for z, *row in zip(part, *(getattr(observed, name) for name in Rows._fields), strict=False):
                 self._kept[z.tobytes()] = tuple(map(np.asarray, row))
             self._save()
             advance(len(points) - len(new) + first + len(part))
@@ -276,28 +276,33 @@ def evolve(
     begun = time.perf_counter()
     search = CMA(np.asarray(centre, float), 1.0, population_size=size, seed=seed, cov=np.array(covariance, float))
     z = np.empty((0, len(centre))) if beside is None else np.asarray(beside, float)
-    seen, cost, told = None, np.empty(0), list[Generation]()
+    rows, cost, progress = None, np.empty(0), list[Generation]()
     for number in range(1, generations + 1):
-        drawn = np.array([search.ask() for _ in range(size)])
-        asked = drawn if number > 1 or not len(z) else np.concatenate([z, drawn])
+        sample = np.array([search.ask() for _ in range(size)])
+        points = sample if number > 1 or not len(z) else np.concatenate([z, sample])
 
         def advance(done: int) -> None:
             minutes = (time.perf_counter() - begun) / 60
-            tell(next_step("members", number, done, len(asked), minutes))  # noqa: B023
+            tell(next_step("members", number, done, len(points), minutes))  # noqa: B023
 
-        now = members.run(asked, advance)
-        z = asked if seen is None else np.concatenate([z, asked])
-        seen = now if seen is None else Rows(*map(np.concatenate, zip(seen, now, strict=True)))
-        cost = np.concatenate([cost, objective(asked, now)])
-        own = cost[-size:]
-        search.tell([(d, float(c)) for d, c in zip(drawn, np.where(np.isfinite(own), own, MISSING**2), strict=True)])
+        now = members.run(points, advance)
+        z = points if rows is None else np.concatenate([z, points])
+        rows = now if rows is None else Rows(*map(np.concatenate, zip(rows, now, strict=True)))
+        cost = np.concatenate([cost, objective(points, now)])
+        own_cost = cost[-size:]
+        search.tell(
+            [
+                (d, float(c))
+                for d, c in zip(sample, np.where(np.isfinite(own_cost), own_cost, MISSING**2), strict=True)
+            ]
+        )
         failed = int(np.sum(members.lost(now).any(-1)))
-        told.append(Generation(len(asked), failed, float(cost.min()), float(np.median(own))))
-        tell(next_step("generation", number, cost.min(), np.median(own), failed))
-        found = Population(z, *seen, cost, tuple(told))
-        if found.settled:
+        progress.append(Generation(len(points), failed, float(cost.min()), float(np.median(own_cost))))
+        tell(next_step("generation", number, cost.min(), np.median(own_cost), failed))
+        population = Population(z, *rows, cost, tuple(progress))
+        if population.settled:
             break
-    return found
+    return population
 
 
 def local_regression(
@@ -323,8 +328,8 @@ def local_regression(
     # A ridge of one prior sd: parameters that the members do not determine get slope zero.
     ridge = np.diag([0.0, *np.full(z.shape[1], 1e-3 * number * np.var(apart[near]) + 1e-12)])
     slope = np.linalg.solve(design.T @ design + ridge, design.T @ moved)
-    left = moved - design @ slope
-    return slope[1:].T, float(np.sqrt(np.mean(left**2)))
+    unexplained = moved - design @ slope
+    return slope[1:].T, float(np.sqrt(np.mean(unexplained**2)))
 
 
 def unreliable_derivatives(
@@ -336,9 +341,9 @@ def unreliable_derivatives(
     `APART` of its size and one data sd per posterior sd.
     """
     steps = STEP * np.diag(sd)
-    seen = members.run(np.concatenate([z + steps, z - steps]))
+    rows = members.run(np.concatenate([z + steps, z - steps]))
     scale = np.asarray(posed.data.weight / posed.data.sd)
-    ahead, behind = np.split(np.where(scale > 0, seen.reading * scale, 0.0), 2)
+    ahead, behind = np.split(np.where(scale > 0, rows.reading * scale, 0.0), 2)
     differences = ((ahead - behind) / (2 * STEP)).reshape(len(z), -1)  # per posterior sd
     derivatives = jacobian.T * sd[:, None]
     off = np.linalg.norm(derivatives - differences, axis=1)
@@ -349,13 +354,13 @@ def unreliable_derivatives(
 def parameters_at_edge(coordinates: Coordinates, z: np.ndarray) -> dict[str, Edge]:
     """Parameters at a bound, or further than `EDGE` from the middle of their prior, with that distance, by name."""
     bound = coordinates.beyond(z)
-    found = {}
+    at_edge = {}
     for name, shift, side in zip(coordinates.names, z, bound, strict=True):
         if side:
-            found[name] = Edge("lower" if side < 0 else "upper", float(shift))
+            at_edge[name] = Edge("lower" if side < 0 else "upper", float(shift))
         elif abs(shift) > EDGE:
-            found[name] = Edge("", float(shift))
-    return found
+            at_edge[name] = Edge("", float(shift))
+    return at_edge
 
 
 @dataclasses.dataclass(frozen=True)
@@ -403,7 +408,7 @@ class Searched:
 
     def remarks(self) -> list[Remark]:
         """Notes on the search."""
-        said: list[Remark] = [
+        notes: list[Remark] = [
             Remark(
                 "generations",
                 members=len(self.found.z),
@@ -413,10 +418,10 @@ class Searched:
         ]
         ended = self.outcomes()
         lost = {status: ended[status] for status in LOST_AS if status in ended}
-        said += [Remark("lost_rows", members=lost)] * bool(lost)
+        notes += [Remark("lost_rows", members=lost)] * bool(lost)
         if "jumps" in ended:
             rows = np.flatnonzero(self._jumps(self.found.flags[self.at]))
-            said.append(Remark("members_jump", members=ended["jumps"], best=tuple(int(k) + 1 for k in rows)))
-        said += [Remark("ended_at_edge", edge=self.edge)] * bool(self.edge)
-        said += [Remark("read_from_members", names=self.apart, left=self.left)] * bool(self.apart)
-        return said
+            notes.append(Remark("members_jump", members=ended["jumps"], best=tuple(int(k) + 1 for k in rows)))
+        notes += [Remark("ended_at_edge", edge=self.edge)] * bool(self.edge)
+        notes += [Remark("read_from_members", names=self.apart, left=self.left)] * bool(self.apart)
+        return notes

@@ -85,16 +85,16 @@ def prepare(
     own_mass.check_priors(priors, robot, runs)
     as_stated, weighed = robot, own_mass.mass_notes(robot, runs)
     robot = own_mass.with_table_mass(robot, runs)
-    known = (noise_room.infer_noise if assume else noise_room.noise_from_table)(runs, observe.sizes(runs), noise)
-    known, larger = repeats.enlarge_noise(known, runs)
-    robot = observe.with_initial_states(robot, runs, known)
-    found = Prepared(robot, observe, known, priors, (), (), (), (), tuple(weighed))
-    names = tuple(choose(found))
+    noise_sds = (noise_room.infer_noise if assume else noise_room.noise_from_table)(runs, observe.sizes(runs), noise)
+    noise_sds, larger = repeats.enlarge_noise(noise_sds, runs)
+    robot = observe.with_initial_states(robot, runs, noise_sds)
+    result = Prepared(robot, observe, noise_sds, priors, (), (), (), (), tuple(weighed))
+    names = tuple(choose(result))
     # The table's masses are compared with those of the file, which are not yet replaced there.
-    checked = checks.check_data(runs, as_stated, names, known)
-    begins = observe.check_start(runs, known, robot)
+    checked = checks.check_data(runs, as_stated, names, noise_sds)
+    begins = observe.check_start(runs, noise_sds, robot)
     return dataclasses.replace(
-        found,
+        result,
         names=names,
         foreign=tuple(inherited_priors(robot, priors)),
         checked=(*larger, *checked),

@@ -189,8 +189,8 @@ def _uncertain(robot: Robot, names: Iterable[str]) -> Names:
     """
     fields, exact = parameters_by_name(robot), robot.rig.exact
     stated = robot.rig.stated if robot.rig.inherits else {*robot.rig.stated, DELAY}
-    mine = (n for n in names if n in fields and n not in exact)
-    return tuple(n for n in mine if float(fields[n].value) != 0.0 or n in stated)
+    own_names = (n for n in names if n in fields and n not in exact)
+    return tuple(n for n in own_names if float(fields[n].value) != 0.0 or n in stated)
 
 
 def stated_names(robot: Robot, configurations: Iterable[str], idle: Names = ()) -> Names:
@@ -204,10 +204,10 @@ def stated_names(robot: Robot, configurations: Iterable[str], idle: Names = ()) 
     """
     others = set(robot.configurations) - set(configurations)
     fields = parameters_by_name(robot)  # a prior may be of an effect that the robot no longer has
-    mine = [
+    own_names = [
         n for n, _, sd in robot.rig.priors if sd > 0 and n in fields and n.partition(".")[0] not in {"rig", *others}
     ]
-    return _drive(robot, (n for n in mine if _leader(robot, n) is None and not n.endswith(idle)))
+    return _drive(robot, (n for n in own_names if _leader(robot, n) is None and not n.endswith(idle)))
 
 
 def delay_names(robot: Robot, names: Iterable[str]) -> Names:

@@ -135,26 +135,26 @@ class Problem(eqx.Module):
         if solved is None:
 
             def explicit(x: Array) -> tuple[Array, tuple[Array, Observation]]:
-                seen = self.observe(robot(x))
-                r = self.signed(seen, data)
-                return r, (r, seen)
+                observation = self.observe(robot(x))
+                r = self.signed(observation, data)
+                return r, (r, observation)
 
-            jacobian, (r, seen) = jax.jacfwd(explicit, has_aux=True)(x)
-            return r, jacobian, seen, None
+            jacobian, (r, observed) = jax.jacfwd(explicit, has_aux=True)(x)
+            return r, jacobian, observed, None
 
-        unknowns, found = solved
+        unknowns, was_found = solved
         size, (rows, count) = x.size, data.measured.shape
 
         def shown(x: Array) -> tuple[tuple[Array, Array], tuple[Array, Observation, Signals]]:
-            seen, signals, left = self.observe.shown(robot(x[:size]), unknowns + x[size:], found)
-            r = self.signed(seen, data)
-            return (r, left), (r, seen, signals)
+            observation, signals, left = self.observe.shown(robot(x[:size]), unknowns + x[size:], was_found)
+            r = self.signed(observation, data)
+            return (r, left), (r, observation, signals)
 
         wide = jnp.concatenate([x, jnp.zeros(unknowns.shape[1])])
-        (slope, left), (r, seen, signals) = jax.jacfwd(shown, has_aux=True)(wide)
+        (slope, left), (r, observed, signals) = jax.jacfwd(shown, has_aux=True)(wide)
         by_row = slope[: rows * count].reshape(rows, count, -1)
         by_row = implicit_slopes(jnp.concatenate([by_row, slope[rows * count :, None]], 1), left)
-        return r, jnp.concatenate([by_row[:, :count].reshape(-1, size), by_row[:, count]]), seen, signals
+        return r, jnp.concatenate([by_row[:, :count].reshape(-1, size), by_row[:, count]]), observed, signals
 
     def excess(self, seen: Observation, data: Data) -> Float[Array, " rows"]:
         """Demand on adhesion above its margin, in units of the penalty. Negative if a row leaves some."""

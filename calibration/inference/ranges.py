@@ -71,7 +71,7 @@ def check_ranges(runs: Runs, robot: Robot) -> list[Remark]:
     if not np.isfinite(possible).any():
         return []
     factors = {c: _factor(measured[:, k], possible[:, :, k]) for k, c in enumerate(robot.channels)}
-    said: list[Remark] = []
+    remarks: list[Remark] = []
     for k, (channel, factor) in enumerate(factors.items()):
         off = max(factor, 1 / factor)
         unknown = not robot.rig.inherits and channel.name in OF_TORQUE
@@ -83,22 +83,24 @@ def check_ranges(runs: Runs, robot: Robot) -> list[Remark]:
         ):  # a sliding vehicle may have other speeds
             continue
         typical = _factor(measured[:, k], possible[1:2, :, k])
-        mine = factors[channel]
-        found = Remark(
+        channel_factors = factors[channel]
+        remark = Remark(
             "off_by",
             column=channel.column,
             unit=channel.unit,
             factor=typical if units else factor,
             units=tuple(units),
             others=tuple(
-                c.column for c, f in factors.items() if c is not channel and abs(math.log(f / mine)) < math.log(ALIKE)
+                c.column
+                for c, f in factors.items()
+                if c is not channel and abs(math.log(f / channel_factors)) < math.log(ALIKE)
             ),
             imposed=runs.layout.imposed_column,
         )
         if off > REFUSED:
-            raise BadData(f"{runs.source}, {describe(found)}")
-        said.append(found)
-    return [*said, *_turned(runs, measured, possible), *_slopes(runs, measured, possible[1], robot)]
+            raise BadData(f"{runs.source}, {describe(remark)}")
+        remarks.append(remark)
+    return [*remarks, *_turned(runs, measured, possible), *_slopes(runs, measured, possible[1], robot)]
 
 
 def turned_signs(runs: Runs, robot: Robot) -> list[Remark]:
@@ -119,14 +121,14 @@ def turned_signs(runs: Runs, robot: Robot) -> list[Remark]:
 
 def _turned(runs: Runs, measured: np.ndarray, possible: np.ndarray) -> list[Remark]:
     """Result of `turned_signs` for readings [SI], shape (runs, channels), and for several robots, (robots, ...)."""
-    found: list[Remark] = []
+    remarks: list[Remark] = []
     for k, channel in enumerate(runs.channels if runs.layout.weight else ()):
         if not channel.directed or runs.layout.magnitude(channel.name):
             continue
         off, turned = (_rms(sign * measured[:, k] - possible[:, :, k]) for sign in (1.0, -1.0))
         if turned * NEARER < off:
             theirs = runs.headings.get(channel.column, channel.column)
-            found.append(
+            remarks.append(
                 Remark(
                     "turned",
                     source=runs.source,
@@ -136,7 +138,7 @@ def _turned(runs: Runs, measured: np.ndarray, possible: np.ndarray) -> list[Rema
                     turned=turned / channel.factor,
                 )
             )
-    return found if len(found) == 1 else []  # with several, the file's values may be wrong instead
+    return remarks if len(remarks) == 1 else []  # with several, the file's values may be wrong instead
 
 
 def _rms(off: np.ndarray) -> float:
@@ -176,11 +178,11 @@ def _factor(measured: np.ndarray, possible: np.ndarray) -> float:
 
 def _units(channel: Channel, measured: np.ndarray, possible: np.ndarray, robot: Robot) -> list[str]:
     """Units that would make the readings possible, the most probable first. Arguments as in `_factor`."""
-    known = {unit: channel.factor / size for unit, size in channel.sizes.items() if size != channel.factor}
+    other_units = {unit: channel.factor / size for unit, size in channel.sizes.items() if size != channel.factor}
     if channel.name == "motor_speed" and robot.has_ground:
-        known["rpm of the driving wheel"] = 1 / float(robot.gearbox.ratio)
-    left = {unit: abs(math.log(_factor(measured / f, possible))) for unit, f in known.items()}
-    return sorted((u for u, x in left.items() if x < math.log(ALIKE)), key=left.__getitem__)
+        other_units["rpm of the driving wheel"] = 1 / float(robot.gearbox.ratio)
+    distance = {unit: abs(math.log(_factor(measured / f, possible))) for unit, f in other_units.items()}
+    return sorted((u for u, x in distance.items() if x < math.log(ALIKE)), key=distance.__getitem__)
 
 
 def _slips(robot: Robot, channel: Channel, factor: float) -> bool:
@@ -190,12 +192,12 @@ def _slips(robot: Robot, channel: Channel, factor: float) -> bool:
 
 def _check_gear(runs: Runs, measured: np.ndarray, robot: Robot) -> None:
     """Refuse a gear ratio that is the inverse of the ratio of the speeds of motor and output."""
-    shown = dict(zip(channels.channel_names(robot.channels), measured.T, strict=True))
+    readings = dict(zip(channels.channel_names(robot.channels), measured.T, strict=True))
     conditions = runs.conditions(robot)
     which = np.asarray(conditions.configuration)
     radius = np.asarray([float(c.radius) for c in robot.configurations.members])[which]
-    output = shown.get("output_speed", shown["speed"] / radius if "speed" in shown else None)
-    motor = shown.get("motor_speed", conditions.motor_speed)
+    output = readings.get("output_speed", readings["speed"] / radius if "speed" in readings else None)
+    motor = readings.get("motor_speed", conditions.motor_speed)
     if motor is None:  # approximately its speed without load
         motor = np.asarray(conditions.voltage) / float(robot.motor.torque_constant)
     ratio = float(robot.gearbox.ratio)
@@ -203,10 +205,10 @@ def _check_gear(runs: Runs, measured: np.ndarray, robot: Robot) -> None:
         return
     turns = np.abs(np.asarray(motor)) / np.maximum(np.abs(output), 1e-12)
     turns = turns[np.isfinite(turns) & (turns > 0)]
-    found = float(np.median(turns)) if turns.size else ratio
-    if abs(math.log(found * ratio)) < math.log(SAID):
+    measured_ratio = float(np.median(turns)) if turns.size else ratio
+    if abs(math.log(measured_ratio * ratio)) < math.log(SAID):
         raise BadData(
-            f"{runs.source}: the motor turns about {bound_text(float(f'{found:.2g}'))} times for one turn "
+            f"{runs.source}: the motor turns about {bound_text(float(f'{measured_ratio:.2g}'))} times for one turn "
             "of the output, "
             f"but gearbox.ratio is {bound_text(float(f'{ratio:.4g}'))}: is it upside down? expected motor "
             "turns per turn "
@@ -218,13 +220,13 @@ def _check_masses(runs: Runs, robot: Robot) -> None:
     """Refuse total masses that are impossible for this robot."""
     if not runs.has("total_mass_kg"):
         return
-    own = np.asarray([float(c.mass) for c in robot.configurations.members])[runs.configurations(robot)]
-    factor = float(np.median(runs["total_mass_kg"] / (own + runs["payload_kg"])))
+    own_mass = np.asarray([float(c.mass) for c in robot.configurations.members])[runs.configurations(robot)]
+    factor = float(np.median(runs["total_mass_kg"] / (own_mass + runs["payload_kg"])))
     if max(factor, 1 / factor) > REFUSED:
         off, size = (factor, "large") if factor > 1 else (1 / factor, "small")
         raise BadData(
             f"{runs.source}, total_mass_kg: about {bound_text(float(f'{off:.2g}'))} times too {size} for this robot "
-            f"({', '.join(f'{bound_text(m)} kg' for m in np.unique(own))} and the payload); check the "
+            f"({', '.join(f'{bound_text(m)} kg' for m in np.unique(own_mass))} and the payload); check the "
             "unit, kg, and the "
             "mass in the robot's file"
         )

@@ -45,18 +45,18 @@ def enlarge_noise(noise: Noise, runs: Runs) -> tuple[Noise, list[Remark]]:
     apart = np.abs(runs.measured()[first] - runs.measured()[second]) / np.hypot(noise.sd[first], noise.sd[second])
     factors, notes = dict[str, float](), list[Remark]()
     for k, channel in enumerate(noise.channels):
-        told = apart[np.isfinite(apart[:, k]), k]
-        if len(told) < FEWEST or noise.source[k] in ("series", "estimated", "no readings"):
+        deviations = apart[np.isfinite(apart[:, k]), k]
+        if len(deviations) < FEWEST or noise.source[k] in ("series", "estimated", "no readings"):
             continue
-        median = float(np.median(told))
-        if _median_tail(median, len(told)) < IMPROBABLE:
+        median = float(np.median(deviations))
+        if _median_tail(median, len(deviations)) < IMPROBABLE:
             factors[channel.name] = median / MEDIAN
             notes.append(
                 Remark(
                     "larger_noise",
                     channel=channel.name,
                     factor=factors[channel.name],
-                    pairs=len(told),
+                    pairs=len(deviations),
                     source=UNSTATED.get(noise.source[k], "stated"),
                 )
             )

@@ -119,22 +119,26 @@ def residual_clusters(fit: Residuals, seed: int = 0) -> tuple[ResidualCluster, .
         fit: residuals of the fit. Of histories the mean of each run is tested.
         seed: random seed of the permutations.
     """
-    whole = _by_run(fit) if fit.runs.sampled else _by_row(fit)
-    columns = _without_role(whole)
+    residuals = _by_run(fit) if fit.runs.sampled else _by_row(fit)
+    columns = _without_role(residuals)
     if not columns:
         return ()
-    made = [(k, seen) for k in range(fit.counts.shape[1]) if (seen := _channel(whole, k, columns)) is not None]
-    count = sum(len(tested.tests) for _, tested in made)
-    every = [(count * float(p[0]), k, test) for k, seen in made for test, p in seen.p_values(seen.left[:, None])]
-    found = [one for one in every if one[0] < LEVEL]
-    if not found:
+    channel_tests = [
+        (k, seen) for k in range(fit.counts.shape[1]) if (seen := _channel(residuals, k, columns)) is not None
+    ]
+    count = sum(len(tested.tests) for _, tested in channel_tests)
+    every = [
+        (count * float(p[0]), k, test) for k, seen in channel_tests for test, p in seen.p_values(seen.left[:, None])
+    ]
+    significant = [one for one in every if one[0] < LEVEL]
+    if not significant:
         return ()
-    strongest = _permuted(made, seed)
+    strongest = _permuted(channel_tests, seed)
     floor = 1 / (1 + len(strongest))
     answer: list[ResidualCluster] = []
-    for k, tested in made:
+    for k, tested in channel_tests:
         chances = [
-            (p, test, floor * (1 + int(np.sum(strongest <= p / count)))) for p, seen, test in found if seen == k
+            (p, test, floor * (1 + int(np.sum(strongest <= p / count)))) for p, seen, test in significant if seen == k
         ]
         mine = sorted(((p if c <= floor else max(p, c)), test) for p, test, c in chances if c <= LEVEL)
         taken: list[tuple[float, _Comparison, list[str]]] = []
@@ -146,7 +150,7 @@ def residual_clusters(fit: Residuals, seed: int = 0) -> tuple[ResidualCluster, .
                 taken.append((p, test, []))
             else:
                 explains[2].append(test.column)
-        answer += [_report_cluster(whole, k, test, p, tuple(names)) for p, test, names in taken]
+        answer += [_report_cluster(residuals, k, test, p, tuple(names)) for p, test, names in taken]
     return tuple(sorted(answer, key=lambda c: c.p))
 
 
@@ -240,7 +244,7 @@ def _by_run(fit: Residuals) -> _Units:
 
 def _without_role(whole: _Units) -> Columns:
     """Columns to test: with more than one level, and no ids, times or aliases of a condition."""
-    runs, kept = whole.runs, {}
+    runs, columns = whole.runs, {}
     # Simulated readings depend only on the conditions.
     conditions = [runs[c] for c in CONDITIONS if runs.has(c)] + list(whole.simulated.T)
     for name, cells in runs.extras.items():
@@ -252,8 +256,8 @@ def _without_role(whole: _Units) -> Columns:
             cells, words, conditions
         ):
             continue
-        kept[name] = cells
-    return kept
+        columns[name] = cells
+    return columns
 
 
 def _words(cells: np.ndarray) -> np.ndarray:
@@ -266,9 +270,9 @@ def _words(cells: np.ndarray) -> np.ndarray:
 def _columns_with_role(runs: Runs) -> Iterator[np.ndarray]:
     """Columns with a role, except readings and their sds, and the combinations of the labels."""
     readings = {name for c in runs.channels for name in (c.column, c.sd_column)}
-    known = {name: v.astype(str) for name, v in runs.columns.items() if name not in readings}
-    labels = [known[name] for name in _labels(runs)]
-    yield from known.values()
+    word_columns = {name: v.astype(str) for name, v in runs.columns.items() if name not in readings}
+    labels = [word_columns[name] for name in _labels(runs)]
+    yield from word_columns.values()
     if len(labels) > 1:
         yield np.array(["|".join(words) for words in zip(*labels, strict=True)])
 
@@ -359,12 +363,12 @@ class _Channel:
 
     def beside(self, test: _Comparison, other: _Comparison) -> float:
         """p-value of a test after another one is projected out too, 1 if nothing is left to test."""
-        own = _orthonormal(test.basis - other.basis @ (other.basis.T @ test.basis))
-        left = self.left - other.basis @ (other.basis.T @ self.left)
+        basis = _orthonormal(test.basis - other.basis @ (other.basis.T @ test.basis))
+        residual = self.left - other.basis @ (other.basis.T @ self.left)
         freedom = self.freedom - other.basis.shape[1]
-        if own.shape[1] == 0 or freedom - own.shape[1] < LEAST:
+        if basis.shape[1] == 0 or freedom - basis.shape[1] < LEAST:
             return 1.0
-        return float(_variance_ratio_test(own, left[:, None], np.array([left @ left]), freedom)[0])
+        return float(_variance_ratio_test(basis, residual[:, None], np.array([residual @ residual]), freedom)[0])
 
 
 def _variance_ratio_test(basis: np.ndarray, residuals: np.ndarray, total: np.ndarray, freedom: int) -> np.ndarray:
@@ -406,8 +410,8 @@ def _channel(whole: _Units, k: int, columns: Columns) -> _Channel | None:
     smooth = _condition_columns(runs, whole.simulated[counts], travel if both else None)
     taken = _orthonormal(np.concatenate([directions[:, ~open_], _unit_columns(scaled(smooth, forth))], 1))
     whitened = scaled(whole.whitened[counts, k][:, None], back)[:, 0]
-    left = whitened - taken @ (taken.T @ whitened)
-    freedom = len(left) - taken.shape[1]
+    projected = whitened - taken @ (taken.T @ whitened)
+    freedom = len(projected) - taken.shape[1]
     tests = []
     for name, cells in columns.items():
         for within in ("", *_labels(runs)):
@@ -418,7 +422,7 @@ def _channel(whole: _Units, k: int, columns: Columns) -> _Channel | None:
                 basis = _orthonormal(basis - taken @ (taken.T @ basis), OWN)
                 if basis.shape[1] and freedom - basis.shape[1] >= LEAST:
                     tests.append(_Comparison(name, within, reversing, basis))
-    return _Channel(left, freedom, taken, tuple(tests)) if tests else None
+    return _Channel(projected, freedom, taken, tuple(tests)) if tests else None
 
 
 def _unit_columns(columns: np.ndarray) -> np.ndarray:
@@ -467,19 +471,19 @@ def _condition_columns(runs: Runs, simulated: np.ndarray, travel: np.ndarray | N
         if labels
         else np.zeros(len(runs), str)
     )
-    made = np.stack([cells == c for c in np.unique(cells)], 1).astype(float)
-    if made.shape[1] > SHARE * len(runs):
-        made = np.ones((len(runs), 1))
+    indicators = np.stack([cells == c for c in np.unique(cells)], 1).astype(float)
+    if indicators.shape[1] > SHARE * len(runs):
+        indicators = np.ones((len(runs), 1))
     variables = [runs[name] for name in (*CONDITIONS, *WHEN) if runs.has(name)] + list(simulated.T)
     variables = [x for x in variables if np.isfinite(x).all() and np.ptp(x) > 1e-9 * np.abs(x).max()]
     for power in range(1, DEGREE + 1):
         for x in variables:
             scaled = 2 * (x - x.min()) / np.ptp(x) - 1
-            more = np.concatenate([made, scaled[:, None] ** power], 1)
+            more = np.concatenate([indicators, scaled[:, None] ** power], 1)
             if np.linalg.matrix_rank(more, 1e-6 * len(more)) > SHARE * len(runs):
-                return made
-            made = more
-    return made
+                return indicators
+            indicators = more
+    return indicators
 
 
 def _permuted(made: Sequence[tuple[int, _Channel]], seed: int) -> np.ndarray:
@@ -489,8 +493,8 @@ def _permuted(made: Sequence[tuple[int, _Channel]], seed: int) -> np.ndarray:
     times = max(PERMUTATIONS // 4, min(PERMUTATIONS, AT_ONCE // longest))
     strongest = np.ones(times)
     for _, tested in made:
-        drawn = random.permuted(np.repeat(tested.left[:, None], times, 1), axis=0)
-        for _, p in tested.p_values(tested.cleared(drawn)):
+        permuted = random.permuted(np.repeat(tested.left[:, None], times, 1), axis=0)
+        for _, p in tested.p_values(tested.cleared(permuted)):
             strongest = np.minimum(strongest, p)
     return strongest
 
@@ -501,7 +505,7 @@ def _report_cluster(whole: _Units, k: int, test: _Comparison, p: float, alike: N
     cells, residual = whole.runs.extras[test.column][counts], whole.residual[counts, k] / channel.factor
     signed = residual * np.sign(whole.simulated[counts, k]) if test.reversing else residual
     within = whole.runs[test.within][counts] if test.within else np.zeros(int(counts.sum()), str)
-    words, correlation, at = _words(cells), None, cells
+    words, correlation, places = _words(cells), None, cells
     words = np.where(words == "", "not stated", words)
     levels: tuple[LevelMean, ...] = ()
     if _is_numeric(cells):
@@ -510,13 +514,13 @@ def _report_cluster(whole: _Units, k: int, test: _Comparison, p: float, alike: N
         fine = np.isfinite(cells)
         correlation = float(spearmanr(cells[fine], signed[fine]).statistic)
     else:
-        at = np.array([f"{w} at {c}" if c else w for w, c in zip(words, within, strict=True)])
+        places = np.array([f"{w} at {c}" if c else w for w, c in zip(words, within, strict=True)])
         keys = sorted(
             set(zip(within.tolist(), words.tolist(), strict=True)), key=lambda x: (x[0], _level_order(x[1]))
         )
         levels = tuple(
-            LevelMean(w, c, float(signed[mine].mean()), int(mine.sum()))
-            for c, w in keys if (mine := (within == c) & (words == w)).any()
+            LevelMean(w, c, float(signed[in_group].mean()), int(in_group.sum()))
+            for c, w in keys if (in_group := (within == c) & (words == w)).any()
         )  # fmt: skip
     return ResidualCluster(
         test.column,
@@ -529,7 +533,7 @@ def _report_cluster(whole: _Units, k: int, test: _Comparison, p: float, alike: N
         p,
         alike,
         () if _is_numeric(cells) else _coarser(whole, k, test.column, words, within, signed),
-        at,
+        places,
         signed,
     )
 
@@ -543,21 +547,21 @@ def _coarser(
         """Sum of squares between levels, within the levels of the label."""
         total = 0.0
         for c in np.unique(within):
-            mine = within == c
-            for w in np.unique(labels[mine]):
-                here = mine & (labels == w)
-                total += here.sum() * (residual[here].mean() - residual[mine].mean()) ** 2
+            in_level = within == c
+            for w in np.unique(labels[in_level]):
+                in_cell = in_level & (labels == w)
+                total += in_cell.sum() * (residual[in_cell].mean() - residual[in_level].mean()) ** 2
         return total
 
-    found, all_of_it, counts = [], between(words), whole.counts[:, k]
+    coarser, all_of_it, counts = [], between(words), whole.counts[:, k]
     for name, cells in whole.runs.extras.items():
         if name == column or _is_numeric(cells[counts]):
             continue
         coarse = _words(cells[counts])
         if len(np.unique(coarse)) > 1 and _divides(words, coarse) and all_of_it > 0:
             share = between(coarse) / all_of_it
-            found += [(name, float(share))] if share >= MOSTLY else []
-    return tuple(sorted(found, key=lambda one: -one[1]))
+            coarser += [(name, float(share))] if share >= MOSTLY else []
+    return tuple(sorted(coarser, key=lambda one: -one[1]))
 
 
 def _level_order(word: str) -> tuple[float, str]:

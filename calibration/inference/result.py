@@ -125,8 +125,8 @@ class Estimate:
 
     def to_json(self) -> Json:
         """Entry of `parameters` in result.json."""
-        found = {name: getattr(self, name) for name in ENTRIES} | {"shift_in_prior_sd": self.shift}
-        return found if self.with_steady is None else {**found, "with_steady": self.with_steady}
+        entries = {name: getattr(self, name) for name in ENTRIES} | {"shift_in_prior_sd": self.shift}
+        return entries if self.with_steady is None else {**entries, "with_steady": self.with_steady}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -356,11 +356,11 @@ class CalibrationResult:
     def held_out_alike(self) -> dict[str, Names]:
         """Distinct kinds of blocks, each with the later kinds that predict every row in the same way (to 1 % of a
         reading's sd)."""
-        found: dict[str, Names] = {}
+        groups: dict[str, Names] = {}
         for kind, held in self.held_out.items():
-            like = next((k for k in found if self._same(self.held_out[k], held)), None)
-            found |= {kind: ()} if like is None else {like: (*found[like], kind)}
-        return found
+            like = next((k for k in groups if self._same(self.held_out[k], held)), None)
+            groups |= {kind: ()} if like is None else {like: (*groups[like], kind)}
+        return groups
 
     def _same(self, one: HeldOut, other: HeldOut) -> bool:
         return all(

@@ -97,14 +97,14 @@ def coordinates_beyond_a_basin(problem: Problem) -> tuple[int, ...]:
 def scan_coordinate(problem: Problem, z: np.ndarray, data: Data, k: int) -> Scan:
     """Misfit over coordinate k near z: evenly over the prior's range, and more closely near minima."""
     count = problem.observe.scan_points(problem, k)
-    seen = _scan_values(problem, z, data, k, np.linspace(-RANGE, RANGE, count))
-    around, few = np.array([z[k], *seen.at[seen.basins()]])[:CLOSER], count // CLOSER
+    scan = _scan_values(problem, z, data, k, np.linspace(-RANGE, RANGE, count))
+    around, few = np.array([z[k], *scan.at[scan.basins()]])[:CLOSER], count // CLOSER
     close = (around[:, None] + 2 * RANGE / (count - 1) * np.linspace(-1, 1, few)).ravel()
     if few > 2:
-        seen = _join_scans(seen, _scan_values(problem, z, data, k, np.resize(close, count)))
-    low, high = seen.interval()
+        scan = _join_scans(scan, _scan_values(problem, z, data, k, np.resize(close, count)))
+    low, high = scan.interval()
     return _join_scans(
-        seen, _scan_values(problem, z, data, k, np.linspace(1.5 * low - 0.5 * high, 1.5 * high - 0.5 * low, count))
+        scan, _scan_values(problem, z, data, k, np.linspace(1.5 * low - 0.5 * high, 1.5 * high - 0.5 * low, count))
     )
 
 
@@ -129,8 +129,8 @@ def place_at_minimum(problem: Problem, starts: Float[np.ndarray, "starts z"]) ->
     """Starts with the scanned coordinates at the lowest misfit near the first start. Others are unchanged."""
     starts = np.array(starts, float)
     for k in scanned_coordinates(problem):
-        seen = scan_coordinate(problem, starts[0], problem.data, k)
-        starts[:, k] = seen.at[np.argmin(seen.cost)]
+        scan = scan_coordinate(problem, starts[0], problem.data, k)
+        starts[:, k] = scan.at[np.argmin(scan.cost)]
     return starts
 
 
@@ -157,15 +157,15 @@ def search_lower_basins(
         return cost if np.isfinite(cost) else np.inf
 
     for _ in range(AGAIN):
-        here, z = float(found[0].cost), np.asarray(found[0].z)
+        cost_here, z = float(found[0].cost), np.asarray(found[0].z)
         looked = {k: scan_coordinate(problem, z, data, k) for k in every}
         lower = found
-        for k, seen in looked.items():
-            for j in [j for j in seen.basins() if seen.cost[j] < here - WORTH][:TRIED]:
-                alone = np.where(np.arange(len(z)) == k, seen.at[j], z)
-                end = search(min((seen.others[j], alone), key=objective))
+        for k, scan in looked.items():
+            for j in [j for j in scan.basins() if scan.cost[j] < cost_here - WORTH][:TRIED]:
+                alone = np.where(np.arange(len(z)) == k, scan.at[j], z)
+                end = search(min((scan.others[j], alone), key=objective))
                 lower = min(lower, end, key=lambda f: float(f[0].cost))
-        if not float(lower[0].cost) < here - WORTH:
+        if not float(lower[0].cost) < cost_here - WORTH:
             break
         found = lower
         over = " or ".join(problem.coordinates.names[k] for k in every)
@@ -173,11 +173,11 @@ def search_lower_basins(
     else:
         return dataclasses.replace(found[0], converged=jnp.asarray(False)), found[1]
     # A kink has a slope on either side, so an optimum there is a point with no lower point nearby.
-    lowest = min(float(seen.cost.min()) for seen in looked.values())
+    lowest = min(float(scan.cost.min()) for scan in looked.values())
     sd = np.asarray(found[0].sd).copy()
-    for k, seen in looked.items():
-        sd[k] = seen.sd()
-    settled = bool(found[0].converged) or here - lowest < WORTH
+    for k, scan in looked.items():
+        sd[k] = scan.sd()
+    settled = bool(found[0].converged) or cost_here - lowest < WORTH
     return dataclasses.replace(found[0], converged=jnp.asarray(settled), sd=jnp.asarray(sd)), found[1]
 
 
@@ -189,8 +189,8 @@ def scan_all(problem: Problem, z: np.ndarray) -> dict[int, Scan]:
 def with_scanned_sds(about: Identifiability, scans: dict[int, Scan]) -> Identifiability:
     """Linear analysis with the sds of scanned coordinates from their profiles. Correlations are kept."""
     sd = about.sd.copy()
-    for k, seen in scans.items():
-        sd[k] = seen.sd()
+    for k, scan in scans.items():
+        sd[k] = scan.sd()
     wider = sd / about.sd
     return dataclasses.replace(about, sd=sd, covariance=about.covariance * np.outer(wider, wider))
 
@@ -204,7 +204,7 @@ def count_outside(scans: dict[int, Scan], z: np.ndarray | None, converged: np.nd
     """
     if z is None:
         return 0
-    ends = {k: seen.interval() for k, seen in scans.items()}
+    ends = {k: scan.interval() for k, scan in scans.items()}
     outside = [(z[:, k] < low) | (z[:, k] > high) for k, (low, high) in ends.items()]
     return int(np.sum(np.any(outside, 0) & converged)) if outside else 0
 
@@ -213,6 +213,6 @@ def scan_remarks(problem: Problem, scans: dict[int, Scan]) -> list[Remark]:
     """Notes on parameters with a 95 % region in several pieces."""
     return [
         Remark("in_pieces", name=problem.coordinates.names[k], pieces=parts)
-        for k, seen in scans.items()
-        if (parts := seen.parts()) > 1
+        for k, scan in scans.items()
+        if (parts := scan.parts()) > 1
     ]

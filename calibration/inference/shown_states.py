@@ -85,27 +85,27 @@ class Plan(eqx.Module):
 
 def plan_of(problem: Problem) -> Plan | None:
     """Returns the plan of a log, None if the log does not show the states."""
-    found = plan_or_lacking(problem)
-    return found if isinstance(found, Plan) else None
+    plan = plan_or_lacking(problem)
+    return plan if isinstance(plan, Plan) else None
 
 
 def plan_or_lacking(problem: Problem) -> Plan | Lacking:
     """Returns the plan of a log, or the reason why there is none."""
     robot, counts = problem.base, np.asarray(problem.data.weight).sum(0) > 0
-    shown = {k: c for k, c in enumerate(problem.channels) if counts[k]}
+    channels_read = {k: c for k, c in enumerate(problem.channels) if counts[k]}
     if robot.rig.turns:
         return Lacking.TURN
     if robot.loose:
         return Lacking.SLACK
-    if {c.name for c in shown.values()} & robot.rig.magnitudes:
+    if {c.name for c in channels_read.values()} & robot.rig.magnitudes:
         return Lacking.SIGN
     imposed = robot.rig.imposed
     pulsed = np.ptp(np.asarray(problem.observe.of_rows.duty)) > 0  # type: ignore[attr-defined]
-    drawn = "total_current"  # proportional to the duty of pulses
-    currents = {k: c.name == drawn for k, c in shown.items() if c.rests_on == CURRENT}
-    voltages = [k for k, c in shown.items() if c.rests_on == VOLTAGE]
-    speeds = [k for k, c in shown.items() if c.zero_at_rest and c.settled]
-    angles = [k for k, c in shown.items() if c.zero_at_rest and not c.settled]
+    current_channel = "total_current"  # proportional to the duty of pulses
+    currents = {k: c.name == current_channel for k, c in channels_read.items() if c.rests_on == CURRENT}
+    voltages = [k for k, c in channels_read.items() if c.rests_on == VOLTAGE]
+    speeds = [k for k, c in channels_read.items() if c.zero_at_rest and c.settled]
+    angles = [k for k, c in channels_read.items() if c.zero_at_rest and not c.settled]
     if imposed == "motor_speed":
         others = (*currents, *voltages)
         return Plan(-1, -1, False, False, others, imposed) if others else Lacking.FOLLOWER
@@ -114,9 +114,13 @@ def plan_or_lacking(problem: Problem) -> Plan | Lacking:
     if not (speeds or angles):
         return Lacking.MOTION
     motion = (*speeds, *angles)[0]
-    slips = [k for k in speeds[1:] if robot.has_ground and _travels(shown[k]) and not _travels(shown[motion])]
+    slips = [
+        k
+        for k in speeds[1:]
+        if robot.has_ground and _travels(channels_read[k]) and not _travels(channels_read[motion])
+    ]
     others = (*slips, *(voltages if imposed == "motor_current" else ()))
-    return Plan(current, motion, not speeds, _travels(shown[motion]), others, imposed)
+    return Plan(current, motion, not speeds, _travels(channels_read[motion]), others, imposed)
 
 
 def _travels(channel: Channel) -> bool:
@@ -244,9 +248,9 @@ def windows_of_run(time: np.ndarray, piece: np.ndarray, length: float) -> list[t
         if piece[begin] < 0 or end - begin < FEWEST:
             continue
         times = time[begin:end]
-        whole = times[-1] - times[0]
-        each = min(length, whole)
-        for first in times[0] + np.linspace(0.0, whole - each, int((whole - each) / (APART * each)) + 1):
+        duration = times[-1] - times[0]
+        each = min(length, duration)
+        for first in times[0] + np.linspace(0.0, duration - each, int((duration - each) / (APART * each)) + 1):
             low, high = np.searchsorted(times, (first - 1e-9, first + each + 1e-9))
             if high - low >= FEWEST - 1:
                 windows.append((np.arange(begin + low, begin + high), (times[low:high] - first) / each))
@@ -319,12 +323,12 @@ class _Log:
         plan, time = self.plan, self.time[rows]
         if not plan.mechanical:
             return time, np.asarray(self.of_rows.motor_speed)[rows], 0.0
-        shown, sd = self.measured[rows, plan.motion], float(np.median(self.sd[rows, plan.motion]))
+        readings, sd = self.measured[rows, plan.motion], float(np.median(self.sd[rows, plan.motion]))
         if plan.angle:
-            lag = slope_rows(time, shown, sd)[0] // 2
+            lag = slope_rows(time, readings, sd)[0] // 2
             apart = time[lag:] - time[:-lag]
-            return time[lag:], (shown[lag:] - shown[:-lag]) / apart, 1.5 * sd / float(np.median(apart))
-        return time, shown, sd
+            return time[lag:], (readings[lag:] - readings[:-lag]) / apart, 1.5 * sd / float(np.median(apart))
+        return time, readings, sd
 
     def length(self) -> float:
         """Length of a window [s], by the bandwidth of the motion."""
@@ -383,8 +387,8 @@ class _Log:
         knots, moved = list[np.ndarray](), list[np.ndarray]()
         values, integrals = ({name: list[np.ndarray]() for name in changing} for _ in range(2))
         for rows, cell in zip(self.every, cells, strict=True):
-            whole = float(self.time[rows[-1]] - self.time[rows[0]]) + 1.0
-            time = np.r_[self.time[rows[0]] - whole, self.time[rows], self.time[rows[-1]] + whole]
+            period = float(self.time[rows[-1]] - self.time[rows[0]]) + 1.0
+            time = np.r_[self.time[rows[0]] - period, self.time[rows], self.time[rows[-1]] + period]
             begin = (knots[-1][-1] if knots else 0.0) + 1.0 - time[0]
             for name, x in changing.items():
                 shown = x[np.r_[rows[0], rows, rows[-1]]]
@@ -419,7 +423,7 @@ def rows_and_windows(
     conditions: Any = jax.tree.map(lambda x: np.asarray(x)[joined["row"]], log.of_rows)
     for name, x in mean.items():
         conditions = replaced(conditions, name, x)
-    time, shown, sd = joined["time"], joined["shown"], joined["sd"]
+    time, readings, sd = joined["time"], joined["shown"], joined["sd"]
     since = np.where(np.diff(run, prepend=-1) != 0, 0.0, np.diff(time, prepend=0.0))
     # Points of different runs or on both sides of a jump are apart for slopes, and those of both ways for windows.
     apart = np.cumsum(np.r_[False, (np.diff(run) != 0) | (np.diff(joined["stretch"]) != 0)])
@@ -429,15 +433,15 @@ def rows_and_windows(
         angle, sds = (x[longest, plan.motion] for x in (log.measured, log.sd))
         wide, noise = slope_rows(log.time[longest], angle, float(np.median(sds)))
         wide = max(FEWEST, wide // size | 1)
-        rate = slopes_of(time, shown[:, plan.motion], apart, wide)
-    way, speed = _ways(problem, plan, conditions, shown, sd, rate, noise)
+        rate = slopes_of(time, readings[:, plan.motion], apart, wide)
+    way, speed = _ways(problem, plan, conditions, readings, sd, rate, noise)
     usable = (way != 0) & (joined["stretch"] >= 0)
     piece = np.where(usable, np.cumsum(np.r_[False, (np.diff(apart) != 0) | (np.diff(way) != 0)]), -1)
     if plan.angle:
-        rate = slopes_of(time, shown[:, plan.motion], piece, wide)
+        rate = slopes_of(time, readings[:, plan.motion], piece, wide)
     turned = np.cumsum(np.where(since > 0, 0.5 * (speed + np.roll(speed, 1)) * since, 0.0))
     none = np.zeros(len(run))
-    arrays = shown, sd, rate, way, turned - turned[count[:-1]][run], since, time, joined["row"]
+    arrays = readings, sd, rate, way, turned - turned[count[:-1]][run], since, time, joined["row"]
     late = none + delay, none + log.step, drift
     windows = [
         _weights(r, time, windows_of_run(time, np.where(run == r, piece, -1), length)) for r in range(len(parts))
@@ -466,8 +470,8 @@ def _consistent(weights: np.ndarray, share: np.ndarray, length: float) -> np.nda
 
     Sums over rows at irregular times would not, and an angle is far from 0, so that its sum would be mostly error.
     """
-    w, powers, at = weights[0], np.arange(4), 2 * share[:, None] - 1
-    basis = at**powers
+    w, powers, scaled_place = weights[0], np.arange(4), 2 * share[:, None] - 1
+    basis = scaled_place**powers
     normal = np.linalg.pinv(basis.T @ (w[:, None] * basis))
     moments = w @ basis
     once = np.r_[0.0, powers[1:] * moments[:3]] * (2 / length)

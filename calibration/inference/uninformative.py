@@ -26,8 +26,8 @@ def nothing_varies(runs: Runs, robot: Robot, noise: Noise) -> Remark | None:
     if len(runs) < 2 or any(float(c.torque_gravity) > 0 for c in robot.configurations.members):
         return None
     foreseen = operating_readings(robot, runs.conditions(robot))
-    seen = np.isfinite(foreseen) & np.isfinite(runs.measured()) & np.isfinite(noise.sd)
-    if not seen.all():
+    is_read = np.isfinite(foreseen) & np.isfinite(runs.measured()) & np.isfinite(noise.sd)
+    if not is_read.all():
         return None
     sd = np.median(noise.sd, 0)
     if (np.ptp(foreseen, 0) >= sd).any() or (np.ptp(runs.measured(), 0) >= RANGE * sd).any():

@@ -57,16 +57,20 @@ def unexplained_torque_notes(runs: Runs) -> tuple[Remark, ...]:
     speed = next((runs[c] for c in (SPEED, "output_speed_rpm") if runs.has(c)), None)
     if speed is None or runs.sampled:
         return ()
-    total = left = 0.0
+    total = unexplained = 0.0
     torque, way = runs[column], np.sign(applied_drive(runs))
     read = np.isfinite(torque) & np.isfinite(speed)
     for name in np.unique(runs["configuration"]):
-        mine = read & (runs["configuration"] == name)
-        if mine.sum() >= 4:
-            y, w, d = torque[mine], np.abs(speed[mine]), way[mine]  # a meter may show only magnitudes
-            left += min(_unexplained_torque(y, w, d), _unexplained_torque(np.abs(y), w, np.abs(d)))
+        of_configuration = read & (runs["configuration"] == name)
+        if of_configuration.sum() >= 4:
+            y, w, d = (
+                torque[of_configuration],
+                np.abs(speed[of_configuration]),
+                way[of_configuration],
+            )  # a meter may show only magnitudes
+            unexplained += min(_unexplained_torque(y, w, d), _unexplained_torque(np.abs(y), w, np.abs(d)))
             total += float(np.sum((y - y.mean()) ** 2))
-    if left <= BRAKED * total or total < VARIES**2 * float(np.sum(torque[read] ** 2)):
+    if unexplained <= BRAKED * total or total < VARIES**2 * float(np.sum(torque[read] ** 2)):
         return ()
     return (
         Remark(
@@ -74,7 +78,7 @@ def unexplained_torque_notes(runs: Runs) -> tuple[Remark, ...]:
             source=runs.source,
             column=column,
             theirs=runs.headings.get(column, column),
-            share=left / total,
+            share=unexplained / total,
         ),
     )
 

@@ -96,8 +96,8 @@ def _current(robot: Robot, conditions: Conditions, state: State, way: Scalar) ->
     """Current of the voltage balance by Newton's method. Its derivatives are those of the last step."""
 
     def left(robot: Robot, state: State, current: Scalar) -> Scalar:
-        at = dataclasses.replace(state, current=current)
-        return jnp.asarray(balances.driven_signals(robot, conditions, at, way).voltage_left)
+        state_there = dataclasses.replace(state, current=current)
+        return jnp.asarray(balances.driven_signals(robot, conditions, state_there, way).voltage_left)
 
     fixed: Any = jax.tree.map(lambda x: jax.lax.stop_gradient(x) if isinstance(x, jax.Array) else x, (robot, state))
     current = jnp.zeros(())
@@ -152,8 +152,8 @@ def _shown_states(plan: Plan, robot: Robot, row: Rows, shown: Array) -> _Shown:
             unit = unit / robot.gearbox.ratio  # that of the output by the output's
         turning = (row.rate if plan.angle else shown[plan.motion]) / unit
     rolls = chassis.radius * turning / robot.gearbox.ratio
-    at = State(current, turning, rolls, none, row.memory, distance=chassis.radius * row.angle)
-    first = balances.begin_signals(robot, conditions, at)
+    states = State(current, turning, rolls, none, row.memory, distance=chassis.radius * row.angle)
+    first = balances.begin_signals(robot, conditions, states)
     errors = {
         k: balances.effects_sum(robot, first, "sensor", names[k]) for k in (plan.motion, plan.current) if k >= 0
     }
@@ -263,14 +263,14 @@ def simulated_rows(problem: Problem, plan: Plan, rows: Rows, z: Array) -> Rows:
         return (x, rests), x
 
     states = jax.lax.scan(step, (read[0, :count], jnp.asarray(True)), (rows, read))[1]
-    shown, rate = rows.shown, rows.rate
+    readings, rate = rows.shown, rows.rate
     if plan.electrical:
-        shown = shown.at[:, plan.current].set(states[:, 1] * units.per_ampere)
+        readings = readings.at[:, plan.current].set(states[:, 1] * units.per_ampere)
     if plan.angle:
         rate = states[:, 0] * units.unit
     else:
-        shown = shown.at[:, plan.motion].set(states[:, 0] * units.unit)
-    return dataclasses.replace(rows, shown=shown, rate=rate)
+        readings = readings.at[:, plan.motion].set(states[:, 0] * units.unit)
+    return dataclasses.replace(rows, shown=readings, rate=rate)
 
 
 @functools.partial(compiled, options=SELDOM)
@@ -300,16 +300,16 @@ def _terms(problem: Problem, plan: Plan, rows: Rows, z: Array, effects: tuple[Sc
     counts = np.array([len(e.at) for e in effects], int)
     enters = [entering.index(b) if (b := e.effect.balance) in entering else -1 for e in effects]
     which = np.repeat(np.array([size + k if k >= 0 else -1 for k in enters], int), counts)
-    at = np.repeat(
+    channel_of_row = np.repeat(
         np.array([names.index(c) if (c := e.effect.channel) in names else 0 for e in effects], int), counts
     )
     first = len(values[0][0]) - len(plan.others)
 
     def of_effects(slope: Array, direct: bool) -> Array:
-        shown = -slope[:, :, size + len(probes) :][:, :, at]
+        change = -slope[:, :, size + len(probes) :][:, :, channel_of_row]
         for k, channel in enumerate(plan.others):
-            shown = shown.at[:, first + k].set(jnp.asarray(1.0 * (at == channel)) * direct)
-        by_term = jnp.where(which >= 0, slope[:, :, np.maximum(which, 0)], shown)
+            change = change.at[:, first + k].set(jnp.asarray(1.0 * (channel_of_row == channel)) * direct)
+        by_term = jnp.where(which >= 0, slope[:, :, np.maximum(which, 0)], change)
         return by_term * entered[:, None]
 
     def both(part: Callable[[Array, bool], Array]) -> tuple[Array, Array]:
@@ -331,8 +331,8 @@ def memory_by_row(robot: Robot, rows: Rows, signals: Signals, effects: tuple[Sco
 
     def of_effect(scored: ScoredEffect) -> Array:
         def rate(effect: Effect, at: Array, signals: Signals) -> Array:
-            known = dataclasses.replace(signals, memory={**signals.memory, effect.name: at})
-            return jnp.asarray(effect.rate(robot, known), float)
+            with_memory = dataclasses.replace(signals, memory={**signals.memory, effect.name: at})
+            return jnp.asarray(effect.rate(robot, with_memory), float)
 
         def begun(angle: Array) -> Array:
             return map_over_shapes(
@@ -443,19 +443,21 @@ def search_delay(problem: Problem, plan: Plan) -> Delay:
             means = course.at(float(delay))[0]
             moved = {n: (means[n] - prompt[n])[:, None, None] for n in change}
             f, y = (fixed[k] + sum(moved[n] * change[n][k] for n in change) for k in range(2))
-            whole = np.concatenate([_integrated(plan, w, f, y) for w in cut], 1)[acts]  # (equations, windows, 1 + z)
-            whole[..., 1:] -= whole[..., :1] * growth
-            whole /= unit
-            size = np.sqrt(np.mean(whole[..., 0] ** 2, 1))
+            all_integrals = np.concatenate([_integrated(plan, w, f, y) for w in cut], 1)[
+                acts
+            ]  # (equations, windows, 1 + z)
+            all_integrals[..., 1:] -= all_integrals[..., :1] * growth
+            all_integrals /= unit
+            size = np.sqrt(np.mean(all_integrals[..., 0] ** 2, 1))
             for _ in range(3):  # the noise of each equation is what the regression leaves
-                scaled = whole / np.maximum(size, 1e-300)[:, None, None]
-                flat = scaled.reshape(-1, whole.shape[2])
+                scaled = all_integrals / np.maximum(size, 1e-300)[:, None, None]
+                flat = scaled.reshape(-1, all_integrals.shape[2])
                 jacobian = np.concatenate([flat[:, 1:][:, free], np.eye(len(free))])
                 target = np.concatenate([flat[:, 0], (z - centre)[free]])
                 move = -np.linalg.lstsq(jacobian, target, rcond=None)[0]
-                left = whole[..., 0] + whole[..., 1:][..., free] @ move
-                size = np.sqrt(np.mean(left**2, 1))
-            costs.append(np.sum(np.log(np.maximum(size, 1e-300))) * whole.shape[1] * APART)
+                remainder = all_integrals[..., 0] + all_integrals[..., 1:][..., free] @ move
+                size = np.sqrt(np.mean(remainder**2, 1))
+            costs.append(np.sum(np.log(np.maximum(size, 1e-300))) * all_integrals.shape[1] * APART)
             ends.append(z.copy())
             ends[-1][free] += move
         return np.array(costs) - np.min(costs), np.stack(ends)
@@ -525,42 +527,42 @@ def weak_form(problem: Problem, effects: tuple[ScoredEffect, ...] = ()) -> WeakF
     def of(z: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
         """Residuals and their derivatives, with the covariance and the states without noise at z."""
         smooth = simulated_rows(problem, plan, rows, jnp.asarray(z))
-        known = terms(smooth, z)
+        terms_there = terms(smooth, z)
         read, none = terms(rows, z), np.zeros(equations)
-        plain = [_factor(plan, w, sd, known, none) for w in cut]
+        plain = [_factor(plan, w, sd, terms_there, none) for w in cut]
         each = [
             (integrals(plan, w, read)[:, 0], np.sum(x**2, 1), np.tile(np.sum(w.weight**2 / w.steps, 1), equations))
             for w, x in zip(cut, plain, strict=True)
         ]
         by_equation = (np.concatenate([x.reshape(equations, -1).T for x in part]) for part in zip(*each, strict=True))
         unknown = disturbances(*by_equation)
-        factors = [_factor(plan, w, sd, known, unknown) for w in cut]
-        offset = whole(factors, read)[:, 0] - whole(factors, known)[:, 0]
+        factors = [_factor(plan, w, sd, terms_there, unknown) for w in cut]
+        offset = whole(factors, read)[:, 0] - whole(factors, terms_there)[:, 0]
 
         last: list[tuple[np.ndarray, np.ndarray]] = []
 
         def at(z: np.ndarray) -> np.ndarray:
             if not last or np.any(last[0][0] != z):
-                mine = whole(factors, terms(smooth, z))
-                mine[:, 0] += offset
-                rest = np.zeros((len(z), mine.shape[1]))
+                factored = whole(factors, terms(smooth, z))
+                factored[:, 0] += offset
+                rest = np.zeros((len(z), factored.shape[1]))
                 rest[:, 0], rest[:, 1 : len(z) + 1] = z - centre, np.eye(len(z))
-                last[:] = [(z.copy(), np.concatenate([mine, rest]))]
+                last[:] = [(z.copy(), np.concatenate([factored, rest]))]
             return last[0][1]
 
-        return at
+        return terms_at_fit
 
     centre = late.start(problem)
     z, size = centre, len(centre)
     try:
         for _ in range(ROUNDS):
-            at = of(z)
-            found = least_squares(
-                lambda z: at(z)[:, 0], z, lambda z: at(z)[:, 1 : size + 1], method="lm",  # noqa: B023
+            terms_at_fit = of(z)
+            regression = least_squares(
+                lambda z: terms_at_fit(z)[:, 0], z, lambda z: terms_at_fit(z)[:, 1 : size + 1], method="lm",  # noqa: B023
                 max_nfev=STEPS, xtol=SMALL, ftol=SMALL,
             )  # fmt: skip
-            step = (found.x - z) * min(1.0, FAR / max(float(np.abs(found.x - z).max()), 1e-300))
-            z, both = z + step, at(z + step)
+            step = (regression.x - z) * min(1.0, FAR / max(float(np.abs(regression.x - z).max()), 1e-300))
+            z, both = z + step, terms_at_fit(z + step)
             if np.abs(both[:, 1 : size + 1] @ step).max() < SETTLED:
                 break
     except (np.linalg.LinAlgError, ValueError):  # non-finite numbers
@@ -595,13 +597,15 @@ def _factor(plan: Plan, w: Windows, sd: np.ndarray, terms: Terms, unknown: np.nd
     noise = []
     for k, slope in enumerate(_slopes(plan, w, equations)):
         changed = w.weight[..., None] * by[w.rows, k] + slope[..., None] * also[w.rows, k]
-        own = np.zeros((*w.rows.shape, equations))
-        own[..., k] = unknown[k] * w.weight / np.sqrt(w.steps)
-        noise.append(np.concatenate([changed * sd[w.rows], own], -1))
-    whole, wide = np.concatenate(noise), channels + equations
+        own_equations = np.zeros((*w.rows.shape, equations))
+        own_equations[..., k] = unknown[k] * w.weight / np.sqrt(w.steps)
+        noise.append(np.concatenate([changed * sd[w.rows], own_equations], -1))
+    all_noise, wide = np.concatenate(noise), channels + equations
     column = np.tile(w.rows, (equations, 1))[..., None] * wide + np.arange(wide)
-    row = np.broadcast_to(np.arange(len(whole))[:, None, None], whole.shape)
-    flat = sparse.csr_matrix((whole.ravel(), (row.ravel(), column.ravel())), shape=(len(whole), points * wide))
+    row = np.broadcast_to(np.arange(len(all_noise))[:, None, None], all_noise.shape)
+    flat = sparse.csr_matrix(
+        (all_noise.ravel(), (row.ravel(), column.ravel())), shape=(len(all_noise), points * wide)
+    )
     covariance = (flat @ flat.T).toarray()
     return np.linalg.cholesky(covariance + np.diag(FLOOR * np.maximum(np.diag(covariance), 1e-300)))
 

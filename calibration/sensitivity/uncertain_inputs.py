@@ -166,7 +166,7 @@ def inputs_from_priors(robot: Robot, words: Sequence[str], ranges: Mapping[str, 
         if not by_name[name].spec.prior_sd(float(by_name[name].value)) > 0:
             raise BadConfiguration(
                 f"--parameters {name}: its prior has no width (nominal value 0 with a relative sd), so nothing "
-                "depends on it; give it a value with --set, or leave it out"
+                "depends on it; give it a value with --set, or remove it"
             )
     try:
         coordinates = priors.parameter_coordinates(robot, names) if names else None

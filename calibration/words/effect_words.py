@@ -63,9 +63,9 @@ def effect_tests(effect: type[Effect]) -> Iterator[str]:
         for name in CHECKED_BY.get(effect.channel, ()):
             yield ACTS[name].format("several values")
         if effect.channel not in CHECKED_BY:
-            shown = find_channel(effect.channel)
-            yield from [ACTS["zero reading"].format(shown.label)] * shown.misses_zero
-            yield COMPARE.format(shown.label)
+            channel_shown = find_channel(effect.channel)
+            yield from [ACTS["zero reading"].format(channel_shown.label)] * channel_shown.misses_zero
+            yield COMPARE.format(channel_shown.label)
         return
     for name in ISOLATED_BY.get(effect.balance, ()):
         if name == "weigh":

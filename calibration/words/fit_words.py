@@ -308,7 +308,7 @@ SAID: dict[str, str | Callable[..., str]] = {
     "unsettled": unsettled_search,
     "elsewhere": "{searches} of {total} searches converged at other values of {names}",
     "in_pieces": "{name}: the values within its 95 % interval are in {pieces} pieces, with worse ones between "
-    "them; samples closer together would tell them apart",
+    "them; samples closer together would distinguish them",
     "generations": search_generations,
     "lost_rows": lost_rows,
     "members_jump": members_jump,

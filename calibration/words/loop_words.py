@@ -68,14 +68,14 @@ def _verdict(said: loop_notes.Summary) -> str:
     if said.verdict == "none":
         return f"Nothing is missing: the residuals are consistent with noise (family-wise p = {said.p:.2g})."
     if said.verdict in WITHOUT_NAME and where is not None:
-        found = said.mechanism
-        if said.verdict == "mechanism" and found is not None:
-            within = _within(where) if where.family in found.families else ""
-            text = f"Missing: {_mechanism(found, within)} ({_evidence(said)}). "
+        mechanism = said.mechanism
+        if said.verdict == "mechanism" and mechanism is not None:
+            within = _within(where) if where.family in mechanism.families else ""
+            text = f"Missing: {_mechanism(mechanism, within)} ({_evidence(said)}). "
             text += "No law of the library is established."
         else:
             text = _without_name(where, _evidence(said), "is established" if said.missing else "explains it")
-            text += f" No mechanism is established: {no_mechanism(found)}." if found is not None else ""
+            text += f" No mechanism is established: {no_mechanism(mechanism)}." if mechanism is not None else ""
         if said.missing:
             text += _tentative(said.missing, said.support)
         elif said.nearest:
@@ -167,7 +167,7 @@ def mechanism_evidence(found: loop_notes.Mechanism) -> str:
     errors = f", {found.gain / found.se:.1f} standard errors" if 0 < found.se < math.inf else ""
     return (
         f"explains {100 * found.share:.0f} % of the excess misfit, gains {found.gain:.2g} nat a reading that it "
-        f"changes on runs that the fit has not seen{errors}, and is found again in {100 * found.again:.0f} % of the "
+        f"changes on held-out runs{errors}, and is found again in {100 * found.again:.0f} % of the "
         "data with a block left out"
     )
 
@@ -175,7 +175,7 @@ def mechanism_evidence(found: loop_notes.Mechanism) -> str:
 #: Evidence against a mechanism.
 NO_MECHANISM = {
     "share": "it explains only {share:.0f} % of the excess misfit",
-    "gain": "on runs that its fit has not seen it gains {0.gain:.2g} ± {0.se:.2g} nat a reading",
+    "gain": "on held-out runs it gains {0.gain:.2g} ± {0.se:.2g} nat a reading",
     "again": "it is found again in only {again:.0f} % of the data with a block left out",
     "many": "{many} variables may drive it",
 }
@@ -220,13 +220,13 @@ def _level(variable: str, x: float) -> str:
 
 def brief_verdict(said: loop_notes.Summary) -> str:
     """A verdict, and the effects in the model by their leaders."""
-    found = []
+    phrases = []
     if said.verdict == "mechanism" and said.mechanism is not None:
-        found.append(" or ".join(said.mechanism.families))
+        phrases.append(" or ".join(said.mechanism.families))
     for word, established in (("established", True), ("tentative", False)):
         names = [one.names[0] for one in said.missing if one.established == established]
-        found += [f"{', '.join(names)} {word}"] * bool(names)
-    return ": ".join([said.verdict, *[", ".join(found)] * bool(found)])
+        phrases += [f"{', '.join(names)} {word}"] * bool(names)
+    return ": ".join([said.verdict, *[", ".join(phrases)] * bool(phrases)])
 
 
 def at_other_noise(found: Sequence[Sensitivity]) -> str:
@@ -365,11 +365,11 @@ def how_sure(found: DiscoveryResult, effect: FoundEffect) -> str:
     """Standing of an effect, with its score and the threshold of chance."""
     test = None if found.support is None else found.support.test_of(effect.name)
     if is_established(found, effect):
-        known = "" if test is None else f": {test.root:.1f} σ (chance: {test.needed:.1f})"
+        evidence = "" if test is None else f": {test.root:.1f} σ (chance: {test.needed:.1f})"
         if test is not None and test.shows_form:
             over = test.over.replace("_", " ")
-            known += f"; accuracy of its form ±{100 * test.spread:.0f} % over {over}"
-        return f"established{known}"
+            evidence += f"; accuracy of its form ±{100 * test.spread:.0f} % over {over}"
+        return f"established{evidence}"
     return f"tentative: it predicts, but {effect_doubts(test)}" if effect_doubts(test) else "tentative"
 
 
@@ -384,10 +384,10 @@ def use_it(found: DiscoveryResult) -> list[str]:
 
 def _rms(errors: Errors, total: int) -> str:
     """Largest rms error of any channel, the worst reading, and the rows reached if not all are."""
-    known = [e for e in errors.values() if e["rows"]]
-    if not known:
+    non_empty = [e for e in errors.values() if e["rows"]]
+    if not non_empty:
         return "no row is reached"
-    rms, worst, rows = (max(float(e[name]) for e in known) for name in ("rms_percent", "max_percent", "rows"))
+    rms, worst, rows = (max(float(e[name]) for e in non_empty) for name in ("rms_percent", "max_percent", "rows"))
     few = f" ({rows:.0f}/{total} reached)" if rows < total else ""
     return f"rms ≤ {rms:.1f} %, worst {worst:.1f} %{few}"
 
@@ -458,11 +458,11 @@ def support_reasons(support: loop_notes.NameSupport | None) -> str:
 
 def naming_reasons(found: DiscoveryResult) -> str:
     """Reasons for or against the names. A curve that explains everything comes first."""
-    said, lacks = support_reasons(found.support), found.unnamed
+    reasons, lacks = support_reasons(found.support), found.unnamed
     if lacks is None or not found.after.adequate or (found.support is not None and found.support.curves):
-        return said
+        return reasons
     over = loop_notes.CurveOver(lacks.place, (lacks.variable,))
-    return "; ".join([REASONS["curve alone"].format(curves=_curve(over)), *[said] * bool(said)])
+    return "; ".join([REASONS["curve alone"].format(curves=_curve(over)), *[reasons] * bool(reasons)])
 
 
 def _strength(test: loop_notes.NameTest) -> str:
@@ -489,10 +489,10 @@ def effect_doubts(test: loop_notes.NameTest | None) -> str:
     if test is None or not test.fails:
         return ""
     over = ", ".join(_over(c.place, *c.variables) for c in test.curves)
-    said = {"beside": over and f" next to smooth curves ({over})", "larger": " and ".join(test.larger)}
-    said |= {"over_variable": test.over.replace("_", " ")}
-    said["spread"] = f" by ±{100 * test.spread:.0f} %" if math.isfinite(test.spread) else ""
-    *first, last = [DOUBTS[d][1].format(test, **said, again=100 * test.again) for d in test.fails]
+    doubts = {"beside": over and f" next to smooth curves ({over})", "larger": " and ".join(test.larger)}
+    doubts |= {"over_variable": test.over.replace("_", " ")}
+    doubts["spread"] = f" by ±{100 * test.spread:.0f} %" if math.isfinite(test.spread) else ""
+    *first, last = [DOUBTS[d][1].format(test, **doubts, again=100 * test.again) for d in test.fails]
     return f"{', '.join(first)} and {last}" if first else last
 
 
@@ -518,8 +518,8 @@ def support_sentence(found: DiscoveryResult) -> str:
 
 def effect_called(found: DiscoveryResult, effect: FoundEffect) -> str:
     """The name of an effect, and where it is tentative what speaks against it."""
-    said = tentative_reason(found, effect)
-    return f"{effect.name}\n({said})" if said else effect.name
+    reason = tentative_reason(found, effect)
+    return f"{effect.name}\n({reason})" if reason else effect.name
 
 
 def tentative_reason(found: DiscoveryResult, effect: FoundEffect) -> str:
@@ -738,14 +738,14 @@ def leader_choice(
         loop_notes.DRAW: f"the fit to all rows, as errors held out are within {told:.0%}",
     }
     each = ", ".join(f"{n} {x:.2f} σ" for n, x in zip(names, rms_sigma, strict=True))
-    said = f"{names[leader]} comes first in its class by {criteria[by]}; errors held out: {each}"
+    sentence = f"{names[leader]} comes first in its class by {criteria[by]}; errors held out: {each}"
     if prefer == HELD_OUT and leader != closest:
-        said += f"; by the fit to all rows {names[closest]} would, by Δχ² {rise_chi2:.1f}"
+        sentence += f"; by the fit to all rows {names[closest]} would, by Δχ² {rise_chi2:.1f}"
     if leader != best:
         asked = prefer == HELD_OUT
         why = "is not as adequate" if asked else f"would come first by --prefer {HELD_OUT}, where adequate"
-        said += f"; {names[best]} {why}"
-    return said
+        sentence += f"; {names[best]} {why}"
+    return sentence
 
 
 def rests_on(
@@ -773,7 +773,7 @@ def unwritten_reason(curve: bool, gain: float, se: float) -> str:
     what = "the curve" if curve else "what was found"
     how = "no better than" if curve and gain > 0 else "worse than"
     return (
-        f"{what} predicts runs that it has not seen {how} the refit ({gain:+.2f} ± {se:.2f} nat a "
+        f"{what} predicts held-out runs {how} the refit ({gain:+.2f} ± {se:.2f} nat a "
         "reading): robot.toml is the refit"
     )
 

@@ -9,12 +9,14 @@ from calibration.discovery import instructions, loop_notes
 from calibration.discovery import result as loop_results
 from calibration.inference import fit_notes
 from calibration.inference import result as fit_results
+from calibration.inference.feedforward import Feedforward
 from calibration.inference.fit_notes import Remark as Remark
 from calibration.inference.lack_of_fit import Adequacy
 from calibration.inference.residual_clusters import ResidualCluster
 from calibration.sensitivity.result import SensitivityResult
 from calibration.words import (
     experiment_words,
+    feedforward_words,
     fit_words,
     loop_words,
     sensitivity_words,
@@ -28,6 +30,7 @@ NOTES: dict[str, str | Callable[..., str]] = {
     "step": step_words.step_sentence,
     "residual_cluster": lambda cluster: fit_words.residual_cluster(cluster),
     **table_words.SAID,
+    **feedforward_words.SAID,
     **fit_words.SAID,
     **loop_words.SAID,
     **sensitivity_words.SAID,
@@ -35,6 +38,7 @@ NOTES: dict[str, str | Callable[..., str]] = {
 #: Kind of result, or part of one → the function that makes its sentence.
 RESULTS: dict[type, Callable[..., str]] = {
     **dict.fromkeys(instructions.KINDS, experiment_words.experiment_instruction),
+    Feedforward: feedforward_words.feedforward_statement,
     fit_notes.Determination: fit_words.is_determined_answer,
     fit_notes.Edge: fit_words.prior_edge,
     fit_notes.Pair: fit_words.determined_combination,

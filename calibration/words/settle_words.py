@@ -20,7 +20,7 @@ WHY = {
     "rest": ("does not move", "nothing: friction holds it there; time histories use it"),
     "stuck": ("shows one number for long: saturated or frozen", "mend the instrument or its range"),
     "glitches": ("has many readings far from the others", "mend the instrument, or log its mean if it shows pulses"),
-    "unread": ("no channel has enough readings", "log more of them, or remove the rows without"),
+    "unread": ("no channel has enough readings", "log more of them, or remove the rows that lack them"),
     "undriven": ("the driver brakes or coasts", "nothing: time histories use it"),
 }
 
@@ -37,15 +37,15 @@ def left_out(stretches: Iterable[Stretch], few: bool = False) -> list[tuple[str,
     Args:
         few: the log itself is to be fitted, as it has too few settled runs.
     """
-    found = []
+    causes = []
     every = [s for s in stretches if s.why]
     for why in dict.fromkeys(s.why for s in every):
         mine = [s for s in every if s.why == why]
         longest = max(mine, key=lambda s: len(s.rows))
         rows = f"{longest.rows[0] + 1}-{longest.rows[-1] + 1}"
         cure = "nothing: the log as it is has them" if few and why in OF_LEVELS else WHY[why][1]
-        found.append((left_out_reason(longest), len(mine), sum(len(s.rows) for s in mine), rows, cure))
-    return found
+        causes.append((left_out_reason(longest), len(mine), sum(len(s.rows) for s in mine), rows, cure))
+    return causes
 
 
 def settle_statement(found: Settled) -> str:
@@ -87,38 +87,38 @@ def too_few(found: Settled, fewest: int, loop: str) -> str:
 
 def glitch_sentences(found: Settled) -> list[str]:
     """Sentences on the readings that means leave out because they are far from the others, one for each channel."""
-    said = []
+    sentences = []
     for channel in (s.channel for s in found.signals):
         mine = [s for s in found.kept if channel.name in s.glitches]
         if mine:
             counts = [s.glitches[channel.name] for s in mine]
             worst = mine[counts.index(max(counts))]
-            said.append(
+            sentences.append(
                 f"{channel.column}: {count_noun(sum(counts), 'reading')} in {count_noun(len(mine), 'settled run')} "
                 f"left out of the mean, far from the readings next to them; most in rows {worst.rows[0] + 1} to "
                 f"{worst.rows[-1] + 1} ({100 * max(counts) / len(worst.rows):.2g} %); look at the instrument, or log "
                 "a mean if they are pulses"
             )
-    return said
+    return sentences
 
 
 def settle_remarks(found: Settled) -> list[str]:
     """Sentences on what should be looked at."""
-    said = []
+    remarks = []
     if found.gaps:
-        said.append(f"samples are missing after {rows_text(found.gaps, 5)}; no stretch goes across")
-    said += glitch_sentences(found)
+        remarks.append(f"samples are missing after {rows_text(found.gaps, 5)}; no stretch goes across")
+    remarks += glitch_sentences(found)
     angles = {rate: angle for angle, rate, _ in RATES}
     for channel in (s.channel for s in found.signals):
         if channel not in found.runs.channels:
-            said.append(
+            remarks.append(
                 f"{channel.column} is the rate of {angles[channel.name]}; add {channel.name} to channels in the "
                 "rig's file, or these runs have no reading of it"
             )
     wide = {name: x for name, x in found.scatter.items() if x > 0}
     for signal in (s for s in found.signals if s.channel.name in wide):
-        said.append(
+        remarks.append(
             f"{signal.channel.column}: levels that were held several times differ by "
             f"{wide[signal.channel.name]:.2g} {signal.channel.unit} beyond their noise; the sds include it"
         )
-    return said
+    return remarks

@@ -14,7 +14,7 @@ STEPS = {
     "alone": "outlying rows found: the same without them",
     "mechanism": "which mechanism explains most of it?",
     "alike": "what else explains as much as {}?",
-    "held out": "which of those predicts best what a fit has not seen?",
+    "held out": "which of those predicts held-out runs best?",
     "factors": "the verdict with {} times the {} noise, next to:",
     "shape": "the shape of what is missing",
     "errors": "errors on data held out",

@@ -69,11 +69,11 @@ def unused_columns(source: str, columns: tuple[tuple[str, str], ...]) -> str:
     """Columns that vary and have no role, and what each may be."""
     names = [name for name, _ in columns]
     vary, are = ("vary", "are") if len(names) > 1 else ("varies", "is")
-    said = [f"{source}: {', '.join(names)} {vary} from row to row and {are} not used"]
+    sentences_unused = [f"{source}: {', '.join(names)} {vary} from row to row and {are} not used"]
     for name, near in columns:
         if near:
-            said.append(f'if {name} is {near}, state [columns] {near} = "{name}" in the robot\'s file')
-    return "; ".join(said)
+            sentences_unused.append(f'if {name} is {near}, state [columns] {near} = "{name}" in the robot\'s file')
+    return "; ".join(sentences_unused)
 
 
 def nothing_varies(source: str, rows: int, column: str, unused: Names = ()) -> str:
@@ -94,10 +94,12 @@ def copied_channel(source: str, column: str, other: str, intercept: float, slope
     """A channel that is a line of another."""
     start = f"{intercept:.4g} {'+' if slope >= 0 else '-'} " if intercept else ""
     factor = abs(slope) if intercept else slope
-    said = f"{source}, {column}: in every row {start}{factor:.4g} times {other}, to the last digit"
+    sentence = f"{source}, {column}: in every row {start}{factor:.4g} times {other}, to the last digit"
     if tied:
-        return f"{said}; if it is computed from it and no reading, remove it, as its noise then counts twice"
-    return f"{said}: it is computed from it and no reading; remove it from channels and table, or read an instrument"
+        return f"{sentence}; if it is computed from it and no reading, remove it, as its noise then counts twice"
+    return (
+        f"{sentence}: it is computed from it and no reading; remove it from channels and table, or read an instrument"
+    )
 
 
 def ends_early(runs: Names, lasts: float, share: float) -> str:
@@ -105,7 +107,7 @@ def ends_early(runs: Names, lasts: float, share: float) -> str:
     at = "" if math.isnan(share) else f", at {share:.0%} of the speed of steady travel"
     return (
         f"{_runs(runs, 'ends', 'end')} after {lasts:.2g} s at the latest{at}: before the robot is under "
-        "way, so what resists its travel is known by its priors; record until the speed is steady"
+        "way, so only priors determine its resistance to travel; record until the speed is steady"
     )
 
 
@@ -140,7 +142,7 @@ SAID: dict[str, str | Callable[..., str]] = {
         f"{name}: nothing in these data measures it; its value is its prior's. {would_measure(name)} would"
     ),
     "constant": lambda column, value, alike: (
-        f"{column} is {bound_text(value)} in every row: {ALIKE[alike]}, and only their priors tell them apart"
+        f"{column} is {bound_text(value)} in every row: {ALIKE[alike]}, so only their priors distinguish them"
     ),
     "repeats": differing_repeats,
     "larger_noise": "{channel}: {pairs} pairs of rows at the same conditions scatter "

@@ -5,6 +5,7 @@ from __future__ import annotations
 from calibration.inference import priors
 from calibration.inference.calibration import calibrate as run
 from sweeps import config as configuration
+from sweeps.commands import feedforward_fit
 from sweeps.console import print_message, step_reporter
 from sweeps.inputs import load_robot, read_runs
 from sweeps.pages import words
@@ -17,6 +18,8 @@ def execute(config: configuration.Calibrate, beside: configuration.FittedRuns) -
 
     0 done. 3 done, but the search or a fit without a block did not converge, or the solver failed at a row.
     """
+    if config.feedforward is not None:
+        return feedforward_fit.execute(config, beside)
     robot = load_robot(config).robot
     runs = read_runs(beside.data, robot, columns=config.columns, measured=True, series=True)
     stated = priors.parse_priors(config.prior)
@@ -24,16 +27,21 @@ def execute(config: configuration.Calibrate, beside: configuration.FittedRuns) -
         open_folder("calibrate", config, robot, beside, runs) as folder,
         step_reporter(print_message, "fitting") as heard,
     ):
-        found = run(
+        result = run(
             runs, robot, rows=config.rows, free=config.free, fix=config.fix, stated=stated,
             noise=config.noise or None, model=config.model, starts=config.starts, population=config.population,
             generations=config.generations, members=beside.members, seed=config.seed,
             profiles=config.profiles, blocks=config.hold_out, solver=config.solver, tell=heard,
         )  # fmt: skip
-        found.save(folder.results(), config.robot, folder.tables)
-        shown = print_report(calibration_report.calibration_document(found, config.robot))
-        settled = found.converged and all(b.converged for h in found.held_out.values() for b in h.blocks.values())
-        manifest = {"seed": found.seed, "statuses": found.counts}
+        result.save(folder.results(), config.robot, folder.tables)
+        document = print_report(calibration_report.calibration_document(result, config.robot))
+        settled = result.converged and all(b.converged for h in result.held_out.values() for b in h.blocks.values())
+        manifest = {"seed": result.seed, "statuses": result.counts}
         return finish_run_folder(
-            folder, config, manifest, solved=settled and words.every_run_solved(found.counts), page=shown, runs=runs
+            folder,
+            config,
+            manifest,
+            solved=settled and words.every_run_solved(result.counts),
+            page=document,
+            runs=runs,
         )

@@ -31,29 +31,31 @@ def execute(config: configuration.Check, beside: configuration.FolderPart) -> in
 
     The code is 0 whether or not requirements are missed, and 3 if the solver failed at a worst corner.
     """
-    asked = requirements_file.load_requirements(Path(config.requirements))
+    demands = requirements_file.load_requirements(Path(config.requirements))
     file = load_robot(config)
     robot = file.robot
     imposed.check_on_ground(robot, "check")
-    sheet.refuse_impossible(robot, asked)
-    _check_charge(robot, asked)
+    sheet.refuse_impossible(robot, demands)
+    _check_charge(robot, demands)
     lacking = robot.unknown(HEAT)
-    for r in asked.each:
+    for r in demands.each:
         if lacking and r.name in OF_HEAT:
             raise BadConfiguration(
-                f"{asked.source}, {r.name}: rests on how warm the windings become, and the robot's file does not "
+                f"{demands.source}, {r.name}: rests on how warm the windings become, and the robot's file does not "
                 f"state {', '.join(lacking)}; state them, or leave the requirement out"
             )
     with open_folder("check", config, robot, beside) as folder:
         with step_reporter(print_message, "reading the requirements") as heard:
-            outcomes = sheet.check_requirements(robot, asked, changes=config.changes, tell=in_words(heard))
-            found = CheckResult(asked, robot, outcomes, posture_words.of_requirements(robot, outcomes))
-        _write(folder, config, found)
-        shown = print_report(check_report.check_document(found, capabilities.shown_name(file), config.changes), file)
-        manifest = {"seed": None, **sheet.count_outcomes(found.outcomes)}
-        solved = words.every_run_solved(Counter(o.status for o in found.outcomes))
+            outcomes = sheet.check_requirements(robot, demands, changes=config.changes, tell=in_words(heard))
+            result = CheckResult(demands, robot, outcomes, posture_words.of_requirements(robot, outcomes))
+        _write(folder, config, result)
+        document = print_report(
+            check_report.check_document(result, capabilities.shown_name(file), config.changes), file
+        )
+        manifest = {"seed": None, **sheet.count_outcomes(result.outcomes)}
+        solved = words.every_run_solved(Counter(o.status for o in result.outcomes))
         return finish_run_folder(
-            folder, config, manifest, robot=found.robot, note="the robot of this check", solved=solved, page=shown
+            folder, config, manifest, robot=result.robot, note="the robot of this check", solved=solved, page=document
         )
 
 

@@ -65,25 +65,25 @@ def execute(config: configuration.Climb, beside: configuration.FolderPart) -> in
     ).resolved(robot)  # fmt: skip
     along = _along(config, robot, conditions, sequence)
     with open_folder("climb", config, robot, beside) as folder:
-        found = _climbed(config, robot, name, words, conditions, sequence, along)
-        folder.write_table("history.csv", found.table)
-        if rows := found.slopes:
+        climbed = _climbed(config, robot, name, words, conditions, sequence, along)
+        folder.write_table("history.csv", climbed.table)
+        if rows := climbed.slopes:
             folder.write_table("derivatives.csv", {name: np.array([row[name] for row in rows]) for name in rows[0]})
-        folder.write_json("result.json", found.to_json())
+        folder.write_json("result.json", climbed.to_json())
         if config.film:
             from sweeps.pages import climb_figures
 
-            climb_figures.render_climb(found, folder.results() / "climb.gif")
-        shown = print_report(climb_report.climb_document(found, file), file)
-        manifest = {"seed": None, "verdict": found.verdict}
+            climb_figures.render_climb(climbed, folder.results() / "climb.gif")
+        document = print_report(climb_report.climb_document(climbed, file), file)
+        manifest = {"seed": None, "verdict": climbed.verdict}
         return finish_run_folder(
             folder,
             config,
             manifest,
             robot=robot,
             note="the robot of this climb",
-            solved=found.verdict != "failed",
-            page=shown,
+            solved=climbed.verdict != "failed",
+            page=document,
         )
 
 
@@ -103,11 +103,17 @@ def _climbed(
         grounds = jax.tree.map(lambda *x: jnp.stack(x), *every)
         alike = [jax.tree.map(lambda x: jnp.stack([jnp.asarray(x)] * len(sizes)), c) for c in (conditions, sequence)]
         with progress_bar(1, quiet=False) as advance:
-            told = scale.share_counter(advance, 1)
+            counter = scale.share_counter(advance, 1)
             ended = climb_batch(
-                robot, alike[0], grounds, alike[1], duration=config.duration_s, step=config.time_step_s, progress=told
+                robot,
+                alike[0],
+                grounds,
+                alike[1],
+                duration=config.duration_s,
+                step=config.time_step_s,
+                progress=counter,
             )
-            told(1.0)
+            counter(1.0)
         return grounds, ended
 
     chosen, largest = 0, None
@@ -147,16 +153,16 @@ def _along(config: configuration.Climb, robot: Robot, conditions: Conditions, se
         sizes["stairs"] = 1000 * terrains.parse_stairs(config.stairs)[0]
     kind = next((k for k, size in sizes.items() if size is not None), None)
     levers = {"levers_front_deg": "front", "levers_rear_deg": "rear"}
-    known = ["adhesion", "payload", "discharge" if config.battery else "voltage"]
+    variables = ["adhesion", "payload", "discharge" if config.battery else "voltage"]
     moved = sequence.begins is None and not without_levers(robot, config.configuration or "")
-    known += [*(levers if moved else ()), *([SIZE] if kind is not None else [])]
+    variables += [*(levers if moved else ()), *([SIZE] if kind is not None else [])]
     for k, name in enumerate(names):
         if name in names[:k]:
             raise BadConfiguration(f"--derivatives: got {name} twice; expected each once")
-        if name not in known and name not in (every := [p.name for p in params.walk_parameters(robot)]):
-            meant = " or ".join(similar_words(name, (*known, *every), 2))
+        if name not in variables and name not in (every := [p.name for p in params.walk_parameters(robot)]):
+            meant = " or ".join(similar_words(name, (*variables, *every), 2))
             raise BadConfiguration(
-                f"--derivatives: got {name}; expected {', '.join(known)} or a parameter of the robot"
+                f"--derivatives: got {name}; expected {', '.join(variables)} or a parameter of the robot"
                 + (f"; did you mean {meant}?" if meant else "")
             )
     of_run = tuple(name for name in names if name not in (*levers, SIZE))
@@ -170,15 +176,17 @@ def _along(config: configuration.Climb, robot: Robot, conditions: Conditions, se
     searched = config.model_copy(update={"step_mm": None, "gap_mm": None, "find": kind})
 
     def given(values: Array) -> ClimbInputs:
-        at = dict(zip(names, values, strict=True))
-        own, run = variation.at(jnp.stack([at[name] for name in of_run] or [jnp.zeros(())]), conditions)
+        value_of = dict(zip(names, values, strict=True))
+        changed_robot, run = variation.at(
+            jnp.stack([value_of[name] for name in of_run] or [jnp.zeros(())]), conditions
+        )
         moved = {
-            end: getattr(sequence, end) + jnp.radians(at[name] - usual[name])
+            end: getattr(sequence, end) + jnp.radians(value_of[name] - usual[name])
             for name, end in levers.items()
-            if name in at
+            if name in value_of
         }
-        ground = _terrain(searched, at[SIZE] / 1000) if SIZE in at else _terrain(config, 0.1)
-        return ClimbInputs(own, run, ground[0], dataclasses.replace(sequence, **moved))
+        ground = _terrain(searched, value_of[SIZE] / 1000) if SIZE in value_of else _terrain(config, 0.1)
+        return ClimbInputs(changed_robot, run, ground[0], dataclasses.replace(sequence, **moved))
 
     values = [usual[name] for name in names]
     widths = [WIDTHS.get(name, WIDTH * abs(value) or 1.0) for name, value in zip(names, values, strict=True)]
@@ -245,27 +253,30 @@ def _sequence(config: configuration.Climb, robot: Robot, name: str) -> Sequence:
     tracked = bool(np.asarray(robot.configurations[name].on_tracks) > 0.5)
     if not tracked and stated != (None, None, None):
         raise BadConfiguration(f"--levers-front, --levers-rear, --sequence: {without_levers(robot, name)}")
-    own = float(np.degrees(np.asarray(gear.lever_front))), 180 - float(np.degrees(np.asarray(gear.lever_rear)))
+    folded_angles = (
+        float(np.degrees(np.asarray(gear.lever_front))),
+        180 - float(np.degrees(np.asarray(gear.lever_rear))),
+    )
     angles = []
-    for option, given, usual in zip(("--levers-front", "--levers-rear"), stated[1:], own, strict=True):
+    for option, given, usual in zip(("--levers-front", "--levers-rear"), stated[1:], folded_angles, strict=True):
         angle = usual if given is None else given
         if given is not None and (why := terrains.lever_angle_refusal(robot, angle)):
             raise BadConfiguration(f"{option}: {why}")
         angles.append(float(np.radians(angle)))
     if config.sequence is None:
-        found = climb_simulation.constant_angles(*angles)
+        sequence = climb_simulation.constant_angles(*angles)
     else:
-        found = terrains.read_sequence(config.sequence, robot, (angles[0], angles[1]))
-        if found.begins is None and stated[1:] != (None, None):
+        sequence = terrains.read_sequence(config.sequence, robot, (angles[0], angles[1]))
+        if sequence.begins is None and stated[1:] != (None, None):
             raise BadConfiguration(
                 f"--levers-front, --levers-rear: {config.sequence.name} states all angles; expected them only with "
                 "a sequence of voltages (front_V, rear_V)"
             )
     if config.levers_voltage_V is not None:
-        found = dataclasses.replace(found, supply=jnp.asarray(config.levers_voltage_V))
+        sequence = dataclasses.replace(sequence, supply=jnp.asarray(config.levers_voltage_V))
     if tracked:
-        first = (float(found.first[0]), float(np.pi - found.first[1]))
+        first = (float(sequence.first[0]), float(np.pi - sequence.first[1]))
         for option, angle in zip(("front", "rear"), first, strict=True):
             if why := terrains.lever_start_refusal(robot, float(np.degrees(angle))):
                 raise BadConfiguration(f"levers {option}: {why}")
-    return found
+    return sequence

@@ -43,8 +43,8 @@ def execute(config: configuration.Compare, beside: configuration.ComparedRuns) -
     robot = instruments.with_inferred_instruments(file.robot, runs)
     if beside.own_mass:
         runs = dataclasses.replace(runs, columns={k: v for k, v in runs.columns.items() if k != "total_mass_kg"})
-    said = sentences(check_ranges(runs, robot))
-    drawn = None if config.posterior is None else beside_robot(file)
+    remarks = sentences(check_ranges(runs, robot))
+    posterior = None if config.posterior is None else beside_robot(file)
     with open_folder("compare", config, robot, beside, runs) as folder:
         table = run.evaluate_runs(robot, runs, config, folder)
         comparison, summary = compare_readings(stated, table, robot)
@@ -53,10 +53,10 @@ def execute(config: configuration.Compare, beside: configuration.ComparedRuns) -
             comparison = add_second_robot(
                 comparison, stated.channels, run.evaluate_runs(other, runs, config, folder=None)
             )
-        notes = (*missing_readings_notes(comparison, stated.channels), *said)
+        notes = (*missing_readings_notes(comparison, stated.channels), *remarks)
         of_draws: list[str] = []
-        if drawn is not None and config.posterior is not None:
-            spread = uncertainty.simulate_draws(robot, drawn, runs, config, config.posterior, folder)
+        if posterior is not None and config.posterior is not None:
+            spread = uncertainty.simulate_draws(robot, posterior, runs, config, config.posterior, folder)
             of_draws = uncertainty.interval_ranges(table, spread)
             table |= spread.columns
             ends = (uncertainty.SD, uncertainty.LOWER, uncertainty.UPPER)
@@ -64,11 +64,11 @@ def execute(config: configuration.Compare, beside: configuration.ComparedRuns) -
                 f"simulated_{key}": table[key] for c in robot.channels for e in ends if (key := c.column + e)
             }
         folder.write_table("comparison.csv", comparison)
-        found = Comparison(
+        result = Comparison(
             comparison, summary, stated.channels, Path(runs.source).name, config.model, capabilities.shown_name(file),
             fit_of(file, runs), notes=(*notes, *of_draws), against=_name_of(config, file, second),
         )  # fmt: skip
-        return _written(folder, config, dataclasses.replace(file, robot=robot), runs, table, found, notes)
+        return _written(folder, config, dataclasses.replace(file, robot=robot), runs, table, result, notes)
 
 
 def _over_time(
@@ -83,7 +83,7 @@ def _over_time(
     for option in (name for name, stated in options.items() if stated):
         raise BadConfiguration(
             f"{option}: {Path(runs.source).name} holds time histories, which are followed sample by sample, with the "
-            "masses and times that they state; leave it out"
+            "masses and times that they state; remove it"
         )
     model = None if config.model == fidelities.NAMES[0] else config.model
     ready = preparation.prepare(runs, file.robot)
@@ -99,11 +99,11 @@ def _over_time(
             *missing_readings_notes(comparison, runs.channels),
             *sentences((*ready.checked, *ready.begins, *ready.weighed)),
         )
-        found = Comparison(
+        result = Comparison(
             comparison, summary, runs.channels, Path(runs.source).name, HISTORIES, capabilities.shown_name(file),
             fit_of(file, runs), OVER, notes, _name_of(config, file, second),
         )  # fmt: skip
-        return _written(folder, config, dataclasses.replace(file, robot=ready.robot), runs, table, found, notes)
+        return _written(folder, config, dataclasses.replace(file, robot=ready.robot), runs, table, result, notes)
 
 
 def _written(
@@ -116,11 +116,11 @@ def _written(
     notes: Names,
 ) -> int:
     """Print a comparison and write its folder, with these notes in `result.json`. Returns the exit code."""
-    shown = print_report(comparison_report.comparison_document(found), file)
+    document = print_report(comparison_report.comparison_document(found), file)
     answer = comparison_report.comparison_answer(found)
     further = {"statement": answer, "errors": found.summary, "notes": [*file.remarks, *notes]}
     result = run.SimulationResult("compare", found.model, file.robot, runs, table, further)
-    return run.write_run_folder(folder, config, result, shown)
+    return run.write_run_folder(folder, config, result, document)
 
 
 def _second_robot(config: configuration.Compare, file: RobotFile) -> RobotFile | None:

@@ -41,26 +41,26 @@ def explain_name(name: str | None, files: Names = ()) -> int:
         BadConfiguration: unknown name. The message lists the nearest.
     """
     library = {**effect_file.effect_library(files), **effects.BESIDE}
-    known = explainable_names(library)
+    names = explainable_names(library)
     if name is None:
-        for kind, those in known.items():
+        for kind, those in names.items():
             print_output(_wrapped(kind, ", ".join(those)))
         print_output("mmrjax explain NAME says what one means.")
         return 0
-    found = False
+    explained = False
     for kind, about in EXPLAINED.items():
         for k, (heading, text) in enumerate(about(name, library)):
             if k == 0:
                 print_output(f"{name}: {kind}")
             print_output(_wrapped(heading, text))
-            found = True
-    if not found:
-        below = [p for p in known["parameters"] if p.endswith(f".{name}")]
+            explained = True
+    if not explained:
+        below = [p for p in names["parameters"] if p.endswith(f".{name}")]
         if below:
             raise BadConfiguration(f"explain: got {name}; is one of these meant? {', '.join(below)}")
-        close = similar_words(name, [n for those in known.values() for n in those], 3)
+        close = similar_words(name, [n for those in names.values() for n in those], 3)
         hint = f"did you mean {', '.join(close)}? " if close else ""
-        raise BadConfiguration(f"explain: got {name}; {hint}mmrjax explain lists the names that there are")
+        raise BadConfiguration(f"explain: got {name}; {hint}mmrjax explain lists all names")
     return 0
 
 
@@ -96,17 +96,17 @@ def _effect(name: str, library: dict[str, type[Effect]]) -> Iterator[Line]:
     yield "equation", equation
     yield "stands for", meaning
     yield "enters", f"the {effect.balance} balance{f', channel {effect.channel}' if effect.channel else ''}"
-    made = effect()
-    for p in params.walk_parameters(made):
+    example = effect()
+    for p in params.walk_parameters(example):
         if p.spec.amplitude:
             yield "typical size", f"{p.spec.prior_sd(0.0):g} {p.spec.unit} ({p.spec.meaning}; {p.spec.source})"
             yield "bounds", _bounds(p.spec)
         else:
             yield f"  {p.name}", f"{float(p.value):g} {p.spec.unit}: {p.spec.meaning}"
-    if said := ", ".join(effect_words.effect_declarations(effect)):
-        yield "declares", said
+    if declarations := ", ".join(effect_words.effect_declarations(effect)):
+        yield "declares", declarations
     yield "in data", f"{effect.family()}{_histories(effect)}"
-    for line in _changes(made):
+    for line in _changes(example):
         yield "", line
     for k, test in enumerate(effect_words.effect_tests(effect)):
         yield "" if k else "on a bench", test
@@ -147,8 +147,8 @@ def _changes(effect: Effect) -> Iterator[str]:
             if np.isfinite(after) and before:
                 shares[c.label] = 100 * (after / before - 1)
         if any(abs(x) > 5e-3 for x in shares.values()):
-            said = ", ".join(f"{label} {x:+.2g} %" for label, x in shares.items())
-            yield f"one typical size at {name}, 24 V, 5°, 3 kg: {said}"
+            changes = ", ".join(f"{label} {x:+.2g} %" for label, x in shares.items())
+            yield f"one typical size at {name}, 24 V, 5°, 3 kg: {changes}"
 
 
 def _status(name: str, library: dict[str, type[Effect]]) -> Iterator[Line]:
@@ -210,8 +210,8 @@ def _condition(name: str, library: dict[str, type[Effect]]) -> Iterator[Line]:
 def _output(name: str, library: dict[str, type[Effect]]) -> Iterator[Line]:
     for o in (o for o in EVERY_OUTPUT if name in (o.name, o.column)):
         yield "is", f"{o.label} [{o.unit_shown}]"
-        if (said := _attribute(Result, o.name)) and o in outputs.FURTHER:
-            yield "equation", said
+        if (meaning := _attribute(Result, o.name)) and o in outputs.FURTHER:
+            yield "equation", meaning
         where = "missions (--profile)" if o in (*mission_batch.OUTPUTS, *mission_batch.OF_TURNS) else "every run"
         yield "column", f"{o.column}, of {'--outputs' if o in derived.TABLE else where}"
 
@@ -219,19 +219,19 @@ def _output(name: str, library: dict[str, type[Effect]]) -> Iterator[Line]:
 def _attribute(kind: type, name: str) -> str:
     """Description of an attribute, from the docstring of its class."""
     text = " ".join((inspect.getdoc(kind) or "").partition("Attributes:")[2].split())
-    found = re.search(rf"(?:^|[.\]] |, |; )(?:\w+, )*{name}(?:, \w+)*: (.*?)(?=\.? [a-z_]+(?:, [a-z_]+)*: |$)", text)
-    return "" if found is None else found[1].rstrip(".")
+    match = re.search(rf"(?:^|[.\]] |, |; )(?:\w+, )*{name}(?:, \w+)*: (.*?)(?=\.? [a-z_]+(?:, [a-z_]+)*: |$)", text)
+    return "" if match is None else match[1].rstrip(".")
 
 
 def _parameter(name: str, library: dict[str, type[Effect]]) -> Iterator[Line]:
     robot = paper_robots.nominal()
-    found = next((p for p in params.walk_parameters(robot) if p.name == name), None)
-    if found is None:
+    parameter = next((p for p in params.walk_parameters(robot) if p.name == name), None)
+    if parameter is None:
         return
-    spec = found.spec
+    spec = parameter.spec
     yield "means", f"{spec.meaning} [{spec.unit}]"
-    yield "nominal", f"{float(found.value):g} {spec.unit}; {spec.source}"
-    yield "prior", _prior(found)
+    yield "nominal", f"{float(parameter.value):g} {spec.unit}; {spec.source}"
+    yield "prior", _prior(parameter)
     yield "bounds", _bounds(spec)
     first = name.partition(".")[0]
     part: Any = dict(robot.configurations.items()).get(first, robot)

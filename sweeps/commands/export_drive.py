@@ -15,23 +15,23 @@ def execute(config: configuration.Export, beside: configuration.FolderPart) -> i
     """Export a drive and leave a run folder with its files. Returns the exit code, 0."""
     file = load_robot(config)
     with open_folder("export", config, file.robot, beside) as folder:
-        found = export_format(
+        exported = export_format(
             file, config.to, configuration=config.configuration, data=config.data, at=config.joint,
             draws=config.draws, seed=config.seed,
         )  # fmt: skip
-        for name, content in found.files.items():
+        for name, content in exported.files.items():
             folder.write_bytes(name, content if isinstance(content, bytes) else content.encode())
-        folder.write_text("LAW.md", words.law_text(found))
-        folder.write_json("result.json", to_json(found))
-        shown = print_report(export_report.export_document(found))
+        folder.write_text("LAW.md", words.law_text(exported))
+        folder.write_json("result.json", to_json(exported))
+        document = print_report(export_report.export_document(exported))
         return finish_run_folder(
             folder,
             config,
             {"seed": config.seed},
             robot=file.robot,
             note="what was exported",
-            page=shown,
-            runs=found.comparison.situation.runs,
+            page=document,
+            runs=exported.comparison.situation.runs,
         )
 
 

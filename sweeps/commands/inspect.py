@@ -15,26 +15,28 @@ def inspect_file(file: str, as_json: bool) -> int:
     Raises:
         BadData: a file that cannot be read.
     """
-    found = contents.inspect_source(file)
+    source = contents.inspect_source(file)
     if as_json:
-        print_json(found.to_json())
+        print_json(source.to_json())
         return 0
     rows = [
         (s.path, s.unit, s.samples, *([""] * 6 if s.refused else
          (s.rate, s.gaps, *(("", "") if s.words else (s.least, s.greatest)), s.missing or "", ", ".join(s.words))))
-        for s in found.signals
+        for s in source.signals
     ]  # fmt: skip
     heads = columns(
         "signal", "unit", "samples |", "Hz | .6g", "gaps | .0f", "from | .6g", "to | .6g", "missing |", "words"
     )
-    said = [*(f"{s.path} {s.refused}" for s in found.signals if s.refused), *found.notes]
+    said = [*(f"{s.path} {s.refused}" for s in source.signals if s.refused), *source.notes]
     proposals = []
-    if found.preset:
-        numbers = "".join(f",{key}=..." for key in presets_file.numbers_to_state(found.preset))
-        proposals.append(f"Its columns are those of the preset {found.preset}: add --columns {found.preset}{numbers}")
-    if found.proposed:
-        proposals.append("\n".join(["For the robot's file, to be checked:", "[columns]", *found.proposed]))
-    answer = f"{found.name}: {found.kind}, {count_noun(len(found.signals), 'signal')}"
+    if source.preset:
+        numbers = "".join(f",{key}=..." for key in presets_file.numbers_to_state(source.preset))
+        proposals.append(
+            f"Its columns are those of the preset {source.preset}: add --columns {source.preset}{numbers}"
+        )
+    if source.proposed:
+        proposals.append("\n".join(["For the robot's file, to be checked:", "[columns]", *source.proposed]))
+    answer = f"{source.name}: {source.kind}, {count_noun(len(source.signals), 'signal')}"
     notes = (Note(text, terminal=True) for text in proposals)
-    print_document(Document(found.name, answer, (Table("signals", heads, rows), *remarks(said), *notes)))
+    print_document(Document(source.name, answer, (Table("signals", heads, rows), *remarks(said), *notes)))
     return 0

@@ -52,10 +52,10 @@ def _run() -> str:
     ideal = params.replace(robot, dict.fromkeys(losses, jnp.asarray(0.0)))
     start = time.perf_counter()
     answer = steady_batch(ideal, Conditions(voltage=jnp.array([24.0])))
-    found, known = float(answer.motor_speed[0]), 24.0 / float(robot.motor.torque_constant)
-    if not math.isclose(found, known, rel_tol=1e-9):
-        raise ArithmeticError(f"no-load speed {found} rad/s; known {known} rad/s")
-    return f"no-load speed {found:.3f} rad/s = 24 V / C_E ({time.perf_counter() - start:.1f} s with compiling)"
+    motor_speed, no_load_speed = float(answer.motor_speed[0]), 24.0 / float(robot.motor.torque_constant)
+    if not math.isclose(motor_speed, no_load_speed, rel_tol=1e-9):
+        raise ArithmeticError(f"no-load speed {motor_speed} rad/s; known {no_load_speed} rad/s")
+    return f"no-load speed {motor_speed:.3f} rad/s = 24 V / C_E ({time.perf_counter() - start:.1f} s with compiling)"
 
 
 def _derivative() -> str:

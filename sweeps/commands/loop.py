@@ -83,16 +83,16 @@ def _loop(config: configuration.Loop, beside: configuration.LoopBeside) -> int:
                 raise OutOfTime
 
         def keep(name: str, make: Callable[[], T]) -> T:
-            found = stages[name] = folder.stage(name, make)
+            result = stages[name] = folder.stage(name, make)
             if name == "ranking":
                 _show_ranking(stages[name], folder, timed)
             if name == "verdict":
                 timed(f"{loop_words.verdict_line(stages[name])}; next, errors held out and other noises")
-            return found
+            return result
 
         try:
             with _alarm(left(), lambda: "verdict" not in stages):
-                found = discover(
+                verdict = discover(
                     runs, robot, rows=config.rows, noise=config.noise or None, stated=stated,
                     library=effect_file.effect_library(config.effects), replicates=replicates, seed=config.seed,
                     prefer=config.prefer, forbidden=config.forbid, progress=progress, keep=keep, left=left,
@@ -103,18 +103,18 @@ def _loop(config: configuration.Loop, beside: configuration.LoopBeside) -> int:
             _say_kept(stages, folder, config.robot)
             raise
         if config.resolve:
-            found = _resolved(found, config, beside.members, progress)
-        document = loop_report.loop_document(found, config.robot, changes_by_effect(found))
-        shown = print_report(document)
-        if config.resolve and found.resolved is None:
+            verdict = _resolved(verdict, config, beside.members, progress)
+        document = loop_report.loop_document(verdict, config.robot, changes_by_effect(verdict))
+        page = print_report(document)
+        if config.resolve and verdict.resolved is None:
             print_output(
                 "The track model was not asked: nothing remains in slip, track or ground that it has a say in."
             )
-        found.save(folder.results(), config.robot, folder.tables)
+        verdict.save(folder.results(), config.robot, folder.tables)
         if config.report:
             progress("writing the report")
-        manifest = {"seed": config.seed, "verdict": found.verdict}
-        return finish_run_folder(folder, config, manifest, solved=found.converged, page=shown, runs=found.runs)
+        manifest = {"seed": config.seed, "verdict": verdict.verdict}
+        return finish_run_folder(folder, config, manifest, solved=verdict.converged, page=page, runs=verdict.runs)
 
 
 def _resolved(
@@ -186,7 +186,7 @@ def _say_kept(stages: Mapping[str, Any], folder: RunFolder, robot_name: str) -> 
     if "ranking" in stages:
         for line in loop_words.ranking_lines(stages["ranking"]):
             print_message(line)
-    searches = [found for name, found in stages.items() if name.startswith("search")]
+    searches = [search for name, search in stages.items() if name.startswith("search")]
     if searches and (best := searches[-1][2].best) is not None:
         library = searches[-1][0].base.space.library
         print_message(loop_words.so_far(best.effects, [library[n].family() for n in best.effects]))

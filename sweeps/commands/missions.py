@@ -92,14 +92,14 @@ def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> 
     _check_turning(robot, runs, source)
     _check_cutoff(robot, runs, source, config)
     with open_folder("simulate", config, robot, beside, runs) as folder:
-        found = run_missions(robot, runs, source, config)
-        folder.write_table("segments.csv", capabilities.without_idle(robot, found.segments))
-        folder.write_table("history.csv", capabilities.without_idle(robot, found.course))
-        if not found.whole:
+        ended = run_missions(robot, runs, source, config)
+        folder.write_table("segments.csv", capabilities.without_idle(robot, ended.segments))
+        folder.write_table("history.csv", capabilities.without_idle(robot, ended.course))
+        if not ended.whole:
             print_message("history.csv ends before the mission does, which has taken more steps than are kept")
-        result = run.SimulationResult("simulate", config.model, robot, runs, found.table, found.to_json())
+        result = run.SimulationResult("simulate", config.model, robot, runs, ended.table, ended.to_json())
         return run.write_run_folder(
-            folder, config, result, print_report(mission_report.missions_document(file, found), file)
+            folder, config, result, print_report(mission_report.missions_document(file, ended), file)
         )
 
 
@@ -163,21 +163,24 @@ def run_missions(robot: Robot, runs: records.Runs, source: ProfileTable, config:
     courses: list[Columns] = []
     done, whole = 0, True
     with progress_bar(len(runs), quiet=False) as advance:
-        for found in mission_batch.simulate_in_parts(robot, conditions, profile, source.start):
-            count = len(found.steps)
-            own = slice(done, done + count)
-            at = jax.tree.map(lambda x, own=own: x[own], conditions)
-            numbers = jax.device_get(mission_batch.mission_numbers(robot, at, found))
+        for batch in mission_batch.simulate_in_parts(robot, conditions, profile, source.start):
+            count = len(batch.steps)
+            rows_done = slice(done, done + count)
+            conditions_of_batch = jax.tree.map(lambda x, own=rows_done: x[own], conditions)
+            numbers = jax.device_get(mission_batch.mission_numbers(robot, conditions_of_batch, batch))
             tables.append(
                 {
                     **mission_batch.numbers_by_column(numbers),
-                    **outputs.status_words(found.result.status, found.result.flags),
+                    **outputs.status_words(batch.result.status, batch.result.flags),
                 }
             )
-            segments.append(_segments(robot, at, source, found, names[own]))
-            courses += [_course(robot, at, source, found, k, str(names[done + k]), rows) for k in range(count)]
-            assert found.course is not None  # it was asked for
-            whole &= bool((found.steps - found.rejected <= found.course.time.shape[-1]).all())
+            segments.append(_segments(robot, conditions_of_batch, source, batch, names[rows_done]))
+            courses += [
+                _course(robot, conditions_of_batch, source, batch, k, str(names[done + k]), rows)
+                for k in range(count)
+            ]
+            assert batch.course is not None  # it was asked for
+            whole &= bool((batch.steps - batch.rejected <= batch.course.time.shape[-1]).all())
             done += count
             advance(count)
     about = _conditions(robot, runs, source, config)

@@ -33,10 +33,10 @@ def execute(config: configuration.Render, picture: configuration.Picture) -> int
         if config != configuration.Render() or picture.stated:
             raise BadConfiguration("--climb: not allowed with options of a run of the track model; give one of them")
         _check_free(picture)
-        found = Seen.read(picture.climb)
+        climb = Seen.read(picture.climb)
         from sweeps.pages import climb_figures
 
-        _write(file, lambda aside: climb_figures.render_climb(found, aside, begin, end, slow))
+        _write(file, lambda aside: climb_figures.render_climb(climb, aside, begin, end, slow))
         print_output(str(file))
         return DONE
     still, given = file.suffix == ".png", picture.stated
@@ -57,9 +57,11 @@ def execute(config: configuration.Render, picture: configuration.Picture) -> int
     conditions = run.conditions_of_runs(robot, one_run(robot, given, config.battery), config)
     run.check_runs_bearable(robot, conditions, config)
     with progress_bar(1, quiet=False) as advance:
-        told = scale.share_counter(advance, 1)
-        trajectory = track_batch(robot, conditions, duration=options["duration"], step=options["step"], progress=told)
-        told(1.0)
+        counter = scale.share_counter(advance, 1)
+        trajectory = track_batch(
+            robot, conditions, duration=options["duration"], step=options["step"], progress=counter
+        )
+        counter(1.0)
     trajectory, conditions = jax.tree.map(lambda x: x[0], (trajectory, conditions))
 
     def draw(aside: Path) -> None:

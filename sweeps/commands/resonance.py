@@ -79,18 +79,18 @@ def execute(config: configuration.Resonance, beside: configuration.FolderPart) -
         what = passing_parts(robot, robot.configurations.names.index(name))
         columns = _rippled(folder, robot, conditions, config, what)
         table = {**run.condition_table(robot, runs), "table8": of_table8, **columns}
-        found = _found(config, robot, what, table)
-        _write(folder, config, found)
-        shown = print_report(resonance_report.resonance_document(found, file), file)
-        manifest, solved = {"seed": None, "statuses": found.statuses}, words.every_run_solved(found.statuses)
+        result = _found(config, robot, what, table)
+        _write(folder, config, result)
+        document = print_report(resonance_report.resonance_document(result, file), file)
+        manifest, solved = {"seed": None, "statuses": result.statuses}, words.every_run_solved(result.statuses)
         return finish_run_folder(
             folder,
             config,
             manifest,
-            robot=found.robot,
+            robot=result.robot,
             note="the robot of this map",
             solved=solved,
-            page=shown,
+            page=document,
             runs=runs,
         )
 
@@ -133,13 +133,13 @@ def _rippled(
             count, name = min(size, total - first), f"chunk-{first // size:06d}"
             part = folder.chunk(name)
             if part is None:
-                told = scale.share_counter(advance, count)
+                counter = scale.share_counter(advance, count)
                 chosen = jax.tree.map(lambda x, rows=rows: x[rows], conditions)
                 options = {key: config.options[key] for key in ("duration", "step")}
-                ended = track_batch(robot, chosen, rolling=True, progress=told, **options)
+                ended = track_batch(robot, chosen, rolling=True, progress=counter, **options)
                 part = {key: x[:count] for key, x in _columns(robot, ended, what).items()}
                 folder.keep_chunk(name, part)
-                told(1.0)
+                counter(1.0)
             else:
                 advance(count)
             parts.append(part)
@@ -148,18 +148,18 @@ def _rippled(
 
 def _columns(robot: Robot, ended: Any, what: Passing) -> Columns:
     """Ripple of a batch of runs, in the units of the table."""
-    found = vibrations_of_runs(robot, ended, what.pitch)
-    status = np.array(STATUSES)[found.status]
-    slow = ~found.read & np.isin(status, ("converged", "not_settled"))
+    vibrations = vibrations_of_runs(robot, ended, what.pitch)
+    status = np.array(STATUSES)[vibrations.status]
+    slow = ~vibrations.read & np.isin(status, ("converged", "not_settled"))
     columns = {
         "status": np.where(slow, SLOW, status),
-        "passing_Hz": found.passing,
+        "passing_Hz": vibrations.passing,
     }
     for name, signal in SIGNALS.items():
         columns |= {
-            f"{name}_mean_{signal.unit}": found.mean[name] / signal.factor,
-            f"{name}_ripple_percent": 100 * found.deviation[name],
-            f"{name}_frequency_Hz": found.frequency[name],
+            f"{name}_mean_{signal.unit}": vibrations.mean[name] / signal.factor,
+            f"{name}_ripple_percent": 100 * vibrations.deviation[name],
+            f"{name}_frequency_Hz": vibrations.frequency[name],
         }
     return columns
 
@@ -168,12 +168,12 @@ def _found(config: configuration.Resonance, robot: Robot, what: Passing, table: 
     """Natural frequencies at the middle voltage, and peaks and crossings at each payload."""
     assert config.configuration is not None
     payloads, middle = config.payloads_kg, config.voltages_V[len(config.voltages_V) // 2]
-    at = _grid(config, (middle,), payloads)
-    linear = modes(robot, run.conditions_of_runs(robot, grid_conditions(at, robot), config))
+    middle_runs = _grid(config, (middle,), payloads)
+    linear = modes(robot, run.conditions_of_runs(robot, grid_conditions(middle_runs, robot), config))
     by_payload = dict(zip(payloads, linear, strict=True))
     tops: list[Peak] = []
     ends: dict[float, tuple[float, float]] = {}
-    for payload, own in by_payload.items():
+    for payload, peaks in by_payload.items():
         gridded = (table["payload_kg"] == payload) & np.isin(table["supply_voltage_V"], config.voltages_V)
         rows = np.flatnonzero(gridded & (table["status"] == "converged"))
         rows = rows[np.argsort(table["speed_mean_mm_s"][rows])]
@@ -185,13 +185,13 @@ def _found(config: configuration.Resonance, robot: Robot, what: Passing, table: 
             for name in SIGNALS
             for peak in peaks_over_speed(
                 name, payload, speed, table["passing_Hz"][rows], table[f"{name}_ripple_percent"][rows] / 100,
-                table[f"{name}_frequency_Hz"][rows], own,
+                table[f"{name}_frequency_Hz"][rows], peaks,
             )
         ]  # fmt: skip
         tops += here
         ends[payload] = float(speed[0]), float(speed[-1])
     tops = confirm_peaks(tops, by_payload)
-    meets = [c for p, own in ends.items() for c in find_crossings(by_payload[p], p, what.travel, *own, tops)]
+    meets = [c for p, peaks in ends.items() for c in find_crossings(by_payload[p], p, what.travel, *peaks, tops)]
     return ResonanceResult(
         config.configuration, config.slope_deg, config.surface, what, robot, table, by_payload, tops, meets
     )

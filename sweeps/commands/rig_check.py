@@ -29,7 +29,7 @@ from mmrjax.model.motor import UNLIMITED
 from mmrjax.model.quantities import HEAT
 from mmrjax.model.robot import Robot
 from mmrjax.model.shaft import Shaft
-from sweeps.commands.rig_template import EXAMPLE
+from sweeps.commands.rig_template import EXAMPLE, is_example
 from sweeps.config import RobotPart
 from sweeps.console import print_json
 from sweeps.inputs import load_robot, read_runs
@@ -89,45 +89,45 @@ class RigCheck:
 
     def remarks(self) -> list[str]:
         """Sentences on points to check, one each."""
-        said = []
+        notes = []
         if self.robot.rig.inherits:
-            said.append(
+            notes.append(
                 'what the file does not state is its base\'s, a packaged robot (base = "none" starts from nothing)'
             )
         if self.examples:
             lines = ", ".join(map(str, self.examples))
             hold = f"{count_noun(len(self.examples), 'line')} still hold{'s' * (len(self.examples) == 1)}"
-            said.append(f"{hold} the number of an example ({EXAMPLE}): {lines}")
-        said += self.doubts
+            notes.append(f"{hold} the number of an example ({EXAMPLE}): {lines}")
+        notes += self.doubts
         if self.runs is not None and self.runs.has("duty") and self.runs.has("total_current_A"):
-            said.append(
+            notes.append(
                 "with a duty, total_current is the supply current: the duty's share of the motors' current; a sensor "
                 "in a motor's leads measures motor_current"
             )
-        said += [f"{fact.what} {fact.value}: {fact.odd}" for fact in self.facts if fact.odd]
+        notes += [f"{fact.what} {fact.value}: {fact.odd}" for fact in self.facts if fact.odd]
         loose = [
             _program(self.robot, o) for o in self.origins if o.why.startswith("the file") and o.sd is None and o.value
         ]
         if loose and not self.robot.rig.inherits:
-            said.append(f"without ±, so with the program's: {', '.join(loose)}")
+            notes.append(f"without ±, so with the program's: {', '.join(loose)}")
         if not self.robot.knows(HEAT) and self.robot.motor.temperature_limit < UNLIMITED:
             lacking = " and ".join(self.robot.unknown(HEAT))
-            said.append(
+            notes.append(
                 f"motor.temperature_limit is stated, and not how warm the windings become: state {lacking}, without "
                 "which nothing is held against it"
             )
         if self.robot.motor.voltage_limit is None and self.robot.rig.imposed == "voltage":
-            said.append("motor.voltage_limit is not stated: experiments are proposed up to what a table used")
-        return said
+            notes.append("motor.voltage_limit is not stated: experiments are proposed up to what a table used")
+        return notes
 
     def channels(self) -> list[Json]:
         """Of each channel: name, the user's column, whether it is signed, its step [unit], source of its sd."""
-        theirs = {mine: column for mine, column, _ in self.robot.rig.columns}
-        shown, found = (self if self.foresight is None else self.foresight).robot.rig, []
+        theirs = {name: column for name, column, _ in self.robot.rig.columns}
+        rig, rows = (self if self.foresight is None else self.foresight).robot.rig, []
         for k, channel in enumerate(self.robot.channels):
-            instrument = shown.instrument(channel.name)
+            instrument = rig.instrument(channel.name)
             usual = f"{channel.sd_column} of the table, else {100 * channel.sd_share:g} % of the reading"
-            found.append(
+            rows.append(
                 {
                     "channel": channel.name,
                     "column": theirs.get(channel.column, channel.column),
@@ -137,20 +137,20 @@ class RigCheck:
                     "sd": usual if self.foresight is None else _source(self.foresight.noise[k], channel),
                 }
             )
-        return found
+        return rows
 
     def columns(self) -> list[Json]:
         """Of each column of the table: what it is used for, its range."""
         if self.runs is None:
             return []
-        found, theirs = [], self.runs.headings
+        rows, theirs = [], self.runs.headings
         for name, values in self.runs.columns.items():
             if name not in theirs and self._means_nothing(name):
                 continue
             number = np.issubdtype(values.dtype, np.number)
             finite = values[np.isfinite(values)] if number else values
             kinds = np.unique(finite)
-            found.append(
+            rows.append(
                 {
                     "column": name,
                     "theirs": theirs.get(name, ""),
@@ -161,7 +161,7 @@ class RigCheck:
                     "words": [] if number else kinds.tolist(),
                 }
             )
-        return found
+        return rows
 
     def _means_nothing(self, column: str) -> bool:
         """True if a column missing from the table does not apply to this rig: ground, or another kind of drive."""
@@ -173,7 +173,7 @@ class RigCheck:
         if self.runs is None:
             return []
         every = {c.column: c.name for c in channels.EVERY}
-        said = [
+        notes = [
             f"{name}: not among the rig's channels; add {every[name]} to channels in its file to use it"
             for name in self.runs.unknown
             if name in every
@@ -183,7 +183,7 @@ class RigCheck:
             f"{', '.join(others)}: without a role, so residuals are tested for clusters by each; name one under "
         )
         without += "[columns] in the rig's file if it has one"
-        return [*said, *([without] if others else [])]
+        return [*notes, *([without] if others else [])]
 
     def statement(self) -> str:
         """Sentence on the parameters that the table can determine."""
@@ -192,9 +192,11 @@ class RigCheck:
         pairs = self.foresight.together
         held = undetermined_names([p.name for p in self.foresight.parameters if p.held], pairs)
         traded = {name for pair in pairs for name in (pair.one, pair.other)}
-        told = [p.name for p in self.foresight.parameters if not p.held and p.name not in traded]
-        told += [fit_words.determined_combination(p) for p in pairs]
-        parts = [f"These data determine {', '.join(told)}" if told else "These data determine no parameter"]
+        determined = [p.name for p in self.foresight.parameters if not p.held and p.name not in traded]
+        determined += [fit_words.determined_combination(p) for p in pairs]
+        parts = [
+            f"These data determine {', '.join(determined)}" if determined else "These data determine no parameter"
+        ]
         parts += [f"{', '.join(held)} would not be determined by these runs"] * bool(held)
         return "; ".join(parts) + "."
 
@@ -287,11 +289,11 @@ def check_rig_file(file: Path, data: str | None, effects: Names, as_json: bool, 
         raise BadConfiguration(f"{file}: is a folder; expected a rig's TOML file")
     if not file.is_file():
         raise BadConfiguration(f"{file}: no such file; mmrjax rig new {file} writes one to fill in")
-    found = examine_rig_file(file, data, effects, columns)
+    check = examine_rig_file(file, data, effects, columns)
     if as_json:
-        print_json(found.to_json())
+        print_json(check.to_json())
     else:
-        print_document(check_document(found))
+        print_document(check_document(check))
     return 0
 
 
@@ -299,20 +301,20 @@ def examine_rig_file(file: Path, data: str | None, effects: Names = (), columns:
     """Remarks on a rig's file, and on a table whose columns a preset may name."""
     rig = load_robot(RobotPart(robot=str(file), effects=effects))
     lines, robot = rig.text.splitlines(), rig.robot
-    examples = tuple(k for k, line in enumerate(lines, 1) if EXAMPLE in line and not line.startswith("#"))
-    found = RigCheck(
+    examples = tuple(k for k, line in enumerate(lines, 1) if is_example(line) and not line.startswith("#"))
+    check = RigCheck(
         rig.name, robot, examples, tuple(rig_facts.number_origins(rig)), tuple(rig_facts.derived_facts(robot))
     )
     if data is None:
-        return found
+        return check
     runs = read_runs(data, robot, columns=columns, measured=True, series=True)
-    seen = foresight.predict_identifiability(runs, robot)
+    foreseen = foresight.predict_identifiability(runs, robot)
     doubts = (
         *filter(None, (settling.doubtful_sign(runs),)),
         *rig_facts.log_doubts(runs, robot),
-        *sentences(seen.doubts),
+        *sentences(foreseen.doubts),
     )
-    return dataclasses.replace(found, runs=runs, foresight=seen, doubts=doubts)
+    return dataclasses.replace(check, runs=runs, foresight=foreseen, doubts=doubts)
 
 
 def check_document(found: RigCheck) -> Document:
@@ -322,7 +324,7 @@ def check_document(found: RigCheck) -> Document:
         FREE if c["quantum"] is None else f"{c['quantum']:.3g} {c['unit']}" if c["quantum"] else ""
         for c in found.channels()
     )
-    shown = [
+    blocks = [
         (c["channel"], c["column"], signs[c["signed"]], step, c["sd"])
         for c, step in zip(found.channels(), steps, strict=True)
     ]
@@ -334,7 +336,7 @@ def check_document(found: RigCheck) -> Document:
         f"{found.file}: {found.statement()}",
         (
             Note(" ".join(found.understood()), terminal=True),
-            Table("channels", columns("channel", "column", "sign", "step |", "sd"), shown, "channels"),
+            Table("channels", columns("channel", "column", "sign", "step |", "sd"), blocks, "channels"),
             Table("numbers", columns("parameter", "value | .5g", "± |", "unit", "from"), numbers, "numbers"),
             Table("facts", columns("fact", "value |", "check"), follows, "what follows"),
             *remarks(found.remarks()),
@@ -352,16 +354,18 @@ def _data_blocks(found: RigCheck, runs: Runs, seen: Foresight) -> tuple[Block, .
         )
         for c in found.columns()
     ]  # fmt: skip
-    said = [*found.unused(), *runs.missing()]
+    notes_of_data = [*found.unused(), *runs.missing()]
     if len(seen.status) < len(runs):
-        said.insert(0, f"loop and calibrate use the readings of {len(seen.status)} of them, evenly in time (--rows)")
+        notes_of_data.insert(
+            0, f"loop and calibrate use the readings of {len(seen.status)} of them, evenly in time (--rows)"
+        )
     held = runs.has("held") or (runs.layout.imposed == "motor_speed" and not runs[runs.layout.imposed_column].any())
     settled = {*words.SETTLED, *(["stalled"] if held else [])}  # a shaft that is held stands still, as it should
     others = [
         f"{count_noun(count, 'row')}: {name}" for name, count in Counter(seen.status).items() if name not in settled
     ]
     if others:
-        said.append(
+        notes_of_data.append(
             f"with the file's numbers not every row settles ({', '.join(others)}); rows without a "
             "steady state are not counted"
         )
@@ -379,7 +383,7 @@ def _data_blocks(found: RigCheck, runs: Runs, seen: Foresight) -> tuple[Block, .
             "columns", columns("column", "used as", "values |", "from | .5g", "to | .5g", "words"), used,
             f"{runs.source}: {count_noun(len(runs), 'row')}",
         ),
-        *remarks(said),
+        *remarks(notes_of_data),
         Table(
             "determined", heads, determined,
             "what these data can determine (posterior sd over prior sd, at the numbers of the file)",

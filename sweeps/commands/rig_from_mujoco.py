@@ -141,16 +141,16 @@ class _Model:
         driven = [k for k in hinges if k in self.actuators] or hinges
         if joint is None:
             if len(driven) != 1:
-                found = f"has {list_some(self.joints[k] for k in driven)}" if driven else "has no named hinge"
-                raise BadConfiguration(f"--joint: missing, and {self.file} {found}; expected the name of one joint")
+                finding = f"has {list_some(self.joints[k] for k in driven)}" if driven else "has no named hinge"
+                raise BadConfiguration(f"--joint: missing, and {self.file} {finding}; expected the name of one joint")
             return driven[0]
-        known = [self.joints[k] for k in hinges]
+        hinge_names = [self.joints[k] for k in hinges]
         if joint not in self.joints:
             raise BadConfiguration(
                 f"--joint: got {joint}; {self.file} has no such joint; "
-                f"{allowed_words(joint, known) if known else 'the file has no named hinge'}"
+                f"{allowed_words(joint, hinge_names) if hinge_names else 'the file has no named hinge'}"
             )
-        if joint not in known:
+        if joint not in hinge_names:
             raise BadConfiguration(f"--joint: got {joint}, which slides or is free; expected a hinge")
         return self.joints.index(joint)
 
@@ -207,7 +207,7 @@ class _Model:
         """Radius of the largest cylinder or sphere about the axis, of collisions if there are any."""
         model, data, geom = self.model, self.data, self.library.mjtGeom
         welded = model.body_weldid[model.jnt_bodyid[joint]]
-        found: list[tuple[bool, float, str]] = []
+        radii: list[tuple[bool, float, str]] = []
         for k in range(model.ngeom):
             kind = int(model.geom_type[k])
             rigid = model.body_weldid[model.geom_bodyid[k]] == welded
@@ -219,8 +219,8 @@ class _Model:
                 shape = "sphere" if along is None else "cylinder"
                 named = self._name(self.library.mjtObj.mjOBJ_GEOM, k)
                 collides = bool(model.geom_contype[k] or model.geom_conaffinity[k])
-                found.append((collides, radius, " ".join(filter(None, ("geom", named, f"({shape})")))))
-        return max(found)[1:] if found else None
+                radii.append((collides, radius, " ".join(filter(None, ("geom", named, f"({shape})")))))
+        return max(radii)[1:] if radii else None
 
     def _sides(self, joint: int, radius: Found | None) -> Found | None:
         """Number of wheels of the same radius and parallel axis that are as driven as this one."""
@@ -244,7 +244,7 @@ def _dc_motor(model: Any, actuator: int, dof: int, ratio: float, file: str) -> d
     effects = _effects(dynamic, bias, ratio)
     friction = float(model.dof_frictionloss[dof]) + (float(bias[3]) * ratio if float(dynamic[5]) > 0 else 0.0)
     number = lambda value, unit, what, width="": Stated(float(value), unit, f"{file}, {what}", width)  # noqa: E731
-    found = {
+    numbers = {
         "motor.resistance": number(resistance, "ohm", "<dcmotor> resistance", "10 %"),
         "motor.torque_constant": number(constant, "N·m/A", "<dcmotor> motorconst", "10 %"),
         "motor.inertia": number(float(model.dof_armature[dof]) / ratio**2, "kg·m^2", "armature / gear²", "50 %"),
@@ -257,32 +257,32 @@ def _dc_motor(model: Any, actuator: int, dof: int, ratio: float, file: str) -> d
     inductance = float(dynamic[0]) * resistance
     voltage = float(np.max(np.abs(model.actuator_ctrlrange[actuator])))
     if inductance > 0:
-        found["motor.inductance"] = number(inductance, "H", "<dcmotor> inductance", "50 %")
+        numbers["motor.inductance"] = number(inductance, "H", "<dcmotor> inductance", "50 %")
     if voltage > 0:
-        found["motor.voltage_limit"] = number(voltage, "V", "<dcmotor> ctrlrange")
+        numbers["motor.voltage_limit"] = number(voltage, "V", "<dcmotor> ctrlrange")
     if model.actuator_forcelimited[actuator]:
         limit = float(np.max(np.abs(model.actuator_forcerange[actuator]))) / constant
-        found["driver.current_limit"] = number(limit, "A", "<dcmotor> forcerange / motorconst")
+        numbers["driver.current_limit"] = number(limit, "A", "<dcmotor> forcerange / motorconst")
     for name, fields in effects.items():
-        found |= {f"effects.{name}.{key}": number(value, "SI", "<dcmotor>") for key, value in fields.items()}
-    return found
+        numbers |= {f"effects.{name}.{key}": number(value, "SI", "<dcmotor>") for key, value in fields.items()}
+    return numbers
 
 
 def _effects(dynamic: Sequence[float], bias: Sequence[float], ratio: float) -> dict[str, dict[str, float]]:
     """Effects of a `<dcmotor>`: name → fields."""
-    found: dict[str, dict[str, float]] = {}
+    amplitudes: dict[str, dict[str, float]] = {}
     resistance_thermal, capacity, stiffness = (float(dynamic[k]) for k in (2, 3, 5))
     amplitude, ripples, phase, coulomb, static, fade = (float(x) for x in bias[:6])
     if resistance_thermal > 0:
-        found["thermal_drift"] = {
+        amplitudes["thermal_drift"] = {
             "amplitude": 1.0, "resistance_thermal": resistance_thermal,
             "time_constant": resistance_thermal * capacity,
         }  # fmt: skip
     if amplitude:
-        found["cogging"] = {"amplitude": -amplitude, "ripples": ripples, "phase": phase}
+        amplitudes["cogging"] = {"amplitude": -amplitude, "ripples": ripples, "phase": phase}
     if stiffness > 0:  # of the motor's shaft, here at the joint
-        found["presliding"] = {"amplitude": coulomb * ratio, "angle_breakaway": static / stiffness / ratio}
+        amplitudes["presliding"] = {"amplitude": coulomb * ratio, "angle_breakaway": static / stiffness / ratio}
         if static > coulomb:
             excess = (static - coulomb) * ratio
-            found["stribeck_exponent"] = {"amplitude": excess, "speed_fade": fade / ratio, "exponent": 2.0}
-    return found
+            amplitudes["stribeck_exponent"] = {"amplitude": excess, "speed_fade": fade / ratio, "exponent": 2.0}
+    return amplitudes

@@ -81,17 +81,17 @@ def read_data_sheet(stated: Mapping[str, str]) -> dict[str, Stated]:
         (_ratio(back, speed), "voltage / no-load speed"),
         (_ratio(torque, drop), "stall torque / stall current"),
     ]
-    known = [(value, source) for value, source in constants if value is not None]
-    _refuse_contradictions((given, "resistance", "ohm"), (known, "torque constant", "N·m/A"))
-    constant = known[0][0]
+    stated_constants = [(value, source) for value, source in constants if value is not None]
+    _refuse_contradictions((given, "resistance", "ohm"), (stated_constants, "torque constant", "N·m/A"))
+    constant = stated_constants[0][0]
 
     def line(value: float, unit: str, source: str, width: float) -> Stated:
         return Stated(float(f"{value:.4g}"), unit, f"data sheet, {source}", f"{width:.2g} %")
 
-    spread = [100 * _difference(pairs) for pairs in (given, known)]
+    spread = [100 * _difference(pairs) for pairs in (given, stated_constants)]
     return {
         "motor.resistance": line(resistance, "ohm", given[0][1], max(WIDTH_RESISTANCE, spread[0])),
-        "motor.torque_constant": line(constant, "N·m/A", known[0][1], max(WIDTH_CONSTANT, spread[1])),
+        "motor.torque_constant": line(constant, "N·m/A", stated_constants[0][1], max(WIDTH_CONSTANT, spread[1])),
         "motor.friction_coulomb": line(constant * idle, "N·m", "torque constant × no-load current", 30.0),
         "motor.friction_viscous": Stated(
             0.0,
@@ -145,12 +145,12 @@ def _difference(pairs: list[tuple[float, str]]) -> float:
 
 
 def _refuse_contradictions(*groups: tuple[list[tuple[float, str]], str, str]) -> None:
-    found = [
+    faults = [
         f"{name} is {' and '.join(f'{three_digits(value)} {unit} ({source})' for value, source in pairs)}, "
         f"{100 * _difference(pairs):.0f} % apart"
         for pairs, name, unit in groups
         if _difference(pairs) > LARGEST
     ]
-    if found:
-        raise BadConfiguration(f"--from-sheet: contradiction: {'; '.join(found)}; expected {100 * LARGEST:.0f} % at "
+    if faults:
+        raise BadConfiguration(f"--from-sheet: contradiction: {'; '.join(faults)}; expected {100 * LARGEST:.0f} % at "
                                "most; all numbers must be of the motor's own shaft at one voltage")  # fmt: skip

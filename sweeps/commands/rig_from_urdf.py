@@ -50,7 +50,7 @@ class _Urdf:
     def __init__(self, root: Element, file: str) -> None:
         self.root, self.file = root, file
         if any("xacro}" in element.tag for element in root.iter()):
-            raise BadConfiguration(f"{file}: has elements of xacro; run xacro {file} > robot.urdf, and state that")
+            raise BadConfiguration(f"{file}: has elements of xacro; run xacro {file} > robot.urdf, and use that file")
         self.links, self.joints = self._named("link"), self._named("joint")
         for name, element in self.joints.items():
             for end in ("parent", "child"):
@@ -61,16 +61,16 @@ class _Urdf:
             self.below[self._link(j, "parent", name)].append(name)
 
     def _named(self, tag: str) -> dict[str, Element]:
-        found: dict[str, Element] = {}
+        elements: dict[str, Element] = {}
         for element in self.root.findall(tag):
             name = element.get("name", "")
-            if not name or name in found:
+            if not name or name in elements:
                 what = f"two are called {name}" if name else "one has no name"
                 raise BadConfiguration(f"{self.file}, <{tag}>: {what}; expected different names")
-            found[name] = element
-        if not found:
+            elements[name] = element
+        if not elements:
             raise BadConfiguration(f"{self.file}: has no <{tag}>; expected a robot with links and joints")
-        return found
+        return elements
 
     def _link(self, joint: Element, end: str, name: str) -> str:
         element = joint.find(end)
@@ -90,8 +90,8 @@ class _Urdf:
         candidates = [name for name in turning if self._driven(name)] or turning
         if joint is None:
             if len(candidates) != 1:
-                found = f"has {list_some(candidates)}" if candidates else "has no joint that turns"
-                raise BadConfiguration(f"--joint: missing, and {self.file} {found}; expected the name of one joint")
+                finding = f"has {list_some(candidates)}" if candidates else "has no joint that turns"
+                raise BadConfiguration(f"--joint: missing, and {self.file} {finding}; expected the name of one joint")
             return candidates[0]
         if joint not in self.joints:
             raise BadConfiguration(
@@ -171,13 +171,13 @@ class _Urdf:
     def _to_root(self, joint: str) -> tuple[Pose, str]:
         """Pose of a joint in the frame of the root link, and the name of that."""
         pose: Pose = (np.eye(3), np.zeros(3))
-        at: str | None = joint
+        joint_name: str | None = joint
         link, met = "", set[str]()
-        while at is not None:
-            pose = _then(self._origin(self.joints[at], f"joint {at}"), pose)
-            link = self._link(self.joints[at], "parent", at)
+        while joint_name is not None:
+            pose = _then(self._origin(self.joints[joint_name], f"joint {joint_name}"), pose)
+            link = self._link(self.joints[joint_name], "parent", joint_name)
             self._once(link, met)
-            at = self.above.get(link)
+            joint_name = self.above.get(link)
         return pose, link
 
     # --- numbers
@@ -204,16 +204,16 @@ class _Urdf:
         xx, yy, zz = (self._number(entries, f"i{a}{a}", where, "kg·m²", 0.0) for a in "xyz")
         xy, xz, yz = (self._number(entries, f"i{a}", where, "kg·m²", None) for a in ("xy", "xz", "yz"))
         tensor = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-        own = turned.T @ axis
+        own_axis = turned.T @ axis
         lever = np.cross(axis, centre)
-        return mass, float(own @ tensor @ own + mass * lever @ lever), mass * centre
+        return mass, float(own_axis @ tensor @ own_axis + mass * lever @ lever), mass * centre
 
     def _radius(self, joint: str) -> Found | None:
         """Radius of the largest cylinder or sphere about the axis: of collisions, else of what is shown."""
         axis = self._axis(joint)
         link = self._link(self.joints[joint], "child", joint)
         for tag in ("collision", "visual"):
-            found: list[Found] = []
+            radii: list[Found] = []
             for name, pose in self._moved(link, rigid=True):
                 for shape in self.links[name].findall(tag):
                     turned, centre = _then(pose, self._origin(shape, f"link {name}, <{tag}>"))
@@ -222,9 +222,9 @@ class _Urdf:
                         element = shape.find(f"geometry/{kind}")
                         radius = self._number(element, "radius", where, "m", 0.0)
                         if radius > 0 and is_round(centre, axis, radius, along):
-                            found.append((radius, where))
-            if found:
-                return max(found)
+                            radii.append((radius, where))
+            if radii:
+                return max(radii)
         return None
 
     def _sides(self, joint: str, radius: Found | None) -> Found | None:

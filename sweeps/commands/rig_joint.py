@@ -78,11 +78,11 @@ class JointNumbers:
 
     def numbers(self, kind: str) -> dict[str, Stated]:
         """Lines of a rig's file of a kind, by dotted name."""
-        found: dict[str, Stated] = {}
+        by_name: dict[str, Stated] = {}
 
         def put(name: str, unit: str, key: str, number: Found | None, source: str = "") -> None:
             if number is not None:
-                found[name] = Stated(number[0], unit, f"{self.file}, {number[1]}{source}", WIDTHS.get(key, ""))
+                by_name[name] = Stated(number[0], unit, f"{self.file}, {number[1]}{source}", WIDTHS.get(key, ""))
 
         moving = kind in VEHICLES
         losses = "load.track" if moving else "load"
@@ -93,7 +93,7 @@ class JointNumbers:
             put("load.torque_gravity", "N·m", "weight", self.weight)
             put("load.angle_zero", "rad", "angle", self.angle)
         if self.sides is not None:
-            found["sides"] = Stated(int(self.sides[0]), "-", f"{self.file}, {self.sides[1]}")
+            by_name["sides"] = Stated(int(self.sides[0]), "-", f"{self.file}, {self.sides[1]}")
         put(f"{losses}.loss_coulomb", "N·m", "friction", self.friction)
         put(f"{losses}.loss_viscous", "N·m·s", "damping", self.damping)
         put("gearbox.ratio", "-", "ratio", self.ratio)
@@ -103,9 +103,9 @@ class JointNumbers:
             put("motor.inertia", "kg·m^2", "armature", rotor, " / ratio²")
         elif self.armature is not None:
             inertia = (inertia[0] + self.armature[0], f"{inertia[1]}, and armature")
-            found["motor.inertia"] = Stated(0.0, "kg·m^2", "no ratio found, so the load's inertia contains it")
+            by_name["motor.inertia"] = Stated(0.0, "kg·m^2", "no ratio found, so the load's inertia contains it")
         put("load.inertia", "kg·m^2", "inertia", inertia)
-        return found | {name.replace("load.loss", f"{losses}.loss"): number for name, number in self.drive.items()}
+        return by_name | {name.replace("load.loss", f"{losses}.loss"): number for name, number in self.drive.items()}
 
 
 def free_unstated_losses(kind: str, numbers: Mapping[str, Stated]) -> dict[str, Stated]:
@@ -115,9 +115,9 @@ def free_unstated_losses(kind: str, numbers: Mapping[str, Stated]) -> dict[str, 
     motor constants and ratio, or without the voltage U for the constant loss, the template's line is kept, and 0 is
     held.
     """
-    found = dict(numbers)
+    freed = dict(numbers)
     constant, resistance, ratio, limit = (
-        found[name].value if name in found else 0.0
+        freed[name].value if name in freed else 0.0
         for name in ("motor.torque_constant", "motor.resistance", "gearbox.ratio", "motor.voltage_limit")
     )
     torque = UNSTATED * constant * ratio / resistance if resistance > 0 else 0.0  # [N·m/V]
@@ -127,14 +127,14 @@ def free_unstated_losses(kind: str, numbers: Mapping[str, Stated]) -> dict[str, 
         ("loss_viscous", "N·m·s", torque * constant * ratio),
     ):
         name, reason = f"{losses}.{key}", f"not in the model; ± is {100 * UNSTATED:g} % of the stall torque"
-        if name in found and found[name].value != 0:
+        if name in freed and freed[name].value != 0:
             continue
         if width > 0:
-            found[name] = Stated(0.0, unit, reason, f"{width:.2g}")
-        elif name in found:
-            held = f'{found[name].source}; 0 is held at 0, "0.0 ± 0.01" frees it'
-            found[name] = dataclasses.replace(found[name], source=held)
-    return found
+            freed[name] = Stated(0.0, unit, reason, f"{width:.2g}")
+        elif name in freed:
+            held = f'{freed[name].source}; 0 is held at 0, "0.0 ± 0.01" frees it'
+            freed[name] = dataclasses.replace(freed[name], source=held)
+    return freed
 
 
 def hanging_torque_and_angle(torque: float, torque_quarter: float) -> tuple[float, float] | None:

@@ -62,10 +62,10 @@ def new_rig_text(kind: str | None, source: Path | None, joint: str | None, sheet
     numbers: dict[str, Stated] = {}
     origins = []
     if source is not None:
-        found = joint_of(source, joint)
-        kind = found.kind(kind)
-        numbers |= found.numbers(kind)
-        origins.append(f"joint {found.joint} of {found.file}")
+        joint_model = joint_of(source, joint)
+        kind = joint_model.kind(kind)
+        numbers |= joint_model.numbers(kind)
+        origins.append(f"joint {joint_model.joint} of {joint_model.file}")
     if sheet is not None:
         from sweeps.commands import rig_from_sheet
 

@@ -66,8 +66,8 @@ def fill_rig_template(kind: str, numbers: Mapping[str, Stated], heading: str) ->
         heading: sentence for the first line.
     """
     lines = rig_template(kind).splitlines()
-    at = next(k for k, line in enumerate(lines) if line.startswith("load = "))
-    load = lines[at - 1].strip("[]")
+    load_line = next(k for k, line in enumerate(lines) if line.startswith("load = "))
+    load = lines[load_line - 1].strip("[]")
     for name, number in numbers.items():
         table, _, key = re.sub(rf"^{LOAD}\.", f"{load}.", name).rpartition(".")
         _put(lines, table, key, f"{key} = {number.text}  # [{number.unit}] {_one_line(number.source)}")
@@ -84,21 +84,32 @@ def _put(lines: list[str], table: str, key: str, line: str) -> None:
         lines += ["", f"[{table}]"]
     start = lines.index(f"[{table}]") + 1 if table else 0
     end = next((k for k in range(start, len(lines)) if _HEADER.match(lines[k])), len(lines))
-    known = [k for k in range(start, end) if re.match(rf"(# )?{key} = ", lines[k])]
-    if known:
-        lines[known[0]] = line
+    key_lines = [k for k in range(start, end) if re.match(rf"(# )?{key} = ", lines[k])]
+    if key_lines:
+        lines[key_lines[0]] = line
         return
     while end > start and (not lines[end - 1] or lines[end - 1].startswith("#")):
         end -= 1  # comments below belong to the next table
     lines.insert(end, line)
 
 
+def is_example(line: str) -> bool:
+    """True if a line of a rig's file is marked as an example and has a template's number."""
+    marked = (x for kind in KINDS for x in rig_template(kind).splitlines() if EXAMPLE in x)
+    return EXAMPLE in line and any(_stated_number(x) == _stated_number(line) for x in marked)
+
+
+def _stated_number(line: str) -> tuple[str, float] | None:
+    match = re.match(r'(\w+) = "?([-+.\deE]+)', line)
+    return None if match is None else (match[1], float(match[2]))
+
+
 def example_numbers(text: str) -> Names:
     """Returns names and units of the numbers that are still those of an example, as `motor.resistance [ohm]`."""
-    found, table = [], ""
+    examples, table = [], ""
     for line in text.splitlines():
         if not line.startswith("#") and (header := _HEADER.match(line)):
             table = f"{header[1]}."
         if EXAMPLE in line and (key := re.match(r"(\w+) = .*?# (\[[^\]]*\])?", line)):
-            found.append(f"{table}{key[1]} {key[2] or ''}".rstrip())
-    return tuple(found)
+            examples.append(f"{table}{key[1]} {key[2] or ''}".rstrip())
+    return tuple(examples)

@@ -77,39 +77,39 @@ def execute(config: configuration.Sensitivity, beside: configuration.FolderPart)
         robot, inputs, Points.of(runs), outputs, config.model, config.options, supply, in_words(print_message)
     )
     with open_folder("sensitivity", config, robot, beside, runs) as folder:
-        found = analyse_sensitivity(study, config.method, config.evaluations, config.seed, candidates)
-        folder.write_json("result.json", found.to_json())
-        for name, table in found.tables().items():
+        result = analyse_sensitivity(study, config.method, config.evaluations, config.seed, candidates)
+        folder.write_json("result.json", result.to_json())
+        for name, table in result.tables().items():
             folder.write_table(name, table)
-        shown = print_report(sensitivity_report.sensitivity_document(found, file), file)
-        manifest = {"seed": found.seed, "statuses": found.statuses}
+        document = print_report(sensitivity_report.sensitivity_document(result, file), file)
+        manifest = {"seed": result.seed, "statuses": result.statuses}
         return finish_run_folder(
             folder,
             config,
             manifest,
             robot=file.robot,
             note="the robot of this study",
-            solved=found.solved,
-            page=shown,
+            solved=result.solved,
+            page=document,
             runs=runs,
         )
 
 
 def _ranges(vary: Names) -> dict[str, tuple[float, float]]:
     """`name=low:high` of every varied condition."""
-    found: dict[str, tuple[float, float]] = {}
+    ranges: dict[str, tuple[float, float]] = {}
     for text in vary:
         name, _, ends = text.partition("=")
         low, _, high = ends.partition(":")
-        if name in found:
+        if name in ranges:
             raise BadConfiguration(f"--vary {name}: given twice; give it once")
         try:
-            found[name] = float(low), float(high)
+            ranges[name] = float(low), float(high)
         except ValueError:
             raise BadConfiguration(
                 f"--vary: got {text}; expected name=low:high with numbers, such as voltage=22:26"
             ) from None
-    return found
+    return ranges
 
 
 def _operating_points(
@@ -135,7 +135,7 @@ def _operating_points(
                 f"--vary {name}: the robot's file imposes the {words_of(layout.imposed)}; vary that"
             )
     if config.battery and "voltage" in ranges:
-        raise BadConfiguration("--vary voltage: acts without --battery only, whose voltage is that of its charge")
+        raise BadConfiguration("--vary voltage: acts only without --battery, whose charge sets the voltage")
     for name, (low, high) in ranges.items():
         if name in AXES:
             if getattr(config, AXES[name]) is not None:
@@ -145,7 +145,7 @@ def _operating_points(
     try:
         stated = GridPart(configurations=config.configurations, surface=config.surface, **axes)
     except ValueError:
-        raise BadConfiguration(f"--vary: got {', '.join(config.vary)}; a range leaves what a run may have") from None
+        raise BadConfiguration(f"--vary: got {', '.join(config.vary)}; a range exceeds the limits of a run") from None
     notes: list[str] = []
     stated = grid_room.resolve_grid(stated, robot, config.battery, notes)
     for note in notes:

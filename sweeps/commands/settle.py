@@ -24,7 +24,7 @@ def execute(config: configuration.Settle, beside: configuration.SettledLog) -> i
     runs = read_runs(beside.data, robot, columns=config.columns, measured=True, series=True)
     named = [] if config.columns is None else ["--columns", config.columns]
     loop = shlex.join(["mmrjax", "loop", beside.data, "--robot", config.robot, *named])
-    found = settling.settle_log(
+    settled = settling.settle_log(
         runs,
         shortest=config.shortest_s,
         drift=config.drift,
@@ -32,20 +32,20 @@ def execute(config: configuration.Settle, beside: configuration.SettledLog) -> i
         rolling=settling.rolling_readings(robot),
         loop=loop,
     )
-    few = settle_words.too_few(found, SettledRuns.fewest, loop)
+    few = settle_words.too_few(settled, SettledRuns.fewest, loop)
     with open_folder("settle", config, robot, beside, runs) as folder:
-        folder.write_table("settled.csv", found.table())
-        folder.write_table("stretches.csv", stretches_table(found))
-        folder.write_json("result.json", to_json(found, few))
-        turned = sentences(ranges.turned_signs(found.settled_runs(), robot))
-        shown = print_report(settle_report.settle_document(found, few, turned))
+        folder.write_table("settled.csv", settled.table())
+        folder.write_table("stretches.csv", stretches_table(settled))
+        folder.write_json("result.json", to_json(settled, few))
+        turned = sentences(ranges.turned_signs(settled.settled_runs(), robot))
+        document = print_report(settle_report.settle_document(settled, few, turned))
         return finish_run_folder(
             folder,
             config,
-            {"seed": None, "settled": len(found.kept)},
+            {"seed": None, "settled": len(settled.kept)},
             robot=robot,
             note="the rig of this log",
-            page=shown,
+            page=document,
             runs=runs,
         )
 

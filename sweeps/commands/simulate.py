@@ -68,19 +68,19 @@ def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> 
         raise BadConfiguration(
             f"--runs: got {len(runs)} runs; --model {config.model} keeps at most {_HISTORIES} histories"
         )
-    drawn = None if config.posterior is None else beside_robot(file)
+    posterior = None if config.posterior is None else beside_robot(file)
     with open_folder("simulate", config, robot, beside, runs) as folder:
-        seen = showing_turns(robot, runs.axes)
-        table, histories = _simulated(folder, seen, runs, config)
+        shows_turns = showing_turns(robot, runs.axes)
+        table, histories = _simulated(folder, shows_turns, runs, config)
         table[PERMISSIBLE] = permissible_durations(robot, table)
         stands = posture_words.posture_of_runs(robot, runs, run.conditions_of_runs(robot, runs, config))
         notes = run_remarks(robot, table) + capabilities.unknown_numbers_sentence(robot)
         further: Json = {"notes": [*file.remarks, *notes]}
         remarks = list(notes)
-        if drawn is not None and config.posterior is not None:
-            found = uncertainty.simulate_draws(robot, drawn, runs, config, config.posterior, folder)
-            table |= found.columns
-            remarks += uncertainty.interval_remarks(found)
+        if posterior is not None and config.posterior is not None:
+            draws = uncertainty.simulate_draws(robot, posterior, runs, config, config.posterior, folder)
+            table |= draws.columns
+            remarks += uncertainty.interval_remarks(draws)
         if stands is not None:
             folder.write_table("posture.csv", stands.table)
             further["notes"] += posture_words.tipping_remarks(stands)
@@ -89,7 +89,7 @@ def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> 
         if PEAK in table:
             further[PEAK] = float(np.nanmax(table[PEAK], initial=0.0))
         result = run.SimulationResult("simulate", config.model, robot, runs, table, further)
-        of_page = dataclasses.replace(file, robot=seen)
+        of_page = dataclasses.replace(file, robot=shows_turns)
         document = runs_report.runs_document(of_page, config.model, table, histories, stands, remarks)
         return run.write_run_folder(folder, config, result, print_report(document, of_page))
 
@@ -104,9 +104,9 @@ def _simulated(
     conditions = run.conditions_of_runs(robot, runs, config)
     run.check_runs_bearable(robot, conditions, config)
     with progress_bar(len(runs), quiet=not fidelity.facts.slow) as advance:
-        told = scale.share_counter(advance, len(runs))
-        batch = jax.device_get(fidelity.histories(robot, conditions, config.options, told))
-        told(1.0)
+        counter = scale.share_counter(advance, len(runs))
+        batch = jax.device_get(fidelity.histories(robot, conditions, config.options, counter))
+        counter(1.0)
     assert batch.history is not None  # the fidelity was asked for it
     folder.write_table("history.csv", capabilities.without_idle(robot, history_table(robot, batch.history, runs)))
     if batch.history.reactions is not None:
@@ -165,11 +165,11 @@ def over_time(robot: Robot, batch: Run) -> Columns:
 def permissible_durations(robot: Robot, table: Columns) -> np.ndarray:
     """Permissible duration of each run's current from ambient temperature [s]. inf: continuous, NaN: no current."""
     current = motor_currents(robot, table)
-    known = np.isfinite(current)
+    has_current = np.isfinite(current)
     filled = np.zeros(len(current) + -len(current) % PAD)
-    filled[: len(current)] = np.where(known, current, 0.0)
+    filled[: len(current)] = np.where(has_current, current, 0.0)
     time = _permissible(robot.motor, jnp.asarray(filled))
-    return np.where(known, np.asarray(time)[: len(current)], np.nan)
+    return np.where(has_current, np.asarray(time)[: len(current)], np.nan)
 
 
 @functools.partial(compiled, options=SELDOM)
@@ -196,7 +196,7 @@ def motor_currents(robot: Robot, table: Columns) -> np.ndarray:
 
 def run_remarks(robot: Robot, table: Columns) -> list[str]:
     """Remarks that the numbers alone do not show, one sentence each, on a few runs at most."""
-    said: list[str] = []
+    remarks: list[str] = []
     several = len(table["status"]) > 1
     times = table[PERMISSIBLE] if PERMISSIBLE in table else permissible_durations(robot, table)
     for k, status in enumerate(table["status"]):
@@ -204,47 +204,47 @@ def run_remarks(robot: Robot, table: Columns) -> list[str]:
         flags, cell = str(table["flags"][k]).split(";"), float(table["voltage_cell_V"][k])
         if "overvoltage" in flags:
             back = -float(robot.battery.current(table["total_current_A"][k]))
-            said.append(
+            remarks.append(
                 f"{name}overvoltage: {back:.2f} A flow into the battery, a cell at {cell:.2f} V, where "
                 f"{robot.battery.voltage_charge:g} V is the highest to charge it with"
             )
         if "cut_off" in flags:
-            said.append(
+            remarks.append(
                 f"{name}cut_off: a cell at {cell:.2f} V, below its cut-off voltage of "
                 f"{robot.battery.voltage_cutoff:g} V"
             )
         if "winding_hot" in flags:
             limit, ambient = robot.motor.temperature_limit, float(robot.motor.temperature_ambient)
-            said.append(
+            remarks.append(
                 f"{name}winding_hot: {limit:g} °C are reached after {float(times[k]):.3g} s at this "
                 f"current, from {ambient:g} °C"
             )
         if np.isinf(table["winding_settled_C"][k]):
             current = float(motor_currents(robot, table)[k])
-            said.append(
+            remarks.append(
                 f"{name}winding, long running: {words.NONE_SETTLES} at {current:.2f} A a motor, as resistance "
                 "rises faster than its heat leaves; it stays permissible up to "
                 f"{float(robot.current_continuous):.2f} A"
             )
         if status == "battery_empty" and "time_end_s" in table:
             when, far = float(table["time_end_s"][k]), float(table["displacement_m"][k])
-            said.append(
+            remarks.append(
                 f"{name}battery_empty: after {when:.1f} s and {far:.2f} m; the numbers are those just before"
                 if when > 0
                 else f"{name}battery_empty: empty before the start"
             )
-    return said[:_SHOWN] + ([f"... and {len(said) - _SHOWN} more remarks"] if len(said) > _SHOWN else [])
+    return remarks[:_SHOWN] + ([f"... and {len(remarks) - _SHOWN} more remarks"] if len(remarks) > _SHOWN else [])
 
 
 def history_table(robot: Robot, history: History, runs: records.Runs) -> Columns:
     """Time histories of a batch as one table, a row a sample. The columns that series are read with."""
     signals = history.signals
     of_rig = {*robot.rig.channels, *(OF_VEHICLE if robot.has_ground else OF_SHAFT)}
-    shown = [c for c in channels.EVERY if c.over_time and c.name in of_rig]
+    shown_channels = [c for c in channels.EVERY if c.over_time and c.name in of_rig]
     return {
         "run_id": np.repeat(run.run_names(runs), history.time.shape[-1]),
         "time_s": np.ravel(history.time),
-        **{c.column: np.ravel(history.reading[c.name]) / c.factor for c in shown},
+        **{c.column: np.ravel(history.reading[c.name]) / c.factor for c in shown_channels},
         "theoretical_speed_mm_s": np.ravel(signals.speed_theoretical) / quantities.MM,
         "slip": np.ravel(ground.slip_ratio(signals.speed, signals.speed_theoretical)),
         "displacement_m": np.ravel(history.distance),
@@ -257,10 +257,10 @@ def starts_from_standstill(robot: Robot, batch: Run, runs: records.Runs) -> list
     """Of each run from standstill its stages, their slip (33) and the acceleration time. No stages where it does not
     get under way."""
     assert batch.history is not None  # the fidelity was asked for it
-    found = stages_of_histories(robot, batch.history, runs.configurations(robot))
+    stages = stages_of_histories(robot, batch.history, runs.configurations(robot))
     nothing: Json = {"stages": [], "acceleration_time_s": None, "slip_over_acceleration": None}
     under_way = [STATUSES[int(s)] in words.UNDER_WAY for s in np.asarray(batch.result.status)]
     return [
         {"run_id": str(name), **(s.to_json() if s is not None and goes else nothing)}
-        for name, s, goes in zip(run.run_names(runs), found, under_way, strict=True)
+        for name, s, goes in zip(run.run_names(runs), stages, under_way, strict=True)
     ]

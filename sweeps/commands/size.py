@@ -30,7 +30,7 @@ def execute(config: configuration.Size, beside: configuration.FolderPart) -> int
 
     The code is 0 whether or not a design meets everything, and 3 if the solver failed at a worst corner of the best.
     """
-    asked = requirements_file.load_requirements(Path(config.requirements))
+    requirements = requirements_file.load_requirements(Path(config.requirements))
     file = load_robot(config)
     robot = file.robot
     imposed.check_on_ground(robot, "size")
@@ -41,36 +41,36 @@ def execute(config: configuration.Size, beside: configuration.FolderPart) -> int
             raise BadConfiguration(f"{where}: got {name}; {allowed_words(name, OBJECTIVES)}")
     if config.pareto and len(set(config.pareto)) != 2:
         raise BadConfiguration(f"--pareto: got {', '.join(config.pareto)}; expected two different objectives")
-    known = [m.name for m in packaged_motors()]
+    motor_names = [m.name for m in packaged_motors()]
     for name in config.motors:
-        if name not in known:
-            raise BadConfiguration(f"--motors: got {name}; {allowed_words(name, known)}")
-    sheet.refuse_impossible(robot, asked)
+        if name not in motor_names:
+            raise BadConfiguration(f"--motors: got {name}; {allowed_words(name, motor_names)}")
+    sheet.refuse_impossible(robot, requirements)
     with open_folder("size", config, robot, beside) as folder:
         with step_reporter(print_message, "drawing designs") as heard:
             sizing = search(
-                robot, asked, objectives, starts=config.starts, motors=config.motors, seed=config.seed,
+                robot, requirements, objectives, starts=config.starts, motors=config.motors, seed=config.seed,
                 tell=in_words(heard),
             )  # fmt: skip
             best = robot if sizing.best is None else sizing.best.robot
             outcomes = (
                 ()
                 if sizing.best is None
-                else sheet.check_requirements(best, asked, changes=False, tell=in_words(heard))
+                else sheet.check_requirements(best, requirements, changes=False, tell=in_words(heard))
             )
             charts: tuple[Chart, ...] = ()
             if config.report:
                 heard("charts of the limits")
-                drawn = (robot,) if sizing.best is None else (best, robot)
-                charts = tuple(margin_chart(r, asked, chart_extent(asked)) for r in drawn)
-        found = SizeResult(asked, robot, sizing, objectives, outcomes, charts)
-        _write(folder, config, found)
-        shown = print_report(
-            size_report.size_document(found, capabilities.shown_name(file)), dataclasses.replace(file, robot=best)
+                robots = (robot,) if sizing.best is None else (best, robot)
+                charts = tuple(margin_chart(r, requirements, chart_extent(requirements)) for r in robots)
+        result = SizeResult(requirements, robot, sizing, objectives, outcomes, charts)
+        _write(folder, config, result)
+        document = print_report(
+            size_report.size_document(result, capabilities.shown_name(file)), dataclasses.replace(file, robot=best)
         )
         manifest = {"seed": config.seed, "feasible": sizing.best is not None}
         solved = words.every_run_solved(Counter(o.status for o in outcomes))
-        return finish_run_folder(folder, config, manifest, solved=solved, page=shown)
+        return finish_run_folder(folder, config, manifest, solved=solved, page=document)
 
 
 def _write(folder: RunFolder, config: configuration.Size, found: SizeResult) -> None:

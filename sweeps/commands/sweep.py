@@ -70,17 +70,17 @@ def execute(config: Campaign | Sweep, options: StoreOptions) -> int:
 def _into_table(config: Sweep, file: RobotFile, options: StoreOptions) -> int:
     robot = file.robot
     runs = grid.grid_conditions(config, robot, config.battery)
-    drawn = None if config.posterior is None else beside_robot(file)
+    posterior = None if config.posterior is None else beside_robot(file)
     with open_folder("sweep", config, robot, options) as folder:
         table = run.evaluate_runs(robot, runs, config, folder)
         notes: list[str] = []
-        if drawn is not None and config.posterior is not None:
-            found = uncertainty.simulate_draws(robot, drawn, runs, config, config.posterior, folder)
-            notes = uncertainty.interval_ranges(table, found)
-            table |= found.columns
+        if posterior is not None and config.posterior is not None:
+            draws = uncertainty.simulate_draws(robot, posterior, runs, config, config.posterior, folder)
+            notes = uncertainty.interval_ranges(table, draws)
+            table |= draws.columns
         result = run.SimulationResult("sweep", config.model, robot, runs, table)
-        shown = print_report(sweep_report.sweep_document(file, config.model, table, notes), file)
-        return run.write_run_folder(folder, config, result, shown)
+        document = print_report(sweep_report.sweep_document(file, config.model, table, notes), file)
+        return run.write_run_folder(folder, config, result, document)
 
 
 def _into_store(config: Campaign, file: RobotFile, options: StoreOptions) -> int:
@@ -222,12 +222,12 @@ def simulate_chunks(store: SweepStore, job: scale.Job, options: StoreOptions, po
     """
     store.begin(options.share)
     done = store.done()
-    mine = chunks_of_shard(options.share, len(job.blocks))
-    left = [k for k in mine if k not in done]
+    own_chunks = chunks_of_shard(options.share, len(job.blocks))
+    left = [k for k in own_chunks if k not in done]
     _refuse_without_space(store.layout.size, len(left) / len(job.blocks), store.path)
     if not left:
         return
-    total = sum(job.blocks.count(k) for k in mine)
+    total = sum(job.blocks.count(k) for k in own_chunks)
     before = total - sum(job.blocks.count(k) for k in left)
     if before:
         print_message(f"{store.partial}: goes on after {before:,} of {total:,} points")
@@ -245,7 +245,7 @@ def simulate_chunks(store: SweepStore, job: scale.Job, options: StoreOptions, po
         written = len(store.done())
         raise DiskFull(
             f"{store.partial}: {error.strerror} after {written} of {len(job.blocks)} chunks; free some space, and "
-            "the same command goes on from there"
+            "the same command resumes from there"
         ) from error
 
 
@@ -262,14 +262,14 @@ def finish_sweep(
         with store.last() as left:
             if left:
                 # Write all files of a run folder except the store, then move the store into place
-                found = sweep_summary(store.layout, job, store.done().values())
-                store.write_json("result.json", found)
+                summary = sweep_summary(store.layout, job, store.done().values())
+                store.write_json("result.json", summary)
                 manifest = {
-                    "statuses": found["statuses"],
+                    "statuses": summary["statuses"],
                     "seed": config.samples.get("seed", 0),
                     "hashes": same["data"],
                 }
-                document = campaign_report.campaign_document(file, store.layout, found, store.partial / STORE)
+                document = campaign_report.campaign_document(file, store.layout, summary, store.partial / STORE)
                 finish_run_folder(
                     store,
                     config,
@@ -312,10 +312,10 @@ def sweep_summary(layout: Layout, job: scale.Job, done: Iterable[Done]) -> Json:
         "outputs": {
             name: {
                 "unit": units[name],
-                "least": min((low for low, _ in found), default=None),
-                "greatest": max((high for _, high in found), default=None),
+                "least": min((low for low, _ in extremes), default=None),
+                "greatest": max((high for _, high in extremes), default=None),
             }
-            for name, found in ranges.items()
+            for name, extremes in ranges.items()
         },
     }
 

@@ -52,19 +52,19 @@ def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> 
     runs = one_run(robot, {**given, **turn_columns(config, given)}, config.battery)
     settled = config.model == fidelities.NAMES[0]
     with open_folder("simulate", config, robot, beside, runs) as folder:
-        asked = run.conditions_of_runs(robot, runs, config)
-        run.check_runs_bearable(robot, asked, config)
-        shown = _channels(robot, settled)
+        conditions = run.conditions_of_runs(robot, runs, config)
+        run.check_runs_bearable(robot, conditions, config)
+        readings = _channels(robot, settled)
         stages = 2 + config.demands
         if config.demands:
             with report_stage(1, stages, "duties of the demanded turn"):
-                asked, runs = _demanded(robot, asked, runs, config)
+                conditions, runs = _demanded(robot, conditions, runs, config)
         if settled:
             with report_stage(stages - 1, stages, "settled turns over the duties of the inner side"):
-                batch, swept = _with_others(robot, asked)
+                batch, swept = _with_others(robot, conditions)
             turns = {
                 **{name: np.asarray(getattr(swept, name)) for name in SIDES},
-                **_columns(robot, shown, swept, batch),
+                **_columns(robot, readings, swept, batch),
             }
             folder.write_table("turns.csv", capabilities.without_idle(robot, turns))
             first, history = jax.tree.map(lambda x: x[:1], batch), None
@@ -77,16 +77,16 @@ def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> 
                 progress_bar(1, quiet=not slow) as advance,
             ):
                 told = scale.share_counter(advance, 1)
-                first = jax.device_get(fidelity.histories(robot, asked, config.options, told))
+                first = jax.device_get(fidelity.histories(robot, conditions, config.options, told))
                 told(1.0)
             turns, history = None, first.history
             assert history is not None
-            folder.write_table("history.csv", history_table(history, shown))
-        own = {name: np.asarray(values) for name, values in first.columns.items()}
-        table = {**run.condition_table(robot, runs), **_columns(robot, shown, asked, first), **own}
+            folder.write_table("history.csv", history_table(history, readings))
+        columns = {name: np.asarray(values) for name, values in first.columns.items()}
+        table = {**run.condition_table(robot, runs), **_columns(robot, readings, conditions, first), **columns}
         turn = {name: _number(table[name][0]) for name in (q.column for q in quantities.TABLE["turn"])}
         with report_stage(stages, stages, "posture"):
-            stands = posture_words.posture_of_runs(robot, runs, asked)
+            stands = posture_words.posture_of_runs(robot, runs, conditions)
         notes = []
         if stands is not None:
             folder.write_table("posture.csv", stands.table)
@@ -184,11 +184,11 @@ def check_can_turn(robot: Robot, named: str) -> None:
 
 def turn_columns(config: configuration.TurnPart, given: Json) -> Json:
     """Columns of the run: duties of the supply's voltage, which is the larger one where it is not stated."""
-    found: Json = {} if config.heading_deg is None else {"heading_deg": config.heading_deg}
+    columns: Json = {} if config.heading_deg is None else {"heading_deg": config.heading_deg}
     if config.duty_left is not None:
-        return found | {"duty_left": config.duty_left, "duty_right": config.duty_right}
+        return columns | {"duty_left": config.duty_left, "duty_right": config.duty_right}
     if config.left_V is None or config.right_V is None:  # those of a demand are found later
-        return found | {name: 1.0 for name in SIDES}
+        return columns | {name: 1.0 for name in SIDES}
     most, supply = max(abs(config.left_V), abs(config.right_V)), given.get(SUPPLY)
     if supply is not None and supply < most:
         raise BadConfiguration(
@@ -196,7 +196,7 @@ def turn_columns(config: configuration.TurnPart, given: Json) -> Json:
         )
     volts = np.array([config.left_V, config.right_V])
     source, duties = sides.supply_and_shares(volts, None if supply is None else np.asarray(supply))
-    return found | {SUPPLY: float(source), **dict(zip(SIDES, map(float, duties), strict=True))}
+    return columns | {SUPPLY: float(source), **dict(zip(SIDES, map(float, duties), strict=True))}
 
 
 def _channels(robot: Robot, settled: bool) -> tuple[Channel, ...]:

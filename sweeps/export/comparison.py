@@ -123,15 +123,15 @@ def compare_format(
     inside = situation.inside
     theta = refit_parameters(law, situation, inside)
     names = tuple(e.name for e in joint.inside)
-    found = list(fates)
+    fates_found = list(fates)
     for effect in joint.inside:
-        own = situation.without((effect.name,))
-        kept = share_kept(law, law_of(joint, {effect.name: 0.0}), situation, inside, own)
+        without_effect = situation.without((effect.name,))
+        kept = share_kept(law, law_of(joint, {effect.name: 0.0}), situation, inside, without_effect)
         verdict = HELD if effect.name in held else DROPPED if kept < LITTLE else APPROXIMATED
         how = held.get(effect.name) or approximated(effect.balance)
         if not np.isfinite(kept) and effect.name not in held:
             verdict, how = DROPPED, "these runs do not show it, and the format has no term for it"
-        found.append(Fate(effect.name, verdict, how, kept))
+        fates_found.append(Fate(effect.name, verdict, how, kept))
     exported = _at(law, theta, situation)
     models = {NATIVE: situation.native, EXPORTED: situation.readings(exported)}
     if law.names:
@@ -143,8 +143,8 @@ def compare_format(
     reference = situation.measured if situation.is_measured else situation.native
     return Comparison(
         situation, dict(zip(law.names, map(float, law.start), strict=True)),
-        dict(zip(law.names, map(float, theta), strict=True)), tuple(found),
-        tuple(Errors(label, channel_errors(joint, shown, reference)) for label, shown in models.items()),
+        dict(zip(law.names, map(float, theta), strict=True)), tuple(fates_found),
+        tuple(Errors(label, channel_errors(joint, readings, reference)) for label, readings in models.items()),
         "the measured readings" if situation.is_measured else "the native model",
         models[EXPORTED], exported,
     )  # fmt: skip
@@ -189,15 +189,15 @@ def _refitted(law: FormatLaw, least: Any, command: Any, load: Any, way: Any, cur
     start = jnp.maximum(jnp.sqrt(law.start) / scale, 1e-3)
 
     def residual(z: jax.Array, args: Any) -> jax.Array:
-        found = law((scale * z) ** 2, command, load, way)
-        apart = [(a - b) / s for a, b, s in zip(found, (current, speed), sizes, strict=True)]
+        solution = law((scale * z) ** 2, command, load, way)
+        apart = [(a - b) / s for a, b, s in zip(solution, (current, speed), sizes, strict=True)]
         return jnp.concatenate([*apart, NEAR * jnp.sqrt(1.0 * len(command)) * (z - start)])
 
     solver: Any = solvers.solver_by_name("lm")
-    found: Any = optx.least_squares(residual, solver, start, max_steps=300, throw=False)
+    solution: Any = optx.least_squares(residual, solver, start, max_steps=300, throw=False)
     misfit = lambda z: jnp.sqrt(jnp.mean(residual(z, None) ** 2))  # noqa: E731
-    exact, better = misfit(jnp.sqrt(law.start) / scale) < EXACT, misfit(found.value) <= misfit(start)
-    return jnp.where(exact, law.start, (scale * jnp.where(better, found.value, start)) ** 2)
+    exact, better = misfit(jnp.sqrt(law.start) / scale) < EXACT, misfit(solution.value) <= misfit(start)
+    return jnp.where(exact, law.start, (scale * jnp.where(better, solution.value, start)) ** 2)
 
 
 def share_kept(law: FormatLaw, bare: FormatLaw, situation: Situation, native: AtJoint, native_bare: AtJoint) -> float:

@@ -48,11 +48,11 @@ def export(
         BadData: a table that is refused.
     """
     file = RobotFile(robot, "robot") if isinstance(robot, Robot) else robot_file.find_robot_file(str(robot))
-    found = export_format(
+    exported = export_format(
         file, to, configuration=configuration, data=data, at=joint, draws=draws, seed=seed, posterior=posterior
     )
-    texts = {**found.files, "LAW.md": export_words.law_text(found)}
-    found = dataclasses.replace(found, files=texts)
+    texts = {**exported.files, "LAW.md": export_words.law_text(exported)}
+    exported = dataclasses.replace(exported, files=texts)
     if out is not None:
         folder = Path(out)
         if taken := next((folder / name for name in texts if (folder / name).exists()), None):
@@ -61,4 +61,4 @@ def export(
         for name, content in texts.items():
             with naming_file(folder / name):
                 (folder / name).write_bytes(content if isinstance(content, bytes) else content.encode())
-    return found
+    return exported

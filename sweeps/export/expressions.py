@@ -101,8 +101,8 @@ def apply_operation(op: str, *args: Symbol) -> Symbol:
     if op == "sub" and args[1].op == "neg":
         return apply_operation("add", args[0], args[1].args[0])
     if op in ("and", "or") and any(a.is_const for a in args):
-        known, other = args if args[0].is_const else args[::-1]
-        return (other if known.value else known) if op == "and" else (known if known.value else other)
+        constant, other = args if args[0].is_const else args[::-1]
+        return (other if constant.value else constant) if op == "and" else (constant if constant.value else other)
     return Symbol.of(op, args)
 
 
@@ -115,10 +115,10 @@ def choice_symbol(condition: Symbol, yes: Symbol, no: Symbol) -> Symbol:
 
 def _each(function: Callable[..., Symbol], *arrays: np.ndarray) -> np.ndarray:
     arrays = np.broadcast_arrays(*arrays)
-    found = np.empty(arrays[0].shape, object)
-    for k in np.ndindex(found.shape):
-        found[k] = function(*(a[k] for a in arrays))
-    return found
+    results = np.empty(arrays[0].shape, object)
+    for k in np.ndindex(results.shape):
+        results[k] = function(*(a[k] for a in arrays))
+    return results
 
 
 def _power(x: Symbol, n: int) -> Symbol:
@@ -150,18 +150,18 @@ def _dot(a: np.ndarray, b: np.ndarray, dimensions: Any) -> np.ndarray:
     if batch or len(left) != 1:
         raise NotImplementedError
     a, b = np.moveaxis(a, left[0], -1), np.moveaxis(b, right[0], -1)
-    found = np.empty(a.shape[:-1] + b.shape[:-1], object)
+    products = np.empty(a.shape[:-1] + b.shape[:-1], object)
     for i in np.ndindex(a.shape[:-1]):
         for j in np.ndindex(b.shape[:-1]):
-            found[i + j] = _total([apply_operation("mul", x, y) for x, y in zip(a[i], b[j], strict=True)])
-    return found
+            products[i + j] = _total([apply_operation("mul", x, y) for x, y in zip(a[i], b[j], strict=True)])
+    return products
 
 
 def _total(terms: Sequence[Symbol]) -> Symbol:
-    found = constant_symbol(0.0)
+    total = constant_symbol(0.0)
     for term in terms:
-        found = apply_operation("add", found, term)
-    return found
+        total = apply_operation("add", total, term)
+    return total
 
 
 #: Primitives that apply one operation to each element.
@@ -208,62 +208,64 @@ def _kept(name: str, shape: tuple[int, ...], p: Json) -> tuple[int, ...]:
 
 def _evaluated(jaxpr: Any, consts: Sequence[Any], arguments: Sequence[np.ndarray]) -> list[np.ndarray]:
     """Symbols of the outputs of a jaxpr, as arrays of objects."""
-    known: dict[Any, np.ndarray] = {}
+    values: dict[Any, np.ndarray] = {}
 
     def read(atom: Any) -> np.ndarray:
-        return _numbers(atom.val) if hasattr(atom, "val") else known[atom]
+        return _numbers(atom.val) if hasattr(atom, "val") else values[atom]
 
-    known.update(zip(jaxpr.constvars, map(_numbers, consts), strict=True))
-    known.update(zip(jaxpr.invars, arguments, strict=True))
+    values.update(zip(jaxpr.constvars, map(_numbers, consts), strict=True))
+    values.update(zip(jaxpr.invars, arguments, strict=True))
     for eqn in jaxpr.eqns:
         x, name, p = [read(v) for v in eqn.invars], eqn.primitive.name, eqn.params
         inner = next((p[key] for key in ("jaxpr", "call_jaxpr", "fun_jaxpr") if key in p), None)
         if name in _SIMPLE:
-            found = [_each(lambda *a, op=_SIMPLE[name]: apply_operation(op, *a), *x)]
+            results = [_each(lambda *a, op=_SIMPLE[name]: apply_operation(op, *a), *x)]
         elif name in _SAME:
-            found = list(x)
+            results = list(x)
         elif name == "integer_pow":
-            found = [_each(lambda a, n=p["y"]: _power(a, n), x[0])]
+            results = [_each(lambda a, n=p["y"]: _power(a, n), x[0])]
         elif name == "square":
-            found = [_each(lambda a: _power(a, 2), x[0])]
+            results = [_each(lambda a: _power(a, 2), x[0])]
         elif name == "rsqrt":
-            found = [_each(lambda a: apply_operation("div", constant_symbol(1.0), apply_operation("sqrt", a)), x[0])]
+            results = [
+                _each(lambda a: apply_operation("div", constant_symbol(1.0), apply_operation("sqrt", a)), x[0])
+            ]
         elif name == "logistic":
-            found = [_each(_logistic, x[0])]
+            results = [_each(_logistic, x[0])]
         elif name == "select_n" and len(x) == 3:
-            found = [
+            results = [
                 _each(
                     lambda c, no, yes: choice_symbol((constant_symbol(bool(c.value)) if c.is_const else c), yes, no),
                     *x,
                 )
             ]
         elif name == "clamp":
-            found = [_each(lambda low, a, high: apply_operation("min", apply_operation("max", a, low), high), *x)]
+            results = [_each(lambda low, a, high: apply_operation("min", apply_operation("max", a, low), high), *x)]
         elif name == "convert_element_type":
-            found = [_each(lambda a, kind=p["new_dtype"]: _converted(a, kind), x[0])]
+            results = [_each(lambda a, kind=p["new_dtype"]: _converted(a, kind), x[0])]
         elif name == "iota":
-            found = [_numbers(np.indices(p["shape"], float)[p["dimension"]])]
+            results = [_numbers(np.indices(p["shape"], float)[p["dimension"]])]
         elif name == "reduce_sum":
             rest = np.moveaxis(x[0], p["axes"], range(len(p["axes"])))
             flat = rest.reshape(-1, *rest.shape[len(p["axes"]) :])
-            found = [_each(lambda *terms: _total(terms), *flat)]
+            results = [_each(lambda *terms: _total(terms), *flat)]
         elif name == "dot_general":
-            found = [_dot(x[0], x[1], p["dimension_numbers"])]
+            results = [_dot(x[0], x[1], p["dimension_numbers"])]
         elif inner is not None:
             closed = hasattr(inner, "consts")
-            found = _evaluated(inner.jaxpr if closed else inner, inner.consts if closed else (), x)
+            results = _evaluated(inner.jaxpr if closed else inner, inner.consts if closed else (), x)
         else:
-            found = [_shaped(name, x, p)]
-        known.update(zip(eqn.outvars, found, strict=True))
+            results = [_shaped(name, x, p)]
+        values.update(zip(eqn.outvars, results, strict=True))
     return [read(v) for v in jaxpr.outvars]
 
 
 def _numbers(value: Any) -> np.ndarray:
     value = np.asarray(value)
-    found = np.empty(value.shape, object)
+    symbols = np.empty(value.shape, object)
     for k in np.ndindex(value.shape):
-        found[k] = constant_symbol(value[k].item())
-    return found
+        symbols[k] = constant_symbol(value[k].item())
+    return symbols
 
 
 def trace_function(function: Callable[..., Any], names: Sequence[str], what: str) -> Symbol:
@@ -295,21 +297,21 @@ def trace_function(function: Callable[..., Any], names: Sequence[str], what: str
 
 def names_of(*symbols: Symbol) -> list[str]:
     """Names that expressions depend on, in the order of their first use."""
-    found: dict[str, None] = {}
-    seen: set[int] = set()
+    names: dict[str, None] = {}
+    visited: set[int] = set()
 
     def visit(x: Symbol) -> None:
-        if id(x) in seen:
+        if id(x) in visited:
             return
-        seen.add(id(x))
+        visited.add(id(x))
         if x.op == "name":
-            found[x.value] = None
+            names[x.value] = None
         for a in x.args:
             visit(a)
 
     for symbol in symbols:
         visit(symbol)
-    return list(found)
+    return list(names)
 
 
 #: The number 0.
@@ -374,16 +376,16 @@ def lines_of(result: Symbol, dialect: Dialect, spelled: Callable[[str], str], in
         if id(x) in local:
             return local[id(x)]
         if x.is_const:
-            shown = number_text(x.value)
-            return f"({shown})" if shown.startswith("-") and outer >= 7 else shown
+            number = number_text(x.value)
+            return f"({number})" if number.startswith("-") and outer >= 7 else number
         if x.op == "name":
             return spelled(x.value)
-        own, written = _written(x, text, dialect)
+        own_rank, written = _written(x, text, dialect)
         if uses[id(x)] > 1:
             local[id(x)] = f"x{len(local) + 1}"
             lines.append(f"{indent}{local[id(x)]} = {written}")
             return local[id(x)]
-        return f"({written})" if own < outer else written
+        return f"({written})" if own_rank < outer else written
 
     last = text(result)
     return [*lines, f"{indent}return {last}"]
@@ -394,10 +396,10 @@ def _written(x: Symbol, text: Callable[..., str], dialect: Dialect) -> tuple[int
     if x.op == "neg":
         return 7, f"-{text(x.args[0], 7)}"
     if x.op in _INFIX:
-        own, sign = _INFIX[x.op]
-        tighter = x.op in ("sub", "div") or own <= 3
-        left = text(x.args[0], own + 1 if x.op == "pow" or own <= 3 else own)
+        own_rank, sign = _INFIX[x.op]
+        tighter = x.op in ("sub", "div") or own_rank <= 3
+        left = text(x.args[0], own_rank + 1 if x.op == "pow" or own_rank <= 3 else own_rank)
         if x.op == "pow" and x.args[1].is_const and float(x.args[1].value).is_integer():
-            return own, f"{left} ** {int(x.args[1].value)}"
-        return own, f"{left} {sign} {text(x.args[1], own + 1 if tighter else own)}"
+            return own_rank, f"{left} ** {int(x.args[1].value)}"
+        return own_rank, f"{left} {sign} {text(x.args[1], own_rank + 1 if tighter else own_rank)}"
     return 9, dialect.call(x.op, [text(a) for a in x.args], [a.is_const for a in x.args])

@@ -78,8 +78,8 @@ def steady_state_map(module: ModuleType, params: Json, speed: np.ndarray, torque
         voltage = jax.lax.scan(again, start, None, STEPS)[0]
         return jax_actuator.settled_actuator(module, params, voltage, speeds)[1] | {"left": lacking(voltage)}
 
-    found = {name: np.asarray(x).reshape(len(speed), len(torque)) for name, x in solved(params).items()}
-    return Map(speed, torque, {name: found[name] for name in COLUMNS})
+    solution = {name: np.asarray(x).reshape(len(speed), len(torque)) for name, x in solved(params).items()}
+    return Map(speed, torque, {name: solution[name] for name in COLUMNS})
 
 
 class TableLaw(eqx.Module):
@@ -104,8 +104,10 @@ class TableLaw(eqx.Module):
         return self._read(self.current, speed, load), speed
 
     def _read(self, values: jax.Array, speed: Any, torque: Any) -> Any:
-        at = [jnp.interp(x, axis, jnp.arange(len(axis))) for x, axis in ((speed, self.speed), (torque, self.torque))]
-        return jax.scipy.ndimage.map_coordinates(values, at, order=1, mode="nearest")
+        places = [
+            jnp.interp(x, axis, jnp.arange(len(axis))) for x, axis in ((speed, self.speed), (torque, self.torque))
+        ]
+        return jax.scipy.ndimage.map_coordinates(values, places, order=1, mode="nearest")
 
 
 def map_of(situation: Situation, constants: Sequence[Constant], amplitudes: Mapping[str, float] | None = None) -> Map:
@@ -123,9 +125,9 @@ def law_of(situation: Situation, constants: Sequence[Constant]) -> Any:
     """Returns the function from a joint and amplitudes to the law of its tables."""
 
     def law(joint: Joint, amplitudes: Mapping[str, float]) -> TableLaw:
-        found = map_of(situation, constants, amplitudes)
-        voltage, current = (jnp.asarray(found.values[name]) for name in ("voltage", "current"))
-        return TableLaw(jnp.asarray(found.speed), jnp.asarray(found.torque), voltage, current)
+        table = map_of(situation, constants, amplitudes)
+        voltage, current = (jnp.asarray(table.values[name]) for name in ("voltage", "current"))
+        return TableLaw(jnp.asarray(table.speed), jnp.asarray(table.torque), voltage, current)
 
     return law
 
@@ -133,14 +135,14 @@ def law_of(situation: Situation, constants: Sequence[Constant]) -> Any:
 def fates_in_tables(situation: Situation, constants: Sequence[Constant]) -> list[Fate]:
     """Fates of the base's terms, and of effects outside the joint."""
     joint = situation.joint
-    found = [
+    fates = [
         f
         for f in jax_actuator.fates_in_actuator(joint)
         if f.name not in ("rotor inertia", "current limit of the driver")
     ]
     means = {c.name: c.value for c in constants}
     changed = []
-    for fate in found:
+    for fate in fates:
         if fate.name == "friction by the joint's surroundings":
             values = ", ".join(f"{n.removeprefix('surroundings.')} = {means[n]:.4g}" for n in joint.surroundings())
             changed.append(Fate(fate.name, APPROXIMATED, f"their mean over the runs: {values}"))

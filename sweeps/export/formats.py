@@ -113,11 +113,11 @@ def notes_of(runs: Situation) -> list[str]:
 def _mujoco(begun: Export, runs: Situation, at: str, draws: int, seed: int) -> Export:
     drive = begun.joint
     normal = float(np.mean(np.asarray(runs.signals.normal)))
-    found = comparison.compare_format(
+    compared = comparison.compare_format(
         runs, mujoco.law_of(normal), mujoco.fates_in_mujoco(drive, normal), mujoco.TERMS, mujoco.approximated_terms
     )
-    motor, name = mujoco.mjcf_motor(drive, found.refitted), f"{drive.name}_drive"
-    about = mujoco.attribute_notes(drive, begun.constants, found.translated, found.refitted)
+    motor, name = mujoco.mjcf_motor(drive, compared.refitted), f"{drive.name}_drive"
+    about = mujoco.attribute_notes(drive, begun.constants, compared.translated, compared.refitted)
     mass = float(np.mean(np.asarray(runs.signals.mass)))
     volts = float(drive.robot.motor.voltage_limit or np.max(np.abs(runs.command)))
     middle = (float(np.mean(runs.command)), float(np.mean(runs.load)))
@@ -125,14 +125,14 @@ def _mujoco(begun: Export, runs: Situation, at: str, draws: int, seed: int) -> E
         "drive.xml": mujoco.mjcf_fragment(drive, motor, about, notes_of(runs), name, at, volts),
         "scene.xml": mujoco.mjcf_scene(drive, mass, name, at, *middle),
     }
-    checks = _checked(texts, motor, runs, found)
+    checks = _checked(texts, motor, runs, compared)
     files: Mapping[str, str | bytes] = texts
     if begun.format == "randomization":
         values = randomization.draw_parameters(
-            drive, begun.posterior, begun.constants, found.refitted, normal, draws, seed
+            drive, begun.posterior, begun.constants, compared.refitted, normal, draws, seed
         )
         files = randomization.randomization_files(values)
-    return dataclasses.replace(begun, files=files, comparison=found, checks=checks)
+    return dataclasses.replace(begun, files=files, comparison=compared, checks=checks)
 
 
 def _checked(texts: Mapping[str, str], motor: mujoco.Motor, runs: Situation, found: Comparison) -> dict[str, float]:
@@ -168,16 +168,16 @@ def _actuator(begun: Export, runs: Situation, at: str, draws: int, seed: int) ->
         checks["ONNX against JAX, largest of 10,000 states [relative]"] = onnx.difference_from_jax(
             drive, constants, model
         )
-    found = comparison.compare_format(
+    compared = comparison.compare_format(
         runs, law, jax_actuator.fates_in_actuator(drive), held, mujoco.approximated_terms
     )
-    return dataclasses.replace(begun, files=files, comparison=found, checks=checks)
+    return dataclasses.replace(begun, files=files, comparison=compared, checks=checks)
 
 
 def _table(begun: Export, runs: Situation, at: str, draws: int, seed: int) -> Export:
     drive, constants = begun.joint, begun.constants
     law, held = feed_forward.law_of(runs, constants), feed_forward.effects_in_tables(drive)
     fates: list[Fate] = feed_forward.fates_in_tables(runs, constants)
-    found = comparison.compare_format(runs, law, fates, held, mujoco.approximated_terms)
+    compared = comparison.compare_format(runs, law, fates, held, mujoco.approximated_terms)
     files = feed_forward.table_files(drive, feed_forward.map_of(runs, constants), notes_of(runs))
-    return dataclasses.replace(begun, files=files, comparison=found)
+    return dataclasses.replace(begun, files=files, comparison=compared)

@@ -96,21 +96,21 @@ def law_of(situation: Situation, constants: Sequence[Constant]) -> Any:
 def fates_in_actuator(joint: Joint) -> list[Fate]:
     """Fates of the base's terms, and of effects outside the joint."""
     robot = joint.robot
-    found = [
+    fates = [
         Fate("motor, winding and gearbox", HELD, "functions of the law"),
         Fate("rotor inertia", HELD, "`armature(params)`, to be set as the joint's own armature"),
     ]
     if joint.surroundings():
         names = ", ".join(joint.surroundings())
-        found.append(Fate("friction by the joint's surroundings", HELD, f"parameters {names}, which you may change"))
+        fates.append(Fate("friction by the joint's surroundings", HELD, f"parameters {names}, which you may change"))
     if robot.has_ground:
         how = "the simulator's own contact with the ground"
-        found.append(Fate("ground: slip and rolling resistance", DROPPED, how))
+        fates.append(Fate("ground: slip and rolling resistance", DROPPED, how))
     if robot.loose:
-        found.append(Fate("backlash", DROPPED, "the joint is rigid; it needs a second body"))
+        fates.append(Fate("backlash", DROPPED, "the joint is rigid; it needs a second body"))
     if joint.limit is not None:
-        found.append(Fate("current limit of the driver", HELD, "a bound of the current"))
-    return [*found, *fates_outside_joint(joint)]
+        fates.append(Fate("current limit of the driver", HELD, "a bound of the current"))
+    return [*fates, *fates_outside_joint(joint)]
 
 
 def effects_in_actuator(joint: Joint) -> dict[str, str]:
@@ -136,8 +136,10 @@ def serialise_actuator(module: ModuleType) -> bytes:
         single, each = jax.ShapeDtypeStruct((), jnp.float32), jax.ShapeDtypeStruct((many,), jnp.float32)
         params = dict.fromkeys(module.PARAMS, single)
         state = dict.fromkeys(module.initial_state(), each)
-        made = export.export(jax.jit(module.actuator), platforms=PLATFORMS)(params, state, each, each, each, single)
-        return bytes(made.serialize(vjp_order=1))
+        exported = export.export(jax.jit(module.actuator), platforms=PLATFORMS)(
+            params, state, each, each, each, single
+        )
+        return bytes(exported.serialize(vjp_order=1))
 
 
 @contextlib.contextmanager

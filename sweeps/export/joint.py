@@ -130,12 +130,12 @@ class Joint:
 
     def parameters(self) -> dict[str, params.Parameter]:
         """Parameters that the law depends on, by dotted name."""
-        known = {p.name: p for p in params.walk_parameters(self.robot)}
+        by_name = {p.name: p for p in params.walk_parameters(self.robot)}
         used = [n for part in self.parts for n in names_of(*_symbols(part))]
         further = ["gearbox.ratio", "motor.inertia", "gearbox.efficiency_load"]
         further += ["driver.current_limit"] * (self.limit is not None)
         further += [f"{self.configuration}.inertia"] * self.accelerates
-        return {n: known[n] for n in dict.fromkeys((*further, *used)) if n in known}
+        return {n: by_name[n] for n in dict.fromkeys((*further, *used)) if n in by_name}
 
     def surroundings(self) -> Names:
         """Signals of the joint's surroundings that the law depends on, such as the normal load."""
@@ -184,8 +184,8 @@ def joint_of_robot(file: RobotFile, configuration: str | None = None) -> Joint:
     inside = tuple(e for e in acting if e.balance in INSIDE and not e.needs_battery and e.balance not in robot.lacks)
     outside = tuple(e for e in acting if e not in inside)
     one = dataclasses.replace(one, effects=inside)
-    found = Joint(file, name, one, inside, outside, idle, ())
-    return dataclasses.replace(found, parts=tuple(_parts(found)))
+    joint = Joint(file, name, one, inside, outside, idle, ())
+    return dataclasses.replace(joint, parts=tuple(_parts(joint)))
 
 
 def _acts(robot: Robot, effect: Effect) -> bool:
@@ -220,8 +220,8 @@ class _Tracer:
 
         def slope(*numbers: Any) -> Any:
             k = self.names.index(by)
-            at = lambda x: jnp.asarray(value(*numbers[:k], x, *numbers[k + 1 :]))  # noqa: E731
-            return jax.jvp(at, (numbers[k],), (jnp.ones_like(numbers[k]),))[1]
+            function = lambda x: jnp.asarray(value(*numbers[:k], x, *numbers[k + 1 :]))  # noqa: E731
+            return jax.jvp(function, (numbers[k],), (jnp.ones_like(numbers[k]),))[1]
 
         return trace_function(slope if by else value, self.names, what)
 
@@ -335,12 +335,12 @@ def memory_grows(part: Part) -> bool:
 
 def mean_surroundings(signals: Signals, names: Sequence[str]) -> dict[str, float]:
     """Mean of signals of the surroundings over runs [SI], by name, 0 if unknown."""
-    found: dict[str, float] = {}
+    means: dict[str, float] = {}
     for name in names:
         value = np.asarray(getattr(signals, name.removeprefix("surroundings.")), float)
         mean = float(np.nanmean(value)) if np.isfinite(value).any() else 0.0
-        found[name] = mean
-    return found
+        means[name] = mean
+    return means
 
 
 def channels_of(joint: Joint) -> tuple[Any, ...]:
@@ -349,5 +349,5 @@ def channels_of(joint: Joint) -> tuple[Any, ...]:
     A rig without any, such as a servo whose angle alone is read, is compared by current and speed of the motor.
     """
     settled = [c for c in EVERY if c.settled]
-    shown = tuple(c for c in settled if c.name in joint.file.robot.rig.channels)
-    return shown or tuple(c for c in settled if c.name in ("motor_current", "motor_speed"))
+    own_channels = tuple(c for c in settled if c.name in joint.file.robot.rig.channels)
+    return own_channels or tuple(c for c in settled if c.name in ("motor_current", "motor_speed"))

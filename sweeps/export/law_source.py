@@ -40,9 +40,9 @@ def posterior_of(joint: Joint) -> Posterior | None:
     path = source.with_name(posterior_file.FILE)
     if source.suffix != ".toml" or not path.is_file():
         return None
-    found = posterior_file.read_posterior(path)
-    found.check(joint.file.robot, str(path))
-    return found
+    posterior = posterior_file.read_posterior(path)
+    posterior.check(joint.file.robot, str(path))
+    return posterior
 
 
 def constants_of(joint: Joint, signals: Signals, posterior: Posterior | None) -> tuple[Constant, ...]:
@@ -52,27 +52,29 @@ def constants_of(joint: Joint, signals: Signals, posterior: Posterior | None) ->
         signals: of the runs.
     """
     ends = _intervals(posterior)
-    found = []
+    constants = []
     for name, parameter in joint.parameters().items():
         low, high, kind = _interval(joint, name, parameter, ends, posterior is not None)
         spec = parameter.spec
         source = f"fitted; prior: {spec.source}" if kind == OF_POSTERIOR else spec.source
         value = float(parameter.value)
-        found.append(Constant(name, value, spec.unit, spec.meaning, source, low, high, kind))
+        constants.append(Constant(name, value, spec.unit, spec.meaning, source, low, high, kind))
     for name, mean in mean_surroundings(signals, joint.surroundings()).items():
         word = name.removeprefix("surroundings.")
-        known = quantities.CONDITIONS.get(word)
+        condition = quantities.CONDITIONS.get(word)
         unit = {"normal": "N", "mass": "kg", "slope": "rad", "payload": "kg"}.get(word, "SI")
-        meaning = {"normal": "normal load of one side"}.get(word, known.label if known else word.replace("_", " "))
-        found.append(Constant(name, mean, unit, meaning, "mean over the compared runs"))
-    return tuple(found)
+        meaning = {"normal": "normal load of one side"}.get(
+            word, condition.label if condition else word.replace("_", " ")
+        )
+        constants.append(Constant(name, mean, unit, meaning, "mean over the compared runs"))
+    return tuple(constants)
 
 
 def _intervals(posterior: Posterior | None) -> dict[str, tuple[float, float]]:
     if posterior is None:
         return {}
-    drawn = np.quantile(posterior.draw(DRAWS, 0), ENDS, axis=0)
-    return {name: (float(a), float(b)) for name, a, b in zip(posterior.names, *drawn, strict=True)}
+    quantiles = np.quantile(posterior.draw(DRAWS, 0), ENDS, axis=0)
+    return {name: (float(a), float(b)) for name, a, b in zip(posterior.names, *quantiles, strict=True)}
 
 
 def _interval(
@@ -141,8 +143,8 @@ _TORCH = _Library(
 def function_arguments(symbol: Symbol) -> list[str]:
     """Arguments of the function of an expression, besides its parameters."""
     used = names_of(symbol)
-    found = [n for n in _ARGUMENTS if n in used]
-    return [*found, "memory"] if any(n.startswith("memory.") for n in used) else found
+    used_arguments = [n for n in _ARGUMENTS if n in used]
+    return [*used_arguments, "memory"] if any(n.startswith("memory.") for n in used) else used_arguments
 
 
 def quoted(word: str) -> str:
@@ -189,20 +191,20 @@ def _sum(parts: Sequence[Part], suffix: str = "", memory: Mapping[str, str] | No
 
 def functions_text(joint: Joint, dialect: Dialect) -> str:
     """Text of the functions of all parts, with their derivatives and rates."""
-    found = []
+    texts = []
     for part in joint.parts:
         unit = "" if part.unit == "-" else f" [{part.unit}]"
         meaning = part.meaning if part.meaning.endswith(".") else f"{part.meaning}." if part.meaning else ""
         document = f"{part.equation.rstrip('.')}{unit}. {meaning}".strip()
-        found.append(_function(part.name, part.value, document, dialect))
+        texts.append(_function(part.name, part.value, document, dialect))
         if part.by:
             what = f"Derivative of `{part.name}` by `{part.by}`."
-            found.append(_function(f"{part.name}_slope", part.slope, what, dialect))
+            texts.append(_function(f"{part.name}_slope", part.slope, what, dialect))
         if part.rate is not None:
-            found.append(_function(f"{part.name}_rate", part.rate, f"Rate of the memory of `{part.name}`.", dialect))
+            texts.append(_function(f"{part.name}_rate", part.rate, f"Rate of the memory of `{part.name}`.", dialect))
             what = f"Derivative of that rate by the memory of `{part.name}`."
-            found.append(_function(f"{part.name}_rate_slope", part.rate_slope, what, dialect))
-    return "\n\n\n".join(found)
+            texts.append(_function(f"{part.name}_rate_slope", part.rate_slope, what, dialect))
+    return "\n\n\n".join(texts)
 
 
 def step_lines(joint: Joint, library: _Library) -> list[str]:

@@ -87,11 +87,15 @@ class MujocoLaw(eqx.Module):
 
 def _numbers(joint: Joint, amplitudes: Mapping[str, float]) -> dict[str, dict[str, float]]:
     """Parameters of each effect inside, by its name, with some amplitudes replaced."""
-    found: dict[str, dict[str, float]] = {}
+    numbers: dict[str, dict[str, float]] = {}
     for effect in joint.inside:
-        own = {f.name: float(getattr(effect, f.name)) for f in dataclasses.fields(effect) if "spec" in f.metadata}
-        found[effect.name] = own | ({"amplitude": amplitudes[effect.name]} if effect.name in amplitudes else {})
-    return found
+        own_fields = {
+            f.name: float(getattr(effect, f.name)) for f in dataclasses.fields(effect) if "spec" in f.metadata
+        }
+        numbers[effect.name] = own_fields | (
+            {"amplitude": amplitudes[effect.name]} if effect.name in amplitudes else {}
+        )
+    return numbers
 
 
 def law_of(normal: float) -> Any:
@@ -112,8 +116,8 @@ def translate_law(joint: Joint, normal: float, amplitudes: Mapping[str, float] |
     robot, load = joint.robot, joint.load
     motor, gear = robot.motor, robot.gearbox
     ratio, share = float(gear.ratio), float(gear.efficiency_load)
-    known = _numbers(joint, amplitudes or {})
-    number = lambda name, key="amplitude": known.get(name, {}).get(key, 0.0)  # noqa: E731
+    numbers_by_effect = _numbers(joint, amplitudes or {})
+    number = lambda name, key="amplitude": numbers_by_effect.get(name, {}).get(key, 0.0)  # noqa: E731
     resistance = float(motor.resistance) + number("series_resistance") + float(robot.sides) * number("supply_sag")
     at_output = ratio * share
     dry = at_output * float(motor.friction_coulomb + gear.friction_coulomb)
@@ -126,10 +130,10 @@ def translate_law(joint: Joint, normal: float, amplitudes: Mapping[str, float] |
         damping += float(load.loss_viscous)
     names = [RESISTANCE, CONSTANT, FRICTION, DAMPING, SHARE]
     start = [resistance / share, float(motor.torque_constant), dry, damping, 1 / share]
-    if excess := stribeck_friction(joint, known):
+    if excess := stribeck_friction(joint, numbers_by_effect):
         names += [EXCESS, FADE]
         start += [max(excess[0], 0.0), excess[1]]
-    if "thermal_drift" in known:
+    if "thermal_drift" in numbers_by_effect:
         names.append(HEAT)
         start.append(max(number("thermal_drift") * number("thermal_drift", "resistance_thermal"), 0.0) / share)
     numbers = (start, ratio, float(motor.temperature_coefficient))
@@ -140,28 +144,31 @@ def stribeck_friction(joint: Joint, known: Mapping[str, Mapping[str, float]]) ->
     """Excess of friction at a crawl [N·m] and its fading speed [rad/s], at the joint, None without such effects."""
     gear = joint.robot.gearbox
     ratio, share = float(gear.ratio), float(gear.efficiency_load)
-    found = [
-        (own["amplitude"] * (ratio * share if at_motor else 1.0), own["speed_fade"] / (ratio if by_motor else 1.0))
-        for name, own in known.items()
+    bristles = [
+        (
+            fields["amplitude"] * (ratio * share if at_motor else 1.0),
+            fields["speed_fade"] / (ratio if by_motor else 1.0),
+        )
+        for name, fields in known.items()
         if name in STRIBECK
         for at_motor, by_motor in (STRIBECK[name],)
     ]
-    if not found:
+    if not bristles:
         return None
-    return sum(a for a, _ in found), max(v for _, v in found)
+    return sum(a for a, _ in bristles), max(v for _, v in bristles)
 
 
 def fates_in_mujoco(joint: Joint, normal: float) -> list[Fate]:
     """Fates of the base's terms, and of effects outside the joint."""
     robot, load = joint.robot, joint.load
     gear = robot.gearbox
-    found = [
+    fates = [
         Fate("winding and back-EMF", HELD, "resistance, motorconst, inductance"),
         Fate("friction of motor and gearbox", HELD, "frictionloss and damping of the joint"),
         Fate("rotor inertia", HELD, "armature of the joint, for a motor that drives"),
     ]
     if float(gear.efficiency_load) != 1:
-        found.append(
+        fates.append(
             Fate(
                 "gearbox losses in proportion to the load", APPROXIMATED,
                 "resistance / η and current = act / η: exact while the motor drives the load; where the load drives "
@@ -169,18 +176,18 @@ def fates_in_mujoco(joint: Joint, normal: float) -> list[Fate]:
             )
         )  # fmt: skip
     if robot.has_ground:
-        found.append(Fate("internal losses of tracks", HELD, "frictionloss and damping of the joint"))
+        fates.append(Fate("internal losses of tracks", HELD, "frictionloss and damping of the joint"))
         if float(load.track.guide_friction * load.track.guide_share) > 0:
             how = f"frictionloss at the mean normal load of these runs, {normal:.4g} N a side"
-            found.append(Fate("friction of track guides", APPROXIMATED, how))
-        found.append(
+            fates.append(Fate("friction of track guides", APPROXIMATED, how))
+        fates.append(
             Fate("ground: slip and rolling resistance", DROPPED, "the simulator's own contact with the ground")
         )
     if robot.loose:
-        found.append(Fate("backlash", DROPPED, "the joint is rigid; a format needs a second body for it"))
+        fates.append(Fate("backlash", DROPPED, "the joint is rigid; a format needs a second body for it"))
     if joint.limit is not None:
-        found.append(Fate("current limit of the driver", HELD, "forcerange"))
-    return [*found, *fates_outside_joint(joint)]
+        fates.append(Fate("current limit of the driver", HELD, "forcerange"))
+    return [*fates, *fates_outside_joint(joint)]
 
 
 def fates_outside_joint(joint: Joint) -> list[Fate]:
@@ -227,10 +234,10 @@ class Motor:
 
 def mjcf_motor(joint: Joint, values: Mapping[str, float]) -> Motor:
     """Numbers of the MJCF for refitted parameters."""
-    robot, known = joint.robot, _numbers(joint, {})
+    robot, numbers = joint.robot, _numbers(joint, {})
     gear, share = robot.gearbox, float(robot.gearbox.efficiency_load)
     ratio = float(gear.ratio)
-    number = lambda name, key="amplitude": known.get(name, {}).get(key, 0.0)  # noqa: E731
+    number = lambda name, key="amplitude": numbers.get(name, {}).get(key, 0.0)  # noqa: E731
     inductance = (float(robot.motor.inductance) + number("armature_inductance")) * values[SHARE]
     inertia = float(inertia_reduced(robot.motor.inertia, gear.ratio, gear.efficiency_load, 0.0))
     thermal: tuple[float, ...] = ()
@@ -386,20 +393,20 @@ def attribute_notes(
     joint: Joint, constants: Sequence[Constant], translated: Mapping[str, float], values: Mapping[str, float]
 ) -> dict[str, str]:
     """Words for where each attribute comes from, with intervals of what it is made of."""
-    known = {c.name: c for c in constants}
+    by_name = {c.name: c for c in constants}
 
     def made_of(*names: str) -> str:
-        found = [known[n] for n in names if n in known]
+        parts = [by_name[n] for n in names if n in by_name]
         return "; ".join(
-            f"{c.name} {c.value:.5g} {c.unit}".rstrip(" -") + (f", {c.interval}" if c.interval else "") for c in found
+            f"{c.name} {c.value:.5g} {c.unit}".rstrip(" -") + (f", {c.interval}" if c.interval else "") for c in parts
         )
 
     def fitted(key: str) -> str:
         return f" (translated {translated[key]:.5g}, refitted to the native model {values[key]:.5g})"
 
-    friction = [n for n in known if n.rpartition(".")[2] in ("friction_coulomb", "loss_coulomb", "guide_friction")]
-    viscous = [n for n in known if n.rpartition(".")[2] in ("friction_viscous", "loss_viscous")]
-    effects = lambda *names: [n for n in known if n.split(".")[1:2] and n.split(".")[1] in names]  # noqa: E731
+    friction = [n for n in by_name if n.rpartition(".")[2] in ("friction_coulomb", "loss_coulomb", "guide_friction")]
+    viscous = [n for n in by_name if n.rpartition(".")[2] in ("friction_viscous", "loss_viscous")]
+    effects = lambda *names: [n for n in by_name if n.split(".")[1:2] and n.split(".")[1] in names]  # noqa: E731
     return {
         "gear": f"ratio motor to joint [-]; {made_of('gearbox.ratio')}",
         "motorconst": f"[N·m/A] = [V·s/rad]; {made_of('motor.torque_constant')}{fitted(CONSTANT)}",

@@ -82,9 +82,9 @@ def difference_from_jax(joint: Joint, constants: Sequence[Constant], model: byte
     with _single():
         expected = [np.asarray(x) for x in jax.jit(step)(*given)]
     session = runtime.InferenceSession(model, providers=["CPUExecutionProvider"])
-    found = session.run(None, dict(zip(inputs, given, strict=True)))
+    outputs = session.run(None, dict(zip(inputs, given, strict=True)))
     sizes = [float(np.sqrt(np.mean(np.square(x)))) or 1.0 for x in expected]
-    return max(float(np.max(np.abs(a - b))) / s for a, b, s in zip(found, expected, sizes, strict=True))
+    return max(float(np.max(np.abs(a - b))) / s for a, b, s in zip(outputs, expected, sizes, strict=True))
 
 
 def random_states(joint: Joint, inputs: int) -> list[np.ndarray]:

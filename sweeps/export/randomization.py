@@ -44,13 +44,13 @@ def draw_parameters(
             "expected FOLDER/robot.toml of calibrate or loop"
         )
     values = posterior.draw(draws, seed)
-    own = {p.name for p in params.walk_parameters(joint.robot)}
-    columns = {name: values[:, k] for k, name in enumerate(posterior.names) if name in own}
+    own_names = {p.name for p in params.walk_parameters(joint.robot)}
+    columns = {name: values[:, k] for k, name in enumerate(posterior.names) if name in own_names}
     centre = mujoco.translate_law(joint, normal)
     factors = {
         n: refitted[n] / x if (x := float(v)) > 0 else 1.0 for n, v in zip(centre.names, centre.start, strict=True)
     }
-    found: dict[str, list[float]] = {}
+    drawn_values: dict[str, list[float]] = {}
     for k in range(draws):
         robot = params.replace(joint.robot, {name: np.asarray(x[k]) for name, x in columns.items()})
         other = joint.with_robot(robot)
@@ -63,10 +63,10 @@ def draw_parameters(
             "damping": theta[mujoco.DAMPING], "current_over_act": theta[mujoco.SHARE],
         }  # fmt: skip
         for name, value in numbers.items():
-            found.setdefault(f"mujoco/{name}", []).append(value)
+            drawn_values.setdefault(f"mujoco/{name}", []).append(value)
     law_names = {c.name for c in constants}
     actuator = {f"actuator/{n}": x for n, x in columns.items() if n in law_names}
-    return {name: np.asarray(x) for name, x in found.items()} | actuator
+    return {name: np.asarray(x) for name, x in drawn_values.items()} | actuator
 
 
 def randomization_files(found: Columns) -> dict[str, str | bytes]:

@@ -111,8 +111,8 @@ class Situation:
             speed_theoretical=speed * radius,
             speed=speed * radius,
         )
-        shown = jax.vmap(lambda s: balances.sensor(robot, s))(signals)
-        return np.stack([np.asarray(shown[c.name]) for c in channels_of(self.joint)], -1)
+        sensor_readings = jax.vmap(lambda s: balances.sensor(robot, s))(signals)
+        return np.stack([np.asarray(sensor_readings[c.name]) for c in channels_of(self.joint)], -1)
 
 
 def _absent(joint: Joint, names: Names = ()) -> Robot:
@@ -153,8 +153,8 @@ def situation_of_joint(joint: Joint, data: Runs | str | None) -> Situation:
     moves, whole = _solved(robot, conditions)
     turns, signals = _solved(_absent(joint), conditions) if joint.outside else (moves, whole)
     channels = channels_of(joint)
-    shown = jax.vmap(lambda s: balances.sensor(robot, s))(whole)
-    native = np.stack([np.asarray(shown[c.name]) for c in channels], -1)
+    sensor_readings = jax.vmap(lambda s: balances.sensor(robot, s))(whole)
+    native = np.stack([np.asarray(sensor_readings[c.name]) for c in channels], -1)
     kept = moves & turns & np.asarray(np.abs(signals.speed_motor) > 0) & (np.asarray(conditions.open) < 0.5)
     if not kept.any():
         raise BadData(f"{source}: the model settles in none of its runs, so there is nothing to compare with")
@@ -195,14 +195,14 @@ def stall_torque(joint: Joint, voltage: np.ndarray) -> np.ndarray:
     """Load at which a shaft's motor stalls [N·m], without effects, within the limits of driver and gearbox."""
     motor, gear, load = joint.robot.motor, joint.robot.gearbox, joint.load
     current = np.minimum(voltage / float(motor.resistance), float(joint.robot.driver.current_limit))
-    made = float(motor.torque_constant) * current - float(motor.friction_coulomb + gear.friction_coulomb)
-    given = float(gear.ratio * gear.efficiency_load) * made - float(load.loss_coulomb)
+    torque = float(motor.torque_constant) * current - float(motor.friction_coulomb + gear.friction_coulomb)
+    given = float(gear.ratio * gear.efficiency_load) * torque - float(load.loss_coulomb)
     return np.clip(given, 0.0, np.inf if gear.torque_limit is None else gear.torque_limit)
 
 
 def _measured(runs: Runs, channels: tuple[Any, ...]) -> np.ndarray:
-    known = {c.name: runs.measured()[:, k] for k, c in enumerate(runs.channels)}
-    return np.stack([known.get(c.name, np.full(len(runs), np.nan)) for c in channels], -1)
+    by_name = {c.name: runs.measured()[:, k] for k, c in enumerate(runs.channels)}
+    return np.stack([by_name.get(c.name, np.full(len(runs), np.nan)) for c in channels], -1)
 
 
 def _table(data: Runs | str, joint: Joint) -> Runs:

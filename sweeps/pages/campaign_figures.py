@@ -77,9 +77,9 @@ def draw_output_spread(output: np.ndarray, label: str, varied: Mapping[str, Vari
         quantiles = np.array([np.quantile(output[which == k], (0.05, 0.5, 0.95)) for k in range(len(middles))])
         axes.fill_between(middles, quantiles[:, 0], quantiles[:, 2], color=BLUE, alpha=0.2, linewidth=0)
         axes.plot(middles, quantiles[:, 1], color=BLUE)
-        found = variance_share(values, output)
-        if found > by_chance(values):
-            corner_note(axes, f"{100 * found:.0f} % of the variance")
+        shares = variance_share(values, output)
+        if shares > by_chance(values):
+            corner_note(axes, f"{100 * shares:.0f} % of the variance")
         axes.set(xlabel=varied[name].label, ylabel=label, title=f"over {short_name(name)}")
         _ticks(axes.xaxis, varied[name])
     if len(names) == 2:
@@ -178,8 +178,8 @@ def _map(
     numbers, first = np.unique(cell[order], return_index=True)
     for number, values in zip(numbers, np.split(output[order], first[1:]), strict=True):
         cells.flat[number] = np.median(values)
-    drawn = axes.pcolormesh(across, along, cells, shading="nearest", cmap="viridis", rasterized=True)
-    colour_bar(fig, drawn, axes, label=f"median {label}")
+    mesh = axes.pcolormesh(across, along, cells, shading="nearest", cmap="viridis", rasterized=True)
+    colour_bar(fig, mesh, axes, label=f"median {label}")
     axes.set(xlabel=one.label, ylabel=other.label, title="over both")
     _ticks(axes.xaxis, one)
     _ticks(axes.yaxis, other)

@@ -49,16 +49,16 @@ def _outlines(found: Drawable, q: np.ndarray) -> list[tuple[np.ndarray, np.ndarr
     belts = [(shape.main, body._replace(origin=rear.origin), q[SHAFT])]
     if np.asarray(chassis.on_tracks) > 0.5:
         belts += [(shape.lever, lever, q[SHAFT] + q[lever.turns]) for lever in (front, rear)]
-    drawn = []
+    outlines = []
     for belt, frame, turned in belts:
         path = frame.world(belt.point(jnp.linspace(0.0, belt.length, 120)[:-1]))
         tips = frame.world(belt_loop.grouser_tips(belt, belt.places(belt.first * turned)).at)
-        drawn.append((np.asarray(path), np.asarray(tips)))
+        outlines.append((np.asarray(path), np.asarray(tips)))
     if np.asarray(chassis.on_tracks) < 0.5:
         round_ = np.linspace(0, 2 * np.pi, 60)
         circle = float(chassis.radius) * np.stack([np.cos(round_), np.sin(round_)], 1)
-        drawn += [(np.asarray(lever.origin) + circle, np.zeros((0, 2))) for lever in (front, rear)]
-    return drawn
+        outlines += [(np.asarray(lever.origin) + circle, np.zeros((0, 2))) for lever in (front, rear)]
+    return outlines
 
 
 def _ground(axes: Any, found: Drawable, begin: float, end: float) -> None:
@@ -106,16 +106,16 @@ def decisive_instants(found: Drawable) -> list[tuple[str, int]]:
 
 def draw_silhouettes(found: ClimbResult) -> Figure:
     """The robot at the decisive instants."""
-    shown = decisive_instants(found)
+    instants = decisive_instants(found)
     q = footing_coordinates(found.table)
-    fig, axes = new_figure(-(-len(shown) // 3), 3, 2.7 * -(-len(shown) // 3))
-    for n, (ax, (name, k)) in enumerate(zip(axes.ravel(), shown, strict=False), 1):
+    fig, axes = new_figure(-(-len(instants) // 3), 3, 2.7 * -(-len(instants) // 3))
+    for n, (ax, (name, k)) in enumerate(zip(axes.ravel(), instants, strict=False), 1):
         _ground(ax, found, q[k, 0] - 0.5, q[k, 0] + 0.5)
         _draw(ax, found, q[k])
         ax.set(xlim=(q[k, 0] - 0.48, q[k, 0] + 0.48), ylim=(q[k, 1] - 0.38, q[k, 1] + 0.38), aspect="equal")
         ax.set_title(f"{n}: {found.table['time_s'][k]:.2f} s, {name}", fontsize=9)
         ax.axis("off")
-    for ax in axes.ravel()[len(shown) :]:
+    for ax in axes.ravel()[len(instants) :]:
         ax.axis("off")
     return fig
 
@@ -135,19 +135,20 @@ def draw_climb_course(found: ClimbResult) -> Figure:
         ("energy [J]", {"from the supply": ("supply_J", INK), "sliding": ("sliding_J", VERMILION),
                         "windings": ("winding_J", ORANGE), "stored": ("stored_J", GREEN)}),
     ]  # fmt: skip
-    at = [t["time_s"][k] for _, k in decisive_instants(found)]
+    times = [t["time_s"][k] for _, k in decisive_instants(found)]
     for ax, (label, lines) in zip(axes.ravel(), rows, strict=True):
         for name, (column, colour) in lines.items():
             ax.plot(t["time_s"], t[column], color=colour, lw=1.3, label=name)
         ax.set_ylabel(label)
-        for x in at:
+        for x in times:
             ax.axvline(x, color=FAINT, lw=0.8)
         ax.legend(loc="upper left", bbox_to_anchor=(1.01, 1.0))
     above = axes[0, 0].secondary_xaxis("top")
-    ends = [0, *(np.flatnonzero(np.diff(at) > NEAR[is_narrow()] * t["time_s"][-1]) + 1), len(at)]
+    ends = [0, *(np.flatnonzero(np.diff(times) > NEAR[is_narrow()] * t["time_s"][-1]) + 1), len(times)]
     numbers = [(a + 1, b) for a, b in itertools.pairwise(ends)]
     above.set_xticks(
-        [(at[a - 1] + at[b - 1]) / 2 for a, b in numbers], [f"{a}" if a == b else f"{a}-{b}" for a, b in numbers]
+        [(times[a - 1] + times[b - 1]) / 2 for a, b in numbers],
+        [f"{a}" if a == b else f"{a}-{b}" for a, b in numbers],
     )
     above.tick_params(length=0)
     axes[-1, 0].set_xlabel("time [s]")
@@ -161,8 +162,10 @@ def draw_size_search(found: ClimbResult) -> Figure:
     fig, axes = new_figure(1, 1, 1.0 + 0.4 * len(kinds))
     ax = axes[0, 0]
     for k, kind in enumerate(kinds):
-        at = sizes[[v == kind for v in verdicts]]
-        ax.plot(at, np.full(len(at), k), "o", color=GREEN if kind == "over" else VERMILION, ms=5)
+        sizes_of_kind = sizes[[v == kind for v in verdicts]]
+        ax.plot(
+            sizes_of_kind, np.full(len(sizes_of_kind), k), "o", color=GREEN if kind == "over" else VERMILION, ms=5
+        )
     ax.set_yticks(range(len(kinds)), kinds)
     ax.set_ylim(-0.6, len(kinds) - 0.4)
     ax.set_xlabel(f"{found.sought} [mm]")

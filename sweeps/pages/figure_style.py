@@ -345,12 +345,12 @@ def _has_names(axis: Axis) -> bool:
 def _run(axis: Axis) -> Json:
     """The ends of an axis, whether it is logarithmic, and its names where its ticks have any."""
     ends = [float(f"{end:.6g}") for end in axis.get_view_interval()]
-    known: Json = {"ends": ends, "log": axis.get_scale() == "log"}
+    axis_facts: Json = {"ends": ends, "log": axis.get_scale() == "log"}
     if _has_names(axis):
         names = [(float(t.get_loc()), t.label1.get_text() or t.label2.get_text()) for t in axis.get_major_ticks()]
         if names and all(name for _, name in names):
-            known["names"] = names
-    return known
+            axis_facts["names"] = names
+    return axis_facts
 
 
 def label_end(axes: Axes, x: np.ndarray, y: np.ndarray, words: str, colour: str, **keywords: Any) -> None:

@@ -104,15 +104,15 @@ def members_with_gear(
 def ripple_numbers(gear: Gear) -> Json:
     """What ripples in a run, by how much and how often."""
     tail, signals = gear.tail(TAIL), gear.signals
-    drawn, travel, reaction = (
+    line, travel, reaction = (
         ripple_peaks.ripple(gear.time[tail], x[tail]) for x in (signals.total_current, signals.speed, signals.normal)
     )
     return {
         "configuration": gear.name,
         "pitch": "grousers, S_g = 35 mm" if gear.on_tracks else "teeth, S_t = 5 mm",
-        "period_ms": 1e3 * drawn.period,
+        "period_ms": 1e3 * line.period,
         "equation_ms": 1e3 * gear.period,
-        "current_percent": 100 * drawn.amplitude,
+        "current_percent": 100 * line.amplitude,
         "speed_percent": 100 * travel.amplitude,
         "reaction_percent": 100 * reaction.amplitude,
         "guide_percent": 100 * gear.guide_share if gear.on_tracks else None,

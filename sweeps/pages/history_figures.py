@@ -50,9 +50,9 @@ def over_log(found: Settled) -> Figure:
     clock, begin = np.zeros(len(runs)), 0.0
     run = runs.run_names
     for name in dict.fromkeys(run.tolist()):  # recordings one after the other
-        mine = np.flatnonzero(run == name)
-        clock[mine] = begin + runs["time_s"][mine] - runs["time_s"][mine[0]]
-        begin = float(clock[mine[-1]])
+        run_rows = np.flatnonzero(run == name)
+        clock[run_rows] = begin + runs["time_s"][run_rows] - runs["time_s"][run_rows[0]]
+        begin = float(clock[run_rows[-1]])
     order = every[np.argsort(clock[every], kind="stable")]
     lines = [("{}\n[{}]".format(*IMPOSED[runs.layout.imposed]), applied_drive(runs))]
     lines += [
@@ -237,8 +237,8 @@ def _current(axes: Axes, start: Start, colour: str) -> None:
     during = (start.time > start.starting) & (start.time < start.slipping)
     middle = float(np.median(start.current[during])) if during.any() else 0.0
     if start.slipping - start.starting > 1.5 * _share(axes, f"{middle:.2f} A") * last and start.gets_under_way:
-        at = (start.starting + start.slipping) / 2
-        axes.annotate(f"{middle:.2f} A", (at, middle), xytext=(0, 5), textcoords="offset points", ha="center")
+        label_time = (start.starting + start.slipping) / 2
+        axes.annotate(f"{middle:.2f} A", (label_time, middle), xytext=(0, 5), textcoords="offset points", ha="center")
     crest = start.current[last_samples(start.time)].max()
     axes.annotate(
         f"{start.ended[0]:.2f} A", (0.98 * last, crest), xytext=(0, 5), ha="right", textcoords="offset points"
@@ -260,9 +260,9 @@ def _speeds(axes: Axes, start: Start, colour: str) -> None:
     # Right of the line at t', where that is beside the curve, else of the curve.
     half = int(np.argmax(start.speed >= 0.5 * start.speed[-1]))
     beside = 0 < start.settled < 0.5 * last and start.gets_under_way
-    at = (start.settled if beside else start.time[half], start.speed[half])
+    label_place = (start.settled if beside else start.time[half], start.speed[half])
     place = (6, 6) if beside else (6, -12)
-    axes.annotate("$V_x$ (robot)", at, xytext=place, textcoords="offset points", color=colour, fontsize=8.5)
+    axes.annotate("$V_x$ (robot)", label_place, xytext=place, textcoords="offset points", color=colour, fontsize=8.5)
     if start.status not in words.SETTLED:
         corner_note(axes, f"ends: {words.short_status(start.status)}", y=0.15, color=VERMILION)
 
@@ -292,9 +292,9 @@ def slip_over_start(shown: list[Start]) -> Figure:
         for words_of, curve, colour_of, place in (
             (r"2  $V_{x\,teor}$", start.theoretical, INK, (0, 5)), ("1  $V_x$", start.speed, colour, (0, -14)),
         ):  # fmt: skip
-            at = 0.78 * upto
+            t = 0.78 * upto
             speeds.annotate(
-                words_of, (at, float(np.interp(at, start.time, curve))), xytext=place, textcoords="offset points",
+                words_of, (t, float(np.interp(t, start.time, curve))), xytext=place, textcoords="offset points",
                 color=colour_of, fontsize=9, ha="center",
             )  # fmt: skip
         _stages(speeds, start)
@@ -394,13 +394,13 @@ def members_as_read(read: Iterable[Channel], history: Any, status: np.ndarray, n
     """
     from mmrjax.model.signals import STATUSES
 
-    answer, shown = [], tuple(c for c in read if c.over_time)
+    answer, shown_channels = [], tuple(c for c in read if c.over_time)
     for k, name in enumerate(names):
-        readings = {c.name: np.asarray(history.reading[c.name][k]) / c.factor for c in shown}
+        readings = {c.name: np.asarray(history.reading[c.name][k]) / c.factor for c in shown_channels}
         finite = np.flatnonzero(np.isfinite(np.stack(list(readings.values()))).all(0))
         upto = slice(0, int(finite[-1]) + 1 if finite.size else 0)
-        known = {channel: values[upto] for channel, values in readings.items()}
-        answer.append(Course(name, STATUSES[int(status[k])], np.asarray(history.time[k])[upto], known))
+        member_readings = {channel: values[upto] for channel, values in readings.items()}
+        answer.append(Course(name, STATUSES[int(status[k])], np.asarray(history.time[k])[upto], member_readings))
     return answer
 
 

@@ -65,15 +65,16 @@ ABREAST = 110
 
 def before_after(table: Columns, channels: Sequence[Channel], verdict: str) -> Figure:
     """Residual of every reading in sigmas, before and after. Runs grouped by configuration and voltage."""
-    own = imposed_column(table)
+    own_column = imposed_column(table)
     beside = [c for c in ("payload_kg", "slope_deg", "load_torque_Nm") if c in table]
-    order = np.lexsort((*(table[c] for c in beside), table[own], table["configuration"]))
+    order = np.lexsort((*(table[c] for c in beside), table[own_column], table["configuration"]))
     fig, grid = new_figure(len(channels), 1, 1.8 * len(channels), sharex=True)
-    levels = np.unique(table[own]).size
-    few = levels <= 8 or own == "supply_voltage_V"  # else a group by configuration alone
+    levels = np.unique(table[own_column]).size
+    few = levels <= 8 or own_column == "supply_voltage_V"  # else a group by configuration alone
     named = not few or np.unique(table["configuration"]).size > 1
     groups = [
-        ", ".join([str(table["configuration"][k])] * named + [f"{table[own][k]:g} {UNITS[own]}"] * few) for k in order
+        ", ".join([str(table["configuration"][k])] * named + [f"{table[own_column][k]:g} {UNITS[own_column]}"] * few)
+        for k in order
     ]
     edges = [i for i in range(1, len(groups)) if groups[i] != groups[i - 1]]
     x = np.arange(len(order))
@@ -92,13 +93,13 @@ def before_after(table: Columns, channels: Sequence[Channel], verdict: str) -> F
         axes.set_ylabel(f"{channel.label} [σ]")
     outer_legend(grid[0, 0], "upper left")
     starts = [0, *edges]
-    told = [groups[a] for a in starts]
-    grid[-1, 0].set_xticks([(a + b - 1) / 2 for a, b in zip(starts, [*edges, len(order)], strict=True)], told,
-                           rotation=90 if sum(len(word) + 2 for word in told) > ABREAST else 0)  # fmt: skip
+    group_labels = [groups[a] for a in starts]
+    grid[-1, 0].set_xticks([(a + b - 1) / 2 for a, b in zip(starts, [*edges, len(order)], strict=True)], group_labels,
+                           rotation=90 if sum(len(word) + 2 for word in group_labels) > ABREAST else 0)  # fmt: skip
     grid[-1, 0].grid(axis="x", visible=False)
-    varied = own == "supply_voltage_V" or any(np.unique(table[c]).size > 1 for c in beside)
+    varied = own_column == "supply_voltage_V" or any(np.unique(table[c]).size > 1 for c in beside)
     words = [CONDITION_WORDS[c][0] for c in reversed(beside)] if varied else []
-    within = f"by {', then '.join(words) or IMPOSED_WORDS[own].partition(' [')[0]}"
+    within = f"by {', then '.join(words) or IMPOSED_WORDS[own_column].partition(' [')[0]}"
     grid[-1, 0].set_xlabel(f"runs, in each group {within}; band: ±2σ of the instruments")
     return fig
 
@@ -121,24 +122,24 @@ def over_time(runs: Runs, table: Columns, channels: Sequence[Channel], verdict: 
     whens = [("before", ORANGE)] if verdict != "none" else []
     whens += [("after", BLUE)]
     for column, name in enumerate(names):
-        mine = runs.in_order(name)
+        run_rows = runs.in_order(name)
         for axes, channel in zip(grid[:, column], channels, strict=True):
             axes.axhspan(-2, 2, color="#eeeeee", lw=0, zorder=0)
             axes.axhline(0, color=FAINT, lw=0.8)
             for when, colour in whens:
-                y = table[f"residual_{when}_{channel.name}_sigma"][mine]
-                axes.plot(table["time_s"][mine], y, ".", ms=3, color=colour, alpha=0.35)
+                y = table[f"residual_{when}_{channel.name}_sigma"][run_rows]
+                axes.plot(table["time_s"][run_rows], y, ".", ms=3, color=colour, alpha=0.35)
                 if len(y) >= AVERAGED:
                     smooth = np.convolve(y, np.ones(AVERAGED) / AVERAGED, "valid")
                     edge = AVERAGED // 2
-                    axes.plot(table["time_s"][mine][edge : edge + len(smooth)], smooth, color=colour, lw=1.3)
+                    axes.plot(table["time_s"][run_rows][edge : edge + len(smooth)], smooth, color=colour, lw=1.3)
             if column == 0:
                 axes.set_ylabel(f"{channel.label} [σ]")
-        first = mine[0]
+        first = run_rows[0]
         grid[0, column].set_title(
-            f"{name}\n{table['configuration'][first]} {_range(table[imposed_column(table)][mine])} "
+            f"{name}\n{table['configuration'][first]} {_range(table[imposed_column(table)][run_rows])} "
             f"{UNITS[imposed_column(table)]}"
-            + (f" {_range(table['slope_deg'][mine])}°" if "slope_deg" in table else ""), fontsize=8,
+            + (f" {_range(table['slope_deg'][run_rows])}°" if "slope_deg" in table else ""), fontsize=8,
         )  # fmt: skip
         grid[-1, column].set_xlabel("time [s]")
     words = "blue: the fitted model" if verdict == "none" else "orange: before, blue: after"
@@ -247,10 +248,10 @@ NEAR = 1 / 12
 
 def imposed_axis(table: Columns) -> tuple[np.ndarray, str]:
     """Imposed quantity of runs and its label. For a supply with a driver, the voltage after the duty."""
-    own = imposed_column(table)
-    if own == "supply_voltage_V" and "duty" in table and np.isfinite(table["duty"]).all():
-        return table[own] * table["duty"], "voltage given to the motors [V]"
-    return table[own], IMPOSED_WORDS[own]
+    own_column = imposed_column(table)
+    if own_column == "supply_voltage_V" and "duty" in table and np.isfinite(table["duty"]).all():
+        return table[own_column] * table["duty"], "voltage given to the motors [V]"
+    return table[own_column], IMPOSED_WORDS[own_column]
 
 
 def roughness(x: np.ndarray, y: np.ndarray) -> float:
@@ -266,18 +267,18 @@ def conditions_and_readings(table: Columns) -> Columns:
 
     A variable of each side also appears as mean and difference.
     """
-    known = {c.column: (c.label, c.unit) for c in EVERY} | CONDITION_WORDS
+    labels = {c.column: (c.label, c.unit) for c in EVERY} | CONDITION_WORDS
     if "duty_left" in table and "supply_voltage_V" in table:
         sides = {f"voltage_{s}_V": table["supply_voltage_V"] * table[f"duty_{s}"] for s in SIDES}
-        table, known = table | sides, known | {f"voltage_{s}_V": (f"voltage, {s}", "V") for s in SIDES}
-    found = {f"{label} [{unit}]": table[c] for c, (label, unit) in known.items() if c in table}
+        table, labels = table | sides, labels | {f"voltage_{s}_V": (f"voltage, {s}", "V") for s in SIDES}
+    columns = {f"{label} [{unit}]": table[c] for c, (label, unit) in labels.items() if c in table}
     values, words = imposed_axis(table)
-    found |= {words: values}
-    for label, left in list(found.items()):
-        if (right := found.get(label.replace(", left", ", right"))) is not None and ", left" in label:
+    columns |= {words: values}
+    for label, left in list(columns.items()):
+        if (right := columns.get(label.replace(", left", ", right"))) is not None and ", left" in label:
             both = label.replace(", left", "")
-            found |= {f"mean of both sides: {both}": (left + right) / 2, f"left less right: {both}": left - right}
-    return found
+            columns |= {f"mean of both sides: {both}": (left + right) / 2, f"left less right: {both}": left - right}
+    return columns
 
 
 def depends_on(table: Columns, change: np.ndarray) -> tuple[np.ndarray, str]:
@@ -320,8 +321,10 @@ def defects_of(table: Columns, when: str, balance: str) -> Columns:
 
 def closed_equations(table: Columns) -> list[str]:
     """Equations that the readings close: those with a defect somewhere, at least one."""
-    found = [b for b in DEFECT_WORDS if any(np.nan_to_num(x).any() for x in defects_of(table, "before", b).values())]
-    return found or ["track"]
+    balances = [
+        b for b in DEFECT_WORDS if any(np.nan_to_num(x).any() for x in defects_of(table, "before", b).values())
+    ]
+    return balances or ["track"]
 
 
 def _over(table: Columns, column: str, label: str, side: str = "") -> tuple[np.ndarray, str]:
@@ -329,12 +332,12 @@ def _over(table: Columns, column: str, label: str, side: str = "") -> tuple[np.n
 
     The imposed quantity replaces a variable that the table lacks or that does not vary.
     """
-    own = imposed_column(table)
+    own_column = imposed_column(table)
     if side:
         column = f"motor_current_{side}_A" if column == "current_A" else f"motor_speed_{side}_rpm"
         label = f"motor {'current' if 'current' in column else 'speed'} of that side [{column.rpartition('_')[2]}]"
     column = "total_" + column if column == "current_A" else column
-    if column not in table or (column not in ("total_current_A", own) and np.unique(table[column]).size == 1):
+    if column not in table or (column not in ("total_current_A", own_column) and np.unique(table[column]).size == 1):
         return imposed_axis(table)
     return table[column], label
 
@@ -346,10 +349,10 @@ def draw_defects(table: Columns, verdict: str, crosses_zero: bool = False) -> Fi
         crosses_zero: whether readings may (`Layout.crosses_zero`): drawn are the equations that they close.
     """
     whens = ("before",) if verdict in ("none", *WITHOUT_NAME) else ("before", "after")
-    drawn = {b: DEFECT_WORDS[b] for b in (closed_equations(table) if crosses_zero else DEFECT_WORDS)}
-    fig, grid = new_figure(len(whens), len(drawn), 2.6 * len(whens) + 0.5, sharex="col", sharey="col")
+    panels = {b: DEFECT_WORDS[b] for b in (closed_equations(table) if crosses_zero else DEFECT_WORDS)}
+    fig, grid = new_figure(len(whens), len(panels), 2.6 * len(whens) + 0.5, sharex="col", sharey="col")
     for row, when in enumerate(whens):
-        for axes, (balance, (words, unit, column, of_what)) in zip(grid[row], drawn.items(), strict=True):
+        for axes, (balance, (words, unit, column, of_what)) in zip(grid[row], panels.items(), strict=True):
             balance_words = RIG_WORDS.get(balance, words) if crosses_zero else words
             by_side = defects_of(table, when, balance)
             names = [(name, side) for name in dict.fromkeys(table["configuration"]) for side in by_side]
@@ -357,10 +360,12 @@ def draw_defects(table: Columns, verdict: str, crosses_zero: bool = False) -> Fi
             for (name, side), (colour, marker) in zip(
                 names, configuration_looks(map(", ".join, names)).values(), strict=True
             ):
-                mine = table["configuration"] == name
+                of_configuration = table["configuration"] == name
                 x, label = _over(table, column, of_what, side)
-                y = by_side[side][mine] * (1e3 if balance == "slip" else 1.0)
-                axes.plot(x[mine], y, marker, ms=4.5, color=colour, label=f"{name}, {side}".removesuffix(", "))
+                y = by_side[side][of_configuration] * (1e3 if balance == "slip" else 1.0)
+                axes.plot(
+                    x[of_configuration], y, marker, ms=4.5, color=colour, label=f"{name}, {side}".removesuffix(", ")
+                )
             axes.set_title(f"{'torque' if crosses_zero and balance == 'track' else balance}, {when}")
             axes.set_ylabel(f"{balance_words} [{unit}]")
             if row == len(whens) - 1:
@@ -376,7 +381,7 @@ def look_alikes(found: DiscoveryResult) -> Figure:
     cosine = found.cosine[: len(names), : len(names)]
     fig, grid = new_figure(1, 1, 5.6)
     axes = grid[0, 0]
-    shown = axes.imshow(cosine, cmap="Blues", vmin=0, vmax=1)
+    image = axes.imshow(cosine, cmap="Blues", vmin=0, vmax=1)
     for i in range(len(names)):
         for j in range(len(names)):
             if i != j and cosine[i, j] > 0.5:
@@ -385,7 +390,7 @@ def look_alikes(found: DiscoveryResult) -> Figure:
     axes.set_xticks(range(len(names)), names, rotation=60, ha="right")
     axes.set_yticks(range(len(names)), names)
     axes.grid(visible=False)
-    colour_bar(fig, shown, axes, label="|cos| of the signatures", shrink=0.8)
+    colour_bar(fig, image, axes, label="|cos| of the signatures", shrink=0.8)
     return fig
 
 

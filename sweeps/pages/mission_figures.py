@@ -50,21 +50,23 @@ def draw_mission_course(rows: Columns, cycle: float | None, limit: float, linear
     for column, (span, title) in enumerate(zip(spans, titles, strict=False)):
         axes = grid[:, column]
         _, size, unit = next(t for t in _TIMES if span >= t[0])
-        shown = {key: value[rows["time_s"] <= span] for key, value in rows.items()}
-        time = shown["time_s"] / size
+        shown_rows = {key: value[rows["time_s"] <= span] for key, value in rows.items()}
+        time = shown_rows["time_s"] / size
         first = column == 0
         axes[0].set_title(f"{title}: speed" + (" and slope" if np.any(rows.get("slope_deg", 0.0)) else ""))
-        _speed(axes[0], time, shown, linear, legend=first)
+        _speed(axes[0], time, shown_rows, linear, legend=first)
         sizes = ", sizes of both sides" if "duty_left" in rows else ""
         axes[1].set_title(f"current of all motors, and duty{sizes}" if first else "current, and duty")
-        _current(axes[1], time, shown, sides, legend=first)
+        _current(axes[1], time, shown_rows, sides, legend=first)
         unlimited = limit >= UNLIMITED or "housing_temperature_C" not in rows
         beyond = (
-            "" if unlimited or _near(shown, limit) else f", the winding's limit of {limit:.0f} °C beyond the scale"
+            ""
+            if unlimited or _near(shown_rows, limit)
+            else f", the winding's limit of {limit:.0f} °C beyond the scale"
         )
         axes[2].set_title("temperatures" + (beyond if first else ""))
-        _temperatures(axes[2], time, shown, limit, legend=first)
-        _source(axes[3], time, shown)
+        _temperatures(axes[2], time, shown_rows, limit, legend=first)
+        _source(axes[3], time, shown_rows)
         axes[3].set(xlabel=f"time [{unit}]", xlim=(0, span / size))
     return fig
 
@@ -204,21 +206,21 @@ def draw_mission_energy(run: Json, on_battery: bool, on_ground: bool = True) -> 
     Args:
         run: its row of runs.csv.
     """
-    drawn = float(run["energy_drawn_Wh"])
+    energy = float(run["energy_drawn_Wh"])
     source = "drawn from the battery's charge" if on_battery else "drawn from the supply"
-    bars: list[tuple[str, float, str]] = [(source, drawn, INK)]
+    bars: list[tuple[str, float, str]] = [(source, energy, INK)]
     for name in SINKS:
         bars.append((words.sink_labels(on_ground)[name], float(run[f"energy_to_{name}_Wh"]), _COLOURS[name]))
     bars.append(("left in motion at the end", float(run["energy_stored_Wh"]), FAINT))
     bars.append(("returned to the source", float(run["energy_returned_Wh"]), GREEN))
-    bars = [bar for bar in bars if abs(bar[1]) > 1e-5 * max(drawn, 1e-12)]
+    bars = [bar for bar in bars if abs(bar[1]) > 1e-5 * max(energy, 1e-12)]
     fig, grid = new_figure(1, 1, 0.9 + 0.34 * len(bars))
     axes = grid[0, 0]
     place = np.arange(len(bars), dtype=float)
     widths = np.array([bar[1] for bar in bars])
     axes.barh(place, widths, height=0.7, color=[bar[2] for bar in bars])
     for y, (_, width, _) in zip(place, bars, strict=True):
-        share = f" ({100 * width / drawn:.1f} %)" if drawn > 0 else ""
+        share = f" ({100 * width / energy:.1f} %)" if energy > 0 else ""
         axes.text(max(width, 0.0), y, f"  {width:.3g} Wh{share}", va="center", fontsize=8.5)
     axes.set_yticks(place, [bar[0] for bar in bars], fontsize=9)
     axes.invert_yaxis()

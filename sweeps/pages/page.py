@@ -52,15 +52,17 @@ class Album:
             draw: returns the figure, alone or followed by numbers, which are returned, or an overlay over time.
         """
         with figure_settings():
-            drawn = draw()
-            if isinstance(drawn, TimeOverlay):
-                return self.add_overlay(name, drawn)
-            figure, *numbers = drawn if isinstance(drawn, tuple) else (drawn,)
+            figure_drawn = draw()
+            if isinstance(figure_drawn, TimeOverlay):
+                return self.add_overlay(name, figure_drawn)
+            figure, *numbers = figure_drawn if isinstance(figure_drawn, tuple) else (figure_drawn,)
             text, narrow = figure_as_svg(figure), ""
         if can_stack(figure):
             with figure_settings(NARROW):
-                drawn = draw()
-                narrow = figure_as_svg(fit_for_phones(drawn[0] if isinstance(drawn, tuple) else drawn))
+                figure_drawn = draw()
+                narrow = figure_as_svg(
+                    fit_for_phones(figure_drawn[0] if isinstance(figure_drawn, tuple) else figure_drawn)
+                )
         write_text(self.folder / f"{name}.svg", printable(text))
         looks = "scale " * has_colour_scale(figure)
         picture = _inline(text, name, looks + ("wide" if narrow else "only"))

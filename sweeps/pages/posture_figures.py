@@ -41,13 +41,13 @@ def draw_margins(found: CheckResult) -> Figure:
             )
             continue
         share = 100 * o.margin / max(abs(requirement_limit(o)), 1e-12)
-        drawn = float(np.clip(share, -LONGEST, LONGEST))
-        ax.barh(k, drawn, height=0.62, color=GREEN if o.met else VERMILION)
+        length = float(np.clip(share, -LONGEST, LONGEST))
+        ax.barh(k, length, height=0.62, color=GREEN if o.met else VERMILION)
         beyond = "" if abs(share) <= LONGEST or is_narrow() else " (beyond the axis)"
-        right = drawn >= 0
+        right = length >= 0
         reached = "" if is_narrow() else f"{reached_value_text(o)}, "
         ax.annotate(
-            f"{reached}{share:+.0f} %{beyond}", (drawn, k), xytext=(5 if right else -5, 0),
+            f"{reached}{share:+.0f} %{beyond}", (length, k), xytext=(5 if right else -5, 0),
             textcoords="offset points", va="center", ha="left" if right else "right", fontsize=8.5, color=INK,
         )  # fmt: skip
     ax.set_yticks(range(len(rows)), [f"{requirement_label(o)} {required_value_text(o)}" for o in rows])
@@ -70,8 +70,8 @@ _CIRCLE = np.stack([np.cos(_ROUND), np.sin(_ROUND)], 1)
 def belt_outline(side: Outline, belt: tuple[int, int]) -> np.ndarray:
     """Corners of the belt around a pair of circles, over its grousers [m]."""
     wide = [float(side.belt) if k in (REAR_AXLE, FRONT_AXLE) else float(side.radius[k]) for k in belt]
-    at = [np.array([float(side.forward[k]), float(side.up[k])]) for k in belt]
-    points = np.concatenate([c + r * _CIRCLE for c, r in zip(at, wide, strict=True)])
+    outline = [np.array([float(side.forward[k]), float(side.up[k])]) for k in belt]
+    points = np.concatenate([c + r * _CIRCLE for c, r in zip(outline, wide, strict=True)])
     return points[ConvexHull(points).vertices]
 
 
@@ -133,8 +133,8 @@ def draw_highest_steps(over: StepMap) -> Figure:
     fig, grid = new_figure(2, 2, 7.6)
     maps = ((over.step_mm, "highest step [mm]"), (over.margin_mm, "margin of tipping at rest [mm]"))
     for axes, (values, label) in zip(grid[:, 0], maps, strict=True):
-        drawn = axes.contourf(over.angles_deg, over.angles_deg, values, levels=12, cmap="cividis")
-        colour_bar(fig, drawn, axes, label=label)
+        contours = axes.contourf(over.angles_deg, over.angles_deg, values, levels=12, cmap="cividis")
+        colour_bar(fig, contours, axes, label=label)
         axes.plot(over.own_deg[1], over.own_deg[0], "o", color="white", mec=INK, ms=8, label="this run")
         axes.plot(over.rear_deg, over.front_deg, "*", color=VERMILION, mec="white", ms=13, label="highest")
         axes.set(

@@ -27,7 +27,7 @@ def power_by_item(runs: Columns) -> Columns:
 
     Rolling resistance holds the acceleration where a run has not settled.
     """
-    chain = [runs[f"power_{at}_W"] for at in ("supply", "motor", "gear", "ground", "lift")]
+    chain = [runs[f"power_{place}_W"] for place in ("supply", "motor", "gear", "ground", "lift")]
     losses = [above - below for above, below in itertools.pairwise(chain)]
     ends = [np.maximum(chain[-1], 0.0), np.maximum(-chain[0], 0.0)]
     return dict(zip(ITEMS, [*losses, *ends], strict=True))
@@ -52,7 +52,7 @@ def draw_power_chain(runs: Columns, names: list[str], has_ground: bool = True) -
     """A bar a run [W], from the motor's losses to the power that lifts the robot, or that the load takes."""
     fig, grid = new_figure(1, 1, 1.15 + 0.42 * len(names))
     axes, parts = grid[0, 0], power_by_item(runs)
-    said = {} if has_ground else ON_SHAFT
+    labels = {} if has_ground else ON_SHAFT
     supply, slope = power_sources(runs)
     total = supply + slope
     left = np.zeros(len(names))
@@ -61,7 +61,7 @@ def draw_power_chain(runs: Columns, names: list[str], has_ground: bool = True) -
         value = np.maximum(parts[item], 0.0)
         if value.max() > 1e-6:
             axes.barh(
-                place, value, left=left, height=0.7, color=colour, label=said.get(item, item), ec="white", lw=0.6
+                place, value, left=left, height=0.7, color=colour, label=labels.get(item, item), ec="white", lw=0.6
             )
         for y, x, width in zip(place, left, value, strict=True):
             if width >= 0.04 * total.max():

@@ -52,8 +52,8 @@ def _top(found: ResonanceResult) -> float:
     """Greatest frequency drawn [Hz]."""
     bands = [m.high for modes in found.modes.values() for m in modes if m.resonant]
     lines = [found.table[f"{name}_frequency_Hz"][found.read] for name in _MARKS]
-    seen = float(np.nanpercentile(np.concatenate(lines), 90)) if found.read.any() else 0.0
-    return 1.15 * max([seen, *bands, 10.0])
+    top = float(np.nanpercentile(np.concatenate(lines), 90)) if found.read.any() else 0.0
+    return 1.15 * max([top, *bands, 10.0])
 
 
 def draw_campbell_diagram(axes: Axes, found: ResonanceResult) -> None:
@@ -131,8 +131,8 @@ def ripple_map(axes: Axes, found: ResonanceResult, name: str) -> None:
     table, payloads = found.table, list(found.modes)
     ripple = table[f"{name}_ripple_percent"]
     settled = found.read & (table["status"] == "converged")
-    shown = ripple[settled] if settled.any() else ripple[found.read]
-    most = float(np.nanmax(shown)) or 1.0
+    shown_ripple = ripple[settled] if settled.any() else ripple[found.read]
+    most = float(np.nanmax(shown_ripple)) or 1.0
     norm = colors.Normalize(0, most)
     guess = found.travel
     for row, payload in enumerate(payloads):

@@ -62,8 +62,10 @@ def draw_tornado(study: OutputStudy, found: SensitivityResult) -> Figure:
     each = max(PANELS // len(kinds), 1)
     chosen: list[int] = []
     for kind in kinds:
-        mine = np.flatnonzero((points.configuration == kind) & np.isfinite(study.value) & study.studied)
-        order = mine[np.lexsort((points.payload[mine], points.slope_deg[mine], points.imposed[1][mine]))]
+        point_rows = np.flatnonzero((points.configuration == kind) & np.isfinite(study.value) & study.studied)
+        order = point_rows[
+            np.lexsort((points.payload[point_rows], points.slope_deg[point_rows], points.imposed[1][point_rows]))
+        ]
         if order.size:
             chosen += [int(order[k]) for k in np.unique(np.linspace(0, order.size - 1, each).astype(int))]
     where = chosen[:PANELS]
@@ -115,25 +117,29 @@ _WORDS = {
 
 
 def _bars(ax: Axes, study: OutputStudy, found: SensitivityResult, top: np.ndarray) -> None:
-    shown: dict[str, Estimate | None] = {key: e for key, e in study.overall.items() if key in _WORDS}
-    shown = shown or {"": None}
-    height = 0.8 / len(shown)
-    for j, (key, estimate) in enumerate(shown.items()):
-        at = -np.arange(len(top)) + 0.4 - height * (j + 0.5)
+    estimates: dict[str, Estimate | None] = {key: e for key, e in study.overall.items() if key in _WORDS}
+    estimates = estimates or {"": None}
+    height = 0.8 / len(estimates)
+    for j, (key, estimate) in enumerate(estimates.items()):
+        bar_places = -np.arange(len(top)) + 0.4 - height * (j + 0.5)
         if estimate is None:
-            ax.barh(at, study.overall_share[top], color=BLUE, height=height, label="share of the linear variance")
+            ax.barh(
+                bar_places, study.overall_share[top], color=BLUE, height=height, label="share of the linear variance"
+            )
             continue
         words, colour = _WORDS[key]
         scale = study.row.factor if key == "mean_absolute_effect" else 1.0
         value = estimate.value[top] / scale
         ends = np.stack([estimate.value - estimate.low, estimate.high - estimate.value])[:, top] / scale
-        ax.barh(at, np.maximum(value, 0.0), color=colour, height=0.9 * height, label=words)
-        ax.errorbar(value, at, xerr=np.maximum(ends, 0.0), fmt="none", ecolor=INK, elinewidth=0.9, capsize=1.5)
+        ax.barh(bar_places, np.maximum(value, 0.0), color=colour, height=0.9 * height, label=words)
+        ax.errorbar(
+            value, bar_places, xerr=np.maximum(ends, 0.0), fmt="none", ecolor=INK, elinewidth=0.9, capsize=1.5
+        )
     ax.set_yticks(-np.arange(len(top)), [short_name(found.names[k]) for k in top], fontsize=8.5)
     ax.set_xlim(left=0)
     unit = "" if study.row.unit_shown == "-" else f" [{study.row.unit_shown}]"
     ax.set_xlabel(
-        f"effect over the 95 % range{unit}" if "mean_absolute_effect" in shown else "share of the variance [-]"
+        f"effect over the 95 % range{unit}" if "mean_absolute_effect" in estimates else "share of the variance [-]"
     )
     ax.grid(axis="y", visible=False)
     columns = legend_columns(ax.get_legend_handles_labels()[1], 2)
@@ -148,21 +154,23 @@ def _over_points(ax: Axes, study: OutputStudy, found: SensitivityResult, top: np
     _cells(ax, study.share[order][:, top].T, 24)
     ax.set_yticks([])
     ticks, labels = [], []
-    word, own, unit = points.imposed
-    along, levels, mark = ("slope", points.slope_deg, "°") if points.has_ground else (f"{word} [{unit}]", own, "")
+    word, own_values, unit = points.imposed
+    along, levels, mark = (
+        ("slope", points.slope_deg, "°") if points.has_ground else (f"{word} [{unit}]", own_values, "")
+    )
     for kind in kinds:
-        mine = np.flatnonzero(names[order] == kind)
-        if mine[0]:
-            ax.axvline(mine[0] - 0.5, color="white", linewidth=4)
-        for level in np.unique(levels[order][mine]):
-            at = mine[levels[order][mine] == level]
-            ticks.append(at.mean())
+        point_rows = np.flatnonzero(names[order] == kind)
+        if point_rows[0]:
+            ax.axvline(point_rows[0] - 0.5, color="white", linewidth=4)
+        for level in np.unique(levels[order][point_rows]):
+            of_level = point_rows[levels[order][point_rows] == level]
+            ticks.append(of_level.mean())
             labels.append(f"{level:g}{mark}")
-            if at[0] != mine[0]:
-                ax.axvline(at[0] - 0.5, color="white", linewidth=1.5)
-        ax.text(mine.mean(), -0.62, kind, ha="center", va="bottom", fontsize=9, fontweight="bold")
+            if of_level[0] != point_rows[0]:
+                ax.axvline(of_level[0] - 0.5, color="white", linewidth=1.5)
+        ax.text(point_rows.mean(), -0.62, kind, ha="center", va="bottom", fontsize=9, fontweight="bold")
     ax.set_xticks(ticks, labels, fontsize=8.5)
-    other = ((word, own, unit), ("payload", points.payload, "kg"))
+    other = ((word, own_values, unit), ("payload", points.payload, "kg"))
     inner = [f"{word} {_range(x)} {unit}" for word, x, unit in other if x is not levels and np.unique(x).size > 1]
     within = f"; within each {' and '.join(inner)}" if inner else ""
     ax.set_xlabel(f"{along}{within}; grey: no index there", fontsize=8.5)
@@ -174,10 +182,10 @@ def _range(values: np.ndarray) -> str:
 
 def draw_convergence(found: SensitivityResult) -> Figure:
     """The main index of the leading inputs of each output against the model evaluations spent."""
-    shown = [s for s in found.outputs.values() if s.convergence][:6]
-    rows = -(-len(shown) // 3)
-    fig, axes = new_figure(rows, min(3, len(shown)), 2.1 * rows + 0.4)
-    for ax, study in zip(axes.ravel(), shown, strict=False):
+    studies = [s for s in found.outputs.values() if s.convergence][:6]
+    rows = -(-len(studies) // 3)
+    fig, axes = new_figure(rows, min(3, len(studies)), 2.1 * rows + 0.4)
+    for ax, study in zip(axes.ravel(), studies, strict=False):
         counts = np.array([count for count, _ in study.convergence])
         for k, colour in zip(leading_inputs(study.overall_share, 3), (BLUE, VERMILION, GREEN), strict=False):
             series = [e[k] for _, e in study.convergence]
@@ -197,7 +205,7 @@ def draw_convergence(found: SensitivityResult) -> Figure:
         ax.set_ylim(bottom=0)
         ax.set_title(study.row.label)
         ax.legend(fontsize=7.5, loc="best")
-    for ax in axes.ravel()[len(shown) :]:
+    for ax in axes.ravel()[len(studies) :]:
         ax.set_visible(False)
     axes[-1, 0].set_xlabel("model evaluations")
     axes[-1, 0].set_ylabel("total index [-]")

@@ -20,9 +20,9 @@ def draw_nearest_limits(found: SizeResult, charts: dict[str, Chart]) -> Figure:
     fig, axes = new_figure(1, len(charts), 4.6, sharex=True, sharey=True)
     e = found.asked.envelope
     palette = ListedColormap([_COLOURS[name] for name in LIMITS])
-    seen: set[int] = set()
+    nearest_limits: set[int] = set()
     for ax, (name, chart) in zip(axes[0], charts.items(), strict=True):
-        seen |= set(np.unique(chart.nearest).tolist())
+        nearest_limits |= set(np.unique(chart.nearest).tolist())
         ax.pcolormesh(
             chart.payload, chart.slope, chart.nearest, cmap=palette, vmin=-0.5, vmax=len(LIMITS) - 0.5, alpha=0.55,
             shading="nearest", rasterized=True,
@@ -39,7 +39,7 @@ def draw_nearest_limits(found: SizeResult, charts: dict[str, Chart]) -> Figure:
         ax.set_xlabel("payload [kg]")
         ax.grid(visible=False)
     axes[0, 0].set_ylabel("slope [deg]")
-    handles = [Patch(color=_COLOURS[LIMITS[k]], alpha=0.55, label=LIMITS[k]) for k in sorted(seen)]
+    handles = [Patch(color=_COLOURS[LIMITS[k]], alpha=0.55, label=LIMITS[k]) for k in sorted(nearest_limits)]
     fig.legend(
         handles=handles,
         loc="outside lower center",

@@ -91,11 +91,11 @@ def _map(axes: Axes, runs: Columns, index: np.ndarray, channel: Channel, norm: A
         return
     cell, has_number = at_payload * slopes.size + at_slope, runs_with_number(runs, channel)[index]
     image = np.full((payloads.size, slopes.size), np.nan)
-    shown, medians = _medians(cell[has_number], runs[channel.column][index][has_number])
-    image.flat[shown] = medians
-    asked, first = np.unique(cell, return_index=True)
-    unshown = ~np.isin(asked, shown)
-    j, i = np.divmod(asked[unshown], slopes.size)
+    has_median, medians = _medians(cell[has_number], runs[channel.column][index][has_number])
+    image.flat[has_median] = medians
+    cells, first = np.unique(cell, return_index=True)
+    unshown = ~np.isin(cells, has_median)
+    j, i = np.divmod(cells[unshown], slopes.size)
     missing = dict(zip(zip(i.tolist(), j.tolist(), strict=True), runs["status"][index[first[unshown]]], strict=True))
     axes.imshow(image, origin="lower", aspect="auto", cmap="viridis", norm=norm, interpolation="nearest")
     labelled = slopes.size <= _CELLS and payloads.size <= _CELLS
@@ -177,38 +177,38 @@ def _scatter(axes: Axes, runs: Columns, index: np.ndarray, channel: Channel, nor
 
 def _lines(runs: Columns, channel: Channel, kinds: list[str]) -> Figure:
     column, settles = channel.column, runs_with_number(runs, channel)
-    over = own = imposed_column(runs)
+    over = own_column = imposed_column(runs)
     if on_ground(runs):
         over = "payload_kg" if np.unique(runs["payload_kg"]).size > 1 else "slope_deg"
-        if np.unique(runs[over]).size == 1 and np.unique(runs[own]).size > 1:
-            over = own
+        if np.unique(runs[over]).size == 1 and np.unique(runs[own_column]).size > 1:
+            over = own_column
     label = {
         "payload_kg": "payload [kg]", "slope_deg": "slope [°]", "supply_voltage_V": "supply voltage [V]",
         "motor_speed_rpm": "motor speed [rpm]",
     }[over]  # fmt: skip
     fig, grid = new_figure(1, len(kinds), 3.2, sharey=True)
     for axes, kind in zip(grid[0], kinds, strict=True):
-        mine = runs["configuration"] == kind
-        volts = [("", mine)] if over == own else panels_by_imposed(runs[own], own)
+        of_kind = runs["configuration"] == kind
+        volts = [("", of_kind)] if over == own_column else panels_by_imposed(runs[own_column], own_column)
         for k, (volt, mask) in enumerate(volts):
-            pick = np.nonzero(mine & mask)[0]
+            pick = np.nonzero(of_kind & mask)[0]
             pick = pick[np.argsort(runs[over][pick], kind="stable")]
             shade = colormaps["viridis"](0.15 + 0.7 * k / max(1, len(volts) - 1))
-            shown = np.where(settles[pick], runs[column][pick], np.nan)
+            line = np.where(settles[pick], runs[column][pick], np.nan)
             axes.plot(
                 runs[over][pick],
-                shown,
+                line,
                 "o-" if pick.size <= 60 else "-",
                 ms=4,
                 color=shade,
                 label=volt or None,
             )
-            gone = pick[~np.isfinite(shown)]
+            gone = pick[~np.isfinite(line)]
             for status in np.unique(runs["status"][gone]):
-                at = gone[runs["status"][gone] == status]
+                rows_of_status = gone[runs["status"][gone] == status]
                 axes.plot(
-                    runs[over][at],
-                    np.full(at.size, 0.03 + 0.05 * k),
+                    runs[over][rows_of_status],
+                    np.full(rows_of_status.size, 0.03 + 0.05 * k),
                     "x",
                     color=shade,
                     ms=6,
@@ -218,7 +218,7 @@ def _lines(runs: Columns, channel: Channel, kinds: list[str]) -> Figure:
                 )
                 axes.annotate(
                     words.short_status(str(status)),
-                    (runs[over][at[0]], 0.03 + 0.05 * k),
+                    (runs[over][rows_of_status[0]], 0.03 + 0.05 * k),
                     xycoords=axes.get_xaxis_transform(),
                     xytext=(6, 4),
                     textcoords="offset points",
@@ -227,8 +227,8 @@ def _lines(runs: Columns, channel: Channel, kinds: list[str]) -> Figure:
         axes.set(xlabel=label, title=kind)
         if volts[0][0]:
             axes.legend()
-    drawn = runs[column][settles]
-    low, high = (float(drawn.min()), float(drawn.max())) if drawn.size else (0.0, 1.0)
+    settled_values = runs[column][settles]
+    low, high = (float(settled_values.min()), float(settled_values.max())) if settled_values.size else (0.0, 1.0)
     grid[0, 0].set_ylim(min(0.0, 1.1 * low), max(0.0, 1.1 * high) or 1.0)
     grid[0, 0].set_ylabel(axis_label(channel))
     return fig

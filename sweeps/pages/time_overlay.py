@@ -134,6 +134,6 @@ def time_overlay(table: Columns, channels: Sequence[Channel], simulated: Mapping
         simulated: prefixes of the simulated columns and their names, as in `TimeOverlay`.
     """
     runs = Runs("a table", {name: table[name] for name in ("run_id", "time_s") if name in table})
-    shown = [c for c in channels if np.isfinite(table[c.column]).any()]
+    shown_channels = [c for c in channels if np.isfinite(table[c.column]).any()]
     rows = {str(name): runs.in_order(name) for name in dict.fromkeys(runs.run_names.tolist())}
-    return TimeOverlay(table, shown, simulated, rows)
+    return TimeOverlay(table, shown_channels, simulated, rows)

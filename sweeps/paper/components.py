@@ -45,14 +45,14 @@ def gearbox_efficiency(robots: dict[str, Robot], rows: data.Rows | None) -> Figu
         inputs = idle + np.geomspace(1e-5, top / float(robot.gearbox.ratio * robot.gearbox.efficiency_load), 300)
         torque, efficiency = data.gear_efficiency(robot, speed, inputs)
         axes.plot(torque, efficiency, line, color=colour)
-        at = int(np.searchsorted(torque, 0.18 * top))
+        place = int(np.searchsorted(torque, 0.18 * top))
         words = f"{words_shown(name)}, {speed:,.0f} rpm (about {volts})"
         offset = (-4, 6) if volts == "15 V" else (8, -14)
         ha = "right" if volts == "15 V" else "left"
         if volts == "15 V":
             axes.annotate(
                 words,
-                (torque[at], efficiency[at]),
+                (torque[place], efficiency[place]),
                 xytext=(40, 26),
                 textcoords="offset points",
                 color=colour,
@@ -62,7 +62,7 @@ def gearbox_efficiency(robots: dict[str, Robot], rows: data.Rows | None) -> Figu
         else:
             axes.annotate(
                 words,
-                (torque[at], efficiency[at]),
+                (torque[place], efficiency[place]),
                 xytext=offset,
                 textcoords="offset points",
                 color=colour,
@@ -182,12 +182,12 @@ def motor_friction(robots: dict[str, Robot]) -> Figure:
     fig, grid = new_figure(1, 1, 3.4)
     axes = grid[0, 0]
     speed = np.linspace(0, 12_500, 60)
-    drawn: set[bytes] = set()
+    drawn_curves: set[bytes] = set()
     for name, robot in robots.items():
         torque = data.motor_friction(robot, speed)
-        if torque.tobytes() in drawn:
+        if torque.tobytes() in drawn_curves:
             continue
-        drawn.add(torque.tobytes())
+        drawn_curves.add(torque.tobytes())
         colour = MODEL.get(name, PURPLE)
         axes.plot(speed, torque, color=colour)
         words = "SM-1, SM-2 (constant)" if name in ("sm1", "sm2") else words_shown(name)
@@ -218,9 +218,9 @@ def idle_track(robots: dict[str, Robot]) -> tuple[Figure, dict[str, float]]:
     name, robot = next(iter(robots.items()))
     speed = np.linspace(0.5, 26.0, 60)
     certainty = {}
-    known = {TRACKED: "three tracks a side", WHEELED: "one track a side"}
+    labels = {TRACKED: "three tracks a side", WHEELED: "one track a side"}
     for kind in data.shown_configurations(robot):
-        words = f"{known[kind]} ({kind})" if kind in known else kind
+        words = f"{labels[kind]} ({kind})" if kind in labels else kind
         current = data.idle_current(robot, kind, speed)
         line, certainty[kind] = data.fit_line(speed, current)
         colour = CONFIGURATION.get(kind, PURPLE)

@@ -41,11 +41,13 @@ def shown_configurations(robot: Robot) -> Names:
 
 def batch_conditions(robot: Robot, configuration: Any, **given: Any) -> Conditions:
     """A batch of conditions with configurations by name. The total mass, if not given, is the robot's own."""
-    made = Conditions(np.asarray(configuration), **given).resolved(robot)
-    if made.total_mass is not None:
-        return made
-    own = np.array([float(chassis.mass) for chassis in robot.configurations.members])
-    return dataclasses.replace(made, total_mass=own[np.asarray(made.configuration)] + made.payload)
+    conditions = Conditions(np.asarray(configuration), **given).resolved(robot)
+    if conditions.total_mass is not None:
+        return conditions
+    own_mass = np.array([float(chassis.mass) for chassis in robot.configurations.members])
+    return dataclasses.replace(
+        conditions, total_mass=own_mass[np.asarray(conditions.configuration)] + conditions.payload
+    )
 
 
 def operating_points(robot: Robot, asked: Conditions) -> Columns:
@@ -113,22 +115,22 @@ def simulate_measured_rows(robot: Robot) -> Rows | None:
         for table in map(runs.read_runs, ("measured", "simulated_by_paper"))
     )
     kind = table["configuration"]
-    asked: Json = {
+    request: Json = {
         "configuration": kind,
         "voltage": table["supply_voltage_V"],
         "payload": table["payload_kg"],
         "slope_deg": table["slope_deg"],
     }
     mass = table["total_mass_kg"]
-    plain = operating_points(robot, batch_conditions(robot, total_mass=mass, **asked))
+    plain = operating_points(robot, batch_conditions(robot, total_mass=mass, **request))
     ratio = {}
     for c in shared_configurations(robot):
         largest = float(np.max(np.abs(plain["adhesion_used"][kind == c])))
         listed = adhesion_ratio(RAISED_SURFACE, c == TRACKED)
         ratio[c] = max(listed, RAISED_MARGIN * largest) if largest > 1 else 1.0
     adhesion = np.array([ratio[c] for c in kind])
-    raised = operating_points(robot, batch_conditions(robot, total_mass=mass, adhesion=adhesion, **asked))
-    weighed = operating_points(robot, batch_conditions(robot, adhesion=adhesion, **asked))
+    raised = operating_points(robot, batch_conditions(robot, total_mass=mass, adhesion=adhesion, **request))
+    weighed = operating_points(robot, batch_conditions(robot, adhesion=adhesion, **request))
     return Rows(table, stack_channels(table.columns), stack_channels(paper.columns), plain, raised, weighed, ratio)
 
 
@@ -137,13 +139,13 @@ def raised_words(robot: Robot, ratio: dict[str, float]) -> str:
     surface = SURFACES[RAISED_SURFACE]
     parts = []
     for c, raised in ratio.items():
-        own = float(robot.configurations[c].ground.friction.static)
+        own_friction = float(robot.configurations[c].ground.friction.static)
         if raised == 1.0:
-            parts.append(f"{c} unchanged at {own:.2f}")
+            parts.append(f"{c} unchanged at {own_friction:.2f}")
             continue
         listed = surface.tracked_x if c == TRACKED else surface.wheeled_x
-        table = " (Table 5, smooth concrete floor)" if abs(own * raised - listed) < 1e-6 else ""
-        parts.append(f"{c} from {own:.2f} to {own * raised:.2f}{table}")
+        table = " (Table 5, smooth concrete floor)" if abs(own_friction * raised - listed) < 1e-6 else ""
+        parts.append(f"{c} from {own_friction:.2f} to {own_friction * raised:.2f}{table}")
     return "; ".join(parts)
 
 
@@ -193,16 +195,18 @@ def idle_current(robot: Robot, configuration: str, speed_wheel: np.ndarray) -> n
     from mmrjax.model import balances
     from mmrjax.model.signals import State
 
-    asked = batch_conditions(robot, np.full(speed_wheel.shape, configuration))
+    conditions = batch_conditions(robot, np.full(speed_wheel.shape, configuration))
     chassis = robot.configurations[configuration]
     wheel = jnp.asarray(speed_wheel)
     zero = jnp.zeros_like(wheel)
 
     def torque_net(current: float) -> np.ndarray:
         state = State(zero + current, wheel * robot.gearbox.ratio, chassis.radius * wheel, zero)
-        signals = balances.begin_signals(robot, asked, state, direction=zero + 1.0)
+        signals = balances.begin_signals(robot, conditions, state, direction=zero + 1.0)
         signals = dataclasses.replace(signals, normal=zero, traction=zero)
-        signals = balances.motor(robot, balances.electrical(robot, asked, balances.supply(robot, asked, signals)))
+        signals = balances.motor(
+            robot, balances.electrical(robot, conditions, balances.supply(robot, conditions, signals))
+        )
         return np.asarray(balances.gearbox(robot, chassis, balances.track(robot, chassis, signals)).torque_net)
 
     low, high = 5.0, 10.0
@@ -249,7 +253,7 @@ def current_over_slope(robot: Robot, ratio: dict[str, float], slopes: np.ndarray
     kind, voltage, payload, adhesion = (
         np.repeat(np.array(v), len(slopes)) for v in zip(*((c, *MODES[mode], r) for c, mode, r in asked), strict=True)
     )
-    at = batch_conditions(
+    conditions = batch_conditions(
         robot,
         kind,
         voltage=voltage.astype(float),
@@ -257,7 +261,7 @@ def current_over_slope(robot: Robot, ratio: dict[str, float], slopes: np.ndarray
         slope_deg=np.tile(slopes, len(asked)),
         adhesion=adhesion.astype(float),
     )
-    current = operating_points(robot, at)["total_current_A"].reshape(len(asked), len(slopes))
+    current = operating_points(robot, conditions)["total_current_A"].reshape(len(asked), len(slopes))
     return {(c, mode): (current[2 * k], current[2 * k + 1]) for k, (c, mode, _) in enumerate(asked[::2])}
 
 
@@ -273,7 +277,7 @@ def supply_errors(robot: Robot, ratio: float, rows_of: Rows, battery: bool) -> d
         if battery and mode == 1:
             continue
         picked = table.where(pick)
-        at = batch_conditions(
+        conditions = batch_conditions(
             robot,
             picked["configuration"],
             voltage=voltage,
@@ -283,7 +287,7 @@ def supply_errors(robot: Robot, ratio: float, rows_of: Rows, battery: bool) -> d
             adhesion=ratio,
             battery=float(battery),
         )
-        answer[mode] = channel_percent_errors(operating_points(robot, at), rows_of.measured[pick])
+        answer[mode] = channel_percent_errors(operating_points(robot, conditions), rows_of.measured[pick])
     return answer
 
 
@@ -311,15 +315,15 @@ def energy_split(robot: Robot, asked: Conditions) -> tuple[Columns, Columns]:
         points["theoretical_speed_mm_s"] * MM * (1 - points["slip"]),
         asked.discharge,
     )
-    at, _ = eqx.filter_jit(balances.settled_signals)(robot, asked, state)
+    signals, _ = eqx.filter_jit(balances.settled_signals)(robot, asked, state)
     sides = robot.sides
     parts = {
-        "winding": sides * at.voltage_drop * at.current,
-        "motor friction": sides * at.torque_motor_loss * at.speed_motor,
+        "winding": sides * signals.voltage_drop * signals.current,
+        "motor friction": sides * signals.torque_motor_loss * signals.speed_motor,
         "gearbox": points["power_motor_W"] - points["power_gear_W"],
-        "track and guides": sides * at.torque_track_loss * at.speed_wheel,
-        "slip": sides * at.traction * (at.speed_theoretical - at.speed),
-        "rolling resistance": sides * at.resistance * at.speed,
+        "track and guides": sides * signals.torque_track_loss * signals.speed_wheel,
+        "slip": sides * signals.traction * (signals.speed_theoretical - signals.speed),
+        "rolling resistance": sides * signals.resistance * signals.speed,
         "lift": points["power_lift_W"],
     }
     split = {k: np.asarray(v) for k, v in parts.items()}
@@ -329,8 +333,8 @@ def energy_split(robot: Robot, asked: Conditions) -> tuple[Columns, Columns]:
 
 def paper_rows_table(rows: Rows) -> Columns:
     """The paper's rows side by side: measured, the paper's simulation, and the robot three ways."""
-    asked = rows.conditions
-    columns = {key: asked[key] for key in ("configuration", *runs.CONDITIONS)}
+    conditions = rows.conditions
+    columns = {key: conditions[key] for key in ("configuration", *runs.CONDITIONS)}
     for k, channel in enumerate(channels_of_paper()):
         columns[channel.column] = rows.measured[:, k]
         columns[f"paper_{channel.column}"] = rows.paper[:, k]

@@ -148,8 +148,8 @@ _SPLIT_COLOURS = {
 
 def draw_energy(robot: Robot, ratio: dict[str, float]) -> tuple[Figure, list[Json]]:
     """Use of the supply's power at twelve operating points, in percent, with watts at the end."""
-    asked = [(c, u, p, s) for c in ratio for u, p in ((15.0, 0.0), (33.0, 8.0)) for s in (0.0, 10.0, 20.0)]
-    kind, voltage, payload, slope = (np.array(v) for v in zip(*asked, strict=True))
+    runs = [(c, u, p, s) for c in ratio for u, p in ((15.0, 0.0), (33.0, 8.0)) for s in (0.0, 10.0, 20.0)]
+    kind, voltage, payload, slope = (np.array(v) for v in zip(*runs, strict=True))
 
     def at(adhesion: np.ndarray) -> tuple[Columns, Columns]:
         return data.energy_split(
@@ -157,14 +157,14 @@ def draw_energy(robot: Robot, ratio: dict[str, float]) -> tuple[Figure, list[Jso
             data.batch_conditions(robot, kind, voltage=voltage, payload=payload, slope_deg=slope, adhesion=adhesion),
         )
 
-    points, _ = at(np.ones(len(asked)))
+    points, _ = at(np.ones(len(runs)))
     slides = points["status"] == "slides"
     lifted_points, lifted = at(np.where(slides, [ratio[k] for k in kind], 1.0))
     fig, grid = new_figure(1, 1, 5.2)
     axes = grid[0, 0]
     table = []
-    height = [float(k) + 0.6 * (k // 3) for k in range(len(asked))]
-    left = np.zeros(len(asked))
+    height = [float(k) + 0.6 * (k // 3) for k in range(len(runs))]
+    left = np.zeros(len(runs))
     total = lifted_points["power_supply_W"]
     for item in (*data.SPLIT, "other"):
         share = 100 * lifted[item] / total
@@ -186,7 +186,7 @@ def draw_energy(robot: Robot, ratio: dict[str, float]) -> tuple[Figure, list[Jso
                 )
         left = left + share
     labels = []
-    for k, (c, u, _p, s) in enumerate(asked):
+    for k, (c, u, _p, s) in enumerate(runs):
         labels.append(f"{c}  {u:.0f} V  {_p:.0f} kg  {s:.0f}°" + (" *" if slides[k] else ""))
         alive = np.isfinite(total[k])
         text = f"{total[k]:.0f} W" if alive else words.short_status(str(lifted_points["status"][k]))
@@ -206,13 +206,13 @@ def draw_energy(robot: Robot, ratio: dict[str, float]) -> tuple[Figure, list[Jso
 
 def row_parity(rows: data.Rows, name: str) -> Figure:
     """Simulated over measured for the rows, every channel, adhesion raised, both masses for 4W2T."""
-    shown = data.channels_of_paper()
-    fig, grid = new_figure(1, len(shown), 3.7)
+    channels_shown = data.channels_of_paper()
+    fig, grid = new_figure(1, len(channels_shown), 3.7)
     kind = rows.conditions["configuration"]
     raised, weighed = data.stack_channels(rows.raised), data.stack_channels(rows.weighed)
     moved = (kind == WHEELED) & (np.abs(rows.raised["total_mass_kg"] - rows.weighed["total_mass_kg"]) > 0.05)
     slides = rows.plain["status"] == "slides"
-    for k, (axes, channel) in enumerate(zip(grid[0], shown, strict=True)):
+    for k, (axes, channel) in enumerate(zip(grid[0], channels_shown, strict=True)):
         measured = rows.measured[:, k]
         span = np.array([0.0, 1.1 * max(measured.max(), np.nanmax(raised[:, k], initial=0))])
         axes.fill_between(span, span * 0.95, span * 1.05, color="#eef3ee", lw=0)

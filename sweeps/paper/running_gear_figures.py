@@ -53,16 +53,16 @@ def draw_running_gear(album: Album, robot: Robot) -> Json:
     )
     facts = album.add("track_fig25_ripple", lambda: gear_figures.current_ripple(gears, "Fig. 25: {}"))
     album.add("track_fig27_reactions", lambda: gear_figures.draw_reactions(gears, "Fig. 27: {}, one side"))
-    known = {"left_out": None, "rows": facts, "currents": None}
+    facts_so_far = {"left_out": None, "rows": facts, "currents": None}
     if TRACKED not in names:
-        return known
+        return facts_so_far
     k = names.index(TRACKED)
     album.add(
         "track_fig26_touchdown", lambda: gear_figures.draw_touchdowns(gears[k], "Fig. 26: grousers land (dotted)")
     )
     lumped = data.operating_points(robot, data.batch_conditions(robot, np.array([TRACKED]), voltage=33.0))
     track = robot.configurations[TRACKED].track
-    return known | {
+    return facts_so_far | {
         "share": float(track.guide_share),
         "friction": float(track.guide_friction),
         "currents": (float(lumped["total_current_A"][0]), float(run.result.total_current[k])),

@@ -67,8 +67,8 @@ class Plan:
 
     def varied(self, robot: Robot) -> variation.Variation:
         """The robot and what varies of it and of conditions, without axes that a task has of its own."""
-        known = variation.variable_names(robot)
-        return variation.Variation(robot, tuple(name for name in self.design.names if name in known))
+        names = variation.variable_names(robot)
+        return variation.Variation(robot, tuple(name for name in self.design.names if name in names))
 
     def fixed(self) -> Conditions:
         """The conditions that do not vary, of shape ()."""
@@ -103,7 +103,7 @@ def plan_design(config: Campaign, robot: Robot, where: str) -> Plan:
             raise BadConfiguration(f"{where}, {name}: stated twice; expected it in one of conditions, axes, samples")
     if fixed.get("battery", 0.0) > 0.5 and "voltage" in {*fixed, *design.names}:
         raise BadConfiguration(
-            f"{where}, voltage: acts without battery only, whose voltage is that of its charge; remove one of them"
+            f"{where}, voltage: acts only without battery, whose charge sets the voltage; remove one of them"
         )
     _acting({*fixed, *design.names}, robot, where, surface)
     which = np.atleast_1d(axes.get(CONFIGURATION, fixed.get(CONFIGURATION, 0.0)))
@@ -113,17 +113,17 @@ def plan_design(config: Campaign, robot: Robot, where: str) -> Plan:
         for name in simulated:
             if why := without_levers(robot, name):
                 raise BadConfiguration(f"{where}, {levers[0]}: {why}")
-    own = AXIS[robot.rig.imposed]
-    if not robot.rig.inherits and own not in {*fixed, *design.names} and fixed.get("battery", 0.0) <= 0.5:
-        level = imposed.imposed_default(robot, f"{where}, conditions.{own}")
-        fixed[own] = level * OF_IMPOSED[own][1]
+    own_axis = AXIS[robot.rig.imposed]
+    if not robot.rig.inherits and own_axis not in {*fixed, *design.names} and fixed.get("battery", 0.0) <= 0.5:
+        level = imposed.imposed_default(robot, f"{where}, conditions.{own_axis}")
+        fixed[own_axis] = level * OF_IMPOSED[own_axis][1]
     if surface is not None and "adhesion" in {*fixed, *design.names}:
         raise BadConfiguration(f"{where}, conditions.surface: got {surface} beside adhesion; expected one of the two")
     if design.points > MOST:
         raise BadConfiguration(f"{where}: got {design.points:.3g} points; expected at most {MOST:.3g}")
-    found = Plan(design, dict(extra), fixed, surface, tuple(data))
-    varied = {**extra, **found.varied(robot).axes}
-    return dataclasses.replace(found, axes={name: varied[name] for name in design.names})
+    plan = Plan(design, dict(extra), fixed, surface, tuple(data))
+    varied = {**extra, **plan.varied(robot).axes}
+    return dataclasses.replace(plan, axes={name: varied[name] for name in design.names})
 
 
 def _acting(names: set[str], robot: Robot, where: str, surface: str | None) -> None:
@@ -132,7 +132,7 @@ def _acting(names: set[str], robot: Robot, where: str, surface: str | None) -> N
         "voltage": ("voltage", "duty", "open"), "motor_speed": ("motor_speed", "motor_acceleration"),
         "motor_current": ("motor_current",),
     }  # fmt: skip
-    idle = {name for kind, mine in kinds.items() if kind != robot.rig.imposed for name in mine}
+    idle = {name for kind, of_kind in kinds.items() if kind != robot.rig.imposed for name in of_kind}
     for name in sorted(names & idle):
         raise BadConfiguration(
             f"{where}, {name}: the robot's file imposes the {robot.rig.imposed.replace('_', ' ')}; vary "
@@ -297,10 +297,10 @@ def _posterior(stated: Any, robot: Robot, where: str, data: list[str]) -> Joint:
         raise BadConfiguration(f"{where}: got {stated!r}; expected a run folder of calibrate or loop")
     path = Path(stated)
     path = path / posterior_file.FILE if path.is_dir() else path
-    found = posterior_file.read_posterior(path)
-    found.check(robot, where)
+    posterior = posterior_file.read_posterior(path)
+    posterior.check(robot, where)
     data.append(str(path))
-    return found
+    return posterior
 
 
 #: Numbers that each distribution states.
@@ -328,8 +328,8 @@ def _quantile(name: str, stated: Any, robot: Robot, where: str) -> Quantile:
     numbers = {key: stated_number(table[key], f"{where}.{key}") for key in needed}
     ordered = [numbers[key] for key in ("low", "mode", "high") if key in numbers]
     if ordered != sorted(ordered) or (ordered and ordered[0] == ordered[-1]):
-        said = ", ".join(f"{key} {value:g}" for key, value in numbers.items())
-        raise BadConfiguration(f"{where}: got {said}; expected {' below '.join(k for k in needed)}")
+        numbers_text = ", ".join(f"{key} {value:g}" for key, value in numbers.items())
+        raise BadConfiguration(f"{where}: got {numbers_text}; expected {' below '.join(k for k in needed)}")
     for key in ("sd", "sd_log"):
         if numbers.get(key, 1.0) <= 0:
             raise BadConfiguration(f"{where}.{key}: got {numbers[key]:g}; expected more than 0")

@@ -65,10 +65,10 @@ def obstacle_axis(obstacle: Obstacle) -> Axis:
 def climb_attributes(obstacle: Obstacle) -> dict[str, Json]:
     """Outputs that a point has, by name, with their attributes in a store."""
     names = (VERDICT, LARGEST) if obstacle.find else tuple(name for name in OUTPUTS if name != LARGEST)
-    found: dict[str, Json] = {name: {"units": OUTPUTS[name][0], "long_name": OUTPUTS[name][1]} for name in names}
-    del found[VERDICT]["units"]
-    found[VERDICT] |= {"flag_values": [*range(len(NAMES))], "flag_meanings": " ".join(NAMES)}
-    return found
+    attributes: dict[str, Json] = {name: {"units": OUTPUTS[name][0], "long_name": OUTPUTS[name][1]} for name in names}
+    del attributes[VERDICT]["units"]
+    attributes[VERDICT] |= {"flag_values": [*range(len(NAMES))], "flag_meanings": " ".join(NAMES)}
+    return attributes
 
 
 def further_variation(obstacle: Obstacle, varied: Columns, robot: Robot, where: str) -> dict[str, float]:
@@ -131,7 +131,7 @@ def compute_climbs(
         sizes: of the obstacles [mm]. None: they are searched for, all side by side.
         told: what share is done.
     """
-    robot, at = variation.at(jnp.asarray(values), conditions)
+    robot, conditions_there = variation.at(jnp.asarray(values), conditions)
     points = len(values)
     if variation.varies_robot:
         base = variation.robot
@@ -142,7 +142,7 @@ def compute_climbs(
             robot,
             base,
         )
-    sequence = _sequences(obstacle, robot, at, points)
+    sequence = _sequences(obstacle, robot, conditions_there, points)
 
     def run(sizes: np.ndarray, told: Callable[[float], None]) -> Climb:
         # Terrains of sizes [mm]
@@ -153,31 +153,31 @@ def compute_climbs(
             "gap": terrain.gap,
         }
         return climb_batch(
-            robot, at, jax.vmap(make[obstacle.kind])(jnp.asarray(sizes) / 1000), sequence,
+            robot, conditions_there, jax.vmap(make[obstacle.kind])(jnp.asarray(sizes) / 1000), sequence,
             duration=obstacle.duration_s, step=obstacle.time_step_s, sample=SAMPLE, record=not obstacle.find,
             progress=told,
         )  # fmt: skip
 
-    found = _numbers(run(sizes, told)) if sizes is not None else _searched(obstacle, points, run, told)
-    verdict = found[VERDICT]
+    results = _numbers(run(sizes, told)) if sizes is not None else _searched(obstacle, points, run, told)
+    verdict = results[VERDICT]
     status = np.where(verdict == FAILED, FAILED_POINT, np.where(verdict == UNFINISHED, NOT_SETTLED, CONVERGED))
     told(1.0)
-    return {**found, VERDICT: verdict.astype(np.uint8), STATUS: status.astype(np.uint8)}
+    return {**results, VERDICT: verdict.astype(np.uint8), STATUS: status.astype(np.uint8)}
 
 
 def _sequences(obstacle: Obstacle, robot: Robot, conditions: Conditions, points: int) -> Sequence:
     each = 0 if jnp.ndim(robot.sides) else None
     angles = jax.vmap(lambda r, c: masses.lever_angles(r.running_gear, c), in_axes=(each, 0))(robot, conditions)
     front, rear = (jnp.broadcast_to(x, (points,)) for x in angles)
-    found = jax.vmap(constant_angles)(front, rear)
+    sequences = jax.vmap(constant_angles)(front, rear)
     if obstacle.sequence is not None:
         one = terrains.read_sequence(obstacle.sequence, robot, (0.0, 0.0))
-        found = jax.tree.map(lambda x: jnp.broadcast_to(x, (points, *jnp.shape(x))), one)
-        if found.begins is not None:
-            found = dataclasses.replace(found, begins=jnp.stack([front, rear], axis=1))
+        sequences = jax.tree.map(lambda x: jnp.broadcast_to(x, (points, *jnp.shape(x))), one)
+        if sequences.begins is not None:
+            sequences = dataclasses.replace(sequences, begins=jnp.stack([front, rear], axis=1))
     if obstacle.levers_voltage_V is None:
-        return found
-    return dataclasses.replace(found, supply=jnp.full(points, obstacle.levers_voltage_V))
+        return sequences
+    return dataclasses.replace(sequences, supply=jnp.full(points, obstacle.levers_voltage_V))
 
 
 def _numbers(found: Climb) -> Columns:

@@ -121,12 +121,12 @@ class Pool:
             TimeoutError: no worker for `WORKER` seconds.
             LostWorkers: the scheduler is gone.
         """
-        found: list[Any] = []
+        finished: list[Any] = []
         failed: list[BaseException] = []
 
         def wait() -> None:
             try:
-                found.append(next(under_way))
+                finished.append(next(under_way))
             except BaseException as error:
                 failed.append(error)
 
@@ -138,7 +138,7 @@ class Pool:
                 self.client.wait_for_workers(1, timeout=WORKER)
         if failed:
             raise failed[0]
-        return found[0]
+        return finished[0]
 
     def _result(self, future: Any) -> Any:
         """Result of a finished future. If its worker is lost before the fetch, another worker recomputes it.
@@ -158,13 +158,15 @@ def _packed(job: Job) -> bytes:
     """A job as bytes, with the source of effects that are the user's own: workers need none of the user's files."""
     import cloudpickle
 
-    own = {sys.modules[type(e).__module__] for e in job.robot.effects if not type(e).__module__.startswith("mmrjax.")}
-    for module in own:
+    own_modules = {
+        sys.modules[type(e).__module__] for e in job.robot.effects if not type(e).__module__.startswith("mmrjax.")
+    }
+    for module in own_modules:
         cloudpickle.register_pickle_by_value(module)
     try:
         return bytes(cloudpickle.dumps(job))
     finally:
-        for module in own:
+        for module in own_modules:
             cloudpickle.unregister_pickle_by_value(module)
 
 
@@ -209,12 +211,12 @@ def _client(address: str) -> Any:
     """
     import distributed
 
-    found: list[Any] = []
+    clients: list[Any] = []
     failed: list[BaseException] = []
 
     def ask() -> None:
         try:
-            found.append(distributed.Client(address, timeout=ANSWER, name="mmrjax sweep", set_as_default=False))
+            clients.append(distributed.Client(address, timeout=ANSWER, name="mmrjax sweep", set_as_default=False))
         except BaseException as error:  # whatever comes of talking to something that is no scheduler
             failed.append(error)
 
@@ -222,8 +224,8 @@ def _client(address: str) -> Any:
         asking = threading.Thread(target=ask, daemon=True)
         asking.start()
         asking.join(ANSWER + 0.5)
-    if found:
-        return found[0]
+    if clients:
+        return clients[0]
     reason = (str(failed[0]).split("\n")[0] or type(failed[0]).__name__) if failed else "silence"
     raise BadConfiguration(
         f"--scheduler: got {address}; no scheduler answers there within {ANSWER:g} s ({reason}); expected the "

@@ -51,32 +51,32 @@ def chunk_tables(store: Path, layout: Layout) -> Iterator[Any]:
     for chunk in range(len(blocks)):
         box = blocks.box(chunk)
         shape = tuple(b.stop - b.start for b in box)
-        found: dict[str, Any] = {}
+        tables: dict[str, Any] = {}
         for k, (name, values) in enumerate(design.axes.items()):
             along = values[box[k]][(slice(None),) + (None,) * (len(shape) - k - 1)]
             flat = np.broadcast_to(along, shape).ravel()
             words = layout.labels.get(name)
             column, unit = COLUMNS.get(name, (name, 1.0))
-            found[column] = (
+            tables[column] = (
                 pa.array(flat / unit)
                 if words is None
                 else pa.DictionaryArray.from_arrays(flat.astype(np.int32), list(words))
             )
         for name in design.samples.names if design.samples is not None else ():
-            drawn: Any = group[name]
+            sampled: Any = group[name]
             column, unit = COLUMNS.get(name, (name, 1.0))
-            found[column] = pa.array(np.broadcast_to(drawn[box[-1]], shape).ravel() / unit)
+            tables[column] = pa.array(np.broadcast_to(sampled[box[-1]], shape).ravel() / unit)
         for variable in layout.variables:
             array: Any = group[variable.name]
             flat = array[box].ravel()
             if variable.name == STATUS:
-                found[STATUS] = pa.DictionaryArray.from_arrays(flat.astype(np.int32), list(STATUSES))
+                tables[STATUS] = pa.DictionaryArray.from_arrays(flat.astype(np.int32), list(STATUSES))
             elif np.dtype(variable.dtype).kind != "f":
                 names = [";".join(f for k, f in enumerate(FLAGS) if bits >> k & 1) for bits in range(1 << len(FLAGS))]
-                found[variable.name] = pa.DictionaryArray.from_arrays(flat.astype(np.int32), names)
+                tables[variable.name] = pa.DictionaryArray.from_arrays(flat.astype(np.int32), names)
             else:
-                found[columns.get(variable.name, variable.name)] = pa.array(flat, from_pandas=True)
-        yield pa.table(found)
+                tables[columns.get(variable.name, variable.name)] = pa.array(flat, from_pandas=True)
+        yield pa.table(tables)
 
 
 def _csv(path: Path, parts: Iterator[Any]) -> None:

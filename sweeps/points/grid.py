@@ -48,12 +48,12 @@ def resolve_grid(config: G, robot: Robot, battery: bool = False, notes: list[str
     """
     layout = Layout.of(robot)
     check_axes(config, robot)
-    own = AXIS[layout.imposed]
+    own_axis = AXIS[layout.imposed]
     update: dict[str, object] = {"configurations": grid_configurations(config, robot)}
     if battery:
         imposed.check_battery(robot)
-    elif getattr(config, own) is None:
-        update[own] = imposed.imposed_levels(robot, OPTIONS[own], notes)
+    elif getattr(config, own_axis) is None:
+        update[own_axis] = imposed.imposed_levels(robot, OPTIONS[own_axis], notes)
     if robot.has_ground:
         table8 = robot.rig.inherits
         update |= {
@@ -94,12 +94,12 @@ def grid_axes(config: GridPart, robot: Robot, battery: bool = False) -> dict[str
         BadConfiguration: a configuration that the robot does not have.
     """
     layout = Layout.of(robot)
-    found: dict[str, tuple[object, ...]] = {
+    axes: dict[str, tuple[object, ...]] = {
         "configuration": grid_configurations(config, robot),
         layout.imposed_column: (math.nan,) if battery else getattr(config, AXIS[layout.imposed]),
     }
     loads = {LOAD: config.load_torques_Nm, "payload_kg": config.payloads_kg, "slope_deg": config.slopes_deg}
-    return found | {column: values for column, values in loads.items() if values}
+    return axes | {column: values for column, values in loads.items() if values}
 
 
 def grid_conditions(config: GridPart, robot: Robot, battery: bool = False) -> Runs:

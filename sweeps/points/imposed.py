@@ -95,11 +95,11 @@ def imposed_levels(robot: Robot, option: str, notes: list[str] | None = None) ->
     most = imposed_limit(robot)
     if most is None:
         raise BadConfiguration(_missing(robot, option, SAID[robot.rig.imposed].several))
-    found = tuple(_digits(share * most) for share in SHARES)
+    levels = tuple(_digits(share * most) for share in SHARES)
     if notes is not None:
-        shown = ",".join(f"{v:g}" for v in found)
-        notes.append(f"{option}: not stated; thirds of the {_of(robot)} of the robot's file are taken: {shown}")
-    return found
+        level_text = ",".join(f"{v:g}" for v in levels)
+        notes.append(f"{option}: not stated; thirds of the {_of(robot)} of the robot's file are taken: {level_text}")
+    return levels
 
 
 def _of(robot: Robot) -> str:
@@ -118,9 +118,9 @@ def _missing(robot: Robot, option: str, example: str) -> str:
 
 def option_refusal(robot: Robot, option: str, instead: str) -> str:
     """Why an option of what is not imposed is refused."""
-    said = SAID[robot.rig.imposed]
+    reason = SAID[robot.rig.imposed]
     if robot.rig.imposed != "voltage":
-        return f"{option}: the {said.words} is imposed on this robot; state {instead} [{said.unit}]"
+        return f"{option}: the {reason.words} is imposed on this robot; state {instead} [{reason.unit}]"
     return f"{option}: the voltage is imposed on this robot, and its motors' speed follows; state {instead} [V]"
 
 
@@ -134,8 +134,8 @@ def check_acting(robot: Robot, ground: Iterable[str] = (), shaft: Iterable[str] 
         BadConfiguration: the first of them.
     """
     for option in shaft if robot.has_ground else ground:
-        why = "the robot's load is a shaft, and slope, payload, mass and surface do not act on it; leave it out"
-        raise BadConfiguration(f"{option}: {f'{NO_BRAKE}; leave it out' if robot.has_ground else why}")
+        why = "the robot's load is a shaft, and slope, payload, mass and surface do not act on it; remove it"
+        raise BadConfiguration(f"{option}: {f'{NO_BRAKE}; remove it' if robot.has_ground else why}")
 
 
 def check_battery(robot: Robot) -> None:
@@ -146,7 +146,7 @@ def check_battery(robot: Robot) -> None:
     """
     if robot.rig.imposed != "voltage":
         what = SAID[robot.rig.imposed].words
-        raise BadConfiguration(f"--battery: the {what} is imposed on this robot, whatever feeds them; leave it out")
+        raise BadConfiguration(f"--battery: the {what} is imposed on this robot, with any supply; remove it")
     if not capabilities.has_battery(robot):
         raise BadConfiguration("--battery: the robot's file states no battery; add [battery], or state --voltage")
 

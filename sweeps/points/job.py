@@ -108,8 +108,8 @@ def _bearable(variation: Variation, task: Task, plan: axes.Plan) -> None:
         try:
             fidelity.check(robot, jax.tree.map(lambda x: jnp.asarray(x)[None], conditions), task.options)
         except ValueError as error:
-            at = ", ".join(f"{n} {v:g}" for n, v in zip(plan.design.names, values, strict=True))
-            raise BadConfiguration(f"--model {task.model}: at {at}: {error}") from error
+            place = ", ".join(f"{n} {v:g}" for n, v in zip(plan.design.names, values, strict=True))
+            raise BadConfiguration(f"--model {task.model}: at {place}: {error}") from error
 
 
 def laid_out(config: Campaign, job: scale.Job) -> Layout:
@@ -120,8 +120,8 @@ def laid_out(config: Campaign, job: scale.Job) -> Layout:
     ]
     meanings = {"flag_values": [*range(len(STATUSES)), ABSENT], "flag_meanings": " ".join((*STATUSES, "absent"))}
     variables.append(Variable(STATUS, scale.KINDS[STATUS], {"long_name": "how the run ended", **meanings}))
-    known = job.plan.axes
-    coordinates = {n: _in_store({"units": axis.unit, "long_name": axis.meaning}) for n, axis in known.items()}
+    planned = job.plan.axes
+    coordinates = {n: _in_store({"units": axis.unit, "long_name": axis.meaning}) for n, axis in planned.items()}
     for name in {axes.CONFIGURATION} & set(coordinates):
         del coordinates[name]["units"]
     labels = {axes.CONFIGURATION: job.robot.configurations.names}

@@ -125,18 +125,18 @@ def compute_chunks(
     """
     chunks = range(len(job.blocks))
     files = [f"{name}-{k:06d}" for k in chunks]
-    found = {} if folder is None else {k: part for k in chunks if (part := folder.chunk(files[k])) is not None}
-    left, times = [k for k in chunks if k not in found], scale.Times()
-    advance(sum(map(job.blocks.count, found)))
+    stored = {} if folder is None else {k: part for k in chunks if (part := folder.chunk(files[k])) is not None}
+    left, times = [k for k in chunks if k not in stored], scale.Times()
+    advance(sum(map(job.blocks.count, stored)))
 
     def keep(chunk: int, arrays: Table, _: Any) -> None:
-        found[chunk] = kept(arrays)
+        stored[chunk] = kept(arrays)
         if folder is not None:
-            folder.keep_chunk(files[chunk], found[chunk])
+            folder.keep_chunk(files[chunk], stored[chunk])
 
     if left:
         scale.write_chunks(keep, job, scale.produce_chunks(scale.Compiled(job), left, times, advance), advance, times)
-    every = [found.pop(k) for k in chunks]
+    every = [stored.pop(k) for k in chunks]
     return {column: np.concatenate([part.pop(column) for part in every]) for column in tuple(every[0])}
 
 
@@ -173,14 +173,14 @@ def evaluate_runs(
     """
     job = job_of(robot, runs, config)
     slow = fidelities.fidelity_facts(config.model).slow or len(job.blocks) > 1
-    with bar(len(runs), quiet=not slow or advance is not None) as own:
-        found = compute_chunks(job, folder, "chunk", advance or own)
-    columns = {row.column: found[row.name] for row in outputs.output_table(robot.channels)}
-    further = {name: found[name] for name in fidelities.get_fidelity(config.model).columns}
+    with bar(len(runs), quiet=not slow or advance is not None) as progress_bar:
+        chunks = compute_chunks(job, folder, "chunk", advance or progress_bar)
+    columns = {row.column: chunks[row.name] for row in outputs.output_table(robot.channels)}
+    further = {name: chunks[name] for name in fidelities.get_fidelity(config.model).columns}
     return {
         **condition_table(robot, runs),
         **columns,
-        **outputs.status_words(found[STATUS], found[FLAGS_CODE]),
+        **outputs.status_words(chunks[STATUS], chunks[FLAGS_CODE]),
         **further,
     }
 
@@ -197,11 +197,11 @@ def follow_histories(robot: Robot, runs: Runs, model: str | None) -> Table:
     Raises:
         BadConfiguration: a fidelity that cannot follow them.
     """
-    seen = jax.device_get(
+    histories = jax.device_get(
         _observed(observers.Histories.of(runs, robot, model, PARTS), params.without_weak_types(robot))
     )
-    columns = {c.column: seen.reading[:, k] / c.factor for k, c in enumerate(robot.channels)}
-    return {**condition_table(robot, runs), **columns, **outputs.status_words(seen.status, seen.flags)}
+    columns = {c.column: histories.reading[:, k] / c.factor for k, c in enumerate(robot.channels)}
+    return {**condition_table(robot, runs), **columns, **outputs.status_words(histories.status, histories.flags)}
 
 
 @compiled
@@ -213,8 +213,8 @@ def condition_table(robot: Robot, runs: Runs) -> Columns:
     """The condition columns of a table, with the robot's total mass if the table has none."""
     columns = dict(runs.columns)
     if "total_mass_kg" in runs.layout.axes and "total_mass_kg" not in columns:
-        own = np.array([float(chassis.mass) for chassis in robot.configurations.members])
-        columns["total_mass_kg"] = own[runs.configurations(robot)] + runs["payload_kg"]
+        own_mass = np.array([float(chassis.mass) for chassis in robot.configurations.members])
+        columns["total_mass_kg"] = own_mass[runs.configurations(robot)] + runs["payload_kg"]
     shown = ("configuration", *dict.fromkeys((*runs.layout.axes, *runs.axes)), "surface", "run_id")
     return {key: columns[key] for key in shown if key in columns}
 

@@ -172,8 +172,8 @@ class Design:
             along = (slice(None),) + (None,) * (len(sizes) - k - 1)
             values[k] = axis[box[k]][along]
         if self.samples is not None:
-            drawn = self.samples.values(box[-1].start, sizes[-1])
-            for k, row in enumerate(drawn, len(self.axes)):
+            samples = self.samples.values(box[-1].start, sizes[-1])
+            for k, row in enumerate(samples, len(self.axes)):
                 values[k] = row
         return values.reshape(len(self.names), -1).T
 
@@ -231,8 +231,8 @@ class Blocks:
 
     def box(self, number: int) -> tuple[slice, ...]:
         """The points of a chunk along each axis."""
-        at = zip(self.place(number), self.size, self.shape, strict=True)
-        return tuple(slice(k * s, min((k + 1) * s, n)) for k, s, n in at)
+        places = zip(self.place(number), self.size, self.shape, strict=True)
+        return tuple(slice(k * s, min((k + 1) * s, n)) for k, s, n in places)
 
     def count(self, number: int) -> int:
         """Points of a chunk."""

@@ -143,15 +143,17 @@ class Compiled:
             which, values = values[:, 0].astype(int), values[:, 1:]
             conditions = jax.tree.map(lambda x: jax.device_put(np.asarray(x)[which], self._split), rows)
         names = [name for name in self.job.plan.design.names if name != ROW]
-        own = [k for k, name in enumerate(names) if name in self.job.task.axes]
-        placed = jax.device_put(np.delete(values, own, axis=1) if own else values, self._split)
+        own_places = [k for k, name in enumerate(names) if name in self.job.task.axes]
+        placed = jax.device_put(np.delete(values, own_places, axis=1) if own_places else values, self._split)
         if self.in_parts:
             conditions = _wide(_on_surface(self._variation, conditions, placed, self._asked.surface), len(values))
             run = self.job.task.run or self._run
-            sizes = values[:, own[0]] if own else None
+            sizes = values[:, own_places[0]] if own_places else None
             return _stored(run(self._variation, conditions, placed, sizes, told or _not_told), self._asked)
-        found: dict[str, Array] = self._program(self._variation, conditions, placed, self._asked, self.job.profile)
-        return found
+        values_by_name: dict[str, Array] = self._program(
+            self._variation, conditions, placed, self._asked, self.job.profile
+        )
+        return values_by_name
 
     def _run(self, variation: Variation, conditions: Conditions, values: Array, _: Any, told: Advance) -> Any:
         """A run of the fidelity."""
@@ -189,8 +191,8 @@ def _on_surface(
     """Conditions of points with the adhesion of their configurations on a surface, if one is stated."""
     if surface is None:
         return conditions
-    _, at = variation.at(values, conditions)
-    ratio = jnp.asarray(surface)[jnp.broadcast_to(at.configuration, values.shape[:1])]
+    _, conditions_there = variation.at(values, conditions)
+    ratio = jnp.asarray(surface)[jnp.broadcast_to(conditions_there.configuration, values.shape[:1])]
     return dataclasses.replace(_wide(conditions, len(values)), adhesion=ratio)
 
 
@@ -200,8 +202,8 @@ def _one_device(
     """Outputs of points as they are stored."""
     conditions = _on_surface(variation, conditions, values, asked.surface)
     names = tuple(name for name, _ in asked.factors)
-    found = evaluate_points(variation, asked.model, values, conditions, dict(asked.options), names, profile)
-    return _stored(found, asked)
+    values_by_name = evaluate_points(variation, asked.model, values, conditions, dict(asked.options), names, profile)
+    return _stored(values_by_name, asked)
 
 
 _one_device_kept = compiled(_one_device)
@@ -283,16 +285,16 @@ def _started(
 ) -> Piece:
     start = time.perf_counter()
     values = points.result()
-    made = time.perf_counter()
+    begin = time.perf_counter()
     if compiled.in_parts and advance is not None:
         count = compiled.job.blocks.count(chunk)
-        told = share_counter(advance, count)
-        piece = Piece(chunk, compiled(values, told), values, count)
-        told(1.0)
+        counter = share_counter(advance, count)
+        piece = Piece(chunk, compiled(values, counter), values, count)
+        counter(1.0)
     else:
         piece = Piece(chunk, compiled(values), values)
-    times.points += made - start
-    times.start += time.perf_counter() - made
+    times.points += begin - start
+    times.start += time.perf_counter() - begin
     return piece
 
 

@@ -55,33 +55,33 @@ def task_of(config: Campaign, robot: Robot, turns: bool = False) -> Task:
     """The task that a configuration states. `turns`: whether its profile drives the sides apart."""
     if config.obstacle is None:
         return of_fidelity(config.model, config.options, robot, config.profile is not None, turns)
-    obstacle, known = config.obstacle, climbs.climb_attributes(config.obstacle)
-    own = (
+    obstacle, attributes = config.obstacle, climbs.climb_attributes(config.obstacle)
+    own_options = (
         {SIZE: climbs.obstacle_axis(obstacle)},
         functools.partial(climbs.further_variation, obstacle),
         functools.partial(climbs.compute_climbs, obstacle),
     )
-    return Task("climb", {}, known, tuple(known), True, climbs.AT_ONCE, *own)
+    return Task("climb", {}, attributes, tuple(attributes), True, climbs.AT_ONCE, *own_options)
 
 
 def of_fidelity(
     model: str, options: Mapping[str, float], robot: Robot, profiled: bool = False, turns: bool = False
 ) -> Task:
     """Task of a run. `profiled`: over a profile, with its totals as outputs. `turns`: with both sides."""
-    facts, own, usual = (
+    facts, own_columns, usual = (
         fidelities.fidelity_facts(model),
         fidelities.get_fidelity(model).columns,
         channels.channel_names(robot.channels),
     )
     rows: dict[str, tuple[str, str]] = {r.name: (r.unit_shown, r.label) for r in outputs.output_table(robot.channels)}
-    rows |= {name: ("", name.replace("_", " ")) for name in own}
+    rows |= {name: ("", name.replace("_", " ")) for name in own_columns}
     if profiled:
         from mmrjax.missions import mission_batch  # which imports an integrator
 
         every = (*mission_batch.OUTPUTS, *(mission_batch.OF_TURNS if turns else ()))
         rows, usual = {r.column: (r.unit, r.label) for r in every}, mission_batch.USUAL
     flags = {"flag_masks": [1 << k for k in range(len(LIMITS))], "flag_meanings": " ".join(LIMITS)}
-    known: Attributes = {n: {"units": unit, "long_name": label} for n, (unit, label) in rows.items()}
-    known[FLAGS] = {"long_name": "limits exceeded", **flags}
+    attributes: Attributes = {n: {"units": unit, "long_name": label} for n, (unit, label) in rows.items()}
+    attributes[FLAGS] = {"long_name": "limits exceeded", **flags}
     at_once = facts.at_once(False), facts.at_once(True)
-    return Task(model, options, known, usual, facts.slow and not profiled, at_once)
+    return Task(model, options, attributes, usual, facts.slow and not profiled, at_once)

@@ -65,32 +65,32 @@ def simulate_draws(
     slow = fidelities.fidelity_facts(config.model).slow or draws * len(runs) > 100_000
 
     def summary(found: run.Table) -> run.Table:
-        seen = {name: values.reshape(-1, draws) for name, values in found.items()}
-        counts = np.isin(seen[STATUS], DONE) & np.isfinite(seen[robot.channels[0].name])
-        return _summary({o.column: seen[o.name] for o in outputs.output_table(robot.channels)}, counts)
+        by_name = {name: values.reshape(-1, draws) for name, values in found.items()}
+        counts = np.isin(by_name[STATUS], DONE) & np.isfinite(by_name[robot.channels[0].name])
+        return _summary({o.column: by_name[o.name] for o in outputs.output_table(robot.channels)}, counts)
 
     whole = job.blocks.size[-1] == draws  # of a run all draws are in one chunk, which is kept in short
     with progress_bar(draws, quiet=not slow, doing="draws") as advance:
-        found = run.compute_chunks(
+        chunks = run.compute_chunks(
             job, folder, "draws", lambda points: advance(points / len(runs)), summary if whole else dict
         )
-    return Intervals(found if whole else summary(found), draws, robot.channels)
+    return Intervals(chunks if whole else summary(chunks), draws, robot.channels)
 
 
 def _summary(columns: Columns, counts: np.ndarray) -> Columns:
     """Spread of each column over draws, arrays of shape (runs, draws), `counts`: where a draw converges."""
     enough = counts.sum(1) >= 2
-    found: Columns = {}
+    by_column: Columns = {}
     for column, values in columns.items():
         x = np.where(enough[:, None], np.where(counts, values, np.nan), 0.0)
         with np.errstate(invalid="ignore"):  # of windings that settle at no temperature
             low, high = np.nanquantile(x, QUANTILES, axis=1)
             spread = np.nanstd(x, 1, ddof=1)
-        found |= {
+        by_column |= {
             column + end: np.where(enough, value, np.nan)
             for end, value in ((SD, spread), (LOWER, low), (UPPER, high))
         }
-    return {**found, SHARE: counts.mean(1)}
+    return {**by_column, SHARE: counts.mean(1)}
 
 
 def interval_ranges(table: Columns, found: Intervals) -> list[str]:
@@ -103,8 +103,8 @@ def interval_ranges(table: Columns, found: Intervals) -> list[str]:
         least, most = rows[np.argmin(value[rows])], rows[np.argmax(value[rows])]
         ends = [with_sd(value[k], sd[k], c.resolution) for k in dict.fromkeys((int(least), int(most)))]
         ranges.append(f"{c.label}: {' to '.join(ends)} {c.unit}")
-    drawn, *lost = interval_remarks(found, "the table")
-    return [*[drawn] * bool(ranges), *ranges, *lost]
+    first_remark, *lost = interval_remarks(found, "the table")
+    return [*[first_remark] * bool(ranges), *ranges, *lost]
 
 
 def interval_remarks(found: Intervals, place: str = "runs.csv") -> list[str]:

@@ -105,28 +105,28 @@ def _hash(file: str) -> str:
 
 
 def _flat(content: Json, prefix: str) -> dict[str, str]:
-    found: dict[str, str] = {}
+    flat: dict[str, str] = {}
     for key, value in content.items():
         if isinstance(value, dict):
-            found |= _flat(value, f"{prefix}{key}.")
+            flat |= _flat(value, f"{prefix}{key}.")
         else:
-            found[f"{prefix}{key}"] = repr(value)
-    return found
+            flat[f"{prefix}{key}"] = repr(value)
+    return flat
 
 
 def identity_differences(
     stored: Mapping[str, Mapping[str, str]], now: Mapping[str, Mapping[str, str]], most: int = 3
 ) -> str:
     """In which sections two identities differ, with the first keys, empty where they do not."""
-    said = []
+    differences = []
     for section in dict.fromkeys((*now, *stored)):
         old, new = stored.get(section, {}), now.get(section, {})
         keys = [key for key in dict.fromkeys((*new, *old)) if old.get(key) != new.get(key)]
         if keys:
-            shown = [f"{key}{_change(old.get(key), new.get(key), section)}" for key in keys[:most]]
+            changes = [f"{key}{_change(old.get(key), new.get(key), section)}" for key in keys[:most]]
             more = f" and {len(keys) - most} more" if len(keys) > most else ""
-            said.append(f"{section} ({', '.join(shown)}{more})")
-    return "; ".join(said)
+            differences.append(f"{section} ({', '.join(changes)}{more})")
+    return "; ".join(differences)
 
 
 def _change(old: str | None, new: str | None, section: str) -> str:
@@ -189,13 +189,13 @@ class Layout:
         each = sum(_on_disk(np.dtype(v.dtype).itemsize * points) for v in self.variables) * len(self.blocks)
         outputs = each + BLOCK * folders * len(self.variables)
         names = () if self.design.samples is None else self.design.samples.names
-        drawn = len(names) * counts[-1] * _on_disk(8 * self.blocks.size[-1])
+        sample_size = len(names) * counts[-1] * _on_disk(8 * self.blocks.size[-1])
         axes = sum(_on_disk(8 * len(values)) for values in self.design.axes.values())
         arrays = len(self.variables) + len(names) + len(self.design.axes)
         widest = {v.name: (-1.2345678901234567e-300,) * 2 for v in self.variables}
         checks = dict.fromkeys([*widest, *names], 2**32 - 1)
         line = _line(Done(len(self.blocks), (points,) * len(STATUSES), widest, checks))
-        return outputs + drawn + axes + arrays * (3 * BLOCK + METADATA) + _on_disk(len(line) * len(self.blocks))
+        return outputs + sample_size + axes + arrays * (3 * BLOCK + METADATA) + _on_disk(len(line) * len(self.blocks))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -359,8 +359,8 @@ class SweepStore(Folder):
         with tempfile.TemporaryDirectory() as place:
             create_store(Path(place) / STORE, self.layout)
             whole = {p.relative_to(place): p.read_bytes() for p in Path(place).rglob("*") if p.is_file()}
-        found = {folder / name: content for name, content in whole.items()}
-        return {p: content for p, content in found.items() if not p.is_file() or p.read_bytes() != content}
+        contents = {folder / name: content for name, content in whole.items()}
+        return {p: content for p, content in contents.items() if not p.is_file() or p.read_bytes() != content}
 
     def _mend_layout(self) -> None:
         """Write what is damaged of metadata and axes anew, with a note."""
@@ -435,14 +435,14 @@ class SweepStore(Folder):
 
     def _records(self) -> dict[int, list[Done]]:
         """Lines of all journals that are whole, by chunk."""
-        found: dict[int, list[Done]] = {}
+        records: dict[int, list[Done]] = {}
         folder = self.path if self.finished else self.partial
         for file in sorted((folder / JOURNAL).glob("*.jsonl")):
             for line in file.read_text(encoding="utf-8", errors="replace").splitlines():
                 record = _record(line)
                 if record is not None and 0 <= record.chunk < len(self.layout.blocks):
-                    found.setdefault(record.chunk, []).append(record)
-        return found
+                    records.setdefault(record.chunk, []).append(record)
+        return records
 
     def _wrong_file(self, record: Done) -> Path | None:
         """File of a chunk that is not as it was written, None if all are."""
@@ -458,10 +458,10 @@ class SweepStore(Folder):
     def _files(self, chunk: int) -> dict[str, Path]:
         """Files of a chunk within the store, by array: those of the samples at the beginning of all other axes."""
         place, samples = self.layout.blocks.place(chunk), self.layout.design.samples
-        found = {v.name: Path(v.name, "c", *map(str, place)) for v in self.layout.variables}
+        files = {v.name: Path(v.name, "c", *map(str, place)) for v in self.layout.variables}
         if samples is not None and not any(place[:-1]):
-            found |= {name: Path(name, "c", *map(str, place[-1:])) for name in samples.names}
-        return found
+            files |= {name: Path(name, "c", *map(str, place[-1:])) for name in samples.names}
+        return files
 
     def write(self, chunk: int, arrays: Columns, drawn: np.ndarray | None) -> Done:
         """Write a chunk and count it as done.
@@ -590,8 +590,8 @@ def create_store(path: Path, layout: Layout) -> None:
     compressors = None if layout.compression == "none" else [ZstdCodec(**ZSTD)]
     group = zarr.create_group(path, zarr_format=3, attributes=dict(layout.attributes))
     design, blocks = layout.design, layout.blocks
-    drawn = design.samples.names if design.samples is not None else ()
-    further = {"coordinates": " ".join(drawn)} if drawn else {}
+    sampled_names = design.samples.names if design.samples is not None else ()
+    further = {"coordinates": " ".join(sampled_names)} if sampled_names else {}
     for v in layout.variables:
         group.create_array(
             v.name, shape=design.shape, chunks=blocks.size, dtype=v.dtype, fill_value=fill_value(v),
@@ -604,7 +604,7 @@ def create_store(path: Path, layout: Layout) -> None:
             dimension_names=(name,), attributes=dict(layout.coordinates[name]),
         )  # fmt: skip
         array[:] = np.array([words[int(k)] for k in values], object) if words else values
-    for name in drawn:
+    for name in sampled_names:
         group.create_array(
             name, shape=design.shape[-1:], chunks=blocks.size[-1:], dtype="float64", fill_value=math.nan,
             compressors=compressors, dimension_names=(SAMPLE,), attributes=dict(layout.coordinates[name]),

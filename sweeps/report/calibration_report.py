@@ -98,15 +98,15 @@ def _over_rows(found: CalibrationResult, sized: bool) -> Iterable[Section]:
     """Simulated readings over time, over the measured ones, and their errors over each condition."""
     table = found.rows()
     table |= {f"simulated_{c.column}": table[f"after_{c.column}"] for c in found.channels}
-    answer, shown = fit_words.calibration_answer(found), found.channels
+    answer, panels = fit_words.calibration_answer(found), found.channels
     if found.axis:
         lines = {"after_": "calibrated", "before_": "before"}
-        yield Section("Histories", (catalogue.figure("fit.overlay", table, shown, lines, finding=answer),))
+        yield Section("Histories", (catalogue.figure("fit.overlay", table, panels, lines, finding=answer),))
     unit = "the channel's unit; band: ±2 sd of the readings" if sized else f"percent of the {OF_SIZE}"
     along = {found.axis: "time [s]"} if found.axis else {}
     figures = (
-        catalogue.figure("calibration.parity", table, shown, not sized, more="" if sized else " Band: ±5 %."),
-        catalogue.figure("calibration.residuals", table, shown, sized, along, words=(unit,)),
+        catalogue.figure("calibration.parity", table, panels, not sized, more="" if sized else " Band: ±5 %."),
+        catalogue.figure("calibration.residuals", table, panels, sized, along, words=(unit,)),
     )  # fmt: skip
     yield from (Section(h, (f,)) for h, f in zip(("Parity", "Residuals over every condition"), figures, strict=True))
 

@@ -48,25 +48,25 @@ def campaign_document(file: RobotFile, layout: Layout, result: Json, store: Path
 
 
 def _sections(store: Path, layout: Layout, extremes: Json) -> Iterable[Section]:
-    values, found = sample_points(store, layout)
+    values, points = sample_points(store, layout)
     yield Section("What varies", (_varied(layout, values),), "varied")
-    if VERDICT in found:
-        codes, design = found[VERDICT].astype(int), layout.design
+    if VERDICT in points:
+        codes, design = points[VERDICT].astype(int), layout.design
         meanings = next(v.attributes for v in layout.variables if v.name == VERDICT)["flag_meanings"].split()
         rows = [(f"`{meanings[k]}`", int((codes == k).sum()), *VERDICTS[meanings[k]]) for k in np.unique(codes)]
         others = [n for n in design.axes if n != SIZE and len(design.axes[n]) > 1][:1]
         figure = catalogue.figure("campaign.endings", codes, meanings, values, layout, *others)  # fmt: skip
-        drawn = (figure,) * bool(others and SIZE in design.axes)
+        figures = (figure,) * bool(others and SIZE in design.axes)
         yield Section(
             "How the climbs ended",
             (
-                Note(_largest(values, found, layout), "answer", "largest"),
+                Note(_largest(values, points, layout), "answer", "largest"),
                 catalogue.table("campaign.endings", rows),
-                *drawn,
+                *figures,
             ),
             "verdicts",
         )
-    yield Section("What came out", tuple(_outputs(values, found, layout, extremes)), "outputs")
+    yield Section("What came out", tuple(_outputs(values, points, layout, extremes)), "outputs")
 
 
 def _outputs(values: np.ndarray, found: Columns, layout: Layout, extremes: Json) -> Iterable[Block]:
@@ -86,8 +86,8 @@ def _outputs(values: np.ndarray, found: Columns, layout: Layout, extremes: Json)
                 finding=f"{label} over what varies", words=(label.capitalize(),),
             )  # fmt: skip
             figures.append(dataclasses.replace(spread, name=f"spread_{name}"))
-    drawn = "" if len(values) == layout.design.points else " drawn at random"
-    yield catalogue.note("campaign.thinned", len(values), drawn)
+    suffix = "" if len(values) == layout.design.points else " drawn at random"
+    yield catalogue.note("campaign.thinned", len(values), suffix)
     yield catalogue.table("campaign.ranges", rows)
     yield from figures
 
@@ -99,11 +99,11 @@ def _largest(values: np.ndarray, found: Columns, layout: Layout) -> str:
     k = int(np.argmax(sizes))
     if sizes[k] <= 0:
         return "No obstacle is got over."
-    at = []
+    places = []
     for name, value in zip(names, values[k], strict=True):
         labels, unit = layout.labels.get(name), layout.coordinates[name].get("units", "").removeprefix("1")
-        at.append(f"{name} {labels[int(value)] if labels else f'{value:.4g} {unit}'.strip()}")
-    rest = ", ".join(words for name, words in zip(names, at, strict=True) if name != SIZE)
+        places.append(f"{name} {labels[int(value)] if labels else f'{value:.4g} {unit}'.strip()}")
+    rest = ", ".join(words for name, words in zip(names, places, strict=True) if name != SIZE)
     return f"The largest obstacle that is got over: {sizes[k]:.4g} mm{', at ' if rest else ''}{rest}."
 
 
@@ -120,14 +120,14 @@ def sample_points(store: Path, layout: Layout) -> tuple[np.ndarray, Columns]:
     chunks = np.sort(rng.permutation(len(blocks))[:CHUNKS])
     each = -(-THINNED // len(chunks))
     values: list[np.ndarray] = []
-    found: dict[str, list[np.ndarray]] = {v.name: [] for v in layout.variables}
+    values_by_name: dict[str, list[np.ndarray]] = {v.name: [] for v in layout.variables}
     for chunk in map(int, chunks):
         box, count = blocks.box(chunk), blocks.count(chunk)
         rows = np.sort(rng.permutation(count)[:each]) if count > each else np.arange(count)
         values.append(layout.design.block(box)[rows])
         for variable in layout.variables:
-            found[variable.name].append(group[variable.name][box].ravel()[rows])
-    return np.concatenate(values), {name: np.concatenate(parts) for name, parts in found.items()}
+            values_by_name[variable.name].append(group[variable.name][box].ravel()[rows])
+    return np.concatenate(values), {name: np.concatenate(parts) for name, parts in values_by_name.items()}
 
 
 def _varied(layout: Layout, values: np.ndarray) -> Table:

@@ -22,14 +22,14 @@ def _content() -> Json:
 def _entry(name: str) -> Json:
     """Words of a figure, table or note, `report.name` of the catalogue."""
     room, _, key = name.partition(".")
-    found: Json = _content()[room][key]
-    return found
+    entry: Json = _content()[room][key]
+    return entry
 
 
 def text(name: str, *words: Any) -> str:
     """A text of the catalogue, with values in it."""
-    said: str = _entry(name).get("text", "")
-    return said.format(*words) if words else said
+    sentence: str = _entry(name).get("text", "")
+    return sentence.format(*words) if words else sentence
 
 
 def figure(name: str, *drawn: Any, finding: str = "", words: Sequence[Any] = (), more: str = "") -> Figure:

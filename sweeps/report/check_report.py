@@ -75,18 +75,18 @@ def _share(outcome: Outcome) -> float:
 
 def requirement_label(outcome: Outcome) -> str:
     """Name of a requirement, with its duty."""
-    at = outcome.at
+    point = outcome.at
     duty = ""
-    if "duty" in at:
-        duty = f" {at['duty']}" + (f" {100 * at['share']:g} % of the time" if at["share"] else " still")
+    if "duty" in point:
+        duty = f" {point['duty']}" + (f" {100 * point['share']:g} % of the time" if point["share"] else " still")
     return f"{outcome.requirement.quantity.label}{duty}"
 
 
 def requirement_limit(outcome: Outcome) -> float:
     """Required value, or the rating of the part."""
-    found = outcome.requirement.limit
-    assert found is not None
-    return found
+    limit = outcome.requirement.limit
+    assert limit is not None
+    return limit
 
 
 def required_value_text(outcome: Outcome) -> str:

@@ -29,9 +29,9 @@ from sweeps.report.document import Block, Document, Note, Section, Table
 VERDICTS: dict[str, tuple[str, str]] = {
     "over": ("gets over", "the rear axle is past the obstacle and a wheel's radius beyond"),
     "tips": ("tips over", "the robot pitched by more than 100 deg"),
-    "stalls": ("stalls", "it comes no further and its tracks stand: the motors cannot turn them"),
-    "slides": ("slides", "it comes no further and its tracks run on: the ground does not hold them"),
-    "hangs": ("hangs", "it comes no further with its body on an edge, or has fallen into a gap"),
+    "stalls": ("stalls", "it stops and its tracks stand still: the motors cannot turn them"),
+    "slides": ("slides", "it stops and its tracks slip: the ground has too little grip"),
+    "hangs": ("hangs", "it stops with its body on an edge, or has fallen into a gap"),
     "unfinished": ("is under way", "the time was over while it still went on; take a longer --duration"),
     "failed": ("failed", "numbers of the run went wrong, or its levers would begin below the ground"),
 }
@@ -89,15 +89,15 @@ class Seen:
             BadConfiguration: it is none.
         """
         try:
-            found = json.loads((folder / "result.json").read_text("utf-8"))
-            ground = found["terrain"]
+            content = json.loads((folder / "result.json").read_text("utf-8"))
+            ground = content["terrain"]
             with (folder / "history.csv").open(newline="", encoding="utf-8") as stream:
                 rows = list(csv.DictReader(stream))
             table = {name: np.array([float(row[name]) for row in rows]) for name in (*COORDINATES, *FILMED)}
             lengths = (jnp.asarray(ground[name]) / 1000 for name in ("points_mm", "nose_mm", "finish_mm"))
             return Seen(
                 robot_file.find_robot_file(str(folder / "robot.toml")).robot,
-                found["configuration"], found["obstacle"], Terrain(*lengths), table,
+                content["configuration"], content["obstacle"], Terrain(*lengths), table,
             )  # fmt: skip
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise BadConfiguration(f"--climb: {folder} cannot be read; expected a folder of mmrjax climb") from error
@@ -179,20 +179,22 @@ class ClimbResult:
         """Margins of the run, shares by the names of `OUTPUTS`. None of a run without numbers."""
         if self.verdict == "failed":
             return {}
-        found = outputs_of_run(self.robot, self.terrain, self.climb, 0)
-        return {name: float(value) for name, value in found.items() if name.startswith("margin_")}
+        run_outputs = outputs_of_run(self.robot, self.terrain, self.climb, 0)
+        return {name: float(value) for name, value in run_outputs.items() if name.startswith("margin_")}
 
     @property
     def slopes(self) -> list[Json] | None:
         """Derivatives, a row an output and value that it is derived by. None: not asked for."""
-        along, found = self.along, self.derivatives
-        if along is None or found is None:
+        along, derivatives = self.along, self.derivatives
+        if along is None or derivatives is None:
             return None
         by = ("by", "by_unit", "by_value", "by_width")
         names = ("output", "unit", "value", *by, "derivative", "slope", "slope_sd")
-        found_by = {name: (found.by[name], found.slope[name], found.slope_sd[name]) for name in OUTPUTS}
+        found_by = {
+            name: (derivatives.by[name], derivatives.slope[name], derivatives.slope_sd[name]) for name in OUTPUTS
+        }
         return [
-            dict(zip(names, (n, unit, found.found[n], *row, *(float(x[k]) for x in found_by[n])), strict=True))
+            dict(zip(names, (n, unit, derivatives.found[n], *row, *(float(x[k]) for x in found_by[n])), strict=True))
             for n, (unit, _) in OUTPUTS.items()
             for k, row in enumerate(along.rows)
         ]

@@ -119,14 +119,14 @@ _FITS = {
 
 def comparison_document(found: Comparison) -> Document:
     """The report of a comparison."""
-    known = found.table, found.channels
+    table = found.table, found.channels
     lead = (
         f"Robot: **{found.robot_name}**. Fidelity: **{found.model}**. Measured: **{found.source}**, "
         f"{count_noun(len(found.table['status']), 'row')}."
     )
     parity = catalogue.figure(
         "comparison.parity",
-        *known,
+        *table,
         False,
         finding="Simulated less measured, on average: "
         + "; ".join(
@@ -135,7 +135,7 @@ def comparison_document(found: Comparison) -> Document:
             if np.isfinite(e := found.table[f"error_{c.name}_percent"]).any()
         ),
     )
-    errors = catalogue.figure("comparison.errors", *known, True, found.over, finding=_trend(found))
+    errors = catalogue.figure("comparison.errors", *table, True, found.over, finding=_trend(found))
     status = found.table["status"]
     return Document(
         f"{found.robot_name} against {found.source}",
@@ -189,8 +189,8 @@ def comparison_answer(found: Comparison) -> str:
     what = f"{rows} of {total} rows" if rows < total else count_noun(total, "row")
     if found.over is not None:
         what = f"{_seconds(found):.3g} s of log"
-    said = f"{what}: rms error {errors} (worst reading {worst:.1f} %). {_FITS[found.fit]}".rstrip()
-    return said if not found.against else f"{said} {_second_robot(found)}"
+    sentence = f"{what}: rms error {errors} (worst reading {worst:.1f} %). {_FITS[found.fit]}".rstrip()
+    return sentence if not found.against else f"{sentence} {_second_robot(found)}"
 
 
 def _second_robot(found: Comparison) -> str:
@@ -229,10 +229,10 @@ def _errors_table(found: Comparison) -> Table:
 
 
 def _rows(found: Comparison) -> Table:
-    table, shown = found.table, condition_formats(found.table, mass=True)
-    heads = [Column("configuration"), *(Column(heading, form=form) for heading, form in shown.values())]
+    table, formats = found.table, condition_formats(found.table, mass=True)
+    heads = [Column("configuration"), *(Column(heading, form=form) for heading, form in formats.values())]
     heads.append(Column("status"))
-    cells: list[Any] = [table["configuration"], *(table[c] for c in shown)]
+    cells: list[Any] = [table["configuration"], *(table[c] for c in formats)]
     cells.append([_status(str(s)) for s in table["status"]])
     for c in found.channels:
         measured, simulated = table[c.column], table[f"simulated_{c.column}"]

@@ -86,15 +86,15 @@ def columns(*titles: str) -> tuple[Column, ...]:
 
     Without ` | ` a column has text, with nothing behind it texts of numbers. `~` marks a column for the page only.
     """
-    found = []
+    columns_so_far = []
     for title in titles:
         name, bar, form = title.removeprefix("~").partition(" |")
         group, _, heading = name.rpartition(" > ")
         heading, _, unit = heading.removesuffix("]").partition(" [")
         form = form.strip()
         form = form if "{" in form or not bar else f"{{:{form}}}"
-        found.append(Column(heading, unit, form, group, not title.startswith("~")))
-    return tuple(found)
+        columns_so_far.append(Column(heading, unit, form, group, not title.startswith("~")))
+    return tuple(columns_so_far)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -151,13 +151,13 @@ class Table:
     @property
     def groups(self) -> list[tuple[str, int]]:
         """Headings above the columns, each with its number of columns. All empty for a table without groups."""
-        found: list[tuple[str, int]] = []
+        group_widths: list[tuple[str, int]] = []
         for column in self.columns:
-            if found and column.group and found[-1][0] == column.group:
-                found[-1] = column.group, found[-1][1] + 1
+            if group_widths and column.group and group_widths[-1][0] == column.group:
+                group_widths[-1] = column.group, group_widths[-1][1] + 1
             else:
-                found.append((column.group, 1))
-        return found
+                group_widths.append((column.group, 1))
+        return group_widths
 
     @property
     def csv(self) -> str:

@@ -79,7 +79,13 @@ def _findings(found: DiscoveryResult, changes: Mapping[str, Change]) -> Iterable
             size += f", which changes the {changes[e.name].channel.label} by {changes[e.name].rms:.2g} %"
         or_else = f" Or {other}." if other else ""
         kinds = ", or ".join(e.families)
-        yield f"**{kinds}** (`{e.name}`): {size}; {loop_words.how_sure(found, e)}.{or_else}"
+        sure = f"{_noise_alone(found).lower()}{loop_words.how_sure(found, e)}"
+        yield f"**{kinds}** (`{e.name}`): {size}; {sure}.{or_else}"
+
+
+def _noise_alone(found: DiscoveryResult) -> str:
+    """Opening of a claim that does not hold at every noise tried, "" for one that does."""
+    return "" if found.headline.level == found.verdict else "At 1 times the noise alone: "
 
 
 def moved_parameters(found: DiscoveryResult) -> Iterable[str]:
@@ -136,8 +142,8 @@ def held_out_table(found: DiscoveryResult) -> Table:
         for c in both[0]:
             texts = [f"{e[c]['rms_percent']:.1f}" if e[c]["rows"] else "-" for e in both[: 1 + many]]
             change = both[1][c]["rms_percent"] - both[0][c]["rms_percent"] if many else 0.0
-            shown = np.inf if c in worse else change if not kind or change < 0 else 0.0
-            cells.append(_marked(" → ".join(texts), shown))
+            change_shown = np.inf if c in worse else change if not kind or change < 0 else 0.0
+            cells.append(_marked(" → ".join(texts), change_shown))
         reached = max(int(e["rows"]) for e in both[0].values())
         what = f"unseen: another {blocks.kind_in_words(kind)}" if kind else "seen by the fit"
         rows.append((what, *cells, f"{reached} of {total}"))
@@ -154,12 +160,12 @@ def _advice(found: DiscoveryResult) -> Table:
         level, texts = found.headline.level, {"none", "undescribed", "named", "open"}
         next_step = catalogue.text(f"loop.next-{level if level in texts else 'other'}")
     else:
-        tells = f" Tells {', '.join(after.separates)}; expected separation {after.expected_sigma:.1f} σ."
+        tells = f" It distinguishes {', '.join(after.separates)}; expected separation {after.expected_sigma:.1f} σ."
         undecided = " Some pairs stay undecided." if found.headline.level == "class" and not after.settles else ""
         next_step = f"**{after.name}**: {after.description}.{tells * bool(after.separates)}{undecided}"
     far = [describe(note) for note in with_codes(found.remarks, "far_from_prior", "repeats", "copied")]
     against = [note for note in found.remarks if isinstance(note, str)]
-    said = [
+    sentences = [
         loop_words.largest_share(found),
         *far,
         *against[:1],
@@ -168,7 +174,9 @@ def _advice(found: DiscoveryResult) -> Table:
         ("use it?", " ".join(loop_words.use_it(found)) or "No runs could be held out."),
         (
             "check first",
-            " ".join([f"{text if '.' in text.split()[0] else text[0].upper() + text[1:]}." for text in said if text])
+            " ".join(
+                [f"{text if '.' in text.split()[0] else text[0].upper() + text[1:]}." for text in sentences if text]
+            )
             or "Nothing unusual.",
         ),
         ("do next", next_step),
@@ -257,9 +265,8 @@ def _certain(found: DiscoveryResult, missing: bool) -> Iterable[Section]:
     noise = loop_words.at_other_noise(found.sensitivity) if found.sensitivity else ""
     noises = {name: (n["median_percent"], n["source"]) for name, n in found.noise.items()}
     notes = [*found.notes, noise, fit_tables.noise_sentence(noises, found.channels)]
-    at = "" if found.headline.level == found.verdict else "At 1 times the noise alone: "
     blocks = [
-        Note(f"{at}{found.verdict_statement}", name="statement", terminal=True),
+        Note(f"{_noise_alone(found)}{found.verdict_statement}", name="statement", terminal=True),
         *([Note(loop_words.cluster_sentence(found.cluster), name="cluster")] if found.cluster else []),
         *(Note(text, name=name, terminal=True) for name, text in reasons.items() if text),
         *remarks(also, "also"),
@@ -322,9 +329,9 @@ def _where_missing(found: DiscoveryResult, table: Columns, changes: Mapping[str,
         more = catalogue.text("loop.unresolved", names) if names else ""
         yield catalogue.figure("loop.series", detail, found.channels, verdict, words=numbers, more=more)
     else:
-        drawn = table, verdict, sized
+        figure_input = table, verdict, sized
         yield catalogue.figure(
-            "loop.defects", *drawn, words=(_closed(found, table) if sized else catalogue.text("loop.three"),)
+            "loop.defects", *figure_input, words=(_closed(found, table) if sized else catalogue.text("loop.three"),)
         )
     if found.unnamed is not None:
         curve = found.unnamed

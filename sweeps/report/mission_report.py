@@ -87,9 +87,9 @@ _NO_RETURN = "Nothing came back to the source"
 def missions_document(file: RobotFile, found: Missions) -> Document:
     """The report of finished missions. In detail the first run."""
     table, source = found.table, found.source
-    shown = capabilities.without_idle(file.robot, table)
+    shown_columns = capabilities.without_idle(file.robot, table)
     first, names = {key: value[0] for key, value in table.items()}, _names(table)
-    answer = mission_answer({key: value[0] for key, value in shown.items()}, file.robot.has_ground)
+    answer = mission_answer({key: value[0] for key, value in shown_columns.items()}, file.robot.has_ground)
     fed = "battery" if np.isfinite(first["state_of_charge"]) else "supply"
     cycles, each = (f", {source.cycles} cycles", " each") if source.cycles > 1 else ("", "")
     between = "linear" if source.linear else "held"
@@ -99,7 +99,7 @@ def missions_document(file: RobotFile, found: Missions) -> Document:
     )
     detail = f"In detail the first of {len(names)} runs: **{names[0]}**." if len(names) > 1 else ""
     runs = run_tables.quantity_table(
-        "runs", shown, _RUNS, first=[(Column("run"), names)], file="runs.csv", sideways=True
+        "runs", shown_columns, _RUNS, first=[(Column("run"), names)], file="runs.csv", sideways=True
     )
     endings = run_tables.endings_table(Counter(map(str, table["status"])))
     whole = len(names) == 1 and first["status"] == "converged"
@@ -121,8 +121,8 @@ def missions_document(file: RobotFile, found: Missions) -> Document:
 def _sections(robot: Robot, found: Missions, first: Json, answer: str) -> Iterable[Section]:
     """The first run over time, from above, its energy and its segments."""
     source, name, limit = found.source, found.segments["run_id"][0], float(robot.motor.temperature_limit)
-    mine = found.course["run_id"] == name
-    rows = {key: value[mine] for key, value in capabilities.without_idle(robot, found.course).items()}
+    run_rows = found.course["run_id"] == name
+    rows = {key: value[run_rows] for key, value in capabilities.without_idle(robot, found.course).items()}
     cycle = float(source.time[-1] - source.time[0]) if source.cycles > 1 else None
     course = catalogue.figure(
         "mission.course", rows, cycle, limit, source.linear, float(robot.sides), words=(len(rows["time_s"]),),
@@ -147,9 +147,9 @@ def _sections(robot: Robot, found: Missions, first: Json, answer: str) -> Iterab
     returned = f"{back:.3g} Wh came back to the source." if back > 1e-6 * first["energy_drawn_Wh"] else (
         f"{_NO_RETURN}; what driven motors give feeds the other consumers first." if on_battery else f"{_NO_RETURN}."
     )  # fmt: skip
-    asked = "battery's charge" if on_battery else "supply", returned, abs(first["unaccounted_share"])
+    source_name = "battery's charge" if on_battery else "supply", returned, abs(first["unaccounted_share"])
     energy = catalogue.figure(
-        "mission.energy", first, on_battery, robot.has_ground, finding=answer, words=asked
+        "mission.energy", first, on_battery, robot.has_ground, finding=answer, words=source_name
     )  # fmt: skip
     yield Section("Where the energy goes", (energy,), "energy-section")
     yield Section(
@@ -159,20 +159,20 @@ def _sections(robot: Robot, found: Missions, first: Json, answer: str) -> Iterab
 
 
 def _names(runs: Columns) -> list[str]:
-    """Headings of runs. What the profile states in the place of a run's condition is left out."""
+    """Headings of runs, without the conditions that the profile states."""
     parts = (label.split(", ") for label in run_headings(runs))
     return [", ".join([head, *(p for p in rest if not p.startswith("nan"))]) for head, *rest in parts]
 
 
 def mission_answer(run: Json, on_ground: bool = True) -> str:
     """One sentence: energy of the mission, its largest shares, and how long the battery lasts."""
-    drawn = float(run["energy_drawn_Wh"])
+    energy = float(run["energy_drawn_Wh"])
     text = f"The mission takes {float(run['energy_Wh']):.3g} Wh"
     if np.isfinite(run.get("distance_m", np.nan)) and run["distance_m"] > 0:
         text += f" over {run['distance_m']:.0f} m"
-    if drawn > 0:
+    if energy > 0:
         labels = words.sink_labels(on_ground)
-        shares = {labels[name]: float(run[f"energy_to_{name}_Wh"]) / drawn for name in SINKS}
+        shares = {labels[name]: float(run[f"energy_to_{name}_Wh"]) / energy for name in SINKS}
         largest = sorted(shares, key=lambda label: -shares[label])[:2]
         parts = [f"{label} {100 * shares[label]:.0f} %" for label in largest if shares[label] > 0]
         text += f" ({', '.join(parts)})"
@@ -186,7 +186,7 @@ def mission_limits(robot: Robot, run: Json) -> list[Json]:
     """Use of each limit by a mission."""
     motor, gearbox, heat = robot.motor, robot.gearbox, robot.knows(WARMING)
     speed, unknown = run["peak_motor_speed_rpm"], 0.0 if heat else np.nan
-    asked = [
+    limits = [
         ("hottest winding", run["winding_peak_C"] + unknown, motor.temperature_limit, "{:.0f} °C"),
         ("motor speed", speed, float(motor.speed_limit) / RPM, "{:.0f} rpm"),
         ("gearbox input speed", speed, float(gearbox.speed_limit) / RPM, "{:.0f} rpm"),
@@ -194,7 +194,7 @@ def mission_limits(robot: Robot, run: Json) -> list[Json]:
          "{:.2f} A"),
         ("rms torque, one gearbox", run["rms_torque_Nm"], gearbox.torque_limit or np.nan, "{:.2f} N·m"),
     ]  # fmt: skip
-    used = run_tables.use_of_limits(asked, float(motor.temperature_ambient))
+    used = run_tables.use_of_limits(limits, float(motor.temperature_ambient))
     low, cutoff = float(run["cell_low_V"]), float(robot.battery.voltage_cutoff)
     if np.isfinite(low):
         line = {"words": "lowest cell (not below)", "value": f"{low:.2f} V", "limit": f"{cutoff:.2f} V"}
@@ -225,29 +225,31 @@ def _charge_left(table: Columns) -> Iterable[str]:
 def _segments(found: Missions, name: str, idle: set[str]) -> Table:
     """Segments of one run: the first cycle, and totals over all cycles."""
     source, many = found.source, found.source.cycles > 1
-    shown = [c for c in _OF_SEGMENTS if c not in idle]
-    totals = [c for c in shown if c != "rms_current_A"] if many else []
+    shown_columns = [c for c in _OF_SEGMENTS if c not in idle]
+    totals = [c for c in shown_columns if c != "rms_current_A"] if many else []
     rows = {key: value[found.segments["run_id"] == name] for key, value in found.segments.items()}
     whole, answer = float(np.sum(rows["energy_Wh"])), []
     for k in range(min(source.segments, SEGMENTS)):
-        mine = {key: value[rows["segment"] == k + 1] for key, value in rows.items()}
-        if not len(mine["status"]):
+        segment_rows = {key: value[rows["segment"] == k + 1] for key, value in rows.items()}
+        if not len(segment_rows["status"]):
             continue
-        ends = Counter(map(words.short_status, map(str, mine["status"])))
-        flags = dict.fromkeys(flag for f in mine["flags"] for flag in str(f).split(";") if flag)
+        ends = Counter(map(words.short_status, map(str, segment_rows["status"])))
+        flags = dict.fromkeys(flag for f in segment_rows["flags"] for flag in str(f).split(";") if flag)
         begin, end = (float(source.time[j] - source.time[0]) for j in (k, k + 1))
-        sums = [np.sum(mine[c]) if c in ("energy_Wh", "distance_m") else np.max(mine[c]) for c in totals]
-        shares = [100 * float(np.sum(mine["energy_Wh"])) / whole if whole > 0 else None] if many else []
+        sums = [
+            np.sum(segment_rows[c]) if c in ("energy_Wh", "distance_m") else np.max(segment_rows[c]) for c in totals
+        ]
+        shares = [100 * float(np.sum(segment_rows["energy_Wh"])) / whole if whole > 0 else None] if many else []
         answer.append(
             (
                 f"{k + 1}: {begin:g} to {end:g} s", source.modes[k].replace("_", " "), _demand(found, k),
-                *(mine[c][0] for c in shown), *sums, *shares,
+                *(segment_rows[c][0] for c in shown_columns), *sums, *shares,
                 ", ".join(f"{s} ({n})" if many else s for s, n in ends.items()),
                 ", ".join(words.FLAGS[f] for f in flags) or "none",
             )
         )  # fmt: skip
     first = "first cycle" if many else "this segment"
-    heads = [quantity_column(c, group=first) for c in shown] + [
+    heads = [quantity_column(c, group=first) for c in shown_columns] + [
         quantity_column(c, group="all cycles") for c in totals
     ]
     heads += columns(*["all cycles > share of energy [%] | .1f"] * many)
@@ -265,16 +267,16 @@ def _demand(found: Missions, k: int) -> str:
         return f"{begin:g}{unit}" if abs(begin - end) < 1e-9 else f"{begin:g} to {end:g}{unit}"
 
     mode = source.modes[k]
-    said = []
+    phrases = []
     if mode in CONTROLLED:
         channel = channels.find_channel(mode)
-        said.append(span(source.demand, channel.factor, channel.unit))
+        phrases.append(span(source.demand, channel.factor, channel.unit))
         if mode == "speed" and YAW_RATE in source.values:
-            said.append(span(source.values[YAW_RATE], 1.0, channels.find_channel(YAW_RATE).unit))
+            phrases.append(span(source.values[YAW_RATE], 1.0, channels.find_channel(YAW_RATE).unit))
     elif mode == "voltage":
         shares = [(name, 0.01, "% duty") for name in ("duty", *PAIRS[0])] + [(name, 1.0, "V") for name in PAIRS[1]]
         spans = [span(source.values[name], one, unit) for name, one, unit in shares if name in source.values]
-        said.append(" and ".join(spans) or "100 % duty")
+        phrases.append(" and ".join(spans) or "100 % duty")
     units = {"voltage": "V", "slope_deg": "°", "payload": "kg", "load_torque": "N·m", "current_other": "A"}
-    said += [span(source.values[name], 1.0, unit) for name, unit in units.items() if name in source.values]
-    return ", ".join([*said, *([source.surface[k]] if source.surface else [])])
+    phrases += [span(source.values[name], 1.0, unit) for name, unit in units.items() if name in source.values]
+    return ", ".join([*phrases, *([source.surface[k]] if source.surface else [])])

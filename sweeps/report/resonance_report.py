@@ -91,12 +91,12 @@ class ResonanceResult:
     @property
     def avoid(self) -> list[tuple[float, float, list[Resonance]]]:
         """Ranges of speed to avoid [m/s], lowest first, each of one mode and order, with what shows it."""
-        found: dict[tuple[str, int], list[Resonance]] = {}
+        by_mode: dict[tuple[str, int], list[Resonance]] = {}
         for r in strongest_resonances(self.resonances):
-            found.setdefault((r.mode, r.order), []).append(r)
+            by_mode.setdefault((r.mode, r.order), []).append(r)
         ranges = [
             (min(r.avoid[0] for r in members), max(r.avoid[1] for r in members), members)
-            for members in found.values()
+            for members in by_mode.values()
         ]
         return sorted(ranges, key=lambda x: x[0])
 
@@ -173,7 +173,7 @@ class ResonanceResult:
             parts.append(self._table8())
         if self.passing.name == "teeth":
             parts.append(
-                f"This configuration has no grousers on the ground; what passes are the belt's teeth, every "
+                f"This configuration has no grousers on the ground. The belt's teeth cause its ripple, one every "
                 f"{self.passing.travel / MM:.2f} mm of travel."
             )
         return parts
@@ -194,11 +194,13 @@ class ResonanceResult:
         rows = np.flatnonzero(self.table["table8"] & self.read)
         inside = []
         for voltage in np.unique(self.table["supply_voltage_V"][rows]):
-            found = rows[self.table["supply_voltage_V"][rows] == voltage]
-            hit = [k for k in found if self.shaken(k)]
+            table_rows = rows[self.table["supply_voltage_V"][rows] == voltage]
+            hit = [k for k in table_rows if self.shaken(k)]
             if hit:
                 loads = ", ".join(f"{self.table['payload_kg'][k]:g}" for k in hit)
-                inside.append(f"{voltage:g} V with {'every payload' if len(hit) == len(found) else loads + ' kg'}")
+                inside.append(
+                    f"{voltage:g} V with {'every payload' if len(hit) == len(table_rows) else loads + ' kg'}"
+                )
         return (
             f"Of Table 8 at {self.slope_deg:g}°, affected at their own payload: {'; '.join(inside)}."
             if inside
@@ -259,13 +261,13 @@ class ResonanceResult:
 
 def _merged(ranges: Iterable[tuple[float, float]]) -> list[tuple[float, float]]:
     """Ranges as few that do not overlap, lowest first."""
-    found: list[tuple[float, float]] = []
+    merged: list[tuple[float, float]] = []
     for low, high in sorted(ranges):
-        if found and low <= found[-1][1]:
-            found[-1] = found[-1][0], max(found[-1][1], high)
+        if merged and low <= merged[-1][1]:
+            merged[-1] = merged[-1][0], max(merged[-1][1], high)
         else:
-            found.append((low, high))
-    return found
+            merged.append((low, high))
+    return merged
 
 
 def ripple_percent(value: float) -> str:

@@ -48,8 +48,8 @@ def condition_formats(table: Columns, *, mass: bool = False) -> dict[str, tuple[
         mass: True to include the total mass.
     """
     readings = {c for c in table if f"simulated_{c}" in table or f"after_{c}" in table}
-    shown = {c: about for c, about in CONDITIONS.items() if c in table and c not in readings}
-    return {c: about for c, about in shown.items() if mass or c != "total_mass_kg"}
+    formats = {c: about for c, about in CONDITIONS.items() if c in table and c not in readings}
+    return {c: about for c, about in formats.items() if mass or c != "total_mass_kg"}
 
 
 #: Quantities by column, of several of one column that of runs.
@@ -108,9 +108,11 @@ def quantity_table(name: str, table: Columns, names: Iterable[str], **options: A
         options: further fields of it, and its `first` columns with their cells.
     """
     first: Sequence[tuple[Column, Sequence[Any]]] = options.pop("first", ())
-    shown = [n for n in dict.fromkeys(names) if n in table and (n == "supply_voltage_V" or not _is_empty(table[n]))]
-    heads = (*(column for column, _ in first), *map(quantity_column, shown))
-    cells = [*(cells for _, cells in first), *(quantity_cells(table, n) for n in shown)]
+    shown_names = [
+        n for n in dict.fromkeys(names) if n in table and (n == "supply_voltage_V" or not _is_empty(table[n]))
+    ]
+    heads = (*(column for column, _ in first), *map(quantity_column, shown_names))
+    cells = [*(cells for _, cells in first), *(quantity_cells(table, n) for n in shown_names)]
     return Table(name, heads, list(zip(*cells, strict=True)), **options)
 
 

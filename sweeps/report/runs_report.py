@@ -60,11 +60,11 @@ def runs_document(
         table.pop("voltage_cell_V", None)
     blocks: list[Block] = [run_tables.lead_note(file, model, "From standstill." if histories is not None else "")]
     blocks += [run_tables.limits_table(used, "this run"), catalogue.note("run.warming")] if used else []
-    shown = run_tables.quantity_table(
+    shown_table = run_tables.quantity_table(
         "runs", table, shown_columns, first=[(Column("run"), names)], file="runs.csv", wide=len(names) > SIDE_BY_SIDE,
         sideways=True,
     )  # fmt: skip
-    of_runs = Section("The run" if single else "The runs", (shown,), "runs-section")
+    of_runs = Section("The run" if single else "The runs", (shown_table,), "runs-section")
     blocks += [] if single and first["status"] in words.SETTLED else [endings]
     blocks += remarks([*notes, *([] if stands is None else [posture_words.posture_sentences(stands)])])
 
@@ -105,8 +105,8 @@ def runs_answer(runs: Columns, channels: Sequence[Channel], used: Sequence[Json]
 
 def run_headings(runs: Columns) -> list[str]:
     """A heading for each run: its name where it has one, and its conditions."""
-    found = [conditions_in_words(runs, k) for k in range(len(runs["status"]))]
-    return [f"{runs['run_id'][k]}: {at}" for k, at in enumerate(found)] if "run_id" in runs else found
+    headings = [conditions_in_words(runs, k) for k in range(len(runs["status"]))]
+    return [f"{runs['run_id'][k]}: {heading}" for k, heading in enumerate(headings)] if "run_id" in runs else headings
 
 
 def conditions_in_words(table: Columns, row: int) -> str:
@@ -137,15 +137,15 @@ def _histories(robot: Robot, runs: Columns, names: list[str], histories: Run) ->
     cut = (catalogue.note("runs.cut", HISTORIES, len(names)),) * (len(names) > HISTORIES)
     if not robot.has_ground:
         if any(c.over_time for c in robot.channels):
-            shown = history_figures.members_as_read(robot.channels, history, status, names[:HISTORIES])
+            members = history_figures.members_as_read(robot.channels, history, status, names[:HISTORIES])
             names_of = [c.name for c in robot.channels]
             ends = [
                 (s.name, words.short_status(s.status), *(read(n) for n in names_of for read in (s.largest, s.last)))
-                for s in shown
+                for s in members
             ]
             read_heads = run_tables.reading_columns(robot.channels, {"": "largest", "last_": "at the end"})
             table = catalogue.table("runs.courses-table", ends, *(column for _, column in read_heads))
-            yield Section("Over time", (*cut, catalogue.figure("runs.courses", shown), table), "history-section")
+            yield Section("Over time", (*cut, catalogue.figure("runs.courses", members), table), "history-section")
         return
     starts = history_figures.members_from_standstill(robot, history, status, which, names[:HISTORIES])
     averaged = ""
@@ -225,7 +225,7 @@ def limits_used(robot: Robot, run: Json) -> list[Json]:
     )
     cell = math.nan if "voltage_cell_V" in idle else float(run["voltage_cell_V"]) or math.nan  # 0: none feeds it
     gear = f"gearbox torque at {'the driving wheel' if robot.has_ground else 'its output'}"
-    asked = [
+    limits = [
         ("adhesion", math.nan if "adhesion_used" in idle else float(run["adhesion_used"]), 1.0, "{:.2f}"),
         ("motor speed", shaft, float(robot.motor.speed_limit) / RPM, "{:.0f} rpm"),
         ("gearbox input speed", shaft, float(robot.gearbox.speed_limit) / RPM, "{:.0f} rpm"),
@@ -233,16 +233,16 @@ def limits_used(robot: Robot, run: Json) -> list[Json]:
         (gear, torque, robot.gearbox.torque_limit or math.nan, "{:.2f} N·m"),
         ("voltage of a cell, charged", cell, robot.battery.voltage_charge, "{:.2f} V"),
     ]
-    found = run_tables.use_of_limits(asked, float(robot.motor.temperature_ambient))
+    used_limits = run_tables.use_of_limits(limits, float(robot.motor.temperature_ambient))
     if PEAK in run and not math.isnan(peak := float(run[PEAK])):
         most = inrush_limit(robot, math.isnan(float(run.get("supply_voltage_V", math.nan))))
-        found.append({
+        used_limits.append({
             "words": "largest current of the start, all motors", "value": f"{peak:.1f} A",
             "limit": "not stated" if most is None else f"{most:.1f} A",
             "percent": None if most is None else 100 * peak / most,
             "unstated": "driver.current_limit" + ", battery.current_limit" * bool(run.get("voltage_cell_V")),
         })  # fmt: skip
-    return found
+    return used_limits
 
 
 def inrush_limit(robot: Robot, on_battery: bool) -> float | None:

@@ -156,8 +156,8 @@ def _ranges(found: SensitivityResult) -> str:
     """Values of the operating points at which any output was studied."""
     p = found.points.at(np.any([o.studied for o in found.outputs.values()], axis=0))
     parts = [", ".join(dict.fromkeys(map(str, p.configuration)))]
-    _, own, symbol = p.imposed
-    for _, x, unit in (("", own, f" {symbol}"), *p.ground):
+    _, own_values, symbol = p.imposed
+    for _, x, unit in (("", own_values, f" {symbol}"), *p.ground):
         on_battery = unit == " V" and np.isnan(x).all()
         parts.append("battery" if on_battery else ", ".join(f"{v:g}" for v in np.unique(x)) + unit)
     return "; ".join(parts)

@@ -23,7 +23,7 @@ def settle_document(found: Settled, few: str = "", notes: Names = ()) -> Documen
     """The report. `few`: sentence of `words.too_few`. `notes`: further sentences on the settled runs."""
     next_step = Note("Next: `mmrjax loop settled.csv` with the same `--robot`.", "lead")
     next_step = Note(few, "lead", "few", terminal=True) if few else next_step
-    said = (*words.settle_remarks(found), *notes)
+    all_remarks = (*words.settle_remarks(found), *notes)
     left = words.left_out(found.stretches, bool(few))
     log = catalogue.figure("settle.log", found, finding=words.settle_statement(found))
     sections = [Section("Over the log", (log,))]
@@ -34,7 +34,7 @@ def settle_document(found: Settled, few: str = "", notes: Names = ()) -> Documen
     return Document(
         f"Settled runs of {Path(found.runs.source).name}",
         words.settle_statement(found),
-        (next_step, *remarks(said)),
+        (next_step, *remarks(all_remarks)),
         (*sections, settled),
     )
 

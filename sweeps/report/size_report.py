@@ -117,7 +117,7 @@ COLUMNS = columns(
 
 #: Motors that the terminal shows.
 SHOWN = 5
-_DESIGNS = "The best, and the best with other parts, with ratios of the makers' sheets and whole cells."
+_DESIGNS = "The best design, and the best designs with other parts, with the makers' gear ratios and whole cells."
 
 
 def size_document(found: SizeResult, robot_name: str) -> Document:

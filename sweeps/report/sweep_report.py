@@ -20,16 +20,16 @@ from sweeps.report.run_tables import imposed_column, quantity_column
 
 def sweep_document(file: RobotFile, model: str, runs: Columns, notes: Sequence[str] = ()) -> Document:
     """The report of a finished sweep of any grid."""
-    shown = capabilities.without_idle(file.robot, runs)
+    shown_runs = capabilities.without_idle(file.robot, runs)
     statuses = Counter(map(str, runs["status"]))
-    known = [*words.STATUSES, *(statuses.keys() - words.STATUSES.keys())]
-    over = {s: int(((runs["status"] == s) & (runs["flags"] != "")).sum()) for s in known}
-    where = {s: "" if s in words.SETTLED else _where(runs, runs["status"] == s) for s in known}
+    statuses_known = [*words.STATUSES, *(statuses.keys() - words.STATUSES.keys())]
+    over = {s: int(((runs["status"] == s) & (runs["flags"] != "")).sum()) for s in statuses_known}
+    where = {s: "" if s in words.SETTLED else _where(runs, runs["status"] == s) for s in statuses_known}
     maps = []
     for c in file.robot.channels:
         labels = c.label.capitalize(), c.unit
-        drawn = catalogue.figure("sweep.sweep", runs, c, finding=f"{c.label} over the grid", words=labels)
-        maps.append(dataclasses.replace(drawn, name=f"sweep_{c.name}"))
+        figure = catalogue.figure("sweep.sweep", runs, c, finding=f"{c.label} over the grid", words=labels)
+        maps.append(dataclasses.replace(figure, name=f"sweep_{c.name}"))
     axes = "; ".join(_levels(runs, c) for c in _axes(runs))
     extremes = (*(c.column for c in file.robot.channels), "slip", "winding_settled_C")
     return Document(
@@ -37,9 +37,9 @@ def sweep_document(file: RobotFile, model: str, runs: Columns, notes: Sequence[s
         sweep_answer(runs),
         (
             run_tables.lead_note(file, model, f"Varied: {axes}."),
-            run_tables.endings_table({s: statuses[s] for s in known}, beyond_a_limit=over, where=where),
+            run_tables.endings_table({s: statuses[s] for s in statuses_known}, beyond_a_limit=over, where=where),
             _limits(runs),
-            _extremes(shown, extremes),
+            _extremes(shown_runs, extremes),
             *remarks(notes),
         ),
         (Section("Over the grid", (catalogue.note("sweep.maps"), *maps), "maps"),),
@@ -96,10 +96,10 @@ def _where(runs: Columns, pick: np.ndarray) -> str:
     """Ranges of slope and imposed quantity of the picked runs, by configuration, in words."""
     parts = []
     for kind in dict.fromkeys(map(str, runs["configuration"][pick])):
-        mine = pick & (runs["configuration"] == kind)
-        names = [c for c in ("slope_deg", imposed_column(runs)) if c in runs and not np.isnan(runs[c][mine]).all()]
-        ranges = "; ".join(_levels(runs, c, mine, 4) for c in names)
-        parts.append(f"{int(mine.sum())} of {kind} ({ranges})")
+        of_kind = pick & (runs["configuration"] == kind)
+        names = [c for c in ("slope_deg", imposed_column(runs)) if c in runs and not np.isnan(runs[c][of_kind]).all()]
+        ranges = "; ".join(_levels(runs, c, of_kind, 4) for c in names)
+        parts.append(f"{int(of_kind.sum())} of {kind} ({ranges})")
     return ", ".join(parts)
 
 

@@ -71,9 +71,9 @@ def turn_document(
 
 def sides_table(robot: Robot, row: Columns) -> Table:
     """What the left and the right side do, without rows if no motion is known."""
-    idle, known = capabilities.idle_columns(robot), math.isfinite(float(row["yaw_rate_rad_s"]))
+    idle, yaw_known = capabilities.idle_columns(robot), math.isfinite(float(row["yaw_rate_rad_s"]))
     rows = []
-    for label, column, form in _ROWS if known else ():
+    for label, column, form in _ROWS if yaw_known else ():
         values = [float(row[column.format(side)]) for side in SIDES]
         if column.format(SIDES[0]) not in idle:
             rows.append((label, *(words.NONE_SETTLES if math.isinf(v) else format(v, form) for v in values)))

@@ -154,13 +154,13 @@ class SettledRuns(Observer):
     def check(cls, runs: Runs, noise: Noise) -> list[Remark | str]:
         """Refuses a table of one condition with readings that differ. Notes the repeats that differ most."""
         measured, alike = runs.measured(), rows_of_same_conditions(runs)
-        least, found = cls.least(runs), list[Remark]()
+        least, remarks = cls.least(runs), list[Remark]()
         shared = np.array([source == "series" for source in noise.source])
         usual = np.array([c.sd_share for c in runs.channels])
         for rows in alike:
-            here, sds = measured[rows], noise.sd[rows]
-            apart = np.abs(here[:, None] - here)
-            mean = np.maximum(np.abs(here[:, None] + here) / 2, least[rows])
+            readings_there, sds = measured[rows], noise.sd[rows]
+            apart = np.abs(readings_there[:, None] - readings_there)
+            mean = np.maximum(np.abs(readings_there[:, None] + readings_there) / 2, least[rows])
             sd = np.hypot(sds[:, None], sds)
             allowed = np.where(noise.estimated, CONTRADICTION_SHARE * mean, CONTRADICTION * sd)
             # An estimate of the noise from the scatter of these readings cannot test that scatter.
@@ -169,32 +169,34 @@ class SettledRuns(Observer):
                 (one, other, k), at = at.tolist(), tuple(at)
                 first, second, column = int(rows[one]), int(rows[other]), runs.channels[k].column
                 in_sds = not (noise.estimated[k] or shared[k])
-                known = f"{apart[at] / sd[at]:.0f} sd" if in_sds else f"{apart[at] / mean[at]:.0%}"
+                deviation = f"{apart[at] / sd[at]:.0f} sd" if in_sds else f"{apart[at] / mean[at]:.0%}"
                 values = float(runs[column][first]), float(runs[column][second])
                 without = [c for c, cells in runs.extras.items() if cells.dtype.kind == "f"]
                 torque = [c for c in (LOAD,) if c != column and runs.has(c)]
                 cells = {**runs.extras, **runs.columns}
                 others = tuple(c for c in (*without, *torque) if cells[c][first] != cells[c][second])
                 near = runs.layout.nearest(others[0], runs.columns) if others else ""
-                found.append(
+                remarks.append(
                     Remark(
                         "repeats",
                         source=runs.source,
                         rows=(first + 1, second + 1),
                         column=column,
                         values=values,
-                        apart=known,
+                        apart=deviation,
                         unused=others,
                         near=near,
                     )
                 )
-        if found and len(alike) == 1:
-            raise BadData(f"{describe(found[0])}; no condition varies, so nothing can be fitted")
-        whole = runs.whole
+        if remarks and len(alike) == 1:
+            raise BadData(f"{describe(remarks[0])}; no condition varies, so nothing can be fitted")
+        whole_table = runs.whole
         thinned = (
-            [] if whole is runs else [Remark("thinned_table", source=runs.source, rows=len(whole), kept=len(runs))]
+            []
+            if whole_table is runs
+            else [Remark("thinned_table", source=runs.source, rows=len(whole_table), kept=len(runs))]
         )
-        return [*thinned, *(Remark(x.code, **x.values, more=len(found) - 1) for x in found[:1])]
+        return [*thinned, *(Remark(x.code, **x.values, more=len(remarks) - 1) for x in remarks[:1])]
 
     @classmethod
     def check_start(cls, runs: Runs, noise: Noise, robot: Robot) -> list[Remark | str]:
@@ -210,8 +212,8 @@ class SettledRuns(Observer):
 
     @classmethod
     def identity(cls, runs: Runs) -> tuple[str, ...]:
-        own = () if "order" in runs.headings else ("order",)  # the order of the rows in the file
-        return tuple(c for c in runs.columns if c not in own)
+        order_column = () if "order" in runs.headings else ("order",)  # the order of the rows in the file
+        return tuple(c for c in runs.columns if c not in order_column)
 
     @classmethod
     def shows(cls, effect: type[Effect]) -> bool:
@@ -375,8 +377,8 @@ class SettledRuns(Observer):
             columns = {**columns, bases_room.VARIABLES["current"]: columns[CURRENT]}
         columns = {**_unmeasured(self, robot, columns), **columns}
         ways = dict.fromkeys(WAYS, np.asarray(_directions(self, robot)))
-        told = columns, weight, robot, None, ways
-        return (*bases_room.curve_families(*told), *bases_room.window_families(*told))
+        base_arguments = columns, weight, robot, None, ways
+        return (*bases_room.curve_families(*base_arguments), *bases_room.window_families(*base_arguments))
 
     def detail(self, bases: Bases, included: np.ndarray, before: Diagnosis, after: Diagnosis) -> EquationDefects:
         """Defects of `electrical`, `track` and `slip` that together make each row's residual.
@@ -391,12 +393,14 @@ def _unmeasured(
 ) -> dict[str, Float[np.ndarray, " rows"]]:
     """Fitted motor speed [rad/s] and motor current [A], by column, if no channel measures them (rigs may show only
     the output)."""
-    wanted = [v for v in ("speed_motor", "current") if bases_room.VARIABLES[v] not in columns]
+    unmeasured = [v for v in ("speed_motor", "current") if bases_room.VARIABLES[v] not in columns]
     if bases_room.VARIABLES["speed"] in columns:
-        wanted = [v for v in wanted if v != "speed_motor"]
-    if not wanted or observe.long:
+        unmeasured = [v for v in unmeasured if v != "speed_motor"]
+    if not unmeasured or observe.long:
         return {}
-    fitted = {v: np.asarray(x, float) for v, x in zip(wanted, _signals(observe, robot, tuple(wanted)), strict=True)}
+    fitted = {
+        v: np.asarray(x, float) for v, x in zip(unmeasured, _signals(observe, robot, tuple(unmeasured)), strict=True)
+    }
     return {bases_room.VARIABLES[v]: x for v, x in fitted.items() if np.isfinite(x).all() and _varies(np.abs(x))}
 
 
@@ -435,10 +439,10 @@ def _defects(linear: Linearization, included: np.ndarray) -> dict[str, np.ndarra
     slopes = (slopes * size[:, None, None, None]).reshape(-1, *slopes.shape[2:]).transpose(1, 2, 0)
     both = slopes @ slopes.transpose(0, 2, 1) + np.eye(slopes.shape[1])
     shares = -slopes.transpose(0, 2, 1) @ np.linalg.solve(both, np.asarray(linear.by_row())[rows, :, None])
-    found = np.full((len(EQUATIONS) * sides, len(included)), np.nan)
-    found[:, rows] = np.repeat(size, sides)[:, None] * shares[:, :, 0].T
+    defects = np.full((len(EQUATIONS) * sides, len(included)), np.nan)
+    defects[:, rows] = np.repeat(size, sides)[:, None] * shares[:, :, 0].T
     names = [f"{b}_{side}" for b in EQUATIONS for side in channels.SIDES] if sides > 1 else EQUATIONS
-    return dict(zip(names, found, strict=True))
+    return dict(zip(names, defects, strict=True))
 
 
 @functools.partial(compiled, options=SELDOM)

@@ -165,11 +165,11 @@ def _with_peaked_friction(problem: Problem, z: np.ndarray) -> np.ndarray:
 
 def _distinct_points(points: np.ndarray) -> np.ndarray:
     """Points without those too close to an earlier one."""
-    kept: list[np.ndarray] = []
+    distinct: list[np.ndarray] = []
     for z in points:
-        if all(np.max(np.abs(z - k)) > APART for k in kept):
-            kept.append(z)
-    return np.stack(kept)
+        if all(np.max(np.abs(z - k)) > APART for k in distinct):
+            distinct.append(z)
+    return np.stack(distinct)
 
 
 def _recombined(problem: Problem, points: np.ndarray) -> np.ndarray:
@@ -217,15 +217,15 @@ def _fit_settled_ends(problem: Problem) -> Float[np.ndarray, "starts parameters"
     ends = settled_ends(problem)
     mean = np.where(_slides_at_end(problem, ends)[:, None], np.nan, ends.mean)
     observe = SettledRuns(ends.conditions, "steady")
-    here = Problem(problem.base, problem.coordinates, observe, data_from_readings(mean, ends.sd, len(names)))
+    ends_problem = Problem(problem.base, problem.coordinates, observe, data_from_readings(mean, ends.sd, len(names)))
     pinned = np.stack([_with_adhesion(problem, np.zeros(len(names)), a) for a in ADHESIONS])
     held = np.zeros(pinned.shape, bool)
     held[:, statics] = True
-    fitted = jax.device_get(_fit_pinned(here, jnp.asarray(pinned), jnp.asarray(held)))
-    free = jax.device_get(_fit_pinned(here, jnp.asarray(fitted.z), jnp.zeros(held.shape, bool)))
+    fitted = jax.device_get(_fit_pinned(ends_problem, jnp.asarray(pinned), jnp.asarray(held)))
+    free = jax.device_get(_fit_pinned(ends_problem, jnp.asarray(fitted.z), jnp.zeros(held.shape, bool)))
     best = free.z[int(np.argmin(np.where(np.isfinite(free.cost), free.cost, np.inf)))]
-    wanted = [z for z in (best, *fitted.z) if np.all(np.isfinite(z))]
-    return np.stack([_with_sliding(problem, z, share) for z in wanted for share in FINER])
+    finite_points = [z for z in (best, *fitted.z) if np.all(np.isfinite(z))]
+    return np.stack([_with_sliding(problem, z, share) for z in finite_points for share in FINER])
 
 
 def _slides_at_end(problem: Problem, ends: Ends) -> np.ndarray:
@@ -262,8 +262,8 @@ def _with_sliding(problem: Problem, z: np.ndarray, share: float) -> np.ndarray:
             value[k] *= share
     for k, name in enumerate(c.names):
         for follower, leader in TIED:
-            if name.endswith(follower) and (own := name.removesuffix(follower) + leader) in c.names:
-                j = c.names.index(own)
+            if name.endswith(follower) and (base_name := name.removesuffix(follower) + leader) in c.names:
+                j = c.names.index(base_name)
                 value[k] = nominal[k] * value[j] / nominal[j]
     inside = np.where(c.scale, np.log(np.maximum(value, 1e-12)), value)
     changed = value != c.value(np.asarray(z))

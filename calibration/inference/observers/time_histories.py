@@ -305,14 +305,14 @@ class Histories(Observer):
     def check(cls, runs: Runs, noise: Noise) -> list[Remark | str]:
         names = runs.run_names
         for name in np.unique(names):
-            mine = names == name
-            if len(np.unique(runs["configuration"][mine])) > 1:
+            run_rows = names == name
+            if len(np.unique(runs["configuration"][run_rows])) > 1:
                 raise BadData(
                     f"{runs.source}, configuration: run {name or '(no run_id)'} has several values; "
                     "a run has one configuration, so give each its own run_id"
                 )
             if runs.has("total_mass_kg"):
-                empty = runs["total_mass_kg"][mine] - runs["payload_kg"][mine]
+                empty = runs["total_mass_kg"][run_rows] - runs["payload_kg"][run_rows]
                 if np.ptp(empty) > ROUNDING:
                     raise BadData(
                         f"{runs.source}, total_mass_kg: run {name or '(no run_id)'} changes by "
@@ -342,16 +342,16 @@ class Histories(Observer):
                 "settled runs without time_s"
             )
         for name in np.unique(names):
-            mine = np.flatnonzero(names == name)
-            first = mine[np.argmin(runs["time_s"][mine])]
-            times, count = np.unique(runs["time_s"][mine], return_counts=True)
+            run_rows = np.flatnonzero(names == name)
+            first = run_rows[np.argmin(runs["time_s"][run_rows])]
+            times, count = np.unique(runs["time_s"][run_rows], return_counts=True)
             if (count > 1).any():
                 raise BadData(
                     f"{runs.source}, time_s: run {name or '(no run_id)'} has {count.max()} samples at "
                     f"{bound_text(times[count.argmax()])} s; give each run its own run_id"
                 )
             for k in moving:
-                size = np.max(np.nan_to_num(np.abs(measured[mine, k])))
+                size = np.max(np.nan_to_num(np.abs(measured[run_rows, k])))
                 limit = max(RESTING * size, RESTING_SD * noise.sd[first, k])
                 if runs["time_s"][first] < EARLY and abs(measured[first, k]) > limit:
                     column, unit = runs.channels[k].column, runs.channels[k].unit
@@ -363,13 +363,13 @@ class Histories(Observer):
                         'readings; if it began in motion, state start = "measured" or "free" in the robot\'s file; '
                         "settled travel is one row a run, without time_s"
                     )
-        said: list[Remark | str] = []
+        remarks: list[Remark | str] = []
         step = runs["time_s"].max() / STEPS
         if robot.rig.imposed != "motor_speed":
             step = max(step, *(h.max(initial=0.0) for h in _longest_steps(runs, robot)))
         if step > FAST * LONGEST:
-            said.append(Remark("coarse_steps", lasts=float(runs["time_s"].max()), step=float(step)))
-        return said
+            remarks.append(Remark("coarse_steps", lasts=float(runs["time_s"].max()), step=float(step)))
+        return remarks
 
     @classmethod
     def check_settled(cls, runs: Runs) -> None:
@@ -394,9 +394,13 @@ class Histories(Observer):
             each = [s for s in each if not _changes_still(speeds, s.after(time, 0.5), s.after(time, 0.75))]
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", RuntimeWarning)  # a channel without readings
-            shown = [np.nanmedian(measured[s.after(time, 0.5)], 0) for s in each]
+            settled_readings = [np.nanmedian(measured[s.after(time, 0.5)], 0) for s in each]
         first = np.array([s.rows[0] for s in each], int)
-        return runs.where(first), np.reshape(shown, (-1, measured.shape[1])), np.array([s.lasts for s in each])
+        return (
+            runs.where(first),
+            np.reshape(settled_readings, (-1, measured.shape[1])),
+            np.array([s.lasts for s in each]),
+        )
 
     @classmethod
     def identity(cls, runs: Runs) -> tuple[str, ...]:
@@ -443,8 +447,8 @@ class Histories(Observer):
         """Observer with the simulated runs of a robot."""
         if self.known is not None:
             return self
-        known = jax.vmap(lambda c, t: linearise_run(robot, c, t))(self.conditions, self.times)
-        return dataclasses.replace(self, known=known)
+        simulated = jax.vmap(lambda c, t: linearise_run(robot, c, t))(self.conditions, self.times)
+        return dataclasses.replace(self, known=simulated)
 
     def whole(self, robot: Robot) -> Signals:
         """Signals of each run at each instant, shape (runs, instants)."""
@@ -602,9 +606,9 @@ class Histories(Observer):
         which = getattr(problem.coordinates, "active", None)
         twice = lambda x: jnp.stack([jnp.asarray(x)] * TOGETHER)  # noqa: E731
         members = twice(z), twice(data.weight), None if which is None else twice(which)
-        r, jacobian, _, known = jax.tree.map(lambda x: x[0], _evaluate(problem, *members))
+        r, jacobian, _, simulated = jax.tree.map(lambda x: x[0], _evaluate(problem, *members))
         residual, jacobian = zero_inactive_residuals(r, jacobian, penalty_slice(data))
-        robot, observe = problem.robot(jnp.asarray(z)), dataclasses.replace(self, known=known)
+        robot, observe = problem.robot(jnp.asarray(z)), dataclasses.replace(self, known=simulated)
         signatures, defects, signals, angle = _responses(observe, robot, effects, data.weight / data.sd)
         return HistoriesLinearization(
             residual,
@@ -626,8 +630,8 @@ class Histories(Observer):
         which = getattr(problem.coordinates, "active", None)
         twice = lambda x: np.stack([np.asarray(x)] * TOGETHER)  # noqa: E731
         members = twice(z), twice(problem.data.weight), None if which is None else twice(which)
-        known = _evaluate(problem, *members)[3]
-        return dataclasses.replace(self, known=jax.tree.map(lambda x: x[0], known))
+        simulated = _evaluate(problem, *members)[3]
+        return dataclasses.replace(self, known=jax.tree.map(lambda x: x[0], simulated))
 
     def replicate(
         self, problem: Problem, data: Data, effects: tuple[ScoredEffect, ...], linear: Linearization, drawn: Array
@@ -650,13 +654,13 @@ class Histories(Observer):
             evaluate = _evaluator(blunt, weights, None)
             return search_rollouts(evaluate, starts, blunt.data, weights, steps, self.policy.batch)[0]
 
-        shown = weak_form(problem if every is None else every)
-        begins = np.zeros((0, len(problem.coordinates))) if shown is None else shown.z[None]
+        regression = weak_form(problem if every is None else every)
+        begins = np.zeros((0, len(problem.coordinates))) if regression is None else regression.z[None]
         if problem.base.has_ground and problem.base.rig.imposed == "voltage":
             draws = random.standard_normal((settled_ends.DRAWS, len(problem.coordinates)))
             ends = settled_ends.starts_from_settled_ends(problem, draws, search)
-            begins = np.concatenate([begins, ends[: max(1, count - len(begins)) if shown is None else 1]])
-        elif shown is None:
+            begins = np.concatenate([begins, ends[: max(1, count - len(begins)) if regression is None else 1]])
+        elif regression is None:
             begins = super().starts(problem, random, count)
         return scans.place_at_minimum(problem, begins[:count])
 
@@ -673,20 +677,20 @@ class Histories(Observer):
         motor, time = problem.base.motor, np.unique(np.round(np.asarray(self.time), 9))
         rise = float(motor.inductance) / float(motor.resistance)
         fine = min(0.125 * float(np.median(np.diff(time))), max(0.5 * rise, 1e-6)) if len(time) > 1 else 1.0
-        wanted = 2 * scans.RANGE * float(problem.coordinates.spread[k]) / fine
-        return int(2 ** np.clip(np.ceil(np.log2(wanted)), *np.log2(DELAYS)))
+        steps_needed = 2 * scans.RANGE * float(problem.coordinates.spread[k]) / fine
+        return int(2 ** np.clip(np.ceil(np.log2(steps_needed)), *np.log2(DELAYS)))
 
     def scan(self, problem: Problem, z: Array, data: Data, k: int, values: Array) -> tuple[Array, Array]:
         """Scan as in the protocol. A delay only shifts the readings of a run, so one run serves all its values."""
         if problem.coordinates.names[k] == DELAY:
             return _over_delays(problem, z, data, jnp.arange(len(z)) == k, values)
-        found = [
+        scans_found = [
             _minimum_with_one_held(
                 *linearise(problem, z.at[k].set(v), data)[:2], z.at[k].set(v), jnp.arange(len(z)) == k
             )
             for v in values
         ]
-        return jnp.stack([cost for cost, _ in found]), jnp.stack([at for _, at in found])
+        return jnp.stack([cost for cost, _ in scans_found]), jnp.stack([at for _, at in scans_found])
 
     def search(
         self,
@@ -724,8 +728,8 @@ class Histories(Observer):
 
         data = dataclasses.replace(bare.data, weight=weights[k])
         best, seen = scans.search_lower_basins(bare, one(optima), data, again, lambda _: None)
-        whole = jax.tree.map(lambda leaf: jnp.asarray(leaf[k]), optima[0])
-        best = dataclasses.replace(best, z=whole.z.at[:size].set(best.z), sd=whole.sd.at[:size].set(best.sd))
+        optimum = jax.tree.map(lambda leaf: jnp.asarray(leaf[k]), optima[0])
+        best = dataclasses.replace(best, z=optimum.z.at[:size].set(best.z), sd=optimum.sd.at[:size].set(best.sd))
         return jax.tree.map(lambda every, mine: jnp.asarray(every).at[k].set(mine), optima, (best, seen))
 
     def observed(self, problem: Problem, z: Numbers, active: Numbers | None = None) -> Observation:
@@ -754,18 +758,18 @@ class Histories(Observer):
             on_tracks[self.run], angle, np.asarray(self.rows_of), np.asarray(self.knots), robot
         )
         weight = included.astype(float)
-        told = columns, weight, robot, None, ways
-        return (*bases_room.curve_families(*told), *bases_room.window_families(*told), *waves)
+        base_arguments = columns, weight, robot, None, ways
+        return (*bases_room.curve_families(*base_arguments), *bases_room.window_families(*base_arguments), *waves)
 
     def detail(self, bases: Bases, included: np.ndarray, before: Diagnosis, after: Diagnosis) -> TimeStatistics:
         names = bases_room.family_names(bases)
         orders = [w for w in bases_room.ORDERS if any(n[1] == w for n in names)]
 
         def strongest(diagnosis: Diagnosis, variable: str) -> Strongest | None:
-            mine = [k for k, n in enumerate(names) if n[1] == variable]
-            if not mine:
+            same_variable = [k for k, n in enumerate(names) if n[1] == variable]
+            if not same_variable:
                 return None
-            k = max(mine, key=lambda j: np.asarray(diagnosis.scores.curve)[j])
+            k = max(same_variable, key=lambda j: np.asarray(diagnosis.scores.curve)[j])
             return Strongest(names[k][0], float(diagnosis.scores.curve[k]), float(diagnosis.scores.explained[k]))
 
         def side(diagnosis: Diagnosis) -> TimeSide:
@@ -793,9 +797,11 @@ def _drive_jumps(runs: Runs, each: list[np.ndarray], rig: Rig) -> list[tuple[np.
     """Times of jumps of the drive of each run's motors [s], and the jumps as shares of its largest value."""
     driven, time = applied_drive(runs), runs["time_s"]
     # An imposed speed determines the current; a linear drive does not jump; an unknown drive is refused later.
-    known = rig.imposed != "motor_speed" and rig.between_rows == "held" and np.isfinite(driven).all() and driven.any()
+    jumps_known = (
+        rig.imposed != "motor_speed" and rig.between_rows == "held" and np.isfinite(driven).all() and driven.any()
+    )
     coasts = runs["mode"] == "coast" if runs.has("mode") else np.zeros(len(runs), bool)
-    driven, jumps = driven if known else np.zeros(len(runs)), []
+    driven, jumps = driven if jumps_known else np.zeros(len(runs)), []
     for rows in each:
         sizes = np.maximum(_relative_jumps(driven[rows]), coasts[rows][1:] != coasts[rows][:-1])
         jumps.append((time[rows[1:]][sizes > 0], sizes[sizes > 0]))
@@ -819,7 +825,7 @@ def _conditions_over_time(
         on_lines: fields that are linear between rows: mean over the step that begins at each instant.
     """
     middle = np.concatenate([0.5 * (times[:, 1:] + times[:, :-1]), times[:, -1:]], 1)
-    at = np.stack(
+    conditions_there = np.stack(
         [
             rows[np.maximum(np.searchsorted(time[rows], t, side="right") - 1, 0)]
             for rows, t in zip(each, times, strict=True)
@@ -829,7 +835,7 @@ def _conditions_over_time(
     for name in CHANGING:
         x = None if getattr(of_rows, name) is None else np.asarray(getattr(of_rows, name))
         if x is not None and any(np.ptp(x[rows]) > 0 for rows in each):
-            values = x[at] if name not in on_lines else _interpolate_at_instants(x, each, time, middle)
+            values = x[conditions_there] if name not in on_lines else _interpolate_at_instants(x, each, time, middle)
             conditions = eqx.tree_at(operator.attrgetter(name), conditions, jnp.asarray(values))
     if of_rows.motor_speed is None:
         return conditions
@@ -878,21 +884,21 @@ def measure_initial_states(robot: Robot, runs: Runs, noise: Noise) -> Robot:
     begins, stated = dict[str, Begin](), []
     rows = runs.configurations(robot)
     for name in np.unique(runs.run_names):
-        mine = runs.in_order(name)
+        run_rows = runs.in_order(name)
         key = initial_state_name(str(name))
         state: dict[str, tuple[float, float]] = {}
         for k, channel in enumerate(runs.channels):
             field = "motor_speed" if channel.settled else "angle"
-            finite = mine[np.isfinite(measured[mine, k])][:FIRST_SAMPLES]
+            finite = run_rows[np.isfinite(measured[run_rows, k])][:FIRST_SAMPLES]
             if channel.zero_at_rest and field not in state and len(finite):
-                configuration = int(rows[mine[0]])
+                configuration = int(rows[run_rows[0]])
                 radius = float(robot.configurations.members[configuration].radius)
                 none, one = jnp.zeros(()), jnp.ones(())
                 rolling = State(none, one, radius / robot.gearbox.ratio, none, distance=radius)
                 factor = 1 / float(
                     channel.read(robot, balances.begin_signals(robot, Conditions(configuration), rolling))
                 )
-                value, sd = _extrapolated(runs["time_s"][finite] - runs["time_s"][mine[0]], measured[finite, k])
+                value, sd = _extrapolated(runs["time_s"][finite] - runs["time_s"][run_rows[0]], measured[finite, k])
                 least = float(np.median(noise.sd[finite, k]))
                 state[field] = factor * value, abs(factor) * max(sd, least)
         begins[key] = Begin(**{field: value for field, (value, _) in state.items()})
@@ -933,8 +939,8 @@ def _check_signs(runs: Runs) -> None:
         for s in (s for s in run if volts[s.rows[0]] < 0 and s.lasts >= LASTING):
             rows = s.after(time, 0.5)
             for k in np.flatnonzero(unsigned):
-                channel, shown = runs.channels[k], measured[rows, k][np.isfinite(measured[rows, k])]
-                if shown.size and np.median(shown) > RESTING * size[k]:
+                channel, readings = runs.channels[k], measured[rows, k][np.isfinite(measured[rows, k])]
+                if readings.size and np.median(readings) > RESTING * size[k]:
                     raise BadData(
                         f"{runs.source} row {rows[0] + 1}, {channel.column}: got "
                         f"{bound_text(runs[channel.column][rows[0]])} {channel.unit} at "
@@ -1054,8 +1060,8 @@ def _common_length(instants: int) -> int:
 
 
 def _reading(robot: Robot, signals: Signals) -> Float[Array, " channels"]:
-    shown = balances.sensor(robot, signals)
-    return jnp.stack([shown[name] for name in channels.channel_names(robot.channels)], -1)
+    sensor_readings = balances.sensor(robot, signals)
+    return jnp.stack([sensor_readings[name] for name in channels.channel_names(robot.channels)], -1)
 
 
 def _readings(robot: Robot, signals: Signals) -> Float[Array, "instants channels"]:
@@ -1070,10 +1076,10 @@ def _readings_within_steps(robot: Robot, steps: StepCourse) -> tuple[Array, ...]
 @functools.partial(compiled, options=OVER_TIME)
 def _turning(observe: Histories, robot: Robot) -> tuple[Array, Array, dict[str, Array]]:
     """Angle of the driving shaft, back-EMF and ways of travel at each row."""
-    whole = observe.whole(robot)
-    rows = observe.at_rows(whole)
+    whole_runs = observe.whole(robot)
+    rows = observe.at_rows(whole_runs)
     ways = {name: jnp.broadcast_to(getattr(rows, name), jnp.shape(rows.speed_motor)) for name in WAYS}
-    return observe.angle(whole), jnp.asarray(rows.voltage_back), ways
+    return observe.angle(whole_runs), jnp.asarray(rows.voltage_back), ways
 
 
 @functools.partial(compiled, options=OVER_TIME)
@@ -1090,15 +1096,15 @@ def _over_delays(problem: Problem, z: Array, data: Data, scanned: Array, values:
     both = [jnp.concatenate([x[..., None], slope], -1) for x, slope in zip(every, slopes, strict=True)]
 
     def one(value: Array) -> tuple[Array, Array]:
-        at = jnp.where(scanned, value, z)
-        late = observe.late((*both, decays), problem.robot(at).rig)
+        coordinates = jnp.where(scanned, value, z)
+        late = observe.late((*both, decays), problem.robot(coordinates).rig)
         error = data.weight * (late[..., 0] - data.measured) / data.sd
         finite = jnp.all(jnp.isfinite(late), -1)
         error = jnp.where(finite, error, MISSING * data.weight)
         jacobian = jnp.where(finite[..., None], (data.weight / data.sd)[..., None] * late[..., 1:], 0.0)
-        residual = jnp.concatenate([error.ravel(), at - data.centre])
-        whole = jnp.concatenate([jacobian.reshape(-1, z.size), jnp.eye(z.size)])
-        return _minimum_with_one_held(residual, whole, at, scanned)
+        residual = jnp.concatenate([error.ravel(), coordinates - data.centre])
+        full_jacobian = jnp.concatenate([jacobian.reshape(-1, z.size), jnp.eye(z.size)])
+        return _minimum_with_one_held(residual, full_jacobian, coordinates, scanned)
 
     return jax.lax.map(one, values, batch_size=16)
 
@@ -1128,9 +1134,9 @@ def _evaluator(problem: Problem, weights: Numbers, active: Numbers | None) -> Ev
     def evaluate(z: np.ndarray, members: np.ndarray) -> tuple[np.ndarray, np.ndarray, Observation]:
         parts = [(z[k : k + TOGETHER], members[k : k + TOGETHER]) for k in range(0, len(members), TOGETHER)]
         with Threads(CORES if made.is_set() else 1) as cores:
-            found = list(cores.map(lambda part: some(*part), parts))
+            results = list(cores.map(lambda part: some(*part), parts))
         made.set()  # the first call has compiled the program
-        return jax.tree.map(lambda *x: np.concatenate(x)[: len(members)], *found)
+        return jax.tree.map(lambda *x: np.concatenate(x)[: len(members)], *results)
 
     return evaluate
 
@@ -1142,13 +1148,13 @@ def _evaluate(
     """Result of `linearise_rollout` for members of a search, and their runs."""
 
     def one(z: Array, weight: Array, which: Array | None) -> tuple[Array, Array, Observation, LinearisedRun]:
-        here = problem
+        problem_there = problem
         if which is not None:
-            here = dataclasses.replace(problem, coordinates=problem.coordinates.with_effects(which))
-        observe: Histories = problem.observe.following(here.robot(z))  # type: ignore[attr-defined]
-        here = dataclasses.replace(here, observe=observe)
+            problem_there = dataclasses.replace(problem, coordinates=problem.coordinates.with_effects(which))
+        observe: Histories = problem.observe.following(problem_there.robot(z))  # type: ignore[attr-defined]
+        problem_there = dataclasses.replace(problem_there, observe=observe)
         assert observe.known is not None
-        return *linearise_rollout(here, z, dataclasses.replace(problem.data, weight=weight)), observe.known
+        return *linearise_rollout(problem_there, z, dataclasses.replace(problem.data, weight=weight)), observe.known
 
     return jax.vmap(one)(z, weights, active)
 
@@ -1203,9 +1209,9 @@ class _Probed(NamedTuple):
         entering = np.array([places.index(b) if (b := e.effect.balance) in places else 0 for e in effects], int)
         entering = np.repeat(entering, counts)
         enters = np.repeat([1.0 * (e.effect.balance in places) for e in effects], counts)
-        shown = channels.channel_names(robot.channels)
-        at_sensor = np.array([[e.effect.channel == c for e in effects] for c in shown], float)
-        at_sensor = np.repeat(at_sensor, counts, 1) if effects else np.zeros((len(shown), 0))
+        shown_channels = channels.channel_names(robot.channels)
+        at_sensor = np.array([[e.effect.channel == c for e in effects] for c in shown_channels], float)
+        at_sensor = np.repeat(at_sensor, counts, 1) if effects else np.zeros((len(shown_channels), 0))
         return cls(robot, every, size, effects, entering, enters, at_sensor)
 
     def at(self, amplitude: Array) -> Robot:
@@ -1266,14 +1272,14 @@ class _Probed(NamedTuple):
         begun = by_probes[:, self.entering] * (self.enters * terms(clock[0], begins, first))
         unmoved = jnp.concatenate([jnp.zeros((len(begins), size * len(clock))), begun], 1)
         changed = run_response(conditions, along, source, seen, unmoved)
-        whole = jnp.concatenate([seen(clock[0], begins, unmoved, first)[None], changed])
-        knots = whole[instants, :, : size * len(clock)].reshape(len(instants), -1, size, len(clock))
-        mine = whole[:, :, size * len(clock) :]
+        state_changes = jnp.concatenate([seen(clock[0], begins, unmoved, first)[None], changed])
+        knots = state_changes[instants, :, : size * len(clock)].reshape(len(instants), -1, size, len(clock))
+        own_changes = state_changes[:, :, size * len(clock) :]
         if delayed:
             step, share = robot.rig.before(times, time)
-            by_effects = mine[step] + share[:, None, None] * (mine[step + 1] - mine[step])
+            by_effects = own_changes[step] + share[:, None, None] * (own_changes[step + 1] - own_changes[step])
         else:
-            by_effects = mine[instants]
+            by_effects = own_changes[instants]
         return knots.transpose(2, 3, 0, 1), by_effects
 
 
@@ -1300,10 +1306,10 @@ def _remembered(
     It follows the stages of the run (`histories.linearise_run`). A memory's rate is linear in the memory, or nearly
     so.
     """
-    mine = [e for e in effects if e.effect.memory_size is not None]
-    counts = np.cumsum([len(e.at) for e in mine])
+    with_memory = [e for e in effects if e.effect.memory_size is not None]
+    counts = np.cumsum([len(e.at) for e in with_memory])
     nothing = [jnp.zeros(len(e.at)) for e in effects]
-    if not mine:
+    if not with_memory:
         return lambda t: nothing
 
     def split(memory: Array) -> list[Array]:
@@ -1313,27 +1319,31 @@ def _remembered(
         signals = moving(robot, held, state_of_unknowns(robot, y), way)
 
         def rate(effect: Effect, remembered: Array) -> Array:
-            known = dataclasses.replace(signals, memory={**signals.memory, effect.name: remembered})
-            return jnp.asarray(effect.rate(robot, known), float)
+            with_memory = dataclasses.replace(signals, memory={**signals.memory, effect.name: remembered})
+            return jnp.asarray(effect.rate(robot, with_memory), float)
 
-        return jnp.concatenate([map_over_shapes(e, rate, m) for e, m in zip(mine, split(memory), strict=True)])
+        return jnp.concatenate([map_over_shapes(e, rate, m) for e, m in zip(with_memory, split(memory), strict=True)])
 
     times = jnp.append(along.clock[:, 0], along.clock[-1, 2])
     steps, constant = run_steps(conditions, times)
 
     def after(memory: Array, step: tuple[LinearisedRun, RunStep]) -> tuple[Array, Array]:
-        here, taken = step
-        held, spans, passes = taken.held(constant), jnp.diff(here.clock), here.sides[0] != here.sides[1]
+        state_there, taken = step
+        held, spans, passes = (
+            taken.held(constant),
+            jnp.diff(state_there.clock),
+            state_there.sides[0] != state_there.sides[1],
+        )
 
         def stage(memory: Array, span: Array, y: Array, way: Array) -> Array:
             law = lambda m: speeds(y, held, way, m)  # noqa: E731
             speed, slope = jax.jvp(law, (memory,), (jnp.ones_like(memory),))
             return memory + span * speed / (1 - span * slope)
 
-        first = stage(memory, spans[0], here.places[0], here.sides[0])
+        first = stage(memory, spans[0], state_there.places[0], state_there.sides[0])
         ahead = jnp.where(passes, 1.0, spans[1] / jnp.where(spans[0] > 0, spans[0], 1.0))
         span = jnp.where(passes, spans[1], spans[0])
-        last = stage(memory + ahead * (first - memory), span, here.places[1], here.sides[1])
+        last = stage(memory + ahead * (first - memory), span, state_there.places[1], state_there.sides[1])
         return last, jnp.stack([first, last])
 
     begin = first_instant(robot, conditions)[1]
@@ -1343,7 +1353,7 @@ def _remembered(
             map_over_shapes(
                 e, lambda effect, _: jnp.asarray(effect.initial(robot, angle), float), jnp.zeros(len(e.at))
             )
-            for e in mine
+            for e in with_memory
         ]
     )
     stages = jax.lax.scan(after, begun, (along, steps))[1]
@@ -1354,9 +1364,9 @@ def _remembered(
         k = jnp.clip(jnp.searchsorted(clock, t, side="right") - 1, 0, len(clock) - 2)
         length = clock[k + 1] - clock[k]
         share = jnp.clip(jnp.where(length > 0, (t - clock[k]) / jnp.where(length > 0, length, 1.0), 0.0), 0.0, 1.0)
-        found = iter(split(nodes[k] + share * (nodes[k + 1] - nodes[k])))
+        parts = iter(split(nodes[k] + share * (nodes[k + 1] - nodes[k])))
         return [
-            zero if e.effect.memory_size is None else next(found) for e, zero in zip(effects, nothing, strict=True)
+            zero if e.effect.memory_size is None else next(parts) for e, zero in zip(effects, nothing, strict=True)
         ]
 
     return at_time

@@ -113,8 +113,8 @@ class SettledTurns(SettledRuns):
         return (), priors.OF_TURNS
 
     def _observed(self, robot: Robot, result: Result) -> Observation:
-        seen = super()._observed(robot, result)
-        return dataclasses.replace(seen, adhesion_used=jnp.zeros_like(seen.adhesion_used))
+        observation = super()._observed(robot, result)
+        return dataclasses.replace(observation, adhesion_used=jnp.zeros_like(observation.adhesion_used))
 
     @property
     def apart(self) -> bool:
@@ -127,8 +127,8 @@ class SettledTurns(SettledRuns):
         self, problem: Problem, z: Array, linear: Linearization, keys: Array, factors: np.ndarray
     ) -> tuple[Any, ...]:
         """Draws as in the protocol, with the roots at each refit."""
-        drawn = super().draws(problem, z, linear, keys, factors)
-        return *drawn, solve_roots(problem, drawn[2])
+        samples = super().draws(problem, z, linear, keys, factors)
+        return *samples, solve_roots(problem, samples[2])
 
     def replicate(
         self,
@@ -151,11 +151,17 @@ class SettledTurns(SettledRuns):
         """
         names = [v for v in VARIABLES if v != "voltage" or robot.rig.shows_voltage]
         signals = results_of_rows(robot, self.conditions)[1]
-        seen = {n: np.asarray(signal_by_point(signals, n)) for n in (*names, *WAYS)}
-        points = {bases_room.VARIABLES[v]: seen[v] for v in names}
+        signal_values = {n: np.asarray(signal_by_point(signals, n)) for n in (*names, *WAYS)}
+        points = {bases_room.VARIABLES[v]: signal_values[v] for v in names}
         points |= {c: np.tile(columns[c], 2) for c in ("configuration", "order") if c in columns}
         weight = np.tile(included.astype(float), 2)
         lacking = bases_room.balances_of(robot, (*bases_room.BALANCES, *bases_room.OF_TURNS))
         axes = (bases_room.axes_of(robot)[0], bases_room.VARIABLES["payload"], *VARIABLES_ROUND)  # what is imposed
-        told = points, weight, robot, bases_room.Scope(lacking, axes), {way: seen[way] for way in WAYS}
-        return (*bases_room.curve_families(*told), *bases_room.window_families(*told))
+        base_arguments = (
+            points,
+            weight,
+            robot,
+            bases_room.Scope(lacking, axes),
+            {way: signal_values[way] for way in WAYS},
+        )
+        return (*bases_room.curve_families(*base_arguments), *bases_room.window_families(*base_arguments))

@@ -91,9 +91,7 @@ def export_remarks(found: Export) -> list[str]:
     if not compared.situation.is_measured:
         said.append("no readings were given, so the reference is the native model; give runs with --data")
     else:
-        said.append(
-            "the refit used no reading: these are hold-out errors if the robot's own fit has not seen these runs"
-        )
+        said.append("the refit used no reading: these are hold-out errors if the robot was not fitted to these runs")
     lost = [f.name for f in compared.fates if f.verdict == DROPPED]
     if lost:
         said.append(f"dropped: {', '.join(lost)}")

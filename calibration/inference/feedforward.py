@@ -1,0 +1,431 @@
+"""Feedforward constants of a drive, V = kS·sgn(v) + kV·v + kA·a + kG, from a log, and feedback gains from them.
+
+The law is integrated over windows: Δv = (∫u - kS ∫sgn(v) - kV ∫v - kG T) / kA. No acceleration is computed from noisy
+speeds, and the noise stands on the left side alone.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable, Iterator
+
+import numpy as np
+import scipy.linalg
+
+from calibration.data import Columns, Json, Names
+from calibration.data.input_errors import BadData
+from calibration.inference.fit_notes import Remark
+from calibration.inference.identifiability import Z95
+
+#: Units of position, with radians in one of them (of a length: 0).
+UNITS = {"rotation": 2 * np.pi, "rad": 1.0, "degree": np.pi / 180, "m": 0.0}
+#: Names of the four tests, and what a log without them calls them.
+TESTS = {
+    "quasistatic-forward": "slow-forward", "quasistatic-reverse": "slow-backward",
+    "dynamic-forward": "fast-forward", "dynamic-reverse": "fast-backward",
+}  # fmt: skip
+#: Length of a window [s], its fewest samples, and the fewest windows of a fit.
+WINDOW, FEWEST, WINDOWS = 0.06, 3, 8
+#: Longest delay that is looked for [s], and the gain of log likelihood that a finding needs.
+LONGEST, CERTAIN = 0.25, 12.0
+#: Delay that is reported [samples]: a shorter one is how the log pairs voltage and motion.
+LATE = 0.75
+#: Least speed of a window that counts [share of the largest].
+MOVES = 0.03
+#: Least misfit of a straight law that a bend removes [share of the change of speed].
+LEAST = 0.05
+#: Ratio of a speed in a wrong unit to the rate of the position.
+WRONG_UNITS = (60.0, 1 / 60, 2 * np.pi, 1 / (2 * np.pi), 360.0, 1 / 360, 60 / (2 * np.pi), 1000.0, 100.0)
+
+
+@dataclasses.dataclass(frozen=True)
+class DriveLog:
+    """Readings of a drive. Those of `velocity`, `position` and `current` may be missing (None).
+
+    Attributes:
+        run: name of the run of each row.
+        time: [s].
+        voltage: [V].
+        position, velocity: in `unit`, per second.
+        current: of the motor [A].
+        battery: its voltage at any times [V].
+        unit: one of `UNITS`.
+    """
+
+    run: np.ndarray
+    time: np.ndarray
+    voltage: np.ndarray
+    position: np.ndarray | None
+    velocity: np.ndarray | None
+    current: np.ndarray | None = None
+    battery: np.ndarray | None = None
+    unit: str = "rotation"
+
+
+@dataclasses.dataclass(frozen=True)
+class Tolerances:
+    """Weights of the regulator (Bryson's rule) and its clock. Defaults are those of WPILib's SysId.
+
+    Attributes:
+        position: [unit].
+        velocity: [unit/s].
+        effort: [V].
+        period: of the loop [s].
+        delay: of the measurement [s].
+    """
+
+    position: float = 1.0
+    velocity: float = 1.5
+    effort: float = 7.0
+    period: float = 0.02
+    delay: float | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class Feedforward:
+    """Constants of a drive with their standard deviations, and gains.
+
+    Attributes:
+        constants, sds: by name, kS, kV, kA, and kG where it applies.
+        missing: tests that the log lacks.
+        delay: of the motion behind the voltage, and of a speed's filter [s].
+        gains: by name.
+        windows: mean voltage, speed, acceleration, and True for one with little acceleration.
+    """
+
+    mechanism: str
+    unit: str
+    constants: dict[str, float]
+    sds: dict[str, float]
+    gains: dict[str, float]
+    tolerances: Tolerances
+    delay: float
+    filter_lag: float
+    missing: Names
+    windows: Columns
+    remarks: tuple[Remark, ...]
+
+    def to_json(self) -> Json:
+        """The content of `feedforward.json`. Intervals are of 95 %."""
+        units = units_of(self.unit)
+        return {
+            "schema": "mmrjax.feedforward/1",
+            "mechanism": self.mechanism,
+            "feedforward": {
+                name: {"value": x, "sd": self.sds[name], "interval": interval(x, self.sds[name]), "unit": units[name]}
+                for name, x in self.constants.items()
+            },
+            "feedback": {name: {"value": x, "unit": units[name.split("_")[-1]]} for name, x in self.gains.items()},
+            "tolerances": dataclasses.asdict(self.tolerances),
+            "delay_s": self.delay,
+            "filter_lag_s": self.filter_lag,
+            "missing_tests": list(self.missing),
+            "remarks": [{"code": r.code, **r.values} for r in self.remarks],
+        }
+
+
+def interval(value: float, sd: float) -> list[float]:
+    """The interval of 95 %."""
+    return [value - Z95 * sd, value + Z95 * sd]
+
+
+def units_of(unit: str) -> dict[str, str]:
+    """Unit of each constant and gain."""
+    return {
+        "kS": "V", "kG": "V", "kV": f"V·s/{unit}", "kA": f"V·s²/{unit}", "kP": f"V/{unit}", "kD": f"V·s/{unit}",
+    }  # fmt: skip
+
+
+def fit_feedforward(log: DriveLog, mechanism: str = "simple", tolerances: Tolerances | None = None) -> Feedforward:
+    """Constants of a drive, gains and what stands in their way.
+
+    Raises:
+        BadData: too little motion. The message names the missing tests.
+    """
+    missing = missing_tests(log)
+    log, lag, remarks = _speeds(log)
+    if len(_windows(log, 0.0)["u"]) < WINDOWS:
+        lacking = f"; missing: {', '.join(missing)}" if missing else ""
+        raise BadData(
+            f"the log has fewer than {WINDOWS} windows of {WINDOW:g} s in motion; expected the four tests of "
+            f"SysId{lacking}"
+        )
+    if _fit(_windows(log, 0.0), "simple")[0][1] < 0:
+        remarks.append(Remark("feedforward_sign"))
+        log = dataclasses.replace(log, voltage=-log.voltage)
+    delay, windows, level, bend = _delay_and_bend(log, mechanism)
+    if delay > LATE * _step(log):
+        remarks.append(Remark("feedforward_delay", delay=delay))
+    else:
+        delay = 0.0
+    if level:
+        most = None if log.current is None else float(np.nanmax(np.abs(log.current)))
+        limited = Remark("feedforward_limit", level=level, current=most)
+        remarks.append(limited if bend < 0 else Remark("feedforward_skid", level=level))
+    kept = _rows(windows, windows["demand"] < level) if level else windows
+    values, covariance, _ = _fit(kept, mechanism)
+    sds = np.sqrt(np.diag(covariance))
+    names = ("kS", "kV", "kA", "kG")[: len(values)]
+    constants = {name: float(x) for name, x in zip(names, values, strict=True)}
+    spread = {name: float(x) for name, x in zip(names, sds, strict=True)}
+    if mechanism == "simple":
+        remarks += _by_direction(kept)
+    remarks += _battery(log)
+    if missing:
+        remarks.append(Remark("feedforward_missing", tests=missing))
+    determined = 0 < Z95 * spread["kA"] < 0.5 * constants["kA"]
+    if not determined:
+        slow = [t for t in missing if t.startswith("dynamic")]
+        remarks.append(Remark("feedforward_no_kA", share=spread["kA"] * Z95 / abs(constants["kA"]), missing=slow))
+    asked = tolerances or Tolerances()
+    asked = dataclasses.replace(asked, delay=delay + lag) if asked.delay is None else asked
+    gains = feedback(constants["kV"], constants["kA"], asked) if determined and constants["kV"] > 0 else {}
+    if gains and asked.delay:
+        prompt = feedback(constants["kV"], constants["kA"], dataclasses.replace(asked, delay=0.0))
+        remarks.append(Remark("feedforward_gains_delayed", delay=asked.delay, slow=gains["velocity_kP"],
+                              prompt=prompt["velocity_kP"]))  # fmt: skip
+    shown = {
+        "run": kept["run"],
+        "voltage_V": kept["u"] / kept["T"],
+        "velocity": kept["x"] / kept["T"],
+        "acceleration": kept["dv"] / kept["T"],
+        "direction": kept["s"] / kept["T"],
+        "quasistatic": kept["quasistatic"],
+    }
+    return Feedforward(
+        mechanism, log.unit, constants, spread, gains, asked, delay, lag, missing, shown, tuple(remarks)
+    )  # fmt: skip
+
+
+def feedback(kV: float, kA: float, tolerances: Tolerances) -> dict[str, float]:
+    """Gains of the regulators of speed and of position.
+
+    Those of WPILib: state cost 1/q², effort cost 1/r², held voltage, and K (A - B K)^(delay / period) for a delay
+    (`FeedbackAnalysis.cpp` and `LinearQuadraticRegulator::LatencyCompensate` of wpilibsuite/allwpilib).
+    """
+    t = tolerances
+    speed = _regulator(np.array([[-kV / kA]]), np.array([[1 / kA]]), [t.velocity], t)
+    place = _regulator(np.array([[0, 1], [0, -kV / kA]]), np.array([[0], [1 / kA]]), [t.position, t.velocity], t)
+    return {"velocity_kP": speed[0], "position_kP": place[0], "position_kD": place[1]}
+
+
+def _regulator(a: np.ndarray, b: np.ndarray, tolerated: list[float], t: Tolerances) -> list[float]:
+    n = len(a)
+    held = scipy.linalg.expm(np.block([[a, b], [np.zeros((1, n + 1))]]) * t.period)
+    a, b = held[:n, :n], held[:n, n:]
+    cost, effort = np.diag(1 / np.square(tolerated)), np.array([[1 / t.effort**2]])
+    p = scipy.linalg.solve_discrete_are(a, b, cost, effort)
+    k = np.linalg.solve(effort + b.T @ p @ b, b.T @ p @ a)
+    later = scipy.linalg.fractional_matrix_power(a - b @ k, (t.delay or 0.0) / t.period)
+    return [float(x) for x in np.real(k @ later)[0]]
+
+
+def missing_tests(log: DriveLog) -> Names:
+    """Tests of SysId that a log lacks. None of a log whose voltage is neither ramp nor step."""
+    present = set()
+    for name in dict.fromkeys(log.run.tolist()):
+        named = next((t for t, old in TESTS.items() if t in name or old in name), None)
+        u = log.voltage[log.run == name]
+        u = u[np.abs(u) > 0.05 * np.abs(u).max()]
+        if named is None and len(u) > WINDOWS:
+            size, rises = np.abs(u), np.mean(np.diff(np.abs(u)) >= 0) > 0.95
+            kind = "dynamic" if size.std() < 0.1 * size.mean() else "quasistatic" if rises else ""
+            if not kind or not (np.all(u > 0) or np.all(u < 0)):
+                return ()
+            named = f"{kind}-{'forward' if u[0] > 0 else 'reverse'}"
+        present.add(named)
+    return tuple(t for t in TESTS if t not in present)
+
+
+def _step(log: DriveLog) -> float:
+    steps = np.diff(log.time)[log.run[1:] == log.run[:-1]]
+    return float(np.median(steps[steps > 0]))
+
+
+def _speeds(log: DriveLog) -> tuple[DriveLog, float, list[Remark]]:
+    """The log with a speed that is the rate of the position, the lag of the log's own speed [s], and remarks."""
+    if log.position is None:
+        return log, 0.0, []
+    step, rate = _step(log), np.zeros(len(log.time))
+    for rows in _runs(log):
+        t, x = log.time[rows], log.position[rows]
+        rate[rows] = np.nan  # at the ends
+        rate[rows[1:-1]] = (x[2:] - x[:-2]) / np.maximum(t[2:] - t[:-2], 1e-9)
+    if log.velocity is None:
+        return dataclasses.replace(log, velocity=rate), 0.0, []
+    remarks, speed = [], log.velocity
+    moving = np.abs(rate) > 0.2 * np.nanmax(np.abs(rate))
+    ratio = float(np.median(speed[moving] / rate[moving])) if moving.any() else 1.0
+    if ratio < 0:
+        remarks.append(Remark("feedforward_speed_sign"))
+    if abs(abs(ratio) - 1) > 0.05:
+        near = min(WRONG_UNITS, key=lambda f: abs(np.log(abs(ratio) / f)))
+        known = abs(np.log(abs(ratio) / near)) < 0.03
+        remarks.append(Remark("feedforward_unit", ratio=abs(ratio), near=near if known else 0.0))
+        speed = speed / abs(ratio)
+    speed = speed * np.sign(ratio)
+    lags = np.arange(0, LONGEST, step / 4)
+    misfit = [
+        sum(np.nansum((rate[r] - np.interp(log.time[r] + lag, log.time[r], speed[r]))[: -int(LONGEST / step)] ** 2)
+            for r in _runs(log) if len(r) > 2 * LONGEST / step)
+        for lag in lags
+    ]  # fmt: skip
+    best = int(np.argmin(misfit))
+    if lags[best] > step and 0.5 * len(rate) * np.log(misfit[0] / misfit[best]) > CERTAIN:
+        remarks.append(Remark("feedforward_filter", lag=float(lags[best])))
+        return dataclasses.replace(log, velocity=rate), float(lags[best]), remarks
+    return dataclasses.replace(log, velocity=speed), 0.0, remarks
+
+
+def _runs(log: DriveLog) -> Iterator[np.ndarray]:
+    for name in dict.fromkeys(log.run.tolist()):
+        yield np.flatnonzero(log.run == name)
+
+
+def _windows(log: DriveLog, delay: float) -> Columns:
+    """Integrals over windows of motion one way: voltage u, path x, direction s, length T, change of speed dv."""
+    found: list[dict[str, object]] = []
+    step, speeds = _step(log), np.asarray(log.velocity)
+    least = MOVES * np.nanmax(np.abs(speeds))
+    count = max(FEWEST, round(WINDOW / step))
+    for rows in _runs(log):
+        t, u, v = log.time[rows], log.voltage[rows], speeds[rows]
+        whole = np.r_[0, np.cumsum(u[:-1] * np.diff(t))]
+        path = np.r_[0, np.cumsum((v[1:] + v[:-1]) / 2 * np.diff(t))] if log.position is None else log.position[rows]
+        at = t - delay
+        rests = not abs(v[0]) >= least  # a test begins without voltage
+        driven = np.interp(at, t, whole) + np.minimum(at - t[0], 0) * (0.0 if rests else u[0])
+        driven += np.maximum(at - t[-1], 0) * u[-1]
+        place = np.zeros(len(t)) if log.position is None else log.position[rows] * UNITS[log.unit]
+        ramp = _is_ramp(u)
+        for a in range(len(t) - count):
+            b = a + count
+            inside = v[a : b + 1]
+            if np.any(np.sign(inside) != np.sign(inside[0])) or np.abs(inside).min() <= least:
+                continue
+            length = t[b] - t[a]
+            if length > 3 * WINDOW and length > 2 * count * step:
+                continue
+            c, s = (length * np.mean(f(place[a : b + 1])) for f in (np.cos, np.sin))
+            found.append({
+                "run": log.run[rows[0]], "row": rows[a], "count": count, "u": driven[b] - driven[a],
+                "x": path[b] - path[a], "T": length, "s": np.sign(inside[0]) * length, "dv": v[b] - v[a],
+                "cos": c, "sin": s, "quasistatic": ramp,
+            })  # fmt: skip
+    keys = ("run", "row", "count", "u", "x", "T", "s", "dv", "cos", "sin", "quasistatic")
+    return {key: np.array([w[key] for w in found]) for key in keys}
+
+
+def _is_ramp(voltage: np.ndarray) -> bool:
+    driven = np.abs(voltage[np.abs(voltage) > 0.05 * np.abs(voltage).max()])
+    return bool(len(driven) and driven.std() > 0.1 * driven.mean())
+
+
+def _rows(windows: Columns, kept: np.ndarray) -> Columns:
+    return {key: x[kept] for key, x in windows.items()}
+
+
+def _matrix(w: Columns, mechanism: str) -> np.ndarray:
+    more = {"simple": (), "elevator": (w["T"],), "arm": (w["cos"], w["sin"])}[mechanism]
+    return np.stack([w["u"], -w["s"], -w["x"], *(-x for x in more)], axis=1)
+
+
+def _fit(w: Columns, mechanism: str, extra: Iterable[np.ndarray] = ()) -> tuple[np.ndarray, np.ndarray, float]:
+    """Constants kS, kV, kA (and kG), their covariance, and the sum of squares.
+
+    Windows overlap: the covariance holds for residuals that are correlated.
+    """
+    matrix = np.column_stack([_matrix(w, mechanism), *extra])
+    solved, *_ = np.linalg.lstsq(matrix, w["dv"], rcond=None)
+    rest = w["dv"] - matrix @ solved
+    inverse = np.linalg.pinv(matrix.T @ matrix)
+    leverage = np.einsum("ij,jk,ik->i", matrix, inverse, matrix)
+    scored = matrix * (rest / np.maximum(1 - leverage, 0.05))[:, None]
+    middle = scored.T @ scored
+    for lag in range(1, w["count"][0] + 1):  # weights of Newey and West (1987)
+        near = (w["row"][lag:] - w["row"][:-lag] == lag) & (w["run"][lag:] == w["run"][:-lag])
+        beside = (scored[lag:] * near[:, None]).T @ scored[:-lag]
+        middle += (1 - lag / (w["count"][0] + 1)) * (beside + beside.T)
+    spread = inverse @ middle @ inverse
+    b, kA = solved[0], 1 / solved[0]
+    names = [solved[1] / b, solved[2] / b, kA]
+    size = np.eye(len(solved)) / b
+    jacobian = [size[1], size[2], np.zeros(len(solved))]
+    jacobian[2][0] = -(kA**2)
+    jacobian[0][0], jacobian[1][0] = -names[0] / b, -names[1] / b
+    if mechanism == "elevator":
+        names, jacobian = [*names, solved[3] / b], [*jacobian, size[3] - np.eye(len(solved))[0] * solved[3] / b**2]
+    elif mechanism == "arm":
+        c, s = solved[3] / b, solved[4] / b
+        kG = np.hypot(c, s)
+        names = [*names, kG]
+        jacobian = [*jacobian, (c * size[3] + s * size[4]) / kG - np.eye(len(solved))[0] * kG / b]
+    by = np.array(jacobian)
+    return np.array(names), by @ spread @ by.T, float(rest @ rest)
+
+
+def _delay_and_bend(log: DriveLog, mechanism: str) -> tuple[float, Columns, float, float]:
+    """The delay [s], windows with it, the accelerating voltage above which the slope changes [V], and its change.
+
+    Each is 0 unless the likelihood needs it: a limit looks like a delay, so the better one is taken first.
+    """
+    step = _step(log)
+    trials = []
+    shifts = [*np.arange(-8, 8) / 8, *np.arange(2, 2 * LONGEST / step) / 2]
+    for delay in step * np.array(sorted(shifts, key=abs)):
+        windows = _windows(log, float(delay))
+        plain = _fit(windows, mechanism)[2]
+        level, bend, cost = _bend(windows, mechanism)
+        trials += [(plain, float(delay), windows, 0.0, 0.0), (cost, float(delay), windows, level, bend)]
+    count = 0.5 * len(trials[0][2]["u"]) / trials[0][2]["count"][0]
+
+    def penalised(trial: tuple[float, float, Columns, float, float]) -> float:
+        cost, delay, _, level, bend = trial
+        if level and abs(bend) < 0.3:
+            return np.inf
+        late = CERTAIN if delay > LATE * step else 3.0 * (delay != 0)
+        return float(count * np.log(cost) + late + 2 * CERTAIN * (level > 0))
+
+    return min(trials, key=penalised)[1:]
+
+
+def _bend(w: Columns, mechanism: str) -> tuple[float, float, float]:
+    """Accelerating voltage above which the slope changes [V], the change, and the sum of squares.
+
+    Negative: less acceleration (a current limit), positive: more (wheels that slip). Sets `demand`.
+    """
+    values, _, plain = _fit(w, mechanism)
+    level, bend, cost, material = 0.0, 0.0, np.inf, False
+    for _ in range(3):
+        asked = (w["u"] - values[0] * w["s"] - values[1] * w["x"]) / w["T"]
+        w["demand"] = np.abs(asked)
+        trials = []
+        for share in np.linspace(0.15, 0.9, 16):
+            limit = share * w["demand"].max()
+            above = w["demand"] > limit
+            if above.sum() >= 3 and (~above).sum() >= WINDOWS:
+                hinge = np.sign(asked) * np.maximum(w["demand"] - limit, 0) * w["T"]
+                matrix = np.column_stack([_matrix(w, mechanism), hinge])
+                slope = np.linalg.lstsq(matrix, w["dv"], rcond=None)[0]
+                trials.append((float(np.sum((w["dv"] - matrix @ slope) ** 2)), float(limit), slope))
+        if not trials:
+            break
+        cost, level, slope = min(trials, key=lambda x: x[0])
+        above = w["demand"] > level
+        material = plain - cost > LEAST**2 * np.sum(w["dv"][above] ** 2)
+        bend, values = float(slope[-1] / slope[0]), slope[1:] / slope[0]
+    return level, bend, cost if material else np.inf
+
+
+def _by_direction(w: Columns) -> Iterator[Remark]:
+    values, covariance, _ = _fit(w, "elevator")  # a constant voltage beside friction is half the difference
+    half, sd = values[3], np.sqrt(covariance[3, 3])
+    if {*np.sign(w["s"])} == {1.0, -1.0} and abs(half) > 4 * sd and abs(half) > 0.05 * abs(values[0]):
+        yield Remark("feedforward_direction", forward=float(values[0] + half), backward=float(values[0] - half))
+
+
+def _battery(log: DriveLog) -> Iterator[Remark]:
+    if log.battery is not None and np.isfinite(log.battery).any():
+        rest, low = float(np.nanmax(log.battery)), float(np.nanmin(log.battery))
+        if low < 0.9 * rest:
+            yield Remark("feedforward_sag", rest=rest, low=low)

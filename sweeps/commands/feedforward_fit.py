@@ -1,0 +1,102 @@
+"""`calibrate --feedforward`: constants kS, kV, kA of a log, as users of WPILib state them."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from importlib import resources
+
+import numpy as np
+
+from calibration.data import contents, robot_file
+from calibration.data.input_errors import BadConfiguration, BadData
+from calibration.data.runs import Runs
+from calibration.inference.feedforward import UNITS, DriveLog, Tolerances, fit_feedforward
+from mmrjax.model.channels import EVERY
+from sweeps import config as configuration
+from sweeps.inputs import load_robot, read_runs
+from sweeps.report import feedforward_report
+from sweeps.store import finish_run_folder, open_folder, print_report
+
+#: Names of signals with the battery's voltage.
+BATTERY = re.compile(r"batt\w*volt", re.IGNORECASE)
+#: Columns of a velocity and its position, the first pair that has readings is fitted.
+PAIRS = (("output_speed_rpm", "output_angle_deg"), ("speed_mm_s", "position_mm"))
+ROTOR = "motor_speed_rpm", ""
+
+
+def execute(config: configuration.Calibrate, beside: configuration.FittedRuns) -> int:
+    """Fit the constants, print them and leave a run folder. Returns the exit code, 0."""
+    if stated := config.robot != "nominal":
+        robot = load_robot(config).robot
+    else:
+        with resources.as_file(resources.files("sweeps") / "rigs" / "feedforward.toml") as path:
+            robot = robot_file.read_robot(path)
+    file = contents.inspect_source(beside.data)
+    columns = config.columns or ("sysid" if file.preset == "sysid" else None)
+    runs = read_runs(beside.data, robot, columns=columns, measured=True, series=True)
+    log = drive_log(runs, config.unit, as_logged=(columns or "").startswith("sysid"))
+    battery = [x for s in file.signals if BATTERY.search(s.path) for x in (s.least, s.greatest)]
+    log = dataclasses.replace(log, battery=np.array(battery) if battery else None)
+    tolerances = Tolerances(
+        config.position_error, config.velocity_error, config.effort_V, config.period_s, config.measurement_delay_s
+    )
+    found = fit_feedforward(log, config.feedforward or "", tolerances)
+    with open_folder("calibrate", config, robot, beside, runs) as folder:
+        folder.write_json("feedforward.json", found.to_json())
+        folder.write_table("windows.csv", found.windows)
+        shown = print_report(feedforward_report.feedforward_document(found))
+        note = "the rig of this log" if stated else "a rig that reads this log"
+        return finish_run_folder(folder, config, {"seed": None}, robot=robot, note=note, page=shown, runs=runs)
+
+
+def drive_log(runs: Runs, unit: str | None = None, as_logged: bool = False) -> DriveLog:
+    """Readings of a log in a unit of position. None: that of its first pair of channels.
+
+    Args:
+        as_logged: True for a log of SysId, which is in units of its own. `unit` is their name.
+
+    Raises:
+        BadData: no time, or neither velocity nor position.
+        BadConfiguration: a unit of length for an angle, or the reverse.
+    """
+
+    factors = {channel.column: channel.factor for channel in EVERY}
+
+    def reading(column: str) -> np.ndarray | None:
+        if not runs.has(column):
+            return None
+        values = runs[column] * factors[column]
+        return values if np.isfinite(values).any() else None
+
+    for pair in (*PAIRS, ROTOR):
+        velocity, position = map(reading, pair)
+        if velocity is not None or position is not None:
+            break
+    else:
+        raise BadData(
+            f"{runs.source}: has neither velocity nor position; expected output_speed_rpm, output_angle_deg, "
+            "speed_mm_s, position_mm or motor_speed_rpm, or --columns sysid"
+        )
+    unit = unit or ("m" if pair[0] == "speed_mm_s" else "rotation")
+    if (unit == "m") != (pair[0] == "speed_mm_s") and not as_logged:
+        raise BadConfiguration(f"--unit: got {unit}, but {pair[0]} is read; expected a unit of its position")
+    size = 2 * np.pi if as_logged else UNITS[unit] or 1.0
+    if not runs.sampled:
+        raise BadData(f"{runs.source}: has no time; expected a column time_s")
+    order = np.concatenate([runs.in_order(name) for name in dict.fromkeys(runs.run_names.tolist())])
+    duty = runs["duty"] if runs.has("duty") else 1.0
+    voltage = np.asarray(runs["supply_voltage_V"] * duty, float)
+
+    def ordered(values: np.ndarray | None, size: float) -> np.ndarray | None:
+        return None if values is None else values[order] / size
+
+    return DriveLog(
+        runs.run_names[order],
+        np.asarray(runs["time_s"], float)[order],
+        voltage[order],
+        ordered(position, size),
+        ordered(velocity, size),
+        ordered(reading("motor_current_A"), 1.0),
+        unit=unit,
+    )

@@ -1,0 +1,30 @@
+"""The report of `calibrate --feedforward`."""
+
+from __future__ import annotations
+
+from calibration.described import sentences
+from calibration.inference.feedforward import Feedforward, interval, units_of
+from calibration.words import feedforward_words
+from sweeps.report import catalogue
+from sweeps.report.document import Block, Document, Section, remarks
+
+
+def feedforward_document(found: Feedforward) -> Document:
+    """Constants, gains, remarks and the two figures."""
+    units, t = units_of(found.unit), found.tolerances
+    constants = [(n, x, interval(x, found.sds[n])[1] - x, units[n]) for n, x in found.constants.items()]
+    gains = [(*name.split("_"), x, units[name.split("_")[1]]) for name, x in found.gains.items()]
+    asked = (
+        f"Gains for tolerances of {t.position:g} {found.unit}, {t.velocity:g} {found.unit}/s and {t.effort:g} V, a "
+        f"period of {1000 * t.period:g} ms and a measurement delay of {1000 * (t.delay or 0):.3g} ms."
+    )
+    blocks: list[Block] = [catalogue.table("feedforward.constants", constants), *remarks(sentences(found.remarks))]
+    if gains:
+        blocks += [catalogue.table("feedforward.gains", gains), *remarks((asked,), "asked")]
+    figures = tuple(catalogue.figure(f"feedforward.{name}", found) for name in ("quasistatic", "dynamic"))
+    return Document(
+        f"Feedforward of {'an' if found.mechanism[0] in 'ae' else 'a'} {found.mechanism} mechanism",
+        feedforward_words.feedforward_statement(found),
+        tuple(blocks),
+        (Section("Windows", figures),),
+    )

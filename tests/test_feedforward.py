@@ -1,0 +1,168 @@
+"""Feedforward constants of WPILib: against an independent least squares, and with seeded faults."""
+
+import dataclasses
+import json
+import struct
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from test_more_formats import wpilog
+
+from calibration.data.input_errors import BadData
+from calibration.described import sentences
+from calibration.inference.feedforward import DriveLog, Tolerances, feedback, fit_feedforward
+
+TESTS = ("quasistatic-forward", "quasistatic-reverse", "dynamic-forward", "dynamic-reverse")
+STEP, FINE = 0.02, 5
+
+
+def simulated(seed, fault="", tests=TESTS, kG=0.0, arm=False):
+    """A log of a drive by explicit steps of 1 ms. Returns it with kS, kV, kA."""
+    rng = np.random.default_rng(seed)
+    kS, kV, kA = rng.uniform(0.1, 0.4), rng.uniform(0.1, 0.2), rng.uniform(0.04, 0.08)
+    rows, battery, currents = [], [], []
+    for test in tests:
+        sign = 1 if test.endswith("forward") else -1
+        x = v = filtered = 0.0
+        places, speeds, past = [0.0] * 200, [0.0] * 200, []
+        for k in range(int((6 if test[0] == "q" else 2) / STEP)):
+            u = sign * (min(1.0 * k * STEP, 7.0) if test[0] == "q" else 7.0)
+            shown = 60 * v if fault == "unit" else filtered if fault == "filter" else v
+            if fault == "delay":
+                x_read, shown = places[-20], speeds[-20]
+            else:
+                x_read = x
+            rows.append([test, k * STEP, -u if fault == "sign" else u, x_read + rng.normal(0, 2e-4),
+                         shown + rng.normal(0, 0.02) * (60 if fault == "unit" else 1)])  # fmt: skip
+            past = [*past[-4:], v]
+            filtered = np.mean(past)
+            for _ in range(FINE):
+                dt = STEP / FINE
+                supply = 12.5 - 0.4 * abs(u - kV * v) if fault == "sag" else 12.5
+                half = v
+                for part in (dt / 2, dt):  # the midpoint rule
+                    asked = u * supply / 12.5 - kV * half - kG * (np.cos(np.pi / 180 * x) if arm else 1)
+                    net = asked - kS * np.sign(v) if v else np.sign(asked) * max(abs(asked) - kS, 0)
+                    net = np.clip(net, -3.0, 3.0) if fault == "limit" else net
+                    net += 1.5 * np.sign(net) * max(abs(net) - 3.0, 0) if fault == "skid" else 0.0
+                    half, before = v + net / kA * part, half
+                x, v = x + before * dt, half
+                places, speeds = [*places[1:], x], [*speeds[1:], v]
+            battery.append(supply)
+            currents.append(abs(net) * 10)
+    run, time, voltage, place, speed = map(np.array, zip(*rows, strict=True))
+    log = DriveLog(run, time, voltage, place, speed, battery=np.array(battery) if fault == "sag" else None)
+    return log, (kS, kV, kA)
+
+
+def least_squares(log):
+    """Next speed on speed, voltage and direction: the exact law of a held voltage. Returns constants and sds."""
+    rows = []
+    for name in TESTS:
+        v, u = log.velocity[log.run == name], log.voltage[log.run == name]
+        moves = np.flatnonzero((np.abs(v[:-1]) > 1.0) & (np.abs(v[1:]) > 1.0))
+        rows += [(v[k + 1], v[k], u[k], np.sign(v[k])) for k in moves]
+    y, x = np.array(rows)[:, 0], np.array(rows)[:, 1:]
+    solved, cost, *_ = np.linalg.lstsq(x, y, rcond=None)
+
+    def constants(b):
+        kV = (1 - b[0]) / b[1]
+        return np.array([-b[2] / b[1], kV, -kV * STEP / np.log(b[0])])
+
+    jacobian = np.array([(constants(solved + d) - constants(solved - d)) / 2e-7 for d in 1e-7 * np.eye(3)]).T
+    spread = cost / (len(y) - 3) * np.linalg.inv(x.T @ x)
+    return constants(solved), np.sqrt(np.diag(jacobian @ spread @ jacobian.T))
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_constants_are_those_of_an_independent_least_squares(seed):
+    log, true = simulated(seed)
+    found = fit_feedforward(log)
+    values, sds = np.array([*found.constants.values()]), np.array([*found.sds.values()])
+    other, spread = least_squares(log)
+    assert (np.abs(values - other) < spread).all()
+    assert (np.abs(values - true) < 4 * sds).all()
+    assert not found.remarks
+
+
+@pytest.mark.parametrize(("fault", "code"), [
+    ("sign", "feedforward_sign"), ("unit", "feedforward_unit"), ("sag", "feedforward_sag"),
+    ("limit", "feedforward_limit"), ("delay", "feedforward_delay"), ("skid", "feedforward_skid"),
+    ("filter", "feedforward_filter"), ("missing", "feedforward_missing"),
+])  # fmt: skip
+@pytest.mark.parametrize("seed", [1, 2])
+def test_seeded_faults_are_named(seed, fault, code):
+    log, true = simulated(seed, fault, TESTS[:2] if fault == "missing" else TESTS)
+    found = fit_feedforward(log)
+    codes = [r.code for r in found.remarks]
+    also = {"delay": ["feedforward_gains_delayed"], "filter": ["feedforward_gains_delayed"],
+            }.get(fault, [])  # fmt: skip
+    assert [c for c in codes if c != "feedforward_no_kA" or fault != "missing"] == [code, *also]
+    if fault != "sag" and fault != "missing":
+        assert_allclose([*found.constants.values()], true, rtol=0.08, atol=0.02)
+    assert all(sentences(found.remarks))
+
+
+@pytest.mark.parametrize(("mechanism", "arm"), [("elevator", False), ("arm", True)])
+def test_weight_of_a_lift_and_of_an_arm(mechanism, arm):
+    log, true = simulated(3, kG=0.5, arm=arm)
+    found = fit_feedforward(dataclasses.replace(log, unit="degree"), mechanism)
+    assert_allclose([*found.constants.values()], [*true, 0.5], rtol=0.03)
+
+
+def test_friction_that_differs_by_direction_is_named():
+    log, (kS, *_) = simulated(3, kG=0.05)
+    (remark,) = fit_feedforward(log).remarks
+    assert remark.code == "feedforward_direction"
+    assert_allclose([remark.forward, remark.backward], [kS + 0.05, kS - 0.05], atol=0.01)
+
+
+def test_constant_of_acceleration_that_is_not_determined_gives_no_gains():
+    log, _ = simulated(1, tests=TESTS[:2])
+    noise = np.random.default_rng(0).normal(0, 0.5, len(log.time))
+    found = fit_feedforward(dataclasses.replace(log, velocity=log.velocity + noise))
+    assert "feedforward_no_kA" in [r.code for r in found.remarks] and not found.gains
+
+
+def test_log_at_rest_says_which_tests_are_missing():
+    log, _ = simulated(1, tests=TESTS[1:2])
+    still = dataclasses.replace(log, position=None, velocity=0 * log.time)
+    with pytest.raises(BadData, match="missing: quasistatic-forward, dynamic-forward, dynamic-reverse"):
+        fit_feedforward(still)
+
+
+def test_gains_solve_the_riccati_equation_by_iteration():
+    kV, kA, dt, q, r = 2.0, 0.4, 0.02, 1.5, 7.0
+    a, b = np.exp(-kV / kA * dt), (1 - np.exp(-kV / kA * dt)) / kV
+    p = 0.0
+    for _ in range(2000):
+        k = a * b * p / (1 / r**2 + b * b * p)
+        p = 1 / q**2 + a * a * p - a * b * p * k
+    assert_allclose(feedback(kV, kA, Tolerances())["velocity_kP"], k, rtol=1e-9)
+    late = feedback(kV, kA, Tolerances(delay=0.05))["velocity_kP"]
+    assert_allclose(late, k * (a - b * k) ** 2.5, rtol=1e-9)
+
+
+def test_command_writes_constants_of_a_wpilog(tmp_path, mmrjax):
+    log, true = simulated(4)
+    records = [(1, 0, ("sysid-test-state-drive", "string"))]
+    records += [(k, 0, (f"{q}-drive", "double")) for k, q in ((2, "voltage"), (3, "position"), (4, "velocity"))]
+    before = 0.0
+    for k, name in enumerate(log.run):
+        before += 0.1 if k and name != log.run[k - 1] else 0.0
+        stamp = round(1e6 * (before + 0.02 * k))
+        values = (log.voltage[k], log.position[k], log.velocity[k])
+        records.append((1, stamp, name.encode()))
+        records += [(e, stamp, struct.pack("<d", v)) for e, v in zip((2, 3, 4), values, strict=True)]
+        if k + 1 == len(log.run) or log.run[k + 1] != name:
+            records.append((1, stamp, b"none"))
+    (tmp_path / "robot.wpilog").write_bytes(wpilog(*records))
+    code, out, error = mmrjax("calibrate robot.wpilog --feedforward simple --out fit")
+    assert code == 0 and "kS = " in out, error
+    found = json.loads((tmp_path / "fit" / "feedforward.json").read_text())
+    values = [found["feedforward"][name]["value"] for name in ("kS", "kV", "kA")]
+    assert_allclose(values, true, rtol=0.02)
+    assert found["feedforward"]["kV"]["unit"] == "V·s/rotation" and found["feedback"]["velocity_kP"]["value"] > 0
+    page = (tmp_path / "fit" / "report.html").read_text()
+    assert "Quasistatic" in page and "Dynamic" in page
