@@ -550,7 +550,7 @@ def weak_form(problem: Problem, effects: tuple[ScoredEffect, ...] = ()) -> WeakF
                 last[:] = [(z.copy(), np.concatenate([factored, rest]))]
             return last[0][1]
 
-        return terms_at_fit
+        return at
 
     centre = late.start(problem)
     z, size = centre, len(centre)

@@ -726,8 +726,8 @@ class Histories(Observer):
         def again(z: np.ndarray) -> tuple[Optimum, Observation]:
             return one(searched(np.tile(np.pad(z, (0, np.shape(starts)[1] - size)), (len(starts), 1))))
 
-        data = dataclasses.replace(bare.data, weight=weights[k])
-        best, seen = scans.search_lower_basins(bare, one(optima), data, again, lambda _: None)
+        scan_data = dataclasses.replace(bare.data, weight=weights[k])
+        best, seen = scans.search_lower_basins(bare, one(optima), scan_data, again, lambda _: None)
         optimum = jax.tree.map(lambda leaf: jnp.asarray(leaf[k]), optima[0])
         best = dataclasses.replace(best, z=optimum.z.at[:size].set(best.z), sd=optimum.sd.at[:size].set(best.sd))
         return jax.tree.map(lambda every, mine: jnp.asarray(every).at[k].set(mine), optima, (best, seen))
