@@ -69,6 +69,8 @@ MORE = {
     "voltages_V": "axis of supply_voltage_V", "payloads_kg": "axis of payload_kg",
     "slopes_deg": "axis of slope_deg", "motor_speeds_rpm": "axis of motor_speed_rpm",
     "motor_currents_A": "axis of motor_current_A",
+    "effort_V": "voltage that feedback gains may use", "period_s": "of a controller",
+    "measurement_delay_s": "of a controller's readings",
     "step_s": "integration step", "shortest_s": "shortest stretch of a log that is taken for settled",
     # runs over time
     "time_end_s": "when a run ends", "permissible_time_s": "how long a current may flow from ambient temperature",
