@@ -19,7 +19,7 @@ from calibration.discovery.result import Ranked, Ranking
 from calibration.discovery.score_tests import ScoreTable
 from calibration.discovery.settings import settings_for
 from calibration.inference.held_out import predict_unseen
-from calibration.inference.observers import Histories
+from calibration.inference.observers import Histories, time_histories
 from calibration.inference.optimizers import Optimum
 from calibration.words import loop_words as words
 from mmrjax.effects import BY_NAME
@@ -70,6 +70,29 @@ def test_the_base_of_a_log_is_fitted_in_the_program_of_its_room(space, monkeypat
     assert bare is scanned is space.bare and nothing is None and start.shape == (1, space.free)
     assert problem.coordinates.names == ("churning",) and active.tolist() == [[-1, -1]]
     assert with_slots[0].tolist() == [0.2] * space.free + [0.0] * 4
+
+
+def test_other_basins_of_a_log_are_searched_in_the_program_of_its_room(space, monkeypatch):
+    """With the priors of its coordinates, which are more than the base's."""
+    problem, (empty,) = space.with_room(["churning"]).fitted_by([("", "")])
+    size, priors = space.free + 4, []
+
+    def rollouts(evaluate, starts, data, weights, *_, **options):
+        priors.append(np.shape(data.centre))
+        zero = np.zeros(len(starts))
+        square = np.zeros((len(starts), size, size))
+        return Optimum(np.asarray(starts), np.asarray(starts), square, zero, zero, zero == 0, zero), zero
+
+    monkeypatch.setattr(time_histories, "search_rollouts", rollouts)
+    monkeypatch.setattr(time_histories.scans, "scanned_coordinates", lambda problem: (0,))
+    monkeypatch.setattr(
+        time_histories.scans, "search_lower_basins", lambda problem, end, data, search, tell: search(end[0].z + 1)
+    )
+    weights, which = space.weight[None], np.asarray(empty)[None]
+    best, _ = space.bare.observe.search(
+        problem, np.zeros((1, size)), weights, which, rivals=True, most=1, scanned=space.bare
+    )
+    assert priors == [(size,)] * 2 and best.z[0].tolist() == [1.0] * space.free + [0.0] * 4
 
 
 def linear_world(space, seed=3):
