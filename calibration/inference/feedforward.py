@@ -7,7 +7,7 @@ speeds, and the noise stands on the left side alone.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 
 import numpy as np
 import scipy.linalg
@@ -144,13 +144,14 @@ def fit_feedforward(log: DriveLog, mechanism: str = "simple", tolerances: Tolera
     """
     missing = missing_tests(log)
     log, lag, remarks = _speeds(log)
-    if len(_windows(log, 0.0)["u"]) < WINDOWS:
+    windows = _windows(log, 0.0)
+    if len(windows["u"]) < WINDOWS:
         lacking = f"; missing: {', '.join(missing)}" if missing else ""
         raise BadData(
             f"the log has fewer than {WINDOWS} windows of {WINDOW:g} s in motion; expected the four tests of "
             f"SysId{lacking}"
         )
-    if _fit(_windows(log, 0.0), "simple")[0][1] < 0:
+    if _fit(windows, "simple")[0][1] < 0:
         remarks.append(Remark("feedforward_sign"))
         log = dataclasses.replace(log, voltage=-log.voltage)
     delay, windows, level, bend = _delay_and_bend(log, mechanism)
@@ -225,11 +226,10 @@ def missing_tests(log: DriveLog) -> Names:
     present = set()
     for name in dict.fromkeys(log.run.tolist()):
         named = next((t for t, old in TESTS.items() if t in name or old in name), None)
-        u = log.voltage[log.run == name]
-        u = u[np.abs(u) > 0.05 * np.abs(u).max()]
+        u = _driven(log.voltage[log.run == name])
         if named is None and len(u) > WINDOWS:
-            size, rises = np.abs(u), np.mean(np.diff(np.abs(u)) >= 0) > 0.95
-            kind = "dynamic" if size.std() < 0.1 * size.mean() else "quasistatic" if rises else ""
+            rises = np.mean(np.diff(np.abs(u)) >= 0) > 0.95
+            kind = "dynamic" if not _is_ramp(u) else "quasistatic" if rises else ""
             if not kind or not (np.all(u > 0) or np.all(u < 0)):
                 return ()
             named = f"{kind}-{'forward' if u[0] > 0 else 'reverse'}"
@@ -297,7 +297,7 @@ def _windows(log: DriveLog, delay: float) -> Columns:
         driven = np.interp(at, t, whole) + np.minimum(at - t[0], 0) * (0.0 if rests else u[0])
         driven += np.maximum(at - t[-1], 0) * u[-1]
         place = np.zeros(len(t)) if log.position is None else log.position[rows] * UNITS[log.unit]
-        ramp = _is_ramp(u)
+        ramp = _is_ramp(_driven(u))
         for a in range(len(t) - count):
             b = a + count
             inside = v[a : b + 1]
@@ -316,9 +316,15 @@ def _windows(log: DriveLog, delay: float) -> Columns:
     return {key: np.array([w[key] for w in found]) for key in keys}
 
 
-def _is_ramp(voltage: np.ndarray) -> bool:
-    driven = np.abs(voltage[np.abs(voltage) > 0.05 * np.abs(voltage).max()])
-    return bool(len(driven) and driven.std() > 0.1 * driven.mean())
+def _driven(voltage: np.ndarray) -> np.ndarray:
+    """The voltages of a run that drive the motor."""
+    return voltage[np.abs(voltage) > 0.05 * np.abs(voltage).max()]
+
+
+def _is_ramp(driven: np.ndarray) -> bool:
+    """True for a test whose driving voltages change, False for a step."""
+    size = np.abs(driven)
+    return bool(len(size) and size.std() > 0.1 * size.mean())
 
 
 def _rows(windows: Columns, kept: np.ndarray) -> Columns:
@@ -330,12 +336,12 @@ def _matrix(w: Columns, mechanism: str) -> np.ndarray:
     return np.stack([w["u"], -w["s"], -w["x"], *(-x for x in more)], axis=1)
 
 
-def _fit(w: Columns, mechanism: str, extra: Iterable[np.ndarray] = ()) -> tuple[np.ndarray, np.ndarray, float]:
+def _fit(w: Columns, mechanism: str) -> tuple[np.ndarray, np.ndarray, float]:
     """Constants kS, kV, kA (and kG), their covariance, and the sum of squares.
 
     Windows overlap: the covariance holds for residuals that are correlated.
     """
-    matrix = np.column_stack([_matrix(w, mechanism), *extra])
+    matrix = _matrix(w, mechanism)
     solved, *_ = np.linalg.lstsq(matrix, w["dv"], rcond=None)
     rest = w["dv"] - matrix @ solved
     inverse = np.linalg.pinv(matrix.T @ matrix)
