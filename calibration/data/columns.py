@@ -11,7 +11,7 @@ from calibration.data import Names
 from calibration.data.input_errors import BadData
 from mmrjax.model import channels, quantities
 from mmrjax.model.channels import Channel
-from mmrjax.model.quantities import BY_COLUMN, GROUND, RPM, SHAFT, VEHICLE, Condition, Quantity
+from mmrjax.model.quantities import BY_COLUMN, GOALS, GROUND, RPM, SHAFT, VEHICLE, Condition, Quantity
 
 if TYPE_CHECKING:
     from mmrjax.model.rig import Instrument
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 #: Column of each imposed quantity (`rig.IMPOSED`), and the SI value of its unit.
 SUPPLY, SPEED, CURRENT = "supply_voltage_V", "motor_speed_rpm", "motor_current_A"
 IMPOSED = {"voltage": (SUPPLY, 1.0), "motor_speed": (SPEED, RPM), "motor_current": (CURRENT, 1.0)}
+IMPOSED |= {c.name: (c.column, c.factor) for c in quantities.SET if c.name in GOALS}
 #: Rows of all runs of a log from which on readings of fewer are used (`thinning`).
 ROWS = 4000
 
@@ -194,7 +195,7 @@ class Layout:
     def known(self) -> Names:
         """Every column with a meaning."""
         read = (SUPPLY, *self.measured_columns, *self.deviation_columns)
-        labels = [word for word in WORDS if word != "mode" or self.imposed == "voltage"]
+        labels = [word for word in WORDS if word != "mode" or self.imposed in ("voltage", *GOALS)]
         set_ = [c.column for c in quantities.SET if c.in_tables and self.imposed in (c.imposed or IMPOSED)]
         every = ("configuration", *self.axes, *read, *labels, "time_s", *self.sides, *set_)
         return tuple(dict.fromkeys(c for c in every if c not in self.idle))

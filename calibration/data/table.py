@@ -274,8 +274,12 @@ class Runs:
             raise BadData(f"{self.source}: no {column}, which the robot's file states as imposed; give it in a table")
         stated = {c.field: self[c.column] for c in quantities.SET if c.in_tables and c.field and self.has(c.column)}
         stated["duty"] = np.where(held, 0.0, stated.get("duty", 1.0))
-        stated["voltage"] = np.zeros(len(self)) if battery or imposed else self[SUPPLY]
-        if imposed:
+        supply = 0.0 if robot.controller is None else robot.controller.supply_voltage
+        absent = battery or (imposed and not (robot.rig.follows_goal and self.has(SUPPLY)))
+        stated["voltage"] = np.full(len(self), supply) if absent else self[SUPPLY]
+        if robot.rig.follows_goal:
+            stated["goal"] = self[column] * factor
+        elif imposed:
             stated[robot.rig.imposed] = self[column] * factor
             for side, name in zip(channels.SIDES, self.layout.sides, strict=False):
                 if self.has(name):

@@ -90,6 +90,7 @@ from mmrjax.fidelities.histories import (
 from mmrjax.model import balances, channels
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.params import Scalar
+from mmrjax.model.quantities import GOALS
 from mmrjax.model.rig import Begin, Begins, Rig
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import CONVERGED, FAILED, Signals, State
@@ -111,9 +112,10 @@ JUMP = 7.0
 #: Fields of `Conditions` that may change within a run.
 CHANGING = (
     "voltage", "motor_current", "slope_deg", "payload", "adhesion", "total_mass", "duty", "open", "load_torque",
+    "goal",
 )  # fmt: skip
 #: Imposed quantities among these, and the torque of a brake, which is measured.
-ON_LINES = ("voltage", "motor_current", "duty", "load_torque")
+ON_LINES = ("voltage", "motor_current", "duty", "load_torque", "goal")
 #: Shortest interval of unchanged conditions that may show steady travel [s].
 LASTING = 0.25
 #: Fewest steps between samples for a run that is driven both ways, near rest, if shafts and load do not move as one:
@@ -930,6 +932,8 @@ def _check_signs(runs: Runs) -> None:
 
     A rig's inertia may carry it forwards during one interval, but not during all of a table.
     """
+    if runs.layout.imposed in GOALS:  # an output may turn away from its goal
+        return
     volts, measured = applied_drive(runs), runs.measured()
     time, size = runs["time_s"], np.nanmax(np.abs(measured), 0, initial=0.0)
     unsigned = np.nanmin(measured, 0, initial=0.0) >= -RESTING * size
@@ -1028,7 +1032,7 @@ def _longest_steps(runs: Runs, robot: Robot) -> list[np.ndarray]:
         if both_ways and not robot.moves_as_one:
             speeds = measured[rows]
             speeds[:, rates] = np.gradient(speeds[:, rates], time, axis=0)
-            slow = _may_pass_rest(speeds, SLOW[rig.imposed])
+            slow = _may_pass_rest(speeds, SLOW.get(rig.imposed, SLOW["motor_current"]))
             before = int(np.ceil(early / _usual_interval(apart)))
             slow = np.convolve(slow, np.ones(before + 1))[before:] > 0
             longest[slow] = min(LONGEST, wait / FINE)
