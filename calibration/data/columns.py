@@ -114,6 +114,7 @@ class Layout:
         instruments: properties of instruments that are known.
         mapped: (column as this program calls it, column of the file, factor from its unit).
         channels: of its readings, in the order of arrays.
+        supply: voltage of a controller's driver in tables without its column [V]. 0: tables have it.
     """
 
     imposed: str = "voltage"
@@ -124,6 +125,7 @@ class Layout:
     instruments: tuple[Instrument, ...] = ()
     mapped: tuple[tuple[str, str, float], ...] = ()
     channels: tuple[Channel, ...] = dataclasses.field(default_factory=channels.usual_channels)
+    supply: float = 0.0
 
     @classmethod
     def of(cls, robot: Robot | None) -> Layout:
@@ -134,9 +136,9 @@ class Layout:
         loads = robot.configurations.members
         weight = any(float(x) != 0 for load in loads for x in (load.torque_constant, load.torque_gravity))
         names = robot.configurations.names
-        return cls(
-            rig.imposed, robot.has_ground, weight, rig.inherits, names, rig.instruments, rig.columns, robot.channels
-        )
+        supply = 0.0 if robot.controller is None else robot.controller.supply_voltage
+        stated = rig.imposed, robot.has_ground, weight, rig.inherits, names, rig.instruments, rig.columns
+        return cls(*stated, robot.channels, supply)
 
     @property
     def table8(self) -> bool:
@@ -206,6 +208,7 @@ class Layout:
             own = (() if measured else ("total_mass_kg",)) + ((SUPPLY,) if battery else ())
             return tuple(c for c in ("configuration", *CONDITIONS) if c not in own)
         imposed = () if battery and self.imposed == "voltage" else (self.imposed_column,)
+        imposed += (SUPPLY,) if self.imposed in GOALS and not self.supply else ()
         return (("configuration",) if len(self.configurations) != 1 else ()) + imposed
 
     def quantities(self) -> dict[str, Quantity]:

@@ -274,9 +274,8 @@ class Runs:
             raise BadData(f"{self.source}: no {column}, which the robot's file states as imposed; give it in a table")
         stated = {c.field: self[c.column] for c in quantities.SET if c.in_tables and c.field and self.has(c.column)}
         stated["duty"] = np.where(held, 0.0, stated.get("duty", 1.0))
-        supply = 0.0 if robot.controller is None else robot.controller.supply_voltage
-        absent = battery or (imposed and not (robot.rig.follows_goal and self.has(SUPPLY)))
-        stated["voltage"] = np.full(len(self), supply) if absent else self[SUPPLY]
+        follows = imposed and not robot.rig.follows_goal
+        stated["voltage"] = np.zeros(len(self)) if battery or follows else self[SUPPLY]
         if robot.rig.follows_goal:
             stated["goal"] = self[column] * factor
         elif imposed:

@@ -121,7 +121,7 @@ def commanded(robot: Robot, conditions: Conditions, state: State) -> Conditions:
 
 
 def integrated_error(robot: Robot, conditions: Conditions, state: State) -> Scalar:
-    """Rate of the integral of a controller's error: the error, unless the duty is at the limit and it has its sign."""
+    """Rate of the integral of a controller's error: the error, unless it would drive the duty beyond its limit."""
     if conditions.goal is None:
         return jnp.zeros_like(state.integral)
     error = conditions.goal - shown_to_controller(robot, conditions, state)[0]
