@@ -207,7 +207,7 @@ class Layout:
         if self.complete:
             own = (() if measured else ("total_mass_kg",)) + ((SUPPLY,) if battery else ())
             return tuple(c for c in ("configuration", *CONDITIONS) if c not in own)
-        imposed = () if battery and self.imposed == "voltage" else (self.imposed_column,)
+        imposed: Names = () if battery and self.imposed == "voltage" else (self.imposed_column,)
         imposed += (SUPPLY,) if self.imposed in GOALS and not self.supply else ()
         return (("configuration",) if len(self.configurations) != 1 else ()) + imposed
 

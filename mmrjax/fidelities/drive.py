@@ -88,7 +88,8 @@ def drive_rates(
     robot: Robot, conditions: Conditions, y: Float[Array, " unknowns"], way: Scalar | None = None
 ) -> Float[Array, " unknowns"]:
     """Rates of the unknowns, in their units [1/s]. `way` as in `balances.moving_signals`, or `HELD`."""
-    held, state = jnp.asarray(False if way is None else way == HELD), state_of_unknowns(robot, y)
+    held = jnp.asarray(False if way is None else way == HELD)
+    state = state_of_unknowns(robot, y)
     signals = moving(robot, conditions, state, None if way is None else jnp.where(held, 0.0, way))
     winding = signals.voltage_left / signals.inductance
     shaft, moves = (

@@ -111,7 +111,7 @@ def shown_to_controller(robot: Robot, conditions: Conditions, state: State) -> t
 
 def commanded(robot: Robot, conditions: Conditions, state: State) -> Conditions:
     """Conditions with the duty that a controller demands in a state, in the place of its goal."""
-    if conditions.goal is None:
+    if conditions.goal is None or robot.controller is None:
         return conditions
     shown, speed = shown_to_controller(robot, conditions, state)
     ahead = 0.0 if robot.rig.imposed == "goal_angle" else conditions.goal
@@ -122,8 +122,8 @@ def commanded(robot: Robot, conditions: Conditions, state: State) -> Conditions:
 
 def integrated_error(robot: Robot, conditions: Conditions, state: State) -> Scalar:
     """Rate of the integral of a controller's error: the error, unless it would drive the duty beyond its limit."""
-    if conditions.goal is None:
-        return jnp.zeros_like(state.integral)
+    if conditions.goal is None or robot.controller is None:
+        return jnp.zeros_like(state.speed)
     error = conditions.goal - shown_to_controller(robot, conditions, state)[0]
     duty = commanded(robot, conditions, state).duty
     limited = (jnp.abs(duty) >= robot.controller.limit) & (duty * error > 0)

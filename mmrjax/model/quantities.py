@@ -366,9 +366,10 @@ TABLE: dict[str, tuple[Quantity, ...]] = {
         Condition(
             "motor_current", "A", "current imposed on each motor", (-2000.0, 2000.0), heading="I [A]", shown="{:.4g}",
         ),
+        Condition("goal", "", "goal of the controller [SI]", _ANY_ANGLE),
         *(
             Condition(
-                name, unit, f"{what} that the controller follows", reach, field="goal", in_tables=True,
+                name, unit, f"{what} that the controller follows", reach, field="", in_tables=True,
                 imposed=(name,), heading=f"goal [{unit}]", shown="{:.4g}",
             )
             for name, unit, what, reach in zip(

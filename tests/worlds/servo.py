@@ -67,7 +67,9 @@ def simulate(goal, times, values=TRUE, tolerance=1e-10):
     for t in times[1:]:
         while now < t:
             until = min(t, instants[k])
-            found = solve_ivp(lambda s, y, k=k: rates(goal[1][k], s, y), (now, until), y, "Radau", rtol=tolerance, atol=tolerance)
+            found = solve_ivp(
+                lambda s, y, k=k: rates(goal[1][k], s, y), (now, until), y, "Radau", rtol=tolerance, atol=tolerance
+            )
             y, now = found.y[:, -1], until
             k += until == instants[k]
         states.append(y)

@@ -123,6 +123,7 @@ LASTING = 0.25
 #: current the instant of rest depends more on calibrated parameters), plus this many times the delay.
 FINE, DELAYED = 16, 2.0
 SLOW, EARLIER = {"voltage": 0.1, "motor_current": 0.3}, {"voltage": 0.03, "motor_current": 0.06}
+SLOW |= dict.fromkeys(GOALS, SLOW["motor_current"])
 #: Longest step elsewhere, in usual longest steps.
 FAST = 2
 #: For a thinned log: least number of steps between readings; largest growth of steps with the time since a condition
@@ -1032,7 +1033,7 @@ def _longest_steps(runs: Runs, robot: Robot) -> list[np.ndarray]:
         if both_ways and not robot.moves_as_one:
             speeds = measured[rows]
             speeds[:, rates] = np.gradient(speeds[:, rates], time, axis=0)
-            slow = _may_pass_rest(speeds, SLOW.get(rig.imposed, SLOW["motor_current"]))
+            slow = _may_pass_rest(speeds, SLOW[rig.imposed])
             before = int(np.ceil(early / _usual_interval(apart)))
             slow = np.convolve(slow, np.ones(before + 1))[before:] > 0
             longest[slow] = min(LONGEST, wait / FINE)
