@@ -373,6 +373,37 @@ def how_sure(found: DiscoveryResult, effect: FoundEffect) -> str:
     return f"tentative: it predicts, but {effect_doubts(test)}" if effect_doubts(test) else "tentative"
 
 
+def brief_answer(found: DiscoveryResult, moved: Sequence[str], next_step: str) -> Names:
+    """Lines after the answer: what moved and what was added, errors with their rows, and the next step.
+
+    Args:
+        moved: sentences on parameters far from their stated values.
+    """
+    added = [
+        f"{e.name} {effect_amplitude(e)}" + " (tentative)" * (not is_established(found, e)) for e in found.effects
+    ]
+    changes = [f"Moved: {'; '.join(moved)}."] * bool(moved) + [f"Added: {', '.join(added)}."] * bool(added)
+    stated, fitted = found.errors_as_stated, found.errors[0 if found.refit_alone else 1]
+    errors = [
+        f"{channels.find_channel(c).label} {percent_text(stated[c])} → {percent_text(e)} %"
+        for c, e in fitted.items()
+        if e["rows"]
+    ]
+    reached, of = max((int(e["rows"]) for e in stated.values()), default=0), len(found.runs)
+    aside = f", {len(found.outliers)} set aside as outliers" * bool(found.outliers)
+    few = f" (as stated the model reaches {reached} rows)" * (reached < of)
+    rows = f"{int(found.included.sum())} of {of} rows are used{aside}{few}"
+    return (*changes, f"rms error as stated → now: {', '.join(errors)}; {rows}.", f"Next: {next_step}")
+
+
+def percent_text(error: Mapping[str, float | int]) -> str:
+    """The rms error of a channel [%]: a digit after the point, more for a small one, `-` without a row."""
+    percent = float(error["rms_percent"])
+    if not error["rows"]:
+        return "-"
+    return f"{percent:.1f}" if percent == 0 or percent >= 0.095 else f"{percent:.1g}"
+
+
 def use_it(found: DiscoveryResult) -> list[str]:
     """Errors of the written robot on fitted and on held-out rows, by kind of block."""
     when = 1 if found.written else 0

@@ -105,7 +105,7 @@ def _loop(config: configuration.Loop, beside: configuration.LoopBeside) -> int:
         if config.resolve:
             verdict = _resolved(verdict, config, beside.members, progress)
         document = loop_report.loop_document(verdict, config.robot, changes_by_effect(verdict))
-        page = print_report(document)
+        page = print_report(document, brief=not beside.verbose)
         if config.resolve and verdict.resolved is None:
             print_output(
                 "The track model was not asked: nothing remains in slip, track or ground that it has a say in."

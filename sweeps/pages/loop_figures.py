@@ -244,6 +244,8 @@ def draw_errors(found: DiscoveryResult) -> Figure:
 
 #: Of the range of a variable, over which the change by an effect is averaged when it is asked how smooth it runs.
 NEAR = 1 / 12
+#: Roughness up to which the change by an effect is drawn as a line over its variable.
+SMOOTH = 0.02
 
 
 def imposed_axis(table: Columns) -> tuple[np.ndarray, str]:
@@ -295,21 +297,41 @@ def depends_on(table: Columns, change: np.ndarray) -> tuple[np.ndarray, str]:
 
 
 def draw_effect_laws(found: DiscoveryResult, table: Columns, changes: Mapping[str, Change]) -> Figure:
-    """Contribution of each effect found: readings minus the robot without it, and the effect's change."""
+    """Law of each effect found, on its readings less those of the robot without it.
+
+    Measured with ±2 sd, the refit with nothing added, and the law with the 95 % band of its amplitude. Runs backward
+    have hollow dots and a line of their own.
+    """
     fig, grid = new_figure(1, len(changes), 3.4)
+    readings, used = found.readings_of_rows, found.included
+    backward = (table[imposed_column(table)] < 0)[used]
     for axes, (name, change) in zip(grid[0], changes.items(), strict=True):
         c = change.channel
-        x, label = depends_on(table, np.where(found.included, change.with_it - change.without, np.nan))
-        measured = found.readings_of_rows.measured[:, [x.name for x in found.channels].index(c.name)]
+        x, label = depends_on(table, np.where(used, change.with_it - change.without, np.nan))
+        k = [x.name for x in found.channels].index(c.name)
+        size = next(e.parameters["amplitude"] for e in found.effects if e.name == name)
+        measured, before, law = (
+            (values - change.without)[used] / c.factor
+            for values in (readings.measured[:, k], readings.before[:, k], change.with_it)
+        )
+        x, sd = x[used], readings.sd[used, k] / c.factor
+        smooth, band = roughness(x, law) < SMOOTH, 1.96 * abs(size.sd / size.value * law)
         axes.axhline(0, color=FAINT, lw=0.8)
-        for what, values, look in (
-            ("measured", measured, {"marker": "o", "color": ORANGE}),
-            ("with it", change.with_it, {"marker": "_", "color": BLUE, "ms": 13, "mew": 2.2}),
-        ):
-            y = (values - change.without)[found.included] / c.factor
-            axes.plot(x[found.included], y, ls="none", label=what, **look)
+        for way, fill, words in ((~backward, ORANGE, ""), (backward, "white", ", backward")):
+            if not way.any():
+                continue
+            rows = np.flatnonzero(way)[np.argsort(x[way])]
+            axes.errorbar(x[rows], measured[rows], 2 * sd[rows], fmt="o", ms=4.5, mfc=fill, color=ORANGE, lw=0.9,
+                          label=f"measured{words}, ±2 sd")  # fmt: skip
+            axes.plot(x[rows], before[rows], "x", ms=5, color=INK, label=f"old law, refitted{words}")
+            if smooth:
+                axes.plot(x[rows], law[rows], color=BLUE, label=f"new law{words}, 95 %")
+                axes.fill_between(x[rows], (law - band)[rows], (law + band)[rows], color=BLUE, alpha=0.2, lw=0)
+            else:
+                axes.errorbar(x[rows], law[rows], band[rows], fmt="_", ms=13, mew=2.2, color=BLUE, elinewidth=6,
+                              alpha=0.6, label=f"new law{words}, 95 %")  # fmt: skip
         axes.set(xlabel=label, ylabel=f"{c.label}, less without it [{c.unit}]", title=name)
-    grid[0, 0].legend(loc="best")
+    outer_legend(grid[0, 0], "upper left")
     return fig
 
 
