@@ -136,7 +136,7 @@ def quick():
 def test_command_ends_well_and_says_what_it_found(done):
     assert done.answer.code == 0
     lines = done.answer.out.rstrip().splitlines()
-    assert lines[-1] == "found" and lines[0].startswith("No: missing is a loss torque")
+    assert lines[-1] == "found" and lines[0].startswith("No: a loss torque")
     assert any(re.match("Missing: .*churning", line) for line in lines)
     assert "fitting the base model" in done.answer.err and "fitting the base model" not in done.answer.out
     names = {p.name for p in (done.folder / "found").iterdir()}

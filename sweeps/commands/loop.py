@@ -85,7 +85,7 @@ def _loop(config: configuration.Loop, beside: configuration.LoopBeside) -> int:
         def keep(name: str, make: Callable[[], T]) -> T:
             result = stages[name] = folder.stage(name, make)
             if name == "ranking":
-                _show_ranking(stages[name], folder, timed)
+                _show_ranking(stages[name], folder, timed, brief=not beside.verbose)
             if name == "verdict":
                 timed(f"{loop_words.verdict_line(stages[name])}; next, errors held out and other noises")
             return result
@@ -160,9 +160,9 @@ def _alarm(seconds: float | None, wanted: Callable[[], bool]) -> Iterator[None]:
         signal.signal(signal.SIGALRM, before)
 
 
-def _show_ranking(found: Ranking, folder: RunFolder, timed: Callable[[str], None]) -> None:
-    """Say what regression makes of the library, and leave it in the run folder: the first answer."""
-    first, *lines = loop_words.ranking_lines(found)
+def _show_ranking(found: Ranking, folder: RunFolder, timed: Callable[[str], None], brief: bool) -> None:
+    """Print the ranking by regression, the first answer, and leave it in the run folder."""
+    first, *lines = loop_words.ranking_lines(found, brief=brief)
     timed(first)
     for line in lines:
         print_message(line)

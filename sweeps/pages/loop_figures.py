@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
+import scipy.stats
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from calibration.data import Columns
 from calibration.data.table import Runs
@@ -14,6 +16,7 @@ from calibration.discovery.settings import WITHOUT_NAME
 from calibration.inference import blocks
 from calibration.inference.bases import place_in_words
 from calibration.inference.details import TimeStatistics
+from mmrjax.effects.base import EQUATION
 from mmrjax.effects.curve import EVERY_VARIABLE, Variable
 from mmrjax.model.channels import EVERY, SIDES, Channel
 from sweeps.pages.figure_style import (
@@ -177,6 +180,71 @@ def time_statistics(detail: TimeStatistics, channels: Sequence[Channel], verdict
     return fig
 
 
+#: Most lags of a correlation with the input [samples].
+LAGS = 20
+#: Most curves of the figure of power.
+CURVES = 5
+
+
+def draw_input_correlation(runs: Runs, table: Columns, channels: Sequence[Channel], verdict: str) -> Figure:
+    """Correlation of each residual with the input at lags of samples, over all runs, before and after."""
+    fig, grid = new_figure(1, len(channels), 2.6, sharey=True)
+    rows_of_runs = [runs.in_order(name) for name in dict.fromkeys(runs.run_names.tolist())]
+    most = min(LAGS, min(map(len, rows_of_runs)) - 1)
+    lags = np.arange(-most, most + 1)
+    centred = lambda values: np.nan_to_num(values - np.nanmean(values))  # noqa: E731
+    for axes, channel in zip(grid[0], channels, strict=True):
+        limit = 2 / np.sqrt(len(table["time_s"]))
+        axes.axhspan(-limit, limit, color="#eeeeee", lw=0, zorder=0)
+        for when, colour in (("before", ORANGE), ("after", BLUE))[verdict == "none" :]:
+            sums, squares = np.zeros(len(lags)), np.zeros(2)
+            for rows in rows_of_runs:
+                residual = centred(table[f"residual_{when}_{channel.name}_sigma"][rows])
+                drive = centred(table[imposed_column(table)][rows])
+                sums += np.correlate(residual, drive, "full")[len(rows) - 1 + lags]
+                squares += residual @ residual, drive @ drive
+            axes.plot(lags, sums / max(np.sqrt(squares.prod()), 1e-300), "o-", ms=3, lw=1, color=colour, label=when)
+        axes.set(title=channel.label, xlabel="residual after the input [samples]")
+    grid[0, 0].set_ylabel("correlation with the input")
+    grid[0, 0].legend(loc="best")
+    return fig
+
+
+def draw_gains(found: DiscoveryResult) -> Figure:
+    """Hold-out gain over the refit of each set of effects, by their number, with its standard error."""
+    fig, grid = new_figure(1, 1, 2.8)
+    axes, last = grid[0, 0], len(found.gains) - 1
+    axes.axhline(0, color=FAINT, lw=0.8)
+    axes.plot(0, 0, "s", ms=5, color=INK, label="refit, nothing added")
+    for k, (names, gain) in enumerate(found.gains):
+        proposed = k == last
+        error = gain.se if np.isfinite(gain.se) else 0.0
+        axes.errorbar(len(names), gain.mean, error, fmt="o", ms=5.5, mfc=BLUE if proposed else "white", color=BLUE,
+                      label="proposed, ± standard error" if proposed else None)  # fmt: skip
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    axes.set(xlabel="effects added", ylabel="gain [nat a reading]")
+    outer_legend(axes, "upper left")
+    return fig
+
+
+def draw_power(found: DiscoveryResult) -> Figure:
+    """Chance that an effect would have been noticed, over its size, for the most visible one of each equation."""
+    level = found.before.kinds["single"].threshold
+    visible = sorted((s for s in found.scores if s.balance in EQUATION), key=lambda s: s.sigmas_per_prior_sd)
+    strongest = {EQUATION[s.balance]: s for s in visible if s.sigmas_per_prior_sd > 0}
+    first = {s.name: s for s in visible if s in strongest.values()}
+    fig, grid = new_figure(1, 1, 3.2)
+    axes, size = grid[0, 0], np.geomspace(0.03, 30, 200)
+    for name, (colour, _) in list(configuration_looks(first).items())[-CURVES:]:
+        shift = size * first[name].sigmas_per_prior_sd
+        chance = scipy.stats.norm.sf(level - shift) + scipy.stats.norm.cdf(-level - shift)
+        axes.plot(size, 100 * chance, color=colour, label=name)
+    axes.set(xscale="log", xlabel="size [typical sizes]", ylabel="would have been noticed [%]", ylim=(0, 103))
+    axes.set_xticks([0.03, 0.1, 0.3, 1, 3, 10, 30], ["0.03", "0.1", "0.3", "1", "3", "10", "30"])
+    outer_legend(axes, "upper left")
+    return fig
+
+
 def draw_effect_scores(found: DiscoveryResult) -> Figure:
     """Score of every effect at the base fit, with the threshold that noise alone passes in few tables."""
     rungs = found.scores[:RUNGS]
@@ -245,7 +313,7 @@ def draw_errors(found: DiscoveryResult) -> Figure:
 #: Of the range of a variable, over which the change by an effect is averaged when it is asked how smooth it runs.
 NEAR = 1 / 12
 #: Roughness up to which the change by an effect is drawn as a line over its variable.
-SMOOTH = 0.02
+SMOOTH = 0.2
 
 
 def imposed_axis(table: Columns) -> tuple[np.ndarray, str]:
@@ -330,7 +398,7 @@ def draw_effect_laws(found: DiscoveryResult, table: Columns, changes: Mapping[st
             else:
                 axes.errorbar(x[rows], law[rows], band[rows], fmt="_", ms=13, mew=2.2, color=BLUE, elinewidth=6,
                               alpha=0.6, label=f"new law{words}, 95 %")  # fmt: skip
-        axes.set(xlabel=label, ylabel=f"{c.label}, less without it [{c.unit}]", title=name)
+        axes.set(xlabel=label, ylabel=f"change of {c.label} [{c.unit}]", title=name)
     outer_legend(grid[0, 0], "upper left")
     return fig
 

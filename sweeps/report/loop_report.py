@@ -196,15 +196,15 @@ def _advice(found: DiscoveryResult) -> Table:
         *against[:1],
     ]  # a sentence begins with a capital, a parameter does not
     rows = [
-        ("use it?", " ".join(loop_words.use_it(found)) or "No runs could be held out."),
+        ("May I use it?", " ".join(loop_words.use_it(found)) or "No runs could be held out."),
         (
-            "check first",
+            "What to check first",
             " ".join(
                 [f"{text if '.' in text.split()[0] else text[0].upper() + text[1:]}." for text in sentences if text]
             )
             or "Nothing unusual.",
         ),
-        ("do next", _next_step(found, more)),
+        ("What to do next", _next_step(found, more)),
     ]
     return catalogue.table("loop.advice", rows)
 
@@ -318,7 +318,9 @@ def _sections(
     fits = {when: by for when, by in found.rms.items() if not (found.refit_alone and "after" in when)}
     sized = Layout.of(found.robot).crosses_zero
     in_units = [fit_tables.rms_table(fits, found.channels)] if sized else []
-    yield Section("Errors on runs that the fit has seen, and has not", (errors, held_out_table(found), *in_units))
+    gains = [catalogue.figure("loop.gains", found)] if len(found.gains) > 1 else []
+    errors_by_kind = (errors, held_out_table(found), *in_units, *gains)
+    yield Section("Errors on runs that the fit has seen, and has not", errors_by_kind)
     yield from _certain(found, missing)
     yield Section("Candidates", tuple(_candidates(found)))
     hidden = catalogue.figure("loop.null", found.before), catalogue.figure("loop.look_alikes", found)
@@ -352,6 +354,7 @@ def _where_missing(found: DiscoveryResult, table: Columns, changes: Mapping[str,
         names = ", ".join(detail.orders_unresolved)
         more = catalogue.text("loop.unresolved", names) if names else ""
         yield catalogue.figure("loop.series", detail, found.channels, verdict, words=numbers, more=more)
+        yield catalogue.figure("loop.input_correlation", found.runs, table, found.channels, verdict)
     else:
         figure_input = table, verdict, sized
         yield catalogue.figure(
@@ -425,6 +428,7 @@ def _named(values: Mapping[str, float]) -> str:
 
 
 def _looked_for(found: DiscoveryResult) -> Iterable[Block]:
+    yield catalogue.figure("loop.power", found)
     yield catalogue.note("loop.seen-above")
     level, listed = found.before.kinds["single"].threshold, []
     for s in found.scores:
@@ -446,7 +450,7 @@ def _base(found: DiscoveryResult) -> Table:
         (
             f"`{name}`", p.prior, p.before, p.after, p.sd_after, p.unit, fit_tables.shift_cell(p.shift_before),
             fit_tables.shift_cell(p.shift_after), describe(Determination.of(name, p.held_by_prior, found.together)),
-            p.meaning,
+            p.at_bound or "", p.meaning,
         )
         for name, p in found.base_shift.items()
     ]  # fmt: skip
