@@ -385,7 +385,7 @@ def brief_answer(found: DiscoveryResult, moved: Sequence[str], next_step: str) -
     added = [
         f"{e.name} {effect_amplitude(e)}" + " (tentative)" * (not is_established(found, e)) for e in found.effects
     ]
-    changes = [f"Moved: {'; '.join(moved)}."] * bool(moved) + [f"Added: {', '.join(added)}."] * bool(added)
+    changes = f"Moved: {'; '.join(moved)}. " * bool(moved) + f"Added: {', '.join(added)}." * bool(added)
     stated, fitted = found.errors_as_stated, found.errors[0 if found.refit_alone else 1]
     errors = [
         f"{channels.find_channel(c).label} {percent_text(stated[c])} → {percent_text(e)} %"
@@ -396,7 +396,11 @@ def brief_answer(found: DiscoveryResult, moved: Sequence[str], next_step: str) -
     aside = f", {len(found.outliers)} set aside as outliers" * bool(found.outliers)
     few = f" (as stated the model reaches {reached} rows)" * (reached < of)
     rows = f"{int(found.included.sum())} of {of} rows are used{aside}{few}"
-    return (*changes, f"rms error as stated → now: {', '.join(errors)}; {rows}.", f"Next: {next_step}")
+    return (
+        *filter(None, [changes.rstrip()]),
+        f"rms error as stated → now: {', '.join(errors)}; {rows}.",
+        f"Next: {next_step}",
+    )
 
 
 def percent_text(error: Mapping[str, float | int]) -> str:

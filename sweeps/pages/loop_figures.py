@@ -16,6 +16,7 @@ from calibration.discovery.settings import WITHOUT_NAME
 from calibration.inference import blocks
 from calibration.inference.bases import place_in_words
 from calibration.inference.details import TimeStatistics
+from mmrjax.effects import BY_NAME
 from mmrjax.effects.base import EQUATION
 from mmrjax.effects.curve import EVERY_VARIABLE, Variable
 from mmrjax.model.channels import EVERY, SIDES, Channel
@@ -351,15 +352,17 @@ def conditions_and_readings(table: Columns) -> Columns:
     return columns
 
 
-def depends_on(table: Columns, change: np.ndarray) -> tuple[np.ndarray, str]:
+def depends_on(table: Columns, change: np.ndarray, driver: str = "") -> tuple[np.ndarray, str]:
     """Abscissa of an effect and its label: the condition or reading that makes the change of a reading smoothest.
 
     Args:
         change: of the reading, shape (rows,), NaN where a row does not count.
+        driver: of the effect; variables with that word are preferred.
     """
     use = np.isfinite(change)
     every = {k: np.asarray(v, float) for k, v in conditions_and_readings(table).items()}
     whole = {k: v for k, v in every.items() if np.isfinite(v[use]).all()}
+    whole = {k: v for k, v in whole.items() if driver in k.split() and np.ptp(v[use]) > 0} or whole
     label = min(whole, key=lambda k: roughness(whole[k][use], change[use]))
     return whole[label], label
 
@@ -375,7 +378,9 @@ def draw_effect_laws(found: DiscoveryResult, table: Columns, changes: Mapping[st
     backward = (table[imposed_column(table)] < 0)[used]
     for axes, (name, change) in zip(grid[0], changes.items(), strict=True):
         c = change.channel
-        x, label = depends_on(table, np.where(used, change.with_it - change.without, np.nan))
+        effect = BY_NAME.get(name)
+        moved = np.where(used, change.with_it - change.without, np.nan)
+        x, label = depends_on(table, moved, "" if effect is None else effect.driver)
         k = [x.name for x in found.channels].index(c.name)
         size = next(e.parameters["amplitude"] for e in found.effects if e.name == name)
         measured, before, law = (
@@ -383,21 +388,21 @@ def draw_effect_laws(found: DiscoveryResult, table: Columns, changes: Mapping[st
             for values in (readings.measured[:, k], readings.before[:, k], change.with_it)
         )
         x, sd = x[used], readings.sd[used, k] / c.factor
-        smooth, band = roughness(x, law) < SMOOTH, 1.96 * abs(size.sd / size.value * law)
+        band = 1.96 * abs(size.sd / size.value * law)
         axes.axhline(0, color=FAINT, lw=0.8)
-        for way, fill, words in ((~backward, ORANGE, ""), (backward, "white", ", backward")):
+        for way, fill, words in ((~backward, ORANGE, "measured, ±2 sd"), (backward, "white", "backward")):
             if not way.any():
                 continue
-            rows = np.flatnonzero(way)[np.argsort(x[way])]
+            rows, first = np.flatnonzero(way)[np.argsort(x[way])], way is not backward or backward.all()
             axes.errorbar(x[rows], measured[rows], 2 * sd[rows], fmt="o", ms=4.5, mfc=fill, color=ORANGE, lw=0.9,
-                          label=f"measured{words}, ±2 sd")  # fmt: skip
-            axes.plot(x[rows], before[rows], "x", ms=5, color=INK, label=f"old law, refitted{words}")
-            if smooth:
-                axes.plot(x[rows], law[rows], color=BLUE, label=f"new law{words}, 95 %")
+                          label=words)  # fmt: skip
+            axes.plot(x[rows], before[rows], "x", ms=5, color=INK, label="old law, refitted" if first else None)
+            if roughness(x[rows], law[rows]) < SMOOTH:
+                axes.plot(x[rows], law[rows], color=BLUE, label="new law, 95 %" if first else None)
                 axes.fill_between(x[rows], (law - band)[rows], (law + band)[rows], color=BLUE, alpha=0.2, lw=0)
             else:
                 axes.errorbar(x[rows], law[rows], band[rows], fmt="_", ms=13, mew=2.2, color=BLUE, elinewidth=6,
-                              alpha=0.6, label=f"new law{words}, 95 %")  # fmt: skip
+                              alpha=0.6, label="new law, 95 %" if first else None)  # fmt: skip
         axes.set(xlabel=label, ylabel=f"change of {c.label} [{c.unit}]", title=name)
     outer_legend(grid[0, 0], "upper left")
     return fig
