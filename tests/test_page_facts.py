@@ -160,3 +160,15 @@ def test_texts_of_a_narrow_figure_are_apart(monkeypatch):
         assert one.y1 < other.y0 + 2 or other.y1 < one.y0 + 2
         assert {label.get_rotation() for label in right.get_xticklabels()} == {90}
         assert left.get_legend().get_window_extent().y0 > left.bbox.y1 and left.bbox.width > 0.3 * fig.bbox.width
+
+
+@pytest.mark.parametrize(("cells", "visible"), [(12, True), (40, False)])
+def test_a_wide_map_shows_numbers_that_fit_its_cells(cells, visible):
+    with figure_style.figure_settings():
+        fig, grid = figure_style.new_figure(1, 1, 6.0)
+        panel = grid[0, 0]
+        panel.imshow(np.eye(cells))
+        for k in range(1, 3):
+            panel.text(k, 4, "-.25", ha="center", va="center")
+        figure_style.figure_as_svg(fig)
+        assert [text.get_visible() for text in panel.texts] == [visible] * 2
