@@ -392,10 +392,10 @@ def brief_answer(found: DiscoveryResult, moved: Sequence[str], next_step: str) -
         for c, e in fitted.items()
         if e["rows"]
     ]
-    reached, of = max((int(e["rows"]) for e in stated.values()), default=0), len(found.runs)
+    reached, total = max((int(e["rows"]) for e in stated.values()), default=0), len(found.runs)
     aside = f", {len(found.outliers)} set aside as outliers" * bool(found.outliers)
-    few = f" (as stated the model reaches {reached} rows)" * (reached < of)
-    rows = f"{int(found.included.sum())} of {of} rows are used{aside}{few}"
+    few = f" (as stated the model reaches {reached} rows)" * (reached < total)
+    rows = f"{int(found.included.sum())} of {total} rows are used{aside}{few}"
     return (
         *filter(None, [changes.rstrip()]),
         f"rms error as stated → now: {', '.join(errors)}; {rows}.",

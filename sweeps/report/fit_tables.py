@@ -70,16 +70,19 @@ def fits_of_runs(table: Columns, shown: Sequence[Channel], lines: Mapping[str, s
         lines: prefixes of simulated columns and their names.
     """
     runs = np.asarray(table.get("run_id", np.zeros(len(table["time_s"]))))
-    rows = [
+    fits = [
         (
             str(name), words,
-            *(100 - 100 * np.sqrt(1 - r_squared(table[c.column][of], table[prefix + c.column][of])) for c in shown),
+            *(
+                100 - 100 * np.sqrt(1 - r_squared(table[c.column][rows], table[prefix + c.column][rows]))
+                for c in shown
+            ),
         )
         for name in dict.fromkeys(runs.tolist())
-        for of in (runs == name,)
+        for rows in (runs == name,)
         for prefix, words in lines.items()
     ]  # fmt: skip
-    return catalogue.table("fit.runs", rows, *(f"{c.label} | .1f" for c in shown))
+    return catalogue.table("fit.runs", fits, *(f"{c.label} | .1f" for c in shown))
 
 
 def clusters_section(clusters: Sequence[ResidualCluster]) -> tuple[Section, ...]:
