@@ -72,6 +72,7 @@ from calibration.inference.fit_notes import Notes, Remark, next_step, with_codes
 from calibration.inference.fit_posterior import undetermined_names
 from calibration.inference.lack_of_fit import Residuals
 from calibration.inference.linearization import Linearization
+from calibration.inference.lost_motion import lost_motion_notes
 from calibration.inference.noise import Noise
 from calibration.inference.noise_factor import common_factors, noise_remarks
 from calibration.inference.residual_clusters import residual_clusters
@@ -440,7 +441,7 @@ def trace(
         screened, left, searched = _search_until_clean(task, screened, sds, ranked)
         if searched is None:
             missed = missed_channels(screened.base.space, runs, sds.noise, left.linear)
-            word = "undescribed" if missed else "none"
+            word = "undescribed" if missed or task.loses_motion else "none"
             return LoopStages(word, screened, left, sds, missed=missed, unused=unused_inputs(runs))
         return _verdict(task, screened, left, sds, searched)
 
@@ -471,6 +472,11 @@ class _Task:
     known: LoopStages | None
     compiling: _Compiling | None
     keep: Keep
+
+    @property
+    def loses_motion(self) -> bool:
+        """True if the log shows a backlash that the robot does not have."""
+        return bool(lost_motion_notes(self.runs, self.robot))
 
     def screen(self, noise: Noise, before: BaseFit | None, ranked: list[Ranking]) -> Screening:
         """The base fit with this noise, from one with another if given, and its outliers. See `windows`."""
@@ -537,15 +543,15 @@ def _search_effects(task: _Task, screened: Screening, left: Diagnosis) -> tuple[
 def _search_until_clean(
     task: _Task, screened: Screening, sds: Sds, ranked: list[Ranking]
 ) -> tuple[Screening, Diagnosis, Search | None]:
-    """Search, repeated while it leaves outliers, None if the base leaves no discrepancy."""
+    """Search, repeated while it leaves outliers, None if the base leaves no discrepancy or lacks a backlash."""
     settings, keep, progress = task.settings, task.keep, task.progress
     for k in range(SCREENINGS):
         progress(next_step("bootstrap", settings.replicates))
         screened, left = keep(f"bootstrap {k}", functools.partial(_test_base, task, sds, screened))
         if k == 0 and not ranked:
             keep("ranking", functools.partial(findings.rank_library, screened.base.space, left, settings))
-        if not left.test.rejected and screened.cluster is None:
-            return screened, left, None
+        if task.loses_motion or (not left.test.rejected and screened.cluster is None):
+            return screened, left, None  # effects of the library would only stand in for a backlash
         progress(next_step("effects"))
         screened, left, searched = keep(f"search {k}", functools.partial(_search_effects, task, screened, left))
         after = searched.diagnosis

@@ -151,6 +151,8 @@ def _undescribed(said: loop_notes.Summary) -> str:
     check = [f"columns that vary and are not used ({', '.join(said.unused)})"] * bool(said.unused)
     check += [f"parameters far from their priors ({', '.join(said.far)})"] * bool(said.far)
     check += ["units, signs and sides of the columns"]
+    if not each:
+        return "This model does not describe these runs: it has no backlash. No effect is named before it has one."
     return (
         f"This model does not describe these runs: refitted, it misses {', '.join(each)}. No effect is named. "
         f"Check first: {'; '.join(check)}."
@@ -278,7 +280,9 @@ def ranking_lines(found: Ranking, most: int = 5, brief: bool = False) -> list[st
     """Lines of the ranking by regression: whether an effect is missing, and the strongest, `brief` by name alone."""
     by = f"by regression on {found.windows} windows of the log" if found.windows else "by regression"
     if not found.missing:
-        return [f"{by}, not yet confirmed: nothing exceeds chance (family-wise p = {found.p_value:.2g})"]
+        return [
+            f"{by}, not yet confirmed: no effect of the library exceeds chance (family-wise p = {found.p_value:.2g})"
+        ]
     first = f"{by}, not yet confirmed: something is missing (family-wise p {p_value(found.p_value)})"
     beyond = [e for e in found.effects if e.score > found.chance and not e.supplies][:most]
     if not beyond:
