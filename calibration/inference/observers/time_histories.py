@@ -262,14 +262,16 @@ class Histories(Observer):
         mine, every = ([table.in_order(name) for name in names] for table in (runs, whole))
         given = [runs["time_s"][m] for m in mine]
         # Rows of the log without a reading here are kept if the imposed quantity changes there.
+        smooth = runs.log is not None and robot.rig.imposed == "motor_current" and not linear
         noted = [
-            np.isin(whole["time_s"][rows], t) | exact | linear | _drive_changes(whole, rows)
+            np.isin(whole["time_s"][rows], t) | exact | linear | _drive_changes(whole, rows, SMALL if smooth else 0.0)
             for rows, t in zip(every, given, strict=True)
         ]
-        steps = [
-            np.minimum.reduceat(h, np.flatnonzero(n)[:-1])
-            for h, n in zip(_longest_steps(runs, robot), noted, strict=True)
-        ]
+        longest_steps = _longest_steps(runs, robot)
+        if smooth:
+            noted = [n | _step_begins(whole["time_s"][rows], n) for n, rows in zip(noted, every, strict=True)]
+            whole = _averaged_drive(whole, every, noted)
+        steps = [np.minimum.reduceat(h, np.flatnonzero(n)[:-1]) for h, n in zip(longest_steps, noted, strict=True)]
         change = LOOSE if robot.loose else CHANGE
         grids = [
             time_grid(whole["time_s"][rows[n]], *c, h, START if robot.has_ground else change, change, parts)
@@ -987,6 +989,25 @@ def _drive_changes(runs: Runs, rows: np.ndarray, share: float = 0.0) -> np.ndarr
     )
     changes[1:] |= _relative_jumps(applied_drive(runs)[rows]) > share
     return changes
+
+
+def _step_begins(time: np.ndarray, noted: np.ndarray) -> np.ndarray:
+    """True for rows that divide the time between noted ones into parts of at most the usual longest step."""
+    begin = time[np.maximum.accumulate(np.where(noted, np.arange(len(time)), 0))]
+    part = np.floor((time - begin) / (FAST * LONGEST) + 1e-9)
+    return np.diff(part, prepend=0.0) > 0
+
+
+def _averaged_drive(runs: Runs, each: list[np.ndarray], noted: list[np.ndarray]) -> Runs:
+    """Runs with the mean of the imposed current between noted rows, which moves the load as much."""
+    column, time = runs.layout.imposed_column, runs["time_s"]
+    drive = runs[column].copy()
+    for rows, begins in zip(each, noted, strict=True):
+        lasts, first = np.diff(time[rows], append=time[rows[-1]]), np.flatnonzero(begins)
+        total, span = (np.add.reduceat(x, first) for x in (drive[rows] * lasts, lasts))
+        mean = np.where(span > 0, total / np.where(span > 0, span, 1.0), drive[rows[first]])
+        drive[rows] = mean[np.cumsum(begins) - 1]
+    return dataclasses.replace(runs, columns={**runs.columns, column: drive})
 
 
 def _relative_jumps(driven: np.ndarray) -> np.ndarray:
