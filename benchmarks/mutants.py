@@ -94,15 +94,16 @@ def mutants() -> list[Mutant]:
     return [Mutant(name, **{**of, "killed_by": tuple(of["killed_by"])}) for name, of in tables.items()]
 
 
-class _Passed:
-    """Pytest plugin that collects the node ids of tests that pass."""
+class _Outcomes:
+    """Pytest plugin that collects the node ids of tests that pass, and those of tests that fail."""
 
     def __init__(self) -> None:
-        self.names: list[str] = []
+        self.passed: list[str] = []
+        self.failed: list[str] = []
 
     def pytest_runtest_logreport(self, report: Any) -> None:
-        if report.when == "call" and report.passed:
-            self.names.append(report.nodeid)
+        if report.failed or (report.when == "call" and report.passed):
+            (self.failed if report.failed else self.passed).append(report.nodeid)
 
 
 def _run(tree: str, tests: list[str], marks: str, log: str, answer: str, options: tuple[str, ...]) -> None:
@@ -115,13 +116,17 @@ def _run(tree: str, tests: list[str], marks: str, log: str, answer: str, options
     os.dup2(output, 2)
     import pytest
 
-    passed = _Passed()
-    code = int(pytest.main([*options, "-m", marks, *tests], plugins=[passed]))
+    outcomes = _Outcomes()
+    try:
+        code = int(pytest.main([*options, "-m", marks, *tests], plugins=[outcomes]))
+    except Exception as error:  # what a test leaves open is raised when pytest ends
+        code = 1 if outcomes.failed else -1
+        print(f"pytest ended with {error!r}", flush=True)
     for name in ("mmrjax", "calibration", "sweeps"):
         module = sys.modules.get(name)
         if module is not None and not str(module.__file__).startswith(tree):
             code = -1  # another installation was tested
-    Path(answer).write_text(json.dumps([code, passed.names]), encoding="utf-8")
+    Path(answer).write_text(json.dumps([code, outcomes.passed]), encoding="utf-8")
 
 
 def run(

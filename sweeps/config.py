@@ -385,6 +385,7 @@ class LoopBeside(FittedRuns):
     within: Annotated[str, Field(pattern=r"^\d+(\.\d+)?(s|min|h)?$")] = option_field(
         "10min", "Wall-clock time after which it ends with the best that there is, as 90s, 5min or 1h"
     )
+    verbose: bool = option_field(False, "Print every table and remark of the page, not five lines")
 
     @property
     def seconds(self) -> float:

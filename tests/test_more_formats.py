@@ -59,6 +59,22 @@ def test_sysid_log_of_wpilib_becomes_one_run_for_each_test(tmp_path):
     assert_allclose(np.diff(columns["time_s"])[:9], 0.02)
 
 
+def test_advantagekit_names_a_module(tmp_path):
+    names = ("DriveAppliedVolts", "DrivePositionRad", "DriveVelocityRadPerSec", "DriveCurrentAmps")
+    entries = [f"/Drive/Module{k}/{name}" for k in (0, 1) for name in names] + ["/SystemStats/BatteryVoltage"]
+    records = [(k, 0, (name, "double")) for k, name in enumerate(entries, 1)]
+    records += [(k, 20_000 * t, struct.pack("<d", 10 * k + t)) for t in range(5) for k in range(1, len(entries) + 1)]
+    (tmp_path / "akit.wpilog").write_bytes(wpilog(*records))
+    assert presets_file.recognise_preset(entries) == "advantagekit"
+    preset = presets_file.find_preset("advantagekit,module=1")
+    table = reading.read_columns(tmp_path / "akit.wpilog", runs.Layout.of(None), preset)
+    columns = dict(zip(table.arrays.header, table.arrays.values, strict=True))
+    found = {mine: columns[theirs] for mine, theirs, _ in table.mapped}
+    expected = ("supply_voltage_V", "output_angle_rad", "output_speed_rad_s", "motor_current_A")
+    for k, mine in enumerate(expected, 5):
+        assert_array_equal(found[mine], 10 * k + np.arange(5))
+
+
 @pytest.mark.parametrize(("change", "words"), [
     (lambda b: b[:-3], "ends within a record"), (lambda b: b[:7] + b"\x02" + b[8:], "of another version"),
     (lambda b: b[:12], "without signals"),

@@ -3,6 +3,7 @@
 import ast
 import functools
 import importlib.util
+import subprocess
 import sys
 from collections import Counter
 from pathlib import Path
@@ -15,6 +16,18 @@ KINDS = {
     "sweeps", "derivatives", "effects", "inertia", "posture", "climb", "sensitivity", "sizing", "words", "pages", "model",
     "fidelities", "safety", "export",
 }  # fmt: skip
+
+#: A test that leaves a file open in a cycle of objects, and one with a claim.
+OPEN = """import gc
+
+def test_open(tmp_path):
+    gc.disable()
+    cycle = [open(tmp_path / "kept", "w")]
+    cycle.append(cycle)
+
+def test_claim():
+    assert {claim}
+"""
 
 
 @pytest.fixture(scope="module")
@@ -73,6 +86,20 @@ def test_tests_that_kill_exist_and_are_quick(command):
             if not any(marks.get(name, {"none"}) in allowed for name in names):
                 wrong.append(f"{mutant.name}: {node}")
     assert not wrong
+
+
+def test_a_failure_counts_although_pytest_ends_with_an_error(tmp_path):
+    """A file that a test leaves open is an error after the last test."""
+    script = """import pathlib, sys, mutants
+tree = pathlib.Path(sys.argv[1])
+print(mutants.run(tree, [sys.argv[2]], "not slow", tree / "log", ("-q", "-W", "error"))[0])"""
+    codes = []
+    for claim in ("False", "True"):
+        (tmp_path / f"test_{claim}.py").write_text(OPEN.format(claim=claim), encoding="utf-8")
+        command = [sys.executable, "-c", script, tmp_path, f"test_{claim}.py"]
+        done = subprocess.run(command, cwd=ROOT / "benchmarks", capture_output=True, text=True, check=True)
+        codes.append(done.stdout.strip())
+    assert codes == ["1", "-1"]
 
 
 def test_a_slow_test_does_not_count_as_quick():

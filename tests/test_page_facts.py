@@ -15,6 +15,7 @@ from mmrjax.model import paper_robots, params
 from mmrjax.model.paper_tables import TRACKED, WHEELED
 from sweeps import pages
 from sweeps.pages import figure_style, sweep_figures
+from sweeps.paper import data
 from sweeps.paper import run_figures as paper_runs
 from sweeps.report import page_renderer, run_tables
 from sweeps.report import runs_report as page
@@ -105,7 +106,8 @@ def test_every_page_warns_of_curves_that_nobody_has_named(robot, tmp_path):
 
 @pytest.mark.slow
 def test_legend_of_the_energy_split_has_what_is_drawn():
-    fig, _ = paper_runs.draw_energy(paper_robots.nominal(), dict.fromkeys((TRACKED, WHEELED), 1.5))
+    used = data.energy_use(paper_robots.nominal(), dict.fromkeys((TRACKED, WHEELED), 1.5))
+    fig = paper_runs.draw_energy(used)
     shown = {text.get_text() for text in fig.legends[0].get_texts()}
     drawn = {
         bars.get_label() for bars in fig.axes[0].containers if max(bar.get_width() for bar in bars.patches) > 0.05
@@ -160,3 +162,15 @@ def test_texts_of_a_narrow_figure_are_apart(monkeypatch):
         assert one.y1 < other.y0 + 2 or other.y1 < one.y0 + 2
         assert {label.get_rotation() for label in right.get_xticklabels()} == {90}
         assert left.get_legend().get_window_extent().y0 > left.bbox.y1 and left.bbox.width > 0.3 * fig.bbox.width
+
+
+@pytest.mark.parametrize(("cells", "visible"), [(12, True), (40, False)])
+def test_a_wide_map_shows_numbers_that_fit_its_cells(cells, visible):
+    with figure_style.figure_settings():
+        fig, grid = figure_style.new_figure(1, 1, 6.0)
+        panel = grid[0, 0]
+        panel.imshow(np.eye(cells))
+        for k in range(1, 3):
+            panel.text(k, 4, "-.25", ha="center", va="center")
+        figure_style.figure_as_svg(fig)
+        assert [text.get_visible() for text in panel.texts] == [visible] * 2

@@ -12,6 +12,7 @@ from numpy.testing import assert_allclose
 from calibration.data import presets_file, robot_file
 from calibration.data import runs as records
 from calibration.data.input_errors import BadConfiguration, BadData
+from calibration.data.sources import reading
 
 RIG = """
 base = "none"
@@ -148,6 +149,84 @@ def test_columns_of_ones_own_win_over_those_of_the_robots_file(tmp_path):
     assert_allclose(found["motor_speed_rpm"], np.array([3.0, -4.0]) * 30 / np.pi)
 
 
+def test_feetech_signs_are_bits(tmp_path):
+    dump = {
+        "t": [0.0, 0.01, 0.02, 0.03], "Present_Voltage": [120, 121, 119, 120], "Present_Load": [0, 500, 1024 + 250, -250],
+        "Present_Current": [0, 100, 32768 + 20, -20], "Present_Velocity": [0, 4096, 32768 + 1024, -1024],
+        "Present_Position": [2048, 4095, 32768 + 2048, -2048],
+    }  # fmt: skip
+    pd.DataFrame(dump).to_csv(tmp_path / "log.csv", index=False)
+    rig = robot(tmp_path, "motor_current", "output_speed", "output_angle")
+    for source in (tmp_path / "log.csv", {name: np.array(values) for name, values in dump.items()}):
+        found = records.read_runs(source, rig, columns="feetech")
+        assert_allclose(found["supply_voltage_V"], [12.0, 12.1, 11.9, 12.0])
+        assert_allclose(found["duty"], [0, 0.5, -0.25, -0.25])
+        assert_allclose(found["motor_current_A"], [0, 0.65, -0.13, -0.13])
+        assert_allclose(found["output_speed_rpm"], [0, 60, -15, -15])
+        assert_allclose(found["output_angle_deg"], [180, 4095 * 360 / 4096, -180, -180])
+
+
+@pytest.mark.parametrize(("preset", "names", "bits", "limits"), [
+    ("damiao,v_max=30,t_max=10", ("p_int", "v_int", "t_int"), (16, 12, 12), (12.5, 30, 10)),
+    ("robstride,speed_max=44,torque_max=17", ("angle_raw", "velocity_raw", "torque_raw"), (16, 16, 16), (4 * np.pi, 44, 17)),
+])  # fmt: skip
+def test_integers_of_a_frame_are_a_share_of_their_limits(tmp_path, preset, names, bits, limits):
+    values = np.array([[-1, 0.25, 1], [-0.5, 0, 1], [-1, 0.1, 0.9]]) * np.array(limits)[:, None]
+    raw = [np.round((x / most + 1) / 2 * (2**n - 1)) for x, most, n in zip(values, limits, bits, strict=True)]
+    step = [2 * most / (2**n - 1) for most, n in zip(limits, bits, strict=True)]
+    rig = robot(tmp_path, "output_speed", "output_angle", "output_torque", imposed="motor_current")
+    log = {"t": [0, 0.1, 0.2], **dict(zip(names, raw, strict=True)), "motor_current_A": [0.0, 1.0, 2.0]}
+    found = records.read_runs(log, rig, columns=preset)
+    assert_allclose(np.radians(found["output_angle_deg"]), values[0], atol=0.51 * step[0])
+    assert_allclose(found["output_speed_rpm"] * np.pi / 30, values[1], atol=0.51 * step[1])
+    assert_allclose(found["output_torque_Nm"], values[2], atol=0.51 * step[2])
+    assert found["output_torque_Nm"][0] == pytest.approx(-limits[2]), "the least integer is exactly the limit"
+    assert any("computed from the current" in note for note in found.notes)
+
+
+def test_integers_are_decoded_before_they_are_interpolated(tmp_path):
+    fast = {"time": np.arange(0, 1, 0.1), "Present_Velocity": np.tile([32768 + 100.0, 100.0], 5)}
+    slow = {"time": np.array([0.05, 0.55]), "Present_Position": np.array([2048.0, 2048.0])}
+    rates = {f"{group}/{name}": values for group, log in (("a", fast), ("b", slow)) for name, values in log.items()}
+    np.savez(tmp_path / "log.npz", **rates, supply_voltage_V=12.0)
+    found = records.read_runs(
+        tmp_path / "log.npz", robot(tmp_path, "output_speed", "output_angle"), columns="feetech"
+    )
+    assert_allclose(found["output_speed_rpm"][:4] * 4096 / 60, [-100, 100, -100, 100])
+
+
+@pytest.mark.parametrize("topic", ["/arm/joint_states", "/dynamic_joint_states"])
+@pytest.mark.parametrize(("preset", "column"), [("ros2", "output_torque_Nm"), ("ros2_amperes", "motor_current_mA")])
+def test_ros_2_effort_is_what_the_preset_assumes(tmp_path, topic, preset, column):
+    from rosbags.rosbag2 import Writer
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    value, state = "control_msgs/msg/InterfaceValue", "control_msgs/msg/DynamicJointState"
+    store.register(get_types_from_msg("string[] interface_names\nfloat64[] values", value))
+    store.register(get_types_from_msg(
+        "std_msgs/Header header\nstring[] joint_names\ncontrol_msgs/InterfaceValue[] interface_values", state
+    ))  # fmt: skip
+    kind = "sensor_msgs/msg/JointState" if "arm" in topic else state
+    with Writer(tmp_path / "bag", version=9) as writer:
+        link = writer.add_connection(topic, kind, typestore=store)
+        for k in range(4):
+            at, joints = 10**9 + 10**7 * k, [np.array([9.0, 9, 9]), np.array([0.5 * k, 2.0 * k, 1.5 * k])]
+            header = store.types["std_msgs/msg/Header"](store.types["builtin_interfaces/msg/Time"](1, 10**7 * k), "")
+            fields = (
+                [*np.array(joints).T.copy()] if kind != state else [[store.types[value](["position", "velocity", "effort"], x) for x in joints]]
+            )  # fmt: skip
+            writer.write(link, at, store.serialize_cdr(store.types[kind](header, ["a", "b"], *fields), kind))
+    read = reading.read_columns(
+        tmp_path / "bag", records.Layout.of(None), presets_file.find_preset(f"{preset},joint=1")
+    )
+    values = dict(zip(read.arrays.header, read.arrays.values, strict=True))
+    found = {mine: factor * values[theirs] for mine, theirs, factor in read.mapped}
+    assert_allclose(found["output_speed_rad_s"], 2.0 * np.arange(4))
+    assert_allclose(found[column], 1.5 * np.arange(4) * (1000 if "mA" in column else 1))
+    assert any(f"read as {column}, is assumed to be" in note for note in read.arrays.notes)
+
+
 WRONG = {
     "another name": ("vesk", r"got vesk; no such file and no packaged preset; did you mean vesc\?"),
     "a number that is none": ("vesc,pole_pairs=x", "got pole_pairs=x; expected a name and a number"),
@@ -162,6 +241,10 @@ FILES = {
     "a number without a name": (
         '[columns]\ntime_s = {column = "t", per = "n"}',
         r"got n; expected a number that \[ask\] names",
+    ),
+    "a part of a bit": (
+        '[columns]\ntime_s = {column = "t", sign_bit = 1.5}',
+        "sign_bit: got 1.5; expected a whole number",
     ),
     "nothing": ("", "expected a table of columns"),
 }

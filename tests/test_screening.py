@@ -262,7 +262,7 @@ def test_what_is_ranked_is_said_not_to_be_confirmed():
     ]  # the others explain no more than chance, or would supply power
     nothing = dataclasses.replace(RANKING, missing=False, p_value=0.4)
     assert words.ranking_lines(nothing) == [
-        "by regression, not yet confirmed: nothing exceeds chance (family-wise p = 0.4)"
+        "by regression, not yet confirmed: no effect of the library exceeds chance (family-wise p = 0.4)"
     ]
 
 

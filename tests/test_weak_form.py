@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from types import SimpleNamespace
 
+import jax
 import numpy as np
 import pytest
 from test_log_kinds import carriage, servo, written
@@ -152,6 +153,28 @@ def test_noise_of_windows_is_that_of_their_readings(space, before):
     found = weak_form.weak_form(posed(quiet, space.bare.base).bare)
     chi2 = np.sum(found.residual**2)
     assert abs(chi2 - found.windows) < 4 * np.sqrt(2 * found.windows)
+
+
+def test_noise_that_windows_and_equations_share_is_correlated(space, before):
+    """As in a Monte Carlo of the motor's two equations, in NumPy, with noise in both readings."""
+    problem, plan = space.bare, shown_states.plan_of(space.bare)
+    rows, _, (w, *_) = shown_states.rows_and_windows(problem, plan)
+    w, z, sd = w.part(np.arange(12)), before.base.z[: space.free], np.asarray(rows.sd)
+    terms = weak_form._terms(problem, plan, rows, z, ())
+    factor = weak_form._factor(plan, w, sd, jax.device_get(terms), np.zeros(2))
+    value = dict(zip(problem.coordinates.names, np.asarray(problem.coordinates.value(z)), strict=True))
+    r, k, inertia = (float(value[f"motor.{name}"]) for name in TRUE)
+    noise = sd * np.random.default_rng(0).standard_normal((20_000, *sd.shape))
+    names = [channel.name for channel in problem.channels]
+    current, speed = (noise[:, w.rows, names.index(f"motor_{name}")] for name in ("current", "speed"))
+    electrical = np.sum(w.weight * (-k * speed - r * current) + w.slope * 4e-4 * current, -1)
+    mechanical = np.sum(w.weight * (k * current - 3e-5 * speed) + w.slope * inertia * speed, -1)
+    drawn = np.corrcoef(np.concatenate([electrical, mechanical], 1).T)
+    covariance = factor @ factor.T
+    size = np.sqrt(np.diag(covariance) / (1 + weak_form.FLOOR))
+    off = ~np.eye(24, dtype=bool)
+    assert np.max(np.abs(covariance / np.outer(size, size) - drawn)[off]) < 0.04
+    assert np.max(np.abs(drawn[:12, 12:])) > 0.3 and np.max(np.abs(drawn[12:, 12:][off[12:, 12:]])) > 0.3
 
 
 @pytest.mark.parametrize("rows", [12, -7])

@@ -13,17 +13,27 @@ from typing import Any
 
 from calibration.data import Names, input_files
 from calibration.data.columns import Layout
-from calibration.data.input_errors import BadConfiguration, BadData, allowed_words, parse_number, stated_number
+from calibration.data.input_errors import (
+    BadConfiguration,
+    BadData,
+    allowed_words,
+    parse_number,
+    stated_count,
+    stated_number,
+)
 from mmrjax.model import channels
 
 #: Presets that come with the package, in `calibration/data/presets/`.
 PACKAGED = (
-    "bam", "dynamixel", "lerobot", "moteus", "odrive", "px4", "rcbenchmark", "simplefoc", "sysid", "vesc",
+    "advantagekit", "bam", "damiao", "dynamixel", "feetech", "lerobot", "moteus", "odrive", "px4", "rcbenchmark",
+    "robstride", "ros2", "ros2_amperes", "simplefoc", "sysid", "vesc",
 )  # fmt: skip
 #: Columns of a packaged preset that a source has at least for it to be recognised.
 OF_A_PRESET = 3
-#: Keys of a preset, and of one of its columns.
-KEYS, KEYS_OF_COLUMN = ("columns", "ask", "header"), ("column", "factor", "per", "times", "note", "needs", "across")
+COLUMN_NAME = "the name of a column"
+#: Keys of a preset, and of one of its columns. Texts have a description.
+KEYS, TEXTS = ("columns", "ask", "header"), {"note": "a sentence", "needs": COLUMN_NAME, "across": COLUMN_NAME}
+KEYS_OF_COLUMN = ("column", "factor", "per", "times", "sign_bit", "zero", *TEXTS)
 #: Keys of a number that a preset asks for.
 KEYS_OF_NUMBER = ("about", "usual")
 #: Between the name of a preset and the numbers that it asks for, `vesc,pole_pairs=7`.
@@ -41,6 +51,8 @@ class PresetColumn:
         note: its meaning, for a note.
         needs: column of this program without which it is not what drives the motor. Empty: none.
         across: column of the file with the current along d, zero where the field is not weakened. Empty: none.
+        sign_bit: bit that is set in raw numbers below zero, whose other bits are the magnitude. 0: none.
+        zero: raw number that stands for zero.
     """
 
     mine: str
@@ -49,6 +61,8 @@ class PresetColumn:
     note: str = ""
     needs: str = ""
     across: str = ""
+    sign_bit: int = 0
+    zero: float = 0.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -86,6 +100,11 @@ class Preset:
             elif self.name not in PACKAGED:  # a packaged preset has columns of several loggers
                 mapped.append((column.mine, column.theirs[0], column.factor))
         return tuple(mapped), tuple(notes)
+
+    def column_of(self, name: str) -> PresetColumn:
+        """Returns the column that is read from a column of the source, an empty one if none is."""
+        read = (c for c in self.columns if any(_among(theirs, {name}) for theirs in c.theirs))
+        return next(read, PresetColumn("", ()))
 
     def check_needed(self, mapped: Iterable[tuple[str, str, float]], imposed: str, name: str) -> None:
         """Refuses a source whose imposed column means nothing without another one that the source lacks.
@@ -263,16 +282,14 @@ def _column(mine: str, theirs: Any, where: str, numbers: Mapping[str, float]) ->
             factor = factor * value if key == "times" else factor / value
     if not factor:
         raise BadConfiguration(f"{where}.factor: got 0; expected a number that is not 0")
-    note = table.get("note", "")
-    if not isinstance(note, str):
-        raise BadConfiguration(f"{where}.note: got {note!r}; expected a sentence")
-    needs = table.get("needs", "")
-    if not isinstance(needs, str):
-        raise BadConfiguration(f"{where}.needs: got {needs!r}; expected the name of a column")
-    across = table.get("across", "")
-    if not isinstance(across, str):
-        raise BadConfiguration(f"{where}.across: got {across!r}; expected the name of a column")
-    return PresetColumn(mine, tuple(_filled(name, where, numbers) for name in names), factor, note, needs, across)
+    texts = {key: table.get(key, "") for key in TEXTS}
+    for key, expected in TEXTS.items():
+        if not isinstance(texts[key], str):
+            raise BadConfiguration(f"{where}.{key}: got {texts[key]!r}; expected {expected}")
+    sign_bit = stated_count(table.get("sign_bit", 0), f"{where}.sign_bit", 0, 63)
+    zero = stated_number(table.get("zero", 0.0), f"{where}.zero")
+    theirs = tuple(_filled(name, where, numbers) for name in names)
+    return PresetColumn(mine, theirs, factor, sign_bit=sign_bit, zero=zero, **texts)
 
 
 def _filled(name: str, where: str, numbers: Mapping[str, float]) -> str:

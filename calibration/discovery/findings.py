@@ -48,6 +48,7 @@ from calibration.discovery.search import single_p_value, without_each
 from calibration.discovery.settings import Settings
 from calibration.discovery.stated_values import Shift
 from calibration.inference import bases, priors
+from calibration.inference.estimates import SIDE_OF_BOUND
 from calibration.inference.held_out import predict_unseen
 from calibration.inference.identifiability import held_by_prior
 from calibration.inference.linearization import Linearization, amplitude_of, shape_at, shape_of, shape_scales
@@ -292,6 +293,7 @@ def base_shift(space: CandidateSpace, before: np.ndarray, after: np.ndarray, sd:
     value = [coordinates.value(np.asarray(x)) for x in (np.zeros(p), *z)]
     slope = np.asarray(coordinates.slope(jnp.asarray(z[1])))
     fields, held_names = priors.parameters_by_name(space.bare.base), held_by_prior(sd)
+    bound = coordinates.beyond(z[1])
     return {
         name: BaseShift(
             prior=float(value[0][k]),
@@ -303,6 +305,7 @@ def base_shift(space: CandidateSpace, before: np.ndarray, after: np.ndarray, sd:
             shift_before=float(z[0][k]),
             shift_after=float(z[1][k]),
             held_by_prior=bool(held_names[k]),
+            at_bound=SIDE_OF_BOUND[int(bound[k])],
         )
         for k, name in enumerate(coordinates.names)
     }

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from calibration.data import Names, robot_file
 from calibration.data import posterior_file as posterior
-from calibration.data import robot_file
 from calibration.data.columns import DRIVING
 from calibration.data.posterior_file import Posterior
 from calibration.data.runs import WHEN, Runs
@@ -218,6 +218,7 @@ class BaseShift:
 
     Attributes:
         held_by_prior: True if it is after, see `identifiability.held_by_prior`.
+        at_bound: bound that it reached after, `lower`, `upper` or None.
     """
 
     prior: float
@@ -229,6 +230,7 @@ class BaseShift:
     shift_before: float
     shift_after: float
     held_by_prior: bool
+    at_bound: str | None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -486,7 +488,8 @@ class DiscoveryResult:
         robot: as written.
         refit: with nothing added.
         written: True if the robot has the proposal.
-        gain: hold-out gain of the proposal over the refit, None if no block can be held out.
+        gains: sets of effects, by their number, with their hold-out gain over the refit. The last one is the
+            proposal. Empty if no block can be held out.
         converged: True if the fit of that robot is an optimum.
         posterior: of all fitted parameters.
         runs: the table.
@@ -531,7 +534,7 @@ class DiscoveryResult:
     summary: Summary
     robot: Robot
     refit: Robot
-    gain: Gain | None
+    gains: tuple[tuple[Names, Gain], ...]
     written: bool
     converged: bool
     posterior: Posterior
@@ -590,6 +593,11 @@ class DiscoveryResult:
     def headline(self) -> Headline:
         """Claim that holds at every noise factor tried."""
         return headline(self.summary, [(s.factor, s.summary) for s in self.sensitivity])
+
+    @property
+    def gain(self) -> Gain | None:
+        """Hold-out gain of the proposal over the refit, None if no block can be held out."""
+        return self.gains[-1][1] if self.gains else None
 
     @property
     def refit_alone(self) -> bool:
@@ -664,6 +672,7 @@ class DiscoveryResult:
         return json_value(
             {
                 "schema": SCHEMA,
+                "statement": self.statement,
                 "verdict": self.verdict,
                 "mechanism": None
                 if self.summary.mechanism is None
@@ -673,7 +682,6 @@ class DiscoveryResult:
                     **{name: getattr(self.headline, name) for name in ("level", "claims", "factors", "shared")},
                     "statement": self.statement,
                 },
-                "statement": self.statement,
                 "verdict_statement": self.verdict_statement,
                 "rows": len(self.runs),
                 "rows_used": int(self.included.sum()),
@@ -697,6 +705,7 @@ class DiscoveryResult:
                 "prediction": {
                     "gain": None if self.gain is None else self.gain.mean,
                     "se": None if self.gain is None else self.gain.se,
+                    "sets": [{"effects": names, "gain": g.mean, "se": g.se} for names, g in self.gains],
                     "unit": "nat a reading",
                     "written": "found" if self.written else "refit",
                 },

@@ -42,9 +42,9 @@ class BatterySag(SupplyEffect):
     The battery's voltage falls over the first half minute of a load.
 
     Source: Chen and Rincón-Mora, Accurate electrical battery model capable of predicting runtime and I-V
-    performance, IEEE Trans. Energy Conversion 21 (2006), the first RC pair. A is its resistance for the
-    whole battery. The memory is q [A], without a memory the settled value is used. The pair returns its stored
-    energy, so it is not a pure loss. On an external supply it is absent.
+    performance, IEEE Trans. Energy Conversion 21 (2006), the first RC pair. The
+    amplitude a is its resistance for the whole battery. The memory is q [A]. Without a memory the settled value is
+    used. The pair returns its stored energy, so it is not a pure loss. On an external supply it is absent.
     """
 
     driver = "current"

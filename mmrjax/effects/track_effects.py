@@ -347,7 +347,7 @@ class PositionFriction(TrackEffect):
 
     Source: Armstrong-Hélouvry, Control of Machines with Friction (1991), ch. 4: friction of a joint over its
     position, to first order. The memory is θ [rad], counted as in the channel of the angle or position, which
-    the rig must show, without one it is 0 at the start of each run. Its mean over the travel is M_t0.
+    the rig must show. Without one the phase is 0 at the start of each run. Its mean over the travel is M_t0.
     """
 
     driver = "position"

@@ -6,9 +6,9 @@ order left, right (leading axis 2), their contact lines at y = ±B/2. A contact 
     u_x = r ω_k,s - V_s - slip, V_s = v_x - ω y_s,    u_y = -v_y - ω x,
 
 and carries the force N μ(|u|) (u_x, λ^a u_y) / |(u_x, λ^(a-1) u_y)|, with μ the law of Fig. 7 and λ = φ_y / φ_x. At
-u_y = 0 this is the law of straight travel, and for any a it is on the friction ellipse. A is the rule of direction.
-At a = 1 the force is along (φ_x u_x, φ_y u_y), at a = 2 it dissipates the most power that the ellipse allows. The
-rule is an assumption, as are the loads of a rigid robot in equilibrium at each instant.
+u_y = 0 this is the law of straight travel, and for any a it is on the friction ellipse. The exponent a sets the
+direction. At a = 1 the force is along (φ_x u_x, φ_y u_y). At a = 2 it dissipates the most power that the ellipse
+allows. The rule is an assumption, as are the loads of a rigid robot in equilibrium at each instant.
 """
 
 from __future__ import annotations

@@ -85,7 +85,7 @@ def _loop(config: configuration.Loop, beside: configuration.LoopBeside) -> int:
         def keep(name: str, make: Callable[[], T]) -> T:
             result = stages[name] = folder.stage(name, make)
             if name == "ranking":
-                _show_ranking(stages[name], folder, timed)
+                _show_ranking(stages[name], folder, timed, brief=not beside.verbose)
             if name == "verdict":
                 timed(f"{loop_words.verdict_line(stages[name])}; next, errors held out and other noises")
             return result
@@ -105,7 +105,7 @@ def _loop(config: configuration.Loop, beside: configuration.LoopBeside) -> int:
         if config.resolve:
             verdict = _resolved(verdict, config, beside.members, progress)
         document = loop_report.loop_document(verdict, config.robot, changes_by_effect(verdict))
-        page = print_report(document)
+        page = print_report(document, brief=not beside.verbose)
         if config.resolve and verdict.resolved is None:
             print_output(
                 "The track model was not asked: nothing remains in slip, track or ground that it has a say in."
@@ -157,9 +157,9 @@ def _alarm(seconds: float, wanted: Callable[[], bool]) -> Iterator[None]:
         signal.signal(signal.SIGALRM, before)
 
 
-def _show_ranking(found: Ranking, folder: RunFolder, timed: Callable[[str], None]) -> None:
-    """Say what regression makes of the library, and leave it in the run folder: the first answer."""
-    first, *lines = loop_words.ranking_lines(found)
+def _show_ranking(found: Ranking, folder: RunFolder, timed: Callable[[str], None], brief: bool) -> None:
+    """Print the ranking by regression, the first answer, and leave it in the run folder."""
+    first, *lines = loop_words.ranking_lines(found, brief=brief)
     timed(first)
     for line in lines:
         print_message(line)

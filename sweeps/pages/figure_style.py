@@ -221,7 +221,7 @@ def figure_as_svg(fig: Figure) -> str:
                 if not _wrap(fig) | _give_names_room(fig):
                     break
                 engine.execute(fig)
-            _clear_texts(fig)
+        _clear_texts(fig, move=least == LEAST_NARROW)
         fig.set_layout_engine(None)  # or savefig draws everything once more to lay it out
     buffer = io.StringIO()
     fig.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
@@ -272,24 +272,25 @@ def _give_names_room(fig: Figure) -> bool:
     return more > 0.05 or turned
 
 
-def _clear_texts(fig: Figure) -> None:
+def _clear_texts(fig: Figure, move: bool) -> None:
     """Separates texts inside axes from other texts: numbers that lie over one are hidden, words are moved.
 
-    A map shows all its numbers or none.
+    A map shows all its numbers or none. Without `move` only maps are changed.
     """
     every: Any = fig.findobj(lambda a: isinstance(a, Text) and a.get_visible() and a.get_text().strip() != "")
     boxes = {text: Text.get_window_extent(text) for text in every if text.get_rotation() == 0}
 
     def is_free(text: Text, box: Bbox) -> bool:
         return not any(
-            min(box.x1, b.x1) - max(box.x0, b.x0) > 2 and min(box.y1, b.y1) - max(box.y0, b.y0) > 2
+            min(box.x1, b.x1) - max(box.x0, b.x0) > 0 and min(box.y1, b.y1) - max(box.y0, b.y0) > 2
             for other, b in boxes.items()
             if other is not text
         )
 
     inside: list[Any] = [text for axes in fig.axes for text in axes.texts if text in boxes]
     crowded = {text.axes for text in inside if text.axes.images and not is_free(text, boxes[text])}
-    for text in sorted(inside, key=lambda text: not _is_number(text)):
+    chosen = inside if move else [text for text in inside if text.axes in crowded and _is_number(text)]
+    for text in sorted(chosen, key=lambda text: not _is_number(text)):
         box, panel, line = boxes[text], text.axes.bbox, text.get_fontsize() / 2
         if _is_number(text) and (text.axes in crowded or not is_free(text, box)):
             text.set_visible(False)

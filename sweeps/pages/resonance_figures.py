@@ -21,6 +21,7 @@ from sweeps.pages.figure_style import (
     SKY,
     VERMILION,
     colour_bar,
+    is_narrow,
     legend_columns,
     new_figure,
 )
@@ -66,7 +67,7 @@ def draw_campbell_diagram(axes: Axes, found: ResonanceResult) -> None:
         axes.plot([0, fastest], [0, at_end], color=FAINT, lw=0.8, zorder=1)
         inside, last = at_end <= top, place
         place = fastest if inside else fastest * 0.985 * top / at_end
-        if last - place < 0.03 * fastest and not inside:
+        if last - place < (0.08 if is_narrow() else 0.03) * fastest and not inside:
             break  # labels and lines would cover one another
         axes.annotate(
             f"{order}×", (place, min(at_end, 0.985 * top)), xytext=(4, 0) if inside else (0, -2),
@@ -96,7 +97,7 @@ def draw_campbell_diagram(axes: Axes, found: ResonanceResult) -> None:
         )  # fmt: skip
     axes.set(ylim=(0, top), ylabel="frequency [Hz]")
     heading = f"{found.configuration}: {what.name} pass every {what.travel / MM:.4g} mm of travel; dotted: Table 8"
-    axes.set_title(heading, pad=18)
+    axes.set_title(heading, pad=22 if is_narrow() else 18)
     labels = axes.get_legend_handles_labels()[1]
     axes.legend(
         loc="upper center", bbox_to_anchor=(0.5, -0.02), ncols=legend_columns(labels, 3), handletextpad=0.2,

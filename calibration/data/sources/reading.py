@@ -15,7 +15,7 @@ from calibration.data import Columns, Names, delimited, input_files, presets_fil
 from calibration.data.columns import SPEED, TIME, WHEN, WORDS, Layout
 from calibration.data.input_errors import BadData
 from calibration.data.named_arrays import NamedArrays, Raw, column_numbers, column_texts
-from calibration.data.presets_file import Preset
+from calibration.data.presets_file import Preset, PresetColumn
 from calibration.data.sources import one_clock, opening
 from calibration.data.sources.recorded_signals import (
     RUN,
@@ -155,9 +155,11 @@ def _of_table(arrays: NamedArrays, layout: Layout, columns: Preset | None) -> Re
     if arrays.header and not any(theirs in by_name for _, theirs, _ in mapped):
         raise _none_of(arrays.name, columns, arrays.header)
     columns.check_needed(mapped, layout.imposed_column, arrays.name)
-    notes = (*notes, *weakened_field_notes(columns, by_name))
+    notes = (*arrays.notes, *notes, *weakened_field_notes(columns, by_name))
+    read = map(columns.column_of, arrays.header)
+    values = tuple(map(_decoded, read, arrays.values))
     return Reading(
-        dataclasses.replace(arrays, notes=(*arrays.notes, *notes)), presets_file.merge_columns(mapped, layout.mapped)
+        dataclasses.replace(arrays, values=values, notes=notes), presets_file.merge_columns(mapped, layout.mapped)
     )
 
 
@@ -216,6 +218,8 @@ def _of_signals(source: Source, layout: Layout, columns: Preset | None, between:
     extras = _extras(source, chosen, own)
     size = input_files.VALUE * sum(s.length for s in (*chosen.values(), *extras.values()))
     input_files.check_memory(source.name, size)
+    if columns is not None:
+        chosen = {name: _decoded_signal(columns.column_of(name), signal) for name, signal in chosen.items()}
     if own:
         values, more = _on_a_grid(source, chosen, layout, between, clock, mapped)
     else:
@@ -263,6 +267,22 @@ def _chosen(source: Source, mapped: Mapped, layout: Layout) -> tuple[dict[str, S
         if signal.name.casefold() in spelled and id(signal) not in taken and not vague:
             chosen.setdefault(signal.name, signal)
     return chosen, clock, tuple(missing)
+
+
+def _decoded(column: PresetColumn, raw: Raw) -> Raw:
+    """Raw numbers as signed numbers that count from zero. Cells without a number stay as they are."""
+    if not (column.sign_bit or column.zero):
+        return raw
+    numbers, sign = column_numbers(raw), 2.0**column.sign_bit
+    counted = np.where(bool(column.sign_bit) & (numbers >= sign), sign - numbers, numbers) - column.zero
+    if isinstance(raw, np.ndarray):
+        return counted
+    return [cell if np.isnan(x) else repr(x) for cell, x in zip(raw, counted.tolist(), strict=True)]
+
+
+def _decoded_signal(column: PresetColumn, signal: Signal) -> Signal:
+    """A signal whose values are decoded before they are interpolated."""
+    return dataclasses.replace(signal, load=lambda: np.asarray(_decoded(column, signal.load())))
 
 
 def _extras(source: Source, chosen: Mapping[str, Signal], own: Sequence[Signal]) -> dict[str, Signal]:
