@@ -502,7 +502,8 @@ class _Task:
             return space, None
         make = functools.partial(findings.rank_by_weak_form, space, ranking, self.settings)
         ranked.append(self.keep("ranking", make))
-        return space.with_room(ranking.room), ranking.base
+        begins = {c.active: c.z for c in [c for c in ranking.alone if c.plausible][:1]}
+        return dataclasses.replace(space.with_room(ranking.room), begins=begins), ranking.base
 
 
 def _fit_base_and_noise(task: _Task, ranked: list[Ranking]) -> tuple[Screening, Sds]:

@@ -309,7 +309,10 @@ def rank_by_weak_form(space: CandidateSpace, known: Beforehand, settings: Settin
     p = single_p_value(float(np.max(known.scores.single**2)), known.null)
     chance = float(np.quantile(known.null, 1 - settings.family_wise_error, method="higher")) ** 2
     listed = _ranked(space, known.scores, settings)
-    return Ranking(p <= settings.family_wise_error, p, chance, listed, known.windows)
+    fit = next((c for c in known.alone if c.plausible), known.base)
+    moved = {} if fit is None else base_shift(space, fit.z, fit.z, fit.sd)
+    parameters = {name: (shift.after, shift.sd_after) for name, shift in moved.items()}
+    return Ranking(p <= settings.family_wise_error, p, chance, listed, known.windows, parameters)
 
 
 def _ranked(space: CandidateSpace, scores: ScoreTable, settings: Settings) -> tuple[Ranked, ...]:

@@ -258,6 +258,7 @@ class Ranking:
         chance: critical score of the strongest effect [σ²].
         effects: the strongest first, then those that would supply power.
         windows: number of equations of the log in weak form, 0 for a ranking by signatures along the base fit.
+        parameters: base parameters next to the first effect, each with its sd [SI].
     """
 
     missing: bool
@@ -265,6 +266,7 @@ class Ranking:
     chance: float
     effects: tuple[Ranked, ...]
     windows: int = 0
+    parameters: dict[str, tuple[float, float]] = dataclasses.field(default_factory=dict)
 
 
 @dataclasses.dataclass(frozen=True)
