@@ -215,12 +215,14 @@ def test_operating_points_lie_on_the_chart_of_motor_and_gear():
     runs = _runs(("6T2A", "4W2T"), 33.0, 8.0, (0.0, 10.0))
     robot = ROBOTS["nominal"]()
     points, curves = power_figures.operating_points(robot, runs), power_figures.drive_curves(robot, 33.0)
-    assert (runs["status"] == "converged").all() and np.ptp(points["torque"]) > 1.0
-    for name in ("speed", "current"):
-        on_curve = np.interp(points["torque"], curves["torque"], curves[name])
+    assert (runs["status"] == "converged").all() and np.ptp(points["torque_Nm"]) > 1.0
+    for name in ("motor_rpm", "motor_A"):
+        on_curve = np.interp(points["torque_Nm"], curves["torque_Nm"], curves[name])
         assert_allclose(points[name], on_curve, rtol=2e-3)
-    lost = 33.0 * curves["current"] - curves["torque"] * curves["speed"] * np.pi / 30 / float(robot.gearbox.ratio)
-    assert (lost > 0).all() and curves["efficiency"].max() < 100 * float(robot.gearbox.efficiency_load)
+    lost = 33.0 * curves["motor_A"] - curves["torque_Nm"] * curves["motor_rpm"] * np.pi / 30 / float(
+        robot.gearbox.ratio
+    )
+    assert (lost > 0).all() and curves["efficiency_percent"].max() < 100 * float(robot.gearbox.efficiency_load)
 
 
 @pytest.mark.slow

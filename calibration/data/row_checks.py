@@ -160,7 +160,7 @@ def _fill(name: str, columns: Columns, rows: int, layout: Layout) -> None:
         columns["configuration"] = np.full(rows, configuration)
     if layout.imposed_column == SPEED and set(SPEEDS) <= set(columns):
         columns[SPEED] = np.mean([columns[c] for c in SPEEDS], 0)
-    for column, value in DEFAULTS.items():
+    for column, value in {**DEFAULTS, SUPPLY: layout.supply}.items():
         columns.setdefault(column, np.full(rows, value))
 
 

@@ -32,7 +32,7 @@ from calibration.discovery.classes import Classes, find_classes, signature_cosin
 from calibration.discovery.description import missed_channels, remaining_errors, unused_inputs
 from calibration.discovery.discrepancy import CurveBeside, Discrepancy, locate_discrepancy
 from calibration.discovery.experiments import Proposal, propose_denser_runs, propose_nothing, propose_separating
-from calibration.discovery.hidden import find_hidden_effects
+from calibration.discovery.hidden import Hidden, find_hidden_effects
 from calibration.discovery.kept import Keep
 from calibration.discovery.location import DiscrepancyLocation, varied_by_duty
 from calibration.discovery.loop_notes import FreedValue, Mechanism, Missed, Missing, NameSupport, NameTest, Summary
@@ -52,7 +52,6 @@ from calibration.discovery.result import (
     Errors,
     FoundEffect,
     HeldOutAlternative,
-    HiddenEffect,
     Ranking,
     ReadingsOfRows,
     Sensitivity,
@@ -504,7 +503,8 @@ class _Task:
             return space, None
         make = functools.partial(findings.rank_by_weak_form, space, ranking, self.settings)
         ranked.append(self.keep("ranking", make))
-        return space.with_room(ranking.room), ranking.base
+        begins = {c.active: c.z for c in [c for c in ranking.alone if c.plausible][:1]}
+        return dataclasses.replace(space.with_room(ranking.room), begins=begins), ranking.base
 
 
 def _fit_base_and_noise(task: _Task, ranked: list[Ranking]) -> tuple[Screening, Sds]:
@@ -944,7 +944,7 @@ def _predicts_well(traced: LoopStages, written: _FitOfVerdict, gain: prediction.
 
 def _claims(
     traced: LoopStages, settings: Settings
-) -> tuple[tuple[FoundEffect, ...], DiscrepancyLocation | None, tuple[HiddenEffect, ...]]:
+) -> tuple[tuple[FoundEffect, ...], DiscrepancyLocation | None, tuple[Hidden, ...]]:
     """Effects that a verdict names, location of the remaining discrepancy, and effects that they may conceal."""
     screened, left, alike = traced.screened, traced.left, traced.alike
     space, base, best = screened.base.space, screened.base.candidate, traced.best
@@ -954,9 +954,7 @@ def _claims(
     if traced.verdict in WITHOUT_NAME:
         return found_effects, None, ()
     ask = space.bare.observe.menu and not space.bare.observe.long
-    concealed = findings.hidden_effects(
-        space, find_hidden_effects(space, best, alike, left, traced.ends, settings, ask=ask)
-    )
+    concealed = find_hidden_effects(space, best, alike, left, traced.ends, settings, ask=ask)
     return found_effects, traced.where, concealed
 
 
@@ -1075,7 +1073,7 @@ def _result(
         effects=found,
         unnamed=_unnamed(about, len(runs)),
         remains=remains,
-        next_experiment=findings.next_experiment(_proposal(space, traced, settings)),
+        next_experiment=_proposal(space, traced, settings),
         cannot_see=findings.invisible_effects(space, left.scores, settings),
         needs_histories=tuple(sorted(name for name, e in library.items() if e.transient and not kind.shows(e))),
         needs_reverse=tuple(

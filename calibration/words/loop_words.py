@@ -15,7 +15,7 @@ from calibration.described import describe
 from calibration.discovery import loop_notes
 from calibration.discovery.clusters import Cluster
 from calibration.discovery.location import DiscrepancyLocation
-from calibration.discovery.settings import FIT, HELD_OUT, WITHOUT_NAME
+from calibration.discovery.settings import FIT, HELD_OUT, WITHOUT_NAME, Settings
 from calibration.inference import bases, blocks
 from calibration.inference.series_noise import SeriesNoise
 from mmrjax import effects
@@ -303,6 +303,18 @@ def ranking_lines(found: Ranking, most: int = 5, brief: bool = False) -> list[st
         for k, e in enumerate(beyond, 1)
     ]
     return [f"{first}; strongest effects, each added alone:", *lines]
+
+
+def regression_verdict(found: Ranking) -> str:
+    """Answer of a ranking to a loop without a verdict: never more than a mechanism, and the base parameters."""
+    beyond = [e for e in found.effects if e.score > found.chance and not e.supplies]
+    alike = [e for e in beyond if e.score >= beyond[0].score - Settings.alternative]
+    families = " or ".join(dict.fromkeys(with_article(e.family) for e in alike))
+    lacks = f"{families} ({' or '.join(e.name for e in alike)})" if alike else "no effect explains it"
+    lacks = f"something is missing, {lacks}" if found.missing else "nothing exceeds chance"
+    numbers = ", ".join(f"{name} {value:.4g} ± {sd:.2g}" for name, (value, sd) in found.parameters.items())
+    numbers = f"; parameters [SI]: {numbers}" if numbers else ""
+    return f"regression only, not confirmed by simulation: {lacks}{numbers}"
 
 
 def so_far(effects: Sequence[str], families: Sequence[str]) -> str:

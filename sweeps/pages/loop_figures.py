@@ -53,6 +53,9 @@ IMPOSED_WORDS = {
     "supply_voltage_V": "supply voltage [V]",
     "motor_speed_rpm": "motor speed [rpm]",
     "motor_current_A": "motor current [A]",
+    "goal_angle_deg": "goal [deg]",
+    "goal_speed_rpm": "goal [rpm]",
+    "goal_current_A": "goal [A]",
 }
 #: Label and unit of conditions that no channel shows.
 CONDITION_WORDS = {

@@ -109,7 +109,7 @@ def drive_curves(robot: Robot, voltage: float) -> Columns:
     speed, drawn = np.asarray(runs.motor_speed), np.asarray(runs.total_current) / float(robot.sides)
     settled = np.asarray(is_done(np.asarray(runs.status))) & (speed > 0)
     efficiency = 100 * torque * speed / float(gearbox.ratio) / np.maximum(voltage * drawn, 1e-9)
-    columns = {"torque": torque, "speed": speed / RPM, "current": drawn, "efficiency": efficiency}
+    columns = {"torque_Nm": torque, "motor_rpm": speed / RPM, "motor_A": drawn, "efficiency_percent": efficiency}
     return {name: values[settled] for name, values in columns.items()}
 
 
@@ -120,7 +120,7 @@ def operating_points(robot: Robot, runs: Columns) -> Columns:
     with np.errstate(divide="ignore", invalid="ignore"):
         torque = runs["power_gear_W"] / float(robot.sides) / output
     speed = output * float(robot.gearbox.ratio) / RPM
-    return {"torque": torque, "speed": speed, "current": runs["total_current_A"] / float(robot.sides)}
+    return {"torque_Nm": torque, "motor_rpm": speed, "motor_A": runs["total_current_A"] / float(robot.sides)}
 
 
 def draw_chart_of_corners(robot: Robot, corners: Sequence[Json]) -> Figure:
@@ -130,7 +130,7 @@ def draw_chart_of_corners(robot: Robot, corners: Sequence[Json]) -> Figure:
     cells = dict.fromkeys(tuple(corner.get(key) for key in keys) for corner in whole)
     rows = [cell for cell in cells if None not in cell[:3]]
     full = float(robot.battery.voltage_no_load(0.0))
-    points = {name: np.zeros(0) for name in ("torque", "speed", "current")}
+    points = {name: np.zeros(0) for name in ("torque_Nm", "motor_rpm", "motor_A")}
     if not rows:
         return draw_drive_chart(robot, [full], points)
     names, payload, slope, charge, volts = zip(*rows, strict=True)
@@ -155,27 +155,31 @@ def draw_drive_chart(robot: Robot, voltages: Sequence[float], points: Columns) -
     Shaded are the torques up to the current that the winding bears continuously, and up to that of the driver.
     """
     fig, grid = new_figure(1, 3, 3.0, sharex=True)
-    panels = {"speed": "motor speed [rpm]", "current": "current of one motor [A]", "efficiency": "efficiency [%]"}
+    panels = {
+        "motor_rpm": "motor speed [rpm]",
+        "motor_A": "current of one motor [A]",
+        "efficiency_percent": "efficiency [%]",
+    }
     bears, limit = float(robot.motor.current_continuous), float(robot.driver.current_limit)
-    reached = np.nanmax(points["torque"], initial=0.0)
+    reached = np.nanmax(points["torque_Nm"], initial=0.0)
     for voltage, style in zip(sorted(voltages, reverse=True), ("-", "--", ":"), strict=False):
         curves = drive_curves(robot, voltage)
-        if curves["torque"].size < 2:
+        if curves["torque_Nm"].size < 2:
             continue
-        continuous = float(np.interp(bears, curves["current"], curves["torque"]))
+        continuous = float(np.interp(bears, curves["motor_A"], curves["torque_Nm"]))
         if style == "-":
-            most = min(max(2.5 * continuous, 1.2 * reached), curves["torque"][-1])
+            most = min(max(2.5 * continuous, 1.2 * reached), curves["torque_Nm"][-1])
             for axes in grid[0]:
                 axes.axvspan(0, min(continuous, most), color=GREEN, alpha=0.18, lw=0, label="continuous")
                 axes.axvspan(min(continuous, most), most, color=ORANGE, alpha=0.12, lw=0, label="short time")
                 axes.set_xlim(0, most)
-        shown = curves["torque"] <= most
+        shown = curves["torque_Nm"] <= most
         for axes, (name, label) in zip(grid[0], panels.items(), strict=True):
-            axes.plot(curves["torque"][shown], curves[name][shown], style, color=BLUE, label=f"{voltage:.3g} V")
+            axes.plot(curves["torque_Nm"][shown], curves[name][shown], style, color=BLUE, label=f"{voltage:.3g} V")
             axes.set(xlabel="torque at the gearbox output [N·m]", ylabel=label)
             axes.set_ylim(bottom=0)
-    for axes, name in zip(grid[0], ("speed", "current"), strict=False):
-        axes.plot(points["torque"], points[name], "o", ms=5, color=INK, label="operating points")
+    for axes, name in zip(grid[0], ("motor_rpm", "motor_A"), strict=False):
+        axes.plot(points["torque_Nm"], points[name], "o", ms=5, color=INK, label="operating points")
     if limit < UNLIMITED:
         grid[0, 1].axhline(limit, color=ORANGE, lw=1, label="driver's limit")
     outer_legend(grid[0, 1], "upper left")
