@@ -372,7 +372,8 @@ parameters fitted again, blue the model with the effects. The grey band is noise
 ![Influence of each effect on its readings](figures/laws.svg)
 
 For each effect, the figure shows the reading that it changes most, minus the same reading of the robot without it. Dots
-are measured, dashes simulated. If an effect is real, its dashes follow the dots along the whole axis.
+are measured, crosses the refitted model with nothing added. The blue line is the law with its 95 % band. If an effect is
+real, the line follows the dots along the whole axis.
 
 ## May I use the robot?
 

@@ -38,9 +38,9 @@ from sweeps.report.document import Document
 Page = Callable[[Path], Any]
 
 
-def print_report(document: Document, file: RobotFile | None = None) -> Page:
+def print_report(document: Document, file: RobotFile | None = None, brief: bool = False) -> Page:
     """Print a document and return its page, which ends with the robot's parameters if its file is given."""
-    terminal_renderer.print_document(document)
+    terminal_renderer.print_document(document, brief)
     return lambda folder: importlib.import_module("sweeps.report.page_renderer").write_report_page(
         folder, document, file
     )

@@ -146,8 +146,6 @@ def test_rows_of_a_clamp_in_tables(tmp_path):
     held = rig(tmp_path, "motor_current", '"motor_voltage", "output_torque"')
     with pytest.raises(BadData, match=r"row 1, load_torque_Nm: got 1 where held is 1; expected 0, .* output_torque"):
         records.read_runs(table(load_torque_Nm=np.ones(16)), robot=held)
-    with pytest.raises(BadData, match="column held is for settled rows"):
-        records.read_runs(table(time_s=np.arange(16.0)) | {"held": np.repeat([0.0, 1.0], 8)}, robot=held)
     speed = rig(tmp_path, "motor_speed", '"motor_current", "output_torque"')
     with pytest.raises(BadData, match=r'nothing drives the motors; .* a held shaft: state imposed = "motor_current"'):
         records.read_runs(table(held=False, motor_speed_rpm=np.zeros(16)), robot=speed)
@@ -170,13 +168,29 @@ def test_a_log_of_a_clamp_is_read_as_settled_rows(tmp_path):
     assert not log.sampled and any("held in every row: each row is read as a settled run" in n for n in log.notes)
     same = records.read_runs(table(), robot=held)
     assert all((log[c] == same[c]).all() for c in ("motor_current_A", "held", *rows))
-    with pytest.raises(BadData, match="column held is for settled rows"):
+    with pytest.raises(BadData, match="held is 1 in each row of a log too fast for settled rows"):
         records.read_runs(table(time_s=1e-4 * np.arange(16.0)), robot=held)
     speed = rig(tmp_path, "motor_speed", '"motor_current", "motor_voltage"')
     columns = {c: v for c, v in table(held=False).items() if c != "output_torque_Nm"}
     columns |= {"motor_speed_rpm": np.zeros(16), "load_torque_Nm": rows["output_torque_Nm"]}
     log = records.read_runs({**columns, "time_s": 0.02 * np.arange(16.0)}, robot=speed)
     assert not log.sampled and len(log) == 16
+
+
+def test_free_stretches_of_a_log_are_runs(tmp_path):
+    """Clamped, free, clamped, free: two runs without the clamp's rows. Such a log was refused."""
+    robot, clamp = rig(tmp_path, "voltage", '"motor_current", "motor_speed"'), np.repeat([1.0, 0.0, 1.0, 0.0], 5)
+    time, volts = 0.01 * np.arange(20), np.linspace(1.0, 3.0, 20)
+    log = {"time_s": time, "supply_voltage_V": volts, "motor_current_A": volts, "motor_speed_rpm": 99 * (1 - clamp)}
+    runs = records.read_runs({**log, "held": clamp}, robot=robot)
+    assert runs.sampled and len(runs) == 10 and (runs["motor_speed_rpm"] == 99).all() and not runs.has("held")
+    assert_allclose(runs["time_s"], time[clamp == 0])
+    assert runs.run_names.tolist() == ["stretch 1"] * 5 + ["stretch 2"] * 5
+    assert any("holds the output in 10 of 20 rows of a log; they are left out" in n for n in runs.notes)
+    named = records.read_runs({**log, "held": clamp, "run_id": np.repeat(["a", "b"], 10)}, robot=robot)
+    assert named.run_names.tolist() == ["a, stretch 1"] * 5 + ["b, stretch 2"] * 5
+    free = records.read_runs({**log, "held": 0 * clamp}, robot=robot)
+    assert free.run_names.tolist() == [""] * 20 and not free.has("held")
 
 
 def test_check_does_not_call_a_held_shaft_stalled(tmp_path, capsys):

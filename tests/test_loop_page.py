@@ -21,8 +21,9 @@ from worlds import settled, tables
 from calibration.data.writing import json_value
 from calibration.discovery.clusters import Cluster
 from calibration.discovery.discover import FAR
+from calibration.discovery.hidden import Hidden
 from calibration.discovery.loop_notes import Asked, NameSupport, NameTest, RuledOut
-from calibration.discovery.result import Alternative, Estimate, HiddenEffect, Resolved, StatedValue, Worse
+from calibration.discovery.result import Alternative, Estimate, Resolved, StatedValue, Worse
 from calibration.discovery.settings import WITHOUT_NAME
 from calibration.inference.identifiability import HELD
 from calibration.words import loop_words as words
@@ -30,6 +31,7 @@ from mmrjax.model import channels
 from sweeps.commands import loop as room
 from sweeps.pages import loop_figures
 from sweeps.pages import page as page_room
+from sweeps.pages.figure_style import figure_settings
 from sweeps.report import loop_report, page_renderer
 from sweeps.report.terminal_renderer import print_document
 
@@ -169,7 +171,46 @@ def test_what_an_effect_changes_is_that_of_the_robot_without_it(shown, capsys):
     here = found.included
     np.testing.assert_allclose(change.with_it[here], found.readings_of_rows.after[here, k], rtol=1e-5)
     assert change.rms > 1.0 and "brush_drop" not in room.changes_by_effect(found)
-    assert "laws" in drawn(shown("churning", capsys).text)
+    assert "law" in drawn(shown("churning", capsys).text)
+
+
+def test_the_page_opens_with_the_law_and_the_terminal_with_five_lines(shown, capsys):
+    """A stranger has to find the law, its band and whether the robot can be used before anything else."""
+    got = shown("churning", capsys)
+    head = got.text[: got.text.index('<nav id="contents"')]
+    assert [head.index(f'id="{name}"') for name in ("answer", "law", "summary", "advice")] == sorted(
+        head.index(f'id="{name}"') for name in ("answer", "law", "summary", "advice")
+    )
+    assert "May I use it?" in head and "new law, 95 %" in head
+    with figure_settings():
+        (axes,) = loop_figures.draw_effect_laws(
+            got.found, loop_report.rows_of(got.found), room.changes_by_effect(got.found)
+        ).axes
+    band = axes.collections[-1].get_paths()[0].get_extents()
+    (change,) = room.changes_by_effect(got.found).values()
+    size = got.found.effects[0].parameters["amplitude"]
+    largest = np.abs(change.with_it - change.without).max() / change.channel.factor
+    assert axes.get_xlabel() == "motor speed [rpm]"
+    np.testing.assert_allclose(
+        max(abs(band.y0), abs(band.y1)), largest * (1 + 1.96 * size.sd / abs(size.value)), rtol=1e-3
+    )
+    capsys.readouterr()
+    print_document(documented(got.found), brief=True)
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) <= 4 and lines[0] == got.found.statement  # the fifth is the path of the folder
+    assert [line.partition(":")[0] for line in lines[1:]] == ["Moved", "rms error as stated → now", "Next"]
+    assert lines[1].index("motor.torque_constant is") < lines[1].index("Added: churning ")  # what moved comes first
+
+
+def test_an_effect_of_the_listed_size_is_noticed_in_half_of_the_tables(shown, capsys):
+    """The curve of power and the table of sizes state one threshold."""
+    found = shown("churning", capsys).found
+    with figure_settings():
+        (axes,) = loop_figures.draw_power(found).axes
+    level, scores = found.before.kinds["single"].threshold, {s.name: s for s in found.scores}
+    for line in axes.lines:
+        at = level / scores[line.get_label()].sigmas_per_prior_sd
+        assert abs(np.interp(at, line.get_xdata(), line.get_ydata()) - 50) < 2
 
 
 def test_squares_of_readings_and_of_priors_are_apart(shown, capsys):
@@ -258,7 +299,7 @@ TOLD = {
         found, verdict="none", effects=(), support=None, summary=dataclasses.replace(found.summary, verdict="none")
     ),
     "hidden": lambda found: dataclasses.replace(found, hidden=(
-        HiddenEffect("brush_drop", 0.21, "V", 5.5, "stall", 7.2), HiddenEffect("load_slip", 1e-4, "1/N", 5.1, "", 0.0),
+        Hidden("brush_drop", 0.21, "V", 5.5, "stall", 7.2), Hidden("load_slip", 1e-4, "1/N", 5.1, "", 0.0),
     )),
     "worse": lambda found: dataclasses.replace(found, held_out_worse=(Worse("slope", "motor_speed", 10, 4.3, 4.7),)),
     "ruled_out": lambda found: dataclasses.replace(found, implausible=(Alternative(
@@ -302,7 +343,7 @@ def test_a_result_is_told_as_recorded(shown, capsys, name):
 def test_the_head_of_a_page_is_read_in_a_minute(shown, capsys):
     text = shown("churning", capsys).text
     head = text[text.index("<h1>") : text.index('<nav id="contents"')]
-    assert len(re.sub(r"<table.*?</table>|<[^>]+>", " ", head, flags=re.S).split()) <= 120
+    assert len(re.sub(r"<table.*?</table>|<svg.*?</svg>|<[^>]+>", " ", head, flags=re.S).split()) <= 120
 
 
 def test_what_the_track_model_found_is_saved(shown, capsys, tmp_path):

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from calibration.data import robot_file
 from calibration.data import runs as records
+from calibration.discovery import discover
 from calibration.inference.lost_motion import lost_motion_notes
 from mmrjax.model.quantities import RPM
 from sweeps.commands.rig_check import check_rig_file
@@ -95,3 +98,27 @@ def test_check_of_a_log_reports_lost_motion(tmp_path, capsys):
     read(tmp_path, servo(play=1.0))
     assert check_rig_file(tmp_path / "rig.toml", str(tmp_path / "log.csv"), (), False) == 0
     assert "reversals loses about" in " ".join(capsys.readouterr().out.split())
+
+
+@pytest.mark.parametrize("lost", [True, False])
+def test_no_effect_stands_in_for_a_missing_backlash(lost):
+    """The search took minutes, and its answer was a driver's characteristic."""
+    rejected = SimpleNamespace(test=SimpleNamespace(rejected=True))
+    steps = []
+
+    def keep(name, make):
+        steps.append(name)
+        return ("base", rejected) if name == "bootstrap 0" else ("base", rejected, SimpleNamespace(diagnosis=None))
+
+    task = SimpleNamespace(
+        settings=SimpleNamespace(replicates=1), keep=keep, progress=lambda step: None, loses_motion=lost
+    )
+    searched = discover._search_until_clean(task, SimpleNamespace(cluster=None), None, ["a ranking"])[2]
+    assert (searched is None) == lost and steps == ["bootstrap 0", "search 0"][: 1 if lost else 2]
+
+
+def test_task_of_the_loop_knows_of_lost_motion(tmp_path):
+    for play in (1.0, 0.0):
+        runs, robot = read(tmp_path, servo(play=play))
+        task = discover._Task(runs, robot, *[None] * 8)
+        assert task.loses_motion == (play > 0)

@@ -38,18 +38,18 @@ def test_a_command_answers_with_one_sentence(words, tmp_path, capsys, monkeypatc
 LAW = dict(claims=(("churning", "windage"),), families=(("loss torque that changes with speed",),), values=((),))
 #: Level of the claim that holds at every noise, and the answer to "is the model complete?" that it begins with.
 ANSWERS = {
-    "none": "Yes, ", "undescribed": "No verdict", "open": "Perhaps. ", "named": "No at", "class": "No at",
-    "mechanism": "No at", "place": "No at",
+    "none": "Yes, ", "undescribed": "No verdict", "open": "Perhaps. ", "named": "No: ", "class": "No: ",
+    "mechanism": "No: ", "place": "No: ",
 }  # fmt: skip
 
 
 @pytest.mark.parametrize("level", ANSWERS)
 def test_the_answer_of_the_loop_is_the_claim_that_holds_at_every_noise(level):
-    """«No: missing is ...» was once printed next to «whether anything is missing depends on the noise»."""
+    """«No: ... is missing» was once printed next to «whether anything is missing depends on the noise»."""
     found = Headline(level, factors=(0.7, 1.0, 1.4), shared=(2,), **LAW)
     answer = describe(found)
     assert answer.startswith(ANSWERS[level]) and "at 0.7, 1 and 1.4 times the noise" in answer
-    assert ("missing is" in answer) == (answer.startswith("No at"))
+    assert ("is missing" in answer) == answer.startswith(("No: ", "Perhaps"))
     assert ("established" in answer) == (level in ("mechanism", "place"))
     alone = describe(dataclasses.replace(found, factors=(1.0,)))
     assert "times the noise" not in alone and alone[:2] == answer[:2]
@@ -61,8 +61,8 @@ def test_the_answer_states_a_value_that_may_be_wrong_before_the_effect_that_imit
         "class", (("gear_load_loss",),), (1.0,), (), (("loss torque that changes with load",),), ((value,),)
     )
     assert describe(found) == (
-        "No: missing is a loss torque that changes with load (gearbox.efficiency_load is 0.685 or gear_load_loss; "
-        "these data cannot tell which)."
+        "No: a loss torque that changes with load (gearbox.efficiency_load is 0.685 or gear_load_loss; "
+        "these data cannot tell which) is missing."
     )
 
 

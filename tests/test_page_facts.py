@@ -15,6 +15,7 @@ from mmrjax.model import paper_robots, params
 from mmrjax.model.paper_tables import TRACKED, WHEELED
 from sweeps import pages
 from sweeps.pages import figure_style, sweep_figures
+from sweeps.paper import data
 from sweeps.paper import run_figures as paper_runs
 from sweeps.report import page_renderer, run_tables
 from sweeps.report import runs_report as page
@@ -105,7 +106,8 @@ def test_every_page_warns_of_curves_that_nobody_has_named(robot, tmp_path):
 
 @pytest.mark.slow
 def test_legend_of_the_energy_split_has_what_is_drawn():
-    fig, _ = paper_runs.draw_energy(paper_robots.nominal(), dict.fromkeys((TRACKED, WHEELED), 1.5))
+    used = data.energy_use(paper_robots.nominal(), dict.fromkeys((TRACKED, WHEELED), 1.5))
+    fig = paper_runs.draw_energy(used)
     shown = {text.get_text() for text in fig.legends[0].get_texts()}
     drawn = {
         bars.get_label() for bars in fig.axes[0].containers if max(bar.get_width() for bar in bars.patches) > 0.05

@@ -24,8 +24,8 @@ SECONDS = 0.9  # of a run; both configurations are under way after 0.5 s
 
 
 def page(folder, robot):
-    path, _ = report.write_paper_page(folder, RobotFile(robot, "nominal"), model="track", gear=True)
-    return path.read_text(encoding="utf-8")
+    document, _ = report.paper_document(RobotFile(robot, "nominal"), gear=True)
+    return page_renderer.write_report_page(folder, document).read_text(encoding="utf-8")
 
 
 def drawn(text):
@@ -53,7 +53,7 @@ def period(written):
 
 @pytest.mark.slow
 def test_ripple_table_has_the_period_of_equation_34(written, period):
-    cells = re.search(r'id="ripple">.*?<tr><td class="words">6T2A</td>(.*?)</tr>', written[1], re.S).group(1)
+    cells = re.search(r'id="ripple-table">.*?<tr><td class="words">6T2A</td>(.*?)</tr>', written[1], re.S).group(1)
     found, expected, current, speed, reaction, guide = map(float, re.findall(r"<td>([^<]+)</td>", cells))
     assert expected == pytest.approx(1e3 * period, abs=0.006)  # as printed
     assert found == pytest.approx(1e3 * period, rel=0.02)

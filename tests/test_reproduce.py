@@ -102,6 +102,15 @@ def test_error_table_gives_the_papers_own_errors(paper):
 
 
 @pytest.mark.slow
+def test_row_table_has_a_second_row_for_another_mass_and_letters_that_say_why(paper):
+    rows = paper[2].tables["rowtable"][2:]
+    wheeled = [r for r in rows if r[0] == "4W2T"]
+    assert len(rows) == 30 and len(wheeled) == 10 and all("M" in r[-1] for r in wheeled)
+    assert [r[2] for r in rows if r[0] == ""] == ["11.5"] * 5 + ["19.5"] * 5
+    assert sum("A" in r[-1].split() for r in rows) == sum("slides" in r for r in rows) == 6
+
+
+@pytest.mark.slow
 def test_raised_adhesion_makes_every_measured_row_climb():
     rows = data.simulate_measured_rows(ROBOTS["nominal"]())
     assert (rows.plain["status"] == "slides").sum() == 6

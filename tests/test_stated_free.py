@@ -13,7 +13,11 @@ from calibration.data import runs as records
 from calibration.data.input_errors import BadConfiguration
 from calibration.inference import foresight, priors, remarks
 from calibration.inference.calibration import calibrate
+from calibration.inference.observers import Histories, SettledRuns
 from tests.commands import ends
+
+#: Observers of logs and of settled runs, and the ends of names that these do not show.
+KINDS = (Histories, ()), (SettledRuns, priors.OVER_TIME)
 
 RIG = """
 base = "none"
@@ -55,6 +59,25 @@ def test_everything_stated_with_a_width_is_freed_that_the_data_show(tmp_path):
     assert "motor.resistance" not in priors.stated_names(driven, ["bench"])  # nothing shows it
     exact = bench(tmp_path, lambda text: text.replace("1.2 ± 5 %", "1.2 ± 0"))
     assert "motor.resistance" not in priors.stated_names(exact, ["bench"])
+
+
+def test_a_log_shows_how_a_vehicle_grips_though_no_channel_shows_its_speed(tmp_path):
+    """Each start does. With the grip held, a wrong mass was answered with `slip`."""
+    vehicle = 'load = "vehicle"\nmass = "10 ± 20 %"\nradius = 0.06\n[bench.ground]\nrolling_resistance = 0.02\n'
+    vehicle += '[bench.ground.friction]\nstatic = "0.6 ± 30 %"\n'
+    robot = bench(tmp_path, lambda text: text.partition('load = "shaft"')[0] + vehicle)
+    grip = {f"bench.{n}" for n in ("mass", "ground.friction.static", "ground.friction.speed_static")}
+    log, settled = (priors.free_names(robot, ["bench"], *kind.free(), idle) for kind, idle in KINDS)
+    assert grip < set(log) and grip & set(settled) == {"bench.mass"}
+
+
+def test_winding_that_nobody_stated_has_a_wide_prior(tmp_path):
+    """A log of a motor without inductance moved the assumed 0.2 ms by 6 sds, and resistance and friction with it."""
+    robot = bench(tmp_path)
+    (sd,) = priors.parameter_coordinates(robot, ["motor.inductance"]).prior_sd
+    assert sd == pytest.approx(float(robot.motor.inductance), rel=1e-6)
+    stated = bench(tmp_path, lambda text: text.replace("[gearbox]", 'inductance = "1e-3 ± 10 %"\n[gearbox]'))
+    assert priors.parameter_coordinates(stated, ["motor.inductance"]).prior_sd == pytest.approx([1e-4])
 
 
 @pytest.mark.slow

@@ -30,7 +30,7 @@ from calibration.inference.fit_notes import Remark, Shown, next_step
 from calibration.inference.lack_of_fit import Adequacy
 from calibration.inference.residual_clusters import LevelMean, ResidualCluster
 from calibration.inference.series_noise import SeriesNoise
-from calibration.words import fit_words, loop_words, step_words, table_words
+from calibration.words import experiment_words, fit_words, loop_words, step_words, table_words
 from calibration.words.note_words import NOTES
 from mmrjax.model import channels
 from sweeps import console
@@ -320,7 +320,8 @@ def made_in_code():
 
 def test_each_remark_of_the_code_has_a_sample_and_a_sentence_with_its_values():
     made = list(made_in_code())
-    assert {code for code, _ in made} == set(NOTES) == {note.code for note in SAMPLES}
+    of_experiments = {*experiment_words.SAID}  # of which test_words_experiments has samples
+    assert {code for code, _ in made} == set(NOTES) == {note.code for note in SAMPLES} | of_experiments
     for code, names in made:
         if isinstance(NOTES[code], str):
             assert names >= {field for _, field, _, _ in string.Formatter().parse(NOTES[code]) if field}, code

@@ -11,7 +11,7 @@ from calibration.data import Names
 from calibration.data.input_errors import BadData
 from mmrjax.model import channels, quantities
 from mmrjax.model.channels import Channel
-from mmrjax.model.quantities import BY_COLUMN, GROUND, RPM, SHAFT, VEHICLE, Condition, Quantity
+from mmrjax.model.quantities import BY_COLUMN, GOALS, GROUND, RPM, SHAFT, VEHICLE, Condition, Quantity
 
 if TYPE_CHECKING:
     from mmrjax.model.rig import Instrument
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 #: Column of each imposed quantity (`rig.IMPOSED`), and the SI value of its unit.
 SUPPLY, SPEED, CURRENT = "supply_voltage_V", "motor_speed_rpm", "motor_current_A"
 IMPOSED = {"voltage": (SUPPLY, 1.0), "motor_speed": (SPEED, RPM), "motor_current": (CURRENT, 1.0)}
+IMPOSED |= {c.name: (c.column, c.factor) for c in quantities.SET if c.name in GOALS}
 #: Rows of all runs of a log from which on readings of fewer are used (`thinning`).
 ROWS = 4000
 
@@ -113,6 +114,7 @@ class Layout:
         instruments: properties of instruments that are known.
         mapped: (column as this program calls it, column of the file, factor from its unit).
         channels: of its readings, in the order of arrays.
+        supply: voltage of a controller's driver in tables without its column [V]. 0: tables have it.
     """
 
     imposed: str = "voltage"
@@ -123,6 +125,7 @@ class Layout:
     instruments: tuple[Instrument, ...] = ()
     mapped: tuple[tuple[str, str, float], ...] = ()
     channels: tuple[Channel, ...] = dataclasses.field(default_factory=channels.usual_channels)
+    supply: float = 0.0
 
     @classmethod
     def of(cls, robot: Robot | None) -> Layout:
@@ -133,9 +136,9 @@ class Layout:
         loads = robot.configurations.members
         weight = any(float(x) != 0 for load in loads for x in (load.torque_constant, load.torque_gravity))
         names = robot.configurations.names
-        return cls(
-            rig.imposed, robot.has_ground, weight, rig.inherits, names, rig.instruments, rig.columns, robot.channels
-        )
+        supply = 0.0 if robot.controller is None else robot.controller.supply_voltage
+        stated = rig.imposed, robot.has_ground, weight, rig.inherits, names, rig.instruments, rig.columns
+        return cls(*stated, robot.channels, supply)
 
     @property
     def table8(self) -> bool:
@@ -194,7 +197,7 @@ class Layout:
     def known(self) -> Names:
         """Every column with a meaning."""
         read = (SUPPLY, *self.measured_columns, *self.deviation_columns)
-        labels = [word for word in WORDS if word != "mode" or self.imposed == "voltage"]
+        labels = [word for word in WORDS if word != "mode" or self.imposed in ("voltage", *GOALS)]
         set_ = [c.column for c in quantities.SET if c.in_tables and self.imposed in (c.imposed or IMPOSED)]
         every = ("configuration", *self.axes, *read, *labels, "time_s", *self.sides, *set_)
         return tuple(dict.fromkeys(c for c in every if c not in self.idle))
@@ -204,7 +207,8 @@ class Layout:
         if self.complete:
             own = (() if measured else ("total_mass_kg",)) + ((SUPPLY,) if battery else ())
             return tuple(c for c in ("configuration", *CONDITIONS) if c not in own)
-        imposed = () if battery and self.imposed == "voltage" else (self.imposed_column,)
+        imposed: Names = () if battery and self.imposed == "voltage" else (self.imposed_column,)
+        imposed += (SUPPLY,) if self.imposed in GOALS and not self.supply else ()
         return (("configuration",) if len(self.configurations) != 1 else ()) + imposed
 
     def quantities(self) -> dict[str, Quantity]:

@@ -23,7 +23,19 @@ from mmrjax.model.track_friction import Track
 MOVERS = {"tracks": 1.0, "wheels": 0.0}
 #: Names that a configuration cannot have: the other keys of a robot file.
 TAKEN = (
-    *("schema", "base", "sides", "configurations", "battery", "motor", "gearbox", "running_gear", "driver", "rig"),
+    *(
+        "schema",
+        "base",
+        "sides",
+        "configurations",
+        "battery",
+        "motor",
+        "gearbox",
+        "running_gear",
+        "driver",
+        "rig",
+        "controller",
+    ),
     *("effects", *rig_file.KEYS),
 )
 _KINDS = ("load", "like", "movers")

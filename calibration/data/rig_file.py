@@ -299,9 +299,10 @@ def needed_parameters(rig: Rig, values: Iterable[tuple[str, Any]] = ()) -> Names
     """
     turns = any(name.endswith(WIDTH) and is_number(value) and value > 0 for name, value in values)
     current = {"total_current", "motor_current", "winding_temperature"} & {*rig.channels, rig.imposed}
-    voltage = rig.imposed == "voltage" or "motor_voltage" in rig.channels
+    voltage = rig.shows_voltage
     hot = "winding_temperature" in rig.channels
     conditions: tuple[tuple[str, Any], ...] = (
+        ("controller.kp", rig.follows_goal),
         ("gearbox.ratio", True),
         ("gearbox.efficiency_load", True),
         ("motor.torque_constant", current or voltage),
@@ -366,7 +367,7 @@ def moved_priors(robot: Robot, values: Mapping[str, float]) -> Robot:
 def rig_lines(rig: Rig) -> tuple[list[str], dict[str, list[str]]]:
     """Lines of a robot file that state a rig: those of its head, then those of each table."""
     head = [
-        f'imposed = "{rig.imposed}"  # on the drives: voltage, motor_speed or motor_current',
+        f'imposed = "{rig.imposed}"  # on the drives: {", ".join(IMPOSED)}',
         f"channels = {toml_value(list(rig.channels))}  # what its instruments show",
         f'start = "{rig.start}"  # of histories: rest, measured or free',
         f'between_rows = "{rig.between_rows}"  # what is imposed, in histories: held or linear',

@@ -23,7 +23,9 @@ from mmrjax.effects import Effect
 from mmrjax.effects.scaled import scaled_effect
 from mmrjax.errors import list_some, printable
 from mmrjax.model import paper_robots, params, power
+from mmrjax.model.controller import Controller
 from mmrjax.model.driver import DECAYS
+from mmrjax.model.quantities import GOALS
 from mmrjax.model.robot import Configurations, Robot
 from mmrjax.model.shaft import Shaft
 
@@ -49,6 +51,7 @@ RATINGS = {
     "battery.delay_cutoff": (0.0, 1e3, "s", "how long a cell may be below it, since a start draws more; assumed"),
     "battery.current_limit": (1e-3, 1e4, "A", "largest current that a cell may give; not stated: none"),
     "battery.current_charge": (0.0, 1e4, "A", "largest current that a cell may take; not stated: none"),
+    "controller.supply_voltage": (0.0, 1000.0, "V", "supply of the driver, for tables without its column; 0: none"),
     "battery.capacity_curve": (1.0, 1e6, "C", "capacity of the cell whose curvature and slope are stated"),
 }
 #: The parabola of a cell's no-load voltage; together with a capacity, it applies to a cell of this capacity.
@@ -205,9 +208,19 @@ def _without_parameters(
     sds = stated.taken_apart(tables, where)
     loads = loads_from_tables(base, content, sds, where)
     rig = rig_file.parse_rig(content, where, list(loads.by_name), travels=loads.travels, inherits=base is not None)
+    if "controller" in content and not rig.follows_goal:
+        raise BadConfiguration(
+            f"{where}, controller: got it with imposed = {toml_value(rig.imposed)}; a controller needs an imposed "
+            f"goal: {', '.join(GOALS)}"
+        )
+    controller = Controller() if rig.follows_goal else None
     if base is not None:
-        return dataclasses.replace(base, configurations=Configurations(loads.by_name), rig=rig), sds, loads.linear
+        robot = dataclasses.replace(
+            base, configurations=Configurations(loads.by_name), rig=rig, controller=controller
+        )
+        return robot, sds, loads.linear
     robot = paper_robots.blank_robot(Configurations(loads.by_name), rig=rig)
+    robot = dataclasses.replace(robot, controller=controller)
     robot = params.replace(robot, {name: jnp.asarray(value) for name, (value, _) in rig_file.DEFAULTS.items()})
     given = dict(_flatten(content))
     parameters = {p.name: p for p in params.walk_parameters(robot)}
@@ -500,7 +513,7 @@ def _lines_of_ratings(robot: Robot, nothing: Robot, stated: set[str]) -> Iterato
 
     def value(owner: Robot, name: str) -> Any:
         part, _, key = name.partition(".")
-        return getattr(getattr(owner, part), key)
+        return getattr(getattr(owner, part), key, None)
 
     for name, (_, _, unit, what) in RATINGS.items():
         part, _, key = name.partition(".")

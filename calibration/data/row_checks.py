@@ -160,7 +160,7 @@ def _fill(name: str, columns: Columns, rows: int, layout: Layout) -> None:
         columns["configuration"] = np.full(rows, configuration)
     if layout.imposed_column == SPEED and set(SPEEDS) <= set(columns):
         columns[SPEED] = np.mean([columns[c] for c in SPEEDS], 0)
-    for column, value in DEFAULTS.items():
+    for column, value in {**DEFAULTS, SUPPLY: layout.supply}.items():
         columns.setdefault(column, np.full(rows, value))
 
 
@@ -195,18 +195,33 @@ def _check_sides(name: str, columns: Columns, layout: Layout) -> None:
 
 
 def _check_held(name: str, columns: Columns) -> None:
-    """Refuses a clamp in a log, and a load torque beside it: what the clamp carries is a reading."""
+    """Refuses a load torque in rows of a clamp: what it carries is a reading."""
     held = columns.get("held", np.zeros(1)) > 0.5
-    if held.any() and set(TIME) <= set(columns):
-        raise BadData(
-            f"{name}: column held is for settled rows; expected no time_s, held = 1 in every row of a log, or a file "
-            "of its own for rows of a clamp"
-        )
     for at in np.flatnonzero(held & (columns.get(LOAD, 0.0) != 0))[:1]:
         raise BadData(
             f"{name} row {at + 1}, {LOAD}: got {bound_text(columns[LOAD][at])} where held is 1; expected 0, as the "
             "torque that a clamp carries is a reading: name its column output_torque"
         )
+
+
+def without_clamped(name: str, columns: Columns, kept: np.ndarray) -> tuple[Columns, np.ndarray, Names]:
+    """Returns the kept rows of a log without those of a clamp, True for these rows, and a sentence on the others.
+
+    Each stretch between two clamps becomes a run, as the motors start again. Settled rows keep theirs.
+    """
+    note: Names = ()
+    if "held" in columns and set(TIME) <= set(columns) and (held := columns.pop("held") > 0.5).any():
+        if held.all():
+            raise BadData(
+                f"{name}: held is 1 in each row of a log too fast for settled rows; expected slower or free rows"
+            )
+        runs = columns.get("run_id", np.zeros(len(held), str))
+        stretch = np.cumsum(np.append(0, np.diff(held.astype(int)) < 0)).astype(str)
+        columns["run_id"] = np.char.add(runs, np.char.add(np.where(runs == "", "stretch ", ", stretch "), stretch))
+        kept &= ~held
+        left_out = f"{name}: a clamp holds the output in {held.sum()} of {len(held)} rows of a log; they are left out"
+        note = (f"{left_out}, and each stretch between them is a run; in a file of their own they are settled rows",)
+    return {c: values[kept] for c, values in columns.items()}, kept, note
 
 
 def _check_mass(name: str, columns: Columns) -> None:

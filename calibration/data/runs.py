@@ -158,9 +158,9 @@ def of_arrays(
         columns, settled = row_checks.settled_points(name, columns, layout, robot)
     notes = (*arrays.notes, *settled, *sides.of_volts(name, columns, battery))
     kept, copied = row_checks.without_copies(name, columns)
-    columns = columns if kept.all() else {c: values[kept] for c, values in columns.items()}
+    columns, kept, clamped = row_checks.without_clamped(name, columns, kept)
     if measured:
-        notes = (*notes, *copied, *_without_repeats(name, columns, layout))
+        notes = (*notes, *copied, *clamped, *_without_repeats(name, columns, layout))
     layout, unsigned = _with_instruments(columns, layout, measured)
     row_checks.complete_columns(name, columns, int(kept.sum()), layout)
     if battery and layout.imposed == "voltage":

@@ -274,8 +274,11 @@ class Runs:
             raise BadData(f"{self.source}: no {column}, which the robot's file states as imposed; give it in a table")
         stated = {c.field: self[c.column] for c in quantities.SET if c.in_tables and c.field and self.has(c.column)}
         stated["duty"] = np.where(held, 0.0, stated.get("duty", 1.0))
-        stated["voltage"] = np.zeros(len(self)) if battery or imposed else self[SUPPLY]
-        if imposed:
+        follows = imposed and not robot.rig.follows_goal
+        stated["voltage"] = np.zeros(len(self)) if battery or follows else self[SUPPLY]
+        if robot.rig.follows_goal:
+            stated["goal"] = self[column] * factor
+        elif imposed:
             stated[robot.rig.imposed] = self[column] * factor
             for side, name in zip(channels.SIDES, self.layout.sides, strict=False):
                 if self.has(name):

@@ -16,7 +16,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from calibration.data import own_mass
+from calibration.data import Names, own_mass
 from calibration.data.columns import ROWS, SIDES, WHEN
 from calibration.data.effect_file import Library
 from calibration.data.input_errors import BadConfiguration, BadData
@@ -32,7 +32,7 @@ from calibration.discovery.classes import Classes, find_classes, signature_cosin
 from calibration.discovery.description import missed_channels, remaining_errors, unused_inputs
 from calibration.discovery.discrepancy import CurveBeside, Discrepancy, locate_discrepancy
 from calibration.discovery.experiments import Proposal, propose_denser_runs, propose_nothing, propose_separating
-from calibration.discovery.hidden import find_hidden_effects
+from calibration.discovery.hidden import Hidden, find_hidden_effects
 from calibration.discovery.kept import Keep
 from calibration.discovery.location import DiscrepancyLocation, varied_by_duty
 from calibration.discovery.loop_notes import FreedValue, Mechanism, Missed, Missing, NameSupport, NameTest, Summary
@@ -52,7 +52,6 @@ from calibration.discovery.result import (
     Errors,
     FoundEffect,
     HeldOutAlternative,
-    HiddenEffect,
     Ranking,
     ReadingsOfRows,
     Sensitivity,
@@ -72,6 +71,7 @@ from calibration.inference.fit_notes import Notes, Remark, next_step, with_codes
 from calibration.inference.fit_posterior import undetermined_names
 from calibration.inference.lack_of_fit import Residuals
 from calibration.inference.linearization import Linearization
+from calibration.inference.lost_motion import lost_motion_notes
 from calibration.inference.noise import Noise
 from calibration.inference.noise_factor import common_factors, noise_remarks
 from calibration.inference.residual_clusters import residual_clusters
@@ -440,7 +440,7 @@ def trace(
         screened, left, searched = _search_until_clean(task, screened, sds, ranked)
         if searched is None:
             missed = missed_channels(screened.base.space, runs, sds.noise, left.linear)
-            word = "undescribed" if missed else "none"
+            word = "undescribed" if missed or task.loses_motion else "none"
             return LoopStages(word, screened, left, sds, missed=missed, unused=unused_inputs(runs))
         return _verdict(task, screened, left, sds, searched)
 
@@ -472,6 +472,11 @@ class _Task:
     compiling: _Compiling | None
     keep: Keep
 
+    @property
+    def loses_motion(self) -> bool:
+        """True if the log shows a backlash that the robot does not have."""
+        return bool(lost_motion_notes(self.runs, self.robot))
+
     def screen(self, noise: Noise, before: BaseFit | None, ranked: list[Ranking]) -> Screening:
         """The base fit with this noise, from one with another if given, and its outliers. See `windows`."""
         space = pose_candidates(self.runs, self.robot, noise.sd, self.settings, self.stated, self.library)
@@ -497,7 +502,8 @@ class _Task:
             return space, None
         make = functools.partial(findings.rank_by_weak_form, space, ranking, self.settings)
         ranked.append(self.keep("ranking", make))
-        return space.with_room(ranking.room), ranking.base
+        begins = {c.active: c.z for c in [c for c in ranking.alone if c.plausible][:1]}
+        return dataclasses.replace(space.with_room(ranking.room), begins=begins), ranking.base
 
 
 def _fit_base_and_noise(task: _Task, ranked: list[Ranking]) -> tuple[Screening, Sds]:
@@ -537,15 +543,15 @@ def _search_effects(task: _Task, screened: Screening, left: Diagnosis) -> tuple[
 def _search_until_clean(
     task: _Task, screened: Screening, sds: Sds, ranked: list[Ranking]
 ) -> tuple[Screening, Diagnosis, Search | None]:
-    """Search, repeated while it leaves outliers, None if the base leaves no discrepancy."""
+    """Search, repeated while it leaves outliers, None if the base leaves no discrepancy or lacks a backlash."""
     settings, keep, progress = task.settings, task.keep, task.progress
     for k in range(SCREENINGS):
         progress(next_step("bootstrap", settings.replicates))
         screened, left = keep(f"bootstrap {k}", functools.partial(_test_base, task, sds, screened))
         if k == 0 and not ranked:
             keep("ranking", functools.partial(findings.rank_library, screened.base.space, left, settings))
-        if not left.test.rejected and screened.cluster is None:
-            return screened, left, None
+        if task.loses_motion or (not left.test.rejected and screened.cluster is None):
+            return screened, left, None  # effects of the library would only stand in for a backlash
         progress(next_step("effects"))
         screened, left, searched = keep(f"search {k}", functools.partial(_search_effects, task, screened, left))
         after = searched.diagnosis
@@ -937,7 +943,7 @@ def _predicts_well(traced: LoopStages, written: _FitOfVerdict, gain: prediction.
 
 def _claims(
     traced: LoopStages, settings: Settings
-) -> tuple[tuple[FoundEffect, ...], DiscrepancyLocation | None, tuple[HiddenEffect, ...]]:
+) -> tuple[tuple[FoundEffect, ...], DiscrepancyLocation | None, tuple[Hidden, ...]]:
     """Effects that a verdict names, location of the remaining discrepancy, and effects that they may conceal."""
     screened, left, alike = traced.screened, traced.left, traced.alike
     space, base, best = screened.base.space, screened.base.candidate, traced.best
@@ -947,9 +953,7 @@ def _claims(
     if traced.verdict in WITHOUT_NAME:
         return found_effects, None, ()
     ask = space.bare.observe.menu and not space.bare.observe.long
-    concealed = findings.hidden_effects(
-        space, find_hidden_effects(space, best, alike, left, traced.ends, settings, ask=ask)
-    )
+    concealed = find_hidden_effects(space, best, alike, left, traced.ends, settings, ask=ask)
     return found_effects, traced.where, concealed
 
 
@@ -983,12 +987,12 @@ def assemble_result(
     nameless = traced.verdict in WITHOUT_NAME
     if traced.alike is not None and not nameless and not compared and not space.bare.observe.long:
         compared = preference.compare_alternatives(space, runs, best, traced.alike)
-    gain = _gain(space, runs, readings_of_rows)
-    keeps_fit = _predicts_well(traced, fit_to_write, gain)
+    gains = _gains(space, runs, traced, readings_of_rows)
+    keeps_fit = _predicts_well(traced, fit_to_write, gains[-1][1] if gains else None)
     fit_to_write = fit_to_write.or_refit(traced, keeps_fit)
     progress(next_step("next"))
     remaining = _residuals(space, runs, fit_to_write.ends.linear, readings_of_rows.after, fit_to_write.z)
-    result_input = _ResultInput(traced, fit_to_write, readings_of_rows, compared, gain, keeps_fit, remaining)
+    result_input = _ResultInput(traced, fit_to_write, readings_of_rows, compared, gains, keeps_fit, remaining)
     result = _result(result_input, runs, numbers, settings, library)
     # A temporary change is not uniform.
     of_noise = noise_remarks_before_verdict(traced.sds, remaining) if traced.sds.factors or not traced.events else ()
@@ -1005,7 +1009,7 @@ class _ResultInput:
         seen: readings of each row.
         compared: alternatives by hold-out errors.
         remaining: residuals of the fit.
-        gain: of the fit's predictions over the refit's.
+        gains: of predictions over the refit's, as from `_gains`.
         kept: True if the fit is written.
     """
 
@@ -1013,7 +1017,7 @@ class _ResultInput:
     written: _FitOfVerdict
     seen: ReadingsOfRows
     compared: tuple[HeldOutAlternative, ...]
-    gain: prediction.Gain | None
+    gains: tuple[tuple[Names, prediction.Gain], ...]
     kept: bool
     remaining: Residuals
 
@@ -1056,7 +1060,7 @@ def _result(
         summary=summary,
         robot=written.robot,
         refit=findings.proposed_robot(space, base),
-        gain=about.gain,
+        gains=about.gains,
         written=about.kept,
         converged=written.converged,
         posterior=written.posterior,
@@ -1068,7 +1072,7 @@ def _result(
         effects=found,
         unnamed=_unnamed(about, len(runs)),
         remains=remains,
-        next_experiment=findings.next_experiment(_proposal(space, traced, settings)),
+        next_experiment=_proposal(space, traced, settings),
         cannot_see=findings.invisible_effects(space, left.scores, settings),
         needs_histories=tuple(sorted(name for name, e in library.items() if e.transient and not kind.shows(e))),
         needs_reverse=tuple(
@@ -1148,18 +1152,24 @@ def noise_remarks_before_verdict(sds: Sds, remaining: Residuals) -> tuple[Remark
     return off
 
 
-def _gain(space: CandidateSpace, runs: Runs, seen: ReadingsOfRows) -> prediction.Gain | None:
-    """Gain of the proposal's predictions over the refit's, None if no block can be held out."""
+def _gains(
+    space: CandidateSpace, runs: Runs, traced: LoopStages, seen: ReadingsOfRows
+) -> tuple[tuple[Names, prediction.Gain], ...]:
+    """Gains of the predictions of sets of effects over the refit's, by the number of effects, the proposal's last.
+
+    Empty if no block can be held out.
+    """
     if not seen.held_out:
-        return None
+        return ()
     counts, kinds = space.weight[: len(runs)] > 0, blocks_room.predictable_blocks(runs, space.bare)
-    before, after = (
-        prediction.score_readings(
-            {k: x[when] for k, x in seen.held_out.items()}, seen.measured, seen.sd, counts, kinds
-        )
-        for when in (0, 1)
+    refit, proposal = ({k: x[when] for k, x in seen.held_out.items()} for when in (0, 1))
+    by_set = {tuple(filter(None, active)): reading for (active, _), reading in traced.predicted.items()}
+    sets = sorted((names for names in by_set if names and names != traced.best.effects), key=len)
+    scored = [*((names, by_set[names]) for names in sets), (traced.best.effects, proposal)]
+    score = functools.partial(
+        prediction.score_readings, measured=seen.measured, sd=seen.sd, counts=counts, kinds=kinds
     )
-    return after.gain(before)
+    return tuple((names, score(reading).gain(score(refit))) for names, reading in scored)
 
 
 def residuals_of(screened: Screening, runs: Runs) -> Residuals:

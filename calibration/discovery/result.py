@@ -8,16 +8,17 @@ from typing import Any
 
 import numpy as np
 
+from calibration.data import Names, robot_file
 from calibration.data import posterior_file as posterior
-from calibration.data import robot_file
 from calibration.data.columns import DRIVING
 from calibration.data.posterior_file import Posterior
 from calibration.data.runs import WHEN, Runs
 from calibration.data.writing import json_value, write_json, write_table
 from calibration.described import describe, sentences
 from calibration.discovery.clusters import Cluster
+from calibration.discovery.experiments import Proposal
 from calibration.discovery.headline import headline
-from calibration.discovery.instructions import Instruction
+from calibration.discovery.hidden import Hidden
 from calibration.discovery.kept import REFIT_FILE
 from calibration.discovery.location import DiscrepancyLocation
 from calibration.discovery.loop_notes import Asked, Headline, Mechanism, NameSupport, RuledOut, Summary
@@ -169,25 +170,6 @@ class UnnamedDiscrepancy(DiscrepancyLocation):
 
 
 @dataclasses.dataclass(frozen=True)
-class HiddenEffect:
-    """An effect that the effects found could hide.
-
-    Attributes:
-        amplitude: the largest possible one in `unit`.
-        sigmas: its change of the readings without them [σ].
-        experiment: that would show it.
-        separation: expected of it [σ]. "" and 0 for none.
-    """
-
-    name: str
-    amplitude: float
-    unit: str
-    sigmas: float
-    experiment: str
-    separation: float
-
-
-@dataclasses.dataclass(frozen=True)
 class Alternative:
     """Effects that were fitted and are not proposed.
 
@@ -218,6 +200,7 @@ class BaseShift:
 
     Attributes:
         held_by_prior: True if it is after, see `identifiability.held_by_prior`.
+        at_bound: bound that it reached after, `lower`, `upper` or None.
     """
 
     prior: float
@@ -229,6 +212,7 @@ class BaseShift:
     shift_before: float
     shift_after: float
     held_by_prior: bool
+    at_bound: str | None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -274,6 +258,7 @@ class Ranking:
         chance: critical score of the strongest effect [σ²].
         effects: the strongest first, then those that would supply power.
         windows: number of equations of the log in weak form, 0 for a ranking by signatures along the base fit.
+        parameters: base parameters next to the first effect, each with its sd [SI].
     """
 
     missing: bool
@@ -281,6 +266,7 @@ class Ranking:
     chance: float
     effects: tuple[Ranked, ...]
     windows: int = 0
+    parameters: dict[str, tuple[float, float]] = dataclasses.field(default_factory=dict)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -300,36 +286,6 @@ class Evidence:
     kinds: dict[str, KindOfEvidence]
     p_value: float
     adequate: bool
-
-
-@dataclasses.dataclass(frozen=True)
-class RankedExperiment:
-    """An experiment of the menu: separations [σ], and probabilities that the false one of two is refuted."""
-
-    name: str
-    smallest_sigma: float
-    separates: tuple[str, ...]
-    chance_worst: float
-    chance_mean: float
-
-
-@dataclasses.dataclass(frozen=True)
-class NextExperiment:
-    """The next experiment, with the whole menu. See `experiments.Proposal`."""
-
-    JSON = ("name", "experiments", "description", "separates", "expected_sigma", "settles", "menu")
-    name: str
-    experiments: tuple[str, ...]
-    instruction: Instruction
-    separates: tuple[str, ...]
-    expected_sigma: float
-    settles: bool
-    menu: tuple[RankedExperiment, ...]
-
-    @property
-    def description(self) -> str:
-        """What to do and what to read."""
-        return describe(self.instruction)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -484,7 +440,8 @@ class DiscoveryResult:
         robot: as written.
         refit: with nothing added.
         written: True if the robot has the proposal.
-        gain: hold-out gain of the proposal over the refit, None if no block can be held out.
+        gains: sets of effects, by their number, with their hold-out gain over the refit. The last one is the
+            proposal. Empty if no block can be held out.
         converged: True if the fit of that robot is an optimum.
         posterior: of all fitted parameters.
         runs: the table.
@@ -529,7 +486,7 @@ class DiscoveryResult:
     summary: Summary
     robot: Robot
     refit: Robot
-    gain: Gain | None
+    gains: tuple[tuple[Names, Gain], ...]
     written: bool
     converged: bool
     posterior: Posterior
@@ -541,13 +498,13 @@ class DiscoveryResult:
     effects: tuple[FoundEffect, ...]
     unnamed: UnnamedDiscrepancy | None
     remains: DiscrepancyLocation | None
-    next_experiment: NextExperiment | None
+    next_experiment: Proposal | None
     cannot_see: tuple[str, ...]
     needs_histories: tuple[str, ...]
     needs_reverse: tuple[str, ...]
     alternatives: tuple[Alternative, ...]
     implausible: tuple[Alternative, ...]
-    hidden: tuple[HiddenEffect, ...]
+    hidden: tuple[Hidden, ...]
     support: NameSupport | None
     cluster: Cluster | None
     residual_clusters: tuple[ResidualCluster, ...]
@@ -588,6 +545,11 @@ class DiscoveryResult:
     def headline(self) -> Headline:
         """Claim that holds at every noise factor tried."""
         return headline(self.summary, [(s.factor, s.summary) for s in self.sensitivity])
+
+    @property
+    def gain(self) -> Gain | None:
+        """Hold-out gain of the proposal over the refit, None if no block can be held out."""
+        return self.gains[-1][1] if self.gains else None
 
     @property
     def refit_alone(self) -> bool:
@@ -662,6 +624,7 @@ class DiscoveryResult:
         return json_value(
             {
                 "schema": SCHEMA,
+                "statement": self.statement,
                 "verdict": self.verdict,
                 "mechanism": None
                 if self.summary.mechanism is None
@@ -671,7 +634,6 @@ class DiscoveryResult:
                     **{name: getattr(self.headline, name) for name in ("level", "claims", "factors", "shared")},
                     "statement": self.statement,
                 },
-                "statement": self.statement,
                 "verdict_statement": self.verdict_statement,
                 "rows": len(self.runs),
                 "rows_used": int(self.included.sum()),
@@ -695,6 +657,7 @@ class DiscoveryResult:
                 "prediction": {
                     "gain": None if self.gain is None else self.gain.mean,
                     "se": None if self.gain is None else self.gain.se,
+                    "sets": [{"effects": names, "gain": g.mean, "se": g.se} for names, g in self.gains],
                     "unit": "nat a reading",
                     "written": "found" if self.written else "refit",
                 },

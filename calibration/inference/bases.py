@@ -120,8 +120,9 @@ def balance_of(place: str) -> str:
 
 
 def place_in_words(place: str) -> str:
-    """Name of a place in words: `slip balance`, `reading of motor speed`."""
-    return f"reading of {place}".replace("_", " ") if is_channel_place(place) else f"{place} balance"
+    """Name of a place in words: `slip balance`, `reading of motor speed`. Benches too have an output shaft."""
+    words = "output shaft" if place == "track" else place
+    return f"reading of {place}".replace("_", " ") if is_channel_place(place) else f"{words} balance"
 
 
 def place_signature(linear: Linearization, place: str, shapes: np.ndarray) -> np.ndarray:

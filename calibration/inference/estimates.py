@@ -38,7 +38,8 @@ from mmrjax.model.robot import Robot
 #: Least change of the readings by one prior sd of a parameter, in data sds, for the data to determine it at all.
 SENSITIVE = 1e-6
 
-_SIDE = {-1: "lower", 0: None, 1: "upper"}
+#: Bound that a coordinate reached, by its side.
+SIDE_OF_BOUND = {-1: "lower", 0: None, 1: "upper"}
 
 
 def parameter_estimates(
@@ -98,7 +99,7 @@ def parameter_estimates(
             shift=float(z[k]),
             variance_ratio=float(about.sd[k] ** 2),
             held_by_prior=bool(about.held_by_prior[k]),
-            at_bound=_SIDE[int(bound[k])],
+            at_bound=SIDE_OF_BOUND[int(bound[k])],
             measured_by_data=bool(about.sensitivity[k] > SENSITIVE),
             profile=None if profile is None else ProfileCurve(profile.value[k], profile.rise[k]),
             with_steady=None

@@ -61,10 +61,15 @@ SURFACE = {
 #: Priors of each of several surfaces of one robot, which differ in their rolling resistance too.
 SURFACE_OF_RIGS = {**SURFACE, "ground.rolling_resistance": 1.0}
 
-#: Friction without a tolerance in a rig's file, by the end of its name, and its relative sd: rigs agree within a
-#: factor of two or three. The fields' own are those of Tables 2 to 4.
-FRICTION_OF_RIGS = (".friction_coulomb", ".friction_viscous", ".loss_coulomb", ".loss_viscous", ".rolling_resistance")
-RELATIVE_OF_RIGS = 0.5
+#: Relative sds of parameters without a tolerance in a rig's file, by the ends of their names. Frictions of rigs agree
+#: within a factor of two or three, windings without a stated inductance within five. The fields' own are those of
+#: Tables 1 to 4.
+RELATIVE_OF_RIGS = {
+    **dict.fromkeys(
+        (".friction_coulomb", ".friction_viscous", ".loss_coulomb", ".loss_viscous", ".rolling_resistance"), 0.5
+    ),
+    ".inductance": 1.0,
+}  # fmt: skip
 
 DELAY = "rig.delay"
 
@@ -472,7 +477,7 @@ def parameter_coordinates(
     of_surfaces = {n: SURFACE_OF_RIGS.get(n.split(".", 1)[-1]) for n in names if n.split(".")[0] in apart}
     wide |= {n: share for n, share in of_surfaces.items() if share is not None}
     if not robot.rig.inherits:
-        wide = {n: RELATIVE_OF_RIGS for n in names if n.endswith(FRICTION_OF_RIGS)} | wide
+        wide = {n: sd for n in names for end, sd in RELATIVE_OF_RIGS.items() if n.endswith(end)} | wide
     known_sds = {n: (float(fields[n].value), float(fields[n].value) * share) for n, share in wide.items()}
     known_sds |= {n: (mean, sd) for n, mean, sd in robot.rig.priors if n in names} | stated
     rows = [_coordinate_of_parameter(fields[name], known_sds.get(name)) for name in names]

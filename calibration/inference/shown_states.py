@@ -50,6 +50,7 @@ class Lacking(StrEnum):
     SIGN = "sign"  # an instrument shows only a magnitude
     SLACK = "slack"  # backlash: motor and load move apart
     TURN = "turn"  # of a robot that turns
+    GOAL = "goal"  # a controller gives the voltage
     FOLLOWER = "follower"  # a speed is imposed, and no channel follows it
 
 
@@ -95,6 +96,8 @@ def plan_or_lacking(problem: Problem) -> Plan | Lacking:
     channels_read = {k: c for k, c in enumerate(problem.channels) if counts[k]}
     if robot.rig.turns:
         return Lacking.TURN
+    if robot.rig.follows_goal:
+        return Lacking.GOAL
     if robot.loose:
         return Lacking.SLACK
     if {c.name for c in channels_read.values()} & robot.rig.magnitudes:

@@ -15,7 +15,7 @@ from calibration.described import describe
 from calibration.discovery import loop_notes
 from calibration.discovery.clusters import Cluster
 from calibration.discovery.location import DiscrepancyLocation
-from calibration.discovery.settings import FIT, HELD_OUT, WITHOUT_NAME
+from calibration.discovery.settings import FIT, HELD_OUT, WITHOUT_NAME, Settings
 from calibration.inference import bases, blocks
 from calibration.inference.series_noise import SeriesNoise
 from mmrjax import effects
@@ -105,20 +105,22 @@ def loop_answer(found: loop_notes.Headline) -> str:
     """
     *first, last = [f"{f:g}" for f in found.factors]
     at = f" at {', '.join(first)} and {last} times the noise" if first else ""
-    claims = " and ".join(
-        _claim(c[: n or len(c)], c[n:] if n else ()) for c, n in zip(found.claims, found.shared, strict=False)
+    claims = [c[: n or len(c)] for c, n in zip(found.claims, found.shared, strict=False)]
+    lacks = _are_missing([" or ".join(map(with_article, sure)) for sure in claims] or ["something"])
+    laws = [_law(*law) for law in zip(found.claims, found.families, found.values, strict=False)]
+    apart = "".join(
+        f" At some of these it may be {' or '.join(map(with_article, c[n:]))} instead."
+        for c, n in zip(found.claims, found.shared, strict=False)
+        if n and c[n:]
     )
-    laws = " and ".join(
-        _law(*law) for law in zip(found.claims, found.families, found.values, strict=False)
-    )  # fmt: skip
     return {
         "none": f"Yes, as far as these runs can show{at}: the residuals are consistent with noise.",
         "undescribed": f"No verdict{at}: this model does not describe these runs.",
         "open": f"Perhaps. The answers{at} differ: whether anything is missing depends on the noise.",
-        "named": f"No{at}: missing is {laws}.",
-        "class": f"No{at}: missing is {laws}.",
-        "mechanism": f"No{at}: missing is {claims}. Its exact law is not established.",
-        "place": f"No{at}: missing is {claims or 'something'}, and no more is established.",
+        "named": f"No: {_are_missing(laws)}{at}.",
+        "class": f"No: {_are_missing(laws)}{at}.",
+        "mechanism": f"No: {lacks}{at}.{apart} Its exact law is not established.",
+        "place": f"No: {lacks}{at}.{apart} No more is established.",
     }[found.level]
 
 
@@ -134,10 +136,9 @@ def with_article(noun: str) -> str:
     return f"{'an' if noun[:1] in 'aeiou' else 'a'} {noun}"
 
 
-def _claim(sure: Sequence[str], others: Sequence[str]) -> str:
-    """Members of a claim, and what some noises do not tell from them."""
-    apart = f" (not told at each noise from {' or '.join(map(with_article, others))})" if others else ""
-    return f"{' or '.join(map(with_article, sure))}{apart}"
+def _are_missing(nouns: Sequence[str]) -> str:
+    """`a slip is missing`, `a slip and a loss torque are missing`."""
+    return f"{' and '.join(nouns)} {'is' if len(nouns) == 1 else 'are'} missing"
 
 
 def _undescribed(said: loop_notes.Summary) -> str:
@@ -150,6 +151,8 @@ def _undescribed(said: loop_notes.Summary) -> str:
     check = [f"columns that vary and are not used ({', '.join(said.unused)})"] * bool(said.unused)
     check += [f"parameters far from their priors ({', '.join(said.far)})"] * bool(said.far)
     check += ["units, signs and sides of the columns"]
+    if not each:
+        return "This model does not describe these runs: it has no backlash. No effect is named before it has one."
     return (
         f"This model does not describe these runs: refitted, it misses {', '.join(each)}. No effect is named. "
         f"Check first: {'; '.join(check)}."
@@ -273,21 +276,37 @@ def verdict_line(stages: LoopStages) -> str:
     return f"at one noise: {', '.join((stages.verdict, *sure))}"
 
 
-def ranking_lines(found: Ranking, most: int = 5) -> list[str]:
-    """Lines of the ranking by regression: whether an effect is missing, and the strongest effects."""
+def ranking_lines(found: Ranking, most: int = 5, brief: bool = False) -> list[str]:
+    """Lines of the ranking by regression: whether an effect is missing, and the strongest, `brief` by name alone."""
     by = f"by regression on {found.windows} windows of the log" if found.windows else "by regression"
     if not found.missing:
-        return [f"{by}, not yet confirmed: nothing exceeds chance (family-wise p = {found.p_value:.2g})"]
+        return [
+            f"{by}, not yet confirmed: no effect of the library exceeds chance (family-wise p = {found.p_value:.2g})"
+        ]
     first = f"{by}, not yet confirmed: something is missing (family-wise p {p_value(found.p_value)})"
     beyond = [e for e in found.effects if e.score > found.chance and not e.supplies][:most]
     if not beyond:
         return [f"{first}; no effect explains more than chance"]
+    if brief:
+        return [f"{first}; strongest alone: {', '.join(e.name for e in beyond)}"]
     lines = [
         f"  {k}. {e.name}, {with_article(e.family)}: lowers the misfit by {three_digits(e.score)} σ², "
         f"amplitude {e.amplitude:.3g} ± {e.sd:.2g} {e.unit}".rstrip(" -")
         for k, e in enumerate(beyond, 1)
     ]
     return [f"{first}; strongest effects, each added alone:", *lines]
+
+
+def regression_verdict(found: Ranking) -> str:
+    """Answer of a ranking to a loop without a verdict: never more than a mechanism, and the base parameters."""
+    beyond = [e for e in found.effects if e.score > found.chance and not e.supplies]
+    alike = [e for e in beyond if e.score >= beyond[0].score - Settings.alternative]
+    families = " or ".join(dict.fromkeys(with_article(e.family) for e in alike))
+    lacks = f"{families} ({' or '.join(e.name for e in alike)})" if alike else "no effect explains it"
+    lacks = f"something is missing, {lacks}" if found.missing else "nothing exceeds chance"
+    numbers = ", ".join(f"{name} {value:.4g} ± {sd:.2g}" for name, (value, sd) in found.parameters.items())
+    numbers = f"; parameters [SI]: {numbers}" if numbers else ""
+    return f"regression only, not confirmed by simulation: {lacks}{numbers}"
 
 
 def so_far(effects: Sequence[str], families: Sequence[str]) -> str:
@@ -371,6 +390,41 @@ def how_sure(found: DiscoveryResult, effect: FoundEffect) -> str:
             evidence += f"; accuracy of its form ±{100 * test.spread:.0f} % over {over}"
         return f"established{evidence}"
     return f"tentative: it predicts, but {effect_doubts(test)}" if effect_doubts(test) else "tentative"
+
+
+def brief_answer(found: DiscoveryResult, moved: Sequence[str], next_step: str) -> Names:
+    """Lines after the answer: what moved and what was added, errors with their rows, and the next step.
+
+    Args:
+        moved: sentences on parameters far from their stated values.
+    """
+    added = [
+        f"{e.name} {effect_amplitude(e)}" + " (tentative)" * (not is_established(found, e)) for e in found.effects
+    ]
+    changes = f"Moved: {'; '.join(moved)}. " * bool(moved) + f"Added: {', '.join(added)}." * bool(added)
+    stated, fitted = found.errors_as_stated, found.errors[0 if found.refit_alone else 1]
+    errors = [
+        f"{channels.find_channel(c).label} {percent_text(stated[c])} → {percent_text(e)} %"
+        for c, e in fitted.items()
+        if e["rows"]
+    ]
+    reached, total = max((int(e["rows"]) for e in stated.values()), default=0), len(found.runs)
+    aside = f", {len(found.outliers)} set aside as outliers" * bool(found.outliers)
+    few = f" (as stated the model reaches {reached} rows)" * (reached < total)
+    rows = f"{int(found.included.sum())} of {total} rows are used{aside}{few}"
+    return (
+        *filter(None, [changes.rstrip()]),
+        f"rms error as stated → now: {', '.join(errors)}; {rows}.",
+        f"Next: {next_step}",
+    )
+
+
+def percent_text(error: Mapping[str, float | int]) -> str:
+    """The rms error of a channel [%]: a digit after the point, more for a small one, `-` without a row."""
+    percent = float(error["rms_percent"])
+    if not error["rows"]:
+        return "-"
+    return f"{percent:.1f}" if percent == 0 or percent >= 0.095 else f"{percent:.1g}"
 
 
 def use_it(found: DiscoveryResult) -> list[str]:

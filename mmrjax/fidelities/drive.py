@@ -66,14 +66,17 @@ class Trajectory(eqx.Module):
 
 def drive_units(robot: Robot) -> tuple[float, ...]:
     """Units of the unknowns."""
-    return _UNITS + tuple(effect.memory_size or 1.0 for effect in robot.remembering) + (_GAP,) * robot.loose
+    memory = tuple(effect.memory_size or 1.0 for effect in robot.remembering)
+    return _UNITS + memory + (1.0,) * (robot.controller is not None) + (_GAP,) * robot.loose
 
 
 def state_of_unknowns(robot: Robot, y: Float[Array, " unknowns"]) -> State:
     """The state of a vector of unknowns."""
     y = y * jnp.asarray(drive_units(robot), y.dtype)
     memory = {effect.name: y[len(_UNITS) + k] for k, effect in enumerate(robot.remembering)}
-    return State(y[0], y[1], y[2], y[4], memory, distance=y[3], gap=y[-1] if robot.loose else None)
+    integral = None if robot.controller is None else y[len(_UNITS) + len(memory)]
+    gap = y[-1] if robot.loose else None
+    return State(y[0], y[1], y[2], y[4], memory, distance=y[3], gap=gap, integral=integral)
 
 
 #: The signals of an instant, traced once for each kind of robot and shared within a program.
@@ -86,9 +89,8 @@ def drive_rates(
 ) -> Float[Array, " unknowns"]:
     """Rates of the unknowns, in their units [1/s]. `way` as in `balances.moving_signals`, or `HELD`."""
     held = jnp.asarray(False if way is None else way == HELD)
-    signals = moving(
-        robot, conditions, state_of_unknowns(robot, y), None if way is None else jnp.where(held, 0.0, way)
-    )
+    state = state_of_unknowns(robot, y)
+    signals = moving(robot, conditions, state, None if way is None else jnp.where(held, 0.0, way))
     winding = signals.voltage_left / signals.inductance
     shaft, moves = (
         jnp.where(held, 0.0, x)
@@ -104,6 +106,7 @@ def drive_rates(
         signals.speed,
         balances.charge_drawn(robot, conditions, signals.total_current),
         *(jnp.asarray(effect.rate(robot, signals), y.dtype) for effect in robot.remembering),
+        *([] if robot.controller is None else [balances.integrated_error(robot, conditions, state)]),
         *[signals.speed_wheel - signals.speed_output] * robot.loose,
     ]
     return jnp.stack(rates) / jnp.asarray(drive_units(robot), y.dtype)
@@ -145,6 +148,7 @@ def drive_start(robot: Robot, conditions: Conditions, rolling: bool = False) -> 
     settled = operating_signals(robot, conditions)
     memory = [effect.settled(robot, settled) for effect in robot.remembering]
     state = [settled.current, settled.speed_motor, settled.speed, 0.0, conditions.discharge, *memory]
+    state += [jnp.zeros(())] * (robot.controller is not None)
     state += [robot.chassis(conditions.configuration).twist(settled.torque_output)] * robot.loose
     y = jnp.stack([jnp.asarray(x, size.dtype) for x in state]) / size
     return jnp.where(jnp.all(jnp.isfinite(y)), y, rest)
@@ -160,7 +164,9 @@ def _initial(robot: Robot, conditions: Conditions) -> Array:
     begin = robot.rig.begins.of(conditions.begin)
     radius = robot.chassis(conditions.configuration).radius
     turning = begin.motor_speed if conditions.motor_speed is None else conditions.motor_speed
-    rolling = radius * turning / robot.gearbox.ratio
+    rolling, none = radius * turning / robot.gearbox.ratio, jnp.zeros(())
+    still = State(none, turning, rolling, none, distance=radius * begin.angle)
+    conditions = balances.commanded(robot, conditions, still)
     left = voltage_at_rest(robot, conditions)
     if conditions.motor_current is None:  # an amplifier compensates it
         share = jnp.abs(balances.duty_given(robot, conditions)) if robot.driver.decay == FAST else 1.0
@@ -203,7 +209,8 @@ def drive(
         return _turning(robot, conditions, times, tolerance, max_steps, rolling)
     y0 = drive_start(robot, conditions, rolling)
     imposed = conditions.motor_speed is not None
-    parked = jnp.asarray(False) if rolling or imposed else holds(robot, conditions)
+    driven = rolling or imposed or robot.controller is not None  # a controller may turn it later
+    parked = jnp.asarray(False) if driven else holds(robot, conditions)
     moves = jnp.where(parked, jnp.zeros_like(y0).at[jnp.asarray([0, 4])].set(1.0), 1.0)
     ys, went = _integrated(drive_rates, _norm, robot, conditions, moves, y0, times, tolerance, max_steps)
     signals = jax.vmap(lambda y: balances.moving_signals(robot, conditions, state_of_unknowns(robot, y)))(ys)
@@ -211,7 +218,8 @@ def drive(
         static = jax.vmap(lambda y: standing_signals(robot, conditions, state_of_unknowns(robot, y)))(ys)
         signals = jax.tree.map(lambda rest, travel: jnp.where(parked, rest, travel), static, signals)
     end = jax.tree.map(lambda x: x[-1], signals)
-    status = _status(robot, conditions, end, parked, went)
+    last = balances.commanded(robot, conditions, state_of_unknowns(robot, ys[-1]))
+    status = _status(robot, last, end, parked, went)
     return _kept(
         robot,
         conditions,

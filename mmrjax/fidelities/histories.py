@@ -60,7 +60,7 @@ LOOSE, LONGEST = (1e-5, 0.08), 2.5e-3
 #: Most steps of a run at a step of LONGEST; a longer run has longer steps.
 STEPS = 8000
 #: Conditions that drive the current.
-DRIVING = ("voltage", "duty", "open", "motor_current")
+DRIVING = ("voltage", "duty", "open", "motor_current", "goal")
 #: Increase of the current for the slope of its rate, which gives its time constant [10 A].
 MORE = 1e-3
 #: Number of searches for the moment at which a shaft comes to rest, each on a line from the start of the step.

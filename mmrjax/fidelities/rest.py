@@ -124,7 +124,7 @@ def standing_signals(robot: Robot, conditions: Conditions, state: State) -> Sign
         conditions: voltage or current imposed, no speed.
         state: with the current that flows at rest.
     """
-    robot = robot.within(conditions.configuration)
+    robot, conditions = robot.within(conditions.configuration), balances.commanded(robot, conditions, state)
     chassis, gear, still = robot.chassis(conditions.configuration), robot.gearbox, _still(state)
     # About to turn forward and backward: the two limits of friction.
     ends = [balances.settled_signals(robot, conditions, still, way)[0] for way in (1.0, -1.0)]
@@ -211,6 +211,7 @@ def shaft_direction(robot: Robot, conditions: Conditions, state: State) -> Array
     0 if friction holds them only now, so that they are about to leave rest, and their speed is below the resolution
     of static friction. An imposed speed turns them in any case, 0 if it is 0.
     """
+    conditions = balances.commanded(robot, conditions, state)
     motor_speed, load = jnp.asarray(state.speed_motor), robot.chassis(conditions.configuration)
     slow = jnp.abs(motor_speed) * load.radius / robot.gearbox.ratio < load.speed_still
     if conditions.motor_speed is not None:

@@ -90,6 +90,8 @@ def simulate(
         raise UsageError(f"model {model}, {error}") from error
     check_robot(robot)
     conditions = check_conditions(robot, conditions)
+    if robot.controller is not None and (model != mission_batch.MODEL or profile is not None):
+        raise UsageError(f"model: got {model}; a controller needs model={mission_batch.MODEL!r}, without a profile")
     _check_battery(robot, conditions)
     _check_turning(robot, conditions, profile)
     if conditions.held is not None and (model != "steady" or robot.has_ground or conditions.motor_speed is not None):
@@ -244,6 +246,12 @@ def check_conditions(robot: Robot, conditions: Conditions) -> Conditions:
         UsageError: a configuration that the robot lacks, a value out of range or NaN, or values that contradict.
     """
     conditions = _resolved(robot, conditions)
+    if (conditions.goal is None) != (robot.controller is None):
+        raise UsageError(
+            "goal: got one, and the robot has no controller; leave it out"
+            if robot.controller is None
+            else f"goal: not stated; the robot's controller needs it ({robot.rig.imposed}, SI)"
+        )
     _check_conditions(conditions)
     return conditions
 

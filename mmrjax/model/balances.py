@@ -100,6 +100,36 @@ def duty_given(robot: Robot, conditions: Conditions) -> Scalar:
     return way * clip(way * (conditions.duty - effects_sum(robot, demanded, "duty")), 0.0, 1.0)
 
 
+def shown_to_controller(robot: Robot, conditions: Conditions, state: State) -> tuple[Scalar, Scalar]:
+    """Reading that a controller compares with its goal, as `Rig.imposed`, and the rate of an angle, else 0 [SI]."""
+    if robot.rig.imposed == "goal_current":
+        return state.current, jnp.zeros_like(state.current)
+    radius = robot.chassis(conditions.configuration).radius
+    speed = state.speed / radius if robot.loose else state.speed_motor * (1 / robot.gearbox.ratio)
+    return (state.distance / radius, speed) if robot.rig.imposed == "goal_angle" else (speed, jnp.zeros_like(speed))
+
+
+def commanded(robot: Robot, conditions: Conditions, state: State) -> Conditions:
+    """Conditions with the duty that a controller demands in a state, in the place of its goal."""
+    if conditions.goal is None or robot.controller is None:
+        return conditions
+    shown, speed = shown_to_controller(robot, conditions, state)
+    ahead = 0.0 if robot.rig.imposed == "goal_angle" else conditions.goal
+    integral = 0.0 if state.integral is None else state.integral
+    duty = conditions.duty * robot.controller.duty(conditions.goal - shown, integral, speed, ahead)
+    return eqx.tree_at(lambda c: (c.duty, c.goal), conditions, (duty, None), is_leaf=lambda x: x is None)
+
+
+def integrated_error(robot: Robot, conditions: Conditions, state: State) -> Scalar:
+    """Rate of the integral of a controller's error: the error, unless it would drive the duty beyond its limit."""
+    if conditions.goal is None or robot.controller is None:
+        return jnp.zeros_like(state.speed)
+    error = conditions.goal - shown_to_controller(robot, conditions, state)[0]
+    duty = commanded(robot, conditions, state).duty
+    limited = (jnp.abs(duty) >= robot.controller.limit) & (duty * error > 0)
+    return jnp.where(limited | (conditions.open > 0.5), 0.0, error)
+
+
 def begin_signals(robot: Robot, conditions: Conditions, state: State, direction: Scalar | None = None) -> Signals:
     """Kinematics and mass of the instant. `direction` None takes it from the speeds, smooth through rest."""
     chassis = robot.chassis(conditions.configuration)
@@ -345,6 +375,7 @@ def moving_signals(robot: Robot, conditions: Conditions, state: State, way: Scal
     Args:
         way: direction of motion that dry friction opposes, ±1 [-]. None or 0: from the speeds, smooth through rest.
     """
+    conditions = commanded(robot, conditions, state)
     if conditions.motor_speed is not None:
         state = dataclasses.replace(state, current=_current(robot, conditions, state, way))
     return _moving(robot, conditions, state, way)
@@ -530,7 +561,7 @@ def resolved_sides(
 
 def driven_signals(robot: Robot, conditions: Conditions, state: State, direction: Scalar | None) -> Signals:
     """Signals of an instant up to the voltage balance. `direction`: as in `begin_signals`."""
-    robot = robot.within(conditions.configuration)
+    robot, conditions = robot.within(conditions.configuration), commanded(robot, conditions, state)
     return electrical(
         robot, conditions, supply(robot, conditions, begin_signals(robot, conditions, state, direction))
     )

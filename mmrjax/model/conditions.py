@@ -101,6 +101,8 @@ class Conditions(eqx.Module):
             None: those of the running gear, folded as it states.
         load_torque: torque of a brake or load motor on the output of each drive [N·m]: positive against forward
             rotation, in both directions of rotation. Only for a load on a shaft. None: 0.
+        goal: of the robot's controller: angle [rad] or speed [rad/s] of the output, or current of each motor [A], as
+            the rig imposes. None: it is not controlled.
         held: 1 where a clamp holds the output of each drive at rest. `output_torque` is then what the clamp carries.
             Only for a load on a shaft at an imposed voltage or current, in settled runs. None: 0.
     """
@@ -131,6 +133,7 @@ class Conditions(eqx.Module):
     levers_front_deg: Float[Array, "..."] | None
     levers_rear_deg: Float[Array, "..."] | None
     load_torque: Float[Array, "..."] | None
+    goal: Float[Array, "..."] | None
     held: Float[Array, "..."] | None
 
     def __init__(
@@ -162,6 +165,7 @@ class Conditions(eqx.Module):
         levers_rear_deg: Number | None = None,
         load_torque: Number | None = None,
         held: Number | bool | None = None,
+        goal: Number | None = None,
     ) -> None:
         # arrays come from other conditions or a table; users write a number or a few
         if not isinstance(duty, np.ndarray | jax.Array | None) and None not in (duty_left, duty_right):

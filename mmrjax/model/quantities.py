@@ -324,6 +324,8 @@ SINKS: dict[str, str] = {
     "rolling": "rolling resistance",
     "lift": "lifting robot and payload (comes back downhill)",
 }
+#: Goals of a controller that a rig may impose.
+GOALS = ("goal_angle", "goal_speed", "goal_current")
 # Limits of voltages and speeds exclude what no motor has. What a rig can reach follows from its file (`rig_facts`).
 _VOLTS, _SHARE, _ANY_ANGLE = (-10_000.0, 10_000.0), (-1.0, 1.0), (-1e6, 1e6)
 _RATIO, _RADIANS_PER_SECOND, _RPMS = (1e-3, 100.0), (-1e5, 1e5), (-1e6, 1e6)
@@ -363,6 +365,20 @@ TABLE: dict[str, tuple[Quantity, ...]] = {
         ),
         Condition(
             "motor_current", "A", "current imposed on each motor", (-2000.0, 2000.0), heading="I [A]", shown="{:.4g}",
+        ),
+        Condition("goal", "", "goal of the controller [SI]", _ANY_ANGLE),
+        *(
+            Condition(
+                name, unit, f"{what} that the controller follows", reach, field="", in_tables=True,
+                imposed=(name,), heading=f"goal [{unit}]", shown="{:.4g}",
+            )
+            for name, unit, what, reach in zip(
+                GOALS,
+                ("deg", "rpm", "A"),
+                ("angle of the output", "speed of the output", "current of each motor"),
+                (_ANY_ANGLE, _RPMS, (-2000.0, 2000.0)),
+                strict=True,
+            )
         ),
         Condition(
             "total_mass", "kg", "total mass of robot and payload", (0.1, 500.0), heading="M [kg]", shown="{:.1f}",

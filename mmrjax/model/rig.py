@@ -13,12 +13,13 @@ from jaxtyping import Array, Float
 
 from mmrjax.model import channels
 from mmrjax.model.params import Index, Scalar, parameter
+from mmrjax.model.quantities import GOALS
 
 #: Ways in which histories may begin.
 STARTS = ("rest", "measured", "free")
 #: Imposed quantity: the voltage of supply or battery (times the duty), the speed of the motor shafts, or the current
-#: of each motor, supplied by an amplifier.
-IMPOSED = ("voltage", "motor_speed", "motor_current")
+#: of each motor, supplied by an amplifier; or the goal of a controller (`Robot.controller`), of output or motor.
+IMPOSED = ("voltage", "motor_speed", "motor_current", *GOALS)
 #: Imposed values between the rows of a history: those of the row before, or on a straight line to the next.
 BETWEEN = ("held", "linear")
 
@@ -200,9 +201,14 @@ class Rig(eqx.Module):
         return self.inherits
 
     @property
+    def follows_goal(self) -> bool:
+        """True if a controller drives the motors towards an imposed goal."""
+        return self.imposed in GOALS
+
+    @property
     def shows_voltage(self) -> bool:
-        """True if the motor voltage is imposed or measured."""
-        return self.imposed == "voltage" or "motor_voltage" in self.channels
+        """True if the motor voltage is imposed or measured. A controller gives it."""
+        return self.imposed == "voltage" or self.follows_goal or "motor_voltage" in self.channels
 
     @property
     def magnitudes(self) -> frozenset[str]:

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from mmrjax.model import channels, params
 from mmrjax.model.channels import Channel
 from mmrjax.model.chassis import Chassis
+from mmrjax.model.controller import Controller
 from mmrjax.model.driver import Driver
 from mmrjax.model.gearbox import Gearbox
 from mmrjax.model.motor import Motor
@@ -89,6 +90,7 @@ class Robot(eqx.Module):
         running_gear: of one side, further parameters of the track model.
         driver: of the motors.
         rig: imposed inputs and instruments.
+        controller: of the motors, if the rig imposes a goal.
     """
 
     battery: Battery
@@ -100,6 +102,7 @@ class Robot(eqx.Module):
     running_gear: RunningGear = eqx.field(default_factory=RunningGear)
     driver: Driver = eqx.field(default_factory=Driver)
     rig: Rig = eqx.field(default_factory=Rig)
+    controller: Controller | None = None
 
     def __repr__(self) -> str:
         effects = "".join(f", {e.name}" for e in self.effects)

@@ -52,6 +52,7 @@ class State(eqx.Module):
         temperature: of the winding [°C], which sets its resistance. None: not followed, resistance as stated.
         distance: travelled since the start of the run [m]. Used by loads that depend on their angle.
         gap: of the output's motor side ahead of the load, from the middle of a backlash [rad]. None: rigid.
+        integral: of the controller's error over time, as in `Controller`. None: no controller.
     """
 
     current: Scalar
@@ -62,6 +63,7 @@ class State(eqx.Module):
     temperature: Scalar | None = None
     distance: Scalar = 0.0
     gap: Scalar | None = None
+    integral: Scalar | None = None
 
 
 class PlaneMotion(eqx.Module):

@@ -64,8 +64,8 @@ def _loop(config: configuration.Loop, beside: configuration.LoopBeside) -> int:
 
     stages: dict[str, Any] = {}
 
-    def left() -> float | None:
-        return None if within is None else max(within - (time.monotonic() - began), 0.0)
+    def left() -> float:
+        return max(within - (time.monotonic() - began), 0.0)
 
     def timed(text: str) -> None:
         used = time.monotonic() - began
@@ -85,7 +85,7 @@ def _loop(config: configuration.Loop, beside: configuration.LoopBeside) -> int:
         def keep(name: str, make: Callable[[], T]) -> T:
             result = stages[name] = folder.stage(name, make)
             if name == "ranking":
-                _show_ranking(stages[name], folder, timed)
+                _show_ranking(stages[name], folder, timed, brief=not beside.verbose)
             if name == "verdict":
                 timed(f"{loop_words.verdict_line(stages[name])}; next, errors held out and other noises")
             return result
@@ -99,13 +99,13 @@ def _loop(config: configuration.Loop, beside: configuration.LoopBeside) -> int:
                 )  # fmt: skip
         except KeyboardInterrupt as ended:
             if isinstance(ended, OutOfTime):
-                _say_out_of_time(within or 0.0, begun=bool(stages))
+                _say_out_of_time(within, begun=bool(stages))
             _say_kept(stages, folder, config.robot)
             raise
         if config.resolve:
             verdict = _resolved(verdict, config, beside.members, progress)
         document = loop_report.loop_document(verdict, config.robot, changes_by_effect(verdict))
-        page = print_report(document)
+        page = print_report(document, brief=not beside.verbose)
         if config.resolve and verdict.resolved is None:
             print_output(
                 "The track model was not asked: nothing remains in slip, track or ground that it has a say in."
@@ -136,14 +136,11 @@ def _say_out_of_time(within: float, begun: bool) -> None:
 
 
 @contextlib.contextmanager
-def _alarm(seconds: float | None, wanted: Callable[[], bool]) -> Iterator[None]:
+def _alarm(seconds: float, wanted: Callable[[], bool]) -> Iterator[None]:
     """Raise `OutOfTime` within once so much time has passed, in the middle of a step too where the platform can,
     while it is `wanted`. It is repeated every second, because a called function may suppress it.
-
-    Args:
-        seconds: None: never.
     """
-    if seconds is None or not hasattr(signal, "SIGALRM"):
+    if not hasattr(signal, "SIGALRM"):
         yield
         return
 
@@ -160,13 +157,14 @@ def _alarm(seconds: float | None, wanted: Callable[[], bool]) -> Iterator[None]:
         signal.signal(signal.SIGALRM, before)
 
 
-def _show_ranking(found: Ranking, folder: RunFolder, timed: Callable[[str], None]) -> None:
-    """Say what regression makes of the library, and leave it in the run folder: the first answer."""
-    first, *lines = loop_words.ranking_lines(found)
+def _show_ranking(found: Ranking, folder: RunFolder, timed: Callable[[str], None], brief: bool) -> None:
+    """Print the ranking by regression, the first answer, and leave it in the run folder."""
+    first, *lines = loop_words.ranking_lines(found, brief=brief)
     timed(first)
     for line in lines:
         print_message(line)
-    content = {"schema": SCREENING, "confirmed": False, **dataclasses.asdict(found)}
+    answer = loop_words.regression_verdict(found)
+    content = {"schema": SCREENING, "confirmed": False, "answer": answer, **dataclasses.asdict(found)}
     folder.write_json(SCREENING_FILE, content)
 
 
@@ -184,7 +182,7 @@ def _say_kept(stages: Mapping[str, Any], folder: RunFolder, robot_name: str) -> 
         print_message(f"{loop_words.verdict_line(traced)}; errors held out and other noises are outstanding")
         return
     if "ranking" in stages:
-        for line in loop_words.ranking_lines(stages["ranking"]):
+        for line in (*loop_words.ranking_lines(stages["ranking"]), loop_words.regression_verdict(stages["ranking"])):
             print_message(line)
     searches = [search for name, search in stages.items() if name.startswith("search")]
     if searches and (best := searches[-1][2].best) is not None:

@@ -10,7 +10,7 @@ from sweeps.console import print_message
 from sweeps.inputs import load_robot
 from sweeps.paper import data, report
 from sweeps.points import imposed
-from sweeps.store import finish_run_folder, open_folder
+from sweeps.store import finish_run_folder, open_folder, print_report
 
 
 def execute(config: configuration.Reproduce, beside: configuration.FolderPart) -> int:
@@ -21,7 +21,7 @@ def execute(config: configuration.Reproduce, beside: configuration.FolderPart) -
     runs = records.read_runs("measured")
     gear = "track.guide_share" in fidelities.fidelity_facts(config.model).computes
     with open_folder("reproduce", config, robot, beside) as folder:
-        _, rows = report.write_paper_page(folder.results(), file, model=config.model, gear=gear)
+        document, rows = report.paper_document(file, gear)
         result = {"schema": "mmrjax.reproduce/1", "model": config.model, "rows": 0}
         if rows is None:
             print_message(f"the paper's runs are of {', '.join(CONFIGURATIONS)}; none of them is this robot's")
@@ -40,5 +40,6 @@ def execute(config: configuration.Reproduce, beside: configuration.FolderPart) -
             robot=robot,
             note="the robot of these figures",
             solved=rows is None or "failed" not in rows.plain["status"],
+            page=print_report(document, file),
             runs=runs,
         )

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from calibration.data import Json, Names, rig_facts, settling
-from calibration.data.columns import SUPPLY, Layout
+from calibration.data.columns import IMPOSED, SUPPLY, Layout
 from calibration.data.input_errors import BadConfiguration
 from calibration.data.rig_facts import Fact, Origin
 from calibration.data.rig_file import FREE
@@ -26,7 +26,7 @@ from mmrjax.model import channels
 from mmrjax.model.channels import Channel
 from mmrjax.model.driver import FAST
 from mmrjax.model.motor import UNLIMITED
-from mmrjax.model.quantities import HEAT
+from mmrjax.model.quantities import GOALS, HEAT
 from mmrjax.model.robot import Robot
 from mmrjax.model.shaft import Shaft
 from sweeps.commands.rig_template import EXAMPLE, is_example
@@ -70,9 +70,9 @@ class RigCheck:
         gear = f"{'its' if count == 1 else 'their'} gearbox {float(robot.gearbox.ratio):g} : 1"
         loads = "; ".join(f"{name}: {_load(load)}" for name, load in robot.configurations.items())
         imposed = "the voltage (times the duty in histories)"
-        imposed = {"motor_speed": "the motors' speed", "motor_current": "the current of each motor"}.get(
-            rig.imposed, imposed
-        )
+        words = {"motor_speed": "the motors' speed", "motor_current": "the current of each motor"}
+        words |= {goal: f"the goal of a controller ({goal.removeprefix('goal_')})" for goal in GOALS}
+        imposed = words.get(rig.imposed, imposed)
         starts = {
             "rest": "start at rest",
             "measured": "start as their first samples show",
@@ -266,15 +266,13 @@ def _load(load: Any) -> str:
 
 
 def _use(column: str, robot: Robot) -> str:
+    if column == IMPOSED[robot.rig.imposed][0]:
+        return "imposed"
     for channel in channels.EVERY:
-        if channel.name == robot.rig.imposed and column == channel.column:
-            return "imposed"
         if channel in robot.channels and column == channel.column:
             return f"channel {channel.name}"
         if column == channel.sd_column:
             return f"sd of {channel.name}"
-    if column == "supply_voltage_V" and robot.rig.imposed == "voltage":
-        return "imposed"
     return "condition"
 
 

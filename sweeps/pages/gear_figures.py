@@ -119,8 +119,8 @@ def ripple_numbers(gear: Gear) -> Json:
     }
 
 
-def current_ripple(shown: list[Gear], title: str = "{}") -> tuple[Figure, list[Json]]:
-    """Total current at the end of each run, and what ripples by how much."""
+def current_ripple(shown: list[Gear], title: str = "{}") -> Figure:
+    """Total current at the end of each run."""
     fig, grid = new_figure(1, len(shown), 3.0)
     look = configuration_looks(gear.name for gear in shown)
     for axes, gear in zip(grid[0], shown, strict=True):
@@ -138,7 +138,7 @@ def current_ripple(shown: list[Gear], title: str = "{}") -> tuple[Figure, list[J
         axes.annotate("", (start, level), (start + 1e3 * expected, level), arrowprops=arrow)
         axes.text(start, level + 0.05 * span, f"{1e3 * expected:.1f} ms, eq. (34)", fontsize=8.5, va="bottom")
         axes.set_title(title.format(gear.name))
-    return fig, [ripple_numbers(gear) for gear in shown]
+    return fig
 
 
 def draw_touchdowns(gear: Gear, title: str = "grousers land (dotted)") -> Figure:

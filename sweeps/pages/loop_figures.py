@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
+import scipy.stats
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from calibration.data import Columns
 from calibration.data.table import Runs
@@ -14,6 +16,8 @@ from calibration.discovery.settings import WITHOUT_NAME
 from calibration.inference import blocks
 from calibration.inference.bases import place_in_words
 from calibration.inference.details import TimeStatistics
+from mmrjax.effects import BY_NAME
+from mmrjax.effects.base import EQUATION
 from mmrjax.effects.curve import EVERY_VARIABLE, Variable
 from mmrjax.model.channels import EVERY, SIDES, Channel
 from sweeps.pages.figure_style import (
@@ -49,6 +53,9 @@ IMPOSED_WORDS = {
     "supply_voltage_V": "supply voltage [V]",
     "motor_speed_rpm": "motor speed [rpm]",
     "motor_current_A": "motor current [A]",
+    "goal_angle_deg": "goal [deg]",
+    "goal_speed_rpm": "goal [rpm]",
+    "goal_current_A": "goal [A]",
 }
 #: Label and unit of conditions that no channel shows.
 CONDITION_WORDS = {
@@ -177,6 +184,71 @@ def time_statistics(detail: TimeStatistics, channels: Sequence[Channel], verdict
     return fig
 
 
+#: Most lags of a correlation with the input [samples].
+LAGS = 20
+#: Most curves of the figure of power.
+CURVES = 5
+
+
+def draw_input_correlation(runs: Runs, table: Columns, channels: Sequence[Channel], verdict: str) -> Figure:
+    """Correlation of each residual with the input at lags of samples, over all runs, before and after."""
+    fig, grid = new_figure(1, len(channels), 2.6, sharey=True)
+    rows_of_runs = [runs.in_order(name) for name in dict.fromkeys(runs.run_names.tolist())]
+    most = min(LAGS, min(map(len, rows_of_runs)) - 1)
+    lags = np.arange(-most, most + 1)
+    centred = lambda values: np.nan_to_num(values - np.nanmean(values))  # noqa: E731
+    for axes, channel in zip(grid[0], channels, strict=True):
+        limit = 2 / np.sqrt(len(table["time_s"]))
+        axes.axhspan(-limit, limit, color="#eeeeee", lw=0, zorder=0)
+        for when, colour in (("before", ORANGE), ("after", BLUE))[verdict == "none" :]:
+            sums, squares = np.zeros(len(lags)), np.zeros(2)
+            for rows in rows_of_runs:
+                residual = centred(table[f"residual_{when}_{channel.name}_sigma"][rows])
+                drive = centred(table[imposed_column(table)][rows])
+                sums += np.correlate(residual, drive, "full")[len(rows) - 1 + lags]
+                squares += residual @ residual, drive @ drive
+            axes.plot(lags, sums / max(np.sqrt(squares.prod()), 1e-300), "o-", ms=3, lw=1, color=colour, label=when)
+        axes.set(title=channel.label, xlabel="residual after the input [samples]")
+    grid[0, 0].set_ylabel("correlation with the input")
+    grid[0, 0].legend(loc="best")
+    return fig
+
+
+def draw_gains(found: DiscoveryResult) -> Figure:
+    """Hold-out gain over the refit of each set of effects, by their number, with its standard error."""
+    fig, grid = new_figure(1, 1, 2.8)
+    axes, last = grid[0, 0], len(found.gains) - 1
+    axes.axhline(0, color=FAINT, lw=0.8)
+    axes.plot(0, 0, "s", ms=5, color=INK, label="refit, nothing added")
+    for k, (names, gain) in enumerate(found.gains):
+        proposed = k == last
+        error = gain.se if np.isfinite(gain.se) else 0.0
+        axes.errorbar(len(names), gain.mean, error, fmt="o", ms=5.5, mfc=BLUE if proposed else "white", color=BLUE,
+                      label="proposed, ± standard error" if proposed else None)  # fmt: skip
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    axes.set(xlabel="effects added", ylabel="gain [nat a reading]")
+    outer_legend(axes, "upper left")
+    return fig
+
+
+def draw_power(found: DiscoveryResult) -> Figure:
+    """Chance that an effect would have been noticed, over its size, for the most visible one of each equation."""
+    level = found.before.kinds["single"].threshold
+    visible = sorted((s for s in found.scores if s.balance in EQUATION), key=lambda s: s.sigmas_per_prior_sd)
+    strongest = {EQUATION[s.balance]: s for s in visible if s.sigmas_per_prior_sd > 0}
+    first = {s.name: s for s in visible if s in strongest.values()}
+    fig, grid = new_figure(1, 1, 3.2)
+    axes, size = grid[0, 0], np.geomspace(0.03, 30, 200)
+    for name, (colour, _) in list(configuration_looks(first).items())[-CURVES:]:
+        shift = size * first[name].sigmas_per_prior_sd
+        chance = scipy.stats.norm.sf(level - shift) + scipy.stats.norm.cdf(-level - shift)
+        axes.plot(size, 100 * chance, color=colour, label=name)
+    axes.set(xscale="log", xlabel="size [typical sizes]", ylabel="would have been noticed [%]", ylim=(0, 103))
+    axes.set_xticks([0.03, 0.1, 0.3, 1, 3, 10, 30], ["0.03", "0.1", "0.3", "1", "3", "10", "30"])
+    outer_legend(axes, "upper left")
+    return fig
+
+
 def draw_effect_scores(found: DiscoveryResult) -> Figure:
     """Score of every effect at the base fit, with the threshold that noise alone passes in few tables."""
     rungs = found.scores[:RUNGS]
@@ -244,6 +316,8 @@ def draw_errors(found: DiscoveryResult) -> Figure:
 
 #: Of the range of a variable, over which the change by an effect is averaged when it is asked how smooth it runs.
 NEAR = 1 / 12
+#: Roughness up to which the change by an effect is drawn as a line over its variable.
+SMOOTH = 0.2
 
 
 def imposed_axis(table: Columns) -> tuple[np.ndarray, str]:
@@ -281,35 +355,59 @@ def conditions_and_readings(table: Columns) -> Columns:
     return columns
 
 
-def depends_on(table: Columns, change: np.ndarray) -> tuple[np.ndarray, str]:
+def depends_on(table: Columns, change: np.ndarray, driver: str = "") -> tuple[np.ndarray, str]:
     """Abscissa of an effect and its label: the condition or reading that makes the change of a reading smoothest.
 
     Args:
         change: of the reading, shape (rows,), NaN where a row does not count.
+        driver: of the effect; variables with that word are preferred.
     """
     use = np.isfinite(change)
     every = {k: np.asarray(v, float) for k, v in conditions_and_readings(table).items()}
     whole = {k: v for k, v in every.items() if np.isfinite(v[use]).all()}
+    whole = {k: v for k, v in whole.items() if driver in k.split() and np.ptp(v[use]) > 0} or whole
     label = min(whole, key=lambda k: roughness(whole[k][use], change[use]))
     return whole[label], label
 
 
 def draw_effect_laws(found: DiscoveryResult, table: Columns, changes: Mapping[str, Change]) -> Figure:
-    """Contribution of each effect found: readings minus the robot without it, and the effect's change."""
+    """Law of each effect found, on its readings less those of the robot without it.
+
+    Measured with ±2 sd, the refit with nothing added, and the law with the 95 % band of its amplitude. Runs backward
+    have hollow dots and a line of their own.
+    """
     fig, grid = new_figure(1, len(changes), 3.4)
+    readings, used = found.readings_of_rows, found.included
+    backward = (table[imposed_column(table)] < 0)[used]
     for axes, (name, change) in zip(grid[0], changes.items(), strict=True):
         c = change.channel
-        x, label = depends_on(table, np.where(found.included, change.with_it - change.without, np.nan))
-        measured = found.readings_of_rows.measured[:, [x.name for x in found.channels].index(c.name)]
+        effect = BY_NAME.get(name)
+        moved = np.where(used, change.with_it - change.without, np.nan)
+        x, label = depends_on(table, moved, "" if effect is None else effect.driver)
+        k = [x.name for x in found.channels].index(c.name)
+        size = next(e.parameters["amplitude"] for e in found.effects if e.name == name)
+        measured, before, law = (
+            (values - change.without)[used] / c.factor
+            for values in (readings.measured[:, k], readings.before[:, k], change.with_it)
+        )
+        x, sd = x[used], readings.sd[used, k] / c.factor
+        band = 1.96 * abs(size.sd / size.value * law)
         axes.axhline(0, color=FAINT, lw=0.8)
-        for what, values, look in (
-            ("measured", measured, {"marker": "o", "color": ORANGE}),
-            ("with it", change.with_it, {"marker": "_", "color": BLUE, "ms": 13, "mew": 2.2}),
-        ):
-            y = (values - change.without)[found.included] / c.factor
-            axes.plot(x[found.included], y, ls="none", label=what, **look)
-        axes.set(xlabel=label, ylabel=f"{c.label}, less without it [{c.unit}]", title=name)
-    grid[0, 0].legend(loc="best")
+        for way, fill, words in ((~backward, ORANGE, "measured, ±2 sd"), (backward, "white", "backward")):
+            if not way.any():
+                continue
+            rows, first = np.flatnonzero(way)[np.argsort(x[way])], way is not backward or backward.all()
+            axes.errorbar(x[rows], measured[rows], 2 * sd[rows], fmt="o", ms=4.5, mfc=fill, color=ORANGE, lw=0.9,
+                          label=words)  # fmt: skip
+            axes.plot(x[rows], before[rows], "x", ms=5, color=INK, label="old law, refitted" if first else None)
+            if roughness(x[rows], law[rows]) < SMOOTH:
+                axes.plot(x[rows], law[rows], color=BLUE, label="new law, 95 %" if first else None)
+                axes.fill_between(x[rows], (law - band)[rows], (law + band)[rows], color=BLUE, alpha=0.2, lw=0)
+            else:
+                axes.errorbar(x[rows], law[rows], band[rows], fmt="_", ms=13, mew=2.2, color=BLUE, elinewidth=6,
+                              alpha=0.6, label="new law, 95 %" if first else None)  # fmt: skip
+        axes.set(xlabel=label, ylabel=f"change of {c.label} [{c.unit}]", title=name)
+    outer_legend(grid[0, 0], "upper left")
     return fig
 
 

@@ -1,8 +1,7 @@
-"""The page of every report: figures drawn once and inlined, a template, one offline HTML file."""
+"""The page of every report: figures drawn once and inlined in one offline HTML file."""
 
 from __future__ import annotations
 
-import math
 import re
 import urllib.parse
 from collections.abc import Callable
@@ -11,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import jinja2
-import numpy as np
 from markupsafe import Markup, escape
 
 from calibration.data import Json
@@ -45,31 +43,27 @@ class Album:
         self.pictures: dict[str, Markup] = {}
         self.overlays = False
 
-    def add(self, name: str, draw: Callable[[], Any]) -> Any:
+    def add(self, name: str, draw: Callable[[], Any]) -> None:
         """Draw one figure, and a narrow one for phones if its panels stand side by side.
 
         Args:
-            draw: returns the figure, alone or followed by numbers, which are returned, or an overlay over time.
+            draw: returns the figure, or an overlay over time.
         """
         with figure_settings():
-            figure_drawn = draw()
-            if isinstance(figure_drawn, TimeOverlay):
-                return self.add_overlay(name, figure_drawn)
-            figure, *numbers = figure_drawn if isinstance(figure_drawn, tuple) else (figure_drawn,)
+            figure = draw()
+            if isinstance(figure, TimeOverlay):
+                self.add_overlay(name, figure)
+                return
             text, narrow = figure_as_svg(figure), ""
         if can_stack(figure):
             with figure_settings(NARROW):
-                figure_drawn = draw()
-                narrow = figure_as_svg(
-                    fit_for_phones(figure_drawn[0] if isinstance(figure_drawn, tuple) else figure_drawn)
-                )
+                narrow = figure_as_svg(fit_for_phones(draw()))
         write_text(self.folder / f"{name}.svg", printable(text))
         looks = "scale " * has_colour_scale(figure)
         picture = _inline(text, name, looks + ("wide" if narrow else "only"))
         self.pictures[name] = Markup(
             picture + (_inline(narrow, f"{name}-narrow", looks + "narrow") if narrow else "")
         )
-        return numbers[0] if numbers else None
 
     def add_overlay(self, name: str, overlay: TimeOverlay) -> None:
         """Draw readings over time, as a figure for print and with the data of an interactive one."""
@@ -122,22 +116,8 @@ def _section(file: RobotFile, nominal: Robot) -> Section:
     )
 
 
-def printed_number(value: Any, form: str = "{:.2f}") -> str:
-    """A number as a page prints it, nothing without a sign. What is not finite is a dash."""
-    if isinstance(value, int | float | np.number):
-        text = form.format(float(value)) if math.isfinite(float(value)) else "–"
-        return re.sub(r"^-(?=0\.?0*$)", "", text)
-    return str(value)
-
-
-def _grade(value: Any) -> str:
-    """Class of a cell by the size of its error [%]: the paper claims 7 %."""
-    size = abs(float(value))
-    return "none" if not math.isfinite(size) else "good" if size <= 5 else "fair" if size <= 10 else "bad"
-
-
-def render_page(folder: Path, template: str, album: Album, **known: Any) -> Path:
-    """Write `report.html` from a template, the album's pictures and the template's values.
+def render_page(folder: Path, album: Album, **known: Any) -> Path:
+    """Write `report.html` from the album's pictures and the values of `document.html.j2`.
 
     Adds the parts of every page: contents after the answer, files of the folder (`files`: unusual meanings), tables
     that scroll.
@@ -150,19 +130,15 @@ def render_page(folder: Path, template: str, album: Album, **known: Any) -> Path
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters |= {
-        "number": printed_number,
-        "grade": _grade,
-    }
     environment.filters |= {"marked": marked_html, "download": download_link, "tone": cell_tone}
     environment.globals |= {
         "page_rows": ROWS,
         "side_by_side": SIDE_BY_SIDE,
-        "status_words": {name: status.short for name, status in words.STATUSES.items()},
         "version": __version__,
     }
     known["files"] = _beside(Path(folder), words.FILES | known.get("files", {}))
-    page = environment.get_template(template).render(pictures=album.pictures, overlays=album.overlays, **known)
+    template = environment.get_template("document.html.j2")
+    page = template.render(pictures=album.pictures, overlays=album.overlays, **known)
     page = page.replace("<table", '<div class="scroll" tabindex="0"><table').replace("</table>", "</table></div>")
     page = _with_contents(page)
     path = Path(folder) / "report.html"

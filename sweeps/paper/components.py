@@ -29,7 +29,6 @@ MODEL = {"nominal": BLUE, "sm1": ORANGE, "sm2": GREEN}
 
 #: No load of the maker's sheet of RE30 310007: speed [rpm], current [A].
 SHEET_NO_LOAD = (8810.0, 0.165)
-PAPER_IDLE_R2 = 0.995  # of Fig. 18
 _GEAR_SPEEDS = {"15 V": 5000.0, "33 V": 11_500.0}  # motor speeds of the measured rows, about
 
 
@@ -211,22 +210,21 @@ def motor_friction(robots: dict[str, Robot]) -> Figure:
     return fig
 
 
-def idle_track(robots: dict[str, Robot]) -> tuple[Figure, dict[str, float]]:
+def idle_track(robots: dict[str, Robot]) -> Figure:
     """Fig. 18: current of one motor that turns a lifted side, over pulley speed, and R² of a line through it."""
     fig, grid = new_figure(1, 1, 3.6)
     axes = grid[0, 0]
     name, robot = next(iter(robots.items()))
     speed = np.linspace(0.5, 26.0, 60)
-    certainty = {}
     labels = {TRACKED: "three tracks a side", WHEELED: "one track a side"}
     for kind in data.shown_configurations(robot):
         words = f"{labels[kind]} ({kind})" if kind in labels else kind
         current = data.idle_current(robot, kind, speed)
-        line, certainty[kind] = data.fit_line(speed, current)
+        line, certainty = data.fit_line(speed, current)
         colour = CONFIGURATION.get(kind, PURPLE)
         axes.plot(speed[::4], current[::4], "o", color=colour, ms=4)
         axes.plot(speed, line, color=colour)
-        label_end(axes, speed, line, f"{words}\nline: R² = {certainty[kind]:.4f}", colour)
+        label_end(axes, speed, line, f"{words}\nline: R² = {certainty:.4f}", colour)
         for other in ("sm1", "sm2"):
             if other in robots and other != name and kind == TRACKED:
                 flat = data.idle_current(robots[other], kind, speed)
@@ -235,4 +233,4 @@ def idle_track(robots: dict[str, Robot]) -> tuple[Figure, dict[str, float]]:
     axes.set(xlabel="pulley speed [rad/s]", ylabel="current of one motor [A]", xlim=(0, 26))
     axes.set_ylim(bottom=0)
     corner_note(axes, f"dots: {words_shown(name)}; lines: straight fits")
-    return fig, certainty
+    return fig

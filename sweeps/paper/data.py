@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -265,6 +265,38 @@ def current_over_slope(robot: Robot, ratio: dict[str, float], slopes: np.ndarray
     return {(c, mode): (current[2 * k], current[2 * k + 1]) for k, (c, mode, _) in enumerate(asked[::2])}
 
 
+def rows_of_mode(rows: Rows, kind: str, mode: int) -> np.ndarray:
+    """Mask of the measured rows of a configuration in a loading mode."""
+    table, (voltage, payload) = rows.conditions, MODES[mode]
+    return np.asarray(
+        (table["configuration"] == kind) & (table["supply_voltage_V"] == voltage) & (table["payload_kg"] == payload)
+    )
+
+
+def slope_certainty(rows: Rows) -> list[tuple[Any, ...]]:
+    """R² (A1) of the current over slope, of each configuration and loading mode with measured rows.
+
+    Returns:
+        Configuration, mode, R² of a straight line through the points, of the robot on its own adhesion, the number
+        of rows that settle on it, and R² with the adhesion raised and with the robot's own mass.
+    """
+    found = []
+    for kind in rows.ratio:
+        for mode in MODES:
+            pick = rows_of_mode(rows, kind, mode)
+            if pick.any():
+                measured = rows.measured[pick, 0]
+                own, *others = (t["total_current_A"][pick] for t in (rows.plain, rows.raised, rows.weighed))
+                straight = fit_line(rows.conditions["slope_deg"][pick], measured)[1]
+                found.append(
+                    (
+                        kind, mode, straight, simulation_errors.r_squared(measured, own),
+                        int(np.isfinite(own).sum()), *(simulation_errors.r_squared(measured, x) for x in others),
+                    )
+                )  # fmt: skip
+    return found
+
+
 def supply_errors(robot: Robot, ratio: float, rows_of: Rows, battery: bool) -> dict[int, np.ndarray]:
     """Errors (35) over the five slopes of 6T2A in modes 1 and 2 of Fig. 29: mode → shape (5, 3).
 
@@ -329,6 +361,46 @@ def energy_split(robot: Robot, asked: Conditions) -> tuple[Columns, Columns]:
     split = {k: np.asarray(v) for k, v in parts.items()}
     split["other"] = points["power_supply_W"] - sum(split.values())
     return points, split
+
+
+class EnergyUse(NamedTuple):
+    """Use of the supply's power at operating points.
+
+    Attributes:
+        labels: of the points, with a star where the robot slides on its own adhesion, so that it is raised.
+        power: item of `SPLIT`, and `other` → [W].
+        total: power of the supply [W].
+        status: of each point.
+    """
+
+    labels: list[str]
+    power: Columns
+    total: np.ndarray
+    status: np.ndarray
+
+
+def energy_use(robot: Robot, ratio: dict[str, float]) -> EnergyUse:
+    """Use of the supply's power at twelve operating points.
+
+    Args:
+        ratio: raised adhesion over the robot's own, by configuration.
+    """
+    asked = [(c, u, p, s) for c in ratio for u, p in ((15.0, 0.0), (33.0, 8.0)) for s in (0.0, 10.0, 20.0)]
+    kind, voltage, payload, slope = (np.array(v) for v in zip(*asked, strict=True))
+
+    def at(adhesion: np.ndarray) -> tuple[Columns, Columns]:
+        conditions = batch_conditions(
+            robot, kind, voltage=voltage, payload=payload, slope_deg=slope, adhesion=adhesion
+        )
+        return energy_split(robot, conditions)
+
+    slides = at(np.ones(len(asked)))[0]["status"] == "slides"
+    points, power = at(np.where(slides, [ratio[k] for k in kind], 1.0))
+    labels = [
+        f"{c}  {u:.0f} V  {p:.0f} kg  {s:.0f}°" + " *" * bool(slid)
+        for (c, u, p, s), slid in zip(asked, slides, strict=True)
+    ]
+    return EnergyUse(labels, power, points["power_supply_W"], points["status"])
 
 
 def paper_rows_table(rows: Rows) -> Columns:

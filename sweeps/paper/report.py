@@ -1,8 +1,8 @@
-"""Page of `reproduce`: the paper's figures and tables for a robot, compared with the bench and the paper."""
+"""The report of `reproduce`: the paper's figures and tables for a robot, compared with the bench and the paper."""
 
 from __future__ import annotations
 
-from pathlib import Path
+from collections.abc import Iterator
 
 import jax.numpy as jnp
 import numpy as np
@@ -10,15 +10,70 @@ import numpy as np
 from calibration.data import Columns, Json, runs
 from calibration.data.robot_file import RobotFile
 from calibration.inference import simulation_errors
-from mmrjax.model.channels import find_channel
 from mmrjax.model.paper_robots import ROBOTS
-from mmrjax.model.paper_tables import CONFIGURATIONS, TRACKED, WHEELED
+from mmrjax.model.paper_tables import TRACKED, WHEELED
 from mmrjax.model.quantities import MM, RPM
 from mmrjax.model.robot import Robot
-from sweeps.pages import history_figures, page
-from sweeps.pages.words import words_shown
-from sweeps.paper import components, data, run_figures
-from sweeps.report.run_tables import reading_text
+from sweeps import capabilities
+from sweeps.pages import words
+from sweeps.paper import data, running_gear_figures
+from sweeps.report import catalogue
+from sweeps.report.document import Block, Cell, Column, Document, Section
+from sweeps.report.fit_tables import error_cell
+from sweeps.report.runs_report import starts_table
+
+
+def paper_document(file: RobotFile, gear: bool) -> tuple[Document, data.Rows | None]:
+    """The report of a robot and its nominal fellows.
+
+    Args:
+        file: of any robot, without one of the paper's configurations it is not compared with the bench.
+        gear: whether its fidelity resolves the running gear, so that there are Figs. 23-27 from it too.
+
+    Returns:
+        The report, and the robot's results for the paper's rows, None without one of their configurations.
+    """
+    robot, name = file.robot, capabilities.shown_name(file)
+    name = file.name if name == words.words_shown(file.name) else name
+    robots = {name: robot} | {n: make() for n, make in ROBOTS.items() if n != name}
+    every = {n: data.simulate_measured_rows(member) for n, member in robots.items()}
+    rows = {n: of_robot for n, of_robot in every.items() if of_robot is not None}
+    own_rows = rows.get(name)
+    blocks: list[Block] = [catalogue.note("paper.lead", capabilities.shown_name(file))]
+    answer = catalogue.text("paper.alone")
+    if own_rows is not None:
+        errors = variant_errors(_variants(name, rows), own_rows)
+        answer = error_answer(errors)
+        blocks += [_error_table(errors), *_sliding(robot, own_rows)]
+
+    def sections() -> Iterator[Section]:
+        if own_rows is not None:
+            yield _against_the_bench(robots, rows, name)
+        nominal = rows["nominal"]
+        raised = data.raised_words(ROBOTS["nominal"](), nominal.ratio)
+        row_blocks = catalogue.note("paper.row-by-row", raised), _row_table(nominal), catalogue.note("paper.reasons")
+        yield Section("The paper against itself, row by row", row_blocks, "rows-table")
+        starts = data.simulate_starts(robot)
+        figure = catalogue.figure("paper.fig23_24_from_standstill", starts, data.FIG_23, data.FIG_24)
+        yield Section("From standstill", (figure, starts_table(starts)), "start")
+        if gear:
+            yield Section("Inside the running gear", tuple(running_gear_figures.gear_blocks(robot)), "gear")
+        ratio = dict.fromkeys(data.shown_configurations(robot), 1.0) if own_rows is None else own_rows.ratio
+        used = data.energy_use(robot, ratio)
+        yield Section("Where the energy goes", (catalogue.figure("paper.energy_split", used),), "energy")
+        watts = np.stack([used.total, *(used.power[item] for item in data.SPLIT)], 1)
+        watt_rows = [(label, *row) for label, row in zip(used.labels, watts, strict=True)]
+        columns = (Column(item, form="{:.1f}") for item in data.SPLIT)
+        yield Section("", (catalogue.table("paper.watts", watt_rows, *columns),), folded="The same in watts")
+        figures = (
+            catalogue.figure("paper.fig05a_gearbox_efficiency", robots, own_rows),
+            *(catalogue.figure(f"paper.{n}", robots) for n in ("fig10_battery", "fig11_motor_friction")),
+            catalogue.figure("paper.fig18_idle_track", robots),
+        )
+        yield Section("Components", figures, "components")
+
+    title = f"The paper's figures and tables: {capabilities.shown_name(file)}"
+    return Document(title, answer, tuple(blocks), page_sections=sections), own_rows
 
 
 def variant_errors(variants: Columns, rows: data.Rows) -> list[Json]:
@@ -50,6 +105,45 @@ def error_answer(every: list[Json]) -> str:
     )
 
 
+def _error_table(errors: list[Json]) -> Block:
+    heads = [Column(word, "%", "{:.1f}", c.label) for c in data.channels_of_paper() for word in ("rms", "worst")]
+    rows = [
+        (
+            e["variant"] * (e["group"] == "all"), e["group"], f"{e['rows']} of {e['of']}",
+            *(cell for c in e["cells"] for cell in (error_cell(c["rms_percent"]), c["max_percent"])),
+        )
+        for e in errors
+    ]  # fmt: skip
+    return catalogue.table("paper.errors", rows, *heads)
+
+
+def _sliding(robot: Robot, rows: data.Rows) -> Iterator[Block]:
+    """Note on the rows that have no operating point on the robot's own adhesion, if there are any."""
+    slides, table = rows.plain["status"] != "converged", rows.conditions
+    each = [
+        f"{table['configuration'][k]} {table['supply_voltage_V'][k]:.0f} V {table['slope_deg'][k]:.0f}° "
+        f"{words.short_status(str(rows.plain['status'][k]))}"
+        for k in np.flatnonzero(slides)
+    ]
+    if each:
+        raised = data.raised_words(robot, rows.ratio)
+        yield catalogue.note("paper.sliding", len(each), len(table), ", ".join(each), raised)
+
+
+def _against_the_bench(robots: dict[str, Robot], rows: dict[str, data.Rows], name: str) -> Section:
+    own_rows = rows[name]
+    certainty = data.slope_certainty(own_rows)
+    table = [(*row[:3], f"{row[3]:.3f} ({row[4]})", *row[5:]) for row in certainty]
+    blocks: list[Block] = [
+        catalogue.figure("paper.rows", own_rows, name),
+        catalogue.figure("paper.fig28_current_over_slope", robots[name], own_rows, certainty),
+        catalogue.table("paper.certainty", table),
+    ]
+    if TRACKED in own_rows.ratio:
+        blocks.append(catalogue.figure("paper.fig29_model_errors", robots, rows))
+    return Section("Against the bench", tuple(blocks), "bench")
+
+
 def implied_resistance(robot: Robot, table: runs.Runs) -> np.ndarray:
     """Resistance [Ω] in series with each motor that current and speed of each row imply by (15)."""
     current = table["total_current_A"]
@@ -57,184 +151,72 @@ def implied_resistance(robot: Robot, table: runs.Runs) -> np.ndarray:
     return robot.sides * (table["supply_voltage_V"] - back) / current
 
 
-def row_by_row(nominal: Robot, rows: data.Rows) -> list[Json]:
-    """The 20 rows: bench, the paper's simulation, the nominal robot three ways, and letters that say why."""
-    table = rows.conditions
+def _row_table(rows: data.Rows) -> Block:
+    """The 20 rows: bench, the paper's simulation, the nominal robot three ways, and letters that say why.
+
+    A wheeled row has a second one with the robot's own mass.
+    """
+    table, own_mass = rows.conditions, rows.weighed["total_mass_kg"]
     own, raised, weighed = (data.stack_channels(t) for t in (rows.plain, rows.raised, rows.weighed))
+    by_row = []
+    for k, letters in enumerate(row_reasons(ROBOTS["nominal"](), rows)):
+        names = ("configuration", "supply_voltage_V", "total_mass_kg", "slope_deg")
+        second = abs(own_mass[k] - table["total_mass_kg"][k]) > 0.05
+        for first, mass in ((True, table["total_mass_kg"][k]), (False, own_mass[k]))[: 1 + second]:
+            cells: list[object] = [table[n][k] if first else "" for n in names]
+            cells[2] = mass
+            for bench, paper, plain, found in zip(
+                rows.measured[k], rows.paper[k], own[k], (raised if first else weighed)[k], strict=True
+            ):
+                plain = plain if np.isfinite(plain) else Cell("slides", "slides")
+                cells += [bench, paper, plain] if first else [""] * 3
+                cells += [found if np.isfinite(found) else "no number"]
+                cells += [error_cell(float(simulation_errors.relative_error(found, x))) for x in (paper, bench)]
+            by_row.append((*cells, " ".join(letters) if first else ""))
+    heads = []
+    for c in data.channels_of_paper():
+        form, group = f"{{:.{max(c.resolution - 1, 0)}f}}", f"{c.label} [{c.unit}]"
+        heads += [Column(word, form=form, group=group) for word in ("bench", "paper", "own", "raised")]
+        heads += [Column(f"Δ {word}", form="{:+.1f}", group=group) for word in ("paper", "bench")]
+    return catalogue.table("paper.rowtable", by_row, *heads)
+
+
+def row_reasons(nominal: Robot, rows: data.Rows) -> Iterator[list[str]]:
+    """Letters of `paper.reasons` in the catalogue, for each row of the nominal robot."""
+    table = rows.conditions
+    raised, weighed = (data.stack_channels(t) for t in (rows.raised, rows.weighed))
     resistance = implied_resistance(nominal, runs.read_runs("simulated_by_paper"))
-    limit = float(nominal.motor.resistance)
-    answer = []
     for k in range(len(table)):
         wheeled = table["configuration"][k] == WHEELED
-        reasons = []
-        if rows.plain["status"][k] == "slides":
-            reasons.append("A")
-        if wheeled and abs(rows.weighed["total_mass_kg"][k] - table["total_mass_kg"][k]) > 0.05:
-            reasons.append("M")
-        if wheeled and abs(weighed[k, 0] - rows.paper[k, 0]) > 0.03 * rows.paper[k, 0]:
-            reasons.append("W")
-        if not wheeled and abs(raised[k, 0] - rows.paper[k, 0]) > 0.01 * rows.paper[k, 0]:
-            reasons.append("G")
-        if resistance[k] > 1.1 * limit:
-            reasons.append("E")
-        if raised[k, 1] > 1.03 * rows.measured[k, 1]:
-            reasons.append("B")
         following = (table["slope_deg"] == table["slope_deg"][k] + 5) & (
             (table["configuration"] == table["configuration"][k])
             & (table["supply_voltage_V"] == table["supply_voltage_V"][k])
         )
-        if following.any() and rows.paper[following, 1][0] > rows.paper[k, 1]:
-            reasons.append("N")
         creep = rows.raised["theoretical_speed_mm_s"][k] * rows.raised["slip"][k]
         radius = float(nominal.configurations[str(table["configuration"][k])].radius) / float(nominal.gearbox.ratio)
         creep_paper = rows.paper[k, 1] * RPM * radius / MM - rows.paper[k, 2]
-        if creep_paper > 1.5 * creep + 2:
-            reasons.append("S")
-        answer.append(
-            {
-                "configuration": table["configuration"][k],
-                "voltage": table["supply_voltage_V"][k],
-                "mass": table["total_mass_kg"][k],
-                "own_mass": float(rows.weighed["total_mass_kg"][k]),
-                "slope": table["slope_deg"][k],
-                "status": str(rows.plain["status"][k]),
-                "reasons": reasons,
-                "channels": [
-                    _cells(
-                        channel.name, rows.measured[k, c], rows.paper[k, c], own[k, c], raised[k, c], weighed[k, c]
-                    )
-                    for c, channel in enumerate(data.channels_of_paper())
-                ],
-            }
-        )
-    return answer
-
-
-def _cells(channel: str, measured: float, paper: float, own: float, raised: float, weighed: float) -> Json:
-    """Texts of one channel in a row. Differences by (35) of the nominal (raised, own mass) from paper and bench."""
-    return {
-        "measured": reading_text(measured, find_channel(channel)),
-        "paper": reading_text(paper, find_channel(channel)),
-        "own": reading_text(own, find_channel(channel)) if np.isfinite(own) else "slides",
-        "raised": reading_text(raised, find_channel(channel)) if np.isfinite(raised) else "no number",
-        "weighed": reading_text(weighed, find_channel(channel)) if np.isfinite(weighed) else "no number",
-        "to_paper": float(simulation_errors.relative_error(np.array(raised), np.array(paper))),
-        "to_paper_weighed": float(simulation_errors.relative_error(np.array(weighed), np.array(paper))),
-        "to_measured": float(simulation_errors.relative_error(np.array(raised), np.array(measured))),
-        "to_measured_weighed": float(simulation_errors.relative_error(np.array(weighed), np.array(measured))),
-    }
-
-
-def row_by_row_facts(nominal: Robot, rows: data.Rows) -> Json:
-    """The numbers behind the letters of `row_by_row`, for the page to put into words."""
-    measured = rows.conditions
-    of_paper = implied_resistance(nominal, runs.read_runs("simulated_by_paper"))
-    tracked = measured["configuration"] == TRACKED
-    slow, slope = measured["supply_voltage_V"] == 15.0, measured["slope_deg"]
-    used = rows.plain["adhesion_used"]
-    extra = rows.weighed["total_current_A"] - rows.paper[:, 0]
-    gap = 100 * (rows.raised["total_current_A"] - rows.paper[:, 0])[tracked] / rows.paper[tracked, 0]
-
-    def span(values: np.ndarray) -> tuple[float, float]:
-        return float(values.min()), float(values.max())
-
-    return {
-        "adhesion": tuple(float(nominal.configurations[c].ground.friction.static) for c in CONFIGURATIONS),
-        "used_tracked_15": float(used[tracked & (slope == 15)][0]),
-        "used_tracked_20": float(used[tracked & (slope == 20)][0]),
-        "used_wheeled_20": float(used[~tracked & (slope == 20)][0]),
-        "extra_slow": span(extra[~tracked & slow]),
-        "extra_fast": span(extra[~tracked & ~slow]),
-        "extra_flat": span(extra[~tracked & (slope == 0)]),
-        "guide_share": float(nominal.configurations[TRACKED].track.guide_share),
-        "gap": span(gap),
-        "resistance": float(nominal.motor.resistance),
-        "paper_slow": span(of_paper[tracked & slow]),
-        "paper_fast": span(of_paper[tracked & ~slow]),
-        "paper_wheeled": float(np.median(of_paper[~tracked])),
-        "bench": float(np.median(implied_resistance(nominal, measured))),
-    }
-
-
-def write_paper_page(folder: Path, file: RobotFile, *, model: str, gear: bool) -> tuple[Path, data.Rows | None]:
-    """Write `report.html` and `figures/` for a robot and its nominal fellows.
-
-    Args:
-        folder: an existing run folder.
-        file: of any robot, without one of the paper's configurations it is not compared with the bench.
-        model: fidelity.
-        gear: whether it resolves the running gear, so that there are Figs. 23-27 from it too.
-
-    Returns:
-        The path of the page, and the robot's results for the paper's rows, None without one of their configurations.
-    """
-    nominal = ROBOTS["nominal"]()
-    robot, robot_blocks = file.robot, page.robot_section(file)
-    name = file.name if robot_blocks["robot"] == words_shown(file.name) else robot_blocks["robot"]
-    robots = {name: robot} | {n: make() for n, make in ROBOTS.items() if n != name}
-    album = page.Album(folder)
-    facts: Json = {"gear": None, "errors": [], "sliding": [], "measured": 0, "raised": ""}
-    rows = {
-        n: r for n, r in ((n, data.simulate_measured_rows(member)) for n, member in robots.items()) if r is not None
-    }
-    own_rows = rows.get(name)
-    ratio = dict.fromkeys(data.shown_configurations(robot), 1.0) if own_rows is None else own_rows.ratio
-    if own_rows is not None:
-        facts |= _against_the_bench(album, robots, rows, name)
-    starts = data.simulate_starts(robot)
-    album.add("fig23_24_from_standstill", lambda: history_figures.from_standstill(starts, data.FIG_23, data.FIG_24))
-    if gear:
-        from sweeps.paper import running_gear_figures
-
-        facts["gear"] = running_gear_figures.draw_running_gear(album, robot)
-    facts["energy"] = album.add("energy_split", lambda: run_figures.draw_energy(robot, ratio))
-    album.add("fig05a_gearbox_efficiency", lambda: components.gearbox_efficiency(robots, own_rows))
-    album.add("fig10_battery", lambda: components.draw_battery(robots))
-    album.add("fig11_motor_friction", lambda: components.motor_friction(robots))
-    facts["idle"] = album.add("fig18_idle_track", lambda: components.idle_track(robots))
-    facts |= {
-        "rows": row_by_row(nominal, rows["nominal"]),
-        "facts": row_by_row_facts(nominal, rows["nominal"]),
-        "raised_nominal": data.raised_words(nominal, rows["nominal"].ratio),
-        "starts": starts,
-        "split": data.SPLIT,
-        "paper_channels": {c.name: (c.label, c.unit) for c in data.channels_of_paper()},
-        "paper_idle_r2": components.PAPER_IDLE_R2,
-    }
-    title = f"The paper's figures and tables: {robot_blocks['robot']}"
-    return page.render_page(
-        folder, "paper.html.j2", album, title=title, model=model, **robot_blocks, **facts
-    ), own_rows
-
-
-def _against_the_bench(album: page.Album, robots: dict[str, Robot], rows: dict[str, data.Rows], name: str) -> Json:
-    own_rows, robot = rows[name], robots[name]
-    album.add("rows", lambda: run_figures.row_parity(own_rows, name))
-    certainty = album.add("fig28_current_over_slope", lambda: run_figures.current_over_slope(robot, own_rows))
-    if TRACKED in own_rows.ratio:
-        album.add("fig29_model_errors", lambda: run_figures.model_errors(robots, rows))
-    errors = variant_errors(_variants(name, rows), own_rows)
-    pick = own_rows.plain["status"] != "converged"
-    table = own_rows.conditions
-    row_conditions = (table["configuration"], table["supply_voltage_V"], table["slope_deg"], own_rows.plain["status"])
-    return {
-        "answer": error_answer(errors),
-        "certainty": certainty,
-        "errors": errors,
-        "raised": data.raised_words(robot, own_rows.ratio),
-        "sliding": list(zip(*tuple(column[pick] for column in row_conditions), strict=True)),
-        "measured": len(own_rows.conditions),
-    }
+        current = rows.paper[k, 0]
+        holds = {
+            "A": rows.plain["status"][k] == "slides",
+            "M": wheeled and abs(rows.weighed["total_mass_kg"][k] - table["total_mass_kg"][k]) > 0.05,
+            "W": wheeled and abs(weighed[k, 0] - current) > 0.03 * current,
+            "G": not wheeled and abs(raised[k, 0] - current) > 0.01 * current,
+            "E": resistance[k] > 1.1 * float(nominal.motor.resistance),
+            "B": raised[k, 1] > 1.03 * rows.measured[k, 1],
+            "N": following.any() and rows.paper[following, 1][0] > rows.paper[k, 1],
+            "S": creep_paper > 1.5 * creep + 2,
+        }
+        yield [letter for letter, does in holds.items() if does]
 
 
 def _variants(name: str, rows: dict[str, data.Rows]) -> Columns:
     """Errors of the rows under the names that the table of errors shows."""
-    own_rows = rows[name]
+    own_rows, shown = rows[name], words.words_shown(name)
     error = data.channel_percent_errors
     answer = {
-        f"{words_shown(name)}: own adhesion, mass as printed": error(own_rows.plain, own_rows.measured),
-        f"{words_shown(name)}: adhesion raised, mass as printed": error(own_rows.raised, own_rows.measured),
-        f"{words_shown(name)}: adhesion raised, the robot's own mass": error(own_rows.weighed, own_rows.measured),
+        f"{shown}: own adhesion, mass as printed": error(own_rows.plain, own_rows.measured),
+        f"{shown}: adhesion raised, mass as printed": error(own_rows.raised, own_rows.measured),
+        f"{shown}: adhesion raised, the robot's own mass": error(own_rows.weighed, own_rows.measured),
     }
     if name != "nominal":
         pick = np.isin(rows["nominal"].conditions["configuration"], list(own_rows.ratio))

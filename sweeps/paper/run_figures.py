@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Any
+
 import numpy as np
 from matplotlib.figure import Figure
 
-from calibration.data import Columns, Json
 from calibration.inference import simulation_errors
 from mmrjax.model.paper_tables import TRACKED, WHEELED
 from mmrjax.model.robot import Robot
@@ -32,14 +34,17 @@ from sweeps.paper.components import CONFIGURATION, MODEL
 _MODES = {1: (BLUE, "o"), 2: (SKY, "v"), 3: (GREEN, "^"), 4: (VERMILION, "s")}
 
 
-def current_over_slope(robot: Robot, rows: data.Rows) -> tuple[Figure, list[Json]]:
-    """Fig. 28: total current over slope in four loading modes, with the measured points and R² (A1)."""
+def current_over_slope(robot: Robot, rows: data.Rows, certainty: Sequence[Sequence[Any]]) -> Figure:
+    """Fig. 28: total current over slope in four loading modes, with the measured points and R² (A1).
+
+    Args:
+        certainty: from `data.slope_certainty`.
+    """
     slopes = np.linspace(0, 20, 81)
     lines = data.current_over_slope(robot, rows.ratio, slopes)
     fig, grid = new_figure(1, len(rows.ratio), 4.4, sharey=True)
-    certainty = []
     for axes, kind in zip(grid[0], rows.ratio, strict=True):
-        for mode, (voltage, payload) in data.MODES.items():
+        for mode in data.MODES:
             colour, marker = _MODES[mode]
             own, raised = lines[kind, mode]
             axes.plot(slopes, raised, "--", color=colour, lw=1.3)
@@ -48,31 +53,17 @@ def current_over_slope(robot: Robot, rows: data.Rows) -> tuple[Figure, list[Json
             if stop.size and stop[-1] < len(slopes) - 1:
                 axes.plot(slopes[stop[-1]], own[stop[-1]], "x", color=colour, ms=7, mew=2)
             label_end(axes, slopes, raised, f"{mode}", colour, fontweight="bold", offset=(5 + 9 * (mode % 2), 0))
-            table = rows.conditions
-            pick = (
-                (table["configuration"] == kind)
-                & (table["supply_voltage_V"] == voltage)
-                & (table["payload_kg"] == payload)
-            )
+            pick = data.rows_of_mode(rows, kind, mode)
             if pick.any():
-                measured = rows.measured[pick, 0]
-                axes.plot(table["slope_deg"][pick], measured, marker, color=colour, ms=6.5, mec=INK, mew=0.8)
-                _, straight = data.fit_line(table["slope_deg"][pick], measured)
-                certainty.append(
-                    {
-                        "configuration": kind,
-                        "mode": mode,
-                        "straight": straight,
-                        "own": simulation_errors.r_squared(measured, rows.plain["total_current_A"][pick]),
-                        "own_rows": int(np.isfinite(rows.plain["total_current_A"][pick]).sum()),
-                        "raised": simulation_errors.r_squared(measured, rows.raised["total_current_A"][pick]),
-                        "weighed": simulation_errors.r_squared(measured, rows.weighed["total_current_A"][pick]),
-                    }
-                )
+                table = rows.conditions["slope_deg"][pick]
+                axes.plot(table, rows.measured[pick, 0], marker, color=colour, ms=6.5, mec=INK, mew=0.8)
         axes.set(xlabel="slope [°]", xticks=[0, 5, 10, 15, 20], xlim=(-0.5, 20.9))
         axes.set_title(kind)
-        fits = [r for r in certainty if r["configuration"] == kind]
-        texts = [f"mode {r['mode']}: R² {r['weighed']:.3f} (straight fit {r['straight']:.3f})" for r in fits]
+        texts = [
+            f"mode {mode}: R² {weighed:.3f} (straight fit {straight:.3f})"
+            for name, mode, straight, *_, weighed in certainty
+            if name == kind
+        ]
         corner_note(axes, "markers: measured\n" + "\n".join(texts), fontsize=8.5)
     grid[0, 0].set_ylim(0, 1.2 * grid[0, 0].dataLim.y1 if np.isfinite(grid[0, 0].dataLim.y1) else 1.0)
     grid[0, 0].set_ylabel("total current [A]")
@@ -81,14 +72,13 @@ def current_over_slope(robot: Robot, rows: data.Rows) -> tuple[Figure, list[Json
         f"loading modes   {modes}\nsolid: own adhesion, × where the robot begins to slide; dashed: adhesion raised",
         fontsize=9,
     )
-    return fig, certainty
+    return fig
 
 
-def model_errors(robots: dict[str, Robot], rows: dict[str, data.Rows]) -> tuple[Figure, Json]:
+def model_errors(robots: dict[str, Robot], rows: dict[str, data.Rows]) -> Figure:
     """Fig. 29: errors (35) in current and speed over slope, 6T2A, modes 1 and 2, adhesion raised."""
     fig, grid = new_figure(2, 2, 6.2, sharex=True)
     slopes = np.array([0.0, 5.0, 10.0, 15.0, 20.0])
-    errors: Json = {}
     for name, robot in robots.items():
         ratio = rows[name].ratio[TRACKED]
         colour = MODEL.get(name, PURPLE)
@@ -96,7 +86,6 @@ def model_errors(robots: dict[str, Robot], rows: dict[str, data.Rows]) -> tuple[
             if battery and name == "sm1":
                 continue  # SM-1 and SM-2 share the constant battery; the paper draws one
             for mode, error in data.supply_errors(robot, ratio, rows[name], battery).items():
-                errors[f"{name}{' battery' if battery else ''} mode {mode}"] = error
                 for row, channel in ((0, 0), (1, 2)):
                     axes = grid[row, mode - 1]
                     axes.plot(slopes, error[:, channel], ":" if battery else "-", color=colour, marker="o", ms=4)
@@ -131,7 +120,7 @@ def model_errors(robots: dict[str, Robot], rows: dict[str, data.Rows]) -> tuple[
         axes.set_xlabel("slope [°]")
     labels = [str(h.get_label()) for h in handles]
     fig.legend(handles=handles, loc="outside lower center", ncols=legend_columns(labels))
-    return fig, errors
+    return fig
 
 
 _SPLIT_COLOURS = {
@@ -146,28 +135,14 @@ _SPLIT_COLOURS = {
 }
 
 
-def draw_energy(robot: Robot, ratio: dict[str, float]) -> tuple[Figure, list[Json]]:
+def draw_energy(used: data.EnergyUse) -> Figure:
     """Use of the supply's power at twelve operating points, in percent, with watts at the end."""
-    runs = [(c, u, p, s) for c in ratio for u, p in ((15.0, 0.0), (33.0, 8.0)) for s in (0.0, 10.0, 20.0)]
-    kind, voltage, payload, slope = (np.array(v) for v in zip(*runs, strict=True))
-
-    def at(adhesion: np.ndarray) -> tuple[Columns, Columns]:
-        return data.energy_split(
-            robot,
-            data.batch_conditions(robot, kind, voltage=voltage, payload=payload, slope_deg=slope, adhesion=adhesion),
-        )
-
-    points, _ = at(np.ones(len(runs)))
-    slides = points["status"] == "slides"
-    lifted_points, lifted = at(np.where(slides, [ratio[k] for k in kind], 1.0))
     fig, grid = new_figure(1, 1, 5.2)
     axes = grid[0, 0]
-    table = []
-    height = [float(k) + 0.6 * (k // 3) for k in range(len(runs))]
-    left = np.zeros(len(runs))
-    total = lifted_points["power_supply_W"]
+    height = [float(k) + 0.6 * (k // 3) for k in range(len(used.labels))]
+    left = np.zeros(len(used.labels))
     for item in (*data.SPLIT, "other"):
-        share = 100 * lifted[item] / total
+        share = 100 * used.power[item] / used.total
         share = np.where(np.isfinite(share), share, 0.0)
         if np.abs(share).max() < 0.05:  # not to be seen, and in no legend
             continue
@@ -185,23 +160,17 @@ def draw_energy(robot: Robot, ratio: dict[str, float]) -> tuple[Figure, list[Jso
                     color="white" if dark else INK,
                 )
         left = left + share
-    labels = []
-    for k, (c, u, _p, s) in enumerate(runs):
-        labels.append(f"{c}  {u:.0f} V  {_p:.0f} kg  {s:.0f}°" + (" *" if slides[k] else ""))
-        alive = np.isfinite(total[k])
-        text = f"{total[k]:.0f} W" if alive else words.short_status(str(lifted_points["status"][k]))
-        axes.text(101 if alive else 1, height[k], text, va="center", fontsize=8.5)
-        table.append(
-            {"point": labels[-1], "total": float(total[k])}
-            | {item: float(lifted[item][k]) for item in (*data.SPLIT, "other")}
-        )
-    axes.set_yticks(height, labels, fontsize=8.5)
+    for y, total, status in zip(height, used.total, used.status, strict=True):
+        alive = np.isfinite(total)
+        text = f"{total:.0f} W" if alive else words.short_status(str(status))
+        axes.text(101 if alive else 1, y, text, va="center", fontsize=8.5)
+    axes.set_yticks(height, used.labels, fontsize=8.5)
     axes.invert_yaxis()
     axes.grid(False)
-    remark = "\n* slides on its own adhesion; shown with adhesion raised" if slides.any() else ""
+    remark = "\n* slides on its own adhesion; shown with adhesion raised" if "*" in "".join(used.labels) else ""
     axes.set(xlabel=f"share of the power taken from the supply [%]{remark}", xlim=(0, 108), xticks=range(0, 101, 20))
     outer_legend(axes, "upper center")
-    return fig, table
+    return fig
 
 
 def row_parity(rows: data.Rows, name: str) -> Figure:

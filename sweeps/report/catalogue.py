@@ -43,10 +43,11 @@ def figure(name: str, *drawn: Any, finding: str = "", words: Sequence[Any] = (),
         more: end of the caption.
     """
     entry = _entry(name)
-    module, _, function = entry["draws"].partition(".")
+    module, _, function = entry["draws"].rpartition(".")
+    module = f"sweeps.{module}" if "." in module else f"sweeps.pages.{module}"
 
     def draw() -> Any:
-        return getattr(importlib.import_module(f"sweeps.pages.{module}"), function)(*drawn)
+        return getattr(importlib.import_module(module), function)(*drawn)
 
     return Figure(name.partition(".")[2], finding or entry["finding"], text(name, *words) + more, draw)
 

@@ -216,6 +216,7 @@ class Document:
         blocks: what follows it before the first heading.
         sections: the rest, in order.
         page_sections: makes those that only the page has, before them.
+        brief: lines of a terminal that does not want the rest, none if it always does.
     """
 
     title: str
@@ -223,6 +224,7 @@ class Document:
     blocks: tuple[Block, ...]
     sections: tuple[Section, ...] = ()
     page_sections: Callable[[], Iterable[Section]] = tuple
+    brief: Names = ()
 
     @property
     def every_block(self) -> list[Block]:

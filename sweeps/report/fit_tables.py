@@ -9,6 +9,7 @@ import numpy as np
 
 from calibration.data import Columns
 from calibration.inference.residual_clusters import ResidualCluster
+from calibration.inference.simulation_errors import r_squared
 from mmrjax.model.channels import Channel
 from sweeps.report import catalogue, run_tables
 from sweeps.report.document import Cell, Column, Section, Table, remarks
@@ -60,6 +61,28 @@ def rms_table(rms: Mapping[str, Mapping[str, float]], shown: Sequence[Channel]) 
     """rms errors in the units of their channels, by fit."""
     rows = [(FITS[fit], *(by.get(c.name) for c in shown)) for fit, by in rms.items()]
     return catalogue.table("fit.rms", rows, *(f"{c.label} [{c.unit}] | .3g" for c in shown))
+
+
+def fits_of_runs(table: Columns, shown: Sequence[Channel], lines: Mapping[str, str]) -> Table:
+    """Fit of each run, 100 (1 - |y - ŷ| / |y - mean y|) [%]: 100 is exact, 0 is as good as the mean.
+
+    Args:
+        lines: prefixes of simulated columns and their names.
+    """
+    runs = np.asarray(table.get("run_id", np.zeros(len(table["time_s"]))))
+    fits = [
+        (
+            str(name), words,
+            *(
+                100 - 100 * np.sqrt(1 - r_squared(table[c.column][rows], table[prefix + c.column][rows]))
+                for c in shown
+            ),
+        )
+        for name in dict.fromkeys(runs.tolist())
+        for rows in (runs == name,)
+        for prefix, words in lines.items()
+    ]  # fmt: skip
+    return catalogue.table("fit.runs", fits, *(f"{c.label} | .1f" for c in shown))
 
 
 def clusters_section(clusters: Sequence[ResidualCluster]) -> tuple[Section, ...]:

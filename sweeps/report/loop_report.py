@@ -23,7 +23,7 @@ from mmrjax.errors import count_noun
 from mmrjax.model import params
 from sweeps.pages import words
 from sweeps.report import catalogue, fit_tables, run_tables
-from sweeps.report.document import Block, Cell, Document, Note, Section, Table, remarks
+from sweeps.report.document import Block, Cell, Document, Figure, Note, Section, Table, remarks
 from sweeps.report.fit_tables import Change
 
 #: Change of an rms error that is marked [%].
@@ -41,22 +41,41 @@ def loop_document(found: DiscoveryResult, robot_name: str, changes: Mapping[str,
         robot_name: name or file of the robot that it began with.
         changes: of settled runs by each effect.
     """
-    missing = found.verdict not in ("none", "undescribed")
-    moved = list(moved_parameters(found))
+    missing, table = found.verdict not in ("none", "undescribed"), rows_of(found)
+    moved, added = list(moved_parameters(found)), list(_findings(found, changes))
     rise = loop_words.rising_errors_sentence(found.held_out_worse, found.predicted)
     return Document(
         f"Is the {words.words_shown(Path(robot_name).name)} model complete?",
         found.statement,
         (
-            *([Note(tuple(moved), name="moved", terminal=True)] if moved else []),
-            *([Note(tuple(_findings(found, changes)), name="found", terminal=True)] if found.effects else []),
+            *remarks(moved, "moved"),
+            *_first_figure(found, table, changes),
             _summary(found),
             *([Note(rise, name="worse", terminal=True)] if rise else []),
             _advice(found),
+            *remarks(added, "found"),
             *run_tables.curve_warning(found.robot),
         ),
-        tuple(_sections(found, changes, missing)),
+        tuple(_sections(found, table, changes, missing)),
+        brief=loop_words.brief_answer(found, moved, _next_step(found, "")),
     )
+
+
+def _first_figure(found: DiscoveryResult, table: Columns, changes: Mapping[str, Change]) -> Iterable[Block]:
+    """The law that was found, on its readings. Without one, and of logs, measured and simulated readings."""
+    if isinstance(found.detail, TimeStatistics):
+        lines = {"after_": "simulated" if found.refit_alone else "with what was found"}
+        lines |= {} if found.refit_alone else {"before_": "before"}
+        yield catalogue.figure("fit.overlay", table, found.channels, lines, finding=found.statement)
+        yield fit_tables.fits_of_runs(table, found.channels, lines)
+    elif changes:
+        name, change = next(iter(changes.items()))
+        size = next(loop_words.effect_amplitude(e) for e in found.effects if e.name == name)
+        yield catalogue.figure("loop.law", found, table, {name: change}, words=(name, size))
+    elif found.unnamed is not None:
+        yield _curve(found)
+    else:
+        yield catalogue.figure("loop.before_after", table, found.channels, "none", words=("",))
 
 
 def rows_of(found: DiscoveryResult) -> Columns:
@@ -121,10 +140,10 @@ def _summary(found: DiscoveryResult) -> Table:
     for what, seen, held in lines:
         cells = []
         for c, e in seen.items():
-            other = f" ({held[c]['rms_percent']:.1f} %)" if c in held and held[c]["rows"] else ""
+            other = f" ({loop_words.percent_text(held[c])} %)" if c in held and held[c]["rows"] else ""
             last, rows_before = before.get(c, (e["rms_percent"], e["rows"]))
             change = e["rms_percent"] - last if rows_before == e["rows"] else 0.0
-            cells.append(_marked(f"{e['rms_percent']:.1f} %{other}", change) if e["rows"] else Cell("-"))
+            cells.append(_marked(f"{loop_words.percent_text(e)} %{other}", change) if e["rows"] else Cell("-"))
         before = {c: (float(e["rms_percent"]), int(e["rows"])) for c, e in seen.items()}
         reached, also = (max((int(e["rows"]) for e in by.values()), default=0) for by in (seen, held))
         rows.append((what, *cells, f"{reached}/{total}" + (f" ({also}/{total})" if also else "")))
@@ -140,7 +159,7 @@ def held_out_table(found: DiscoveryResult) -> Table:
         worse = {w.channel for w in found.held_out_worse if w.kind == kind}
         cells = []
         for c in both[0]:
-            texts = [f"{e[c]['rms_percent']:.1f}" if e[c]["rows"] else "-" for e in both[: 1 + many]]
+            texts = [loop_words.percent_text(e[c]) for e in both[: 1 + many]]
             change = both[1][c]["rms_percent"] - both[0][c]["rms_percent"] if many else 0.0
             change_shown = np.inf if c in worse else change if not kind or change < 0 else 0.0
             cells.append(_marked(" → ".join(texts), change_shown))
@@ -154,15 +173,21 @@ def held_out_table(found: DiscoveryResult) -> Table:
     return catalogue.table("loop.errors", rows, *(f"{c.label} |" for c in found.channels))
 
 
-def _advice(found: DiscoveryResult) -> Table:
+def _next_step(found: DiscoveryResult, more: str) -> str:
+    """What to do next. `more`: what follows the name and description of an experiment."""
     after = found.next_experiment
-    if after is None:
-        level, texts = found.headline.level, {"none", "undescribed", "named", "open"}
-        next_step = catalogue.text(f"loop.next-{level if level in texts else 'other'}")
-    else:
-        tells = f" It distinguishes {', '.join(after.separates)}; expected separation {after.expected_sigma:.1f} σ."
-        undecided = " Some pairs stay undecided." if found.headline.level == "class" and not after.settles else ""
-        next_step = f"**{after.name}**: {after.description}.{tells * bool(after.separates)}{undecided}"
+    if after is not None:
+        return f"**{after.name}**: {after.description}.{more}"
+    level, texts = found.headline.level, {"none", "undescribed", "named", "open"}
+    return catalogue.text(f"loop.next-{level if level in texts else 'other'}")
+
+
+def _advice(found: DiscoveryResult) -> Table:
+    after, more = found.next_experiment, ""
+    if after is not None and after.separates:
+        more = f" It distinguishes {', '.join(after.separates)}; expected separation {after.expected_sigma:.1f} σ."
+    if after is not None and found.headline.level == "class" and not after.settles:
+        more += " Some pairs stay undecided."
     far = [describe(note) for note in with_codes(found.remarks, "far_from_prior", "repeats", "copied")]
     against = [note for note in found.remarks if isinstance(note, str)]
     sentences = [
@@ -171,15 +196,15 @@ def _advice(found: DiscoveryResult) -> Table:
         *against[:1],
     ]  # a sentence begins with a capital, a parameter does not
     rows = [
-        ("use it?", " ".join(loop_words.use_it(found)) or "No runs could be held out."),
+        ("May I use it?", " ".join(loop_words.use_it(found)) or "No runs could be held out."),
         (
-            "check first",
+            "What to check first",
             " ".join(
                 [f"{text if '.' in text.split()[0] else text[0].upper() + text[1:]}." for text in sentences if text]
             )
             or "Nothing unusual.",
         ),
-        ("do next", next_step),
+        ("What to do next", _next_step(found, more)),
     ]
     return catalogue.table("loop.advice", rows)
 
@@ -280,9 +305,11 @@ def _certain(found: DiscoveryResult, missing: bool) -> Iterable[Section]:
         yield _resolved(found)
 
 
-def _sections(found: DiscoveryResult, changes: Mapping[str, Change], missing: bool) -> Iterable[Section]:
-    table, looked_for = rows_of(found), Section("What was looked for", tuple(_looked_for(found)))
-    yield Section("Measured and simulated, run by run", tuple(_run_by_run(found, table)))
+def _sections(
+    found: DiscoveryResult, table: Columns, changes: Mapping[str, Change], missing: bool
+) -> Iterable[Section]:
+    looked_for = Section("What was looked for", tuple(_looked_for(found)))
+    yield Section("Measured and simulated, run by run", tuple(_run_by_run(found, table, changes)))
     yield from [] if missing else [looked_for]
     where = "Where it is missing" if missing else "What each equation lacks"
     yield Section(where, tuple(_where_missing(found, table, changes)))
@@ -291,7 +318,9 @@ def _sections(found: DiscoveryResult, changes: Mapping[str, Change], missing: bo
     fits = {when: by for when, by in found.rms.items() if not (found.refit_alone and "after" in when)}
     sized = Layout.of(found.robot).crosses_zero
     in_units = [fit_tables.rms_table(fits, found.channels)] if sized else []
-    yield Section("Errors on runs that the fit has seen, and has not", (errors, held_out_table(found), *in_units))
+    seen: list[Block] = [errors, held_out_table(found), *in_units]
+    seen += [catalogue.figure("loop.gains", found)] if len(found.gains) > 1 else []
+    yield Section("Errors on runs that the fit has seen, and has not", tuple(seen))
     yield from _certain(found, missing)
     yield Section("Candidates", tuple(_candidates(found)))
     hidden = catalogue.figure("loop.null", found.before), catalogue.figure("loop.look_alikes", found)
@@ -306,21 +335,18 @@ def _sections(found: DiscoveryResult, changes: Mapping[str, Change], missing: bo
     yield Section("Words", (catalogue.table("loop.words", list(words.GLOSSARY.items())),))
 
 
-def _run_by_run(found: DiscoveryResult, table: Columns) -> Iterable[Block]:
+def _run_by_run(found: DiscoveryResult, table: Columns, changes: Mapping[str, Change]) -> Iterable[Block]:
     verdict, detail = "none" if found.refit_alone else found.verdict, found.detail
-    if not isinstance(detail, TimeStatistics):
+    if isinstance(detail, TimeStatistics):
+        some = f", of the first 8 of {detail.runs} runs" if detail.runs > 8 else ""
+        yield catalogue.figure("loop.over_time", found.runs, table, found.channels, verdict, words=(some,))
+    elif changes or found.unnamed is not None:  # else it is the first figure
         yield catalogue.figure("loop.before_after", table, found.channels, verdict, words=("",))
-        return
-    lines = {"after_": "with what was found", "before_": "before"}
-    lines = {"after_": "simulated"} if verdict == "none" else lines
-    yield catalogue.figure("fit.overlay", table, found.channels, lines, finding=found.statement)
-    some = f", of the first 8 of {detail.runs} runs" if detail.runs > 8 else ""
-    yield catalogue.figure("loop.over_time", found.runs, table, found.channels, verdict, words=(some,))
 
 
 def _where_missing(found: DiscoveryResult, table: Columns, changes: Mapping[str, Change]) -> Iterable[Block]:
     verdict, sized = "none" if found.refit_alone else found.verdict, Layout.of(found.robot).crosses_zero
-    if changes:
+    if len(changes) > 1:
         yield catalogue.figure("loop.laws", found, table, changes)
     if isinstance(detail := found.detail, TimeStatistics):
         memory = detail.before.memory
@@ -328,16 +354,25 @@ def _where_missing(found: DiscoveryResult, table: Columns, changes: Mapping[str,
         names = ", ".join(detail.orders_unresolved)
         more = catalogue.text("loop.unresolved", names) if names else ""
         yield catalogue.figure("loop.series", detail, found.channels, verdict, words=numbers, more=more)
+        yield catalogue.figure("loop.input_correlation", found.runs, table, found.channels, verdict)
     else:
         figure_input = table, verdict, sized
         yield catalogue.figure(
             "loop.defects", *figure_input, words=(_closed(found, table) if sized else catalogue.text("loop.three"),)
         )
     if found.unnamed is not None:
-        curve = found.unnamed
-        key = "tentative" if found.effects else "written" if found.written else "left"
-        yield catalogue.figure("loop.curve", curve, words=(catalogue.text(f"loop.curve-{key}", curve.effect),))
-        yield Note(loop_words.proposed_formula(curve), name="proposal")
+        if changes or isinstance(detail, TimeStatistics):  # else it is the first figure
+            yield _curve(found)
+        yield Note(loop_words.proposed_formula(found.unnamed), name="proposal")
+
+
+def _curve(found: DiscoveryResult) -> Figure:
+    """The smooth curve of a discrepancy without a name."""
+    assert found.unnamed is not None
+    key = "tentative" if found.effects else "written" if found.written else "left"
+    return catalogue.figure(
+        "loop.curve", found.unnamed, words=(catalogue.text(f"loop.curve-{key}", found.unnamed.effect),)
+    )
 
 
 def _closed(found: DiscoveryResult, table: Columns) -> str:
@@ -393,6 +428,7 @@ def _named(values: Mapping[str, float]) -> str:
 
 
 def _looked_for(found: DiscoveryResult) -> Iterable[Block]:
+    yield catalogue.figure("loop.power", found)
     yield catalogue.note("loop.seen-above")
     level, listed = found.before.kinds["single"].threshold, []
     for s in found.scores:
@@ -414,7 +450,7 @@ def _base(found: DiscoveryResult) -> Table:
         (
             f"`{name}`", p.prior, p.before, p.after, p.sd_after, p.unit, fit_tables.shift_cell(p.shift_before),
             fit_tables.shift_cell(p.shift_after), describe(Determination.of(name, p.held_by_prior, found.together)),
-            p.meaning,
+            p.at_bound or "", p.meaning,
         )
         for name, p in found.base_shift.items()
     ]  # fmt: skip

@@ -23,4 +23,4 @@ def write_report_page(folder: Path, document: Document, file: RobotFile | None =
         if isinstance(block, Figure):
             album.add(block.name, block.draw)
     about: Json = {"warnings": (), "about_robot": None} if file is None else robot_section(file)
-    return render_page(folder, "document.html.j2", album, title=document.title, document=document, **about)
+    return render_page(folder, album, title=document.title, document=document, **about)

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from calibration.data import Columns, Json
+from calibration.data.columns import IMPOSED
 from calibration.data.robot_file import RobotFile
 from mmrjax import effects
 from mmrjax.model import channels
@@ -24,7 +25,7 @@ from sweeps.report import catalogue
 from sweeps.report.document import Cell, Column, Note, Table, columns
 
 #: Units of what may be imposed on a run, by column.
-UNITS = {"supply_voltage_V": "V", "motor_speed_rpm": "rpm", "motor_current_A": "A"}
+UNITS = {column: column.rpartition("_")[2] for column, _ in IMPOSED.values()}
 
 
 def imposed_column(runs: Iterable[str]) -> str:

@@ -152,9 +152,8 @@ def _histories(robot: Robot, runs: Columns, names: list[str], histories: Run) ->
     if history.reactions is not None:
         averaged = catalogue.text("runs.averaged", 1e3 * float(history.time[0, 1] - history.time[0, 0]))
     figure = catalogue.figure("runs.history", starts, more=averaged)
-    yield Section(
-        "From standstill", (*cut, figure, _starts(starts), catalogue.figure("runs.slip", starts)), "history-section"
-    )
+    slip = catalogue.figure("runs.slip", starts)
+    yield Section("From standstill", (*cut, figure, starts_table(starts), slip), "history-section")
     if history.reactions is None:
         return
     share = np.asarray(histories.columns["guide_share"])
@@ -165,7 +164,7 @@ def _histories(robot: Robot, runs: Columns, names: list[str], histories: Run) ->
         yield Section("Inside the running gear", tuple(_gear(ripples)), "gear")
 
 
-def _starts(starts: Sequence[Any]) -> Table:
+def starts_table(starts: Sequence[Any]) -> Table:
     """Stages, currents and slip of each start, without stages where a run does not get under way."""
     rows = []
     for s in starts:
@@ -179,12 +178,17 @@ def _starts(starts: Sequence[Any]) -> Table:
     return catalogue.table("runs.starts", rows)
 
 
-def _gear(ripples: Sequence[Any]) -> Iterable[Block]:
-    """Ripple of currents, speeds and reactions at the end of runs."""
+def ripple_table(ripples: Sequence[Any]) -> Table:
+    """Ripple of each run at its end."""
     from sweeps.pages import gear_figures
 
+    return catalogue.table("runs.ripple-table", [tuple(gear_figures.ripple_numbers(g).values()) for g in ripples])
+
+
+def _gear(ripples: Sequence[Any]) -> Iterable[Block]:
+    """Ripple of currents, speeds and reactions at the end of runs."""
     yield catalogue.figure("runs.ripple", ripples)
-    yield catalogue.table("runs.ripple-table", [tuple(gear_figures.ripple_numbers(g).values()) for g in ripples])
+    yield ripple_table(ripples)
     for gear in [g for g in ripples if g.on_tracks][:1]:
         yield catalogue.figure("runs.touchdown", gear, f"{gear.name}: touchdowns dotted")
     yield catalogue.figure("runs.reactions", ripples)

@@ -16,6 +16,9 @@ IMPOSED = {
     "voltage": ("voltage", "V"),
     "motor_speed": ("motor speed", "rpm"),
     "motor_current": ("motor current", "A"),
+    "goal_angle": ("goal", "deg"),
+    "goal_speed": ("goal", "rpm"),
+    "goal_current": ("goal", "A"),
 }
 
 

@@ -16,9 +16,12 @@ SHORT = 12
 TONES = {"bad": "red"}
 
 
-def print_document(document: Document) -> None:
-    """Print a document: the answer first, then what its blocks show on a terminal."""
+def print_document(document: Document, brief: bool = False) -> None:
+    """Print a document: the answer first, then what its blocks show on a terminal, or its `brief` lines."""
     print_output(plain_text(document.answer))
+    if brief:
+        print_output("\n".join(map(plain_text, document.brief)))
+        return
     for block in document.every_block:
         if isinstance(block, Note) and block.terminal:
             items = (block.text,) if isinstance(block.text, str) else tuple(f"- {item}" for item in block.text)

@@ -90,6 +90,7 @@ from mmrjax.fidelities.histories import (
 from mmrjax.model import balances, channels
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.params import Scalar
+from mmrjax.model.quantities import GOALS
 from mmrjax.model.rig import Begin, Begins, Rig
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import CONVERGED, FAILED, Signals, State
@@ -111,9 +112,10 @@ JUMP = 7.0
 #: Fields of `Conditions` that may change within a run.
 CHANGING = (
     "voltage", "motor_current", "slope_deg", "payload", "adhesion", "total_mass", "duty", "open", "load_torque",
+    "goal",
 )  # fmt: skip
 #: Imposed quantities among these, and the torque of a brake, which is measured.
-ON_LINES = ("voltage", "motor_current", "duty", "load_torque")
+ON_LINES = ("voltage", "motor_current", "duty", "load_torque", "goal")
 #: Shortest interval of unchanged conditions that may show steady travel [s].
 LASTING = 0.25
 #: Fewest steps between samples for a run that is driven both ways, near rest, if shafts and load do not move as one:
@@ -121,6 +123,7 @@ LASTING = 0.25
 #: current the instant of rest depends more on calibrated parameters), plus this many times the delay.
 FINE, DELAYED = 16, 2.0
 SLOW, EARLIER = {"voltage": 0.1, "motor_current": 0.3}, {"voltage": 0.03, "motor_current": 0.06}
+SLOW |= dict.fromkeys(GOALS, SLOW["motor_current"])
 #: Longest step elsewhere, in usual longest steps.
 FAST = 2
 #: Longest step of a load on an elastic joint, as a share of its swing's time per radian: readings within 0.1 %.
@@ -264,14 +267,16 @@ class Histories(Observer):
         mine, every = ([table.in_order(name) for name in names] for table in (runs, whole))
         given = [runs["time_s"][m] for m in mine]
         # Rows of the log without a reading here are kept if the imposed quantity changes there.
+        smooth = runs.log is not None and robot.rig.imposed == "motor_current" and not linear
         noted = [
-            np.isin(whole["time_s"][rows], t) | exact | linear | _drive_changes(whole, rows)
+            np.isin(whole["time_s"][rows], t) | exact | linear | _drive_changes(whole, rows, SMALL if smooth else 0.0)
             for rows, t in zip(every, given, strict=True)
         ]
-        steps = [
-            np.minimum.reduceat(h, np.flatnonzero(n)[:-1])
-            for h, n in zip(_longest_steps(runs, robot), noted, strict=True)
-        ]
+        longest_steps = _longest_steps(runs, robot)
+        if smooth:
+            noted = [n | _step_begins(whole["time_s"][rows], n) for n, rows in zip(noted, every, strict=True)]
+            whole = _averaged_drive(whole, every, noted)
+        steps = [np.minimum.reduceat(h, np.flatnonzero(n)[:-1]) for h, n in zip(longest_steps, noted, strict=True)]
         change = LOOSE if robot.loose else CHANGE
         grids = [
             time_grid(whole["time_s"][rows[n]], *c, h, START if robot.has_ground else change, change, parts)
@@ -415,7 +420,7 @@ class Histories(Observer):
 
     @classmethod
     def free(cls) -> tuple[tuple[str, ...], tuple[str, ...]]:
-        return ("motor.inductance", "motor.inertia", DELAY), ("inertia", *settled_ends.SLIDING)
+        return ("motor.inductance", "motor.inertia", DELAY), ("inertia", *settled_ends.GRIP, *settled_ends.SLIDING)
 
     def defective(
         self, robot: Robot, probes: tuple[Effect, ...]
@@ -932,6 +937,8 @@ def _check_signs(runs: Runs) -> None:
 
     A rig's inertia may carry it forwards during one interval, but not during all of a table.
     """
+    if runs.layout.imposed in GOALS:  # an output may turn away from its goal
+        return
     volts, measured = applied_drive(runs), runs.measured()
     time, size = runs["time_s"], np.nanmax(np.abs(measured), 0, initial=0.0)
     unsigned = np.nanmin(measured, 0, initial=0.0) >= -RESTING * size
@@ -989,6 +996,25 @@ def _drive_changes(runs: Runs, rows: np.ndarray, share: float = 0.0) -> np.ndarr
     )
     changes[1:] |= _relative_jumps(applied_drive(runs)[rows]) > share
     return changes
+
+
+def _step_begins(time: np.ndarray, noted: np.ndarray) -> np.ndarray:
+    """True for rows that divide the time between noted ones into parts of at most the usual longest step."""
+    begin = time[np.maximum.accumulate(np.where(noted, np.arange(len(time)), 0))]
+    part = np.floor((time - begin) / (FAST * LONGEST) + 1e-9)
+    return np.diff(part, prepend=0.0) > 0
+
+
+def _averaged_drive(runs: Runs, each: list[np.ndarray], noted: list[np.ndarray]) -> Runs:
+    """Runs with the mean of the imposed current between noted rows, which moves the load as much."""
+    column, time = runs.layout.imposed_column, runs["time_s"]
+    drive = runs[column].copy()
+    for rows, begins in zip(each, noted, strict=True):
+        lasts, first = np.diff(time[rows], append=time[rows[-1]]), np.flatnonzero(begins)
+        total, span = (np.add.reduceat(x, first) for x in (drive[rows] * lasts, lasts))
+        mean = np.where(span > 0, total / np.where(span > 0, span, 1.0), drive[rows[first]])
+        drive[rows] = mean[np.cumsum(begins) - 1]
+    return dataclasses.replace(runs, columns={**runs.columns, column: drive})
 
 
 def _relative_jumps(driven: np.ndarray) -> np.ndarray:

@@ -1,0 +1,52 @@
+"""Controller of an actuator: the duty that it demands for a goal, from the readings of the output or the motor."""
+
+from __future__ import annotations
+
+import equinox as eqx
+
+from mmrjax.model.params import Scalar, parameter
+from mmrjax.numerics.one_sided import clip
+
+#: Source of the gains.
+STATED = "stated by the owner of the actuator"
+
+
+class Controller(eqx.Module):
+    """Proportional, integral and derivative action on a goal, and a feed-forward, within a limit.
+
+    D = K_p e + K_i ∫ e dt - K_d dx/dt + K_f g, with e = g - x, |D| <= D_max. While D is at the limit, an error that
+    drives it further is not integrated. x is the angle or the speed of the output, or the current of the motor. dx/dt
+    acts where x is an angle, K_f g where it is not.
+
+    Attributes:
+        supply_voltage: of the driver, for tables without its column [V]. 0: they have the column.
+    """
+
+    kp: Scalar = parameter(
+        0.0, "-", "proportional gain: share of the supply's voltage per rad, rad/s or A of error", (0.0, 1e6), STATED,
+        relative_sd=0.3,
+    )  # fmt: skip
+    ki: Scalar = parameter(
+        0.0, "1/s", "integral gain: the same per second", (0.0, 1e6), STATED, relative_sd=0.3,
+    )  # fmt: skip
+    kd: Scalar = parameter(
+        0.0, "s", "derivative gain: share of the supply's voltage per rad/s of the output", (0.0, 1e4), STATED,
+        relative_sd=0.3,
+    )  # fmt: skip
+    feed_forward: Scalar = parameter(
+        0.0, "-", "share of the supply's voltage per rad/s or A of the goal", (-1e3, 1e3), STATED, relative_sd=0.3,
+    )  # fmt: skip
+    limit: Scalar = parameter(1.0, "-", "largest duty", (0.01, 1.0), STATED, relative_sd=0.1)
+    supply_voltage: float = eqx.field(default=0.0, static=True)
+
+    def duty(self, error: Scalar, integral: Scalar, speed: Scalar, goal: Scalar) -> Scalar:
+        """Duty [-] within the limit.
+
+        Args:
+            error: e [rad, rad/s or A].
+            integral: ∫ e dt.
+            speed: dx/dt of an angle [rad/s], else 0.
+            goal: g of a speed or a current, else 0.
+        """
+        wanted = self.kp * error + self.ki * integral - self.kd * speed + self.feed_forward * goal
+        return clip(wanted, -self.limit, self.limit)

@@ -1,0 +1,139 @@
+"""A controller in the loop: simulation, steps, derivatives, tables of goal and angle, and calibration from them."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from worlds import servo
+
+import mmrjax as mm
+from calibration.data import robot_file
+from calibration.data import runs as records
+from calibration.data.input_errors import BadConfiguration, BadData
+from mmrjax.fidelities import drive, histories
+from mmrjax.model import params
+
+SMOOTH = {**servo.TRUE, "coulomb": 0.0, "ki": 50.0}
+
+
+@pytest.fixture
+def actuator(tmp_path):
+    """Robot of a file with these values. `lines`: a replacement in its text."""
+
+    def made(values=servo.TRUE, old="", new=""):
+        (tmp_path / "servo.toml").write_text(servo.RIG.format(**values).replace(old, new))
+        return robot_file.read_robot(tmp_path / "servo.toml")
+
+    return made
+
+
+def angles(robot, goal, times, parts=1):
+    """Simulated angles of the output [rad] for a goal held from each of its instants."""
+    grid = histories.time_grid(times, goal[0], parts=parts)
+    held = goal[1][np.searchsorted(goal[0], grid, side="right") - 1]
+    conditions = mm.Conditions(voltage=servo.TRUE["supply"], goal=0.0)
+    conditions = eqx.tree_at(lambda c: c.goal, conditions, jnp.asarray(held))
+    shown = jax.jit(lambda r: histories.history_signals(r, conditions, jnp.asarray(grid)).angle)
+    return shown(robot), np.searchsorted(grid, times)
+
+
+STEPS = np.array([0.0, 0.25]), np.array([0.8, -0.3])
+
+
+def test_a_servo_follows_as_an_own_simulation(actuator):
+    times = np.linspace(0.0, 0.4, 9)
+    own = servo.simulate(STEPS, times, servo.TRUE)[0]
+    shown, rows = angles(actuator(), STEPS, times, parts=8)
+    assert_allclose(np.asarray(shown)[rows], own, atol=1e-6)
+
+
+def test_a_run_of_drive_follows_as_an_own_simulation(actuator):
+    times = np.linspace(0.0, 0.5, 11)
+    own, states = servo.simulate((np.zeros(1), np.ones(1)), times, SMOOTH)
+    one = jax.tree.map(lambda x: jnp.asarray(x)[None], mm.Conditions(voltage=7.4, goal=1.0))
+    run = drive.drive_batch(actuator(SMOOTH), one, jnp.asarray(times), 1e-9, 20_000)
+    assert_allclose(run.signals.angle[0], own, atol=1e-6)
+    assert 50 * np.abs(states[:, 3]).max() > 0.1, "the integral acts"
+
+
+@pytest.mark.parametrize("name", ["controller.kp", "controller.kd", "controller.limit", "motor.torque_constant"])
+def test_derivatives_of_a_controlled_run_are_finite_differences(actuator, name):
+    robot, times = actuator(), np.linspace(0.0, 0.4, 9)
+    onward = STEPS[0], np.array([0.8, 1.2])  # a reversal within a step has an error of its own
+    value = next(float(p.value) for p in params.walk_parameters(robot) if p.name == name)
+
+    def shown(x):
+        found, rows = angles(params.replace(robot, {name: x}), onward, times)
+        return found[rows]
+
+    h = 1e-4 * value
+    _, slope = jax.jvp(shown, (jnp.asarray(value),), (jnp.ones(()),))
+    differences = (shown(jnp.asarray(value + h)) - shown(jnp.asarray(value - h))) / (2 * h)
+    assert np.abs(differences).max() > 1e-3 / value
+    assert_allclose(slope, differences, atol=1e-6 * np.abs(differences).max())
+
+
+def test_steps_follow_a_goal(actuator):
+    robot = actuator()
+    state = mm.initial_state(robot, mm.Conditions(voltage=7.4, goal=0.0))
+    step = jax.jit(lambda s: mm.step(robot, s, {"goal": 0.5}, 0.01, mm.Conditions(voltage=7.4, goal=0.0)))
+    for _ in range(60):
+        state = step(state)
+    own = servo.simulate((np.zeros(1), np.full(1, 0.5)), np.array([0.0, 0.6]), servo.TRUE)[0][-1]
+    assert float(state.distance) == pytest.approx(own, abs=2e-3)
+
+
+def test_a_motor_that_is_off_coasts(actuator, tmp_path):
+    log = {"time_s": np.arange(4) * 0.1, "goal_angle_deg": [0.0, 30, 30, 30], "output_angle_deg": [0.0, 0, 5, 20],
+           "mode": ["voltage", "voltage", "coast", "voltage"]}  # fmt: skip
+    robot = actuator()
+    held = records.read_runs(log, robot).conditions(robot)
+    assert_allclose(held.goal, np.radians(log["goal_angle_deg"]))
+    assert_allclose(held.open, [0, 0, 1, 0])
+    assert_allclose(held.voltage, 7.4)
+
+
+def test_a_table_states_the_supply_where_the_file_does_not(actuator):
+    robot = actuator(old="supply_voltage = 7.4\n")
+    log = {"time_s": [0.0, 0.1], "goal_angle_rad": [0.0, 1.0], "output_angle_deg": [0.0, 1.0]}
+    with pytest.raises(BadData, match="supply_voltage_V is missing"):
+        records.read_runs(log, robot)
+    held = records.read_runs({**log, "supply_voltage_V": [7.0, 6.5]}, robot).conditions(robot)
+    assert_allclose(held.voltage, [7.0, 6.5])
+    assert_allclose(held.goal, [0.0, 1.0])
+
+
+def test_a_robot_file_keeps_its_controller(actuator, tmp_path):
+    robot = actuator(old="kp = 8.0", new='kp = "8.0 ± 10 %"')
+    robot_file.write_robot(robot, tmp_path / "again.toml")
+    again = robot_file.read_robot(tmp_path / "again.toml")
+    assert jax.tree.all(jax.tree.map(lambda a, b: bool(a == b), again.controller, robot.controller))
+    assert again.rig.priors == robot.rig.priors == (("controller.kp", 8.0, pytest.approx(0.8)),)
+
+
+REFUSED = {
+    "no gain": ("kp = 8.0\n", "", r"controller\.kp"),
+    "no goal": ('imposed = "goal_angle"\n', "", r"controller: got it with imposed = .voltage.*goal_angle"),
+    "no such gain": ("kd = 0.1", "kq = 0.1", r"controller\.kq: no such parameter.*controller\.k"),
+    "a limit beyond the supply": ("limit = 0.9", "limit = 1.5", r"controller\.limit: got 1\.5; expected 0\.01 to 1"),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_a_controller_that_cannot_be_is_refused(actuator, case):
+    old, new, says = REFUSED[case]
+    with pytest.raises(BadConfiguration, match=says):
+        actuator(old=old, new=new)
+
+
+def test_a_goal_and_a_controller_need_each_other(actuator):
+    with pytest.raises(mm.UsageError, match="goal: not stated"):
+        mm.simulate(actuator(), mm.Conditions(voltage=7.4), model="drive")
+    with pytest.raises(mm.UsageError, match="the robot has no controller"):
+        mm.simulate(mm.nominal(), mm.Conditions(goal=1.0))
+    with pytest.raises(mm.UsageError, match="a controller needs model='drive'"):
+        mm.simulate(actuator(), mm.Conditions(voltage=7.4, goal=1.0))
