@@ -194,7 +194,9 @@ def _base_searches(space: CandidateSpace, settings: Settings, near: Candidate | 
     if near is not None and (few or observe.long):
         starts = near.z[None, : space.free]
         if not near.simulated:
-            mean = [np.zeros(space.free)] if np.abs(starts).max() > UNLIKELY else []
+            # If an effect is missing, the fits with effects begin at the mean too, and the base explains too little.
+            doubted = np.abs(starts).max() > UNLIKELY and not space.begins
+            mean = [np.zeros(space.free)] if doubted else []
             starts = scans.place_at_minimum(bare, np.stack([*starts, *mean]))
     else:
         starts = observe.starts(bare, np.random.default_rng(settings.seed), observe.policy.searches)
@@ -205,7 +207,7 @@ def _base_searches(space: CandidateSpace, settings: Settings, near: Candidate | 
         starts = np.pad(starts, ((0, 0), (0, 2 * settings.slots)))
         which = np.repeat(np.asarray(empty)[None], len(starts), 0)
     search_inputs = jnp.asarray(starts), jnp.asarray(weights), which
-    most = FEW if few else None
+    most = FEW if few else observe.policy.steps if space.begins else None
     return jax.device_get(observe.search(problem, *search_inputs, rivals=not few, most=most, scanned=bare))
 
 

@@ -14,9 +14,9 @@ from jaxtyping import Array
 
 from calibration.data.input_errors import BadConfiguration, allowed_words
 from calibration.discovery import setups
-from calibration.discovery.loop_notes import Heat, Overspeed, Overvoltage, Watch
 from calibration.discovery.reach import SLOPE, Reach, Used
 from calibration.discovery.setups import Setup
+from calibration.inference.fit_notes import Remark
 from mmrjax.model import balances, channels
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.quantities import RPM
@@ -104,7 +104,7 @@ class Run:
     beyond: float = math.inf
     steepest: bool = False
     repeats: int = 3
-    watch: tuple[Watch, ...] = ()
+    watch: tuple[Remark, ...] = ()
     imposed: str = "voltage"
     where: str = ""
     motors: int = 1
@@ -423,18 +423,18 @@ def restrict_run(run: Run, kept: np.ndarray, temperature: np.ndarray, speed: np.
         tuple(v for v, k in zip(x, kept, strict=True) if k) if x else ()
         for x in (run.voltage, run.slope, run.payload, run.torque)
     )
-    watch: list[Watch] = []
+    watch: list[Remark] = []
     hottest, fastest, highest = float(temperature[kept].max()), float(np.abs(speed[kept]).max()), max(voltage)
     allowed = reach.hot if reach.hot < UNLIMITED else None
     if run.setup is setups.blocked:
-        watch.append(Heat("held", hottest, allowed, highest / reach.resistance))
+        watch.append(Remark("held_motor", temperature=hottest, allowed=allowed, current=highest / reach.resistance))
     elif run.setup is setups.braked:
-        watch.append(Heat("braked", hottest, allowed))
+        watch.append(Remark("braked_motor", temperature=hottest, allowed=allowed))
     elif hottest > reach.hot - WARM:
-        watch.append(Heat("run", hottest, allowed))
+        watch.append(Remark("hot_motor", temperature=hottest, allowed=allowed))
     limit = reach.limit_alone if run.setup in (setups.bare, setups.braked) else reach.limit_geared
     if run.setup in (setups.bare, setups.lifted) and fastest > FAST * limit:
-        watch.append(Overspeed(fastest, limit, highest))
+        watch.append(Remark("overspeed", speed=fastest, limit=limit, voltage=highest))
     if run.imposed == "voltage" and highest > reach.voltages[-1]:
-        watch.append(Overvoltage(highest, reach.voltages[-1]))
+        watch.append(Remark("overvoltage", voltage=highest, used=reach.voltages[-1]))
     return dataclasses.replace(run, voltage=voltage, slope=slope, payload=payload, torque=torque, watch=tuple(watch))
