@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections import Counter
 from pathlib import Path
 from typing import Any
@@ -220,6 +221,7 @@ class RigCheck:
                     {**dataclasses.asdict(p), "determined": self.determined(p)} for p in self.foresight.parameters
                 ],
                 "alike": [list(pair) for pair in self.foresight.alike],
+                "separating": [list(columns) for columns in self.foresight.separating],
                 "together": [pair.to_json() for pair in self.foresight.together],
             }
         return {
@@ -372,9 +374,10 @@ def _data_blocks(found: RigCheck, runs: Runs, seen: Foresight) -> tuple[Block, .
         for p in sorted(seen.parameters, key=lambda p: p.share)
     ]
     heads = columns("parameter", "value | .4g", "prior ± | .2g", "unit", "posterior/prior | .2f", "determined")
+    would = (f"; {' or '.join(names)} would separate them" if names else "" for names in seen.separating)
     alike = (
-        f"{one} and {other} are nearly indistinguishable in these data (correlation {size:+.2f})"
-        for one, other, size in seen.alike
+        f"{one} and {other} are nearly indistinguishable in these data (correlation {size:+.2f}){more}"
+        for (one, other, size), more in itertools.zip_longest(seen.alike, would, fillvalue="")
     )
     return (
         Table(
