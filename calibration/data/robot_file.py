@@ -330,7 +330,7 @@ def change_robot(robot: Robot, values: Mapping[str, Any], where: str, notes: lis
     shapes = CURVE | {"battery.capacity_curve"}
     if notes is not None and shapes & values.keys() and (remark := power.curve_remark(robot.battery)):
         notes.append(f"{where}, battery.curvature: {remark}")
-    return _with_backlash(robot, where)
+    return _with_states(robot, where)
 
 
 def _refused(name: str, value: Any, known: Mapping[str, params.Parameter]) -> str:
@@ -353,8 +353,8 @@ def _refused(name: str, value: Any, known: Mapping[str, params.Parameter]) -> st
     return ""
 
 
-def _with_backlash(robot: Robot, where: str) -> Robot:
-    """`robot` that keeps the two sides of a backlash apart, where a load states one."""
+def _with_states(robot: Robot, where: str) -> Robot:
+    """`robot` with the states that its values need: both sides of a backlash, the duty of a lagging controller."""
     loose = {name: load for name, load in robot.configurations.items() if float(load.backlash) > 0}
     for name, load in loose.items():
         if not (float(robot.motor.inertia) > 0 and float(load.inertia) > 0):
@@ -362,7 +362,9 @@ def _with_backlash(robot: Robot, where: str) -> Robot:
                 f"{where}, {name}.backlash: got {float(load.backlash):g} rad; motor and load then turn apart, so "
                 f"motor.inertia and {name}.inertia have to be more than 0"
             )
-    return dataclasses.replace(robot, rig=dataclasses.replace(robot.rig, loose=bool(loose)))
+    own = robot.controller
+    own = None if own is None else dataclasses.replace(own, lags=float(own.lag) > 0)
+    return dataclasses.replace(robot, rig=dataclasses.replace(robot.rig, loose=bool(loose)), controller=own)
 
 
 def _switch(where: str, name: str, value: Any) -> bool:

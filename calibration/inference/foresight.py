@@ -124,7 +124,9 @@ def predict_identifiability(runs: Runs, robot: Robot, noise: str | None = None, 
         posterior_of_coordinates(coordinates, np.asarray(z), about.covariance), priors_hold
     )
     alike = tuple(about.correlated())
-    separating = tuple(_separating(runs, posed, about, alike)) if robot.rig.follows_goal and alike else ()
+    separating = (
+        tuple(_separating(runs, posed, about, alike)) if robot.rig.follows_goal and alike else ((),) * len(alike)
+    )
     return Foresight(estimates, statuses, table_noise.source, alike, together, robot, doubts, separating)
 
 

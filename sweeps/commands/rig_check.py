@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
 from collections import Counter
 from pathlib import Path
 from typing import Any
@@ -374,10 +373,10 @@ def _data_blocks(found: RigCheck, runs: Runs, seen: Foresight) -> tuple[Block, .
         for p in sorted(seen.parameters, key=lambda p: p.share)
     ]
     heads = columns("parameter", "value | .4g", "prior ± | .2g", "unit", "posterior/prior | .2f", "determined")
-    would = (f"; {' or '.join(names)} would separate them" if names else "" for names in seen.separating)
     alike = (
-        f"{one} and {other} are nearly indistinguishable in these data (correlation {size:+.2f}){more}"
-        for (one, other, size), more in itertools.zip_longest(seen.alike, would, fillvalue="")
+        f"{one} and {other} are nearly indistinguishable in these data (correlation {size:+.2f})"
+        + f"; {' or '.join(more)} would separate them" * bool(more)
+        for (one, other, size), more in zip(seen.alike, seen.separating, strict=True)
     )
     return (
         Table(
