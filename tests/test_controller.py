@@ -50,7 +50,7 @@ STEPS = np.array([0.0, 0.25]), np.array([0.8, -0.3])
 @pytest.mark.parametrize("lag", [0.0, 0.005])
 def test_a_servo_follows_as_an_own_simulation(actuator, lag):
     times, lagging = np.linspace(0.0, 0.4, 9), f"lag = {lag}\nkp = "
-    values = SMOOTH if lag else servo.TRUE
+    values = {**servo.TRUE, "coulomb": 0.0} if lag else servo.TRUE
     own = servo.simulate(STEPS, times, {**values, "lag": lag})[0]
     shown, rows = angles(actuator(values, "kp = ", lagging), STEPS, times, parts=8)
     assert_allclose(np.asarray(shown)[rows], own, atol=1e-6)
