@@ -67,6 +67,7 @@ from calibration.inference import blocks as blocks_room
 from calibration.inference import noise as noise_room
 from calibration.inference import observers, preparation, priors, series_noise
 from calibration.inference.bases import Bases
+from calibration.inference.conduct import error_after_steps
 from calibration.inference.fit_notes import Notes, Remark, next_step, with_codes
 from calibration.inference.identifiability import undetermined_names
 from calibration.inference.lack_of_fit import Residuals
@@ -1231,6 +1232,9 @@ def loop_remarks(found: DiscoveryResult) -> Notes:
     remarks += [Remark("only_together", pairs=found.together)] * bool(found.together)
     remarks += [Remark("not_predictable", kinds=found.held_out_unpredictable)] * bool(found.held_out_unpredictable)
     remarks += [Remark("residual_cluster", cluster=c) for c in found.residual_clusters]
+    after = found.readings_of_rows.after if found.written else found.readings_of_rows.before
+    off = np.where(found.included[:, None], after - found.readings_of_rows.measured, np.nan)
+    remarks += error_after_steps(found.runs, off)
     wave = found.unnamed
     if wave is not None and wave.score_free_in_each_run and wave.score < 0.5 * wave.score_free_in_each_run:
         remarks.append(Remark("phases_differ", free=wave.score_free_in_each_run, held=wave.score))
