@@ -31,6 +31,7 @@ from calibration.inference import (
     scans,
     solvers,
 )
+from calibration.inference.conduct import error_after_steps
 from calibration.inference.fit_notes import Remark, next_step
 from calibration.inference.fit_posterior import posterior_of_coordinates
 from calibration.inference.multistart import SearchResult
@@ -502,7 +503,11 @@ def _result(
         residual_clusters=residual_clusters(residuals, seed),
         identifiability=about,
         posterior=posterior_of_coordinates(posed.coordinates, z, about.covariance),
-        remarks=(*notes, *checks.unmeasured_notes(setting.ready.names, about.sensitivity)),
+        remarks=(
+            *notes,
+            *error_after_steps(runs, observation - measured),
+            *checks.unmeasured_notes(setting.ready.names, about.sensitivity),
+        ),
     )
     return dataclasses.replace(result, remarks=(*result.remarks, *calibration_remarks(result)))
 
