@@ -382,16 +382,14 @@ class FittedRuns(MembersPart, Measured):
 class LoopBeside(FittedRuns):
     """Options of the loop that change no number."""
 
-    within: Annotated[str, Field(pattern=r"^\d+(\.\d+)?(s|min|h)?$")] | None = option_field(
-        None, "Wall-clock time after which it ends with the best that there is, as 90s, 5min or 1h"
+    within: Annotated[str, Field(pattern=r"^\d+(\.\d+)?(s|min|h)?$")] = option_field(
+        "10min", "Wall-clock time after which it ends with the best that there is, as 90s, 5min or 1h"
     )
     verbose: bool = option_field(False, "Print every table and remark of the page, not five lines")
 
     @property
-    def seconds(self) -> float | None:
-        """The time [s]. None: as long as it takes."""
-        if self.within is None:
-            return None
+    def seconds(self) -> float:
+        """The time [s]."""
         number = self.within.rstrip("sminh")
         return float(number) * {"min": 60.0, "h": 3600.0}.get(self.within.removeprefix(number), 1.0)
 

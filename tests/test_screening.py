@@ -13,7 +13,7 @@ from numpy.testing import assert_allclose
 from synthetic import Analyst, table
 from worlds import histories, rigs
 
-from calibration.discovery import candidates, screening
+from calibration.discovery import candidates, screening, search
 from calibration.discovery.candidates import Candidate, fill_slots
 from calibration.discovery.result import Ranked, Ranking
 from calibration.discovery.score_tests import ScoreTable
@@ -266,6 +266,19 @@ def test_what_is_ranked_is_said_not_to_be_confirmed():
     ]
 
 
+def test_a_ranking_answers_with_a_mechanism_at_most_and_with_parameters():
+    found = dataclasses.replace(RANKING, parameters={"motor.inertia": (2.5e-4, 1e-6)})
+    assert words.regression_verdict(found) == (
+        "regression only, not confirmed by simulation: something is missing, a loss torque that changes with speed "
+        "(churning); parameters [SI]: motor.inertia 0.00025 ± 1e-06"
+    )
+    assert words.regression_verdict(dataclasses.replace(found, effects=(), parameters={})).endswith(
+        "no effect explains it"
+    )
+    nothing = dataclasses.replace(RANKING, missing=False)
+    assert words.regression_verdict(nothing).endswith("simulation: nothing exceeds chance")
+
+
 def test_what_is_found_before_the_verdict_is_said_to_be_untested(capsys):
     found = SimpleNamespace(best=SimpleNamespace(effects=("churning",)))
     library = {"churning": BY_NAME["churning"]()}
@@ -287,8 +300,10 @@ def test_a_budget_that_ends_after_the_screening_leaves_its_ranking(tmp_path, mmr
     monkeypatch.setattr(command, "discover", screened)
     options = ("--robot", "rig.toml", "--no-report", "--out", "found", "--within", "20s")
     code, _, err = mmrjax("loop table.csv", *options)
-    assert code == 3 and err.count("  1. churning, a loss torque that changes with speed") == 2  # at once, and last
+    assert code == 3 and "strongest alone: churning\n" in err  # at once
+    assert err.count("  1. churning, a loss torque that changes with speed") == 1  # at the end
     assert "no verdict within 20 s\n" in err and "kept: ranking" in err
+    assert "regression only, not confirmed by simulation: something is missing, a loss torque that changes" in err
     left = json.loads((tmp_path / "found.partial" / "screening.json").read_text(encoding="utf-8"))
     assert left["schema"] == "mmrjax.screening/1" and left["confirmed"] is False
     assert [e["name"] for e in left["effects"]] == ["churning", "brush_drop", "bending_loss"]
@@ -307,3 +322,22 @@ def test_noise_stated_too_small_is_no_excess_of_a_log():
 
     assert misfit(2.0) == pytest.approx(4 * count, rel=0.15)
     assert misfit(0.5) == count
+
+
+@pytest.mark.parametrize(("far", "gain", "begun"), [(0.5, 50.0, False), (60.0, 50.0, True), (60.0, 1.0, False)])
+def test_effects_are_ranked_at_the_set_of_the_equations_where_the_base_is_far(monkeypatch, far, gain, begun):
+    """The base of EMPS ends 60 prior sds away and 112 mm off: its signatures rank nothing."""
+    fits, settings = [], settings_for(Histories)
+    best = SimpleNamespace(cost=100.0 - gain)
+    monkeypatch.setattr(search, "fit_candidates", lambda space, given, _: fits.append(given) or [best])
+    monkeypatch.setattr(search, "diagnose_candidate", lambda *_: "its diagnosis")
+    space = SimpleNamespace(begins={("torque_offset",): np.ones(3)}, free=1)
+    base, left = (
+        SimpleNamespace(z=np.array([far, 0.0, 0.0]), cost=100.0),
+        SimpleNamespace(test=SimpleNamespace(null=0)),
+    )
+    wanted = (best, "its diagnosis") if begun else (base, left)
+    assert search._linearised_fit(space, base, left, (), settings) == wanted
+    assert len(fits) == (far > 4) and search._linearised_fit(
+        SimpleNamespace(begins={}, free=1), base, left, (), settings
+    ) == (base, left)

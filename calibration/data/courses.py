@@ -110,11 +110,15 @@ def course_stretches(runs: Runs) -> list[list[Stretch]]:
 
 
 def course_of_each_row(runs: Runs) -> np.ndarray:
-    """For every row the course of its run's conditions, empty where they do not change, shape (rows,)."""
-    courses = np.full(len(runs), "", dtype=object)
+    """For every row the name of its run's course of conditions, empty where they do not change, shape (rows,).
+
+    A name is short: a course with thousands of changes, written in each of its rows, took gigabytes.
+    """
+    courses, names = np.full(len(runs), "", dtype=object), dict[str, str]()
     if rows_of_varying_runs(runs).any():
         columns = changing_columns(runs)
         for run in (r for r in course_stretches(runs) if len(r) > 1):
             said = [f"{s.begin:g}: {', '.join(str(runs[c][s.rows[0]]) for c in columns)}" for s in run]
-            courses[np.concatenate([s.rows for s in run])] = "; ".join(said)
+            name = names.setdefault("; ".join(said), f"course {len(names) + 1}")
+            courses[np.concatenate([s.rows for s in run])] = name
     return courses.astype(str)

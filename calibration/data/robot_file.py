@@ -354,13 +354,14 @@ def _refused(name: str, value: Any, known: Mapping[str, params.Parameter]) -> st
 
 
 def _with_states(robot: Robot, where: str) -> Robot:
-    """`robot` with the states that its values need: both sides of a backlash, the duty of a lagging controller."""
-    loose = {name: load for name, load in robot.configurations.items() if float(load.backlash) > 0}
+    """`robot` with the states that its values need: of two bodies where a load gives way, of a controller that lags."""
+    loose = {name: load for name, load in robot.configurations.items() if load.has_two_bodies}
     for name, load in loose.items():
         if not (float(robot.motor.inertia) > 0 and float(load.inertia) > 0):
+            key, unit = ("backlash", "rad") if load.backlash > 0 else ("stiffness", "N·m/rad")
+            stated = f"{where}, {name}.{key}: got {float(getattr(load, key)):g} {unit}"
             raise BadConfiguration(
-                f"{where}, {name}.backlash: got {float(load.backlash):g} rad; motor and load then turn apart, so "
-                f"motor.inertia and {name}.inertia have to be more than 0"
+                f"{stated}; motor and load then turn apart, so motor.inertia and {name}.inertia have to exceed 0"
             )
     own = robot.controller
     own = None if own is None else dataclasses.replace(own, lags=float(own.lag) > 0)

@@ -147,6 +147,7 @@ class CandidateSpace:
         room: names of effects that the program of every fit of histories includes, see `fitted_by`.
         near: coordinates of fits of the same histories with other sds, by their effects. Fits then start there and
             take a few steps, and none has effects beyond `room`.
+        begins: coordinates of the first set of effects by the log's equations, by its effects.
     """
 
     bare: Problem
@@ -154,6 +155,7 @@ class CandidateSpace:
     library: ScoredLibrary
     room: tuple[str, ...] = ()
     near: Mapping[tuple[str, ...], np.ndarray] = dataclasses.field(default_factory=dict)
+    begins: Mapping[tuple[str, ...], np.ndarray] = dataclasses.field(default_factory=dict)
 
     @property
     def coordinates(self) -> ActiveSet:

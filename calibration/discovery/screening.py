@@ -17,7 +17,7 @@ import numpy as np
 
 from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.adequacy import Diagnosis
-from calibration.discovery.candidates import Candidate, candidate_of_fit, empty_slots, fit_candidates
+from calibration.discovery.candidates import Candidate, candidate_of_fit, empty_slots, fill_slots, fit_candidates
 from calibration.discovery.score_tests import ABSORBED, ScoreTable
 from calibration.discovery.settings import Settings
 from calibration.inference.linearization import Linearization
@@ -193,6 +193,7 @@ class Beforehand:
         base: the fit without effects, by regression. None if the load may slide on its ground, which the
             equations do not show, so that a search should not begin there.
         room: effects in the program of all fits, if the equations show that one is missing and the log is `BRIEF`.
+        alone: fits of each effect alone, by regression, the lowest first. Empty if nothing is missing.
         scores: of every instance.
         windows: number of equations.
         null: root of the strongest score of tables under the null hypothesis [σ], shape (replicates,).
@@ -200,6 +201,7 @@ class Beforehand:
 
     base: Candidate | None
     room: tuple[str, ...]
+    alone: tuple[Candidate, ...]
     scores: ScoreTable
     windows: int
     null: np.ndarray
@@ -235,8 +237,9 @@ def screen_by_weak_form(space: CandidateSpace, settings: Settings) -> Beforehand
     slides = problem.base.has_ground and problem.base.rig.imposed == "voltage"
     missing = np.mean(null >= np.max(np.abs(single))) < settings.family_wise_error
     brief = problem.observe.times.size <= BRIEF  # type: ignore[attr-defined]  # of histories
-    room = _program_room(space, base, equations, scores, settings) if missing and brief else ()
-    return Beforehand(None if slides else base, room, scores, equations.windows, null)
+    alone = _each_alone(space, base, equations, scores, settings) if missing else ()
+    room = _program_room(space, alone, scores, settings) if missing and brief else ()
+    return Beforehand(None if slides else base, room, alone, scores, equations.windows, null)
 
 
 def fit_by_regression(
@@ -260,15 +263,27 @@ def with_program_room(
     """
     if not space.bare.observe.long or space.room:
         return space
-    return space.with_room(_program_room(space, base, linear, scores, settings))
+    alone = _each_alone(space, base, linear, scores, settings)
+    return space.with_room(_program_room(space, alone, scores, settings))
+
+
+def _each_alone(
+    space: CandidateSpace, base: Candidate, linear: Linearization | WeakForm, scores: ScoreTable, settings: Settings
+) -> tuple[Candidate, ...]:
+    """Fits of each effect alone, by regression, the lowest first."""
+    beside = Regression(space, base, linear, scores, settings)
+    return tuple(sorted((beside(fill_slots([name], settings)) for name in space.library.names), key=lambda c: c.cost))
 
 
 def _program_room(
-    space: CandidateSpace, base: Candidate, linear: Linearization | WeakForm, scores: ScoreTable, settings: Settings
+    space: CandidateSpace, order: Sequence[Candidate], scores: ScoreTable, settings: Settings
 ) -> tuple[str, ...]:
-    """Effects to be simulated first, similar ones, and the best of other families."""
-    beside, library = Regression(space, base, linear, scores, settings), space.library
-    order = sorted((beside((name, *empty_slots(settings)[1:])) for name in library.names), key=lambda c: c.cost)
+    """Effects to be simulated first, similar ones, and the best of other families.
+
+    Args:
+        order: fits of each effect alone, the lowest first.
+    """
+    library = space.library
     first = [c.active[0] for c in _first_to_simulate(space, order)]
     cosine = np.abs(np.asarray(scores.cosine)[library.best_instance(first[0], np.asarray(scores.single))])
     alike = library.largest(cosine)

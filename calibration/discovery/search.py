@@ -12,7 +12,14 @@ import numpy as np
 from calibration.data import Names
 from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.adequacy import AdequacyTest, Diagnosis
-from calibration.discovery.candidates import Candidate, fill_slots, fit_candidates, fit_in_addition, start_of_fit
+from calibration.discovery.candidates import (
+    UNLIKELY,
+    Candidate,
+    fill_slots,
+    fit_candidates,
+    fit_in_addition,
+    start_of_fit,
+)
 from calibration.discovery.score_tests import ScoreTable, Statistics, diagnose_fit
 from calibration.discovery.screening import Confirmed, confirm_by_simulation, fit_by_regression
 from calibration.discovery.settings import Settings
@@ -71,7 +78,8 @@ def search_effects(
     names = _ranked(space, left.scores)
     if not space.bare.observe.long:
         names = names[: _batch(space)]
-    rounds = [_fit_sets(space, [(fill_slots([name], settings), base, left) for name in names], settings)]
+    at, by = _linearised_fit(space, base, left, bases, settings)
+    rounds = [_fit_sets(space, [(fill_slots([name], settings), at, by) for name in names], settings)]
     space = space.with_room(rounds[0].room)
     ladder = list(rounds[0].candidates)
     null = np.asarray(left.test.null.single)
@@ -86,7 +94,7 @@ def search_effects(
         ):
             break
         progress(next_step("more effects", best.effects))
-        rounds.append(_extend(space, best, diagnosis, base, left, settings))
+        rounds.append(_extend(space, best, diagnosis, at, by, settings))
         more, space = list(rounds[-1].candidates), space.with_room(rounds[-1].room)
         best = _accepted(_best(more), ladder, settings)
         ladder += more
@@ -98,6 +106,22 @@ def search_effects(
                 best = None
     simulated_count, otherwise = (sum(getattr(r, name) for r in rounds) for name in ("asked", "otherwise"))
     return Search(tuple(ladder), diagnosed, diagnosis, simulated_count, otherwise, space.room)
+
+
+def _linearised_fit(
+    space: CandidateSpace, base: Candidate, left: Diagnosis, bases: Bases, settings: Settings
+) -> tuple[Candidate, Diagnosis]:
+    """Fit whose linearised equations rank the effects, and its diagnosis.
+
+    The base, unless it ends `UNLIKELY` far from its prior: the signatures there are no guide. Then the set that the
+    log's equations rank first, simulated from their coordinates.
+    """
+    if not space.begins or np.abs(base.z[: space.free]).max() <= UNLIKELY:
+        return base, left
+    (fitted,) = fit_candidates(space, list(space.begins.items()), settings)
+    if not 2 * (base.cost - fitted.cost) > settings.same:
+        return base, left
+    return fitted, diagnose_candidate(space, fitted, bases, left.test.null, settings)
 
 
 def best_of_each_size(found: Search) -> list[Candidate]:
@@ -161,18 +185,18 @@ def _extend(
     space: CandidateSpace,
     best: Candidate,
     left_by_best: Diagnosis,
-    base: Candidate,
+    at: Candidate,
     left: Diagnosis,
     settings: Settings,
 ) -> Confirmed:
-    """Sets with one more effect than the best, and pairs for the base."""
+    """Sets with one more effect than the best, and pairs for another fit if that is the base."""
     names = _ranked(space, left_by_best.scores, best.effects)[: _batch(space)]
     sources = {fill_slots([*best.effects, name], settings): (best, left_by_best) for name in names}
-    if len(best.effects) == 1:
+    if len(best.effects) == 1 and not at.effects:
         for pair in _pairs(space, left.scores):
             one, swapped = fill_slots(pair, settings), fill_slots(pair[::-1], settings)
             if one not in sources and swapped not in sources:
-                sources[one] = (base, left)
+                sources[one] = (at, left)
     return _fit_sets(space, [(w, at, by) for w, (at, by) in sources.items()], settings)
 
 

@@ -64,8 +64,8 @@ def _loop(config: configuration.Loop, beside: configuration.LoopBeside) -> int:
 
     stages: dict[str, Any] = {}
 
-    def left() -> float | None:
-        return None if within is None else max(within - (time.monotonic() - began), 0.0)
+    def left() -> float:
+        return max(within - (time.monotonic() - began), 0.0)
 
     def timed(text: str) -> None:
         used = time.monotonic() - began
@@ -99,7 +99,7 @@ def _loop(config: configuration.Loop, beside: configuration.LoopBeside) -> int:
                 )  # fmt: skip
         except KeyboardInterrupt as ended:
             if isinstance(ended, OutOfTime):
-                _say_out_of_time(within or 0.0, begun=bool(stages))
+                _say_out_of_time(within, begun=bool(stages))
             _say_kept(stages, folder, config.robot)
             raise
         if config.resolve:
@@ -136,14 +136,11 @@ def _say_out_of_time(within: float, begun: bool) -> None:
 
 
 @contextlib.contextmanager
-def _alarm(seconds: float | None, wanted: Callable[[], bool]) -> Iterator[None]:
+def _alarm(seconds: float, wanted: Callable[[], bool]) -> Iterator[None]:
     """Raise `OutOfTime` within once so much time has passed, in the middle of a step too where the platform can,
     while it is `wanted`. It is repeated every second, because a called function may suppress it.
-
-    Args:
-        seconds: None: never.
     """
-    if seconds is None or not hasattr(signal, "SIGALRM"):
+    if not hasattr(signal, "SIGALRM"):
         yield
         return
 
@@ -166,7 +163,8 @@ def _show_ranking(found: Ranking, folder: RunFolder, timed: Callable[[str], None
     timed(first)
     for line in lines:
         print_message(line)
-    content = {"schema": SCREENING, "confirmed": False, **dataclasses.asdict(found)}
+    answer = loop_words.regression_verdict(found)
+    content = {"schema": SCREENING, "confirmed": False, "answer": answer, **dataclasses.asdict(found)}
     folder.write_json(SCREENING_FILE, content)
 
 
@@ -184,7 +182,7 @@ def _say_kept(stages: Mapping[str, Any], folder: RunFolder, robot_name: str) -> 
         print_message(f"{loop_words.verdict_line(traced)}; errors held out and other noises are outstanding")
         return
     if "ranking" in stages:
-        for line in loop_words.ranking_lines(stages["ranking"]):
+        for line in (*loop_words.ranking_lines(stages["ranking"]), loop_words.regression_verdict(stages["ranking"])):
             print_message(line)
     searches = [search for name, search in stages.items() if name.startswith("search")]
     if searches and (best := searches[-1][2].best) is not None:

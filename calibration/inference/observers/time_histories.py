@@ -126,6 +126,8 @@ SLOW, EARLIER = {"voltage": 0.1, "motor_current": 0.3}, {"voltage": 0.03, "motor
 SLOW |= dict.fromkeys(GOALS, SLOW["motor_current"])
 #: Longest step elsewhere, in usual longest steps.
 FAST = 2
+#: Longest step of a load on an elastic joint, as a share of its swing's time per radian: readings within 0.1 %.
+ELASTIC = 0.2
 #: For a thinned log: least number of steps between readings; largest growth of steps with the time since a condition
 #: changed [1/s · s]; change of the supply that counts, as a share of its largest value.
 BETWEEN, LATER, SMALL = 4, 0.05, 0.05
@@ -265,14 +267,16 @@ class Histories(Observer):
         mine, every = ([table.in_order(name) for name in names] for table in (runs, whole))
         given = [runs["time_s"][m] for m in mine]
         # Rows of the log without a reading here are kept if the imposed quantity changes there.
+        smooth = runs.log is not None and robot.rig.imposed == "motor_current" and not linear
         noted = [
-            np.isin(whole["time_s"][rows], t) | exact | linear | _drive_changes(whole, rows)
+            np.isin(whole["time_s"][rows], t) | exact | linear | _drive_changes(whole, rows, SMALL if smooth else 0.0)
             for rows, t in zip(every, given, strict=True)
         ]
-        steps = [
-            np.minimum.reduceat(h, np.flatnonzero(n)[:-1])
-            for h, n in zip(_longest_steps(runs, robot), noted, strict=True)
-        ]
+        longest_steps = _longest_steps(runs, robot)
+        if smooth:
+            noted = [n | _step_begins(whole["time_s"][rows], n) for n, rows in zip(noted, every, strict=True)]
+            whole = _averaged_drive(whole, every, noted)
+        steps = [np.minimum.reduceat(h, np.flatnonzero(n)[:-1]) for h, n in zip(longest_steps, noted, strict=True)]
         change = LOOSE if robot.loose else CHANGE
         grids = [
             time_grid(whole["time_s"][rows[n]], *c, h, START if robot.has_ground else change, change, parts)
@@ -416,7 +420,7 @@ class Histories(Observer):
 
     @classmethod
     def free(cls) -> tuple[tuple[str, ...], tuple[str, ...]]:
-        return ("motor.inductance", "motor.inertia", DELAY), ("inertia", *settled_ends.GRIP, *settled_ends.SLIDING)
+        return ("motor.inductance", "motor.inertia", DELAY), ("inertia", settled_ends.STATIC, *settled_ends.SLIDING)
 
     def defective(
         self, robot: Robot, probes: tuple[Effect, ...]
@@ -994,6 +998,25 @@ def _drive_changes(runs: Runs, rows: np.ndarray, share: float = 0.0) -> np.ndarr
     return changes
 
 
+def _step_begins(time: np.ndarray, noted: np.ndarray) -> np.ndarray:
+    """True for rows that divide the time between noted ones into parts of at most the usual longest step."""
+    begin = time[np.maximum.accumulate(np.where(noted, np.arange(len(time)), 0))]
+    part = np.floor((time - begin) / (FAST * LONGEST) + 1e-9)
+    return np.diff(part, prepend=0.0) > 0
+
+
+def _averaged_drive(runs: Runs, each: list[np.ndarray], noted: list[np.ndarray]) -> Runs:
+    """Runs with the mean of the imposed current between noted rows, which moves the load as much."""
+    column, time = runs.layout.imposed_column, runs["time_s"]
+    drive = runs[column].copy()
+    for rows, begins in zip(each, noted, strict=True):
+        lasts, first = np.diff(time[rows], append=time[rows[-1]]), np.flatnonzero(begins)
+        total, span = (np.add.reduceat(x, first) for x in (drive[rows] * lasts, lasts))
+        mean = np.where(span > 0, total / np.where(span > 0, span, 1.0), drive[rows[first]])
+        drive[rows] = mean[np.cumsum(begins) - 1]
+    return dataclasses.replace(runs, columns={**runs.columns, column: drive})
+
+
 def _relative_jumps(driven: np.ndarray) -> np.ndarray:
     """Change of a run's drive from row to row, as a share of its largest value."""
     return np.abs(np.diff(driven)) / max(float(np.abs(driven).max(initial=0.0)), 1e-300)
@@ -1018,6 +1041,8 @@ def _longest_steps(runs: Runs, robot: Robot) -> list[np.ndarray]:
     measured, rates = whole.measured()[:, moved], [k for k, at in enumerate(moved) if not runs.channels[at].settled]
     driven = None if exact else applied_drive(whole)
     early, found = DELAYED * np.max(np.asarray(rig.delay)) + EARLIER.get(rig.imposed, 0.0), []
+    turned = robot.motor.inertia * robot.gearbox.ratio**2
+    elastic = max(float(load.frequency(turned)) for _, load in robot.configurations.items()) if robot.loose else 0.0
     for name in np.unique(runs.run_names):
         rows = whole.in_order(name)
         time = whole["time_s"][rows]
@@ -1037,6 +1062,8 @@ def _longest_steps(runs: Runs, robot: Robot) -> list[np.ndarray]:
             before = int(np.ceil(early / _usual_interval(apart)))
             slow = np.convolve(slow, np.ones(before + 1))[before:] > 0
             longest[slow] = min(LONGEST, wait / FINE)
+        if elastic > 0:
+            longest = np.minimum(longest, ELASTIC / elastic)
         found.append(longest)
     return found
 
