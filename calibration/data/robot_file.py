@@ -354,7 +354,7 @@ def _refused(name: str, value: Any, known: Mapping[str, params.Parameter]) -> st
 
 
 def _with_states(robot: Robot, where: str) -> Robot:
-    """`robot` with the states that its values need: of two bodies where a load gives way, of a controller that lags."""
+    """`robot` with the states that its values need: two bodies where a load gives way, a duty that lags."""
     loose = {name: load for name, load in robot.configurations.items() if load.has_two_bodies}
     for name, load in loose.items():
         if not (float(robot.motor.inertia) > 0 and float(load.inertia) > 0):
