@@ -69,7 +69,7 @@ from calibration.inference import observers, preparation, priors, series_noise
 from calibration.inference.bases import Bases
 from calibration.inference.conduct import error_after_steps
 from calibration.inference.fit_notes import Notes, Remark, next_step, with_codes
-from calibration.inference.fit_posterior import undetermined_names
+from calibration.inference.identifiability import undetermined_names
 from calibration.inference.lack_of_fit import Residuals
 from calibration.inference.linearization import Linearization
 from calibration.inference.lost_motion import lost_motion_notes
