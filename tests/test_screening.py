@@ -276,7 +276,7 @@ def test_a_ranking_answers_with_a_mechanism_at_most_and_with_parameters():
         "no effect explains it"
     )
     nothing = dataclasses.replace(RANKING, missing=False)
-    assert words.regression_verdict(nothing).endswith("simulation: nothing exceeds chance")
+    assert words.regression_verdict(nothing).endswith("simulation: no effect of the library exceeds chance")
 
 
 def test_what_is_found_before_the_verdict_is_said_to_be_untested(capsys):
