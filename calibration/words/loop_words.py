@@ -318,9 +318,7 @@ def regression_verdict(found: Ranking) -> str:
 
 
 #: Remark beside a regression that sees nothing, where the simulation does.
-DISAGREES = (
-    "by simulation something is missing: refitted, the model leaves more than chance would; trust the simulation"
-)
+DISAGREES = "by simulation something is missing: the refitted model leaves more than chance; trust the simulation"
 
 
 def so_far(effects: Sequence[str], families: Sequence[str]) -> str:
