@@ -290,6 +290,15 @@ def test_what_is_found_before_the_verdict_is_said_to_be_untested(capsys):
     assert said.index("by regression") < said.index("so far")
 
 
+@pytest.mark.parametrize("missing", [True, False])
+def test_a_simulation_that_contradicts_the_regression_is_said_to(missing, capsys):
+    folder = SimpleNamespace(keeps=lambda name: True, path="found")
+    left = SimpleNamespace(test=SimpleNamespace(rejected=True))
+    ranking = dataclasses.replace(RANKING, missing=missing)
+    command._say_kept({"ranking": ranking, "bootstrap 0": (None, left)}, folder, "rig.toml")
+    assert (words.DISAGREES in capsys.readouterr().err) is not missing
+
+
 def test_a_budget_that_ends_after_the_screening_leaves_its_ranking(tmp_path, mmrjax, monkeypatch):
     rigs.case(rigs.world(np.random.default_rng(3), "bench", "voltage", rows=(16, 20))).write(tmp_path)
 

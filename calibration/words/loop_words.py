@@ -317,6 +317,10 @@ def regression_verdict(found: Ranking) -> str:
     return f"regression only, not confirmed by simulation: {lacks}{numbers}"
 
 
+#: Remark beside a regression that sees nothing, where the simulation does.
+DISAGREES = "by simulation something is missing: the refitted model leaves more than chance; trust the simulation"
+
+
 def so_far(effects: Sequence[str], families: Sequence[str]) -> str:
     """Findings of a search before its verdict is known."""
     return (
