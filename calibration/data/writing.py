@@ -37,17 +37,17 @@ def columns_of(result: Any) -> Columns:
         TypeError: something without a table.
     """
     if isinstance(result, Mapping):
-        found = result
+        content = result
     elif isinstance(getattr(result, "columns", None), Mapping):
-        found = result.columns
+        content = result.columns
     else:
         table = next(
             (getattr(result, name) for name in ("rows_table", "rows", "table") if hasattr(result, name)), None
         )
         if table is None:
             raise TypeError(f"expected a result with a table, got {type(result).__name__}")
-        found = table() if callable(table) else table
-    return {str(name): np.asarray(values) for name, values in found.items()}
+        content = table() if callable(table) else table
+    return {str(name): np.asarray(values) for name, values in content.items()}
 
 
 def to_arrow(result: Any) -> ArrowTable:
@@ -158,9 +158,9 @@ def write_json(path: Path, content: Mapping[str, Any]) -> None:
 def json_text(content: Mapping[str, Any]) -> str:
     """Data as JSON: numbers that are not finite become null, characters that are not `printable` their escapes."""
     text = json.dumps(json_value(content), indent=2, ensure_ascii=False)
-    shown = printable(text)
-    pairs = zip(text, shown, strict=True)
-    return text if shown == text else "".join(a if a == b else json.dumps(a)[1:-1] for a, b in pairs)
+    printed = printable(text)
+    pairs = zip(text, printed, strict=True)
+    return text if printed == text else "".join(a if a == b else json.dumps(a)[1:-1] for a, b in pairs)
 
 
 def toml_value(value: Any) -> str:

@@ -138,8 +138,8 @@ def drive_start(robot: Robot, conditions: Conditions, rolling: bool = False) -> 
         first = _initial(robot, conditions)
         angle = first[3] / robot.chassis(conditions.configuration).radius
         memory = [effect.initial(robot, angle) for effect in robot.remembering]
-        known = jnp.stack([*first, jnp.asarray(conditions.discharge, size.dtype), *memory])
-        rest = rest.at[: len(known)].set(known / size[: len(known)])
+        begin = jnp.stack([*first, jnp.asarray(conditions.discharge, size.dtype), *memory])
+        rest = rest.at[: len(begin)].set(begin / size[: len(begin)])
     if robot.loose:
         shaft = robot.chassis(conditions.configuration)
         rest = rest.at[-1].set(shaft.twist(shaft.torque_load(rest[3] * size[3] / shaft.radius)) / size[-1])
