@@ -19,6 +19,7 @@ import numpy as np
 
 from calibration.data import Columns
 from mmrjax.errors import printable
+from mmrjax.model.quantities import TABLE, unit_at_end, unit_in_column
 
 #: Types of libraries that are imported where they are needed.
 PandasFrame: TypeAlias = Any
@@ -94,7 +95,7 @@ def to_polars(result: Any) -> PolarsFrame:
 
 
 def to_xarray(result: Any) -> XarrayDataset:
-    """Returns the table of a result as an xarray Dataset with the dimension `row`.
+    """Returns the table of a result as an xarray Dataset with the dimension `row` and the columns' units.
 
     Args:
         result: runs, a calibration, the result of a loop or of a simulation, or a dict of columns.
@@ -104,7 +105,14 @@ def to_xarray(result: Any) -> XarrayDataset:
     """
     import xarray as xr
 
-    return xr.Dataset({name: ("row", values) for name, values in columns_of(result).items()})
+    units = {unit_in_column(q.unit): q.unit for rows in TABLE.values() for q in rows}
+    ends = {name: unit_at_end(name, units) for name in columns_of(result)}
+    return xr.Dataset(
+        {
+            name: ("row", values, {} if (end := ends[name]) is None else {"units": units[end]})
+            for name, values in columns_of(result).items()
+        }
+    )
 
 
 @contextlib.contextmanager
