@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from scipy import signal
 from scipy.integrate import solve_ivp
 from test_events import NAMES, SAMPLES
 from worlds.events import Bench, through
@@ -23,6 +24,7 @@ from mmrjax.model.quantities import RPM
 from mmrjax.model.rig import Rig
 from mmrjax.model.robot import Configurations
 from mmrjax.model.shaft import Shaft
+from sweeps.pages.history_figures import frequency_response
 
 #: A motor that turns against the joint, with little back-EMF.
 MOTOR = Bench(inertia_motor=2e-5, torque_constant=0.02, loss_coulomb=0.02, friction_motor=2e-4)
@@ -190,3 +192,20 @@ def test_a_rigid_model_takes_friction_away_and_an_elastic_one_finds_the_joint(lo
         entry = fit.parameters[name]
         assert entry.interval[0] < truth < entry.interval[1] and not entry.held_by_prior, name
     assert abs(fit.parameters["bench.stiffness"].value - bench.stiffness) < 0.02 * bench.stiffness
+
+
+def test_a_frequency_response_is_that_of_the_filter_that_made_it():
+    """Two runs of steps through a resonance, read at uneven times, beside the filter's own response."""
+    random, runs = np.random.default_rng(2), []
+    numerator, denominator = signal.zpk2tf(*signal.bilinear_zpk([], np.array([-8 + 40j, -8 - 40j]), 1600.0, 200.0))
+    for rows in (4000, 2600):
+        drive = np.repeat(random.choice([-1.0, 1.0, 2.0], size=rows // 20), 20)
+        reading = signal.lfilter(numerator, denominator, drive)
+        kept = np.sort(np.concatenate([[0], random.choice(np.arange(1, rows), size=rows - 40, replace=False)]))
+        runs.append((kept / 200.0, drive[kept], reading[kept][None]))
+    frequency, response, coherence = frequency_response(runs)
+    exact = np.abs(signal.freqz(numerator, denominator, frequency, fs=200.0)[1])
+    low = frequency < 12
+    assert_allclose(np.abs(response[0])[low], exact[low], rtol=0.25)
+    assert frequency[np.argmax(np.abs(response[0]))] == pytest.approx(40 / (2 * np.pi), abs=0.8)
+    assert coherence[0][low].min() > 0.7

@@ -16,10 +16,9 @@ from calibration.data import robot_file
 from calibration.data.input_errors import BadConfiguration
 from calibration.discovery import experiments, menu, predicted
 from calibration.discovery.candidates import Candidate, fill_slots, fit_candidates
-from calibration.discovery.classes import Classes
+from calibration.discovery.classes import Classes, Shift
 from calibration.discovery.location import DiscrepancyLocation
 from calibration.discovery.reach import reach_of_table
-from calibration.discovery.stated_values import Shift
 from calibration.inference.fit_notes import Remark
 from mmrjax.effects import BY_NAME, OF_CHANNELS
 from mmrjax.fidelities.steady import IMPLICIT

@@ -19,10 +19,10 @@ from test_stated_values import traced as leads
 from worlds import settled, tables
 
 from calibration.data.writing import json_value
-from calibration.discovery.clusters import Cluster
 from calibration.discovery.discover import FAR
 from calibration.discovery.hidden import Hidden
 from calibration.discovery.loop_notes import Asked, NameSupport, NameTest, RuledOut
+from calibration.discovery.outliers import Cluster
 from calibration.discovery.result import Alternative, Estimate, Resolved, StatedValue, Worse
 from calibration.discovery.settings import WITHOUT_NAME
 from calibration.inference.identifiability import HELD

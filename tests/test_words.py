@@ -184,6 +184,7 @@ SAMPLES = [
     Remark("agreement", starts=1, agree=0, elsewhere=0, more=0.0, open=1),
     Remark("agreement", starts=4, agree=4, elsewhere=0, more=0.0, open=0),
     Remark("agreement", starts=4, agree=1, elsewhere=2, more=3.2, open=1),
+    Remark("agreement", starts=2, agree=0, elsewhere=0, more=0.0, open=2),
     Remark("unsettled", names=("a", "b")),
     Remark("unsettled", names=()),
     Remark("elsewhere", searches=1, total=3, names=("a", "b")),

@@ -69,7 +69,7 @@ from calibration.inference import observers, preparation, priors, series_noise
 from calibration.inference.bases import Bases
 from calibration.inference.conduct import error_after_steps
 from calibration.inference.fit_notes import Notes, Remark, next_step, with_codes
-from calibration.inference.fit_posterior import undetermined_names
+from calibration.inference.identifiability import undetermined_names
 from calibration.inference.lack_of_fit import Residuals
 from calibration.inference.linearization import Linearization
 from calibration.inference.lost_motion import lost_motion_notes
@@ -556,6 +556,8 @@ def _search_until_clean(
         progress(next_step("effects"))
         screened, left, searched = keep(f"search {k}", functools.partial(_search_effects, task, screened, left))
         after = searched.diagnosis
+        if after is None and (confirmed := _confirmed(screened, left, searched)) is not None:
+            return screened, confirmed, None
         if after is None or not after.test.rejected_with_margin or screened.base.space.near:
             break
         more = screen_with_effects(
@@ -566,6 +568,22 @@ def _search_until_clean(
         progress(next_step("alone"))
         screened = more
     return screened, left, searched
+
+
+def _confirmed(screened: Screening, left: Diagnosis, searched: Search) -> Diagnosis | None:
+    """Diagnosis of a log's base fit with the gains that simulation confirms, None if these reject the base as well.
+
+    Scores are linear. The contact of a vehicle is not, and a score beyond chance may come to nothing in a simulation.
+    """
+    space, test, scores = screened.base.space, left.test, np.asarray(left.scores.single)
+    gains = {c.effects: 2 * (screened.base.candidate.cost - c.cost) for c in searched.ladder if c.simulated}
+    best = {name: abs(float(scores[space.library.best_instance(name, scores)])) for name in space.library.names}
+    promising = {(name,) for name, score in best.items() if score > test.threshold("single")}
+    simulated = bool(promising) and promising <= gains.keys()
+    if not (simulated and space.bare.observe.long) or screened.cluster is not None:
+        return None
+    confirmed = test.confirmed(max(0.0, *gains.values()))
+    return None if confirmed.rejected else dataclasses.replace(left, test=confirmed)
 
 
 def _verdict(task: _Task, screened: Screening, left: Diagnosis, sds: Sds, searched: Search) -> LoopStages:

@@ -14,7 +14,7 @@ from calibration.data.runs import Runs
 from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.adequacy import AdequacyTest, Diagnosis
 from calibration.discovery.candidates import Candidate
-from calibration.discovery.classes import Classes
+from calibration.discovery.classes import Classes, Shift
 from calibration.discovery.discrepancy import Discrepancy
 from calibration.discovery.location import DiscrepancyLocation
 from calibration.discovery.loop_notes import RuledOut
@@ -41,7 +41,6 @@ from calibration.discovery.score_tests import ScoreTable
 from calibration.discovery.screening import Beforehand
 from calibration.discovery.search import single_p_value, without_each
 from calibration.discovery.settings import Settings
-from calibration.discovery.stated_values import Shift
 from calibration.inference import bases, priors
 from calibration.inference.estimates import SIDE_OF_BOUND
 from calibration.inference.held_out import predict_unseen
@@ -322,7 +321,7 @@ def _ranked(space: CandidateSpace, scores: ScoreTable, settings: Settings) -> tu
         effect = space.library[s.name]
         sd = amplitude_unit(effect) / max(s.sigmas_per_prior_sd, 1e-300)
         unit = amplitude_of(effect).spec.unit
-        # as in `dissipation.supplying_effects`
+        # as in `candidates.supplying_effects`
         supplies = space.bare.observe.long and effect.dissipative and s.amplitude < 0
         listed.append(Ranked(s.name, effect.family(), unit, s.score, s.amplitude, sd, supplies))
     return tuple(sorted(listed, key=lambda e: e.supplies))

@@ -9,8 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from calibration.discovery.clusters import Cluster
 from calibration.discovery.location import DiscrepancyLocation
+from calibration.discovery.outliers import Cluster
 from calibration.inference.fit_notes import Remark
 
 # --- the verdict ----------------------------------------------------------------------------------------

@@ -15,18 +15,18 @@ from calibration.data.posterior_file import Posterior
 from calibration.data.runs import WHEN, Runs
 from calibration.data.writing import json_value, write_json, write_table
 from calibration.described import describe, sentences
-from calibration.discovery.clusters import Cluster
 from calibration.discovery.experiments import Proposal
 from calibration.discovery.headline import headline
 from calibration.discovery.hidden import Hidden
 from calibration.discovery.kept import REFIT_FILE
 from calibration.discovery.location import DiscrepancyLocation
 from calibration.discovery.loop_notes import Asked, Headline, Mechanism, NameSupport, RuledOut, Summary
+from calibration.discovery.outliers import Cluster
 from calibration.discovery.prediction import Gain
 from calibration.discovery.settings import Settings
 from calibration.inference.details import Detail
 from calibration.inference.fit_notes import Notes, Pair, Remark, with_codes
-from calibration.inference.fit_posterior import determined_together
+from calibration.inference.identifiability import determined_together
 from calibration.inference.residual_clusters import ResidualCluster
 from calibration.inference.simulation_errors import OF_SIZE
 from mmrjax.model.channels import Channel

@@ -33,7 +33,7 @@ from calibration.inference import (
 )
 from calibration.inference.conduct import error_after_steps
 from calibration.inference.fit_notes import Remark, next_step
-from calibration.inference.fit_posterior import posterior_of_coordinates
+from calibration.inference.identifiability import posterior_of_coordinates
 from calibration.inference.multistart import SearchResult
 from calibration.inference.noise import Noise
 from calibration.inference.noise_factor import noise_remarks

@@ -97,6 +97,8 @@ def search_agreement(starts: int, agree: int, elsewhere: int, more: float, open:
         return "one search, which did not converge" if open else "one search"
     if agree == starts:
         return f"all {starts} starts end at the same optimum"
+    if open == starts:
+        return f"none of {starts} searches converged, so the best end is shown"
     parts = [f"{agree} of {starts} starts end at the best optimum"]
     if elsewhere:
         parts.append(f"{elsewhere} at others (the next costs {more:.3g} more)")

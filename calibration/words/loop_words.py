@@ -13,8 +13,8 @@ from calibration.data import Names
 from calibration.data.input_errors import three_digits
 from calibration.described import describe
 from calibration.discovery import loop_notes
-from calibration.discovery.clusters import Cluster
 from calibration.discovery.location import DiscrepancyLocation
+from calibration.discovery.outliers import Cluster
 from calibration.discovery.settings import FIT, HELD_OUT, WITHOUT_NAME, Settings
 from calibration.inference import bases, blocks
 from calibration.inference.series_noise import SeriesNoise

@@ -113,21 +113,28 @@ def commanded(robot: Robot, conditions: Conditions, state: State) -> Conditions:
     """Conditions with the duty that a controller demands in a state, in the place of its goal."""
     if conditions.goal is None or robot.controller is None:
         return conditions
-    displayed, speed = shown_to_controller(robot, conditions, state)
-    ahead = 0.0 if robot.rig.imposed == "goal_angle" else conditions.goal
-    integral = 0.0 if state.integral is None else state.integral
-    duty = conditions.duty * robot.controller.duty(conditions.goal - displayed, integral, speed, ahead)
+    duty = conditions.duty * (_wanted(robot, conditions, state) if state.command is None else state.command)
     return eqx.tree_at(lambda c: (c.duty, c.goal), conditions, (duty, None), is_leaf=lambda x: x is None)
 
 
-def integrated_error(robot: Robot, conditions: Conditions, state: State) -> Scalar:
-    """Rate of the integral of a controller's error: the error, unless it would drive the duty beyond its limit."""
+def _wanted(robot: Robot, conditions: Conditions, state: State) -> Scalar:
+    """Duty that a controller wants [-]."""
+    assert robot.controller is not None and conditions.goal is not None
+    shown, speed = shown_to_controller(robot, conditions, state)
+    ahead = 0.0 if robot.rig.imposed == "goal_angle" else conditions.goal
+    integral = 0.0 if state.integral is None else state.integral
+    return robot.controller.duty(conditions.goal - shown, integral, speed, ahead)
+
+
+def controller_rates(robot: Robot, conditions: Conditions, state: State) -> list[Scalar]:
+    """Rates of a controller's states: the error, unless it would drive the duty beyond its limit, and the duty's."""
     if conditions.goal is None or robot.controller is None:
-        return jnp.zeros_like(state.speed)
+        return [jnp.zeros_like(state.speed)] * robot.controller_size
+    duty = _wanted(robot, conditions, state)
     error = conditions.goal - shown_to_controller(robot, conditions, state)[0]
-    duty = commanded(robot, conditions, state).duty
     limited = (jnp.abs(duty) >= robot.controller.limit) & (duty * error > 0)
-    return jnp.where(limited | (conditions.open > 0.5), 0.0, error)
+    integrated = jnp.where(limited | (conditions.open > 0.5), 0.0, error)
+    return [integrated] if state.command is None else [integrated, (duty - state.command) / robot.controller.lag]
 
 
 def begin_signals(robot: Robot, conditions: Conditions, state: State, direction: Scalar | None = None) -> Signals:

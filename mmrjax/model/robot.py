@@ -174,6 +174,11 @@ class Robot(eqx.Module):
         return self.rig.loose
 
     @property
+    def controller_size(self) -> int:
+        """Number of states of its controller: the integral of the error, and the duty if that lags."""
+        return 0 if self.controller is None else 1 + self.controller.lags
+
+    @property
     def moves_as_one(self) -> bool:
         """True if shafts and load stop together: no backlash, elastic joint or ground to slip on."""
         return not (self.loose or self.has_ground)

@@ -420,7 +420,7 @@ class Histories(Observer):
 
     @classmethod
     def free(cls) -> tuple[tuple[str, ...], tuple[str, ...]]:
-        return ("motor.inductance", "motor.inertia", DELAY), ("inertia", *settled_ends.GRIP, *settled_ends.SLIDING)
+        return ("motor.inductance", "motor.inertia", DELAY), ("inertia", settled_ends.STATIC, *settled_ends.SLIDING)
 
     def defective(
         self, robot: Robot, probes: tuple[Effect, ...]
