@@ -149,7 +149,8 @@ def drive_start(robot: Robot, conditions: Conditions, rolling: bool = False) -> 
     memory = [effect.settled(robot, settled) for effect in robot.remembering]
     state = [settled.current, settled.speed_motor, settled.speed, 0.0, conditions.discharge, *memory]
     state += [jnp.zeros(())] * robot.controller_size
-    state += [robot.chassis(conditions.configuration).twist(settled.torque_output)] * robot.loose
+    if robot.loose:
+        state += [robot.chassis(conditions.configuration).twist(settled.torque_output)]
     y = jnp.stack([jnp.asarray(x, size.dtype) for x in state]) / size
     return jnp.where(jnp.all(jnp.isfinite(y)), y, rest)
 
