@@ -311,10 +311,14 @@ def regression_verdict(found: Ranking) -> str:
     alike = [e for e in beyond if e.score >= beyond[0].score - Settings.alternative]
     families = " or ".join(dict.fromkeys(with_article(e.family) for e in alike))
     lacks = f"{families} ({' or '.join(e.name for e in alike)})" if alike else "no effect explains it"
-    lacks = f"something is missing, {lacks}" if found.missing else "nothing exceeds chance"
+    lacks = f"something is missing, {lacks}" if found.missing else "no effect of the library exceeds chance"
     numbers = ", ".join(f"{name} {value:.4g} ± {sd:.2g}" for name, (value, sd) in found.parameters.items())
     numbers = f"; parameters [SI]: {numbers}" if numbers else ""
     return f"regression only, not confirmed by simulation: {lacks}{numbers}"
+
+
+#: Remark beside a regression that sees nothing, where the simulation does.
+DISAGREES = "by simulation something is missing: the refitted model leaves more than chance; trust the simulation"
 
 
 def so_far(effects: Sequence[str], families: Sequence[str]) -> str:
