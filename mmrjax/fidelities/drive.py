@@ -138,8 +138,8 @@ def drive_start(robot: Robot, conditions: Conditions, rolling: bool = False) -> 
         first = _initial(robot, conditions)
         angle = first[3] / robot.chassis(conditions.configuration).radius
         memory = [effect.initial(robot, angle) for effect in robot.remembering]
-        known = jnp.stack([*first, jnp.asarray(conditions.discharge, size.dtype), *memory])
-        rest = rest.at[: len(known)].set(known / size[: len(known)])
+        begin = jnp.stack([*first, jnp.asarray(conditions.discharge, size.dtype), *memory])
+        rest = rest.at[: len(begin)].set(begin / size[: len(begin)])
     if robot.loose:
         shaft = robot.chassis(conditions.configuration)
         rest = rest.at[-1].set(shaft.twist(shaft.torque_load(rest[3] * size[3] / shaft.radius)) / size[-1])
@@ -149,7 +149,8 @@ def drive_start(robot: Robot, conditions: Conditions, rolling: bool = False) -> 
     memory = [effect.settled(robot, settled) for effect in robot.remembering]
     state = [settled.current, settled.speed_motor, settled.speed, 0.0, conditions.discharge, *memory]
     state += [jnp.zeros(())] * robot.controller_size
-    state += [robot.chassis(conditions.configuration).twist(settled.torque_output)] * robot.loose
+    if robot.loose:
+        state += [robot.chassis(conditions.configuration).twist(settled.torque_output)]
     y = jnp.stack([jnp.asarray(x, size.dtype) for x in state]) / size
     return jnp.where(jnp.all(jnp.isfinite(y)), y, rest)
 

@@ -136,9 +136,9 @@ def _commanded(robot: Robot, command: Command, conditions: Conditions | None) ->
     values: Mapping[str, Any] = {}
     if command is not None:
         values = command if isinstance(command, Mapping) else {"duty": command}
-    known = [field.name for field in dataclasses.fields(Conditions)]
-    if unknown := next((name for name in values if name not in known), None):
-        raise UsageError(f"command: got {unknown}; {allowed_words(str(unknown), known)}")
+    field_names = [field.name for field in dataclasses.fields(Conditions)]
+    if unknown := next((name for name in values if name not in field_names), None):
+        raise UsageError(f"command: got {unknown}; {allowed_words(str(unknown), field_names)}")
     for name, value in values.items():
         if name != "configuration" and _shape(value) is None:
             raise UsageError(f"command, {name}: got {_named(value)}; expected a number")
@@ -190,6 +190,7 @@ def _vector(robot: Robot, state: State) -> Float[Array, " unknowns"]:
     if shape := next((np.shape(x) for x in jax.tree.leaves(state) if np.shape(x)), ()):
         raise UsageError(f"state: got numbers of shape {shape}; expected one state, or jax.vmap over several")
     memory = [state.memory[effect.name] for effect in robot.remembering]
-    own = [state.current, state.speed_motor, state.speed, state.distance, state.discharge]
+    values = [state.current, state.speed_motor, state.speed, state.distance, state.discharge]
     last = [x for x in (state.integral, state.command, state.gap) if x is not None]
-    return jnp.stack([jnp.asarray(x, float) for x in (*own, *memory, *last)]) / jnp.asarray(drive.drive_units(robot))
+    units = jnp.asarray(drive.drive_units(robot))
+    return jnp.stack([jnp.asarray(x, float) for x in (*values, *memory, *last)]) / units

@@ -125,10 +125,10 @@ class Robot(eqx.Module):
 
     def showing_turns(self, columns: Collection[str] | None = None) -> Robot:
         """Same robot with instruments for both sides and yaw. With `columns`, only for columns of the table."""
-        own = self.rig.channels
+        shown_channels = self.rig.channels
         read = [c for c in channels.OF_TURNS if (c.settled if columns is None else c.column in columns)]
-        more = [c.name for c in read if c.name not in own]
-        return dataclasses.replace(self, rig=dataclasses.replace(self.rig, channels=(*own, *more)))
+        more = [c.name for c in read if c.name not in shown_channels]
+        return dataclasses.replace(self, rig=dataclasses.replace(self.rig, channels=(*shown_channels, *more)))
 
     @property
     def unlike(self) -> tuple[str, ...]:
