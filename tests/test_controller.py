@@ -98,6 +98,18 @@ def test_derivatives_of_a_controlled_run_are_finite_differences(actuator, name):
     assert_allclose(slope, differences, atol=1e-6 * np.abs(differences).max())
 
 
+@pytest.mark.parametrize(("goal", "value", "gains", "signal"), [
+    ("goal_speed", 3.0, {"kp": 0.5, "ki": 5.0, "kd": 0.0}, "speed_output"),
+    ("goal_current", 0.4, {"kp": 1.0, "ki": 5e3, "kd": 0.0}, "current"),
+])  # fmt: skip
+def test_an_integral_brings_speed_and_current_to_their_goals(actuator, goal, value, gains, signal):
+    robot = actuator({**servo.TRUE, **gains}, "goal_angle", goal)
+    one = jax.tree.map(lambda x: jnp.asarray(x)[None], mm.Conditions(voltage=24.0, goal=value))
+    run = drive.drive_batch(robot, one, jnp.asarray([0.0, 0.1, 1.0]))
+    row = 1 if signal == "current" else 2  # a shaft without a load soon turns too fast for its current
+    assert_allclose(getattr(run.signals, signal)[0, row], value, rtol=5e-3)
+
+
 def test_steps_follow_a_goal(actuator):
     robot = actuator()
     state = mm.initial_state(robot, mm.Conditions(voltage=7.4, goal=0.0))
