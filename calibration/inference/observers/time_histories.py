@@ -717,7 +717,8 @@ class Histories(Observer):
 
         optima = searched(starts)
         near = np.asarray(optima[0].cost) < np.nanmin(optima[0].cost) + NEAR
-        if most is None and np.any(near & ~np.asarray(optima[0].converged)):  # a proposal has to be an optimum
+        unended = ~np.asarray(optima[0].converged) & (np.asarray(optima[0].steps) >= steps)
+        if most is None and np.any(near & unended):  # a proposal has to be an optimum
             optima = searched(np.asarray(optima[0].z))
         bare = problem if scanned is None else scanned
         if not rivals or not scans.scanned_coordinates(bare):
