@@ -44,7 +44,7 @@ MOST_STEPS = 256, 2000
 #: Multiple of the decrease predicted by its linearisation that a search of rollouts may still achieve.
 HOPELESS = 10.0
 #: Number of last steps that predict the further decrease of a search of rollouts. Share of the objective by which
-#: twice as many steps have to lower it. (Where a load sticks, a rollout is not smooth, and its Jacobian promises more.)
+#: twice as many have to lower it. (Where a load sticks, a rollout is not smooth, and its Jacobian promises more.)
 LATELY, STALLED = 5, 1e-4
 #: Number of searches that have to end in one place, and their tolerance in the objective, for an optimum.
 AGREE, SAME = 3, 0.01
