@@ -143,9 +143,9 @@ def test_a_regression_takes_an_effect_of_the_other_fit_away(space):
     assert_allclose(back.z, beside(("", "")).z, atol=1e-9)
 
 
-def ranked_sets(space, **explained):
-    """Screened single effects that explain so much [σ²], of 1000."""
-    at = np.zeros(space.free + 4)
+def ranked_sets(space, far=0.0, **explained):
+    """Screened single effects that explain so much [σ²], of 1000, so far from the prior mean [prior sd]."""
+    at = np.repeat([far, 0.0], [space.free, 4])
     return [
         Candidate(fill_slots([n], ANALYST.settings), at, at, 500 - x / 2, np.zeros(2), np.zeros(2), True, True, True,
                   simulated=False)
@@ -154,14 +154,15 @@ def ranked_sets(space, **explained):
 
 
 @pytest.mark.parametrize(
-    ("simulated", "asked", "otherwise"),
+    ("simulated", "asked", "otherwise", "far"),
     [
-        ({"churning": 900, "series_resistance": 500, "stribeck_track": 895}, 3, 0),
-        ({"churning": 300, "series_resistance": 500, "stribeck_track": 400, "brush_drop": 700}, 4, 2),
+        ({"churning": 900, "series_resistance": 500, "stribeck_track": 895}, 3, 0, 2.0),
+        ({"churning": 300, "series_resistance": 500, "stribeck_track": 400, "brush_drop": 700}, 4, 2, 2.0),
+        ({"churning": 300, "series_resistance": 500, "stribeck_track": 400, "brush_drop": 700}, 4, 2, 0.5),
     ],
 )
 def test_simulation_confirms_the_first_and_its_rivals_or_another_is_tried(
-    space, monkeypatch, simulated, asked, otherwise
+    space, monkeypatch, simulated, asked, otherwise, far
 ):
     tried = []
 
@@ -174,13 +175,13 @@ def test_simulation_confirms_the_first_and_its_rivals_or_another_is_tried(
         ]
 
     monkeypatch.setattr(screening, "fit_candidates", fit)
-    screened = ranked_sets(space, churning=900, stribeck_track=890, series_resistance=500, brush_drop=480)
+    screened = ranked_sets(space, far, churning=900, stribeck_track=890, series_resistance=500, brush_drop=480)
     found = screening.confirm_by_simulation(space.with_room(NAMES), screened, ANALYST.settings)
     assert (found.asked, found.otherwise) == (asked, otherwise)
     assert [c.simulated for c in found.candidates].count(True) == asked
     assert tried[:3] == ["churning", "series_resistance", "stribeck_track"]
-    # From the prior mean too if simulation explains less than the regression.
-    assert [tried.count(n) for n in tried[:3]] == ([1, 1, 1] if otherwise == 0 else [2, 1, 2])
+    # From the prior mean too if simulation explains less than the regression, which is not near that mean.
+    assert [tried.count(n) for n in tried[:3]] == ([1, 1, 1] if otherwise == 0 or far < 1 else [2, 1, 2])
     best = min((c for c in found.candidates if c.simulated), key=lambda c: c.cost)
     assert best.effects == (("churning",) if otherwise == 0 else ("brush_drop",))
 

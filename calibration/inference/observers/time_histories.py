@@ -148,6 +148,9 @@ def _by_row(
     return jnp.zeros((rows, *of_runs.shape[2:]), of_runs.dtype).at[place].set(of_runs, mode="drop")
 
 
+#: Distance from the prior from which a fit that did not converge, of a log with a missing effect, is not scanned for
+#: other delays [prior sd].
+LOST = 4.0
 #: Distance from the lowest of several fits up to which an unconverged one continues [half σ²], the margin of a class.
 NEAR = 3.0
 
@@ -724,6 +727,8 @@ class Histories(Observer):
         if not rivals or not scans.scanned_coordinates(bare):
             return optima
         k, size = int(np.nanargmin(optima[0].cost)), len(bare.coordinates)
+        if most is not None and not optima[0].converged[k] and np.abs(optima[0].z[k]).max() > LOST:
+            return optima
 
         def one(every: tuple[Optimum, Observation]) -> tuple[Optimum, Observation]:
             best, seen = jax.tree.map(lambda leaf: leaf[k], every)
