@@ -72,8 +72,9 @@ def test_the_base_of_a_log_is_fitted_in_the_program_of_its_room(space, monkeypat
     assert with_slots[0].tolist() == [0.2] * space.free + [0.0] * 4
 
 
-def test_other_basins_of_a_log_are_searched_in_the_program_of_its_room(space, monkeypatch):
-    """With the priors of its coordinates, which are more than the base's."""
+@pytest.mark.parametrize("lost", [False, True])
+def test_other_basins_of_a_log_are_searched_in_the_program_of_its_room(space, monkeypatch, lost):
+    """With the priors of its coordinates, which are more than the base's. Not of a fit that is lost."""
     problem, (empty,) = space.with_room(["churning"]).fitted_by([("", "")])
     size, priors = space.free + 4, []
 
@@ -81,7 +82,7 @@ def test_other_basins_of_a_log_are_searched_in_the_program_of_its_room(space, mo
         priors.append(np.shape(data.centre))
         zero = np.zeros(len(starts))
         square = np.zeros((len(starts), size, size))
-        return Optimum(np.asarray(starts), np.asarray(starts), square, zero, zero, zero == 0, zero), zero
+        return Optimum(np.asarray(starts), np.asarray(starts), square, zero, zero, zero == lost, zero), zero
 
     monkeypatch.setattr(time_histories, "search_rollouts", rollouts)
     monkeypatch.setattr(time_histories.scans, "scanned_coordinates", lambda problem: (0,))
@@ -90,8 +91,11 @@ def test_other_basins_of_a_log_are_searched_in_the_program_of_its_room(space, mo
     )
     weights, which = space.weight[None], np.asarray(empty)[None]
     best, _ = space.bare.observe.search(
-        problem, np.zeros((1, size)), weights, which, rivals=True, most=1, scanned=space.bare
+        problem, np.full((1, size), 60.0 * lost), weights, which, rivals=True, most=1, scanned=space.bare
     )
+    if lost:
+        assert priors == [(size,)] and best.z[0].tolist() == [60.0] * size
+        return
     assert priors == [(size,)] * 2 and best.z[0].tolist() == [1.0] * space.free + [0.0] * 4
 
 
