@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from calibration.words import effect_words as words
+from calibration.words import experiment_words as words
 from mmrjax.effects import ALL, OF_CHANNELS, OF_TURNS, Effect
 from mmrjax.fidelities.drive import drive
 from mmrjax.fidelities.steady import steady

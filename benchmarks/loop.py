@@ -171,7 +171,7 @@ def deviates(case: Case, found, settings) -> dict:
 
     Empty if the found class does not contain the truth, or if there is a wrong finding.
     """
-    from calibration.discovery.findings import amplitude_unit
+    from calibration.inference.linearization import amplitude_unit
 
     truths = [e["class"] for e in case.label["effects"]]
     space, best = found.screened.base.space, found.best

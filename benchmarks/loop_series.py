@@ -111,7 +111,8 @@ def work(task: Task) -> dict:
 
 def _left(found, effect: dict, settings) -> dict:
     """Remainder of a library effect after the loop's own base, which frees its base parameters at its own fit."""
-    from calibration.discovery.findings import amplitude_unit, effect_scores
+    from calibration.discovery.findings import effect_scores
+    from calibration.inference.linearization import amplitude_unit
 
     if not effect["class"]:
         return {}
@@ -125,7 +126,7 @@ def _left(found, effect: dict, settings) -> dict:
 
 def _amplitudes(found, settings) -> dict:
     """Amplitude of each named effect, and its sd [SI]."""
-    from calibration.discovery.findings import amplitude_unit
+    from calibration.inference.linearization import amplitude_unit
 
     space, best = found.screened.base.space, found.best
     sd = {e.name: amplitude_unit(e) for e in space.library.effects}

@@ -373,7 +373,7 @@ parameters fitted again, blue the model with the effects. The grey band is noise
 
 For each effect, the figure shows the reading that it changes most, minus the same reading of the robot without it. Dots
 are measured, crosses the refitted model with nothing added. The blue line is the law with its 95 % band. If an effect is
-real, the line follows the dots along the whole axis.
+real, the line follows the dots.
 
 ## May I use the robot?
 

@@ -28,7 +28,7 @@ from mmrjax.model.channels import Channel
 
 #: Packages whose dataclasses a file may name, and modules whose functions it may.
 PACKAGES = ("mmrjax", "calibration")
-FUNCTIONS = ("calibration.discovery.setups", "calibration.discovery.menu")
+FUNCTIONS = ("calibration.discovery.menu", "calibration.discovery.menu")
 #: Kinds of arrays that are bytes alone.
 KINDS = "biufcSU"
 

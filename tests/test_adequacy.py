@@ -5,7 +5,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from calibration.discovery.adequacy import AdequacyTest
+from calibration.discovery import discover
+from calibration.discovery.adequacy import AdequacyTest, Diagnosis
+from calibration.discovery.score_tests import Statistics
 
 SETTINGS = SimpleNamespace(
     shares={"single": 0.05, "curve": 0.1}, margins={"single": 1.0, "curve": 2.0}, family_wise_error=0.15
@@ -34,3 +36,28 @@ def test_rejected_with_margin_is_above_the_threshold_by_the_margin():
     assert threshold == 95.0  # 94 of 99 are below
     assert not judged(threshold + 0.9, 0.0).rejected_with_margin
     assert judged(threshold + 1.1, 0.0).rejected_with_margin
+
+
+@pytest.mark.parametrize(
+    ("gain", "simulated", "long", "chi2", "stands"),
+    [(5.4, True, True, 1, False), (19.0, True, True, 1, True), (0.0, False, True, 1, True), (0.0, True, False, 1, True),
+     (5.4, True, True, 99, True)],
+    ids=["refuted", "confirmed", "not simulated", "table", "other statistic"],
+)  # fmt: skip
+def test_score_of_a_log_that_its_simulation_refutes_is_no_finding(gain, simulated, long, chi2, stands):
+    """A start of a vehicle that slips is not linear: 4.4 sigma of a score were 2.3 in the simulation."""
+    zeros = np.zeros(99)
+    null = Statistics(np.linspace(1, 4, 99), np.linspace(1, 20, 99), zeros, np.linspace(1, 9, 99), zeros, zeros)
+    settings = SimpleNamespace(shares={"single": 0.03, "pair": 0.03, "chi2": 0.03}, family_wise_error=0.05)
+    found = Statistics(np.asarray(4.4), np.asarray(30.0), *(np.asarray(float(x)) for x in (0, chi2, 0, 1)))
+    library = SimpleNamespace(names=("a", "b"), best_instance=lambda name, scores: "ab".index(name))
+    space = SimpleNamespace(library=library, bare=SimpleNamespace(observe=SimpleNamespace(long=long)))
+    base = SimpleNamespace(space=space, candidate=SimpleNamespace(cost=100.0))
+    ladder = [SimpleNamespace(effects=("a",), cost=100 - gain / 2, simulated=simulated)]
+    left = Diagnosis(None, SimpleNamespace(single=np.array([-4.4, 1.0])), AdequacyTest(found, null, settings))
+    screened = SimpleNamespace(base=base, cluster=None)
+    confirmed = discover._confirmed(screened, left, SimpleNamespace(ladder=ladder))
+    assert left.test.rejected and (confirmed is None) == stands
+    if confirmed is not None:
+        assert confirmed.test.found.single == pytest.approx(gain**0.5) and not confirmed.test.rejected
+        assert confirmed.test.found.pair == pytest.approx(30 - 4.4**2 + gain)

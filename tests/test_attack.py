@@ -27,7 +27,7 @@ from calibration.data import posterior_file as posterior_file
 from calibration.data import robot_file
 from calibration.data.input_errors import BadConfiguration
 from calibration.inference import priors
-from calibration.inference.fit_posterior import posterior_of_coordinates
+from calibration.inference.identifiability import posterior_of_coordinates
 from mmrjax.errors import printable
 from mmrjax.model import paper_robots
 from sweeps import cli

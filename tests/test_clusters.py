@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from calibration.discovery import clusters
-from calibration.discovery.clusters import find_cluster
+from calibration.discovery import outliers
+from calibration.discovery.outliers import find_cluster
 from calibration.words import loop_words as words
 
 ERROR = 0.01
@@ -36,7 +36,7 @@ def drawn(mask, count, seed=1):
 @pytest.mark.slow
 def test_scattered_outliers_are_no_cluster(monkeypatch):
     """As seldom as stated, over 200 draws. A test of the test: of outliers that lie together, nearly always."""
-    monkeypatch.setattr(clusters, "PERMUTATIONS", 400)
+    monkeypatch.setattr(outliers, "PERMUTATIONS", 400)
     axes, levels, error = {"time": TIME}, {"supply_voltage_V": VOLTAGE}, 0.05
     count = np.random.default_rng(2).integers(3, 16, 200)
     false = [found(drawn(np.ones(ROWS, bool), n, k), axes, levels, error) for k, n in enumerate(count)]
@@ -63,7 +63,7 @@ def test_outliers_on_a_stretch_are_found_there(case):
     x = AXES[axis][inside]
     # the place is told to the width of the widest window, and holds all of them
     assert got.low <= x.min() and got.high >= x.max() and got.inside >= len(inside)
-    assert got.high - got.low <= max(clusters.WINDOWS) * np.ptp(AXES[axis])
+    assert got.high - got.low <= max(outliers.WINDOWS) * np.ptp(AXES[axis])
     assert got.of == len(np.union1d(inside, alone))
     assert words.cluster_sentence(got).startswith(
         f"{got.inside} of {got.of} outlying rows cluster at {axis} {got.low:.3g} to"
@@ -86,7 +86,7 @@ def test_the_least_probable_cluster_is_told():
 
 
 def test_two_outliers_are_no_cluster():
-    assert clusters.FEWEST == 3 and found([100, 101]) is None and found([]) is None
+    assert outliers.FEWEST == 3 and found([100, 101]) is None and found([]) is None
 
 
 def test_rows_that_never_counted_are_no_place_for_outliers():

@@ -6,7 +6,7 @@ import pytest
 from calibration.data.posterior_file import LOG, NORMAL, Posterior
 from calibration.described import describe
 from calibration.inference.fit_notes import Determination
-from calibration.inference.fit_posterior import determined_together, undetermined_names
+from calibration.inference.identifiability import determined_together, undetermined_names
 
 
 def posterior(correlation, kinds, spread=(1.0, 1.0), value=(3.0, 5.0)):

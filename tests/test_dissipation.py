@@ -6,8 +6,7 @@ import pytest
 from calibration.data import robot_file
 from calibration.data.runs import Runs
 from calibration.discovery import discover
-from calibration.discovery.candidates import candidate_of_fit
-from calibration.discovery.dissipation import supplying_effects
+from calibration.discovery.candidates import candidate_of_fit, supplying_effects
 from calibration.discovery.settings import settings_for
 from calibration.inference import observers
 from calibration.inference.optimizers import Optimum

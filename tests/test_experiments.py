@@ -16,12 +16,10 @@ from calibration.data import robot_file
 from calibration.data.input_errors import BadConfiguration
 from calibration.discovery import experiments, menu, predicted
 from calibration.discovery.candidates import Candidate, fill_slots, fit_candidates
-from calibration.discovery.classes import Classes
-from calibration.discovery.instructions import NothingPossible
+from calibration.discovery.classes import Classes, Shift
 from calibration.discovery.location import DiscrepancyLocation
-from calibration.discovery.loop_notes import Heat, Overspeed, Overvoltage
 from calibration.discovery.reach import reach_of_table
-from calibration.discovery.stated_values import Shift
+from calibration.inference.fit_notes import Remark
 from mmrjax.effects import BY_NAME, OF_CHANNELS
 from mmrjax.fidelities.steady import IMPLICIT
 from mmrjax.model import channels, paper_robots, params
@@ -366,7 +364,7 @@ def test_higher_voltage_needs_a_rating_and_is_watched(rover):
     run = next(r for r in runs_of(menu.experiment_menu(within)) if r.name == "other voltages, rover")
     assert max(run.voltage) == 18.0
     shown = menu.restrict_run(run, *plain(run), within)
-    assert Overvoltage(18.0, 12.0) in shown.watch
+    assert Remark("overvoltage", voltage=18.0, used=12.0) in shown.watch
 
 
 @pytest.mark.parametrize(
@@ -465,15 +463,22 @@ def test_steepest_slope_is_one_that_the_robot_climbs():
 @pytest.mark.parametrize(
     ("name", "temperature", "speed", "watch"),
     [
-        ("stall", 90.0, 0.0, Heat("held", 90.0, 125.0, max(BY["stall"].voltage) / REACH.resistance)),
-        ("braked motor", 90.0, 900.0, Heat("braked", 90.0, 125.0)),
+        (
+            "stall",
+            90.0,
+            0.0,
+            Remark(
+                "held_motor", temperature=90.0, allowed=125.0, current=max(BY["stall"].voltage) / REACH.resistance
+            ),
+        ),
+        ("braked motor", 90.0, 900.0, Remark("braked_motor", temperature=90.0, allowed=125.0)),
         (
             "lifted, 6T2A",
             40.0,
             1250.0,
-            Overspeed(1250.0, REACH.limit_geared, max(BY["lifted, 6T2A"].voltage)),
+            Remark("overspeed", speed=1250.0, limit=REACH.limit_geared, voltage=max(BY["lifted, 6T2A"].voltage)),
         ),
-        ("payload 12 kg, 6T2A", 118.0, 500.0, Heat("run", 118.0, 125.0)),
+        ("payload 12 kg, 6T2A", 118.0, 500.0, Remark("hot_motor", temperature=118.0, allowed=125.0)),
     ],
 )
 def test_what_can_do_damage_is_to_be_watched(name, temperature, speed, watch):
@@ -530,7 +535,7 @@ def test_forbidden_and_impossible_experiments_are_not_proposed(seen):
     assert left.value.shape[1] == sum(predicted.reading_count(e) for e in left.experiments) == len(left.sd)
     everything = dataclasses.replace(SETTINGS, forbidden=menu.KINDS)
     nothing = experiments.choose_experiment(experiments.predict_menu(space, fitted, everything))
-    assert nothing.name == experiments.NONE and nothing.instruction == NothingPossible()
+    assert nothing.name == experiments.NONE and nothing.instruction == Remark("nothing_possible")
 
 
 def test_finer_steps_are_within_the_tables_ranges(rover):

@@ -2,7 +2,7 @@
 
 import pytest
 
-from calibration.words import effect_words as words_of
+from calibration.words import experiment_words as words_of
 from mmrjax import effects
 from mmrjax.errors import allowed_words, similar_words
 from mmrjax.model import channels, paper_robots, params

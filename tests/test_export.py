@@ -26,7 +26,7 @@ import mmrjax as mm
 from calibration.data import posterior_file, robot_file
 from calibration.data.input_errors import BadConfiguration, BadData
 from calibration.inference import priors
-from calibration.inference.fit_posterior import posterior_of_coordinates
+from calibration.inference.identifiability import posterior_of_coordinates
 from mmrjax import effects
 from mmrjax.model import balances, paper_robots, params
 from mmrjax.model.signals import Signals
@@ -38,7 +38,6 @@ from sweeps.export import (
     formats,
     jax_actuator,
     law_source,
-    mjlab,
     mujoco,
     onnx,
     randomization,
@@ -367,7 +366,7 @@ def test_mjlab_actuator_gives_the_torque_of_jax_within_a_stand_in(with_effects, 
 
     stand_in(monkeypatch)
     drive, _, known = with_effects
-    (tmp_path / "mjlab_actuator.py").write_text(mjlab.mjlab_files(drive, known, [])["mjlab_actuator.py"])
+    (tmp_path / "mjlab_actuator.py").write_text(law_source.mjlab_files(drive, known, [])["mjlab_actuator.py"])
     monkeypatch.syspath_prepend(tmp_path)
     module = importlib.import_module("mjlab_actuator")
     cfg = module.DriveActuatorCfg(target_names_expr=("left", "right"))

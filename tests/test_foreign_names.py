@@ -23,7 +23,7 @@ from mmrjax.errors import UsageError, printable
 from mmrjax.model.robot import Configurations
 from sweeps import config as configuration
 from sweeps import console
-from sweeps.export import feed_forward, law_source, mjlab, mujoco
+from sweeps.export import feed_forward, law_source, mujoco
 from sweeps.export import joint as joints
 from sweeps.report import page_renderer
 from sweeps.report.document import Column, Document, Note, Section, Table
@@ -68,7 +68,7 @@ def test_generated_source_has_names_as_words_and_runs_none(drive, monkeypatch):
     monkeypatch.setattr(builtins, "boom", boom, raising=False)
     joint, known = drive
     jax_text = law_source.jax_source(joint, known, [ALL])
-    for text in (jax_text, mjlab.mjlab_files(joint, known, [ALL])["mjlab_actuator.py"]):
+    for text in (jax_text, law_source.mjlab_files(joint, known, [ALL])["mjlab_actuator.py"]):
         tree = ast.parse(text)
         assert "boom" not in {n.id for n in ast.walk(tree) if isinstance(n, ast.Name)}
         assert not obeyed(text) and "boom" in ast.get_docstring(tree)

@@ -157,6 +157,18 @@ def test_what_is_written_predicts_and_the_refit_stands_beside_it(done):
             assert values[name] == pytest.approx(shift["before"], rel=1e-6)
 
 
+def test_residuals_of_rows_are_simulated_less_measured_readings(done):
+    """As statistics.md has it, before as after."""
+    with (done.folder / "found" / "rows.csv").open(encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(file))
+    for name, unit in (("total_current", "A"), ("motor_speed", "rpm"), ("speed", "mm_s")):
+        for fit in ("before", "after"):
+            names = f"{fit}_{name}_{unit}", f"{name}_{unit}", f"{name}_sd_{unit}", f"residual_{fit}_{name}_sigma"
+            shown, read, sd, residual = (np.array([float(row[n]) for row in rows]) for n in names)
+            np.testing.assert_allclose(residual, (shown - read) / sd, atol=1e-4)  # nine digits are written
+            assert np.ptp(residual) > 1
+
+
 def test_result_has_the_schema_of_the_issue(done):
     r = done.result
     schema = json.loads((Path(__file__).parents[1] / "docs" / "schemas" / "loop.schema.json").read_text())

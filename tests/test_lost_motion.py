@@ -101,7 +101,7 @@ def test_check_of_a_log_reports_lost_motion(tmp_path, capsys):
 
 
 @pytest.mark.parametrize("lost", [True, False])
-def test_no_effect_stands_in_for_a_missing_backlash(lost):
+def test_no_effect_stands_in_for_a_missing_backlash(lost, monkeypatch):
     """The search took minutes, and its answer was a driver's characteristic."""
     rejected = SimpleNamespace(test=SimpleNamespace(rejected=True))
     steps = []
@@ -110,6 +110,7 @@ def test_no_effect_stands_in_for_a_missing_backlash(lost):
         steps.append(name)
         return ("base", rejected) if name == "bootstrap 0" else ("base", rejected, SimpleNamespace(diagnosis=None))
 
+    monkeypatch.setattr(discover, "_confirmed", lambda *stages: None)
     task = SimpleNamespace(
         settings=SimpleNamespace(replicates=1), keep=keep, progress=lambda step: None, loses_motion=lost
     )

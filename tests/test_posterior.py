@@ -16,7 +16,7 @@ from calibration.data.input_errors import BadData
 from calibration.data.posterior_file import ANGLE, LOG, NORMAL, Posterior
 from calibration.data.runs import read_runs
 from calibration.inference import priors
-from calibration.inference.fit_posterior import posterior_of_coordinates
+from calibration.inference.identifiability import posterior_of_coordinates
 from mmrjax.fidelities.steady import steady_batch
 from mmrjax.fidelities.variation import Variation
 from mmrjax.model import params

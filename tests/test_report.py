@@ -190,7 +190,7 @@ def test_report_of_a_file_names_it_without_its_folder_and_lists_what_changed(tmp
 def test_one_run_is_shown_with_its_readings_limits_and_power(tmp_path):
     runs = _runs("6T2A", 33.0, 0.0, 5.0)
     _, page = _write(tmp_path, runs, document=runs_report.runs_document)
-    assert drawn(page) == {"power"} and outside(tmp_path) == []
+    assert drawn(page) == {"power", "drive_chart"} and outside(tmp_path) == []
     tables = Tables(page).tables
     (_, heading), *rows = tables["runs"]
     shown = dict(rows)
@@ -208,6 +208,21 @@ def test_run_without_numbers_says_why(tmp_path):
     assert (
         drawn(page) == set() and words.STATUSES["slides"].meaning in page and "No run ends in steady travel" in page
     )
+
+
+def test_operating_points_lie_on_the_chart_of_motor_and_gear():
+    """The chart is of a bench with a brake, the points are of the robot on a slope: one drive."""
+    runs = _runs(("6T2A", "4W2T"), 33.0, 8.0, (0.0, 10.0))
+    robot = ROBOTS["nominal"]()
+    points, curves = power_figures.operating_points(robot, runs), power_figures.drive_curves(robot, 33.0)
+    assert (runs["status"] == "converged").all() and np.ptp(points["torque_Nm"]) > 1.0
+    for name in ("motor_rpm", "motor_A"):
+        on_curve = np.interp(points["torque_Nm"], curves["torque_Nm"], curves[name])
+        assert_allclose(points[name], on_curve, rtol=2e-3)
+    lost = 33.0 * curves["motor_A"] - curves["torque_Nm"] * curves["motor_rpm"] * np.pi / 30 / float(
+        robot.gearbox.ratio
+    )
+    assert (lost > 0).all() and curves["efficiency_percent"].max() < 100 * float(robot.gearbox.efficiency_load)
 
 
 @pytest.mark.slow

@@ -16,7 +16,7 @@ from mmrjax.model.conditions import Conditions
 from mmrjax.model.signals import CONVERGED, FAILED
 from mmrjax.undercarriage.stability import largest_step
 from sweeps.pages import gear_figures
-from sweeps.paper import report, running_gear_figures
+from sweeps.paper import report
 from sweeps.points import run as simulation
 from sweeps.report import page_renderer, runs_report
 
@@ -35,10 +35,10 @@ def drawn(text):
 @pytest.fixture(scope="module")
 def written(robot, tmp_path_factory):
     """Folder and text of the paper remade with the track model, and the run that its figures show."""
-    seen, runs = [], running_gear_figures.simulate_gear_runs
+    seen, runs = [], report.simulate_gear_runs
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(running_gear_figures, "SECONDS", SECONDS)
-        patch.setattr(running_gear_figures, "simulate_gear_runs", lambda robot: seen.append(runs(robot)) or seen[0])
+        patch.setattr(report, "SECONDS", SECONDS)
+        patch.setattr(report, "simulate_gear_runs", lambda robot: seen.append(runs(robot)) or seen[0])
         folder = tmp_path_factory.mktemp("report")
         text = page(folder, robot)
     return folder, text, seen[0]
@@ -100,7 +100,7 @@ def test_robot_that_does_not_get_under_way_is_said_and_not_drawn(robot, written,
         signals=dataclasses.replace(run.signals, total_current=np.full_like(run.signals.total_current, np.nan)),
         result=dataclasses.replace(run.result, status=np.array([FAILED, CONVERGED])),
     )
-    monkeypatch.setattr(running_gear_figures, "simulate_gear_runs", lambda robot: broken)
+    monkeypatch.setattr(report, "simulate_gear_runs", lambda robot: broken)
     text = page(tmp_path, robot)
     assert drawn(text) == set()
     assert re.search(r'id="gear-left-out">.*6T2A: failed, 4W2T: settled', text)
@@ -112,9 +112,9 @@ def test_stiff_robot_is_run_with_a_step_that_it_bears(robot, monkeypatch):
     stiff = params.replace(robot, {"running_gear.contact_stiffness": np.asarray(1e12)})
     taken = {}
     monkeypatch.setattr(
-        running_gear_figures, "track_batch", lambda robot, conditions, **keywords: taken.update(keywords)
+        "mmrjax.fidelities.track.track_batch", lambda robot, conditions, **keywords: taken.update(keywords)
     )
-    running_gear_figures.simulate_gear_runs(stiff)
+    report.simulate_gear_runs(stiff)
     limit = largest_step(stiff, Conditions(["6T2A", "4W2T"], 33.0).resolved(stiff)).min()
     assert taken["step"] <= limit < 1e-4
     assert (taken["sample"] / taken["step"]) == pytest.approx(round(taken["sample"] / taken["step"]))

@@ -12,6 +12,7 @@ from test_rig_histories import BENCH, DRIVE, history
 from calibration.data import robot_file
 from calibration.inference import multistart, noise, observers, priors, scans
 from calibration.inference.calibration import calibrate
+from calibration.inference.identifiability import Z95
 from calibration.inference.observers import time_histories
 from calibration.inference.optimizers import evaluate_residuals
 from calibration.inference.scans import Scan
@@ -150,3 +151,17 @@ def test_a_fit_that_may_be_proposed_goes_on_until_it_is_an_optimum(monkeypatch):
     calls.clear()
     search(np.zeros((3, 2)), np.ones(3), most=6)  # as many steps as are stated
     assert len(calls) == 1
+
+
+def test_a_scan_sees_a_minimum_that_no_point_of_its_grid_is_in():
+    """A stiff joint's: 0.01 prior sds wide where points are 0.27 apart, and a slope beyond it. z is the minimum."""
+    at, width = -0.764, 0.01
+
+    def scan(problem, z, data, k, values):
+        x = np.asarray(values)
+        cost = np.minimum(0.5 * ((x - at) / width) ** 2, 800.0 + 100.0 * x)
+        return cost, np.stack([x, np.zeros_like(x)], 1)
+
+    problem = SimpleNamespace(observe=SimpleNamespace(scan_points=lambda problem, k: 32, scan=scan))
+    low, high = scans.scan_coordinate(problem, np.array([at, 0.0]), None, 0).interval()
+    assert_allclose([low, high], [at - Z95 * width, at + Z95 * width], atol=0.2 * width)

@@ -18,8 +18,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 from calibration.data import posterior_file as posteriors
 from calibration.data import robot_file
 from calibration.inference import priors
-from calibration.inference.fit_posterior import posterior_of_coordinates
-from calibration.sensitivity import information
+from calibration.inference.identifiability import posterior_of_coordinates
+from calibration.sensitivity import next_runs
 from calibration.sensitivity import uncertain_inputs as room
 from calibration.sensitivity.analyse import analyse_sensitivity
 from calibration.sensitivity.local import inert_inputs, local_derivatives
@@ -183,7 +183,7 @@ def test_morris_has_indices_of_its_own(mmrjax, tmp_path):
 
 
 def test_a_share_of_a_reading_of_zero_tells_nothing():
-    told = information.fisher_information(np.ones((1, 2, 1)), np.array([[0.0, 2.0]]))
+    told = next_runs.fisher_information(np.ones((1, 2, 1)), np.array([[0.0, 2.0]]))
     assert_array_equal(told, [[[0.25]]])
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from calibration.sensitivity import information, morris, sobol
+from calibration.sensitivity import morris, next_runs, sobol
 from calibration.sensitivity.replicates import REPLICATES, ratio_estimate
 
 A, B = 7.0, 0.1
@@ -164,9 +164,9 @@ def test_morris_design_is_repeatable_and_leaves_the_global_generator_alone():
 def test_chosen_runs_are_the_best_of_all_sets():
     rng = np.random.default_rng(0)
     jacobian = rng.normal(size=(9, 2, 3)) * rng.uniform(0.2, 3, size=(9, 1, 1))
-    each = information.fisher_information(jacobian, np.full((9, 2), 0.5))
+    each = next_runs.fisher_information(jacobian, np.full((9, 2), 0.5))
     value = lambda rows: np.linalg.slogdet(np.eye(3) + each[list(rows)].sum(0))[1]  # noqa: E731
-    choice = information.choose_runs(each, 3)
+    choice = next_runs.choose_runs(each, 3)
     best = max(itertools.combinations(range(9), 3), key=value)
     assert value(choice.rows) == pytest.approx(value(best))
     assert np.sum(choice.gain) * 2 * np.log(2) == pytest.approx(value(choice.rows))
@@ -175,7 +175,7 @@ def test_chosen_runs_are_the_best_of_all_sets():
 
 def test_missing_readings_tell_nothing():
     jacobian = np.array([[[1.0], [np.nan]]])
-    assert information.fisher_information(jacobian, np.array([[0.5, 1.0]]))[0, 0, 0] == 4.0
+    assert next_runs.fisher_information(jacobian, np.array([[0.5, 1.0]]))[0, 0, 0] == 4.0
 
 
 def test_ratio_interval_is_that_of_students_t_for_a_constant_denominator():

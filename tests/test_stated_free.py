@@ -66,7 +66,7 @@ def test_a_log_shows_how_a_vehicle_grips_though_no_channel_shows_its_speed(tmp_p
     vehicle = 'load = "vehicle"\nmass = "10 ± 20 %"\nradius = 0.06\n[bench.ground]\nrolling_resistance = 0.02\n'
     vehicle += '[bench.ground.friction]\nstatic = "0.6 ± 30 %"\n'
     robot = bench(tmp_path, lambda text: text.partition('load = "shaft"')[0] + vehicle)
-    grip = {f"bench.{n}" for n in ("mass", "ground.friction.static", "ground.friction.speed_static")}
+    grip = {f"bench.{n}" for n in ("mass", "ground.friction.static")}
     log, settled = (priors.free_names(robot, ["bench"], *kind.free(), idle) for kind, idle in KINDS)
     assert grip < set(log) and grip & set(settled) == {"bench.mass"}
 

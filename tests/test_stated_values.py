@@ -9,8 +9,8 @@ from synthetic import FEW, SETTLED, small, table
 from worlds import laws, settled, tables
 
 from calibration.discovery import discover, findings
+from calibration.discovery.classes import find_prior_shifts, prior_shift_scores
 from calibration.discovery.loop_notes import FreedValue
-from calibration.discovery.stated_values import find_prior_shifts, prior_shift_scores
 from calibration.words import loop_words as words
 
 NOMINAL = settled.CLIMBING["motor.resistance"]

@@ -189,7 +189,7 @@ SPELLED = {
     ("calibration/discovery/menu.py", "TURNING, STANDING"),
     ("calibration/data/proposals.py", "MEANINGS"),  # words in the names of other people's signals
     ("calibration/data/proposals.py", "BY_UNIT"),
-    ("calibration/words/effect_words.py", "CHECKED_BY"),  # which act checks which instrument
+    ("calibration/words/experiment_words.py", "CHECKED_BY"),  # which act checks which instrument
     ("calibration/inference/blocks.py", "BLOCKS"),  # what is imposed may be a channel's column
     ("calibration/inference/observers/settled_ends.py", "_slides_at_end"),  # the two that show slip
 }

@@ -11,7 +11,7 @@ from calibration.data import runs as records
 from calibration.data.input_errors import BadData
 from calibration.described import describe
 from calibration.discovery import discover
-from calibration.inference import noise, observers, ranges, uninformative
+from calibration.inference import checks, noise, observers, ranges
 
 RIG = """
 base = "none"
@@ -47,7 +47,7 @@ def foreseen(monkeypatch):
     """The robot foresees what these functions of current and torque say, without a program."""
 
     def says(readings):
-        for room in (ranges, uninformative):
+        for room in (ranges, checks):
             monkeypatch.setattr(room, "operating_readings", lambda robot, conditions: readings)
 
     return says
@@ -68,7 +68,7 @@ def shown(runs):
 
 
 def test_independent_readings_are_no_copies(tmp_path, robot):
-    assert uninformative.copied_channels(table(tmp_path, robot), robot) == []
+    assert checks.copied_channels(table(tmp_path, robot), robot) == []
 
 
 @pytest.mark.parametrize(
@@ -84,7 +84,7 @@ def test_independent_readings_are_no_copies(tmp_path, robot):
 )
 def test_a_channel_that_is_a_line_of_another_is_refused_by_the_loop(tmp_path, robot, foreseen, copy, column, said):
     runs = table(tmp_path, robot, **copy)
-    (found,) = uninformative.copied_channels(runs, robot)
+    (found,) = checks.copied_channels(runs, robot)
     assert (found.column, found.tied) == (column, False) and said in describe(found)
     foreseen(shown(runs))
     with pytest.raises(BadData, match=rf"t\.csv, {column}: in every row .* remove it from channels and table"):
@@ -95,7 +95,7 @@ def test_a_channel_that_is_a_line_of_another_is_refused_by_the_loop(tmp_path, ro
     "torque", [0.64 * CURRENT + 2e-4 * RNG.standard_normal(12), np.round(0.64 * CURRENT, 2), 0.64 * CURRENT**2]
 )
 def test_what_follows_another_within_noise_or_a_display_or_on_a_curve_is_no_copy(tmp_path, robot, torque):
-    assert uninformative.copied_channels(table(tmp_path, robot, torque=torque), robot) == []
+    assert checks.copied_channels(table(tmp_path, robot, torque=torque), robot) == []
 
 
 @pytest.mark.parametrize("torque", [0.64 * CURRENT, np.round(0.64 * CURRENT, 4)])
@@ -139,7 +139,7 @@ def test_readings_that_a_rigid_gear_ties_are_said_and_not_refused(tmp_path, robo
     path = tmp_path / "t.csv"
     rows = (",".join(f"{x:.6g}" for x in row) for row in zip(*columns.values(), strict=True))
     path.write_text("\n".join([",".join(columns), *rows]) + "\n", encoding="utf-8")
-    (found,) = uninformative.copied_channels(records.read_runs(path, robot=driven), driven)
+    (found,) = checks.copied_channels(records.read_runs(path, robot=driven), driven)
     assert found.tied and found.slope == pytest.approx(0.05) and "counts twice" in describe(found)
 
 
@@ -153,7 +153,7 @@ def test_runs_of_one_condition_are_refused_by_the_loop(tmp_path, robot, foreseen
     known = noise.infer_noise(runs, kind.sizes(runs), "motor_current=0.01A,output_torque=0.01Nm,output_speed=1rpm")
     middle = np.mean(shown(runs), 0)
     foreseen(middle + spread * np.median(known.sd, 0) * np.linspace(-0.5, 0.5, 12)[:, None])
-    found = uninformative.nothing_varies(runs, robot, known)
+    found = checks.nothing_varies(runs, robot, known)
     assert (found is None) == varies
     if not varies:
         assert (found.rows, found.column, found.unused) == (12, "motor_speed_rpm", ("wind_V",))

@@ -11,8 +11,8 @@ from calibration.data.input_errors import BadData
 from calibration.described import sentences
 from calibration.discovery import description
 from calibration.inference import noise
+from calibration.inference.checks import unexplained_torque_notes, unused_notes
 from calibration.inference.observers import SettledRuns
-from calibration.inference.unused import unexplained_torque_notes, unused_notes
 
 RIG = IDEAL.replace("loss_coulomb = 0.0", "loss_coulomb = 0.1")
 #: Of an ideal motor at 24 V, R 0.5, k 0.05, M0 0.01: torque of a brake [N·m], speed [rpm], current [A].

@@ -164,4 +164,4 @@ def test_loop_finds_the_effect_in_what_the_track_model_made():
     found = discover(table, paper_robots.nominal(), noise="current=1%,motor_speed=0.3%,speed=0.3%")
     assert found.verdict in ("named", "class") and [e.name for e in found.effects] == ["vibration_slip"]
     before, after = found.errors_held_out["voltage"]
-    assert after["speed"]["rms_percent"] < 0.5 * before["speed"]["rms_percent"]
+    assert after["speed"]["rms_sigma"] < 0.5 * before["speed"]["rms_sigma"]  # sds are shares of each reading

@@ -30,7 +30,7 @@ from calibration.inference.fit_notes import Remark, Shown, next_step
 from calibration.inference.lack_of_fit import Adequacy
 from calibration.inference.residual_clusters import LevelMean, ResidualCluster
 from calibration.inference.series_noise import SeriesNoise
-from calibration.words import fit_words, loop_words, step_words, table_words
+from calibration.words import experiment_words, fit_words, loop_words, step_words, table_words
 from calibration.words.note_words import NOTES
 from mmrjax.model import channels
 from sweeps import console
@@ -173,6 +173,7 @@ SAMPLES = [
     Remark("of_rows", rows=(3,), what="jumps"),
     Remark("of_rows", rows=(3,), what="slides"),
     Remark("at_bound", name="a", side="upper"),
+    Remark("after_steps", channel="motor_current", share=0.932, rows=24, total=6000),
     Remark("product_alone", friction="f", share="s", free=True),
     Remark("product_alone", friction="f", share="s", free=False),
     Remark("prior_of_product", name="f", mean=0.06, sd=0.02, share=0.98),
@@ -183,6 +184,7 @@ SAMPLES = [
     Remark("agreement", starts=1, agree=0, elsewhere=0, more=0.0, open=1),
     Remark("agreement", starts=4, agree=4, elsewhere=0, more=0.0, open=0),
     Remark("agreement", starts=4, agree=1, elsewhere=2, more=3.2, open=1),
+    Remark("agreement", starts=2, agree=0, elsewhere=0, more=0.0, open=2),
     Remark("unsettled", names=("a", "b")),
     Remark("unsettled", names=()),
     Remark("elsewhere", searches=1, total=3, names=("a", "b")),
@@ -320,7 +322,8 @@ def made_in_code():
 
 def test_each_remark_of_the_code_has_a_sample_and_a_sentence_with_its_values():
     made = list(made_in_code())
-    assert {code for code, _ in made} == set(NOTES) == {note.code for note in SAMPLES}
+    of_experiments = {*experiment_words.SAID}  # of which test_words_experiments has samples
+    assert {code for code, _ in made} == set(NOTES) == {note.code for note in SAMPLES} | of_experiments
     for code, names in made:
         if isinstance(NOTES[code], str):
             assert names >= {field for _, field, _, _ in string.Formatter().parse(NOTES[code]) if field}, code

@@ -5,11 +5,11 @@ import dataclasses
 import pytest
 from pages import recorded
 
+from calibration.described import describe
 from calibration.discovery import menu
 from calibration.discovery.experiments import denser_runs_instruction
-from calibration.discovery.instructions import CarryOut, NothingPossible, NothingTells, TooWeak
-from calibration.discovery.loop_notes import Heat, Overspeed, Overvoltage
 from calibration.discovery.reach import Reach, Used
+from calibration.inference.fit_notes import Remark
 from calibration.words import experiment_words as words
 
 TRACKED = Used("6T2A", 0, (15.0, 24.0, 33.0), (0.0, 10.0, 20.0), (0.0, 8.0), 21.1)
@@ -45,34 +45,42 @@ OVER = (
     "order 3 to 17", "slope 0.17453 to 0.17453", "time 0.1 to 0.45",
 )  # fmt: skip
 WATCHED = (
-    Heat("held", 90.0, 125.0, 1.58), Heat("braked", float("inf"), None), Heat("run", 118.2, 125.0),
-    Overspeed(1250.0, 1290.0, 32.0), Overvoltage(18.0, 12.0),
+    Remark("held_motor", temperature=90.0, allowed=125.0, current=1.58),
+    Remark("braked_motor", temperature=float("inf"), allowed=None),
+    Remark("hot_motor", temperature=118.2, allowed=125.0),
+    Remark("overspeed", speed=1250.0, limit=1290.0, voltage=32.0), Remark("overvoltage", voltage=18.0, used=12.0),
 )  # fmt: skip
+CRAWL, REVERSE = (e for e in menu.experiment_menu(ONE) if e.name in ("crawl, rover", "reverse, rover"))
+INSTRUCTIONS = (
+    Remark("carry_out", experiments=(CRAWL, REVERSE)),
+    Remark("nothing_possible"),
+    Remark("nothing_tells", names=("a", "b"), sigma=2.0),
+    Remark("too_weak", variable="slope", sigma=1.23),
+)
 
 
 def told():
     """Lines of all that is said: each experiment, more runs over each variable, what to watch, what else there is."""
-    crawl, reverse = (e for e in menu.experiment_menu(ONE) if e.name in ("crawl, rover", "reverse, rover"))
     for name, reach in REACHES.items():
         yield from (f"{name}, {e}: {sentence}" for e, sentence in on(reach).items())
         for variable in OVER:
             more = denser_runs_instruction("slip", variable, reach, by_duty=bool(reach.duties))
-            yield f"{name}, over {variable}: {words.experiment_instruction(more)}"
+            yield f"{name}, over {variable}: {describe(more)}"
     for part in WATCHED:
-        yield f"watch: {words.part_to_watch(part)}"
-    yield words.experiment_sentences(dataclasses.replace(crawl, watch=WATCHED[-1:]))
-    instructions = (
-        CarryOut((crawl, reverse)),
-        NothingPossible(),
-        NothingTells(("a", "b"), 2.0),
-        TooWeak("slope", 1.23),
-    )
-    yield from map(words.experiment_instruction, instructions)
+        yield f"watch: {describe(part)}"
+    yield words.experiment_sentences(dataclasses.replace(CRAWL, watch=WATCHED[-1:]))
+    yield from map(describe, INSTRUCTIONS)
 
 
 def test_what_to_do_next_is_said_as_recorded():
     text = "\n".join(told()) + "\n"
     assert text == recorded("experiments", text)
+
+
+def test_every_instruction_and_every_risk_has_a_sample():
+    instructions = [*INSTRUCTIONS, denser_runs_instruction("slip", "speed", ONE), Remark("no_menu", word="turns")]
+    assert {note.code for note in (*instructions, *WATCHED)} == set(words.SAID)
+    assert describe(instructions[-1]) == "The menu of experiments is of straight travel and has no turns"
 
 
 def test_the_zero_of_every_meter_is_read_at_rest():
@@ -114,8 +122,8 @@ def test_steps_are_those_that_a_person_sets(span, count, step):
 
 def test_a_temperature_that_nobody_stated_is_not_watched():
     stated, unknown = (denser_runs_instruction("slip", "time", dataclasses.replace(ONE, hot=t)) for t in (125.0, 1e9))
-    assert "(125 °C is allowed)" in words.experiment_instruction(stated)
-    assert words.experiment_instruction(unknown).count("watch the winding's temperature;") == 1
+    assert "(125 °C is allowed)" in describe(stated)
+    assert describe(unknown).count("watch the winding's temperature;") == 1
 
 
 @pytest.mark.parametrize("reach", [ONE, BENCH, DRIVEN, BRAKED, HELD])
@@ -125,6 +133,6 @@ def test_a_temperature_that_nobody_stated_is_not_watched():
 def test_more_runs_are_said_of_a_table_that_varied_nothing(reach, variable):
     """Where a speed is imposed the table has no voltage at all."""
     used = tuple(dataclasses.replace(u, voltages=(0.0,), slopes=(0.0,), payloads=(0.0,)) for u in reach.used)
-    assert words.experiment_instruction(
-        denser_runs_instruction("track", variable, dataclasses.replace(reach, used=used))
-    ).startswith("Re")
+    assert describe(denser_runs_instruction("track", variable, dataclasses.replace(reach, used=used))).startswith(
+        "Re"
+    )

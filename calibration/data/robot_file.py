@@ -330,7 +330,7 @@ def change_robot(robot: Robot, values: Mapping[str, Any], where: str, notes: lis
     shapes = CURVE | {"battery.capacity_curve"}
     if notes is not None and shapes & values.keys() and (remark := power.curve_remark(robot.battery)):
         notes.append(f"{where}, battery.curvature: {remark}")
-    return _with_backlash(robot, where)
+    return _with_two_bodies(robot, where)
 
 
 def _refused(name: str, value: Any, known: Mapping[str, params.Parameter]) -> str:
@@ -353,14 +353,15 @@ def _refused(name: str, value: Any, known: Mapping[str, params.Parameter]) -> st
     return ""
 
 
-def _with_backlash(robot: Robot, where: str) -> Robot:
-    """`robot` that keeps the two sides of a backlash apart, where a load states one."""
-    loose = {name: load for name, load in robot.configurations.items() if float(load.backlash) > 0}
+def _with_two_bodies(robot: Robot, where: str) -> Robot:
+    """`robot` whose motor and load turn apart, where a load states a backlash or a stiffness."""
+    loose = {name: load for name, load in robot.configurations.items() if load.has_two_bodies}
     for name, load in loose.items():
         if not (float(robot.motor.inertia) > 0 and float(load.inertia) > 0):
+            key, unit = ("backlash", "rad") if load.backlash > 0 else ("stiffness", "N·m/rad")
+            stated = f"{where}, {name}.{key}: got {float(getattr(load, key)):g} {unit}"
             raise BadConfiguration(
-                f"{where}, {name}.backlash: got {float(load.backlash):g} rad; motor and load then turn apart, so "
-                f"motor.inertia and {name}.inertia have to be more than 0"
+                f"{stated}; motor and load then turn apart, so motor.inertia and {name}.inertia have to exceed 0"
             )
     return dataclasses.replace(robot, rig=dataclasses.replace(robot.rig, loose=bool(loose)))
 

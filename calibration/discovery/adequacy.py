@@ -51,6 +51,13 @@ class AdequacyTest:
         statistic = float(getattr(self.found, kind)) if found is None else found
         return statistic > self.threshold(kind) + self.settings.margins[kind]
 
+    def confirmed(self, gain: float) -> AdequacyTest:
+        """Test in which the strongest effect gains no more than its simulation does, nor do pairs with it [σ²]."""
+        promised = float(self.found.single) ** 2
+        pair = self.found.pair - max(promised - gain, 0.0)
+        found = dataclasses.replace(self.found, single=np.sqrt(min(promised, gain)), pair=pair)
+        return dataclasses.replace(self, found=found)
+
     @property
     def p_value(self) -> float:
         """Family-wise p-value: the smallest of its kinds, each over its share of the error."""

@@ -11,7 +11,7 @@ from calibration.data.runs import Runs
 from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.loop_notes import Missed
 from calibration.discovery.prediction import HeldOutScore
-from calibration.inference import unused as unused_room
+from calibration.inference import checks as unused_room
 from calibration.inference.lack_of_fit import EXPLAINED, UNDESCRIBED
 from calibration.inference.linearization import Linearization
 from calibration.inference.noise import UNSTATED, Noise

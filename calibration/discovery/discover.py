@@ -32,7 +32,7 @@ from calibration.discovery.classes import Classes, find_classes, signature_cosin
 from calibration.discovery.description import missed_channels, remaining_errors, unused_inputs
 from calibration.discovery.discrepancy import CurveBeside, Discrepancy, locate_discrepancy
 from calibration.discovery.experiments import Proposal, propose_denser_runs, propose_nothing, propose_separating
-from calibration.discovery.hidden import find_hidden_effects
+from calibration.discovery.hidden import Hidden, find_hidden_effects
 from calibration.discovery.kept import Keep
 from calibration.discovery.location import DiscrepancyLocation, varied_by_duty
 from calibration.discovery.loop_notes import FreedValue, Mechanism, Missed, Missing, NameSupport, NameTest, Summary
@@ -52,7 +52,6 @@ from calibration.discovery.result import (
     Errors,
     FoundEffect,
     HeldOutAlternative,
-    HiddenEffect,
     Ranking,
     ReadingsOfRows,
     Sensitivity,
@@ -68,8 +67,9 @@ from calibration.inference import blocks as blocks_room
 from calibration.inference import noise as noise_room
 from calibration.inference import observers, preparation, priors, series_noise
 from calibration.inference.bases import Bases
+from calibration.inference.conduct import error_after_steps
 from calibration.inference.fit_notes import Notes, Remark, next_step, with_codes
-from calibration.inference.fit_posterior import undetermined_names
+from calibration.inference.identifiability import undetermined_names
 from calibration.inference.lack_of_fit import Residuals
 from calibration.inference.linearization import Linearization
 from calibration.inference.lost_motion import lost_motion_notes
@@ -556,6 +556,8 @@ def _search_until_clean(
         progress(next_step("effects"))
         screened, left, searched = keep(f"search {k}", functools.partial(_search_effects, task, screened, left))
         after = searched.diagnosis
+        if after is None and (confirmed := _confirmed(screened, left, searched)) is not None:
+            return screened, confirmed, None
         if after is None or not after.test.rejected_with_margin or screened.base.space.near:
             break
         more = screen_with_effects(
@@ -566,6 +568,22 @@ def _search_until_clean(
         progress(next_step("alone"))
         screened = more
     return screened, left, searched
+
+
+def _confirmed(screened: Screening, left: Diagnosis, searched: Search) -> Diagnosis | None:
+    """Diagnosis of a log's base fit with the gains that simulation confirms, None if these reject the base as well.
+
+    Scores are linear. The contact of a vehicle is not, and a score beyond chance may come to nothing in a simulation.
+    """
+    space, test, scores = screened.base.space, left.test, np.asarray(left.scores.single)
+    gains = {c.effects: 2 * (screened.base.candidate.cost - c.cost) for c in searched.ladder if c.simulated}
+    best = {name: abs(float(scores[space.library.best_instance(name, scores)])) for name in space.library.names}
+    promising = {(name,) for name, score in best.items() if score > test.threshold("single")}
+    simulated = bool(promising) and promising <= gains.keys()
+    if not (simulated and space.bare.observe.long) or screened.cluster is not None:
+        return None
+    confirmed = test.confirmed(max(0.0, *gains.values()))
+    return None if confirmed.rejected else dataclasses.replace(left, test=confirmed)
 
 
 def _verdict(task: _Task, screened: Screening, left: Diagnosis, sds: Sds, searched: Search) -> LoopStages:
@@ -944,7 +962,7 @@ def _predicts_well(traced: LoopStages, written: _FitOfVerdict, gain: prediction.
 
 def _claims(
     traced: LoopStages, settings: Settings
-) -> tuple[tuple[FoundEffect, ...], DiscrepancyLocation | None, tuple[HiddenEffect, ...]]:
+) -> tuple[tuple[FoundEffect, ...], DiscrepancyLocation | None, tuple[Hidden, ...]]:
     """Effects that a verdict names, location of the remaining discrepancy, and effects that they may conceal."""
     screened, left, alike = traced.screened, traced.left, traced.alike
     space, base, best = screened.base.space, screened.base.candidate, traced.best
@@ -954,9 +972,7 @@ def _claims(
     if traced.verdict in WITHOUT_NAME:
         return found_effects, None, ()
     ask = space.bare.observe.menu and not space.bare.observe.long
-    concealed = findings.hidden_effects(
-        space, find_hidden_effects(space, best, alike, left, traced.ends, settings, ask=ask)
-    )
+    concealed = find_hidden_effects(space, best, alike, left, traced.ends, settings, ask=ask)
     return found_effects, traced.where, concealed
 
 
@@ -1075,7 +1091,7 @@ def _result(
         effects=found,
         unnamed=_unnamed(about, len(runs)),
         remains=remains,
-        next_experiment=findings.next_experiment(_proposal(space, traced, settings)),
+        next_experiment=_proposal(space, traced, settings),
         cannot_see=findings.invisible_effects(space, left.scores, settings),
         needs_histories=tuple(sorted(name for name, e in library.items() if e.transient and not kind.shows(e))),
         needs_reverse=tuple(
@@ -1234,6 +1250,9 @@ def loop_remarks(found: DiscoveryResult) -> Notes:
     remarks += [Remark("only_together", pairs=found.together)] * bool(found.together)
     remarks += [Remark("not_predictable", kinds=found.held_out_unpredictable)] * bool(found.held_out_unpredictable)
     remarks += [Remark("residual_cluster", cluster=c) for c in found.residual_clusters]
+    after = found.readings_of_rows.after if found.written else found.readings_of_rows.before
+    off = np.where(found.included[:, None], after - found.readings_of_rows.measured, np.nan)
+    remarks += error_after_steps(found.runs, off)
     wave = found.unnamed
     if wave is not None and wave.score_free_in_each_run and wave.score < 0.5 * wave.score_free_in_each_run:
         remarks.append(Remark("phases_differ", free=wave.score_free_in_each_run, held=wave.score))

@@ -26,23 +26,16 @@ from jaxtyping import Array, Float
 from scipy.special import ndtr
 
 from calibration.data import Names
+from calibration.described import describe
 from calibration.discovery import menu, predicted
 from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.candidates import Candidate
 from calibration.discovery.classes import Classes
-from calibration.discovery.instructions import (
-    CarryOut,
-    Instruction,
-    MoreRuns,
-    NoMenu,
-    NothingPossible,
-    NothingTells,
-    TooWeak,
-)
 from calibration.discovery.location import DiscrepancyLocation
 from calibration.discovery.reach import Reach, reach_of_space
 from calibration.discovery.settings import Settings
 from calibration.inference import bases, priors
+from calibration.inference.fit_notes import Remark
 from calibration.inference.optimizers import informative_residuals
 from calibration.inference.problem import Problem
 from mmrjax.compile.compiling import SELDOM, compiled
@@ -106,6 +99,7 @@ class Ranked:
         settings: thresholds of the separation.
     """
 
+    JSON = ("name", "smallest_sigma=smallest", "separates", "chance_worst", "chance_mean")
     experiments: Names
     sigma: tuple[float, ...]
     separates: Names
@@ -127,6 +121,21 @@ class Ranked:
         sigma = np.maximum(self.sigma, 1e-9)
         return ndtr((sigma**2 - self.settings.refuted) / (2 * sigma))
 
+    @property
+    def name(self) -> str:
+        """Name of the first experiment."""
+        return self.experiments[0]
+
+    @property
+    def chance_worst(self) -> float:
+        """Least of `chances`."""
+        return float(self.chances.min())
+
+    @property
+    def chance_mean(self) -> float:
+        """Mean of `chances`."""
+        return float(self.chances.mean())
+
 
 @dataclasses.dataclass(frozen=True)
 class Proposal:
@@ -141,8 +150,9 @@ class Proposal:
         table: the whole menu, the most useful experiment first.
     """
 
+    JSON = ("name", "experiments", "description", "separates", "expected_sigma", "settles", "menu=table")
     experiments: Names
-    instruction: Instruction
+    instruction: Remark
     separates: Names
     expected_sigma: float
     settles: bool
@@ -152,6 +162,11 @@ class Proposal:
     def name(self) -> str:
         """Name of the proposal, with all its experiments."""
         return " and ".join(self.experiments)
+
+    @property
+    def description(self) -> str:
+        """What to do and what to read."""
+        return describe(self.instruction)
 
 
 # --- alternatives -----------------------------------------------------------------------------------
@@ -309,7 +324,7 @@ def choose_experiment(seen: PredictedReadings) -> Proposal:
     """The experiment of the menu that separates most pairs, with a second one if that adds enough."""
     table = rank_experiments(seen)
     if not table:
-        return Proposal((NONE,), NothingPossible(), (), 0.0, False, ())
+        return Proposal((NONE,), Remark("nothing_possible"), (), 0.0, False, ())
     plan = table[0]
     (first,) = plan.experiments
     rankings = (_rank_experiment(seen, first, e.name) for e in seen.experiments if e.name != first)
@@ -317,9 +332,11 @@ def choose_experiment(seen: PredictedReadings) -> Proposal:
     if more.told and (not plan.told or _usefulness(more)[1] > _usefulness(plan)[1] + seen.settings.gain):
         plan = more
     if not plan.told:
-        return Proposal((NONE,), NothingTells(seen.names, seen.settings.worth), (), 0.0, False, table)
+        return Proposal(
+            (NONE,), Remark("nothing_tells", names=seen.names, sigma=seen.settings.worth), (), 0.0, False, table
+        )
     by_name = {e.name: e for e in seen.experiments}
-    what = CarryOut(tuple(by_name[name] for name in plan.experiments))
+    what = Remark("carry_out", experiments=tuple(by_name[name] for name in plan.experiments))
     return Proposal(
         plan.experiments, what, plan.separates, min(plan.told), plan.smallest >= seen.settings.apart, table
     )
@@ -329,8 +346,12 @@ def choose_experiment(seen: PredictedReadings) -> Proposal:
 SERIES, REPEATS = 15, 3
 
 
-def denser_runs_instruction(place: str, variable: str, within: Reach, by_duty: bool = False) -> MoreRuns:
-    """Instruction to cover the variable of a curve more densely, within reach of the table."""
+def denser_runs_instruction(place: str, variable: str, within: Reach, by_duty: bool = False) -> Remark:
+    """Instruction to cover the variable of a curve more densely, within reach of the table.
+
+    Its values: `low` and `high`, the range of the series' voltages, `top`, the highest voltage of the table [V],
+    `slope` [deg] and `payload` [kg], the largest ones, and `steps` of voltage, slope and payload.
+    """
     volts = within.voltages
     low, high = (volts[0], volts[-1]) if volts[-1] > volts[0] else (menu.round_significant(0.5 * volts[0]), volts[0])
     slope = max(u.steepest for u in within.used)
@@ -340,8 +361,10 @@ def denser_runs_instruction(place: str, variable: str, within: Reach, by_duty: b
         menu.last_setting(x, by) for x, by in ((low, step), (high, step), (slope, angle), (payload, mass))
     )
     low = low or step
-    steps = step, angle, mass
-    return MoreRuns(place, variable, SERIES, low, high, volts[-1], slope, payload, steps, within, by_duty)
+    return Remark(
+        "more_runs", place=place, variable=variable, runs=SERIES, low=low, high=high, top=volts[-1], slope=slope,
+        payload=payload, steps=(step, angle, mass), within=within, by_duty=by_duty,
+    )  # fmt: skip
 
 
 def propose_denser_runs(space: CandidateSpace, where: DiscrepancyLocation, settings: Settings) -> Proposal:
@@ -353,7 +376,7 @@ def propose_denser_runs(space: CandidateSpace, where: DiscrepancyLocation, setti
     runs = space.bare.observe.runs_counting(space.included)
     sigma = float(np.sqrt(max(where.strongest, 0.0) * SERIES * REPEATS / max(runs, 1)))
     if sigma < settings.worth:
-        return Proposal((NONE,), TooWeak(variable, sigma), (), 0.0, False, ())
+        return Proposal((NONE,), Remark("too_weak", variable=variable, sigma=sigma), (), 0.0, False, ())
     name = f"steady speeds for {variable}" if variable in bases.ORDERS else f"finer steps in {variable}"
     name = name if bases.window_from_name(variable) is None else "the same runs again"
     curve = f"curve of the {bases.place_in_words(where.place)} over {variable}"
@@ -364,7 +387,7 @@ def propose_denser_runs(space: CandidateSpace, where: DiscrepancyLocation, setti
 
 def propose_nothing(space: CandidateSpace) -> Proposal:
     """Empty proposal, because the menu has no runs of the table's kind."""
-    return Proposal((NONE,), NoMenu(space.bare.observe.word), (), 0.0, False, ())
+    return Proposal((NONE,), Remark("no_menu", word=space.bare.observe.word), (), 0.0, False, ())
 
 
 def propose_separating(space: CandidateSpace, best: Candidate, found: Classes, settings: Settings) -> Proposal | None:

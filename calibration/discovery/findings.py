@@ -14,10 +14,8 @@ from calibration.data.runs import Runs
 from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.adequacy import AdequacyTest, Diagnosis
 from calibration.discovery.candidates import Candidate
-from calibration.discovery.classes import Classes
+from calibration.discovery.classes import Classes, Shift
 from calibration.discovery.discrepancy import Discrepancy
-from calibration.discovery.experiments import Proposal
-from calibration.discovery.hidden import Hidden
 from calibration.discovery.location import DiscrepancyLocation
 from calibration.discovery.loop_notes import RuledOut
 from calibration.discovery.mechanism import excess_misfit, share_of_excess
@@ -31,12 +29,9 @@ from calibration.discovery.result import (
     Evidence,
     Formula,
     FoundEffect,
-    HiddenEffect,
     KindOfEvidence,
     Member,
-    NextExperiment,
     Ranked,
-    RankedExperiment,
     Ranking,
     ReadingsOfRows,
     StatedValue,
@@ -46,22 +41,23 @@ from calibration.discovery.score_tests import ScoreTable
 from calibration.discovery.screening import Beforehand
 from calibration.discovery.search import single_p_value, without_each
 from calibration.discovery.settings import Settings
-from calibration.discovery.stated_values import Shift
 from calibration.inference import bases, priors
 from calibration.inference.estimates import SIDE_OF_BOUND
 from calibration.inference.held_out import predict_unseen
 from calibration.inference.identifiability import held_by_prior
-from calibration.inference.linearization import Linearization, amplitude_of, shape_at, shape_of, shape_scales
+from calibration.inference.linearization import (
+    Linearization,
+    amplitude_of,
+    amplitude_unit,
+    shape_at,
+    shape_of,
+    shape_scales,
+)
 from calibration.inference.problem import Observation, Problem
 from calibration.inference.simulation_errors import channel_errors
 from mmrjax.effects import Effect
 from mmrjax.model.balances import BALANCES
 from mmrjax.model.robot import Robot
-
-
-def amplitude_unit(effect: Effect) -> float:
-    """One prior sd of an effect's amplitude [its unit]."""
-    return amplitude_of(effect).spec.prior_sd(0.0)
 
 
 def equation_and_source(effect: Effect) -> tuple[str, str]:
@@ -213,21 +209,6 @@ def listed_alternatives(
     return plausible, ruled_out
 
 
-def hidden_effects(space: CandidateSpace, found: Sequence[Hidden]) -> tuple[HiddenEffect, ...]:
-    """Effects that a name could hide, in their units."""
-    return tuple(
-        HiddenEffect(
-            h.name,
-            h.amplitude * amplitude_unit(space.library[h.name]),
-            amplitude_of(space.library[h.name]).spec.unit,
-            h.sigmas,
-            h.experiment,
-            h.separation,
-        )
-        for h in found
-    )
-
-
 def _alternative(space: CandidateSpace, c: Candidate, rise: float, settings: Settings) -> Alternative:
     sds, sizes, why = {}, {}, list[RuledOut]()
     for slot, (name, amplitude, size) in enumerate(zip(c.active, c.amplitude, c.size, strict=True)):
@@ -251,20 +232,6 @@ def proposed_robot(space: CandidateSpace, best: Candidate) -> Robot:
     robot = space.problem(best.active).robot(jnp.asarray(best.z))
     keep = set(best.effects) | {e.name for e in space.bare.base.effects}
     return dataclasses.replace(robot, effects=tuple(e for e in robot.effects if e.name in keep))
-
-
-def next_experiment(proposal: Proposal | None) -> NextExperiment | None:
-    """A proposal as plain data."""
-    if proposal is None:
-        return None
-    menu = tuple(
-        RankedExperiment(r.experiments[0], r.smallest, r.separates, float(r.chances.min()), float(r.chances.mean()))
-        for r in proposal.table
-    )
-    return NextExperiment(
-        proposal.name, proposal.experiments, proposal.instruction, proposal.separates, proposal.expected_sigma,
-        proposal.settles, menu,
-    )  # fmt: skip
 
 
 # --- the base and the library ---------------------------------------------------------------------------
@@ -354,7 +321,7 @@ def _ranked(space: CandidateSpace, scores: ScoreTable, settings: Settings) -> tu
         effect = space.library[s.name]
         sd = amplitude_unit(effect) / max(s.sigmas_per_prior_sd, 1e-300)
         unit = amplitude_of(effect).spec.unit
-        # as in `dissipation.supplying_effects`
+        # as in `candidates.supplying_effects`
         supplies = space.bare.observe.long and effect.dissipative and s.amplitude < 0
         listed.append(Ranked(s.name, effect.family(), unit, s.score, s.amplitude, sd, supplies))
     return tuple(sorted(listed, key=lambda e: e.supplies))

@@ -18,6 +18,7 @@ from calibration.discovery.adequacy import Diagnosis
 from calibration.discovery.candidates import Candidate, fit_candidates, start_of_fit
 from calibration.discovery.classes import Classes
 from calibration.discovery.settings import Settings
+from calibration.inference.linearization import amplitude_of, amplitude_unit
 from calibration.inference.optimizers import informative_residuals, linearise
 
 #: Rise of the objective up to which a joint fit is as good [σ²]; largest number of reported effects; number of them
@@ -31,13 +32,14 @@ class Hidden:
 
     Attributes:
         name: of the effect.
-        amplitude: the largest possible one [prior sds].
+        amplitude: the largest possible one in `unit`.
         sigmas: change of the readings by it, without the name [σ].
         experiment: of the menu, that would show it, with the expected separation [σ]. "" and 0 for none.
     """
 
     name: str
     amplitude: float
+    unit: str
     sigmas: float
     experiment: str = ""
     separation: float = 0.0
@@ -75,7 +77,9 @@ def find_hidden_effects(
             ends = np.maximum(ends, 0.0)
         size = float(ends[np.argmax(np.abs(ends))])
         if abs(size) * alone >= settings.needed and abs(size) * beside <= 2 * np.sqrt(SAME):
-            hidden_effects.append(Hidden(effect.name, size, abs(size) * alone))
+            hidden_effects.append(
+                Hidden(effect.name, size * amplitude_unit(effect), amplitude_of(effect).spec.unit, abs(size) * alone)
+            )
     hidden_effects = sorted(hidden_effects, key=lambda h: -h.sigmas)[:MOST]
     if not ask or len(best.effects) >= settings.slots:
         return tuple(hidden_effects)
@@ -98,7 +102,7 @@ def _with_experiment(
     informed = np.asarray(jacobian)[informative_residuals(problem.data)]
     covariance = np.linalg.inv(informed.T @ informed)
     k = space.free + slot
-    move = what.amplitude / settings.width - joint.z[k]
+    move = what.amplitude / amplitude_unit(space.library[what.name]) / settings.width - joint.z[k]
     z = joint.z + covariance[:, k] / covariance[k, k] * move
     moved = dataclasses.replace(joint, z=z, cost=joint.cost + 0.5 * move**2 / covariance[k, k])
     predicted_menu = experiments.predict_menu(space, {"without": best, "with": moved}, settings)

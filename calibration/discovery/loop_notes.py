@@ -9,8 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from calibration.discovery.clusters import Cluster
 from calibration.discovery.location import DiscrepancyLocation
+from calibration.discovery.outliers import Cluster
 from calibration.inference.fit_notes import Remark
 
 # --- the verdict ----------------------------------------------------------------------------------------
@@ -348,43 +348,3 @@ class Asked:
 
 #: Hold-out errors that do not decide between alternatives.
 DRAW = "draw"
-
-
-# --- what to do next ------------------------------------------------------------------------------------
-
-
-@dataclasses.dataclass(frozen=True)
-class Heat:
-    """A winding that gets hot.
-
-    Attributes:
-        how: it happens in a motor that is `held` or `braked`, or in a `run`.
-        temperature: after long running, infinite if none settles.
-        allowed: None if unknown [°C].
-        current: of a motor that is held [A], else 0.
-    """
-
-    how: str
-    temperature: float
-    allowed: float | None
-    current: float = 0.0
-
-
-@dataclasses.dataclass(frozen=True)
-class Overspeed:
-    """Unloaded motors near their speed limit: speed and its limit [rad/s], at a voltage [V]."""
-
-    speed: float
-    limit: float
-    voltage: float
-
-
-@dataclasses.dataclass(frozen=True)
-class Overvoltage:
-    """A supply voltage above the table's largest [V]."""
-
-    voltage: float
-    used: float
-
-
-Watch = Heat | Overspeed | Overvoltage

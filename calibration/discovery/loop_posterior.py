@@ -11,7 +11,7 @@ from calibration.data import Names
 from calibration.data.posterior_file import ANGLE, LOG, NORMAL, Posterior, join_posteriors
 from calibration.discovery.active_set import ActiveSet, CandidateSpace
 from calibration.discovery.discrepancy import Discrepancy, Shaped
-from calibration.inference.fit_posterior import posterior_of_coordinates
+from calibration.inference.identifiability import posterior_of_coordinates
 from calibration.inference.linearization import Linearization, amplitude_of, shape_of, shape_scales
 from calibration.inference.optimizers import informative_residuals
 from calibration.inference.priors import Coordinates

@@ -6,22 +6,86 @@ import dataclasses
 import functools
 import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
 from calibration.data.input_errors import BadConfiguration, allowed_words
-from calibration.discovery import setups
-from calibration.discovery.loop_notes import Heat, Overspeed, Overvoltage, Watch
 from calibration.discovery.reach import SLOPE, Reach, Used
-from calibration.discovery.setups import Setup
-from mmrjax.model import balances, channels
+from calibration.inference.fit_notes import Remark
+from mmrjax.model import balances, channels, params
 from mmrjax.model.conditions import Conditions
+from mmrjax.model.params import Scalar
 from mmrjax.model.quantities import RPM
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import Signals, State
+
+# --- setups of a robot ----------------------------------------------------------------------------
+
+
+#: Friction of a shaft that is held in a vice [N·m].
+BLOCKED = 1e3
+#: Function of the robot and the brake's torque on each motor shaft [N·m] that returns the robot as set up.
+Setup = Callable[[Robot, Scalar], Robot]
+
+
+def _with(robot: Robot, values: Mapping[str, Scalar]) -> Robot:
+    return params.replace(robot, {k: jnp.asarray(v, float) for k, v in values.items()})
+
+
+def without(robot: Robot, *closed: str) -> Robot:
+    """The robot without the effects that enter the balances `closed`."""
+    return _with(robot, {f"effects.{e.name}.amplitude": 0.0 for e in robot.effects if e.balance in closed})
+
+
+def on_ground(robot: Robot, brake: Scalar = 0.0) -> Robot:
+    """The unchanged robot. All setups except `braked` ignore the brake."""
+    return robot
+
+
+def reversed_(robot: Robot, brake: Scalar = 0.0) -> Robot:
+    """The robot turned about, so that its travel is forward again.
+
+    With the negative of the slope as condition, friction, slip and meters are unchanged, because they follow the
+    travel. Effects that are odd in travel change sign: an error of the slope remains but now drives, and so does
+    the zero error of an instrument with signed readings.
+    """
+    odd = (e for e in robot.effects if e.odd_in_travel and e.channel not in robot.rig.magnitudes)
+    biased = {f"effects.{e.name}.amplitude": -e.amplitude for e in odd}
+    return _with(robot, biased)
+
+
+def lifted(robot: Robot, brake: Scalar = 0.0) -> Robot:
+    """The robot on stands, with its movers in the air: no normal load, no ground."""
+    rolling = {f"{c}.ground.rolling_resistance": 0.0 for c in robot.configurations}
+    return _with(without(robot, "mass", "ground", "slip"), rolling)
+
+
+def bare(robot: Robot, brake: Scalar = 0.0) -> Robot:
+    """The motors with their gearboxes uncoupled. Only supply, electrical and motor balances remain."""
+    losses = {f"{c}.track.loss_{kind}": 0.0 for c in robot.configurations for kind in ("coulomb", "viscous")}
+    gear = {"gearbox.friction_coulomb": 0.0, "gearbox.friction_viscous": 0.0, "gearbox.efficiency_load": 1.0}
+    return _with(without(lifted(robot), "gearbox", "track"), losses | gear)
+
+
+def blocked(robot: Robot, brake: Scalar = 0.0) -> Robot:
+    """The motors with their shafts held: U_e = E + I R at speed 0."""
+    return _with(lifted(robot), {"gearbox.friction_coulomb": BLOCKED})
+
+
+def braked(robot: Robot, brake: Scalar = 0.0) -> Robot:
+    """The bare motors, each against a brake of constant torque [N·m]."""
+    return _with(bare(robot), {"gearbox.friction_coulomb": brake})
+
+
+#: Setups that carry no weight.
+WEIGHTLESS = (lifted, bare, blocked, braked)
+
+
+# --- the menu -------------------------------------------------------------------------------------
+
 
 #: Kinds of experiments that a user may forbid, in addition to configurations; an experiment may have several kinds.
 KINDS = (
@@ -104,7 +168,7 @@ class Run:
     beyond: float = math.inf
     steepest: bool = False
     repeats: int = 3
-    watch: tuple[Watch, ...] = ()
+    watch: tuple[Remark, ...] = ()
     imposed: str = "voltage"
     where: str = ""
     motors: int = 1
@@ -165,7 +229,7 @@ def spaced_settings(least: float, most: float, count: int) -> tuple[float, ...]:
 def _weighed(robot: Robot, at: Array) -> Array:
     """Mass in addition to the stated one, so that its origin does not matter."""
     still = State(*(jnp.zeros(()),) * 4)
-    stated = setups.without(robot, "mass")
+    stated = without(robot, "mass")
     loads = [Conditions(configuration=k.astype(int), payload=m) for k, m in at]
     return jnp.stack(
         [balances.begin_signals(robot, c, still).mass - balances.begin_signals(stated, c, still).mass for c in loads]
@@ -240,7 +304,7 @@ def _runs(
     reach: Reach,
     name: str,
     doing: str,
-    setup: Setup = setups.on_ground,
+    setup: Setup = on_ground,
     *,
     kinds: tuple[str, ...] = (),
     voltages: Sequence[float],
@@ -300,10 +364,10 @@ def _travel_runs(reach: Reach, used: Used) -> tuple[Run, ...]:
     air, payload = spaced_settings(0.2 * reach.geared, reach.geared, 5), round_significant(used.payload)
     runs = functools.partial(_runs, reach, at=used)
     experiments = [
-        runs("reverse", "backwards", setups.reversed_, voltages=ends, slopes=(0.0, -some)),
+        runs("reverse", "backwards", reversed_, voltages=ends, slopes=(0.0, -some)),
         runs("downhill", "about", voltages=ends, slopes=(-inclines[0], -some)),
-        runs("lifted", "lifted", setups.lifted, voltages=air, read=TURNING),
-        runs("one motor", "one lifted", setups.lifted, kinds=("one motor", "lifted"), voltages=air, sides=1,
+        runs("lifted", "lifted", lifted, voltages=air, read=TURNING),
+        runs("one motor", "one lifted", lifted, kinds=("one motor", "lifted"), voltages=air, sides=1,
              read=TURNING),
         runs(f"payload {payload:g} kg", "laden", kinds=("payload",), voltages=ends,
              slopes=(0.0, some, most), payload=payload),
@@ -326,11 +390,11 @@ def _motor_runs(reach: Reach) -> tuple[Run, ...]:
     )
     brake = round_significant(0.6 * reach.torque_constant * reach.current, 1)
     experiments = [
-        _runs(reach, "bare motor", "alone", setups.bare, voltages=volts, read=TURNING),
-        _runs(reach, "stall", "held", setups.blocked, voltages=stalling, read=STANDING),
-        _runs(reach, "stall, one motor", "one held", setups.blocked, kinds=("stall", "one motor"), voltages=stalling,
+        _runs(reach, "bare motor", "alone", bare, voltages=volts, read=TURNING),
+        _runs(reach, "stall", "held", blocked, voltages=stalling, read=STANDING),
+        _runs(reach, "stall, one motor", "one held", blocked, kinds=("stall", "one motor"), voltages=stalling,
               read=STANDING, sides=1),
-        _runs(reach, "braked motor", "braked", setups.braked,
+        _runs(reach, "braked motor", "braked", braked,
               voltages=spaced_settings(0.4 * reach.alone, reach.alone, 3), read=TURNING, brake=brake),
     ]  # fmt: skip
     return tuple(r for r in experiments if reach.motors > 1 or r.sides is None)
@@ -423,18 +487,18 @@ def restrict_run(run: Run, kept: np.ndarray, temperature: np.ndarray, speed: np.
         tuple(v for v, k in zip(x, kept, strict=True) if k) if x else ()
         for x in (run.voltage, run.slope, run.payload, run.torque)
     )
-    watch: list[Watch] = []
+    watch: list[Remark] = []
     hottest, fastest, highest = float(temperature[kept].max()), float(np.abs(speed[kept]).max()), max(voltage)
     allowed = reach.hot if reach.hot < UNLIMITED else None
-    if run.setup is setups.blocked:
-        watch.append(Heat("held", hottest, allowed, highest / reach.resistance))
-    elif run.setup is setups.braked:
-        watch.append(Heat("braked", hottest, allowed))
+    if run.setup is blocked:
+        watch.append(Remark("held_motor", temperature=hottest, allowed=allowed, current=highest / reach.resistance))
+    elif run.setup is braked:
+        watch.append(Remark("braked_motor", temperature=hottest, allowed=allowed))
     elif hottest > reach.hot - WARM:
-        watch.append(Heat("run", hottest, allowed))
-    limit = reach.limit_alone if run.setup in (setups.bare, setups.braked) else reach.limit_geared
-    if run.setup in (setups.bare, setups.lifted) and fastest > FAST * limit:
-        watch.append(Overspeed(fastest, limit, highest))
+        watch.append(Remark("hot_motor", temperature=hottest, allowed=allowed))
+    limit = reach.limit_alone if run.setup in (bare, braked) else reach.limit_geared
+    if run.setup in (bare, lifted) and fastest > FAST * limit:
+        watch.append(Remark("overspeed", speed=fastest, limit=limit, voltage=highest))
     if run.imposed == "voltage" and highest > reach.voltages[-1]:
-        watch.append(Overvoltage(highest, reach.voltages[-1]))
+        watch.append(Remark("overvoltage", voltage=highest, used=reach.voltages[-1]))
     return dataclasses.replace(run, voltage=voltage, slope=slope, payload=payload, torque=torque, watch=tuple(watch))

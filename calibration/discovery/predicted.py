@@ -14,9 +14,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from calibration.data import Names
-from calibration.discovery import setups
-from calibration.discovery.menu import Act, Experiment, Run
-from calibration.discovery.setups import Setup
+from calibration.discovery import menu
+from calibration.discovery.menu import Act, Experiment, Run, Setup
 from mmrjax.fidelities.steady import IMPLICIT
 from mmrjax.model import channels
 from mmrjax.model.conditions import Conditions
@@ -93,7 +92,7 @@ def batch_experiments(experiments: Sequence[Experiment], shown: Names) -> Batch:
 
 def _conditions(run: Run) -> Conditions:
     # None would mean the robot's own mass, which cannot be in a batch with other masses.
-    mass = UNLOADED if run.setup in setups.WEIGHTLESS else math.nan
+    mass = UNLOADED if run.setup in menu.WEIGHTLESS else math.nan
     torque = run.torque or None
     if run.imposed != "voltage":
         level = {run.imposed: run.voltage}
@@ -133,7 +132,7 @@ def predict_readings(
     acts = tuple(act(robot, at) for act, at in zip(experiments.acts, experiments.at, strict=True))
     result, _, left = map_over_runs(IMPLICIT.shown, robot, experiments, unknowns, found)
     all_readings = jnp.stack([result.reading[c] for c in channels.channel_names(robot.channels)], -1)
-    is_held = np.array([experiments.set_up[k][0] is setups.blocked for k in experiments.which])
+    is_held = np.array([experiments.set_up[k][0] is menu.blocked for k in experiments.which])
     does = jnp.where(jnp.asarray(is_held), result.status == STALLED, is_done(result.status))
     exists = arrange_readings(
         experiments, [jnp.ones(a.shape, bool) for a in acts], jnp.broadcast_to(does[:, None], all_readings.shape)

@@ -15,17 +15,18 @@ from calibration.data.posterior_file import Posterior
 from calibration.data.runs import WHEN, Runs
 from calibration.data.writing import json_value, write_json, write_table
 from calibration.described import describe, sentences
-from calibration.discovery.clusters import Cluster
+from calibration.discovery.experiments import Proposal
 from calibration.discovery.headline import headline
-from calibration.discovery.instructions import Instruction
+from calibration.discovery.hidden import Hidden
 from calibration.discovery.kept import REFIT_FILE
 from calibration.discovery.location import DiscrepancyLocation
 from calibration.discovery.loop_notes import Asked, Headline, Mechanism, NameSupport, RuledOut, Summary
+from calibration.discovery.outliers import Cluster
 from calibration.discovery.prediction import Gain
 from calibration.discovery.settings import Settings
 from calibration.inference.details import Detail
 from calibration.inference.fit_notes import Notes, Pair, Remark, with_codes
-from calibration.inference.fit_posterior import determined_together
+from calibration.inference.identifiability import determined_together
 from calibration.inference.residual_clusters import ResidualCluster
 from calibration.inference.simulation_errors import OF_SIZE
 from mmrjax.model.channels import Channel
@@ -169,25 +170,6 @@ class UnnamedDiscrepancy(DiscrepancyLocation):
 
 
 @dataclasses.dataclass(frozen=True)
-class HiddenEffect:
-    """An effect that the effects found could hide.
-
-    Attributes:
-        amplitude: the largest possible one in `unit`.
-        sigmas: its change of the readings without them [σ].
-        experiment: that would show it.
-        separation: expected of it [σ]. "" and 0 for none.
-    """
-
-    name: str
-    amplitude: float
-    unit: str
-    sigmas: float
-    experiment: str
-    separation: float
-
-
-@dataclasses.dataclass(frozen=True)
 class Alternative:
     """Effects that were fitted and are not proposed.
 
@@ -304,36 +286,6 @@ class Evidence:
     kinds: dict[str, KindOfEvidence]
     p_value: float
     adequate: bool
-
-
-@dataclasses.dataclass(frozen=True)
-class RankedExperiment:
-    """An experiment of the menu: separations [σ], and probabilities that the false one of two is refuted."""
-
-    name: str
-    smallest_sigma: float
-    separates: tuple[str, ...]
-    chance_worst: float
-    chance_mean: float
-
-
-@dataclasses.dataclass(frozen=True)
-class NextExperiment:
-    """The next experiment, with the whole menu. See `experiments.Proposal`."""
-
-    JSON = ("name", "experiments", "description", "separates", "expected_sigma", "settles", "menu")
-    name: str
-    experiments: tuple[str, ...]
-    instruction: Instruction
-    separates: tuple[str, ...]
-    expected_sigma: float
-    settles: bool
-    menu: tuple[RankedExperiment, ...]
-
-    @property
-    def description(self) -> str:
-        """What to do and what to read."""
-        return describe(self.instruction)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -546,13 +498,13 @@ class DiscoveryResult:
     effects: tuple[FoundEffect, ...]
     unnamed: UnnamedDiscrepancy | None
     remains: DiscrepancyLocation | None
-    next_experiment: NextExperiment | None
+    next_experiment: Proposal | None
     cannot_see: tuple[str, ...]
     needs_histories: tuple[str, ...]
     needs_reverse: tuple[str, ...]
     alternatives: tuple[Alternative, ...]
     implausible: tuple[Alternative, ...]
-    hidden: tuple[HiddenEffect, ...]
+    hidden: tuple[Hidden, ...]
     support: NameSupport | None
     cluster: Cluster | None
     residual_clusters: tuple[ResidualCluster, ...]

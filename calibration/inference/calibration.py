@@ -31,8 +31,9 @@ from calibration.inference import (
     scans,
     solvers,
 )
+from calibration.inference.conduct import error_after_steps
 from calibration.inference.fit_notes import Remark, next_step
-from calibration.inference.fit_posterior import posterior_of_coordinates
+from calibration.inference.identifiability import posterior_of_coordinates
 from calibration.inference.multistart import SearchResult
 from calibration.inference.noise import Noise
 from calibration.inference.noise_factor import noise_remarks
@@ -502,7 +503,11 @@ def _result(
         residual_clusters=residual_clusters(residuals, seed),
         identifiability=about,
         posterior=posterior_of_coordinates(posed.coordinates, z, about.covariance),
-        remarks=(*notes, *checks.unmeasured_notes(setting.ready.names, about.sensitivity)),
+        remarks=(
+            *notes,
+            *error_after_steps(runs, observation - measured),
+            *checks.unmeasured_notes(setting.ready.names, about.sensitivity),
+        ),
     )
     return dataclasses.replace(result, remarks=(*result.remarks, *calibration_remarks(result)))
 

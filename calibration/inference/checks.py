@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.optimize import nnls
 
-from calibration.data.columns import SUPPLY
+from calibration.data import Names
+from calibration.data.columns import LOAD, SPEED, SUPPLY
+from calibration.data.computed_columns import line_through
 from calibration.data.courses import applied_drive
 from calibration.data.input_errors import BadConfiguration, BadData, bound_text
 from calibration.data.runs import Runs
@@ -15,12 +19,149 @@ from calibration.inference.conduct import conduct_notes
 from calibration.inference.fit_notes import Remark
 from calibration.inference.lost_motion import lost_motion_notes
 from calibration.inference.noise import Noise
+from calibration.inference.operating import operating_readings
 from calibration.inference.ranges import check_ranges
-from calibration.inference.uninformative import copied_channels, nothing_varies
-from calibration.inference.unused import unexplained_torque_notes, unused_notes
+from calibration.inference.residual_clusters import TIMES
 from mmrjax.errors import count_noun
+from mmrjax.model import channels
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import SLIDES, STATUSES
+
+# --- columns that vary and are not used -----------------------------------------------------------
+
+
+#: Share of a torque's variation unexplained by any load of a shaft above which a brake may impose it; least variation
+#: of the torque as a share of its size.
+BRAKED, VARIES = 0.5, 0.2
+#: Channel of the torque at the output.
+TORQUE = channels.find_channel("output_torque")
+
+
+def unused_notes(runs: Runs) -> tuple[Remark, ...]:
+    """A note on the columns of numbers that vary and have no role, without row numbers and times."""
+    columns = tuple((name, runs.layout.nearest(name, runs.columns)) for name in unused_columns(runs))
+    return (Remark("unused", source=runs.source, columns=columns),) if columns else ()
+
+
+def unused_columns(runs: Runs) -> Names:
+    """Names of the columns of numbers that vary and have no role."""
+    return tuple(name for name, cells in runs.extras.items() if _varies(name, cells))
+
+
+def _varies(name: str, cells: np.ndarray) -> bool:
+    """True for a column of several numbers that neither counts the rows nor states when they were measured."""
+    if cells.dtype.kind != "f" or TIMES.search(name):
+        return False
+    levels = np.unique(cells[np.isfinite(cells)])
+    counts = len(levels) == len(cells) and bool((np.diff(levels) == 1).all())
+    return len(levels) > 1 and not counts
+
+
+def unexplained_torque_notes(runs: Runs) -> tuple[Remark, ...]:
+    """A note on a measured output torque with a variation that no load on a shaft causes.
+
+    A load takes M_0 sign ω + K ω + M_c with M_0 and K of at least 0. If the best such load in each configuration
+    leaves more than `BRAKED` of the variance of the readings, a brake imposes the torque.
+    """
+    column = TORQUE.column
+    if (
+        runs.layout.has_ground
+        or runs.has(LOAD)
+        or runs.has("held")
+        or not (runs.has(column) and TORQUE in runs.channels)
+    ):
+        return ()
+    speed = next((runs[c] for c in (SPEED, "output_speed_rpm") if runs.has(c)), None)
+    if speed is None or runs.sampled:
+        return ()
+    total = unexplained = 0.0
+    torque, way = runs[column], np.sign(applied_drive(runs))
+    read = np.isfinite(torque) & np.isfinite(speed)
+    for name in np.unique(runs["configuration"]):
+        of_configuration = read & (runs["configuration"] == name)
+        if of_configuration.sum() >= 4:
+            y, w, d = (
+                torque[of_configuration],
+                np.abs(speed[of_configuration]),
+                way[of_configuration],
+            )  # a meter may show only magnitudes
+            unexplained += min(_unexplained_torque(y, w, d), _unexplained_torque(np.abs(y), w, np.abs(d)))
+            total += float(np.sum((y - y.mean()) ** 2))
+    if unexplained <= BRAKED * total or total < VARIES**2 * float(np.sum(torque[read] ** 2)):
+        return ()
+    return (
+        Remark(
+            "no_load_gives",
+            source=runs.source,
+            column=column,
+            theirs=runs.headings.get(column, column),
+            share=unexplained / total,
+        ),
+    )
+
+
+def _unexplained_torque(torque: np.ndarray, speed: np.ndarray, way: np.ndarray) -> float:
+    """Sum of squared residuals of a torque after the best load, for magnitudes of a speed and its directions."""
+    w, ones = speed / max(float(speed.max()), 1e-12), np.ones(len(speed))
+    return float(nnls(np.stack([way, way * w, ones, -ones], 1), torque)[1] ** 2)
+
+
+# --- uninformative tables -----------------------------------------------------------------------
+
+
+#: Range of readings that differ only by noise, in its sds: on average 5 for a hundred rows.
+RANGE = 8.0
+
+
+def nothing_varies(runs: Runs, robot: Robot, noise: Noise) -> Remark | None:
+    """Note that readings and predictions are the same in all rows within the noise.
+
+    None if a channel differs by more, or if the file's robot does not reach a row.
+    """
+    if len(runs) < 2 or any(float(c.torque_gravity) > 0 for c in robot.configurations.members):
+        return None
+    foreseen = operating_readings(robot, runs.conditions(robot))
+    is_read = np.isfinite(foreseen) & np.isfinite(runs.measured()) & np.isfinite(noise.sd)
+    if not is_read.all():
+        return None
+    sd = np.median(noise.sd, 0)
+    if (np.ptp(foreseen, 0) >= sd).any() or (np.ptp(runs.measured(), 0) >= RANGE * sd).any():
+        return None
+    return Remark(
+        "nothing_varies",
+        source=runs.source,
+        rows=len(runs),
+        column=runs.layout.imposed_column,
+        unused=unused_columns(runs),
+    )
+
+
+def copied_channels(runs: Runs, robot: Robot) -> list[Remark]:
+    """Channels that are a linear function of another channel in all rows, to the digits of the file."""
+    copied, copies = list[Remark](), set[str]()
+    names = [c for c in runs.channels if runs.has(c.column)]
+    for one, other in itertools.combinations(names, 2):
+        if {one.name, other.name} & copies:
+            continue
+        x, y = np.asarray(runs[one.column], float), np.asarray(runs[other.column], float)
+        if (line := line_through(x, y)) is not None:
+            copies.add(other.name)
+            same = one.unit_si == other.unit_si
+            copied.append(
+                Remark(
+                    "copied",
+                    source=runs.source,
+                    column=other.column,
+                    other=one.column,
+                    intercept=line[0],
+                    slope=line[1],
+                    tied=same or (not robot.has_ground and one.zero_at_rest and other.zero_at_rest),
+                )
+            )
+    return copied
+
+
+# --- checks -------------------------------------------------------------------------------------
 
 
 def check_data(runs: Runs, robot: Robot, names: Sequence[str], noise: Noise) -> list[Remark | str]:

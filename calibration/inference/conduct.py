@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from calibration.data import Names
-from calibration.data.courses import rows_of_varying_runs
+from calibration.data.courses import applied_drive, rows_of_varying_runs
 from calibration.data.runs import Runs
 from calibration.inference import observers
 from calibration.inference.fit_notes import Remark
@@ -17,6 +17,39 @@ from mmrjax.model.robot import Robot
 #: Share of the speed of steady travel below which a short run has ended early, and share of the movers' speed below
 #: which a long run does not grip [-].
 SLOW, SLIDING = 0.7, 0.7
+
+
+#: Change of the drive that is a step, as a share of its largest value; share of a squared error from which it lies
+#: after the steps, and largest share of the rows that these are [-].
+STEP, MOST_ERROR, FEW_ROWS = 0.1, 0.5, 0.1
+
+
+def error_after_steps(runs: Runs, off: np.ndarray) -> list[Remark]:
+    """Notes on channels with an error that lies in the first sample with or after each step of the drive.
+
+    Args:
+        off: simulated minus measured, NaN where either is missing, shape (rows, channels).
+    """
+    if not observers.observer_kind(runs).axis:
+        return []
+    driven = applied_drive(runs)
+    largest = max(float(np.abs(driven).max(initial=0.0)), 1e-300)
+    with_step, after = np.zeros((2, len(runs)), bool)
+    for name in dict.fromkeys(runs.run_names.tolist()):
+        rows = runs.in_order(name)
+        stepped = np.flatnonzero(np.abs(np.diff(driven[rows])) > STEP * largest) + 1
+        with_step[rows[stepped]] = True
+        after[rows[np.minimum(stepped + 1, len(rows) - 1)]] = True
+    notes = []
+    for k, channel in enumerate(runs.channels):
+        squares = np.nan_to_num(off[:, k]) ** 2
+        sums = {rows.tobytes(): (float(squares[rows].sum()), int(rows.sum())) for rows in (with_step, after)}
+        most, count = max(sums.values())
+        if 0 < count <= FEW_ROWS * len(runs) and most >= MOST_ERROR * squares.sum() > 0:
+            notes.append(
+                Remark("after_steps", channel=channel.name, share=most / squares.sum(), rows=count, total=len(runs))
+            )
+    return notes
 
 
 def conduct_notes(runs: Runs, robot: Robot) -> list[Remark]:

@@ -14,7 +14,7 @@ from calibration.data.runs import Runs
 from calibration.data.thinning import used_rows
 from calibration.inference import identifiability, observers, optimizers, priors
 from calibration.inference.fit_notes import Notes, Pair, with_codes
-from calibration.inference.fit_posterior import determined_together, posterior_of_coordinates
+from calibration.inference.identifiability import determined_together, posterior_of_coordinates
 from calibration.inference.preparation import prepare
 from mmrjax import fidelities
 from mmrjax.model.robot import Robot

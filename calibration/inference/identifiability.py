@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Collection
 
 import jax
 import jax.numpy as jnp
@@ -10,8 +11,11 @@ import numpy as np
 from jaxtyping import Array
 
 from calibration.data import Names
+from calibration.data.posterior_file import LOG, NORMAL, Posterior
 from calibration.inference import optimizers
+from calibration.inference.fit_notes import Pair
 from calibration.inference.optimizers import Pin
+from calibration.inference.priors import SOFTNESS, Coordinates
 from calibration.inference.problem import Data, Problem
 from mmrjax.compile.compiling import compiled
 
@@ -208,3 +212,61 @@ def _interval_ends(at: np.ndarray, root: np.ndarray) -> tuple[float, float]:
     """Coordinates where a profile's signed root reaches ∓Z95. Its end points if it does not reach them."""
     rising = np.maximum.accumulate(root)
     return float(np.interp(-Z95, rising, at)), float(np.interp(Z95, rising, at))
+
+
+# --- posteriors of fits ---------------------------------------------------------------------------
+
+
+#: Correlation beyond which two parameters are not determined separately.
+TOGETHER = 0.95
+#: Ratio of two relative sds up to which the combination of two parameters is a ratio or a product.
+EVEN = 1.25
+
+
+def posterior_of_coordinates(coordinates: Coordinates, z: np.ndarray, covariance: np.ndarray) -> Posterior:
+    """Posterior of a fit with optimum z and this covariance."""
+    size = len(coordinates)
+    return Posterior(
+        coordinates=coordinates.names,
+        units=coordinates.units,
+        mean=np.asarray(z, float),
+        covariance=np.asarray(covariance, float),
+        location=np.asarray(coordinates.location, float),
+        spread=np.asarray(coordinates.spread, float),
+        low=np.asarray(coordinates.low, float),
+        high=np.asarray(coordinates.high, float),
+        softness=np.full(size, SOFTNESS),
+        kinds=tuple(LOG if scale else NORMAL for scale in coordinates.scale),
+        tied=coordinates.tied,
+    )
+
+
+def determined_together(posterior: Posterior, held: Collection[str] = ()) -> tuple[Pair, ...]:
+    """Pairs of parameters with a posterior correlation beyond `TOGETHER`, strongest first, and their combination.
+
+    Args:
+        held: names of parameters held by their priors. A pair of two of these is omitted. In a pair with one of them,
+            the other is known only as well as that prior, and the data determine only their combination.
+    """
+    sd = np.sqrt(np.diag(posterior.covariance))
+    value = posterior.at(posterior.mean)
+    log = np.array([kind == LOG for kind in posterior.kinds])
+    spread = posterior.spread * sd  # of the parameter, or of its logarithm
+    groups = []
+    for i, j in zip(*np.triu_indices(len(sd), 1), strict=True):
+        one, other = posterior.coordinates[i], posterior.coordinates[j]
+        correlation = float(posterior.covariance[i, j] / max(sd[i] * sd[j], 1e-300))
+        if not abs(correlation) > TOGETHER or (one in held and other in held):
+            continue
+        size = spread * np.where(log, value[: len(sd)], 1.0)
+        weight = -np.sign(correlation) * abs(size[i] / size[j])
+        even = log[i] and log[j] and 1 / EVEN < spread[i] / spread[j] < EVEN
+        form = "linear" if not even else "ratio" if correlation > 0 else "product"
+        groups.append(Pair(one, other, correlation, form, float(weight)))
+    return tuple(sorted(groups, key=lambda pair: -abs(pair.correlation)))
+
+
+def undetermined_names(held: Collection[str], pairs: Collection[Pair]) -> Names:
+    """Names held by priors, without names in a pair with a determined combination."""
+    paired = {name for pair in pairs for name in (pair.one, pair.other)}
+    return tuple(name for name in held if name not in paired)

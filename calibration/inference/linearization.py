@@ -279,3 +279,8 @@ class Linearization(eqx.Module):
 def finite_or_zero(x: Array) -> Array:
     """x with 0 for non-finite values."""
     return jnp.where(jnp.isfinite(x), x, 0.0)
+
+
+def amplitude_unit(effect: Effect) -> float:
+    """One prior sd of an effect's amplitude [its unit]."""
+    return amplitude_of(effect).spec.prior_sd(0.0)

@@ -582,8 +582,8 @@ def search_rollouts(
 ) -> tuple[Optimum, Observation]:
     """`levenberg_marquardt` of any number of members with its steps in Python, so that rollouts are compiled once.
 
-    Finished members are not evaluated again, and are replaced by queued ones. A search that hardly lowers its
-    objective (`STALLED`) ends.
+    Finished members are not evaluated again, and are replaced by queued ones. A search ends
+    whose last steps lowered its objective by too little (`STALLED`).
 
     Args:
         starts: shape (members, coordinates).

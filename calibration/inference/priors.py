@@ -34,7 +34,7 @@ FRICTION = (
 #: Free by default for a load on a shaft.
 SHAFT = ("loss_coulomb", "loss_viscous", "torque_constant", "torque_gravity", "angle_zero")
 #: Ends of the names of parameters that settled travel does not show.
-OVER_TIME = (".inertia", ".inductance", ".backlash")
+OVER_TIME = (".inertia", ".inductance", ".backlash", ".stiffness", ".damping")
 #: Free in addition for configurations on tracks, after the losses; guide friction μ_t stays at Table 4 because only
 #: its product with the share of the guides matters.
 GUIDE_SHARE, GUIDE_FRICTION = "track.guide_share", "track.guide_friction"

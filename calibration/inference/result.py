@@ -13,8 +13,7 @@ from calibration.data import posterior_file as posterior
 from calibration.data.posterior_file import Posterior
 from calibration.described import describe, sentences
 from calibration.inference.fit_notes import Determination, Notes, Pair, Remark
-from calibration.inference.fit_posterior import determined_together, undetermined_names
-from calibration.inference.identifiability import Identifiability
+from calibration.inference.identifiability import Identifiability, determined_together, undetermined_names
 from calibration.inference.lack_of_fit import Adequacy
 from calibration.inference.multistart import Starts
 from calibration.inference.population import Searched

@@ -95,9 +95,12 @@ def coordinates_beyond_a_basin(problem: Problem) -> tuple[int, ...]:
 
 
 def scan_coordinate(problem: Problem, z: np.ndarray, data: Data, k: int) -> Scan:
-    """Misfit over coordinate k near z: evenly over the prior's range, and more closely near minima."""
+    """Misfit over coordinate k: at z, evenly over the prior's range, and more closely near minima.
+
+    Without z an interval could begin beyond a narrow minimum that no other point is in.
+    """
     count = problem.observe.scan_points(problem, k)
-    scan = _scan_values(problem, z, data, k, np.linspace(-RANGE, RANGE, count))
+    scan = _scan_values(problem, z, data, k, np.append(np.linspace(-RANGE, RANGE, count - 1), z[k]))
     around, few = np.array([z[k], *scan.at[scan.basins()]])[:CLOSER], count // CLOSER
     close = (around[:, None] + 2 * RANGE / (count - 1) * np.linspace(-1, 1, few)).ravel()
     if few > 2:

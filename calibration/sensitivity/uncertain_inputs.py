@@ -18,7 +18,7 @@ from calibration.data import Names
 from calibration.data.input_errors import BadConfiguration, allowed_words
 from calibration.data.posterior_file import Posterior
 from calibration.inference import priors
-from calibration.inference.fit_posterior import posterior_of_coordinates
+from calibration.inference.identifiability import posterior_of_coordinates
 from mmrjax import fidelities
 from mmrjax.errors import UsageError
 from mmrjax.fidelities.variation import CONDITIONS, Axis, Variation

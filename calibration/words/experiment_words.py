@@ -3,21 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from types import SimpleNamespace
 
-from calibration.discovery import menu, setups
-from calibration.discovery.instructions import (
-    CarryOut,
-    Instruction,
-    MoreRuns,
-    NoMenu,
-    NothingPossible,
-    NothingTells,
-    TooWeak,
-)
-from calibration.discovery.loop_notes import Overspeed, Overvoltage, Watch
+from calibration.described import describe
+from calibration.discovery import menu
 from calibration.inference import bases
+from mmrjax.effects import OF_TURNS, Effect
+from mmrjax.effects.base import THE_SIDE
 from mmrjax.model import channels
+from mmrjax.model.channels import find_channel
 from mmrjax.model.quantities import RPM
 
 # --- amounts --------------------------------------------------------------------------------------------
@@ -109,14 +104,14 @@ def _weigh(act: menu.Act) -> str:
 
 def _run(run: menu.Run) -> str:
     level = (run.imposed != "voltage" or bool(run.torque)) and not any(run.slope)
-    where = "" if run.setup in setups.WEIGHTLESS or level else f" {join_slopes(run.slope)}"
+    where = "" if run.setup in menu.WEIGHTLESS or level else f" {join_slopes(run.slope)}"
     read = join_words([channels.find_channel(c).label for c in run.channels])
     turning = [menu.round_significant(v / RPM) for v in run.voltage]
     unit = {"voltage": "V", "motor_current": "A of each motor"}.get(run.imposed)
     at = join_amounts(turning, "rpm of the motor") if unit is None else join_amounts(run.voltage, unit)
     against = f" against a brake of {join_torques(run.torque)}" if any(run.torque) else ""
     text = f"{_doing(run)}{where} at {at}{against}; read {read}"
-    return f"{text}. Watch {'; '.join(map(part_to_watch, run.watch))}" if run.watch else text
+    return f"{text}. Watch {'; '.join(map(describe, run.watch))}" if run.watch else text
 
 
 def _doing(run: menu.Run) -> str:
@@ -130,25 +125,16 @@ def _doing(run: menu.Run) -> str:
     return f"{run.where}: {doing}" if run.where else doing
 
 
-def part_to_watch(about: Watch) -> str:
-    """Part that can be damaged, and the sign of it."""
-    if isinstance(about, Overspeed):
-        return (
-            f"the motor speed: about {about.speed / RPM:.0f} rpm without load at {about.voltage:g} V, and no more "
-            f"than {about.limit / RPM:.0f} rpm; raise the voltage slowly"
-        )
-    if isinstance(about, Overvoltage):
-        return f"the supply: {about.voltage:g} V is more than the table's {about.used:g} V"
-    settles = math.isfinite(about.temperature)
-    would = f"would reach {about.temperature:.0f} °C" if settles else "would burn: no temperature settles"
-    allowed = "" if about.allowed is None else _allowed(about.allowed)
-    heats = f"a winding left on {would}{allowed}"
-    return {
-        "held": f"current × time: {about.current:.2g} A in a motor that does not turn, and so is not cooled; {heats}"
-        ", so switch off within seconds and let it cool between readings",
-        "braked": f"the brake and the winding's temperature: {heats}; seconds are enough for a reading",
-        "run": f"the winding's temperature: {heats}; keep the runs short",
-    }[about.how]
+def heated_winding(temperature: float, allowed: float | None) -> str:
+    """What becomes of a winding left on.
+
+    Args:
+        temperature: after long running, infinite if none settles.
+        allowed: limit, None if unknown [°C].
+    """
+    settles = math.isfinite(temperature)
+    would = f"would reach {temperature:.0f} °C" if settles else "would burn: no temperature settles"
+    return f"a winding left on {would}{'' if allowed is None else _allowed(allowed)}"
 
 
 def _allowed(temperature: float) -> str:
@@ -159,24 +145,8 @@ def _allowed(temperature: float) -> str:
 # --- what is proposed -----------------------------------------------------------------------------------
 
 
-def experiment_instruction(what: Instruction) -> str:
-    """Instruction for one calibration act: the steps and the readings."""
-    if isinstance(what, NothingPossible):
-        return "Every experiment of the menu is forbidden or beyond reach"
-    if isinstance(what, NoMenu):
-        return f"The menu of experiments is of straight travel and has no {what.word}"
-    if isinstance(what, NothingTells):
-        return f"No experiment of the menu tells {' and '.join(what.names)} apart by {what.sigma:g} sigma"
-    if isinstance(what, CarryOut):
-        return ". And: ".join(map(experiment_sentences, what.experiments))
-    if isinstance(what, TooWeak):
-        return f"A series in {what.variable} would show what is missing by {what.sigma:.1f} sigma"
-    place = bases.place_in_words(what.place)
-    return f"{more_runs(what)}; read every channel. What the {place} lacks then shows its shape"
-
-
-def more_runs(what: MoreRuns) -> str:
-    """More runs along the variable of a discrepancy."""
+def more_runs(what: SimpleNamespace) -> str:
+    """More runs along the variable of a discrepancy, from the values of `denser_runs_instruction`."""
     if what.variable in bases.ORDERS:
         return _steady_speeds(what)
     happens = bases.window_from_name(what.variable)
@@ -190,7 +160,7 @@ def more_runs(what: MoreRuns) -> str:
     return (_usual(what) | by_kind).get(what.variable, last)
 
 
-def _steady_speeds(what: MoreRuns) -> str:
+def _steady_speeds(what: SimpleNamespace) -> str:
     """Speeds for measuring a wave."""
     three = [f"{menu.round_significant(v):g}" for v in (what.low, 0.5 * (what.low + what.high), what.high)]
     return (
@@ -215,7 +185,7 @@ def _again(happens: bases.Window) -> str:
     )
 
 
-def _steps(what: MoreRuns, first: str = "") -> str:
+def _steps(what: SimpleNamespace, first: str = "") -> str:
     """`the supply voltage in 15 even steps up to 8 V`: what drives the motors, as the table varied it."""
     top = menu.round_significant(what.top)
     if what.by_duty:
@@ -230,7 +200,7 @@ def _up_to(most: float, runs: int, unit: str = "", first: str = "") -> str:
     return f" from {first} to {last} in steps of {by}" if first else f" up to {last} in steps of {by}"
 
 
-def _usual(what: MoreRuns) -> dict[str, str]:
+def _usual(what: SimpleNamespace) -> dict[str, str]:
     """Advice by variable, for a vehicle with an imposed voltage."""
     low, high, within = what.low, what.high, what.within
     load = [f"a payload up to {what.payload:g} kg"] * bool(what.payload > 0)
@@ -260,7 +230,7 @@ def _usual(what: MoreRuns) -> dict[str, str]:
     }
 
 
-def _of_level(what: MoreRuns) -> dict[str, str]:
+def _of_level(what: SimpleNamespace) -> dict[str, str]:
     """Advice by variable, for an imposed speed or current of the motors."""
     within = what.within
     level = "Repeat on the level, unladen," if within.has_ground else "Repeat"
@@ -282,14 +252,14 @@ def _of_level(what: MoreRuns) -> dict[str, str]:
     return words
 
 
-def _brake(what: MoreRuns) -> str:
+def _brake(what: SimpleNamespace) -> str:
     """`the brake's torque up to 0.8 N·m in steps of 0.05 N·m`, as the table varied it."""
     most = max(what.within.torques)
     size, unit = (1e3, "mN·m") if most < SMALL else (1.0, "N·m")
     return f"the brake's torque{_up_to(size * most, what.runs, unit)}"
 
 
-def _of_shaft(what: MoreRuns) -> dict[str, str]:
+def _of_shaft(what: SimpleNamespace) -> dict[str, str]:
     """Advice by variable, for a shaft as the load."""
     crawl, top = f"Repeat with {_steps(what, 'crawl')}", menu.round_significant(what.top)
     return {
@@ -298,3 +268,109 @@ def _of_shaft(what: MoreRuns) -> dict[str, str]:
         "speed": crawl,
         "current": f"Repeat at {top:g} V with {_brake(what)}" if any(what.within.torques) else crawl,
     }
+
+
+#: Code of an instruction or of what to watch → a sentence with its values, or a function that makes one.
+SAID: dict[str, str | Callable[..., str]] = {
+    "nothing_possible": "Every experiment of the menu is forbidden or beyond reach",
+    "no_menu": "The menu of experiments is of straight travel and has no {word}",
+    "nothing_tells": lambda names, sigma: (
+        f"No experiment of the menu tells {' and '.join(names)} apart by {sigma:g} sigma"
+    ),
+    "too_weak": "A series in {variable} would show what is missing by {sigma:.1f} sigma",
+    "carry_out": lambda experiments: ". And: ".join(map(experiment_sentences, experiments)),
+    "more_runs": lambda **series: (
+        f"{more_runs(SimpleNamespace(**series))}; read every channel. "
+        f"What the {bases.place_in_words(series['place'])} lacks then shows its shape"
+    ),
+    "overspeed": lambda speed, limit, voltage: (
+        f"the motor speed: about {speed / RPM:.0f} rpm without load at {voltage:g} V, and no more than "
+        f"{limit / RPM:.0f} rpm; raise the voltage slowly"
+    ),
+    "overvoltage": "the supply: {voltage:g} V is more than the table's {used:g} V",
+    "held_motor": lambda current, **heat: (
+        f"current × time: {current:.2g} A in a motor that does not turn, and so is not cooled; "
+        f"{heated_winding(**heat)}, so switch off within seconds and let it cool between readings"
+    ),
+    "braked_motor": lambda **heat: (
+        f"the brake and the winding's temperature: {heated_winding(**heat)}; seconds are enough for a reading"
+    ),
+    "hot_motor": lambda **heat: f"the winding's temperature: {heated_winding(**heat)}; keep the runs short",
+}
+
+
+# --- effects, and tests that distinguish them on a bench ------------------------------------------
+
+
+#: Tests that isolate a balance: rows of `experiments.DOING`, `weigh`, and of a channel of `sensor` rows of `ACTS`.
+ISOLATED_BY = {
+    "mass": ("weigh",), "duty": ("alone",), "supply": ("held", "one held"), "electrical": ("held", "alone"),
+    "motor": ("alone",),
+    "gearbox": ("braked", "lifted"), "track": ("lifted",), "ground": ("laden", "about"), "slip": ("laden",),
+    "inertia": ("lifted",), "inductance": ("held",),
+}  # fmt: skip
+CHECKED_BY = {"total_current": ("zero current", "shunt"), "motor_speed": ("strobe",), "speed": ("timing",)}
+#: Test of any other channel.
+COMPARE = "Read a second instrument next to that of the {}, at several values"
+#: Condition to vary, all others constant, so that a term that depends on a signal changes.
+VARY = {
+    "speed": "the speed (the supply voltage)", "current": "the current (slope or payload at one voltage)",
+    "load": "the load (slope or payload at one voltage)", "slope": "the slope", "weight": "the payload",
+    "duty": "the duty at one supply voltage",
+    "configuration": "the configuration", "direction": "the direction of travel",
+    "demand": "the demand on adhesion (slope or payload)", "angle": "nothing: sample fast enough to see a turn",
+    THE_SIDE: "nothing: compare the sides in straight travel and in turns both ways",
+    "position": "the position: go over the whole travel both ways at one voltage",
+    "": "nothing: it is the same share everywhere",
+}  # fmt: skip
+WEIGH = "Weigh the robot, unladen and laden, and take the stated mass from it"
+
+
+def effect_summary(effect: type[Effect]) -> tuple[str, str, str]:
+    """Equation, meaning and source of an effect, each on one line."""
+    text, _, source = (effect.__doc__ or "").partition("Source:")
+    equation, meaning = ([" ".join(part.split()) for part in text.split("\n\n")] + [""])[:2]
+    return equation.rstrip("."), meaning, " ".join(source.split())
+
+
+def effect_declarations(effect: type[Effect]) -> Iterator[str]:
+    """Declarations of an effect in addition to its equation."""
+    words = [
+        "dissipative" * effect.dissipative,
+        "in histories alone" * effect.transient,
+        "in turns alone" * (effect.name in OF_TURNS),
+        f"settles to `{effect.settles_to}`" * bool(effect.settles_to),
+        "on the battery alone" * effect.needs_battery,
+        "in runs both ways alone" * effect.needs_reverse,
+        "at a duty below 1 alone" * effect.needs_duty,
+        "odd in travel" * effect.odd_in_travel,
+        f"on {effect.movers} alone" * bool(effect.movers),
+        f"rests on `{', '.join(effect.rests_on)}`" * bool(effect.rests_on),
+    ]
+    yield from filter(None, words)
+
+
+def effect_tests(effect: type[Effect]) -> Iterator[str]:
+    """Bench tests that distinguish it from other effects: how to isolate its balance, and the change to make."""
+    if effect.channel:
+        for name in CHECKED_BY.get(effect.channel, ()):
+            yield ACTS[name].format("several values")
+        if effect.channel not in CHECKED_BY:
+            channel_shown = find_channel(effect.channel)
+            yield from [ACTS["zero reading"].format(channel_shown.label)] * channel_shown.misses_zero
+            yield COMPARE.format(channel_shown.label)
+        return
+    for name in ISOLATED_BY.get(effect.balance, ()):
+        if name == "weigh":
+            yield WEIGH
+        else:
+            text = DOING[name].format(
+                payload=8,
+                brake=20,
+                others="all motors but one disconnected",
+                gears="gearboxes",
+                shafts="the motor shafts",
+            )
+            yield f"{text[0].upper()}{text[1:].rstrip(',')}, at several voltages"
+    what = VARY.get(effect.driver, f"the {effect.driver}")  # one's own may go with anything
+    yield f"Vary {what}" + ("; from rest, over time" if effect.transient or effect.settles_to else "")

@@ -97,6 +97,8 @@ def search_agreement(starts: int, agree: int, elsewhere: int, more: float, open:
         return "one search, which did not converge" if open else "one search"
     if agree == starts:
         return f"all {starts} starts end at the same optimum"
+    if open == starts:
+        return f"none of {starts} searches converged, so the best end is shown"
     parts = [f"{agree} of {starts} starts end at the best optimum"]
     if elsewhere:
         parts.append(f"{elsewhere} at others (the next costs {more:.3g} more)")
@@ -287,6 +289,11 @@ SAID: dict[str, str | Callable[..., str]] = {
     "with steady; furthest apart is {furthest}, {sds:.2f} sd",
     "of_rows": of_rows,
     "at_bound": "{name} is at its {side} bound",
+    "after_steps": lambda channel, share, rows, total: (
+        f"{share:.0%} of the squared error of {channels.find_channel(channel).label} lies in the first sample after "
+        f"each step ({rows} of {total} rows): readings and command may be timed apart; state "
+        '[rig] delay = "0 ± 0.02" [s], which may be negative, and calibrate frees it'
+    ),
     "product_alone": lambda friction, share, free: (
         f"only the product {friction} x {share} acts; the priors alone divide it"
         if free

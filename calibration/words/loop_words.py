@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
@@ -13,12 +13,13 @@ from calibration.data import Names
 from calibration.data.input_errors import three_digits
 from calibration.described import describe
 from calibration.discovery import loop_notes
-from calibration.discovery.clusters import Cluster
 from calibration.discovery.location import DiscrepancyLocation
+from calibration.discovery.outliers import Cluster
 from calibration.discovery.settings import FIT, HELD_OUT, WITHOUT_NAME, Settings
 from calibration.inference import bases, blocks
 from calibration.inference.series_noise import SeriesNoise
 from mmrjax import effects
+from mmrjax.effects.base import EQUATION
 from mmrjax.errors import count_noun
 from mmrjax.model import channels
 
@@ -126,9 +127,15 @@ def loop_answer(found: loop_notes.Headline) -> str:
 
 def _law(names: Sequence[str], families: Sequence[str], values: Sequence[loop_notes.FreedValue]) -> str:
     """`a loss torque that changes with speed (churning or windage; these data cannot tell which)`."""
-    each = [*map(freed_value, values), *names]
+    each = [*map(freed_value, values), *in_order_of_parts(names)]
     which = "; these data cannot tell which" if len(each) > 1 else ""
     return f"{' or '.join(map(with_article, families))} ({' or '.join(each)}{which})"
+
+
+def in_order_of_parts(names: Iterable[str]) -> list[str]:
+    """Effects in the order of the balances from the supply to the instruments, others last."""
+    parts, balances = tuple(EQUATION), {e.name: e.balance for e in effects.ALL}
+    return sorted(names, key=lambda name: parts.index(balances[name]) if name in balances else len(parts))
 
 
 def with_article(noun: str) -> str:
@@ -250,7 +257,8 @@ def _named(one: loop_notes.Missing) -> str:
     if len(one.names) + len(one.values) == 1:
         return one.names[0]
     family = f"{one.families[0]}, " if len(one.families) == 1 else ""
-    listed = ", ".join(one.names) if len(one.names) == 1 else f"one of {', '.join(one.names)}"
+    names = ", ".join(in_order_of_parts(one.names))
+    listed = names if len(one.names) == 1 else f"one of {names}"
     values = [freed_value(v) for v in one.values]
     return f"{family}{', or '.join([listed, *values])} (these data cannot tell which)"
 
@@ -651,8 +659,9 @@ def indistinguishable_effects(found: DiscoveryResult, e: FoundEffect) -> str:
     settled = [x.name for x in effects.ALL if x.settles_to in e.members and not found.runs.sampled]
     others = ", ".join(
         [
-            name + (f" (at {m.size:.2g} times its largest plausible size)" if m.size >= 1 else "")
-            for name, m in list(e.members.items())[1:]
+            name
+            + (f" (at {size:.2g} times its largest plausible size)" if (size := e.members[name].size) >= 1 else "")
+            for name in in_order_of_parts(list(e.members)[1:])
         ]
         + [f"{name} (time histories alone tell that)" for name in settled if name not in e.members]
     )

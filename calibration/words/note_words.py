@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from calibration.data.settling import Settled
-from calibration.discovery import instructions, loop_notes
+from calibration.discovery import loop_notes
 from calibration.discovery import result as loop_results
 from calibration.inference import fit_notes
 from calibration.inference import result as fit_results
@@ -33,11 +33,11 @@ NOTES: dict[str, str | Callable[..., str]] = {
     **feedforward_words.SAID,
     **fit_words.SAID,
     **loop_words.SAID,
+    **experiment_words.SAID,
     **sensitivity_words.SAID,
 }
 #: Kind of result, or part of one → the function that makes its sentence.
 RESULTS: dict[type, Callable[..., str]] = {
-    **dict.fromkeys(instructions.KINDS, experiment_words.experiment_instruction),
     Feedforward: feedforward_words.feedforward_statement,
     fit_notes.Determination: fit_words.is_determined_answer,
     fit_notes.Edge: fit_words.prior_edge,

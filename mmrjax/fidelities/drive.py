@@ -38,7 +38,7 @@ from mmrjax.turning.two_sides import SIDES
 # The memories of effects follow, each in its own unit.
 _UNITS = (10.0, 1000.0, 1.0, 1.0, 10.0)
 CURRENT, MOTOR, GROUND = 0, 1, 2
-_GAP = 0.01  # of the gap within a backlash, the last unknown if there is one [rad]
+_GAP = 0.01  # of the angle between motor and load, the last unknown if there is one [rad]
 
 #: Time after which a run counts as settled [s].
 TIME_SETTLED = 4.0
@@ -140,12 +140,16 @@ def drive_start(robot: Robot, conditions: Conditions, rolling: bool = False) -> 
         memory = [effect.initial(robot, angle) for effect in robot.remembering]
         known = jnp.stack([*first, jnp.asarray(conditions.discharge, size.dtype), *memory])
         rest = rest.at[: len(known)].set(known / size[: len(known)])
+    if robot.loose:
+        shaft = robot.chassis(conditions.configuration)
+        rest = rest.at[-1].set(shaft.twist(shaft.torque_load(rest[3] * size[3] / shaft.radius)) / size[-1])
     if not rolling:
         return rest
     settled = operating_signals(robot, conditions)
     memory = [effect.settled(robot, settled) for effect in robot.remembering]
     state = [settled.current, settled.speed_motor, settled.speed, 0.0, conditions.discharge, *memory]
-    state += [jnp.zeros(())] * ((robot.controller is not None) + robot.loose)
+    state += [jnp.zeros(())] * (robot.controller is not None)
+    state += [robot.chassis(conditions.configuration).twist(settled.torque_output)] * robot.loose
     y = jnp.stack([jnp.asarray(x, size.dtype) for x in state]) / size
     return jnp.where(jnp.all(jnp.isfinite(y)), y, rest)
 

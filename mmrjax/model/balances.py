@@ -464,7 +464,7 @@ def _moving(robot: Robot, conditions: Conditions, state: State, way: Scalar | No
     if isinstance(chassis, Shaft):
         signals = _fill(signals, traction=signals.demand)
         if state.gap is not None:
-            return _within_backlash(robot, chassis, signals, state.gap)
+            return _two_bodies(robot, chassis, signals, state.gap)
         signals = gearbox(robot, chassis, track(robot, chassis, signals))
         return _fill(signals, acceleration=chassis.radius * signals.acceleration_wheel)
     traction = chassis.ground.traction(signals.speed_sliding, signals.normal, signals.adhesion)
@@ -472,14 +472,14 @@ def _moving(robot: Robot, conditions: Conditions, state: State, way: Scalar | No
     return gearbox(robot, chassis, track(robot, chassis, signals))
 
 
-def _within_backlash(robot: Robot, chassis: Shaft, signals: Signals, gap: Scalar) -> Signals:
-    """Motor and load as two bodies, between which the gear flanks carry their contact torque [N·m]."""
+def _two_bodies(robot: Robot, chassis: Shaft, signals: Signals, gap: Scalar) -> Signals:
+    """Motor and load as two bodies, between which gear flanks or an elastic joint carry a torque [N·m]."""
     gear = robot.gearbox
     idle = gear.torque_idle(signals.speed_motor, signals.direction)
     loss = chassis.torque_loss(signals.speed_output, signals.direction_travel) + effects_sum(robot, signals, "track")
     inertia_added = effects_sum(robot, signals, "inertia")
     inertia_motor = robot.motor.inertia * gear.ratio**2
-    mesh = chassis.torque_mesh(gap, signals.speed_wheel - signals.speed_output, inertia_motor)
+    mesh = chassis.torque_joint(gap, signals.speed_wheel - signals.speed_output, inertia_motor)
     signals = _fill(signals, torque_track_loss=loss, torque_carried=mesh)
     own = effects_sum(robot, signals, "gearbox")
     efficiency = gear.efficiency_flow(mesh, signals.direction)

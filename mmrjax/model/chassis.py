@@ -21,13 +21,14 @@ class Chassis(eqx.Module):
         on_tracks: 1 on tracks, 0 on wheels [-].
         turning: parameters of the chassis that matter only in turns.
         lacks: balances that it does not have.
-        torque_constant, torque_gravity, backlash: of a `Shaft`, 0 here.
+        torque_constant, torque_gravity: of a `Shaft`, 0 here.
+        has_two_bodies: False, motor and wheel turn together.
     """
 
     lacks: ClassVar[frozenset[str]] = frozenset()
     torque_constant: ClassVar[float] = 0.0
     torque_gravity: ClassVar[float] = 0.0
-    backlash: ClassVar[float] = 0.0
+    has_two_bodies: ClassVar[bool] = False
     track: Track
     ground: Ground
     on_tracks: Scalar = eqx.field(converter=as_float)

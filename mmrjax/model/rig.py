@@ -110,7 +110,8 @@ class Rig(eqx.Module):
         inherits: True if a packaged robot supplies what the file leaves open. False: nothing comes from another.
         unknown: parameters that nobody stated and that have no substitute. Their fields hold a packaged robot's value
             to keep the equations computable. Results that depend on them are not known (`Robot.knows`).
-        loose: True if the load on the shaft has backlash, which histories then follow as a state.
+        loose: True if the load turns apart from the motor, by a backlash or an elastic joint. Histories follow their
+            difference as a state.
     """
 
     delay: Scalar = parameter(

@@ -170,12 +170,12 @@ class Robot(eqx.Module):
 
     @property
     def loose(self) -> bool:
-        """True if its load can turn within a backlash, as a separate body."""
+        """True if its load turns apart from the motor, by a backlash or an elastic joint."""
         return self.rig.loose
 
     @property
     def moves_as_one(self) -> bool:
-        """True if shafts and load stop together: neither backlash nor a ground to slip on."""
+        """True if shafts and load stop together: no backlash, elastic joint or ground to slip on."""
         return not (self.loose or self.has_ground)
 
     def chassis(self, configuration: Index) -> Any:

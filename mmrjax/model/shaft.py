@@ -59,6 +59,14 @@ class Shaft(eqx.Module):
         0.0, "rad", "backlash of gearbox and couplings at the output, from flank to flank", (0.0, 1.0), _STATED,
         relative_sd=0.3, scanned=0.0,
     )  # fmt: skip
+    stiffness: Scalar = parameter(
+        0.0, "N·m/rad", "stiffness k of gearbox and coupling at the output (0: rigid)", (0.0, 1e8), _STATED,
+        relative_sd=0.3,
+    )  # fmt: skip
+    damping: Scalar = parameter(
+        0.0, "N·m·s", "damping d of an elastic gearbox and coupling at the output", (0.0, 1e4), _STATED,
+        relative_sd=0.5,
+    )  # fmt: skip
     radius: Scalar = parameter(
         1.0, "m", "travel per radian of the output: radius of a drum, lead of a screw / 2π", (1e-6, 10.0), _STATED,
         relative_sd=0.005,
@@ -74,12 +82,30 @@ class Shaft(eqx.Module):
         """Friction torque M_0 sign ω + K ω [N·m] at `speed` [rad/s] and its `direction` (-1..1)."""
         return self.loss_coulomb * direction + self.loss_viscous * speed
 
-    def torque_mesh(self, gap: Scalar, closing: Scalar, inertia_motor: Scalar) -> Scalar:
-        """Torque that the gear flanks carry [N·m], 0 while they do not touch.
+    @property
+    def has_two_bodies(self) -> bool:
+        """True if motor and load turn apart, by a backlash or an elastic joint."""
+        return bool(self.backlash > 0) or bool(self.stiffness > 0)
 
-        k s + d ds/dt over the compression s beyond half the backlash, never pulling (a dead zone with compliance:
-        Nordin and Gutman, Controlling mechanical systems with backlash, Automatica 38 (2002) 1633). A rig's sampling
-        does not resolve the flanks' stiffness: they oscillate at `MESH_FREQUENCY`, damped by `MESH_DAMPING`.
+    def frequency(self, inertia_motor: Scalar) -> Scalar:
+        """Angular frequency at which motor and load swing against each other across an elastic joint [rad/s].
+
+        √(k (1/J_m + 1/J)) with the inertia J_m of the motor side at the output [kg·m²]. 0 without a stiffness.
+        """
+        return jnp.sqrt(self.stiffness * (1 / inertia_motor + 1 / self.inertia))
+
+    def twist(self, torque: Scalar) -> Scalar:
+        """Twist of an elastic joint under a torque at the output [rad], 0 of a rigid one."""
+        elastic = jnp.asarray(self.stiffness) > 0
+        return jnp.where(elastic, torque / jnp.where(elastic, self.stiffness, 1.0), 0.0)
+
+    def torque_joint(self, gap: Scalar, closing: Scalar, inertia_motor: Scalar) -> Scalar:
+        """Torque that the gear flanks or the elastic joint carry [N·m], 0 while flanks do not touch.
+
+        k s + d ds/dt over the twist s. With backlash s is the compression beyond half of it, and flanks never pull (a
+        dead zone with compliance: Nordin and Gutman, Controlling mechanical systems with backlash, Automatica 38
+        (2002) 1633). A rig's sampling does not resolve the stiffness of flanks. If no stiffness is stated, they
+        oscillate at `MESH_FREQUENCY`, damped by `MESH_DAMPING`.
 
         Args:
             gap: of the output's motor side ahead of the load, from the middle [rad].
@@ -88,14 +114,16 @@ class Shaft(eqx.Module):
         """
         inertia = inertia_motor * self.inertia / (inertia_motor + self.inertia)
         omega = 2 * jnp.pi * MESH_FREQUENCY
+        elastic = jnp.asarray(self.stiffness) > 0
+        stiffness = jnp.where(elastic, self.stiffness, omega**2 * inertia)
+        damping = jnp.where(elastic, self.damping, 2 * MESH_DAMPING * omega * inertia) * closing
         ahead = jnp.maximum(gap - 0.5 * self.backlash, 0.0)
         behind = jnp.minimum(gap + 0.5 * self.backlash, 0.0)
-        damping = 2 * MESH_DAMPING * omega * inertia * closing
         # Damping sets in over a tenth of the backlash, so that the torque is continuous at contact.
         full = 0.1 * self.backlash + 1e-4
-        push = jnp.maximum(omega**2 * inertia * ahead + damping * jnp.minimum(ahead / full, 1.0), 0.0)
-        pull = jnp.minimum(omega**2 * inertia * behind + damping * jnp.minimum(-behind / full, 1.0), 0.0)
-        return push + pull
+        push = jnp.maximum(stiffness * ahead + damping * jnp.minimum(ahead / full, 1.0), 0.0)
+        pull = jnp.minimum(stiffness * behind + damping * jnp.minimum(-behind / full, 1.0), 0.0)
+        return jnp.where(jnp.asarray(self.backlash) > 0, push + pull, stiffness * gap + damping)
 
     def torque_weight(self, mass: Scalar, slope: Scalar) -> Scalar:
         """Torque of gravity at rest against forward rotation [N·m], independent of a vehicle's mass and slope."""

@@ -51,7 +51,7 @@ class State(eqx.Module):
         memory: of each effect that has one, by effect name, in its own unit, empty if not followed.
         temperature: of the winding [°C], which sets its resistance. None: not followed, resistance as stated.
         distance: travelled since the start of the run [m]. Used by loads that depend on their angle.
-        gap: of the output's motor side ahead of the load within the backlash, from its middle [rad]. None: rigid.
+        gap: of the output's motor side ahead of the load, from the middle of a backlash [rad]. None: rigid.
         integral: of the controller's error over time, as in `Controller`. None: no controller.
     """
 

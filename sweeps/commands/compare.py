@@ -14,6 +14,7 @@ from calibration.data.input_errors import BadConfiguration
 from calibration.data.robot_file import RobotFile
 from calibration.described import sentences
 from calibration.inference import preparation
+from calibration.inference.conduct import error_after_steps
 from calibration.inference.ranges import check_ranges
 from mmrjax import fidelities
 from mmrjax.model.channels import Channel
@@ -95,9 +96,11 @@ def _over_time(
             other = preparation.prepare(runs, second.robot).robot
             comparison = add_second_robot(comparison, runs.channels, run.follow_histories(other, runs, model))
         folder.write_table("comparison.csv", comparison)
+        readings = ((comparison[f"simulated_{c.column}"], comparison[c.column]) for c in runs.channels)
+        off = np.stack([simulated - measured for simulated, measured in readings], 1)
         notes = (
             *missing_readings_notes(comparison, runs.channels),
-            *sentences((*ready.checked, *ready.begins, *ready.weighed)),
+            *sentences((*error_after_steps(runs, off), *ready.checked, *ready.begins, *ready.weighed)),
         )
         result = Comparison(
             comparison, summary, runs.channels, Path(runs.source).name, HISTORIES, capabilities.shown_name(file),

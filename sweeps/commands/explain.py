@@ -12,7 +12,7 @@ import numpy as np
 
 from calibration.data import Names, effect_file
 from calibration.data.input_errors import BadConfiguration, bound_text
-from calibration.words import effect_words
+from calibration.words import experiment_words
 from mmrjax import derived, effects
 from mmrjax.effects import Effect
 from mmrjax.errors import similar_words
@@ -92,7 +92,7 @@ def _effect(name: str, library: dict[str, type[Effect]]) -> Iterator[Line]:
     effect = library.get(name)
     if effect is None:
         return
-    equation, meaning, source = effect_words.effect_summary(effect)
+    equation, meaning, source = experiment_words.effect_summary(effect)
     yield "equation", equation
     yield "stands for", meaning
     yield "enters", f"the {effect.balance} balance{f', channel {effect.channel}' if effect.channel else ''}"
@@ -103,12 +103,12 @@ def _effect(name: str, library: dict[str, type[Effect]]) -> Iterator[Line]:
             yield "bounds", _bounds(p.spec)
         else:
             yield f"  {p.name}", f"{float(p.value):g} {p.spec.unit}: {p.spec.meaning}"
-    if declarations := ", ".join(effect_words.effect_declarations(effect)):
+    if declarations := ", ".join(experiment_words.effect_declarations(effect)):
         yield "declares", declarations
     yield "in data", f"{effect.family()}{_histories(effect)}"
     for line in _changes(example):
         yield "", line
-    for k, test in enumerate(effect_words.effect_tests(effect)):
+    for k, test in enumerate(experiment_words.effect_tests(effect)):
         yield "" if k else "on a bench", test
     if source:
         yield "source", source
@@ -187,7 +187,7 @@ def _channel(name: str, library: dict[str, type[Effect]]) -> Iterator[Line]:
     wrong = [e for e in library.values() if e.channel == c.name and e.name not in effects.UNNAMED]
     if wrong:
         yield "its errors", ", ".join(e.name for e in wrong)
-        for k, test in enumerate(effect_words.effect_tests(wrong[0])):
+        for k, test in enumerate(experiment_words.effect_tests(wrong[0])):
             yield "" if k else "on a bench", test
 
 

@@ -55,7 +55,8 @@ def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> 
         )
     if robot.loose:
         raise BadConfiguration(
-            "--profile: a profile does not follow a backlash; set it to 0, or simulate over time with --model drive"
+            "--profile: a profile does not follow a backlash or an elastic joint; set them to 0, or simulate over "
+            "time with --model drive"
         )
     for name, load in robot.configurations.items():
         if float(load.torque_gravity) > 0:

@@ -18,8 +18,8 @@ from calibration.data.runs import Runs
 from calibration.described import describe, sentences
 from calibration.inference import foresight, identifiability, priors
 from calibration.inference.fit_notes import Determination
-from calibration.inference.fit_posterior import undetermined_names
 from calibration.inference.foresight import Determined, Foresight
+from calibration.inference.identifiability import undetermined_names
 from calibration.words import fit_words
 from mmrjax.errors import count_noun
 from mmrjax.model import channels

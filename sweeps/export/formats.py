@@ -14,7 +14,7 @@ from calibration.data.robot_file import RobotFile
 from calibration.data.runs import Runs
 from mmrjax.compile.precision import in_double
 from mmrjax.errors import count_noun
-from sweeps.export import comparison, feed_forward, jax_actuator, mjlab, mujoco, onnx, randomization
+from sweeps.export import comparison, feed_forward, jax_actuator, law_source, mujoco, onnx, randomization
 from sweeps.export.comparison import Comparison, Fate
 from sweeps.export.joint import Joint, joint_of_robot
 from sweeps.export.law_source import Constant, constants_of, posterior_of
@@ -25,7 +25,7 @@ FORMATS = {
     "mujoco": "MJCF with <dcmotor>, and a scene that runs",
     "jax": "an actuator function in JAX, as source and as a serialised program",
     "onnx": "the same step as an ONNX model, for Isaac Lab, Unity or C++",
-    "mjlab": "an actuator configuration for mjlab, in PyTorch",
+    "mjlab": "an actuator configuration for law_source, in PyTorch",
     "table": "feed-forward and efficiency maps, as CSV and as a C header",
     "randomization": "draws of the posterior in the parameters of MuJoCo and of the actuator",
 }
@@ -161,7 +161,7 @@ def _actuator(begun: Export, runs: Situation, at: str, draws: int, seed: int) ->
     if begun.format == "jax":
         files = jax_actuator.jax_files(drive, constants, notes)
     elif begun.format == "mjlab":
-        files = mjlab.mjlab_files(drive, constants, notes)
+        files = law_source.mjlab_files(drive, constants, notes)
     else:
         files = onnx.onnx_files(drive, constants)
         model: Any = files["actuator.onnx"]

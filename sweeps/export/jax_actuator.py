@@ -107,7 +107,7 @@ def fates_in_actuator(joint: Joint) -> list[Fate]:
         how = "the simulator's own contact with the ground"
         fates.append(Fate("ground: slip and rolling resistance", DROPPED, how))
     if robot.loose:
-        fates.append(Fate("backlash", DROPPED, "the joint is rigid; it needs a second body"))
+        fates.append(Fate("backlash and elasticity", DROPPED, "the joint is rigid; it needs a second body"))
     if joint.limit is not None:
         fates.append(Fate("current limit of the driver", HELD, "a bound of the current"))
     return [*fates, *fates_outside_joint(joint)]

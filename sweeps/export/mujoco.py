@@ -184,7 +184,7 @@ def fates_in_mujoco(joint: Joint, normal: float) -> list[Fate]:
             Fate("ground: slip and rolling resistance", DROPPED, "the simulator's own contact with the ground")
         )
     if robot.loose:
-        fates.append(Fate("backlash", DROPPED, "the joint is rigid; a format needs a second body for it"))
+        fates.append(Fate("backlash and elasticity", DROPPED, "the joint is rigid; a format needs a second body"))
     if joint.limit is not None:
         fates.append(Fate("current limit of the driver", HELD, "forcerange"))
     return [*fates, *fates_outside_joint(joint)]

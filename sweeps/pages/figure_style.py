@@ -164,7 +164,10 @@ def fit_for_phones(fig: Figure) -> Figure:
             axes.set_ylabel(axes.get_ylabel() or grid[i, 0].get_ylabel())
             axes.set_xlabel(axes.get_xlabel() or grid[-1, j].get_xlabel())
         axes.set_xlabel("\n".join(textwrap.wrap(axes.get_xlabel(), LETTERS)))
-        axes.set_title("\n".join(textwrap.wrap(axes.get_title(loc="left"), LETTERS - 12)))
+        title = axes.get_title(loc="left")
+        for text in axes.get_children():
+            if title and isinstance(text, Text) and text.get_text() == title:
+                text.set_text("\n".join(textwrap.wrap(title, LETTERS - 12)))  # `set_title` would reset its pad
         names = [tick.get_text() for tick in axes.get_yticklabels()]
         if _has_names(axes.yaxis) and max(map(len, names), default=0) > NAMES:
             axes.set_yticks(axes.get_yticks(), [_broken_name(name) for name in names])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import jax.numpy as jnp
@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 
 from calibration.data import Columns
 from calibration.data.courses import applied_drive
+from calibration.data.runs import Runs
 from calibration.data.settling import Settled
 from mmrjax.derived.start_figures import (
     StartStages,
@@ -36,8 +37,13 @@ from sweeps.pages.figure_style import (
     corner_note,
     new_figure,
 )
+from sweeps.report.run_tables import UNITS, imposed_column
 from sweeps.report.settle_report import IMPOSED
 
+#: Samples of a segment of a frequency response, and least coherence of a point that is drawn.
+SEGMENT, COHERENT = 256, 0.7
+#: Least rows of a run for a frequency response.
+SHORTEST = 32
 #: Most points of a line of a figure, in pairs of the least and the greatest of as many samples.
 POINTS = 3000
 
@@ -415,4 +421,74 @@ def over_time(shown: list[Course]) -> Figure:
             axes.set(xlabel="time [s]", ylabel=axis_label(channel))
         if course.status not in words.SETTLED:
             corner_note(row[0], f"ends: {words.short_status(course.status)}", color=VERMILION)
+    return fig
+
+
+def frequency_response(
+    runs: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]],
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Response of readings to a drive by Welch's method, averaged over runs (the H1 estimate).
+
+    Bendat and Piersol, Random Data (2010), ch. 6. Runs are read at even times, a median interval apart.
+
+    Args:
+        runs: time [s], shape (rows,), drive, shape (rows,), and readings, shape (readings, rows), of each run.
+
+    Returns:
+        Frequencies between 0 and half the sampling rate [Hz], complex responses, shape (readings, frequencies), and
+        coherence of each.
+    """
+    from scipy import signal
+
+    apart = float(np.median(np.concatenate([np.diff(time) for time, _, _ in runs])))
+    length = min(SEGMENT, *(int(np.ptp(time) / apart) + 1 for time, _, _ in runs))
+    spectra: Any = 0.0
+    for time, drive, readings in runs:
+        even = time[0] + apart * np.arange(int(np.ptp(time) / apart) + 1)
+        held = drive[np.searchsorted(time, even + 1e-3 * apart, side="right") - 1]
+        series = np.stack([held, *(np.interp(even, time, reading) for reading in readings)])
+        frequency, cross = signal.csd(held, series, 1 / apart, nperseg=length)
+        _, power = signal.welch(series, 1 / apart, nperseg=length)
+        spectra = spectra + len(even) * np.stack([cross, power + 0j])
+    cross, power = spectra[0, 1:, 1:], spectra[1, :, 1:].real
+    coherence = np.abs(cross) ** 2 / np.maximum(power[0] * power[1:], 1e-300)
+    return frequency[1:-1], (cross / np.maximum(power[0], 1e-300))[:, :-1], coherence[:, :-1]
+
+
+def draw_frequency_response(table: Columns, read: Sequence[Channel], simulated: Mapping[str, str]) -> Figure:
+    """Gain and phase of each channel over the frequency of the drive: measured as points, simulated as lines.
+
+    Args:
+        table: of rows over time, as for `time_overlay`.
+        read: channels.
+        simulated: prefixes of the simulated columns, and their names.
+    """
+    runs, imposed_name = Runs("a table", table), imposed_column(table)
+    drive = table[imposed_name] * table.get("duty", 1.0)
+    fig, grid = new_figure(2, len(read), 4.4, sharex=True)
+    for (gain, phase), channel in zip(grid.T, read, strict=True):
+        columns = [channel.column, *(prefix + channel.column for prefix in simulated)]
+        rows = [runs.in_order(name) for name in dict.fromkeys(runs.run_names.tolist())]
+        finite = [r[np.all([np.isfinite(table[c][r]) for c in columns], axis=0)] for r in rows]
+        series = [
+            (table["time_s"][r], drive[r], np.stack([table[c][r] for c in columns]))
+            for r in finite
+            if len(r) >= SHORTEST
+        ]
+        if not series:
+            corner_note(gain, "no run is long enough")
+            continue
+        frequency, response, coherence = frequency_response(series)
+        looks = zip(response, coherence, ("measured", *simulated.values()), (INK, BLUE, FAINT), strict=False)
+        for values, coherent, label, colour in looks:
+            drawn = np.where(coherent > COHERENT, values, np.nan)
+            style = {"ls": "none", "marker": "o", "ms": 3} if label == "measured" else {"lw": 1.5}
+            gain.loglog(frequency, np.abs(drawn), color=colour, label=label, **style)
+            angle = np.degrees(np.angle(drawn))
+            if label != "measured":
+                angle[1:][np.abs(np.diff(angle)) > 180] = np.nan  # no line from -180° to 180°
+            phase.semilogx(frequency, angle, color=colour, **style)
+        gain.set(title=channel.label, ylabel=f"gain [{channel.unit}/{UNITS[imposed_name]}]")
+        phase.set(xlabel="frequency [Hz]", ylabel="phase [°]", ylim=(-190, 190), yticks=[-180, -90, 0, 90, 180])
+    grid[0, 0].legend(loc="best")
     return fig

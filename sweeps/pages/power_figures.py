@@ -1,13 +1,22 @@
-"""The power chain of runs: what the supply gives and where it is lost on the way to the slope."""
+"""Where the power of runs goes on the way to the slope, and the chart of motor and gear with operating points."""
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
+from collections.abc import Sequence
 
 import numpy as np
 from matplotlib.figure import Figure
 
-from calibration.data import Columns
+from calibration.data import Columns, Json
+from mmrjax.fidelities.simulation import simulate
+from mmrjax.model.conditions import Conditions
+from mmrjax.model.quantities import RPM
+from mmrjax.model.robot import Configurations, Robot
+from mmrjax.model.shaft import Shaft
+from mmrjax.model.signals import is_done
+from sweeps.export.joint import UNLIMITED
 from sweeps.pages.figure_style import BLUE, GREEN, INK, ORANGE, PURPLE, SKY, new_figure, outer_legend
 
 #: Where power goes, with its colour: losses in the order of the chain, then what is left.
@@ -77,4 +86,101 @@ def draw_power_chain(runs: Columns, names: list[str], has_ground: bool = True) -
     beyond = 1.35 if (slope > 1e-6).any() else 1.1
     axes.set(xlabel="power [W]", xlim=(0, beyond * float(total.max())))
     outer_legend(axes, "upper center")
+    return fig
+
+
+#: Loads of a curve of the drive, and balances whose effects it has.
+LOADS = 60
+INSIDE = ("duty", "supply", "electrical", "motor", "gearbox")
+
+
+def drive_curves(robot: Robot, voltage: float) -> Columns:
+    """Torque at the gearbox output, speed, current and efficiency of one motor and gear at a supply voltage.
+
+    By the robot's own equations with a frictionless shaft as its load, from no load to the current limit or to stall.
+    """
+    shaft = Shaft(inertia=1e-3, loss_coulomb=0.0)
+    inside = tuple(e for e in robot.effects if e.balance in INSIDE and e.acts_everywhere)
+    bench = dataclasses.replace(robot, configurations=Configurations({"shaft": shaft}), effects=inside)
+    motor, gearbox = robot.motor, robot.gearbox
+    current = min(float(motor.current_stall(voltage)), float(robot.driver.current_limit))
+    torque = np.linspace(0, 1, LOADS, endpoint=False) ** 2 * float(motor.torque_constant * gearbox.ratio) * current
+    runs = simulate(bench, Conditions(0, voltage, load_torque=torque))
+    speed, drawn = np.asarray(runs.motor_speed), np.asarray(runs.total_current) / float(robot.sides)
+    settled = np.asarray(is_done(np.asarray(runs.status))) & (speed > 0)
+    efficiency = 100 * torque * speed / float(gearbox.ratio) / np.maximum(voltage * drawn, 1e-9)
+    columns = {"torque_Nm": torque, "motor_rpm": speed / RPM, "motor_A": drawn, "efficiency_percent": efficiency}
+    return {name: values[settled] for name, values in columns.items()}
+
+
+def operating_points(robot: Robot, runs: Columns) -> Columns:
+    """Torque at the gearbox output, speed and current of one motor in settled runs, out of columns of `runs.csv`."""
+    radius = np.array([float(robot.configurations[name].radius) for name in runs["configuration"]])
+    output = runs["theoretical_speed_mm_s"] / 1e3 / radius
+    with np.errstate(divide="ignore", invalid="ignore"):
+        torque = runs["power_gear_W"] / float(robot.sides) / output
+    speed = output * float(robot.gearbox.ratio) / RPM
+    return {"torque_Nm": torque, "motor_rpm": speed, "motor_A": runs["total_current_A"] / float(robot.sides)}
+
+
+def draw_chart_of_corners(robot: Robot, corners: Sequence[Json]) -> Figure:
+    """The chart of motor and gear with operating points at corners of an envelope, on the robot's own ground."""
+    keys = ("configuration", "payload_kg", "slope_deg", "state_of_charge", "supply_voltage_V")
+    whole = (corner for corner in corners if not any(isinstance(corner.get(key), list | tuple) for key in keys))
+    cells = dict.fromkeys(tuple(corner.get(key) for key in keys) for corner in whole)
+    rows = [cell for cell in cells if None not in cell[:3]]
+    full = float(robot.battery.voltage_no_load(0.0))
+    points = {name: np.zeros(0) for name in ("torque_Nm", "motor_rpm", "motor_A")}
+    if not rows:
+        return draw_drive_chart(robot, [full], points)
+    names, payload, slope, charge, volts = zip(*rows, strict=True)
+    on_battery = np.array([v is None for v in volts])
+    used = float(robot.battery.capacity) * (1 - np.array([1.0 if c is None else max(c, 1e-9) for c in charge]))
+    supply = np.array([full if v is None else v for v in volts], float)
+    runs = simulate(robot, Conditions(
+        list(names), supply, slope_deg=np.array(slope, float), payload=np.array(payload, float),
+        battery=on_battery.astype(float), discharge=np.where(on_battery, used, 0.0),
+    ))  # fmt: skip
+    done, speed = np.asarray(is_done(np.asarray(runs.status))), np.asarray(runs.motor_speed)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        torque = np.asarray(runs.power_gear) / float(robot.sides) / speed * float(robot.gearbox.ratio)
+    columns = torque, speed / RPM, np.asarray(runs.total_current) / float(robot.sides)
+    points = {name: values[done] for name, values in zip(points, columns, strict=True)}
+    return draw_drive_chart(robot, sorted(set(supply.tolist()))[-3:], points)
+
+
+def draw_drive_chart(robot: Robot, voltages: Sequence[float], points: Columns) -> Figure:
+    """Speed, current and efficiency of one motor and gear over the torque at the output.
+
+    Shaded are the torques up to the current that the winding bears continuously, and up to that of the driver.
+    """
+    fig, grid = new_figure(1, 3, 3.0, sharex=True)
+    panels = {
+        "motor_rpm": "motor speed [rpm]",
+        "motor_A": "current of one motor [A]",
+        "efficiency_percent": "efficiency [%]",
+    }
+    bears, limit = float(robot.motor.current_continuous), float(robot.driver.current_limit)
+    reached = np.nanmax(points["torque_Nm"], initial=0.0)
+    for voltage, style in zip(sorted(voltages, reverse=True), ("-", "--", ":"), strict=False):
+        curves = drive_curves(robot, voltage)
+        if curves["torque_Nm"].size < 2:
+            continue
+        continuous = float(np.interp(bears, curves["motor_A"], curves["torque_Nm"]))
+        if style == "-":
+            most = min(max(2.5 * continuous, 1.2 * reached), curves["torque_Nm"][-1])
+            for axes in grid[0]:
+                axes.axvspan(0, min(continuous, most), color=GREEN, alpha=0.18, lw=0, label="continuous")
+                axes.axvspan(min(continuous, most), most, color=ORANGE, alpha=0.12, lw=0, label="short time")
+                axes.set_xlim(0, most)
+        shown = curves["torque_Nm"] <= most
+        for axes, (name, label) in zip(grid[0], panels.items(), strict=True):
+            axes.plot(curves["torque_Nm"][shown], curves[name][shown], style, color=BLUE, label=f"{voltage:.3g} V")
+            axes.set(xlabel="torque at the gearbox output [N·m]", ylabel=label)
+            axes.set_ylim(bottom=0)
+    for axes, name in zip(grid[0], ("motor_rpm", "motor_A"), strict=False):
+        axes.plot(points["torque_Nm"], points[name], "o", ms=5, color=INK, label="operating points")
+    if limit < UNLIMITED:
+        grid[0, 1].axhline(limit, color=ORANGE, lw=1, label="driver's limit")
+    outer_legend(grid[0, 1], "upper left")
     return fig

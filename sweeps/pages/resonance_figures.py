@@ -97,7 +97,7 @@ def draw_campbell_diagram(axes: Axes, found: ResonanceResult) -> None:
         )  # fmt: skip
     axes.set(ylim=(0, top), ylabel="frequency [Hz]")
     heading = f"{found.configuration}: {what.name} pass every {what.travel / MM:.4g} mm of travel; dotted: Table 8"
-    axes.set_title(heading, pad=22 if is_narrow() else 18)
+    axes.set_title(heading, pad=18)
     labels = axes.get_legend_handles_labels()[1]
     axes.legend(
         loc="upper center", bbox_to_anchor=(0.5, -0.02), ncols=legend_columns(labels, 3), handletextpad=0.2,

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -15,12 +17,62 @@ from mmrjax.model.paper_tables import TRACKED, WHEELED
 from mmrjax.model.quantities import MM, RPM
 from mmrjax.model.robot import Robot
 from sweeps import capabilities
-from sweeps.pages import words
-from sweeps.paper import data, running_gear_figures
+from sweeps.pages import gear_figures, words
+from sweeps.paper import data
 from sweeps.report import catalogue
 from sweeps.report.document import Block, Cell, Column, Document, Section
 from sweeps.report.fit_tables import error_cell
-from sweeps.report.runs_report import starts_table
+from sweeps.report.runs_report import ripple_table, starts_table
+
+# --- Figures 23-27 from the track model -----------------------------------------------------------
+
+
+SECONDS = 1.5  # of a run
+SAMPLE = 5e-4  # of its record [s]
+
+
+def simulate_gear_runs(robot: Robot) -> Any:
+    """The paper's configurations from standstill on the flat at 33 V without payload, in NumPy.
+
+    A robot too stiff for the model's usual step is run with a smaller one.
+    """
+    import jax
+
+    from mmrjax.fidelities import track
+    from mmrjax.undercarriage.stability import largest_step
+
+    conditions = data.batch_conditions(robot, data.shown_configurations(robot), voltage=33.0)
+    step = min(track.STEP, float(largest_step(robot, conditions).min()))
+    step = SAMPLE / math.ceil(SAMPLE / step * (1 - 1e-9))
+    return jax.device_get(track.track_batch(robot, conditions, duration=SECONDS, sample=SAMPLE, step=step))
+
+
+def gear_blocks(robot: Robot) -> Iterator[Block]:
+    """Figures and the table of ripple. If a run does not get under way, the statuses of all and no figures."""
+    run, names = simulate_gear_runs(robot), data.shown_configurations(robot)
+    which = [robot.configurations.index(c) for c in names]
+    status, share = np.asarray(run.result.status), np.asarray(run.steady.guide_share)
+    gears = gear_figures.members_with_gear(robot, run, status, share, which, names)
+    yield catalogue.note("paper.gear")
+    if not all(gear.rolls for gear in gears):
+        ended = ", ".join(f"{g.name}: {words.short_status(g.status)}" for g in gears)
+        yield catalogue.note("paper.gear-left-out", ended)
+        return
+    starts = data.starts_of(robot, run, run.result.status)
+    yield catalogue.figure("paper.track_fig23_24_from_standstill", starts, data.FIG_23, data.FIG_24)
+    yield catalogue.figure("paper.track_fig25_ripple", gears, "Fig. 25: {}")
+    yield ripple_table(gears)
+    if TRACKED in names:
+        k = names.index(TRACKED)
+        lumped = data.operating_points(robot, data.batch_conditions(robot, np.array([TRACKED]), voltage=33.0))
+        track = robot.configurations[TRACKED].track
+        currents = float(run.result.total_current[k]), float(lumped["total_current_A"][0])
+        yield catalogue.note("paper.guide-share", float(track.guide_share), float(track.guide_friction), *currents)
+        yield catalogue.figure("paper.track_fig26_touchdown", gears[k], "Fig. 26: grousers land (dotted)")
+    yield catalogue.figure("paper.track_fig27_reactions", gears, "Fig. 27: {}, one side")
+
+
+# --- the report -----------------------------------------------------------------------------------
 
 
 def paper_document(file: RobotFile, gear: bool) -> tuple[Document, data.Rows | None]:
@@ -57,7 +109,7 @@ def paper_document(file: RobotFile, gear: bool) -> tuple[Document, data.Rows | N
         figure = catalogue.figure("paper.fig23_24_from_standstill", starts, data.FIG_23, data.FIG_24)
         yield Section("From standstill", (figure, starts_table(starts)), "start")
         if gear:
-            yield Section("Inside the running gear", tuple(running_gear_figures.gear_blocks(robot)), "gear")
+            yield Section("Inside the running gear", tuple(gear_blocks(robot)), "gear")
         ratio = dict.fromkeys(data.shown_configurations(robot), 1.0) if own_rows is None else own_rows.ratio
         used = data.energy_use(robot, ratio)
         yield Section("Where the energy goes", (catalogue.figure("paper.energy_split", used),), "energy")

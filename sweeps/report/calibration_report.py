@@ -18,6 +18,9 @@ from sweeps.pages import words
 from sweeps.report import catalogue, fit_tables, run_tables
 from sweeps.report.document import Block, Document, Note, Section, Table, remarks
 
+#: Least number of rows of a log for a frequency response.
+FREQUENCIES = 64
+
 
 def calibration_document(found: CalibrationResult, robot_name: str) -> Document:
     """The report of a calibration of a robot of that name or file."""
@@ -101,7 +104,10 @@ def _over_rows(found: CalibrationResult, sized: bool) -> Iterable[Section]:
     answer, panels = fit_words.calibration_answer(found), found.channels
     if found.axis:
         lines = {"after_": "calibrated", "before_": "before"}
-        yield Section("Histories", (catalogue.figure("fit.overlay", table, panels, lines, finding=answer),))
+        drive = table[run_tables.imposed_column(table)] * table.get("duty", 1.0)
+        swept = np.ptp(drive) > 0 and len(drive) >= FREQUENCIES
+        response = [catalogue.figure("fit.frequency", table, panels, lines)] * bool(swept)
+        yield Section("Histories", (catalogue.figure("fit.overlay", table, panels, lines, finding=answer), *response))
     unit = "the channel's unit; band: ±2 sd of the readings" if sized else f"percent of the {OF_SIZE}"
     along = {found.axis: "time [s]"} if found.axis else {}
     figures = (

@@ -143,6 +143,8 @@ def check_document(found: CheckResult, robot_name: str, changes: bool = True) ->
     ]
     if changes and found.missed:
         sections.append(Section("Changes that would meet them", _changes(found), "changes"))
+    corners = [o.at for o in found.outcomes]
+    sections.append(Section("Motor and gear", (catalogue.figure("run.chart_of_corners", found.robot, corners),)))
     blocks: tuple[Block, ...] = (Note(lead, "lead"), margins, *_postures(found))
     return Document("Requirements", found.statement(), blocks, tuple(sections))
 

@@ -16,7 +16,7 @@ from mmrjax.errors import count_noun
 from mmrjax.model.channels import Channel
 from mmrjax.model.robot import Robot
 from sweeps.pages import words
-from sweeps.report import catalogue
+from sweeps.report import catalogue, fit_tables
 from sweeps.report.document import Cell, Column, Document, Note, Section, Table, is_missing, remarks
 from sweeps.report.run_tables import condition_formats
 
@@ -174,8 +174,10 @@ def _over_time(found: Comparison) -> tuple[Section, ...]:
     if not found.against:
         lines = {"simulated_": "simulated"}
     answer = comparison_answer(found)
-    overlay = catalogue.figure("fit.overlay", found.table, found.channels, lines, finding=answer)
-    return (Section("Over time", (overlay,)),)
+    fits = fit_tables.fits_of_runs(found.table, found.channels, lines)
+    more = fit_tables.range_of_fits(fits, found.channels)
+    overlay = catalogue.figure("fit.overlay", found.table, found.channels, lines, finding=answer, more=more)
+    return (Section("Over time", (overlay, fits)),)
 
 
 def comparison_answer(found: Comparison) -> str:

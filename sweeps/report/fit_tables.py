@@ -69,7 +69,7 @@ def fits_of_runs(table: Columns, shown: Sequence[Channel], lines: Mapping[str, s
     Args:
         lines: prefixes of simulated columns and their names.
     """
-    runs = np.asarray(table.get("run_id", np.zeros(len(table["time_s"]))))
+    runs = np.asarray(table.get("run_id", np.full(len(table["time_s"]), "log")))
     fits = [
         (
             str(name), words,
@@ -83,6 +83,17 @@ def fits_of_runs(table: Columns, shown: Sequence[Channel], lines: Mapping[str, s
         for prefix, words in lines.items()
     ]  # fmt: skip
     return catalogue.table("fit.runs", fits, *(f"{c.label} | .1f" for c in shown))
+
+
+def range_of_fits(fits: Table, shown: Sequence[Channel]) -> str:
+    """Sentence on the fits of `fits_of_runs`: range over the runs of each channel, of the first simulated line."""
+    first = [row[2:] for row in fits.rows if row[1] == fits.rows[0][1]]
+    each = []
+    for channel, values in zip(shown, np.array(first, float).T, strict=True):
+        if np.isfinite(values).any():
+            ends = dict.fromkeys(f"{end(values):.1f}" for end in (np.nanmin, np.nanmax))
+            each.append(f"{channel.label} {' to '.join(ends)} %")
+    return f" Fit of each run (100 %: exact, 0 %: no better than its mean): {', '.join(each)}."
 
 
 def clusters_section(clusters: Sequence[ResidualCluster]) -> tuple[Section, ...]:

@@ -64,10 +64,9 @@ def loop_document(found: DiscoveryResult, robot_name: str, changes: Mapping[str,
 def _first_figure(found: DiscoveryResult, table: Columns, changes: Mapping[str, Change]) -> Iterable[Block]:
     """The law that was found, on its readings. Without one, and of logs, measured and simulated readings."""
     if isinstance(found.detail, TimeStatistics):
-        lines = {"after_": "simulated" if found.refit_alone else "with what was found"}
-        lines |= {} if found.refit_alone else {"before_": "before"}
-        yield catalogue.figure("fit.overlay", table, found.channels, lines, finding=found.statement)
-        yield fit_tables.fits_of_runs(table, found.channels, lines)
+        lines = _simulated_lines(found)
+        fits = fit_tables.range_of_fits(fit_tables.fits_of_runs(table, found.channels, lines), found.channels)
+        yield catalogue.figure("fit.overlay", table, found.channels, lines, finding=found.statement, more=fits)
     elif changes:
         name, change = next(iter(changes.items()))
         size = next(loop_words.effect_amplitude(e) for e in found.effects if e.name == name)
@@ -76,6 +75,11 @@ def _first_figure(found: DiscoveryResult, table: Columns, changes: Mapping[str, 
         yield _curve(found)
     else:
         yield catalogue.figure("loop.before_after", table, found.channels, "none", words=("",))
+
+
+def _simulated_lines(found: DiscoveryResult) -> dict[str, str]:
+    """Prefixes of the simulated readings that figures over time show, with their names, the proposal's first."""
+    return {"after_": "simulated"} if found.refit_alone else {"after_": "with what was found", "before_": "before"}
 
 
 def rows_of(found: DiscoveryResult) -> Columns:
@@ -188,7 +192,7 @@ def _advice(found: DiscoveryResult) -> Table:
         more = f" It distinguishes {', '.join(after.separates)}; expected separation {after.expected_sigma:.1f} σ."
     if after is not None and found.headline.level == "class" and not after.settles:
         more += " Some pairs stay undecided."
-    far = [describe(note) for note in with_codes(found.remarks, "far_from_prior", "repeats", "copied")]
+    far = [describe(note) for note in with_codes(found.remarks, "after_steps", "far_from_prior", "repeats", "copied")]
     against = [note for note in found.remarks if isinstance(note, str)]
     sentences = [
         loop_words.largest_share(found),
@@ -340,6 +344,7 @@ def _run_by_run(found: DiscoveryResult, table: Columns, changes: Mapping[str, Ch
     if isinstance(detail, TimeStatistics):
         some = f", of the first 8 of {detail.runs} runs" if detail.runs > 8 else ""
         yield catalogue.figure("loop.over_time", found.runs, table, found.channels, verdict, words=(some,))
+        yield fit_tables.fits_of_runs(table, found.channels, _simulated_lines(found))
     elif changes or found.unnamed is not None:  # else it is the first figure
         yield catalogue.figure("loop.before_after", table, found.channels, verdict, words=("",))
 

@@ -73,7 +73,8 @@ def runs_document(
             yield from _histories(robot, runs, names, histories)
         if stands is not None:
             yield _posture(stands, names)
-        yield Section("Where the power goes", tuple(_power_chain(robot, runs, names)), "chain")
+        chart = tuple(_drive_chart(robot, runs))
+        yield Section("Where the power goes", (*_power_chain(robot, runs, names), *chart), "chain")
 
     title = f"Run of {names[0]}" if single else f"{len(names)} runs"
     return Document(title, runs_answer(runs, robot.channels, used), tuple(blocks), (of_runs,), sections)
@@ -214,6 +215,18 @@ def _power_chain(robot: Robot, runs: Columns, names: Sequence[str]) -> Iterable[
     picked = {key: value[chain] for key, value in runs.items()}
     more = catalogue.text("runs.on_ground" if robot.has_ground else "runs.on_shaft")
     yield catalogue.figure("runs.power", picked, [names[k] for k in chain], robot.has_ground, more=more)
+
+
+def _drive_chart(robot: Robot, runs: Columns) -> Iterable[Block]:
+    """Chart of motor and gear with the settled runs that a supply feeds, forward."""
+    from sweeps.pages import power_figures
+
+    supply = runs.get("supply_voltage_V", np.full(len(runs["status"]), np.nan))
+    used = np.isin(runs["status"], words.SETTLED) & (supply > 0) & (runs["theoretical_speed_mm_s"] > 0)
+    if used.any() and robot.knows(VOLTAGE) and np.isfinite(runs["total_current_A"][used]).all():
+        points = power_figures.operating_points(robot, {key: value[used] for key, value in runs.items()})
+        voltages = np.unique(supply[used])[-3:].tolist()
+        yield catalogue.figure("run.drive_chart", robot, voltages, points)
 
 
 def limits_used(robot: Robot, run: Json) -> list[Json]:

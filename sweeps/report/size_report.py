@@ -138,8 +138,18 @@ def size_document(found: SizeResult, robot_name: str) -> Document:
         (
             Section("Designs", (Note(about), *tables), "designs"),
             Section("Every motor", (catalogue.note("size.motors"), motors), "motors"),
+            *_chart(found),
         ),
     )
+
+
+def _chart(found: SizeResult) -> tuple[Section, ...]:
+    """Chart of motor and gear of the best design, if there is one."""
+    best = found.sizing.best
+    if best is None:
+        return ()
+    corners = [o.at for o in found.outcomes]
+    return (Section("Motor and gear", (catalogue.figure("run.chart_of_corners", best.robot, corners),)),)
 
 
 def _table(

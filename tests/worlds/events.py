@@ -41,6 +41,8 @@ class Bench:
     backlash: float = 0.0
     frequency: float = 150.0  # of the flanks [Hz]
     damping: float = 0.4
+    stiffness: float = 0.0  # of an elastic joint, if there is one [N·m/rad]
+    damper: float = 0.0  # of an elastic joint [N·m·s/rad]
 
     def winding(self, current: float, motor: float, volts: float) -> float:
         over = max(abs(current) / self.current_limit - 1, 0.0)
@@ -61,17 +63,21 @@ class Bench:
         return [self.winding(y[0], y[1], volts), self.turning(y[0], y[1], way) if way else 0.0]
 
     def flanks(self, gap: float, closing: float) -> float:
-        """Torque between the two sides of a backlash at the output [N·m]."""
+        """Torque between the two sides of a backlash or an elastic joint at the output [N·m]."""
+        if self.stiffness and not self.backlash:
+            return self.stiffness * gap + self.damper * closing
         motor, beyond = self.inertia_motor * self.ratio**2, abs(gap) - self.backlash / 2
         if beyond <= 0:
             return 0.0
         side, omega = np.sign(gap), 2 * np.pi * self.frequency
         inertia = motor * self.inertia / (motor + self.inertia)
-        damped = 2 * self.damping * omega * inertia * side * closing * min(beyond / (0.1 * self.backlash + 1e-4), 1.0)
-        return side * max(omega**2 * inertia * beyond + damped, 0.0)
+        stiffness = self.stiffness or omega**2 * inertia
+        damper = self.damper if self.stiffness else 2 * self.damping * omega * inertia
+        damped = damper * side * closing * min(beyond / (0.1 * self.backlash + 1e-4), 1.0)
+        return side * max(stiffness * beyond + damped, 0.0)
 
     def rates_loose(self, y: np.ndarray, volts: float) -> list[float]:
-        """Of current, motor speed, speed of the load at the output, and gap."""
+        """Of current, motor speed, speed of the load at the output, and angle between them."""
         current, motor, load, gap = y
         torque = self.flanks(gap, motor / self.ratio - load)
         way = _smooth(motor / self.ratio)
@@ -100,7 +106,7 @@ def through(
     Args:
         volts: that act from `changes` on, the first of which is 0.
     """
-    loose, way = bench.backlash > 0, 0
+    loose, way = bench.backlash > 0 or bench.stiffness > 0, 0
     y, t, found, happened = np.zeros(4 if loose else 2), 0.0, [], {}
     limited = _event(lambda _, y, *a: abs(y[0]) - bench.current_limit, 0.0)
     rests = _event(lambda _, y, v, way: way * y[1], -1.0)
@@ -111,7 +117,13 @@ def through(
         while t < end:
             if not loose and y[1] == 0.0:  # at rest: is it turned, or held?
                 way = next((s for s in (1, -1) if s * bench.turning(y[0], 0.0, s) > 1e-9), 0)
-            events = [limited, meets] if loose else [limited, rests] if way else [limited, *starts]
+            events = (
+                [limited, meets][: 1 + (bench.backlash > 0)]
+                if loose
+                else [limited, rests]
+                if way
+                else [limited, *starts]
+            )
             rates = (lambda _, y, v, w: bench.rates_loose(y, v)) if loose else lambda _, y, v, w: bench.rates(y, v, w)
             scale = np.array([1.0, 100.0, 10.0, 0.01])[: len(y)]
             run = solve_ivp(

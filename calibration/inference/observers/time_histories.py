@@ -126,6 +126,8 @@ SLOW, EARLIER = {"voltage": 0.1, "motor_current": 0.3}, {"voltage": 0.03, "motor
 SLOW |= dict.fromkeys(GOALS, SLOW["motor_current"])
 #: Longest step elsewhere, in usual longest steps.
 FAST = 2
+#: Longest step of a load on an elastic joint, as a share of its swing's time per radian: readings within 0.1 %.
+ELASTIC = 0.2
 #: For a thinned log: least number of steps between readings; largest growth of steps with the time since a condition
 #: changed [1/s · s]; change of the supply that counts, as a share of its largest value.
 BETWEEN, LATER, SMALL = 4, 0.05, 0.05
@@ -421,7 +423,7 @@ class Histories(Observer):
 
     @classmethod
     def free(cls) -> tuple[tuple[str, ...], tuple[str, ...]]:
-        return ("motor.inductance", "motor.inertia", DELAY), ("inertia", *settled_ends.GRIP, *settled_ends.SLIDING)
+        return ("motor.inductance", "motor.inertia", DELAY), ("inertia", settled_ends.STATIC, *settled_ends.SLIDING)
 
     def defective(
         self, robot: Robot, probes: tuple[Effect, ...]
@@ -1045,6 +1047,8 @@ def _longest_steps(runs: Runs, robot: Robot) -> list[np.ndarray]:
     measured, rates = whole.measured()[:, moved], [k for k, at in enumerate(moved) if not runs.channels[at].settled]
     driven = None if exact else applied_drive(whole)
     early, found = DELAYED * np.max(np.asarray(rig.delay)) + EARLIER.get(rig.imposed, 0.0), []
+    turned = robot.motor.inertia * robot.gearbox.ratio**2
+    elastic = max(float(load.frequency(turned)) for _, load in robot.configurations.items()) if robot.loose else 0.0
     for name in np.unique(runs.run_names):
         rows = whole.in_order(name)
         time = whole["time_s"][rows]
@@ -1064,6 +1068,8 @@ def _longest_steps(runs: Runs, robot: Robot) -> list[np.ndarray]:
             before = int(np.ceil(early / _usual_interval(apart)))
             slow = np.convolve(slow, np.ones(before + 1))[before:] > 0
             longest[slow] = min(LONGEST, wait / FINE)
+        if elastic > 0:
+            longest = np.minimum(longest, ELASTIC / elastic)
         found.append(longest)
     return found
 
