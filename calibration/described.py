@@ -26,16 +26,16 @@ def describe(found: Any, part: str = "", *about: str) -> str:
     # results and notes are described by methods of their own, so their module cannot be imported above
     tables = importlib.import_module("calibration.words.note_words")
     if isinstance(found, tables.Remark) and not part:
-        said = tables.NOTES[found.code]
-        if isinstance(said, str):
+        sentence = tables.NOTES[found.code]
+        if isinstance(sentence, str):
             listed = {name: ", ".join(x) if isinstance(x, tuple) else x for name, x in found.values.items()}
-            return said.format(**listed)
-        return said(**found.values)
-    said = tables.PARTS.get((type(found), part)) if part else tables.RESULTS.get(type(found))
-    if said is None:
+            return sentence.format(**listed)
+        return sentence(**found.values)
+    sentence = tables.PARTS.get((type(found), part)) if part else tables.RESULTS.get(type(found))
+    if sentence is None:
         kind = type(found).__name__ + (f", {part}" if part else "")
         raise TypeError(f"describe: got {kind}; expected a note or a result of calibrate, discover or sensitivity")
-    return said(found, *about)
+    return sentence(found, *about)
 
 
 def sentences(notes: Iterable[object]) -> tuple[str, ...]:

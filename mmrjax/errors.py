@@ -32,8 +32,10 @@ def shorten(message: str, longest: int = LONGEST) -> str:
         end = word[0][len(word[0].rstrip(";,:.)")) :]
         return f"{word[0][:SHOWN]}… ({len(word[0]) - len(end):,} characters){end}"
 
-    found = re.sub(r"\S+", cut, message)
-    return found if len(found) <= longest else f"{found[: 2 * longest // 3]} … {found[-longest // 4 :]}"
+    shortened = re.sub(r"\S+", cut, message)
+    return (
+        shortened if len(shortened) <= longest else f"{shortened[: 2 * longest // 3]} … {shortened[-longest // 4 :]}"
+    )
 
 
 class UsageError(ValueError):
@@ -59,8 +61,8 @@ def allowed_words(word: str, allowed: Iterable[str], most: int = 1, shown: Itera
         shown: the words to list as allowed, if not all.
     """
     allowed = list(allowed)
-    found = similar_words(word, allowed, most)
-    hint = f"did you mean {', '.join(found)}? " if found else ""
+    similar = similar_words(word, allowed, most)
+    hint = f"did you mean {', '.join(similar)}? " if similar else ""
     return f"{hint}allowed: {list_some(allowed if shown is None else shown)}"
 
 
@@ -68,9 +70,9 @@ def list_some(names: Iterable[str], width: int = 240) -> str:
     """A list of names, cut after `width` characters with the number of the others: "a, b and 3 more"."""
     names = list(names)
     ends = list(itertools.accumulate(len(name) + 2 for name in names))
-    shown = max(1, sum(end <= width for end in ends))
-    rest = len(names) - shown
-    return ", ".join(names) if rest <= 1 else f"{', '.join(names[:shown])} and {rest} more"
+    listed_count = max(1, sum(end <= width for end in ends))
+    rest = len(names) - listed_count
+    return ", ".join(names) if rest <= 1 else f"{', '.join(names[:listed_count])} and {rest} more"
 
 
 def similar_words(word: str, allowed: Iterable[str], most: int = 1) -> list[str]:

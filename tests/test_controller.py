@@ -14,6 +14,9 @@ import mmrjax as mm
 from calibration.data import robot_file
 from calibration.data import runs as records
 from calibration.data.input_errors import BadConfiguration, BadData
+from calibration.inference import foresight
+from calibration.inference.calibration import calibrate
+from calibration.inference.observers.time_histories import Histories
 from mmrjax.fidelities import drive, histories
 from mmrjax.model import params
 
@@ -44,11 +47,29 @@ def angles(robot, goal, times, parts=1):
 STEPS = np.array([0.0, 0.25]), np.array([0.8, -0.3])
 
 
-def test_a_servo_follows_as_an_own_simulation(actuator):
-    times = np.linspace(0.0, 0.4, 9)
-    own = servo.simulate(STEPS, times, servo.TRUE)[0]
-    shown, rows = angles(actuator(), STEPS, times, parts=8)
+@pytest.mark.parametrize("lag", [0.0, 0.005])
+def test_a_servo_follows_as_an_own_simulation(actuator, lag):
+    times, lagging = np.linspace(0.0, 0.4, 9), f"lag = {lag}\nkp = "
+    values = {**servo.TRUE, "coulomb": 0.0} if lag else servo.TRUE
+    own = servo.simulate(STEPS, times, {**values, "lag": lag})[0]
+    shown, rows = angles(actuator(values, "kp = ", lagging), STEPS, times, parts=8)
     assert_allclose(np.asarray(shown)[rows], own, atol=1e-6)
+
+
+@pytest.mark.parametrize("late", [False, True])
+def test_a_sampled_controller_is_nearly_one_with_a_lag(actuator, late):
+    period, times = 0.002, np.linspace(0.0, 0.6, 13)
+    instants = np.arange(0, 0.6, period)
+    goal = 0.4 * np.sin(4 * np.pi * instants) ** 2
+    own = servo.simulate((instants, goal), times, servo.TRUE, 1e-7, period, late)[0]
+
+    def error(lag):
+        earlier = np.maximum(instants - period / 2 * (lag > 0), 0.0)
+        earlier[1:] += 1e-9  # the first two goals have one instant
+        shown, rows = angles(actuator(old="kp = ", new=f"lag = {lag}\nkp = "), (earlier, goal), times)
+        return np.abs(np.asarray(shown)[rows] - own).max()
+
+    assert error(1.5 * period if late else 0.5 * period) < 3e-4 < 3e-3 < error(0.0)
 
 
 def test_a_run_of_drive_follows_as_an_own_simulation(actuator):
@@ -75,6 +96,18 @@ def test_derivatives_of_a_controlled_run_are_finite_differences(actuator, name):
     differences = (shown(jnp.asarray(value + h)) - shown(jnp.asarray(value - h))) / (2 * h)
     assert np.abs(differences).max() > 1e-3 / value
     assert_allclose(slope, differences, atol=1e-6 * np.abs(differences).max())
+
+
+@pytest.mark.parametrize(("goal", "value", "gains", "signal"), [
+    ("goal_speed", 3.0, {"kp": 0.5, "ki": 5.0, "kd": 0.0}, "speed_output"),
+    ("goal_current", 0.4, {"kp": 1.0, "ki": 5e3, "kd": 0.0}, "current"),
+])  # fmt: skip
+def test_an_integral_brings_speed_and_current_to_their_goals(actuator, goal, value, gains, signal):
+    robot = actuator({**servo.TRUE, **gains}, "goal_angle", goal)
+    one = jax.tree.map(lambda x: jnp.asarray(x)[None], mm.Conditions(voltage=24.0, goal=value))
+    run = drive.drive_batch(robot, one, jnp.asarray([0.0, 0.1, 1.0]))
+    row = 1 if signal == "current" else 2  # a shaft without a load soon turns too fast for its current
+    assert_allclose(getattr(run.signals, signal)[0, row], value, rtol=5e-3)
 
 
 def test_steps_follow_a_goal(actuator):
@@ -137,3 +170,73 @@ def test_a_goal_and_a_controller_need_each_other(actuator):
         mm.simulate(mm.nominal(), mm.Conditions(goal=1.0))
     with pytest.raises(mm.UsageError, match="a controller needs model='drive'"):
         mm.simulate(actuator(), mm.Conditions(voltage=7.4, goal=1.0))
+
+
+SLOW = np.arange(0, 2.5, 0.01)
+SLOW_GOAL = 0.3 * np.sin(np.pi * SLOW) * np.minimum(SLOW, 1)
+WIDE = {"kp = 8.0": 'kp = "7.0 ± 100 %"', "torque_constant = 0.006": 'torque_constant = "0.0065 ± 100 %"'}
+
+
+def servo_log(goal, seed=1):
+    """Goal and angle of 12 bits at 100 Hz, and the states."""
+    rng, step = np.random.default_rng(seed), 2 * np.pi / 4096
+    times, goal = np.arange(len(goal)) * 0.01, np.round(goal / step) * step
+    angle, states = servo.simulate((times, goal), times, servo.TRUE, 1e-8)
+    shown = np.round((angle + rng.normal(0, 0.5 * step, len(times))) / step) * step
+    return {"time_s": times, "goal_angle_deg": np.degrees(goal), "output_angle_deg": np.degrees(shown)}, states
+
+
+@pytest.mark.slow
+def test_the_missing_column_that_separates_a_gain_is_named_and_does(tmp_path):
+    text = servo.RIG.format(**servo.TRUE)
+    for old, new in WIDE.items():
+        text = text.replace(old, new)
+    log, states = servo_log(SLOW_GOAL)
+    duty = np.radians(log["goal_angle_deg"]) - states[:, 2]
+    log["motor_voltage_V"] = 7.4 * np.clip(8.0 * duty - 0.1 * states[:, 1], -0.9, 0.9)
+    pair = {"controller.kp", "motor.torque_constant"}
+
+    def foreseen(channels):
+        (tmp_path / "rig.toml").write_text(text.replace('["output_angle"]', channels))
+        robot = robot_file.read_robot(tmp_path / "rig.toml")
+        return foresight.predict_identifiability(records.read_runs(log, robot), robot)
+
+    alone = foreseen('["output_angle"]')
+    by_pair = {frozenset(each[:2]): names for each, names in zip(alone.alike, alone.separating, strict=True)}
+    assert "motor_voltage_V" in by_pair[frozenset(pair)]
+    assert pair not in [{*each[:2]} for each in foreseen('["output_angle", "motor_voltage"]').alike]
+
+
+#: Prior of a hobby servo of which little is known; true values are in `servo.TRUE`.
+PRIOR = {
+    "kp = 8.0": 'kp = "7.0 ± 30 %"', "kd = 0.1": 'kd = "0.08 ± 50 %"', "inertia = 0.0005": 'inertia = "0.0006 ± 30 %"',
+    "torque_constant = 0.006": 'torque_constant = "0.0065 ± 20 %"', "loss_coulomb = 0.02": 'loss_coulomb = "0.03 ± 50 %"',
+    "loss_viscous = 0.005": 'loss_viscous = "0.004 ± 50 %"', "resistance = 4.0": 'resistance = "4.0 ± 0"',
+}  # fmt: skip
+
+
+@pytest.mark.slow
+def test_goal_and_angle_alone_give_a_servos_parameters(tmp_path):
+    text = servo.RIG.format(**servo.TRUE)
+    for old, new in PRIOR.items():
+        assert old in text
+        text = text.replace(old, new)
+    (tmp_path / "rig.toml").write_text(f"{text}[instruments.output_angle]\nquantum = {360 / 4096}\n")
+    robot = robot_file.read_robot(tmp_path / "rig.toml")
+    t = np.arange(0, 4.5, 0.01)
+    swings = np.where(t < 3, 0.6 * np.sin(3 * np.pi * (t - 1.6)), np.where(t < 3.8, np.sin(6 * np.pi * t), -0.9))
+    goal = np.where(t < 0.2, 0.0, np.where(t < 0.9, 0.8, np.where(t < 1.6, -0.5, swings)))
+    fitted = servo_log(goal)[0]
+    found = calibrate(records.read_runs(fitted, robot), robot, starts=2, profiles=False, blocks=False)
+    names = ("controller.kp", "controller.kd", "motor.torque_constant", "horn.inertia", "horn.loss_coulomb")
+    truth = (8.0, 0.1, 0.006, 5e-4, 0.02)
+    for name, true in zip(names, truth, strict=True):
+        estimate = found.parameters[name]
+        assert abs(estimate.value - true) < 3 * estimate.sd, name
+        assert abs(estimate.value / true - 1) < 0.1, name
+    unseen = servo_log(-0.7 * goal[::-1] + 0.7 * goal[-1], seed=2)[0]
+    runs = records.read_runs(unseen, found.robot)
+    shown = np.asarray(Histories.of(runs, found.robot)(found.robot).reading)[:, 0]
+    error = np.sqrt(np.mean((shown - np.radians(unseen["output_angle_deg"])) ** 2))
+    floor = 2 * np.pi / 4096 * np.sqrt(0.5**2 + 1 / 12)
+    assert error < 1.2 * floor

@@ -14,7 +14,7 @@ from mmrjax import effects
 from mmrjax.model import paper_robots, params
 from mmrjax.model.paper_tables import TRACKED, WHEELED
 from sweeps import pages
-from sweeps.pages import figure_style, sweep_figures
+from sweeps.pages import figure_style, power_figures, sweep_figures
 from sweeps.paper import data
 from sweeps.paper import run_figures as paper_runs
 from sweeps.report import page_renderer, run_tables
@@ -174,3 +174,11 @@ def test_a_wide_map_shows_numbers_that_fit_its_cells(cells, visible):
             panel.text(k, 4, "-.25", ha="center", va="center")
         figure_style.figure_as_svg(fig)
         assert [text.get_visible() for text in panel.texts] == [visible] * 2
+
+
+def test_a_chart_of_corners_does_not_warn_of_the_cut_off():
+    """A warning went to the terminal, between the lines of `size`."""
+    robot = params.replace(paper_robots.nominal(), {"battery.voltage_cutoff": np.asarray(2.5)})
+    corner = {"configuration": "4W2T", "payload_kg": 0.0, "slope_deg": 5.0, "state_of_charge": 0.5}
+    with figure_style.figure_settings():
+        assert power_figures.draw_chart_of_corners(robot, [corner]).axes

@@ -281,7 +281,7 @@ def test_a_ranking_answers_with_a_mechanism_at_most_and_with_parameters():
         "no effect explains it"
     )
     nothing = dataclasses.replace(RANKING, missing=False)
-    assert words.regression_verdict(nothing).endswith("simulation: nothing exceeds chance")
+    assert words.regression_verdict(nothing).endswith("simulation: no effect of the library exceeds chance")
 
 
 def test_what_is_found_before_the_verdict_is_said_to_be_untested(capsys):
@@ -293,6 +293,15 @@ def test_what_is_found_before_the_verdict_is_said_to_be_untested(capsys):
     said = capsys.readouterr().err
     assert "so far, confirmed by simulation: a loss torque that changes with speed (churning);" in said
     assert said.index("by regression") < said.index("so far")
+
+
+@pytest.mark.parametrize("missing", [True, False])
+def test_a_simulation_that_contradicts_the_regression_is_said_to(missing, capsys):
+    folder = SimpleNamespace(keeps=lambda name: True, path="found")
+    left = SimpleNamespace(test=SimpleNamespace(rejected=True))
+    ranking = dataclasses.replace(RANKING, missing=missing)
+    command._say_kept({"ranking": ranking, "bootstrap 0": (None, left)}, folder, "rig.toml")
+    assert (words.DISAGREES in capsys.readouterr().err) is not missing
 
 
 def test_a_budget_that_ends_after_the_screening_leaves_its_ranking(tmp_path, mmrjax, monkeypatch):

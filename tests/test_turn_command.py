@@ -437,3 +437,21 @@ def test_a_mission_of_which_no_heat_is_known_is_laid_out():
     assert all(axes.get_position().width > 0.2 for axes in fig.axes)
     first, second = (axes.title.get_window_extent() for axes in fig.axes[2:4])
     assert not first.overlaps(second)
+
+
+@pytest.mark.parametrize("cycles", [3, 400])
+def test_many_cycles_of_a_mission_are_drawn_as_their_envelope(cycles):
+    """120 cycles made a solid block."""
+    time = np.linspace(0.0, 60.0, 20_001)
+    rows = {name: time for name in ("theoretical_speed_mm_s", "source_voltage_V", "motor_current_A", "duty")}
+    swing = 2.0 + np.sin(2 * np.pi * cycles * time / 60)
+    rows |= {"time_s": time, "slope_deg": 0 * time, "state_of_charge": np.nan * time, "motor_current_A": swing}
+    fig = mission_figures.draw_mission_course(
+        rows | {"demanded_speed_mm_s": time}, None, UNLIMITED, linear=False, sides=2.0
+    )
+    current = fig.axes[1]
+    drawn_points = max(len(line.get_xdata()) for line in current.lines)
+    assert (drawn_points == len(time)) == (cycles == 3) and bool(current.collections) == (cycles == 400)
+    if cycles == 400:
+        box = current.collections[0].get_paths()[0].get_extents()
+        assert_allclose((box.y0, box.y1), (2.0, 6.0), rtol=0.02)  # of two motors, least to greatest

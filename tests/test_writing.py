@@ -49,6 +49,9 @@ def test_results_are_frames_of_every_library():
         assert list(frame.columns) == ["a", "word"] and frame["a"].to_numpy().tolist() == [0.5, 2.0]
     assert writing.to_xarray(table)["a"].values.tolist() == [0.5, 2.0]
     runs = records.read_runs("measured")
+    dataset = writing.to_xarray(runs)
+    units = {name: dataset[name].attrs.get("units") for name in dataset}
+    assert units["motor_speed_rpm"] == "rpm" and units["speed_mm_s"] == "mm/s" and units["configuration"] is None
     assert writing.to_pandas(runs)["supply_voltage_V"].tolist() == runs["supply_voltage_V"].tolist()
     again = records.read_runs(writing.to_polars(runs))
     assert_array_equal(again.measured(), runs.measured())

@@ -152,9 +152,9 @@ def match_column_names(
 
 def _in_case(name: str, header: Sequence[str], layout: Layout, inferred: bool) -> tuple[list[str], Names]:
     """A header with the capitals of the columns' names, and notes on changed names."""
-    known = dataclasses.replace(layout, channels=channels.EVERY) if inferred else layout
+    full_layout = dataclasses.replace(layout, channels=channels.EVERY) if inferred else layout
     spelled: dict[str, set[str]] = {}
-    for column in known.spellings():
+    for column in full_layout.spellings():
         spelled.setdefault(column.casefold(), set()).add(column)
     columns_found, notes = [], []
     for column in header:
@@ -208,9 +208,9 @@ def check_header(
         expected = ", ".join(layout.measured_columns)
         other = _other_names(strange, layout.measured_columns[0])
         turning = {c.column: c.name for c in channels.OF_TURNS}
-        if found := [c for c in strange if c in turning]:
-            names = ", ".join(f'"{turning[c]}"' for c in found)
-            other = f"; {', '.join(found)}: state in the robot's file channels = [{names}]"
+        if of_turns := [c for c in strange if c in turning]:
+            names = ", ".join(f'"{turning[c]}"' for c in of_turns)
+            other = f"; {', '.join(of_turns)}: state in the robot's file channels = [{names}]"
         raise BadData(f"{name}: no column of a channel; expected at least one of {expected}{other}")
     for column in strange:
         close = difflib.get_close_matches(column, [c for c in layout.known() if c not in stated], 1, 0.85)
@@ -249,16 +249,18 @@ def _check_names_of_sides(name: str, strange: list[str], stated: set[str], layou
     def words(column: str) -> list[str]:
         return sorted(_SIDE.get(word.casefold(), word.casefold()) for word in column.split("_"))
 
-    known = {tuple(words(c)): c for c in layout.known() if set(channels.SIDES) & set(words(c))}
+    columns_of_sides = {tuple(words(c)): c for c in layout.known() if set(channels.SIDES) & set(words(c))}
     for column in strange:
-        meant = known.get(tuple(words(column)))
+        meant = columns_of_sides.get(tuple(words(column)))
         if meant is not None and meant not in stated:
             raise BadData(
                 f"{name}: column {column}: the sides are called left and right; name it {meant}, or state [columns] "
                 f'{meant} = "{column}" in the robot\'s file'
             )
         side = next((side for side in channels.SIDES if side in words(column)), None)
-        turns = set(SIDES) <= set(known.values()) and not stated.isdisjoint(c.column for c in channels.OF_TURNS)
+        turns = set(SIDES) <= set(columns_of_sides.values()) and not stated.isdisjoint(
+            c.column for c in channels.OF_TURNS
+        )
         if side and turns and not stated & {*SIDES, *VOLTS} and column.endswith("V"):
             raise BadData(
                 f"{name}: column {column}: if it is the voltage that drives the {side} side, name it "
@@ -272,9 +274,9 @@ def check_units(arrays: NamedArrays, meanings: Sequence[Column | None]) -> None:
     for j, (unit, meaning) in enumerate(zip(arrays.units, meanings, strict=bool(arrays.units))):
         if meaning is None or meaning.column in WORDS:
             continue
-        known = meaning.quantity.columns().values()
-        if unit and unit not in known and abs(meaning.factor) == 1.0:  # a factor states the unit
-            allowed = ", ".join(filter(None, known))
+        known_units = meaning.quantity.columns().values()
+        if unit and unit not in known_units and abs(meaning.factor) == 1.0:  # a factor states the unit
+            allowed = ", ".join(filter(None, known_units))
             raise BadData(
                 f"{arrays.name}, {meaning.shown}: got {unit} in {arrays.units_from}; "
                 f"expected {f'one of {allowed}' if allowed else 'none'}; correct or remove it"

@@ -205,8 +205,8 @@ class Layout:
     def required(self, *, measured: bool, battery: bool) -> Names:
         """Columns that a table has to have, besides channels."""
         if self.complete:
-            own = (() if measured else ("total_mass_kg",)) + ((SUPPLY,) if battery else ())
-            return tuple(c for c in ("configuration", *CONDITIONS) if c not in own)
+            further = (() if measured else ("total_mass_kg",)) + ((SUPPLY,) if battery else ())
+            return tuple(c for c in ("configuration", *CONDITIONS) if c not in further)
         imposed: Names = () if battery and self.imposed == "voltage" else (self.imposed_column,)
         imposed += (SUPPLY,) if self.imposed in GOALS and not self.supply else ()
         return (("configuration",) if len(self.configurations) != 1 else ()) + imposed

@@ -121,10 +121,10 @@ def _source(source: Any) -> Source:
     form = opening.format_of(path, name)
     if form is not None:
         return opening.open_signals(path, within, name, form)
-    found = _of_text(delimited.read_csv_columns(path, name))
-    if not found.signals:
+    table = _of_text(delimited.read_csv_columns(path, name))
+    if not table.signals:
         raise BadData(f"{name}: the file is empty; expected a header and rows")
-    return found.below(within) if within else found
+    return table.below(within) if within else table
 
 
 def _of_text(arrays: NamedArrays) -> Source:
@@ -230,8 +230,8 @@ def _proposed(signals: Sequence[Signal]) -> Iterator[tuple[str, str]]:
     def seconds(signal: Signal) -> np.ndarray | None:
         if signal.clock is None:
             return elapsed
-        found = _seconds(signal.clock)
-        return None if isinstance(found, str) else found[0]
+        clock_seconds = _seconds(signal.clock)
+        return None if isinstance(clock_seconds, str) else clock_seconds[0]
 
     yield from proposals.propose_columns(rest, spelled, seconds)
 

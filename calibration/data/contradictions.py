@@ -43,8 +43,8 @@ def check_contradictions(runs: Runs, robot: Robot) -> None:
         raise BadData(f"{runs.source}, {', '.join((*runs.layout.sides, *HEADING))}: {why}")
     if runs.turns:
         sides.check_turns(runs)
-    if found := misplaced_levers(runs, robot):
-        row, column, why = found
+    if misplaced := misplaced_levers(runs, robot):
+        row, column, why = misplaced
         raise BadData(f"{runs.source} row {row + 1}, {column}: {why}")
     if robot.rig.imposed == "motor_speed" and not runs.sampled and not runs.turns:
         for column in (SUPPLY, "motor_voltage_V"):

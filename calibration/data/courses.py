@@ -118,7 +118,7 @@ def course_of_each_row(runs: Runs) -> np.ndarray:
     if rows_of_varying_runs(runs).any():
         columns = changing_columns(runs)
         for run in (r for r in course_stretches(runs) if len(r) > 1):
-            said = [f"{s.begin:g}: {', '.join(str(runs[c][s.rows[0]]) for c in columns)}" for s in run]
-            name = names.setdefault("; ".join(said), f"course {len(names) + 1}")
+            descriptions = [f"{s.begin:g}: {', '.join(str(runs[c][s.rows[0]]) for c in columns)}" for s in run]
+            name = names.setdefault("; ".join(descriptions), f"course {len(names) + 1}")
             courses[np.concatenate([s.rows for s in run])] = name
     return courses.astype(str)

@@ -76,12 +76,12 @@ def infer_instruments(
     inferred = []
     for instrument in instruments:
         channel = channels.find_channel(instrument.channel)
-        shown = columns.get(channel.column, np.zeros(0))
+        readings = columns.get(channel.column, np.zeros(0))
         signed, quantum = instrument.signed, instrument.quantum
         if signed is None:
-            signed = not back or bool((shown < 0).any())
+            signed = not back or bool((readings < 0).any())
         if quantum is None:
-            quantum = step_of(shown) * channel.factor
+            quantum = step_of(readings) * channel.factor
         inferred.append(Instrument(instrument.channel, signed, quantum))
     return tuple(inferred)
 

@@ -222,15 +222,15 @@ def _parsed(content: Mapping[str, Any], where: str, given: Mapping[str, float]) 
     if not isinstance(columns, dict) or not columns:
         raise BadConfiguration(f'{where}, columns: got {columns!r}; expected a table of columns, as time_s = "t"')
     layout = Layout(channels=channels.EVERY)
-    known, found = layout.spellings(), []
+    spellings, entries = layout.spellings(), []
     for mine, theirs in columns.items():
-        if mine not in known:
-            listed = allowed_words(mine, known, shown=layout.known())
+        if mine not in spellings:
+            listed = allowed_words(mine, spellings, shown=layout.known())
             raise BadConfiguration(
                 f"{where}, columns.{mine}: no such column of a table; {listed}; also in other units"
             )
-        found.append(_column(mine, theirs, f"{where}, columns.{mine}", numbers))
-    return Preset(where, tuple(found), header)
+        entries.append(_column(mine, theirs, f"{where}, columns.{mine}", numbers))
+    return Preset(where, tuple(entries), header)
 
 
 def _numbers(asked: Any, where: str, given: Mapping[str, float]) -> dict[str, float]:
@@ -241,7 +241,7 @@ def _numbers(asked: Any, where: str, given: Mapping[str, float]) -> dict[str, fl
         if key not in asked:
             listed = allowed_words(key, asked) if asked else "it asks for no number"
             raise BadConfiguration(f"--columns {where}: got {key}; {listed}")
-    found: dict[str, float] = {}
+    numbers: dict[str, float] = {}
     for key, stated in asked.items():
         table = {"about": stated} if isinstance(stated, str) else stated
         if not isinstance(table, dict) or {*table} - {*KEYS_OF_NUMBER} or not isinstance(table.get("about"), str):
@@ -254,10 +254,10 @@ def _numbers(asked: Any, where: str, given: Mapping[str, float]) -> dict[str, fl
                 f"--columns {where}{SEPARATOR}{key}=7"
             )
         value = given.get(key, table.get("usual"))
-        found[key] = stated_number(value, f"{where}, {key}")
-        if found[key] == 0 and key in given and "usual" not in table:
+        numbers[key] = stated_number(value, f"{where}, {key}")
+        if numbers[key] == 0 and key in given and "usual" not in table:
             raise BadConfiguration(f"--columns {where}, {key}: got 0; expected a number that is not 0")
-    return found
+    return numbers
 
 
 def _column(mine: str, theirs: Any, where: str, numbers: Mapping[str, float]) -> PresetColumn:
@@ -322,5 +322,5 @@ def merge_columns(
 def _bare(mine: str) -> str:
     """Name of a column without its unit, so that time_ms and time_s are the same."""
     layout = Layout(channels=channels.EVERY)
-    found = layout.quantities()
-    return next((column for column, quantity in found.items() if mine in quantity.columns()), mine)
+    quantities = layout.quantities()
+    return next((column for column, quantity in quantities.items() if mine in quantity.columns()), mine)

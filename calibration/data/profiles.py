@@ -417,15 +417,15 @@ def _driven(cells: _Cells) -> tuple[Names, Columns]:
         filled = [field for field in DEMANDS if cells.text(field, row)]
         ends = {field for field in filled if cells.linear and before == DEMANDS[field]}
         mode = _mode(cells, row, before, [f for f in filled if f not in ends] or filled)
-        own = [field for field in filled if DEMANDS[field] == mode]
-        _check_demands(cells, row, before, mode, own, [f for f in filled if f not in own and f not in ends])
+        demands = [field for field in filled if DEMANDS[field] == mode]
+        _check_demands(cells, row, before, mode, demands, [f for f in filled if f not in demands and f not in ends])
         modes.append(mode)
         if row and cells.linear:  # default end of the ramp that leads here
             for name in wholes:
                 shares_found[name][row] = 0.0 if mode in CONTROLLED else shares_found[name][row - 1]
             for name in shares:
                 shares_found[name][row] = full[name] if mode == MODES[VOLTAGE] else shares_found[name][row - 1]
-        for field in (*(f for f in ends if f not in own), *own):
+        for field in (*(f for f in ends if f not in demands), *demands):
             shares_found["demand" if field in CONTROLLED else field][row] = cells.value(field, row)
         speed, stated = MODES[SPEED], bool(cells.text(YAW_RATE, row))
         if stated and mode != speed and not (cells.linear and before == speed):

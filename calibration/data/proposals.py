@@ -111,14 +111,22 @@ def propose_columns(
     """
     columns = {q.stem or q.name: q.columns() for q in Layout(channels=channels.EVERY).quantities().values()}
     taken = {signal.name.rpartition("_")[0] for signal in signals if signal.name in spelled}
-    known = {unit for units in columns.values() for unit in units.values()} - {"", "s", "ms", "us", "ns", "min", "h"}
-    units = [_unit(signal, known) for signal in signals]
+    known_units = {unit for units in columns.values() for unit in units.values()} - {
+        "",
+        "s",
+        "ms",
+        "us",
+        "ns",
+        "min",
+        "h",
+    }
+    units = [_unit(signal, known_units) for signal in signals]
     count = collections.Counter(units)
     pool = [
         candidate
         for signal, unit in zip(signals, units, strict=True)
         if signal.name not in spelled
-        and (unit is None or unit in known)
+        and (unit is None or unit in known_units)
         and (candidate := _candidate(signal, unit, count[unit] == 1, columns)) is not None
     ]
     units_of = dict(zip((signal.path for signal in signals), units, strict=True))
@@ -230,8 +238,8 @@ def seconds_of_a_count(signals: Sequence[Signal], count: np.ndarray) -> float:
     Args:
         count: numbers of the clock, shape (rows,).
     """
-    known = {unit for units in RATES for unit in units[:2] if isinstance(unit, str)}
-    stated = {signal.path: _unit(signal, known) for signal in signals if not (signal.refused or signal.words)}
+    known_units = {unit for units in RATES for unit in units[:2] if isinstance(unit, str)}
+    stated = {signal.path: _unit(signal, known_units) for signal in signals if not (signal.refused or signal.words)}
     pairs = {(of_place, of_rate): one for of_place, of_rate, one in RATES}
     for place, rate in itertools.permutations([s for s in signals if stated.get(s.path)], 2):
         one = pairs.get((str(stated[place.path]), str(stated[rate.path])))
@@ -263,8 +271,8 @@ def _by_rate(
         time = seconds(rate.signal) if place.signal.length == rate.signal.length else None
         if time is None or len(time) != rate.signal.length or "motor" in rate.signal.path.casefold():
             continue
-        known = [stated[c.signal.path] for c in (place, rate)]
-        units = _units_of_place_and_rate(time, place.signal, rate.signal, known)
+        stated_rates = [stated[c.signal.path] for c in (place, rate)]
+        units = _units_of_place_and_rate(time, place.signal, rate.signal, stated_rates)
         if not units:
             continue
         *others, words = ["", *(f"{p} and {v.replace('_', '/')}" for p, v in reversed(units[:4]))]
@@ -274,7 +282,7 @@ def _by_rate(
         for k, candidate in enumerate((place, rate)):
             quantity, other = quantities_of_both[k], (rate, place)[k]
             column = next(c for c, u in columns[quantity].items() if u == units[0][k])
-            question = "" if None not in known else f"by {other.signal.path}, in {words}{either}"
+            question = "" if None not in stated_rates else f"by {other.signal.path}, in {words}{either}"
             agreed[candidate.signal.path] = Candidate(candidate.signal, quantity, column, question)
     yield from (agreed.get(c.signal.path, c) for c in pool)
 

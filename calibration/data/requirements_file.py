@@ -259,10 +259,10 @@ def _requirements(name: str, value: Any, envelope: Envelope, where: str) -> list
     source, duty, share = table.pop("source", ""), table.pop("duty", None), table.pop("share", None)
     tread = table.pop(TREAD) if TREAD in table and name == STAIRS else None
     own_keys = {"endurance_min": ("duty", "share"), STAIRS: (TREAD,)}.get(name, ())
-    known = ("least", "most", "source", *KEYS, *own_keys)
+    allowed = ("least", "most", "source", *KEYS, *own_keys)
     for key in table:
-        if key not in known:
-            raise BadConfiguration(f"{where}, {_unknown(key, known)}")
+        if key not in allowed:
+            raise BadConfiguration(f"{where}, {_unknown(key, allowed)}")
     for key in table:
         if key in AXES and key not in quantity.axes:
             raise BadConfiguration(f"{where}, {key}: {quantity.label} does not depend on it; remove it")

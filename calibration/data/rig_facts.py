@@ -199,11 +199,11 @@ def doubtful_time(runs: Runs, robot: Robot) -> str:
     for stretch in (s for run in course_stretches(runs) for s in run if len(s.rows) >= 4 * RISING):
         time = runs["time_s"][stretch.rows]
         for channel in moving:
-            shown = runs[channel.column][stretch.rows]
-            end = np.nanmedian(shown[len(shown) // 2 :]) - shown[0]
+            readings = runs[channel.column][stretch.rows]
+            end = np.nanmedian(readings[len(readings) // 2 :]) - readings[0]
             if not abs(end) > 0.5 * np.nanmax(np.abs(runs[channel.column])):
                 continue
-            share = (shown - shown[0]) / end
+            share = (readings - readings[0]) / end
             rises = np.flatnonzero((share > 0.1) & (share < 0.9))
             if len(rises) < RISING or np.any(np.diff(rises) > 1) or time[rises[-1]] - time[rises[0]] < longest:
                 continue
@@ -329,18 +329,18 @@ def saturation_sentence(runs: Runs) -> str:
     voltage all the time if the driver limits it.
     """
     # With a duty, the supply's current is only a share of the motors' current.
-    known = [CURRENT, *(() if runs.has("duty") else ("total_current_A",))]
-    current, speed = next((c for c in known if runs.has(c)), CURRENT), SPEED
+    current_columns = [CURRENT, *(() if runs.has("duty") else ("total_current_A",))]
+    current, speed = next((c for c in current_columns if runs.has(c)), CURRENT), SPEED
     if runs.layout.imposed != "voltage" or not (runs.sampled and runs.has(current) and runs.has(speed)) or runs.turns:
         return ""
     if any(runs.layout.magnitude(c.name) for c in runs.channels if c.column in (current, speed)):
         return ""
-    given, shown = applied_drive(runs), np.stack([runs[current], runs[speed]], 1)
-    read = np.isfinite(shown).all(1)
+    given, readings = applied_drive(runs), np.stack([runs[current], runs[speed]], 1)
+    read = np.isfinite(readings).all(1)
     inner = read & (given != 0) & (np.abs(given) <= INNER * float(np.max(np.abs(given))))
     if inner.sum() < ROWS_INNER:
         return ""
-    seen = shown @ np.linalg.lstsq(shown[inner], given[inner], rcond=None)[0]
+    seen = readings @ np.linalg.lstsq(readings[inner], given[inner], rcond=None)[0]
     if np.std(seen[inner] - given[inner]) > FITS * np.std(given[inner]):
         return ""
     top = read & (np.abs(given) >= np.quantile(np.abs(given[read]), 0.9))
@@ -443,10 +443,10 @@ def held_sentence(runs: Runs) -> str:
     drive, range_ = runs[imposed], float(np.ptp(np.nan_to_num(runs[imposed])))
     for name in np.unique(runs.run_names):
         rows = runs.in_order(name)
-        for channel, shown in zip(runs.channels, runs.measured()[rows].T, strict=True):
-            begins = np.flatnonzero(np.r_[True, np.diff(shown) != 0])
+        for channel, readings in zip(runs.channels, runs.measured()[rows].T, strict=True):
+            begins = np.flatnonzero(np.r_[True, np.diff(readings) != 0])
             for begin, end in zip(begins, np.r_[begins[1:], len(rows)], strict=True):
-                moves = abs(shown[begin]) > MOVES * np.nanmax(np.abs(shown), initial=0.0)
+                moves = abs(readings[begin]) > MOVES * np.nanmax(np.abs(readings), initial=0.0)
                 if moves and end - begin > HELD * len(rows) and np.ptp(drive[rows[begin:end]]) > HELD * range_ > 0:
                     column, last = runs.headings.get(channel.column, channel.column), rows[end - 1] + 1
                     return (
@@ -464,8 +464,8 @@ def swapped_sentence(runs: Runs) -> str:
         return ""  # what never changes its sign may lack one, which other checks report
     for name in np.unique(runs.run_names):
         rows = runs.in_order(name)
-        for channel, shown in zip(runs.channels, runs.measured()[rows].T, strict=True):
-            power = np.nan_to_num(runs[imposed][rows] * shown)
+        for channel, readings in zip(runs.channels, runs.measured()[rows].T, strict=True):
+            power = np.nan_to_num(runs[imposed][rows] * readings)
             total = np.cumsum(power) / max(float(np.abs(power).sum()), 1e-300)
             turn = int(np.argmax(np.abs(total)))
             first, rest = total[turn], total[-1] - total[turn]

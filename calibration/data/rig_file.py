@@ -99,25 +99,31 @@ def linear_to_shaft(table: Json, name: str, where: str, sds: dict[str, float], s
         BadConfiguration: an unknown key, a value that is no number, no mass, not exactly one travel, or a mass or
             travel that is not positive.
     """
-    at = {key: _linear_value(table, key, where) for key in list(table) if _known_key(key, where)}
-    travels = [key for key in _TRAVEL if key in at]
+    values = {key: _linear_value(table, key, where) for key in list(table) if _known_key(key, where)}
+    travels = [key for key in _TRAVEL if key in values]
     if len(travels) != 1:
         raise BadConfiguration(
             f"{where}: got {' and '.join(travels) or 'neither lead_mm nor drum_radius_mm'}; expected one of them, "
             "the travel of one turn, or the radius of a drum or pulley"
         )
-    if "mass_kg" not in at:
+    if "mass_kg" not in values:
         raise BadConfiguration(f"{where}.mass_kg: missing; expected the mass that it moves [kg]")
     table.clear()
-    table.update(_shaft(at, sides))
-    inputs = {key: sds.pop(f"{name}.{key}") for key in at if f"{name}.{key}" in sds}
+    table.update(_shaft(values, sides))
+    inputs = {key: sds.pop(f"{name}.{key}") for key in values if f"{name}.{key}" in sds}
     exact = {key for key, sd in inputs.items() if sd == 0}
     for result in table:
-        moved = {key for key in at if _shaft({**at, key: 1.01 * at[key] + 1e-6}, sides)[result] != table[result]}
+        moved = {
+            key
+            for key in values
+            if _shaft({**values, key: 1.01 * values[key] + 1e-6}, sides)[result] != table[result]
+        }
         if moved and moved <= exact:
             sds[f"{name}.{result}"] = 0.0
             continue
-        steps = [_shaft({**at, key: at[key] + sd}, sides)[result] - table[result] for key, sd in inputs.items()]
+        steps = [
+            _shaft({**values, key: values[key] + sd}, sides)[result] - table[result] for key, sd in inputs.items()
+        ]
         sd = math.hypot(*steps)
         if sd > 0:
             sds[f"{name}.{result}"] = float(f"{sd:.12g}")
@@ -158,10 +164,10 @@ def vehicle_defaults(on_tracks: bool, table: Mapping[str, Any], sides: float) ->
     """
 
     def stated(*keys: str) -> float:
-        at: Any = table
+        entry: Any = table
         for key in keys:
-            at = at.get(key) if isinstance(at, Mapping) else None
-        return float(at) if is_number(at) else 0.0  # a value that is no number is refused later
+            entry = entry.get(key) if isinstance(entry, Mapping) else None
+        return float(entry) if is_number(entry) else 0.0  # a value that is no number is refused later
 
     defaults = {name: value for name, (value, _) in VEHICLE.items() if not (on_tracks and name in _OF_TRACKS)}
     wheels = 0.5 * WHEELS * stated("mass") * stated("radius") ** 2 / sides
@@ -186,9 +192,9 @@ def parse_rig(content: Json, where: str, loads: Sequence[str], *, travels: bool,
     between = _one_of(content.pop("between_rows", BETWEEN[0]), BETWEEN, f"{where}, between_rows")
     usual = [name for name in channels.USUAL if travels or name != "speed"]
     names = _channels(content.pop("channels", [n for n in usual if n != imposed]), f"{where}, channels")
-    if shown := {imposed, f"{imposed}_left", f"{imposed}_right"} & set(names):
+    if idle := {imposed, f"{imposed}_left", f"{imposed}_right"} & set(names):
         raise BadConfiguration(
-            f"{where}, channels: {min(shown)} is imposed, so it is no reading; remove it, or state imposed = "
+            f"{where}, channels: {min(idle)} is imposed, so it is no reading; remove it, or state imposed = "
             f'"{next(word for word in IMPOSED if word != imposed)}"'
         )
     return Rig(
@@ -275,7 +281,7 @@ def _columns(stated: Any, where: str) -> tuple[tuple[str, str, float], ...]:
     form = 'expected MINE = "THEIRS", or MINE = {column = "THEIRS", factor = 0.001}'
     if not isinstance(stated, dict):
         raise BadConfiguration(f"{here}: got {stated!r}; expected a table [columns]")
-    layout, found = Layout(channels=channels.EVERY), []
+    layout, entries = Layout(channels=channels.EVERY), []
     spellings = layout.spellings()
     for mine, theirs in stated.items():
         if mine not in spellings:
@@ -287,8 +293,8 @@ def _columns(stated: Any, where: str) -> tuple[tuple[str, str, float], ...]:
         factor = table.get("factor", 1.0)
         if not is_number(factor) or not math.isfinite(factor) or not factor:
             raise BadConfiguration(f"{here}.{mine}.factor: got {factor!r}; expected a number that is not 0")
-        found.append((mine, table["column"], float(factor)))
-    return tuple(found)
+        entries.append((mine, table["column"], float(factor)))
+    return tuple(entries)
 
 
 def needed_parameters(rig: Rig, values: Iterable[tuple[str, Any]] = ()) -> Names:

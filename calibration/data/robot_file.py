@@ -330,7 +330,7 @@ def change_robot(robot: Robot, values: Mapping[str, Any], where: str, notes: lis
     shapes = CURVE | {"battery.capacity_curve"}
     if notes is not None and shapes & values.keys() and (remark := power.curve_remark(robot.battery)):
         notes.append(f"{where}, battery.curvature: {remark}")
-    return _with_two_bodies(robot, where)
+    return _with_states(robot, where)
 
 
 def _refused(name: str, value: Any, known: Mapping[str, params.Parameter]) -> str:
@@ -353,8 +353,8 @@ def _refused(name: str, value: Any, known: Mapping[str, params.Parameter]) -> st
     return ""
 
 
-def _with_two_bodies(robot: Robot, where: str) -> Robot:
-    """`robot` whose motor and load turn apart, where a load states a backlash or a stiffness."""
+def _with_states(robot: Robot, where: str) -> Robot:
+    """`robot` with the states that its values need: two bodies where a load gives way, a duty that lags."""
     loose = {name: load for name, load in robot.configurations.items() if load.has_two_bodies}
     for name, load in loose.items():
         if not (float(robot.motor.inertia) > 0 and float(load.inertia) > 0):
@@ -363,7 +363,9 @@ def _with_two_bodies(robot: Robot, where: str) -> Robot:
             raise BadConfiguration(
                 f"{stated}; motor and load then turn apart, so motor.inertia and {name}.inertia have to exceed 0"
             )
-    return dataclasses.replace(robot, rig=dataclasses.replace(robot.rig, loose=bool(loose)))
+    own = robot.controller
+    own = None if own is None else dataclasses.replace(own, lags=float(own.lag) > 0)
+    return dataclasses.replace(robot, rig=dataclasses.replace(robot.rig, loose=bool(loose)), controller=own)
 
 
 def _switch(where: str, name: str, value: Any) -> bool:

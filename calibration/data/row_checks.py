@@ -94,8 +94,8 @@ def used_once(values: np.ndarray, time: np.ndarray, run: np.ndarray | None = Non
         times = np.maximum(np.floor(lengths / rows_apart + 0.5), 1).astype(int)  # a reading may be the same again
         first = np.repeat(begins, times)
         again = np.arange(len(first)) - np.repeat(np.cumsum(times) - times, times)
-        at = shown[np.minimum(first + np.round(again * rows_apart).astype(int), len(shown) - 1)]
-        kept[at] = values[at]
+        nearest = shown[np.minimum(first + np.round(again * rows_apart).astype(int), len(shown) - 1)]
+        kept[nearest] = values[nearest]
     return kept, rows_apart
 
 
@@ -173,11 +173,12 @@ def _check_driving(name: str, columns: Columns) -> None:
     driven = modes == DRIVEN[0]
     wrong = np.where(driven, np.isnan(duty), ~np.isnan(duty) & (duty != 0))
     if wrong.any():
-        at = int(np.argmax(wrong))
-        if driven[at]:
-            raise BadData(f"{name} row {at + 1}, duty: got an empty cell; expected a number, -1 to 1")
+        row = int(np.argmax(wrong))
+        if driven[row]:
+            raise BadData(f"{name} row {row + 1}, duty: got an empty cell; expected a number, -1 to 1")
         raise BadData(
-            f"{name} row {at + 1}, duty: got {bound_text(duty[at])} in mode {modes[at]}; expected 0 or an empty cell"
+            f"{name} row {row + 1}, duty: got {bound_text(duty[row])} in mode {modes[row]}; expected 0 or an "
+            "empty cell"
         )
     columns["duty"] = np.nan_to_num(duty)
 
@@ -197,9 +198,9 @@ def _check_sides(name: str, columns: Columns, layout: Layout) -> None:
 def _check_held(name: str, columns: Columns) -> None:
     """Refuses a load torque in rows of a clamp: what it carries is a reading."""
     held = columns.get("held", np.zeros(1)) > 0.5
-    for at in np.flatnonzero(held & (columns.get(LOAD, 0.0) != 0))[:1]:
+    for row in np.flatnonzero(held & (columns.get(LOAD, 0.0) != 0))[:1]:
         raise BadData(
-            f"{name} row {at + 1}, {LOAD}: got {bound_text(columns[LOAD][at])} where held is 1; expected 0, as the "
+            f"{name} row {row + 1}, {LOAD}: got {bound_text(columns[LOAD][row])} where held is 1; expected 0, as the "
             "torque that a clamp carries is a reading: name its column output_torque"
         )
 
@@ -228,8 +229,8 @@ def _check_mass(name: str, columns: Columns) -> None:
     if "total_mass_kg" not in columns:
         return
     total, payload = columns["total_mass_kg"], columns["payload_kg"]
-    for at in np.flatnonzero(total <= payload)[:1]:
-        raise BadData(too_light(f"{name} row {at + 1}", total[at], payload[at]))
+    for row in np.flatnonzero(total <= payload)[:1]:
+        raise BadData(too_light(f"{name} row {row + 1}", total[row], payload[row]))
 
 
 def too_light(where: str, total: float, payload: float) -> str:
@@ -285,11 +286,11 @@ def _are_points(columns: Columns, layout: Layout, apart: float) -> bool:
     Readings follow the setting of their own row as well as that of the row before. They do not if a setting begins at
     its row.
     """
-    shown = [c for c in layout.channels if c.column in columns]
+    present = [c for c in layout.channels if c.column in columns]
     if layout.imposed != "voltage" or SUPPLY not in columns or "held" in columns or apart < SECONDS_APART:
         return False
     settings = [c for c in (SUPPLY, "duty", LOAD, "slope_deg", "payload_kg") if c in columns]
-    if not all(c.settled for c in shown) or np.any([np.diff(columns[c]) != 0 for c in settings], 0).mean() < 0.5:
+    if not all(c.settled for c in present) or np.any([np.diff(columns[c]) != 0 for c in settings], 0).mean() < 0.5:
         return False
     drive = columns[SUPPLY] * columns.get("duty", 1.0)
     others = [columns[c] for c in settings if c not in (SUPPLY, "duty")]
@@ -297,7 +298,7 @@ def _are_points(columns: Columns, layout: Layout, apart: float) -> bool:
     def left(readings: np.ndarray, k: int) -> float:
         return _unexplained(readings[1:], [x[k : len(x) - 1 + k] for x in (drive, *others)])
 
-    return all(left(columns[c.column], 1) <= 2 * left(columns[c.column], 0) for c in shown)
+    return all(left(columns[c.column], 1) <= 2 * left(columns[c.column], 0) for c in present)
 
 
 def _unexplained(readings: np.ndarray, settings: Sequence[np.ndarray]) -> float:
@@ -423,21 +424,21 @@ def _check_signs(name: str, columns: Columns, layout: Layout) -> None:
         forward &= channel.name != "motor_voltage"  # it is compared with the back-EMF
         against = np.flatnonzero(forward & (readings < -doubt))
         if against.size:
-            at = int(against[0])
+            row = int(against[0])
             alike = "" if channel not in channels.OF_TURNS else f"; a turn has {' and '.join(layout.sides)} too"
             raise BadData(
-                f"{name} row {at + 1}, {channel.column}: got {bound_text(readings[at])} at "
-                f"{bound_text(imposed[at])} {unit}; "
+                f"{name} row {row + 1}, {channel.column}: got {bound_text(readings[row])} at "
+                f"{bound_text(imposed[row])} {unit}; "
                 "nothing else drives the motors there, so expected a reading with the sign of the drive, the "
                 f"same in every row{alike}"
             )
         if wrong.size:
-            at = int(wrong[0])
+            row = int(wrong[0])
             alone = f"; or signed = false for {channel.name} in the robot's file, if it shows magnitude alone"
             hint = alone if layout.crosses_zero else ""
             raise BadData(
-                f"{name} row {at + 1}, {channel.column}: got {bound_text(readings[at])} at "
-                f"{bound_text(imposed[at])} {unit}; expected readings with their signs, negative backward{hint}"
+                f"{name} row {row + 1}, {channel.column}: got {bound_text(readings[row])} at "
+                f"{bound_text(imposed[row])} {unit}; expected readings with their signs, negative backward{hint}"
             )
 
 

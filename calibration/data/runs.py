@@ -211,10 +211,10 @@ def _columns(
             wrong = np.flatnonzero(refused).tolist()
             count += len(wrong)
             for k in wrong[:LISTED]:
-                said = column_names.refused_cell_sentence(
+                refusal = column_names.refused_cell_sentence(
                     arrays.row(k), meaning, column_texts(raw[k : k + 1])[0], layout
                 )
-                bad.append((k, j, said))
+                bad.append((k, j, refusal))
     if bad:
         raise BadData(_listed(arrays.name, [sentence for _, _, sentence in sorted(bad)], count))
     return columns, tuple(notes)
@@ -230,11 +230,11 @@ def _listed(name: str, said: Sequence[str], count: int) -> str:
     first, *others = said
     if not others:
         return first
-    more, known = list[str](), {first.partition(";")[2]}
+    more, seen = list[str](), {first.partition(";")[2]}
     for sentence in others[: LISTED - 1]:
         what, _, cure = sentence.removeprefix(f"{name} ").partition(";")
-        more.append(what if cure in known else f"{what};{cure}")
-        known.add(cure)
+        more.append(what if cure in seen else f"{what};{cure}")
+        seen.add(cure)
     rest = f"; and {count - LISTED} more" if count > LISTED else ""
     return f"{first}; also {'; '.join(more)}{rest}"
 

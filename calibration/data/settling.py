@@ -337,19 +337,19 @@ def _signals(
     for c in runs.channels:
         if c.settled and runs.has(c.column) and np.isfinite(runs[c.column]).any():
             off = find_glitches(runs[c.column], levels, width, _step(runs, c, runs[c.column]), drift)
-            shown = np.where(off, np.nan, runs[c.column])
-            signals.append(Signal(c, shown, none, _step(runs, c, shown), _size(shown), off))
+            readings = np.where(off, np.nan, runs[c.column])
+            signals.append(Signal(c, readings, none, _step(runs, c, readings), _size(readings), off))
     have = {s.channel.name for s in signals}
     for angle, rate, factor in RATES:
         if angle in runs.layout.measured_columns and runs.has(angle) and rate not in have:
             whole = np.full(len(runs), np.nan)
-            shown = np.full(len(runs), np.nan)
+            readings = np.full(len(runs), np.nan)
             read = next(c for c in runs.channels if c.column == angle)
             off = find_glitches(runs[angle], levels, width, _step(runs, read, runs[angle]), None)
             for rows in each:
                 whole[rows] = np.where(off[rows], np.nan, runs[angle][rows] * factor)
-                shown[rows] = _rate(runs["time_s"][rows], whole[rows], half)
-            signals.append(Signal(channels.find_channel(rate), shown, whole, 0.0, _size(shown), off))
+                readings[rows] = _rate(runs["time_s"][rows], whole[rows], half)
+            signals.append(Signal(channels.find_channel(rate), readings, whole, 0.0, _size(readings), off))
     if not signals:
         raise BadData(f"{runs.source}: no channel with readings that settled travel shows")
     return tuple(signals)
@@ -547,11 +547,11 @@ def _settled(
     for signal in signals:
         if stuck[signal.channel.name][rows].mean() > 0.5:
             return out("stuck", signal.channel.name)
-    found = _end(signals, time, rows, shortest, drift)
-    unsettled, left_over = _unsettled(signals, rows, found, drift)
+    stretch = _end(signals, time, rows, shortest, drift)
+    unsettled, left_over = _unsettled(signals, rows, stretch, drift)
     if unsettled is not None:
         return out(*unsettled)
-    seen = {name: x for name, x in found.seen.items() if math.isfinite(x[0])}
+    seen = {name: x for name, x in stretch.seen.items() if math.isfinite(x[0])}
     if not seen:
         return out("unread")
     moving = [
@@ -561,7 +561,7 @@ def _settled(
     if bool(ends) and all(abs(mean) < max(STILL * s.largest, SDS * sd) for s, mean, sd in ends):
         return out("rest")
     acting = inertia.get(str(runs["configuration"][rows[0]]))
-    lasts = float(time[found.rows[-1]] - time[found.rows[0]])
+    lasts = float(time[stretch.rows[-1]] - time[stretch.rows[0]])
     if acting is not None and (accelerates := _accelerates(acting, seen, lasts, imposed, drift)) is not None:
         return out(*accelerates)
     every = {s.channel.name: seen.get(s.channel.name, (math.nan,) * 3) for s in signals}
@@ -569,12 +569,12 @@ def _settled(
     further = {s.channel.name: left_over * _scale(s, every[s.channel.name][0]) for s in signals}
     return dataclasses.replace(
         left,
-        rows=found.rows,
-        begin=float(time[found.rows[0]]),
+        rows=stretch.rows,
+        begin=float(time[stretch.rows[0]]),
         mean={name: mean for name, (mean, _, _) in every.items()},
         sd={name: math.hypot(sd, further[name]) for name, (_, sd, _) in every.items()},
         drift={name: change for name, (_, _, change) in every.items()},
-        glitches={name: count for name, count in found.glitches.items() if count},
+        glitches={name: count for name, count in stretch.glitches.items() if count},
     )
 
 
@@ -677,8 +677,8 @@ def _size(shown: np.ndarray) -> float:
 def _parts(time: np.ndarray, shortest: float) -> list[tuple[int, int]]:
     """A level in parts of a third of the shortest stretch, `PART` samples at least, the last three a stretch."""
     size = max(shortest / 3, float(time[-1] - time[0]) / 300)
-    at = ((time[-1] - time) / size).astype(int)  # counted from the end, so that the last parts are whole
-    edges = [0, *(np.flatnonzero(np.diff(at)) + 1).tolist(), len(time)]
+    part = ((time[-1] - time) / size).astype(int)  # counted from the end, so that the last parts are whole
+    edges = [0, *(np.flatnonzero(np.diff(part)) + 1).tolist(), len(time)]
     whole: list[tuple[int, int]] = []
     for low, high in reversed(list(pairwise(edges))):
         if whole and whole[-1][1] - whole[-1][0] < PART:
@@ -786,11 +786,11 @@ def _scatter(runs: Runs, found: list[Stretch], signals: tuple[Signal, ...], larg
         excess, freedom = 0.0, 0
         for group in groups:
             values = np.array([s.mean[name] for s in group])
-            own = np.array([s.sd[name] for s in group])
+            sds = np.array([s.sd[name] for s in group])
             good = np.isfinite(values)
             if good.sum() > 1:
                 excess += float(np.sum((values[good] - values[good].mean()) ** 2))
-                excess -= float((1 - 1 / good.sum()) * np.sum(own[good] ** 2))
+                excess -= float((1 - 1 / good.sum()) * np.sum(sds[good] ** 2))
                 freedom += int(good.sum()) - 1
         scatter[name] = math.sqrt(max(excess, 0.0) / freedom) if freedom >= 3 else 0.0
     return scatter
@@ -819,9 +819,9 @@ NEAR = 0.03
 
 def _shows(found: Settled, s: Stretch, channel: Channel) -> str:
     """Place of a stretch, with a channel's reading there and the imposed value, for a message."""
-    shown, unit = bound_text(_digits(s.mean[channel.name], 4)), found.runs.layout.imposed_column.rpartition("_")[2]
+    reading, unit = bound_text(_digits(s.mean[channel.name], 4)), found.runs.layout.imposed_column.rpartition("_")[2]
     return (
-        f"{found.runs.source} rows {s.rows[0] + 1} to {s.rows[-1] + 1}, {channel.column}: shows {shown} "
+        f"{found.runs.source} rows {s.rows[0] + 1} to {s.rows[-1] + 1}, {channel.column}: shows {reading} "
         f"{channel.unit} at {bound_text(_digits(s.imposed, 4))} {unit}"
     )
 
@@ -857,11 +857,11 @@ def _check_units(found: Settled, rolling: Mapping[str, Mapping[str, float]]) -> 
     # The angle is doubted first, as its rate is not read directly.
     order = sorted(found.signals, key=lambda s: not len(s.angle))
     for s in found.kept:
-        shown = rolling.get(str(runs["configuration"][s.rows[0]]), {})
+        units = rolling.get(str(runs["configuration"][s.rows[0]]), {})
         turns = {
-            x.channel.name: abs(s.mean[x.channel.name] / shown[x.channel.name])
+            x.channel.name: abs(s.mean[x.channel.name] / units[x.channel.name])
             for x in order
-            if shown.get(x.channel.name)
+            if units.get(x.channel.name)
         }
         if runs.layout.imposed == "motor_speed":
             turns["motor_speed"] = abs(s.imposed) * math.pi / 30
@@ -961,9 +961,9 @@ def acceleration_currents(robot: Robot) -> dict[str, Inertia]:
         currents, speeds = ({c.name: _shown(robot, k, c, state) for c in settled_channels(robot)} for state in states)
         current = next((n for n, x in currents.items() if x and not speeds[n]), "")
         speed = next((n for n, x in speeds.items() if x), "")
-        known = current or robot.rig.imposed == "motor_current"
+        is_known = current or robot.rig.imposed == "motor_current"
         currents[""] = 1.0  # of the imposed one
-        if known and speed and at_motor > 0 and constant > 0:
+        if is_known and speed and at_motor > 0 and constant > 0:
             per_rate = at_motor / constant * currents[current] / speeds[speed]
             found[name] = Inertia(speed, current, per_rate, least=1e-3)
     return found

@@ -137,8 +137,8 @@ def unsigned_current_channels(columns: Mapping[str, np.ndarray], layout: Layout)
     for side, drive in zip(channels.SIDES, drive_of_sides(columns, layout), strict=True):
         channel = channels.find_channel(f"motor_current_{side}")
         if channel.column in columns:
-            shown = columns[channel.column]
-            back = np.isfinite(shown) & (drive < -CLEAR * np.max(np.abs(drive)))
-            if back.sum() >= FEWEST - 1 and (shown[back] > 0).all() and not (shown < 0).any():
+            readings = columns[channel.column]
+            back = np.isfinite(readings) & (drive < -CLEAR * np.max(np.abs(drive)))
+            if back.sum() >= FEWEST - 1 and (readings[back] > 0).all() and not (readings < 0).any():
                 unsigned.append(Instrument(channel.name, signed=False))
     return tuple(unsigned)

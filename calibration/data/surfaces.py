@@ -64,17 +64,17 @@ def with_surface_configurations(robot: Robot, runs: Runs) -> Robot:
     leaders: dict[str, str] = {}
     for configuration in dict.fromkeys(c for c, _ in pairs):
         mine = [label for c, label in pairs if c == configuration]
-        own = [x for x in mine if x not in labelled or configuration_on_surface(configuration, x) in members]
+        own_names = [x for x in mine if x not in labelled or configuration_on_surface(configuration, x) in members]
         present = [
             configuration_on_surface(configuration, x)
-            for x in own
+            for x in own_names
             if configuration_on_surface(configuration, x) in members
         ]
-        if not own or (len(mine) == 1 and not present) or (configuration not in members and not present):
+        if not own_names or (len(mine) == 1 and not present) or (configuration not in members and not present):
             continue
-        stays = configuration in members and len(own) < len(mine)
+        stays = configuration in members and len(own_names) < len(mine)
         pattern = members[configuration] if configuration in members else members[present[0]]
-        names = list(dict.fromkeys(configuration_on_surface(configuration, x) for x in own))
+        names = list(dict.fromkeys(configuration_on_surface(configuration, x) for x in own_names))
         if configuration in members and not stays:  # in its place
             members = {
                 n: m for key, value in members.items()
@@ -111,14 +111,14 @@ def names_of_surfaces(names: Iterable[str], robot: Robot, runs: Runs) -> list[st
 
     A parameter of the ground becomes one for each surface. Any other becomes the first surface's.
     """
-    found: list[str] = []
+    names_found: list[str] = []
     for name in names:
         configuration, _, rest = name.partition(".")
         gone = configuration not in robot.configurations and configuration in (
             runs["configuration"] if runs.has("surface") else ()
         )
         if not gone:
-            found.append(name)
+            names_found.append(name)
             continue
         mine = runs["surface"][runs["configuration"] == configuration]
         on = [
@@ -126,5 +126,5 @@ def names_of_surfaces(names: Iterable[str], robot: Robot, runs: Runs) -> list[st
             for n in dict.fromkeys(configuration_on_surface(configuration, s) for s in mine)
             if n in robot.configurations
         ]
-        found += [f"{n}.{rest}" for n in (on if rest.startswith((GROUND, "*")) else on[:1])]
-    return found
+        names_found += [f"{n}.{rest}" for n in (on if rest.startswith((GROUND, "*")) else on[:1])]
+    return names_found

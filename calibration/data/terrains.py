@@ -120,10 +120,10 @@ def read_sequence(path: Path, robot: Robot, begins: tuple[float, float]) -> Sequ
             voltage beyond `HIGHEST`.
     """
     angles, volts = ("front_deg", "rear_deg"), ("front_V", "rear_V")
-    wanted = [(at, *both) for both in (angles, volts) for at in ("x_mm", "time_s")]
+    wanted = [(abscissa, *both) for both in (angles, volts) for abscissa in ("x_mm", "time_s")]
     columns, names = _read(path, "--sequence", wanted)
-    at = columns[names[0]] * (1e-3 if names[0] == "x_mm" else 1.0)
-    if (falls := np.flatnonzero(np.diff(at) <= 0)).size:
+    abscissa = columns[names[0]] * (1e-3 if names[0] == "x_mm" else 1.0)
+    if (falls := np.flatnonzero(np.diff(abscissa) <= 0)).size:
         raise BadData(
             f"{path.name} row {falls[0] + 3}, {names[0]}: got {columns[names[0]][falls[0] + 1]:g} after "
             f"{columns[names[0]][falls[0]]:g}; expected values that rise"
@@ -137,13 +137,13 @@ def read_sequence(path: Path, robot: Robot, begins: tuple[float, float]) -> Sequ
                         f"{path.name} row {k + 2}, {name}: got {value:g} V; expected -{HIGHEST:g} to {HIGHEST:g} V"
                     )
         front, rear = (jnp.asarray(columns[name]) for name in volts)
-        return Sequence(jnp.asarray(at), front, rear, jnp.asarray(begins), over_time)
+        return Sequence(jnp.asarray(abscissa), front, rear, jnp.asarray(begins), over_time)
     for name in angles:
         for k, value in enumerate(columns[name]):
             if why := lever_angle_refusal(robot, value):
                 raise BadData(f"{path.name} row {k + 2}, {name}: {why}")
     front, rear = (jnp.asarray(np.radians(columns[name])) for name in angles)
-    return Sequence(jnp.asarray(at), front, rear, over_time=over_time)
+    return Sequence(jnp.asarray(abscissa), front, rear, over_time=over_time)
 
 
 def lever_start_refusal(robot: Robot, angle: float) -> str:

@@ -69,12 +69,12 @@ def _beyond_limit(runs: Runs, drive: np.ndarray) -> np.ndarray:
     If the supply's voltage falls over them, the supply is at its limit in all of them. Else the least command may
     just reach the limit.
     """
-    found = np.zeros(len(runs), bool)
+    beyond = np.zeros(len(runs), bool)
     command, supply = (np.abs(runs["duty"]), np.abs(runs[SUPPLY])) if runs.has("duty") else (drive, drive)
     drawn = [runs["total_current_A"][:, None]] if runs.has("total_current_A") else []
     others = [runs[c] for c in (LOAD, "slope_deg", "payload_kg", "configuration") if runs.has(c)]
     if len(runs) < 4 or any(len(np.unique(x)) > 1 for x in others):
-        return found
+        return beyond
     order = np.argsort(-command, kind="stable")
     for shown in (np.abs(x)[order] for x in (*drawn, runs.measured())):
         same = np.all(np.isnan(shown) | (np.abs(shown - shown[0]) <= ALIKE * np.abs(shown[0])), axis=1)
@@ -83,7 +83,7 @@ def _beyond_limit(runs: Runs, drive: np.ndarray) -> np.ndarray:
         if len(levels) < 2 or levels[-1] < RISE * levels[0] or not np.isfinite(shown[0]).any():
             continue
         if supply[top].min() < (1 - FALLS) * supply[top].max() and supply[top[0]] == supply[top].min():
-            found[top] = True
+            beyond[top] = True
         elif len(levels) > 2 and drive[top].max() > RISE * drive[top].min():
-            found[top[command[top] > levels[0]]] = True
-    return found
+            beyond[top[command[top] > levels[0]]] = True
+    return beyond

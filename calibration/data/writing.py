@@ -19,6 +19,7 @@ import numpy as np
 
 from calibration.data import Columns
 from mmrjax.errors import printable
+from mmrjax.model.quantities import TABLE, unit_at_end, unit_in_column
 
 #: Types of libraries that are imported where they are needed.
 PandasFrame: TypeAlias = Any
@@ -37,17 +38,17 @@ def columns_of(result: Any) -> Columns:
         TypeError: something without a table.
     """
     if isinstance(result, Mapping):
-        found = result
+        content = result
     elif isinstance(getattr(result, "columns", None), Mapping):
-        found = result.columns
+        content = result.columns
     else:
         table = next(
             (getattr(result, name) for name in ("rows_table", "rows", "table") if hasattr(result, name)), None
         )
         if table is None:
             raise TypeError(f"expected a result with a table, got {type(result).__name__}")
-        found = table() if callable(table) else table
-    return {str(name): np.asarray(values) for name, values in found.items()}
+        content = table() if callable(table) else table
+    return {str(name): np.asarray(values) for name, values in content.items()}
 
 
 def to_arrow(result: Any) -> ArrowTable:
@@ -94,7 +95,7 @@ def to_polars(result: Any) -> PolarsFrame:
 
 
 def to_xarray(result: Any) -> XarrayDataset:
-    """Returns the table of a result as an xarray Dataset with the dimension `row`.
+    """Returns the table of a result as an xarray Dataset with the dimension `row` and the columns' units.
 
     Args:
         result: runs, a calibration, the result of a loop or of a simulation, or a dict of columns.
@@ -104,7 +105,14 @@ def to_xarray(result: Any) -> XarrayDataset:
     """
     import xarray as xr
 
-    return xr.Dataset({name: ("row", values) for name, values in columns_of(result).items()})
+    units = {unit_in_column(q.unit): q.unit for rows in TABLE.values() for q in rows}
+    ends = {name: unit_at_end(name, units) for name in columns_of(result)}
+    return xr.Dataset(
+        {
+            name: ("row", values, {} if (end := ends[name]) is None else {"units": units[end]})
+            for name, values in columns_of(result).items()
+        }
+    )
 
 
 @contextlib.contextmanager
@@ -158,9 +166,9 @@ def write_json(path: Path, content: Mapping[str, Any]) -> None:
 def json_text(content: Mapping[str, Any]) -> str:
     """Data as JSON: numbers that are not finite become null, characters that are not `printable` their escapes."""
     text = json.dumps(json_value(content), indent=2, ensure_ascii=False)
-    shown = printable(text)
-    pairs = zip(text, shown, strict=True)
-    return text if shown == text else "".join(a if a == b else json.dumps(a)[1:-1] for a, b in pairs)
+    printed = printable(text)
+    pairs = zip(text, printed, strict=True)
+    return text if printed == text else "".join(a if a == b else json.dumps(a)[1:-1] for a, b in pairs)
 
 
 def toml_value(value: Any) -> str:

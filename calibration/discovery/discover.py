@@ -1308,5 +1308,5 @@ def neighbouring_levels(x: np.ndarray, here: float) -> tuple[float, ...]:
     if not other_levels.size:
         return ()
     unit = 10.0 ** math.floor(math.log10(other_levels.min() / 2))
-    step, at = round(other_levels.min() / 2 / unit) * unit, round(here / unit) * unit
-    return tuple(float(f"{v:.6g}") for v in (at - step, at + step))
+    step, level = round(other_levels.min() / 2 / unit) * unit, round(here / unit) * unit
+    return tuple(float(f"{v:.6g}") for v in (level - step, level + step))

@@ -56,14 +56,14 @@ def conduct_notes(runs: Runs, robot: Robot) -> list[Remark]:
     """Notes on runs that end before they reach steady travel, and on runs that never grip."""
     runs = runs.of(robot)
     kind = observers.observer_kind(runs)
-    ends, shown, lasts = kind.settled(runs)
+    ends, readings, lasts = kind.settled(runs)
     if not kind.axis or not len(ends) or not robot.has_ground or "speed" not in robot.rig.channels:
         return []
-    speed = shown[:, channels.channel_index("speed", robot.channels)]
+    speed = readings[:, channels.channel_index("speed", robot.channels)]
     names = ends["run_id"] if ends.has("run_id") else np.array(["(no run_id)"] * len(ends))
     conditions = ends.conditions(robot)
     if "motor_speed" in robot.rig.channels:
-        turning = shown[:, channels.channel_index("motor_speed", robot.channels)]
+        turning = readings[:, channels.channel_index("motor_speed", robot.channels)]
     else:
         imposed = conditions.motor_speed
         turning = np.full(len(ends), np.nan) if imposed is None else np.asarray(imposed)

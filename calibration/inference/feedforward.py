@@ -185,7 +185,7 @@ def fit_feedforward(log: DriveLog, mechanism: str = "simple", tolerances: Tolera
         prompt = feedback(constants["kV"], constants["kA"], dataclasses.replace(asked, delay=0.0))
         remarks.append(Remark("feedforward_gains_delayed", delay=asked.delay, slow=gains["velocity_kP"],
                               prompt=prompt["velocity_kP"]))  # fmt: skip
-    shown = {
+    figures = {
         "run": kept["run"],
         "voltage_V": kept["u"] / kept["T"],
         "velocity": kept["x"] / kept["T"],
@@ -194,7 +194,7 @@ def fit_feedforward(log: DriveLog, mechanism: str = "simple", tolerances: Tolera
         "quasistatic": kept["quasistatic"],
     }
     return Feedforward(
-        mechanism, log.unit, constants, spread, gains, asked, delay, lag, missing, shown, tuple(remarks)
+        mechanism, log.unit, constants, spread, gains, asked, delay, lag, missing, figures, tuple(remarks)
     )  # fmt: skip
 
 
@@ -260,8 +260,8 @@ def _speeds(log: DriveLog) -> tuple[DriveLog, float, list[Remark]]:
         remarks.append(Remark("feedforward_speed_sign"))
     if abs(abs(ratio) - 1) > 0.05:
         near = min(WRONG_UNITS, key=lambda f: abs(np.log(abs(ratio) / f)))
-        known = abs(np.log(abs(ratio) / near)) < 0.03
-        remarks.append(Remark("feedforward_unit", ratio=abs(ratio), near=near if known else 0.0))
+        is_close = abs(np.log(abs(ratio) / near)) < 0.03
+        remarks.append(Remark("feedforward_unit", ratio=abs(ratio), near=near if is_close else 0.0))
         speed = speed / abs(ratio)
     speed = speed * np.sign(ratio)
     lags = np.arange(0, LONGEST, step / 4)
@@ -284,7 +284,7 @@ def _runs(log: DriveLog) -> Iterator[np.ndarray]:
 
 def _windows(log: DriveLog, delay: float) -> Columns:
     """Integrals over windows of motion one way: voltage u, path x, direction s, length T, change of speed dv."""
-    found: list[dict[str, object]] = []
+    windows: list[dict[str, object]] = []
     step, speeds = _step(log), np.asarray(log.velocity)
     least = MOVES * np.nanmax(np.abs(speeds))
     count = max(FEWEST, round(WINDOW / step))
@@ -292,10 +292,10 @@ def _windows(log: DriveLog, delay: float) -> Columns:
         t, u, v = log.time[rows], log.voltage[rows], speeds[rows]
         whole = np.r_[0, np.cumsum(u[:-1] * np.diff(t))]
         path = np.r_[0, np.cumsum((v[1:] + v[:-1]) / 2 * np.diff(t))] if log.position is None else log.position[rows]
-        at = t - delay
+        instants = t - delay
         rests = not abs(v[0]) >= least  # a test begins without voltage
-        driven = np.interp(at, t, whole) + np.minimum(at - t[0], 0) * (0.0 if rests else u[0])
-        driven += np.maximum(at - t[-1], 0) * u[-1]
+        driven = np.interp(instants, t, whole) + np.minimum(instants - t[0], 0) * (0.0 if rests else u[0])
+        driven += np.maximum(instants - t[-1], 0) * u[-1]
         place = np.zeros(len(t)) if log.position is None else log.position[rows] * UNITS[log.unit]
         ramp = _is_ramp(_driven(u))
         for a in range(len(t) - count):
@@ -307,13 +307,13 @@ def _windows(log: DriveLog, delay: float) -> Columns:
             if length > 3 * WINDOW and length > 2 * count * step:
                 continue
             c, s = (length * np.mean(f(place[a : b + 1])) for f in (np.cos, np.sin))
-            found.append({
+            windows.append({
                 "run": log.run[rows[0]], "row": rows[a], "count": count, "u": driven[b] - driven[a],
                 "x": path[b] - path[a], "T": length, "s": np.sign(inside[0]) * length, "dv": v[b] - v[a],
                 "cos": c, "sin": s, "quasistatic": ramp,
             })  # fmt: skip
     keys = ("run", "row", "count", "u", "x", "T", "s", "dv", "cos", "sin", "quasistatic")
-    return {key: np.array([w[key] for w in found]) for key in keys}
+    return {key: np.array([w[key] for w in windows]) for key in keys}
 
 
 def _driven(voltage: np.ndarray) -> np.ndarray:

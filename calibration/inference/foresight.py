@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterator, Sequence
 
 import jax.numpy as jnp
 import numpy as np
@@ -14,8 +15,9 @@ from calibration.data.runs import Runs
 from calibration.data.thinning import used_rows
 from calibration.inference import identifiability, observers, optimizers, priors
 from calibration.inference.fit_notes import Notes, Pair, with_codes
-from calibration.inference.identifiability import determined_together, posterior_of_coordinates
+from calibration.inference.identifiability import Identifiability, determined_together, posterior_of_coordinates
 from calibration.inference.preparation import prepare
+from calibration.inference.problem import Problem
 from mmrjax import fidelities
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import STATUSES
@@ -25,6 +27,10 @@ DOUBTS = (
     "copied", "larger_noise", "lost_motion", "no_load_gives", "nothing_varies", "off_by", "repeats", "slopes_in",
     "stiff_supply", "turned", "unused",
 )  # fmt: skip
+
+
+#: Channels that a log of goal and angle may lack.
+MORE = ("motor_current", "output_speed", "motor_voltage")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -59,6 +65,7 @@ class Foresight:
         together: pairs of parameters that the data determine only in combination.
         robot: completed from the table, see `preparation.prepare`.
         doubts: notes to look at before a fit.
+        separating: for each of `alike`, columns that the log lacks, each of which would separate the pair.
     """
 
     parameters: tuple[Determined, ...]
@@ -68,6 +75,7 @@ class Foresight:
     together: tuple[Pair, ...]
     robot: Robot
     doubts: Notes = ()
+    separating: tuple[Names, ...] = ()
 
 
 def predict_identifiability(runs: Runs, robot: Robot, noise: str | None = None, rows: int = ROWS) -> Foresight:
@@ -114,4 +122,42 @@ def predict_identifiability(runs: Runs, robot: Robot, noise: str | None = None, 
     together = determined_together(
         posterior_of_coordinates(coordinates, np.asarray(z), about.covariance), priors_hold
     )
-    return Foresight(estimates, statuses, table_noise.source, tuple(about.correlated()), together, robot, doubts)
+    alike = tuple(about.correlated())
+    separating = (
+        tuple(_separating(runs, posed, about, alike)) if robot.rig.follows_goal and alike else ((),) * len(alike)
+    )
+    return Foresight(estimates, statuses, table_noise.source, alike, together, robot, doubts, separating)
+
+
+def _separating(
+    runs: Runs, posed: Problem, about: Identifiability, alike: Sequence[tuple[str, str, float]]
+) -> Iterator[Names]:
+    """Columns that separate each pair: with their readings it is neither correlated nor held by its priors.
+
+    The sensitivities of these readings are simulated, as if each sample had one.
+    """
+    own, rig = posed.base.channels, posed.base.rig
+    wide = dataclasses.replace(posed.base, rig=dataclasses.replace(rig, channels=(*rig.channels, *MORE)))
+    columns = {**{c.column: np.zeros(len(runs)) for c in wide.channels}, **runs.columns}
+    layout = dataclasses.replace(runs.layout, channels=wide.channels)
+    table = dataclasses.replace(runs, columns=columns, layout=layout)
+    sd = np.ones((len(runs), len(wide.channels)))
+    problem = observers.pose_problem(table, wide, posed.coordinates, sd)
+    found = optimizers.linearise(problem, jnp.zeros(len(posed.coordinates)), problem.data)[:2]
+    shown, slopes = (np.asarray(x)[: sd.size].reshape(*sd.shape, *x.shape[1:]) for x in found)
+    covariances = {}
+    for k, channel in enumerate(wide.channels):
+        size = channel.sd_share * np.sqrt(np.mean(shown[:, k] ** 2))
+        if channel not in own and size > 0:
+            rows = np.concatenate([about.jacobian, slopes[:, k] / size, np.eye(len(about.sd))])
+            covariances[channel.column] = np.linalg.inv(rows.T @ rows)
+    for one, other, _ in alike:
+        pair = [about.names.index(one), about.names.index(other)]
+        yield tuple(column for column, c in covariances.items() if _apart(c[np.ix_(pair, pair)]))
+
+
+def _apart(covariance: np.ndarray) -> bool:
+    """True if two parameters are neither correlated nor held by their priors."""
+    sd = np.sqrt(np.diag(covariance))
+    correlation = abs(covariance[0, 1]) / (sd[0] * sd[1])
+    return bool(correlation <= identifiability.CORRELATED and not identifiability.held_by_prior(sd).any())

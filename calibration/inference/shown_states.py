@@ -394,11 +394,11 @@ class _Log:
             time = np.r_[self.time[rows[0]] - period, self.time[rows], self.time[rows[-1]] + period]
             begin = (knots[-1][-1] if knots else 0.0) + 1.0 - time[0]
             for name, x in changing.items():
-                shown = x[np.r_[rows[0], rows, rows[-1]]]
+                padded = x[np.r_[rows[0], rows, rows[-1]]]
                 lines = name == "motor_speed" or (linear and name != "motor_acceleration")
-                mean = 0.5 * (shown[1:] + shown[:-1]) if lines else shown[:-1]
+                mean = 0.5 * (padded[1:] + padded[:-1]) if lines else padded[:-1]
                 integrals[name].append(np.r_[0.0, np.cumsum(np.diff(time) * mean)])
-                values[name].append(shown)
+                values[name].append(padded)
             knots.append(time + begin)
             moved.append(cell + begin)
         held, summed = ({n: np.concatenate(x) for n, x in each.items()} for each in (values, integrals))

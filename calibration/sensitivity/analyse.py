@@ -101,15 +101,17 @@ def _described(inputs: Inputs, idle: np.ndarray) -> dict[str, Input]:
         for k in range(p, len(inputs)):
             rows[side][k] = inputs.centre
             rows[side][k, k] = 0.5 + side * 0.475
-    at = {
+    settings = {
         q: inputs.values(x)[:, inputs.places][np.arange(len(inputs)), np.arange(len(inputs))] for q, x in rows.items()
     }
     described = {}
     for k, name in enumerate(inputs.names):
         kind = "uniform" if uniform[k] else "posterior" if inputs.is_posterior else inputs.parameters.kinds[k]
         axis = inputs.axes[name]
-        interval = (float(at[-1][k]), float(at[1][k]))
-        described[name] = Input(axis.unit, axis.meaning, kind, float(at[0][k]), interval, float(sd[k]), bool(idle[k]))
+        interval = (float(settings[-1][k]), float(settings[1][k]))
+        described[name] = Input(
+            axis.unit, axis.meaning, kind, float(settings[0][k]), interval, float(sd[k]), bool(idle[k])
+        )
     return described
 
 
@@ -152,22 +154,22 @@ def _study_of(row: Quantity, study: Study, found: Local, part: Part | None) -> O
 
 
 def _none_converges(study: Study, statuses: dict[str, dict[str, int]]) -> str:
-    said = "; ".join(f"{s}: " + ", ".join(f"{n} {w}" for w, n in by.items()) for s, by in statuses.items())
+    listed = "; ".join(f"{s}: " + ", ".join(f"{n} {w}" for w, n in by.items()) for s, by in statuses.items())
     return (
-        f"no operating point can be studied, because too many robots do not travel there ({said}); choose smaller "
+        f"no operating point can be studied, because too many robots do not travel there ({listed}); choose smaller "
         "--slopes, another --voltages, or reduce the uncertainty of the adhesion with --set or by calibrating"
     )
 
 
 def _remarks(study: Study, method: str, outputs: dict[str, OutputStudy], idle: np.ndarray) -> tuple[Remark, ...]:
-    said: list[Remark] = []
+    remarks: list[Remark] = []
     alike: dict[tuple[bytes, bytes], list[OutputStudy]] = {}
     for o in outputs.values():
         alike.setdefault((o.studied.tobytes(), o.lost.tobytes()), []).append(o)
     for group in alike.values():
         o, names = group[0], tuple(x.row.label for x in group)
         if not o.studied.all():
-            said.append(
+            remarks.append(
                 Remark(
                     "points_left_out",
                     points=int((~o.studied).sum()),
@@ -178,12 +180,12 @@ def _remarks(study: Study, method: str, outputs: dict[str, OutputStudy], idle: n
             )
         some = o.studied & (o.lost >= 1e-3)
         if some.any():
-            said.append(
+            remarks.append(
                 Remark("sample_left_out", points=int(some.sum()), share=float(o.lost[some].max()), outputs=names)
             )
     names = tuple(n for k, n in enumerate(study.inputs.names) if idle[k])
     if names:
-        said.append(Remark("inert", inputs=names))
+        remarks.append(Remark("inert", inputs=names))
     if study.inputs.parameters.tied:
-        said.append(Remark("tied", inputs=tuple(f for f, _, _ in study.inputs.parameters.tied)))
-    return tuple(said)
+        remarks.append(Remark("tied", inputs=tuple(f for f, _, _ in study.inputs.parameters.tied)))
+    return tuple(remarks)

@@ -178,13 +178,13 @@ class Model:
     def derivatives(self, values: Float[np.ndarray, "points columns"], conditions: Conditions) -> Columns:
         """Exact derivatives of each output by each column [SI per unit], shape (points, columns). Zeros for a run
         without values."""
-        found: Columns = {}
+        columns: Columns = {}
         for source in self.sources:
             size = self.chunk(source, len(values), differentiated=True)
             made = self._chunked(self._function(source, differentiated=True), size, values, conditions)
             made.pop(STATUS)
-            found |= made
-        return {o.name: found[o.name] for o in self.outputs}
+            columns |= made
+        return {o.name: columns[o.name] for o in self.outputs}
 
     def _function(self, source: str, differentiated: bool = False) -> Callable[..., dict[str, Array]]:
         rows = tuple(o.name for o in self.sources[source])

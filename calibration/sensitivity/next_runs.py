@@ -133,8 +133,8 @@ def next_runs(study: Study, found: Local, candidates: Candidates) -> NextRuns | 
         None if no candidate travels, or no parameter is uncertain.
     """
     points, conditions = candidates.points, candidates.conditions
-    known = known_outputs(study.robot)
-    shown = tuple(known[c.name] for c in study.robot.channels)
+    outputs_known = known_outputs(study.robot)
+    shown = tuple(outputs_known[c.name] for c in study.robot.channels)
     model = dataclasses.replace(study.model, outputs=shown, fidelity="steady", options={})
     p = len(study.inputs.parameters)
     if not p:

@@ -84,10 +84,10 @@ class Points:
 
     def columns(self) -> Columns:
         """Columns as in tables of runs."""
-        own = (
+        further = (
             {"supply_voltage_V": self.voltage} if self.motor_speed is None else {"motor_speed_rpm": self.motor_speed}
         )
-        return {"configuration": self.configuration, **own, **{column: x for column, x, _ in self.ground}}
+        return {"configuration": self.configuration, **further, **{column: x for column, x, _ in self.ground}}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -264,13 +264,13 @@ class SensitivityResult:
 
     def leaders(self) -> dict[str, list[tuple[str, float]]]:
         """Input → label and share [-] of each output that depends on it more than on any other."""
-        found: dict[str, list[tuple[str, float]]] = {}
+        leading: dict[str, list[tuple[str, float]]] = {}
         for study in self.outputs.values():
             share = study.overall_share
             if share.max(initial=0.0) > 0:
                 k = int(np.argmax(share))
-                found.setdefault(self.names[k], []).append((study.row.label, float(share[k])))
-        return found
+                leading.setdefault(self.names[k], []).append((study.row.label, float(share[k])))
+        return leading
 
     def statement(self) -> str:
         """What decides these outputs, in one sentence."""

@@ -304,16 +304,16 @@ def check_requirements(
                 robot, r, (*{name: by_name[name] for name in names if name in by_name}, *of_levers, CELLS)
             )
         )
-    found = []
+    outcomes = []
     for k, h in enumerate(held, 1):
         tell(next_step("requirement", k, len(held), h.requirement.quantity.label))
-        found.append(_outcome(h))
+        outcomes.append(_outcome(h))
     if not changes:
-        return tuple(found)
-    missed, answer = [k for k, o in enumerate(found) if not o.met], list(found)
+        return tuple(outcomes)
+    missed, answer = [k for k, o in enumerate(outcomes) if not o.met], list(outcomes)
     for n, k in enumerate(missed, 1):
         tell(next_step("changes", n, len(missed), held[k].requirement.quantity.label))
-        answer[k] = _with_changes(held[k], found[k], held, found)
+        answer[k] = _with_changes(held[k], outcomes[k], held, outcomes)
     return tuple(answer)
 
 
@@ -340,11 +340,11 @@ def _corner(held: _QuantityOfRobot, k: int) -> Json:
     """A point in the names of a file."""
     r, at = held.requirement, held.at
     e = r.envelope
-    known = {
+    places = {
         PAYLOAD: ("payload_kg", at.payload), SLOPE: ("slope_deg", at.slope_deg), AMBIENT: ("ambient_C", at.ambient),
         CHARGE: ("state_of_charge" if e.battery else "supply_voltage_V", at.charge),
     }  # fmt: skip
-    corner: Json = {known[a][0]: round(float(np.asarray(known[a][1])[k]), 9) for a in r.quantity.axes}
+    corner: Json = {places[a][0]: round(float(np.asarray(places[a][1])[k]), 9) for a in r.quantity.axes}
     if r.name == "endurance_min":
         low = e.charge_end
         corner |= {

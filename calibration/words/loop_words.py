@@ -105,7 +105,7 @@ def loop_answer(found: loop_notes.Headline) -> str:
     Terminal, page, result.json and robot files state this sentence, and no other level.
     """
     *first, last = [f"{f:g}" for f in found.factors]
-    at = f" at {', '.join(first)} and {last} times the noise" if first else ""
+    noises = f" at {', '.join(first)} and {last} times the noise" if first else ""
     claims = [c[: n or len(c)] for c, n in zip(found.claims, found.shared, strict=False)]
     lacks = _are_missing([" or ".join(map(with_article, sure)) for sure in claims] or ["something"])
     laws = [_law(*law) for law in zip(found.claims, found.families, found.values, strict=False)]
@@ -115,13 +115,13 @@ def loop_answer(found: loop_notes.Headline) -> str:
         if n and c[n:]
     )
     return {
-        "none": f"Yes, as far as these runs can show{at}: the residuals are consistent with noise.",
-        "undescribed": f"No verdict{at}: this model does not describe these runs.",
-        "open": f"Perhaps. The answers{at} differ: whether anything is missing depends on the noise.",
-        "named": f"No: {_are_missing(laws)}{at}.",
-        "class": f"No: {_are_missing(laws)}{at}.",
-        "mechanism": f"No: {lacks}{at}.{apart} Its exact law is not established.",
-        "place": f"No: {lacks}{at}.{apart} No more is established.",
+        "none": f"Yes, as far as these runs can show{noises}: the residuals are consistent with noise.",
+        "undescribed": f"No verdict{noises}: this model does not describe these runs.",
+        "open": f"Perhaps. The answers{noises} differ: whether anything is missing depends on the noise.",
+        "named": f"No: {_are_missing(laws)}{noises}.",
+        "class": f"No: {_are_missing(laws)}{noises}.",
+        "mechanism": f"No: {lacks}{noises}.{apart} Its exact law is not established.",
+        "place": f"No: {lacks}{noises}.{apart} No more is established.",
     }[found.level]
 
 
@@ -311,10 +311,14 @@ def regression_verdict(found: Ranking) -> str:
     alike = [e for e in beyond if e.score >= beyond[0].score - Settings.alternative]
     families = " or ".join(dict.fromkeys(with_article(e.family) for e in alike))
     lacks = f"{families} ({' or '.join(e.name for e in alike)})" if alike else "no effect explains it"
-    lacks = f"something is missing, {lacks}" if found.missing else "nothing exceeds chance"
+    lacks = f"something is missing, {lacks}" if found.missing else "no effect of the library exceeds chance"
     numbers = ", ".join(f"{name} {value:.4g} ± {sd:.2g}" for name, (value, sd) in found.parameters.items())
     numbers = f"; parameters [SI]: {numbers}" if numbers else ""
     return f"regression only, not confirmed by simulation: {lacks}{numbers}"
+
+
+#: Remark beside a regression that sees nothing, where the simulation does.
+DISAGREES = "by simulation something is missing: the refitted model leaves more than chance; trust the simulation"
 
 
 def so_far(effects: Sequence[str], families: Sequence[str]) -> str:
@@ -464,8 +468,8 @@ def largest_share(found: DiscoveryResult) -> str:
         return ""
     row, k = np.unravel_index(int(np.nanargmax(squares)), squares.shape)
     columns = {c: runs[c][row] for c in ("configuration", *runs.axes) if runs.has(c)}
-    at, label = _conditions(columns), found.channels[k].label
-    return f"Row {found.numbers[row]} ({at}): its {label} makes {share:.0f} % of the misfit that is left"
+    where, label = _conditions(columns), found.channels[k].label
+    return f"Row {found.numbers[row]} ({where}): its {label} makes {share:.0f} % of the misfit that is left"
 
 
 def _conditions(columns: Mapping[str, str | float]) -> str:
@@ -725,10 +729,10 @@ def track_model_answer(found: Resolved) -> str:
             f"leave it ({slip}, χ² falls by {found.fall:.0f}, p = {found.p:.2g}{why}){on}"
         )
     held = len(found.constants) - len(found.known_from_rows)
-    known = f"not determined by these rows: {held} of {len(found.constants)} constants"
+    undetermined = f"not determined by these rows: {held} of {len(found.constants)} constants"
     return (
         f"Track model, {track_model_question(found.asked)}: a running gear within its priors leaves it ({slip}, "
-        f"χ² falls by {found.fall:.0f}, p = {found.p:.2g}): {gear}; {known}{on}"
+        f"χ² falls by {found.fall:.0f}, p = {found.p:.2g}): {gear}; {undetermined}{on}"
     )
 
 
@@ -742,17 +746,17 @@ def in_parts(noise: SeriesNoise) -> str:
         f"{100 * noise.share:.2g} % of the reading" if noise.share else "",
     ]
     step = math.sqrt(12) * noise.least / noise.channel.factor
-    shown = f" (its display steps by {step:.2g} {noise.channel.unit})" if noise.least > noise.floor else ""
-    return " and ".join(filter(None, parts)) + shown
+    display = f" (its display steps by {step:.2g} {noise.channel.unit})" if noise.least > noise.floor else ""
+    return " and ".join(filter(None, parts)) + display
 
 
 def noise_from_series(noise: tuple[SeriesNoise, ...]) -> str:
     """Channels whose sds are estimated along series."""
-    shown = [f"{s.channel.label} {in_parts(s)}" for s in noise]
+    parts = [f"{s.channel.label} {in_parts(s)}" for s in noise]
     along = dict.fromkeys(f"{s.count} series of {s.axis}" for s in noise)
     freedom = min(s.freedom for s in noise)
     return (
-        f"no sd is stated for {', '.join(s.channel.name for s in noise)}: {', '.join(shown)} are estimated "
+        f"no sd is stated for {', '.join(s.channel.name for s in noise)}: {', '.join(parts)} are estimated "
         f"from how readings scatter along {' and '.join(along)} ({freedom:.1f} degrees of freedom); state yours with "
         "--noise"
     )
@@ -818,8 +822,8 @@ def rests_on(
     beside: tuple[float, ...] = (),
 ) -> str:
     """Sentence on an effect that depends on one run."""
-    at = _conditions(conditions)
-    run = f"{test.what} {test.rests_on}{f' ({at})' * bool(at)}"
+    where = _conditions(conditions)
+    run = f"{test.what} {test.rests_on}{f' ({where})' * bool(where)}"
     others = (
         f"run it at {axis} {' and '.join(f'{x:g}' for x in beside)} too"
         if beside

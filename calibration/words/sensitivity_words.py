@@ -44,13 +44,13 @@ def sensitivity_statement(found: SensitivityResult) -> str:
     if not leaders:
         return "None of these inputs changes any of these outputs."
     verb, measure, note = _CAUSES.get(found.method, ("causes", "variance", ""))
-    said = "; ".join(
+    listed = "; ".join(
         f"{input_in_words(found, name)} {verb} {100 * outputs[0][1]:.0f} % of the {measure} of {outputs[0][0]}"
         + "".join(f", {100 * share:.0f} % of {label}" for label, share in outputs[1:])
         for name, outputs in sorted(leaders.items(), key=lambda item: -len(item[1]))
     )
     where, idle = points_studied(found), len(found.negligible)
-    return f"{where}: {said}{note}. " + (
+    return f"{where}: {listed}{note}. " + (
         f"{idle} of {len(found.inputs)} inputs do not matter." if idle else "Every input matters somewhere."
     )
 

@@ -50,7 +50,7 @@ def differing_repeats(
 ) -> str:
     """Rows under the same conditions whose readings differ."""
     (first, second), (one, other) = rows, map(bound_text, values)
-    said = (
+    reading = (
         f"{source} rows {first} and {second}, {column}: the same conditions gave {one} and {other}, "
         f"{apart} apart{f' (and so {more} more)' * bool(more)}"
     )
@@ -58,10 +58,10 @@ def differing_repeats(
         many = len(unused) > 1
         name = f'state [columns] {near} = "{unused[0]}"' if near else "name it under [columns]"
         return (
-            f"{said}; {', '.join(unused)} {'vary' if many else 'varies'} there and {'are' if many else 'is'} "
+            f"{reading}; {', '.join(unused)} {'vary' if many else 'varies'} there and {'are' if many else 'is'} "
             f"not used as a condition: {name}, or give each level of a load a configuration"
         )
-    wrong = f"{said}; if one is wrong, remove it"
+    wrong = f"{reading}; if one is wrong, remove it"
     return f"{wrong}, else find what changed between such rows that the table does not state" if more else wrong
 
 
@@ -104,9 +104,9 @@ def copied_channel(source: str, column: str, other: str, intercept: float, slope
 
 def ends_early(runs: Names, lasts: float, share: float) -> str:
     """Histories that end before the robot is under way."""
-    at = "" if math.isnan(share) else f", at {share:.0%} of the speed of steady travel"
+    at_speed = "" if math.isnan(share) else f", at {share:.0%} of the speed of steady travel"
     return (
-        f"{_runs(runs, 'ends', 'end')} after {lasts:.2g} s at the latest{at}: before the robot is under "
+        f"{_runs(runs, 'ends', 'end')} after {lasts:.2g} s at the latest{at_speed}: before the robot is under "
         "way, so only priors determine its resistance to travel; record until the speed is steady"
     )
 

@@ -166,7 +166,7 @@ def climb_derivatives(
     ran = jax.tree.map(jnp.asarray, whole.run(0))
     count = len(ran.time)
     top = crest_sample(run.terrain, ran, verdict == OVER)
-    found, by = _along(
+    gradients, by = _along(
         lambda run_of: climb_outputs(run_of[0].robot, run_of[0].terrain, run_of[1], top),
         (run, ran),
         (turned, jax.tree.map(lambda x: x[:, :count], changed)),
@@ -181,7 +181,7 @@ def climb_derivatives(
     single = (jax.tree.map(lambda x, k=k: x[k], (more.robot, more.terrain)) for k in range(len(beside)))
     others = [outputs_of_run(robot, terrain, batch, k) for k, (robot, terrain) in enumerate(single)]
     slope, sd = {}, {}
-    for name in found:
+    for name in gradients:
         y = np.array([float(other[name]) for other in others]).reshape(-1, BESIDE)
         square, off = np.sum(offsets**2), y - y.mean(axis=1, keepdims=True)
         rise = off @ offsets / square
@@ -189,7 +189,7 @@ def climb_derivatives(
         slope[name] = rise / np.asarray(widths)
         sd[name] = np.sqrt(np.sum(left**2, axis=1) / (BESIDE - 2) / square) / np.asarray(widths)
     return Derivatives(
-        whole, {n: float(x) for n, x in found.items()}, {n: np.asarray(x) for n, x in by.items()}, slope, sd
+        whole, {n: float(x) for n, x in gradients.items()}, {n: np.asarray(x) for n, x in by.items()}, slope, sd
     )
 
 
@@ -206,15 +206,15 @@ def _along(function: Callable[[Any], Any], at: Any, directions: Any) -> tuple[An
 
     def one(moved: Any) -> tuple[Any, Any, Any]:
         def of_numbers(numbers: Any) -> tuple[Any, Any]:
-            found, others = eqx.partition(function(eqx.combine(numbers, rest)), eqx.is_inexact_array)
+            numeric, others = eqx.partition(function(eqx.combine(numbers, rest)), eqx.is_inexact_array)
             arrays, words = eqx.partition(others, eqx.is_array)
             further.append(words)
-            return found, arrays
+            return numeric, arrays
 
         return jax.jvp(of_numbers, (numbers,), (moved,), has_aux=True)
 
-    found, changed, arrays = jax.vmap(one, out_axes=(None, 0, None))(directions)
-    return eqx.combine(found, arrays, further[-1]), changed
+    values, changed, arrays = jax.vmap(one, out_axes=(None, 0, None))(directions)
+    return eqx.combine(values, arrays, further[-1]), changed
 
 
 def _initial(run: ClimbInputs, step: Scalar) -> Any:

@@ -87,8 +87,8 @@ class Sequence(eqx.Module):
 
     def asked(self, place: Scalar, time: Scalar) -> tuple[Array, Array]:
         """Demanded angles of front and rear [rad], or voltages of their motors, positive up [V]."""
-        at = time if self.over_time else place
-        return jnp.interp(at, self.at, self.front), jnp.interp(at, self.at, self.rear)
+        abscissa = time if self.over_time else place
+        return jnp.interp(abscissa, self.at, self.front), jnp.interp(abscissa, self.at, self.rear)
 
 
 def _turned(front: Array, rear: Array) -> Float[Array, " 2"]:
@@ -199,7 +199,7 @@ def climb_system(
     lever = jnp.stack([gear.lever_mass, gear.lever_centre, gear.lever_inertia]) * jnp.stack(
         [chassis.on_tracks, jnp.ones(()), chassis.on_tracks]
     )
-    main, own = (
+    main, rotor_inertia = (
         jax.tree.map(lambda part, whole: jnp.where(chassis.on_tracks > 0.5, part, whole), track, without)
         for track, without in zip(
             gear.levers.tracks(chassis.track),
@@ -211,7 +211,17 @@ def climb_system(
     robot = eqx.tree_at(lambda r: r.configurations.chosen, robot, chassis)
     drive = lever_drive(robot)
     return System(
-        robot, conditions, terrain, sequence, shape, half, lever, chassis, own, drive, jnp.asarray(step, float)
+        robot,
+        conditions,
+        terrain,
+        sequence,
+        shape,
+        half,
+        lever,
+        chassis,
+        rotor_inertia,
+        drive,
+        jnp.asarray(step, float),
     )
 
 
@@ -240,16 +250,16 @@ def mass_matrix_and_bias(run: System, q: Array, v: Array) -> tuple[Float[Array, 
         masses.append((half.pulley, axle, None, None))
         reach = lever.along(jnp.stack([centre_lever, zero]))
         masses.append((mass_lever, axle + reach, reach, lever.turns))
-    for mass, at, out, turns in masses:
-        columns = [jnp.stack([one, zero]), jnp.stack([zero, one]), across(at), *[jnp.zeros(2)] * 3]
-        centrifugal = -at * v[PITCH] ** 2
+    for mass, place, out, turns in masses:
+        columns = [jnp.stack([one, zero]), jnp.stack([zero, one]), across(place), *[jnp.zeros(2)] * 3]
+        centrifugal = -place * v[PITCH] ** 2
         if out is not None and turns is not None:
             columns[turns] = -across(out)
-            centrifugal = -(at - out) * v[PITCH] ** 2 - out * (v[PITCH] - v[turns]) ** 2
+            centrifugal = -(place - out) * v[PITCH] ** 2 - out * (v[PITCH] - v[turns]) ** 2
         moves = jnp.stack(columns, axis=1)
         matrix = matrix + mass * moves.T @ moves
         bias = bias + mass * moves.T @ (centrifugal + down)
-        height = height + mass * down @ (body.origin + at)
+        height = height + mass * down @ (body.origin + place)
     turning = [(half.inertia, {PITCH: 1.0}), (2 * half.inertia_pulley, {PITCH: 1.0, SHAFT: 1.0})]
     turning += [(run.lever[2], {PITCH: 1.0, k: -1.0}) for k in (FRONT, REAR)]
     for about, by in turning:
@@ -280,10 +290,16 @@ class _Mover(eqx.Module):
 
     def pull(self, chassis: Chassis, signals: Signals) -> _Pull:
         """Friction of the contacts (25) by Fig. 7, and of the guide (26)."""
-        at = self.at
-        force = jnp.asarray(chassis.ground.traction(_sliding(at, self.v, signals), at.force, signals.adhesion))
-        guide = jnp.sum(chassis.track.guide_friction * at.guided * at.force * signals.direction)
-        load = guide * self.radius + self.levers - jnp.sum(force * at.along[:, SHAFT] + at.force * at.off[:, SHAFT])
+        touching = self.at
+        force = jnp.asarray(
+            chassis.ground.traction(_sliding(touching, self.v, signals), touching.force, signals.adhesion)
+        )
+        guide = jnp.sum(chassis.track.guide_friction * touching.guided * touching.force * signals.direction)
+        load = (
+            guide * self.radius
+            + self.levers
+            - jnp.sum(force * touching.along[:, SHAFT] + touching.force * touching.off[:, SHAFT])
+        )
         return _Pull(jnp.sum(force), guide, load, force)
 
 
@@ -293,18 +309,20 @@ def _sliding(at: Footing, v: Array, signals: Signals) -> Array:
 
 def climb_instant(run: System, motion: Motion, on: Scalar) -> tuple[Signals, Footing, _Pull, Array]:
     """All signals, contacts, forces and load shares of an instant. `on`: share of their voltage at the motors."""
-    at = footing.footing(run.shape, run.terrain, motion.q, motion.v)
+    touching = footing.footing(run.shape, run.terrain, motion.q, motion.v)
     # share of each rolling contact in the load, and the robot's speed along the ground, their load-weighted mean
-    bears = at.force * at.rolls
+    bears = touching.force * touching.rolls
     share = bears / jnp.maximum(jnp.sum(bears), 1e-9)
-    speed = share @ (at.carried @ motion.v)
+    speed = share @ (touching.carried @ motion.v)
     conditions = _driven(run, on)
 
     ratio = run.robot.gearbox.ratio
     state = State(motion.current, ratio * motion.v[SHAFT], speed, motion.discharge)
-    mover = _Mover(at, motion.v, run.shape.main.first, jnp.sum(_lever_loss(run, motion.v[SHAFT] + motion.v[LED])))
+    mover = _Mover(
+        touching, motion.v, run.shape.main.first, jnp.sum(_lever_loss(run, motion.v[SHAFT] + motion.v[LED]))
+    )
     signals, pulled = balances.resolved_signals(run.robot, conditions, state, mover, 2 * run.half.inertia_pulley)
-    return signals, at, pulled, share
+    return signals, touching, pulled, share
 
 
 def _driven(run: System, on: Scalar) -> Conditions:
@@ -365,13 +383,13 @@ def advance_climb(run: System, motion: Motion, time: Scalar, energy: Energy) -> 
         Motion and energy after the step, and the record of the instant before it.
     """
     run, on = _loaded(run, motion), jnp.clip((time - SETTLES) / RISES, 0.0, 1.0)
-    signals, at, pulled, share = climb_instant(run, motion, on)
+    signals, touching, pulled, share = climb_instant(run, motion, on)
     robot, step, radius = run.robot, run.step, run.shape.main.first
     matrix, bias, height = mass_matrix_and_bias(run, motion.q, motion.v)
     ratio, rotor = robot.gearbox.ratio, robot.motor.inertia
     armature = rotor * ratio**2 * signals.efficiency_load + signals.inertia_added
-    resisted = signals.resistance * (share @ at.carried)
-    force = pulled.force @ at.along + at.force @ at.off - resisted
+    resisted = signals.resistance * (share @ touching.carried)
+    force = pulled.force @ touching.along + touching.force @ touching.off - resisted
     force = force.at[SHAFT].set(signals.torque_net - resisted[SHAFT])
     belts = motion.v[SHAFT] + motion.v[LED]
     lost, stiffens = jax.jvp(lambda speed: _lever_loss(run, speed), (belts,), (jnp.ones_like(belts),))
@@ -379,10 +397,10 @@ def advance_climb(run: System, motion: Motion, time: Scalar, energy: Energy) -> 
     force = force.at[LED].add(-lost)
 
     rises = jnp.maximum(
-        run.chassis.ground.traction_rise(_sliding(at, motion.v, signals), at.force, signals.adhesion), 0
+        run.chassis.ground.traction_rise(_sliding(touching, motion.v, signals), touching.force, signals.adhesion), 0
     )
-    shaft = _shaft_loss(run, motion, signals, at)
-    damping = contacts_resist(at.along, at.off, pulled.force, at.force, rises, at.damped)
+    shaft = _shaft_loss(run, motion, signals, touching)
+    damping = contacts_resist(touching.along, touching.off, pulled.force, touching.force, rises, touching.damped)
     damping = damping.at[SHAFT, SHAFT].add(shaft) + (_ON_BELTS.T * stiffens) @ _ON_BELTS
     whole = matrix.at[SHAFT, SHAFT].add(armature) + step * damping
     # of wheels, with massless levers
@@ -410,13 +428,13 @@ def advance_climb(run: System, motion: Motion, time: Scalar, energy: Energy) -> 
     pair = run.drive
     # (1 / step) is the compiler's form of a division by a constant: a step passed as an argument gives the same bits
     geared = (pair.constant * swung.current - pair.inertia * led * (1 / step) - swung.torque) @ middle[LED]
-    off, along = at.off @ gained, at.along @ gained
-    normal = at.force - at.damped * off
-    friction = pulled.force - rises * along - pulled.force / jnp.maximum(at.force, 1e-9) * at.damped * off
+    off, along = touching.off @ gained, touching.along @ gained
+    normal = touching.force - touching.damped * off
+    friction = pulled.force - rises * along - pulled.force / jnp.maximum(touching.force, 1e-9) * touching.damped * off
     motor = ratio * middle[SHAFT]
     drive = signals.torque_motor - signals.torque_idle
     mesh = drive - rotor * ratio * gained[SHAFT] * (1 / step)
-    own = signals.torque_load - signals.torque_track_loss - (pulled.load - pulled.guide * radius)
+    imbalance = signals.torque_load - signals.torque_track_loss - (pulled.load - pulled.guide * radius)
     rise = current - signals.current
     mean, resistance = signals.current + rise / 2, robot.motor.resistance
     added = run.step * robot.sides * jnp.stack([
@@ -424,21 +442,21 @@ def advance_climb(run: System, motion: Motion, time: Scalar, energy: Energy) -> 
         swung.voltage @ swung.current / robot.sides,
         (signals.voltage_drop + resistance * rise / 2) * mean + resistance * rise**2 / 12,
         signals.torque_motor_loss * motor,
-        (signals.torque_idle + (1 - signals.efficiency_load) * mesh) * motor + own * middle[SHAFT],
+        (signals.torque_idle + (1 - signals.efficiency_load) * mesh) * motor + imbalance * middle[SHAFT],
         (signals.torque_track_loss + shaft * gained[SHAFT]) * middle[SHAFT]
         + (lost + stiffens * (_ON_BELTS @ gained)) @ (_ON_BELTS @ middle),
-        -friction @ (at.along @ middle),
-        -(normal - at.elastic) @ (at.off @ middle),
+        -friction @ (touching.along @ middle),
+        -(normal - touching.elastic) @ (touching.off @ middle),
         resisted @ middle,
         pair.resistance * swung.current @ swung.current / robot.sides,
         geared / robot.sides,
     ])  # fmt: skip
     spent = {name: energy[name] + added[k] for k, name in enumerate((*SOURCES, *LOSSES))}
     kinetic = motion.v @ matrix @ motion.v + (signals.inertia_added + rotor * ratio**2) * motion.v[SHAFT] ** 2
-    stored = kinetic / 2 + signals.inductance * motion.current**2 / 2 + height + jnp.sum(at.energy)
+    stored = kinetic / 2 + signals.inductance * motion.current**2 / 2 + height + jnp.sum(touching.energy)
     up = jnp.array([1.0, -1.0])  # for a rear lever, upward is decreasing ψ
-    total = jnp.sum(at.force)
-    held = run.chassis.ground.force_adhesion(jnp.sum(at.force * at.rolls), signals.adhesion)
+    total = jnp.sum(touching.force)
+    held = run.chassis.ground.force_adhesion(jnp.sum(touching.force * touching.rolls), signals.adhesion)
     centre = motion.q[0] - matrix[1, PITCH] / matrix[0, 0]
     passed = ClimbRecord(
         time=time,
@@ -453,11 +471,11 @@ def advance_climb(run: System, motion: Motion, time: Scalar, energy: Energy) -> 
         energy=energy,
         stored=robot.sides * stored + pair.inertia * motion.v[LED] @ motion.v[LED] / 2,
         normal=total,
-        body=jnp.sum(at.force * (1 - at.rolls)) / jnp.maximum(total, 1e-9),
-        grip=jnp.sum(jnp.abs(pulled.force) * at.rolls) / jnp.maximum(held, 1e-9),
+        body=jnp.sum(touching.force * (1 - touching.rolls)) / jnp.maximum(total, 1e-9),
+        grip=jnp.sum(jnp.abs(pulled.force) * touching.rolls) / jnp.maximum(held, 1e-9),
         carried=total / (GRAVITY * matrix[0, 0]),
         centre=centre,
-        base=_base(centre, at),
+        base=_base(centre, touching),
     )
     return after, spent, passed
 
@@ -479,9 +497,9 @@ def _shaft_loss(run: System, motion: Motion, signals: Signals, at: Footing) -> S
     def loss(speed: Scalar) -> Scalar:
         direction = contact.smooth_sign(run.chassis.radius * speed, run.chassis.speed_still)
         motor = speed * run.robot.gearbox.ratio
-        own = run.robot.motor.torque_loss(motor, direction) + run.robot.gearbox.torque_idle(motor, direction)
+        idle_torque = run.robot.motor.torque_loss(motor, direction) + run.robot.gearbox.torque_idle(motor, direction)
         track = run.chassis.track.torque_loss(speed, direction)
-        return track + force * direction + own * run.robot.gearbox.ratio * signals.efficiency_load
+        return track + force * direction + idle_torque * run.robot.gearbox.ratio * signals.efficiency_load
 
     return jnp.maximum(jax.jvp(loss, (motion.v[SHAFT],), (one,))[1], 0.0)
 
@@ -644,8 +662,8 @@ def _part(
         return advance_samples(climb_system(robot, conditions, terrain, sequence, step), state, first, steps, samples)
 
     each = (_alike(robot), 0, 0, 0, 0)
-    found: tuple[Any, ClimbRecord] = jax.vmap(one, in_axes=each)(robot, conditions, terrain, sequence, state)
-    return found
+    parts: tuple[Any, ClimbRecord] = jax.vmap(one, in_axes=each)(robot, conditions, terrain, sequence, state)
+    return parts
 
 
 _compiled = compiled(_part, options=SMALL)

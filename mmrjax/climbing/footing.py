@@ -149,20 +149,20 @@ def _belt(shape: Shape, terrain: Terrain, belt: Loop, frame: Frame, drawn: Scala
     radius, main = shape.main.first, frame.turns is None
     place = belt.places(drawn)
     tips = belt_loop.grouser_tips(belt, place)
-    at = frame.world(tips.at)
-    gap, normal = terrain.distance(at)
+    points = frame.world(tips.at)
+    gap, normal = terrain.distance(points)
 
     def group(at: Array, gap: Array, normal: Array, rate: Array, place: Array) -> _Group:
         guided = _guided(shape, place) if main else jnp.zeros_like(gap)
         return _Group(at, gap, normal, radius * rate, frame.turns, guided, bears * jnp.ones_like(gap))
 
-    groups = [group(at, gap, normal, frame.along(tips.rate), place)]
+    groups = [group(points, gap, normal, frame.along(tips.rate), place)]
     corners = terrain.corners
     local = frame.within(corners)
     for near in (belt_loop.gaps_to_belt(belt, local), belt_loop.gaps_to_grousers(belt, drawn, local)):
         normal = -frame.along(near.normal)
-        at = corners + terrain.nose * -normal
-        groups.append(group(at, near.gap - terrain.nose, normal, frame.along(near.rate), near.place))
+        points = corners + terrain.nose * -normal
+        groups.append(group(points, near.gap - terrain.nose, normal, frame.along(near.rate), near.place))
     return groups
 
 
@@ -183,10 +183,10 @@ def _wheels(shape: Shape, terrain: Terrain, body: Frame) -> list[_Group]:
         to_corner = jnp.sqrt(jnp.sum(arm**2, axis=1))
         gap = jnp.concatenate([jnp.where(beside, to_edge, FAR_OFF), to_corner]) - shape.wheel - terrain.nose
         normal = jnp.concatenate([normals, arm / to_corner[:, None]])
-        at = centre - (shape.wheel + jnp.minimum(gap, 0.0))[:, None] * normal
+        touch_points = centre - (shape.wheel + jnp.minimum(gap, 0.0))[:, None] * normal
         none = jnp.zeros_like(gap)
         rate = shape.wheel * belt_loop.running_direction(-normal)
-        groups.append(_Group(at, gap, normal, rate, None, none, none + 1 - shape.on_tracks))
+        groups.append(_Group(touch_points, gap, normal, rate, None, none, none + 1 - shape.on_tracks))
     return groups
 
 
@@ -217,23 +217,23 @@ def footing(shape: Shape, terrain: Terrain, q: Array, v: Array) -> Footing:
     groups += _wheels(shape, terrain, body)
     groups.append(_body(shape, terrain, body))
 
-    at, normal, rate = (jnp.concatenate([getattr(g, name) for g in groups]) for name in ("at", "normal", "rate"))
+    points, normal, rate = (jnp.concatenate([getattr(g, name) for g in groups]) for name in ("at", "normal", "rate"))
     gap, guided, bears = (jnp.concatenate([getattr(g, name) for g in groups]) for name in ("gap", "guided", "bears"))
     rolls = np.concatenate([np.full(len(g.gap), g.rolls) for g in groups])
     along = belt_loop.running_direction(normal)
-    carried, own = [], []
+    carried, own_loads = [], []
     for direction in (normal, along):
-        columns = [direction[:, 0], direction[:, 1], _turned(direction, at - body.origin)]
+        columns = [direction[:, 0], direction[:, 1], _turned(direction, points - body.origin)]
         belt = jnp.sum(direction * rate, axis=1)
         levers, with_belt = [], []
         for lever in (front, rear):
             on = np.concatenate([np.full(len(g.gap), g.turns == lever.turns) for g in groups])
-            turned = jnp.where(on, -_turned(direction, at - lever.origin), 0.0)
+            turned = jnp.where(on, -_turned(direction, points - lever.origin), 0.0)
             levers.append(turned)
             with_belt.append(turned + jnp.where(on, belt, 0.0))
         carried.append(jnp.stack([*columns, 0 * belt, *levers], axis=1))
-        own.append(jnp.stack([*columns, belt, *with_belt], axis=1))
-    off, gear = own[0], shape.gear
+        own_loads.append(jnp.stack([*columns, belt, *with_belt], axis=1))
+    off, gear = own_loads[0], shape.gear
     gap_rate = off @ v
     stiffness, exponent = gear.contact_stiffness, gear.contact_exponent
     force = force_contact(gap, gap_rate, 0.0, stiffness, exponent, gear.contact_damping, gear.contact_depth) * bears
@@ -244,7 +244,7 @@ def footing(shape: Shape, terrain: Terrain, q: Array, v: Array) -> Footing:
         gap_rate=gap_rate,
         normal=normal,
         off=off,
-        along=own[1],
+        along=own_loads[1],
         carried=carried[1],
         force=force,
         damped=jnp.asarray(damping_contact(force, gap, 0.0, gear.contact_damping, gear.contact_depth)),
@@ -252,7 +252,7 @@ def footing(shape: Shape, terrain: Terrain, q: Array, v: Array) -> Footing:
         energy=elastic * depth / (exponent + 1),
         guided=guided,
         rolls=jnp.asarray(rolls),
-        place=at[:, 0],
+        place=points[:, 0],
     )
 
 

@@ -104,11 +104,11 @@ def side_outline(robot: Robot, conditions: Conditions, mass: Scalar | None = Non
     half, reach = gear.wheelbase / 2, gear.lever_length * tracked
     axle, roller = chassis.radius + tracked * gear.grouser_height, gear.levers.roller * tracked
     none = jnp.zeros_like(half)
-    at = [-half - reach * jnp.cos(rear), -half, half, half + reach * jnp.cos(front)]
+    corners = [-half - reach * jnp.cos(rear), -half, half, half + reach * jnp.cos(front)]
     lie = [reach * jnp.sin(rear), none, none, reach * jnp.sin(front)]
     forward, up, radius = (
         jnp.stack(jnp.broadcast_arrays(*(jnp.asarray(x) for x in row)), -1)
-        for row in (at, lie, [roller, axle, axle, roller])
+        for row in (corners, lie, [roller, axle, axle, roller])
     )
     return Outline(forward, up, radius, robot.radius_pulley + gear.grouser_height, tracked, ahead, high)
 
@@ -182,13 +182,13 @@ def rest_outline(side: Outline, slope: Scalar, inertia: Scalar) -> Posture:
     tangent = jnp.abs(ratio) < 1
     pitch = jnp.arcsin(jnp.where(tangent, ratio, 0.0)) - jnp.arctan2(rise, jnp.where(apart > 1e-6, ahead, 1.0))
     pitch = jnp.arctan2(jnp.sin(pitch), jnp.cos(pitch))
-    at = side.pitched(pitch)
-    low = at.up - at.radius  # (edges, circles)
+    rotated = side.pitched(pitch)
+    low = rotated.up - rotated.radius  # (edges, circles)
     every = np.arange(len(EDGES))
     gaps = low - low[every, tail][:, None]
-    rear, front = at.forward[every, tail], at.forward[every, nose]
-    high = jnp.asarray(at.centre_up) - low[every, tail]
-    centre = jnp.asarray(at.centre_forward)
+    rear, front = rotated.forward[every, tail], rotated.forward[every, nose]
+    high = jnp.asarray(rotated.centre_up) - low[every, tail]
+    centre = jnp.asarray(rotated.centre_forward)
     foot = centre - high * jnp.tan(slope)
     margin = jnp.minimum(foot - rear, front - foot)
 

@@ -260,8 +260,8 @@ def steps_over_lever_angles(
     The margin is on the slope of the run [m] (see `Posture`). Leaves have shape (n, m, ...).
     """
     pairs = np.stack(np.meshgrid(front_deg, rear_deg, indexing="ij"), -1)
-    found = _over_levers(robot, conditions, jnp.asarray(pairs.reshape(-1, 2), float))
-    return jax.tree.map(lambda x: x.reshape(*pairs.shape[:2], *x.shape[1:]), found)
+    step_heights = _over_levers(robot, conditions, jnp.asarray(pairs.reshape(-1, 2), float))
+    return jax.tree.map(lambda x: x.reshape(*pairs.shape[:2], *x.shape[1:]), step_heights)
 
 
 @jax.jit

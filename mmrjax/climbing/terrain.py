@@ -40,10 +40,10 @@ class Terrain(eqx.Module):
     @property
     def corners(self) -> Float[Array, "corners 2"]:
         """Convex corners, centres of the noses [m]. Concave ones are out of reach."""
-        before, at, after = self.points[:-2], self.points[1:-1], self.points[2:]
-        turn = _cross(at - before, after - at)
+        before, middle, after = self.points[:-2], self.points[1:-1], self.points[2:]
+        turn = _cross(middle - before, after - middle)
         # A repeated vertex has no edge; its next different vertex gives the direction.
-        return jnp.where((turn < -1e-15)[:, None], at, jnp.asarray(_NOWHERE))
+        return jnp.where((turn < -1e-15)[:, None], middle, jnp.asarray(_NOWHERE))
 
     def inside(self, at: Float[Array, "n 2"]) -> Bool[Array, " n"]:
         """True for points below the polyline."""

@@ -62,9 +62,9 @@ def compiled(function: Callable[P, T], *, options: dict[str, Any] | None = None)
         if structure is not None and structure in traced:
             return inner(*arguments[0], **arguments[1])
         with TRACING:
-            found = inner(*arguments[0], **arguments[1])
+            result = inner(*arguments[0], **arguments[1])
         if structure is not None:
             traced.add(structure)
-        return found
+        return result
 
     return call

@@ -79,8 +79,8 @@ class Program:
 
     def __call__(self, arguments: Any) -> Any:
         """Calls the function with arguments of this structure."""
-        found = iter(self.executable(*_arrays(jax.tree.leaves(arguments))))
-        return jax.tree.map(lambda x: next(found) if isinstance(x, _Place) else x, self.result)
+        outputs = iter(self.executable(*_arrays(jax.tree.leaves(arguments))))
+        return jax.tree.map(lambda x: next(outputs) if isinstance(x, _Place) else x, self.result)
 
 
 def compile_with_options(lowered: Any, options: dict[str, Any]) -> Any:
@@ -92,8 +92,8 @@ def compile_with_options(lowered: Any, options: dict[str, Any]) -> Any:
     try:
         return lowered.compile(options)
     except jax.errors.JaxRuntimeError as error:
-        known = {k: v for k, v in options.items() if f"No such compile option: '{k}'" not in str(error)}
-        return compile_with_options(lowered, known) if len(known) < len(options) else lowered.compile()
+        accepted = {k: v for k, v in options.items() if f"No such compile option: '{k}'" not in str(error)}
+        return compile_with_options(lowered, accepted) if len(accepted) < len(options) else lowered.compile()
 
 
 class Programs:
@@ -113,19 +113,19 @@ class Programs:
         folder = os.environ.get(VARIABLE, "")
         if structure is None or not folder or not _keeps() or not _private(folder):
             return None
-        known = self._found.get(structure)
-        if known is not None:
-            return known.result()
+        existing = self._found.get(structure)
+        if existing is not None:
+            return existing.result()
         # The tracing thread may wait for a program of another thread, which must have finished its own tracing.
         with TRACING:
             first = structure not in self._found
-            found = self._found.setdefault(structure, Future())
+            promise = self._found.setdefault(structure, Future())
             if first:
                 leaves, tree = jax.tree.flatten(arguments)
                 make = self._kept(structure, functools.partial(self._obtained, Path(folder), leaves, tree))
         if first:
-            found.set_result(self._kept(structure, make))
-        return found.result()
+            promise.set_result(self._kept(structure, make))
+        return promise.result()
 
     def _kept(self, structure: Hashable, make: Callable[[], T]) -> T:
         """Result of `make`, stored. After an error it is forgotten, and waiting threads receive the error."""
@@ -141,12 +141,12 @@ class Programs:
             name = _name(self.function, tree.unflatten([_shape(x) for x in leaves]))
         except (Unnamed, pickle.PicklingError, AttributeError, TypeError, RecursionError):
             return lambda: None
-        place, known = folder / f"{name}.program", None
+        place, loaded = folder / f"{name}.program", None
         with contextlib.suppress(Exception):  # an unreadable entry, for any reason, is made again
-            known = pickle.loads(place.read_bytes())
+            loaded = pickle.loads(place.read_bytes())
         arrays = _arrays(leaves)
-        if known is not None:
-            result, compiled = known
+        if loaded is not None:
+            result, compiled = loaded
             executable = _loaded(folder, compiled, len(arrays), result)
             if executable is not None:
                 return functools.partial(Program, executable, result)
@@ -157,20 +157,20 @@ class Programs:
 
         def make() -> Program:
             """Compiles in parallel with other threads that trace and compile."""
-            found = executable
-            if found is None:
+            program = executable
+            if program is None:
                 with _read_from_cache() as read:
-                    found = compile_with_options(lowered, self.options)
+                    program = compile_with_options(lowered, self.options)
                 # A program that JAX has read from its cache loses functions when it is written again (XLA on a CPU),
                 # and one with callbacks into Python holds addresses of this process.
                 if read or "callback" in text:
-                    return Program(found, result)
+                    return Program(program, result)
                 with contextlib.suppress(Exception):  # an unwritable program, for any reason, is not stored
-                    written = serialize_executable.serialize(found)[0]
+                    written = serialize_executable.serialize(program)[0]
                     _write(_executable(folder, compiled), zlib.compress(written, 1))
             with contextlib.suppress(pickle.PicklingError, AttributeError, TypeError):
                 _write(place, pickle.dumps((result, compiled)))
-            return Program(found, result)
+            return Program(program, result)
 
         return make
 
@@ -256,10 +256,10 @@ class _Describer(pickle.Pickler):
 
 def _found(thing: type) -> Any:
     """The object that a module holds under the name of a class."""
-    at: Any = sys.modules.get(thing.__module__)
+    scope: Any = sys.modules.get(thing.__module__)
     for name in thing.__qualname__.split("."):
-        at = getattr(at, name, None)
-    return at
+        scope = getattr(scope, name, None)
+    return scope
 
 
 def _name(function: Callable[..., Any], arguments: Any) -> str:

@@ -19,9 +19,9 @@ def compute(robot: Robot, conditions: Conditions) -> dict[str, Array]:
     Returns:
         `pitch` [rad], `highest_step`, in this posture, and `best_step`, in any [m], `status`: always `converged`.
     """
-    found = {
+    columns = {
         "pitch": resting_posture.posture(robot, conditions).pitch,
         "highest_step": static_limits.find_highest_step(resting_posture.side_outline(robot, conditions)).height,
         "best_step": static_limits.best_step(robot, conditions)[0].height,
     }
-    return {name: jnp.asarray(x) for name, x in found.items()} | {"status": jnp.asarray(CONVERGED)}
+    return {name: jnp.asarray(x) for name, x in columns.items()} | {"status": jnp.asarray(CONVERGED)}

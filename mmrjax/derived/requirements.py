@@ -149,7 +149,7 @@ def travel_quantities(robot: Robot, point: EnvelopePoint, rated: Ratings) -> tup
     warm = dataclasses.replace(robot.motor, temperature_ambient=point.ambient)  # its resistance as stated
     moving = jnp.where(jnp.abs(signals.speed) > 1e-6, signals.speed, 1e-6)
     turns = jnp.abs(signals.speed_motor)
-    found = {
+    quantities = {
         "speed_m_s": signals.speed,
         "speed_end_of_charge_m_s": signals.speed,
         "winding_C": warm.temperature_settled(signals.current),
@@ -164,7 +164,7 @@ def travel_quantities(robot: Robot, point: EnvelopePoint, rated: Ratings) -> tup
         "left": steepest_slope.travel_margin(here, signals),
         "cell": _cell(rated, signals, point),
     }
-    return {name: jnp.asarray(x) for name, x in found.items()}, outcome
+    return {name: jnp.asarray(x) for name, x in quantities.items()}, outcome
 
 
 def _travel(robot: Robot, point: EnvelopePoint, rated: Ratings, name: str) -> QuantityValue:
@@ -192,10 +192,10 @@ def _payload(robot: Robot, point: EnvelopePoint, rated: Ratings, name: str) -> Q
     most = CONDITIONS["payload"].range[1]
 
     def left(robot: Robot, payload: Scalar) -> Scalar:
-        at = dataclasses.replace(point, payload=payload)
-        here, conditions = _at(robot, at, rated)
+        loaded_point = dataclasses.replace(point, payload=payload)
+        here, conditions = _at(robot, loaded_point, rated)
         signals, _, _ = operating_state(here, conditions)
-        hot = heat_left(robot, at, signals.current, rated.temperature)
+        hot = heat_left(robot, loaded_point, signals.current, rated.temperature)
         torque = 1 - jnp.abs(signals.torque_gear) / rated.torque
         each = [steepest_slope.travel_margin(here, signals), hot, torque, _cell(rated, signals, point)]
         return functools.reduce(jnp.minimum, each)
@@ -226,10 +226,10 @@ def _edge(left, robot: Robot, low: Array, high: Array) -> tuple[Array, Array]:  
     steep = jax.jvp(lambda x: left(still, x), (at,), (jnp.ones_like(at),))[1]
     usable = jnp.isfinite(steep) & (jnp.abs(steep) > 1e-12)
     step = left(robot, at) / jnp.where(usable, jax.lax.stop_gradient(steep), 1.0)
-    found = at - jnp.where(usable & jnp.isfinite(step), step, 0.0)
+    edge = at - jnp.where(usable & jnp.isfinite(step), step, 0.0)
     # A margin that jumps has no root for a Newton step.
-    found = jnp.where(jnp.abs(found - at) < 1e-3 * (end - begin) + 1e-9, found, at)
-    return jnp.where(left(still, end) > 0, high, found), left(still, begin) > 0
+    edge = jnp.where(jnp.abs(edge - at) < 1e-3 * (end - begin) + 1e-9, edge, at)
+    return jnp.where(left(still, end) > 0, high, edge), left(still, begin) > 0
 
 
 #: Nodes of the integral over the charge.
@@ -257,8 +257,8 @@ def _endurance(robot: Robot, point: EnvelopePoint, rated: Ratings, name: str) ->
 
     end, begins = _edge(lambda robot, c: drawn(robot, c)[1], robot, first, last)
     nodes, weights = np.polynomial.legendre.leggauss(NODES)
-    at = first + (end - first) * jnp.asarray((nodes + 1) / 2)
-    current, _, status = jax.vmap(lambda c: drawn(robot, c))(at)
+    discharges = first + (end - first) * jnp.asarray((nodes + 1) / 2)
+    current, _, status = jax.vmap(lambda c: drawn(robot, c))(discharges)
     flowing = jnp.maximum(current, 1e-9)
     time = (end - first) * jnp.sum(jnp.asarray(weights / 2) / flowing)
     worst = status[jnp.argmax(status != CONVERGED)]
@@ -282,8 +282,8 @@ def _turn(robot: Robot, point: EnvelopePoint, rated: Ratings, name: str) -> Quan
         conditions, slope_deg=jnp.zeros(()), adhesion_lateral=jnp.asarray(point.adhesion_lateral),
         duty_left=jnp.asarray(DUTY_LEFT[name]), duty_right=jnp.asarray(1.0),
     )  # fmt: skip
-    found, motion, status = circling_signals(here, conditions)
-    low = jnp.any(jnp.asarray(_cell(rated, found.signals, point)) < 0)
+    signals, motion, status = circling_signals(here, conditions)
+    low = jnp.any(jnp.asarray(_cell(rated, signals.signals, point)) < 0)
     turns = jnp.where(jnp.abs(motion.yaw_rate) > 1e-6, motion.yaw_rate, 1e-6)
     rolls = motion.speed**2 + motion.speed_lateral**2
     # A root of 0 has no derivative.
@@ -322,8 +322,8 @@ def _posture(robot: Robot, point: EnvelopePoint, rated: Ratings, name: str) -> Q
         value = static_limits.stairs_rise(robot, conditions, point.tread, friction)
     else:
         angle = static_limits.flush_lever_angle(robot) if name == "gap_mm" else jnp.pi
-        found = static_limits.posture_limits(robot, static_limits.with_levers(conditions, angle, angle))
-        value = {"gap_mm": found.gap, "length_mm": found.length, "height_mm": found.height}[name]
+        limits = static_limits.posture_limits(robot, static_limits.with_levers(conditions, angle, angle))
+        value = {"gap_mm": limits.gap, "length_mm": limits.length, "height_mm": limits.height}[name]
     return QuantityValue(jnp.asarray(value), jnp.asarray(CONVERGED))
 
 

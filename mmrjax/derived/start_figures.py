@@ -89,8 +89,8 @@ def mean_slip(
     if not end > begin:
         return np.nan
     within = time[(time > begin) & (time < end)]
-    at = np.concatenate([[begin], within, [end]])
-    travelled, rolled = (np.trapezoid(np.interp(at, time, v), at) for v in (speed, theoretical))
+    instants = np.concatenate([[begin], within, [end]])
+    travelled, rolled = (np.trapezoid(np.interp(instants, time, v), instants) for v in (speed, theoretical))
     return float(1 - travelled / rolled) if abs(rolled) > 1e-9 else np.nan
 
 
@@ -133,7 +133,7 @@ def stages_of_histories(
     Args:
         which: index of each run's configuration in `robot`. Its loads are vehicles.
     """
-    found: list[StartStages | None] = []
+    stages: list[StartStages | None] = []
     for k, index in enumerate(which):
         signals = history.signals
         upto = count_finite_samples(np.asarray(signals.total_current)[k])
@@ -143,8 +143,8 @@ def stages_of_histories(
         static, way = float(chassis.ground.friction.speed_static), 0.0
         if history.reactions is not None:  # from individual contacts
             way = PITCH_GROUSER if float(chassis.on_tracks) > 0.5 else PITCH_TOOTH
-        found.append(stages_of_start(time, motion[0], motion[1], motion[2], static, way) if upto else None)
-    return found
+        stages.append(stages_of_start(time, motion[0], motion[1], motion[2], static, way) if upto else None)
+    return stages
 
 
 def count_finite_samples(values: Float[np.ndarray, " times"]) -> int:
@@ -174,15 +174,15 @@ def curve_peak(times: Float[Array, " times"], x: Float[Array, " times"], kink: S
         x: samples, NaN if the curve has no value.
         kink: largest value of the parabola. At a limit of the current the curve has a corner.
     """
-    known = jnp.where(jnp.isfinite(x), x, -jnp.inf)
-    k = jnp.clip(jnp.argmax(known), 1, x.shape[0] - 2)
+    finite_values = jnp.where(jnp.isfinite(x), x, -jnp.inf)
+    k = jnp.clip(jnp.argmax(finite_values), 1, x.shape[0] - 2)
     before, after = times[k] - times[k - 1], times[k + 1] - times[k]
     inside = (before > 0) & (after > 0) & (x[k] > x[k - 1]) & (x[k] > x[k + 1])
     before, after = jnp.where(inside, before, 1.0), jnp.where(inside, after, 1.0)
     rise, fall = (x[k] - x[k - 1]) / before, (x[k + 1] - x[k]) / after
     bend = (fall - rise) / (before + after)
     slope = rise + bend * before
-    highest = known[jnp.argmax(known)]
+    highest = finite_values[jnp.argmax(finite_values)]
     top = jnp.minimum(x[k] - slope**2 / (4 * jnp.where(inside, bend, -1.0)), jnp.maximum(kink, highest))
     return jnp.where(inside, top, highest)
 
@@ -230,7 +230,7 @@ def compute(robot: Robot, conditions: Conditions) -> dict[str, Array]:
     width = jnp.diff(times)
     whole = jnp.concatenate([jnp.zeros(1), jnp.cumsum(width * (power[1:] + power[:-1]) / 2)])
     here = power[k] + share * (power[k + 1] - power[k])
-    found = {
+    columns = {
         "peak_current": curve_peak(
             times, jnp.asarray(robot.sides * signals.current), robot.sides * robot.driver.current_limit
         ),
@@ -238,4 +238,4 @@ def compute(robot: Robot, conditions: Conditions) -> dict[str, Array]:
         "energy_start": whole[k] + share * width[k] * (power[k] + here) / 2,
     }
     converged = run.result.status == CONVERGED
-    return {**{name: jnp.where(converged, x, jnp.nan) for name, x in found.items()}, "status": run.result.status}
+    return {**{name: jnp.where(converged, x, jnp.nan) for name, x in columns.items()}, "status": run.result.status}

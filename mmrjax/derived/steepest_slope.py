@@ -53,7 +53,7 @@ def compute(robot: Robot, conditions: Conditions) -> dict[str, Array]:
     flat = operating_point(robot, dataclasses.replace(conditions, slope_deg=jnp.zeros_like(conditions.slope_deg)))[0]
     still_robot, still = jax.lax.stop_gradient((robot, conditions))
 
-    found: optx.Solution = optx.root_find(
+    solution: optx.Solution = optx.root_find(
         lambda slope, _: slope_margin(still_robot, still, slope),
         optx.Bisection(rtol=0.0, atol=0.0, flip=True),  # type: ignore[call-arg]  # its norm is no field
         jnp.full_like(conditions.slope_deg, STEEPEST / 2),
@@ -61,11 +61,11 @@ def compute(robot: Robot, conditions: Conditions) -> dict[str, Array]:
         max_steps=HALVINGS,
         throw=False,
     )
-    at = jax.lax.stop_gradient(found.value)
+    root = jax.lax.stop_gradient(solution.value)
     slope = jax.lax.stop_gradient(
-        jax.jvp(lambda a: slope_margin(still_robot, still, a), (at,), (jnp.ones_like(at),))[1]
+        jax.jvp(lambda a: slope_margin(still_robot, still, a), (root,), (jnp.ones_like(root),))[1]
     )
-    held = at - slope_margin(robot, conditions, at) / slope
-    holds_all = slope_margin(still_robot, still, jnp.full_like(at, STEEPEST)) > 0
+    held = root - slope_margin(robot, conditions, root) / slope
+    holds_all = slope_margin(still_robot, still, jnp.full_like(root, STEEPEST)) > 0
     held = jnp.where(holds_all, STEEPEST, jnp.clip(held, 0.0, STEEPEST))
     return {"steepest_slope": jnp.where(flat.status == CONVERGED, held, jnp.nan), "status": flat.status}

@@ -45,8 +45,8 @@ def compute(robot: Robot, conditions: Conditions) -> dict[str, Array]:
         `turning_radius` [m], NaN if no turn settles. `status` of the turn. Derivatives are implicit.
     """
     point = steady(robot, conditions)
-    found = turning_radius(*(point.reading[name] for name in PLANE))
-    return {"turning_radius": jnp.where(jnp.isnan(point.speed), jnp.nan, found), "status": point.status}
+    radius = turning_radius(*(point.reading[name] for name in PLANE))
+    return {"turning_radius": jnp.where(jnp.isnan(point.speed), jnp.nan, radius), "status": point.status}
 
 
 def turns_under_equal_commands(robot: Robot, imposed: float) -> Result:
@@ -74,7 +74,7 @@ def turning_columns(robot: Robot, reading: Mapping[str, Any], radius: np.ndarray
     rolled = {side: radius * n / float(robot.gearbox.ratio) for side, n in shafts.items()}
     units = float(robot.sides) / 2
     ahead, left = (-np.asarray(reading["lateral_speed"]) / rate, np.asarray(reading["speed"]) / rate)
-    found = {
+    columns = {
         "turning_radius_mm": np.asarray(turning_radius(*(np.asarray(reading[name]) for name in PLANE))) / MM,
         "centre_x_mm": ahead / MM,
         "centre_y_mm": left / MM,
@@ -82,8 +82,8 @@ def turning_columns(robot: Robot, reading: Mapping[str, Any], radius: np.ndarray
     }
     for side in channels.SIDES:
         current = np.asarray(reading[f"motor_current_{side}"])
-        found[f"power_{side}_W"] = units * np.asarray(reading[f"motor_voltage_{side}"]) * current
+        columns[f"power_{side}_W"] = units * np.asarray(reading[f"motor_voltage_{side}"]) * current
     for side in channels.SIDES:
         current = np.asarray(reading[f"motor_current_{side}"])
-        found[f"winding_{side}_C"] = np.asarray(robot.motor.temperature_settled(jnp.asarray(current)))
-    return {name: np.where(np.isnan(turn), np.nan, x) for name, x in found.items()}
+        columns[f"winding_{side}_C"] = np.asarray(robot.motor.temperature_settled(jnp.asarray(current)))
+    return {name: np.where(np.isnan(turn), np.nan, x) for name, x in columns.items()}

@@ -185,5 +185,5 @@ def name_class(kind: type[Effect], name: str) -> type[Effect]:
 
 def effects_of_module(module: ModuleType) -> tuple[type[Effect], ...]:
     """The effects that a module defines, in its order. Classes without a `term` are left out."""
-    own = [v for v in vars(module).values() if inspect.isclass(v) and v.__module__ == module.__name__]
-    return tuple(v for v in own if issubclass(v, Effect) and not inspect.isabstract(v))
+    classes = [v for v in vars(module).values() if inspect.isclass(v) and v.__module__ == module.__name__]
+    return tuple(v for v in classes if issubclass(v, Effect) and not inspect.isabstract(v))

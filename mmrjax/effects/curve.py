@@ -200,15 +200,15 @@ def _description(place: str, over: str) -> str:
 
 def _curve(place: str, over: str) -> type[Effect]:
     """The curve of one variable in one balance, or in the readings of one channel."""
-    shown = place in READINGS
+    is_reading = place in READINGS
     unit, size, _ = PLACES[place]
     abscissa = EVERY_VARIABLE[over]
     unit_x, first, last = abscissa.unit, abscissa.low, abscissa.high
 
     class Curve(Effect):
         name = f"curve_{place}_{over}"
-        balance = "sensor" if shown else place
-        channel = place if shown else ""
+        balance = "sensor" if is_reading else place
+        channel = place if is_reading else ""
         driver = THE_SIDE if over == "side" else ""
         variable: ClassVar[str] = over
         memory_size = 1.0 if over == "time" else None

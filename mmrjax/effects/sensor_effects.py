@@ -27,9 +27,9 @@ class SensorEffect(Effect):
         """True if the error does not depend on the value shown."""
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:
-        shown = robot.rig.instrument(self.channel).shows(channels.find_channel(self.channel).read(robot, signals))
+        reading = robot.rig.instrument(self.channel).shows(channels.find_channel(self.channel).read(robot, signals))
         # A factor 1 of the signals' shape keeps a batch a batch.
-        return self.amplitude * (jnp.ones_like(shown) if self.of_zero else shown)
+        return self.amplitude * (jnp.ones_like(reading) if self.of_zero else reading)
 
 
 class AmmeterGain(SensorEffect):
@@ -133,9 +133,9 @@ def _errors() -> Iterator[type[Effect]]:
     First those of scale, except of temperatures, whose zero is a convention. Then those of zero. Random numbers
     depend on the position: add new ones at the end.
     """
-    own = [c for c in channels.EVERY if c not in channels.usual_channels()]
-    yield from (_error(c, of_zero=c.unit_shown == "°C") for c in own)
-    yield from (_error(c, of_zero=True) for c in own if c.misses_zero)
+    further = [c for c in channels.EVERY if c not in channels.usual_channels()]
+    yield from (_error(c, of_zero=c.unit_shown == "°C") for c in further)
+    yield from (_error(c, of_zero=True) for c in further if c.misses_zero)
 
 
 #: A rig has the errors of its channels.

@@ -107,8 +107,8 @@ class Facts:
             if value is None:
                 continue
             if name not in values:
-                known = ", ".join(values) or "none"
-                raise ValueError(f"{name}: got {value!r}; this fidelity has no such option; its options: {known}")
+                listed = ", ".join(values) or "none"
+                raise ValueError(f"{name}: got {value!r}; this fidelity has no such option; its options: {listed}")
             values[name] = float(value)
         for option in self.options:
             value = values[option.name]

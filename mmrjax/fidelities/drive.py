@@ -67,16 +67,16 @@ class Trajectory(eqx.Module):
 def drive_units(robot: Robot) -> tuple[float, ...]:
     """Units of the unknowns."""
     memory = tuple(effect.memory_size or 1.0 for effect in robot.remembering)
-    return _UNITS + memory + (1.0,) * (robot.controller is not None) + (_GAP,) * robot.loose
+    return _UNITS + memory + (1.0,) * robot.controller_size + (_GAP,) * robot.loose
 
 
 def state_of_unknowns(robot: Robot, y: Float[Array, " unknowns"]) -> State:
     """The state of a vector of unknowns."""
     y = y * jnp.asarray(drive_units(robot), y.dtype)
     memory = {effect.name: y[len(_UNITS) + k] for k, effect in enumerate(robot.remembering)}
-    integral = None if robot.controller is None else y[len(_UNITS) + len(memory)]
-    gap = y[-1] if robot.loose else None
-    return State(y[0], y[1], y[2], y[4], memory, distance=y[3], gap=gap, integral=integral)
+    first = len(_UNITS) + len(memory)
+    own = dict(zip(("integral", "command"), y[first : first + robot.controller_size], strict=False))
+    return State(y[0], y[1], y[2], y[4], memory, distance=y[3], gap=y[-1] if robot.loose else None, **own)
 
 
 #: The signals of an instant, traced once for each kind of robot and shared within a program.
@@ -106,7 +106,7 @@ def drive_rates(
         signals.speed,
         balances.charge_drawn(robot, conditions, signals.total_current),
         *(jnp.asarray(effect.rate(robot, signals), y.dtype) for effect in robot.remembering),
-        *([] if robot.controller is None else [balances.integrated_error(robot, conditions, state)]),
+        *balances.controller_rates(robot, conditions, state),
         *[signals.speed_wheel - signals.speed_output] * robot.loose,
     ]
     return jnp.stack(rates) / jnp.asarray(drive_units(robot), y.dtype)
@@ -138,8 +138,8 @@ def drive_start(robot: Robot, conditions: Conditions, rolling: bool = False) -> 
         first = _initial(robot, conditions)
         angle = first[3] / robot.chassis(conditions.configuration).radius
         memory = [effect.initial(robot, angle) for effect in robot.remembering]
-        known = jnp.stack([*first, jnp.asarray(conditions.discharge, size.dtype), *memory])
-        rest = rest.at[: len(known)].set(known / size[: len(known)])
+        begin = jnp.stack([*first, jnp.asarray(conditions.discharge, size.dtype), *memory])
+        rest = rest.at[: len(begin)].set(begin / size[: len(begin)])
     if robot.loose:
         shaft = robot.chassis(conditions.configuration)
         rest = rest.at[-1].set(shaft.twist(shaft.torque_load(rest[3] * size[3] / shaft.radius)) / size[-1])
@@ -148,8 +148,9 @@ def drive_start(robot: Robot, conditions: Conditions, rolling: bool = False) -> 
     settled = operating_signals(robot, conditions)
     memory = [effect.settled(robot, settled) for effect in robot.remembering]
     state = [settled.current, settled.speed_motor, settled.speed, 0.0, conditions.discharge, *memory]
-    state += [jnp.zeros(())] * (robot.controller is not None)
-    state += [robot.chassis(conditions.configuration).twist(settled.torque_output)] * robot.loose
+    state += [jnp.zeros(())] * robot.controller_size
+    if robot.loose:
+        state += [robot.chassis(conditions.configuration).twist(settled.torque_output)]
     y = jnp.stack([jnp.asarray(x, size.dtype) for x in state]) / size
     return jnp.where(jnp.all(jnp.isfinite(y)), y, rest)
 

@@ -207,9 +207,9 @@ class RunStep(eqx.Module):
         before = eqx.combine(self.before, constant)
         nothing = [x if x is None else self.begun * x for x in (before.duty, before.motor_current)]
         before = eqx.tree_at(lambda c: [c.duty, c.motor_current], before, nothing, is_leaf=lambda x: x is None)
-        at = jnp.stack([y, y, y + MORE * _current(y)])
+        states = jnp.stack([y, y, y + MORE * _current(y)])
         each = jax.tree.map(lambda before, now: jnp.stack([before, now, now]), before, now)
-        return jax.vmap(rate)(at, each)
+        return jax.vmap(rate)(states, each)
 
 
 def run_steps(conditions: Conditions, times: Float[Array, " times"]) -> tuple[RunStep, Conditions]:
@@ -246,9 +246,9 @@ def _lag(rate: Float[Array, " rates"], step: RunStep, current: Scalar, limit: Sc
 def _decaying(begin: Array, decay: Array, h: Array) -> Lag:
     """Lag in a part of a step, from its value at the start."""
     parts = jnp.array([1 - _GAMMA, _GAMMA]) * h
-    at = begin * jnp.exp(-decay * jnp.stack([jnp.zeros(()), parts[0]]))
+    currents = begin * jnp.exp(-decay * jnp.stack([jnp.zeros(()), parts[0]]))
     z = decay * parts
-    means = jnp.where(z > 0, -jnp.expm1(-z) / jnp.where(z > 0, z, 1.0), 1.0) * at
+    means = jnp.where(z > 0, -jnp.expm1(-z) / jnp.where(z > 0, z, 1.0), 1.0) * currents
     return Lag(begin, means, begin * jnp.exp(-decay * h), decay)
 
 
@@ -355,8 +355,8 @@ def solve_states(robot: Robot, conditions: Conditions, times: Float[Array, " tim
 
             def stage(given: tuple[Array, Array], mean: Array) -> tuple[tuple[Array, Array], Array]:
                 now = functools.partial(law, way=part.side)
-                found = _stage(now, *given, part.length, mean * _current(y), mine.decay)
-                return (first + (1 - _GAMMA) / _GAMMA * (found - first), found), found
+                stage_result = _stage(now, *given, part.length, mean * _current(y), mine.decay)
+                return (first + (1 - _GAMMA) / _GAMMA * (stage_result - first), stage_result), stage_result
 
             stages = jax.lax.scan(stage, (first, first), mine.means)[1]
             end = stages[1] + mine.end * _current(y)
@@ -377,8 +377,8 @@ def solve_states(robot: Robot, conditions: Conditions, times: Float[Array, " tim
 
         side = _side(robot, held, y)
         whole = _Part(jnp.asarray(0), y, lag.begin, step.length, side, jnp.stack([y, y]), y)
-        found = jax.lax.while_loop(lambda part: part.turn < TURNS + 2, turned, whole)
-        return found.end, RunStates(found.stages, found.end, jnp.stack([side, found.side]), found.length)
+        last = jax.lax.while_loop(lambda part: part.turn < TURNS + 2, turned, whole)
+        return last.end, RunStates(last.stages, last.end, jnp.stack([side, last.side]), last.length)
 
     return jax.lax.scan(taken, first_state, steps)[1]
 
@@ -454,8 +454,8 @@ def _ends(
 @_ends.def_jvp
 def _response(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
     """Tangents with respect to the robot's parameters."""
-    (robot, conditions, times, known), moved = primals, tangents[0]
-    along = known if isinstance(known, LinearisedRun) else linearise_run(robot, conditions, times, known)
+    (robot, conditions, times, states), moved = primals, tangents[0]
+    along = states if isinstance(states, LinearisedRun) else linearise_run(robot, conditions, times, states)
 
     def change(law: Callable[[Robot], Array]) -> Array:
         value, moves = eqx.filter_jvp(law, (robot,), (moved,))
@@ -465,7 +465,7 @@ def _response(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
         return change(lambda r: drive_rates(r, held, y, way))
 
     begin = change(lambda r: first_instant(r, conditions)[1])
-    return known.ends, run_response(conditions, along, source, lambda t, y, dy, _: dy, begin)
+    return states.ends, run_response(conditions, along, source, lambda t, y, dy, _: dy, begin)
 
 
 def run_response(
@@ -493,10 +493,10 @@ def run_response(
         """Contribution of the sources of a step, at its end."""
         held = step.held(constant)
         both = jax.vmap(lambda t, y, way: source(t, y, held, way))(along.clock[1:], along.places, along.sides)
-        found = jnp.tensordot(along.gains, both, ((0, 2), (0, 1)))
+        tangents = jnp.tensordot(along.gains, both, ((0, 2), (0, 1)))
         at_start = lambda y, held: source(along.clock[0], y, held, along.sides[0])[CURRENT]  # noqa: E731
         of_lag = step.rates_at_start(constant, at_start, along.begins)
-        return found + jnp.tensordot(along.lags, of_lag, ((0,), (0,)))
+        return tangents + jnp.tensordot(along.lags, of_lag, ((0,), (0,)))
 
     def after(dy: Array, step: tuple[Array, Array]) -> tuple[Array, Array]:
         dy = jnp.tensordot(step[0], dy, 1) + step[1]
@@ -643,11 +643,11 @@ def course_between_instants(
                 first, first, _shown(robot, eqx.combine(then, constant), after, sides[1]), jnp.zeros(())
             )
         lag, current = _lag_of(robot, constant, step, y), _current(y)
-        at = jnp.stack([y, y - lag.begin * current, after - lag.end * current])
-        found = jax.vmap(lambda *at: jax.tree.map(jnp.asarray, _shown(robot, held, *at)))(
-            at, sides[np.array([0, 0, 1])]
+        states = jnp.stack([y, y - lag.begin * current, after - lag.end * current])
+        rows = jax.vmap(lambda *at: jax.tree.map(jnp.asarray, _shown(robot, held, *at)))(
+            states, sides[np.array([0, 0, 1])]
         )
-        first, begin, end = (jax.tree.map(lambda x, k=k: x[k], found) for k in range(3))
+        first, begin, end = (jax.tree.map(lambda x, k=k: x[k], rows) for k in range(3))
         return StepCourse(first, begin, end, lag.decay * step.length)
 
     return jax.vmap(one)(*each)

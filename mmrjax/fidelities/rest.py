@@ -36,10 +36,10 @@ def smallest(*values: Scalar) -> Array:
     The derivative of `jnp.minimum` is 0 if XLA computes an argument twice with different rounding, because it
     compares each argument with the result.
     """
-    found = jnp.asarray(values[0])
+    least = jnp.asarray(values[0])
     for value in values[1:]:
-        found = jnp.where(value < found, value, found)
-    return found
+        least = jnp.where(value < least, value, least)
+    return least
 
 
 def travel_direction(robot: Robot, conditions: Conditions) -> Array:
@@ -220,7 +220,7 @@ def shaft_direction(robot: Robot, conditions: Conditions, state: State) -> Array
 
     def leaving(robot: Robot, conditions: Conditions, state: State) -> Array:
         settled = dataclasses.replace(state, current=current_at_rest(robot, conditions, state))
-        now, then = (_about_to_turn(robot, conditions, at) for at in (state, settled))
+        now, then = (_about_to_turn(robot, conditions, state_there) for state_there in (state, settled))
         turned, later = (1.0 * (ahead.torque_net > 0) - 1.0 * (back.torque_net < 0) for ahead, back in (now, then))
         stands, moved = state.speed_motor == 0, jnp.sign(state.speed_motor)
         held = jnp.where(later != 0, 0.0, jnp.where(stands, HELD, moved))

@@ -34,7 +34,7 @@ def result_of_signals(robot: Robot, signals: Signals, status: Int[Array, "..."])
     limit = robot.motor.temperature_limit
     hot = (temperature > limit) & (limit < UNLIMITED) & robot.knows(HEAT)  # settled or not
     flags = flag_mask({**exceeded_limits(robot, signals), "winding_hot": hot})
-    found = Result(
+    result = Result(
         reading=balances.sensor(robot, signals),
         theoretical_speed=signals.speed_theoretical,
         slip=ground.slip_ratio(signals.speed, signals.speed_theoretical),
@@ -55,7 +55,7 @@ def result_of_signals(robot: Robot, signals: Signals, status: Int[Array, "..."])
         status=status,
         flags=flags,
     )
-    return mask_unknown(robot, found)
+    return mask_unknown(robot, result)
 
 
 def mask_unknown(robot: Robot, found: Result) -> Result:

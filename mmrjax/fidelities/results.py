@@ -91,9 +91,9 @@ def _in_chunks(fidelity: Fidelity, function: Callable[[Conditions], T], conditio
     filled = min(fidelity.facts.filled(runs), size)
     if 0 < runs < filled:
         rows = np.minimum(np.arange(filled), runs - 1)  # padding repeats the last run
-        found = function(jax.device_put(jax.tree.map(lambda x: np.ravel(x)[rows], conditions)))
+        part = function(jax.device_put(jax.tree.map(lambda x: np.ravel(x)[rows], conditions)))
         return jax.device_put(
-            jax.tree.map(lambda x: np.asarray(x)[:runs].reshape((*conditions.shape, *x.shape[1:])), found)
+            jax.tree.map(lambda x: np.asarray(x)[:runs].reshape((*conditions.shape, *x.shape[1:])), part)
         )
     every = flatten_conditions(conditions)
     if runs <= size:
@@ -138,8 +138,8 @@ def total_mass(robot: Robot, conditions: Conditions) -> jax.Array:
     """Mass of robot and payload, stated or the robot's own [kg]."""
     if conditions.total_mass is not None:
         return conditions.total_mass
-    own = tuple(chassis.mass for chassis in robot.configurations.members)
-    return _own_mass(own, conditions.configuration, conditions.payload)
+    masses = tuple(chassis.mass for chassis in robot.configurations.members)
+    return _own_mass(masses, conditions.configuration, conditions.payload)
 
 
 @compiled
@@ -237,9 +237,9 @@ class Results:
     def pending(batch: Pending, configurations: tuple[str, ...], model: str) -> Results:
         """Results that will be computed at first use."""
         results = object.__new__(Results)
-        known = {"conditions": batch.conditions, "further": {}, "history": None, "mission": None, "stated": ()}
+        fields = {"conditions": batch.conditions, "further": {}, "history": None, "mission": None, "stated": ()}
         results.__dict__.update(
-            known, configurations=configurations, model=model, channels=batch.robot.channels, _pending=batch
+            fields, configurations=configurations, model=model, channels=batch.robot.channels, _pending=batch
         )
         return results
 
@@ -252,21 +252,21 @@ class Results:
 
     def _compute(self, name: str) -> None:
         """Computes the program that holds a name, unless a computed one has it."""
-        own, batch = self.__dict__, self.__dict__.get("_pending")
+        cache, batch = self.__dict__, self.__dict__.get("_pending")
         if batch is None or name.startswith("_"):
             return
         if name == "total_mass":
-            own[name] = batch.total_mass()
-        elif "result" not in own and name in (*channel_names(batch.robot.channels), "status"):
-            shown = own.get("_shown") or batch.shown()
-            own["_shown"] = {**shown, STATUS: _compared(shown[STATUS])}
-            own.update(own["_shown"])
-        elif "result" not in own:
+            cache[name] = batch.total_mass()
+        elif "result" not in cache and name in (*channel_names(batch.robot.channels), "status"):
+            columns = cache.get("_shown") or batch.shown()
+            cache["_shown"] = {**columns, STATUS: _compared(columns[STATUS])}
+            cache.update(cache["_shown"])
+        elif "result" not in cache:
             whole = batch.result()
-            shown = own.get("_shown", {})
-            reading = {k: shown.get(k, x) for k, x in whole.reading.items()}
-            status = shown.get(STATUS, _compared(whole.status))
-            own["result"] = dataclasses.replace(whole, reading=reading, status=status)
+            columns = cache.get("_shown", {})
+            reading = {k: columns.get(k, x) for k, x in whole.reading.items()}
+            status = columns.get(STATUS, _compared(whole.status))
+            cache["result"] = dataclasses.replace(whole, reading=reading, status=status)
 
     def __getattr__(self, name: str) -> Any:
         self._compute(name)

@@ -180,27 +180,27 @@ def _missions(robot: Robot, conditions: Conditions, profile: Profile, start: Sta
         cell = mission_batch.cell_below_cutoff(robot, runs, profile, start)
         if np.isfinite(cell).any():
             k = int(np.argmax(np.isfinite(cell)))
-            at = f"[{k}]" if len(cell) > 1 else ""
+            run = f"[{k}]" if len(cell) > 1 else ""
             raise UsageError(
-                f"discharge{at}: got {float(np.asarray(runs.discharge)[k]):g} C; a cell is then at {cell[k]:.4g} V, "
+                f"discharge{run}: got {float(np.asarray(runs.discharge)[k]):g} C; a cell is then at {cell[k]:.4g} V, "
                 f"below its cut-off of {robot.battery.voltage_cutoff:g} V, before the mission begins"
             )
-    found = mission_batch.missions_of_runs(robot, runs, profile, start, history=history)
-    further = mission_batch.numbers_by_column(mission_batch.mission_numbers(robot, runs, found))
+    missions = mission_batch.missions_of_runs(robot, runs, profile, start, history=history)
+    further = mission_batch.numbers_by_column(mission_batch.mission_numbers(robot, runs, missions))
     course = None
-    if found.course is not None:
-        course = History.of(robot, found.course.time, found.course.distance, found.course.signals)
-    found, further, course = reshape_runs((found, further, course), conditions.shape)
+    if missions.course is not None:
+        course = History.of(robot, missions.course.time, missions.course.distance, missions.course.signals)
+    missions, further, course = reshape_runs((missions, further, course), conditions.shape)
     names, mass = robot.configurations.names, total_mass(robot, conditions)
     return Results(
         conditions,
         mass,
-        found.result,
+        missions.result,
         further,
         course,
         names,
         mission_batch.MODEL,
-        found,
+        missions,
         profile.stated,
         robot.channels,
     )
@@ -234,8 +234,8 @@ def _resolved(robot: Robot, conditions: Conditions) -> Conditions:
     if not has_tracer(which) and which.size and not _within(_ends(which), 0, len(names) - 1):
         wrong = _first_outside(which, 0, len(names) - 1)
         assert wrong is not None
-        known = ", ".join(f"{k} ({name})" for k, name in enumerate(names))
-        raise UsageError(f"configuration{wrong[0]}: got {wrong[1]:g}; expected one of {known}")
+        listed = ", ".join(f"{k} ({name})" for k, name in enumerate(names))
+        raise UsageError(f"configuration{wrong[0]}: got {wrong[1]:g}; expected one of {listed}")
     return conditions
 
 
@@ -284,8 +284,8 @@ def _check_conditions(conditions: Conditions) -> None:
     bare = np.asarray(stated) - np.asarray(payload)
     wrong = _first_outside(bare, np.nextafter(0.0, 1.0), math.inf)
     if wrong is not None:
-        at = np.unravel_index(int(np.argmax(~(bare > 0))), bare.shape)
-        mass, load = float(np.asarray(stated)[at]), float(np.asarray(payload)[at])
+        place = np.unravel_index(int(np.argmax(~(bare > 0))), bare.shape)
+        mass, load = float(np.asarray(stated)[place]), float(np.asarray(payload)[place])
         raise UsageError(f"total_mass{wrong[0]}: got {mass:g} kg; expected more than the payload, {load:g} kg")
 
 
@@ -310,5 +310,5 @@ def _first_outside(value: Any, low: float, high: float) -> tuple[str, float] | N
     bad = ~((numbers >= low) & (numbers <= high) & np.isfinite(numbers))
     if not bad.any():
         return None
-    at = np.unravel_index(int(np.argmax(bad)), bad.shape)
-    return ("[" + ", ".join(str(int(k)) for k in at) + "]" if at else ""), float(numbers[at])
+    place = np.unravel_index(int(np.argmax(bad)), bad.shape)
+    return ("[" + ", ".join(str(int(k)) for k in place) + "]" if place else ""), float(numbers[place])

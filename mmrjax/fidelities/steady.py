@@ -74,8 +74,12 @@ def _settled_at(
     torque = sense * jnp.where(moving < lacking, moving, lacking)
     slip, voltage = signals.speed_sliding - creep, (signals.voltage_left - held) / _VOLTAGE
     if conditions.motor_speed is not None:  # the torque determines the current; the motor speed is given
-        known = speed_motor - conditions.motor_speed / _SPEED_MOTOR
-        return state, signals, (jnp.asarray(slip), jnp.asarray(signals.torque_net / _TORQUE), jnp.asarray(known))
+        speed_error = speed_motor - conditions.motor_speed / _SPEED_MOTOR
+        return (
+            state,
+            signals,
+            (jnp.asarray(slip), jnp.asarray(signals.torque_net / _TORQUE), jnp.asarray(speed_error)),
+        )
     if not robot.driver.returns_current:  # a diode takes the rest of the voltage
         settled = signals.voltage_back + signals.voltage_drop
         signals = dataclasses.replace(signals, voltage=settled, voltage_left=jnp.zeros_like(settled))
@@ -148,9 +152,9 @@ def _root(robot: Robot, conditions: Conditions, large: bool = True) -> tuple[Vec
     tolerance = float(jnp.finfo(jnp.result_type(conditions.voltage)).eps) ** 0.85
     sound = _sound(robot, conditions)[1]
     start = jax.lax.stop_gradient(_start(robot, sound))
-    own = conditions, travel_direction(robot, sound)
+    inputs = conditions, travel_direction(robot, sound)
     linear = _residual_unlimited if large and not robot.effects else None
-    return root(_residual, start, robot, own, tolerance, linear, large)
+    return root(_residual, start, robot, inputs, tolerance, linear, large)
 
 
 @compiled
@@ -296,14 +300,14 @@ def _over_points(function: Callable[..., Any], *arguments: Any) -> Any:
         return batched(*arguments)
 
     def of_block(rows: list[Array | None]) -> Any:
-        own = [x if row is None else row for x, row in zip(leaves, rows, strict=True)]
-        return batched(*jax.tree.unflatten(tree, own))
+        block_leaves = [x if row is None else row for x, row in zip(leaves, rows, strict=True)]
+        return batched(*jax.tree.unflatten(tree, block_leaves))
 
     # Reverse mode computes a block again: the stored values of all blocks would fill the memory.
-    found = jax.lax.map(
+    blocks = jax.lax.map(
         jax.checkpoint(of_block), [jnp.reshape(x, (-1, block)) if jnp.ndim(x) else None for x in leaves]
     )
-    return jax.tree.map(lambda x: jnp.reshape(x, points), found)
+    return jax.tree.map(lambda x: jnp.reshape(x, points), blocks)
 
 
 @compiled
@@ -318,10 +322,10 @@ def steady_batch(robot: Robot, conditions: Conditions) -> Result:
 
 
 def _check_outputs(names: Iterable[str]) -> None:
-    known = (*outputs.output_names(channels.EVERY), *CODES)
+    allowed = (*outputs.output_names(channels.EVERY), *CODES)
     for name in names:
-        if name not in known:
-            raise KeyError(f"no output {name}; there are {', '.join(known)}")
+        if name not in allowed:
+            raise KeyError(f"no output {name}; there are {', '.join(allowed)}")
 
 
 @compiled
@@ -355,8 +359,8 @@ def _settled(robot: Robot, conditions: Conditions) -> Result:
 def _solve(robot: Robot, conditions: Conditions) -> tuple[Float[Array, " unknowns"], Bool[Array, ""]]:
     if conditions.turns:
         return circling.solve_turn(robot, conditions)
-    unknowns, found = _root(robot, conditions, large=False)
-    return jax.lax.stop_gradient((jnp.stack(unknowns), found))
+    unknowns, is_root = _root(robot, conditions, large=False)
+    return jax.lax.stop_gradient((jnp.stack(unknowns), is_root))
 
 
 def _shown(
@@ -383,8 +387,8 @@ def results_of_rows(robot: Robot, conditions: Conditions) -> tuple[Result, Signa
     size = next((s for s in SIZES if s >= rows), rows + -rows % SIZES[-1])
     index = np.concatenate([np.arange(rows), np.zeros(size - rows, int)])
     padded = jax.tree.map(lambda x: jnp.asarray(np.asarray(x)[index]), conditions)
-    found = _shown_rows(robot, padded, *_solved_rows(robot, padded))
-    return jax.tree.map(lambda x: x[:rows], found)
+    results = _shown_rows(robot, padded, *_solved_rows(robot, padded))
+    return jax.tree.map(lambda x: x[:rows], results)
 
 
 @functools.partial(compiled, options=SELDOM)

@@ -109,8 +109,8 @@ def _stepped(
 ) -> Float[Array, " unknowns"]:
     """The unknowns of `drive` after a step. A robot that has stopped is held if friction at rest can hold it."""
     speeds = np.isin(np.arange(len(y)), (drive.MOTOR, drive.GROUND))
-    goes_on = (drive.CURRENT, _DISCHARGE, len(drive.drive_units(robot)) - 1 - robot.loose)
-    drawn = np.isin(np.arange(len(y)), goes_on[: 2 + (robot.controller is not None)])
+    last = len(y) - robot.loose
+    drawn = np.isin(np.arange(len(y)), (drive.CURRENT, _DISCHARGE, *range(last - robot.controller_size, last)))
     held = holds(robot, balances.commanded(robot, conditions, drive.state_of_unknowns(robot, y)))
     stands = held & jnp.all(jnp.where(speeds, y, 0.0) == 0)
     moves = jnp.where(stands, jnp.asarray(drawn, y.dtype), 1.0)
@@ -136,9 +136,9 @@ def _commanded(robot: Robot, command: Command, conditions: Conditions | None) ->
     values: Mapping[str, Any] = {}
     if command is not None:
         values = command if isinstance(command, Mapping) else {"duty": command}
-    known = [field.name for field in dataclasses.fields(Conditions)]
-    if unknown := next((name for name in values if name not in known), None):
-        raise UsageError(f"command: got {unknown}; {allowed_words(str(unknown), known)}")
+    field_names = [field.name for field in dataclasses.fields(Conditions)]
+    if unknown := next((name for name in values if name not in field_names), None):
+        raise UsageError(f"command: got {unknown}; {allowed_words(str(unknown), field_names)}")
     for name, value in values.items():
         if name != "configuration" and _shape(value) is None:
             raise UsageError(f"command, {name}: got {_named(value)}; expected a number")
@@ -183,14 +183,14 @@ def _vector(robot: Robot, state: State) -> Float[Array, " unknowns"]:
     if not isinstance(state, State):
         raise UsageError(f"state: got {type(state).__name__}; expected one from mmrjax.initial_state or a step")
     remembered = {effect.name for effect in robot.remembering}
-    if remembered != state.memory.keys() or (state.gap is not None, state.integral is not None) != (
-        bool(robot.loose),
-        robot.controller is not None,
-    ):
+    controlled = (state.integral is not None) + (state.command is not None)
+    others = (state.gap is not None) != bool(robot.loose) or controlled != robot.controller_size
+    if remembered != state.memory.keys() or others:
         raise UsageError("state: got one of another robot; expected one from mmrjax.initial_state(robot)")
     if shape := next((np.shape(x) for x in jax.tree.leaves(state) if np.shape(x)), ()):
         raise UsageError(f"state: got numbers of shape {shape}; expected one state, or jax.vmap over several")
     memory = [state.memory[effect.name] for effect in robot.remembering]
-    own = [state.current, state.speed_motor, state.speed, state.distance, state.discharge]
-    last = [x for x in (state.integral, state.gap) if x is not None]
-    return jnp.stack([jnp.asarray(x, float) for x in (*own, *memory, *last)]) / jnp.asarray(drive.drive_units(robot))
+    values = [state.current, state.speed_motor, state.speed, state.distance, state.discharge]
+    last = [x for x in (state.integral, state.command, state.gap) if x is not None]
+    units = jnp.asarray(drive.drive_units(robot))
+    return jnp.stack([jnp.asarray(x, float) for x in (*values, *memory, *last)]) / units

@@ -101,14 +101,14 @@ def _average(
 
     half = jnp.floor(periods / 2) + 1
     early = plain * (jnp.cumsum(plain) <= jnp.sum(plain) / 2)
-    found, guided = mean(periods, 0.0, plain)
+    means, guided = mean(periods, 0.0, plain)
     halves = mean(periods, periods - half, early)[0], mean(half, 0.0, plain - early)[0]
-    earlier, later, whole = (signals_of(x) for x in (*halves, found))
+    earlier, later, whole = (signals_of(x) for x in (*halves, means))
     changes = [
         (jnp.abs(getattr(later, f) - getattr(earlier, f)), jnp.abs(getattr(whole, f)))
         for f in ("total_current", "speed_motor", "speed")
     ]
-    return found, guided, periods.astype(int), changes
+    return means, guided, periods.astype(int), changes
 
 
 def track(

@@ -70,11 +70,11 @@ class Variation(eqx.Module):
     names: tuple[str, ...] = eqx.field(static=True)
 
     def __init__(self, robot: Robot, names: tuple[str, ...]) -> None:
-        known = variable_names(robot)
+        allowed = variable_names(robot)
         for k, name in enumerate(names):
-            if name not in known:
+            if name not in allowed:
                 raise UsageError(
-                    f"{name}: neither a parameter of the robot nor a condition; {allowed_words(name, known, 3)}"
+                    f"{name}: neither a parameter of the robot nor a condition; {allowed_words(name, allowed, 3)}"
                 )
             if name in names[:k]:
                 raise UsageError(f"{name}: stated twice; expected each name once")
@@ -93,8 +93,8 @@ class Variation(eqx.Module):
         if name == "configuration":
             return Axis(name, "", CONDITIONS[name], (0.0, len(self.robot.configurations) - 1.0), 0.0)
         condition, usual = quantities.CONDITIONS[name], getattr(Conditions(), name)
-        at = None if usual is None else float(usual)
-        return Axis(name, condition.unit_shown, condition.label, condition.range, at)
+        usual_value = None if usual is None else float(usual)
+        return Axis(name, condition.unit_shown, condition.label, condition.range, usual_value)
 
     @property
     def varies_robot(self) -> bool:
@@ -149,8 +149,8 @@ def evaluate_points(
     Raises:
         UsageError: an output that the fidelity does not have.
     """
-    found = _evaluate(variation, fidelity, values, conditions, dict(options), tuple(outputs), profile)
-    return {name: found[name] for name in (*outputs, STATUS)}  # jit sorts the names
+    evaluated = _evaluate(variation, fidelity, values, conditions, dict(options), tuple(outputs), profile)
+    return {name: evaluated[name] for name in (*outputs, STATUS)}  # jit sorts the names
 
 
 @compiled
@@ -165,11 +165,11 @@ def _evaluate(
 ) -> dict[str, Array]:
     (points, _) = values.shape
     conditions = jax.tree.map(lambda x: jnp.broadcast_to(x, (points,)), conditions)
-    shown = variation.robot.channels
+    outputs_of = variation.robot.channels
     if profile is None and fidelity == "steady":
         from mmrjax.fidelities.steady import steady_outputs
 
-        _known(names, table_of_outputs.output_names(shown))
+        _known(names, table_of_outputs.output_names(outputs_of))
         robot, each = variation.at(values, conditions)
         each = jax.tree.map(lambda x: jnp.broadcast_to(x, (points,)), each)
         return steady_outputs(robot, each, (*names, STATUS))
@@ -182,23 +182,23 @@ def _evaluate(
         return fidelities.get_fidelity(fidelity).run(robot, conditions, options)
 
     if not variation.varies_robot:
-        return pick_outputs(simulate(*variation.at(values, conditions)), shown, names)
+        return pick_outputs(simulate(*variation.at(values, conditions)), outputs_of, names)
 
     def one(values: Array, conditions: Conditions) -> Run:
         robot, point = variation.at(values, conditions)
         run = simulate(robot, jax.tree.map(lambda x: x[None], point))
         return jax.tree.map(lambda x: x[0], run)
 
-    return pick_outputs(jax.vmap(one)(values, conditions), shown, names)
+    return pick_outputs(jax.vmap(one)(values, conditions), outputs_of, names)
 
 
 def pick_outputs(run: Run, shown: tuple[Channel, ...], names: tuple[str, ...]) -> dict[str, Array]:
     """Outputs of a batch by name, as from `evaluate_points`, of a rig with these channels."""
     rows = table_of_outputs.output_names(shown)
     _known(names, (*rows, *run.columns))
-    found = {n: getattr(run.result, n) if n in rows else run.columns[n] for n in names if n != FLAGS}
+    columns = {n: getattr(run.result, n) if n in rows else run.columns[n] for n in names if n != FLAGS}
     further = {FLAGS: run.result.flags} if FLAGS in names else {}
-    return {**found, **further, STATUS: run.result.status}
+    return {**columns, **further, STATUS: run.result.status}
 
 
 def _known(names: tuple[str, ...], known: tuple[str, ...]) -> None:

@@ -160,12 +160,12 @@ def initial_unknowns(law: MotionLaw, robot: Robot, conditions: Conditions, start
     winding, housing = (ambient if t is None else t for t in (start.temperature_winding, start.temperature_housing))
     shafts = start.speed / robot.chassis(conditions.configuration).radius * robot.gearbox.ratio
     y = jnp.zeros_like(law.units(robot))
-    for at, value in (
+    for place, value in (
         (law.CURRENT, start.current), (law.MOTOR, shafts), (law.WINDING, winding), (law.HOUSING, housing),
         (law.GROUND, start.speed), (law.HEADING, 0.0 if heading is None else jnp.radians(heading)),
         (law.DISCHARGE, conditions.discharge),
     ):  # fmt: skip
-        y = y.at[at].set(value)
+        y = y.at[place].set(value)
     return y
 
 
@@ -287,18 +287,18 @@ def _segment_end(
     law: MotionLaw, robot: Robot, conditions: Conditions, segment: Profile, before: Carry, c: Carry, beginning: Any
 ) -> _Segment:
     """A segment at its end `c`, from the state `before` it and its first instant."""
-    found, _, _, asked = law.instant(robot, conditions, segment, c.y, c.stands)
-    status, missed = _ends(law, robot, conditions, segment, found, asked, c.stands)
+    signals, _, _, asked = law.instant(robot, conditions, segment, c.y, c.stands)
+    status, missed = _ends(law, robot, conditions, segment, signals, asked, c.stands)
     status = jnp.where(c.ended, _ending(c), status)
-    slips = law.exceeded(robot, found)["slips"] & ~c.stands
+    slips = law.exceeded(robot, signals)["slips"] & ~c.stands
     flags = c.flags | flag_mask({"demand_missed": missed & ~c.ended, "slips": slips})
-    rise = law.stored(robot, found) - law.stored(robot, beginning)
+    rise = law.stored(robot, signals) - law.stored(robot, beginning)
     drawn, returned = (c.q[list(law.TOTALS).index(name)] for name in ("drawn", "returned"))
     first, last = (robot.battery.energy(_charge(law, x.y)) for x in (before, c))
     given = jnp.where(conditions.battery > 0.5, last - first, drawn - returned)
     ran = ~before.ended
     time, rise, given = (jnp.where(ran, x, 0.0) for x in (c.y[law.CLOCK], rise, given))
-    return _Segment(time, jnp.where(ran, c.q, 0.0), rise, given, c.peaks, status, flags, found, c.kept)
+    return _Segment(time, jnp.where(ran, c.q, 0.0), rise, given, c.peaks, status, flags, signals, c.kept)
 
 
 def _mission(
@@ -345,10 +345,10 @@ def _course(
 ) -> Course:
     assert c.buffer is not None
     ys, qs, stood, marks = c.buffer
-    at = jnp.arange(len(ys))
+    index = jnp.arange(len(ys))
     # Segment of each recorded step: the first one with a larger step count.
-    segment = jnp.minimum(jnp.searchsorted(kept, at, side="right"), len(kept) - 1)
-    within = at < kept[-1]
+    segment = jnp.minimum(jnp.searchsorted(kept, index, side="right"), len(kept) - 1)
+    within = index < kept[-1]
     begun = jnp.concatenate([jnp.zeros(1), jnp.cumsum(each.time.ravel())])[segment]
     so_far = {
         name: jnp.concatenate([jnp.zeros(1), jnp.cumsum(each.of[name].ravel())])[segment] + qs[:, i]

@@ -157,8 +157,8 @@ def missions_of_runs(
         return simulate_batch(robot, conditions, profile, start, 0)
     if has_tracer((robot, conditions, profile, start)):
         return simulate_batch(robot, conditions, profile, start, _room(profile))
-    found = list(simulate_in_parts(robot, conditions, profile, start))
-    return jax.tree.map(lambda *x: np.concatenate(x), *found)
+    parts = list(simulate_in_parts(robot, conditions, profile, start))
+    return jax.tree.map(lambda *x: np.concatenate(x), *parts)
 
 
 def simulate_in_parts(
@@ -176,12 +176,12 @@ def simulate_in_parts(
         rows = np.minimum(np.arange(first, first + size), runs - 1)  # padding repeats the last run
         some = jax.tree.map(lambda x, rows=rows: jnp.asarray(np.asarray(x)[rows]), conditions)
         followed = jax.tree.map(lambda x, rows=rows: x[rows] if x.ndim == 2 else x, profile)
-        found = jax.device_get(simulate_batch(robot, some, followed, start, keep))
-        steps = int(np.max(found.steps - found.rejected))
+        part = jax.device_get(simulate_batch(robot, some, followed, start, keep))
+        steps = int(np.max(part.steps - part.rejected))
         if steps > keep and keep < MOST_KEPT:
             keep = min(MOST_KEPT, _power(steps))
             continue
-        yield jax.tree.map(lambda x, count=runs - first: x[:count], found)
+        yield jax.tree.map(lambda x, count=runs - first: x[:count], part)
         first += size
 
 
@@ -207,15 +207,15 @@ def simulate_batch(
     Args:
         keep: largest number of steps in the recorded courses, 0 for no courses.
     """
-    own = jax.tree.map(lambda x: 0 if x.ndim == 2 else None, profile)
+    axes = jax.tree.map(lambda x: 0 if x.ndim == 2 else None, profile)
 
     def one(conditions: Conditions, profile: Profile) -> Mission:
         return mission(robot, conditions, profile, start, tolerance=tolerance, keep=keep)
 
-    return jax.vmap(one, in_axes=(0, own))(conditions, profile)
+    return jax.vmap(one, in_axes=(0, axes))(conditions, profile)
 
 
 def run_missions(robot: Robot, conditions: Conditions, profile: Profile) -> Run:
     """Missions of a batch as runs of a fidelity, with their numbers as columns."""
-    found = missions_of_runs(robot, conditions, profile)
-    return Run(found.result, numbers_by_column(mission_numbers(robot, conditions, found)))
+    missions = missions_of_runs(robot, conditions, profile)
+    return Run(missions.result, numbers_by_column(mission_numbers(robot, conditions, missions)))

@@ -436,18 +436,18 @@ class _Leg(NamedTuple):
         """The state after a step of length h [s], with its contributions to peaks, flags and the course."""
         law, robot, otherwise, segment, *_ = self
         y, stands, below, taken, cut_off = landed.y, landed.stands, landed.below, landed.taken, landed.cut_off
-        found, dy, _, _ = law.instant(robot, otherwise, segment, y, stands)
+        signals, dy, _, _ = law.instant(robot, otherwise, segment, y, stands)
         # Current and heat may peak within the step. Speeds are different: at the end of a long step their slopes
         # belong to the stiff part of the solution, and a cubic would oscillate.
         tops = _top(c.y, y, h * c.slope, h * dy)
         within = law.peaks_within(robot, y, tops)
         highest = jnp.stack([jnp.where(taken, within.get(name, -jnp.inf), -jnp.inf) for name in law.PEAKS])
-        each = law.peaks(robot, found)
+        each = law.peaks(robot, signals)
         peaks = jnp.maximum(
             jnp.maximum(c.peaks, jnp.stack([jnp.asarray(each[name]) * jnp.ones(()) for name in law.PEAKS])), highest
         )
         hot = taken & (within["temperature"] > robot.motor.temperature_limit)
-        over = law.exceeded(robot, found)
+        over = law.exceeded(robot, signals)
         over.pop("slips")  # every start slips for an instant; for a segment, slip counts at its end
         flags = flag_mask({**over, "cut_off": cut_off}) | flag_mask({"too_hot": hot})
         failed = c.failed | (~good & (h <= SHORTEST))
@@ -457,9 +457,9 @@ class _Leg(NamedTuple):
         events_now = compute_rarely(landed.event, functools.partial(event_functions, law), now, unchanged)
         kept, buffer = c.kept, c.buffer
         if buffer is not None:
-            at = jnp.where(taken, kept, buffer[0].shape[0])  # beyond the end: dropped
+            slot = jnp.where(taken, kept, buffer[0].shape[0])  # beyond the end: dropped
             row = (y, landed.q, stands, jnp.where(cut_off, MARKS.index("cut_off"), landed.which))
-            buffer = tuple(b.at[at].set(r, mode="drop") for b, r in zip(buffer, row, strict=True))
+            buffer = tuple(b.at[slot].set(r, mode="drop") for b, r in zip(buffer, row, strict=True))
         return Carry(
             y=y, q=landed.q, step=landed.step, stands=stands, ended=ended, below=below, low=landed.low,
             cut_off=cut_off, peaks=peaks, flags=c.flags | flags,

@@ -96,15 +96,17 @@ def demanded(robot: Robot, otherwise: Conditions, segment: Profile) -> Array:
 def asked_at(robot: Robot, otherwise: Conditions, segment: Profile, y: Array, stands: Array) -> SegmentInputs:
     asked = segment.at(y[CLOCK])
     robot, conditions = mission_straight.with_consumers(robot, asked), asked.conditions(otherwise)
-    motion, own = state_of(robot, y, stands), conditions.of_sides()
+    motion, of_sides = state_of(robot, y, stands), conditions.of_sides()
     state = balances.states_of_sides(robot, conditions, motion)
     if asked.voltage_left is not None and asked.voltage_right is not None:
         volts = jnp.stack([asked.voltage_left, asked.voltage_right])
-        share = own.polarity * volts / jnp.maximum(mission_straight.source(robot, own, state.discharge), 1e-3)
-        own = dataclasses.replace(own, duty=jnp.where(asked.mode == VOLTAGE, share, own.duty))
+        share = (
+            of_sides.polarity * volts / jnp.maximum(mission_straight.source(robot, of_sides, state.discharge), 1e-3)
+        )
+        of_sides = dataclasses.replace(of_sides, duty=jnp.where(asked.mode == VOLTAGE, share, of_sides.duty))
     demand = demanded(robot, conditions, asked)
     law = jax.vmap(functools.partial(mission_straight.driven, robot, asked.mode))
-    duty, rate, error = law(demand, own, state, y[INTEGRAL] * _EACH[-1])
+    duty, rate, error = law(demand, of_sides, state, y[INTEGRAL] * _EACH[-1])
     return SegmentInputs(robot, dataclasses.replace(conditions, duty_left=duty[0], duty_right=duty[1]), rate, error)
 
 

@@ -169,10 +169,10 @@ def profile(
     for k, name in enumerate(modes):
         if name not in MODES:
             raise UsageError(f"profile, mode, row {k + 1}: got {name}; expected {', '.join(MODES)}")
-    known = (*CONDITIONS, *FURTHER)
-    unknown = sorted(set(values) - set(known))
+    allowed = (*CONDITIONS, *FURTHER)
+    unknown = sorted(set(values) - set(allowed))
     if unknown:
-        raise UsageError(f"profile: no field {unknown[0]}; expected one of {', '.join(known)}")
+        raise UsageError(f"profile: no field {unknown[0]}; expected one of {', '.join(allowed)}")
     given: dict[str, Any] = {"demand": demand, **{name: v for name, v in values.items() if v is not None}}
     if why := sides_error(list(given), MODES[SPEED] in modes):
         raise UsageError(f"profile: {why}")

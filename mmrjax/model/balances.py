@@ -113,21 +113,28 @@ def commanded(robot: Robot, conditions: Conditions, state: State) -> Conditions:
     """Conditions with the duty that a controller demands in a state, in the place of its goal."""
     if conditions.goal is None or robot.controller is None:
         return conditions
-    shown, speed = shown_to_controller(robot, conditions, state)
-    ahead = 0.0 if robot.rig.imposed == "goal_angle" else conditions.goal
-    integral = 0.0 if state.integral is None else state.integral
-    duty = conditions.duty * robot.controller.duty(conditions.goal - shown, integral, speed, ahead)
+    duty = conditions.duty * (_wanted(robot, conditions, state) if state.command is None else state.command)
     return eqx.tree_at(lambda c: (c.duty, c.goal), conditions, (duty, None), is_leaf=lambda x: x is None)
 
 
-def integrated_error(robot: Robot, conditions: Conditions, state: State) -> Scalar:
-    """Rate of the integral of a controller's error: the error, unless it would drive the duty beyond its limit."""
+def _wanted(robot: Robot, conditions: Conditions, state: State) -> Scalar:
+    """Duty that a controller wants [-]."""
+    assert robot.controller is not None and conditions.goal is not None
+    shown, speed = shown_to_controller(robot, conditions, state)
+    ahead = 0.0 if robot.rig.imposed == "goal_angle" else conditions.goal
+    integral = 0.0 if state.integral is None else state.integral
+    return robot.controller.duty(conditions.goal - shown, integral, speed, ahead)
+
+
+def controller_rates(robot: Robot, conditions: Conditions, state: State) -> list[Scalar]:
+    """Rates of a controller's states: the error, unless it would drive the duty beyond its limit, and the duty's."""
     if conditions.goal is None or robot.controller is None:
-        return jnp.zeros_like(state.speed)
+        return [jnp.zeros_like(state.speed)] * robot.controller_size
+    duty = _wanted(robot, conditions, state)
     error = conditions.goal - shown_to_controller(robot, conditions, state)[0]
-    duty = commanded(robot, conditions, state).duty
     limited = (jnp.abs(duty) >= robot.controller.limit) & (duty * error > 0)
-    return jnp.where(limited | (conditions.open > 0.5), 0.0, error)
+    integrated = jnp.where(limited | (conditions.open > 0.5), 0.0, error)
+    return [integrated] if state.command is None else [integrated, (duty - state.command) / robot.controller.lag]
 
 
 def begin_signals(robot: Robot, conditions: Conditions, state: State, direction: Scalar | None = None) -> Signals:
@@ -238,8 +245,8 @@ def motor(robot: Robot, signals: Signals) -> Signals:
 
 def opposing_torque(chassis: Shaft, signals: Signals) -> Scalar:
     """Torque that opposes forward rotation of a shaft in both directions: its own load and a brake's [N·m]."""
-    own = chassis.torque_load(signals.angle)
-    return own if signals.load_torque is None else own + signals.load_torque
+    load = chassis.torque_load(signals.angle)
+    return load if signals.load_torque is None else load + signals.load_torque
 
 
 def travel(robot: Robot, chassis: Load, signals: Signals) -> Signals:
@@ -309,9 +316,9 @@ def gearbox(
         signals = at_output(torque)
         return torque - load - (chassis.inertia + signals.inertia_added) * signals.acceleration_wheel
 
-    torque, found = load, at_output(load)
+    torque, output = load, at_output(load)
     if settled or not any(e.balance == "gearbox" for e in robot.effects):
-        return found
+        return output
     for _ in range(TORQUE_STEPS):
         left, rise = jax.jvp(surplus, (torque,), (jnp.ones_like(torque),))
         torque = torque - left / rise
@@ -481,21 +488,21 @@ def _two_bodies(robot: Robot, chassis: Shaft, signals: Signals, gap: Scalar) -> 
     inertia_motor = robot.motor.inertia * gear.ratio**2
     mesh = chassis.torque_joint(gap, signals.speed_wheel - signals.speed_output, inertia_motor)
     signals = _fill(signals, torque_track_loss=loss, torque_carried=mesh)
-    own = effects_sum(robot, signals, "gearbox")
+    added_loss = effects_sum(robot, signals, "gearbox")
     efficiency = gear.efficiency_flow(mesh, signals.direction)
     drive = signals.torque_motor - idle
-    net = gear.ratio * drive - mesh / efficiency - own
+    net = gear.ratio * drive - mesh / efficiency - added_loss
     acceleration = net / inertia_motor
     return _fill(
         signals,
         torque_idle=idle,
-        torque_load=mesh + own,
+        torque_load=mesh + added_loss,
         inertia_added=inertia_added,
         efficiency_load=efficiency,
         torque_net=net,
         acceleration_wheel=acceleration,
         torque_input=signals.torque_motor - robot.motor.inertia * gear.ratio * acceleration,
-        torque_gear=mesh + own,
+        torque_gear=mesh + added_loss,
         torque_output=mesh,
         acceleration=chassis.radius
         * (mesh - loss - opposing_torque(chassis, signals))
@@ -552,9 +559,9 @@ def resolved_sides(
     """
     robot = robot.within(conditions.configuration)
     chassis = dataclasses.replace(robot.chassis(conditions.configuration), inertia=inertia)
-    own = conditions.of_sides()
-    signals = _fill(_begin_sides(robot, conditions, own, motion), normal=mover.normal)
-    signals = jax.vmap(lambda c, s: _to_slip(robot, c, chassis, s))(own, signals)
+    sides = conditions.of_sides()
+    signals = _fill(_begin_sides(robot, conditions, sides, motion), normal=mover.normal)
+    signals = jax.vmap(lambda c, s: _to_slip(robot, c, chassis, s))(sides, signals)
     pull = mover.pull(chassis, signals)
     return jax.vmap(lambda s, p: _drawn(robot, chassis, s, p))(signals, pull), pull
 
@@ -652,9 +659,9 @@ def states_of_sides(robot: Robot, conditions: Conditions, motion: PlaneMotion) -
 
 def lateral_friction(conditions: Conditions, chassis: Chassis) -> Scalar:
     """Lateral friction over longitudinal on this ground, λ [-]."""
-    own = chassis.turning.lateral
+    lateral = chassis.turning.lateral
     stated = conditions.adhesion_lateral
-    return own if stated is None else own * stated / conditions.adhesion
+    return lateral if stated is None else lateral * stated / conditions.adhesion
 
 
 def _both(x: Scalar) -> Array:
@@ -698,11 +705,11 @@ def turning_signals(
         loads: normal loads of both sides [N], see `turning.grip`.
     """
     robot = robot.within(conditions.configuration)
-    chassis, own = robot.chassis(conditions.configuration), conditions.of_sides()
+    chassis, sides = robot.chassis(conditions.configuration), conditions.of_sides()
     y = SIDES * chassis.turning.width
-    signals = _begin_sides(robot, conditions, own, motion)
+    signals = _begin_sides(robot, conditions, sides, motion)
     sine_slope, mass = sine(conditions.slope), jnp.maximum(*jnp.asarray(signals.mass))
-    even = jax.vmap(lambda c, s: _to_slip(robot, c, chassis, s))(own, signals)
+    even = jax.vmap(lambda c, s: _to_slip(robot, c, chassis, s))(sides, signals)
     rolling = chassis.ground.force_resistance(1.0, even.direction_travel)
     units = robot.sides / 2
     stands = stance(robot, conditions, chassis, mass)
@@ -722,10 +729,10 @@ def turning_signals(
     acceleration = along / mass + motion.yaw_rate * motion.speed_lateral
     pulled = _fill(own_load, traction=held.ahead / units, acceleration=acceleration - turn * y)
     pulled = jax.vmap(lambda s: track(robot, chassis, s))(pulled)
-    if own.motor_speed is None:
+    if sides.motor_speed is None:
         pulled = jax.vmap(lambda s: gearbox(robot, chassis, s))(pulled)
     else:
-        pulled = jax.vmap(lambda c, s: _speed_imposed(robot, c, chassis, s))(own, pulled)
+        pulled = jax.vmap(lambda c, s: _speed_imposed(robot, c, chassis, s))(sides, pulled)
         pulled = _fill(pulled, total_current=_both(sum_of_sides(jnp.asarray(pulled.total_current)) / 2))
     return Travel(
         pulled,

@@ -56,7 +56,7 @@ def channel_index(name: str, shown: Iterable[Channel]) -> int:
     Raises:
         KeyError: `shown` does not contain the channel.
     """
-    known = channel_names(shown)
-    if name not in known:
-        raise KeyError(f"no channel {name}; there are {', '.join(known)}")
-    return known.index(name)
+    names = channel_names(shown)
+    if name not in names:
+        raise KeyError(f"no channel {name}; there are {', '.join(names)}")
+    return names.index(name)

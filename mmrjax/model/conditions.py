@@ -232,8 +232,8 @@ class Conditions(eqx.Module):
 
         def side(name: str) -> Conditions:
             stated = {key: getattr(self, f"{key}_{name}") for key in ("duty", "open", "motor_speed")}
-            own: dict[str, Any] = dict.fromkeys(OF_SIDES)
-            return dataclasses.replace(self, **own | {k: x for k, x in stated.items() if x is not None})
+            fields: dict[str, Any] = dict.fromkeys(OF_SIDES)
+            return dataclasses.replace(self, **fields | {k: x for k, x in stated.items() if x is not None})
 
         return jax.tree.map(lambda left, right: jnp.stack([left, right]), side("left"), side("right"))
 
@@ -268,8 +268,8 @@ def sides_contradiction(stated: Collection[str]) -> str:
     left, right = (name in stated for name in OF_SIDES[-2:])
     if left == right or "motor_speed" in stated:
         return ""
-    known, lacking = OF_SIDES[-2:] if left else OF_SIDES[:-3:-1]
-    return f"{known}: got it without {lacking}; state both"
+    stated_fields, lacking = OF_SIDES[-2:] if left else OF_SIDES[:-3:-1]
+    return f"{stated_fields}: got it without {lacking}; state both"
 
 
 def _number(name: str, x: Any, kind: type = float) -> Any:

@@ -16,9 +16,12 @@ class Controller(eqx.Module):
 
     D = K_p e + K_i ∫ e dt - K_d dx/dt + K_f g, with e = g - x, |D| <= D_max. While D is at the limit, an error that
     drives it further is not integrated. x is the angle or the speed of the output, or the current of the motor. dx/dt
-    acts where x is an angle, K_f g where it is not.
+    acts where x is an angle, K_f g where it is not. The duty follows D with a lag. A controller that samples with a
+    period T, and holds its duty, is nearly one with a lag of T / 2 whose goal comes T / 2 earlier (`Rig.delay`). If
+    it acts a sample later, the lag is 3 T / 2.
 
     Attributes:
+        lags: True if the lag is more than 0, so that the duty is a state.
         supply_voltage: of the driver, for tables without its column [V]. 0: they have the column.
     """
 
@@ -37,6 +40,11 @@ class Controller(eqx.Module):
         0.0, "-", "share of the supply's voltage per rad/s or A of the goal", (-1e3, 1e3), STATED, relative_sd=0.3,
     )  # fmt: skip
     limit: Scalar = parameter(1.0, "-", "largest duty", (0.01, 1.0), STATED, relative_sd=0.1)
+    lag: Scalar = parameter(
+        0.0, "s", "lag of the duty behind the demand of the controller",
+        (0.0, 1.0), STATED, relative_sd=0.3,
+    )  # fmt: skip
+    lags: bool = eqx.field(default=False, static=True)
     supply_voltage: float = eqx.field(default=0.0, static=True)
 
     def duty(self, error: Scalar, integral: Scalar, speed: Scalar, goal: Scalar) -> Scalar:

@@ -33,7 +33,7 @@ def sink_powers(robot: Robot, conditions: Conditions, signals: Signals) -> dict[
     """
     sides, battery, on_battery = robot.sides, robot.battery, conditions.battery > 0.5
     load = battery.current(signals.total_current)
-    own = signals.torque_load - signals.torque_track_loss  # at the wheel: ground, and effects of the gearbox
+    torque_out = signals.torque_load - signals.torque_track_loss  # at the wheel: ground, and effects of the gearbox
     ground = signals.traction * signals.speed_theoretical
     into = signals.torque_input * signals.speed_motor - signals.torque_gear * signals.speed_wheel
     return {
@@ -42,7 +42,7 @@ def sink_powers(robot: Robot, conditions: Conditions, signals: Signals) -> dict[
         "driver": signals.voltage_source * signals.total_current - power_drawn(robot, signals),
         "winding": sides * signals.voltage_drop * signals.current * robot.driver.ripple(signals.duty),
         "motor": sides * signals.torque_motor_loss * signals.speed_motor,
-        "gearbox": sides * (into + own * signals.speed_wheel - ground),
+        "gearbox": sides * (into + torque_out * signals.speed_wheel - ground),
         "track": sides * signals.torque_track_loss * signals.speed_wheel,
         "sliding": sides * signals.traction * (signals.speed_theoretical - signals.speed),
         "rolling": sides * signals.resistance * signals.speed,
@@ -62,21 +62,21 @@ def sink_powers_turning(robot: Robot, conditions: Conditions, travel: Travel) ->
     """Same as `sink_powers` for a robot that turns: sliding is Σ F·u over all contacts, lift follows its heading."""
     signals = travel.signals
     each = jax.vmap(lambda c, s: sink_powers(robot, c, s))(conditions.of_sides(), signals)
-    found: dict[str, Scalar] = {name: jnp.mean(jnp.asarray(power)) for name, power in each.items()}
+    means: dict[str, Scalar] = {name: jnp.mean(jnp.asarray(power)) for name, power in each.items()}
     weight = jnp.mean(jnp.asarray(signals.mass)) * GRAVITY * sine(conditions.slope)
     across = jnp.mean(jnp.asarray(signals.speed_lateral)) * sine(jnp.mean(jnp.asarray(signals.heading)))
-    found["sliding"] = found["sliding"] + jnp.sum(travel.grip.across)
+    means["sliding"] = means["sliding"] + jnp.sum(travel.grip.across)
     for balance, rate in (("lateral", signals.speed_lateral), ("yaw", signals.yaw_rate)):
         taken = jax.vmap(lambda s, balance=balance: effects_sum(robot, s, balance) * jnp.ones(()))(signals)
-        found["sliding"] = found["sliding"] + robot.sides / 2 * jnp.sum(taken * jnp.asarray(rate))
-    found["lift"] = found["lift"] - weight * across
-    return found
+        means["sliding"] = means["sliding"] + robot.sides / 2 * jnp.sum(taken * jnp.asarray(rate))
+    means["lift"] = means["lift"] - weight * across
+    return means
 
 
 def stored_energy_turning(robot: Robot, travel: Travel, motion: PlaneMotion) -> Scalar:
     """Same as `stored_energy` for a robot that turns, with lateral and yaw motion [J]."""
     signals = dataclasses.replace(travel.signals, speed=jnp.broadcast_to(motion.speed, (2,)))
     turning = robot.chassis(jnp.max(jnp.asarray(signals.configuration))).turning
-    own = jnp.mean(jax.vmap(lambda s: stored_energy(robot, s))(signals))
+    mean_energy = jnp.mean(jax.vmap(lambda s: stored_energy(robot, s))(signals))
     across = jnp.mean(jnp.asarray(signals.mass)) * motion.speed_lateral**2
-    return own + 0.5 * (across + turning.inertia * motion.yaw_rate**2)
+    return mean_energy + 0.5 * (across + turning.inertia * motion.yaw_rate**2)

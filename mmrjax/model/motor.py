@@ -186,11 +186,11 @@ class Motor(eqx.Module):
             max_steps=60,
             throw=False,
         )
-        found = jax.lax.stop_gradient(jnp.exp(solution.value))
+        seconds = jax.lax.stop_gradient(jnp.exp(solution.value))
         # The Newton step from here changes no value; it carries the derivative.
-        hot, around = self.temperatures_after(current, found, *begin)
+        hot, around = self.temperatures_after(current, seconds, *begin)
         rise = self.heating(self.voltage_winding(current, hot) * current, hot, around)[0]
         rises = jnp.isfinite(hot) & (rise > 0)
-        found = found - jnp.where(rises, (hot - limit) / jnp.where(rises, rise, 1.0), 0.0)
+        seconds = seconds - jnp.where(rises, (hot - limit) / jnp.where(rises, rise, 1.0), 0.0)
         ever = (self.temperature_settled(current) > limit) & (excess(jnp.asarray(_LONG), held) > 0)
-        return jnp.where(jnp.asarray(begin[0]) >= limit, 0.0, jnp.where(ever, found, jnp.inf))
+        return jnp.where(jnp.asarray(begin[0]) >= limit, 0.0, jnp.where(ever, seconds, jnp.inf))

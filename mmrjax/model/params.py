@@ -179,18 +179,18 @@ def replace(component: M, values: dict[str, Any]) -> M:
     Raises:
         KeyError: a name is no parameter of `component`. The message suggests similar names.
     """
-    known = [p.name for p in walk_parameters(component)]
-    unknown = sorted(set(values) - set(known))
+    names = [p.name for p in walk_parameters(component)]
+    unknown = sorted(set(values) - set(names))
     if unknown:
-        meant = [similar_words(name, known, 3) for name in unknown]
+        meant = [similar_words(name, names, 3) for name in unknown]
         hints = [f"{n} (did you mean {', '.join(m)}?)" if m else n for n, m in zip(unknown, meant, strict=True)]
         raise KeyError(f"no such parameter: {', '.join(hints)}")
     replaced = _replace(component, values, "")
     rig: Any = getattr(replaced, "rig", None)
     if rig is None or values.keys().isdisjoint(rig.unknown):
         return replaced
-    known = dataclasses.replace(rig, unknown=tuple(name for name in rig.unknown if name not in values))
-    changes: dict[str, Any] = {"rig": known}
+    names = dataclasses.replace(rig, unknown=tuple(name for name in rig.unknown if name not in values))
+    changes: dict[str, Any] = {"rig": names}
     return dataclasses.replace(replaced, **changes)
 
 

@@ -59,8 +59,8 @@ def unit_at_end(text: str, known: Iterable[str]) -> str | None:
     """Returns the unit among `known` that a column's name ends with, such as kNm of `torque_kNm` and `Torque [kN·m]`,
     None if there is none."""
     end = re.split(r"[\[(\s]", text.rstrip("])"))[-1]
-    found = [unit for unit in known if unit and re.search(rf"(?:^|[^A-Za-z]){unit}$", unit_in_column(end))]
-    return max(found, key=len, default=None)
+    units = [unit for unit in known if unit and re.search(rf"(?:^|[^A-Za-z]){unit}$", unit_in_column(end))]
+    return max(units, key=len, default=None)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

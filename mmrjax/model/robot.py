@@ -125,10 +125,10 @@ class Robot(eqx.Module):
 
     def showing_turns(self, columns: Collection[str] | None = None) -> Robot:
         """Same robot with instruments for both sides and yaw. With `columns`, only for columns of the table."""
-        own = self.rig.channels
+        shown_channels = self.rig.channels
         read = [c for c in channels.OF_TURNS if (c.settled if columns is None else c.column in columns)]
-        more = [c.name for c in read if c.name not in own]
-        return dataclasses.replace(self, rig=dataclasses.replace(self.rig, channels=(*own, *more)))
+        more = [c.name for c in read if c.name not in shown_channels]
+        return dataclasses.replace(self, rig=dataclasses.replace(self.rig, channels=(*shown_channels, *more)))
 
     @property
     def unlike(self) -> tuple[str, ...]:
@@ -172,6 +172,11 @@ class Robot(eqx.Module):
     def loose(self) -> bool:
         """True if its load turns apart from the motor, by a backlash or an elastic joint."""
         return self.rig.loose
+
+    @property
+    def controller_size(self) -> int:
+        """Number of states of its controller: the integral of the error, and the duty if that lags."""
+        return 0 if self.controller is None else 1 + self.controller.lags
 
     @property
     def moves_as_one(self) -> bool:

@@ -53,6 +53,7 @@ class State(eqx.Module):
         distance: travelled since the start of the run [m]. Used by loads that depend on their angle.
         gap: of the output's motor side ahead of the load, from the middle of a backlash [rad]. None: rigid.
         integral: of the controller's error over time, as in `Controller`. None: no controller.
+        command: duty of a controller with a lag [-]. None: without a lag.
     """
 
     current: Scalar
@@ -64,6 +65,7 @@ class State(eqx.Module):
     distance: Scalar = 0.0
     gap: Scalar | None = None
     integral: Scalar | None = None
+    command: Scalar | None = None
 
 
 class PlaneMotion(eqx.Module):

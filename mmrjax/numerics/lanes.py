@@ -68,17 +68,17 @@ class _Loop(NamedTuple):
             return jnp.any(carry[1] < size_busy)
 
         def step(carry: tuple) -> tuple:
-            found, place, following, state = carry
+            results, place, following, state = carry
             member = member_of(place)
             state = chosen(over(state), state, go(at(member), state))
             free = over(state) & (place < size_busy)
-            found = jax.tree.map(
+            results = jax.tree.map(
                 lambda all_, x: all_.at[jnp.where(free, member, size)].set(x, mode="drop"),
-                found,
+                results,
                 jax.vmap(self.kept)(state),
             )
             place = jnp.where(free, following + jnp.cumsum(free) - 1, place)
-            return found, place, following + jnp.sum(free), chosen(free, begin(at(member_of(place))), state)
+            return results, place, following + jnp.sum(free), chosen(free, begin(at(member_of(place))), state)
 
         first = jnp.arange(lanes)
         carry = jax.vmap(self.kept)(begins), first, jnp.asarray(lanes), begin(at(member_of(first)))
@@ -119,8 +119,8 @@ def loop_until(
 
         @custom_vmap
         def each(numbers: Any) -> T:
-            found: T = loop.refilled(numbers, batched, size)
-            return found
+            result: T = loop.refilled(numbers, batched, size)
+            return result
 
         @each.def_vmap
         def flat(outer: int, of_outer: Any, numbers: Any) -> tuple[T, Any]:
@@ -135,19 +135,21 @@ def loop_until(
 
             whole = jax.tree.map(member, numbers, batched, of_outer)
             either = jax.tree.map(lambda inner, out: inner or out, batched, of_outer)
-            found = jax.tree.map(lambda x: x.reshape(outer, size, *x.shape[1:]), many(whole, either, outer * size))
-            return found, jax.tree.map(lambda _: True, found)
+            flattened = jax.tree.map(
+                lambda x: x.reshape(outer, size, *x.shape[1:]), many(whole, either, outer * size)
+            )
+            return flattened, jax.tree.map(lambda _: True, flattened)
 
         return each(numbers)
 
     @custom_vmap
     def alone(numbers: Any) -> T:
-        found: T = loop.alone(numbers)
-        return found
+        result: T = loop.alone(numbers)
+        return result
 
     @alone.def_vmap
     def together(size: int, batched: Any, numbers: Any) -> tuple[T, Any]:
-        found = many(numbers, batched[0], size)
-        return found, jax.tree.map(lambda _: True, found)
+        results = many(numbers, batched[0], size)
+        return results, jax.tree.map(lambda _: True, results)
 
     return alone(numbers)

@@ -94,13 +94,13 @@ def regularise(factors: Factors) -> tuple[Factors, Bool[Array, ""]]:
     derivatives of either mode.
     """
     size = sum((jnp.abs(x) for row in factors for x in row if x is not None), jnp.zeros(()))
-    own = jnp.isfinite(size)
+    is_regular = jnp.isfinite(size)
     for k, row in enumerate(factors):
-        own &= False if (pivot := row[k]) is None else pivot != 0
+        is_regular &= False if (pivot := row[k]) is None else pivot != 0
     return [
-        [None if x is None else jnp.where(own, x, 1.0 if i == k else 0.0) for k, x in enumerate(row)]
+        [None if x is None else jnp.where(is_regular, x, 1.0 if i == k else 0.0) for k, x in enumerate(row)]
         for i, row in enumerate(factors)
-    ], own
+    ], is_regular
 
 
 def inverse(matrix: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Float[Array, ""]]:
@@ -127,8 +127,8 @@ def solve(matrix: Float[Array, "n n"], b: Float[Array, "n ..."]) -> Float[Array,
 
     def turn(k: Array, rest: Array) -> Array:
         pivot = jnp.argmax(jnp.where(index < k, -1.0, jnp.abs(rest[:, k])))
-        found = (index == pivot) @ rest
-        row = found / found[k]
+        chosen = (index == pivot) @ rest
+        row = chosen / chosen[k]
         exchanged = jnp.where((index == pivot)[:, None], rest[k], rest)
         column = jnp.where(index == k, 0.0, exchanged[:, k])
         return jnp.where((index == k)[:, None], row, exchanged - column[:, None] * row)

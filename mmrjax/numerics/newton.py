@@ -220,10 +220,10 @@ def root(
 
     def search(start: Vector, shared: Any, own: Any) -> tuple[Vector, Array]:
         method: Any = FewUnknowns(atol=tolerance, apart=apart)
-        found: optx.Solution = optx.root_find(
+        solution: optx.Solution = optx.root_find(
             function, method, start, (shared, own), has_aux=True, max_steps=MAX_STEPS, throw=False
         )
-        return found.value, found.state.solved
+        return solution.value, solution.state.solved
 
     if linear is None:
         return search(start, shared, own)
@@ -239,12 +239,12 @@ def _function(residual: Residual) -> Function:
 
 @root.def_jvp
 def _implicit(primals: tuple, tangents: tuple) -> tuple[tuple[Vector, Array], tuple[Any, None]]:
-    residual, start, shared, own, tolerance, linear, apart = primals
-    y, solved = root(residual, start, shared, own, tolerance, linear, apart)
-    moved = eqx.filter_jvp(lambda *given: residual(y, *given), (shared, own), tangents[2:4])[1]
+    residual, start, shared, inputs, tolerance, linear, apart = primals
+    y, solved = root(residual, start, shared, inputs, tolerance, linear, apart)
+    moved = eqx.filter_jvp(lambda *given: residual(y, *given), (shared, inputs), tangents[2:4])[1]
     if moved is None or all(m is None for m in moved):
         return (y, solved), (tuple(jnp.zeros_like(x) for x in y), None)
-    factors, own_factors = regularise(factorise(_linearised(_function(residual), y, (shared, own), apart)[0]))
+    factors, own_factors = regularise(factorise(_linearised(_function(residual), y, (shared, inputs), apart)[0]))
     step = substitute(factors, moved)
     change = tuple(
         jnp.zeros_like(a) if b is None else jnp.where(own_factors, -b, 0.0) for a, b in zip(y, step, strict=True)
@@ -264,9 +264,9 @@ def implicit_slopes(slope: Float[Array, "rows outputs x_and_y"], left: Float[Arr
     """
     n = left.shape[1]
     size = left.shape[2] - n
-    factors, own = regularise(factorise([[left[:, i, size + j, None] for j in range(n)] for i in range(n)]))
+    factors, regular = regularise(factorise([[left[:, i, size + j, None] for j in range(n)] for i in range(n)]))
     by_x = slope[:, :, :size]
     for k, moved in enumerate(substitute(factors, [left[:, i, :size] for i in range(n)])):
         assert moved is not None
-        by_x = by_x - slope[:, :, size + k, None] * jnp.where(own, moved, 0.0)[:, None, :]
+        by_x = by_x - slope[:, :, size + k, None] * jnp.where(regular, moved, 0.0)[:, None, :]
     return by_x

@@ -89,8 +89,8 @@ def rosenbrock_stages(
     """
 
     def both(y: Array) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
-        found = rates(y)
-        return found, found
+        rates_there = rates(y)
+        return rates_there, rates_there
 
     (jacobian, jacobian_q), (f, g) = jax.jacfwd(both, has_aux=True)(y0)
     # A vanishing pivot spoils the step, and the error control rejects it; a shorter step makes the diagonal dominate.

@@ -97,7 +97,7 @@ def _rates(robot: Robot, conditions: Conditions, y: Array, travel: balances.Trav
     signals = travel.signals
     free = conditions.of_sides().motor_speed is None
     cos, sin = jnp.cos(motion.heading), jnp.sin(motion.heading)
-    found = [
+    residuals = [
         *jnp.asarray(free * signals.voltage_left / signals.inductance),
         *jnp.asarray(free * signals.acceleration_wheel * robot.gearbox.ratio),
         travel.acceleration,
@@ -109,8 +109,8 @@ def _rates(robot: Robot, conditions: Conditions, y: Array, travel: balances.Trav
         balances.charge_drawn(robot, conditions, jnp.asarray(signals.total_current)[0]),
     ]
     for effect in kept:
-        found.extend(jax.vmap(lambda s, effect=effect: effect.rate(robot, s))(signals))
-    return jnp.stack([jnp.asarray(x, y.dtype) for x in found]) / _units(kept).astype(y.dtype)
+        residuals.extend(jax.vmap(lambda s, effect=effect: effect.rate(robot, s))(signals))
+    return jnp.stack([jnp.asarray(x, y.dtype) for x in residuals]) / _units(kept).astype(y.dtype)
 
 
 def turning_start(robot: Robot, conditions: Conditions, rolling: bool = False) -> Float[Array, " unknowns"]:
@@ -119,10 +119,10 @@ def turning_start(robot: Robot, conditions: Conditions, rolling: bool = False) -
     Motors with an imposed speed turn.
     """
     heading = 0.0 if conditions.heading_deg is None else jnp.radians(conditions.heading_deg)
-    size, own = _units(robot.remembering), conditions.of_sides()
+    size, sides = _units(robot.remembering), conditions.of_sides()
     y = jnp.zeros_like(size).at[7].set(heading).at[10].set(conditions.discharge)
-    if own.motor_speed is not None:
-        y = y.at[2:4].set(own.motor_speed)
+    if sides.motor_speed is not None:
+        y = y.at[2:4].set(sides.motor_speed)
     if not rolling:
         return y / size
     unknowns, solved = _unknowns(robot, conditions)
@@ -139,10 +139,10 @@ def turning_start(robot: Robot, conditions: Conditions, rolling: bool = False) -
 
 def _guess(robot: Robot, conditions: Conditions) -> Float[Array, " 11"]:
     """Motors near their no-load speed, and the turn of a robot of twice the width without slip."""
-    own, chassis = conditions.of_sides(), robot.chassis(conditions.configuration)
-    shafts = 0.9 * jax.vmap(lambda c: voltage_at_rest(robot, c))(own) / robot.motor.torque_constant
-    if own.motor_speed is not None:
-        shafts = own.motor_speed
+    sides, chassis = conditions.of_sides(), robot.chassis(conditions.configuration)
+    shafts = 0.9 * jax.vmap(lambda c: voltage_at_rest(robot, c))(sides) / robot.motor.torque_constant
+    if sides.motor_speed is not None:
+        shafts = sides.motor_speed
     speeds = chassis.radius * shafts / robot.gearbox.ratio
     turn = (speeds[1] - speeds[0]) / (2 * chassis.turning.width)
     y = jnp.zeros(len(_UNITS)).at[2:4].set(shafts).at[4].set(jnp.mean(speeds)).at[6].set(turn)
@@ -229,7 +229,7 @@ def _turning_round(robot: Robot, conditions: Conditions, y: Float[Array, " 9"]) 
 def _share(robot: Robot, conditions: Conditions, y: Array, step: Array) -> Scalar:
     """Share of a step that changes no unknown by more than `FAR` and does not cross a reversal of friction."""
     share = jnp.minimum(1.0, FAR / jnp.max(jnp.abs(step[:SETTLING])))
-    now, then = (_turning_round(robot, conditions, at) for at in (y, y + share * step))
+    now, then = (_turning_round(robot, conditions, state_there) for state_there in (y, y + share * step))
     across = (now * then < 0) & (jnp.minimum(jnp.abs(now), jnp.abs(then)) > 1)
     return share * jnp.min(jnp.where(across, now / jnp.where(across, now - then, 1.0), 1.0))
 
@@ -265,14 +265,14 @@ def _look(held: tuple[Robot, Conditions], search: _Secant) -> _Secant:
     step = (search.inverse * search.rates).sum(-1)
     taken = step * _share(*held, search.y, step)
     taken = jnp.where(aside, ALONG * (np.arange(size) == search.looks - 1), taken)
-    found = _balance(*held, search.y + taken)
-    found = jnp.where(_moves(held[1]), found, _begins(*held) - search.y - taken)
-    gone = search.inverse @ (search.rates - found)
+    residual = _balance(*held, search.y + taken)
+    residual = jnp.where(_moves(held[1]), residual, _begins(*held) - search.y - taken)
+    gone = search.inverse @ (search.rates - residual)
     row = taken @ search.inverse
     change = jnp.outer(taken - gone, row) / (taken @ gone)
     inverse = jnp.where((search.looks > 0) & jnp.all(jnp.isfinite(change)), search.inverse + change, search.inverse)
     y = jnp.where(aside, search.y, search.y + taken)
-    rates = jnp.where(aside & (search.looks > 0), search.rates, found)
+    rates = jnp.where(aside & (search.looks > 0), search.rates, residual)
     return _Secant(y, rates, inverse, search.looks + 1, ~aside & (jnp.max(jnp.abs(step)) < NEAR))
 
 
@@ -283,8 +283,8 @@ def _still(conditions: Conditions) -> Float[np.ndarray, "9 9"]:
 
 def _around(robot: Robot, conditions: Conditions, y: Array) -> tuple[Array, Array]:
     """The Jacobian of `_balance`, and its value. Imposed unknowns have no equation."""
-    slope, found = jax.jacfwd(lambda y: (_balance(robot, conditions, y),) * 2, has_aux=True)(y)
-    return jnp.where(_moves(conditions)[:, None], slope, _still(conditions)), found
+    slope, residual = jax.jacfwd(lambda y: (_balance(robot, conditions, y),) * 2, has_aux=True)(y)
+    return jnp.where(_moves(conditions)[:, None], slope, _still(conditions)), residual
 
 
 def _unknown(held: tuple[Robot, Conditions, Array, Array]) -> _Linear:
@@ -293,18 +293,18 @@ def _unknown(held: tuple[Robot, Conditions, Array, Array]) -> _Linear:
 
 def _linear(held: tuple[Robot, Conditions, Array, Array], _: _Linear) -> _Linear:
     y, solved = held[2:]
-    slope, found = _around(*held[:2], y)
+    slope, residual = _around(*held[:2], y)
     inverted, determinant = inverse(-slope)
-    close = jnp.max(jnp.abs(inverted @ found)) < CLOSE
+    close = jnp.max(jnp.abs(inverted @ residual)) < CLOSE
     return _Linear(slope, solved & close & (determinant > 0), jnp.asarray(True))
 
 
 def _follow(held: tuple[Robot, Conditions, Array, _Linear]) -> _Search:
     """State before the first step, which has length 0 and only evaluates."""
-    y, known = held[2:]
-    y = jnp.where(known.sound, y, _begins(*held[:2]))
-    slope = jnp.where(known.sound, known.jacobian, _still(held[1]))
-    return _Search(y, jnp.zeros_like(y), slope, jnp.asarray(FIRST), jnp.asarray(0), known.sound)
+    y, unknowns = held[2:]
+    y = jnp.where(unknowns.sound, y, _begins(*held[:2]))
+    slope = jnp.where(unknowns.sound, unknowns.jacobian, _still(held[1]))
+    return _Search(y, jnp.zeros_like(y), slope, jnp.asarray(FIRST), jnp.asarray(0), unknowns.sound)
 
 
 def _turn(held: tuple[Robot, Conditions, Array, _Linear], search: _Search) -> _Search:
@@ -312,17 +312,17 @@ def _turn(held: tuple[Robot, Conditions, Array, _Linear], search: _Search) -> _S
     slow = np.diag(np.arange(search.y.size) < SETTLING)
     step = inverse(jnp.asarray(slow) / search.step - search.jacobian)[0] @ search.rates
     largest, next_y = jnp.max(jnp.abs(step)), search.y + step
-    slope, found = _around(*held[:2], next_y)
-    before, after = jnp.linalg.norm(search.rates), jnp.linalg.norm(found)
+    slope, residual = _around(*held[:2], next_y)
+    before, after = jnp.linalg.norm(search.rates), jnp.linalg.norm(residual)
     worse = (~(after <= WORSE * before + SMALL) | (largest > FAR)) & (search.turns > 0)
     worse &= search.step > SHORTEST
     ended = ~worse & (largest < SMALL) & ((search.step > LONG) | (after < SMALL_RATE))
-    y, found, slope = (
+    y, residual, slope = (
         jnp.where(worse, old, new)
-        for old, new in ((search.y, next_y), (search.rates, found), (search.jacobian, slope))
+        for old, new in ((search.y, next_y), (search.rates, residual), (search.jacobian, slope))
     )
     length = jnp.clip(search.step * jnp.where(worse, SHORTER, LONGER), SHORTEST, LONGEST)
-    return _Search(y, found, slope, length, search.turns + 1, ended)
+    return _Search(y, residual, slope, length, search.turns + 1, ended)
 
 
 def _unknowns(robot: Robot, conditions: Conditions) -> tuple[Float[Array, " 9"], Bool[Array, ""]]:
@@ -337,9 +337,9 @@ def _unknowns(robot: Robot, conditions: Conditions) -> tuple[Float[Array, " 9"],
     """
     held = robot, conditions
     first = lanes.loop_until(_secant, _look, lambda s: (s.looks >= SOON) | s.solved, held, lambda s: (s.y, s.solved))
-    known = lanes.loop_until(_unknown, _linear, lambda s: s.known, (*held, *first))
+    solution = lanes.loop_until(_unknown, _linear, lambda s: s.known, (*held, *first))
     end = lanes.loop_until(
-        _follow, _turn, lambda s: (s.turns >= TURNS) | s.solved, (*held, first[0], known), most=FEW
+        _follow, _turn, lambda s: (s.turns >= TURNS) | s.solved, (*held, first[0], solution), most=FEW
     )
     sound = end.solved & jnp.all(jnp.isfinite(end.jacobian))
     slope = jnp.where(sound, end.jacobian, jnp.asarray(_still(conditions)))
@@ -439,18 +439,18 @@ norm = functools.partial(error_norm_of_sides, whole=slice(4, len(_UNITS)), own=O
 
 def _of_sides(robot: Robot, conditions: Conditions, motion: PlaneMotion) -> tuple[Conditions, State]:
     """Conditions of each side, with the slope along its heading, and its state."""
-    own = conditions.of_sides()
-    along = jnp.degrees(jnp.arcsin(jnp.sin(own.slope) * jnp.cos(motion.heading)))
+    sides = conditions.of_sides()
+    along = jnp.degrees(jnp.arcsin(jnp.sin(sides.slope) * jnp.cos(motion.heading)))
     return (
-        dataclasses.replace(own, slope_deg=along, heading_deg=None),
+        dataclasses.replace(sides, slope_deg=along, heading_deg=None),
         balances.states_of_sides(robot, conditions, motion),
     )
 
 
 def current_at_rest(robot: Robot, conditions: Conditions, motion: PlaneMotion) -> Float[Array, " 2"]:
     """Currents that settle in a standing robot [A]."""
-    own, state = _of_sides(robot, conditions, motion)
-    return jnp.asarray(jax.vmap(lambda c, s: rest.current_at_rest(robot, c, s))(own, state))
+    sides, state = _of_sides(robot, conditions, motion)
+    return jnp.asarray(jax.vmap(lambda c, s: rest.current_at_rest(robot, c, s))(sides, state))
 
 
 def firmness(robot: Robot, conditions: Conditions, motion: PlaneMotion) -> Scalar:
@@ -488,7 +488,7 @@ def result_of(robot: Robot, travel: balances.Travel, status: Array) -> Result:
     mean = jax.tree.map(lambda x: jnp.mean(x, axis=0), each)
     flags = each.flags[0] | each.flags[1]
     limit = robot.sides / 2 * signals.adhesion_limit
-    found = dataclasses.replace(
+    result = dataclasses.replace(
         mean,
         reading=balances.readings_of_sides(robot, signals),
         slip=ground.slip_ratio(mean.speed, mean.theoretical_speed),
@@ -500,7 +500,7 @@ def result_of(robot: Robot, travel: balances.Travel, status: Array) -> Result:
         status=status,
         flags=flags,
     )
-    return mask_unknown(robot, found)
+    return mask_unknown(robot, result)
 
 
 def operating_point(robot: Robot, conditions: Conditions) -> tuple[Result, Array]:

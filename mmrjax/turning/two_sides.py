@@ -218,9 +218,9 @@ def _moments_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
     law, sliding, middle, end = primals
     across = middle + end * law.places()
     along = sliding[:, None] ** 2
-    found = law.over(law.per_speed(along, across**2), 3)
+    moments = law.over(law.per_speed(along, across**2), 3)
     by_along, by_across = law.per_speed_rise(along, across**2)
-    change = jnp.zeros_like(found)
+    change = jnp.zeros_like(moments)
     if tangents[1] is not None:
         change += 2 * (sliding * tangents[1])[:, None] * law.over(by_along, 3)
     if tangents[2] is not None or tangents[3] is not None:
@@ -229,7 +229,7 @@ def _moments_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
             change += 0.0 if tangent is None else 2 * tangent * part
     if any(x is not None for x in jax.tree.leaves(tangents[0])):
         change += eqx.filter_jvp(lambda law: law.over(law.per_speed(along, across**2), 3), (law,), (tangents[0],))[1]
-    return found, change
+    return moments, change
 
 
 class _Given(NamedTuple):
@@ -277,10 +277,10 @@ def grip(
         return _at_loads(loads, None, given)
     held = jax.lax.stop_gradient(given)
     at, rise = _loads(held)
-    found = _at_loads(at, None, given)
+    forces = _at_loads(at, None, given)
     # Only the last step carries derivatives, the implicit ones; it is so small that linear terms suffice.
-    change = _step(found.lacking, rise.lacking)
-    return jax.tree.map(lambda x, slope: x - slope @ change, found, rise)
+    change = _step(forces.lacking, rise.lacking)
+    return jax.tree.map(lambda x, slope: x - slope @ change, forces, rise)
 
 
 def _step(lacking: Float[Array, " 2"], slope: Float[Array, "2 2"]) -> Float[Array, " 2"]:
@@ -305,8 +305,8 @@ def _loads(given: _Given) -> tuple[Float[Array, " 2"], Grip]:
             slope, left = jax.jacfwd(lacking, has_aux=True)(loads)
             return loads - _step(left, slope)
 
-        found = jax.lax.fori_loop(0, LOAD_STEPS, step, loads, unroll=even is not None)
-        return found, jax.jacfwd(lambda x: _at_loads(x, even, given))(found)
+        loads_found = jax.lax.fori_loop(0, LOAD_STEPS, step, loads, unroll=even is not None)
+        return loads_found, jax.jacfwd(lambda x: _at_loads(x, even, given))(loads_found)
 
     nothing = load * given.sliding[0]
     begun = jnp.stack([jnp.zeros_like(nothing), stance.ahead * jnp.ones_like(nothing)])

@@ -106,11 +106,11 @@ def _contacts(run: System, motion: Motion) -> _Sides:
     nothing = jnp.zeros_like(y)
     of_q = jnp.stack([nothing, heights, q[PITCH] + nothing, *q[PULLEYS].T], axis=1)
     of_v = jnp.stack([speed - v[YAW] * y, rises, v[PITCH] + nothing, *v[PULLEYS].T], axis=1)
-    at = jax.vmap(lambda q, v: side_contacts.contact_state(run.path, run.chassis, q, v))(of_q, of_v)
+    touching = jax.vmap(lambda q, v: side_contacts.contact_state(run.path, run.chassis, q, v))(of_q, of_v)
     own, ratio = run.chassis.turning, balances.lateral_friction(run.conditions, run.chassis)
     law = Law(run.chassis.ground.friction, ratio ** (2 * own.rule - 2), run.chassis.on_tracks, own.nodes)
-    aside = lateral + v[YAW] * at.lever_x - v[ROLL] * at.lever_z
-    return _Sides(run.path, law, ratio**own.rule, at, aside, heights)
+    aside = lateral + v[YAW] * touching.lever_x - v[ROLL] * touching.lever_z
+    return _Sides(run.path, law, ratio**own.rule, touching, aside, heights)
 
 
 def _resolved(run: System, motion: PlaneMotion, sides: _Sides) -> tuple[Signals, Pull]:
@@ -190,15 +190,15 @@ def resistance(
     Also returns the levers, and the rise of each contact's forces with its sliding [N·s/m], shape (2, 2, 2,
     contacts).
     """
-    levers, at = _levers(run, motion, sides.at), sides.at
+    levers, touching = _levers(run, motion, sides.at), sides.at
     assert pulled.aside is not None
-    sliding = jax.vmap(side_contacts.sliding_speeds)(signals, at)
-    weight = jnp.asarray(signals.adhesion)[:, None] * at.force
+    sliding = jax.vmap(side_contacts.sliding_speeds)(signals, touching)
+    weight = jnp.asarray(signals.adhesion)[:, None] * touching.force
     rises = jnp.stack([jnp.stack(row) for row in sides.law.rises(sliding, -sides.aside)])
     rises = rises * jnp.stack([weight, sides.lateral * weight])[:, None]
-    least = jnp.maximum(at.force, 1e-9)
+    least = jnp.maximum(touching.force, 1e-9)
     moves = jnp.concatenate([levers.along, levers.across, levers.off], axis=1)
-    falls = at.damped[..., None] * levers.off
+    falls = touching.damped[..., None] * levers.off
     pushes = [
         rises[k, 0][..., None] * levers.along
         + rises[k, 1][..., None] * levers.across
@@ -209,13 +209,13 @@ def resistance(
     losses = _losses(run, plane_motion(run, motion), sides)
     # Rolling resistance acts at each side, along the robot.
     cos, sin = cosine(motion.q[YAW]), sine(motion.q[YAW])
-    found = jnp.zeros((COORDINATES, COORDINATES), motion.v.dtype)
+    total = jnp.zeros((COORDINATES, COORDINATES), motion.v.dtype)
     for k, y in enumerate(SIDES):
         way = jnp.zeros(8).at[jnp.asarray([X, Y, YAW])].set(jnp.stack([cos, sin, -y * _width(run)]))
-        own = each[k] + losses[0, k] * jnp.outer(way, way)
-        own = own.at[6, 6].add(losses[1, k])
-        found = found.at[np.ix_(OF_SIDE[k], OF_SIDE[k])].add(own)
-    return run.robot.sides / 2 * found, levers, rises
+        of_side = each[k] + losses[0, k] * jnp.outer(way, way)
+        of_side = of_side.at[6, 6].add(losses[1, k])
+        total = total.at[np.ix_(OF_SIDE[k], OF_SIDE[k])].add(of_side)
+    return run.robot.sides / 2 * total, levers, rises
 
 
 def dynamics(
@@ -269,8 +269,8 @@ def advance(run: System, motion: Motion) -> tuple[Motion, balances.Travel, Float
         The motion after it. All signals of the instant before it, with forces and accelerations of the step. The load
         on each lower guide before it [N].
     """
-    found = _forces(run, motion)
-    return _moved(run, motion, found, _solver(run, found)(found.push))
+    forces = _forces(run, motion)
+    return _moved(run, motion, forces, _solver(run, forces)(forces.push))
 
 
 @advance.def_jvp
@@ -291,21 +291,23 @@ def _differentiated(primals: tuple[System, Motion], tangents: tuple[Any, Any]) -
 
 def _fallen(run: System, motion: Motion, found: _Forces, gained: Float[Array, " 10"]) -> Float[Array, " 10"]:
     """The product K Δv, see `resistance`, without forming K."""
-    at, pulled, levers = found.sides.at, found.pulled, found.levers
+    touching, pulled, levers = found.sides.at, found.pulled, found.levers
     assert pulled.aside is not None
-    after = forces_after(at, pulled, levers, found.rises, gained)
+    after = forces_after(touching, pulled, levers, found.rises, gained)
     losses, shafts = _losses(run, plane_motion(run, motion), found.sides)
     cos, sin, y = cosine(motion.q[YAW]), sine(motion.q[YAW]), SIDES * _width(run)
     ahead, turn = cos * gained[X] + sin * gained[Y], gained[YAW]
     rolls = losses * (ahead - y * turn)
-    own = jnp.zeros(COORDINATES, motion.v.dtype).at[SHAFTS].set(shafts * gained[SHAFTS])
-    own = own.at[jnp.asarray([X, Y, YAW])].add(jnp.stack([cos * jnp.sum(rolls), sin * jnp.sum(rolls), -y @ rolls]))
+    gained_forces = jnp.zeros(COORDINATES, motion.v.dtype).at[SHAFTS].set(shafts * gained[SHAFTS])
+    gained_forces = gained_forces.at[jnp.asarray([X, Y, YAW])].add(
+        jnp.stack([cos * jnp.sum(rolls), sin * jnp.sum(rolls), -y @ rolls])
+    )
     for lever, now, then in zip(
-        (levers.along, levers.across, levers.off), (pulled.force, pulled.aside, at.force), after, strict=True
+        (levers.along, levers.across, levers.off), (pulled.force, pulled.aside, touching.force), after, strict=True
     ):
         each = jnp.einsum("sci,sc->si", lever, now - then)
-        own = own.at[OF_SIDE[0]].add(each[0]).at[OF_SIDE[1]].add(each[1])
-    return run.robot.sides / 2 * own
+        gained_forces = gained_forces.at[OF_SIDE[0]].add(each[0]).at[OF_SIDE[1]].add(each[1])
+    return run.robot.sides / 2 * gained_forces
 
 
 def _moved(
@@ -329,8 +331,8 @@ def forces_after(
 
     Each has shape (2, contacts).
     """
-    own = gained[OF_SIDE]
-    along, across, off = (jnp.einsum("sci,si->sc", x, own) for x in (levers.along, levers.across, levers.off))
+    of_side = gained[OF_SIDE]
+    along, across, off = (jnp.einsum("sci,si->sc", x, of_side) for x in (levers.along, levers.across, levers.off))
     down, least = at.damped * off, jnp.maximum(at.force, 1e-9)
     assert pulled.aside is not None
     ahead, aside = (
@@ -342,10 +344,10 @@ def forces_after(
 
 def _travel(run: System, motion: Motion, found: _Forces, gained: Float[Array, " 10"]) -> balances.Travel:
     """All signals of a step, with its forces at its end to first order."""
-    sides, signals, at, several = found.sides, found.signals, found.sides.at, run.robot.sides / 2
-    ahead, aside, normal = forces_after(at, found.pulled, found.levers, found.rises, gained)
+    sides, signals, touching, several = found.sides, found.signals, found.sides.at, run.robot.sides / 2
+    ahead, aside, normal = forces_after(touching, found.pulled, found.levers, found.rises, gained)
     forward = run.half.centre[0]
-    arm = at.lever_x - forward
+    arm = touching.lever_x - forward
     load, moment = jnp.sum(normal, axis=-1), jnp.sum(aside * arm, axis=-1)
     signals = dataclasses.replace(signals, traction=jnp.sum(ahead, axis=-1), normal=load, moment_lateral=moment)
     # Of the centre of mass, in the rotating frame of the robot.
@@ -362,7 +364,7 @@ def _travel(run: System, motion: Motion, found: _Forces, gained: Float[Array, " 
         moment=several * moment,
         across=-several * jnp.sum(aside * sides.aside, axis=-1),
         moved=several * (load[1] - load[0]) / 2,
-        centre=jnp.sum(normal * at.lever_x) / jnp.maximum(jnp.sum(load), 1e-9),
+        centre=jnp.sum(normal * touching.lever_x) / jnp.maximum(jnp.sum(load), 1e-9),
         lacking=jnp.zeros_like(y),
     )
     return balances.Travel(signals, grip, acceleration, aside_gained - motion.v[YAW] * speed + forward * turn, turn)
@@ -411,8 +413,8 @@ def away(q: Array, reactions: Reactions) -> tuple[Array, Reactions | None]:
 def averaged(average: Average, travelled: Array, passed: balances.Travel, guided: Array) -> Steady:
     """See `half_robot.averaged`. Quantities of the whole robot are averaged over the periods of both sides."""
     both = jax.tree.map(lambda x: jnp.broadcast_to(x.reshape(*x.shape[:1], -1), (*x.shape[:1], 2)), passed)
-    found, load, periods, changes = jax.vmap(average, in_axes=1)(jnp.abs(travelled), (both, guided))
-    travel = jax.tree.map(lambda x, like: x if like.ndim > 1 else jnp.mean(x), found, passed)
+    means, load, periods, changes = jax.vmap(average, in_axes=1)(jnp.abs(travelled), (both, guided))
+    travel = jax.tree.map(lambda x, like: x if like.ndim > 1 else jnp.mean(x), means, passed)
     share = jnp.sum(load) / jnp.maximum(jnp.sum(travel.signals.normal), 1e-9)
     # A side that hardly moves counts as settled if its changes are small compared with the other side's.
     larger = [(change, jnp.max(size)) for change, size in changes]

@@ -191,8 +191,8 @@ def linearize(
     def each(values: Mapping[str, Any]) -> Float[Array, "sums contacts"]:
         path_now, chassis_now = _with(path, chassis, values)
         z, pitch, front, rear, *v = (values[name] for name in MOTION)
-        at = contact_state(path_now, chassis_now, (0.0, z, pitch, front, rear), v)
-        return contact_shares(path_now, chassis_now, at, values["slip"], values["adhesion"], gained)
+        touching = contact_state(path_now, chassis_now, (0.0, z, pitch, front, rear), v)
+        return contact_shares(path_now, chassis_now, touching, values["slip"], values["adhesion"], gained)
 
     def along(name: str) -> Float[Array, "sums contacts"]:
         value = jnp.asarray(given[name])
@@ -246,21 +246,21 @@ class _Law(eqx.Module):
 
         None: no change.
         """
-        at, sinks = self.at, None if gap is None else -gap
+        touching, sinks = self.at, None if gap is None else -gap
         yields = None if compliance is None else -self.share * compliance
-        force = _total((self.by_depth, sinks), (-at.damped, gap_rate), (at.force, yields))
-        damped = _total((self.damped_by_depth, sinks), (at.damped, yields))
-        turned = _total((self.bend * at.force, slide), (self.rise, force))
-        down = _total((damped, self.off), (at.damped, off))
+        force = _total((self.by_depth, sinks), (-touching.damped, gap_rate), (touching.force, yields))
+        damped = _total((self.damped_by_depth, sinks), (touching.damped, yields))
+        turned = _total((self.bend * touching.force, slide), (self.rise, force))
+        down = _total((damped, self.off), (touching.damped, off))
         fallen = _total(
             (jnp.where(self.rise > 0, self.along, 0.0), turned),
-            (jnp.maximum(self.rise, 0.0) * at.force, along),
-            (self.rise * at.damped * self.off, slide),
+            (jnp.maximum(self.rise, 0.0) * touching.force, along),
+            (self.rise * touching.damped * self.off, slide),
             (self.coefficient, down),
         )
-        pulled = _total((self.rise * at.force, slide), (self.coefficient, force))
-        found = (pulled, force, fallen, down, turned)
-        return tuple(jnp.zeros_like(at.force) if a is None else a for a in found)
+        pulled = _total((self.rise * touching.force, slide), (self.coefficient, force))
+        moved_sums = (pulled, force, fallen, down, turned)
+        return tuple(jnp.zeros_like(touching.force) if a is None else a for a in moved_sums)
 
 
 def _law(path: Path, chassis: Chassis, at: Touch, given: Mapping[str, Any], gained: Array) -> _Law:
@@ -337,10 +337,17 @@ def _by_motion(
     and changes of the levers with its forces.
     """
     height, pitch, front, rear, *v = (given[name] for name in MOTION)
-    at = contact_state(path, chassis, (0.0, height, pitch, front, rear), v)
-    law = _law(path, chassis, at, given, gained)
-    x, z, rate_x, rate_z, guided, one = at.lever_x, at.lever_z, at.rate_x, at.rate_z, at.guided, jnp.ones_like(at.gap)
-    on_front, on_rear = path.radius * (1 - at.weight), path.radius * at.weight
+    touching = contact_state(path, chassis, (0.0, height, pitch, front, rear), v)
+    law = _law(path, chassis, touching, given, gained)
+    x, z, rate_x, rate_z, guided, one = (
+        touching.lever_x,
+        touching.lever_z,
+        touching.rate_x,
+        touching.rate_z,
+        touching.guided,
+        jnp.ones_like(touching.gap),
+    )
+    on_front, on_rear = path.radius * (1 - touching.weight), path.radius * touching.weight
     speed, drawn = (on_front * a[3] + on_rear * a[4] for a in (v, gained))
 
     def turned(dx: Array, dz: Array, ahead: Array, rise: Array, compliance: Array | None = None) -> Forces:
@@ -364,7 +371,7 @@ def _by_motion(
     # Along the belt the tips move in the frame of the pitched chassis, and their shares of the pulleys change.
     unit = jnp.ones_like(front)
     (place, _), (by_front, shared) = jax.jvp(lambda a: path.place(a, rear), (front,), (unit,))
-    by_front, shared, by_rear = join_contacts(by_front), join_contacts(shared), at.weight * path.radius
+    by_front, shared, by_rear = join_contacts(by_front), join_contacts(shared), touching.weight * path.radius
     tip = jax.tree.map(join_contacts, jax.jvp(lambda p: tips_on_path(path, p), (place,), (jnp.ones_like(place),))[1])
     cos, sin = cosine(pitch), sine(pitch)
     belt = (
@@ -394,7 +401,7 @@ def _by_motion(
         law.moved(gap_rate=-x, slide=-z),
         law.moved(gap_rate=rate_z * on_front, slide=-rate_x * on_front),
         law.moved(gap_rate=rate_z * on_rear, slide=-rate_x * on_rear),
-        law.moved(compliance=-at.compliance / taut),
+        law.moved(compliance=-touching.compliance / taut),
     ]
     forces, rates = law.forces(), (rate_x, rate_z, guided)
     here = _Levers.of(one, x, z, tuple(a * on_front for a in rates), tuple(a * on_rear for a in rates))

@@ -142,9 +142,9 @@ class _Mover(eqx.Module):
 
 def instant(run: System, motion: Motion) -> tuple[Signals, Touch, Pull]:
     """All signals, contacts and forces of an instant."""
-    at = side_contacts.contact_state(run.path, run.chassis, motion.q, motion.v)
-    signals, pulled = _resolved(run, motion, _Mover(run.path, at, motion.q[1]), motion.v[0], motion.v[3])
-    return signals, at, pulled
+    touching = side_contacts.contact_state(run.path, run.chassis, motion.q, motion.v)
+    signals, pulled = _resolved(run, motion, _Mover(run.path, touching, motion.q[1]), motion.v[0], motion.v[3])
+    return signals, touching, pulled
 
 
 def _resolved(
@@ -219,8 +219,8 @@ def resistance(run: System, motion: Motion, signals: Signals, at: Touch, pulled:
     along = jnp.stack([one, none, at.lever_z, at.rate_x * front, at.rate_x * rear], axis=1)
     off = jnp.stack([none, one, -at.lever_x, at.rate_z * front, at.rate_z * rear], axis=1)
     none = jnp.zeros_like(losses[0])
-    own = jnp.diag(jnp.stack([losses[0], none, none, losses[1], none]))
-    return contacts_resist(along, off, pulled.force, at.force, rises, at.damped) + own
+    diagonal = jnp.diag(jnp.stack([losses[0], none, none, losses[1], none]))
+    return contacts_resist(along, off, pulled.force, at.force, rises, at.damped) + diagonal
 
 
 def contacts_resist(
@@ -265,9 +265,9 @@ class _Step(eqx.Module):
 
 
 def _step(run: System, motion: Motion) -> _Step:
-    signals, at, pulled = instant(run, motion)
+    signals, touching, pulled = instant(run, motion)
     pushed, mass = _pushed(run, motion, signals, pulled)
-    damping = resistance(run, motion, signals, at, pulled)
+    damping = resistance(run, motion, signals, touching, pulled)
     factors = factorise(mass + run.step * damping)
     gained = solve_factorised(factors, mass @ (pushed - motion.v))
     after, over = _moved(motion, run.step, state_after(run, motion, signals), damping @ gained, gained, signals)
@@ -430,9 +430,11 @@ def stand(run: System, turned: Scalar = 0.0) -> Motion:
 
     def unbalanced(y: Vector, _: None, given: tuple[Any, ...]) -> Vector:
         path, chassis, turned, weight, forward, up, axle, cos, sin = given
-        at = side_contacts.contact_state(path, chassis, placed(turned, axle - y[0], y[1]), jnp.zeros_like(rest))
-        moment = weight * (cos * (forward + y[1] * up) - sin * (up + axle)) - jnp.sum(at.force * at.lever_x)
-        return (at.normal - weight * cos) / weight, moment / weight
+        touching = side_contacts.contact_state(path, chassis, placed(turned, axle - y[0], y[1]), jnp.zeros_like(rest))
+        moment = weight * (cos * (forward + y[1] * up) - sin * (up + axle)) - jnp.sum(
+            touching.force * touching.lever_x
+        )
+        return (touching.normal - weight * cos) / weight, moment / weight
 
     recess = jnp.maximum(run.path.gear.guide_recess, 0.0) * run.chassis.on_tracks
     given = run.path, run.chassis, turned, weight, forward, up, axle, cos, sin

@@ -88,13 +88,13 @@ def robot_bodies(robot: Robot, half: Masses, conditions: Conditions) -> Bodies:
         roll = 2 * several * (half.body / 3 + half.chassis - half.body - payload) * aside**2
         rows = [jnp.stack([jnp.maximum(roll, yaw - pitch), pitch, yaw])] + [jnp.stack([spins] * 3)] * 4
         inertia = jnp.stack(rows)
-    own = jnp.stack([half.forward, zero, half.up])
+    half_sizes = jnp.stack([half.forward, zero, half.up])
     return Bodies(
         ("chassis", *names),
         jnp.stack(mass),
         inertia,
-        jnp.zeros_like(inertia).at[0].set(own),
-        jnp.stack([jnp.zeros_like(own), *places]),
+        jnp.zeros_like(inertia).at[0].set(half_sizes),
+        jnp.stack([jnp.zeros_like(half_sizes), *places]),
     )
 
 
@@ -127,13 +127,13 @@ def mjcf_text(robot: Robot, conditions: Conditions, mass: float, step: float = 1
     for k, name in enumerate(parts.names[1:], 1):
         disc = f'<geom type="cylinder" size="{outer:.9g} 0.018" euler="90 0 0" rgba=".2 .2 .2 1"'
         middles = (0.0,) if conditions.turns else (0.122, -0.122)
-        shown = "".join(f'{disc} pos="0 {y} 0"/>\n        ' for y in middles)
+        discs = "".join(f'{disc} pos="0 {y} 0"/>\n        ' for y in middles)
         across = 0.019 if conditions.turns else 0.141
         pulleys += f"""
       <body name="{name}" pos="{_row(parts.place[k])}">
         <inertial pos="0 0 0" mass="{float(parts.mass[k]):.17g}" diaginertia="{_row(parts.inertia[k])}"/>
         <joint name="{name}" type="hinge" axis="0 1 0"/>
-        {shown}<geom type="box" size="{outer:.9g} {across} 0.003" rgba=".8 .8 .2 1"/>
+        {discs}<geom type="box" size="{outer:.9g} {across} 0.003" rgba=".8 .8 .2 1"/>
       </body>"""
     joints = "".join(f'<joint name="{n}" type="{t}" axis="{a}"/>\n      ' for n, t, a in _JOINTS[conditions.turns])
     belts = "".join(

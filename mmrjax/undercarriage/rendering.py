@@ -138,8 +138,8 @@ def _turn(points: Any, angle: float, about: tuple[float, float] = (0.0, 0.0)) ->
 def belt_outline(path: Path, height: float, places: np.ndarray) -> np.ndarray:
     """Points of the belt (height 0) or of grouser tips in the chassis frame [m], at positions on its path."""
     gear = params.replace(path.gear, {"grouser_height": jnp.asarray(height)})
-    at = tips_on_path(Path(path.radius, gear), jnp.asarray(places))
-    return np.stack([np.asarray(at.forward), np.asarray(at.up)], axis=1)
+    tips = tips_on_path(Path(path.radius, gear), jnp.asarray(places))
+    return np.stack([np.asarray(tips.forward), np.asarray(tips.up)], axis=1)
 
 
 def draw(axes: Any, view: Scene, k: int) -> None:
@@ -245,9 +245,9 @@ def figure(view: Scene, k: int) -> Any:
         f"V = {view.speed[k]:.2f} m/s",
         fontsize=11,
     )
-    shown = [entry for entry in _LEGEND if not (view.wheeled and "guide" in entry[0])]
-    handles = [Line2D([], [], color=colour, lw=2.5, label=label) for label, colour in shown]
-    upper.legend(handles=handles, loc="upper left", fontsize=8, frameon=False, ncols=len(shown))
+    legend_entries = [entry for entry in _LEGEND if not (view.wheeled and "guide" in entry[0])]
+    handles = [Line2D([], [], color=colour, lw=2.5, label=label) for label, colour in legend_entries]
+    upper.legend(handles=handles, loc="upper left", fontsize=8, frameon=False, ncols=len(legend_entries))
     foot = -0.14 - rise * 0.5
     upper.plot([span - 0.02 - 50 * FORCE, span - 0.02], [foot] * 2, color=_INK, lw=2)
     upper.text(span - 0.02 - 25 * FORCE, foot + 0.004, "50 N", fontsize=8, va="bottom", ha="center")

@@ -202,15 +202,17 @@ def vibrations_of_runs(robot: Robot, runs: Trajectory, pitch: float) -> Vibratio
     """
     time, status = np.asarray(runs.time[0]), np.asarray(runs.result.status)
     tail = time > time[-1] - TAIL * (time[-1] - time[0])
-    at = time[tail]
-    found = {
-        name: np.array([fluctuation(at, x) for x in np.asarray(getattr(runs.signals, signal.field))[:, tail]])
+    tail_time = time[tail]
+    vibrations = {
+        name: np.array([fluctuation(tail_time, x) for x in np.asarray(getattr(runs.signals, signal.field))[:, tail]])
         for name, signal in SIGNALS.items()
     }
     rates = np.asarray(runs.signals.speed_wheel)[:, tail].mean(axis=1) * float(robot.radius_pulley) / pitch
-    travels = np.isin(status, (CONVERGED, NOT_SETTLED)) & np.isfinite([x[:, 1] for x in found.values()]).all(axis=0)
-    read = travels & (rates * (at[-1] - at[0]) >= PERIODS)
-    column = {name: np.where(read[:, None], x, np.nan).T for name, x in found.items()}
+    travels = np.isin(status, (CONVERGED, NOT_SETTLED)) & np.isfinite([x[:, 1] for x in vibrations.values()]).all(
+        axis=0
+    )
+    read = travels & (rates * (tail_time[-1] - tail_time[0]) >= PERIODS)
+    column = {name: np.where(read[:, None], x, np.nan).T for name, x in vibrations.items()}
     mean, deviation, frequency = ({name: x[k] for name, x in column.items()} for k in range(3))
     return Vibrations(status, read, mean["speed"], np.where(read, rates, np.nan), mean, deviation, frequency)
 
@@ -271,12 +273,12 @@ def peaks_over_speed(
         low, high = (float(np.interp(widths[side][k], index, speed)) for side in (2, 3))
         ratio = frequency[top] / passing[top]
         bend, slope, _ = np.polyfit(speed[top - 1 : top + 2] - speed[top], deviation[top - 1 : top + 2], 2)
-        at = float(np.clip(speed[top] - slope / (2 * bend), low, high))
+        peak_speed = float(np.clip(speed[top] - slope / (2 * bend), low, high))
         whole = round(float(ratio)) if np.isfinite(ratio) else 0
         order = whole if whole and abs(ratio - whole) < _SAME else 0
         near = [m for m in modes if order and m.resonant and m.band[0] <= frequency[top] <= m.band[1]]
         mode = min(near, key=lambda m: abs(m.frequency - frequency[top])).name if near else ""
-        answer.append(Peak(signal, payload, at, low, high, height, rise, order, float(frequency[top]), mode))
+        answer.append(Peak(signal, payload, peak_speed, low, high, height, rise, order, float(frequency[top]), mode))
     return answer
 
 

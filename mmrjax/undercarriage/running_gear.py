@@ -74,8 +74,8 @@ class Levers(eqx.Module):
                 side, loss_coulomb=coulomb * side.loss_coulomb, loss_viscous=viscous * side.loss_viscous
             )
 
-        own = share(self.share_coulomb, self.share_viscous)
-        return share(1 - 2 * self.share_coulomb, 1 - 2 * self.share_viscous), own
+        own_share = share(self.share_coulomb, self.share_viscous)
+        return share(1 - 2 * self.share_coulomb, 1 - 2 * self.share_viscous), own_share
 
 
 __all__ = ["GROUSERS", "TEETH_BELT", "TEETH_PULLEY", "WHEELS", "RunningGear"]

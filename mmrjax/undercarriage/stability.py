@@ -80,9 +80,9 @@ def largest_step(robot: Robot, conditions: Conditions) -> Float[np.ndarray, " ru
     robot = params.without_weak_types(_unhurried(robot))
 
     def maps(steps: Float[np.ndarray, "runs starts"]) -> Float[np.ndarray, "runs starts 11 11"]:
-        found = np.asarray(_maps(robot, conditions, jnp.asarray(steps)))
-        usable = np.isfinite(found).all(axis=(-2, -1), keepdims=True)
-        return np.where(usable, found, 0.0)
+        transition_maps = np.asarray(_maps(robot, conditions, jnp.asarray(steps)))
+        usable = np.isfinite(transition_maps).all(axis=(-2, -1), keepdims=True)
+        return np.where(usable, transition_maps, 0.0)
 
     low, high = np.full((*conditions.shape, 2), -7.0), np.full((*conditions.shape, 2), -2.0)  # powers of ten
     # Growth in continuous time (a robot about to tip, friction that falls with speed) does not depend on the step;

@@ -184,6 +184,9 @@ def _say_kept(stages: Mapping[str, Any], folder: RunFolder, robot_name: str) -> 
     if "ranking" in stages:
         for line in (*loop_words.ranking_lines(stages["ranking"]), loop_words.regression_verdict(stages["ranking"])):
             print_message(line)
+        tests = [stage[1].test for name, stage in stages.items() if name.startswith("bootstrap")]
+        if tests and tests[-1].rejected and not stages["ranking"].missing:
+            print_message(loop_words.DISAGREES)
     searches = [search for name, search in stages.items() if name.startswith("search")]
     if searches and (best := searches[-1][2].best) is not None:
         library = searches[-1][0].base.space.library

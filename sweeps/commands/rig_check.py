@@ -220,6 +220,7 @@ class RigCheck:
                     {**dataclasses.asdict(p), "determined": self.determined(p)} for p in self.foresight.parameters
                 ],
                 "alike": [list(pair) for pair in self.foresight.alike],
+                "separating": [list(columns) for columns in self.foresight.separating],
                 "together": [pair.to_json() for pair in self.foresight.together],
             }
         return {
@@ -374,7 +375,8 @@ def _data_blocks(found: RigCheck, runs: Runs, seen: Foresight) -> tuple[Block, .
     heads = columns("parameter", "value | .4g", "prior ± | .2g", "unit", "posterior/prior | .2f", "determined")
     alike = (
         f"{one} and {other} are nearly indistinguishable in these data (correlation {size:+.2f})"
-        for one, other, size in seen.alike
+        + f"; {' or '.join(more)} would separate them" * bool(more)
+        for (one, other, size), more in zip(seen.alike, seen.separating, strict=True)
     )
     return (
         Table(

@@ -31,6 +31,7 @@ from sweeps.pages.figure_style import (
     BLUE,
     FAINT,
     INK,
+    ORANGE,
     VERMILION,
     axis_label,
     configuration_looks,
@@ -479,7 +480,7 @@ def draw_frequency_response(table: Columns, read: Sequence[Channel], simulated: 
             corner_note(gain, "no run is long enough")
             continue
         frequency, response, coherence = frequency_response(series)
-        looks = zip(response, coherence, ("measured", *simulated.values()), (INK, BLUE, FAINT), strict=False)
+        looks = zip(response, coherence, ("measured", *simulated.values()), (INK, BLUE, ORANGE), strict=False)
         for values, coherent, label, colour in looks:
             drawn = np.where(coherent > COHERENT, values, np.nan)
             style = {"ls": "none", "marker": "o", "ms": 3} if label == "measured" else {"lw": 1.5}

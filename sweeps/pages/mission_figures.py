@@ -110,12 +110,27 @@ def _legend(axes: Axes, *others: Axes) -> None:
     axes.set_ylim(low, high + 0.22 * (high - low))  # room for it
 
 
+#: Turns of a curve's slope above which it is drawn as its envelope, and number of parts of the time then.
+TURNS, PARTS = 300, 200
+
+
+def _curve(axes: Axes, time: np.ndarray, values: np.ndarray, colour: str, label: str, width: float = 1.0) -> None:
+    """A curve over time, or from least to greatest in each part of the time if many cycles would fill the panel."""
+    if np.count_nonzero(np.diff(np.sign(np.diff(values)))) <= TURNS:
+        axes.plot(time, values, color=colour, lw=width, label=label)
+        return
+    parts = np.array_split(np.arange(len(time)), PARTS)
+    middle = [time[rows].mean() for rows in parts]
+    least, greatest = ([end(values[rows]) for rows in parts] for end in (np.min, np.max))
+    axes.fill_between(middle, least, greatest, color=colour, alpha=0.35, lw=0.6, label=f"{label}, least to greatest")
+
+
 def _speed(axes: Axes, time: np.ndarray, rows: Columns, linear: bool, legend: bool) -> None:
     turning = "demanded_motor_speed_rpm" in rows  # a shaft's
     speed = rows["motor_speed_rpm"] if turning else rows.get("speed_mm_s", rows["theoretical_speed_mm_s"])
-    axes.plot(time, speed, color=BLUE, lw=1.4, label="speed")
+    _curve(axes, time, speed, BLUE, "speed", 1.4)
     demanded = rows["demanded_motor_speed_rpm" if turning else "demanded_speed_mm_s"]
-    if np.isfinite(demanded).any():
+    if np.isfinite(demanded).any() and np.count_nonzero(np.diff(np.sign(np.diff(demanded)))) <= TURNS:
         axes.plot(time, demanded, color=INK, lw=0.9, ls=(0, (4, 2)), label="demanded")
     axes.set_ylabel("motor speed [rpm]" if turning else "speed [mm/s]")
     if turning or not np.any(rows["slope_deg"]):
@@ -136,12 +151,12 @@ def _speed(axes: Axes, time: np.ndarray, rows: Columns, linear: bool, legend: bo
 def _current(axes: Axes, time: np.ndarray, rows: Columns, sides: float, legend: bool) -> None:
     current, driven = (of_motors(rows, *name) for name in (("motor_current", "_A"), ("duty", "")))
     current = sides * current
-    axes.plot(time, current, color=VERMILION, lw=1.0, label="current")
+    _curve(axes, time, current, VERMILION, "current")
     top = int(np.argmax(np.abs(current)))
     axes.plot(time[top], current[top], marker="o", ms=4, color=INK, ls="none", label=f"peak {current[top]:.2f} A")
     axes.set_ylabel("current [A]")
     duty = _beside(axes, "duty [%]", PURPLE)
-    duty.plot(time, 100 * driven, color=PURPLE, lw=0.9, alpha=0.8, label="duty")
+    _curve(duty, time, 100 * driven, PURPLE, "duty", 0.9)
     low = -110 if (driven < 0).any() else 0
     duty.set_ylim(low, 110)
     if legend:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import warnings
 from collections.abc import Sequence
 
 import numpy as np
@@ -137,10 +138,13 @@ def draw_chart_of_corners(robot: Robot, corners: Sequence[Json]) -> Figure:
     on_battery = np.array([v is None for v in volts])
     used = float(robot.battery.capacity) * (1 - np.array([1.0 if c is None else max(c, 1e-9) for c in charge]))
     supply = np.array([full if v is None else v for v in volts], float)
-    runs = simulate(robot, Conditions(
+    conditions = Conditions(
         list(names), supply, slope_deg=np.array(slope, float), payload=np.array(payload, float),
         battery=on_battery.astype(float), discharge=np.where(on_battery, used, 0.0),
-    ))  # fmt: skip
+    )  # fmt: skip
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # a cut-off that rarely acts
+        runs = simulate(robot, conditions)
     done, speed = np.asarray(is_done(np.asarray(runs.status))), np.asarray(runs.motor_speed)
     with np.errstate(divide="ignore", invalid="ignore"):
         torque = np.asarray(runs.power_gear) / float(robot.sides) / speed * float(robot.gearbox.ratio)

@@ -49,6 +49,7 @@ def calibration_document(found: CalibrationResult, robot_name: str) -> Document:
             *run_tables.curve_warning(found.robot),
             *remarks(found.notes),
             facts,
+            catalogue.note("calibration.free"),
         ),
         (
             Section("Parameters before and after", tuple(_shifts(found)), "parameters-section"),

@@ -322,7 +322,7 @@ def _sections(
     fits = {when: by for when, by in found.rms.items() if not (found.refit_alone and "after" in when)}
     sized = Layout.of(found.robot).crosses_zero
     in_units = [fit_tables.rms_table(fits, found.channels)] if sized else []
-    seen: list[Block] = [errors, held_out_table(found), *in_units]
+    seen: list[Block] = [errors, held_out_table(found), catalogue.note("loop.fitted_again"), *in_units]
     seen += [catalogue.figure("loop.gains", found)] if len(found.gains) > 1 else []
     yield Section("Errors on runs that the fit has seen, and has not", tuple(seen))
     yield from _certain(found, missing)

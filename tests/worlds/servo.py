@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 from scipy.integrate import solve_ivp
 
@@ -36,41 +38,46 @@ loss_coulomb = {coulomb}
 loss_viscous = {viscous}
 """
 #: Speed of the output up to which dry friction grows to its value [rad/s].
-REST = 1e-4
+REST = 1e-5
 
 
-def simulate(goal, times, values=TRUE, tolerance=1e-10):
-    """Angle of the output at `times` [rad], and the state (current, speed, angle, integral) there.
+def simulate(goal, times, values=TRUE, tolerance=1e-10, period=0.0, late=False):
+    """Angle of the output at `times` [rad], and the state (current, speed, angle, integral, lagging duty) there.
 
     Args:
         goal: (instants, values): held from each instant until the next.
+        period: of a sampled controller, which holds its duty for so long [s]. 0: a continuous one.
+        late: True if the duty acts one sample later.
     """
-    v, states, y = values, [np.zeros(4)], np.zeros(4)
+    v, states, y = values, [np.zeros(5)], np.zeros(5)
+    lag, duties = v.get("lag", 0.0), [0.0, 0.0]  # the duty that acts, and the one that acts next
     inertia = v["load"] + v["ratio"] ** 2 * v["rotor"]
 
-    def rates(aim, t, y):
-        current, speed, angle, integral = y
-        wanted = v["kp"] * (aim - angle) + v["ki"] * integral - v["kd"] * speed
-        duty = min(max(wanted, -v["limit"]), v["limit"])
+    def demand(aim, y):
+        wanted = v["kp"] * (aim - y[2]) + v["ki"] * y[3] - v["kd"] * y[1]
+        return min(max(wanted, -v["limit"]), v["limit"])
+
+    def rates(aim, y):
+        current, speed, angle, _, lagging = y
+        wanted = demand(aim, y)
+        duty = duties[0] if period else lagging if lag else wanted
         back = v["constant"] * v["ratio"] * speed
         friction = v["coulomb"] * np.clip(speed / REST, -1, 1) + v["viscous"] * speed
         torque = v["ratio"] * v["constant"] * current - friction
-        wound = abs(duty) >= v["limit"] and duty * (aim - angle) > 0
+        wound = abs(wanted) >= v["limit"] and wanted * (aim - angle) > 0
         return [
             (duty * v["supply"] - v["resistance"] * current - back) / v["inductance"],
-            torque / inertia, speed, 0.0 if wound else aim - angle,
+            torque / inertia, speed, 0.0 if wound else aim - angle, (wanted - lagging) / lag if lag else 0.0,
         ]  # fmt: skip
 
-    instants = np.append(goal[0][1:], np.inf)
-    k = int(np.searchsorted(goal[0], 0.0, side="right")) - 1
-    now = 0.0
-    for t in times[1:]:
-        while now < t:
-            until = min(t, instants[k])
-            found = solve_ivp(
-                lambda s, y, k=k: rates(goal[1][k], s, y), (now, until), y, "Radau", rtol=tolerance, atol=tolerance
-            )
-            y, now = found.y[:, -1], until
-            k += until == instants[k]
-        states.append(y)
+    samples = np.arange(0.0, times[-1], period) if period else []
+    clock = np.unique(np.round(np.concatenate([goal[0], times, samples]), 12))
+    for now, until in itertools.pairwise(clock):
+        aim = goal[1][np.searchsorted(goal[0], now + 1e-9, side="right") - 1]
+        if period and abs(now / period - round(now / period)) < 1e-6:
+            duties[:] = (duties[1], demand(aim, y)) if late else (demand(aim, y), 0.0)
+        law = lambda _, y, aim=aim: rates(aim, y)  # noqa: E731
+        y = solve_ivp(law, (now, until), y, "Radau", rtol=tolerance, atol=tolerance).y[:, -1]
+        if np.abs(times - until).min() < 1e-9:
+            states.append(y)
     return np.array(states)[:, 2], np.array(states)

@@ -53,9 +53,9 @@ def of_npy(path: Path, name: str) -> tuple[Signal, ...]:
     with path.open("rb") as stream:
         shape, dtype = _header(stream)
     loaded = functools.cache(lambda: np.load(path, allow_pickle=False))
-    found = of_arrays(name, {path.stem: (shape, dtype, loaded)})
-    fields = (dataclasses.replace(s, path=s.path.removeprefix(f"{path.stem}.")) for s in found)
-    return tuple(fields) if dtype.names else found
+    signals = of_arrays(name, {path.stem: (shape, dtype, loaded)})
+    fields = (dataclasses.replace(s, path=s.path.removeprefix(f"{path.stem}.")) for s in signals)
+    return tuple(fields) if dtype.names else signals
 
 
 def _header(stream: Any) -> tuple[tuple[int, ...], np.dtype]:
@@ -99,14 +99,14 @@ def _check_matlab(path: Path, name: str) -> None:
     """
     content = input_files.file_bytes(path, name)
     order: Literal["little", "big"] = "big" if content[126:128] == b"MI" else "little"
-    at, size = 128, 0
-    while at + 8 <= len(content):
-        kind, length = (int.from_bytes(content[k : k + 4], order) for k in (at, at + 4))
-        at += 8
+    offset, size = 128, 0
+    while offset + 8 <= len(content):
+        kind, length = (int.from_bytes(content[k : k + 4], order) for k in (offset, offset + 4))
+        offset += 8
         # of a compressed variable, the size after decompression follows its kind
-        begin = zlib.decompressobj().decompress(content[at : at + 256], 8) if kind == COMPRESSED else b""
+        begin = zlib.decompressobj().decompress(content[offset : offset + 256], 8) if kind == COMPRESSED else b""
         size += int.from_bytes(begin[4:8], order) if begin else length
-        at += length
+        offset += length
     input_files.check_declared(name, 1, size, len(content))
     input_files.check_memory(name, size)
 
@@ -119,12 +119,12 @@ def _fields(path: str, value: np.ndarray) -> list[tuple[str, np.ndarray]]:
     """Arrays of a structure by path. Of an array of structures each has its index."""
     if value.dtype.names is None:
         return [(path, value)]
-    found: list[tuple[str, np.ndarray]] = []
+    fields: list[tuple[str, np.ndarray]] = []
     for k, each in enumerate(np.ravel(value)):
-        at = path if value.size == 1 else f"{path}[{k}]"
+        place = path if value.size == 1 else f"{path}[{k}]"
         for field in value.dtype.names:
-            found += _fields(f"{at}.{field}", np.asarray(each[field]))
-    return found
+            fields += _fields(f"{place}.{field}", np.asarray(each[field]))
+    return fields
 
 
 def of_hdf5(path: Path, name: str) -> tuple[Signal, ...]:

@@ -37,7 +37,7 @@ def of_bag(path: Path, name: str) -> tuple[Signal, ...]:
     Raises:
         BadData: a bag without definitions of its messages.
     """
-    found: list[Signal] = []
+    signals: list[Signal] = []
     with _opened(path) as reader:
         topics = {c.topic: c for c in reader.connections}
         for topic in sorted(topics):
@@ -45,15 +45,15 @@ def of_bag(path: Path, name: str) -> tuple[Signal, ...]:
             count = sum(c.msgcount for c in reader.connections if c.topic == topic)
             kinds = sorted({c.msgtype for c in reader.connections if c.topic == topic})
             if len(kinds) > 1:
-                found.append(
+                signals.append(
                     _refused(topic, count, f"has messages of types {' and '.join(kinds)}; expected one type")
                 )
                 continue
             if not count:
-                found.append(_refused(topic, 0, f"has no message of type {kind}"))
+                signals.append(_refused(topic, 0, f"has no message of type {kind}"))
                 continue
             if kind not in reader.typestore.fielddefs:
-                found.append(
+                signals.append(
                     _refused(
                         topic,
                         count,
@@ -68,15 +68,17 @@ def of_bag(path: Path, name: str) -> tuple[Signal, ...]:
             clock = Clock(f"{topic}.{_STAMP}" if stamped else f"{topic} (recorded)", _column(read, ""), "ns")
             for field, words, refused in _fields(first, ""):
                 if field != _STAMP:
-                    at = f"{topic}.{field}"
-                    found.append(Signal(at, count, _column(read, field), _unit(kind, field), clock, words, refused))
-    return tuple(found)
+                    place = f"{topic}.{field}"
+                    signals.append(
+                        Signal(place, count, _column(read, field), _unit(kind, field), clock, words, refused)
+                    )
+    return tuple(signals)
 
 
 def _unit(kind: str, field: str) -> str:
     """Unit of a field by its type of message, empty if the type states none."""
-    known = UNITS.get(kind, {})
-    return next((unit for start, unit in known.items() if field.startswith(start)), "")
+    units = UNITS.get(kind, {})
+    return next((unit for start, unit in units.items() if field.startswith(start)), "")
 
 
 def _opened(path: Path) -> Any:
@@ -123,12 +125,12 @@ def _topic(path: Path, topic: str) -> Columns:
                 )
             rows.append(tuple(values[n] for n in names if n in values))
             recorded.append(at)
-    found = {n: np.array(column) for n, column in zip(names or [], zip(*rows, strict=True), strict=True)}
-    stamps = found.pop(_STAMP, None)
+    columns = {n: np.array(column) for n, column in zip(names or [], zip(*rows, strict=True), strict=True)}
+    stamps = columns.pop(_STAMP, None)
     received = np.array(recorded, np.int64)
     if stamps is None or not (stamps > 0).all() or np.median(np.abs(stamps - received)) > _APART:
-        return found | {"": received}  # stamps of a simulator, or none
-    return found | {"": stamps}
+        return columns | {"": received}  # stamps of a simulator, or none
+    return columns | {"": stamps}
 
 
 def _fields(message: Any, at: str) -> Iterator[tuple[str, bool, str]]:

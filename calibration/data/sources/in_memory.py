@@ -33,17 +33,17 @@ def of_object(source: Any) -> tuple[str, tuple[Signal, ...]]:
     library = type(source).__module__.partition(".")[0]
     kind = type(source).__name__
     if library == "pandas" and kind == "DataFrame":
-        found = []
+        signals = []
         for level in range(source.index.nlevels):
             index = source.index.get_level_values(level)
             named = index.name is not None or index.dtype.kind in "mM"
             if named:
-                found.append(_of_series(str(index.name or "time"), index, len(source)))
-        found += [
+                signals.append(_of_series(str(index.name or "time"), index, len(source)))
+        signals += [
             _of_series(_column_name(column), source.iloc[:, j], len(source))
             for j, column in enumerate(source.columns)
         ]
-        return "the DataFrame", tuple(found)
+        return "the DataFrame", tuple(signals)
     if library == "polars" and kind in ("DataFrame", "LazyFrame"):
         try:
             frame = source.collect() if kind == "LazyFrame" else source
@@ -105,7 +105,7 @@ def _of_xarray(dataset: Any) -> tuple[Signal, ...]:
     """Signals of a Dataset. If its variables have several dimensions of time, each variable has its own clock."""
     dimensions = {d for v in dataset.data_vars.values() for d in v.dims}
     several = len({dataset.sizes[d] for d in dimensions if dataset.sizes[d] > 1}) > 1 and len(dimensions) > 1
-    found: list[Signal] = []
+    signals_found: list[Signal] = []
     for name, array in {**dataset.coords, **dataset.data_vars}.items():
         if not array.dims:
             continue
@@ -118,8 +118,8 @@ def _of_xarray(dataset: Any) -> tuple[Signal, ...]:
         signals = of_arrays(
             "the Dataset", {str(name): (shape, dtype, _values(array))}, {str(name): str(array.attrs.get("units", ""))}
         )
-        found += [dataclasses.replace(s, clock=clock) for s in signals]
-    return tuple(found)
+        signals_found += [dataclasses.replace(s, clock=clock) for s in signals]
+    return tuple(signals_found)
 
 
 def _values(array: Any) -> Callable[[], np.ndarray]:

@@ -60,11 +60,11 @@ def _object(pairs: list[tuple[str, Any]]) -> Json:
     Raises:
         ValueError: a key is there twice.
     """
-    found = dict(pairs)
-    if len(found) < len(pairs):
+    by_key = dict(pairs)
+    if len(by_key) < len(pairs):
         twice = next(key for key, count in collections.Counter(key for key, _ in pairs).items() if count > 1)
         raise ValueError(f"an object has the key {encodable_text(twice)} twice")
-    return found
+    return by_key
 
 
 def of_content(content: Any, name: str) -> tuple[Signal, ...]:
@@ -75,13 +75,13 @@ def of_content(content: Any, name: str) -> tuple[Signal, ...]:
     """
     arrays: Json = {}
     _collect(content, "", arrays, name, 1)
-    arrays = _stacked({at: values for at, values in arrays.items() if values.size})
+    arrays = _stacked({path: values for path, values in arrays.items() if values.size})
     if not arrays:
         raise BadData(
             f"{name}: holds no list of records and no arrays; expected "
             '[{"time_s": 0.0, ...}, ...] or {"time_s": [...], ...}'
         )
-    return of_arrays(name, {at: (v.shape, v.dtype, values_in_memory(v)) for at, v in arrays.items()})
+    return of_arrays(name, {path: (v.shape, v.dtype, values_in_memory(v)) for path, v in arrays.items()})
 
 
 def _collect(value: Any, at: str, arrays: Columns, name: str, depth: int) -> None:
@@ -190,10 +190,10 @@ def _array(values: Sequence[Any]) -> np.ndarray:
     if kinds <= {str, type(None)}:
         return np.array(["" if value is None else value for value in values])
     try:
-        found = np.array([[np.nan if x is None else x for x in v] if isinstance(v, list) else v for v in values])
+        array = np.array([[np.nan if x is None else x for x in v] if isinstance(v, list) else v for v in values])
     except (ValueError, TypeError):  # lists of several lengths
-        found = np.empty(len(values), object)
-    return found if found.dtype.kind in "biufUS" else found.astype(object)
+        array = np.empty(len(values), object)
+    return array if array.dtype.kind in "biufUS" else array.astype(object)
 
 
 def _stacked(arrays: Columns) -> Columns:
@@ -201,12 +201,12 @@ def _stacked(arrays: Columns) -> Columns:
 
     A file of WPILib SysId has such tables: «slow-forward», «fast-backward», ... are lists of rows.
     """
-    shaped = {at: v for at, v in arrays.items() if v.ndim == 2 and v.dtype.kind in "iuf" and v.shape[1] > 1}
+    shaped = {path: v for path, v in arrays.items() if v.ndim == 2 and v.dtype.kind in "iuf" and v.shape[1] > 1}
     widths = {v.shape[1] for v in shaped.values()}
-    groups = {parent_path(at) for at in shaped}
+    groups = {parent_path(path) for path in shaped}
     if len(shaped) < 2 or len(widths) > 1 or len(groups) > 1:
         return arrays
     (above,) = groups
-    rest = {at: v for at, v in arrays.items() if at not in shaped}
-    runs = np.concatenate([np.full(len(v), path_parts(at)[-1]) for at, v in shaped.items()])
+    rest = {path: v for path, v in arrays.items() if path not in shaped}
+    runs = np.concatenate([np.full(len(v), path_parts(path)[-1]) for path, v in shaped.items()])
     return rest | {f"{above}rows": np.concatenate(list(shaped.values())), f"{above}{RUN}": runs}

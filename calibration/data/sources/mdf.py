@@ -16,7 +16,7 @@ from calibration.data.sources.recorded_signals import Clock, Signal
 
 def of_mdf(path: Path, name: str) -> tuple[Signal, ...]:
     """Signals of an MDF file by channel. Where groups have channels of one name, `group/channel`."""
-    found: list[Signal] = []
+    signals: list[Signal] = []
     with _opened(path) as file:
         count = collections.Counter(c.name for g in file.groups for c in g.channels)
         for k, group in enumerate(file.groups):
@@ -29,15 +29,15 @@ def of_mdf(path: Path, name: str) -> tuple[Signal, ...]:
                     continue
                 at = channel.name if count[channel.name] == 1 else f"{title}/{channel.name}"
                 unit = file.get_channel_unit(group=k, index=j) or ""
-                found.append(Signal(at, rows, _column(path, k, j), unit, clock))
-    clocks = {id(s.clock) for s in found}
-    if len(clocks) == 1 and found and found[0].clock is not None:  # a table
-        time = found[0].clock
-        found = [
-            Signal("time_s", found[0].length, time.load, "s"),
-            *(Signal(s.path, s.length, s.load, s.unit) for s in found),
+                signals.append(Signal(at, rows, _column(path, k, j), unit, clock))
+    clocks = {id(s.clock) for s in signals}
+    if len(clocks) == 1 and signals and signals[0].clock is not None:  # a table
+        time = signals[0].clock
+        signals = [
+            Signal("time_s", signals[0].length, time.load, "s"),
+            *(Signal(s.path, s.length, s.load, s.unit) for s in signals),
         ]
-    return tuple(found)
+    return tuple(signals)
 
 
 @contextlib.contextmanager
@@ -78,9 +78,9 @@ def _time(path: Path, group: int) -> Callable[[], np.ndarray]:
 def _column(path: Path, group: int, index: int) -> Callable[[], np.ndarray]:
     def load() -> np.ndarray:
         with _opened(path) as file:
-            found = file.get(group=group, index=index, ignore_invalidation_bits=True)  # else they are left out
-        invalid = found.invalidation_bits
-        values = np.asarray(found.samples)
+            samples = file.get(group=group, index=index, ignore_invalidation_bits=True)  # else they are left out
+        invalid = samples.invalidation_bits
+        values = np.asarray(samples.samples)
         return values if invalid is None else np.ma.masked_array(values, np.asarray(invalid, bool))
 
     return load

@@ -65,17 +65,17 @@ def clock_seconds(clock: Clock) -> Elapsed:
 
 def guessed_unit(raw: np.ndarray) -> str:
     """Unit of a clock by its numbers, a key of `recorded_signals.UNITS`."""
-    found = np.asarray(raw, float)
-    found = found[np.isfinite(found)]
-    if not len(found):
+    stamps = np.asarray(raw, float)
+    stamps = stamps[np.isfinite(stamps)]
+    if not len(stamps):
         return "s"
     for unit in ("s", "ms", "us", "ns"):
         low, high = (limit / UNITS[unit] for limit in EPOCH)
-        if low <= found[0] <= high:
+        if low <= stamps[0] <= high:
             return unit
-    steps = np.diff(found)
+    steps = np.diff(stamps)
     steps = steps[steps > 0]
-    if not len(steps) or (found % 1).any():
+    if not len(steps) or (stamps % 1).any():
         return "s"
     usual = float(np.median(steps))
     if usual % 100 == 0 and 1e2 < usual <= 1e5 and 1e6 % usual and not (steps % 100).any():
@@ -183,20 +183,20 @@ def used_once(rows: np.ndarray, time: np.ndarray, values: np.ndarray) -> np.ndar
         rows: time of the rows [s], shape (rows,).
         time, values: of the samples, shape (samples,).
     """
-    own = np.asarray(values, float)
-    sound = np.isfinite(own)
-    time, own = time[sound], own[sound]
-    found = np.full(len(rows), np.nan)
+    numbers = np.asarray(values, float)
+    sound = np.isfinite(numbers)
+    time, numbers = time[sound], numbers[sound]
+    resampled = np.full(len(rows), np.nan)
     if not len(time) or not len(rows):
-        return found
+        return resampled
     after = np.clip(np.searchsorted(rows, time), 1, max(len(rows) - 1, 1))
     nearest = np.where(time - rows[after - 1] <= rows[np.minimum(after, len(rows) - 1)] - time, after - 1, after)
     nearest = np.minimum(nearest, len(rows) - 1)
     step = _step(rows)
     near = np.unique(nearest[np.abs(rows[nearest] - time) <= max(step, 1e-9)])
     near = near[(rows[near] >= time[0]) & (rows[near] <= time[-1])]
-    found[near] = np.interp(rows[near], time, own)
-    return found
+    resampled[near] = np.interp(rows[near], time, numbers)
+    return resampled
 
 
 def _order(time: np.ndarray) -> np.ndarray | None:
@@ -221,9 +221,9 @@ def _check(name: str, clock: str, time: np.ndarray) -> None:
     if not len(time):
         raise BadData(f"{name}, {clock}: has no sample; expected time stamps")
     if (back := np.flatnonzero(~(np.diff(time) >= 0))).size:
-        at = int(back[0])
+        row = int(back[0])
         raise BadData(
-            f"{name}, {clock}: goes back from {bound_text(time[at])} to {bound_text(time[at + 1])} s at "
-            f"sample {at + 2}; "
+            f"{name}, {clock}: goes back from {bound_text(time[row])} to {bound_text(time[row + 1])} s at "
+            f"sample {row + 2}; "
             "expected time stamps that rise; sort the recording, or give each part its own file"
         )

@@ -168,8 +168,8 @@ def open_signals(path: Path, within: str, name: str, form: Format) -> Source:
     if not signals:
         raise BadData(f"{name}: is {form.kind} without signals; expected at least one column or array")
     held = sum(file.stat().st_size for file in _files(path))
-    found = checked_source(name, form.kind, signals, held, source_digest(path))
-    return found.below(within) if within else found
+    source = checked_source(name, form.kind, signals, held, source_digest(path))
+    return source.below(within) if within else source
 
 
 def open_object(source: Any) -> Source:
@@ -261,12 +261,12 @@ def check_folder(path: Path, name: str) -> None:
 
 def source_digest(path: Path) -> str:
     """SHA-256 of a file, or of the files of a folder in the order of their names."""
-    found = hashlib.sha256()
+    digest = hashlib.sha256()
     for file in _files(path):
         with file.open("rb") as stream:
             while block := stream.read(2**20):
-                found.update(block)
-    return found.hexdigest()
+                digest.update(block)
+    return digest.hexdigest()
 
 
 def _files(path: Path) -> list[Path]:

@@ -214,13 +214,13 @@ def _of_signals(source: Source, layout: Layout, columns: Preset | None, between:
                 f"{source.name}, {signal.path}: {signal.refused}"
                 + ("" if column == signal.path else f" (read as {column})")
             )
-    own = [s for s in chosen.values() if s.clock is not None]
-    extras = _extras(source, chosen, own)
+    timed = [s for s in chosen.values() if s.clock is not None]
+    extras = _extras(source, chosen, timed)
     size = input_files.VALUE * sum(s.length for s in (*chosen.values(), *extras.values()))
     input_files.check_memory(source.name, size)
     if columns is not None:
         chosen = {name: _decoded_signal(columns.column_of(name), signal) for name, signal in chosen.items()}
-    if own:
+    if timed:
         values, more = _on_a_grid(source, chosen, layout, between, clock, mapped)
     else:
         values, more = _in_rows(source, chosen), ()
@@ -259,8 +259,8 @@ def _chosen(source: Source, mapped: Mapped, layout: Layout) -> tuple[dict[str, S
         else:
             near = suggested_paths(theirs, [s.path for s in source.signals])
             missing.append(f"{source.name}: no signal {theirs}, which {mine} is read from; {near}")
-    own = dataclasses.replace(layout, channels=channels.EVERY, mapped=()).spellings()
-    spelled = {name.casefold() for name in own}
+    spellings = dataclasses.replace(layout, channels=channels.EVERY, mapped=()).spellings()
+    spelled = {name.casefold() for name in spellings}
     taken = {id(signal) for signal in chosen.values()}
     for signal in source.signals:
         vague = signal.clock is not None and signal.name in (*WORDS, *WHEN)  # a topic's mode is something else
@@ -307,11 +307,11 @@ def _in_rows(source: Source, signals: Mapping[str, Signal], rows: int = 0) -> Co
                 f"{source.name}, {signals[column].path}: has {length} values, and {other} has {rows}; "
                 "expected equal lengths, or time stamps of its own in the same group, an array named time"
             )
-    found = {}
+    columns = {}
     for column, signal in signals.items():
         values = signal.load()
-        found[column] = values if len(values) == rows else np.repeat(values, rows)
-    return found
+        columns[column] = values if len(values) == rows else np.repeat(values, rows)
+    return columns
 
 
 def _on_a_grid(

@@ -136,13 +136,13 @@ def find_signal(signals: Sequence[Signal], name: str, where: str) -> Signal:
     Raises:
         BadData: no signal matches, or several match.
     """
-    found = matching_signals(signals, name)
-    if len(found) == 1:
-        return found[0]
-    if found:
-        listed = ", ".join(s.path for s in found[:8])
+    matches = matching_signals(signals, name)
+    if len(matches) == 1:
+        return matches[0]
+    if matches:
+        listed = ", ".join(s.path for s in matches[:8])
         raise BadData(
-            f"{where}, {name}: got a name of {len(found)} signals, {listed}; expected the path of one of them"
+            f"{where}, {name}: got a name of {len(matches)} signals, {listed}; expected the path of one of them"
         )
     raise BadData(f"{where}, {name}: no such signal; {suggested_paths(name, [s.path for s in signals])}")
 
@@ -162,9 +162,9 @@ def unit_of_clock(name: str) -> str | None:
         return ""
     if bare in ("millis", "micros", "nanos"):
         return {"millis": "ms", "micros": "us", "nanos": "ns"}[bare]
-    found = _UNIT_OF_CLOCK.search(bare)
-    if found and bare[: found.start()].rstrip("_ ") in CLOCKS:
-        unit = found.group(1)
+    match = _UNIT_OF_CLOCK.search(bare)
+    if match and bare[: match.start()].rstrip("_ ") in CLOCKS:
+        unit = match.group(1)
         return _WORDS_OF_UNITS.get(unit, unit.replace("µ", "u"))
     return None
 
@@ -198,13 +198,15 @@ def of_arrays(
             if unit is not None and dtype.kind in "iufM" and sum(n > 1 for n in shape) == 1:
                 of_length = clocks.setdefault(sample_count(shape), {})
                 of_length.setdefault(parent_path(path), Clock(path, _flat(arrays[path][2]), unit))
-    found: list[Signal] = []
+    signals: list[Signal] = []
     for path, (shape, dtype, load) in arrays.items():
         unit = units.get(path, "")
-        own = clocks.get(sample_count(shape), {})
-        clock = own.get(parent_path(path)) or (next(iter(own.values())) if len(own) == 1 else None)
-        found += _of_array(path, shape, dtype, load, unit, clock)
-    return tuple(found)
+        clock_of_size = clocks.get(sample_count(shape), {})
+        clock = clock_of_size.get(parent_path(path)) or (
+            next(iter(clock_of_size.values())) if len(clock_of_size) == 1 else None
+        )
+        signals += _of_array(path, shape, dtype, load, unit, clock)
+    return tuple(signals)
 
 
 def parent_path(path: str) -> str:
@@ -281,8 +283,8 @@ class Source:
             BadData: there are none.
         """
         wanted = path_parts(prefix)
-        found = tuple(s for s in self.signals if path_parts(s.path)[: len(wanted)] == wanted or s.path == prefix)
-        if not found:
+        inside = tuple(s for s in self.signals if path_parts(s.path)[: len(wanted)] == wanted or s.path == prefix)
+        if not inside:
             groups = dict.fromkeys(parent_path(s.path).rstrip("/.") or s.path for s in self.signals)
             raise BadData(f"{self.name}::{prefix}: no such signal; {suggested_paths(prefix, list(groups))}")
-        return dataclasses.replace(self, signals=found)
+        return dataclasses.replace(self, signals=inside)

@@ -42,15 +42,15 @@ def of_ulog(path: Path, name: str) -> tuple[Signal, ...]:
             f"{name}: is a damaged ULog file, or one without data; expected a whole log; download it again from the "
             "autopilot"
         )
-    found = []
+    signals = []
     for data in log.data_list:
         topic = data.name if data.multi_id == 0 else f"{data.name}[{data.multi_id}]"
         clock = Clock(f"{topic}.timestamp", _column(data, "timestamp"), "us")
         for field in data.data:
             if field != "timestamp":
                 values = data.data[field]
-                found.append(Signal(f"{topic}.{field}", len(values), _column(data, field), "", clock))
-    return tuple(found)
+                signals.append(Signal(f"{topic}.{field}", len(values), _column(data, field), "", clock))
+    return tuple(signals)
 
 
 def _check_messages(path: Path, name: str) -> dict[str, list[tuple[str, int]]]:
@@ -60,27 +60,27 @@ def _check_messages(path: Path, name: str) -> dict[str, list[tuple[str, int]]]:
         BadData: the file ends within a message. The library does not report that.
     """
     formats: dict[str, list[tuple[str, int]]] = {}
-    size, at = path.stat().st_size, HEADER
+    size, byte = path.stat().st_size, HEADER
     with path.open("rb") as stream:
-        stream.seek(at)
-        block, begin = b"", at
-        while at < size:
-            if at - begin + 3 + 2**16 > len(block) and begin + len(block) < size:
-                stream.seek(at)
-                block, begin = stream.read(2**22), at
-            if len(block) - (at - begin) < 3:
+        stream.seek(byte)
+        block, begin = b"", byte
+        while byte < size:
+            if byte - begin + 3 + 2**16 > len(block) and begin + len(block) < size:
+                stream.seek(byte)
+                block, begin = stream.read(2**22), byte
+            if len(block) - (byte - begin) < 3:
                 break
-            after = at + 3 + int.from_bytes(block[at - begin : at - begin + 2], "little")
+            after = byte + 3 + int.from_bytes(block[byte - begin : byte - begin + 2], "little")
             if after > size:
                 break
-            if block[at - begin + 2 : at - begin + 3] == b"F":
-                topic, _, fields = block[at - begin + 3 : after - begin].decode("utf-8", "replace").partition(":")
+            if block[byte - begin + 2 : byte - begin + 3] == b"F":
+                topic, _, fields = block[byte - begin + 3 : after - begin].decode("utf-8", "replace").partition(":")
                 formats[topic] = [(kind, int(count or 1)) for kind, count in _FIELD.findall(fields)]
-            at = after
-    if at != size:
+            byte = after
+    if byte != size:
         raise BadData(
-            f"{name}: ends within a message, at byte {at} of {size}, as if it is cut off; copy it again, or if the "
-            f"recorder lost its power, keep the whole messages: head -c {at} {name}"
+            f"{name}: ends within a message, at byte {byte} of {size}, as if it is cut off; copy it again, or if the "
+            f"recorder lost its power, keep the whole messages: head -c {byte} {name}"
         )
     return formats
 

@@ -45,17 +45,17 @@ def of_workbook(path: Path, name: str) -> tuple[Signal, ...]:
     tables = {sheet: frame.dropna(how="all") for sheet, frame in sheets.items()}
     tables = {sheet: frame for sheet, frame in tables.items() if len(frame) > 1}
     input_files.check_declared(name, sum(frame.shape[1] for frame in tables.values()))
-    found = []
+    signals = []
     for sheet, frame in tables.items():
         header = ["" if pd.isna(cell) else str(cell).strip() for cell in frame.iloc[0]]
         units = delimited.row_of_units(header, ["" if pd.isna(c) else str(c).strip() for c in frame.iloc[1]])
         body = frame.iloc[2 if units else 1 :]
         for k, title in enumerate(header):
             if title:
-                found.append(_signal(body.iloc[:, k].infer_objects(), title, sheet, units[k] if units else ""))
+                signals.append(_signal(body.iloc[:, k].infer_objects(), title, sheet, units[k] if units else ""))
     alone = len(tables) == 1
     return tuple(
-        dataclasses.replace(s, path=s.path.removeprefix(f"{next(iter(tables))}/")) if alone else s for s in found
+        dataclasses.replace(s, path=s.path.removeprefix(f"{next(iter(tables))}/")) if alone else s for s in signals
     )
 
 

@@ -1,0 +1,116 @@
+"""Prose and names that a reader would stumble over: docs, strings of the source, templates, help, locals.
+
+    python benchmarks/prose.py              # figures, and ceilings
+    python benchmarks/prose.py --most 20    # with the longest sentences that are flagged
+
+Sentences with a habit of `HABITS` or more than `LONG` words [%]. A semicolon does not end a sentence. Semicolons in
+docstrings [per 1000 words]. Assignments to a local that is named after how it was come by [%].
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import re
+import tomllib
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).parents[1]
+PACKAGES = ("mmrjax", "calibration", "sweeps")
+LONG = 32
+HABITS = re.compile(
+    r"^(What|Whether|How|Where|Those|Which) (?!is the|to )|\b(of|by|from|at|on|over|beside) which\b|\bbeside\b"
+    r"|\b(is|are|was|were) (said|told|asked)\b|\b(one|those) that\b|\b(says nothing|is none|are none|nothing of)\b"
+    r"|\b(alike|by itself|hardly|now and then)\b"
+)
+#: Locals that say how a value was come by, and not what it is.
+EMPTY_NAMES = frozenset(["found", "at", "own", "shown", "known", "said"])
+#: Largest figures. They only fall.
+CEILINGS = {
+    "docs": 1.3, "help": 2.5, "templates": 13.0, "strings": 1.6, "semicolons": 0.5,
+    **dict.fromkeys(PACKAGES, 1.0),
+}  # fmt: skip
+
+
+def sentences(text: str) -> list[str]:
+    """Sentences of at least six words, without code and markup."""
+    text = re.sub(r"`[^`]*`|{[{%#].*?[}%#]}|<[^>]*>|{[^}]*}", "X", text)
+    parts = re.split(r"(?<=[.!?])\s+|\n\s*\n|\n\s*[-*|#]", text)
+    return [" ".join(part.split()) for part in parts if len(part.split()) > 5]
+
+
+def is_flagged(sentence: str) -> bool:
+    """True for a long sentence and for one with a habit."""
+    return len(sentence.split()) > LONG or HABITS.search(sentence) is not None
+
+
+def _texts(content: Any) -> Iterator[str]:
+    if isinstance(content, str):
+        yield content
+    for item in content.values() if isinstance(content, dict) else content if isinstance(content, list) else ():
+        yield from _texts(item)
+
+
+def _docstrings(tree: ast.AST) -> Iterator[str]:
+    kinds = ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef
+    yield from (text for node in ast.walk(tree) if isinstance(node, kinds) and (text := ast.get_docstring(node)))
+
+
+def _strings(trees: Iterable[ast.AST]) -> Iterator[str]:
+    for tree in trees:
+        for node in ast.walk(tree):
+            if isinstance(node, ast.Constant) and isinstance(node.value, str):
+                yield node.value
+
+
+def empty_names(trees: Iterable[ast.AST]) -> float:
+    """Share of assignments to a name of `EMPTY_NAMES` [%]."""
+    nodes = (node for tree in trees for node in ast.walk(tree))
+    names = [node.id for node in nodes if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store)]
+    return 100 * sum(name in EMPTY_NAMES for name in names) / max(len(names), 1)
+
+
+def texts_by_kind(root: Path) -> dict[str, list[str]]:
+    """Texts of the docs, of help, of templates, and of the other strings of the source."""
+    docs = [p for p in sorted((root / "docs").rglob("*.md")) if "lab" not in p.parts]
+    sources = {p: ast.parse(p.read_text("utf-8")) for name in PACKAGES for p in sorted((root / name).rglob("*.py"))}
+    help_files = {p for p in sources if p.parent.name == "sweeps" and p.name.startswith(("config", "cli"))}
+    pages = root / "sweeps" / "pages" / "templates"
+    catalogue = tomllib.loads((pages / "catalogue.toml").read_text("utf-8"))
+    return {
+        "docs": [re.sub(r"```.*?```", "", p.read_text("utf-8"), flags=re.S) for p in (root / "README.md", *docs)],
+        "help": [*_strings(sources[p] for p in help_files)],
+        "templates": [*(p.read_text("utf-8") for p in pages.glob("*.j2")), *_texts(catalogue)],
+        "strings": [*_strings(tree for p, tree in sources.items() if p not in help_files)],
+    }
+
+
+def figures(root: Path = ROOT) -> dict[str, float]:
+    """Each figure of `CEILINGS`."""
+    result = {}
+    for kind, texts in texts_by_kind(root).items():
+        every = [sentence for text in texts for sentence in sentences(text)]
+        result[kind] = 100 * sum(map(is_flagged, every)) / max(len(every), 1)
+    trees = {name: [ast.parse(p.read_text("utf-8")) for p in (root / name).rglob("*.py")] for name in PACKAGES}
+    written = [text for each in trees.values() for tree in each for text in _docstrings(tree)]
+    result["semicolons"] = 1000 * sum(t.count(";") for t in written) / max(sum(len(t.split()) for t in written), 1)
+    return result | {name: empty_names(each) for name, each in trees.items()}
+
+
+def main() -> None:
+    """Print the figures, and the longest flagged sentences if wanted."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--most", type=int, default=0)
+    most = parser.parse_args().most
+    for name, figure in figures().items():
+        print(f"{name:12s} {figure:6.2f} of {CEILINGS[name]:g}")
+    for kind, texts in texts_by_kind(ROOT).items():
+        flagged = {s for text in texts for s in sentences(text) if is_flagged(s)}
+        for sentence in sorted(flagged, key=len, reverse=True)[:most]:
+            print(f"{kind}: {sentence[:240]}")
+
+
+if __name__ == "__main__":
+    main()
