@@ -46,13 +46,17 @@ def tokens(text: str) -> tuple[list[str], list[float]]:
 
 
 class Tables(HTMLParser):
-    """Rows of cell texts of every table with an id, and all text outside scripts and styles."""
+    """Rows of cell texts of every table with an id, and all text outside scripts and styles.
+
+    What stands small below a name, its meaning, is the last cell of its row.
+    """
 
     def __init__(self, page: str) -> None:
         super().__init__()
         self.tables: dict[str, list[list[str]]] = {}
         self.text = ""
         self._name: str | None = None
+        self._small, self._meaning = False, ""
         self.feed(page)
 
     def handle_starttag(self, tag, attrs):
@@ -63,16 +67,25 @@ class Tables(HTMLParser):
             self.tables[self._name].append([])
         elif tag in ("td", "th") and self._name:
             self.tables[self._name][-1].append("")
+        elif tag == "small":
+            self._small, self._meaning = True, ""
 
     def handle_endtag(self, tag):
         if tag == "table":
             self._name = None
+        elif tag == "small":
+            self._small = False
+        elif tag == "tr" and self._name and self._meaning:
+            self.tables[self._name][-1].append(self._meaning)
+            self._meaning = ""
 
     def handle_data(self, data):
         if self.cdata_elem:  # a script or a style
             return
         self.text += data
-        if self._name and self.tables[self._name] and self.tables[self._name][-1]:
+        if self._small:
+            self._meaning += data.strip()
+        elif self._name and self.tables[self._name] and self.tables[self._name][-1]:
             self.tables[self._name][-1][-1] += data.strip()
 
 

@@ -178,7 +178,8 @@ def test_a_wide_map_shows_numbers_that_fit_its_cells(cells, visible):
 
 def test_a_chart_of_corners_does_not_warn_of_the_cut_off():
     """A warning went to the terminal, between the lines of `size`."""
-    robot = params.replace(paper_robots.nominal(), {"battery.voltage_cutoff": np.asarray(2.5)})
+    robot = paper_robots.nominal()
+    robot = dataclasses.replace(robot, battery=dataclasses.replace(robot.battery, voltage_cutoff=2.5))
     corner = {"configuration": "4W2T", "payload_kg": 0.0, "slope_deg": 5.0, "state_of_charge": 0.5}
     with figure_style.figure_settings():
         assert power_figures.draw_chart_of_corners(robot, [corner]).axes
