@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from test_log_kinds import servo, written
 from test_weak_form import RIG, motor
 
 from calibration.data import rig_facts, robot_file
+from calibration.data import runs as records
+from calibration.data.input_errors import BadData
 from calibration.data.runs import Runs
 from calibration.described import describe
 from calibration.inference.conduct import error_after_steps
@@ -33,20 +36,38 @@ def swapped(speed):
     return np.where(np.arange(len(speed)) % 150 > 75, -speed, speed)
 
 
-@pytest.mark.parametrize("fault, sentence", [
-    (still, rig_facts.still_sentence), (held, rig_facts.held_sentence), (swapped, rig_facts.swapped_sentence),
+def constant(volts):
+    return np.full_like(volts, 12.0)
+
+
+def jumped(time):
+    return time + np.where(np.arange(len(time)) % 150 > 75, 3.0, 0.0)
+
+
+SPEED, VOLTS, TIME = "motor_speed_rpm", "supply_voltage_V", "time_s"
+
+
+@pytest.mark.parametrize("column, fault, words", [
+    (SPEED, still, "the same in every row, so nothing moves"),
+    (SPEED, held, "empty these cells, and the other rows are used"),
+    (SPEED, swapped, "row 377,"),  # of the first run with so much of both signs
+    (VOLTS, constant, "12 V in every row"),
+    (TIME, jumped, "row 77, time_s: 3.01 s after the row before it"),
 ])  # fmt: skip
-def test_a_fault_of_a_log_is_reported_and_only_that(robot, fault, sentence):
+def test_a_fault_of_a_log_is_reported_and_only_that(robot, column, fault, words):
     columns = motor()
-    sound = Runs("log.csv", columns).of(robot)
-    every = rig_facts.still_sentence, rig_facts.held_sentence, rig_facts.swapped_sentence
-    assert not any(of_fault(sound) for of_fault in every)
-    faulty = Runs("log.csv", {**columns, "motor_speed_rpm": fault(columns["motor_speed_rpm"])}).of(robot)
-    assert [of_fault for of_fault in every if of_fault(faulty)] == [sentence]
-    text = sentence(faulty)
-    assert "motor_speed_rpm" in text and len(text) <= 400
-    if fault is swapped:
-        assert "row 377," in text  # of the first run with so much of both signs
+    assert rig_facts.log_doubts(Runs("log.csv", columns).of(robot), robot) == ()
+    faulty = Runs("log.csv", {**columns, column: fault(columns[column])}).of(robot)
+    (text,) = rig_facts.log_doubts(faulty, robot)
+    assert words in text and column in text and len(text) <= 400
+
+
+def test_an_encoder_that_wraps_undeclared_is_refused_at_its_first_jump(tmp_path):
+    log = servo(np.random.default_rng(1))
+    log["output_angle_deg"] = log["output_angle_deg"] % 360
+    servos = written(tmp_path, "servo", log)
+    with pytest.raises(BadData, match=r"jumps by -3.* as an angle that wraps; expected an angle that continues"):
+        records.read_runs(tmp_path / "log.csv", robot=servos)
 
 
 @pytest.mark.parametrize("late", [0, 1])

@@ -548,3 +548,18 @@ def test_a_rival_that_promises_much_and_brings_nothing_ends():
     )
     assert_allclose(found.cost, [2, 2000], atol=1e-3)
     assert found.steps[1] <= fit.LATELY + 1 < alone.steps[1]
+
+
+def test_a_search_that_hardly_lowers_its_objective_ends(monkeypatch):
+    """As where a load sticks: each step brings a hundredth of a unit of 2000, and the slope promises many times more."""
+
+    def evaluate(z, members):
+        r = np.stack([[(4000 - 0.02 * abs(x)) ** 0.5, 0.0] for x in z[:, 0]])
+        return r, np.tile([[-0.01], [0.0]], (len(members), 1, 1)), members
+
+    one = jnp.ones((1, 1))
+    data = problem.Data(0 * one, one, one, jnp.zeros(1), jnp.asarray(1.0))
+    search = lambda: fit.search_rollouts(evaluate, np.zeros((1, 1)), data, np.ones((1, 1, 1)), 40, 1)[0].steps[0]  # noqa: E731
+    soon = search()
+    monkeypatch.setattr(fit, "STALLED", -1.0)
+    assert soon <= 2 * fit.LATELY + 1 < search()

@@ -72,8 +72,9 @@ def test_the_base_of_a_log_is_fitted_in_the_program_of_its_room(space, monkeypat
     assert with_slots[0].tolist() == [0.2] * space.free + [0.0] * 4
 
 
-def test_other_basins_of_a_log_are_searched_in_the_program_of_its_room(space, monkeypatch):
-    """With the priors of its coordinates, which are more than the base's."""
+@pytest.mark.parametrize("lost", [False, True])
+def test_other_basins_of_a_log_are_searched_in_the_program_of_its_room(space, monkeypatch, lost):
+    """With the priors of its coordinates, which are more than the base's. Not of a fit that is lost."""
     problem, (empty,) = space.with_room(["churning"]).fitted_by([("", "")])
     size, priors = space.free + 4, []
 
@@ -81,7 +82,7 @@ def test_other_basins_of_a_log_are_searched_in_the_program_of_its_room(space, mo
         priors.append(np.shape(data.centre))
         zero = np.zeros(len(starts))
         square = np.zeros((len(starts), size, size))
-        return Optimum(np.asarray(starts), np.asarray(starts), square, zero, zero, zero == 0, zero), zero
+        return Optimum(np.asarray(starts), np.asarray(starts), square, zero, zero, zero == lost, zero), zero
 
     monkeypatch.setattr(time_histories, "search_rollouts", rollouts)
     monkeypatch.setattr(time_histories.scans, "scanned_coordinates", lambda problem: (0,))
@@ -90,8 +91,11 @@ def test_other_basins_of_a_log_are_searched_in_the_program_of_its_room(space, mo
     )
     weights, which = space.weight[None], np.asarray(empty)[None]
     best, _ = space.bare.observe.search(
-        problem, np.zeros((1, size)), weights, which, rivals=True, most=1, scanned=space.bare
+        problem, np.full((1, size), 60.0 * lost), weights, which, rivals=True, most=1, scanned=space.bare
     )
+    if lost:
+        assert priors == [(size,)] and best.z[0].tolist() == [60.0] * size
+        return
     assert priors == [(size,)] * 2 and best.z[0].tolist() == [1.0] * space.free + [0.0] * 4
 
 
@@ -143,9 +147,9 @@ def test_a_regression_takes_an_effect_of_the_other_fit_away(space):
     assert_allclose(back.z, beside(("", "")).z, atol=1e-9)
 
 
-def ranked_sets(space, **explained):
-    """Screened single effects that explain so much [σ²], of 1000."""
-    at = np.zeros(space.free + 4)
+def ranked_sets(space, far=0.0, **explained):
+    """Screened single effects that explain so much [σ²], of 1000, so far from the prior mean [prior sd]."""
+    at = np.repeat([far, 0.0], [space.free, 4])
     return [
         Candidate(fill_slots([n], ANALYST.settings), at, at, 500 - x / 2, np.zeros(2), np.zeros(2), True, True, True,
                   simulated=False)
@@ -154,14 +158,15 @@ def ranked_sets(space, **explained):
 
 
 @pytest.mark.parametrize(
-    ("simulated", "asked", "otherwise"),
+    ("simulated", "asked", "otherwise", "far"),
     [
-        ({"churning": 900, "series_resistance": 500, "stribeck_track": 895}, 3, 0),
-        ({"churning": 300, "series_resistance": 500, "stribeck_track": 400, "brush_drop": 700}, 4, 2),
+        ({"churning": 900, "series_resistance": 500, "stribeck_track": 895}, 3, 0, 2.0),
+        ({"churning": 300, "series_resistance": 500, "stribeck_track": 400, "brush_drop": 700}, 4, 2, 2.0),
+        ({"churning": 300, "series_resistance": 500, "stribeck_track": 400, "brush_drop": 700}, 4, 2, 0.5),
     ],
 )
 def test_simulation_confirms_the_first_and_its_rivals_or_another_is_tried(
-    space, monkeypatch, simulated, asked, otherwise
+    space, monkeypatch, simulated, asked, otherwise, far
 ):
     tried = []
 
@@ -174,13 +179,13 @@ def test_simulation_confirms_the_first_and_its_rivals_or_another_is_tried(
         ]
 
     monkeypatch.setattr(screening, "fit_candidates", fit)
-    screened = ranked_sets(space, churning=900, stribeck_track=890, series_resistance=500, brush_drop=480)
+    screened = ranked_sets(space, far, churning=900, stribeck_track=890, series_resistance=500, brush_drop=480)
     found = screening.confirm_by_simulation(space.with_room(NAMES), screened, ANALYST.settings)
     assert (found.asked, found.otherwise) == (asked, otherwise)
     assert [c.simulated for c in found.candidates].count(True) == asked
     assert tried[:3] == ["churning", "series_resistance", "stribeck_track"]
-    # From the prior mean too if simulation explains less than the regression.
-    assert [tried.count(n) for n in tried[:3]] == ([1, 1, 1] if otherwise == 0 else [2, 1, 2])
+    # From the prior mean too if simulation explains less than the regression, which is not near that mean.
+    assert [tried.count(n) for n in tried[:3]] == ([1, 1, 1] if otherwise == 0 or far < 1 else [2, 1, 2])
     best = min((c for c in found.candidates if c.simulated), key=lambda c: c.cost)
     assert best.effects == (("churning",) if otherwise == 0 else ("brush_drop",))
 

@@ -33,6 +33,8 @@ FURTHER = 3
 
 #: Largest initial amplitude of a fit [prior sds of a fit].
 FAR = 1.5
+#: Distance of a start from the prior mean up to which a fit is not repeated from there [prior sd].
+BESIDE = 1.0
 #: Least gain by a set that needs another program, as a share of the largest gain of any set.
 ANOTHER = 0.05
 #: Most steps of all runs for which a base fit in the program with effects costs less than a program of its own.
@@ -141,13 +143,14 @@ def confirm_by_simulation(space: CandidateSpace, screened: Sequence[Candidate], 
     def simulate(those: Sequence[Candidate]) -> None:
         """Simulate from the regression's coordinates.
 
-        Sets that explain less there are repeated from the prior mean: a model error may have led the fit without the
-        effect elsewhere.
+        Sets that explain less there are repeated from the prior mean, unless that is near: a model error may have led
+        the fit without the effect elsewhere.
         """
         fits = fit_candidates(space, [(c.active, _start_of_simulation(space, c)) for c in those], settings)
         simulated.update({c.active: c for c in fits})
         new = [c for c in those if c.active not in space.near]
-        doubted = [c for c in new if less(simulated[c.active])]
+        elsewhere = [c for c in new if np.abs(c.z[: space.free]).max() > BESIDE]
+        doubted = [c for c in elsewhere if less(simulated[c.active])]
         at_mean = [np.where(np.arange(len(c.z)) < space.free, 0.0, _start_of_simulation(space, c)) for c in doubted]
         refits = fit_candidates(space, [(c.active, z) for c, z in zip(doubted, at_mean, strict=True)], settings)
         simulated.update({c.active: c for c in refits if c.cost < simulated[c.active].cost})

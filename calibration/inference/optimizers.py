@@ -43,8 +43,9 @@ TOLERANCE, TOLERANCE_LONG = 1e-6, 1e-3
 MOST_STEPS = 256, 2000
 #: Multiple of the decrease predicted by its linearisation that a search of rollouts may still achieve.
 HOPELESS = 10.0
-#: Number of last steps that predict the further decrease of a search of rollouts.
-LATELY = 5
+#: Number of last steps that predict the further decrease of a search of rollouts. Share of the objective by which
+#: twice as many have to lower it. (Where a load sticks, a rollout is not smooth, and its Jacobian promises more.)
+LATELY, STALLED = 5, 1e-4
 #: Number of searches that have to end in one place, and their tolerance in the objective, for an optimum.
 AGREE, SAME = 3, 0.01
 #: Largest number of cores for parallel searches.
@@ -581,7 +582,8 @@ def search_rollouts(
 ) -> tuple[Optimum, Observation]:
     """`levenberg_marquardt` of any number of members with its steps in Python, so that rollouts are compiled once.
 
-    Finished members are not evaluated again, and are replaced by queued ones.
+    Finished members are not evaluated again, and are replaced by queued ones. A search ends
+    whose last steps lowered its objective by too little (`STALLED`).
 
     Args:
         starts: shape (members, coordinates).
@@ -597,7 +599,7 @@ def search_rollouts(
     starts, weights, solver = np.asarray(starts), np.asarray(weights), _solver(data, long=True)
     assigned = Places(range(len(starts)), max(places, len(starts) * rivals))
     cost, ahead = np.full(len(starts), np.inf), starts[assigned.member]
-    trail = np.full((LATELY, len(assigned.member)), np.nan)
+    trail = np.full((2 * LATELY, len(assigned.member)), np.nan)
     progress: Progress | None = None
     while assigned:
         fresh, going = assigned.fill(), np.flatnonzero(assigned.taken)
@@ -609,6 +611,7 @@ def search_rollouts(
             evaluated,
         )
         if len(fresh):
+            trail[:, fresh] = np.nan
             aux = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), optima[2])
             begin = functools.partial(_begin, solver, size=optima[0].shape[1], aux=aux)
             begun = jax.device_get(jax.vmap(begin)(jnp.asarray(ahead)))
@@ -620,6 +623,7 @@ def search_rollouts(
         ahead, observation = state.ahead, state.aux
         small = 0.1 * (DECREMENT + DECREMENT_SHARE * ends.cost)
         over = state.over | (state.steps >= max_steps) | ((state.rejected == 0) & (ends.decrement < small))
+        over = over | (trail[0] - ends.cost < SAME + STALLED * ends.cost)
         cost[assigned.holds[going]] = ends.cost[going]
         if rivals:
             done = np.r_[[*assigned.ended], assigned.holds[over & assigned.taken]].astype(int)
@@ -628,9 +632,9 @@ def search_rollouts(
             agree = np.sum(cost[done] < lowest + SAME) >= AGREE and not lower.any()
             so_far = min(lowest, np.min(ends.cost[assigned.taken]))
             with np.errstate(invalid="ignore"):  # NaN of runs that cannot be simulated yet
-                hope = HOPELESS * np.fmin(ends.decrement, trail[0] - ends.cost)
+                hope = HOPELESS * np.fmin(ends.decrement, trail[LATELY] - ends.cost)
             over = over | (ends.cost - hope > so_far + SAME) | agree
-            trail = np.concatenate([trail[1:], ends.cost[None]])
+        trail = np.concatenate([trail[1:], ends.cost[None]])
         assigned.leave(over, (ends, observation))
     return jax.tree.map(lambda *x: np.stack(x), *(assigned.ended[k] for k in range(len(starts))))
 

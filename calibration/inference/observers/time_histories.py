@@ -150,6 +150,9 @@ def _by_row(
     return jnp.zeros((rows, *of_runs.shape[2:]), of_runs.dtype).at[place].set(of_runs, mode="drop")
 
 
+#: Distance from the prior from which a fit that did not converge, of a log with a missing effect, is not scanned for
+#: other delays [prior sd].
+LOST = 4.0
 #: Distance from the lowest of several fits up to which an unconverged one continues [half σ²], the margin of a class.
 NEAR = 3.0
 
@@ -719,12 +722,15 @@ class Histories(Observer):
 
         optima = searched(starts)
         near = np.asarray(optima[0].cost) < np.nanmin(optima[0].cost) + NEAR
-        if most is None and np.any(near & ~np.asarray(optima[0].converged)):  # a proposal has to be an optimum
+        unended = ~np.asarray(optima[0].converged) & (np.asarray(optima[0].steps) >= steps)
+        if most is None and np.any(near & unended):  # a proposal has to be an optimum
             optima = searched(np.asarray(optima[0].z))
         bare = problem if scanned is None else scanned
         if not rivals or not scans.scanned_coordinates(bare):
             return optima
         k, size = int(np.nanargmin(optima[0].cost)), len(bare.coordinates)
+        if most is not None and not optima[0].converged[k] and np.abs(optima[0].z[k]).max() > LOST:
+            return optima
 
         def one(every: tuple[Optimum, Observation]) -> tuple[Optimum, Observation]:
             best, seen = jax.tree.map(lambda leaf: leaf[k], every)

@@ -1,0 +1,113 @@
+"""Answers of the regression alone, on generated logs of one motor with six faults. Plain NumPy laws, no simulation."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from calibration.data import robot_file
+from calibration.data.runs import Runs
+from calibration.discovery import discover, findings, screening
+from calibration.discovery.settings import settings_for
+from calibration.inference.observers import Histories
+from calibration.words import loop_words
+from mmrjax.effects import BY_NAME
+
+STEP, EVERY, ROWS, RPM = 2e-4, 0.01, 200, np.pi / 30
+RIG = """
+base = "none"
+imposed = "voltage"
+channels = ["motor_current", "motor_speed"]
+sides = 1
+[motor]
+torque_constant = "0.042 ± 0.5 %"
+resistance = "0.9 ± 1 %"
+inductance = 0.0004
+friction_coulomb = "0.02 ± 50 %"
+friction_viscous = "3e-5 ± 100 %"
+inertia = "0.0002 ± 40 %"
+[gearbox]
+ratio = 1
+efficiency_load = "1 ± 0"
+[bench]
+load = "shaft"
+inertia = "1e-7 ± 0"
+loss_coulomb = "0 ± 0"
+"""
+NAMES = (
+    "encoder_scale", "supply_sag", "brush_drop", "directional_friction", "torque_offset", "torque_constant_saturation",
+    "stick_slip", "stribeck_track", "churning",
+)  # fmt: skip
+SD = np.array([8 * RPM, 0.03])  # of speed and current [SI]
+SETTINGS = settings_for(Histories, 333)
+
+
+def log(seed=1, late=0, scale=1.0, sag=0.0, forward=0.0, saturates=0.0, sticks=0.0):
+    """U - R_s I = k ω + R I + L dI/dt, J dω/dt = k I (1 - s I) - M(ω) - b ω of four runs under stairs of voltage.
+
+    Args:
+        late: rows by which the voltage acts later than its column says.
+        forward: friction is larger by this share forward, smaller backward. sticks: larger by it at rest, and falls over 60 rad/s.
+    """
+    rng = np.random.default_rng(seed)
+    levels = np.where(np.arange(5) % 2, rng.uniform(1.2, 4.0, (4, 5)), rng.uniform(4.0, 24.0, (4, 5)))
+    volts = np.repeat(levels * rng.choice([-1.0, 1.0], (4, 5)), ROWS // 5, axis=1)
+    acts = np.concatenate([np.zeros((4, late)), volts], 1)[:, :ROWS]
+    current, speed, shown = np.zeros(4), np.zeros(4), []
+    for n in range(ROWS):
+        shown.append((current, speed))
+        for _ in range(round(EVERY / STEP)):
+            settled = (acts[:, n] - 0.042 * speed) / (0.9 + sag)  # exact for the winding, of time constant 2 steps
+            current = settled + (current - settled) * np.exp(-STEP * (0.9 + sag) / 4e-4)
+            dry = 0.02 * (1 + forward * np.sign(speed) + sticks * np.exp(-np.abs(speed) / 60)) * np.tanh(speed / 0.05)
+            torque = 0.042 * current * (1 - saturates * np.abs(current)) - dry - 3e-5 * speed
+            speed = speed + STEP * torque / 2.4e-4
+    current, speed = (np.array(x).T for x in zip(*shown, strict=True))
+    return {
+        "run_id": np.repeat(["a", "b", "c", "d"], ROWS),
+        "configuration": np.repeat(["bench"], 4 * ROWS),
+        "time_s": np.tile(np.arange(ROWS) * EVERY, 4),
+        "supply_voltage_V": volts.ravel(),
+        "motor_speed_rpm": (scale * speed + SD[0] * rng.standard_normal(speed.shape)).ravel() / RPM,
+        "motor_current_A": (current + SD[1] * rng.standard_normal(current.shape)).ravel(),
+        "slope_deg": np.zeros(4 * ROWS),
+        "payload_kg": np.zeros(4 * ROWS),
+    }
+
+
+@pytest.fixture(scope="module")
+def answered(tmp_path_factory):
+    """Function from the faults of a log to its ranking."""
+    file = tmp_path_factory.mktemp("motor") / "rig.toml"
+    file.write_text(RIG, encoding="utf-8")
+    robot, library = robot_file.read_robot(file), {n: BY_NAME[n] for n in NAMES}
+
+    def of(**faults):
+        runs = Runs("log.csv", log(**faults)).of(robot)
+        sd = np.broadcast_to(SD[[0 if c.name == "motor_speed" else 1 for c in runs.channels]], runs.measured().shape)
+        space = discover.pose_candidates(runs, robot, sd, SETTINGS, {}, library)
+        return findings.rank_by_weak_form(space, screening.screen_by_weak_form(space, SETTINGS), SETTINGS)
+
+    return of
+
+
+@pytest.mark.parametrize("fault, family", [
+    ({}, ""),
+    ({"scale": 0.95}, "reading of motor speed that is the same share everywhere"),
+    ({"sag": 0.1}, "voltage drop that changes with current"),
+    ({"forward": 0.3}, "loss torque that changes with direction"),
+    ({"saturates": 0.01}, "loss torque that changes with load"),
+    ({"sticks": 2.0}, "loss torque that changes with speed"),
+])  # fmt: skip
+def test_the_mechanism_of_a_fault_leads(answered, fault, family):
+    found = answered(**fault)
+    print(loop_words.ranking_lines(found), loop_words.regression_verdict(found))
+    assert found.missing == bool(fault)
+    assert not fault or found.effects[0].family == family
+    assert family in loop_words.regression_verdict(found)
+
+
+def test_a_delay_of_ten_rows_is_a_parameter_and_nothing_is_missing(answered):
+    found = answered(late=10)
+    value, _ = found.parameters["rig.delay"]
+    assert not found.missing and value == pytest.approx(0.1, abs=EVERY)
