@@ -139,7 +139,10 @@ def test_a_fit_that_may_be_proposed_goes_on_until_it_is_an_optimum(monkeypatch):
         calls.append(np.asarray(starts))
         cost = np.array([100.0, 102.0, 110.0]) - len(calls)
         return SimpleNamespace(
-            z=np.asarray(starts) + 1, cost=cost, converged=np.array([True, len(calls) > 1, False])
+            z=np.asarray(starts) + 1,
+            cost=cost,
+            converged=np.array([True, len(calls) > 1, False]),
+            steps=np.full(3, 30),
         ), None
 
     monkeypatch.setattr(time_histories, "search_rollouts", ended)
