@@ -10,7 +10,7 @@ STEPS = {
     "sds": "the stated sds do not fit: the same with sds from the residuals",
     "bootstrap": "bootstrap of {} tables: what would a complete model leave?",
     "effects": "something is missing: fitting every effect that could explain it",
-    "more effects": "{} does not explain everything: fitting further effects",
+    "more effects": "{}: not everything is explained, fitting further effects",
     "alone": "outlying rows found: the same without them",
     "mechanism": "which mechanism explains most of it?",
     "alike": "what else explains as much as {}?",
