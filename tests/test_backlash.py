@@ -130,14 +130,19 @@ backlash = "0.08 ± 30 %"
 """
 
 
-def test_a_file_with_backlash_is_followed_with_it_and_needs_inertia(tmp_path):
-    path = tmp_path / "rig.toml"
-    path.write_text(FILE)
+@pytest.mark.parametrize(
+    ("stated", "got"),
+    [
+        ('backlash = "0.08 ± 30 %"', r"backlash: got 0\.08 rad"),
+        ('stiffness = "20 ± 5"\ndamping = "0.01 ± 0.005"', "stiffness: got 20 N·m/rad"),
+    ],
+)
+def test_a_file_with_backlash_is_followed_with_it_and_needs_inertia(tmp_path, stated, got):
+    path, text = tmp_path / "rig.toml", FILE.replace('backlash = "0.08 ± 30 %"', stated)
+    path.write_text(text)
     assert robot_file.load_robot(str(path)).loose
-    path.write_text(FILE.replace("inertia = 2e-6\n", ""))
-    with pytest.raises(
-        BadConfiguration, match=r"bench\.backlash: got 0\.08 rad; .* motor\.inertia and bench\.inertia"
-    ):
+    path.write_text(text.replace("inertia = 2e-6\n", ""))
+    with pytest.raises(BadConfiguration, match=rf"bench\.{got}; .* motor\.inertia and bench\.inertia"):
         robot_file.load_robot(str(path))
 
 

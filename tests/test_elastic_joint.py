@@ -14,7 +14,6 @@ from worlds.events import Bench, through
 
 from calibration.data import robot_file
 from calibration.data import runs as records
-from calibration.data.input_errors import BadConfiguration
 from calibration.inference.calibration import calibrate
 from mmrjax.fidelities.drive import drive_batch, drive_rates, drive_start, drive_units
 from mmrjax.fidelities.steady import steady_batch
@@ -86,39 +85,6 @@ def test_settled_travel_knows_no_joint_and_a_hanging_load_begins_twisted():
     assert_allclose(turned.reading["motor_speed"], rigid.reading["motor_speed"], rtol=1e-12)
     start = drive_start(robot_of(bench, **{"bench.torque_constant": 0.6}), Conditions(voltage=0.0))
     assert float(start[-1]) * drive_units(robot_of(bench))[-1] == pytest.approx(0.6 / 36.0)
-
-
-FILE = """
-schema = "mmrjax.robot/2"
-base = "none"
-imposed = "voltage"
-channels = ["motor_speed", "output_angle"]
-[motor]
-resistance = 3.0
-torque_constant = 0.05
-inertia = 2e-6
-friction_coulomb = 2e-3
-[gearbox]
-ratio = 16
-efficiency_load = 0.8
-[bench]
-load = "shaft"
-inertia = 0.01
-loss_coulomb = 0.1
-stiffness = "20 ± 5"
-damping = "0.01 ± 0.005"
-"""
-
-
-def test_a_file_with_a_stiffness_has_two_bodies_and_needs_inertia(tmp_path):
-    path = tmp_path / "rig.toml"
-    path.write_text(FILE)
-    assert robot_file.load_robot(str(path)).loose
-    path.write_text(FILE.replace("inertia = 2e-6\n", ""))
-    with pytest.raises(
-        BadConfiguration, match=r"bench\.stiffness: got 20 N·m/rad; .* motor\.inertia and bench\.inertia"
-    ):
-        robot_file.load_robot(str(path))
 
 
 @pytest.fixture(scope="module")

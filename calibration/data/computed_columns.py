@@ -29,8 +29,8 @@ def without_computed_torques(runs: Runs, robot: Robot) -> Runs:
     """The table without a torque that is a multiple of a current in all rows, to the digits of the file.
 
     A motor's friction leaves an offset between current and torque, so a torque that was set or read is no multiple.
-    Without a set load torque, the load of each row is the one that the file's robot balances at the current that was
-    read. That current then is no reading any more.
+    If no load torque is set, the load of each row is found from its current by the balances of the file's robot. The
+    current is then no longer a reading.
 
     Raises:
         BadData: a computed load of a log, of a table of an imposed current, or without another channel.

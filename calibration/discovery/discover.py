@@ -573,7 +573,7 @@ def _search_until_clean(
 def _confirmed(screened: Screening, left: Diagnosis, searched: Search) -> Diagnosis | None:
     """Diagnosis of a log's base fit with the gains that simulation confirms, None if these reject the base as well.
 
-    Scores are linear. The contact of a vehicle is not, and a score beyond chance may come to nothing in a simulation.
+    Scores are linear and the contact of a vehicle is not, so a score beyond chance may vanish in a simulation.
     """
     space, test, scores = screened.base.space, left.test, np.asarray(left.scores.single)
     gains = {c.effects: 2 * (screened.base.candidate.cost - c.cost) for c in searched.ladder if c.simulated}

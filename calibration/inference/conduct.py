@@ -25,7 +25,7 @@ STEP, MOST_ERROR, FEW_ROWS = 0.1, 0.5, 0.1
 
 
 def error_after_steps(runs: Runs, off: np.ndarray) -> list[Remark]:
-    """Notes on channels with an error that lies in the first sample with or after each step of the drive.
+    """Notes on channels whose error is concentrated in the first sample with or after each step of the drive.
 
     Args:
         off: simulated minus measured, NaN where either is missing, shape (rows, channels).

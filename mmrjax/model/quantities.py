@@ -56,8 +56,7 @@ def unit_in_column(unit: str) -> str:
 
 
 def unit_at_end(text: str, known: Iterable[str]) -> str | None:
-    """Returns the unit among `known` that a column's name ends with, such as kNm of `torque_kNm` and `Torque [kN·m]`,
-    None if there is none."""
+    """Unit among `known` at the end of a column's name, such as kNm of `torque_kNm` and `Torque [kN·m]`, or None."""
     end = re.split(r"[\[(\s]", text.rstrip("])"))[-1]
     units = [unit for unit in known if unit and re.search(rf"(?:^|[^A-Za-z]){unit}$", unit_in_column(end))]
     return max(units, key=len, default=None)
