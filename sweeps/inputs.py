@@ -48,9 +48,9 @@ def load_robot(config: RobotPart) -> RobotFile:
         )
     unlike = () if getattr(config, "turns", False) else _unlike(file.name, robot)
     examples = list_some(stated.example_numbers(file.text))
-    if examples and type(config) is not RobotPart:  # `rig check` lists their lines
+    if examples and isinstance(config, Calibrate | Loop):  # `rig check` lists their lines
         wide = f"± {100 * stated.EXAMPLE_SHARE:g} %"
-        notes.append(f"{file.name}: still the template's, so {wide} in a fit where they have ±: {examples}")
+        notes.append(f"{file.name}: still the template's, so the fit takes {wide} where they have ±: {examples}")
     for note in (*notes, *unlike):
         print_message(note)
     resolves = isinstance(config, FidelityPart) and fidelities.fidelity_facts(config.model).resolves

@@ -483,11 +483,13 @@ def test_an_examples_number_is_wide_until_it_is_replaced(tmp_path, kind):
     assert own == pytest.approx(mean * float(sd) / 100)
 
 
-def test_every_command_says_which_numbers_are_a_templates(mmrjax, tmp_path):
+def test_a_fit_says_which_numbers_are_a_templates(mmrjax, tmp_path):
     text = rig_new.rig_template("bench").replace('"2.0 ± 5 %"', '"2.2 ± 5 %"')
     (tmp_path / "rig.toml").write_text(text)
-    _, _, err = ends(mmrjax("compare measured --robot rig.toml --out c"), code=4)
-    assert "rig.toml: still the template's, so ± 300 % in a fit where they have ±: motor.torque_constant, " in err
+    _, _, err = ends(mmrjax("calibrate measured --robot rig.toml --out c"), code=4)
+    assert (
+        "rig.toml: still the template's, so the fit takes ± 300 % where they have ±: motor.torque_constant, " in err
+    )
     assert "motor.resistance" not in err
 
 
