@@ -1,18 +1,14 @@
 """The command line in this process, and the tables that it leaves."""
 
-from __future__ import annotations
-
 import csv
 import sys
-from collections.abc import Iterable
-from pathlib import Path
 
 import pytest
 
 from sweeps import cli
 
 
-def command(arguments: Iterable[object]) -> int:
+def command(arguments):
     """Run a command, its first words as one string. Returns its exit code."""
     words, *rest = arguments
     with pytest.MonkeyPatch.context() as patch, pytest.raises(SystemExit) as end:
@@ -21,13 +17,13 @@ def command(arguments: Iterable[object]) -> int:
     return end.value.code
 
 
-def rows(path: Path) -> list[dict[str, str]]:
+def rows(path):
     """The rows of a CSV file."""
     with path.open(newline="", encoding="utf-8") as stream:
         return list(csv.DictReader(stream))
 
 
-def ends(run: tuple[int, str, str], *said: str, code: int = 2) -> tuple[int, str, str]:
+def ends(run, *said, code=2):
     """A run (exit code, stdout, stderr) that ended with `code` and says each sentence, on stderr if it was refused."""
     ended, out, err = run
     text = out + err if code == 0 else err

@@ -4,8 +4,6 @@ one short sentence, in bounded time and memory.
 Mutations are drawn from a seeded generator.
 """
 
-from __future__ import annotations
-
 import contextlib
 import io
 import json

@@ -1,7 +1,5 @@
 """Clocks that wrap, repeat or count from 1970, and readings that a log repeats: recognised, and reported."""
 
-from __future__ import annotations
-
 import numpy as np
 import pandas as pd
 import pytest

@@ -1,7 +1,5 @@
 """A controller in the loop: simulation, steps, derivatives, tables of goal and angle, and calibration from them."""
 
-from __future__ import annotations
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp

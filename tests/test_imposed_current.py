@@ -1,7 +1,5 @@
 """Motors whose current is imposed: steady travel, histories, tables and fits against plain physics, without a winding."""
 
-from __future__ import annotations
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp

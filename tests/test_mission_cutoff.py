@@ -1,7 +1,5 @@
 """Missions that a battery's cut-off ends: beside an independent integration, its derivative, its words, bad input."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 
@@ -300,7 +298,7 @@ def test_a_cut_off_above_a_full_cell_is_refused_in_a_file(tmp_path):
 
 def test_a_cut_off_below_an_empty_cell_is_said_where_a_file_states_it(tmp_path):
     (tmp_path / "low.toml").write_text("[battery]\nvoltage_cutoff = 2.9\n")
-    notes: list[str] = []
+    notes = []
     robot_file.read_robot(tmp_path / "low.toml", notes=notes)
     assert notes == [
         "low.toml, battery.voltage_cutoff: 2.9 V is below the 3.41 V of an empty cell without load: it acts only "

@@ -1,7 +1,5 @@
 """Presets of loggers: names, units and signs of their columns, and the numbers that they ask for."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

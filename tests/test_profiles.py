@@ -1,7 +1,5 @@
 """Profiles from files: columns, units, modes and settings. Everything wrong is said in one sentence."""
 
-from __future__ import annotations
-
 import re
 
 import numpy as np
@@ -21,7 +19,7 @@ from mmrjax.model.paper_tables import adhesion_ratio
 def read(tmp_path):
     """Read a profile from text."""
 
-    def one(text: str) -> profiles.ProfileTable:
+    def one(text):
         path = tmp_path / "mission.csv"
         path.write_text(text)
         return profiles.read_profile(path)

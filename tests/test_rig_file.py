@@ -1,7 +1,5 @@
 """Rig files: the templates read, loads are converted, what is written reads back, and one sentence for each mistake."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import math

@@ -1,7 +1,5 @@
 """Rig files from URDF and from MuJoCo's models: numbers, their sources, and one sentence for each mistake."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Robots with effects of a rig's size are read again as they were written, whatever the effect and the rig."""
 
-from __future__ import annotations
-
 import dataclasses
 import pickle
 

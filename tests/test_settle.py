@@ -1,7 +1,5 @@
 """Settled runs out of logs: they are those of the levels that were held, with sds that hold. What cannot be is said."""
 
-from __future__ import annotations
-
 import contextlib
 import csv
 import json

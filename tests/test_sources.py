@@ -1,7 +1,5 @@
 """Files of every format and tables in memory: each is read equal to the arrays that it was made of."""
 
-from __future__ import annotations
-
 import json
 import os
 import sqlite3

@@ -1,7 +1,5 @@
 """Stages in files: what is read is what was written, to the bit, and no file runs code or names what it may not."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import os

@@ -1,7 +1,5 @@
 """What a rig's file states with ± is what a calibration frees, with the width that stands there."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import numpy as np

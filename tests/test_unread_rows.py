@@ -1,7 +1,5 @@
 """Settled rows whose tachometer did not read, and rows beyond a limit of supply or driver, are no readings."""
 
-from __future__ import annotations
-
 import json
 import re
 

@@ -1,7 +1,5 @@
 """Regression of a log's equations in weak form, on logs from plain NumPy laws. No window holds a jump."""
 
-from __future__ import annotations
-
 import dataclasses
 from types import SimpleNamespace
 
