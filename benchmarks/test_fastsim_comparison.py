@@ -1,6 +1,7 @@
 """Missions beside FASTSim (benchmarks/fastsim_comparison.py): beside the integral of rolling, climb and acceleration."""
 
 import importlib.util
+import sys
 
 import fastsim_comparison as comparison
 import numpy as np
@@ -59,7 +60,8 @@ def test_integral_of_a_plain_ramp():
 
 
 @pytest.mark.skipif(INSTALLED, reason="fastsim is installed")
-def test_without_fastsim_it_says_how_to_install_it(capsys):
+def test_without_fastsim_it_says_how_to_install_it(capsys, monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["fastsim_comparison.py"])
     with pytest.raises(SystemExit) as ended:
         comparison.main()
     assert ended.value.code == 2
