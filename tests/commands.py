@@ -1,10 +1,12 @@
-"""The command line in this process, and the tables that it leaves."""
+"""The command line in this process, the tables that it leaves, and files that it reads."""
 
 import csv
 import sys
 
 import pytest
 
+from calibration.data import robot_file
+from calibration.data import runs as records
 from sweeps import cli
 
 
@@ -31,3 +33,19 @@ def ends(run, *said, code=2):
     for sentence in said:
         assert sentence in text or sentence in " ".join(text.split()), text
     return run
+
+
+def text_file(path, text):
+    """Path of a new file with this text."""
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def read_rig(folder, text, name="rig.toml", **options):
+    """The robot of a new file with this text."""
+    return robot_file.read_robot(text_file(folder / name, text), **options)
+
+
+def read_table(folder, text, robot, name="log.csv"):
+    """The runs of a new table with this text."""
+    return records.read_runs(text_file(folder / name, text), robot=robot)

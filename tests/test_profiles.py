@@ -13,6 +13,7 @@ from mmrjax.missions.profile import MODES
 from mmrjax.model import channels, paper_robots
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.paper_tables import adhesion_ratio
+from tests.commands import text_file
 
 
 @pytest.fixture
@@ -20,9 +21,7 @@ def read(tmp_path):
     """Read a profile from text."""
 
     def one(text):
-        path = tmp_path / "mission.csv"
-        path.write_text(text)
-        return profiles.read_profile(path)
+        return profiles.read_profile(text_file(tmp_path / "mission.csv", text))
 
     return one
 
