@@ -1,7 +1,5 @@
 """Sizing: what a search finds meets the requirements, no grid is better, what binds, and what is refused."""
 
-from __future__ import annotations
-
 import itertools
 import json
 import math
