@@ -4,18 +4,12 @@ from __future__ import annotations
 
 import math
 import re
-from typing import Any
 
 from calibration.data import Json
 from calibration.data.input_errors import BadConfiguration, parse_number
 
 FORM = 'expected a number, or one with its standard deviation as "0.61 ± 0.03" or "0.61 ± 5 %"'
 _SIGNS = r"(?:±|\+/-|\+-)"
-
-
-def is_stated(value: Any) -> bool:
-    """True if a value of a file is text with ±."""
-    return isinstance(value, str) and re.search(_SIGNS, value) is not None
 
 
 def stated_number(text: str, where: str) -> tuple[float, float]:
@@ -57,6 +51,6 @@ def taken_apart(table: Json, where: str, prefix: str = "") -> dict[str, float]:
         name = f"{prefix}{key}"
         if isinstance(value, dict):
             sds |= taken_apart(value, where, f"{name}.")
-        elif is_stated(value):
+        elif isinstance(value, str) and re.search(_SIGNS, value) is not None:
             table[key], sds[name] = stated_number(value, f"{where}, {name}")
     return sds

@@ -93,7 +93,7 @@ def _errors(found: CalibrationResult) -> Table:
 def _shifts(found: CalibrationResult) -> Iterable[Block]:
     yield catalogue.figure("calibration.parameters", found, words=(HELD,))
     if found.tied:
-        yield Note(f"Tied: {'; '.join(f'`{n}` = {t.ratio:.4g} x `{t.leader}`' for n, t in found.tied.items())}.")
+        yield Note(f"Tied: {'; '.join(f'`{n}` = {ratio:.4g} x `{leader}`' for n, (leader, ratio) in found.tied.items())}.")
     noises = {name: (n.median_percent, n.source) for name, n in found.noise.items()}
     yield Note(fit_tables.noise_sentence(noises, found.channels))
 
