@@ -40,7 +40,9 @@ def load_robot(config: RobotPart) -> RobotFile:
     notes: list[str] = []
     file = robot_file.find_robot_file(config.robot, effect_file.effect_library(config.effects), notes)
     robot = robot_file.change_robot(file.robot, config.set, where="--set", notes=notes)
-    if robot.rig.follows_goal and not (type(config) is RobotPart or isinstance(config, Calibrate | Compare | Export | Loop)):
+    if robot.rig.follows_goal and not (
+        type(config) is RobotPart or isinstance(config, Calibrate | Compare | Export | Loop)
+    ):
         raise BadConfiguration(
             f"--robot {file.name}: its controller follows a goal over time; expected calibrate, compare, loop or rig "
             "check with a log, export, or mmrjax.simulate in Python"

@@ -132,7 +132,9 @@ def _mujoco(begun: Export, runs: Situation, at: str, draws: int, seed: int) -> E
     def texts_of(drive: Joint) -> dict[str, str]:
         return {
             "drive.xml": mujoco.mjcf_fragment(drive, motor, about, notes_of(runs), name, at, volts),
-            "scene.xml": mujoco.mjcf_scene(drive, mass, name, at, *((GOAL * motor.ratio, 0.0) if follows else middle)),
+            "scene.xml": mujoco.mjcf_scene(
+                drive, mass, name, at, *((GOAL * motor.ratio, 0.0) if follows else middle)
+            ),
         }
 
     texts = texts_of(drive)
@@ -173,7 +175,7 @@ def _followed(drive: Joint, texts: Mapping[str, str], command: float, ratio: flo
     own = drive.controller
     given = Conditions(voltage=command) if own is None else Conditions(voltage=own.supply_voltage, goal=command)
     run = drive_batch(drive.robot, jax.tree.map(lambda x: jnp.asarray(x, float)[None], given), jnp.asarray(times))
-    native = np.asarray(run.signals.angle[0])
+    native = np.asarray(run.signals.angle)[0]
     got = mujoco.angles_in_mujoco(texts, command * ratio, times)
     share = 100 * float(np.sqrt(np.mean((got - native) ** 2)) / np.sqrt(np.mean(native**2)))
     return {f"angle over {START:g} s from rest, MuJoCo C against native [%]": share}
@@ -202,7 +204,7 @@ def _actuator(begun: Export, runs: Situation, at: str, draws: int, seed: int) ->
 def _table(begun: Export, runs: Situation, at: str, draws: int, seed: int) -> Export:
     drive, constants = begun.joint, begun.constants
     law, held = feed_forward.law_of(runs, constants), feed_forward.effects_in_tables(drive)
-    fates: list[Fate] = feed_forward.fates_in_tables(runs, constants)
+    fates: list[Fate] = feed_forward.fates_in_tables(drive, constants)
     compared = comparison.compare_format(runs, law, fates, held, mujoco.approximated_terms)
     files = feed_forward.table_files(drive, feed_forward.map_of(runs, constants), notes_of(runs))
     return dataclasses.replace(begun, files=files, comparison=compared)

@@ -278,7 +278,9 @@ def _controller_lines(joint: Joint, library: _Library) -> list[str]:
     assert own is not None
     shown = {"goal_angle": "angle", "goal_speed": "joint_velocity", "goal_current": 'state["current"]'}[imposed]
     last = (
-        '- p["controller.kd"] * joint_velocity' if imposed == "goal_angle" else '+ p["controller.feed_forward"] * command'
+        '- p["controller.kd"] * joint_velocity'
+        if imposed == "goal_angle"
+        else '+ p["controller.feed_forward"] * command'
     )
     limit = 'p["controller.limit"]'
     return [
@@ -286,7 +288,7 @@ def _controller_lines(joint: Joint, library: _Library) -> list[str]:
         f"error = command - {shown}",
         f'wanted = p["controller.kp"] * error + p["controller.ki"] * state["integral"] {last}',
         f"demanded = {library.clipped('wanted', limit)}",
-        f"integral = state[\"integral\"] + dt * {prefix}.where(({prefix}.abs(demanded) >= {limit}) & "
+        f'integral = state["integral"] + dt * {prefix}.where(({prefix}.abs(demanded) >= {limit}) & '
         f"(demanded * error > 0), 0.0 * error, error)",
         *(
             [
@@ -322,7 +324,11 @@ def _play_lines(joint: Joint, library: _Library, lost: str) -> list[str]:
         'gap = state["gap"] + dt * closing  # which opened or closed it within the last step',
         "later = gap + dt * closing",
     ]
-    carried = "stiffness * beyond + damping * closing" if joint.load.backlash > 0 else "stiffness * later + damping * closing"
+    carried = (
+        "stiffness * beyond + damping * closing"
+        if joint.load.backlash > 0
+        else "stiffness * later + damping * closing"
+    )
     if joint.load.backlash > 0:
         prefix = library.dialect.prefix
         lines += [
@@ -433,12 +439,14 @@ def _source(joint: Joint, constants: Sequence[Constant], library: _Library, what
         "" if not joint.accelerates else ", and the joint's speed one step before [rad/s]: set it if the joint moves"
     )
     if joint.loose:
-        moving = ", gap between motor and load [rad] and speed of the motor's side [rad/s]: set this if the joint moves"
+        moving = (
+            ", gap between motor and load [rad] and speed of the motor's side [rad/s]: set this if the joint moves"
+        )
     goals = {"goal_angle": "angle [rad]", "goal_speed": "speed [rad/s]", "goal_current": "current [A]"}
     goal = goals.get(joint.robot.rig.imposed)
     volts = "voltage at the driver's output [V]: its duty times the voltage of the supply"
     document = _DOCUMENT.replace("{command}", f"goal of the controller: {goal}" if goal else volts)
-    rotor = "0.0 * p[\"motor.inertia\"]" if joint.loose else _ROTOR
+    rotor = '0.0 * p["motor.inertia"]' if joint.loose else _ROTOR
     own = "The motor turns apart" if joint.loose else "Inertia of the rotor at the joint, J i² η"
     added = "".join(f" + {call_text(p)}" for p in joint.of("inertia"))
     body = textwrap.indent("\n".join(step_lines(joint, library)), "    ")

@@ -192,19 +192,21 @@ def fates_in_mujoco(joint: Joint, normal: float) -> list[Fate]:
         how = "a joint for the motor's side, and a tendon between both with a range or a stiffness"
         fates.append(Fate(PLAY, HELD, how))
     if own := joint.controller:
-        fates.append(controller_fate(robot.rig.imposed, float(own.lag), float(own.ki)))
+        fates.append(_controller_fate(joint, float(own.lag), float(own.ki)))
     if joint.limit is not None:
         fates.append(Fate("current limit of the driver", HELD, "forcerange"))
     return [*fates, *fates_outside_joint(joint)]
 
 
-def controller_fate(imposed: str, lag: float, ki: float) -> Fate:
-    """Fate of a controller in `<dcmotor>`, whose own follows an angle, at once, with a limited integral."""
+def _controller_fate(joint: Joint, lag: float, ki: float) -> Fate:
+    """Fate of a controller in `<dcmotor>`, whose own follows the motor's angle, at once, with a limited integral."""
+    imposed = joint.robot.rig.imposed
     if imposed != "goal_angle":
         how = f"<dcmotor> follows no {imposed.replace('_', ' ')} with such gains: LAW.md has them, give it voltages"
         return Fate(CONTROLLER, DROPPED, how)
     lost = [f"its lag of {lag:g} s is dropped"] * (lag > 0)
     lost += ["its integral stops at a value, not where the duty is at its limit"] * (ki > 0)
+    lost += ["it reads the motor's side of the play"] * joint.loose
     return Fate(CONTROLLER, APPROXIMATED if lost else HELD, "; ".join(["gains and limit of voltage", *lost]))
 
 
@@ -310,7 +312,7 @@ def _play(joint: Joint, found: Motor, name: str, at: str) -> str:
         square, damper = omega**2, 2 * MESH_DAMPING * omega
     if load.backlash > 0:
         half = 0.5 * float(load.backlash)
-        of = f'limited="true" range="{_digits(-half, half)}" solreflimit="{_digits(-IMPEDANCE * square, -damper)}" '
+        of = f'limited="true" range="{_digits(-half, half)}" solreflimit="{_digits(-square, -damper)}" '
         of += f'solimplimit="{_digits(IMPEDANCE, IMPEDANCE)} 1 0.5 1"'
     else:
         of = f'stiffness="{_digits(float(load.stiffness))}" damping="{_digits(float(load.damping))}" springlength="0"'
@@ -374,9 +376,9 @@ def mjcf_fragment(
     numbers = [max(found.friction, 0.0), v[DAMPING], found.armature]
     sides = [("", numbers, at)]
     if joint.loose:
-        own = [min(x, float(y)) for x, y in zip(numbers, (joint.load.loss_coulomb, joint.load.loss_viscous))]
-        own.append(found.added)
-        sides = [("", own, at), ("_rotor", [a - b for a, b in zip(numbers, own)], f"{at}_rotor")]
+        of_load = (joint.load.loss_coulomb, joint.load.loss_viscous, found.added)
+        own = [min(x, float(y)) for x, y in zip(numbers, of_load, strict=True)]
+        sides = [("", own, at), ("_rotor", [a - b for a, b in zip(numbers, own, strict=True)], f"{at}_rotor")]
     return (
         "<mujocoinclude>\n"
         + _comment(head, "  ")
