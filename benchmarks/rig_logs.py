@@ -77,7 +77,7 @@ def work(task: Task) -> dict:
         from calibration.discovery.discover import assemble_result
 
         began = time.perf_counter()
-        whole = assemble_result(found, given.runs, given.numbers, given.settings, given.library, lambda note: None)
+        whole = assemble_result(given, found)
         line |= held_out(whole, case) | {"seconds_whole": line["seconds"] + time.perf_counter() - began}
         with tempfile.TemporaryDirectory() as folder:
             robot_file.write_robot(whole.robot, Path(folder) / "robot.toml")

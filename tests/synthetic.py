@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 from worlds import settled
 
 from calibration.data.runs import Runs
@@ -15,7 +16,7 @@ from calibration.data.runs import read_runs as read_runs
 from calibration.discovery import discover
 from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.candidates import BaseFit, fit_base
-from calibration.discovery.discover import LoopStages
+from calibration.discovery.discover import LoopInput, LoopStages
 from calibration.discovery.outliers import Screening, screen_outliers
 from calibration.discovery.result import DiscoveryResult
 from calibration.discovery.settings import Settings, settings_for
@@ -67,13 +68,18 @@ class Analyst:
         """The base fitted to a table, rows that stand alone set aside."""
         return screen_outliers(self.base(runs), lambda base: discover.bases_at_fit(runs, base), runs, self.settings)
 
+    def given(self, runs: Runs) -> LoopInput:
+        """What the loop is given for a table."""
+        numbers = np.arange(1, len(runs) + 1)
+        return LoopInput(runs, numbers, paper_robots.nominal(), known(runs), self.stated, self.settings, self.library)
+
     def trace(self, runs: Runs) -> LoopStages:
         """The stages of the loop up to its verdict."""
-        return discover.trace(runs, paper_robots.nominal(), known(runs), self.settings, self.stated, self.library)
+        return self.given(runs).trace()
 
     def result(self, traced: LoopStages, runs: Runs) -> DiscoveryResult:
         """What the loop makes of its stages."""
-        return discover.assemble_result(traced, runs, None, self.settings, self.library, lambda note: None)
+        return discover.assemble_result(self.given(runs), traced)
 
     def discover(self, runs: Runs) -> DiscoveryResult:
         """The whole loop."""

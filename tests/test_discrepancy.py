@@ -19,7 +19,6 @@ from calibration.data import robot_file
 from calibration.discovery import discover, discrepancy, formula
 from calibration.discovery.discrepancy import CurveBeside, fit_discrepancy, refine_window, similar_variables
 from calibration.discovery.projection import defect_by_row
-from calibration.discovery.result import Formula
 from calibration.discovery.score_tests import diagnose_fit
 from calibration.discovery.smooth import smooth_curve
 from calibration.inference import bases
@@ -153,7 +152,7 @@ def test_formula_finds_the_variable(found):
     if found.what.balance == "electrical":
         seen = SimpleNamespace(
             window=None, variable=found.what.variable, at=found.what.grid, value=found.what.curve, unit="V",
-            proposal=Formula(proposal.formula, proposal.mark, (), (), proposal.gain, proposal.tried),
+            proposal=proposal,
         )  # fmt: skip
         assert not proposal.terms and loop_words.proposed_formula(seen).startswith("The curve rises from ")
         return
@@ -163,8 +162,8 @@ def test_formula_finds_the_variable(found):
     assert proposal.explained >= formula.MOST * curve.explained > 100
     assert all(abs(c) > 3 * s for c, s in zip(proposal.coefficients, proposal.sds, strict=True))
     unit = found.what.unit
-    assert proposal.formula.startswith(formula.SYMBOL[found.what.balance] + " = ")
-    assert proposal.formula.count(f" {unit} (") == len(proposal.terms)
+    assert proposal.expression.startswith(formula.SYMBOL[found.what.balance] + " = ")
+    assert proposal.expression.count(f" {unit} (") == len(proposal.terms)
 
 
 @pytest.mark.slow
@@ -220,7 +219,7 @@ def test_no_formula_is_proposed_where_nothing_shows(found):
     blind = eqx.tree_at(lambda linear: linear.defects, found.linear, 0 * np.asarray(found.linear.defects))
     curve = smooth_curve(found.linear, found.what.balance, found.what.variable, found.space.included)
     proposal = formula.propose_formula(blind, found.what.balance, found.space.included, curve)
-    assert proposal.formula == "" and proposal.terms == ()
+    assert proposal.expression == "" and proposal.terms == ()
     assert np.isnan(defect_by_row(blind, found.what.balance).value).all()
 
 

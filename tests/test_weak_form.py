@@ -141,7 +141,7 @@ def test_the_ranking_comes_before_the_base_fit_which_begins_there(space, before,
     runs, library = Runs("synthetic", motor()).of(space.bare.base), {n: BY_NAME[n] for n in NAMES}
     noise = SimpleNamespace(sd=np.broadcast_to(SD, runs.measured().shape))
     with pytest.raises(InterruptedError):
-        discover.trace(runs, space.bare.base, noise, SETTINGS, {}, library, keep=keep)
+        discover.LoopInput(runs, None, space.bare.base, noise, {}, SETTINGS, library, keep=keep).trace()
     assert kept == ["ranking"]
     assert not begun[0].simulated and begun[0].z == pytest.approx(before.base.z)
     assert "churning" in begun[1] and {*begun[1]} == {*before.room}

@@ -15,6 +15,7 @@ from calibration.data.posterior_file import Posterior
 from calibration.data.runs import WHEN, Runs
 from calibration.data.writing import json_value, write_json, write_table
 from calibration.described import describe, sentences
+from calibration.discovery import formula
 from calibration.discovery.experiments import Proposal
 from calibration.discovery.headline import headline
 from calibration.discovery.hidden import Hidden
@@ -117,24 +118,6 @@ class FoundEffect:
 
 
 @dataclasses.dataclass(frozen=True)
-class Formula:
-    """A formula for a curve. See `formula.Proposal`."""
-
-    JSON = ("formula", "mark", "coefficients", "sds", "bic_gain_over_curve", "tried")
-    expression: str
-    mark: str
-    coefficients: tuple[float, ...]
-    sds: tuple[float, ...]
-    bic_gain_over_curve: float
-    tried: int
-
-    @property
-    def formula(self) -> str:
-        """Its expression, or that there is none."""
-        return describe(self)
-
-
-@dataclasses.dataclass(frozen=True)
 class UnnamedDiscrepancy(DiscrepancyLocation):
     """A discrepancy that no effect of the library explains.
 
@@ -166,7 +149,7 @@ class UnnamedDiscrepancy(DiscrepancyLocation):
     over: np.ndarray | None
     defect: np.ndarray | None
     defect_sd: np.ndarray | None
-    proposal: Formula
+    proposal: formula.Proposal
 
 
 @dataclasses.dataclass(frozen=True)
