@@ -312,14 +312,14 @@ def _play(joint: Joint, found: Motor, name: str, at: str) -> str:
         square, damper = omega**2, 2 * MESH_DAMPING * omega
     if load.backlash > 0:
         half = 0.5 * float(load.backlash)
-        of = f'limited="true" range="{_digits(-half, half)}" solreflimit="{_digits(-square, -damper)}" '
-        of += f'solimplimit="{_digits(IMPEDANCE, IMPEDANCE)} 1 0.5 1"'
+        limits = f'limited="true" range="{_digits(-half, half)}" solreflimit="{_digits(-square, -damper)}" '
+        limits += f'solimplimit="{_digits(IMPEDANCE, IMPEDANCE)} 1 0.5 1"'
     else:
-        of = f'stiffness="{_digits(float(load.stiffness))}" damping="{_digits(float(load.damping))}" springlength="0"'
+        limits = f'stiffness="{_digits(float(load.stiffness))}" damping="{_digits(float(load.damping))}" springlength="0"'
     return (
         f'  <worldbody>\n    <body name="{at}_rotor">\n      <joint name="{at}_rotor" class="{name}_rotor" '
         'type="hinge"/>\n      <inertial pos="0 0 0" mass="1e-6" diaginertia="1e-12 1e-12 1e-12"/>\n'
-        f'    </body>\n  </worldbody>\n  <tendon>\n    <fixed name="{name}_play" {of}>\n'
+        f'    </body>\n  </worldbody>\n  <tendon>\n    <fixed name="{name}_play" {limits}>\n'
         f'      <joint joint="{at}_rotor" coef="1"/>\n      <joint joint="{at}" coef="-1"/>\n'
         "    </fixed>\n  </tendon>\n"
     )
