@@ -315,7 +315,9 @@ def _play(joint: Joint, found: Motor, name: str, at: str) -> str:
         limits = f'limited="true" range="{_digits(-half, half)}" solreflimit="{_digits(-square, -damper)}" '
         limits += f'solimplimit="{_digits(IMPEDANCE, IMPEDANCE)} 1 0.5 1"'
     else:
-        limits = f'stiffness="{_digits(float(load.stiffness))}" damping="{_digits(float(load.damping))}" springlength="0"'
+        limits = (
+            f'stiffness="{_digits(float(load.stiffness))}" damping="{_digits(float(load.damping))}" springlength="0"'
+        )
     return (
         f'  <worldbody>\n    <body name="{at}_rotor">\n      <joint name="{at}_rotor" class="{name}_rotor" '
         'type="hinge"/>\n      <inertial pos="0 0 0" mass="1e-6" diaginertia="1e-12 1e-12 1e-12"/>\n'
