@@ -7,7 +7,7 @@
 A case is a command with few points, rows or searches, and takes a folder of inputs. The digest covers the exit code
 and the CSV, JSON and TOML files of the result. Text is stored as a hash. Each list of numbers under one name is
 stored as count, norm and two weighted sums (short ones as they are). Times, places and versions are left out.
-`tests/test_record_commands.py` checks all cases, and a few quick ones with every `make test`.
+`benchmarks/test_record_commands.py` checks all cases, and a few quick ones with every `make test`.
 """
 
 from __future__ import annotations

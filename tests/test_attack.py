@@ -3,8 +3,6 @@
 Mutations of valid files are drawn from a seeded generator. One that is still a valid input may be accepted (0).
 """
 
-from __future__ import annotations
-
 import ast
 import contextlib
 import json

@@ -1,7 +1,5 @@
 """Discrepancies outside the library: their curve, the robot that has it, and the formula that is proposed."""
 
-from __future__ import annotations
-
 import dataclasses
 from types import SimpleNamespace
 
@@ -60,13 +58,13 @@ def found(request):
     )
 
 
-def sigmas(found, reading) -> np.ndarray:
+def sigmas(found, reading):
     """Rms error against the noise-free truth, by channel [σ of a reading]."""
     sd = np.asarray(found.space.bare.data.sd)[: len(reading)]
     return np.sqrt(np.mean(((reading - found.truth) / sd) ** 2, 0))
 
 
-def at_rows(found, values) -> np.ndarray:
+def at_rows(found, values):
     """What is known on the grid, at the rows of the table."""
     x = np.asarray(getattr(found.linear.signals, found.what.variable))[: len(found.runs)]
     return np.interp(x, found.what.grid, values)

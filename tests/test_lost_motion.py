@@ -1,7 +1,5 @@
 """Backlash, play and soft couplings are noticed in a log by the angle that each reversal loses."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import numpy as np

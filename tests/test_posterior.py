@@ -1,7 +1,5 @@
 """Posteriors: the file, draws against the linear analysis, and what is refused."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import jax.numpy as jnp

@@ -1,7 +1,5 @@
 """Rig files: the templates read, loads are converted, what is written reads back, and one sentence for each mistake."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import math
@@ -24,15 +22,13 @@ from mmrjax.model.rig import Instrument
 from mmrjax.model.shaft import Shaft
 from mmrjax.model.signals import FLAGS, GRAVITY
 from sweeps.commands import rig_check, rig_new
-from tests.commands import ends
+from tests.commands import ends, read_rig
 
 KINDS = tuple(rig_new.KINDS)
 
 
 def read(tmp_path, text):
-    path = tmp_path / "rig.toml"
-    path.write_text(text, encoding="utf-8")
-    return robot_file.read_robot(path)
+    return read_rig(tmp_path, text)
 
 
 def again(tmp_path, robot):

@@ -1,20 +1,17 @@
 """Rig files from URDF and from MuJoCo's models: numbers, their sources, and one sentence for each mistake."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from calibration.data import robot_file
 from calibration.data.input_errors import BadConfiguration
 from mmrjax.model import params
 from mmrjax.model.signals import GRAVITY
 from sweeps.commands import rig_from_mujoco, rig_new
 from sweeps.commands.rig_template import example_numbers, is_example, rig_template
-from tests.commands import ends
+from tests.commands import ends, read_rig
 
 DIFFBOT = Path(__file__).parent / "data" / "diffbot.urdf"
 FREE = """<mujoco>
@@ -36,9 +33,7 @@ FREE = """<mujoco>
 
 def values(text, tmp_path):
     """Parameters of a rig's text by name, after it was read."""
-    path = tmp_path / "rig.toml"
-    path.write_text(text, encoding="utf-8")
-    robot = robot_file.read_robot(path)
+    robot = read_rig(tmp_path, text)
     numbers = {"sides": float(robot.sides), **{p.name: float(p.value) for p in params.walk_parameters(robot)}}
     return numbers, {name: sd for name, _, sd in robot.rig.priors}
 

@@ -289,7 +289,7 @@ SAMPLES = [
 RECORD = ROOT / "tests" / "record" / "pages" / "notes.txt"
 
 
-def as_text() -> str:
+def as_text():
     """The sentence of each sample, a line each."""
     return "".join(f"{note.code}: {describe(note)}\n" for note in SAMPLES)
 

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from calibration.data import Json, Names, rig_file, stated
 from calibration.data.configuration_tables import loads_from_tables, resolved_likes
 from calibration.data.effect_file import Library
-from calibration.data.input_errors import BadConfiguration, allowed_words, bound_text, is_number
+from calibration.data.input_errors import BadConfiguration, allowed_words, is_number
 from calibration.data.input_files import toml_content, toml_text
 from calibration.data.writing import toml_value, write_text
 from mmrjax import effects
@@ -339,17 +339,16 @@ def _refused(name: str, value: Any, known: Mapping[str, params.Parameter]) -> st
         return f"no such parameter; {_parameters(name, known)}"
     spec = known[name].spec
     low, high = spec.bounds
-    allowed = f"{bound_text(low)} to {bound_text(high)} {spec.unit} ({spec.meaning})"
+    allowed = f"{low:g} to {high:g} {spec.unit} ({spec.meaning})"
     if not is_number(value):
         form = ', alone or with its standard deviation as "0.61 ± 0.03"' if isinstance(value, str) else ""
         return f"got {value!r}; expected a number, {allowed}{form}"
     if name == "gearbox.ratio" and 0 < value < 1:
         return (
-            f"got {bound_text(value)}; expected turns of the motor for one of the output, at least 1; is "
-            f"{bound_text(1 / value)} meant?"
+            f"got {value:g}; expected turns of the motor for one of the output, at least 1; is {1 / value:g} meant?"
         )
     if not math.isfinite(value) or not low <= value <= high:
-        return f"got {bound_text(value)}; expected {allowed}"
+        return f"got {value:g}; expected {allowed}"
     return ""
 
 
@@ -384,10 +383,8 @@ def _choice(where: str, name: str, value: Any) -> str:
 def _rating(where: str, name: str, value: Any) -> float:
     low, high, unit, what = RATINGS[name]
     if not is_number(value) or not low <= value <= high:
-        got = bound_text(value) if is_number(value) else repr(value)
-        raise BadConfiguration(
-            f"{where}, {name}: got {got}; expected a number, {bound_text(low)} to {bound_text(high)} {unit} ({what})"
-        )
+        got = f"{value:g}" if is_number(value) else repr(value)
+        raise BadConfiguration(f"{where}, {name}: got {got}; expected a number, {low:g} to {high:g} {unit} ({what})")
     return float(value)
 
 
