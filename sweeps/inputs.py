@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Collection
 from pathlib import Path
 
-from calibration.data import Json, Names, effect_file, posterior_file, robot_file, surface_labels
+from calibration.data import Json, Names, effect_file, posterior_file, robot_file, stated, surface_labels
 from calibration.data import runs as records
 from calibration.data.columns import IMPOSED, Layout
 from calibration.data.contradictions import misplaced_levers
@@ -15,6 +15,7 @@ from calibration.data.posterior_file import Posterior
 from calibration.data.robot_file import RobotFile
 from mmrjax import fidelities
 from mmrjax.derived.turning_figures import turns_under_equal_commands
+from mmrjax.errors import list_some
 from mmrjax.model.paper_tables import BENCH, SURFACES
 from mmrjax.model.quantities import RPM
 from mmrjax.model.robot import Robot, turn_error
@@ -48,6 +49,10 @@ def load_robot(config: RobotPart) -> RobotFile:
             "check with a log, export, or mmrjax.simulate in Python"
         )
     unlike = () if getattr(config, "turns", False) else _unlike(file.name, robot)
+    examples = list_some(stated.example_numbers(file.text))
+    if examples and isinstance(config, Calibrate | Loop):  # `rig check` lists their lines
+        wide = f"± {100 * stated.EXAMPLE_SHARE:g} %"
+        notes.append(f"{file.name}: still the template's, so the fit takes {wide} where they have ±: {examples}")
     for note in (*notes, *unlike):
         print_message(note)
     resolves = isinstance(config, FidelityPart) and fidelities.fidelity_facts(config.model).resolves
