@@ -220,10 +220,10 @@ def _columns(
 
 
 def _listed(name: str, said: Sequence[str], count: int) -> str:
-    """One message on all refused cells, the first row first, without repeated advice.
+    """Combines the messages on refused cells into one, in the order of the rows, each piece of advice once.
 
     Args:
-        said: sentences, at least the first `LISTED`.
+        said: messages, of which at least the first `LISTED` must be given.
         count: number of cells.
     """
     first, *others = said

@@ -140,7 +140,7 @@ class Quantity:
 
     @functools.cached_property
     def sizes(self) -> dict[str, float]:
-        """SI value of each unit that its columns may state, its own first. No slope in per cent."""
+        """SI value of each unit that its column names may state, its own unit first. Slopes cannot be in per cent."""
         alike: Mapping[str, float] = next((units for units in DIMENSIONS if self.unit in units), {})
         share = {PERCENT: 1e-2} if self.percent and self.unit != "deg" else {}
         return {self.unit: self.factor} | {u: size for u, size in alike.items() if u != self.unit} | share

@@ -153,10 +153,10 @@ class Observer(eqx.Module):
     @classmethod
     @abc.abstractmethod
     def check_start(cls, runs: Runs, noise: Noise, robot: Robot) -> list[Remark | str]:
-        """Refuse runs with a start that the model cannot follow. Return notes on their length.
+        """Refuse runs whose initial state the model cannot reproduce. Return notes on the length of the others.
 
         Raises:
-            BadData: a run that does not begin as the model does.
+            BadData: a run does not begin in an initial state of the model.
         """
 
     @classmethod
