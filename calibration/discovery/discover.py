@@ -473,7 +473,7 @@ class _Task:
     compiling: _Compiling | None
     keep: Keep
 
-    @property
+    @functools.cached_property
     def loses_motion(self) -> bool:
         """True if the log shows a backlash that the robot does not have."""
         return bool(lost_motion_notes(self.runs, self.robot))
