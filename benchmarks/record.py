@@ -7,7 +7,7 @@
 A case is a command with few points, rows or searches, and takes a folder of inputs. The digest covers the exit code
 and the CSV, JSON and TOML files of the result. Text is stored as a hash. Each list of numbers under one name is
 stored as count, norm and two weighted sums (short ones as they are). Times, places and versions are left out.
-`tests/test_record_commands.py` checks all cases, and a few quick ones with every `make test`.
+`benchmarks/test_record_commands.py` checks all cases, and a few quick ones with every `make test`.
 """
 
 from __future__ import annotations
@@ -30,9 +30,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from everything import known_flags
-
 from calibration.data.input_errors import is_number
+from mmrjax import OLDER_EMITTERS
 
 RECORD = Path(__file__).resolve().parents[1] / "tests" / "record" / "commands"
 ROBOTINO = Path(__file__).resolve().parents[1] / "docs" / "rigs" / "robotino"
@@ -274,7 +273,7 @@ def with_needed(names: list[str]) -> list[str]:
 
 def main() -> int:
     # Compiled by the older emitters, in half of the time; traced, because programs on disk may be of another source.
-    os.environ.setdefault("XLA_FLAGS", known_flags(sys.executable, "--xla_cpu_use_fusion_emitters=false"))
+    os.environ.setdefault("XLA_FLAGS", f"--xla_backend_extra_options={OLDER_EMITTERS}")
     os.environ["MMRJAX_PROGRAMS"] = ""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     what = parser.add_mutually_exclusive_group(required=True)

@@ -155,7 +155,7 @@ def verdict(p: Posed) -> Found:
     began, given = time.perf_counter(), p.given
     stages = given.trace()
     spent = time.perf_counter() - began
-    whole = assemble_result(stages, given.runs, given.numbers, given.settings, given.library, lambda note: None)
+    whole = assemble_result(given, stages)
     seen = whole.readings_of_rows.held_out
     at = {kind: after if whole.written else before for kind, (before, after) in seen.items()}
     families = list(stages.families)

@@ -21,7 +21,7 @@ LAUNCH = (
 )
 
 
-def found() -> str | None:
+def found():
     """The browser of this machine, if it has one."""
     return next((path for name in NAMES if (path := shutil.which(name))), None)
 
@@ -29,7 +29,7 @@ def found() -> str | None:
 class Browser:
     """One browser with one page, for as long as the block lasts."""
 
-    def __enter__(self) -> Browser:
+    def __enter__(self):
         self.home = tempfile.TemporaryDirectory(ignore_cleanup_errors=True)
         theirs, self.out = os.pipe()
         self.back, others = os.pipe()
@@ -49,13 +49,13 @@ class Browser:
             self(f"{domain}.enable")
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, *_):
         os.close(self.out), os.close(self.back)
         self.process.terminate()
         self.process.wait(timeout=20)
         self.home.cleanup()
 
-    def _next(self) -> dict:
+    def _next(self):
         while b"\0" not in self.rest:
             if not (more := os.read(self.back, 1 << 20)):
                 raise RuntimeError("the browser has gone")
@@ -63,7 +63,7 @@ class Browser:
         first, self.rest = self.rest.split(b"\0", 1)
         return json.loads(first)
 
-    def __call__(self, method: str, **params: object) -> dict:
+    def __call__(self, method, **params):
         """Call a method of the protocol. What happens meanwhile is kept in `events`."""
         self.count += 1
         mine = {"id": self.count, "method": method, "params": params}
@@ -76,7 +76,7 @@ class Browser:
             raise RuntimeError(f"{method}: {got['error']}")
         return got["result"]
 
-    def open(self, page: Path, width: int, *, height: int = 900, media: str = "screen", dark: bool = False) -> None:
+    def open(self, page, width, *, height=900, media="screen", dark=False):
         """Open a page at a width [px of CSS], on a screen or in `print`."""
         self.events.clear()
         self("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False)
@@ -86,14 +86,14 @@ class Browser:
         while not any(e["method"] == "Page.loadEventFired" for e in self.events):
             self.events.append(self._next())
 
-    def value(self, script: str) -> object:
+    def value(self, script):
         """What an expression in the page is. It has to be of JSON."""
         got = self("Runtime.evaluate", expression=script, returnByValue=True, awaitPromise=True)
         if "exceptionDetails" in got:
             raise RuntimeError(got["exceptionDetails"]["exception"].get("description", "?"))
         return got["result"].get("value")
 
-    def complaints(self) -> list[str]:
+    def complaints(self):
         """Errors of the console and of scripts, and requests that leave the file, since the page was opened."""
         said = []
         for event in self.events:
@@ -110,7 +110,7 @@ class Browser:
                 said.append(f"request to {p['request']['url']}")
         return said
 
-    def picture(self, path: Path) -> None:
+    def picture(self, path):
         """The whole page as PNG."""
         got = self("Page.captureScreenshot", captureBeyondViewport=True)
         Path(path).write_bytes(base64.b64decode(got["data"]))

@@ -1,18 +1,16 @@
-"""The command line in this process, and the tables that it leaves."""
-
-from __future__ import annotations
+"""The command line in this process, the tables that it leaves, and files that it reads."""
 
 import csv
 import sys
-from collections.abc import Iterable
-from pathlib import Path
 
 import pytest
 
+from calibration.data import robot_file
+from calibration.data import runs as records
 from sweeps import cli
 
 
-def command(arguments: Iterable[object]) -> int:
+def command(arguments):
     """Run a command, its first words as one string. Returns its exit code."""
     words, *rest = arguments
     with pytest.MonkeyPatch.context() as patch, pytest.raises(SystemExit) as end:
@@ -21,13 +19,13 @@ def command(arguments: Iterable[object]) -> int:
     return end.value.code
 
 
-def rows(path: Path) -> list[dict[str, str]]:
+def rows(path):
     """The rows of a CSV file."""
     with path.open(newline="", encoding="utf-8") as stream:
         return list(csv.DictReader(stream))
 
 
-def ends(run: tuple[int, str, str], *said: str, code: int = 2) -> tuple[int, str, str]:
+def ends(run, *said, code=2):
     """A run (exit code, stdout, stderr) that ended with `code` and says each sentence, on stderr if it was refused."""
     ended, out, err = run
     text = out + err if code == 0 else err
@@ -35,3 +33,19 @@ def ends(run: tuple[int, str, str], *said: str, code: int = 2) -> tuple[int, str
     for sentence in said:
         assert sentence in text or sentence in " ".join(text.split()), text
     return run
+
+
+def text_file(path, text):
+    """Path of a new file with this text."""
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def read_rig(folder, text, name="rig.toml", **options):
+    """The robot of a new file with this text."""
+    return robot_file.read_robot(text_file(folder / name, text), **options)
+
+
+def read_table(folder, text, robot, name="log.csv"):
+    """The runs of a new table with this text."""
+    return records.read_runs(text_file(folder / name, text), robot=robot)

@@ -7,20 +7,18 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
 
 from calibration.inference import identifiability
 from calibration.inference import optimizers as fit
 from calibration.inference.optimizers import Pin
-from calibration.inference.problem import Data, Problem
 from mmrjax.compile.compiling import compiled
 
 
 @compiled
-def _redraw(problem: Problem, truth: Array, data: Data, keys: Array, profiles: bool) -> tuple[fit.Optimum, Array]:
+def _redraw(problem, truth, data, keys, profiles):
     clean = problem.observation(truth).reading
 
-    def draw(key: Array) -> tuple[fit.Optimum, Array]:
+    def draw(key):
         one, two = jax.random.split(key)
         noisy = dataclasses.replace(
             data,
@@ -54,7 +52,7 @@ class Coverage:
     converged: np.ndarray
 
 
-def coverage(problem: Problem, truth: Array, draws: int, seed: int, profiles: bool = False) -> Coverage:
+def coverage(problem, truth, draws, seed, profiles=False):
     """Coverage of the 95 % intervals over noise draws, all in one vmapped batch.
 
     Each draw takes new readings (with their sds) and new bench values (the prior means, with theirs): a

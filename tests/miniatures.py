@@ -1,10 +1,5 @@
 """Small records of own numbers with the columns, units, formats and faults of public ones, and their rigs."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
-from pathlib import Path
-
 import numpy as np
 
 _HEAD = 'schema = "mmrjax.robot/2"\nbase = "none"\nsides = 1\n'
@@ -23,7 +18,7 @@ _WHEELS = '[car]\nload = "vehicle"\nmovers = "wheels"\nmass = "{} ± 10 %"\nradi
 _WHEELS += '[car.ground]\nrolling_resistance = "0.02 ± 100 %"\n[car.ground.friction]\nstatic = "0.8 ± 30 %"\n'
 
 
-def _speed(time: np.ndarray, drive: np.ndarray, gain: float, constant: float, dry: float) -> np.ndarray:
+def _speed(time, drive, gain, constant, dry):
     """Speed of a first-order drive with a dead band [units of gain], held drive from row to row."""
     speed = np.zeros(len(time))
     for k, step in enumerate(np.diff(time)):
@@ -32,11 +27,11 @@ def _speed(time: np.ndarray, drive: np.ndarray, gain: float, constant: float, dr
     return speed
 
 
-def _integral(time: np.ndarray, speed: np.ndarray) -> np.ndarray:
+def _integral(time, speed):
     return np.concatenate([[0.0], np.cumsum(0.5 * np.diff(time) * (speed[1:] + speed[:-1]))])
 
 
-def step_in_ticks(path: Path) -> Path:
+def step_in_ticks(path):
     """Step of voltage. Ticks of 8 kHz, comments with %, rows that end with a semicolon, unwritten rows."""
     random = np.random.default_rng(1)
     ticks = 3 + np.cumsum(random.integers(40, 60, 400))
@@ -52,7 +47,7 @@ def step_in_ticks(path: Path) -> Path:
     return path
 
 
-def force_and_place(path: Path) -> Path:
+def force_and_place(path):
     """Carriage with its force and place at 200 Hz, back and forth."""
     time = np.arange(1200) / 200
     speed, mass, place = 0.15 * np.sin(2.1 * time), 80.0, 0.15 / 2.1 * (1 - np.cos(2.1 * time))
@@ -62,7 +57,7 @@ def force_and_place(path: Path) -> Path:
     return _csv(path, {"time_s": time, "force_N": force + noise[0], "position_m": place + noise[1]})
 
 
-def four_tests_of_sides(path: Path) -> Path:
+def four_tests_of_sides(path):
     """Drive of both sides: tests by name, a clock that runs on, voltage, place and speed without units."""
     random, parts = np.random.default_rng(3), []
     for k, (name, top) in enumerate((("slow-forward", 5.0), ("slow-back", -5.0), ("fast-forward", 6.0))):
@@ -79,7 +74,7 @@ def four_tests_of_sides(path: Path) -> Path:
     return _csv(path, {name: np.concatenate([p[name] for p in parts]) for name in parts[0]})
 
 
-def throttle_and_odometer(path: Path) -> Path:
+def throttle_and_odometer(path):
     """Model car: stamps in ns since 1970, throttle, speed and distance without units, current that stays raw."""
     random = np.random.default_rng(4)
     time = np.arange(500) * 0.05
@@ -93,7 +88,7 @@ def throttle_and_odometer(path: Path) -> Path:
     })  # fmt: skip
 
 
-def brake_table(path: Path) -> Path:
+def brake_table(path):
     """Brake dyno at one voltage, the torque in a column of its own."""
     random = np.random.default_rng(5)
     torque = np.linspace(2.4, 0.0, 13)
@@ -106,7 +101,7 @@ def brake_table(path: Path) -> Path:
     })  # fmt: skip
 
 
-def command_sweep(path: Path) -> Path:
+def command_sweep(path):
     """Wheel motors over a command of -255 to 255, a point each 1.1 s, with blanks after commas."""
     random = np.random.default_rng(6)
     command = np.concatenate([np.arange(-254, 0, 6), np.arange(255, 0, -6)])
@@ -120,14 +115,14 @@ def command_sweep(path: Path) -> Path:
     return _csv(path, columns, ", ")
 
 
-def _csv(path: Path, columns: dict, between: str = ",") -> Path:
+def _csv(path, columns, between=","):
     lines = [between.join(columns), *(between.join(map(str, row)) for row in zip(*columns.values(), strict=True))]
     path.write_text("\n".join(lines) + "\n")
     return path
 
 
 #: Record → (function that writes it, robot's file without its columns, lines of `[columns]` that a user corrects).
-RECORDS: dict[str, tuple[Callable[[Path], Path], str, dict[str, str]]] = {
+RECORDS = {
     "odrive": (
         step_in_ticks,
         f'{_HEAD}imposed = "voltage"\nchannels = ["output_speed"]\nstart = "measured"\n'

@@ -7,13 +7,13 @@ import re
 from html.parser import HTMLParser
 from pathlib import Path
 
-from sweeps.report.document import Document, Figure, Note, Section
+from sweeps.report.document import Figure, Note, Section
 
 #: Texts of documents and sentences as they are; `MMRJAX_RECORD=1 pytest FILE` writes those of a file anew.
 RECORD = Path(__file__).parent / "record" / "pages"
 
 
-def recorded(name: str, text: str) -> str:
+def recorded(name, text):
     """The recorded text of this name, after writing it where that is asked for."""
     path = RECORD / f"{name}.txt"
     if os.environ.get("MMRJAX_RECORD"):
@@ -21,7 +21,7 @@ def recorded(name: str, text: str) -> str:
     return path.read_text(encoding="utf-8")
 
 
-def as_text(document: Document) -> str:
+def as_text(document):
     """A document as lines of text: headings, notes, alternative texts of figures, and tables with their headings."""
     lines = [f"# {document.title}", document.answer]
     for section in (Section("", document.blocks), *document.sections):
@@ -39,7 +39,7 @@ def as_text(document: Document) -> str:
     return "\n".join(lines) + "\n"
 
 
-def tokens(text: str) -> tuple[list[str], list[float]]:
+def tokens(text):
     """Words of a text with # for each number, and the numbers."""
     number = r"\d+(?:\.\d+)?(?:e[+-]?\d+)?"
     return re.sub(number, "#", text).split(), [float(x) for x in re.findall(number, text)]
@@ -51,7 +51,7 @@ class Tables(HTMLParser):
     What stands small below a name, its meaning, is the last cell of its row.
     """
 
-    def __init__(self, page: str) -> None:
+    def __init__(self, page):
         super().__init__()
         self.tables: dict[str, list[list[str]]] = {}
         self.text = ""
@@ -89,12 +89,12 @@ class Tables(HTMLParser):
             self.tables[self._name][-1][-1] += data.strip()
 
 
-def drawn(page: str) -> set[str]:
+def drawn(page):
     """Names of the figures on a page."""
     return set(re.findall(r'<figure id="([^"]+)">', page))
 
 
-def outside(folder: Path) -> list[str]:
+def outside(folder):
     """What a page and its figures refer to that is not in them."""
     found = []
     for document in ((folder / "report.html").read_text(), *(p.read_text() for p in (folder / "figures").iterdir())):

@@ -1,11 +1,7 @@
 """Sample logs in every format that is read, each made of the same arrays by the format's own writer."""
 
-from __future__ import annotations
-
 import json
 import struct
-from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 
@@ -13,25 +9,25 @@ import numpy as np
 FAST, SLOW = 100, 40
 
 
-def fast(seconds: float = 2.0) -> dict[str, np.ndarray]:
+def fast(seconds=2.0):
     """Time [s], voltage [V] and current [A] of a staircase, at `FAST` Hz."""
     t = np.arange(round(seconds * FAST)) / FAST
     volts = 6.0 + 6.0 * np.floor(2 * t)
     return {"t": t, "volts": volts, "amps": 0.1 * volts + 0.01 * np.sin(40 * t)}
 
 
-def slow(seconds: float = 2.0) -> dict[str, np.ndarray]:
+def slow(seconds=2.0):
     """Time [s] and speed [rpm], at `SLOW` Hz, from 5 ms on."""
     t = 0.005 + np.arange(round(seconds * SLOW)) / SLOW
     return {"t": t, "rpm": 100.0 * np.floor(2 * t) + 50.0 + np.sin(9 * t)}
 
 
-def table() -> dict[str, np.ndarray]:
+def table():
     """One table of the signals at `FAST` Hz."""
     return {**fast(), "rpm": np.interp(fast()["t"], *slow().values())}
 
 
-def _arrow(columns: dict[str, np.ndarray]):
+def _arrow(columns):
     import pyarrow as pa
 
     units = {"t": "s", "volts": "V", "amps": "A", "rpm": "rpm"}
@@ -39,19 +35,19 @@ def _arrow(columns: dict[str, np.ndarray]):
     return pa.table({n: pa.array(v) for n, v in columns.items()}, schema=pa.schema(fields))
 
 
-def parquet(path: Path, columns: dict[str, np.ndarray]) -> None:
+def parquet(path, columns):
     from pyarrow import parquet as writer
 
     writer.write_table(_arrow(columns), path)
 
 
-def feather(path: Path, columns: dict[str, np.ndarray]) -> None:
+def feather(path, columns):
     from pyarrow import feather as writer
 
     writer.write_feather(_arrow(columns), str(path))
 
 
-def arrow(path: Path, columns: dict[str, np.ndarray]) -> None:
+def arrow(path, columns):
     import pyarrow as pa
 
     made = _arrow(columns)
@@ -59,26 +55,26 @@ def arrow(path: Path, columns: dict[str, np.ndarray]) -> None:
         writer.write_table(made)
 
 
-def npz(path: Path, columns: dict[str, np.ndarray]) -> None:
+def npz(path, columns):
     np.savez_compressed(path, **columns)
 
 
-def json_records(path: Path, columns: dict[str, np.ndarray]) -> None:
+def json_records(path, columns):
     rows = [dict(zip(columns, map(float, row), strict=True)) for row in zip(*columns.values(), strict=True)]
     path.write_text(json.dumps(rows))
 
 
-def json_arrays(path: Path, columns: dict[str, np.ndarray]) -> None:
+def json_arrays(path, columns):
     path.write_text(json.dumps({"rig": {"motor": {n: v.tolist() for n, v in columns.items()}}}))
 
 
-def mat5(path: Path, columns: dict[str, np.ndarray]) -> None:
+def mat5(path, columns):
     from scipy import io
 
     io.savemat(path, {"log": columns})
 
 
-def hdf5(path: Path, fast_signals: dict[str, np.ndarray], slow_signals: dict[str, np.ndarray]) -> None:
+def hdf5(path, fast_signals, slow_signals):
     import h5py
 
     with h5py.File(path, "w") as file:
@@ -88,7 +84,7 @@ def hdf5(path: Path, fast_signals: dict[str, np.ndarray], slow_signals: dict[str
         file["encoder/rpm"].attrs["units"] = "rpm"
 
 
-def mat73(path: Path, columns: dict[str, np.ndarray]) -> None:
+def mat73(path, columns):
     """As MATLAB writes it: HDF5 below a block of 512 bytes, columns of a matrix as rows."""
     import h5py
 
@@ -99,7 +95,7 @@ def mat73(path: Path, columns: dict[str, np.ndarray]) -> None:
         stream.write(b"MATLAB 7.3 MAT-file".ljust(124) + struct.pack("<H2s", 0x0200, b"IM"))
 
 
-def _messages(store, names: tuple[str, str, str], fast_signals, slow_signals, stamped: Callable):
+def _messages(store, names, fast_signals, slow_signals, stamped):
     """(topic, time [ns], message) of both rates in the order of time. Joint states and voltages."""
     joint, volts, current = names
     found = []
@@ -117,14 +113,14 @@ def _messages(store, names: tuple[str, str, str], fast_signals, slow_signals, st
 BEGIN = 1_700_000_000
 
 
-def ros1(path: Path, fast_signals: dict[str, np.ndarray], slow_signals: dict[str, np.ndarray]) -> None:
+def ros1(path, fast_signals, slow_signals):
     from rosbags.rosbag1 import Writer
     from rosbags.typesys import Stores, get_typestore
 
     store = get_typestore(Stores.ROS1_NOETIC)
     header, time = store.types["std_msgs/msg/Header"], store.types["builtin_interfaces/msg/Time"]
 
-    def stamped(t: float):
+    def stamped(t):
         ns = round(t * 1e9)
         return header(0, time(BEGIN + ns // 10**9, ns % 10**9), "")
 
@@ -140,17 +136,17 @@ def ros1(path: Path, fast_signals: dict[str, np.ndarray], slow_signals: dict[str
             writer.write(links[topic], at, store.serialize_ros1(message, kind))
 
 
-def mcap(path: Path, fast_signals: dict[str, np.ndarray], slow_signals: dict[str, np.ndarray]) -> None:
+def mcap(path, fast_signals, slow_signals):
     ros2(path, fast_signals, slow_signals, as_mcap=True)
 
 
 def ros2(
-    path: Path,
-    fast_signals: dict[str, np.ndarray],
-    slow_signals: dict[str, np.ndarray],
-    as_mcap: bool = False,
-    lose: bool = False,
-) -> None:
+    path,
+    fast_signals,
+    slow_signals,
+    as_mcap=False,
+    lose=False,
+):
     """The last message of the joints has one joint less with `lose`."""
     from rosbags.rosbag2 import StoragePlugin, Writer
     from rosbags.typesys import Stores, get_typestore
@@ -158,7 +154,7 @@ def ros2(
     store = get_typestore(Stores.ROS2_HUMBLE)
     header, time = store.types["std_msgs/msg/Header"], store.types["builtin_interfaces/msg/Time"]
 
-    def stamped(t: float):
+    def stamped(t):
         ns = round(t * 1e9)
         return header(time(BEGIN + ns // 10**9, ns % 10**9), "")
 
@@ -177,10 +173,10 @@ def ros2(
             writer.write(links[topic], at, store.serialize_cdr(message, links[topic].msgtype))
 
 
-def ulog(path: Path, fast_signals: dict[str, np.ndarray], slow_signals: dict[str, np.ndarray]) -> None:
+def ulog(path, fast_signals, slow_signals):
     """By the definition of the format (PX4 guide, ULog file format), since pyulog writes only what it has read."""
 
-    def message(kind: bytes, body: bytes) -> bytes:
+    def message(kind, body):
         return struct.pack("<HB", len(body), kind[0]) + body
 
     written = b"ULog\x01\x12\x35\x01" + struct.pack("<Q", 1_000_000)
@@ -196,7 +192,7 @@ def ulog(path: Path, fast_signals: dict[str, np.ndarray], slow_signals: dict[str
     path.write_bytes(written)
 
 
-def mdf(path: Path, fast_signals: dict[str, np.ndarray], slow_signals: dict[str, np.ndarray]) -> None:
+def mdf(path, fast_signals, slow_signals):
     from asammdf import MDF, Signal
 
     units = {"volts": "V", "amps": "A", "rpm": "rpm"}

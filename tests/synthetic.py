@@ -6,24 +6,20 @@ import dataclasses
 import functools
 from collections.abc import Mapping
 from types import SimpleNamespace
-from typing import Any
 
+import numpy as np
 from worlds import settled
 
 from calibration.data.runs import Runs
 from calibration.data.runs import read_runs as read_runs
 from calibration.discovery import discover
-from calibration.discovery.active_set import CandidateSpace
-from calibration.discovery.candidates import BaseFit, fit_base
-from calibration.discovery.discover import LoopStages
-from calibration.discovery.outliers import Screening, screen_outliers
-from calibration.discovery.result import DiscoveryResult
+from calibration.discovery.candidates import fit_base
+from calibration.discovery.discover import LoopInput
+from calibration.discovery.outliers import screen_outliers
 from calibration.discovery.settings import Settings, settings_for
 from calibration.inference import noise, observers
 from calibration.inference.calibration import calibrate
-from calibration.inference.noise import Noise
 from calibration.inference.observers import SettledRuns
-from calibration.inference.result import CalibrationResult
 from mmrjax.effects import BY_NAME, Effect
 from mmrjax.model import paper_robots
 
@@ -31,12 +27,12 @@ from mmrjax.model import paper_robots
 STATED = {f"{c}.ground.friction.static": (0.6, 0.09) for c in ("6T2A", "4W2T")}
 
 
-def table(made: Any) -> Runs:
+def table(made):
     """The runs of a case without its label, or of columns."""
     return Runs("synthetic", dict(getattr(made, "table", made)))
 
 
-def known(runs: Runs) -> Noise:
+def known(runs):
     """The sds that a table states."""
     return noise.noise_from_table(runs, observers.observer_kind(runs).sizes(runs))
 
@@ -49,38 +45,43 @@ class Analyst:
     library: Mapping[str, type[Effect]]
     stated: Mapping[str, tuple[float, float]] = dataclasses.field(default_factory=lambda: STATED)
 
-    def seeded(self, seed: int) -> Analyst:
+    def seeded(self, seed):
         """The same with another random seed."""
         return dataclasses.replace(self, settings=dataclasses.replace(self.settings, seed=seed))
 
-    def space(self, runs: Runs) -> CandidateSpace:
+    def space(self, runs):
         """What can be fitted to a table."""
         return discover.pose_candidates(
             runs, paper_robots.nominal(), known(runs).sd, self.settings, self.stated, self.library
         )
 
-    def base(self, runs: Runs) -> BaseFit:
+    def base(self, runs):
         """The base fitted to a table."""
         return fit_base(self.space(runs), self.settings, runs.source)
 
-    def screened(self, runs: Runs) -> Screening:
+    def screened(self, runs):
         """The base fitted to a table, rows that stand alone set aside."""
         return screen_outliers(self.base(runs), lambda base: discover.bases_at_fit(runs, base), runs, self.settings)
 
-    def trace(self, runs: Runs) -> LoopStages:
+    def given(self, runs):
+        """What the loop is given for a table."""
+        numbers = np.arange(1, len(runs) + 1)
+        return LoopInput(runs, numbers, paper_robots.nominal(), known(runs), self.stated, self.settings, self.library)
+
+    def trace(self, runs):
         """The stages of the loop up to its verdict."""
-        return discover.trace(runs, paper_robots.nominal(), known(runs), self.settings, self.stated, self.library)
+        return self.given(runs).trace()
 
-    def result(self, traced: LoopStages, runs: Runs) -> DiscoveryResult:
+    def result(self, traced, runs):
         """What the loop makes of its stages."""
-        return discover.assemble_result(traced, runs, None, self.settings, self.library, lambda note: None)
+        return discover.assemble_result(self.given(runs), traced)
 
-    def discover(self, runs: Runs) -> DiscoveryResult:
+    def discover(self, runs):
         """The whole loop."""
         return self.result(self.trace(runs), runs)
 
 
-def parts(runs: Runs, traced: LoopStages) -> SimpleNamespace:
+def parts(runs, traced):
     """What tests of the stages ask for, under short names."""
     base = traced.screened.base
     return SimpleNamespace(
@@ -96,13 +97,13 @@ FEWEST = (
 FEW = Analyst(settings_for(SettledRuns, 250), {name: BY_NAME[name] for name in FEWEST})
 
 
-def small(p: Mapping[str, float] = settled.CLIMBING) -> settled.Conditions:
+def small(p=settled.CLIMBING):
     """24 runs: two slopes, two payloads, three voltages, both configurations."""
     return settled.table8(p, payloads=(0.0, 8.0), slopes=(0.0, 10.0))
 
 
 @functools.cache
-def calibrated() -> CalibrationResult:
+def calibrated():
     """The packaged table from four starts, without profiles and without what is left out. Made once for all files."""
     return calibrate(read_runs("measured"), paper_robots.nominal(), starts=4, profiles=False, blocks=())
 

@@ -4,8 +4,6 @@ one short sentence, in bounded time and memory.
 Mutations are drawn from a seeded generator.
 """
 
-from __future__ import annotations
-
 import contextlib
 import io
 import json
@@ -31,6 +29,7 @@ from calibration.data import runs as records
 from calibration.data.input_errors import InputError
 from mmrjax.errors import LONGEST
 from sweeps.commands import rig_new
+from tests.commands import text_file
 
 #: Most processor time of one answer [s], wall-clock time after which it hangs [s], and memory that it may take [bytes].
 SECONDS, HANGS, MEMORY = 5.0, 60, 2**31
@@ -55,9 +54,7 @@ loss_coulomb = "0.01 ± 50 %"
 
 @pytest.fixture(scope="module")
 def robot(tmp_path_factory):
-    path = tmp_path_factory.mktemp("rig") / "rig.toml"
-    path.write_text(RIG, encoding="utf-8")
-    return robot_file.read_robot(path)
+    return robot_file.read_robot(text_file(tmp_path_factory.mktemp("rig") / "rig.toml", RIG))
 
 
 class Hangs(BaseException):
@@ -599,8 +596,15 @@ def test_models_that_mujoco_does_not_end_with_are_refused(tmp_path, monkeypatch,
 def test_a_sound_model_is_read_and_leaves_no_file(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "part.xml").write_text('<mujoco><option timestep="0.001"/></mujoco>')
-    (tmp_path / "model.xml").write_text(MODEL % ('<size njmax="5000" nconmax="2000"/><include file="part.xml"/>', ""))
-    assert rig_new.joint_of(tmp_path / "model.xml", None).joint == "j"
+    assert (
+        rig_new.joint_of(
+            text_file(
+                tmp_path / "model.xml", MODEL % ('<size njmax="5000" nconmax="2000"/><include file="part.xml"/>', "")
+            ),
+            None,
+        ).joint
+        == "j"
+    )
     assert sorted(os.listdir()) == ["model.xml", "part.xml"]
 
 

@@ -9,7 +9,6 @@ import pytest
 from numpy.testing import assert_allclose
 
 from calibration.data import robot_file
-from calibration.data import runs as records
 from calibration.data.input_errors import BadConfiguration
 from calibration.inference.calibration import calibrate
 from mmrjax.effects import ALL
@@ -22,6 +21,7 @@ from mmrjax.model.rig import Rig
 from mmrjax.model.robot import Configurations
 from mmrjax.model.shaft import Shaft
 from mmrjax.model.signals import Signals, State
+from tests.commands import read_table
 
 DRIVE = {
     "gearbox.ratio": 16.0, "gearbox.efficiency_load": 0.8, "motor.torque_constant": 0.05, "motor.resistance": 3.0,
@@ -161,9 +161,7 @@ def test_backlash_is_found_in_a_history_of_reversals(tmp_path):
         speed = float(seen.speed_motor[k]) / quantities.RPM + 5 * random.standard_normal()
         angle = np.degrees(float(seen.angle[k])) + 0.2 * random.standard_normal()
         lines.append(f"{t:.9g},{VOLTAGE[k]:g},{speed:.6g},5,{angle:.6g},0.2")
-    table = tmp_path / "table.csv"
-    table.write_text("\n".join(lines))
-    runs = records.read_runs(table, robot=robot)
+    runs = read_table(tmp_path, "\n".join(lines), robot, "table.csv")
     found = calibrate(
         runs, robot, free=["bench.backlash", "bench.loss_coulomb"], model="drive", starts=2, blocks=False,
         profiles=False,

@@ -1,7 +1,5 @@
 """Settled runs behind a current limit or a diode, compared with a bisection in NumPy, and their derivatives."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import jax

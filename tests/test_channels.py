@@ -1,7 +1,5 @@
 """Channels belong to a rig: its robot, the tables of its runs and every result carry theirs, and nothing else does."""
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 import pickle

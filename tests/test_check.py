@@ -1,7 +1,5 @@
 """Requirements: the paper's robot against the paper's aims, what would meet them, what is refused."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import math
@@ -33,7 +31,7 @@ def read(text):
     return requirements_file.parse_requirements(text, "r.toml")
 
 
-def some_of_the_papers(*kept: str) -> str:
+def some_of_the_papers(*kept):
     """The paper's file with some of its aims, in the same envelope. Of the endurances that of standing still."""
     text = (Path(requirements_file.__file__).parent / "aims" / "paper.toml").read_text("utf-8")
     head, envelope, tail = text.partition("[envelope]")

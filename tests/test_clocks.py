@@ -1,7 +1,5 @@
 """Clocks that wrap, repeat or count from 1970, and readings that a log repeats: recognised, and reported."""
 
-from __future__ import annotations
-
 import numpy as np
 import pandas as pd
 import pytest
@@ -10,6 +8,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from calibration.data import clock, robot_file, row_checks
 from calibration.data import runs as records
+from tests.commands import text_file
 
 RIG = """
 base = "none"
@@ -42,9 +41,7 @@ CLOCKS = {
 
 @pytest.fixture(scope="module")
 def robot(tmp_path_factory):
-    path = tmp_path_factory.mktemp("rig") / "rig.toml"
-    path.write_text(RIG, encoding="utf-8")
-    return robot_file.read_robot(path)
+    return robot_file.read_robot(text_file(tmp_path_factory.mktemp("rig") / "rig.toml", RIG))
 
 
 def frame(**columns):

@@ -1,7 +1,5 @@
 """The compilation cache: a second process compiles nothing, broken entries harm nothing, it can be switched off."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess
@@ -38,7 +36,7 @@ print(json.dumps({"folder": folder and str(folder), "answer": slope.tolist(),
 """
 
 
-def process(cache: Path | str, more: str = "", **environment: str) -> dict:
+def process(cache, more="", **environment):
     """What one process did with this value of MMRJAX_CACHE. Warnings are errors."""
     clean = {k: v for k, v in os.environ.items() if not k.startswith(("JAX_", "XDG_", "TF_CPP"))}
     answer = subprocess.run(

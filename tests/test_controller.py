@@ -1,7 +1,5 @@
 """A controller in the loop: simulation, steps, derivatives, tables of goal and angle, and calibration from them."""
 
-from __future__ import annotations
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -19,6 +17,7 @@ from calibration.inference.calibration import calibrate
 from calibration.inference.observers.time_histories import Histories
 from mmrjax.fidelities import drive, histories
 from mmrjax.model import params
+from tests.commands import read_rig
 
 SMOOTH = {**servo.TRUE, "coulomb": 0.0, "ki": 50.0}
 
@@ -28,8 +27,7 @@ def actuator(tmp_path):
     """Robot of a file with these values. `lines`: a replacement in its text."""
 
     def made(values=servo.TRUE, old="", new=""):
-        (tmp_path / "servo.toml").write_text(servo.RIG.format(**values).replace(old, new))
-        return robot_file.read_robot(tmp_path / "servo.toml")
+        return read_rig(tmp_path, servo.RIG.format(**values).replace(old, new), "servo.toml")
 
     return made
 
@@ -197,8 +195,7 @@ def test_the_missing_column_that_separates_a_gain_is_named_and_does(tmp_path):
     pair = {"controller.kp", "motor.torque_constant"}
 
     def foreseen(channels):
-        (tmp_path / "rig.toml").write_text(text.replace('["output_angle"]', channels))
-        robot = robot_file.read_robot(tmp_path / "rig.toml")
+        robot = read_rig(tmp_path, text.replace('["output_angle"]', channels))
         return foresight.predict_identifiability(records.read_runs(log, robot), robot)
 
     alone = foreseen('["output_angle"]')
@@ -221,8 +218,7 @@ def test_goal_and_angle_alone_give_a_servos_parameters(tmp_path):
     for old, new in PRIOR.items():
         assert old in text
         text = text.replace(old, new)
-    (tmp_path / "rig.toml").write_text(f"{text}[instruments.output_angle]\nquantum = {360 / 4096}\n")
-    robot = robot_file.read_robot(tmp_path / "rig.toml")
+    robot = read_rig(tmp_path, f"{text}[instruments.output_angle]\nquantum = {360 / 4096}\n")
     t = np.arange(0, 4.5, 0.01)
     swings = np.where(t < 3, 0.6 * np.sin(3 * np.pi * (t - 1.6)), np.where(t < 3.8, np.sin(6 * np.pi * t), -0.9))
     goal = np.where(t < 0.2, 0.0, np.where(t < 0.9, 0.8, np.where(t < 1.6, -0.5, swings)))

@@ -21,6 +21,7 @@ from mmrjax.model.rig import Rig
 from mmrjax.model.robot import Configurations
 from mmrjax.model.shaft import Shaft
 from mmrjax.model.signals import Signals
+from tests.commands import read_rig
 
 EACH = pytest.mark.parametrize("effect", CURVES.values(), ids=list(CURVES))
 SHAPE = {"y0": 0.7, "y1": -0.4, "y2": 1.1, "y3": 0.2, "y4": -0.9, "y5": 0.5}
@@ -204,9 +205,7 @@ def test_robot_with_curves_written_and_read_is_the_same(tmp_path):
 
 
 def test_curve_without_a_range_is_refused(tmp_path):
-    path = tmp_path / "mine.toml"
-    path.write_text("[effects.curve_track_payload]\nlow = 3\nhigh = 3\n")
     with pytest.raises(
         BadConfiguration, match=r"mine\.toml, effects\.curve_track_payload\.high: got 3; expected more than low, 3"
     ):
-        robot_file.read_robot(path)
+        read_rig(tmp_path, "[effects.curve_track_payload]\nlow = 3\nhigh = 3\n", "mine.toml")

@@ -1,7 +1,5 @@
 """Derived outputs: the steepest slope and the start, against closed forms, other searches and finite differences."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 import os

@@ -1,7 +1,5 @@
 """What shows only where a robot goes both ways, or where its load drives it, through the stages of the loop."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np
@@ -29,7 +27,7 @@ ANALYST = Analyst(
 )
 
 
-def table(name: str, amplitude: float, voltages: tuple[float, ...]) -> Runs:
+def table(name, amplitude, voltages):
     """80 noisy runs up and down slopes with one effect."""
     wheeled, slope, payload, voltage = (
         x.ravel() for x in np.meshgrid([0, 1], [0.0, 5.0, 10.0, 20.0, -10.0], [0.0, 5.0], voltages, indexing="ij")
@@ -133,5 +131,5 @@ def test_loop_takes_friction_of_one_direction_for_dry_friction():
     assert "directional_friction" not in {s.name for s in found.scores}
 
 
-def _sd(name: str) -> float:
+def _sd(name):
     return next(p for p in params.walk_parameters(BY_NAME[name]()) if p.spec.amplitude).spec.prior_sd(0.0)

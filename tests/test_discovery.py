@@ -1,7 +1,5 @@
 """The closed loop on synthetic tables: verdicts, what it sets aside, its statistics against a second implementation."""
 
-from __future__ import annotations
-
 import dataclasses
 from types import SimpleNamespace
 
@@ -14,7 +12,6 @@ from scipy import stats
 from synthetic import FEW, SETTLED, known, parts, small, table
 from worlds import settled, tables
 
-from calibration.data.runs import Runs
 from calibration.data.runs import read_runs as read_runs
 from calibration.discovery import discover
 from calibration.discovery.candidates import fit_base
@@ -54,21 +51,21 @@ def churning(looks):
     return SimpleNamespace(**vars(parts(runs, looks.analyst.trace(runs))), label=case.label)
 
 
-def classes(traced) -> list[set[str]]:
+def classes(traced):
     return [set(members) for members in traced.members]
 
 
-def changed(runs: Runs, column: str, row: int, by: float) -> Runs:
+def changed(runs, column, row, by):
     values = runs[column].copy()
     values[row] += by
     return dataclasses.replace(runs, columns=runs.columns | {column: values})
 
 
-def joined(runs: Runs, more: Runs) -> Runs:
+def joined(runs, more):
     return dataclasses.replace(runs, columns={k: np.concatenate([v, more[k]]) for k, v in runs.columns.items()})
 
 
-def set_aside(traced) -> tuple[tuple[int, ...], tuple[int, ...]]:
+def set_aside(traced):
     return traced.screened.outliers, traced.screened.base.unusable
 
 
@@ -294,19 +291,19 @@ def toy():
     )
 
 
-def left(linear: SettledLinearization, columns: np.ndarray) -> np.ndarray:
+def left(linear, columns):
     """What a least-squares fit of the free coordinates leaves of columns over the readings."""
     jacobian = np.asarray(linear.jacobian)
     long = np.concatenate([columns, np.zeros((len(jacobian) - len(columns), columns.shape[1]))])
     return long - jacobian @ np.linalg.lstsq(jacobian, long, rcond=None)[0]
 
 
-def fall(linear: SettledLinearization, columns: np.ndarray) -> float:
+def fall(linear, columns):
     """Fall of the sum of squares when columns over the readings are fitted beside the free coordinates."""
     e, jacobian = np.asarray(linear.residual), np.asarray(linear.jacobian)
     long = np.concatenate([columns, np.zeros((len(jacobian) - len(columns), columns.shape[1]))])
 
-    def squares(a: np.ndarray) -> float:
+    def squares(a):
         return float(np.sum((e - a @ np.linalg.lstsq(a, e, rcond=None)[0]) ** 2))
 
     return squares(jacobian) - squares(np.concatenate([jacobian, long], 1))
@@ -368,7 +365,7 @@ def test_column_within_the_fit_scores_nothing(toy):
 def test_diagnosis_is_that_of_the_fit_and_of_the_rows_that_count(clean):
     space, z = clean.space, jnp.asarray(clean.base.z)
 
-    def residual(space, z) -> np.ndarray:
+    def residual(space, z):
         problem = space.problem(clean.base.active)
         return np.asarray(diagnose_fit(problem, z, space.library.scored, clean.bases)[0].residual)
 

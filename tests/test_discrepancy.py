@@ -1,7 +1,5 @@
 """Discrepancies outside the library: their curve, the robot that has it, and the formula that is proposed."""
 
-from __future__ import annotations
-
 import dataclasses
 from types import SimpleNamespace
 
@@ -19,7 +17,6 @@ from calibration.data import robot_file
 from calibration.discovery import discover, discrepancy, formula
 from calibration.discovery.discrepancy import CurveBeside, fit_discrepancy, refine_window, similar_variables
 from calibration.discovery.projection import defect_by_row
-from calibration.discovery.result import Formula
 from calibration.discovery.score_tests import diagnose_fit
 from calibration.discovery.smooth import smooth_curve
 from calibration.inference import bases
@@ -61,13 +58,13 @@ def found(request):
     )
 
 
-def sigmas(found, reading) -> np.ndarray:
+def sigmas(found, reading):
     """Rms error against the noise-free truth, by channel [σ of a reading]."""
     sd = np.asarray(found.space.bare.data.sd)[: len(reading)]
     return np.sqrt(np.mean(((reading - found.truth) / sd) ** 2, 0))
 
 
-def at_rows(found, values) -> np.ndarray:
+def at_rows(found, values):
     """What is known on the grid, at the rows of the table."""
     x = np.asarray(getattr(found.linear.signals, found.what.variable))[: len(found.runs)]
     return np.interp(x, found.what.grid, values)
@@ -153,7 +150,7 @@ def test_formula_finds_the_variable(found):
     if found.what.balance == "electrical":
         seen = SimpleNamespace(
             window=None, variable=found.what.variable, at=found.what.grid, value=found.what.curve, unit="V",
-            proposal=Formula(proposal.formula, proposal.mark, (), (), proposal.gain, proposal.tried),
+            proposal=proposal,
         )  # fmt: skip
         assert not proposal.terms and loop_words.proposed_formula(seen).startswith("The curve rises from ")
         return
@@ -163,8 +160,8 @@ def test_formula_finds_the_variable(found):
     assert proposal.explained >= formula.MOST * curve.explained > 100
     assert all(abs(c) > 3 * s for c, s in zip(proposal.coefficients, proposal.sds, strict=True))
     unit = found.what.unit
-    assert proposal.formula.startswith(formula.SYMBOL[found.what.balance] + " = ")
-    assert proposal.formula.count(f" {unit} (") == len(proposal.terms)
+    assert proposal.expression.startswith(formula.SYMBOL[found.what.balance] + " = ")
+    assert proposal.expression.count(f" {unit} (") == len(proposal.terms)
 
 
 @pytest.mark.slow
@@ -220,7 +217,7 @@ def test_no_formula_is_proposed_where_nothing_shows(found):
     blind = eqx.tree_at(lambda linear: linear.defects, found.linear, 0 * np.asarray(found.linear.defects))
     curve = smooth_curve(found.linear, found.what.balance, found.what.variable, found.space.included)
     proposal = formula.propose_formula(blind, found.what.balance, found.space.included, curve)
-    assert proposal.formula == "" and proposal.terms == ()
+    assert proposal.expression == "" and proposal.terms == ()
     assert np.isnan(defect_by_row(blind, found.what.balance).value).all()
 
 

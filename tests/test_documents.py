@@ -1,14 +1,11 @@
 """Reports as documents: page, terminal and CSV show the same cells. One text of each document is kept."""
 
-from __future__ import annotations
-
 import csv
 import dataclasses
 import io
 import json
 import re
 import urllib.parse
-from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -38,7 +35,7 @@ from sweeps.report.document import Cell, Column, Document, Note, Section, Table,
 from sweeps.report.size_report import SizeResult
 
 
-def outcomes() -> tuple[sheet.Outcome, ...]:
+def outcomes():
     """A requirement that is met, one missed with two changes, and one without a value."""
     asked = requirements_file.parse_requirements("speed_m_s = 1\nmass_kg = 15\nslope_deg = 20\n", "aims.toml")
     at = {"configuration": "6T2A", "surface": "lacquered_wood", "payload_kg": 8.0, "slope_deg": 10.0}
@@ -54,12 +51,12 @@ def outcomes() -> tuple[sheet.Outcome, ...]:
     )
 
 
-def check() -> Document:
+def check():
     asked = requirements_file.parse_requirements("speed_m_s = 1\nmass_kg = 15\nslope_deg = 20\n", "aims.toml")
     return check_report.check_document(CheckResult(asked, nominal(), outcomes()), "nominal (PM)")
 
 
-def size() -> Document:
+def size():
     robot, drive = nominal(), drive_options(("RE 40 24 V",))[0]
     asked = requirements_file.parse_requirements("mass_kg = 15\n", "aims.toml")
     best = SizedDesign(
@@ -73,7 +70,7 @@ def size() -> Document:
     return size_report.size_document(SizeResult(asked, robot, sizing, ("mass",), outcomes()), "nominal (PM)")
 
 
-def comparison(log: bool = False) -> Document:
+def comparison(log=False):
     """The bench's rows with a simulation 4 % above them, the first row without one. Of a log as its first 2.8 s."""
     measured = records.read_runs("measured")
     error = np.where(np.arange(len(measured)) == 0, np.nan, 1.04 + 0.001 * measured["slope_deg"])
@@ -90,7 +87,7 @@ def comparison(log: bool = False) -> Document:
     )  # fmt: skip
 
 
-def comparison_two() -> Document:
+def comparison_two():
     """The same with a second robot, 2 % below the readings, which reaches the first row but not the second."""
     measured = records.read_runs("measured")
     error = np.where(np.arange(len(measured)) == 0, np.nan, 1.04)
@@ -114,11 +111,11 @@ def test_two_robots_are_compared_on_the_rows_that_both_reach():
     assert "This robot and found/robot.toml on the same 18 rows: total current 4.0 and 2.0 %" in text
 
 
-def comparison_log() -> Document:
+def comparison_log():
     return comparison(log=True)
 
 
-def settle() -> Document:
+def settle():
     """A log of two levels, the first of which still changes at its beginning, and of a third that is too short."""
     rng = np.random.default_rng(3)
     volts = np.repeat([6.0, 12.0, 18.0], (200, 200, 12))
@@ -135,7 +132,7 @@ def settle() -> Document:
     return settle_report.settle_document(settling.settle_log(runs), "Too few for the loop.", ("a further note",))
 
 
-DOCUMENTS: dict[str, Callable[[], Document]] = {
+DOCUMENTS = {
     "check": check, "size": size, "comparison": comparison, "comparison_log": comparison_log, "comparison_two": comparison_two,
     "settle": settle,
 }  # fmt: skip

@@ -11,6 +11,7 @@ from mmrjax.effects import BY_NAME
 from mmrjax.fidelities.steady import steady_batch
 from mmrjax.model import paper_robots, params
 from mmrjax.model.conditions import Conditions
+from tests.commands import read_rig
 
 GOOD = '''
 from mmrjax.effects import Effect, amplitude
@@ -215,9 +216,11 @@ def test_packaged_effects_pass_the_users_checks():
 
 
 def test_robot_file_names_the_configurations_of_an_effect(tmp_path):
-    path = tmp_path / "robot.toml"
-    path.write_text('[effects.churning]\nconfigurations = ["4W2T"]\namplitude = 1e-4\n[effects.mass_offset]\n')
-    robot = robot_file.read_robot(path)
+    robot = read_rig(
+        tmp_path,
+        '[effects.churning]\nconfigurations = ["4W2T"]\namplitude = 1e-4\n[effects.mass_offset]\n',
+        "robot.toml",
+    )
     assert [e.configurations for e in robot.effects] == [("4W2T",), ()]
     assert float(robot.effects[0].amplitude) == 1e-4
     robot_file.write_robot(robot, tmp_path / "again.toml")
@@ -246,7 +249,5 @@ def test_robot_file_may_undo_the_configurations_of_a_class(tmp_path):
     ],
 )
 def test_wrong_configurations_of_an_effect_are_refused(tmp_path, value, sentence):
-    path = tmp_path / "mine.toml"
-    path.write_text(f"[effects.mass_offset]\nconfigurations = {value}\n")
     with pytest.raises(BadConfiguration, match=r"mine\.toml, effects\.mass_offset\.configurations: " + sentence):
-        robot_file.read_robot(path)
+        read_rig(tmp_path, f"[effects.mass_offset]\nconfigurations = {value}\n", "mine.toml")

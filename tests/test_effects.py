@@ -76,9 +76,9 @@ UNIT_OF = {name: unit for unit, fields in SIGNAL_UNITS.items() for name in field
 SENSOR_UNITS = {c.name: c.unit_si for c in channels.EVERY}
 
 
-def dimensions(unit: str) -> Counter:
+def dimensions(unit):
     """Exponents of the base units of a product such as `N·m·s^2` or `V/C^2`."""
-    total: Counter = Counter()
+    total = Counter()
     for sign, symbol, power in re.findall(r"([·/]?)([^·/^]+)(?:\^(\d+(?:\.\d+)?))?", unit):
         exponent = float(power or 1) * (-1 if sign == "/" else 1)
         if symbol in BASE:
@@ -91,12 +91,12 @@ def dimensions(unit: str) -> Counter:
     return total
 
 
-def factor(unit: str, change: dict[str, float]) -> float:
+def factor(unit, change):
     """What a number in `unit` is multiplied by when each base unit's numbers are."""
     return float(np.prod([change[base] ** count for base, count in dimensions(unit).items()]))
 
 
-def balance_unit(effect: type[Effect]) -> str:
+def balance_unit(effect):
     return SENSOR_UNITS[effect.channel] if effect.balance == "sensor" else balances.BALANCES[effect.balance][0]
 
 
@@ -156,33 +156,33 @@ def random_states(n=400):
 STATES = random_states()
 
 
-def size(effect: type[Effect]) -> float:
+def size(effect):
     spec = next(p for p in params.walk_parameters(effect()) if p.name == "amplitude").spec
     return spec.prior_sd(0.0)
 
 
-def fitted(effect: type[Effect], amplitude: float) -> Effect:
+def fitted(effect, amplitude):
     return params.replace(effect(), {"amplitude": jnp.asarray(amplitude)})
 
 
-def with_effects(*present: Effect, robot=None):
+def with_effects(*present, robot=None):
     return dataclasses.replace(robot or NOMINAL, effects=present)
 
 
-def terms(effect: Effect, robot=None, signals: Signals = STATES) -> np.ndarray:
+def terms(effect, robot=None, signals=STATES):
     """What it adds to its balance in each of the states."""
     robot = with_effects(effect, robot=robot)
     added = jax.vmap(lambda s: balances.effects_sum(robot, s, effect.balance, effect.channel) + 0.0 * s.current)
     return np.asarray(added(signals))
 
 
-def readings(robot, signals: Signals) -> jax.Array:
+def readings(robot, signals):
     """What the instruments show, channels last, in their order."""
     shown = balances.sensor(robot, signals)
     return jnp.stack([shown[name] for name in channels.USUAL], -1)
 
 
-def floats(tree) -> jax.Array:
+def floats(tree):
     return jnp.stack([x for x in jax.tree.leaves(tree) if jnp.issubdtype(x.dtype, jnp.floating)])
 
 
@@ -199,7 +199,7 @@ def outputs_start(robot):
 
 
 @functools.cache
-def compiled(outputs, those: tuple[type[Effect], ...]):
+def compiled(outputs, those):
     """Outputs, and their derivatives with them, as functions of the amplitudes of effects."""
 
     def numbers(amplitudes):
@@ -213,7 +213,7 @@ def compiled(outputs, those: tuple[type[Effect], ...]):
 
 
 @functools.cache
-def at_zero(outputs, those: tuple[type[Effect], ...]) -> tuple[np.ndarray, np.ndarray]:
+def at_zero(outputs, those):
     """Outputs and their slopes where all amplitudes are zero."""
     slopes, values = compiled(outputs, those)[1](jnp.zeros(len(those)))
     return np.asarray(values), np.asarray(slopes)
@@ -225,7 +225,7 @@ TRANSIENT = tuple(effect for effect in ALL if effect.transient)
 # --- the laws: each takes an effect class and raises AssertionError ------------------------------------
 
 
-def law_declared(effect: type[Effect]) -> None:
+def law_declared(effect):
     """It states its equation's source, its balance, its amplitude, and for a sensor its channel."""
     assert "Source:" in (effect.__doc__ or ""), "docstring states no source"
     assert effect.name.isidentifier() and effect.name == effect.name.lower()
@@ -271,7 +271,7 @@ SHARED = {
 }
 
 
-def law_family(effect: type[Effect]) -> None:
+def law_family(effect):
     """Its family is its equation and its driver. Its term changes with that driver, or is a share without one."""
     assert effect.family().startswith(base.EQUATION[effect.balance]) and effect.driver in ("", *DRIVERS)
     assert (effect.driver or "same share everywhere") in effect.family()
@@ -300,14 +300,14 @@ def law_family(effect: type[Effect]) -> None:
     assert np.abs(after - before).max() > 1e-3 * np.abs(before).max(), f"does not change with {effect.driver}"
 
 
-def law_absent_at_zero(effect: type[Effect]) -> None:
+def law_absent_at_zero(effect):
     """Zero amplitude changes no number of the steady state, to the last bits."""
     bare = compiled(outputs_steady, ())[0](jnp.zeros(0))
     assert_allclose(at_zero(outputs_steady, ALL)[0], bare, rtol=1e-13, atol=1e-13)
     assert (terms(effect()) == 0).all()
 
 
-def law_alive_at_zero(effect: type[Effect]) -> None:
+def law_alive_at_zero(effect):
     """The derivative at zero is finite everywhere and not zero where the effect acts."""
     there = TRANSIENT if effect.transient else ALL
     values, slopes = at_zero(outputs_start if effect.transient else outputs_steady, there)
@@ -318,7 +318,7 @@ def law_alive_at_zero(effect: type[Effect]) -> None:
     assert moved.max() > 1e-6, "dead gradient"
 
 
-def law_linear(effect: type[Effect]) -> None:
+def law_linear(effect):
     """The term is the amplitude times something that does not know the amplitude."""
     one = terms(fitted(effect, size(effect)))
     assert np.abs(one).max() > 0, "no term at all"
@@ -327,7 +327,7 @@ def law_linear(effect: type[Effect]) -> None:
         assert_allclose(many, amplitude * one, rtol=1e-12, atol=1e-12 * np.abs(one).max())
 
 
-def law_unit(effect: type[Effect]) -> None:
+def law_unit(effect):
     """Under other units of mass, length, time and current the term turns as the unit of its balance."""
     rng = np.random.default_rng(7)
     start = fitted(effect, 0.8 * size(effect))
@@ -349,7 +349,7 @@ def law_unit(effect: type[Effect]) -> None:
         assert_allclose(after, expected, rtol=1e-9, atol=1e-12 * np.abs(expected).max())
 
 
-def law_dissipative(effect: type[Effect]) -> None:
+def law_dissipative(effect):
     """At positive amplitude a dissipative term takes power from every state, or none."""
     if not effect.dissipative:
         return
@@ -369,14 +369,14 @@ INSTANTS = {
 
 
 @functools.cache
-def known(balance: str, channel: str, instant: str) -> Signals:
+def known(balance, channel, instant):
     """What a term in this balance may read."""
     state, settled = INSTANTS[instant]
     run = jax.tree.map(lambda x: x[2], CONDITIONS)
     return readable_signals(NOMINAL, run, state, balance, channel, settled=settled)
 
 
-def law_readable(effect: type[Effect]) -> None:
+def law_readable(effect):
     """Term and derivatives are finite on the signals that are computed before its balance, at rest too."""
     robot = with_effects(fitted(effect, size(effect)))
     for instant in INSTANTS:
@@ -397,13 +397,13 @@ EVEN = (
 )
 
 
-def mirrored(signals: Signals) -> Signals:
+def mirrored(signals):
     """Signals of a run in mirror image. What is not followed stays so."""
     odd = (f.name for f in dataclasses.fields(Signals) if f.name not in EVEN)
     return dataclasses.replace(signals, **{n: -getattr(signals, n) for n in odd if getattr(signals, n) is not None})
 
 
-def law_travel(effect: type[Effect]) -> None:
+def law_travel(effect):
     """In a run in mirror image a term is the mirror image, and in that of one `odd_in_travel` what it was."""
     if effect.balance not in CONJUGATE or issubclass(effect, Periodic):
         return  # masses and readings have no direction; a phase has its own

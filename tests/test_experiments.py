@@ -25,6 +25,7 @@ from mmrjax.fidelities.steady import IMPLICIT
 from mmrjax.model import channels, paper_robots, params
 from mmrjax.model.conditions import Conditions
 from sweeps import stage_files
+from tests.commands import read_rig
 
 PAIRS = {
     ("series_resistance", "supply_sag"): {"one motor, 6T2A", "one motor, 4W2T", "stall, one motor"},
@@ -308,8 +309,7 @@ static = 0.6
 
 @pytest.fixture
 def rover(tmp_path):
-    (tmp_path / "rover.toml").write_text(ROVER)
-    return robot_file.read_robot(tmp_path / "rover.toml")
+    return read_rig(tmp_path, ROVER, "rover.toml")
 
 
 def grid(voltages, slopes, payloads):

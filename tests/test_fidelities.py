@@ -1,7 +1,5 @@
 """The registry of fidelities: every one keeps the contract, broken ones do not, and a new one is a file and a line."""
 
-from __future__ import annotations
-
 import dataclasses
 import subprocess
 import sys
@@ -26,7 +24,7 @@ RUNS = Conditions(configuration=[0, 1], voltage=24.0, slope_deg=[5.0, 0.0])
 SHORT = 0.03  # [s]
 
 
-def short(fidelity: Fidelity) -> dict[str, float]:
+def short(fidelity):
     has = {option.name for option in fidelity.facts.options}
     return fidelity.facts.resolved(**({"duration": SHORT} if "duration" in has else {}))
 
@@ -34,7 +32,7 @@ def short(fidelity: Fidelity) -> dict[str, float]:
 # --- the contract -----------------------------------------------------------------------------------
 
 
-def knows_itself(fidelity: Fidelity, robot) -> None:
+def knows_itself(fidelity, robot):
     facts = fidelity.facts
     assert (
         fidelity.name in fidelities.TABLE
@@ -49,7 +47,7 @@ def knows_itself(fidelity: Fidelity, robot) -> None:
     assert set(facts.computes) <= parameters
 
 
-def settles_traceably(fidelity: Fidelity, robot) -> None:
+def settles_traceably(fidelity, robot):
     def readings(resistance):
         result = fidelity.settled(params.replace(robot, {"motor.resistance": resistance}), RUNS)
         assert isinstance(result, Result)
@@ -60,7 +58,7 @@ def settles_traceably(fidelity: Fidelity, robot) -> None:
     assert all(x.shape == (2,) for x in jax.tree.leaves(result))
 
 
-def runs_batches(fidelity: Fidelity, robot) -> None:
+def runs_batches(fidelity, robot):
     done = fidelity.run(robot, RUNS, short(fidelity))
     assert isinstance(done, Run) and done.history is None
     assert all(x.shape == (2,) for x in jax.tree.leaves(done))
@@ -68,10 +66,10 @@ def runs_batches(fidelity: Fidelity, robot) -> None:
     assert set(done.result.reading) == {c.name for c in channels.EVERY}
 
 
-def keeps_histories(fidelity: Fidelity, robot) -> None:
+def keeps_histories(fidelity, robot):
     if fidelity.histories is None:
         return
-    told: list[float] = []
+    told = []
     kept = fidelity.histories(robot, RUNS, short(fidelity), told.append)
     history = kept.history
     assert isinstance(history, History)
@@ -85,7 +83,7 @@ def keeps_histories(fidelity: Fidelity, robot) -> None:
     assert kept.result.status.shape == (2,)
 
 
-def checks_and_cautions(fidelity: Fidelity, robot) -> None:
+def checks_and_cautions(fidelity, robot):
     assert fidelity.check(robot, RUNS, short(fidelity)) is None
 
 

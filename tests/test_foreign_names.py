@@ -39,7 +39,7 @@ NAMES = (
 ALL = " ".join(NAMES)
 
 
-def obeyed(text: str) -> set[str]:
+def obeyed(text):
     """Characters that a terminal or page would obey."""
     return set(text) - set(printable(text))
 
@@ -147,7 +147,7 @@ def test_cells_that_are_numbers_get_no_apostrophe():
 class Elements(html.parser.HTMLParser):
     """Tags and attributes of a page."""
 
-    def __init__(self, text: str) -> None:
+    def __init__(self, text):
         super().__init__()
         self.found: list[tuple[str, ...]] = []
         self.feed(text)

@@ -8,7 +8,7 @@ from numpy.testing import assert_allclose
 from test_shaft import DRIVE, bench
 
 import mmrjax as mm
-from calibration.data import rig_facts, robot_file
+from calibration.data import rig_facts
 from calibration.data import runs as records
 from calibration.data.input_errors import BadConfiguration, BadData
 from calibration.inference.observers import SettledRuns
@@ -19,6 +19,7 @@ from mmrjax.model.conditions import Conditions
 from mmrjax.model.rig import Rig
 from mmrjax.model.signals import STATUSES
 from sweeps.commands import rig_check
+from tests.commands import read_rig
 
 AMPERES = np.array([-8.0, -2.0, 0.5, 5.0])
 #: Friction of motor (N·m) and efficiency of `bench`; its load has none here.
@@ -101,9 +102,7 @@ FREED = ("motor.resistance", "motor.torque_constant", "motor.friction_coulomb")
 
 
 def rig(tmp_path, imposed, channels):
-    path = tmp_path / "rig.toml"
-    path.write_text(RIG_HELD.format(imposed=imposed, channels=channels), encoding="utf-8")
-    return robot_file.read_robot(path)
+    return read_rig(tmp_path, RIG_HELD.format(imposed=imposed, channels=channels))
 
 
 def table(held=True, **more):

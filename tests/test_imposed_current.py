@@ -1,7 +1,5 @@
 """Motors whose current is imposed: steady travel, histories, tables and fits against plain physics, without a winding."""
 
-from __future__ import annotations
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -9,7 +7,6 @@ import numpy as np
 import pytest
 
 from calibration.data import rig_facts, robot_file
-from calibration.data import runs as records
 from calibration.data.input_errors import BadConfiguration, BadData
 from calibration.discovery import discover
 from calibration.inference import bases, checks, observers
@@ -22,7 +19,7 @@ from mmrjax.model import params
 from mmrjax.model.balances import absent_balances
 from mmrjax.model.conditions import Conditions
 from sweeps.pages import comparison_figures
-from tests.commands import ends
+from tests.commands import ends, read_rig, read_table
 
 K, RATIO, ETA = 0.05, 10.0, 0.9
 DRY, VISCOUS, INERTIA, ROTOR = 0.3, 0.02, 0.01, 2e-6
@@ -46,8 +43,7 @@ loss_viscous = "{VISCOUS} ± 50 %"
 
 @pytest.fixture
 def robot(tmp_path):
-    (tmp_path / "rig.toml").write_text(RIG, encoding="utf-8")
-    return robot_file.read_robot(tmp_path / "rig.toml")
+    return read_rig(tmp_path, RIG)
 
 
 def settles(current):
@@ -67,8 +63,10 @@ def followed(current, times, dry=DRY):
 def test_a_current_in_another_unit_is_doubted_with_what_turns_the_load(tmp_path, robot, factor, doubted):
     """It is 0.67 A that turns the load slowly."""
     rows = "".join(f"{0.1 * k},{factor * current},0\n" for k, current in enumerate((1.5, 2.0, -1.5)))
-    (tmp_path / "log.csv").write_text(f"time_s,motor_current_A,motor_speed_rpm\n{rows}", encoding="utf-8")
-    said = rig_facts.doubtful_current(records.read_runs(tmp_path / "log.csv", robot=robot), robot)
+    said = rig_facts.doubtful_current(
+        read_table(tmp_path, f"time_s,motor_current_A,motor_speed_rpm\n{rows}", robot),
+        robot,
+    )
     assert bool(said) == doubted
     if doubted:
         assert f"up to {2 * factor:g} A, where the file's numbers turn the load slowly with 0.667 A; is it in" in said
@@ -79,8 +77,7 @@ def test_a_current_in_another_unit_is_doubted_with_what_turns_the_load(tmp_path,
 def test_a_loop_and_a_calibration_say_so_before_they_fit(tmp_path, robot, factor, doubted, monkeypatch):
     current = np.array([1.0, 1.5, 2.0, -1.0, -1.5, -2.0, 1.2, 1.8])
     rows = [f"{factor * i},{x * 9.549}\n" for i, x in zip(current, settles(current), strict=True)]
-    (tmp_path / "runs.csv").write_text("motor_current_A,motor_speed_rpm\n" + "".join(rows), encoding="utf-8")
-    runs = records.read_runs(tmp_path / "runs.csv", robot=robot)
+    runs = read_table(tmp_path, "motor_current_A,motor_speed_rpm\n" + "".join(rows), robot, "runs.csv")
     monkeypatch.setattr(checks, "check_ranges", lambda runs, robot: [])  # which refuses it where speeds show it too
     ready = discover.prepare_loop(runs, robot)
     assert any("is it in another unit" in str(note) for note in ready.at_first) == doubted
@@ -96,12 +93,10 @@ def test_the_file_says_what_is_imposed_and_needs_no_winding(robot, tmp_path):
     assert {"electrical", "inductance", "supply"} <= absent_balances(robot)
     robot_file.write_robot(robot, tmp_path / "again.toml")
     assert robot_file.read_robot(tmp_path / "again.toml").rig == robot.rig
-    (tmp_path / "bad.toml").write_text(RIG.replace('["motor_speed"]', '["motor_current"]'), encoding="utf-8")
     with pytest.raises(BadConfiguration, match="motor_current is imposed, so it is no reading"):
-        robot_file.read_robot(tmp_path / "bad.toml")
-    (tmp_path / "bad.toml").write_text(RIG.replace(f"torque_constant = {K}", ""), encoding="utf-8")
+        read_rig(tmp_path, RIG.replace('["motor_speed"]', '["motor_current"]'), "bad.toml")
     with pytest.raises(BadConfiguration, match=r"motor\.torque_constant \[N·m/A\] is missing"):
-        robot_file.read_robot(tmp_path / "bad.toml")
+        read_rig(tmp_path, RIG.replace(f"torque_constant = {K}", ""), "bad.toml")
 
 
 @pytest.mark.parametrize("resistance", [0.1, 5.0])
@@ -127,8 +122,7 @@ def test_a_run_follows_its_first_order_law(robot):
 def test_a_shaft_turns_through_rest_and_is_held_there_at_its_very_moment(tmp_path):
     """Friction jumps there. By steps of 5 ms from 3 A to -2 A to 0.1 A, against the law of either way. Its derivative by
     the dry friction too: it goes on from the first way to the second, and what friction holds forgets it."""
-    (tmp_path / "rig.toml").write_text(RIG.replace(f"load = {ETA}", "load = 1.0"), encoding="utf-8")
-    robot = robot_file.read_robot(tmp_path / "rig.toml")
+    robot = read_rig(tmp_path, RIG.replace(f"load = {ETA}", "load = 1.0"))
     times = np.arange(0.0, 0.9001, 0.005)
     levels = np.select([times < 0.3, times < 0.6], [3.0, -2.0], 0.1)
     rate = VISCOUS / (INERTIA + ROTOR * RATIO**2)
@@ -171,8 +165,7 @@ def log(tmp_path, robot, noise, dry=DRY):
         rows += [
             f"{run},{t:.3f},{levels[int(t >= 0.6)]},{x * 30 / np.pi:.4f}" for t, x in zip(times, shown, strict=True)
         ]
-    (tmp_path / "log.csv").write_text("run_id,time_s,motor_current_A,motor_speed_rpm\n" + "\n".join(rows) + "\n")
-    return records.read_runs(tmp_path / "log.csv", robot=robot)
+    return read_table(tmp_path, "run_id,time_s,motor_current_A,motor_speed_rpm\n" + "\n".join(rows) + "\n", robot)
 
 
 @pytest.mark.slow
@@ -191,10 +184,9 @@ def settled_table(tmp_path, robot, dry):
     torque = RATIO * ETA * K * np.abs(current) - dry
     speed = np.sign(current) * RATIO * torque / VISCOUS + 0.5 * rng.standard_normal(len(current))
     rows = [f"{i},{w * 30 / np.pi:.4f},{0.5 * 30 / np.pi:.4f}" for i, w in zip(current, speed, strict=True)]
-    (tmp_path / "runs.csv").write_text(
-        "motor_current_A,motor_speed_rpm,motor_speed_sd_rpm\n" + "\n".join(rows) + "\n", encoding="utf-8"
+    return read_table(
+        tmp_path, "motor_current_A,motor_speed_rpm,motor_speed_sd_rpm\n" + "\n".join(rows) + "\n", robot, "runs.csv"
     )
-    return records.read_runs(tmp_path / "runs.csv", robot=robot)
 
 
 def test_levels_of_the_current_are_blocks_to_hold_out(robot, tmp_path):
@@ -247,6 +239,5 @@ def test_errors_are_drawn_over_a_current_that_is_imposed(robot):
 
 
 def test_a_table_without_its_current_is_refused(robot, tmp_path):
-    (tmp_path / "runs.csv").write_text("motor_speed_rpm\n100\n", encoding="utf-8")
     with pytest.raises(BadData, match="column motor_current_A is missing"):
-        records.read_runs(tmp_path / "runs.csv", robot=robot)
+        read_table(tmp_path, "motor_speed_rpm\n100\n", robot, "runs.csv")

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from calibration.data import input_files, robot_file
+from calibration.data import input_files
 from calibration.data import runs as records
 from calibration.data.input_errors import BadConfiguration, BadData, InputError
 from calibration.discovery.discover import without_copies
@@ -15,6 +15,7 @@ from calibration.inference.checks import _check_stuck_channels
 from calibration.inference.fit_notes import Remark
 from mmrjax.errors import count_noun
 from sweeps.pages import comparison_figures
+from tests.commands import read_rig, read_table
 
 RIG = """
 base = "none"
@@ -34,13 +35,11 @@ loss_coulomb = 0.01
 
 
 def bench(tmp_path, more=""):
-    (tmp_path / "rig.toml").write_text(RIG.format(more=more), encoding="utf-8")
-    return robot_file.read_robot(tmp_path / "rig.toml")
+    return read_rig(tmp_path, RIG.format(more=more))
 
 
 def table(tmp_path, text, robot):
-    (tmp_path / "t.csv").write_text(text, encoding="utf-8")
-    return records.read_runs(tmp_path / "t.csv", robot=robot)
+    return read_table(tmp_path, text, robot, "t.csv")
 
 
 DEEP = "a." * 4_999 + "a"
@@ -62,9 +61,8 @@ TOML = {
 @pytest.mark.parametrize("case", TOML)
 def test_toml_that_cannot_be_is_refused_in_one_short_sentence(tmp_path, case):
     text, says = TOML[case]
-    (tmp_path / "r.toml").write_text(text)
     with pytest.raises(BadConfiguration, match=says) as refusal:
-        robot_file.read_robot(tmp_path / "r.toml")
+        read_rig(tmp_path, text, "r.toml")
     assert len(str(refusal.value)) < 400 and "\n" not in str(refusal.value)
 
 
@@ -148,10 +146,9 @@ def test_rows_alike_are_repeats_and_the_same_run_twice_is_a_copy(tmp_path, head,
 
 
 def test_a_stiff_supply_is_no_stuck_instrument(tmp_path):
-    (tmp_path / "rig.toml").write_text(
-        RIG.format(more='imposed = "motor_speed"').replace('"output_speed"', '"motor_voltage"')
+    robot = read_rig(
+        tmp_path, RIG.format(more='imposed = "motor_speed"').replace('"output_speed"', '"motor_voltage"')
     )
-    robot = robot_file.read_robot(tmp_path / "rig.toml")
     rows = "".join(f"{speed},{0.01 * k},24\n" for k, speed in enumerate((4500, 4400, 4300, 4200)))
     found = table(tmp_path, f"motor_speed_rpm,motor_current_A,motor_voltage_V\n{rows}", robot)
     assert _check_stuck_channels(found) == [Remark("stiff_supply", column="motor_voltage_V", value=24.0)]

@@ -1,7 +1,5 @@
 """Loops whose members take different numbers of turns: each ends as by itself, in as many turns as the mean asks."""
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 import numpy as np

@@ -28,6 +28,7 @@ from mmrjax.model.rig import Rig
 from mmrjax.model.signals import STATUSES, State
 from sweeps.config import Sweep
 from sweeps.config_campaign import of_grid
+from tests.commands import read_table, text_file
 
 VOLTS = np.array([24.0, 6.0, -12.0, 12.0])
 TORQUE = np.array([0.5, 0.1, -0.3, 0.0])  # of a brake: against the way that each turns
@@ -214,10 +215,8 @@ def test_columns_that_may_be_the_torque_are_asked_about(tmp_path):
 
 def test_a_table_of_a_vehicle_with_a_brake_is_refused(tmp_path):
     head = "configuration,supply_voltage_V,total_mass_kg,payload_kg,slope_deg,total_current_A,load_torque_mNm"
-    path = tmp_path / "runs.csv"
-    path.write_text(f"{head}\n6T2A,24,15,0,0,3,0\n6T2A,24,15,0,0,3,20\n")
     with pytest.raises(BadData) as error:
-        records.read_runs(path, robot=mm.nominal())
+        read_table(tmp_path, f"{head}\n6T2A,24,15,0,0,3,0\n6T2A,24,15,0,0,3,20\n", mm.nominal(), "runs.csv")
     assert str(error.value) == (
         "runs.csv row 2, load_torque_mNm: got 20; the robot is a vehicle; the torque of a brake acts only "
         "on a shaft; state slope_deg or payload_kg, or describe the load as a shaft"
@@ -297,13 +296,11 @@ def test_a_torque_in_another_unit_is_doubted(tmp_path):
 
 
 def test_a_profile_and_a_sweep_state_the_torque(tmp_path):
-    (tmp_path / "p.csv").write_text("time_s,duty,load_torque_mNm\n0,1,0\n1,1,300\n2,,\n")
-    table = profiles.read_profile(tmp_path / "p.csv")
+    table = profiles.read_profile(text_file(tmp_path / "p.csv", "time_s,duty,load_torque_mNm\n0,1,0\n1,1,300\n2,,\n"))
     assert_allclose(table.values["load_torque"], [0.0, 0.3, 0.3])
     assert table.stated == ("load_torque_Nm",)
-    (tmp_path / "bad.csv").write_text("time_s,duty,load_torque_Nm\n0,1,0\n1,1,\n2,1,0\n")
     with pytest.raises(BadData, match=r"bad\.csv row 2, load_torque_Nm: got an empty cell; expected a number"):
-        profiles.read_profile(tmp_path / "bad.csv")
+        profiles.read_profile(text_file(tmp_path / "bad.csv", "time_s,duty,load_torque_Nm\n0,1,0\n1,1,\n2,1,0\n"))
     made = mm.sweep(bench(), voltages=[12.0, 24.0], load_torques=[0.0, 0.5])
     assert made.to_dict()["load_torque_Nm"].tolist() == [0.0, 0.5, 0.0, 0.5]
     free, braked = np.asarray(made.motor_speed).reshape(2, 2).T

@@ -1,7 +1,5 @@
 """Logs with faults that no reader sees: one sentence each. Sound logs have none."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from test_log_kinds import servo, written

@@ -1,7 +1,5 @@
 """Logs of a servo on PWM and of a carriage on an amplifier, from plain NumPy laws, through the files of `rig new`."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -55,7 +55,7 @@ class PayloadBinding(Effect):
 '''
 
 
-def mmrjax(folder, *arguments) -> SimpleNamespace:
+def mmrjax(folder, *arguments):
     """Run a command in this process and in a folder: exit code, stdout and stderr."""
     out, err = io.StringIO(), io.StringIO()
     with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
@@ -67,7 +67,7 @@ def mmrjax(folder, *arguments) -> SimpleNamespace:
     return SimpleNamespace(code=end.value.code, out=out.getvalue(), err=err.getvalue())
 
 
-def written(path, table) -> None:
+def written(path, table):
     with path.open("w", newline="", encoding="utf-8") as file:
         out = csv.writer(file)
         out.writerow(table)
@@ -79,7 +79,7 @@ def loaded(p):
 
 
 @functools.cache
-def commanded(every=False) -> SimpleNamespace:
+def commanded(every=False):
     """The whole command on 24 runs of a robot whose track churns, one of them twice. Made once for all files.
 
     It looks for the effects of `FEW` alone, or for `every` one of the library.
@@ -362,7 +362,7 @@ def test_interrupt_leaves_nothing(tmp_path, monkeypatch):
 # --- histories ---------------------------------------------------------------------------------------
 
 
-def starts_churning(folder) -> SimpleNamespace:
+def starts_churning(folder):
     """The whole command on six starts of a robot whose tracks churn, one sample given twice."""
     made = histories.narrow(["churning"], 14.0, seed=5, duration=0.8)
     written(folder / "starts.csv", {k: np.append(v, v[40]) for k, v in made.table.items()})

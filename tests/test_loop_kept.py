@@ -1,7 +1,5 @@
 """Stages of the loop are kept as they end, the same command goes on, and a budget of time ends it with what there is."""
 
-from __future__ import annotations
-
 import concurrent.futures
 import os
 import signal
@@ -191,7 +189,7 @@ def test_a_loop_of_kept_stages_finds_what_it_found(tmp_path):
     (tmp_path / "table.csv").write_text("\n".join(rows) + "\n")
     robot = robot_file.read_robot(tmp_path / "rig.toml")
     runs = records.read_runs(tmp_path / "table.csv", robot=robot)
-    written: dict[str, object] = {}
+    written = {}
 
     def keep(name, make):
         made = make()

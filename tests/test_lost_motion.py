@@ -1,7 +1,5 @@
 """Backlash, play and soft couplings are noticed in a log by the angle that each reversal loses."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import numpy as np
@@ -121,5 +119,5 @@ def test_no_effect_stands_in_for_a_missing_backlash(lost, monkeypatch):
 def test_task_of_the_loop_knows_of_lost_motion(tmp_path):
     for play in (1.0, 0.0):
         runs, robot = read(tmp_path, servo(play=play))
-        task = discover._Task(runs, robot, *[None] * 8)
-        assert task.loses_motion == (play > 0)
+        given = discover.LoopInput(runs, None, robot, *[None] * 4)
+        assert given.loses_motion == (play > 0)

@@ -1,7 +1,5 @@
 """Missions that a battery's cut-off ends: beside an independent integration, its derivative, its words, bad input."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 
@@ -21,7 +19,7 @@ from mmrjax.missions.profile import profile
 from mmrjax.model import paper_robots, params
 from mmrjax.model.signals import STATUSES
 from sweeps import cli
-from tests.commands import ends, rows
+from tests.commands import ends, read_rig, rows
 
 HOUR = profile([0.0, 3600.0], "voltage", duty=1.0, slope_deg=10.0, payload=5.0)
 #: Room for the steps of a mission, as the command keeps; one program serves all with the same cut-off.
@@ -289,9 +287,8 @@ def test_names_shared_by_a_run_and_a_mission_are_the_same_quantities(folder, cap
 
 
 def test_a_cut_off_above_a_full_cell_is_refused_in_a_file(tmp_path):
-    (tmp_path / "low.toml").write_text("[battery]\nvoltage_cutoff = 4.18\n")
     with pytest.raises(BadConfiguration) as said:
-        robot_file.read_robot(tmp_path / "low.toml")
+        read_rig(tmp_path, "[battery]\nvoltage_cutoff = 4.18\n", "low.toml")
     assert str(said.value) == (
         "low.toml, battery.voltage_cutoff: got 4.18 V; expected less than voltage_full, 4.17 V: a full cell would be "
         "cut off"
@@ -300,14 +297,13 @@ def test_a_cut_off_above_a_full_cell_is_refused_in_a_file(tmp_path):
 
 def test_a_cut_off_below_an_empty_cell_is_said_where_a_file_states_it(tmp_path):
     (tmp_path / "low.toml").write_text("[battery]\nvoltage_cutoff = 2.9\n")
-    notes: list[str] = []
+    notes = []
     robot_file.read_robot(tmp_path / "low.toml", notes=notes)
     assert notes == [
         "low.toml, battery.voltage_cutoff: 2.9 V is below the 3.41 V of an empty cell without load: it acts only "
         "beyond 10.4 A"
     ]
-    (tmp_path / "low.toml").write_text("[battery]\nvoltage_cutoff = 3.45\n")
-    robot_file.read_robot(tmp_path / "low.toml", notes=(quiet := []))
+    read_rig(tmp_path, "[battery]\nvoltage_cutoff = 3.45\n", "low.toml", notes=(quiet := []))
     assert quiet == []
 
 

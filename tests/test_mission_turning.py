@@ -12,7 +12,7 @@ import mmrjax as mm
 from mmrjax.fidelities.drive import drive
 from mmrjax.missions import mission_batch as missions
 from mmrjax.missions import mission_straight
-from mmrjax.missions.mission import TOLERANCE, Mission, Start, Totals, initial_unknowns, mission
+from mmrjax.missions.mission import TOLERANCE, Start, Totals, initial_unknowns, mission
 from mmrjax.missions.mission_batch import simulate_batch
 from mmrjax.missions.mission_steps import BREAKS_AWAY, event_functions
 from mmrjax.missions.profile import profile
@@ -23,7 +23,7 @@ RAMP = dict(demand=[0, 0.3, 0.3, 0, 0], linear=True)
 MODES = ["speed"] * 3 + ["brake"] * 2
 
 
-def conditions(count: int, **given: float) -> mm.Conditions:
+def conditions(count, **given):
     return mm.Conditions(**{"configuration": np.full(count, 1), "voltage": 24.0} | given)
 
 
@@ -32,20 +32,20 @@ def several(*profiles):
     return jax.tree.map(lambda *x: jnp.stack(x), *profiles)
 
 
-def demanding(robot, run: mm.Conditions, *asks, tolerance: float = TOLERANCE) -> Mission:
+def demanding(robot, run, *asks, tolerance=TOLERANCE):
     """Three missions that demand a speed and a yaw rate in five rows: what is asked so has one program."""
     return jax.device_get(simulate_batch(robot, run, several(*asks), None, 512, jnp.asarray(tolerance)))
 
 
 @pytest.fixture(scope="module")
-def demanded(robot) -> Mission:
+def demanded(robot):
     """Speed with a yaw rate of 0, of 0.5 and -0.5 rad/s."""
     rates = ([0.0] * 5, [0, 0.5, 0.5, 0, 0], [0, -0.5, -0.5, 0, 0])
     run = conditions(3, payload=np.zeros(3)).resolved(robot)
     return demanding(robot, run, *(profile(ROWS, MODES, yaw_rate=rate, **RAMP) for rate in rates))
 
 
-def with_duties(robot) -> Mission:
+def with_duties(robot):
     """Duties held, left the slower side, the faster one, and one against the other, in steps fine enough for `drive`."""
     duties = ((0.4, 0.9), (0.9, 0.4), (-0.8, 0.8))
     one = several(*(profile([0.0, 0.5, 1.0], duty_left=left, duty_right=right) for left, right in duties))
@@ -53,7 +53,7 @@ def with_duties(robot) -> Mission:
 
 
 @pytest.fixture(scope="module")
-def driven(robot) -> Mission:
+def driven(robot):
     return with_duties(robot)
 
 

@@ -11,6 +11,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from calibration.data import delimited, presets_file, runs
 from calibration.data.input_errors import BadData
 from calibration.data.sources import json_records, opening, reading
+from tests.commands import text_file
 
 
 def signals_of(path):
@@ -154,16 +155,18 @@ def test_damaged_workbook_is_refused(tmp_path):
 def test_header_and_units_stand_in_comments_of_matlab(tmp_path, sign):
     file = tmp_path / "step.csv"
     lines = ["Bench 3", "Date:,03/02/2026", "", "tick,voltage,speed", "[#],[V],[turns/s]"]
-    file.write_text("".join(f"{sign}{line}\n" if line else "\n" for line in lines) + "0,0.0,0.1;\n1,3.0,0.2;\n")
-    table = delimited.read_csv_columns(file, "step.csv")
+    table = delimited.read_csv_columns(
+        text_file(file, "".join(f"{sign}{line}\n" if line else "\n" for line in lines) + "0,0.0,0.1;\n1,3.0,0.2;\n"),
+        "step.csv",
+    )
     assert table.header == ("tick", "voltage", "speed") and table.units[1:] == ("V", "turns_s")
     assert table.values[2] == ["0.1", "0.2"]
 
 
 def test_last_comment_without_units_is_the_header(tmp_path):
-    file = tmp_path / "a.csv"
-    file.write_text("% by me\n% time,voltage\n0,1\n1,2\n")
-    assert delimited.read_csv_columns(file, "a.csv").header == ("time", "voltage")
+    assert delimited.read_csv_columns(
+        text_file(tmp_path / "a.csv", "% by me\n% time,voltage\n0,1\n1,2\n"), "a.csv"
+    ).header == ("time", "voltage")
 
 
 # --- JSON ---------------------------------------------------------------------------------------------------------
@@ -216,7 +219,7 @@ def test_files_of_a_pattern_have_the_same_columns(tmp_path):
 
 
 def test_json_of_episodes_is_read_from_a_file(tmp_path):
-    file = tmp_path / "log.json"
-    file.write_text(json.dumps({"dt": 0.1, "data": [{"u": [1.0, 2.0]}, {"u": [3.0, None]}]}))
-    signals = signals_of(file)
+    signals = signals_of(
+        text_file(tmp_path / "log.json", json.dumps({"dt": 0.1, "data": [{"u": [1.0, 2.0]}, {"u": [3.0, None]}]}))
+    )
     assert_array_equal(signals["data.u"].load(), [1, 2, 3, np.nan])

@@ -1,7 +1,5 @@
 """Motors from the six numbers of a data sheet: constants, contradictions, and what is refused."""
 
-from __future__ import annotations
-
 import itertools
 import json
 from pathlib import Path

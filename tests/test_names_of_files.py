@@ -1,7 +1,5 @@
 """One name is one quantity in every file that a command writes: tables of names, and the files of every command."""
 
-from __future__ import annotations
-
 import contextlib
 import csv
 import inspect
@@ -12,10 +10,7 @@ import os
 import re
 import sys
 import tomllib
-from collections.abc import Iterator
-from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -127,9 +122,9 @@ SHARED = {
 FOREIGN = {"parameters", "set", "versions", "hashes", "prior", "blocks", "statuses", "tied"}
 
 
-def registries() -> dict[str, list[tuple[str, str]]]:
+def registries():
     """Unit and meaning of every name of the tables that writers use. Of each table in which it is."""
-    found: dict[str, list[tuple[str, str]]] = {}
+    found = {}
     for row in (*outputs.output_table(channels.EVERY), *mission_batch.OUTPUTS, *derived.TABLE):
         found.setdefault(row.column, []).append((row.unit_shown, row.label))
     for c in channels.EVERY:
@@ -143,13 +138,13 @@ def registries() -> dict[str, list[tuple[str, str]]]:
     return found
 
 
-def options() -> set[str]:
+def options():
     """Names of all options of all commands, as `config.resolved.toml` has them."""
     parts = [c for _, c in inspect.getmembers(config, inspect.isclass) if issubclass(c, config.Part)]
     return {name for part in parts for name in part.model_fields}
 
 
-def known(name: str, names: set[str]) -> bool:
+def known(name, names):
     """Whether a name is in a table, or is one that is, of something else."""
     if name in names or NUMBERED.fullmatch(name):
         return True
@@ -165,7 +160,7 @@ def known(name: str, names: set[str]) -> bool:
     return bool(BEFORE.match(name)) and known(BEFORE.sub("", name), names)
 
 
-def keys(content: Any, before: str = "") -> Iterator[tuple[str, str]]:
+def keys(content, before=""):
     """Every key of JSON or TOML, and the path of keys to it."""
     if isinstance(content, dict):
         for key, value in content.items():
@@ -177,15 +172,15 @@ def keys(content: Any, before: str = "") -> Iterator[tuple[str, str]]:
             yield from keys(value, f"{before}[]")
 
 
-def table(path: Path) -> dict[str, list[str]]:
+def table(path):
     with path.open(newline="") as stream:
         rows = list(csv.reader(stream))
     return {name: [row[k] for row in rows[1:]] for k, name in enumerate(rows[0])}
 
 
-def walk(folder: Path) -> dict[str, str]:
+def walk(folder):
     """Every name in every file of a folder, with one place where it is."""
-    found: dict[str, str] = {}
+    found = {}
     for path in sorted(folder.rglob("*"), key=lambda path: (path.suffix == ".csv", path)):
         if path.suffix == ".csv":
             found |= {name: str(path) for name in table(path)}
@@ -196,7 +191,7 @@ def walk(folder: Path) -> dict[str, str]:
     return found
 
 
-def unknown(folder: Path) -> dict[str, str]:
+def unknown(folder):
     """Names that end in a unit and are in no table, with a place of each."""
     names, asked = {*registries(), *MORE}, {*requirements.QUANTITIES} - SHARED
     return {
@@ -207,7 +202,7 @@ def unknown(folder: Path) -> dict[str, str]:
     }
 
 
-def numbers(found: dict[str, list[str]]) -> dict[str, np.ndarray]:
+def numbers(found):
     """Columns of numbers. An empty cell is NaN."""
     kept = {}
     for name, cells in found.items():
@@ -229,7 +224,7 @@ ALIKE = {
 }  # fmt: skip
 
 
-def twins(path: Path) -> list[tuple[str, str]]:
+def twins(path):
     """Columns with one unit and the same numbers in at least two rows that differ: one quantity under two names."""
     found = {n: x for n, x in numbers(table(path)).items() if END.search(n) and not NUMBERED.fullmatch(n)}
     pairs = itertools.combinations(found, 2)
@@ -243,7 +238,7 @@ def twins(path: Path) -> list[tuple[str, str]]:
     ]
 
 
-def command(folder: Path, *arguments: Any) -> SimpleNamespace:
+def command(folder, *arguments):
     """Run a command in this process and in a folder."""
     out, err = io.StringIO(), io.StringIO()
     with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
@@ -257,13 +252,13 @@ def command(folder: Path, *arguments: Any) -> SimpleNamespace:
     return SimpleNamespace(code=end.value.code, out=out.getvalue(), err=err.getvalue())
 
 
-def sound(folder: Path) -> None:
+def sound(folder):
     """No name without a meaning, no quantity under two names, in all files of a folder."""
     assert unknown(folder) == {}
     assert {str(path): twins(path) for path in folder.rglob("*.csv") if twins(path)} == {}
 
 
-def same(one: dict[str, np.ndarray], other: dict[str, np.ndarray], *, but: tuple[str, ...] = ()) -> set[str]:
+def same(one, other, *, but=()):
     """Names that two tables of the same rows share. Their numbers are the same."""
     shared = (set(one) & set(other)) - set(but)
     for name in sorted(shared):
@@ -284,7 +279,7 @@ def test_a_name_has_one_unit_in_all_tables_and_one_meaning():
 
 def test_a_meaning_has_one_name():
     """Words of reports too: no two columns have one label."""
-    names: dict[str, set[str]] = {}
+    names = {}
     for name, said in registries().items():
         for _, meaning in said:
             names.setdefault(meaning, set()).add(name)
@@ -347,9 +342,9 @@ def folder(tmp_path_factory):
 @pytest.fixture(scope="module")
 def made(folder):
     """A command's folder, made once."""
-    done: dict[str, Path] = {}
+    done = {}
 
-    def run(name: str, *arguments: Any) -> Path:
+    def run(name, *arguments):
         if name not in done:
             command(folder, *arguments, "--out", name)
             done[name] = folder / name

@@ -1,7 +1,5 @@
 """The notebooks run and their asserts hold. What is committed with outputs is what the paired script says."""
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess

@@ -213,7 +213,7 @@ def test_search_has_its_model_in_one_place_of_its_program(posed):
 
     rows = str(jax.core.ShapedArray((len(posed.data.measured),), float))
 
-    def loops(jaxpr) -> int:
+    def loops(jaxpr):
         """Searches for the operating point: innermost loops whose state has numbers of each row."""
         found = 0
         for e in jaxpr.eqns:

@@ -1,7 +1,5 @@
 """Options of commands are what their configurations say: nothing of a field is stated twice."""
 
-from __future__ import annotations
-
 import re
 import sys
 from pathlib import Path
@@ -102,7 +100,7 @@ def test_solver_options_are_hidden_until_all_are_asked_for(command, parameters, 
         assert said(command, "--help") == short  # nothing is left of it
 
 
-def _file(folder: Path, text: str) -> Path:
+def _file(folder, text):
     (folder / "c.toml").write_text(text)
     return folder / "c.toml"
 

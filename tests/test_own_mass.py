@@ -27,7 +27,7 @@ from mmrjax.model import channels, paper_robots, params
 MASSES = {"6T2A": 14.2, "4W2T": 13.1}
 
 
-def table(masses=MASSES, surface=None) -> records.Runs:
+def table(masses=MASSES, surface=None):
     """Twelve runs, six of each configuration, with stated masses."""
     names = np.repeat(list(masses), 6)
     payload = np.tile([0.0, 3.0, 8.0], 4)
@@ -41,7 +41,7 @@ def table(masses=MASSES, surface=None) -> records.Runs:
     return records.Runs("runs.csv", columns | ({} if surface is None else {"surface": np.full(12, surface)}))
 
 
-def unweighed(runs: records.Runs) -> records.Runs:
+def unweighed(runs):
     """The same conditions with the robot's own mass and the payload."""
     return dataclasses.replace(runs, columns={k: v for k, v in runs.columns.items() if k != "total_mass_kg"})
 
@@ -101,7 +101,7 @@ def fits(tmp_path_factory):
     return of
 
 
-def _sd(effect) -> float:
+def _sd(effect):
     return next(p for p in params.walk_parameters(effect()) if p.spec.amplitude).spec.prior_sd(0.0)
 
 

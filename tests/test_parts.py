@@ -1,7 +1,5 @@
 """Packaged parts: every value has a source, and each sheet agrees with itself."""
 
-from __future__ import annotations
-
 import csv
 import dataclasses
 import math
@@ -40,13 +38,13 @@ NEEDED = (
 )
 
 
-def given(sheet) -> dict[str, float]:
+def given(sheet):
     """Numbers that a sheet states."""
     values = {f.name: getattr(sheet, f.name) for f in dataclasses.fields(sheet)}
     return {name: v for name, v in values.items() if isinstance(v, float) and not math.isnan(v)}
 
 
-def inconsistency(sheet: parts.MotorSheet) -> dict[str, float]:
+def inconsistency(sheet):
     """Relative departures of a sheet's values from each other, NaN where it does not state them."""
     s = sheet
     return {
@@ -58,7 +56,7 @@ def inconsistency(sheet: parts.MotorSheet) -> dict[str, float]:
     }
 
 
-def inconsistent(sheet: parts.MotorSheet) -> list[str]:
+def inconsistent(sheet):
     """What is off by more than 3 % (no load) or 1 % (the rest, rounding)."""
     return [k for k, v in inconsistency(sheet).items() if abs(v) > (0.03 if k == "no load" else 0.01)]
 
@@ -149,7 +147,7 @@ def test_parts_columns_are_those_of_the_sheets(tmp_path, monkeypatch):
     with (ROOT / "calibration/data/parts/cells.csv").open(encoding="utf-8", newline="") as lines:
         header, first, *_ = csv.reader(lines)
 
-    def write(*rows: list[str]) -> None:
+    def write(*rows):
         with (folder / "cells.csv").open("w", encoding="utf-8", newline="") as out:
             csv.writer(out).writerows(rows)
 

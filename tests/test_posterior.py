@@ -1,7 +1,5 @@
 """Posteriors: the file, draws against the linear analysis, and what is refused."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import jax.numpy as jnp
@@ -247,12 +245,11 @@ def test_posterior_of_the_loop_has_what_it_found(names, verdict):
     from synthetic import SETTLED, table
     from worlds import tables
 
-    from calibration.discovery.discover import assemble_result
     from mmrjax.effects import BY_NAME
 
     runs = table(tables.narrow(names, 10.0, seed=4) if names else tables.narrow(seed=2))
     traced = SETTLED.trace(runs)
-    found = assemble_result(traced, runs, None, SETTLED.settings, BY_NAME, lambda text: None)
+    found = dataclasses.replace(SETTLED, library=BY_NAME).result(traced, runs)
     assert (found.verdict == "none") == (verdict == "none")
     found.posterior.check(found.robot, "the loop's")
     sd = dict(zip(found.posterior.names, found.posterior.sd, strict=True))

@@ -12,7 +12,7 @@ from calibration.data.input_errors import BadConfiguration, BadData
 from mmrjax.model import paper_robots, params
 from sweeps.inputs import one_run
 from sweeps.report.words import posture_words
-from tests.commands import ends
+from tests.commands import ends, text_file
 
 
 @pytest.fixture(scope="module")
@@ -76,14 +76,16 @@ def test_angle_beyond_the_range_of_a_robots_levers_is_refused(robot):
 def test_a_table_states_levers_by_row(robot, tmp_path):
     head = "configuration,supply_voltage_V,payload_kg,slope_deg,total_mass_kg,levers_front_deg,levers_rear_deg\n"
     path = tmp_path / "runs.csv"
-    path.write_text(head + "6T2A,33,0,0,13.1,30,-8\n6T2A,24,0,5,13.1,180,180\n")
-    runs = records.read_runs(path, robot=robot, measured=False)
+    runs = records.read_runs(
+        text_file(path, head + "6T2A,33,0,0,13.1,30,-8\n6T2A,24,0,5,13.1,180,180\n"), robot=robot, measured=False
+    )
     conditions = runs.conditions(robot)
     assert conditions.levers_front_deg.tolist() == [30, 180] and conditions.levers_rear_deg.tolist() == [-8, 180]
     assert contradictions.misplaced_levers(runs, robot) is None
-    path.write_text(head + "6T2A,33,0,0,13.1,30,-8\n4W2T,24,0,5,11.5,180,180\n")
     with pytest.raises(BadData, match=r"runs.csv row 2, levers_front_deg: 4W2T has no levers"):
-        records.read_runs(path, robot=robot, measured=False)
+        records.read_runs(
+            text_file(path, head + "6T2A,33,0,0,13.1,30,-8\n4W2T,24,0,5,11.5,180,180\n"), robot=robot, measured=False
+        )
 
 
 @pytest.mark.slow

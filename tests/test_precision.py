@@ -1,7 +1,5 @@
 """Precision: public functions are double outside a trace, take JAX's own within one, and change none of its settings."""
 
-from __future__ import annotations
-
 import pickle
 import threading
 

@@ -4,17 +4,17 @@ import dataclasses
 
 import numpy as np
 import pytest
-from synthetic import SETTLED, known, table
+from synthetic import SETTLED, table
 from worlds import tables
 
 from calibration.data.input_errors import BadConfiguration
-from calibration.discovery import discover, preference
+from calibration.discovery import preference
 from calibration.discovery.loop_notes import DRAW
 from calibration.discovery.result import HeldOutAlternative, Worse
 from calibration.discovery.settings import HELD_OUT, settings_for
 from calibration.inference.fit_notes import Remark
 from calibration.inference.observers import SettledRuns
-from mmrjax.model import channels, paper_robots
+from mmrjax.model import channels
 
 NAMES = channels.USUAL
 
@@ -118,21 +118,13 @@ def test_another_preference_lists_the_choices():
 
 
 RUNS = table(tables.narrow(["series_resistance", "tension_friction"], 12.0, seed=3))
-SETTINGS = dataclasses.replace(SETTLED.settings, prefer=HELD_OUT)
-
-
-def trace():
-    """The stages of a table whose effects have look-alikes, held-out data choosing."""
-    return discover.trace(RUNS, paper_robots.nominal(), known(RUNS), SETTINGS, SETTLED.stated, SETTLED.library)
-
-
-def finished(traced):
-    return discover.assemble_result(traced, RUNS, None, SETTINGS, SETTLED.library, lambda text: None)
+#: The stages of a table whose effects have look-alikes, held-out data choosing.
+HELD = dataclasses.replace(SETTLED, settings=dataclasses.replace(SETTLED.settings, prefer=HELD_OUT))
 
 
 @pytest.fixture(scope="module")
 def traced():
-    return trace()
+    return HELD.trace(RUNS)
 
 
 @pytest.mark.nightly
@@ -158,11 +150,11 @@ def test_what_follows_is_of_the_leader_that_was_chosen(traced, monkeypatch):
             return tuple(dataclasses.replace(a, rms_sigma=0.5 if j == k else 1.0) for j, a in rows)
 
         monkeypatch.setattr(preference, "compare_alternatives", turned)
-        other = trace()
+        other = HELD.trace(RUNS)
         assert other.best.effects == traced.held_out[k].effects and other.held_out[k].leads
         assert other.members[0][0] == other.best.effects[0] and other.verdict == "class"
         assert {frozenset(m) for m in other.members} == {frozenset(m) for m in traced.members}
-        found = finished(other)
+        found = HELD.result(other, RUNS)
         assert [next(iter(e.members)) for e in found.effects] == list(other.best.effects)
         assert {e.name for e in found.robot.effects} == set(other.best.effects)
         assert any("comes first in its class by errors held out" in n for n in found.notes)

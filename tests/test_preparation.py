@@ -12,6 +12,7 @@ from calibration.discovery import discover
 from calibration.inference.calibration import calibrate
 from calibration.inference.foresight import predict_identifiability
 from mmrjax.model import paper_robots
+from tests.commands import read_table
 
 ALL = {
     "calibrate": lambda runs, robot: calibrate(runs, robot),
@@ -43,11 +44,15 @@ def test_a_campaign_sees_the_instruments_that_the_table_shows(tmp_path):
     volts = np.concatenate([np.linspace(-12, -4, 12), np.linspace(4, 12, 12)])
     current = np.round(0.3 + 0.01 * np.abs(volts), 2)
     columns = {"supply_voltage_V": volts, "total_current_A": current}
-    table = tmp_path / "table.csv"
-    table.write_text(
-        "\n".join([",".join(columns), *(",".join(map(str, row)) for row in zip(*columns.values(), strict=True))])
+    given = discover.prepare_loop(
+        read_table(
+            tmp_path,
+            "\n".join([",".join(columns), *(",".join(map(str, row)) for row in zip(*columns.values(), strict=True))]),
+            robot,
+            "table.csv",
+        ),
+        robot,
     )
-    given = discover.prepare_loop(records.read_runs(table, robot=robot), robot)
     seen = given.robot.rig.instruments[0]
     assert seen.signed is False and seen.quantum == pytest.approx(0.01)
     assert given.noise.sd.min() >= 0.01 / 12**0.5  # with the error of the step

@@ -1,7 +1,5 @@
 """Presets of loggers: names, units and signs of their columns, and the numbers that they ask for."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np
@@ -9,10 +7,11 @@ import pandas as pd
 import pytest
 from numpy.testing import assert_allclose
 
-from calibration.data import presets_file, robot_file
+from calibration.data import presets_file
 from calibration.data import runs as records
 from calibration.data.input_errors import BadConfiguration, BadData
 from calibration.data.sources import reading
+from tests.commands import read_rig, text_file
 
 RIG = """
 base = "none"
@@ -37,10 +36,7 @@ VESC = {
 
 
 def robot(tmp_path, *channels, imposed="voltage"):
-    (tmp_path / "rig.toml").write_text(
-        RIG.format(imposed=imposed, channels=", ".join(f'"{c}"' for c in channels)), encoding="utf-8"
-    )
-    return robot_file.read_robot(tmp_path / "rig.toml")
+    return read_rig(tmp_path, RIG.format(imposed=imposed, channels=", ".join(f'"{c}"' for c in channels)))
 
 
 @pytest.mark.parametrize("name", presets_file.PACKAGED)
@@ -93,9 +89,10 @@ def test_a_weakened_field_is_noted(tmp_path, along_d, noted):
 
 
 def test_simplefoc_prints_milliamperes_and_no_header(tmp_path):
-    (tmp_path / "log.txt").write_text("2.0\t2.00\t0\t150\t0\t10.0\t0.1\n3.0\t3.00\t0\t250\t0\t15.0\t0.2\n")
     found = records.read_runs(
-        tmp_path / "log.txt", robot(tmp_path, "motor_current", "motor_speed"), columns="simplefoc"
+        text_file(tmp_path / "log.txt", "2.0\t2.00\t0\t150\t0\t10.0\t0.1\n3.0\t3.00\t0\t250\t0\t15.0\t0.2\n"),
+        robot(tmp_path, "motor_current", "motor_speed"),
+        columns="simplefoc",
     )
     assert_allclose(found["motor_current_A"], np.sqrt(0.75) * np.array([0.15, 0.25]))
     assert_allclose(found["motor_speed_rpm"], np.array([10.0, 15.0]) * 30 / np.pi)
@@ -104,8 +101,11 @@ def test_simplefoc_prints_milliamperes_and_no_header(tmp_path):
 
 def test_sysid_has_a_run_for_each_test(tmp_path):
     test = [[0.02 * k, 0.5 * k, 0.1 * k, 1.0 * k] for k in range(4)]
-    (tmp_path / "log.json").write_text(json.dumps({"sysid": True, "slow-forward": test, "fast-forward": test}))
-    found = records.read_runs(tmp_path / "log.json", robot(tmp_path, "output_speed"), columns="sysid")
+    found = records.read_runs(
+        text_file(tmp_path / "log.json", json.dumps({"sysid": True, "slow-forward": test, "fast-forward": test})),
+        robot(tmp_path, "output_speed"),
+        columns="sysid",
+    )
     assert dict.fromkeys(found["run_id"].tolist()).keys() == {"slow-forward", "fast-forward"}
     assert_allclose(found["output_speed_rpm"], np.tile([0.0, 60, 120, 180], 2))
 
@@ -115,8 +115,11 @@ def test_bam_has_entries_with_a_duty(tmp_path):
         {"position": 0.1 * k, "speed": 1.0 * k, "load": 102.3 * k, "input_volts": 15.0, "timestamp": 0.01 * k}
         for k in range(4)
     ]
-    (tmp_path / "log.json").write_text(json.dumps({"mass": 0.5, "entries": entries}))
-    found = records.read_runs(tmp_path / "log.json", robot(tmp_path, "output_speed"), columns="bam,load_limit=1023")
+    found = records.read_runs(
+        text_file(tmp_path / "log.json", json.dumps({"mass": 0.5, "entries": entries})),
+        robot(tmp_path, "output_speed"),
+        columns="bam,load_limit=1023",
+    )
     assert_allclose(found["duty"], [0, 0.1, 0.2, 0.3])
     assert_allclose(found["output_speed_rpm"], np.arange(4) * 30 / np.pi)
 
@@ -260,9 +263,8 @@ def test_a_preset_that_cannot_be_is_refused(case):
 @pytest.mark.parametrize("case", FILES)
 def test_a_presets_file_that_cannot_be_is_refused(tmp_path, case):
     text, says = FILES[case]
-    (tmp_path / "mine.toml").write_text(text)
     with pytest.raises(BadConfiguration, match=says):
-        presets_file.find_preset(tmp_path / "mine.toml")
+        presets_file.find_preset(text_file(tmp_path / "mine.toml", text))
 
 
 def test_a_file_of_another_logger_is_refused_with_its_columns(tmp_path):

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from calibration.data import robot_file
 from calibration.data.input_errors import BadConfiguration
 from calibration.inference import priors
 from calibration.inference.fit_notes import Remark
 from calibration.inference.foreign import inherited_priors
 from mmrjax.effects import ALL
 from mmrjax.model import paper_robots, params
+from tests.commands import read_rig
 
 EVERY = [
     p.name
@@ -177,8 +177,7 @@ def test_stated_prior_moves_the_centre(robot):
 
 
 def read(tmp_path, text):
-    (tmp_path / "mine.toml").write_text(text)
-    return robot_file.read_robot(tmp_path / "mine.toml")
+    return read_rig(tmp_path, text, "mine.toml")
 
 
 def test_friction_left_in_from_another_robot_is_said(tmp_path):
@@ -239,7 +238,6 @@ static = 0.6
 """
     freed = []
     for mass in ('"10 ± 20 %"', "10"):
-        (tmp_path / "rig.toml").write_text(text.format(mass=mass), encoding="utf-8")
-        freed.append(priors.free_names(robot_file.read_robot(tmp_path / "rig.toml"), ["rover"]))
+        freed.append(priors.free_names(read_rig(tmp_path, text.format(mass=mass)), ["rover"]))
     assert set(freed[0]) - set(freed[1]) == {"rover.mass"}
     assert "motor.inertia" not in freed[0]  # settled runs do not show it

@@ -1,7 +1,5 @@
 """Programs that were compiled are read from folders that nobody else can change, and from no others."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Profiles from files: columns, units, modes and settings. Everything wrong is said in one sentence."""
 
-from __future__ import annotations
-
 import re
 
 import numpy as np
@@ -15,16 +13,15 @@ from mmrjax.missions.profile import MODES
 from mmrjax.model import channels, paper_robots
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.paper_tables import adhesion_ratio
+from tests.commands import text_file
 
 
 @pytest.fixture
 def read(tmp_path):
     """Read a profile from text."""
 
-    def one(text: str) -> profiles.ProfileTable:
-        path = tmp_path / "mission.csv"
-        path.write_text(text)
-        return profiles.read_profile(path)
+    def one(text):
+        return profiles.read_profile(text_file(tmp_path / "mission.csv", text))
 
     return one
 

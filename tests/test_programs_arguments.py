@@ -1,7 +1,5 @@
 """Programs on disk whose equations leave arguments out: each reads its own."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from numpy.testing import assert_array_equal

@@ -1,7 +1,5 @@
 """The public API: five lines, one run or a batch, any fidelity. Transformations go through, wrong use is said."""
 
-from __future__ import annotations
-
 import dataclasses
 import datetime
 import os
@@ -33,7 +31,7 @@ from mmrjax.model.signals import Result
 ROOT = Path(__file__).resolve().parents[1]
 
 
-def python(code: str, **environment: str) -> str:
+def python(code, **environment):
     clean = {k: v for k, v in os.environ.items() if k != "JAX_ENABLE_X64"}  # JAX is single, as its users find it
     answer = subprocess.run(
         [sys.executable, "-W", "error", "-c", code], cwd=ROOT, env={**clean, **environment}, capture_output=True,
@@ -391,7 +389,7 @@ WRONG_CALL = {
 }
 
 
-def refused(robot, conditions, **call) -> str:
+def refused(robot, conditions, **call):
     with pytest.raises(mm.UsageError) as error:
         mm.simulate(robot, conditions, **call)
     assert isinstance(error.value, ValueError)

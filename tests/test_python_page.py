@@ -1,7 +1,5 @@
 """Python code of the docs runs as it stands, with JAX in single precision as a reader has it."""
 
-from __future__ import annotations
-
 import json
 import re
 import runpy

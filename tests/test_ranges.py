@@ -9,7 +9,6 @@ from synthetic import table
 from test_loop_command import mmrjax
 from worlds import tables
 
-from calibration.data import robot_file
 from calibration.data import runs as records
 from calibration.data.input_errors import BadData
 from calibration.data.runs import Runs
@@ -17,6 +16,7 @@ from calibration.inference import ranges
 from calibration.inference.ranges import check_ranges
 from mmrjax.model import paper_robots, params
 from mmrjax.model.quantities import RPM
+from tests.commands import read_rig, read_table
 
 #: Column of a table, factor on its readings, and what is said.
 WRONG = {
@@ -70,13 +70,14 @@ loss_coulomb = 0.03
 
 @pytest.mark.parametrize("sign", [1, -1])
 def test_a_current_that_one_sign_explains_beside_a_weight_is_doubted(tmp_path, sign):
-    (tmp_path / "rig.toml").write_text(WINCH)
-    robot = robot_file.read_robot(tmp_path / "rig.toml")
+    robot = read_rig(tmp_path, WINCH)
     lifts = np.array([30.0, 120.0, 240.0, -30.0, -120.0, -240.0])
     current = sign * np.where(lifts > 0, 4.7, 3.2)
     rows = "".join(f"{n},{i}\n" for n, i in zip(lifts, current, strict=True))
-    (tmp_path / "t.csv").write_text(f"motor_speed_rpm,motor_current_A\n{rows}")
-    found = ranges.turned_signs(records.read_runs(tmp_path / "t.csv", robot=robot), robot)
+    found = ranges.turned_signs(
+        read_table(tmp_path, f"motor_speed_rpm,motor_current_A\n{rows}", robot, "t.csv"),
+        robot,
+    )
     assert [note.column for note in found] == ["motor_current_A"] * (sign < 0)
     assert all(note.turned < 1.0 < 7.0 < note.off for note in found)
 

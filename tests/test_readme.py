@@ -7,8 +7,9 @@ from pathlib import Path
 import pytest
 from typer.main import get_command
 
-from calibration.data import profiles, requirements_file, robot_file
+from calibration.data import profiles, requirements_file
 from sweeps import cli
+from tests.commands import read_rig, text_file
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -85,7 +86,5 @@ def block(page, kind):
 def test_files_of_the_how_to_pages_are_read(tmp_path):
     assert requirements_file.parse_requirements(block("howto/requirements.md", "toml"), "x.toml")
     for page in ("howto/describe-a-rig.md", "howto/turn.md"):
-        (tmp_path / "robot.toml").write_text(block(page, "toml"), encoding="utf-8")
-        assert robot_file.read_robot(tmp_path / "robot.toml").sides == 2
-    (tmp_path / "mission.csv").write_text(block("howto/mission.md", "csv"), encoding="utf-8")
-    assert profiles.read_profile(tmp_path / "mission.csv").cycles == 40
+        assert read_rig(tmp_path, block(page, "toml"), "robot.toml").sides == 2
+    assert profiles.read_profile(text_file(tmp_path / "mission.csv", block("howto/mission.md", "csv"))).cycles == 40

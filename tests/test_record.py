@@ -4,8 +4,6 @@ A result that is corrected on purpose is changed there too, with a line in CHANG
 renews what the loop gives (all of its tables, or those that are named), and nothing else.
 """
 
-from __future__ import annotations
-
 import csv
 import json
 import sys
@@ -17,7 +15,6 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from calibration.data import runs as tables
 from calibration.discovery.discover import discover
-from calibration.discovery.result import DiscoveryResult
 from calibration.inference import priors
 from mmrjax import fidelities
 from mmrjax.model.conditions import Conditions
@@ -30,7 +27,7 @@ EQUAL = {"steady": 1e-9, "drive": 1e-9, "track": 1e-6}
 NUMBERS = ("total_current", "motor_speed", "speed", "slip", "traction", "power_gear")
 
 
-def _table8() -> dict[str, np.ndarray]:
+def _table8():
     with (RECORD / "table8.csv").open(encoding="utf-8") as stream:
         rows = list(csv.DictReader(stream))
     words = {"configuration": np.array([r["configuration"] for r in rows])}
@@ -54,7 +51,7 @@ def test_table8_is_as_recorded(name):
         )
 
 
-def _source(name: str) -> str:
+def _source(name):
     return name if name == "measured" else str(RECORD / f"{name}.csv")
 
 
@@ -62,12 +59,12 @@ SLOW = pytest.mark.slow
 TABLES = [pytest.param(n, marks=SLOW) for n in RESULTS["loop"]]
 
 
-def _found(name: str) -> DiscoveryResult:
+def _found(name):
     stated = {} if name == "measured" else priors.parse_priors(RESULTS["priors"])
     return discover(tables.read_runs(_source(name)), nominal(), stated=stated)
 
 
-def recorded(found: DiscoveryResult) -> dict:
+def recorded(found):
     """What the record keeps of a result."""
     held = next(iter(found.errors_held_out.values()))[1]
     remains = found.to_json()["remains"]

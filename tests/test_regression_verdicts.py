@@ -1,7 +1,5 @@
 """Answers of the regression alone, on generated logs of one motor with six faults. Plain NumPy laws, no simulation."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

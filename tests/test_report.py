@@ -1,8 +1,6 @@
 # ruff: noqa: E402 (double precision is set before anything is imported)
 """The reports of runs, sweeps and comparisons: they show these, offline, true to the numbers, whatever the grid."""
 
-from __future__ import annotations
-
 import dataclasses
 import re
 

@@ -1,8 +1,6 @@
 # ruff: noqa: E402 (double precision is set before anything is imported)
 """The paper remade by `mmrjax reproduce`: complete, offline, true to the paper's tables and to the model's numbers."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import sys

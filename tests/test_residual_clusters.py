@@ -22,6 +22,7 @@ from calibration.inference.residual_clusters import LEVEL, residual_clusters
 from mmrjax.fidelities.steady import steady_batch
 from mmrjax.model import paper_robots
 from sweeps.report import calibration_report, page_renderer
+from tests.commands import text_file
 
 SCHEMAS = Path(__file__).parents[1] / "docs" / "schemas"
 ROWS = 90
@@ -313,8 +314,7 @@ def test_columns_without_a_role_keep_their_cells(tmp_path):
         "configuration,supply_voltage_V,total_mass_kg,payload_kg,slope_deg,speed_mm_s,idle_wheel,who,note",
         "6T2A,12,12,0,0,300,1,Ann,", "6T2A,18,12,0,0,450,,Bo,", "6T2A,24,12,0,0,600,3,Ann,",
     ]  # fmt: skip
-    (tmp_path / "runs.csv").write_text("\n".join(lines), encoding="utf-8")
-    runs = records.read_runs(tmp_path / "runs.csv")
+    runs = records.read_runs(text_file(tmp_path / "runs.csv", "\n".join(lines)))
     assert runs.unknown == ("idle_wheel", "who", "note") and not set(runs.unknown) & set(runs.columns)
     np.testing.assert_array_equal(runs.extras["idle_wheel"], [1.0, np.nan, 3.0])
     assert runs.extras["who"].tolist() == ["Ann", "Bo", "Ann"] and np.isnan(runs.extras["note"]).all()

@@ -1,7 +1,5 @@
 """The command `resonance`: what it finds on 6T2A, what it leaves, and what it refuses."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 from contextlib import contextmanager

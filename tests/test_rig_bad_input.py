@@ -3,11 +3,12 @@
 import numpy as np
 import pytest
 
-from calibration.data import robot_file, stated
 from calibration.data import runs as records
+from calibration.data import stated
 from calibration.data.input_errors import BadConfiguration, BadData
 from calibration.inference import bases, observers
 from sweeps.commands import rig_check
+from tests.commands import read_rig, text_file
 
 BRAKE = """
 base = "none"
@@ -28,9 +29,7 @@ WINCH = BRAKE + "torque_constant = 0.2\n"
 
 
 def rig_of(tmp_path, text):
-    path = tmp_path / "rig.toml"
-    path.write_text(text, encoding="utf-8")
-    return robot_file.read_robot(path)
+    return read_rig(tmp_path, text)
 
 
 def table(tmp_path, *rows, header="motor_speed_rpm,total_current_A"):
@@ -113,8 +112,10 @@ def test_rig_check_does_not_call_runs_backward_unsettled(tmp_path, capsys):
 
 
 def test_rig_check_says_what_a_file_without_base_takes(tmp_path, capsys):
-    (tmp_path / "rig.toml").write_text("[motor]\nresistance = 0.6\n")
-    assert rig_check.check_rig_file(tmp_path / "rig.toml", None, (), False) == 0
+    assert (
+        rig_check.check_rig_file(text_file(tmp_path / "rig.toml", "[motor]\nresistance = 0.6\n"), None, (), False)
+        == 0
+    )
     assert 'is its base\'s, a packaged robot (base = "none" starts from nothing)' in " ".join(
         capsys.readouterr().out.split()
     )

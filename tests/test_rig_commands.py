@@ -1,7 +1,5 @@
 """The front door of rigs: every command from a rig's file alone, and not a word of another robot in what it leaves."""
 
-from __future__ import annotations
-
 import json
 import re
 
@@ -250,7 +248,7 @@ def test_levels_are_thirds_of_the_limit_to_two_digits(tmp_path):
     robot = robot_file.change_robot(
         robot_file.read_robot(of_kind(tmp_path, "bench", speed=True)), {"motor.speed_limit": 500.0}, "x"
     )
-    notes: list[str] = []
+    notes = []
     top = 500.0 / quantities.RPM
     found = imposed.imposed_levels(robot, "--motor-speeds", notes)
     assert all(0.9 * share * top < level <= share * top for level, share in zip(found, imposed.SHARES, strict=True))

@@ -25,7 +25,7 @@ from mmrjax.model import balances, channels, params, quantities
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.rig import Begin, Begins, Rig
 from mmrjax.model.signals import State
-from tests.commands import ends
+from tests.commands import ends, read_table, text_file
 
 DRIVE = """
 schema = "mmrjax.robot/2"
@@ -69,9 +69,7 @@ def written(tmp_path, robot, columns, sd, readings=0.0):
     names = [*columns, *(n for c in robot.channels for n in (c.column, c.sd_column))]
     cells = [*columns.values(), *(x for k in range(len(sd)) for x in (readings[:, k], np.full(rows, sd[k])))]
     lines = [",".join(names), *(",".join(str(c[k]) for c in cells) for k in range(rows))]
-    path = tmp_path / "table.csv"
-    path.write_text("\n".join(lines))
-    return records.read_runs(path, robot=robot)
+    return read_table(tmp_path, "\n".join(lines), robot, "table.csv")
 
 
 def history(tmp_path, robot, truth, columns, sd, seed):
@@ -192,8 +190,7 @@ def test_beginnings_are_measured_by_the_first_samples(tmp_path):
         table = tmp_path / "table.csv"
         lines = ["time_s,supply_voltage_V,output_speed_rpm,output_angle_deg"]
         lines += [f"{t},6,{60 + 100 * t},{30 + 360 * t + 300 * t**2}" for t in np.arange(0, 0.2, 0.01)]
-        table.write_text("\n".join(lines))
-        runs = records.read_runs(table, robot=robot)
+        runs = records.read_runs(text_file(table, "\n".join(lines)), robot=robot)
         kind = observers.observer_kind(runs)
         known = noise.noise_from_table(runs, kind.sizes(runs), "output_speed=1rpm,output_angle=1deg")
         begun = kind.with_initial_states(robot, runs, known)
@@ -369,9 +366,7 @@ def test_steps_follow_the_rows_of_a_log_whose_input_changes_at_each(tmp_path, mo
     t = np.arange(0, 1, 0.02)
     volts = 12 * np.sin(5 * t) + 6 * np.sign(np.sin(11 * t)) + 0.5 * np.random.default_rng(1).standard_normal(50)
     rows = [f"{a:.2f},{b:.4f},0,0" for a, b in zip(t, volts, strict=True)]
-    table = tmp_path / "log.csv"
-    table.write_text("time_s,supply_voltage_V,total_current_A,motor_speed_rpm\n" + "\n".join(rows))
-    runs = records.read_runs(table, robot=robot)
+    runs = read_table(tmp_path, "time_s,supply_voltage_V,total_current_A,motor_speed_rpm\n" + "\n".join(rows), robot)
     made = observers.observer_kind(runs).of(runs, robot)
     shown = np.asarray(made(robot).reading)
     monkeypatch.setattr(histories_room, "CHANGE", (1e-6, 0.1))
@@ -408,8 +403,7 @@ def test_steps_are_short_where_a_drive_passes_through_rest(tmp_path, imposed):
     speed = 2000 * np.clip((1.5 - t) / 0.3, -1, 1) * np.minimum(t / 0.2, 1)  # through rest at 1.5 s
     angle = np.cumsum(speed) * 0.02 * 6
     rows = [f"{a:.2f},{8 if a < 1.2 else -8},{s:.1f},{x:.2f}" for a, s, x in zip(t, speed, angle, strict=True)]
-    (tmp_path / "log.csv").write_text(f"time_s,{column},motor_speed_rpm,output_angle_deg\n" + "\n".join(rows))
-    runs = records.read_runs(tmp_path / "log.csv", robot=robot)
+    runs = read_table(tmp_path, f"time_s,{column},motor_speed_rpm,output_angle_deg\n" + "\n".join(rows), robot)
 
     def longest(runs, begin, end, robot=robot):
         times = np.asarray(Histories.of(runs, robot).times)[0]
@@ -434,10 +428,11 @@ def test_a_voltage_on_lines_is_the_mean_of_each_step_and_no_jump(tmp_path):
     text = DRIVE.format(imposed="voltage", channels='"motor_speed"', start="rest") + BENCH
     (tmp_path / "rig.toml").write_text(text.replace('start = "rest"', 'start = "rest"\nbetween_rows = "linear"'))
     robot = robot_file.load_robot(str(tmp_path / "rig.toml"))
-    (tmp_path / "log.csv").write_text(
-        "time_s,supply_voltage_V,duty,motor_speed_rpm\n0,2,1,0\n0.1,12,1,0\n0.3,4,0.5,0\n0.4,4,0.5,0\n"
+    runs = read_table(
+        tmp_path,
+        "time_s,supply_voltage_V,duty,motor_speed_rpm\n0,2,1,0\n0.1,12,1,0\n0.3,4,0.5,0\n0.4,4,0.5,0\n",
+        robot,
     )
-    runs = records.read_runs(tmp_path / "log.csv", robot=robot)
     made = observers.observer_kind(runs).of(runs, robot)
     volts, times = np.asarray(made.conditions.voltage)[0], np.asarray(made.times)[0]
     assert np.sum(volts[:-1] * np.diff(times)) == pytest.approx(0.1 * 7 + 0.2 * 8 + 0.1 * 4)
@@ -467,8 +462,7 @@ def test_what_is_imposed_is_held_or_goes_on_lines_between_rows(tmp_path):
         t = np.arange(0, 0.8 + 1e-9, step)
         volts = np.interp(t, [0, 0.3, 0.5, 0.8], [2.0, 14.0, 14.0, -5.0])
         rows = [f"{a:.4f},{b:.6f},0" for a, b in zip(t, volts, strict=True)]
-        (tmp_path / "log.csv").write_text("time_s,supply_voltage_V,motor_speed_rpm\n" + "\n".join(rows))
-        runs = records.read_runs(tmp_path / "log.csv", robot=robot)
+        runs = read_table(tmp_path, "time_s,supply_voltage_V,motor_speed_rpm\n" + "\n".join(rows), robot)
         made = observers.observer_kind(runs).of(runs, robot)
         reading = np.asarray(made(robot).reading)[:, 0]
         return reading[:: round(0.02 / step)]
@@ -524,9 +518,12 @@ THROUGH_REST = ("bench.inertia", "bench.loss_coulomb", "motor.friction_coulomb")
 @pytest.fixture(scope="module")
 def through_rest(tmp_path_factory):
     """Derivatives of the speeds of a run by shares of its parameters, and differences of steps without end."""
-    path = tmp_path_factory.mktemp("rig") / "robot.toml"
-    path.write_text(DRIVE.format(imposed="voltage", channels='"motor_current", "motor_speed"', start="rest") + BENCH)
-    robot = robot_file.read_robot(path)
+    robot = robot_file.read_robot(
+        text_file(
+            tmp_path_factory.mktemp("rig") / "robot.toml",
+            DRIVE.format(imposed="voltage", channels='"motor_current", "motor_speed"', start="rest") + BENCH,
+        )
+    )
     every = np.arange(0, 1.2, 0.02)
     values = {p.name: float(p.value) for p in params.walk_parameters(robot)}
 

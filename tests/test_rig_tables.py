@@ -27,6 +27,7 @@ from mmrjax.model.signals import STALLED
 from mmrjax.model.track_friction import Track
 from sweeps import config as configuration
 from sweeps.points import run
+from tests.commands import read_rig, text_file
 
 DRIVE = {
     "motor.resistance": 2.0,
@@ -55,9 +56,7 @@ def vehicle(mass=10.0, **stated):
 
 
 def read(tmp_path, text, robot, **options):
-    path = tmp_path / "runs.csv"
-    path.write_text(text, encoding="utf-8")
-    return records.read_runs(path, robot=robot, **options)
+    return records.read_runs(text_file(tmp_path / "runs.csv", text), robot=robot, **options)
 
 
 def measured(tmp_path, robot, conditions, columns, true=None, *, share=0.01, seed=0):
@@ -602,8 +601,7 @@ def test_an_instrument_left_free_is_what_its_table_shows(tmp_path):
     with pytest.raises(BadData, match="negative backward; or signed = false"):
         records.read_runs(path, robot=bench())
     signed = re.sub(r"(-\d+),0", r"\1,-0", path.read_text(encoding="utf-8"))
-    path.write_text(signed, encoding="utf-8")
-    assert records.read_runs(path, robot=free).layout.instruments[0].signed is True
+    assert records.read_runs(text_file(path, signed), robot=free).layout.instruments[0].signed is True
 
 
 @pytest.mark.slow
@@ -627,8 +625,7 @@ loss_viscous = "0.002 ± 50 %"
 signed = "free"
 quantum = "free"
 """
-    (tmp_path / "rig.toml").write_text(text, encoding="utf-8")
-    robot = robot_file.read_robot(tmp_path / "rig.toml")
+    robot = read_rig(tmp_path, text)
     assert robot.rig.instruments == (Instrument("total_current", None, None),)
     robot_file.write_robot(robot, tmp_path / "again.toml", note="of a test")
     assert robot_file.read_robot(tmp_path / "again.toml").rig.instruments == robot.rig.instruments
@@ -639,8 +636,15 @@ quantum = "free"
     read = np.round(np.abs(np.asarray(truth)) / 0.004) * 0.004
     path = tmp_path / "t.csv"
     rows = "".join(f"{n:g},{i:.3f},0.002\n" for n, i in zip(speeds, read, strict=True))
-    path.write_text("motor_speed_rpm,total_current_A,total_current_sd_A\n" + rows, encoding="utf-8")
-    found = calibrate(records.read_runs(path, robot=robot), robot, starts=2, profiles=False, blocks=False)
+    found = calibrate(
+        records.read_runs(
+            text_file(path, "motor_speed_rpm,total_current_A,total_current_sd_A\n" + rows), robot=robot
+        ),
+        robot,
+        starts=2,
+        profiles=False,
+        blocks=False,
+    )
     (instrument,) = found.robot.rig.instruments
     assert instrument.signed is False and instrument.quantum == pytest.approx(0.004, rel=1e-6)
     loss = found.parameters["brake.loss_coulomb"]
@@ -683,16 +687,14 @@ def motor_table(resistance, constant, friction, voltages):
     ((4.1, 0.83, 0.05), [150, 220, 310, -310]), ((0.14, 0.0021, 2e-4), [2, 6, 11.6]),
 ])  # fmt: skip
 def test_motors_far_from_the_packaged_one_are_read_without_a_doubt(tmp_path, numbers, voltages):
-    (tmp_path / "rig.toml").write_text(MOTOR.format(resistance=numbers[0], constant=numbers[1], friction=numbers[2]))
-    rig = robot_file.read_robot(tmp_path / "rig.toml")
+    rig = read_rig(tmp_path, MOTOR.format(resistance=numbers[0], constant=numbers[1], friction=numbers[2]))
     runs = records.read_runs(motor_table(*numbers, voltages), rig)
     assert len(runs) == len(voltages) and rig_facts.doubtful_speed(runs, rig) == ""
 
 
 @pytest.mark.parametrize(("column", "factor"), [("motor_speed_rpm", 60.0), ("supply_voltage_V", 1000.0)])
 def test_a_speed_that_the_constant_cannot_give_is_doubted_with_its_number(tmp_path, column, factor):
-    (tmp_path / "rig.toml").write_text(MOTOR.format(resistance=0.4, constant=0.05, friction=0.01))
-    rig = robot_file.read_robot(tmp_path / "rig.toml")
+    rig = read_rig(tmp_path, MOTOR.format(resistance=0.4, constant=0.05, friction=0.01))
     table = motor_table(0.4, 0.05, 0.01, [6, 9])
     runs = records.read_runs({**table, column: factor * table[column]}, rig)
     reached = factor * 6 / 0.05 * 30 / np.pi if column == "supply_voltage_V" else 6 / 0.05 * 30 / np.pi
@@ -700,8 +702,7 @@ def test_a_speed_that_the_constant_cannot_give_is_doubted_with_its_number(tmp_pa
 
 
 def test_an_offset_of_an_ammeter_is_no_lost_sign(tmp_path):
-    (tmp_path / "rig.toml").write_text(MOTOR.format(resistance=0.4, constant=0.05, friction=0.01))
-    rig = robot_file.read_robot(tmp_path / "rig.toml")
+    rig = read_rig(tmp_path, MOTOR.format(resistance=0.4, constant=0.05, friction=0.01))
     table = motor_table(0.4, 0.05, 0.01, [*range(3, 25, 3), *range(-3, -25, -3)])
     drag = table["motor_current_A"] + 4e-5 * table["motor_speed_rpm"]  # churning
     assert len(records.read_runs({**table, "motor_current_A": drag + 0.4}, rig)) == 16

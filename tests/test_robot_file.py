@@ -7,6 +7,7 @@ from calibration.data import robot_file
 from calibration.data.input_errors import BadConfiguration
 from mmrjax import effects
 from mmrjax.model import paper_robots, params
+from tests.commands import read_rig, text_file
 
 
 def values(robot):
@@ -22,9 +23,16 @@ def test_robot_written_and_read_is_the_same(tmp_path, name):
 
 
 def test_file_states_only_what_differs(tmp_path):
-    path = tmp_path / "mine.toml"
-    path.write_text('base = "sm1"\n[motor]\nresistance = 0.9\n[effects.series_resistance]\namplitude = 0.3\n')
-    robot, base = values(robot_file.read_robot(path)), values(paper_robots.sm1())
+    robot, base = (
+        values(
+            read_rig(
+                tmp_path,
+                'base = "sm1"\n[motor]\nresistance = 0.9\n[effects.series_resistance]\namplitude = 0.3\n',
+                "mine.toml",
+            )
+        ),
+        values(paper_robots.sm1()),
+    )
     assert robot.pop("motor.resistance") == 0.9 and robot.pop("effects.series_resistance.amplitude") == 0.3
     assert base.pop("motor.resistance") == 0.611 and robot == base
 
@@ -67,8 +75,7 @@ dynamic = 0.5
 
 @pytest.mark.parametrize("text", [ROVER, CRAWLER], ids=["rover", "crawler"])
 def test_a_robot_of_another_build_is_written_and_read_the_same(tmp_path, text):
-    (tmp_path / "mine.toml").write_text(text)
-    robot = robot_file.read_robot(tmp_path / "mine.toml")
+    robot = read_rig(tmp_path, text, "mine.toml")
     robot_file.write_robot(robot, tmp_path / "again.toml")
     again = robot_file.read_robot(tmp_path / "again.toml")
     assert eqx.tree_equal(robot, again)
@@ -81,8 +88,7 @@ def test_a_robot_of_another_build_is_written_and_read_the_same(tmp_path, text):
 
 
 def test_like_starts_from_that_configuration(tmp_path):
-    (tmp_path / "mine.toml").write_text(ROVER)
-    robot, base = robot_file.read_robot(tmp_path / "mine.toml"), paper_robots.nominal()
+    robot, base = read_rig(tmp_path, ROVER, "mine.toml"), paper_robots.nominal()
     assert robot.configurations.names == ("rover", "6T2A") and robot.sides == 4 and robot.battery.cells == 4
     rover, wheeled = robot.configurations["rover"], base.configurations["4W2T"]
     assert float(rover.mass) == 6.0 and float(rover.ground.friction.static) == 0.6
@@ -91,8 +97,7 @@ def test_like_starts_from_that_configuration(tmp_path):
 
 
 def test_movers_start_from_the_defaults_of_the_fields(tmp_path):
-    (tmp_path / "mine.toml").write_text(CRAWLER)
-    crawler = robot_file.read_robot(tmp_path / "mine.toml").configurations["crawler-2"]
+    crawler = read_rig(tmp_path, CRAWLER, "mine.toml").configurations["crawler-2"]
     assert float(crawler.on_tracks) == 1.0
     assert float(crawler.track.guide_friction) == 0.20 and float(crawler.ground.friction.speed_static) == 0.02
 
@@ -203,10 +208,9 @@ def test_unknown_name_lists_the_robots():
 
 
 def test_ratings_are_stated_written_and_checked(tmp_path):
-    (tmp_path / "mine.toml").write_text(
-        "[motor]\nvoltage_limit = 14.4\nspeed_limit = 900.0\n[gearbox]\nspeed_limit = 600\n"
+    robot = read_rig(
+        tmp_path, "[motor]\nvoltage_limit = 14.4\nspeed_limit = 900.0\n[gearbox]\nspeed_limit = 600\n", "mine.toml"
     )
-    robot = robot_file.read_robot(tmp_path / "mine.toml")
     assert (robot.motor.voltage_limit, robot.motor.speed_limit, robot.gearbox.speed_limit) == (14.4, 900.0, 600.0)
     assert paper_robots.nominal().motor.voltage_limit is None  # the bench went to 33 V with a motor of 24 V
     robot_file.write_robot(robot, tmp_path / "again.toml")
@@ -223,12 +227,14 @@ def test_ratings_are_stated_written_and_checked(tmp_path):
 
 def test_robot_file_knows_what_it_states(tmp_path):
     path = tmp_path / "rig.toml"
-    path.write_text(
-        'base = "none"\nchannels = ["total_current"]\n[motor]\nresistance = "1.0 ± 5 %"\ntorque_constant = 0.05\n'
-        "[gearbox]\nratio = 10\nefficiency_load = 0.8  # example: yours\n"
-        '[screw]\nload = "linear"\nmass_kg = 2\nlead_mm = 5\n[twice]\nlike = "screw"\nmass_kg = 4\n'
+    found = robot_file.parse_robot_file(
+        text_file(
+            path,
+            'base = "none"\nchannels = ["total_current"]\n[motor]\nresistance = "1.0 ± 5 %"\ntorque_constant = 0.05\n'
+            "[gearbox]\nratio = 10\nefficiency_load = 0.8  # example: yours\n"
+            '[screw]\nload = "linear"\nmass_kg = 2\nlead_mm = 5\n[twice]\nlike = "screw"\nmass_kg = 4\n',
+        )
     )
-    found = robot_file.parse_robot_file(path)
     assert found.name == "rig.toml" and found.text == path.read_text()
     assert found.linear == {"screw", "twice"}  # what another table states of it is stated
     assert {"motor.resistance", "gearbox.ratio", "screw.inertia", "twice.inertia"} <= found.stated
@@ -247,22 +253,19 @@ def test_a_stated_curve_is_that_of_the_capacity_beside_it(tmp_path):
         ("capacity = 18000.0", 7920.0),
         ("slope = -1e-4", 7920.0),
     ):
-        path.write_text(f"[battery]\n{text}\n")
-        battery = robot_file.read_robot(path).battery
+        battery = robot_file.read_robot(text_file(path, f"[battery]\n{text}\n")).battery
         assert battery.capacity_curve == of
         robot_file.write_robot(robot_file.read_robot(path), again)
         assert robot_file.read_robot(again).battery == battery
         start = 'base = "none"\nchannels = ["total_current"]\n[motor]\nresistance = 1.0\ntorque_constant = 0.05\n'
         load = '[gearbox]\nratio = 10\nefficiency_load = 0.8\n[arm]\nload = "shaft"\ninertia = 1e-3\nloss_coulomb = 0.01\n'
-        path.write_text(f"{start}{load}[battery]\n{text}\n")
-        robot_file.write_robot(robot_file.read_robot(path), again)
+        robot_file.write_robot(robot_file.read_robot(text_file(path, f"{start}{load}[battery]\n{text}\n")), again)
         assert robot_file.read_robot(again).battery == robot_file.read_robot(path).battery
         assert robot_file.read_robot(again).battery.capacity_curve == of
 
 
 def test_a_curve_that_turns_up_is_said_where_a_file_states_it(tmp_path):
-    (tmp_path / "up.toml").write_text("[battery]\ncurvature = 1e-8\n")
-    robot_file.read_robot(tmp_path / "up.toml", notes=(notes := []))
+    read_rig(tmp_path, "[battery]\ncurvature = 1e-8\n", "up.toml", notes=(notes := []))
     assert notes == [
         "up.toml, battery.curvature: with this curvature and slope a cell's voltage rises again once 87.7 % of its "
         "capacity is taken (capacity_curve: 7920 C)"
@@ -274,9 +277,8 @@ def test_a_curve_that_turns_up_is_said_where_a_file_states_it(tmp_path):
 
 
 def test_all_that_is_wrong_with_a_file_is_said_at_once(tmp_path):
-    (tmp_path / "bad.toml").write_text("[motor]\nresistance = -1\nresistence = 0.6\n[gearbox]\nratio = 'x'\n")
     with pytest.raises(BadConfiguration) as error:
-        robot_file.read_robot(tmp_path / "bad.toml")
+        read_rig(tmp_path, "[motor]\nresistance = -1\nresistence = 0.6\n[gearbox]\nratio = 'x'\n", "bad.toml")
     said = str(error.value)
     assert said.startswith("bad.toml, motor.resistance: got -1; expected 0.001 to 1000 ohm")
     assert "; also motor.resistence: no such parameter" in said and "; also gearbox.ratio: got 'x'; expected" in said

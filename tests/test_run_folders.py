@@ -1,7 +1,5 @@
 """Run folders: nothing that is not ours is deleted, one process at a time works on one, others' work is left alone."""
 
-from __future__ import annotations
-
 import json
 import os
 import resource

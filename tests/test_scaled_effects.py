@@ -1,7 +1,5 @@
 """Robots with effects of a rig's size are read again as they were written, whatever the effect and the rig."""
 
-from __future__ import annotations
-
 import dataclasses
 import pickle
 
@@ -21,6 +19,7 @@ from mmrjax.effects.scaled import amplitude_of, scaled_effect, shape_of
 from mmrjax.model import params
 from mmrjax.model.quantities import RPM
 from sweeps.commands import rig_new
+from tests.commands import read_rig, read_table
 
 #: Of rigs: kind and what is imposed; the largest and the smallest that a few draws give.
 RIGS = [("bench", "voltage"), ("linear", "motor_speed"), ("wheeled", "voltage")]
@@ -174,21 +173,19 @@ def test_one_class_for_the_same_factors():
 
 @pytest.mark.parametrize("stated", ["3", "[1, 2]", "[1, 2, 0]", '[1, 2, "x"]'])
 def test_factors_are_three_positive_numbers(tmp_path, stated):
-    (tmp_path / "robot.toml").write_text(f"[effects.churning]\nscaled = {stated}\namplitude = 0.0\n")
     with pytest.raises(
         BadConfiguration, match=r"effects\.churning\.scaled: got .* expected three numbers more than 0"
     ):
-        robot_file.read_robot(tmp_path / "robot.toml")
+        read_rig(tmp_path, f"[effects.churning]\nscaled = {stated}\namplitude = 0.0\n", "robot.toml")
 
 
 @pytest.mark.slow
 def test_friction_along_the_travel_is_sized_by_the_travel_and_looked_for_where_a_channel_shows_it(tmp_path):
     robot = servo(tmp_path)
     rows = ["0.4,0,0", "0.7,1.5,360", "1,3.0,720", "-0.9,4.0,-720"]
-    (tmp_path / "log.csv").write_text(
-        "supply_voltage_V,duty,time_s,output_angle_deg\n" + "\n".join(f"6,{r}" for r in rows) + "\n"
+    runs = read_table(
+        tmp_path, "supply_voltage_V,duty,time_s,output_angle_deg\n" + "\n".join(f"6,{r}" for r in rows) + "\n", robot
     )
-    runs = records.read_runs(tmp_path / "log.csv", robot=robot)
     turned = scales.output_rotation(runs, robot)
     assert turned == pytest.approx(2 * np.pi * np.sqrt((1 + 4 + 4) / 3))
     kinds = [
@@ -207,8 +204,7 @@ def test_friction_along_the_travel_is_sized_by_the_travel_and_looked_for_where_a
 
 def servo(folder):
     """The robot of the template of a servo."""
-    (folder / "rig.toml").write_text(rig_new.rig_template("servo"), encoding="utf-8")
-    return robot_file.read_robot(folder / "rig.toml")
+    return read_rig(folder, rig_new.rig_template("servo"))
 
 
 METERED = """
@@ -231,8 +227,7 @@ loss_viscous = "0.001 ± 1 %"
 
 def metered(tmp_path, off):
     """A bench whose torque meter reads so much high, and its table."""
-    (tmp_path / "rig.toml").write_text(METERED)
-    robot = robot_file.read_robot(tmp_path / "rig.toml")
+    robot = read_rig(tmp_path, METERED)
     volts = np.repeat(np.linspace(3.0, 24.0, 10), 2)
     seen = mm.simulate(robot, mm.Conditions(voltage=volts))
     noise = 1 + 0.003 * np.random.default_rng(1).standard_normal((3, len(volts)))
@@ -245,8 +240,7 @@ def metered(tmp_path, off):
     heads = [name for c in columns for name in (c, f"{c.rpartition('_')[0]}_sd_{c.rpartition('_')[2]}")]
     rows = [[v, *(y for x in xs for y in (x, 0.003 * x))] for v, xs in zip(volts, read.T, strict=True)]
     lines = [",".join(("supply_voltage_V", *heads)), *(",".join(f"{x:.6g}" for x in row) for row in rows)]
-    (tmp_path / "runs.csv").write_text("\n".join(lines) + "\n")
-    return records.read_runs(tmp_path / "runs.csv", robot=robot), robot
+    return read_table(tmp_path, "\n".join(lines) + "\n", robot, "runs.csv"), robot
 
 
 def test_the_loop_looks_for_an_error_of_every_instrument(tmp_path):
@@ -264,8 +258,7 @@ def test_the_loop_looks_for_an_error_of_every_instrument(tmp_path):
 def test_a_current_sensors_offset_is_named(tmp_path, signed):
     """Of a bench driven both ways. Where the sensor shows magnitudes a friction may look alike."""
     shown = f"[instruments.motor_current]\nsigned = {str(signed).lower()}\n"
-    (tmp_path / "rig.toml").write_text(METERED.replace(', "output_torque"', ', "motor_current"') + shown)
-    robot = robot_file.read_robot(tmp_path / "rig.toml")
+    robot = read_rig(tmp_path, METERED.replace(', "output_torque"', ', "motor_current"') + shown)
     off = effects.OF_CHANNELS["motor_current_offset"](amplitude=0.02)
     volts = np.linspace(4.0, 24.0, 8)[:, None] * [1.0, -1.0]
     seen = mm.simulate(dataclasses.replace(robot, effects=(off,)), mm.Conditions(voltage=volts.ravel()))

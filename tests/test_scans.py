@@ -133,7 +133,7 @@ def test_searches_that_converged_elsewhere_are_counted():
 
 def test_a_fit_that_may_be_proposed_goes_on_until_it_is_an_optimum(monkeypatch):
     """A fit that has used up its steps and lies within a class's margin of the lowest one goes on from its end."""
-    calls: list[np.ndarray] = []
+    calls = []
 
     def ended(evaluate, starts, *_, **__):
         calls.append(np.asarray(starts))

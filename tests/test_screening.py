@@ -1,7 +1,5 @@
 """Sets of effects are ranked by regression where runs take long, and simulation confirms the first of them."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 from types import SimpleNamespace

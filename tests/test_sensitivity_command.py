@@ -1,7 +1,5 @@
 """The command `sensitivity` and its study: against finite differences and the model itself, and what is refused."""
 
-from __future__ import annotations
-
 import json
 import re
 import tomllib

@@ -1,7 +1,5 @@
 """Indices against what is known exactly: Ishigami, linear models, correlated normals, brute force."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np

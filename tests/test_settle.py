@@ -1,7 +1,5 @@
 """Settled runs out of logs: they are those of the levels that were held, with sds that hold. What cannot be is said."""
 
-from __future__ import annotations
-
 import contextlib
 import csv
 import json
@@ -24,7 +22,7 @@ from calibration.inference import noise as noises
 from calibration.inference.foresight import Foresight
 from calibration.words import settle_words as words
 from sweeps.commands import rig_check
-from tests.commands import ends
+from tests.commands import ends, read_rig
 
 
 def made(tmp_path, seed=1, kind="bench", imposed="voltage", **options):
@@ -379,8 +377,7 @@ def test_signs_and_units_that_are_right_are_not_doubted(tmp_path):
     assert len(settled(tmp_path, robot, rolling=rolling_readings(robot)).kept) == 4
     text = (tmp_path / "rig.toml").read_text() + "[instruments.total_current]\nsigned = false\n"
     bench(tmp_path, both_ways(total_current_A=np.abs), '"total_current", "motor_speed", "output_angle"')
-    (tmp_path / "rig.toml").write_text(text)
-    robot = robot_file.read_robot(tmp_path / "rig.toml")
+    robot = read_rig(tmp_path, text)
     assert len(settled(tmp_path, robot, rolling=rolling_readings(robot)).kept) == 4
 
 

@@ -1,7 +1,5 @@
 """`simulate --profile`, `mm.simulate(profile=...)` and sweeps over a profile: what comes out, and what is refused."""
 
-from __future__ import annotations
-
 import csv
 import json
 import re
@@ -44,7 +42,7 @@ def mmrjax(tmp_path_factory):
     """Run the command line in a folder of its own."""
     folder = tmp_path_factory.mktemp("missions")
 
-    def run(capsys, monkeypatch, *words: str) -> tuple[int, str, str]:
+    def run(capsys, monkeypatch, *words):
         monkeypatch.chdir(folder)
         monkeypatch.setattr("sys.argv", ["mmrjax", *words])
         with pytest.raises(SystemExit) as ended:
@@ -57,11 +55,11 @@ def mmrjax(tmp_path_factory):
     return run
 
 
-def rows(path) -> dict[str, np.ndarray]:
+def rows(path):
     with path.open() as stream:
         table = list(csv.DictReader(stream))
 
-    def cell(text: str):
+    def cell(text):
         try:
             return float(text) if text else np.nan
         except ValueError:

@@ -1,7 +1,5 @@
 """Sizing: what a search finds meets the requirements, no grid is better, what binds, and what is refused."""
 
-from __future__ import annotations
-
 import itertools
 import json
 import math
@@ -74,7 +72,7 @@ def space(robot, asked, found):
 def meets(f, asked):
     """Whether a design meets every requirement. Each is a structure of its own to compile."""
     outcomes = sheet.check_requirements(f.robot, asked, changes=False)
-    assert all(o.met for o in outcomes), (f.to_json(), outcomes)
+    assert all(o.met for o in outcomes), (f, outcomes)
     assert float(f.robot.chassis(0).mass) == pytest.approx(f.objectives["mass"])
 
 

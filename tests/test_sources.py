@@ -1,7 +1,5 @@
 """Files of every format and tables in memory: each is read equal to the arrays that it was made of."""
 
-from __future__ import annotations
-
 import json
 import os
 import sqlite3
@@ -21,6 +19,7 @@ from calibration.data.input_errors import BadData
 from calibration.data.sources import one_clock, opening
 from calibration.data.sources.recorded_signals import Clock, Signal, find_signal
 from sweeps.commands import inspect as command
+from tests.commands import text_file
 
 RIG = """
 base = "none"
@@ -63,9 +62,7 @@ FORMS = {
 
 @pytest.fixture(scope="module")
 def robot(tmp_path_factory):
-    path = tmp_path_factory.mktemp("rig") / "rig.toml"
-    path.write_text(RIG, encoding="utf-8")
-    return robot_file.read_robot(path)
+    return robot_file.read_robot(text_file(tmp_path_factory.mktemp("rig") / "rig.toml", RIG))
 
 
 def opened(path, within=""):
@@ -90,8 +87,7 @@ def test_json_of_every_form_is_read_equal_to_its_arrays(tmp_path, robot, orient)
     text = json.dumps(frame.to_dict("list")) if orient == "list" else None
     stated = {"orient": "records", "lines": True} if orient == "lines" else {"orient": orient}
     text = text or frame.to_json(double_precision=15, **stated)
-    (tmp_path / "log.json").write_text(text)
-    runs = records.read_runs(tmp_path / "log.json", robot, columns=COLUMNS)
+    runs = records.read_runs(text_file(tmp_path / "log.json", text), robot, columns=COLUMNS)
     for column, name in COLUMNS.items():
         assert_allclose(runs[column], table[name], rtol=1e-13, atol=1e-15)
 
@@ -230,17 +226,15 @@ def test_profiles_and_terrains_are_read_from_tables_of_every_format(tmp_path):
 
 def test_a_long_csv_file_is_read_as_a_short_one(tmp_path, monkeypatch):
     text = "run_id,time_s,a,b,c\n1,0.5, 7,1e-3,x\n2,-3.25,,2,\n1,1e5,nan,3,z\n"
-    (tmp_path / "log.csv").write_text(text)
-    short = delimited.read_csv_columns(tmp_path / "log.csv", "log.csv")
+    short = delimited.read_csv_columns(text_file(tmp_path / "log.csv", text), "log.csv")
     monkeypatch.setattr(delimited, "LONG", 0)
     long = delimited.read_csv_columns(tmp_path / "log.csv", "log.csv")
     assert isinstance(long.values[1], np.ndarray) and long.header == short.header and long.digest == short.digest
     for mine, theirs in zip(long.values, short.values, strict=True):
         assert_array_equal(delimited_numbers(mine), delimited_numbers(theirs))
     assert list(long.values[4]) == short.values[4]
-    (tmp_path / "log.csv").write_text(text + "1,2\n")
     with pytest.raises(BadData, match="row 4: got 2 cells; the header has 5 columns"):
-        delimited.read_csv_columns(tmp_path / "log.csv", "log.csv")
+        delimited.read_csv_columns(text_file(tmp_path / "log.csv", text + "1,2\n"), "log.csv")
 
 
 def delimited_numbers(raw):
@@ -421,9 +415,8 @@ def test_inspect_prints_what_contents_finds(tmp_path, capsys):
 def test_contents_of_an_empty_file_are_an_error_and_empty_cells_are_missing(tmp_path):
     (tmp_path / "log.csv").write_text("t,amps\n0,\n1,\n")
     assert [s.missing for s in contents.inspect_source(tmp_path / "log.csv").signals] == [0, 2]
-    (tmp_path / "log.csv").write_text("")
     with pytest.raises(BadData, match="the file is empty"):
-        contents.inspect_source(tmp_path / "log.csv")
+        contents.inspect_source(text_file(tmp_path / "log.csv", ""))
 
 
 def test_a_bags_folder_without_its_metadata_is_named(tmp_path):

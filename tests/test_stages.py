@@ -1,7 +1,5 @@
 """Stages in files: what is read is what was written, to the bit, and no file runs code or names what it may not."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import os
@@ -24,6 +22,7 @@ from mmrjax.effects.scaled import scaled_effect
 from mmrjax.model import channels, paper_robots
 from sweeps import stage_files
 from sweeps.store import RunFolder
+from tests.commands import text_file
 
 OWN = '''
 import jax.numpy as jnp
@@ -87,8 +86,7 @@ def test_our_own_classes_come_back_by_name(tmp_path):
 
 
 def test_an_effect_of_the_users_own_comes_back_only_once_it_is_loaded(tmp_path, monkeypatch):
-    (tmp_path / "own.py").write_text(OWN)
-    (mine,) = effect_file.read_effect_file(tmp_path / "own.py")
+    (mine,) = effect_file.read_effect_file(text_file(tmp_path / "own.py", OWN))
     assert type(again(tmp_path, mine())) is mine
     monkeypatch.delitem(sys.modules, mine.__module__)
     with pytest.raises(stage_files.Unreadable, match="a class of mmrjax_user_effects_"):

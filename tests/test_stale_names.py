@@ -1,11 +1,8 @@
 """Names that tests and benchmarks take from the project exist: what only runs by `make slow`, or never in CI, is read here."""
 
-from __future__ import annotations
-
 import ast
 import importlib
 import types
-from collections.abc import Iterator
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -15,9 +12,9 @@ OWN = ("mmrjax", "calibration", "sweeps", "worlds", *IMPORTED)
 FILES = [p for folder in ("tests", "tests/worlds", "benchmarks") for p in sorted((ROOT / folder).glob("*.py"))]
 
 
-def stale(tree: ast.Module) -> Iterator[tuple[int, str]]:
+def stale(tree):
     """Line and name of what is asked of one of the project's modules, and is not there."""
-    modules: dict[str, types.ModuleType] = {}
+    modules = {}
     bound = {n.id for n in ast.walk(tree) if isinstance(n, ast.Name) and isinstance(n.ctx, ast.Store)}
     bound |= {a.arg for a in ast.walk(tree) if isinstance(a, ast.arg)}
     for node in ast.walk(tree):

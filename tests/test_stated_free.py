@@ -1,7 +1,5 @@
 """What a rig's file states with ± is what a calibration frees, with the width that stands there."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import numpy as np
@@ -14,7 +12,7 @@ from calibration.data.input_errors import BadConfiguration
 from calibration.inference import foresight, priors, remarks
 from calibration.inference.calibration import calibrate
 from calibration.inference.observers import Histories, SettledRuns
-from tests.commands import ends
+from tests.commands import ends, read_rig, read_table
 
 #: Observers of logs and of settled runs, and the ends of names that these do not show.
 KINDS = (Histories, ()), (SettledRuns, priors.OVER_TIME)
@@ -38,8 +36,7 @@ loss_coulomb = 0.1
 
 
 def bench(tmp_path, change=lambda text: text):
-    (tmp_path / "rig.toml").write_text(change(RIG), encoding="utf-8")
-    return robot_file.read_robot(tmp_path / "rig.toml")
+    return read_rig(tmp_path, change(RIG))
 
 
 def test_everything_stated_with_a_width_is_freed_that_the_data_show(tmp_path):
@@ -105,10 +102,15 @@ def test_a_prior_is_shown_as_it_is_stated(tmp_path):
     names = ("motor.friction_coulomb", "motor.resistance")
     sds = priors.parameter_coordinates(robot, names).prior_sd
     assert sds == pytest.approx([0.002, 0.06])  # the slope of the log-normal one is 0.0019
-    (tmp_path / "runs.csv").write_text(
-        "supply_voltage_V,total_current_A,motor_speed_rpm\n12,2.0,1600\n24,2.1,3900\n", encoding="utf-8"
+    seen = foresight.predict_identifiability(
+        read_table(
+            tmp_path,
+            "supply_voltage_V,total_current_A,motor_speed_rpm\n12,2.0,1600\n24,2.1,3900\n",
+            robot,
+            "runs.csv",
+        ),
+        robot,
     )
-    seen = foresight.predict_identifiability(records.read_runs(tmp_path / "runs.csv", robot=robot), robot)
     assert {p.name: p.prior_sd for p in seen.parameters}[names[0]] == pytest.approx(0.002)
 
 

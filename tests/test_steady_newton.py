@@ -104,11 +104,11 @@ def test_root_takes_data_shared_by_a_batch_or_of_its_members():
 # --- programs that the compilation cache keeps --------------------------------------------------------
 
 
-def lowered(function, *arguments) -> str:
+def lowered(function, *arguments):
     return jax.jit(function).lower(*arguments).as_text()
 
 
-def holds_callback(program: str) -> bool:
+def holds_callback(program):
     return "callback" in program
 
 

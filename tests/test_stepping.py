@@ -1,7 +1,5 @@
 """`rates`, `step` and `initial_state`: the fidelity `drive` in steps, under transformations, in either precision."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 

@@ -1,7 +1,5 @@
 """How the code hangs together, read from the code with `ast`. Every rule is shown to be able to fail."""
 
-from __future__ import annotations
-
 import ast
 import functools
 import graphlib
@@ -23,7 +21,7 @@ HEAVY = {"jax", "jaxlib", "equinox", "optimistix", "lineax", "diffrax", "matplot
 
 
 @functools.lru_cache(maxsize=10_000)  # of a module and of all functions in it
-def walked(tree: ast.AST) -> list[ast.AST]:
+def walked(tree):
     """Every node of a module, which all rules go through, or of a part of one."""
     return list(ast.walk(tree))
 
@@ -32,7 +30,7 @@ Breach = tuple[int, str]
 Rule = Callable[[PurePosixPath, ast.Module], Iterator[Breach]]
 
 
-def imports(tree: ast.AST, package: str) -> list[tuple[str, int]]:
+def imports(tree, package):
     """Names of imported modules with their lines, anywhere in a module of `package`."""
     found = []
     for node in walked(tree):
@@ -57,7 +55,7 @@ def imports(tree: ast.AST, package: str) -> list[tuple[str, int]]:
     return found
 
 
-def names_imported(tree: ast.AST, package: str) -> list[tuple[str, int]]:
+def names_imported(tree, package):
     """As `imports`, with what is imported from a module too, `module.name`."""
     found = imports(tree, package)
     for node in walked(tree):
@@ -67,7 +65,7 @@ def names_imported(tree: ast.AST, package: str) -> list[tuple[str, int]]:
     return found
 
 
-def prose(tree: ast.Module) -> set[int]:
+def prose(tree):
     """Ids of the strings that are for people: docstrings, help, descriptions and meanings, sentences."""
     found = set()
     for node in walked(tree):
@@ -81,7 +79,7 @@ def prose(tree: ast.Module) -> set[int]:
 
 
 @functools.lru_cache(maxsize=1)
-def places(tree: ast.Module) -> dict[int, str]:
+def places(tree):
     """Id of every node → name of the function, class or variable at the top of the module that it is in."""
     found = {}
     for top in tree.body:
@@ -98,7 +96,7 @@ def places(tree: ast.Module) -> dict[int, str]:
 # --- rules ------------------------------------------------------------------------------------------
 
 
-def rooms_have_names_of_their_own(path: PurePosixPath, tree: ast.Module) -> Iterator[Breach]:
+def rooms_have_names_of_their_own(path, tree):
     for part in (*path.parent.parts, path.stem):
         if part in FORBIDDEN_ROOMS:
             yield 1, f"a room named {part}"
@@ -110,7 +108,7 @@ DOOR = ("mmrjax/__init__.py", "_ABOVE")
 NAMED = {DOOR, ("mmrjax/compile/programs.py", "OWN")}
 
 
-def physics_names_no_layer_above(path: PurePosixPath, tree: ast.Module) -> Iterator[Breach]:
+def physics_names_no_layer_above(path, tree):
     """By a string, as `importlib` takes it. Of statements Ruff sees to that (ruff.toml of each layer)."""
     place = places(tree)
     for node in walked(tree) if path.parts[0] == LAYERS[0] else ():
@@ -119,14 +117,14 @@ def physics_names_no_layer_above(path: PurePosixPath, tree: ast.Module) -> Itera
             yield node.lineno, f"{LAYERS[0]} imports {text}"
 
 
-def balances_alone_sum_terms(path: PurePosixPath, tree: ast.Module) -> Iterator[Breach]:
+def balances_alone_sum_terms(path, tree):
     for node in walked(tree):
         sums = isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr == "term"
         if sums and path.as_posix() != "mmrjax/model/balances.py":
             yield node.lineno, "sums an effect's term outside balances"
 
 
-def figures_wait_for_the_page(path: PurePosixPath, tree: ast.Module) -> Iterator[Breach]:
+def figures_wait_for_the_page(path, tree):
     """A command imports figures and pages once it draws: they cost half a second before the answer."""
     if path.parent.as_posix() == "sweeps/commands":
         head = ast.Module([n for n in tree.body if isinstance(n, ast.Import | ast.ImportFrom)], [])
@@ -139,7 +137,7 @@ def figures_wait_for_the_page(path: PurePosixPath, tree: ast.Module) -> Iterator
 OBSERVERS = {"Histories", "SettledRuns"}
 
 
-def _conditions(tree: ast.Module) -> Iterator[ast.expr]:
+def _conditions(tree):
     for node in walked(tree):
         if isinstance(node, ast.If | ast.While | ast.IfExp | ast.Assert):
             yield node.test
@@ -151,7 +149,7 @@ def _conditions(tree: ast.Module) -> Iterator[ast.expr]:
             yield node.operand
 
 
-def observers_alone_know_the_kind_of_data(path: PurePosixPath, tree: ast.Module) -> Iterator[Breach]:
+def observers_alone_know_the_kind_of_data(path, tree):
     """No other room asks whether a table holds settled runs or histories. It calls a method of the observer."""
     if path.parts[:3] == ("calibration", "inference", "observers"):
         return
@@ -195,7 +193,7 @@ SPELLED = {
 }
 
 
-def channels_are_counted_in_one_place(path: PurePosixPath, tree: ast.Module) -> Iterator[Breach]:
+def channels_are_counted_in_one_place(path, tree):
     """No literal outside the table of channels spells two or more of them."""
     if path.parts[0] == "mmrjax" or path.parts[:2] == REPRODUCTION:
         return
@@ -218,7 +216,7 @@ CONFIGURED = {
 }
 
 
-def configurations_are_data(path: PurePosixPath, tree: ast.Module) -> Iterator[Breach]:
+def configurations_are_data(path, tree):
     if path.as_posix() in CONFIGURED or path.parts[:2] == REPRODUCTION:
         return
     texts, place = prose(tree), places(tree)
@@ -235,7 +233,7 @@ def configurations_are_data(path: PurePosixPath, tree: ast.Module) -> Iterator[B
             yield node.lineno, f"knows the configuration {name}"
 
 
-def discovery_keeps_its_stages(path: PurePosixPath, tree: ast.Module) -> Iterator[Breach]:
+def discovery_keeps_its_stages(path, tree):
     """No function outside calibration/discovery takes what its stages hand to one another."""
     if path.parts[:2] == ("calibration", "discovery"):
         return
@@ -291,11 +289,11 @@ CARRIERS = ("ContextVar", "threading.local")
 Function = ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda
 
 
-def _stored(tree: ast.AST) -> set[str]:
+def _stored(tree):
     return {n.id for n in walked(tree) if isinstance(n, ast.Name) and isinstance(n.ctx, ast.Store)}
 
 
-def _at_the_top(tree: ast.Module) -> tuple[set[str], set[str]]:
+def _at_the_top(tree):
     """Names of a module's own that functions can see, and those that it imports."""
     own, imported = set(), set()
     for node in walked(tree):
@@ -309,12 +307,12 @@ def _at_the_top(tree: ast.Module) -> tuple[set[str], set[str]]:
     return own, imported
 
 
-def _parameters(function: Function) -> set[str]:
+def _parameters(function):
     a = function.args
     return {x.arg for x in (*a.posonlyargs, *a.args, *a.kwonlyargs, *filter(None, (a.vararg, a.kwarg)))}
 
 
-def _dotted(node: ast.expr) -> str:
+def _dotted(node):
     """`a.b` of what is `a.b[c].d`."""
     while isinstance(node, ast.Subscript):
         node = node.value
@@ -324,7 +322,7 @@ def _dotted(node: ast.expr) -> str:
     return node.id if isinstance(node, ast.Name) else ""
 
 
-def _changed(node: ast.AST, inside: bool) -> Iterator[str]:
+def _changed(node, inside):
     """What a node rebinds, changes or remembers, as a dotted name."""
     if isinstance(node, ast.Global):
         yield from node.names
@@ -342,11 +340,11 @@ def _changed(node: ast.AST, inside: bool) -> Iterator[str]:
         yield f"{_dotted(node.args[0])}.{ast.unparse(node.func)}"
 
 
-def modules_keep_no_state(path: PurePosixPath, tree: ast.Module) -> Iterator[Breach]:
+def modules_keep_no_state(path, tree):
     """No function changes what belongs to a module, its own or another, but for what is `KEPT`."""
     own, imported = _at_the_top(tree)
 
-    def walk(node: ast.AST, hidden: set[str], inside: bool) -> Iterator[Breach]:
+    def walk(node, hidden, inside):
         for name in _changed(node, inside):
             first, _, rest = name.partition(".")
             called = isinstance(node, ast.Call) and first in imported and (not rest or first in ("np", "jnp"))
@@ -364,7 +362,7 @@ def modules_keep_no_state(path: PurePosixPath, tree: ast.Module) -> Iterator[Bre
     yield from walk(tree, set(), False)
 
 
-def _rebound(function: Function) -> set[str]:
+def _rebound(function):
     return {name for n in walked(function) if isinstance(n, ast.Global) for name in n.names}
 
 
@@ -373,7 +371,7 @@ COMPUTING = tuple(f"calibration/{room}/" for room in ("inference", "discovery", 
 MOST_WORDS = 5
 
 
-def computing_rooms_say_nothing(path: PurePosixPath, tree: ast.Module) -> Iterator[Breach]:
+def computing_rooms_say_nothing(path, tree):
     """No sentence where things are computed, but docstrings and what an error of input says."""
     if not path.as_posix().startswith(COMPUTING):
         return
@@ -388,7 +386,7 @@ def computing_rooms_say_nothing(path: PurePosixPath, tree: ast.Module) -> Iterat
             yield node.lineno, "says a sentence where things are computed"
 
 
-def of_errors(tree: ast.Module) -> set[int]:
+def of_errors(tree):
     """Ids of all that errors are made of: in `raise` and calls of `Bad...`, under names that these take in the same
     function, and in functions of the module that they call."""
     found, called = set[int](), set[str]()
@@ -410,7 +408,7 @@ def of_errors(tree: ast.Module) -> set[int]:
     return found | {id(n) for function in functions if function.name in called for n in walked(function)}
 
 
-def names_are_nouns(path: PurePosixPath, tree: ast.Module) -> Iterator[Breach]:
+def names_are_nouns(path, tree):
     """No mask is called `there`, and no local or argument `of`."""
     for node in walked(tree):
         name = node.arg if isinstance(node, ast.arg) else node.id if isinstance(node, ast.Name) else ""
@@ -423,13 +421,13 @@ def names_are_nouns(path: PurePosixPath, tree: ast.Module) -> Iterator[Breach]:
 
 
 @functools.lru_cache(maxsize=4)
-def fields(tree: ast.Module) -> set[int]:
+def fields(tree):
     """Ids of the names of fields of classes."""
     classes = (n for n in walked(tree) if isinstance(n, ast.ClassDef))
     return {id(n.target) for found in classes for n in found.body if isinstance(n, ast.AnnAssign)}
 
 
-RULES: tuple[Rule, ...] = (
+RULES = (
     names_are_nouns,
     rooms_have_names_of_their_own,
     physics_names_no_layer_above,
@@ -444,7 +442,7 @@ RULES: tuple[Rule, ...] = (
 )
 
 
-def breaches(path: str, source: str) -> list[tuple[str, int, str]]:
+def breaches(path, source):
     """Name of each rule that a module breaks, with its line and what it says."""
     tree = ast.parse(source)
     found = [(rule.__name__, *breach) for rule in RULES for breach in sorted(rule(PurePosixPath(path), tree))]
@@ -598,7 +596,7 @@ INNER = {
     "without_copies", "pose", "pose_problem", "pose_candidates", "fit_base", "trace",
 }  # fmt: skip
 #: Campaigns and notebooks that call a part of that all the same, and why.
-CALLED: dict[tuple[str, str], str] = {
+CALLED = {
     (
         "loop_baselines",
         "pose_candidates",
@@ -617,13 +615,13 @@ SHARED_NAMES = {"__init__", "result", "base"}
 def test_modules_have_base_names_of_their_own():
     """Two modules of one name are told apart by their folders alone, which imports and messages leave out."""
     files = [p for layer in LAYERS for p in (ROOT / layer).rglob("*.py") if p.stem not in SHARED_NAMES]
-    seen: dict[str, Path] = {}
+    seen = {}
     for path in files:
         assert path.stem not in seen, f"{path.relative_to(ROOT)} and {seen[path.stem].relative_to(ROOT)}"
         seen[path.stem] = path
 
 
-def inner_calls(source: str) -> Iterator[tuple[int, str]]:
+def inner_calls(source):
     """Calls of `INNER` functions in a module, but of methods of what `prepare_loop` gives."""
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Call) and getattr(node.func, "attr", getattr(node.func, "id", "")) in INNER:
@@ -677,7 +675,7 @@ def test_one_preparation_serves_all():
         assert "prepare" in calls, room
 
 
-def circle(root: Path) -> list[str]:
+def circle(root):
     """Modules that import one another in a circle, inside of functions too, as `graphlib` lists them. Empty: none.
 
     Imports for annotations alone (under `TYPE_CHECKING`) are no part of it.
@@ -691,7 +689,7 @@ def circle(root: Path) -> list[str]:
     for file in (file for layer in LAYERS for file in sorted((root / layer).rglob("*.py"))):
         parts = file.relative_to(root).with_suffix("").parts
         files[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = file
-    graph: dict[str, set[str]] = {}
+    graph = {}
     for name, file in files.items():
         package = name if file.name == "__init__.py" else name.rpartition(".")[0]
         tree = Runs().visit(ast.parse(file.read_text(encoding="utf-8")))
@@ -727,7 +725,7 @@ def test_a_circle_of_imports_is_found(found, tmp_path):
 ANNOTATED = 15
 
 
-def annotated(root: Path) -> list[str]:
+def annotated(root):
     """Modules with imports for annotations alone, under `TYPE_CHECKING`."""
     return [
         path.relative_to(root).as_posix()

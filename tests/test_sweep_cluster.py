@@ -8,7 +8,6 @@ import subprocess
 import sys
 import threading
 import time
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -29,7 +28,7 @@ pytest.importorskip("distributed")
 class Cluster:
     """A scheduler and workers, processes of their own."""
 
-    def __init__(self, folder: Path, workers: int, nanny: str = "--no-nanny") -> None:
+    def __init__(self, folder, workers, nanny="--no-nanny"):
         self.folder = folder
         environment = {**os.environ, "JAX_PLATFORMS": "cpu", "PYTHONWARNINGS": "ignore"}
         self.log = (folder / "cluster.log").open("w")
@@ -51,7 +50,7 @@ class Cluster:
             for k in range(workers)
         ]  # fmt: skip
 
-    def close(self) -> None:
+    def close(self):
         for process in (*self.workers, self.scheduler):
             if process.poll() is None:
                 process.kill()
@@ -59,7 +58,7 @@ class Cluster:
         self.log.close()
 
 
-def free_port() -> int:
+def free_port():
     with socket.socket() as found:
         found.bind(("127.0.0.1", 0))
         return int(found.getsockname()[1])

@@ -15,7 +15,7 @@ from mmrjax.model import paper_robots, signals
 from sweeps.commands.simulate import PEAK, run_remarks
 from sweeps.pages import figure_style, history_figures, words
 from sweeps.report import runs_report
-from tests.commands import ends
+from tests.commands import ends, read_rig, text_file
 from tests.commands import rows as table
 
 SPEED_STATIC = 0.02  # V_s of the packaged robot [m/s]: within it contacts creep
@@ -194,9 +194,8 @@ COLUMNS = "configuration,supply_voltage_V,total_mass_kg,payload_kg,slope_deg,tot
     ],
 )
 def test_readings_without_a_sign_are_refused_backward(tmp_path, row, sentence):
-    (tmp_path / "mine.csv").write_text(f"{COLUMNS}\n6T2A,15,13.1,0,0,2.1,5292\n{row}\n")
     with pytest.raises(BadData, match=f"mine.csv row 2, {sentence}"):
-        runs.read_runs(tmp_path / "mine.csv")
+        runs.read_runs(text_file(tmp_path / "mine.csv", f"{COLUMNS}\n6T2A,15,13.1,0,0,2.1,5292\n{row}\n"))
 
 
 @pytest.mark.slow
@@ -302,8 +301,7 @@ RATED = (
 def test_rated_limits_and_switches_are_read_and_written(tmp_path):
     nominal = paper_robots.nominal()
     assert nominal.gearbox.torque_limit == pytest.approx(3.0 * 25 / 12)
-    (tmp_path / "mine.toml").write_text(RATED)
-    robot = robot_file.read_robot(tmp_path / "mine.toml")
+    robot = read_rig(tmp_path, RATED, "mine.toml")
     assert (robot.gearbox.torque_limit, robot.gearbox.mesh_theory, robot.driver.returns_current) == (4.5, True, False)
     assert robot.driver.decay == "fast"
     battery = robot.battery

@@ -29,7 +29,7 @@ from sweeps.points.imposed import UNLIMITED
 from sweeps.points.job import showing_turns
 from sweeps.report import check_report, run_tables, turn_report
 from sweeps.report.words import turn_words
-from tests.commands import ends, rows
+from tests.commands import ends, rows, text_file
 
 
 @pytest.mark.slow
@@ -176,16 +176,13 @@ HEADER, SIDED = "configuration,supply_voltage_V,payload_kg,slope_deg,", "duty_le
 
 def test_tables_take_the_duty_of_either_side(tmp_path):
     path = tmp_path / "turns.csv"
-    path.write_text(f"{HEADER}duty_left,duty_right\n6T2A,33,0,0,1,-0.5\n")
-    runs = records.read_runs(path, measured=False)
+    runs = records.read_runs(text_file(path, f"{HEADER}duty_left,duty_right\n6T2A,33,0,0,1,-0.5\n"), measured=False)
     assert runs.turns
     assert runs.axes[-2:] == ("duty_left", "duty_right")
-    path.write_text(f"{HEADER}duty_left\n6T2A,33,0,0,1\n")
     with pytest.raises(BadData, match="column duty_right is missing, duty_left is stated"):
-        records.read_runs(path, measured=False)
-    path.write_text(f"{HEADER}duty_left,duty_right,duty\n6T2A,33,0,0,1,1,1\n")
+        records.read_runs(text_file(path, f"{HEADER}duty_left\n6T2A,33,0,0,1\n"), measured=False)
     with pytest.raises(BadData, match="column duty in addition to duty_left"):
-        records.read_runs(path, measured=False)
+        records.read_runs(text_file(path, f"{HEADER}duty_left,duty_right,duty\n6T2A,33,0,0,1,1,1\n"), measured=False)
 
 
 def row(**changes):

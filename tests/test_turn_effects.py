@@ -12,13 +12,13 @@ from test_turning import flat, of_world
 from worlds import turning as world
 
 import mmrjax as mm
-from calibration.data import robot_file
 from calibration.data import runs as records
 from calibration.inference.calibration import calibrate
 from mmrjax import effects
 from mmrjax.model import balances, energy, paper_robots, params
 from mmrjax.model.signals import PlaneMotion, State
 from mmrjax.turning import circling
+from tests.commands import read_rig
 
 OF_SIDES = ("side_friction", "side_torque", "side_voltage", "side_radius")
 #: In units of the prior sd.
@@ -144,9 +144,7 @@ def test_straight_travel_shows_none_of_them():
 
 
 def test_robot_files_know_them_and_the_library_of_straight_travel_does_not(tmp_path):
-    path = tmp_path / "robot.toml"
-    path.write_text('base = "nominal"\n[effects.side_torque]\namplitude = 0.1\n')
-    robot = robot_file.read_robot(path)
+    robot = read_rig(tmp_path, 'base = "nominal"\n[effects.side_torque]\namplitude = 0.1\n', "robot.toml")
     assert [e.name for e in robot.effects] == ["side_torque"] and float(robot.effects[0].amplitude) == 0.1
     assert not set(effects.OF_TURNS) & set(effects.BY_NAME)
     for kind in effects.OF_TURNS.values():

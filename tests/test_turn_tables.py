@@ -15,6 +15,7 @@ from mmrjax.model import balances
 from mmrjax.model.quantities import RPM
 from mmrjax.model.signals import State
 from sweeps.inputs import read_runs
+from tests.commands import read_table, text_file
 
 #: A robot on four wheels whose sides' speeds are imposed; the numbers are nobody's.
 KINEMATIC = """
@@ -70,9 +71,9 @@ def rig(tmp_path):
 @pytest.fixture
 def table(tmp_path):
     def written(header, *rows, robot):
-        path = tmp_path / "turns.csv"
-        path.write_text("\n".join([header, *(",".join(map(str, row)) for row in rows)]) + "\n")
-        return records.read_runs(path, robot=robot)
+        return read_table(
+            tmp_path, "\n".join([header, *(",".join(map(str, row)) for row in rows)]) + "\n", robot, "turns.csv"
+        )
 
     return written
 
@@ -96,12 +97,15 @@ def test_speeds_of_both_sides_are_conditions(rig, table):
 
 def test_a_table_of_turns_with_channels_of_turns_alone_is_answered_by_the_line_to_write(tmp_path, rig):
     path = tmp_path / "turns.csv"
-    path.write_text(
-        "configuration,supply_voltage_V,total_mass_kg,payload_kg,slope_deg,duty_left,duty_right,yaw_rate_rad_s\n"
-        + "6T2A,33,13.1,0,0,1,0.4,-1.1\n" * 3
-    )
     with pytest.raises(BadData, match=r"yaw_rate_rad_s: state in the robot's file channels = ") as said:
-        records.read_runs(path, robot=rig('base = "nominal"'))
+        records.read_runs(
+            text_file(
+                path,
+                "configuration,supply_voltage_V,total_mass_kg,payload_kg,slope_deg,duty_left,duty_right,yaw_rate_rad_s\n"
+                + "6T2A,33,13.1,0,0,1,0.4,-1.1\n" * 3,
+            ),
+            robot=rig('base = "nominal"'),
+        )
     line = said.value.args[0].rpartition("file ")[2]
     robot = rig(f'base = "nominal"\n{line}')
     assert [c.name for c in records.read_runs(path, robot=robot).channels] == ["yaw_rate"]
@@ -189,8 +193,9 @@ def test_a_supply_of_either_sign_drives_the_sides(rig, table):
 def test_the_packaged_robot_turns_by_voltages_of_its_sides_without_a_supply(tmp_path):
     path = tmp_path / "turns.csv"
     header = "configuration,total_mass_kg,payload_kg,slope_deg,voltage_left_mV,voltage_right_mV"
-    path.write_text(f"{header}\n6T2A,13.1,0,0,6000,24000\n6T2A,13.1,0,0,-12000,12000\n")
-    runs = records.read_runs(path, measured=False)
+    runs = records.read_runs(
+        text_file(path, f"{header}\n6T2A,13.1,0,0,6000,24000\n6T2A,13.1,0,0,-12000,12000\n"), measured=False
+    )
     conditions = runs.conditions(mm.nominal())
     assert_allclose(conditions.voltage, [24.0, 12.0])
     assert_allclose(conditions.duty_left, [0.25, -1.0])
@@ -236,9 +241,13 @@ def test_readings_of_turns_on_a_slope_are_refused_with_what_follows_them(tmp_pat
     ):
         table(header, *rows, robot=robot)
     assert len(table(header, rows[0], robot=robot)) == 1
-    path = tmp_path / "asked.csv"  # which are followed over time
-    path.write_text(f"supply_voltage_V,slope_deg,{of_turns}\n24,5,{','.join(map(str, each))}\n")
-    assert records.read_runs(path, measured=False, robot=robot).turns
+    assert records.read_runs(
+        text_file(
+            tmp_path / "asked.csv", f"supply_voltage_V,slope_deg,{of_turns}\n24,5,{','.join(map(str, each))}\n"
+        ),
+        measured=False,
+        robot=robot,
+    ).turns
 
 
 def test_yaw_rate_in_degrees_is_converted(rig, table):

@@ -12,6 +12,7 @@ from calibration.data.input_errors import BadData
 from calibration.described import describe
 from calibration.discovery import discover
 from calibration.inference import checks, noise, observers, ranges
+from tests.commands import read_table, text_file
 
 RIG = """
 base = "none"
@@ -37,9 +38,7 @@ OUTPUT = SPEED / 20 + 0.2 * RNG.standard_normal(12)
 
 @pytest.fixture(scope="module")
 def robot(tmp_path_factory):
-    path = tmp_path_factory.mktemp("rig") / "rig.toml"
-    path.write_text(RIG, encoding="utf-8")
-    return robot_file.read_robot(path)
+    return robot_file.read_robot(text_file(tmp_path_factory.mktemp("rig") / "rig.toml", RIG))
 
 
 @pytest.fixture
@@ -57,9 +56,7 @@ def table(tmp_path, robot, current=CURRENT, torque=TORQUE, output=OUTPUT, speed=
     columns = {"motor_speed_rpm": speed, "motor_current_A": current, "output_torque_Nm": torque,
                "output_speed_rpm": output, **more}  # fmt: skip
     lines = [",".join(columns), *(",".join(f"{x:.6g}" for x in row) for row in zip(*columns.values(), strict=True))]
-    path = tmp_path / "t.csv"
-    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
-    return records.read_runs(path, robot=robot)
+    return read_table(tmp_path, "\n".join(lines) + "\n", robot, "t.csv")
 
 
 def shown(runs):
@@ -138,8 +135,9 @@ def test_readings_that_a_rigid_gear_ties_are_said_and_not_refused(tmp_path, robo
     columns = {"supply_voltage_V": SPEED / 200, "motor_speed_rpm": SPEED, "output_speed_rpm": SPEED / 20}
     path = tmp_path / "t.csv"
     rows = (",".join(f"{x:.6g}" for x in row) for row in zip(*columns.values(), strict=True))
-    path.write_text("\n".join([",".join(columns), *rows]) + "\n", encoding="utf-8")
-    (found,) = checks.copied_channels(records.read_runs(path, robot=driven), driven)
+    (found,) = checks.copied_channels(
+        records.read_runs(text_file(path, "\n".join([",".join(columns), *rows]) + "\n"), robot=driven), driven
+    )
     assert found.tied and found.slope == pytest.approx(0.05) and "counts twice" in describe(found)
 
 

@@ -10,12 +10,12 @@ from pathlib import Path
 
 import pytest
 
-from calibration.data import robot_file
 from calibration.data import runs as records
 from calibration.data.input_errors import BadData
 from mmrjax.fidelities import outputs
 from mmrjax.model import channels, quantities
 from sweeps.commands import explain
+from tests.commands import read_rig, read_table, text_file
 
 #: One of each unit, in SI.
 BY_HAND = {
@@ -75,15 +75,15 @@ def two_rows_more(monkeypatch):
 
 def test_a_quantity_is_read_written_and_explained_by_its_row(two_rows_more, tmp_path):
     path = tmp_path / "runs.csv"
-    path.write_text(TABLE.format("depth_m,terminal_voltage_mV", 0.098))
-    runs = records.read_runs(path)
+    runs = records.read_runs(text_file(path, TABLE.format("depth_m,terminal_voltage_mV", 0.098)))
     assert runs.unknown == () and runs.channels[-1] is CHANNEL
     assert runs["depth_mm"].tolist() == [98.0, 101.3] and runs["terminal_voltage_V"].tolist() == [2.0, 4.0]
-    path.write_text(TABLE.format("depth_mm,terminal_voltage_V", 40))
     with pytest.raises(BadData, match=r"row 1, depth_mm: got 40; expected 50 to 120; also row 1, terminal_"):
-        records.read_runs(path)
-    path.write_text(TABLE.format("Depth_m,terminal_voltage_mV", 0.098))
-    assert "Depth_m is read as depth_m" in records.read_runs(path).notes[0]
+        records.read_runs(text_file(path, TABLE.format("depth_mm,terminal_voltage_V", 40)))
+    assert (
+        "Depth_m is read as depth_m"
+        in records.read_runs(text_file(path, TABLE.format("Depth_m,terminal_voltage_mV", 0.098))).notes[0]
+    )
     (output,) = (o for o in outputs.output_table(runs.channels) if o.name == CHANNEL.name)
     assert (output.column, output.unit, output.label) == ("terminal_voltage_V", "V", "terminal voltage")
     for kind, name in (("channel", "terminal_voltage"), ("condition", "depth_mm")):
@@ -91,11 +91,10 @@ def test_a_quantity_is_read_written_and_explained_by_its_row(two_rows_more, tmp_
 
 
 def test_a_rig_states_a_channel_by_its_row(two_rows_more, tmp_path):
-    path = tmp_path / "rig.toml"
-    path.write_text('channels = ["terminal_voltage"]\n[columns]\ndepth_m = "p"\nterminal_voltage_mV = "Ut"\n')
-    robot = robot_file.read_robot(path)
-    (tmp_path / "runs.csv").write_text(TABLE.format("p,Ut", 0.098))
-    runs = records.read_runs(tmp_path / "runs.csv", robot=robot)
+    robot = read_rig(
+        tmp_path, 'channels = ["terminal_voltage"]\n[columns]\ndepth_m = "p"\nterminal_voltage_mV = "Ut"\n'
+    )
+    runs = read_table(tmp_path, TABLE.format("p,Ut", 0.098), robot, "runs.csv")
     assert runs["depth_mm"].tolist() == [98.0, 101.3] and runs.measured().tolist() == [[2.0], [4.0]]
     assert robot.channels == (CHANNEL,) and runs.headings["terminal_voltage_V"] == "Ut"
 

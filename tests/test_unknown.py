@@ -21,7 +21,7 @@ from sweeps.config_campaign import Campaign
 from sweeps.inputs import load_robot
 from sweeps.points import axes
 from sweeps.points.job import prepare_job
-from tests.commands import ends
+from tests.commands import ends, read_rig
 
 MOTOR = "[motor]\ntorque_constant = 0.03\n{more}[gearbox]\nratio = 20\nefficiency_load = 0.8\n"
 BENCH = (
@@ -57,9 +57,7 @@ wheelbase = 0.4
 
 
 def read(tmp_path, text, imposed, more=""):
-    path = tmp_path / "rig.toml"
-    path.write_text(text.format(imposed=imposed, more=more), encoding="utf-8")
-    return robot_file.read_robot(path)
+    return read_rig(tmp_path, text.format(imposed=imposed, more=more))
 
 
 def elsewhere(robot):

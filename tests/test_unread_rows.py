@@ -1,7 +1,5 @@
 """Settled rows whose tachometer did not read, and rows beyond a limit of supply or driver, are no readings."""
 
-from __future__ import annotations
-
 import json
 import re
 
@@ -10,7 +8,7 @@ import pytest
 from commands import command
 
 from calibration.data import robot_file
-from calibration.data import runs as records
+from tests.commands import read_table
 
 RIG = """base = "none"
 channels = ["total_current", "motor_speed"]
@@ -41,8 +39,7 @@ def stand(tmp_path):
         )  # fmt: skip
         (tmp_path / "rig.toml").write_text(RIG)
         lines = ["supply_voltage_V,duty,motor_speed_rpm,total_current_A", *(",".join(map(str, row)) for row in rows)]
-        (tmp_path / "runs.csv").write_text("\n".join(lines) + "\n")
-        return records.read_runs(tmp_path / "runs.csv", robot=robot_file.read_robot(tmp_path / "rig.toml"))
+        return read_table(tmp_path, "\n".join(lines) + "\n", robot_file.read_robot(tmp_path / "rig.toml"), "runs.csv")
 
     return read
 

@@ -4,8 +4,6 @@ import numpy as np
 import pytest
 from test_load_torque import RIG as IDEAL
 
-from calibration.data import robot_file
-from calibration.data import runs as records
 from calibration.data.columns import LOAD, Layout
 from calibration.data.input_errors import BadData
 from calibration.described import sentences
@@ -13,6 +11,7 @@ from calibration.discovery import description
 from calibration.inference import noise
 from calibration.inference.checks import unexplained_torque_notes, unused_notes
 from calibration.inference.observers import SettledRuns
+from tests.commands import read_rig, read_table
 
 RIG = IDEAL.replace("loss_coulomb = 0.0", "loss_coulomb = 0.1")
 #: Of an ideal motor at 24 V, R 0.5, k 0.05, M0 0.01: torque of a brake [N·m], speed [rpm], current [A].
@@ -23,12 +22,10 @@ SPEED = (24 - 0.5 * CURRENT) / 0.05 * 30 / np.pi
 
 def table(tmp_path, head, **columns):
     """A table of six rows read for the rig with a line `head` in its file."""
-    (tmp_path / "rig.toml").write_text(RIG.format(head=head))
-    robot = robot_file.read_robot(tmp_path / "rig.toml")
+    robot = read_rig(tmp_path, RIG.format(head=head))
     every = {"supply_voltage_V": np.full(6, 24.0), "motor_speed_rpm": SPEED, "motor_current_A": CURRENT, **columns}
     lines = [",".join(every), *(",".join(map(str, row)) for row in zip(*every.values(), strict=True))]
-    (tmp_path / "runs.csv").write_text("\n".join(lines) + "\n")
-    return records.read_runs(tmp_path / "runs.csv", robot=robot)
+    return read_table(tmp_path, "\n".join(lines) + "\n", robot, "runs.csv")
 
 
 CHANNELS = 'channels = ["motor_current", "motor_speed"]'

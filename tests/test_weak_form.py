@@ -1,7 +1,5 @@
 """Regression of a log's equations in weak form, on logs from plain NumPy laws. No window holds a jump."""
 
-from __future__ import annotations
-
 import dataclasses
 from types import SimpleNamespace
 
@@ -18,6 +16,7 @@ from calibration.discovery.settings import settings_for
 from calibration.inference import shown_states, weak_form
 from calibration.inference.observers import Histories
 from mmrjax.effects import BY_NAME
+from tests.commands import read_rig
 
 STEP, EVERY, RPM = 2e-4, 0.01, np.pi / 30
 TRUE = {"resistance": 0.9, "torque_constant": 0.042, "inertia": 2.4e-4}
@@ -141,7 +140,7 @@ def test_the_ranking_comes_before_the_base_fit_which_begins_there(space, before,
     runs, library = Runs("synthetic", motor()).of(space.bare.base), {n: BY_NAME[n] for n in NAMES}
     noise = SimpleNamespace(sd=np.broadcast_to(SD, runs.measured().shape))
     with pytest.raises(InterruptedError):
-        discover.trace(runs, space.bare.base, noise, SETTINGS, {}, library, keep=keep)
+        discover.LoopInput(runs, None, space.bare.base, noise, {}, SETTINGS, library, keep=keep).trace()
     assert kept == ["ranking"]
     assert not begun[0].simulated and begun[0].z == pytest.approx(before.base.z)
     assert "churning" in begun[1] and {*begun[1]} == {*before.room}
@@ -232,8 +231,7 @@ def test_a_current_or_a_speed_may_be_imposed(tmp_path, imposed, channel):
     text = RIG.replace('imposed = "voltage"', f'imposed = "{imposed}"')
     if imposed == "motor_current":  # samples of a current that changes between them, half a row earlier than if held
         text += f'[rig]\ndelay = "{-EVERY / 2} ± 0"\n'
-    (tmp_path / "rig.toml").write_text(text.replace('"motor_current", "motor_speed"', f'"{channel}"'), "utf-8")
-    robot = robot_file.read_robot(tmp_path / "rig.toml")
+    robot = read_rig(tmp_path, text.replace('"motor_current", "motor_speed"', f'"{channel}"'))
     columns = motor(noise=(0.0, 1.0) if imposed == "motor_speed" else (1.0, 0.0))
     del columns["supply_voltage_V"]
     lines = [",".join(columns), *(",".join(map(str, row)) for row in zip(*columns.values(), strict=True))]

@@ -14,6 +14,7 @@ import pytest
 
 from calibration.described import describe, in_words
 from calibration.discovery import loop_notes as of_loop
+from calibration.discovery.formula import Proposal
 from calibration.discovery.loop_notes import (
     CurveOver,
     FreedValue,
@@ -24,7 +25,7 @@ from calibration.discovery.loop_notes import (
     RuledOut,
     Summary,
 )
-from calibration.discovery.result import Formula, Sensitivity, Worse
+from calibration.discovery.result import Sensitivity, Worse
 from calibration.inference import fit_notes as of_fit
 from calibration.inference.fit_notes import Remark, Shown, next_step
 from calibration.inference.lack_of_fit import Adequacy
@@ -288,7 +289,7 @@ SAMPLES = [
 RECORD = ROOT / "tests" / "record" / "pages" / "notes.txt"
 
 
-def as_text() -> str:
+def as_text():
     """The sentence of each sample, a line each."""
     return "".join(f"{note.code}: {describe(note)}\n" for note in SAMPLES)
 
@@ -565,8 +566,8 @@ def test_what_settled_runs_cannot_tell_from_an_effect_is_said_of_them_alone(samp
 
 
 def test_a_formula_without_terms_says_so():
-    assert Formula("", "mark", (), (), 0.0, 9).formula == "no single term explains 90 % of it"
-    assert Formula("ΔU = 1 V", "mark", (1.0,), (0.1,), 3.0, 9).formula == "ΔU = 1 V"
+    assert Proposal("", (), (), (), (), 0.0, 0.0, 9).formula == "no single term explains 90 % of it"
+    assert Proposal("ΔU = 1 V", (), (1.0,), (0.1,), (), 0.0, 3.0, 9).formula == "ΔU = 1 V"
 
 
 def test_why_an_effect_is_ruled_out():

@@ -11,13 +11,13 @@ from worlds.histories import EVENTS, SERIES, samples, shown_by, simulated
 from worlds.settled import CLIMBING, of_rows, remainder
 from worlds.tables import READINGS
 
-from calibration.data import robot_file
 from calibration.data import runs as records
 from calibration.inference import noise, observers
 from mmrjax.effects import ALL, BY_NAME
 from mmrjax.fidelities.drive import drive_batch
 from mmrjax.model import paper_robots, params
 from mmrjax.model.conditions import Conditions
+from tests.commands import read_rig
 
 RUNS = histories.starts(CLIMBING)
 DURATION, EVERY = 0.6, 0.01
@@ -154,8 +154,7 @@ def test_runs_of_another_robot_end_where_settled_travel_is():
 @pytest.mark.parametrize("variety", range(3))
 def test_histories_of_another_robot_agree_with_drive(tmp_path, variety):
     w = brief(world("robots", variety, seed=3), 0.6)
-    (tmp_path / "robot.toml").write_text(w.machine.toml)
-    robot = robot_file.read_robot(tmp_path / "robot.toml")
+    robot = read_rig(tmp_path, w.machine.toml, "robot.toml")
     lost = {"battery", *machines.ROLES} - set(w.machine.names)
     kept = {w.machine.public(n): v for n, v in w.constants.items() if n.split(".")[0] not in lost}
     robot = params.replace(robot, {n: jnp.asarray(v, float) for n, v in kept.items()})

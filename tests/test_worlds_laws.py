@@ -1,7 +1,5 @@
 """The foreign laws are sound physics in form: finite, linear in their amplitude, losses where they claim to be, new."""
 
-from __future__ import annotations
-
 import itertools
 from types import SimpleNamespace
 
@@ -18,17 +16,17 @@ TABLE = settled.table8()
 INSTRUMENTS = settled.Instruments()
 
 
-def shapes(law: laws.Law, values: int) -> list[dict[str, float]]:
+def shapes(law, values):
     """Every shape on a grid over its bounds."""
     axes = [np.linspace(*bounds, values) for bounds in law.shapes.values()]
     return [dict(zip(law.shapes, map(float, point), strict=True)) for point in itertools.product(*axes)]
 
 
-def middle(law: laws.Law) -> dict[str, float]:
+def middle(law):
     return {k: (low + high) / 2 for k, (low, high) in law.shapes.items()}
 
 
-def experiments() -> list[SimpleNamespace]:
+def experiments():
     """Further experiments: every way of setting up either configuration, down slopes too."""
     voltages = {"stall": (1.0, 2.0)}
     return [
@@ -42,7 +40,7 @@ def experiments() -> list[SimpleNamespace]:
     ]  # fmt: skip
 
 
-def signature(name: str, law: laws.Law, q: dict[str, float], share: float = 1e-3) -> np.ndarray:
+def signature(name, law, q, share=1e-3):
     term = laws.Term(name, share * law.size, q, law)
     return settled.signature(TABLE, settled.CLIMBING, [term], INSTRUMENTS) / share
 

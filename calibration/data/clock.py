@@ -11,7 +11,6 @@ import numpy as np
 
 from calibration.data import Names
 from calibration.data.columns import TIME, Column
-from calibration.data.input_errors import bound_text
 from calibration.data.named_arrays import NamedArrays, Raw, column_numbers, missing_readings
 from mmrjax.errors import count_noun
 
@@ -176,7 +175,7 @@ def from_the_first(name: str, meaning: Column, raw: Raw, runs: Sequence[str] | N
     if of_day:
         return passed, (*notes, f"{name}: {meaning.shown} is a time of day; counted from the first of each run")
     which = run[np.flatnonzero(first[run])[0]]
-    where = f"{bound_text(first[which] / factor)}{f' in run {names[which]}' if names[which] else ''}"
+    where = f"{first[which] / factor:g}{f' in run {names[which]}' if names[which] else ''}"
     return passed, (
         *notes,
         f"{name}: {meaning.shown} begins at {where}; a run begins at its first row, and its time counts from there; "

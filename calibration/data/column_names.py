@@ -11,7 +11,7 @@ import numpy as np
 
 from calibration.data import Names, surfaces
 from calibration.data.columns import DRIVEN, DUTY, HEADING, SIDES, SPEED, SUPPLY, TIME, VOLTS, WORDS, Column, Layout
-from calibration.data.input_errors import BadData, allowed_words, bound_text, parse_number
+from calibration.data.input_errors import BadData, allowed_words, parse_number
 from calibration.data.named_arrays import NamedArrays, Raw, column_numbers, column_texts, missing_readings
 from mmrjax.model import channels, quantities
 from mmrjax.model.channels import Channel
@@ -82,7 +82,7 @@ def refused_cell_sentence(where: str, meaning: Column, cell: str, layout: Layout
         low, high = meaning.limits()
         hint = _hint(meaning, cell, hints, (*layout.measured_columns, *layout.deviation_columns, *DUTY))
         more = "more than " if column in layout.deviation_columns else ""
-        allowed = f"{more}{bound_text(low)} to {bound_text(high)}"
+        allowed = f"{more}{low:g} to {high:g}"
         try:
             parse_number(cell)
         except ValueError:

@@ -7,7 +7,7 @@ import numpy as np
 
 from calibration.data import sides
 from calibration.data.columns import HEADING, LEVERS, SPEED, SUPPLY
-from calibration.data.input_errors import BadData, bound_text
+from calibration.data.input_errors import BadData
 from calibration.data.table import Runs
 from mmrjax.model import params
 from mmrjax.model.quantities import CURRENT, RPM, VOLTAGE
@@ -137,9 +137,9 @@ def _voltage(runs: Runs, robot: Robot, column: str) -> None:
         row = int(wrong[0])
         why = "of the other sign" if along[row] < 0 else "too small"
         raise BadData(
-            f"{runs.source} row {row + 1}, {column}: got {bound_text(voltage[row])} at an imposed {SPEED} of "
-            f"{bound_text(runs[SPEED][row])}, {why} for the motors' back-EMF of "
-            f"{bound_text(float(f'{back[row]:.3g}'))} V; "
+            f"{runs.source} row {row + 1}, {column}: got {voltage[row]:g} at an imposed {SPEED} of "
+            f"{runs[SPEED][row]:g}, {why} for the motors' back-EMF of "
+            f"{float(f'{back[row]:.3g}'):g} V; "
             "check both columns and motor.torque_constant in the robot's file"
         )
 
@@ -153,7 +153,7 @@ def _time(runs: Runs) -> None:
         if 0 < back.size <= max(SELDOM * len(mine), 1):
             row, was, now = mine[back[0] + 1] + 1, time[mine[back[0]]], time[mine[back[0] + 1]]
             raise BadData(
-                f"{runs.source} row {row}, time_s: goes back from {bound_text(was)} to {bound_text(now)} s; "
+                f"{runs.source} row {row}, time_s: goes back from {was:g} to {now:g} s; "
                 "give each recording its own run_id, or sort the rows"
             )
 
@@ -181,10 +181,10 @@ def _angle(runs: Runs) -> None:
             gap = passed[jumps[0]]
             why = "as an angle that wraps; expected an angle that continues beyond a turn"
             if gap > GAP * np.median(passed):
-                why = f"{bound_text(float(f'{gap:.3g}'))} s earlier; give each recording its own run_id"
+                why = f"{float(f'{gap:.3g}'):g} s earlier; give each recording its own run_id"
             raise BadData(
                 f"{runs.source} row {row + 1}, output_angle_deg: jumps by "
-                f"{bound_text(float(f'{step[jumps[0]]:.4g}'))} "
+                f"{float(f'{step[jumps[0]]:.4g}'):g} "
                 f"deg from the sample before, {why}"
             )
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -193,7 +193,7 @@ def _angle(runs: Runs) -> None:
         mixed = np.flatnonzero(other & (np.abs(step) > UNUSUAL * np.maximum(usual, 1.0)))
         if mixed.size:
             row, k = int(mine[mixed[0] + 1]), mixed[0]
-            was, now = (bound_text(float(f"{x:.4g}")) for x in angle[mine][k : k + 2])
+            was, now = (f"{float(f'{x:.4g}'):g}" for x in angle[mine][k : k + 2])
             raise BadData(
                 f"{runs.source} row {row + 1}, output_angle_deg: goes from {was} to {now} between two samples, as "
                 "if degrees and radians are mixed; write all rows in one unit"

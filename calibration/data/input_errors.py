@@ -56,11 +56,6 @@ def rows_text(rows: Sequence[int], most: int, rest: str = ", ...") -> str:
     return f"row{'s' * (len(rows) > 1)} {listed}"
 
 
-def bound_text(value: float) -> str:
-    """A bound as a person writes it."""
-    return f"{value:g}"
-
-
 def three_digits(value: float) -> str:
     """A value as a sheet shows it, to three digits."""
     return f"{value:.0f}" if abs(value) >= 100 else f"{value:.3g}"
@@ -98,6 +93,6 @@ def stated_number(
         kind = "a number" if unit is None else f"a number [{unit or '-'}]"
         raise BadConfiguration(f"{where}: got {value!r}; expected {kind}")
     if not math.isfinite(value) or not low <= value <= high:
-        allowed = f"{bound_text(low)} to {bound_text(high)} {unit or ''}".rstrip()
+        allowed = f"{low:g} to {high:g} {unit or ''}".rstrip()
         raise BadConfiguration(f"{where}: got {value}; expected {allowed}")
     return float(value)

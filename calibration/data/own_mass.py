@@ -13,7 +13,7 @@ from collections.abc import Iterable
 import jax.numpy as jnp
 import numpy as np
 
-from calibration.data.input_errors import BadConfiguration, BadData, bound_text
+from calibration.data.input_errors import BadConfiguration, BadData
 from calibration.data.runs import Runs
 from calibration.data.surface_labels import rows_of_scaled_adhesion
 from mmrjax.model import params
@@ -61,10 +61,10 @@ def stated_masses(robot: Robot, runs: Runs) -> dict[str, StatedMass]:
     if wrong.size:
         row = int(wrong[0])
         raise BadData(
-            f"{runs.source} row {row + 1}, total_mass_kg: got {bound_text(runs['total_mass_kg'][row])} "
+            f"{runs.source} row {row + 1}, total_mass_kg: got {runs['total_mass_kg'][row]:g} "
             "with a payload of "
-            f"{bound_text(runs['payload_kg'][row])} kg; expected a robot of {bound_text(low)} to "
-            f"{bound_text(high)} kg without it"
+            f"{runs['payload_kg'][row]:g} kg; expected a robot of {low:g} to "
+            f"{high:g} kg without it"
         )
     masses = {}
     for index in np.unique(which):

@@ -18,7 +18,7 @@ from jaxtyping import Array
 
 from calibration.data import Columns, Json, Names, delimited, input_files
 from calibration.data.columns import LOAD, SUPPLY
-from calibration.data.input_errors import BadConfiguration, BadData, allowed_words, bound_text, is_number
+from calibration.data.input_errors import BadConfiguration, BadData, allowed_words, is_number
 from calibration.data.named_arrays import column_texts
 from calibration.data.sources import opening, reading
 from mmrjax.errors import count_noun
@@ -361,7 +361,7 @@ class _Cells:
         """A number in the unit of `Profile`."""
         quantity, unit = QUANTITIES[field], self.columns[field][1]
         low, high = quantity.limits(unit)
-        allowed = f"{bound_text(low)} to {bound_text(high)}"
+        allowed = f"{low:g} to {high:g}"
         try:
             written = float(self.text(field, row))
         except ValueError:

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from calibration.data import Json, Names, rig_file, stated
 from calibration.data.configuration_tables import loads_from_tables, resolved_likes
 from calibration.data.effect_file import Library
-from calibration.data.input_errors import BadConfiguration, allowed_words, bound_text, is_number
+from calibration.data.input_errors import BadConfiguration, allowed_words, is_number
 from calibration.data.input_files import toml_content, toml_text
 from calibration.data.writing import toml_value, write_text
 from mmrjax import effects
@@ -146,7 +146,8 @@ def parse_robot_file(path: Path, library: Library = effects.BY_NAME, notes: list
             Otherwise it states `movers` (`tracks` or `wheels`) or `load` (see `rig_file.LOADS`), and every parameter
             without default.
         parameters: in tables by dotted name in SI units, e.g. `[motor] resistance = 0.9`, or with the sd of their
-            prior as `"0.9 ± 5 %"`. RATINGS. SWITCHES, true or false, and CHOICES.
+            prior as `"0.9 ± 5 %"`, which is wider while the number is a template's. RATINGS. SWITCHES, true or
+            false, and CHOICES.
         effects: an effect is present if the file has its table `[effects.NAME]`. The table may name the
             `configurations` that the effect acts on, and scale its priors and limits by `scaled` (see
             `effects.scaled`).
@@ -174,7 +175,10 @@ def parse_robot_file(path: Path, library: Library = effects.BY_NAME, notes: list
             f"{path.name}, base: got {base}; {allowed_words(str(base), (*paper_robots.ROBOTS, rig_file.NONE))}"
         )
     robot, sds, linear = _without_parameters(
-        None if base == rig_file.NONE else paper_robots.ROBOTS[base](), content, path.name
+        None if base == rig_file.NONE else paper_robots.ROBOTS[base](),
+        content,
+        path.name,
+        stated.example_numbers(text),
     )
     present = content.get("effects", {})
     if not isinstance(present, dict):
@@ -194,18 +198,21 @@ def parse_robot_file(path: Path, library: Library = effects.BY_NAME, notes: list
 
 
 def _without_parameters(
-    base: Robot | None, content: Json, where: str
+    base: Robot | None, content: Json, where: str, examples: Collection[str]
 ) -> tuple[Robot, dict[str, float], frozenset[str]]:
     """The robot of a file's content before the parameters that it states, the sds stated of those, its linear units.
 
     Args:
         base: None starts from nothing.
         content: the function removes keys other than parameters.
+        examples: names of numbers that are still a template's.
     """
     if base is None:
         resolved_likes(content, where)
     tables = {key: value for key, value in content.items() if key not in rig_file.KEYS and isinstance(value, dict)}
     sds = stated.taken_apart(tables, where)
+    values = dict(_flatten(tables))
+    sds |= {name: stated.example_sd(values[name], sds[name]) for name in sds.keys() & set(examples)}
     loads = loads_from_tables(base, content, sds, where)
     rig = rig_file.parse_rig(content, where, list(loads.by_name), travels=loads.travels, inherits=base is not None)
     if "controller" in content and not rig.follows_goal:
@@ -339,17 +346,16 @@ def _refused(name: str, value: Any, known: Mapping[str, params.Parameter]) -> st
         return f"no such parameter; {_parameters(name, known)}"
     spec = known[name].spec
     low, high = spec.bounds
-    allowed = f"{bound_text(low)} to {bound_text(high)} {spec.unit} ({spec.meaning})"
+    allowed = f"{low:g} to {high:g} {spec.unit} ({spec.meaning})"
     if not is_number(value):
         form = ', alone or with its standard deviation as "0.61 ± 0.03"' if isinstance(value, str) else ""
         return f"got {value!r}; expected a number, {allowed}{form}"
     if name == "gearbox.ratio" and 0 < value < 1:
         return (
-            f"got {bound_text(value)}; expected turns of the motor for one of the output, at least 1; is "
-            f"{bound_text(1 / value)} meant?"
+            f"got {value:g}; expected turns of the motor for one of the output, at least 1; is {1 / value:g} meant?"
         )
     if not math.isfinite(value) or not low <= value <= high:
-        return f"got {bound_text(value)}; expected {allowed}"
+        return f"got {value:g}; expected {allowed}"
     return ""
 
 
@@ -384,10 +390,8 @@ def _choice(where: str, name: str, value: Any) -> str:
 def _rating(where: str, name: str, value: Any) -> float:
     low, high, unit, what = RATINGS[name]
     if not is_number(value) or not low <= value <= high:
-        got = bound_text(value) if is_number(value) else repr(value)
-        raise BadConfiguration(
-            f"{where}, {name}: got {got}; expected a number, {bound_text(low)} to {bound_text(high)} {unit} ({what})"
-        )
+        got = f"{value:g}" if is_number(value) else repr(value)
+        raise BadConfiguration(f"{where}, {name}: got {got}; expected a number, {low:g} to {high:g} {unit} ({what})")
     return float(value)
 
 

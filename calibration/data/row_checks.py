@@ -21,7 +21,7 @@ from calibration.data.columns import (
     WHEN,
     Layout,
 )
-from calibration.data.input_errors import BadData, bound_text, three_digits
+from calibration.data.input_errors import BadData, three_digits
 from calibration.data.table import driven_on
 from mmrjax.model import channels
 from mmrjax.model.channels import Channel
@@ -177,8 +177,7 @@ def _check_driving(name: str, columns: Columns) -> None:
         if driven[row]:
             raise BadData(f"{name} row {row + 1}, duty: got an empty cell; expected a number, -1 to 1")
         raise BadData(
-            f"{name} row {row + 1}, duty: got {bound_text(duty[row])} in mode {modes[row]}; expected 0 or an "
-            "empty cell"
+            f"{name} row {row + 1}, duty: got {duty[row]:g} in mode {modes[row]}; expected 0 or an empty cell"
         )
     columns["duty"] = np.nan_to_num(duty)
 
@@ -200,7 +199,7 @@ def _check_held(name: str, columns: Columns) -> None:
     held = columns.get("held", np.zeros(1)) > 0.5
     for row in np.flatnonzero(held & (columns.get(LOAD, 0.0) != 0))[:1]:
         raise BadData(
-            f"{name} row {row + 1}, {LOAD}: got {bound_text(columns[LOAD][row])} where held is 1; expected 0, as the "
+            f"{name} row {row + 1}, {LOAD}: got {columns[LOAD][row]:g} where held is 1; expected 0, as the "
             "torque that a clamp carries is a reading: name its column output_torque"
         )
 
@@ -234,8 +233,8 @@ def _check_mass(name: str, columns: Columns) -> None:
 
 
 def too_light(where: str, total: float, payload: float) -> str:
-    included = f"more than the payload of {bound_text(payload)} kg that it includes"
-    return f"{where}, total_mass_kg: got {bound_text(total)}; expected {included}"
+    included = f"more than the payload of {payload:g} kg that it includes"
+    return f"{where}, total_mass_kg: got {total:g}; expected {included}"
 
 
 def _check_deviations(name: str, columns: Columns, shown: tuple[Channel, ...]) -> None:
@@ -347,7 +346,7 @@ def driven_rows(name: str, columns: Columns, layout: Layout) -> tuple[Columns, n
                 f", and so in {np.count_nonzero(slope)} of {len(slope)} rows" if np.count_nonzero(slope) > 1 else ""
             )
             raise BadData(
-                f"{name} row {row + 1}, slope_deg: got {bound_text(slope[row])} in a table of settled turns{more}; "
+                f"{name} row {row + 1}, slope_deg: got {slope[row]:g} in a table of settled turns{more}; "
                 "on a slope the heading changes all the time, so that no turn is settled there: expected 0; remove "
                 "such rows (simulate --left, --right and --slope with --model drive follows one over time)"
             )
@@ -379,7 +378,7 @@ def _driven(name: str, columns: Columns, layout: Layout) -> tuple[np.ndarray, st
         moving = idle[np.abs(readings[idle]) > STILL * np.max(np.abs(readings))]
         if moving.size and moving.size < len(readings):
             raise BadData(
-                f"{name} row {moving[0] + 1}, {channel.column}: got {bound_text(readings[moving[0]])} where "
+                f"{name} row {moving[0] + 1}, {channel.column}: got {readings[moving[0]]:g} where "
                 f"{zero} is 0; expected what drives it, or remove the row"
             )
     if idle.size == len(size):
@@ -408,7 +407,7 @@ def _check_signs(name: str, columns: Columns, layout: Layout) -> None:
             wrong = np.flatnonzero(readings < 0)
             if wrong.size:
                 raise BadData(
-                    f"{name} row {wrong[0] + 1}, {channel.column}: got {bound_text(readings[wrong[0]])}; expected no "
+                    f"{name} row {wrong[0] + 1}, {channel.column}: got {readings[wrong[0]]:g}; expected no "
                     "negative reading, as the robot's file states that the instrument shows magnitude alone"
                 )
             continue
@@ -427,8 +426,8 @@ def _check_signs(name: str, columns: Columns, layout: Layout) -> None:
             row = int(against[0])
             alike = "" if channel not in channels.OF_TURNS else f"; a turn has {' and '.join(layout.sides)} too"
             raise BadData(
-                f"{name} row {row + 1}, {channel.column}: got {bound_text(readings[row])} at "
-                f"{bound_text(imposed[row])} {unit}; "
+                f"{name} row {row + 1}, {channel.column}: got {readings[row]:g} at "
+                f"{imposed[row]:g} {unit}; "
                 "nothing else drives the motors there, so expected a reading with the sign of the drive, the "
                 f"same in every row{alike}"
             )
@@ -437,8 +436,8 @@ def _check_signs(name: str, columns: Columns, layout: Layout) -> None:
             alone = f"; or signed = false for {channel.name} in the robot's file, if it shows magnitude alone"
             hint = alone if layout.crosses_zero else ""
             raise BadData(
-                f"{name} row {row + 1}, {channel.column}: got {bound_text(readings[row])} at "
-                f"{bound_text(imposed[row])} {unit}; expected readings with their signs, negative backward{hint}"
+                f"{name} row {row + 1}, {channel.column}: got {readings[row]:g} at "
+                f"{imposed[row]:g} {unit}; expected readings with their signs, negative backward{hint}"
             )
 
 
@@ -508,7 +507,7 @@ def driven_backward_notes(name: str, columns: Columns, layout: Layout) -> Iterat
     if on.size and not set(TIME) & set(columns) and columns[LOAD].min() >= 0:
         more = f", and so in {on.size} rows" if on.size > 1 else ""
         yield (
-            f"{name} row {on[0] + 1}, {LOAD}: got {bound_text(columns[LOAD][on[0]])} where the shaft is driven "
+            f"{name} row {on[0] + 1}, {LOAD}: got {columns[LOAD][on[0]]:g} where the shaft is driven "
             f"backward{more}: it turns the shaft on there; a brake's torque is negative backward"
         )
 

@@ -30,7 +30,7 @@ from calibration.data import (
 )
 from calibration.data.columns import CONDITIONS, DUTY, SUPPLY, TIME, WHEN, Column, Layout
 from calibration.data.computed_columns import without_computed_torques
-from calibration.data.input_errors import BadConfiguration, BadData, bound_text
+from calibration.data.input_errors import BadConfiguration, BadData
 from calibration.data.named_arrays import NamedArrays, Raw, column_numbers, column_texts, missing_readings
 from calibration.data.sources import opening, reading
 from calibration.data.sources.in_memory import EXPECTED
@@ -331,7 +331,7 @@ def single_run(cells: Json, layout: Layout | None = None) -> Runs:
     for column, value in cells.items():
         quantity = rows[column]
         meaning = Column(quantity, column, next(iter(quantity.units)))
-        text = bound_text(value) if isinstance(value, float) else str(value)
+        text = f"{value:g}" if isinstance(value, float) else str(value)
         columns[column], refused = column_names.convert_column(meaning, [text], layout)
         if refused.any():
             raise BadConfiguration(column_names.refused_cell_sentence("option", meaning, text, layout, hints=False))

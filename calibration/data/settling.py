@@ -15,7 +15,7 @@ from calibration.data import Columns
 from calibration.data.columns import LOAD, SPEED, TIME
 from calibration.data.contradictions import GAP
 from calibration.data.courses import applied_drive, differs_from_row_before
-from calibration.data.input_errors import BadData, bound_text
+from calibration.data.input_errors import BadData
 from calibration.data.instruments import step_of
 from calibration.data.row_checks import inertia_at_motor
 from calibration.data.runs import Runs
@@ -311,12 +311,12 @@ def _in_order(runs: Runs) -> list[np.ndarray]:
             row, was, now = int(rows[k + 1]) + 1, time[rows[k]], time[rows[k + 1]]
             if now == was:
                 raise BadData(
-                    f"{runs.source} row {row}, time_s: {bound_text(now)} s is repeated; give each sample "
+                    f"{runs.source} row {row}, time_s: {now:g} s is repeated; give each sample "
                     "its own time, "
                     "with more digits if the clock has them, or remove one"
                 )
             raise BadData(
-                f"{runs.source} row {row}, time_s: goes back from {bound_text(was)} to {bound_text(now)} "
+                f"{runs.source} row {row}, time_s: goes back from {was:g} to {now:g} "
                 "s; give each "
                 "recording its own run_id, or sort the rows"
             )
@@ -432,7 +432,7 @@ def _check_alive(runs: Runs, signal: Signal) -> None:
             column, _, factor = next(x for x in RATES if x[1] == signal.channel.name)
             value, unit = signal.angle[np.isfinite(signal.angle)][0] / factor, column.rpartition("_")[2]
         raise BadData(
-            f"{runs.source} rows 1 to {len(runs)}, {column}: {bound_text(value)} {unit} in every row; the channel is "
+            f"{runs.source} rows 1 to {len(runs)}, {column}: {value:g} {unit} in every row; the channel is "
             "frozen or not connected; remove the column, or the channel from the rig's file"
         )
 
@@ -819,10 +819,10 @@ NEAR = 0.03
 
 def _shows(found: Settled, s: Stretch, channel: Channel) -> str:
     """Place of a stretch, with a channel's reading there and the imposed value, for a message."""
-    reading, unit = bound_text(_digits(s.mean[channel.name], 4)), found.runs.layout.imposed_column.rpartition("_")[2]
+    reading, unit = _digits(s.mean[channel.name], 4), found.runs.layout.imposed_column.rpartition("_")[2]
     return (
-        f"{found.runs.source} rows {s.rows[0] + 1} to {s.rows[-1] + 1}, {channel.column}: shows {reading} "
-        f"{channel.unit} at {bound_text(_digits(s.imposed, 4))} {unit}"
+        f"{found.runs.source} rows {s.rows[0] + 1} to {s.rows[-1] + 1}, {channel.column}: shows {reading:g} "
+        f"{channel.unit} at {_digits(s.imposed, 4):g} {unit}"
     )
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from calibration.data import Columns, Names
 from calibration.data.columns import DUTY, SIDES, SUPPLY, VOLTS, Layout
-from calibration.data.input_errors import BadData, bound_text
+from calibration.data.input_errors import BadData
 from calibration.data.table import Runs, drive_of_sides
 from mmrjax.model import channels
 from mmrjax.model.quantities import TURN
@@ -65,8 +65,8 @@ def of_volts(name: str, columns: Columns, battery: bool) -> Names:
     if beyond.any():
         side, row = (int(k[0]) for k in np.nonzero(beyond))
         raise BadData(
-            f"{name} row {row + 1}, {[*VOLTS][side]}: got {bound_text(volts[side, row])} of a supply of "
-            f"{bound_text(supply[row])} V; expected no more than {SUPPLY}, or no such column: the supply's "
+            f"{name} row {row + 1}, {[*VOLTS][side]}: got {volts[side, row]:g} of a supply of "
+            f"{supply[row]:g} V; expected no more than {SUPPLY}, or no such column: the supply's "
             "is then the "
             "larger of both sides'"
         )
@@ -116,7 +116,7 @@ def _refuse_against(
     if told.sum() < FEWEST or against.sum() <= MOSTLY * told.sum():
         return
     row = int(np.argmax(np.where(against, np.abs(drive), -1.0)))
-    got, at = (" and ".join(bound_text(float(f"{x[row]:.4g}")) for x in sides) for sides in (shown, runs.of_sides))
+    got, at = (" and ".join(f"{float(f'{x[row]:.4g}'):g}" for x in sides) for sides in (shown, runs.of_sides))
     unit = runs.layout.imposed_column.rpartition("_")[2]
     raise BadData(
         f"{runs.source} row {row + 1}, {column}: got {got} where left and right side are driven at {at} {unit}, "

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import csv
 import dataclasses
+import inspect
 import io
 import json
 import math
@@ -17,7 +18,7 @@ from typing import Any, TextIO, TypeAlias
 
 import numpy as np
 
-from calibration.data import Columns
+from calibration.data import Columns, Json
 from mmrjax.errors import printable
 from mmrjax.model.quantities import TABLE, unit_at_end, unit_in_column
 
@@ -237,11 +238,18 @@ def _is_number(text: str) -> bool:
     return False
 
 
+def entries_of(value: Any, *listed: str) -> Json:
+    """Entries of an object, listed as `key` or `key=attribute.of.attribute`. Methods are called."""
+    pairs = (entry.partition("=") for entry in listed)
+    found = {key: operator.attrgetter(attribute or key)(value) for key, _, attribute in pairs}
+    return {key: x() if inspect.ismethod(x) else x for key, x in found.items()}
+
+
 def json_value(value: Any) -> Any:
     """Data for JSON, with null in place of numbers that are not finite.
 
-    An object becomes the entries that its class lists in `JSON`, as `key` or `key=attribute.of.attribute`. Without
-    such a list it becomes its `to_json()`, or the fields of its dataclass.
+    An object becomes the entries that its class lists in `JSON`, see `entries_of`. Without such a list it becomes its
+    `to_json()`, or the fields of its dataclass.
     """
     listed = getattr(value, "JSON", None)
     if listed is None and hasattr(value, "to_json"):
@@ -249,8 +257,7 @@ def json_value(value: Any) -> Any:
     if listed is None and dataclasses.is_dataclass(value):
         listed = [field.name for field in dataclasses.fields(value)]
     if listed is not None:
-        pairs = (entry.partition("=") for entry in listed)
-        return {key: json_value(operator.attrgetter(attribute or key)(value)) for key, _, attribute in pairs}
+        return json_value(entries_of(value, *listed))
     if isinstance(value, Mapping):
         return {key: json_value(v) for key, v in value.items()}
     if isinstance(value, list | tuple):

@@ -20,7 +20,6 @@ from calibration.data import Names, own_mass
 from calibration.data.columns import ROWS, SIDES, WHEN
 from calibration.data.effect_file import Library
 from calibration.data.input_errors import BadConfiguration, BadData
-from calibration.data.posterior_file import Posterior
 from calibration.data.runs import Runs
 from calibration.data.thinning import used_rows
 from calibration.described import describe, in_words
@@ -30,7 +29,7 @@ from calibration.discovery.adequacy import AdequacyTest, Diagnosis
 from calibration.discovery.candidates import BaseFit, Candidate, fill_slots, fit_base, fit_candidates, start_of_fit
 from calibration.discovery.classes import Classes, find_classes, signature_cosines
 from calibration.discovery.description import missed_channels, remaining_errors, unused_inputs
-from calibration.discovery.discrepancy import CurveBeside, Discrepancy, locate_discrepancy
+from calibration.discovery.discrepancy import CurveBeside, locate_discrepancy
 from calibration.discovery.experiments import Proposal, propose_denser_runs, propose_nothing, propose_separating
 from calibration.discovery.hidden import Hidden, find_hidden_effects
 from calibration.discovery.kept import Keep
@@ -47,7 +46,6 @@ from calibration.discovery.outliers import (
 )
 from calibration.discovery.prediction import Predicted
 from calibration.discovery.result import (
-    Alternative,
     DiscoveryResult,
     Errors,
     FoundEffect,
@@ -55,7 +53,6 @@ from calibration.discovery.result import (
     Ranking,
     ReadingsOfRows,
     Sensitivity,
-    UnnamedDiscrepancy,
 )
 from calibration.discovery.score_tests import Statistics, bootstrap
 from calibration.discovery.screening import screen_by_weak_form, with_program_room
@@ -76,6 +73,7 @@ from calibration.inference.lost_motion import lost_motion_notes
 from calibration.inference.noise import Noise
 from calibration.inference.noise_factor import common_factors, noise_remarks
 from calibration.inference.residual_clusters import residual_clusters
+from calibration.inference.simulation_errors import channel_errors
 from mmrjax import effects, fidelities
 from mmrjax.compile.precision import SINGLE, Threads, in_double, is_double
 from mmrjax.effects import Effect
@@ -153,10 +151,10 @@ def discover(
         runs, robot, noise=noise, stated=stated, library=library, replicates=replicates, seed=seed, prefer=prefer,
         forbidden=forbidden, rows=rows,
     )  # fmt: skip
-    distinct, known = ready.runs, ready.noise
+    told, known = dataclasses.replace(ready, progress=tell, keep=keep), ready.noise
     for note in ready.at_first:
         tell(note)
-    traced, notes = keep("verdict", lambda: ready.trace(progress=tell, ahead=True, keep=keep)), ready.notes
+    traced, notes = keep("verdict", lambda: told.trace(ahead=True)), ready.notes
     silent = channels.channel_names(known.silent)
     factors = FACTORS.get(known.word, ())
     # Verdicts at other noises use the programs of the first one, so they run in parallel on other cores.
@@ -168,13 +166,10 @@ def discover(
 
         def other(factor: float) -> LoopStages:
             noise = known.scaled(dict.fromkeys(silent, factor))
-            return keep(f"noise {factor:g}", lambda: ready.trace(noise, known=traced))
+            return keep(f"noise {factor:g}", dataclasses.replace(ready, noise=noise, known=traced).trace)
 
         verdicts = {f: threads.submit(other, f) for f in factors}
-        found = keep(
-            "result",
-            lambda: assemble_result(traced, distinct, ready.numbers, ready.settings, ready.library, tell),
-        )
+        found = keep("result", lambda: assemble_result(told, traced))
         if not all(verdict.done() for verdict in verdicts.values()):
             tell(next_step("others"))
         for f, verdict in verdicts.items():
@@ -201,7 +196,7 @@ def discover(
 
 @dataclasses.dataclass(frozen=True)
 class LoopInput:
-    """Input of the loop's stages: a table, its robot, and the settings.
+    """Context of the loop's stages: a table, its robot, the settings, and callbacks.
 
     Attributes:
         runs: without copies.
@@ -213,31 +208,81 @@ class LoopInput:
         library: effects to test.
         notes: on all of these.
         at_first: those to report before the first fit.
+        progress: callback for progress notes.
+        keep: function that stores each stage when it ends. A stored stage contains the results of the stages before.
+        known: stages of the same table with other sds.
+        others: open while programs of later stages are compiled on other cores, which `later` begins, or None.
     """
 
     runs: Runs
     numbers: np.ndarray
     robot: Robot
     noise: Noise
-    stated: dict[str, tuple[float, float]]
+    stated: Mapping[str, tuple[float, float]]
     settings: Settings
     library: Library
-    notes: Notes
-    at_first: Notes
+    notes: Notes = ()
+    at_first: Notes = ()
+    progress: Tell = lambda note: None
+    keep: Keep = kept.keep_nothing
+    known: LoopStages | None = None
+    others: contextlib.ExitStack | None = None
+    later: list[Callable[[BaseFit], None]] = dataclasses.field(default_factory=list)
 
-    def trace(
-        self,
-        noise: Noise | None = None,
-        progress: Tell = lambda note: None,
-        known: LoopStages | None = None,
-        ahead: bool = False,
-        keep: Keep = kept.keep_nothing,
-    ) -> LoopStages:
-        """Stages up to a verdict, with this noise or another. Other arguments as in the function `trace`."""
-        sds = self.noise if noise is None else noise
-        return trace(
-            self.runs, self.robot, sds, self.settings, self.stated, self.library, progress, known, ahead, keep
-        )
+    def trace(self, ahead: bool = False) -> LoopStages:
+        """Stages of the loop up to a verdict, in order.
+
+        With `ahead`, programs of later stages are compiled on other cores once a log's equations are ranked.
+
+        The bootstrap's statistics, in units of their sds, depend only weakly on the sds. If the stages of the same
+        table with other sds are `known`, with the same included rows, their replicates are reused. Fits of histories
+        then take a few Gauss-Newton steps from those. Sets of effects outside their program are not simulated, and no
+        further row is excluded.
+
+        If the residuals have no structure and exceed the sds by the same factor everywhere, the sds are wrong. The
+        stages are then repeated with sds from the residuals.
+        """
+        ranked = list[Ranking]()
+        with contextlib.ExitStack() as others:
+            given = dataclasses.replace(self, others=others if ahead else None, later=[])
+            screened, sds = self.keep("base", functools.partial(_fit_base_and_noise, given, ranked))
+            screened, left, searched = _search_until_clean(given, screened, sds, ranked)
+            if searched is None:
+                missed = missed_channels(screened.base.space, self.runs, sds.noise, left.linear)
+                word = "undescribed" if missed or self.loses_motion else "none"
+                return LoopStages(word, screened, left, sds, missed=missed, unused=unused_inputs(self.runs))
+            return _verdict(given, screened, left, sds, searched)
+
+    @functools.cached_property
+    def loses_motion(self) -> bool:
+        """True if the log shows a backlash that the robot does not have."""
+        return bool(lost_motion_notes(self.runs, self.robot))
+
+    def screen(self, noise: Noise, before: BaseFit | None, ranked: list[Ranking]) -> Screening:
+        """The base fit with this noise, from one with another if given, and its outliers.
+
+        A log's equations in weak form give the program and the start of its fit. Their ranking of the library is
+        appended to `ranked`.
+        """
+        space = pose_candidates(self.runs, self.robot, noise.sd, self.settings, self.stated, self.library)
+        known, at = self.known, functools.partial(bases_at_fit, self.runs)
+        near = None
+        if before is not None:
+            space, near = space.with_room(before.space.room), before.candidate
+        else:
+            if (ranking := screen_by_weak_form(space, self.settings)) is not None:
+                make = functools.partial(findings.rank_by_weak_form, space, ranking, self.settings)
+                ranked.append(self.keep("ranking", make))
+                begins = {c.active: c.z for c in [c for c in ranking.alone if c.plausible][:1]}
+                space, near = dataclasses.replace(space.with_room(ranking.room), begins=begins), ranking.base
+            if self.others is not None:
+                self.later.append(self.others.enter_context(compile_ahead(space, at, self.settings)))
+        self.progress(next_step("base"))
+        if known is not None and space.bare.observe.long:  # the same rows are included here
+            space = dataclasses.replace(space.without(np.array(known.screened.outliers, int)), near=known.simulated)
+            base = fit_base(space, self.settings, self.runs.source, near)
+            return screen_known_rows(base, at, known.screened, self.settings)
+        return screen_outliers(fit_base(space, self.settings, self.runs.source, near), at, self.runs, self.settings)
 
 
 def prepare_loop(
@@ -408,160 +453,62 @@ class LoopStages:
         return self.searched.diagnosis
 
 
-def trace(
-    runs: Runs,
-    robot: Robot,
-    noise: Noise,
-    settings: Settings,
-    stated: Mapping[str, tuple[float, float]] | None = None,
-    library: Library = effects.BY_NAME,
-    progress: Tell = lambda note: None,
-    known: LoopStages | None = None,
-    ahead: bool = False,
-    keep: Keep = kept.keep_nothing,
-) -> LoopStages:
-    """Stages of the loop up to a verdict, in order, with known noise.
-
-    With `ahead`, programs of later stages are compiled on other cores once a log's equations are ranked. A stored
-    stage contains the results of the stages before it.
-
-    The bootstrap's statistics, in units of their sds, depend only weakly on the sds. If the stages of the same table
-    with other sds are `known`, with the same included rows, their replicates are reused. Fits of histories then take
-    a few Gauss-Newton steps from those. Sets of effects outside their program are not simulated, and no further
-    row is excluded.
-
-    If the residuals have no structure and exceed the sds by the same factor everywhere, the sds are wrong. The
-    stages are then repeated with sds from the residuals.
-    """
-    ranked = list[Ranking]()
-    with contextlib.ExitStack() as others:
-        compiling = _Compiling(others) if ahead else None
-        task = _Task(runs, robot, noise, settings, stated, library, progress, known, compiling, keep)
-        screened, sds = keep("base", functools.partial(_fit_base_and_noise, task, ranked))
-        screened, left, searched = _search_until_clean(task, screened, sds, ranked)
-        if searched is None:
-            missed = missed_channels(screened.base.space, runs, sds.noise, left.linear)
-            word = "undescribed" if missed or task.loses_motion else "none"
-            return LoopStages(word, screened, left, sds, missed=missed, unused=unused_inputs(runs))
-        return _verdict(task, screened, left, sds, searched)
-
-
-class _Compiling:
-    """Programs that are compiled on other cores, until `others` is closed."""
-
-    def __init__(self, others: contextlib.ExitStack) -> None:
-        self.others, self.later = others, lambda base: None
-
-    def begin(self, task: _Task, space: CandidateSpace) -> None:
-        """Begin with the programs of a space."""
-        at = functools.partial(bases_at_fit, task.runs)
-        self.later = self.others.enter_context(compile_ahead(space, at, task.settings))
-
-
-@dataclasses.dataclass(frozen=True)
-class _Task:
-    """Arguments of `trace`, shared by its stages."""
-
-    runs: Runs
-    robot: Robot
-    noise: Noise
-    settings: Settings
-    stated: Mapping[str, tuple[float, float]] | None
-    library: Library
-    progress: Tell
-    known: LoopStages | None
-    compiling: _Compiling | None
-    keep: Keep
-
-    @functools.cached_property
-    def loses_motion(self) -> bool:
-        """True if the log shows a backlash that the robot does not have."""
-        return bool(lost_motion_notes(self.runs, self.robot))
-
-    def screen(self, noise: Noise, before: BaseFit | None, ranked: list[Ranking]) -> Screening:
-        """The base fit with this noise, from one with another if given, and its outliers. See `windows`."""
-        space = pose_candidates(self.runs, self.robot, noise.sd, self.settings, self.stated, self.library)
-        known, at = self.known, functools.partial(bases_at_fit, self.runs)
-        if before is None:
-            space, near = self.windows(space, ranked)
-            if self.compiling is not None:
-                self.compiling.begin(self, space)
-        else:
-            space, near = space.with_room(before.space.room), before.candidate
-        self.progress(next_step("base"))
-        if known is not None and space.bare.observe.long:  # the same rows are included here
-            space = dataclasses.replace(space.without(np.array(known.screened.outliers, int)), near=known.simulated)
-            base = fit_base(space, self.settings, self.runs.source, near)
-            return screen_known_rows(base, at, known.screened, self.settings)
-        return screen_outliers(fit_base(space, self.settings, self.runs.source, near), at, self.runs, self.settings)
-
-    def windows(self, space: CandidateSpace, ranked: list[Ranking]) -> tuple[CandidateSpace, Candidate | None]:
-        """Program and start of the base fit from a log's equations in weak form. Their ranking of the library is
-        appended to `ranked`."""
-        ranking = screen_by_weak_form(space, self.settings)
-        if ranking is None:
-            return space, None
-        make = functools.partial(findings.rank_by_weak_form, space, ranking, self.settings)
-        ranked.append(self.keep("ranking", make))
-        begins = {c.active: c.z for c in [c for c in ranking.alone if c.plausible][:1]}
-        return dataclasses.replace(space.with_room(ranking.room), begins=begins), ranking.base
-
-
-def _fit_base_and_noise(task: _Task, ranked: list[Ranking]) -> tuple[Screening, Sds]:
+def _fit_base_and_noise(given: LoopInput, ranked: list[Ranking]) -> tuple[Screening, Sds]:
     """The base fit and the noise, rescaled if residuals without structure exceed it by one factor."""
-    known, noise = task.known, task.noise
-    screened = task.screen(noise, None if known is None else known.screened.base, ranked)
-    residuals = residuals_of(screened, task.runs)
+    known, noise = given.known, given.noise
+    screened = given.screen(noise, None if known is None else known.screened.base, ranked)
+    residuals = residuals_of(screened, given.runs)
     factors = {} if screened.cluster is not None else common_factors(residuals)
     sds = Sds(noise, factors, tuple(noise_remarks(residuals, noise.word)))
     if factors:
-        task.progress(next_step("sds"))
+        given.progress(next_step("sds"))
         sds = dataclasses.replace(sds, noise=noise.scaled(factors))
-        screened = task.screen(sds.noise, screened.base, ranked)
+        screened = given.screen(sds.noise, screened.base, ranked)
     return screened, sds
 
 
-def _test_base(task: _Task, sds: Sds, screened: Screening) -> tuple[Screening, Diagnosis]:
+def _test_base(given: LoopInput, sds: Sds, screened: Screening) -> tuple[Screening, Diagnosis]:
     """A base fit with the sets of effects to be simulated in its program, and the bootstrap of its residuals."""
-    known, weight = task.known, screened.base.space.weight
+    known, weight = given.known, screened.base.space.weight
     null = None if known is None or np.any(known.screened.base.space.weight != weight) else known.left.test.null
     base, (linear, scores, _) = screened.base, screened.diagnosed
-    space = with_program_room(base.space, base.candidate, linear, scores, task.settings)
+    space = with_program_room(base.space, base.candidate, linear, scores, given.settings)
     screened = dataclasses.replace(screened, base=dataclasses.replace(base, space=space))
-    if task.compiling is not None and np.max(np.abs(np.asarray(scores.single))) > LIKELY:
-        task.compiling.later(screened.base)
-    return screened, diagnosis_of_base(screened, task.settings, sds.noise.freedom, null)
+    if np.max(np.abs(np.asarray(scores.single))) > LIKELY:
+        for begin in given.later:
+            begin(screened.base)
+    return screened, diagnosis_of_base(screened, given.settings, sds.noise.freedom, null)
 
 
-def _search_effects(task: _Task, screened: Screening, left: Diagnosis) -> tuple[Screening, Diagnosis, Search]:
+def _search_effects(given: LoopInput, screened: Screening, left: Diagnosis) -> tuple[Screening, Diagnosis, Search]:
     """Search for effects that explain the residuals of the base."""
     base = screened.base
-    searched = search_effects(base.space, base.candidate, left, screened.bases, task.settings, task.progress)
+    searched = search_effects(base.space, base.candidate, left, screened.bases, given.settings, given.progress)
     base = dataclasses.replace(base, space=base.space.with_room(searched.room))
     return dataclasses.replace(screened, base=base), left, searched
 
 
 def _search_until_clean(
-    task: _Task, screened: Screening, sds: Sds, ranked: list[Ranking]
+    given: LoopInput, screened: Screening, sds: Sds, ranked: list[Ranking]
 ) -> tuple[Screening, Diagnosis, Search | None]:
     """Search, repeated while it leaves outliers, None if the base leaves no discrepancy or lacks a backlash."""
-    settings, keep, progress = task.settings, task.keep, task.progress
+    settings, keep, progress = given.settings, given.keep, given.progress
     for k in range(SCREENINGS):
         progress(next_step("bootstrap", settings.replicates))
-        screened, left = keep(f"bootstrap {k}", functools.partial(_test_base, task, sds, screened))
+        screened, left = keep(f"bootstrap {k}", functools.partial(_test_base, given, sds, screened))
         if k == 0 and not ranked:
             keep("ranking", functools.partial(findings.rank_library, screened.base.space, left, settings))
-        if task.loses_motion or (not left.test.rejected and screened.cluster is None):
+        if given.loses_motion or (not left.test.rejected and screened.cluster is None):
             return screened, left, None  # effects of the library would only stand in for a backlash
         progress(next_step("effects"))
-        screened, left, searched = keep(f"search {k}", functools.partial(_search_effects, task, screened, left))
+        screened, left, searched = keep(f"search {k}", functools.partial(_search_effects, given, screened, left))
         after = searched.diagnosis
         if after is None and (confirmed := _confirmed(screened, left, searched)) is not None:
             return screened, confirmed, None
         if after is None or not after.test.rejected_with_margin or screened.base.space.near:
             break
         more = screen_with_effects(
-            screened, after.scores, lambda base: bases_at_fit(task.runs, base), task.runs, settings
+            screened, after.scores, lambda base: bases_at_fit(given.runs, base), given.runs, settings
         )
         if more is None:
             break
@@ -586,9 +533,9 @@ def _confirmed(screened: Screening, left: Diagnosis, searched: Search) -> Diagno
     return None if confirmed.rejected else dataclasses.replace(left, test=confirmed)
 
 
-def _verdict(task: _Task, screened: Screening, left: Diagnosis, sds: Sds, searched: Search) -> LoopStages:
+def _verdict(given: LoopInput, screened: Screening, left: Diagnosis, sds: Sds, searched: Search) -> LoopStages:
     """Verdict on a base with a discrepancy: names, classes, a mechanism or a place."""
-    runs, settings, progress = task.runs, task.settings, task.progress
+    runs, settings, progress = given.runs, given.settings, given.progress
     base, space, bases = screened.base.candidate, screened.base.space, screened.bases
     beside, predicted = CurveBeside(space, base, left, bases), Predicted()
     where = dataclasses.replace(beside.where, by_duty=varied_by_duty(runs))
@@ -894,220 +841,99 @@ def missing_effects(space: CandidateSpace, alike: Classes, support: NameSupport 
 # --- the result -----------------------------------------------------------------------------------------
 
 
-@dataclasses.dataclass(frozen=True)
-class _FitOfVerdict:
-    """Fit of a result: with the named effects, or with the curve if no name is given.
-
-    Attributes:
-        before, after: fits of the base and of the proposal, None if that is the base.
-        robot: of the fit, with its coordinates z, their sds, its cost, and whether it converged.
-        ends: its diagnosis.
-        curve, beside: the curve and the diagnosis with it, if no name is given.
-    """
-
-    before: findings.Fitted
-    after: findings.Fitted | None
-    robot: Robot
-    z: np.ndarray
-    sd: np.ndarray
-    cost: float
-    converged: bool
-    posterior: Posterior
-    ends: Diagnosis
-    curve: Discrepancy | None = None
-    beside: Diagnosis | None = None
-
-    def or_refit(self, traced: LoopStages, kept: bool) -> _FitOfVerdict:
-        """Copy that is unchanged if `kept`, else has the robot and the posterior of the refit."""
-        if kept:
-            return self
-        space, base = traced.screened.base.space, traced.screened.base.candidate
-        posterior = posterior_of_fit(space, base.active, base.z, traced.left.linear)
-        robot = findings.proposed_robot(space, base)
-        return dataclasses.replace(self, robot=robot, converged=base.converged, posterior=posterior)
-
-
-def _fit_of_verdict(traced: LoopStages, progress: Tell) -> _FitOfVerdict:
-    """Fit of a verdict's result."""
-    space, base, best, ends = traced.screened.base.space, traced.screened.base.candidate, traced.best, traced.ends
-    curve = beside = None
-    if traced.verdict in WITHOUT_NAME and traced.beside is not None:
-        progress(next_step("shape"))
-        curve, beside = traced.beside.curve, traced.beside.diagnosis
-    before = findings.Fitted(*space.fit_of(base.active, base.z))
-    if best is base and curve is not None and beside is not None:
-        return _FitOfVerdict(
-            before, findings.Fitted(curve.problem, curve.z, None), curve.robot, curve.z,
-            np.sqrt(np.diag(curve.covariance)), curve.chi2[1] / 2, curve.converged,
-            posterior_of_curve(space, best.active, curve), beside, curve, beside,
-        )  # fmt: skip
-    after = None if best is base else findings.Fitted(*space.fit_of(best.active, best.z))
-    posterior = posterior_of_fit(space, best.active, best.z, ends.linear)
-    robot = findings.proposed_robot(space, best)
-    return _FitOfVerdict(
-        before, after, robot, best.z, best.sd, best.cost, best.converged, posterior, ends, curve, beside
-    )
-
-
-def _predicts_well(traced: LoopStages, written: _FitOfVerdict, gain: prediction.Gain | None) -> bool:
-    """True if the proposal predicts well enough to be written instead of the refit.
-
-    A written fit never predicts worse than the refit. A curve, which claims no cause, has to predict better.
-    """
-    refit = traced.best is traced.screened.base.candidate
-    if gain is None or (written.curve is None and refit):
-        return True
-    return gain.mean > gain.se if refit else gain.mean >= -prediction.WORSE
-
-
-def _claims(
-    traced: LoopStages, settings: Settings
-) -> tuple[tuple[FoundEffect, ...], DiscrepancyLocation | None, tuple[Hidden, ...]]:
-    """Effects that a verdict names, location of the remaining discrepancy, and effects that they may conceal."""
-    screened, left, alike = traced.screened, traced.left, traced.alike
-    space, base, best = screened.base.space, screened.base.candidate, traced.best
-    if alike is None:
-        return (), None, ()
-    found_effects = findings.found_effects(space, base, best, alike, left.test, settings)
-    if traced.verdict in WITHOUT_NAME:
-        return found_effects, None, ()
-    ask = space.bare.observe.menu and not space.bare.observe.long
-    concealed = find_hidden_effects(space, best, alike, left, traced.ends, settings, ask=ask)
-    return found_effects, traced.where, concealed
-
-
-def assemble_result(
-    traced: LoopStages,
-    runs: Runs,
-    numbers: np.ndarray | None,
-    settings: Settings,
-    library: Library,
-    progress: Tell,
-) -> DiscoveryResult:
+def assemble_result(given: LoopInput, traced: LoopStages) -> DiscoveryResult:
     """Result of a verdict, with the final computations: hold-out errors, and the next experiment."""
-    screened, noise = traced.screened, traced.sds.noise
-    space, base, best = screened.base.space, screened.base.candidate, traced.best
-    included = space.included[: len(runs)]
-    numbers = np.arange(1, len(runs) + 1) if numbers is None else numbers
-    fit_to_write = _fit_of_verdict(traced, progress)
+    runs, numbers, settings, progress = given.runs, given.numbers, given.settings, given.progress
+    screened, left, noise, nameless = traced.screened, traced.left, traced.sds.noise, traced.verdict in WITHOUT_NAME
+    space, base, best, ends = screened.base.space, screened.base.candidate, traced.best, traced.ends
+    observe, included = space.bare.observe, space.included[: len(runs)]
+    # The fit of the result: with the named effects, or with the curve if no name is given.
+    beside = traced.beside if nameless else None
+    if beside is not None:
+        progress(next_step("shape"))
+    before, curve = findings.Fitted(*space.fit_of(base.active, base.z)), None
+    after, z, sd, cost = None, best.z, best.sd, best.cost
+    if beside is not None and best is base:
+        curve, ends = beside.curve, beside.diagnosis
+        z, sd, cost = curve.z, np.sqrt(np.diag(curve.covariance)), curve.chi2[1] / 2
+        after = findings.Fitted(curve.problem, z, None)
+    elif best is not base:
+        after = findings.Fitted(*space.fit_of(best.active, z))
     progress(next_step("errors"))
     predictions = [traced.predicted.get(prediction.candidate_key(c)) for c in (base, best)]
     kinds = blocks_room.predictable_blocks(runs, space.bare)
-    readings_of_rows = findings.readings_of_rows(
-        runs,
-        noise.sd,
-        kinds,
-        fit_to_write.before,
-        fit_to_write.after,
-        predictions[0],
-        None if best is base else predictions[1],
+    seen = findings.readings_of_rows(
+        runs, noise.sd, kinds, before, after, predictions[0], None if best is base else predictions[1]
     )
     compared = traced.held_out
-    nameless = traced.verdict in WITHOUT_NAME
-    if traced.alike is not None and not nameless and not compared and not space.bare.observe.long:
+    if traced.alike is not None and not nameless and not compared and not observe.long:
         compared = preference.compare_alternatives(space, runs, best, traced.alike)
-    gains = _gains(space, runs, traced, readings_of_rows)
-    keeps_fit = _predicts_well(traced, fit_to_write, gains[-1][1] if gains else None)
-    fit_to_write = fit_to_write.or_refit(traced, keeps_fit)
+    gains = _gains(space, runs, traced, seen)
+    gain = gains[-1][1] if gains and after is not None else None
+    # What is written never predicts worse than the refit. A curve, which claims no cause, has to predict better.
+    written = gain is None or (gain.mean > gain.se if best is base else gain.mean >= -prediction.WORSE)
+    if written and curve is not None:
+        robot, converged, posterior = curve.robot, curve.converged, posterior_of_curve(space, best.active, curve)
+    else:
+        fit, of_fit = (best, traced.ends) if written else (base, left)
+        robot, converged = findings.proposed_robot(space, fit), fit.converged
+        posterior = posterior_of_fit(space, fit.active, fit.z, of_fit.linear)
     progress(next_step("next"))
-    remaining = _residuals(space, runs, fit_to_write.ends.linear, readings_of_rows.after, fit_to_write.z)
-    result_input = _ResultInput(traced, fit_to_write, readings_of_rows, compared, gains, keeps_fit, remaining)
-    result = _result(result_input, runs, numbers, settings, library)
-    # A temporary change is not uniform.
-    of_noise = noise_remarks_before_verdict(traced.sds, remaining) if traced.sds.factors or not traced.events else ()
-    return dataclasses.replace(
-        result, remarks=(*of_noise, *refit_worse(readings_of_rows, noise, included), *loop_remarks(result))
-    )
+    remaining = _residuals(space, runs, ends.linear, seen.after, z)
 
+    def error(simulated: np.ndarray) -> Errors:
+        simulated = np.where(included[:, None], simulated, np.nan)
+        return channel_errors(space.bare.channels, simulated, seen.measured, seen.sd)
 
-@dataclasses.dataclass(frozen=True)
-class _ResultInput:
-    """Verdict, fit and predictions as input of a result.
-
-    Attributes:
-        seen: readings of each row.
-        compared: alternatives by hold-out errors.
-        remaining: residuals of the fit.
-        gains: of predictions over the refit's, as from `_gains`.
-        kept: True if the fit is written.
-    """
-
-    traced: LoopStages
-    written: _FitOfVerdict
-    seen: ReadingsOfRows
-    compared: tuple[HeldOutAlternative, ...]
-    gains: tuple[tuple[Names, prediction.Gain], ...]
-    kept: bool
-    remaining: Residuals
-
-
-def _alternatives(found: _ResultInput, settings: Settings) -> tuple[tuple[Alternative, ...], tuple[Alternative, ...]]:
-    """Sets of effects that explain nearly as much, and those of implausible size."""
-    traced = found.traced
-    ladder = traced.searched.ladder if traced.searched is not None else ()
-    ladder = traced.alike.ladder if traced.alike is not None else ladder
-    return findings.listed_alternatives(traced.screened.base.space, traced.best, found.written.cost, ladder, settings)
-
-
-def _unnamed(found: _ResultInput, rows: int) -> UnnamedDiscrepancy | None:
-    """Discrepancy described by a curve, if no name is given."""
-    written, where = found.written, found.traced.where
-    if written.curve is None or where is None or written.beside is None:
-        return None
-    return findings.unnamed_discrepancy(
-        written.curve, where, found.traced.left.test.p_value, written.beside.linear, rows
-    )
-
-
-def _result(
-    about: _ResultInput, runs: Runs, numbers: np.ndarray, settings: Settings, library: Library
-) -> DiscoveryResult:
-    """Result without its remarks."""
-    traced, written, seen = about.traced, about.written, about.seen
-    screened, left, ends = traced.screened, traced.left, written.ends
-    space, base = screened.base.space, screened.base.candidate
-    observe, included = space.bare.observe, space.included[: len(runs)]
-    error = lambda simulated: findings.errors_of_readings(space.bare, simulated, seen.measured, seen.sd, included)  # noqa: E731
-    near, too_large = _alternatives(about, settings)
-    found, remains, concealed = _claims(traced, settings)
+    ladder = () if traced.searched is None else traced.searched.ladder
+    ladder = ladder if traced.alike is None else traced.alike.ladder
+    near, too_large = findings.listed_alternatives(space, best, cost, ladder, settings)
+    found: tuple[FoundEffect, ...] = ()
+    concealed: tuple[Hidden, ...] = ()
+    if traced.alike is not None:
+        found = findings.found_effects(space, base, best, traced.alike, left.test, settings)
+        if not nameless:
+            ask = observe.menu and not observe.long
+            concealed = find_hidden_effects(space, best, traced.alike, left, traced.ends, settings, ask=ask)
     listed = findings.effect_scores(space, left.scores, settings)
     library_places = space.library.indices([s.name for s in listed])
-    summary = verdict_summary(traced, numbers)
-    kind = type(observe)
-    return DiscoveryResult(
+    summary, kind = verdict_summary(traced, numbers), type(observe)
+    result = DiscoveryResult(
         verdict=traced.verdict,
         summary=summary,
-        robot=written.robot,
+        robot=robot,
         refit=findings.proposed_robot(space, base),
-        gains=about.gains,
-        written=about.kept,
-        converged=written.converged,
-        posterior=written.posterior,
+        gains=gains,
+        written=written,
+        converged=converged,
+        posterior=posterior,
         runs=runs,
         numbers=numbers,
         included=included,
         outliers=tuple(int(numbers[k]) for k in screened.outliers),
         unusable=tuple(int(numbers[k]) for k in screened.base.unusable),
         effects=found,
-        unnamed=_unnamed(about, len(runs)),
-        remains=remains,
+        unnamed=None
+        if beside is None or traced.where is None
+        else findings.unnamed_discrepancy(beside, traced.where, left.test.p_value, len(runs)),
+        remains=None if nameless or traced.alike is None else traced.where,
         next_experiment=_proposal(space, traced, settings),
         cannot_see=findings.invisible_effects(space, left.scores, settings),
-        needs_histories=tuple(sorted(name for name, e in library.items() if e.transient and not kind.shows(e))),
+        needs_histories=tuple(sorted(name for name, e in given.library.items() if e.transient and not kind.shows(e))),
         needs_reverse=tuple(
-            sorted(name for name, e in library.items() if e.needs_reverse and not goes_both_ways(runs))
+            sorted(name for name, e in given.library.items() if e.needs_reverse and not goes_both_ways(runs))
         ),
         alternatives=near,
         implausible=too_large,
         hidden=concealed,
         support=summary.support,
         cluster=screened.cluster,
-        residual_clusters=residual_clusters(about.remaining, settings.seed),
+        residual_clusters=residual_clusters(remaining, settings.seed),
         before=findings.evidence_of_test(left.test, adequate=not left.test.rejected),
         after=findings.evidence_of_test(ends.test, adequate=not ends.test.rejected_with_margin),
-        chi2=(2 * base.cost, 2 * written.cost),
+        chi2=(2 * base.cost, 2 * cost),
         readings=int(np.sum(space.weight > 0)),
-        base_shift=findings.base_shift(space, base.z, written.z, written.sd),
+        base_shift=findings.base_shift(space, base.z, z, sd),
         scores=listed,
         cosine=signature_cosines(space, left.scores)[np.ix_(library_places, library_places)],
         detail=observe.detail(screened.bases, included, left, ends),
@@ -1117,10 +943,15 @@ def _result(
         errors_held_out={k: on_same_rows(*both, error) for k, both in seen.held_out.items()},
         held_out_unpredictable=blocks_room.unpredictable_kinds(runs, space.bare),
         held_out_worse=preference.worse_predictions(seen.held_out, error),
-        alternatives_held_out=about.compared,
-        noise=_noise(runs, traced.sds.noise, type(observe)),
+        alternatives_held_out=compared,
+        noise=_noise(runs, noise, kind),
         settings=settings,
         replicates=len(left.test.null.single),
+    )
+    # A temporary change is not uniform.
+    of_noise = noise_remarks_before_verdict(traced.sds, remaining) if traced.sds.factors or not traced.events else ()
+    return dataclasses.replace(
+        result, remarks=(*of_noise, *refit_worse(seen, noise, included), *loop_remarks(result))
     )
 
 

@@ -15,7 +15,7 @@ from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.adequacy import AdequacyTest, Diagnosis
 from calibration.discovery.candidates import Candidate
 from calibration.discovery.classes import Classes, Shift
-from calibration.discovery.discrepancy import Discrepancy
+from calibration.discovery.discrepancy import CurveBeside
 from calibration.discovery.location import DiscrepancyLocation
 from calibration.discovery.loop_notes import RuledOut
 from calibration.discovery.mechanism import excess_misfit, share_of_excess
@@ -24,10 +24,8 @@ from calibration.discovery.result import (
     Alternative,
     BaseShift,
     EffectScore,
-    Errors,
     Estimate,
     Evidence,
-    Formula,
     FoundEffect,
     KindOfEvidence,
     Member,
@@ -46,7 +44,6 @@ from calibration.inference.estimates import SIDE_OF_BOUND
 from calibration.inference.held_out import predict_unseen
 from calibration.inference.identifiability import held_by_prior
 from calibration.inference.linearization import (
-    Linearization,
     amplitude_of,
     amplitude_unit,
     shape_at,
@@ -54,7 +51,6 @@ from calibration.inference.linearization import (
     shape_scales,
 )
 from calibration.inference.problem import Observation, Problem
-from calibration.inference.simulation_errors import channel_errors
 from mmrjax.effects import Effect
 from mmrjax.model.balances import BALANCES
 from mmrjax.model.robot import Robot
@@ -151,14 +147,11 @@ def _without_each(
 
 
 def unnamed_discrepancy(
-    found: Discrepancy, where: DiscrepancyLocation, p_value: float, linear: Linearization, rows: int
+    beside: CurveBeside, where: DiscrepancyLocation, p_value: float, rows: int
 ) -> UnnamedDiscrepancy:
-    """Discrepancy of an `unnamed_discrepancy` verdict, over the rows of the table. Curve and rows are of one fit.
-
-    Args:
-        linear: the fit with the curve, linearised.
-    """
-    f, lacks, happens = found.proposal, None, bases.window_from_name(where.variable)
+    """Discrepancy of a verdict without a name, over the rows of the table. Curve and rows are of one fit."""
+    found, linear, lacks = beside.curve, beside.diagnosis.linear, None
+    happens = bases.window_from_name(where.variable)
     x, way = linear.in_travel(found.balance, where.variable if happens is None else happens.axis)
     if found.defect is not None:
         lacks = defect_by_row(linear, found.balance)
@@ -179,7 +172,7 @@ def unnamed_discrepancy(
         over=None if lacks is None else x[:rows],
         defect=None if lacks is None else lacks.value[:rows],
         defect_sd=None if lacks is None else lacks.sd[:rows],
-        proposal=Formula(f.formula, f.mark, f.coefficients, f.sds, f.gain, f.tried),
+        proposal=found.proposal,
     )
 
 
@@ -405,11 +398,3 @@ def readings_of_rows(
     stated, fitted = seen(dataclasses.replace(before, z=np.zeros_like(before.z))), seen(before)
     later = fitted if after is None else seen(after)
     return ReadingsOfRows(runs.measured(), sd[:rows], stated, fitted, later, held, labels)
-
-
-def errors_of_readings(
-    problem: Problem, simulated: np.ndarray, measured: np.ndarray, sd: np.ndarray, included: np.ndarray
-) -> Errors:
-    """Errors of each channel [%, and in σ] over the included rows with a simulated value."""
-    simulated = np.where(included[:, None], simulated, np.nan)
-    return channel_errors(problem.channels, simulated, measured, sd)

@@ -8,6 +8,7 @@ import itertools
 import numpy as np
 
 from calibration.data import Names
+from calibration.described import describe
 from calibration.discovery.projection import Projection
 from calibration.discovery.smooth import Smooth
 from calibration.inference.bases import ORDERS, place_signature
@@ -133,7 +134,7 @@ class Proposal:
     """A formula for a discrepancy: one term of a dictionary of dimensionless monomials.
 
     Attributes:
-        formula: as `ΔU = 0.42 V (I/2 A)^2`, "" if no single term explains `MOST` of the curve.
+        expression: as `ΔU = 0.42 V (I/2 A)^2`, "" if no single term explains `MOST` of the curve.
         mark: its label.
         terms: its monomials.
         coefficients, sds: of each [unit of the balance].
@@ -143,7 +144,8 @@ class Proposal:
         tried: size of the dictionary: a larger one makes a good formula less significant.
     """
 
-    formula: str
+    JSON = ("formula", "mark", "coefficients", "sds", "bic_gain_over_curve=gain", "tried")
+    expression: str
     terms: tuple[Monomial, ...]
     coefficients: tuple[float, ...]
     sds: tuple[float, ...]
@@ -152,6 +154,11 @@ class Proposal:
     gain: float
     tried: int
     mark: str = MARK
+
+    @property
+    def formula(self) -> str:
+        """Its expression, or that there is none."""
+        return describe(self)
 
 
 def propose_formula(
@@ -204,7 +211,7 @@ def propose_formula(
     k = min(near.tolist(), key=lambda j: (terms[j].complexity, dear[j]))
     size, sd = float(b[k] / scale[k]), float(1 / scale[k])
     return Proposal(
-        formula=f"{SYMBOL[balance]} = {size:.2g} {PLACES[balance][0]} {terms[k]}",
+        expression=f"{SYMBOL[balance]} = {size:.2g} {PLACES[balance][0]} {terms[k]}",
         terms=(terms[k],),
         coefficients=(size,),
         sds=(sd,),

@@ -13,14 +13,15 @@ from calibration.data import posterior_file as posterior
 from calibration.data.columns import DRIVING
 from calibration.data.posterior_file import Posterior
 from calibration.data.runs import WHEN, Runs
-from calibration.data.writing import json_value, write_json, write_table
+from calibration.data.writing import entries_of, json_value, write_json, write_table
 from calibration.described import describe, sentences
+from calibration.discovery import formula
 from calibration.discovery.experiments import Proposal
 from calibration.discovery.headline import headline
 from calibration.discovery.hidden import Hidden
 from calibration.discovery.kept import REFIT_FILE
 from calibration.discovery.location import DiscrepancyLocation
-from calibration.discovery.loop_notes import Asked, Headline, Mechanism, NameSupport, RuledOut, Summary
+from calibration.discovery.loop_notes import Asked, Headline, NameSupport, RuledOut, Summary
 from calibration.discovery.outliers import Cluster
 from calibration.discovery.prediction import Gain
 from calibration.discovery.settings import Settings
@@ -117,24 +118,6 @@ class FoundEffect:
 
 
 @dataclasses.dataclass(frozen=True)
-class Formula:
-    """A formula for a curve. See `formula.Proposal`."""
-
-    JSON = ("formula", "mark", "coefficients", "sds", "bic_gain_over_curve", "tried")
-    expression: str
-    mark: str
-    coefficients: tuple[float, ...]
-    sds: tuple[float, ...]
-    bic_gain_over_curve: float
-    tried: int
-
-    @property
-    def formula(self) -> str:
-        """Its expression, or that there is none."""
-        return describe(self)
-
-
-@dataclasses.dataclass(frozen=True)
 class UnnamedDiscrepancy(DiscrepancyLocation):
     """A discrepancy that no effect of the library explains.
 
@@ -166,7 +149,7 @@ class UnnamedDiscrepancy(DiscrepancyLocation):
     over: np.ndarray | None
     defect: np.ndarray | None
     defect_sd: np.ndarray | None
-    proposal: Formula
+    proposal: formula.Proposal
 
 
 @dataclasses.dataclass(frozen=True)
@@ -412,16 +395,9 @@ class Resolved:
         return json_value(
             {
                 "asked": describe(self.asked),
-                "statement": self.statement,
-                "explains": self.explains,
-                "rows": self.rows,
-                "constants": self.constants,
-                "known_from_rows": self.known_from_rows,
+                **entries_of(self, "statement", "explains", "rows", "constants", "known_from_rows"),
                 "alike": [{"a": a, "b": b, "correlation": r} for a, b, r in self.alike],
-                "outside": self.outside,
-                "settled": self.settled,
-                "fall_chi2": self.fall,
-                "p": self.p,
+                **entries_of(self, "outside", "settled", "fall_chi2=fall", "p"),
                 "chi2": {"before": self.chi2[0], "after": self.chi2[1], "readings": self.readings},
                 "rms_percent": {n: {"before": b, "after": a} for n, (b, a) in self.rms_percent.items()},
                 "slip_rms_points": {"before": self.slip_rms[0], "after": self.slip_rms[1]},
@@ -621,47 +597,52 @@ class DiscoveryResult:
 
     def to_json(self) -> dict[str, Any]:
         """Everything as JSON-able data, as docs/schemas/loop.schema.json describes it."""
+        mechanism, main = self.summary.mechanism, next(iter(self.errors_held_out.values()), (None, None))
         return json_value(
             {
                 "schema": SCHEMA,
-                "statement": self.statement,
-                "verdict": self.verdict,
+                **entries_of(self, "statement", "verdict"),
                 "mechanism": None
-                if self.summary.mechanism is None
-                else _mechanism(self.summary.mechanism, self.unnamed),
+                if mechanism is None
+                else {
+                    **entries_of(mechanism, "families", "effects", "fails", "share", "gain", "again", "se", "errors"),
+                    "established": not mechanism.fails,
+                    "course": "" if self.unnamed is None else describe(self.unnamed),
+                },
                 "missed": [m._asdict() for m in self.summary.missed],
                 "headline": {
-                    **{name: getattr(self.headline, name) for name in ("level", "claims", "factors", "shared")},
+                    **entries_of(self.headline, "level", "claims", "factors", "shared"),
                     "statement": self.statement,
                 },
                 "verdict_statement": self.verdict_statement,
                 "rows": len(self.runs),
                 "rows_used": int(self.included.sum()),
-                "rows_unusable": self.unusable,
-                "rows_outliers": self.outliers,
+                **entries_of(self, "rows_unusable=unusable", "rows_outliers=outliers"),
                 "effects": [_effect(e, self.support) for e in self.effects]
                 + ([] if self.unnamed is None else [_unnamed(self.unnamed)]),
-                "next_experiment": self.next_experiment,
-                "remains": self.remains,
-                "cannot_see": self.cannot_see,
-                "needs_series": self.needs_histories,
+                **entries_of(self, "next_experiment", "remains", "cannot_see", "needs_series=needs_histories"),
                 "needs_reverse": self.needs_reverse,
                 **self.detail.to_json(),
-                "alternatives": self.alternatives,
-                "implausible": self.implausible,
-                "hidden": self.hidden,
-                "standing": self.standing,
-                "cluster": self.cluster,
+                **entries_of(self, "alternatives", "implausible", "hidden", "standing", "cluster"),
                 "residual_clusters": self.residual_clusters,
-                **self._errors_to_json(),
+                "errors": {
+                    # nothing is fitted as stated, so both are the same
+                    "as_stated": {"fitted": self.errors_as_stated, "held_out": self.errors_as_stated},
+                    **{w: {"fitted": self.errors[k], "held_out": main[k]} for k, w in enumerate(("before", "after"))},
+                },
+                "errors_percent_of": OF_SIZE,
+                "held_out_by": {
+                    kind: {"before": before, "after": after, "blocks": self.readings_of_rows.blocks[kind]}
+                    for kind, (before, after) in self.errors_held_out.items()
+                },
+                **entries_of(self, "held_out_unpredictable", "held_out_worse", "alternatives_held_out"),
                 "prediction": {
-                    "gain": None if self.gain is None else self.gain.mean,
-                    "se": None if self.gain is None else self.gain.se,
+                    **({"gain": None, "se": None} if self.gain is None else entries_of(self.gain, "gain=mean", "se")),
                     "sets": [{"effects": names, "gain": g.mean, "se": g.se} for names, g in self.gains],
                     "unit": "nat a reading",
                     "written": "found" if self.written else "refit",
                 },
-                "adequate": {"before": self.before.adequate, "after": self.after.adequate},
+                "adequate": entries_of(self, "before=before.adequate", "after=after.adequate"),
                 "evidence": {"before": _evidence(self.before), "after": _evidence(self.after)},
                 "chi2": {
                     "before": self.chi2[0],
@@ -669,42 +650,14 @@ class DiscoveryResult:
                     "readings": self.readings,
                     "of_readings": dict(zip(("before", "after"), self.chi2_of_readings, strict=True)),
                 },
-                "base_shift": self.base_shift,
-                "together": self.together,
-                "scores": self.scores,
+                **entries_of(self, "base_shift", "together", "scores"),
                 "bootstrap": {
                     "replicates": self.replicates,
-                    "asked": self.settings.replicates,
-                    "seed": self.settings.seed,
-                    "family_wise_error": self.settings.family_wise_error,
-                    "shares": self.settings.shares,
+                    **entries_of(self.settings, "asked=replicates", "seed", "family_wise_error", "shares"),
                 },
-                "settings": self.settings,
-                "noise": self.noise,
-                "noise_sensitivity": self.sensitivity,
-                "notes": self.notes,
-                "resolved": self.resolved,
+                **entries_of(self, "settings", "noise", "noise_sensitivity=sensitivity", "notes", "resolved"),
             }
         )
-
-    def _errors_to_json(self) -> dict[str, Any]:
-        """Errors of the fits and of data held out, as in `to_json`."""
-        main = next(iter(self.errors_held_out.values()), (None, None))
-        return {
-            "errors": {
-                # nothing is fitted as stated, so both are the same
-                "as_stated": {"fitted": self.errors_as_stated, "held_out": self.errors_as_stated},
-                **{w: {"fitted": self.errors[k], "held_out": main[k]} for k, w in enumerate(("before", "after"))},
-            },
-            "errors_percent_of": OF_SIZE,
-            "held_out_by": {
-                kind: {"before": before, "after": after, "blocks": self.readings_of_rows.blocks[kind]}
-                for kind, (before, after) in self.errors_held_out.items()
-            },
-            "held_out_unpredictable": self.held_out_unpredictable,
-            "held_out_worse": self.held_out_worse,
-            "alternatives_held_out": self.alternatives_held_out,
-        }
 
     def rows_table(self) -> dict[str, np.ndarray]:
         """Table by row: conditions, readings measured, simulated before and after and held out, defects if known."""
@@ -779,7 +732,7 @@ class Sensitivity:
 
     def to_json(self) -> dict[str, Any]:
         """Entry of result.json."""
-        entries = {n: getattr(self, n) for n in ("factor", "verdict", "statement", "classes", "adequate_after")}
+        entries = entries_of(self, "factor", "verdict", "statement", "classes", "adequate_after")
         return entries | ({"near": True} if self.near else {})
 
 
@@ -793,52 +746,26 @@ def _effect(e: FoundEffect, support: NameSupport | None) -> dict[str, Any]:
         "rests_on_row": None if test is None else test.rests_on,
         "root": None if test is None else test.root,
         "root_needed": None if test is None else test.needed,
-        "families": e.families,
-        "balance": e.balance,
-        "unit": e.unit,
-        "equation": e.equation,
-        "source": e.source,
-        "parameters": e.parameters,
-        "p_value": e.p_value,
-        "score": e.score,
-        "share": e.share,
+        **entries_of(
+            e, "families", "balance", "unit", "equation", "source", "parameters", "p_value", "score", "share"
+        ),
         "accuracy_of_form": None
         if test is None or not test.shows_form
         else {"over": test.over, "share": test.spread},
-        "members": e.members,
-        "stated_values": e.stated,
-    }
-
-
-def _mechanism(m: Mechanism, curve: UnnamedDiscrepancy | None) -> dict[str, Any]:
-    names = ("families", "effects", "fails", "share", "gain", "again", "se", "errors")
-    return {
-        **{name: getattr(m, name) for name in names},
-        "established": not m.fails,
-        "course": "" if curve is None else describe(curve),
+        **entries_of(e, "members", "stated_values=stated"),
     }
 
 
 def _unnamed(d: UnnamedDiscrepancy) -> dict[str, Any]:
-    curve = {name: getattr(d, name) for name in ("at", "value", "sd", "unit")}
     return {
         "name": "unnamed",
         "class": [],
-        "families": d.families,
-        "balance": d.balance,
-        "channel": d.channel,
-        "balances_alike": d.balances_alike,
-        "variable": d.variable,
-        "variables_alike": d.variables_alike,
-        "window": d.window,
+        **entries_of(d, "families", "balance", "channel", "balances_alike", "variable", "variables_alike", "window"),
         "unit": d.unit,
         "equation": None,
         "parameters": {},
-        "p_value": d.p_value,
-        "score": d.score,
-        "effect": d.effect,
-        "score_free_in_each_run": d.score_free_in_each_run,
-        "curve": curve,
+        **entries_of(d, "p_value", "score", "effect", "score_free_in_each_run"),
+        "curve": entries_of(d, "at", "value", "sd", "unit"),
         "course": describe(d),
         "proposal": d.proposal,
     }

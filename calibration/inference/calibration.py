@@ -7,7 +7,6 @@ import functools
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -124,45 +123,6 @@ def calibrate(
             stated_count(value, name, low, LARGEST[name])
     solver = solvers.solver_by_name(solver) if isinstance(solver, str) else solver
     runs, progress = used_rows(runs, robot, rows), in_words(tell)
-    plan = _make_plan(runs, model, starts, profiles, blocks)
-    choose = functools.partial(_free_names, runs, plan, free, fix)
-    ready = prepare(runs, robot, noise, stated, assume=False, choose=choose)
-    for note in (*ready.foreign, *ready.doubted):
-        progress(note)
-    base, of_product = _with_guide_priors(runs, ready, plan)
-    setting = _Setting(runs, plan, ready, base, of_product)
-    posed = setting.problem()
-    evolved = _population_options(posed, ready.names, runs, population, generations, members)
-    search, beside = _search(runs, base, posed, ready.noise, plan.starts, evolved, seed, progress, solver)
-    optimum = _optimum(setting, search)
-    if search.problem.observe.long:
-        doing = ["the linear analysis", *["profiles"] * plan.profiles, *["blocks held out"] * bool(plan.kinds)]
-        progress(next_step("optimum", ", ".join(doing)))
-    return _result(setting, search, optimum, _analyse(setting, search, optimum), beside, seed)
-
-
-@dataclasses.dataclass(frozen=True)
-class _Plan:
-    """Settings of a calibration, completed by the kind of data and the fidelity.
-
-    Attributes:
-        fidelity: its name.
-        starts: of the search.
-        profiles: True to profile every parameter.
-        kinds: of the blocks that are held out.
-    """
-
-    observe: type[observers.Observer]
-    fidelity: str
-    starts: int
-    profiles: bool
-    kinds: Names
-
-
-def _make_plan(
-    runs: Runs, model: str | None, starts: int | None, profiles: bool | None, blocks: Sequence[str] | bool | None
-) -> _Plan:
-    """Plan of a calibration from the arguments of `calibrate`. None is replaced by a default for the data."""
     observe = observers.observer_kind(runs)
     fidelity = model or (OF_HISTORIES if observe.axis else fidelities.NAMES[0])
     effort = observers.fidelity_facts(fidelity).effort
@@ -170,12 +130,25 @@ def _make_plan(
     profiles = effort.profiles and observe.profiled if profiles is None else profiles
     blocks = effort.blocks if blocks is None else blocks
     kinds = (observe.blocks if blocks else ()) if isinstance(blocks, bool) else tuple(blocks)
-    return _Plan(observe, fidelity, starts, profiles, kinds)
+    choose = functools.partial(_free_names, runs, observe, fidelity, free, fix)
+    ready = prepare(runs, robot, noise, stated, assume=False, choose=choose)
+    for note in (*ready.foreign, *ready.doubted):
+        progress(note)
+    base, of_product = _with_guide_priors(runs, ready, fidelity)
+    coordinates = priors.parameter_coordinates(base, ready.names, {**of_product, **ready.stated})
+    posed = observers.pose_problem(runs, base, coordinates, ready.noise.sd, fidelity)
+    more = members is not None or generations is not None
+    evolved = _population_size(posed, ready.names, runs, population, more), generations or GENERATIONS, members
+    search, beside = _search(runs, base, posed, ready.noise, starts, *evolved, seed, progress, solver)
+    return _result(
+        _Setting(runs, observe, fidelity, profiles, kinds, ready, base, of_product), search, beside, seed, progress
+    )
 
 
 def _free_names(
     runs: Runs,
-    plan: _Plan,
+    observe: type[observers.Observer],
+    fidelity: str,
     free: Sequence[str],
     fix: Sequence[str],
     prepared: Prepared,
@@ -185,14 +158,14 @@ def _free_names(
     Raises:
         BadConfiguration: an unknown name, or one that the fidelity does not read.
     """
-    robot, fidelity, computes = prepared.robot, plan.fidelity, observers.fidelity_facts(plan.fidelity).computes
+    robot, computes = prepared.robot, observers.fidelity_facts(fidelity).computes
     words = [surfaces.names_of_surfaces(names, robot, runs) for names in (free, fix)]
     present = _present(runs, robot)
     default = priors.default_names(present, robot, computed=computes, turns=runs.turns)
-    owned = priors.stated_names(robot, present, () if plan.observe.axis else priors.OVER_TIME)
+    owned = priors.stated_names(robot, present, () if observe.axis else priors.OVER_TIME)
     held = {*default, *fidelities.unread_parameters(fidelity, owned, runs.turns)}
     default = (*default, *(n for n in owned if n not in held and not n.endswith(computes)))
-    default = (*default, *priors.delay_names(robot, plan.observe.free()[0]))
+    default = (*default, *priors.delay_names(robot, observe.free()[0]))
     names = priors.choose_free_names(robot, default, *words)
     if unread := fidelities.unread_parameters(fidelity, names, runs.turns):
         if fidelities.OF_TURNS in unread[0]:
@@ -211,41 +184,31 @@ def _present(runs: Runs, robot: Robot) -> set[str]:
 
 @dataclasses.dataclass(frozen=True)
 class _Setting:
-    """A table and a robot, ready for a search.
+    """Table, robot and settings of a calibration, completed by the kind of data and the fidelity.
 
     Attributes:
+        fidelity: its name.
+        profiles: True to profile every parameter.
+        kinds: of the blocks that are held out.
         base: the robot at the prior means.
         of_product: priors of its guide frictions, see `_with_guide_priors`.
     """
 
     runs: Runs
-    plan: _Plan
+    observe: type[observers.Observer]
+    fidelity: str
+    profiles: bool
+    kinds: Names
     ready: Prepared
     base: Robot
     of_product: dict[str, tuple[float, float]]
 
-    def problem(self) -> Problem:
-        """The problem to be solved, with the noise known before the search."""
-        coordinates = priors.parameter_coordinates(
-            self.base, self.ready.names, {**self.of_product, **self.ready.stated}
-        )
-        return observers.pose_problem(self.runs, self.base, coordinates, self.ready.noise.sd, self.plan.fidelity)
 
-    def remarks(self) -> list[Remark | str]:
-        """Remarks on the table and the priors."""
-        ready = self.ready
-        products = [
-            Remark("prior_of_product", name=name, mean=mean, sd=sd, share=priors.GUIDED)
-            for name, (mean, sd) in self.of_product.items()
-        ]
-        return [*ready.foreign, *ready.doubted, *ready.checked, *ready.weighed, *products, *ready.begins]
-
-
-def _with_guide_priors(runs: Runs, ready: Prepared, plan: _Plan) -> tuple[Robot, dict[str, tuple[float, float]]]:
+def _with_guide_priors(runs: Runs, ready: Prepared, fidelity: str) -> tuple[Robot, dict[str, tuple[float, float]]]:
     """Robot with the guides' share that the fidelity computes, and priors of the free guide frictions without a
     stated prior."""
     robot, guide_priors = ready.robot, dict[str, tuple[float, float]]()
-    if priors.GUIDE_SHARE not in observers.fidelity_facts(plan.fidelity).computes:
+    if priors.GUIDE_SHARE not in observers.fidelity_facts(fidelity).computes:
         return robot, guide_priors
     present = _present(runs, robot)
     for name, chassis in ready.robot.configurations.items():
@@ -257,22 +220,19 @@ def _with_guide_priors(runs: Runs, ready: Prepared, plan: _Plan) -> tuple[Robot,
     }
 
 
-def _population_options(
-    posed: Problem,
-    names: Sequence[str],
-    runs: Runs,
-    population: int | None,
-    generations: int | None,
-    members: Path | None,
-) -> _PopulationOptions:
-    """Settings of the search by generations, from the arguments of `calibrate`.
+def _population_size(posed: Problem, names: Sequence[str], runs: Runs, population: int | None, more: bool) -> int:
+    """Members of each generation of a search by generations, 0 for none.
+
+    Args:
+        population: as for `calibrate`.
+        more: True if other options of that search are stated.
 
     Raises:
         BadConfiguration: options of a population without one, or for data that no population search supports.
     """
     if population is None:
         population = POPULATION if fidelities.unread_parameters("steady", names, runs.turns) else 0
-    if (members is not None or generations is not None) and not population:
+    if more and not population:
         raise BadConfiguration("--generations, --members: there is no population; state --population")
     if population and not posed.observe.eased:
         raise BadConfiguration(
@@ -280,7 +240,7 @@ def _population_options(
         )
     if 0 < population < LEAST:
         raise BadConfiguration(f"--population: got {population}; expected 0 or at least {LEAST} members")
-    return _PopulationOptions(population, generations or GENERATIONS, members)
+    return population
 
 
 def _search(
@@ -289,14 +249,15 @@ def _search(
     posed: Problem,
     known: Noise,
     starts: int,
-    evolved: _PopulationOptions,
+    size: int,
+    generations: int,
+    members_file: Path | None,
     seed: int,
     tell: Callable[[Remark], None],
     solver: optimizers.Solver | None,
 ) -> tuple[SearchResult, np.ndarray | None]:
     """The searches of a problem, and where they began at the optimum of `steady`, that optimum."""
-    rng, size = np.random.default_rng(seed), len(posed.coordinates)
-    every = None
+    rng, every = np.random.default_rng(seed), None
     if runs.log is not None:
         sd = np.broadcast_to(np.median(known.sd, 0), runs.log.measured().shape)
         every = observers.pose_problem(runs.log, base, posed.coordinates, sd)
@@ -307,9 +268,9 @@ def _search(
         shares = multistart.initial_noise_shares(known)
         return multistart.search_one_by_one(posed, known, points, shares, tell, solver), None
     tell(next_step("steady"))
-    if evolved.size:
-        population.Members(posed, evolved.file)  # refuses another calibration's file before the search of steady
-    draws = rng.standard_normal((fidelities.fidelity_facts("steady").effort.starts, size))
+    if size:
+        population.Members(posed, members_file)  # refuses another calibration's file before the search of steady
+    draws = rng.standard_normal((fidelities.fidelity_facts("steady").effort.starts, len(posed.coordinates)))
     draws[0] = 0.0
     easy = multistart.search_from_starts(
         observers.pose_problem(runs, base, posed.coordinates, known.sd), known, draws, solver
@@ -317,13 +278,18 @@ def _search(
     points[0] = beside = np.asarray(easy.best.z)
     points[1:] = multistart.starts_from_posterior(easy.problem, beside, rng, len(points) - 1)
     posed = dataclasses.replace(posed, data=easy.problem.data)
-    if not evolved.size:
+    if not size:
         return multistart.search_one_by_one(posed, known, points, easy.shares, tell, solver), beside
-    covariance = _first_generation(easy.problem, beside)
-    members = population.Members(posed, evolved.file)
+    # The first generation has the posterior of `steady`, but the prior for friction of contacts, which has another
+    # meaning there.
+    covariance = identifiability.analyse_identifiability(easy.problem, jnp.asarray(beside)).covariance.copy()
+    friction = np.array([FRICTION in name for name in easy.problem.coordinates.names])
+    covariance[friction] = covariance[:, friction] = 0.0
+    covariance[friction, friction] = 1.0
+    members = population.Members(posed, members_file)
     everyone = population.evolve(
-        members, population.member_objective(posed, known), beside, covariance, size=evolved.size,
-        generations=evolved.generations, seed=seed, beside=points, tell=tell,
+        members, population.member_objective(posed, known), beside, covariance, size=size, generations=generations,
+        seed=seed, beside=points, tell=tell,
     )  # fmt: skip
     best_member = int(everyone.order[0])
     if not np.isfinite(everyone.cost[best_member]):
@@ -344,99 +310,47 @@ def _search(
     return multistart.optimum_of_population(posed, known, shares, searched, tell, solver), beside
 
 
-@dataclasses.dataclass(frozen=True)
-class _PopulationOptions:
-    """Options of a search by generations: members of each (0 for no search), largest number, file of members."""
+def _result(
+    setting: _Setting,
+    found: SearchResult,
+    beside: np.ndarray | None,
+    seed: int,
+    tell: Callable[[Remark], None],
+) -> CalibrationResult:
+    """Result of a calibration: linear analysis, scans, profiles and held-out blocks at the optimum.
 
-    size: int
-    generations: int
-    file: Path | None
-
-
-def _first_generation(easy: Problem, z: np.ndarray) -> np.ndarray:
-    """Covariance of the first generation: the posterior of `steady`, but the prior for friction of contacts.
-
-    That friction has another meaning in `steady`.
-    """
-    covariance = identifiability.analyse_identifiability(easy, jnp.asarray(z)).covariance.copy()
-    friction = np.array([FRICTION in name for name in easy.coordinates.names])
-    covariance[friction] = covariance[:, friction] = 0.0
-    covariance[friction, friction] = 1.0
-    return covariance
-
-
-@dataclasses.dataclass(frozen=True)
-class _Optimum:
-    """The model at the optimum and before the fit.
-
-    Attributes:
-        z: coordinates.
-        robot: the robot at z.
-        after: its observation.
-        status, status_before: codes, shape (rows,).
-        seen, seen_before: readings [SI], shape (rows, channels), NaN in rows that the model does not reach.
-    """
-
-    z: np.ndarray
-    robot: Robot
-    after: optimizers.Observation
-    status: np.ndarray
-    status_before: np.ndarray
-    seen: np.ndarray
-    seen_before: np.ndarray
-
-
-def _optimum(setting: _Setting, found: SearchResult) -> _Optimum:
-    """Model at the optimum of the search and before the fit.
+    Args:
+        beside: the optimum of `steady` that the search began from, if any.
 
     Raises:
         BadConfiguration: the model reaches no operating point in some row at the optimum.
     """
-    posed, z = found.problem, np.asarray(found.best.z)
-    fitted = posed.robot(jnp.asarray(z))
+    runs, ready, observe, noise = setting.runs, setting.ready, setting.observe, setting.ready.noise
+    posed, z, searched = found.problem, np.asarray(found.best.z), found.searched
+    robot = posed.robot(jnp.asarray(z))
     after, before = optimizers.observe_at(posed, jnp.asarray(z)), optimizers.observe_robot(posed, posed.base)
     status, status_before = np.asarray(after.status), np.asarray(before.status)
     lost = multistart.unreachable_rows(posed, status)
     if lost.any():
-        raise checks.infeasible_error(setting.runs, fitted, status, lost, setting.ready.names)
-    observation, seen_before = (
-        _reached_readings(posed, status, after.reading),
-        _reached_readings(posed, status_before, before.reading),
+        raise checks.infeasible_error(runs, robot, status, lost, ready.names)
+    seen, seen_before = (
+        np.where(posed.observe.unreachable(codes)[:, None], np.nan, np.asarray(x.reading))
+        for codes, x in ((status, after), (status_before, before))
     )
-    return _Optimum(z, fitted, after, status, status_before, observation, seen_before)
-
-
-@dataclasses.dataclass(frozen=True)
-class _Analysis:
-    """Analysis of an optimum.
-
-    Attributes:
-        about: the linear analysis.
-        scanned: scans along parameters, by the number of the coordinate.
-        elsewhere: number of searches that ended in a minimum that the scans do not show, see `scans.count_outside`.
-        profile: of each parameter, None without profiles.
-        held: blocks held out, by kind.
-        notes: remarks on these.
-    """
-
-    about: identifiability.Identifiability
-    scanned: dict[int, scans.Scan]
-    elsewhere: int
-    profile: identifiability.Profile | None
-    held: dict[str, holdout.HeldOut]
-    notes: list[Remark | str]
-
-
-def _analyse(setting: _Setting, found: SearchResult, optimum: _Optimum) -> _Analysis:
-    """Linear analysis, scans, profiles and held-out blocks at the optimum."""
-    posed, z, plan, searched = found.problem, optimum.z, setting.plan, found.searched
-    notes: list[Remark | str] = [*posed.observe.cautions(optimum.robot)]
+    if posed.observe.long:
+        doing = ["the linear analysis", *["profiles"] * setting.profiles, *["blocks held out"] * bool(setting.kinds)]
+        tell(next_step("optimum", ", ".join(doing)))
     about = identifiability.analyse_identifiability(
         posed, jnp.asarray(z), slope=None if searched is None else searched.slope
     )
-    notes += searched.remarks() if searched is not None else []
     scanned = scans.scan_all(posed, z)
     about = scans.with_scanned_sds(about, scanned)
+    notes = [*ready.foreign, *ready.doubted, *ready.checked, *ready.weighed]
+    notes += [
+        Remark("prior_of_product", name=name, mean=mean, sd=sd, share=priors.GUIDED)
+        for name, (mean, sd) in setting.of_product.items()
+    ]
+    notes += [*ready.begins, *posed.observe.cautions(robot), *(() if searched is None else searched.remarks())]
     notes += scans.scan_remarks(posed, scanned)
     elsewhere = scans.count_outside(scanned, found.starts.z, found.starts.converged)
     if elsewhere:
@@ -444,59 +358,41 @@ def _analyse(setting: _Setting, found: SearchResult, optimum: _Optimum) -> _Anal
         notes.append(Remark("elsewhere", searches=elsewhere, total=len(found.starts.cost), names=over))
     if not np.isfinite(about.covariance).all():
         notes.append(Remark("no_covariance"))
-    if jumps := row_numbers(np.asarray(optimum.after.flags) >> FLAGS.index("jumps") & 1):
+    if jumps := row_numbers(np.asarray(after.flags) >> FLAGS.index("jumps") & 1):
         notes.append(Remark("of_rows", rows=jumps, what="jumps"))
     profile = None
-    if plan.profiles:
+    if setting.profiles:
         profile = identifiability.profile_likelihoods(posed, jnp.asarray(z), float(found.best.cost), about)
-    held = holdout.hold_out_by_kind(
-        posed, z, {kind: holdout.blocks_of_kind(setting.runs, kind) for kind in plan.kinds}
-    )
-    return _Analysis(about, scanned, elsewhere, profile, held, notes)
-
-
-def _result(
-    setting: _Setting,
-    found: SearchResult,
-    optimum: _Optimum,
-    analysis: _Analysis,
-    beside: np.ndarray | None,
-    seed: int,
-) -> CalibrationResult:
-    """The result of a calibration. `beside` is the optimum of `steady` that the search began from, if any."""
-    runs, noise, posed, about = setting.runs, setting.ready.noise, found.problem, analysis.about
-    z, observation, seen_before, observe = optimum.z, optimum.seen, optimum.seen_before, setting.plan.observe
+    held = holdout.hold_out_by_kind(posed, z, {kind: holdout.blocks_of_kind(runs, kind) for kind in setting.kinds})
     measured, sd, converged = runs.measured(), np.asarray(posed.data.sd), bool(found.best.converged)
-    finite = np.isfinite(measured) & np.isfinite(observation)
-    whitened = np.where(finite, (observation - measured) / sd, 0.0)
-    residuals = lack_of_fit.Residuals(observe, runs, observation, whitened, finite, about.jacobian, z)
-    notes = [*setting.remarks(), *analysis.notes, *([] if noise.estimated.any() else noise_remarks(residuals))]
-    sources = {name: "product" for name in setting.of_product} | {name: "stated" for name in setting.ready.stated}
+    finite = np.isfinite(measured) & np.isfinite(seen)
+    whitened = np.where(finite, (seen - measured) / sd, 0.0)
+    residuals = lack_of_fit.Residuals(observe, runs, seen, whitened, finite, about.jacobian, z)
+    notes += [] if noise.estimated.any() else noise_remarks(residuals)
+    sources = {name: "product" for name in setting.of_product} | {name: "stated" for name in ready.stated}
     result = CalibrationResult(
-        robot=optimum.robot,
+        robot=robot,
         source=runs.source,
         channels=runs.channels,
-        model=setting.plan.fidelity,
+        model=setting.fidelity,
         seed=seed,
-        parameters=estimates.parameter_estimates(
-            posed, setting.base, z, about, analysis.profile, beside, sources, analysis.scanned
-        ),
+        parameters=estimates.parameter_estimates(posed, setting.base, z, about, profile, beside, sources, scanned),
         tied=estimates.tied_parameters(posed),
         noise=estimates.channel_noise(posed, noise, found.shares, measured),
         axis=observe.axis,
         errors_before=estimates.errors_by_channel(runs.channels, seen_before, measured, sd),
-        errors_after=estimates.errors_by_channel(runs.channels, observation, measured, sd),
-        held_out={kind: estimates.hold_out_errors(posed, h, measured, sd) for kind, h in analysis.held.items()},
+        errors_after=estimates.errors_by_channel(runs.channels, seen, measured, sd),
+        held_out={kind: estimates.hold_out_errors(posed, h, measured, sd) for kind, h in held.items()},
         conditions=estimates.condition_columns(observe, runs),
-        readings=estimates.readings_by_channel(runs.channels, measured, sd, seen_before, observation),
-        status_before=np.array(STATUSES)[optimum.status_before],
-        status=np.array(STATUSES)[optimum.status],
-        adhesion_used=np.asarray(optimum.after.adhesion_used),
+        readings=estimates.readings_by_channel(runs.channels, measured, sd, seen_before, seen),
+        status_before=np.array(STATUSES)[status_before],
+        status=np.array(STATUSES)[status],
+        adhesion_used=np.asarray(after.adhesion_used),
         objective=float(found.best.cost),
-        converged=converged and not analysis.elsewhere,
+        converged=converged and not elsewhere,
         starts=found.starts,
-        searched=found.searched,
-        chi_square=estimates.chi_square(observation, measured, sd, about, noise),
+        searched=searched,
+        chi_square=estimates.chi_square(seen, measured, sd, about, noise),
         adequacy=lack_of_fit.judge_adequacy(
             residuals, seen_before, sd, estimated=noise.estimated, converged=converged
         ),
@@ -505,13 +401,8 @@ def _result(
         posterior=posterior_of_coordinates(posed.coordinates, z, about.covariance),
         remarks=(
             *notes,
-            *error_after_steps(runs, observation - measured),
-            *checks.unmeasured_notes(setting.ready.names, about.sensitivity),
+            *error_after_steps(runs, seen - measured),
+            *checks.unmeasured_notes(ready.names, about.sensitivity),
         ),
     )
     return dataclasses.replace(result, remarks=(*result.remarks, *calibration_remarks(result)))
-
-
-def _reached_readings(posed: Problem, status: np.ndarray, reading: jax.Array) -> np.ndarray:
-    """Readings [SI], NaN in rows that the model does not reach."""
-    return np.where(posed.observe.unreachable(status)[:, None], np.nan, np.asarray(reading))

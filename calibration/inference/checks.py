@@ -12,7 +12,7 @@ from calibration.data import Names
 from calibration.data.columns import LOAD, SPEED, SUPPLY
 from calibration.data.computed_columns import line_through
 from calibration.data.courses import applied_drive
-from calibration.data.input_errors import BadConfiguration, BadData, bound_text
+from calibration.data.input_errors import BadConfiguration, BadData
 from calibration.data.runs import Runs
 from calibration.inference import observers
 from calibration.inference.conduct import conduct_notes
@@ -211,7 +211,7 @@ def _check_motion(runs: Runs, noise: Noise) -> None:
         if driven and scatter <= WHITE * float(np.nanmax(noise.sd[:, k])) / channel.factor:
             return
     imposed, (_, channel) = runs.layout.imposed_column, speeds[0]
-    size, name, unit = bound_text(float(f"{scatter:.2g}")), channel.name, channel.unit
+    size, name, unit = f"{float(f'{scatter:.2g}'):g}", channel.name, channel.unit
     if driven:
         raise BadData(
             f"{runs.source} rows 1 to {len(runs)}, {channel.column}: readings are noise about zero ({size} {unit}), "
@@ -269,7 +269,7 @@ def _check_stuck_channels(runs: Runs) -> list[Remark]:
                 stiff.append(Remark("stiff_supply", column=channel.column, value=float(readings[0])))
                 continue
             raise BadData(
-                f"{runs.source}, {channel.column}: {bound_text(readings[0])} in every row although the "
+                f"{runs.source}, {channel.column}: {readings[0]:g} in every row although the "
                 "conditions vary; "
                 "the instrument was stuck or the column is a copy"
             )

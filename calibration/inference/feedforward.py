@@ -14,6 +14,7 @@ import scipy.linalg
 
 from calibration.data import Columns, Json, Names
 from calibration.data.input_errors import BadData
+from calibration.data.writing import entries_of
 from calibration.inference.fit_notes import Remark
 from calibration.inference.identifiability import Z95
 
@@ -116,10 +117,7 @@ class Feedforward:
                 for name, x in self.constants.items()
             },
             "feedback": {name: {"value": x, "unit": units[name.split("_")[-1]]} for name, x in self.gains.items()},
-            "tolerances": dataclasses.asdict(self.tolerances),
-            "delay_s": self.delay,
-            "filter_lag_s": self.filter_lag,
-            "missing_tests": list(self.missing),
+            **entries_of(self, "tolerances", "delay_s=delay", "filter_lag_s=filter_lag", "missing_tests=missing"),
             "remarks": [{"code": r.code, **r.values} for r in self.remarks],
         }
 

@@ -24,7 +24,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from calibration.data import Json, Names
 from calibration.data.input_errors import BadConfiguration
-from calibration.data.writing import replacing
+from calibration.data.writing import entries_of, replacing
 from calibration.described import describe
 from calibration.inference import noise as noise_room
 from calibration.inference import series_noise
@@ -398,12 +398,9 @@ class Searched:
         """Entries of result.json."""
         return {
             "members": len(self.found.z),
-            "settled": self.found.settled,
-            "generations": self.found.generations,
-            "outcomes": self.outcomes(),
+            **entries_of(self, "settled=found.settled", "generations=found.generations", "outcomes"),
             "at_edge": {name: describe(at) for name, at in self.edge.items()},
-            "derivatives_apart": list(self.apart),
-            "regression_rms_sd": self.left if np.isfinite(self.left) else None,
+            **entries_of(self, "derivatives_apart=apart", "regression_rms_sd=left"),
         }
 
     def remarks(self) -> list[Remark]:

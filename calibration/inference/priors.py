@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from calibration.data import Names
-from calibration.data.input_errors import BadConfiguration, allowed_words, bound_text
+from calibration.data.input_errors import BadConfiguration, allowed_words
 from calibration.data.surfaces import GROUND
 from mmrjax.compile.compiling import SELDOM, compiled
 from mmrjax.model import params
@@ -514,10 +514,7 @@ def _coordinate_of_parameter(
     low, high = spec.bounds
     mean, sd = stated or (float(parameter.value), spec.prior_sd(float(parameter.value)))
     if not low <= mean <= high:
-        raise BadConfiguration(
-            f"--prior {parameter.name}: got {bound_text(mean)}; expected {bound_text(low)} to "
-            f"{bound_text(high)} {spec.unit}"
-        )
+        raise BadConfiguration(f"--prior {parameter.name}: got {mean:g}; expected {low:g} to {high:g} {spec.unit}")
     if stated is not None and not 0 < sd < math.inf:
         raise BadConfiguration(f"--prior {parameter.name}: got a standard deviation of {sd:g}; expected more than 0")
     if sd <= 0:

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from calibration.data import Names
-from calibration.data.input_errors import BadData, bound_text
+from calibration.data.input_errors import BadData
 from calibration.data.runs import Runs
 from calibration.described import describe
 from calibration.inference import observers
@@ -208,9 +208,9 @@ def _check_gear(runs: Runs, measured: np.ndarray, robot: Robot) -> None:
     measured_ratio = float(np.median(turns)) if turns.size else ratio
     if abs(math.log(measured_ratio * ratio)) < math.log(SAID):
         raise BadData(
-            f"{runs.source}: the motor turns about {bound_text(float(f'{measured_ratio:.2g}'))} times for one turn "
+            f"{runs.source}: the motor turns about {float(f'{measured_ratio:.2g}'):g} times for one turn "
             "of the output, "
-            f"but gearbox.ratio is {bound_text(float(f'{ratio:.4g}'))}: is it upside down? expected motor "
+            f"but gearbox.ratio is {float(f'{ratio:.4g}'):g}: is it upside down? expected motor "
             "turns per turn "
             "of the output"
         )
@@ -225,8 +225,8 @@ def _check_masses(runs: Runs, robot: Robot) -> None:
     if max(factor, 1 / factor) > REFUSED:
         off, size = (factor, "large") if factor > 1 else (1 / factor, "small")
         raise BadData(
-            f"{runs.source}, total_mass_kg: about {bound_text(float(f'{off:.2g}'))} times too {size} for this robot "
-            f"({', '.join(f'{bound_text(m)} kg' for m in np.unique(own_mass))} and the payload); check the "
+            f"{runs.source}, total_mass_kg: about {float(f'{off:.2g}'):g} times too {size} for this robot "
+            f"({', '.join(f'{m:g} kg' for m in np.unique(own_mass))} and the payload); check the "
             "unit, kg, and the "
             "mass in the robot's file"
         )

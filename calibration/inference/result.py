@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -79,7 +80,7 @@ class SteadyEstimate:
 #: Entries of an estimate in result.json that are its fields.
 ENTRIES = (
     "value", "sd", "interval", "interval_linear", "interval_open", "unit", "meaning", "prior", "variance_ratio",
-    "held_by_prior", "at_bound", "measured_by_data",
+    "held_by_prior", "at_bound", "measured_by_data", "shift_in_prior_sd=shift",
 )  # fmt: skip
 
 
@@ -124,8 +125,7 @@ class Estimate:
 
     def to_json(self) -> Json:
         """Entry of `parameters` in result.json."""
-        entries = {name: getattr(self, name) for name in ENTRIES} | {"shift_in_prior_sd": self.shift}
-        return entries if self.with_steady is None else {**entries, "with_steady": self.with_steady}
+        return writing.entries_of(self, *ENTRIES, *["with_steady"] * (self.with_steady is not None))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -196,11 +196,7 @@ class Block:
 
     def to_json(self) -> Json:
         """Entry of `held_out_by` in result.json."""
-        return {
-            **self.errors,
-            "unreachable_rows": self.unreachable_rows,
-            "converged": self.converged,
-        }
+        return {**self.errors, **writing.entries_of(self, "unreachable_rows", "converged")}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -382,7 +378,7 @@ class CalibrationResult:
 
     def to_json(self) -> Json:
         """Entries of result.json, docs/schemas/calibrate.schema.json."""
-        about, main = self.identifiability, self.main_blocks
+        about, main, entries = self.identifiability, self.main_blocks, functools.partial(writing.entries_of, self)
         return writing.json_value(
             {
                 "schema": SCHEMA,
@@ -396,7 +392,7 @@ class CalibrationResult:
                 "percent_of": OF_SIZE,
                 "errors": {
                     # no fit precedes, so both are the same
-                    "before": {"fitted": self.errors_before, "held_out": self.errors_before},
+                    "before": entries("fitted=errors_before", "held_out=errors_before"),
                     "after": {
                         "fitted": self.errors_after,
                         "held_out": None if main is None else main.errors,
@@ -408,18 +404,12 @@ class CalibrationResult:
                     "status": "converged" if self.converged else "not_converged",
                     "objective": self.objective,
                     "starts": len(self.starts.cost),
-                    "starts_infeasible": self.starts.infeasible,
-                    "starts_at_best": self.starts.agree,
-                    "agreement": self.starts.statement(),
-                    "seed": self.seed,
-                    "population": self.searched,
+                    **entries("starts_infeasible=starts.infeasible", "starts_at_best=starts.agree"),
+                    **entries("agreement=starts.statement", "seed", "population=searched"),
                 },
-                "chi2": self.chi_square,
-                "adequate": self.adequacy,
-                "residual_clusters": self.residual_clusters,
+                **entries("chi2=chi_square", "adequate=adequacy", "residual_clusters"),
                 "identifiability": {
-                    "singular_values": about.singular_values,
-                    "rank": about.rank,
+                    **entries("singular_values=identifiability.singular_values", "rank=identifiability.rank"),
                     "directions_better_known_from_data": int(np.sum(about.singular_values > 1)),
                     "weak_directions": [
                         {"singular_value": s, "components": main} for s, main in about.weak_directions()
@@ -428,8 +418,7 @@ class CalibrationResult:
                     "together": self.together,
                 },
                 "statuses_before": _counts(self.status_before),
-                "statuses": self.counts,
-                "notes": self.notes,
+                **entries("statuses=counts", "notes"),
             }
         )
 

@@ -9,7 +9,7 @@ from scipy import stats
 
 from calibration.data import Columns, Json, Names
 from calibration.data.runs import Runs
-from calibration.data.writing import json_value
+from calibration.data.writing import entries_of, json_value
 from calibration.described import describe, sentences
 from calibration.inference.fit_notes import Remark
 from calibration.sensitivity.replicates import LEVEL, REPLICATES, Estimate
@@ -133,6 +133,7 @@ class OutputStudy:
         studied: True for included points.
     """
 
+    JSON = ("label=row.label", "unit=row.unit_shown", "factor=row.factor", "value", "sd", "share", "studied", "lost")
     row: Quantity
     value: np.ndarray
     derivative: np.ndarray
@@ -287,17 +288,12 @@ class SensitivityResult:
         return json_value(
             {
                 "schema": SCHEMA,
-                "method": self.method,
-                "model": self.model,
-                "seed": self.seed,
-                "statement": self.statement(),
-                "inputs": self.inputs,
-                "correlated": self.correlated,
+                **entries_of(self, "method", "model", "seed", "statement", "inputs", "correlated"),
                 "points": [
                     {key: column[k].item() for key, column in self.points.columns().items()}
                     for k in range(len(self.points))
                 ],
-                "outputs": {name: _output(study) for name, study in self.outputs.items()},
+                "outputs": self.outputs,
                 "indices": {name: self._indices(study) for name, study in self.outputs.items()},
                 "interactions": {
                     name: interactions(study, names)
@@ -312,20 +308,16 @@ class SensitivityResult:
                     for name, study in self.outputs.items()
                     if study.convergence
                 },
-                "negligible": self.negligible,
-                "statuses": self.statuses,
-                "statuses_sampled": self.sampled,
+                **entries_of(self, "negligible", "statuses", "statuses_sampled=sampled"),
                 "next_runs": None if self.next_runs is None else _next_runs(self.next_runs, names),
-                "evaluations": self.evaluations,
-                "seconds": self.seconds,
-                "notes": self.notes,
+                **entries_of(self, "evaluations", "seconds", "notes"),
             }
         )
 
     def _indices(self, study: OutputStudy) -> Json:
         if self.method == "local":
             return {
-                name: {"derivative": study.derivative[:, k].tolist(), "elasticity": study.elasticity[:, k].tolist()}
+                name: {"derivative": study.derivative[:, k], "elasticity": study.elasticity[:, k]}
                 for k, name in enumerate(self.names)
             }
         return _by_input(self.names, study.overall)
@@ -365,19 +357,6 @@ class SensitivityResult:
         }
 
 
-def _output(study: OutputStudy) -> Json:
-    return {
-        "label": study.row.label,
-        "unit": study.row.unit_shown,
-        "factor": study.row.factor,
-        "value": study.value.tolist(),
-        "sd": study.sd.tolist(),
-        "share": study.share.tolist(),
-        "studied": study.studied.tolist(),
-        "lost": study.lost.tolist(),
-    }
-
-
 def _by_input(names: Names, estimates: dict[str, Estimate]) -> Json:
     return {
         name: {
@@ -410,13 +389,11 @@ def interactions(study: OutputStudy, names: Names) -> list[Interaction]:
 def _next_runs(runs: NextRuns, names: Names) -> Json:
     columns = runs.points.columns()
     return {
-        "candidates": runs.candidates,
-        "source": runs.source,
-        "noise": runs.noise,
+        **entries_of(runs, "candidates", "source", "noise"),
         "runs": [
             {**{key: column[k].item() for key, column in columns.items()}, "gain_bits": float(runs.gain[k])}
             for k in range(len(runs.points))
         ],
-        "sd_ratio": {name: runs.sd[:, k].tolist() for k, name in enumerate(names)},
-        "output_sd": {name: x.tolist() for name, x in runs.output_sd.items()},
+        "sd_ratio": dict(zip(names, runs.sd.T, strict=True)),
+        "output_sd": runs.output_sd,
     }

@@ -14,7 +14,7 @@ import numpy as np
 import optax
 from jaxtyping import Array, Float
 
-from calibration.data import Json, Names
+from calibration.data import Names
 from calibration.data.input_errors import BadConfiguration, allowed_words
 from calibration.data.parts import CellSheet
 from calibration.data.requirements_file import Requirements
@@ -60,6 +60,10 @@ class SizedDesign:
         robot: of the design.
     """
 
+    JSON = (
+        "motor=drive.motor.name", "gearbox", "ratio", "radius_m=radius", "cell=cell.name", "cells=in_series",
+        "parallel", "objectives", "feasible", "binds", "margins",
+    )  # fmt: skip
     drive: Drive
     cell: CellSheet
     ratio: float
@@ -82,14 +86,10 @@ class SizedDesign:
         order = sorted(self.margins.items(), key=lambda item: item[1])
         return [*(label for label, m in order if m < BINDS), *self.bounds]
 
-    def to_json(self) -> Json:
-        """Entry of `result.json`."""
-        return {
-            "motor": self.drive.motor.name, "gearbox": f"{self.drive.family}, stages {self.drive.stages}",
-            "ratio": self.ratio, "radius_m": self.radius, "cell": self.cell.name, "cells": self.in_series,
-            "parallel": self.parallel, "objectives": self.objectives, "feasible": self.feasible, "binds": self.binds,
-            "margins": self.margins,
-        }  # fmt: skip
+    @property
+    def gearbox(self) -> str:
+        """Family of the gearbox, and its stages."""
+        return f"{self.drive.family}, stages {self.drive.stages}"
 
 
 @dataclasses.dataclass(frozen=True)

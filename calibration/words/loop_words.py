@@ -213,7 +213,7 @@ def curve_course(d: UnnamedDiscrepancy) -> str:
 def proposed_formula(d: UnnamedDiscrepancy) -> str:
     """The formula of a curve, or its course where no single term explains it."""
     if d.proposal.expression:
-        return f"{d.proposal.formula} ({d.proposal.mark})"
+        return f"{d.proposal.expression} ({d.proposal.mark})"
     what = curve_course(d)
     return f"The curve {what}; {NO_FORMULA}" if what else NO_FORMULA
 

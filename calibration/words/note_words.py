@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from calibration.data.settling import Settled
-from calibration.discovery import loop_notes
+from calibration.discovery import formula, loop_notes
 from calibration.discovery import result as loop_results
 from calibration.inference import fit_notes
 from calibration.inference import result as fit_results
@@ -52,7 +52,7 @@ RESULTS: dict[type, Callable[..., str]] = {
     loop_notes.Summary: loop_words.verdict_sentences,
     loop_results.Alternative: lambda found: loop_words.why_ruled_out(found.reasons),
     loop_results.DiscoveryResult: lambda found: loop_words.loop_answer(found.headline),
-    loop_results.Formula: lambda found: found.expression or loop_words.NO_FORMULA,
+    formula.Proposal: lambda found: found.expression or loop_words.NO_FORMULA,
     loop_results.Resolved: loop_words.track_model_answer,
     loop_results.UnnamedDiscrepancy: loop_words.curve_course,
     SensitivityResult: sensitivity_words.sensitivity_statement,

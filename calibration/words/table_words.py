@@ -6,7 +6,6 @@ import math
 from collections.abc import Callable
 
 from calibration.data import Names
-from calibration.data.input_errors import bound_text
 
 #: Measurements that determine a parameter which the data do not, by the start or end of its name.
 WOULD_MEASURE = {
@@ -49,9 +48,9 @@ def differing_repeats(
     near: str = "",
 ) -> str:
     """Rows under the same conditions whose readings differ."""
-    (first, second), (one, other) = rows, map(bound_text, values)
+    (first, second), (one, other) = rows, values
     reading = (
-        f"{source} rows {first} and {second}, {column}: the same conditions gave {one} and {other}, "
+        f"{source} rows {first} and {second}, {column}: the same conditions gave {one:g} and {other:g}, "
         f"{apart} apart{f' (and so {more} more)' * bool(more)}"
     )
     if unused:
@@ -117,7 +116,7 @@ def _runs(names: Names, one: str, several: str) -> str:
 
 def inherited_priors(part: str, changed: tuple[tuple[str, float, float], ...], kept: Names) -> str:
     """A part that is not the nominal robot's while friction of it is."""
-    each = ", ".join(f"{name} {bound_text(mine)} for {bound_text(nominal)}" for name, mine, nominal in changed)
+    each = ", ".join(f"{name} {mine:g} for {nominal:g}" for name, mine, nominal in changed)
     one = len(kept) == 1
     return (
         f"{part} is not the nominal robot's ({each}), but its {', '.join(kept)} still "
@@ -129,7 +128,7 @@ def inherited_priors(part: str, changed: tuple[tuple[str, float, float], ...], k
 def off_by(column: str, unit: str, factor: float, units: Names, others: Names, imposed: str) -> str:
     """Readings that no robot like this one shows."""
     off, size = (factor, "large") if factor > 1 else (1 / factor, "small")
-    what = f"{column}: readings are about {bound_text(float(f'{off:.2g}'))} times too {size} for this robot"
+    what = f"{column}: readings are about {float(f'{off:.2g}'):g} times too {size} for this robot"
     alike = f"; {' and '.join(others)} alike: check {imposed} and the robot's file" if others else ""
     if units:
         return f"{what}; are they in {' or '.join(units)}? expected {unit}{alike}"
@@ -142,7 +141,7 @@ SAID: dict[str, str | Callable[..., str]] = {
         f"{name}: nothing in these data measures it; its value is its prior's. {would_measure(name)} would"
     ),
     "constant": lambda column, value, alike: (
-        f"{column} is {bound_text(value)} in every row: {ALIKE[alike]}, so only their priors distinguish them"
+        f"{column} is {value:g} in every row: {ALIKE[alike]}, so only their priors distinguish them"
     ),
     "repeats": differing_repeats,
     "larger_noise": "{channel}: {pairs} pairs of rows at the same conditions scatter "

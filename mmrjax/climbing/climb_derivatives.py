@@ -32,7 +32,7 @@ from mmrjax.climbing.footing import PITCH
 from mmrjax.climbing.terrain import Terrain
 from mmrjax.compile.compiling import SELDOM, compiled
 from mmrjax.model.conditions import Conditions
-from mmrjax.model.params import Scalar
+from mmrjax.model.params import Scalar, Scalars
 from mmrjax.model.robot import Robot
 
 #: Margins (and instants) within this distance of the smallest one count as well [-].
@@ -79,7 +79,7 @@ def crest_sample(terrain: Terrain, record: ClimbRecord, over: bool) -> int | Non
     return int(jnp.argmax(record.centre > terrain.finish)) if over else None
 
 
-def climb_outputs(robot: Robot, terrain: Terrain, record: ClimbRecord, crest: int | None) -> dict[str, Scalar]:
+def climb_outputs(robot: Robot, terrain: Terrain, record: ClimbRecord, crest: int | None) -> Scalars:
     """`OUTPUTS` of a run until its verdict, from its record of shape (samples,)."""
     reach = jnp.asarray((record.centre - terrain.finish) / (robot.running_gear.wheelbase / 2))
     # the crest is between two samples
@@ -193,7 +193,7 @@ def climb_derivatives(
     )
 
 
-def outputs_of_run(robot: Robot, terrain: Terrain, ended: Climb, k: int) -> dict[str, Scalar]:
+def outputs_of_run(robot: Robot, terrain: Terrain, ended: Climb, k: int) -> Scalars:
     """`OUTPUTS` of run `k` of a batch."""
     record = jax.tree.map(jnp.asarray, ended.run(k))
     return climb_outputs(robot, terrain, record, crest_sample(terrain, record, bool(ended.verdict[k] == OVER)))

@@ -27,7 +27,7 @@ from mmrjax.model import balances, contact
 from mmrjax.model.chassis import Chassis
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.masses import Masses, without_levers
-from mmrjax.model.params import Scalar
+from mmrjax.model.params import Pair, Scalar
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import GRAVITY, Signals, State
 from mmrjax.model.track_friction import Track
@@ -76,12 +76,12 @@ class Sequence(eqx.Module):
     at: Float[Array, " knots"]
     front: Float[Array, " knots"]
     rear: Float[Array, " knots"]
-    begins: Float[Array, " 2"] | None = None
+    begins: Pair | None = None
     over_time: bool = eqx.field(default=False, static=True)
     supply: Scalar | None = None
 
     @property
-    def first(self) -> Float[Array, " 2"]:
+    def first(self) -> Pair:
         """Initial ψ of both levers [rad]."""
         return _turned(*(self.asked(-jnp.inf, 0.0) if self.begins is None else self.begins))
 
@@ -91,7 +91,7 @@ class Sequence(eqx.Module):
         return jnp.interp(abscissa, self.at, self.front), jnp.interp(abscissa, self.at, self.rear)
 
 
-def _turned(front: Array, rear: Array) -> Float[Array, " 2"]:
+def _turned(front: Array, rear: Array) -> Pair:
     """Converts between ψ of both levers and their angles, see `footing` [rad]."""
     return jnp.stack([front, jnp.pi - rear])
 
@@ -147,10 +147,10 @@ class ClimbRecord(eqx.Module):
     current: Scalar
     total_current: Scalar
     voltage: Scalar
-    torque: Float[Array, " 2"]
-    lever_current: Float[Array, " 2"]
-    lever_voltage: Float[Array, " 2"]
-    holds: Float[Array, " 2"]
+    torque: Pair
+    lever_current: Pair
+    lever_voltage: Pair
+    holds: Pair
     energy: Energy
     stored: Scalar
     normal: Scalar
@@ -158,7 +158,7 @@ class ClimbRecord(eqx.Module):
     grip: Scalar
     carried: Scalar
     centre: Scalar
-    base: Float[Array, " 2"]
+    base: Pair
 
     @property
     def margin(self) -> Scalar:
@@ -342,7 +342,7 @@ def _loaded(run: System, motion: Motion) -> System:
     return dataclasses.replace(run, robot=dataclasses.replace(run.robot, battery=battery))
 
 
-def demanded_lever_rates(run: System, motion: Motion, time: Scalar) -> Float[Array, " 2"]:
+def demanded_lever_rates(run: System, motion: Motion, time: Scalar) -> Pair:
     """Demanded angular speeds of the levers after a step [rad/s].
 
     They lead to the sequence's angles, limited by the levers' rate. Levers at their angle stand.
@@ -480,7 +480,7 @@ def advance_climb(run: System, motion: Motion, time: Scalar, energy: Energy) -> 
     return after, spent, passed
 
 
-def _base(centre: Scalar, at: Footing) -> Float[Array, " 2"]:
+def _base(centre: Scalar, at: Footing) -> Pair:
     """Distances of the outermost contacts behind and ahead of the centre of mass [m], assuming level ground below."""
     bears, ahead = at.force > 0, at.place - centre
     return jnp.stack([jnp.max(jnp.where(bears, way, -jnp.inf)) for way in (-ahead, ahead)])

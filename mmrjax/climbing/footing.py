@@ -26,6 +26,9 @@ from mmrjax.model.paper_tables import GROUSERS_LEVER
 from mmrjax.model.params import Scalar
 from mmrjax.undercarriage.running_gear import GROUSERS, RunningGear
 
+#: A number of each pair of a body and the ground.
+PerPair = Float[Array, " pairs"]
+
 COORDINATES = 6
 PITCH, SHAFT, FRONT, REAR = 2, 3, 4, 5
 
@@ -95,19 +98,19 @@ class Footing(eqx.Module):
         place: x of the contact [m].
     """
 
-    gap: Float[Array, " pairs"]
-    gap_rate: Float[Array, " pairs"]
+    gap: PerPair
+    gap_rate: PerPair
     normal: Float[Array, "pairs 2"]
     off: Float[Array, "pairs 6"]
     along: Float[Array, "pairs 6"]
     carried: Float[Array, "pairs 6"]
-    force: Float[Array, " pairs"]
-    damped: Float[Array, " pairs"]
-    elastic: Float[Array, " pairs"]
-    energy: Float[Array, " pairs"]
-    guided: Float[Array, " pairs"]
-    rolls: Float[Array, " pairs"]
-    place: Float[Array, " pairs"]
+    force: PerPair
+    damped: PerPair
+    elastic: PerPair
+    energy: PerPair
+    guided: PerPair
+    rolls: PerPair
+    place: PerPair
 
 
 class _Group(NamedTuple):

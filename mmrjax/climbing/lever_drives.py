@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from mmrjax.model.gearbox import Gearbox
-from mmrjax.model.params import Scalar
+from mmrjax.model.params import Pair, Scalar
 from mmrjax.model.robot import Robot
 
 #: Pieces of a drive's law: the voltage is at its minimum (-1), its maximum (1), or follows from the demanded rate
@@ -100,12 +100,12 @@ class Swing(NamedTuple):
 def step_levers(
     drive: LeverDrive,
     step: Scalar,
-    rate: Float[Array, " 2"],
-    free: Float[Array, " 2"],
+    rate: Pair,
+    free: Pair,
     yields: Float[Array, "2 2"],
-    asked: Float[Array, " 2"],
-    least: Float[Array, " 2"],
-    most: Float[Array, " 2"],
+    asked: Pair,
+    least: Pair,
+    most: Pair,
 ) -> Swing:
     """One step of both pairs: the demanded rates if the voltages permit them, else the rates that these give.
 

@@ -21,6 +21,9 @@ from mmrjax.model.params import Scalar
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import CONVERGED
 
+#: A number of each instant.
+OverTime = Float[np.ndarray, " times"]
+
 #: Names of the stages, in order.
 NAMES = ("starting", "acceleration with slipping", "uniform")
 #: Deviation from the last speed that ends a start [-], and length of the end of a run that is averaged for it [s].
@@ -76,9 +79,9 @@ def _smoothed(time: np.ndarray, values: np.ndarray, period: float) -> np.ndarray
 
 
 def mean_slip(
-    time: Float[np.ndarray, " times"],
-    speed: Float[np.ndarray, " times"],
-    theoretical: Float[np.ndarray, " times"],
+    time: OverTime,
+    speed: OverTime,
+    theoretical: OverTime,
     begin: float,
     end: float,
 ) -> float:
@@ -95,10 +98,10 @@ def mean_slip(
 
 
 def stages_of_start(
-    time: Float[np.ndarray, " times"],
-    speed: Float[np.ndarray, " times"],
-    theoretical: Float[np.ndarray, " times"],
-    sliding: Float[np.ndarray, " times"],
+    time: OverTime,
+    speed: OverTime,
+    theoretical: OverTime,
+    sliding: OverTime,
     speed_static: float,
     way: float = 0.0,
 ) -> StartStages:
@@ -147,13 +150,13 @@ def stages_of_histories(
     return stages
 
 
-def count_finite_samples(values: Float[np.ndarray, " times"]) -> int:
+def count_finite_samples(values: OverTime) -> int:
     """Number of samples of a run up to its last finite one."""
     finite = np.flatnonzero(np.isfinite(values))
     return int(finite[-1]) + 1 if finite.size else 0
 
 
-def last_samples(time: Float[np.ndarray, " times"]) -> np.ndarray:
+def last_samples(time: OverTime) -> np.ndarray:
     """Mask of the last 0.15 s, several pitches of the running gear. For a short run, of its last tenth."""
     return np.asarray(time >= time[-1] - min(LAST, 0.1 * float(time[-1])))
 

@@ -16,6 +16,7 @@ import numpy as np
 
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.params import Scalar, parameter
+from mmrjax.model.quantities import Names
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import Signals
 
@@ -86,7 +87,7 @@ class Effect(eqx.Module):
     name: ClassVar[str]
     balance: ClassVar[str]
     driver: ClassVar[str] = ""
-    rests_on: ClassVar[tuple[str, ...]] = ()
+    rests_on: ClassVar[Names] = ()
     dissipative: ClassVar[bool] = False
     channel: ClassVar[str] = ""
     transient: ClassVar[bool] = False
@@ -108,7 +109,7 @@ class Effect(eqx.Module):
         amplitude: Scalar = eqx.field(default=0.0, kw_only=True)
     else:
         amplitude: eqx.AbstractVar[Scalar]
-    configurations: tuple[str, ...] = eqx.field(default=(), static=True, kw_only=True)
+    configurations: Names = eqx.field(default=(), static=True, kw_only=True)
 
     def __init_subclass__(cls, **keywords: Any) -> None:
         super().__init_subclass__(**keywords)
@@ -116,7 +117,7 @@ class Effect(eqx.Module):
             cls.name = re.sub(r"(?<!^)(?=[A-Z])", "_", cls.__name__).lower()
         # Stated next to the class attributes, it is the default of the field.
         if isinstance(stated := vars(cls).get("configurations"), tuple):
-            cls.__annotations__ = {**inspect.get_annotations(cls), "configurations": tuple[str, ...]}
+            cls.__annotations__ = {**inspect.get_annotations(cls), "configurations": Names}
             cls.configurations = eqx.field(default=stated, static=True, kw_only=True)
 
     def for_equations(self) -> Effect:

@@ -11,6 +11,8 @@ import math
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
+from mmrjax.model.quantities import Names
+
 if TYPE_CHECKING:
     from mmrjax.fidelities.base import Fidelity
 
@@ -79,8 +81,8 @@ class Facts:
     options: tuple[Option, ...] = ()
     rollout: bool = False
     histories: bool = False
-    computes: tuple[str, ...] = ()
-    resolves: tuple[str, ...] = ()
+    computes: Names = ()
+    resolves: Names = ()
     reverse: bool = True
     slow: bool = False
     one_thread: bool = False
@@ -158,7 +160,7 @@ TABLE: dict[str, Facts] = {
     ),
 }
 
-NAMES: tuple[str, ...] = tuple(TABLE)
+NAMES: Names = tuple(TABLE)
 
 
 def fidelity_facts(name: str) -> Facts:
@@ -176,7 +178,7 @@ def fidelity_facts(name: str) -> Facts:
 OF_TURNS = ".turning."
 
 
-def unread_parameters(name: str, parameters: Iterable[str], turns: bool = False) -> tuple[str, ...]:
+def unread_parameters(name: str, parameters: Iterable[str], turns: bool = False) -> Names:
     """Parameters among `parameters` (dotted) that a fidelity does not read in straight travel, or in turns."""
     of_others = {head for other in TABLE.values() for head in other.resolves} - set(fidelity_facts(name).resolves)
     return tuple(p for p in parameters if p.startswith(tuple(of_others)) or (OF_TURNS in p and not turns))

@@ -16,7 +16,7 @@ from mmrjax.compile.compiling import compiled
 from mmrjax.fidelities import Facts
 from mmrjax.model import balances, channels
 from mmrjax.model.conditions import Conditions
-from mmrjax.model.params import Scalar
+from mmrjax.model.params import Scalars
 from mmrjax.model.quantities import VOLTAGE
 from mmrjax.model.rig import Rig
 from mmrjax.model.robot import Robot
@@ -43,7 +43,7 @@ class History(eqx.Module):
     time: Float[Array, "runs samples"]
     distance: Float[Array, "runs samples"]
     signals: Signals
-    reading: dict[str, Scalar]
+    reading: Scalars
     reactions: Reactions | None = None
 
     @staticmethod
@@ -92,7 +92,7 @@ def in_table_time(rig: Rig, time: Float[Array, "runs samples"], values: T) -> tu
 
 
 @compiled
-def _shown(robot: Robot, signals: Signals, apart: bool = False) -> dict[str, Scalar]:
+def _shown(robot: Robot, signals: Signals, apart: bool = False) -> Scalars:
     """Readings of the channels that change in a history. `apart`: from signals of left and right side."""
     every = balances.readings_of_sides(robot, signals) if apart else balances.sensor(robot, signals)
     return {c.name: every[c.name] for c in channels.EVERY if c.over_time}
@@ -119,7 +119,7 @@ class Run(eqx.Module):
     """
 
     result: Result
-    columns: dict[str, Scalar] = eqx.field(default_factory=dict)
+    columns: Scalars = eqx.field(default_factory=dict)
     history: History | None = None
 
 

@@ -30,7 +30,7 @@ from mmrjax.model.signals import (
     Signals,
     State,
 )
-from mmrjax.numerics.rosenbrock import error_norm, step_longest
+from mmrjax.numerics.rosenbrock import Unknowns, error_norm, step_longest
 from mmrjax.turning import circling
 from mmrjax.turning.two_sides import SIDES
 
@@ -70,7 +70,7 @@ def drive_units(robot: Robot) -> tuple[float, ...]:
     return _UNITS + memory + (1.0,) * robot.controller_size + (_GAP,) * robot.loose
 
 
-def state_of_unknowns(robot: Robot, y: Float[Array, " unknowns"]) -> State:
+def state_of_unknowns(robot: Robot, y: Unknowns) -> State:
     """The state of a vector of unknowns."""
     y = y * jnp.asarray(drive_units(robot), y.dtype)
     memory = {effect.name: y[len(_UNITS) + k] for k, effect in enumerate(robot.remembering)}
@@ -84,9 +84,7 @@ moving = compiled(balances.moving_signals)
 
 
 @compiled
-def drive_rates(
-    robot: Robot, conditions: Conditions, y: Float[Array, " unknowns"], way: Scalar | None = None
-) -> Float[Array, " unknowns"]:
+def drive_rates(robot: Robot, conditions: Conditions, y: Unknowns, way: Scalar | None = None) -> Unknowns:
     """Rates of the unknowns, in their units [1/s]. `way` as in `balances.moving_signals`, or `HELD`."""
     held = jnp.asarray(False if way is None else way == HELD)
     state = state_of_unknowns(robot, y)
@@ -112,7 +110,7 @@ def drive_rates(
     return jnp.stack(rates) / jnp.asarray(drive_units(robot), y.dtype)
 
 
-def winding_rate(robot: Robot, conditions: Conditions, y: Float[Array, " unknowns"]) -> Array:
+def winding_rate(robot: Robot, conditions: Conditions, y: Unknowns) -> Array:
     """Rate of the current only, in its unit, without an imposed speed [1/s]."""
     state = state_of_unknowns(robot, y)
     signals = balances.driven_signals(robot, conditions, state, None)
@@ -122,7 +120,7 @@ def winding_rate(robot: Robot, conditions: Conditions, y: Float[Array, " unknown
 _norm = functools.partial(error_norm, own=len(_UNITS))
 
 
-def drive_start(robot: Robot, conditions: Conditions, rolling: bool = False) -> Float[Array, " unknowns"]:
+def drive_start(robot: Robot, conditions: Conditions, rolling: bool = False) -> Unknowns:
     """Unknowns at rest, or for `rolling` those of the steady fidelity with settled memories of effects.
 
     At rest too if the steady fidelity has no root.

@@ -39,12 +39,13 @@ from mmrjax.fidelities.drive import (
 )
 from mmrjax.fidelities.rest import HELD, shaft_direction, standing_signals
 from mmrjax.model.conditions import Conditions
-from mmrjax.model.params import Scalar
+from mmrjax.model.params import Pair, Scalar
 from mmrjax.model.rig import interpolate
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import Signals
 from mmrjax.numerics.linear_equations import invert, solve
 from mmrjax.numerics.rarely import compute_rarely
+from mmrjax.numerics.rosenbrock import Unknowns
 
 T = TypeVar("T")
 
@@ -122,7 +123,7 @@ def _in_time(conditions: Conditions) -> tuple[Conditions, Conditions]:
     return eqx.partition(conditions, lambda x: jnp.ndim(x) > 0)
 
 
-def first_instant(robot: Robot, conditions: Conditions) -> tuple[Conditions, Float[Array, " unknowns"]]:
+def first_instant(robot: Robot, conditions: Conditions) -> tuple[Conditions, Unknowns]:
     """Conditions and state of a run at its first instant."""
     changing, constant = _in_time(conditions)
     held = eqx.combine(jax.tree.map(lambda x: x[0], changing), constant)
@@ -152,7 +153,7 @@ class LinearisedRun(eqx.Module):
     lags: Float[Array, "steps rates unknowns"]
 
 
-def _current(y: Float[Array, " unknowns"]) -> Float[Array, " unknowns"]:
+def _current(y: Unknowns) -> Unknowns:
     """Unit vector of the current among the unknowns."""
     return jnp.eye(len(y), dtype=y.dtype)[CURRENT]
 
@@ -167,7 +168,7 @@ class Lag(eqx.Module):
     """
 
     begin: Float[Array, ""]
-    means: Float[Array, " 2"]
+    means: Pair
     end: Float[Array, ""]
     decay: Float[Array, ""]
 
@@ -194,7 +195,7 @@ class RunStep(eqx.Module):
         return eqx.combine(self.now, constant)
 
     def rates_at_start(
-        self, constant: Conditions, rate: Callable[[Array, Conditions], Array], y: Float[Array, " unknowns"]
+        self, constant: Conditions, rate: Callable[[Array, Conditions], Array], y: Unknowns
     ) -> Float[Array, "rates ..."]:
         """Rates of the current at the start of the step, for the input before and after the last jump.
 
@@ -252,14 +253,12 @@ def _decaying(begin: Array, decay: Array, h: Array) -> Lag:
     return Lag(begin, means, begin * jnp.exp(-decay * h), decay)
 
 
-def _windings(
-    robot: Robot, constant: Conditions, step: RunStep, y: Float[Array, " unknowns"]
-) -> Float[Array, " rates"]:
+def _windings(robot: Robot, constant: Conditions, step: RunStep, y: Unknowns) -> Float[Array, " rates"]:
     """Rates that determine the lag of a step, see `Step.rates_at_start`."""
     return step.rates_at_start(constant, lambda y, held: winding_rate(robot, held, y), y)
 
 
-def _lag_of(robot: Robot, constant: Conditions, step: RunStep, y: Float[Array, " unknowns"]) -> Lag:
+def _lag_of(robot: Robot, constant: Conditions, step: RunStep, y: Unknowns) -> Lag:
     return _lag(_windings(robot, constant, step, y), step, y[CURRENT], _limit(robot))
 
 
@@ -322,12 +321,12 @@ class _Part(eqx.Module):
     """
 
     turn: Array
-    begin: Float[Array, " unknowns"]
+    begin: Unknowns
     lag: Array
     length: Array
     side: Array
     stages: Float[Array, "2 unknowns"]
-    end: Float[Array, " unknowns"]
+    end: Unknowns
 
 
 def solve_states(robot: Robot, conditions: Conditions, times: Float[Array, " times"]) -> RunStates:
@@ -527,9 +526,7 @@ def _of_steps(blocks: T, count: int) -> T:
     return jax.tree.map(lambda x: x.reshape(x.shape[0] * BLOCK, *x.shape[2:])[:count], blocks)
 
 
-def _jump(
-    robot: Robot, conditions: Conditions, y: Float[Array, " unknowns"], sides: Float[Array, " 2"]
-) -> Float[Array, " unknowns"]:
+def _jump(robot: Robot, conditions: Conditions, y: Unknowns, sides: Pair) -> Unknowns:
     """Jump of the unknowns' sensitivity at a passage through rest, per motor speed before it: (f⁺ - f⁻) / f⁻.
 
     The moment of rest moves by -1 / f⁻ (Filippov systems; Leine and Nijmeijer 2004, Section 7.3).

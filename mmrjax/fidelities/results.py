@@ -23,6 +23,7 @@ from mmrjax.model import channels
 from mmrjax.model.channels import Channel, channel_names, usual_channels
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.params import Scalar
+from mmrjax.model.quantities import Names
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import CODES, STATUSES, Result
 
@@ -222,10 +223,10 @@ class Results:
     result: Result
     further: dict[str, Scalar]
     history: History | None
-    configurations: tuple[str, ...]
+    configurations: Names
     model: str
     mission: Mission | None = None
-    stated: tuple[str, ...] = ()
+    stated: Names = ()
     channels: tuple[Channel, ...] = dataclasses.field(default_factory=usual_channels)
 
     def __post_init__(self) -> None:
@@ -234,7 +235,7 @@ class Results:
             object.__setattr__(self, "result", dataclasses.replace(result, status=coded))
 
     @staticmethod
-    def pending(batch: Pending, configurations: tuple[str, ...], model: str) -> Results:
+    def pending(batch: Pending, configurations: Names, model: str) -> Results:
         """Results that will be computed at first use."""
         results = object.__new__(Results)
         fields = {"conditions": batch.conditions, "further": {}, "history": None, "mission": None, "stated": ()}

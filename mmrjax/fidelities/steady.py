@@ -44,6 +44,7 @@ from mmrjax.numerics.linear_equations import Vector
 from mmrjax.numerics.newton import root
 from mmrjax.numerics.one_sided import clip
 from mmrjax.numerics.rarely import compute_rarely
+from mmrjax.numerics.rosenbrock import Unknowns
 from mmrjax.turning import circling
 
 # Units of the unknowns and of the torque residual, which scale them to the order of one.
@@ -356,7 +357,7 @@ def _settled(robot: Robot, conditions: Conditions) -> Result:
     return jax.vmap(lambda c: operating_point(robot, c)[0])(conditions)
 
 
-def _solve(robot: Robot, conditions: Conditions) -> tuple[Float[Array, " unknowns"], Bool[Array, ""]]:
+def _solve(robot: Robot, conditions: Conditions) -> tuple[Unknowns, Bool[Array, ""]]:
     if conditions.turns:
         return circling.solve_turn(robot, conditions)
     unknowns, is_root = _root(robot, conditions, large=False)
@@ -364,8 +365,8 @@ def _solve(robot: Robot, conditions: Conditions) -> tuple[Float[Array, " unknown
 
 
 def _shown(
-    robot: Robot, conditions: Conditions, unknowns: Float[Array, " unknowns"], found: Bool[Array, ""]
-) -> tuple[Result, Signals, Float[Array, " unknowns"]]:
+    robot: Robot, conditions: Conditions, unknowns: Unknowns, found: Bool[Array, ""]
+) -> tuple[Result, Signals, Unknowns]:
     if conditions.turns:
         return circling.turn_results(robot, conditions, unknowns, found)
     signals, status, _, left = _operating_at(robot, conditions, tuple(unknowns), found, stands=False)

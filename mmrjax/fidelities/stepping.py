@@ -14,7 +14,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array
 
 from mmrjax.compile.compiling import compiled
 from mmrjax.compile.precision import as_floats
@@ -28,7 +28,7 @@ from mmrjax.model.conditions import OF_TURNS, Conditions
 from mmrjax.model.params import Scalar
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import State
-from mmrjax.numerics.rosenbrock import rosenbrock_stages
+from mmrjax.numerics.rosenbrock import Unknowns, rosenbrock_stages
 
 #: Duty of the driver, or values of conditions by name.
 Command = Scalar | Mapping[str, Scalar] | None
@@ -99,14 +99,12 @@ def step(robot: Robot, state: State, command: Command, dt: Scalar, conditions: C
 
 
 @compiled
-def _begun(robot: Robot, conditions: Conditions, rolling: bool) -> Float[Array, " unknowns"]:
+def _begun(robot: Robot, conditions: Conditions, rolling: bool) -> Unknowns:
     return drive.drive_start(robot, conditions, rolling)
 
 
 @compiled
-def _stepped(
-    robot: Robot, conditions: Conditions, y: Float[Array, " unknowns"], dt: Scalar
-) -> Float[Array, " unknowns"]:
+def _stepped(robot: Robot, conditions: Conditions, y: Unknowns, dt: Scalar) -> Unknowns:
     """The unknowns of `drive` after a step. A robot that has stopped is held if friction at rest can hold it."""
     speeds = np.isin(np.arange(len(y)), (drive.MOTOR, drive.GROUND))
     last = len(y) - robot.loose
@@ -178,7 +176,7 @@ def _seconds(dt: Scalar) -> Scalar:
     return jnp.asarray(dt, float)
 
 
-def _vector(robot: Robot, state: State) -> Float[Array, " unknowns"]:
+def _vector(robot: Robot, state: State) -> Unknowns:
     """The unknowns of `drive` for a state, the inverse of `drive.state_of_unknowns`."""
     if not isinstance(state, State):
         raise UsageError(f"state: got {type(state).__name__}; expected one from mmrjax.initial_state or a step")

@@ -20,6 +20,7 @@ from mmrjax.missions.profile import Profile
 from mmrjax.model import params, quantities
 from mmrjax.model.channels import Channel
 from mmrjax.model.conditions import Conditions
+from mmrjax.model.quantities import Names
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import CODES
 
@@ -67,9 +68,9 @@ class Variation(eqx.Module):
     """
 
     robot: Robot
-    names: tuple[str, ...] = eqx.field(static=True)
+    names: Names = eqx.field(static=True)
 
-    def __init__(self, robot: Robot, names: tuple[str, ...]) -> None:
+    def __init__(self, robot: Robot, names: Names) -> None:
         allowed = variable_names(robot)
         for k, name in enumerate(names):
             if name not in allowed:
@@ -116,7 +117,7 @@ class Variation(eqx.Module):
         return robot, dataclasses.replace(conditions, **stated)
 
 
-def variable_names(robot: Robot) -> tuple[str, ...]:
+def variable_names(robot: Robot) -> Names:
     """Every name that may vary: conditions, then the robot's parameters."""
     return (*CONDITIONS, *(p.name for p in params.walk_parameters(robot)))
 
@@ -127,7 +128,7 @@ def evaluate_points(
     values: Float[Array, "points names"],
     conditions: Conditions,
     options: Mapping[str, float],
-    outputs: tuple[str, ...],
+    outputs: Names,
     profile: Profile | None = None,
 ) -> dict[str, Array]:
     """Outputs of many points in one call, compiled once for each number of points.
@@ -160,7 +161,7 @@ def _evaluate(
     values: Array,
     conditions: Conditions,
     options: dict[str, float],
-    names: tuple[str, ...],
+    names: Names,
     profile: Profile | None,
 ) -> dict[str, Array]:
     (points, _) = values.shape
@@ -192,7 +193,7 @@ def _evaluate(
     return pick_outputs(jax.vmap(one)(values, conditions), outputs_of, names)
 
 
-def pick_outputs(run: Run, shown: tuple[Channel, ...], names: tuple[str, ...]) -> dict[str, Array]:
+def pick_outputs(run: Run, shown: tuple[Channel, ...], names: Names) -> dict[str, Array]:
     """Outputs of a batch by name, as from `evaluate_points`, of a rig with these channels."""
     rows = table_of_outputs.output_names(shown)
     _known(names, (*rows, *run.columns))
@@ -201,7 +202,7 @@ def pick_outputs(run: Run, shown: tuple[Channel, ...], names: tuple[str, ...]) -
     return {**columns, **further, STATUS: run.result.status}
 
 
-def _known(names: tuple[str, ...], known: tuple[str, ...]) -> None:
+def _known(names: Names, known: Names) -> None:
     for name in names:
         if name not in known and name != FLAGS:
             raise UsageError(f"outputs: got {name}; {allowed_words(name, (*known, FLAGS), 3)}")

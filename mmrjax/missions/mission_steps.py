@@ -19,7 +19,7 @@ from mmrjax.fidelities.rest import smallest
 from mmrjax.fidelities.result import flag_mask
 from mmrjax.missions.profile import Profile
 from mmrjax.model.conditions import Conditions
-from mmrjax.model.params import Scalar
+from mmrjax.model.params import Scalar, Scalars
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import Signals
 from mmrjax.numerics.rarely import compute_rarely
@@ -125,18 +125,18 @@ class MotionLaw(Protocol):
         """Energy in the motion [J]."""
         ...
 
-    def peaks(self, robot: Robot, found: Any) -> dict[str, Scalar]:
+    def peaks(self, robot: Robot, found: Any) -> Scalars:
         """Values of an instant that enter `PEAKS`. Of the cell voltage the negative."""
         ...
 
-    def peaks_within(self, robot: Robot, y: Array, tops: Array) -> dict[str, Scalar]:
+    def peaks_within(self, robot: Robot, y: Array, tops: Array) -> Scalars:
         """Peaks of currents and temperatures from the largest unknowns within a step.
 
         A current counts up to the driver's limit: beyond it only the ends of a step are exact.
         """
         ...
 
-    def exceeded(self, robot: Robot, found: Any) -> dict[str, Scalar]:
+    def exceeded(self, robot: Robot, found: Any) -> Scalars:
         """Limits exceeded at an instant."""
         ...
 

@@ -7,7 +7,7 @@ import functools
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array
 
 from mmrjax.compile.compiling import compiled
 from mmrjax.fidelities import rest, result
@@ -15,11 +15,12 @@ from mmrjax.missions.mission_steps import SegmentInputs
 from mmrjax.missions.profile import MOTOR_SPEED, SPEED, Profile
 from mmrjax.model import balances, energy
 from mmrjax.model.conditions import Conditions
-from mmrjax.model.params import Scalar
+from mmrjax.model.params import Scalar, Scalars
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import Signals, State
 from mmrjax.numerics import rosenbrock
 from mmrjax.numerics.one_sided import clip
+from mmrjax.numerics.rosenbrock import Unknowns
 
 #: Units of the unknowns current, motor speed, speed, discharge, temperatures of winding and housing, integral of the
 #: controller and time in the segment, which scale them to the order of one. The memories of effects follow.
@@ -42,12 +43,12 @@ PEAKS: dict[str, str] = {
 }  # fmt: skip
 
 
-def units(robot: Robot) -> Float[Array, " unknowns"]:
+def units(robot: Robot) -> Unknowns:
     """Units of the unknowns."""
     return jnp.asarray(UNITS + tuple(effect.memory_size or 1.0 for effect in robot.remembering))
 
 
-def state_of(robot: Robot, y: Float[Array, " unknowns"], stands: Array) -> State:
+def state_of(robot: Robot, y: Unknowns, stands: Array) -> State:
     x = y * units(robot).astype(y.dtype)
     memory = {effect.name: x[len(UNITS) + k] for k, effect in enumerate(robot.remembering)}
     motor, speed = (jnp.where(stands, 0.0, x[k]) for k in (MOTOR, GROUND))
@@ -163,7 +164,7 @@ def stored(robot: Robot, found: Signals) -> Scalar:
     return energy.stored_energy(robot, found)
 
 
-def peaks(robot: Robot, found: Signals) -> dict[str, Scalar]:
+def peaks(robot: Robot, found: Signals) -> Scalars:
     cell = jnp.where(found.battery > 0.5, found.voltage_source / robot.battery.cells, jnp.inf)
     assert found.temperature is not None
     return {
@@ -176,14 +177,14 @@ def peaks(robot: Robot, found: Signals) -> dict[str, Scalar]:
     }
 
 
-def peaks_within(robot: Robot, y: Array, tops: Array) -> dict[str, Scalar]:
+def peaks_within(robot: Robot, y: Array, tops: Array) -> Scalars:
     return {
         "current": robot.sides * jnp.minimum(UNITS[CURRENT] * tops[CURRENT], robot.driver.current_limit),
         "temperature": jnp.where(y[WINDING] > 0, UNITS[WINDING] * tops[WINDING], -jnp.inf),
     }
 
 
-def exceeded(robot: Robot, found: Signals) -> dict[str, Scalar]:
+def exceeded(robot: Robot, found: Signals) -> Scalars:
     hot = jnp.asarray(found.temperature) > robot.motor.temperature_limit
     return {**result.exceeded_limits(robot, found), "too_hot": hot}
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array
 
 from mmrjax.compile.compiling import compiled
 from mmrjax.fidelities.rest import smallest
@@ -21,10 +21,11 @@ from mmrjax.missions.mission_steps import SegmentInputs
 from mmrjax.missions.profile import SPEED, VOLTAGE, Profile
 from mmrjax.model import balances, channels, energy
 from mmrjax.model.conditions import Conditions
-from mmrjax.model.params import Scalar
+from mmrjax.model.params import Scalar, Scalars
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import PlaneMotion, Signals
 from mmrjax.numerics import rosenbrock
+from mmrjax.numerics.rosenbrock import Unknowns
 from mmrjax.turning import circling
 from mmrjax.turning.two_sides import SIDES, sum_of_sides
 
@@ -70,12 +71,12 @@ class TurningInstant(balances.Travel):
     motion: PlaneMotion
 
 
-def units(robot: Robot) -> Float[Array, " unknowns"]:
+def units(robot: Robot) -> Unknowns:
     """Units of the unknowns."""
     return jnp.asarray((*UNITS, *(size for e in robot.remembering for size in (e.memory_size or 1.0,) * 2)))
 
 
-def state_of(robot: Robot, y: Float[Array, " unknowns"], stands: Array) -> PlaneMotion:
+def state_of(robot: Robot, y: Unknowns, stands: Array) -> PlaneMotion:
     x = y * units(robot).astype(y.dtype)
     memory = {e.name: x[len(UNITS) + 2 * k :][:2] for k, e in enumerate(robot.remembering)}
     motor, ahead, aside, yaw = (jnp.where(stands, 0.0, x[k]) for k in (MOTOR, GROUND, LATERAL, YAW))
@@ -183,28 +184,28 @@ def stored(robot: Robot, found: TurningInstant) -> Scalar:
     return energy.stored_energy_turning(robot, found, found.motion)
 
 
-def peaks(robot: Robot, found: TurningInstant) -> dict[str, Scalar]:
+def peaks(robot: Robot, found: TurningInstant) -> Scalars:
     each = jax.vmap(lambda s: mission_straight.peaks(robot, s))(found.signals)
-    most: dict[str, Scalar] = {name: jnp.max(jnp.asarray(x)) for name, x in each.items()}
+    most: Scalars = {name: jnp.max(jnp.asarray(x)) for name, x in each.items()}
     most |= {"current": sum_of_sides(jnp.asarray(each["current"])) / 2, "speed": _size(found.motion)}
     return {**most, "yaw_rate": jnp.abs(found.motion.yaw_rate), **_of_sides(robot, each)}
 
 
-def peaks_within(robot: Robot, y: Array, tops: Array) -> dict[str, Scalar]:
+def peaks_within(robot: Robot, y: Array, tops: Array) -> Scalars:
     current = robot.sides * jnp.minimum(_EACH[0] * tops[CURRENT], robot.driver.current_limit)
     temperature = jnp.where(y[WINDING] > 0, _EACH[2] * tops[WINDING], -jnp.inf)
     either = _of_sides(robot, {"current": current, "temperature": temperature})
     return {"current": sum_of_sides(current) / 2, "temperature": jnp.max(temperature), **either}
 
 
-def _of_sides(robot: Robot, each: dict[str, Any]) -> dict[str, Scalar]:
+def _of_sides(robot: Robot, each: dict[str, Any]) -> Scalars:
     """Peaks of one motor of each side."""
     current = jnp.asarray(each["current"]) / robot.sides
     both = (("current", current), ("temperature", jnp.asarray(each["temperature"])))
     return {f"{name}_{side}": x[k] for name, x in both for k, side in enumerate(channels.SIDES)}
 
 
-def exceeded(robot: Robot, found: TurningInstant) -> dict[str, Scalar]:
+def exceeded(robot: Robot, found: TurningInstant) -> Scalars:
     each = jax.vmap(lambda s: mission_straight.exceeded(robot, s))(found.signals)
     return {name: jnp.any(x) for name, x in each.items()}
 

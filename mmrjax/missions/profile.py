@@ -17,6 +17,9 @@ from mmrjax.errors import UsageError, count_noun
 from mmrjax.model.conditions import Conditions, Number
 from mmrjax.model.params import Scalar
 
+#: A number of each row.
+PerRow = Float[Array, " rows"]
+
 #: Drive of the motors in a segment: by a share of the supply's voltage; by the driver's controller, at a demanded
 #: motor speed or ground speed; or not driven, with terminals shorted (brake) or circuit open (coast).
 MODES = ("voltage", "motor_speed", "speed", "brake", "coast")
@@ -60,22 +63,22 @@ class Profile(eqx.Module):
         cycles: number of repetitions of the rows.
     """
 
-    time: Float[Array, " rows"]
+    time: PerRow
     mode: Int[Array, " rows"]
-    demand: Float[Array, " rows"]
-    voltage: Float[Array, " rows"] | None = None
-    duty: Float[Array, " rows"] | None = None
-    duty_left: Float[Array, " rows"] | None = None
-    duty_right: Float[Array, " rows"] | None = None
-    slope_deg: Float[Array, " rows"] | None = None
-    payload: Float[Array, " rows"] | None = None
-    adhesion: Float[Array, " rows"] | None = None
-    adhesion_lateral: Float[Array, " rows"] | None = None
-    load_torque: Float[Array, " rows"] | None = None
-    voltage_left: Float[Array, " rows"] | None = None
-    voltage_right: Float[Array, " rows"] | None = None
-    yaw_rate: Float[Array, " rows"] | None = None
-    current_other: Float[Array, " rows"] | None = None
+    demand: PerRow
+    voltage: PerRow | None = None
+    duty: PerRow | None = None
+    duty_left: PerRow | None = None
+    duty_right: PerRow | None = None
+    slope_deg: PerRow | None = None
+    payload: PerRow | None = None
+    adhesion: PerRow | None = None
+    adhesion_lateral: PerRow | None = None
+    load_torque: PerRow | None = None
+    voltage_left: PerRow | None = None
+    voltage_right: PerRow | None = None
+    yaw_rate: PerRow | None = None
+    current_other: PerRow | None = None
     linear: bool = eqx.field(default=False, static=True)
     cycles: int = eqx.field(default=1, static=True)
 

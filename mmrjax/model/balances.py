@@ -21,7 +21,7 @@ from mmrjax.model import channels, contact, ground, masses, power
 from mmrjax.model import chassis as chassis_room
 from mmrjax.model.chassis import Chassis
 from mmrjax.model.conditions import Conditions
-from mmrjax.model.params import Scalar
+from mmrjax.model.params import Scalar, Scalars
 from mmrjax.model.robot import Load, Robot
 from mmrjax.model.shaft import Shaft
 from mmrjax.model.signals import GRAVITY, PlaneMotion, Signals, State
@@ -743,7 +743,7 @@ def turning_signals(
     )
 
 
-def sensor(robot: Robot, signals: Signals) -> dict[str, Scalar]:
+def sensor(robot: Robot, signals: Signals) -> Scalars:
     """Ideal readings of every channel [SI], by channel name, NaN if a reading depends on an unknown parameter."""
     return {
         c.name: robot.rig.instrument(c.name).shows(c.read(robot, signals))
@@ -754,7 +754,7 @@ def sensor(robot: Robot, signals: Signals) -> dict[str, Scalar]:
     }
 
 
-def readings_of_sides(robot: Robot, signals: Signals) -> dict[str, Scalar]:
+def readings_of_sides(robot: Robot, signals: Signals) -> Scalars:
     """Same as `sensor` for signals with a last axis of left and right side.
 
     A channel of one side shows that side. The others show the mean.

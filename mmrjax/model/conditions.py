@@ -18,6 +18,9 @@ from mmrjax.errors import UsageError
 from mmrjax.model.quantities import CONDITIONS
 from mmrjax.model.robot import Robot
 
+#: Numbers of the runs.
+Values = Float[Array, "..."]
+
 Number = float | Sequence[float] | np.ndarray | Array
 
 #: Conditions that can be stated for each side.
@@ -108,33 +111,33 @@ class Conditions(eqx.Module):
     """
 
     configuration: Any  # Int[Array, "..."] | Named
-    voltage: Float[Array, "..."]
-    slope_deg: Float[Array, "..."]
-    payload: Float[Array, "..."]
-    battery: Float[Array, "..."]
-    discharge: Float[Array, "..."]
-    adhesion: Float[Array, "..."]
-    total_mass: Float[Array, "..."] | None
-    order: Float[Array, "..."]
-    duty: Float[Array, "..."]
-    open: Float[Array, "..."]
-    motor_speed: Float[Array, "..."] | None
-    motor_acceleration: Float[Array, "..."] | None
-    motor_current: Float[Array, "..."] | None
+    voltage: Values
+    slope_deg: Values
+    payload: Values
+    battery: Values
+    discharge: Values
+    adhesion: Values
+    total_mass: Values | None
+    order: Values
+    duty: Values
+    open: Values
+    motor_speed: Values | None
+    motor_acceleration: Values | None
+    motor_current: Values | None
     begin: Int[Array, "..."] | None
-    duty_left: Float[Array, "..."] | None
-    duty_right: Float[Array, "..."] | None
-    open_left: Float[Array, "..."] | None
-    open_right: Float[Array, "..."] | None
-    motor_speed_left: Float[Array, "..."] | None
-    motor_speed_right: Float[Array, "..."] | None
-    heading_deg: Float[Array, "..."] | None
-    adhesion_lateral: Float[Array, "..."] | None
-    levers_front_deg: Float[Array, "..."] | None
-    levers_rear_deg: Float[Array, "..."] | None
-    load_torque: Float[Array, "..."] | None
-    goal: Float[Array, "..."] | None
-    held: Float[Array, "..."] | None
+    duty_left: Values | None
+    duty_right: Values | None
+    open_left: Values | None
+    open_right: Values | None
+    motor_speed_left: Values | None
+    motor_speed_right: Values | None
+    heading_deg: Values | None
+    adhesion_lateral: Values | None
+    levers_front_deg: Values | None
+    levers_rear_deg: Values | None
+    load_torque: Values | None
+    goal: Values | None
+    held: Values | None
 
     def __init__(
         self,
@@ -238,7 +241,7 @@ class Conditions(eqx.Module):
         return jax.tree.map(lambda left, right: jnp.stack([left, right]), side("left"), side("right"))
 
     @property
-    def slope(self) -> Float[Array, "..."]:
+    def slope(self) -> Values:
         """Slope angle α, positive uphill [rad]."""
         return self.slope_deg * (math.pi / 180)
 

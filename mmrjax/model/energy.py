@@ -9,7 +9,7 @@ import jax.numpy as jnp
 
 from mmrjax.model.balances import Travel, effects_sum, power_drawn
 from mmrjax.model.conditions import Conditions
-from mmrjax.model.params import Scalar
+from mmrjax.model.params import Scalar, Scalars
 from mmrjax.model.quantities import SINKS as SINKS
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import GRAVITY, PlaneMotion, Signals
@@ -26,7 +26,7 @@ def source_power(robot: Robot, conditions: Conditions, signals: Signals) -> Scal
     return jnp.where(conditions.battery > 0.5, chemical, signals.voltage_source * signals.total_current)
 
 
-def sink_powers(robot: Robot, conditions: Conditions, signals: Signals) -> dict[str, Scalar]:
+def sink_powers(robot: Robot, conditions: Conditions, signals: Signals) -> Scalars:
     """Power into each of `SINKS` [W], over all motors and sides.
 
     Together with the change of the energy `stored_energy` they add up to `source_power` at each instant.
@@ -58,11 +58,11 @@ def stored_energy(robot: Robot, signals: Signals) -> Scalar:
     return 0.5 * (signals.mass * signals.speed**2 + robot.sides * (rotating + magnetic))
 
 
-def sink_powers_turning(robot: Robot, conditions: Conditions, travel: Travel) -> dict[str, Scalar]:
+def sink_powers_turning(robot: Robot, conditions: Conditions, travel: Travel) -> Scalars:
     """Same as `sink_powers` for a robot that turns: sliding is Σ F·u over all contacts, lift follows its heading."""
     signals = travel.signals
     each = jax.vmap(lambda c, s: sink_powers(robot, c, s))(conditions.of_sides(), signals)
-    means: dict[str, Scalar] = {name: jnp.mean(jnp.asarray(power)) for name, power in each.items()}
+    means: Scalars = {name: jnp.mean(jnp.asarray(power)) for name, power in each.items()}
     weight = jnp.mean(jnp.asarray(signals.mass)) * GRAVITY * sine(conditions.slope)
     across = jnp.mean(jnp.asarray(signals.speed_lateral)) * sine(jnp.mean(jnp.asarray(signals.heading)))
     means["sliding"] = means["sliding"] + jnp.sum(travel.grip.across)

@@ -19,6 +19,10 @@ from mmrjax.errors import similar_words
 
 #: A number, or an array of numbers (a batch or a tracer).
 Scalar = Float[Array, "..."] | float
+#: Numbers by name.
+Scalars = dict[str, Scalar]
+#: Two numbers: of left and right, of two axes, or of two levers.
+Pair = Float[Array, " 2"]
 #: An index, or an array of indices.
 Index = Int[Array, "..."] | np.ndarray | int
 

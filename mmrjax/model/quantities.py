@@ -14,6 +14,9 @@ import re
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
+#: Words in order.
+Names = tuple[str, ...]
+
 DEG = math.pi / 180  # rad
 RPM = math.pi / 30  # rad/s
 MM = 1e-3  # m
@@ -97,9 +100,9 @@ class Quantity:
     stem: str = ""
     sign: str = ""
     in_profiles: bool = False
-    rests_on: tuple[str, ...] = ()
+    rests_on: Names = ()
     group: str = ""
-    ignores: tuple[str, ...] = ()
+    ignores: Names = ()
     least: bool = False
 
     def __post_init__(self) -> None:
@@ -131,7 +134,7 @@ class Quantity:
         return self.unit_shown if self.factor == 1.0 else next(u for u, size in self.sizes.items() if size == 1.0)
 
     @property
-    def axes(self) -> tuple[str, ...]:
+    def axes(self) -> Names:
         """Axes of an envelope of use that it depends on."""
         return tuple(axis for axis in AXES if axis not in self.ignores)
 
@@ -143,7 +146,7 @@ class Quantity:
         return {self.unit: self.factor} | {u: size for u, size in alike.items() if u != self.unit} | share
 
     @property
-    def other_units(self) -> tuple[str, ...]:
+    def other_units(self) -> Names:
         """Further units that its columns may state."""
         return (*[unit for unit in self.sizes if unit not in (self.unit, PERCENT)], *[PERCENT] * self.percent)
 
@@ -192,7 +195,7 @@ class Condition(Quantity):
     heading: str = ""
     shown: str = "{:g}"
     in_tables: bool = False
-    imposed: tuple[str, ...] = ()
+    imposed: Names = ()
     acts: str = ""
     usual: float | None = None
 

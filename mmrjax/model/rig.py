@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 from mmrjax.model import channels
 from mmrjax.model.params import Index, Scalar, parameter
-from mmrjax.model.quantities import GOALS
+from mmrjax.model.quantities import GOALS, Names
 
 #: Ways in which histories may begin.
 STARTS = ("rest", "measured", "free")
@@ -77,7 +77,7 @@ class Begin(eqx.Module):
 class Begins(eqx.Module):
     """The beginnings of runs by name, in a fixed order. Conditions hold an index."""
 
-    names: tuple[str, ...] = eqx.field(static=True)
+    names: Names = eqx.field(static=True)
     members: tuple[Begin, ...]
 
     def __init__(self, by_name: Mapping[str, Begin]) -> None:
@@ -120,7 +120,7 @@ class Rig(eqx.Module):
     )  # fmt: skip
     begins: Begins | None = None
     imposed: str = eqx.field(default=IMPOSED[0], static=True)
-    channels: tuple[str, ...] = eqx.field(default=channels.USUAL, static=True)
+    channels: Names = eqx.field(default=channels.USUAL, static=True)
     instruments: tuple[Instrument, ...] = eqx.field(default=(), static=True)
     columns: tuple[tuple[str, str, float], ...] = eqx.field(default=(), static=True)
     priors: tuple[tuple[str, float, float], ...] = eqx.field(default=(), static=True)
@@ -128,7 +128,7 @@ class Rig(eqx.Module):
     between_rows: str = eqx.field(default=BETWEEN[0], static=True)
     surfaces: tuple[tuple[str, str], ...] = eqx.field(default=(), static=True)
     inherits: bool = eqx.field(default=True, static=True)
-    unknown: tuple[str, ...] = eqx.field(default=(), static=True)
+    unknown: Names = eqx.field(default=(), static=True)
     loose: bool = eqx.field(default=False, static=True)
 
     def for_equations(self) -> Rig:

@@ -20,7 +20,7 @@ from mmrjax.model.motor import Motor
 from mmrjax.model.paper_tables import RADIUS_PULLEY
 from mmrjax.model.params import Index, Scalar, as_float
 from mmrjax.model.power import Battery
-from mmrjax.model.quantities import HEAT, WARMING
+from mmrjax.model.quantities import HEAT, WARMING, Names
 from mmrjax.model.rig import Rig
 from mmrjax.model.shaft import Shaft
 from mmrjax.undercarriage.running_gear import RunningGear
@@ -42,7 +42,7 @@ class Configurations(eqx.Module):
         chosen: the load of the current configuration, within equations of one run (`Robot.within`).
     """
 
-    names: tuple[str, ...] = eqx.field(static=True)
+    names: Names = eqx.field(static=True)
     members: tuple[Any, ...]  # Load
     chosen: Any = None  # Load | None
 
@@ -131,7 +131,7 @@ class Robot(eqx.Module):
         return dataclasses.replace(self, rig=dataclasses.replace(self.rig, channels=(*shown_channels, *more)))
 
     @property
-    def unlike(self) -> tuple[str, ...]:
+    def unlike(self) -> Names:
         """Names of its effects that make the sides differ. They have no meaning in runs without data of each side."""
         return tuple(effect.name for effect in self.effects if effect.unlike)
 
@@ -145,7 +145,7 @@ class Robot(eqx.Module):
         """True if a ground carries it. Slope, payload and adhesion then act, and its movers can slip."""
         return "ground" not in self.lacks
 
-    def unknown(self, names: Iterable[str]) -> tuple[str, ...]:
+    def unknown(self, names: Iterable[str]) -> Names:
         """Parameters among `names` (dotted) that neither its file nor its base robot states."""
         return tuple(name for name in names if name in self.rig.unknown)
 

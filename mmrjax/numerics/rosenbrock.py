@@ -17,6 +17,9 @@ from mmrjax.model.params import Scalar
 from mmrjax.model.robot import Robot
 from mmrjax.numerics.linear_equations import inverse
 
+#: Unknowns in their units, or their rates.
+Unknowns = Float[Array, " unknowns"]
+
 _GAMMA = 0.25
 _A = (
     (1.544000000000000,),
@@ -36,12 +39,12 @@ _C = (
 KINK = 1e-2
 
 
-def error_norm(error: Float[Array, " unknowns"], own: int, weight: float | np.ndarray = 1.0) -> Scalar:
+def error_norm(error: Unknowns, own: int, weight: float | np.ndarray = 1.0) -> Scalar:
     """Root mean square of an error of the robot's `own` unknowns. Memories add to it and never dilute it."""
     return jnp.sqrt(jnp.sum(weight * error**2) / own)
 
 
-def error_norm_of_sides(error: Float[Array, " unknowns"], whole: slice, own: int) -> Scalar:
+def error_norm_of_sides(error: Unknowns, whole: slice, own: int) -> Scalar:
     """Same as `error_norm` for unknowns of both sides and those of the `whole` robot.
 
     A pair counts as one unknown, so that with equal sides the steps are those of the `own` unknowns of straight
@@ -52,9 +55,7 @@ def error_norm_of_sides(error: Float[Array, " unknowns"], whole: slice, own: int
     return error_norm(error, own, weight)
 
 
-def error_across_kink(
-    error: Float[Array, " unknowns"], y0: Float[Array, " unknowns"], y1: Float[Array, " unknowns"], kink: Array
-) -> Float[Array, " unknowns"]:
+def error_across_kink(error: Unknowns, y0: Unknowns, y1: Unknowns, kink: Array) -> Unknowns:
     """Error of a step, with `KINK` of the unknowns' change if it crosses a kink of the rates.
 
     The method linearises at the start of a step, so that its estimate does not see a kink within it. With this share

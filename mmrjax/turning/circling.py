@@ -23,7 +23,7 @@ from mmrjax.fidelities.result import mask_unknown, power_ratio, result_of_signal
 from mmrjax.model import balances, ground
 from mmrjax.model.chassis import Chassis
 from mmrjax.model.conditions import Conditions
-from mmrjax.model.params import Scalar
+from mmrjax.model.params import Pair, Scalar
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import (
     BATTERY_EMPTY,
@@ -40,8 +40,11 @@ from mmrjax.model.signals import (
 )
 from mmrjax.numerics import lanes
 from mmrjax.numerics.linear_equations import inverse
-from mmrjax.numerics.rosenbrock import error_norm_of_sides
+from mmrjax.numerics.rosenbrock import Unknowns, error_norm_of_sides
 from mmrjax.turning.two_sides import SIDES
+
+#: Unknowns of a settled turn.
+Settling = Float[Array, " 9"]
 
 # Units of the unknowns: currents, motor speeds, speed, lateral speed, yaw rate; heading, place; discharge.
 _UNITS = (10.0, 10.0, 1000.0, 1000.0, 1.0, 1.0, 10.0, 1.0, 1.0, 1.0, 10.0)
@@ -75,7 +78,7 @@ def _units(kept: tuple[Effect, ...]) -> Array:
     return jnp.asarray((*_UNITS, *(size for e in kept for size in (e.memory_size or 1.0,) * 2)))
 
 
-def motion_of(robot: Robot, y: Float[Array, " unknowns"]) -> PlaneMotion:
+def motion_of(robot: Robot, y: Unknowns) -> PlaneMotion:
     """The motion of a vector of unknowns."""
     kept = _kept(robot, y.shape[0])
     y = y * _units(kept).astype(y.dtype)
@@ -87,7 +90,7 @@ _turning = compiled(balances.turning_signals)
 
 
 @compiled
-def turning_rates(robot: Robot, conditions: Conditions, y: Float[Array, " unknowns"]) -> Float[Array, " unknowns"]:
+def turning_rates(robot: Robot, conditions: Conditions, y: Unknowns) -> Unknowns:
     """Rates of the unknowns, in their units [1/s], 0 for a motor whose speed is imposed."""
     return _rates(robot, conditions, y, _turning(robot, conditions, motion_of(robot, y)))
 
@@ -113,7 +116,7 @@ def _rates(robot: Robot, conditions: Conditions, y: Array, travel: balances.Trav
     return jnp.stack([jnp.asarray(x, y.dtype) for x in residuals]) / _units(kept).astype(y.dtype)
 
 
-def turning_start(robot: Robot, conditions: Conditions, rolling: bool = False) -> Float[Array, " unknowns"]:
+def turning_start(robot: Robot, conditions: Conditions, rolling: bool = False) -> Unknowns:
     """Unknowns at rest with the heading of the conditions, or for `rolling` in the settled turn if it exists.
 
     Motors with an imposed speed turn.
@@ -160,8 +163,8 @@ class _Secant(eqx.Module):
         solved: True once the search has converged.
     """
 
-    y: Float[Array, " 9"]
-    rates: Float[Array, " 9"]
+    y: Settling
+    rates: Settling
     inverse: Float[Array, "9 9"]
     looks: Scalar
     solved: Array
@@ -193,32 +196,32 @@ class _Search(eqx.Module):
         solved: True once it has converged.
     """
 
-    y: Float[Array, " 9"]
-    rates: Float[Array, " 9"]
+    y: Settling
+    rates: Settling
     jacobian: Float[Array, "9 9"]
     step: Scalar
     turns: Scalar
     solved: Array
 
 
-def _balance(robot: Robot, conditions: Conditions, y: Float[Array, " 9"]) -> Float[Array, " 9"]:
+def _balance(robot: Robot, conditions: Conditions, y: Settling) -> Settling:
     """Rates of the unknowns that settle [1/s], and minus the errors of the loads."""
     return _left(robot, conditions, y, _circled(robot, conditions, y)[0])
 
 
-def _left(robot: Robot, conditions: Conditions, y: Float[Array, " 9"], travel: balances.Travel) -> Float[Array, " 9"]:
+def _left(robot: Robot, conditions: Conditions, y: Settling, travel: balances.Travel) -> Settling:
     """`_balance` from the signals of both sides."""
     lacking = travel.grip.lacking / _load_units(robot, conditions)
     return jnp.concatenate([_rates(robot, conditions, _whole(conditions, y), travel)[:SETTLING], -lacking])
 
 
-def _whole(conditions: Conditions, y: Float[Array, " 9"]) -> Float[Array, " 11"]:
+def _whole(conditions: Conditions, y: Settling) -> Float[Array, " 11"]:
     """All unknowns of a robot that has not left its place."""
     charge = jnp.zeros(len(_UNITS) - SETTLING).at[-1].set(conditions.discharge / _UNITS[-1])
     return jnp.concatenate([y[:SETTLING], charge])
 
 
-def _turning_round(robot: Robot, conditions: Conditions, y: Float[Array, " 9"]) -> Float[Array, " 4"]:
+def _turning_round(robot: Robot, conditions: Conditions, y: Settling) -> Float[Array, " 4"]:
     """Speeds of both sides and of their movers that decide the sign of friction, over its smoothing width [-]."""
     chassis = robot.chassis(conditions.configuration)
     _, shafts, ahead, _, yaw = jnp.split(y[:SETTLING] * jnp.asarray(_UNITS[:SETTLING]), [2, 4, 5, 6])
@@ -234,12 +237,12 @@ def _share(robot: Robot, conditions: Conditions, y: Array, step: Array) -> Scala
     return share * jnp.min(jnp.where(across, now / jnp.where(across, now - then, 1.0), 1.0))
 
 
-def _load_units(robot: Robot, conditions: Conditions) -> Float[Array, " 2"]:
+def _load_units(robot: Robot, conditions: Conditions) -> Pair:
     """Units of the transferred load [N] and of the centre of pressure [m]."""
     return jnp.stack([robot.chassis(conditions.configuration).mass * GRAVITY, robot.running_gear.wheelbase])
 
 
-def _loads(robot: Robot, conditions: Conditions, y: Float[Array, " 9"]) -> Float[Array, " 2"]:
+def _loads(robot: Robot, conditions: Conditions, y: Settling) -> Pair:
     return y[SETTLING:] * _load_units(robot, conditions)
 
 
@@ -248,7 +251,7 @@ def _moves(conditions: Conditions) -> np.ndarray:
     return np.arange(SETTLING + len(SIDES)) >= (0 if conditions.of_sides().motor_speed is None else 4)
 
 
-def _begins(robot: Robot, conditions: Conditions) -> Float[Array, " 9"]:
+def _begins(robot: Robot, conditions: Conditions) -> Settling:
     """Initial unknowns of a search. Imposed speeds keep these values."""
     return jnp.concatenate([_guess(robot, conditions)[:SETTLING], jnp.zeros(len(SIDES))])
 
@@ -325,7 +328,7 @@ def _turn(held: tuple[Robot, Conditions, Array, _Linear], search: _Search) -> _S
     return _Search(y, residual, slope, length, search.turns + 1, ended)
 
 
-def _unknowns(robot: Robot, conditions: Conditions) -> tuple[Float[Array, " 9"], Bool[Array, ""]]:
+def _unknowns(robot: Robot, conditions: Conditions) -> tuple[Settling, Bool[Array, ""]]:
     """The unknowns of a settled turn on level ground, see `_Search`, and whether it was found.
 
     Broyden's method, which first evaluates along each unknown, finds most. If it does not converge, or converges to
@@ -346,7 +349,7 @@ def _unknowns(robot: Robot, conditions: Conditions) -> tuple[Float[Array, " 9"],
     return end.y + inverse(-slope)[0] @ jnp.where(sound, _balance(robot, conditions, end.y), 0.0), sound
 
 
-def _circled(robot: Robot, conditions: Conditions, y: Float[Array, " 9"]) -> tuple[balances.Travel, PlaneMotion]:
+def _circled(robot: Robot, conditions: Conditions, y: Settling) -> tuple[balances.Travel, PlaneMotion]:
     """Signals of both sides and motion at the unknowns of a search.
 
     Their currents are those that the duties alone would drive, see `rest.admitted_current`.
@@ -360,14 +363,14 @@ def _circled(robot: Robot, conditions: Conditions, y: Float[Array, " 9"]) -> tup
     return dataclasses.replace(travel, signals=signals), motion
 
 
-def solve_turn(robot: Robot, conditions: Conditions) -> tuple[Float[Array, " 9"], Bool[Array, ""]]:
+def solve_turn(robot: Robot, conditions: Conditions) -> tuple[Settling, Bool[Array, ""]]:
     """The unknowns of a settled turn, and whether they were found, see `Implicit.solve`."""
     return jax.lax.stop_gradient(_unknowns(*jax.lax.stop_gradient((robot, conditions))))
 
 
 def turn_results(
-    robot: Robot, conditions: Conditions, unknowns: Float[Array, " 9"], found: Bool[Array, ""]
-) -> tuple[Result, Signals, Float[Array, " 9"]]:
+    robot: Robot, conditions: Conditions, unknowns: Settling, found: Bool[Array, ""]
+) -> tuple[Result, Signals, Settling]:
     """Result, signals of both sides and residuals of the balances at given unknowns, see `Implicit.shown`."""
     travel, motion = _circled(robot, conditions, unknowns)
     stays = unknowns - jax.lax.stop_gradient(_begins(robot, conditions))
@@ -429,7 +432,7 @@ def status_moving(robot: Robot, conditions: Conditions, travel: balances.Travel,
     return jnp.where((change * TIME > SHARE * size) & (status == CONVERGED), NOT_SETTLED, status)
 
 
-def changing_at_rest(y: Float[Array, " unknowns"]) -> Float[Array, " unknowns"]:
+def changing_at_rest(y: Unknowns) -> Unknowns:
     """1 for the unknowns that change while friction holds a robot (currents and charge), else 0."""
     return jnp.zeros_like(y).at[jnp.asarray([0, 1, 10])].set(1.0)
 
@@ -447,7 +450,7 @@ def _of_sides(robot: Robot, conditions: Conditions, motion: PlaneMotion) -> tupl
     )
 
 
-def current_at_rest(robot: Robot, conditions: Conditions, motion: PlaneMotion) -> Float[Array, " 2"]:
+def current_at_rest(robot: Robot, conditions: Conditions, motion: PlaneMotion) -> Pair:
     """Currents that settle in a standing robot [A]."""
     sides, state = _of_sides(robot, conditions, motion)
     return jnp.asarray(jax.vmap(lambda c, s: rest.current_at_rest(robot, c, s))(sides, state))

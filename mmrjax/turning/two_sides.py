@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from mmrjax.model.contact import Friction
-from mmrjax.model.params import Scalar, parameter
+from mmrjax.model.params import Pair, Scalar, parameter
 from mmrjax.numerics.rarely import compute_rarely
 
 #: Position of a side's contact line from the middle of the robot, in shares of B [-]: left, right.
@@ -117,14 +117,14 @@ class Grip(eqx.Module):
         lacking: excess of both over the values that these forces give: 0, except during a search for them [N, m].
     """
 
-    normal: Float[Array, " 2"]
-    ahead: Float[Array, " 2"]
-    aside: Float[Array, " 2"]
-    moment: Float[Array, " 2"]
-    across: Float[Array, " 2"]
+    normal: Pair
+    ahead: Pair
+    aside: Pair
+    moment: Pair
+    across: Pair
     moved: Scalar
     centre: Scalar
-    lacking: Float[Array, " 2"]
+    lacking: Pair
 
 
 def loaded_part(stance: Stance, centre: Scalar) -> tuple[Scalar, Scalar, Scalar]:
@@ -198,7 +198,7 @@ class Law(eqx.Module):
 
 
 @eqx.filter_custom_jvp
-def law_moments(law: Law, sliding: Float[Array, " 2"], middle: Scalar, end: Scalar) -> Float[Array, "2 4"]:
+def law_moments(law: Law, sliding: Pair, middle: Scalar, end: Scalar) -> Float[Array, "2 4"]:
     """Moments of order 0 to 3 of `Law.per_speed` over a uniformly loaded contact, of each side [s/m].
 
     They are taken about its middle and in units of half its length.
@@ -250,11 +250,11 @@ def grip(
     friction: Friction,
     adhesion: Scalar,
     load: Scalar,
-    sliding: Float[Array, " 2"],
+    sliding: Pair,
     lateral_speed: Scalar,
     yaw_rate: Scalar,
-    resistance: Float[Array, " 2"],
-    loads: Float[Array, " 2"] | None = None,
+    resistance: Pair,
+    loads: Pair | None = None,
 ) -> Grip:
     """Forces and loads of both sides, which depend on each other.
 
@@ -283,14 +283,14 @@ def grip(
     return jax.tree.map(lambda x, slope: x - slope @ change, forces, rise)
 
 
-def _step(lacking: Float[Array, " 2"], slope: Float[Array, "2 2"]) -> Float[Array, " 2"]:
+def _step(lacking: Pair, slope: Float[Array, "2 2"]) -> Pair:
     """Newton step of the loads, to be subtracted."""
     (a, b), (c, d) = slope
     first, second = lacking
     return jnp.stack([d * first - b * second, a * second - c * first]) / (a * d - b * c)
 
 
-def _loads(given: _Given) -> tuple[Float[Array, " 2"], Grip]:
+def _loads(given: _Given) -> tuple[Pair, Grip]:
     """The transferred load [N] and the centre of pressure [m], and the derivatives of `Grip` with respect to them.
 
     None of these carry derivatives. While the whole contact is loaded, the moments of its law do not depend on them.

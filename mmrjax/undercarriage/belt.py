@@ -20,6 +20,9 @@ from mmrjax.model.params import Scalar
 from mmrjax.numerics.trigonometry import cosine, sine
 from mmrjax.undercarriage.running_gear import GROUSERS, TEETH_PULLEY, RunningGear
 
+#: Numbers along the belt.
+Numbers = Float[Array, " n"]
+
 #: Relative variation of the pulley's radius: links of a chain form a polygon with as many sides as teeth.
 POLYGON = (1 - math.cos(math.pi / TEETH_PULLEY)) / 2
 
@@ -45,7 +48,7 @@ class Path(eqx.Module):
         """Pitch of the grousers S_g [m], 35 mm on the paper's robot."""
         return self.length / GROUSERS
 
-    def weight(self, place: Float[Array, " n"]) -> Float[Array, " n"]:
+    def weight(self, place: Numbers) -> Numbers:
         """Share of the rear pulley's motion in a belt point's: 0 on the front pulley, 1 on the rear one.
 
         A run stretches uniformly between them, so the share is linear. A force on the point loads the
@@ -71,15 +74,15 @@ class Tips(eqx.Module):
         compliance: of the free belt between pulley and guide at unit tension [m], see `tips_on_path`.
     """
 
-    forward: Float[Array, " n"]
-    up: Float[Array, " n"]
-    rate_forward: Float[Array, " n"]
-    rate_up: Float[Array, " n"]
-    guided: Float[Array, " n"]
-    compliance: Float[Array, " n"]
+    forward: Numbers
+    up: Numbers
+    rate_forward: Numbers
+    rate_up: Numbers
+    guided: Numbers
+    compliance: Numbers
 
 
-def tips_on_path(path: Path, place: Float[Array, " n"]) -> Tips:
+def tips_on_path(path: Path, place: Numbers) -> Tips:
     """Tips of the grousers at `place` [m along the path].
 
     A grouser sits on a rigid base and turns with the mean direction of the path under that base. Its
@@ -163,7 +166,7 @@ def belt_runs(path: Path, angles: Sequence[Scalar], rates: Sequence[Scalar]) -> 
 
 
 def tension_along(
-    path: Path, tension: Runs, place: Float[Array, " n"], force: Float[Array, " n"], stations: Float[Array, " s"]
+    path: Path, tension: Runs, place: Numbers, force: Numbers, stations: Float[Array, " s"]
 ) -> Float[Array, " s"]:
     """Tension [N] at `stations` [m along the path] under forces [N] on the belt against its running.
 

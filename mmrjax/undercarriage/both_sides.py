@@ -24,7 +24,7 @@ from jaxtyping import Array, Float
 from mmrjax.model import balances
 from mmrjax.model.chassis import Chassis
 from mmrjax.model.conditions import Conditions
-from mmrjax.model.params import Scalar
+from mmrjax.model.params import Pair, Scalar
 from mmrjax.model.signals import CONVERGED, NOT_SETTLED, PlaneMotion, Result, Signals
 from mmrjax.numerics.linear_equations import factorise, solve_factorised
 from mmrjax.numerics.trigonometry import cosine, sine
@@ -35,6 +35,9 @@ from mmrjax.undercarriage.belt import Path
 from mmrjax.undercarriage.half_robot import Average, Motion, Steady, System
 from mmrjax.undercarriage.mjcf import mjx
 from mmrjax.undercarriage.side_contacts import Pull, Reactions, Touch
+
+#: Coordinates of the robot, or their velocities or forces.
+Coordinates = Float[Array, " 10"]
 
 X, Y, HEIGHT, YAW, PITCH, ROLL = range(6)
 #: Driving and driven pulley of left and right side.
@@ -53,10 +56,10 @@ class _Sides(eqx.Module):
     lateral: Scalar
     at: Touch
     aside: Float[Array, "2 contacts"]  # velocity of each contact to the left [m/s]
-    height: Float[Array, " 2"]
+    height: Pair
 
     @property
-    def normal(self) -> Float[Array, " 2"]:
+    def normal(self) -> Pair:
         return jnp.sum(self.at.force, axis=-1)
 
     def pull(self, chassis: Chassis, signals: Signals) -> Pull:
@@ -73,7 +76,7 @@ def _width(run: System) -> Scalar:
     return run.chassis.turning.width
 
 
-def _ahead(run: System, v: Float[Array, " 10"], yaw: Scalar) -> tuple[Scalar, Scalar]:
+def _ahead(run: System, v: Coordinates, yaw: Scalar) -> tuple[Scalar, Scalar]:
     """Speeds of the middle of the wheelbase in the frame of the robot, ahead and to the left [m/s]."""
     cos, sin = cosine(yaw), sine(yaw)
     return cos * v[X] + sin * v[Y], cos * v[Y] - sin * v[X]
@@ -159,7 +162,7 @@ def _levers(run: System, motion: Motion, at: Touch) -> _Levers:
     return _Levers(*(jnp.stack(rows, axis=-1) for rows in (along, across, off)))
 
 
-def generalized(run: System, motion: Motion, signals: Signals, at: Touch, pulled: Pull) -> Float[Array, " 10"]:
+def generalized(run: System, motion: Motion, signals: Signals, at: Touch, pulled: Pull) -> Coordinates:
     """Generalized forces on q [N, N·m]."""
     cos, sin = cosine(motion.q[YAW]), sine(motion.q[YAW])
     y, several = SIDES * _width(run), run.robot.sides / 2
@@ -218,9 +221,7 @@ def resistance(
     return run.robot.sides / 2 * total, levers, rises
 
 
-def dynamics(
-    run: System, motion: Motion, armature: Float[Array, " 2"]
-) -> tuple[Float[Array, "10 10"], Float[Array, " 10"]]:
+def dynamics(run: System, motion: Motion, armature: Pair) -> tuple[Float[Array, "10 10"], Coordinates]:
     """Mass matrix and bias of MJX. The mass matrix includes the rotors' `armature` at the driving shafts [kg·m²]."""
     model = run.model.replace(dof_armature=jnp.zeros(COORDINATES).at[SHAFTS].set(armature))
     data = run.data.replace(qpos=motion.q, qvel=motion.v)
@@ -239,7 +240,7 @@ class _Forces(eqx.Module):
     rises: Array
     mass: Float[Array, "10 10"]
     damping: Float[Array, "10 10"]
-    push: Float[Array, " 10"]
+    push: Coordinates
 
 
 def _forces(run: System, motion: Motion, stored: bool = False) -> _Forces:
@@ -256,13 +257,13 @@ def _forces(run: System, motion: Motion, stored: bool = False) -> _Forces:
     return _Forces(sides, signals, pulled, levers, rises, mass, damping, push)
 
 
-def _solver(run: System, found: _Forces) -> Callable[[Float[Array, " 10"]], Float[Array, " 10"]]:
+def _solver(run: System, found: _Forces) -> Callable[[Coordinates], Coordinates]:
     factors = factorise(found.mass + run.step * found.damping)
     return functools.partial(solve_factorised, factors)
 
 
 @eqx.filter_custom_jvp
-def advance(run: System, motion: Motion) -> tuple[Motion, balances.Travel, Float[Array, " 2"]]:
+def advance(run: System, motion: Motion) -> tuple[Motion, balances.Travel, Pair]:
     """One step, see `half_robot.advance`: (M + Δt K) Δv = Δt (Q - c).
 
     Returns:
@@ -289,7 +290,7 @@ def _differentiated(primals: tuple[System, Motion], tangents: tuple[Any, Any]) -
     return eqx.filter_jvp(_moved, (*primals, found, gained), (*tangents, changed, solve(left)))
 
 
-def _fallen(run: System, motion: Motion, found: _Forces, gained: Float[Array, " 10"]) -> Float[Array, " 10"]:
+def _fallen(run: System, motion: Motion, found: _Forces, gained: Coordinates) -> Coordinates:
     """The product K Δv, see `resistance`, without forming K."""
     touching, pulled, levers = found.sides.at, found.pulled, found.levers
     assert pulled.aside is not None
@@ -310,9 +311,7 @@ def _fallen(run: System, motion: Motion, found: _Forces, gained: Float[Array, " 
     return run.robot.sides / 2 * gained_forces
 
 
-def _moved(
-    run: System, motion: Motion, found: _Forces, gained: Float[Array, " 10"]
-) -> tuple[Motion, balances.Travel, Float[Array, " 2"]]:
+def _moved(run: System, motion: Motion, found: _Forces, gained: Coordinates) -> tuple[Motion, balances.Travel, Pair]:
     v = motion.v + gained
 
     def later(own: Conditions, signals: Signals, memory: Mapping[str, Scalar]) -> Any:
@@ -325,7 +324,7 @@ def _moved(
 
 
 def forces_after(
-    at: Touch, pulled: Pull, levers: _Levers, rises: Array, gained: Float[Array, " 10"]
+    at: Touch, pulled: Pull, levers: _Levers, rises: Array, gained: Coordinates
 ) -> tuple[Array, Array, Array]:
     """Forces of the contacts ahead, to the left and off the ground [N] during a step that gains Δv.
 
@@ -342,7 +341,7 @@ def forces_after(
     return ahead, aside, at.force - down
 
 
-def _travel(run: System, motion: Motion, found: _Forces, gained: Float[Array, " 10"]) -> balances.Travel:
+def _travel(run: System, motion: Motion, found: _Forces, gained: Coordinates) -> balances.Travel:
     """All signals of a step, with its forces at its end to first order."""
     sides, signals, touching, several = found.sides, found.signals, found.sides.at, run.robot.sides / 2
     ahead, aside, normal = forces_after(touching, found.pulled, found.levers, found.rises, gained)

@@ -45,6 +45,9 @@ from mmrjax.undercarriage.contact_sums import Linearized
 from mmrjax.undercarriage.mjcf import mjx
 from mmrjax.undercarriage.side_contacts import Pull, Reactions, Touch
 
+#: Coordinates of half a robot, or their velocities or forces.
+Coordinates = Float[Array, " 5"]
+
 #: Coordinate of the driving pulley.
 SHAFTS = 3
 #: Pitch beyond which a robot has turned over [rad], and limit of a valid height [axle heights].
@@ -69,8 +72,8 @@ class Motion(eqx.Module):
         memory: of each effect that has one, by effect name.
     """
 
-    q: Float[Array, " 5"]
-    v: Float[Array, " 5"]
+    q: Coordinates
+    v: Coordinates
     current: Scalar
     discharge: Scalar
     memory: Mapping[str, Scalar] = eqx.field(default_factory=dict)
@@ -174,7 +177,7 @@ def _losses(run: System, motion: Motion, mover: balances.Mover) -> tuple[Scalar,
     return jnp.maximum(-fall_x, 0.0), jnp.maximum(-fall_shaft, 0.0)
 
 
-def generalized(run: System, signals: Signals, pulled: Pull) -> tuple[Float[Array, " 5"], Float[Array, " 5"]]:
+def generalized(run: System, signals: Signals, pulled: Pull) -> tuple[Coordinates, Coordinates]:
     """Generalized forces on q [N, N·m], and the armature's inertia seen at each joint [kg·m²], eq. (31)."""
     force = jnp.insert(pulled.generalized, 3, signals.torque_net)
     return force, jnp.zeros_like(force).at[3].set(armature_inertia(run, signals))
@@ -235,9 +238,7 @@ def contacts_resist(
     return (along.T * rises) @ along + (pushes.T * damped) @ off
 
 
-def _pushed(
-    run: System, motion: Motion, signals: Signals, pulled: Pull
-) -> tuple[Float[Array, " 5"], Float[Array, "5 5"]]:
+def _pushed(run: System, motion: Motion, signals: Signals, pulled: Pull) -> tuple[Coordinates, Float[Array, "5 5"]]:
     """Velocities after one explicit step, and the mass matrix."""
     force, armature = generalized(run, signals, pulled)
     data = run.data.replace(qpos=motion.q, qvel=motion.v, qfrc_applied=force)
@@ -260,7 +261,7 @@ class _Step(eqx.Module):
     guided: Scalar
     damping: Float[Array, "5 5"]
     factors: Factors
-    gained: Float[Array, " 5"]
+    gained: Coordinates
     slip: Scalar
 
 
@@ -362,7 +363,7 @@ def _inputs(run: System, motion: Motion) -> dict[str, Scalar]:
 
 
 def _held(
-    run: System, motion: Motion, gained: Float[Array, " 5"], linearized: Linearized
+    run: System, motion: Motion, gained: Coordinates, linearized: Linearized
 ) -> tuple[Array, Array, _Later, Signals, Scalar]:
     """Residual of a step with constant Δv, K Δv of x and z, and the remaining results of the step.
 
@@ -425,7 +426,7 @@ def stand(run: System, turned: Scalar = 0.0) -> Motion:
     axle = axle_height(run)
     rest = jnp.zeros(5, jnp.result_type(axle))
 
-    def placed(turned: Scalar, height: Scalar, pitch: Scalar) -> Float[Array, " 5"]:
+    def placed(turned: Scalar, height: Scalar, pitch: Scalar) -> Coordinates:
         return jnp.zeros_like(rest).at[3:5].set(turned).at[1].set(height).at[2].set(pitch)
 
     def unbalanced(y: Vector, _: None, given: tuple[Any, ...]) -> Vector:

@@ -27,6 +27,9 @@ from mmrjax.numerics.trigonometry import cosine, sine
 from mmrjax.undercarriage.belt import Path, Runs, belt_runs, tension_along, tips_on_path
 from mmrjax.undercarriage.running_gear import GROUSERS, TEETH_BELT, WHEELS, RunningGear
 
+#: A number of each contact.
+PerContact = Float[Array, " contacts"]
+
 CONTACTS = GROUSERS + WHEELS  # with the ground, of one side; those of the other configuration carry no load
 TEETH_GROUSER = TEETH_BELT // GROUSERS  # teeth under one grouser's pitch
 
@@ -49,18 +52,18 @@ class Touch(eqx.Module):
         belt: tensions of the runs.
     """
 
-    lever_x: Float[Array, " contacts"]
-    lever_z: Float[Array, " contacts"]
-    rate_x: Float[Array, " contacts"]
-    rate_z: Float[Array, " contacts"]
-    weight: Float[Array, " contacts"]
-    speed_x: Float[Array, " contacts"]
-    gap: Float[Array, " contacts"]
-    gap_rate: Float[Array, " contacts"]
-    compliance: Float[Array, " contacts"]
-    force: Float[Array, " contacts"]
-    damped: Float[Array, " contacts"]
-    guided: Float[Array, " contacts"]
+    lever_x: PerContact
+    lever_z: PerContact
+    rate_x: PerContact
+    rate_z: PerContact
+    weight: PerContact
+    speed_x: PerContact
+    gap: PerContact
+    gap_rate: PerContact
+    compliance: PerContact
+    force: PerContact
+    damped: PerContact
+    guided: PerContact
     place: Float[Array, " 24"]
     belt: Runs
 
@@ -70,14 +73,12 @@ class Touch(eqx.Module):
         return jnp.sum(self.force)
 
 
-def join_contacts(
-    grousers: Float[Array, " 24"], wheels: Array | np.ndarray | float = 0.0
-) -> Float[Array, " contacts"]:
+def join_contacts(grousers: Float[Array, " 24"], wheels: Array | np.ndarray | float = 0.0) -> PerContact:
     """One array of grousers and wheels, padded and masked: XLA vectorises this but not a concatenation."""
     return jnp.where(WHEEL, wheels, jnp.pad(grousers, (0, WHEELS)))
 
 
-def bearing_contacts(chassis: Chassis) -> Float[Array, " contacts"]:
+def bearing_contacts(chassis: Chassis) -> PerContact:
     """1 for contacts that carry load in this configuration, else 0 [-]."""
     return jnp.where(WHEEL, 1 - chassis.on_tracks, chassis.on_tracks)
 
@@ -154,12 +155,12 @@ class Pull(eqx.Module):
         aside: lateral force of each contact, to the left on a robot free to turn [N]. None: straight travel.
     """
 
-    force: Float[Array, " contacts"]
-    guide: Float[Array, " contacts"]
+    force: PerContact
+    guide: PerContact
     guided: Float[Array, ""]
     load: Scalar
     generalized: Float[Array, " 4"]
-    aside: Float[Array, " contacts"] | None = None
+    aside: PerContact | None = None
 
     @property
     def traction(self) -> Scalar:
@@ -167,12 +168,12 @@ class Pull(eqx.Module):
         return jnp.sum(self.force)
 
 
-def sliding_speeds(signals: Signals, at: Touch) -> Float[Array, " contacts"]:
+def sliding_speeds(signals: Signals, at: Touch) -> PerContact:
     """Backward sliding speed of each contact over the ground [m/s], `speed_slip_terms` shifts it."""
     return -at.speed_x - signals.speed_slip_terms
 
 
-def friction_rise(chassis: Chassis, signals: Signals, at: Touch) -> Float[Array, " contacts"]:
+def friction_rise(chassis: Chassis, signals: Signals, at: Touch) -> PerContact:
     """Derivative of the traction of each contact with respect to its sliding speed [N·s/m]."""
     return jnp.asarray(chassis.ground.traction_rise(sliding_speeds(signals, at), at.force, signals.adhesion))
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from calibration.data import Names, effect_file
-from calibration.data.input_errors import BadConfiguration, bound_text
+from calibration.data.input_errors import BadConfiguration
 from calibration.words import experiment_words
 from mmrjax import derived, effects
 from mmrjax.effects import Effect
@@ -179,7 +179,7 @@ def _channel(name: str, library: dict[str, type[Effect]]) -> Iterator[Line]:
         return
     low, high = c.range
     yield "is", f"{c.label} [{c.unit_shown}], as its instrument shows it{c.where and f': {c.where}'}"
-    yield "column", f"{c.column}, its standard deviation {c.sd_column}, {bound_text(low)} to {bound_text(high)}"
+    yield "column", f"{c.column}, its standard deviation {c.sd_column}, {low:g} to {high:g}"
     if c.other_units:
         yield "other units", ", ".join(c.other_units)
     yield "typical noise", f"{100 * c.sd_share:g} % of the reading, where nobody states it"
@@ -199,7 +199,7 @@ def _condition(name: str, library: dict[str, type[Effect]]) -> Iterator[Line]:
     if c is None:
         return
     low, high = c.range
-    yield "is", f"{c.label} [{c.unit_shown or '-'}], {bound_text(low)} to {bound_text(high)}"
+    yield "is", f"{c.label} [{c.unit_shown or '-'}], {low:g} to {high:g}"
     yield "column", c.column
     if c.other_units:
         yield "other units", ", ".join(c.other_units)
@@ -258,7 +258,7 @@ def _prior(p: Parameter) -> str:
 
 def _bounds(spec: Spec) -> str:
     low, high = spec.bounds
-    return f"{bound_text(low)} to {bound_text(high)} {spec.unit}"
+    return f"{low:g} to {high:g} {spec.unit}"
 
 
 #: What explains a name, by kind.

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from calibration.data import Json, writing
+from calibration.data import Json
 from calibration.data.input_errors import three_digits
 from calibration.data.requirements_file import Requirements
 from calibration.sizing import sheet
@@ -64,7 +64,7 @@ class CheckResult:
             "statement": self.statement(),
             "source": self.asked.source,
             **sheet.count_outcomes(self.outcomes),
-            "requirements": writing.json_value(self.outcomes),
+            "requirements": self.outcomes,
         }
 
 

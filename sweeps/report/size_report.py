@@ -60,21 +60,14 @@ class SizeResult:
 
     def to_json(self) -> Json:
         """`result.json`."""
-        s = self.sizing
         return {
             "schema": "mmrjax.size/1",
             "statement": self.statement(),
-            "source": self.asked.source,
-            "objectives": list(self.objectives),
-            "unmeetable": list(s.unmeetable),
-            "best": None if s.best is None else s.best.to_json(),
-            "ideal": None if s.ideal is None else s.ideal.to_json(),
-            "alternatives": [f.to_json() for f in s.alternatives],
-            "motors": [{"motor": name, **f.to_json()} for name, f in s.motors.items()],
-            "pareto": [f.to_json() for f in s.front],
-            "requirements": writing.json_value(self.outcomes),
-            "starts": s.starts,
-            "evaluated": s.evaluated,
+            **writing.entries_of(self, "source=asked.source", "objectives"),
+            **writing.entries_of(self.sizing, "unmeetable", "best", "ideal", "alternatives"),
+            "motors": list(self.sizing.motors.values()),
+            **writing.entries_of(self, "pareto=sizing.front", "requirements=outcomes"),
+            **writing.entries_of(self.sizing, "starts", "evaluated"),
         }
 
 

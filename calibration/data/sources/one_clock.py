@@ -9,7 +9,7 @@ import numpy as np
 
 from calibration.data import Columns, Names
 from calibration.data.clock import unwrap_counter
-from calibration.data.input_errors import BadData, bound_text
+from calibration.data.input_errors import BadData
 from calibration.data.sources.recorded_signals import UNITS, Clock, Signal
 from mmrjax.errors import count_noun
 
@@ -132,7 +132,7 @@ def on_one_grid(
     for key, time in times.items():
         if time[-1] < rows[kept][0] if kept.any() else True:
             raise BadData(
-                f"{name}: {clocks[key].name} ends at {bound_text(time[-1])} s, before {clocks[main].name} and "
+                f"{name}: {clocks[key].name} ends at {time[-1]:g} s, before {clocks[main].name} and "
                 "every command have begun; expected clocks with a time in common"
             )
     values: Columns = {}
@@ -214,7 +214,7 @@ def _step(time: np.ndarray) -> float:
 
 def _rate(time: np.ndarray) -> str:
     step = _step(time)
-    return f"{bound_text(round(1 / step, 3 if step > 1 else 0))} Hz" if 0 < step < np.inf else "one sample"
+    return f"{round(1 / step, 3 if step > 1 else 0):g} Hz" if 0 < step < np.inf else "one sample"
 
 
 def _check(name: str, clock: str, time: np.ndarray) -> None:
@@ -223,7 +223,7 @@ def _check(name: str, clock: str, time: np.ndarray) -> None:
     if (back := np.flatnonzero(~(np.diff(time) >= 0))).size:
         row = int(back[0])
         raise BadData(
-            f"{name}, {clock}: goes back from {bound_text(time[row])} to {bound_text(time[row + 1])} s at "
+            f"{name}, {clock}: goes back from {time[row]:g} to {time[row + 1]:g} s at "
             f"sample {row + 2}; "
             "expected time stamps that rise; sort the recording, or give each part its own file"
         )

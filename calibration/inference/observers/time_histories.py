@@ -30,7 +30,7 @@ from calibration.data.courses import (
     differs_from_row_before,
     divide_run,
 )
-from calibration.data.input_errors import BadConfiguration, BadData, bound_text
+from calibration.data.input_errors import BadConfiguration, BadData
 from calibration.data.runs import Runs
 from calibration.inference import bases as bases_room
 from calibration.inference import scans
@@ -326,7 +326,7 @@ class Histories(Observer):
                 if np.ptp(empty) > ROUNDING:
                     raise BadData(
                         f"{runs.source}, total_mass_kg: run {name or '(no run_id)'} changes by "
-                        f"{bound_text(np.ptp(empty))} kg apart from its payload; "
+                        f"{np.ptp(empty):g} kg apart from its payload; "
                         "within a run only payload_kg may change it"
                     )
         _check_signs(runs)
@@ -358,7 +358,7 @@ class Histories(Observer):
             if (count > 1).any():
                 raise BadData(
                     f"{runs.source}, time_s: run {name or '(no run_id)'} has {count.max()} samples at "
-                    f"{bound_text(times[count.argmax()])} s; give each run its own run_id"
+                    f"{times[count.argmax()]:g} s; give each run its own run_id"
                 )
             for k in moving:
                 size = np.max(np.nan_to_num(np.abs(measured[run_rows, k])))
@@ -367,7 +367,7 @@ class Histories(Observer):
                     column, unit = runs.channels[k].column, runs.channels[k].unit
                     raise BadData(
                         f"{runs.source} row {first + 1}, time_s: run {name or '(no run_id)'} is moving at "
-                        f"{bound_text(runs['time_s'][first])} s ({bound_text(runs[column][first])} "
+                        f"{runs['time_s'][first]:g} s ({runs[column][first]:g} "
                         f"{unit}); a history "
                         "begins at rest at its first row. If it began earlier, add a row at that time without "
                         'readings; if it began in motion, state start = "measured" or "free" in the robot\'s file; '
@@ -958,8 +958,8 @@ def _check_signs(runs: Runs) -> None:
                 if readings.size and np.median(readings) > RESTING * size[k]:
                     raise BadData(
                         f"{runs.source} row {rows[0] + 1}, {channel.column}: got "
-                        f"{bound_text(runs[channel.column][rows[0]])} {channel.unit} at "
-                        f"{bound_text(volts[rows[0]])} {unit}; "
+                        f"{runs[channel.column][rows[0]]:g} {channel.unit} at "
+                        f"{volts[rows[0]]:g} {unit}; "
                         "expected readings with a sign, negative backward; or state [instruments."
                         f"{channel.name}] signed = false in the robot's file, if it shows the magnitude only"
                     )

@@ -1,8 +1,6 @@
 # ruff: noqa: E402 (the cache and double precision are set before anything is imported)
 """What the tests share: the compilation cache, double precision, the runs of Table 8, and compiled functions."""
 
-from __future__ import annotations
-
 import contextlib
 import ctypes
 import dataclasses
@@ -31,7 +29,6 @@ from mmrjax.fidelities.drive import drive, drive_batch
 from mmrjax.fidelities.steady import steady, steady_batch
 from mmrjax.model import paper_robots, params
 from mmrjax.model.conditions import Conditions
-from mmrjax.model.signals import Result
 from sweeps import cli, console, pages
 
 pages.FOR_PHONES = False  # figures once; browser tests draw them for phones too
@@ -47,7 +44,7 @@ LIMIT = 10.0
 STARTED = pytest.StashKey[float]()
 
 
-def _crowded() -> bool:
+def _crowded():
     """Whether this process has too many programs to begin another file. Where Linux's files are not there: no."""
     own = Path("/proc/self")
     if not (own / "statm").exists():
@@ -56,7 +53,7 @@ def _crowded() -> bool:
     return resident > MEMORY or (own / "maps").read_bytes().count(b"\n") > MAPPINGS
 
 
-def _make_room() -> None:
+def _make_room():
     """Forget compiled programs before the process has too many, and give their memory back."""
     if not _crowded():
         return
@@ -68,7 +65,7 @@ def _make_room() -> None:
             ctypes.CDLL(None).malloc_trim(0)
 
 
-def _spent() -> float:
+def _spent():
     """Processor time of this process and of those that it has waited for [s]."""
     at = os.times()
     return at.user + at.system + at.children_user + at.children_system
@@ -112,7 +109,7 @@ def pytest_collection_finish():
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items):
     """Mark as slow the parameter sets that `quick` leaves to `make test-all`. Files that share results come first."""
-    met: Counter[str] = Counter()
+    met = Counter()
     for item in items:
         mark = item.get_closest_marker("quick")
         if mark is not None:
@@ -187,13 +184,13 @@ def grid():
 
 
 @pytest.fixture(scope="session")
-def table8(grid) -> Conditions:
+def table8(grid):
     wheeled, slope, payload, voltage = grid.T
     return Conditions(voltage=voltage, slope_deg=slope, payload=payload, configuration=wheeled)
 
 
 @pytest.fixture(scope="session")
-def steady_table8(robot, table8) -> Result:
+def steady_table8(robot, table8):
     return steady_batch(robot, table8)
 
 
@@ -265,7 +262,7 @@ def rebuild(robot_with_representatives, free):
     return lambda vector: params.replace(robot_with_representatives, {n: vector[k] for k, n in enumerate(names)})
 
 
-def numbers(tree) -> jax.Array:
+def numbers(tree):
     """Every floating-point leaf of a result in one vector."""
     leaves = [x for x in jax.tree.leaves(tree) if jnp.issubdtype(x.dtype, jnp.floating)]
     return jnp.concatenate([jnp.ravel(x) for x in leaves])
@@ -292,9 +289,9 @@ def drive_numbers(rebuild):
 @pytest.fixture
 def compilations():
     """A list that grows by one for each program that XLA compiles while the test runs."""
-    seen: list[str] = []
+    seen = []
 
-    def listen(event: str, duration: float, **_: object) -> None:
+    def listen(event, duration, **_):
         if event.endswith("backend_compile_duration"):
             seen.append(event)
 

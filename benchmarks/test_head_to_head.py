@@ -13,6 +13,8 @@ import rivals
 from public_records import Answer, judged
 from worlds import rigs
 
+from tests.commands import text_file
+
 SPEED = "loss torque that changes with speed"
 LAW = Answer("library", ("windage", "churning"), (SPEED,))
 OUTSIDE = Answer("outside", (), (SPEED,))
@@ -171,8 +173,7 @@ def test_records_of_others_are_read_from_their_folder(tmp_path):
     from calibration.data import robot_file
 
     for name, one in public_records.PUBLIC.items():
-        (tmp_path / f"{name}.toml").write_text(one.toml, encoding="utf-8")
-        assert robot_file.read_robot(tmp_path / f"{name}.toml").rig.channels, name
+        assert robot_file.read_robot(text_file(tmp_path / f"{name}.toml", one.toml)).rig.channels, name
     (folder / "log.csv").write_text("time,speed\n1,2\n", encoding="utf-8")
     with pytest.raises(public_records.NoRecord, match="no column batteryVoltage"):
         public_records.record("micromouse-left", tmp_path, tmp_path / "public", None, 0)

@@ -1,7 +1,5 @@
 """What every command leaves is what `tests/record/commands` has of it (benchmarks/record.py). A difference is seen."""
 
-from __future__ import annotations
-
 import copy
 import subprocess
 import sys

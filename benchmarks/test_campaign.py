@@ -12,6 +12,8 @@ import numpy as np
 import pytest
 from worlds import foreign, laws, tables
 
+from tests.commands import text_file
+
 
 def line(verdict="none", classes=(), where=None, truth=(), **more):
     return {
@@ -120,9 +122,9 @@ def test_skipped_cases_are_listed_by_reason():
 
 
 def test_a_line_that_was_cut_off_is_done_again(tmp_path):
-    path = tmp_path / "x.jsonl"
-    path.write_text(json.dumps({"kind": "clean", "seed": 1}) + '\n{"kind": "cle')
-    assert campaign.known(path) == [{"kind": "clean", "seed": 1}]
+    assert campaign.known(
+        text_file(tmp_path / "x.jsonl", json.dumps({"kind": "clean", "seed": 1}) + '\n{"kind": "cle')
+    ) == [{"kind": "clean", "seed": 1}]
 
 
 def test_what_a_result_holds_is_written_as_json():
