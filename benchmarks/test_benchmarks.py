@@ -44,12 +44,6 @@ def test_every_script_is_imported_or_prints_its_help(unchanged, monkeypatch):
         assert not end.value.code and shown.getvalue().startswith("usage:"), script.name
 
 
-def test_flags_that_xla_does_not_know_are_left_out():
-    known = importlib.import_module("everything").known_flags
-    fast = "--xla_backend_optimization_level=1"
-    assert known(sys.executable, "--xla_no_such_flag=1", fast) == fast
-
-
 def test_a_killed_tier_counts_what_has_finished(tmp_path):
     everything, log = importlib.import_module("everything"), tmp_path / "quick.jsonl"
     assert everything.summary("quick", log)["state"] == "not run"

@@ -19,7 +19,7 @@ import typer
 
 from calibration.data import Names
 from calibration.data.input_errors import BadConfiguration, InputError
-from mmrjax import SOUND_AT_LEVEL_0, WORKER, __version__, fidelities
+from mmrjax import OLDER_EMITTERS, SOUND_AT_LEVEL_0, WORKER, __version__, fidelities
 from mmrjax.errors import printable, shorten
 from sweeps import config, config_campaign
 from sweeps import options as made
@@ -519,6 +519,7 @@ def _prepare(resolved: Any, no_cache: bool = False) -> None:
     model = getattr(resolved, "model", None)  # None: of a calibration, whose data decide
     one_thread = model is not None and fidelities.fidelity_facts(model).one_thread
     options = (f"xla_cpu_small_while_loop_byte_threshold={WHOLE}",) * isinstance(resolved, config.Loop)
+    options += (OLDER_EMITTERS,) * isinstance(resolved, config.Loop | config.Calibrate)
     _start_jax(no_cache, ("--xla_cpu_multi_thread_eigen=false",) * one_thread, options)
 
 

@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Collection
 from pathlib import Path
 
-from calibration.data import Json, Names, effect_file, posterior_file, robot_file, surface_labels
+from calibration.data import Json, Names, effect_file, posterior_file, robot_file, stated, surface_labels
 from calibration.data import runs as records
 from calibration.data.columns import IMPOSED, Layout
 from calibration.data.contradictions import misplaced_levers
@@ -15,11 +15,12 @@ from calibration.data.posterior_file import Posterior
 from calibration.data.robot_file import RobotFile
 from mmrjax import fidelities
 from mmrjax.derived.turning_figures import turns_under_equal_commands
+from mmrjax.errors import list_some
 from mmrjax.model.paper_tables import BENCH, SURFACES
 from mmrjax.model.quantities import RPM
 from mmrjax.model.robot import Robot, turn_error
 from sweeps import capabilities, store
-from sweeps.config import Calibrate, Compare, FidelityPart, GivenRuns, Loop, OneRun, RobotPart, Simulate
+from sweeps.config import Calibrate, Compare, Export, FidelityPart, GivenRuns, Loop, OneRun, RobotPart, Simulate
 from sweeps.console import print_message
 from sweeps.options import options_of_fields
 from sweeps.points import imposed
@@ -40,12 +41,18 @@ def load_robot(config: RobotPart) -> RobotFile:
     notes: list[str] = []
     file = robot_file.find_robot_file(config.robot, effect_file.effect_library(config.effects), notes)
     robot = robot_file.change_robot(file.robot, config.set, where="--set", notes=notes)
-    if robot.rig.follows_goal and not (type(config) is RobotPart or isinstance(config, Calibrate | Compare | Loop)):
+    if robot.rig.follows_goal and not (
+        type(config) is RobotPart or isinstance(config, Calibrate | Compare | Export | Loop)
+    ):
         raise BadConfiguration(
             f"--robot {file.name}: its controller follows a goal over time; expected calibrate, compare, loop or rig "
-            "check with a log, or mmrjax.simulate in Python"
+            "check with a log, export, or mmrjax.simulate in Python"
         )
     unlike = () if getattr(config, "turns", False) else _unlike(file.name, robot)
+    examples = list_some(stated.example_numbers(file.text))
+    if examples and isinstance(config, Calibrate | Loop):  # `rig check` lists their lines
+        wide = f"± {100 * stated.EXAMPLE_SHARE:g} %"
+        notes.append(f"{file.name}: still the template's, so the fit takes {wide} where they have ±: {examples}")
     for note in (*notes, *unlike):
         print_message(note)
     resolves = isinstance(config, FidelityPart) and fidelities.fidelity_facts(config.model).resolves

@@ -52,9 +52,7 @@ def base(tmp_path_factory):
     (folder / "profile.csv").write_text(data.joinpath("profiles/shuttle.csv").read_text("utf-8"))
     (folder / "wants.toml").write_text(data.joinpath("aims/paper.toml").read_text("utf-8"))
     for kind in ("bench", "tracked"):
-        (folder / f"{kind}.toml").write_text(
-            resources.files("sweeps.rigs").joinpath(f"{kind}.toml").read_text("utf-8")
-        )
+        (folder / f"{kind}.toml").write_text(data.joinpath("rigs", f"{kind}.toml").read_text("utf-8"))
     rng = np.random.default_rng(5)
     world = rigs.world(rng, "bench", "voltage", rows=(16, 20))
     rigs.case(world).write(folder)

@@ -13,7 +13,7 @@ import rich.text
 import typer
 
 from calibration.data.input_errors import BadConfiguration
-from mmrjax import SOUND_AT_LEVEL_0, errors, fidelities
+from mmrjax import OLDER_EMITTERS, SOUND_AT_LEVEL_0, errors, fidelities
 from sweeps import cli, config, options
 from sweeps.points import scale
 from tests.commands import ends, read_json
@@ -407,7 +407,8 @@ def test_track_model_runs_xla_on_one_thread_unless_told_otherwise(monkeypatch, g
         ("sweep --config grid.toml", [SOUND_AT_LEVEL_0, "--xla_cpu_multi_thread_eigen=false"]),
         ("compare --model track", [SOUND_AT_LEVEL_0, "--xla_cpu_multi_thread_eigen=false"]),
         ("sweep", [SOUND_AT_LEVEL_0]),
-        ("loop", [f"{SOUND_AT_LEVEL_0},xla_cpu_small_while_loop_byte_threshold={cli.WHOLE}"]),
+        ("loop", [f"{SOUND_AT_LEVEL_0},xla_cpu_small_while_loop_byte_threshold={cli.WHOLE},{OLDER_EMITTERS}"]),
+        ("calibrate", [f"{SOUND_AT_LEVEL_0},{OLDER_EMITTERS}"]),
     ],
 )
 def test_flags_are_set_before_jax_is_imported(tmp_path, arguments, flags):

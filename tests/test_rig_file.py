@@ -10,7 +10,7 @@ import equinox as eqx
 import numpy as np
 import pytest
 
-from calibration.data import configuration_tables, rig_facts, rig_file, robot_file
+from calibration.data import configuration_tables, rig_facts, rig_file, robot_file, stated
 from calibration.data.input_errors import BadConfiguration
 from calibration.inference import priors
 from calibration.sensitivity import uncertain_inputs
@@ -462,6 +462,31 @@ def test_rig_new_lists_the_kinds(mmrjax, tmp_path):
     )
     ends(mmrjax("rig new nowhere/my-rig.toml"), "no such folder as nowhere")
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_an_examples_number_is_wide_until_it_is_replaced(tmp_path, kind):
+    """A template's number is of another robot: within ± 5 % of it, a fit of this one would need an effect."""
+    text = rig_new.rig_template(kind)
+    priors = {name: (mean, sd) for name, mean, sd in read(tmp_path, text).rig.priors}
+    wide = {name for name in stated.example_numbers(text) if priors.get(name, (0.0, 0.0))[1] > 0}
+    assert "motor.torque_constant" in wide and not wide & {"gearbox.ratio"}
+    assert all(sd >= 2.99 * mean and sd > 0 for mean, sd in (priors[name] for name in wide))
+    line = next(x for x in text.splitlines() if x.startswith("torque_constant"))
+    value, sd = re.search(r'"(.*) ± (\d+) %"', line).groups()
+    replaced = read(tmp_path, text.replace(line, line.replace(value, f"{float(value) * 1.1:.6g}"))).rig.priors
+    mean, own = next((mean, sd) for name, mean, sd in replaced if name == "motor.torque_constant")
+    assert own == pytest.approx(mean * float(sd) / 100)
+
+
+def test_a_fit_says_which_numbers_are_a_templates(mmrjax, tmp_path):
+    text = rig_new.rig_template("bench").replace('"2.0 ± 5 %"', '"2.2 ± 5 %"')
+    (tmp_path / "rig.toml").write_text(text)
+    _, _, err = ends(mmrjax("calibrate measured --robot rig.toml --out c"), code=4)
+    assert (
+        "rig.toml: still the template's, so the fit takes ± 300 % where they have ±: motor.torque_constant, " in err
+    )
+    assert "motor.resistance" not in err
 
 
 @pytest.fixture

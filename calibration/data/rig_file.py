@@ -99,7 +99,11 @@ def linear_to_shaft(table: Json, name: str, where: str, sds: dict[str, float], s
         BadConfiguration: an unknown key, a value that is no number, no mass, not exactly one travel, or a mass or
             travel that is not positive.
     """
-    values = {key: _linear_value(table, key, where) for key in list(table) if _known_key(key, where)}
+    if strange := [key for key in table if key not in LINEAR]:
+        raise BadConfiguration(
+            f"{where}.{strange[0]}: no such key of a linear unit; {allowed_words(strange[0], LINEAR)}"
+        )
+    values = {key: _linear_value(table, key, where) for key in table}
     travels = [key for key in _TRAVEL if key in values]
     if len(travels) != 1:
         raise BadConfiguration(
@@ -127,12 +131,6 @@ def linear_to_shaft(table: Json, name: str, where: str, sds: dict[str, float], s
         sd = math.hypot(*steps)
         if sd > 0:
             sds[f"{name}.{result}"] = float(f"{sd:.12g}")
-
-
-def _known_key(key: str, where: str) -> bool:
-    if key not in LINEAR:
-        raise BadConfiguration(f"{where}.{key}: no such key of a linear unit; {allowed_words(key, LINEAR)}")
-    return True
 
 
 def _linear_value(table: Mapping[str, Any], key: str, where: str) -> float:

@@ -146,7 +146,8 @@ def parse_robot_file(path: Path, library: Library = effects.BY_NAME, notes: list
             Otherwise it states `movers` (`tracks` or `wheels`) or `load` (see `rig_file.LOADS`), and every parameter
             without default.
         parameters: in tables by dotted name in SI units, e.g. `[motor] resistance = 0.9`, or with the sd of their
-            prior as `"0.9 ± 5 %"`. RATINGS. SWITCHES, true or false, and CHOICES.
+            prior as `"0.9 ± 5 %"`, which is wider while the number is a template's. RATINGS. SWITCHES, true or
+            false, and CHOICES.
         effects: an effect is present if the file has its table `[effects.NAME]`. The table may name the
             `configurations` that the effect acts on, and scale its priors and limits by `scaled` (see
             `effects.scaled`).
@@ -174,7 +175,10 @@ def parse_robot_file(path: Path, library: Library = effects.BY_NAME, notes: list
             f"{path.name}, base: got {base}; {allowed_words(str(base), (*paper_robots.ROBOTS, rig_file.NONE))}"
         )
     robot, sds, linear = _without_parameters(
-        None if base == rig_file.NONE else paper_robots.ROBOTS[base](), content, path.name
+        None if base == rig_file.NONE else paper_robots.ROBOTS[base](),
+        content,
+        path.name,
+        stated.example_numbers(text),
     )
     present = content.get("effects", {})
     if not isinstance(present, dict):
@@ -194,18 +198,21 @@ def parse_robot_file(path: Path, library: Library = effects.BY_NAME, notes: list
 
 
 def _without_parameters(
-    base: Robot | None, content: Json, where: str
+    base: Robot | None, content: Json, where: str, examples: Collection[str]
 ) -> tuple[Robot, dict[str, float], frozenset[str]]:
     """The robot of a file's content before the parameters that it states, the sds stated of those, its linear units.
 
     Args:
         base: None starts from nothing.
         content: the function removes keys other than parameters.
+        examples: names of numbers that are still a template's.
     """
     if base is None:
         resolved_likes(content, where)
     tables = {key: value for key, value in content.items() if key not in rig_file.KEYS and isinstance(value, dict)}
     sds = stated.taken_apart(tables, where)
+    values = dict(_flatten(tables))
+    sds |= {name: stated.example_sd(values[name], sds[name]) for name in sds.keys() & set(examples)}
     loads = loads_from_tables(base, content, sds, where)
     rig = rig_file.parse_rig(content, where, list(loads.by_name), travels=loads.travels, inherits=base is not None)
     if "controller" in content and not rig.follows_goal:

@@ -1,21 +1,24 @@
-"""Numbers with their uncertainty: `5.95 ± 5 %`, `0.82 ± 0.02`. `12 ± 0` is exact."""
+"""Numbers with their uncertainty: `5.95 ± 5 %`, `0.82 ± 0.02`. `12 ± 0` is exact. A template's are examples."""
 
 from __future__ import annotations
 
 import math
 import re
-from typing import Any
+from importlib import resources
 
 from calibration.data import Json
 from calibration.data.input_errors import BadConfiguration, parse_number
 
 FORM = 'expected a number, or one with its standard deviation as "0.61 ± 0.03" or "0.61 ± 5 %"'
 _SIGNS = r"(?:±|\+/-|\+-)"
-
-
-def is_stated(value: Any) -> bool:
-    """True if a value of a file is text with ±."""
-    return isinstance(value, str) and re.search(_SIGNS, value) is not None
+#: Comment of a line whose number is an example's.
+EXAMPLE = "example: yours"
+#: Least sd of an example's number that nobody replaced: share of the number. It is some other robot's, and robots
+#: differ by factors, so what a template states of its own robot is no knowledge of this one.
+EXAMPLE_SHARE = 3.0
+#: The same for an example of 0: times its sd.
+EXAMPLE_ZERO = 10.0
+HEADER = re.compile(r"(?:# )?\[([\w.]+)\]$")
 
 
 def stated_number(text: str, where: str) -> tuple[float, float]:
@@ -57,6 +60,40 @@ def taken_apart(table: Json, where: str, prefix: str = "") -> dict[str, float]:
         name = f"{prefix}{key}"
         if isinstance(value, dict):
             sds |= taken_apart(value, where, f"{name}.")
-        elif is_stated(value):
+        elif isinstance(value, str) and re.search(_SIGNS, value) is not None:
             table[key], sds[name] = stated_number(value, f"{where}, {name}")
     return sds
+
+
+def is_example(line: str) -> bool:
+    """True if a line of a rig's file is marked as an example and has a template's number."""
+    return EXAMPLE in line and not line.startswith("#") and _number_of_line(line) in _template_numbers()
+
+
+def example_numbers(text: str) -> dict[str, str]:
+    """Returns names and units of the numbers that are still those of an example, as `motor.resistance`: `[ohm]`."""
+    examples, table = {}, ""
+    for line in text.splitlines():
+        if not line.startswith("#") and (header := HEADER.match(line)):
+            table = f"{header[1]}."
+        if is_example(line) and (key := re.match(r"(\w+) = .*?# (\[[^\]]*\])?", line)):
+            examples[f"{table}{key[1]}"] = key[2] or ""
+    return examples
+
+
+def example_sd(value: float, sd: float) -> float:
+    """Sd of an example's number that nobody replaced. An exact one stays exact."""
+    least = EXAMPLE_SHARE * abs(value) or EXAMPLE_ZERO * sd
+    return max(sd, float(f"{least:.12g}")) if sd else 0.0
+
+
+def _template_numbers() -> frozenset[tuple[str, float] | None]:
+    texts = [file.read_text("utf-8") for file in resources.files("calibration.data").joinpath("rigs").iterdir()]
+    return frozenset(_number_of_line(line) for text in texts for line in text.splitlines() if EXAMPLE in line) - {
+        None
+    }
+
+
+def _number_of_line(line: str) -> tuple[str, float] | None:
+    match = re.match(r'(\w+) = "?([-+.\deE]+)', line)
+    return None if match is None else (match[1], float(match[2]))

@@ -457,7 +457,8 @@ def _fit_base_and_noise(given: LoopInput, ranked: list[Ranking]) -> tuple[Screen
     """The base fit and the noise, rescaled if residuals without structure exceed it by one factor."""
     known, noise = given.known, given.noise
     screened = given.screen(noise, None if known is None else known.screened.base, ranked)
-    residuals = residuals_of(screened, given.runs)
+    base, free = screened.base, screened.base.space.free
+    residuals = _residuals(base.space, given.runs, screened.diagnosed[0], base.reading, base.candidate.z[:free])
     factors = {} if screened.cluster is not None else common_factors(residuals)
     sds = Sds(noise, factors, tuple(noise_remarks(residuals, noise.word)))
     if factors:
@@ -1020,12 +1021,6 @@ def _gains(
         prediction.score_readings, measured=seen.measured, sd=seen.sd, counts=counts, kinds=kinds
     )
     return tuple((names, score(reading).gain(score(refit))) for names, reading in scored)
-
-
-def residuals_of(screened: Screening, runs: Runs) -> Residuals:
-    """Residuals of the base fit, by reading."""
-    base, free = screened.base, screened.base.space.free
-    return _residuals(base.space, runs, screened.diagnosed[0], base.reading, base.candidate.z[:free])
 
 
 def _residuals(

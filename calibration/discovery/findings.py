@@ -73,7 +73,9 @@ def found_effects(
     Args:
         test: of the base fit. Its bootstrap gives the p-values.
     """
-    gains = _without_each(space, base, best, found.ladder, settings)
+    # The unique contribution of each effect: the rise of χ² if it is removed and everything is refitted.
+    others = [base] if len(best.effects) == 1 else without_each(space, best, settings, found.ladder)
+    gains = [2 * (c.cost - best.cost) for c in others]
     null, excess = np.asarray(test.null.single), excess_misfit(space, base)
     listed = []
     for slot, members in enumerate(found.members):
@@ -135,15 +137,6 @@ def _stated(space: CandidateSpace, best: Candidate, shift: Shift) -> StatedValue
     value = [float(coordinates.value(np.asarray(z))[k]) for z in (shift.fit.z[:p], np.zeros(p))]
     rise = float(2 * (shift.fit.cost - best.cost))
     return StatedValue(value[0], value[1], coordinates.units[k], float(shift.fit.z[k]), rise)
-
-
-def _without_each(
-    space: CandidateSpace, base: Candidate, best: Candidate, ladder: Sequence[Candidate], settings: Settings
-) -> list[float]:
-    """Unique contribution of each effect: the rise of χ² if it is removed and everything is refitted."""
-    if len(best.effects) == 1:
-        return [2 * (base.cost - best.cost)]
-    return [2 * (c.cost - best.cost) for c in without_each(space, best, settings, ladder)]
 
 
 def unnamed_discrepancy(

@@ -215,11 +215,6 @@ def stated_names(robot: Robot, configurations: Iterable[str], idle: Names = ()) 
     return _drive(robot, (n for n in own_names if _leader(robot, n) is None and not n.endswith(idle)))
 
 
-def delay_names(robot: Robot, names: Iterable[str]) -> Names:
-    """The delay among `names`, for a rig with a file that states its sd."""
-    return tuple(n for n in names if n == DELAY and n in robot.rig.stated - robot.rig.exact)
-
-
 def default_names(
     configurations: Iterable[str], robot: Robot, *, computed: Sequence[str] = (), turns: bool = False
 ) -> Names:

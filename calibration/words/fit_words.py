@@ -116,11 +116,6 @@ def unsettled_search(names: Names) -> str:
     )
 
 
-def calibrated_header(found: CalibrationResult, robot_name: str) -> str:
-    """Header of the calibrated robot's file."""
-    return f"calibrated from {robot_name} with {found.source}; the free parameters: {', '.join(found.parameters)}"
-
-
 # --- a search by population -----------------------------------------------------------------------------
 
 

@@ -30,7 +30,7 @@ def execute(config: configuration.Calibrate, beside: configuration.FittedRuns) -
     if stated := config.robot != "nominal":
         robot = load_robot(config).robot
     else:
-        with resources.as_file(resources.files("sweeps") / "rigs" / "feedforward.toml") as path:
+        with resources.as_file(resources.files("calibration.data") / "rigs" / "feedforward.toml") as path:
             robot = robot_file.read_robot(path)
     file = contents.inspect_source(beside.data)
     columns = config.columns or ("sysid" if file.preset == "sysid" else None)

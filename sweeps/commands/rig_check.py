@@ -15,6 +15,7 @@ from calibration.data.input_errors import BadConfiguration
 from calibration.data.rig_facts import Fact, Origin
 from calibration.data.rig_file import FREE
 from calibration.data.runs import Runs
+from calibration.data.stated import EXAMPLE, EXAMPLE_SHARE, is_example
 from calibration.described import describe, sentences
 from calibration.inference import foresight, identifiability, priors
 from calibration.inference.fit_notes import Determination
@@ -29,7 +30,6 @@ from mmrjax.model.motor import UNLIMITED
 from mmrjax.model.quantities import GOALS, HEAT
 from mmrjax.model.robot import Robot
 from mmrjax.model.shaft import Shaft
-from sweeps.commands.rig_template import EXAMPLE, is_example
 from sweeps.config import RobotPart
 from sweeps.console import print_json
 from sweeps.inputs import load_robot, read_runs
@@ -97,7 +97,8 @@ class RigCheck:
         if self.examples:
             lines = ", ".join(map(str, self.examples))
             hold = f"{count_noun(len(self.examples), 'line')} still hold{'s' * (len(self.examples) == 1)}"
-            notes.append(f"{hold} the number of an example ({EXAMPLE}): {lines}")
+            wide = f"where they have ±, a fit takes ± {100 * EXAMPLE_SHARE:g} %"
+            notes.append(f"{hold} the number of an example ({EXAMPLE}): {lines}; {wide}")
         notes += self.doubts
         if self.runs is not None and self.runs.has("duty") and self.runs.has("total_current_A"):
             notes.append(
@@ -300,7 +301,7 @@ def examine_rig_file(file: Path, data: str | None, effects: Names = (), columns:
     """Remarks on a rig's file, and on a table whose columns a preset may name."""
     rig = load_robot(RobotPart(robot=str(file), effects=effects))
     lines, robot = rig.text.splitlines(), rig.robot
-    examples = tuple(k for k, line in enumerate(lines, 1) if is_example(line) and not line.startswith("#"))
+    examples = tuple(k for k, line in enumerate(lines, 1) if is_example(line))
     check = RigCheck(
         rig.name, robot, examples, tuple(rig_facts.number_origins(rig)), tuple(rig_facts.derived_facts(robot))
     )

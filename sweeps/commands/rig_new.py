@@ -9,9 +9,10 @@ from xml.etree import ElementTree
 
 from calibration.data.input_errors import BadConfiguration, allowed_words
 from calibration.data.input_files import file_bytes
+from calibration.data.stated import EXAMPLE, example_numbers
 from calibration.data.writing import write_text
 from sweeps.commands.rig_joint import JointNumbers, free_unstated_losses
-from sweeps.commands.rig_template import KINDS, Stated, example_numbers, fill_rig_template, rig_template
+from sweeps.commands.rig_template import KINDS, Stated, fill_rig_template, rig_template
 from sweeps.console import print_output
 
 #: Kind of rig if neither an option nor a model states one.
@@ -109,9 +110,9 @@ def write_new_rig(
         raise BadConfiguration(f"{file}: no such folder as {file.parent}; make it first")
     written = new_rig_text(kind, source, joint, sheet)
     if source is None and sheet is None:
-        what = f"{KINDS[kind or USUAL]}. Fill in what is marked example: yours, then"
+        what = f"{KINDS[kind or USUAL]}. Fill in what is marked {EXAMPLE}, then"
     else:
-        lacking = ", ".join(example_numbers(written))
+        lacking = ", ".join(f"{name} {unit}".rstrip() for name, unit in example_numbers(written).items())
         what = written.removeprefix("# ").partition("; a comment")[0]
         what += f"; not found, so fill in: {lacking}. Then" if lacking else ". Next"
     try:

@@ -7,7 +7,7 @@ import re
 from collections.abc import Mapping
 from importlib import resources
 
-from calibration.data import Names
+from calibration.data.stated import HEADER
 
 #: Kinds of rig, in words.
 KINDS = {
@@ -20,12 +20,8 @@ KINDS = {
     "wheeled": "a robot on wheels",
     "tracked": "a robot on tracks",
 }
-#: Comment of a line whose number is an example's.
-EXAMPLE = "example: yours"
 #: Name of the load's table in the names of numbers; the template's own name replaces it.
 LOAD = "load"
-
-_HEADER = re.compile(r"(?:# )?\[([\w.]+)\]$")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,7 +49,7 @@ class Stated:
 
 def rig_template(kind: str) -> str:
     """The file of a kind, to fill in."""
-    return resources.files("sweeps").joinpath("rigs", f"{kind}.toml").read_text(encoding="utf-8")
+    return resources.files("calibration.data").joinpath("rigs", f"{kind}.toml").read_text(encoding="utf-8")
 
 
 def fill_rig_template(kind: str, numbers: Mapping[str, Stated], heading: str) -> str:
@@ -83,7 +79,7 @@ def _put(lines: list[str], table: str, key: str, line: str) -> None:
     if table and f"[{table}]" not in lines:
         lines += ["", f"[{table}]"]
     start = lines.index(f"[{table}]") + 1 if table else 0
-    end = next((k for k in range(start, len(lines)) if _HEADER.match(lines[k])), len(lines))
+    end = next((k for k in range(start, len(lines)) if HEADER.match(lines[k])), len(lines))
     key_lines = [k for k in range(start, end) if re.match(rf"(# )?{key} = ", lines[k])]
     if key_lines:
         lines[key_lines[0]] = line
@@ -91,25 +87,3 @@ def _put(lines: list[str], table: str, key: str, line: str) -> None:
     while end > start and (not lines[end - 1] or lines[end - 1].startswith("#")):
         end -= 1  # comments below belong to the next table
     lines.insert(end, line)
-
-
-def is_example(line: str) -> bool:
-    """True if a line of a rig's file is marked as an example and has a template's number."""
-    marked = (x for kind in KINDS for x in rig_template(kind).splitlines() if EXAMPLE in x)
-    return EXAMPLE in line and any(_stated_number(x) == _stated_number(line) for x in marked)
-
-
-def _stated_number(line: str) -> tuple[str, float] | None:
-    match = re.match(r'(\w+) = "?([-+.\deE]+)', line)
-    return None if match is None else (match[1], float(match[2]))
-
-
-def example_numbers(text: str) -> Names:
-    """Returns names and units of the numbers that are still those of an example, as `motor.resistance [ohm]`."""
-    examples, table = [], ""
-    for line in text.splitlines():
-        if not line.startswith("#") and (header := _HEADER.match(line)):
-            table = f"{header[1]}."
-        if EXAMPLE in line and (key := re.match(r"(\w+) = .*?# (\[[^\]]*\])?", line)):
-            examples.append(f"{table}{key[1]} {key[2] or ''}".rstrip())
-    return tuple(examples)

@@ -93,7 +93,8 @@ def _errors(found: CalibrationResult) -> Table:
 def _shifts(found: CalibrationResult) -> Iterable[Block]:
     yield catalogue.figure("calibration.parameters", found, words=(HELD,))
     if found.tied:
-        yield Note(f"Tied: {'; '.join(f'`{n}` = {t.ratio:.4g} x `{t.leader}`' for n, t in found.tied.items())}.")
+        ties = (f"`{name}` = {ratio:.4g} x `{leader}`" for name, (leader, ratio) in found.tied.items())
+        yield Note(f"Tied: {'; '.join(ties)}.")
     noises = {name: (n.median_percent, n.source) for name, n in found.noise.items()}
     yield Note(fit_tables.noise_sentence(noises, found.channels))
 

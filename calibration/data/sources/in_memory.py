@@ -40,7 +40,11 @@ def of_object(source: Any) -> tuple[str, tuple[Signal, ...]]:
             if named:
                 signals.append(_of_series(str(index.name or "time"), index, len(source)))
         signals += [
-            _of_series(_column_name(column), source.iloc[:, j], len(source))
+            _of_series(
+                ".".join(str(part) for part in column if str(part)) if isinstance(column, tuple) else str(column),
+                source.iloc[:, j],
+                len(source),
+            )
             for j, column in enumerate(source.columns)
         ]
         return "the DataFrame", tuple(signals)
@@ -72,10 +76,6 @@ def of_object(source: Any) -> tuple[str, tuple[Signal, ...]]:
 def _called(source: Any) -> str:
     kind = type(source)
     return kind.__name__ if kind.__module__ == "builtins" else f"{kind.__module__.partition('.')[0]} {kind.__name__}"
-
-
-def _column_name(column: Any) -> str:
-    return ".".join(str(part) for part in column if str(part)) if isinstance(column, tuple) else str(column)
 
 
 def _of_series(name: str, series: Any, rows: int) -> Signal:

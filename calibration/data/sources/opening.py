@@ -163,7 +163,11 @@ def open_signals(path: Path, within: str, name: str, form: Format) -> Source:
         BadData: as `Format.signals`. No signal, or none below `within`.
     """
     if path.is_dir():
-        check_folder(path, name)
+        for item in path.iterdir():
+            if item.is_symlink() and not (item.exists() and item.resolve().is_relative_to(path.resolve())):
+                raise BadData(f"{name}, {item.name}: is a link that leads out of the bag; expected the file itself")
+            if not stat.S_ISREG(item.stat().st_mode) and not item.is_dir():
+                raise BadData(f"{name}, {item.name}: is no regular file; expected the files of a bag")
     signals = tuple(form.signals(path, name))
     if not signals:
         raise BadData(f"{name}: is {form.kind} without signals; expected at least one column or array")
@@ -244,19 +248,6 @@ def _guarded(signals: Sequence[Signal], name: str, kind: str) -> tuple[Signal, .
         )
         for s in signals
     )
-
-
-def check_folder(path: Path, name: str) -> None:
-    """Refuse a bag whose folder has a file that is no regular file, or a link that leads out of it.
-
-    Raises:
-        BadData: it has.
-    """
-    for item in path.iterdir():
-        if item.is_symlink() and not (item.exists() and item.resolve().is_relative_to(path.resolve())):
-            raise BadData(f"{name}, {item.name}: is a link that leads out of the bag; expected the file itself")
-        if not stat.S_ISREG(item.stat().st_mode) and not item.is_dir():
-            raise BadData(f"{name}, {item.name}: is no regular file; expected the files of a bag")
 
 
 def source_digest(path: Path) -> str:

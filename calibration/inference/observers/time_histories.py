@@ -1367,11 +1367,7 @@ def _remembered(
 
     def after(memory: Array, step: tuple[LinearisedRun, RunStep]) -> tuple[Array, Array]:
         state_there, taken = step
-        held, spans, passes = (
-            taken.held(constant),
-            jnp.diff(state_there.clock),
-            state_there.sides[0] != state_there.sides[1],
-        )
+        held, spans, passes = taken.held(constant), jnp.diff(state_there.clock), state_there.passes
 
         def stage(memory: Array, span: Array, y: Array, way: Array) -> Array:
             law = lambda m: speeds(y, held, way, m)  # noqa: E731
