@@ -319,7 +319,7 @@ BAD_PLANS = {
     "another model": ('model = "steady"\n' + PLAN, r"profile acts only with model drive"),
     "a duration": ("duration_s = 3\n" + PLAN, r"duration_s acts only without profile"),
     "no such profile": (PLAN.replace("mission.csv", "none.csv"), r"none.csv: no such file and no packaged profile"),
-    "surfaces": (PLAN.replace("mission.csv", "floors.csv"), r"profile: got floors.csv with the column surface"),
+    "surfaces": (PLAN.replace("mission.csv", "floors.csv"), r"profile: got floors.csv with a column surface"),
 }  # fmt: skip
 
 

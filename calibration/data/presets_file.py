@@ -124,8 +124,8 @@ class Preset:
                 wanted = " or ".join(by_name[needs].theirs)
                 raise BadData(
                     f"{name}: has no {wanted}; --columns {self.name} needs it for {needs}, because {present[mine]} "
-                    "alone is not the voltage at the motor; record it, or impose the speed or the current (imposed "
-                    "in the rig's file)"
+                    f"alone does not give the motor's voltage; record {wanted}, or set imposed to the speed or the "
+                    "current in the rig's file"
                 )
 
 

@@ -163,8 +163,8 @@ def parse_robot_file(path: Path, library: Library = effects.BY_NAME, notes: list
     content = toml_content(text, path.name)
     if not content:
         raise BadConfiguration(
-            f"{path.name}: states nothing; expected tables of parameters, as [motor], or for the packaged robot "
-            'base = "nominal"'
+            f"{path.name}: states nothing; expected tables of parameters such as [motor], or "
+            'base = "nominal" for the packaged robot'
         )
     schema = content.pop("schema", SCHEMA)
     if schema != SCHEMA:
@@ -446,7 +446,7 @@ def write_robot(robot: Robot, path: Path, *, note: str = "") -> None:
 
     Parameters that a robot which starts from nothing does not state are left out.
     """
-    whole, nothing = robot.rig.inherits, _start(robot)
+    whole, nothing = robot.rig.inherits, _base_robot(robot)
     pack = not whole and robot.battery.cells == nothing.battery.cells
     tables: dict[str, list[str]] = {
         "battery": [] if pack else [f"cells = {robot.battery.cells}  # in series"],
@@ -538,7 +538,7 @@ def _lines_of_ratings(robot: Robot, nothing: Robot, stated: set[str]) -> Iterato
             yield part, f"{key} = {toml_value(value(robot, name))}  # {what}"
 
 
-def _start(robot: Robot) -> Robot:
+def _base_robot(robot: Robot) -> Robot:
     """Robot that the file of a robot starts from."""
     if robot.rig.inherits:
         return paper_robots.nominal()

@@ -253,7 +253,7 @@ class LoopInput:
                 return LoopStages(word, screened, left, sds, missed=missed, unused=unused_inputs(self.runs))
             return _verdict(given, screened, left, sds, searched)
 
-    @property
+    @functools.cached_property
     def loses_motion(self) -> bool:
         """True if the log shows a backlash that the robot does not have."""
         return bool(lost_motion_notes(self.runs, self.robot))

@@ -162,7 +162,7 @@ def _free_names(
     words = [surfaces.names_of_surfaces(names, robot, runs) for names in (free, fix)]
     present = _present(runs, robot)
     default = priors.default_names(present, robot, computed=computes, turns=runs.turns)
-    owned = priors.stated_names(robot, present, () if observe.axis else priors.OVER_TIME)
+    owned = priors.names_to_fit(robot, present, () if observe.axis else priors.OVER_TIME)
     held = {*default, *fidelities.unread_parameters(fidelity, owned, runs.turns)}
     default = (*default, *(n for n in owned if n not in held and not n.endswith(computes)))
     if priors.DELAY in observe.free()[0] and priors.DELAY in robot.rig.stated - robot.rig.exact:

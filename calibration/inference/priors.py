@@ -198,7 +198,7 @@ def _uncertain(robot: Robot, names: Iterable[str]) -> Names:
     return tuple(n for n in own_names if float(fields[n].value) != 0.0 or n in stated)
 
 
-def stated_names(robot: Robot, configurations: Iterable[str], idle: Names = ()) -> Names:
+def names_to_fit(robot: Robot, configurations: Iterable[str], idle: Names = ()) -> Names:
     """Parameters that a robot's file states with a ± other than 0, which is a request to fit them.
 
     They must be parameters of the robot, belong to configurations in the data, show in the data, and follow no other
@@ -266,7 +266,7 @@ def free_names(
 
     Args:
         drive, chassis: further parameters that the data determine, see `Observer.free`.
-        idle: as of `stated_names`.
+        idle: as of `names_to_fit`.
     """
     present = set(configurations)
     names = [
@@ -281,7 +281,7 @@ def free_names(
     ]
     names = [n for n in names if _leader(robot, n) is None]
     decided = (*(f".{n}" for n in (*SHAFT, *OF_TURNS)), ".radius")  # above, by what the channels show
-    stated = stated_names(robot, present, idle)
+    stated = names_to_fit(robot, present, idle)
     owned = (n for n in stated if not n.endswith(decided) and ".track." not in n and f".{GROUND}" not in n)
     return tuple(
         dict.fromkeys(

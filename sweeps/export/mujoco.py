@@ -418,7 +418,7 @@ def mjcf_scene(joint: Joint, mass: float, name: str, at: str, command: float, lo
     if joint.robot.has_ground:
         radius = float(moved.radius)
         inertia = float(moved.inertia) + mass / float(joint.robot.sides) * radius**2
-        head = f"One side of the robot: its wheel, with {mass:.4g} kg / {float(joint.robot.sides):g} rolling along"
+        head = f"One side of the robot: its wheel, carrying 1/{float(joint.robot.sides):g} of {mass:.4g} kg"
         weight, arm, angle = 0.0, radius, 0.0
     else:
         inertia, weight, angle = float(moved.inertia), float(moved.torque_gravity), float(moved.angle_zero)

@@ -141,7 +141,7 @@ def outer_legend(axes: Axes, place: str) -> None:
 
 
 def can_stack(fig: Figure) -> bool:
-    """True for a figure that `new_figure` made, which can be drawn for a phone."""
+    """True if phone versions are on and `new_figure` made the figure, so that its panels can be stacked."""
     return pages.FOR_PHONES and hasattr(fig, "panels")
 
 

@@ -103,7 +103,7 @@ def plan_design(config: Campaign, robot: Robot, where: str) -> Plan:
             raise BadConfiguration(f"{where}, {name}: stated twice; expected it in one of conditions, axes, samples")
     if fixed.get("battery", 0.0) > 0.5 and "voltage" in {*fixed, *design.names}:
         raise BadConfiguration(
-            f"{where}, voltage: acts only without battery, whose charge sets the voltage; remove one of them"
+            f"{where}, voltage: acts only without battery, whose charge sets the voltage; remove voltage or battery"
         )
     _acting({*fixed, *design.names}, robot, where, surface)
     which = np.atleast_1d(axes.get(CONFIGURATION, fixed.get(CONFIGURATION, 0.0)))

@@ -43,7 +43,7 @@ def of_npz(path: Path, name: str) -> tuple[Signal, ...]:
         if array in arrays:
             raise BadData(f"{name}, {member}: is in the archive twice; expected different names")
         with archive.open(member) as stream:
-            shape, dtype = _header(stream)
+            shape, dtype = _read_npy_header(stream)
         arrays[array] = (shape, dtype, _member(archive, member))
     return of_arrays(name, arrays)
 
@@ -51,14 +51,14 @@ def of_npz(path: Path, name: str) -> tuple[Signal, ...]:
 def of_npy(path: Path, name: str) -> tuple[Signal, ...]:
     """Signals of an .npy file: columns of its array, or fields of its records."""
     with path.open("rb") as stream:
-        shape, dtype = _header(stream)
+        shape, dtype = _read_npy_header(stream)
     loaded = functools.cache(lambda: np.load(path, allow_pickle=False))
     signals = of_arrays(name, {path.stem: (shape, dtype, loaded)})
     fields = (dataclasses.replace(s, path=s.path.removeprefix(f"{path.stem}.")) for s in signals)
     return tuple(fields) if dtype.names else signals
 
 
-def _header(stream: Any) -> tuple[tuple[int, ...], np.dtype]:
+def _read_npy_header(stream: Any) -> tuple[tuple[int, ...], np.dtype]:
     version = np.lib.format.read_magic(stream)
     read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
     shape, _, dtype = read(stream)

@@ -142,7 +142,7 @@ LEVELS = 6
 ROUNDING = 1e-3
 
 
-def _by_row(
+def _to_rows(
     of_runs: Float[Array, "runs samples ..."], rows_of: Int[Array, "runs samples"], rows: int
 ) -> Float[Array, "rows ..."]:
     """Values of each sample of the runs, by the table's rows. Values beyond a run's last row are dropped."""
@@ -176,7 +176,7 @@ class HistoriesLinearization(Linearization):
 
     def columns(self, balance: Scalar | int, shapes: Array | np.ndarray) -> Float[Array, "readings terms"]:
         moved = jnp.einsum("rksc,rkt->rsct", self.defects[balance], shapes[self.knots])
-        return _by_row(moved, self.rows_of, self.rows).reshape(-1, shapes.shape[1])
+        return _to_rows(moved, self.rows_of, self.rows).reshape(-1, shapes.shape[1])
 
     def places(self) -> np.ndarray:
         return np.unique(np.asarray(self.knots))
@@ -553,7 +553,7 @@ class Histories(Observer):
             return StepCourse.read(tuple(x[step] for x in every), share)
 
         of_runs = jax.vmap(of_run)(self.times, every, self.time[self.rows_of])
-        return _by_row(of_runs, self.rows_of, len(self.run))
+        return _to_rows(of_runs, self.rows_of, len(self.run))
 
     def __call__(self, robot: Robot) -> Observation:
         def of_run(
@@ -570,7 +570,7 @@ class Histories(Observer):
 
         places = self.instant[self.rows_of], self.time[self.rows_of]
         of_runs = jax.vmap(of_run)(self.conditions, self.times, self.known, *places)
-        reading = _by_row(of_runs, self.rows_of, len(self.run))
+        reading = _to_rows(of_runs, self.rows_of, len(self.run))
         followed = jnp.all(jnp.isfinite(reading), 1)
         status = jnp.where(followed, CONVERGED, FAILED)
         return Observation(reading, jnp.zeros(self.run.shape), status, jnp.zeros_like(status))
@@ -1210,7 +1210,7 @@ def _responses(
     defects, by_effects = observe.changes(robot, tuple(balance_probe(b) for b in PROBED), effects)
     rows_of, rows = observe.rows_of, len(scale)
     defects = jnp.where(rows_of[:, None, :, None] < 0, 0.0, defects * scale[rows_of][:, None])
-    signatures = _by_row(by_effects, rows_of, rows) * scale[..., None]
+    signatures = _to_rows(by_effects, rows_of, rows) * scale[..., None]
     runs = observe.whole(robot)
     by_reading = signatures.reshape(scale.size, -1)
     return finite_or_zero(by_reading), finite_or_zero(defects), observe.at_rows(runs), observe.angle(runs)
