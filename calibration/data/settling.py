@@ -527,7 +527,7 @@ def _settled(
     shortest: float,
     drift: float,
     step: float,
-    stuck: Mapping[str, np.ndarray],
+    stuck: Columns,
     inertia: Mapping[str, Inertia],
 ) -> Stretch:
     """The settled end of a level, or the reason why it has none."""

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from calibration.data import Names
 from calibration.data.input_errors import BadConfiguration, allowed_words
 from calibration.discovery.reach import SLOPE, Reach, Used
 from calibration.inference.fit_notes import Remark
@@ -122,7 +123,7 @@ class Act:
     """
 
     name: str
-    kinds: tuple[str, ...]
+    kinds: Names
     reading: Callable[[Robot, Array], Array]
     at: tuple[tuple[float, ...], ...]
     sd: float | None
@@ -155,13 +156,13 @@ class Run:
     """
 
     name: str
-    kinds: tuple[str, ...]
+    kinds: Names
     doing: str
     setup: Setup
     voltage: tuple[float, ...]
     slope: tuple[float, ...]
     payload: tuple[float, ...]
-    channels: tuple[str, ...]
+    channels: Names
     configuration: int = 0
     sides: int | None = None
     brake: float = 0.0
@@ -174,7 +175,7 @@ class Run:
     motors: int = 1
     torque: tuple[float, ...] = ()
 
-    def read(self, shown: tuple[str, ...]) -> tuple[int, ...]:
+    def read(self, shown: Names) -> tuple[int, ...]:
         """Positions of the channels to read among all channels."""
         return tuple(shown.index(c) for c in self.channels)
 
@@ -306,11 +307,11 @@ def _runs(
     doing: str,
     setup: Setup = on_ground,
     *,
-    kinds: tuple[str, ...] = (),
+    kinds: Names = (),
     voltages: Sequence[float],
     slopes: Sequence[float] = (0.0,),
     payload: float = 0.0,
-    read: tuple[str, ...] = (),
+    read: Names = (),
     at: Used | None = None,
     sides: int | None = None,
     brake: float = 0.0,

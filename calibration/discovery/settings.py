@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 
+from calibration.data import Names
 from calibration.data.input_errors import SEEDS, BadConfiguration, allowed_words, stated_count
 from calibration.inference.observers import Observer
 
@@ -93,8 +94,8 @@ class Settings:
     gain: float = 0.2
     refuted: float = 4.0
     prefer: str = FIT
-    forbidden: tuple[str, ...] = ()
-    silent: tuple[str, ...] = ()
+    forbidden: Names = ()
+    silent: Names = ()
 
     def outliers(self, rows: int) -> int:
         """Largest number of rows that may be excluded."""

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
 
-from calibration.data import Names, surfaces
+from calibration.data import Names, Priors, surfaces
 from calibration.data.columns import ROWS
 from calibration.data.input_errors import SEEDS, BadConfiguration, stated_count
 from calibration.data.runs import Runs
@@ -64,7 +64,7 @@ def calibrate(
     *,
     free: Sequence[str] = (),
     fix: Sequence[str] = (),
-    stated: Mapping[str, tuple[float, float]] | None = None,
+    stated: Priors | None = None,
     noise: str | None = None,
     model: str | None = None,
     starts: int | None = None,
@@ -202,10 +202,10 @@ class _Setting:
     kinds: Names
     ready: Prepared
     base: Robot
-    of_product: dict[str, tuple[float, float]]
+    of_product: Priors
 
 
-def _with_guide_priors(runs: Runs, ready: Prepared, fidelity: str) -> tuple[Robot, dict[str, tuple[float, float]]]:
+def _with_guide_priors(runs: Runs, ready: Prepared, fidelity: str) -> tuple[Robot, Priors]:
     """Robot with the guides' share that the fidelity computes, and priors of the free guide frictions without a
     stated prior."""
     robot, guide_priors = ready.robot, dict[str, tuple[float, float]]()

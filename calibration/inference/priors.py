@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from calibration.data import Names
+from calibration.data import Names, Priors
 from calibration.data.input_errors import BadConfiguration, allowed_words
 from calibration.data.surfaces import GROUND
 from mmrjax.compile.compiling import SELDOM, compiled
@@ -319,7 +319,7 @@ def _drive(robot: Robot, names: Iterable[str]) -> Names:
     return tuple(n for n in names if n not in ELECTRICAL)
 
 
-def with_guide_share(robot: Robot, configuration: str) -> tuple[Robot, dict[str, tuple[float, float]]]:
+def with_guide_share(robot: Robot, configuration: str) -> tuple[Robot, Priors]:
     """`robot` with the track model's guide share, and the resulting prior of its guide friction.
 
     The prior is that of the product of friction and share, because all fidelities agree on the product. Table 4
@@ -418,7 +418,7 @@ def parse_prior(text: str) -> tuple[str, float, float]:
     return match["name"], mean, sd
 
 
-def parse_priors(texts: Sequence[str]) -> dict[str, tuple[float, float]]:
+def parse_priors(texts: Sequence[str]) -> Priors:
     """Name → (mean, sd) of stated priors, each as `parse_prior`.
 
     Raises:
@@ -436,7 +436,7 @@ def parse_priors(texts: Sequence[str]) -> dict[str, tuple[float, float]]:
 def parameter_coordinates(
     robot: Robot,
     names: Sequence[str],
-    stated: dict[str, tuple[float, float]] | None = None,
+    stated: Priors | None = None,
     *,
     any_surface: bool = False,
 ) -> Coordinates:
@@ -474,7 +474,7 @@ def parameter_coordinates(
     if not robot.rig.inherits:
         wide = {n: sd for n in names for end, sd in RELATIVE_OF_RIGS.items() if n.endswith(end)} | wide
     known_sds = {n: (float(fields[n].value), float(fields[n].value) * share) for n, share in wide.items()}
-    known_sds |= {n: (mean, sd) for n, mean, sd in robot.rig.priors if n in names} | stated
+    known_sds |= {**{n: (mean, sd) for n, mean, sd in robot.rig.priors if n in names}, **stated}
     rows = [_coordinate_of_parameter(fields[name], known_sds.get(name)) for name in names]
     location, spread, low, high, scale = zip(*rows, strict=True)
     tied = tuple(

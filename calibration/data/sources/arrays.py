@@ -14,10 +14,10 @@ import numpy as np
 
 from calibration.data import Columns, input_files
 from calibration.data.input_errors import BadData
-from calibration.data.sources.recorded_signals import Signal, of_arrays, values_in_memory
+from calibration.data.sources.recorded_signals import Load, Signal, of_arrays, values_in_memory
 
 #: Arrays by path: shape, type, and a function that returns the array.
-Arrays: TypeAlias = dict[str, tuple[tuple[int, ...], np.dtype, Callable[[], np.ndarray]]]
+Arrays: TypeAlias = dict[str, tuple[tuple[int, ...], np.dtype, Load]]
 #: Name of the type of an array of objects.
 _OBJECTS = np.dtype(object)
 #: Kind of a compressed variable in a MATLAB file.
@@ -65,7 +65,7 @@ def _read_npy_header(stream: Any) -> tuple[tuple[int, ...], np.dtype]:
     return shape, dtype
 
 
-def _member(archive: zipfile.ZipFile, member: str) -> Callable[[], np.ndarray]:
+def _member(archive: zipfile.ZipFile, member: str) -> Load:
     def load() -> np.ndarray:
         with archive.open(member) as stream:
             return np.lib.format.read_array(stream, allow_pickle=False)
@@ -111,7 +111,7 @@ def _check_matlab(path: Path, name: str) -> None:
     input_files.check_memory(name, size)
 
 
-def _variable(loaded: Callable[[], Columns], name: str) -> Callable[[], np.ndarray]:
+def _variable(loaded: Callable[[], Columns], name: str) -> Load:
     return lambda: loaded()[name]
 
 
@@ -193,7 +193,7 @@ def _walk(
         units[here] = stated.decode("utf-8", "replace") if isinstance(stated, bytes) else str(stated)
 
 
-def _dataset(path: Path, at: str, words: bool, char: bool, matlab: bool) -> Callable[[], np.ndarray]:
+def _dataset(path: Path, at: str, words: bool, char: bool, matlab: bool) -> Load:
     def load() -> np.ndarray:
         import h5py
 

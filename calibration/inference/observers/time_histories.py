@@ -12,7 +12,7 @@ import operator
 import re
 import threading
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
@@ -21,6 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from calibration.data import Columns, Names
 from calibration.data.columns import SUPPLY
 from calibration.data.courses import (
     Stretch,
@@ -232,10 +233,10 @@ class Histories(Observer):
     word: ClassVar[str] = "sample"
     fewest: ClassVar[int] = 24
     axis: ClassVar[str] = "time_s"
-    blocks: ClassVar[tuple[str, ...]] = ("slope", "voltage", "run")
+    blocks: ClassVar[Names] = ("slope", "voltage", "run")
     policy: ClassVar[SearchPolicy] = SearchPolicy(batch=8, steps=30, searches=8, one_by_one=False)
     rows_tell: ClassVar[bool] = False
-    evidence: ClassVar[tuple[str, ...]] = ("single", "curve", "pair", "chi2", "white")
+    evidence: ClassVar[Names] = ("single", "curve", "pair", "chi2", "white")
     searches: ClassVar[int | None] = 8
 
     conditions: Conditions
@@ -413,7 +414,7 @@ class Histories(Observer):
         )
 
     @classmethod
-    def identity(cls, runs: Runs) -> tuple[str, ...]:
+    def identity(cls, runs: Runs) -> Names:
         """All columns, including the run: repeats have the same beginning, at rest."""
         return tuple(runs.columns)
 
@@ -422,7 +423,7 @@ class Histories(Observer):
         return not effect.needs_battery
 
     @classmethod
-    def free(cls) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    def free(cls) -> tuple[Names, Names]:
         return ("motor.inductance", "motor.inertia", DELAY), ("inertia", settled_ends.STATIC, *settled_ends.SLIDING)
 
     def defective(
@@ -755,7 +756,7 @@ class Histories(Observer):
         r, jacobian, seen = jax.tree.map(lambda x: x[0], evaluate(np.asarray(z)[None], np.zeros(1, int)))
         return *zero_inactive_residuals(jnp.asarray(r), jnp.asarray(jacobian), penalty_slice(problem.data)), seen
 
-    def bases(self, columns: Mapping[str, np.ndarray], included: np.ndarray, robot: Robot) -> Bases:
+    def bases(self, columns: Columns, included: np.ndarray, robot: Robot) -> Bases:
         """Curves and windows as for settled runs, also over time, and waves over the angle of a shaft.
 
         Curves over the voltage are over the motors' voltage if it differs from the supply's.
@@ -826,7 +827,7 @@ def _conditions_over_time(
     each: list[np.ndarray],
     time: np.ndarray,
     times: np.ndarray,
-    on_lines: tuple[str, ...] = (),
+    on_lines: Names = (),
 ) -> Conditions:
     """Conditions of runs from those of rows, shape (runs,), or (runs, instants) if they change within a run.
 
