@@ -21,6 +21,7 @@ from calibration.inference import estimates, noise, observers
 from calibration.inference.result import CalibrationResult
 from mmrjax.fidelities.steady import steady_batch
 from mmrjax.model import channels, params, quantities
+from tests.commands import csv_text, text_file
 
 RIG = """base = "none"
 sides = 1
@@ -54,9 +55,7 @@ def rig(folder, shown):
 
 
 def written(path, columns):
-    lines = [",".join(columns), *(",".join(map(str, row)) for row in zip(*columns.values(), strict=True))]
-    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
-    return path
+    return text_file(path, csv_text(columns))
 
 
 def made_up(robot, unit=None):

@@ -69,7 +69,7 @@ def test_a_start_against_the_joint_is_that_of_scipy(name):
     bench = JOINTS[name]
     exact, _ = through(bench, np.array([6.0]), np.array([0.0]), SAMPLES)
     run = drive_batch(
-        robot_of(bench), Conditions(voltage=jnp.asarray([6.0])), jnp.asarray(SAMPLES), tolerance=1e-9, max_steps=40000
+        robot_of(bench), Conditions(voltage=[6.0]), jnp.asarray(SAMPLES), tolerance=1e-9, max_steps=40000
     )
     shown = np.stack([run.signals.current[0], run.signals.speed_motor[0]], -1)
     assert_allclose(shown / np.abs(exact).max(0), exact / np.abs(exact).max(0), atol=1e-6)

@@ -12,7 +12,7 @@ from calibration.discovery import discover
 from calibration.inference.calibration import calibrate
 from calibration.inference.foresight import predict_identifiability
 from mmrjax.model import paper_robots
-from tests.commands import read_table
+from tests.commands import csv_text, read_table
 
 ALL = {
     "calibrate": lambda runs, robot: calibrate(runs, robot),
@@ -47,7 +47,7 @@ def test_a_campaign_sees_the_instruments_that_the_table_shows(tmp_path):
     given = discover.prepare_loop(
         read_table(
             tmp_path,
-            "\n".join([",".join(columns), *(",".join(map(str, row)) for row in zip(*columns.values(), strict=True))]),
+            csv_text(columns),
             robot,
             "table.csv",
         ),

@@ -17,6 +17,7 @@ from calibration.inference import optimizers as fit
 from calibration.inference.calibration import calibrate
 from calibration.inference.observers.turns import SettledTurns
 from mmrjax.model import balances, channels
+from tests.commands import csv_text, text_file
 
 CURRENTS = ("motor_current_left", "motor_current_right")
 MOTION = ("motor_speed_left", "motor_speed_right", "yaw_rate")
@@ -45,9 +46,7 @@ def written(path, configuration, mass, readings):
     for name, values in readings.items():
         channel = channels.find_channel(name)
         columns[channel.column] = np.asarray(values) / channel.factor + SDS[name] * random.normal(size=len(DUTIES))
-    lines = [",".join(str(v) for v in row) for row in zip(*columns.values(), strict=True)]
-    path.write_text("\n".join([",".join(columns), *lines]) + "\n")
-    return path
+    return text_file(path, csv_text(columns))
 
 
 @pytest.fixture(scope="module")
