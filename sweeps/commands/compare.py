@@ -153,7 +153,7 @@ def missing_readings_notes(table: Columns, channels: Sequence[Channel]) -> list[
     lost = {c.column: int(np.isnan(table[c.column]).sum()) for c in channels}
     rows = len(table["status"])
     return [
-        f"{column}: {'all' if count == rows else f'{count} of {rows}'} readings are missing; they weigh nothing"
+        f"{column}: {'all' if count == rows else f'{count} of {rows}'} readings are missing and are ignored"
         for column, count in lost.items()
         if count
     ]
