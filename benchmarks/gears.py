@@ -6,8 +6,8 @@
 `xl330` (commit af226046, bam/data.bak/raw) and `sts3250` (commit d13c0577, data_raw_feetech). The arm's own mass
 is not in these logs. Mass and length give the torque T = m l² α + m g l sin θ at the output. The motor's voltage is
 c U = T + k ω + J α + friction. The columns of friction are the terms of the program's own effects. Coefficients
-follow by least squares with the signs that physics allows, shapes by a grid, both from training logs alone. The voltage
-is predicted, because a loss by torque would contain the torque that it predicts.
+follow by least squares with the signs that physics allows, shapes by a grid, both from training logs alone. The
+voltage is predicted, because a loss by torque would contain the torque that it predicts.
 """
 
 from __future__ import annotations
