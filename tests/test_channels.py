@@ -49,9 +49,7 @@ FIRST = 0.06129
 
 
 def rig(folder, shown):
-    path = folder / "rig.toml"
-    path.write_text(RIG.format(channels=list(shown)).replace("'", '"'), encoding="utf-8")
-    return calibration.read_robot(str(path))
+    return calibration.read_robot(text_file(folder / "rig.toml", RIG.format(channels=list(shown)).replace("'", '"')))
 
 
 def written(path, columns):

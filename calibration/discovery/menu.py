@@ -261,7 +261,8 @@ def calibration_acts(reach: Reach) -> tuple[Act, ...]:
     paces = round_significant(0.35 * reach.speed), round_significant(0.8 * reach.speed)
     settings = tuple((float(u.index), m) for u in reach.used for m in loads)
     weighing = Act("weigh", ("weigh",), _weighed, settings, 0.02, repeats=1)
-    shunted, strobed = _Instrument("total_current", ("total_current",)), _Instrument("motor_speed", ("speed_motor",))
+    shunted = _Instrument("total_current", ("total_current",))
+    strobed = _Instrument("motor_speed", ("speed_motor",))
     ammeter = [
         Act("zero current", ("zero current",), shunted, ((0.0,),), 0.02),
         Act("shunt", ("shunt",), shunted, _one_tuple_each(amperes), 0.02),
