@@ -377,8 +377,8 @@ real, the line follows the dots.
 
 ## May I use the robot?
 
-One block of runs at a time (one slope, one voltage) is left out and predicted by a fit to the rest. Use the robot where
-these errors are small:
+Each block of runs is left out in turn and predicted by a fit to the others. Use the robot where these errors are
+small:
 
 | rms error of unseen runs [%] | model | {" | ".join(labels.values())} | reached |
 |---|---|---|---|---|---|
