@@ -377,7 +377,7 @@ real, the line follows the dots.
 
 ## May I use the robot?
 
-Each kind of block is left out in turn and predicted by a fit that has not seen it. Use the robot where these errors are
+Each block of runs is left out in turn and predicted by a fit to the others. Use the robot where these errors are
 small:
 
 | rms error of unseen runs [%] | model | {" | ".join(labels.values())} | reached |
