@@ -1,6 +1,6 @@
 """Friction laws of servo gears on public records: held-out error, parameters, and what a record separates.
 
-    python benchmarks/gears.py --data DIR [--out docs/lab/gears.md]
+    python benchmarks/gears.py --data DIR [--out docs/lab/gears.md] [--shelf docs/actuators]
 
 `DIR` holds folders of JSON logs of github.com/Rhoban/bam (Apache-2.0), a servo that swings a mass on an arm:
 `xl330` (commit af226046, bam/data.bak/raw) and `sts3250` (commit d13c0577, data_raw_feetech). The arm's own mass
@@ -163,7 +163,12 @@ def study(logs: list[Log], law: str) -> dict:
     drawn = np.stack([physical(y) for y in drawn])
     low, high = np.quantile(drawn, [0.025, 0.975], axis=0)
     values = zip(physical(x), low, high, strict=True)
-    return {"errors": np.array(errors), "shape": shape, "values": dict(zip(names, values, strict=True))}
+    return {
+        "errors": np.array(errors),
+        "shape": shape,
+        "values": dict(zip(names, values, strict=True)),
+        "drawn": drawn,
+    }
 
 
 def physical(x: np.ndarray) -> np.ndarray:
@@ -220,6 +225,52 @@ def separated(found: dict) -> str:
     return "\n".join(words)
 
 
+ROBOT = """schema = "mmrjax.robot/2"
+base = "none"
+sides = 1
+imposed = "voltage"
+channels = ["output_angle"]
+[motor]
+resistance = {R:.4g}
+torque_constant = {C:.4g}
+inertia = {J:.4g}
+voltage_limit = {limit:.3g}
+[gearbox]
+ratio = 1
+efficiency_load = 1.0
+[arm]
+load = "shaft"
+inertia = {inertia:.4g}
+torque_gravity = {weight:.4g}
+loss_coulomb = {M_0}
+loss_viscous = {K}
+[effects.gear_load_loss]
+amplitude = {share:.4g}
+"""
+#: Page of an identified actuator.
+SHELF = """# {name}
+
+Identified from public logs of a servo that swings a mass, without its case being opened. `python benchmarks/gears.py
+--data DIR --shelf docs/actuators` wrote this page.
+[Load loss of gears](../lab/gears.md) has source, licence and method.
+
+* Unseen error of the voltage: {error:.2g} V (rms), {percent:.1f} % of the rms, over logs left out one at a time.
+* 95 % intervals: share lost by torque {share}, constant k/c {constant} N·m/A, c {c} N·m/V, inertia {inertia} kg·m².
+* Conditions seen: {conditions}.
+* Not told apart: the two directions of the load loss. Gear ratio and motor: all numbers are at the output, as
+  of a motor with the ratio 1. Effects of temperature. Dry friction of 0: the load loss explains it in these rows.
+
+## robot.toml
+
+```toml
+{robot}```
+
+## drive.xml
+
+```xml
+{drive}```
+
+{law}"""
 TOP = """# Load loss of gears
 
 `<dcmotor>` of MuJoCo has Coulomb, viscous and LuGre friction. google-deepmind/mujoco issue 3528 asks for a loss in
@@ -238,18 +289,65 @@ The voltage of the XL330 is read. That of the STS3250 is computed from goal, ang
 """
 
 
+def actuator(robot: str) -> tuple[str, str]:
+    """The drive of a robot's text as MJCF without comments, and its law, with headings of a page below."""
+    import tempfile
+
+    from calibration.data import robot_file
+    from mmrjax.compile.precision import in_double
+    from sweeps.export.formats import export_format
+    from sweeps.report.words import export_words
+
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "robot.toml"
+        path.write_text(robot, encoding="utf-8")
+        exported = in_double(lambda: export_format(robot_file.find_robot_file(str(path)), "mujoco"))()
+    drive = str(exported.files["drive.xml"]).splitlines(keepends=True)
+    law = export_words.law_text(exported).replace("\n## ", "\n### ").replace("# The law", "## LAW.md: the law", 1)
+    return "".join(line for line in drive if "<!--" not in line), law
+
+
+def shelf_page(name: str, logs: list[Log], paths: list[Path]) -> str:
+    """Page of an actuator with its load loss."""
+    found, text = study(logs, "load loss"), json.loads(paths[0].read_text(encoding="utf-8"))
+    values = {n: x[0] for n, x in found["values"].items()}
+    mass, length, (c, k) = text["mass"], text["length"], (values["c"], values["k"])
+    robot = ROBOT.format(
+        R=k / c**2, C=k / c, J=values["J"], M_0=short(values["M_0"]), K=short(values["K"]),
+        share=values["gear_load_loss"], limit=text["vin"], inertia=mass * length**2, weight=mass * length * GRAVITY,
+    )  # fmt: skip
+    between = {n: f"{short(low)} to {short(high)}" for n, (_, low, high) in found["values"].items()}
+    voltage, torque = (np.concatenate([x[log.moves] for log in logs for x in (of(log),)]) for of in (
+        lambda log: log.voltage, lambda log: log.torque))  # fmt: skip
+    error = rms(found["errors"])
+    ratio = np.quantile(found["drawn"][:, 1] / found["drawn"][:, 0], [0.025, 0.975])
+    drive, law = actuator(robot)
+    return SHELF.format(
+        name=name, error=error, percent=100 * error / rms(voltage), share=between["gear_load_loss"], c=between["c"],
+        constant=f"{ratio[0]:.3g} to {ratio[1]:.3g}", inertia=between["J"], robot=robot, drive=drive, law=law,
+        conditions=f"{len(logs)} logs, torque to {np.abs(torque).max():.3g} N·m, voltage to "
+        f"{np.abs(voltage).max():.3g} V, mass {mass:g} kg on {length:g} m",
+    )  # fmt: skip
+
+
 def main() -> None:
-    """Writes the page."""
+    """Writes the pages."""
     wanted = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     wanted.add_argument("--data", type=Path, required=True)
     wanted.add_argument("--out", type=Path, default=Path("docs/lab/gears.md"))
+    wanted.add_argument("--shelf", type=Path, help="folder of the pages of actuators")
     given = wanted.parse_args()
     titles = {"xl330": "Dynamixel XL330, 16 logs", "sts3250": "Feetech STS3250, 4 logs"}
     texts = [TOP]
     for folder, title in titles.items():
         paths = sorted((given.data / folder).glob("*.json"))
         if paths:
-            texts.append(section(title.split(",")[0], [read_log(p) for p in paths]))
+            logs, name = [read_log(p) for p in paths], title.split(",")[0]
+            texts.append(section(name, logs))
+            # The voltage of the other record is computed, and no law predicts it well.
+            if given.shelf is not None and folder == "xl330":
+                given.shelf.mkdir(exist_ok=True)
+                (given.shelf / f"{folder}.md").write_text(shelf_page(name, logs, paths), encoding="utf-8")
     given.out.write_text("\n".join(texts).rstrip() + "\n", encoding="utf-8")
 
 

@@ -1,11 +1,14 @@
 """The study of gears: a generated log with a loss by torque gives that loss back, one without gives none."""
 
 import json
+import re
+from pathlib import Path
 
 import gears
 import numpy as np
 import pytest
 
+SHELF = Path(gears.__file__).resolve().parent.parent / "docs" / "actuators"
 MASS, LENGTH, C, K, J, DRY = 0.5, 0.1, 0.08, 0.03, 1.5e-3, 0.02
 
 
@@ -33,6 +36,20 @@ def write(folder, name, seed, share):
     ]
     text = {"mass": MASS, "length": LENGTH, "kp": 100, "trajectory": name, "entries": entries}
     (folder / f"{name}.json").write_text(json.dumps(text))
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("page", sorted(SHELF.glob("*.md")), ids=lambda p: p.stem)
+def test_an_actuator_of_the_shelf_is_what_its_robot_exports(page):
+    text = page.read_text("utf-8")
+    robot, drive = (text.split(f"```{kind}\n")[1].split("```")[0] for kind in ("toml", "xml"))
+    ours, law = gears.actuator(robot)
+    number = re.compile(r"-?\d+\.?\d*(?:e-?\d+)?")
+    for made, kept in ((ours, drive), (law, "## LAW.md" + text.split("## LAW.md")[1])):
+        assert number.sub("#", made).split() == number.sub("#", kept).split()
+        mine, theirs = (np.array(number.findall(x), float) for x in (made, kept))
+        np.testing.assert_allclose(mine, theirs, rtol=1e-3, atol=1e-7)
+    assert "<dcmotor" in drive
 
 
 @pytest.mark.parametrize("share", [0.0, 0.3])

@@ -26,7 +26,10 @@ def site():
 
 SITE = site()
 #: Pages that programs write: they count as reference and not as prose.
-MADE = {f"reference/{name}.md" for name in (*SITE.PAGES, "effects")} | {"lab/gears.md"}
+MADE = {f"reference/{name}.md" for name in (*SITE.PAGES, "effects")} | {
+    "lab/gears.md",
+    *(f"actuators/{p.name}" for p in (DOCS / "actuators").glob("*.md")),
+}
 
 
 @pytest.mark.parametrize("name", SITE.PAGES)
@@ -38,7 +41,7 @@ def test_a_page_that_is_made_is_what_makes_it(name):
 def test_pages_are_on_four_shelves_and_in_the_lab():
     pages = {str(p.relative_to(DOCS)) for p in DOCS.rglob("*.md")}
     shelves = {page.split("/")[0] for page in pages}
-    assert shelves == {"index.md", "start", "howto", "explanation", "reference", "rigs", "lab"}
+    assert shelves == {"index.md", "start", "howto", "explanation", "reference", "rigs", "lab", "actuators"}
     assert pages > MADE
 
 
