@@ -127,10 +127,7 @@ def _wanted(robot: Robot, conditions: Conditions, state: State) -> Scalar:
 
 
 def controller_rates(robot: Robot, conditions: Conditions, state: State) -> list[Scalar]:
-    """Time derivatives of the controller's states: of its integral, and of the duty if that lags.
-
-    The integral grows with the error. It stops while the duty is at its limit (anti-windup).
-    """
+    """Rates of a controller's states: the error, unless it would drive the duty beyond its limit, and the duty's."""
     if conditions.goal is None or robot.controller is None:
         return [jnp.zeros_like(state.speed)] * robot.controller_size
     duty = _wanted(robot, conditions, state)
@@ -299,11 +296,10 @@ TORQUE_STEPS = 4
 def gearbox(
     robot: Robot, chassis: Load, signals: Signals, mover: Scalar | None = None, *, settled: bool = False
 ) -> Signals:
-    """Torques at both shafts and acceleration of the driving wheel. Part of the torque accelerates the armature.
+    """Torques at both shafts and the acceleration of the driving wheel, the armature taking its share.
 
-    Gearbox effects depend on the torque at the output, B + J_w ω̇_k. J_w is the inertia on the output side, and B the
-    load torque without the loss of these effects. Their loss changes that torque in turn, so Newton's method solves
-    for it.
+    Effects of the gearbox depend on the torque B + J_w ω̇_k that it transmits to its output, J_w being what turns with
+    the output and B the load without their own loss. That torque depends on their loss, so Newton's method finds it.
 
     Args:
         mover: the mover's torque on the shaft in addition to the track losses [N·m]. None: the traction.
@@ -702,8 +698,8 @@ def turning_signals(
 ) -> Travel:
     """All signals of a robot free to turn: the balances of both sides, coupled by supply and ground.
 
-    Each side sees the component of the slope along its heading. Effects that reduce the speed of a side are evaluated
-    with the load shared equally by both sides.
+    Each side has the component of the slope along its heading. Effects that lower the speed of a side are evaluated
+    with the load divided equally between the sides.
 
     Args:
         loads: normal loads of both sides [N], see `turning.grip`.
