@@ -424,7 +424,7 @@ def _side(robot: Robot, conditions: Conditions, y: Array, length: Array) -> tupl
     if not robot.moves_as_one:
         return jnp.zeros(()), jnp.zeros(()), jnp.zeros(())
     way, wait = shaft_direction(robot, conditions, state_of_unknowns(robot, y))
-    way, wait = jnp.where(wait < length, way, HELD), jnp.where(wait < length, wait, 0.0)
+    way, wait = jnp.where(wait <= length, way, HELD), jnp.where(wait <= length, wait, 0.0)
     return jnp.where(wait > 0, HELD, way), way, wait
 
 
