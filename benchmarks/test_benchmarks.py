@@ -80,6 +80,7 @@ SMALL = {
     "emps.py": None,  # needs the record, which is not in the project
     "fastsim_comparison.py": None,  # benchmarks/test_fastsim_comparison.py
     "free_chain.py": None,  # a chain of 168 masses takes half a minute
+    "gears.py": None,  # needs the logs, which are not in the project
     "head_to_head.py": "--quick --out lines.jsonl",
     "loop.py": _ONE,
     "loop_baselines.py": None,  # PySINDy, of the extra bench

@@ -101,7 +101,8 @@ def errors_over(
     conditions = {c: words for c, words in every.items() if c in table and f"simulated_{c}" not in table}
     if in_units:
         conditions |= beside or {}
-        conditions = {c: words for c, words in conditions.items() if np.unique(table[c]).size > 1}
+        varied = {c: words for c, words in conditions.items() if np.unique(table[c]).size > 1}
+        conditions = varied or dict(list(conditions.items())[:1])
     if not conditions:
         conditions, table = {"row": "row"}, {**table, "row": np.arange(1.0, len(table["configuration"]) + 1)}
     fig, grid = new_figure(len(channels), len(conditions), 2.3 * len(channels), sharex="col", sharey="row")
