@@ -179,6 +179,10 @@ class Runs:
         rows = np.flatnonzero(self.run_names == name)
         return rows[np.argsort(self["time_s"][rows], kind="stable")]
 
+    def rows_by_run(self) -> dict[str, np.ndarray]:
+        """Rows of each run in the order of time, by its name, runs in the order of the file."""
+        return {name: self.in_order(name) for name in dict.fromkeys(self.run_names.tolist())}
+
     def where(self, rows: np.ndarray) -> Runs:
         """The rows that a mask or an index selects."""
         columns, extras = ({k: v[rows] for k, v in cells.items()} for cells in (self.columns, self.extras))

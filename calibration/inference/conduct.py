@@ -35,8 +35,7 @@ def error_after_steps(runs: Runs, off: np.ndarray) -> list[Remark]:
     driven = applied_drive(runs)
     largest = max(float(np.abs(driven).max(initial=0.0)), 1e-300)
     with_step, after = np.zeros((2, len(runs)), bool)
-    for name in dict.fromkeys(runs.run_names.tolist()):
-        rows = runs.in_order(name)
+    for rows in runs.rows_by_run().values():
         stepped = np.flatnonzero(np.abs(np.diff(driven[rows])) > STEP * largest) + 1
         with_step[rows[stepped]] = True
         after[rows[np.minimum(stepped + 1, len(rows) - 1)]] = True
@@ -55,7 +54,7 @@ def error_after_steps(runs: Runs, off: np.ndarray) -> list[Remark]:
 def _time_shifts(runs: Runs, off: np.ndarray) -> list[Remark]:
     """Notes on channels whose error is mostly that of a shift in time: proportional to the simulated rate."""
     notes, time = [], runs["time_s"]
-    rows_of_runs = [runs.in_order(name) for name in dict.fromkeys(runs.run_names.tolist())]
+    rows_of_runs = list(runs.rows_by_run().values())
     for k, channel in enumerate(runs.channels):
         simulated, rate = runs.measured()[:, k] + off[:, k], np.zeros(len(runs))
         for rows in (r for r in rows_of_runs if len(r) > 1 and np.ptp(time[r]) > 0):

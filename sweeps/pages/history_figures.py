@@ -464,11 +464,10 @@ def draw_frequency_response(runs: Runs, read: Sequence[Channel], simulated: Mapp
         read: channels.
         simulated: prefixes of the simulated columns, and their names.
     """
-    table, drive = runs.columns, applied_drive(runs)
+    table, drive, rows = runs.columns, applied_drive(runs), runs.rows_by_run().values()
     fig, grid = new_figure(2, len(read), 4.4, sharex=True)
     for (gain, phase), channel in zip(grid.T, read, strict=True):
         columns = [channel.column, *(prefix + channel.column for prefix in simulated)]
-        rows = [runs.in_order(name) for name in dict.fromkeys(runs.run_names.tolist())]
         finite = [r[np.all([np.isfinite(table[c][r]) for c in columns], axis=0)] for r in rows]
         series = [
             (table["time_s"][r], drive[r], np.stack([table[c][r] for c in columns]))

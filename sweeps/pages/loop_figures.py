@@ -194,7 +194,7 @@ CURVES = 5
 def draw_input_correlation(runs: Runs, table: Columns, channels: Sequence[Channel], verdict: str) -> Figure:
     """Correlation of each residual with the input at lags of samples, over all runs, before and after."""
     fig, grid = new_figure(1, len(channels), 2.6, sharey=True)
-    rows_of_runs = [runs.in_order(name) for name in dict.fromkeys(runs.run_names.tolist())]
+    rows_of_runs = list(runs.rows_by_run().values())
     applied = applied_drive(runs)
     most = min(LAGS, min(map(len, rows_of_runs)) - 1)
     lags = np.arange(-most, most + 1)
