@@ -127,12 +127,16 @@ class Joint:
         return any(p.by for p in (*(() if self.loose else self.of("gearbox")), *self.of("track")))
 
     @property
+    def controller_states(self) -> Names:
+        """Names of the controller's states: the integral of its error, and the duty if it lags."""
+        return ("integral", "duty")[: self.robot.controller_size]
+
+    @property
     def states(self) -> Names:
         """Names of the actuator's state: current, memories, controller, motor side, and the speed one step before."""
-        controlled = ("integral", "duty")[: self.robot.controller_size]
         motor_side = ("gap", "rotor_speed") * self.loose
         memories = (p.name for p in self.remembering)
-        return ("current", *memories, *controlled, *motor_side, *(("speed",) * self.accelerates))
+        return ("current", *memories, *self.controller_states, *motor_side, *(("speed",) * self.accelerates))
 
     @property
     def steady(self) -> Joint:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import ast
 import contextlib
 import dataclasses
-import math
 import re
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
@@ -22,7 +21,7 @@ from mmrjax.errors import printable
 from mmrjax.model import quantities
 from mmrjax.model.balances import TORQUE_STEPS
 from mmrjax.model.params import Parameter
-from mmrjax.model.shaft import MESH_DAMPING, MESH_FREQUENCY
+from mmrjax.model.shaft import FLANK_DAMPING, FLANK_STIFFNESS
 from mmrjax.model.signals import Signals
 from sweeps.export.expressions import JAX, TORCH, Dialect, Symbol, lines_of, names_of
 from sweeps.export.joint import VARIABLES, Joint, Part, mean_surroundings
@@ -237,7 +236,7 @@ def step_lines(joint: Joint, library: _Library) -> list[str]:
             f"current = {library.clipped('current', 'p[' + chr(34) + 'driver.current_limit' + chr(34) + ']')}"
         )
     lines.append('memory = {"current": current}')
-    lines += [f'memory["{name}"] = {name}' for name in ("integral", "duty")[: joint.robot.controller_size]]
+    lines += [f'memory["{name}"] = {name}' for name in joint.controller_states]
     if joint.remembering:
         lines.append("# Memories: one implicit Euler step each.")
     lines += [
@@ -311,10 +310,9 @@ def _play_lines(joint: Joint, library: _Library, lost: str) -> list[str]:
     if joint.load.stiffness > 0:
         elastic = [f"stiffness, damping = {value('stiffness')}, {value('damping')}"]
     else:
-        omega = 2 * math.pi * MESH_FREQUENCY
         elastic = [
             f"reduced = inertia * {value('inertia')} / (inertia + {value('inertia')})",
-            f"stiffness, damping = {omega**2!r} * reduced, {2 * MESH_DAMPING * omega!r} * reduced  # of flanks",
+            f"stiffness, damping = {FLANK_STIFFNESS!r} * reduced, {FLANK_DAMPING!r} * reduced  # of flanks",
         ]
     lines = [
         "# Motor and load are two bodies: the torque that flanks or an elastic joint carry between them.",
@@ -368,7 +366,7 @@ def _inertia_lines(joint: Joint) -> list[str]:
     ]
 
 
-#: Inertia of the rotor at the joint.
+#: Inertia of the rotor at the output, and at the joint as the gear's efficiency lets the load see it.
 _TURNING = 'p["motor.inertia"] * p["gearbox.ratio"] ** 2'
 _ROTOR = f'{_TURNING} * p["gearbox.efficiency_load"]'
 

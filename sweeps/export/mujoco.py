@@ -19,7 +19,7 @@ from calibration.data.input_errors import BadConfiguration
 from mmrjax import __version__
 from mmrjax.errors import printable
 from mmrjax.model.chassis import inertia_reduced
-from mmrjax.model.shaft import MESH_DAMPING, MESH_FREQUENCY
+from mmrjax.model.shaft import FLANK_DAMPING, FLANK_STIFFNESS
 from sweeps.export.comparison import APPROXIMATED, DROPPED, HELD, Fate
 from sweeps.export.joint import Joint
 from sweeps.export.law_source import Constant
@@ -308,8 +308,7 @@ def _play(joint: Joint, found: Motor, name: str, at: str) -> str:
     if load.stiffness > 0:
         square, damper = float(load.stiffness) * rate, float(load.damping) * rate
     else:
-        omega = 2 * math.pi * MESH_FREQUENCY
-        square, damper = omega**2, 2 * MESH_DAMPING * omega
+        square, damper = FLANK_STIFFNESS, FLANK_DAMPING
     if load.backlash > 0:
         half = 0.5 * float(load.backlash)
         limits = f'limited="true" range="{_digits(-half, half)}" solreflimit="{_digits(-square, -damper)}" '
