@@ -257,6 +257,7 @@ KEPT = {
     ("calibration/data/effect_file.py", "_instants"): "pure: signals of the nominal robot",
     ("calibration/data/effect_file.py", "sys.modules"): "a user's module, by a name that follows from its path",
     ("calibration/data/parts.py", "packaged_motors"): "a packaged table",
+    ("calibration/data/stated.py", "_template_numbers"): "packaged files",
     ("calibration/data/parts.py", "packaged_gearboxes"): "a packaged table",
     ("calibration/data/parts.py", "packaged_cells"): "a packaged table",
     ("calibration/discovery/scales.py", "_nominal"): "pure: signals of the nominal robot",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 import re
 from importlib import resources
@@ -87,6 +88,7 @@ def example_sd(value: float, sd: float) -> float:
     return max(sd, float(f"{least:.12g}")) if sd else 0.0
 
 
+@functools.cache
 def _template_numbers() -> frozenset[tuple[str, float] | None]:
     texts = [file.read_text("utf-8") for file in resources.files("calibration.data").joinpath("rigs").iterdir()]
     return frozenset(_number_of_line(line) for text in texts for line in text.splitlines() if EXAMPLE in line) - {
