@@ -407,7 +407,7 @@ def test_track_model_runs_xla_on_one_thread_unless_told_otherwise(monkeypatch, g
         ("sweep --config grid.toml", [SOUND_AT_LEVEL_0, "--xla_cpu_multi_thread_eigen=false"]),
         ("compare --model track", [SOUND_AT_LEVEL_0, "--xla_cpu_multi_thread_eigen=false"]),
         ("sweep", [SOUND_AT_LEVEL_0]),
-        ("loop", [f"{SOUND_AT_LEVEL_0},xla_cpu_small_while_loop_byte_threshold={cli.WHOLE},{OLDER_EMITTERS}"]),
+        ("loop", [",".join((SOUND_AT_LEVEL_0, *cli.OF_LOOP))]),
         ("calibrate", [f"{SOUND_AT_LEVEL_0},{OLDER_EMITTERS}"]),
     ],
 )
