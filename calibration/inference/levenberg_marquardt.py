@@ -274,13 +274,14 @@ class OneSidedLevenbergMarquardt(optx.AbstractLeastSquaresSolver[Z, Array, Any, 
         region = _where(state.mixed & ~accepted, state.region, region)
         ended = self._is_small(state.ahead, moved, linearised, before) & accepted
 
-        along, length = before.jacobian @ moved, jnp.maximum(moved @ moved, jnp.finfo(y.dtype).tiny)
         corrected = state.slope
         if self.rough:
+            least = jnp.finfo(y.dtype).tiny
+            along, length = corrected @ moved, jnp.maximum(moved @ moved, least)
             missed = linearised.residual - before.residual - along
             near = (state.steps > 0) & (linearised.as_min() < TELLING * before.as_min())
             corrected = jnp.where(near, corrected + jnp.outer(missed, moved) / length, corrected)
-            half = jnp.minimum(region.step_size, length / jnp.maximum(along @ along, jnp.finfo(y.dtype).tiny))
+            half = jnp.minimum(region.step_size, length / jnp.maximum(along @ along, least))
             region = _where(accepted | state.mixed, region, dataclasses.replace(region, step_size=half))
         slope = jnp.where(accepted, linearised.jacobian, corrected)
         y, best, aux = _where(accepted, (state.ahead, linearised, aux), (y, state.found, state.aux))
