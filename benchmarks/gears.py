@@ -132,6 +132,16 @@ def rms(x: np.ndarray) -> float:
     return float(np.sqrt(np.mean(x**2)))
 
 
+def moving(logs: list[Log], column: str) -> np.ndarray:
+    """A column of the compared rows of all logs."""
+    return np.concatenate([getattr(log, column)[log.moves] for log in logs])
+
+
+def mean_and_error(x: np.ndarray) -> tuple[float, float]:
+    """Mean over logs and its standard error."""
+    return float(np.mean(x)), float(np.std(x, ddof=1) / np.sqrt(len(x)))
+
+
 def study(logs: list[Log], law: str) -> dict:
     """Held-out errors of each log, parameters with intervals of drawn logs, and the shapes of the whole record."""
     names = (*BASE, *LAWS[law])
@@ -178,9 +188,8 @@ def physical(x: np.ndarray) -> np.ndarray:
 
 def section(name: str, logs: list[Log]) -> str:
     """Section of the page for one record."""
-    torque = np.concatenate([log.torque[log.moves] for log in logs])
-    speed = np.concatenate([log.speed[log.moves] for log in logs])
-    whole, back = rms(np.concatenate([log.voltage[log.moves] for log in logs])), float(np.mean(torque * speed < 0))
+    torque, speed, whole = moving(logs, "torque"), moving(logs, "speed"), rms(moving(logs, "voltage"))
+    back = float(np.mean(torque * speed < 0))
     found = {law: study(logs, law) for law in LAWS}
     plain = found["Coulomb and viscous"]["errors"]
     lines = [
@@ -192,10 +201,8 @@ def section(name: str, logs: list[Log]) -> str:
         "|---|---|---|---|",
     ]
     for law, x in found.items():
-        gain = plain - x["errors"]
-        sd = float(np.std(gain, ddof=1) / np.sqrt(len(gain)))
-        mean = float(np.sqrt(np.mean(x["errors"] ** 2)))
-        less = "" if law == "Coulomb and viscous" else f"{np.mean(gain):.3f} ± {sd:.3f}"
+        (gain, sd), mean = mean_and_error(plain - x["errors"]), rms(x["errors"])
+        less = "" if law == "Coulomb and viscous" else f"{gain:.3f} ± {sd:.3f}"
         lines.append(f"| {law} | {mean:.3f} | {100 * mean / whole:.1f} | {less} |")
     lines += ["", "| law | parameter | value | 95 % interval | unit |", "|---|---|---|---|---|"]
     for law, x in found.items():
@@ -216,12 +223,9 @@ def separated(found: dict) -> str:
     """Sentences for the pairs of laws that the record tells apart, by the errors of its logs."""
     names, words = list(LAWS), []
     for a, b in itertools.pairwise(names[1:]):
-        gain = found[a]["errors"] - found[b]["errors"]
-        sd = float(np.std(gain, ddof=1) / np.sqrt(len(gain)))
-        better = b if np.mean(gain) > 0 else a
-        sure = abs(np.mean(gain)) > 2 * sd
-        answer = f"{better} predicts better" if sure else "not told apart"
-        words.append(f"* {a}, {b}: {answer} ({np.mean(gain):.3f} ± {sd:.3f} V).")
+        gain, sd = mean_and_error(found[a]["errors"] - found[b]["errors"])
+        answer = f"{b if gain > 0 else a} predicts better" if abs(gain) > 2 * sd else "not told apart"
+        words.append(f"* {a}, {b}: {answer} ({gain:.3f} ± {sd:.3f} V).")
     return "\n".join(words)
 
 
@@ -317,8 +321,7 @@ def shelf_page(name: str, logs: list[Log], paths: list[Path]) -> str:
         share=values["gear_load_loss"], limit=text["vin"], inertia=mass * length**2, weight=mass * length * GRAVITY,
     )  # fmt: skip
     between = {n: f"{short(low)} to {short(high)}" for n, (_, low, high) in found["values"].items()}
-    voltage, torque = (np.concatenate([x[log.moves] for log in logs for x in (of(log),)]) for of in (
-        lambda log: log.voltage, lambda log: log.torque))  # fmt: skip
+    voltage, torque = moving(logs, "voltage"), moving(logs, "torque")
     error = rms(found["errors"])
     ratio = np.quantile(found["drawn"][:, 1] / found["drawn"][:, 0], [0.025, 0.975])
     drive, law = actuator(robot)
