@@ -61,3 +61,27 @@ def read_table(folder, text, robot, name="log.csv"):
 def read_json(path):
     """The content of a file of JSON."""
     return json.loads(path.read_text(encoding="utf-8"))
+
+
+def motor_on_bench(torque_constant, resistance):
+    """Rig file of one motor on a bench, from which current and speed are read."""
+    return f"""
+base = "none"
+imposed = "voltage"
+channels = ["motor_current", "motor_speed"]
+sides = 1
+[motor]
+torque_constant = "{torque_constant}"
+resistance = "{resistance}"
+inductance = 0.0004
+friction_coulomb = "0.02 ± 50 %"
+friction_viscous = "3e-5 ± 100 %"
+inertia = "0.0002 ± 40 %"
+[gearbox]
+ratio = 1
+efficiency_load = "1 ± 0"
+[bench]
+load = "shaft"
+inertia = "1e-7 ± 0"
+loss_coulomb = "0 ± 0"
+"""

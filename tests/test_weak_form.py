@@ -16,30 +16,11 @@ from calibration.discovery.settings import settings_for
 from calibration.inference import shown_states, weak_form
 from calibration.inference.observers import Histories
 from mmrjax.effects import BY_NAME
-from tests.commands import csv_text, read_rig, read_table
+from tests.commands import csv_text, motor_on_bench, read_rig, read_table
 
 STEP, EVERY, RPM = 2e-4, 0.01, np.pi / 30
 TRUE = {"resistance": 0.9, "torque_constant": 0.042, "inertia": 2.4e-4}
-RIG = """
-base = "none"
-imposed = "voltage"
-channels = ["motor_current", "motor_speed"]
-sides = 1
-[motor]
-torque_constant = "0.043 ± 10 %"
-resistance = "0.8 ± 20 %"
-inductance = 0.0004
-friction_coulomb = "0.02 ± 50 %"
-friction_viscous = "3e-5 ± 100 %"
-inertia = "0.0002 ± 40 %"
-[gearbox]
-ratio = 1
-efficiency_load = "1 ± 0"
-[bench]
-load = "shaft"
-inertia = "1e-7 ± 0"
-loss_coulomb = "0 ± 0"
-"""
+RIG = motor_on_bench("0.043 ± 10 %", "0.8 ± 20 %")
 NAMES = ("churning", "stribeck_track", "torque_constant_saturation", "series_resistance", "directional_friction")
 SETTINGS = settings_for(Histories, 250)
 SD = np.array([8 * RPM, 0.03])  # of speed and current [SI]
