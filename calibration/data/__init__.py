@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, TypeAlias
 
+from mmrjax.model.quantities import Names as Names
+
 if TYPE_CHECKING:
     import numpy as np
 
-#: Names in order, such as those of effects or columns.
-Names: TypeAlias = tuple[str, ...]
 #: A table: arrays of the same length by column.
 Columns: TypeAlias = "dict[str, np.ndarray]"
 #: Content of a JSON object.

@@ -78,13 +78,13 @@ def stated_count(value: Any, where: str, low: int, high: int) -> int:
 
 
 def stated_word(value: Any, known: Iterable[str], where: str, wrong: str = "") -> str:
-    """A word of a file or of an argument, one of those that are known.
+    """Checks a word of a file or of an argument against the known ones, and returns it.
 
     Args:
-        wrong: what another word is not. Empty: the message has the word.
+        wrong: beginning of the message for an unknown word. Empty: the message quotes the word.
 
     Raises:
-        BadConfiguration: another word. The message lists the nearest ones.
+        BadConfiguration: an unknown word. The message lists the nearest ones.
     """
     if value not in known:
         raise BadConfiguration(f"{where}: {wrong or f'got {value}'}; {allowed_words(str(value), known)}")

@@ -47,11 +47,11 @@ class Defect:
 
 
 def defect_by_row(linear: Linearization, place: str) -> Defect:
-    """Error of one balance equation in each row, by least squares beside the free parameters.
+    """Error of one balance equation in each row, by least squares that also refits the free parameters.
 
-    δ_i = -(r_i·e) / ‖r_i‖² with the sd 1/‖r_i‖, where r_i = (I - P) g_i, e are the residuals, and g_i is the change
-    of all readings per unit error of the equation in row i. In time histories the error is largest at that instant
-    and falls to zero at the neighbouring knots. Rows between knots are NaN.
+    δ_i = -(r_i·e) / ‖r_i‖² with the sd 1/‖r_i‖ and r_i = (I - P) g_i. The residuals are e. All readings change by g_i
+    per unit error of the equation in row i. In time histories the error is largest at that instant and falls to zero
+    at the neighbouring knots. Rows between knots are NaN.
     """
     places = linear.places()
     shapes = np.zeros((linear.rows, len(places)))

@@ -137,8 +137,8 @@ def first_instant(robot: Robot, conditions: Conditions) -> tuple[Conditions, Unk
 class LinearisedRun(eqx.Module):
     """A solved run and its equations linearised along it: the response of the run to a change of its rates.
 
-    The change at the end of a step has three parts: `carries` times the change before the step, `gains` times the
-    change of the rates at each stage, and `lags` times the change of the current's rates at its start.
+    The change at the end of a step has three parts. `carries` multiplies the change before the step, `gains` the
+    change of the rates at each stage, and `lags` the change of the current's rates at its start.
 
     Attributes:
         begins, ends: unknowns at the beginning and end of every step, shape (steps, unknowns).
@@ -240,7 +240,7 @@ def _lag(
     step: RunStep,
     current: Scalar,
     limit: Scalar,
-    parts: Float[Array, " 2"],
+    parts: Pair,
     wait: Scalar = 0.0,
 ) -> Lag:
     """Lag of a step after the last jump, from the rates at its start: the remainder of its decay.
@@ -258,7 +258,7 @@ def _lag(
     return _decaying(jnp.where(follows, left, 0.0), decay, parts, wait)
 
 
-def _decaying(begin: Array, decay: Array, parts: Float[Array, " 2"], wait: Scalar = 0.0) -> Lag:
+def _decaying(begin: Array, decay: Array, parts: Pair, wait: Scalar = 0.0) -> Lag:
     """Lag in two parts of a step [s], from its value at the start. `wait` lies between them [s]."""
     second = parts[0] + wait
     currents = begin * jnp.exp(-decay * jnp.stack([jnp.zeros(()), second]))

@@ -14,7 +14,7 @@ import re
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
-#: Words in order.
+#: Names in order, such as those of effects or columns.
 Names = tuple[str, ...]
 
 DEG = math.pi / 180  # rad
