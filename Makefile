@@ -17,7 +17,7 @@ demo: $(READY)
 PYTEST := $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder --durations=10 --durations-min=2
 # The compiler's older emitters, and few of its optimizations: a program compiles faster and runs slower, which short
 # tests don't feel. Level 0 needs mmrjax.SOUND_AT_LEVEL_0 and brings these tests nothing more.
-QUICK := XLA_FLAGS="--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=1 --xla_cpu_parallel_codegen_split_count=1"
+QUICK := XLA_FLAGS="--xla_backend_extra_options=xla_cpu_disable_new_fusion_emitters=true --xla_backend_optimization_level=1 --xla_cpu_parallel_codegen_split_count=1"
 
 # The checks of `lint` beside them: they need one core of two.
 test: $(TOOLS)
@@ -80,8 +80,10 @@ gallery: $(TOOLS)
 	$(BIN)/mmrjax check --out runs/gallery/check --force
 	$(BIN)/mmrjax size --out runs/gallery/size --force
 	$(BIN)/mmrjax sensitivity --outputs total_current,slip --out runs/gallery/sensitivity --force
+	$(BIN)/mmrjax loop docs/rigs/public/neo_dyno.csv --robot docs/rigs/public/neo_dyno.toml --out runs/gallery/neo_dyno --force
+	$(BIN)/mmrjax loop docs/rigs/public/odrive.csv --robot docs/rigs/public/odrive.toml --out runs/gallery/odrive --force
 	$(BIN)/python docs/site.py runs/gallery/loop
-	$(BIN)/python docs/gallery/make.py $(foreach page,loop run sweep mission check size sensitivity,$(page)=runs/gallery/$(page))
+	$(BIN)/python docs/gallery/make.py $(foreach page,loop run sweep mission check size sensitivity neo_dyno odrive,$(page)=runs/gallery/$(page))
 
 clean:
 	rm -rf $(VENV) runs site

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import functools
 import json
 import os
 import re
@@ -40,7 +39,7 @@ LINT = {
 OUTCOMES = ("passed", "failed", "skipped")
 #: Flags of `make test`: programs compile faster and run slower.
 FLAGS = (
-    "--xla_cpu_use_fusion_emitters=false",
+    "--xla_backend_extra_options=xla_cpu_disable_new_fusion_emitters=true",
     "--xla_backend_optimization_level=1",
     "--xla_cpu_parallel_codegen_split_count=1",
 )
@@ -130,22 +129,11 @@ def commands(tier: str, options: argparse.Namespace) -> dict[str, list[str]]:
     return {tier: [python, "-m", "pytest", *words]}
 
 
-@functools.cache
-def known_flags(python: str, *flags: str) -> str:
-    """Those of the flags that this version of XLA accepts. XLA aborts each process that is given another one."""
-
-    def accepted(flag: str) -> bool:
-        command = [python, "-c", "import jax; jax.devices()"]
-        return not subprocess.run(command, env={**os.environ, "XLA_FLAGS": flag}, capture_output=True).returncode
-
-    return " ".join(filter(accepted, flags))
-
-
 def environment(python: str, log: Path, done: Path) -> dict[str, str]:
     """Environment of a tier: this tree's packages first, fast compilation, and where tests are logged."""
     path = os.pathsep.join([str(ROOT), str(ROOT / "benchmarks"), *filter(None, [os.environ.get("PYTHONPATH")])])
     return {
-        "XLA_FLAGS": known_flags(python, *FLAGS),
+        "XLA_FLAGS": " ".join(FLAGS),
         **os.environ,
         "PYTHONPATH": path,
         "PYTHONDONTWRITEBYTECODE": "",  # tests start processes, which would compile all modules again

@@ -30,9 +30,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from everything import known_flags
-
 from calibration.data.input_errors import is_number
+from mmrjax import OLDER_EMITTERS
 
 RECORD = Path(__file__).resolve().parents[1] / "tests" / "record" / "commands"
 ROBOTINO = Path(__file__).resolve().parents[1] / "docs" / "rigs" / "robotino"
@@ -274,7 +273,7 @@ def with_needed(names: list[str]) -> list[str]:
 
 def main() -> int:
     # Compiled by the older emitters, in half of the time; traced, because programs on disk may be of another source.
-    os.environ.setdefault("XLA_FLAGS", known_flags(sys.executable, "--xla_cpu_use_fusion_emitters=false"))
+    os.environ.setdefault("XLA_FLAGS", f"--xla_backend_extra_options={OLDER_EMITTERS}")
     os.environ["MMRJAX_PROGRAMS"] = ""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     what = parser.add_mutually_exclusive_group(required=True)

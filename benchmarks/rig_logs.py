@@ -11,7 +11,8 @@ Logs come from `tests/worlds/logs.py`, which shares no code with the simulator: 
 states. The loop reads only `rig.toml` and `table.csv`. Only the scorer reads the labels. Every log is one line
 of `--out`, and a restarted campaign continues where it ended. With `--brief` there is no
 hold-out. In the stratum `varied` half of the tables have no sds, a quarter of the logs show an angle alone and a
-quarter have coarse instruments, and effects of the library leave 5 σ.
+quarter have coarse instruments, and effects of the library leave 5 σ. In the stratum `servo` the goal of a controller
+is imposed and a 12-bit encoder shows the angle at 50 or 100 Hz.
 """
 
 from __future__ import annotations
@@ -40,19 +41,22 @@ TRIES = 6
 TENTH = 0.1
 
 
-def inputs(seed: int) -> tuple[str, float]:
+def inputs(seed: int, servo: bool = False) -> tuple[str, float]:
     """Imposed quantity and sampling interval [s], in turn. Each step occurs with each effect."""
+    if servo:
+        return logs.GOAL, logs.EVERY[1 + seed % 2]
     turn = seed // len(logs.IMPOSED)
     return logs.IMPOSED[seed % len(logs.IMPOSED)], logs.EVERY[(turn + turn // 9) % len(logs.EVERY)]
 
 
 @functools.lru_cache(maxsize=2)
-def attempt(kind: str, seed: int, varied: bool = False) -> logs.Case | str:
-    """The case of a kind and a seed, or the reason why it is invalid. `varied` as the stratum."""
+def attempt(kind: str, seed: int, stratum: str = "") -> logs.Case | str:
+    """The case of a kind and a seed, or the reason why it is invalid."""
+    varied, servo = stratum == "varied", stratum == "servo"
     rng = np.random.default_rng([41, KINDS.index(kind), seed])
-    imposed, every = inputs(seed)
+    imposed, every = inputs(seed, servo)
     turn = seed // 2 % 4 if varied else 0
-    made = functools.partial(logs.rig, rng, imposed, every, alone=turn == 1, coarse=turn == 3)
+    made = functools.partial(logs.rig, rng, imposed, every, alone=turn == 1, coarse=servo or turn == 3)
     stated, sigmas = not varied or seed % 2 == 0, (VARIED if varied else SIGMAS)
     if kind == "clean":
         return logs.case(made(), "", 0.0, seed, stated=stated)
@@ -67,7 +71,7 @@ def attempt(kind: str, seed: int, varied: bool = False) -> logs.Case | str:
 
 def work(task: Task) -> dict:
     """Makes a log, runs the loop on it and scores it against its label."""
-    case = attempt(task.kind, task.seed, task.stratum == "varied")
+    case = attempt(task.kind, task.seed, task.stratum)
     if isinstance(case, str):
         return {"skipped": case}
     given, found, line = looped(case, task)
@@ -117,7 +121,7 @@ def held_out(whole, case: logs.Case) -> dict:
 
 def program(task: Task) -> tuple[str, float, bool]:
     """Properties that logs with the same programs share: what is imposed, the sampling interval, an angle alone."""
-    return *inputs(task.seed), task.stratum == "varied" and task.seed // 2 % 4 == 1
+    return *inputs(task.seed, task.stratum == "servo"), task.stratum == "varied" and task.seed // 2 % 4 == 1
 
 
 def summary(lines: list[dict]) -> list[str]:
@@ -134,7 +138,7 @@ def summary(lines: list[dict]) -> list[str]:
     f.say("  unnamed in the right equation", outside, scores.placed)
     f.say("  nothing found", outside, lambda x: x["verdict"] == "none")
     every = f.of(*KINDS)
-    for imposed in logs.IMPOSED:
+    for imposed in (*logs.IMPOSED, logs.GOAL):
         some = [x for x in every if x["made"]["imposed"] == imposed]
         f.say(f"  {imposed}: clean without a finding, library right, outside without a name", some, right)
     for name in ("alone", "coarse", "stated"):
@@ -149,6 +153,8 @@ def summary(lines: list[dict]) -> list[str]:
     f.say("held out within a tenth of least squares with the true term (goal >= 90 %)", compared,
           lambda x: x["held_out"]["found"] <= (1 + TENTH) * x["held_out"]["own_with_term"])  # fmt: skip
     f.say("  without it", compared, lambda x: x["held_out"]["found"] <= (1 + TENTH) * x["held_out"]["own"])
+    servos = [x for x in compared if x["made"]["imposed"] == logs.GOAL]
+    f.say("servos: angle held out within 1.2 of the noise", servos, lambda x: x["held_out"]["found"] <= 1.2)
     late = [x for x in every if x.get("delay")]
     f.say("delay within 3 of its sds", late, lambda x: abs(x["delay"][0] - x["made"]["delay"]) < 3 * x["delay"][1])
     asked, otherwise = (sum((x.get("screened") or (0, 0))[k] for x in every) for k in (0, 1))

@@ -341,8 +341,7 @@ def _scaled(columns: Sequence[np.ndarray]) -> list[np.ndarray]:
 def _before(runs: Any, x: np.ndarray, back: int) -> np.ndarray:
     """A column shifted by `back` rows within the run of each row. Before that the run's first row."""
     found = np.empty_like(x)
-    for name in dict.fromkeys(runs.run_names.tolist()):
-        rows = runs.in_order(name)
+    for rows in runs.rows_by_run().values():
         found[rows] = x[rows[np.maximum(np.arange(len(rows)) - back, 0)]]
     return found
 

@@ -44,12 +44,6 @@ def test_every_script_is_imported_or_prints_its_help(unchanged, monkeypatch):
         assert not end.value.code and shown.getvalue().startswith("usage:"), script.name
 
 
-def test_flags_that_xla_does_not_know_are_left_out():
-    known = importlib.import_module("everything").known_flags
-    fast = "--xla_backend_optimization_level=1"
-    assert known(sys.executable, "--xla_no_such_flag=1", fast) == fast
-
-
 def test_a_killed_tier_counts_what_has_finished(tmp_path):
     everything, log = importlib.import_module("everything"), tmp_path / "quick.jsonl"
     assert everything.summary("quick", log)["state"] == "not run"
@@ -86,6 +80,7 @@ SMALL = {
     "emps.py": None,  # needs the record, which is not in the project
     "fastsim_comparison.py": None,  # benchmarks/test_fastsim_comparison.py
     "free_chain.py": None,  # a chain of 168 masses takes half a minute
+    "gears.py": None,  # needs the logs, which are not in the project
     "head_to_head.py": "--quick --out lines.jsonl",
     "loop.py": _ONE,
     "loop_baselines.py": None,  # PySINDy, of the extra bench

@@ -30,5 +30,6 @@ if TYPE_CHECKING:
     from sweeps.export.drive_export import export as export
 
 __version__: str
+OLDER_EMITTERS: str
 SOUND_AT_LEVEL_0: str
 WORKER: str

@@ -19,7 +19,7 @@ import typer
 
 from calibration.data import Names
 from calibration.data.input_errors import BadConfiguration, InputError
-from mmrjax import SOUND_AT_LEVEL_0, WORKER, __version__, fidelities
+from mmrjax import OLDER_EMITTERS, SOUND_AT_LEVEL_0, WORKER, __version__, fidelities
 from mmrjax.errors import printable, shorten
 from sweeps import config, config_campaign
 from sweeps import options as made
@@ -518,13 +518,15 @@ def _prepare(resolved: Any, no_cache: bool = False) -> None:
     """
     model = getattr(resolved, "model", None)  # None: of a calibration, whose data decide
     one_thread = model is not None and fidelities.fidelity_facts(model).one_thread
-    options = (f"xla_cpu_small_while_loop_byte_threshold={WHOLE}",) * isinstance(resolved, config.Loop)
+    options = (
+        OF_LOOP if isinstance(resolved, config.Loop) else (OLDER_EMITTERS,) * isinstance(resolved, config.Calibrate)
+    )
     _start_jax(no_cache, ("--xla_cpu_multi_thread_eigen=false",) * one_thread, options)
 
 
-#: Up to how many bytes a loop within a program of `loop` is compiled as one function [bytes]. In another one each
-#: turn hands some hundred operations to the executor, which is most of the time of a run over time.
-WHOLE = 1_000_000
+#: Options of the compiler for `loop`. A loop within a program is compiled as one function up to this size [bytes]. In
+#: another one each turn hands some hundred operations to the executor, which is most of the time of a run over time.
+OF_LOOP = ("xla_cpu_small_while_loop_byte_threshold=1000000", OLDER_EMITTERS)
 
 
 def _start_jax(no_cache: bool, flags: Names = (), options: Names = ()) -> None:

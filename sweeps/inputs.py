@@ -20,7 +20,7 @@ from mmrjax.model.paper_tables import BENCH, SURFACES
 from mmrjax.model.quantities import RPM
 from mmrjax.model.robot import Robot, turn_error
 from sweeps import capabilities, store
-from sweeps.config import Calibrate, Compare, FidelityPart, GivenRuns, Loop, OneRun, RobotPart, Simulate
+from sweeps.config import Calibrate, Compare, Export, FidelityPart, GivenRuns, Loop, OneRun, RobotPart, Simulate
 from sweeps.console import print_message
 from sweeps.options import options_of_fields
 from sweeps.points import imposed
@@ -41,10 +41,12 @@ def load_robot(config: RobotPart) -> RobotFile:
     notes: list[str] = []
     file = robot_file.find_robot_file(config.robot, effect_file.effect_library(config.effects), notes)
     robot = robot_file.change_robot(file.robot, config.set, where="--set", notes=notes)
-    if robot.rig.follows_goal and not (type(config) is RobotPart or isinstance(config, Calibrate | Compare | Loop)):
+    if robot.rig.follows_goal and not (
+        type(config) is RobotPart or isinstance(config, Calibrate | Compare | Export | Loop)
+    ):
         raise BadConfiguration(
             f"--robot {file.name}: its controller follows a goal over time; expected calibrate, compare, loop or rig "
-            "check with a log, or mmrjax.simulate in Python"
+            "check with a log, export, or mmrjax.simulate in Python"
         )
     unlike = () if getattr(config, "turns", False) else _unlike(file.name, robot)
     examples = list_some(stated.example_numbers(file.text))

@@ -21,6 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from worlds import servo
 
 import mmrjax as mm
 from calibration.data import posterior_file, robot_file
@@ -28,6 +29,7 @@ from calibration.data.input_errors import BadConfiguration, BadData
 from calibration.inference import priors
 from calibration.inference.identifiability import posterior_of_coordinates
 from mmrjax import effects
+from mmrjax.fidelities.drive import drive_batch
 from mmrjax.model import balances, paper_robots, params
 from mmrjax.model.signals import Signals
 from sweeps.commands import rig_new
@@ -688,3 +690,92 @@ def test_symbols_fold_numbers_and_keep_the_order_of_operations():
     assert text == ["    x1 = a - (b - 2.0)", "    return x1 * x1"]
     with pytest.raises(BadConfiguration, match="mine: its equation uses"):
         expressions.trace_function(lambda x: jnp.sort(jnp.stack([x, 1.0]))[0], ["x"], "mine")
+
+
+#: Servos and drives whose load turns apart: text of the file, the control, and the allowed error of the angle [rad] in
+#: MuJoCo C and of the law in JAX. Angles reach 0.5 rad with a goal, 2.3 rad with a voltage.
+VOLTS = (
+    servo.RIG.format(**servo.TRUE)
+    .replace('imposed = "goal_angle"', 'imposed = "voltage"')
+    .replace("[controller]", "[motor]")
+)
+VOLTS = re.sub(r"(?s)\[motor\].*?\[motor\]", "[motor]", VOLTS)
+APART = {
+    "servo": (servo.RIG.format(**servo.TRUE), 5e-4, 4e-4),
+    "servo with an integral and a lag": (
+        servo.RIG.format(**servo.TRUE | {"ki": 20.0}).replace("kp =", "lag = 0.005\nkp ="), None, 3e-4),
+    "play": (VOLTS.replace("efficiency_load = 1.0", "efficiency_load = 0.7") + "backlash = 0.03\n", 6e-3, 2e-3),
+    "elastic joint": (VOLTS + "stiffness = 12.0\ndamping = 0.02\n", 1e-3, 4e-4),
+    "elastic joint with play": (VOLTS + "stiffness = 12.0\ndamping = 0.02\nbacklash = 0.03\n", 1e-3, 1e-3),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.quick(1)) for n in APART])
+def test_exported_servo_and_play_move_as_the_drive(name, rig):
+    """A start from rest under one goal or voltage: MJCF in MuJoCo C, and the law in JAX beside a simulator's steps."""
+    text, in_mujoco, in_jax = APART[name]
+    rig.write_text(text)
+    file = robot_file.find_robot_file(str(rig))
+    drive, goal = joints.joint_of_robot(file), "servo" in name
+    command, times = 0.5 if goal else 6.0, np.linspace(0, 0.5, 26)
+    given = {"voltage": 7.4, "goal": command} if goal else {"voltage": command}
+    run = drive_batch(file.robot, jax.tree.map(lambda x: jnp.asarray(x, float)[None], mm.Conditions(**given)), times, 1e-8, 20_000)  # fmt: skip
+    native = np.asarray(run.signals.angle[0])
+    if in_mujoco is not None:
+        angles = mujoco.angles_in_mujoco(xml_of(rig), command * (200 if goal else 1), times, 1e-4)
+        assert np.abs(angles - native).max() < in_mujoco
+    module = law_source.module_from_source(law_source.jax_source(drive, law_source.constants_of(drive, None, None)))
+    inertia, step = float(drive.load.inertia) + float(module.armature(module.PARAMS)), 5e-5
+
+    def advance(at, _):
+        state, speed, angle = at
+        torque, state, _ = module.actuator(module.PARAMS, state, command, angle, speed, step)
+        speed = speed + step * torque / inertia
+        return (state, speed, angle + step * speed), angle
+
+    angles = jax.lax.scan(advance, (module.initial_state(), 0.0, 0.0), None, length=10_001)[1]
+    assert np.abs(np.asarray(angles)[::400] - native).max() < in_jax
+
+
+def test_stated_fate_of_a_controller_and_of_play_is_by_format(rig):
+    rig.write_text(APART["servo with an integral and a lag"][0] + "backlash = 0.03\n")
+    drive = joints.joint_of_robot(robot_file.find_robot_file(str(rig)))
+    known = law_source.constants_of(drive, None, None)
+    verdicts = [
+        {f.name: f for f in fates}
+        for fates in (mujoco.fates_in_mujoco(drive, 0.0), jax_actuator.fates_in_actuator(drive), feed_forward.fates_in_tables(drive, known))
+    ]  # fmt: skip
+    held, near, lost = comparison.HELD, comparison.APPROXIMATED, comparison.DROPPED
+    assert [v[mujoco.PLAY].verdict for v in verdicts] == [held, held, lost]
+    assert [v[mujoco.CONTROLLER].verdict for v in verdicts] == [near, held, lost]
+    assert "lag of 0.005 s is dropped" in verdicts[0][mujoco.CONTROLLER].how
+    assert "0.03 rad of play" in verdicts[2][mujoco.PLAY].how
+    rig.write_text(rig.read_text().replace("supply_voltage = 7.4", ""))
+    with pytest.raises(BadConfiguration, match=r"controller.supply_voltage: missing, and an exported controller"):
+        joints.joint_of_robot(robot_file.find_robot_file(str(rig)))
+
+
+def test_mjlab_actuator_of_a_servo_with_play_is_that_of_jax(monkeypatch, rig):
+    stand_in(monkeypatch)
+    rig.write_text(APART["servo with an integral and a lag"][0] + "backlash = 0.03\n")
+    drive = joints.joint_of_robot(robot_file.find_robot_file(str(rig)))
+    known = law_source.constants_of(drive, None, None)
+    ours, theirs = (
+        law_source.module_from_source(f(drive, known)) for f in (law_source.jax_source, law_source.torch_source)
+    )
+    states, angle, speed = (
+        [ours.initial_state((3,)), theirs.initial_state((3,))],
+        np.array([0.0, 0.1, -0.2]),
+        np.zeros(3),
+    )
+    for _ in range(40):
+        torques = []
+        for k, module in enumerate((ours, theirs)):
+            torque, states[k], _ = module.actuator(
+                module.PARAMS, states[k], np.array([1.0, -0.5, 0.3]), angle, speed, 2e-3
+            )
+            torques.append(np.asarray(torque))
+        assert_allclose(torques[0], torques[1], rtol=1e-9, atol=1e-12)
+        speed = speed + 2e-3 * torques[0] / float(drive.load.inertia)
+        angle = angle + 2e-3 * speed
+    assert np.abs(torques[0]).max() > 0.01

@@ -150,6 +150,41 @@ def test_a_shaft_turns_through_rest_and_is_held_there_at_its_very_moment(tmp_pat
     assert np.abs(slope - expected).max() < 0.02 * np.abs(expected).max()
 
 
+def test_derivatives_are_those_of_the_steps_where_a_lagging_current_stops_a_shaft_and_starts_it(tmp_path):
+    """A carriage under a position controller: the current passes the dry friction every tenth of a second, within
+    steps of 1 ms, and lags by 0.3 ms. Where a level is just above the friction, the shaft creeps."""
+    robot = params.replace(read_rig(tmp_path, RIG), {"motor.inductance": 3e-4, "motor.resistance": 1.0})
+    times = np.arange(0.0, 1.2, 1e-3)
+    current = np.round(1.2 * np.sin(2 * np.pi * 3.1 * times) + 0.25 * np.sin(2 * np.pi * 41 * times), 2)
+
+    @jax.jit
+    def ours(values):
+        changed = params.replace(robot, {"bench.loss_coulomb": values[0], "bench.inertia": values[1]})
+        found = integrator.history_signals(
+            changed, Conditions(motor_current=jnp.asarray(current)), jnp.asarray(times)
+        )
+        return found.speed_motor
+
+    at = np.array([DRY, INERTIA])
+    slope, shown = np.asarray(jax.jit(jax.jacfwd(ours))(at)), np.asarray(ours(at))
+    moves = np.diff(np.sign(shown)) != 0
+    assert moves.sum() > 12 and (shown == 0).sum() > 50
+    for k, change in enumerate(np.diag(1e-7 * at)):
+        steps = np.asarray(ours(at + change) - ours(at - change)) / (2 * change[k])
+        assert np.abs(slope[:, k] - steps).max() < 2e-3 * np.abs(steps).max()
+
+
+@pytest.mark.parametrize("excess", [1e-3, 1e-5])
+def test_a_current_just_above_the_friction_hardly_turns_a_shaft(robot, excess):
+    """It leaves rest when the lagging current exceeds the friction, and moves by the excess alone."""
+    robot = params.replace(robot, {"motor.inductance": 1e-3, "motor.resistance": 1.0})
+    level = DRY * (1 + excess) / (RATIO * ETA * K)
+    times = jnp.arange(0.0, 0.05, 2.5e-3)
+    found = integrator.history_signals(robot, Conditions(motor_current=jnp.full(times.shape, level)), times)
+    speed, most = np.asarray(found.speed_motor), RATIO * DRY * excess / (INERTIA + ETA * ROTOR * RATIO**2) * 0.05
+    assert 0.5 * most < speed[-1] < most
+
+
 def log(tmp_path, robot, noise, dry=DRY):
     """A table over time of two runs at currents that step, with readings of the law itself."""
     rng = np.random.default_rng(2)

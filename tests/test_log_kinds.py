@@ -5,6 +5,7 @@ import pytest
 
 from calibration.data import robot_file, settling
 from calibration.data import runs as records
+from calibration.data.stated import EXAMPLE
 from calibration.data.thinning import thin_rows
 from calibration.inference import bases, observers
 from calibration.inference.preparation import prepare
@@ -15,8 +16,8 @@ STEP = 1e-4  # of the simulation [s]
 
 
 def written(tmp_path, kind, columns):
-    """A file of `rig new` and a log of these columns beside it."""
-    (tmp_path / "rig.toml").write_text(rig_new.rig_template(kind), encoding="utf-8")
+    """A file of `rig new` and a log of these columns beside it. The template's numbers are those of the log."""
+    (tmp_path / "rig.toml").write_text(rig_new.rig_template(kind).replace(EXAMPLE, "measured"), encoding="utf-8")
     lines = [",".join(columns), *(",".join(f"{x:.9g}" for x in row) for row in zip(*columns.values(), strict=True))]
     (tmp_path / "log.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
     return robot_file.read_robot(tmp_path / "rig.toml")

@@ -535,9 +535,12 @@ def test_rival_searches_end_where_three_agree_unless_one_is_lower():
 def test_a_rival_that_promises_much_and_brings_nothing_ends():
     """Member 0 is at its optimum of 2. The slopes of member 1 promise a fall from 2000 that does not come."""
     slopes = np.array([[[1.0], [0.0], [1e-3]], [[-40.0], [0.0], [1e-3]]])
+    wall = lambda x: 4000**0.5 * (1 if x == 0 else 3)  # noqa: E731  # too high to correct the slope
 
     def evaluate(z, members):
-        r = np.stack([[z[k, 0], 2.0, 1e-3 * z[k, 0]] if m == 0 else [4000**0.5, 0, 0] for k, m in enumerate(members)])
+        r = np.stack(
+            [[z[k, 0], 2.0, 1e-3 * z[k, 0]] if m == 0 else [wall(z[k, 0]), 0, 0] for k, m in enumerate(members)]
+        )
         return r, slopes[members], members
 
     one = jnp.ones((1, 2))

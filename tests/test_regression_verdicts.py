@@ -10,28 +10,10 @@ from calibration.discovery.settings import settings_for
 from calibration.inference.observers import Histories
 from calibration.words import loop_words
 from mmrjax.effects import BY_NAME
+from tests.commands import motor_on_bench
 
 STEP, EVERY, ROWS, RPM = 2e-4, 0.01, 200, np.pi / 30
-RIG = """
-base = "none"
-imposed = "voltage"
-channels = ["motor_current", "motor_speed"]
-sides = 1
-[motor]
-torque_constant = "0.042 ± 0.5 %"
-resistance = "0.9 ± 1 %"
-inductance = 0.0004
-friction_coulomb = "0.02 ± 50 %"
-friction_viscous = "3e-5 ± 100 %"
-inertia = "0.0002 ± 40 %"
-[gearbox]
-ratio = 1
-efficiency_load = "1 ± 0"
-[bench]
-load = "shaft"
-inertia = "1e-7 ± 0"
-loss_coulomb = "0 ± 0"
-"""
+RIG = motor_on_bench("0.042 ± 0.5 %", "0.9 ± 1 %")
 NAMES = (
     "encoder_scale", "supply_sag", "brush_drop", "directional_friction", "torque_offset", "torque_constant_saturation",
     "stick_slip", "stribeck_track", "churning",

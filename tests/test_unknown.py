@@ -174,7 +174,9 @@ def test_a_store_of_what_is_unknown_is_refused_unless_it_varies(tmp_path, varied
     config = Campaign(axes={"motor_speed": [100.0, 200.0], **varied}, outputs=("power_supply",), chunk=4)
     plan = axes.plan_design(config, robot, "map.toml")
     if refused:
-        with pytest.raises(BadConfiguration, match=r"power_supply is not known, as .* state motor\.resistance$"):
+        with pytest.raises(
+            BadConfiguration, match=r"power_supply cannot be computed, as .* lacks motor\.resistance$"
+        ):
             prepare_job(config, robot, plan, "map.toml")
     else:
         assert prepare_job(config, robot, plan, "map.toml").outputs == ("power_supply",)

@@ -87,12 +87,14 @@ def inspect_source(source: str | Path | Any) -> Contents:
     """
     contents_found = _source(source)
     times: dict[int, tuple[np.ndarray, str] | str] = {}
-    table = _clock_of_table(contents_found)
+    clocks = {id(s.clock) for s in contents_found.signals if s.clock is not None}
+    named = (s for s in contents_found.signals if not (s.words or s.refused) and _unit_of_time(s.name) is not None)
+    table = None if clocks else next(named, None)  # the signal of a table that is its time
+    clock = None if table is None else Clock(table.path, table.load, _unit_of_time(table.name) or "")
     facts = tuple(
-        _facts(signal, signal.clock or (None if signal is table else _clock(table)), times)
+        _facts(signal, signal.clock or (None if signal is table else clock), times)
         for signal in contents_found.signals
     )
-    clocks = {id(s.clock) for s in contents_found.signals if s.clock is not None}
     notes = list(contents_found.notes)
     for signal in contents_found.signals:
         time = times.get(id(signal.clock)) if signal.clock is not None else None
@@ -137,20 +139,6 @@ def _of_text(arrays: NamedArrays) -> Source:
         unit = arrays.units[k] if arrays.units else ""
         signals.append(Signal(name, len(values), values_in_memory(loaded), unit, words=words))
     return Source(arrays.name, "a text file", tuple(signals), arrays.digest, arrays.notes)
-
-
-def _clock_of_table(source: Source) -> Signal | None:
-    """The signal of a table that is its time, by its name."""
-    if any(s.clock is not None for s in source.signals):
-        return None
-    return next(
-        (s for s in source.signals if _unit_of_time(s.name) is not None and not s.words and not s.refused), None
-    )
-
-
-def _clock(signal: Signal | None) -> Clock | None:
-    unit = None if signal is None else _unit_of_time(signal.name)
-    return None if signal is None else Clock(signal.path, signal.load, unit or "")
 
 
 def _unit_of_time(name: str) -> str | None:

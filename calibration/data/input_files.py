@@ -59,11 +59,11 @@ def first_bytes(path: Path, where: str | Path, kind: type[InputError] = BadData,
     """Returns the first bytes of a regular file of any size.
 
     Args:
-        where: opens the message of an error.
-        kind: of the error.
+        where: beginning of the error message.
+        kind: class of the exception.
 
     Raises:
-        InputError: as `file_bytes`.
+        InputError: for the same reasons as in `file_bytes`.
     """
     with _opened(path, where, kind) as stream:
         return stream.read(length)

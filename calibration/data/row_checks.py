@@ -26,7 +26,6 @@ from calibration.data.table import driven_on
 from mmrjax.model import channels
 from mmrjax.model.channels import Channel
 from mmrjax.model.quantities import VOLTAGE
-from mmrjax.model.rig import Instrument
 from mmrjax.model.robot import Load, Robot
 
 #: Least rows between two readings of a slow sensor, and least number of its readings.
@@ -113,10 +112,25 @@ def complete_columns(name: str, columns: Columns, rows: int, layout: Layout) -> 
     """Fills columns that a table may leave out, and refuses values that contradict each other."""
     _fill(name, columns, rows, layout)
     _check_driving(name, columns)
-    _check_held(name, columns)
+    held = columns.get("held", np.zeros(1)) > 0.5
+    for row in np.flatnonzero(held & (columns.get(LOAD, 0.0) != 0))[:1]:
+        raise BadData(
+            f"{name} row {row + 1}, {LOAD}: got {columns[LOAD][row]:g} where held is 1; expected 0, as the "
+            "torque that a clamp carries is a reading: name its column output_torque"
+        )
     _check_sides(name, columns, layout)
-    _check_mass(name, columns)
-    _check_deviations(name, columns, layout.channels)
+    if "total_mass_kg" in columns:
+        total, payload = columns["total_mass_kg"], columns["payload_kg"]
+        for row in np.flatnonzero(total <= payload)[:1]:
+            raise BadData(too_light(f"{name} row {row + 1}", total[row], payload[row]))
+    for channel in layout.channels:
+        if channel.column in columns and channel.sd_column in columns:
+            lost = np.isfinite(columns[channel.column]) & ~np.isfinite(columns[channel.sd_column])
+            if lost.any():
+                raise BadData(
+                    f"{name} row {int(np.flatnonzero(lost)[0]) + 1}, {channel.sd_column}: got an empty cell next "
+                    f"to a reading; expected its sd, more than 0 {channel.unit}"
+                )
 
 
 def without_copies(name: str, columns: Columns) -> tuple[np.ndarray, Names]:
@@ -194,16 +208,6 @@ def _check_sides(name: str, columns: Columns, layout: Layout) -> None:
         )
 
 
-def _check_held(name: str, columns: Columns) -> None:
-    """Refuses a load torque in rows of a clamp: what it carries is a reading."""
-    held = columns.get("held", np.zeros(1)) > 0.5
-    for row in np.flatnonzero(held & (columns.get(LOAD, 0.0) != 0))[:1]:
-        raise BadData(
-            f"{name} row {row + 1}, {LOAD}: got {columns[LOAD][row]:g} where held is 1; expected 0, as the "
-            "torque that a clamp carries is a reading: name its column output_torque"
-        )
-
-
 def without_clamped(name: str, columns: Columns, kept: np.ndarray) -> tuple[Columns, np.ndarray, Names]:
     """Returns the kept rows of a log without those of a clamp, True for these rows, and a sentence on the others.
 
@@ -224,28 +228,9 @@ def without_clamped(name: str, columns: Columns, kept: np.ndarray) -> tuple[Colu
     return {c: values[kept] for c, values in columns.items()}, kept, note
 
 
-def _check_mass(name: str, columns: Columns) -> None:
-    if "total_mass_kg" not in columns:
-        return
-    total, payload = columns["total_mass_kg"], columns["payload_kg"]
-    for row in np.flatnonzero(total <= payload)[:1]:
-        raise BadData(too_light(f"{name} row {row + 1}", total[row], payload[row]))
-
-
 def too_light(where: str, total: float, payload: float) -> str:
     included = f"more than the payload of {payload:g} kg that it includes"
     return f"{where}, total_mass_kg: got {total:g}; expected {included}"
-
-
-def _check_deviations(name: str, columns: Columns, shown: tuple[Channel, ...]) -> None:
-    for channel in shown:
-        if channel.column in columns and channel.sd_column in columns:
-            lost = np.isfinite(columns[channel.column]) & ~np.isfinite(columns[channel.sd_column])
-            if lost.any():
-                raise BadData(
-                    f"{name} row {int(np.flatnonzero(lost)[0]) + 1}, {channel.sd_column}: got an empty cell next "
-                    f"to a reading; expected its sd, more than 0 {channel.unit}"
-                )
 
 
 def settled_points(name: str, columns: Columns, layout: Layout, robot: Robot) -> tuple[Columns, Names]:
@@ -347,8 +332,8 @@ def driven_rows(name: str, columns: Columns, layout: Layout) -> tuple[Columns, n
             )
             raise BadData(
                 f"{name} row {row + 1}, slope_deg: got {slope[row]:g} in a table of settled turns{more}; "
-                "on a slope the heading changes all the time, so that no turn is settled there: expected 0; remove "
-                "such rows (simulate --left, --right and --slope with --model drive follows one over time)"
+                "expected 0, since on a slope the heading always changes and no turn settles; remove such rows, and "
+                "follow such a turn over time by simulate --model drive --left --right --slope"
             )
     if not set(layout.sides) & set(columns):
         _check_signs(name, columns, layout)
@@ -382,7 +367,7 @@ def _driven(name: str, columns: Columns, layout: Layout) -> tuple[np.ndarray, st
                 f"{zero} is 0; expected what drives it, or remove the row"
             )
     if idle.size == len(size):
-        clamp = '; a held shaft: state imposed = "motor_current" or "voltage", a column held = 1, and output_torque'
+        clamp = '; for a held shaft state imposed = "motor_current" or "voltage", columns held = 1, output_torque'
         raise BadData(
             f"{name}: {zero} is 0 in every row, so nothing drives the motors; expected rows that are driven"
             f"{clamp * (layout.imposed == 'motor_speed' and not layout.has_ground)}"
@@ -510,10 +495,3 @@ def driven_backward_notes(name: str, columns: Columns, layout: Layout) -> Iterat
             f"{name} row {on[0] + 1}, {LOAD}: got {columns[LOAD][on[0]]:g} where the shaft is driven "
             f"backward{more}: it turns the shaft on there; a brake's torque is negative backward"
         )
-
-
-def shows_magnitude(name: str, instrument: Instrument) -> str:
-    return (
-        f"{name}: {channels.find_channel(instrument.channel).column} is positive where its side is driven "
-        "backward; it is taken to show magnitude alone, and magnitudes are compared"
-    )

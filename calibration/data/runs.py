@@ -37,8 +37,8 @@ from calibration.data.sources.in_memory import EXPECTED
 from calibration.data.sources.reading import Mapped
 from calibration.data.table import Runs
 from calibration.data.unread_rows import without_unread
+from mmrjax.model import channels
 from mmrjax.model.quantities import MM, RPM
-from mmrjax.model.rig import Instrument
 from mmrjax.model.robot import NO_BRAKE, Robot
 
 __all__ = ["CONDITIONS", "DUTY", "MM", "RPM", "WHEN", "Runs", "of_arrays", "read_runs", "single_run"]
@@ -92,21 +92,14 @@ def read_runs(
             raise BadData(f"{source}: no such file and no packaged table; packaged: {', '.join(PACKAGED)}")
         reading_found = reading.read_columns(source, layout, preset, between)
         arrays, mapped = reading_found.arrays, reading_found.mapped
-    if preset is None:
-        _refuse_a_loggers_names(arrays, layout)
-    return of_arrays(arrays, measured=measured, battery=battery, robot=robot, of_turns=of_turns, mapped=mapped)
-
-
-def _refuse_a_loggers_names(arrays: NamedArrays, layout: Layout) -> None:
-    """Refuses a source without any column of a known name whose columns match a preset."""
-    if any(m is not None for m in layout.meanings(arrays.name, list(dict.fromkeys(arrays.header)))):
-        return
-    if name := presets_file.recognise_preset(arrays.header):
+    known = preset is not None or any(layout.meanings(arrays.name, list(dict.fromkeys(arrays.header))))
+    if not known and (name := presets_file.recognise_preset(arrays.header)):
         numbers_asked = "".join(f",{key}=..." for key in presets_file.numbers_to_state(name))
         raise BadData(
             f"{arrays.name}: has no column with a known name, but columns of {name}; add --columns "
             f'{name}{numbers_asked}, in Python columns="{name}{numbers_asked}"'
         )
+    return of_arrays(arrays, measured=measured, battery=battery, robot=robot, of_turns=of_turns, mapped=mapped)
 
 
 def of_arrays(
@@ -153,7 +146,7 @@ def of_arrays(
         raise BadData(f"{name}: a header and no rows; expected at least one run")
     arrays = clock.recorded_rows(arrays, meanings)
     columns, changed = _columns(arrays, meanings, layout, battery)
-    settled: tuple[str, ...] = ()
+    settled: Names = ()
     if measured and robot is not None:
         columns, settled = row_checks.settled_points(name, columns, layout, robot)
     notes = (*arrays.notes, *settled, *sides.of_volts(name, columns, battery))
@@ -161,7 +154,10 @@ def of_arrays(
     columns, kept, clamped = row_checks.without_clamped(name, columns, kept)
     if measured:
         notes = (*notes, *copied, *clamped, *_without_repeats(name, columns, layout))
-    layout, unsigned = _with_instruments(columns, layout, measured)
+    stated = instruments.infer_instruments(layout.instruments, columns)
+    unsigned = sides.unsigned_current_channels(columns, layout) if measured else ()
+    unsigned = tuple(i for i in unsigned if i.channel not in {known.channel for known in stated})
+    layout = dataclasses.replace(layout, instruments=(*stated, *unsigned))
     row_checks.complete_columns(name, columns, int(kept.sum()), layout)
     if battery and layout.imposed == "voltage":
         columns[SUPPLY] = np.full(int(kept.sum()), np.nan)
@@ -173,7 +169,10 @@ def of_arrays(
         columns["order"] = np.arange(1.0, kept.sum() + 1)
     extras = {c: _extra(raw)[kept] for c, m, raw in zip(header, meanings, arrays.values, strict=True) if m is None}
     notes = (*notes, *capitals, *changed, *(row_checks.missing_data_notes(name, columns, layout) if measured else ()))
-    notes = (*notes, *(row_checks.shows_magnitude(name, i) for i in unsigned))
+    notes = (*notes, *(
+        f"{name}: {channels.find_channel(i.channel).column} is positive where its side is driven backward; it is "
+        "taken to show magnitude alone, and magnitudes are compared" for i in unsigned
+    ))  # fmt: skip
     notes = (*notes, *row_checks.driven_backward_notes(name, columns, layout))
     headings = {m.column: m.shown for m in meanings if m is not None}
     runs = Runs(name, columns, tuple(extras), arrays.digest, extras, layout, notes, headings)
@@ -221,10 +220,10 @@ def _columns(
 
 
 def _listed(name: str, said: Sequence[str], count: int) -> str:
-    """One message on all refused cells, the first row first, without repeated advice.
+    """Combines the messages on refused cells into one, in the order of the rows, each piece of advice once.
 
     Args:
-        said: sentences, at least the first `LISTED`.
+        said: messages, of which at least the first `LISTED` must be given.
         count: number of cells.
     """
     first, *others = said
@@ -252,18 +251,6 @@ def _without_repeats(name: str, columns: Columns, layout: Layout) -> Iterator[st
                 f"{name}: {channel.column} repeats each reading in {rows:.3g} rows, as of a slower sensor; each is "
                 "used once, in its first row"
             )
-
-
-def _with_instruments(
-    columns: Mapping[str, np.ndarray], layout: Layout, measured: bool
-) -> tuple[Layout, tuple[Instrument, ...]]:
-    """The layout with the instruments inferred from the readings, and instruments without sign."""
-    inferred = instruments.infer_instruments(layout.instruments, columns)
-    stated = {i.channel for i in inferred}
-    unsigned = tuple(
-        i for i in sides.unsigned_current_channels(columns, layout) if measured and i.channel not in stated
-    )
-    return dataclasses.replace(layout, instruments=(*inferred, *unsigned)), unsigned
 
 
 def _configurations_in_case(name: str, cells: list[str], layout: Layout) -> tuple[list[str], list[str]]:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import functools
 import math
 import re
 from importlib import resources
-from typing import Any
 
 from calibration.data import Json
 from calibration.data.input_errors import BadConfiguration, parse_number
@@ -20,11 +20,6 @@ EXAMPLE_SHARE = 3.0
 #: The same for an example of 0: times its sd.
 EXAMPLE_ZERO = 10.0
 HEADER = re.compile(r"(?:# )?\[([\w.]+)\]$")
-
-
-def is_stated(value: Any) -> bool:
-    """True if a value of a file is text with ±."""
-    return isinstance(value, str) and re.search(_SIGNS, value) is not None
 
 
 def stated_number(text: str, where: str) -> tuple[float, float]:
@@ -66,7 +61,7 @@ def taken_apart(table: Json, where: str, prefix: str = "") -> dict[str, float]:
         name = f"{prefix}{key}"
         if isinstance(value, dict):
             sds |= taken_apart(value, where, f"{name}.")
-        elif is_stated(value):
+        elif isinstance(value, str) and re.search(_SIGNS, value) is not None:
             table[key], sds[name] = stated_number(value, f"{where}, {name}")
     return sds
 
@@ -93,6 +88,7 @@ def example_sd(value: float, sd: float) -> float:
     return max(sd, float(f"{least:.12g}")) if sd else 0.0
 
 
+@functools.cache
 def _template_numbers() -> frozenset[tuple[str, float] | None]:
     texts = [file.read_text("utf-8") for file in resources.files("calibration.data").joinpath("rigs").iterdir()]
     return frozenset(_number_of_line(line) for text in texts for line in text.splitlines() if EXAMPLE in line) - {

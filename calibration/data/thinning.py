@@ -58,7 +58,7 @@ def thin_rows(runs: Runs, most: int = ROWS) -> Runs:
     apart, kept = -(-len(runs) // most), []
     read = np.isfinite(runs.measured())
     if runs.sampled:
-        ordered = [runs.in_order(name) for name in dict.fromkeys(runs.run_names.tolist())]
+        ordered = list(runs.rows_by_run().values())
     else:
         ordered = [np.lexsort([runs[column] for column in reversed(("configuration", *runs.axes))])]
     for rows in ordered:

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from calibration.data import Columns, Names
 from calibration.data.runs import Runs
 from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.adequacy import AdequacyTest, Diagnosis
@@ -73,7 +74,9 @@ def found_effects(
     Args:
         test: of the base fit. Its bootstrap gives the p-values.
     """
-    gains = _without_each(space, base, best, found.ladder, settings)
+    # The unique contribution of each effect: the rise of χ² if it is removed and everything is refitted.
+    others = [base] if len(best.effects) == 1 else without_each(space, best, settings, found.ladder)
+    gains = [2 * (c.cost - best.cost) for c in others]
     null, excess = np.asarray(test.null.single), excess_misfit(space, base)
     listed = []
     for slot, members in enumerate(found.members):
@@ -135,15 +138,6 @@ def _stated(space: CandidateSpace, best: Candidate, shift: Shift) -> StatedValue
     value = [float(coordinates.value(np.asarray(z))[k]) for z in (shift.fit.z[:p], np.zeros(p))]
     rise = float(2 * (shift.fit.cost - best.cost))
     return StatedValue(value[0], value[1], coordinates.units[k], float(shift.fit.z[k]), rise)
-
-
-def _without_each(
-    space: CandidateSpace, base: Candidate, best: Candidate, ladder: Sequence[Candidate], settings: Settings
-) -> list[float]:
-    """Unique contribution of each effect: the rise of χ² if it is removed and everything is refitted."""
-    if len(best.effects) == 1:
-        return [2 * (base.cost - best.cost)]
-    return [2 * (c.cost - best.cost) for c in without_each(space, best, settings, ladder)]
 
 
 def unnamed_discrepancy(
@@ -331,7 +325,7 @@ def _plausible_score(
     return amplitude, float(scores.single[m] ** 2 - ((wanted - amplitude) * left) ** 2)
 
 
-def invisible_effects(space: CandidateSpace, scores: ScoreTable, settings: Settings) -> tuple[str, ...]:
+def invisible_effects(space: CandidateSpace, scores: ScoreTable, settings: Settings) -> Names:
     """Effects that the data cannot show: even the largest plausible amplitude changes the readings too little."""
     largest_scores = space.library.largest(np.asarray(scores.left))
     return tuple(
@@ -359,13 +353,13 @@ class Fitted:
 
 
 #: Kind of block → hold-out predictions of each row, shape (rows, channels).
-HeldOutReadings = dict[str, np.ndarray]
+HeldOutReadings = Columns
 
 
 def readings_of_rows(
     runs: Runs,
     sd: np.ndarray,
-    kinds: Mapping[str, Mapping[str, np.ndarray]],
+    kinds: Mapping[str, Columns],
     before: Fitted,
     after: Fitted | None,
     known_before: HeldOutReadings | None = None,

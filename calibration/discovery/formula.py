@@ -236,7 +236,8 @@ def _wave_formula(balance: str, curve: Smooth) -> Proposal:
 def _decay_formula(linear: Linearization, balance: str, counts: np.ndarray, curve: Smooth) -> Proposal:
     """Formula of a decay with time or from run to run: an exponential without offset.
 
-    Its constant is from a grid over the length of the runs or of the table. The base takes up a constant level.
+    The time constant is searched on a grid scaled to the length of the runs, or of the table. No offset is fitted,
+    because the base parameters absorb it.
     """
     (t, way), counts = linear.in_travel(balance, curve.variable), linear.at_points(counts)
     symbol, unit = FADING[curve.variable]

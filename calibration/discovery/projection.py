@@ -47,10 +47,11 @@ class Defect:
 
 
 def defect_by_row(linear: Linearization, place: str) -> Defect:
-    """Defect of a place in each row: least squares of the row's residual along its sensitivity.
+    """Error of one balance equation in each row, by least squares that also refits the free parameters.
 
-    δ_i = -(r_i·e) / ‖r_i‖², sd 1/‖r_i‖, r_i = (I - P) g_i, g_i the change of all readings by a defect of row i
-    (of histories: at that instant, falling to zero at the neighbouring knots; NaN between knots).
+    δ_i = -(r_i·e) / ‖r_i‖² with the sd 1/‖r_i‖ and r_i = (I - P) g_i. The residuals are e. All readings change by g_i
+    per unit error of the equation in row i. In time histories the error is largest at that instant and falls to zero
+    at the neighbouring knots. Rows between knots are NaN.
     """
     places = linear.places()
     shapes = np.zeros((linear.rows, len(places)))

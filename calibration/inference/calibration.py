@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
 
-from calibration.data import Names, surfaces
+from calibration.data import Names, Priors, surfaces
 from calibration.data.columns import ROWS
 from calibration.data.input_errors import SEEDS, BadConfiguration, stated_count
 from calibration.data.runs import Runs
@@ -64,7 +64,7 @@ def calibrate(
     *,
     free: Sequence[str] = (),
     fix: Sequence[str] = (),
-    stated: Mapping[str, tuple[float, float]] | None = None,
+    stated: Priors | None = None,
     noise: str | None = None,
     model: str | None = None,
     starts: int | None = None,
@@ -162,10 +162,11 @@ def _free_names(
     words = [surfaces.names_of_surfaces(names, robot, runs) for names in (free, fix)]
     present = _present(runs, robot)
     default = priors.default_names(present, robot, computed=computes, turns=runs.turns)
-    owned = priors.stated_names(robot, present, () if observe.axis else priors.OVER_TIME)
+    owned = priors.names_to_fit(robot, present, () if observe.axis else priors.OVER_TIME)
     held = {*default, *fidelities.unread_parameters(fidelity, owned, runs.turns)}
     default = (*default, *(n for n in owned if n not in held and not n.endswith(computes)))
-    default = (*default, *priors.delay_names(robot, observe.free()[0]))
+    if priors.DELAY in observe.free()[0] and priors.DELAY in robot.rig.stated - robot.rig.exact:
+        default = (*default, priors.DELAY)
     names = priors.choose_free_names(robot, default, *words)
     if unread := fidelities.unread_parameters(fidelity, names, runs.turns):
         if fidelities.OF_TURNS in unread[0]:
@@ -201,10 +202,10 @@ class _Setting:
     kinds: Names
     ready: Prepared
     base: Robot
-    of_product: dict[str, tuple[float, float]]
+    of_product: Priors
 
 
-def _with_guide_priors(runs: Runs, ready: Prepared, fidelity: str) -> tuple[Robot, dict[str, tuple[float, float]]]:
+def _with_guide_priors(runs: Runs, ready: Prepared, fidelity: str) -> tuple[Robot, Priors]:
     """Robot with the guides' share that the fidelity computes, and priors of the free guide frictions without a
     stated prior."""
     robot, guide_priors = ready.robot, dict[str, tuple[float, float]]()
@@ -351,10 +352,13 @@ def _result(
         for name, (mean, sd) in setting.of_product.items()
     ]
     notes += [*ready.begins, *posed.observe.cautions(robot), *(() if searched is None else searched.remarks())]
-    notes += scans.scan_remarks(posed, scanned)
+    names = posed.coordinates.names
+    notes += [
+        Remark("in_pieces", name=names[k], pieces=parts) for k, s in scanned.items() if (parts := s.parts()) > 1
+    ]
     elsewhere = scans.count_outside(scanned, found.starts.z, found.starts.converged)
     if elsewhere:
-        over = tuple(posed.coordinates.names[k] for k in scanned)
+        over = tuple(names[k] for k in scanned)
         notes.append(Remark("elsewhere", searches=elsewhere, total=len(found.starts.cost), names=over))
     if not np.isfinite(about.covariance).all():
         notes.append(Remark("no_covariance"))
@@ -377,7 +381,7 @@ def _result(
         model=setting.fidelity,
         seed=seed,
         parameters=estimates.parameter_estimates(posed, setting.base, z, about, profile, beside, sources, scanned),
-        tied=estimates.tied_parameters(posed),
+        tied={follower: (names[k], ratio) for follower, k, ratio in posed.coordinates.tied},
         noise=estimates.channel_noise(posed, noise, found.shares, measured),
         axis=observe.axis,
         errors_before=estimates.errors_by_channel(runs.channels, seen_before, measured, sd),
@@ -402,7 +406,7 @@ def _result(
         remarks=(
             *notes,
             *error_after_steps(runs, seen - measured),
-            *checks.unmeasured_notes(ready.names, about.sensitivity),
+            *(Remark("unmeasured", name=n) for n, s in zip(ready.names, about.sensitivity, strict=True) if s < 1e-6),
         ),
     )
     return dataclasses.replace(result, remarks=(*result.remarks, *calibration_remarks(result)))

@@ -189,7 +189,10 @@ def check_data(runs: Runs, robot: Robot, names: Sequence[str], noise: Noise) -> 
         *_constant_conditions(runs),
     ]
     remarks += [*unused_notes(runs), *unexplained_torque_notes(runs)]
-    remarks += [*check_ranges(runs, robot), *_uninformative(runs, robot, noise)]
+    remarks += check_ranges(runs, robot)
+    if not (runs.sampled or runs.turns):
+        same = nothing_varies(runs, robot, noise)
+        remarks += [same] if same is not None else copied_channels(runs, robot)
     return [*remarks, *conduct_notes(runs, robot), *lost_motion_notes(runs, robot)]
 
 
@@ -221,14 +224,6 @@ def _check_motion(runs: Runs, noise: Noise) -> None:
         f"{runs.source} rows 1 to {len(runs)}, {imposed}: nothing drives the motors and nothing moves; expected rows "
         "in which they are driven; if another column drives them, name it under [columns] in the rig's file"
     )
-
-
-def _uninformative(runs: Runs, robot: Robot, noise: Noise) -> list[Remark]:
-    """Notes on settled runs of one condition, and on channels computed from others."""
-    if runs.sampled or runs.turns:
-        return []
-    same = nothing_varies(runs, robot, noise)
-    return [same] if same is not None else [*copied_channels(runs, robot)]
 
 
 def _check_enough_readings(runs: Runs, names: Sequence[str], noise: Noise) -> None:
@@ -289,11 +284,6 @@ def _constant_conditions(runs: Runs) -> list[Remark]:
         and np.ptp(runs[column]) == 0
         and (column != SUPPLY or np.ptp(applied_drive(runs)) == 0)
     ]
-
-
-def unmeasured_notes(names: Sequence[str], sensitivity: np.ndarray) -> list[Remark]:
-    """Notes on free parameters that change no reading."""
-    return [Remark("unmeasured", name=name) for name, s in zip(names, sensitivity, strict=True) if s < 1e-6]
 
 
 def infeasible_error(

@@ -27,7 +27,6 @@ from calibration.inference.result import (
     Prior,
     ProfileCurve,
     SteadyEstimate,
-    Tie,
 )
 from calibration.inference.scans import Scan
 from calibration.inference.simulation_errors import channel_errors, sized_error
@@ -111,12 +110,6 @@ def parameter_estimates(
 
 def _pair(ends: np.ndarray) -> tuple[float, float]:
     return float(ends[0]), float(ends[1])
-
-
-def tied_parameters(posed: Problem) -> dict[str, Tie]:
-    """Parameters tied to a free one, by name."""
-    names = posed.coordinates.names
-    return {follower: Tie(names[k], ratio) for follower, k, ratio in posed.coordinates.tied}
 
 
 def channel_noise(posed: Problem, known: Noise, shares: np.ndarray, measured: np.ndarray) -> dict[str, ChannelNoise]:

@@ -9,6 +9,7 @@ its linearisation predicts a gain that does not exist, and it then follows the e
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -18,6 +19,7 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
+from calibration.data import Json
 from mmrjax.numerics.linear_equations import solve
 
 #: Rejected steps in a row after which a search ends.
@@ -26,6 +28,8 @@ PATIENCE = 12
 #: may be longer. Factors of the length of the next step in these cases.
 LITTLE, NEARLY_ALL = 0.01, 0.75
 SHORTER, LONGER = 0.25, 3.5
+#: Multiple of the objective up to which a rejected point corrects the slope.
+TELLING = 4.0
 #: Most iterations in which the one-sided residuals that are positive at the end of a step are determined.
 TURNS = 8
 #: Largest step that is mixed with the last one [prior sds], and the largest factor of that mixing.
@@ -186,6 +190,7 @@ class Searching(eqx.Module):
 
     Attributes:
         found: linearisation at y.
+        slope: Jacobian of the next step, which rejected steps have corrected.
         aux: auxiliary output of its evaluation.
         stride: step of the linearisation there.
         ahead: point of the next evaluation.
@@ -197,6 +202,7 @@ class Searching(eqx.Module):
     """
 
     found: Linearisation
+    slope: Float[Array, "residuals parameters"]
     aux: Any
     stride: Z
     ahead: Z
@@ -222,6 +228,9 @@ class OneSidedLevenbergMarquardt(optx.AbstractLeastSquaresSolver[Z, Array, Any, 
         first, last: the one-sided residuals are those from `first` up to `last`. The function returns them with their
             signs.
         near: largest step that is mixed with the last one, `NEAR`, 0 for none.
+        rough: True for residuals with kinks, such as those of rollouts in which a load stops. A rejected step then
+            corrects the slope in its direction (Broyden, Math. Comp. 19 (1965)), and the next one is at most half as
+            long in it.
     """
 
     rtol: float
@@ -229,6 +238,7 @@ class OneSidedLevenbergMarquardt(optx.AbstractLeastSquaresSolver[Z, Array, Any, 
     first: int = eqx.field(static=True, default=0)
     last: int = eqx.field(static=True, default=0)
     near: float = NEAR
+    rough: bool = eqx.field(static=True, default=False)
     norm: Callable[[Any], Array] = eqx.field(static=True, default=optx.max_norm)
     descent: OneSidedDescent = OneSidedDescent()
     search: OneSidedTrustRegion = OneSidedTrustRegion()
@@ -239,34 +249,49 @@ class OneSidedLevenbergMarquardt(optx.AbstractLeastSquaresSolver[Z, Array, Any, 
         return Linearisation(residual, jacobian, self.first, self.last), aux
 
     def init(
-        self, fn: Function, y: Z, args: Any, options: dict[str, Any], f_struct: Any, aux_struct: Any, tags: frozenset
+        self, fn: Function, y: Z, args: Any, options: Json, f_struct: Any, aux_struct: Any, tags: frozenset
     ) -> Searching:
         """Returns the state of a search that has evaluated nothing yet."""
         none, no, still = jnp.asarray(0), jnp.asarray(False), jnp.zeros_like(y)
         jacobian = jnp.zeros((f_struct.size, y.size), f_struct.dtype)
         unevaluated = Linearisation(jnp.zeros(f_struct.shape, f_struct.dtype), jacobian, self.first, self.last)
         aux = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), aux_struct)
-        return Searching(unevaluated, aux, still, y, no, self.search.init(y, unevaluated), none, none, no)
+        return Searching(unevaluated, jacobian, aux, still, y, no, self.search.init(y, unevaluated), none, none, no)
 
     def step(
-        self, fn: Function, y: Z, args: Any, options: dict[str, Any], state: Searching, tags: frozenset
+        self, fn: Function, y: Z, args: Any, options: Json, state: Searching, tags: frozenset
     ) -> tuple[Z, Searching, Any]:
         """Evaluates the function at the end of the last step, accepts or rejects that step, and finds the next."""
         linearised, aux = self._linearised(fn, state.ahead, args)
-        moved, first, before = state.ahead - y, state.steps == 0, state.found
+        moved, first, before = (
+            state.ahead - y,
+            state.steps == 0,
+            dataclasses.replace(state.found, jacobian=state.slope),
+        )
         _, accepted, _, region = self.search.step(first, y, state.ahead, before, linearised, state.region)
         alike = jnp.all(linearised.positive == before.positive)
         accepted &= first | alike | ~state.mixed
         region = _where(state.mixed & ~accepted, state.region, region)
         ended = self._is_small(state.ahead, moved, linearised, before) & accepted
 
-        y, best, aux = _where(accepted, (state.ahead, linearised, aux), (y, before, state.aux))
-        stride, _ = self.descent.step(region.step_size, self.descent.query(y, best, best))
+        corrected = state.slope
+        if self.rough:
+            least = jnp.finfo(y.dtype).tiny
+            along, length = corrected @ moved, jnp.maximum(moved @ moved, least)
+            missed = linearised.residual - before.residual - along
+            near = (state.steps > 0) & (linearised.as_min() < TELLING * before.as_min())
+            corrected = jnp.where(near, corrected + jnp.outer(missed, moved) / length, corrected)
+            half = jnp.minimum(region.step_size, length / jnp.maximum(along @ along, least))
+            region = _where(accepted | state.mixed, region, dataclasses.replace(region, step_size=half))
+        slope = jnp.where(accepted, linearised.jacobian, corrected)
+        y, best, aux = _where(accepted, (state.ahead, linearised, aux), (y, state.found, state.aux))
+        ahead_of = dataclasses.replace(best, jacobian=slope)
+        stride, _ = self.descent.step(region.step_size, self.descent.query(y, ahead_of, ahead_of))
         mixed = accepted & alike & (state.steps > 1) & (jnp.max(jnp.abs(stride)) < self.near)
         ahead = y + jnp.where(mixed, mixed_step(stride, moved, stride - state.stride), stride)
         rejected = jnp.where(accepted, 0, state.rejected + 1)
         over = ended | (rejected >= PATIENCE)
-        new = Searching(best, aux, stride, ahead, mixed, region, state.steps + 1, rejected, over)
+        new = Searching(best, slope, aux, stride, ahead, mixed, region, state.steps + 1, rejected, over)
         return y, new, aux
 
     def _is_small(self, y: Z, moved: Z, found: Linearisation, before: Linearisation) -> Array:
@@ -277,7 +302,7 @@ class OneSidedLevenbergMarquardt(optx.AbstractLeastSquaresSolver[Z, Array, Any, 
         )
 
     def terminate(
-        self, fn: Function, y: Z, args: Any, options: dict[str, Any], state: Searching, tags: frozenset
+        self, fn: Function, y: Z, args: Any, options: Json, state: Searching, tags: frozenset
     ) -> tuple[Array, optx.RESULTS]:
         """True if the search has ended."""
         return state.over, optx.RESULTS.successful  # type: ignore[return-value]  # an enumeration of equinox's
@@ -288,11 +313,11 @@ class OneSidedLevenbergMarquardt(optx.AbstractLeastSquaresSolver[Z, Array, Any, 
         y: Z,
         aux: Any,
         args: Any,
-        options: dict[str, Any],
+        options: Json,
         state: Searching,
         tags: frozenset,
         result: optx.RESULTS,
-    ) -> tuple[Z, Any, dict[str, Any]]:
+    ) -> tuple[Z, Any, Json]:
         """Returns the best point, the auxiliary output of its evaluation, and no statistics."""
         return y, aux, {}
 

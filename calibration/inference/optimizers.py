@@ -19,6 +19,7 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
 from calibration.inference.levenberg_marquardt import (
+    NEAR,
     Function,
     OneSidedLevenbergMarquardt,
     Searching,
@@ -136,15 +137,21 @@ def residual_function(problem: Problem, data: Data, pin: Pin) -> Function:
 def _solver(data: Data, long: bool) -> OneSidedLevenbergMarquardt:
     """Solver of fits to such data. Of rollouts if `long`."""
     held, tolerance = penalty_slice(data), TOLERANCE_LONG if long else TOLERANCE
-    return OneSidedLevenbergMarquardt(tolerance, tolerance, held.start, held.stop)
+    return OneSidedLevenbergMarquardt(
+        tolerance, tolerance, held.start, held.stop, near=0.0 if long else NEAR, rough=long
+    )
 
 
-def _optimum(jacobian: Array, r: Array, z: Array, data: Data, pin: Pin, steps: Array) -> Optimum:
+def _optimum(
+    jacobian: Array, r: Array, z: Array, data: Data, pin: Pin, steps: Array, slope: Array | None = None
+) -> Optimum:
+    """A point as an optimum. `slope` predicts its decrement, None for the Jacobian."""
+    slope = jacobian if slope is None else slope
     held_rows = penalty_slice(data)
     informed = jacobian[informative_residuals(data)]
     half = solve_lower(informed.T @ informed, jnp.eye(z.shape[0]))
     sd = jnp.linalg.norm(half, axis=0)
-    ahead = r + jacobian @ one_sided_step(r, jacobian, held_rows, 0.0)
+    ahead = r + slope @ one_sided_step(r, slope, held_rows, 0.0)
     decrement = half_squares(r, held_rows) - half_squares(ahead, held_rows)
     held = jnp.where(pin.held, pin.at - data.centre, 0.0)
     cost = half_squares(r, held_rows) + 0.5 * jnp.sum(held**2)
@@ -216,7 +223,7 @@ def _ended(at: Progress, data: Data, pin: Pin) -> Optimum:
     y, state = at
     # optimistix takes no step from a start that is not finite.
     r = jnp.where(jnp.all(jnp.isfinite(y)), state.found.residual, jnp.nan)
-    return _optimum(state.found.jacobian, r, y, data, pin, state.steps)
+    return _optimum(state.found.jacobian, r, y, data, pin, state.steps, state.slope)
 
 
 def levenberg_marquardt(
@@ -453,11 +460,13 @@ def _refilled(problem: Problem, members: Member, max_steps: int, places: int) ->
 
 def linearise(problem: Problem, z: Z, data: Data) -> tuple[Array, Array, Observation]:
     """Residuals (misfit, then prior) at z, their Jacobian, and the observation."""
-    r, jacobian, observation = (linearise_rollout if problem.observe.long else _first_step)(problem, z, data)
+    r, jacobian, observation = (linearise_rollout if problem.observe.long else _linearise_by_search_program)(
+        problem, z, data
+    )
     return *_clip_penalties(r, jacobian, data), observation
 
 
-def _first_step(problem: Problem, z: Z, data: Data) -> tuple[Array, Array, Observation]:
+def _linearise_by_search_program(problem: Problem, z: Z, data: Data) -> tuple[Array, Array, Observation]:
     """Result of `linearise` with the signs of penalties, by the compiled program of the searches."""
     active = getattr(problem.coordinates, "active", None)
     one_member = [np.asarray(x)[None] for x in (z, data.weight, data.measured, data.centre)]
@@ -622,7 +631,7 @@ def search_rollouts(
         state = progress[1]
         ahead, observation = state.ahead, state.aux
         small = 0.1 * (DECREMENT + DECREMENT_SHARE * ends.cost)
-        over = state.over | (state.steps >= max_steps) | ((state.rejected == 0) & (ends.decrement < small))
+        over = state.over | (state.steps >= max_steps) | (ends.decrement < small)
         over = over | (trail[0] - ends.cost < SAME + STALLED * ends.cost)
         cost[assigned.holds[going]] = ends.cost[going]
         if rivals:
@@ -710,11 +719,11 @@ def search_with_solver(
 
 def observe_robot(problem: Problem, robot: Robot) -> Observation:
     """Observation of any robot in each row of the problem, compiled."""
-    return problem.observe.read(robot) if problem.observe.apart else _observe_robot(problem, robot)
+    return problem.observe.read(robot) if problem.observe.apart else _simulated_readings(problem, robot)
 
 
 @functools.partial(compiled, options=OVER_TIME)
-def _observe_robot(problem: Problem, robot: Robot) -> Observation:
+def _simulated_readings(problem: Problem, robot: Robot) -> Observation:
     return problem.observe(robot)
 
 

@@ -129,14 +129,6 @@ class Estimate:
 
 
 @dataclasses.dataclass(frozen=True)
-class Tie:
-    """A parameter that keeps its ratio to a free one: value = ratio · leader."""
-
-    leader: str
-    ratio: float
-
-
-@dataclasses.dataclass(frozen=True)
 class ChannelNoise:
     """The sd of a channel.
 
@@ -260,7 +252,7 @@ class CalibrationResult:
         model: the fidelity.
         seed: of the starts.
         parameters: the free ones, by name.
-        tied: those tied to them, by name.
+        tied: those tied to them, by name: the free one, and the ratio that they keep to it.
         noise: by channel.
         axis: column that orders the rows of a run.
         errors_before, errors_after: of the robot as given and as calibrated, by channel.
@@ -287,7 +279,7 @@ class CalibrationResult:
     model: str
     seed: int
     parameters: dict[str, Estimate]
-    tied: dict[str, Tie]
+    tied: dict[str, tuple[str, float]]
     noise: dict[str, ChannelNoise]
     axis: str
     errors_before: Errors
@@ -387,7 +379,7 @@ class CalibrationResult:
                 "parameters": {
                     name: {**p.to_json(), "determined": self.determined(name)} for name, p in self.parameters.items()
                 },
-                "tied": {name: f"{tie.ratio:.4g} x {tie.leader}" for name, tie in self.tied.items()},
+                "tied": {name: f"{ratio:.4g} x {leader}" for name, (leader, ratio) in self.tied.items()},
                 "noise": self.noise,
                 "percent_of": OF_SIZE,
                 "errors": {

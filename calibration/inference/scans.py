@@ -210,12 +210,3 @@ def count_outside(scans: dict[int, Scan], z: np.ndarray | None, converged: np.nd
     ends = {k: scan.interval() for k, scan in scans.items()}
     outside = [(z[:, k] < low) | (z[:, k] > high) for k, (low, high) in ends.items()]
     return int(np.sum(np.any(outside, 0) & converged)) if outside else 0
-
-
-def scan_remarks(problem: Problem, scans: dict[int, Scan]) -> list[Remark]:
-    """Notes on parameters with a 95 % region in several pieces."""
-    return [
-        Remark("in_pieces", name=problem.coordinates.names[k], pieces=parts)
-        for k, scan in scans.items()
-        if (parts := scan.parts()) > 1
-    ]

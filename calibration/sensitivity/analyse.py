@@ -58,7 +58,11 @@ def analyse_sensitivity(
         raise BadConfiguration(
             "--parameters: the derivative of every output by every input is zero; choose others, or change --outputs"
         )
-    parts = _by_method(study, method, ~idle, evaluations, seed)
+    parts: dict[str, Part] = {}
+    if method != "local":
+        study.tell(Remark("sampling", method=method, points=len(study.points)))
+        by_method = sobol_indices if method == "sobol" else morris_screening
+        parts = by_method(study, ~idle, evaluations, seed)
     outputs = {o.name: _study_of(o, study, studies, parts.get(o.name)) for o in model.outputs}
     if method != "local" and not any(s.studied.any() for s in outputs.values()):
         raise BadConfiguration(_none_converges(study, study.statuses()))
@@ -78,15 +82,6 @@ def analyse_sensitivity(
         seconds=round(study.seconds, 3),
         remarks=_remarks(study, method, outputs, idle),
     )
-
-
-def _by_method(study: Study, method: str, moving: np.ndarray, evaluations: int, seed: int) -> dict[str, Part]:
-    if method == "local":
-        return {}
-    study.tell(Remark("sampling", method=method, points=len(study.points)))
-    if method == "sobol":
-        return sobol_indices(study, moving, evaluations, seed)
-    return morris_screening(study, moving, evaluations, seed)
 
 
 def _described(inputs: Inputs, idle: np.ndarray) -> dict[str, Input]:

@@ -71,13 +71,6 @@ def drive_options(names: Names = ()) -> tuple[Drive, ...]:
     return tuple(options)
 
 
-def packable_cells() -> tuple[CellSheet, ...]:
-    """Cells with all data for a pack: capacity, full voltage and cut-off are stated, or are the paper's."""
-    return tuple(
-        c for c in packaged_cells() if c.cells == 1 and (c.name == CELL or not math.isnan(c.voltage_cut_off))
-    )
-
-
 _LIPO = "lithium-polymer"
 
 
@@ -109,7 +102,10 @@ def options_for_robot(robot: Robot, names: Names = ()) -> Options:
         robot: source of friction, efficiencies and cells missing in sheets.
         names: of motors, empty: all.
     """
-    chosen, packs = drive_options(names), packable_cells()
+    chosen, packs = (
+        drive_options(names),
+        tuple(c for c in packaged_cells() if c.cells == 1 and (c.name == CELL or not math.isnan(c.voltage_cut_off))),
+    )
     paper_motor = next(m for m in packaged_motors() if m.name == MOTOR)
     paper_gear = next(g for g in packaged_gearboxes() if g.name == GEARBOX)
     paper_cell = next(c for c in packaged_cells() if c.name == CELL)

@@ -85,21 +85,17 @@ def experiment_sentences(e: menu.Experiment) -> str:
 
 def _act(act: menu.Act) -> str:
     if act.name == "weigh":
-        return _weigh(act)
+        configurations, payload = {k for k, _ in act.at}, max(m for _, m in act.at)
+        each = {1: "", 2: "in both configurations, "}.get(len(configurations), "in each configuration, ")
+        laden = f"unladen and with the payload of {payload:g} kg, " if payload > 0 else "unladen, "
+        return (
+            f"Weigh the robot {each}{laden}on scales that are good to 20 g; read the total mass, and take the stated "
+            "one from it"
+        )
     (kind,) = act.kinds
     if act.channel:
         return ACTS[kind].format(channels.find_channel(act.channel).label)
     return ACTS[kind].format(join_amounts([v for (v,) in act.at], UNITS[kind]))
-
-
-def _weigh(act: menu.Act) -> str:
-    configurations, payload = {k for k, _ in act.at}, max(m for _, m in act.at)
-    each = {1: "", 2: "in both configurations, "}.get(len(configurations), "in each configuration, ")
-    laden = f"unladen and with the payload of {payload:g} kg, " if payload > 0 else "unladen, "
-    return (
-        f"Weigh the robot {each}{laden}on scales that are good to 20 g; read the total mass, and take the stated one "
-        "from it"
-    )
 
 
 def _run(run: menu.Run) -> str:
@@ -148,7 +144,12 @@ def _allowed(temperature: float) -> str:
 def more_runs(what: SimpleNamespace) -> str:
     """More runs along the variable of a discrepancy, from the values of `denser_runs_instruction`."""
     if what.variable in bases.ORDERS:
-        return _steady_speeds(what)
+        three = [f"{menu.round_significant(v):g}" for v in (what.low, 0.5 * (what.low + what.high), what.high)]
+        return (
+            "Mark the driving shaft, start every run from the mark, and record steady travel at "
+            f"{', '.join(three[:2])} and {three[2]} V with at least 20 samples a wave: what keeps its "
+            f"{what.variable} at every speed turns with that part"
+        )
     happens = bases.window_from_name(what.variable)
     if happens is not None:
         return _again(happens)
@@ -158,16 +159,6 @@ def more_runs(what: SimpleNamespace) -> str:
         by_kind = {} if what.within.has_ground else _of_shaft(what)
     last = f"Repeat with {what.variable.replace('_', ' ')} in even small steps from its least to its largest"
     return (_usual(what) | by_kind).get(what.variable, last)
-
-
-def _steady_speeds(what: SimpleNamespace) -> str:
-    """Speeds for measuring a wave."""
-    three = [f"{menu.round_significant(v):g}" for v in (what.low, 0.5 * (what.low + what.high), what.high)]
-    return (
-        f"Mark the driving shaft, start every run from the mark, and record steady travel at {', '.join(three[:2])} "
-        f"and {three[2]} V with at least 20 samples a wave: what keeps its {what.variable} at every speed turns with "
-        "that part"
-    )
 
 
 def _again(happens: bases.Window) -> str:
@@ -180,8 +171,8 @@ def _again(happens: bases.Window) -> str:
     if happens.axis != "time":
         return f"Make the runs at {happens.words} again, on another day, and as many a little below and above that"
     return (
-        f"Make two of the runs again, sampled as finely as the instruments allow from {happens.low:.3g} to "
-        f"{happens.high:.3g} s, one of them with all that is switched in that time left as it is"
+        f"Repeat two of the runs, sampled as finely as the instruments allow from {happens.low:.3g} to "
+        f"{happens.high:.3g} s; in one of them, switch nothing during that time"
     )
 
 
@@ -318,7 +309,7 @@ VARY = {
     "load": "the load (slope or payload at one voltage)", "slope": "the slope", "weight": "the payload",
     "duty": "the duty at one supply voltage",
     "configuration": "the configuration", "direction": "the direction of travel",
-    "demand": "the demand on adhesion (slope or payload)", "angle": "nothing: sample fast enough to see a turn",
+    "demand": "the demand on adhesion (slope or payload)", "angle": "nothing: sample each revolution",
     THE_SIDE: "nothing: compare the sides in straight travel and in turns both ways",
     "position": "the position: go over the whole travel both ways at one voltage",
     "": "nothing: it is the same share everywhere",

@@ -55,7 +55,7 @@ def double_precision() -> Iterator[None]:
 def in_double(function: Callable[P, T]) -> Callable[P, T]:
     """Decorator: the function computes in double precision when it is called outside a trace.
 
-    If JAX was single before the call, arrays among its results are NumPy arrays.
+    If JAX was in single precision before the call, arrays in the result are returned as NumPy arrays.
     """
 
     @functools.wraps(function)

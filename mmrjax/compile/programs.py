@@ -89,11 +89,20 @@ def compile_with_options(lowered: Any, options: dict[str, Any]) -> Any:
     Args:
         lowered: result of `jax.jit(function).lower`.
     """
+    return lowered.compile({name: value for name, value in options.items() if _is_supported(name, value)})
+
+
+@functools.cache
+def _is_supported(option: str, value: Any) -> bool:
+    """True if this version of XLA has a compile option, tried on a small program.
+
+    XLA refuses an option after a tenth of a compilation, which for a log is seconds.
+    """
     try:
-        return lowered.compile(options)
-    except jax.errors.JaxRuntimeError as error:
-        accepted = {k: v for k, v in options.items() if f"No such compile option: '{k}'" not in str(error)}
-        return compile_with_options(lowered, accepted) if len(accepted) < len(options) else lowered.compile()
+        jax.jit(lambda x: x).lower(0.0).compile({option: value})
+    except jax.errors.JaxRuntimeError:
+        return False
+    return True
 
 
 class Programs:

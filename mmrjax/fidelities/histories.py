@@ -24,7 +24,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from mmrjax.fidelities.drive import (
     CURRENT,
@@ -50,6 +50,8 @@ from mmrjax.numerics.rosenbrock import Unknowns
 T = TypeVar("T")
 
 _GAMMA = 1 - 0.5**0.5
+#: Consecutive parts of a step that its stages weigh, as shares.
+_WEIGHED = np.array([1 - _GAMMA, _GAMMA])
 #: Most Newton steps of a stage, which starts from the solution of the last one, and the residual allowed, in the
 #: units of the unknowns (10 A, 1000 rad/s, 1 m/s).
 NEWTON, SOLVED = 30, 1e-9
@@ -64,8 +66,10 @@ STEPS = 8000
 DRIVING = ("voltage", "duty", "open", "motor_current", "goal")
 #: Increase of the current for the slope of its rate, which gives its time constant [10 A].
 MORE = 1e-3
-#: Number of searches for the moment at which a shaft comes to rest, each on a line from the start of the step.
-TURNS = 2
+#: Number of searches for the moment at which a shaft comes to rest: on a line from the start of the step, then by
+#: Newton's method.
+TURNS = 3
+WAITS = TURNS + 1
 #: Number of steps whose linearised equations are computed together.
 BLOCK = 32
 
@@ -133,13 +137,14 @@ def first_instant(robot: Robot, conditions: Conditions) -> tuple[Conditions, Unk
 class LinearisedRun(eqx.Module):
     """A solved run and its equations linearised along it: the response of the run to a change of its rates.
 
-    The change at the end of a step has three parts: `carries` times the change before the step, `gains` times the
-    change of the rates at each stage, and `lags` times the change of the current's rates at its start.
+    The change at the end of a step has three parts. `carries` multiplies the change before the step, `gains` the
+    change of the rates at each stage, and `lags` the change of the current's rates at its start.
 
     Attributes:
         begins, ends: unknowns at the beginning and end of every step, shape (steps, unknowns).
         places: unknowns at both stages, where the equations are linearised, shape (steps, 2, unknowns).
         sides: see `RunStates`.
+        passes: True for steps in which a shaft stops or leaves rest.
         clock: start of a step, and the times of its stages [s], shape (steps, 3).
     """
 
@@ -147,6 +152,7 @@ class LinearisedRun(eqx.Module):
     ends: Float[Array, "steps unknowns"]
     places: Float[Array, "steps 2 unknowns"]
     sides: Float[Array, "steps 2"]
+    passes: Bool[Array, " steps"]
     clock: Float[Array, "steps 3"]
     carries: Float[Array, "steps unknowns unknowns"]
     gains: Float[Array, "steps 2 unknowns unknowns"]
@@ -229,28 +235,36 @@ def run_steps(conditions: Conditions, times: Float[Array, " times"]) -> tuple[Ru
     return RunStep(jnp.diff(times), since, begun, before if conditions.motor_speed is None else None, now), constant
 
 
-def _lag(rate: Float[Array, " rates"], step: RunStep, current: Scalar, limit: Scalar) -> Lag:
+def _lag(
+    rate: Float[Array, " rates"],
+    step: RunStep,
+    current: Scalar,
+    limit: Scalar,
+    parts: Pair,
+    wait: Scalar = 0.0,
+) -> Lag:
     """Lag of a step after the last jump, from the rates at its start: the remainder of its decay.
 
-    None if the driver's limit acts on the `current`, which then follows the limit at once.
+    `parts` and `wait` as of `_decaying`. None if the driver's limit acts on the `current`, which then follows the
+    limit at once.
     """
     if not len(rate):
-        return _decaying(jnp.zeros(()), jnp.zeros(()), step.length)
+        return _decaying(jnp.zeros(()), jnp.zeros(()), parts, wait)
     slope = (rate[1] - rate[2]) / MORE
     follows = slope > 0  # except when a diode begins to block
     decay = jnp.where(follows, slope, 1.0)
     left = (rate[0] - rate[1]) / decay * jnp.exp(-decay * step.since)
     follows &= jax.lax.stop_gradient(jnp.abs(current - left)) <= limit
-    return _decaying(jnp.where(follows, left, 0.0), decay, step.length)
+    return _decaying(jnp.where(follows, left, 0.0), decay, parts, wait)
 
 
-def _decaying(begin: Array, decay: Array, h: Array) -> Lag:
-    """Lag in a part of a step, from its value at the start."""
-    parts = jnp.array([1 - _GAMMA, _GAMMA]) * h
-    currents = begin * jnp.exp(-decay * jnp.stack([jnp.zeros(()), parts[0]]))
+def _decaying(begin: Array, decay: Array, parts: Pair, wait: Scalar = 0.0) -> Lag:
+    """Lag in two parts of a step [s], from its value at the start. `wait` lies between them [s]."""
+    second = parts[0] + wait
+    currents = begin * jnp.exp(-decay * jnp.stack([jnp.zeros(()), second]))
     z = decay * parts
     means = jnp.where(z > 0, -jnp.expm1(-z) / jnp.where(z > 0, z, 1.0), 1.0) * currents
-    return Lag(begin, means, begin * jnp.exp(-decay * h), decay)
+    return Lag(begin, means, begin * jnp.exp(-decay * (second + parts[1])), decay)
 
 
 def _windings(robot: Robot, constant: Conditions, step: RunStep, y: Unknowns) -> Float[Array, " rates"]:
@@ -259,7 +273,7 @@ def _windings(robot: Robot, constant: Conditions, step: RunStep, y: Unknowns) ->
 
 
 def _lag_of(robot: Robot, constant: Conditions, step: RunStep, y: Unknowns) -> Lag:
-    return _lag(_windings(robot, constant, step, y), step, y[CURRENT], _limit(robot))
+    return _lag(_windings(robot, constant, step, y), step, y[CURRENT], _limit(robot), step.length * _WEIGHED)
 
 
 def _limit(robot: Robot) -> Scalar:
@@ -297,34 +311,42 @@ class RunStates(eqx.Module):
     Attributes:
         stages: unknowns at both stages of every step, without lags.
         ends: at its end.
-        sides: direction of a shaft (see `turning_way`) at the start and end of a step. They differ if it
-            stops within the step.
-        before: time in such a step until rest [s].
+        sides: direction of a shaft (see `shaft_direction`) at the start and end of a step. They differ if it
+            stops or leaves rest within the step.
+        before: time in such a step until it stops, or leaves rest [s].
+        since: start of the last part of a step [s], later if friction holds the shaft after it stops.
+        rest: unknowns at that moment.
     """
 
     stages: Float[Array, "steps 2 unknowns"]
     ends: Float[Array, "steps unknowns"]
     sides: Float[Array, "steps 2"]
     before: Float[Array, " steps"]
+    since: Float[Array, " steps"]
+    rest: Float[Array, "steps unknowns"]
 
 
 class _Part(eqx.Module):
-    """A step, or its part before or after a shaft stops.
+    """A step, or its part before or after a shaft stops, or while it waits at rest.
 
     Attributes:
-        turn: 0 for the whole step, 1 to `TURNS` for iterations of the part before rest. Then the remaining part.
+        turn: 0 for the whole step, 1 to `TURNS` for iterations of the part before rest. Then `WAITS` while friction
+            still holds the shaft, and the remaining part.
         begin: unknowns at its start.
         lag: of the current there.
-        length: [s].
-        side: direction in which a shaft turns.
-        stages, end: see `RunStates`.
+        since, length: its start and length [s].
+        side, then: direction in which a shaft turns, and after it has waited.
+        before, stages, end: see `RunStates`.
     """
 
     turn: Array
     begin: Unknowns
     lag: Array
+    since: Array
     length: Array
     side: Array
+    then: Array
+    before: Array
     stages: Float[Array, "2 unknowns"]
     end: Unknowns
 
@@ -349,7 +371,7 @@ def solve_states(robot: Robot, conditions: Conditions, times: Float[Array, " tim
         law = functools.partial(drive_rates, robot, held)
 
         def turned(part: _Part) -> _Part:
-            mine = _decaying(part.lag, lag.decay, part.length)
+            mine = _decaying(part.lag, lag.decay, part.length * _WEIGHED)
             first = part.begin - mine.begin * _current(y)
 
             def stage(given: tuple[Array, Array], mean: Array) -> tuple[tuple[Array, Array], Array]:
@@ -361,30 +383,49 @@ def solve_states(robot: Robot, conditions: Conditions, times: Float[Array, " tim
             end = stages[1] + mine.end * _current(y)
             before, after = part.begin[MOTOR], end[MOTOR]
             nears = jnp.where(part.turn == 0, part.side * after < 0, part.turn < TURNS)
-            rests, rest = part.turn == TURNS, end - after * along
+            rests, waited, rest = part.turn == TURNS, part.turn == WAITS, end - after * along
             lost = before - after  # 0 in a part of no length, of a step that begins at rest
-            to_rest = part.length * jnp.clip(before / jnp.where(lost == 0, 1.0, lost), 0.0, 1.0)
+            on_line = part.length * before / jnp.where(lost == 0, 1.0, lost)
+            slows = law(end, way=part.side)[MOTOR]
+            by_newton = part.length - after / jnp.where(slows == 0, 1.0, slows)
+            to_rest = jnp.clip(jnp.where(part.turn == 0, on_line, by_newton), 0.0, step.length)
+            since = part.since + jnp.where(rests | waited, part.length, 0.0)
+            side, then, wait = _side(robot, held, rest, step.length - since)
+            left = jnp.where(rests & (wait > 0), wait, step.length - since)
+            after_rest = jnp.where(wait > 0, WAITS, WAITS + 1)
             return _Part(
-                jnp.where(nears | rests, part.turn + 1, TURNS + 2),
-                jnp.where(rests, rest, part.begin),
-                jnp.where(rests, mine.end, part.lag),
-                jnp.where(nears, to_rest, step.length - part.length),
-                jnp.where(rests, _side(robot, held, rest), part.side),
+                jnp.where(nears, part.turn + 1, jnp.where(rests, after_rest, WAITS + 2 - waited)),
+                jnp.where(rests, rest, jnp.where(waited, end, part.begin)),
+                jnp.where(rests | waited, mine.end, part.lag),
+                since,
+                jnp.where(nears, to_rest, left),
+                jnp.where(rests, side, jnp.where(waited, part.then, part.side)),
+                jnp.where(rests, then, part.then),
+                jnp.where(rests, part.length, part.before),
                 stages,
                 end,
             )
 
-        side = _side(robot, held, y)
-        whole = _Part(jnp.asarray(0), y, lag.begin, step.length, side, jnp.stack([y, y]), y)
-        last = jax.lax.while_loop(lambda part: part.turn < TURNS + 2, turned, whole)
-        return last.end, RunStates(last.stages, last.end, jnp.stack([side, last.side]), last.length)
+        side, then, wait = _side(robot, held, y, step.length)
+        turn, length, none = jnp.where(wait > 0, WAITS, 0), jnp.where(wait > 0, wait, step.length), jnp.zeros(())
+        whole = _Part(turn, y, lag.begin, none, length, side, then, wait, jnp.stack([y, y]), y)
+        last = jax.lax.while_loop(lambda part: part.turn < WAITS + 2, turned, whole)
+        sides = jnp.stack([side, last.side])
+        return last.end, RunStates(last.stages, last.end, sides, last.before, last.since, last.begin)
 
     return jax.lax.scan(taken, first_state, steps)[1]
 
 
-def _side(robot: Robot, conditions: Conditions, y: Array) -> Array:
-    """`turning_way` of a step, 0 if shafts and load stop separately."""
-    return shaft_direction(robot, conditions, state_of_unknowns(robot, y)) if robot.moves_as_one else jnp.zeros(())
+def _side(robot: Robot, conditions: Conditions, y: Array, length: Array) -> tuple[Array, Array, Array]:
+    """Direction of a shaft in a part of a step, after it has waited, and that time (see `shaft_direction`).
+
+    0 if shafts and load stop separately. It waits at most for the part's length [s].
+    """
+    if not robot.moves_as_one:
+        return jnp.zeros(()), jnp.zeros(()), jnp.zeros(())
+    way, wait = shaft_direction(robot, conditions, state_of_unknowns(robot, y))
+    way, wait = jnp.where(wait <= length, way, HELD), jnp.where(wait <= length, wait, 0.0)
+    return jnp.where(wait > 0, HELD, way), way, wait
 
 
 def linearise_run(
@@ -400,27 +441,32 @@ def linearise_run(
     begins = jnp.concatenate([first_state[None], run.ends[:-1]])
     # A step to rest and the one from it use an approximant of the exponential. For a current that lags by a quarter
     # of such a part, implicit Euler would keep a fifth of the decayed excess.
-    passes = run.sides[:, 0] != run.sides[:, 1]
+    passes = (run.sides[:, 0] != run.sides[:, 1]) | (run.since > 0)
     h = steps.length
-    spans = jnp.where(passes[:, None], jnp.stack([run.before, h - run.before], 1), _GAMMA * h[:, None])
+    spans = jnp.where(passes[:, None], jnp.stack([run.before, h - run.since], 1), _GAMMA * h[:, None])
+    rests = run.rest, jnp.where(passes, run.since - run.before, 0.0)
     middle = times[:-1] + spans[:, 0]
     clock = jnp.stack([times[:-1], middle, times[1:]], 1)
 
     def linear(given: tuple) -> tuple[Array, Array, Array, Array]:
-        begin, end, stages, sides, spans, passes, step = given
+        begin, end, stages, (rest, wait), sides, spans, passes, step = given
         held = step.held(constant)
         one = jnp.eye(len(end), dtype=end.dtype)
         current = _current(end)
 
         by_begin, rate = jax.jacfwd(lambda y: (_windings(robot, constant, step, y),) * 2, has_aux=True)(begin)
-        by_rate, lag = jax.jacfwd(lambda r: (_lag(r, step, begin[CURRENT], _limit(robot)),) * 2, has_aux=True)(rate)
-        ends = jnp.stack([begin - lag.begin * current, end - lag.end * current])
-        places = jnp.where(passes, ends, stages) + lag.means[:, None] * current
+        parts = jnp.where(passes, spans, step.length * _WEIGHED)
+        lagging = lambda r: (_lag(r, step, begin[CURRENT], _limit(robot), parts, wait),) * 2  # noqa: E731
+        by_rate, lag = jax.jacfwd(lagging, has_aux=True)(rate)
+        lags = jnp.stack([lag.begin, lag.begin * jnp.exp(-lag.decay * (spans[0] + wait)), lag.end])
+        ends = jnp.stack([begin, rest, end]) - lags[:, None] * current
+        places = jnp.where(passes, (ends[1:] + ends[:-1]) / 2, stages) + lag.means[:, None] * current
         slopes = jax.vmap(jax.jacfwd(lambda y, way: drive_rates(robot, held, y, way)))(places, sides)
         z = spans[:, None, None] * slopes
         weight = jnp.where(passes, one - z / 2 + z @ z / 6, one)  # Padé (0, 3): 1 / (1 - z + z²/2 - z³/6)
         first, second = jax.vmap(invert)(one - z @ weight)
-        jump = compute_rarely(passes, _jump, (robot, held, places[1], sides), jnp.zeros_like(end))
+        stops, ways = passes & (sides[0] != HELD), sides.at[1].set(jnp.where(wait > 0, HELD, sides[1]))
+        jump = compute_rarely(stops, _jump, (robot, held, rest, ways), jnp.zeros_like(end))
         # The start of the second stage depends on the first stage and on the change before the step.
         by_first = jnp.where(passes, one + jump[:, None] * one[MOTOR], (1 - _GAMMA) / _GAMMA * one)
         by_before = jnp.where(passes, 0.0, 1 - (1 - _GAMMA) / _GAMMA) * one
@@ -434,9 +480,9 @@ def linearise_run(
         lags = lags + jnp.outer(by_rate.end, current) + jnp.outer(by_rate.decay, by_decay)
         return places, carries + lags.T @ by_begin, gains, lags
 
-    each = begins, run.ends, run.stages, run.sides, spans, passes, steps
+    each = begins, run.ends, run.stages, rests, run.sides, spans, passes, steps
     places, carries, gains, lags = _of_steps(jax.lax.map(jax.vmap(linear), _in_blocks(each)), len(h))
-    return LinearisedRun(begins, run.ends, places, run.sides, clock, carries, gains, lags)
+    return LinearisedRun(begins, run.ends, places, run.sides, passes, clock, carries, gains, lags)
 
 
 @eqx.filter_custom_jvp

@@ -103,9 +103,9 @@ def without_diode(robot: Robot) -> Robot:
 
 
 def _carried(robot: Robot, conditions: Conditions, state: State, direction: Scalar) -> Signals:
-    """Signals of shafts that turn in `travel_direction`, or are about to, under a standing robot.
+    """Signals of a standing robot whose shafts turn, or are about to turn, in `direction`.
 
-    Movers carry the robot's demand, up to the limit of the ground.
+    Traction equals the robot's demand, clipped to the adhesion limit.
     """
     signals = balances.settled_signals(robot, conditions, state, direction)[0]
     limit = signals.adhesion_limit
@@ -204,29 +204,37 @@ def _about_to_turn(robot: Robot, conditions: Conditions, state: State) -> tuple[
     return _carried(robot, conditions, still, 1.0), _carried(robot, conditions, still, -1.0)
 
 
-def shaft_direction(robot: Robot, conditions: Conditions, state: State) -> Array:
-    """Direction in which shafts and a load that move as one turn, or leave rest, ±1 [-].
+def shaft_direction(robot: Robot, conditions: Conditions, state: State) -> tuple[Array, Array]:
+    """Direction in which shafts and a load that move as one turn, or leave rest, ±1 [-], and time until then [s].
 
     `HELD` if they rest and friction holds them by the test of `firmness`, both now and at the later current at rest.
-    0 if friction holds them only now, so that they are about to leave rest, and their speed is below the resolution
-    of static friction. An imposed speed turns them in any case, 0 if it is 0.
+    If friction holds them only now, they leave rest when the current, which lags exponentially, exceeds it. An
+    imposed speed turns them in any case, 0 if it is 0.
     """
     conditions = balances.commanded(robot, conditions, state)
     motor_speed, load = jnp.asarray(state.speed_motor), robot.chassis(conditions.configuration)
     slow = jnp.abs(motor_speed) * load.radius / robot.gearbox.ratio < load.speed_still
+    at_once = jnp.zeros_like(motor_speed)
     if conditions.motor_speed is not None:
         change = jnp.asarray(0.0 if conditions.motor_acceleration is None else conditions.motor_acceleration)
-        return jnp.where(slow & (change == 0), 0.0, jnp.sign(jnp.where(motor_speed == 0, change, motor_speed)))
+        way = jnp.where(slow & (change == 0), 0.0, jnp.sign(jnp.where(motor_speed == 0, change, motor_speed)))
+        return way, at_once
 
-    def leaving(robot: Robot, conditions: Conditions, state: State) -> Array:
+    def leaving(robot: Robot, conditions: Conditions, state: State) -> tuple[Array, Array]:
         settled = dataclasses.replace(state, current=current_at_rest(robot, conditions, state))
         now, then = (_about_to_turn(robot, conditions, state_there) for state_there in (state, settled))
         turned, later = (1.0 * (ahead.torque_net > 0) - 1.0 * (back.torque_net < 0) for ahead, back in (now, then))
-        stands, moved = state.speed_motor == 0, jnp.sign(state.speed_motor)
-        held = jnp.where(later != 0, 0.0, jnp.where(stands, HELD, moved))
-        return jnp.where(turned == 0, held, jnp.where(stands, turned, moved))
+        lacks, exceeds = (jnp.where(later > 0, ahead.torque_net, -back.torque_net) for ahead, back in (now, then))
+        winding = balances.driven_signals(robot, conditions, _still(state), None)
+        rises, missing = winding.voltage_left / winding.inductance, settled.current - state.current
+        waits = (turned == 0) & (later != 0) & (rises * missing > 0)
+        share = jnp.where(waits, -lacks / jnp.where(waits, exceeds - lacks, 1.0), 0.0)
+        wait = -jnp.log1p(-share) * missing / jnp.where(waits, rises, 1.0)
+        way = jnp.where(turned != 0, turned, jnp.where(later != 0, later, HELD))
+        stands = state.speed_motor == 0
+        return jnp.where(stands, way, jnp.sign(state.speed_motor)), jnp.where(stands & waits, wait, 0.0)
 
-    return compute_rarely(slow, leaving, (robot, conditions, state), jnp.sign(motor_speed))
+    return compute_rarely(slow, leaving, (robot, conditions, state), (jnp.sign(motor_speed), at_once))
 
 
 def slides_in_place(robot: Robot, conditions: Conditions) -> Array:

@@ -17,8 +17,8 @@ class Controller(eqx.Module):
     D = K_p e + K_i ∫ e dt - K_d dx/dt + K_f g, with e = g - x, |D| <= D_max. While D is at the limit, an error that
     drives it further is not integrated. x is the angle or the speed of the output, or the current of the motor. dx/dt
     acts where x is an angle, K_f g where it is not. The duty follows D with a lag. A controller that samples with a
-    period T and holds its duty is approximated by a lag of T / 2 and a goal T / 2 earlier (`Rig.delay`). If it acts
-    one sample late, the lag is 3 T / 2.
+    period T and holds its duty is approximated by a lag of T / 2. Its goal is then T / 2 earlier (`Rig.delay`). If it
+    acts one sample late, the lag is 3 T / 2.
 
     Attributes:
         lags: True if the lag is more than 0, so that the duty is a state.

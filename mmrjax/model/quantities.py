@@ -14,7 +14,7 @@ import re
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
-#: Words in order.
+#: Names in order, such as those of effects or columns.
 Names = tuple[str, ...]
 
 DEG = math.pi / 180  # rad
@@ -140,7 +140,7 @@ class Quantity:
 
     @functools.cached_property
     def sizes(self) -> dict[str, float]:
-        """SI value of each unit that its columns may state, its own first. No slope in per cent."""
+        """SI value of each unit that its column names may state, its own unit first. Slopes cannot be in per cent."""
         alike: Mapping[str, float] = next((units for units in DIMENSIONS if self.unit in units), {})
         share = {PERCENT: 1e-2} if self.percent and self.unit != "deg" else {}
         return {self.unit: self.factor} | {u: size for u, size in alike.items() if u != self.unit} | share
@@ -210,7 +210,7 @@ class Condition(Quantity):
 
     @functools.cached_property
     def sizes(self) -> dict[str, float]:
-        """SI value of each unit that its columns may state. Of its own alone if no file may state it."""
+        """SI value of each unit that its columns may state. Only its own unit if no file may hold it."""
         return super().sizes if self.in_tables or self.in_profiles else {self.unit: self.factor}
 
 

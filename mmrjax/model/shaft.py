@@ -13,6 +13,9 @@ from mmrjax.model.params import Scalar, parameter
 _STATED = "stated by the owner of the rig"
 #: Flanks in contact: natural frequency of the two sides [Hz], and damping ratio [-].
 MESH_FREQUENCY, MESH_DAMPING = 150.0, 0.4
+_MESH = 2 * math.pi * MESH_FREQUENCY
+#: Stiffness and damping of flanks in contact, per reduced inertia of the two sides [1/s²], [1/s].
+FLANK_STIFFNESS, FLANK_DAMPING = _MESH**2, 2 * MESH_DAMPING * _MESH
 
 
 class Shaft(eqx.Module):
@@ -113,10 +116,9 @@ class Shaft(eqx.Module):
             inertia_motor: of the motor side at the output [kg·m²].
         """
         inertia = inertia_motor * self.inertia / (inertia_motor + self.inertia)
-        omega = 2 * jnp.pi * MESH_FREQUENCY
         elastic = jnp.asarray(self.stiffness) > 0
-        stiffness = jnp.where(elastic, self.stiffness, omega**2 * inertia)
-        damping = jnp.where(elastic, self.damping, 2 * MESH_DAMPING * omega * inertia) * closing
+        stiffness = jnp.where(elastic, self.stiffness, FLANK_STIFFNESS * inertia)
+        damping = jnp.where(elastic, self.damping, FLANK_DAMPING * inertia) * closing
         ahead = jnp.maximum(gap - 0.5 * self.backlash, 0.0)
         behind = jnp.minimum(gap + 0.5 * self.backlash, 0.0)
         # Damping sets in over a tenth of the backlash, so that the torque is continuous at contact.

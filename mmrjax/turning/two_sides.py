@@ -214,7 +214,10 @@ def law_moments(law: Law, sliding: Pair, middle: Scalar, end: Scalar) -> Float[A
 
 @law_moments.def_jvp
 def _moments_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
-    """Tangents in closed form for the speeds, once for all directions. As computed for the law's own numbers."""
+    """Derivatives in closed form with respect to the speeds, evaluated once for all tangent directions.
+
+    Derivatives with respect to the law's parameters are left to JAX.
+    """
     law, sliding, middle, end = primals
     across = middle + end * law.places()
     along = sliding[:, None] ** 2

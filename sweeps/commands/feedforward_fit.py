@@ -84,7 +84,7 @@ def drive_log(runs: Runs, unit: str | None = None, as_logged: bool = False) -> D
     size = 2 * np.pi if as_logged else UNITS[unit] or 1.0
     if not runs.sampled:
         raise BadData(f"{runs.source}: has no time; expected a column time_s")
-    order = np.concatenate([runs.in_order(name) for name in dict.fromkeys(runs.run_names.tolist())])
+    order = np.concatenate(list(runs.rows_by_run().values()))
     duty = runs["duty"] if runs.has("duty") else 1.0
     voltage = np.asarray(runs["supply_voltage_V"] * duty, float)
 

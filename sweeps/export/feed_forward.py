@@ -15,8 +15,8 @@ from calibration.data import Columns, Json, Names
 from calibration.data.writing import table_text
 from mmrjax import __version__
 from mmrjax.errors import printable
-from sweeps.export import jax_actuator
-from sweeps.export.comparison import APPROXIMATED, HELD, Fate
+from sweeps.export import jax_actuator, mujoco
+from sweeps.export.comparison import APPROXIMATED, DROPPED, HELD, Fate
 from sweeps.export.joint import Joint
 from sweeps.export.law_source import Constant, jax_source, module_from_source
 from sweeps.export.situation import Situation
@@ -132,9 +132,8 @@ def law_of(situation: Situation, constants: Sequence[Constant]) -> Any:
     return law
 
 
-def fates_in_tables(situation: Situation, constants: Sequence[Constant]) -> list[Fate]:
+def fates_in_tables(joint: Joint, constants: Sequence[Constant]) -> list[Fate]:
     """Fates of the base's terms, and of effects outside the joint."""
-    joint = situation.joint
     fates = [
         f
         for f in jax_actuator.fates_in_actuator(joint)
@@ -146,6 +145,12 @@ def fates_in_tables(situation: Situation, constants: Sequence[Constant]) -> list
         if fate.name == "friction by the joint's surroundings":
             values = ", ".join(f"{n.removeprefix('surroundings.')} = {means[n]:.4g}" for n in joint.surroundings())
             changed.append(Fate(fate.name, APPROXIMATED, f"their mean over the runs: {values}"))
+        elif fate.name == mujoco.PLAY:
+            play, twist = float(joint.load.backlash), float(joint.load.twist(1.0))
+            how = f"tables have no state: {play:.3g} rad of play and {twist:.3g} rad/(N·m) of twist"
+            changed.append(Fate(fate.name, DROPPED, how))
+        elif fate.name == mujoco.CONTROLLER:
+            changed.append(Fate(fate.name, DROPPED, "tables give the voltage that it would find"))
         else:
             changed.append(Fate(fate.name, fate.verdict, fate.how.replace("functions of the law", "the tables")))
     how = "no table: add (armature) · acceleration to the torque"

@@ -6,14 +6,18 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
-from calibration.data.input_errors import BadConfiguration, allowed_words
+from calibration.data.input_errors import BadConfiguration, stated_word
 from calibration.data.posterior_file import Posterior
 from calibration.data.robot_file import RobotFile
 from calibration.data.runs import Runs
 from mmrjax.compile.precision import in_double
 from mmrjax.errors import count_noun
+from mmrjax.fidelities.drive import drive_batch
+from mmrjax.model.conditions import Conditions
 from sweeps.export import comparison, feed_forward, jax_actuator, law_source, mujoco, onnx, randomization
 from sweeps.export.comparison import Comparison, Fate
 from sweeps.export.joint import Joint, joint_of_robot
@@ -29,6 +33,8 @@ FORMATS = {
     "table": "feed-forward and efficiency maps, as CSV and as a C header",
     "randomization": "draws of the posterior in the parameters of MuJoCo and of the actuator",
 }
+#: Goal of a start in MuJoCo [rad], and its length [s].
+GOAL, START = 0.5, 0.5
 #: Most runs that are checked in MuJoCo C.
 CHECKED = 12
 
@@ -81,15 +87,14 @@ def export_format(
     Raises:
         BadConfiguration, BadData: a format, a drive or a table that is refused.
     """
-    if to not in FORMATS:
-        raise BadConfiguration(f"--to: got {to}; {allowed_words(to, FORMATS)}")
+    stated_word(to, FORMATS, "--to")
     if not at.isprintable() or not at or any(c in at for c in "\"'<>&"):
         raise BadConfiguration(f"--joint: got {at!r}; expected the name of a joint, without quotes and brackets")
     if to in ("mujoco", "randomization"):
         mujoco.mujoco_module()
     drive = joint_of_robot(file, configuration)
     posterior = posterior_of(drive) if posterior is None else posterior
-    runs = situation_of_joint(drive, data)
+    runs = situation_of_joint(drive.steady, data)
     constants = constants_of(drive, runs.signals, posterior)
     make = {
         "mujoco": _mujoco, "randomization": _mujoco, "table": _table, "jax": _actuator, "onnx": _actuator,
@@ -121,11 +126,20 @@ def _mujoco(begun: Export, runs: Situation, at: str, draws: int, seed: int) -> E
     mass = float(np.mean(np.asarray(runs.signals.mass)))
     volts = float(drive.robot.motor.voltage_limit or np.max(np.abs(runs.command)))
     middle = (float(np.mean(runs.command)), float(np.mean(runs.load)))
-    texts = {
-        "drive.xml": mujoco.mjcf_fragment(drive, motor, about, notes_of(runs), name, at, volts),
-        "scene.xml": mujoco.mjcf_scene(drive, mass, name, at, *middle),
-    }
-    checks = _checked(texts, motor, runs, compared)
+    follows = drive.robot.rig.imposed == "goal_angle"
+
+    def texts_of(drive: Joint) -> dict[str, str]:
+        return {
+            "drive.xml": mujoco.mjcf_fragment(drive, motor, about, notes_of(runs), name, at, volts),
+            "scene.xml": mujoco.mjcf_scene(
+                drive, mass, name, at, *((GOAL * motor.ratio, 0.0) if follows else middle)
+            ),
+        }
+
+    texts = texts_of(drive)
+    checks = _checked(texts_of(drive.steady), motor, runs, compared)
+    if follows or (drive.loose and drive.controller is None):
+        checks |= _followed(drive, texts, GOAL if follows else volts, motor.ratio if follows else 1.0)
     files: Mapping[str, str | bytes] = texts
     if begun.format == "randomization":
         values = randomization.draw_parameters(
@@ -154,6 +168,18 @@ def _checked(texts: Mapping[str, str], motor: mujoco.Motor, runs: Situation, fou
     }
 
 
+def _followed(drive: Joint, texts: Mapping[str, str], command: float, ratio: float) -> dict[str, float]:
+    """Difference of MuJoCo C from the native model over the start of a constant goal [rad] or voltage [V] at rest."""
+    times = np.linspace(0.0, START, 26)
+    own = drive.controller
+    given = Conditions(voltage=command) if own is None else Conditions(voltage=own.supply_voltage, goal=command)
+    run = drive_batch(drive.robot, jax.tree.map(lambda x: jnp.asarray(x, float)[None], given), jnp.asarray(times))
+    native = np.asarray(run.signals.angle)[0]
+    got = mujoco.angles_in_mujoco(texts, command * ratio, times)
+    share = 100 * float(np.sqrt(np.mean((got - native) ** 2)) / np.sqrt(np.mean(native**2)))
+    return {f"angle over {START:g} s from rest, MuJoCo C against native [%]": share}
+
+
 def _actuator(begun: Export, runs: Situation, at: str, draws: int, seed: int) -> Export:
     drive, constants, notes = begun.joint, begun.constants, notes_of(runs)
     law, held = jax_actuator.law_of(runs, constants), jax_actuator.effects_in_actuator(drive)
@@ -177,7 +203,7 @@ def _actuator(begun: Export, runs: Situation, at: str, draws: int, seed: int) ->
 def _table(begun: Export, runs: Situation, at: str, draws: int, seed: int) -> Export:
     drive, constants = begun.joint, begun.constants
     law, held = feed_forward.law_of(runs, constants), feed_forward.effects_in_tables(drive)
-    fates: list[Fate] = feed_forward.fates_in_tables(runs, constants)
+    fates: list[Fate] = feed_forward.fates_in_tables(drive, constants)
     compared = comparison.compare_format(runs, law, fates, held, mujoco.approximated_terms)
     files = feed_forward.table_files(drive, feed_forward.map_of(runs, constants), notes_of(runs))
     return dataclasses.replace(begun, files=files, comparison=compared)

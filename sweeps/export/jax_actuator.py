@@ -16,7 +16,7 @@ from calibration.data import Json, Names
 from sweeps.export.comparison import DROPPED, HELD, Fate
 from sweeps.export.joint import Joint, memory_grows
 from sweeps.export.law_source import Constant, constant_values, jax_source, module_from_source
-from sweeps.export.mujoco import fates_outside_joint
+from sweeps.export.mujoco import CONTROLLER, PLAY, fates_outside_joint
 from sweeps.export.situation import Situation
 
 #: Steps of a run to its steady state, and their length [s]: of an implicit step so long, Newton's method is left.
@@ -106,8 +106,10 @@ def fates_in_actuator(joint: Joint) -> list[Fate]:
     if robot.has_ground:
         how = "the simulator's own contact with the ground"
         fates.append(Fate("ground: slip and rolling resistance", DROPPED, how))
-    if robot.loose:
-        fates.append(Fate("backlash and elasticity", DROPPED, "the joint is rigid; it needs a second body"))
+    if joint.loose:
+        fates.append(Fate(PLAY, HELD, "states of the law: gap, and speed of the motor's side"))
+    if joint.controller is not None:
+        fates.append(Fate(CONTROLLER, HELD, "functions of the law; the command is its goal"))
     if joint.limit is not None:
         fates.append(Fate("current limit of the driver", HELD, "a bound of the current"))
     return [*fates, *fates_outside_joint(joint)]

@@ -17,6 +17,7 @@ from calibration.data.robot_file import RobotFile
 from mmrjax.effects import Effect
 from mmrjax.model import balances, contact, params
 from mmrjax.model.channels import EVERY
+from mmrjax.model.controller import Controller
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import Signals
 from sweeps.export.expressions import ZERO, Symbol, names_of, trace_function
@@ -111,14 +112,45 @@ class Joint:
         return tuple(p for p in self.parts if p.rate is not None)
 
     @property
+    def loose(self) -> bool:
+        """True if the load turns apart from the motor, by a backlash or an elastic joint."""
+        return self.robot.loose
+
+    @property
+    def controller(self) -> Controller | None:
+        """Controller of its motor."""
+        return self.robot.controller
+
+    @property
     def accelerates(self) -> bool:
         """True if a loss depends on the torque at gearbox or wheel, which what turns before them takes a share of."""
-        return any(p.by for p in (*self.of("gearbox"), *self.of("track")))
+        return any(p.by for p in (*(() if self.loose else self.of("gearbox")), *self.of("track")))
+
+    @property
+    def controller_states(self) -> Names:
+        """Names of the controller's states: the integral of its error, and the duty if it lags."""
+        return ("integral", "duty")[: self.robot.controller_size]
 
     @property
     def states(self) -> Names:
-        """Names of the actuator's state: the current, memories of effects, and the speed one step before."""
-        return ("current", *(p.name for p in self.remembering), *(("speed",) * self.accelerates))
+        """Names of the actuator's state: current, memories, controller, motor side, and the speed one step before."""
+        motor_side = ("gap", "rotor_speed") * self.loose
+        memories = (p.name for p in self.remembering)
+        return ("current", *memories, *self.controller_states, *motor_side, *(("speed",) * self.accelerates))
+
+    @property
+    def steady(self) -> Joint:
+        """The same joint in steady travel under a voltage, without the controller and with a rigid gearbox."""
+
+        def driven(robot: Robot) -> Robot:
+            motor, own = robot.motor, robot.controller
+            if own is not None and motor.voltage_limit is None:
+                motor = dataclasses.replace(motor, voltage_limit=float(own.supply_voltage * own.limit))
+            rig = dataclasses.replace(robot.rig, imposed="voltage", loose=False)
+            return dataclasses.replace(robot, motor=motor, rig=rig, controller=None)
+
+        file = dataclasses.replace(self.file, robot=driven(self.file.robot))
+        return dataclasses.replace(self, file=file, robot=driven(self.robot))
 
     def of(self, balance: str) -> tuple[Part, ...]:
         """Parts of a balance, in order."""
@@ -134,7 +166,9 @@ class Joint:
         used = [n for part in self.parts for n in names_of(*_symbols(part))]
         further = ["gearbox.ratio", "motor.inertia", "gearbox.efficiency_load"]
         further += ["driver.current_limit"] * (self.limit is not None)
-        further += [f"{self.configuration}.inertia"] * self.accelerates
+        further += [f"{self.configuration}.inertia"] * (self.accelerates or self.loose)
+        further += [f"{self.configuration}.{n}" for n in ("backlash", "stiffness", "damping")] * self.loose
+        further += [n for n in by_name if n.startswith("controller.")]
         return {n: by_name[n] for n in dict.fromkeys((*further, *used)) if n in by_name}
 
     def surroundings(self) -> Names:
@@ -169,11 +203,16 @@ def joint_of_robot(file: RobotFile, configuration: str | None = None) -> Joint:
             f"{file.name}: {', '.join(robot.unlike)} makes its sides differ, and one joint has one drive; expected a "
             "robot with identical sides: export a robot file of each side, without this effect"
         )
-    if robot.rig.imposed != "voltage":
+    if robot.controller is not None and not robot.controller.supply_voltage:
+        raise BadConfiguration(
+            f"{file.name}, controller.supply_voltage: missing, and an exported controller gives its motor a share of "
+            "it; state it [V]"
+        )
+    if robot.rig.imposed != "voltage" and robot.controller is None:
         what = robot.rig.imposed.replace("_", " ")
         raise BadConfiguration(
-            f"{file.name}, [rig] imposed: got {robot.rig.imposed}; expected voltage, the command of an exported "
-            f"drive. Where the {what} is imposed, the runs tell nothing about the winding"
+            f"{file.name}, [rig] imposed: got {robot.rig.imposed}; expected voltage or a goal, the command of an "
+            f"exported drive. Where the {what} is imposed, the runs tell nothing about the winding"
         )
     if lacking := [n for n in ("motor.resistance", "motor.torque_constant") if n in robot.rig.unknown]:
         raise BadConfiguration(f"{file.name}: {', '.join(lacking)} is missing, and a drive's law needs it; state it")

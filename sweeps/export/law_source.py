@@ -21,6 +21,7 @@ from mmrjax.errors import printable
 from mmrjax.model import quantities
 from mmrjax.model.balances import TORQUE_STEPS
 from mmrjax.model.params import Parameter
+from mmrjax.model.shaft import FLANK_DAMPING, FLANK_STIFFNESS
 from mmrjax.model.signals import Signals
 from sweeps.export.expressions import JAX, TORCH, Dialect, Symbol, lines_of, names_of
 from sweeps.export.joint import VARIABLES, Joint, Part, mean_surroundings
@@ -67,6 +68,9 @@ def constants_of(joint: Joint, signals: Signals, posterior: Posterior | None) ->
             word, condition.label if condition else word.replace("_", " ")
         )
         constants.append(Constant(name, mean, unit, meaning, "mean over the compared runs"))
+    if joint.controller is not None:
+        volts = joint.controller.supply_voltage
+        constants.append(Constant(SUPPLY, volts, "V", "supply of the driver", "stated by the owner of the actuator"))
     return tuple(constants)
 
 
@@ -92,6 +96,8 @@ def _interval(
     return max(value - 2 * sd, low), min(value + 2 * sd, high), kind
 
 
+#: Name of the constant of a controller's supply.
+SUPPLY = "controller.supply_voltage"
 _ARGUMENTS = (*VARIABLES, "load", "pull")
 
 
@@ -214,7 +220,9 @@ def step_lines(joint: Joint, library: _Library) -> list[str]:
     later = {p.name: f'memory["{p.name}"]' for p in joint.remembering}
     through = "(load + rotor)" if joint.accelerates else "load"
     lines = [
-        "p, voltage, angle, wheel_speed = params, command, joint_position, joint_velocity",
+        "p, angle, wheel_speed = params, joint_position, "
+        + ('state["rotor_speed"]  # of the motor\'s side' if joint.loose else "joint_velocity"),
+        *(["voltage = command"] if joint.controller is None else _controller_lines(joint, library)),
         'motor_speed = p["gearbox.ratio"] * wheel_speed',
         f"way = {call_text(joint.of('way')[0])}",
         "# Current of the winding: L dI/dt = U - E - U_R - ..., one implicit Euler step, linear in the current.",
@@ -228,6 +236,7 @@ def step_lines(joint: Joint, library: _Library) -> list[str]:
             f"current = {library.clipped('current', 'p[' + chr(34) + 'driver.current_limit' + chr(34) + ']')}"
         )
     lines.append('memory = {"current": current}')
+    lines += [f'memory["{name}"] = {name}' for name in joint.controller_states]
     if joint.remembering:
         lines.append("# Memories: one implicit Euler step each.")
     lines += [
@@ -242,17 +251,107 @@ def step_lines(joint: Joint, library: _Library) -> list[str]:
         f"made = {call_text(joint.of('torque')[0])}",
         f"at_shaft = made - ({_sum(joint.of('motor'), '', later)})",
         f"load = at_shaft - {call_text(joint.of('idle')[0])}",
-        f'through = p["gearbox.ratio"] * {call_text(joint.of("efficiency")[0])} * load',
+    ]
+    if joint.loose:
+        lines += _play_lines(joint, library, _sum(gear, "", later))
+    else:
+        lines.append(f'through = p["gearbox.ratio"] * {call_text(joint.of("efficiency")[0])} * load')
+    lines += [
         *(_inertia_lines(joint) if joint.accelerates else ()),
-        *_solved("load", "through - rotor" if joint.accelerates else "through", gear, later),
+        *([] if joint.loose else _solved("load", "through - rotor" if joint.accelerates else "through", gear, later)),
         *_solved("pull", "load - wheel" if joint.accelerates else "load", track, later),
         'info = {"current": current, "voltage": voltage, "motor_speed": motor_speed, "power": voltage * current,',
         '        "lost_winding": lost * current, "lost_motor": (made - at_shaft) * motor_speed,',
-        f'        "lost_gearbox": at_shaft * motor_speed - {through} * wheel_speed,',
+        '        "lost_gearbox": lost_gearbox,'
+        if joint.loose
+        else f'        "lost_gearbox": at_shaft * motor_speed - {through} * wheel_speed,',
         f'        "lost_output": (load{" - wheel" * joint.accelerates} - pull) * wheel_speed}}',
         f"return pull{' + wheel + rotor' * joint.accelerates}, memory, info",
     ]
     return lines
+
+
+def _controller_lines(joint: Joint, library: _Library) -> list[str]:
+    """Lines of the controller: the voltage for a goal, and the states after the step."""
+    imposed, own, prefix = joint.robot.rig.imposed, joint.controller, library.dialect.prefix
+    assert own is not None
+    shown = {"goal_angle": "angle", "goal_speed": "joint_velocity", "goal_current": 'state["current"]'}[imposed]
+    last = (
+        '- p["controller.kd"] * joint_velocity'
+        if imposed == "goal_angle"
+        else '+ p["controller.feed_forward"] * command'
+    )
+    limit = 'p["controller.limit"]'
+    return [
+        "# Controller: share of the supply's voltage. At its limit, it integrates no error that drives it further.",
+        f"error = command - {shown}",
+        f'wanted = p["controller.kp"] * error + p["controller.ki"] * state["integral"] {last}',
+        f"demanded = {library.clipped('wanted', limit)}",
+        f'integral = state["integral"] + dt * {prefix}.where(({prefix}.abs(demanded) >= {limit}) & '
+        f"(demanded * error > 0), 0.0 * error, error)",
+        *(
+            [
+                'duty = state["duty"] + (demanded - state["duty"]) * dt / (p["controller.lag"] + dt)',
+                f'voltage = p["{SUPPLY}"] * duty',
+            ]
+            if own.lags
+            else [f'voltage = p["{SUPPLY}"] * demanded']
+        ),
+    ]
+
+
+def _play_lines(joint: Joint, library: _Library, lost: str) -> list[str]:
+    """Lines of the torque between motor and load (`Shaft.torque_joint`), one implicit Euler step of the motor's side.
+
+    Args:
+        lost: text of what effects of the gearbox lose.
+    """
+    value = lambda name: f"p[{quoted(f'{joint.configuration}.{name}')}]"  # noqa: E731
+    if joint.load.stiffness > 0:
+        elastic = [f"stiffness, damping = {value('stiffness')}, {value('damping')}"]
+    else:
+        elastic = [
+            f"reduced = inertia * {value('inertia')} / (inertia + {value('inertia')})",
+            f"stiffness, damping = {FLANK_STIFFNESS!r} * reduced, {FLANK_DAMPING!r} * reduced  # of flanks",
+        ]
+    lines = [
+        "# Motor and load are two bodies: the torque that flanks or an elastic joint carry between them.",
+        f"inertia = {_TURNING}",
+        *elastic,
+        "closing = wheel_speed - joint_velocity",
+        'gap = state["gap"] + dt * closing  # which opened or closed it within the last step',
+        "later = gap + dt * closing",
+    ]
+    carried = (
+        "stiffness * beyond + damping * closing"
+        if joint.load.backlash > 0
+        else "stiffness * later + damping * closing"
+    )
+    if joint.load.backlash > 0:
+        prefix = library.dialect.prefix
+        lines += [
+            f"half = 0.5 * {value('backlash')}",
+            f"beyond = later - {library.clipped('later', 'half')}",
+            # As in the model, damping sets in over a tenth of the backlash, and flanks never pull.
+            f"share = {library.clipped(f'{prefix}.abs(beyond) / (0.2 * half + 1e-4)', '1.0')}",
+            f"stiffness, damping = {prefix}.where(beyond != 0, stiffness, 0.0 * stiffness), share * damping",
+        ]
+        carried = f"{prefix}.where(beyond > 0, {library.positive(carried)}, -{library.positive(f'-({carried})')})"
+    ratio, idle = 'p["gearbox.ratio"]', call_text(joint.of("idle")[0])
+    return [
+        *lines,
+        f"drive = {ratio} * load",
+        f"load = {carried}",
+        f"passed = {call_text(joint.of('efficiency')[0])}",
+        f"lost_gear = {lost}",
+        f"lost_gearbox = ({ratio} * {idle} + (1.0 / passed - 1.0) * load + lost_gear) * wheel_speed",
+        "give = (dt * stiffness + damping) / passed",
+        "turning = dt * (drive - load / passed - lost_gear) / (inertia + dt * give)",
+        "load = load + passed * give * turning",
+        'memory["gap"], memory["rotor_speed"] = gap, wheel_speed + turning',
+        "wheel_speed = joint_velocity",
+        f"way = {call_text(joint.of('way')[0])}",
+    ]
 
 
 def _inertia_lines(joint: Joint) -> list[str]:
@@ -262,13 +361,14 @@ def _inertia_lines(joint: Joint) -> list[str]:
         "# Torques that accelerate rotor and wheel, by the acceleration of the last step.",
         'acceleration = (wheel_speed - state["speed"]) / dt',
         'memory["speed"] = wheel_speed',
-        f"rotor = {_ROTOR} * acceleration",
+        f"rotor = {'0.0' if joint.loose else _ROTOR} * acceleration",
         f"wheel = ({' + '.join(wheel)}) * acceleration",
     ]
 
 
-#: Inertia of the rotor at the joint.
-_ROTOR = 'p["motor.inertia"] * p["gearbox.ratio"] ** 2 * p["gearbox.efficiency_load"]'
+#: Inertia of the rotor at the output, and at the joint as the gear's efficiency lets the load see it.
+_TURNING = 'p["motor.inertia"] * p["gearbox.ratio"] ** 2'
+_ROTOR = f'{_TURNING} * p["gearbox.efficiency_load"]'
 
 
 def _solved(name: str, given: str, parts: Sequence[Part], later: Mapping[str, str]) -> list[str]:
@@ -308,7 +408,7 @@ _DOCUMENT = '''"""One step of the drive: torque at the joint, state after the st
     Args:
         params: `PARAMS`, or with other numbers; each may be an array of the joint's shape.
         state: from `initial_state` or the step before.
-        command: voltage at the driver's output [V]: its duty times the voltage of the supply.
+        command: {command}.
         joint_position: [rad]; joint_velocity: [rad/s], of the wheel or output shaft.
         dt: length of the step [s].
 
@@ -336,6 +436,16 @@ def _source(joint: Joint, constants: Sequence[Constant], library: _Library, what
     moving = (
         "" if not joint.accelerates else ", and the joint's speed one step before [rad/s]: set it if the joint moves"
     )
+    if joint.loose:
+        moving = (
+            ", gap between motor and load [rad] and speed of the motor's side [rad/s]: set this if the joint moves"
+        )
+    goals = {"goal_angle": "angle [rad]", "goal_speed": "speed [rad/s]", "goal_current": "current [A]"}
+    goal = goals.get(joint.robot.rig.imposed)
+    volts = "voltage at the driver's output [V]: its duty times the voltage of the supply"
+    document = _DOCUMENT.replace("{command}", f"goal of the controller: {goal}" if goal else volts)
+    rotor = '0.0 * p["motor.inertia"]' if joint.loose else _ROTOR
+    own = "The motor turns apart" if joint.loose else "Inertia of the rotor at the joint, J i² η"
     added = "".join(f" + {call_text(p)}" for p in joint.of("inertia"))
     body = textwrap.indent("\n".join(step_lines(joint, library)), "    ")
     zero = "jnp.zeros(shape)" if library.dialect is JAX else "torch.zeros(shape, device=device)"
@@ -344,15 +454,15 @@ def _source(joint: Joint, constants: Sequence[Constant], library: _Library, what
         f"{_header(joint, what, notes)}\n{library.imports}\n\n{constants_text(constants)}\n\n\n"
         f"{functions_text(joint, library.dialect)}\n\n\n"
         f"def armature(params):\n"
-        f'    """Inertia of the rotor at the joint, J i² η, for the joint\'s own armature [kg·m²]."""\n'
+        f'    """{own}, for the joint\'s own armature [kg·m²]."""\n'
         f"    p = params\n"
-        f"    return {_ROTOR}{added}\n\n\n"
+        f"    return {rotor}{added}\n\n\n"
         f"def initial_state({given}):\n"
         f'    """State at rest: current [A], memories of effects{moving}."""\n'
         f"    zero = {zero}\n"
         f"    return {{{states}}}\n\n\n"
         f"def actuator(params, state, command, joint_position, joint_velocity, dt):\n"
-        f"    {_DOCUMENT}\n{body}\n"
+        f"    {document}\n{body}\n"
     )
 
 

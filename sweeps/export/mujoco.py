@@ -19,6 +19,7 @@ from calibration.data.input_errors import BadConfiguration
 from mmrjax import __version__
 from mmrjax.errors import printable
 from mmrjax.model.chassis import inertia_reduced
+from mmrjax.model.shaft import FLANK_DAMPING, FLANK_STIFFNESS
 from sweeps.export.comparison import APPROXIMATED, DROPPED, HELD, Fate
 from sweeps.export.joint import Joint
 from sweeps.export.law_source import Constant
@@ -49,6 +50,10 @@ YIELD = 0.02
 LEAST_SHARE = 0.05
 #: Fixed-point steps of heat and falling friction.
 STEPS = 12
+#: Names of what is no effect.
+PLAY, CONTROLLER = "backlash and elasticity", "controller"
+#: Impedance of a tendon's limit: so low that the limit is a spring and a damper, which adds to other torques.
+IMPEDANCE = 1e-3
 #: Names of the format's parameters.
 RESISTANCE, CONSTANT, FRICTION, DAMPING, SHARE = (
     "resistance", "motorconst", "frictionloss", "damping", "current over act",
@@ -183,11 +188,26 @@ def fates_in_mujoco(joint: Joint, normal: float) -> list[Fate]:
         fates.append(
             Fate("ground: slip and rolling resistance", DROPPED, "the simulator's own contact with the ground")
         )
-    if robot.loose:
-        fates.append(Fate("backlash and elasticity", DROPPED, "the joint is rigid; a format needs a second body"))
+    if joint.loose:
+        how = "a joint for the motor's side, and a tendon between both with a range or a stiffness"
+        fates.append(Fate(PLAY, HELD, how))
+    if own := joint.controller:
+        fates.append(_controller_fate(joint, float(own.lag), float(own.ki)))
     if joint.limit is not None:
         fates.append(Fate("current limit of the driver", HELD, "forcerange"))
     return [*fates, *fates_outside_joint(joint)]
+
+
+def _controller_fate(joint: Joint, lag: float, ki: float) -> Fate:
+    """Fate of a controller in `<dcmotor>`, whose own follows the motor's angle, at once, with a limited integral."""
+    imposed = joint.robot.rig.imposed
+    if imposed != "goal_angle":
+        how = f"<dcmotor> follows no {imposed.replace('_', ' ')} with such gains: LAW.md has them, give it voltages"
+        return Fate(CONTROLLER, DROPPED, how)
+    lost = [f"its lag of {lag:g} s is dropped"] * (lag > 0)
+    lost += ["its integral stops at a value, not where the duty is at its limit"] * (ki > 0)
+    lost += ["it reads the motor's side of the play"] * joint.loose
+    return Fate(CONTROLLER, APPROXIMATED if lost else HELD, "; ".join(["gains and limit of voltage", *lost]))
 
 
 def fates_outside_joint(joint: Joint) -> list[Fate]:
@@ -213,6 +233,7 @@ class Motor:
     Attributes:
         values: refitted parameters by name [SI].
         ratio, inductance, armature: [-], [H], [kg·m²].
+        added: inertia that effects add to the joint, part of the armature [kg·m²].
         thermal, lugre, cogging: attributes of `<dcmotor>`, at the motor's shaft, empty where it has none.
         limit: largest torque of the motor by its driver's limit [N·m]. None: no limit.
     """
@@ -221,6 +242,7 @@ class Motor:
     ratio: float
     inductance: float
     armature: float
+    added: float = 0.0
     thermal: tuple[float, ...] = ()
     lugre: tuple[float, ...] = ()
     cogging: tuple[float, ...] = ()
@@ -260,11 +282,56 @@ def mjcf_motor(joint: Joint, values: Mapping[str, float]) -> Motor:
         else ()
     )
     limit = None if joint.limit is None else values[CONSTANT] * joint.limit / values[SHARE]
-    return Motor(values, ratio, inductance, inertia + number("rotating_inertia"), thermal, lugre, cogging, limit)
+    added = number("rotating_inertia")
+    return Motor(values, ratio, inductance, inertia + added, added, thermal, lugre, cogging, limit)
+
+
+def _controller(joint: Joint, found: Motor) -> tuple[float, ...]:
+    """Gains of the controller of `<dcmotor>`: kp, ki, kd of a torque, -, limits of integral and voltage.
+
+    It wants U = (R/K) (kp e + ki ∫ e dt - kd ω_m) + K ω_m, of the motor's angle. Empty: it gets a voltage.
+    """
+    own = joint.controller
+    if own is None or joint.robot.rig.imposed != "goal_angle":
+        return ()
+    constant = found.values[CONSTANT]
+    volts, kp, ki, kd = (own.supply_voltage * float(g) / found.ratio for g in (1.0, own.kp, own.ki, own.kd))
+    torque = constant / found.values[RESISTANCE]
+    most = float(own.limit) * found.ratio / float(own.ki) if ki else 0.0
+    return kp * torque, ki * torque, (kd + constant) * torque, 0.0, most, volts * found.ratio * float(own.limit)
+
+
+def _play(joint: Joint, found: Motor, name: str, at: str) -> str:
+    """Text of the motor's side as a body of its own, and of the tendon between its joint and the load's."""
+    load, motor = joint.load, found.armature - found.added
+    rate = 1 / motor + 1 / (float(load.inertia) + found.added)
+    if load.stiffness > 0:
+        square, damper = float(load.stiffness) * rate, float(load.damping) * rate
+    else:
+        square, damper = FLANK_STIFFNESS, FLANK_DAMPING
+    if load.backlash > 0:
+        half = 0.5 * float(load.backlash)
+        limits = f'limited="true" range="{_digits(-half, half)}" solreflimit="{_digits(-square, -damper)}" '
+        limits += f'solimplimit="{_digits(IMPEDANCE, IMPEDANCE)} 1 0.5 1"'
+    else:
+        limits = (
+            f'stiffness="{_digits(float(load.stiffness))}" damping="{_digits(float(load.damping))}" springlength="0"'
+        )
+    return (
+        f'  <worldbody>\n    <body name="{at}_rotor">\n      <joint name="{at}_rotor" class="{name}_rotor" '
+        'type="hinge"/>\n      <inertial pos="0 0 0" mass="1e-6" diaginertia="1e-12 1e-12 1e-12"/>\n'
+        f'    </body>\n  </worldbody>\n  <tendon>\n    <fixed name="{name}_play" {limits}>\n'
+        f'      <joint joint="{at}_rotor" coef="1"/>\n      <joint joint="{at}" coef="-1"/>\n'
+        "    </fixed>\n  </tendon>\n"
+    )
 
 
 def _digits(*numbers: float) -> str:
     return " ".join(f"{x:.9g}" for x in numbers)
+
+
+#: Command that shows the scene. It has no double hyphen, which an XML comment cannot hold.
+VIEWER = "python -c \"import mujoco.viewer as v; v.launch_from_path('scene.xml')\""
 
 
 def _comment(lines: Sequence[str], indent: str) -> str:
@@ -292,13 +359,17 @@ def mjcf_fragment(
         "thermal": found.thermal, "lugre": found.lugre, "cogging": found.cogging,
     }  # fmt: skip
     limits = f' ctrllimited="false" ctrlrange="{_digits(-volts, volts)}"'
+    if gains := _controller(joint, found):
+        limits = f' input="pos" controller="{_digits(*gains)}"'
     limits += "" if found.limit is None else f' forcelimited="true" forcerange="{_digits(-found.limit, found.limit)}"'
     written = "".join(f' {key}="{_digits(*x)}"' for key, x in attributes.items() if x)
     head = [
         f"Drive of {joint.file.name}, {joint.configuration}. Written by mmrjax {__version__}; MuJoCo {_version()} "
         f"or later.",
         f'In the model: <include file="drive.xml"/> before <worldbody>, and class="{name}" on the joint "{at}".',
-        "Command: voltage at the driver's output [V], its duty times the supply's voltage.",
+        f"Command: goal angle of the motor [rad], {found.ratio:.6g} times that of the joint; MuJoCo 3.17 or later."
+        if gains
+        else "Command: voltage at the driver's output [V], its duty times the supply's voltage.",
         f"Current of the motor [A]: {share:.6g} times the actuator's last activation, or "
         f"{share / v[CONSTANT]:.6g} times its force.",
         *notes,
@@ -306,15 +377,28 @@ def mjcf_fragment(
     about_motor = [
         f"{key}: {about[key]}" for key in ("gear", *(k for k, x in attributes.items() if x)) if key in about
     ]
+    # What turns apart from the motor has the friction of the load; the motor's side has the rest.
+    numbers = [max(found.friction, 0.0), v[DAMPING], found.armature]
+    sides = [("", numbers, at)]
+    if joint.loose:
+        of_load = (joint.load.loss_coulomb, joint.load.loss_viscous, found.added)
+        own = [min(x, float(y)) for x, y in zip(numbers, of_load, strict=True)]
+        sides = [("", own, at), ("_rotor", [a - b for a, b in zip(numbers, own, strict=True)], f"{at}_rotor")]
     return (
         "<mujocoinclude>\n"
         + _comment(head, "  ")
-        + f'  <default>\n    <default class="{name}">\n'
-        + _comment([f"{k}: {about[k]}" for k in ("frictionloss", "damping", "armature")], "      ")
-        + f'      <joint frictionloss="{_digits(max(found.friction, 0.0))}" damping="{_digits(v[DAMPING])}" '
-        f'armature="{_digits(found.armature)}"/>\n    </default>\n  </default>\n  <actuator>\n'
+        + "  <default>\n"
+        + _comment([f"{k}: {about[k]}" for k in ("frictionloss", "damping", "armature")], "    ")
+        + "".join(
+            f'    <default class="{name}{side}">\n      <joint frictionloss="{_digits(dry)}" '
+            f'damping="{_digits(viscous)}" armature="{_digits(inertia)}"/>\n    </default>\n'
+            for side, (dry, viscous, inertia), _ in sides
+        )
+        + "  </default>\n"
+        + (_play(joint, found, name, at) if joint.loose else "")
+        + "  <actuator>\n"
         + _comment(about_motor, "    ")
-        + f'    <dcmotor name="{name}" joint="{at}" gear="{_digits(found.ratio)}"{written}{limits}/>\n'
+        + f'    <dcmotor name="{name}" joint="{sides[-1][2]}" gear="{_digits(found.ratio)}"{written}{limits}/>\n'
         + "  </actuator>\n</mujocoinclude>\n"
     )
 
@@ -331,13 +415,13 @@ def mjcf_scene(joint: Joint, mass: float, name: str, at: str, command: float, lo
 
     Args:
         mass: of the vehicle [kg].
-        command, load: of the key frame `run` [V], [N·m].
+        command, load: of the key frame `run` [V or rad], [N·m].
     """
     moved = joint.load
     if joint.robot.has_ground:
         radius = float(moved.radius)
         inertia = float(moved.inertia) + mass / float(joint.robot.sides) * radius**2
-        head = f"One side of the robot: its wheel, with {mass:.4g} kg / {float(joint.robot.sides):g} rolling along"
+        head = f"One side of the robot: its wheel, carrying 1/{float(joint.robot.sides):g} of {mass:.4g} kg"
         weight, arm, angle = 0.0, radius, 0.0
     else:
         inertia, weight, angle = float(moved.inertia), float(moved.torque_gravity), float(moved.angle_zero)
@@ -345,10 +429,10 @@ def mjcf_scene(joint: Joint, mass: float, name: str, at: str, command: float, lo
     body = _body(inertia, weight, angle)
     return (
         "<mujoco>\n"
-        + _comment([f"{head}. Try: python -m mujoco.viewer --mjcf=scene.xml, key frame run."], "  ")
+        + _comment([f"{head}. Key frame run turns it. Viewer:", VIEWER], "  ")
         + '  <include file="drive.xml"/>\n'
         '  <compiler angle="radian"/>\n'
-        '  <option timestep="0.001" integrator="implicitfast"/>\n'
+        '  <option timestep="' + ("0.0005" if joint.loose else "0.001") + '" integrator="implicitfast"/>\n'
         '  <visual><headlight ambient="0.5 0.5 0.5"/></visual>\n'
         "  <worldbody>\n"
         '    <geom name="floor" type="plane" size="1 1 0.01" pos="0 0 -0.3" rgba="0.9 0.9 0.9 1" contype="0" '
@@ -444,6 +528,27 @@ def mujoco_module() -> Any:
     return found
 
 
+def angles_in_mujoco(
+    files: Mapping[str, str], command: float, times: np.ndarray, timestep: float | None = None
+) -> np.ndarray:
+    """Angles of the joint [rad] at instants after a start from rest in MuJoCo C under a constant control.
+
+    Args:
+        timestep: [s]. None: that of the scene.
+    """
+    assets = {name: text.encode() for name, text in files.items()}
+    mujoco, model = mujoco_module(), mujoco_module().MjModel.from_xml_string(files["scene.xml"], assets)
+    model.opt.timestep = timestep or model.opt.timestep
+    data = mujoco.MjData(model)
+    data.ctrl[0] = command
+    angles = np.zeros(len(times))
+    for k, time in enumerate(times):
+        while data.time < time - 0.5 * model.opt.timestep:
+            mujoco.mj_step(model, data)
+        angles[k] = data.qpos[-1]
+    return angles
+
+
 def settle_in_mujoco(
     files: Mapping[str, str], found: Motor, at: Situation, expected: AtJoint, rows: Sequence[int]
 ) -> AtJoint:
@@ -460,14 +565,14 @@ def settle_in_mujoco(
     data = mujoco.MjData(model)
     current, speed = np.empty(len(rows)), np.empty(len(rows))
     period = model.opt.timestep
-    total = float(model.dof_armature[0] + model.body_inertia[1, 1])
+    total = float(np.sum(model.dof_armature) + np.sum(model.body_inertia[:, 1]))
     turns = found.ratio * found.values[CONSTANT]
     settle = 12 * total * found.values[RESISTANCE] / turns**2
     steps = int(np.clip(settle / period, 500, 20_000))
     for k, row in enumerate(rows):
         mujoco.mj_resetData(model, data)
         data.ctrl[:] = at.command[row], at.load[row]
-        data.qvel[0] = 0.9 * expected.speed[row]
+        data.qvel[:] = 0.9 * expected.speed[row]
         if found.thermal:  # in its settled state, as the steady law
             heat = found.values[RESISTANCE] * (expected.current[row] / found.values[SHARE]) ** 2 * found.thermal[0]
             data.act[0] = heat / (1 - found.thermal[3] * heat)
@@ -476,5 +581,5 @@ def settle_in_mujoco(
         for _ in range(steps):
             mujoco.mj_step(model, data)
         current[k] = found.values[SHARE] * data.act[-1]
-        speed[k] = data.qvel[0]
+        speed[k] = data.qvel[-1]
     return AtJoint(current, speed)

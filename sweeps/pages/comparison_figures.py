@@ -17,6 +17,7 @@ from sweeps.pages.figure_style import (
     BLUE,
     FAINT,
     INK,
+    LOOKS,
     VERMILION,
     axis_label,
     configuration_looks,
@@ -73,7 +74,7 @@ def draw_parity(table: Columns, channels: Sequence[Channel], band: bool = True) 
         axes.set_ylim(*span)
         if not both.any():
             corner_note(axes, "no row has both numbers")
-    if grid[0, 0].get_legend_handles_labels()[0]:
+    if grid[0, 0].get_legend_handles_labels()[0] and len(look) <= LOOKS:
         grid[0, 0].legend(loc="lower right")
     if band:
         corner_note(grid[0, 0], "band: ±5 %")
@@ -130,7 +131,7 @@ def errors_over(
                     axes.set_xticks(levels)
         row[0].set_ylabel(f"{channel.label}\nerror [{channel.unit if in_units else '%'}]")
     for axes in grid[0]:
-        if axes.get_legend_handles_labels()[0]:
+        if axes.get_legend_handles_labels()[0] and len(look) <= LOOKS:
             axes.legend(loc="best")
             break
     return fig

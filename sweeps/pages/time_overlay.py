@@ -135,5 +135,5 @@ def time_overlay(table: Columns, channels: Sequence[Channel], simulated: Mapping
     """
     runs = Runs("a table", {name: table[name] for name in ("run_id", "time_s") if name in table})
     shown_channels = [c for c in channels if np.isfinite(table[c.column]).any()]
-    rows = {str(name): runs.in_order(name) for name in dict.fromkeys(runs.run_names.tolist())}
+    rows = {str(name): ordered for name, ordered in runs.rows_by_run().items()}
     return TimeOverlay(table, shown_channels, simulated, rows)

@@ -21,19 +21,24 @@ from worlds.settled import Sealed, between, remainder, robot_toml, typed
 from worlds.tables import told_apart
 
 IMPOSED = ("voltage", "motor_current", "motor_speed")
+#: What a servo's log states: the goal of its output, which a proportional and derivative controller follows.
+GOAL = "goal_angle"
+#: Share of the supply that the controller of a servo gives at most.
+LIMIT = 0.9
 RUNS, ROWS = 4, 200
 EVERY = (0.005, 0.01, 0.02)  # [s]
 STEP = 1e-4  # [s]; the winding's time constant is 2e-4 s, and the method is stable to 2.7 of them
 REST = 0.01  # of the output, within which friction at an imposed speed is smoothed [rad/s]
 RELATIVE = {
     "resistance": 0.05, "torque_constant": 0.03, "friction": 0.3, "viscous": 0.3, "efficiency": 0.04,
-    "rotor": 0.1, "inertia": 0.2, "dry": 0.3, "damping": 0.3,
+    "rotor": 0.1, "inertia": 0.2, "dry": 0.3, "damping": 0.3, "kp": 0.2, "kd": 0.2,
 }  # fmt: skip
 #: Names of the constants in the rig's file.
 PUBLIC = {
     "resistance": "motor.resistance", "torque_constant": "motor.torque_constant", "friction": "motor.friction_coulomb",
     "viscous": "motor.friction_viscous", "rotor": "motor.inertia", "efficiency": "gearbox.efficiency_load",
     "inertia": "bench.inertia", "dry": "bench.loss_coulomb", "damping": "bench.loss_viscous",
+    "kp": "controller.kp", "kd": "controller.kd",
 }  # fmt: skip
 #: Column, SI value of its unit, and noise of a channel as a share of its rms.
 CHANNELS = {
@@ -88,7 +93,7 @@ class Rig:
 
     @property
     def channels(self) -> tuple[str, ...]:
-        if self.alone:
+        if self.alone or self.imposed == GOAL:
             return ("output_angle",)
         own = {"voltage": ("total_current", "motor_speed"), "motor_current": ("motor_speed", "output_angle")}
         return own.get(self.imposed, ("total_current",))
@@ -96,8 +101,8 @@ class Rig:
     @property
     def names(self) -> tuple[str, ...]:
         """Constants that act."""
-        electric = ("resistance",) if self.imposed == "voltage" else ()
-        return tuple(n for n in RELATIVE if n != "resistance" or n in electric)
+        of_voltage = self.imposed in ("voltage", GOAL)
+        return tuple(n for n in RELATIVE if n in self.p and (n != "resistance" or of_voltage))
 
     @property
     def scale(self) -> SimpleNamespace:
@@ -121,13 +126,17 @@ def rig(
     torque, w_k = ratio * eta * C * rated, fast / ratio
     whole = rng.uniform(0.1, 0.3) * ratio**2 * C**2 / R  # inertia at the output by the mechanical time constant
     share = rng.uniform(0.3, 0.7)
-    slow = imposed != "voltage"
+    slow = imposed not in ("voltage", GOAL)
     p = {
         "resistance": R, "torque_constant": C, "friction": C * stall * rng.uniform(0.005, 0.02),
         "viscous": C * stall * rng.uniform(0.003, 0.015) / fast, "efficiency": eta, "rotor": share * whole / ratio**2,
         "inertia": (1 - share) * whole, "dry": torque * rng.uniform(0.1, 0.3),
         "damping": torque * rng.uniform(*((0.5, 1.0) if slow else (0.1, 0.3))) / w_k,
     }  # fmt: skip
+    if imposed == GOAL:  # damped, and at its limit for large steps
+        p["kp"] = rng.uniform(3.0, 8.0)
+        lag = whole * R / (ratio * C) ** 2
+        p["kd"] = max((2 * rng.uniform(0.6, 1.0) * np.sqrt(p["kp"] * w_k * lag) - 1) / w_k, 0.01)
     stated = {n: typed(x * np.exp(RELATIVE[n] * rng.standard_normal()), 4) for n, x in p.items()}
     stated["efficiency"] = min(stated["efficiency"], 0.97)
     drawn = float(rng.choice(EVERY))
@@ -142,7 +151,8 @@ def rig(
     sd = {n: typed(CHANNELS[n][2] * np.sqrt(np.mean(shown[n] ** 2)), 2) for n in made.channels}
     if not coarse:
         return dataclasses.replace(made, sd=sd)
-    steps = {n: ENCODER if n == "output_angle" else typed(COARSE * x, 2) for n, x in sd.items()}
+    encoder = ENCODER / 4 if imposed == GOAL else ENCODER
+    steps = {n: encoder if n == "output_angle" else typed(COARSE * x, 2) for n, x in sd.items()}
     sd = {n: typed(float(np.hypot(x, steps[n] / 12**0.5)), 3) for n, x in sd.items()}
     return dataclasses.replace(made, sd=sd, steps=steps)
 
@@ -155,7 +165,7 @@ def _inputs(rng, imposed, every, supply, rated, fast) -> np.ndarray:
             rng.uniform(0.2, 1.0) * np.sin(k * 2 * np.pi * t / t[-1] * rng.uniform(0.8, 1.2)) for k in (1, 2, 4)
         )
         return np.round(rng.uniform(0.5, 0.9) * fast * waves / np.abs(waves).max(), 4)
-    size = supply if imposed == "voltage" else 1.2 * rated
+    size = {"voltage": supply, GOAL: 1.5}.get(imposed, 1.2 * rated)
     levels = rng.uniform(0.35, 1.0, 8) * np.where(rng.random(8) < 0.5, -1, 1) * size
     at = np.sort(rng.choice(np.arange(10, ROWS - 5), 7, replace=False))
     return np.round(levels[np.searchsorted(at, np.arange(ROWS), side="right")], 4)
@@ -205,7 +215,10 @@ def histories(r: Rig, members: Sequence[Mapping[str, float]], terms: Sequence[Se
                 eta = teeth(A * J_w + i * J_d * B, s.d, p["efficiency"])
                 s.rate = (i * eta * A - B) / (J_w + J_d * i**2 * eta)
                 s.B = load + J_w * s.rate  # transmitted to the output, which effects of the gearbox see
-        if r.imposed == "voltage":
+        if r.imposed == GOAL:
+            duty = np.clip(p["kp"] * (given - s.turn) - p["kd"] * s.w_k, -LIMIT, LIMIT)
+            s.dI = (duty * r.supply - C * s.w - R * s.I - extra("electrical")) / (2e-4 * R)
+        elif r.imposed == "voltage":
             s.dI = (given - C * s.w - R * s.I - extra("electrical")) / (2e-4 * R)
         else:
             s.dI = (given - s.I) / 2e-4
@@ -370,12 +383,17 @@ def case(r: Rig, name: str, sigmas: float, seed: int, *, stated: bool = True) ->
         effects.append(term.label | {"sigmas": left_over(r, term), **oracle(r, term, y, columns)})
     shown = histories(r, [r.p], [terms])[0]
     measured = {n: _read(r, n, x, rng) for n, x in shown.items()}
-    column = {"voltage": "supply_voltage_V", "motor_current": "motor_current_A", "motor_speed": "motor_speed_rpm"}
+    column = {
+        "voltage": "supply_voltage_V",
+        "motor_current": "motor_current_A",
+        "motor_speed": "motor_speed_rpm",
+        GOAL: "goal_angle_deg",
+    }
     t = np.round(np.arange(ROWS) * r.every, 6)
     table: dict[str, np.ndarray] = {
         "run_id": np.repeat([f"run{k}" for k in range(RUNS)], ROWS),
         "time_s": np.tile(t, RUNS),
-        column[r.imposed]: (r.inputs / (RPM if r.imposed == "motor_speed" else 1.0)).ravel(),
+        column[r.imposed]: (r.inputs / {"motor_speed": RPM, GOAL: np.pi / 180}.get(r.imposed, 1.0)).ravel(),
     }
     if r.load_torque is not None:
         table["load_torque_Nm"] = r.load_torque.ravel()
@@ -509,9 +527,10 @@ def toml(r: Rig) -> str:
     tables: dict[str, dict[str, Any]] = {
         "": top, "motor": {}, "gearbox": {"ratio": f"{r.ratio} ± 0"}, "bench": {"load": "shaft"},
     }  # fmt: skip
-    for name in RELATIVE:
-        if name != "resistance" or r.imposed == "voltage":
-            table, _, key = PUBLIC[name].partition(".")
-            tables[table][key] = f"{r.stated[name]!r} ± {100 * RELATIVE[name]:g} %"
+    if r.imposed == GOAL:
+        tables["controller"] = {"limit": LIMIT, "supply_voltage": r.supply}
+    for name in r.names:
+        table, _, key = PUBLIC[name].partition(".")
+        tables[table][key] = f"{r.stated[name]!r} ± {100 * RELATIVE[name]:g} %"
     tables |= {f"instruments.{name}": {"quantum": "free"} for name in r.steps}
     return robot_toml(tables)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -12,6 +12,7 @@ from calibration.data.input_errors import BadData
 from calibration.data.sources import columnar, json_records
 from calibration.data.sources.recorded_signals import (
     Clock,
+    Load,
     Signal,
     of_arrays,
     refused_type,
@@ -40,7 +41,11 @@ def of_object(source: Any) -> tuple[str, tuple[Signal, ...]]:
             if named:
                 signals.append(_of_series(str(index.name or "time"), index, len(source)))
         signals += [
-            _of_series(_column_name(column), source.iloc[:, j], len(source))
+            _of_series(
+                ".".join(str(part) for part in column if str(part)) if isinstance(column, tuple) else str(column),
+                source.iloc[:, j],
+                len(source),
+            )
             for j, column in enumerate(source.columns)
         ]
         return "the DataFrame", tuple(signals)
@@ -74,10 +79,6 @@ def _called(source: Any) -> str:
     return kind.__name__ if kind.__module__ == "builtins" else f"{kind.__module__.partition('.')[0]} {kind.__name__}"
 
 
-def _column_name(column: Any) -> str:
-    return ".".join(str(part) for part in column if str(part)) if isinstance(column, tuple) else str(column)
-
-
 def _of_series(name: str, series: Any, rows: int) -> Signal:
     dtype = series.dtype
     kind = getattr(dtype, "kind", "O")
@@ -97,7 +98,7 @@ def _of_series(name: str, series: Any, rows: int) -> Signal:
     return Signal(name, rows, lambda: np.asarray(series.to_numpy(dtype=float, na_value=np.nan)))
 
 
-def _words(series: Any) -> Callable[[], np.ndarray]:
+def _words(series: Any) -> Load:
     return lambda: np.array(["" if lost else str(value) for value, lost in zip(series, series.isna(), strict=True)])
 
 
@@ -122,5 +123,5 @@ def _of_xarray(dataset: Any) -> tuple[Signal, ...]:
     return tuple(signals_found)
 
 
-def _values(array: Any) -> Callable[[], np.ndarray]:
+def _values(array: Any) -> Load:
     return lambda: np.asarray(array.values)

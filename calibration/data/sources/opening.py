@@ -11,7 +11,7 @@ import math
 import os
 import stat
 import zipfile
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,7 @@ import numpy as np
 from calibration.data import input_files
 from calibration.data.input_errors import BadData, InputError
 from calibration.data.sources import in_memory
-from calibration.data.sources.recorded_signals import Signal, Source, plain_values, refused_type
+from calibration.data.sources.recorded_signals import Load, Signal, Source, plain_values, refused_type
 
 #: Separator between the path of a file and the path of signals in it.
 WITHIN = "::"
@@ -163,7 +163,11 @@ def open_signals(path: Path, within: str, name: str, form: Format) -> Source:
         BadData: as `Format.signals`. No signal, or none below `within`.
     """
     if path.is_dir():
-        check_folder(path, name)
+        for item in path.iterdir():
+            if item.is_symlink() and not (item.exists() and item.resolve().is_relative_to(path.resolve())):
+                raise BadData(f"{name}, {item.name}: is a link that leads out of the bag; expected the file itself")
+            if not stat.S_ISREG(item.stat().st_mode) and not item.is_dir():
+                raise BadData(f"{name}, {item.name}: is no regular file; expected the files of a bag")
     signals = tuple(form.signals(path, name))
     if not signals:
         raise BadData(f"{name}: is {form.kind} without signals; expected at least one column or array")
@@ -207,9 +211,7 @@ def _guarded(signals: Sequence[Signal], name: str, kind: str) -> tuple[Signal, .
     """Signals that raise `BadData` if they are refused, too large for the memory, or if their library cannot read
     their values. Shared clocks stay shared."""
 
-    def guarded(
-        load: Callable[[], np.ndarray], path: str, signal: Signal, refused: str = ""
-    ) -> Callable[[], np.ndarray]:
+    def guarded(load: Load, path: str, signal: Signal, refused: str = "") -> Load:
         where = f"{name}, {path}"
 
         def read() -> np.ndarray:
@@ -244,19 +246,6 @@ def _guarded(signals: Sequence[Signal], name: str, kind: str) -> tuple[Signal, .
         )
         for s in signals
     )
-
-
-def check_folder(path: Path, name: str) -> None:
-    """Refuse a bag whose folder has a file that is no regular file, or a link that leads out of it.
-
-    Raises:
-        BadData: it has.
-    """
-    for item in path.iterdir():
-        if item.is_symlink() and not (item.exists() and item.resolve().is_relative_to(path.resolve())):
-            raise BadData(f"{name}, {item.name}: is a link that leads out of the bag; expected the file itself")
-        if not stat.S_ISREG(item.stat().st_mode) and not item.is_dir():
-            raise BadData(f"{name}, {item.name}: is no regular file; expected the files of a bag")
 
 
 def source_digest(path: Path) -> str:

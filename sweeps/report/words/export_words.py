@@ -10,9 +10,10 @@ from calibration.data.input_errors import three_digits
 from mmrjax import __version__
 from mmrjax.errors import count_noun, printable
 from mmrjax.model import channels
+from mmrjax.model.shaft import MESH_DAMPING, MESH_FREQUENCY
 from sweeps.export.comparison import APPROXIMATED, DROPPED, EXPORTED, HELD, NATIVE, Fate
 from sweeps.export.formats import FORMATS, Export
-from sweeps.export.joint import INSIDE
+from sweeps.export.joint import INSIDE, Joint
 
 #: Use of a file of each format, as a paragraph of LAW.md.
 USE = {
@@ -48,6 +49,12 @@ USE = {
         "they are correlated. `mujoco/…` are attributes of `drive.xml` as the format mujoco writes it; `actuator/…` "
         "are keys of `PARAMS`."
     ),
+}
+#: Readings that a controller compares with its goal, their units, and the last term of its duty.
+GOALS = {
+    "goal_angle": ("angle", "rad", "- K_d ω"),
+    "goal_speed": ("ω", "rad/s", "+ K_f goal"),
+    "goal_current": ("I", "A", "+ K_f goal"),
 }
 NOT_TESTED = (
     "Voltages, loads and temperatures outside the runs above.",
@@ -163,6 +170,7 @@ def law_equations(found: Export) -> list[str]:
             lines.append(
                 f"`{part.name}`, in {where[part.balance]}: {part.equation} [{part.unit}] {part.meaning}".rstrip()
             )
+    lines += _further_equations(found.joint)
     if found.format == "mujoco":
         lines += [
             "MuJoCo's form of it: U = R' I' + L' dI'/dt + i_r K ω and M = i_r K I' - f sign ω - d ω. Here "
@@ -170,6 +178,41 @@ def law_equations(found: Export) -> list[str]:
             "the motor's current I = c I' (current over act). Its numbers are refitted to the law above.",
         ]
     return lines
+
+
+def _further_equations(joint: Joint) -> list[str]:
+    """Equations of a controller, and of a load that turns apart from the motor."""
+    lines = []
+    if joint.controller is not None:
+        goal, unit, rate = GOALS[joint.robot.rig.imposed]
+        lines.append(
+            f"Controller: e = goal - {goal} [{unit}], D = K_p e + K_i ∫ e dt {rate} within ± limit, U = D times the "
+            "supply. At the limit, an error that drives D further is not integrated. With a lag T, the duty follows: "
+            "T dD'/dt = D - D'. [-]"
+        )
+    if joint.loose:
+        lines.append(
+            "Play: motor and load turn apart by φ. s = φ less half of the backlash towards 0, and 0 within it. "
+            "M_r = k s + d ds/dt is the torque between them, and flanks never pull. Without a stated stiffness, "
+            f"k and d give {MESH_FREQUENCY:g} Hz and a damping ratio of {MESH_DAMPING:g}. The motor's side: "
+            "J i_r² dω/dt = i_r (M_d - M_rf0 sign ω - K_fr ω) - M_r/η - gearbox effects. [N·m]"
+        )
+    return lines
+
+
+def command_sentence(found: Export) -> str:
+    """Sentence for the command of an exported controller, empty where the command is a voltage."""
+    imposed = found.joint.robot.rig.imposed
+    if found.joint.controller is None or found.format == "table":
+        return ""
+    if found.format != "mujoco":
+        return f"\n\nThe command is the controller's goal [{GOALS[imposed][1]}], not a voltage."
+    if imposed != "goal_angle":
+        return ""
+    ratio = float(found.joint.robot.gearbox.ratio)
+    return (
+        f"\n\nThe control is the goal angle of the motor, {ratio:.6g} times that of the joint [rad], not a voltage."
+    )
 
 
 def markdown(text: str) -> str:
@@ -209,7 +252,7 @@ found its numbers from measurements or data sheets, and wrote it as {FORMATS[fou
 that program. All units are SI; the joint is the driven wheel or output shaft.
 
 ## How to use it
-{USE[found.format].format(**about)}
+{USE[found.format].format(**about)}{command_sentence(found)}
 
 ## Equations
 {bullets(law_equations(found))}
