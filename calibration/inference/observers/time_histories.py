@@ -233,7 +233,7 @@ class Histories(Observer):
     word: ClassVar[str] = "sample"
     fewest: ClassVar[int] = 24
     axis: ClassVar[str] = "time_s"
-    blocks: ClassVar[Names] = ("slope", "voltage", "run")
+    blocks: ClassVar[Names] = ("slope", "voltage", "run", "part")
     policy: ClassVar[SearchPolicy] = SearchPolicy(batch=8, steps=30, searches=8, one_by_one=False)
     rows_tell: ClassVar[bool] = False
     evidence: ClassVar[Names] = ("single", "curve", "pair", "chi2", "white")
