@@ -1065,7 +1065,7 @@ def _proposal(space: CandidateSpace, traced: LoopStages, settings: Settings) -> 
     """Next experiment, None if there are no alternatives to separate, or if the model does not describe the runs."""
     if traced.verdict == "undescribed":
         return None
-    if not space.bare.observe.menu:
+    if not space.bare.observe.menu or space.bare.base.rig.follows_goal:
         return propose_nothing(space) if traced.verdict != "none" else None
     if traced.verdict in WITHOUT_NAME and traced.where is not None:
         return propose_denser_runs(space, traced.where, settings)
