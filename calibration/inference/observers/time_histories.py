@@ -717,9 +717,10 @@ class Histories(Observer):
         """Searches as in the protocol. The runs are compiled once for all steps."""
         data, steps = problem.data, self.policy.steps if most is None else most
 
-        def searched(starts: Numbers) -> tuple[Optimum, Observation]:
-            evaluate = _evaluator(problem, weights, active)
-            return search_rollouts(evaluate, starts, data, weights, steps, self.policy.batch, rivals=rivals)
+        def searched(starts: Numbers, members: slice = slice(None)) -> tuple[Optimum, Observation]:
+            these = weights[members]
+            evaluate = _evaluator(problem, these, None if active is None else active[members])
+            return search_rollouts(evaluate, starts, data, these, steps, self.policy.batch, rivals=rivals)
 
         optima = searched(starts)
         near = np.asarray(optima[0].cost) < np.nanmin(optima[0].cost) + NEAR
@@ -733,15 +734,15 @@ class Histories(Observer):
         if most is not None and not optima[0].converged[k] and np.abs(optima[0].z[k]).max() > LOST:
             return optima
 
-        def one(every: tuple[Optimum, Observation]) -> tuple[Optimum, Observation]:
+        def one(every: tuple[Optimum, Observation], k: int) -> tuple[Optimum, Observation]:
             best, seen = jax.tree.map(lambda leaf: leaf[k], every)
             return dataclasses.replace(best, z=best.z[:size], sd=best.sd[:size]), seen
 
         def again(z: np.ndarray) -> tuple[Optimum, Observation]:
-            return one(searched(np.tile(np.pad(z, (0, np.shape(starts)[1] - size)), (len(starts), 1))))
+            return one(searched(np.pad(z, (0, np.shape(starts)[1] - size))[None], slice(k, k + 1)), 0)
 
         scan_data = dataclasses.replace(bare.data, weight=weights[k])
-        best, seen = scans.search_lower_basins(bare, one(optima), scan_data, again, lambda _: None)
+        best, seen = scans.search_lower_basins(bare, one(optima, k), scan_data, again, lambda _: None)
         optimum = jax.tree.map(lambda leaf: jnp.asarray(leaf[k]), optima[0])
         best = dataclasses.replace(best, z=optimum.z.at[:size].set(best.z), sd=optimum.sd.at[:size].set(best.sd))
         return jax.tree.map(lambda every, mine: jnp.asarray(every).at[k].set(mine), optima, (best, seen))
