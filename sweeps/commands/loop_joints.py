@@ -10,12 +10,13 @@ from pathlib import Path
 
 import numpy as np
 from scipy.interpolate import UnivariateSpline
+from scipy.ndimage import uniform_filter1d
 
-from calibration.data import Columns, Names, delimited
+from calibration.data import Names, delimited
 from calibration.data import runs as records
-from calibration.data.columns import IMPOSED, LOAD
+from calibration.data.columns import CURRENT, LOAD, SPEED
 from calibration.data.input_errors import BadConfiguration, BadData, allowed_words
-from calibration.data.named_arrays import NamedArrays, column_numbers, column_texts
+from calibration.data.named_arrays import NamedArrays, Raw, column_numbers, column_texts
 from calibration.data.runs import Runs
 from calibration.data.sources import reading
 from mmrjax.model.quantities import RPM
@@ -34,6 +35,8 @@ from sweeps.report.document import Document
 ANGLES = {"output_angle_deg": math.pi / 180, "output_angle_rad": 1.0}
 #: Stands for the name of a joint in the name of its robot's file.
 JOINT = "{joint}"
+#: Column of the current's sd, and rows over which that of the torque is averaged.
+SD, NEAR = "motor_current_sd_A", 11
 #: Fewest readings of a run whose motion is smoothed.
 FEWEST = 12
 #: Median of the magnitude of sixth differences of white noise [sd].
@@ -87,24 +90,28 @@ class Chain:
         return needed
 
 
-def smoothed_motion(time: np.ndarray, angle: np.ndarray, times: np.ndarray) -> np.ndarray:
+def noise_of(readings: np.ndarray) -> float:
+    """Standard deviation of the noise of a slow signal, by its sixth differences."""
+    return float(np.nanmedian(np.abs(np.diff(readings, 6)))) / QUANTILE
+
+
+def smoothed_motion(time: np.ndarray, angle: np.ndarray, times: np.ndarray, degree: int) -> np.ndarray:
     """Angle [rad], speed and acceleration at `times`, shape (3, times), by a spline that leaves the noise alone.
 
-    It has the fewest knots with which readings are off by their noise: that of sixth differences, at least that of
-    the display's step if most readings repeat others. At a jump of the torque, knots crowd, so that the acceleration
-    jumps within a few samples.
+    It has the fewest knots with which readings are off by their noise, at least that of the display's step if most
+    readings repeat others. At a jump of the torque, knots crowd, so that the acceleration jumps within a few samples.
     """
-    noise, steps = np.median(np.abs(np.diff(angle, 6))) / QUANTILE, np.diff(np.unique(np.round(angle, 9)))
+    noise, steps = noise_of(angle), np.diff(np.unique(np.round(angle, 9)))
     if 0 < len(steps) < len(angle) / 2:
         noise = max(noise, steps.min() / math.sqrt(12))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # that more knots would be needed, for readings without noise
-        curve = UnivariateSpline(time, angle, k=5, s=len(time) * noise**2)
+        curve = UnivariateSpline(time, angle, k=degree, s=len(time) * noise**2)
     return np.stack([curve(times), curve.derivative(1)(times), curve.derivative(2)(times)])
 
 
-def smoothed_log(log: NamedArrays, chain: Chain) -> np.ndarray:
-    """Motion of all joints at each row of a log, shape (3, rows, joints).
+def smoothed_log(log: NamedArrays, chain: Chain, degree: int = 5) -> np.ndarray:
+    """Motion of all joints at each row of a log, shape (3, rows, joints), by splines of a degree.
 
     Raises:
         BadData: the log has no `time_s`, lacks the angle of a joint, or has too few readings of it in a run.
@@ -130,15 +137,16 @@ def smoothed_log(log: NamedArrays, chain: Chain) -> np.ndarray:
                     f"{log.name}, {name}.{column}: has {len(seen)} readings in run {run or 1}; expected at least "
                     f"{FEWEST} with a time_s that rises"
                 )
-            motion[:, rows, k] = smoothed_motion(time[seen], angle[seen], time[rows])
+            motion[:, rows, k] = smoothed_motion(time[seen], angle[seen], time[rows], degree)
     return motion
 
 
-def runs_of_joint(log: NamedArrays, chain: Chain, name: str, robot: Robot, motion: np.ndarray) -> Runs:
+def runs_of_joint(log: NamedArrays, chain: Chain, name: str, robot: Robot) -> Runs:
     """Runs of a joint, with the torque of the rest of the model as the torque of its load.
 
-    It is what the model needs less the inertia and the weight that the joint's own file states. A motor speed that
-    the file imposes and the log lacks is that of the smoothed motion.
+    It is what the model needs less the inertia and the weight that the joint's own file states. The motor speed is
+    that of the smoothed motion. Its torque is less exact where the torque jumps, by about its difference from that of
+    cubic splines: the sd of the current has this share, unless the log states one.
 
     Raises:
         BadData: as `records.of_arrays`.
@@ -146,14 +154,15 @@ def runs_of_joint(log: NamedArrays, chain: Chain, name: str, robot: Robot, motio
     k, (load,) = chain.names.index(name), robot.configurations.members
     own = {h.removeprefix(f"{name}."): v for h, v in zip(log.header, log.values, strict=True)}
     kept = {h: v for h, v in own.items() if not h.startswith(tuple(f"{n}." for n in chain.names))}
+    motion = smoothed_log(log, chain)
+    torque, cubic = (chain.torques(x)[:, k] for x in (motion, smoothed_log(log, chain, 3)))
     angle, speed, acceleration = motion[:, :, k]
-    added: Columns = {
-        LOAD: chain.torques(motion)[:, k] - float(load.inertia) * acceleration - np.asarray(load.torque_load(angle))
-    }
-    imposed = IMPOSED[robot.rig.imposed][0]
-    if robot.rig.imposed == "motor_speed" and imposed not in kept:
-        added[imposed] = speed * float(robot.gearbox.ratio) / RPM
-    columns = {**kept, **added}
+    stated = float(load.inertia) * acceleration + np.asarray(load.torque_load(angle))
+    per_ampere = float(robot.gearbox.ratio * robot.gearbox.efficiency_load * robot.motor.torque_constant)
+    columns: dict[str, Raw] = {**kept, LOAD: torque - stated, SPEED: speed * float(robot.gearbox.ratio) / RPM}
+    if CURRENT in kept and SD not in kept:
+        off = np.sqrt(uniform_filter1d((torque - cubic) ** 2, NEAR)) / per_ampere
+        columns[SD] = np.hypot(off, noise_of(column_numbers(kept[CURRENT])))
     arrays = NamedArrays(f"{log.name}, joint {name}", tuple(columns), tuple(columns.values()), digest=log.digest)
     return records.of_arrays(arrays, robot=robot)
 
@@ -162,16 +171,18 @@ def robot_of_joint(config: configuration.Loop, joint: str) -> tuple[configuratio
     """Configuration of the loop of a joint, and its robot.
 
     Raises:
-        BadConfiguration: no such file, or no rig of one shaft.
+        BadConfiguration: no such file, or no rig of one shaft whose motor speed is imposed and current read.
     """
     named = f"{JOINT}.toml" if config.robot == "nominal" else config.robot
     one = config.model_copy(update={"robot": named.replace(JOINT, joint), "joints": (joint,)})
     robot = load_robot(one).robot
-    members = robot.configurations.members
-    if len(members) != 1 or not isinstance(members[0], Shaft):
+    members, rig = robot.configurations.members, robot.rig
+    shaft = len(members) == 1 and isinstance(members[0], Shaft)
+    if not shaft or (rig.imposed, rig.channels) != ("motor_speed", ("motor_current",)):
         raise BadConfiguration(
-            f'--robot {one.robot}: expected the rig of one joint, with one load = "shaft"; mmrjax rig new '
-            f"{joint}.toml --from {config.model} --joint {joint} --kind bench writes one"
+            f'--robot {one.robot}: expected the rig of one joint with load = "shaft", imposed = "motor_speed" and '
+            'channels = ["motor_current"]: the torque of the model holds for the measured motion alone; mmrjax rig '
+            f"new {joint}.toml --from {config.model} --joint {joint} --kind bench begins one"
         )
     return one, robot
 
@@ -207,8 +218,7 @@ def run_joints(
     if not data.is_file():
         raise BadData(f"{data}: no such file; expected a log of the joints of {config.model.name}")
     log = reading.read_whole_table(data) or delimited.read_csv_columns(data, data.name)
-    motion = smoothed_log(log, chain)
-    runs = {name: runs_of_joint(log, chain, name, robot, motion) for name, (_, robot) in robots.items()}
+    runs = {name: runs_of_joint(log, chain, name, robot) for name, (_, robot) in robots.items()}
     folder = beside.out or store.default_path("loop")
     code, rows = 0, []
     for name, (one, robot) in robots.items():
