@@ -91,6 +91,8 @@ STORE, JOURNAL, IDENTITY, ASIDE = "results.zarr", "journal", "identity.json", "w
 PARTS = frozenset((LOCK, CHUNKS, REFIT_FILE, STORE, JOURNAL, IDENTITY, ASIDE))
 #: Endings of the files in `CHUNKS`.
 KEPT = (".npz", ".stage")
+#: File of what the loop's regression says before anything is confirmed.
+SCREENING_FILE = "screening.json"
 #: Key of the mark with the names of files that are not ours.
 FOREIGN = "foreign"
 #: First arguments of commands that fit a robot.

@@ -42,20 +42,20 @@ inertia = 0.05
 loss_coulomb = "0.1 ± 100 %"
 loss_viscous = "0.05 ± 100 %"
 """
-#: Dry friction of each joint forward and backward [N·m], and viscous friction [N·m·s].
-DRY, VISCOUS = np.array([[0.1, 0.1], [0.25, 0.1]]), 0.05
+#: Dry friction of each joint forward and backward [N·m], viscous friction [N·m·s], speed of smoothed rest [rad/s].
+DRY, VISCOUS, REST = np.array([[0.1, 0.1], [0.25, 0.1]]), 0.05, 2e-3
 
 
 def arm(seconds=4.0, every=0.005, seed=0):
     """A log of the arm under steps of voltage, by own steps of motors and friction around MuJoCo's `mj_forward`."""
     model = mujoco.MjModel.from_xml_string(MODEL)
     model.dof_damping[:], model.dof_frictionloss[:], model.dof_armature[:] = 0, 0, 2e-6 * 50**2
-    data, rng, step = mujoco.MjData(model), np.random.default_rng(seed), 2e-4
+    data, rng, step = mujoco.MjData(model), np.random.default_rng(seed), 5e-5
     volts = np.repeat(rng.choice([-1.0, 1.0], (40, 2)) * rng.uniform(2, 7, (40, 2)), 50, 0)
     angle, speed, current, rows = np.zeros(2), np.zeros(2), np.zeros(2), []
     for k in range(round(seconds / step)):
         now = volts[int(k * step / every)] if k * step > 0.1 else np.zeros(2)
-        friction = np.where(speed > 0, DRY[:, 0], DRY[:, 1]) * np.tanh(speed / 0.02) + VISCOUS * speed
+        friction = np.where(speed > 0, DRY[:, 0], DRY[:, 1]) * np.tanh(speed / REST) + VISCOUS * speed
         data.qpos[:], data.qvel[:], data.qfrc_applied[:] = angle, speed, 50 * 0.02 * current - friction
         mujoco.mj_forward(model, data)
         if k % round(every / step) == 0:
@@ -85,7 +85,7 @@ def test_torque_of_the_model_is_what_mujoco_was_given_without_friction_and_rotor
     (tmp_path / "arm.xml").write_text(MODEL)
     chain, rows = loop_joints.Chain(tmp_path / "arm.xml"), arm(0.5)[::10]
     friction = (
-        np.where(rows[:, 7:9] > 0, DRY[:, 0], DRY[:, 1]) * np.tanh(rows[:, 7:9] / 0.02) + VISCOUS * rows[:, 7:9]
+        np.where(rows[:, 7:9] > 0, DRY[:, 0], DRY[:, 1]) * np.tanh(rows[:, 7:9] / REST) + VISCOUS * rows[:, 7:9]
     )
     given = 50 * 0.02 * rows[:, 3:5] - friction - 2e-6 * 50**2 * rows[:, 9:]
     assert_allclose(chain.torques(rows[:, 5:].reshape(-1, 3, 2).swapaxes(0, 1)), given, atol=1e-9)
@@ -146,7 +146,9 @@ def test_what_a_joint_lacks_is_named(mmrjax, tmp_path):
     log = (tmp_path / "log.csv").read_text()
     (tmp_path / "log.csv").write_text(log.replace("elbow.output_angle_deg", "wrist.output_angle_deg"))
     ends(
-        mmrjax(*arguments, "--joints", "shoulder"), "has no column elbow.output_angle_deg or output_angle_rad", code=4
+        mmrjax(*arguments, "--joints", "shoulder"),
+        "has no column elbow.output_angle_deg or elbow.output_angle_rad",
+        code=4,
     )
     (tmp_path / "log.csv").write_text(log.replace("time_s", "moment"))
     ends(mmrjax(*arguments, "--joints", "elbow"), "has no column time_s", code=4)

@@ -31,6 +31,7 @@ from calibration.words.step_words import expected_time
 from mmrjax.model import params
 from mmrjax.model.robot import Robot
 from sweeps import config as configuration
+from sweeps import store
 from sweeps.console import print_message, print_output, step_reporter
 from sweeps.inputs import load_robot, read_runs
 from sweeps.report import loop_report
@@ -38,8 +39,8 @@ from sweeps.report.fit_tables import Change
 from sweeps.store import SOLVER_FAILED, RunFolder, finish_run_folder, open_folder, print_report
 
 T = TypeVar("T")
-#: File of what regression says before anything is confirmed, and its schema.
-SCREENING_FILE, SCREENING = "screening.json", "mmrjax.screening/1"
+#: Schema of the file of what regression says before anything is confirmed.
+SCREENING = "mmrjax.screening/1"
 
 
 def execute(config: configuration.Loop, beside: configuration.LoopBeside) -> int:
@@ -176,7 +177,7 @@ def _show_ranking(found: Ranking, folder: RunFolder, timed: Callable[[str], None
         print_message(line)
     answer = loop_words.regression_verdict(found)
     content = {"schema": SCREENING, "confirmed": False, "answer": answer, **dataclasses.asdict(found)}
-    folder.write_json(SCREENING_FILE, content)
+    folder.write_json(store.SCREENING_FILE, content)
 
 
 def _say_kept(stages: Mapping[str, Any], folder: RunFolder, robot_name: str) -> None:

@@ -21,7 +21,6 @@ from calibration.data.runs import Runs
 from calibration.data.sources import reading
 from mmrjax.model.quantities import RPM
 from mmrjax.model.robot import Robot
-from mmrjax.model.shaft import Shaft
 from sweeps import config as configuration
 from sweeps import store
 from sweeps.commands.rig_from_mujoco import read_mujoco_model
@@ -36,7 +35,7 @@ ANGLES = {"output_angle_deg": math.pi / 180, "output_angle_rad": 1.0}
 #: Stands for the name of a joint in the name of its robot's file.
 JOINT = "{joint}"
 #: Column of the current's sd, and rows over which that of the torque is averaged.
-SD, NEAR = "motor_current_sd_A", 11
+SD, NEAR = "motor_current_sd_A", 21
 #: Fewest readings of a run whose motion is smoothed.
 FEWEST = 12
 #: Median of the magnitude of sixth differences of white noise [sd].
@@ -117,24 +116,27 @@ def smoothed_log(log: NamedArrays, chain: Chain, degree: int = 5) -> np.ndarray:
         BadData: the log has no `time_s`, lacks the angle of a joint, or has too few readings of it in a run.
     """
     columns = dict(zip(log.header, log.values, strict=True))
-    if "time_s" not in columns:
-        raise BadData(f"{log.name}: has no column time_s; expected a log over time, because its motion is smoothed")
-    time, motion = column_numbers(columns["time_s"]), np.empty((3, len(log), len(chain.names)))
-    runs = np.array(column_texts(columns["run_id"]) if "run_id" in columns else [""] * len(log))
-    for k, name in enumerate(chain.names):
-        column = next((c for c in ANGLES if f"{name}.{c}" in columns), None)
+
+    def numbers(*names: str) -> tuple[str, np.ndarray]:
+        column = next((c for c in names if c in columns), None)
         if column is None:
             raise BadData(
-                f"{log.name}: has no column {name}.{' or '.join(ANGLES)}; expected the angle of each joint of the "
+                f"{log.name}: has no column {' or '.join(names)}; expected time_s and the angle of each joint of the "
                 "model, because every joint's torque depends on the whole motion"
             )
-        angle = ANGLES[column] * column_numbers(columns[f"{name}.{column}"])
+        return column, column_numbers(columns[column])
+
+    time, motion = numbers("time_s")[1], np.empty((3, len(log), len(chain.names)))
+    runs = np.array(column_texts(columns["run_id"]) if "run_id" in columns else [""] * len(log))
+    for k, name in enumerate(chain.names):
+        column, angle = numbers(*(f"{name}.{c}" for c in ANGLES))
+        angle = ANGLES[column.removeprefix(f"{name}.")] * angle
         for run in np.unique(runs):
             rows = np.flatnonzero(runs == run)
             seen = rows[np.isfinite(angle[rows])]
             if len(seen) < FEWEST or not (np.diff(time[seen]) > 0).all():
                 raise BadData(
-                    f"{log.name}, {name}.{column}: has {len(seen)} readings in run {run or 1}; expected at least "
+                    f"{log.name}, {column}: has {len(seen)} readings in run {run or 1}; expected at least "
                     f"{FEWEST} with a time_s that rises"
                 )
             motion[:, rows, k] = smoothed_motion(time[seen], angle[seen], time[rows], degree)
@@ -146,7 +148,7 @@ def runs_of_joint(log: NamedArrays, chain: Chain, name: str, robot: Robot) -> Ru
 
     It is what the model needs less the inertia and the weight that the joint's own file states. The motor speed is
     that of the smoothed motion. Its torque is less exact where the torque jumps, by about its difference from that of
-    cubic splines: the sd of the current has this share, unless the log states one.
+    cubic splines. Unless the log states the current's sd, it has twice this share, as neighbouring rows err alike.
 
     Raises:
         BadData: as `records.of_arrays`.
@@ -161,7 +163,7 @@ def runs_of_joint(log: NamedArrays, chain: Chain, name: str, robot: Robot) -> Ru
     per_ampere = float(robot.gearbox.ratio * robot.gearbox.efficiency_load * robot.motor.torque_constant)
     columns: dict[str, Raw] = {**kept, LOAD: torque - stated, SPEED: speed * float(robot.gearbox.ratio) / RPM}
     if CURRENT in kept and SD not in kept:
-        off = np.sqrt(uniform_filter1d((torque - cubic) ** 2, NEAR)) / per_ampere
+        off = 2 * np.sqrt(uniform_filter1d((torque - cubic) ** 2, NEAR)) / per_ampere
         columns[SD] = np.hypot(off, noise_of(column_numbers(kept[CURRENT])))
     arrays = NamedArrays(f"{log.name}, joint {name}", tuple(columns), tuple(columns.values()), digest=log.digest)
     return records.of_arrays(arrays, robot=robot)
@@ -176,8 +178,7 @@ def robot_of_joint(config: configuration.Loop, joint: str) -> tuple[configuratio
     named = f"{JOINT}.toml" if config.robot == "nominal" else config.robot
     one = config.model_copy(update={"robot": named.replace(JOINT, joint), "joints": (joint,)})
     robot = load_robot(one).robot
-    members, rig = robot.configurations.members, robot.rig
-    shaft = len(members) == 1 and isinstance(members[0], Shaft)
+    rig, shaft = robot.rig, not robot.has_ground and len(robot.configurations.members) == 1
     if not shaft or (rig.imposed, rig.channels) != ("motor_speed", ("motor_current",)):
         raise BadConfiguration(
             f'--robot {one.robot}: expected the rig of one joint with load = "shaft", imposed = "motor_speed" and '
@@ -240,7 +241,9 @@ def run_joints(
 def _row(joint: str, place: Path) -> tuple[str, str, str, str]:
     """Row of a joint: its name, answer, held-out errors and page."""
     if not (place / "result.json").is_file():
-        return joint, "no verdict in time; the same command goes on.", "", ""
+        ranked = place.with_name(f"{joint}.partial") / store.SCREENING_FILE
+        answer = json.loads(ranked.read_text(encoding="utf-8"))["answer"] if ranked.is_file() else ""
+        return joint, f"no verdict in time, the same command goes on; {answer}.", "", ""
     result: Mapping = json.loads((place / "result.json").read_text(encoding="utf-8"))
     before, after = (result["errors"][which]["held_out"] or {} for which in ("before", "after"))
     errors = "; ".join(f"{c.replace('_', ' ')} {before[c]:.3g} → {after[c]:.3g}" for c in after if before.get(c))
