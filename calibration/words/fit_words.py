@@ -290,6 +290,10 @@ SAID: dict[str, str | Callable[..., str]] = {
         'readings and command may be offset in time; state [rig] delay = "0 ± 0.02" [s], which may be negative, and '
         "calibrate fits it"
     ),
+    "freed_delay": lambda channel, share: (
+        f"without a delay, {share:.0%} of the squared error of {channels.find_channel(channel).label} lies in the "
+        "first sample after each step; rig.delay is therefore fitted, unless the file has [rig] delay = '0 ± 0'"
+    ),
     "shifted": lambda channel, share, shift: (
         f"{share:.0%} of the squared error of {channels.find_channel(channel).label} is that of readings "
         f"{abs(1e3 * shift):.2g} ms too {'late' if shift > 0 else 'early'}: state [rig] delay = "

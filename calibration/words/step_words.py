@@ -35,6 +35,7 @@ STEPS = {
     # a calibration
     "optimum": "optimum found; now {}",
     "steady": "the same with steady first, to begin from its optimum",
+    "delay": "the error lies in the first sample after each step: the same with a delay",
     "derivatives": "population done; now derivatives against differences at the best",
     "search": "  step {}: objective {:.4f}, {:.1f} min",
     "round": "round {}: objective {:.4f} after {} steps, {:.1f} min",
