@@ -226,6 +226,28 @@ def test_a_set_that_needs_another_program_has_to_promise_more(space, monkeypatch
     assert tried[: len(simulated)] == simulated and ("churning" in tried) is (first == 930)
 
 
+def test_a_set_without_one_of_its_effects_has_no_empty_slot_between(space, monkeypatch):
+    """The position of an effect among the effects is its slot. Sets that are known in any order are not fitted again."""
+    settings = dataclasses.replace(ANALYST.settings, slots=3)
+    z = np.arange(space.free + 6.0)
+    one = lambda *names: Candidate(fill_slots(names, settings), z, z, 5.0, z, z, True, True, True)  # noqa: E731
+    starts = {}
+
+    def fit(space, proposals, settings):
+        starts.update(proposals)
+        return [one(*(n for n in names if n)) for names, _ in proposals]
+
+    monkeypatch.setattr(search, "fit_candidates", fit)
+    known = one("stribeck_track", "churning")
+    fewer = search.without_each(space, one("churning", "brush_drop", "stribeck_track"), settings, [known])
+    assert fewer[1] is known
+    assert [c.active for c in (fewer[0], fewer[2])] == list(starts) == [
+        ("brush_drop", "stribeck_track", ""), ("churning", "brush_drop", ""),
+    ]  # fmt: skip
+    p = space.free
+    assert starts["brush_drop", "stribeck_track", ""][p:].tolist() == [p + 1, p + 2, 0, p + 4, p + 5, 0]
+
+
 def test_fits_with_other_sds_are_few_steps_from_those_that_are_known(space, monkeypatch):
     """Such a fit begins where it ended with the other sds. One that is not known takes as many steps as it needs."""
     known, other, new = fill_slots(["churning"], ANALYST.settings), fill_slots(["brush_drop"], ANALYST.settings), []

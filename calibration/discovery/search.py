@@ -151,13 +151,15 @@ def without_each(
     Args:
         ladder: known fits, which are not repeated.
     """
-    fewer = [tuple("" if s == slot else n for s, n in enumerate(best.active)) for slot in range(len(best.effects))]
-    simulated = {c.active: c for c in ladder if c.simulated}
+    fewer = [fill_slots([n for n in best.effects if n != without], settings) for without in best.effects]
+    simulated = {c.key: c for c in ladder if c.simulated}
     new = fit_candidates(
-        space, [(w, start_of_fit(space, best, w, settings)) for w in fewer if w not in simulated], settings
+        space,
+        [(w, start_of_fit(space, best, w, settings)) for w in fewer if frozenset(w) - {""} not in simulated],
+        settings,
     )
-    simulated |= {c.active: c for c in new}
-    return [simulated[w] for w in fewer]
+    simulated |= {c.key: c for c in new}
+    return [simulated[frozenset(w) - {""}] for w in fewer]
 
 
 def _ranked(space: CandidateSpace, scores: ScoreTable, without: Sequence[str] = ()) -> list[str]:
