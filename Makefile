@@ -80,8 +80,10 @@ gallery: $(TOOLS)
 	$(BIN)/mmrjax check --out runs/gallery/check --force
 	$(BIN)/mmrjax size --out runs/gallery/size --force
 	$(BIN)/mmrjax sensitivity --outputs total_current,slip --out runs/gallery/sensitivity --force
+	$(BIN)/mmrjax loop docs/rigs/public/neo_dyno.csv --robot docs/rigs/public/neo_dyno.toml --out runs/gallery/neo_dyno --force
+	$(BIN)/mmrjax loop docs/rigs/public/odrive.csv --robot docs/rigs/public/odrive.toml --out runs/gallery/odrive --force
 	$(BIN)/python docs/site.py runs/gallery/loop
-	$(BIN)/python docs/gallery/make.py $(foreach page,loop run sweep mission check size sensitivity,$(page)=runs/gallery/$(page))
+	$(BIN)/python docs/gallery/make.py $(foreach page,loop run sweep mission check size sensitivity neo_dyno odrive,$(page)=runs/gallery/$(page))
 
 clean:
 	rm -rf $(VENV) runs site

@@ -6,6 +6,8 @@ import importlib
 from collections.abc import Callable, Iterable
 from typing import Any
 
+from calibration.data import Names
+
 
 def describe(found: Any, part: str = "", *about: str) -> str:
     """English sentence of a note or a result, such as a calibration's `remarks` or what `discover` returns.
@@ -38,7 +40,7 @@ def describe(found: Any, part: str = "", *about: str) -> str:
     return sentence(found, *about)
 
 
-def sentences(notes: Iterable[object]) -> tuple[str, ...]:
+def sentences(notes: Iterable[object]) -> Names:
     """Sentence of each note, in order."""
     return tuple(map(describe, notes))
 

@@ -342,8 +342,8 @@ def example(result: Path) -> str:
     after = d["next_experiment"]
     return f"""# A table of runs
 
-Twenty settled runs of the robot were measured: two configurations, 15 and 33 V, slopes from 0 to 20°. Does the paper's
-model describe them? One command answers, in a minute on two cores:
+Twenty settled runs of the robot were measured, in two configurations, at 15 and 33 V, on slopes from 0 to 20°. Does the
+paper's model describe them? One command answers in a minute on two cores:
 
 ```sh
 mmrjax loop measured --out found
@@ -362,7 +362,7 @@ All figures below are from `found/result.json`; `found/report.html` shows them w
 |---|---|---|---|---|
 {table}
 
-A run is *reached* if the robot has a steady state there; otherwise it slides or stands.
+A run is *reached* if the robot has a steady state there. Otherwise the robot slides or does not move.
 
 ![Residuals of every reading, before and after](figures/before_after.svg)
 
@@ -371,13 +371,13 @@ parameters fitted again, blue the model with the effects. The grey band is noise
 
 ![Influence of each effect on its readings](figures/laws.svg)
 
-For each effect, the figure shows the reading that it changes most, minus the same reading of the robot without it. Dots
-are measured, crosses the refitted model with nothing added. The blue line is the law with its 95 % band. If an effect is
+For each effect, the figure shows the reading that it changes most, relative to the robot without the effect. Dots are
+measured; crosses are the refitted model with nothing added. The blue line is the law with its 95 % band. If an effect is
 real, the line follows the dots.
 
 ## May I use the robot?
 
-Each kind of block is left out in turn and predicted by a fit that has not seen it. Use the robot where these errors are
+Each block of runs is left out in turn and predicted by a fit to the others. Use the robot where these errors are
 small:
 
 | rms error of unseen runs [%] | model | {" | ".join(labels.values())} | reached |
@@ -395,8 +395,8 @@ mmrjax sweep --robot found/robot.toml
 mmrjax explain {d["effects"][0]["name"]}
 ```
 
-The first command simulates the new robot over voltages, payloads and slopes. The second prints the equation and the size
-of an effect, and a test for it. [Read a verdict](../howto/read-a-verdict.md) explains the other verdicts.
+The first command simulates the new robot over voltages, payloads and slopes. The second prints an effect's equation,
+its usual size, and a test for it. [Read a verdict](../howto/read-a-verdict.md) explains the other verdicts.
 """
 
 

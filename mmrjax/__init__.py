@@ -56,7 +56,7 @@ __all__ = sorted((*_HOME, *_ABOVE, "__version__"))
 #: at optimization level 0 and compiles some derivatives wrongly (NaN or zero; jaxlib 0.10.2).
 SOUND_AT_LEVEL_0 = "--xla_backend_extra_options=-fast-isel=false"
 #: Addition to it that halves the compilation of programs over time from jaxlib 0.11, which has no option for a single
-#: program any more (81 s of processor time for a log of 800 rows, 53 s with it).
+#: program any more (78 s of processor time for a log of 800 rows, 53 s with it).
 OLDER_EMITTERS = "xla_cpu_disable_new_fusion_emitters=true"
 #: Beginning of the names of threads that compute, which a process must not end around.
 WORKER = "mmrjax-worker"

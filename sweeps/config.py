@@ -788,7 +788,9 @@ class Sensitivity(RobotPart, DataPart, FidelityPart, SupplyPart, AxesPart, Outpu
     parameters: Names = option_field(
         (), "Uncertain parameters, comma-separated, or a group such as motor.*", usual="all that have a prior"
     )
-    vary: Names = option_field((), "A condition that is uncertain too, repeatable: voltage=22:26, slope_deg=0:5")
+    vary: Names = option_field(
+        (), "Treat an operating condition as uncertain too. May be repeated: voltage=22:26, slope_deg=0:5"
+    )
     outputs: Names = option_field(
         (),
         "Outputs, comma-separated: those of a run, steepest_slope, highest_step, best_step, start for its three",

@@ -1,6 +1,7 @@
 """The command line in this process, the tables that it leaves, and files that it reads."""
 
 import csv
+import json
 import sys
 
 import pytest
@@ -41,6 +42,12 @@ def text_file(path, text):
     return path
 
 
+def csv_text(columns):
+    """A table of columns as the text of a CSV file."""
+    lines = [",".join(columns), *(",".join(map(str, row)) for row in zip(*columns.values(), strict=True))]
+    return "\n".join(lines) + "\n"
+
+
 def read_rig(folder, text, name="rig.toml", **options):
     """The robot of a new file with this text."""
     return robot_file.read_robot(text_file(folder / name, text), **options)
@@ -49,3 +56,8 @@ def read_rig(folder, text, name="rig.toml", **options):
 def read_table(folder, text, robot, name="log.csv"):
     """The runs of a new table with this text."""
     return records.read_runs(text_file(folder / name, text), robot=robot)
+
+
+def read_json(path):
+    """The content of a file of JSON."""
+    return json.loads(path.read_text(encoding="utf-8"))

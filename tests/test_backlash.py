@@ -21,7 +21,7 @@ from mmrjax.model.rig import Rig
 from mmrjax.model.robot import Configurations
 from mmrjax.model.shaft import Shaft
 from mmrjax.model.signals import Signals, State
-from tests.commands import read_table
+from tests.commands import read_rig, read_table, text_file
 
 DRIVE = {
     "gearbox.ratio": 16.0, "gearbox.efficiency_load": 0.8, "motor.torque_constant": 0.05, "motor.resistance": 3.0,
@@ -139,19 +139,15 @@ backlash = "0.08 ± 30 %"
 )
 def test_a_file_with_backlash_is_followed_with_it_and_needs_inertia(tmp_path, stated, got):
     path, text = tmp_path / "rig.toml", FILE.replace('backlash = "0.08 ± 30 %"', stated)
-    path.write_text(text)
-    assert robot_file.load_robot(str(path)).loose
-    path.write_text(text.replace("inertia = 2e-6\n", ""))
+    assert robot_file.load_robot(text_file(path, text)).loose
     with pytest.raises(BadConfiguration, match=rf"bench\.{got}; .* motor\.inertia and bench\.inertia"):
-        robot_file.load_robot(str(path))
+        robot_file.load_robot(text_file(path, text.replace("inertia = 2e-6\n", "")))
 
 
 @pytest.mark.nightly
 @pytest.mark.slow
 def test_backlash_is_found_in_a_history_of_reversals(tmp_path):
-    path = tmp_path / "rig.toml"
-    path.write_text(FILE)
-    robot = robot_file.load_robot(str(path))
+    robot = read_rig(tmp_path, FILE)
     truth = params.replace(robot, {"bench.backlash": 0.06})
     seen = driven(truth)
     at = np.searchsorted(TIMES, SAMPLES)

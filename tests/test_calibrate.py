@@ -33,10 +33,11 @@ from mmrjax.fidelities.steady import steady_batch
 from mmrjax.model import channels, paper_robots
 from sweeps.report import calibration_report
 from sweeps.report.terminal_renderer import print_document
+from tests.commands import read_json
 from tests.commands import rows as rows_of
 
 ROOT = Path(__file__).resolve().parents[1]
-SCHEMA = json.loads((ROOT / "docs" / "schemas" / "calibrate.schema.json").read_text(encoding="utf-8"))
+SCHEMA = read_json(ROOT / "docs" / "schemas" / "calibrate.schema.json")
 
 
 @pytest.fixture(scope="module")
@@ -120,7 +121,7 @@ def test_saved_result_has_a_robot_that_reaches_every_row(found, measured, tmp_pa
     found.save(tmp_path / "fitted")
     files = ["posterior.nc", "result.json", "robot.toml", "rows.csv"]
     assert sorted(p.name for p in (tmp_path / "fitted").iterdir()) == files
-    jsonschema.validate(json.loads((tmp_path / "fitted" / "result.json").read_text()), SCHEMA)
+    jsonschema.validate(read_json(tmp_path / "fitted" / "result.json"), SCHEMA)
     again = robot_file.read_robot(tmp_path / "fitted" / "robot.toml")
     answer = steady_batch(again, measured.conditions(again))
     assert_array_equal(answer.status, 0)

@@ -32,7 +32,7 @@ TRUTH = 0.12
 @pytest.fixture(scope="module")
 def base():
     """Nominal, with adhesion for the slopes of the tests, and a friction law that is no stiffer for it."""
-    return params.replace(paper_robots.nominal(), {STATIC: jnp.asarray(0.6), CREEP: jnp.asarray(0.1)})
+    return params.replace(paper_robots.nominal(), {STATIC: 0.6, CREEP: 0.1})
 
 
 @pytest.fixture(scope="module")
@@ -125,7 +125,7 @@ def test_the_robot_says_the_same_in_the_other_fidelities(found, made):
 @pytest.mark.slow
 def test_a_belt_too_stiff_for_the_step_is_said(base, made):
     """Friction and contacts are implicit in a step, the springs of the belt are not."""
-    stiff = params.replace(base, {"running_gear.span_stiffness": jnp.asarray(1e8)})
+    stiff = params.replace(base, {"running_gear.span_stiffness": 1e8})
     (said,) = fidelities.get_fidelity("track").cautions(stiff, made.conditions(stiff))
     assert said.startswith("rows 1, 2")
     assert "the track model's step of 0.0001 s is above the largest stable one" in said

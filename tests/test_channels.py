@@ -21,6 +21,7 @@ from calibration.inference import estimates, noise, observers
 from calibration.inference.result import CalibrationResult
 from mmrjax.fidelities.steady import steady_batch
 from mmrjax.model import channels, params, quantities
+from tests.commands import csv_text, text_file
 
 RIG = """base = "none"
 sides = 1
@@ -48,15 +49,11 @@ FIRST = 0.06129
 
 
 def rig(folder, shown):
-    path = folder / "rig.toml"
-    path.write_text(RIG.format(channels=list(shown)).replace("'", '"'), encoding="utf-8")
-    return calibration.read_robot(str(path))
+    return calibration.read_robot(text_file(folder / "rig.toml", RIG.format(channels=list(shown)).replace("'", '"')))
 
 
 def written(path, columns):
-    lines = [",".join(columns), *(",".join(map(str, row)) for row in zip(*columns.values(), strict=True))]
-    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
-    return path
+    return text_file(path, csv_text(columns))
 
 
 def made_up(robot, unit=None):

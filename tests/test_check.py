@@ -21,10 +21,10 @@ from mmrjax.fidelities.steady import steady_batch
 from mmrjax.model import params
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.signals import CONVERGED, SLIDES, STALLED, STATUSES
-from tests.commands import command
+from tests.commands import command, read_json
 from tests.pages import Tables
 
-SCHEMA = json.loads((Path(__file__).parents[1] / "docs" / "schemas" / "check.schema.json").read_text("utf-8"))
+SCHEMA = read_json(Path(__file__).parents[1] / "docs" / "schemas" / "check.schema.json")
 
 
 def read(text):
@@ -53,19 +53,19 @@ def folder(request, tmp_path_factory):
 @pytest.fixture(scope="module")
 def values(folder):
     """The result of more aims. Where the folder lacks them, without what would change them."""
-    found = json.loads((folder / "result.json").read_text())
+    found = read_json(folder / "result.json")
     if "winding_C" in {r["name"] for r in found["requirements"]}:
         return found
     path = folder.with_name("values")
     aims = some_of_the_papers("speed_m_s", "speed_end_of_charge_m_s", "mass_kg", "winding_C", "standing")
     path.with_suffix(".toml").write_text(aims, encoding="utf-8")
     assert command(["check", path.with_suffix(".toml"), "--no-changes", "--no-report", "--out", path]) == 0
-    return json.loads((path / "result.json").read_text())
+    return read_json(path / "result.json")
 
 
 @pytest.fixture(scope="module")
 def result(folder):
-    return json.loads((folder / "result.json").read_text())
+    return read_json(folder / "result.json")
 
 
 def row(result, name, k=0):
@@ -279,7 +279,7 @@ def test_external_supply_and_another_configuration(tmp_path):
         '[envelope]\nconfiguration = "4W2T"\nsupply_voltage_V = [30, 33]\npayload_kg = 3\nambient_C = [0, 40]\n'
     )
     assert command(["check", file, "--out", tmp_path / "run", "--no-report"]) == 0
-    found = json.loads((tmp_path / "run" / "result.json").read_text())
+    found = read_json(tmp_path / "run" / "result.json")
     assert [r["met"] for r in found["requirements"]] == [True] * 5 and found["missed"] == 0
     slow, fast = (row(found, "speed_m_s", k) for k in (0, 1))
     assert (slow["at"]["supply_voltage_V"], fast["at"]["supply_voltage_V"]) == (30, 33)

@@ -1,6 +1,5 @@
 """The command line as a user runs it: run folders, exit codes, messages, interruption."""
 
-import json
 import os
 import re
 import subprocess
@@ -17,7 +16,7 @@ from calibration.data.input_errors import BadConfiguration
 from mmrjax import OLDER_EMITTERS, SOUND_AT_LEVEL_0, errors, fidelities
 from sweeps import cli, config, options
 from sweeps.points import scale
-from tests.commands import ends
+from tests.commands import ends, read_json
 from tests.commands import rows as table
 from tests.pages import recorded
 
@@ -150,7 +149,7 @@ def test_data_are_hashed_in_the_manifest(mmrjax, tmp_path):
     (tmp_path / "sub" / "runs.csv").write_text(f"{HEADER}\n6T2A,15,13.1,0,5,2.75,4800,400\n")
     assert mmrjax("compare sub/runs.csv --no-report --out x")[0] == 0
     known = hashlib.sha256((tmp_path / "sub" / "runs.csv").read_bytes()).hexdigest()
-    assert json.loads((tmp_path / "x" / "manifest.json").read_text())["hashes"]["runs.csv"] == known
+    assert read_json(tmp_path / "x" / "manifest.json")["hashes"]["runs.csv"] == known
 
 
 @pytest.mark.slow
@@ -164,7 +163,7 @@ def test_sweep_track_has_a_bar_a_status_a_run_and_the_share_of_each(mmrjax, tmp_
     assert [row["status"] for row in rows] == ["converged", "slides", "converged", "converged"]
     shares = [float(row["guide_share"]) for row in rows]
     assert shares[0] > 0.95 and shares[2:] == [0.0, 0.0]
-    assert json.loads((tmp_path / "t" / "manifest.json").read_text())["versions"]["mujoco-mjx"]
+    assert read_json(tmp_path / "t" / "manifest.json")["versions"]["mujoco-mjx"]
 
 
 @pytest.mark.slow

@@ -383,7 +383,8 @@ def test_rates_of_all_gaps_are_the_derivatives_of_the_gaps():
 def test_polyline_of_constant_slope_is_tilted_gravity():
     angle = np.radians(10.0)
     conditions = [Conditions(0, voltage=10.0, slope_deg=slope).resolved(ROBOT) for slope in (0.0, 10.0)]
-    grounds = terrain.inclined_ground(angle), terrain.flat_ground()
+    end_point = terrain.FAR * np.array([np.cos(angle), np.sin(angle)])
+    grounds = terrain._terrain([-end_point, end_point], 0.0), terrain.flat_ground()
     raised, level = (
         climb_system(ROBOT, *of, constant_angles(np.pi, np.pi)) for of in zip(conditions, grounds, strict=True)
     )

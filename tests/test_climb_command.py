@@ -1,7 +1,6 @@
 """The command `climb`: what it leaves, how it searches, and what it refuses."""
 
 import csv
-import json
 import re
 from pathlib import Path
 
@@ -16,9 +15,9 @@ from mmrjax.climbing.climb_simulation import LOSSES
 from mmrjax.model.paper_robots import nominal
 from sweeps.commands import climb as room
 from sweeps.report.climb_report import Seen, footing_coordinates
-from tests.commands import ends, text_file
+from tests.commands import ends, read_json, text_file
 
-SCHEMA = json.loads((Path(__file__).parents[1] / "docs" / "schemas" / "climb.schema.json").read_text("utf-8"))
+SCHEMA = read_json(Path(__file__).parents[1] / "docs" / "schemas" / "climb.schema.json")
 
 REFUSED = {
     "levers of a wheeled robot": (["--step", "50", "--configuration", "4W2T", "--levers-front", "30"],
@@ -171,7 +170,7 @@ def test_one_climb_leaves_a_folder_whose_energy_adds_up(mmrjax, tmp_path):
         code=0,
     )
     folder = tmp_path / "c"
-    result = json.loads((folder / "result.json").read_text("utf-8"))
+    result = read_json(folder / "result.json")
     jsonschema.validate(result, SCHEMA)
     assert result["verdict"] == "over" and result["largest_mm"] is None
     with (folder / "history.csv").open(newline="") as stream:

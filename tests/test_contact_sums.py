@@ -29,7 +29,7 @@ STEP = 1e-4
 @pytest.fixture(scope="module")
 def recessed(robot):
     """A robot in which nothing that contacts depend on is zero."""
-    return params.replace(robot, {"running_gear.guide_recess": jnp.asarray(1e-4)})
+    return params.replace(robot, {"running_gear.guide_recess": 1e-4})
 
 
 @pytest.fixture(scope="module")

@@ -131,7 +131,7 @@ def test_curves_act_in_drive_and_at_zero_change_nothing():
 
 @EACH
 def test_curve_of_a_run_in_mirror_image_is_the_mirror_image(effect):
-    made = params.replace(effect(), {**{n: jnp.asarray(v) for n, v in SHAPE.items()}, "amplitude": jnp.asarray(0.3)})
+    made = params.replace(effect(), {**{n: jnp.asarray(v) for n, v in SHAPE.items()}, "amplitude": 0.3})
     there = laws.terms(made, signals=laws.mirrored(laws.STATES))
     assert_allclose(there, -laws.terms(made), rtol=1e-12, atol=1e-15)
 
@@ -139,7 +139,7 @@ def test_curve_of_a_run_in_mirror_image_is_the_mirror_image(effect):
 def test_a_curve_of_what_shows_magnitudes_is_the_same_in_mirror_image():
     """As it is written in a robot, and as the loop looks for it."""
     made = params.replace(UNNAMED["curve_motor_current_current"](), {n: jnp.asarray(v) for n, v in SHAPE.items()})
-    made = params.replace(made, {"amplitude": jnp.asarray(0.3)})
+    made = params.replace(made, {"amplitude": 0.3})
     robot = laws.metered(signed=False)
     each = [laws.terms(made, robot, s) for s in (laws.STATES, laws.mirrored(laws.STATES))]
     assert_allclose(*each, rtol=1e-12, atol=1e-15)
@@ -155,7 +155,7 @@ def test_a_curve_of_what_shows_magnitudes_is_the_same_in_mirror_image():
 
 @EACH
 def test_curve_has_finite_derivatives_by_everything_at_rest(effect):
-    made = params.replace(effect(), {"amplitude": jnp.asarray(0.3)})
+    made = params.replace(effect(), {"amplitude": 0.3})
     floats = [f.name for f in dataclasses.fields(Signals) if f.name not in ("memory", "configuration")]
     still = Signals(**{name: jnp.asarray(0.0) for name in floats})
     slopes = eqx.filter_grad(lambda both: both[0].term(paper_robots.nominal(), both[1]))((made, still))

@@ -2,7 +2,6 @@
 
 import importlib.util
 import inspect
-import json
 import re
 import tomllib
 from pathlib import Path
@@ -11,6 +10,7 @@ import jsonschema
 import pytest
 
 import mmrjax as mm
+from tests.commands import read_json
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
@@ -26,7 +26,10 @@ def site():
 
 SITE = site()
 #: Pages that programs write: they count as reference and not as prose.
-MADE = {f"reference/{name}.md" for name in (*SITE.PAGES, "effects")}
+MADE = {f"reference/{name}.md" for name in (*SITE.PAGES, "effects")} | {
+    "lab/gears.md",
+    *(f"actuators/{p.name}" for p in (DOCS / "actuators").glob("*.md")),
+}
 
 
 @pytest.mark.parametrize("name", SITE.PAGES)
@@ -38,7 +41,7 @@ def test_a_page_that_is_made_is_what_makes_it(name):
 def test_pages_are_on_four_shelves_and_in_the_lab():
     pages = {str(p.relative_to(DOCS)) for p in DOCS.rglob("*.md")}
     shelves = {page.split("/")[0] for page in pages}
-    assert shelves == {"index.md", "start", "howto", "explanation", "reference", "rigs", "lab"}
+    assert shelves == {"index.md", "start", "howto", "explanation", "reference", "rigs", "lab", "actuators"}
     assert pages > MADE
 
 
@@ -97,7 +100,7 @@ def test_the_site_asks_nothing_of_a_network():
 
 @pytest.mark.parametrize("path", sorted((DOCS / "schemas").glob("*.json")), ids=lambda path: path.stem)
 def test_every_schema_is_one_and_is_listed(path):
-    jsonschema.validators.validator_for(schema := json.loads(path.read_text("utf-8"))).check_schema(schema)
+    jsonschema.validators.validator_for(schema := read_json(path)).check_schema(schema)
     assert f"schemas/{path.name}" in (DOCS / "reference" / "schemas.md").read_text("utf-8")
 
 
@@ -131,7 +134,7 @@ def test_sentences_of_the_example_follow_from_the_recorded_result():
 
 def test_pictures_are_of_todays_pages():
     """Else: make gallery."""
-    made = json.loads((DOCS / "gallery" / "sources.json").read_text("utf-8"))
+    made = read_json(DOCS / "gallery" / "sources.json")
     assert made == {p.stem: SITE.picture_source(p.stem) for p in (DOCS / "gallery").glob("*.png")}
 
 

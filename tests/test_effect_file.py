@@ -11,7 +11,7 @@ from mmrjax.effects import BY_NAME
 from mmrjax.fidelities.steady import steady_batch
 from mmrjax.model import paper_robots, params
 from mmrjax.model.conditions import Conditions
-from tests.commands import read_rig
+from tests.commands import read_rig, text_file
 
 GOOD = '''
 from mmrjax.effects import Effect, amplitude
@@ -72,9 +72,9 @@ def stating(*lines):
 def test_user_effect_is_usable_by_name_in_a_robot_file(tmp_path, text):
     library = effect_file.effect_library([written(tmp_path, text)])
     assert list(library) == [*BY_NAME, "seal_drag"] and "seal_drag" not in BY_NAME
-    path = tmp_path / "robot.toml"
-    path.write_text("[effects.seal_drag]\namplitude = 0.05\n")
-    robot = robot_file.load_robot(str(path), library)
+    robot = robot_file.load_robot(
+        text_file(tmp_path / "robot.toml", "[effects.seal_drag]\namplitude = 0.05\n"), library
+    )
     more = params.replace(robot_file.load_robot("nominal"), {"6T2A.track.loss_coulomb": 0.4})
     run = Conditions(voltage=[15.0])
     got, expected = (steady_batch(r, run).total_current for r in (robot, more))
@@ -109,10 +109,8 @@ def test_user_effect_may_settle_to_another_of_the_users(tmp_path):
 
 
 def test_robot_file_without_the_users_library_says_so(tmp_path):
-    path = tmp_path / "robot.toml"
-    path.write_text("[effects.seal_drag]\namplitude = 0.05\n")
     with pytest.raises(BadConfiguration, match=r"effects\.seal_drag: no such effect"):
-        robot_file.load_robot(str(path))
+        read_rig(tmp_path, "[effects.seal_drag]\namplitude = 0.05\n", "robot.toml")
 
 
 REFUSED = {

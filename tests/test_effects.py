@@ -817,7 +817,7 @@ def test_stribeck_exponent_is_its_formula(exponent):
 def test_stribeck_exponent_has_finite_derivatives_through_rest(exponent):
     def term(speed, fade, power):
         effect = params.replace(BY_NAME["stribeck_exponent"](), {"speed_fade": fade, "exponent": power})
-        effect = params.replace(effect, {"amplitude": jnp.asarray(1.0)})
+        effect = params.replace(effect, {"amplitude": 1.0})
         return effect.term(NOMINAL, Signals(speed_wheel=speed, direction=jnp.asarray(1.0)))
 
     slopes = jax.vmap(jax.grad(term, (0, 1, 2)), (0, None, None))

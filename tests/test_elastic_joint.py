@@ -12,7 +12,6 @@ from scipy.integrate import solve_ivp
 from test_events import NAMES, SAMPLES
 from worlds.events import Bench, through
 
-from calibration.data import robot_file
 from calibration.data import runs as records
 from calibration.inference.calibration import calibrate
 from mmrjax.fidelities.drive import drive_batch, drive_rates, drive_start, drive_units
@@ -24,6 +23,7 @@ from mmrjax.model.rig import Rig
 from mmrjax.model.robot import Configurations
 from mmrjax.model.shaft import Shaft
 from sweeps.pages.history_figures import frequency_response
+from tests.commands import read_rig
 
 #: A motor that turns against the joint, with little back-EMF.
 MOTOR = Bench(inertia_motor=2e-5, torque_constant=0.02, loss_coulomb=0.02, friction_motor=2e-4)
@@ -69,7 +69,7 @@ def test_a_start_against_the_joint_is_that_of_scipy(name):
     bench = JOINTS[name]
     exact, _ = through(bench, np.array([6.0]), np.array([0.0]), SAMPLES)
     run = drive_batch(
-        robot_of(bench), Conditions(voltage=jnp.asarray([6.0])), jnp.asarray(SAMPLES), tolerance=1e-9, max_steps=40000
+        robot_of(bench), Conditions(voltage=[6.0]), jnp.asarray(SAMPLES), tolerance=1e-9, max_steps=40000
     )
     shown = np.stack([run.signals.current[0], run.signals.speed_motor[0]], -1)
     assert_allclose(shown / np.abs(exact).max(0), exact / np.abs(exact).max(0), atol=1e-6)
@@ -145,8 +145,7 @@ loss_viscous = "0.02 ± 0.02"
 @pytest.mark.parametrize("joint", ["", 'stiffness = "20 ± 15"\ndamping = "0.03 ± 0.03"\n'], ids=["rigid", "elastic"])
 def test_a_rigid_model_takes_friction_away_and_an_elastic_one_finds_the_joint(log, joint):
     folder, bench = log
-    (folder / "rig.toml").write_text(RIG + joint)
-    robot = robot_file.load_robot(str(folder / "rig.toml"))
+    robot = read_rig(folder, RIG + joint)
     runs = records.read_runs(folder / "log.csv", robot=robot)
     fit = calibrate(runs, robot, model="drive", starts=1, blocks=False, profiles=False)
     friction = fit.parameters["bench.loss_coulomb"]

@@ -146,7 +146,9 @@ def test_rows_of_a_clamp_in_tables(tmp_path):
     with pytest.raises(BadData, match=r"row 1, load_torque_Nm: got 1 where held is 1; expected 0, .* output_torque"):
         records.read_runs(table(load_torque_Nm=np.ones(16)), robot=held)
     speed = rig(tmp_path, "motor_speed", '"motor_current", "output_torque"')
-    with pytest.raises(BadData, match=r'nothing drives the motors; .* a held shaft: state imposed = "motor_current"'):
+    with pytest.raises(
+        BadData, match=r'nothing drives the motors; .* for a held shaft state imposed = "motor_current"'
+    ):
         records.read_runs(table(held=False, motor_speed_rpm=np.zeros(16)), robot=speed)
     rows = table(held=False, motor_speed_rpm=np.zeros(16), load_torque_Nm=np.r_[np.ones(15), 0.0])
     assert len(records.read_runs(rows, robot=speed)) == 15

@@ -153,10 +153,7 @@ def test_a_shaft_turns_through_rest_and_is_held_there_at_its_very_moment(tmp_pat
 def test_derivatives_are_those_of_the_steps_where_a_lagging_current_stops_a_shaft_and_starts_it(tmp_path):
     """A carriage under a position controller: the current passes the dry friction every tenth of a second, within
     steps of 1 ms, and lags by 0.3 ms. Where a level is just above the friction, the shaft creeps."""
-    (tmp_path / "rig.toml").write_text(RIG, encoding="utf-8")
-    robot = params.replace(
-        robot_file.read_robot(tmp_path / "rig.toml"), {"motor.inductance": 3e-4, "motor.resistance": 1.0}
-    )
+    robot = params.replace(read_rig(tmp_path, RIG), {"motor.inductance": 3e-4, "motor.resistance": 1.0})
     times = np.arange(0.0, 1.2, 1e-3)
     current = np.round(1.2 * np.sin(2 * np.pi * 3.1 * times) + 0.25 * np.sin(2 * np.pi * 41 * times), 2)
 

@@ -4,7 +4,6 @@ import contextlib
 import csv
 import functools
 import io
-import json
 import os
 import re
 import subprocess
@@ -26,6 +25,7 @@ from mmrjax.effects import BY_NAME
 from mmrjax.model import params
 from sweeps import cli
 from sweeps.commands import loop as room
+from tests.commands import read_json
 
 PRIORS = [a for c in ("6T2A", "4W2T") for a in ("--prior", f"{c}.ground.friction.static=0.6±0.09")]
 
@@ -100,7 +100,7 @@ def commanded(every=False):
         if not every:
             patch.setattr(room, "effect_file", SimpleNamespace(effect_library=lambda paths: FEW.library))
         answer = mmrjax(folder, "loop", "runs.csv", "--replicates", 250, "--out", "found", *PRIORS)
-    result = json.loads((folder / "found" / "result.json").read_text())
+    result = read_json(folder / "found" / "result.json")
     return SimpleNamespace(
         folder=folder, case=case, answer=answer, result=result, found=kept[0], room_for_it=room_for_it
     )
@@ -171,7 +171,7 @@ def test_residuals_of_rows_are_simulated_less_measured_readings(done):
 
 def test_result_has_the_schema_of_the_issue(done):
     r = done.result
-    schema = json.loads((Path(__file__).parents[1] / "docs" / "schemas" / "loop.schema.json").read_text())
+    schema = read_json(Path(__file__).parents[1] / "docs" / "schemas" / "loop.schema.json")
     jsonschema.validate(r, schema)
     with pytest.raises(jsonschema.ValidationError):
         jsonschema.validate({**r, "verdict": "perhaps"}, schema)
@@ -239,7 +239,7 @@ def test_users_effect_is_scored_and_named(quick, tmp_path):
     run = ["loop", "runs.csv", "--no-report", "--replicates", 250, "--out", "x", *PRIORS]
     answer = mmrjax(tmp_path, *run, "--effects", "mine.py")
     assert answer.code == 0
-    result = json.loads((tmp_path / "x" / "result.json").read_text())
+    result = read_json(tmp_path / "x" / "result.json")
     assert result["verdict"] == "named" and [e["name"] for e in result["effects"]] == ["payload_binding"]
     assert result["scores"][0]["name"] == "payload_binding" and result["scores"][0]["score"] > 60
     assert "[effects.payload_binding]" in (tmp_path / "x" / "robot.toml").read_text()
@@ -252,7 +252,7 @@ def test_one_voltage_gives_a_verdict(quick, tmp_path):
     (tmp_path / "mine.py").write_text(MINE)
     run = ["loop", "runs.csv", "--no-report", "--replicates", 250, "--out", "x", "--effects", "mine.py", *PRIORS]
     answer = mmrjax(tmp_path, *run)
-    result = json.loads((tmp_path / "x" / "result.json").read_text())
+    result = read_json(tmp_path / "x" / "result.json")
     assert answer.code == 0 and result["verdict"] == "none" and result["effects"] == []
     assert result["adequate"]["before"] and result["next_experiment"] is None
     assert any("supply_voltage_V" in note for note in result["notes"])  # what one voltage cannot show
@@ -380,7 +380,7 @@ def started(quick, tmp_path_factory):
 @pytest.mark.slow
 def test_histories_go_through_the_command(started):
     assert started.answer.code == 0, started.answer.err
-    r = json.loads((started.folder / "found" / "result.json").read_text())
+    r = read_json(started.folder / "found" / "result.json")
     (effect,) = r["effects"]
     assert r["verdict"] == "named" and effect["name"] == "churning" and r["rows"] == 6 * 41
     amplitude = effect["parameters"]["amplitude"]
@@ -448,7 +448,7 @@ def test_fourth_channel_goes_through_the_loop_by_one_row(tmp_path):
         list(map(str, command)), cwd=source.parents[2], capture_output=True, text=True, timeout=900, check=False
     )
     assert done.returncode == 0, done.stderr
-    found = json.loads((tmp_path / "found" / "result.json").read_text())
+    found = read_json(tmp_path / "found" / "result.json")
     assert "churning" in found["effects"][0]["class"] and "terminal_voltage" in found["noise"]
     assert found["chi2"]["readings"] == 4 * found["rows"]
     assert found["errors"]["after"]["fitted"]["terminal_voltage"]["rows"] == found["rows"]

@@ -34,8 +34,9 @@ from sweeps.pages import page as page_room
 from sweeps.pages.figure_style import figure_settings
 from sweeps.report import loop_report, page_renderer
 from sweeps.report.terminal_renderer import print_document
+from tests.commands import read_json
 
-SCHEMA = json.loads((Path(__file__).parents[1] / "docs" / "schemas" / "loop.schema.json").read_text("utf-8"))
+SCHEMA = read_json(Path(__file__).parents[1] / "docs" / "schemas" / "loop.schema.json")
 
 
 def happening():

@@ -5,7 +5,6 @@ import csv
 import inspect
 import io
 import itertools
-import json
 import os
 import re
 import sys
@@ -29,6 +28,7 @@ from mmrjax.model import channels, quantities
 from mmrjax.undercarriage.ripple_peaks import SIGNALS
 from sweeps import capabilities, cli, config
 from sweeps.points import export
+from tests.commands import read_json
 
 #: Ends of names, and the unit of each.
 UNITS = {
@@ -185,7 +185,7 @@ def walk(folder):
         if path.suffix == ".csv":
             found |= {name: str(path) for name in table(path)}
         elif path.suffix == ".json" and path.name not in ("zarr.json", "identity.json"):
-            found |= {name: f"{path}{where}" for name, where in keys(json.loads(path.read_text()))}
+            found |= {name: f"{path}{where}" for name, where in keys(read_json(path))}
         elif path.suffix == ".toml" and path.name != "robot.toml":  # names of parameters, in SI units
             found |= {name: f"{path}{where}" for name, where in keys(tomllib.loads(path.read_text()))}
     return found
@@ -400,7 +400,7 @@ def test_files_over_time_end_on_the_numbers_of_their_runs(made, folder):
         end, course = (numbers(table(run / n)) for n in ("runs.csv", "history.csv"))
         last = {n: x[-1:] for n, x in course.items()}
         assert same(last, end, but=("time_s",)) >= {"displacement_m"}
-        result = json.loads((run / "result.json").read_text())
+        result = read_json(run / "result.json")
         stated = {n: np.array([x]) for n, x in result.items() if isinstance(x, float)}
         assert same(stated, end)
     rows = numbers(table(mission / "history.csv"))

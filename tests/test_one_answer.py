@@ -1,7 +1,6 @@
 """One sentence answers: the same in the terminal, on the page and in result.json."""
 
 import dataclasses
-import json
 
 import pytest
 from commands import command
@@ -13,6 +12,7 @@ from calibration.discovery.loop_notes import FreedValue, Headline
 from calibration.words import loop_words
 from sweeps.report import page_renderer, terminal_renderer
 from sweeps.report.document import plain_text
+from tests.commands import read_json
 
 
 @pytest.mark.parametrize("made", [check, size, comparison])
@@ -30,7 +30,7 @@ def test_terminal_and_page_open_with_the_same_sentence(made, tmp_path, capsys):
 def test_a_command_answers_with_one_sentence(words, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert command([*words, "--out", "x"]) == 0
-    statement = json.loads((tmp_path / "x" / "result.json").read_text("utf-8"))["statement"]
+    statement = read_json(tmp_path / "x" / "result.json")["statement"]
     page = Tables((tmp_path / "x" / "report.html").read_text("utf-8"))
     assert capsys.readouterr().out.startswith(statement) and statement in page.text
 

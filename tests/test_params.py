@@ -69,7 +69,7 @@ def test_walk_collects_every_differentiable_leaf(robot_with_effects):
 def test_replace_changes_the_named_and_nothing_else(robot_with_effects):
     before = {p.name: float(p.value) for p in params.walk_parameters(robot_with_effects)}
     for name in before:
-        changed = params.replace(robot_with_effects, {name: jnp.asarray(0.125)})
+        changed = params.replace(robot_with_effects, {name: 0.125})
         after = {p.name: float(p.value) for p in params.walk_parameters(changed)}
         assert {n for n in before if before[n] != after[n]} <= {name} and after[name] == 0.125
 

@@ -12,7 +12,7 @@ from calibration.discovery import discover
 from calibration.inference.calibration import calibrate
 from calibration.inference.foresight import predict_identifiability
 from mmrjax.model import paper_robots
-from tests.commands import read_table
+from tests.commands import csv_text, read_table, text_file
 
 ALL = {
     "calibrate": lambda runs, robot: calibrate(runs, robot),
@@ -38,8 +38,7 @@ def test_a_campaign_sees_the_instruments_that_the_table_shows(tmp_path):
     path = tmp_path / "rig.toml"
     text = DRIVE.format(imposed="voltage", channels='"total_current"', start="rest")
     text += '[instruments.total_current]\nsigned = "free"\nquantum = "free"\n'
-    path.write_text(text + ARM)
-    robot = robot_file.load_robot(str(path))
+    robot = robot_file.load_robot(text_file(path, text + ARM))
     assert robot.rig.instruments[0].free
     volts = np.concatenate([np.linspace(-12, -4, 12), np.linspace(4, 12, 12)])
     current = np.round(0.3 + 0.01 * np.abs(volts), 2)
@@ -47,7 +46,7 @@ def test_a_campaign_sees_the_instruments_that_the_table_shows(tmp_path):
     given = discover.prepare_loop(
         read_table(
             tmp_path,
-            "\n".join([",".join(columns), *(",".join(map(str, row)) for row in zip(*columns.values(), strict=True))]),
+            csv_text(columns),
             robot,
             "table.csv",
         ),

@@ -183,7 +183,7 @@ WRONG = {
     "NaN": ("time_s,duty\n0,nan\n5,1\n", r"row 1, duty: got nan; expected -1 to 1"),
     "infinite time": ("time_s,duty\n0,1\ninf,1\n", r"row 2, time_s: got inf; expected 0 to 1e\+06"),
     "a word": ("time_s,slope_deg\n0,steep\n5,1\n", r"row 1, slope_deg: got steep; expected a number, -45 to 45"),
-    "empty file": ("", r"mission.csv: the file is empty; expected a header with time_s"),
+    "empty file": ("", r"mission.csv: the file is empty; expected a header that has time_s"),
     "comments only": ("# cycles = 3\n", r"mission.csv: the file is empty"),
     "header only": ("time_s,duty\n", r"got a header and no rows; expected two rows or more"),
     "one row only": ("time_s,duty\n0,1\n", r"got one row; expected two rows or more; the last one ends the mission"),

@@ -1,6 +1,5 @@
 """Python code of the docs runs as it stands, with JAX in single precision as a reader has it."""
 
-import json
 import re
 import runpy
 from pathlib import Path
@@ -11,6 +10,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from calibration.data import effect_file
+from tests.commands import read_json
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 #: Pages whose blocks continue each other; blocks that read what a command wrote are left out.
@@ -82,6 +82,6 @@ def test_the_tutorial_about_a_log_finds_the_fan(tmp_path, mmrjax):
     assert mmrjax("settle", bench / "log.csv", "--robot", "rig.toml", "--out", "settled", "--no-report")[0] == 0
     assert len((tmp_path / "settled" / "settled.csv").read_text().splitlines()) == 25
     assert mmrjax("loop settled/settled.csv --robot rig.toml --out found --no-report")[0] == 0
-    found = json.loads((tmp_path / "found" / "result.json").read_text("utf-8"))
+    found = read_json(tmp_path / "found" / "result.json")
     assert found["verdict"] == "class" and "loss torque that changes with speed" in found["statement"]
     assert "windage" in found["statement"]

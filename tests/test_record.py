@@ -19,9 +19,10 @@ from calibration.inference import priors
 from mmrjax import fidelities
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.paper_robots import nominal
+from tests.commands import read_json
 
 RECORD = Path(__file__).parent / "record"
-RESULTS = json.loads((RECORD / "results.json").read_text(encoding="utf-8"))
+RESULTS = read_json(RECORD / "results.json")
 #: Largest relative difference of what a fidelity gives over Table 8.
 EQUAL = {"steady": 1e-9, "drive": 1e-9, "track": 1e-6}
 NUMBERS = ("total_current", "motor_speed", "speed", "slip", "traction", "power_gear")

@@ -1,13 +1,12 @@
 """Records as people have them lead from the file to a first statement, with the columns that `inspect` proposes."""
 
-import json
-
 import numpy as np
 import pytest
 from commands import command
 from miniatures import RECORDS
 
 from calibration.data import contents, rig_facts, robot_file, row_checks, runs
+from tests.commands import read_json
 
 #: Columns that `inspect` proposes, with the factor to the unit of the column.
 PROPOSED = {
@@ -107,7 +106,7 @@ def test_a_record_is_checked_and_calibrated(name, tmp_path, capsys, monkeypatch)
     assert command(["rig", "check", file, data]) == 0
     assert "These data determine" in capsys.readouterr().out
     assert command(["calibrate", data, "--robot", file, "--out", "fit"]) == (3 if name in UNSETTLED else 0)
-    found = json.loads((tmp_path / "fit" / "result.json").read_text("utf-8"))
+    found = read_json(tmp_path / "fit" / "result.json")
     assert found["optimizer"]["status"] == ("not_converged" if name in UNSETTLED else "converged")
     errors = {channel: e["rms_percent"] for channel, e in found["errors"]["after"]["fitted"].items()}
     assert errors and max(errors.values()) < MISSED[name], errors

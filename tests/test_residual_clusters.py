@@ -22,7 +22,7 @@ from calibration.inference.residual_clusters import LEVEL, residual_clusters
 from mmrjax.fidelities.steady import steady_batch
 from mmrjax.model import paper_robots
 from sweeps.report import calibration_report, page_renderer
-from tests.commands import text_file
+from tests.commands import read_json, text_file
 
 SCHEMAS = Path(__file__).parents[1] / "docs" / "schemas"
 ROWS = 90
@@ -263,7 +263,7 @@ def test_calibration_says_what_its_residuals_cluster_by(shifted, tmp_path):
     (found,) = shifted.residual_clusters
     assert (found.column, found.channel, found.within) == ("idle_wheel", "speed", "")
     document = json.loads(json.dumps(shifted.to_json()))
-    jsonschema.validate(document, json.loads((SCHEMAS / "calibrate.schema.json").read_text("utf-8")))
+    jsonschema.validate(document, read_json(SCHEMAS / "calibrate.schema.json"))
     assert document["residual_clusters"][0]["statement"] == found.statement and found.statement in document["notes"]
     document = calibration_report.calibration_document(shifted, "nominal")
     page = page_renderer.write_report_page(tmp_path, document).read_text("utf-8")

@@ -17,10 +17,10 @@ from sweeps import config
 from sweeps.commands import resonance as room
 from sweeps.pages.resonance_figures import resonance_map
 from sweeps.points import run
-from tests.commands import command, rows
+from tests.commands import command, read_json, rows
 from tests.pages import Tables, drawn, outside
 
-SCHEMA = json.loads((Path(__file__).parents[1] / "docs" / "schemas" / "resonance.schema.json").read_text("utf-8"))
+SCHEMA = read_json(Path(__file__).parents[1] / "docs" / "schemas" / "resonance.schema.json")
 SMALL = ("resonance", "--voltages", "24:40:2", "--payloads", "8,0", "--duration", "1")
 
 
@@ -121,7 +121,7 @@ def test_ripple_peaks_where_harmonics_meet_natural_frequencies(tracked):
 
 def test_command_leaves_result_tables_and_a_page_of_its_own(tracked):
     folder, found = tracked
-    result = json.loads((folder / "result.json").read_text())
+    result = read_json(folder / "result.json")
     jsonschema.validate(result, SCHEMA)
     assert result["schema"] == "mmrjax.resonance/1" and result["statement"] == found.statement()
     assert result["statement"].startswith("Avoid ")
@@ -179,7 +179,7 @@ def test_wheels_have_no_grousers_and_nothing_to_avoid(tmp_path, kind):
     out = tmp_path / "wheels"
     with runs_of(kind):
         assert command([*SMALL, "--configuration", "4W2T", "--out", out]) == 0
-    result = json.loads((out / "result.json").read_text())
+    result = read_json(out / "result.json")
     assert result["passing"]["of"] == "teeth" and result["avoid"] == []
     assert "no grousers" in result["statement"]
     assert {m["name"] for m in result["modes"]} == {"bounce", "pitch"}
@@ -196,7 +196,7 @@ def test_shaking_gear_says_what_does_not_settle(tmp_path):
     changes = [part for name, value in settings.items() for part in ("--set", f"{name}={value:g}")]
     out = tmp_path / "shaking"
     assert command([*SMALL, *changes, "--out", out]) == 0
-    result = json.loads((out / "result.json").read_text())
+    result = read_json(out / "result.json")
     assert result["statuses"]["converged"] < result["runs"] and result["restless_m_s"]
     assert "Pitch has no one frequency" in result["statement"]
 

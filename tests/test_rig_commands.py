@@ -1,6 +1,5 @@
 """The front door of rigs: every command from a rig's file alone, and not a word of another robot in what it leaves."""
 
-import json
 import re
 
 import jax
@@ -18,7 +17,7 @@ from sweeps import capabilities
 from sweeps.commands import rig_new
 from sweeps.points import imposed
 from sweeps.report import fit_tables
-from tests.commands import ends
+from tests.commands import ends, read_json
 from tests.commands import rows as rows_of
 
 #: Words of the paper's robot, its parts, its tables and its surfaces; none is a rig's.
@@ -328,7 +327,7 @@ def test_a_vehicle_is_drawn(mmrjax, tmp_path):
 def test_compare_and_calibrate_take_one_channel_both_ways(mmrjax, tmp_path, bench):
     rig, data = bench
     _, out, _ = ends(mmrjax("compare", data, "--robot", rig, "--out", "compared"), code=0)
-    errors = json.loads((tmp_path / "compared" / "result.json").read_text())["errors"]["all"]["total_current"]
+    errors = read_json(tmp_path / "compared" / "result.json")["errors"]["all"]["total_current"]
     assert errors["unit"] == "A" and 0.01 < errors["rms"] < 0.1 and " A " in out
     _, said, err = ends(
         mmrjax("calibrate", data, "--robot", rig, "--starts", "2", "--no-profiles", "--out", "fitted"),
@@ -338,7 +337,7 @@ def test_compare_and_calibrate_take_one_channel_both_ways(mmrjax, tmp_path, benc
     assert "speed" not in said.splitlines()[0]
     fitted = robot_file.read_robot(tmp_path / "fitted" / "robot.toml")
     assert float(fitted.configurations["bench"].loss_coulomb) == pytest.approx(0.07, rel=0.05)
-    priors = json.loads((tmp_path / "fitted" / "result.json").read_text())["parameters"]
+    priors = read_json(tmp_path / "fitted" / "result.json")["parameters"]
     assert {p["prior"]["source"] for p in priors.values()} <= {params.STATED, params.DEFAULT}
     for folder in ("compared", "fitted"):
         assert words_of_others(*left_in(tmp_path / folder)) == [], folder
@@ -413,7 +412,7 @@ def test_what_explains_all_of_precise_readings_is_named(mmrjax, tmp_path):
     (tmp_path / "motor.toml").write_text(MOTOR, encoding="utf-8")
     data = precise_table(tmp_path / "runs.csv")
     _, told, _ = ends(mmrjax("loop", data, "--robot", "motor.toml", "--replicates", "250", "--out", "found"), code=0)
-    found = json.loads((tmp_path / "found" / "result.json").read_text(encoding="utf-8"))
+    found = read_json(tmp_path / "found" / "result.json")
     assert found["verdict"] in ("named", "class"), told
     (effect,) = found["effects"]
     amplitude = effect["parameters"]["amplitude"]

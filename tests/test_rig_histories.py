@@ -25,7 +25,7 @@ from mmrjax.model import balances, channels, params, quantities
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.rig import Begin, Begins, Rig
 from mmrjax.model.signals import State
-from tests.commands import ends, read_table, text_file
+from tests.commands import ends, read_rig, read_table, text_file
 
 DRIVE = """
 schema = "mmrjax.robot/2"
@@ -84,9 +84,10 @@ def history(tmp_path, robot, truth, columns, sd, seed):
 def test_the_speed_at_which_a_run_begins_moves_with_the_robot(tmp_path):
     """Where a speed is imposed a run begins at it, and what moves with the shafts at what the robot makes of it."""
     cart = '[cart]\nload = "linear"\nmass_kg = 3.0\nlead_mm = 5.0\n'
-    path = tmp_path / "rig.toml"
-    path.write_text(DRIVE.format(imposed="motor_speed", channels='"speed"', start="rest") + cart)
-    robot, times = robot_file.load_robot(str(path)), jnp.array([0.0, 0.1, 0.2])
+    robot, times = (
+        read_rig(tmp_path, DRIVE.format(imposed="motor_speed", channels='"speed"', start="rest") + cart),
+        jnp.array([0.0, 0.1, 0.2]),
+    )
     given = Conditions(motor_speed=100.0, motor_acceleration=0.0)
     names = ("cart.radius", "gearbox.ratio")
     values = {p.name: float(p.value) for p in params.walk_parameters(robot) if p.name in names}
@@ -119,9 +120,10 @@ def test_the_speed_at_which_a_run_begins_moves_with_the_robot(tmp_path):
 )
 def test_readings_without_a_sign_are_refused_unless_the_file_says_so(tmp_path, load, shown, stated, said, duty):
     """Of a log that goes both ways: a speed, and a current that nothing but the voltage drives."""
-    path = tmp_path / "rig.toml"
-    path.write_text(DRIVE.format(imposed="voltage", channels=f'"{shown}"', start="rest") + stated + load)
-    robot, t = robot_file.load_robot(str(path)), np.arange(0, 2, 0.02)
+    robot, t = (
+        read_rig(tmp_path, DRIVE.format(imposed="voltage", channels=f'"{shown}"', start="rest") + stated + load),
+        np.arange(0, 2, 0.02),
+    )
     way = np.where(t < 1, 1.0, -1.0)
     driven = {"supply_voltage_V": 12.0, "duty": way / 2} if duty else {"supply_voltage_V": 6 * way}
     columns = {"time_s": t, **driven, channels.find_channel(shown).column: np.abs(way)}
@@ -139,9 +141,9 @@ def test_readings_without_a_sign_are_refused_unless_the_file_says_so(tmp_path, l
 @pytest.mark.nightly
 @pytest.mark.slow
 def test_a_delay_of_the_imposed_speed_is_found(tmp_path):
-    path = tmp_path / "rig.toml"
-    path.write_text(DRIVE.format(imposed="motor_speed", channels='"total_current"', start="measured") + BENCH)
-    robot = robot_file.load_robot(str(path))
+    robot = read_rig(
+        tmp_path, DRIVE.format(imposed="motor_speed", channels='"total_current"', start="measured") + BENCH
+    )
     truth = params.replace(robot, {"rig.delay": 0.03, "bench.loss_coulomb": 0.26})
     t = np.arange(0, 4, 0.03)
     speed = (200 * np.sin(1.5 * t) + 50 * np.sin(4 * t)) / quantities.RPM
@@ -154,11 +156,11 @@ def test_a_delay_of_the_imposed_speed_is_found(tmp_path):
 
 @pytest.mark.slow
 def test_the_beginning_of_an_arm_in_motion_is_found(tmp_path):
-    path = tmp_path / "rig.toml"
-    path.write_text(
-        DRIVE.format(imposed="voltage", channels='"total_current", "motor_speed", "output_angle"', start="free") + ARM
+    robot = read_rig(
+        tmp_path,
+        DRIVE.format(imposed="voltage", channels='"total_current", "motor_speed", "output_angle"', start="free")
+        + ARM,
     )
-    robot = robot_file.load_robot(str(path))
     begins = Begins({"begin_a": Begin(motor_speed=30.0, angle=0.3), "begin_b": Begin(motor_speed=-20.0, angle=0.1)})
     truth = params.replace(robot, {"arm.torque_gravity": 0.66, "arm.loss_coulomb": 0.08})
     truth = dataclasses.replace(truth, rig=dataclasses.replace(truth.rig, begins=begins))
@@ -185,8 +187,11 @@ def test_beginnings_are_measured_by_the_first_samples(tmp_path):
     """A line through five samples, whatever channel shows the speed. Only free ones are free."""
     path = tmp_path / "rig.toml"
     for start in ("measured", "free"):
-        path.write_text(DRIVE.format(imposed="voltage", channels='"output_speed", "output_angle"', start=start) + ARM)
-        robot = robot_file.load_robot(str(path))
+        robot = robot_file.load_robot(
+            text_file(
+                path, DRIVE.format(imposed="voltage", channels='"output_speed", "output_angle"', start=start) + ARM
+            )
+        )
         table = tmp_path / "table.csv"
         lines = ["time_s,supply_voltage_V,output_speed_rpm,output_angle_deg"]
         lines += [f"{t},6,{60 + 100 * t},{30 + 360 * t + 300 * t**2}" for t in np.arange(0, 0.2, 0.01)]
@@ -202,9 +207,7 @@ def test_beginnings_are_measured_by_the_first_samples(tmp_path):
 
 
 def test_a_robot_at_rest_has_no_beginnings(tmp_path):
-    path = tmp_path / "rig.toml"
-    path.write_text(DRIVE.format(imposed="voltage", channels='"motor_speed"', start="rest") + ARM)
-    robot = robot_file.load_robot(str(path))
+    robot = read_rig(tmp_path, DRIVE.format(imposed="voltage", channels='"motor_speed"', start="rest") + ARM)
     assert robot.rig.begins is None and jnp.asarray(robot.rig.delay) == 0
 
 
@@ -243,8 +246,7 @@ def imposed_speed(tmp_path, runs, filled=written):
     """A rig whose motor's speed is imposed over time, and the table of so many runs of it, whatever it reads."""
     path = tmp_path / "rig.toml"
     text = DRIVE.format(imposed="motor_speed", channels='"total_current"', start="measured") + BENCH
-    path.write_text(text.replace('delay = "0 ± 0.05"', "delay = 0.0"))
-    robot = robot_file.load_robot(str(path))
+    robot = robot_file.load_robot(text_file(path, text.replace('delay = "0 ± 0.05"', "delay = 0.0")))
     t = np.tile(np.arange(0, 1, 0.05), runs)
     run = np.repeat(np.arange(runs), 20)
     speed = (200 * np.sin(6 * t + run) + 50 * np.sin(14 * t)) / quantities.RPM
@@ -348,8 +350,9 @@ def test_histories_are_compared_with_a_robot(tmp_path, mmrjax):
 def test_the_loop_looks_for_a_delay_that_no_file_rules_out(tmp_path, stated, free):
     path = tmp_path / "rig.toml"
     text = DRIVE.format(imposed="voltage", channels='"motor_speed"', start="rest") + BENCH
-    path.write_text(text.replace('delay = "0 ± 0.05"', f"delay = {stated}" if stated else ""))
-    robot = robot_file.load_robot(str(path))
+    robot = robot_file.load_robot(
+        text_file(path, text.replace('delay = "0 ± 0.05"', f"delay = {stated}" if stated else ""))
+    )
     names = priors.free_names(robot, ("bench",), *observers.Histories.free())
     assert ("rig.delay" in names) == free and "motor.inertia" in names
     of_settled = priors.free_names(robot, ("bench",), *observers.KINDS[1].free())
@@ -361,8 +364,11 @@ def test_steps_follow_the_rows_of_a_log_whose_input_changes_at_each(tmp_path, mo
     """A second of a voltage at 50 Hz, against steps that stay short after each change."""
     path = tmp_path / "rig.toml"
     text = DRIVE.format(imposed="voltage", channels='"total_current", "motor_speed"', start="rest") + BENCH
-    path.write_text(text.replace('delay = "0 ± 0.05"', "delay = 0.0").replace("inertia = 0.02", "inertia = 0.002"))
-    robot = robot_file.load_robot(str(path))
+    robot = robot_file.load_robot(
+        text_file(
+            path, text.replace('delay = "0 ± 0.05"', "delay = 0.0").replace("inertia = 0.02", "inertia = 0.002")
+        )
+    )
     t = np.arange(0, 1, 0.02)
     volts = 12 * np.sin(5 * t) + 6 * np.sign(np.sin(11 * t)) + 0.5 * np.random.default_rng(1).standard_normal(50)
     rows = [f"{a:.2f},{b:.4f},0,0" for a, b in zip(t, volts, strict=True)]
@@ -426,8 +432,7 @@ def test_steps_are_short_where_a_drive_passes_through_rest(tmp_path, imposed):
 def test_a_voltage_on_lines_is_the_mean_of_each_step_and_no_jump(tmp_path):
     """The means of all steps make up the integral of the broken line. Nothing else than what is imposed is on lines."""
     text = DRIVE.format(imposed="voltage", channels='"motor_speed"', start="rest") + BENCH
-    (tmp_path / "rig.toml").write_text(text.replace('start = "rest"', 'start = "rest"\nbetween_rows = "linear"'))
-    robot = robot_file.load_robot(str(tmp_path / "rig.toml"))
+    robot = read_rig(tmp_path, text.replace('start = "rest"', 'start = "rest"\nbetween_rows = "linear"'))
     runs = read_table(
         tmp_path,
         "time_s,supply_voltage_V,duty,motor_speed_rpm\n0,2,1,0\n0.1,12,1,0\n0.3,4,0.5,0\n0.4,4,0.5,0\n",
@@ -457,8 +462,7 @@ def test_what_is_imposed_is_held_or_goes_on_lines_between_rows(tmp_path):
     text = text.replace("inertia = 0.02", "inertia = 0.002")
 
     def shown(word, step):
-        (tmp_path / "rig.toml").write_text(text.replace('start = "rest"', f'start = "rest"\nbetween_rows = "{word}"'))
-        robot = robot_file.load_robot(str(tmp_path / "rig.toml"))
+        robot = read_rig(tmp_path, text.replace('start = "rest"', f'start = "rest"\nbetween_rows = "{word}"'))
         t = np.arange(0, 0.8 + 1e-9, step)
         volts = np.interp(t, [0, 0.3, 0.5, 0.8], [2.0, 14.0, 14.0, -5.0])
         rows = [f"{a:.4f},{b:.6f},0" for a, b in zip(t, volts, strict=True)]
@@ -475,11 +479,13 @@ def test_what_is_imposed_is_held_or_goes_on_lines_between_rows(tmp_path):
 def test_between_rows_is_one_of_two_words_and_is_written(tmp_path):
     path = tmp_path / "rig.toml"
     text = DRIVE.format(imposed="voltage", channels='"motor_speed"', start="rest") + BENCH
-    path.write_text(text.replace('start = "rest"', 'start = "rest"\nbetween_rows = "spline"'))
     with pytest.raises(BadConfiguration, match=r"rig.toml, between_rows: got spline; .*allowed: held, linear"):
-        robot_file.load_robot(str(path))
-    path.write_text(text.replace('start = "rest"', 'start = "rest"\nbetween_rows = "linear"'))
-    robot = robot_file.load_robot(str(path))
+        robot_file.load_robot(
+            text_file(path, text.replace('start = "rest"', 'start = "rest"\nbetween_rows = "spline"'))
+        )
+    robot = robot_file.load_robot(
+        text_file(path, text.replace('start = "rest"', 'start = "rest"\nbetween_rows = "linear"'))
+    )
     robot_file.write_robot(robot, tmp_path / "robot.toml")
     assert robot_file.load_robot(str(tmp_path / "robot.toml")).rig.between_rows == robot.rig.between_rows == "linear"
 
@@ -488,10 +494,7 @@ def test_a_jump_of_the_voltage_is_exact_in_every_step(tmp_path):
     """L / R of 3.3 ms, a shaft so heavy that it stands: the current's closed form at the end of steps of 20, 10 and 5 ms
     after a start and a jump, within one, and its derivative by the resistance."""
     text = DRIVE.format(imposed="voltage", channels='"motor_current"', start="rest") + BENCH
-    (tmp_path / "rig.toml").write_text(
-        text.replace("[gearbox]", "inductance = 0.01\n[gearbox]").replace("0.02", "1e3")
-    )
-    robot = robot_file.load_robot(str(tmp_path / "rig.toml"))
+    robot = read_rig(tmp_path, text.replace("[gearbox]", "inductance = 0.01\n[gearbox]").replace("0.02", "1e3"))
     times = jnp.array([0.0, 0.02, 0.03, 0.035, 0.04, 0.04])  # the last instant begins a step, as the observer has it
     driven = Conditions(voltage=np.array([6.0, 6.0, 9.0, 9.0, 9.0, 9.0]))
 

@@ -27,7 +27,7 @@ from mmrjax.model.signals import STALLED
 from mmrjax.model.track_friction import Track
 from sweeps import config as configuration
 from sweeps.points import run
-from tests.commands import read_rig, text_file
+from tests.commands import csv_text, read_rig, text_file
 
 DRIVE = {
     "motor.resistance": 2.0,
@@ -67,8 +67,7 @@ def measured(tmp_path, robot, conditions, columns, true=None, *, share=0.01, see
     for c in robot.channels:
         x = np.asarray(found.reading[c.name]) / c.factor
         columns[c.column] = [f"{v:.6g}" for v in x * (1 + share * rng.standard_normal(x.shape))]
-    lines = [",".join(columns), *(",".join(map(str, row)) for row in zip(*columns.values(), strict=True))]
-    return read(tmp_path, "\n".join(lines) + "\n", robot)
+    return read(tmp_path, csv_text(columns), robot)
 
 
 # --- which columns

@@ -193,10 +193,8 @@ REFUSED = {
 @pytest.mark.parametrize("case", REFUSED, ids=list(REFUSED))
 def test_bad_robots_are_refused_in_one_sentence(tmp_path, case):
     text, sentence = REFUSED[case]
-    path = tmp_path / "mine.toml"
-    path.write_text(text)
     with pytest.raises(BadConfiguration, match=sentence) as refusal:
-        robot_file.load_robot(str(path))
+        read_rig(tmp_path, text, "mine.toml")
     assert refusal.value.exit_code == 2
 
 

@@ -13,6 +13,7 @@ from calibration.data import writing
 from calibration.data.input_errors import BadConfiguration
 from sweeps.commands.rig_new import write_new_rig
 from sweeps.store import RunFolder, lock_text
+from tests.commands import read_json
 
 LOOP, SWEEP = {"command": "loop", "seed": 1}, {"command": "sweep", "seed": 1}
 
@@ -38,7 +39,7 @@ def interrupted(path, identity=LOOP):
 def test_a_finished_folder_holds_what_its_manifest_lists(tmp_path):
     folder = finished(tmp_path / "x")
     assert names(folder) == ["manifest.json", "robot.toml"]
-    assert json.loads((folder / "manifest.json").read_text())["contents"] == names(folder)
+    assert read_json(folder / "manifest.json")["contents"] == names(folder)
     finished(tmp_path / "x", force=True)
     assert names(tmp_path) == ["x", "x/manifest.json", "x/robot.toml"]
 
@@ -137,7 +138,7 @@ def test_a_foreign_file_that_comes_during_the_run_is_not_listed_as_ours(tmp_path
         (folder.partial / "notes.txt").write_text("years of work")
         folder.write_text("robot.toml", "")
         folder.finish({})
-    assert json.loads((tmp_path / "x" / "manifest.json").read_text())["contents"] == ["manifest.json", "robot.toml"]
+    assert read_json(tmp_path / "x" / "manifest.json")["contents"] == ["manifest.json", "robot.toml"]
     with pytest.raises(BadConfiguration, match=r"--force would delete notes\.txt"):
         finished(tmp_path / "x", force=True)
     with pytest.raises(KeyboardInterrupt), RunFolder(tmp_path / "y", LOOP) as folder:

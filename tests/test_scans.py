@@ -9,7 +9,6 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from test_rig_histories import BENCH, DRIVE, history
 
-from calibration.data import robot_file
 from calibration.inference import multistart, noise, observers, priors, scans
 from calibration.inference.calibration import calibrate
 from calibration.inference.identifiability import Z95
@@ -17,6 +16,7 @@ from calibration.inference.observers import time_histories
 from calibration.inference.optimizers import evaluate_residuals
 from calibration.inference.scans import Scan
 from mmrjax.model import params
+from tests.commands import read_rig
 
 OPTIONS = {"model": "drive", "starts": 1, "blocks": False, "profiles": False}
 TRUTH = 0.0312
@@ -28,8 +28,7 @@ def coarse(tmp_path_factory):
     folder = tmp_path_factory.mktemp("coarse")
     text = DRIVE.format(imposed="voltage", channels='"total_current"', start="rest") + BENCH
     text = text.replace("resistance = 3.0", "resistance = 3.0\ninductance = 1e-3").replace("0 ± 0.05", "0 ± 0.02")
-    (folder / "rig.toml").write_text(text)
-    robot = robot_file.load_robot(str(folder / "rig.toml"))
+    robot = read_rig(folder, text)
     truth = params.replace(robot, {"rig.delay": TRUTH, "bench.loss_coulomb": 0.24})
     t = np.arange(0, 0.32, 0.02)
     columns = {"time_s": t, "supply_voltage_V": np.where(t < 0.16, 12.0, 6.0)}

@@ -1,7 +1,6 @@
 """Sets of effects are ranked by regression where runs take long, and simulation confirms the first of them."""
 
 import dataclasses
-import json
 from types import SimpleNamespace
 
 import jax.numpy as jnp
@@ -22,6 +21,7 @@ from calibration.inference.optimizers import Optimum
 from calibration.words import loop_words as words
 from mmrjax.effects import BY_NAME
 from sweeps.commands import loop as command
+from tests.commands import read_json
 
 NAMES = ("churning", "stribeck_track", "series_resistance", "brush_drop")
 ANALYST = Analyst(dataclasses.replace(settings_for(Histories, 300), slots=2), {n: BY_NAME[n] for n in NAMES})
@@ -316,7 +316,7 @@ def test_a_budget_that_ends_after_the_screening_leaves_its_ranking(tmp_path, mmr
     assert err.count("  1. churning, a loss torque that changes with speed") == 1  # at the end
     assert "no verdict within 20 s\n" in err and "kept: ranking" in err
     assert "regression only, not confirmed by simulation: something is missing, a loss torque that changes" in err
-    left = json.loads((tmp_path / "found.partial" / "screening.json").read_text(encoding="utf-8"))
+    left = read_json(tmp_path / "found.partial" / "screening.json")
     assert left["schema"] == "mmrjax.screening/1" and left["confirmed"] is False
     assert [e["name"] for e in left["effects"]] == ["churning", "brush_drop", "bending_loss"]
 

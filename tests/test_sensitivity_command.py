@@ -1,6 +1,5 @@
 """The command `sensitivity` and its study: against finite differences and the model itself, and what is refused."""
 
-import json
 import re
 import tomllib
 from pathlib import Path
@@ -28,12 +27,12 @@ from mmrjax.fidelities.steady import steady_batch
 from mmrjax.model import params
 from sweeps.report import sensitivity_report
 from sweeps.report.document import Figure
-from tests.commands import ends
+from tests.commands import ends, read_json
 from tests.commands import rows as table
 from tests.pages import Tables
 
 ROOT = Path(__file__).parents[1]
-SCHEMA = json.loads((ROOT / "docs" / "schemas" / "sensitivity.schema.json").read_text(encoding="utf-8"))
+SCHEMA = read_json(ROOT / "docs" / "schemas" / "sensitivity.schema.json")
 NAMES = ("motor.torque_constant", "6T2A.track.guide_share", "4W2T.track.loss_coulomb", "motor.inductance")
 SMALL = (
     "sensitivity --parameters", ",".join(NAMES), "--voltages", "24", "--payloads", "3", "--slopes", "0,5",
@@ -148,7 +147,7 @@ def test_command_leaves_indices_tables_and_a_page(mmrjax, tmp_path, outputs):
     )
     assert out.rstrip().splitlines()[-1] == "s"
     folder = tmp_path / "s"
-    document = json.loads((folder / "result.json").read_text())
+    document = read_json(folder / "result.json")
     jsonschema.Draft202012Validator.check_schema(SCHEMA)
     jsonschema.validate(document, SCHEMA)
     assert document["evaluations"] >= 3000 and len(document["points"]) == 4
@@ -174,7 +173,7 @@ def test_command_leaves_indices_tables_and_a_page(mmrjax, tmp_path, outputs):
 @pytest.mark.slow
 def test_morris_has_indices_of_its_own(mmrjax, tmp_path):
     code, _, _ = mmrjax(*SMALL, "--method", "morris", "--no-report", "--out", "m")
-    document = json.loads((tmp_path / "m" / "result.json").read_text())
+    document = read_json(tmp_path / "m" / "result.json")
     jsonschema.validate(document, SCHEMA)
     index = document["indices"]["speed"]["motor.torque_constant"]
     assert code == 0 and {"mean_absolute_effect", "mean_effect", "sd_effect"} <= set(index)
@@ -208,7 +207,7 @@ def test_posterior_of_a_robot_is_its_inputs_and_gives_runs_their_uncertainty(mmr
     code, out, _ = mmrjax(
         "sensitivity --robot robot.toml --posterior --voltages 24 --payloads 3 --slopes 0 --configurations 6T2A --outputs speed --evaluations 6000 --no-report --out p",
     )  # fmt: skip
-    document = json.loads((tmp_path / "p" / "result.json").read_text())
+    document = read_json(tmp_path / "p" / "result.json")
     jsonschema.validate(document, SCHEMA)
     assert code == 0 and document["method"] == "local" and document["correlated"]
 
@@ -285,7 +284,7 @@ def test_candidates_are_read_as_tables_of_runs(mmrjax, tmp_path):
         "configuration,supply_voltage_V,payload_kg,slope_deg\n6T2A,24,3,0\n4W2T,33,8,5\n"
     )
     got, _, _ = mmrjax(*SMALL, "--method", "local", "--candidates", "two.csv", "--no-report", "--out", "c")
-    runs = json.loads((tmp_path / "c" / "result.json").read_text())["next_runs"]
+    runs = read_json(tmp_path / "c" / "result.json")["next_runs"]
     assert got == 0 and runs["candidates"] == 2 and runs["source"] == "two.csv" and len(runs["runs"]) == 2
 
 
@@ -314,7 +313,7 @@ def test_points_that_are_not_held_are_said(mmrjax, tmp_path):
         "1 of 2 operating points are left out",
         code=0,
     )
-    document = json.loads((tmp_path / "h" / "result.json").read_text())
+    document = read_json(tmp_path / "h" / "result.json")
     assert document["outputs"]["speed"]["studied"] == [True, False]
     low, high = document["indices"]["speed"][NAMES[0]]["total_interval"]
     assert low < 1 < high  # the only input
@@ -344,7 +343,7 @@ def test_conditions_that_vary_are_those_of_each_candidate_where_it_states_them(m
         ),
         code=0,
     )
-    document = json.loads((tmp_path / "v" / "result.json").read_text())
+    document = read_json(tmp_path / "v" / "result.json")
     assert vary.partition("=")[0] in document["inputs"] and len(document["next_runs"]["runs"]) == 5
 
 
@@ -353,7 +352,7 @@ def test_start_outputs_are_studied_by_drive(mmrjax, tmp_path):
     code, _, _ = mmrjax(
         "sensitivity --method local --parameters motor.resistance,6T2A.ground.friction.dynamic --voltages 24 --payloads 0 --slopes 0 --configurations 6T2A --outputs start --no-report --out t",
     )  # fmt: skip
-    document = json.loads((tmp_path / "t" / "result.json").read_text())
+    document = read_json(tmp_path / "t" / "result.json")
     assert code == 0 and set(document["outputs"]) == {"peak_current", "time_to_speed", "energy_start"}
     peak, time = (document["indices"][n] for n in ("peak_current", "time_to_speed"))
     assert peak["motor.resistance"]["elasticity"][0] < -0.5  # U / R before the motor turns

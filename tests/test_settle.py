@@ -22,7 +22,7 @@ from calibration.inference import noise as noises
 from calibration.inference.foresight import Foresight
 from calibration.words import settle_words as words
 from sweeps.commands import rig_check
-from tests.commands import ends, read_rig
+from tests.commands import csv_text, ends, read_rig, text_file
 
 
 def made(tmp_path, seed=1, kind="bench", imposed="voltage", **options):
@@ -173,8 +173,7 @@ inertia = 0.002
 loss_coulomb = 0.1
 """
     (tmp_path / "rig.toml").write_text(text, encoding="utf-8")
-    lines = [",".join(columns), *(",".join(map(str, row)) for row in zip(*columns.values(), strict=True))]
-    (tmp_path / "log.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    text_file(tmp_path / "log.csv", csv_text(columns))
     return robot_file.read_robot(tmp_path / "rig.toml")
 
 

@@ -1,7 +1,6 @@
 """`simulate --profile`, `mm.simulate(profile=...)` and sweeps over a profile: what comes out, and what is refused."""
 
 import csv
-import json
 import re
 
 import numpy as np
@@ -17,7 +16,7 @@ from mmrjax.model import energy
 from mmrjax.model.signals import STATUSES
 from sweeps import cli
 from sweeps.commands.missions import rows_to_keep
-from tests.commands import ends
+from tests.commands import ends, read_json
 
 #: Up a slope, to a stop, and back; twice.
 MISSION = """\
@@ -84,7 +83,7 @@ def done(mmrjax, capsys, monkeypatch):
 
 @pytest.mark.slow
 def test_endurance_and_range_are_those_of_the_mean_current(done):
-    result = json.loads((done / "result.json").read_text())
+    result = read_json(done / "result.json")
     used = 1 - result["state_of_charge"]
     assert result["endurance_s"] == pytest.approx(result["duration_s"] / used, rel=1e-9)
     assert result["range_m"] == pytest.approx(result["distance_m"] / used, rel=1e-9)
@@ -133,7 +132,7 @@ def test_history_follows_the_demand_and_holds_each_segments_peak(done):
 def test_console_says_the_numbers_and_the_status(done):
     said = (done.parent / "said.txt").read_text()
     assert "Profile mission.csv: 10 s, 2 cycles, 7 segments each" in said
-    result = json.loads((done / "result.json").read_text())
+    result = read_json(done / "result.json")
     assert re.search(rf"energy \[Wh\] +{result['energy_Wh']:.3f}", said)
     assert re.search(r"status +converged", said)
 
@@ -144,7 +143,7 @@ def test_report_shows_course_energy_and_segments(done):
     assert drawn(page) == {"course", "energy"}
     tables = Tables(page)
     assert len(tables.tables["segments"]) == 2 + 7
-    result = json.loads((done / "result.json").read_text())
+    result = read_json(done / "result.json")
     assert f"{result['energy_Wh']:.4g} Wh" in tables.text
     assert "0 to 300\u00a0mm/s, 0 to 5°" in tables.text
     assert outside(done) == []
@@ -159,7 +158,7 @@ def test_runs_of_a_file_follow_the_same_profile(mmrjax, capsys, monkeypatch):
     _, _, err = ends(mmrjax(capsys, monkeypatch, "simulate", *words), code=0)
     assert "plan.csv, slope_deg: not used, mission.csv states it" in err
     folder = mmrjax.folder / "several"
-    result = json.loads((folder / "result.json").read_text())
+    result = read_json(folder / "result.json")
     assert [m["status"] for m in result["missions"]] == ["converged"] * 2
     assert (
         result["missions"][0]["energy_Wh"] > 1.5 * result["missions"][1]["energy_Wh"]
@@ -175,7 +174,7 @@ def test_battery_that_ends_in_the_mission_is_said(mmrjax, capsys, monkeypatch):
     ends(
         mmrjax(capsys, monkeypatch, "simulate", *words), "battery empty", "the battery's capacity is used up", code=0
     )
-    result = json.loads((mmrjax.folder / "empty" / "result.json").read_text())
+    result = read_json(mmrjax.folder / "empty" / "result.json")
     assert result["status"] == "battery_empty" and 2 < result["duration_s"] < 5
     assert result["endurance_s"] == pytest.approx(result["duration_s"])
     assert result["state_of_charge"] == pytest.approx(0, abs=1e-6)
@@ -308,7 +307,7 @@ def test_sweep_over_a_profile_stores_the_missions_numbers(mmrjax, done, capsys, 
     (mmrjax.folder / "plan.toml").write_text(PLAN)
     ends(mmrjax(capsys, monkeypatch, "sweep", "plan.toml", "--no-report", "--out", "swept"), code=0)
     found = xr.open_zarr(mmrjax.folder / "swept" / "results.zarr")
-    one = json.loads((done / "result.json").read_text())
+    one = read_json(done / "result.json")
     assert float(found.energy_Wh.sel(payload=0)) == pytest.approx(one["energy_Wh"], rel=1e-6)
     assert float(found.energy_Wh.sel(payload=8)) > one["energy_Wh"] and found.energy_Wh.attrs["units"] == "Wh"
     assert [STATUSES[int(k)] for k in found.status] == ["converged"] * 2 and found.flags.dtype == np.uint16
@@ -320,7 +319,7 @@ BAD_PLANS = {
     "another model": ('model = "steady"\n' + PLAN, r"profile acts only with model drive"),
     "a duration": ("duration_s = 3\n" + PLAN, r"duration_s acts only without profile"),
     "no such profile": (PLAN.replace("mission.csv", "none.csv"), r"none.csv: no such file and no packaged profile"),
-    "surfaces": (PLAN.replace("mission.csv", "floors.csv"), r"profile: got floors.csv with the column surface"),
+    "surfaces": (PLAN.replace("mission.csv", "floors.csv"), r"profile: got floors.csv with a column surface"),
 }  # fmt: skip
 
 

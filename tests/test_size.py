@@ -1,7 +1,6 @@
 """Sizing: what a search finds meets the requirements, no grid is better, what binds, and what is refused."""
 
 import itertools
-import json
 import math
 from pathlib import Path
 
@@ -19,9 +18,9 @@ from calibration.sizing.part_options import BELT_STAGE, MOTOR, drive_options, op
 from mmrjax.derived.requirements import QUANTITIES
 from mmrjax.model import params
 from sweeps.report.size_report import design_verdict
-from tests.commands import command
+from tests.commands import command, read_json
 
-SCHEMA = json.loads((Path(__file__).parents[1] / "docs" / "schemas" / "size.schema.json").read_text("utf-8"))
+SCHEMA = read_json(Path(__file__).parents[1] / "docs" / "schemas" / "size.schema.json")
 TEXT = """
 speed_m_s = 0.9
 payload_kg = 8
@@ -182,7 +181,7 @@ def test_paper_parts_make_the_papers_robot(robot, asked):
 
 @pytest.mark.slow
 def test_command_leaves_what_its_schema_says(folder):
-    result = json.loads((folder / "result.json").read_text())
+    result = read_json(folder / "result.json")
     jsonschema.validate(result, SCHEMA)
     assert "NaN" not in (folder / "result.json").read_text()
     front = [(f["objectives"]["mass"], f["objectives"]["energy"]) for f in result["pareto"]]

@@ -169,8 +169,10 @@ def test_effects_are_those_of_the_file_that_is_read_and_not_of_bytes_beside_it(t
     import py_compile
 
     file = tmp_path / "own.py"
-    file.write_text("import pathlib\npathlib.Path('harmed').touch()\n" + OWN)
-    py_compile.compile(str(file), invalidation_mode=py_compile.PycInvalidationMode.UNCHECKED_HASH)
+    py_compile.compile(
+        text_file(file, "import pathlib\npathlib.Path('harmed').touch()\n" + OWN),
+        invalidation_mode=py_compile.PycInvalidationMode.UNCHECKED_HASH,
+    )
     assert os.path.exists(importlib.util.cache_from_source(str(file)))
     file.write_text(OWN)
     before = os.getcwd()

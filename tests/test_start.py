@@ -1,7 +1,6 @@
 """Runs from standstill as they are written: by the clock of the rig, with the slip over the stages of the start."""
 
 import csv
-import json
 from pathlib import Path
 
 import jax
@@ -20,9 +19,10 @@ from mmrjax.model.quantities import MM
 from mmrjax.model.rig import Rig
 from mmrjax.model.signals import Signals
 from sweeps.commands import simulate
+from tests.commands import read_json
 
 VOLTAGE, V_S = 33.0, 0.02
-SCHEMA = json.loads((Path(__file__).parents[1] / "docs" / "schemas" / "simulate.schema.json").read_text("utf-8"))
+SCHEMA = read_json(Path(__file__).parents[1] / "docs" / "schemas" / "simulate.schema.json")
 
 
 def table(path):
@@ -39,7 +39,7 @@ def written(mmrjax, tmp_path):
         (tmp_path / "own.toml").write_text(f'schema = "mmrjax.robot/2"\nbase = "nominal"\n{rig}')
         asked = ("--model", "drive", "--robot", "own.toml", "--voltage", VOLTAGE, "--no-report", "--force")
         assert mmrjax("simulate", *asked, "--out", "d")[0] == 0
-        return table(tmp_path / "d" / "history.csv"), json.loads((tmp_path / "d" / "result.json").read_text())
+        return table(tmp_path / "d" / "history.csv"), read_json(tmp_path / "d" / "result.json")
 
     return left
 

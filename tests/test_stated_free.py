@@ -48,14 +48,14 @@ def test_everything_stated_with_a_width_is_freed_that_the_data_show(tmp_path):
         "motor.friction_coulomb",
         "bench.inertia",
     )
-    assert set(priors.stated_names(robot, ["bench"])) == set(over_time)
-    settled = priors.stated_names(robot, ["bench"], priors.OVER_TIME)
+    assert set(priors.names_to_fit(robot, ["bench"])) == set(over_time)
+    settled = priors.names_to_fit(robot, ["bench"], priors.OVER_TIME)
     assert set(settled) == {n for n in over_time if not n.endswith(".inertia")}
-    assert not [n for n in priors.stated_names(robot, ["other"]) if n.startswith("bench")]
+    assert not [n for n in priors.names_to_fit(robot, ["other"]) if n.startswith("bench")]
     driven = bench(tmp_path, lambda text: text.replace(', "motor_speed"]', ']\nimposed = "motor_speed"'))
-    assert "motor.resistance" not in priors.stated_names(driven, ["bench"])  # nothing shows it
+    assert "motor.resistance" not in priors.names_to_fit(driven, ["bench"])  # nothing shows it
     exact = bench(tmp_path, lambda text: text.replace("1.2 ± 5 %", "1.2 ± 0"))
-    assert "motor.resistance" not in priors.stated_names(exact, ["bench"])
+    assert "motor.resistance" not in priors.names_to_fit(exact, ["bench"])
 
 
 def test_a_log_shows_how_a_vehicle_grips_though_no_channel_shows_its_speed(tmp_path):

@@ -253,6 +253,7 @@ KEPT = {
     ("mmrjax/undercarriage/mjcf.py", "_template"): "pure: the topology of the track model",
     ("mmrjax/effects/scaled.py", "scaled_effect"): "pure: a class of a class and its factors",
     ("mmrjax/model/params.py", "rig_spec"): "pure, of hashable arguments",
+    ("mmrjax/compile/programs.py", "_is_supported"): "pure: whether this XLA has a compile option",
     ("calibration/data/effect_file.py", "_instants"): "pure: signals of the nominal robot",
     ("calibration/data/effect_file.py", "sys.modules"): "a user's module, by a name that follows from its path",
     ("calibration/data/parts.py", "packaged_motors"): "a packaged table",

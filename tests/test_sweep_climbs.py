@@ -1,6 +1,5 @@
 """Sweeps of climbs: the search of many points side by side, points as single climbs, the store, what is refused."""
 
-import json
 import time
 
 import numpy as np
@@ -17,7 +16,7 @@ from mmrjax.model.paper_robots import nominal
 from sweeps.config_campaign import Campaign, Obstacle
 from sweeps.pages.campaign_figures import Varied, draw_grid_statuses
 from sweeps.points import axes, climbs, scale
-from tests.commands import ends
+from tests.commands import ends, read_json
 
 ROBOT = nominal()
 
@@ -207,7 +206,7 @@ obstacle_mm = [60, 500]
     for share in ("1/2", "2/2"):
         ends(mmrjax("sweep map.toml --shard", share, "--out", "run"), code=0)
         assert (tmp_path / "run").exists() == (share == "2/2")
-    result = json.loads((tmp_path / "run" / "result.json").read_text("utf-8"))
+    result = read_json(tmp_path / "run" / "result.json")
     assert result["model"] == "climb" and result["statuses"]["converged"] == 4
     store = zarr.open_group(tmp_path / "run" / "results.zarr", mode="r")
     verdicts = [[NAMES[k] for k in row] for row in store["verdict"][:]]

@@ -32,7 +32,7 @@ from sweeps.points import axes, scale, zarr_store
 from sweeps.points.job import laid_out, prepare_job
 from sweeps.points.tasks import task_of
 from sweeps.store import LOCK, MANIFEST, RunFolder
-from tests.commands import ends
+from tests.commands import ends, read_json
 
 CONFIG = """report = false
 chunk = 40
@@ -122,7 +122,7 @@ def test_store_is_opened_by_xarray_with_units_and_long_names(whole):
 
 def test_result_counts_statuses_and_states_ranges(whole):
     found = xr.open_zarr(whole / zarr_store.STORE).load()
-    result = json.loads((whole / "result.json").read_text())
+    result = read_json(whole / "result.json")
     assert result["schema"] == "mmrjax.sweep_store/1" and result["points"] == POINTS
     for code, status in enumerate(STATUSES):
         assert result["statuses"][status] == int((found.status == code).sum())
@@ -130,7 +130,7 @@ def test_result_counts_statuses_and_states_ranges(whole):
         "unit": "A", "least": float(found.total_current.min()), "greatest": float(found.total_current.max()),
     }  # fmt: skip
     assert result["statuses"]["slides"] > 0
-    manifest = json.loads((whole / "manifest.json").read_text())
+    manifest = read_json(whole / "manifest.json")
     assert manifest["statuses"] == result["statuses"] and manifest["seed"] == 7
 
 
@@ -151,7 +151,7 @@ def test_large_grid_of_options_leaves_a_store_with_the_numbers_of_the_table(mmrj
     assert left == {
         "config.resolved.toml", "identity.json", "journal", "manifest.json", "result.json", "results.zarr", "robot.toml",
     }  # fmt: skip
-    results = [json.loads((tmp_path / name / "result.json").read_text()) for name in ("small", "large")]
+    results = [read_json(tmp_path / name / "result.json") for name in ("small", "large")]
     assert results[0]["statuses"] == results[1]["statuses"] and results[0]["runs"] == results[1]["points"] == 12
     written = arrays(tmp_path / "large")
     assert mmrjax(*grid, "--out", "large", "--export", "csv")[0] == small
@@ -775,7 +775,7 @@ def test_a_store_and_a_table_of_one_path_leave_each_other_alone(opened, tmp_path
     with pytest.raises(BadConfiguration, match="holds an interrupted sweep, which"):
         opened()
     store = opened(force=True)
-    assert json.loads((store.partial / LOCK).read_text())["command"] == zarr_store.COMMAND and not store.done()
+    assert read_json(store.partial / LOCK)["command"] == zarr_store.COMMAND and not store.done()
 
 
 # --- devices --------------------------------------------------------------------------------------------------------
@@ -788,7 +788,7 @@ def test_four_devices_give_the_same_samples_and_results_to_1e_12(whole, tmp_path
     command = [*MMRJAX, "sweep", "plan.toml", "--chunk", "27", "--out", "s"]
     done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    assert len(json.loads((tmp_path / "s" / "manifest.json").read_text())["devices"]) == 4
+    assert len(read_json(tmp_path / "s" / "manifest.json")["devices"]) == 4
     compare(tmp_path / "s", whole)
 
 

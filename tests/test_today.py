@@ -15,7 +15,7 @@ from mmrjax.model import paper_robots, signals
 from sweeps.commands.simulate import PEAK, run_remarks
 from sweeps.pages import figure_style, history_figures, words
 from sweeps.report import runs_report
-from tests.commands import ends, read_rig, text_file
+from tests.commands import ends, read_json, read_rig, text_file
 from tests.commands import rows as table
 
 SPEED_STATIC = 0.02  # V_s of the packaged robot [m/s]: within it contacts creep
@@ -83,7 +83,7 @@ def test_charging_above_the_charge_voltage_is_flagged_with_the_voltage_of_a_cell
     assert "overvoltage" in row["flags"].split(";") and float(row["total_current_A"]) < -0.5
     assert float(row["voltage_cell_V"]) == pytest.approx(float(row["voltage_V"]) / 8, rel=1e-6)
     assert float(row["voltage_cell_V"]) > 4.2 and row["supply_voltage_V"] == ""
-    (note,) = json.loads((tmp_path / "a" / "result.json").read_text())["notes"]
+    (note,) = read_json(tmp_path / "a" / "result.json")["notes"]
     assert note in " ".join(out.split()) and "A flow into the battery, a cell at 4." in note
     _, out, _ = ends(
         mmrjax(DOWNHILL, *model, "--set", "battery.voltage_charge=4.9", "--no-report", "--out", "b"), code=0
@@ -173,7 +173,7 @@ def test_the_command_line_reverses(mmrjax, tmp_path):
         ),
         code=0,
     )
-    assert json.loads((tmp_path / "c" / "result.json").read_text())["statuses"]["reverses"] == 4
+    assert read_json(tmp_path / "c" / "result.json")["statuses"]["reverses"] == 4
     assert "-33 V" in (tmp_path / "c" / "report.html").read_text()
     ends(
         mmrjax("simulate --voltage", 0, "--slope", 20, "--model", "drive", "--no-report", "--out", "d"),
@@ -228,7 +228,7 @@ def test_a_history_has_the_peak_of_the_inrush(climb, mmrjax, tmp_path):
     assert float(row[PEAK]) == pytest.approx(peak, rel=1e-4)
     kept = [float(r["total_current_A"]) for r in table(tmp_path / "a" / "history.csv")]
     assert 0.999 * float(row[PEAK]) < max(kept) < float(row[PEAK])
-    assert json.loads((tmp_path / "a" / "result.json").read_text())[PEAK] == pytest.approx(float(row[PEAK]))
+    assert read_json(tmp_path / "a" / "result.json")[PEAK] == pytest.approx(float(row[PEAK]))
 
 
 @pytest.mark.slow

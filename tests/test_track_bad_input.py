@@ -19,14 +19,12 @@ from sweeps import config as configuration
 from sweeps.points import run
 from sweeps.points.grid import grid_conditions
 
-TWO = Conditions(
-    voltage=jnp.asarray([33.0, 33.0]), payload=jnp.asarray([0.0, 8.0]), configuration=jnp.asarray([0.0, 1.0])
-)
+TWO = Conditions(voltage=[33.0, 33.0], payload=[0.0, 8.0], configuration=[0.0, 1.0])
 
 
 @pytest.mark.slow
 def test_step_too_large_is_refused_with_the_largest_stable_one(robot):
-    robot = params.replace(robot, {"running_gear.contact_stiffness": jnp.asarray(3e9)})
+    robot = params.replace(robot, {"running_gear.contact_stiffness": 3e9})
     limit = float(largest_step(robot, TWO).min())
     with pytest.raises(
         ValueError, match=r"step: got 0.001 s; .*largest stable step is 0\.000\d+ s \(run 1 of 2\); take 0.0005 s,"
@@ -56,7 +54,7 @@ def test_largest_step_falls_with_stiffness(robot):
 @pytest.mark.slow
 def test_beyond_the_largest_step_a_run_goes_wrong_and_below_it_does_not(robot):
     """On tracks whose contacts are a thousand times as stiff: beyond twice the limit there are no numbers."""
-    stiff = params.replace(robot, {"running_gear.contact_stiffness": jnp.asarray(3e10)})
+    stiff = params.replace(robot, {"running_gear.contact_stiffness": 3e10})
     limit = float(largest_step(stiff, TWO)[0])
     assert 2e-4 < limit < 3e-4
     below, beyond = (_batch(stiff, TWO, 0.3, step, 1e-3, True).result for step in (1e-4, 5e-4))
@@ -68,7 +66,7 @@ def test_beyond_the_largest_step_a_run_goes_wrong_and_below_it_does_not(robot):
 def test_small_v_s_is_neither_refused_nor_wrong(robot, speed_static):
     """At the standard step, against a tenth of it, to 0.05 points of slip."""
     small = params.replace(robot, {"6T2A.ground.friction.speed_static": jnp.asarray(speed_static)})
-    runs = Conditions(voltage=jnp.asarray([15.0, 33.0]), slope_deg=jnp.asarray([5.0, 10.0]))
+    runs = Conditions(voltage=[15.0, 33.0], slope_deg=[5.0, 10.0])
     assert largest_step(small, runs).min() > 1e-4
     slip = [np.asarray(_batch(small, runs, 0.5, step, 1e-3, True).result.slip) for step in (1e-4, 1e-5)]
     np.testing.assert_allclose(slip[0], slip[1], atol=5e-4)
@@ -121,7 +119,7 @@ def test_standing_robot_is_in_balance(robot):
     """Weight and moment to 1e-9, on a slope with a payload off centre. Then no force is left over."""
     from mmrjax.undercarriage.half_robot import instant
 
-    loaded = params.replace(robot, {"running_gear.payload_offset": jnp.asarray(0.05)})
+    loaded = params.replace(robot, {"running_gear.payload_offset": 0.05})
     for wheeled in (0.0, 1.0):
         run = half_robot_system(
             loaded, Conditions(slope_deg=np.degrees(0.1), payload=5.0, configuration=wheeled), 1e-4
@@ -160,7 +158,7 @@ def test_member_that_blows_up_fails_alone(robot):
 def test_step_that_a_later_chunk_cannot_bear_is_refused_before_the_first(robot):
     options = {"model": "track", "step_s": 5e-4, "chunk": 2, "slopes_deg": (0.0,), "configurations": ("4W2T", "6T2A")}
     config = configuration.resolve_configuration(configuration.Sweep, None, options)
-    robot = params.replace(robot, {"running_gear.contact_stiffness": jnp.asarray(5e9)})
+    robot = params.replace(robot, {"running_gear.contact_stiffness": 5e9})
     runs, told = grid_conditions(config, robot), []
     limits = largest_step(robot, run.conditions_of_runs(robot, runs, config))
     worst = int(np.argmin(limits))
@@ -187,9 +185,7 @@ def changed(robot, values):
 @pytest.mark.slow
 def test_gear_that_throws_the_robot_off_the_ground_is_flagged(robot):
     """Set S at 33 V on 15 deg leaves the ground for a twentieth of the time. At 15 V it shakes and stays on it."""
-    runs = Conditions(
-        voltage=jnp.asarray([15.0, 33.0]), slope_deg=jnp.asarray([10.0, 15.0]), payload=jnp.asarray([0.0, 8.0])
-    )
+    runs = Conditions(voltage=[15.0, 33.0], slope_deg=[10.0, 15.0], payload=[0.0, 8.0])
     answer = _batch(changed(robot, SHAKING), runs, 0.6, 1e-4, 1e-3, True)
     jumps = np.asarray(answer.result.flags) >> FLAGS.index("jumps") & 1
     assert jumps.tolist() == [0, 1]
@@ -207,9 +203,7 @@ def test_robot_thrown_over_by_its_own_motion_tips_and_harms_no_other(robot):
         "6T2A.ground.friction.dynamic": 1.1,
     }
     tall = changed(robot, high)
-    runs = Conditions(
-        voltage=jnp.asarray([33.0, 15.0]), slope_deg=jnp.asarray([20.0, 0.0]), payload=jnp.asarray([8.0, 0.0])
-    )
+    runs = Conditions(voltage=[33.0, 15.0], slope_deg=[20.0, 0.0], payload=[8.0, 0.0])
     assert (
         float(tipping_margin(half_robot_system(tall, Conditions(voltage=33.0, slope_deg=20.0, payload=8.0), 1e-4)))
         > 0
@@ -220,6 +214,6 @@ def test_robot_thrown_over_by_its_own_motion_tips_and_harms_no_other(robot):
 
 
 def test_lever_stated_of_a_run_below_the_ground_is_refused(robot):
-    lowered = Conditions(levers_front_deg=jnp.asarray([180.0, 180.0]), levers_rear_deg=jnp.asarray([40.0, -60.0]))
+    lowered = Conditions(levers_front_deg=[180.0, 180.0], levers_rear_deg=[40.0, -60.0])
     with pytest.raises(ValueError, match="levers_rear_deg: got -60 deg, its tip 134 mm below the ground"):
         track_batch(robot, lowered)

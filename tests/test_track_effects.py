@@ -19,12 +19,12 @@ SETTLED = tuple(e for e in ALL if not e.transient)
 TRANSIENT = tuple(e for e in ALL if e.transient)
 OUTPUTS = ("total_current", "motor_speed", "speed")
 RUNS = Conditions(
-    voltage=jnp.asarray([33.0, 24.0, 24.0]),
-    slope_deg=jnp.asarray([3.0, 5.0, -12.0]),  # down the last one the load drives the motors
-    payload=jnp.asarray([3.0, 0.0, 3.0]),
-    configuration=jnp.asarray([0.0, 1.0, 1.0]),
-    battery=jnp.asarray([0.0, 1.0, 0.0]),  # 4W2T on its battery, whose effects act there alone
-    duty=jnp.asarray([1.0, 1.0, 0.9]),  # effects of the driver act below 1
+    voltage=[33.0, 24.0, 24.0],
+    slope_deg=[3.0, 5.0, -12.0],  # down the last one the load drives the motors
+    payload=[3.0, 0.0, 3.0],
+    configuration=[0.0, 1.0, 1.0],
+    battery=[0.0, 1.0, 0.0],  # 4W2T on its battery, whose effects act there alone
+    duty=[1.0, 1.0, 0.9],  # effects of the driver act below 1
 )
 
 

@@ -15,10 +15,10 @@ from mmrjax.undercarriage.belt import belt_travel
 from mmrjax.undercarriage.half_robot import advance, centre_of_mass, half_robot_system, instant, stand
 
 RUNS = Conditions(
-    voltage=jnp.asarray([33.0, 15.0, 24.0, 33.0]),
-    slope_deg=jnp.asarray([0.0, 5.0, 5.0, 0.0]),
-    payload=jnp.asarray([0.0, 8.0, 3.0, 8.0]),
-    configuration=jnp.asarray([0.0, 0.0, 1.0, 1.0]),
+    voltage=[33.0, 15.0, 24.0, 33.0],
+    slope_deg=[0.0, 5.0, 5.0, 0.0],
+    payload=[0.0, 8.0, 3.0, 8.0],
+    configuration=[0.0, 0.0, 1.0, 1.0],
 )
 
 
@@ -97,10 +97,10 @@ def test_every_loss_takes_energy(ledger):
 @pytest.fixture(scope="module")
 def averages():
     runs = Conditions(
-        voltage=jnp.asarray([33.0, 33.0, 15.0, 33.0]),
-        slope_deg=jnp.asarray([0.0, 10.0, 5.0, 10.0]),
-        payload=jnp.asarray([0.0, 8.0, 0.0, 8.0]),
-        configuration=jnp.asarray([0.0, 0.0, 0.0, 1.0]),
+        voltage=[33.0, 33.0, 15.0, 33.0],
+        slope_deg=[0.0, 10.0, 5.0, 10.0],
+        payload=[0.0, 8.0, 0.0, 8.0],
+        configuration=[0.0, 0.0, 0.0, 1.0],
     )
 
     @eqx.filter_jit

@@ -69,16 +69,16 @@ def test_robot_that_slips_on_average_and_goes_on_steadily_has_settled(robot):
     shaking = params.replace(
         robot,
         {
-            "6T2A.ground.friction.static": jnp.asarray(0.6093), "6T2A.ground.friction.dynamic": jnp.asarray(0.5331),
-            "6T2A.ground.friction.speed_static": jnp.asarray(0.00961),
-            "6T2A.ground.friction.speed_dynamic": jnp.asarray(0.0961),
-            "6T2A.track.guide_friction": jnp.asarray(0.06), "running_gear.guide_recess": jnp.asarray(3.648e-4),
-            "running_gear.contact_stiffness": jnp.asarray(3.816e7),
-            "running_gear.contact_damping": jnp.asarray(649.2), "running_gear.guide_gap": jnp.asarray(0.01066),
-            "running_gear.centre_offset": jnp.asarray(1.1e-4), "running_gear.payload_height": jnp.asarray(0.0595),
+            "6T2A.ground.friction.static": 0.6093, "6T2A.ground.friction.dynamic": 0.5331,
+            "6T2A.ground.friction.speed_static": 0.00961,
+            "6T2A.ground.friction.speed_dynamic": 0.0961,
+            "6T2A.track.guide_friction": 0.06, "running_gear.guide_recess": 3.648e-4,
+            "running_gear.contact_stiffness": 3.816e7,
+            "running_gear.contact_damping": 649.2, "running_gear.guide_gap": 0.01066,
+            "running_gear.centre_offset": 1.1e-4, "running_gear.payload_height": 0.0595,
         },
     )  # fmt: skip
-    commands = Conditions(voltage=jnp.asarray([15.0, 15.0]), slope_deg=jnp.asarray([10.0, 20.0]))
+    commands = Conditions(voltage=[15.0, 15.0], slope_deg=[10.0, 20.0])
     answer = _batch(shaking, commands, 1.5, 1e-4, 1e-3, True)
     assert [STATUSES[s] for s in answer.result.status] == ["converged"] * 2
     slips = 1 << FLAGS.index("slips")
@@ -244,7 +244,7 @@ def test_batch_is_its_members(robot):
     """vmap = loop: a run does not depend on who runs beside it."""
     from mmrjax.fidelities.track import _batch
 
-    two = Conditions(voltage=jnp.asarray([33.0, 15.0]), configuration=jnp.asarray([0.0, 1.0]))
+    two = Conditions(voltage=[33.0, 15.0], configuration=[0.0, 1.0])
     twin = jax.tree.map(lambda x: x[::-1], two)
     a = _batch(robot, two, 0.05, 1e-4, 1e-3, False)
     b = _batch(robot, twin, 0.05, 1e-4, 1e-3, False)
@@ -252,7 +252,7 @@ def test_batch_is_its_members(robot):
 
 
 def test_batch_compiles_once(robot, compilations):
-    commands = Conditions(voltage=jnp.asarray([33.0, 15.0]), configuration=jnp.asarray([0.0, 1.0]))
+    commands = Conditions(voltage=[33.0, 15.0], configuration=[0.0, 1.0])
     keywords = dict(duration=0.02, sample=1e-3)
     track_batch(robot, commands, **keywords)
     before = len(compilations)
@@ -264,7 +264,7 @@ def test_run_in_parts_is_the_run_in_one(robot):
     """What a progress bar asks for: the same numbers, also where the parts do not divide the run."""
     from mmrjax.fidelities.track import PARTS, _batch
 
-    two = Conditions(voltage=jnp.asarray([33.0, 15.0]), configuration=jnp.asarray([0.0, 1.0]))
+    two = Conditions(voltage=[33.0, 15.0], configuration=[0.0, 1.0])
     shares = []
     whole = _batch(robot, two, 0.047, 1e-4, 1e-3, False)
     parts = track_batch(robot, two, duration=0.047, progress=shares.append)

@@ -4,7 +4,6 @@ import importlib.util
 from types import SimpleNamespace
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from PIL import Image
@@ -13,7 +12,7 @@ from mmrjax.fidelities.track import _batch
 from mmrjax.model.conditions import Conditions
 from mmrjax.undercarriage.rendering import render, scene
 
-RUNS = Conditions(voltage=jnp.asarray([33.0, 24.0, np.nan]), slope_deg=np.degrees(0.1), configuration=[0, 1, 0])
+RUNS = Conditions(voltage=[33.0, 24.0, np.nan], slope_deg=np.degrees(0.1), configuration=[0, 1, 0])
 
 
 def _member(runs, k):

@@ -202,7 +202,7 @@ def test_bodies_are_the_robot_that_mujoco_compiles(robot, configuration):
     run = Conditions(configuration, payload=3.0, heading_deg=0.0)
     zero = jnp.asarray(0.0)
     total = balances.begin_signals(robot, run, State(zero, zero, zero, zero)).mass
-    changed = params.replace(robot, {"running_gear.centre_offset": jnp.asarray(0.02)})
+    changed = params.replace(robot, {"running_gear.centre_offset": 0.02})
     model = mujoco.MjModel.from_xml_string(mjcf.mjcf_text(changed, run, float(total), STEP))
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)

@@ -17,6 +17,7 @@ from calibration.inference import optimizers as fit
 from calibration.inference.calibration import calibrate
 from calibration.inference.observers.turns import SettledTurns
 from mmrjax.model import balances, channels
+from tests.commands import csv_text, text_file
 
 CURRENTS = ("motor_current_left", "motor_current_right")
 MOTION = ("motor_speed_left", "motor_speed_right", "yaw_rate")
@@ -45,16 +46,17 @@ def written(path, configuration, mass, readings):
     for name, values in readings.items():
         channel = channels.find_channel(name)
         columns[channel.column] = np.asarray(values) / channel.factor + SDS[name] * random.normal(size=len(DUTIES))
-    lines = [",".join(str(v) for v in row) for row in zip(*columns.values(), strict=True)]
-    path.write_text("\n".join([",".join(columns), *lines]) + "\n")
-    return path
+    return text_file(path, csv_text(columns))
 
 
 @pytest.fixture(scope="module")
 def robot(tmp_path_factory):
-    path = tmp_path_factory.mktemp("robot") / "robot.toml"
-    path.write_text(f'base = "nominal"\nchannels = [{", ".join(map(repr, SHOWN))}]\n')
-    return mm.read_robot(str(path))
+    return mm.read_robot(
+        text_file(
+            tmp_path_factory.mktemp("robot") / "robot.toml",
+            f'base = "nominal"\nchannels = [{", ".join(map(repr, SHOWN))}]\n',
+        )
+    )
 
 
 @pytest.fixture(scope="module")
@@ -149,11 +151,16 @@ def test_histories_of_turns_are_refused(robot, of_world, tmp_path):
         "configuration,supply_voltage_V,total_mass_kg,payload_kg,slope_deg,duty_left,duty_right,time_s,yaw_rate_rad_s"
     ]
     lines += [f"6T2A,33,13.1,0,0,1,0.5,{0.1 * k},{-0.05 * k}" for k in range(12)]
-    path.write_text("\n".join(lines) + "\n")
     with pytest.raises(
         BadConfiguration, match=r"history.csv: time histories of a robot .* mmrjax settle history.csv"
     ):
-        calibrate(records.read_runs(path, robot=robot), robot, model="drive", free=[f"6T2A.{LATERAL}"], noise=NOISE)
+        calibrate(
+            records.read_runs(text_file(path, "\n".join(lines) + "\n"), robot=robot),
+            robot,
+            model="drive",
+            free=[f"6T2A.{LATERAL}"],
+            noise=NOISE,
+        )
 
 
 @pytest.mark.nightly
@@ -172,9 +179,9 @@ def test_truth_of_a_second_implementation_is_found(robot, of_world):
 @pytest.mark.slow
 def test_wheels_that_creep_tell_the_effective_width_alone(tmp_path):
     """Without currents only B + φ_y/φ_x L²/B shows, which the correlation of both says."""
-    path = tmp_path / "robot.toml"
-    path.write_text(f'base = "nominal"\nchannels = [{", ".join(map(repr, MOTION))}]\n')
-    robot = mm.read_robot(str(path))
+    robot = mm.read_robot(
+        text_file(tmp_path / "robot.toml", f'base = "nominal"\nchannels = [{", ".join(map(repr, MOTION))}]\n')
+    )
     duties = dict(zip(("duty_left", "duty_right"), np.array(DUTIES).T, strict=True))
     seen = mm.simulate(robot, mm.Conditions(["4W2T"] * len(DUTIES), voltage=33.0, **duties)).reading
     mass = float(robot.configurations["4W2T"].mass)

@@ -372,7 +372,7 @@ def test_simulate_in_python_refuses_turns_as_the_command_line_does():
     with pytest.raises(UsageError, match="duty_left: got a robot of 1 side"):
         mm.simulate(alone, mm.Conditions("6T2A", duty_left=1, duty_right=0.5))
     with pytest.raises(UsageError, match="duty: got it together with duty_left and duty_right"):
-        mm.simulate(mm.nominal(), mm.Conditions("6T2A", duty=jnp.asarray(0.5), duty_left=1, duty_right=0.5))
+        mm.simulate(mm.nominal(), mm.Conditions("6T2A", duty=0.5, duty_left=1, duty_right=0.5))
 
 
 @pytest.mark.parametrize("duty", [1, 1.0, 0.5, [1.0, 1.0]])

@@ -18,7 +18,7 @@ from mmrjax import effects
 from mmrjax.model import balances, energy, paper_robots, params
 from mmrjax.model.signals import PlaneMotion, State
 from mmrjax.turning import circling
-from tests.commands import read_rig
+from tests.commands import read_rig, text_file
 
 OF_SIDES = ("side_friction", "side_torque", "side_voltage", "side_radius")
 #: In units of the prior sd.
@@ -160,8 +160,9 @@ def test_sides_that_are_not_alike_are_found(tmp_path):
     seen = mm.simulate(true, mm.Conditions(["6T2A"] * len(DUTIES), voltage=33.0, **duties)).reading
     path = tmp_path / "robot.toml"
     shown = f"channels = [{', '.join(map(repr, SHOWN))}]\n"
-    path.write_text(f'base = "nominal"\n{shown}[effects.side_friction]\n[effects.side_torque]\n')
-    robot = mm.read_robot(str(path))
+    robot = mm.read_robot(
+        text_file(path, f'base = "nominal"\n{shown}[effects.side_friction]\n[effects.side_torque]\n')
+    )
     mass = float(robot.configurations["6T2A"].mass)
     table = written(tmp_path / "turns.csv", "6T2A", mass, {name: seen[name] for name in SHOWN})
     free = [f"effects.{name}.amplitude" for name in ("side_friction", "side_torque")] + ["6T2A.turning.lateral"]

@@ -61,9 +61,7 @@ def rig(tmp_path):
     """Reads a robot's file, then a table of its runs."""
 
     def written(content):
-        path = tmp_path / "rover.toml"
-        path.write_text(content)
-        return mm.read_robot(str(path))
+        return mm.read_robot(text_file(tmp_path / "rover.toml", content))
 
     return written
 
@@ -116,16 +114,26 @@ def test_a_table_of_turns_is_read_once_with_the_channels_of_turns_that_it_has(tm
     read = records.read_runs
     monkeypatch.setattr(records, "read_runs", lambda *told, **how: reads.append(told) or read(*told, **how))
     header = "configuration,voltage_left_V,voltage_right_V,total_mass_kg,payload_kg,slope_deg"
-    path.write_text(f"{header},yaw_rate_rad_s,motor_current_left_A\n" + "6T2A,24,12,13.1,0,0,-1.1,2\n" * 2)
-    runs = read_runs(str(path), mm.nominal(), measured=True, of_turns=True)
+    runs = read_runs(
+        text_file(path, f"{header},yaw_rate_rad_s,motor_current_left_A\n" + "6T2A,24,12,13.1,0,0,-1.1,2\n" * 2),
+        mm.nominal(),
+        measured=True,
+        of_turns=True,
+    )
     assert len(reads) == 1 and not runs.unknown
     assert [c.name for c in runs.channels] == [
         "total_current", "motor_speed", "speed", "motor_current_left", "yaw_rate"
     ]  # fmt: skip
-    straight = tmp_path / "straight.csv"
-    straight.write_text(f"{header.replace('voltage_left_V,voltage_right_V', 'supply_voltage_V')},yaw_rate_rad_s,speed_mm_s"
-                        "\n6T2A,24,13.1,0,0,0,700\n")  # fmt: skip
-    assert read_runs(str(straight), mm.nominal(), measured=True, of_turns=True).unknown == ("yaw_rate_rad_s",)
+    assert read_runs(
+        text_file(
+            tmp_path / "straight.csv",
+            f"{header.replace('voltage_left_V,voltage_right_V', 'supply_voltage_V')},yaw_rate_rad_s,speed_mm_s"
+            "\n6T2A,24,13.1,0,0,0,700\n",
+        ),
+        mm.nominal(),
+        measured=True,
+        of_turns=True,
+    ).unknown == ("yaw_rate_rad_s",)
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ from calibration.discovery import description
 from calibration.inference import noise
 from calibration.inference.checks import unexplained_torque_notes, unused_notes
 from calibration.inference.observers import SettledRuns
-from tests.commands import read_rig, read_table
+from tests.commands import csv_text, read_rig, read_table
 
 RIG = IDEAL.replace("loss_coulomb = 0.0", "loss_coulomb = 0.1")
 #: Of an ideal motor at 24 V, R 0.5, k 0.05, M0 0.01: torque of a brake [N·m], speed [rpm], current [A].
@@ -24,8 +24,7 @@ def table(tmp_path, head, **columns):
     """A table of six rows read for the rig with a line `head` in its file."""
     robot = read_rig(tmp_path, RIG.format(head=head))
     every = {"supply_voltage_V": np.full(6, 24.0), "motor_speed_rpm": SPEED, "motor_current_A": CURRENT, **columns}
-    lines = [",".join(every), *(",".join(map(str, row)) for row in zip(*every.values(), strict=True))]
-    return read_table(tmp_path, "\n".join(lines) + "\n", robot, "runs.csv")
+    return read_table(tmp_path, csv_text(every), robot, "runs.csv")
 
 
 CHANNELS = 'channels = ["motor_current", "motor_speed"]'

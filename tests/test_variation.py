@@ -67,7 +67,7 @@ def test_evaluate_compiles_once_a_shape(variation, compilations):
         found = evaluate_points(variation, "steady", jnp.asarray(VALUES + shift), Conditions(), {}, ("slip",))
         return jax.block_until_ready(found)
 
-    other = Variation(params.replace(variation.robot, {"motor.inductance": jnp.asarray(2e-4)}), NAMES)
+    other = Variation(params.replace(variation.robot, {"motor.inductance": 2e-4}), NAMES)
     call(0.0)
     compilations.clear()
     call(0.01)

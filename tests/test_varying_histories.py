@@ -57,7 +57,7 @@ def engine():
         known = {p.name: p for p in params.walk_parameters(paper_robots.nominal())}
         cold = {"motor.time_constant_winding": jnp.asarray(known["motor.time_constant_winding"].spec.bounds[1])}
         robot = dataclasses.replace(paper_robots.nominal(), effects=(BY_NAME[UNDECLARED](),))
-        robot = params.replace(robot, {f"effects.{UNDECLARED}.amplitude": jnp.asarray(0.0), **cold, **values})
+        robot = params.replace(robot, {f"effects.{UNDECLARED}.amplitude": 0.0, **cold, **values})
         asked = profile(np.asarray(SEGMENTS), voltage=np.zeros(5))
         asked = dataclasses.replace(asked, mode=modes, voltage=voltage)
         return mission(robot, Conditions(0, 24.0, slope, 2.0), asked, tolerance=1e-7, keep=2000).course

@@ -16,7 +16,7 @@ from calibration.discovery.settings import settings_for
 from calibration.inference import shown_states, weak_form
 from calibration.inference.observers import Histories
 from mmrjax.effects import BY_NAME
-from tests.commands import read_rig
+from tests.commands import csv_text, read_rig, read_table
 
 STEP, EVERY, RPM = 2e-4, 0.01, np.pi / 30
 TRUE = {"resistance": 0.9, "torque_constant": 0.042, "inertia": 2.4e-4}
@@ -234,13 +234,7 @@ def test_a_current_or_a_speed_may_be_imposed(tmp_path, imposed, channel):
     robot = read_rig(tmp_path, text.replace('"motor_current", "motor_speed"', f'"{channel}"'))
     columns = motor(noise=(0.0, 1.0) if imposed == "motor_speed" else (1.0, 0.0))
     del columns["supply_voltage_V"]
-    lines = [",".join(columns), *(",".join(map(str, row)) for row in zip(*columns.values(), strict=True))]
-    (tmp_path / "log.csv").write_text("\n".join(lines) + "\n", "utf-8")
-    mine = posed(
-        records.read_runs(str(tmp_path / "log.csv"), robot=robot).of(robot),
-        robot,
-        SD[int(channel == "motor_current")],
-    )
+    mine = posed(read_table(tmp_path, csv_text(columns), robot).of(robot), robot, SD[int(channel == "motor_current")])
     found = screening.screen_by_weak_form(mine, SETTINGS)
     names, value = mine.coordinates.base.names, mine.coordinates.base.value(found.base.z[: mine.free])
     ratio = value[names.index("motor.inertia")] / value[names.index("motor.torque_constant")]

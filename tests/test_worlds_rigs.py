@@ -2,7 +2,6 @@
 
 import csv
 import dataclasses
-import json
 
 import jax
 import jax.numpy as jnp
@@ -23,6 +22,7 @@ from mmrjax.model.robot import Configurations
 from mmrjax.model.shaft import Shaft
 from mmrjax.model.signals import STATUSES
 from mmrjax.model.track_friction import Track
+from tests.commands import read_json
 
 ROWS = 64  # of all tables once padded, so that few programs are compiled
 
@@ -128,7 +128,7 @@ def test_file_states_what_was_drawn_around(worlds, tmp_path):
             assert lead / 1e3 == pytest.approx(2 * np.pi * w.rig.stated["radius"], rel=1e-12)
             force = float(load["force_coulomb_N"].partition(" ")[0])
             assert force * w.rig.stated["radius"] == pytest.approx(w.rig.stated["loss_coulomb"], rel=1e-12)
-        label = json.loads((tmp_path / "rig" / "label.json").read_text(encoding="utf-8"))
+        label = read_json(tmp_path / "rig" / "label.json")
         assert label["kind"] == "clean" and not label["effects"] and label["rows_lost"] == 0
         with (tmp_path / "rig" / "table.csv").open(encoding="utf-8") as file:
             header, *rows = csv.reader(file)

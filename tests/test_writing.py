@@ -1,7 +1,6 @@
 """Tables and documents as files."""
 
 import csv
-import json
 
 import numpy as np
 import pytest
@@ -9,6 +8,7 @@ from numpy.testing import assert_array_equal
 
 from calibration.data import runs as records
 from calibration.data import writing
+from tests.commands import read_json
 
 
 def test_numbers_keep_nine_digits_and_what_is_not_finite_is_left_empty(tmp_path):
@@ -27,7 +27,7 @@ def test_what_is_not_finite_is_null(tmp_path):
         "e": float("nan"),
     }
     writing.write_json(tmp_path / "r.json", content)
-    found = json.loads((tmp_path / "r.json").read_text(encoding="utf-8"))
+    found = read_json(tmp_path / "r.json")
     assert found == {"a": [1.5, None], "b": {"c": None}, "d": [3, True], "e": None}
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 if TYPE_CHECKING:
@@ -13,3 +14,5 @@ Names: TypeAlias = tuple[str, ...]
 Columns: TypeAlias = "dict[str, np.ndarray]"
 #: Content of a JSON object.
 Json: TypeAlias = dict[str, Any]
+#: Priors of parameters by name: mean and sd [SI].
+Priors: TypeAlias = Mapping[str, tuple[float, float]]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import functools
 from collections.abc import Collection, Mapping
 from typing import TYPE_CHECKING
 
@@ -155,7 +156,7 @@ class Layout:
         """True if readings may cross zero, so that errors are percent of a channel's size and not of the reading."""
         return not self.table8 or not set(channels.OF_TURNS).isdisjoint(self.channels)
 
-    @property
+    @functools.cached_property
     def idle(self) -> Names:
         """Columns of conditions that do not act on its load."""
         return ON_SHAFT if self.has_ground else (*_conditions(GROUND, VEHICLE), "surface")
@@ -226,7 +227,7 @@ class Layout:
         Raises:
             BadData: two columns of one quantity.
         """
-        by_name = self._by_name()
+        by_name = self._by_name
         theirs = {column: (mine, factor) for mine, column, factor in self.mapped if column in header}
         taken = {_standard(by_name, mine) for mine, _ in theirs.values()}
         meanings_found: list[Column | None] = []
@@ -254,6 +255,7 @@ class Layout:
                 raise BadData(f"{source}: columns {twin.shown} and {meaning.shown} state the same; keep one of them")
         return meanings_found
 
+    @functools.cached_property
     def _by_name(self) -> Mapping[str, Column]:
         """Every name of a column, in any unit, with its quantity."""
         held = self.quantities().values()
@@ -261,7 +263,7 @@ class Layout:
 
     def spellings(self) -> Names:
         """Every name of a column with a meaning, in any unit."""
-        return (*self._by_name(), *(column for _, column, _ in self.mapped))
+        return (*self._by_name, *(column for _, column, _ in self.mapped))
 
     def nearest(self, name: str, stated: Collection[str]) -> str:
         """Returns the column, in the unit of `name`, that a column without a role is most similar to.
@@ -284,7 +286,7 @@ class Layout:
 
     def expected(self, column: str) -> str:
         """Returns the column, with its source column if the robot's file states one."""
-        theirs = next((their for mine, their, _ in self.mapped if _standard(self._by_name(), mine) == column), None)
+        theirs = next((their for mine, their, _ in self.mapped if _standard(self._by_name, mine) == column), None)
         return column if theirs is None else f"{column} (in the robot's file: {theirs})"
 
 

@@ -10,7 +10,7 @@ from typing import Any
 import equinox as eqx
 
 from calibration.data import Json, Names, rig_file
-from calibration.data.input_errors import BadConfiguration, allowed_words
+from calibration.data.input_errors import BadConfiguration, stated_word
 from mmrjax.model import params
 from mmrjax.model.chassis import Chassis
 from mmrjax.model.contact import Friction
@@ -130,8 +130,7 @@ def resolved_likes(content: Json, where: str) -> None:
     for name, table in tables.items():
         if "like" in table:
             like = table.pop("like")
-            if like not in own_names:
-                raise BadConfiguration(f"{where}, {name}.like: got {like}; {allowed_words(str(like), own_names)}")
+            stated_word(like, own_names, f"{where}, {name}.like")
             content[name] = _over(tables[like], table)
 
 
@@ -148,8 +147,7 @@ def _kind(table: Json, where: str) -> str:
     if "load" not in table:
         return "vehicle"
     load = table.pop("load")
-    if load not in rig_file.LOADS:
-        raise BadConfiguration(f"{where}.load: got {load}; {allowed_words(str(load), rig_file.LOADS)}")
+    stated_word(load, rig_file.LOADS, f"{where}.load")
     for key in ("like", "movers"):
         if load != "vehicle" and key in table:
             raise BadConfiguration(f"{where}: states both load = {load!r} and {key}; state one of them")
@@ -202,9 +200,7 @@ def _vehicle(table: Json, where: str, sides: float) -> tuple[Chassis, list[str]]
 
 
 def _movers(stated: Any, where: str) -> float:
-    if stated not in MOVERS:
-        raise BadConfiguration(f"{where}.movers: got {stated}; {allowed_words(str(stated), MOVERS)}")
-    return MOVERS[stated]
+    return MOVERS[stated_word(stated, MOVERS, f"{where}.movers")]
 
 
 def _listed(names: list[str]) -> str:
@@ -234,9 +230,7 @@ def _chassis(robot: Robot, name: str, table: Json, where: str) -> Chassis:
     if like is not None and movers is not None:
         raise BadConfiguration(f"{where}: states both like and movers; state one of them")
     if like is not None:
-        if like not in have.names:
-            raise BadConfiguration(f"{where}.like: got {like}; {allowed_words(str(like), have)}")
-        return have[like]
+        return have[stated_word(like, have.names, f"{where}.like")]
     if movers is not None:
         return _blank(have.members[0], _movers(movers, where), table, where)
     if name in have:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import numbers
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 from mmrjax.errors import allowed_words as allowed_words
@@ -75,6 +75,20 @@ def stated_count(value: Any, where: str, low: int, high: int) -> int:
     if isinstance(value, bool) or not isinstance(value, numbers.Integral) or not low <= int(value) <= high:
         raise BadConfiguration(f"{where}: got {value!r}; expected a whole number from {low} to {high}")
     return int(value)
+
+
+def stated_word(value: Any, known: Iterable[str], where: str, wrong: str = "") -> str:
+    """A word of a file or of an argument, one of those that are known.
+
+    Args:
+        wrong: what another word is not. Empty: the message has the word.
+
+    Raises:
+        BadConfiguration: another word. The message lists the nearest ones.
+    """
+    if value not in known:
+        raise BadConfiguration(f"{where}: {wrong or f'got {value}'}; {allowed_words(str(value), known)}")
+    return str(value)
 
 
 def stated_number(

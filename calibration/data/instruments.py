@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping
 
 import numpy as np
 
+from calibration.data import Columns
 from calibration.data.table import Runs
 from mmrjax.model import channels
 from mmrjax.model.channels import Channel
@@ -62,9 +62,7 @@ def display_step(readings: np.ndarray, channel: Channel) -> float:
     return float(fits[0] * channel.factor) if fits else 0.0
 
 
-def infer_instruments(
-    instruments: tuple[Instrument, ...], columns: Mapping[str, np.ndarray]
-) -> tuple[Instrument, ...]:
+def infer_instruments(instruments: tuple[Instrument, ...], columns: Columns) -> tuple[Instrument, ...]:
     """Instruments with sign and step inferred from the readings where they are free.
 
     An instrument shows magnitude alone if no reading is negative although some runs go backward.

@@ -20,6 +20,7 @@ from calibration.data.input_errors import (
     parse_number,
     stated_count,
     stated_number,
+    stated_word,
 )
 from mmrjax.model import channels
 
@@ -124,8 +125,8 @@ class Preset:
                 wanted = " or ".join(by_name[needs].theirs)
                 raise BadData(
                     f"{name}: has no {wanted}; --columns {self.name} needs it for {needs}, because {present[mine]} "
-                    "alone is not the voltage at the motor; record it, or impose the speed or the current (imposed "
-                    "in the rig's file)"
+                    f"alone does not give the motor's voltage; record {wanted}, or set imposed to the speed or the "
+                    "current in the rig's file"
                 )
 
 
@@ -214,8 +215,7 @@ def parse_preset(text: str, where: str, given: Mapping[str, float]) -> Preset:
 
 def _parsed(content: Mapping[str, Any], where: str, given: Mapping[str, float]) -> Preset:
     for key in content:
-        if key not in KEYS:
-            raise BadConfiguration(f"{where}: got the key {key}; {allowed_words(key, KEYS)}")
+        stated_word(key, KEYS, where, f"got the key {key}")
     numbers = _numbers(content.get("ask", {}), where, given)
     header = _texts(content.get("header", []), f"{where}, header")
     columns = content.get("columns", {})
@@ -264,8 +264,7 @@ def _column(mine: str, theirs: Any, where: str, numbers: Mapping[str, float]) ->
     form = f'expected {mine} = "THEIRS", or {mine} = {{column = "THEIRS", factor = 0.001}}'
     table = theirs if isinstance(theirs, dict) else {"column": theirs}
     for key in table:
-        if key not in KEYS_OF_COLUMN:
-            raise BadConfiguration(f"{where}: got the key {key}; {allowed_words(key, KEYS_OF_COLUMN)}")
+        stated_word(key, KEYS_OF_COLUMN, where, f"got the key {key}")
     stated = table.get("column")
     names = _texts([stated] if isinstance(stated, str) else stated, f"{where}.column", form)
     factor = stated_number(table.get("factor", 1.0), f"{where}.factor")

@@ -186,12 +186,12 @@ class ProfileTable:
         tracks = np.array([float(c.on_tracks) > 0.5 for c in robot.configurations.members])
         which = tracks[np.asarray(conditions.configuration)].astype(int)
 
-        def of(ratio: Callable[[str, bool], float]) -> Array:
+        def ratio_by_surface(ratio: Callable[[str, bool], float]) -> Array:
             assert self.surface is not None
             return jnp.asarray(np.array([[ratio(s, kind) for s in self.surface] for kind in (False, True)])[which])
 
-        lateral = of(lateral_ratio) if self.turns else None
-        return dataclasses.replace(made, adhesion=of(adhesion_ratio), adhesion_lateral=lateral)
+        lateral = ratio_by_surface(lateral_ratio) if self.turns else None
+        return dataclasses.replace(made, adhesion=ratio_by_surface(adhesion_ratio), adhesion_lateral=lateral)
 
 
 def read_profile(source: str | Path) -> ProfileTable:
@@ -227,7 +227,7 @@ def _of_text(content: bytes, name: str) -> ProfileTable:
 
 def _parsed(name: str, settings: Json, rows: list[list[str]], digest: str, notes: Names) -> ProfileTable:
     if not rows:
-        raise BadData(f"{name}: the file is empty; expected a header with time_s and rows")
+        raise BadData(f"{name}: the file is empty; expected a header that has time_s, and rows below it")
     header, body = rows[0], rows[1:]
     columns = _columns(name, header)
     if len(body) < 2:

@@ -120,10 +120,10 @@ class Requirements:
     """A file of requirements.
 
     Attributes:
-        source: its name.
-        envelope: that it states.
-        each: its requirements, in order.
-        text: of the file.
+        source: name of the file.
+        envelope: default envelope that the file states.
+        each: requirements, in the order of the file.
+        text: content of the file.
     """
 
     source: str

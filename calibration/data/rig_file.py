@@ -10,7 +10,7 @@ from typing import Any
 
 from calibration.data import Json, Names
 from calibration.data.columns import Layout
-from calibration.data.input_errors import BadConfiguration, allowed_words, is_number
+from calibration.data.input_errors import BadConfiguration, allowed_words, is_number, stated_word
 from calibration.data.writing import toml_value
 from mmrjax.model import channels, params
 from mmrjax.model.paper_robots import DYNAMIC_SHARE
@@ -99,10 +99,8 @@ def linear_to_shaft(table: Json, name: str, where: str, sds: dict[str, float], s
         BadConfiguration: an unknown key, a value that is no number, no mass, not exactly one travel, or a mass or
             travel that is not positive.
     """
-    if strange := [key for key in table if key not in LINEAR]:
-        raise BadConfiguration(
-            f"{where}.{strange[0]}: no such key of a linear unit; {allowed_words(strange[0], LINEAR)}"
-        )
+    for key in table:
+        stated_word(key, LINEAR, f"{where}.{key}", "no such key of a linear unit")
     values = {key: _linear_value(table, key, where) for key in table}
     travels = [key for key in _TRAVEL if key in values]
     if len(travels) != 1:
@@ -185,9 +183,11 @@ def parse_rig(content: Json, where: str, loads: Sequence[str], *, travels: bool,
             that the rig does not have.
     """
     stated = content.pop("imposed", IMPOSED[0])
-    imposed = _one_of(SHORT.get(stated, stated) if isinstance(stated, str) else stated, IMPOSED, f"{where}, imposed")
-    start = _one_of(content.pop("start", STARTS[0]), STARTS, f"{where}, start")
-    between = _one_of(content.pop("between_rows", BETWEEN[0]), BETWEEN, f"{where}, between_rows")
+    imposed = stated_word(
+        SHORT.get(stated, stated) if isinstance(stated, str) else stated, IMPOSED, f"{where}, imposed"
+    )
+    start = stated_word(content.pop("start", STARTS[0]), STARTS, f"{where}, start")
+    between = stated_word(content.pop("between_rows", BETWEEN[0]), BETWEEN, f"{where}, between_rows")
     usual = [name for name in channels.USUAL if travels or name != "speed"]
     names = _channels(content.pop("channels", [n for n in usual if n != imposed]), f"{where}, channels")
     if idle := {imposed, f"{imposed}_left", f"{imposed}_right"} & set(names):
@@ -207,12 +207,6 @@ def parse_rig(content: Json, where: str, loads: Sequence[str], *, travels: bool,
     )
 
 
-def _one_of(word: Any, known: Sequence[str], where: str) -> str:
-    if word not in known:
-        raise BadConfiguration(f"{where}: got {word}; {allowed_words(str(word), known)}")
-    return str(word)
-
-
 def _channels(stated: Any, where: str) -> Names:
     every = channels.channel_names(channels.EVERY)
     if not isinstance(stated, list) or not stated or not all(isinstance(name, str) for name in stated):
@@ -220,8 +214,7 @@ def _channels(stated: Any, where: str) -> Names:
             f"{where}: got {stated!r}; expected a list of channels, at least one of {', '.join(every)}"
         )
     for name in stated:
-        if name not in every:
-            raise BadConfiguration(f"{where}: got {name}; {allowed_words(name, every)}")
+        stated_word(name, every, where)
         if stated.count(name) > 1:
             raise BadConfiguration(f"{where}: {name} is repeated; expected each channel once")
     return tuple(name for name in every if name in stated)
@@ -233,8 +226,7 @@ def _surfaces(stated: Any, loads: Sequence[str], where: str) -> tuple[tuple[str,
         raise BadConfiguration(f"{here}: got {stated!r}; expected a table [surfaces]")
     for name, other in stated.items():
         for word in (name, other):
-            if word not in loads:
-                raise BadConfiguration(f"{here}.{name}: got {word}; {allowed_words(str(word), loads)}")
+            stated_word(word, loads, f"{here}.{name}")
     return tuple(stated.items())
 
 
@@ -248,15 +240,11 @@ def _instruments(stated: Any, names: Sequence[str], where: str) -> tuple[Instrum
         raise BadConfiguration(f"{here}: got {stated!r}; expected tables such as [instruments.{names[0]}]")
     instruments = []
     for name, table in stated.items():
-        if name not in names:
-            raise BadConfiguration(f"{here}.{name}: the rig has no such channel; {allowed_words(name, names)}")
+        stated_word(name, names, f"{here}.{name}", "the rig has no such channel")
         if not isinstance(table, dict):
             raise BadConfiguration(f"{here}.{name}: got {table!r}; expected a table [instruments.{name}]")
         for key in table:
-            if key not in ("signed", "quantum"):
-                raise BadConfiguration(
-                    f"{here}.{name}.{key}: no such key; {allowed_words(key, ('signed', 'quantum'))}"
-                )
+            stated_word(key, ("signed", "quantum"), f"{here}.{name}.{key}", "no such key")
         signed, quantum = table.get("signed", True), table.get("quantum", 0.0)
         channel = channels.find_channel(name)
         if not isinstance(signed, bool) and signed != FREE:

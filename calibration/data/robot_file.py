@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from calibration.data import Json, Names, rig_file, stated
 from calibration.data.configuration_tables import loads_from_tables, resolved_likes
 from calibration.data.effect_file import Library
-from calibration.data.input_errors import BadConfiguration, allowed_words, is_number
+from calibration.data.input_errors import BadConfiguration, allowed_words, is_number, stated_word
 from calibration.data.input_files import toml_content, toml_text
 from calibration.data.writing import toml_value, write_text
 from mmrjax import effects
@@ -163,17 +163,14 @@ def parse_robot_file(path: Path, library: Library = effects.BY_NAME, notes: list
     content = toml_content(text, path.name)
     if not content:
         raise BadConfiguration(
-            f"{path.name}: states nothing; expected tables of parameters, as [motor], or for the packaged robot "
-            'base = "nominal"'
+            f"{path.name}: states nothing; expected tables of parameters such as [motor], or "
+            'base = "nominal" for the packaged robot'
         )
     schema = content.pop("schema", SCHEMA)
     if schema != SCHEMA:
         raise BadConfiguration(f"{path.name}, schema: got {schema}; expected {SCHEMA}")
     base = content.pop("base", "nominal")
-    if base not in (*paper_robots.ROBOTS, rig_file.NONE):
-        raise BadConfiguration(
-            f"{path.name}, base: got {base}; {allowed_words(str(base), (*paper_robots.ROBOTS, rig_file.NONE))}"
-        )
+    stated_word(base, (*paper_robots.ROBOTS, rig_file.NONE), f"{path.name}, base")
     robot, sds, linear = _without_parameters(
         None if base == rig_file.NONE else paper_robots.ROBOTS[base](),
         content,
@@ -287,8 +284,7 @@ def with_effects(
         if not isinstance(acting, list | tuple) or not all(isinstance(c, str) for c in acting):
             raise BadConfiguration(f"{here}: got {acting!r}; expected a list of {', '.join(robot.configurations)}")
         for c in acting:
-            if c not in robot.configurations:
-                raise BadConfiguration(f"{here}: got {c}; {allowed_words(c, robot.configurations)}")
+            stated_word(c, robot.configurations, here)
         present.append(dataclasses.replace(effect, configurations=tuple(acting)))
     return dataclasses.replace(robot, effects=tuple(present))
 
@@ -305,12 +301,10 @@ def change_robot(robot: Robot, values: Mapping[str, Any], where: str, notes: lis
         BadConfiguration: as `parse_robot_file`.
     """
     stated = dict(values)
-    counts = {name: _count(where, name, stated.pop(name)) for name in COUNTS if name in stated}
-    ratings: Json = {name: _rating(where, name, stated.pop(name)) for name in RATINGS if name in stated}
+    settings = (*COUNTS, *RATINGS, *SWITCHES, *CHOICES)
+    ratings = {name: _setting(where, name, stated.pop(name)) for name in settings if name in stated}
     if CURVE & stated.keys() and "battery.capacity" in stated:  # all of one cell, unless stated otherwise
         ratings.setdefault("battery.capacity_curve", stated["battery.capacity"])
-    ratings |= {name: _switch(where, name, stated.pop(name)) for name in SWITCHES if name in stated}
-    ratings |= {name: _choice(where, name, stated.pop(name)) for name in CHOICES if name in stated}
     parameters = {p.name: p for p in params.walk_parameters(robot)}
     refused: dict[str, list[str]] = {}
     for name, value in stated.items():
@@ -323,11 +317,7 @@ def change_robot(robot: Robot, values: Mapping[str, Any], where: str, notes: lis
         raise BadConfiguration(f"{where}, {'; also '.join(sentences)}")
     robot = params.replace(robot, {name: jnp.asarray(value, float) for name, value in stated.items()})
     robot = rig_file.moved_priors(robot, stated)
-    robot = dataclasses.replace(
-        robot,
-        sides=counts.get("sides", robot.sides),
-        battery=dataclasses.replace(robot.battery, cells=counts.get("battery.cells", robot.battery.cells)),
-    )
+    robot = dataclasses.replace(robot, sides=ratings.pop("sides", robot.sides))
     for name, value in ratings.items():
         part, _, key = name.partition(".")
         robot = dataclasses.replace(robot, **{part: dataclasses.replace(getattr(robot, part), **{key: value})})
@@ -374,32 +364,28 @@ def _with_states(robot: Robot, where: str) -> Robot:
     return dataclasses.replace(robot, rig=dataclasses.replace(robot.rig, loose=bool(loose)), controller=own)
 
 
-def _switch(where: str, name: str, value: Any) -> bool:
-    if not isinstance(value, bool):
-        raise BadConfiguration(f"{where}, {name}: got {value!r}; expected true or false ({SWITCHES[name]})")
+def _setting(where: str, name: str, value: Any) -> Any:
+    """A count, a rating, a switch or a choice of a robot's file, checked."""
+    if name in SWITCHES:
+        allowed, expected = isinstance(value, bool), f"true or false ({SWITCHES[name]})"
+    elif name in CHOICES:
+        words, what = CHOICES[name]
+        allowed, expected = value in words, f"{' or '.join(words)} ({what})"
+    elif name in COUNTS:
+        low, high, what = COUNTS[name]
+        allowed = is_number(value) and value == value // 1 and low <= value <= high
+        value, expected = int(value) if allowed else value, f"a whole number, {low} to {high} {what}"
+    else:
+        least, most, unit, what = RATINGS[name]
+        allowed = is_number(value) and least <= value <= most
+        value, expected = (
+            float(value) if is_number(value) else value,
+            f"a number, {least:g} to {most:g} {unit} ({what})",
+        )
+    if not allowed:
+        got = f"{value:g}" if name in RATINGS and is_number(value) else repr(value)
+        raise BadConfiguration(f"{where}, {name}: got {got}; expected {expected}")
     return value
-
-
-def _choice(where: str, name: str, value: Any) -> str:
-    allowed, what = CHOICES[name]
-    if value not in allowed:
-        raise BadConfiguration(f"{where}, {name}: got {value!r}; expected {' or '.join(allowed)} ({what})")
-    return value
-
-
-def _rating(where: str, name: str, value: Any) -> float:
-    low, high, unit, what = RATINGS[name]
-    if not is_number(value) or not low <= value <= high:
-        got = f"{value:g}" if is_number(value) else repr(value)
-        raise BadConfiguration(f"{where}, {name}: got {got}; expected a number, {low:g} to {high:g} {unit} ({what})")
-    return float(value)
-
-
-def _count(where: str, name: str, value: Any) -> int:
-    low, high, what = COUNTS[name]
-    if not is_number(value) or value != value // 1 or not low <= value <= high:
-        raise BadConfiguration(f"{where}, {name}: got {value!r}; expected a whole number, {low} to {high} {what}")
-    return int(value)
 
 
 def _parameters(name: str, known: Collection[str]) -> str:
@@ -446,7 +432,7 @@ def write_robot(robot: Robot, path: Path, *, note: str = "") -> None:
 
     Parameters that a robot which starts from nothing does not state are left out.
     """
-    whole, nothing = robot.rig.inherits, _start(robot)
+    whole, nothing = robot.rig.inherits, _base_robot(robot)
     pack = not whole and robot.battery.cells == nothing.battery.cells
     tables: dict[str, list[str]] = {
         "battery": [] if pack else [f"cells = {robot.battery.cells}  # in series"],
@@ -538,7 +524,7 @@ def _lines_of_ratings(robot: Robot, nothing: Robot, stated: set[str]) -> Iterato
             yield part, f"{key} = {toml_value(value(robot, name))}  # {what}"
 
 
-def _start(robot: Robot) -> Robot:
+def _base_robot(robot: Robot) -> Robot:
     """Robot that the file of a robot starts from."""
     if robot.rig.inherits:
         return paper_robots.nominal()

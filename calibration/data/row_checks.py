@@ -332,8 +332,8 @@ def driven_rows(name: str, columns: Columns, layout: Layout) -> tuple[Columns, n
             )
             raise BadData(
                 f"{name} row {row + 1}, slope_deg: got {slope[row]:g} in a table of settled turns{more}; "
-                "on a slope the heading changes all the time, so that no turn is settled there: expected 0; remove "
-                "such rows (simulate --left, --right and --slope with --model drive follows one over time)"
+                "expected 0, since on a slope the heading always changes and no turn settles; remove such rows, and "
+                "follow such a turn over time by simulate --model drive --left --right --slope"
             )
     if not set(layout.sides) & set(columns):
         _check_signs(name, columns, layout)
@@ -367,7 +367,7 @@ def _driven(name: str, columns: Columns, layout: Layout) -> tuple[np.ndarray, st
                 f"{zero} is 0; expected what drives it, or remove the row"
             )
     if idle.size == len(size):
-        clamp = '; a held shaft: state imposed = "motor_current" or "voltage", a column held = 1, and output_torque'
+        clamp = '; for a held shaft state imposed = "motor_current" or "voltage", columns held = 1, output_torque'
         raise BadData(
             f"{name}: {zero} is 0 in every row, so nothing drives the motors; expected rows that are driven"
             f"{clamp * (layout.imposed == 'motor_speed' and not layout.has_ground)}"

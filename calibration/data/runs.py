@@ -146,7 +146,7 @@ def of_arrays(
         raise BadData(f"{name}: a header and no rows; expected at least one run")
     arrays = clock.recorded_rows(arrays, meanings)
     columns, changed = _columns(arrays, meanings, layout, battery)
-    settled: tuple[str, ...] = ()
+    settled: Names = ()
     if measured and robot is not None:
         columns, settled = row_checks.settled_points(name, columns, layout, robot)
     notes = (*arrays.notes, *settled, *sides.of_volts(name, columns, battery))

@@ -527,7 +527,7 @@ def _settled(
     shortest: float,
     drift: float,
     step: float,
-    stuck: Mapping[str, np.ndarray],
+    stuck: Columns,
     inertia: Mapping[str, Inertia],
 ) -> Stretch:
     """The settled end of a level, or the reason why it has none."""
@@ -669,7 +669,7 @@ def _to_come(signal: Signal, rows: np.ndarray, mean: float) -> float:
 
 
 def _size(shown: np.ndarray) -> float:
-    """Size of the largest readings of a channel, without the largest two in a hundred."""
+    """98th percentile of the magnitudes of a channel's finite readings, 0 if it has none."""
     sizes = np.abs(shown[np.isfinite(shown)])
     return float(np.quantile(sizes, 0.98)) if len(sizes) else 0.0
 
@@ -901,7 +901,7 @@ def _nothing(found: Settled, loop: str) -> str:
             needed = max(FEWEST, round(found.shortest / step) if step > 0 else FEWEST)
             held, asked = count_noun(len(longest.rows), "sample"), f"{needed}"
             cure = (
-                "log faster, hold each level longer (--shortest states the time, of at least "
+                "log faster, hold each level longer (for --shortest and at least "
                 f"{FEWEST} samples), or remove time_s if each row is a settled run already"
             )
         return (

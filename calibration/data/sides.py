@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import numpy as np
 
 from calibration.data import Columns, Names
@@ -124,7 +122,7 @@ def _refuse_against(
     )
 
 
-def unsigned_current_channels(columns: Mapping[str, np.ndarray], layout: Layout) -> tuple[Instrument, ...]:
+def unsigned_current_channels(columns: Columns, layout: Layout) -> tuple[Instrument, ...]:
     """Instruments of the sides' currents that show no sign: their readings are positive in every row that drives
     their side backward.
 

@@ -30,13 +30,13 @@ from mmrjax.model.paper_tables import adhesion_ratio, lateral_ratio
 from mmrjax.model.robot import Robot
 
 
-def driven_on(columns: Mapping[str, np.ndarray], layout: Layout) -> np.ndarray:
+def driven_on(columns: Columns, layout: Layout) -> np.ndarray:
     """True for rows whose stated load torque acts in the direction of the drive, shape (rows,)."""
     imposed = columns[layout.imposed_column] * (columns.get("duty", 1.0) if layout.imposed == "voltage" else 1.0)
     return columns[LOAD] * imposed < 0 if LOAD in columns else np.zeros(len(imposed), bool)
 
 
-def drive_of_sides(columns: Mapping[str, np.ndarray], layout: Layout) -> np.ndarray:
+def drive_of_sides(columns: Columns, layout: Layout) -> np.ndarray:
     """Voltage [V] of the left and the right side, on a battery a share of it, or their speed [rpm], shape (2, rows),
     negative backward.
 
@@ -71,7 +71,7 @@ class Runs:
     columns: Columns
     unknown: Names = ()
     digest: str = ""
-    extras: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)
+    extras: Columns = dataclasses.field(default_factory=dict)
     layout: Layout = dataclasses.field(default_factory=Layout)
     notes: Names = ()
     headings: Mapping[str, str] = dataclasses.field(default_factory=dict)

@@ -186,7 +186,7 @@ def toml_value(value: Any) -> str:
     return repr(value)
 
 
-def write_table(path: Path, columns: Mapping[str, np.ndarray], tables: str = "csv") -> None:
+def write_table(path: Path, columns: Columns, tables: str = "csv") -> None:
     """Write a table as CSV. Numbers that are not finite become empty cells.
 
     Args:
@@ -201,14 +201,14 @@ def write_table(path: Path, columns: Mapping[str, np.ndarray], tables: str = "cs
         _write_rows(stream, columns)
 
 
-def table_text(columns: Mapping[str, np.ndarray]) -> str:
+def table_text(columns: Columns) -> str:
     """A table as the text of a CSV file, as `write_table` writes it."""
     stream = io.StringIO()
     _write_rows(stream, columns)
     return stream.getvalue()
 
 
-def _write_rows(stream: TextIO, columns: Mapping[str, np.ndarray]) -> None:
+def _write_rows(stream: TextIO, columns: Columns) -> None:
     writer = csv.writer(stream, lineterminator="\n")
     writer.writerow(map(cell_text, columns))
     writer.writerows(zip(*(map(cell_text, column) for column in columns.values()), strict=True))

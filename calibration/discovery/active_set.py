@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from calibration.data import Names
 from calibration.data.effect_file import Library
 from calibration.inference.linearization import (
     ScoredEffect,
@@ -48,8 +49,8 @@ class ActiveSet(eqx.Module):
     active: Int[Array, " slots"]
     sd: Float[Array, " effects"]
     scales: tuple[Array, Array, Array, Array, Array]
-    names: tuple[str, ...] = eqx.field(static=True)
-    shapes: tuple[str, ...] = eqx.field(static=True)
+    names: Names = eqx.field(static=True)
+    shapes: Names = eqx.field(static=True)
 
     @property
     def slots(self) -> int:
@@ -109,7 +110,7 @@ class ScoredLibrary:
     at: np.ndarray
 
     @property
-    def names(self) -> tuple[str, ...]:
+    def names(self) -> Names:
         """Names of the effects."""
         return tuple(e.name for e in self.effects)
 
@@ -153,9 +154,9 @@ class CandidateSpace:
     bare: Problem
     equipped: Problem
     library: ScoredLibrary
-    room: tuple[str, ...] = ()
-    near: Mapping[tuple[str, ...], np.ndarray] = dataclasses.field(default_factory=dict)
-    begins: Mapping[tuple[str, ...], np.ndarray] = dataclasses.field(default_factory=dict)
+    room: Names = ()
+    near: Mapping[Names, np.ndarray] = dataclasses.field(default_factory=dict)
+    begins: Mapping[Names, np.ndarray] = dataclasses.field(default_factory=dict)
 
     @property
     def coordinates(self) -> ActiveSet:

@@ -112,7 +112,7 @@ class Candidate:
         simulated: True for a fit of the model, False for one of its linearised equations (`screening`).
     """
 
-    active: tuple[str, ...]
+    active: Names
     z: np.ndarray
     sd: np.ndarray
     cost: float
@@ -121,11 +121,11 @@ class Candidate:
     plausible: bool
     nearly: bool
     converged: bool
-    supplying: tuple[str, ...] = ()
+    supplying: Names = ()
     simulated: bool = True
 
     @property
-    def effects(self) -> tuple[str, ...]:
+    def effects(self) -> Names:
         """Names of the effects that are present."""
         return tuple(name for name in self.active if name)
 
@@ -135,17 +135,17 @@ class Candidate:
         return frozenset(self.effects)
 
 
-def empty_slots(settings: Settings) -> tuple[str, ...]:
+def empty_slots(settings: Settings) -> Names:
     """Slots without effects."""
     return ("",) * settings.slots
 
 
-def fill_slots(effects: Sequence[str], settings: Settings) -> tuple[str, ...]:
+def fill_slots(effects: Sequence[str], settings: Settings) -> Names:
     """Slots with these effects first."""
     return (*effects, *("",) * (settings.slots - len(effects)))
 
 
-def candidate_of_fit(space: CandidateSpace, active: tuple[str, ...], best: Optimum, settings: Settings) -> Candidate:
+def candidate_of_fit(space: CandidateSpace, active: Names, best: Optimum, settings: Settings) -> Candidate:
     """Candidate from a fit of the effects in its slots."""
     amplitude = settings.width * np.asarray(space.coordinates.parts(best.z)[1])
     spread = settings.width * np.asarray(space.coordinates.parts(best.sd)[1])
@@ -270,7 +270,7 @@ def _base_searches(space: CandidateSpace, settings: Settings, near: Candidate | 
     return jax.device_get(observe.search(problem, *search_inputs, rivals=not few, most=most, scanned=bare))
 
 
-Proposal = tuple[tuple[str, ...], np.ndarray]
+Proposal = tuple[Names, np.ndarray]
 
 
 def fit_candidates(space: CandidateSpace, proposals: Sequence[Proposal], settings: Settings) -> list[Candidate]:
@@ -294,7 +294,7 @@ def fit_candidates(space: CandidateSpace, proposals: Sequence[Proposal], setting
 
 
 def fit_in_addition(
-    space: CandidateSpace, wanted: Sequence[tuple[tuple[str, ...], Candidate, ScoreTable]], settings: Settings
+    space: CandidateSpace, wanted: Sequence[tuple[Names, Candidate, ScoreTable]], settings: Settings
 ) -> list[Candidate]:
     """Fit effects in addition to those of another fit, from the starts that their scores give.
 
@@ -319,7 +319,7 @@ def fit_in_addition(
 def start_of_fit(
     space: CandidateSpace,
     at: Candidate,
-    active: tuple[str, ...],
+    active: Names,
     settings: Settings,
     scores: ScoreTable | None = None,
 ) -> np.ndarray:

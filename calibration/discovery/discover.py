@@ -10,13 +10,12 @@ import contextlib
 import dataclasses
 import functools
 import math
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
 
 import jax.numpy as jnp
 import numpy as np
 
-from calibration.data import Names, own_mass
+from calibration.data import Json, Names, Priors, own_mass
 from calibration.data.columns import ROWS, SIDES, WHEN
 from calibration.data.effect_file import Library
 from calibration.data.input_errors import BadConfiguration, BadData
@@ -110,7 +109,7 @@ def discover(
     robot: Robot,
     *,
     noise: str | None = None,
-    stated: Mapping[str, tuple[float, float]] | None = None,
+    stated: Priors | None = None,
     library: Library = effects.BY_NAME,
     replicates: int = 500,
     seed: int = 0,
@@ -218,7 +217,7 @@ class LoopInput:
     numbers: np.ndarray
     robot: Robot
     noise: Noise
-    stated: Mapping[str, tuple[float, float]]
+    stated: Priors
     settings: Settings
     library: Library
     notes: Notes = ()
@@ -253,7 +252,7 @@ class LoopInput:
                 return LoopStages(word, screened, left, sds, missed=missed, unused=unused_inputs(self.runs))
             return _verdict(given, screened, left, sds, searched)
 
-    @property
+    @functools.cached_property
     def loses_motion(self) -> bool:
         """True if the log shows a backlash that the robot does not have."""
         return bool(lost_motion_notes(self.runs, self.robot))
@@ -290,7 +289,7 @@ def prepare_loop(
     robot: Robot,
     *,
     noise: str | None = None,
-    stated: Mapping[str, tuple[float, float]] | None = None,
+    stated: Priors | None = None,
     library: Library = effects.BY_NAME,
     replicates: int = 500,
     seed: int = 0,
@@ -382,15 +381,15 @@ class LoopStages:
     predicted: Predicted = dataclasses.field(default_factory=dict)
     mechanism: Mechanism | None = None
     missed: tuple[Missed, ...] = ()
-    unused: tuple[str, ...] = ()
+    unused: Names = ()
 
     @property
-    def members(self) -> tuple[tuple[str, ...], ...]:
+    def members(self) -> tuple[Names, ...]:
         """For each established effect, those that these data cannot separate from it, itself first."""
         return tuple(m for m, name in zip(self._classes, self._named, strict=True) if name)
 
     @property
-    def _classes(self) -> tuple[tuple[str, ...], ...]:
+    def _classes(self) -> tuple[Names, ...]:
         return () if self.alike is None else self.alike.members
 
     @property
@@ -403,7 +402,7 @@ class LoopStages:
         return float(np.exp(np.mean(np.log(list(self.sds.factors.values()))))) if self.sds.factors else None
 
     @property
-    def families(self) -> tuple[str, ...]:
+    def families(self) -> Names:
         """Families of the members of each established class, or of the location of an unnamed discrepancy."""
         if self.alike is not None and self.verdict not in WITHOUT_NAME:
             return tuple(f for each, name in zip(self.alike.families, self._named, strict=True) if name for f in each)
@@ -412,17 +411,17 @@ class LoopStages:
         return () if self.where is None else (self.where.family,)
 
     @property
-    def events(self) -> tuple[dict[str, Any], ...]:
+    def events(self) -> tuple[Json, ...]:
         """Temporary changes: axis and window, and numbers of the rows in it."""
         return () if self.where is None else self._happening(self.where.variable)
 
     @property
-    def events_alike(self) -> tuple[dict[str, Any], ...]:
+    def events_alike(self) -> tuple[Json, ...]:
         """Temporary changes that cannot be separated from `events`, in the same form."""
         alike = () if self.where is None else self.where.variables_alike
         return tuple(event for variable in alike for event in self._happening(variable))
 
-    def _happening(self, variable: str) -> tuple[dict[str, Any], ...]:
+    def _happening(self, variable: str) -> tuple[Json, ...]:
         happens = bases_room.window_from_name(variable)
         if happens is None or self.where is None:
             return ()
@@ -433,7 +432,7 @@ class LoopStages:
         return ({"axis": happens.axis, "window": (happens.low, happens.high), "rows": rows},)
 
     @property
-    def simulated(self) -> dict[tuple[str, ...], np.ndarray]:
+    def simulated(self) -> dict[Names, np.ndarray]:
         """Coordinates of each simulated fit, by its effects."""
         all_candidates = (self.screened.base.candidate, *(() if self.searched is None else self.searched.ladder))
         return {c.active: c.z for c in reversed(all_candidates) if c.simulated and np.isfinite(c.cost)}
@@ -659,7 +658,7 @@ def pose_candidates(
     robot: Robot,
     sd: np.ndarray,
     settings: Settings,
-    stated: Mapping[str, tuple[float, float]] | None = None,
+    stated: Priors | None = None,
     library: Library = effects.BY_NAME,
 ) -> CandidateSpace:
     """Base problem of a table, with slots for the effects that its data can show.
@@ -773,7 +772,7 @@ def without_copies(runs: Runs) -> tuple[Runs, np.ndarray, list[Remark]]:
     display. They are copies only if the whole table repeats: the same rows in the same sequence, several times.
     """
     columns = [*(runs[c] for c in observers.observer_kind(runs).identity(runs)), *runs.extras.values()]
-    seen_columns: set[tuple[str, ...]] = set()
+    seen_columns: set[Names] = set()
     keep: list[int] = []
     copies: list[int] = []
     if runs.sampled or {"run_id", *WHEN} & set(runs.headings):

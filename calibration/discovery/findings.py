@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from calibration.data import Columns, Names
 from calibration.data.runs import Runs
 from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.adequacy import AdequacyTest, Diagnosis
@@ -324,7 +325,7 @@ def _plausible_score(
     return amplitude, float(scores.single[m] ** 2 - ((wanted - amplitude) * left) ** 2)
 
 
-def invisible_effects(space: CandidateSpace, scores: ScoreTable, settings: Settings) -> tuple[str, ...]:
+def invisible_effects(space: CandidateSpace, scores: ScoreTable, settings: Settings) -> Names:
     """Effects that the data cannot show: even the largest plausible amplitude changes the readings too little."""
     largest_scores = space.library.largest(np.asarray(scores.left))
     return tuple(
@@ -352,13 +353,13 @@ class Fitted:
 
 
 #: Kind of block → hold-out predictions of each row, shape (rows, channels).
-HeldOutReadings = dict[str, np.ndarray]
+HeldOutReadings = Columns
 
 
 def readings_of_rows(
     runs: Runs,
     sd: np.ndarray,
-    kinds: Mapping[str, Mapping[str, np.ndarray]],
+    kinds: Mapping[str, Columns],
     before: Fitted,
     after: Fitted | None,
     known_before: HeldOutReadings | None = None,

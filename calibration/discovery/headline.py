@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from calibration.data import Names
 from calibration.discovery.loop_notes import Headline, Summary
 from calibration.discovery.settings import WITHOUT_NAME
 
@@ -40,7 +41,7 @@ def _verdict_without_claim(said: Summary) -> str:
     return said.verdict if said.verdict in ("none", "undescribed") else ""
 
 
-def _mechanisms(said: Summary) -> list[tuple[str, ...]]:
+def _mechanisms(said: Summary) -> list[Names]:
     """Families of each established law or mechanism."""
     families = [m.families for m in said.missing if m.established]
     return (
@@ -50,7 +51,7 @@ def _mechanisms(said: Summary) -> list[tuple[str, ...]]:
     )
 
 
-def _places(said: Summary) -> list[tuple[str, ...]]:
+def _places(said: Summary) -> list[Names]:
     """Equations with a discrepancy, in words: families without their driver."""
     families = _mechanisms(said)
     if said.verdict in WITHOUT_NAME and said.where is not None:
@@ -59,14 +60,14 @@ def _places(said: Summary) -> list[tuple[str, ...]]:
 
 
 def _shared_claims(
-    claims: Sequence[Sequence[tuple[str, ...]]],
-) -> tuple[tuple[tuple[str, ...], ...], tuple[int, ...]]:
+    claims: Sequence[Sequence[Names]],
+) -> tuple[tuple[Names, ...], tuple[int, ...]]:
     """Claims of the first verdict that share a member with a claim of each other verdict, and their shared members.
 
     Members in all verdicts come first, then any that some noises cannot separate from them. A claim within another
     is omitted. The second result is the number of shared members of each claim.
     """
-    counts: dict[tuple[str, ...], int] = {}
+    counts: dict[Names, int] = {}
     for claim in claims[0]:
         alike = [[other for other in those if set(other) & set(claim)] for those in claims[1:]]
         if all(alike):

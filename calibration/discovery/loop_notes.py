@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from calibration.data import Names
 from calibration.discovery.location import DiscrepancyLocation
 from calibration.discovery.outliers import Cluster
 from calibration.inference.fit_notes import Remark
@@ -20,7 +21,7 @@ class CurveOver(NamedTuple):
     """A smooth curve of one variable, or a surface of two, in a place of the model: a balance or a channel."""
 
     place: str
-    variables: tuple[str, ...]
+    variables: Names
 
 
 #: Advantage in evidence of a smooth curve of an effect's own equation that refutes its name [σ²]
@@ -71,7 +72,7 @@ class NameTest:
     row: int | None = None
     root_without: float = math.inf
     again: float = 1.0
-    larger: tuple[str, ...] = ()
+    larger: Names = ()
     remains: bool = False
     what: str = "row"
     varies: float = 0.0
@@ -93,7 +94,7 @@ class NameTest:
         return self.row if self.root_without < max(self.needed, KEPT[self.what] * self.root) else None
 
     @property
-    def fails(self) -> tuple[str, ...]:
+    def fails(self) -> Names:
         """Reasons against the name, rows of `loop_words.DOUBTS`, empty for an established one."""
         doubts = {
             "chance": self.root < self.needed,
@@ -132,7 +133,7 @@ class NameSupport:
 
     stands: bool
     why: str = ""
-    effects: tuple[str, ...] = ()
+    effects: Names = ()
     curves: tuple[CurveOver, ...] = ()
     tests: tuple[NameTest, ...] = ()
 
@@ -196,9 +197,9 @@ class Missing:
         test: of its own, None without one.
     """
 
-    names: tuple[str, ...]
+    names: Names
     values: tuple[FreedValue, ...]
-    families: tuple[str, ...]
+    families: Names
     established: bool = True
     test: NameTest | None = None
 
@@ -222,8 +223,8 @@ class Mechanism:
         errors: standard error of the gain by kind of block [nat a reading].
     """
 
-    families: tuple[str, ...]
-    effects: tuple[str, ...]
+    families: Names
+    effects: Names
     share: float
     gain: float
     se: float
@@ -231,12 +232,12 @@ class Mechanism:
     errors: Mapping[str, float] = dataclasses.field(default_factory=dict)
 
     @property
-    def drivers(self) -> tuple[str, ...]:
+    def drivers(self) -> Names:
         """Possible drivers. The families differ in these, or only in the equation."""
         return tuple(dict.fromkeys(f.partition(" that ")[2] for f in self.families))
 
     @property
-    def fails(self) -> tuple[str, ...]:
+    def fails(self) -> Names:
         """Reasons against the mechanism, rows of `loop_words.NO_MECHANISM`, empty for an established one."""
         doubts = {
             "share": self.share < HALF,
@@ -279,7 +280,7 @@ class Summary:
     p: float
     where: DiscrepancyLocation | None
     missing: tuple[Missing, ...] = ()
-    nearest: tuple[str, ...] = ()
+    nearest: Names = ()
     support: NameSupport | None = None
     aside: int = 0
     of: int = 0
@@ -287,8 +288,8 @@ class Summary:
     cluster: Cluster | None = None
     mechanism: Mechanism | None = None
     missed: tuple[Missed, ...] = ()
-    unused: tuple[str, ...] = ()
-    far: tuple[str, ...] = ()
+    unused: Names = ()
+    far: Names = ()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -306,10 +307,10 @@ class Headline:
     """
 
     level: str
-    claims: tuple[tuple[str, ...], ...]
+    claims: tuple[Names, ...]
     factors: tuple[float, ...]
     shared: tuple[int, ...] = ()
-    families: tuple[tuple[str, ...], ...] = ()
+    families: tuple[Names, ...] = ()
     values: tuple[tuple[FreedValue, ...], ...] = ()
 
 
@@ -327,7 +328,7 @@ class RuledOut:
     name: str
     why: str
     size: float = 0.0
-    check: tuple[str, ...] = ()
+    check: Names = ()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -343,7 +344,7 @@ class Asked:
     why: str
     balance: str = ""
     variable: str = ""
-    effects: tuple[str, ...] = ()
+    effects: Names = ()
 
 
 #: Hold-out errors that do not decide between alternatives.

@@ -12,7 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from calibration.data.input_errors import BadConfiguration, allowed_words
+from calibration.data import Names
+from calibration.data.input_errors import stated_word
 from calibration.discovery.reach import SLOPE, Reach, Used
 from calibration.inference.fit_notes import Remark
 from mmrjax.model import balances, channels, params
@@ -25,6 +26,8 @@ from mmrjax.model.signals import Signals, State
 # --- setups of a robot ----------------------------------------------------------------------------
 
 
+#: Signals that are zero for a robot at rest with its motors off.
+STILL = ("current", "voltage", "torque_output")
 #: Friction of a shaft that is held in a vice [N·m].
 BLOCKED = 1e3
 #: Function of the robot and the brake's torque on each motor shaft [N·m] that returns the robot as set up.
@@ -122,7 +125,7 @@ class Act:
     """
 
     name: str
-    kinds: tuple[str, ...]
+    kinds: Names
     reading: Callable[[Robot, Array], Array]
     at: tuple[tuple[float, ...], ...]
     sd: float | None
@@ -155,13 +158,13 @@ class Run:
     """
 
     name: str
-    kinds: tuple[str, ...]
+    kinds: Names
     doing: str
     setup: Setup
     voltage: tuple[float, ...]
     slope: tuple[float, ...]
     payload: tuple[float, ...]
-    channels: tuple[str, ...]
+    channels: Names
     configuration: int = 0
     sides: int | None = None
     brake: float = 0.0
@@ -174,7 +177,7 @@ class Run:
     motors: int = 1
     torque: tuple[float, ...] = ()
 
-    def read(self, shown: tuple[str, ...]) -> tuple[int, ...]:
+    def read(self, shown: Names) -> tuple[int, ...]:
         """Positions of the channels to read among all channels."""
         return tuple(shown.index(c) for c in self.channels)
 
@@ -236,31 +239,16 @@ def _weighed(robot: Robot, at: Array) -> Array:
     )
 
 
-def _show(robot: Robot, channel: str, signals: Sequence[Signals]) -> Array:
-    """Readings of a channel's instrument for known signals."""
-    return jnp.stack([jnp.asarray(balances.sensor(robot, s)[channel]) for s in signals])
-
-
-def _shunted(robot: Robot, at: Array) -> Array:
-    return _show(robot, "total_current", [Signals(total_current=i) for (i,) in at])
-
-
-def _strobed(robot: Robot, at: Array) -> Array:
-    return _show(robot, "motor_speed", [Signals(speed_motor=w) for (w,) in at])
-
-
-def _timed(robot: Robot, at: Array) -> Array:
-    return _show(robot, "speed", [Signals(speed=v) for (v,) in at])
-
-
 @dataclasses.dataclass(frozen=True)
-class _Zero:
-    """Reading of a channel's instrument for a robot at rest with its motors off."""
+class _Instrument:
+    """Readings of a channel's instrument where these signals have known values."""
 
     channel: str
+    signals: Names
 
     def __call__(self, robot: Robot, at: Array) -> Array:
-        return _show(robot, self.channel, [Signals(current=0.0, voltage=0.0, torque_output=0.0)])
+        shown = [Signals(**dict.fromkeys(self.signals, x)) for (x,) in at]
+        return jnp.stack([jnp.asarray(balances.sensor(robot, s)[self.channel]) for s in shown])
 
 
 def calibration_acts(reach: Reach) -> tuple[Act, ...]:
@@ -273,17 +261,20 @@ def calibration_acts(reach: Reach) -> tuple[Act, ...]:
     paces = round_significant(0.35 * reach.speed), round_significant(0.8 * reach.speed)
     settings = tuple((float(u.index), m) for u in reach.used for m in loads)
     weighing = Act("weigh", ("weigh",), _weighed, settings, 0.02, repeats=1)
+    shunted = _Instrument("total_current", ("total_current",))
+    strobed = _Instrument("motor_speed", ("speed_motor",))
     ammeter = [
-        Act("zero current", ("zero current",), _shunted, ((0.0,),), 0.02),
-        Act("shunt", ("shunt",), _shunted, _one_tuple_each(amperes), 0.02),
+        Act("zero current", ("zero current",), shunted, ((0.0,),), 0.02),
+        Act("shunt", ("shunt",), shunted, _one_tuple_each(amperes), 0.02),
     ]
-    strobe = Act("strobe", ("strobe",), _strobed, _one_tuple_each(turning), 5 * RPM)
-    timing = Act("timing", ("timing",), _timed, _one_tuple_each(paces), 3e-3)
+    strobe = Act("strobe", ("strobe",), strobed, _one_tuple_each(turning), 5 * RPM)
+    timing = Act("timing", ("timing",), _Instrument("speed", ("speed",)), _one_tuple_each(paces), 3e-3)
     acts = [weighing] * reach.has_ground
     acts += ammeter * ("total_current" in reach.measured)
     meters = [c for c in channels.channels_named(reach.measured) if c.misses_zero]
     acts += [
-        Act(f"zero of {c.label}", ("zero reading",), _Zero(c.name), ((0.0,),), None, channel=c.name) for c in meters
+        Act(f"zero of {c.label}", ("zero reading",), _Instrument(c.name, STILL), ((0.0,),), None, channel=c.name)
+        for c in meters
     ]
     acts += [strobe] * ("motor_speed" in reach.measured)
     acts += [timing] * ("speed" in reach.measured)
@@ -306,11 +297,11 @@ def _runs(
     doing: str,
     setup: Setup = on_ground,
     *,
-    kinds: tuple[str, ...] = (),
+    kinds: Names = (),
     voltages: Sequence[float],
     slopes: Sequence[float] = (0.0,),
     payload: float = 0.0,
-    read: tuple[str, ...] = (),
+    read: Names = (),
     at: Used | None = None,
     sides: int | None = None,
     brake: float = 0.0,
@@ -449,10 +440,7 @@ def check_forbidden(forbidden: Sequence[str], robot: Robot) -> None:
     """
     allowed = (*KINDS, *robot.configurations)
     for name in forbidden:
-        if name not in allowed:
-            raise BadConfiguration(
-                f"--forbid {name}: no such experiment or configuration; {allowed_words(name, allowed)}"
-            )
+        stated_word(name, allowed, f"--forbid {name}", "no such experiment or configuration")
 
 
 # --- possible experiments -----------------------------------------------------------------------------

@@ -6,7 +6,7 @@ import concurrent.futures
 import contextlib
 import dataclasses
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import jax
@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.special import ndtr, ndtri
 
+from calibration.data import Columns
 from calibration.data.runs import Runs
 from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.candidates import BaseFit, Candidate, empty_slots, fit_base
@@ -62,8 +63,8 @@ class Cluster:
 def find_cluster(
     outliers: np.ndarray,
     included: np.ndarray,
-    axes: Mapping[str, np.ndarray],
-    levels: Mapping[str, np.ndarray],
+    axes: Columns,
+    levels: Columns,
     error: float,
     seed: int,
 ) -> Cluster | None:

@@ -100,7 +100,7 @@ def score_readings(
     measured: Readings,
     sd: Readings,
     counts: Bool[np.ndarray, "rows channels"],
-    kinds: Mapping[str, Mapping[str, np.ndarray]],
+    kinds: Mapping[str, Columns],
 ) -> HeldOutScore:
     """Scores of hold-out predictions.
 
@@ -124,7 +124,7 @@ def score_readings(
 
 
 #: `candidate_key` of a candidate → kind of block → hold-out predictions of each row.
-Predicted = dict[tuple[tuple[str, ...], bytes], dict[str, Readings]]
+Predicted = dict[tuple[Names, bytes], dict[str, Readings]]
 
 
 def candidate_key(candidate: Candidate) -> tuple[Names, bytes]:

@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
+from calibration.data import Columns
 from calibration.data.runs import Runs
 from calibration.discovery import experiments
 from calibration.discovery.active_set import CandidateSpace
@@ -74,7 +75,7 @@ def compare_alternatives(
     held_out = {kind: counts & np.any(list(by.values()), 0)[:, None] for kind, by in kinds.items()}
     common = {kind: np.all([np.isfinite(e[kind]) for e in errors], 0) for kind in kinds}
 
-    def rms(e: Mapping[str, np.ndarray], blocks: Sequence[str]) -> float:
+    def rms(e: Columns, blocks: Sequence[str]) -> float:
         squares = np.concatenate([e[kind][common[kind]] ** 2 for kind in blocks])
         return float(np.sqrt(squares.mean())) if squares.size else float("nan")
 

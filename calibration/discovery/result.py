@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from calibration.data import Names, robot_file
+from calibration.data import Columns, Json, Names, robot_file
 from calibration.data import posterior_file as posterior
 from calibration.data.columns import DRIVING
 from calibration.data.posterior_file import Posterior
@@ -106,7 +105,7 @@ class FoundEffect:
     name: str
     members: dict[str, Member]
     stated: dict[str, StatedValue]
-    families: tuple[str, ...]
+    families: Names
     balance: str
     unit: str
     equation: str
@@ -137,7 +136,7 @@ class UnnamedDiscrepancy(DiscrepancyLocation):
     """
 
     unit: str
-    families: tuple[str, ...]
+    families: Names
     window: dict[str, str | float] | None
     effect: str
     p_value: float
@@ -289,7 +288,7 @@ class ReadingsOfRows:
     before: np.ndarray
     after: np.ndarray
     held_out: dict[str, tuple[np.ndarray, np.ndarray]]
-    blocks: dict[str, tuple[str, ...]]
+    blocks: dict[str, Names]
 
 
 Errors = dict[str, dict[str, float | int]]
@@ -326,7 +325,7 @@ class HeldOutAlternative:
         lost: number of held-out readings without a prediction, because its robot slides or fails there.
     """
 
-    effects: tuple[str, ...]
+    effects: Names
     leads: bool
     rise_chi2: float
     rms_sigma: float
@@ -360,7 +359,7 @@ class Resolved:
     robot: Robot
     constants: dict[str, Estimate]
     alike: tuple[tuple[str, str, float], ...]
-    outside: tuple[str, ...]
+    outside: Names
     settled: bool
     fall: float
     p: float
@@ -371,7 +370,7 @@ class Resolved:
     remarks: Notes
 
     @property
-    def known_from_rows(self) -> tuple[str, ...]:
+    def known_from_rows(self) -> Names:
         """Constants not held by their priors."""
         return tuple(name for name, e in self.constants.items() if not e.held_by_prior)
 
@@ -386,11 +385,11 @@ class Resolved:
         return describe(self)
 
     @property
-    def notes(self) -> tuple[str, ...]:
+    def notes(self) -> Names:
         """Remarks of the search, as sentences."""
         return sentences(self.remarks)
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> Json:
         """Entry of result.json."""
         return json_value(
             {
@@ -475,9 +474,9 @@ class DiscoveryResult:
     unnamed: UnnamedDiscrepancy | None
     remains: DiscrepancyLocation | None
     next_experiment: Proposal | None
-    cannot_see: tuple[str, ...]
-    needs_histories: tuple[str, ...]
-    needs_reverse: tuple[str, ...]
+    cannot_see: Names
+    needs_histories: Names
+    needs_reverse: Names
     alternatives: tuple[Alternative, ...]
     implausible: tuple[Alternative, ...]
     hidden: tuple[Hidden, ...]
@@ -496,10 +495,10 @@ class DiscoveryResult:
     errors_as_stated: Errors
     errors: tuple[Errors, Errors]
     errors_held_out: dict[str, tuple[Errors, Errors]]
-    held_out_unpredictable: tuple[str, ...]
+    held_out_unpredictable: Names
     held_out_worse: tuple[Worse, ...]
     alternatives_held_out: tuple[HeldOutAlternative, ...]
-    noise: dict[str, dict[str, Any]]
+    noise: dict[str, Json]
     settings: Settings
     replicates: int
     remarks: Notes = ()
@@ -538,7 +537,7 @@ class DiscoveryResult:
         return describe(self, "standing")
 
     @property
-    def notes(self) -> tuple[str, ...]:
+    def notes(self) -> Names:
         """Remarks as sentences."""
         return sentences(self.remarks)
 
@@ -582,7 +581,7 @@ class DiscoveryResult:
         return {fit: {name: e["rms"] for name, e in by.items() if e["rows"]} for fit, by in fits.items()}
 
     @property
-    def held_by_prior(self) -> tuple[str, ...]:
+    def held_by_prior(self) -> Names:
         """Names of the fitted parameters of the proposed robot that are held by their priors."""
         base = [name for name, p in self.base_shift.items() if p.held_by_prior]
         parameters = [(f"effects.{e.name}.{name}", p) for e in self.effects for name, p in e.parameters.items()]
@@ -595,7 +594,7 @@ class DiscoveryResult:
         pairs = determined_together(self.posterior, self.held_by_prior)
         return tuple(pair for pair in pairs if shown_names >= {pair.one, pair.other})
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> Json:
         """Everything as JSON-able data, as docs/schemas/loop.schema.json describes it."""
         mechanism, main = self.summary.mechanism, next(iter(self.errors_held_out.values()), (None, None))
         return json_value(
@@ -659,7 +658,7 @@ class DiscoveryResult:
             }
         )
 
-    def rows_table(self) -> dict[str, np.ndarray]:
+    def rows_table(self) -> Columns:
         """Table by row: conditions, readings measured, simulated before and after and held out, defects if known."""
         readings = self.readings_of_rows
         known_columns = ("run_id", *WHEN, "configuration", *self.runs.axes, *DRIVING)
@@ -721,7 +720,7 @@ class Sensitivity:
     factor: float
     verdict: str
     summary: Summary
-    classes: tuple[tuple[str, ...], ...]
+    classes: tuple[Names, ...]
     adequate_after: bool
     near: bool = False
 
@@ -730,13 +729,13 @@ class Sensitivity:
         """The verdict as a sentence."""
         return describe(self.summary)
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> Json:
         """Entry of result.json."""
         entries = entries_of(self, "factor", "verdict", "statement", "classes", "adequate_after")
         return entries | ({"near": True} if self.near else {})
 
 
-def _effect(e: FoundEffect, support: NameSupport | None) -> dict[str, Any]:
+def _effect(e: FoundEffect, support: NameSupport | None) -> Json:
     test = None if support is None else support.test_of(e.name)
     return {
         "name": e.name,
@@ -756,7 +755,7 @@ def _effect(e: FoundEffect, support: NameSupport | None) -> dict[str, Any]:
     }
 
 
-def _unnamed(d: UnnamedDiscrepancy) -> dict[str, Any]:
+def _unnamed(d: UnnamedDiscrepancy) -> Json:
     return {
         "name": "unnamed",
         "class": [],
@@ -771,6 +770,6 @@ def _unnamed(d: UnnamedDiscrepancy) -> dict[str, Any]:
     }
 
 
-def _evidence(e: Evidence) -> dict[str, Any]:
+def _evidence(e: Evidence) -> Json:
     kinds = {name: {"found": k.found, "threshold": k.threshold, "p": k.p} for name, k in e.kinds.items()}
     return {**kinds, "p_value": e.p_value}

@@ -131,7 +131,7 @@ def output_rotation(runs: Runs, robot: Robot) -> float:
 
 
 def _at_position(signals: Signals, kind: type[Effect], turned: float | None = None) -> Signals:
-    """Signals of an effect that depends on position, at a given angle, or for None at its reference angle."""
+    """Signals with an effect of position at an angle, by default its reference angle. Unchanged for other effects."""
     if kind.driver != "position" or kind.memory_size is None:
         return signals
     positions = jnp.full(jnp.shape(signals.speed_motor), kind.memory_size if turned is None else turned)

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from calibration.data import Names
 from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.adequacy import Diagnosis
 from calibration.discovery.candidates import Candidate, candidate_of_fit, empty_slots, fill_slots, fit_candidates
@@ -57,7 +58,7 @@ class Confirmed:
     candidates: tuple[Candidate, ...]
     asked: int = 0
     otherwise: int = 0
-    room: tuple[str, ...] = ()
+    room: Names = ()
 
 
 class Regression:
@@ -80,7 +81,7 @@ class Regression:
         self.jacobian, self.residual = np.asarray(linear.jacobian), np.asarray(linear.residual)
         self.signatures = np.asarray(linear.signatures)
 
-    def __call__(self, active: tuple[str, ...]) -> Candidate:
+    def __call__(self, active: Names) -> Candidate:
         """Candidate with these effects in the slots. New ones have the shape of their grid with the best score."""
         p, s, at = self.space.free, self.settings.slots, self.at
         size = self.jacobian.shape[1]  # residuals of the priors come last, in the order of the coordinates
@@ -133,7 +134,7 @@ def confirm_by_simulation(space: CandidateSpace, screened: Sequence[Candidate], 
     order = sorted(screened, key=lambda c: c.cost + (0.0 if fits(c) else more))
     order = [c for c in order if np.isfinite(c.cost)]
     within = [c for c in order if fits(c)] if order and fits(order[0]) else order
-    first, simulated = _first_to_simulate(space, within), dict[tuple[str, ...], Candidate]()
+    first, simulated = _first_to_simulate(space, within), dict[Names, Candidate]()
     space = space.with_room([*space.room, *(n for c in first for n in c.effects)])  # one program for all of them
     by_regression = {c.active: c for c in order}
 
@@ -203,7 +204,7 @@ class Beforehand:
     """
 
     base: Candidate | None
-    room: tuple[str, ...]
+    room: Names
     alone: tuple[Candidate, ...]
     scores: ScoreTable
     windows: int
@@ -246,7 +247,7 @@ def screen_by_weak_form(space: CandidateSpace, settings: Settings) -> Beforehand
 
 
 def fit_by_regression(
-    space: CandidateSpace, wanted: Sequence[tuple[tuple[str, ...], Candidate, Diagnosis]], settings: Settings
+    space: CandidateSpace, wanted: Sequence[tuple[Names, Candidate, Diagnosis]], settings: Settings
 ) -> list[Candidate]:
     """Sets of effects by regression, each in addition to another fit.
 
@@ -278,9 +279,7 @@ def _each_alone(
     return tuple(sorted((beside(fill_slots([name], settings)) for name in space.library.names), key=lambda c: c.cost))
 
 
-def _program_room(
-    space: CandidateSpace, order: Sequence[Candidate], scores: ScoreTable, settings: Settings
-) -> tuple[str, ...]:
+def _program_room(space: CandidateSpace, order: Sequence[Candidate], scores: ScoreTable, settings: Settings) -> Names:
     """Effects to be simulated first, similar ones, and the best of other families.
 
     Args:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import dataclasses
 import math
 
-from calibration.data.input_errors import SEEDS, BadConfiguration, allowed_words, stated_count
+from calibration.data import Names
+from calibration.data.input_errors import SEEDS, stated_count, stated_word
 from calibration.inference.observers import Observer
 
 #: Family-wise error of the test for a missing effect, divided among the kinds of evidence: single effects, curves,
@@ -93,8 +94,8 @@ class Settings:
     gain: float = 0.2
     refuted: float = 4.0
     prefer: str = FIT
-    forbidden: tuple[str, ...] = ()
-    silent: tuple[str, ...] = ()
+    forbidden: Names = ()
+    silent: Names = ()
 
     def outliers(self, rows: int) -> int:
         """Largest number of rows that may be excluded."""
@@ -122,7 +123,6 @@ def settings_for(kind: type[Observer], replicates: int = 500, seed: int = 0, pre
     """
     stated_count(replicates, "replicates", 1, 100_000)
     stated_count(seed, "seed", 0, SEEDS)
-    if prefer not in PREFERENCES:
-        raise BadConfiguration(f"--prefer: got {prefer}; {allowed_words(prefer, PREFERENCES)}")
+    stated_word(prefer, PREFERENCES, "--prefer")
     shares = dict(zip(kind.evidence, SHARES[kind.evidence], strict=True))
     return Settings(shares, replicates=replicates, seed=seed, prefer=prefer)

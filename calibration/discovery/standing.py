@@ -395,13 +395,14 @@ def _evidence_over_curves(
     bases: Bases,
     settings: Settings,
 ) -> float:
-    """Twice the log of the evidence for an effect of a candidate over the best smooth curve of its equation [σ²].
+    """Twice the log Bayes factor of an effect over the best smooth curve in its equation [σ²].
 
-    Both are penalised for the number of alternatives in that equation: effects, and curves.
+    Each is penalised for the number of its alternatives in that equation: effects, or curves.
 
     Args:
-        without: the same fit without it.
-        linear: linearization of that fit.
+        best: candidate with the effect.
+        without: the same candidate without the effect.
+        linear: linearization at `without`.
     """
     equation = _equation(space, effect)
     offered = sum(_equation(space, name) == equation for name in space.library.names)

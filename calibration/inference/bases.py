@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import equinox as eqx
 import jax
@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.polynomial import legendre
 
-from calibration.data import Names
+from calibration.data import Columns, Names
 from calibration.data.columns import CURRENT, LOAD, SPEED, Layout
 from calibration.inference.linearization import Linearization
 from mmrjax.effects.curve import DRIFT, EVERY_VARIABLE, READ_BY, WAYS, direction_signal, in_travel_frame, sign_factor
@@ -169,13 +169,13 @@ class Scope:
         """All balances and conditions of a robot's straight travel. For None, of the packaged one."""
         return cls(balances_of(robot), axes_of(robot))
 
-    def over(self, columns: Mapping[str, np.ndarray]) -> Scope:
+    def over(self, columns: Columns) -> Scope:
         """Scope that includes a brake's torque among the conditions if the table has it."""
         return dataclasses.replace(self, axes=(*self.axes, LOAD)) if LOAD in columns else self
 
 
 #: Signals of `effects.curve.WAYS`, by point; and a balance of the shafts.
-Ways = Mapping[str, np.ndarray]
+Ways = Columns
 SHAFTS = "electrical"
 
 
@@ -185,7 +185,7 @@ def forward_ways(points: int) -> Ways:
 
 
 def curve_families(
-    columns: Mapping[str, np.ndarray],
+    columns: Columns,
     weight: np.ndarray,
     robot: Robot | None = None,
     scope: Scope | None = None,
@@ -248,7 +248,7 @@ def curve_families(
 
 
 def condition_polynomials(
-    columns: Mapping[str, np.ndarray], weight: np.ndarray, scope: Scope, ways: Ways, place: str
+    columns: Columns, weight: np.ndarray, scope: Scope, ways: Ways, place: str
 ) -> Float[np.ndarray, "points terms"]:
     """Polynomials in all conditions for each configuration. Arguments as in `curve_families`."""
     of_column = {column: variable for variable, column in VARIABLES.items()}
@@ -294,7 +294,7 @@ def window_from_name(variable: str) -> Window | None:
 
 
 def window_families(
-    columns: Mapping[str, np.ndarray],
+    columns: Columns,
     weight: np.ndarray,
     robot: Robot | None = None,
     scope: Scope | None = None,
@@ -359,7 +359,7 @@ def window_families(
 
 
 def order_collinearity(
-    columns: Mapping[str, np.ndarray], weight: np.ndarray, axes: Sequence[str] | None = None, column: str = "order"
+    columns: Columns, weight: np.ndarray, axes: Sequence[str] | None = None, column: str = "order"
 ) -> float:
     """Share of the variance of the order of runs, or of their time, that their conditions explain (R²).
 

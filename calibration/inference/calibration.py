@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
 
-from calibration.data import Names, surfaces
+from calibration.data import Names, Priors, surfaces
 from calibration.data.columns import ROWS
 from calibration.data.input_errors import SEEDS, BadConfiguration, stated_count
 from calibration.data.runs import Runs
@@ -64,7 +64,7 @@ def calibrate(
     *,
     free: Sequence[str] = (),
     fix: Sequence[str] = (),
-    stated: Mapping[str, tuple[float, float]] | None = None,
+    stated: Priors | None = None,
     noise: str | None = None,
     model: str | None = None,
     starts: int | None = None,
@@ -162,7 +162,7 @@ def _free_names(
     words = [surfaces.names_of_surfaces(names, robot, runs) for names in (free, fix)]
     present = _present(runs, robot)
     default = priors.default_names(present, robot, computed=computes, turns=runs.turns)
-    owned = priors.stated_names(robot, present, () if observe.axis else priors.OVER_TIME)
+    owned = priors.names_to_fit(robot, present, () if observe.axis else priors.OVER_TIME)
     held = {*default, *fidelities.unread_parameters(fidelity, owned, runs.turns)}
     default = (*default, *(n for n in owned if n not in held and not n.endswith(computes)))
     if priors.DELAY in observe.free()[0] and priors.DELAY in robot.rig.stated - robot.rig.exact:
@@ -202,10 +202,10 @@ class _Setting:
     kinds: Names
     ready: Prepared
     base: Robot
-    of_product: dict[str, tuple[float, float]]
+    of_product: Priors
 
 
-def _with_guide_priors(runs: Runs, ready: Prepared, fidelity: str) -> tuple[Robot, dict[str, tuple[float, float]]]:
+def _with_guide_priors(runs: Runs, ready: Prepared, fidelity: str) -> tuple[Robot, Priors]:
     """Robot with the guides' share that the fidelity computes, and priors of the free guide frictions without a
     stated prior."""
     robot, guide_priors = ready.robot, dict[str, tuple[float, float]]()

@@ -28,7 +28,7 @@ def error_after_steps(runs: Runs, off: np.ndarray) -> list[Remark]:
     """Notes on channels whose error is concentrated in the first sample with or after each step of the drive.
 
     Args:
-        off: simulated minus measured, NaN where either is missing, shape (rows, channels).
+        off: simulated minus measured [SI], NaN where either is missing, shape (rows, channels).
     """
     if not observers.observer_kind(runs).axis:
         return []
@@ -49,6 +49,22 @@ def error_after_steps(runs: Runs, off: np.ndarray) -> list[Remark]:
             notes.append(
                 Remark("after_steps", channel=channel.name, share=most / squares.sum(), rows=count, total=len(runs))
             )
+    return notes or _time_shifts(runs, off)
+
+
+def _time_shifts(runs: Runs, off: np.ndarray) -> list[Remark]:
+    """Notes on channels whose error is mostly that of a shift in time: proportional to the simulated rate."""
+    notes, time = [], runs["time_s"]
+    rows_of_runs = [runs.in_order(name) for name in dict.fromkeys(runs.run_names.tolist())]
+    for k, channel in enumerate(runs.channels):
+        simulated, rate = runs.measured()[:, k] + off[:, k], np.zeros(len(runs))
+        for rows in (r for r in rows_of_runs if len(r) > 1 and np.ptp(time[r]) > 0):
+            rate[rows] = np.nan_to_num(np.gradient(simulated[rows], time[rows]))
+        error = np.nan_to_num(off[:, k])
+        late, size = error @ rate, rate @ rate
+        if late**2 >= MOST_ERROR * size * (error @ error) > 0:
+            shift, share = float(late / size), float(late**2 / size / (error @ error))
+            notes.append(Remark("shifted", channel=channel.name, share=share, shift=shift))
     return notes
 
 

@@ -43,9 +43,9 @@ class Identifiability:
     """The linear analysis at the optimum, in coordinates z (one prior sd each).
 
     Attributes:
-        names: of the parameters.
-        covariance: posterior, of z, shape (parameters, parameters).
-        sd: posterior sd of z, thus the square root of the posterior over the prior variance.
+        names: names of the parameters.
+        covariance: posterior covariance of z, shape (parameters, parameters).
+        sd: posterior sd of z: posterior sd over prior sd.
         singular_values: of the whitened Jacobian of the readings without priors: prior sd over data sd along each
             direction, largest first. Above 1 the data are more informative than the prior.
         directions: right singular vectors, one a row. Those beyond the rank as `separate_directions` returns them.

@@ -19,6 +19,7 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
+from calibration.data import Json
 from mmrjax.numerics.linear_equations import solve
 
 #: Rejected steps in a row after which a search ends.
@@ -248,7 +249,7 @@ class OneSidedLevenbergMarquardt(optx.AbstractLeastSquaresSolver[Z, Array, Any, 
         return Linearisation(residual, jacobian, self.first, self.last), aux
 
     def init(
-        self, fn: Function, y: Z, args: Any, options: dict[str, Any], f_struct: Any, aux_struct: Any, tags: frozenset
+        self, fn: Function, y: Z, args: Any, options: Json, f_struct: Any, aux_struct: Any, tags: frozenset
     ) -> Searching:
         """Returns the state of a search that has evaluated nothing yet."""
         none, no, still = jnp.asarray(0), jnp.asarray(False), jnp.zeros_like(y)
@@ -258,7 +259,7 @@ class OneSidedLevenbergMarquardt(optx.AbstractLeastSquaresSolver[Z, Array, Any, 
         return Searching(unevaluated, jacobian, aux, still, y, no, self.search.init(y, unevaluated), none, none, no)
 
     def step(
-        self, fn: Function, y: Z, args: Any, options: dict[str, Any], state: Searching, tags: frozenset
+        self, fn: Function, y: Z, args: Any, options: Json, state: Searching, tags: frozenset
     ) -> tuple[Z, Searching, Any]:
         """Evaluates the function at the end of the last step, accepts or rejects that step, and finds the next."""
         linearised, aux = self._linearised(fn, state.ahead, args)
@@ -300,7 +301,7 @@ class OneSidedLevenbergMarquardt(optx.AbstractLeastSquaresSolver[Z, Array, Any, 
         )
 
     def terminate(
-        self, fn: Function, y: Z, args: Any, options: dict[str, Any], state: Searching, tags: frozenset
+        self, fn: Function, y: Z, args: Any, options: Json, state: Searching, tags: frozenset
     ) -> tuple[Array, optx.RESULTS]:
         """True if the search has ended."""
         return state.over, optx.RESULTS.successful  # type: ignore[return-value]  # an enumeration of equinox's
@@ -311,11 +312,11 @@ class OneSidedLevenbergMarquardt(optx.AbstractLeastSquaresSolver[Z, Array, Any, 
         y: Z,
         aux: Any,
         args: Any,
-        options: dict[str, Any],
+        options: Json,
         state: Searching,
         tags: frozenset,
         result: optx.RESULTS,
-    ) -> tuple[Z, Any, dict[str, Any]]:
+    ) -> tuple[Z, Any, Json]:
         """Returns the best point, the auxiliary output of its evaluation, and no statistics."""
         return y, aux, {}
 

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from calibration.data import Names
 from mmrjax.compile.compiling import compiled
 from mmrjax.effects import Effect
 from mmrjax.effects.curve import in_travel_frame
@@ -185,7 +186,7 @@ class Linearization(eqx.Module):
     one for each row and side, with the left side of all rows first.
     """
 
-    probed: ClassVar[tuple[str, ...]] = PROBED
+    probed: ClassVar[Names] = PROBED
 
     residual: Float[Array, " residuals"]
     jacobian: Float[Array, "residuals coordinates"]
@@ -193,7 +194,7 @@ class Linearization(eqx.Module):
     defects: Float[Array, "balances ..."]
     scale: Float[Array, "rows channels"]
     signals: Signals
-    channels: tuple[str, ...] = eqx.field(static=True, kw_only=True)
+    channels: Names = eqx.field(static=True, kw_only=True)
     magnitudes: frozenset[str] = eqx.field(default=frozenset(), static=True, kw_only=True)
 
     @property

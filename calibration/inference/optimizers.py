@@ -460,11 +460,13 @@ def _refilled(problem: Problem, members: Member, max_steps: int, places: int) ->
 
 def linearise(problem: Problem, z: Z, data: Data) -> tuple[Array, Array, Observation]:
     """Residuals (misfit, then prior) at z, their Jacobian, and the observation."""
-    r, jacobian, observation = (linearise_rollout if problem.observe.long else _first_step)(problem, z, data)
+    r, jacobian, observation = (linearise_rollout if problem.observe.long else _linearise_by_search_program)(
+        problem, z, data
+    )
     return *_clip_penalties(r, jacobian, data), observation
 
 
-def _first_step(problem: Problem, z: Z, data: Data) -> tuple[Array, Array, Observation]:
+def _linearise_by_search_program(problem: Problem, z: Z, data: Data) -> tuple[Array, Array, Observation]:
     """Result of `linearise` with the signs of penalties, by the compiled program of the searches."""
     active = getattr(problem.coordinates, "active", None)
     one_member = [np.asarray(x)[None] for x in (z, data.weight, data.measured, data.centre)]
@@ -717,11 +719,11 @@ def search_with_solver(
 
 def observe_robot(problem: Problem, robot: Robot) -> Observation:
     """Observation of any robot in each row of the problem, compiled."""
-    return problem.observe.read(robot) if problem.observe.apart else _observe_robot(problem, robot)
+    return problem.observe.read(robot) if problem.observe.apart else _simulated_readings(problem, robot)
 
 
 @functools.partial(compiled, options=OVER_TIME)
-def _observe_robot(problem: Problem, robot: Robot) -> Observation:
+def _simulated_readings(problem: Problem, robot: Robot) -> Observation:
     return problem.observe(robot)
 
 

@@ -8,9 +8,9 @@ from the table, the noise and the initial states of histories, and checks all th
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 
-from calibration.data import Names, instruments, own_mass, rig_facts, surfaces
+from calibration.data import Names, Priors, instruments, own_mass, rig_facts, surfaces
 from calibration.data.input_errors import BadConfiguration
 from calibration.data.runs import Runs
 from calibration.inference import checks, observers, repeats
@@ -44,7 +44,7 @@ class Prepared:
     robot: Robot
     observe: type[Observer]
     noise: Noise
-    stated: dict[str, tuple[float, float]]
+    stated: Priors
     names: Names
     foreign: Notes
     checked: Notes
@@ -57,7 +57,7 @@ def prepare(
     runs: Runs,
     robot: Robot,
     noise: str | None = None,
-    stated: Mapping[str, tuple[float, float]] | None = None,
+    stated: Priors | None = None,
     *,
     assume: bool = True,
     choose: Callable[[Prepared], Sequence[str]] = lambda prepared: (),

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from calibration.data import Names
+from calibration.data import Names, Priors
 from calibration.data.input_errors import BadConfiguration, allowed_words
 from calibration.data.surfaces import GROUND
 from mmrjax.compile.compiling import SELDOM, compiled
@@ -198,7 +198,7 @@ def _uncertain(robot: Robot, names: Iterable[str]) -> Names:
     return tuple(n for n in own_names if float(fields[n].value) != 0.0 or n in stated)
 
 
-def stated_names(robot: Robot, configurations: Iterable[str], idle: Names = ()) -> Names:
+def names_to_fit(robot: Robot, configurations: Iterable[str], idle: Names = ()) -> Names:
     """Parameters that a robot's file states with a ± other than 0, which is a request to fit them.
 
     They must be parameters of the robot, belong to configurations in the data, show in the data, and follow no other
@@ -266,7 +266,7 @@ def free_names(
 
     Args:
         drive, chassis: further parameters that the data determine, see `Observer.free`.
-        idle: as of `stated_names`.
+        idle: as of `names_to_fit`.
     """
     present = set(configurations)
     names = [
@@ -281,7 +281,7 @@ def free_names(
     ]
     names = [n for n in names if _leader(robot, n) is None]
     decided = (*(f".{n}" for n in (*SHAFT, *OF_TURNS)), ".radius")  # above, by what the channels show
-    stated = stated_names(robot, present, idle)
+    stated = names_to_fit(robot, present, idle)
     owned = (n for n in stated if not n.endswith(decided) and ".track." not in n and f".{GROUND}" not in n)
     return tuple(
         dict.fromkeys(
@@ -319,7 +319,7 @@ def _drive(robot: Robot, names: Iterable[str]) -> Names:
     return tuple(n for n in names if n not in ELECTRICAL)
 
 
-def with_guide_share(robot: Robot, configuration: str) -> tuple[Robot, dict[str, tuple[float, float]]]:
+def with_guide_share(robot: Robot, configuration: str) -> tuple[Robot, Priors]:
     """`robot` with the track model's guide share, and the resulting prior of its guide friction.
 
     The prior is that of the product of friction and share, because all fidelities agree on the product. Table 4
@@ -418,7 +418,7 @@ def parse_prior(text: str) -> tuple[str, float, float]:
     return match["name"], mean, sd
 
 
-def parse_priors(texts: Sequence[str]) -> dict[str, tuple[float, float]]:
+def parse_priors(texts: Sequence[str]) -> Priors:
     """Name → (mean, sd) of stated priors, each as `parse_prior`.
 
     Raises:
@@ -436,7 +436,7 @@ def parse_priors(texts: Sequence[str]) -> dict[str, tuple[float, float]]:
 def parameter_coordinates(
     robot: Robot,
     names: Sequence[str],
-    stated: dict[str, tuple[float, float]] | None = None,
+    stated: Priors | None = None,
     *,
     any_surface: bool = False,
 ) -> Coordinates:
@@ -474,7 +474,7 @@ def parameter_coordinates(
     if not robot.rig.inherits:
         wide = {n: sd for n in names for end, sd in RELATIVE_OF_RIGS.items() if n.endswith(end)} | wide
     known_sds = {n: (float(fields[n].value), float(fields[n].value) * share) for n, share in wide.items()}
-    known_sds |= {n: (mean, sd) for n, mean, sd in robot.rig.priors if n in names} | stated
+    known_sds |= {**{n: (mean, sd) for n, mean, sd in robot.rig.priors if n in names}, **stated}
     rows = [_coordinate_of_parameter(fields[name], known_sds.get(name)) for name in names]
     location, spread, low, high, scale = zip(*rows, strict=True)
     tied = tuple(

@@ -14,7 +14,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from datetime import datetime
 
 import numpy as np
@@ -154,9 +154,7 @@ def residual_clusters(fit: Residuals, seed: int = 0) -> tuple[ResidualCluster, .
     return tuple(sorted(answer, key=lambda c: c.p))
 
 
-def _coarse_first(
-    found: list[tuple[float, _Comparison]], columns: Mapping[str, np.ndarray]
-) -> list[tuple[float, _Comparison]]:
+def _coarse_first(found: list[tuple[float, _Comparison]], columns: Columns) -> list[tuple[float, _Comparison]]:
     """Findings in the order of their p-values, but with a column before any finer division of its levels."""
     words = {test.column: _words(columns[test.column]) for _, test in found}
     levels = {name for name in words if not _is_numeric(columns[name])}

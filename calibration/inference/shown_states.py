@@ -19,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from calibration.data import Columns
 from calibration.inference.problem import Problem
 from mmrjax.model import balances
 from mmrjax.model.channels import Channel
@@ -189,11 +190,11 @@ class Course:
     """
 
     time: np.ndarray
-    values: dict[str, np.ndarray]
-    integrals: dict[str, np.ndarray]
+    values: Columns
+    integrals: Columns
     cell: np.ndarray
 
-    def at(self, delay: float) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+    def at(self, delay: float) -> tuple[Columns, Columns]:
         """Mean of each quantity at each point, if it acts `delay` [s] later than its column states, and its slope."""
         low, high = (edge - delay for edge in self.cell.T)
         mean, drift = {}, {}
@@ -338,7 +339,7 @@ class _Log:
         lasting = [correlation_time(*self.motion(rows)) for rows in self.each if len(rows) > 2 * FEWEST]
         return max(CORRELATED * float(np.median(lasting)) if lasting else 0.0, LONG * self.step)
 
-    def points(self, run: int, size: int, delay: float | None) -> dict[str, np.ndarray]:
+    def points(self, run: int, size: int, delay: float | None) -> Columns:
         """Means of `size` rows of a run each, within stretches without a gap or a jump.
 
         Args:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from calibration.data.input_errors import BadConfiguration, allowed_words
+from calibration.data.input_errors import stated_word
 
 if TYPE_CHECKING:
     import optimistix as optx
@@ -34,8 +34,7 @@ def solver_by_name(name: str) -> optx.AbstractLeastSquaresSolver | optx.Abstract
     Raises:
         BadConfiguration: an unknown name.
     """
-    if name not in NAMES:
-        raise BadConfiguration(f"solver: got {name}; {allowed_words(name, NAMES)}")
+    stated_word(name, NAMES, "solver")
     import optax
     import optimistix as optx
 

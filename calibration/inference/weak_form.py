@@ -33,6 +33,7 @@ from scipy import sparse
 from scipy.linalg import solve_triangular
 from scipy.optimize import least_squares
 
+from calibration.data import Columns
 from calibration.inference.linearization import ScoredEffect, balance_probe, effect_terms, map_over_shapes
 from calibration.inference.priors import DELAY
 from calibration.inference.problem import Problem
@@ -392,7 +393,7 @@ def _by_coordinates(problem: Problem, plan: Plan, rows: Rows, z: Array) -> Array
     return jnp.moveaxis(jax.vmap(one)(rows), 1, 0)
 
 
-def _with_imposed(rows: Rows, given: dict[str, np.ndarray]) -> Rows:
+def _with_imposed(rows: Rows, given: Columns) -> Rows:
     """Points with other imposed quantities, which no delay changes."""
     conditions = rows.conditions
     for name, x in given.items():

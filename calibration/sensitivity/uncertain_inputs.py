@@ -15,7 +15,7 @@ from jaxtyping import Float
 from scipy.special import ndtri
 
 from calibration.data import Names
-from calibration.data.input_errors import BadConfiguration, allowed_words
+from calibration.data.input_errors import BadConfiguration, stated_word
 from calibration.data.posterior_file import Posterior
 from calibration.inference import priors
 from calibration.inference.identifiability import posterior_of_coordinates
@@ -186,9 +186,7 @@ def _inputs(
     robot: Robot, parameters: Posterior, ranges: Mapping[str, tuple[float, float]], *, posterior: bool
 ) -> Inputs:
     for name in ranges:
-        if name not in CONDITIONS or name == "configuration":
-            allowed = [n for n in CONDITIONS if n != "configuration"]
-            raise BadConfiguration(f"--vary {name}: no such condition; {allowed_words(name, allowed)}")
+        stated_word(name, [n for n in CONDITIONS if n != "configuration"], f"--vary {name}", "no such condition")
     try:
         axes = Variation(robot, (*parameters.names, *ranges)).axes
     except UsageError as error:

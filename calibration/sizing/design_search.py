@@ -15,7 +15,7 @@ import optax
 from jaxtyping import Array, Float
 
 from calibration.data import Names
-from calibration.data.input_errors import BadConfiguration, allowed_words
+from calibration.data.input_errors import stated_word
 from calibration.data.parts import CellSheet
 from calibration.data.requirements_file import Requirements
 from calibration.inference.fit_notes import Remark, next_step
@@ -260,8 +260,7 @@ def size_robot(
         BadConfiguration: any raised by `sheet.refuse_impossible`. An unknown objective or motor.
     """
     for name in objectives:
-        if name not in OBJECTIVES:
-            raise BadConfiguration(f"objective: got {name}; {allowed_words(name, OBJECTIVES)}")
+        stated_word(name, OBJECTIVES, "objective")
     sheet.refuse_impossible(robot, asked)
     chosen = options_for_robot(robot, motors)
     problem = sizing_task(robot, asked, chosen)

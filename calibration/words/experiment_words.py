@@ -171,8 +171,8 @@ def _again(happens: bases.Window) -> str:
     if happens.axis != "time":
         return f"Make the runs at {happens.words} again, on another day, and as many a little below and above that"
     return (
-        f"Make two of the runs again, sampled as finely as the instruments allow from {happens.low:.3g} to "
-        f"{happens.high:.3g} s, one of them with all that is switched in that time left as it is"
+        f"Repeat two of the runs, sampled as finely as the instruments allow from {happens.low:.3g} to "
+        f"{happens.high:.3g} s; in one of them, switch nothing during that time"
     )
 
 
@@ -309,7 +309,7 @@ VARY = {
     "load": "the load (slope or payload at one voltage)", "slope": "the slope", "weight": "the payload",
     "duty": "the duty at one supply voltage",
     "configuration": "the configuration", "direction": "the direction of travel",
-    "demand": "the demand on adhesion (slope or payload)", "angle": "nothing: sample fast enough to see a turn",
+    "demand": "the demand on adhesion (slope or payload)", "angle": "nothing: sample each revolution",
     THE_SIDE: "nothing: compare the sides in straight travel and in turns both ways",
     "position": "the position: go over the whole travel both ways at one voltage",
     "": "nothing: it is the same share everywhere",

@@ -286,8 +286,14 @@ SAID: dict[str, str | Callable[..., str]] = {
     "at_bound": "{name} is at its {side} bound",
     "after_steps": lambda channel, share, rows, total: (
         f"{share:.0%} of the squared error of {channels.find_channel(channel).label} lies in the first sample after "
-        f"each step ({rows} of {total} rows): readings and command may be timed apart; state "
-        '[rig] delay = "0 ± 0.02" [s], which may be negative, and calibrate frees it'
+        f"each step ({rows} of {total} rows; without them the rms error is {100 * (1 - share) ** 0.5:.0f} % of it): "
+        'readings and command may be offset in time; state [rig] delay = "0 ± 0.02" [s], which may be negative, and '
+        "calibrate fits it"
+    ),
+    "shifted": lambda channel, share, shift: (
+        f"{share:.0%} of the squared error of {channels.find_channel(channel).label} is that of readings "
+        f"{abs(1e3 * shift):.2g} ms too {'late' if shift > 0 else 'early'}: state [rig] delay = "
+        f'"{shift:.2g} ± {max(abs(shift), 0.005):.2g}" [s], and calibrate fits it'
     ),
     "product_alone": lambda friction, share, free: (
         f"only the product {friction} x {share} acts; the priors alone divide it"

@@ -176,9 +176,8 @@ def mechanism_evidence(found: loop_notes.Mechanism) -> str:
     """Evidence for a mechanism: share of the misfit, gain on held-out runs, and repeatability."""
     errors = f", {found.gain / found.se:.1f} standard errors" if 0 < found.se < math.inf else ""
     return (
-        f"explains {100 * found.share:.0f} % of the excess misfit, gains {found.gain:.2g} nat a reading that it "
-        f"changes on held-out runs{errors}, and is found again in {100 * found.again:.0f} % of the "
-        "data with a block left out"
+        f"explains {100 * found.share:.0f} % of the excess misfit, gains {found.gain:.2g} nat per affected reading "
+        f"on held-out runs{errors}, and is found again in {100 * found.again:.0f} % of the fits without one block"
     )
 
 
@@ -186,7 +185,7 @@ def mechanism_evidence(found: loop_notes.Mechanism) -> str:
 NO_MECHANISM = {
     "share": "it explains only {share:.0f} % of the excess misfit",
     "gain": "on held-out runs it gains {0.gain:.2g} ± {0.se:.2g} nat a reading",
-    "again": "it is found again in only {again:.0f} % of the data with a block left out",
+    "again": "it is found again in only {again:.0f} % of the fits without one block",
     "many": "{many} variables may drive it",
 }
 
@@ -783,7 +782,7 @@ def imposed_delay(delay: float, sd: float) -> str:
     when = "later" if delay > 0 else "earlier"
     return (
         f"what is imposed acts {1e3 * abs(delay):.3g} ± {1e3 * sd:.2g} ms {when} than its column says, and "
-        f'the rig\'s file states no delay: with [rig] delay = "{delay:.3g} ± {sd:.2g}" it begins there'
+        f'the rig\'s file states no delay; state [rig] delay = "{delay:.3g} ± {sd:.2g}" to start the fit there'
     )
 
 

@@ -157,9 +157,8 @@ SAID: dict[str, str | Callable[..., str]] = {
     "turned": "{source}, {theirs}: off by {off:.2g} (rms) from what the file's numbers give, "
     "with the other sign "
     'by {turned:.2g}; if it is turned round, state [columns] {column} = {{column = "{theirs}", factor = -1}}',
-    "stiff_supply": "{column} is {value:g} in every row: taken for a stiff supply; if it is "
-    "no reading, remove "
-    "the column",
+    "stiff_supply": "{column} is {value:g} in every row: treated as a stiff supply; if it was not "
+    "measured, remove the column",
     "lost_motion": "{source}, {column}: each of {reversals} reversals loses about {width:.2g} {unit} that friction, "
     'inertia and delay do not explain: backlash, play or a soft coupling; state backlash = "{angle:.2g} ± 30 %" [rad '
     "at the output] of the load in the robot's file",

@@ -106,7 +106,9 @@ def step_height_at(side: Outline, pitch: Scalar) -> Scalar:
     return ahead - behind
 
 
-def _highest(height: Callable[[Scalar], Scalar], count: int, near: int, rounds: int) -> tuple[Scalar, Scalar]:
+def _pitch_of_highest_step(
+    height: Callable[[Scalar], Scalar], count: int, near: int, rounds: int
+) -> tuple[Scalar, Scalar]:
     """The pitch of the highest step from `count` pitches, then `rounds` times from `near`, and the spacing [rad]."""
     apart = jnp.pi / 2 / (count - 1)
     grid = jnp.linspace(0.0, jnp.pi / 2, count)
@@ -127,7 +129,9 @@ def find_highest_step(side: Outline, pitch: Scalar | None = None) -> StepLimit:
         pitch: of the highest step [rad]. None: it is searched.
     """
     still = jax.lax.stop_gradient(side)
-    best = _highest(lambda pitch: step_height_at(still, pitch), *_PITCHES)[0] if pitch is None else pitch
+    best = (
+        _pitch_of_highest_step(lambda pitch: step_height_at(still, pitch), *_PITCHES)[0] if pitch is None else pitch
+    )
     beside = best + jnp.array([-_BESIDE, _BESIDE])
     rises = jax.vmap(lambda pitch: jax.jvp(lambda x: step_height_at(still, x), (pitch,), (jnp.ones_like(pitch),))[1])(
         beside
@@ -184,7 +188,7 @@ def best_step(robot: Robot, conditions: Conditions) -> tuple[StepLimit, Scalar, 
             resting_posture.side_outline(still, with_levers(run, *best_levers(still, run, pitch))), pitch
         )
 
-    best, apart = _highest(height, *_POSTURES)
+    best, apart = _pitch_of_highest_step(height, *_POSTURES)
     for _ in range(2):  # smooth here: vertices of parabolas
         low, middle, high = jnp.asarray(jax.vmap(height)(best + apart * jnp.array([-1.0, 0.0, 1.0])))
         bend = 2 * middle - low - high

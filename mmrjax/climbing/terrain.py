@@ -97,12 +97,6 @@ def flat_ground(size: int = 0) -> Terrain:
     return _terrain([(-FAR, 0.0), (FAR, 0.0)], 0.0, size=size)
 
 
-def inclined_ground(angle: Scalar, size: int = 0) -> Terrain:
-    """Ground that rises at a constant `angle` [rad], through the origin."""
-    x, z = FAR * jnp.cos(angle), FAR * jnp.sin(angle)
-    return _terrain([(-x, -z), (x, z)], 0.0, size=size)
-
-
 def single_step(height: Scalar, nose: Scalar = 0.0, size: int = 0) -> Terrain:
     """A step up (or down) by `height` [m], its corner rounded by `nose` [m]."""
     return _terrain([(-FAR, 0.0), (0.0, 0.0), (0.0, height), (FAR, height)], 0.0, nose, size)

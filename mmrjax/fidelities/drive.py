@@ -126,21 +126,20 @@ def drive_start(robot: Robot, conditions: Conditions, rolling: bool = False) -> 
     At rest too if the steady fidelity has no root.
     """
     size = jnp.asarray(drive_units(robot), jnp.result_type(conditions.voltage))
+    load = robot.chassis(conditions.configuration)
     rest = jnp.zeros_like(size).at[4].set(conditions.discharge / size[4])
     if conditions.motor_speed is not None:
         rest = rest.at[1].set(conditions.motor_speed / size[1])
         if not robot.has_ground:  # only a ground has a speed of grip
-            radius = robot.chassis(conditions.configuration).radius / robot.gearbox.ratio
-            rest = rest.at[2].set(radius * conditions.motor_speed / size[2])
+            rest = rest.at[2].set(load.radius / robot.gearbox.ratio * conditions.motor_speed / size[2])
     if robot.rig.begins is not None and conditions.begin is not None:
         first = _initial(robot, conditions)
-        angle = first[3] / robot.chassis(conditions.configuration).radius
+        angle = first[3] / load.radius
         memory = [effect.initial(robot, angle) for effect in robot.remembering]
         begin = jnp.stack([*first, jnp.asarray(conditions.discharge, size.dtype), *memory])
         rest = rest.at[: len(begin)].set(begin / size[: len(begin)])
     if robot.loose:
-        shaft = robot.chassis(conditions.configuration)
-        rest = rest.at[-1].set(shaft.twist(shaft.torque_load(rest[3] * size[3] / shaft.radius)) / size[-1])
+        rest = rest.at[-1].set(load.twist(load.torque_load(rest[3] * size[3] / load.radius)) / size[-1])
     if not rolling:
         return rest
     settled = operating_signals(robot, conditions)
@@ -148,7 +147,7 @@ def drive_start(robot: Robot, conditions: Conditions, rolling: bool = False) -> 
     state = [settled.current, settled.speed_motor, settled.speed, 0.0, conditions.discharge, *memory]
     state += [jnp.zeros(())] * robot.controller_size
     if robot.loose:
-        state += [robot.chassis(conditions.configuration).twist(settled.torque_output)]
+        state += [load.twist(settled.torque_output)]
     y = jnp.stack([jnp.asarray(x, size.dtype) for x in state]) / size
     return jnp.where(jnp.all(jnp.isfinite(y)), y, rest)
 

@@ -103,9 +103,9 @@ def without_diode(robot: Robot) -> Robot:
 
 
 def _carried(robot: Robot, conditions: Conditions, state: State, direction: Scalar) -> Signals:
-    """Signals of shafts that turn in `travel_direction`, or are about to, under a standing robot.
+    """Signals of a standing robot whose shafts turn, or are about to turn, in `direction`.
 
-    Movers carry the robot's demand, up to the limit of the ground.
+    Traction equals the robot's demand, clipped to the adhesion limit.
     """
     signals = balances.settled_signals(robot, conditions, state, direction)[0]
     limit = signals.adhesion_limit

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import jax
@@ -322,13 +322,6 @@ def steady_batch(robot: Robot, conditions: Conditions) -> Result:
     return _over_points(steady, robot, conditions)
 
 
-def _check_outputs(names: Iterable[str]) -> None:
-    allowed = (*outputs.output_names(channels.EVERY), *CODES)
-    for name in names:
-        if name not in allowed:
-            raise KeyError(f"no output {name}; there are {', '.join(allowed)}")
-
-
 @compiled
 def steady_outputs(robot: Robot, conditions: Conditions, names: tuple[str, ...]) -> dict[str, Array]:
     """`steady` over a batch, limited to the named outputs.
@@ -344,7 +337,9 @@ def steady_outputs(robot: Robot, conditions: Conditions, names: tuple[str, ...])
     Raises:
         KeyError: an unknown name. The message lists the valid ones.
     """
-    _check_outputs(names)
+    allowed = (*outputs.output_names(channels.EVERY), *CODES)
+    if unknown := [name for name in names if name not in allowed]:
+        raise KeyError(f"no output {unknown[0]}; there are {', '.join(allowed)}")
 
     def one(robot: Robot, conditions: Conditions) -> dict[str, Array]:
         answer = steady(robot, conditions)

@@ -698,8 +698,8 @@ def turning_signals(
 ) -> Travel:
     """All signals of a robot free to turn: the balances of both sides, coupled by supply and ground.
 
-    Each side is on the part of the slope along its heading. Effects that lower the speed of a side are evaluated at
-    equal loads of both.
+    Each side has the component of the slope along its heading. Effects that lower the speed of a side are evaluated
+    with the load divided equally between the sides.
 
     Args:
         loads: normal loads of both sides [N], see `turning.grip`.

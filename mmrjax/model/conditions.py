@@ -241,7 +241,7 @@ class Conditions(eqx.Module):
         return jax.tree.map(lambda left, right: jnp.stack([left, right]), side("left"), side("right"))
 
     @property
-    def slope(self) -> Values:
+    def slope(self) -> Float[Array, "..."]:
         """Slope angle α, positive uphill [rad]."""
         return self.slope_deg * (math.pi / 180)
 

@@ -210,7 +210,7 @@ class Condition(Quantity):
 
     @functools.cached_property
     def sizes(self) -> dict[str, float]:
-        """SI value of each unit that its columns may state. Of its own alone if no file may state it."""
+        """SI value of each unit that its columns may state. Only its own unit if no file may hold it."""
         return super().sizes if self.in_tables or self.in_profiles else {self.unit: self.factor}
 
 

@@ -50,12 +50,6 @@ def _maps(
     return jax.vmap(one)(conditions, steps)
 
 
-def _unhurried(robot: Robot) -> Robot:
-    """The robot with every V_s at least `LEAST`."""
-    laws = [p for p in params.walk_parameters(robot) if p.name.endswith("ground.friction.speed_static")]
-    return params.replace(robot, {p.name: jnp.maximum(p.value, LEAST) for p in laws})
-
-
 def _roll_period(robot: Robot, conditions: Conditions) -> Scalar:
     """Period of rolling over that of bouncing, for a robot on contacts at ±B/2 [-]."""
     zero = jnp.zeros_like(conditions.voltage)
@@ -77,7 +71,8 @@ def largest_step(robot: Robot, conditions: Conditions) -> Float[np.ndarray, " ru
     if conditions.turns:
         slower = np.asarray(jax.vmap(lambda c: _roll_period(robot, c))(conditions))
         return np.minimum(slower, 1.0) * largest_step(robot, conditions.straight())
-    robot = params.without_weak_types(_unhurried(robot))
+    laws = [p for p in params.walk_parameters(robot) if p.name.endswith("ground.friction.speed_static")]
+    robot = params.without_weak_types(params.replace(robot, {p.name: jnp.maximum(p.value, LEAST) for p in laws}))
 
     def maps(steps: Float[np.ndarray, "runs starts"]) -> Float[np.ndarray, "runs starts 11 11"]:
         transition_maps = np.asarray(_maps(robot, conditions, jnp.asarray(steps)))

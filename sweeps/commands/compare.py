@@ -97,7 +97,8 @@ def _over_time(
             comparison = add_second_robot(comparison, runs.channels, run.follow_histories(other, runs, model))
         folder.write_table("comparison.csv", comparison)
         readings = ((comparison[f"simulated_{c.column}"], comparison[c.column]) for c in runs.channels)
-        off = np.stack([simulated - measured for simulated, measured in readings], 1)
+        factors = [c.factor for c in runs.channels]
+        off = np.stack([simulated - measured for simulated, measured in readings], 1) * factors
         notes = (
             *missing_readings_notes(comparison, runs.channels),
             *sentences((*error_after_steps(runs, off), *ready.checked, *ready.begins, *ready.weighed)),
@@ -153,7 +154,7 @@ def missing_readings_notes(table: Columns, channels: Sequence[Channel]) -> list[
     lost = {c.column: int(np.isnan(table[c.column]).sum()) for c in channels}
     rows = len(table["status"])
     return [
-        f"{column}: {'all' if count == rows else f'{count} of {rows}'} readings are missing; they weigh nothing"
+        f"{column}: {'all' if count == rows else f'{count} of {rows}'} readings are missing and are ignored"
         for column, count in lost.items()
         if count
     ]

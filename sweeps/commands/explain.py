@@ -25,10 +25,12 @@ from sweeps.console import print_output
 from sweeps.pages import words
 from sweeps.report.climb_report import VERDICTS
 
+#: Effects by name.
+Library = dict[str, type[Effect]]
 #: A line of an explanation: heading and text.
 Line = tuple[str, str]
 #: Lines on a name, none if it has another meaning.
-Explain = Callable[[str, dict[str, type[Effect]]], Iterator[Line]]
+Explain = Callable[[str, Library], Iterator[Line]]
 WIDTH, INDENT = 80, 16
 #: Of a run, solved for, and of a mission.
 EVERY_OUTPUT: tuple[Any, ...] = (*outputs.FURTHER, *derived.TABLE, *mission_batch.OUTPUTS, *mission_batch.OF_TURNS)
@@ -72,7 +74,7 @@ def _wrapped(heading: str, text: str) -> str:
     )  # fmt: skip
 
 
-def explainable_names(library: dict[str, type[Effect]]) -> dict[str, list[str]]:
+def explainable_names(library: Library) -> dict[str, list[str]]:
     """Every name that can be explained, by kind."""
     return {
         "effects": [name for name in library if name not in effects.UNNAMED],
@@ -88,7 +90,7 @@ def explainable_names(library: dict[str, type[Effect]]) -> dict[str, list[str]]:
     }
 
 
-def _effect(name: str, library: dict[str, type[Effect]]) -> Iterator[Line]:
+def _effect(name: str, library: Library) -> Iterator[Line]:
     effect = library.get(name)
     if effect is None:
         return
@@ -151,7 +153,7 @@ def _changes(effect: Effect) -> Iterator[str]:
             yield f"one typical size at {name}, 24 V, 5°, 3 kg: {changes}"
 
 
-def _status(name: str, library: dict[str, type[Effect]]) -> Iterator[Line]:
+def _status(name: str, library: Library) -> Iterator[Line]:
     if name in words.STATUSES:
         about = words.STATUSES[name]
         yield "means", about.meaning
@@ -164,7 +166,7 @@ def _status(name: str, library: dict[str, type[Effect]]) -> Iterator[Line]:
 def _meaning(meanings: Mapping[str, str], where: str = "") -> Explain:
     """Explains names that have a meaning each. `where` they are found in files."""
 
-    def about(name: str, library: dict[str, type[Effect]]) -> Iterator[Line]:
+    def about(name: str, library: Library) -> Iterator[Line]:
         if name in meanings:
             yield "means", meanings[name]
             if where:
@@ -173,7 +175,7 @@ def _meaning(meanings: Mapping[str, str], where: str = "") -> Explain:
     return about
 
 
-def _channel(name: str, library: dict[str, type[Effect]]) -> Iterator[Line]:
+def _channel(name: str, library: Library) -> Iterator[Line]:
     c = next((c for c in channels.EVERY if name in (c.name, c.column, c.sd_column)), None)
     if c is None:
         return
@@ -191,7 +193,7 @@ def _channel(name: str, library: dict[str, type[Effect]]) -> Iterator[Line]:
             yield "" if k else "on a bench", test
 
 
-def _condition(name: str, library: dict[str, type[Effect]]) -> Iterator[Line]:
+def _condition(name: str, library: Library) -> Iterator[Line]:
     if label := next((label for label in quantities.LABELS if label.name == name), None):
         yield "is", label.label
         yield "column", label.column
@@ -207,7 +209,7 @@ def _condition(name: str, library: dict[str, type[Effect]]) -> Iterator[Line]:
         yield "from Python", f"mm.Conditions({c.field}=...)"
 
 
-def _output(name: str, library: dict[str, type[Effect]]) -> Iterator[Line]:
+def _output(name: str, library: Library) -> Iterator[Line]:
     for o in (o for o in EVERY_OUTPUT if name in (o.name, o.column)):
         yield "is", f"{o.label} [{o.unit_shown}]"
         if (meaning := _attribute(Result, o.name)) and o in outputs.FURTHER:
@@ -223,7 +225,7 @@ def _attribute(kind: type, name: str) -> str:
     return "" if match is None else match[1].rstrip(".")
 
 
-def _parameter(name: str, library: dict[str, type[Effect]]) -> Iterator[Line]:
+def _parameter(name: str, library: Library) -> Iterator[Line]:
     robot = paper_robots.nominal()
     parameter = next((p for p in params.walk_parameters(robot) if p.name == name), None)
     if parameter is None:

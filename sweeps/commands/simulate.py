@@ -85,7 +85,14 @@ def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> 
             folder.write_table("posture.csv", stands.table)
             further["notes"] += posture_words.tipping_remarks(stands)
         if histories is not None and robot.has_ground:
-            further["starts"] = starts_from_standstill(robot, histories, runs)
+            assert histories.history is not None  # the fidelity was asked for it
+            stages = stages_of_histories(robot, histories.history, runs.configurations(robot))
+            nothing: Json = {"stages": [], "acceleration_time_s": None, "slip_over_acceleration": None}
+            under_way = [STATUSES[int(s)] in words.UNDER_WAY for s in np.asarray(histories.result.status)]
+            further["starts"] = [
+                {"run_id": str(name), **(s.to_json() if s is not None and goes else nothing)}
+                for name, s, goes in zip(run.run_names(runs), stages, under_way, strict=True)
+            ]
         if PEAK in table:
             further[PEAK] = float(np.nanmax(table[PEAK], initial=0.0))
         result = run.SimulationResult("simulate", config.model, robot, runs, table, further)
@@ -251,16 +258,3 @@ def history_table(robot: Robot, history: History, runs: records.Runs) -> Columns
         "voltage_V": np.ravel(signals.voltage),
         "traction_N": float(robot.sides) * np.ravel(signals.traction),
     }
-
-
-def starts_from_standstill(robot: Robot, batch: Run, runs: records.Runs) -> list[Json]:
-    """Of each run from standstill its stages, their slip (33) and the acceleration time. No stages where it does not
-    get under way."""
-    assert batch.history is not None  # the fidelity was asked for it
-    stages = stages_of_histories(robot, batch.history, runs.configurations(robot))
-    nothing: Json = {"stages": [], "acceleration_time_s": None, "slip_over_acceleration": None}
-    under_way = [STATUSES[int(s)] in words.UNDER_WAY for s in np.asarray(batch.result.status)]
-    return [
-        {"run_id": str(name), **(s.to_json() if s is not None and goes else nothing)}
-        for name, s, goes in zip(run.run_names(runs), stages, under_way, strict=True)
-    ]

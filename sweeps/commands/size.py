@@ -7,7 +7,7 @@ from collections import Counter
 from pathlib import Path
 
 from calibration.data import requirements_file, robot_file
-from calibration.data.input_errors import BadConfiguration, allowed_words
+from calibration.data.input_errors import BadConfiguration, allowed_words, stated_word
 from calibration.data.parts import packaged_motors
 from calibration.described import in_words
 from calibration.sizing import sheet
@@ -43,8 +43,7 @@ def execute(config: configuration.Size, beside: configuration.FolderPart) -> int
         raise BadConfiguration(f"--pareto: got {', '.join(config.pareto)}; expected two different objectives")
     motor_names = [m.name for m in packaged_motors()]
     for name in config.motors:
-        if name not in motor_names:
-            raise BadConfiguration(f"--motors: got {name}; {allowed_words(name, motor_names)}")
+        stated_word(name, motor_names, "--motors")
     sheet.refuse_impossible(robot, requirements)
     with open_folder("size", config, robot, beside) as folder:
         with step_reporter(print_message, "drawing designs") as heard:

@@ -146,18 +146,13 @@ def dry_run(job: scale.Job, layout: Layout, path: Path) -> None:
     free = _free(path)
     rows = {
         "points": f"{design.points:,} ({dimensions})",
-        "chunks": f"{len(blocks):,} of {blocks.points:,} points on {device_words(compiled)}",
+        "chunks": f"{len(blocks):,} of {blocks.points:,} points on {compiled.mesh.size} x {scale.device_kind()}",
         "store": f"{bytes_text(layout.size)} (uncompressed); free {bytes_text(free)} in {_existing(path)}",
         "time": f"about {duration_text(each * blocks.points * len(blocks))} once compiled, {1 / each:,.0f} points/s "
         f"(timed here on {compiled.size:,} points); compiling {duration_text(max(spent[0] - spent[1], 0.0))}",
     }
     print_table(Table("dry-run", (Column("a sweep of"), Column("")), list(rows.items())))
     _refuse_without_space(layout.size, 1.0, path)
-
-
-def device_words(compiled: scale.Compiled) -> str:
-    """«2 x cpu: cpu»."""
-    return f"{compiled.mesh.size} x {scale.device_kind()}"
 
 
 def _existing(path: Path) -> Path:

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from calibration.data.input_errors import BadConfiguration, allowed_words
+from calibration.data.input_errors import BadConfiguration, stated_word
 from calibration.data.posterior_file import Posterior
 from calibration.data.robot_file import RobotFile
 from calibration.data.runs import Runs
@@ -87,8 +87,7 @@ def export_format(
     Raises:
         BadConfiguration, BadData: a format, a drive or a table that is refused.
     """
-    if to not in FORMATS:
-        raise BadConfiguration(f"--to: got {to}; {allowed_words(to, FORMATS)}")
+    stated_word(to, FORMATS, "--to")
     if not at.isprintable() or not at or any(c in at for c in "\"'<>&"):
         raise BadConfiguration(f"--joint: got {at!r}; expected the name of a joint, without quotes and brackets")
     if to in ("mujoco", "randomization"):

@@ -331,6 +331,10 @@ def _digits(*numbers: float) -> str:
     return " ".join(f"{x:.9g}" for x in numbers)
 
 
+#: Command that shows the scene. It has no double hyphen, which an XML comment cannot hold.
+VIEWER = "python -c \"import mujoco.viewer as v; v.launch_from_path('scene.xml')\""
+
+
 def _comment(lines: Sequence[str], indent: str) -> str:
     """Lines as XML comments. Names in them come from users, so nothing in them can end the comment."""
     text = [re.sub("-(?=-)", "- ", t) for line in lines for t in textwrap.wrap(printable(line), 104 - len(indent))]
@@ -418,7 +422,7 @@ def mjcf_scene(joint: Joint, mass: float, name: str, at: str, command: float, lo
     if joint.robot.has_ground:
         radius = float(moved.radius)
         inertia = float(moved.inertia) + mass / float(joint.robot.sides) * radius**2
-        head = f"One side of the robot: its wheel, with {mass:.4g} kg / {float(joint.robot.sides):g} rolling along"
+        head = f"One side of the robot: its wheel, carrying 1/{float(joint.robot.sides):g} of {mass:.4g} kg"
         weight, arm, angle = 0.0, radius, 0.0
     else:
         inertia, weight, angle = float(moved.inertia), float(moved.torque_gravity), float(moved.angle_zero)
@@ -426,7 +430,7 @@ def mjcf_scene(joint: Joint, mass: float, name: str, at: str, command: float, lo
     body = _body(inertia, weight, angle)
     return (
         "<mujoco>\n"
-        + _comment([f"{head}. Try: python -m mujoco.viewer --mjcf=scene.xml, key frame run."], "  ")
+        + _comment([f"{head}. Key frame run turns it. Viewer:", VIEWER], "  ")
         + '  <include file="drive.xml"/>\n'
         '  <compiler angle="radian"/>\n'
         '  <option timestep="' + ("0.0005" if joint.loose else "0.001") + '" integrator="implicitfast"/>\n'

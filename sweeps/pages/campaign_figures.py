@@ -88,13 +88,13 @@ def draw_output_spread(output: np.ndarray, label: str, varied: Mapping[str, Vari
 
 
 def draw_verdicts(codes: np.ndarray, names: Sequence[str], values: np.ndarray, layout: Layout, first: str) -> Figure:
-    """Verdicts of climbs over an axis and the size of the obstacle. Of other axes at their first values.
+    """Verdicts of climbs over an axis and the size of the obstacle. Other axes are at their first values.
 
     Args:
-        codes: of the points.
-        names: of the codes.
-        values: of what varies, shape (points, names).
-        first: of the axis.
+        codes: verdict of each point.
+        names: names of the verdicts, by code.
+        values: varied quantities, shape (points, names).
+        first: name of the horizontal axis.
     """
     design = layout.design
     rest = [k for k, n in enumerate(design.names) if n not in (SIZE, first)]

@@ -17,6 +17,7 @@ from sweeps.pages.figure_style import (
     BLUE,
     FAINT,
     INK,
+    LOOKS,
     VERMILION,
     axis_label,
     configuration_looks,
@@ -73,7 +74,7 @@ def draw_parity(table: Columns, channels: Sequence[Channel], band: bool = True) 
         axes.set_ylim(*span)
         if not both.any():
             corner_note(axes, "no row has both numbers")
-    if grid[0, 0].get_legend_handles_labels()[0]:
+    if grid[0, 0].get_legend_handles_labels()[0] and len(look) <= LOOKS:
         grid[0, 0].legend(loc="lower right")
     if band:
         corner_note(grid[0, 0], "band: ±5 %")
@@ -100,8 +101,7 @@ def errors_over(
     conditions = {c: words for c, words in every.items() if c in table and f"simulated_{c}" not in table}
     if in_units:
         conditions |= beside or {}
-        varied = {c: words for c, words in conditions.items() if np.unique(table[c]).size > 1}
-        conditions = varied or dict(list(conditions.items())[:1])
+        conditions = {c: words for c, words in conditions.items() if np.unique(table[c]).size > 1}
     if not conditions:
         conditions, table = {"row": "row"}, {**table, "row": np.arange(1.0, len(table["configuration"]) + 1)}
     fig, grid = new_figure(len(channels), len(conditions), 2.3 * len(channels), sharex="col", sharey="row")
@@ -130,7 +130,7 @@ def errors_over(
                     axes.set_xticks(levels)
         row[0].set_ylabel(f"{channel.label}\nerror [{channel.unit if in_units else '%'}]")
     for axes in grid[0]:
-        if axes.get_legend_handles_labels()[0]:
+        if axes.get_legend_handles_labels()[0] and len(look) <= LOOKS:
             axes.legend(loc="best")
             break
     return fig

@@ -37,6 +37,8 @@ INK, FAINT = "#222222", "#8a8a8a"
 # Okabe and Ito (2008), without the yellow that white paper swallows.
 BLUE, VERMILION, GREEN, ORANGE, PURPLE, SKY = "#0072B2", "#D55E00", "#009E73", "#E69F00", "#CC79A7", "#56B4E9"
 _CYCLE = ((BLUE, "o"), (VERMILION, "s"), (GREEN, "^"), (PURPLE, "D"), (ORANGE, "v"), (SKY, "P"))
+#: Number of looks that differ. More configurations share them, so a legend would not tell which is which.
+LOOKS = len(_CYCLE)
 
 
 def configuration_looks(names: Iterable[str]) -> dict[str, tuple[str, str]]:
@@ -141,7 +143,7 @@ def outer_legend(axes: Axes, place: str) -> None:
 
 
 def can_stack(fig: Figure) -> bool:
-    """True for a figure that `new_figure` made, which can be drawn for a phone."""
+    """True if phone versions are on and `new_figure` made the figure, so that its panels can be stacked."""
     return pages.FOR_PHONES and hasattr(fig, "panels")
 
 
@@ -183,7 +185,7 @@ def fit_for_phones(fig: Figure) -> Figure:
 def _broken_name(name: str) -> str:
     """A name in lines of at most `NAMES` letters if it can be broken at spaces, dots and underlines."""
     lines = [""]
-    for part in re.findall(r"[^ ._]*[ ._]*", name):
+    for part in re.findall(r"[^ ._\n]*[ ._\n]*", name):  # panels that share an axis break its names again
         if lines[-1] and len(lines[-1] + part.rstrip()) > NAMES:
             lines.append("")
         lines[-1] += part

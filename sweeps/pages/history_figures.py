@@ -38,7 +38,7 @@ from sweeps.pages.figure_style import (
     corner_note,
     new_figure,
 )
-from sweeps.report.run_tables import UNITS, imposed_column
+from sweeps.report.run_tables import UNITS
 from sweeps.report.settle_report import IMPOSED
 
 #: Samples of a segment of a frequency response, and least coherence of a point that is drawn.
@@ -456,16 +456,15 @@ def frequency_response(
     return frequency[1:-1], (cross / np.maximum(power[0], 1e-300))[:, :-1], coherence[:, :-1]
 
 
-def draw_frequency_response(table: Columns, read: Sequence[Channel], simulated: Mapping[str, str]) -> Figure:
+def draw_frequency_response(runs: Runs, read: Sequence[Channel], simulated: Mapping[str, str]) -> Figure:
     """Gain and phase of each channel over the frequency of the drive: measured as points, simulated as lines.
 
     Args:
-        table: of rows over time, as for `time_overlay`.
+        runs: with measured and simulated columns.
         read: channels.
         simulated: prefixes of the simulated columns, and their names.
     """
-    runs, imposed_name = Runs("a table", table), imposed_column(table)
-    drive = table[imposed_name] * table.get("duty", 1.0)
+    table, drive = runs.columns, applied_drive(runs)
     fig, grid = new_figure(2, len(read), 4.4, sharex=True)
     for (gain, phase), channel in zip(grid.T, read, strict=True):
         columns = [channel.column, *(prefix + channel.column for prefix in simulated)]
@@ -489,7 +488,7 @@ def draw_frequency_response(table: Columns, read: Sequence[Channel], simulated: 
             if label != "measured":
                 angle[1:][np.abs(np.diff(angle)) > 180] = np.nan  # no line from -180° to 180°
             phase.semilogx(frequency, angle, color=colour, **style)
-        gain.set(title=channel.label, ylabel=f"gain [{channel.unit}/{UNITS[imposed_name]}]")
+        gain.set(title=channel.label, ylabel=f"gain [{channel.unit}/{UNITS[runs.layout.imposed_column]}]")
         phase.set(xlabel="frequency [Hz]", ylabel="phase [°]", ylim=(-190, 190), yticks=[-180, -90, 0, 90, 180])
     grid[0, 0].legend(loc="best")
     return fig

@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from calibration.data import Columns
+from calibration.data.courses import applied_drive
 from calibration.data.table import Runs
 from calibration.discovery.result import DiscoveryResult, Evidence, UnnamedDiscrepancy
 from calibration.discovery.settings import WITHOUT_NAME
@@ -194,6 +195,7 @@ def draw_input_correlation(runs: Runs, table: Columns, channels: Sequence[Channe
     """Correlation of each residual with the input at lags of samples, over all runs, before and after."""
     fig, grid = new_figure(1, len(channels), 2.6, sharey=True)
     rows_of_runs = [runs.in_order(name) for name in dict.fromkeys(runs.run_names.tolist())]
+    applied = applied_drive(runs)
     most = min(LAGS, min(map(len, rows_of_runs)) - 1)
     lags = np.arange(-most, most + 1)
     centred = lambda values: np.nan_to_num(values - np.nanmean(values))  # noqa: E731
@@ -204,7 +206,7 @@ def draw_input_correlation(runs: Runs, table: Columns, channels: Sequence[Channe
             sums, squares = np.zeros(len(lags)), np.zeros(2)
             for rows in rows_of_runs:
                 residual = centred(table[f"residual_{when}_{channel.name}_sigma"][rows])
-                drive = centred(table[imposed_column(table)][rows])
+                drive = centred(applied[rows])
                 sums += np.correlate(residual, drive, "full")[len(rows) - 1 + lags]
                 squares += residual @ residual, drive @ drive
             axes.plot(lags, sums / max(np.sqrt(squares.prod()), 1e-300), "o-", ms=3, lw=1, color=colour, label=when)

@@ -122,7 +122,7 @@ def _curve(axes: Axes, time: np.ndarray, values: np.ndarray, colour: str, label:
     parts = np.array_split(np.arange(len(time)), PARTS)
     middle = [time[rows].mean() for rows in parts]
     least, greatest = ([end(values[rows]) for rows in parts] for end in (np.min, np.max))
-    axes.fill_between(middle, least, greatest, color=colour, alpha=0.35, lw=0.6, label=f"{label}, least to greatest")
+    axes.fill_between(middle, least, greatest, color=colour, alpha=0.35, lw=0.6, label=f"{label}, range")
 
 
 def _speed(axes: Axes, time: np.ndarray, rows: Columns, linear: bool, legend: bool) -> None:

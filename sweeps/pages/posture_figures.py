@@ -108,7 +108,7 @@ ASKED = {"step_mm": "On its highest step", "gap_mm": "Flush over a gap", "length
 
 
 def asked_about(drawn: Mapping[str, tuple[Drawn, float, float]]) -> Figure:
-    """A robot as requirements of its geometry ask about it."""
+    """Side views of the robot, one for each geometric requirement, in the posture that it refers to."""
     fig, grid = new_figure(1, max(len(drawn), 2), 3.6)
     for axes, (name, (shown, front, rear)) in zip(grid[0], drawn.items(), strict=False):
         step = f": {shown.step / MM:.0f} mm" if shown.step else ""

@@ -1,4 +1,4 @@
-"""Where the power of runs goes on the way to the slope, and the chart of motor and gear with operating points."""
+"""Figures of the power of runs from the supply to the slope, and the chart of motor and gear."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from calibration.data import Columns, Json
+from mmrjax.fidelities.outputs import output_columns
 from mmrjax.fidelities.simulation import simulate
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.quantities import RPM
@@ -131,9 +132,8 @@ def draw_chart_of_corners(robot: Robot, corners: Sequence[Json]) -> Figure:
     cells = dict.fromkeys(tuple(corner.get(key) for key in keys) for corner in whole)
     rows = [cell for cell in cells if None not in cell[:3]]
     full = float(robot.battery.voltage_no_load(0.0))
-    points = {name: np.zeros(0) for name in ("torque_Nm", "motor_rpm", "motor_A")}
     if not rows:
-        return draw_drive_chart(robot, [full], points)
+        return draw_drive_chart(robot, [full], dict.fromkeys(("torque_Nm", "motor_rpm", "motor_A"), np.zeros(0)))
     names, payload, slope, charge, volts = zip(*rows, strict=True)
     on_battery = np.array([v is None for v in volts])
     used = float(robot.battery.capacity) * (1 - np.array([1.0 if c is None else max(c, 1e-9) for c in charge]))
@@ -145,12 +145,11 @@ def draw_chart_of_corners(robot: Robot, corners: Sequence[Json]) -> Figure:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # a cut-off that rarely acts
         runs = simulate(robot, conditions)
-    done, speed = np.asarray(is_done(np.asarray(runs.status))), np.asarray(runs.motor_speed)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        torque = np.asarray(runs.power_gear) / float(robot.sides) / speed * float(robot.gearbox.ratio)
-    columns = torque, speed / RPM, np.asarray(runs.total_current) / float(robot.sides)
-    points = {name: values[done] for name, values in zip(points, columns, strict=True)}
-    return draw_drive_chart(robot, sorted(set(supply.tolist()))[-3:], points)
+    columns = {"configuration": np.array(names), **output_columns(runs.result, robot.channels)}
+    points = operating_points(robot, columns)
+    done = np.asarray(is_done(np.asarray(runs.status)))
+    settled = {name: values[done] for name, values in points.items()}
+    return draw_drive_chart(robot, sorted(set(supply.tolist()))[-3:], settled)
 
 
 def draw_drive_chart(robot: Robot, voltages: Sequence[float], points: Columns) -> Figure:

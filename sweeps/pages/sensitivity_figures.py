@@ -86,7 +86,7 @@ def draw_tornado(study: OutputStudy, found: SensitivityResult) -> Figure:
         ax.axvline(value[n], color=INK, linewidth=0.9)
         ax.set_title(_split(found.points.label(where[n])), fontsize=8.5)
         ax.tick_params(axis="x", labelsize=8)
-        ax.locator_params(axis="x", nbins=4)
+        ax.locator_params(axis="x", nbins=3, steps=[1, 2, 5, 10])  # of few digits, so that they do not touch
         ax.grid(axis="y", visible=False)
     axes[0, 0].set_yticks([-p for p in range(len(top))], [short_name(found.names[i]) for i in top], fontsize=8.5)
     axes[0, 0].set_xlabel(f"{study.row.label}{'' if unit == '-' else f' [{unit}]'}", fontsize=9)

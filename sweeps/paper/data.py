@@ -29,14 +29,14 @@ FIG_23, FIG_24 = "Fig. 23: total current", r"Fig. 24: $V_x$ and $V_{x\,teor}$"  
 MODES = {1: (15.0, 0.0), 2: (33.0, 0.0), 3: (33.0, 5.0), 4: (33.0, 8.0)}
 
 
-def shared_configurations(robot: Robot) -> Names:
+def paper_configurations(robot: Robot) -> Names:
     """The paper's configurations that a robot has. Its runs on the bench can be set against these alone."""
     return tuple(c for c in CONFIGURATIONS if c in robot.configurations)
 
 
 def shown_configurations(robot: Robot) -> Names:
     """The configurations that are shown of a robot: the paper's, or where it has none of them its own."""
-    return shared_configurations(robot) or robot.configurations.names
+    return paper_configurations(robot) or robot.configurations.names
 
 
 def batch_conditions(robot: Robot, configuration: Any, **given: Any) -> Conditions:
@@ -108,10 +108,10 @@ def simulate_measured_rows(robot: Robot) -> Rows | None:
 
     None where the robot has none of their configurations.
     """
-    if not shared_configurations(robot):
+    if not paper_configurations(robot):
         return None
     table, paper = (
-        table.where(np.isin(table["configuration"], shared_configurations(robot)))
+        table.where(np.isin(table["configuration"], paper_configurations(robot)))
         for table in map(runs.read_runs, ("measured", "simulated_by_paper"))
     )
     kind = table["configuration"]
@@ -124,7 +124,7 @@ def simulate_measured_rows(robot: Robot) -> Rows | None:
     mass = table["total_mass_kg"]
     plain = operating_points(robot, batch_conditions(robot, total_mass=mass, **request))
     ratio = {}
-    for c in shared_configurations(robot):
+    for c in paper_configurations(robot):
         largest = float(np.max(np.abs(plain["adhesion_used"][kind == c])))
         listed = adhesion_ratio(RAISED_SURFACE, c == TRACKED)
         ratio[c] = max(listed, RAISED_MARGIN * largest) if largest > 1 else 1.0

@@ -15,7 +15,7 @@ from calibration.data import Json, Names
 from calibration.data.columns import IMPOSED as OF_IMPOSED
 from calibration.data.columns import LEVERS
 from calibration.data.contradictions import without_levers
-from calibration.data.input_errors import BadConfiguration, allowed_words, stated_count, stated_number
+from calibration.data.input_errors import BadConfiguration, allowed_words, stated_count, stated_number, stated_word
 from mmrjax.fidelities import variation
 from mmrjax.fidelities.variation import Axis
 from mmrjax.model.conditions import Conditions
@@ -103,7 +103,7 @@ def plan_design(config: Campaign, robot: Robot, where: str) -> Plan:
             raise BadConfiguration(f"{where}, {name}: stated twice; expected it in one of conditions, axes, samples")
     if fixed.get("battery", 0.0) > 0.5 and "voltage" in {*fixed, *design.names}:
         raise BadConfiguration(
-            f"{where}, voltage: acts only without battery, whose charge sets the voltage; remove one of them"
+            f"{where}, voltage: acts only without battery, whose charge sets the voltage; remove voltage or battery"
         )
     _acting({*fixed, *design.names}, robot, where, surface)
     which = np.atleast_1d(axes.get(CONFIGURATION, fixed.get(CONFIGURATION, 0.0)))
@@ -232,8 +232,7 @@ def _range(stated: Json, where: str) -> np.ndarray:
 
 def _keys(stated: Json, allowed: Names, needed: Names, where: str) -> None:
     for key in stated:
-        if key not in allowed:
-            raise BadConfiguration(f"{where}.{key}: no such key; {allowed_words(key, allowed)}")
+        stated_word(key, allowed, f"{where}.{key}", "no such key")
     for key in needed:
         if key not in stated:
             raise BadConfiguration(f"{where}: {key} is missing; expected {', '.join(needed)}")
@@ -248,8 +247,7 @@ def _fixed(stated: Json, robot: Robot, where: str) -> tuple[dict[str, float], st
     surface = None
     for name, value in stated.items():
         place = f"{where}.{name}"
-        if name not in allowed:
-            raise BadConfiguration(f"{place}: no such condition; {allowed_words(name, allowed)}")
+        stated_word(name, allowed, place, "no such condition")
         if name == SURFACE:
             if not isinstance(value, str) or (value not in SURFACES and robot.rig.scales_adhesion):
                 raise BadConfiguration(f"{place}: got {value!r}; {allowed_words(str(value), SURFACES)}")

@@ -56,10 +56,15 @@ OUTPUTS: dict[str, tuple[str, str]] = {
 }
 
 
-def obstacle_axis(obstacle: Obstacle) -> Axis:
-    """Axis of the obstacle's size."""
-    meaning = {"step": "height of the step", "stairs": "rise of each stair", "gap": "width of the trench"}
-    return Axis(SIZE, "mm", meaning[obstacle.kind], (1.0, 5000.0), None)
+#: Size of each obstacle, which may vary from point to point.
+SIZES = {
+    kind: Axis(SIZE, "mm", meaning, (1.0, 5000.0), None)
+    for kind, meaning in (
+        ("step", "height of the step"),
+        ("stairs", "rise of each stair"),
+        ("gap", "width of the trench"),
+    )
+}
 
 
 def climb_attributes(obstacle: Obstacle) -> dict[str, Json]:

@@ -55,7 +55,7 @@ def prepare_job(config: Campaign, robot: Robot, plan: axes.Plan, where: str) -> 
     for name in config.outputs:
         if lacking := [n for n in robot.unknown(rests.get(name, ())) if n not in plan.design.names]:
             raise BadConfiguration(
-                f"{where}, outputs: {name} is not known, as the robot's file does not state {' and '.join(lacking)}"
+                f"{where}, outputs: {name} cannot be computed, as the robot's file lacks {' and '.join(lacking)}"
             )
     assert config.chunk is not None
     blocks = Blocks.of(plan.design.shape, config.chunk)
@@ -77,7 +77,7 @@ def _profile(name: str, robot: Robot, plan: axes.Plan, where: str) -> Profile:
         print_message(note)
     if source.surface is not None:
         raise BadConfiguration(
-            f"{where}, profile: got {source.source} with the column surface; expected the surface in conditions"
+            f"{where}, profile: got {source.source} with a column surface; state the surface in conditions"
         )
     if source.begins:
         raise BadConfiguration(f"{where}, profile: got {source.source} with a start; points of a sweep begin at rest")

@@ -149,7 +149,7 @@ class Compiled:
             conditions = _wide(_on_surface(self._variation, conditions, placed, self._asked.surface), len(values))
             run = self.job.task.run or self._run
             sizes = values[:, own_places[0]] if own_places else None
-            return _stored(run(self._variation, conditions, placed, sizes, told or _not_told), self._asked)
+            return _stored(run(self._variation, conditions, placed, sizes, told or (lambda share: None)), self._asked)
         values_by_name: dict[str, Array] = self._program(
             self._variation, conditions, placed, self._asked, self.job.profile
         )
@@ -179,10 +179,6 @@ class _Asked(NamedTuple):
 
 def _wide(conditions: Conditions, points: int) -> Conditions:
     return jax.tree.map(lambda x: jnp.broadcast_to(x, (points,)), conditions)
-
-
-def _not_told(share: float) -> None:
-    pass
 
 
 def _on_surface(

@@ -57,7 +57,7 @@ def task_of(config: Campaign, robot: Robot, turns: bool = False) -> Task:
         return of_fidelity(config.model, config.options, robot, config.profile is not None, turns)
     obstacle, attributes = config.obstacle, climbs.climb_attributes(config.obstacle)
     own_options = (
-        {SIZE: climbs.obstacle_axis(obstacle)},
+        {SIZE: climbs.SIZES[obstacle.kind]},
         functools.partial(climbs.further_variation, obstacle),
         functools.partial(climbs.compute_climbs, obstacle),
     )

@@ -8,6 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from calibration.data.columns import Layout
+from calibration.data.courses import applied_drive
+from calibration.data.table import Runs
 from calibration.inference import blocks
 from calibration.inference.identifiability import HELD
 from calibration.inference.result import METHOD, CalibrationResult
@@ -106,9 +108,9 @@ def _over_rows(found: CalibrationResult, sized: bool) -> Iterable[Section]:
     answer, panels = fit_words.calibration_answer(found), found.channels
     if found.axis:
         lines = {"after_": "calibrated", "before_": "before"}
-        drive = table[run_tables.imposed_column(table)] * table.get("duty", 1.0)
-        swept = np.ptp(drive) > 0 and len(drive) >= FREQUENCIES
-        response = [catalogue.figure("fit.frequency", table, panels, lines)] * bool(swept)
+        runs = Runs(found.source, table, layout=Layout.of(found.robot))
+        swept = np.ptp(applied_drive(runs)) > 0 and len(runs) >= FREQUENCIES
+        response = [catalogue.figure("fit.frequency", runs, panels, lines)] * bool(swept)
         yield Section("Histories", (catalogue.figure("fit.overlay", table, panels, lines, finding=answer), *response))
     unit = "the channel's unit; band: ±2 sd of the readings" if sized else f"percent of the {OF_SIZE}"
     along = {found.axis: "time [s]"} if found.axis else {}

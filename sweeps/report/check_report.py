@@ -54,8 +54,8 @@ class CheckResult:
         verb = "is" if len(missed) == 1 else "are"
         listed = "; ".join(f"{requirement_label(o)} {shortfall_text(o)}" for o in missed[:NAMED])
         more = f"; and {len(missed) - NAMED} more" if len(missed) > NAMED else ""
-        worst = "" if len(missed) <= NAMED else "the worst "
-        return f"{len(missed)} of {number} requirements {verb} missed: {worst}{listed}{more}."
+        worst = ":" if len(missed) <= NAMED else ". Worst:"
+        return f"{len(missed)} of {number} requirements {verb} missed{worst} {listed}{more}."
 
     def to_json(self) -> Json:
         """`result.json`."""
@@ -105,13 +105,10 @@ def reached_value_text(outcome: Outcome) -> str:
 
 
 def shortfall_text(outcome: Outcome) -> str:
-    """Value and its distance from the limit."""
-    r = outcome.requirement
+    """Value and its limit."""
     if outcome.value is None or outcome.margin is None:
         return f"({reached_value_text(outcome)})"
-    way = "below" if r.least else "above"
-    distance, limit = three_digits(-outcome.margin), three_digits(requirement_limit(outcome))
-    return f"{reached_value_text(outcome)}, {distance} {way} {limit}"
+    return f"{reached_value_text(outcome)}, required {required_value_text(outcome)}"
 
 
 _PLACES = {

@@ -27,7 +27,7 @@ from sweeps.report.document import Block, Document, Note, Section, Table
 
 #: Verdicts in words.
 VERDICTS: dict[str, tuple[str, str]] = {
-    "over": ("gets over", "the rear axle is past the obstacle and a wheel's radius beyond"),
+    "over": ("gets over", "the rear axle is at least a wheel's radius past the obstacle"),
     "tips": ("tips over", "the robot pitched by more than 100 deg"),
     "stalls": ("stalls", "it stops and its tracks stand still: the motors cannot turn them"),
     "slides": ("slides", "it stops and its tracks slip: the ground has too little grip"),

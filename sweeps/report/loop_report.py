@@ -151,8 +151,8 @@ def _summary(found: DiscoveryResult) -> Table:
         before = {c: (float(e["rms_percent"]), int(e["rows"])) for c, e in seen.items()}
         reached, also = (max((int(e["rows"]) for e in by.values()), default=0) for by in (seen, held))
         rows.append((what, *cells, f"{reached}/{total}" + (f" ({also}/{total})" if also else "")))
-    by = blocks.kind_in_words(kind) if kind else "nothing"
-    heads = f"rms error, seen and (unseen, by {by})", *(f"{c.label} |" for c in found.channels)
+    held_out = f", seen and (unseen, by {blocks.kind_in_words(kind)})" if kind else ""
+    heads = f"rms error{held_out}", *(f"{c.label} |" for c in found.channels)
     return catalogue.table("loop.summary", rows, *heads, f"{_rows_are(found)} reached |")
 
 
@@ -192,7 +192,10 @@ def _advice(found: DiscoveryResult) -> Table:
         more = f" It distinguishes {', '.join(after.separates)}; expected separation {after.expected_sigma:.1f} σ."
     if after is not None and found.headline.level == "class" and not after.settles:
         more += " Some pairs stay undecided."
-    far = [describe(note) for note in with_codes(found.remarks, "after_steps", "far_from_prior", "repeats", "copied")]
+    far = [
+        describe(note)
+        for note in with_codes(found.remarks, "after_steps", "shifted", "far_from_prior", "repeats", "copied")
+    ]
     against = [note for note in found.remarks if isinstance(note, str)]
     sentences = [
         loop_words.largest_share(found),

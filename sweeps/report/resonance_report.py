@@ -148,7 +148,7 @@ class ResonanceResult:
         named, bare = ([r for r in self.avoid if bool(r[2][0].mode) is has] for has in (True, False))
         if named:
             loads = "" if len(self.modes) == 1 else "at one payload or another: "
-            parts.append(f"Avoid {loads}{_listed(named, self.passing.name)}.")
+            parts.append(f"Avoid {loads}{_ranges_in_words(named, self.passing.name)}.")
         elif not bare:
             largest = ", ".join(f"{s.label} {ripple_percent(self._largest(n))}" for n, s in SIGNALS.items())
             parts.append(
@@ -157,7 +157,9 @@ class ResonanceResult:
             )
         if bare:
             also = "Ripple also peaks" if named else "Ripple peaks"
-            parts.append(f"{also}, with no natural frequency to name, at {_listed(bare, self.passing.name)}.")
+            parts.append(
+                f"{also}, with no natural frequency to name, at {_ranges_in_words(bare, self.passing.name)}."
+            )
         for name, lowest, highest in self._spread():
             parts.append(
                 f"{name.capitalize()} has no one frequency: {span_text(lowest, highest, 1)} Hz over the "
@@ -275,7 +277,7 @@ def ripple_percent(value: float) -> str:
     return "under 0.01 %" if value < 0.01 else f"{value:.0f} %" if value >= 10 else f"{value:.2g} %"
 
 
-def _listed(ranges: list[tuple[float, float, list[Resonance]]], what: str) -> str:
+def _ranges_in_words(ranges: list[tuple[float, float, list[Resonance]]], what: str) -> str:
     """Ranges to avoid, the lowest speed first. Only the strongest if there are many."""
     most = sorted(ranges, key=lambda r: -max(x.rise for x in r[2]))[:SAID]
     texts = []

@@ -230,7 +230,7 @@ def _drive_chart(robot: Robot, runs: Columns) -> Iterable[Block]:
 
 
 def limits_used(robot: Robot, run: Json) -> list[Json]:
-    """Use of each limit by a run. An inrush without a stated limit has no share."""
+    """Use of each limit by a run. The inrush current has no share of a limit that is not stated."""
     idle = capabilities.idle_columns(robot)
     radius = float(robot.configurations[str(run["configuration"])].radius)
     shaft = float(run["theoretical_speed_mm_s"]) * MM / radius * float(robot.gearbox.ratio) / RPM

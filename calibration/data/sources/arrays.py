@@ -14,10 +14,10 @@ import numpy as np
 
 from calibration.data import Columns, input_files
 from calibration.data.input_errors import BadData
-from calibration.data.sources.recorded_signals import Signal, of_arrays, values_in_memory
+from calibration.data.sources.recorded_signals import Load, Signal, of_arrays, values_in_memory
 
 #: Arrays by path: shape, type, and a function that returns the array.
-Arrays: TypeAlias = dict[str, tuple[tuple[int, ...], np.dtype, Callable[[], np.ndarray]]]
+Arrays: TypeAlias = dict[str, tuple[tuple[int, ...], np.dtype, Load]]
 #: Name of the type of an array of objects.
 _OBJECTS = np.dtype(object)
 #: Kind of a compressed variable in a MATLAB file.
@@ -43,7 +43,7 @@ def of_npz(path: Path, name: str) -> tuple[Signal, ...]:
         if array in arrays:
             raise BadData(f"{name}, {member}: is in the archive twice; expected different names")
         with archive.open(member) as stream:
-            shape, dtype = _header(stream)
+            shape, dtype = _read_npy_header(stream)
         arrays[array] = (shape, dtype, _member(archive, member))
     return of_arrays(name, arrays)
 
@@ -51,21 +51,21 @@ def of_npz(path: Path, name: str) -> tuple[Signal, ...]:
 def of_npy(path: Path, name: str) -> tuple[Signal, ...]:
     """Signals of an .npy file: columns of its array, or fields of its records."""
     with path.open("rb") as stream:
-        shape, dtype = _header(stream)
+        shape, dtype = _read_npy_header(stream)
     loaded = functools.cache(lambda: np.load(path, allow_pickle=False))
     signals = of_arrays(name, {path.stem: (shape, dtype, loaded)})
     fields = (dataclasses.replace(s, path=s.path.removeprefix(f"{path.stem}.")) for s in signals)
     return tuple(fields) if dtype.names else signals
 
 
-def _header(stream: Any) -> tuple[tuple[int, ...], np.dtype]:
+def _read_npy_header(stream: Any) -> tuple[tuple[int, ...], np.dtype]:
     version = np.lib.format.read_magic(stream)
     read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
     shape, _, dtype = read(stream)
     return shape, dtype
 
 
-def _member(archive: zipfile.ZipFile, member: str) -> Callable[[], np.ndarray]:
+def _member(archive: zipfile.ZipFile, member: str) -> Load:
     def load() -> np.ndarray:
         with archive.open(member) as stream:
             return np.lib.format.read_array(stream, allow_pickle=False)
@@ -111,7 +111,7 @@ def _check_matlab(path: Path, name: str) -> None:
     input_files.check_memory(name, size)
 
 
-def _variable(loaded: Callable[[], Columns], name: str) -> Callable[[], np.ndarray]:
+def _variable(loaded: Callable[[], Columns], name: str) -> Load:
     return lambda: loaded()[name]
 
 
@@ -193,7 +193,7 @@ def _walk(
         units[here] = stated.decode("utf-8", "replace") if isinstance(stated, bytes) else str(stated)
 
 
-def _dataset(path: Path, at: str, words: bool, char: bool, matlab: bool) -> Callable[[], np.ndarray]:
+def _dataset(path: Path, at: str, words: bool, char: bool, matlab: bool) -> Load:
     def load() -> np.ndarray:
         import h5py
 

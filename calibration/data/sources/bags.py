@@ -11,7 +11,7 @@ import numpy as np
 
 from calibration.data import Columns
 from calibration.data.input_errors import BadData
-from calibration.data.sources.recorded_signals import Clock, Signal
+from calibration.data.sources.recorded_signals import Clock, Load, Signal
 
 #: Most elements of an array in a message that become separate signals; larger arrays are pictures and clouds.
 ELEMENTS = 64
@@ -100,7 +100,7 @@ def _first(reader: Any, topic: str) -> Any:
     return reader.deserialize(raw, connection.msgtype)
 
 
-def _column(read: Callable[[], Columns], field: str) -> Callable[[], np.ndarray]:
+def _column(read: Callable[[], Columns], field: str) -> Load:
     return lambda: read()[field]
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from calibration.data import input_files
-from calibration.data.sources.recorded_signals import Signal
+from calibration.data.sources.recorded_signals import Load, Signal
 
 #: Most elements of a list that become separate signals.
 MOST = 64
@@ -26,7 +26,7 @@ def of_parquet(path: Path, name: str) -> tuple[Signal, ...]:
     size = input_files.VALUE * rows * file.metadata.num_columns
     input_files.check_declared(name, file.metadata.num_columns, size, path.stat().st_size)
 
-    def column(field: str) -> Callable[[], np.ndarray]:
+    def column(field: str) -> Load:
         return lambda: of_column(file.read([field], use_threads=True).column(0))
 
     return tuple(s for field in schema for s in _signals(field, rows, column(field.name), file.read))
@@ -53,7 +53,7 @@ def of_arrow(path: Path, name: str) -> tuple[Signal, ...]:
     input_files.check_declared(name, len(schema))
     rows = column(0).num_rows if len(schema) else 0
 
-    def values(k: int) -> Callable[[], np.ndarray]:
+    def values(k: int) -> Load:
         return lambda: of_column(column(k).column(0))
 
     def whole(k: int) -> Callable[[list[str]], Any]:
@@ -65,7 +65,7 @@ def of_arrow(path: Path, name: str) -> tuple[Signal, ...]:
 def of_table(table: Any) -> tuple[Signal, ...]:
     """Signals of a `pyarrow.Table`."""
 
-    def column(field: str) -> Callable[[], np.ndarray]:
+    def column(field: str) -> Load:
         return lambda: of_column(table.column(field))
 
     return tuple(
@@ -73,7 +73,7 @@ def of_table(table: Any) -> tuple[Signal, ...]:
     )
 
 
-def _signals(field: Any, rows: int, load: Callable[[], np.ndarray], read: Callable[[list[str]], Any]) -> list[Signal]:
+def _signals(field: Any, rows: int, load: Load, read: Callable[[list[str]], Any]) -> list[Signal]:
     """Signals of a column. Of a column of lists, one signal for each element, `name[0]`."""
     import pyarrow.types as kinds
 
@@ -89,7 +89,7 @@ def _signals(field: Any, rows: int, load: Callable[[], np.ndarray], read: Callab
         why = "holds lists of several lengths; expected one length in every row"
         return [Signal(field.name, rows, load, refused=why)]
 
-    def element(k: int) -> Callable[[], np.ndarray]:
+    def element(k: int) -> Load:
         return lambda: of_column(compute.list_element(column, k))
 
     return [
@@ -98,7 +98,7 @@ def _signals(field: Any, rows: int, load: Callable[[], np.ndarray], read: Callab
     ]
 
 
-def _signal(field: Any, rows: int, load: Callable[[], np.ndarray]) -> Signal:
+def _signal(field: Any, rows: int, load: Load) -> Signal:
     import pyarrow.types as kinds
 
     kind, stated = field.type, field.metadata or {}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -12,6 +12,7 @@ from calibration.data.input_errors import BadData
 from calibration.data.sources import columnar, json_records
 from calibration.data.sources.recorded_signals import (
     Clock,
+    Load,
     Signal,
     of_arrays,
     refused_type,
@@ -97,7 +98,7 @@ def _of_series(name: str, series: Any, rows: int) -> Signal:
     return Signal(name, rows, lambda: np.asarray(series.to_numpy(dtype=float, na_value=np.nan)))
 
 
-def _words(series: Any) -> Callable[[], np.ndarray]:
+def _words(series: Any) -> Load:
     return lambda: np.array(["" if lost else str(value) for value, lost in zip(series, series.isna(), strict=True)])
 
 
@@ -122,5 +123,5 @@ def _of_xarray(dataset: Any) -> tuple[Signal, ...]:
     return tuple(signals_found)
 
 
-def _values(array: Any) -> Callable[[], np.ndarray]:
+def _values(array: Any) -> Load:
     return lambda: np.asarray(array.values)

@@ -5,13 +5,12 @@ from __future__ import annotations
 import collections
 import contextlib
 import logging
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from calibration.data.sources.recorded_signals import Clock, Signal
+from calibration.data.sources.recorded_signals import Clock, Load, Signal
 
 
 def of_mdf(path: Path, name: str) -> tuple[Signal, ...]:
@@ -67,7 +66,7 @@ def _close_half_made(error: BaseException) -> None:
         frame = frame.tb_next
 
 
-def _time(path: Path, group: int) -> Callable[[], np.ndarray]:
+def _time(path: Path, group: int) -> Load:
     def load() -> np.ndarray:
         with _opened(path) as file:
             return np.array(file.get_master(group))
@@ -75,7 +74,7 @@ def _time(path: Path, group: int) -> Callable[[], np.ndarray]:
     return load
 
 
-def _column(path: Path, group: int, index: int) -> Callable[[], np.ndarray]:
+def _column(path: Path, group: int, index: int) -> Load:
     def load() -> np.ndarray:
         with _opened(path) as file:
             samples = file.get(group=group, index=index, ignore_invalidation_bits=True)  # else they are left out

@@ -11,7 +11,7 @@ import math
 import os
 import stat
 import zipfile
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,7 @@ import numpy as np
 from calibration.data import input_files
 from calibration.data.input_errors import BadData, InputError
 from calibration.data.sources import in_memory
-from calibration.data.sources.recorded_signals import Signal, Source, plain_values, refused_type
+from calibration.data.sources.recorded_signals import Load, Signal, Source, plain_values, refused_type
 
 #: Separator between the path of a file and the path of signals in it.
 WITHIN = "::"
@@ -211,9 +211,7 @@ def _guarded(signals: Sequence[Signal], name: str, kind: str) -> tuple[Signal, .
     """Signals that raise `BadData` if they are refused, too large for the memory, or if their library cannot read
     their values. Shared clocks stay shared."""
 
-    def guarded(
-        load: Callable[[], np.ndarray], path: str, signal: Signal, refused: str = ""
-    ) -> Callable[[], np.ndarray]:
+    def guarded(load: Load, path: str, signal: Signal, refused: str = "") -> Load:
         where = f"{name}, {path}"
 
         def read() -> np.ndarray:

@@ -7,6 +7,7 @@ import fnmatch
 import math
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import TypeAlias
 
 import numpy as np
 
@@ -14,6 +15,8 @@ from calibration.data import Names, input_files
 from calibration.data.input_errors import BadData
 from mmrjax.errors import similar_words
 
+#: Function that reads the values of a signal from its source.
+Load: TypeAlias = Callable[[], np.ndarray]
 #: Last parts of the paths of signals that are time stamps, without a unit behind them.
 CLOCKS = ("time", "t", "timestamp", "timestamps", "stamp", "elapsed", "clock", "timestamp_sample")
 #: Units that the name of a clock may end with, and the seconds of one.
@@ -39,7 +42,7 @@ class Clock:
     """
 
     name: str
-    load: Callable[[], np.ndarray]
+    load: Load
     unit: str = ""
 
 
@@ -60,7 +63,7 @@ class Signal:
 
     path: str
     length: int
-    load: Callable[[], np.ndarray]
+    load: Load
     unit: str = ""
     clock: Clock | None = None
     words: bool = False
@@ -106,7 +109,7 @@ def plain_values(values: np.ndarray) -> np.ndarray:
     return values
 
 
-def values_in_memory(values: np.ndarray) -> Callable[[], np.ndarray]:
+def values_in_memory(values: np.ndarray) -> Load:
     """Returns a function that returns the given values."""
     return lambda: values
 
@@ -171,7 +174,7 @@ def unit_of_clock(name: str) -> str | None:
 
 def of_arrays(
     source: str,
-    arrays: Mapping[str, tuple[tuple[int, ...], np.dtype, Callable[[], np.ndarray]]],
+    arrays: Mapping[str, tuple[tuple[int, ...], np.dtype, Load]],
     units: Mapping[str, str] | None = None,
 ) -> tuple[Signal, ...]:
     """Signals of named arrays. Each column of an array of two dimensions is a separate signal, `name[0]`.
@@ -227,12 +230,12 @@ def _column_count(shape: tuple[int, ...], dtype: np.dtype) -> int:
     return columns * sum(_column_count((), dtype[name]) for name in dtype.names) if dtype.names else columns
 
 
-def _flat(load: Callable[[], np.ndarray]) -> Callable[[], np.ndarray]:
+def _flat(load: Load) -> Load:
     return lambda: np.ravel(load())
 
 
 def _of_array(
-    path: str, shape: tuple[int, ...], dtype: np.dtype, load: Callable[[], np.ndarray], unit: str, clock: Clock | None
+    path: str, shape: tuple[int, ...], dtype: np.dtype, load: Load, unit: str, clock: Clock | None
 ) -> list[Signal]:
     words, n = dtype.kind in "US", sample_count(shape)
     if dtype.names:
@@ -250,11 +253,11 @@ def _of_array(
     return [Signal(f"{path}[{j}]", n, _column(load, j), unit, clock, words, "", size) for j in range(shape[1])]
 
 
-def _column(load: Callable[[], np.ndarray], j: int) -> Callable[[], np.ndarray]:
+def _column(load: Load, j: int) -> Load:
     return lambda: load()[:, j]
 
 
-def _field(load: Callable[[], np.ndarray], name: str) -> Callable[[], np.ndarray]:
+def _field(load: Load, name: str) -> Load:
     return lambda: load()[name]
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import io
 import re
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,7 @@ import numpy as np
 
 from calibration.data import input_files
 from calibration.data.input_errors import BadData
-from calibration.data.sources.recorded_signals import Clock, Signal
+from calibration.data.sources.recorded_signals import Clock, Load, Signal
 
 #: Bytes before the first message.
 HEADER = 16
@@ -93,5 +92,5 @@ def _field_count(topic: str, formats: dict[str, list[tuple[str, int]]], sizes: d
     return sizes[topic]
 
 
-def _column(data: Any, field: str) -> Callable[[], np.ndarray]:
+def _column(data: Any, field: str) -> Load:
     return lambda: np.asarray(data.data[field])

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from calibration.data.input_errors import BadConfiguration, allowed_words
+from calibration.data.input_errors import stated_word
 from calibration.data.runs import Runs
 from calibration.inference.observers.base import Observer
 from calibration.inference.observers.settled import SettledRuns
@@ -37,8 +37,7 @@ def fidelity_facts(model: str) -> Facts:
     Raises:
         BadConfiguration: no such fidelity.
     """
-    if model not in fidelities.TABLE:
-        raise BadConfiguration(f"--model {model}: no such fidelity; {allowed_words(model, fidelities.TABLE)}")
+    stated_word(model, fidelities.TABLE, f"--model {model}", "no such fidelity")
     return fidelities.fidelity_facts(model)
 
 

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from calibration.data import Columns, Names
 from calibration.data.runs import Runs
 from calibration.inference.bases import Bases
 from calibration.inference.details import Detail
@@ -110,10 +111,10 @@ class Observer(eqx.Module):
     fewest: ClassVar[int]
     axis: ClassVar[str] = ""
     sizes_padded: ClassVar[tuple[int, ...]] = ()
-    blocks: ClassVar[tuple[str, ...]]
+    blocks: ClassVar[Names]
     policy: ClassVar[SearchPolicy]
     rows_tell: ClassVar[bool]
-    evidence: ClassVar[tuple[str, ...]]
+    evidence: ClassVar[Names]
     library: ClassVar[Mapping[str, type[Effect]]] = {}
     menu: ClassVar[bool] = True
     searches: ClassVar[int | None] = None
@@ -122,7 +123,7 @@ class Observer(eqx.Module):
     # --- of a table, before anything is simulated
 
     @classmethod
-    def axes_of(cls, runs: Runs) -> tuple[str, ...]:
+    def axes_of(cls, runs: Runs) -> Names:
         """Columns of a table that its readings vary with."""
         return (*runs.axes, *([cls.axis] if cls.axis else []))
 
@@ -184,7 +185,7 @@ class Observer(eqx.Module):
 
     @classmethod
     @abc.abstractmethod
-    def identity(cls, runs: Runs) -> tuple[str, ...]:
+    def identity(cls, runs: Runs) -> Names:
         """Columns in which duplicates of a row agree."""
 
     @classmethod
@@ -194,7 +195,7 @@ class Observer(eqx.Module):
 
     @classmethod
     @abc.abstractmethod
-    def free(cls) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    def free(cls) -> tuple[Names, Names]:
         """Further parameters that such data determine: of the drive, and of each chassis."""
 
     # --- of robots
@@ -366,7 +367,7 @@ class Observer(eqx.Module):
         return linearise(_with_effects(problem, active), jnp.asarray(z), problem.data)
 
     @abc.abstractmethod
-    def bases(self, columns: Mapping[str, np.ndarray], included: Bool[np.ndarray, " rows"], robot: Robot) -> Bases:
+    def bases(self, columns: Columns, included: Bool[np.ndarray, " rows"], robot: Robot) -> Bases:
         """Bases of curves for the search for a discrepancy.
 
         Args:

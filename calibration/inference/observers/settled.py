@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
-from collections.abc import Mapping
 from typing import ClassVar
 
 import equinox as eqx
@@ -14,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from calibration.data import Columns, Names
 from calibration.data.columns import CURRENT
 from calibration.data.input_errors import BadConfiguration, BadData
 from calibration.data.runs import Runs
@@ -107,13 +107,13 @@ class SettledRuns(Observer):
     word: ClassVar[str] = "run"
     fewest: ClassVar[int] = 6
     sizes_padded: ClassVar[tuple[int, ...]] = SIZES
-    blocks: ClassVar[tuple[str, ...]] = (
+    blocks: ClassVar[Names] = (
         "slope", "voltage_configuration", "voltage", "duty", "speed", "current", "payload", "load_torque",
         "configuration",
     )  # fmt: skip
     policy: ClassVar[SearchPolicy] = SearchPolicy()
     rows_tell: ClassVar[bool] = True
-    evidence: ClassVar[tuple[str, ...]] = ("single", "curve", "pair", "chi2")
+    evidence: ClassVar[Names] = ("single", "curve", "pair", "chi2")
     linearization: ClassVar[type[SettledLinearization]] = SettledLinearization
     shape_sides: ClassVar[tuple[int, ...]] = ()  # of values that differ between sides
 
@@ -211,7 +211,7 @@ class SettledRuns(Observer):
         return runs, runs.measured(), np.full(len(runs), np.inf)
 
     @classmethod
-    def identity(cls, runs: Runs) -> tuple[str, ...]:
+    def identity(cls, runs: Runs) -> Names:
         order_column = () if "order" in runs.headings else ("order",)  # the order of the rows in the file
         return tuple(c for c in runs.columns if c not in order_column)
 
@@ -220,7 +220,7 @@ class SettledRuns(Observer):
         return not (effect.needs_battery or effect.transient or effect.settles_to)
 
     @classmethod
-    def free(cls) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    def free(cls) -> tuple[Names, Names]:
         return (), ()
 
     def __call__(self, robot: Robot) -> Observation:
@@ -369,7 +369,7 @@ class SettledRuns(Observer):
         """
         return FEW if problem.base.effects else MANY
 
-    def bases(self, columns: Mapping[str, np.ndarray], included: np.ndarray, robot: Robot) -> Bases:
+    def bases(self, columns: Columns, included: np.ndarray, robot: Robot) -> Bases:
         weight = included.astype(float)
         if "duty" in columns:  # the motors' mean voltage
             columns = {**columns, "supply_voltage_V": columns["supply_voltage_V"] * columns["duty"]}
@@ -388,9 +388,7 @@ class SettledRuns(Observer):
         return EquationDefects(_defects(before.linear, included), _defects(after.linear, included))
 
 
-def _unmeasured(
-    observe: SettledRuns, robot: Robot, columns: Mapping[str, np.ndarray]
-) -> dict[str, Float[np.ndarray, " rows"]]:
+def _unmeasured(observe: SettledRuns, robot: Robot, columns: Columns) -> dict[str, Float[np.ndarray, " rows"]]:
     """Fitted motor speed [rad/s] and motor current [A], by column, if no channel measures them (rigs may show only
     the output)."""
     unmeasured = [v for v in ("speed_motor", "current") if bases_room.VARIABLES[v] not in columns]
@@ -410,14 +408,14 @@ def _varies(x: np.ndarray) -> bool:
 
 
 @functools.partial(compiled, options=SELDOM)
-def _signals(observe: SettledRuns, robot: Robot, names: tuple[str, ...]) -> tuple[Float[Array, " rows"], ...]:
+def _signals(observe: SettledRuns, robot: Robot, names: Names) -> tuple[Float[Array, " rows"], ...]:
     """Signals of a fit at each row's operating point."""
     signals = jax.vmap(functools.partial(operating_signals, robot))(observe.conditions)
     rows = jnp.shape(observe.conditions.slope_deg)
     return tuple(jnp.broadcast_to(getattr(signals, name), rows) for name in names)
 
 
-def _defects(linear: Linearization, included: np.ndarray) -> dict[str, np.ndarray]:
+def _defects(linear: Linearization, included: np.ndarray) -> Columns:
     """Defects along the travel that make the residual r of each row, of each side if sides are driven independently.
 
     They are the most probable δ of r = -S δ + noise of one sd: δ = -D Sᵀ (S D Sᵀ + 1)⁻¹ r. Their prior sds D^½ are

@@ -12,7 +12,7 @@ import operator
 import re
 import threading
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
@@ -21,6 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from calibration.data import Columns, Names
 from calibration.data.columns import SUPPLY
 from calibration.data.courses import (
     Stretch,
@@ -142,7 +143,7 @@ LEVELS = 6
 ROUNDING = 1e-3
 
 
-def _by_row(
+def _to_rows(
     of_runs: Float[Array, "runs samples ..."], rows_of: Int[Array, "runs samples"], rows: int
 ) -> Float[Array, "rows ..."]:
     """Values of each sample of the runs, by the table's rows. Values beyond a run's last row are dropped."""
@@ -176,7 +177,7 @@ class HistoriesLinearization(Linearization):
 
     def columns(self, balance: Scalar | int, shapes: Array | np.ndarray) -> Float[Array, "readings terms"]:
         moved = jnp.einsum("rksc,rkt->rsct", self.defects[balance], shapes[self.knots])
-        return _by_row(moved, self.rows_of, self.rows).reshape(-1, shapes.shape[1])
+        return _to_rows(moved, self.rows_of, self.rows).reshape(-1, shapes.shape[1])
 
     def places(self) -> np.ndarray:
         return np.unique(np.asarray(self.knots))
@@ -232,10 +233,10 @@ class Histories(Observer):
     word: ClassVar[str] = "sample"
     fewest: ClassVar[int] = 24
     axis: ClassVar[str] = "time_s"
-    blocks: ClassVar[tuple[str, ...]] = ("slope", "voltage", "run")
+    blocks: ClassVar[Names] = ("slope", "voltage", "run")
     policy: ClassVar[SearchPolicy] = SearchPolicy(batch=8, steps=30, searches=8, one_by_one=False)
     rows_tell: ClassVar[bool] = False
-    evidence: ClassVar[tuple[str, ...]] = ("single", "curve", "pair", "chi2", "white")
+    evidence: ClassVar[Names] = ("single", "curve", "pair", "chi2", "white")
     searches: ClassVar[int | None] = 8
 
     conditions: Conditions
@@ -413,7 +414,7 @@ class Histories(Observer):
         )
 
     @classmethod
-    def identity(cls, runs: Runs) -> tuple[str, ...]:
+    def identity(cls, runs: Runs) -> Names:
         """All columns, including the run: repeats have the same beginning, at rest."""
         return tuple(runs.columns)
 
@@ -422,7 +423,7 @@ class Histories(Observer):
         return not effect.needs_battery
 
     @classmethod
-    def free(cls) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    def free(cls) -> tuple[Names, Names]:
         return ("motor.inductance", "motor.inertia", DELAY), ("inertia", settled_ends.STATIC, *settled_ends.SLIDING)
 
     def defective(
@@ -553,7 +554,7 @@ class Histories(Observer):
             return StepCourse.read(tuple(x[step] for x in every), share)
 
         of_runs = jax.vmap(of_run)(self.times, every, self.time[self.rows_of])
-        return _by_row(of_runs, self.rows_of, len(self.run))
+        return _to_rows(of_runs, self.rows_of, len(self.run))
 
     def __call__(self, robot: Robot) -> Observation:
         def of_run(
@@ -570,7 +571,7 @@ class Histories(Observer):
 
         places = self.instant[self.rows_of], self.time[self.rows_of]
         of_runs = jax.vmap(of_run)(self.conditions, self.times, self.known, *places)
-        reading = _by_row(of_runs, self.rows_of, len(self.run))
+        reading = _to_rows(of_runs, self.rows_of, len(self.run))
         followed = jnp.all(jnp.isfinite(reading), 1)
         status = jnp.where(followed, CONVERGED, FAILED)
         return Observation(reading, jnp.zeros(self.run.shape), status, jnp.zeros_like(status))
@@ -755,7 +756,7 @@ class Histories(Observer):
         r, jacobian, seen = jax.tree.map(lambda x: x[0], evaluate(np.asarray(z)[None], np.zeros(1, int)))
         return *zero_inactive_residuals(jnp.asarray(r), jnp.asarray(jacobian), penalty_slice(problem.data)), seen
 
-    def bases(self, columns: Mapping[str, np.ndarray], included: np.ndarray, robot: Robot) -> Bases:
+    def bases(self, columns: Columns, included: np.ndarray, robot: Robot) -> Bases:
         """Curves and windows as for settled runs, also over time, and waves over the angle of a shaft.
 
         Curves over the voltage are over the motors' voltage if it differs from the supply's.
@@ -826,7 +827,7 @@ def _conditions_over_time(
     each: list[np.ndarray],
     time: np.ndarray,
     times: np.ndarray,
-    on_lines: tuple[str, ...] = (),
+    on_lines: Names = (),
 ) -> Conditions:
     """Conditions of runs from those of rows, shape (runs,), or (runs, instants) if they change within a run.
 
@@ -1210,7 +1211,7 @@ def _responses(
     defects, by_effects = observe.changes(robot, tuple(balance_probe(b) for b in PROBED), effects)
     rows_of, rows = observe.rows_of, len(scale)
     defects = jnp.where(rows_of[:, None, :, None] < 0, 0.0, defects * scale[rows_of][:, None])
-    signatures = _by_row(by_effects, rows_of, rows) * scale[..., None]
+    signatures = _to_rows(by_effects, rows_of, rows) * scale[..., None]
     runs = observe.whole(robot)
     by_reading = signatures.reshape(scale.size, -1)
     return finite_or_zero(by_reading), finite_or_zero(defects), observe.at_rows(runs), observe.angle(runs)

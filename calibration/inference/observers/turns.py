@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from calibration.data import Names
+from calibration.data import Columns, Names
 from calibration.data.input_errors import BadConfiguration
 from calibration.data.runs import Runs
 from calibration.inference import bases as bases_room
@@ -144,7 +144,7 @@ class SettledTurns(SettledRuns):
     def unreachable(self, status: np.ndarray) -> np.ndarray:
         return super().unreachable(status) | (status == NOT_SETTLED)
 
-    def bases(self, columns: Mapping[str, np.ndarray], included: np.ndarray, robot: Robot) -> Bases:
+    def bases(self, columns: Columns, included: np.ndarray, robot: Robot) -> Bases:
         """Bases as in the protocol, in the same balances of both sides and in those of the turn.
 
         Curves are over each side's signals, the yaw rate, and the side.

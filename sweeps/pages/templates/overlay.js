@@ -28,7 +28,7 @@ document.querySelectorAll("script[data-overlay]").forEach(source => {
         : {label: name, stroke: ink, width: 0, points: {show: true, size: 4, fill: ink}, value});
       add(`${label} [${unit}]`, 170, values, each);
       const off = values.slice(1).map(simulated => simulated.map((v, i) => v == null || measured[i] == null ? null : v - measured[i]));
-      add(`residual [${unit}]`, 110, off, off.map((_, n) => ({label: data.labels[n + 1] + " − measured", stroke: lines[n], width: 1, value})), k === channels.length - 1);
+      add(`residual [${unit}]`, 130, off, off.map((_, n) => ({label: data.labels[n + 1] + " − measured", stroke: lines[n], width: 1, value})), k === channels.length - 1);
     });
   };
   const hint = document.createElement("p");
