@@ -161,8 +161,7 @@ GLOSSARY = {
     "χ²": "sum of (simulated minus measured)² / σ² over all readings. Noise alone gives about one per reading",
     "prior": "value and standard deviation of a parameter from a bench or a data sheet, before any run is used",
     "p": "probability that noise alone gives a result as extreme as this one",
-    "nat": "unit of the log probability of held-out readings. With 60 readings, a gain of 0.1 per "
-    "reading is significant",
+    "nat": "unit of log probability of held-out readings. With 60 readings, a gain of 0.1 per reading is significant",
     "reached": "runs in which the robot has a steady state. In the others it slides or does not move",
     "voltage_limit": "largest voltage that the loop may propose for an experiment, from `[motor]` of the robot file",
 }
@@ -172,8 +171,7 @@ FLAGS = {
     "gearbox_overspeed": "gearbox input above its permitted speed",
     "winding_hot": "winding hotter than permitted after long running at this current",
     "slips": "slides faster than V_s on average, although it travels steadily",
-    "jumps": "the running gear changes between support by guides and by pulleys so hard that the robot leaves "
-    "the ground at times",
+    "jumps": "the weight passes between guides and pulleys so hard that the robot leaves the ground at times",
     "overvoltage": "current flows back into the battery: the cells are above their charge voltage, or the "
     "charging current is too high",
     "cut_off": "a cell is below its cut-off voltage",
