@@ -231,7 +231,7 @@ BAD_RUNS = {
         HEADER.replace("speed_mm_s", "spede_mm_s") + "\n6T2A,15,13.1,0,5,2.75,4800,400",
         "column speed_mm_s is missing; is spede_mm_s meant?",
     ),
-    "no channel": (HEADER.split(",total_current_A")[0] + "\n6T2A,15,13.1,0,5", "no column of a channel"),
+    "no channel": (HEADER.split(",total_current_A")[0] + "\n6T2A,15,13.1,0,5", "no column with readings"),
     "slope": (
         f"{HEADER}\n6T2A,15,13.1,0,95,2.75,4800,400",
         "runs.csv row 1, slope_deg: got 95; is it in percent? then name the column slope_percent; expected -45 to 45",

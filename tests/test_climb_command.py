@@ -21,7 +21,7 @@ SCHEMA = read_json(Path(__file__).parents[1] / "docs" / "schemas" / "climb.schem
 
 REFUSED = {
     "levers of a wheeled robot": (["--step", "50", "--configuration", "4W2T", "--levers-front", "30"],
-                                  r"4W2T has no levers; those that have: 6T2A"),
+                                  r"4W2T has no levers; configurations with levers: 6T2A"),
     "a derivative by levers of a wheeled robot": (["--step", "50", "--configuration", "4W2T", "--derivatives",
                                                    "payload,levers_front_deg"],
                                                   r"got levers_front_deg; expected adhesion, payload, voltage, obstacle_mm"),
@@ -122,7 +122,7 @@ def test_terrains_that_are_none_are_refused_in_one_sentence(tmp_path, case):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("time_s,front_deg,rear_deg\n1,0,0\n1,0,0\n", r"row 3, time_s: got 1 after 1; expected values that rise"),
+        ("time_s,front_deg,rear_deg\n1,0,0\n1,0,0\n", r"row 3, time_s: got 1 after 1; expected increasing values"),
         ("time_s,front_deg,rear_deg\n1,0,270\n", r"row 2, rear_deg: got 270 deg; expected -180 to 180"),
         ("time_s,front_V,rear_V\n1,0,2400\n", r"row 2, rear_V: got 2400 V; expected -1000 to 1000 V"),
         ("front_deg,rear_deg\n1,0\n", r"expected x_mm and front_deg and rear_deg, or time_s"),

@@ -69,7 +69,10 @@ def test_a_current_in_another_unit_is_doubted_with_what_turns_the_load(tmp_path,
     )
     assert bool(said) == doubted
     if doubted:
-        assert f"up to {2 * factor:g} A, where the file's numbers turn the load slowly with 0.667 A; is it in" in said
+        assert (
+            f"up to {2 * factor:g} A, although by the file's numbers the load turns slowly at 0.667 A; is it in"
+            in said
+        )
 
 
 @pytest.mark.slow
@@ -93,7 +96,7 @@ def test_the_file_says_what_is_imposed_and_needs_no_winding(robot, tmp_path):
     assert {"electrical", "inductance", "supply"} <= absent_balances(robot)
     robot_file.write_robot(robot, tmp_path / "again.toml")
     assert robot_file.read_robot(tmp_path / "again.toml").rig == robot.rig
-    with pytest.raises(BadConfiguration, match="motor_current is imposed, so it is no reading"):
+    with pytest.raises(BadConfiguration, match="motor_current is imposed, so it cannot be a reading"):
         read_rig(tmp_path, RIG.replace('["motor_speed"]', '["motor_current"]'), "bad.toml")
     with pytest.raises(BadConfiguration, match=r"motor\.torque_constant \[N·m/A\] is missing"):
         read_rig(tmp_path, RIG.replace(f"torque_constant = {K}", ""), "bad.toml")

@@ -56,7 +56,7 @@ def test_one_pair_alone_leaves_the_other_as_the_robot_states_it(robot):
     [
         (
             {"configuration": "4W2T", "levers_rear_deg": 10.0},
-            "--levers-rear: 4W2T has no levers; those that have: 6T2A",
+            "--levers-rear: 4W2T has no levers; configurations with levers: 6T2A",
         ),
         ({"levers_front_deg": 200.0}, "levers_front_deg: got 200; expected -180 to 180"),
     ],

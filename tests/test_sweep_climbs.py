@@ -48,7 +48,7 @@ REFUSED = {
     "beyond the range": ({"kind": "step"}, {"levers_rear_deg": [190], "obstacle_mm": [50]}, r"expected -180 to 180 deg"),
     "no size at all": ({"kind": "step"}, {"obstacle_mm": [0]}, r"obstacle_mm: got 0; expected 1 to 5000 mm"),
     "levers of a wheeled robot": ({"kind": "step"}, {"levers_front_deg": [30], "obstacle_mm": [50], "configuration": ["6T2A", "4W2T"]},
-                                  r"levers_front_deg: 4W2T has no levers; those that have: 6T2A"),
+                                  r"levers_front_deg: 4W2T has no levers; configurations with levers: 6T2A"),
     "a nose larger than its tread": ({"kind": "stairs", "nose_mm": 100, "tread_mm": 190}, {"obstacle_mm": [250]},
                                      r"nose_mm: got 100; expected less than half of rise and tread, 95 mm"),
     "a nose larger than its rise": ({"kind": "stairs", "nose_mm": 40}, {"obstacle_mm": [70, 90]}, r"expected less than .* 35 mm$"),

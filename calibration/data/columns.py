@@ -242,8 +242,8 @@ class Layout:
                     continue
                 if meant is None:
                     raise BadData(
-                        f"{source}: the robot's file reads {mine} from column {column}; this program has no column "
-                        f"{mine} for it (known: {', '.join(self.known())})"
+                        f"{source}: the robot's file reads {mine} from column {column}; mmrjax has no column "
+                        f"{mine} (known: {', '.join(self.known())})"
                     )
                 meanings_found.append(dataclasses.replace(meant, shown=column, factor=factor))
             else:
@@ -252,7 +252,9 @@ class Layout:
         for k, meaning in enumerate(meanings_found):
             twin = next((m for m in meanings_found[:k] if m and meaning and m.column == meaning.column), None)
             if meaning and twin and meaning.shown != twin.shown:
-                raise BadData(f"{source}: columns {twin.shown} and {meaning.shown} state the same; keep one of them")
+                raise BadData(
+                    f"{source}: columns {twin.shown} and {meaning.shown} have the same meaning; keep one of them"
+                )
         return meanings_found
 
     @functools.cached_property

@@ -58,16 +58,16 @@ def check_contradictions(runs: Runs, robot: Robot) -> None:
 def cannot_stand(robot: Robot) -> str | None:
     """Reason why the stance of a robot is unknown, None if it is known."""
     if not robot.has_ground:
-        return "the robot's load is a shaft, which stands on no ground"
+        return "the robot's load is a shaft, which has no contact with the ground"
     if not any(robot.knows([f"running_gear.{p.name}"]) for p in params.walk_parameters(robot.running_gear)):
-        return "the robot's file states no running_gear; state its wheelbase, levers and masses there"
+        return "the robot's file has no running_gear; add its wheelbase, levers and masses"
     return None
 
 
 def without_levers(robot: Robot, configuration: str) -> str:
     """Reason why a configuration has no levers, empty if it has levers."""
     have = [name for name, c in robot.configurations.items() if float(c.on_tracks) > 0.5]
-    others = f"those that have: {', '.join(have)}" if have else "no configuration of the robot has"
+    others = f"configurations with levers: {', '.join(have)}" if have else "no configuration of the robot has"
     return "" if configuration in have else f"{configuration} has no levers; {others}"
 
 
@@ -108,8 +108,8 @@ def _mass(runs: Runs, robot: Robot) -> None:
     for name in np.unique(runs.configurations_named(robot)):
         if name in robot.configurations and float(robot.configurations[str(name)].mass) <= 0:
             raise BadData(
-                f"{runs.source}: no column total_mass_kg, and the robot's file states no mass of {name}; a vehicle "
-                "needs one of them"
+                f"{runs.source}: no column total_mass_kg, and the robot's file gives no mass for {name}; a "
+                "vehicle needs one of the two"
             )
 
 
@@ -179,7 +179,7 @@ def _angle(runs: Runs) -> None:
         if jumps.size:
             row, passed = int(mine[jumps[0] + 1]), np.diff(runs["time_s"][mine])
             gap = passed[jumps[0]]
-            why = "as an angle that wraps; expected an angle that continues beyond a turn"
+            why = "like an angle that wraps; expected an angle that keeps counting beyond one turn"
             if gap > GAP * np.median(passed):
                 why = f"{float(f'{gap:.3g}'):g} s earlier; give each recording its own run_id"
             raise BadData(

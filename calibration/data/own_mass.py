@@ -114,8 +114,8 @@ def mass_notes(robot: Robot, runs: Runs) -> list[str]:
     others = [s for s in np.unique(runs["surface"][of_table5]) if s != BENCH] if of_table5.any() else []
     if others:
         notes.append(
-            f"the table has runs on {', '.join(others)}: the written friction is for {BENCH}; simulate "
-            f"with --surface {others[0]} to meet what was fitted"
+            f"the table has runs on {', '.join(others)}: the written friction is for {BENCH}; simulate with "
+            f"--surface {others[0]} to use the fitted values"
         )
     return notes
 

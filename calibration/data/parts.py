@@ -191,7 +191,9 @@ def _rows(kind: type[Sheet], file: str) -> Iterator[Sheet]:
         raise BadData(f"{file}: got the columns {reader.fieldnames}; expected {wanted}")
     for row in reader:
         if None in row or None in row.values():
-            raise BadData(f"{file} row {reader.line_num}: got another number of cells than columns, {len(wanted)}")
+            raise BadData(
+                f"{file} row {reader.line_num}: the number of cells differs from the number of columns, {len(wanted)}"
+            )
         yield kind(**{f.name: _value(row[f.metadata["column"]], f"{file} row {reader.line_num}", f) for f in fields})
 
 

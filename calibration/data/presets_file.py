@@ -124,9 +124,9 @@ class Preset:
             if mine == imposed and (needs := by_name[mine].needs) and needs not in present:
                 wanted = " or ".join(by_name[needs].theirs)
                 raise BadData(
-                    f"{name}: has no {wanted}; --columns {self.name} needs it for {needs}, because {present[mine]} "
-                    f"alone does not give the motor's voltage; record {wanted}, or set imposed to the speed or the "
-                    "current in the rig's file"
+                    f"{name}: has no {wanted}; --columns {self.name} needs it for {needs}, because "
+                    f"{present[mine]} by itself does not give the motor voltage; record {wanted}, or set imposed "
+                    "to the speed or the current in the rig's file"
                 )
 
 
@@ -157,7 +157,7 @@ def find_preset(stated: str | Path) -> Preset:
         except ValueError as error:
             got = f"{key}{equals}{text}"
             raise BadConfiguration(
-                f"--columns {name}: got {got}; expected a name and a number, as pole_pairs=7"
+                f"--columns {name}: got {got}; expected a name and a number, such as pole_pairs=7"
             ) from error
     if name in PACKAGED:
         return parse_preset(_packaged(name), name, given)
@@ -220,14 +220,16 @@ def _parsed(content: Mapping[str, Any], where: str, given: Mapping[str, float]) 
     header = _texts(content.get("header", []), f"{where}, header")
     columns = content.get("columns", {})
     if not isinstance(columns, dict) or not columns:
-        raise BadConfiguration(f'{where}, columns: got {columns!r}; expected a table of columns, as time_s = "t"')
+        raise BadConfiguration(
+            f'{where}, columns: got {columns!r}; expected a table of columns, such as time_s = "t"'
+        )
     layout = Layout(channels=channels.EVERY)
     spellings, entries = layout.spellings(), []
     for mine, theirs in columns.items():
         if mine not in spellings:
             listed = allowed_words(mine, spellings, shown=layout.known())
             raise BadConfiguration(
-                f"{where}, columns.{mine}: no such column of a table; {listed}; also in other units"
+                f"{where}, columns.{mine}: no such column of a table; {listed}; other units are allowed too"
             )
         entries.append(_column(mine, theirs, f"{where}, columns.{mine}", numbers))
     return Preset(where, tuple(entries), header)
@@ -239,7 +241,7 @@ def _numbers(asked: Any, where: str, given: Mapping[str, float]) -> dict[str, fl
         raise BadConfiguration(f"{where}, ask: got {asked!r}; expected a table")
     for key in given:
         if key not in asked:
-            listed = allowed_words(key, asked) if asked else "it asks for no number"
+            listed = allowed_words(key, asked) if asked else "it defines no numbers under [ask]"
             raise BadConfiguration(f"--columns {where}: got {key}; {listed}")
     numbers: dict[str, float] = {}
     for key, stated in asked.items():
@@ -250,8 +252,8 @@ def _numbers(asked: Any, where: str, given: Mapping[str, float]) -> dict[str, fl
             )
         if key not in given and "usual" not in table:
             raise BadConfiguration(
-                f"--columns {where}: {key} is missing, the {table['about']}; state it as "
-                f"--columns {where}{SEPARATOR}{key}=7"
+                f"--columns {where}: {key} is missing, the {table['about']}; give it as --columns "
+                f"{where}{SEPARATOR}{key}=7"
             )
         value = given.get(key, table.get("usual"))
         numbers[key] = stated_number(value, f"{where}, {key}")
@@ -272,7 +274,7 @@ def _column(mine: str, theirs: Any, where: str, numbers: Mapping[str, float]) ->
         if key in table:
             if table[key] not in numbers:
                 raise BadConfiguration(
-                    f"{where}.{key}: got {table[key]}; expected a number that [ask] names; "
+                    f"{where}.{key}: got {table[key]}; expected one of the numbers defined under [ask]; "
                     f"{allowed_words(str(table[key]), numbers)}"
                 )
             value = numbers[table[key]]

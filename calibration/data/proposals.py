@@ -201,7 +201,7 @@ def _candidate(
         if largest > {"V": LARGEST_V, "A": LARGEST_A}.get(unit, np.inf):
             unit, question = f"m{unit}", f"numbers up to {largest:.0f}: m{unit}?"
     elif not matches:
-        question = "by its unit alone: check it"
+        question = "a guess from its unit only: check it"
     elif "effort" in name:
         question = "effort may be a torque or a current: check it"
     column = next(c for c, u in units.items() if u == unit)

@@ -44,7 +44,7 @@ def stated_number(text: str, where: str) -> tuple[float, float]:
     if sd.strip().endswith("%"):
         if mean == 0 and size > 0:
             raise BadConfiguration(
-                f"{where}: got {text!r}; 0 has no percentage: state the standard deviation; {FORM}"
+                f"{where}: got {text!r}; a percentage of 0 is 0, so give the standard deviation itself; {FORM}"
             )
         size *= abs(mean) / 100
     return mean, float(f"{size:.12g}")  # a percentage leaves digits of rounding

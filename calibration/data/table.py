@@ -113,8 +113,8 @@ class Runs:
         mine = {column for c in robot.channels for column in (c.column, c.sd_column)}
         if lost := [column for column in self.unknown if column in mine]:
             raise BadData(
-                f"{self.source}, {lost[0]}: left out as the table was read, but the robot has this channel; read the "
-                "table with robot=, the robot that it is of"
+                f"{self.source}, {lost[0]}: this channel of the robot was left out when the table was read; read "
+                "the table with robot=, set to this robot"
             )
         mine |= {self.layout.imposed_column, IMPOSED[robot.rig.imposed][0], *self.layout.sides}
         others = {column for c in channels.EVERY for column in (c.column, c.sd_column)} - mine
@@ -207,7 +207,9 @@ class Runs:
         for k, channel in enumerate(self.channels):
             lost = np.flatnonzero(np.isnan(self.measured()[:, k]))
             if not self.has(channel.column) or lost.size == len(self):
-                notes.append(f"{channel.column}: no readings; parameters that only they show are not fitted")
+                notes.append(
+                    f"{channel.column}: no readings; parameters that only this channel determines are not fitted"
+                )
             elif lost.size:
                 rows = rows_text(lost.tolist(), 8)
                 notes.append(f"{channel.column}: {lost.size} of {len(self)} readings are missing ({rows})")
@@ -275,7 +277,10 @@ class Runs:
         column, factor = IMPOSED[robot.rig.imposed]
         imposed = robot.rig.imposed != "voltage"
         if imposed and not self.has(column):
-            raise BadData(f"{self.source}: no {column}, which the robot's file states as imposed; give it in a table")
+            raise BadData(
+                f"{self.source}: no {column}, which is the imposed quantity in the robot's file; the "
+                "table must contain it"
+            )
         stated = {c.field: self[c.column] for c in quantities.SET if c.in_tables and c.field and self.has(c.column)}
         stated["duty"] = np.where(held, 0.0, stated.get("duty", 1.0))
         follows = imposed and not robot.rig.follows_goal

@@ -176,8 +176,8 @@ def weakened_field_notes(preset: Preset, values: Mapping[str, Raw]) -> Names:
             q, d = (np.sqrt(np.nanmean(column_numbers(values[c]) ** 2)) for c in (theirs, column.across))
             if d > WEAKENED * q:
                 notes.append(
-                    f"{preset.name}: {column.across} is {d / q:.0%} of {theirs}, so the field is weakened, "
-                    "which no DC motor does; leave those rows out"
+                    f"{preset.name}: {column.across} is {d / q:.0%} of {theirs}. The motor runs with field "
+                    "weakening there, which a DC motor model does not cover; leave those rows out"
                 )
     return tuple(notes)
 
@@ -258,7 +258,7 @@ def _chosen(source: Source, mapped: Mapped, layout: Layout) -> tuple[dict[str, S
             chosen[theirs] = find_signal(source.signals, theirs, source.name)
         else:
             near = suggested_paths(theirs, [s.path for s in source.signals])
-            missing.append(f"{source.name}: no signal {theirs}, which {mine} is read from; {near}")
+            missing.append(f"{source.name}: no signal {theirs}, from which {mine} is read; {near}")
     spellings = dataclasses.replace(layout, channels=channels.EVERY, mapped=()).spellings()
     spelled = {name.casefold() for name in spellings}
     taken = {id(signal) for signal in chosen.values()}
@@ -340,8 +340,8 @@ def _on_a_grid(
 def _how_to_name(source: Source) -> str:
     paths = [s.path for s in source.signals]
     return (
-        f"{suggested_paths('', paths)}; state their columns in the robot's file, [columns] supply_voltage_V = "
-        f'"{paths[0]}" (mmrjax inspect proposes the lines)'
+        f"{suggested_paths('', paths)}; give their columns in the robot's file, for example [columns] "
+        f'supply_voltage_V = "{paths[0]}" (mmrjax inspect proposes the lines)'
     )
 
 
