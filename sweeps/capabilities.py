@@ -58,7 +58,7 @@ def unknown_numbers_sentence(robot: Robot) -> list[str]:
     gone = [output for output in outputs.FURTHER if not robot.knows(output.rests_on)]
     lacking = dict.fromkeys(name for output in gone for name in robot.unknown(output.rests_on))
     labels = "; ".join(output.label for output in gone)
-    return [f"not known, as the robot's file does not state {', '.join(lacking)}: {labels}"] if gone else []
+    return [f"cannot be computed: the robot's file does not give {', '.join(lacking)}: {labels}"] if gone else []
 
 
 def idle_columns(robot: Robot) -> set[str]:

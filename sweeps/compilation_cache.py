@@ -112,7 +112,8 @@ def _refused(folder: str) -> bool:
         from sweeps.console import print_message
 
         print_message(
-            f"compiled programs are not kept: {reason}; name a folder of your own in {VARIABLE}, or chmod go-w it"
+            f"compiled programs are not cached: {reason}; set {VARIABLE} to a folder of your own, or remove write "
+            "access for others (chmod go-w)"
         )
     return bool(reason)
 

@@ -160,7 +160,7 @@ def help_all(kinds: tuple[type[BaseModel], ...]) -> Iterator[inspect.Parameter]:
     if hidden:
         option = typer.Option(
             "--help-all", is_eager=True, callback=_show_all,
-            help=f"Show this with {', '.join(hidden)} too, which \\[solver] of --config may state.",
+            help=f"Also show {', '.join(hidden)}, which \\[solver] of --config may contain.",
         )  # fmt: skip
         kind = inspect.Parameter.KEYWORD_ONLY
         yield inspect.Parameter("help_all", kind, default=False, annotation=Annotated[bool, option])
@@ -213,7 +213,7 @@ def parse_axis(option: str, text: str) -> tuple[float, ...]:
             first, last, step = numbers
             if (last - first) * step < 0:
                 raise BadConfiguration(
-                    f"{option}: got {part}, which ends before it begins; expected first:last:step as 0:20:0.5"
+                    f"{option}: got {part}, which ends before it begins; expected first:last:step, such as 0:20:0.5"
                 )
             count = (last - first) / step
             if not 0 <= count < 1e6:
@@ -221,6 +221,7 @@ def parse_axis(option: str, text: str) -> tuple[float, ...]:
             values += [first + k * step for k in range(round(count - 0.5 + 1e-9) + 1)]
         except (ValueError, ZeroDivisionError, OverflowError):
             raise BadConfiguration(
-                f"{option}: got {part or 'nothing'}; expected numbers as 0,5,10 or first:last:step as 0:20:0.5"
+                f"{option}: got {part or 'nothing'}; expected numbers such as 0,5,10 or first:last:step such as "
+                "0:20:0.5"
             ) from None
     return tuple(values)

@@ -456,7 +456,7 @@ def test_heat_that_the_file_does_not_state_is_asked_for(tmp_path, capsys):
         assert command(["check", asked, "--robot", tmp_path / "rig.toml", "--out", tmp_path / "run"]) == 2
         lacking = "motor.resistance_thermal_winding, motor.resistance_thermal_housing"
         assert (
-            f"asked.toml, {name}: rests on how warm the windings become, and the robot's file does not state {lacking}"
+            f"asked.toml, {name}: depends on the winding temperature, for which the robot's file lacks {lacking}"
             in " ".join(capsys.readouterr().err.split())
         )
 
@@ -466,7 +466,7 @@ def test_a_battery_that_the_file_does_not_state_is_no_supply(tmp_path, capsys):
     asked = tmp_path / "asked.toml"
     asked.write_text("mass_kg = 50\nspeed_m_s = 0.5\n")
     assert command(["check", asked, "--robot", tmp_path / "rig.toml", "--out", tmp_path / "run"]) == 2
-    assert "asked.toml, speed_m_s: the robot's file states no battery" in capsys.readouterr().err
+    assert "asked.toml, speed_m_s: the robot's file has no battery" in capsys.readouterr().err
     assert not (tmp_path / "run").exists()
 
 

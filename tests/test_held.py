@@ -205,4 +205,4 @@ def test_check_does_not_call_a_held_shaft_stalled(tmp_path, capsys):
     (tmp_path / "runs.csv").write_text("\n".join(lines) + "\n")
     assert rig_check.check_rig_file(tmp_path / "rig.toml", str(tmp_path / "runs.csv"), (), False) == 0
     printed = capsys.readouterr().out
-    assert "what these data can determine" in printed and "not every row settles" not in printed
+    assert "parameters that these data can determine" in printed and "some rows have no steady state" not in printed

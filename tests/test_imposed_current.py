@@ -256,10 +256,10 @@ def test_commands_take_a_current_or_say_what_to_state(robot, tmp_path, mmrjax):
     assert cells["motor_current_A"] == "2"
     code, _, err = ends(mmrjax("sweep --robot rig.toml --motor-currents 1,2,-2 --no-report --out many"), code=0)
     for options, said in (
-        (["simulate", "--voltage", "12"], "--voltage: the motors' current is imposed on this robot; state --motor-current [A]"),
-        (["simulate"], "--motor-current: not stated; state it [A], as --motor-current 2"),
+        (["simulate", "--voltage", "12"], "--voltage: the motors' current is imposed on this robot; give --motor-current [A]"),
+        (["simulate"], "--motor-current: not given; give it [A], such as --motor-current 2"),
         (["simulate", "--battery"], "--battery: the motors' current is imposed on this robot"),
-        (["sensitivity"], "sensitivity: the motors' current is imposed on this robot"),
+        (["sensitivity"], "sensitivity: the motor current is imposed on this robot"),
         (["simulate", "--model", "track", "--motor-current", "1"], "which has no running gear"),
     ):  # fmt: skip
         code, _, err = mmrjax(*options, "--robot", "rig.toml", "--out", "none")

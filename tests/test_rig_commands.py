@@ -165,23 +165,23 @@ def test_a_profile_turns_a_bench(mmrjax, tmp_path):
 
 
 REFUSED = {
-    "no voltage": ("bench", False, "simulate", r"--voltage: not stated, and the robot's file has no motor\.voltage_l"),
+    "no voltage": ("bench", False, "simulate", r"--voltage: not given, and the robot's file has no motor\.voltage_l"),
     "no speed": ("bench", True, "simulate", r"--motor-speed: not stated, .* as --motor-speed 3000"),
     "voltage of an imposed speed": (
         "bench", True, "simulate --voltage 12", r"--voltage: the motors' speed is imposed .* state --motor-speed",
     ),
     "speed of an imposed voltage": (
-        "bench", False, "simulate --motor-speed 900", r"--motor-speed: the voltage is imposed .* state --voltage",
+        "bench", False, "simulate --motor-speed 900", r"--motor-speed: the voltage is imposed .* give --voltage",
     ),
     "slope": ("bench", False, "simulate --voltage 9 --slope 5", r"--slope: the robot's load is a shaft"),
     "payload": ("linear", False, "simulate --voltage 9 --payload 1", r"--payload: the robot's load is a"),
     "mass": ("bench", False, "simulate --voltage 9 --mass 5", r"--mass: the robot's load is a shaft"),
     "surface": ("bench", False, "simulate --voltage 9 --surface x", r"--surface: the robot's load is a"),
-    "battery": ("bench", False, "simulate --battery", r"--battery: the robot's file states no battery"),
+    "battery": ("bench", False, "simulate --battery", r"--battery: the robot's file has no battery"),
     "battery of an imposed speed": ("bench", True, "simulate --battery", r"--battery: the motors' speed is imposed"),
     "a pendulum's steady state": ("pendulum", False, "simulate --voltage 3", r"arm .* has no steady state"),
     "a pendulum's profile": (
-        "pendulum", False, "simulate --profile shuttle", r"--profile: arm is an arm whose gravity load varies with its angle",
+        "pendulum", False, "simulate --profile shuttle", r"--profile: arm is an arm, whose gravity load varies with its angle",
     ),
     "an imposed speed's profile": (
         "bench", True, "simulate --profile shuttle", r"--profile: the motors' speed is imposed on this robot",
@@ -205,7 +205,7 @@ REFUSED = {
         "bench", False, "simulate --voltage 9 --model track", r"--model track: the robot's load is a shaft",
     ),
     "resonance": ("bench", False, "resonance", r"resonance: the robot's load is a shaft"),
-    "requirements": ("bench", False, "check", r"check: the robot's load is a shaft, which has no wheels"),
+    "requirements": ("bench", False, "check", r"check: the robot's load is a shaft, without wheels"),
     "the paper's figures": ("bench", False, "reproduce", r"reproduce: the robot's load is a shaft"),
     "steepest slope": (
         "bench", False, "sensitivity --voltages 9 --outputs steepest_slope",
@@ -252,7 +252,7 @@ def test_levels_are_thirds_of_the_limit_to_two_digits(tmp_path):
     found = imposed.imposed_levels(robot, "--motor-speeds", notes)
     assert all(0.9 * share * top < level <= share * top for level, share in zip(found, imposed.SHARES, strict=True))
     assert notes == [
-        "--motor-speeds: not stated; thirds of the speed_limit of the robot's file are taken: 1500,3100,4700"
+        "--motor-speeds: not given; thirds of the speed_limit in the robot's file are used: 1500,3100,4700"
     ]
 
 
@@ -264,7 +264,7 @@ def test_a_sweep_of_a_bench_has_one_axis(mmrjax, tmp_path):
     rig = of_kind(tmp_path, "bench")
     _, out, err = ends(
         mmrjax("sweep --robot", rig, "--set", "motor.voltage_limit=24", "--out", "run"),
-        "thirds of the voltage_limit of the robot's file are taken: 8,16,24",
+        "thirds of the voltage_limit in the robot's file are used: 8,16,24",
         code=0,
     )
     table = rows_of(tmp_path / "run" / "runs.csv")
@@ -317,7 +317,7 @@ def test_a_vehicle_is_drawn(mmrjax, tmp_path):
         code=0,
     )
     assert (tmp_path / "x.png").stat().st_size > 1000
-    assert "states no running_gear" in err and words_of_others(out, err) == []
+    assert "has no running_gear" in err and words_of_others(out, err) == []
 
 
 # --- measured tables ----------------------------------------------------------------------------------------------

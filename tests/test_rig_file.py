@@ -449,7 +449,7 @@ def test_rig_new_writes_a_file_that_reads(mmrjax, tmp_path, kind):
 
 def test_rig_new_keeps_a_file_unless_forced(mmrjax, tmp_path):
     (tmp_path / "my-rig.toml").write_text("mine")
-    ends(mmrjax("rig new my-rig.toml"), "my-rig.toml: there already; --force replaces it")
+    ends(mmrjax("rig new my-rig.toml"), "my-rig.toml: already exists; --force replaces it")
     assert (tmp_path / "my-rig.toml").read_text() == "mine"
     assert mmrjax("rig new my-rig.toml --force")[0] == 0
     assert not robot_file.load_robot(str(tmp_path / "my-rig.toml")).has_ground
@@ -460,7 +460,7 @@ def test_rig_new_lists_the_kinds(mmrjax, tmp_path):
         mmrjax("rig new my-rig.toml --kind bensh"),
         "--kind: got bensh; did you mean bench? allowed: bench, dyno, pendulum, servo, linear, carriage, wheeled, tracked",
     )
-    ends(mmrjax("rig new nowhere/my-rig.toml"), "no such folder as nowhere")
+    ends(mmrjax("rig new nowhere/my-rig.toml"), "the folder nowhere does not exist")
     assert not list(tmp_path.iterdir())
 
 
@@ -484,7 +484,8 @@ def test_a_fit_says_which_numbers_are_a_templates(mmrjax, tmp_path):
     (tmp_path / "rig.toml").write_text(text)
     _, _, err = ends(mmrjax("calibrate measured --robot rig.toml --out c"), code=4)
     assert (
-        "rig.toml: still the template's, so the fit takes ± 300 % where they have ±: motor.torque_constant, " in err
+        "rig.toml: still the example numbers of the template, so the fit uses ± 300 % for those with ±: motor.torque_constant, "
+        in err
     )
     assert "motor.resistance" not in err
 
@@ -509,7 +510,7 @@ def test_rig_check_says_what_a_file_is(mmrjax, bench):
     assert (code, err) == (0, "")
     assert "One motor drives, through its gearbox 20 : 1, bench: a shaft of 0.002 kg·m²." in out
     assert "10 lines still hold the number of an example" in out
-    assert "382 rpm/V" in out and "LOOK" not in out and "Without data" in out
+    assert "382 rpm/V" in out and "LOOK" not in out and "No data given" in out
 
 
 @pytest.mark.slow
@@ -529,12 +530,12 @@ def test_rig_check_says_what_a_table_can_determine(mmrjax, bench):
         "motor.friction_coulomb", "motor.friction_viscous", "gearbox.efficiency_load",
     }  # fmt: skip
     assert shares["motor.torque_constant"] < 0.2 and shares["bench.loss_viscous"] < 0.3
-    assert "would not be determined by these runs" in found["statement"]
+    assert "are not determined by these runs" in found["statement"]
 
 
 def test_rig_check_of_data_says_the_same_in_words(mmrjax, bench):
     _, out, _ = ends(mmrjax("rig check my-rig.toml runs.csv"), "total_current_A, yours total_current_mA", code=0)
-    assert re.search(r"total_current .*signed +(assumed, 2 %, as total_curr|estimated by how readings)", out)
+    assert re.search(r"total_current .*signed +(assumed, 2 %, as total_curr|estimated from the scatter)", out)
     assert "gearbox.efficiency_load" in out and "not determined" in out
     assert "room: without a role" in out and "add output_torque to channels" in out
 

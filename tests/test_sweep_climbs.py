@@ -42,7 +42,7 @@ def test_search_of_many_points_ends_within_a_millimetre_of_each_ones_limit():
 
 REFUSED = {
     "no size": ({"kind": "step"}, {"levers_front_deg": [30, 45]}, r"obstacle_mm: got none; expected an axis obstacle_mm"),
-    "a size beside a search": ({"kind": "gap", "find": True}, {"obstacle_mm": [30, 45]}, r"got it; find looks for it"),
+    "a size beside a search": ({"kind": "gap", "find": True}, {"obstacle_mm": [30, 45]}, r"got it; find searches for it"),
     "a lever below the ground": ({"kind": "step"}, {"levers_front_deg": [-30, 45], "obstacle_mm": [50]},
                                  r"levers_front_deg: at -30 deg they begin 72 mm below the ground"),
     "beyond the range": ({"kind": "step"}, {"levers_rear_deg": [190], "obstacle_mm": [50]}, r"expected -180 to 180 deg"),
@@ -69,7 +69,7 @@ def test_sweeps_that_cannot_be_climbed_are_refused_in_one_sentence(case):
     [("tread_mm", 300, "step", "stairs"), ("count", 2, "gap", "stairs"), ("nose_mm", 5, "gap", "step or stairs")],
 )
 def test_keys_of_another_obstacle_are_refused(key, value, kind, kinds):
-    with pytest.raises(ValidationError, match=f"`{key}` acts only with `kind` {kinds}"):
+    with pytest.raises(ValidationError, match=f"`{key}` has an effect only with `kind` {kinds}"):
         Obstacle(kind=kind, **{key: value})
     # as a file of all keys has them
     assert Obstacle(**Obstacle(kind=kind).model_dump()) == Obstacle(kind=kind)
@@ -180,7 +180,7 @@ def test_page_says_the_largest_obstacle_and_where_it_is_got_over(mmrjax, tmp_pat
         assert mmrjax("sweep", f"{name}.toml", "--out", name)[0] == 0
         page = (tmp_path / name / "report.html").read_text("utf-8")
         where = "levers_front_deg 0 deg" if name == "map" else "levers_front_deg 30 deg, adhesion 0.5"
-        assert f"The largest obstacle that is got over: {size} mm, at {where}." in page
+        assert f"The largest obstacle that the robot gets over: {size} mm, at {where}." in page
     page = (tmp_path / "map" / "report.html").read_text("utf-8")
     names = {name: (meaning, unit) for name, meaning, unit, _ in Tables(page).tables["names"][1:]}
     assert names["obstacle_mm"] == ("height of the step", "mm") and "endings" in drawn(page)

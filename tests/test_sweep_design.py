@@ -220,16 +220,16 @@ BAD = {
     "range with a wrong key": ({"axes": {"slope_deg": RANGE | {"steps": 3}}}, r"axes\.slope_deg\.steps: no such key; .*allowed: start, stop, number, scale"),
     "range without number": ({"axes": {"slope_deg": {"start": 0, "stop": 3}}}, r"axes\.slope_deg: number is missing; expected start, stop, number"),
     "range on no scale": ({"axes": {"slope_deg": RANGE | {"scale": "sqrt"}}}, r"scale: got 'sqrt'; allowed: linear, log"),
-    "logarithm of zero": ({"axes": {"slope_deg": RANGE | {"scale": "log"}}}, r"start: got 0; expected more than 0 with scale log"),
+    "logarithm of zero": ({"axes": {"slope_deg": RANGE | {"scale": "log"}}}, r"start: got 0; expected a number above 0 with scale log"),
     "steps upside down": ({"axes": {"slope_deg": "20:0:5"}}, r"axes\.slope_deg: got 20:0:5, which ends before it begins; expected first:last:step"),
     "a word": ({"axes": {"voltage": [15, "high"]}}, r"axes\.voltage: got 'high'; expected a number"),
     "twice the same": ({"axes": {"voltage": [15, 15]}}, r"axes\.voltage: got a value twice"),
     "out of bounds": ({"axes": {"slope_deg": [0, 95]}}, r"axes\.slope_deg: got 95; expected -45 to 45 deg \(slope"),
     "parameter out of bounds": ({"axes": {"motor.resistance": [-1]}}, r"axes\.motor\.resistance: got -1; expected 0"),
     "unknown configuration": ({"axes": {"configuration": ["8T"]}}, r"axes\.configuration: got '8T'; the robot has no such configuration; allowed: 6T2A, 4W2T"),
-    "nothing varies": ({}, r"plan\.toml: got neither \[axes\] nor \[samples\]"),
+    "nothing varies": ({}, r"plan\.toml: no \[axes\] or \[samples\]"),
     "stated twice": ({"axes": {"payload": [1]}, "samples": SAMPLES}, r"plan\.toml, payload: stated twice"),
-    "also fixed": ({"axes": {"payload": [1]}, "conditions": {"payload": 2}}, r"payload: stated twice; expected it in one of conditions"),
+    "also fixed": ({"axes": {"payload": [1]}, "conditions": {"payload": 2}}, r"payload: given twice; give it once, under conditions"),
     "surface and adhesion": ({"axes": {"adhesion": [1]}, "conditions": {"surface": "asphalt"}}, r"conditions\.surface: got asphalt beside adhesion"),
     "unknown surface": ({"axes": {"payload": [1]}, "conditions": {"surface": "ice"}}, r"conditions\.surface: got 'ice'; allowed: linoleum"),
     "unknown condition": ({"axes": {"payload": [1]}, "conditions": {"volts": 3}}, r"conditions\.volts: no such condition; did you mean voltage"),
@@ -250,7 +250,7 @@ BAD = {
     "distribution out of bounds": ({"samples": SAMPLES | {"over": {"slope_deg": UNIFORM | {"high": 90}}}}, r"over\.slope_deg: got 90; expected -45 to 45"),
     "condition has no prior": ({"samples": SAMPLES | {"over": {"payload": "prior"}}}, r"over\.payload: payload has no prior; expected one of uniform"),
     "sampled configuration": ({"samples": SAMPLES | {"over": {"configuration": UNIFORM}}}, r"over\.configuration: cannot be sampled"),
-    "logarithm from zero": ({"samples": SAMPLES | {"over": {"payload": {**UNIFORM, "distribution": "loguniform"}}}}, r"over\.payload\.low: got 0; expected more than 0 with loguniform"),
+    "logarithm from zero": ({"samples": SAMPLES | {"over": {"payload": {**UNIFORM, "distribution": "loguniform"}}}}, r"over\.payload\.low: got 0; expected a number above 0 with loguniform"),
 }  # fmt: skip
 
 

@@ -300,7 +300,7 @@ REFUSED = {
     "one side": (KINEMATIC, f"motor_speed_left_rpm,{READ}", row_of(KEEP[0], *KEEP[2:]),
                  "column motor_speed_right_rpm is missing, motor_speed_left_rpm is stated"),
     "one duty": (DRIVEN, f"supply_voltage_V,duty_left,{READ}", [(24, 1, *row[2:]) for row in SOUND],
-                 "column duty_right is missing, duty_left is stated"),
+                 "column duty_right is missing although duty_left is present"),
     "both ways": (KINEMATIC, f"motor_speed_rpm,{SPEEDS},{READ}", [(1, *row) for row in SOUND],
                   "column motor_speed_rpm in addition to motor_speed_left_rpm, motor_speed_right_rpm; keep one"),
     "letters": (KINEMATIC, f"{SPEEDS},motor_current_l_A,motor_current_r_A,yaw_rate_rad_s", SOUND,

@@ -140,7 +140,7 @@ def test_a_fidelity_that_resolves_the_running_gear_says_where_it_is_an_examples(
     read(tmp_path, kept.partition("[rover.turning]")[0] + kept.partition("inertia = 0.2\n")[2], "voltage", DRIVEN)
     for model in ("steady", "track"):
         load_robot(Simulate(robot=str(tmp_path / "rig.toml"), set={"rover.inertia": 0.001}, model=model))
-        assert ("are those of an example" in capsys.readouterr().err) == (said and model == "track")
+        assert ("are example values" in capsys.readouterr().err) == (said and model == "track")
 
 
 def test_a_parameter_that_is_set_is_known(tmp_path):
@@ -175,7 +175,7 @@ def test_a_store_of_what_is_unknown_is_refused_unless_it_varies(tmp_path, varied
     plan = axes.plan_design(config, robot, "map.toml")
     if refused:
         with pytest.raises(
-            BadConfiguration, match=r"power_supply cannot be computed, as .* lacks motor\.resistance$"
+            BadConfiguration, match=r"power_supply cannot be computed, because .* lacks motor\.resistance$"
         ):
             prepare_job(config, robot, plan, "map.toml")
     else:

@@ -66,7 +66,7 @@ def spread_shared_stamps(time: np.ndarray, run: np.ndarray) -> tuple[np.ndarray,
     The number of rows is 0 where nothing is changed.
 
     Args:
-        time: of rows in order, shape (rows,).
+        time: time of rows in order, shape (rows,).
         run: index of the recording of each row, shape (rows,).
     """
     if len(time) < 3:
@@ -137,8 +137,8 @@ def from_the_first(name: str, meaning: Column, raw: Raw, runs: Sequence[str] | N
     and the reader refuses that cell.
 
     Args:
-        name: of the source.
-        meaning: of the column.
+        name: name of the source.
+        meaning: meaning of the column.
         runs: `run_id` of each cell. None: all are of one run.
     """
     factor = meaning.value(1.0)

@@ -73,8 +73,8 @@ class Column:
 
     Attributes:
         shown: name of the column in the file.
-        unit: that it states.
-        factor: from its cells to that unit.
+        unit: unit that it states.
+        factor: factor from its cells to that unit.
     """
 
     quantity: Quantity
@@ -114,7 +114,7 @@ class Layout:
         configurations: their names.
         instruments: properties of instruments that are known.
         mapped: (column as this program calls it, column of the file, factor from its unit).
-        channels: of its readings, in the order of arrays.
+        channels: channels of its readings, in the order of arrays.
         supply: voltage of a controller's driver in tables without its column [V]. 0: tables have it.
     """
 

@@ -31,12 +31,12 @@ class SignalFacts:
 
     Attributes:
         path: of it.
-        unit: that the file states.
+        unit: unit that the file states.
         samples: number of them.
         refused: why it cannot be read.
-        rate: of its clock [Hz], NaN where it has none.
+        rate: rate of its clock [Hz], NaN where it has none.
         gaps: number of steps of more than `GAP` usual ones, NaN without a clock.
-        least, greatest: of its numbers, NaN where it has none.
+        least, greatest: smallest and largest of its numbers, NaN where it has none.
         missing: samples without a number.
         words: some of its words, of a signal of words.
         clock: name of its clock.
@@ -60,9 +60,9 @@ class Contents:
     """Contents of a file.
 
     Attributes:
-        name, kind: of the file.
+        name, kind: name and kind of the file.
         signals: of it.
-        notes: on how it was read.
+        notes: notes on how it was read.
         preset: name of the packaged preset that its columns are of. Empty: none.
         proposed: lines of a table `[columns]`, for a person to check.
     """

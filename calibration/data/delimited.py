@@ -40,11 +40,11 @@ def read_csv_columns(path: Path, name: str) -> NamedArrays:
     """Returns the columns of a CSV file as texts.
 
     Args:
-        name: of the file, for messages.
+        name: name of the file, for messages.
 
     Raises:
-        BadData: as `input_files.csv_bytes`, `decode_text` and `split_cells`, or a row of another length than the
-            header.
+        BadData: for the same reasons as `input_files.csv_bytes`, `decode_text` and `split_cells`, or a row of another
+            length than the header.
     """
     content = input_files.csv_bytes(path, name)
     if len(content) >= LONG and (plain := _plain(name, content)) is not None:
@@ -186,7 +186,7 @@ def split_cells(name: str, lines: Sequence[str]) -> tuple[list[list[str]], Names
     Semicolons or tabs separate cells where the header has no comma. Numbers may have decimal commas then.
 
     Args:
-        name: of the file, for messages.
+        name: name of the file, for messages.
         lines: of the file, its header first.
 
     Raises:

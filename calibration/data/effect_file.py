@@ -100,7 +100,8 @@ def effect_library(paths: Sequence[Path | str] = ()) -> Library:
     """Returns the packaged effects and the effects of the files, by name.
 
     Raises:
-        BadConfiguration: as `read_effect_file`. A repeated name. An effect that settles to an unknown effect.
+        BadConfiguration: for the same reasons as `read_effect_file`. A repeated name. An effect that settles to an
+            unknown effect.
     """
     library = dict(effects.BY_NAME)
     own_effects = [(path, effect) for path in map(Path, paths) for effect in read_effect_file(path)]

@@ -98,7 +98,7 @@ def stated_number(
 
     Args:
         low, high: bounds.
-        unit: of the number, empty or `-` for none. None: unknown, the message leaves it out.
+        unit: unit of the number, empty or `-` for none. None: unknown, the message leaves it out.
 
     Raises:
         BadConfiguration: no number, or a number that is not finite or out of bounds.

@@ -23,7 +23,7 @@ class NamedArrays:
     Messages count rows from 1. A reader that leaves out rows says so in `notes`.
 
     Attributes:
-        name: of the source, which opens every message.
+        name: name of the source, which opens every message.
         header: names of the columns, as the source states them.
         values: one for each column, all of one length.
         units: one for each column, spelled by `quantities.unit_in_column`, empty if unknown, or no units at all.

@@ -29,7 +29,7 @@ class StatedMass:
     """Mass of one configuration without payload, `total_mass_kg` less `payload_kg`.
 
     Attributes:
-        median, low, high: over the rows of the configuration [kg].
+        median, low, high: median, lower limit and upper limit over the rows of the configuration [kg].
         unladen: true if it varies although `total_mass_kg` is constant, as if that column leaves the payload out.
     """
 
@@ -80,7 +80,7 @@ def with_table_mass(robot: Robot, runs: Runs) -> Robot:
     """`robot` with the own mass that a table states for each configuration, the median over its rows.
 
     Raises:
-        BadData: as `stated_masses`.
+        BadData: for the same reasons as `stated_masses`.
     """
     own_masses = {name: float(chassis.mass) for name, chassis in robot.configurations.items()}
     masses = {n: s.median for n, s in stated_masses(robot, runs).items() if abs(s.median - own_masses[n]) > ROUNDING}

@@ -33,8 +33,9 @@ class Posterior:
     Attributes:
         coordinates: names of the parameters that have a coordinate each.
         units: of them.
-        mean, covariance: of z, shape (coordinates,) and (coordinates, coordinates).
-        location, spread, low, high: of u, in the parameter's unit or its logarithm.
+        mean, covariance: mean and covariance of z, shape (coordinates,) and (coordinates, coordinates).
+        location, spread, low, high: location, spread, lower limit and upper limit of u, in the parameter's unit or
+            its logarithm.
         softness: [-].
         kinds: `NORMAL`, `LOG` or `ANGLE`, of each.
         tied: (follower, index of the coordinate that it follows, ratio).

@@ -48,7 +48,7 @@ class PresetColumn:
     Attributes:
         mine: name of the column.
         theirs: names that it may have in the file, `*` for any text. The first that the file has is read.
-        factor: from its unit to the unit of `mine`.
+        factor: factor from its unit to the unit of `mine`.
         note: its meaning, for a note.
         needs: column of this program without which it is not what drives the motor. Empty: none.
         across: column of the file with the current along d, zero where the field is not weakened. Empty: none.
@@ -71,8 +71,8 @@ class Preset:
     """Columns of a logger's files.
 
     Attributes:
-        name: of the preset or its file.
-        columns: in its order.
+        name: name of the preset or its file.
+        columns: columns in its order.
         header: names of the columns of a file without a header. Empty: every file has one.
     """
 
@@ -113,7 +113,7 @@ class Preset:
         Args:
             mapped: columns of the source.
             imposed: the column that drives the motor.
-            name: of the source.
+            name: name of the source.
 
         Raises:
             BadData: it lacks that column.
@@ -134,7 +134,7 @@ def of_columns(columns: Mapping[str, Any], where: str = "the stated table") -> P
     """Returns the columns that a table `[columns]` states.
 
     Raises:
-        BadConfiguration: as `parse_preset`.
+        BadConfiguration: for the same reasons as `parse_preset`.
     """
     return _parsed({"columns": dict(columns)}, where, {})
 
@@ -173,7 +173,7 @@ def recognise_preset(names: Sequence[str]) -> str:
     """Returns the packaged preset with most columns in a source, at least `OF_A_PRESET`, empty if no preset has.
 
     Args:
-        names: of the source's columns, or paths of its signals.
+        names: names of the source's columns, or paths of its signals.
     """
     best, most = "", OF_A_PRESET - 1
     ends = {*names, *(re.split(r"[/.]", name)[-1] for name in names)}

@@ -80,11 +80,11 @@ class ProfileTable:
 
     Attributes:
         source: name of the file or of the packaged profile, for messages.
-        time: of the rows [s].
-        modes: of `MODES`, one a row.
+        time: time of the rows [s].
+        modes: modes from `MODES`, one a row.
         demand: motor speed [rad/s] or speed [m/s], shape (rows,).
         values: fields of `mmrjax.missions.profile.Profile` that it states, by name, shape (rows,).
-        surface: of Table 5, one a row, None where it states none.
+        surface: surface of Table 5, one a row, None where it states none.
         linear, cycles: as of `mmrjax.missions.profile.Profile`.
         digest: SHA-256 of the file.
         begins: fields of `Start` that it states [SI, °C]. Rolling speed, temperatures of winding and housing.
@@ -166,8 +166,8 @@ class ProfileTable:
         """The profile that a simulation takes, for a batch of runs.
 
         Args:
-            robot: that follows it.
-            conditions: of shape (runs,), configurations as indices.
+            robot: robot that follows it.
+            conditions: conditions of shape (runs,), configurations as indices.
 
         Returns:
             Fields of shape (rows,). Where surfaces are stated, `adhesion` of shape (runs, rows).

@@ -48,8 +48,8 @@ class Envelope:
     """Conditions under which a requirement has to be met: ranges, each from its least to its greatest value.
 
     Attributes:
-        configuration: of the robot, by name. Empty: its first.
-        surface: of Table 5. battery: on the battery, else on the external supply.
+        configuration: configuration of the robot, by name. Empty: its first.
+        surface: surface of Table 5. battery: on the battery, else on the external supply.
         payload_kg, slope_deg, state_of_charge, supply_voltage_V: as named.
         ambient_C: None: the robot's own ambient temperature.
     """
@@ -87,12 +87,12 @@ class Requirement:
     """One requirement.
 
     Attributes:
-        name: of `QUANTITIES`.
-        limit: in the unit of the name, None: as the part is rated.
+        name: one of `QUANTITIES`.
+        limit: limit in the unit of the name, None: as the part is rated.
         least: true if the quantity has to be at least the limit, false if at most.
         envelope: conditions under which it has to be met.
-        share: of the time that the robot drives, for the endurance. 0: it stands.
-        tread_mm: of stairs, for their rise.
+        share: share of the time that the robot drives, for the endurance. 0: it stands.
+        tread_mm: tread of stairs, for their rise.
         source: where the requirement comes from.
     """
 

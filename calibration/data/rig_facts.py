@@ -36,7 +36,7 @@ class Fact:
 
     Attributes:
         what: in words.
-        value: with its unit.
+        value: value with its unit.
         odd: reason to check its numbers again, else empty.
     """
 
@@ -503,7 +503,7 @@ class Origin:
     """Origin of a number of a robot.
 
     Attributes:
-        name: of the parameter, value [unit].
+        name: name of the parameter, value [unit].
         sd: as stated, None if the file states none.
         why: in words.
     """

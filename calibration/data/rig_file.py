@@ -93,7 +93,7 @@ def linear_to_shaft(table: Json, name: str, where: str, sds: dict[str, float], s
     The sds are first order for independent inputs. Exact inputs give exact values.
 
     Args:
-        table: of the configuration `name`, without `load`.
+        table: table of the configuration `name`, without `load`.
         where: opens the message of an error.
         sds: stated, by dotted name.
         sides: drives that move it together.
@@ -158,7 +158,7 @@ def vehicle_defaults(on_tracks: bool, table: Mapping[str, Any], sides: float) ->
     """Returns default values of a vehicle that starts from nothing.
 
     Args:
-        table: that its file states of it.
+        table: table that its file states of it.
         sides: drives that move it together.
     """
 
@@ -290,7 +290,7 @@ def needed_parameters(rig: Rig, values: Iterable[tuple[str, Any]] = ()) -> Names
     """Required parameters of a robot that starts from nothing: of its drive, and of its turns if it turns.
 
     Args:
-        values: of its parameters, by dotted name.
+        values: values of its parameters, by dotted name.
     """
     turns = any(name.endswith(WIDTH) and is_number(value) and value > 0 for name, value in values)
     current = {"total_current", "motor_current", "winding_temperature"} & {*rig.channels, rig.imposed}

@@ -94,7 +94,7 @@ class RobotFile:
         source: path of its file, or name of a packaged robot. A packaged robot states no parameters.
         stated: names of the parameters that the file states. A linear unit's keys become parameters of its shaft.
         linear: configurations that it states as linear units.
-        text: of the file.
+        text: text of the file.
         remarks: sentences on the robot, for readers of its numbers.
     """
 
@@ -165,9 +165,9 @@ def parse_robot_file(path: Path, library: Library = effects.BY_NAME, notes: list
             A configuration that is not in the base states `like`, the base's configuration that it starts from.
             Otherwise it states `movers` (`tracks` or `wheels`) or `load` (see `rig_file.LOADS`), and every parameter
             without default.
-        parameters: in tables by dotted name in SI units, e.g. `[motor] resistance = 0.9`, or with the sd of their
-            prior as `"0.9 ± 5 %"`, which is wider while the number is a template's. RATINGS. SWITCHES, true or
-            false, and CHOICES.
+        parameters: parameters in tables by dotted name in SI units, e.g. `[motor] resistance = 0.9`, or with the sd
+            of their prior as `"0.9 ± 5 %"`, which is wider while the number is a template's. RATINGS. SWITCHES, true
+            or false, and CHOICES.
         effects: an effect is present if the file has its table `[effects.NAME]`. The table may name the
             `configurations` that the effect acts on, and scale its priors and limits by `scaled` (see
             `effects.scaled`).
@@ -318,7 +318,7 @@ def change_robot(robot: Robot, values: Mapping[str, Any], where: str, notes: lis
         notes: as for `find_robot_file`.
 
     Raises:
-        BadConfiguration: as `parse_robot_file`.
+        BadConfiguration: for the same reasons as `parse_robot_file`.
     """
     stated = dict(values)
     settings = (*COUNTS, *RATINGS, *SWITCHES, *CHOICES)

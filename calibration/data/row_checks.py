@@ -71,7 +71,7 @@ def used_once(values: np.ndarray, time: np.ndarray, run: np.ndarray | None = Non
 
     Args:
         values: NaN for a missing reading, shape (rows,).
-        time: of the rows.
+        time: time of the rows.
         run: name of the recording of each row. None: all are of one.
     """
     if (np.diff(values) == 0).sum() < LEAST * len(values):
@@ -328,7 +328,7 @@ def driven_rows(name: str, columns: Columns, layout: Layout) -> tuple[Columns, n
     on the other ones.
 
     Raises:
-        BadData: as `_driven`, turns on a slope, or a reading without its sign.
+        BadData: for the same reasons as `_driven`, turns on a slope, or a reading without its sign.
     """
     driven, note = _driven(name, columns, layout)
     if note:

@@ -66,8 +66,9 @@ def read_runs(
             Arrow, spreadsheets, MATLAB, HDF5, NumPy, JSON, ROS bags, MCAP, ULog, MDF and WPILOG. A path of signals
             may follow `::`. A pattern such as `runs/*.csv` reads files that are a run each. Tables in memory are a
             pandas or polars DataFrame, an Arrow table, an xarray Dataset, a dict of arrays, or a list of records.
-        columns: of the source, where its names are not this program's: a packaged preset (`vesc,pole_pairs=7`), a
-            preset's file, or a dict such as `{"motor_speed_rpm": "speed"}`. They win over the robot's file.
+        columns: columns of the source, where its names are not this program's: a packaged preset
+            (`vesc,pole_pairs=7`), a preset's file, or a dict such as `{"motor_speed_rpm": "speed"}`. They win over
+            the robot's file.
         measured, battery, robot, of_turns: as for `of_arrays`.
 
     Raises:

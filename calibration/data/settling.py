@@ -66,10 +66,10 @@ class Signal:
     """Readings of a channel in settled travel, sample by sample.
 
     Attributes:
-        channel: of the table of settled runs.
+        channel: channel of the table of settled runs.
         shown: its readings [unit of the column], NaN if missing or a glitch.
         angle: the angle whose rate it is [unit of its column], empty if the channel is read directly.
-        step: of its instrument [unit], 0 without.
+        step: step of its instrument [unit], 0 without.
         largest: size of its readings but for the last two in a hundred.
         glitches: True for readings far from the readings next to them, see `find_glitches`, shape (rows,).
     """
@@ -113,8 +113,8 @@ class Stretch:
         begin, end: of time [s].
         why: empty for a settled run, else one of `REASONS`.
         channel: the channel to blame, if there is one.
-        size: of its change, as a share.
-        mean, sd: of each channel, by name [unit of the column]. Only for a settled run.
+        size: size of its change, as a share.
+        mean, sd: mean and standard deviation of each channel, by name [unit of the column]. Only for a settled run.
         drift: change of each channel over it, by name [unit].
         imposed: mean of what drives the motors.
         glitches: readings of each channel that its mean leaves out, by name. Only channels that have some.
@@ -144,9 +144,9 @@ class Settled:
     """Settled travel of a log.
 
     Attributes:
-        runs: of the log.
+        runs: runs of the log.
         stretches: all of them, in the order of the log.
-        signals: of its channels.
+        signals: signals of its channels.
         shortest, drift: as requested.
         gaps: rows after which samples are missing.
         scatter: sd of each channel between stretches under the same conditions beyond their own sds, by name [unit].
@@ -372,7 +372,7 @@ def find_glitches(
         shown: readings, NaN where missing.
         levels: rows of each level, in the order of time.
         width: readings that a median is of.
-        step: of the instrument [unit of the readings].
+        step: step of the instrument [unit of the readings].
         drift: largest change of a mean within a stretch, as a share of it. None: the readings are an angle.
     """
     from scipy.ndimage import binary_opening, median_filter

@@ -130,7 +130,7 @@ def unsigned_current_channels(columns: Columns, layout: Layout) -> tuple[Instrum
     their side backward.
 
     Args:
-        columns: of the table.
+        columns: columns of the table.
     """
     if not layout.sides or not set(layout.sides) <= set(columns):
         return ()

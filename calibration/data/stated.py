@@ -54,7 +54,7 @@ def taken_apart(table: Json, where: str, prefix: str = "") -> dict[str, float]:
     """Replaces each `value ± sd` of a table and its subtables by the value. Returns the sds by dotted name.
 
     Raises:
-        BadConfiguration: as `stated_number`.
+        BadConfiguration: for the same reasons as `stated_number`.
     """
     sds: dict[str, float] = {}
     for key, value in table.items():

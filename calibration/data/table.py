@@ -41,7 +41,7 @@ def drive_of_sides(columns: Columns, layout: Layout) -> np.ndarray:
     negative backward.
 
     Args:
-        columns: of a table that turns.
+        columns: columns of a table that turns.
     """
     alike = np.ones(len(next(iter(columns.values()))))
     each = np.stack([columns.get(name, columns.get("duty", alike)) for name in layout.sides])
@@ -258,7 +258,7 @@ class Runs:
             discharge: charge already taken from it [C].
 
         Raises:
-            BadData: as `configurations`.
+            BadData: for the same reasons as `configurations`.
         """
         from mmrjax.model.conditions import Conditions
 

@@ -24,7 +24,7 @@ def used_rows(runs: Runs, robot: Robot, most: int = ROWS) -> Runs:
 
     Raises:
         BadConfiguration: other objects than `Runs` and a `Robot`, or as `thin_rows`.
-        BadData: as `Runs.of` and `thin_rows`.
+        BadData: for the same reasons as `Runs.of` and `thin_rows`.
     """
     for name, value, kind in (("runs", runs, Runs), ("robot", robot, Robot)):
         if not isinstance(value, kind):

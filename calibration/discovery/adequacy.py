@@ -71,8 +71,8 @@ class Diagnosis:
 
     Attributes:
         linear: the fit, linearised.
-        scores: of effects and curves.
-        test: of the residuals.
+        scores: scores of effects and curves.
+        test: test of the residuals.
     """
 
     linear: Linearization

@@ -47,7 +47,7 @@ def supplying_effects(space: CandidateSpace, active: Sequence[str], amplitude: n
 
     Args:
         active: name of the effect in each slot.
-        amplitude: of each.
+        amplitude: amplitude of each.
         z: coordinates of the fit.
     """
     negative = [n for n, a in zip(active, amplitude, strict=True) if n and a <= 0 and space.library[n].dissipative]
@@ -103,8 +103,8 @@ class Candidate:
         z: coordinates, see `ActiveSet`.
         sd: their posterior sds.
         cost: the objective [½σ²].
-        amplitude: in prior sds of each slot's effect (0 if empty).
-        size: of each slot over the largest plausible amplitude in its direction, 0 if empty.
+        amplitude: amplitude in prior sds of each slot's effect (0 if empty).
+        size: size of each slot over the largest plausible amplitude in its direction, 0 if empty.
         plausible: True if each amplitude has a plausible size, is off its bounds, and has a sign that physics allows.
         nearly: True if it is plausible except for amplitudes up to `settings.stretched` times the largest.
         converged: True if the fit is an optimum.
@@ -178,9 +178,9 @@ class BaseFit:
     """The base fitted without effects.
 
     Attributes:
-        candidate: without effects.
-        reading: of each row [SI], shape (rows, channels).
-        space: without the rows that it cannot reach.
+        candidate: candidate without effects.
+        reading: reading of each row [SI], shape (rows, channels).
+        space: space without the rows that it cannot reach.
         unusable: indices of those.
     """
 

@@ -33,8 +33,8 @@ class Shift:
 
     Attributes:
         name: dotted, of the parameter.
-        index: of its coordinate.
-        fit: of all other parameters. Its cost excludes the prior.
+        index: index of its coordinate.
+        fit: fit of all other parameters. Its cost excludes the prior.
     """
 
     name: str
@@ -47,7 +47,7 @@ def prior_shift_scores(jacobian: np.ndarray, residual: np.ndarray) -> tuple[np.n
     without its prior [prior sds].
 
     Args:
-        jacobian, residual: of a fit, the priors' residuals last.
+        jacobian, residual: Jacobian and residual of a fit, the priors' residuals last.
     """
     half = np.linalg.solve(np.linalg.cholesky(jacobian.T @ jacobian), jacobian.T)
     prior_rows = np.arange(len(residual) - jacobian.shape[1], len(residual))

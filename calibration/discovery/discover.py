@@ -129,7 +129,7 @@ def discover(
             or without series a usual one, halved and doubled.
         stated: parameter → (mean, sd) [SI], priors that replace the fields'.
         library: effects to test.
-        replicates: of the bootstrap.
+        replicates: replicates of the bootstrap.
         seed: random seed.
         prefer: criterion for the leader of a class, `fit` or `held-out`.
         forbidden: kinds of experiments (`menu.KINDS`) and configurations that are not proposed.
@@ -198,14 +198,14 @@ class LoopInput:
     """Context of the loop's stages: a table, its robot, the settings, and callbacks.
 
     Attributes:
-        runs: without copies.
-        numbers: of the rows, as in messages.
+        runs: runs without copies.
+        numbers: numbers of the rows, as in messages.
         robot: as `preparation.prepare` returns it.
-        noise: of the readings.
+        noise: noise of the readings.
         stated: priors (mean, sd) [SI].
         settings: statistical.
         library: effects to test.
-        notes: on all of these.
+        notes: notes on all of these.
         at_first: those to report before the first fit.
         progress: callback for progress notes.
         keep: function that stores each stage when it ends. A stored stage contains the results of the stages before.
@@ -336,7 +336,7 @@ class Sds:
     """Noise of a verdict.
 
     Attributes:
-        noise: of the readings.
+        noise: noise of the readings.
         factors: changes of the given sds by channel, empty for none.
         remarks: notes on the noise.
     """
@@ -1029,7 +1029,7 @@ def _residuals(
 
     Args:
         linear: the fit at z, linearised.
-        reading: of each row [SI], shape (rows or more, channels).
+        reading: reading of each row [SI], shape (rows or more, channels).
     """
     rows, count = len(runs), len(runs.channels)
     counts = (space.weight[:rows] > 0) & np.isfinite(reading[:rows])

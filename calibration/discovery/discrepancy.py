@@ -186,14 +186,14 @@ class Discrepancy:
     Attributes:
         balance, variable, unit: its place and variable, and the unit of the balance.
         effect: name of the curve among the effects of `robot`, the fitted robot with the curve.
-        defect: of the balance, by row, at the fit without the curve, None if single rows do not show it.
-        grid: of the variable [SI].
+        defect: error of the balance, by row, at the fit without the curve, None if single rows do not show it.
+        grid: grid of the variable [SI].
         curve, sd: there [unit], shape (points,). The 95 % band is ±1.96 sd. The band includes the uncertainty
             of the base, so it is wide if base parameters can replace the curve.
         chi2: twice the objective before and after [σ²], priors included.
         z, covariance: posterior of the coordinates of `problem`, the ordinates last.
-        problem: of the fit.
-        reading: of each row [SI], shape (rows, channels).
+        problem: problem of the fit.
+        reading: reading of each row [SI], shape (rows, channels).
         converged: True if the fit is an optimum.
         proposal: a formula for the curve.
     """

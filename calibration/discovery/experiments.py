@@ -55,10 +55,10 @@ class PredictedReadings:
     """Predictions of every reading of the menu, by alternative.
 
     Attributes:
-        names: of the alternatives, the best fit first.
+        names: names of the alternatives, the best fit first.
         experiments: the menu.
         value: readings [SI], shape (alternatives, readings).
-        sd: of the instruments [SI], shape (readings,).
+        sd: standard deviation of the instruments [SI], shape (readings,).
         half: J C^½, so that the covariance due to the fit is half halfᵀ. Shape
             (alternatives, readings, coordinates).
         exists: True for readings that every alternative has, shape (readings,).

@@ -31,10 +31,10 @@ class Hidden:
     """An effect that the names of a fit could hide.
 
     Attributes:
-        name: of the effect.
+        name: name of the effect.
         amplitude: the largest possible one in `unit`.
         sigmas: change of the readings by it, without the name [σ].
-        experiment: of the menu, that would show it, with the expected separation [σ]. "" and 0 for none.
+        experiment: experiment of the menu, that would show it, with the expected separation [σ]. "" and 0 for none.
     """
 
     name: str

@@ -33,7 +33,7 @@ class DiscrepancyLocation:
 
     Attributes:
         place: balance with the curve that explains most, or channel with shifted readings.
-        variable: of the curve.
+        variable: variable of the curve.
         alike: places with curves that explain as much, or that represent balances without curves of their own.
         variables_alike: other variables with curves of similar significance there, the most significant first. Of
             temporary changes one along each axis.

@@ -253,7 +253,7 @@ def _within_seen_range(space: CandidateSpace, beside: CurveBeside, masks: Sequen
     """True for rows with a curve's variable within the range of the rows outside their block, shape (rows,).
 
     Args:
-        masks: of the rows of each block.
+        masks: masks of the rows of each block.
     """
     where, linear, rows = beside.where, beside.left.linear, len(masks[0])
     in_range = np.ones(rows, bool)

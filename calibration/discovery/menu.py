@@ -116,10 +116,10 @@ class Act:
 
     Attributes:
         name: of it.
-        kinds: of `KINDS`.
+        kinds: kinds from `KINDS`.
         reading: function of a robot and of the settings [SI], shape (readings,).
         at: settings, one tuple a reading [SI]. Of `weigh`, the configuration's index and the payload.
-        sd: of a single reading [SI]. None: that of the table's readings of `channel`.
+        sd: standard deviation of a single reading [SI]. None: that of the table's readings of `channel`.
         repeats: number of readings that are averaged.
         channel: channel of the instrument for a reading of zero, "" for another act.
     """
@@ -139,10 +139,10 @@ class Run:
 
     Attributes:
         name: of them.
-        kinds: of `KINDS`, and the configuration where there is one.
+        kinds: kinds from `KINDS`, and the configuration where there is one.
         doing: a row of `experiment_words.DOING`.
         where: the configuration's name, "" for none.
-        motors: of the robot.
+        motors: motors of the robot.
         setup: how the robot is set up.
         voltage [V], slope [deg], payload [kg]: conditions of each run, shape (runs,).
         channels: names of the channels to read.
@@ -154,7 +154,7 @@ class Run:
         repeats: number of readings that are averaged.
         watch: risks of damage, with their indications.
         imposed: quantity instead of the voltage, see `Rig`. `motor_speed`: [rad/s]. `motor_current`: [A].
-        torque: of a brake on the output, against forward rotation [N·m], empty without a brake.
+        torque: torque of a brake on the output, against forward rotation [N·m], empty without a brake.
     """
 
     name: str
@@ -468,8 +468,8 @@ def restrict_run(run: Run, kept: np.ndarray, temperature: np.ndarray, speed: np.
 
     Args:
         kept: by `possible_runs`.
-        temperature: of a winding after long running [°C].
-        speed: of the motor shaft [rad/s]. Both predicted, shape (runs,).
+        temperature: temperature of a winding after long running [°C].
+        speed: speed of the motor shaft [rad/s]. Both predicted, shape (runs,).
     """
     voltage, slope, payload, torque = (
         tuple(v for v, k in zip(x, kept, strict=True) if k) if x else ()

@@ -46,7 +46,7 @@ class Cluster:
     Attributes:
         axis: column, or angle, of the cluster.
         low, high: its ends.
-        level: of a column of words or levels.
+        level: level of a column of words or levels.
         inside, of: number of outliers in it, and of all.
         p: p-value.
     """
@@ -141,7 +141,7 @@ class Screening:
     Attributes:
         base: the fit.
         outliers: indices of the excluded rows, in the order of their exclusion.
-        bases: of the curves for a discrepancy, at that fit.
+        bases: bases of the curves for a discrepancy, at that fit.
         diagnosed: the fit linearised, and scores of effects and curves on its residuals.
         cluster: common property of outliers, which were then not excluded, None for none.
     """

@@ -85,7 +85,8 @@ def resolve(
     Args:
         found: by the loop, from settled rows.
         noise: as given to the loop.
-        population, generations, members, seed: of the search, see `calibrate`.
+        population, generations, members, seed: population, generations, members and seed of the search, see
+            `calibrate`.
         tell: callback for a progress note, or for a sentence of `calibrate`.
 
     Returns:

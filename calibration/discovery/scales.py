@@ -91,8 +91,8 @@ def library_of_size(robot: Robot, conditions: Conditions, library: Library, turn
     """`library` with priors of a rig's size. Unchanged for robots that inherit the nominal one.
 
     Args:
-        robot: of the rig.
-        conditions: of its table, shape (runs,).
+        robot: robot of the rig.
+        conditions: conditions of its table, shape (runs,).
         turned: rotation of its output, see `output_rotation`. NaN: not known.
     """
     if robot.rig.inherits:

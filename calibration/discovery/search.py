@@ -37,7 +37,7 @@ class Search:
     Attributes:
         ladder: every candidate that was fitted.
         best: the proposed one, None without a plausible one.
-        diagnosis: of its residuals.
+        diagnosis: diagnosis of its residuals.
         asked, otherwise: number of simulated sets that were screened by regression, and of unconfirmed ones
             among them, see `screening.Confirmed`.
         room: effects in the program of these fits.

@@ -292,10 +292,10 @@ def infeasible_error(
     """Error for rows that the model does not reach at the best point of all searches.
 
     Args:
-        robot: of that point.
-        status: of each row there, shape (rows,).
+        robot: robot of that point.
+        status: status of each row there, shape (rows,).
         lost: True for rows not reached, shape (rows,).
-        names: of the free parameters.
+        names: names of the free parameters.
     """
 
     def rows(which: np.ndarray) -> str:

@@ -47,8 +47,8 @@ class DriveLog:
         run: name of the run of each row.
         time: [s].
         voltage: [V].
-        position, velocity: in `unit`, per second.
-        current: of the motor [A].
+        position, velocity: position and velocity in `unit`, per second.
+        current: current of the motor [A].
         battery: its voltage at any times [V].
         unit: one of `UNITS`.
     """
@@ -71,8 +71,8 @@ class Tolerances:
         position: [unit].
         velocity: [unit/s].
         effort: [V].
-        period: of the loop [s].
-        delay: of the measurement [s].
+        period: period of the loop [s].
+        delay: delay of the measurement [s].
     """
 
     position: float = 1.0
@@ -89,7 +89,7 @@ class Feedforward:
     Attributes:
         constants, sds: by name, kS, kV, kA, and kG where it applies.
         missing: tests that the log lacks.
-        delay: of the motion behind the voltage, and of a speed's filter [s].
+        delay: delay of the motion behind the voltage, and of a speed's filter [s].
         gains: by name.
         windows: mean voltage, speed, acceleration, and True for one with little acceleration.
     """

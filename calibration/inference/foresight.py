@@ -38,9 +38,9 @@ class Determined:
     """Information that a table has on a free parameter.
 
     Attributes:
-        name: of the parameter.
+        name: name of the parameter.
         value: prior mean [unit].
-        prior_sd: of it [unit].
+        prior_sd: prior standard deviation of it [unit].
         share: posterior over prior sd [-].
         held: True if its prior holds it.
     """
@@ -58,8 +58,8 @@ class Foresight:
     """Information that a table has on a robot.
 
     Attributes:
-        parameters: that `loop` would free.
-        status: of each row, for the values in the file.
+        parameters: parameters that `loop` would free.
+        status: status of each row, for the values in the file.
         noise: source of each channel's sd.
         alike: strongly correlated pairs of parameters, with the correlation of their posterior.
         together: pairs of parameters that the data determine only in combination.

@@ -79,8 +79,8 @@ class Optimum(eqx.Module):
 
     Attributes:
         z: coordinates, shape (parameters,).
-        covariance: of z, from the Gauss-Newton curvature (JᵀJ)⁻¹ of readings and priors, shape (parameters,
-            parameters).
+        covariance: covariance of z, from the Gauss-Newton curvature (JᵀJ)⁻¹ of readings and priors, shape
+            (parameters, parameters).
         sd: root of its diagonal.
         cost: objective, half the sum of squares of misfit and prior [-].
         decrement: further decrease predicted by the Gauss-Newton step from here [-].
@@ -596,7 +596,7 @@ def search_rollouts(
 
     Args:
         starts: shape (members, coordinates).
-        weights: of each member's readings, shape (members, rows, channels).
+        weights: weights of each member's readings, shape (members, rows, channels).
         places: number of searches in parallel.
         rivals: True if all search the same optimum. All then end once `AGREE` of them have ended in one place and no
             other is lower. A search ends earlier if it cannot reach the lowest so far: by `HOPELESS` times the

@@ -66,7 +66,7 @@ def expected_time(text: str, seconds: float) -> float | None:
 
     Args:
         text: line of a stage that begins.
-        seconds: since the loop began.
+        seconds: seconds since the loop began.
     """
     stage, _, rest = text.partition(f" of {OF}, ")
     over = OVER.get(int(stage)) if rest and stage.isdigit() else None

@@ -269,8 +269,8 @@ def _sequence(config: configuration.Climb, robot: Robot, name: str) -> Sequence:
         sequence = terrains.read_sequence(config.sequence, robot, (angles[0], angles[1]))
         if sequence.begins is None and stated[1:] != (None, None):
             raise BadConfiguration(
-                f"--levers-front, --levers-rear: {config.sequence.name} states all angles; expected them only with "
-                "a sequence of voltages (front_V, rear_V)"
+                f"--levers-front, --levers-rear: {config.sequence.name} already gives all angles; give these "
+                "options only with a sequence of voltages (front_V, rear_V)"
             )
     if config.levers_voltage_V is not None:
         sequence = dataclasses.replace(sequence, supply=jnp.asarray(config.levers_voltage_V))

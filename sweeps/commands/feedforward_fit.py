@@ -75,15 +75,17 @@ def drive_log(runs: Runs, unit: str | None = None, as_logged: bool = False) -> D
             break
     else:
         raise BadData(
-            f"{runs.source}: has neither velocity nor position; expected output_speed_rpm, output_angle_deg, "
+            f"{runs.source}: no velocity and no position; expected output_speed_rpm, output_angle_deg, "
             "speed_mm_s, position_mm or motor_speed_rpm, or --columns sysid"
         )
     unit = unit or ("m" if pair[0] == "speed_mm_s" else "rotation")
     if (unit == "m") != (pair[0] == "speed_mm_s") and not as_logged:
-        raise BadConfiguration(f"--unit: got {unit}, but {pair[0]} is read; expected a unit of its position")
+        raise BadConfiguration(
+            f"--unit: got {unit}, but the log is read from {pair[0]}; expected a unit of that position"
+        )
     size = 2 * np.pi if as_logged else UNITS[unit] or 1.0
     if not runs.sampled:
-        raise BadData(f"{runs.source}: has no time; expected a column time_s")
+        raise BadData(f"{runs.source}: no time; expected a column time_s")
     order = np.concatenate(list(runs.rows_by_run().values()))
     duty = runs["duty"] if runs.has("duty") else 1.0
     voltage = np.asarray(runs["supply_voltage_V"] * duty, float)

@@ -87,7 +87,7 @@ def _loop(config: configuration.Loop, beside: configuration.LoopBeside) -> int:
             if name == "ranking":
                 _show_ranking(stages[name], folder, timed, brief=not beside.verbose)
             if name == "verdict":
-                timed(f"{loop_words.verdict_line(stages[name])}; next, errors held out and other noises")
+                timed(f"{loop_words.verdict_line(stages[name])}; next: held-out errors and other noise levels")
             return result
 
         try:
@@ -107,9 +107,7 @@ def _loop(config: configuration.Loop, beside: configuration.LoopBeside) -> int:
         document = loop_report.loop_document(verdict, config.robot, changes_by_effect(verdict))
         page = print_report(document, brief=not beside.verbose)
         if config.resolve and verdict.resolved is None:
-            print_output(
-                "The track model was not asked: nothing remains in slip, track or ground that it has a say in."
-            )
+            print_output("The track model was not run: no error remains in the slip, track or ground balance.")
         verdict.save(folder.results(), config.robot, folder.tables)
         if config.report:
             progress("writing the report")
@@ -131,7 +129,7 @@ def _resolved(
 def _say_out_of_time(within: float, begun: bool) -> None:
     """Report that time was out before a verdict [s]. `begun`: a stage has ended."""
     more = max(5, math.ceil(within / 30))  # twice as much
-    first = "" if begun else f", nor a fit of the base model; give it more, as --within {more}min"
+    first = "" if begun else f", and no fit of the base model; allow more time, such as --within {more}min"
     print_message(f"no verdict within {within:g} s{first}")
 
 
@@ -174,12 +172,12 @@ def _say_kept(stages: Mapping[str, Any], folder: RunFolder, robot_name: str) -> 
         return
     kept = [name for name in stages if folder.keeps(name)]
     if not kept:
-        print_message(f"nothing could be kept of {', '.join(stages)}; the same command begins anew")
+        print_message(f"nothing could be saved of {', '.join(stages)}; the same command starts again")
         return
     print_message(f"kept: {', '.join(kept)}; to continue, run the same command with --out {folder.path}")
     if "verdict" in stages:
         traced = stages["verdict"]
-        print_message(f"{loop_words.verdict_line(traced)}; errors held out and other noises are outstanding")
+        print_message(f"{loop_words.verdict_line(traced)}; held-out errors and other noise levels are still missing")
         return
     if "ranking" in stages:
         for line in (*loop_words.ranking_lines(stages["ranking"]), loop_words.regression_verdict(stages["ranking"])):
@@ -198,7 +196,7 @@ def _say_kept(stages: Mapping[str, Any], folder: RunFolder, robot_name: str) -> 
     robot_file.write_robot(
         robot, folder.partial / REFIT_FILE, note=f"{robot_name}, fitted; the loop has no verdict yet"
     )
-    print_message(f"the best that is known so far is the refit, {folder.partial / REFIT_FILE}")
+    print_message(f"the best result so far is the refit, {folder.partial / REFIT_FILE}")
 
 
 def changes_by_effect(found: DiscoveryResult) -> dict[str, Change]:

@@ -50,19 +50,19 @@ def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> 
     if robot.rig.imposed != "voltage":
         what = imposed.SAID[robot.rig.imposed].words
         raise BadConfiguration(
-            f"--profile: the {what} is imposed on this robot, and a profile drives motors by their voltage; "
-            'simulate a table of runs, or state imposed = "voltage" in the robot\'s file'
+            f"--profile: the {what} is imposed on this robot, but a profile imposes the motor voltage; "
+            'simulate a table of runs, or set imposed = "voltage" in the robot\'s file'
         )
     if robot.loose:
         raise BadConfiguration(
-            "--profile: a profile does not follow a backlash or an elastic joint; set them to 0, or simulate over "
+            "--profile: profiles do not simulate backlash or an elastic joint; set them to 0, or simulate over "
             "time with --model drive"
         )
     for name, load in robot.configurations.items():
         if float(load.torque_gravity) > 0:
             raise BadConfiguration(
-                f"--profile: {name} is an arm whose gravity load varies with its angle, unlike a profile; "
-                "simulate it over time with --model drive"
+                f"--profile: {name} is an arm, whose gravity load varies with its angle; profiles do not cover "
+                "this. Simulate it over time with --model drive"
             )
     source = profiles.read_profile(config.profile)
     for note in source.notes:
@@ -74,22 +74,25 @@ def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> 
     imposed.check_acting(robot, ground, shaft)
     if "speed" in source.modes and not robot.shows_travel:
         raise BadConfiguration(
-            f"{source.source}, speed_mm_s: the robot's load is a shaft, so no channel shows a distance; state "
+            f"{source.source}, speed_mm_s: the robot's load is a shaft, so there is no travelling speed; give "
             "motor_speed_rpm or duty"
         )
     source.check_source(config.battery)
     for column in source.stated:
         if column in beside.stated:
             raise BadConfiguration(
-                f"{OPTIONS[column]}: got it beside {source.source}, which states {column}; expected one of the two"
+                f"{OPTIONS[column]}: got it in addition to {source.source}, which contains {column}; keep one of "
+                "the two"
             )
     _check_charge(robot, config)
     runs = given_runs(robot, beside, config, source.stated)
     for column in source.stated:
         if beside.runs is not None and runs.has(column):
-            print_message(f"{runs.source}, {column}: not used, {source.source} states it")
+            print_message(f"{runs.source}, {column}: not used, because {source.source} gives it")
     if "current_other" in source.values and not config.battery:
-        print_message(f"{source.source}, current_other_A: not used, other consumers are on the battery")
+        print_message(
+            f"{source.source}, current_other_A: not used, because other consumers are supplied by the battery"
+        )
     _check_turning(robot, runs, source)
     _check_cutoff(robot, runs, source, config)
     with open_folder("simulate", config, robot, beside, runs) as folder:
@@ -97,7 +100,9 @@ def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> 
         folder.write_table("segments.csv", capabilities.without_idle(robot, ended.segments))
         folder.write_table("history.csv", capabilities.without_idle(robot, ended.course))
         if not ended.whole:
-            print_message("history.csv ends before the mission does, which has taken more steps than are kept")
+            print_message(
+                "history.csv ends before the mission, because the mission took more steps than can be saved"
+            )
         result = run.SimulationResult("simulate", config.model, robot, runs, ended.table, ended.to_json())
         return run.write_run_folder(
             folder, config, result, print_report(mission_report.missions_document(file, ended), file)
@@ -109,7 +114,7 @@ def _check_turning(robot: Robot, runs: records.Runs, source: ProfileTable) -> No
     if not source.turns:
         return
     names = sorted({str(name) for name in runs.configurations_named(robot)})
-    imposed.check_can_turn(robot, names, f"{source.source} drives the sides apart")
+    imposed.check_can_turn(robot, names, f"{source.source} drives the two sides differently")
     most = max((float(np.abs(source.values[name]).max()) for name in PAIRS[1] if name in source.values), default=0.0)
     supply = np.min(np.abs(source.values["voltage"] if "voltage" in source.values else runs[SUPPLY]))
     if most > supply:
@@ -257,7 +262,7 @@ def rows_to_keep(segment: np.ndarray, current: np.ndarray, most: int, marked: np
 
     Args:
         segment: of each row, not decreasing.
-        current: of each row.
+        current: current of each row.
         most: rows to keep at most.
         marked: rows to keep, of many the last ones.
     """

@@ -80,7 +80,7 @@ def _check_free(picture: configuration.Picture) -> None:
     if file.exists() and not picture.force:
         raise BadConfiguration(f"FILE: {file} exists already; choose another name (--force replaces it)")
     if not file.parent.is_dir():
-        raise BadConfiguration(f"FILE: {file.parent} is no folder; choose another path")
+        raise BadConfiguration(f"FILE: {file.parent} is not a folder; choose another path")
 
 
 def _write(file: Path, draw: Callable[[Path], Any]) -> None:

@@ -62,15 +62,16 @@ def execute(config: configuration.Resonance, beside: configuration.FolderPart) -
         }
     )
     if config.voltages_V[0] <= 0:
-        raise BadConfiguration(f"--voltages: got {config.voltages_V[0]:g}; expected more than 0 to 100, forward")
+        raise BadConfiguration(f"--voltages: got {config.voltages_V[0]:g}; expected above 0 and up to 100, forward")
     if len(config.voltages_V) < FEWEST:
         raise BadConfiguration(
-            f"--voltages: got {len(config.voltages_V)} of them; expected at least {FEWEST}, or no peak over speed "
-            "can be told"
+            f"--voltages: got {len(config.voltages_V)} of them; expected at least {FEWEST}, or peaks over speed "
+            "cannot be found"
         )
     if config.options["duration"] < SHORTEST:
         raise BadConfiguration(
-            f"--duration: got {config.options['duration']:g} s; expected at least {SHORTEST:g} s, or no grousers pass"
+            f"--duration: got {config.options['duration']:g} s; expected at least {SHORTEST:g} s, so that "
+            "grousers pass"
         )
     runs, of_table8 = _points(config, robot)
     conditions = run.conditions_of_runs(robot, runs, config)

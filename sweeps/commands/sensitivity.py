@@ -118,9 +118,7 @@ def _operating_points(
     """The grid of operating points. An axis that varies has one value, the middle of its range."""
     layout = Layout.of(robot)
     if layout.imposed == "motor_current":
-        raise BadConfiguration(
-            "sensitivity: the motors' current is imposed on this robot; simulate and sweep take it"
-        )
+        raise BadConfiguration("sensitivity: the motor current is imposed on this robot; use simulate or sweep")
     table8: dict[str, tuple[float, ...]] = {}
     if layout.table8:
         table8 = CORNERS if config.method in ("sobol", "morris") else WHOLE
@@ -132,15 +130,17 @@ def _operating_points(
         imposed.check_acting(robot, ground, shaft)
         if name in grid_room.AXIS and name != layout.imposed:
             raise BadConfiguration(
-                f"--vary {name}: the robot's file imposes the {words_of(layout.imposed)}; vary that"
+                f"--vary {name}: the robot's file imposes the {words_of(layout.imposed)}; vary it instead"
             )
     if config.battery and "voltage" in ranges:
-        raise BadConfiguration("--vary voltage: acts only without --battery, whose charge sets the voltage")
+        raise BadConfiguration(
+            "--vary voltage: has no effect on battery power, where the state of charge sets the voltage"
+        )
     for name, (low, high) in ranges.items():
         if name in AXES:
             if getattr(config, AXES[name]) is not None:
                 option = AXES[name].partition("_")[0]
-                raise BadConfiguration(f"--vary {name}: --{option} states it too; give one of them")
+                raise BadConfiguration(f"--vary {name}: --{option} sets it too; give one of them")
             axes[AXES[name]] = ((low + high) / 2 / (RPM if name == "motor_speed" else 1.0),)
     try:
         stated = GridPart(configurations=config.configurations, surface=config.surface, **axes)
@@ -168,7 +168,10 @@ def _inputs(
     robot, present = file.robot, tuple(dict.fromkeys(map(str, runs["configuration"])))
     if config.posterior:
         if config.parameters:
-            raise BadConfiguration("--posterior: says what is uncertain, and so does --parameters; give one of them")
+            raise BadConfiguration(
+                "--posterior: cannot be combined with --parameters, since both choose the "
+                "uncertain inputs; give one of them"
+            )
         return uncertain_inputs.inputs_from_posterior(robot, beside_robot(file), ranges)
     names = config.parameters or uncertain_inputs.default_input_names(
         robot, present, config.battery, config.model, not {*OF_TURNS}.isdisjoint(ranges)

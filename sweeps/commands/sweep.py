@@ -47,7 +47,7 @@ def execute(config: Campaign | Sweep, options: StoreOptions) -> int:
 
     Args:
         config: the configuration.
-        options: of a store. With any of them a small grid leaves one too.
+        options: options of a store. With any of them a small grid leaves one too.
     """
     file = load_robot(config)
     if not isinstance(config, Sweep):
@@ -57,8 +57,8 @@ def execute(config: Campaign | Sweep, options: StoreOptions) -> int:
     count = math.prod(map(len, grid.grid_axes(resolved, file.robot, config.battery).values()))
     small = not options.of_store and (count <= TABLE or config.posterior is not None)
     if not options.of_store and not small:
-        print_message(f"{count:,} points: {STORE} in place of runs.csv, which a sweep of at most {TABLE:,} has; "
-             "the same command with --export csv writes it too")  # fmt: skip
+        print_message(f"{count:,} points: too many for runs.csv (limit {TABLE:,}), so results go to {STORE}; "
+             "add --export csv to get a CSV as well")  # fmt: skip
     for note in notes:
         print_message(note)
     if small:
@@ -170,8 +170,8 @@ def _refuse_without_space(size: int, share: float, path: Path) -> None:
     """Refuse a sweep whose results would not fit.
 
     Args:
-        size: of the whole store [bytes].
-        share: of it that is still to be written.
+        size: size of the whole store [bytes].
+        share: share of it that is still to be written.
     """
     needed, free = math.ceil(size * share) + MARGIN, _free(path)
     if needed > free:
@@ -225,7 +225,7 @@ def simulate_chunks(store: SweepStore, job: scale.Job, options: StoreOptions, po
     total = sum(job.blocks.count(k) for k in own_chunks)
     before = total - sum(job.blocks.count(k) for k in left)
     if before:
-        print_message(f"{store.partial}: goes on after {before:,} of {total:,} points")
+        print_message(f"{store.partial}: resumes after {before:,} of {total:,} points")
     times = scale.Times()
     try:
         with progress_bar(total, quiet=False, done=before, rate=True) as advance:
@@ -275,8 +275,8 @@ def finish_sweep(
                 )
     done = store.done()
     if not store.finished:
-        print_output(f"{len(done)} of {len(job.blocks)} chunks of {store.partial} are done; the last share "
-            "finishes the sweep or the same command without --shard")  # fmt: skip
+        print_output(f"{len(done)} of {len(job.blocks)} chunks of {store.partial} are finished; the last share, "
+                     "or the same command without --shard, completes the sweep")  # fmt: skip
         return DONE
     if options.export:
         from sweeps.points import export

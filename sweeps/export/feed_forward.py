@@ -142,25 +142,25 @@ def fates_in_tables(joint: Joint, constants: Sequence[Constant]) -> list[Fate]:
     means = {c.name: c.value for c in constants}
     changed = []
     for fate in fates:
-        if fate.name == "friction by the joint's surroundings":
+        if fate.name == "friction from the joint's surroundings":
             values = ", ".join(f"{n.removeprefix('surroundings.')} = {means[n]:.4g}" for n in joint.surroundings())
             changed.append(Fate(fate.name, APPROXIMATED, f"their mean over the runs: {values}"))
         elif fate.name == mujoco.PLAY:
             play, twist = float(joint.load.backlash), float(joint.load.twist(1.0))
-            how = f"tables have no state: {play:.3g} rad of play and {twist:.3g} rad/(N·m) of twist"
+            how = f"tables have no state, so  {play:.3g} rad of play and {twist:.3g} rad/(N·m) of twist are ignored"
             changed.append(Fate(fate.name, DROPPED, how))
         elif fate.name == mujoco.CONTROLLER:
-            changed.append(Fate(fate.name, DROPPED, "tables give the voltage that it would find"))
+            changed.append(Fate(fate.name, DROPPED, "the tables give the voltage that it would produce"))
         else:
             changed.append(Fate(fate.name, fate.verdict, fate.how.replace("functions of the law", "the tables")))
-    how = "no table: add (armature) · acceleration to the torque"
-    lines = Fate("steady states", HELD, "straight lines between points")
+    how = "not in the tables: add armature · acceleration to the torque"
+    lines = Fate("steady states", HELD, "linear interpolation between points")
     return [*changed, Fate("rotor inertia", APPROXIMATED, how), lines]
 
 
 def effects_in_tables(joint: Joint) -> dict[str, str]:
     """Words for each effect inside the joint without a memory. One with a memory is held at its settled value."""
-    settled = "its settled value: a table has no memory"
+    settled = "its settled value, since a table has no state"
     return {e.name: settled if e.memory_size is not None else "the tables" for e in joint.inside}
 
 

@@ -63,8 +63,8 @@ def draw_output_spread(output: np.ndarray, label: str, varied: Mapping[str, Vari
     """Histogram of an output, its median over the two names that it follows most, and over both together.
 
     Args:
-        output: of the points that settled.
-        label: with its unit.
+        output: output of the points that settled.
+        label: label with its unit.
         varied: by name, at these points.
     """
     names = sorted(varied, key=lambda name: -variance_share(varied[name].values, output))[:2]
@@ -107,8 +107,8 @@ def draw_grid_statuses(codes: np.ndarray, names: Sequence[str], across: Varied, 
     """Status of the points of a grid over two of its axes.
 
     Args:
-        codes: of the points.
-        names: of the codes.
+        codes: codes of the points.
+        names: names of the codes.
     """
     fig, axes = new_figure(1, 1, 4.2)
     ax = axes[0, 0]

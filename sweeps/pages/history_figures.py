@@ -112,9 +112,10 @@ class Start:
     Attributes:
         name: heading, configuration, status.
         time: [s].
-        current: of all motors [A].
+        current: current of all motors [A].
         speed, theoretical: V and r_k ω_k [mm/s].
-        stages: of the start. Current and speeds are drawn, and kept here, times its `sense`. None without numbers.
+        stages: stages of the start. Current and speeds are drawn, and kept here, times its `sense`. None without
+            numbers.
     """
 
     name: str
@@ -372,7 +373,7 @@ class Course:
     Attributes:
         name: heading, status.
         time: [s].
-        readings: of each channel by name, in the unit of its column.
+        readings: readings of each channel by name, in the unit of its column.
     """
 
     name: str
@@ -395,7 +396,7 @@ def members_as_read(read: Iterable[Channel], history: Any, status: np.ndarray, n
 
     Args:
         read: channels of the robot.
-        history: of the batch.
+        history: history of the batch.
         status: codes of how its members ended.
         names: headings of the members.
     """
@@ -460,7 +461,7 @@ def draw_frequency_response(runs: Runs, read: Sequence[Channel], simulated: Mapp
     """Gain and phase of each channel over the frequency of the drive: measured as points, simulated as lines.
 
     Args:
-        runs: with measured and simulated columns.
+        runs: runs with measured and simulated columns.
         read: channels.
         simulated: prefixes of the simulated columns, and their names.
     """

@@ -103,14 +103,14 @@ def _section(file: RobotFile, nominal: Robot) -> Section:
     first, value = Column("parameter"), "{:.6g}"
     if not file.robot.rig.inherits:
         columns = (first, Column("value", form=value), *end, Column("source"))
-        text = "Its parameters (SI units). A loss or limit that its file does not state is absent."
+        text = "Its parameters (SI units). Losses and limits that are not in its file are left out."
         rows, table = capabilities.rig_parameters(file), "own"
     else:
         columns = (first, Column("this robot", form=value), Column("nominal", form=value), *end)
         text = "Parameters that differ from the nominal robot's (SI units):"
         rows, table = capabilities.changed_parameters(file.robot, nominal), "changed"
     if not rows:
-        text = "Every parameter is the nominal robot's (Tables 1-7 of the paper and the makers' sheets)."
+        text = "Every parameter has its value from the nominal robot (Tables 1-7 of the paper and data sheets)."
     return Section(
         "The robot", (Note(text), Table(table, columns, [(f"`{name}`", *rest) for name, *rest in rows])), "robot"
     )

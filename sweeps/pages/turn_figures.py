@@ -37,7 +37,7 @@ def _outline(axes: Axes, robot: Robot, row: Json, x: float, y: float, yaw: float
 def _plan(axes: Axes) -> None:
     axes.set_aspect("equal", adjustable="datalim")
     axes.set_xlabel("to the right of the start [m]", color=INK)
-    axes.set_ylabel("uphill, or ahead of the start [m]", color=INK)
+    axes.set_ylabel("uphill of the start, or ahead of it [m]", color=INK)
 
 
 def draw_turn_circle(robot: Robot, row: Json) -> Figure:

@@ -367,10 +367,10 @@ class EnergyUse(NamedTuple):
     """Use of the supply's power at operating points.
 
     Attributes:
-        labels: of the points, with a star where the robot slides on its own adhesion, so that it is raised.
+        labels: labels of the points, with a star where the robot slides on its own adhesion, so that it is raised.
         power: item of `SPLIT`, and `other` → [W].
         total: power of the supply [W].
-        status: of each point.
+        status: status of each point.
     """
 
     labels: list[str]

@@ -110,7 +110,7 @@ def grid_conditions(config: GridPart, robot: Robot, battery: bool = False) -> Ru
         battery: whether the runs are on the battery.
 
     Raises:
-        BadConfiguration: as `resolve_grid`.
+        BadConfiguration: for the same reasons as `resolve_grid`.
     """
     config = resolve_grid(config, robot, battery)
     values = grid_axes(config, robot, battery)

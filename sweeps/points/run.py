@@ -48,9 +48,9 @@ class SimulationResult:
     """Result of a simulating command. All its files are written from it.
 
     Attributes:
-        command: that simulated.
+        command: command that simulated.
         model: fidelity.
-        robot: that was simulated.
+        robot: robot that was simulated.
         runs: what was simulated.
         table: their conditions and outcomes, a column each as in `runs.csv`.
         further: what the command adds to `result.json`.
@@ -233,7 +233,7 @@ def write_run_folder(
     """Write what every simulating command leaves, and move the folder into place. Returns the exit code.
 
     Args:
-        folder: of the command.
+        folder: folder of the command.
         config: its configuration, with the robot's name.
         page: its page.
     """

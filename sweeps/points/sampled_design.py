@@ -55,8 +55,8 @@ class Samples:
 
     Attributes:
         design: one of `DESIGNS`.
-        number: of points.
-        seed: of everything random.
+        number: number of points.
+        seed: seed of everything random.
         marginals: quantile function of each name, from (0, 1) to its unit.
         names: theirs.
         joint: further names that are sampled together, a posterior. They take the design's last dimensions.
@@ -188,8 +188,8 @@ class Blocks:
     """The chunks of a sweep: equal boxes of consecutive points, those at the end of the split axis smaller.
 
     Attributes:
-        shape: of all points.
-        size: of one box, 1 along the axes before the split one and whole along those after.
+        shape: shape of all points.
+        size: size of one box, 1 along the axes before the split one and whole along those after.
     """
 
     shape: tuple[int, ...]

@@ -53,11 +53,11 @@ class Job:
     """All that is needed to compute any chunk of a sweep, here or in another process.
 
     Attributes:
-        robot: that is varied.
+        robot: robot that is varied.
         task: what every point does.
         outputs: names.
         storage: type that they are stored in.
-        profile: that every point follows, if any.
+        profile: profile that every point follows, if any.
     """
 
     robot: Robot
@@ -166,7 +166,7 @@ class _Asked(NamedTuple):
     """Outputs of each point by a fidelity with its options, and their form in the store.
 
     Attributes:
-        factors: of each output, the SI value of its unit in tables.
+        factors: factors of each output, the SI value of its unit in tables.
         surface: adhesion of each configuration as a ratio to the bench's.
     """
 
@@ -240,9 +240,9 @@ class Piece:
     """A chunk under way.
 
     Attributes:
-        chunk: its number.
+        chunk: number of chunk.
         arrays: by variable, which may be on a device still.
-        values: of its points, a row each, where they are at hand.
+        values: values of its points, a row each, where they are at hand.
         told: points of it that count as done already.
     """
 

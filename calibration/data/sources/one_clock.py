@@ -27,10 +27,10 @@ class Elapsed(NamedTuple):
     """Times of a clock.
 
     Attributes:
-        time: since its first sample [s], shape (n,).
+        time: time since its first sample [s], shape (n,).
         first: that sample by the clock [s].
-        unit: of its numbers, empty for dates.
-        period: of a counter that wraps, else 0.
+        unit: unit of its numbers, empty for dates.
+        period: period of a counter that wraps, else 0.
     """
 
     time: np.ndarray
@@ -98,7 +98,7 @@ def on_one_grid(
     there. Other rows have none.
 
     Args:
-        name: of the source.
+        name: name of the source.
         chosen: signals by the name of their column, each with a clock.
         is_held: True for a column whose values are held.
         is_measured: True for a column of readings.
@@ -182,7 +182,7 @@ def used_once(rows: np.ndarray, time: np.ndarray, values: np.ndarray) -> np.ndar
 
     Args:
         rows: time of the rows [s], shape (rows,).
-        time, values: of the samples, shape (samples,).
+        time, values: time and values of the samples, shape (samples,).
     """
     numbers = np.asarray(values, float)
     sound = np.isfinite(numbers)

@@ -157,10 +157,10 @@ def open_signals(path: Path, within: str, name: str, form: Format) -> Source:
 
     Args:
         within: path of signals in it, empty for all.
-        name: of the file, for messages.
+        name: name of the file, for messages.
 
     Raises:
-        BadData: as `Format.signals`. No signal, or none below `within`.
+        BadData: for the same reasons as `Format.signals`. No signal, or none below `within`.
     """
     if path.is_dir():
         for item in path.iterdir():
@@ -180,7 +180,7 @@ def open_object(source: Any) -> Source:
     """The signals of a table in memory.
 
     Raises:
-        BadData: as `in_memory.of_object`.
+        BadData: for the same reasons as `in_memory.of_object`.
     """
     kind, signals = in_memory.of_object(source)
     return checked_source(kind, kind, signals)

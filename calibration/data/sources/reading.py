@@ -55,7 +55,7 @@ def read_columns(source: Any, layout: Layout, columns: Preset | None = None, bet
     Args:
         source: a path, perhaps with `::` and the path of signals in the file, or a table in memory
             (`in_memory.EXPECTED`). A pattern such as `runs/*.csv` names files that are a run each.
-        layout: of the table's robot.
+        layout: layout of the table's robot.
         columns: names of the source's columns, in addition to the robot's. They win over these.
         between: `linear` if the imposed quantity follows straight lines between samples, as in `Rig.between_rows`.
 
@@ -115,7 +115,7 @@ def read_whole_table(path: Path, within: str = "") -> NamedArrays | None:
     """Returns every column of a table in a file, unchanged, None for text, whose comments have a meaning.
 
     Raises:
-        BadData: as `read_columns`. Signals with separate clocks, which do not form one table.
+        BadData: for the same reasons as `read_columns`. Signals with separate clocks, which do not form one table.
     """
     name = path.name or str(path)
     form = opening.format_of(path, name)
