@@ -155,6 +155,6 @@ def _refuse_contradictions(*groups: tuple[list[tuple[float, str]], str, str]) ->
     ]
     if faults:
         raise BadConfiguration(
-            f"--from-sheet: contradiction: {'; '.join(faults)}; expected at most {100 * LARGEST:.0f} %; all data must "
+            f"--from-sheet: contradiction: {'; '.join(faults)}; expected at most {100 * LARGEST:.0f} %; data must "
             "be for the motor shaft at one voltage"
         )
