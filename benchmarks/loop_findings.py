@@ -67,11 +67,12 @@ def findings(given: Any, found: Any) -> dict[str, Any]:
             {
                 "name": m[0],
                 "class": list(m),
+                "families": list(families),
                 "stated": [s.name for s in v],
                 "standing": "established" if m[0] in named else "tentative",
                 "size": float(best.size[best.active.index(m[0])]),
             }
-            for m, v in zip(members, stated, strict=True)
+            for m, v, families in zip(members, stated, () if alike is None else alike.families, strict=True)
         ],
         "standing": None if stood is None else [stood.stands, stood.why, list(stood.effects)],
         "tests": _tests(found),

@@ -160,7 +160,9 @@ def established_families(x: dict) -> list[tuple[str, ...]]:
         return [tuple(x["mechanism"]["families"])]
     if x["verdict"] not in ("named", "class"):
         return []
-    return [tuple(dict.fromkeys(BY_NAME[n].family() for n in c if n in BY_NAME)) for c in x["classes"]]
+    listed = {tuple(e["class"]): tuple(e.get("families", ())) for e in x.get("effects", ())}
+    members = [tuple(dict.fromkeys(BY_NAME[n].family() for n in c if n in BY_NAME)) for c in x["classes"]]
+    return [listed.get(tuple(c)) or families for c, families in zip(x["classes"], members, strict=True)]
 
 
 def same_mechanism(family: str, truth: dict, loosely: bool = False) -> bool:

@@ -8,6 +8,8 @@ import pytest
 from calibration.data.runs import Runs
 from calibration.discovery.description import missed_channels, remaining_errors, unused_inputs
 from calibration.discovery.loop_notes import Missed, Missing, Summary
+from calibration.inference.blocks import predictable_blocks
+from calibration.inference.observers import Histories
 from calibration.words import loop_words
 from mmrjax.model import channels
 
@@ -73,6 +75,26 @@ def test_effects_describe_what_the_refit_misses_if_unseen_errors_are_halved(refi
 
     left = remaining_errors(space, runs, (Missed("total_current", 0.27, noise),), unseen(refit), unseen(found))
     assert left == (() if remains is None else (Missed("total_current", pytest.approx(remains), noise),))
+
+
+@pytest.mark.parametrize("configurations", [("a",), ("a", "b"), ("a", "a")])
+def test_a_run_without_others_is_held_out_in_parts_of_its_time(configurations, monkeypatch):
+    samples = 12
+    runs = Runs("log.csv", {
+        "time_s": np.concatenate([start + np.arange(samples) * 0.1 for start, _ in enumerate(configurations)]),
+        "run_id": np.repeat(np.arange(len(configurations)).astype(str), samples),
+        "configuration": np.repeat(configurations, samples), "supply_voltage_V": np.full(samples * len(configurations), 9.0),
+    })  # fmt: skip
+    monkeypatch.setattr(Runs, "configurations_named", lambda self, robot: self["configuration"])
+    coordinates = SimpleNamespace(names=tuple(f"{c}.friction" for c in set(configurations)), tied=())
+    problem = SimpleNamespace(base=None, coordinates=coordinates, observe=Histories)
+    kinds = predictable_blocks(runs, problem)
+    if configurations == ("a", "a"):
+        assert list(kinds) == ["run"]
+        return
+    quarters = np.tile(np.repeat(np.arange(4), samples // 4), len(configurations))
+    assert list(kinds) == ["part"]
+    np.testing.assert_array_equal(np.argmax(list(kinds["part"].values()), 0), quarters)
 
 
 def test_the_first_sentence_has_the_error_that_remains():

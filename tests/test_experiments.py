@@ -1,6 +1,7 @@
 """The next experiment: what the menu foresees, which experiment is chosen, and what its readings say."""
 
 import dataclasses
+import types
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -14,7 +15,8 @@ from worlds import laws, settled, tables
 
 from calibration.data import robot_file
 from calibration.data.input_errors import BadConfiguration
-from calibration.discovery import experiments, menu, predicted
+from calibration.described import describe
+from calibration.discovery import discover, experiments, menu, predicted
 from calibration.discovery.candidates import Candidate, fill_slots, fit_candidates
 from calibration.discovery.classes import Classes, Shift
 from calibration.discovery.location import DiscrepancyLocation
@@ -24,6 +26,7 @@ from mmrjax.effects import BY_NAME, OF_CHANNELS
 from mmrjax.fidelities.steady import IMPLICIT
 from mmrjax.model import channels, paper_robots, params
 from mmrjax.model.conditions import Conditions
+from mmrjax.model.rig import Rig
 from sweeps import stage_files
 from tests.commands import read_rig
 
@@ -553,3 +556,14 @@ def test_every_experiment_is_kept_in_a_stage(tmp_path):
     stage_files.write_stage(tmp_path / "menu", MENU)
     assert stage_files.read_stage(tmp_path / "menu") == MENU
     assert {type(e) for e in MENU} == {menu.Act, menu.Run}
+
+
+def test_a_class_of_a_servos_log_has_no_experiment_of_the_menu():
+    """The menu has no runs with a goal: the loop ended in an IndexError once effects of a servo were inseparable."""
+    seen = types.SimpleNamespace(menu=True, word="sample")
+    base = types.SimpleNamespace(rig=Rig(imposed="goal_angle"))
+    space = types.SimpleNamespace(bare=types.SimpleNamespace(observe=seen, base=base))
+    traced = types.SimpleNamespace(verdict="class", where=None, alike=object())
+    proposal = discover._proposal(space, traced, None)
+    assert proposal.experiments == (experiments.NONE,)
+    assert describe(proposal.instruction).endswith("has no goals of a controller")

@@ -379,13 +379,14 @@ def test_mjlab_actuator_gives_the_torque_of_jax_within_a_stand_in(with_effects, 
     )
     actuator.edit_spec(spec, ["left", "right"])
     model = spec.compile()
-    assert model.nu == 2 and model.dof_armature[0] == pytest.approx(3.35e-6 * 48**2 * 0.74)
+    assert model.nu == 2 and model.dof_armature[0] == pytest.approx(3.35e-6 * 48**2 * (0.74 + 1 / 0.74) / 2)
     actuator.initialize(model, None, types.SimpleNamespace(nworld=3), "cpu")
     rng = np.random.default_rng(3)
     native = law_source.module_from_source(law_source.jax_source(drive, known))
     state = native.initial_state((3, 2))
     for _ in range(3):
         volts, speeds = rng.uniform(-24, 24, (3, 2)), rng.uniform(-8, 8, (3, 2))
+        state["speed"] = speeds if not state["speed"].any() else state["speed"]  # it moves at the first step
         found = actuator.compute(types.SimpleNamespace(effort_target=volts, pos=0 * volts, vel=speeds))
         torque, state, _ = native.actuator(native.PARAMS, state, volts, 0 * volts, speeds, model.opt.timestep)
         assert_allclose(found, torque, rtol=1e-9)
@@ -708,6 +709,12 @@ APART = {
     "servo": (servo.RIG.format(**servo.TRUE), 5e-4, 4e-4),
     "servo with an integral and a lag": (
         servo.RIG.format(**servo.TRUE | {"ki": 20.0}).replace("kp =", "lag = 0.005\nkp ="), None, 3e-4),
+    **{
+        f"servo with a lossy gear, {load} load": (
+            servo.RIG.format(**servo.TRUE | {"load": inertia}).replace("efficiency_load = 1.0", f"efficiency_load = {share}")
+            + f"torque_constant = {torque}\n", None, 4e-4)
+        for load, inertia, torque, share in (("light", 1e-4, 0.0, 0.7), ("heavy", 0.02, 0.0, 0.7), ("driving", 5e-4, -0.25, 0.4))
+    },
     "play": (VOLTS.replace("efficiency_load = 1.0", "efficiency_load = 0.7") + "backlash = 0.03\n", 6e-3, 2e-3),
     "elastic joint": (VOLTS + "stiffness = 12.0\ndamping = 0.02\n", 1e-3, 4e-4),
     "elastic joint with play": (VOLTS + "stiffness = 12.0\ndamping = 0.02\nbacklash = 0.03\n", 1e-3, 1e-3),
@@ -730,11 +737,12 @@ def test_exported_servo_and_play_move_as_the_drive(name, rig):
         assert np.abs(angles - native).max() < in_mujoco
     module = law_source.module_from_source(law_source.jax_source(drive, law_source.constants_of(drive, None, None)))
     inertia, step = float(drive.load.inertia) + float(module.armature(module.PARAMS)), 5e-5
+    resisting = float(drive.load.torque_constant)
 
     def advance(at, _):
         state, speed, angle = at
         torque, state, _ = module.actuator(module.PARAMS, state, command, angle, speed, step)
-        speed = speed + step * torque / inertia
+        speed = speed + step * (torque - resisting) / inertia
         return (state, speed, angle + step * speed), angle
 
     angles = jax.lax.scan(advance, (module.initial_state(), 0.0, 0.0), None, length=10_001)[1]

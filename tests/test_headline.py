@@ -63,6 +63,16 @@ def test_it_is_said_with_the_noises_at_which_it_holds():
     )
 
 
+def test_a_law_that_an_ammeter_imitates_is_stated_with_it():
+    both = "loss torque that changes with speed", "reading of total current that changes with speed"
+    found = headline(law("windage", families=both))
+    assert found.level == "class" and loop_words.loop_answer(found) == (
+        f"No: a {both[0]} or a {both[1]} (windage; these data cannot tell which) is missing."
+    )
+    verdict = loop_words.verdict_sentences(law("windage", families=both))
+    assert verdict.startswith(f"Missing: windage, or a {both[1]} (these data cannot tell which) (")
+
+
 def test_what_only_some_noises_cannot_tell_apart_comes_after_what_all_list():
     found = headline(of_mechanism(SLIP, DROP), [(0.7, of_mechanism(DROP)), (1.4, of_mechanism(DROP, "x that is"))])
     assert found.claims == ((DROP, SLIP, "x that is"),) and found.shared == (1,)

@@ -11,7 +11,9 @@ import mmrjax as mm
 from calibration.data import rig_facts
 from calibration.data import runs as records
 from calibration.data.input_errors import BadConfiguration, BadData
+from calibration.discovery import scales
 from calibration.inference.observers import SettledRuns
+from mmrjax import effects
 from mmrjax.errors import UsageError
 from mmrjax.fidelities.steady import steady_batch
 from mmrjax.model import params
@@ -123,6 +125,15 @@ def test_a_test_with_the_shaft_held_gives_constant_friction_and_resistance(tmp_p
     for name, right in (("resistance", 0.25), ("torque_constant", 0.12), ("friction_coulomb", 0.03)):
         p = found.parameters[f"motor.{name}"]
         assert abs(p.value - right) < 4 * p.sd and p.sd < 0.1 * right, (name, p.value, p.sd)
+
+
+def test_a_gearbox_that_loses_nothing_by_its_file_has_no_effect(tmp_path):
+    """A saturating motor was led by `gear_quadratic_loss`, though its file states an efficiency of exactly 1."""
+    kind = effects.BY_NAME["gear_quadratic_loss"]
+    exact = RIG_HELD.format(imposed="motor_speed", channels='"motor_current"')
+    lossy = exact.replace('load = "1 ± 0"', 'load = "0.9 ± 5 %"')
+    applies = [scales.effect_applies(kind, read_rig(tmp_path, text)) for text in (exact, lossy)]
+    assert applies == [False, True]
 
 
 @pytest.mark.slow

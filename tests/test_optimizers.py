@@ -518,7 +518,7 @@ def test_rival_searches_end_where_three_agree_unless_one_is_lower():
     data = problem.Data(0 * one, one, one, jnp.zeros(2), jnp.asarray(1.0))
     begin = jnp.asarray([[0.1, 0.0], [0.2, 0.0], [0.3, 0.0], [-1.2, 1.0], [-1.9, 2.0], [0.0, 0.0]])
     weights = jnp.ones((6, 1, 3))
-    found, _ = fit.search_rollouts(evaluate, begin, data, weights, 40, 2, rivals=True)
+    found, _ = fit.search_rollouts(evaluate, begin, data, weights, 40, 2, within=fit.SAME)
     assert_allclose(found.cost[3:5], 0, atol=1e-3)
     assert found.converged[3:5].all() and found.steps[3] > found.steps[0]
     evaluated.clear()
@@ -528,7 +528,7 @@ def test_rival_searches_end_where_three_agree_unless_one_is_lower():
     # Nor does a search go on that cannot come down to where another one is.
     assert (found.steps[[0, 1, 2, 5]] < alone.steps[[0, 1, 2, 5]]).all()
     assert (found.cost[:3] < 31).all()
-    same, _ = fit.search_rollouts(evaluate, begin[:3], data, weights[:3], 40, 2, rivals=True)
+    same, _ = fit.search_rollouts(evaluate, begin[:3], data, weights[:3], 40, 2, within=fit.SAME)
     assert (same.steps <= alone.steps[:3]).all()
 
 
@@ -546,8 +546,8 @@ def test_a_rival_that_promises_much_and_brings_nothing_ends():
     one = jnp.ones((1, 2))
     data = problem.Data(0 * one, one, one, jnp.zeros(1), jnp.asarray(1.0))
     found, alone = (
-        fit.search_rollouts(evaluate, np.array([[0.5], [0.0]]), data, np.ones((2, 1, 2)), 40, 2, rivals=r)[0]
-        for r in (True, False)
+        fit.search_rollouts(evaluate, np.array([[0.5], [0.0]]), data, np.ones((2, 1, 2)), 40, 2, within=distance)[0]
+        for distance in (3.0, np.inf)
     )
     assert_allclose(found.cost, [2, 2000], atol=1e-3)
     assert found.steps[1] <= fit.LATELY + 1 < alone.steps[1]

@@ -578,6 +578,8 @@ def test_three_motors_forward_and_reverse_are_calibrated(tmp_path):
         ([np.nan, *[3.0] * 9], 0.0),
         ([], 0.0),
         (np.random.default_rng(1).uniform(0, 1, 40), 0.0),
+        (3.0 * np.r_[-8:0, 1:9], 0.0),  # set by a person, as the currents of a clamped motor
+        (3.0 * np.r_[-8:0, 1:9, 4], 3.0),  # an uneven count is a display's
     ],
 )
 def test_step_of_readings_is_their_common_divisor(readings, step):

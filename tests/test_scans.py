@@ -132,10 +132,11 @@ def test_searches_that_converged_elsewhere_are_counted():
 
 def test_a_fit_that_may_be_proposed_goes_on_until_it_is_an_optimum(monkeypatch):
     """A fit that has used up its steps and lies within a class's margin of the lowest one goes on from its end."""
-    calls = []
+    calls, distances = [], []
 
-    def ended(evaluate, starts, *_, **__):
+    def ended(evaluate, starts, *_, within):
         calls.append(np.asarray(starts))
+        distances.append(within)
         cost = np.array([100.0, 102.0, 110.0]) - len(calls)
         return SimpleNamespace(
             z=np.asarray(starts) + 1,
@@ -153,6 +154,8 @@ def test_a_fit_that_may_be_proposed_goes_on_until_it_is_an_optimum(monkeypatch):
     calls.clear()
     search(np.zeros((3, 2)), np.ones(3), most=6)  # as many steps as are stated
     assert len(calls) == 1
+    search(np.zeros((3, 2)), np.arange(3), most=6)  # fits of different readings have no lowest one
+    assert distances == [time_histories.NEAR] * 3 + [np.inf]
 
 
 def test_a_scan_sees_a_minimum_that_no_point_of_its_grid_is_in():

@@ -237,12 +237,19 @@ def test_a_refit_without_a_block_is_a_step_of_gauss_and_newton():
     observe = SimpleNamespace(long=True, at=at, unreachable=lambda status: status > 0)
     data = SimpleNamespace(weight=np.ones((rows, 2)), sd=sd)
     block = np.arange(rows) < 4
-    found = predict_unseen(SimpleNamespace(observe=observe, data=data), np.zeros(3), [block])
-    kept = np.concatenate([(slopes[~block] / sd[~block][..., None]).reshape(-1, 3), np.eye(3)])
-    wanted = np.concatenate([(measured[~block] / sd[~block]).ravel(), np.zeros(3)])
-    z = np.linalg.lstsq(kept, wanted, rcond=None)[0]
+
+    def optimum(kept):
+        rows_of_fit = np.concatenate([(slopes[kept] / sd[kept][..., None]).reshape(-1, 3), np.eye(3)])
+        wanted = np.concatenate([(measured[kept] / sd[kept]).ravel(), np.zeros(3)])
+        return np.linalg.lstsq(rows_of_fit, wanted, rcond=None)[0]
+
+    every, z = optimum(np.ones(rows, bool)), optimum(~block)
+    found = predict_unseen(SimpleNamespace(observe=observe, data=data), every, [block])
     assert_allclose(found.z[0], z, rtol=1e-9)
     assert_allclose(found.reading[block], slopes[block] @ z, rtol=1e-9)
+    # Where the search ended short of the optimum, the step that remains is no effect of the block.
+    short = predict_unseen(SimpleNamespace(observe=observe, data=data), every + 0.1, [block])
+    assert_allclose(short.z[0], z + 0.1, rtol=1e-9)
     assert np.isnan(found.reading[~block]).all() and list(found.block) == [0] * 4 + [-1] * 8
 
 

@@ -9,9 +9,11 @@ from numpy.testing import assert_allclose, assert_array_equal
 from calibration.data.instruments import display_step
 from calibration.data.runs import Runs
 from calibration.data.table import Layout
+from calibration.data.thinning import thin_rows
 from calibration.discovery.score_tests import UNSURE, _factors
 from calibration.inference import noise, series_noise
 from calibration.inference.observers import SettledRuns
+from calibration.inference.observers.time_histories import Histories
 from mmrjax.model import channels, quantities
 
 SLOPES = np.arange(0.0, 21.0, 5.0)
@@ -170,3 +172,26 @@ def test_readings_of_motors_at_rest_do_not_tell_the_noise_of_those_that_turn():
     runs = dataclasses.replace(runs, columns={**runs.columns, "motor_speed_rpm": speed})
     _, motor, _ = found(runs)
     assert_allclose(motor.sd(quantities.RPM * np.array([30.0, 600.0])) / quantities.RPM, 3.0, rtol=0.35)
+
+
+@pytest.mark.parametrize("thinned", [False, True])
+def test_noise_of_a_log_is_that_of_its_readings_over_time(thinned):
+    """Speed after steps of a voltage, with a time constant of 60 ms, read at 100 Hz."""
+    time, random = np.arange(0.0, 8.0, 0.01), np.random.default_rng(5)
+    since = time % 1.0
+    speed = 40.0 * (1 - np.exp(-since / 0.06)) + 0.3 * random.standard_normal(len(time))
+    current = np.exp(-since / 0.06) + 0.01 * random.standard_normal(len(time))
+    columns = {
+        "configuration": np.full(len(time), "4W2T"),
+        "run_id": np.repeat(["a", "b"], len(time) // 2),
+        "time_s": time,
+        "total_current_A": current,
+        "motor_speed_rpm": speed / quantities.RPM,
+        "speed_mm_s": np.full(len(time), np.nan),
+    }
+    runs = Runs("log", columns, layout=Layout())
+    runs = thin_rows(runs, 80) if thinned else runs
+    known = noise.infer_noise(runs, np.nan_to_num(Histories.sizes(runs), nan=1.0))
+    assert known.source[:2] == ("series", "series") and known.along_series[0].axis == "time_s"
+    assert known.along_series[0].share == 0.0
+    assert_allclose(known.sd[0, :2], [0.01, 0.3], rtol=0.15)

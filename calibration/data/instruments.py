@@ -26,9 +26,10 @@ COARSEST = 0.25
 def step_of(readings: np.ndarray) -> float:
     """Returns the largest common divisor of all differences between readings, by Euclid's algorithm.
 
-    It is 0 if the divisor is no larger than rounding, or if there are too few different readings.
+    It is 0 if the divisor is no larger than rounding, or if there are too few different readings. A ladder of levels
+    from its first rung on, each as often, at most one left out, was set by a person: it shows no display.
     """
-    levels = np.unique(readings[np.isfinite(readings)])
+    levels, counts = np.unique(readings[np.isfinite(readings)], return_counts=True)
     if levels.size < FEWEST:
         return 0.0
     step, largest = 0.0, float(np.ptp(levels))
@@ -40,7 +41,9 @@ def step_of(readings: np.ndarray) -> float:
         step = a
         if step < SMALLEST * largest:
             return 0.0
-    return step
+    ladder = largest < (levels.size + 0.5) * step and np.min(np.abs(levels)) < 1.5 * step
+    set_by_hand = ladder and np.ptp(counts) == 0
+    return 0.0 if set_by_hand else step
 
 
 def display_step(readings: np.ndarray, channel: Channel) -> float:

@@ -13,12 +13,15 @@ from calibration.data import Names
 from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.adequacy import Diagnosis
 from calibration.discovery.candidates import Candidate, candidate_of_fit, fit_candidates, start_of_fit
+from calibration.discovery.projection import explained_by
 from calibration.discovery.score_tests import ScoreTable
 from calibration.discovery.screening import fit_by_regression
 from calibration.discovery.search import without_each
 from calibration.discovery.settings import Settings
+from calibration.inference.bases import place_in_words
 from calibration.inference.held_out import search_each
 from calibration.inference.linearization import Linearization
+from mmrjax.model import channels
 
 # --- stated values that may be wrong instead of an effect -----------------------------------------
 
@@ -131,7 +134,7 @@ class Classes:
     Attributes:
         members: for each effect of the best candidate, the effects indistinguishable from it, itself first.
         stated: for each, base parameters whose stated value may be wrong instead.
-        families: for each, the families of its members, the leader's first.
+        families: for each, the families of its members, the leader's first, then those of `ammeter_families`.
         ladder: all candidates that were fitted, including those of the search.
     """
 
@@ -141,9 +144,11 @@ class Classes:
     ladder: tuple[Candidate, ...]
 
     @property
-    def single(self) -> bool:
-        """True if each effect has one name."""
-        return all(len(m) + len(s) == 1 for m, s in zip(self.members, self.stated, strict=True))
+    def alone(self) -> list[bool]:
+        """For each effect, True if the data separate it from everything else."""
+        return [
+            len(m) == len(f) == 1 and not s for m, s, f in zip(self.members, self.stated, self.families, strict=True)
+        ]
 
 
 def signature_cosines(space: CandidateSpace, scores: ScoreTable) -> np.ndarray:
@@ -194,7 +199,8 @@ def find_classes(
     wanted_fits = [(w, start_of_fit(space, best, w, settings, left.scores)) for w in new]
     fitted += fit_candidates(space, wanted_fits, settings)
     simulated |= {c.key: c for c in fitted if c.simulated}
-    members, stated = [], []
+    members, stated, ammeter = [], [], []
+    jacobian, residual = map(np.asarray, (after.linear.jacobian, after.linear.residual))
     for slot, (name, gain) in enumerate(zip(best.effects, gains, strict=True)):
         same = [name]
         within = {f: max(settings.same, f**2 * gain) for f in (settings.form, settings.form_family)}
@@ -208,17 +214,60 @@ def find_classes(
             if s == slot and (rival.nearly if akin else rival.plausible) and 2 * (rival.cost - best.cost) <= limit:
                 same.append(other)
         members.append(tuple(same))
+        column = jacobian[: after.linear.readings, space.free + slot, None]
+        rest = without_amplitude(space, best, slot, jacobian, residual)
+        ammeter.append(ammeter_families(space, *rest, column, family, settings))
         linear = left.linear if len(best.effects) == 1 else None
         shifts = find_prior_shifts(space, fewer[slot], SURE * gain, settings, linear)
         stated.append(tuple(s for s in shifts if 2 * (s.fit.cost - best.cost) <= within[settings.form]))
     by_regression = [c for c in (*ladder, *fitted) if not c.simulated and c.key not in simulated]
     latest = {c.key: c for c in by_regression} | {k: c for k, c in simulated.items() if not c.simulated}
     all_fits = (*latest.values(), *(c for c in (*ladder, *fitted) if c.simulated))
-    return Classes(
-        tuple(members), tuple(stated), tuple(families_of_members(space, same) for same in members), all_fits
-    )
+    families = ((*families_of_members(space, same), *also) for same, also in zip(members, ammeter, strict=True))
+    return Classes(tuple(members), tuple(stated), tuple(tuple(dict.fromkeys(f)) for f in families), all_fits)
 
 
 def families_of_members(space: CandidateSpace, members: Sequence[str]) -> Names:
     """Families of the members of a class, the leader's first."""
     return tuple(dict.fromkeys(space.library[m].family() for m in members))
+
+
+def without_amplitude(
+    space: CandidateSpace, best: Candidate, slot: int, jacobian: np.ndarray, residual: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Jacobian and residual of a fit without one of its effects, whose contribution the residual gets back."""
+    k = space.free + slot
+    return np.delete(jacobian, [k, k + len(best.active)], 1), residual - jacobian[:, k] * best.z[k]
+
+
+def ammeter_families(
+    space: CandidateSpace,
+    jacobian: np.ndarray,
+    residual: np.ndarray,
+    columns: np.ndarray,
+    family: str,
+    settings: Settings,
+) -> Names:
+    """Families of errors of an ammeter that explain as much as effects do, by the same change of its readings alone.
+
+    Where the speed is imposed, the current is the first reading of a torque. Only a further one that responds to
+    the torque, by enough over its noise, separates a loss from an error of the ammeter.
+
+    Args:
+        jacobian, residual: of the fit without the effects.
+        columns: of the effects over the readings.
+        family: of the effects.
+    """
+    names = channels.channel_names(space.bare.channels)
+    if space.bare.base.rig.imposed != "motor_speed":
+        return ()
+    explained = explained_by(jacobian, residual)
+    most = explained(columns)[0]
+    least = most - max(settings.same, settings.form**2 * most)
+    driver = family.partition(" that ")[2].replace("with load", "with current")
+    return tuple(
+        f"{place_in_words(name)} that {driver}"
+        for k, name in enumerate(names)
+        if name.endswith("current")
+        and explained(columns * (np.arange(len(columns)) % len(names) == k)[:, None])[0] >= least
+    )

@@ -26,7 +26,7 @@ from calibration.discovery import findings, kept, menu, prediction, preference, 
 from calibration.discovery.active_set import CandidateSpace, candidate_space
 from calibration.discovery.adequacy import AdequacyTest, Diagnosis
 from calibration.discovery.candidates import BaseFit, Candidate, fill_slots, fit_base, fit_candidates, start_of_fit
-from calibration.discovery.classes import Classes, find_classes, signature_cosines
+from calibration.discovery.classes import Classes, ammeter_families, find_classes, signature_cosines
 from calibration.discovery.description import missed_channels, remaining_errors, unused_inputs
 from calibration.discovery.discrepancy import CurveBeside, locate_discrepancy
 from calibration.discovery.experiments import Proposal, propose_denser_runs, propose_nothing, propose_separating
@@ -53,7 +53,7 @@ from calibration.discovery.result import (
     ReadingsOfRows,
     Sensitivity,
 )
-from calibration.discovery.score_tests import Statistics, bootstrap
+from calibration.discovery.score_tests import Statistics, bootstrap, family_columns
 from calibration.discovery.screening import screen_by_weak_form, with_program_room
 from calibration.discovery.search import Search, best_of_each_size, diagnose_candidate, search_effects
 from calibration.discovery.settings import FIT, HELD_OUT, WITHOUT_NAME, Settings, settings_for
@@ -559,6 +559,7 @@ def _verdict(given: LoopInput, screened: Screening, left: Diagnosis, sds: Sds, s
         progress(next_step("mechanism"))
         ladder = [c for c in (*searched.ladder, *([] if model is None else model[:1]))]
         mechanism = find_mechanism(space, runs, base, left, ladder, bases, beside, predicted, settings)
+        mechanism = mechanism and _or_ammeter(space, mechanism, left.linear, bases, where, settings)
         level = "place" if mechanism is None or mechanism.fails else "mechanism"
     if model is None:
         return stages(level, screened, left, sds, searched, where=where, standing=stood, mechanism=mechanism)
@@ -575,12 +576,32 @@ def _verdict(given: LoopInput, screened: Screening, left: Diagnosis, sds: Sds, s
         searched, alike, compared = preference.prefer_by_held_out(space, runs, searched, alike, bases, settings)
         after = searched.diagnosis or after
         stood = stood.renamed(dict(zip(best.active, (searched.best or best).active, strict=True)))
-    single_members = [len(m) + len(v) == 1 for m, v in zip(alike.members, alike.stated, strict=True)]
-    verdict = (
-        "named" if all(one for one, name in zip(single_members, established_names, strict=True) if name) else "class"
-    )
+    alone = all(one for one, name in zip(alike.alone, established_names, strict=True) if name)
+    verdict = "named" if alone else "class"
     remains = locate_discrepancy(after, bases, space.included) if after.test.rejected_with_margin else None
     return stages(verdict, screened, left, sds, searched, alike, remains, standing=stood, held_out=compared)
+
+
+def _or_ammeter(
+    space: CandidateSpace,
+    found: Mechanism,
+    linear: Linearization,
+    bases: Bases,
+    where: DiscrepancyLocation,
+    settings: Settings,
+) -> Mechanism:
+    """A mechanism with the errors of an ammeter that explain as much, see `ammeter_families`.
+
+    Args:
+        linear: the base fit, linearised.
+        where: location of its discrepancy, the curve of a mechanism without effects.
+    """
+    columns = np.asarray(linear.signatures)[:, [space.library.names[k] in found.effects for k in space.library.of]]
+    if not found.effects:
+        columns = family_columns(linear, bases, bases_room.family_names(bases).index((where.place, where.variable)))
+    fit = np.asarray(linear.jacobian), np.asarray(linear.residual)
+    also = ammeter_families(space, *fit, columns, found.families[0], settings)
+    return dataclasses.replace(found, families=tuple(dict.fromkeys((*found.families, *also))))
 
 
 def choose_effects(
@@ -1044,7 +1065,7 @@ def _proposal(space: CandidateSpace, traced: LoopStages, settings: Settings) -> 
     """Next experiment, None if there are no alternatives to separate, or if the model does not describe the runs."""
     if traced.verdict == "undescribed":
         return None
-    if not space.bare.observe.menu:
+    if not space.bare.observe.menu or space.bare.base.rig.follows_goal:
         return propose_nothing(space) if traced.verdict != "none" else None
     if traced.verdict in WITHOUT_NAME and traced.where is not None:
         return propose_denser_runs(space, traced.where, settings)

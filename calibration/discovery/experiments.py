@@ -387,7 +387,8 @@ def propose_denser_runs(space: CandidateSpace, where: DiscrepancyLocation, setti
 
 def propose_nothing(space: CandidateSpace) -> Proposal:
     """Empty proposal, because the menu has no runs of the table's kind."""
-    return Proposal((NONE,), Remark("no_menu", word=space.bare.observe.word), (), 0.0, False, ())
+    word = "goals of a controller" if space.bare.base.rig.follows_goal else space.bare.observe.word
+    return Proposal((NONE,), Remark("no_menu", word=word), (), 0.0, False, ())
 
 
 def propose_separating(space: CandidateSpace, best: Candidate, found: Classes, settings: Settings) -> Proposal | None:

@@ -23,7 +23,9 @@ def headline(said: Summary, others: Sequence[tuple[float, Summary]] = ()) -> Hea
         return Headline(said.verdict, (), factors)
     laws, _ = _shared_claims([[m.names for m in s.missing if m.established] for s in every])
     if laws:
-        alone = all(len(names) == 1 for names in laws) and not any(m.values for s in every for m in s.missing)
+        alone = all(len(names) == 1 for names in laws) and not any(
+            m.values or len(m.families) > len(m.names) for s in every for m in s.missing
+        )
         effects_of_laws = [
             next(m for m in said.missing if m.established and set(m.names) & set(names)) for names in laws
         ]

@@ -233,8 +233,10 @@ class Mechanism:
 
     @property
     def drivers(self) -> Names:
-        """Possible drivers. The families differ in these, or only in the equation."""
-        return tuple(dict.fromkeys(f.partition(" that ")[2] for f in self.families))
+        """Possible drivers. The families differ in these, or only in the equation. An error of an ammeter has the
+        driver of the loss that it imitates."""
+        losses = [f for f in self.families if f == self.families[0] or not f.startswith("reading")]
+        return tuple(dict.fromkeys(f.partition(" that ")[2] for f in losses))
 
     @property
     def fails(self) -> Names:

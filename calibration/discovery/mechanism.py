@@ -7,7 +7,7 @@ mechanism explains, its predictions, and its repetition without parts of the dat
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -21,6 +21,7 @@ from calibration.discovery.discrepancy import CurveBeside
 from calibration.discovery.location import DiscrepancyLocation
 from calibration.discovery.loop_notes import AGAIN, HALF, Mechanism
 from calibration.discovery.prediction import Gain, HeldOutScore, Predicted
+from calibration.discovery.projection import explained_by
 from calibration.discovery.score_tests import family_columns
 from calibration.discovery.settings import Settings
 from calibration.discovery.standing import chosen_again
@@ -331,7 +332,7 @@ def _curve_again(
     ]
     columns = [family_columns(linear, bases, k) for k in smooth]
     jacobian, residual = np.asarray(linear.jacobian), np.asarray(linear.residual)
-    explains = _explained_by(jacobian, residual)
+    explains = explained_by(jacobian, residual)
     explained_before = [
         explains(c)[1] for c, explained_by_akin in zip(columns, akin, strict=True) if explained_by_akin
     ]
@@ -341,7 +342,7 @@ def _curve_again(
         kept_readings = np.repeat(~rows, linear.readings // len(rows))
         kept_residuals = np.concatenate([kept_readings, np.ones(len(residual) - len(kept_readings), bool)])
         explained = [
-            _explained_by(jacobian[kept_residuals], residual[kept_residuals])(c[kept_readings]) for c in columns
+            explained_by(jacobian[kept_residuals], residual[kept_residuals])(c[kept_readings]) for c in columns
         ]
         explained_by_akin = [f for f, a in zip(explained, akin, strict=True) if a]
         if not explained_by_akin or max(told for _, told in explained_by_akin) < 0.5 * max(explained_before):
@@ -349,16 +350,3 @@ def _curve_again(
         most = max(gain for gain, _ in explained)
         again.append(max(gain for gain, _ in explained_by_akin) >= most - max(settings.same, settings.form**2 * most))
     return float(np.mean(again)) if again else 1.0
-
-
-def _explained_by(jacobian: np.ndarray, residual: np.ndarray) -> Callable[[np.ndarray], tuple[float, float]]:
-    """Function of columns over the readings: decrease of χ² and remaining sensitivity of all columns [σ²]."""
-    half = np.linalg.solve(np.linalg.cholesky(jacobian.T @ jacobian), jacobian.T)
-    projected_residual = residual - half.T @ (half @ residual)
-
-    def of(columns: np.ndarray) -> tuple[float, float]:
-        inside = half[:, : len(columns)] @ columns
-        inner, told = columns.T @ columns - inside.T @ inside, columns.T @ projected_residual[: len(columns)]
-        return float(told @ np.linalg.lstsq(inner, told, rcond=1e-9)[0]), float(np.trace(inner))
-
-    return of

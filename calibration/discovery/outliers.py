@@ -17,7 +17,7 @@ from scipy.special import ndtr, ndtri
 from calibration.data import Columns
 from calibration.data.runs import Runs
 from calibration.discovery.active_set import CandidateSpace
-from calibration.discovery.candidates import BaseFit, Candidate, empty_slots, fit_base
+from calibration.discovery.candidates import FEW, BaseFit, Candidate, empty_slots, fit_base
 from calibration.discovery.experiments import predict_menu
 from calibration.discovery.score_tests import Diagnosed, ScoreTable, bootstrap, diagnose_fit
 from calibration.discovery.settings import Settings
@@ -312,7 +312,7 @@ def _refit_without(base: BaseFit, rows: np.ndarray, settings: Settings, where: s
 def _set_gross_aside(base: BaseFit, settings: Settings, where: str) -> tuple[BaseFit, tuple[int, ...]]:
     """Exclude rows so far from the fit that they distort it, and with it every score.
 
-    They are found at a robust fit: Cauchy's weights, iterated (Holland and Welsch 1977).
+    They are found at a robust fit: Cauchy's weights, iterated with a few steps each (Holland and Welsch 1977).
     """
     space = base.space
     data, included = space.bare.data, space.included
@@ -327,7 +327,7 @@ def _set_gross_aside(base: BaseFit, settings: Settings, where: str) -> tuple[Bas
         return base, ()
     for _ in range(settings.reweightings):
         robust = space.weight / np.sqrt(1 + (far / settings.cauchy) ** 2)[:, None]
-        optima, observations = search_each(problem, [start], [robust], None if active is None else [active])
+        optima, observations = search_each(problem, [start], [robust], None if active is None else [active], FEW)
         far, start = off(np.asarray(observations.reading[0])), np.asarray(optima.z[0])
     gross = included & (far > settings.gross * max(1.0, float(np.median(far[included]))))
     if not gross.any() or gross.sum() > settings.outliers(int(included.sum())):

@@ -161,7 +161,10 @@ def _classes_of_leader(
     return Classes(
         tuple(members[name] for name in leader.effects),
         tuple(stated[name] for name in leader.effects),
-        tuple(families_of_members(space, members[name]) for name in leader.effects),
+        tuple(
+            tuple(dict.fromkeys((*families_of_members(space, members[name]), *others)))
+            for name, others in zip(leader.effects, alike.families, strict=True)
+        ),
         (best, *alike.ladder, *fitted),
     )
 

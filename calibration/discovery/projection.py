@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 
 import numpy as np
 
@@ -64,3 +65,16 @@ def defect_by_row(linear: Linearization, place: str) -> Defect:
     value, sd = np.full(linear.rows, np.nan), np.full(linear.rows, np.nan)
     value[places], sd[places] = b / norm2, 1 / np.sqrt(norm2)
     return Defect(value, sd)
+
+
+def explained_by(jacobian: np.ndarray, residual: np.ndarray) -> Callable[[np.ndarray], tuple[float, float]]:
+    """Function of columns over the readings: decrease of χ² and remaining sensitivity of all columns [σ²]."""
+    half = np.linalg.solve(np.linalg.cholesky(jacobian.T @ jacobian), jacobian.T)
+    projected_residual = residual - half.T @ (half @ residual)
+
+    def of(columns: np.ndarray) -> tuple[float, float]:
+        inside = half[:, : len(columns)] @ columns
+        inner, told = columns.T @ columns - inside.T @ inside, columns.T @ projected_residual[: len(columns)]
+        return float(told @ np.linalg.lstsq(inner, told, rcond=1e-9)[0]), float(np.trace(inner))
+
+    return of

@@ -19,6 +19,7 @@ import numpy as np
 from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.adequacy import AdequacyTest, Diagnosis
 from calibration.discovery.candidates import Candidate
+from calibration.discovery.classes import without_amplitude
 from calibration.discovery.discrepancy import CurveBeside, locate_discrepancy
 from calibration.discovery.loop_notes import CurveOver, NameSupport, NameTest
 from calibration.discovery.projection import Projection
@@ -457,9 +458,7 @@ def _put_back(
     confirm.
     """
     jacobian, residual, signatures = beside
-    k = space.free + best.active.index(effect)
-    residual_without = residual - jacobian[:, k] * best.z[k]
-    return np.delete(jacobian, [k, k + len(best.active)], 1), residual_without, signatures
+    return *without_amplitude(space, best, best.active.index(effect), jacobian, residual), signatures
 
 
 def chosen_again(

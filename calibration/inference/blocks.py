@@ -27,8 +27,8 @@ BLOCKS: dict[str, Names] = {
     "voltage_configuration": ("configuration", "supply_voltage_V"),
     "run": ("run_id",),
 }
-#: Name of the blocks by sharpness of a turn.
-TURN = "turn"
+#: Names of the blocks by sharpness of a turn, and by parts of a run over time.
+TURN, PART = "turn", "part"
 
 
 def kind_in_words(by: str, joint: str = " and ") -> str:
@@ -75,6 +75,22 @@ def blocks_by_sharpness(runs: Runs) -> Columns:
     return {f"{share[mine].min():.2g} to {share[mine].max():.2g}": mine for mine in rows} if len(rows) > 1 else {}
 
 
+def parts_over_time(runs: Runs) -> Columns:
+    """Label → mask of its rows, for `PARTS` consecutive parts of the time of each run.
+
+    Empty if a configuration has several runs, because these are blocks.
+    """
+    names, run = np.unique(runs.run_names, return_inverse=True)
+    if len(names) > len(np.unique(runs["configuration"])):
+        return {}
+    part = np.zeros(len(runs), int)
+    for k in range(len(names)):
+        time = runs["time_s"][run == k]
+        edges = np.linspace(time.min(), time.max(), PARTS + 1)
+        part[run == k] = np.searchsorted(edges[1:-1], time, side="right")
+    return {f"{k + 1} of {PARTS}": part == k for k in np.unique(part)}
+
+
 def blocks_of_kind(runs: Runs, by: str) -> Columns:
     """Label → mask of its rows, for each block of `by`, empty if the data do not vary in it.
 
@@ -82,6 +98,8 @@ def blocks_of_kind(runs: Runs, by: str) -> Columns:
     """
     if by == TURN:
         return blocks_by_sharpness(runs) if runs.turns else {}
+    if by == PART:
+        return parts_over_time(runs)
     columns = [c for c in BLOCKS[by] if runs.has(c) and (c in NO_CONDITIONS or c in runs.axes)]
     if len(columns) < len(BLOCKS[by]):
         return {}

@@ -157,8 +157,8 @@ def default_noise(shown: Iterable[Channel]) -> str:
 def infer_noise(runs: Runs, sizes: np.ndarray, stated: str | None = None) -> Noise:
     """Noise as `noise_from_table`, but known before any fit.
 
-    Instead of an estimate from the misfit it takes the scatter along series (`series_noise`), or `default_noise` if
-    the table has none.
+    Instead of an estimate from the misfit it takes the scatter along series or over time (`series_noise`), or
+    `default_noise` if the table has no series.
 
     Raises:
         BadConfiguration, BadData: for the same reasons as `noise_from_table`.
@@ -168,7 +168,7 @@ def infer_noise(runs: Runs, sizes: np.ndarray, stated: str | None = None) -> Noi
         return given
     sd, words, series = given.sd.copy(), list(given.source), []
     guess = noise_from_table(runs, sizes, default_noise(runs.channels))
-    from_series = (None,) * len(words) if runs.sampled else series_noise.estimate_noise(runs, sizes)
+    from_series = series_noise.estimate_noise(runs, sizes)
     for k in np.flatnonzero(given.estimated):
         estimate = from_series[k]
         if estimate is None:

@@ -587,7 +587,7 @@ def search_rollouts(
     max_steps: int,
     places: int,
     *,
-    rivals: bool = False,
+    within: float = np.inf,
 ) -> tuple[Optimum, Observation]:
     """`levenberg_marquardt` of any number of members with its steps in Python, so that rollouts are compiled once.
 
@@ -598,15 +598,16 @@ def search_rollouts(
         starts: shape (members, coordinates).
         weights: weights of each member's readings, shape (members, rows, channels).
         places: number of searches in parallel.
-        rivals: True if all search the same optimum. All then end once `AGREE` of them have ended in one place and no
-            other is lower. A search ends earlier if it cannot reach the lowest so far: by `HOPELESS` times the
-            predicted decrease of its step, or by the decrease of its last `LATELY` steps.
+        within: distance from the lowest objective that matters, for members with the same readings. A search ends
+            that cannot come so near: by `HOPELESS` times the predicted decrease of its step, or by the decrease of
+            its last `LATELY` steps. `SAME` if all search the same optimum. All then end once `AGREE` of them have
+            ended in one place and no other is lower.
 
     Returns:
         End of each search, and the observation there.
     """
     starts, weights, solver = np.asarray(starts), np.asarray(weights), _solver(data, long=True)
-    assigned = Places(range(len(starts)), max(places, len(starts) * rivals))
+    assigned = Places(range(len(starts)), max(places, len(starts) * (within <= SAME)))
     cost, ahead = np.full(len(starts), np.inf), starts[assigned.member]
     trail = np.full((2 * LATELY, len(assigned.member)), np.nan)
     progress: Progress | None = None
@@ -634,15 +635,15 @@ def search_rollouts(
         over = state.over | (state.steps >= max_steps) | (ends.decrement < small)
         over = over | (trail[0] - ends.cost < SAME + STALLED * ends.cost)
         cost[assigned.holds[going]] = ends.cost[going]
-        if rivals:
+        if within < np.inf:
             done = np.r_[[*assigned.ended], assigned.holds[over & assigned.taken]].astype(int)
             lowest = np.min(cost[done], initial=np.inf)
             lower = assigned.taken & ~over & (ends.cost < lowest - SAME)
-            agree = np.sum(cost[done] < lowest + SAME) >= AGREE and not lower.any()
+            agree = within <= SAME and np.sum(cost[done] < lowest + SAME) >= AGREE and not lower.any()
             so_far = min(lowest, np.min(ends.cost[assigned.taken]))
             with np.errstate(invalid="ignore"):  # NaN of runs that cannot be simulated yet
                 hope = HOPELESS * np.fmin(ends.decrement, trail[LATELY] - ends.cost)
-            over = over | (ends.cost - hope > so_far + SAME) | agree
+            over = over | (ends.cost - hope > so_far + within) | agree
         trail = np.concatenate([trail[1:], ends.cost[None]])
         assigned.leave(over, (ends, observation))
     return jax.tree.map(lambda *x: np.stack(x), *(assigned.ended[k] for k in range(len(starts))))

@@ -1,6 +1,7 @@
-"""Estimate of unstated noise from the scatter of readings along series of conditions.
+"""Estimate of unstated noise from the scatter of readings along series of conditions, or over time.
 
-Along a series, rows that differ in one condition only, a model's readings are smooth. The difference of a reading
+Along a series, rows that differ in one condition only, a model's readings are smooth. So they are over time, except
+after a step of what is imposed, whose few differences are left out. The difference of a reading
 from the line between its neighbours is noise, plus curvature if the steps are wide. So the estimate may be too
 large, never too small (second differences: von Neumann, Ann. Math. Stat. 12 (1941). Gasser, Sroka and
 Jennen-Steinmetz, Biometrika 73 (1986), for any spacing).
@@ -68,8 +69,12 @@ def estimate_noise(runs: Runs, sizes: Float[np.ndarray, "rows channels"]) -> tup
     Args:
         sizes: reference size of each reading for shares [SI].
     """
+    if runs.sampled:  # of all rows of a thinned log, with sizes that are those of the channels
+        runs = runs.whole
+        sizes, by_axis = np.tile(sizes[:1], (len(runs), 1)), {"time_s": list(runs.rows_by_run().values())}
+    else:
+        by_axis = {axis: series_along(runs, axis) for axis in sorted(runs.axes, key=lambda axis: axis != FIRST)}
     measured = runs.measured()
-    by_axis = {axis: series_along(runs, axis) for axis in sorted(runs.axes, key=lambda axis: axis != FIRST)}
     noises: list[SeriesNoise | None] = []
     for k, channel in enumerate(runs.channels):
         each = [_noise_of_channel(channel, measured[:, k], sizes[:, k], runs[a], a, s) for a, s in by_axis.items()]
@@ -131,7 +136,7 @@ def _noise_of_channel(
     difference = weights @ np.nan_to_num(measured)
     least = float(display_step(measured, channel) / np.sqrt(12))
     forms = []
-    for in_share in (False, True):
+    for in_share in (False, True) if np.ptp(sizes) else (False,):
         scale = weights.multiply(sizes[None]) if in_share else weights
         spread = np.sqrt(scale.power(2).sum(1))
         unit, scale = difference / spread, sparse.csr_array(scale.multiply(1 / spread[:, None]))
@@ -145,7 +150,7 @@ def _noise_of_channel(
         forms.append((likely, size, freedom))
     likely, size, freedom = np.array(forms).T
     probability = np.exp(likely - likely.max()) / np.exp(likely - likely.max()).sum()
-    floor, share = np.sqrt(probability) * size * (probability > NEGLIGIBLE)
+    floor, share = (*(np.sqrt(probability) * size * (probability > NEGLIGIBLE)), 0.0)[:2]
     return SeriesNoise(channel, float(floor), float(share), float(probability @ freedom), axis, used, least)
 
 

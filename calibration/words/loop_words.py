@@ -130,7 +130,7 @@ def loop_answer(found: loop_notes.Headline) -> str:
 def _law(names: Sequence[str], families: Sequence[str], values: Sequence[loop_notes.FreedValue]) -> str:
     """`a loss torque that changes with speed (churning or windage; these data cannot tell which)`."""
     each = [*map(freed_value, values), *in_order_of_parts(names)]
-    which = "; these data cannot tell which" if len(each) > 1 else ""
+    which = "; these data cannot tell which" if len(each) + len(families) > 2 else ""
     return f"{' or '.join(map(with_article, families))} ({' or '.join(each)}{which})"
 
 
@@ -257,13 +257,14 @@ def at_other_noise(found: Sequence[Sensitivity]) -> str:
 
 def _named(one: loop_notes.Missing) -> str:
     """An effect, with what it cannot be told from."""
-    if len(one.names) + len(one.values) == 1:
+    readings = [with_article(f) for f in one.families[1:] if f.startswith("reading")]
+    if len(one.names) + len(one.values) + len(readings) == 1:
         return one.names[0]
     family = f"{one.families[0]}, " if len(one.families) == 1 else ""
     names = ", ".join(in_order_of_parts(one.names))
     listed = names if len(one.names) == 1 else f"one of {names}"
     values = [freed_value(v) for v in one.values]
-    return f"{family}{', or '.join([listed, *values])} (these data cannot tell which)"
+    return f"{family}{', or '.join([listed, *values, *readings])} (these data cannot tell which)"
 
 
 def _tentative(those: Sequence[loop_notes.Missing], support: loop_notes.NameSupport | None) -> str:

@@ -55,11 +55,14 @@ def absent_balances(robot: Robot) -> frozenset[str]:
     """Balances that a robot lacks or that its instruments cannot show.
 
     A load on a shaft lacks those of the ground. `duty` and `supply` need an imposed voltage,
-    `electrical` and `inductance` an imposed or measured one, `lateral` and `yaw` instruments of a turn.
+    `electrical` and `inductance` an imposed or measured one, `lateral` and `yaw` instruments of a turn. A file that
+    states an efficiency of exactly 1 describes a drive whose gearbox, if any, loses nothing.
     """
     supply = set() if robot.rig.imposed == "voltage" else {"duty", "supply"}
     winding = set() if robot.rig.shows_voltage else {"electrical", "inductance"}
-    return robot.lacks | supply | winding | (set() if robot.rig.turns else {*ROUND})
+    geared = "gearbox.efficiency_load" not in robot.rig.exact or float(robot.gearbox.efficiency_load) < 1
+    turns = set() if robot.rig.turns else {*ROUND}
+    return robot.lacks | supply | winding | turns | (set() if geared else {"gearbox"})
 
 
 def effects_sum(robot: Robot, signals: Signals, balance: str, channel: str = "") -> Scalar:

@@ -124,7 +124,9 @@ class Joint:
     @property
     def accelerates(self) -> bool:
         """True if a loss depends on the torque at gearbox or wheel, which what turns before them takes a share of."""
-        return any(p.by for p in (*(() if self.loose else self.of("gearbox")), *self.of("track")))
+        gear = () if self.loose else self.of("gearbox")
+        lossy = not self.loose and float(self.robot.gearbox.efficiency_load) != 1
+        return lossy or any(p.by for p in (*gear, *self.of("track")))
 
     @property
     def controller_states(self) -> Names:

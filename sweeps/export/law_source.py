@@ -218,7 +218,9 @@ def step_lines(joint: Joint, library: _Library) -> list[str]:
     circuit = joint.of("supply") + joint.of("electrical")
     gear, track = joint.of("gearbox"), joint.of("track")
     later = {p.name: f'memory["{p.name}"]' for p in joint.remembering}
-    through = "(load + rotor)" if joint.accelerates else "load"
+    inertia = _inertia_lines(joint) if joint.accelerates else []
+    rigid = not joint.loose
+    rotor, wheel = " - rotor" * (joint.accelerates and rigid), " - wheel" * joint.accelerates
     lines = [
         "p, angle, wheel_speed = params, joint_position, "
         + ('state["rotor_speed"]  # of the motor\'s side' if joint.loose else "joint_velocity"),
@@ -249,24 +251,22 @@ def step_lines(joint: Joint, library: _Library) -> list[str]:
         f"lost = {_sum(circuit, '', later)}",
         "# Torques from the winding to the wheel.",
         f"made = {call_text(joint.of('torque')[0])}",
-        f"at_shaft = made - ({_sum(joint.of('motor'), '', later)})",
+        *(() if joint.loose else inertia),
+        f"at_shaft = made - ({_sum(joint.of('motor'), '', later)}){rotor}",
         f"load = at_shaft - {call_text(joint.of('idle')[0])}",
     ]
     if joint.loose:
-        lines += _play_lines(joint, library, _sum(gear, "", later))
+        lines += [*_play_lines(joint, library, _sum(gear, "", later)), *inertia]
     else:
         lines.append(f'through = p["gearbox.ratio"] * {call_text(joint.of("efficiency")[0])} * load')
+        lines += _solved("load", "through", gear, later)
     lines += [
-        *(_inertia_lines(joint) if joint.accelerates else ()),
-        *([] if joint.loose else _solved("load", "through - rotor" if joint.accelerates else "through", gear, later)),
-        *_solved("pull", "load - wheel" if joint.accelerates else "load", track, later),
+        *_solved("pull", f"load{wheel}", track, later),
         'info = {"current": current, "voltage": voltage, "motor_speed": motor_speed, "power": voltage * current,',
-        '        "lost_winding": lost * current, "lost_motor": (made - at_shaft) * motor_speed,',
-        '        "lost_gearbox": lost_gearbox,'
-        if joint.loose
-        else f'        "lost_gearbox": at_shaft * motor_speed - {through} * wheel_speed,',
-        f'        "lost_output": (load{" - wheel" * joint.accelerates} - pull) * wheel_speed}}',
-        f"return pull{' + wheel + rotor' * joint.accelerates}, memory, info",
+        f'        "lost_winding": lost * current, "lost_motor": (made - at_shaft{rotor}) * motor_speed,',
+        f'        "lost_gearbox": {"at_shaft * motor_speed - load * wheel_speed" if rigid else "lost_gearbox"},',
+        f'        "lost_output": (load{wheel} - pull) * wheel_speed}}',
+        f"return pull{' + wheel' * joint.accelerates}{f' + {ARMATURE} * acceleration' * bool(rotor)}, memory, info",
     ]
     return lines
 
@@ -316,7 +316,7 @@ def _play_lines(joint: Joint, library: _Library, lost: str) -> list[str]:
         ]
     lines = [
         "# Motor and load are two bodies: the torque that flanks or an elastic joint carry between them.",
-        f"inertia = {_TURNING}",
+        f"inertia = {TURNING}",
         *elastic,
         "closing = wheel_speed - joint_velocity",
         'gap = state["gap"] + dt * closing  # which opened or closed it within the last step',
@@ -355,20 +355,24 @@ def _play_lines(joint: Joint, library: _Library, lost: str) -> list[str]:
 
 
 def _inertia_lines(joint: Joint) -> list[str]:
-    """Lines for the torques that accelerate rotor and wheel: the joint has their inertia, losses by torque do not."""
+    """Lines for the torques that accelerate rotor and wheel: the joint has their inertia, losses by torque do not.
+
+    As in the model, the gearbox transmits what is left after the rotor, and its sign is the direction of power.
+    """
     wheel = [f"p[{quoted(f'{joint.configuration}.inertia')}]", *map(call_text, joint.of("inertia"))]
     return [
         "# Torques that accelerate rotor and wheel, by the acceleration of the last step.",
         'acceleration = (wheel_speed - state["speed"]) / dt',
         'memory["speed"] = wheel_speed',
-        f"rotor = {'0.0' if joint.loose else _ROTOR} * acceleration",
+        *(() if joint.loose else ['rotor = p["motor.inertia"] * p["gearbox.ratio"] * acceleration']),
         f"wheel = ({' + '.join(wheel)}) * acceleration",
     ]
 
 
-#: Inertia of the rotor at the output, and at the joint as the gear's efficiency lets the load see it.
-_TURNING = 'p["motor.inertia"] * p["gearbox.ratio"] ** 2'
-_ROTOR = f'{_TURNING} * p["gearbox.efficiency_load"]'
+#: Inertia of the rotor at the output. A load sees it as J i² η or J i² / η, by the direction of power. With their
+#: mean as the joint's armature, the torque left for either one lags a step, and is stable at any load.
+TURNING = 'p["motor.inertia"] * p["gearbox.ratio"] ** 2'
+ARMATURE = f'{TURNING} * 0.5 * (p["gearbox.efficiency_load"] + 1.0 / p["gearbox.efficiency_load"])'
 
 
 def _solved(name: str, given: str, parts: Sequence[Part], later: Mapping[str, str]) -> list[str]:
@@ -444,8 +448,8 @@ def _source(joint: Joint, constants: Sequence[Constant], library: _Library, what
     goal = goals.get(joint.robot.rig.imposed)
     volts = "voltage at the driver's output [V]: its duty times the voltage of the supply"
     document = _DOCUMENT.replace("{command}", f"goal of the controller: {goal}" if goal else volts)
-    rotor = '0.0 * p["motor.inertia"]' if joint.loose else _ROTOR
-    own = "The motor turns apart" if joint.loose else "Inertia of the rotor at the joint, J i² η"
+    rotor = '0.0 * p["motor.inertia"]' if joint.loose else ARMATURE
+    own = "The motor turns apart" if joint.loose else "Inertia of the rotor at the joint, J i² (η + 1/η) / 2"
     added = "".join(f" + {call_text(p)}" for p in joint.of("inertia"))
     body = textwrap.indent("\n".join(step_lines(joint, library)), "    ")
     zero = "jnp.zeros(shape)" if library.dialect is JAX else "torch.zeros(shape, device=device)"
@@ -537,9 +541,14 @@ class DriveActuator(Actuator):
         shape = (data.nworld, len(self._target_ids_list))
         self.params = {n: torch.full(shape, float(v), device=device) for n, v in self.cfg.params.items()}
         self.state = initial_state(shape, device)
+        self.begins = torch.full(shape, True, device=device)
 
     def compute(self, cmd):
         """Torque of each joint [N·m], shape (environments, joints)."""
+        for name in ("speed", "rotor_speed"):  # of a joint that moves at the first step
+            if name in self.state:
+                self.state[name] = torch.where(self.begins, cmd.vel, self.state[name])
+        self.begins[...] = False
         torque, self.state, self.info = actuator(
             self.params, self.state, cmd.effort_target, cmd.pos, cmd.vel, self.dt
         )
@@ -550,6 +559,7 @@ class DriveActuator(Actuator):
         super().reset(env_ids)
         rows = slice(None) if env_ids is None else env_ids
         self.state = {n: x.clone() for n, x in self.state.items()}
+        self.begins[rows] = True
         for value in self.state.values():
             value[rows] = 0.0
 

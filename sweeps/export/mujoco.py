@@ -176,8 +176,8 @@ def fates_in_mujoco(joint: Joint, normal: float) -> list[Fate]:
         fates.append(
             Fate(
                 "gearbox losses proportional to the load", APPROXIMATED,
-                "resistance / η and current = act / η: exact while the motor drives the load; while the load "
-                "drives the motor, the joint is braked less than in reality",
+                "resistance / η and current = act / η: exact while power flows to the load; while it flows back "
+                "(gravity, a heavy load that stops), the joint is braked less than in reality",
             )
         )  # fmt: skip
     if robot.has_ground:

@@ -53,6 +53,7 @@ from calibration.inference.observers import settled_ends
 from calibration.inference.observers.base import Diagnosis, Observer, SearchPolicy
 from calibration.inference.optimizers import (
     CORES,
+    SAME,
     Evaluate,
     Numbers,
     Optimum,
@@ -154,7 +155,7 @@ def _to_rows(
 #: Distance from the prior from which a fit that did not converge, of a log with a missing effect, is not scanned for
 #: other delays [prior sd].
 LOST = 4.0
-#: Distance from the lowest of several fits up to which an unconverged one continues [half σ²], the margin of a class.
+#: Distance from the lowest of several fits up to which one continues [half σ²], the margin of a class.
 NEAR = 3.0
 
 
@@ -234,7 +235,7 @@ class Histories(Observer):
     word: ClassVar[str] = "sample"
     fewest: ClassVar[int] = 24
     axis: ClassVar[str] = "time_s"
-    blocks: ClassVar[Names] = ("slope", "voltage", "run")
+    blocks: ClassVar[Names] = ("slope", "voltage", "run", "part")
     policy: ClassVar[SearchPolicy] = SearchPolicy(batch=8, steps=30, searches=8, one_by_one=False)
     rows_tell: ClassVar[bool] = False
     evidence: ClassVar[Names] = ("single", "curve", "pair", "chi2", "white")
@@ -664,7 +665,9 @@ class Histories(Observer):
         def search(blunt: Problem, starts: np.ndarray, steps: int) -> Optimum:
             weights = np.repeat(np.asarray(blunt.data.weight)[None], len(starts), 0)
             evaluate = _evaluator(blunt, weights, None)
-            return search_rollouts(evaluate, starts, blunt.data, weights, steps, self.policy.batch)[0]
+            # The best parameters of each configuration are combined, so a search may be the best of one only.
+            within = NEAR if len(blunt.base.configurations) == 1 else np.inf
+            return search_rollouts(evaluate, starts, blunt.data, weights, steps, self.policy.batch, within=within)[0]
 
         regression = weak_form(problem if every is None else every)
         begins = np.zeros((0, len(problem.coordinates))) if regression is None else regression.z[None]
@@ -717,10 +720,13 @@ class Histories(Observer):
     ) -> tuple[Optimum, Observation]:
         """Searches as in the protocol. The runs are compiled once for all steps."""
         data, steps = problem.data, self.policy.steps if most is None else most
+        of_same_readings = bool(np.all(weights == np.asarray(weights)[:1]))
+        within = SAME if rivals else NEAR if of_same_readings else np.inf
 
-        def searched(starts: Numbers) -> tuple[Optimum, Observation]:
-            evaluate = _evaluator(problem, weights, active)
-            return search_rollouts(evaluate, starts, data, weights, steps, self.policy.batch, rivals=rivals)
+        def searched(starts: Numbers, members: slice = slice(None)) -> tuple[Optimum, Observation]:
+            own = np.asarray(weights)[members]
+            evaluate = _evaluator(problem, own, None if active is None else np.asarray(active)[members])
+            return search_rollouts(evaluate, starts, data, own, steps, self.policy.batch, within=within)
 
         optima = searched(starts)
         near = np.asarray(optima[0].cost) < np.nanmin(optima[0].cost) + NEAR
@@ -734,15 +740,15 @@ class Histories(Observer):
         if most is not None and not optima[0].converged[k] and np.abs(optima[0].z[k]).max() > LOST:
             return optima
 
-        def one(every: tuple[Optimum, Observation]) -> tuple[Optimum, Observation]:
+        def one(every: tuple[Optimum, Observation], k: int) -> tuple[Optimum, Observation]:
             best, seen = jax.tree.map(lambda leaf: leaf[k], every)
             return dataclasses.replace(best, z=best.z[:size], sd=best.sd[:size]), seen
 
         def again(z: np.ndarray) -> tuple[Optimum, Observation]:
-            return one(searched(np.tile(np.pad(z, (0, np.shape(starts)[1] - size)), (len(starts), 1))))
+            return one(searched(np.pad(z, (0, np.shape(starts)[1] - size))[None], slice(k, k + 1)), 0)
 
         scan_data = dataclasses.replace(bare.data, weight=weights[k])
-        best, seen = scans.search_lower_basins(bare, one(optima), scan_data, again, lambda _: None)
+        best, seen = scans.search_lower_basins(bare, one(optima, k), scan_data, again, lambda _: None)
         optimum = jax.tree.map(lambda leaf: jnp.asarray(leaf[k]), optima[0])
         best = dataclasses.replace(best, z=optimum.z.at[:size].set(best.z), sd=optimum.sd.at[:size].set(best.sd))
         return jax.tree.map(lambda every, mine: jnp.asarray(every).at[k].set(mine), optima, (best, seen))

@@ -14,6 +14,7 @@ from mmrjax.model.shaft import MESH_DAMPING, MESH_FREQUENCY
 from sweeps.export.comparison import APPROXIMATED, DROPPED, EXPORTED, HELD, NATIVE, Fate
 from sweeps.export.formats import FORMATS, Export
 from sweeps.export.joint import INSIDE, Joint
+from sweeps.export.law_source import jax_source, module_from_source
 
 #: Use of a file of each format, as a paragraph of LAW.md.
 USE = {
@@ -140,8 +141,11 @@ def not_tested(found: Export) -> list[str]:
 
 
 def rotor_inertia(found: Export) -> float:
-    """Inertia of the rotor at the joint [kg·m²], of a motor that drives."""
+    """Inertia of the rotor at the joint [kg·m²]: of a motor that drives, or the armature of an exported law."""
     robot = found.joint.robot
+    if found.format == "onnx":
+        law = module_from_source(jax_source(found.joint, found.constants))
+        return float(law.armature(law.PARAMS))
     value = float(robot.motor.inertia) * float(robot.gearbox.ratio) ** 2 * float(robot.gearbox.efficiency_load)
     return value + sum(float(e.amplitude) for e in found.joint.inside if e.balance == "inertia")
 
@@ -154,14 +158,15 @@ def law_equations(found: Export) -> list[str]:
     places = {where[p.balance] for p in found.joint.parts if p.effect and p.balance in INSIDE}
     less = {place: f" - {place} effects" if place in places else "" for place in where.values()}
     dry, viscous = ("M_t0", "K_ft") if robot.has_ground else ("M_0", "K")
+    rotor = "" if found.joint.loose else " - J_d i_r dω/dt"
     backward = "2 - 1/η_rm, at least 0.02" if robot.gearbox.mesh_theory else "η_rm"
     lines = [
         "ω is the speed of the joint [rad/s], ω_m = i_r ω that of the motor. U is the voltage at the driver's "
         "output, I the current of the motor. sign ω fades to 0 at rest.",
         f"Winding: L_d dI/dt = U - C_m ω_m - R_rot I{less['winding']}. [V]",
         f"Motor: M_d = C_m I - (M_df0 sign ω + K_fd ω_m){less['motor']}, at its shaft. [N·m]",
-        f"Gearbox: M_r = i_r η_rm (M_d - M_rf0 sign ω - K_fr ω_m){less['gearbox']}, at its output. 1/η_b replaces "
-        f"η_rm while the load drives the motor; η_b is {backward}. [N·m]",
+        f"Gearbox: M_r = i_r η_rm (M_d - M_rf0 sign ω - K_fr ω_m{rotor}){less['gearbox']}, at its output. 1/η_b "
+        f"replaces η_rm while the sum in brackets brakes; η_b is {backward}. [N·m]",
         f"Output: M = M_r - ({dry} sign ω + {viscous} ω){' - guides' if robot.has_ground else ''}{less['output']}: "
         "the torque on the joint. [N·m]",
     ]
