@@ -167,9 +167,9 @@ def _root(
 def simulate() -> None:
     """Simulate operating points, a start, a mission or a turn.
 
-    One operating point is stated by options, several by --runs FILE.csv. With --model drive or track the run starts
-    from standstill. history.csv then holds current and speeds over time. With track, reactions.csv also holds the
-    loads inside the running gear. With --profile the robot follows a mission: segments.csv holds energy (Wh, Wh/m),
+    Options describe one operating point, --runs FILE.csv several. With --model drive or track the run starts from
+    standstill. history.csv then holds current and speeds over time. With track, reactions.csv also holds the loads
+    inside the running gear. With --profile the robot follows a mission: segments.csv holds energy (Wh, Wh/m),
     distance, peaks, temperatures and charge of each segment. With --left and --right the two sides have different
     voltages, and the robot turns (docs/howto/turn.md).
     """
@@ -513,11 +513,11 @@ def explain(
 
 
 def _prepare(resolved: Any, no_cache: bool = False) -> None:
-    """Make the environment ready for the jax that a command of this configuration will import.
+    """Prepare the environment before a command of this configuration imports jax.
 
-    Runs of the track model have hung for good, one sweep in seven on two cores, with every thread asleep in
-    XLA's CPU executor (jax 0.10.2). With one thread none of twelve did (docs/lab/figures.md). Whoever sets
-    XLA_FLAGS, be it to nothing, is heeded.
+    With several threads, one sweep of the track model in seven hung forever on two cores, with every thread asleep
+    in XLA's CPU executor (jax 0.10.2). With one thread none of twelve did (docs/lab/figures.md). XLA_FLAGS set by
+    the user, even if empty, takes precedence.
     """
     model = getattr(resolved, "model", None)  # None: of a calibration, whose data decide
     one_thread = model is not None and fidelities.fidelity_facts(model).one_thread
@@ -607,7 +607,8 @@ def main() -> None:
 
 
 def _obey_interrupt(ignored: Any) -> None:
-    """Interrupts again, soon: an interrupt is lost in a callback, of collected garbage for instance."""
+    """Repeats an interrupt shortly afterwards, because an interrupt inside a callback (such as garbage collection)
+    is lost."""
     if issubclass(ignored.exc_type, KeyboardInterrupt):
         signal.setitimer(signal.ITIMER_REAL, 0.01)
     else:
@@ -615,7 +616,8 @@ def _obey_interrupt(ignored: Any) -> None:
 
 
 def _replace_closed_streams() -> None:
-    """Opens closed standard streams, so that no file gets their numbers and with them what libraries print."""
+    """Reopens closed standard streams. Otherwise a file could get their numbers, and with them the output of
+    libraries."""
     for number in range(3):
         with contextlib.suppress(OSError):
             os.fstat(number)
@@ -660,7 +662,7 @@ def _answered(error: BaseException) -> int:
 
 
 def _memory_exhausted(error: BaseException | None) -> bool:
-    """True if a failure, or what it came of, is that memory ran out: Python's, XLA's or the loader's of libraries."""
+    """True if an error, or one of its causes, is a lack of memory in Python, XLA or the library loader."""
     while error is not None:
         out = isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in str(error)
         if out or (isinstance(error, ImportError) and "failed to map segment" in str(error)):
@@ -670,7 +672,7 @@ def _memory_exhausted(error: BaseException | None) -> bool:
 
 
 def _no_number(error: Any) -> str:
-    """Error message for a text in place of a number. Most often the text includes a unit."""
+    """Error message for a text instead of a number. Usually the text includes a unit."""
     option = getattr(error, "param", None)
     if option is None or not re.search(r"valid (number|float|integer)", str(getattr(error, "message", ""))):
         return ""

@@ -66,7 +66,7 @@ def option_field(default: Any, description: str, **extra: Any) -> Any:
 
 
 class Part(BaseModel):
-    """A part of a command's configuration. Unknown keys are refused."""
+    """A part of a command's configuration. Unknown keys are rejected."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -116,7 +116,7 @@ class SettledLog(FolderPart):
 
 
 class DataPart(Part):
-    """Columns of a table or log that have other names than this program's."""
+    """Names of the columns of a table or log, if they differ from those of mmrjax."""
 
     columns: str | None = option_field(
         None,
@@ -138,14 +138,14 @@ class ModelPart(Part):
 
 
 def _fidelity(model: str) -> str:
-    """The name of a fidelity, refused where there is no such one."""
+    """The name of a fidelity. Unknown names are rejected."""
     if model not in fidelities.TABLE:
         raise PydanticCustomError("unknown", f"input should be {_either(map(repr, fidelities.TABLE))}")
     return model
 
 
 def _solver(name: str) -> str:
-    """The name of a solver of fits, refused where there is no such one."""
+    """The name of a solver for fits. Unknown names are rejected."""
     if name not in solvers.NAMES:
         raise PydanticCustomError("unknown", allowed_words(name, solvers.NAMES))
     return name
@@ -292,7 +292,7 @@ class OneRun(Part):
 
 
 class GivenRuns(OneRun, FolderPart):
-    """Runs of `simulate`: one of options, or those of a file."""
+    """Runs of `simulate`: one run from options, or those in a file."""
 
     runs: Path | None = option_field(None, "CSV of runs to simulate instead; condition columns are enough")
 
@@ -403,7 +403,7 @@ class LoopBeside(FittedRuns):
 
 
 class TurnPart(Part):
-    """Different drive of the two sides of one run. None: the same."""
+    """Different commands for the two sides of one run. None: the same command."""
 
     left_V: Voltage | None = option_field(None, "Voltage of the left motor (V); with --right the robot can turn")
     right_V: Voltage | None = option_field(None, "Voltage of the right motor (V)")
@@ -430,7 +430,7 @@ class TurnPart(Part):
         return any(getattr(self, name) is not None for name in TurnPart.model_fields)
 
     def refuse_volts(self, battery: bool) -> None:
-        """Refuse volts of either side where a battery decides them."""
+        """Reject side voltages on battery power, which sets the voltage."""
         if battery and self.left_V is not None:
             raise PydanticCustomError(
                 "idle", "`left_V` cannot be combined with `battery`; give `duty_left` and `duty_right`"
@@ -786,7 +786,7 @@ class RequirementsPart(Part):
 
 
 class Check(RequirementsPart, RobotPart, OutputPart):
-    """A robot held against requirements."""
+    """A check of a robot against requirements."""
 
     changes: bool = option_field(True, "Search for changes that meet the missed requirements")
 
@@ -857,7 +857,8 @@ def read_toml(file: Path) -> Json:
 
 
 def fields_with(kind: type[Part], fact: str) -> list[str]:
-    """Names of the fields whose `option_field` states a fact: `solver`, the keys of `[solver]` of a file, for one."""
+    """Names of the fields whose `option_field` has a property, such as `solver` (the keys of `[solver]` in a
+    file)."""
     return [name for name, facts in schema_facts(kind).items() if facts.get(fact)]
 
 
@@ -933,7 +934,7 @@ def _sentence(kind: type[Part], error: ValidationError, file: Path | None, given
     first, options = error.errors()[0], options_of_fields(kind)
 
     def called(name: str) -> str:
-        """A field as whoever stated it did, or would: by its option, or its key in the file."""
+        """Name of a field for messages: its option, or its key in the file that contains it."""
         return options.get(name, name) if file is None or name in given else name
 
     if first["type"] == "idle":  # whose message has fields between backticks

@@ -137,7 +137,7 @@ class StoreOptions(FolderPart):
 
     @property
     def of_store(self) -> bool:
-        """True if only a store has what is stated."""
+        """True if an option is given that only a store supports."""
         return any((self.zarr, self.outputs, self.dry_run, self.export, self.shard, self.scheduler))
 
 

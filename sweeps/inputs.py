@@ -102,13 +102,13 @@ def beside_robot(file: RobotFile) -> Posterior:
 
 
 def fit_of(file: RobotFile, runs: records.Runs) -> str:
-    """`these` if the robot's folder records a fit to these rows, `others` if one to others, "" if none."""
+    """`these` if the robot's folder records a fit to these rows, `others` for a fit to other rows, "" for no fit."""
     fitted = store.rows_of_fit(Path(file.source))
     return "" if not fitted else "these" if runs.digest in fitted else "others"
 
 
 def check_configurations(robot: Robot, names: Names, where: str) -> None:
-    """Refuse a configuration that the robot does not have.
+    """Reject a configuration that the robot does not have.
 
     Raises:
         BadConfiguration: says `where`, and which the robot has.
@@ -122,7 +122,7 @@ def check_configurations(robot: Robot, names: Names, where: str) -> None:
 
 
 def check_surface(robot: Robot, names: Collection[str], surface: str | None, where: str) -> None:
-    """Refuse a surface whose adhesion neither Table 5 nor a configuration of the robot states.
+    """Reject a surface whose adhesion is neither in Table 5 nor in a configuration of the robot.
 
     Args:
         names: names of the configurations that are simulated.
@@ -178,7 +178,7 @@ def read_runs(
 
 
 def given_runs(robot: Robot, beside: GivenRuns, config: Simulate, elsewhere: Collection[str] = ()) -> records.Runs:
-    """Runs of a file, or one of options. `elsewhere`: columns that a profile states."""
+    """Runs from a file, or one run from options. `elsewhere`: columns that a profile states."""
     if beside.runs is None:
         return one_run(robot, beside.stated, config.battery, elsewhere)
     return read_runs(str(beside.runs), robot, columns=config.columns, measured=False, battery=config.battery)

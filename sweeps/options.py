@@ -51,7 +51,7 @@ def option_of_field(name: str, fact: Json) -> str:
 
 
 def of_unit(name: str) -> tuple[str, str]:
-    """A field's name without its unit, and that, empty where it has none."""
+    """A field's name without its unit, and the unit (empty if it has none)."""
     return next(
         ((name.removesuffix(f"_{end}"), unit) for end, unit in UNITS.items() if name.endswith(f"_{end}")), (name, "")
     )
@@ -67,7 +67,7 @@ _LISTS = {"number": str, "string": list[str]}  # an axis is one text
 
 
 def option_help(name: str, fact: Json) -> str:
-    """Meaning, unit, choices, bounds and default of a field, as a help text has them."""
+    """Help text of a field: meaning, unit, choices, bounds and default."""
     _, unit = of_unit(name)
     texts = [str(fact.get("description", name)).rstrip(".")]
     if unit and f"({unit})" not in texts[0]:
@@ -100,7 +100,7 @@ def _default(name: str, fact: Json) -> str:
 
 
 def option_parameters(kind: type[BaseModel]) -> Iterator[inspect.Parameter]:
-    """A parameter of a command's function for each field that can be chosen, None where it is not given."""
+    """A function parameter for each field of a command that can be chosen, with default None."""
     for name, fact in schema_facts(kind).items():
         if "const" in fact:  # one choice is none
             continue
@@ -150,7 +150,7 @@ def _read(name: str, fact: Json, value: Any) -> Any:
 
 
 def help_all(kinds: tuple[type[BaseModel], ...]) -> Iterator[inspect.Parameter]:
-    """The option that shows those of solvers too, where a command has any."""
+    """The option that also shows solver options, for a command that has them."""
     hidden = [
         option_of_field(name, fact)
         for kind in kinds

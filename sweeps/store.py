@@ -121,7 +121,7 @@ class Folder:
         self.started = datetime.datetime.now(datetime.UTC)
 
     def refuse_taken(self, force: bool) -> None:
-        """Refuse a path that holds something already.
+        """Reject a path that holds something already.
 
         Args:
             force: replace a run folder that holds nothing but what its command left.
@@ -145,7 +145,7 @@ class Folder:
         raise BadConfiguration(f"--out: {self.path} exists already; choose another path ({hint})")
 
     def refuse_foreign(self, command: str, force: bool) -> None:
-        """Refuse a `.partial` that is not ours, or holds a file that is not, or interrupted work of another command.
+        """Reject a `.partial` that is not ours, or holds a file that is not, or interrupted work of another command.
 
         Args:
             command: command that is to go on there.
@@ -173,7 +173,7 @@ class Folder:
             )
 
     def refuse_appeared(self, force: bool) -> None:
-        """Refuse to move the finished folder to a path where something has appeared meanwhile.
+        """Reject to move the finished folder to a path where something has appeared meanwhile.
 
         Raises:
             OSError: it has, the partial folder is left.

@@ -166,9 +166,9 @@ def test_a_profile_turns_a_bench(mmrjax, tmp_path):
 
 REFUSED = {
     "no voltage": ("bench", False, "simulate", r"--voltage: not given, and the robot's file has no motor\.voltage_l"),
-    "no speed": ("bench", True, "simulate", r"--motor-speed: not stated, .* as --motor-speed 3000"),
+    "no speed": ("bench", True, "simulate", r"--motor-speed: not given, .* such as --motor-speed 3000"),
     "voltage of an imposed speed": (
-        "bench", True, "simulate --voltage 12", r"--voltage: the motors' speed is imposed .* state --motor-speed",
+        "bench", True, "simulate --voltage 12", r"--voltage: the motors' speed is imposed .* give --motor-speed",
     ),
     "speed of an imposed voltage": (
         "bench", False, "simulate --motor-speed 900", r"--motor-speed: the voltage is imposed .* give --voltage",
@@ -189,8 +189,8 @@ REFUSED = {
     "a shaft's travel": (
         "bench", False, "simulate --voltage 9 --profile shuttle", r"shuttle.*load is a shaft",
     ),
-    "no axis": ("bench", False, "sweep", r"--voltages: not stated, .* state it \[V\], as --voltages 6,12,24"),
-    "no axis of speed": ("wheeled", True, "sweep", r"--motor-speeds: not stated, .* --motor-speeds 1000,2000"),
+    "no axis": ("bench", False, "sweep", r"--voltages: not given, .* give it \[V\], such as --voltages 6,12,24"),
+    "no axis of speed": ("wheeled", True, "sweep", r"--motor-speeds: not given, .*  --motor-speeds 1000,2000"),
     "axis of slopes": ("bench", False, "sweep --voltages 9 --slopes 0,5", r"--slopes: the robot's load"),
     "axis of voltages": ("wheeled", True, "sweep --voltages 9", r"--voltages: the motors' speed is imposed"),
     "picture": ("bench", False, "render x.png --voltage 9", r"render: the robot's load is a shaft"),
@@ -213,12 +213,12 @@ REFUSED = {
     ),
     "a stance": (
         "wheeled", False, "sensitivity --voltages 9 --outputs pitch",
-        r"--outputs pitch: the robot's file states no running_gear",
+        r"--outputs pitch: the robot's file has no running_gear",
     ),
     "a pendulum's sensitivity": (
         "pendulum", False, "sensitivity --voltages 3", r"--model steady: arm .* has no steady state",
     ),
-    "sensitivity": ("bench", False, "sensitivity", r"--voltages: not stated"),
+    "sensitivity": ("bench", False, "sensitivity", r"--voltages: not given"),
     "varied slope": (
         "bench", False, "sensitivity --voltages 9 --vary slope_deg=0:5", r"--vary slope_deg: the robot's lo",
     ),
@@ -293,7 +293,7 @@ def test_a_sweep_into_a_store_knows_what_is_imposed(mmrjax, tmp_path):
     assert words_of_others(out, *left_in(tmp_path / "run")) == []
     plan = tmp_path / "plan.toml"
     plan.write_text(f'robot = "{rig.name}"\n[axes]\n"bench.loss_coulomb" = [0.05, 0.07]\n')
-    ends(mmrjax("sweep", plan), "plan.toml, conditions.motor_speed: not stated")
+    ends(mmrjax("sweep", plan), "plan.toml, conditions.motor_speed: not given")
     plan.write_text(f'robot = "{rig.name}"\n[axes]\nslope_deg = [0, 5]\n[conditions]\nmotor_speed = 100.0\n')
     ends(mmrjax("sweep", plan), "plan.toml, slope_deg: the robot's load is a shaft")
     plan.write_text(f'robot = "{rig.name}"\n[axes]\nvoltage = [9, 12]\n')

@@ -54,7 +54,7 @@ def test_force_replaces_no_folder_that_is_none_of_ours(tmp_path, manifest):
     else:
         (folder / "manifest.json").write_bytes(manifest.encode("latin1"))
     before = names(tmp_path)
-    with pytest.raises(BadConfiguration, match="thesis.txt" if manifest is None else "it is no run folder"):
+    with pytest.raises(BadConfiguration, match="thesis.txt" if manifest is None else "it is not a run folder"):
         finished(tmp_path / "x", force=True)
     assert names(tmp_path) == before
 
@@ -202,9 +202,9 @@ def test_a_second_process_is_refused_at_once_and_disturbs_nothing(tmp_path):
         first.stage("base", lambda: 1)
         before = names(tmp_path)
         for identity in (LOOP, LOOP | {"seed": 2}, SWEEP):
-            with pytest.raises(BadConfiguration, match=r"(another process is at work on|holds an interrupted loop)"):
+            with pytest.raises(BadConfiguration, match=r"(another process is using|holds an interrupted loop)"):
                 RunFolder(tmp_path / "x", identity)
-            with pytest.raises(BadConfiguration, match=r"another process is at work on \S*x\.partial; wait for it"):
+            with pytest.raises(BadConfiguration, match=r"another process is using \S*x\.partial; wait for it"):
                 RunFolder(tmp_path / "x", identity, force=True)
         assert names(tmp_path) == before
         first.write_text("robot.toml", "")

@@ -530,7 +530,7 @@ def test_share_that_another_process_works_on_is_refused(sweep, monkeypatch, tmp_
     with (tmp_path / "s.partial" / "journal" / "2-of-3.jsonl").open("a") as held:
         fcntl.flock(held, fcntl.LOCK_EX)
         code, _, err = sweep("s", "--shard", "2/3")
-    assert code == 2 and "another process is at work on s.partial, share 2 of 3" in err
+    assert code == 2 and "another process is using s.partial, share 2 of 3" in err
     assert sweep("s", "--shard", "2/3")[0] == 0
 
 
@@ -565,7 +565,7 @@ def written(store, *chunks, speed=1.0):
 def test_refused_second_process_leaves_the_store_of_the_first(opened, tmp_path):
     first, second = opened(), opened()
     first.begin()
-    with pytest.raises(BadConfiguration, match=r"another process is at work on \S*s\.partial, share 1 of 1; wait"):
+    with pytest.raises(BadConfiguration, match=r"another process is using \S*s\.partial, share 1 of 1; wait"):
         second.begin()
     second.abandon()
     written(first, 0)
@@ -596,7 +596,7 @@ def test_process_whose_store_was_abandoned_meanwhile_is_told(opened):
 def test_force_is_refused_while_another_process_writes(opened):
     first = opened()
     first.begin((2, 3))
-    with pytest.raises(BadConfiguration, match=r"another process is at work on \S*s\.partial, share 2 of 3; wait"):
+    with pytest.raises(BadConfiguration, match=r"another process is using \S*s\.partial, share 2 of 3; wait"):
         opened(seed=1, force=True)
     written(first, 1)
     assert set(opened().done()) == {1}

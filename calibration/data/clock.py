@@ -25,7 +25,7 @@ SHARED, ODD = 0.1, 0.1
 
 
 def unwrap_counter(count: np.ndarray, run: np.ndarray) -> tuple[np.ndarray, float]:
-    """Returns a counter that goes on past its end, and its period, 0 where it does not.
+    """Returns a counter without wraps, and its period (0 if it does not wrap).
 
     A counter wraps where it falls from its last numbers to its first ones, within `LACKING` usual steps, and never
     goes back otherwise.
@@ -61,9 +61,10 @@ def unwrap_counter(count: np.ndarray, run: np.ndarray) -> tuple[np.ndarray, floa
 
 
 def spread_shared_stamps(time: np.ndarray, run: np.ndarray) -> tuple[np.ndarray, float]:
-    """Returns times with rows that share a stamp set evenly between it and the next, and the rows of a stamp.
+    """Returns times with rows of equal stamps spread evenly up to the next stamp, and the number of rows per
+    stamp.
 
-    The number of rows is 0 where nothing is changed.
+    The number of rows is 0 if nothing was changed.
 
     Args:
         time: time of rows in order, shape (rows,).
@@ -99,7 +100,7 @@ _WITH_POINTS = re.compile(r"(\d\d)\.(\d\d)\.(\d{4})(?=[ T])")
 
 
 def recorded_rows(arrays: NamedArrays, meanings: Sequence[Column | None]) -> NamedArrays:
-    """Returns the columns without rows that nothing was recorded in, which a note counts.
+    """Returns the columns without empty rows, and a note that counts these rows.
 
     Every cell of such a row is missing, or it is at the end of a log whose clock is back at 0 there: a logger writes
     all of its memory.

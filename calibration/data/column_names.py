@@ -27,7 +27,7 @@ _WITH_UNIT = re.compile(r"([+-]?\d*\.?\d+(?:[eE][+-]?\d+)?)\s*([^\d\s.,].*)")
 
 
 def convert_column(meaning: Column, raw: Raw, layout: Layout) -> tuple[np.ndarray, np.ndarray]:
-    """Returns a column's values in its unit, NaN where there is no reading, and True for each cell to be refused.
+    """Returns a column's values in its unit (NaN without a reading), and True for each cell that is rejected.
 
     All cells are read at once, since a log may have a million rows. `refused_cell_sentence` makes the sentence about
     one of them.
@@ -58,7 +58,7 @@ def _in_its_unit(meaning: Column, written: np.ndarray) -> np.ndarray:
 
 
 def _allowed_words(column: str, word: str, layout: Layout) -> str:
-    """Allowed words for the message about a word, empty if the word is allowed itself."""
+    """Allowed words, for the error message about a word. Empty if the word itself is allowed."""
     if column == "surface":
         return surfaces.allowed_labels(word, layout)
     if column == "mode" and word not in DRIVEN:
@@ -91,7 +91,7 @@ def refused_cell_sentence(where: str, meaning: Column, cell: str, layout: Layout
 
 
 def _hint(meaning: Column, cell: str, units: bool, readings: Names) -> str:
-    """Guess at the meaning of a refused cell, with a semicolon at its end, empty without a guess."""
+    """Guess at the meaning of a rejected cell, ending in a semicolon. Empty without a guess."""
     if cell.lower() in NOTHING:
         return "leave the cell empty if there is no reading; " if meaning.column in readings else ""
     quantity, mine = meaning.quantity, meaning.unit
@@ -223,7 +223,7 @@ def check_header(
 
 
 def check_time(name: str, header: list[str], meanings: list[Column | None], layout: Layout) -> None:
-    """Refuses readings of a log without a column of time."""
+    """Rejects readings of a log without a column of time."""
     stated = {m.column: m.shown for m in meanings if m is not None}
     over_time = [stated[c.column] for c in layout.channels if c.column in stated and not c.settled]
     if over_time and stated.keys().isdisjoint(TIME):
@@ -249,7 +249,7 @@ def _other_names(strange: list[str], column: str) -> str:
 
 
 def _check_names_of_sides(name: str, strange: list[str], stated: set[str], layout: Layout) -> None:
-    """Refuses columns that name a side in other words, or elsewhere in the column's name."""
+    """Rejects columns that name a side with other words, or in another place of the column's name."""
 
     def words(column: str) -> list[str]:
         return sorted(_SIDE.get(word.casefold(), word.casefold()) for word in column.split("_"))
@@ -274,7 +274,7 @@ def _check_names_of_sides(name: str, strange: list[str], stated: set[str], layou
 
 
 def check_units(arrays: NamedArrays, meanings: Sequence[Column | None]) -> None:
-    """Refuses a column whose name, or whose source, states another unit than it is read in."""
+    """Rejects a column if its name or its source gives a unit other than the one in which it is read."""
     below = [""] * len(meanings)
     for j, (unit, meaning) in enumerate(zip(arrays.units, meanings, strict=bool(arrays.units))):
         if meaning is None or meaning.column in WORDS:

@@ -104,7 +104,7 @@ class Column:
 
 @dataclasses.dataclass(frozen=True)
 class Layout:
-    """Facts of a robot that decide about the columns of its tables.
+    """Properties of a robot that determine the columns of its tables.
 
     Attributes:
         imposed: quantity imposed on its motors, one of `rig.IMPOSED`.
@@ -148,7 +148,7 @@ class Layout:
 
     @property
     def complete(self) -> bool:
-        """True if tables have to state every condition, otherwise a missing condition has its usual value."""
+        """True if tables must contain every condition. Otherwise a missing condition has its usual value."""
         return self.table8
 
     @property
@@ -188,7 +188,7 @@ class Layout:
         return tuple(c.sd_column for c in self.channels)
 
     def magnitude(self, channel: str) -> bool:
-        """True if the instrument of a channel shows its magnitude alone."""
+        """True if the instrument of a channel shows only the magnitude."""
         return any(i.channel == channel and i.signed is False for i in self.instruments)
 
     def variance(self, channel: str) -> float:

@@ -26,7 +26,7 @@ TORQUE = "output_torque_Nm"
 
 
 def without_computed_torques(runs: Runs, robot: Robot) -> Runs:
-    """The table without a torque that is a multiple of a current in all rows, to the digits of the file.
+    """The table without a torque column that is an exact multiple of a current in all rows.
 
     A motor's friction leaves an offset between current and torque, so a torque that was set or read is no multiple.
     If no load torque is set, the load of each row is found from its current by the balances of the file's robot. The

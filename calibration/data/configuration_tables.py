@@ -138,7 +138,7 @@ def resolved_likes(content: Json, where: str) -> None:
 
 
 def _over(below: Mapping[str, Any], above: Mapping[str, Any]) -> Json:
-    """Two tables as one, in which `above` wins."""
+    """Two tables merged into one. Entries of `above` take precedence."""
     both = {
         key: value for key, value in below.items() if isinstance(value, dict) and isinstance(above.get(key), dict)
     }
@@ -245,7 +245,7 @@ def _chassis(robot: Robot, name: str, table: Json, where: str) -> Chassis:
 
 
 def _blank(pattern: Chassis, on_tracks: float, table: Mapping[str, Any], where: str) -> Chassis:
-    """A chassis with defaults where its fields have them. The table has to state all others."""
+    """A chassis with the default of every field that has one. The table must give all other fields."""
     defaults = dict(_defaults(pattern))
     missing = [name for name, default in defaults.items() if default is None and not _states(table, name)]
     if missing:

@@ -32,7 +32,7 @@ RADIAN, ALIKE = 180 / np.pi, 0.03
 
 
 def check_contradictions(runs: Runs, robot: Robot) -> None:
-    """Refuse a table that contradicts itself or its robot.
+    """Reject a table that contradicts itself or its robot.
 
     Raises:
         BadData: a vehicle has no mass. A robot turns that cannot turn, or its sides are exchanged. The stated voltage
@@ -114,7 +114,7 @@ def _mass(runs: Runs, robot: Robot) -> None:
 
 
 def _voltage(runs: Runs, robot: Robot, column: str) -> None:
-    """Refuse a voltage that contradicts the motors' back-EMF, which follows from the imposed speed.
+    """Reject a voltage that contradicts the motors' back-EMF at the imposed speed.
 
     A bridge may reverse the supply. Motors that a load drives brake: their voltage is smaller by the voltage drop of
     their current. Without readings of current, a share of the rows may be such rows.
@@ -145,7 +145,8 @@ def _voltage(runs: Runs, robot: Robot, column: str) -> None:
 
 
 def _time(runs: Runs) -> None:
-    """Refuse time that sometimes goes back: several recordings, or a clock that was set. Any order is allowed."""
+    """Reject a time that sometimes goes back, because of several recordings or a clock that was reset. Any order
+    is allowed."""
     time, run = runs["time_s"], runs.run_names
     for name in np.unique(run):
         mine = np.flatnonzero(run == name)

@@ -32,7 +32,7 @@ from mmrjax.model.signals import Signals, State
 
 
 def _witness(place: str, whose: str, seen: list[Signals]) -> Effect:
-    """An effect with a zero term that records the signals its balance passes to it."""
+    """An effect with a zero term, which records the signals that its balance passes to it."""
 
     class Witness(Effect):
         balance = place

@@ -87,7 +87,7 @@ def _opened(path: Path, where: str | Path, kind: type[InputError], largest: floa
 
 
 def check_declared(where: str | Path, columns: int, size: float = 0.0, held: float = math.inf) -> None:
-    """Refuses sizes that a source declares, before its values are read.
+    """Rejects sizes that a source declares, before its values are read.
 
     Args:
         where: opens the message of an error.
@@ -108,7 +108,7 @@ def check_declared(where: str | Path, columns: int, size: float = 0.0, held: flo
 
 
 def check_memory(where: str | Path, size: float) -> None:
-    """Refuses values that need more than `SHARE` of the free memory, before they are read.
+    """Rejects values that need more than `SHARE` of the free memory, before they are read.
 
     Args:
         where: opens the message of an error.

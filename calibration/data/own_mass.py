@@ -77,7 +77,7 @@ def stated_masses(robot: Robot, runs: Runs) -> dict[str, StatedMass]:
 
 
 def with_table_mass(robot: Robot, runs: Runs) -> Robot:
-    """`robot` with the own mass that a table states for each configuration, the median over its rows.
+    """`robot` with each configuration's own mass from the table, the median over its rows.
 
     Raises:
         BadData: for the same reasons as `stated_masses`.
@@ -121,7 +121,7 @@ def mass_notes(robot: Robot, runs: Runs) -> list[str]:
 
 
 def check_priors(stated: Iterable[str], robot: Robot, runs: Runs) -> None:
-    """Refuse a prior of a mass that the table states: it would be written, and was not fitted with.
+    """Reject a prior of a mass that the table contains, because the fit uses the mass in the table.
 
     Args:
         stated: names of parameters.

@@ -40,7 +40,7 @@ def _texts(name: str) -> Any:
 
 @dataclasses.dataclass(frozen=True)
 class MotorSheet:
-    """A brushed DC motor as its maker's sheet states it, at 25 °C, NaN where the sheet is silent.
+    """Data sheet of a brushed DC motor at 25 °C. NaN marks values that the sheet does not give.
 
     Attributes:
         name, maker, order_number: name, maker and order number of the winding.
@@ -95,7 +95,7 @@ class MotorSheet:
 
 @dataclasses.dataclass(frozen=True)
 class GearboxSheet:
-    """A planetary gearbox as its maker's sheet states it, NaN where the sheet is silent.
+    """Data sheet of a planetary gearbox. NaN marks values that the sheet does not give.
 
     Attributes:
         name, maker, order_number, family: one row a ratio of a family.
@@ -131,7 +131,8 @@ class GearboxSheet:
 
 @dataclasses.dataclass(frozen=True)
 class CellSheet:
-    """A battery cell, or a pack of `cells` in series, as its sheet states it, NaN where the sheet is silent.
+    """Data sheet of a battery cell, or of a pack of `cells` in series. NaN marks values that the sheet does not
+    give.
 
     Attributes:
         name, maker, chemistry: name, maker and chemistry of the cell.

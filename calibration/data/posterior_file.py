@@ -102,7 +102,7 @@ class Posterior:
         return self.values(np.random.default_rng(seed).standard_normal((draws, len(self))))
 
     def check(self, robot: Robot, where: str) -> None:
-        """Refuse a posterior that is not this robot's.
+        """Reject a posterior that is not this robot's.
 
         Args:
             where: opens the message.

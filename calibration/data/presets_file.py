@@ -108,7 +108,7 @@ class Preset:
         return next(read, PresetColumn("", ()))
 
     def check_needed(self, mapped: Iterable[tuple[str, str, float]], imposed: str, name: str) -> None:
-        """Refuses a source whose imposed column means nothing without another one that the source lacks.
+        """Rejects a source whose imposed column cannot be used without another column that the source lacks.
 
         Args:
             mapped: columns of the source.
@@ -190,7 +190,7 @@ def _among(theirs: str, names: set[str]) -> bool:
 
 
 def numbers_to_state(name: str) -> Names:
-    """Returns names of the numbers that a packaged preset asks for and has no usual value for."""
+    """Returns names of the numbers that a packaged preset needs and for which it has no default."""
     numbers = input_files.toml_content(_packaged(name), name).get("ask", {})
     return tuple(key for key, stated in numbers.items() if isinstance(stated, str) or "usual" not in stated)
 
@@ -236,7 +236,7 @@ def _parsed(content: Mapping[str, Any], where: str, given: Mapping[str, float]) 
 
 
 def _numbers(asked: Any, where: str, given: Mapping[str, float]) -> dict[str, float]:
-    """Numbers that a preset asks for, by name."""
+    """Numbers that the user must give for a preset, by name."""
     if not isinstance(asked, dict):
         raise BadConfiguration(f"{where}, ask: got {asked!r}; expected a table")
     for key in given:
@@ -314,7 +314,7 @@ def _texts(stated: Any, where: str, form: str = "expected a list of names") -> N
 def merge_columns(
     first: Iterable[tuple[str, str, float]], others: Iterable[tuple[str, str, float]]
 ) -> tuple[tuple[str, str, float], ...]:
-    """Columns of two tables. `first` wins where both have a column, or read the same source column."""
+    """Columns of two tables. `first` takes precedence if both have a column, or use the same source column."""
     first = tuple(first)
     taken = {_bare(mine) for mine, _, _ in first} | {theirs for _, theirs, _ in first}
     return (*first, *(c for c in others if _bare(c[0]) not in taken and c[1] not in taken))

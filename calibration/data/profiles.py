@@ -147,7 +147,7 @@ class ProfileTable:
         return np.where(np.isin(mode, CONTROLLED), value, np.nan)
 
     def check_source(self, battery: bool) -> None:
-        """Refuse a profile that contradicts the supply of the run.
+        """Reject a profile that contradicts the supply of the run.
 
         Raises:
             BadConfiguration: it states a voltage, and the battery feeds the motors.
@@ -456,7 +456,7 @@ def _mode(cells: _Cells, row: int, before: str, filled: list[str]) -> str:
 
 
 def _check_demands(cells: _Cells, row: int, before: str, mode: str, own: list[str], others: list[str]) -> None:
-    """Refuse a row with two demands or a missing one, and a ramp from one kind of demand to another."""
+    """Reject a row with two demands or a missing one, and a ramp from one kind of demand to another."""
     if others:
         where = cells.columns[others[0]][0]
         beside = cells.columns[own[0]][0] if own and not cells.text(MODE, row) else f"mode {mode}"

@@ -45,7 +45,7 @@ RATINGS = ("winding_C", "motor_speed_rpm", "gearbox_speed_rpm", "gearbox_Nm")
 
 @dataclasses.dataclass(frozen=True)
 class Envelope:
-    """Conditions under which a requirement has to be met: ranges, each from its least to its greatest value.
+    """Ranges of the conditions under which a requirement must be met.
 
     Attributes:
         configuration: configuration of the robot, by name. Empty: its first.

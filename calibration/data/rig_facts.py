@@ -32,7 +32,7 @@ FAR, RISING = 100.0, 3
 
 @dataclasses.dataclass(frozen=True)
 class Fact:
-    """Returns facts that follow from a rig's numbers.
+    """A value derived from a rig's numbers, for a plausibility check.
 
     Attributes:
         what: in words.
@@ -111,14 +111,14 @@ def _torque(robot: Robot, current: float) -> float:
 
 
 def _current(robot: Robot, torque: float) -> float:
-    """Current of one motor that a torque at its output takes, slowly [A]."""
+    """Motor current needed for a torque at its output, at low speed [A]."""
     motor, gear = robot.motor, robot.gearbox
     lost = float(motor.friction_coulomb) + float(gear.friction_coulomb)
     return (torque / (float(gear.ratio) * float(gear.efficiency_load)) + lost) / float(motor.torque_constant)
 
 
 def _drawn(robot: Robot, what: str, torque: float, places: str) -> Iterator[Fact]:
-    """Current that a torque takes, compared with the stall current if the voltage's limit is stated."""
+    """Current needed for a torque, compared with the stall current if a voltage limit is given."""
     if not robot.knows(["motor.torque_constant"]):
         return
     current, limit = _current(robot, torque), robot.motor.voltage_limit

@@ -312,7 +312,7 @@ def needed_parameters(rig: Rig, values: Iterable[tuple[str, Any]] = ()) -> Names
 def refuse_missing(
     missing: Sequence[str], known: Mapping[str, params.Parameter], where: str, given: Iterable[str] = ()
 ) -> None:
-    """Refuse a robot that starts from nothing and does not state all required parameters.
+    """Reject a robot that starts from nothing and does not state all required parameters.
 
     Args:
         missing: names of parameters.

@@ -393,7 +393,7 @@ def _driven(name: str, columns: Columns, layout: Layout) -> tuple[np.ndarray, st
 
 
 def _check_signs(name: str, columns: Columns, layout: Layout) -> None:
-    """Refuses readings without a sign in rows that drive the robot backward."""
+    """Rejects readings without a sign in rows that drive the robot backward."""
     column = layout.imposed_column
     imposed, unit = columns[column], column.split("_")[-1]
     if layout.imposed == "voltage":

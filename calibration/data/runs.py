@@ -275,7 +275,7 @@ def _extra(raw: Raw) -> np.ndarray:
 
 
 def _refuse_idle(arrays: NamedArrays, meaning: Column, raw: Raw, layout: Layout) -> None:
-    """Refuses a condition that does not act on the robot's load, unless it is 0 or not stated."""
+    """Rejects a condition that does not act on the robot's load, unless it is 0 or not stated."""
     why = (
         f"{NO_BRAKE}; give slope_deg or payload_kg, or describe the load as a shaft"
         if layout.has_ground
@@ -291,7 +291,7 @@ def _refuse_idle(arrays: NamedArrays, meaning: Column, raw: Raw, layout: Layout)
 
 
 def _refuse_stated(arrays: NamedArrays, voltages: Raw) -> None:
-    """Refuses voltages of a supply next to a battery."""
+    """Rejects voltages of a supply next to a battery."""
     if isinstance(voltages, np.ndarray):
         stated = np.flatnonzero(~np.isnan(voltages.astype(float)))[:1].tolist()
     else:

@@ -828,7 +828,7 @@ def _shows(found: Settled, s: Stretch, channel: Channel) -> str:
 
 
 def _check_signs(found: Settled) -> None:
-    """Refuse speeds and currents of stretches both ways that have one sign."""
+    """Reject speeds and currents of stretches both ways that have one sign."""
     layout, runs = found.runs.layout, found.runs
     for signal in (s for s in found.signals if runs.turns_round(s.channel)):
         channel = signal.channel
@@ -853,7 +853,7 @@ def _check_signs(found: Settled) -> None:
 
 
 def _check_units(found: Settled, rolling: Mapping[str, Mapping[str, float]]) -> None:
-    """Refuse speeds, and rates of angles, that differ from another channel's by the factor between two units."""
+    """Reject speeds, and rates of angles, that differ from another channel's by the factor between two units."""
     runs = found.runs
     angles = {rate: angle for angle, rate, _ in RATES}
     # The angle is doubted first, as its rate is not read directly.

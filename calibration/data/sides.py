@@ -76,7 +76,7 @@ def of_volts(name: str, columns: Columns, battery: bool) -> Names:
 
 
 def check_turns(runs: Runs) -> None:
-    """Refuses a table of turns with exchanged sides or a yaw rate of the other sign.
+    """Rejects a table of turns with exchanged sides or a yaw rate of the other sign.
 
     Raises:
         BadData: readings of a side that follow the drive of the other side, or a yaw rate that contradicts both.
@@ -107,7 +107,7 @@ def check_turns(runs: Runs) -> None:
 def _refuse_against(
     runs: Runs, column: str, shown: tuple[np.ndarray, ...], readings: np.ndarray, drive: np.ndarray, expected: str
 ) -> None:
-    """Refuses readings that mostly have the other sign than their drive. The message names the clearest row.
+    """Rejects readings that mostly have the other sign than their drive. The message names the clearest row.
 
     Args:
         shown: values of the columns in every row.

@@ -231,7 +231,7 @@ def fit_base(space: CandidateSpace, settings: Settings, where: str, near: Candid
 
 
 def _beyond_adhesion(space: CandidateSpace) -> np.ndarray:
-    """True for rows in which the robot slides at any plausible adhesion, shape (rows,).
+    """True for rows in which the robot slides even at the largest plausible adhesion, shape (rows,).
 
     A search would increase the adhesion, and distort the whole base, until the robot grips in them.
     """
@@ -274,7 +274,7 @@ Proposal = tuple[Names, np.ndarray]
 
 
 def fit_candidates(space: CandidateSpace, proposals: Sequence[Proposal], settings: Settings) -> list[Candidate]:
-    """Fit each (active effects, start). Those known with other sds take a few steps from there."""
+    """Fits each pair of active effects and start. Fits known with other sds continue from there for a few steps."""
     if not proposals:
         return []
     problem, active = space.fitted_by(names for names, _ in proposals)

@@ -120,7 +120,7 @@ def discover(
     keep: Keep = kept.keep_nothing,
     left: Callable[[], float | None] = lambda: None,
 ) -> DiscoveryResult:
-    """Find the model error of a robot against measured runs, and trace it to a balance or an effect.
+    """Finds the model error of a robot with respect to measured runs, and traces it to a balance or an effect.
 
     Args:
         runs: settled runs, or time histories from rest.
@@ -254,7 +254,7 @@ class LoopInput:
 
     @functools.cached_property
     def loses_motion(self) -> bool:
-        """True if the log shows a backlash that the robot does not have."""
+        """True if the log shows backlash but the robot has none."""
         return bool(lost_motion_notes(self.runs, self.robot))
 
     def screen(self, noise: Noise, before: BaseFit | None, ranked: list[Ranking]) -> Screening:
@@ -734,7 +734,7 @@ def has_pulses(runs: Runs) -> bool:
 
 
 def goes_both_ways(runs: Runs) -> bool:
-    """True if runs go both forward and backward, by any speed that they state or by their drive."""
+    """True if there are both forward and backward runs, judged by any measured speed or by the command."""
     moved = [c.column for c in channels.EVERY if c.zero_at_rest and c.directed]
     columns = [runs[name] for name in (*moved, runs.layout.imposed_column, "duty") if runs.has(name)]
     finite_columns = [x[np.isfinite(x)] for x in columns]
@@ -977,7 +977,7 @@ def assemble_result(given: LoopInput, traced: LoopStages) -> DiscoveryResult:
 
 
 def refit_worse(seen: ReadingsOfRows, noise: Noise, included: np.ndarray) -> list[Remark]:
-    """Channels with unstated sds and a refit that is worse than the robot as stated, beyond their noise.
+    """Channels without stated sds in which the refit is worse than the robot as stated, by more than the noise.
 
     The estimated sds then give some readings too much weight.
 
@@ -1084,7 +1084,7 @@ def _noise(runs: Runs, noise: Noise, kind: type[observers.Observer]) -> dict[str
 
 
 def loop_remarks(found: DiscoveryResult) -> Notes:
-    """Remarks of a careful engineer on a result."""
+    """Remarks on a result that a careful engineer would make."""
     remarks: list[Remark] = []
     for rows, why in ((found.unusable, "unusable"), (found.outliers, "outliers")):
         if rows:
@@ -1123,8 +1123,8 @@ def loop_remarks(found: DiscoveryResult) -> Notes:
 
 
 def _rests_on(found: DiscoveryResult, test: NameTest) -> Remark:
-    """Experiment to test the run that an effect depends on: a repeat, and half steps to either side along a series
-    of that run."""
+    """Experiment that tests the single run on which an effect depends: a repeat, and half steps to both sides of
+    it."""
     runs = found.runs
     if test.what == "run":
         return Remark("rests_on", test=test)

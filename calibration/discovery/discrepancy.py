@@ -113,7 +113,7 @@ def _axis(variable: str) -> str:
 def refine_window(
     linear: Linearization, place: str, axis: str, included: np.ndarray
 ) -> tuple[bases_room.Window, float]:
-    """Window of an axis that explains most, and its decrease of χ² [σ²].
+    """Window along an axis that explains most of the misfit, and its decrease of χ² [σ²].
 
     Windows begin and end at the axis's instants and hold at most half of the rows. Those of the tests are coarser.
 
@@ -313,6 +313,6 @@ def _with_curve(space: CandidateSpace, base: Candidate, curve: Smooth) -> Proble
 
 
 def _present(robot: Robot, space: CandidateSpace, base: Candidate, curve: str) -> Robot:
-    """Robot with only the effects that are present: its own, those of the fit, and the curve."""
+    """Robot with only its own effects, those of the fit, and the curve."""
     names = {e.name for e in space.bare.base.effects} | set(base.effects) | {curve}
     return dataclasses.replace(robot, effects=tuple(e for e in robot.effects if e.name in names))

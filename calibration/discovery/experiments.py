@@ -107,12 +107,12 @@ class Ranked:
 
     @property
     def smallest(self) -> float:
-        """Separation of the pair that is separated worst [σ]."""
+        """Smallest separation of any pair [σ]."""
         return min(self.sigma, default=0.0)
 
     @property
     def told(self) -> tuple[float, ...]:
-        """Separations that are worth an experiment."""
+        """Separations that justify an experiment."""
         return tuple(s for s in self.sigma if s >= self.settings.worth)
 
     @property
@@ -128,7 +128,7 @@ class Ranked:
 
     @property
     def chance_worst(self) -> float:
-        """Least of `chances`."""
+        """Smallest of `chances`."""
         return float(self.chances.min())
 
     @property
@@ -310,7 +310,7 @@ def _rank_experiment(seen: PredictedReadings, *experiments: str) -> Ranked:
 
 
 def _usefulness(r: Ranked) -> tuple[bool, float]:
-    """True if it is worth an experiment for any pair, and the expected number of separated pairs."""
+    """True if an experiment separates any pair well enough, and the expected number of separated pairs."""
     return bool(r.told), float(np.sum(np.minimum(r.chances, r.settings.enough)))
 
 

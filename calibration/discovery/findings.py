@@ -326,7 +326,8 @@ def _plausible_score(
 
 
 def invisible_effects(space: CandidateSpace, scores: ScoreTable, settings: Settings) -> Names:
-    """Effects that the data cannot show: even the largest plausible amplitude changes the readings too little."""
+    """Effects that the data cannot reveal, because even the largest plausible amplitude changes the readings too
+    little."""
     largest_scores = space.library.largest(np.asarray(scores.left))
     return tuple(
         e.name

@@ -157,7 +157,7 @@ class Proposal:
 
     @property
     def formula(self) -> str:
-        """Its expression, or that there is none."""
+        """The expression, or a sentence that there is none."""
         return describe(self)
 
 

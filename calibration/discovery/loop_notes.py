@@ -88,7 +88,8 @@ class NameTest:
 
     @property
     def rests_on(self) -> int | None:
-        """Number of the row without which it would fail, None if it needs no single row, or fails anyway."""
+        """Number of the row without which the test would fail. None if it depends on no single row, or fails
+        anyway."""
         if self.root < self.needed:
             return None
         return self.row if self.root_without < max(self.needed, KEPT[self.what] * self.root) else None
@@ -296,7 +297,7 @@ class Summary:
 
 @dataclasses.dataclass(frozen=True)
 class Headline:
-    """Claims that hold at every noise that was tried.
+    """Claims that hold at every noise level tried.
 
     Attributes:
         level: level of the claims, a verdict, `open` if the noise decides whether an effect is missing.

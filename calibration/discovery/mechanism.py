@@ -49,7 +49,7 @@ def find_mechanism(
     predicted: Predicted,
     settings: Settings,
 ) -> Mechanism | None:
-    """Mechanism that explains most of the base's discrepancy.
+    """Mechanism that explains most of the discrepancy of the base fit.
 
     It is that of effects of one family of the library, or that of a smooth curve if none of them explains as
     much, None for histories if only a curve does.

@@ -74,7 +74,7 @@ def bare(robot: Robot, brake: Scalar = 0.0) -> Robot:
 
 
 def blocked(robot: Robot, brake: Scalar = 0.0) -> Robot:
-    """The motors with their shafts held: U_e = E + I R at speed 0."""
+    """The motors with locked shafts: U_e = E + I R at speed 0."""
     return _with(lifted(robot), {"gearbox.friction_coulomb": BLOCKED})
 
 
@@ -135,7 +135,7 @@ class Act:
 
 @dataclasses.dataclass(frozen=True)
 class Run:
-    """Settled runs under conditions that the table does not have.
+    """Settled runs under conditions that are not in the table.
 
     Attributes:
         name: of them.
@@ -186,7 +186,7 @@ Experiment = Act | Run
 
 
 def round_significant(value: float, digits: int = 2) -> float:
-    """A number with so many significant digits, as a person sets it."""
+    """A number rounded to this many significant digits, as a person would set it."""
     return float(f"{value:.{digits - 1}e}")
 
 
@@ -215,7 +215,7 @@ def last_setting(most: float, step: float) -> float:
 
 
 def floor_significant(value: float) -> float:
-    """Largest number of two digits up to a positive one."""
+    """Largest number with two significant digits that does not exceed a positive number."""
     step = 10.0 ** (math.floor(math.log10(value)) - 1)
     return round_significant(math.floor(value / step + 1e-9) * step)
 
@@ -241,7 +241,7 @@ def _weighed(robot: Robot, at: Array) -> Array:
 
 @dataclasses.dataclass(frozen=True)
 class _Instrument:
-    """Readings of a channel's instrument where these signals have known values."""
+    """Readings of a channel's instrument for known values of these signals."""
 
     channel: str
     signals: Names
@@ -433,7 +433,7 @@ def _shaft_runs(reach: Reach, used: Used) -> tuple[Run, ...]:
 
 
 def check_forbidden(forbidden: Sequence[str], robot: Robot) -> None:
-    """Refuse names that are neither kinds of experiments nor configurations.
+    """Reject names that are neither kinds of experiments nor configurations.
 
     Raises:
         BadConfiguration: such a name, with the choices.

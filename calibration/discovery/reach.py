@@ -22,7 +22,7 @@ LOADED, RUNNING = 0.3, 0.8
 
 @dataclasses.dataclass(frozen=True)
 class Used:
-    """Ranges that a table used of one configuration, each increasing and without repeats.
+    """Values of the conditions in a table for one configuration, increasing and without repeats.
 
     Attributes:
         configuration: its name.

@@ -220,7 +220,7 @@ def _best(candidates: Sequence[Candidate]) -> Candidate | None:
 
 
 def _accepted(c: Candidate | None, ladder: Sequence[Candidate], settings: Settings) -> Candidate | None:
-    """The candidate if each of its effects is needed: it explains clearly more than any with one effect fewer."""
+    """The candidate, if it explains clearly more than any candidate with one effect fewer."""
     if c is None:
         return None
     fewer = [x.cost for x in ladder if len(x.effects) == len(c.effects) - 1 and x.plausible]

@@ -123,7 +123,7 @@ class Feedforward:
 
 
 def interval(value: float, sd: float) -> list[float]:
-    """The interval of 95 %."""
+    """The 95 % interval."""
     return [value - Z95 * sd, value + Z95 * sd]
 
 
@@ -135,7 +135,7 @@ def units_of(unit: str) -> dict[str, str]:
 
 
 def fit_feedforward(log: DriveLog, mechanism: str = "simple", tolerances: Tolerances | None = None) -> Feedforward:
-    """Constants of a drive, gains and what stands in their way.
+    """Constants and gains of a drive, and reasons why some are missing.
 
     Raises:
         BadData: too little motion. The message names the missing tests.
@@ -315,7 +315,7 @@ def _windows(log: DriveLog, delay: float) -> Columns:
 
 
 def _driven(voltage: np.ndarray) -> np.ndarray:
-    """The voltages of a run that drive the motor."""
+    """Voltages of the samples of a run in which the motor is driven."""
     return voltage[np.abs(voltage) > 0.05 * np.abs(voltage).max()]
 
 

@@ -67,7 +67,7 @@ class Pair(NamedTuple):
 
 
 class Determination(NamedTuple):
-    """Whether data determine a parameter.
+    """Result of the test whether data determine a parameter.
 
     Attributes:
         held: True if only its prior does.
@@ -79,7 +79,7 @@ class Determination(NamedTuple):
 
     @classmethod
     def of(cls, name: str, held: bool, pairs: Iterable[Pair]) -> Determination:
-        """From the pairs that data determine only in combination."""
+        """Determination of a parameter, from the pairs that data determine only in combination."""
         return cls(held, tuple(p.other if p.one == name else p.one for p in pairs if name in (p.one, p.other)))
 
 

@@ -35,7 +35,7 @@ MORE = ("motor_current", "output_speed", "motor_voltage")
 
 @dataclasses.dataclass(frozen=True)
 class Determined:
-    """Information that a table has on a free parameter.
+    """Information that a table contains on a free parameter.
 
     Attributes:
         name: name of the parameter.
@@ -55,7 +55,7 @@ class Determined:
 
 @dataclasses.dataclass(frozen=True)
 class Foresight:
-    """Information that a table has on a robot.
+    """Information that a table contains on a robot's parameters.
 
     Attributes:
         parameters: parameters that `loop` would free.

@@ -267,6 +267,6 @@ def determined_together(posterior: Posterior, held: Collection[str] = ()) -> tup
 
 
 def undetermined_names(held: Collection[str], pairs: Collection[Pair]) -> Names:
-    """Names held by priors, without names in a pair with a determined combination."""
+    """Names of parameters held by their priors, except those in a pair with a determined combination."""
     paired = {name for pair in pairs for name in (pair.one, pair.other)}
     return tuple(name for name in held if name not in paired)

@@ -212,7 +212,7 @@ class Linearization(eqx.Module):
         return self.residual[: self.readings].reshape(self.rows, -1)
 
     def with_residual(self, residual: Array) -> Linearization:
-        """Copy with other residuals."""
+        """Copy with these residuals."""
         return dataclasses.replace(self, residual=residual)
 
     @property

@@ -117,7 +117,7 @@ def with_ratings(robot: Robot, asked: Requirements) -> Requirements:
 
 
 def refuse_impossible(robot: Robot, asked: Requirements) -> None:
-    """Refuse requirements that cannot be evaluated for a robot of these configurations.
+    """Reject requirements that cannot be evaluated for a robot of these configurations.
 
     Raises:
         BadConfiguration: a configuration that the robot does not have. A turn that it cannot make. A posture of a

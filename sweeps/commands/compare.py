@@ -79,7 +79,7 @@ def _over_time(
     runs: records.Runs,
     beside: configuration.ComparedRuns,
 ) -> int:
-    """The same for time histories, each simulated from its beginning as in fits."""
+    """Comparison with time histories, each simulated from its beginning as in fits."""
     options = {"--own-mass": beside.own_mass, "--posterior": config.posterior, "--duration": config.duration_s}
     for option in (name for name, stated in options.items() if stated):
         raise BadConfiguration(

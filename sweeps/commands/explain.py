@@ -164,7 +164,7 @@ def _status(name: str, library: Library) -> Iterator[Line]:
 
 
 def _meaning(meanings: Mapping[str, str], where: str = "") -> Explain:
-    """Explains names that have a meaning each. `where` they are found in files."""
+    """Explanation of names from a table of meanings. `where` describes in which files they occur."""
 
     def about(name: str, library: Library) -> Iterator[Line]:
         if name in meanings:

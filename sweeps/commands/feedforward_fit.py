@@ -26,7 +26,7 @@ ROTOR = "motor_speed_rpm", ""
 
 
 def execute(config: configuration.Calibrate, beside: configuration.FittedRuns) -> int:
-    """Fit the constants, print them and leave a run folder. Returns the exit code, 0."""
+    """Fit the constants, print them and write a run folder. Returns the exit code, 0."""
     if stated := config.robot != "nominal":
         robot = load_robot(config).robot
     else:
@@ -51,7 +51,7 @@ def execute(config: configuration.Calibrate, beside: configuration.FittedRuns) -
 
 
 def drive_log(runs: Runs, unit: str | None = None, as_logged: bool = False) -> DriveLog:
-    """Readings of a log in a unit of position. None: that of its first pair of channels.
+    """Readings of a log in a unit of position. None: the unit of its first pair of channels.
 
     Args:
         as_logged: True for a log of SysId, which is in units of its own. `unit` is their name.

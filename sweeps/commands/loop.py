@@ -42,7 +42,7 @@ SCREENING_FILE, SCREENING = "screening.json", "mmrjax.screening/1"
 
 
 def execute(config: configuration.Loop, beside: configuration.LoopBeside) -> int:
-    """Run the closed loop on a table and leave a run folder. Returns the exit code.
+    """Run the closed loop on a table and write a run folder. Returns the exit code.
 
     0 done, whatever the verdict. 3 done, but the fit that is proposed did not converge, or its time was out before
     there was a verdict. Stages are kept as they end, so that the same command goes on after that, or an interrupt.
@@ -118,7 +118,7 @@ def _loop(config: configuration.Loop, beside: configuration.LoopBeside) -> int:
 def _resolved(
     found: DiscoveryResult, config: configuration.Loop, members: Path | None, progress: Callable[[str], None]
 ) -> DiscoveryResult:
-    """The result, with its resistance resolved by the track model."""
+    """The result, with the track model's test added: does a different running gear explain the misfit?"""
     resolved = resolve(
         found, noise=config.noise or None, population=config.population, generations=config.generations,
         members=members, seed=config.seed, tell=in_words(progress),
@@ -127,7 +127,7 @@ def _resolved(
 
 
 def _say_out_of_time(within: float, begun: bool) -> None:
-    """Report that time was out before a verdict [s]. `begun`: a stage has ended."""
+    """Report that the time budget [s] ended before a verdict. `begun`: at least one stage has finished."""
     more = max(5, math.ceil(within / 30))  # twice as much
     first = "" if begun else f", and no fit of the base model; allow more time, such as --within {more}min"
     print_message(f"no verdict within {within:g} s{first}")
@@ -156,7 +156,7 @@ def _alarm(seconds: float, wanted: Callable[[], bool]) -> Iterator[None]:
 
 
 def _show_ranking(found: Ranking, folder: RunFolder, timed: Callable[[str], None], brief: bool) -> None:
-    """Print the ranking by regression, the first answer, and leave it in the run folder."""
+    """Print the ranking by regression, the first answer, and write it to the run folder."""
     first, *lines = loop_words.ranking_lines(found, brief=brief)
     timed(first)
     for line in lines:
@@ -167,7 +167,7 @@ def _show_ranking(found: Ranking, folder: RunFolder, timed: Callable[[str], None
 
 
 def _say_kept(stages: Mapping[str, Any], folder: RunFolder, robot_name: str) -> None:
-    """Say which stages are kept, and leave the robot of the base fit where there is one but no verdict."""
+    """Print which stages are stored. Without a verdict, write the robot of the base fit if it is known."""
     if not stages:
         return
     kept = [name for name in stages if folder.keeps(name)]

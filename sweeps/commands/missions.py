@@ -37,7 +37,7 @@ _LASTING = MARKS.index("battery_empty")  # events from here on are kept in histo
 
 
 def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> int:
-    """Simulate runs of a file, or one of options, over a profile. Returns the exit code.
+    """Simulate runs from a file, or one run from options, over a profile. Returns the exit code.
 
     Raises:
         BadConfiguration: a condition that both the options and the profile state, a battery that is empty or below
@@ -110,7 +110,8 @@ def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> 
 
 
 def _check_turning(robot: Robot, runs: records.Runs, source: ProfileTable) -> None:
-    """Refuse a robot that cannot turn where the profile drives its sides apart, and more than the supply has."""
+    """Reject a robot that cannot turn if the profile drives its sides differently, and voltages above the supply
+    voltage."""
     if not source.turns:
         return
     names = sorted({str(name) for name in runs.configurations_named(robot)})
@@ -125,7 +126,7 @@ def _check_turning(robot: Robot, runs: records.Runs, source: ProfileTable) -> No
 
 
 def _commanded(robot: Robot, runs: records.Runs, source: ProfileTable, config: configuration.Simulate) -> Conditions:
-    """Conditions of the runs. Of robots that turn with the lateral adhesion of a stated surface."""
+    """Conditions of the runs. For robots that turn, they include the lateral adhesion of a given surface."""
     conditions = run.conditions_of_runs(robot, runs, config)
     if not source.turns or not runs.has(profiles.SURFACE) or source.surface is not None:
         return conditions
@@ -145,7 +146,7 @@ def _check_charge(robot: Robot, config: configuration.Simulate) -> None:
 
 
 def _check_cutoff(robot: Robot, runs: records.Runs, source: ProfileTable, config: configuration.Simulate) -> None:
-    """Refuse missions that begin with cells below their cut-off."""
+    """Reject missions that begin with cells below their cut-off voltage."""
     if not config.battery:
         return
     conditions = run.conditions_of_runs(robot, runs, config)
@@ -194,7 +195,7 @@ def run_missions(robot: Robot, runs: records.Runs, source: ProfileTable, config:
 
 
 def _below(tables: list[Columns]) -> Columns:
-    """Tables of the same columns one below the other."""
+    """Concatenated tables with the same columns."""
     return {key: np.concatenate([table[key] for table in tables]) for key in tables[0]}
 
 
@@ -251,7 +252,7 @@ def _segments(
 
 
 def _segment_of(found: Mission, k: int) -> np.ndarray:
-    """Segment of each kept step of a run. Those after the last are of one beyond the end."""
+    """Segment of each stored step of a run. Steps after the last one get an index beyond the last segment."""
     assert found.course is not None  # it was asked for
     segment = np.asarray(found.course.segment[k])
     return np.where(segment < 0, np.iinfo(segment.dtype).max, segment)

@@ -124,7 +124,7 @@ class RigCheck:
         return notes
 
     def channels(self) -> list[Json]:
-        """Of each channel: name, the user's column, whether it is signed, its step [unit], source of its sd."""
+        """Name, column in the file, sign convention, resolution [unit] and source of the sd of each channel."""
         theirs = {name: column for name, column, _ in self.robot.rig.columns}
         rig, rows = (self if self.foresight is None else self.foresight).robot.rig, []
         for k, channel in enumerate(self.robot.channels):
@@ -143,7 +143,7 @@ class RigCheck:
         return rows
 
     def columns(self) -> list[Json]:
-        """Of each column of the table: what it is used for, its range."""
+        """Use and range of each column of the table."""
         if self.runs is None:
             return []
         rows, theirs = [], self.runs.headings
@@ -172,7 +172,7 @@ class RigCheck:
         return column in idle or (column == SUPPLY and self.robot.rig.imposed != "voltage")
 
     def unused(self) -> list[str]:
-        """Of each column that is not used, why."""
+        """Reason why each unused column is not used."""
         if self.runs is None:
             return []
         every = {c.column: c.name for c in channels.EVERY}
@@ -205,12 +205,12 @@ class RigCheck:
         return "; ".join(parts) + "."
 
     def determined(self, parameter: Determined) -> str:
-        """`yes`, `no`, or with which parameters together the table determines one."""
+        """`yes`, `no`, or the parameters with which the table determines this one in combination."""
         assert self.foresight is not None
         return describe(Determination.of(parameter.name, parameter.held, self.foresight.together))
 
     def to_json(self) -> Json:
-        """The whole, for machines."""
+        """The whole check as JSON-able data."""
         runs = None
         if self.runs is not None:
             assert self.foresight is not None
@@ -253,7 +253,7 @@ def _source(word: str, channel: Channel) -> str:
 
 
 def _program(robot: Robot, origin: Origin) -> str:
-    """A number stated without ±, with the width that the program gives it where a fit frees it."""
+    """A number without ±, with the default prior width that a fit gives it."""
     sd = float(priors.parameter_coordinates(robot, (origin.name,)).prior_sd[0])
     return f"{origin.name} (±{100 * sd / abs(origin.value):.2g} %)"
 
@@ -282,7 +282,7 @@ def _use(column: str, robot: Robot) -> str:
 
 
 def check_rig_file(file: Path, data: str | None, effects: Names, as_json: bool, columns: str | None = None) -> int:
-    """Report how a rig's file was read, and what a table can determine of it. Returns 0.
+    """Report how a rig's file was interpreted, and which parameters a table can determine. Returns 0.
 
     Raises:
         BadConfiguration: a file that cannot be read, or lacks something, with all that it lacks.
@@ -321,7 +321,7 @@ def examine_rig_file(file: Path, data: str | None, effects: Names = (), columns:
 
 
 def check_document(found: RigCheck) -> Document:
-    """All of it, for a person."""
+    """The whole check as a document."""
     signs = {None: FREE, True: "signed", False: "magnitude"}
     steps = (
         FREE if c["quantum"] is None else f"{c['quantum']:.3g} {c['unit']}" if c["quantum"] else ""

@@ -60,7 +60,7 @@ def read_mujoco_hinge(source: Path, joint: str | None) -> JointNumbers:
 
 
 def check_mujoco_model(source: Path) -> None:
-    """Refuses a model with sizes or files for which MuJoCo's compiler does not end, before that compiler starts.
+    """Rejects a model with sizes or files for which MuJoCo's compiler does not end, before that compiler starts.
 
     Raises:
         BadConfiguration: numbers that are not finite, too many copies, elements or cells, or a file that is a pipe or
@@ -191,7 +191,7 @@ class _Model:
         )  # fmt: skip
 
     def _load(self, joint: int, dof: int, armature: float) -> tuple[float, tuple[float, float] | None]:
-        """Inertia of what turns and its weight as `hanging`, other joints at rest in the reference pose."""
+        """Inertia of the rotating parts and their weight as `hanging`, with other joints in the reference pose."""
         model, data, place = self.model, self.data, self.model.jnt_qposadr[joint]
         weights = []
         for angle in (np.pi / 2, 0.0):
@@ -223,7 +223,7 @@ class _Model:
         return max(radii)[1:] if radii else None
 
     def _sides(self, joint: int, radius: Found | None) -> Found | None:
-        """Number of wheels of the same radius and parallel axis that are as driven as this one."""
+        """Number of driven wheels with the same radius and a parallel axis, including this one."""
         if radius is None:
             return None
         equal, driven = [], joint in self.actuators

@@ -230,7 +230,7 @@ class _Urdf:
         return None
 
     def _sides(self, joint: str, radius: Found | None) -> Found | None:
-        """Number of wheels of the same radius and parallel axis that are as driven as this one."""
+        """Number of driven wheels with the same radius and a parallel axis, including this one."""
         axis = self._to_root(joint)[0][0] @ self._axis(joint)
         equal = []
         for name, element in self.joints.items():

@@ -64,7 +64,7 @@ class JointNumbers:
     drive: Mapping[str, Stated] = dataclasses.field(default_factory=dict)
 
     def kind(self, stated: str | None) -> str:
-        """The kind of rig: `stated`, or else what the joint moves.
+        """The kind of rig: `stated`, or else the kind that fits the joint's load.
 
         Raises:
             BadConfiguration: a kind whose load slides.

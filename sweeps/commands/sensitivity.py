@@ -55,7 +55,7 @@ AXES = {
 
 
 def execute(config: configuration.Sensitivity, beside: configuration.FolderPart) -> int:
-    """Study a robot and leave a run folder. Returns the exit code.
+    """Run a sensitivity study of a robot and write a run folder. Returns the exit code.
 
     0 done. 3 done, but the solver failed at some operating points.
     """
@@ -115,7 +115,7 @@ def _ranges(vary: Names) -> dict[str, tuple[float, float]]:
 def _operating_points(
     config: configuration.Sensitivity, robot: Robot, ranges: dict[str, tuple[float, float]]
 ) -> Runs:
-    """The grid of operating points. An axis that varies has one value, the middle of its range."""
+    """The grid of operating points. For a condition with --vary it contains one value, the middle of the range."""
     layout = Layout.of(robot)
     if layout.imposed == "motor_current":
         raise BadConfiguration("sensitivity: the motor current is imposed on this robot; use simulate or sweep")
@@ -180,7 +180,7 @@ def _inputs(
 
 
 def _candidates(config: configuration.Sensitivity, robot: Robot, points: Runs, turns: bool) -> Candidates:
-    """Runs of a table, or of Table 8 in every configuration. Of a rig, and of turns, its operating points."""
+    """Candidate runs: a table, or Table 8 in every configuration. For a rig or for turns, the operating points."""
     if config.candidates:
         runs = read_runs(config.candidates, robot, columns=config.columns, measured=False)
         source = runs.source

@@ -52,7 +52,7 @@ PERMISSIBLE = "permissible_time_s"
 
 
 def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> int:
-    """Simulate runs of a file, or one of options. Leave a run folder. Returns the exit code.
+    """Simulate runs from a file, or one run from options, and write a run folder. Returns the exit code.
 
     Raises:
         BadConfiguration: more runs than histories can be kept of.
@@ -192,7 +192,7 @@ def _permissible(motor: Motor, currents: Float[Array, " runs"]) -> Scalar:
 
 
 def motor_currents(robot: Robot, table: Columns) -> np.ndarray:
-    """Size of the current of one motor [A], of sides driven apart the larger, NaN where no column tells it."""
+    """Magnitude of the current of one motor [A], the larger one if the sides differ. NaN if no column contains it."""
     if all(column in table for column in _OF_SIDES):
         return np.asarray(np.max([np.abs(table[column]) for column in _OF_SIDES], axis=0))
     for column, motors in (("total_current_A", float(robot.sides)), ("motor_current_A", 1.0)):

@@ -43,7 +43,8 @@ PROBED = 64
 
 
 def execute(config: Campaign | Sweep, options: StoreOptions) -> int:
-    """Simulate a design and leave a run folder, of a grid of up to `TABLE` runs with a table. Returns the exit code.
+    """Simulate a sweep and write a run folder, with a table if the grid has at most `TABLE` runs. Returns the exit
+    code.
 
     Args:
         config: the configuration.
@@ -167,7 +168,7 @@ def _free(path: Path) -> int:
 
 
 def _refuse_without_space(size: int, share: float, path: Path) -> None:
-    """Refuse a sweep whose results would not fit.
+    """Reject a sweep whose results would not fit on the disk.
 
     Args:
         size: size of the whole store [bytes].
@@ -183,7 +184,7 @@ def _refuse_without_space(size: int, share: float, path: Path) -> None:
 
 
 def bytes_text(size: float) -> str:
-    """Bytes as a person reads them."""
+    """A number of bytes as text."""
     for unit in ("B", "kB", "MB", "GB", "TB"):
         if size < 1000 or unit == "TB":
             return f"{size:.3g} {unit}" if size < 1e6 else f"{size:,.0f} {unit}"
@@ -192,7 +193,7 @@ def bytes_text(size: float) -> str:
 
 
 def duration_text(seconds: float) -> str:
-    """Seconds as a person reads them."""
+    """A duration as text."""
     for unit, length in (("days", 86400.0), ("h", 3600.0), ("min", 60.0)):
         if seconds >= 2 * length:
             return f"{seconds / length:.1f} {unit}"
@@ -245,7 +246,7 @@ def simulate_chunks(store: SweepStore, job: scale.Job, options: StoreOptions, po
 
 
 class DiskFull(InputError):
-    """No space left in the middle of a sweep, which can be taken up again."""
+    """The disk filled up during a sweep. The sweep can be resumed."""
 
 
 def finish_sweep(

@@ -38,7 +38,8 @@ SHOWN = tuple(c.name for c in channels.OF_TURNS)
 
 
 def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> int:
-    """Simulate one run of options whose sides are driven apart. Leave a run folder. Returns the exit code.
+    """Simulate one run from options with different commands for the two sides, and write a run folder. Returns the
+    exit code.
 
     Raises:
         BadConfiguration: runs of a file, a robot that cannot turn, a turn without a steady state.
@@ -173,7 +174,7 @@ def _ended(history: History | None) -> dict[str, float] | None:
 
 
 def check_can_turn(robot: Robot, named: str) -> None:
-    """Refuse a robot that cannot turn, in this configuration.
+    """Reject a robot that cannot turn in this configuration.
 
     Raises:
         BadConfiguration: why.
@@ -184,7 +185,7 @@ def check_can_turn(robot: Robot, named: str) -> None:
 
 
 def turn_columns(config: configuration.TurnPart, given: Json) -> Json:
-    """Columns of the run: duties of the supply's voltage, which is the larger one where it is not stated."""
+    """Columns of the run: both duties, and the supply voltage. Without --voltage it is the larger side voltage."""
     columns: Json = {} if config.heading_deg is None else {"heading_deg": config.heading_deg}
     if config.duty_left is not None:
         return columns | {"duty_left": config.duty_left, "duty_right": config.duty_right}

@@ -201,7 +201,7 @@ def _refitted(law: FormatLaw, least: Any, command: Any, load: Any, way: Any, cur
 
 
 def share_kept(law: FormatLaw, bare: FormatLaw, situation: Situation, native: AtJoint, native_bare: AtJoint) -> float:
-    """Share of an effect's change of current and speed that a refitted format shows [-], at most 1.
+    """Fraction of an effect's change of current and speed that a refitted format reproduces [-], at most 1.
 
     1 less the rms of what the change of the format's error by the effect is, over that of the change itself. NaN
     where the effect changes nothing.

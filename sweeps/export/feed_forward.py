@@ -53,7 +53,8 @@ class Map(eqx.Module):
 
 
 def symmetric_axis(largest: float) -> np.ndarray:
-    """Values from -`largest` to `largest`, 0 and both its neighbours close together, where friction turns round."""
+    """Values from -`largest` to `largest`, with both neighbours of 0 close to it, because friction changes sign
+    there."""
     half = np.linspace(0.0, largest, POINTS + 1)[1:]
     near = np.array([1e-3 * largest])
     return np.concatenate([-half[::-1], -near, [0.0], near, half])
@@ -83,7 +84,7 @@ def steady_state_map(module: ModuleType, params: Json, speed: np.ndarray, torque
 
 
 class TableLaw(eqx.Module):
-    """The tables, read with straight lines between their points. Attributes: as of `comparison.FormatLaw`."""
+    """The tables, with linear interpolation between points. Attributes: as of `comparison.FormatLaw`."""
 
     speed: jax.Array
     torque: jax.Array
@@ -111,7 +112,7 @@ class TableLaw(eqx.Module):
 
 
 def map_of(situation: Situation, constants: Sequence[Constant], amplitudes: Mapping[str, float] | None = None) -> Map:
-    """The tables of a drive, as far as the runs reach and a little beyond."""
+    """The tables of a drive, over the range of the runs and slightly beyond."""
     module = module_from_source(jax_source(situation.joint, constants))
     params = jax_actuator.steady_params(situation.joint, constants, amplitudes or {})
     reach = float(np.max(np.abs(situation.inside.speed))) * BEYOND
@@ -159,7 +160,7 @@ def fates_in_tables(joint: Joint, constants: Sequence[Constant]) -> list[Fate]:
 
 
 def effects_in_tables(joint: Joint) -> dict[str, str]:
-    """Words for each effect inside the joint without a memory. One with a memory is held at its settled value."""
+    """Words for each effect inside the joint. Effects with a memory keep their settled value."""
     settled = "its settled value, since a table has no state"
     return {e.name: settled if e.memory_size is not None else "the tables" for e in joint.inside}
 

@@ -102,7 +102,7 @@ class Joint:
 
     @property
     def limit(self) -> float | None:
-        """Largest current of one motor that the driver lets flow [A]. None: no limit."""
+        """Current limit of the driver per motor [A]. None: no limit."""
         limit = float(self.robot.driver.current_limit)
         return limit if limit < UNLIMITED else None
 
@@ -123,7 +123,8 @@ class Joint:
 
     @property
     def accelerates(self) -> bool:
-        """True if a loss depends on the torque at gearbox or wheel, which what turns before them takes a share of."""
+        """True if a loss depends on the torque at gearbox or wheel, which is reduced by the acceleration of the
+        parts before it."""
         gear = () if self.loose else self.of("gearbox")
         lossy = not self.loose and float(self.robot.gearbox.efficiency_load) != 1
         return lossy or any(p.by for p in (*gear, *self.of("track")))
@@ -253,7 +254,7 @@ class _Tracer:
         ]
 
     def __call__(self, function: Callable[[Robot, Signals], Any], what: str, balance: str, by: str = "") -> Symbol:
-        """Expression of a function of robot and signals. Of its derivative by a variable, where `by` names one."""
+        """Expression of a function of robot and signals, or of its derivative with respect to the variable `by`."""
         self.at_wheel = balance != "gearbox"
 
         def value(*numbers: Any) -> Any:

@@ -147,7 +147,7 @@ _TORCH = _Library(
 
 
 def function_arguments(symbol: Symbol) -> list[str]:
-    """Arguments of the function of an expression, besides its parameters."""
+    """Arguments of the function of an expression, in addition to its parameters."""
     used = names_of(symbol)
     used_arguments = [n for n in _ARGUMENTS if n in used]
     return [*used_arguments, "memory"] if any(n.startswith("memory.") for n in used) else used_arguments
@@ -485,7 +485,7 @@ def module_from_source(source: str, name: str = "exported_law") -> ModuleType:
 
 
 def _states_a_law(tree: ast.Module) -> bool:
-    """True if a source imports one library, assigns literals, and defines functions that call only these."""
+    """True if a source only imports one library, assigns literals, and defines functions that call nothing else."""
     defined = {node.name for node in tree.body if isinstance(node, ast.FunctionDef)} | {"range"}
     for node in tree.body:
         if isinstance(node, ast.Assign):

@@ -214,7 +214,7 @@ def _controller_fate(joint: Joint, lag: float, ki: float) -> Fate:
 
 
 def fates_outside_joint(joint: Joint) -> list[Fate]:
-    """Fates of effects that no joint has."""
+    """Fates of effects that are not part of a joint."""
     where = {
         "sensor": "an instrument error, not part of the drive",
         "supply": "the battery; the command is a voltage, so reduce it accordingly",
@@ -253,7 +253,7 @@ class Motor:
 
     @property
     def friction(self) -> float:
-        """Friction loss of the joint [N·m], without what `lugre` carries."""
+        """Friction loss of the joint [N·m], without the part in `lugre`."""
         return self.values[FRICTION] - (self.lugre[2] * self.ratio if self.lugre else 0.0)
 
 
@@ -479,7 +479,7 @@ def _body(inertia: float, weight: float, angle: float) -> str:
 def attribute_notes(
     joint: Joint, constants: Sequence[Constant], translated: Mapping[str, float], values: Mapping[str, float]
 ) -> dict[str, str]:
-    """Words for where each attribute comes from, with intervals of what it is made of."""
+    """Origin of each attribute in words, with intervals of the parameters from which it is computed."""
     by_name = {c.name: c for c in constants}
 
     def made_of(*names: str) -> str:

@@ -125,7 +125,7 @@ def _absent(joint: Joint, names: Names = ()) -> Robot:
 
 
 def _solved(robot: Robot, conditions: Conditions) -> tuple[np.ndarray, Signals]:
-    """Mask of the runs that end as their conditions ask, and the signals of all."""
+    """Mask of the runs that end in the commanded direction, and the signals of all runs."""
     result, signals = results_of_rows(robot, conditions)
     return np.asarray(is_done(result.status)), signals
 
@@ -192,7 +192,8 @@ def export_grid(joint: Joint) -> Runs:
 
 
 def stall_torque(joint: Joint, voltage: np.ndarray) -> np.ndarray:
-    """Load at which a shaft's motor stalls [N·m], without effects, within the limits of driver and gearbox."""
+    """Load torque at which a shaft's motor stalls [N·m], without effects and within the limits of driver and
+    gearbox."""
     motor, gear, load = joint.robot.motor, joint.robot.gearbox, joint.load
     current = np.minimum(voltage / float(motor.resistance), float(joint.robot.driver.current_limit))
     torque = float(motor.torque_constant) * current - float(motor.friction_coulomb + gear.friction_coulomb)
@@ -206,7 +207,7 @@ def _measured(runs: Runs, channels: tuple[Any, ...]) -> np.ndarray:
 
 
 def _table(data: Runs | str, joint: Joint) -> Runs:
-    """Runs of a table in the joint's configuration. Of a log its settled stretches."""
+    """Runs of a table in the joint's configuration. For a log, its settled segments."""
     robot = joint.file.robot
     runs = read_runs(data, robot, measured=True, series=True) if isinstance(data, str) else data.of(robot)
     if runs.turns:

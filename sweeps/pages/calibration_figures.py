@@ -21,7 +21,7 @@ SHOWN, ACROSS, WIDE = 6, 3, 0.5
 
 
 def draw_clusters(found: Sequence[ResidualCluster]) -> Figure:
-    """Residuals of each finding over its column, a dot a row. Bar: mean of a level."""
+    """Residuals of each finding over its column, one dot per row. Bars are means of a level."""
     found = found[:SHOWN]
     across = min(ACROSS, len(found))
     rows = -(-len(found) // across)

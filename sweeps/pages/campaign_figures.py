@@ -55,7 +55,7 @@ def varied_names(values: np.ndarray, layout: Layout) -> dict[str, Varied]:
 
 
 def draw_output(output: np.ndarray, label: str, values: np.ndarray, layout: Layout) -> Figure:
-    """How an output of a store spreads, and how it follows what varies."""
+    """Distribution of an output of a store, and its dependence on the varied quantities."""
     return draw_output_spread(output, label, varied_names(values, layout))
 
 
@@ -127,7 +127,7 @@ def draw_grid_statuses(codes: np.ndarray, names: Sequence[str], across: Varied, 
 
 
 def _number(values: np.ndarray, most: int) -> int:
-    """Bins that so many values fill."""
+    """Number of bins for this many values."""
     return min(most, max(LEAST, len(values) // EACH))
 
 

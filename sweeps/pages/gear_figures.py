@@ -102,7 +102,7 @@ def members_with_gear(
 
 
 def ripple_numbers(gear: Gear) -> Json:
-    """What ripples in a run, by how much and how often."""
+    """Size and frequency of the ripples in a run."""
     tail, signals = gear.tail(TAIL), gear.signals
     line, travel, reaction = (
         ripple_peaks.ripple(gear.time[tail], x[tail]) for x in (signals.total_current, signals.speed, signals.normal)

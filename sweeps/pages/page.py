@@ -147,7 +147,7 @@ def render_page(folder: Path, album: Album, **known: Any) -> Path:
 
 
 def _beside(folder: Path, meanings: dict[str, str]) -> dict[str, str]:
-    """Files that a run folder has, or is about to have, with what they are. What is known first."""
+    """Files of a run folder, including those still to be written, with their descriptions. Known files come first."""
     files = {p.name + "/" * p.is_dir() for p in folder.iterdir()} | {"manifest.json"}
     files = {name for name in files if name in meanings or "." in name} - {"report.html"}  # no locks, no chunks
     return {

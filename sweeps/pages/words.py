@@ -215,7 +215,7 @@ NO_TURN = (
 
 
 def reason_without_value(outcome: str) -> str:
-    """In one line why a quantity has no value."""
+    """Reason why a quantity has no value, in one line."""
     return STATUSES[outcome].why if outcome in STATUSES else OUTCOMES[outcome]
 
 
@@ -238,5 +238,5 @@ def words_shown(name: str) -> str:
 
 
 def short_name(name: str) -> str:
-    """A parameter's name without the words that every such name has."""
+    """A parameter's name without the group names that carry no information."""
     return name.replace("ground.", "").replace("track.", "").replace("effects.", "")

@@ -76,7 +76,7 @@ def gear_blocks(robot: Robot) -> Iterator[Block]:
 
 
 def paper_document(file: RobotFile, gear: bool) -> tuple[Document, data.Rows | None]:
-    """The report of a robot and its nominal fellows.
+    """The report on a robot, next to the nominal robots.
 
     Args:
         file: file of any robot, without one of the paper's configurations it is not compared with the bench.
@@ -204,9 +204,8 @@ def implied_resistance(robot: Robot, table: runs.Runs) -> np.ndarray:
 
 
 def _row_table(rows: data.Rows) -> Block:
-    """The 20 rows: bench, the paper's simulation, the nominal robot three ways, and letters that say why.
-
-    A wheeled row has a second one with the robot's own mass.
+    """The 20 rows: bench, the paper's simulation, three variants of the nominal robot, and letters for the reasons
+    of differences. Wheeled rows appear a second time with the robot's own mass.
     """
     table, own_mass = rows.conditions, rows.weighed["total_mass_kg"]
     own, raised, weighed = (data.stack_channels(t) for t in (rows.plain, rows.raised, rows.weighed))

@@ -63,11 +63,11 @@ class Plan:
 
     @staticmethod
     def of_rows(rows: Conditions, samples: Drawn | None = None) -> Plan:
-        """The runs of a table, of shape (runs,), each crossed with every sample."""
+        """The runs of a table, of shape (runs,), each combined with every sample."""
         return Plan(Design({ROW: np.arange(rows.shape[0], dtype=float)}, samples), {}, {}, rows=rows)
 
     def varied(self, robot: Robot) -> variation.Variation:
-        """The robot and what varies of it and of conditions, without axes that a task has of its own."""
+        """The robot and the varied parameters and conditions, without the axes that belong to a task."""
         names = variation.variable_names(robot)
         return variation.Variation(robot, tuple(name for name in self.design.names if name in names))
 
@@ -131,7 +131,7 @@ def plan_design(config: Campaign, robot: Robot, where: str) -> Plan:
 
 
 def _acting(names: set[str], robot: Robot, where: str, surface: str | None) -> None:
-    """Refuse conditions that do not act on a robot."""
+    """Reject conditions that do not act on a robot."""
     kinds = {
         "voltage": ("voltage", "duty", "open"), "motor_speed": ("motor_speed", "motor_acceleration"),
         "motor_current": ("motor_current",),
@@ -345,7 +345,7 @@ def _quantile(name: str, stated: Any, robot: Robot, where: str) -> Quantile:
 
 
 def _prior(name: str, robot: Robot) -> Quantile:
-    """The quantile function of a parameter's prior, the one with which `calibrate` and `sensitivity` work."""
+    """The quantile function of a parameter's prior, as in `calibrate` and `sensitivity`."""
     from scipy.special import ndtri
 
     from calibration.inference import priors

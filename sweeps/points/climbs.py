@@ -113,7 +113,7 @@ def further_variation(obstacle: Obstacle, varied: Columns, robot: Robot, where: 
 
 
 def climb_refusal(robot: Robot) -> str | None:
-    """Why a robot cannot climb. None: it can."""
+    """Reason why a robot cannot climb, or None."""
     if not robot.has_ground:
         return "the robot's load is a shaft; a climb needs a vehicle"
     if robot.rig.imposed != "voltage":
@@ -212,7 +212,8 @@ def _numbers(found: Climb) -> Columns:
 
 
 def _searched(obstacle: Obstacle, points: int, run: Callable[..., Climb], told: Callable[[float], None]) -> Columns:
-    """The largest sizes that are got over, by bisection of all points side by side, and how the next one ends."""
+    """Largest sizes that are climbed, by simultaneous bisection for all points, and the result for the next larger
+    size."""
     low, high = SOUGHT[obstacle.kind]
     rounds = 1 + int(np.ceil(np.log2((high - low) / NEAR)))
     over, beyond, verdict, sizes = (

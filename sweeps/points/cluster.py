@@ -49,11 +49,11 @@ class Pool:
     device: str
 
     def close(self) -> None:
-        """Take leave of the scheduler."""
+        """Disconnects from the scheduler."""
         self.client.close()
 
     def produce(self, job: Job, chunks: Iterable[int]) -> Produced:
-        """Chunks as the workers finish them. A chunk is computed again where its worker is lost.
+        """Yields chunks as workers finish them. If a worker is lost, its chunk is computed again.
 
         Raises:
             LostWorkers: a chunk's workers were lost too often, none was left for a minute, or the scheduler is gone.
@@ -155,7 +155,7 @@ class Pool:
 
 
 def _packed(job: Job) -> bytes:
-    """A job as bytes, with the source of effects that are the user's own: workers need none of the user's files."""
+    """A job as bytes. It includes the source of the user's own effects, so workers need no user files."""
     import cloudpickle
 
     own_modules = {
@@ -235,7 +235,7 @@ def _client(address: str) -> Any:
 
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
-    """Keep what dask logs of a failed connection off the console: the error says it in one sentence."""
+    """Suppresses dask's log of a failed connection, because the error message already reports it."""
     import logging
 
     loggers = [logging.getLogger(name) for name in ("distributed.comm", "distributed.client", "distributed.core")]

@@ -65,7 +65,7 @@ def resolve_grid(config: G, robot: Robot, battery: bool = False, notes: list[str
 
 
 def check_axes(config: GridPart, robot: Robot) -> None:
-    """Refuse axes that a robot does not have.
+    """Reject axes that a robot does not have.
 
     Raises:
         BadConfiguration: such an axis, or a surface not in Table 5 for a robot that takes its surfaces.

@@ -117,7 +117,7 @@ def _missing(robot: Robot, option: str, example: str) -> str:
 
 
 def option_refusal(robot: Robot, option: str, instead: str) -> str:
-    """Why an option of what is not imposed is refused."""
+    """Reason why an option is rejected for a quantity that is not imposed."""
     reason = SAID[robot.rig.imposed]
     if robot.rig.imposed != "voltage":
         return f"{option}: the {reason.words} is imposed on this robot; give {instead} [{reason.unit}]"
@@ -125,7 +125,7 @@ def option_refusal(robot: Robot, option: str, instead: str) -> str:
 
 
 def check_acting(robot: Robot, ground: Iterable[str] = (), shaft: Iterable[str] = ()) -> None:
-    """Refuse conditions of the ground for a load that has none, and those of a load on a shaft for a vehicle.
+    """Reject conditions of the ground for a load that has none, and those of a load on a shaft for a vehicle.
 
     Args:
         ground, shaft: options or places that state one.
@@ -139,7 +139,7 @@ def check_acting(robot: Robot, ground: Iterable[str] = (), shaft: Iterable[str] 
 
 
 def check_battery(robot: Robot) -> None:
-    """Refuse to run a rig on a battery that its file does not state.
+    """Reject to run a rig on a battery that its file does not state.
 
     Raises:
         BadConfiguration: its speed is imposed, or its file states no battery.
@@ -152,7 +152,7 @@ def check_battery(robot: Robot) -> None:
 
 
 def check_on_ground(robot: Robot, command: str) -> None:
-    """Refuse a command of the running gear for a load that has none.
+    """Reject a command of the running gear for a load that has none.
 
     Raises:
         BadConfiguration: the load is a shaft.
@@ -165,7 +165,7 @@ def check_on_ground(robot: Robot, command: str) -> None:
 
 
 def check_can_turn(robot: Robot, names: Iterable[str], where: str) -> None:
-    """Refuse a robot that cannot turn in some of these configurations.
+    """Reject a robot that cannot turn in some of these configurations.
 
     Raises:
         BadConfiguration: opens with `where`, and says why.
@@ -175,7 +175,7 @@ def check_can_turn(robot: Robot, names: Iterable[str], where: str) -> None:
 
 
 def check_turning(robot: Robot, stated: Collection[str], names: Iterable[str], where: str) -> None:
-    """Refuse conditions that free a robot to turn which cannot, or that leave open what drives a side.
+    """Reject conditions that free a robot to turn which cannot, or that leave open what drives a side.
 
     Args:
         stated: names of conditions.

@@ -31,7 +31,7 @@ ASKED = 48
 
 
 def showing_turns(robot: Robot, conditions: Collection[str]) -> Robot:
-    """The robot, with instruments of both sides and of its yaw where conditions of these names free it to turn."""
+    """The robot, with instruments for both sides and for yaw if conditions of these names let it turn."""
     return robot if set(OF_TURNS).isdisjoint(conditions) else robot.showing_turns()
 
 
@@ -95,7 +95,7 @@ def _profile(name: str, robot: Robot, plan: axes.Plan, where: str) -> Profile:
 
 
 def _bearable(variation: Variation, task: Task, plan: axes.Plan) -> None:
-    """Ask the fidelity about points spread over the design, its corners among them.
+    """Lets the fidelity check points spread over the design, including its corners.
 
     Raises:
         BadConfiguration: a point that the fidelity refuses.

@@ -97,7 +97,7 @@ class Samples:
 
 @dataclasses.dataclass(frozen=True)
 class Drawn:
-    """Sampled points that are at hand.
+    """Sampled points that are already available.
 
     Attributes:
         names: what is sampled.
@@ -121,7 +121,7 @@ def in_blocks(
     values: Callable[[Any], Any],
     normal_scores: Float[np.ndarray, "points coordinates"],
 ) -> Float[np.ndarray, "points names"]:
-    """Values of a jax function at many points, computed on the CPU whatever device the sweep uses."""
+    """Values of a JAX function at many points, computed on the CPU whatever device the sweep uses."""
     import jax
 
     points = len(normal_scores)
@@ -197,7 +197,7 @@ class Blocks:
 
     @staticmethod
     def of(shape: tuple[int, ...], most: int) -> Blocks:
-        """Boxes of at most `most` points, of nearly equal size."""
+        """Boxes with at most `most` points and nearly equal sizes."""
         size, inner = [1] * len(shape), 1
         for k in reversed(range(len(shape))):
             if inner * shape[k] > most:
@@ -245,7 +245,7 @@ Unit = Float[np.ndarray, "dimensions points"]
 
 
 def _key(seed: int, dimension: int, use: str) -> int:
-    """128 bits that no other dimension or use of the same seed has."""
+    """128 bits that are unique to a dimension and a use of a seed."""
     return int.from_bytes(hashlib.blake2b(f"{seed} {dimension} {use}".encode(), digest_size=16).digest(), "little")
 
 

@@ -50,7 +50,7 @@ KINDS = {STATUS: "uint8", FLAGS: "uint16", VERDICT: "uint8"}
 
 @dataclasses.dataclass(frozen=True)
 class Job:
-    """All that is needed to compute any chunk of a sweep, here or in another process.
+    """All data needed to compute any chunk of a sweep, in this or another process.
 
     Attributes:
         robot: robot that is varied.
@@ -206,7 +206,7 @@ _one_device_kept = compiled(_one_device)
 
 
 def _stored(found: Mapping[str, Array], asked: _Asked) -> dict[str, Array]:
-    """Outputs in the units of tables, in the stored type, but those of `KINDS` in their own."""
+    """Outputs in the units of tables and in the stored type. Those in `KINDS` keep their own type."""
     stored = {n: (found[n] / factor).astype(asked.storage) for n, factor in asked.factors if n not in KINDS}
     named = (*(n for n, _ in asked.factors if n in KINDS), STATUS)
     return {**stored, **{n: found[n].astype(KINDS[n]) for n in named}}
@@ -237,7 +237,7 @@ def _split_among(mesh: Mesh) -> Callable[..., dict[str, Array]]:
 
 @dataclasses.dataclass(frozen=True)
 class Piece:
-    """A chunk under way.
+    """A chunk in progress.
 
     Attributes:
         chunk: number of chunk.

@@ -370,7 +370,7 @@ class SweepStore(Folder):
             write_file(file, content, self._aside)
 
     def _refuse_damaged(self) -> None:
-        """Refuse a finished sweep with a damaged file.
+        """Reject a finished sweep with a damaged file.
 
         Raises:
             BadData: names the first file.

@@ -92,7 +92,7 @@ def of_matlab(path: Path, name: str) -> tuple[Signal, ...]:
 
 
 def _check_matlab(path: Path, name: str) -> None:
-    """Refuses a file whose variables need more memory than is free. Reading one of them loads all.
+    """Rejects a file whose variables need more memory than is free. Reading one of them loads all.
 
     Raises:
         BadData: they do.

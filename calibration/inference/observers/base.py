@@ -146,7 +146,7 @@ class Observer(eqx.Module):
     @classmethod
     @abc.abstractmethod
     def check(cls, runs: Runs, noise: Noise) -> list[Remark | str]:
-        """Refuse runs that contradict each other. Return notes on the others.
+        """Reject runs that contradict each other. Return notes on the others.
 
         Raises:
             BadData: readings that cannot all be true.
@@ -155,7 +155,7 @@ class Observer(eqx.Module):
     @classmethod
     @abc.abstractmethod
     def check_start(cls, runs: Runs, noise: Noise, robot: Robot) -> list[Remark | str]:
-        """Refuse runs whose initial state the model cannot reproduce. Return notes on the length of the others.
+        """Reject runs whose initial state the model cannot reproduce. Return notes on the length of the others.
 
         Raises:
             BadData: a run does not begin in an initial state of the model.
@@ -169,7 +169,7 @@ class Observer(eqx.Module):
     @classmethod
     @abc.abstractmethod
     def check_settled(cls, runs: Runs) -> None:
-        """Refuse runs other than settled ones of one row each.
+        """Reject runs other than settled ones of one row each.
 
         Raises:
             BadData: time histories.

@@ -947,7 +947,7 @@ def _merge_levels(x: np.ndarray) -> np.ndarray:
 
 
 def _check_signs(runs: Runs) -> None:
-    """Refuse unsigned speeds and currents of runs that are driven backward.
+    """Reject unsigned speeds and currents of runs that are driven backward.
 
     A rig's inertia may carry it forwards during one interval, but not during all of a table.
     """
