@@ -190,7 +190,7 @@ REFUSED = {
         "bench", False, "simulate --voltage 9 --profile shuttle", r"shuttle.*load is a shaft",
     ),
     "no axis": ("bench", False, "sweep", r"--voltages: not given, .* give it \[V\], such as --voltages 6,12,24"),
-    "no axis of speed": ("wheeled", True, "sweep", r"--motor-speeds: not given, .*  --motor-speeds 1000,2000"),
+    "no axis of speed": ("wheeled", True, "sweep", r"--motor-speeds: not given, .* --motor-speeds 1000,2000"),
     "axis of slopes": ("bench", False, "sweep --voltages 9 --slopes 0,5", r"--slopes: the robot's load"),
     "axis of voltages": ("wheeled", True, "sweep --voltages 9", r"--voltages: the motors' speed is imposed"),
     "picture": ("bench", False, "render x.png --voltage 9", r"render: the robot's load is a shaft"),
