@@ -18,6 +18,9 @@ import sys
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
+from typing import NamedTuple
+
+import mutants
 
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("mmrjax", "calibration", "sweeps")
@@ -42,6 +45,14 @@ class Draw:
     operator: str
     begin: int
     end: int
+    by: str
+
+
+class Change(NamedTuple):
+    """A change as tests/mutants.toml states it: the function's qualified name, its text and the replacement."""
+
+    function: str
+    text: str
     by: str
 
 
@@ -162,21 +173,24 @@ def places(file: Path) -> list[Draw]:
     return finder.found
 
 
-def context(source: str, draw: Draw) -> tuple[str, str] | None:
-    """Whole lines around a change that occur once in the source, and the same lines with the change, or None."""
-    lines = source.splitlines(keepends=True)
-    last = source.count("\n", 0, draw.begin)
-    end = sum(map(len, lines[: last + 1])) - 1
-    for first in range(last, max(last - 4, -1), -1):
-        begin = sum(map(len, lines[:first]))
+def context(source: str, draw: Draw) -> Change:
+    """The innermost function of a change, and the fewest words and signs around it that occur once there."""
+    around = [(b - a, n) for n, (a, b) in mutants.functions(source).items() if a <= draw.begin and draw.end <= b]
+    function = min(around)[1]
+    whole = mutants.functions(source)[function]
+    tokens = [m.span() for m in mutants.TOKEN.finditer(source)]
+    first = sum(end <= draw.begin for _, end in tokens)
+    last = max(first, sum(begin < draw.end for begin, _ in tokens) - 1)
+    for more in range(len(tokens)):
+        begin, end = tokens[max(first - more // 2, 0)][0], tokens[min(last + (more + 1) // 2, len(tokens) - 1)][1]
         text = source[begin:end]
-        if source.count(text) == 1:
-            return text, source[begin : draw.begin] + draw.by + source[draw.end : end]
-    return None
+        if len(mutants.pattern(text).findall(source, *whole)) == 1:
+            break
+    return Change(function, text, source[begin : draw.begin] + draw.by + source[draw.end : end])
 
 
-def drawn(number: int, seed: int) -> Iterator[tuple[Draw, str, str]]:
-    """Mutants drawn at random: a file, weighted by the square root of its size, then a place, then its texts."""
+def drawn(number: int, seed: int) -> Iterator[tuple[Draw, Change]]:
+    """Mutants drawn at random: a file, weighted by the square root of its size, then a place."""
     rng = random.Random(seed)
     files = sorted(file for package in PACKAGES for file in (ROOT / package).rglob("*.py"))
     found = {file: places(file) for file in files}
@@ -190,9 +204,6 @@ def drawn(number: int, seed: int) -> Iterator[tuple[Draw, str, str]]:
             continue
         draw = found[file].pop(rng.randrange(len(found[file])))
         source = file.read_text(encoding="utf-8")
-        texts = context(source, draw)
-        if texts is None:
-            continue
         try:
             changed = ast.parse(source[: draw.begin] + draw.by + source[draw.end :])
         except SyntaxError:
@@ -201,7 +212,7 @@ def drawn(number: int, seed: int) -> Iterator[tuple[Draw, str, str]]:
             continue
         taken[file] += 1
         count += 1
-        yield draw, *texts
+        yield draw, context(source, draw)
 
 
 def main() -> int:
@@ -212,11 +223,11 @@ def main() -> int:
     if options.number < 1:
         parser.error(f"--number: got {options.number}; expected at least 1")
     names: Counter[str] = Counter()
-    for draw, text, by in drawn(options.number, options.seed):
+    for draw, change in drawn(options.number, options.seed):
         name = f"{Path(draw.file).with_suffix('').as_posix().replace('/', '_')}_{draw.operator}_{draw.line}"
         names[name] += 1
         name += f"_{names[name]}" if names[name] > 1 else ""
-        fields = {"kind": "drawn", "file": draw.file, "text": text, "by": by}
+        fields = {"kind": "drawn", "file": draw.file, **change._asdict()}
         print(
             f"[{name}]",
             *(f"{key} = {json.dumps(value, ensure_ascii=False)}" for key, value in fields.items()),

@@ -1,25 +1,29 @@
 """Applies the plausible mistakes of tests/mutants.toml: each has to make one of its listed tests fail.
 
-Each mutant replaces one piece of text in a copy of the tree and runs its tests in a separate process. Before that the
-same tests have to pass without any mutant. Tests of `make test` kill at least 97 % of the list.
+Each mutant replaces one piece of a function's text in a copy of the tree and runs its tests in a separate process.
+Before that the same tests have to pass without any mutant. Tests of `make test` kill at least 97 % of the list.
 A mutant with `slow = true` is killed by a slow test, one of `make test-all`.
 
     python benchmarks/mutants.py                          # all of them, one at a time
     python benchmarks/mutants.py --jobs 2
     python benchmarks/mutants.py --only track_drops_guide --only gravity_takes_cosine
 
-Exits with 1 if a mutant survives, its tests cannot run, or its text does not occur exactly once in its file.
+Exits with 1 if a mutant survives, its tests cannot run, or its text does not occur exactly once in its function.
 """
 
 from __future__ import annotations
 
 import argparse
+import ast
 import dataclasses
+import functools
 import importlib.util
+import itertools
 import json
 import multiprocessing
 import os
 import queue
+import re
 import shutil
 import sys
 import tempfile
@@ -44,6 +48,8 @@ BASE = (
     "ignore::pytest.PytestAssertRewriteWarning",
 )
 OPTIONS = ("-x", *BASE)
+#: A word or a sign of a program.
+TOKEN = re.compile(r"\w+|[^\w\s]")
 #: Time limit of a mutant's tests [s]: a mutant may loop for ever.
 PATIENCE = 900.0
 LEFT_OUT = shutil.ignore_patterns(".git", ".venv", "runs", "__pycache__", ".*_cache", "*.egg-info", ".hypothesis")
@@ -56,9 +62,10 @@ class Mutant:
     Attributes:
         kind: where it is.
         file: from the root of the tree.
-        text: replaced, once in the file.
+        text: replaced, once in the function, with any white space between its words and signs.
         by: its replacement.
         killed_by: node ids of tests, at least one of them has to fail.
+        function: qualified name of the function or class. Empty for the whole file.
         slow: these tests are marked slow.
     """
 
@@ -68,6 +75,7 @@ class Mutant:
     text: str
     by: str
     killed_by: tuple[str, ...]
+    function: str = ""
     slow: bool = False
 
     @property
@@ -81,10 +89,36 @@ class Mutant:
         Raises:
             ValueError: the text does not occur exactly once in the file.
         """
-        found = source.count(self.text)
-        if found != 1:
-            raise ValueError(f"{self.name}: its text occurs {found} times in {self.file}; expected once")
-        return source.replace(self.text, self.by)
+        matches = list(pattern(self.text).finditer(source, *functions(source)[self.function]))
+        if len(matches) != 1:
+            where = f"{self.function} of {self.file}" if self.function else self.file
+            raise ValueError(f"{self.name}: its text occurs {len(matches)} times in {where}; expected once")
+        begin, end = matches[0].span()
+        return source[:begin] + self.by + source[end:]
+
+
+def pattern(text: str) -> re.Pattern[str]:
+    """Expression for a text with any white space between its words and signs."""
+    return re.compile(r"\s*".join(map(re.escape, TOKEN.findall(text))))
+
+
+@functools.cache
+def functions(source: str) -> dict[str, tuple[int, int]]:
+    """Characters of each function and class by its qualified name, with decorators. Empty: the whole file."""
+    starts = list(itertools.accumulate(map(len, source.splitlines(keepends=True)), initial=0))
+    spans = {"": (0, len(source))}
+
+    def visit(node: ast.AST, prefix: str) -> None:
+        for child in ast.iter_child_nodes(node):
+            inner = prefix
+            if isinstance(child, (ast.FunctionDef, ast.ClassDef)):
+                first = min([child.lineno, *(d.lineno for d in child.decorator_list)])
+                spans[prefix + child.name] = starts[first - 1], starts[child.end_lineno or child.lineno]
+                inner = f"{prefix}{child.name}."
+            visit(child, inner)
+
+    visit(ast.parse(source), "")
+    return spans
 
 
 def mutants() -> list[Mutant]:
