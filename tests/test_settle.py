@@ -230,7 +230,7 @@ BAD = {
         lambda c: (
             stairs((12.0,), 600) | {"motor_speed_rpm": 300 + 200 * c["time_s"]}
         ),
-        r"never settles: at the end of its longest level \(rows 1 to 600\) motor_speed still changes by .* state --drift",
+        r"never settles: at the end of its longest level \(rows 1 to 600\) motor_speed still changes by .* set a larger --drift",
     ),
     "few samples": (lambda c: cut(c, slice(5)), r"5 samples in its longest run; at least 8 are needed"),
 }  # fmt: skip

@@ -302,7 +302,7 @@ def test_interrupted_sweep_goes_on_to_the_same_bits(sweep, whole, monkeypatch, t
     _, _, err = ends(sweep("s"), code=0)
     assert not (tmp_path / "s.partial").exists()
     done = CHUNKS - len(computed)
-    assert (done > 0) == ("goes on after" in err) == (at > 6)
+    assert (done > 0) == ("resumes after" in err) == (at > 6)
     assert arrays("s") == arrays(whole)
 
 
@@ -438,7 +438,7 @@ def test_sweep_of_other_data_code_or_versions_is_refused_saying_which(begun, mon
 @pytest.mark.slow
 def test_force_begins_anew(begun, tmp_path):
     _, _, err = ends(begun("--chunk", "50", "--force"), code=0)
-    assert "goes on after" not in err
+    assert "resumes after" not in err
     compare(tmp_path / "s", tmp_path / "first")
 
 
@@ -513,7 +513,7 @@ def test_shares_started_at_once_finish_one_store(whole, tmp_path):
 @pytest.mark.slow
 def test_rest_of_lost_shares_is_done_by_the_command_without(sweep, whole):
     assert sweep("s", "--shard", "2/5")[0] == 0
-    ends(sweep("s"), "goes on after", code=0)
+    ends(sweep("s"), "resumes after", code=0)
     assert arrays("s") == arrays(whole)
 
 

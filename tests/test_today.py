@@ -317,7 +317,7 @@ def test_rated_limits_and_switches_are_read_and_written(tmp_path):
 @pytest.mark.parametrize(
     ("values", "sentence"),
     [
-        ({"gearbox.mesh_theory": 1}, r"mine.toml, gearbox.mesh_theory: got 1; expected true or false \(load driving"),
+        ({"gearbox.mesh_theory": 1}, r"mine.toml, gearbox.mesh_theory: got 1; expected true or false \(efficiency"),
         ({"driver.returns_current": "no"}, "driver.returns_current: got 'no'; expected true or false"),
         ({"driver.decay": "coast"}, r"mine.toml, driver.decay: got 'coast'; expected slow or fast \(between pulses"),
         ({"driver.decay": ["fast"]}, r"driver.decay: got \['fast'\]; expected slow or fast"),

@@ -144,14 +144,14 @@ def test_a_table_of_turns_is_read_once_with_the_channels_of_turns_that_it_has(tm
             r"column left_V: .* voltage of the left side, rename it to voltage_left_V, or set \[columns\] voltage_left_V = "
             '"left_V" in',
         ),
-        ("U_right_V,U_left_V", r"column U_right_V: .* name it voltage_right_V, or state \[columns\] voltage_right_V"),
+        ("U_right_V,U_left_V", r"column U_right_V: .* rename it to voltage_right_V, or set \[columns\] voltage_right_V"),
         (
             "motor_voltage_left_V,motor_voltage_right_V",
-            r"supply_voltage_V is missing; .* \[columns\] voltage_left_V = \"motor_voltage_left_V\", voltage_right_V",
+            r"supply_voltage_V is missing; .* \[columns\]: voltage_left_V = \"motor_voltage_left_V\", voltage_right_V",
         ),
         (
             "U_1,U_2",
-            "row 2, motor_current_left_A: got -2 at 24 V; nothing else .*; a turn has duty_left and duty_right too",
+            "row 2, motor_current_left_A: got -2 at 24 V; only this .*; a turn has duty_left and duty_right too",
         ),
     ],
 )
@@ -193,7 +193,7 @@ def test_a_supply_of_either_sign_drives_the_sides(rig, table):
     assert_allclose(unsigned.of_sides[0], [0.012 * a for a, *_ in SOUND * 2])
     assert [i.channel for i in unsigned.layout.instruments] == ["motor_current_left", "motor_current_right"]
     with pytest.raises(
-        BadData, match=r"got -1500 and 1500 although the left and right sides are driven at 18 and -18 V, and"
+        BadData, match=r"got -1500 and 1500 although the left and right sides are driven at 18 and -18 V"
     ):
         table(header, *[(24, *row[1:]) for row in rows], robot=robot)
 
@@ -236,7 +236,7 @@ def test_a_turn_that_nothing_drives_is_left_out_with_a_note(rig, table, row, zer
     header = f"supply_voltage_V,duty_left,duty_right,{SPEEDS}"
     found = table(header, (24, 0, 1, 0, 900), (*row, 0, 0), robot=rig(DRIVEN))
     assert len(found) == 1
-    assert f"turns.csv: row 2 is left out, since nothing drives the motors ({zero} 0); " in found.notes[0]
+    assert f"turns.csv: row 2 is left out, since nothing drives the motors ({zero} is 0); " in found.notes[0]
 
 
 @pytest.mark.parametrize("of_turns", ["duty_left,duty_right", "heading_deg,duty_left,duty_right", "heading_deg"])
@@ -298,7 +298,7 @@ def row_of(*changes):
 KEEP = tuple((k, 1) for k in range(5))
 REFUSED = {
     "one side": (KINEMATIC, f"motor_speed_left_rpm,{READ}", row_of(KEEP[0], *KEEP[2:]),
-                 "column motor_speed_right_rpm is missing, motor_speed_left_rpm is stated"),
+                 "column motor_speed_right_rpm is missing although motor_speed_left_rpm is present"),
     "one duty": (DRIVEN, f"supply_voltage_V,duty_left,{READ}", [(24, 1, *row[2:]) for row in SOUND],
                  "column duty_right is missing although duty_left is present"),
     "both ways": (KINEMATIC, f"motor_speed_rpm,{SPEEDS},{READ}", [(1, *row) for row in SOUND],
@@ -306,7 +306,7 @@ REFUSED = {
     "letters": (KINEMATIC, f"{SPEEDS},motor_current_l_A,motor_current_r_A,yaw_rate_rad_s", SOUND,
                 "column motor_current_l_A: the two sides must be called left and right; rename it to motor_current_left_A"),
     "in front": (KINEMATIC, f"{SPEEDS},left_motor_current_A,right_motor_current_A,yaw_rate_rad_s", SOUND,
-                 r"name it motor_current_left_A, or state \[columns\]"),
+                 r"rename it to motor_current_left_A, or set \[columns\]"),
     "duties by letters": (DRIVEN, f"supply_voltage_V,duty_L,duty_R,{READ}", [(24, 1, 1, *r[2:]) for r in SOUND],
                           "column duty_L: the two sides must be called left and right; rename it to duty_left"),
     "yaw to the right": (KINEMATIC, f"{SPEEDS},{READ}", row_of(*KEEP[:4], (4, -1)),

@@ -109,7 +109,7 @@ def test_effects_of_a_file_say_that_they_are_of_one_side(tmp_path):
 
     of_side = 'driver = "the side"'
     for balance, term in (("ground", "signals.side"), ("yaw", "signals.normal"), ("lateral", "signals.normal")):
-        with pytest.raises(BadConfiguration, match=r"Own, driver: got '' of a term .* expected .the side."):
+        with pytest.raises(BadConfiguration, match=r"Own, driver: got '' for a term .* expected .the side."):
             read(balance, term)
         (own,) = read(balance, term, of_side)
         assert own(amplitude=1.0).unlike
