@@ -104,7 +104,7 @@ def test_a_table_of_turns_with_channels_of_turns_alone_is_answered_by_the_line_t
             ),
             robot=rig('base = "nominal"'),
         )
-    line = said.value.args[0].rpartition("file ")[2]
+    line = said.value.args[0].rpartition("set ")[2].partition(" in ")[0]
     robot = rig(f'base = "nominal"\n{line}')
     assert [c.name for c in records.read_runs(path, robot=robot).channels] == ["yaw_rate"]
 
@@ -310,7 +310,7 @@ REFUSED = {
     "duties by letters": (DRIVEN, f"supply_voltage_V,duty_L,duty_R,{READ}", [(24, 1, 1, *r[2:]) for r in SOUND],
                           "column duty_L: the two sides must be called left and right; rename it to duty_left"),
     "yaw to the right": (KINEMATIC, f"{SPEEDS},{READ}", row_of(*KEEP[:4], (4, -1)),
-                         r"row 4, yaw_rate_rad_s: got -0.9 where .* at -1500 and 1500 rpm \(as in 5 of 5 rows\); "
+                         r"row 4, yaw_rate_rad_s: got -0.9 although .* at -1500 and 1500 rpm \(as in 5 of 5 rows\); "
                          "expected a positive value if the right side is faster"),
     "currents exchanged": (KINEMATIC, f"{SPEEDS},{READ}", row_of(*KEEP[:2], (3, 1), (2, 1), KEEP[4]),
                            r"row 4, motor_current_left_A and motor_current_right_A: got 8 and -8 .* exchanged"),
