@@ -175,6 +175,7 @@ SAMPLES = [
     Remark("of_rows", rows=(3,), what="slides"),
     Remark("at_bound", name="a", side="upper"),
     Remark("after_steps", channel="motor_current", share=0.932, rows=24, total=6000),
+    Remark("freed_delay", channel="motor_current", share=0.95),
     Remark("shifted", channel="output_speed", share=0.62, shift=0.0034),
     Remark("product_alone", friction="f", share="s", free=True),
     Remark("product_alone", friction="f", share="s", free=False),

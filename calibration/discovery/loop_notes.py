@@ -207,7 +207,7 @@ class Missing:
 
 #: Requirements of a mechanism: share of the excess misfit, and standard errors of its hold-out gain.
 HALF, SURE = 0.5, 2.0
-#: Largest number of drivers that the data cannot separate for a mechanism to be stated.
+#: Largest number of drivers, and of equations, that the data cannot separate for a mechanism to be stated.
 FEW = 3
 
 
@@ -234,10 +234,18 @@ class Mechanism:
 
     @property
     def drivers(self) -> Names:
-        """Possible drivers. The families differ in these, or only in the equation. An error of an ammeter has the
-        driver of the loss that it imitates."""
+        """Possible drivers."""
+        return self._possible(2)
+
+    @property
+    def candidates(self) -> int:
+        """Number of possible drivers or equations, whichever is larger."""
+        return max(len(self._possible(0)), len(self.drivers))
+
+    def _possible(self, part: int) -> Names:
+        """Equations (0) or drivers (2) of the families. An error of an ammeter counts as the loss."""
         losses = [f for f in self.families if f == self.families[0] or not f.startswith("reading")]
-        return tuple(dict.fromkeys(f.partition(" that ")[2] for f in losses))
+        return tuple(dict.fromkeys(f.partition(" that ")[part] for f in losses))
 
     @property
     def fails(self) -> Names:
@@ -246,7 +254,7 @@ class Mechanism:
             "share": self.share < HALF,
             "gain": not self.gain > SURE * self.se,
             "again": self.again < AGAIN,
-            "many": len(self.drivers) > FEW,
+            "many": self.candidates > FEW,
         }
         return tuple(doubt for doubt, holds in doubts.items() if holds)
 

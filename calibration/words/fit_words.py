@@ -291,6 +291,10 @@ SAID: dict[str, str | Callable[..., str]] = {
         f"{100 * (1 - share) ** 0.5:.0f} % of its value). The readings may be offset in time from the command; "
         'set [rig] delay = "0 ± 0.02" [s] (it may be negative), and calibrate fits it'
     ),
+    "freed_delay": lambda channel, share: (
+        f"without a delay, {share:.0%} of the squared error of {channels.find_channel(channel).label} lies in the "
+        "first sample after each step; rig.delay is therefore fitted, unless the file has [rig] delay = '0 ± 0'"
+    ),
     "shifted": lambda channel, share, shift: (
         f"{share:.0%} of the squared error of {channels.find_channel(channel).label} is explained by readings "
         f'that are {abs(1e3 * shift):.2g} ms {"late" if shift > 0 else "early"}: set [rig] delay = "{shift:.2g} '

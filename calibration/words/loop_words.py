@@ -190,13 +190,13 @@ NO_MECHANISM = {
     "share": "it explains only {share:.0f} % of the excess misfit",
     "gain": "on held-out runs it gains {0.gain:.2g} ± {0.se:.2g} nat a reading",
     "again": "it is found again in only {again:.0f} % of the fits without one block",
-    "many": "it may depend on any of {many} variables",
+    "many": "any of {many} variables or equations may be its cause",
 }
 
 
 def no_mechanism(found: loop_notes.Mechanism) -> str:
     """Reasons against the best mechanism."""
-    numbers = {"share": 100 * found.share, "again": 100 * found.again, "many": len(found.drivers)}
+    numbers = {"share": 100 * found.share, "again": 100 * found.again, "many": found.candidates}
     why = [NO_MECHANISM[name].format(found, **numbers) for name in found.fails]
     return f"the best one is a {found.families[0]}, but {' and '.join(why)}"
 

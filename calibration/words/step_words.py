@@ -35,6 +35,7 @@ STEPS = {
     # a calibration
     "optimum": "optimum found; now {}",
     "steady": "fitting the steady model first, to start from its optimum",
+    "delay": "the error lies in the first sample after each step: fitting again with a delay",
     "derivatives": "population finished; comparing derivatives with finite differences at the best member",
     "search": "  step {}: objective {:.4f}, {:.1f} min",
     "round": "round {}: objective {:.4f} after {} steps, {:.1f} min",
