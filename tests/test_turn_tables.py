@@ -144,7 +144,10 @@ def test_a_table_of_turns_is_read_once_with_the_channels_of_turns_that_it_has(tm
             r"column left_V: .* voltage of the left side, rename it to voltage_left_V, or set \[columns\] voltage_left_V = "
             '"left_V" in',
         ),
-        ("U_right_V,U_left_V", r"column U_right_V: .* rename it to voltage_right_V, or set \[columns\] voltage_right_V"),
+        (
+            "U_right_V,U_left_V",
+            r"column U_right_V: .* rename it to voltage_right_V, or set \[columns\] voltage_right_V",
+        ),
         (
             "motor_voltage_left_V,motor_voltage_right_V",
             r"supply_voltage_V is missing; .* \[columns\]: voltage_left_V = \"motor_voltage_left_V\", voltage_right_V",

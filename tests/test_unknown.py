@@ -128,7 +128,9 @@ def test_rig_check_says_what_of_a_battery_is_an_examples(tmp_path):
     def left_open(more):
         read(tmp_path, ROVER + more, "voltage", DRIVEN)
         found = rig_facts.number_origins(robot_file.parse_robot_file(tmp_path / "rig.toml"))
-        return {o.name.partition(".")[2] for o in found if o.name.startswith("battery.") and "an example value" in o.why}
+        return {
+            o.name.partition(".")[2] for o in found if o.name.startswith("battery.") and "an example value" in o.why
+        }
 
     assert left_open("") == set()
     stated = "[battery]\ncells = 3\nvoltage_full = 4.1\nresistance = 0.02\n"
