@@ -381,3 +381,20 @@ def test_effects_are_ranked_at_the_set_of_the_equations_where_the_base_is_far(mo
     assert len(fits) == (far > 4) and search._linearised_fit(
         SimpleNamespace(begins={}, free=1), base, left, (), settings
     ) == (base, left)
+
+
+def test_effects_that_remain_without_another_take_the_first_slots(monkeypatch):
+    """A gap in the slots shifted the columns of a class, or ended a loop on 509 rows with an internal error."""
+    asked = []
+
+    def fit_candidates(space, proposals, settings):
+        asked.extend(proposals)
+        return [SimpleNamespace(active=active) for active, _ in proposals]
+
+    monkeypatch.setattr(search, "fit_candidates", fit_candidates)
+    settings = dataclasses.replace(ANALYST.settings, slots=3)
+    z, zeros = np.arange(2 + 6.0), np.zeros(3)  # two base parameters, then amplitudes and shapes
+    best = Candidate(("churning", "brush_drop", ""), z, z, 0.0, zeros, zeros, True, True, True)
+    fewer = search.without_each(SimpleNamespace(free=2), best, settings)
+    assert [c.active for c in fewer] == [("brush_drop", "", ""), ("churning", "", "")]
+    assert_allclose(asked[0][1], [0, 1, 3, 0, 0, 6, 0, 0])
