@@ -146,12 +146,12 @@ def single_p_value(gain: float, null: np.ndarray) -> float:
 def without_each(
     space: CandidateSpace, best: Candidate, settings: Settings, ladder: Sequence[Candidate] = ()
 ) -> list[Candidate]:
-    """The candidate without each of its effects in turn, refitted.
+    """The candidate without each of its effects in turn, refitted. Those that remain take the first slots.
 
     Args:
         ladder: known fits, which are not repeated.
     """
-    fewer = [tuple("" if s == slot else n for s, n in enumerate(best.active)) for slot in range(len(best.effects))]
+    fewer = [fill_slots([n for n in best.effects if n != name], settings) for name in best.effects]
     simulated = {c.active: c for c in ladder if c.simulated}
     new = fit_candidates(
         space, [(w, start_of_fit(space, best, w, settings)) for w in fewer if w not in simulated], settings
