@@ -107,7 +107,7 @@ def score_readings(
     Args:
         reading: kind of block → predictions of each row by a fit without its block, NaN for none.
         counts: True for included readings.
-        kinds: of blocks, label → mask of its rows each.
+        kinds: kinds of blocks, label → mask of its rows each.
     """
     by_kind, blocks = {}, {}
     norm = math.lgamma((FREEDOM + 1) / 2) - math.lgamma(FREEDOM / 2) - 0.5 * math.log(FREEDOM * math.pi)

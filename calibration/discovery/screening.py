@@ -50,7 +50,7 @@ class Confirmed:
     """Sets of effects after a round of screening.
 
     Attributes:
-        candidates: of every set, by simulation if available, else by regression.
+        candidates: candidates of every set, by simulation if available, else by regression.
         asked: number of regressions that were simulated.
         otherwise: number of these that explained less than the regression by more than `Settings.same`.
         room: names of the effects in the program of these fits, see `CandidateSpace`.
@@ -201,7 +201,7 @@ class Beforehand:
             equations do not show, so that a search should not begin there.
         room: effects in the program of all fits, if the equations show that one is missing and the log is `BRIEF`.
         alone: fits of each effect alone, by regression, the lowest first. Empty if nothing is missing.
-        scores: of every instance.
+        scores: scores of every instance.
         windows: number of equations.
         null: root of the strongest score of tables under the null hypothesis [σ], shape (replicates,).
     """
