@@ -1,5 +1,7 @@
 """Logs with faults that no reader sees: one sentence each. Sound logs have none."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from test_log_kinds import servo, written
@@ -10,6 +12,7 @@ from calibration.data import runs as records
 from calibration.data.input_errors import BadData
 from calibration.data.runs import Runs
 from calibration.described import describe
+from calibration.inference import calibration
 from calibration.inference.conduct import error_after_steps
 
 
@@ -47,7 +50,7 @@ SPEED, VOLTS, TIME = "motor_speed_rpm", "supply_voltage_V", "time_s"
 
 @pytest.mark.parametrize("column, fault, words", [
     (SPEED, still, "the same in every row, so nothing moves"),
-    (SPEED, held, "empty these cells, and the other rows are used"),
+    (SPEED, held, "empty these cells to use the other rows"),
     (SPEED, swapped, "row 377,"),  # of the first run with so much of both signs
     (VOLTS, constant, "12 V in every row"),
     (TIME, jumped, "row 77, time_s: 3.01 s after the row before it"),
@@ -64,7 +67,9 @@ def test_an_encoder_that_wraps_undeclared_is_refused_at_its_first_jump(tmp_path)
     log = servo(np.random.default_rng(1))
     log["output_angle_deg"] = log["output_angle_deg"] % 360
     servos = written(tmp_path, "servo", log)
-    with pytest.raises(BadData, match=r"jumps by -3.* as an angle that wraps; expected an angle that continues"):
+    with pytest.raises(
+        BadData, match=r"jumps by -3.* like an angle that wraps; expected an angle that keeps counting"
+    ):
         records.read_runs(tmp_path / "log.csv", robot=servos)
 
 
@@ -83,10 +88,45 @@ def test_an_error_in_the_first_sample_after_each_step_is_named_with_its_share(ro
     assert (note.channel, note.rows, note.share) == (runs.channels[1].name, len(steps), pytest.approx(share))
     text = describe(note)
     rest = np.delete(off[:, 1], steps + late)
-    assert f"the rms error is {100 * np.linalg.norm(rest) / np.linalg.norm(off[:, 1]):.0f} % of it" in text
+    assert f"the rms error falls to {100 * np.linalg.norm(rest) / np.linalg.norm(off[:, 1]):.0f} % of it" in text
     assert f"{share:.0%} of the squared error" in text and "may be negative" in text and len(text) <= 400
     off[:, 1] = 5.0
     assert error_after_steps(runs, off) == []  # an error everywhere
+
+
+@pytest.mark.parametrize(("file", "options", "freed"), [
+    ("", {}, True), ("", {"fix": ["rig.delay"]}, False), ("", {"free": ["motor.resistance"]}, False),
+    ("[rig]\ndelay = \"0 ± 0\"\n", {}, False),
+])  # fmt: skip
+def test_a_delay_is_freed_if_the_error_lies_after_the_steps(robot, tmp_path, monkeypatch, file, options, freed):
+    """Mass and resistance of a robot absorbed 95 % of the error of its current, which was read after each step."""
+    (tmp_path / "rig.toml").write_text(RIG + file, encoding="utf-8")
+    robot = robot_file.read_robot(tmp_path / "rig.toml")
+    runs, searches = Runs("log.csv", motor()).of(robot), []
+    off = 0.02 * np.random.default_rng(0).standard_normal((len(runs), 2))
+    volts = runs["supply_voltage_V"]
+    off[np.flatnonzero(np.abs(np.diff(volts)) > 0.1 * np.abs(volts).max()) + 1, 1] = 5.0
+
+    def search(problem, noise, starts, *rest):
+        searches.append(problem.coordinates.names)
+        best = SimpleNamespace(z=np.ones(len(problem.coordinates)))
+        return SimpleNamespace(problem=problem, best=best, shares=None, starts=starts)
+
+    monkeypatch.setattr(calibration.multistart, "search_one_by_one", search)
+    monkeypatch.setattr(
+        calibration, "_search", lambda runs, base, posed, noise, *_: (search(posed, noise, None), None)
+    )
+    monkeypatch.setattr(calibration.scans, "place_at_minimum", lambda problem, starts: starts)
+    seen = SimpleNamespace(reading=runs.measured() + off)
+    monkeypatch.setattr(calibration.optimizers, "observe_at", lambda *_: seen)
+    monkeypatch.setattr(calibration, "_result", lambda setting, search, *_: (setting, search))
+    setting, found = calibration.calibrate(runs, robot, **options)
+    first, *again = searches
+    assert "rig.delay" not in first and [set(x) - set(first) for x in again] == [{"rig.delay"}] * freed
+    if freed:
+        (z,) = found.starts
+        assert dict(zip(again[0], z, strict=True)) == dict.fromkeys(first, 1.0) | {"rig.delay": 0.0}
+        assert "rig.delay is therefore fitted" in describe(setting.ready.weighed[-1])
 
 
 @pytest.mark.parametrize("late", [-0.004, 0.01])
@@ -103,4 +143,4 @@ def test_readings_that_are_late_or_early_are_named_with_their_shift(robot, late)
     off[:, list(runs.layout.measured_columns).index(SPEED)] *= np.pi / 30
     (note,) = error_after_steps(runs, off)
     assert note.code == "shifted" and note.shift == pytest.approx(late, rel=0.1) and note.share > 0.9
-    assert f"ms too {'late' if late > 0 else 'early'}: state [rig] delay" in describe(note)
+    assert f"ms {'late' if late > 0 else 'early'}: set [rig] delay" in describe(note)

@@ -35,6 +35,9 @@ def test_a_mechanism_needs_each_of_its_tests():
         name: (name,) for name in worse
     }
     assert dataclasses.replace(stands, se=np.inf).fails == ("gain",)  # nothing could be held out
+    places = "loss torque", "resistance to travel", "mass", "voltage drop"
+    everywhere = dataclasses.replace(stands, families=tuple(f"{x} that changes with slope" for x in places))
+    assert everywhere.fails == ("many",)  # as of a table in which nothing was missing
 
 
 def fitted(*effects, explains, plausible=True):

@@ -31,7 +31,7 @@ from calibration.inference import (
     solvers,
 )
 from calibration.inference.conduct import error_after_steps
-from calibration.inference.fit_notes import Remark, next_step
+from calibration.inference.fit_notes import Remark, next_step, with_codes
 from calibration.inference.identifiability import posterior_of_coordinates
 from calibration.inference.multistart import SearchResult
 from calibration.inference.noise import Noise
@@ -140,9 +140,10 @@ def calibrate(
     more = members is not None or generations is not None
     evolved = _population_size(posed, ready.names, runs, population, more), generations or GENERATIONS, members
     search, beside = _search(runs, base, posed, ready.noise, starts, *evolved, seed, progress, solver)
-    return _result(
-        _Setting(runs, observe, fidelity, profiles, kinds, ready, base, of_product), search, beside, seed, progress
-    )
+    setting = _Setting(runs, observe, fidelity, profiles, kinds, ready, base, of_product)
+    if not free and priors.DELAY not in (*fix, *ready.names):
+        setting, search = _with_delay(setting, search, progress, solver)
+    return _result(setting, search, beside, seed, progress)
 
 
 def _free_names(
@@ -190,7 +191,7 @@ class _Setting:
     Attributes:
         fidelity: its name.
         profiles: True to profile every parameter.
-        kinds: of the blocks that are held out.
+        kinds: kinds of the blocks that are held out.
         base: the robot at the prior means.
         of_product: priors of its guide frictions, see `_with_guide_priors`.
     """
@@ -219,6 +220,31 @@ def _with_guide_priors(runs: Runs, ready: Prepared, fidelity: str) -> tuple[Robo
     return robot, {
         name: prior for name, prior in guide_priors.items() if name in ready.names and name not in ready.stated
     }
+
+
+def _with_delay(
+    setting: _Setting, found: SearchResult, tell: Callable[[Remark], None], solver: optimizers.Solver | None
+) -> tuple[_Setting, SearchResult]:
+    """The setting and a search that also frees the delay, if the error of a log lies in the samples after steps.
+
+    No other parameter explains such an error, and the others absorb it.
+    """
+    runs, ready, rig = setting.runs, setting.ready, setting.base.rig
+    reading = np.asarray(optimizers.observe_at(found.problem, found.best.z).reading)
+    late = with_codes(error_after_steps(runs, reading - runs.measured()), "after_steps")
+    if not late or rig.inherits or priors.DELAY in rig.exact:
+        return setting, found
+    tell(next_step("delay"))
+    note = Remark("freed_delay", channel=late[0].channel, share=late[0].share)
+    ready = dataclasses.replace(ready, names=(*ready.names, priors.DELAY), weighed=(*ready.weighed, note))
+    coordinates = priors.parameter_coordinates(setting.base, ready.names, {**setting.of_product, **ready.stated})
+    posed = observers.pose_problem(runs, setting.base, coordinates, ready.noise.sd, setting.fidelity)
+    index = [coordinates.names.index(name) for name in found.problem.coordinates.names]
+    start = np.zeros((1, len(coordinates)))
+    start[0, index] = found.best.z
+    start = scans.place_at_minimum(posed, start)
+    found = multistart.search_one_by_one(posed, ready.noise, start, found.shares, tell, solver)
+    return dataclasses.replace(setting, ready=ready), found
 
 
 def _population_size(posed: Problem, names: Sequence[str], runs: Runs, population: int | None, more: bool) -> int:
@@ -405,7 +431,7 @@ def _result(
         posterior=posterior_of_coordinates(posed.coordinates, z, about.covariance),
         remarks=(
             *notes,
-            *error_after_steps(runs, seen - measured),
+            *(() if priors.DELAY in ready.names else error_after_steps(runs, seen - measured)),
             *(Remark("unmeasured", name=n) for n, s in zip(ready.names, about.sensitivity, strict=True) if s < 1e-6),
         ),
     )

@@ -44,7 +44,7 @@ SCREENING = "mmrjax.screening/1"
 
 
 def execute(config: configuration.Loop, beside: configuration.LoopBeside) -> int:
-    """Run the closed loop on a table and leave a run folder. Returns the exit code.
+    """Run the closed loop on a table and write a run folder. Returns the exit code.
 
     0 done, whatever the verdict. 3 done, but the fit that is proposed did not converge, or its time was out before
     there was a verdict. Stages are kept as they end, so that the same command goes on after that, or an interrupt.
@@ -99,7 +99,7 @@ def _loop(config: configuration.Loop, beside: configuration.LoopBeside, robot: R
             if name == "ranking":
                 _show_ranking(stages[name], folder, timed, brief=not beside.verbose)
             if name == "verdict":
-                timed(f"{loop_words.verdict_line(stages[name])}; next, errors held out and other noises")
+                timed(f"{loop_words.verdict_line(stages[name])}; next: held-out errors and other noise levels")
             return result
 
         try:
@@ -119,9 +119,7 @@ def _loop(config: configuration.Loop, beside: configuration.LoopBeside, robot: R
         document = loop_report.loop_document(verdict, config.robot, changes_by_effect(verdict))
         page = print_report(document, brief=not beside.verbose)
         if config.resolve and verdict.resolved is None:
-            print_output(
-                "The track model was not asked: nothing remains in slip, track or ground that it has a say in."
-            )
+            print_output("The track model was not run: no error remains in the slip, track or ground balance.")
         verdict.save(folder.results(), config.robot, folder.tables)
         if config.report:
             progress("writing the report")
@@ -132,7 +130,7 @@ def _loop(config: configuration.Loop, beside: configuration.LoopBeside, robot: R
 def _resolved(
     found: DiscoveryResult, config: configuration.Loop, members: Path | None, progress: Callable[[str], None]
 ) -> DiscoveryResult:
-    """The result, with its resistance resolved by the track model."""
+    """The result, with the track model's test added: does a different running gear explain the misfit?"""
     resolved = resolve(
         found, noise=config.noise or None, population=config.population, generations=config.generations,
         members=members, seed=config.seed, tell=in_words(progress),
@@ -141,9 +139,9 @@ def _resolved(
 
 
 def _say_out_of_time(within: float, begun: bool) -> None:
-    """Report that time was out before a verdict [s]. `begun`: a stage has ended."""
+    """Report that the time budget [s] ended before a verdict. `begun`: at least one stage has finished."""
     more = max(5, math.ceil(within / 30))  # twice as much
-    first = "" if begun else f", nor a fit of the base model; give it more, as --within {more}min"
+    first = "" if begun else f", and no fit of the base model; allow more time, such as --within {more}min"
     print_message(f"no verdict within {within:g} s{first}")
 
 
@@ -170,7 +168,7 @@ def _alarm(seconds: float, wanted: Callable[[], bool]) -> Iterator[None]:
 
 
 def _show_ranking(found: Ranking, folder: RunFolder, timed: Callable[[str], None], brief: bool) -> None:
-    """Print the ranking by regression, the first answer, and leave it in the run folder."""
+    """Print the ranking by regression, the first answer, and write it to the run folder."""
     first, *lines = loop_words.ranking_lines(found, brief=brief)
     timed(first)
     for line in lines:
@@ -181,17 +179,17 @@ def _show_ranking(found: Ranking, folder: RunFolder, timed: Callable[[str], None
 
 
 def _say_kept(stages: Mapping[str, Any], folder: RunFolder, robot_name: str) -> None:
-    """Say which stages are kept, and leave the robot of the base fit where there is one but no verdict."""
+    """Print which stages are stored. Without a verdict, write the robot of the base fit if it is known."""
     if not stages:
         return
     kept = [name for name in stages if folder.keeps(name)]
     if not kept:
-        print_message(f"nothing could be kept of {', '.join(stages)}; the same command begins anew")
+        print_message(f"nothing could be saved of {', '.join(stages)}; the same command starts again")
         return
     print_message(f"kept: {', '.join(kept)}; to continue, run the same command with --out {folder.path}")
     if "verdict" in stages:
         traced = stages["verdict"]
-        print_message(f"{loop_words.verdict_line(traced)}; errors held out and other noises are outstanding")
+        print_message(f"{loop_words.verdict_line(traced)}; held-out errors and other noise levels are still missing")
         return
     if "ranking" in stages:
         for line in (*loop_words.ranking_lines(stages["ranking"]), loop_words.regression_verdict(stages["ranking"])):
@@ -210,7 +208,7 @@ def _say_kept(stages: Mapping[str, Any], folder: RunFolder, robot_name: str) -> 
     robot_file.write_robot(
         robot, folder.partial / REFIT_FILE, note=f"{robot_name}, fitted; the loop has no verdict yet"
     )
-    print_message(f"the best that is known so far is the refit, {folder.partial / REFIT_FILE}")
+    print_message(f"the best result so far is the refit, {folder.partial / REFIT_FILE}")
 
 
 def changes_by_effect(found: DiscoveryResult) -> dict[str, Change]:
