@@ -14,7 +14,7 @@ def describe(found: Any, part: str = "", *about: str) -> str:
 
     Args:
         found: a note, a result, or a sentence, which is returned as it is.
-        part: of a result: `header` of its robot's file, or `standing` of the loop's names. "": its answer.
+        part: part of a result: `header` of its robot's file, or `standing` of the loop's names. "": its answer.
         about: the robot's name, for a header.
 
     Returns:

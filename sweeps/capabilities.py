@@ -31,12 +31,12 @@ RESTS_ON = {q.column: q.rests_on for rows in quantities.TABLE.values() for q in 
 
 
 def _nothing(robot: Robot) -> dict[str, float]:
-    """Parameters of a rig whose file states its loads only."""
+    """Parameters of a rig whose file describes only its loads."""
     return {p.name: float(p.value) for p in params.walk_parameters(blank_robot(robot.configurations, rig=robot.rig))}
 
 
 def states_parameter(robot: Robot, prefix: str) -> bool:
-    """True if the robot's file or its base states any parameter whose name begins so."""
+    """True if the robot's file or its base gives a parameter whose name begins with this text."""
     return any(p.name.startswith(prefix) and robot.knows([p.name]) for p in params.walk_parameters(robot))
 
 
@@ -54,15 +54,15 @@ def has_battery(robot: Robot) -> bool:
 
 
 def unknown_numbers_sentence(robot: Robot) -> list[str]:
-    """Sentences on results that are unknown because the robot's file does not state their parameters."""
+    """Sentences on results that cannot be computed because the robot's file lacks their parameters."""
     gone = [output for output in outputs.FURTHER if not robot.knows(output.rests_on)]
     lacking = dict.fromkeys(name for output in gone for name in robot.unknown(output.rests_on))
     labels = "; ".join(output.label for output in gone)
-    return [f"not known, as the robot's file does not state {', '.join(lacking)}: {labels}"] if gone else []
+    return [f"cannot be computed: the robot's file does not give {', '.join(lacking)}: {labels}"] if gone else []
 
 
 def idle_columns(robot: Robot) -> set[str]:
-    """Columns of runs and histories that mean nothing for a robot."""
+    """Columns of runs and histories that do not apply to a robot."""
     idle: set[str] = set()
     if not robot.has_ground:
         idle |= {*OF_GROUND}
@@ -77,7 +77,7 @@ def idle_columns(robot: Robot) -> set[str]:
 
 
 def without_idle(robot: Robot, table: Columns) -> Columns:
-    """A table without what means nothing for the robot, the columns of its channels aside."""
+    """A table without the columns that do not apply to the robot. Columns of its channels are kept."""
     idle = idle_columns(robot) - {c.column for c in robot.channels}
     ends = ("", "_sd", "_lower", "_upper")
     gone = {column + end for column in idle for end in ends}

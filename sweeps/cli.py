@@ -37,19 +37,21 @@ app = typer.Typer(
 
 _NoCache = Annotated[
     bool,
-    typer.Option("--no-cache", help="Compile again: neither read nor keep compiled programs."),
+    typer.Option("--no-cache", help="Do not use the cache of compiled programs."),
 ]
 _Config = Annotated[
-    Path | None, typer.Option("--config", help="TOML file with the keys of a config.resolved.toml; options win.")
+    Path | None,
+    typer.Option("--config", help="TOML file with the keys of a config.resolved.toml. Options override it."),
 ]
-_Trust = Annotated[
-    bool, typer.Option("--trust", help="Allow --config to name code that is run: effects and a scheduler.")
-]
+_Trust = Annotated[bool, typer.Option("--trust", help="Allow --config to name code to run: effects and a scheduler.")]
 _Effects = Annotated[
-    list[str] | None, typer.Option("--effects", help="A Python file with effects of your own, repeatable.")
+    list[str] | None, typer.Option("--effects", help="Python file with your own effects. May be repeated.")
 ]
 _Columns = Annotated[
-    str | None, typer.Option("--columns", help="A preset of the data's columns, or its file (docs/howto/formats.md).")
+    str | None,
+    typer.Option(
+        "--columns", help="Preset for the column names of the data, or a preset file (docs/howto/formats.md)."
+    ),
 ]
 
 
@@ -60,7 +62,7 @@ def _command(
     group: str,
     example: str,
     room: str = "",
-    failure: str = "the solver failed at some runs (status failed). Runs that stall or slide are answers: 0",
+    failure: str = "the solver failed at some runs (status failed). Runs that stall or slide give 0",
     resolve: Callable[..., config.Part] | None = None,
 ) -> Callable[[Callable[[], None]], None]:
     """Decorator for the name and help of a command whose options are the fields of two configurations.
@@ -84,7 +86,7 @@ def _command(
 
             file, plan, trust = given["config_file"], given.get("plan"), given["trust"]
             if plan is not None and file is not None:
-                raise InputError(f"--config: got {file} beside {plan}; expected one of them")
+                raise InputError(f"--config: got {file} in addition to {plan}; give one of them")
             file = plan if file is None else file
             if "plan" in given:
                 given["plan"] = file
@@ -129,7 +131,7 @@ FIRST_HOUR = """mmrjax simulates a small robot's drive and compares it with meas
 
   mmrjax simulate --configuration 6T2A --voltage 24 --slope 10    one run of the packaged robot
   mmrjax inspect log.csv                                          what a data file contains
-  mmrjax loop measured --out found                                what the model lacks of the packaged runs
+  mmrjax loop measured --out found what the model lacks, from the packaged runs
 
 mmrjax --help lists all commands."""
 
@@ -165,9 +167,9 @@ def _root(
 def simulate() -> None:
     """Simulate operating points, a start, a mission or a turn.
 
-    One operating point is stated by options, several by --runs FILE.csv. With --model drive or track the run starts
-    from standstill. history.csv then holds current and speeds over time. With track, reactions.csv also holds the
-    loads inside the running gear. With --profile the robot follows a mission: segments.csv holds energy (Wh, Wh/m),
+    Options describe one operating point, --runs FILE.csv several. With --model drive or track the run starts from
+    standstill. history.csv then holds current and speeds over time. With track, reactions.csv also holds the loads
+    inside the running gear. With --profile the robot follows a mission: segments.csv holds energy (Wh, Wh/m),
     distance, peaks, temperatures and charge of each segment. With --left and --right the two sides have different
     voltages, and the robot turns (docs/howto/turn.md).
     """
@@ -238,8 +240,8 @@ def render() -> None:
     config.FittedRuns,
     group=DATA,
     example="mmrjax calibrate measured --noise current=2%,motor_speed=0.5%,speed=1% --out fitted",
-    failure="the search, or one without a block, did not converge, or the solver failed at a row. A fit that is not "
-    "adequate and rows that slide are answers: 0",
+    failure="the search, or one without a block, did not converge, or the solver failed at a row. An inadequate "
+    "fit and rows that slide give 0",
 )
 def calibrate() -> None:
     """Fit parameters to measured runs, with intervals.
@@ -258,7 +260,7 @@ def calibrate() -> None:
     group=DATA,
     example="mmrjax settle log.csv --robot rig.toml --out settled, then "
     "mmrjax loop settled/settled.csv --robot rig.toml",
-    failure="does not occur: nothing is solved",
+    failure="does not occur, since no equations are solved",
 )
 def settle() -> None:
     """Extract the settled runs of a log as a table.
@@ -273,8 +275,8 @@ def settle() -> None:
     config.LoopBeside,
     group=DATA,
     example="mmrjax loop measured --out found, then mmrjax sweep --robot found/robot.toml",
-    failure="the fit that is proposed did not converge, or --within was out before a verdict (the same command with "
-    "more goes on). Every verdict is an answer: 0",
+    failure="the proposed fit did not converge, or --within ran out before a verdict (the same command with more "
+    "time continues). Every verdict gives 0",
 )
 def loop() -> None:
     """Find the effect that the model lacks, and add it.
@@ -322,7 +324,7 @@ def resonance() -> None:
     config.FolderPart,
     group=MODEL,
     example="mmrjax climb --step 120 --levers-front 45 --levers-rear -8.5 --voltage 6; mmrjax climb --find step",
-    failure="numbers of the run went wrong (verdict failed). That a robot does not get over is an answer: 0",
+    failure="the simulation broke down (verdict failed). A robot that does not get over the obstacle gives 0",
 )
 def climb() -> None:
     """Simulate a climb over a step, stairs, a gap or a terrain.
@@ -339,7 +341,7 @@ def climb() -> None:
     config.FolderPart,
     group=DESIGN,
     example="mmrjax check requirements.toml --robot found/robot.toml --set gearbox.ratio=40",
-    failure=f"{_AT_CORNER}. A requirement that is missed is an answer: 0; result.json counts them",
+    failure=f"{_AT_CORNER}. A missed requirement gives 0; result.json counts them",
 )
 def check() -> None:
     """Check a robot against requirements.
@@ -354,7 +356,7 @@ def check() -> None:
     config.FolderPart,
     group=DESIGN,
     example="mmrjax size requirements.toml --pareto mass,energy",
-    failure=f"{_AT_CORNER} of the best. That no design meets all is an answer: 0",
+    failure=f"{_AT_CORNER} of the best design. If no design meets all requirements, the code is 0",
 )
 def size() -> None:
     """Choose motor, gearbox and cells that meet requirements.
@@ -397,26 +399,24 @@ _SHEET = "Data sheet"
     "--resistance 0.611ohm"
 )
 def new(
-    file: Annotated[Path, typer.Argument(metavar="FILE.toml", help="The file to write.")],
+    file: Annotated[Path, typer.Argument(metavar="FILE.toml", help="File to write.")],
     kind: Annotated[
         str | None,
         typer.Option(
-            help="tracked, wheeled, bench, dyno, pendulum, servo, linear or carriage.  "
-            "\\[default: what the joint of --from moves, else bench]"
+            help="tracked, wheeled, bench, dyno, pendulum, servo, linear or carriage.  \\[default: from the load "
+            "on the joint of --from, else bench]"
         ),
     ] = None,
-    source: Annotated[
-        Path | None, typer.Option("--from", help="A URDF or a model of MuJoCo with the driven joint.")
-    ] = None,
+    source: Annotated[Path | None, typer.Option("--from", help="URDF or MuJoCo model with the driven joint.")] = None,
     joint: Annotated[
         str | None, typer.Option(help="Name of the revolute joint.  \\[default: the only driven one]")
     ] = None,
     from_sheet: Annotated[
         bool,
-        typer.Option("--from-sheet", help="Read a motor; the numbers below imply it.", rich_help_panel=_SHEET),
+        typer.Option("--from-sheet", help="Read motor data. The options below imply it.", rich_help_panel=_SHEET),
     ] = False,
     voltage: Annotated[
-        str | None, typer.Option(help="Voltage of the numbers below: V, mV.", rich_help_panel=_SHEET)
+        str | None, typer.Option(help="Voltage at which the data below hold: V or mV.", rich_help_panel=_SHEET)
     ] = None,
     no_load_speed: Annotated[str | None, typer.Option(help="rpm, 1/min or rad/s.", rich_help_panel=_SHEET)] = None,
     no_load_current: Annotated[str | None, typer.Option(help="A or mA; required.", rich_help_panel=_SHEET)] = None,
@@ -427,7 +427,7 @@ def new(
     resistance: Annotated[
         str | None, typer.Option(help="Terminal resistance: ohm or mohm.", rich_help_panel=_SHEET)
     ] = None,
-    force: Annotated[bool, typer.Option("--force", help="Replace the file where there is one.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Overwrite the file if it exists.")] = False,
 ) -> int:
     """Write a rig's file to fill in.
 
@@ -454,11 +454,11 @@ def rig_check(
     file: Annotated[Path, typer.Argument(metavar="FILE.toml", help="The rig's file.")],
     data: Annotated[
         str | None,
-        typer.Argument(metavar="[DATA]", help="A table of runs or a log, in any format (docs/howto/formats.md)."),
+        typer.Argument(metavar="[DATA]", help="Table of runs or log, in any format (docs/howto/formats.md)."),
     ] = None,
     columns: _Columns = None,
     effects: _Effects = None,
-    json: Annotated[bool, typer.Option("--json", help="Print JSON (mmrjax.rig_check/1) instead of words.")] = False,
+    json: Annotated[bool, typer.Option("--json", help="Print JSON (mmrjax.rig_check/1) instead of text.")] = False,
     no_cache: _NoCache = False,
 ) -> int:
     """Check a rig's file, and data for it.
@@ -478,8 +478,8 @@ def rig_check(
     "inspect", rich_help_panel=DATA, epilog="Example: mmrjax inspect log.bag; mmrjax inspect log.h5::/run1 --json"
 )
 def inspect_file(
-    file: Annotated[str, typer.Argument(metavar="FILE", help="A file of data; ::PATH for a part of it.")],
-    json: Annotated[bool, typer.Option("--json", help="Print JSON (mmrjax.inspect/1) instead of words.")] = False,
+    file: Annotated[str, typer.Argument(metavar="FILE", help="Data file; ::PATH selects a part of it.")],
+    json: Annotated[bool, typer.Option("--json", help="Print JSON (mmrjax.inspect/1) instead of text.")] = False,
 ) -> int:
     """List the signals of a data file, and propose column names.
 
@@ -494,7 +494,10 @@ def inspect_file(
 def explain(
     name: Annotated[
         list[str] | None,
-        typer.Argument(help="Effect, status, flag, output, channel, parameter or word of a report. None lists them."),
+        typer.Argument(
+            help="Effect, status, flag, output, channel, parameter or word of a report. Without a "
+            "name, all are listed."
+        ),
     ] = None,
     effects: _Effects = None,
     no_cache: _NoCache = False,
@@ -510,14 +513,14 @@ def explain(
 
 
 def _prepare(resolved: Any, no_cache: bool = False) -> None:
-    """Make the environment ready for the jax that a command of this configuration will import.
+    """Prepare the environment before a command of this configuration imports jax.
 
-    Runs of the track model have hung for good, one sweep in seven on two cores, with every thread asleep in
-    XLA's CPU executor (jax 0.10.2). With one thread none of twelve did (docs/lab/figures.md). Whoever sets
-    XLA_FLAGS, be it to nothing, is heeded.
+    With several threads, one sweep of the track model in seven hung forever on two cores, with every thread asleep
+    in XLA's CPU executor (jax 0.10.2). With one thread none of twelve did (docs/lab/figures.md). XLA_FLAGS set by
+    the user, even if empty, takes precedence.
     """
-    model = getattr(resolved, "model", None)  # None: of a calibration, whose data decide
-    one_thread = model is not None and fidelities.fidelity_facts(model).one_thread
+    model = getattr(resolved, "model", None)  # a fidelity; of a calibration, whose data decide, None
+    one_thread = isinstance(model, str) and fidelities.fidelity_facts(model).one_thread
     options = (
         OF_LOOP if isinstance(resolved, config.Loop) else (OLDER_EMITTERS,) * isinstance(resolved, config.Calibrate)
     )
@@ -604,7 +607,8 @@ def main() -> None:
 
 
 def _obey_interrupt(ignored: Any) -> None:
-    """Interrupts again, soon: an interrupt is lost in a callback, of collected garbage for instance."""
+    """Repeats an interrupt shortly afterwards, because an interrupt inside a callback (such as garbage collection)
+    is lost."""
     if issubclass(ignored.exc_type, KeyboardInterrupt):
         signal.setitimer(signal.ITIMER_REAL, 0.01)
     else:
@@ -612,7 +616,8 @@ def _obey_interrupt(ignored: Any) -> None:
 
 
 def _replace_closed_streams() -> None:
-    """Opens closed standard streams, so that no file gets their numbers and with them what libraries print."""
+    """Reopens closed standard streams. Otherwise a file could get their numbers, and with them the output of
+    libraries."""
     for number in range(3):
         with contextlib.suppress(OSError):
             os.fstat(number)
@@ -629,24 +634,24 @@ def _answered(error: BaseException) -> int:
     if isinstance(error, InputError):
         return _fail(str(error), error.exit_code)
     if isinstance(error, typer.Abort | KeyboardInterrupt):
-        advice = "no run folder was left"
+        advice = "no run folder was written"
         if "sweep" in sys.argv[1:2]:
-            advice = "a sweep goes on where it stopped, after its last whole chunk, with the same --out"
+            advice = "the same command with the same --out resumes the sweep after its last complete chunk"
         if "loop" in sys.argv[1:2]:
-            advice = "the loop goes on after its last whole stage, with the same --out"
+            advice = "the same command with the same --out resumes the loop after its last complete stage"
         return _fail(f"interrupted; {advice}", INTERRUPTED)
     if _memory_exhausted(error):
-        return _fail("memory exhausted; take fewer points at once (--chunk), fewer rows, or more memory", 2)
+        return _fail("out of memory; use fewer points at a time (--chunk), fewer rows, or more memory", 2)
     if isinstance(error, OSError):
         from sweeps.console import OUTPUT
 
         place = str(error.filename or OUTPUT)  # run folders and tables name theirs
-        left = "" if place == OUTPUT else "; no run folder was left; what was kept is in its .partial"
+        left = "" if place == OUTPUT else "; no run folder was written; finished parts are in its .partial"
         return _fail(f"{place}: {error.strerror}{left}", 2)
     if isinstance(error, SystemExit) and isinstance(error.__context__, BrokenPipeError):
         return 1  # whoever reads the output has had enough: head, or a pager that was left
     if isinstance(error, SystemExit):
-        return _fail("--effects: code of a file of effects has ended the program; remove the call that does", 2)
+        return _fail("--effects: the code in an effects file ended the program; remove that call", 2)
     if hasattr(error, "format_message") and hasattr(error, "exit_code"):  # a usage error of the option parser
         return _fail(_no_number(error) or error.format_message(), error.exit_code)
     import traceback
@@ -657,7 +662,7 @@ def _answered(error: BaseException) -> int:
 
 
 def _memory_exhausted(error: BaseException | None) -> bool:
-    """True if a failure, or what it came of, is that memory ran out: Python's, XLA's or the loader's of libraries."""
+    """True if an error, or one of its causes, is a lack of memory in Python, XLA or the library loader."""
     while error is not None:
         out = isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in str(error)
         if out or (isinstance(error, ImportError) and "failed to map segment" in str(error)):
@@ -667,7 +672,7 @@ def _memory_exhausted(error: BaseException | None) -> bool:
 
 
 def _no_number(error: Any) -> str:
-    """Error message for a text in place of a number. Most often the text includes a unit."""
+    """Error message for a text instead of a number. Usually the text includes a unit."""
     option = getattr(error, "param", None)
     if option is None or not re.search(r"valid (number|float|integer)", str(getattr(error, "message", ""))):
         return ""

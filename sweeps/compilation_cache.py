@@ -106,13 +106,14 @@ def keep_programs() -> Path | None:
 
 
 def _refused(folder: str) -> bool:
-    """True if others could change a folder of programs, which is reported: their code would be run."""
+    """True if other users could change a folder of compiled programs and so run their code. This is reported."""
     reason = exposure_reason(Path(folder)) if folder else ""
     if reason:
         from sweeps.console import print_message
 
         print_message(
-            f"compiled programs are not kept: {reason}; name a folder of your own in {VARIABLE}, or chmod go-w it"
+            f"compiled programs are not cached: {reason}; set {VARIABLE} to a folder of your own, or remove write "
+            "access for others (chmod go-w)"
         )
     return bool(reason)
 
@@ -131,7 +132,7 @@ def _entries(folder: Path) -> list[tuple[float, int, Path]]:
 
 
 def _prune(caches: Path) -> None:
-    """Drop the oldest entries of all versions if they have become too many."""
+    """Delete the oldest entries of all versions if there are too many."""
     entries = [entry for folder in caches.glob("xla-*") for entry in _entries(folder)]
     size = sum(entry[1] for entry in entries)
     if size <= LIMIT:

@@ -66,7 +66,7 @@ def option_field(default: Any, description: str, **extra: Any) -> Any:
 
 
 class Part(BaseModel):
-    """A part of a command's configuration. Unknown keys are refused."""
+    """A part of a command's configuration. Unknown keys are rejected."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -74,12 +74,12 @@ class Part(BaseModel):
 class RobotPart(Part):
     """Robot."""
 
-    robot: str = option_field("nominal", "nominal, sm1, sm2, or a robot's TOML file")
+    robot: str = option_field("nominal", "nominal, sm1, sm2, or the TOML file of a robot")
     set: dict[str, bool | float] = option_field(
-        {}, "Change a parameter, SI units, repeatable: 6T2A.ground.friction.static=0.6"
+        {}, "Change a parameter (SI units); may be repeated: 6T2A.ground.friction.static=0.6"
     )
     effects: Names = option_field(
-        (), "A Python file with effects of your own, repeatable; its code is run", verbatim=True, executes=True
+        (), "Python file with your own effects; its code is run; may be repeated", verbatim=True, executes=True
     )
 
 
@@ -93,7 +93,9 @@ class FolderPart(Part):
 class Measured(FolderPart):
     """Measured data of a command."""
 
-    data: str = option_field("measured", "Measured runs or histories in any format, or measured", argument=True)
+    data: str = option_field(
+        "measured", "Measured runs or time histories in any format, or measured (packaged runs)", argument=True
+    )
 
 
 class ComparedRuns(Measured):
@@ -102,24 +104,24 @@ class ComparedRuns(Measured):
     data: str = option_field(
         "measured", "Measured runs in any format, or measured, or simulated_by_paper", argument=True
     )
-    own_mass: bool = option_field(False, "Take the robot's mass and the payload, not the stated total mass")
+    own_mass: bool = option_field(False, "Use the robot's mass plus payload instead of the total mass in the table")
 
 
 class SettledLog(FolderPart):
     """Data of `settle`."""
 
     data: str = option_field(
-        ..., "A log over time in any format: time_s, what is imposed, channels", argument=True, metavar="LOG"
+        ..., "Log over time in any format: time_s, the imposed quantity, channels", argument=True, metavar="LOG"
     )
 
 
 class DataPart(Part):
-    """Columns of a table or log that have other names than this program's."""
+    """Names of the columns of a table or log, if they differ from those of mmrjax."""
 
     columns: str | None = option_field(
         None,
-        "Names, units and signs of the data's columns: a preset "
-        f"({', '.join(presets_file.PACKAGED)}; with the numbers it asks for, vesc,pole_pairs=7) or a preset's file",
+        f"Names, units and signs of the columns: a preset ({', '.join(presets_file.PACKAGED)}; with the numbers "
+        "that it needs, such as vesc,pole_pairs=7) or a preset file",
         usual="[columns] of the robot's file",
     )
 
@@ -136,14 +138,14 @@ class ModelPart(Part):
 
 
 def _fidelity(model: str) -> str:
-    """The name of a fidelity, refused where there is no such one."""
+    """The name of a fidelity. Unknown names are rejected."""
     if model not in fidelities.TABLE:
         raise PydanticCustomError("unknown", f"input should be {_either(map(repr, fidelities.TABLE))}")
     return model
 
 
 def _solver(name: str) -> str:
-    """The name of a solver of fits, refused where there is no such one."""
+    """The name of a solver for fits. Unknown names are rejected."""
     if name not in solvers.NAMES:
         raise PydanticCustomError("unknown", allowed_words(name, solvers.NAMES))
     return name
@@ -188,11 +190,12 @@ class FidelityPart(ModelPart):
             value, having = getattr(self, f"{name}_s"), _having(name)
             usual = {option.default for option in having.values()}
             if value is not None and self.model not in having and value not in usual:
-                raise PydanticCustomError("idle", f"`{name}_s` acts only with `model` {_either(having)}")
+                raise PydanticCustomError("idle", f"`{name}_s` has an effect only with `model` {_either(having)}")
             if value is not None and self.model in having and value > having[self.model].most:
                 most = having[self.model]
                 raise PydanticCustomError(
-                    "idle", f"`{name}_s`: got {value:g}; `model` {self.model} takes at most {most.most:g} {most.unit}"
+                    "idle",
+                    f"`{name}_s`: got {value:g}; `model` {self.model} allows at most {most.most:g} {most.unit}",
                 )
         return self
 
@@ -208,7 +211,7 @@ class BatchPart(FidelityPart):
 
     chunk: Annotated[int, Field(ge=1, le=1_000_000_000)] | None = option_field(
         None,
-        "Runs in one vmapped call",
+        "Runs per vmapped call",
         usual=", ".join(f"{name} {facts.at_once(accelerator=False)}" for name, facts in fidelities.TABLE.items())
         + " on processors",
     )
@@ -225,16 +228,16 @@ class SupplyPart(Part):
     @model_validator(mode="after")
     def _feeds(self) -> Self:
         if self.discharge_mAh and not self.battery:
-            raise PydanticCustomError("idle", "`discharge_mAh` acts only with `battery`")
+            raise PydanticCustomError("idle", "`discharge_mAh` has an effect only with `battery`")
         if self.battery and getattr(self, "voltages_V", None) is not None:
             raise PydanticCustomError(
-                "idle", "`voltages_V` acts only without `battery`, whose charge sets the voltage"
+                "idle", "`voltages_V` cannot be combined with `battery`, whose charge sets the voltage"
             )
         return self
 
 
 SURFACE = (
-    "Surface of Table 5; scales the adhesion, which a robot states for lacquered_wood. Of a rig a label of its own"
+    "Surface of Table 5, which scales the adhesion (given for lacquered_wood); for a rig, one of its own surfaces"
 )
 
 
@@ -249,32 +252,36 @@ class OneRun(Part):
     """
 
     configuration: str | None = option_field(
-        None, "One of the robot's, such as 6T2A or 4W2T of the packaged one", usual="its first"
+        None, "Configuration of the robot, such as 6T2A or 4W2T", usual="its first"
     )
     supply_voltage_V: float | None = option_field(
         None,
         "Supply voltage (V), negative backward",
-        usual="33; of a rig its limit; none with --battery",
+        usual="33; for a rig its limit; none with --battery",
         flag="--voltage",
     )
     motor_speed_rpm: float | None = option_field(
-        None, "Motor speed (rpm), negative backward, of a rig on whose motors it is imposed"
+        None, "Motor speed (rpm), negative backward, for rigs with imposed motor speed"
     )
     motor_current_A: float | None = option_field(
-        None, "Current of each motor (A), negative backward, of a rig on whose motors it is imposed"
+        None, "Current per motor (A), negative backward, for rigs with imposed motor current"
     )
     payload_kg: float | None = option_field(None, "Additional load mass", usual="0")
     slope_deg: float | None = option_field(None, "Slope, positive uphill", usual="0")
-    surface: str | None = option_field(None, SURFACE, usual=f"{BENCH}; of a rig none")
+    surface: str | None = option_field(None, SURFACE, usual=f"{BENCH}; for a rig none")
     total_mass_kg: float | None = option_field(
         None, "Total mass", usual="the robot's own mass and the payload", flag="--mass"
     )
     levers_front_deg: float | None = option_field(
-        None, "Angle of the front levers, 0 along the wheelbase outward, positive up, 180 folded", usual="the robot's"
+        None,
+        "Angle of the front levers (0: extended along the wheelbase, positive: up, 180: folded)",
+        usual="the robot's",
     )
-    levers_rear_deg: float | None = option_field(None, "The same of the rear levers", usual="the robot's")
+    levers_rear_deg: float | None = option_field(
+        None, "Angle of the rear levers, with the same convention", usual="the robot's"
+    )
     load_torque_Nm: float | None = option_field(
-        None, "Torque of a brake on the output of each drive (N·m), against forward rotation, of a load on a shaft",
+        None, "Brake torque at the output of each drive (N·m), against forward rotation, for loads on a shaft",
         usual="none"
     )  # fmt: skip
 
@@ -285,16 +292,16 @@ class OneRun(Part):
 
 
 class GivenRuns(OneRun, FolderPart):
-    """Runs of `simulate`: one of options, or those of a file."""
+    """Runs of `simulate`: one run from options, or those in a file."""
 
-    runs: Path | None = option_field(None, "CSV of runs to simulate instead; the condition columns are enough")
+    runs: Path | None = option_field(None, "CSV of runs to simulate instead; condition columns are enough")
 
     @model_validator(mode="after")
     def _once(self) -> Self:
         if self.runs is not None and self.stated:
             raise PydanticCustomError(
-                "idle", f"{', '.join(f'`{name}`' for name in self.stated)}: not allowed with `runs`, whose columns "
-                "state the conditions of each run; state it there, or leave out `runs`",
+                "idle", f"{', '.join(f'`{name}`' for name in self.stated)}: not allowed with `runs`, whose "
+                        "columns give the conditions of each run; give it there, or omit `runs`",
             )  # fmt: skip
         return self
 
@@ -302,14 +309,14 @@ class GivenRuns(OneRun, FolderPart):
 class Picture(OneRun):
     """File of `render`, and the run that it shows."""
 
-    file: Path = option_field(..., "What to write: its suffix is .png, .gif or .mp4", argument=True)
+    file: Path = option_field(..., "Output file, ending in .png, .gif or .mp4", argument=True)
     begin: float | None = option_field(
-        None, "Instant of a picture, first one of a film (s)", usual="0; of a picture 0.8"
+        None, "Time of the picture, or start of the film (s)", usual="0; for a picture 0.8"
     )
-    end: float | None = option_field(None, "Last instant of a film (s)", usual="begin + 0.1")
+    end: float | None = option_field(None, "End of the film (s)", usual="begin + 0.1")
     slow: Annotated[float, Field(ge=0.01)] | None = option_field(None, "Slow-motion factor of a film", usual="20")
     climb: Path | None = option_field(
-        None, "Folder of mmrjax climb to draw instead, by default whole and at half speed"
+        None, "Folder of mmrjax climb to draw instead; by default the whole climb at half speed"
     )
     force: bool = option_field(False, "Replace an existing file")
 
@@ -321,31 +328,31 @@ class AxesPart(Part):
     """
 
     configurations: Several[str] | None = option_field(
-        None, "Comma-separated, of the robot's", usual="all that it has"
+        None, "Configurations of the robot, comma-separated", usual="all configurations"
     )
     voltages_V: Several[Voltage] | None = option_field(
-        None, "Supply voltages (V), of a rig thirds of its voltage_limit", usual=_shown(VOLTAGES_V)
+        None, "Supply voltages (V); for a rig thirds of its voltage_limit", usual=_shown(VOLTAGES_V)
     )
     motor_speeds_rpm: Several[MotorSpeed] | None = option_field(
-        None, "Motor speeds (rpm) of a rig on whose motors they are imposed", usual="thirds of speed_limit"
+        None, "Motor speeds (rpm), for rigs with imposed motor speed", usual="thirds of speed_limit"
     )
     payloads_kg: Several[Payload] | None = option_field(
-        None, "Additional load masses (kg), of a rig 0", usual=_shown(PAYLOADS_KG)
+        None, "Additional load masses (kg); for a rig 0", usual=_shown(PAYLOADS_KG)
     )
     slopes_deg: Several[Slope] | None = option_field(
         None, "Slopes (deg), positive uphill; 0 for a rig", usual=_shown(SLOPES_DEG)
     )
-    surface: str | None = option_field(None, SURFACE, usual=f"{BENCH}; of a rig none")
+    surface: str | None = option_field(None, SURFACE, usual=f"{BENCH}; for a rig none")
 
 
 class GridPart(AxesPart):
     """Axes of a grid, those of shafts and imposed currents among them."""
 
     motor_currents_A: Several[MotorCurrent] | None = option_field(
-        None, "Currents of each motor (A) of a rig on whose motors they are imposed"
+        None, "Currents per motor (A), for rigs with imposed motor current"
     )
     load_torques_Nm: Several[LoadTorque] | None = option_field(
-        None, "Torques of a brake on the output of each drive (N·m), of a load on a shaft", usual="none"
+        None, "Brake torques at the output of each drive (N·m), for loads on a shaft", usual="none"
     )
 
 
@@ -353,16 +360,17 @@ class InferencePart(Part):
     """Prior knowledge and data of a fit."""
 
     prior: Names = option_field(
-        (), "A prior in SI units, repeatable: 6T2A.ground.friction.static=0.45±0.05", verbatim=True
+        (), "A prior in SI units; may be repeated: 6T2A.ground.friction.static=0.45±0.05", verbatim=True
     )
     noise: str = option_field(
         "",
-        "Sd of current, motor_speed, speed in % or A, rpm, mm/s: current=2%,speed=5mm/s",
-        usual="the file's columns; else calibrate estimates; loop estimates from series, as of slopes (0.7 and 1.4 "
-        "times too), and without such assumes 2, 0.5, 1 %, halved and doubled",
+        "Standard deviations of current, motor_speed and speed in % or in A, rpm, mm/s: current=2%,speed=5mm/s",
+        usual="from the file's columns; else calibrate estimates them; loop estimates them from series of rows "
+        "(and tries 0.7 and 1.4 times), or without series assumes 2, 0.5 and 1 % (and tries half and "
+        "double)",
     )
     rows: Annotated[int, Field(ge=100, le=1_000_000)] = option_field(
-        ROWS, "Largest number of rows used; more are thinned evenly, those of a log in time, others over conditions"
+        ROWS, "Largest number of rows used; larger data are thinned evenly, logs in time, tables over conditions"
     )
     seed: Seed = option_field(0, "Random seed")
 
@@ -371,7 +379,7 @@ class MembersPart(Part):
     """Folder in which a population keeps its runs. It changes no number."""
 
     members: Path | None = option_field(
-        None, "File for the population's runs, from which the same command resumes", solver=True
+        None, "File for the runs of the population; the same command resumes from it", solver=True
     )
 
 
@@ -383,9 +391,9 @@ class LoopBeside(FittedRuns):
     """Options of the loop that change no number."""
 
     within: Annotated[str, Field(pattern=r"^\d+(\.\d+)?(s|min|h)?$")] = option_field(
-        "10min", "Wall-clock time after which it ends with the best that there is, as 90s, 5min or 1h"
+        "10min", "Wall-clock limit, such as 90s, 5min or 1h; then the best result so far is reported"
     )
-    verbose: bool = option_field(False, "Print every table and remark of the page, not five lines")
+    verbose: bool = option_field(False, "Print every table and remark of the page instead of five lines")
 
     @property
     def seconds(self) -> float:
@@ -395,19 +403,21 @@ class LoopBeside(FittedRuns):
 
 
 class TurnPart(Part):
-    """Different drive of the two sides of one run. None: the same."""
+    """Different commands for the two sides of one run. None: the same command."""
 
     left_V: Voltage | None = option_field(None, "Voltage of the left motor (V); with --right the robot can turn")
     right_V: Voltage | None = option_field(None, "Voltage of the right motor (V)")
-    duty_left: Duty | None = option_field(None, "Share of the supply's voltage at the left motor, in place of --left")
-    duty_right: Duty | None = option_field(None, "Share of the supply's voltage at the right motor")
+    duty_left: Duty | None = option_field(
+        None, "Duty of the left motor (share of the supply voltage), instead of --left"
+    )
+    duty_right: Duty | None = option_field(None, "Duty of the right motor (share of the supply voltage)")
     speed_m_s: Annotated[float, between(-100, 100)] | None = option_field(
-        None, "Speed of the settled turn (m/s), with --yaw-rate, from which --left and --right are computed"
+        None, "Speed of the settled turn (m/s); with --yaw-rate it determines --left and --right"
     )
     yaw_rate_rad_s: Annotated[float, between(-100, 100)] | None = option_field(
         None, "Yaw rate of the settled turn (rad/s), positive to the left; with --speed"
     )
-    heading_deg: Heading | None = option_field(None, "Heading at the start, from uphill, positive to the left")
+    heading_deg: Heading | None = option_field(None, "Heading at the start, relative to uphill, positive to the left")
 
     @property
     def demands(self) -> bool:
@@ -420,10 +430,10 @@ class TurnPart(Part):
         return any(getattr(self, name) is not None for name in TurnPart.model_fields)
 
     def refuse_volts(self, battery: bool) -> None:
-        """Refuse volts of either side where a battery decides them."""
+        """Reject side voltages on battery power, which sets the voltage."""
         if battery and self.left_V is not None:
             raise PydanticCustomError(
-                "idle", "`left_V` acts only without `battery`; state `duty_left` and `duty_right`"
+                "idle", "`left_V` cannot be combined with `battery`; give `duty_left` and `duty_right`"
             )
 
     @model_validator(mode="after")
@@ -432,12 +442,12 @@ class TurnPart(Part):
         for left, right in pairs:
             if (getattr(self, left) is None) != (getattr(self, right) is None):
                 one, other = (left, right) if getattr(self, right) is None else (right, left)
-                raise PydanticCustomError("idle", f"`{one}` acts only with `{other}`; state both")
+                raise PydanticCustomError("idle", f"`{one}` needs `{other}`; give both")
         stated = [one for one, _ in pairs if getattr(self, one) is not None]
         if len(stated) > 1:
             raise PydanticCustomError(
                 "idle",
-                f"`{stated[0]}` acts only without `{stated[1]}`; state voltages, duties, or speed and yaw rate",
+                f"`{stated[0]}` cannot be combined with `{stated[1]}`; give voltages, duties, or speed and yaw rate",
             )
         return self
 
@@ -446,7 +456,7 @@ class PosteriorPart(Part):
     """Uncertainty of results from the posterior of a calibrated robot."""
 
     posterior: Annotated[int, Field(ge=10, le=100_000)] | None = option_field(
-        None, "Give results with ±, from this number of robots drawn from the posterior.nc of the calibrated --robot"
+        None, "Report results with ±, from this many robots drawn from the posterior.nc of the calibrated --robot"
     )
 
 
@@ -454,7 +464,7 @@ class OutputPart(Part):
     """Files written in addition to the numbers."""
 
     report: bool = option_field(True, "Write report.html")
-    table: Literal["csv", "parquet"] = option_field("csv", "Format of the tables: CSV, or also Parquet")
+    table: Literal["csv", "parquet"] = option_field("csv", "Format of the tables: CSV only, or also Parquet")
 
 
 class ProfilePart(FidelityPart):
@@ -482,10 +492,14 @@ class ProfilePart(FidelityPart):
             return self
         if self.model != PROFILED:
             raise PydanticCustomError(
-                "idle", f"`profile` acts only with `model` {PROFILED}, which follows one; got `model` {self.model}"
+                "idle",
+                f"`profile` has an effect only with `model` {PROFILED}, which simulates a profile; got "
+                f"`model` {self.model}",
             )
         if self.duration_s is not None:
-            raise PydanticCustomError("idle", "`duration_s` acts only without `profile`, which sets the duration")
+            raise PydanticCustomError(
+                "idle", "`duration_s` cannot be combined with `profile`, which sets the duration"
+            )
         return self
 
     @property
@@ -503,10 +517,10 @@ class Simulate(RobotPart, DataPart, ProfilePart, SupplyPart, TurnPart, Posterior
             beside = [name for name in ("profile", "posterior") if getattr(self, name) is not None]
             if beside:
                 stated = next(name for name in TurnPart.model_fields if getattr(self, name) is not None)
-                raise PydanticCustomError("idle", f"`{stated}` acts only without `{beside[0]}`")
+                raise PydanticCustomError("idle", f"`{stated}` cannot be combined with `{beside[0]}`")
             self.refuse_volts(self.battery)
         if self.profile is not None and self.posterior is not None:
-            raise PydanticCustomError("idle", "`posterior` acts only without `profile`")
+            raise PydanticCustomError("idle", "`posterior` cannot be combined with `profile`")
         return self
 
     @property
@@ -538,7 +552,9 @@ class Render(RobotPart, FidelityPart, SupplyPart, TurnPart):
     @model_validator(mode="after")
     def _driven(self) -> Self:
         if self.demands:
-            raise PydanticCustomError("idle", "`speed_m_s` acts only with simulate; state `left_V` and `right_V`")
+            raise PydanticCustomError(
+                "idle", "`speed_m_s` has an effect only with simulate; give `left_V` and `right_V`"
+            )
         self.refuse_volts(self.battery)
         return self
 
@@ -576,16 +592,20 @@ class Climb(RobotPart, SupplyPart, OutputPart):
     stairs: str | None = option_field(None, "RISExTREADxCOUNT in mm, such as 170x290x3")
     gap_mm: Height | None = option_field(None, "Width of a trench")
     terrain: Path | None = option_field(
-        None, "CSV of a polyline with columns x_m and z_m, or x_mm and z_mm", format="path"
+        None, "CSV of a ground profile (polyline) with columns x_m and z_m, or x_mm and z_mm", format="path"
     )
-    nose_mm: Annotated[float, between(0, 500)] = option_field(0.0, "Radius of the noses of step or stairs")
+    nose_mm: Annotated[float, between(0, 500)] = option_field(0.0, "Radius of the edges of a step or stairs")
     levers_front_deg: Angle | None = option_field(
-        None, "Front levers, 0 along the wheelbase outward, positive up, 180 folded", usual="as the robot states them"
+        None,
+        "Angle of the front levers (0: extended along the wheelbase, positive: up, 180: folded)",
+        usual="from the robot's file",
     )
-    levers_rear_deg: Angle | None = option_field(None, "Rear levers, the same", usual="as the robot states them")
+    levers_rear_deg: Angle | None = option_field(
+        None, "Angle of the rear levers, with the same convention", usual="from the robot's file"
+    )
     sequence: Path | None = option_field(
-        None, "CSV of lever angles: x_mm (middle of the robot from the obstacle) or time_s, front_deg, rear_deg; or "
-        "voltages of their motors, front_V, rear_V, beginning at the stated angles",
+        None, "CSV of lever angles: x_mm (middle of the robot from the obstacle) or time_s, front_deg, rear_deg; "
+              "or voltages of the lever motors, front_V, rear_V, starting from the given angles",
         format="path",
     )  # fmt: skip
     levers_voltage_V: Annotated[float, positive(1e6)] | None = option_field(
@@ -597,12 +617,14 @@ class Climb(RobotPart, SupplyPart, OutputPart):
         BENCH, "Surface of Table 5, which scales the adhesion"
     )
     find: Literal["step", "stairs", "gap"] | None = option_field(
-        None, "Look for the largest that it gets over, in place of one run; of stairs the rise at --stairs' tread"
+        None,
+        "Search for the largest obstacle that the robot gets over, instead of one run; for stairs the rise "
+        "at the tread of --stairs",
     )
     derivatives: Names = option_field(
         (),
-        "Derivatives of margins, time, energy and currents by these, comma-separated: parameters, adhesion, payload, "
-        "voltage, levers_front_deg, levers_rear_deg, obstacle_mm",
+        "Derivatives of margins, time, energy and currents with respect to these, comma-separated: parameters, "
+        "adhesion, payload, voltage, levers_front_deg, levers_rear_deg, obstacle_mm",
     )
     film: bool = option_field(False, "Write climb.gif")
     duration_s: Annotated[float, positive(600)] = option_field(20.0, "Longest run")
@@ -612,29 +634,29 @@ class Climb(RobotPart, SupplyPart, OutputPart):
     def _one_obstacle(self) -> Self:
         given = [name for name in ("step_mm", "stairs", "gap_mm", "terrain") if getattr(self, name) is not None]
         if len(given) > 1:
-            raise PydanticCustomError("idle", f"`{given[0]}` and `{given[1]}` are stated both; state one obstacle")
+            raise PydanticCustomError("idle", f"`{given[0]}` and `{given[1]}` are both given; keep one obstacle")
         if not given and self.find is None:
             raise PydanticCustomError(
-                "idle", "no obstacle is stated; state `step_mm`, `stairs`, `gap_mm` or `terrain`, or `find`"
+                "idle", "no obstacle is given; give `step_mm`, `stairs`, `gap_mm` or `terrain`, or `find`"
             )
         if self.find == "stairs" and self.stairs is None:
             raise PydanticCustomError("idle", "`find` stairs needs `stairs`, which sets tread and count")
         if self.find is not None and given and not given[0].startswith(self.find):
-            raise PydanticCustomError("idle", f"`find` {self.find} acts without `{given[0]}`")
+            raise PydanticCustomError("idle", f"`find` {self.find} cannot be combined with `{given[0]}`")
         if self.nose_mm and (self.gap_mm is not None or self.terrain is not None or self.find == "gap"):
-            raise PydanticCustomError("idle", "`nose_mm` acts only with steps and stairs")
+            raise PydanticCustomError("idle", "`nose_mm` has an effect only with steps and stairs")
         if self.battery and self.supply_voltage_V is not None:
-            raise PydanticCustomError("idle", "`supply_voltage_V` acts only without `battery`")
+            raise PydanticCustomError("idle", "`supply_voltage_V` cannot be combined with `battery`")
         for name in ("film", "derivatives"):
             if getattr(self, name) and self.find is not None:
-                raise PydanticCustomError("idle", f"`{name}` acts only without `find`")
+                raise PydanticCustomError("idle", f"`{name}` cannot be combined with `find`")
         return self
 
 
 class Reproduce(RobotPart, ModelPart):
     """The paper's figures and tables."""
 
-    model: str = option_field(fidelities.NAMES[0], "steady, or track for Figs. 23-27 too")
+    model: str = option_field(fidelities.NAMES[0], "steady; or track, which adds Figs. 23-27")
 
 
 class FeedforwardPart(Part):
@@ -644,16 +666,14 @@ class FeedforwardPart(Part):
         None, "Fit kS, kV, kA (kG) of this mechanism instead, and feedback gains (docs/howto/wpilib.md)", usual="no"
     )
     unit: Literal["rotation", "rad", "degree", "m"] | None = option_field(
-        None, "Unit of position that kV and kA are for, with --feedforward", usual="rotation; m of a travel"
+        None, "Unit of position for kV and kA, with --feedforward", usual="rotation; for a travel m"
     )
-    position_error: Annotated[float, positive(1e6)] = option_field(
-        1.0, "Tolerance of the position's regulator [unit]"
-    )
-    velocity_error: Annotated[float, positive(1e6)] = option_field(1.5, "Tolerance of velocity [unit/s]")
+    position_error: Annotated[float, positive(1e6)] = option_field(1.0, "Tolerance of the position regulator [unit]")
+    velocity_error: Annotated[float, positive(1e6)] = option_field(1.5, "Tolerance of the velocity [unit/s]")
     effort_V: Annotated[float, positive(1e4)] = option_field(7.0, "Voltage that the gains may use (V)")
     period_s: Annotated[float, positive(10)] = option_field(0.02, "Period of the controller (s)")
     measurement_delay_s: Annotated[float, between(0, 10)] | None = option_field(
-        None, "Delay of its measurement (s)", usual="what the log shows"
+        None, "Delay of the measurement (s)", usual="from the log"
     )
 
 
@@ -663,19 +683,19 @@ class Calibrate(RobotPart, DataPart, InferencePart, FeedforwardPart, OutputPart)
     model: Annotated[str, AfterValidator(_fidelity)] | None = option_field(
         None, f"Fidelity: {', '.join(fidelities.NAMES)}", usual="drive for a log over time, else steady"
     )
-    free: Names = option_field((), "Parameters to free, comma-separated, or a group such as motor.*")
-    fix: Names = option_field((), "Parameters to hold, comma-separated")
+    free: Names = option_field((), "Parameters to fit, comma-separated, or a group such as motor.*")
+    fix: Names = option_field((), "Parameters to keep fixed, comma-separated")
     starts: Annotated[int, Field(ge=1, le=100_000)] | None = option_field(
         None, "Searches", usual="64; histories 8; settled turns 4; rows with drive or track 1"
     )
     population: Annotated[int, Field(ge=0, le=1_000_000)] | None = option_field(
         None,
         "Members of each generation of the gradient-free search before a fit with drive or track",
-        usual="256 where the running gear is free, else 0",
+        usual="256 if the running gear is fitted, else 0",
         solver=True,
     )
     generations: Annotated[int, Field(ge=1, le=10_000)] | None = option_field(
-        None, "Of the population, at most", usual="30", solver=True
+        None, "Largest number of generations of the population", usual="30", solver=True
     )
     solver: Annotated[str, AfterValidator(_solver)] | None = option_field(
         None,
@@ -684,18 +704,20 @@ class Calibrate(RobotPart, DataPart, InferencePart, FeedforwardPart, OutputPart)
         usual="our Levenberg-Marquardt",
         solver=True,
     )
-    profiles: bool | None = option_field(None, "Profile likelihood of each", usual="steady only, but of turns")
-    hold_out: bool | None = option_field(None, "Fit again without each block", usual="steady only")
+    profiles: bool | None = option_field(
+        None, "Compute the profile likelihood of each parameter", usual="for steady, except turns"
+    )
+    hold_out: bool | None = option_field(None, "Refit without each block in turn", usual="steady only")
 
 
 class Settle(RobotPart, DataPart, OutputPart):
     """Options for extracting settled runs from a log over time."""
 
     shortest_s: Annotated[float, positive(3600)] | None = option_field(
-        None, "Shortest stretch that is taken for settled", usual="0.3, and at least 20 samples"
+        None, "Shortest segment that counts as settled", usual="0.3, and at least 20 samples"
     )
     drift: Annotated[float, Field(gt=0, le=0.5)] = option_field(
-        0.02, "Largest change of a channel's mean within a stretch, as a share of the mean"
+        0.02, "Largest change of a channel's mean within a segment, as a fraction of the mean"
     )
 
 
@@ -704,7 +726,7 @@ class Export(RobotPart, OutputPart):
 
     robot: str = option_field(
         "nominal",
-        "nominal, sm1, sm2, or a robot's TOML file",
+        "nominal, sm1, sm2, or the TOML file of a robot",
         metavar="[ROBOT.toml]",
         format="path",
         argument=True,
@@ -713,11 +735,13 @@ class Export(RobotPart, OutputPart):
         "mujoco", "Format (docs/howto/export.md)"
     )
     data: str | None = option_field(
-        None, "A table of runs or a log, with which the exported drive is compared", usual="a grid without readings"
+        None, "Table of runs or log with which the exported drive is compared", usual="a grid without readings"
     )
-    configuration: str | None = option_field(None, "Which of the robot's configurations", usual="its first")
+    configuration: str | None = option_field(None, "Configuration of the robot", usual="its first")
     joint: str = option_field("drive", "Name of the joint in the simulator's model, for mujoco")
-    draws: Annotated[int, Field(ge=1, le=100_000)] = option_field(1000, "Draws of the posterior, for randomization")
+    draws: Annotated[int, Field(ge=1, le=100_000)] = option_field(
+        1000, "Samples from the posterior, for randomization"
+    )
     seed: Seed = option_field(0, "Of the draws")
 
 
@@ -725,7 +749,7 @@ class Loop(RobotPart, DataPart, InferencePart, OutputPart):
     """Options of the closed loop."""
 
     replicates: Annotated[int, Field(ge=250, le=100_000)] = option_field(
-        500, "Tables of the bootstrap; of time histories at least 333 are made", solver=True
+        500, "Number of bootstrap tables; time histories use at least 333", solver=True
     )
     prefer: Literal["fit", "held-out"] = option_field(
         "fit",
@@ -733,19 +757,31 @@ class Loop(RobotPart, DataPart, InferencePart, OutputPart):
         "blocks left out of the fit",
     )
     forbid: Names = option_field(
-        (), "An experiment that cannot be done, repeatable: stall, lifted, 'one motor', or a configuration"
+        (), "Experiment that you cannot do; may be repeated: stall, lifted, 'one motor', or a configuration"
     )
     resolve: bool = option_field(
         False,
-        "Ask the track model whether a running gear within its priors leaves what remains in slip, track or ground; "
-        "tens of minutes on two cores",
+        "Test with the track model whether a different running gear within its priors explains the remaining "
+        "error in slip, track or ground; takes tens of minutes on two cores",
     )
     population: Annotated[int, Field(ge=4, le=1_000_000)] | None = option_field(
         None, "Members of each generation of the search for --resolve", usual="128", solver=True
     )
     generations: Annotated[int, Field(ge=1, le=10_000)] | None = option_field(
-        None, "Of --resolve, at most", usual="20", solver=True
+        None, "Largest number of generations for --resolve", usual="20", solver=True
     )
+    model: Path | None = option_field(
+        None, "A MuJoCo model of several joints: a loop for each, with the model's torque as its load"
+    )
+    joints: Names = option_field(
+        (), "Joints of --model, comma-separated, or all that it drives; columns of the log are JOINT.output_angle_deg"
+    )
+
+    @model_validator(mode="after")
+    def _joints_of_a_model(self) -> Self:
+        if (self.model is None) == bool(self.joints):
+            raise PydanticCustomError("idle", "`model` and `joints` act only together; state both")
+        return self
 
 
 class RequirementsPart(Part):
@@ -762,7 +798,7 @@ class RequirementsPart(Part):
 
 
 class Check(RequirementsPart, RobotPart, OutputPart):
-    """A robot held against requirements."""
+    """A check of a robot against requirements."""
 
     changes: bool = option_field(True, "Search for changes that meet the missed requirements")
 
@@ -771,8 +807,8 @@ class Size(RequirementsPart, RobotPart, OutputPart):
     """A search for a robot that meets requirements."""
 
     objective: str = option_field("mass", "Quantity to minimise: mass (kg), energy (Wh/m), cost (EUR)")
-    pareto: Names = option_field((), "Two objectives, comma-separated, for a front of both instead")
-    motors: Names = option_field((), "Motors to choose from, comma-separated", usual="all of the sheets")
+    pareto: Names = option_field((), "Two objectives, comma-separated, for a Pareto front instead")
+    motors: Names = option_field((), "Motors to choose from, comma-separated", usual="all in the catalogue")
     starts: Annotated[int, Field(ge=1, le=100_000)] = option_field(256, "Searches in one batch")
     seed: Seed = option_field(0, "Of the starts")
 
@@ -789,26 +825,27 @@ class Sensitivity(RobotPart, DataPart, FidelityPart, SupplyPart, AxesPart, Outpu
         (), "Uncertain parameters, comma-separated, or a group such as motor.*", usual="all that have a prior"
     )
     vary: Names = option_field(
-        (), "Treat an operating condition as uncertain too. May be repeated: voltage=22:26, slope_deg=0:5"
+        (), "Also treat an operating condition as uncertain; may be repeated: voltage=22:26, slope_deg=0:5"
     )
     outputs: Names = option_field(
         (),
-        "Outputs, comma-separated: those of a run, steepest_slope, highest_step, best_step, start for its three",
+        "Outputs, comma-separated: outputs of a run, steepest_slope, highest_step, best_step, or start for the "
+        "three outputs of a start",
         usual="current, speeds, slip, power, efficiency, steepest slope",
     )
     evaluations: Annotated[int, Field(ge=1, le=1_000_000_000)] | None = option_field(
-        None, "Model evaluations, at least, in all", usual="1000000; runs over time 100000"
+        None, "Smallest total number of model evaluations", usual="1000000; for runs over time 100000"
     )
     seed: Seed = option_field(0, "Of the sample")
-    posterior: bool = option_field(False, "Take the inputs from the posterior.nc of the calibrated --robot")
+    posterior: bool = option_field(False, "Use the posterior.nc of the calibrated --robot as inputs")
     candidates: str = option_field(
         "",
-        "CSV of runs that could be made next",
-        usual="Table 8; of a rig the operating points",
+        "CSV of candidate runs",
+        usual="Table 8; for a rig the operating points",
         format="path",
     )
     runs: Annotated[int, Field(ge=1, le=100)] = option_field(5, "Number of runs to propose")
-    noise: str = option_field("", "Sd of their readings", usual="current=2%,motor_speed=0.5%,speed=1%")
+    noise: str = option_field("", "Noise (sd) of their readings", usual="current=2%,motor_speed=0.5%,speed=1%")
 
     @model_validator(mode="before")
     @classmethod
@@ -832,7 +869,8 @@ def read_toml(file: Path) -> Json:
 
 
 def fields_with(kind: type[Part], fact: str) -> list[str]:
-    """Names of the fields whose `option_field` states a fact: `solver`, the keys of `[solver]` of a file, for one."""
+    """Names of the fields whose `option_field` has a property, such as `solver` (the keys of `[solver]` in a
+    file)."""
     return [name for name, facts in schema_facts(kind).items() if facts.get(fact)]
 
 
@@ -848,7 +886,7 @@ def _keys(kind: type[Part], file: Path, beside: type[Part] | None) -> Json:
             allowed = allowed_words(key, own_fields + others) if own_fields + others else "this command has none"
             raise BadConfiguration(f"{file.name}, solver.{key}: no such key; {allowed}")
         if key in values:
-            raise BadConfiguration(f"{file.name}, solver.{key}: the file states {key} too; expected it once")
+            raise BadConfiguration(f"{file.name}, solver.{key}: {key} is in the file twice; give it once")
     return {**values, **{key: value for key, value in table.items() if key in own_fields}}
 
 
@@ -859,7 +897,7 @@ def resolve_beside(kind: type[C], file: Path | None, options: Json, trust: bool 
         trust: as of `resolve_configuration`.
 
     Raises:
-        BadConfiguration: as `resolve_configuration`.
+        BadConfiguration: for the same reasons as `resolve_configuration`.
     """
     table = {} if file is None else read_toml(file).get("solver", {})
     stated = {key: table[key] for key in fields_with(kind, "solver") if key in table}
@@ -891,8 +929,8 @@ def _checked(kind: type[C], file: Path | None, values: Json, options: Json, trus
         if file is not None and values.get(name) and name not in given and not trust:
             option = options_of_fields(kind)[name]
             raise BadConfiguration(
-                f"{file.name}, {name}: would run code, which a file cannot ask for; state {option} on the command "
-                "line, or --trust if you trust who wrote the file"
+                f"{file.name}, {name}: would run code, which a file may not request; give {option} on the command "
+                "line, or --trust if you trust the author of the file"
             )
     if "set" in given:
         stated = values.get("set", {})
@@ -908,7 +946,7 @@ def _sentence(kind: type[Part], error: ValidationError, file: Path | None, given
     first, options = error.errors()[0], options_of_fields(kind)
 
     def called(name: str) -> str:
-        """A field as whoever stated it did, or would: by its option, or its key in the file."""
+        """Name of a field for messages: its option, or its key in the file that contains it."""
         return options.get(name, name) if file is None or name in given else name
 
     if first["type"] == "idle":  # whose message has fields between backticks

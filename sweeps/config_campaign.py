@@ -59,7 +59,7 @@ class Obstacle(Part):
     def _of_its_kind(self) -> Self:
         for name, kinds in {"tread_mm": ("stairs",), "count": ("stairs",), "nose_mm": ("step", "stairs")}.items():
             if getattr(self, name) != type(self).model_fields[name].default and self.kind not in kinds:
-                raise PydanticCustomError("idle", f"`{name}` acts only with `kind` {' or '.join(kinds)}")
+                raise PydanticCustomError("idle", f"`{name}` has an effect only with `kind` {' or '.join(kinds)}")
         return self
 
 
@@ -68,13 +68,13 @@ class Campaign(RobotPart, ProfilePart, BatchPart, OutputPart):
 
     Attributes:
         conditions: constant conditions, by name.
-        axes: of the grid, by name: a list, `first:last:step`, or a table with start, stop, number and scale.
+        axes: axes of the grid, by name: a list, `first:last:step`, or a table with start, stop, number and scale.
         samples: a sampled design: design, number, seed, over (distributions by name), posterior.
         outputs: names of `mmrjax.fidelities.outputs.output_table()`, of columns of the fidelity, or flags. Empty: the
             channels. Over a profile columns of `missions.mission_batch.OUTPUTS`, or flags. Empty: its `USUAL`.
         storage: type in which outputs are stored.
-        compression: of the store's chunks.
-        obstacle: that every point climbs, in place of a run of the fidelity.
+        compression: compression of the store's chunks.
+        obstacle: obstacle that every point climbs, in place of a run of the fidelity.
     """
 
     conditions: Json = Field(default_factory=dict)
@@ -92,16 +92,16 @@ class StoreOptions(FolderPart):
     plan: Path | None = option_field(
         None, "TOML file with [axes] or [samples] (docs/reference/plans.md)", argument=True, metavar="[CONFIG.toml]"
     )
-    zarr: bool = option_field(False, "Write a Zarr store, even for a small grid")
+    zarr: bool = option_field(False, "Write a Zarr store even for a small grid")
     outputs: Names = option_field(
-        (), "Comma-separated, what a store holds of each point", usual="what its instruments show"
+        (), "Outputs to store for each point, comma-separated", usual="the channels of its instruments"
     )
-    dry_run: bool = option_field(False, "Print points, chunks, bytes and expected time without writing files")
+    dry_run: bool = option_field(False, "Print points, chunks, bytes and expected time, and write nothing")
     export: tuple[Literal["csv", "parquet"], ...] = option_field(
-        (), "Write the store as csv or parquet too, repeatable"
+        (), "Also write the store as csv or parquet; may be repeated"
     )
     shard: str | None = option_field(
-        None, "Simulate the i-th of n shares, as 3/8: a process of a job array each", solver=True
+        None, "Simulate the i-th of n shares, such as 3/8, in one process of a job array", solver=True
     )
     scheduler: str | None = option_field(
         None,
@@ -137,7 +137,7 @@ class StoreOptions(FolderPart):
 
     @property
     def of_store(self) -> bool:
-        """True if only a store has what is stated."""
+        """True if an option is given that only a store supports."""
         return any((self.zarr, self.outputs, self.dry_run, self.export, self.shard, self.scheduler))
 
 
@@ -147,16 +147,15 @@ def resolve_campaign(file: Path | None, options: Json, trust: bool = False) -> C
     A grid is one of a store's once the robot is known (`of_grid`).
 
     Raises:
-        BadConfiguration: as `resolve`. An option of the grid with a file that has its own axes.
+        BadConfiguration: for the same reasons as `resolve`. An option of the grid with a file that has its own axes.
     """
     if file is not None and not set(KEYS).isdisjoint(read_toml(file)):
         assert file is not None
         for name in GRID:
             if options.get(name) is not None:
                 raise BadConfiguration(
-                    f"{options_of_fields(Sweep)[name]}: acts only with a grid of options; expected it in "
-                    f"{file.name}, among its "
-                    "axes or conditions"
+                    f"{options_of_fields(Sweep)[name]}: has an effect only with a grid given by options; put it "
+                    f"into the axes or conditions of {file.name}"
                 )
         return resolve_configuration(
             Campaign, file, {k: v for k, v in options.items() if k not in GRID}, StoreOptions, trust

@@ -52,7 +52,7 @@ _out = _Outlet(highlight=False, soft_wrap=True, markup=False, width=_WIDTH)
 
 
 class _Messages(io.TextIOBase):
-    """Standard error. Messages that it does not take, for instance because its disk is full, are lost."""
+    """Standard error. Messages that cannot be written, for instance because the disk is full, are lost."""
 
     def write(self, text: str) -> int:
         with contextlib.suppress(OSError):
@@ -87,20 +87,20 @@ def print_json(content: Json) -> None:
 
 
 def print_message(text: str) -> None:
-    """Print a line to stderr, in place of a progress line."""
+    """Print a line to stderr. It replaces a progress line."""
     rewrite_line("")
     _err.print(wrap_for_terminal(text) if MESSAGES.isatty() else text)
 
 
 def rewrite_line(text: str) -> None:
-    """Write the last line of a terminal anew. A file, which keeps every line, gets none."""
+    """Rewrite the last line of a terminal. Nothing is written to a file."""
     if MESSAGES.isatty():
         MESSAGES.write(f"\r\x1b[K{printable(text)[: COLUMNS - 1]}")
         MESSAGES.flush()
 
 
 def wrap_for_terminal(text: str) -> str:
-    """Text for a terminal, in lines of at most `COLUMNS`, what is listed indented. A file gets it as it is."""
+    """Text wrapped for a terminal at `COLUMNS`, with indented lists. For a file it is unchanged."""
     return "\n".join(
         textwrap.fill(
             line, COLUMNS, subsequent_indent="  " * line.startswith("- "), break_long_words=False,
@@ -112,7 +112,7 @@ def wrap_for_terminal(text: str) -> str:
 
 @contextmanager
 def report_working(name: str) -> Iterator[None]:
-    """Say that a command works where it has not ended soon: what it imports and compiles can take longer."""
+    """Print that a command is working if it takes longer than usual, because imports and compilation take time."""
     soon = threading.Timer(FIRST, print_message, [f"{name}: working"])
     soon.daemon = True
     soon.start()
@@ -188,7 +188,7 @@ class RateColumn(ProgressColumn):
     """Column with the rate per second."""
 
     def render(self, task: Task) -> Text:
-        """Of the latest minute, and of the whole at the end."""
+        """Rate over the latest minute, or over the whole run at its end."""
         speed = task.finished_speed or task.speed
         return Text("" if speed is None else f"{speed:,.0f}/s")
 

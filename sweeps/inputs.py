@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from pathlib import Path
 
 from calibration.data import Json, Names, effect_file, posterior_file, robot_file, stated, surface_labels
@@ -45,14 +45,17 @@ def load_robot(config: RobotPart) -> RobotFile:
         type(config) is RobotPart or isinstance(config, Calibrate | Compare | Export | Loop)
     ):
         raise BadConfiguration(
-            f"--robot {file.name}: its controller follows a goal over time; expected calibrate, compare, loop or rig "
-            "check with a log, export, or mmrjax.simulate in Python"
+            f"--robot {file.name}: its controller follows a goal over time, which this command does not simulate; "
+            "use calibrate, compare, loop or rig check with a log, export, or mmrjax.simulate in Python"
         )
     unlike = () if getattr(config, "turns", False) else _unlike(file.name, robot)
     examples = list_some(stated.example_numbers(file.text))
     if examples and isinstance(config, Calibrate | Loop):  # `rig check` lists their lines
         wide = f"± {100 * stated.EXAMPLE_SHARE:g} %"
-        notes.append(f"{file.name}: still the template's, so the fit takes {wide} where they have ±: {examples}")
+        notes.append(
+            f"{file.name}: still the example numbers of the template, so the fit uses {wide} for those "
+            f"with ±: {examples}"
+        )
     for note in (*notes, *unlike):
         print_message(note)
     resolves = isinstance(config, FidelityPart) and fidelities.fidelity_facts(config.model).resolves
@@ -64,9 +67,7 @@ def load_robot(config: RobotPart) -> RobotFile:
     if (
         resolves and runs and not capabilities.states_parameter(robot, "running_gear.")
     ):  # else the model itself is refused
-        print_message(
-            "the robot's file states no running_gear: wheelbase, belt and masses within are those of an example"
-        )
+        print_message("the robot's file has no running_gear: wheelbase, belt and internal masses are example values")
     return dataclasses.replace(file, robot=robot, remarks=unlike)
 
 
@@ -75,7 +76,7 @@ def _unlike(name: str, robot: Robot) -> Names:
     if not robot.unlike or not robot.has_ground:
         return ()
     if why := turn_error(robot, robot.configurations):
-        return (turn_words.unlike_sides_note(name, robot.unlike, f"how it would turn is not known: {why}"),)
+        return (turn_words.unlike_sides_note(name, robot.unlike, f"turning cannot be computed: {why}"),)
     value = imposed.imposed_example(robot)
     turn_rows = turns_under_equal_commands(robot, value * RPM if robot.rig.imposed == "motor_speed" else value)
     turns = turn_words.by_itself(robot, turn_rows, value)
@@ -91,7 +92,8 @@ def beside_robot(file: RobotFile) -> Posterior:
     """
     if Path(file.source).suffix != ".toml":
         raise BadConfiguration(
-            f"--posterior: {file.source} has none; expected --robot FOLDER/robot.toml of calibrate or loop"
+            f"--posterior: {file.source} has no posterior; expected --robot FOLDER/robot.toml, written by "
+            "calibrate or loop"
         )
     path = Path(file.source).with_name(posterior_file.FILE)
     posterior = posterior_file.read_posterior(path)
@@ -100,13 +102,13 @@ def beside_robot(file: RobotFile) -> Posterior:
 
 
 def fit_of(file: RobotFile, runs: records.Runs) -> str:
-    """`these` if the robot's folder records a fit to these rows, `others` if one to others, "" if none."""
+    """`these` if the robot's folder records a fit to these rows, `others` for a fit to other rows, "" for no fit."""
     fitted = store.rows_of_fit(Path(file.source))
     return "" if not fitted else "these" if runs.digest in fitted else "others"
 
 
 def check_configurations(robot: Robot, names: Names, where: str) -> None:
-    """Refuse a configuration that the robot does not have.
+    """Reject a configuration that the robot does not have.
 
     Raises:
         BadConfiguration: says `where`, and which the robot has.
@@ -120,10 +122,10 @@ def check_configurations(robot: Robot, names: Names, where: str) -> None:
 
 
 def check_surface(robot: Robot, names: Collection[str], surface: str | None, where: str) -> None:
-    """Refuse a surface whose adhesion neither Table 5 nor a configuration of the robot states.
+    """Reject a surface whose adhesion is neither in Table 5 nor in a configuration of the robot.
 
     Args:
-        names: of the configurations that are simulated.
+        names: names of the configurations that are simulated.
 
     Raises:
         BadConfiguration: the message has `where` and the known surfaces.
@@ -133,7 +135,7 @@ def check_surface(robot: Robot, names: Collection[str], surface: str | None, whe
         surface_labels.configuration_on_surface(name, str(surface)) in robot.configurations for name in names
     ):
         raise BadConfiguration(
-            f"{where}: got {surface}, whose friction is not known; {allowed_words(str(surface), SURFACES)}"
+            f"{where}: got {surface}, for which no friction is known; {allowed_words(str(surface), SURFACES)}"
         )
 
 
@@ -142,7 +144,7 @@ def read_runs(
     robot: Robot,
     *,
     measured: bool,
-    columns: str | None = None,
+    columns: str | Mapping[str, str] | None = None,
     series: bool = False,
     battery: bool = False,
     of_turns: bool = False,
@@ -154,7 +156,7 @@ def read_runs(
         robot: has the configurations of the table.
         measured: whether readings are needed.
         series: whether time histories are taken.
-        columns: a preset or its file, see `records.read_runs`.
+        columns: a preset, its file or names by this program's, see `records.read_runs`.
         battery: whether the runs are on the battery, see `records.read_runs`.
         of_turns: whether a table of turns has each channel of both sides, and of the yaw, for which it has a column.
 
@@ -176,7 +178,7 @@ def read_runs(
 
 
 def given_runs(robot: Robot, beside: GivenRuns, config: Simulate, elsewhere: Collection[str] = ()) -> records.Runs:
-    """Runs of a file, or one of options. `elsewhere`: columns that a profile states."""
+    """Runs from a file, or one run from options. `elsewhere`: columns that a profile states."""
     if beside.runs is None:
         return one_run(robot, beside.stated, config.battery, elsewhere)
     return read_runs(str(beside.runs), robot, columns=config.columns, measured=False, battery=config.battery)

@@ -51,7 +51,7 @@ def option_of_field(name: str, fact: Json) -> str:
 
 
 def of_unit(name: str) -> tuple[str, str]:
-    """A field's name without its unit, and that, empty where it has none."""
+    """A field's name without its unit, and the unit (empty if it has none)."""
     return next(
         ((name.removesuffix(f"_{end}"), unit) for end, unit in UNITS.items() if name.endswith(f"_{end}")), (name, "")
     )
@@ -67,7 +67,7 @@ _LISTS = {"number": str, "string": list[str]}  # an axis is one text
 
 
 def option_help(name: str, fact: Json) -> str:
-    """Meaning, unit, choices, bounds and default of a field, as a help text has them."""
+    """Help text of a field: meaning, unit, choices, bounds and default."""
     _, unit = of_unit(name)
     texts = [str(fact.get("description", name)).rstrip(".")]
     if unit and f"({unit})" not in texts[0]:
@@ -100,7 +100,7 @@ def _default(name: str, fact: Json) -> str:
 
 
 def option_parameters(kind: type[BaseModel]) -> Iterator[inspect.Parameter]:
-    """A parameter of a command's function for each field that can be chosen, None where it is not given."""
+    """A function parameter for each field of a command that can be chosen, with default None."""
     for name, fact in schema_facts(kind).items():
         if "const" in fact:  # one choice is none
             continue
@@ -150,7 +150,7 @@ def _read(name: str, fact: Json, value: Any) -> Any:
 
 
 def help_all(kinds: tuple[type[BaseModel], ...]) -> Iterator[inspect.Parameter]:
-    """The option that shows those of solvers too, where a command has any."""
+    """The option that also shows solver options, for a command that has them."""
     hidden = [
         option_of_field(name, fact)
         for kind in kinds
@@ -160,7 +160,7 @@ def help_all(kinds: tuple[type[BaseModel], ...]) -> Iterator[inspect.Parameter]:
     if hidden:
         option = typer.Option(
             "--help-all", is_eager=True, callback=_show_all,
-            help=f"Show this with {', '.join(hidden)} too, which \\[solver] of --config may state.",
+            help=f"Also show {', '.join(hidden)}, which \\[solver] of --config may contain.",
         )  # fmt: skip
         kind = inspect.Parameter.KEYWORD_ONLY
         yield inspect.Parameter("help_all", kind, default=False, annotation=Annotated[bool, option])
@@ -213,7 +213,7 @@ def parse_axis(option: str, text: str) -> tuple[float, ...]:
             first, last, step = numbers
             if (last - first) * step < 0:
                 raise BadConfiguration(
-                    f"{option}: got {part}, which ends before it begins; expected first:last:step as 0:20:0.5"
+                    f"{option}: got {part}, which ends before it begins; expected first:last:step, such as 0:20:0.5"
                 )
             count = (last - first) / step
             if not 0 <= count < 1e6:
@@ -221,6 +221,7 @@ def parse_axis(option: str, text: str) -> tuple[float, ...]:
             values += [first + k * step for k in range(round(count - 0.5 + 1e-9) + 1)]
         except (ValueError, ZeroDivisionError, OverflowError):
             raise BadConfiguration(
-                f"{option}: got {part or 'nothing'}; expected numbers as 0,5,10 or first:last:step as 0:20:0.5"
+                f"{option}: got {part or 'nothing'}; expected numbers such as 0,5,10 or first:last:step such as "
+                "0:20:0.5"
             ) from None
     return tuple(values)

@@ -60,7 +60,7 @@ def finish_run_folder(
     """Write the configuration and the page (if wanted), move the folder into place and print its path.
 
     Args:
-        folder: with the command's own files.
+        folder: folder with the command's own files.
         robot: written as `robot.toml` with a note, if it is not among them.
         manifest: entries besides program, versions and hashes.
         runs: the table whose hash is recorded, if any.
@@ -91,6 +91,8 @@ STORE, JOURNAL, IDENTITY, ASIDE = "results.zarr", "journal", "identity.json", "w
 PARTS = frozenset((LOCK, CHUNKS, REFIT_FILE, STORE, JOURNAL, IDENTITY, ASIDE))
 #: Endings of the files in `CHUNKS`.
 KEPT = (".npz", ".stage")
+#: File of what the loop's regression says before anything is confirmed.
+SCREENING_FILE = "screening.json"
 #: Key of the mark with the names of files that are not ours.
 FOREIGN = "foreign"
 #: First arguments of commands that fit a robot.
@@ -121,7 +123,7 @@ class Folder:
         self.started = datetime.datetime.now(datetime.UTC)
 
     def refuse_taken(self, force: bool) -> None:
-        """Refuse a path that holds something already.
+        """Reject a path that holds something already.
 
         Args:
             force: replace a run folder that holds nothing but what its command left.
@@ -136,7 +138,7 @@ class Folder:
         elif not force:
             hint = "--force replaces a run folder"
         elif (left := listed_names(self.path)) is None:
-            hint = "it is no run folder that --force could replace"
+            hint = "it is not a run folder, so --force does not replace it"
         else:
             foreign = sorted({p.name for p in self.path.iterdir()} - {*left, *self.further})
             if not foreign:
@@ -145,10 +147,10 @@ class Folder:
         raise BadConfiguration(f"--out: {self.path} exists already; choose another path ({hint})")
 
     def refuse_foreign(self, command: str, force: bool) -> None:
-        """Refuse a `.partial` that is not ours, or holds a file that is not, or interrupted work of another command.
+        """Reject a `.partial` that is not ours, or holds a file that is not, or interrupted work of another command.
 
         Args:
-            command: that is to go on there.
+            command: command that is to go on there.
             force: begin anew in place of another command.
 
         Raises:
@@ -158,7 +160,9 @@ class Folder:
             return
         mark = interrupted_run(self.partial)
         if mark is None:
-            raise BadConfiguration(f"--out: {self.partial} is in the way and is no run of ours; choose another path")
+            raise BadConfiguration(
+                f"--out: {self.partial} already exists and was not created by mmrjax; choose another path"
+            )
         if foreign := sorted(self._foreign()):
             raise BadConfiguration(
                 f"--out: {self.partial} holds {foreign[0]}, which its command did not write; move it, or choose "
@@ -166,12 +170,12 @@ class Folder:
             )
         if mark["command"] not in ("", command) and not force and holds_work(self.partial):
             raise BadConfiguration(
-                f"--out: {self.partial} holds an interrupted {mark['command']}, which the same command takes up "
-                "again; choose another path, or --force to begin anew"
+                f"--out: {self.partial} holds an interrupted {mark['command']}, which the same command resumes; "
+                "choose another path, or use --force to start again"
             )
 
     def refuse_appeared(self, force: bool) -> None:
-        """Refuse to move the finished folder to a path where something has appeared meanwhile.
+        """Reject to move the finished folder to a path where something has appeared meanwhile.
 
         Raises:
             OSError: it has, the partial folder is left.
@@ -376,7 +380,7 @@ class RunFolder(Folder):
         """
         super().__init__(path)
         self._force, self._command = force, str(identity.get("command", ""))
-        self._digest = sha256_hex(json.dumps(identity, sort_keys=True, default=str).encode())
+        self._digest = identity_digest(identity)
         self._lock: TextIO | None = None
         self._taken_up = False
         self.refuse_taken(force)
@@ -401,7 +405,7 @@ class RunFolder(Folder):
         if not try_to_lock(lock) or share_at_work(self.partial) is not None:
             lock.close()
             raise BadConfiguration(
-                f"--out: another process is at work on {self.partial}; wait for it, or choose another path"
+                f"--out: another process is using {self.partial}; wait for it, or choose another path"
             )
         with contextlib.suppress(FileNotFoundError):
             if os.path.samestat(os.fstat(lock.fileno()), (self.partial / LOCK).stat()):
@@ -423,10 +427,10 @@ class RunFolder(Folder):
             if holds_work(self.partial) or FOREIGN in _json(self.partial / LOCK):
                 if not self._force:
                     raise BadConfiguration(
-                        f"--out: {self.partial} holds interrupted work of another configuration, table or version; "
-                        "choose another path, or --force to begin anew"
+                        f"--out: {self.partial} contains interrupted work of another configuration, table or "
+                        "version; choose another path, or use --force to start again"
                     )
-                print_message(f"{self.partial}: of another configuration; begun anew")
+                print_message(f"{self.partial}: was made with another configuration; started again")
             self._clear()
             self._lock.truncate(0)
             self._lock.write(lock_text(self._command, self._digest))
@@ -504,6 +508,10 @@ class RunFolder(Folder):
     def _of_stage(self, name: str) -> Path:
         return self.partial / CHUNKS / f"{re.sub(r'[^a-z0-9.]', '-', name)}.stage"
 
+    def finish(self, manifest: Json, runs: Runs | None = None) -> Path:
+        """As of `Folder`, with the identity of the run in the manifest."""
+        return super().finish({**manifest, "identity": self._digest}, runs)
+
     def move_into_place(self) -> Path:
         """Drop the chunks, and move the folder to where it is to appear. The lock's file goes last.
 
@@ -531,15 +539,24 @@ def open_folder(
     Args:
         command: its name.
         config: its configuration.
-        robot: of the configuration, with its changes.
+        robot: robot of the configuration, with its changes.
         beside: says where the folder is to appear, and if it replaces an existing one.
         runs: the table that it was given, if any.
     """
+    folder = RunFolder(
+        beside.out or default_path(command), run_identity(command, config, robot, runs), force=beside.force
+    )
+    folder.tables = getattr(config, "table", folder.tables)
+    return folder
+
+
+def run_identity(command: str, config: RobotPart, robot: Robot, runs: Runs | None) -> Json:
+    """Identity of a run: its configuration, its inputs and the program's source. Arguments: as of `open_folder`."""
     import jax
 
     from mmrjax.compile.programs import source_hash
 
-    identity = {
+    return {
         "command": command,
         "program": f"{source_hash()}, {jax.default_backend()}",
         "config": config.model_dump(exclude={"report", "table"}),
@@ -547,9 +564,16 @@ def open_folder(
         "runs": None if runs is None else {key: value.tolist() for key, value in runs.columns.items()},
         "effects": [sha256_hex(Path(file).read_bytes()) for file in config.effects],
     }
-    folder = RunFolder(beside.out or default_path(command), identity, force=beside.force)
-    folder.tables = getattr(config, "table", folder.tables)
-    return folder
+
+
+def is_finished(path: Path, identity: Json) -> bool:
+    """True if the finished run folder at a path has this identity."""
+    return bool(_json(path / "manifest.json").get("identity") == identity_digest(identity))
+
+
+def identity_digest(identity: Json) -> str:
+    """SHA-256 of the identity of a run."""
+    return sha256_hex(json.dumps(identity, sort_keys=True, default=str).encode())
 
 
 def rows_of_fit(robot: Path) -> frozenset[str]:

@@ -167,7 +167,9 @@ def test_a_table_takes_the_channels_of_the_robot_that_it_is_used_with(tmp_path, 
     assert wide.of(bench) is wide and wide.of(other).channels == narrow.channels
     assert wide.of(other).unknown == narrow.unknown and wide.of(other).columns.keys() == narrow.columns.keys()
     assert_array_equal(wide.of(other).measured(), narrow.measured())
-    with pytest.raises(BadData, match=r"t\.csv, output_torque_Nm: left out as the table was read, .* with robot="):
+    with pytest.raises(
+        BadData, match=r"t\.csv, output_torque_Nm: this channel of the robot was left out .* with robot="
+    ):
         narrow.of(bench)
 
 

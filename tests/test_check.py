@@ -297,11 +297,11 @@ def test_paper_file_states_where_each_aim_comes_from():
 
 
 REFUSED = {
-    "": r"^r.toml: states no requirement; expected one of speed_m_s, ",
-    "[envelope]\npayload_kg = 3": r"^r.toml: states no requirement",
+    "": r"^r.toml: contains no requirement; expected one of speed_m_s, ",
+    "[envelope]\npayload_kg = 3": r"^r.toml: contains no requirement",
     "speed = 1.0": r"^r.toml, speed: no unit in its name; write speed_m_s$",
-    "endurance_h = 3": r"^r.toml, endurance_h: unit h is not read; write endurance_min$",
-    "speed_km_h = 3.6": r"^r.toml, speed_km_h: unit km_h is not read; write speed_m_s$",
+    "endurance_h = 3": r"^r.toml, endurance_h: unit h is not supported; write endurance_min$",
+    "speed_km_h = 3.6": r"^r.toml, speed_km_h: unit km_h is not supported; write speed_m_s$",
     "speeed_m_s = 1": r"^r.toml, speeed_m_s: no such key; did you mean speed_m_s\? allowed: speed_m_s, ",
     "speed_m_s = nan": r"^r.toml, speed_m_s: got nan; expected 0 to 1e\+06 m/s$",
     "side_slope_deg = 95": r"^r.toml, side_slope_deg: got 95; expected 0 to 45 deg$",
@@ -311,9 +311,9 @@ REFUSED = {
     "speed_m_s = 'rated'": r"^r.toml, speed_m_s: got 'rated'; expected a number, only winding_C, ",
     "speed_m_s = true": r"^r.toml, speed_m_s: got True; expected a number \[m/s\]$",
     "speed_m_s = []": r"^r.toml, speed_m_s: got an empty list; expected ",
-    "speed_m_s = {slope_deg = 3}": r"^r.toml, speed_m_s: states neither least nor most; expected one of them \[m/s\]$",
+    "speed_m_s = {slope_deg = 3}": r"^r.toml, speed_m_s: expected least, most or both \[m/s\]$",
     "speed_m_s = {least = 1, slope = 3}": r"^r.toml, speed_m_s, slope: no unit in its name; write slope_deg$",
-    "speed_m_s = {least = 1, duty = 'driving'}": r"^r.toml, speed_m_s: duty and share are of endurance_min alone$",
+    "speed_m_s = {least = 1, duty = 'driving'}": r"^r.toml, speed_m_s: duty and share can be used only with endurance_min$",
     "endurance_min = {least = 1, duty = 'dancing'}": r"^r.toml, endurance_min, duty: got 'dancing'; did you mean standing\? allowed: standing, driving$",
     "endurance_min = {least = 1, duty = 'standing', share = 0.2}": r"duty standing and a share of 0.2 contradict each other$",
     "speed_m_s = 1\n[envelope]\npayload_kg = [8, 0]": r"^r.toml, envelope.payload_kg: got \[8, 0\], an empty range; expected ",
@@ -444,7 +444,7 @@ def test_stairs_need_friction_reach_and_a_tread(robot):
 def test_posture_of_a_robot_that_states_no_running_gear_is_not_known(robot):
     gear = tuple(p.name for p in params.walk_parameters(robot) if p.name.startswith("running_gear."))
     bare = dataclasses.replace(robot, rig=dataclasses.replace(robot.rig, unknown=gear))
-    with pytest.raises(BadConfiguration, match="step_mm: the robot's file states no running_gear"):
+    with pytest.raises(BadConfiguration, match="step_mm: the robot's file has no running_gear"):
         sheet.refuse_impossible(bare, requirements_file.parse_requirements("step_mm = 100", "posture.toml"))
 
 
@@ -456,7 +456,7 @@ def test_heat_that_the_file_does_not_state_is_asked_for(tmp_path, capsys):
         assert command(["check", asked, "--robot", tmp_path / "rig.toml", "--out", tmp_path / "run"]) == 2
         lacking = "motor.resistance_thermal_winding, motor.resistance_thermal_housing"
         assert (
-            f"asked.toml, {name}: rests on how warm the windings become, and the robot's file does not state {lacking}"
+            f"asked.toml, {name}: depends on the winding temperature, for which the robot's file lacks {lacking}"
             in " ".join(capsys.readouterr().err.split())
         )
 
@@ -466,7 +466,7 @@ def test_a_battery_that_the_file_does_not_state_is_no_supply(tmp_path, capsys):
     asked = tmp_path / "asked.toml"
     asked.write_text("mass_kg = 50\nspeed_m_s = 0.5\n")
     assert command(["check", asked, "--robot", tmp_path / "rig.toml", "--out", tmp_path / "run"]) == 2
-    assert "asked.toml, speed_m_s: the robot's file states no battery" in capsys.readouterr().err
+    assert "asked.toml, speed_m_s: the robot's file has no battery" in capsys.readouterr().err
     assert not (tmp_path / "run").exists()
 
 

@@ -47,7 +47,7 @@ USAGE = {
     "NaN": ("sweep --payloads nan", r"--payloads: got nan"),
     "no numbers": (
         "sweep --slopes steep",
-        r"--slopes: got steep; expected numbers as 0,5,10 or first:last:step",
+        r"--slopes: got steep; expected numbers such as 0,5,10 or first:last:step",
     ),
     "step of zero": ("sweep --slopes 0:5:0", r"--slopes: got 0:5:0"),
     "unknown configuration": (
@@ -97,12 +97,12 @@ USAGE = {
     "NaN for one run": ("simulate --voltage nan", r"option, supply_voltage_V: got nan"),
     "duration without a history": (
         "sweep --duration 2",
-        r"--duration acts only with --model drive or track",
+        r"--duration has an effect only with --model drive or track",
     ),
     "unknown model of the paper": ("reproduce --model magic", r"--model: got 'magic'"),
-    "step without the track model": ("simulate --step 1e-5", r"--step acts only with --model track"),
+    "step without the track model": ("simulate --step 1e-5", r"--step has an effect only with --model track"),
     "duration without end": ("simulate --model track --duration inf", r"--duration: got inf"),
-    "discharge without battery": ("sweep --discharge 100", r"--discharge acts only with --battery"),
+    "discharge without battery": ("sweep --discharge 100", r"--discharge has an effect only with --battery"),
     "duration of zero": ("simulate --duration 0", r"--duration: got 0"),
 }
 
@@ -128,7 +128,7 @@ def test_somebody_elses_partial_folder_is_left_alone(mmrjax, tmp_path):
     (tmp_path / "mine.partial" / "thesis.txt").write_text("years of work")
     ends(
         mmrjax("simulate --no-report --out mine --force"),
-        "mine.partial is in the way and is no run of ours",
+        "mine.partial already exists and was not created by mmrjax",
     )
     assert (tmp_path / "mine.partial" / "thesis.txt").read_text() == "years of work"
 
@@ -231,7 +231,7 @@ BAD_RUNS = {
         HEADER.replace("speed_mm_s", "spede_mm_s") + "\n6T2A,15,13.1,0,5,2.75,4800,400",
         "column speed_mm_s is missing; is spede_mm_s meant?",
     ),
-    "no channel": (HEADER.split(",total_current_A")[0] + "\n6T2A,15,13.1,0,5", "no column of a channel"),
+    "no channel": (HEADER.split(",total_current_A")[0] + "\n6T2A,15,13.1,0,5", "no column with readings"),
     "slope": (
         f"{HEADER}\n6T2A,15,13.1,0,95,2.75,4800,400",
         "runs.csv row 1, slope_deg: got 95; is it in percent? then name the column slope_percent; expected -45 to 45",
@@ -293,7 +293,7 @@ def test_full_disk_leaves_no_run_folder(mmrjax, tmp_path, monkeypatch):
         raise OSError(28, "No space left on device", "runs.csv")
 
     monkeypatch.setattr("sweeps.store.RunFolder.write_table", full)
-    ends(mmrjax("simulate --no-report --out r"), "runs.csv: No space left on device; no run folder was left")
+    ends(mmrjax("simulate --no-report --out r"), "runs.csv: No space left on device; no run folder was written")
     assert not (tmp_path / "r").exists()
 
 
@@ -310,7 +310,7 @@ def test_interrupted_sweep_goes_on_where_it_stopped(mmrjax, tmp_path, monkeypatc
         return honest(compiled, values, *told)
 
     monkeypatch.setattr(scale.Compiled, "__call__", interrupted)
-    ends(mmrjax(f"{arguments} --chunk 10 --out s"), "goes on where it stopped", code=130)
+    ends(mmrjax(f"{arguments} --chunk 10 --out s"), "resumes the sweep after its last complete chunk", code=130)
     assert not (tmp_path / "s").exists() and (tmp_path / "s.partial").exists()
     kept = len(list((tmp_path / "s.partial" / "chunks").glob("*.npz")))
     assert 0 < kept <= 3
@@ -522,7 +522,7 @@ def test_memory_exhausted_is_one_sentence_and_leaves_nothing(mmrjax, tmp_path, m
     monkeypatch.setattr(scale.Compiled, "__call__", short)
     code, _, err = mmrjax(command, "--no-report", "--out", "x")
     assert code == 2 and err.endswith(
-        "mmrjax: memory exhausted; take fewer points at once (--chunk), fewer rows, or more memory\n"
+        "mmrjax: out of memory; use fewer points at a time (--chunk), fewer rows, or more memory\n"
     )
     assert "Traceback" not in err and not any(tmp_path.iterdir())
 
@@ -556,7 +556,7 @@ def test_an_effects_file_cannot_end_the_command_as_if_it_were_done(mmrjax, tmp_p
         raise SystemExit(0)
 
     monkeypatch.setattr(scale.Compiled, "__call__", later)
-    ends(mmrjax("simulate --no-report --out x"), "code of a file of effects has ended the program")
+    ends(mmrjax("simulate --no-report --out x"), "the code in an effects file ended the program")
     assert [p.name for p in tmp_path.iterdir()] == ["own.py"]
 
 
@@ -596,4 +596,4 @@ def test_a_rig_on_a_read_only_disk_is_named_without_a_partial(mmrjax, monkeypatc
         Path, "write_text", lambda *_, **__: (_ for _ in ()).throw(OSError(30, "Read-only file system"))
     )
     code, _, err = mmrjax("rig new r.toml --kind bench")
-    assert code == 2 and err == "mmrjax: r.toml: cannot be written (Read-only file system); state a file elsewhere\n"
+    assert code == 2 and err == "mmrjax: r.toml: cannot be written (Read-only file system); choose another path\n"

@@ -120,7 +120,7 @@ REFUSED = {
     "no term": (GOOD.replace("def term", "def other"), r"holds no effect; .*; SealDrag defines no term"),
     "name": (stating('name = "seal drag"'), r"name: got 'seal drag'; expected lower-case words"),
     "no name": (stating("name = None"), r"mine\.py, SealDrag, name: got None"),
-    "name taken": (GOOD.replace("SealDrag", "Churning"), r"name: churning is taken; choose another"),
+    "name taken": (GOOD.replace("SealDrag", "Churning"), r"name: churning is already used; choose another"),
     "no balance": (GOOD.replace('    balance = "track"\n', ""), r"SealDrag, balance: got None; expected a str"),
     "balance": (GOOD.replace('"track"', '"trak"'), r"balance: got trak; did you mean track\? allowed: mass,"),
     "no channel": (
@@ -156,11 +156,14 @@ REFUSED = {
     "configuration": (stating("configurations = (4,)"), r"configurations: got \(4,\); expected a tuple of names"),
     "memory": (stating("memory_size = True"), r"memory_size: got True; expected a positive number, or None"),
     "no rate": (stating("memory_size = 1.0"), r"cannot be computed \(NotImplementedError: seal_drag has a memory"),
-    "source": (GOOD.replace("Source: none, an example.", ""), r"its docstring states no equation with its «Source:»"),
+    "source": (
+        GOOD.replace("Source: none, an example.", ""),
+        r"its docstring must give the equation and its «Source:»",
+    ),
     "no default": (EXPLICIT.replace("        0.0, unit", "        unit"), r"its code fails \(TypeError: .*'default'"),
     "no field": (
         GOOD.replace("amplitude: Scalar", "size: Scalar"),
-        r"cannot be made without arguments \(.*amplitude.*\); give every field a default",
+        r"cannot be created without arguments \(.*amplitude.*\); give every field a default",
     ),
     "present at rest": (EXPLICIT.replace("        0.0, unit", "        0.1, unit"), r"amplitude: got default 0\.1"),
     "no amplitude": (EXPLICIT.replace(", amplitude=True", ""), r"its amplitudes are none; expected one field"),

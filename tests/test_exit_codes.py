@@ -104,7 +104,7 @@ def test_an_interrupt_within_a_callback_is_obeyed(monkeypatch, capsys):
         cli.main()
     signal.signal(signal.SIGINT, ignored)
     assert end.value.code == 130 and time.monotonic() - begun < 4 and sys.unraisablehook is hook
-    assert capsys.readouterr().err == "mmrjax: interrupted; no run folder was left\n"
+    assert capsys.readouterr().err == "mmrjax: interrupted; no run folder was written\n"
 
 
 def test_no_thread_outlives_a_refusal(monkeypatch):

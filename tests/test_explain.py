@@ -53,7 +53,9 @@ def test_an_effect_of_ones_own_may_go_with_anything():
 def test_a_typical_size_is_simulated(robot):
     """0.5 ohm in series take 0.5 V/A · I of 24 V less what drives: the motors slow down by that."""
     changes = list(explain._changes(effects.BY_NAME["series_resistance"]()))
-    assert len(changes) == 2 and changes[0].startswith("one typical size at 6T2A, 24 V, 5°, 3 kg: total current -")
+    assert len(changes) == 2 and changes[0].startswith(
+        "change for one typical size, for 6T2A at 24 V, 5°, 3 kg: total current -"
+    )
     assert "motor speed -3.3 %" in changes[0]
     assert list(explain._changes(effects.BY_NAME["armature_inductance"]())) == []
 
@@ -68,7 +70,7 @@ def test_parameters_and_channels_are_explained_by_their_rows():
     lines = dict(said("channel", "speed_mm_s"))
     assert "speed_sd_mm_s" in lines["column"] and lines["other units"].startswith("m/s, km/h")
     assert lines["typical noise"].startswith(f"{100 * channels.find_channel('speed').sd_share:g} %")
-    assert "shows it: drawn from the supply by all motors" in dict(said("channel", "total_current"))["is"]
+    assert "by its instrument: drawn from the supply by all motors" in dict(said("channel", "total_current"))["is"]
     assert dict(said("output", "slip"))["equation"].startswith("1 - V / V_theoretical, eq. (33)")
 
 
@@ -84,7 +86,7 @@ def test_the_command_prints_80_columns_and_every_meaning_of_a_name(mmrjax):
 @pytest.mark.parametrize(
     ("name", "says"),
     [
-        ("resistance", "is one of these meant? battery.resistance, motor.resistance"),
+        ("resistance", "did you mean one of these? battery.resistance, motor.resistance"),
         ("slidez", "did you mean slides"),
         ("xyzzy", "explain: got xyzzy; mmrjax explain lists all names"),
     ],

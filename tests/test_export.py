@@ -546,7 +546,7 @@ def test_rig_that_was_exported_comes_back_to_the_last_digit(rig, tmp_path):
         ("none.xml", None, r"none.xml: cannot be read"),
         ("bad.xml", None, r"bad.xml: not a readable XML file"),
         ("two.xml", None, r"--joint: missing, and two.xml has drive, other; expected the name of one joint"),
-        ("two.xml", "slide", r"--joint: got slide, which slides or is free; expected a hinge"),
+        ("two.xml", "slide", r"--joint: got slide, a slide or free joint; expected a hinge"),
     ],
 )
 def test_models_without_a_driven_joint_are_refused_in_a_sentence(source, joint, message, rig, tmp_path):
@@ -573,7 +573,11 @@ def test_older_mujoco_is_refused_with_the_version_that_it_takes(monkeypatch, rig
 @pytest.mark.parametrize(
     ("amplitudes", "configuration", "message"),
     [
-        ({"side_friction": 1e-3}, None, r"side_friction makes its sides differ, and one joint has one drive"),
+        (
+            {"side_friction": 1e-3},
+            None,
+            r"side_friction makes the two sides differ, but an export describes one drive",
+        ),
         ({}, "4W2", r"--configuration: got 4W2; .* did you mean 4W2T\?"),
     ],
 )
@@ -606,7 +610,7 @@ def test_runs_of_more_than_one_joint_are_refused(header, row, message, tmp_path)
 
 def test_a_rig_without_a_limit_of_the_voltage_needs_runs(rig):
     rig.write_text(RIG.replace("voltage_limit = 12.0\n", ""))
-    with pytest.raises(BadConfiguration, match=r"--data: not stated, and rig\.toml has no motor\."):
+    with pytest.raises(BadConfiguration, match=r"--data: not given, and rig\.toml has no motor\."):
         situation.situation_of_joint(joints.joint_of_robot(robot_file.find_robot_file(str(rig)), "arm"), None)
 
 
@@ -759,7 +763,7 @@ def test_stated_fate_of_a_controller_and_of_play_is_by_format(rig):
     assert "lag of 0.005 s is dropped" in verdicts[0][mujoco.CONTROLLER].how
     assert "0.03 rad of play" in verdicts[2][mujoco.PLAY].how
     rig.write_text(rig.read_text().replace("supply_voltage = 7.4", ""))
-    with pytest.raises(BadConfiguration, match=r"controller.supply_voltage: missing, and an exported controller"):
+    with pytest.raises(BadConfiguration, match=r"controller.supply_voltage: missing; the exported controller"):
         joints.joint_of_robot(robot_file.find_robot_file(str(rig)))
 
 

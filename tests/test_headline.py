@@ -76,7 +76,9 @@ def test_a_law_that_an_ammeter_imitates_is_stated_with_it():
 def test_what_only_some_noises_cannot_tell_apart_comes_after_what_all_list():
     found = headline(of_mechanism(SLIP, DROP), [(0.7, of_mechanism(DROP)), (1.4, of_mechanism(DROP, "x that is"))])
     assert found.claims == ((DROP, SLIP, "x that is"),) and found.shared == (1,)
-    assert f"At some of these it may be a {SLIP} or a x that is instead." in loop_words.loop_answer(found)
+    assert f"At some of these noise levels it may be a {SLIP} or a x that is instead." in loop_words.loop_answer(
+        found
+    )
 
 
 def test_one_mechanism_is_claimed_once():
@@ -93,4 +95,4 @@ def test_lost_motion_comes_before_what_the_library_explains():
     of = lambda *remarks: SimpleNamespace(remarks=remarks, headline=headline(law("a"), []))  # noqa: E731
     alone = DiscoveryResult.statement.fget(of())
     first = DiscoveryResult.statement.fget(of("a note", lost))
-    assert first == f"{describe(lost)}. {alone}" and "each of 20 reversals loses about 0.96 deg" in first
+    assert first == f"{describe(lost)}. {alone}" and "at each of 20 reversals about 0.96 deg" in first

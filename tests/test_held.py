@@ -154,11 +154,13 @@ def test_a_clamp_with_another_model_is_refused(tmp_path):
 
 def test_rows_of_a_clamp_in_tables(tmp_path):
     held = rig(tmp_path, "motor_current", '"motor_voltage", "output_torque"')
-    with pytest.raises(BadData, match=r"row 1, load_torque_Nm: got 1 where held is 1; expected 0, .* output_torque"):
+    with pytest.raises(
+        BadData, match=r"row 1, load_torque_Nm: got 1 although held is 1; expected 0, .* output_torque"
+    ):
         records.read_runs(table(load_torque_Nm=np.ones(16)), robot=held)
     speed = rig(tmp_path, "motor_speed", '"motor_current", "output_torque"')
     with pytest.raises(
-        BadData, match=r'nothing drives the motors; .* for a held shaft state imposed = "motor_current"'
+        BadData, match=r'nothing drives the motors; .* if the shaft is locked, set imposed = "motor_current"'
     ):
         records.read_runs(table(held=False, motor_speed_rpm=np.zeros(16)), robot=speed)
     rows = table(held=False, motor_speed_rpm=np.zeros(16), load_torque_Nm=np.r_[np.ones(15), 0.0])
@@ -167,7 +169,7 @@ def test_rows_of_a_clamp_in_tables(tmp_path):
     strong = {**rows, "motor_current_A": 5 * rows["motor_current_A"]}
     assert rig_facts.doubtful_current(records.read_runs(strong, robot=held), held) == ""
     strong["held"] = np.r_[np.zeros(15), 1.0]
-    assert "80 A, where the file's numbers turn the load" in rig_facts.doubtful_current(
+    assert "80 A, although by the file's numbers the load turns" in rig_facts.doubtful_current(
         records.read_runs(strong, robot=held), held
     )
 
@@ -177,10 +179,10 @@ def test_a_log_of_a_clamp_is_read_as_settled_rows(tmp_path):
     rows = {"output_torque_Nm": table()["output_torque_Nm"], "motor_voltage_V": table()["motor_voltage_V"]}
     held = rig(tmp_path, "motor_current", '"motor_voltage", "output_torque"')
     log = records.read_runs(table(time_s=0.02 * np.arange(16.0)), robot=held)
-    assert not log.sampled and any("held in every row: each row is read as a settled run" in n for n in log.notes)
+    assert not log.sampled and any("held in every row, so each row is read as a settled run" in n for n in log.notes)
     same = records.read_runs(table(), robot=held)
     assert all((log[c] == same[c]).all() for c in ("motor_current_A", "held", *rows))
-    with pytest.raises(BadData, match="held is 1 in each row of a log too fast for settled rows"):
+    with pytest.raises(BadData, match="held is 1 in every row, and rows follow too fast to be settled"):
         records.read_runs(table(time_s=1e-4 * np.arange(16.0)), robot=held)
     speed = rig(tmp_path, "motor_speed", '"motor_current", "motor_voltage"')
     columns = {c: v for c, v in table(held=False).items() if c != "output_torque_Nm"}
@@ -214,4 +216,4 @@ def test_check_does_not_call_a_held_shaft_stalled(tmp_path, capsys):
     (tmp_path / "runs.csv").write_text("\n".join(lines) + "\n")
     assert rig_check.check_rig_file(tmp_path / "rig.toml", str(tmp_path / "runs.csv"), (), False) == 0
     printed = capsys.readouterr().out
-    assert "what these data can determine" in printed and "not every row settles" not in printed
+    assert "parameters that these data can determine" in printed and "some rows have no steady state" not in printed

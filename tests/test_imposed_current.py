@@ -69,7 +69,10 @@ def test_a_current_in_another_unit_is_doubted_with_what_turns_the_load(tmp_path,
     )
     assert bool(said) == doubted
     if doubted:
-        assert f"up to {2 * factor:g} A, where the file's numbers turn the load slowly with 0.667 A; is it in" in said
+        assert (
+            f"up to {2 * factor:g} A, although by the file's numbers the load turns slowly at 0.667 A; is it in"
+            in said
+        )
 
 
 @pytest.mark.slow
@@ -93,7 +96,7 @@ def test_the_file_says_what_is_imposed_and_needs_no_winding(robot, tmp_path):
     assert {"electrical", "inductance", "supply"} <= absent_balances(robot)
     robot_file.write_robot(robot, tmp_path / "again.toml")
     assert robot_file.read_robot(tmp_path / "again.toml").rig == robot.rig
-    with pytest.raises(BadConfiguration, match="motor_current is imposed, so it is no reading"):
+    with pytest.raises(BadConfiguration, match="motor_current is imposed, so it cannot be a reading"):
         read_rig(tmp_path, RIG.replace('["motor_speed"]', '["motor_current"]'), "bad.toml")
     with pytest.raises(BadConfiguration, match=r"motor\.torque_constant \[N·m/A\] is missing"):
         read_rig(tmp_path, RIG.replace(f"torque_constant = {K}", ""), "bad.toml")
@@ -253,10 +256,10 @@ def test_commands_take_a_current_or_say_what_to_state(robot, tmp_path, mmrjax):
     assert cells["motor_current_A"] == "2"
     code, _, err = ends(mmrjax("sweep --robot rig.toml --motor-currents 1,2,-2 --no-report --out many"), code=0)
     for options, said in (
-        (["simulate", "--voltage", "12"], "--voltage: the motors' current is imposed on this robot; state --motor-current [A]"),
-        (["simulate"], "--motor-current: not stated; state it [A], as --motor-current 2"),
+        (["simulate", "--voltage", "12"], "--voltage: the motors' current is imposed on this robot; give --motor-current [A]"),
+        (["simulate"], "--motor-current: not given; give it [A], such as --motor-current 2"),
         (["simulate", "--battery"], "--battery: the motors' current is imposed on this robot"),
-        (["sensitivity"], "sensitivity: the motors' current is imposed on this robot"),
+        (["sensitivity"], "sensitivity: the motor current is imposed on this robot"),
         (["simulate", "--model", "track", "--motor-current", "1"], "which has no running gear"),
     ):  # fmt: skip
         code, _, err = mmrjax(*options, "--robot", "rig.toml", "--out", "none")

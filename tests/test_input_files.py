@@ -50,7 +50,7 @@ TOML = {
     "a long header": (f"[{DEEP}]\nx = 1", "nested too deep"),
     "many keys": ("".join(f"k{k} = 1\n" for k in range(2_001)), "more than 2,000 keys; is it the right file"),
     "a long value": ('base = "' + "x" * 100_000 + '"', "100,000 characters"),
-    "empty": ("# nothing\n", "states nothing; expected tables of parameters"),
+    "empty": ("# nothing\n", "is empty; expected parameter tables"),
     "a channel twice": (
         RIG.format(more="").replace('"motor_current"', '"output_speed"'),
         "output_speed is repeated",
@@ -124,7 +124,7 @@ def test_a_row_that_nothing_drives_is_left_out_with_a_note(tmp_path, imposed, co
     robot = bench(tmp_path, f'imposed = "{imposed}"')
     found = table(tmp_path, f"{column},motor_current_A,room_C\n0,0,20\n4,0.3,21\n8,0.4,22\n", robot)
     assert found[column].tolist() == [4.0, 8.0] and found.extras["room_C"].tolist() == [21.0, 22.0]
-    assert [n for n in found.notes if f"row 1 is left out, as nothing drives the motors ({column} 0)" in n]
+    assert [n for n in found.notes if f"row 1 is left out, since nothing drives the motors ({column} is 0)" in n]
 
 
 ROWS = "4,0.3,700{}\n6,0.4,1100{}\n6,0.4,1100{}\n"

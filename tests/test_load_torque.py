@@ -197,7 +197,7 @@ def test_the_torque_of_a_row_is_read_in_its_unit(tmp_path, column, head, factor)
         ("nan", "runs.csv row 1, load_torque_Nm: got nan; expected -10000 to 10000"),
         ("inf", "runs.csv row 1, load_torque_Nm: got inf; expected -10000 to 10000"),
         ("25000", "runs.csv row 1, load_torque_Nm: got 25000; is it in mNm? then name the column load_torque_mNm; "),
-        ("200 mNm", "write numbers alone, in Nm, or name the column load_torque_mNm"),
+        ("200 mNm", "write numbers without units, in Nm, or name the column load_torque_mNm"),
     ],
 )
 def test_a_torque_that_is_none_is_refused(tmp_path, cell, said):
@@ -209,7 +209,7 @@ def test_a_torque_that_is_none_is_refused(tmp_path, cell, said):
 def test_columns_that_may_be_the_torque_are_asked_about(tmp_path):
     with pytest.raises(BadData, match=r"unknown column load_torque; did you mean load_torque_Nm\?"):
         read(tmp_path, ["supply_voltage_V,motor_speed_rpm,load_torque", "24,4000,0"])
-    with pytest.raises(BadData, match="load_torque_Nm and load_torque_mNm state the same"):
+    with pytest.raises(BadData, match="load_torque_Nm and load_torque_mNm have the same meaning"):
         read(tmp_path, ["supply_voltage_V,motor_speed_rpm,load_torque_Nm,load_torque_mNm", "24,4000,0,0"])
 
 
@@ -219,7 +219,7 @@ def test_a_table_of_a_vehicle_with_a_brake_is_refused(tmp_path):
         read_table(tmp_path, f"{head}\n6T2A,24,15,0,0,3,0\n6T2A,24,15,0,0,3,20\n", mm.nominal(), "runs.csv")
     assert str(error.value) == (
         "runs.csv row 2, load_torque_mNm: got 20; the robot is a vehicle; the torque of a brake acts only "
-        "on a shaft; state slope_deg or payload_kg, or describe the load as a shaft"
+        "on a shaft; give slope_deg or payload_kg, or describe the load as a shaft"
     )
 
 
@@ -234,8 +234,8 @@ def test_a_torque_without_a_sign_is_said_to_drive_a_shaft_that_runs_backward(tmp
     assert (
         runs.pulled
         and (
-            "runs.csv row 2, load_torque_Nm: got 0.2 where the shaft is driven backward: it turns the shaft on there; a "
-            "brake's torque is negative backward"
+            "runs.csv row 2, load_torque_Nm: got 0.2 where the shaft is driven backward: here it drives "
+            "the shaft. The torque of a brake is negative for backward motion"
         )
         in runs.notes
     )
@@ -290,7 +290,7 @@ def test_a_torque_in_another_unit_is_doubted(tmp_path):
         said = rig_facts.doubtful_torque(runs, rig)
         assert bool(said) == doubted and rig_facts.log_doubts(runs, rig) == ((said,) if doubted else ())
         assert not doubted or said == (
-            "runs.csv row 2, load_torque_Nm: got 100 N·m, where the motors stall at 2.39 N·m; is it in mN·m? then state "
+            "runs.csv row 2, load_torque_Nm: got 100 N·m, but the motors stall at 2.39 N·m; is it in mN·m? then state "
             '[columns] load_torque_mNm = "load_torque_Nm"'
         )
 

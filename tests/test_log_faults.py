@@ -50,7 +50,7 @@ SPEED, VOLTS, TIME = "motor_speed_rpm", "supply_voltage_V", "time_s"
 
 @pytest.mark.parametrize("column, fault, words", [
     (SPEED, still, "the same in every row, so nothing moves"),
-    (SPEED, held, "empty these cells, and the other rows are used"),
+    (SPEED, held, "empty these cells to use the other rows"),
     (SPEED, swapped, "row 377,"),  # of the first run with so much of both signs
     (VOLTS, constant, "12 V in every row"),
     (TIME, jumped, "row 77, time_s: 3.01 s after the row before it"),
@@ -67,7 +67,9 @@ def test_an_encoder_that_wraps_undeclared_is_refused_at_its_first_jump(tmp_path)
     log = servo(np.random.default_rng(1))
     log["output_angle_deg"] = log["output_angle_deg"] % 360
     servos = written(tmp_path, "servo", log)
-    with pytest.raises(BadData, match=r"jumps by -3.* as an angle that wraps; expected an angle that continues"):
+    with pytest.raises(
+        BadData, match=r"jumps by -3.* like an angle that wraps; expected an angle that keeps counting"
+    ):
         records.read_runs(tmp_path / "log.csv", robot=servos)
 
 
@@ -86,7 +88,7 @@ def test_an_error_in_the_first_sample_after_each_step_is_named_with_its_share(ro
     assert (note.channel, note.rows, note.share) == (runs.channels[1].name, len(steps), pytest.approx(share))
     text = describe(note)
     rest = np.delete(off[:, 1], steps + late)
-    assert f"the rms error is {100 * np.linalg.norm(rest) / np.linalg.norm(off[:, 1]):.0f} % of it" in text
+    assert f"the rms error falls to {100 * np.linalg.norm(rest) / np.linalg.norm(off[:, 1]):.0f} % of it" in text
     assert f"{share:.0%} of the squared error" in text and "may be negative" in text and len(text) <= 400
     off[:, 1] = 5.0
     assert error_after_steps(runs, off) == []  # an error everywhere
@@ -141,4 +143,4 @@ def test_readings_that_are_late_or_early_are_named_with_their_shift(robot, late)
     off[:, list(runs.layout.measured_columns).index(SPEED)] *= np.pi / 30
     (note,) = error_after_steps(runs, off)
     assert note.code == "shifted" and note.shift == pytest.approx(late, rel=0.1) and note.share > 0.9
-    assert f"ms too {'late' if late > 0 else 'early'}: state [rig] delay" in describe(note)
+    assert f"ms {'late' if late > 0 else 'early'}: set [rig] delay" in describe(note)

@@ -277,7 +277,7 @@ def moving(t, voltage=15):
 BAD = {
     "empty": ("", "runs.csv: the file is empty"),
     "missing column": (f"{HEADER.replace(',slope_deg', '')}\n6T2A,15,13.1,0,2.75,4800,400", "column slope_deg is missing"),
-    "no channel": ("\n".join([",".join(HEADER.split(",")[:5]), *["6T2A,15,13.1,0,5"] * 8]), "runs.csv: no column of a channel"),
+    "no channel": ("\n".join([",".join(HEADER.split(",")[:5]), *["6T2A,15,13.1,0,5"] * 8]), "runs.csv: no column with readings"),
     "no such configuration": (f"{HEADER}\n{ROW.replace('6T2A', '8W8T')}", "configuration: got 8W8T; expected one of these; allowed: 6T2A, 4W2T"),
     "not a number": (f"{HEADER}\n{ROW.replace('2.75', 'inf')}", "runs.csv row 1, total_current_A: got inf"),
     "no noise": (f"{HEADER},speed_sd_mm_s\n{ROW},0", "runs.csv row 1, speed_sd_mm_s: got 0; expected more than 0"),

@@ -113,8 +113,8 @@ def test_an_interrupted_loop_goes_on_after_its_last_stage(rig, mmrjax, monkeypat
     )
     assert at_once == [code]
     assert ("no verdict within 300 s\n" in err) == (end is OutOfTime)
-    assert "s  verdict: class, iron_loss or windage; next, errors held out and other noises\n" in err  # at once
-    assert "verdict: class, iron_loss or windage; errors held out and other noises are outstanding" in err
+    assert "s  verdict: class, iron_loss or windage; next: held-out errors and other noise levels\n" in err  # at once
+    assert "verdict: class, iron_loss or windage; held-out errors and other noise levels are still missing" in err
     assert not (tmp_path / "found").exists()
 
     def again(*_, keep, **__):
@@ -132,7 +132,7 @@ def test_what_cannot_be_kept_is_not_said_to_be(rig, mmrjax, monkeypatch, tmp_pat
 
     monkeypatch.setattr(command, "discover", first)
     monkeypatch.setattr(command.loop_words, "verdict_line", lambda found: found.verdict)
-    _, _, err = ends(mmrjax(*rig), "nothing could be kept of verdict; the same command begins anew", code=130)
+    _, _, err = ends(mmrjax(*rig), "nothing could be saved of verdict; the same command starts again", code=130)
     assert "kept: verdict" not in err and not (tmp_path / "found.partial").exists()
 
 
@@ -150,9 +150,7 @@ def test_time_that_is_out_before_the_verdict_ends_it_there_and_says_so(rig, mmrj
     monkeypatch.setattr(command, "discover", late)
     code, _, err = mmrjax(*rig, "--within", within)
     assert code == 3 and "went on" not in err and "interrupted" not in err
-    said = (
-        f"no verdict within {within.removesuffix('s')} s, nor a fit of the base model; give it more, as --within 5min"
-    )
+    said = f"no verdict within {within.removesuffix('s')} s, and no fit of the base model; allow more time, such as --within 5min"
     assert said in err
     assert signal.getitimer(signal.ITIMER_REAL) == (0.0, 0.0) and not (tmp_path / "found.partial").exists()
 
@@ -163,7 +161,7 @@ def test_a_budget_that_was_too_small_is_answered_by_a_larger_one(rig, mmrjax, mo
 
     monkeypatch.setattr(command, "discover", late)
     assert (
-        "no verdict within 540 s, nor a fit of the base model; give it more, as --within 18min"
+        "no verdict within 540 s, and no fit of the base model; allow more time, such as --within 18min"
         in (mmrjax(*rig, "--within", "9min")[2])
     )
 

@@ -135,7 +135,7 @@ def test_numbers_of_a_page_agree(shown, capsys, name):
     # what would explain more than what is proposed is not left without a word
     assert all(a["why"] for a in d["implausible"]) and not any(a["why"] for a in d["alternatives"])
     best = min((a["rise_chi2"] for a in d["implausible"]), default=0.0)
-    assert best > -d["settings"]["same"] or "ruled out by size or sign alone" in got.page.text
+    assert best > -d["settings"]["same"] or "ruled out only by size or sign" in got.page.text
     # one family-wise p on all of the page, each effect with a p of its own that is no larger than is allowed
     p = words.p_value(got.found.before.p_value)
     assert f"family-wise p {p}" in got.page.text and f"(family-wise p {p})" in d["verdict_statement"]
@@ -199,7 +199,11 @@ def test_the_page_opens_with_the_law_and_the_terminal_with_five_lines(shown, cap
     print_document(documented(got.found), brief=True)
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) <= 4 and lines[0] == got.found.statement  # the fifth is the path of the folder
-    assert [line.partition(":")[0] for line in lines[1:]] == ["Moved", "rms error as stated → now", "Next"]
+    assert [line.partition(":")[0] for line in lines[1:]] == [
+        "Moved",
+        "rms error, robot file as given → after the loop",
+        "Next",
+    ]
     assert lines[1].index("motor.torque_constant is") < lines[1].index("Added: churning ")  # what moved comes first
 
 

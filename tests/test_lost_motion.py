@@ -95,7 +95,7 @@ def test_stated_backlash_needs_no_note(tmp_path):
 def test_check_of_a_log_reports_lost_motion(tmp_path, capsys):
     read(tmp_path, servo(play=1.0))
     assert check_rig_file(tmp_path / "rig.toml", str(tmp_path / "log.csv"), (), False) == 0
-    assert "reversals loses about" in " ".join(capsys.readouterr().out.split())
+    assert "reversals about" in " ".join(capsys.readouterr().out.split())
 
 
 @pytest.mark.parametrize("lost", [True, False])

@@ -77,7 +77,7 @@ def test_advantagekit_names_a_module(tmp_path):
 
 
 @pytest.mark.parametrize(("change", "words"), [
-    (lambda b: b[:-3], "ends within a record"), (lambda b: b[:7] + b"\x02" + b[8:], "of another version"),
+    (lambda b: b[:-3], "ends within a record"), (lambda b: b[:7] + b"\x02" + b[8:], "with a version other than 1"),
     (lambda b: b[:12], "without signals"),
 ])  # fmt: skip
 def test_damaged_wpilog_is_refused(tmp_path, change, words):

@@ -124,7 +124,7 @@ def test_solver_table_of_a_file_is_read_and_options_win(tmp_path):
         (config.Loop, "[solver]\nseed = 3\n", r"c.toml, solver.seed: no such key; allowed: replicates, population"),
         (config.Check, "[solver]\nmembers = 3\n", r"c.toml, solver.members: no such key; this command has none"),
         (config.Loop, "solver = 3\n", r"c.toml, solver: got 3; expected a table, \[solver\]"),
-        (config.Loop, "replicates = 400\n[solver]\nreplicates = 300\n", r"solver.replicates: the file states replicates"),
+        (config.Loop, "replicates = 400\n[solver]\nreplicates = 300\n", r"solver.replicates: replicates is in the file twice"),
         (config.Loop, "[solver]\nreplicates = 3\n", r"c.toml, replicates: got 3; expected 250 to 100000"),
     ],
 )  # fmt: skip
@@ -159,10 +159,10 @@ def test_no_message_of_what_was_stated_by_options_names_a_field(tmp_path):
     fields = {n for kinds in KINDS.values() for k in kinds for n in options.options_of_fields(k) if "_" in n}
     assert len(rules) > 15 and [r for r in rules for n in fields if re.search(rf"(?<![`\w]){n}(?![`\w])", r)] == []
     given = {"left_V": 5.0, "battery": True}
-    with pytest.raises(BadConfiguration, match=r"^--left acts only with --right; state both$"):
+    with pytest.raises(BadConfiguration, match=r"^--left needs --right; give both$"):
         config.resolve_configuration(config.Simulate, None, given)
     (tmp_path / "a.toml").write_text("left_V = 5.0\n")
-    with pytest.raises(BadConfiguration, match=r"^a\.toml: left_V acts only with right_V; state both$"):
+    with pytest.raises(BadConfiguration, match=r"^a\.toml: left_V needs right_V; give both$"):
         config.resolve_configuration(config.Simulate, tmp_path / "a.toml", {})
     with pytest.raises(BadConfiguration, match=r"^--left: got 50000\.0; "):
         config.resolve_configuration(config.Simulate, None, {"left_V": 50000.0, "right_V": 1.0})
@@ -183,7 +183,7 @@ def test_a_file_runs_no_code_unless_it_is_trusted(mmrjax, tmp_path, command, tex
     (tmp_path / "own.py").write_text(HARM)
     (tmp_path / "plan.toml").write_text(text)
     asks = (*command, "--config", "plan.toml", "--out", "x")
-    _, out, _ = ends(mmrjax(*asks), f"would run code, which a file cannot ask for; state {option} on the command")
+    _, out, _ = ends(mmrjax(*asks), f"would run code, which a file may not request; give {option} on the command")
     assert not out and sorted(p.name for p in tmp_path.iterdir()) == ["own.py", "plan.toml"]
     if option == "--effects":
         for how in (("--trust",), ("--effects", "own.py")):

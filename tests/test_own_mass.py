@@ -215,7 +215,7 @@ def test_a_surface_other_than_the_robots_is_said(robot):
     said = own_mass.mass_notes(robot, table({"6T2A": 13.1, "4W2T": 11.5}, surface="asphalt"))
     assert said == [
         "the table has runs on asphalt: the written friction is for lacquered_wood; simulate with "
-        "--surface asphalt to meet what was fitted"
+        "--surface asphalt to use the fitted values"
     ]
     assert own_mass.mass_notes(robot, table({"6T2A": 13.1, "4W2T": 11.5}, surface="lacquered_wood")) == []
 

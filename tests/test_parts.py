@@ -158,7 +158,9 @@ def test_parts_columns_are_those_of_the_sheets(tmp_path, monkeypatch):
     with pytest.raises(BadData, match=r"cells.csv row 2, capacity_mAh: got '2.2 Ah'; expected a number or nothing"):
         read()
     write(header, first[:-1])
-    with pytest.raises(BadData, match=r"cells\.csv row 2: got another number of cells than columns, 14"):
+    with pytest.raises(
+        BadData, match=r"cells\.csv row 2: the number of cells differs from the number of columns, 14"
+    ):
         read()
     write(header[:-1], first[:-1])
     with pytest.raises(BadData, match=r"cells\.csv: got the columns"):

@@ -33,7 +33,7 @@ def test_a_run_that_would_tip_is_said_to(flush):
         {**flush.table, "margin_mm": np.array([-3.0])}, flush.rest, flush.step, flush.over
     )
     assert posture_words.tipping_remarks(tipping) == [
-        "posture: the run would tip over on that slope; currents and speeds are of a robot that is held on it"
+        "posture: the run would tip over on that slope; currents and speeds are for a robot that is held upright on it"
     ]
 
 
@@ -56,7 +56,7 @@ def test_one_pair_alone_leaves_the_other_as_the_robot_states_it(robot):
     [
         (
             {"configuration": "4W2T", "levers_rear_deg": 10.0},
-            "--levers-rear: 4W2T has no levers; those that have: 6T2A",
+            "--levers-rear: 4W2T has no levers; configurations with levers: 6T2A",
         ),
         ({"levers_front_deg": 200.0}, "levers_front_deg: got 200; expected -180 to 180"),
     ],

@@ -10,7 +10,7 @@ from scipy import stats
 
 from calibration.data import robot_file
 from calibration.data.runs import Runs
-from calibration.discovery import findings, prediction
+from calibration.discovery import findings, mechanism, prediction
 from calibration.discovery.discover import discover
 from calibration.discovery.prediction import Gain, HeldOutScore, score_readings, smallest_predictive_set
 from calibration.inference.blocks import distinct_blocks, predictable_blocks, unpredictable_kinds
@@ -32,6 +32,24 @@ def runs():
         "speed_mm_s": 700 + np.arange(rows, dtype=float),
     }  # fmt: skip
     return Runs("a table", columns)
+
+
+def test_predictions_that_were_scored_before_are_those_of_the_first_time(runs, monkeypatch):
+    """They decide if a model describes the runs at all. Without them every model with effects was `undescribed`."""
+    measured, calls = runs.measured(), []
+    monkeypatch.setattr(
+        prediction, "predict_unseen", lambda *a: calls.append(a) or SimpleNamespace(reading=measured + 1)
+    )
+    monkeypatch.setattr(prediction.blocks_room, "predictable_blocks", lambda *_: {"slope": {"0": np.ones(12, bool)}})
+    space = SimpleNamespace(
+        equipped=SimpleNamespace(data=SimpleNamespace(measured=measured, sd=np.ones_like(measured))),
+        weight=np.ones_like(measured), bare=None, fit_of=lambda active, z: (None, z, active),
+    )  # fmt: skip
+    candidate, predicted = SimpleNamespace(active=("churning",), z=np.zeros(2)), {}
+    first, again = (mechanism.scored_once(space, runs, candidate, predicted) for _ in range(2))
+    assert len(calls) == 1
+    assert_array_equal(first.reading["slope"], measured + 1)
+    assert_array_equal(again.reading["slope"], measured + 1)
 
 
 def test_score_is_the_log_density_and_what_is_not_reached_counts(runs):

@@ -157,4 +157,4 @@ def test_what_follows_is_of_the_leader_that_was_chosen(traced, monkeypatch):
         found = HELD.result(other, RUNS)
         assert [next(iter(e.members)) for e in found.effects] == list(other.best.effects)
         assert {e.name for e in found.robot.effects} == set(other.best.effects)
-        assert any("comes first in its class by errors held out" in n for n in found.notes)
+        assert any("is listed first in its class because of held-out errors" in n for n in found.notes)

@@ -85,7 +85,7 @@ def test_a_weakened_field_is_noted(tmp_path, along_d, noted):
     log = {**VESC, "d_axis_current": [along_d, -along_d, along_d]}
     rig = robot(tmp_path, "total_current", "motor_current", "motor_speed")
     notes = records.read_runs(log, rig, columns="vesc,pole_pairs=7").notes
-    assert any("field is weakened" in note for note in notes) == noted
+    assert any("field weakening" in note for note in notes) == noted
 
 
 def test_simplefoc_prints_milliamperes_and_no_header(tmp_path):
@@ -234,7 +234,7 @@ WRONG = {
     "another name": ("vesk", r"got vesk; no such file and no packaged preset; did you mean vesc\?"),
     "a number that is none": ("vesc,pole_pairs=x", "got pole_pairs=x; expected a name and a number"),
     "no poles": ("vesc,pole_pairs=0", "pole_pairs: got 0; expected a number that is not 0"),
-    "another number": ("moteus,pole_pairs=7", "got pole_pairs; it asks for no number"),
+    "another number": ("moteus,pole_pairs=7", "got pole_pairs; it defines no numbers under"),
 }
 FILES = {
     "another column": ('[columns]\nmotor_sped_rpm = "n"', "columns.motor_sped_rpm: no such column of a table"),
@@ -243,7 +243,7 @@ FILES = {
     "a factor of nothing": ('[columns]\ntime_s = {column = "t", factor = 0}', "factor: got 0; expected a number"),
     "a number without a name": (
         '[columns]\ntime_s = {column = "t", per = "n"}',
-        r"got n; expected a number that \[ask\] names",
+        r"got n; expected one of the numbers defined under \[ask\]",
     ),
     "a part of a bit": (
         '[columns]\ntime_s = {column = "t", sign_bit = 1.5}',

@@ -59,7 +59,7 @@ def test_a_folder_that_others_could_change_is_not_used_and_that_is_said(cache, c
         assert exposure_reason(cache) == reason
         jax.config.update("jax_compilation_cache_dir", None)  # as in a process that begins
         assert compilation_cache.keep_programs() is None
-        assert f"compiled programs are not kept: {reason}" in capsys.readouterr().err.replace("\n", " ")
+        assert f"compiled programs are not cached: {reason}" in capsys.readouterr().err.replace("\n", " ")
         assert not programs._private(str(cache))
         assert compilation_cache.describe_cache() == f"{cache}: not used, since {reason}"
     finally:

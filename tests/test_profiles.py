@@ -141,7 +141,7 @@ def test_supply_voltage_beside_the_battery_is_refused(read):
     table = read("time_s,supply_voltage_V\n0,24\n1,24\n")
     table.check_source(battery=False)
     with pytest.raises(
-        BadConfiguration, match=r"--battery: got it together with mission.csv, which states supply_voltage_V"
+        BadConfiguration, match=r"--battery: got it together with mission.csv, which contains supply_voltage_V"
     ):
         table.check_source(battery=True)
 
@@ -160,8 +160,8 @@ WRONG = {
     "gap in the time": ("time_s,duty\n0,1\n,1\n9,1\n", r"row 2, time_s: got an empty cell; expected a number, 0 to 1e\+06"),
     "gap at a ramp's end": (_LINEAR + "time_s,duty,slope_deg\n0,1,0\n5,1,\n", r"row 2, slope_deg: got an empty cell"),
     "gap in the surface": ("time_s,duty,surface\n0,1,asphalt\n5,1,\n9,1,\n", r"row 2, surface: got an empty cell; expected one of"),
-    "two demands": ("time_s,motor_speed_rpm,speed_mm_s\n0,3000,\n5,3000,400\n6,3000,\n", r"row 2, speed_mm_s: got 400 in addition to motor_speed_rpm; expected one demand in a row"),
-    "duty beside a speed": ("time_s,duty,speed_mm_s\n0,0.5,400\n5,,400\n", r"row 1, speed_mm_s: got 400 in addition to duty; expected one demand in a row"),
+    "two demands": ("time_s,motor_speed_rpm,speed_mm_s\n0,3000,\n5,3000,400\n6,3000,\n", r"row 2, speed_mm_s: got 400 in addition to motor_speed_rpm; expected one demand per row"),
+    "duty beside a speed": ("time_s,duty,speed_mm_s\n0,0.5,400\n5,,400\n", r"row 1, speed_mm_s: got 400 in addition to duty; expected one demand per row"),
     "demand beside another mode": ("time_s,speed_mm_s,mode\n0,400,brake\n5,,brake\n", r"row 1, speed_mm_s: got 400 in addition to mode brake"),
     "no demand": ("time_s,duty,speed_mm_s\n0,1,\n5,,\n9,,400\n", r"row 2: got no demand; expected a value in one of duty, speed_mm_s, or brake or coast"),
     "mode without its column": ("time_s,mode\n0,speed\n5,speed\n", r"row 1, mode: got speed; expected a column with that demand, such as speed_mm_s"),
@@ -183,12 +183,12 @@ WRONG = {
     "NaN": ("time_s,duty\n0,nan\n5,1\n", r"row 1, duty: got nan; expected -1 to 1"),
     "infinite time": ("time_s,duty\n0,1\ninf,1\n", r"row 2, time_s: got inf; expected 0 to 1e\+06"),
     "a word": ("time_s,slope_deg\n0,steep\n5,1\n", r"row 1, slope_deg: got steep; expected a number, -45 to 45"),
-    "empty file": ("", r"mission.csv: the file is empty; expected a header that has time_s"),
+    "empty file": ("", r"mission.csv: the file is empty; expected a header that includes time_s"),
     "comments only": ("# cycles = 3\n", r"mission.csv: the file is empty"),
     "header only": ("time_s,duty\n", r"got a header and no rows; expected two rows or more"),
-    "one row only": ("time_s,duty\n0,1\n", r"got one row; expected two rows or more; the last one ends the mission"),
+    "one row only": ("time_s,duty\n0,1\n", r"got one row; expected two rows or more, of which the last ends the mission"),
     "a short row": ("time_s,duty\n0,1\n5\n", r"row 2: got 1 cell; the header has 2 columns"),
-    "commas and points": ("time_s;duty\n0;0,5\n5;0.5\n", r"duty: got 0,5 and 0\.5; expected decimal commas or points"),
+    "commas and points": ("time_s;duty\n0;0,5\n5;0.5\n", r"duty: got 0,5 and 0\.5; expected either decimal commas or decimal points"),
     "unknown surface": ("time_s,duty,surface\n0,1,ice\n5,1,ice\n", r"row 1, surface: got ice; expected one of these; .*asphalt"),
     "no cycles": ("# cycles = 0\ntime_s,duty\n0,1\n5,1\n", r"mission.csv, cycles: got 0; expected a whole number from 1"),
     "half a cycle": ("# cycles = 1.5\ntime_s,duty\n0,1\n5,1\n", r"cycles: got 1.5; expected a whole number"),
@@ -200,11 +200,11 @@ WRONG = {
     "one side's voltage": ("time_s,voltage_right_V\n0,1\n5,1\n", r"got voltage_right_V without voltage_left_V; expected both"),
     "duties and voltages": ("time_s,duty_left,duty_right,voltage_left_V,voltage_right_V\n0,1,1,,\n5,1,1,,\n", r"got duty_left together with voltage_left_V; expected one of the two"),
     "duty beside duties": ("time_s,duty,duty_left,duty_right\n0,,1,1\n5,,1,1\n", r"got duty together with duty_left; expected one"),
-    "gap in a side": ("time_s,duty_left,duty_right\n0,1,\n5,1,1\n", r"row 1, duty_right: got an empty cell; expected a value for either side"),
-    "duties beside a speed": ("time_s,duty_left,duty_right,speed_mm_s\n0,1,1,300\n5,1,1,\n", r"row 1, speed_mm_s: got 300 in addition to duty_left; expected one demand in a row"),
+    "gap in a side": ("time_s,duty_left,duty_right\n0,1,\n5,1,1\n", r"row 1, duty_right: got an empty cell; expected a value for each side"),
+    "duties beside a speed": ("time_s,duty_left,duty_right,speed_mm_s\n0,1,1,300\n5,1,1,\n", r"row 1, speed_mm_s: got 300 in addition to duty_left; expected one demand per row"),
     "yaw rate without a speed": ("time_s,yaw_rate_rad_s,duty\n0,1,1\n5,1,1\n", r"got yaw_rate_rad_s without speed_mm_s; expected a demanded ground speed"),
     "gap in the yaw rate": ("time_s,speed_mm_s,yaw_rate_deg_s\n0,300,\n5,300,10\n", r"row 1, yaw_rate_deg_s: got an empty cell; expected the demanded yaw rate, 0 for straight travel"),
-    "yaw rate of a braked robot": ("time_s,speed_mm_s,yaw_rate_rad_s,mode\n0,,1,brake\n5,,,\n", r"row 1, yaw_rate_rad_s: got 1; expected an empty cell: a yaw rate goes with a demanded speed, and this row has mode brake"),
+    "yaw rate of a braked robot": ("time_s,speed_mm_s,yaw_rate_rad_s,mode\n0,,1,brake\n5,,,\n", r"row 1, yaw_rate_rad_s: got 1; expected an empty cell: a yaw rate needs a demanded speed, but this row has mode brake"),
     "setting twice": ("# cycles = 4\n# cycles = 4\ntime_s,duty\n0,1\n5,1\n", r"cycles is set twice"),
 }  # fmt: skip
 

@@ -489,7 +489,7 @@ REFUSED = {
         lambda r, t: mm.read_runs(t.assign(total_current_sd_A=-1.0)), BadData, "total_current_sd_A: got -1; expected more"
     ),
     "one name twice": (
-        lambda r, t: mm.read_runs(pd.concat([t, t["slope_deg"]], axis=1)), BadData, "slope_deg: has the name of another"
+        lambda r, t: mm.read_runs(pd.concat([t, t["slope_deg"]], axis=1)), BadData, "slope_deg: has the same name as another"
     ),
     "complex readings": (
         lambda r, t: mm.read_runs(t.assign(total_current_A=1j)), BadData, "total_current_A: holds complex numbers"

@@ -88,7 +88,7 @@ def test_rows_that_nothing_was_recorded_in_are_left_out(tmp_path):
     data, file = made("odrive", tmp_path)
     read = runs.read_runs(data, robot_file.read_robot(file))
     assert any("2 rows without any reading left out" in note for note in read.notes)
-    assert any("5 rows at the end left out: the clock is back at 0" in note for note in read.notes)
+    assert any("5 rows at the end left out, because the clock restarts at 0" in note for note in read.notes)
     assert (np.diff(read["time_s"]) > 0).all() and read["time_s"][-1] == pytest.approx(399 * 0.00625, rel=0.05)
 
 

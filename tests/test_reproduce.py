@@ -85,7 +85,9 @@ def test_robot_of_another_kind_is_shown_and_not_set_against_the_bench(reproduced
     (tmp_path / "crawler.toml").write_text('configurations = ["crawler"]\n[crawler]\nlike = "6T2A"\n')
     code, folder = reproduced("--robot", tmp_path / "crawler.toml")
     assert code == 0
-    assert "the paper's runs are of 6T2A, 4W2T; none of them is this robot's" in capsys.readouterr().err
+    assert (
+        "the paper's runs use the configurations 6T2A, 4W2T; this robot has none of them" in capsys.readouterr().err
+    )
     page = (folder / "report.html").read_text()
     assert drawn(page) == FIGURES - {"rows", "fig28_current_over_slope", "fig29_model_errors"}
     assert "not set against the bench" in page and not (folder / "rows.csv").exists()

@@ -171,7 +171,7 @@ def test_runs_without_ripple_are_shown_as_what_they_are(tracked):
         if key.endswith(("_percent", "_Hz", "mm_s")):
             table[key][:] = np.nan
     none = dataclasses.replace(found, table=table, peaks=[], crossings=[])
-    assert none.statement() == "No run of 6T2A travels: there is no ripple to read (status says why)."
+    assert none.statement() == "No run of 6T2A travels, so there is no ripple (status gives the reason)."
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -198,17 +198,17 @@ def test_shaking_gear_says_what_does_not_settle(tmp_path):
     assert command([*SMALL, *changes, "--out", out]) == 0
     result = read_json(out / "result.json")
     assert result["statuses"]["converged"] < result["runs"] and result["restless_m_s"]
-    assert "Pitch has no one frequency" in result["statement"]
+    assert "Pitch has no single frequency" in result["statement"]
 
 
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
         (("--set", "running_gear.guide_reces=1e-4"), "guide_recess"),
-        (("--voltages", ""), "--voltages: got nothing; expected numbers as 0,5,10"),
+        (("--voltages", ""), "--voltages: got nothing; expected numbers such as 0,5,10"),
         (("--voltages", "36:10:1"), "--voltages: got 36:10:1, which ends before it begins; expected first:last:step"),
         (("--voltages", "24,24,33"), "--voltages: got 2 of them; expected at least 5"),
-        (("--voltages", "0:30:5"), "--voltages: got 0; expected more than 0 to 100"),
+        (("--voltages", "0:30:5"), "--voltages: got 0; expected above 0 and up to 100"),
         (("--payloads", "0,-1"), "--payloads: got -1.0; expected 0 to 300"),
         (("--slope", "60"), "--slope: got 60.0; expected -45 to 45"),
         (("--surface", "ice"), "surface"),

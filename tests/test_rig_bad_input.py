@@ -41,11 +41,11 @@ def table(tmp_path, *rows, header="motor_speed_rpm,total_current_A"):
 FILES = {
     "a key misspelt": (
         BRAKE.replace("inertia = ", "inertai = "),
-        r"rig\.toml: brake\.inertia \[kg·m\^2\] is missing, .*; is brake\.inertai meant to be brake\.inertia\?$",
+        r"rig\.toml: brake\.inertia \[kg·m\^2\] is missing; .*; is brake\.inertai meant to be brake\.inertia\?$",
     ),
     "no base": (
         BRAKE.replace('base = "none"', ""),
-        r'brake: not among the configurations, .*, or state base = "none" for a rig that starts from nothing$',
+        r'brake: not one of the configurations .*, or set base = "none" for a rig that is described completely in this file$',
     ),
     "a plus for a ±": (
         BRAKE.replace("0.041 ± 3 %", "0.041 + 3 %"),
@@ -57,7 +57,7 @@ FILES = {
     ),
     "another key": (
         'colour = "red"\n' + BRAKE,
-        r"colour: no such parameter; the robot has .*; a file may state base, ",
+        r"colour: no such parameter; the robot has .*; a file may also contain base, ",
     ),
     "a key of the rig misspelt": (
         BRAKE.replace("imposed", "impose"),
@@ -87,7 +87,7 @@ def test_a_folder_is_no_rigs_file(tmp_path):
 @pytest.mark.parametrize("rows", [("900,-0.6", "1800,-0.7"), ("900,-0.6", "1800,0.7", "-900,-0.6")])
 def test_a_current_against_the_imposed_speed_is_refused_forward_too(tmp_path, rows):
     robot = rig_of(tmp_path, BRAKE)
-    message = r"t\.csv row 1, total_current_A: got -0\.6 at 900 rpm; nothing else drives the motors there, so expected a reading"
+    message = r"t\.csv row 1, total_current_A: got -0\.6 at 900 rpm; only this drives the motors, so the reading should have its sign"
     with pytest.raises(BadData, match=message):
         records.read_runs(table(tmp_path, *rows), robot=robot)
 
@@ -116,9 +116,7 @@ def test_rig_check_says_what_a_file_without_base_takes(tmp_path, capsys):
         rig_check.check_rig_file(text_file(tmp_path / "rig.toml", "[motor]\nresistance = 0.6\n"), None, (), False)
         == 0
     )
-    assert 'is its base\'s, a packaged robot (base = "none" starts from nothing)' in " ".join(
-        capsys.readouterr().out.split()
-    )
+    assert "come from its base, a packaged robot, unless base is none" in " ".join(capsys.readouterr().out.split())
 
 
 @pytest.mark.slow

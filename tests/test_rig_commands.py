@@ -165,23 +165,23 @@ def test_a_profile_turns_a_bench(mmrjax, tmp_path):
 
 
 REFUSED = {
-    "no voltage": ("bench", False, "simulate", r"--voltage: not stated, and the robot's file has no motor\.voltage_l"),
-    "no speed": ("bench", True, "simulate", r"--motor-speed: not stated, .* as --motor-speed 3000"),
+    "no voltage": ("bench", False, "simulate", r"--voltage: not given, and the robot's file has no motor\.voltage_l"),
+    "no speed": ("bench", True, "simulate", r"--motor-speed: not given, .* such as --motor-speed 3000"),
     "voltage of an imposed speed": (
-        "bench", True, "simulate --voltage 12", r"--voltage: the motors' speed is imposed .* state --motor-speed",
+        "bench", True, "simulate --voltage 12", r"--voltage: the motors' speed is imposed .* give --motor-speed",
     ),
     "speed of an imposed voltage": (
-        "bench", False, "simulate --motor-speed 900", r"--motor-speed: the voltage is imposed .* state --voltage",
+        "bench", False, "simulate --motor-speed 900", r"--motor-speed: the voltage is imposed .* give --voltage",
     ),
     "slope": ("bench", False, "simulate --voltage 9 --slope 5", r"--slope: the robot's load is a shaft"),
     "payload": ("linear", False, "simulate --voltage 9 --payload 1", r"--payload: the robot's load is a"),
     "mass": ("bench", False, "simulate --voltage 9 --mass 5", r"--mass: the robot's load is a shaft"),
     "surface": ("bench", False, "simulate --voltage 9 --surface x", r"--surface: the robot's load is a"),
-    "battery": ("bench", False, "simulate --battery", r"--battery: the robot's file states no battery"),
+    "battery": ("bench", False, "simulate --battery", r"--battery: the robot's file has no battery"),
     "battery of an imposed speed": ("bench", True, "simulate --battery", r"--battery: the motors' speed is imposed"),
     "a pendulum's steady state": ("pendulum", False, "simulate --voltage 3", r"arm .* has no steady state"),
     "a pendulum's profile": (
-        "pendulum", False, "simulate --profile shuttle", r"--profile: arm is an arm whose gravity load varies with its angle",
+        "pendulum", False, "simulate --profile shuttle", r"--profile: arm is an arm, whose gravity load varies with its angle",
     ),
     "an imposed speed's profile": (
         "bench", True, "simulate --profile shuttle", r"--profile: the motors' speed is imposed on this robot",
@@ -189,8 +189,8 @@ REFUSED = {
     "a shaft's travel": (
         "bench", False, "simulate --voltage 9 --profile shuttle", r"shuttle.*load is a shaft",
     ),
-    "no axis": ("bench", False, "sweep", r"--voltages: not stated, .* state it \[V\], as --voltages 6,12,24"),
-    "no axis of speed": ("wheeled", True, "sweep", r"--motor-speeds: not stated, .* --motor-speeds 1000,2000"),
+    "no axis": ("bench", False, "sweep", r"--voltages: not given, .* give it \[V\], such as --voltages 6,12,24"),
+    "no axis of speed": ("wheeled", True, "sweep", r"--motor-speeds: not given, .* --motor-speeds 1000,2000"),
     "axis of slopes": ("bench", False, "sweep --voltages 9 --slopes 0,5", r"--slopes: the robot's load"),
     "axis of voltages": ("wheeled", True, "sweep --voltages 9", r"--voltages: the motors' speed is imposed"),
     "picture": ("bench", False, "render x.png --voltage 9", r"render: the robot's load is a shaft"),
@@ -205,7 +205,7 @@ REFUSED = {
         "bench", False, "simulate --voltage 9 --model track", r"--model track: the robot's load is a shaft",
     ),
     "resonance": ("bench", False, "resonance", r"resonance: the robot's load is a shaft"),
-    "requirements": ("bench", False, "check", r"check: the robot's load is a shaft, which has no wheels"),
+    "requirements": ("bench", False, "check", r"check: the robot's load is a shaft, without wheels"),
     "the paper's figures": ("bench", False, "reproduce", r"reproduce: the robot's load is a shaft"),
     "steepest slope": (
         "bench", False, "sensitivity --voltages 9 --outputs steepest_slope",
@@ -213,12 +213,12 @@ REFUSED = {
     ),
     "a stance": (
         "wheeled", False, "sensitivity --voltages 9 --outputs pitch",
-        r"--outputs pitch: the robot's file states no running_gear",
+        r"--outputs pitch: the robot's file has no running_gear",
     ),
     "a pendulum's sensitivity": (
         "pendulum", False, "sensitivity --voltages 3", r"--model steady: arm .* has no steady state",
     ),
-    "sensitivity": ("bench", False, "sensitivity", r"--voltages: not stated"),
+    "sensitivity": ("bench", False, "sensitivity", r"--voltages: not given"),
     "varied slope": (
         "bench", False, "sensitivity --voltages 9 --vary slope_deg=0:5", r"--vary slope_deg: the robot's lo",
     ),
@@ -252,7 +252,7 @@ def test_levels_are_thirds_of_the_limit_to_two_digits(tmp_path):
     found = imposed.imposed_levels(robot, "--motor-speeds", notes)
     assert all(0.9 * share * top < level <= share * top for level, share in zip(found, imposed.SHARES, strict=True))
     assert notes == [
-        "--motor-speeds: not stated; thirds of the speed_limit of the robot's file are taken: 1500,3100,4700"
+        "--motor-speeds: not given; thirds of the speed_limit in the robot's file are used: 1500,3100,4700"
     ]
 
 
@@ -264,7 +264,7 @@ def test_a_sweep_of_a_bench_has_one_axis(mmrjax, tmp_path):
     rig = of_kind(tmp_path, "bench")
     _, out, err = ends(
         mmrjax("sweep --robot", rig, "--set", "motor.voltage_limit=24", "--out", "run"),
-        "thirds of the voltage_limit of the robot's file are taken: 8,16,24",
+        "thirds of the voltage_limit in the robot's file are used: 8,16,24",
         code=0,
     )
     table = rows_of(tmp_path / "run" / "runs.csv")
@@ -293,7 +293,7 @@ def test_a_sweep_into_a_store_knows_what_is_imposed(mmrjax, tmp_path):
     assert words_of_others(out, *left_in(tmp_path / "run")) == []
     plan = tmp_path / "plan.toml"
     plan.write_text(f'robot = "{rig.name}"\n[axes]\n"bench.loss_coulomb" = [0.05, 0.07]\n')
-    ends(mmrjax("sweep", plan), "plan.toml, conditions.motor_speed: not stated")
+    ends(mmrjax("sweep", plan), "plan.toml, conditions.motor_speed: not given")
     plan.write_text(f'robot = "{rig.name}"\n[axes]\nslope_deg = [0, 5]\n[conditions]\nmotor_speed = 100.0\n')
     ends(mmrjax("sweep", plan), "plan.toml, slope_deg: the robot's load is a shaft")
     plan.write_text(f'robot = "{rig.name}"\n[axes]\nvoltage = [9, 12]\n')
@@ -317,7 +317,7 @@ def test_a_vehicle_is_drawn(mmrjax, tmp_path):
         code=0,
     )
     assert (tmp_path / "x.png").stat().st_size > 1000
-    assert "states no running_gear" in err and words_of_others(out, err) == []
+    assert "has no running_gear" in err and words_of_others(out, err) == []
 
 
 # --- measured tables ----------------------------------------------------------------------------------------------

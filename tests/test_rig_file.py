@@ -298,14 +298,14 @@ def test_wheels_whose_inertia_is_not_stated_are_disks_of_a_share_of_the_mass(tmp
     assert same(again(tmp_path, robot), robot)
     (tmp_path / "rover.toml").write_text(ROVER, encoding="utf-8")
     found = {o.name: o for o in rig_facts.number_origins(robot_file.parse_robot_file(tmp_path / "rover.toml"))}
-    assert found["rover.inertia"].why == "not stated: assumed, wheels that are disks of 5 % of the mass"
+    assert found["rover.inertia"].why == "not stated: assumed, disk wheels with 5 % of the mass"
     stated = read(tmp_path, ROVER.replace("radius = 0.04", "radius = 0.04\ninertia = 0.003"))
     assert float(stated.configurations["rover"].inertia) == 0.003
 
 
 def test_a_robot_that_turns_states_its_wheelbase_and_is_written_with_it(tmp_path):
     turns = f"{ROVER}[rover.turning]\nwidth = 0.3\ninertia = 0.2\n"
-    with pytest.raises(BadConfiguration, match=r"running_gear\.wheelbase \[m\] is missing, which a robot with base"):
+    with pytest.raises(BadConfiguration, match=r"running_gear\.wheelbase \[m\] is missing; a robot with base"):
         read(tmp_path, turns)
     usual = float(read(tmp_path, ROVER).running_gear.wheelbase)  # an example's
     robot = read(tmp_path, f"{turns}[running_gear]\nwheelbase = {usual}\n")
@@ -316,7 +316,7 @@ def test_a_robot_that_turns_states_its_wheelbase_and_is_written_with_it(tmp_path
         for o in rig_facts.number_origins(robot_file.parse_robot_file(tmp_path / "turns.toml"))
         if "centre_height" in o.name
     ]
-    assert "an example's" in height.why
+    assert "an example value" in height.why
 
 
 LIMIT, PATH = "temperature_limit = 125.0\n", "resistance_thermal_winding = 1.7\nresistance_thermal_housing = 6.0\n"
@@ -344,9 +344,9 @@ def without(text, *keys):
 
 
 REFUSED = {
-    "no load": ('base = "none"\n[motor]\nresistance = 1.0\n', r"no load; expected a table such as \[bench\] with load"),
+    "no load": ('base = "none"\n[motor]\nresistance = 1.0\n', r"no load is defined; add a table such as \[bench\] with load"),
     "unknown base": ('base = "nothing"', r"base: got nothing; .*none"),
-    "vehicle without mass": (without(ROVER, "mass"), r'rig\.toml: rover\.mass \[kg\] is missing, which a robot with base'),
+    "vehicle without mass": (without(ROVER, "mass"), r'rig\.toml: rover\.mass \[kg\] is missing; a robot with base'),
     "all that is missing": (
         'base = "none"\n[bench]\nload = "shaft"\n',
         r"gearbox\.ratio \[-\], gearbox\.efficiency_load \[-\], motor\.torque_constant \[N·m/A\], motor\.resistance "
@@ -362,19 +362,19 @@ REFUSED = {
     ),
     "ratio upside down": (
         BENCH.replace("ratio = 16", "ratio = 0.0625"),
-        r"gearbox\.ratio: got 0\.0625; expected turns of the motor for one of the output, at least 1; is 16 meant\?",
+        r"gearbox\.ratio: got 0\.0625; expected motor turns per output turn, at least 1; is 16 meant\?",
     ),
     "vehicle and shaft": (
         BENCH + ROVER[ROVER.index("[rover]") :],
-        r"bench is a shaft and rover a vehicle; expected loads of one kind",
+        r"bench is a shaft and rover a vehicle; a file can describe only one kind",
     ),
     "unknown load": (BENCH.replace('"shaft"', '"shafts"'), r"bench\.load: got shafts; did you mean shaft\?"),
-    "shaft on wheels": (BENCH + 'movers = "wheels"', r"bench: states both load = 'shaft' and movers"),
+    "shaft on wheels": (BENCH + 'movers = "wheels"', r"bench: load = 'shaft' and movers contradict"),
     "not said what": (
         BENCH + "[other]\ninertia = 1.0\n",
-        r"other: its kind is missing; state load = one of shaft, linear, vehicle",
+        r"other: the kind of load is missing; set load = one of shaft, linear, vehicle",
     ),
-    "not among": ('configurations = ["bench"]' + BENCH + '[slow]\nload = "shaft"', r"slow: not among the configurations"),
+    "not among": ('configurations = ["bench"]' + BENCH + '[slow]\nload = "shaft"', r"slow: not one of the configurations"),
     "vehicle with a parameter of a shaft": (
         ROVER.replace("mass = 4.0", "mass = 4.0\ntorque_gravity = 1.0"),
         r"rover\.torque_gravity: no such parameter",
@@ -382,7 +382,7 @@ REFUSED = {
     "unknown imposed": (BENCH.replace('"motor_speed"', '"torque"'), r"imposed: got torque; allowed: voltage, motor_speed"),
     "imposed and read": (
         BENCH.replace('["total_current"]', '["motor_speed"]'),
-        r'channels: motor_speed is imposed, so it is no reading; remove it, or state imposed = "voltage"',
+        r'channels: motor_speed is imposed, so it cannot be a reading; remove it, or set imposed = "voltage"',
     ),
     "unknown channel": (
         BENCH.replace('["total_current"]', '["totalcurrent"]'),
@@ -403,21 +403,21 @@ REFUSED = {
     "odd instrument": (BENCH + "[instruments.total_current]\nstep = 1", r"total_current\.step: no such key; allowed: signed, quantum"),
     "negative step": (
         BENCH + "[instruments.total_current]\nquantum = -1",
-        r"quantum: got -1; expected the step of its readings, 0 or more A",
+        r"quantum: got -1; expected the resolution of its readings, 0 or more A",
     ),
-    "signed in words": (BENCH + '[instruments.total_current]\nsigned = "no"', r"signed: got 'no'; expected true, false: shows magnitude"),
+    "signed in words": (BENCH + '[instruments.total_current]\nsigned = "no"', r"signed: got 'no'; expected true, false \(shows only the magnitude\)"),
     "± nothing": (BENCH.replace("0.1 ± 0.05", "0.1 ± "), r"bench\.loss_coulomb: got '0\.1 ± '; expected a number, or one with"),
     "± less than zero": (BENCH.replace("0.1 ± 0.05", "0.1 ± -1"), r"the standard deviation must be 0 \(exact\) or more"),
-    "percent of zero": (BENCH.replace("0.1 ± 0.05", "0 ± 5 %"), r"0 has no percentage: state the standard deviation"),
+    "percent of zero": (BENCH.replace("0.1 ± 0.05", "0 ± 5 %"), r"a percentage of 0 is 0, so give the standard deviation itself"),
     "± out of bounds": (BENCH.replace("0.8 +- 0.03", "1.8 ± 0.1"), r"efficiency_load: got 1\.8; expected 0\.05 to 1"),
     "± of a rating": (BENCH + '[motor.x]\ny = 1\n', r"motor\.x\.y: no such parameter"),
     "two travels": (
         CARRIAGE.format(sides=1) + "mass_kg = 1.0\nlead_mm = 5.0\ndrum_radius_mm = 3.0\n",
-        r"carriage: got lead_mm and drum_radius_mm; expected one of them",
+        r"carriage: got lead_mm and drum_radius_mm; expected one of the two",
     ),
     "no travel": (CARRIAGE.format(sides=1) + "mass_kg = 1.0\n", r"carriage: got neither lead_mm nor drum_radius_mm"),
     "no mass": (CARRIAGE.format(sides=1) + "lead_mm = 1.0\n", r"carriage\.mass_kg: missing"),
-    "negative lead": (CARRIAGE.format(sides=1) + "mass_kg = 1.0\nlead_mm = -5.0\n", r"lead_mm: got -5\.0; expected a number more than 0"),
+    "negative lead": (CARRIAGE.format(sides=1) + "mass_kg = 1.0\nlead_mm = -5.0\n", r"lead_mm: got -5\.0; expected a number above 0"),
     "SI in a linear unit": (CARRIAGE.format(sides=1) + "mass = 1.0\nlead_mm = 5.0\n", r"carriage\.mass: no such key of a linear unit"),
     "like nobody": (BENCH + '[b]\nlike = "bensh"', r"b\.like: got bensh; did you mean bench\?"),
 }  # fmt: skip
@@ -449,7 +449,7 @@ def test_rig_new_writes_a_file_that_reads(mmrjax, tmp_path, kind):
 
 def test_rig_new_keeps_a_file_unless_forced(mmrjax, tmp_path):
     (tmp_path / "my-rig.toml").write_text("mine")
-    ends(mmrjax("rig new my-rig.toml"), "my-rig.toml: there already; --force replaces it")
+    ends(mmrjax("rig new my-rig.toml"), "my-rig.toml: already exists; --force replaces it")
     assert (tmp_path / "my-rig.toml").read_text() == "mine"
     assert mmrjax("rig new my-rig.toml --force")[0] == 0
     assert not robot_file.load_robot(str(tmp_path / "my-rig.toml")).has_ground
@@ -460,7 +460,7 @@ def test_rig_new_lists_the_kinds(mmrjax, tmp_path):
         mmrjax("rig new my-rig.toml --kind bensh"),
         "--kind: got bensh; did you mean bench? allowed: bench, dyno, pendulum, servo, linear, carriage, wheeled, tracked",
     )
-    ends(mmrjax("rig new nowhere/my-rig.toml"), "no such folder as nowhere")
+    ends(mmrjax("rig new nowhere/my-rig.toml"), "the folder nowhere does not exist")
     assert not list(tmp_path.iterdir())
 
 
@@ -484,7 +484,8 @@ def test_a_fit_says_which_numbers_are_a_templates(mmrjax, tmp_path):
     (tmp_path / "rig.toml").write_text(text)
     _, _, err = ends(mmrjax("calibrate measured --robot rig.toml --out c"), code=4)
     assert (
-        "rig.toml: still the template's, so the fit takes ± 300 % where they have ±: motor.torque_constant, " in err
+        "rig.toml: still the example numbers of the template, so the fit uses ± 300 % for those with ±: motor.torque_constant, "
+        in err
     )
     assert "motor.resistance" not in err
 
@@ -509,7 +510,7 @@ def test_rig_check_says_what_a_file_is(mmrjax, bench):
     assert (code, err) == (0, "")
     assert "One motor drives, through its gearbox 20 : 1, bench: a shaft of 0.002 kg·m²." in out
     assert "10 lines still hold the number of an example" in out
-    assert "382 rpm/V" in out and "LOOK" not in out and "Without data" in out
+    assert "382 rpm/V" in out and "LOOK" not in out and "No data given" in out
 
 
 @pytest.mark.slow
@@ -529,12 +530,12 @@ def test_rig_check_says_what_a_table_can_determine(mmrjax, bench):
         "motor.friction_coulomb", "motor.friction_viscous", "gearbox.efficiency_load",
     }  # fmt: skip
     assert shares["motor.torque_constant"] < 0.2 and shares["bench.loss_viscous"] < 0.3
-    assert "would not be determined by these runs" in found["statement"]
+    assert "are not determined by these runs" in found["statement"]
 
 
 def test_rig_check_of_data_says_the_same_in_words(mmrjax, bench):
     _, out, _ = ends(mmrjax("rig check my-rig.toml runs.csv"), "total_current_A, yours total_current_mA", code=0)
-    assert re.search(r"total_current .*signed +(assumed, 2 %, as total_curr|estimated by how readings)", out)
+    assert re.search(r"total_current .*signed +(assumed, 2 %, as total_curr|estimated from the scatter)", out)
     assert "gearbox.efficiency_load" in out and "not determined" in out
     assert "room: without a role" in out and "add output_torque to channels" in out
 
@@ -550,14 +551,18 @@ def test_rig_check_ends_with_2_for_the_file_and_4_for_the_data(mmrjax, bench, tm
 
 ODD = {
     "constant in mN·m/A": ("torque_constant = 0.05", "torque_constant = 5.0", "is torque_constant in N·m/A?"),
-    "efficient stages": ("ratio = 16", "ratio = 300", "an efficiency of 0.9 is more than three stages"),
+    "efficient stages": (
+        "ratio = 16",
+        "ratio = 300",
+        "an efficiency of 0.9 is higher than usual for three or more stages",
+    ),
     "nothing geared": (
         "ratio = 16\nefficiency_load = 0.9",
         "ratio = 1\nefficiency_load = 0.5",
         "is the ratio missing?",
     ),
-    "stuck": ("loss_coulomb = 0.1", "loss_coulomb = 40.0", "above the stall current 12 A at 12 V, so it stands"),
-    "rotor in g·cm²": ("[gearbox]", "inertia = 0.02\n[gearbox]", "look at motor.inertia (1 g·cm² is 1e-7 kg·m²)"),
+    "stuck": ("loss_coulomb = 0.1", "loss_coulomb = 40.0", "above the stall current 12 A at 12 V, so it cannot move"),
+    "rotor in g·cm²": ("[gearbox]", "inertia = 0.02\n[gearbox]", "check motor.inertia (1 g·cm² is 1e-7 kg·m²)"),
     "voltage beyond the speed": (
         "voltage_limit = 12.0",
         "voltage_limit = 120.0",
@@ -593,12 +598,12 @@ def test_facts_say_which_number_to_look_at(tmp_path, case):
 def test_facts_of_an_arm_and_a_vehicle_by_hand(tmp_path):
     arm = read(tmp_path, SOUND + "torque_gravity = 0.5\n")
     found = {f.what: f for f in rig_facts.derived_facts(arm)}
-    assert found["bench: swings as a pendulum of"].value == f"{1e3 * 0.001 * GRAVITY / 0.5:.3g} mm"
+    assert found["bench: length of a pendulum with the same period"].value == f"{1e3 * 0.001 * GRAVITY / 0.5:.3g} mm"
     current = (0.6 / (16 * 0.9) + 0.002) / 0.05
-    assert found["bench: current to hold and lift the arm"].value == f"{current:.3g} A each motor"
+    assert found["bench: current to hold and lift the arm"].value == f"{current:.3g} A per motor"
     rover = read(tmp_path, ROVER.replace("[gearbox]", "voltage_limit = 12.0\n[gearbox]"))
     found = {f.what: f for f in rig_facts.derived_facts(rover)}
-    assert found["rover: steepest slope that the ground holds"].value == "27°"
+    assert found["rover: steepest slope without sliding"].value == "27°"
     assert found["rover: speed without load at 12 V"].value == f"{12 / 0.05 / 16 * 0.04:.3g} m/s"
     assert found["rover: steepest slope that the stall torque holds at 12 V"].value == "any"
 

@@ -128,7 +128,7 @@ def test_losses_that_a_model_leaves_at_0_are_free_up_to_a_share_of_the_stall_tor
         assert found[f"{losses}.loss_coulomb"] == 0
         assert sds[f"{losses}.loss_coulomb"] == pytest.approx(0.05 * 20 * constant * 24 / resistance, rel=0.03)
     elif motor != "sheet":
-        assert '0 is held at 0, "0.0 ± 0.01" frees it' in rig and f"{losses}.loss_coulomb" not in sds
+        assert 'a value of 0 stays fixed, "0.0 ± 0.01" is fitted' in rig and f"{losses}.loss_coulomb" not in sds
 
 
 def test_losses_of_a_model_without_motor_constants_keep_the_lines_of_the_template(tmp_path):
@@ -158,7 +158,7 @@ def test_name_with_a_line_break_stays_in_its_comment(tmp_path):
         ('<mass value="0.32"/>', '<mass value="-1"/>', "left_wheel_joint", r"link left_wheel, <mass>: got value -1; expected 0 kg"),
         ('<mass value="0.32"/>', '<mass value="${m}"/>', "left_wheel_joint", r"got '\$\{m\}'; expected a number \[kg\]; run xacro"),
         ('izz="6.8e-4"', 'izz="0"', "left_wheel_joint", r"<inertia>: got 0 kg·m² about the axis of left_wheel_joint"),
-        ('<link name="tool">', '<a:arg xmlns:a="http://www.ros.org/wiki/xacro"/><link name="tool">', "arm_joint", r"r.urdf: has elements of xacro; run"),
+        ('<link name="tool">', '<a:arg xmlns:a="http://www.ros.org/wiki/xacro"/><link name="tool">', "arm_joint", r"r.urdf: contains xacro elements; run"),
         ("inertial>", "inert>", "left_wheel_joint", r"link left_wheel: no <inertial>"),
         ("<robot", "<robot><joint", "arm_joint", r"r.urdf: not a readable XML file \(mismatched tag"),
         ("mechanicalReduction>34", "mechanicalReduction>0.1", "left_wheel_joint", r"left_drive, <mechanicalReduction>: got 0.1;"),

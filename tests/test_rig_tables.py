@@ -160,13 +160,13 @@ REFUSED = {
     "no channel": (
         bench,
         "motor_speed_rpm,speed_mm_s\n9,0.4\n",
-        r"no column of a channel; expected at least one of to",
+        r"no column with readings; expected at least one of to",
     ),
     "an empty file": (bench, "", r"the file is empty; expected a header with motor_speed_rpm, total_current_A"),
     "not a number": (
         bench,
         f"{BENCH}1000,?\n",
-        r"row 1, total_current_A: got \?; leave the cell empty where there is no reading; expected a number, -2000 to",
+        r"row 1, total_current_A: got \?; leave the cell empty if there is no reading; expected a number, -2000 to",
     ),
     "in its own unit": (
         bench,
@@ -198,7 +198,7 @@ REFUSED = {
     "an angle that wraps": (
         lambda: bench("voltage", ("output_angle",)),
         "time_s,supply_voltage_V,output_angle_deg\n0,9,340\n1,9,350\n2,9,1\n3,9,11\n",
-        r"row 3, output_angle_deg: jumps by -349 deg from the sample before, as an angle that wraps",
+        r"row 3, output_angle_deg: jumps by -349 deg from the sample before, like an angle that wraps",
     ),
     "a recording after another": (
         lambda: bench("voltage", ("output_angle",)),
@@ -208,7 +208,7 @@ REFUSED = {
     "a log without its time": (
         lambda: bench("voltage", ("output_speed", "output_angle")),
         "t,supply_voltage_V,output_angle_deg\n0,9,340\n1,9,350\n",
-        r"column time_s is missing, and output_angle_deg is read over time alone; of settled runs, remove .*; other "
+        r"column time_s is missing, and output_angle_deg can be used only in a time history; if these are settled runs, remove .*; other "
         r"columns: t; .*\[columns\] time_s = {column",
     ),
 }
@@ -232,7 +232,9 @@ def test_times_of_day_count_from_the_first_of_each_run(tmp_path, column, cells):
     robot = bench("voltage")
     runs = read(tmp_path, f"run_id,{column},supply_voltage_V,total_current_A\n{rows}", robot)
     assert runs["time_s"] == pytest.approx([0, 0.25, 1.25] * 2, abs=1e-6)
-    assert any(f"{column} is a time of day; counted from the first of each run" in note for note in runs.notes)
+    assert any(
+        f"{column} is a time of day; time is counted from the first row of each run" in note for note in runs.notes
+    )
     usual = read(tmp_path, "time_s,supply_voltage_V,total_current_A\n0,12,0.4\n6,12,0.4\n7,12,0.4\n", robot)
     assert usual["time_s"] == pytest.approx([0, 6, 7]) and usual.notes == ()
     with pytest.raises(BadData, match=r"row 2, time_s: got 25\.11\.2026 12:00; .*expected a number"):
@@ -245,10 +247,13 @@ def test_a_run_begins_at_its_first_row_whatever_its_clock_shows(tmp_path):
     rows = "".join(f"{run},{cell},12,{amps}\n" for run, cell, amps in (r.split(",") for r in rows.split()))
     runs = read(tmp_path, f"run_id,time_s,supply_voltage_V,total_current_A\n{rows}", bench("voltage"))
     assert runs["time_s"].tolist() == [0.0, 0.0, 0.5, 0.25, 0.0]
-    assert any(n.startswith("runs.csv: time_s begins at 3600.25 in run a; a run begins at its") for n in runs.notes)
+    assert any(
+        n.startswith("runs.csv: time_s begins at 3600.25 in run a; time is counted from the first row")
+        for n in runs.notes
+    )
     slow = "time_min,supply_voltage_V,total_current_A\n60,12,0.4\n60.5,12,0.4\n"
     runs = read(tmp_path, slow, bench("voltage"))
-    assert runs["time_s"].tolist() == [0.0, 30.0] and any("time_min begins at 60; a run" in n for n in runs.notes)
+    assert runs["time_s"].tolist() == [0.0, 30.0] and any("time_min begins at 60; time is" in n for n in runs.notes)
     late = "time_s,supply_voltage_V,total_current_A\n60,12,0.4\n-1,12,0.4\n"
     with pytest.raises(BadData, match=r"row 2, time_s: got -1; expected 0 to 1e\+06"):
         read(tmp_path, late, bench("voltage"))
@@ -292,7 +297,7 @@ def test_a_unit_in_a_columns_name_is_converted_or_refused(tmp_path):
 def test_a_row_of_units_below_the_header_is_read(tmp_path):
     robot = of_torque()
     runs = read(tmp_path, "motor_speed_rpm,M,note\n[rpm],N·m,\n900,4,x\n1800,5,y\n", robot)
-    assert runs["output_torque_Nm"].tolist() == [4.0, 5.0] and "states units" in runs.notes[0]
+    assert runs["output_torque_Nm"].tolist() == [4.0, 5.0] and "contains units" in runs.notes[0]
     with pytest.raises(
         BadData, match=r"column M states kNm in the row of units below the header, .* output_torque_kNm = \"M\""
     ):
@@ -322,7 +327,7 @@ def test_a_slope_of_nothing_on_a_bench_is_let_pass(tmp_path):
 
 
 def test_a_mapped_column_in_the_place_of_none_is_refused(tmp_path):
-    with pytest.raises(BadData, match=r"reads currrent from column I; this program has no column currrent"):
+    with pytest.raises(BadData, match=r"reads currrent from column I; mmrjax has no column currrent"):
         read(tmp_path, "motor_speed_rpm,I\n9,1\n", bench(columns=(("currrent", "I", 1.0),)))
 
 
@@ -699,7 +704,7 @@ def test_a_speed_that_the_constant_cannot_give_is_doubted_with_its_number(tmp_pa
     table = motor_table(0.4, 0.05, 0.01, [6, 9])
     runs = records.read_runs({**table, column: factor * table[column]}, rig)
     reached = factor * 6 / 0.05 * 30 / np.pi if column == "supply_voltage_V" else 6 / 0.05 * 30 / np.pi
-    assert f"turns the motors at up to {three_digits(reached)} rpm" in rig_facts.doubtful_speed(runs, rig)
+    assert f"the motors reach at most {three_digits(reached)} rpm" in rig_facts.doubtful_speed(runs, rig)
 
 
 def test_an_offset_of_an_ammeter_is_no_lost_sign(tmp_path):

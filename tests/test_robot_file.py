@@ -128,10 +128,10 @@ REFUSED = {
     "unknown base": ("base = 'best'", r"base: got best; allowed: nominal, sm1, sm2"),
     "other schema": ("schema = 'x/9'", r"schema: got x/9; expected mmrjax\.robot/2"),
     "unknown configuration": ("[8T]\nmass = 2", r"8T\.mass: no such parameter; the robot has .*gearbox, 6T2A, 4W2T"),
-    "no configurations": ("configurations = []", r"configurations: got \[\]; expected a list of names, at least one"),
+    "no configurations": ("configurations = []", r"configurations: got \[\]; expected a list of at least one name"),
     "configurations as a word": (
         "configurations = 'rover'",
-        r"configurations: got 'rover'; expected a list of names",
+        r"configurations: got 'rover'; expected a list of at least one name",
     ),
     "a configuration twice": (
         "configurations = ['6T2A', '6T2A']",
@@ -143,15 +143,15 @@ REFUSED = {
     ),
     "a configuration named as a part": (
         "configurations = ['motor']",
-        r"motor is the name of something else in a robot",
+        r"motor has another meaning in robot",
     ),
     "a configuration from nowhere": (
         "configurations = ['rover']",
-        r'rover: the base has no such configuration; state like = "6T2A" \(one of 6T2A, 4W2T\), or movers',
+        r'rover: the base has no such configuration; set like = "6T2A" \(one of 6T2A, 4W2T\), or movers',
     ),
     "a configuration that is not listed": (
         "[rover]\nlike = '4W2T'",
-        r"rover: not among the configurations, 6T2A, 4W2T; add it to configurations",
+        r"rover: not one of the configurations 6T2A, 4W2T; add it to configurations",
     ),
     "a configuration as a number": (
         "configurations = ['rover']\nrover = 3",
@@ -167,14 +167,14 @@ REFUSED = {
     ),
     "like and movers": (
         "configurations = ['rover']\n[rover]\nlike = '4W2T'\nmovers = 'wheels'",
-        r"rover: states both like and movers; state one of them",
+        r"rover: like and movers contradict each other; give one of them",
     ),
     "parameters missing": (
         "configurations = ['rover']\n[rover]\nmovers = 'wheels'\nmass = 3\n[rover.track]\nguide_share = 0",
-        r"rover: movers without like starts from nothing; track\.loss_coulomb, track\.loss_viscous, "
+        r"rover: with movers instead of like, the configuration must be described completely; track\.loss_coulomb, track\.loss_viscous, "
         r"ground\.friction\.static, ground\.friction\.dynamic, ground\.rolling_resistance, radius, inertia are missing",
     ),
-    "no sides": ("sides = 0", r"sides: got 0; expected a whole number, 1 to 12 \(motors driven alike\)"),
+    "no sides": ("sides = 0", r"sides: got 0; expected a whole number, 1 to 12 \(motors with the same command\)"),
     "half a side": ("sides = 2.5", r"sides: got 2\.5; expected a whole number"),
     "sides as a boolean": ("sides = true", r"sides: got True; expected a whole number"),
     "cells as a word": ("[battery]\ncells = 'x'", r"battery\.cells: got 'x'; expected a whole number, 1 to 100"),

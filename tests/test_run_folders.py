@@ -54,7 +54,7 @@ def test_force_replaces_no_folder_that_is_none_of_ours(tmp_path, manifest):
     else:
         (folder / "manifest.json").write_bytes(manifest.encode("latin1"))
     before = names(tmp_path)
-    with pytest.raises(BadConfiguration, match="thesis.txt" if manifest is None else "it is no run folder"):
+    with pytest.raises(BadConfiguration, match="thesis.txt" if manifest is None else "it is not a run folder"):
         finished(tmp_path / "x", force=True)
     assert names(tmp_path) == before
 
@@ -75,7 +75,7 @@ def test_a_foreign_partial_folder_is_left_alone(tmp_path, name, text, force):
     file.write_text(text)
     (tmp_path / "x.partial" / "thesis.txt").write_text("years of work")
     before = names(tmp_path)
-    with pytest.raises(BadConfiguration, match=r"x\.partial is in the way and is no run of ours"):
+    with pytest.raises(BadConfiguration, match=r"x\.partial already exists and was not created by mmrjax"):
         RunFolder(tmp_path / "x", LOOP, force=force)
     assert names(tmp_path) == before
 
@@ -83,7 +83,7 @@ def test_a_foreign_partial_folder_is_left_alone(tmp_path, name, text, force):
 def test_a_partial_folder_that_is_a_link_is_left_alone(tmp_path):
     partial = interrupted(tmp_path / "y")
     (tmp_path / "x.partial").symlink_to(partial)
-    with pytest.raises(BadConfiguration, match="no run of ours"):
+    with pytest.raises(BadConfiguration, match="not created by mmrjax"):
         RunFolder(tmp_path / "x", SWEEP, force=True)
     assert (partial / "chunks" / "base.stage").is_file()
 
@@ -91,18 +91,18 @@ def test_a_partial_folder_that_is_a_link_is_left_alone(tmp_path):
 def test_interrupted_work_of_another_command_is_left_alone(tmp_path, capsys):
     partial = interrupted(tmp_path / "x")
     with pytest.raises(
-        BadConfiguration, match=r"x\.partial holds an interrupted loop, which the same command takes up"
+        BadConfiguration, match=r"x\.partial holds an interrupted loop, which the same command resumes"
     ):
         RunFolder(tmp_path / "x", SWEEP)
     other = LOOP | {"seed": 2}
     with pytest.raises(
-        BadConfiguration, match=r"x\.partial holds interrupted work of another configuration.*--force"
+        BadConfiguration, match=r"x\.partial contains interrupted work of another configuration.*--force"
     ):
         RunFolder(tmp_path / "x", other)
     assert (partial / "chunks" / "base.stage").is_file()
     RunFolder(tmp_path / "x", other, force=True).close()
     assert not (partial / "chunks" / "base.stage").exists()
-    assert "x.partial: of another configuration; begun anew" in capsys.readouterr().err
+    assert "x.partial: was made with another configuration; started again" in capsys.readouterr().err
     RunFolder(tmp_path / "x", SWEEP).close()  # nothing of the loop's is left
     interrupted(tmp_path / "x", SWEEP)
     with RunFolder(tmp_path / "x", LOOP, force=True) as folder:
@@ -128,7 +128,7 @@ def test_a_forged_mark_costs_no_file(tmp_path):
     with pytest.raises(BadConfiguration, match=r"thesis\.txt, which its command did not write"):
         finished(tmp_path / "x")
     (partial / "lock").write_text(json.dumps(json.loads(lock_text("loop")) | {"foreign": []}))
-    with pytest.raises(BadConfiguration, match="or --force to begin anew"):
+    with pytest.raises(BadConfiguration, match="or use --force to start again"):
         finished(tmp_path / "x")
     assert (partial / "thesis.txt").is_file()
 
@@ -202,9 +202,9 @@ def test_a_second_process_is_refused_at_once_and_disturbs_nothing(tmp_path):
         first.stage("base", lambda: 1)
         before = names(tmp_path)
         for identity in (LOOP, LOOP | {"seed": 2}, SWEEP):
-            with pytest.raises(BadConfiguration, match=r"(another process is at work on|holds an interrupted loop)"):
+            with pytest.raises(BadConfiguration, match=r"(another process is using|holds an interrupted loop)"):
                 RunFolder(tmp_path / "x", identity)
-            with pytest.raises(BadConfiguration, match=r"another process is at work on \S*x\.partial; wait for it"):
+            with pytest.raises(BadConfiguration, match=r"another process is using \S*x\.partial; wait for it"):
                 RunFolder(tmp_path / "x", identity, force=True)
         assert names(tmp_path) == before
         first.write_text("robot.toml", "")

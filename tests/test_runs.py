@@ -72,14 +72,14 @@ def test_missing_readings_are_nan_and_counted(tmp_path):
     assert_array_equal(np.isnan(runs.measured()), [[False, True, False], [True, True, False]])
     assert runs.missing() == [
         "total_current_A: 1 of 2 readings are missing (row 2)",
-        "motor_speed_rpm: no readings; parameters that only they show are not fitted",
+        "motor_speed_rpm: no readings; parameters that only this channel determines are not fitted",
     ]
     assert np.isnan(runs.deviations()).all()
 
 
 def test_a_table_without_any_known_channel_is_refused(tmp_path):
     header, row = ",".join(HEADER.split(",")[:5]), "6T2A,15,13.1,0,5"
-    with pytest.raises(BadData, match=r"no column of a channel; expected at least one of total_current_A, motor_sp"):
+    with pytest.raises(BadData, match=r"no column with readings; expected at least one of total_current_A, motor_sp"):
         records.read_runs(write(tmp_path, f"{header}\n{row}\n"))
 
 
@@ -190,7 +190,7 @@ def test_conditions_alone_suffice_where_nothing_is_compared(tmp_path, robot):
 REFUSED = {
     "empty file": ("", r"runs\.csv: the file is empty; expected a header with configuration"),
     "blank lines": ("\n\n", r"the file is empty"),
-    "no rows": (HEADER, r"a header and no rows"),
+    "no rows": (HEADER, r"a header without rows"),
     "missing column": (
         HEADER.replace(",slope_deg", "") + "\n6T2A,15,13.1,0,2.75,4800,400",
         r"runs\.csv: column slope_deg is missing \(required: configuration",
@@ -213,11 +213,11 @@ REFUSED = {
     ),
     "zero voltage everywhere": (
         f"{HEADER}\n6T2A,0,13.1,0,5,0,0,0",
-        r"supply_voltage_V is 0 in every row, so nothing drives the motors; expected rows that are driven",
+        r"supply_voltage_V is 0 in every row, so nothing drives the motors; expected rows with a command",
     ),
     "zero voltage of one that runs": (
         f"{HEADER}\n{ROW}\n{ROW.replace(',15,', ',0,')}",
-        r"row 2, motor_speed_rpm: got 4800 where supply_voltage_V is 0; expected what drives it, or remove the row",
+        r"row 2, motor_speed_rpm: got 4800 although supply_voltage_V is 0; give the command that drives it, or remove the row",
     ),
     "NaN of a condition": (f"{HEADER}\n{ROW.replace(',5,', ',NaN,')}", r"row 1, slope_deg: got NaN; expected -45 to"),
     "NA of what is imposed": (f"{HEADER}\n{ROW.replace('15', 'NA')}", r"supply_voltage_V: got NA; expected a number"),
@@ -282,9 +282,7 @@ def test_semicolons_and_decimal_commas_are_taken_and_said(tmp_path):
     assert usual.notes == ()
 
 
-@pytest.mark.parametrize(
-    ("encoding", "said"), [("utf-16", "is in UTF-16; read so"), ("cp1252", "read as Windows-1252")]
-)
+@pytest.mark.parametrize(("encoding", "said"), [("utf-16", "is read as UTF-16"), ("cp1252", "read as Windows-1252")])
 def test_tables_in_other_encodings_are_read_and_said(tmp_path, encoding, said):
     text = f"{HEADER},Öl [µm]\n{ROW},1\n"
     usual = records.read_runs(written(tmp_path, text))
@@ -307,12 +305,15 @@ def test_bytes_that_are_no_text_are_refused(tmp_path):
     [
         (
             "15;13,1;0;0;2,75;4.800;422",
-            r"motor_speed_rpm: got 4\.800 next to 13,1 in total_mass_kg; expected decimal",
+            r"motor_speed_rpm: got 4\.800 next to 13,1 in total_mass_kg; expected either decimal",
         ),
-        ("15;13.1;0;0;2.75;4,800;422", "motor_speed_rpm: got 4,800 next to 13.1 in total_mass_kg; expected decimal"),
+        (
+            "15;13.1;0;0;2.75;4,800;422",
+            "motor_speed_rpm: got 4,800 next to 13.1 in total_mass_kg; expected either decimal",
+        ),
         (
             "15;13;0;0;3;4.800;422\n6T2A;5;13;0;0;3;950;92",
-            r"motor_speed_rpm: got 4\.800 next to whole numbers below a thousand; .* nothing between thousands",
+            r"motor_speed_rpm: got 4\.800 next to whole numbers below a thousand; .* no thousands separators",
         ),
     ],
 )
@@ -341,7 +342,8 @@ def test_copies_of_rows_are_said(tmp_path):
 def test_commas_and_points_in_one_column_are_refused(tmp_path):
     text = f"{HEADER}\n{ROW}\n6T2A,33,21.1,8,0,3.2,11590,970\n".replace(",", ";").replace("2.75", "2,75")
     with pytest.raises(
-        BadData, match=r"runs\.csv, total_current_A: got 2,75 and 3\.2; expected decimal commas or points"
+        BadData,
+        match=r"runs\.csv, total_current_A: got 2,75 and 3\.2; expected either decimal commas or decimal points",
     ):
         records.read_runs(written(tmp_path, text))
 
@@ -352,9 +354,9 @@ def test_commas_and_points_in_one_column_are_refused(tmp_path):
         (
             "supply_voltage_V",
             "24V",
-            "got 24V; write 24, as the column's name has the unit; expected a number, -100",
+            "got 24V; write 24, since the unit is in the column's name; expected a number, -100",
         ),
-        ("supply_voltage_V", "24 volts", "got 24 volts; write 24, as the column's name has"),
+        ("supply_voltage_V", "24 volts", "got 24 volts; write 24, since the unit is in"),
         (
             "supply_voltage_V",
             "24000",
@@ -363,7 +365,7 @@ def test_commas_and_points_in_one_column_are_refused(tmp_path):
         (
             "total_current_A",
             "2750 mA",
-            "write numbers alone, in A, or name the column total_current_mA; expected a num",
+            "write numbers without units, in A, or name the column total_current_mA; expected a num",
         ),
         (
             "total_current_A",
@@ -371,11 +373,11 @@ def test_commas_and_points_in_one_column_are_refused(tmp_path):
             r"is it in mA\? then name the column total_current_mA; expected -2000 to 2000",
         ),
         ("payload_kg", "1500", r"is it in g\? then name the column payload_g; expected 0 to 300"),
-        ("payload_kg", "1500 g", "write numbers alone, in kg, or name the column payload_g"),
-        ("slope_deg", "5 %", "write numbers alone, in deg, or name the column slope_percent"),
-        ("slope_deg", "5 furlongs", "write the number alone, in deg; expected a number, -45 to 45"),
+        ("payload_kg", "1500 g", "write numbers without units, in kg, or name the column payload_g"),
+        ("slope_deg", "5 %", "write numbers without units, in deg, or name the column slope_percent"),
+        ("slope_deg", "5 furlongs", "write only the number, in deg; expected a number, -45 to 45"),
         ("slope_deg", "nan", "got nan; expected -45 to 45"),
-        ("motor_speed_rpm", "--", "leave the cell empty where there is no reading; expected a number"),
+        ("motor_speed_rpm", "--", "leave the cell empty if there is no reading; expected a number"),
         ("motor_speed_rpm", "1e9", r"got 1e9; expected -1e\+06 to 1e\+06"),
     ],
 )
@@ -413,8 +415,8 @@ def test_what_a_table_lacks_is_said_before_it_is_used(tmp_path):
     rows[1] = rows[1].replace("2.71", "")
     found = records.read_runs(written(tmp_path, "\n".join([header, *rows])), robot=paper_robots.nominal())
     assert found.notes == (
-        "runs.csv: 1 of 4 cells of total_current_A are empty, the first in row 2; they weigh nothing",
-        "runs.csv: no column motor_speed_rpm; nothing is known of its channel",
+        "runs.csv: 1 of 4 cells of total_current_A are empty, the first in row 2; they are ignored",
+        "runs.csv: no column motor_speed_rpm, so this channel has no readings",
         "runs.csv: run_id a is in rows 1, 3; without time_s every row is a separate run",
     )
 

@@ -173,9 +173,7 @@ def test_one_class_for_the_same_factors():
 
 @pytest.mark.parametrize("stated", ["3", "[1, 2]", "[1, 2, 0]", '[1, 2, "x"]'])
 def test_factors_are_three_positive_numbers(tmp_path, stated):
-    with pytest.raises(
-        BadConfiguration, match=r"effects\.churning\.scaled: got .* expected three numbers more than 0"
-    ):
+    with pytest.raises(BadConfiguration, match=r"effects\.churning\.scaled: got .* expected three factors above 0"):
         read_rig(tmp_path, f"[effects.churning]\nscaled = {stated}\namplitude = 0.0\n", "robot.toml")
 
 

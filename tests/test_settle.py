@@ -206,16 +206,16 @@ BAD = {
     ),
     "no time": (
         lambda c: {k: v for k, v in c.items() if k != "time_s"},
-        r"column time_s is missing, and a row is a settled run already; give it to loop",
+        r"column time_s is missing, so each row is already a settled run; use it with loop",
     ),
     "frozen": (
         lambda c: c | {"motor_speed_rpm": np.full(600, 812.0)},
-        r"rows 1 to 600, motor_speed_rpm: 812 rpm in every row; the channel is frozen or not connected; remove",
+        r"rows 1 to 600, motor_speed_rpm: 812 rpm in every row, so the channel is frozen or not connected; remove",
     ),
     "never holds": (
         lambda c: c | {"supply_voltage_V": np.round(12 + 6 * np.sin(8 * c["time_s"]), 5)},
-        r"no settled stretch: the longest level has 0\.\d+ s \(rows \d+ to \d+\); expected at least 0\.3 s; "
-        r"use the log itself \(mmrjax loop LOG --robot RIG\), or hold each level longer or state --shortest",
+        r"no settled segment: the longest level has 0\.\d+ s \(rows \d+ to \d+\); expected at least 0\.3 s; "
+        r"use the log itself \(mmrjax loop LOG --robot RIG\), or hold each level longer or set a smaller --shortest",
     ),
     "no sign of the duty, levels repeated": (
         lambda c: (
@@ -225,12 +225,12 @@ BAD = {
         ),
         r"motor_speed_rpm: shows -1001 rpm at 6 V; expected the sign of the imposed quantity; give duty the sign",
     ),
-    "nothing imposed": (lambda c: c | {"supply_voltage_V": np.zeros(600)}, r"rows 1 to 600, no settled stretch: supply_voltage_V: nothing drives the motors; log rows"),
+    "nothing imposed": (lambda c: c | {"supply_voltage_V": np.zeros(600)}, r"rows 1 to 600, no settled segment: supply_voltage_V: nothing drives the motors; log rows"),
     "never settles": (
         lambda c: (
             stairs((12.0,), 600) | {"motor_speed_rpm": 300 + 200 * c["time_s"]}
         ),
-        r"never settles: at the end of its longest level \(rows 1 to 600\) motor_speed still changes by .* state --drift",
+        r"never settles: at the end of its longest level \(rows 1 to 600\) motor_speed still changes by .* set a larger --drift",
     ),
     "few samples": (lambda c: cut(c, slice(5)), r"5 samples in its longest run; at least 8 are needed"),
 }  # fmt: skip
@@ -278,12 +278,12 @@ WRONG = {
     ),
     "an angle in radians": (
         dict(output_angle_deg=np.radians),
-        r"rows \d+ to 200, output_angle_deg: 0\.01745 times as fast as motor_speed_rpm with the ratio of the rig's "
-        r"file; is it radians for degrees\? write all rows in its unit, or state .* factor = 57\.3\}",
+        r"rows \d+ to 200, output_angle_deg: 0\.01745 times the value that motor_speed_rpm and the gear ratio of the "
+        r"rig's file imply; is it in radians for degrees\? convert all rows to the unit in the column name, or set .* factor = 57\.3\}",
     ),
     "recordings in two units": (
         dict(output_angle_deg=lambda x: np.where(np.arange(800) < 400, x - x[399], np.radians(x - x[399]))),
-        r"rows \d+ to 600, output_angle_deg: 0\.01745 times as fast as motor_speed_rpm with",
+        r"rows \d+ to 600, output_angle_deg: 0\.01745 times the value that motor_speed_rpm and",
     ),
     "an angle that changes its unit": (
         dict(output_angle_deg=lambda x: np.where(np.arange(800) < 350, x, np.radians(x))),
@@ -291,7 +291,7 @@ WRONG = {
     ),
     "an angle that wraps": (
         dict(output_angle_deg=lambda x: np.mod(x, 360.0)),
-        r"output_angle_deg: jumps by -?3\d\d\.?\d* deg from the sample before, as an angle that wraps",
+        r"output_angle_deg: jumps by -?3\d\d\.?\d* deg from the sample before, like an angle that wraps",
     ),
 }  # fmt: skip
 
@@ -328,7 +328,7 @@ def test_rig_check_says_which_current_a_total_one_is_beside_a_duty(tmp_path, mon
     bench(tmp_path, columns)
     monkeypatch.setattr(rig_check.foresight, "predict_identifiability", lambda runs, robot: NOTHING_FORESEEN)
     said = rig_check.examine_rig_file(tmp_path / "rig.toml", str(tmp_path / "log.csv")).remarks()
-    assert any("in a motor's leads measures motor_current" in s for s in said) == duty
+    assert any("in the motor leads measures motor_current" in s for s in said) == duty
 
 
 @pytest.mark.quick(1)
@@ -366,7 +366,7 @@ def test_an_angle_that_is_frozen_is_named_itself(tmp_path):
     columns = {k: v for k, v in both_ways(output_angle_deg=lambda x: 0 * x + 12.5).items() if k != "motor_speed_rpm"}
     robot = bench(tmp_path, columns, '"total_current", "output_angle"')
     with pytest.raises(
-        BadData, match=r"rows 1 to 800, output_angle_deg: 12\.5 deg in every row; the channel is frozen"
+        BadData, match=r"rows 1 to 800, output_angle_deg: 12\.5 deg in every row, so the channel is frozen"
     ):
         settled(tmp_path, robot)
 
@@ -387,7 +387,7 @@ def test_a_duty_beyond_one_is_refused_with_its_row(tmp_path):
         settled(tmp_path, robot)
     robot = bench(tmp_path, columns | {"duty": np.full(600, 255)})
     with pytest.raises(
-        BadData, match=r"row 1, duty: got 255; a command of another size\? divide .*; expected -1 to 1"
+        BadData, match=r"row 1, duty: got 255; is the command scaled differently\? divide .*; expected -1 to 1"
     ):
         settled(tmp_path, robot)
 
@@ -397,7 +397,7 @@ def test_missing_samples_divide_a_level_and_are_said(tmp_path):
     robot = bench(tmp_path, cut(columns, np.r_[0:300, 400:600]))
     found = settled(tmp_path, robot)
     assert found.gaps == (299,) and len(found.kept) == 2
-    assert words.settle_remarks(found)[0].startswith("samples are missing after row 300; no stretch goes across")
+    assert words.settle_remarks(found)[0].startswith("samples are missing after row 300; no segment spans such a gap")
 
 
 def test_days_between_rows_are_a_gap(tmp_path):
@@ -412,7 +412,10 @@ def test_a_saturated_channel_leaves_its_stretch_out(tmp_path):
     columns["total_current_A"] = np.minimum(columns["total_current_A"], 1.15)  # of 1.2 A at 18 V
     found = settled(tmp_path, bench(tmp_path, columns))
     assert [s.why for s in found.stretches] == ["", "", "stuck"] and found.stretches[2].channel == "total_current"
-    assert "total_current shows one number for long: saturated or frozen" in words.left_out(found.stretches)[0]
+    assert (
+        "total_current shows the same number for a long time: saturated or frozen"
+        in words.left_out(found.stretches)[0]
+    )
 
 
 GLITCHES = {  # share of the speed's readings, what they are multiplied by, glitches in the middle level
@@ -567,10 +570,15 @@ def test_a_column_without_a_role_may_be_empty_for_a_while(tmp_path):
 def test_a_log_with_few_settled_runs_is_given_to_the_loop_itself(tmp_path):
     found, loop = settled(tmp_path, bench(tmp_path, stairs())), "mmrjax loop log.csv"
     said = words.too_few(found, 6, loop)
-    assert "give it the log as it is: mmrjax loop log.csv; calibrate" in said and words.too_few(found, 3, loop) == ""
+    assert (
+        "run it on the log as it is: mmrjax loop log.csv. With calibrate" in said
+        and words.too_few(found, 3, loop) == ""
+    )
     every = [settling.Stretch("", np.arange(9), 0.0, 1.0, 6.0, why) for why in settling.REASONS]
     told = {row[0]: row[-1] for row in words.left_out(every, few=True)}
-    assert {told[words.WHY[why][0]] for why in words.OF_LEVELS} == {"nothing: the log as it is has them"}
+    assert {told[words.WHY[why][0]] for why in words.OF_LEVELS} == {
+        "nothing: a fit to the log as it is uses these samples"
+    }
     assert told[words.WHY["stuck"][0]] == words.WHY["stuck"][1]
 
 
@@ -613,7 +621,7 @@ def test_a_channel_that_is_read_in_few_rows_has_the_means_of_these_or_none(tmp_p
     text = {n: ["" if np.isnan(v) else f"{v:.9g}" for v in x] for n, x in columns.items()}
     robot = bench(tmp_path, text, '"motor_speed"')
     if not kept:
-        with pytest.raises(BadData, match="no settled stretch: no channel has enough readings"):
+        with pytest.raises(BadData, match="no settled segment: no channel has enough readings"):
             settled(tmp_path, robot)
         return
     found = settled(tmp_path, robot)
@@ -626,8 +634,8 @@ def test_a_channel_that_is_read_in_few_rows_has_the_means_of_these_or_none(tmp_p
 @pytest.mark.parametrize(("case", "said"), [
     ("even", ""),
     ("uneven rows", ""),
-    ("missing rows", r"^log\.csv row 401, time_s: 90 s after the row before it, where 0\.01 s is usual; a fit holds"),
-    ("a clock that jitters", r"^log\.csv rows 1 to 600, time_s: the clock jitters by 0\.00\d+ s about even rows; .* 0\.01 s apart"),
+    ("missing rows", r"^log\.csv row 401, time_s: 90 s after the row before it, where 0\.01 s is usual; a fit keeps"),
+    ("a clock that jitters", r"^log\.csv rows 1 to 600, time_s: the clock jitters by 0\.00\d+ s around even spacing; .* 0\.01 s apart"),
 ])  # fmt: skip
 def test_gaps_and_a_clock_that_jitters_are_said_with_rows_and_remedy(tmp_path, case, said):
     rng, columns = np.random.default_rng(12), stairs()
@@ -660,12 +668,12 @@ def test_a_log_in_which_nothing_moves_is_refused_unless_a_shaft_is_locked(tmp_pa
     with refused:
         checks._check_motion(runs, noises.noise_from_table(runs, observers.observer_kind(runs).sizes(runs), noise))
     if volts == 0.5:  # nor is it a settled run
-        with pytest.raises(BadData, match="no settled stretch: nothing moves beyond its noise"):
+        with pytest.raises(BadData, match="no settled segment: no level shows motion above the noise"):
             settled(tmp_path, robot)
 
 
 @pytest.mark.parametrize(("levels", "said"), [
-    ((12.0,) * 3, r"^log\.csv rows 1 to 600, supply_voltage_V: 12 V in every row; .* log three levels or more"),
+    ((12.0,) * 3, r"^log\.csv rows 1 to 600, supply_voltage_V: 12 V in every row; .* Log three levels or more"),
     ((6.0, 12.0), ""),
 ])  # fmt: skip
 def test_a_log_of_one_level_is_said_with_what_it_lacks(tmp_path, levels, said):

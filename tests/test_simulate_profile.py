@@ -185,11 +185,11 @@ def test_battery_that_ends_in_the_mission_is_said(mmrjax, capsys, monkeypatch):
 # --- what is refused ------------------------------------------------------------------------------------------------
 
 REFUSED = {
-    "steady": (["--model", "steady"], 2, r"--profile acts only with --model drive, which follows one; got --model steady"),
+    "steady": (["--model", "steady"], 2, r"--profile has an effect only with --model drive, which simulates a profile; got --model steady"),
     "track": (["--model", "track"], 2, r"got --model track"),
-    "duration": (["--duration", "5"], 2, r"--duration acts only without --profile"),
-    "posterior": (["--posterior", "50"], 2, r"--posterior acts only without --profile"),
-    "slope twice": (["--slope", "0"], 2, r"--slope: got it beside mission.csv, which states slope_deg"),
+    "duration": (["--duration", "5"], 2, r"--duration cannot be combined with --profile"),
+    "posterior": (["--posterior", "50"], 2, r"--posterior cannot be combined with --profile"),
+    "slope twice": (["--slope", "0"], 2, r"--slope: got it in addition to mission.csv, which contains slope_deg"),
     "empty battery": (["--battery", "--discharge", "2300"], 2, r"--discharge: got 2300 mAh; the battery is empty at 2200 mAh"),
     "no such profile": (["--profile", "petrol"], 4, r"petrol: no such file and no packaged profile; .*patrol"),
 }  # fmt: skip
@@ -207,9 +207,9 @@ def test_what_does_not_go_with_a_profile_is_refused(mmrjax, capsys, monkeypatch,
 _VOLTS = "time_s,voltage_left_V,voltage_right_V\n0,20,10\n2,20,10\n"
 SIDES = {
     "more than the supply has": (_VOLTS, ["--voltage", "15"], r"voltage_left_V and voltage_right_V: got 20 V; the supply has 15 V"),
-    "voltages of a battery": (_VOLTS, ["--battery"], r"--battery: got it together with sides.csv, which states voltage_left_V; .* duty_left and duty_right"),
-    "a robot of one side": (_VOLTS, ["--set", "sides=1"], r"sides.csv drives the sides apart: got a robot of 1 side; expected sides = 2"),
-    "options beside": (_VOLTS, ["--left", "10", "--right", "5"], r"--left acts only without --profile"),
+    "voltages of a battery": (_VOLTS, ["--battery"], r"--battery: got it together with sides.csv, which contains voltage_left_V; .* duty_left and duty_right"),
+    "a robot of one side": (_VOLTS, ["--set", "sides=1"], r"sides.csv drives the two sides differently: got a robot of 1 side; expected sides = 2"),
+    "options beside": (_VOLTS, ["--left", "10", "--right", "5"], r"--left cannot be combined with --profile"),
 }  # fmt: skip
 
 
@@ -226,7 +226,7 @@ def test_voltage_of_the_profile_beside_the_battery_is_refused(mmrjax, capsys, mo
     (mmrjax.folder / "volts.csv").write_text("time_s,supply_voltage_V\n0,24\n1,24\n")
     ends(
         mmrjax(capsys, monkeypatch, "simulate", "--profile", "volts.csv", "--battery"),
-        "--battery: got it together with volts.csv, which states supply_voltage_V",
+        "--battery: got it together with volts.csv, which contains supply_voltage_V",
     )
 
 
@@ -315,11 +315,11 @@ def test_sweep_over_a_profile_stores_the_missions_numbers(mmrjax, done, capsys, 
 
 BAD_PLANS = {
     "an output of a run": (PLAN.replace('"energy_Wh"', '"slip"'), r"plan.toml, outputs: got slip;"),
-    "a condition twice": (PLAN + "slope_deg = [0, 5]\n", r"plan.toml, slope_deg: got it beside mission.csv, which states it"),
-    "another model": ('model = "steady"\n' + PLAN, r"profile acts only with model drive"),
-    "a duration": ("duration_s = 3\n" + PLAN, r"duration_s acts only without profile"),
+    "a condition twice": (PLAN + "slope_deg = [0, 5]\n", r"plan.toml, slope_deg: got it in addition to mission.csv, which contains it"),
+    "another model": ('model = "steady"\n' + PLAN, r"profile has an effect only with model drive"),
+    "a duration": ("duration_s = 3\n" + PLAN, r"duration_s cannot be combined with profile"),
     "no such profile": (PLAN.replace("mission.csv", "none.csv"), r"none.csv: no such file and no packaged profile"),
-    "surfaces": (PLAN.replace("mission.csv", "floors.csv"), r"profile: got floors.csv with a column surface"),
+    "surfaces": (PLAN.replace("mission.csv", "floors.csv"), r"profile: got floors.csv, which has a surface column"),
 }  # fmt: skip
 
 

@@ -181,7 +181,7 @@ def test_a_clock_of_its_own_may_wrap_and_start_at_boot(tmp_path, robot):
     runs = records.read_runs(tmp_path / "log.h5", robot, columns=COLUMNS)
     assert_allclose(runs["time_s"], fast["t"], rtol=0, atol=1e-6)
     assert any("/drive/t wraps at 4294967296" in note for note in runs.notes)
-    assert any("/drive/t states no unit; its numbers are read as us (100 Hz)" in note for note in runs.notes)
+    assert any("/drive/t has no unit; its numbers are read as us (100 Hz)" in note for note in runs.notes)
     read = np.isfinite(runs["motor_speed_rpm"])
     assert_allclose(runs["motor_speed_rpm"][read], np.interp(fast["t"], slow["t"], slow["rpm"])[read], rtol=1e-6)
 
@@ -195,7 +195,7 @@ def test_a_missing_topic_is_named_with_the_nearest(tmp_path, robot):
     }
     runs = records.read_runs(tmp_path / "bag", robot, columns=columns)
     assert any(
-        "no signal /joint_state.velocity[2], which motor_speed_rpm is read from; did you mean /joint_states.velocity[2]"
+        "no signal /joint_state.velocity[2], from which motor_speed_rpm is read; did you mean /joint_states.velocity[2]"
         in note
         for note in runs.notes
     )
@@ -296,7 +296,7 @@ def _outside(path):
 BAD_ARCHIVES = {
     "another length": (_other_length, "rpm: has 7 values, and .* has 200; expected equal lengths"),
     "objects": (_objects, "rpm: holds objects; expected numbers or words"),
-    "a path outside": (_outside, "../../rpm.npy: is a path that leads out of the archive"),
+    "a path outside": (_outside, "../../rpm.npy: is a path that points outside the archive"),
 }
 
 
@@ -326,7 +326,7 @@ def test_a_link_to_another_file_is_not_followed(tmp_path, robot):
         records.read_runs(tmp_path / "log.h5", robot)
     samples.ros2(tmp_path / "bag", samples.fast(0.1), samples.slow(0.1))
     (tmp_path / "bag" / "more.db3").symlink_to("/etc/passwd")
-    with pytest.raises(BadData, match=r"bag, more.db3: is a link that leads out of the bag"):
+    with pytest.raises(BadData, match=r"bag, more.db3: is a link that points outside the bag"):
         records.read_runs(tmp_path / "bag", robot)
 
 
@@ -365,9 +365,7 @@ def test_an_array_that_changes_its_length_is_refused_with_its_message(tmp_path):
 def test_a_library_that_is_missing_is_named_with_the_extra(tmp_path, robot, monkeypatch):
     samples.hdf5(tmp_path / "log.h5", samples.fast(), samples.slow())
     monkeypatch.setitem(sys.modules, "h5py", None)
-    with pytest.raises(
-        BadData, match=r"h5py reads, and it is not installed; install it with pip install mmrjax\[logs\]"
-    ):
+    with pytest.raises(BadData, match=r"reading it needs h5py, which is not installed: pip install mmrjax\[logs\]"):
         records.read_runs(tmp_path / "log.h5", robot)
 
 

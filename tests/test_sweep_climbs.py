@@ -42,13 +42,13 @@ def test_search_of_many_points_ends_within_a_millimetre_of_each_ones_limit():
 
 REFUSED = {
     "no size": ({"kind": "step"}, {"levers_front_deg": [30, 45]}, r"obstacle_mm: got none; expected an axis obstacle_mm"),
-    "a size beside a search": ({"kind": "gap", "find": True}, {"obstacle_mm": [30, 45]}, r"got it; find looks for it"),
+    "a size beside a search": ({"kind": "gap", "find": True}, {"obstacle_mm": [30, 45]}, r"got it; find searches for it"),
     "a lever below the ground": ({"kind": "step"}, {"levers_front_deg": [-30, 45], "obstacle_mm": [50]},
                                  r"levers_front_deg: at -30 deg they begin 72 mm below the ground"),
     "beyond the range": ({"kind": "step"}, {"levers_rear_deg": [190], "obstacle_mm": [50]}, r"expected -180 to 180 deg"),
     "no size at all": ({"kind": "step"}, {"obstacle_mm": [0]}, r"obstacle_mm: got 0; expected 1 to 5000 mm"),
     "levers of a wheeled robot": ({"kind": "step"}, {"levers_front_deg": [30], "obstacle_mm": [50], "configuration": ["6T2A", "4W2T"]},
-                                  r"levers_front_deg: 4W2T has no levers; those that have: 6T2A"),
+                                  r"levers_front_deg: 4W2T has no levers; configurations with levers: 6T2A"),
     "a nose larger than its tread": ({"kind": "stairs", "nose_mm": 100, "tread_mm": 190}, {"obstacle_mm": [250]},
                                      r"nose_mm: got 100; expected less than half of rise and tread, 95 mm"),
     "a nose larger than its rise": ({"kind": "stairs", "nose_mm": 40}, {"obstacle_mm": [70, 90]}, r"expected less than .* 35 mm$"),
@@ -69,7 +69,7 @@ def test_sweeps_that_cannot_be_climbed_are_refused_in_one_sentence(case):
     [("tread_mm", 300, "step", "stairs"), ("count", 2, "gap", "stairs"), ("nose_mm", 5, "gap", "step or stairs")],
 )
 def test_keys_of_another_obstacle_are_refused(key, value, kind, kinds):
-    with pytest.raises(ValidationError, match=f"`{key}` acts only with `kind` {kinds}"):
+    with pytest.raises(ValidationError, match=f"`{key}` has an effect only with `kind` {kinds}"):
         Obstacle(kind=kind, **{key: value})
     # as a file of all keys has them
     assert Obstacle(**Obstacle(kind=kind).model_dump()) == Obstacle(kind=kind)
@@ -153,7 +153,7 @@ def test_interrupted_map_goes_on_after_its_last_chunk(mmrjax, tmp_path, monkeypa
     (tmp_path / "map.toml").write_text(MAP)
     assert mmrjax("sweep map.toml --out map")[0] == 130
     assert climbed == [[0.0, 0.0]] and (tmp_path / "map.partial").is_dir()
-    ends(mmrjax("sweep map.toml --out map"), "goes on after 2 of 6 points", "came to a verdict", code=0)
+    ends(mmrjax("sweep map.toml --out map"), "resumes after 2 of 6 points", "came to a verdict", code=0)
     assert climbed == [[0.0, 0.0], [30.0, 30.0], [60.0, 60.0]]
     store = zarr.open_group(tmp_path / "map" / "results.zarr", mode="r")
     assert store["energy_J"][:].tolist() == [[60, 560 - 60], [90, 530], [120, 560]]
@@ -180,7 +180,7 @@ def test_page_says_the_largest_obstacle_and_where_it_is_got_over(mmrjax, tmp_pat
         assert mmrjax("sweep", f"{name}.toml", "--out", name)[0] == 0
         page = (tmp_path / name / "report.html").read_text("utf-8")
         where = "levers_front_deg 0 deg" if name == "map" else "levers_front_deg 30 deg, adhesion 0.5"
-        assert f"The largest obstacle that is got over: {size} mm, at {where}." in page
+        assert f"The largest obstacle that the robot gets over: {size} mm, at {where}." in page
     page = (tmp_path / "map" / "report.html").read_text("utf-8")
     names = {name: (meaning, unit) for name, meaning, unit, _ in Tables(page).tables["names"][1:]}
     assert names["obstacle_mm"] == ("height of the step", "mm") and "endings" in drawn(page)

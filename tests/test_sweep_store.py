@@ -145,7 +145,7 @@ def test_large_grid_of_options_leaves_a_store_with_the_numbers_of_the_table(mmrj
     monkeypatch.setattr("sweeps.commands.sweep.TABLE", 11)
     code, out, said = mmrjax(*grid, "--out", "large")
     assert code == small and out.splitlines()[-1] == "large"
-    assert "12 points: results.zarr in place of runs.csv, which a sweep of at most 11 has" in said
+    assert "12 points: too many for runs.csv (limit 11), so results go to results.zarr" in said
     assert "--export csv" in said
     left = {f.name for f in (tmp_path / "large").iterdir()}
     assert left == {
@@ -242,7 +242,7 @@ def test_finished_sweep_is_not_simulated_again(sweep, monkeypatch, tmp_path):
     assert out.splitlines()[-1] == "s" and (tmp_path / "s" / "runs.parquet").is_file()
     ends(
         sweep("s", config=CONFIG.replace("seed = 7", "seed = 8")),
-        "s holds another sweep, which differs in configuration (samples.seed was 7, is 8)",
+        "s contains another sweep, which differs in configuration (samples.seed was 7, is 8)",
     )
 
 
@@ -294,7 +294,7 @@ def stopping(monkeypatch, at, error):
 @pytest.mark.parametrize("at", [2, 6, 20, *(pytest.param(k, marks=pytest.mark.slow) for k in (5, 7, 33, 40))])
 def test_interrupted_sweep_goes_on_to_the_same_bits(sweep, whole, monkeypatch, tmp_path, at):
     heal = stopping(monkeypatch, at, KeyboardInterrupt())
-    ends(sweep("s"), "goes on where it stopped", code=130)
+    ends(sweep("s"), "resumes the sweep after its last complete chunk", code=130)
     assert not (tmp_path / "s").exists()
     heal()
     computed, honest = [], scale.Compiled.__call__
@@ -302,7 +302,7 @@ def test_interrupted_sweep_goes_on_to_the_same_bits(sweep, whole, monkeypatch, t
     _, _, err = ends(sweep("s"), code=0)
     assert not (tmp_path / "s.partial").exists()
     done = CHUNKS - len(computed)
-    assert (done > 0) == ("goes on after" in err) == (at > 6)
+    assert (done > 0) == ("resumes after" in err) == (at > 6)
     assert arrays("s") == arrays(whole)
 
 
@@ -408,8 +408,8 @@ def test_sweep_of_another_configuration_is_refused(begun, sweep, tmp_path):
             "configuration (set.motor.inductance is new, robot motor.inductance was",
         ),
     ):
-        _, _, err = ends(begun(*options), f"s.partial holds another sweep, which differs in {what}")
-        assert "choose another path, or --force to begin anew" in err
+        _, _, err = ends(begun(*options), f"s.partial contains another sweep, which differs in {what}")
+        assert "choose another path, or use --force to start again" in err
     assert begun()[0] == 0  # nothing was lost
 
 
@@ -438,7 +438,7 @@ def test_sweep_of_other_data_code_or_versions_is_refused_saying_which(begun, mon
 @pytest.mark.slow
 def test_force_begins_anew(begun, tmp_path):
     _, _, err = ends(begun("--chunk", "50", "--force"), code=0)
-    assert "goes on after" not in err
+    assert "resumes after" not in err
     compare(tmp_path / "s", tmp_path / "first")
 
 
@@ -487,9 +487,7 @@ def test_killed_at_twenty_random_moments_goes_on_to_equal_stores(tmp_path):
 @pytest.mark.slow
 def test_shares_make_the_same_store_in_any_order(sweep, whole, tmp_path):
     for k in (3, 1):
-        ends(
-            sweep("s", "--shard", f"{k}/3"), "chunks of s.partial are done; the last share finishes the sweep", code=0
-        )
+        ends(sweep("s", "--shard", f"{k}/3"), "chunks of s.partial are finished; the last share", code=0)
     assert not (tmp_path / "s").exists()
     _, out, _ = ends(sweep("s", "--shard", "2/3"), code=0)
     assert out.splitlines()[-1] == "s"
@@ -515,7 +513,7 @@ def test_shares_started_at_once_finish_one_store(whole, tmp_path):
 @pytest.mark.slow
 def test_rest_of_lost_shares_is_done_by_the_command_without(sweep, whole):
     assert sweep("s", "--shard", "2/5")[0] == 0
-    ends(sweep("s"), "goes on after", code=0)
+    ends(sweep("s"), "resumes after", code=0)
     assert arrays("s") == arrays(whole)
 
 
@@ -532,7 +530,7 @@ def test_share_that_another_process_works_on_is_refused(sweep, monkeypatch, tmp_
     with (tmp_path / "s.partial" / "journal" / "2-of-3.jsonl").open("a") as held:
         fcntl.flock(held, fcntl.LOCK_EX)
         code, _, err = sweep("s", "--shard", "2/3")
-    assert code == 2 and "another process is at work on s.partial, share 2 of 3" in err
+    assert code == 2 and "another process is using s.partial, share 2 of 3" in err
     assert sweep("s", "--shard", "2/3")[0] == 0
 
 
@@ -567,7 +565,7 @@ def written(store, *chunks, speed=1.0):
 def test_refused_second_process_leaves_the_store_of_the_first(opened, tmp_path):
     first, second = opened(), opened()
     first.begin()
-    with pytest.raises(BadConfiguration, match=r"another process is at work on \S*s\.partial, share 1 of 1; wait"):
+    with pytest.raises(BadConfiguration, match=r"another process is using \S*s\.partial, share 1 of 1; wait"):
         second.begin()
     second.abandon()
     written(first, 0)
@@ -590,7 +588,7 @@ def test_process_whose_store_was_abandoned_meanwhile_is_told(opened):
     other.begin()
     other.abandon()
     with pytest.raises(
-        BadConfiguration, match=r"another process has removed \S*s\.partial; the same command begins anew"
+        BadConfiguration, match=r"another process has removed \S*s\.partial; the same command starts again"
     ):
         early.begin()
 
@@ -598,7 +596,7 @@ def test_process_whose_store_was_abandoned_meanwhile_is_told(opened):
 def test_force_is_refused_while_another_process_writes(opened):
     first = opened()
     first.begin((2, 3))
-    with pytest.raises(BadConfiguration, match=r"another process is at work on \S*s\.partial, share 2 of 3; wait"):
+    with pytest.raises(BadConfiguration, match=r"another process is using \S*s\.partial, share 2 of 3; wait"):
         opened(seed=1, force=True)
     written(first, 1)
     assert set(opened().done()) == {1}
@@ -610,7 +608,7 @@ def test_force_is_refused_while_another_process_writes(opened):
 
 def test_process_whose_store_was_replaced_meanwhile_does_not_write_into_the_new_one(opened):
     early, forced = opened(), opened(seed=1, force=True)
-    with pytest.raises(BadConfiguration, match=r"s\.partial holds another sweep, which differs in configuration"):
+    with pytest.raises(BadConfiguration, match=r"s\.partial contains another sweep, which differs in configuration"):
         early.begin()
     forced.begin()
     assert str(os.getpid()) in forced._aside.name
@@ -709,7 +707,7 @@ def test_what_is_damaged_of_an_interrupted_sweep_is_computed_again(opened, tmp_p
     HARMS[harm](victim(store.partial, name))
     if name == "identity.json" and harm != "remove":  # without one the store had not begun
         with pytest.raises(
-            BadData, match=r"identity\.json is damaged; choose another path, or --force to begin anew"
+            BadData, match=r"identity\.json is damaged; choose another path, or use --force to start again"
         ):
             opened()
         again = opened(force=True)
@@ -874,7 +872,7 @@ REFUSED = {
     "share in words": (CONFIG, ["--shard", "first"], "--shard: got first; expected i/n"),
     "shares of a cluster": (CONFIG, ["--shard", "1/2", "--scheduler", "tcp://x:1"], "--shard: not allowed with --scheduler"),
     "unknown export": (CONFIG, ["--export", "xls"], "--export: got 'xls'; expected 'csv' or 'parquet'"),
-    "option of a grid": (CONFIG, ["--slopes", "3"], "--slopes: acts only with a grid of options"),
+    "option of a grid": (CONFIG, ["--slopes", "3"], "--slopes: has an effect only with a grid given by options"),
     "two configurations": (CONFIG, ["--config", "plan.toml"], "--config: got plan.toml beside plan.toml"),
     "not a scheduler": (CONFIG, ["--scheduler", "nonsense"], "--scheduler: got nonsense; no scheduler answers there"),
     "axes are no table": ("axes = 3\nreport = false\n", [], "plan.toml, axes: got 3"),
@@ -892,7 +890,7 @@ def test_bad_sweeps_end_with_2_and_one_sentence_and_leave_nothing(sweep, tmp_pat
 def test_somebody_elses_folder_is_left_alone(sweep, tmp_path):
     (tmp_path / "s.partial").mkdir()
     (tmp_path / "s.partial" / "thesis.txt").write_text("years of work")
-    ends(sweep("s"), "is in the way and is no run of ours")
+    ends(sweep("s"), "already exists and was not created by mmrjax")
     (tmp_path / "t").mkdir()
     (tmp_path / "t" / "thesis.txt").write_text("years of work")
     for force in ([], ["--force"]):

@@ -103,7 +103,7 @@ def test_a_winding_that_no_temperature_settles_says_so(mmrjax, tmp_path):
     text = (tmp_path / "a" / "result.json").read_text()
     assert "Infinity" not in text and "NaN" not in text
     (row,) = table(tmp_path / "a" / "runs.csv")
-    said = f"winding, long running: none settles at {float(row['total_current_A']) / 2:.2f} A a motor"
+    said = f"winding, long running: none settles at {float(row['total_current_A']) / 2:.2f} A per motor"
     notes = json.loads(text)["notes"]
     assert notes[1].startswith(said)
     time = float(row["permissible_time_s"])
@@ -125,11 +125,11 @@ def test_a_voltage_beside_the_battery_is_refused(mmrjax, tmp_path):
         code, _, err = mmrjax(command, "--battery", "--voltage", "15")
         assert code == 2
         assert err == ("mmrjax: --voltage: got 15 with --battery, whose charge sets the voltage; give one of them\n")
-    ends(mmrjax("sweep --battery --voltages 15,24"), "--voltages acts only without --battery")
-    ends(mmrjax("sensitivity --battery --vary voltage=15:24"), "--vary voltage: acts only without --battery")
+    ends(mmrjax("sweep --battery --voltages 15,24"), "--voltages cannot be combined with --battery")
+    ends(mmrjax("sensitivity --battery --vary voltage=15:24"), "--vary voltage: has no effect on battery power")
     (tmp_path / "plan.toml").write_text("[axes]\nvoltage = [15, 24]\n[conditions]\nbattery = true\n")
     code, _, err = mmrjax("sweep plan.toml")
-    assert code == 2 and err.startswith("mmrjax: plan.toml, voltage: acts only without battery")
+    assert code == 2 and err.startswith("mmrjax: plan.toml: voltage has no effect on battery power")
     (tmp_path / "runs.csv").write_text("configuration,supply_voltage_V,payload_kg,slope_deg\n6T2A,24,0,0\n")
     code, _, err = mmrjax("simulate --battery --runs runs.csv")
     assert code == 4
@@ -281,7 +281,7 @@ def test_a_run_may_last_a_day(mmrjax):
     ends(mmrjax("simulate --model drive --duration 86401"), "86400")
     ends(
         mmrjax("simulate --model track --duration 3601"),
-        "--duration: got 3601; --model track takes at most 3600 s",
+        "--duration: got 3601; --model track allows at most 3600 s",
     )
 
 
@@ -317,7 +317,7 @@ def test_rated_limits_and_switches_are_read_and_written(tmp_path):
 @pytest.mark.parametrize(
     ("values", "sentence"),
     [
-        ({"gearbox.mesh_theory": 1}, r"mine.toml, gearbox.mesh_theory: got 1; expected true or false \(load driving"),
+        ({"gearbox.mesh_theory": 1}, r"mine.toml, gearbox.mesh_theory: got 1; expected true or false \(efficiency"),
         ({"driver.returns_current": "no"}, "driver.returns_current: got 'no'; expected true or false"),
         ({"driver.decay": "coast"}, r"mine.toml, driver.decay: got 'coast'; expected slow or fast \(between pulses"),
         ({"driver.decay": ["fast"]}, r"driver.decay: got \['fast'\]; expected slow or fast"),

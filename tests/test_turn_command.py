@@ -76,7 +76,7 @@ def test_a_demanded_turn_is_that_of_the_voltages_found(tmp_path, mmrjax):
     code, _, err = mmrjax("simulate", *told[:4], "--voltage", "12", "--out", str(tmp_path / "weak"))
     assert code == 2
     said = " ".join(err.split())
-    assert "take 18.1 V at one motor; the supply has 12 V, with which it reaches about 0.1" in said
+    assert "take 18.1 V at one motor; the supply has 12 V, which gives about 0.1" in said
     words = (
         said.rpartition("about ")[0].split("about ")[1],
         said.rpartition("about ")[2],
@@ -94,11 +94,11 @@ ROLLS, WIDE = 0.03, 0.5
 @pytest.mark.parametrize(
     ("speed", "rate", "says"),
     [
-        (0.3, 3.0, "take 35 V at one motor; the supply has 24 V, with which it reaches about 1.68 rad/s at 0.3 m/s and "
+        (0.3, 3.0, "take 35 V at one motor; the supply has 24 V, which gives about 1.68 rad/s at 0.3 m/s and "
                    "no more than 2.88 rad/s, on the spot"),
         (-0.6, 1.0, "take 28.3 V at one motor; .* about 0.48 rad/s at 0.6 m/s and about 0.47 m/s at 1 rad/s"),
-        (0.0, -9.0, "with which it reaches no more than 2.88 rad/s, on the spot"),
-        (2.0, -0.5, "with which it reaches about 0.595 m/s at 0.5 rad/s and no more than 0.72 m/s, straight"),
+        (0.0, -9.0, "which gives no more than 2.88 rad/s, on the spot"),
+        (2.0, -0.5, "which gives about 0.595 m/s at 0.5 rad/s and no more than 0.72 m/s, straight"),
     ],
 )  # fmt: skip
 def test_a_turn_beyond_the_supply_is_refused_with_what_it_reaches(monkeypatch, speed, rate, says):
@@ -131,25 +131,25 @@ def test_a_required_turn_without_a_steady_state_is_not_told_of_options_of_runs()
 
 def test_a_turn_that_is_not_found_though_it_is_within_reach_is_friction_s():
     speeds, rates = np.array([0.7, np.nan, 0.0]), np.array([0.0, np.nan, 3.0])
-    assert "friction that falls with sliding" in turn_words.turn_not_found_reason(0.3, 1.0, speeds, rates)
-    assert "reaches" in turn_words.turn_not_found_reason(0.3, 2.0, speeds, rates)
+    assert "friction falls with sliding" in turn_words.turn_not_found_reason(0.3, 1.0, speeds, rates)
+    assert "gives about" in turn_words.turn_not_found_reason(0.3, 2.0, speeds, rates)
     assert "no turn settles" in turn_words.turn_not_found_reason(0.3, 2.0, np.full(3, np.nan), rates)
 
 
 REFUSED = {
-    "one side": (("--left", "33"), "--left acts only with --right"),
+    "one side": (("--left", "33"), "--left needs --right"),
     "volts and duties": (
         ("--left", "3", "--right", "1", "--duty-left", "1", "--duty-right", "1"),
-        "--left acts only without --duty-left",
+        "--left cannot be combined with --duty-left",
     ),
-    "speed alone": (("--speed", "0.3"), "--speed acts only with --yaw-rate"),
+    "speed alone": (("--speed", "0.3"), "--speed needs --yaw-rate"),
     "volts and a demand": (
         ("--left", "3", "--right", "1", "--speed", "0.3", "--yaw-rate", "1"),
-        "--left acts only without --speed",
+        "--left cannot be combined with --speed",
     ),
-    "volts on the battery": (("--left", "3", "--right", "1", "--battery"), "state --duty-left and --duty-right"),
-    "track, one side": (("--left", "3", "--model", "track"), "--left acts only with --right"),
-    "profile": (("--left", "3", "--right", "1", "--profile", "patrol"), "--left acts only without --profile"),
+    "volts on the battery": (("--left", "3", "--right", "1", "--battery"), "give --duty-left and --duty-right"),
+    "track, one side": (("--left", "3", "--model", "track"), "--left needs --right"),
+    "profile": (("--left", "3", "--right", "1", "--profile", "patrol"), "--left cannot be combined with --profile"),
     "supply too low": (("--left", "33", "--right", "1", "--voltage", "20"), "expected at least 33 V"),
     "slope": (("--left", "33", "--right", "1", "--slope", "5"), "its heading changes there continuously"),
     "one motor": (("--left", "3", "--right", "1", "--robot", "ONE"), "expected sides = 2"),
@@ -179,7 +179,7 @@ def test_tables_take_the_duty_of_either_side(tmp_path):
     runs = records.read_runs(text_file(path, f"{HEADER}duty_left,duty_right\n6T2A,33,0,0,1,-0.5\n"), measured=False)
     assert runs.turns
     assert runs.axes[-2:] == ("duty_left", "duty_right")
-    with pytest.raises(BadData, match="column duty_right is missing, duty_left is stated"):
+    with pytest.raises(BadData, match="column duty_right is missing although duty_left is present"):
         records.read_runs(text_file(path, f"{HEADER}duty_left\n6T2A,33,0,0,1\n"), measured=False)
     with pytest.raises(BadData, match="column duty in addition to duty_left"):
         records.read_runs(text_file(path, f"{HEADER}duty_left,duty_right,duty\n6T2A,33,0,0,1,1,1\n"), measured=False)
@@ -266,7 +266,7 @@ def test_a_surface_of_which_nothing_is_known_is_refused(mmrjax):
     for more in ((), ("--left", "24", "--right", "10"), ("--model", "drive")):
         ends(
             mmrjax("simulate --surface ice", *more),
-            "--surface: got ice, whose friction is not known; allowed: linoleum",
+            "--surface: got ice, for which no friction is known; allowed: linoleum",
         )
 
 

@@ -95,7 +95,7 @@ def test_speeds_of_both_sides_are_conditions(rig, table):
 
 def test_a_table_of_turns_with_channels_of_turns_alone_is_answered_by_the_line_to_write(tmp_path, rig):
     path = tmp_path / "turns.csv"
-    with pytest.raises(BadData, match=r"yaw_rate_rad_s: state in the robot's file channels = ") as said:
+    with pytest.raises(BadData, match=r"yaw_rate_rad_s: set channels = ") as said:
         records.read_runs(
             text_file(
                 path,
@@ -104,7 +104,7 @@ def test_a_table_of_turns_with_channels_of_turns_alone_is_answered_by_the_line_t
             ),
             robot=rig('base = "nominal"'),
         )
-    line = said.value.args[0].rpartition("file ")[2]
+    line = said.value.args[0].rpartition("set ")[2].partition(" in ")[0]
     robot = rig(f'base = "nominal"\n{line}')
     assert [c.name for c in records.read_runs(path, robot=robot).channels] == ["yaw_rate"]
 
@@ -141,17 +141,20 @@ def test_a_table_of_turns_is_read_once_with_the_channels_of_turns_that_it_has(tm
     [
         (
             "left_V,right_V",
-            r"column left_V: .* drives the left side, name it voltage_left_V, or state \[columns\] voltage_left_V = "
+            r"column left_V: .* voltage of the left side, rename it to voltage_left_V, or set \[columns\] voltage_left_V = "
             '"left_V" in',
         ),
-        ("U_right_V,U_left_V", r"column U_right_V: .* name it voltage_right_V, or state \[columns\] voltage_right_V"),
+        (
+            "U_right_V,U_left_V",
+            r"column U_right_V: .* rename it to voltage_right_V, or set \[columns\] voltage_right_V",
+        ),
         (
             "motor_voltage_left_V,motor_voltage_right_V",
-            r"supply_voltage_V is missing; .* \[columns\] voltage_left_V = \"motor_voltage_left_V\", voltage_right_V",
+            r"supply_voltage_V is missing; .* \[columns\]: voltage_left_V = \"motor_voltage_left_V\", voltage_right_V",
         ),
         (
             "U_1,U_2",
-            "row 2, motor_current_left_A: got -2 at 24 V; nothing else .*; a turn has duty_left and duty_right too",
+            "row 2, motor_current_left_A: got -2 at 24 V; only this .*; a turn has duty_left and duty_right too",
         ),
     ],
 )
@@ -193,7 +196,7 @@ def test_a_supply_of_either_sign_drives_the_sides(rig, table):
     assert_allclose(unsigned.of_sides[0], [0.012 * a for a, *_ in SOUND * 2])
     assert [i.channel for i in unsigned.layout.instruments] == ["motor_current_left", "motor_current_right"]
     with pytest.raises(
-        BadData, match=r"got -1500 and 1500 where left and right side are driven at 18 and -18 V, and"
+        BadData, match=r"got -1500 and 1500 although the left and right sides are driven at 18 and -18 V"
     ):
         table(header, *[(24, *row[1:]) for row in rows], robot=robot)
 
@@ -207,18 +210,18 @@ def test_the_packaged_robot_turns_by_voltages_of_its_sides_without_a_supply(tmp_
     conditions = runs.conditions(mm.nominal())
     assert_allclose(conditions.voltage, [24.0, 12.0])
     assert_allclose(conditions.duty_left, [0.25, -1.0])
-    with pytest.raises(BadData, match=r"voltage_left_V together with --battery, .* state duty_left and duty_right"):
+    with pytest.raises(BadData, match=r"voltage_left_V together with --battery, .* give duty_left and duty_right"):
         records.read_runs(path, measured=False, battery=True)
 
 
 @pytest.mark.parametrize(
     ("header", "row", "says"),
     [
-        ("voltage_left_V", (3,), "column voltage_right_V is missing, voltage_left_V is stated; state the drive of both"),
+        ("voltage_left_V", (3,), "column voltage_right_V is missing although voltage_left_V is present; give the command of both"),
         ("voltage_left_V,voltage_right_V,duty_left,duty_right", (3, 6, 0.5, 1), "column duty_left in addition to voltage_left"),
         ("voltage_left_V,voltage_right_V,duty", (3, 6, 1), "column duty in addition to voltage_left_V, .* keep one"),
         ("voltage_left_V,voltage_right_V,supply_voltage_V", (3, 13, 12), "row 2, voltage_right_V: got 13 of a supply "
-         "of 12 V; expected no more than supply_voltage_V, or no such column"),
+         "of 12 V; expected no more than supply_voltage_V, or remove that column"),
         ("voltage_left_V,voltage_right_V", ("", 3), "row 2, voltage_left_V: got an empty cell; expected a number, -100"),
     ],
 )  # fmt: skip
@@ -236,7 +239,7 @@ def test_a_turn_that_nothing_drives_is_left_out_with_a_note(rig, table, row, zer
     header = f"supply_voltage_V,duty_left,duty_right,{SPEEDS}"
     found = table(header, (24, 0, 1, 0, 900), (*row, 0, 0), robot=rig(DRIVEN))
     assert len(found) == 1
-    assert f"turns.csv: row 2 is left out, as nothing drives the motors ({zero} 0); " in found.notes[0]
+    assert f"turns.csv: row 2 is left out, since nothing drives the motors ({zero} is 0); " in found.notes[0]
 
 
 @pytest.mark.parametrize("of_turns", ["duty_left,duty_right", "heading_deg,duty_left,duty_right", "heading_deg"])
@@ -298,25 +301,25 @@ def row_of(*changes):
 KEEP = tuple((k, 1) for k in range(5))
 REFUSED = {
     "one side": (KINEMATIC, f"motor_speed_left_rpm,{READ}", row_of(KEEP[0], *KEEP[2:]),
-                 "column motor_speed_right_rpm is missing, motor_speed_left_rpm is stated"),
+                 "column motor_speed_right_rpm is missing although motor_speed_left_rpm is present"),
     "one duty": (DRIVEN, f"supply_voltage_V,duty_left,{READ}", [(24, 1, *row[2:]) for row in SOUND],
-                 "column duty_right is missing, duty_left is stated"),
+                 "column duty_right is missing although duty_left is present"),
     "both ways": (KINEMATIC, f"motor_speed_rpm,{SPEEDS},{READ}", [(1, *row) for row in SOUND],
                   "column motor_speed_rpm in addition to motor_speed_left_rpm, motor_speed_right_rpm; keep one"),
     "letters": (KINEMATIC, f"{SPEEDS},motor_current_l_A,motor_current_r_A,yaw_rate_rad_s", SOUND,
-                "column motor_current_l_A: the sides are called left and right; name it motor_current_left_A"),
+                "column motor_current_l_A: the two sides must be called left and right; rename it to motor_current_left_A"),
     "in front": (KINEMATIC, f"{SPEEDS},left_motor_current_A,right_motor_current_A,yaw_rate_rad_s", SOUND,
-                 r"name it motor_current_left_A, or state \[columns\]"),
+                 r"rename it to motor_current_left_A, or set \[columns\]"),
     "duties by letters": (DRIVEN, f"supply_voltage_V,duty_L,duty_R,{READ}", [(24, 1, 1, *r[2:]) for r in SOUND],
-                          "column duty_L: the sides are called left and right; name it duty_left"),
+                          "column duty_L: the two sides must be called left and right; rename it to duty_left"),
     "yaw to the right": (KINEMATIC, f"{SPEEDS},{READ}", row_of(*KEEP[:4], (4, -1)),
-                         r"row 4, yaw_rate_rad_s: got -0.9 where .* at -1500 and 1500 rpm, and so in 5 of 5 rows; "
-                         "expected a positive one where the right side is the faster"),
+                         r"row 4, yaw_rate_rad_s: got -0.9 although .* at -1500 and 1500 rpm \(as in 5 of 5 rows\); "
+                         "expected a positive value if the right side is faster"),
     "currents exchanged": (KINEMATIC, f"{SPEEDS},{READ}", row_of(*KEEP[:2], (3, 1), (2, 1), KEEP[4]),
                            r"row 4, motor_current_left_A and motor_current_right_A: got 8 and -8 .* exchanged"),
     "duties exchanged": (DRIVEN, f"supply_voltage_V,duty_left,duty_right,{SPEEDS}",
                          [(24, b / 2000, a / 2000, a, b) for a, b, *_ in SOUND],
-                         "motor_speed_left_rpm and motor_speed_right_rpm: .* the sides of one pair of columns are"),
+                         "motor_speed_left_rpm and motor_speed_right_rpm: .* the left and right columns of one quantity are"),
     "no width": (KINEMATIC.replace('width = "0.555 ± 5 %"\n', ""), f"{SPEEDS},{READ}", SOUND,
                  r"the robot's file lacks rover.turning.width \[m\], needed for a turn"),
     "one motor": (KINEMATIC.replace("sides = 2", "sides = 1"), f"{SPEEDS},{READ}", SOUND,
@@ -343,7 +346,7 @@ def test_sound_tables_of_turns_are_not_refused(rig, table):
 def test_what_is_wrong_with_a_robot_that_turns_is_said(rig):
     with pytest.raises(BadConfiguration, match=r"rover.turning.width: got 555; expected 0 to 5"):
         rig(KINEMATIC.replace('"0.555 ± 5 %"', "555"))
-    with pytest.raises(BadConfiguration, match="motor_speed_left is imposed, so it is no reading"):
+    with pytest.raises(BadConfiguration, match="motor_speed_left is imposed, so it cannot be a reading"):
         rig(KINEMATIC.replace('["motor_current_left"', '["motor_speed_left"'))
 
 

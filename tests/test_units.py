@@ -134,7 +134,7 @@ def test_a_channel_of_one_row_is_in_tables_sweeps_help_pages_and_json(tmp_path):
         [sys.executable, "-c", ROW_MORE], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stderr
-    assert "torque of the gearbox [N·m], as its instrument shows it" in done.stdout
+    assert "torque of the gearbox [N·m], as shown by its instrument" in done.stdout
     with (tmp_path / "swept" / "runs.csv").open() as stream:
         assert [float(row["gear_torque_Nm"]) for row in csv.DictReader(stream)] == pytest.approx([0.1, 0.1])
     assert "torque of the gearbox" in (tmp_path / "compared" / "report.html").read_text("utf-8")

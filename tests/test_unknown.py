@@ -128,7 +128,9 @@ def test_rig_check_says_what_of_a_battery_is_an_examples(tmp_path):
     def left_open(more):
         read(tmp_path, ROVER + more, "voltage", DRIVEN)
         found = rig_facts.number_origins(robot_file.parse_robot_file(tmp_path / "rig.toml"))
-        return {o.name.partition(".")[2] for o in found if o.name.startswith("battery.") and "an example's" in o.why}
+        return {
+            o.name.partition(".")[2] for o in found if o.name.startswith("battery.") and "an example value" in o.why
+        }
 
     assert left_open("") == set()
     stated = "[battery]\ncells = 3\nvoltage_full = 4.1\nresistance = 0.02\n"
@@ -140,7 +142,7 @@ def test_a_fidelity_that_resolves_the_running_gear_says_where_it_is_an_examples(
     read(tmp_path, kept.partition("[rover.turning]")[0] + kept.partition("inertia = 0.2\n")[2], "voltage", DRIVEN)
     for model in ("steady", "track"):
         load_robot(Simulate(robot=str(tmp_path / "rig.toml"), set={"rover.inertia": 0.001}, model=model))
-        assert ("are those of an example" in capsys.readouterr().err) == (said and model == "track")
+        assert ("are example values" in capsys.readouterr().err) == (said and model == "track")
 
 
 def test_a_parameter_that_is_set_is_known(tmp_path):
@@ -175,7 +177,7 @@ def test_a_store_of_what_is_unknown_is_refused_unless_it_varies(tmp_path, varied
     plan = axes.plan_design(config, robot, "map.toml")
     if refused:
         with pytest.raises(
-            BadConfiguration, match=r"power_supply cannot be computed, as .* lacks motor\.resistance$"
+            BadConfiguration, match=r"power_supply cannot be computed, because .* lacks motor\.resistance$"
         ):
             prepare_job(config, robot, plan, "map.toml")
     else:

@@ -78,7 +78,7 @@ def test_a_file_of_unlike_sides_is_said_to_turn_and_by_how_much(tmp_path, capsys
     assert inputs.load_robot(config.Simulate(robot=file.source, left_V=9.0, right_V=9.0)).remarks == ()
     assert of_file(tmp_path, SIDE_RADIUS.replace("0.01", "0.0")).remarks == ()
     (narrow,) = of_file(tmp_path, SIDE_RADIUS, set={"4W2T.turning.width": 0.0}).remarks
-    assert narrow.endswith("how it would turn is not known: the robot's file lacks 4W2T.turning.width [m], needed for "
+    assert narrow.endswith("turning cannot be computed: the robot's file lacks 4W2T.turning.width [m], needed for "
                            "a turn")  # fmt: skip
     document = Document("a", "b.", (), (Section("c", ()),))
     warned = page_renderer.write_report_page(tmp_path, document, file).read_text("utf-8")
@@ -109,7 +109,7 @@ def test_effects_of_a_file_say_that_they_are_of_one_side(tmp_path):
 
     of_side = 'driver = "the side"'
     for balance, term in (("ground", "signals.side"), ("yaw", "signals.normal"), ("lateral", "signals.normal")):
-        with pytest.raises(BadConfiguration, match=r"Own, driver: got '' of a term .* expected .the side."):
+        with pytest.raises(BadConfiguration, match=r"Own, driver: got '' for a term .* expected .the side."):
             read(balance, term)
         (own,) = read(balance, term, of_side)
         assert own(amplitude=1.0).unlike

@@ -55,7 +55,7 @@ def test_numbers_that_vary_and_have_no_role_are_said(tmp_path):
     (note,) = unused_notes(runs)
     assert note.columns == (("brake_torque_Nm", "load_torque_Nm"),)
     assert sentences((note,)) == (
-        "runs.csv: brake_torque_Nm varies from row to row and is not used; if brake_torque_Nm is load_torque_Nm, state "
+        "runs.csv: brake_torque_Nm varies from row to row and is not used; if brake_torque_Nm is load_torque_Nm, set "
         '[columns] load_torque_Nm = "brake_torque_Nm" in the robot\'s file',
     )
     assert description.unused_inputs(runs) == ("brake_torque_Nm",)
@@ -80,7 +80,7 @@ def test_readings_that_a_brake_explains_are_no_contradiction(tmp_path):
         return SettledRuns.check(runs, noise.infer_noise(runs, SettledRuns.sizes(runs), None))
 
     runs = table(tmp_path, 'channels = ["motor_current", "motor_speed", "output_torque"]', output_torque_Nm=TORQUE)
-    with pytest.raises(BadData, match=r'state \[columns\] load_torque_Nm = "output_torque_Nm"'):
+    with pytest.raises(BadData, match=r'set \[columns\] load_torque_Nm = "output_torque_Nm"'):
         checked(runs)
     runs = table(tmp_path, f'{CHANNELS}\n[columns]\nload_torque_Nm = "output_torque_Nm"', output_torque_Nm=TORQUE)
     assert checked(runs) == [] and runs.axes == ("supply_voltage_V", LOAD)

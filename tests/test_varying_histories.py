@@ -378,7 +378,7 @@ def test_columns_of_the_driver_are_read(tmp_path):
         (f"{HEADER},mode", "a,0,6T2A,24,0,0,0,11,reverse",
          r"row 1, mode: got reverse; expected one of these; .*voltage, brake, coast"),
         (f"{HEADER},duty", "a,0,6T2A,24,0,0,0,11,2", r"row 1, duty: got 2; expected -1 to 1"),
-        (f"{HEADER},duty", "a,0,6T2A,24,0,0,0,11,", r"row 1, duty: got an empty cell; expected a number, -1 to 1"),
+        (f"{HEADER},duty", "a,0,6T2A,24,0,0,0,11,", r"row 1, duty: got an empty cell; expected a number from -1 to 1"),
         (f"{HEADER},duty,mode", "a,0,6T2A,24,0,0,0,11,0.3,brake",
          r"row 1, duty: got 0.3 in mode brake; expected 0 or an empty cell"),
         (HEADER, "a,0,6T2A,-10001,0,0,0,11", r"row 1, supply_voltage_V: got -10001; expected -10000 to 10000"),

@@ -394,15 +394,15 @@ OVER = CurveOver("slip", ("slope",))
     [
         (None, ""),
         (NameSupport(True), ""),
-        (NameSupport(False, "implausible"), "no effect of the library that explains it is of a plausible size"),
+        (NameSupport(False, "implausible"), "every effect of the library that explains it has an implausible size"),
         (NameSupport(False, "larger", ("a", "b")), "a and b would explain more, but not at a plausible size"),
         (
             NameSupport(False, "better curve", ("a",), (CurveOver("speed", ("speed_motor", "slope")),)),
-            "one smooth surface in the reading of speed over speed motor and slope is the better explanation than a",
+            "one smooth surface in the reading of speed over speed motor and slope is a better explanation than a",
         ),
         (
             NameSupport(False, "curve alone", curves=(OVER,)),
-            "one smooth curve in the slip balance over slope leaves nothing",
+            "one smooth curve in the slip balance over slope leaves no significant misfit",
         ),
         (
             NameSupport(
@@ -416,7 +416,7 @@ OVER = CurveOver("slip", ("slope",))
             ),
             "a explains 1.2 σ next to smooth curves (slip balance over slope); chance alone reaches 3.4; b is a worse "
             "explanation than a smooth curve in its place and rests on row 10; c is chosen again in 75 % of the data "
-            "with a block left out, has a rival of an implausible size (d and e) and leaves something in its own "
+            "with a block left out, has a better rival, but of implausible size (d and e) and leaves an error in its own "
             "equation",
         ),
         (
@@ -451,7 +451,7 @@ def test_verdict_tells_what_is_tentative():
     test = NameTest("b", 5.0, 3.4, (), 9.0, 10, 2.0)
     sure, tentative = Missing(("a",), (), ("drop",)), Missing(("b",), (), ("slip",), False, test)
     assert loop_words.verdict_sentences(Summary("named", 0.001, None, (sure, tentative))) == (
-        "Missing: a (family-wise p ≤ 0.001). Tentative, in the model since it predicts better: b, which rests on row 10."
+        "Missing: a (family-wise p ≤ 0.001). Tentative, kept in the model because it improves predictions: b, which rests on row 10."
     )
     # where no name stands and it was not tested by itself, what speaks against all of them
     curve = NameSupport(False, "curve alone", curves=(OVER,))
@@ -461,7 +461,9 @@ def test_verdict_tells_what_is_tentative():
     only = Missing(("b",), (), ("slip",), False)
     said = loop_words.verdict_sentences(Summary("place", 0.001, place, (only,), support=curve))
     assert "no effect of the library is established" in said
-    assert said.endswith("predicts better: b (one smooth curve in the slip balance over slope leaves nothing).")
+    assert said.endswith(
+        "improves predictions: b (one smooth curve in the slip balance over slope leaves no significant misfit)."
+    )
 
 
 def test_a_mechanism_is_stated_with_what_it_explains_and_predicts():
@@ -484,7 +486,7 @@ def test_a_mechanism_is_stated_with_what_it_explains_and_predicts():
 
 
 def test_a_mechanism_is_stated_with_its_window_and_why_no_name_stands():
-    """A discrepancy of some runs alone: its window stands in verdict and answer, and what leaves nothing comes first."""
+    """A discrepancy of some runs alone: its window stands in verdict and answer, and what leaves no significant misfit comes first."""
     here = SimpleNamespace(
         place="slip", variable="order 30 to 44", alike=("slip",), variables_alike=("order 31 to 44",), by_duty=False,
         family="slip that changes with order", window={"axis": "order", "low": 30.0, "high": 44.0},
@@ -501,9 +503,7 @@ def test_a_mechanism_is_stated_with_its_window_and_why_no_name_stands():
     found = SimpleNamespace(
         verdict="mechanism", summary=summary, effects=(), unnamed=here, support=support, after=SimpleNamespace(adequate=True)
     )  # fmt: skip
-    said = (
-        "one constant in the slip balance in runs 30 to 44 leaves nothing; a explains 1.2 σ; chance alone reaches 3.4"
-    )
+    said = "one constant in the slip balance in runs 30 to 44 leaves no significant misfit; a explains 1.2 σ; chance alone reaches 3.4"
     assert loop_words.naming_reasons(found) == said
     found.after.adequate = False
     assert loop_words.naming_reasons(found) == loop_words.support_reasons(support)
@@ -518,7 +518,7 @@ def test_every_doubt_about_a_mechanism_has_words():
     ("value", "said"),
     [
         ([4.0, 1.0, 0.5], "falls from 4 N·m at 95.5 rpm to 0.5 N·m at 955 rpm"),
-        ([0.5, 6.0, 1.0], "rises from 0.5 N·m at 95.5 rpm to 1 N·m at 955 rpm, by way of 6 N·m at 191 rpm"),
+        ([0.5, 6.0, 1.0], "rises from 0.5 N·m at 95.5 rpm to 1 N·m at 955 rpm, passing 6 N·m at 191 rpm"),
     ],
 )
 def test_the_course_of_a_curve_is_told_by_its_ends(value, said):
@@ -556,7 +556,7 @@ def test_verdict_lists_what_cannot_be_told_apart():
 
 
 @pytest.mark.parametrize(("sampled", "said"), [
-    (False, "angle_friction (at 1.5 times its largest plausible size), torque_offset (time histories alone tell that)"),
+    (False, "angle_friction (at 1.5 times its largest plausible size), torque_offset (only time histories can tell)"),
     (True, "angle_friction (at 1.5 times its largest plausible size)"),
 ])  # fmt: skip
 def test_what_settled_runs_cannot_tell_from_an_effect_is_said_of_them_alone(sampled, said):
@@ -575,7 +575,7 @@ def test_a_formula_without_terms_says_so():
 def test_why_an_effect_is_ruled_out():
     reasons = (RuledOut("a", "power"), RuledOut("b", "size", 2.94, ("x", "y")), RuledOut("c", "edge"))
     assert loop_words.why_ruled_out(reasons) == (
-        "a would make its balance supply power; b at 2.9 times its largest plausible size; check x and y; c is within an sd of the "
+        "a would supply power instead of losing it; b at 2.9 times its largest plausible size; check x and y; c is within one sd of its "
         "largest plausible size"
     )
 
@@ -591,7 +591,7 @@ def test_names_say_what_would_explain_more_than_they():
     assert loop_words.ruled_out(of("named", candidate(6.5, "a"))) == "" == loop_words.ruled_out(of("place"))
     assert loop_words.ruled_out(of("named", near)).startswith("a would explain as much as what is proposed, but is")
     assert loop_words.ruled_out(of("class", near, better)) == (
-        "b and c would explain 30 σ² more than what is proposed, but are ruled out by size or sign alone: too large."
+        "b and c would explain 30 σ² more than what is proposed, but are ruled out only by size or sign: too large."
     )
     assert loop_words.ruled_out(of("place", better, near)).startswith("a would explain as much as the curve, but is")
 
@@ -616,7 +616,7 @@ def test_what_is_predicted_worse_is_said_with_its_rows(found, predicted, said):
 @pytest.mark.parametrize(
     ("about", "said"),
     [
-        (("missing", "slip", "speed_motor"), "what is missing in the slip balance over speed motor"),
+        (("missing", "slip", "speed_motor"), "the error of the slip balance over speed motor"),
         (("found", "", "", ("a", "b")), "a, b, found by the lumped model"),
         (("near", "", "", ("a",)), "a, which explains the readings nearly as well"),
     ],
@@ -634,12 +634,12 @@ def test_what_the_track_model_is_asked_about(about, said):
         (
             Adequacy(False, 812.3, 600.0, 1e-9, Shown(what="stated"), True),
             "Not adequate: the residuals exceed the stated noise (χ² 812.3 on 600 degrees of freedom, p < 1e-6), so "
-            "something is missing and the parameters may absorb it; run mmrjax loop to find it",
+            "a term is missing and the parameters may absorb its effect; run mmrjax loop to find it",
         ),
         (
             Adequacy(False, 60.0, 60.0, 0.0021, Shown("motor_speed", "follow", "slope_deg"), False),
             "Not adequate: the residuals of motor speed follow slope_deg (p = 0.0021, the noise estimated from them), "
-            "so something is missing and the parameters may absorb it; run mmrjax loop to find it",
+            "so a term is missing and the parameters may absorb its effect; run mmrjax loop to find it",
         ),
         (
             Adequacy(True, 61.0, 60.0, 0.4, Shown(what="repeats"), True),
@@ -648,12 +648,12 @@ def test_what_the_track_model_is_asked_about(about, said):
         (
             Adequacy(True, 50.0, 50.0, 0.4, Shown(), False),
             "Adequate as far as can be tested: the residuals show no structure (p = 0.4); the noise was estimated from "
-            "them, so χ² tests nothing",
+            "them, so χ² is no test",
         ),
         (
             Adequacy(None, 5.0, 2.5, None, Shown(), False),
-            "Adequacy cannot be tested: the noise was estimated from the misfit, and 2.5 degrees of freedom cannot show "
-            "structure; state it with --noise",
+            "Adequacy cannot be tested: the noise was estimated from the misfit, and 2.5 degrees of freedom are too few "
+            "to show structure; state the noise with --noise",
         ),
     ],
 )
@@ -677,20 +677,20 @@ def clustered(levels, **other):
     [
         (
             clustered({"1": -14.42, "2": 3.6}, alike=("direction_deg",)),
-            "residuals of speed cluster by wheel (simulated less measured at levels 1: -14 mm/s, 2: +3.6 mm/s; p = 2e-07), "
+            "residuals of speed differ between the levels of wheel (simulated minus measured, by level: 1: -14 mm/s, 2: +3.6 mm/s; p = 2e-07), "
             "a column without a role (as well by direction_deg): give each level its own configuration, or find what "
-            "differs",
+            "differs between them",
         ),
         (
             clustered({"1": -1.0, "2": 1.0}, reversing=True, within="configuration", coarser=(("axle", 0.91),)),
-            "residuals of speed cluster by wheel within configuration, with opposite signs in the two directions of travel "
-            "(simulated less measured at levels 1: -1 mm/s, 2: +1 mm/s; p = 2e-07), a column without a role (axle alone "
-            "91% of it): give each level its own configuration, or find what differs",
+            "residuals of speed differ between the levels of wheel within configuration, with opposite signs in the two directions of travel "
+            "(simulated minus measured, by level: 1: -1 mm/s, 2: +1 mm/s; p = 2e-07), a column without a role (axle alone "
+            "91% of it): give each level its own configuration, or find what differs between them",
         ),
         (
             clustered({}, correlation=-0.456),
-            "residuals of speed go with wheel (rank correlation -0.46; p = 2e-07), a column without a role: find what "
-            "differs with it",
+            "residuals of speed are correlated with wheel (rank correlation -0.46; p = 2e-07), a column without a role: find "
+            "what changes along with it",
         ),
     ],
 )
@@ -714,7 +714,7 @@ def test_tests_that_are_as_improbable_are_named_in_the_order_of_their_words():
 def test_what_would_measure_is_found_by_either_end_of_a_name():
     assert table_words.would_measure("motor.inductance").startswith("a time history of the start-up current")
     assert re.search("slippery slope", table_words.would_measure("6T2A.ground.friction.dynamic"))
-    assert table_words.would_measure("x.y") == "runs under conditions in which it acts"
+    assert table_words.would_measure("x.y") == "runs under conditions in which it has an effect"
 
 
 def test_lines_of_a_terminal_have_80_columns_and_those_of_a_file_are_whole(monkeypatch, capsys):

@@ -80,7 +80,7 @@ def test_what_to_do_next_is_said_as_recorded():
 def test_every_instruction_and_every_risk_has_a_sample():
     instructions = [*INSTRUCTIONS, denser_runs_instruction("slip", "speed", ONE), Remark("no_menu", word="turns")]
     assert {note.code for note in (*instructions, *WATCHED)} == set(words.SAID)
-    assert describe(instructions[-1]) == "The menu of experiments is of straight travel and has no turns"
+    assert describe(instructions[-1]) == "The loop can propose experiments for straight travel only, not for turns"
 
 
 def test_the_zero_of_every_meter_is_read_at_rest():
@@ -88,7 +88,7 @@ def test_the_zero_of_every_meter_is_read_at_rest():
     shown = ("motor_speed", "motor_current", "position", "output_torque", "winding_temperature")
     said = {n: text for n, text in on(dataclasses.replace(BENCH, measured=shown)).items() if n.startswith("zero")}
     assert said == {
-        f"zero of {label}": f"Switch the motors off, at rest and with no load; read the {label}"
+        f"zero of {label}": f"Switch the motors off, with the shaft at rest and unloaded, and read the {label}"
         for label in ("motor current", "output torque")
     }
 
@@ -122,7 +122,7 @@ def test_steps_are_those_that_a_person_sets(span, count, step):
 
 def test_a_temperature_that_nobody_stated_is_not_watched():
     stated, unknown = (denser_runs_instruction("slip", "time", dataclasses.replace(ONE, hot=t)) for t in (125.0, 1e9))
-    assert "(125 °C is allowed)" in describe(stated)
+    assert "(limit 125 °C)" in describe(stated)
     assert describe(unknown).count("watch the winding's temperature;") == 1
 
 

@@ -25,7 +25,7 @@ SHARED, ODD = 0.1, 0.1
 
 
 def unwrap_counter(count: np.ndarray, run: np.ndarray) -> tuple[np.ndarray, float]:
-    """Returns a counter that goes on past its end, and its period, 0 where it does not.
+    """Returns a counter without wraps, and its period (0 if it does not wrap).
 
     A counter wraps where it falls from its last numbers to its first ones, within `LACKING` usual steps, and never
     goes back otherwise.
@@ -61,12 +61,13 @@ def unwrap_counter(count: np.ndarray, run: np.ndarray) -> tuple[np.ndarray, floa
 
 
 def spread_shared_stamps(time: np.ndarray, run: np.ndarray) -> tuple[np.ndarray, float]:
-    """Returns times with rows that share a stamp set evenly between it and the next, and the rows of a stamp.
+    """Returns times with rows of equal stamps spread evenly up to the next stamp, and the number of rows per
+    stamp.
 
-    The number of rows is 0 where nothing is changed.
+    The number of rows is 0 if nothing was changed.
 
     Args:
-        time: of rows in order, shape (rows,).
+        time: time of rows in order, shape (rows,).
         run: index of the recording of each row, shape (rows,).
     """
     if len(time) < 3:
@@ -99,7 +100,7 @@ _WITH_POINTS = re.compile(r"(\d\d)\.(\d\d)\.(\d{4})(?=[ T])")
 
 
 def recorded_rows(arrays: NamedArrays, meanings: Sequence[Column | None]) -> NamedArrays:
-    """Returns the columns without rows that nothing was recorded in, which a note counts.
+    """Returns the columns without empty rows, and a note that counts these rows.
 
     Every cell of such a row is missing, or it is at the end of a log whose clock is back at 0 there: a logger writes
     all of its memory.
@@ -111,7 +112,7 @@ def recorded_rows(arrays: NamedArrays, meanings: Sequence[Column | None]) -> Nam
         kept = np.ones(len(arrays), bool)
         kept[empty] = False
         arrays = arrays.rows(
-            kept, f"{count_noun(len(empty), 'row')} without any reading left out; others are counted"
+            kept, f"{count_noun(len(empty), 'row')} without any reading left out; row numbers count only the others"
         )
     stated = [None if m is None else m.column for m in meanings]
     clock = next((raw for c, raw in zip(stated, arrays.values, strict=True) if c in TIME), None)
@@ -122,7 +123,7 @@ def recorded_rows(arrays: NamedArrays, meanings: Sequence[Column | None]) -> Nam
     if not len(used) or used[-1] == len(count) - 1 or not np.nanmax(count) > 0:
         return arrays
     kept = np.arange(len(count)) <= used[-1]
-    note = f"{count_noun(int((~kept).sum()), 'row')} at the end left out: the clock is back at 0 there"
+    note = f"{count_noun(int((~kept).sum()), 'row')} at the end left out, because the clock restarts at 0 there"
     return arrays.rows(kept, note)
 
 
@@ -137,8 +138,8 @@ def from_the_first(name: str, meaning: Column, raw: Raw, runs: Sequence[str] | N
     and the reader refuses that cell.
 
     Args:
-        name: of the source.
-        meaning: of the column.
+        name: name of the source.
+        meaning: meaning of the column.
         runs: `run_id` of each cell. None: all are of one run.
     """
     factor = meaning.value(1.0)
@@ -158,7 +159,7 @@ def from_the_first(name: str, meaning: Column, raw: Raw, runs: Sequence[str] | N
             if unit is None:
                 return raw, ()
             clock = clock * PARTS[unit]
-            notes = (*notes, f"{name}: {meaning.shown} counts {unit} since 1970 by its size; read so")
+            notes = (*notes, f"{name}: {meaning.shown} is read as {unit} since 1970, judging by its size")
         if not of_day and not ((low <= clock) & (clock <= high)).all():
             return raw, ()
     run = np.zeros(len(clock), int) if run is None else run
@@ -173,13 +174,16 @@ def from_the_first(name: str, meaning: Column, raw: Raw, runs: Sequence[str] | N
         return (clock / factor if notes else raw), notes
     passed = np.round(clock - first[run], 9) / factor
     if of_day:
-        return passed, (*notes, f"{name}: {meaning.shown} is a time of day; counted from the first of each run")
+        return passed, (
+            *notes,
+            f"{name}: {meaning.shown} is a time of day; time is counted from the first row of each run",
+        )
     which = run[np.flatnonzero(first[run])[0]]
     where = f"{first[which] / factor:g}{f' in run {names[which]}' if names[which] else ''}"
     return passed, (
         *notes,
-        f"{name}: {meaning.shown} begins at {where}; a run begins at its first row, and its time counts from there; "
-        "if it began earlier, add a row at that time without readings",
+        f"{name}: {meaning.shown} begins at {where}; time is counted from the first row of a run. If the run "
+        "began earlier, add a row without readings at that time",
     )
 
 
@@ -195,7 +199,9 @@ def _counted(name: str, meaning: Column, count: np.ndarray, run: np.ndarray | No
         notes.append(f"{name}: {meaning.shown} wraps at {period:.10g}; counted on from there")
     count, rows = spread_shared_stamps(count, recording)
     if rows:
-        notes.append(f"{name}: {meaning.shown} repeats, {rows:.3g} rows a stamp; rows are set evenly between stamps")
+        notes.append(
+            f"{name}: {meaning.shown} repeats, {rows:.3g} rows per time stamp; rows are spaced evenly between stamps"
+        )
     return count, tuple(notes)
 
 

@@ -27,7 +27,7 @@ _WITH_UNIT = re.compile(r"([+-]?\d*\.?\d+(?:[eE][+-]?\d+)?)\s*([^\d\s.,].*)")
 
 
 def convert_column(meaning: Column, raw: Raw, layout: Layout) -> tuple[np.ndarray, np.ndarray]:
-    """Returns a column's values in its unit, NaN where there is no reading, and True for each cell to be refused.
+    """Returns a column's values in its unit (NaN without a reading), and True for each cell that is rejected.
 
     All cells are read at once, since a log may have a million rows. `refused_cell_sentence` makes the sentence about
     one of them.
@@ -58,7 +58,7 @@ def _in_its_unit(meaning: Column, written: np.ndarray) -> np.ndarray:
 
 
 def _allowed_words(column: str, word: str, layout: Layout) -> str:
-    """Allowed words for the message about a word, empty if the word is allowed itself."""
+    """Allowed words, for the error message about a word. Empty if the word itself is allowed."""
     if column == "surface":
         return surfaces.allowed_labels(word, layout)
     if column == "mode" and word not in DRIVEN:
@@ -91,9 +91,9 @@ def refused_cell_sentence(where: str, meaning: Column, cell: str, layout: Layout
 
 
 def _hint(meaning: Column, cell: str, units: bool, readings: Names) -> str:
-    """Guess at the meaning of a refused cell, with a semicolon at its end, empty without a guess."""
+    """Guess at the meaning of a rejected cell, ending in a semicolon. Empty without a guess."""
     if cell.lower() in NOTHING:
-        return "leave the cell empty where there is no reading; " if meaning.column in readings else ""
+        return "leave the cell empty if there is no reading; " if meaning.column in readings else ""
     quantity, mine = meaning.quantity, meaning.unit
     if not units or meaning.factor != 1.0:
         return ""
@@ -105,7 +105,10 @@ def _hint(meaning: Column, cell: str, units: bool, readings: Names) -> str:
         return "" if match is None else _unit_hint(match[1], match[2], mine, named)
     far = abs(value) > FAR * max(map(abs, quantity.limits(mine)))
     if far and meaning.column in DUTY:
-        return "a command of another size? divide by its largest, of a log by [columns] duty = {column, factor}; "
+        return (
+            "is the command scaled differently? divide it by its maximum, in a log with "
+            "[columns] duty = {column, factor}; "
+        )
     for unit, column in named.items():
         low, high = quantity.limits(unit)
         if far and unit != mine and low <= value <= high:
@@ -117,10 +120,10 @@ def _unit_hint(value: str, written: str, mine: str, named: Mapping[str, str]) ->
     """Advice on a unit next to a number. `mine`: the column's own unit. `named`: columns by their units."""
     unit = quantities.unit_in_column(written)
     if unit == mine:
-        return f"write {value}, as the column's name has the unit; "
+        return f"write {value}, since the unit is in the column's name; "
     if unit in named:
-        return f"write numbers alone, in {mine or 'shares of 1'}, or name the column {named[unit]}; "
-    return f"write the number alone{f', in {mine}' if mine else ''}; "
+        return f"write numbers without units, in {mine or 'shares of 1'}, or name the column {named[unit]}; "
+    return f"write only the number{f', in {mine}' if mine else ''}; "
 
 
 #: Most columns of a table that a message names.
@@ -197,8 +200,9 @@ def check_header(
         if column in required or (close and layout.complete):
             got = f"; is {close[0]} meant?" if close else ""
             if column == SUPPLY and {f"motor_{volts}" for volts in VOLTS} <= {*header}:  # they may be readings too
-                got = "; the drive of the sides may be stated, in the robot's file: [columns] " + ", ".join(
-                    f'{volts} = "motor_{volts}"' for volts in VOLTS
+                got = (
+                    "; the columns that drive the two sides can be named in the robot's file under [columns]: "
+                    + ", ".join(f'{volts} = "motor_{volts}"' for volts in VOLTS)
                 )
             raise BadData(
                 f"{name}: column {layout.expected(column)} is missing{got} (required: {', '.join(required)})"
@@ -210,8 +214,8 @@ def check_header(
         turning = {c.column: c.name for c in channels.OF_TURNS}
         if of_turns := [c for c in strange if c in turning]:
             names = ", ".join(f'"{turning[c]}"' for c in of_turns)
-            other = f"; {', '.join(of_turns)}: state in the robot's file channels = [{names}]"
-        raise BadData(f"{name}: no column of a channel; expected at least one of {expected}{other}")
+            other = f"; {', '.join(of_turns)}: set channels = [{names}] in the robot's file"
+        raise BadData(f"{name}: no column with readings; expected at least one of {expected}{other}")
     for column in strange:
         close = difflib.get_close_matches(column, [c for c in layout.known() if c not in stated], 1, 0.85)
         if close:
@@ -219,14 +223,14 @@ def check_header(
 
 
 def check_time(name: str, header: list[str], meanings: list[Column | None], layout: Layout) -> None:
-    """Refuses readings of a log without a column of time."""
+    """Rejects readings of a log without a column of time."""
     stated = {m.column: m.shown for m in meanings if m is not None}
     over_time = [stated[c.column] for c in layout.channels if c.column in stated and not c.settled]
     if over_time and stated.keys().isdisjoint(TIME):
         strange = [c for c, m in zip(header, meanings, strict=True) if m is None]
         raise BadData(
-            f"{name}: column {layout.expected('time_s')} is missing, and {over_time[0]} is read over time alone; of "
-            f"settled runs, remove {over_time[0]}{_other_names(strange, 'time_s')}"
+            f"{name}: column {layout.expected('time_s')} is missing, and {over_time[0]} can be used only in a "
+            f"time history; if these are settled runs, remove {over_time[0]}{_other_names(strange, 'time_s')}"
         )
 
 
@@ -238,13 +242,14 @@ def _other_names(strange: list[str], column: str) -> str:
     guess = next((c for c in strange if re.search(rf"\b{unit}\b", c)), "...")
     listed = ", ".join(strange[:NAMED]) + (", ..." if len(strange) > NAMED else "")
     return (
-        f"; other columns: {listed}; if one of them is it, state it in the robot's file, with the factor from its "
-        f'unit: [columns] {column} = {{column = "{guess}", factor = 1.0}} (mmrjax inspect proposes such lines)'
+        f"; other columns: {listed}; if one of them has these values, name it in the robot's file, with the "
+        f'factor for its unit: [columns] {column} = {{column = "{guess}", factor = 1.0}} (mmrjax inspect '
+        "proposes such lines)"
     )
 
 
 def _check_names_of_sides(name: str, strange: list[str], stated: set[str], layout: Layout) -> None:
-    """Refuses columns that name a side in other words, or elsewhere in the column's name."""
+    """Rejects columns that name a side with other words, or in another place of the column's name."""
 
     def words(column: str) -> list[str]:
         return sorted(_SIDE.get(word.casefold(), word.casefold()) for word in column.split("_"))
@@ -254,8 +259,8 @@ def _check_names_of_sides(name: str, strange: list[str], stated: set[str], layou
         meant = columns_of_sides.get(tuple(words(column)))
         if meant is not None and meant not in stated:
             raise BadData(
-                f"{name}: column {column}: the sides are called left and right; name it {meant}, or state [columns] "
-                f'{meant} = "{column}" in the robot\'s file'
+                f"{name}: column {column}: the two sides must be called left and right; rename it to {meant}, or "
+                f'set [columns] {meant} = "{column}" in the robot\'s file'
             )
         side = next((side for side in channels.SIDES if side in words(column)), None)
         turns = set(SIDES) <= set(columns_of_sides.values()) and not stated.isdisjoint(
@@ -263,13 +268,13 @@ def _check_names_of_sides(name: str, strange: list[str], stated: set[str], layou
         )
         if side and turns and not stated & {*SIDES, *VOLTS} and column.endswith("V"):
             raise BadData(
-                f"{name}: column {column}: if it is the voltage that drives the {side} side, name it "
-                f'voltage_{side}_V, or state [columns] voltage_{side}_V = "{column}" in the robot\'s file'
+                f"{name}: column {column}: if it is the voltage of the {side} side, rename it to "
+                f'voltage_{side}_V, or set [columns] voltage_{side}_V = "{column}" in the robot\'s file'
             )
 
 
 def check_units(arrays: NamedArrays, meanings: Sequence[Column | None]) -> None:
-    """Refuses a column whose name, or whose source, states another unit than it is read in."""
+    """Rejects a column if its name or its source gives a unit other than the one in which it is read."""
     below = [""] * len(meanings)
     for j, (unit, meaning) in enumerate(zip(arrays.units, meanings, strict=bool(arrays.units))):
         if meaning is None or meaning.column in WORDS:

@@ -73,8 +73,8 @@ class Column:
 
     Attributes:
         shown: name of the column in the file.
-        unit: that it states.
-        factor: from its cells to that unit.
+        unit: unit that it states.
+        factor: factor from its cells to that unit.
     """
 
     quantity: Quantity
@@ -104,7 +104,7 @@ class Column:
 
 @dataclasses.dataclass(frozen=True)
 class Layout:
-    """Facts of a robot that decide about the columns of its tables.
+    """Properties of a robot that determine the columns of its tables.
 
     Attributes:
         imposed: quantity imposed on its motors, one of `rig.IMPOSED`.
@@ -114,7 +114,7 @@ class Layout:
         configurations: their names.
         instruments: properties of instruments that are known.
         mapped: (column as this program calls it, column of the file, factor from its unit).
-        channels: of its readings, in the order of arrays.
+        channels: channels of its readings, in the order of arrays.
         supply: voltage of a controller's driver in tables without its column [V]. 0: tables have it.
     """
 
@@ -148,7 +148,7 @@ class Layout:
 
     @property
     def complete(self) -> bool:
-        """True if tables have to state every condition, otherwise a missing condition has its usual value."""
+        """True if tables must contain every condition. Otherwise a missing condition has its usual value."""
         return self.table8
 
     @property
@@ -188,7 +188,7 @@ class Layout:
         return tuple(c.sd_column for c in self.channels)
 
     def magnitude(self, channel: str) -> bool:
-        """True if the instrument of a channel shows its magnitude alone."""
+        """True if the instrument of a channel shows only the magnitude."""
         return any(i.channel == channel and i.signed is False for i in self.instruments)
 
     def variance(self, channel: str) -> float:
@@ -242,8 +242,8 @@ class Layout:
                     continue
                 if meant is None:
                     raise BadData(
-                        f"{source}: the robot's file reads {mine} from column {column}; this program has no column "
-                        f"{mine} for it (known: {', '.join(self.known())})"
+                        f"{source}: the robot's file reads {mine} from column {column}; mmrjax has no column "
+                        f"{mine} (known: {', '.join(self.known())})"
                     )
                 meanings_found.append(dataclasses.replace(meant, shown=column, factor=factor))
             else:
@@ -252,7 +252,9 @@ class Layout:
         for k, meaning in enumerate(meanings_found):
             twin = next((m for m in meanings_found[:k] if m and meaning and m.column == meaning.column), None)
             if meaning and twin and meaning.shown != twin.shown:
-                raise BadData(f"{source}: columns {twin.shown} and {meaning.shown} state the same; keep one of them")
+                raise BadData(
+                    f"{source}: columns {twin.shown} and {meaning.shown} have the same meaning; keep one of them"
+                )
         return meanings_found
 
     @functools.cached_property

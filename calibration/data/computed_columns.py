@@ -26,7 +26,7 @@ TORQUE = "output_torque_Nm"
 
 
 def without_computed_torques(runs: Runs, robot: Robot) -> Runs:
-    """The table without a torque that is a multiple of a current in all rows, to the digits of the file.
+    """The table without a torque column that is an exact multiple of a current in all rows.
 
     A motor's friction leaves an offset between current and torque, so a torque that was set or read is no multiple.
     If no load torque is set, the load of each row is found from its current by the balances of the file's robot. The
@@ -43,21 +43,25 @@ def without_computed_torques(runs: Runs, robot: Robot) -> Runs:
         line = None if len(np.unique(runs[current])) < FEWEST else line_through(runs[current], runs[torque])
         if line is None or line[0] != 0.0:
             continue
-        computed = f"{runs.source}, {torque}: in every row {line[1]:.4g} times {current}, to the last digit; it was "
-        computed += "computed and never measured, so it tells nothing of torque constant, friction or efficiency"
+        computed = (
+            f"{runs.source}, {torque}: equals {line[1]:.4g} times {current} in every row, to the last "
+            "digit, so it was "
+        )
+        computed += "computed, not measured, and contains no information on torque constant, friction or efficiency"
         if torque == TORQUE:
             columns.pop(torque)
             notes.append(f"{computed}; it is left out")
         elif runs.sampled or set(shown_columns) <= {current, TORQUE} or current not in shown_columns:
             raise BadData(
-                f"{computed}; remove the column and keep rows without a load, or give a torque that was set"
+                f"{computed}; remove the column and keep only rows without a load, or give the torque set at the "
+                "brake"
             )
         else:
             columns[torque] = _load_at(runs, robot, shown_columns[current], runs[current])
             columns.pop(current)
             notes.append(
                 f"{computed}; it is left out. The load of each row follows from {current} and the robot's file, "
-                "so that this current is no reading either: these rows tell of voltages and speeds"
+                "so this current is not a reading either. These rows contribute only voltages and speeds"
             )
     return dataclasses.replace(runs, columns=columns, notes=tuple(notes))
 
@@ -83,7 +87,7 @@ def _load_at(runs: Runs, robot: Robot, channel: str, current: np.ndarray) -> np.
     if far.size:
         raise BadData(
             f"{runs.source} row {far[0] + 1}, {LOAD}: it was computed from {channel}, and the file's robot draws "
-            f"{current[far[0]]:.4g} A at no load torque; check the file's numbers, or remove the row"
+            f"{current[far[0]]:.4g} A without a load torque; check the numbers in the file, or remove the row"
         )
     return load
 

@@ -80,15 +80,15 @@ def loads_from_tables(base: Robot | None, content: Json, sds: dict[str, float], 
     usual = load_names if base is None else list(base.configurations)
     if not usual and "configurations" not in content:
         raise BadConfiguration(
-            f"{where}: no load; expected a table such as [bench] with load = one of {', '.join(rig_file.LOADS)}"
+            f"{where}: no load is defined; add a table such as [bench] with load = one of {', '.join(rig_file.LOADS)}"
         )
     names = _names(content.pop("configurations", usual), where)
-    nothing = f', or state base = "{rig_file.NONE}" for a rig that starts from nothing'
+    nothing = f', or set base = "{rig_file.NONE}" for a rig that is described completely in this file'
     for name in load_names:
         if name not in names and set(_KINDS) & set(content[name]):
             raise BadConfiguration(
-                f"{where}, {name}: not among the configurations, {', '.join(names)}; add it to configurations = [...]"
-                f"{'' if base is None else nothing}"
+                f"{where}, {name}: not one of the configurations {', '.join(names)}; add it to configurations = "
+                f"[...]{'' if base is None else nothing}"
             )
     by_name: dict[str, Load] = {}
     missing: list[str] = []
@@ -108,13 +108,16 @@ def loads_from_tables(base: Robot | None, content: Json, sds: dict[str, float], 
         else:
             by_name[name], lacking = _chassis(base, name, table, here), []
         if lacking and base is not None:
-            raise BadConfiguration(f"{here}: load has no base to start from; {_listed(lacking)} missing")
+            raise BadConfiguration(
+                f"{here}: without a base, the load must be described completely; {_listed(lacking)} missing"
+            )
         missing += [f"{name}.{key}" for key in lacking]
     shafts = [name for name, load in by_name.items() if isinstance(load, Shaft)]
     vehicles = [name for name in names if name not in shafts]
     if shafts and vehicles:
         raise BadConfiguration(
-            f"{where}: {shafts[0]} is a shaft and {vehicles[0]} a vehicle; expected loads of one kind, one file each"
+            f"{where}: {shafts[0]} is a shaft and {vehicles[0]} a vehicle; a file can describe only one kind; use "
+            "two files"
         )
     return Loads(by_name, not shafts or bool(linear), frozenset(linear), tuple(missing))
 
@@ -135,7 +138,7 @@ def resolved_likes(content: Json, where: str) -> None:
 
 
 def _over(below: Mapping[str, Any], above: Mapping[str, Any]) -> Json:
-    """Two tables as one, in which `above` wins."""
+    """Two tables merged into one. Entries of `above` take precedence."""
     both = {
         key: value for key, value in below.items() if isinstance(value, dict) and isinstance(above.get(key), dict)
     }
@@ -150,7 +153,7 @@ def _kind(table: Json, where: str) -> str:
     stated_word(load, rig_file.LOADS, f"{where}.load")
     for key in ("like", "movers"):
         if load != "vehicle" and key in table:
-            raise BadConfiguration(f"{where}: states both load = {load!r} and {key}; state one of them")
+            raise BadConfiguration(f"{where}: load = {load!r} and {key} contradict each other; keep one")
     if load == "vehicle":
         table.setdefault("movers", "wheels") if "like" not in table else None
     return str(load)
@@ -176,8 +179,8 @@ def _vehicle(table: Json, where: str, sides: float) -> tuple[Chassis, list[str]]
     """A vehicle before the parameters of its table apply, and the required parameters that the table lacks."""
     if "movers" not in table:
         raise BadConfiguration(
-            f"{where}: its kind is missing; state load = one of {', '.join(rig_file.LOADS)}, or movers = one of "
-            f"{', '.join(MOVERS)}"
+            f"{where}: the kind of load is missing; set load = one of {', '.join(rig_file.LOADS)}, or movers = "
+            f"one of {', '.join(MOVERS)}"
         )
     on_tracks = _movers(table.pop("movers"), where)
     nothing = Chassis(
@@ -210,12 +213,12 @@ def _listed(names: list[str]) -> str:
 def _names(stated: Any, where: str) -> list[str]:
     where = f"{where}, configurations"
     if not isinstance(stated, list) or not stated or not all(isinstance(name, str) for name in stated):
-        raise BadConfiguration(f"{where}: got {stated!r}; expected a list of names, at least one, as {_EXAMPLE}")
+        raise BadConfiguration(f"{where}: got {stated!r}; expected a list of at least one name, such as {_EXAMPLE}")
     for name in stated:
         if stated.count(name) > 1:
             raise BadConfiguration(f"{where}: {name} is listed {stated.count(name)} times; name each once")
         if name in TAKEN:
-            raise BadConfiguration(f"{where}: {name} is the name of something else in a robot file; choose another")
+            raise BadConfiguration(f"{where}: {name} has another meaning in robot files; choose a different name")
         if not re.fullmatch(r"[A-Za-z0-9_-]+", name):
             raise BadConfiguration(
                 f"{where}: got {name!r}; expected letters, digits, underscores and hyphens, as {_EXAMPLE}"
@@ -228,7 +231,7 @@ def _chassis(robot: Robot, name: str, table: Json, where: str) -> Chassis:
     like, movers = table.pop("like", None), table.pop("movers", None)
     have = robot.configurations
     if like is not None and movers is not None:
-        raise BadConfiguration(f"{where}: states both like and movers; state one of them")
+        raise BadConfiguration(f"{where}: like and movers contradict each other; give one of them")
     if like is not None:
         return have[stated_word(like, have.names, f"{where}.like")]
     if movers is not None:
@@ -236,17 +239,20 @@ def _chassis(robot: Robot, name: str, table: Json, where: str) -> Chassis:
     if name in have:
         return have[name]
     raise BadConfiguration(
-        f'{where}: the base has no such configuration; state like = "{have.names[0]}" (one of {", ".join(have)}), or '
-        'movers = "tracks" or "wheels" and its parameters'
+        f'{where}: the base has no such configuration; set like = "{have.names[0]}" (one of {", ".join(have)}), '
+        'or movers = "tracks" or "wheels" and its parameters'
     )
 
 
 def _blank(pattern: Chassis, on_tracks: float, table: Mapping[str, Any], where: str) -> Chassis:
-    """A chassis with defaults where its fields have them. The table has to state all others."""
+    """A chassis with the default of every field that has one. The table must give all other fields."""
     defaults = dict(_defaults(pattern))
     missing = [name for name, default in defaults.items() if default is None and not _states(table, name)]
     if missing:
-        raise BadConfiguration(f"{where}: movers without like starts from nothing; {_listed(missing)} missing")
+        raise BadConfiguration(
+            f"{where}: with movers instead of like, the configuration must be described "
+            f"completely; {_listed(missing)} missing"
+        )
     known_values = {name: params.as_float(default) for name, default in defaults.items() if default is not None}
     return params.replace(dataclasses.replace(pattern, on_tracks=on_tracks), known_values)
 

@@ -31,12 +31,12 @@ class SignalFacts:
 
     Attributes:
         path: of it.
-        unit: that the file states.
+        unit: unit that the file states.
         samples: number of them.
         refused: why it cannot be read.
-        rate: of its clock [Hz], NaN where it has none.
+        rate: rate of its clock [Hz], NaN where it has none.
         gaps: number of steps of more than `GAP` usual ones, NaN without a clock.
-        least, greatest: of its numbers, NaN where it has none.
+        least, greatest: smallest and largest of its numbers, NaN where it has none.
         missing: samples without a number.
         words: some of its words, of a signal of words.
         clock: name of its clock.
@@ -60,9 +60,9 @@ class Contents:
     """Contents of a file.
 
     Attributes:
-        name, kind: of the file.
+        name, kind: name and kind of the file.
         signals: of it.
-        notes: on how it was read.
+        notes: notes on how it was read.
         preset: name of the packaged preset that its columns are of. Empty: none.
         proposed: lines of a table `[columns]`, for a person to check.
     """
@@ -103,7 +103,8 @@ def inspect_source(source: str | Path | Any) -> Contents:
     preset = presets_file.recognise_preset([s.path for s in contents_found.signals])
     if len(clocks) > 1:
         notes.append(
-            f"{contents_found.name}: signals have {len(clocks)} clocks; rows become those of the densest channel"
+            f"{contents_found.name}: signals have {len(clocks)} clocks; rows are taken at the samples of the "
+            "densest channel"
         )
     still = {fact.path for fact in facts if fact.least == fact.greatest}
     read = (dataclasses.replace(s, refused=f.refused) for s, f in zip(contents_found.signals, facts, strict=True))
@@ -202,9 +203,9 @@ def _proposed(signals: Sequence[Signal]) -> Iterator[tuple[str, str]]:
         line = f'time_{unit} = "{clock.path}"'
         if named is None and elapsed is not None:
             each = proposals.seconds_of_a_count(rest, np.asarray(clock.load(), float))
-            question = f"by a place and its rate it counts {1 / each:.3g} a second"
+            question = f"compared with a position, it counts {1 / each:.3g} per second"
             if math.isnan(each):
-                each, question = UNITS[unit], "counts of what? give the seconds of one"
+                each, question = UNITS[unit], "unit of the counts? give the seconds per count"
             each = float(f"{each:.3g}")
             elapsed = np.asarray(clock.load(), float) * each
             line = f'time_s = {{column = "{clock.path}", factor = {each:g}}}  # {question}'

@@ -32,7 +32,7 @@ RADIAN, ALIKE = 180 / np.pi, 0.03
 
 
 def check_contradictions(runs: Runs, robot: Robot) -> None:
-    """Refuse a table that contradicts itself or its robot.
+    """Reject a table that contradicts itself or its robot.
 
     Raises:
         BadData: a vehicle has no mass. A robot turns that cannot turn, or its sides are exchanged. The stated voltage
@@ -58,16 +58,16 @@ def check_contradictions(runs: Runs, robot: Robot) -> None:
 def cannot_stand(robot: Robot) -> str | None:
     """Reason why the stance of a robot is unknown, None if it is known."""
     if not robot.has_ground:
-        return "the robot's load is a shaft, which stands on no ground"
+        return "the robot's load is a shaft, which has no contact with the ground"
     if not any(robot.knows([f"running_gear.{p.name}"]) for p in params.walk_parameters(robot.running_gear)):
-        return "the robot's file states no running_gear; state its wheelbase, levers and masses there"
+        return "the robot's file has no running_gear; add its wheelbase, levers and masses"
     return None
 
 
 def without_levers(robot: Robot, configuration: str) -> str:
     """Reason why a configuration has no levers, empty if it has levers."""
     have = [name for name, c in robot.configurations.items() if float(c.on_tracks) > 0.5]
-    others = f"those that have: {', '.join(have)}" if have else "no configuration of the robot has"
+    others = f"configurations with levers: {', '.join(have)}" if have else "no configuration of the robot has"
     return "" if configuration in have else f"{configuration} has no levers; {others}"
 
 
@@ -108,13 +108,13 @@ def _mass(runs: Runs, robot: Robot) -> None:
     for name in np.unique(runs.configurations_named(robot)):
         if name in robot.configurations and float(robot.configurations[str(name)].mass) <= 0:
             raise BadData(
-                f"{runs.source}: no column total_mass_kg, and the robot's file states no mass of {name}; a vehicle "
-                "needs one of them"
+                f"{runs.source}: no column total_mass_kg, and the robot's file gives no mass for {name}; a "
+                "vehicle needs one of the two"
             )
 
 
 def _voltage(runs: Runs, robot: Robot, column: str) -> None:
-    """Refuse a voltage that contradicts the motors' back-EMF, which follows from the imposed speed.
+    """Reject a voltage that contradicts the motors' back-EMF at the imposed speed.
 
     A bridge may reverse the supply. Motors that a load drives brake: their voltage is smaller by the voltage drop of
     their current. Without readings of current, a share of the rows may be such rows.
@@ -145,7 +145,8 @@ def _voltage(runs: Runs, robot: Robot, column: str) -> None:
 
 
 def _time(runs: Runs) -> None:
-    """Refuse time that sometimes goes back: several recordings, or a clock that was set. Any order is allowed."""
+    """Reject a time that sometimes goes back, because of several recordings or a clock that was reset. Any order
+    is allowed."""
     time, run = runs["time_s"], runs.run_names
     for name in np.unique(run):
         mine = np.flatnonzero(run == name)
@@ -179,7 +180,7 @@ def _angle(runs: Runs) -> None:
         if jumps.size:
             row, passed = int(mine[jumps[0] + 1]), np.diff(runs["time_s"][mine])
             gap = passed[jumps[0]]
-            why = "as an angle that wraps; expected an angle that continues beyond a turn"
+            why = "like an angle that wraps; expected an angle that keeps counting beyond one turn"
             if gap > GAP * np.median(passed):
                 why = f"{float(f'{gap:.3g}'):g} s earlier; give each recording its own run_id"
             raise BadData(

@@ -110,7 +110,7 @@ def course_stretches(runs: Runs) -> list[list[Stretch]]:
 
 
 def course_of_each_row(runs: Runs) -> np.ndarray:
-    """For every row the name of its run's course of conditions, empty where they do not change, shape (rows,).
+    """Name of the course of conditions of each row's run, shape (rows,). Empty if the conditions do not change.
 
     A name is short: a course with thousands of changes, written in each of its rows, took gigabytes.
     """

@@ -40,11 +40,11 @@ def read_csv_columns(path: Path, name: str) -> NamedArrays:
     """Returns the columns of a CSV file as texts.
 
     Args:
-        name: of the file, for messages.
+        name: name of the file, for messages.
 
     Raises:
-        BadData: as `input_files.csv_bytes`, `decode_text` and `split_cells`, or a row of another length than the
-            header.
+        BadData: for the same reasons as `input_files.csv_bytes`, `decode_text` and `split_cells`, or a row of another
+            length than the header.
     """
     content = input_files.csv_bytes(path, name)
     if len(content) >= LONG and (plain := _plain(name, content)) is not None:
@@ -58,7 +58,7 @@ def read_csv_columns(path: Path, name: str) -> NamedArrays:
     units = row_of_units(header, body[0]) if body else ()
     if units:
         body = body[1:]
-        notes = (*notes, f"{name}: the row below the header states units; rows are counted from the next")
+        notes = (*notes, f"{name}: the row below the header contains units; row numbers start below it")
     for k, row in enumerate(body, 1):
         if len(row) != len(header):
             raise BadData(
@@ -147,7 +147,7 @@ def decode_text(name: str, content: bytes) -> tuple[str, Names]:
     """
     try:
         if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
-            return content.decode("utf-16"), (f"{name}: is in UTF-16; read so",)
+            return content.decode("utf-16"), (f"{name}: is read as UTF-16",)
         return content.decode("utf-8-sig"), ()
     except UnicodeDecodeError as error:
         wrong = f"{name}: cannot be read as a text file ({error}); save it as CSV in UTF-8"
@@ -186,7 +186,7 @@ def split_cells(name: str, lines: Sequence[str]) -> tuple[list[list[str]], Names
     Semicolons or tabs separate cells where the header has no comma. Numbers may have decimal commas then.
 
     Args:
-        name: of the file, for messages.
+        name: name of the file, for messages.
         lines: of the file, its header first.
 
     Raises:
@@ -221,7 +221,7 @@ def split_cells(name: str, lines: Sequence[str]) -> tuple[list[list[str]], Names
                 point.setdefault(j, []).append(cell)
             elif _BELOW.fullmatch(cell):
                 whole.add(j)
-    wanted = "expected decimal commas or points, one of them in a column, and nothing between thousands"
+    wanted = "expected either decimal commas or decimal points in a column, and no thousands separators"
     for j in comma.keys() & point.keys():
         raise BadData(f"{name}, {_column(rows, j)}: got {comma[j][0]} and {point[j][0]}; {wanted}")
     for marked, other in ((point, comma), (comma, point)):

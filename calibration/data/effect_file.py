@@ -32,7 +32,7 @@ from mmrjax.model.signals import Signals, State
 
 
 def _witness(place: str, whose: str, seen: list[Signals]) -> Effect:
-    """An effect with a zero term that records the signals its balance passes to it."""
+    """An effect with a zero term, which records the signals that its balance passes to it."""
 
     class Witness(Effect):
         balance = place
@@ -100,13 +100,14 @@ def effect_library(paths: Sequence[Path | str] = ()) -> Library:
     """Returns the packaged effects and the effects of the files, by name.
 
     Raises:
-        BadConfiguration: as `read_effect_file`. A repeated name. An effect that settles to an unknown effect.
+        BadConfiguration: for the same reasons as `read_effect_file`. A repeated name. An effect that settles to an
+            unknown effect.
     """
     library = dict(effects.BY_NAME)
     own_effects = [(path, effect) for path in map(Path, paths) for effect in read_effect_file(path)]
     for path, effect in own_effects:
         if effect.name in {**effects.BESIDE, **library}:
-            raise BadConfiguration(f"{_where(path, effect)}, name: {effect.name} is taken; choose another")
+            raise BadConfiguration(f"{_where(path, effect)}, name: {effect.name} is already used; choose another")
         library[effect.name] = effect
     for path, effect in own_effects:
         others = [name for name in library if name != effect.name]
@@ -189,11 +190,11 @@ def _check(path: Path, effect: type[Effect]) -> None:
     if size is not None and not (is_number(size) and size > 0):
         raise refuse(f", memory_size: got {size}; expected a positive number, or None for no memory")
     if "Source:" not in (effect.__doc__ or ""):
-        raise refuse(": its docstring states no equation with its «Source:»")
+        raise refuse(": its docstring must give the equation and its «Source:»")
     try:
         default = effect()
     except (Exception, SystemExit) as error:
-        raise refuse(f": cannot be made without arguments ({error}); give every field a default") from error
+        raise refuse(f": cannot be created without arguments ({error}); give every field a default") from error
     acting, stated = default.configurations, effect.configurations
     if acting != stated or not isinstance(acting, tuple) or not all(isinstance(c, str) for c in acting):
         raise refuse(f', configurations: got {stated!r}; expected a tuple of names such as ("4W2T",)')
@@ -205,9 +206,12 @@ def _check(path: Path, effect: type[Effect]) -> None:
             "amplitude: Scalar = amplitude(unit=..., meaning=..., bounds=..., sd=..., source=...)"
         )
     if float(declared["amplitude"].value) != 0.0:
-        raise refuse(f", amplitude: got default {float(declared['amplitude'].value):g}; expected 0, which is absent")
+        raise refuse(f", amplitude: got default {float(declared['amplitude'].value):g}; expected 0 (effect off)")
     if not declared["amplitude"].spec.prior_sd(0.0) > 0:
-        raise refuse(", amplitude: expected a prior with sd > 0; relative_sd is a share of zero")
+        raise refuse(
+            ", amplitude: expected a prior with sd > 0; give sd, since relative_sd is relative to the "
+            "default, which is 0"
+        )
     _check_term(refuse, effect, declared["amplitude"].spec.prior_sd(0.0))
 
 
@@ -263,21 +267,23 @@ def _check_term(refuse: Callable[[str], BadConfiguration], effect: type[Effect],
         if not jnp.array_equal(once, late, equal_nan=True):
             raise refuse(": its term reads a signal that is computed after its balance; see balances.moving_signals")
         if float(none) != 0.0:
-            raise refuse(f": its term is {float(none):g} at amplitude 0; expected 0, which is absent")
+            raise refuse(f": its term is {float(none):g} at amplitude 0; expected 0, so that the effect is off")
         if not math.isfinite(float(slope)):
             raise refuse(f": the derivative of its term at amplitude 0 is {float(slope)}; expected a finite one")
         bent = abs(float(twice) - 2 * float(once)) > 1e-6 * abs(float(twice))
         if bent or (float(slope) == 0) != (float(once) == 0):
-            raise refuse(": its term is not linear in its amplitude; expected amplitude times something")
+            raise refuse(
+                ": its term is not linear in its amplitude; expected amplitude times a function of the other signals"
+            )
         if not all(math.isfinite(float(jnp.sum(x))) for x in kept):
-            raise refuse(": rate or settled value of its memory is no finite number")
+            raise refuse(": the rate or settled value of its memory is not finite")
         if not all(jnp.isfinite(x).all() for x in jax.tree.leaves(at_rest)):
             raise refuse(": derivatives of its term are not finite at rest, where drive and track start")
         alike = effect.balance == "sensor" or jnp.allclose(once, other, rtol=1e-9, atol=0.0)
         if not alike and effect.driver != THE_SIDE:
             raise refuse(
-                f", driver: got {effect.driver!r} of a term that is not the same on both sides; expected "
-                f'"{THE_SIDE}", as a robot with this effect does not travel straight without steering'
+                f", driver: got {effect.driver!r} for a term that differs between the sides; expected "
+                f'"{THE_SIDE}", since a robot with this effect turns unless it is steered'
             )
         if effect.needs_battery and float(fed) != 0.0:
             raise refuse(f", needs_battery: its term is {float(fed):g} on an external supply; expected 0")

@@ -15,7 +15,7 @@ SEEDS = 2**32 - 1
 
 
 class InputError(Exception):
-    """Error of input from outside. The message is one sentence for a person."""
+    """Error in user input. The message is a sentence for the user."""
 
     def __init__(self, message: str) -> None:
         """Keeps the message, `shorten` and `printable`."""
@@ -48,7 +48,7 @@ def parse_number(text: str) -> float:
 
 
 def rows_text(rows: Sequence[int], most: int, rest: str = ", ...") -> str:
-    """`row 4`, or `rows 4, 5` and so on, from indices that begin at 0.
+    """Row numbers as text, such as `row 4` or `rows 4, 5`, from indices that begin at 0.
 
     `rest` stands for rows after the first `most`. `{}` in it is their number.
     """
@@ -57,7 +57,7 @@ def rows_text(rows: Sequence[int], most: int, rest: str = ", ...") -> str:
 
 
 def three_digits(value: float) -> str:
-    """A value as a sheet shows it, to three digits."""
+    """A value as text, to three significant digits."""
     return f"{value:.0f}" if abs(value) >= 100 else f"{value:.3g}"
 
 
@@ -98,7 +98,7 @@ def stated_number(
 
     Args:
         low, high: bounds.
-        unit: of the number, empty or `-` for none. None: unknown, the message leaves it out.
+        unit: unit of the number, empty or `-` for none. None: unknown, the message leaves it out.
 
     Raises:
         BadConfiguration: no number, or a number that is not finite or out of bounds.

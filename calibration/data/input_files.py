@@ -45,7 +45,7 @@ def file_bytes(path: Path, where: str | Path, kind: type[InputError] = BadData, 
 
     Args:
         where: opens the message of an error.
-        kind: of the error.
+        kind: kind of the error.
         largest: number of bytes.
 
     Raises:
@@ -87,12 +87,12 @@ def _opened(path: Path, where: str | Path, kind: type[InputError], largest: floa
 
 
 def check_declared(where: str | Path, columns: int, size: float = 0.0, held: float = math.inf) -> None:
-    """Refuses sizes that a source declares, before its values are read.
+    """Rejects sizes that a source declares, before its values are read.
 
     Args:
         where: opens the message of an error.
         columns: number of signals or columns.
-        size: of all values [bytes].
+        size: size of all values [bytes].
         held: size of the file that has them [bytes].
 
     Raises:
@@ -108,11 +108,11 @@ def check_declared(where: str | Path, columns: int, size: float = 0.0, held: flo
 
 
 def check_memory(where: str | Path, size: float) -> None:
-    """Refuses values that need more than `SHARE` of the free memory, before they are read.
+    """Rejects values that need more than `SHARE` of the free memory, before they are read.
 
     Args:
         where: opens the message of an error.
-        size: of the values [bytes].
+        size: size of the values [bytes].
 
     Raises:
         BadData: they do.
@@ -149,7 +149,7 @@ def csv_bytes(path: Path, where: str | Path) -> bytes:
     """Returns the bytes of a file that should be CSV.
 
     Raises:
-        BadData: as `file_bytes`, or another format, which the message names.
+        BadData: for the same reasons as `file_bytes`, or another format, which the message names.
     """
     content = file_bytes(path, where)
     what = next((word for begin, word in BINARY.items() if content.startswith(begin)), None)
@@ -170,7 +170,7 @@ def toml_text(path: Path, where: str | Path) -> str:
         where: opens the message of an error.
 
     Raises:
-        BadConfiguration: as `file_bytes`, or text that is not UTF-8.
+        BadConfiguration: for the same reasons as `file_bytes`, or text that is not UTF-8.
     """
     try:
         return file_bytes(path, where, BadConfiguration, LARGEST_TOML).decode("utf-8-sig")
@@ -183,7 +183,7 @@ def toml_content(text: str, where: str | Path, kind: type[InputError] = BadConfi
 
     Args:
         where: opens the message of an error.
-        kind: of the error.
+        kind: kind of the error.
 
     Raises:
         InputError: it is no TOML, has more than `KEYS` keys or `DEEPEST` tables within one another, or a whole number

@@ -71,7 +71,7 @@ def infer_instruments(instruments: tuple[Instrument, ...], columns: Columns) -> 
     An instrument shows magnitude alone if no reading is negative although some runs go backward.
 
     Args:
-        columns: of the table, in their units.
+        columns: columns of the table, in their units.
     """
     back = any((columns[c] < 0).any() for c in ("supply_voltage_V", "motor_speed_rpm", "duty") if c in columns)
     inferred = []

@@ -23,7 +23,7 @@ class NamedArrays:
     Messages count rows from 1. A reader that leaves out rows says so in `notes`.
 
     Attributes:
-        name: of the source, which opens every message.
+        name: name of the source, which opens every message.
         header: names of the columns, as the source states them.
         values: one for each column, all of one length.
         units: one for each column, spelled by `quantities.unit_in_column`, empty if unknown, or no units at all.
@@ -66,7 +66,7 @@ def column_texts(raw: Raw) -> list[str]:
 
 
 def cell_number(cell: str) -> float:
-    """Returns a cell's number, NaN where it states none."""
+    """Returns a cell's number, NaN if it contains none."""
     try:
         return parse_number(cell)
     except ValueError:
@@ -74,7 +74,7 @@ def cell_number(cell: str) -> float:
 
 
 def column_numbers(raw: Raw) -> np.ndarray:
-    """Returns the numbers of a column's cells, NaN where a cell states none."""
+    """Returns the numbers in a column's cells, NaN for a cell without a number."""
     if isinstance(raw, np.ndarray):
         return raw.astype(float)
     try:
@@ -86,7 +86,7 @@ def column_numbers(raw: Raw) -> np.ndarray:
 
 
 def missing_readings(raw: Raw, rows: np.ndarray) -> np.ndarray:
-    """Returns True for each of some rows in which there is no reading, shape (rows,)."""
+    """Returns True for each row without a reading, shape (rows,)."""
     if isinstance(raw, np.ndarray):
         return np.isnan(raw[rows].astype(float))
     return np.array([raw[row].lower() in MISSING for row in rows.tolist()], bool)

@@ -29,7 +29,7 @@ class StatedMass:
     """Mass of one configuration without payload, `total_mass_kg` less `payload_kg`.
 
     Attributes:
-        median, low, high: over the rows of the configuration [kg].
+        median, low, high: median, lower limit and upper limit over the rows of the configuration [kg].
         unladen: true if it varies although `total_mass_kg` is constant, as if that column leaves the payload out.
     """
 
@@ -77,10 +77,10 @@ def stated_masses(robot: Robot, runs: Runs) -> dict[str, StatedMass]:
 
 
 def with_table_mass(robot: Robot, runs: Runs) -> Robot:
-    """`robot` with the own mass that a table states for each configuration, the median over its rows.
+    """`robot` with each configuration's own mass from the table, the median over its rows.
 
     Raises:
-        BadData: as `stated_masses`.
+        BadData: for the same reasons as `stated_masses`.
     """
     own_masses = {name: float(chassis.mass) for name, chassis in robot.configurations.items()}
     masses = {n: s.median for n, s in stated_masses(robot, runs).items() if abs(s.median - own_masses[n]) > ROUNDING}
@@ -114,14 +114,14 @@ def mass_notes(robot: Robot, runs: Runs) -> list[str]:
     others = [s for s in np.unique(runs["surface"][of_table5]) if s != BENCH] if of_table5.any() else []
     if others:
         notes.append(
-            f"the table has runs on {', '.join(others)}: the written friction is for {BENCH}; simulate "
-            f"with --surface {others[0]} to meet what was fitted"
+            f"the table has runs on {', '.join(others)}: the written friction is for {BENCH}; simulate with "
+            f"--surface {others[0]} to use the fitted values"
         )
     return notes
 
 
 def check_priors(stated: Iterable[str], robot: Robot, runs: Runs) -> None:
-    """Refuse a prior of a mass that the table states: it would be written, and was not fitted with.
+    """Reject a prior of a mass that the table contains, because the fit uses the mass in the table.
 
     Args:
         stated: names of parameters.

@@ -40,24 +40,25 @@ def _texts(name: str) -> Any:
 
 @dataclasses.dataclass(frozen=True)
 class MotorSheet:
-    """A brushed DC motor as its maker's sheet states it, at 25 °C, NaN where the sheet is silent.
+    """Data sheet of a brushed DC motor at 25 °C. NaN marks values that the sheet does not give.
 
     Attributes:
-        name, maker, order_number: of the winding.
+        name, maker, order_number: name, maker and order number of the winding.
         voltage_nominal: voltage of the no-load and stall values [V].
         resistance, inductance: terminal resistance [ohm] and inductance [H].
         torque_constant: C_m [N·m/A].
         speed_constant: [rad/(s·V)], the inverse of C_m but for rounding.
-        speed_no_load, current_no_load: at the nominal voltage [rad/s], [A].
-        speed_nominal, torque_nominal, current_nominal: at the largest continuous torque [rad/s], [N·m], [A].
-        torque_stall, current_stall: at the nominal voltage [N·m], [A].
-        inertia: of the rotor [kg·m²].
+        speed_no_load, current_no_load: no-load speed and no-load current at the nominal voltage [rad/s], [A].
+        speed_nominal, torque_nominal, current_nominal: nominal speed, nominal torque and nominal current at the
+            largest continuous torque [rad/s], [N·m], [A].
+        torque_stall, current_stall: stall torque and stall current at the nominal voltage [N·m], [A].
+        inertia: inertia of the rotor [kg·m²].
         speed_max: largest permissible speed [rad/s].
         resistance_thermal_housing, resistance_thermal_winding: housing to ambient, winding to housing [K/W].
         time_constant_winding, time_constant_motor: time constants [s].
         temperature_winding_max: largest permissible winding temperature [°C].
         mass: [kg].
-        price: of one piece without tax [EUR of 2020].
+        price: price of one piece without tax [EUR of 2020].
         gearboxes: families of `packaged_gearboxes()` that the source combines it with, among those packaged.
         source: sheet and where it was read.
         note: further facts.
@@ -94,7 +95,7 @@ class MotorSheet:
 
 @dataclasses.dataclass(frozen=True)
 class GearboxSheet:
-    """A planetary gearbox as its maker's sheet states it, NaN where the sheet is silent.
+    """Data sheet of a planetary gearbox. NaN marks values that the sheet does not give.
 
     Attributes:
         name, maker, order_number, family: one row a ratio of a family.
@@ -102,11 +103,11 @@ class GearboxSheet:
         ratio: exact where the sheet gives a fraction.
         torque_max, torque_intermittent_max: largest continuous and intermittent output torque [N·m].
         efficiency: largest efficiency, as the sheets give it.
-        inertia: at the input shaft [kg·m²].
+        inertia: inertia at the input shaft [kg·m²].
         speed_input_max: largest continuous input speed [rad/s].
         power_max: largest continuous power [W].
         mass: [kg].
-        price: of one piece without tax [EUR of 2020].
+        price: price of one piece without tax [EUR of 2020].
         source, note: as of `MotorSheet`.
     """
 
@@ -130,17 +131,18 @@ class GearboxSheet:
 
 @dataclasses.dataclass(frozen=True)
 class CellSheet:
-    """A battery cell, or a pack of `cells` in series, as its sheet states it, NaN where the sheet is silent.
+    """Data sheet of a battery cell, or of a pack of `cells` in series. NaN marks values that the sheet does not
+    give.
 
     Attributes:
-        name, maker, chemistry: of the cell.
-        cells: in series.
+        name, maker, chemistry: name, maker and chemistry of the cell.
+        cells: cells in series.
         capacity: [C].
         voltage_full, voltage_cut_off: of one cell [V].
         current_max, current_charge_max: largest continuous currents [A].
-        resistance: of one cell to direct current [ohm].
-        impedance: of one cell at 1 kHz [ohm]. Smaller than the resistance.
-        mass: of all cells [kg].
+        resistance: resistance of one cell to direct current [ohm].
+        impedance: impedance of one cell at 1 kHz [ohm]. Smaller than the resistance.
+        mass: mass of all cells [kg].
         source, note: as of `MotorSheet`.
     """
 
@@ -191,7 +193,9 @@ def _rows(kind: type[Sheet], file: str) -> Iterator[Sheet]:
         raise BadData(f"{file}: got the columns {reader.fieldnames}; expected {wanted}")
     for row in reader:
         if None in row or None in row.values():
-            raise BadData(f"{file} row {reader.line_num}: got another number of cells than columns, {len(wanted)}")
+            raise BadData(
+                f"{file} row {reader.line_num}: the number of cells differs from the number of columns, {len(wanted)}"
+            )
         yield kind(**{f.name: _value(row[f.metadata["column"]], f"{file} row {reader.line_num}", f) for f in fields})
 
 

@@ -33,8 +33,9 @@ class Posterior:
     Attributes:
         coordinates: names of the parameters that have a coordinate each.
         units: of them.
-        mean, covariance: of z, shape (coordinates,) and (coordinates, coordinates).
-        location, spread, low, high: of u, in the parameter's unit or its logarithm.
+        mean, covariance: mean and covariance of z, shape (coordinates,) and (coordinates, coordinates).
+        location, spread, low, high: location, spread, lower limit and upper limit of u, in the parameter's unit or
+            its logarithm.
         softness: [-].
         kinds: `NORMAL`, `LOG` or `ANGLE`, of each.
         tied: (follower, index of the coordinate that it follows, ratio).
@@ -101,7 +102,7 @@ class Posterior:
         return self.values(np.random.default_rng(seed).standard_normal((draws, len(self))))
 
     def check(self, robot: Robot, where: str) -> None:
-        """Refuse a posterior that is not this robot's.
+        """Reject a posterior that is not this robot's.
 
         Args:
             where: opens the message.
@@ -116,7 +117,7 @@ class Posterior:
             if name not in values:
                 alike = [n for n in values if n.rpartition(".")[2] == name.rpartition(".")[2]]
                 raise BadData(
-                    f"{where}: a posterior of {name}, which this robot does not have, so it is of another robot; "
+                    f"{where}: this robot has no {name}, so the posterior belongs to another robot; "
                     f"{allowed_words(name, alike or values)}"
                 )
         with np.errstate(invalid="ignore"):  # of a file with NaN, refused below
@@ -149,7 +150,7 @@ def write_posterior(posterior: Posterior, path: Path | str) -> None:
         "spread": (p.spread, "du/dz"),
         "low": (p.low, "least u"),
         "high": (p.high, "greatest u"),
-        "softness": (p.softness, "width of the soft transition at the bounds, as a share of the spread"),
+        "softness": (p.softness, "width of the smooth transition at the bounds, as a fraction of the spread"),
         "value": (p.at(p.mean)[: len(p)], "parameter at the mean [SI]"),
         "sd": (p.sd[: len(p)], "standard deviation of the parameter, to first order [SI]"),
         "covariance": (p.covariance, "covariance of z"),
@@ -214,9 +215,7 @@ def read_posterior(path: Path | str) -> Posterior:
         and set(posterior.kinds) <= {NORMAL, LOG, ANGLE}
     )
     if not sound:
-        raise BadData(
-            f"{path}: the covariance is not one, or a number is missing or out of range; write the file anew"
-        )
+        raise BadData(f"{path}: not a valid covariance, or a number is missing or out of range; write the file again")
     return posterior
 
 

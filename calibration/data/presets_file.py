@@ -48,7 +48,7 @@ class PresetColumn:
     Attributes:
         mine: name of the column.
         theirs: names that it may have in the file, `*` for any text. The first that the file has is read.
-        factor: from its unit to the unit of `mine`.
+        factor: factor from its unit to the unit of `mine`.
         note: its meaning, for a note.
         needs: column of this program without which it is not what drives the motor. Empty: none.
         across: column of the file with the current along d, zero where the field is not weakened. Empty: none.
@@ -71,8 +71,8 @@ class Preset:
     """Columns of a logger's files.
 
     Attributes:
-        name: of the preset or its file.
-        columns: in its order.
+        name: name of the preset or its file.
+        columns: columns in its order.
         header: names of the columns of a file without a header. Empty: every file has one.
     """
 
@@ -108,12 +108,12 @@ class Preset:
         return next(read, PresetColumn("", ()))
 
     def check_needed(self, mapped: Iterable[tuple[str, str, float]], imposed: str, name: str) -> None:
-        """Refuses a source whose imposed column means nothing without another one that the source lacks.
+        """Rejects a source whose imposed column cannot be used without another column that the source lacks.
 
         Args:
             mapped: columns of the source.
             imposed: the column that drives the motor.
-            name: of the source.
+            name: name of the source.
 
         Raises:
             BadData: it lacks that column.
@@ -124,9 +124,9 @@ class Preset:
             if mine == imposed and (needs := by_name[mine].needs) and needs not in present:
                 wanted = " or ".join(by_name[needs].theirs)
                 raise BadData(
-                    f"{name}: has no {wanted}; --columns {self.name} needs it for {needs}, because {present[mine]} "
-                    f"alone does not give the motor's voltage; record {wanted}, or set imposed to the speed or the "
-                    "current in the rig's file"
+                    f"{name}: has no {wanted}; --columns {self.name} needs it for {needs}, because "
+                    f"{present[mine]} by itself does not give the motor voltage; record {wanted}, or set imposed "
+                    "to the speed or the current in the rig's file"
                 )
 
 
@@ -134,7 +134,7 @@ def of_columns(columns: Mapping[str, Any], where: str = "the stated table") -> P
     """Returns the columns that a table `[columns]` states.
 
     Raises:
-        BadConfiguration: as `parse_preset`.
+        BadConfiguration: for the same reasons as `parse_preset`.
     """
     return _parsed({"columns": dict(columns)}, where, {})
 
@@ -157,7 +157,7 @@ def find_preset(stated: str | Path) -> Preset:
         except ValueError as error:
             got = f"{key}{equals}{text}"
             raise BadConfiguration(
-                f"--columns {name}: got {got}; expected a name and a number, as pole_pairs=7"
+                f"--columns {name}: got {got}; expected a name and a number, such as pole_pairs=7"
             ) from error
     if name in PACKAGED:
         return parse_preset(_packaged(name), name, given)
@@ -173,7 +173,7 @@ def recognise_preset(names: Sequence[str]) -> str:
     """Returns the packaged preset with most columns in a source, at least `OF_A_PRESET`, empty if no preset has.
 
     Args:
-        names: of the source's columns, or paths of its signals.
+        names: names of the source's columns, or paths of its signals.
     """
     best, most = "", OF_A_PRESET - 1
     ends = {*names, *(re.split(r"[/.]", name)[-1] for name in names)}
@@ -190,7 +190,7 @@ def _among(theirs: str, names: set[str]) -> bool:
 
 
 def numbers_to_state(name: str) -> Names:
-    """Returns names of the numbers that a packaged preset asks for and has no usual value for."""
+    """Returns names of the numbers that a packaged preset needs and for which it has no default."""
     numbers = input_files.toml_content(_packaged(name), name).get("ask", {})
     return tuple(key for key, stated in numbers.items() if isinstance(stated, str) or "usual" not in stated)
 
@@ -220,26 +220,28 @@ def _parsed(content: Mapping[str, Any], where: str, given: Mapping[str, float]) 
     header = _texts(content.get("header", []), f"{where}, header")
     columns = content.get("columns", {})
     if not isinstance(columns, dict) or not columns:
-        raise BadConfiguration(f'{where}, columns: got {columns!r}; expected a table of columns, as time_s = "t"')
+        raise BadConfiguration(
+            f'{where}, columns: got {columns!r}; expected a table of columns, such as time_s = "t"'
+        )
     layout = Layout(channels=channels.EVERY)
     spellings, entries = layout.spellings(), []
     for mine, theirs in columns.items():
         if mine not in spellings:
             listed = allowed_words(mine, spellings, shown=layout.known())
             raise BadConfiguration(
-                f"{where}, columns.{mine}: no such column of a table; {listed}; also in other units"
+                f"{where}, columns.{mine}: no such column of a table; {listed}; other units are allowed too"
             )
         entries.append(_column(mine, theirs, f"{where}, columns.{mine}", numbers))
     return Preset(where, tuple(entries), header)
 
 
 def _numbers(asked: Any, where: str, given: Mapping[str, float]) -> dict[str, float]:
-    """Numbers that a preset asks for, by name."""
+    """Numbers that the user must give for a preset, by name."""
     if not isinstance(asked, dict):
         raise BadConfiguration(f"{where}, ask: got {asked!r}; expected a table")
     for key in given:
         if key not in asked:
-            listed = allowed_words(key, asked) if asked else "it asks for no number"
+            listed = allowed_words(key, asked) if asked else "it defines no numbers under [ask]"
             raise BadConfiguration(f"--columns {where}: got {key}; {listed}")
     numbers: dict[str, float] = {}
     for key, stated in asked.items():
@@ -250,8 +252,8 @@ def _numbers(asked: Any, where: str, given: Mapping[str, float]) -> dict[str, fl
             )
         if key not in given and "usual" not in table:
             raise BadConfiguration(
-                f"--columns {where}: {key} is missing, the {table['about']}; state it as "
-                f"--columns {where}{SEPARATOR}{key}=7"
+                f"--columns {where}: {key} is missing, the {table['about']}; give it as --columns "
+                f"{where}{SEPARATOR}{key}=7"
             )
         value = given.get(key, table.get("usual"))
         numbers[key] = stated_number(value, f"{where}, {key}")
@@ -272,7 +274,7 @@ def _column(mine: str, theirs: Any, where: str, numbers: Mapping[str, float]) ->
         if key in table:
             if table[key] not in numbers:
                 raise BadConfiguration(
-                    f"{where}.{key}: got {table[key]}; expected a number that [ask] names; "
+                    f"{where}.{key}: got {table[key]}; expected one of the numbers defined under [ask]; "
                     f"{allowed_words(str(table[key]), numbers)}"
                 )
             value = numbers[table[key]]
@@ -312,7 +314,7 @@ def _texts(stated: Any, where: str, form: str = "expected a list of names") -> N
 def merge_columns(
     first: Iterable[tuple[str, str, float]], others: Iterable[tuple[str, str, float]]
 ) -> tuple[tuple[str, str, float], ...]:
-    """Columns of two tables. `first` wins where both have a column, or read the same source column."""
+    """Columns of two tables. `first` takes precedence if both have a column, or use the same source column."""
     first = tuple(first)
     taken = {_bare(mine) for mine, _, _ in first} | {theirs for _, theirs, _ in first}
     return (*first, *(c for c in others if _bare(c[0]) not in taken and c[1] not in taken))

@@ -80,11 +80,11 @@ class ProfileTable:
 
     Attributes:
         source: name of the file or of the packaged profile, for messages.
-        time: of the rows [s].
-        modes: of `MODES`, one a row.
+        time: time of the rows [s].
+        modes: modes from `MODES`, one a row.
         demand: motor speed [rad/s] or speed [m/s], shape (rows,).
         values: fields of `mmrjax.missions.profile.Profile` that it states, by name, shape (rows,).
-        surface: of Table 5, one a row, None where it states none.
+        surface: surface of Table 5, one a row, None where it states none.
         linear, cycles: as of `mmrjax.missions.profile.Profile`.
         digest: SHA-256 of the file.
         begins: fields of `Start` that it states [SI, °C]. Rolling speed, temperatures of winding and housing.
@@ -147,28 +147,27 @@ class ProfileTable:
         return np.where(np.isin(mode, CONTROLLED), value, np.nan)
 
     def check_source(self, battery: bool) -> None:
-        """Refuse a profile that contradicts the supply of the run.
+        """Reject a profile that contradicts the supply of the run.
 
         Raises:
             BadConfiguration: it states a voltage, and the battery feeds the motors.
         """
         if battery and PAIRS[1][0] in self.values:
             raise BadConfiguration(
-                f"--battery: got it together with {self.source}, which states voltage_left_V; a battery's voltage "
-                "falls, so state duty_left and duty_right"
+                f"--battery: got it together with {self.source}, which contains voltage_left_V; a battery's "
+                "voltage falls, so give duty_left and duty_right instead"
             )
         if battery and "voltage" in self.values:
             raise BadConfiguration(
-                f"--battery: got it together with {self.source}, which states supply_voltage_V; expected one of "
-                "the two"
+                f"--battery: got it together with {self.source}, which contains supply_voltage_V; use one of the two"
             )
 
     def profile(self, robot: Robot, conditions: Conditions) -> Profile:
         """The profile that a simulation takes, for a batch of runs.
 
         Args:
-            robot: that follows it.
-            conditions: of shape (runs,), configurations as indices.
+            robot: robot that follows it.
+            conditions: conditions of shape (runs,), configurations as indices.
 
         Returns:
             Fields of shape (rows,). Where surfaces are stated, `adhesion` of shape (runs, rows).
@@ -227,12 +226,12 @@ def _of_text(content: bytes, name: str) -> ProfileTable:
 
 def _parsed(name: str, settings: Json, rows: list[list[str]], digest: str, notes: Names) -> ProfileTable:
     if not rows:
-        raise BadData(f"{name}: the file is empty; expected a header that has time_s, and rows below it")
+        raise BadData(f"{name}: the file is empty; expected a header that includes time_s, followed by data rows")
     header, body = rows[0], rows[1:]
     columns = _columns(name, header)
     if len(body) < 2:
         got = "one row" if body else "a header and no rows"
-        raise BadData(f"{name}: got {got}; expected two rows or more; the last one ends the mission")
+        raise BadData(f"{name}: got {got}; expected two rows or more, of which the last ends the mission")
     for k, row in enumerate(body, 1):
         if len(row) != len(header):
             raise BadData(
@@ -430,7 +429,7 @@ def _driven(cells: _Cells) -> tuple[Names, Columns]:
         speed, stated = MODES[SPEED], bool(cells.text(YAW_RATE, row))
         if stated and mode != speed and not (cells.linear and before == speed):
             cells.refuse(
-                YAW_RATE, row, f"an empty cell: a yaw rate goes with a demanded speed, and this row has mode {mode}"
+                YAW_RATE, row, f"an empty cell: a yaw rate needs a demanded speed, but this row has mode {mode}"
             )
         if cells.has(YAW_RATE) and not stated and mode == speed and (cells.linear or row < len(cells) - 1):
             cells.refuse(YAW_RATE, row, "the demanded yaw rate, 0 for straight travel")
@@ -457,19 +456,19 @@ def _mode(cells: _Cells, row: int, before: str, filled: list[str]) -> str:
 
 
 def _check_demands(cells: _Cells, row: int, before: str, mode: str, own: list[str], others: list[str]) -> None:
-    """Refuse a row with two demands or a missing one, and a ramp from one kind of demand to another."""
+    """Reject a row with two demands or a missing one, and a ramp from one kind of demand to another."""
     if others:
         where = cells.columns[others[0]][0]
         beside = cells.columns[own[0]][0] if own and not cells.text(MODE, row) else f"mode {mode}"
         raise BadData(
             f"{cells.source} row {row + 1}, {where}: got {cells.text(others[0], row)} in addition to {beside}; "
-            "expected one demand in a row"
+            "expected one demand per row"
         )
     pair = next((pair for pair in PAIRS if cells.has(pair[0])), ())
     ends = row == len(cells) - 1 and not cells.linear
     for field in pair:
         if mode == MODES[VOLTAGE] and field not in own and not ends:
-            cells.refuse(field, row, "a value for either side")
+            cells.refuse(field, row, "a value for each side")
     if mode not in CONTROLLED:
         return
     if not cells.has(mode):
@@ -481,6 +480,6 @@ def _check_demands(cells: _Cells, row: int, before: str, mode: str, own: list[st
         cells.refuse(mode, row, f"the demand of mode {mode}")
     if cells.linear and before in CONTROLLED and before != mode:
         raise BadData(
-            f"{cells.source} row {row + 1}: goes from a demanded {before} to a demanded {mode} where between_rows is "
-            "linear; expected one kind of demand, or a row that brakes or coasts between them"
+            f"{cells.source} row {row + 1}: goes from a demanded {before} to a demanded {mode} although "
+            "between_rows is linear; expected one kind of demand, or a row that brakes or coasts in between"
         )

@@ -83,7 +83,7 @@ class Candidate:
     Attributes:
         column: name of the column with the signal's unit.
         question: empty, or what a person has to check.
-        factor: from the signal's unit, if no column has it.
+        factor: factor from the signal's unit, if no column has it.
     """
 
     signal: Signal
@@ -162,7 +162,7 @@ def _candidate(
     """Quantity that a signal may show, None if its unit, its behaviour or its name excludes every one.
 
     Args:
-        unit: that it states, a column's. None: it states none. alone: True if no other signal states it.
+        unit: unit that it states, a column's. None: it states none. alone: True if no other signal states it.
         columns: names of the columns of each quantity, and their units.
     """
     if signal.refused:
@@ -201,7 +201,7 @@ def _candidate(
         if largest > {"V": LARGEST_V, "A": LARGEST_A}.get(unit, np.inf):
             unit, question = f"m{unit}", f"numbers up to {largest:.0f}: m{unit}?"
     elif not matches:
-        question = "by its unit alone: check it"
+        question = "a guess from its unit only: check it"
     elif "effort" in name:
         question = "effort may be a torque or a current: check it"
     column = next(c for c, u in units.items() if u == unit)
@@ -293,7 +293,7 @@ def _units_of_place_and_rate(
     """Units in which a place is the integral of its rate, empty if it is not.
 
     Args:
-        time: of both [s].
+        time: time of both [s].
         stated: unit of each, None if it states none.
     """
     turned = np.asarray(rate.load(), float)

@@ -45,11 +45,11 @@ RATINGS = ("winding_C", "motor_speed_rpm", "gearbox_speed_rpm", "gearbox_Nm")
 
 @dataclasses.dataclass(frozen=True)
 class Envelope:
-    """Conditions under which a requirement has to be met: ranges, each from its least to its greatest value.
+    """Ranges of the conditions under which a requirement must be met.
 
     Attributes:
-        configuration: of the robot, by name. Empty: its first.
-        surface: of Table 5. battery: on the battery, else on the external supply.
+        configuration: configuration of the robot, by name. Empty: its first.
+        surface: surface of Table 5. battery: on the battery, else on the external supply.
         payload_kg, slope_deg, state_of_charge, supply_voltage_V: as named.
         ambient_C: None: the robot's own ambient temperature.
     """
@@ -87,12 +87,12 @@ class Requirement:
     """One requirement.
 
     Attributes:
-        name: of `QUANTITIES`.
-        limit: in the unit of the name, None: as the part is rated.
+        name: one of `QUANTITIES`.
+        limit: limit in the unit of the name, None: as the part is rated.
         least: true if the quantity has to be at least the limit, false if at most.
         envelope: conditions under which it has to be met.
-        share: of the time that the robot drives, for the endurance. 0: it stands.
-        tread_mm: of stairs, for their rise.
+        share: share of the time that the robot drives, for the endurance. 0: it stands.
+        tread_mm: tread of stairs, for their rise.
         source: where the requirement comes from.
     """
 
@@ -184,7 +184,7 @@ def parse_requirements(text: str, where: str) -> Requirements:
             place = f"{where}, {name}" + (f" {k + 1}" if len(tables) > 1 else "")
             each += _requirements(name, table, envelope, place)
     if not each:
-        raise BadConfiguration(f"{where}: states no requirement; expected one of {', '.join(QUANTITIES)}")
+        raise BadConfiguration(f"{where}: contains no requirement; expected one of {', '.join(QUANTITIES)}")
     _contradictions(each, envelope, where)
     return Requirements(where, envelope, tuple(each), text)
 
@@ -203,7 +203,7 @@ def _unknown(name: str, known: Iterable[str]) -> str:
         return f"{name}: no unit in its name; write {stems[name]}"
     head = max((s for s in stems if name.startswith(f"{s}_")), key=len, default="")
     if head:
-        return f"{name}: unit {name[len(head) + 1 :]} is not read; write {stems[head]}"
+        return f"{name}: unit {name[len(head) + 1 :]} is not supported; write {stems[head]}"
     return f"{name}: no such key; {allowed_words(name, known)}"
 
 
@@ -238,16 +238,16 @@ def _envelope(base: Envelope, stated: Mapping[str, Any], where: str) -> Envelope
             envelope[key] = value
     if "supply_voltage_V" in envelope:
         if envelope.setdefault("battery", False):
-            raise BadConfiguration(f"{where}: battery and supply_voltage_V contradict each other; state one of them")
+            raise BadConfiguration(f"{where}: battery and supply_voltage_V contradict each other; give one of them")
         if "state_of_charge" in envelope:
             raise BadConfiguration(
-                f"{where}: state_of_charge and supply_voltage_V contradict each other; state one of them"
+                f"{where}: state_of_charge and supply_voltage_V contradict each other; give one of them"
             )
     elif "state_of_charge" in envelope and not envelope.setdefault("battery", True):
         raise BadConfiguration(f"{where}: state_of_charge needs the battery; got battery = false")
     merged = dataclasses.replace(base, **envelope)
     if not merged.battery and merged.supply_voltage_V is None:
-        raise BadConfiguration(f"{where}: battery = false needs supply_voltage_V, which is not stated")
+        raise BadConfiguration(f"{where}: battery = false needs supply_voltage_V, which is missing")
     return merged
 
 
@@ -267,11 +267,11 @@ def _requirements(name: str, value: Any, envelope: Envelope, where: str) -> list
         if key in AXES and key not in quantity.axes:
             raise BadConfiguration(f"{where}, {key}: {quantity.label} does not depend on it; remove it")
     if not limits:
-        raise BadConfiguration(f"{where}: states neither least nor most; expected one of them [{quantity.unit}]")
+        raise BadConfiguration(f"{where}: expected least, most or both [{quantity.unit}]")
     if not isinstance(source, str):
         raise BadConfiguration(f"{where}, source: got {source!r}; expected text")
     if name != "endurance_min" and (duty is not None or share is not None):
-        raise BadConfiguration(f"{where}: duty and share are of endurance_min alone")
+        raise BadConfiguration(f"{where}: duty and share can be used only with endurance_min")
     if name == STAIRS and tread is None:
         raise BadConfiguration(
             f"{where}: stairs without a tread; expected a table such as {{ least = 170, {TREAD} = 290 }}"
@@ -279,11 +279,11 @@ def _requirements(name: str, value: Any, envelope: Envelope, where: str) -> list
     depth = 0.0 if tread is None else stated_number(tread, f"{where}, {TREAD}", *TREADS, "mm")
     own_envelope = _envelope(envelope, table, where)
     if name == "endurance_min" and not own_envelope.battery:
-        raise BadConfiguration(f"{where}: endurance needs the battery, and the envelope states supply_voltage_V")
+        raise BadConfiguration(f"{where}: endurance needs the battery, but the envelope sets supply_voltage_V")
     if name == "speed_end_of_charge_m_s":
         if not own_envelope.battery:
             raise BadConfiguration(
-                f"{where}: an end of charge needs the battery, and the envelope states another supply"
+                f"{where}: an end of charge needs the battery, but the envelope sets another supply"
             )
         own_envelope = dataclasses.replace(
             own_envelope, state_of_charge=(own_envelope.charge_end, own_envelope.charge_end)

@@ -32,11 +32,11 @@ FAR, RISING = 100.0, 3
 
 @dataclasses.dataclass(frozen=True)
 class Fact:
-    """Returns facts that follow from a rig's numbers.
+    """A value derived from a rig's numbers, for a plausibility check.
 
     Attributes:
         what: in words.
-        value: with its unit.
+        value: value with its unit.
         odd: reason to check its numbers again, else empty.
     """
 
@@ -69,10 +69,10 @@ def _motor(robot: Robot) -> Iterator[Fact]:
         yield Fact("speed without load, of each volt", f"{three_digits(per_volt)} rpm/V", odd)
         idle = float(motor.friction_coulomb) / constant
         odd = _within(idle, 0, 10, "is friction_coulomb in N·m? it is torque_constant times the no-load current")
-        yield Fact("current that the motor's dry friction takes", f"{three_digits(idle)} A", odd)
+        yield Fact("current needed to overcome the motor's dry friction", f"{three_digits(idle)} A", odd)
     if with_constant and voltage is not None:
         fastest = voltage / constant
-        odd = "" if fastest < 2 * motor.speed_limit else "more than twice motor.speed_limit; look at torque_constant"
+        odd = "" if fastest < 2 * motor.speed_limit else ("more than twice motor.speed_limit; check torque_constant")
         yield Fact(f"speed without load at {three_digits(voltage)} V", f"{three_digits(fastest / RPM)} rpm", odd)
     if with_resistance and voltage is not None:
         stall = float(motor.current_stall(voltage))
@@ -81,12 +81,12 @@ def _motor(robot: Robot) -> Iterator[Fact]:
     if with_constant and with_resistance:
         size = constant**2 / resistance
         odd = _within(
-            size, 1e-7, 1.0, "torque_constant and resistance are unlikely to be of one motor; look at their units"
+            size, 1e-7, 1.0, "torque_constant and resistance are unlikely to belong to one motor; check their units"
         )
         yield Fact("torque over speed k²/R", f"{three_digits(size * 1e3)} mN·m·s", odd)
         if inertia > 0:
             constant_time = inertia / size
-            why = "look at motor.inertia (1 g·cm² is 1e-7 kg·m²), torque_constant and resistance"
+            why = "check motor.inertia (1 g·cm² is 1e-7 kg·m²), torque_constant and resistance"
             odd = _within(constant_time, 5e-4, 0.5, why)
             yield Fact(
                 "mechanical time constant of the motor alone J R/k²", f"{three_digits(constant_time * 1e3)} ms", odd
@@ -95,9 +95,9 @@ def _motor(robot: Robot) -> Iterator[Fact]:
 
 def _gearbox(robot: Robot) -> Iterator[Fact]:
     ratio, efficiency = float(robot.gearbox.ratio), float(robot.gearbox.efficiency_load)
-    odd = _within(ratio, 1, 3000, "is it motor turns for one of the output?")
+    odd = _within(ratio, 1, 3000, "expected motor turns per output turn")
     if ratio >= STAGES and efficiency > EFFICIENCY:
-        odd = f"an efficiency of {efficiency:g} is more than three stages or more have (mostly 0.5 to {EFFICIENCY:g})"
+        odd = f"an efficiency of {efficiency:g} is higher than usual for three or more stages (0.5 to {EFFICIENCY:g})"
     if ratio == 1 and efficiency < 0.9:
         odd = f"an efficiency of {efficiency:g} without a gearbox; is the ratio missing?"
     yield Fact("gearbox", f"{ratio:g} : 1 with efficiency {efficiency:g}", odd)
@@ -111,26 +111,26 @@ def _torque(robot: Robot, current: float) -> float:
 
 
 def _current(robot: Robot, torque: float) -> float:
-    """Current of one motor that a torque at its output takes, slowly [A]."""
+    """Motor current needed for a torque at its output, at low speed [A]."""
     motor, gear = robot.motor, robot.gearbox
     lost = float(motor.friction_coulomb) + float(gear.friction_coulomb)
     return (torque / (float(gear.ratio) * float(gear.efficiency_load)) + lost) / float(motor.torque_constant)
 
 
 def _drawn(robot: Robot, what: str, torque: float, places: str) -> Iterator[Fact]:
-    """Current that a torque takes, compared with the stall current if the voltage's limit is stated."""
+    """Current needed for a torque, compared with the stall current if a voltage limit is given."""
     if not robot.knows(["motor.torque_constant"]):
         return
     current, limit = _current(robot, torque), robot.motor.voltage_limit
-    odd = _within(current, 0, 200, f"look at {places}, and the gearbox")
+    odd = _within(current, 0, 200, f"check {places}, and the gearbox")
     if limit is not None and robot.knows(["motor.resistance"]):
         stall = float(robot.motor.current_stall(limit))
         if current > stall:
             odd = (
-                f"above the stall current {three_digits(stall)} A at {three_digits(limit)} V, so it stands; "
-                f"look at {places}"
+                f"above the stall current {three_digits(stall)} A at {three_digits(limit)} V, so it cannot move; "
+                f"check {places}"
             )
-    yield Fact(what, f"{three_digits(current)} A each motor", odd)
+    yield Fact(what, f"{three_digits(current)} A per motor", odd)
 
 
 def _shaft(robot: Robot, name: str, load: Shaft) -> Iterator[Fact]:
@@ -142,20 +142,24 @@ def _shaft(robot: Robot, name: str, load: Shaft) -> Iterator[Fact]:
             robot, f"{name}: current to hold and lift the arm", friction + gravity, f"{name}.torque_gravity"
         )
         length = float(load.inertia) * GRAVITY / gravity
-        why = f"{name}.inertia and {name}.torque_gravity are unlikely to be of one arm: m l² and m g l"
+        why = f"{name}.inertia and {name}.torque_gravity are unlikely to belong to one arm (m l² and m g l)"
         yield Fact(
-            f"{name}: swings as a pendulum of", f"{three_digits(length * 1e3)} mm", _within(length, 0.01, 3.0, why)
+            f"{name}: length of a pendulum with the same period",
+            f"{three_digits(length * 1e3)} mm",
+            _within(length, 0.01, 3.0, why),
         )
     if float(load.inertia) > 0 and float(robot.motor.inertia) > 0:
         share = float(load.inertia) / (float(robot.motor.inertia) * float(robot.gearbox.ratio) ** 2)
-        why = f"look at {name}.inertia and motor.inertia [kg·m²]; 1 g·cm² is 1e-7"
+        why = f"check {name}.inertia and motor.inertia [kg·m²]; 1 g·cm² is 1e-7"
         yield Fact(
-            f"{name}: inertia over the motor's at the output", three_digits(share), _within(share, 1e-4, 1e4, why)
+            f"{name}: load inertia over motor inertia, both at the output",
+            three_digits(share),
+            _within(share, 1e-4, 1e4, why),
         )
     if float(load.radius) != 1.0:
         travel = 2 * math.pi * float(load.radius)
         yield Fact(
-            f"{name}: travel of a turn", f"{three_digits(travel * 1e3)} mm", _within(travel, 1e-4, 10.0, "look at it")
+            f"{name}: travel per turn", f"{three_digits(travel * 1e3)} mm", _within(travel, 1e-4, 10.0, "look at it")
         )
 
 
@@ -172,18 +176,18 @@ def _vehicle(robot: Robot, name: str) -> Iterator[Fact]:
     grip = math.degrees(math.atan(static))
     odd = "" if static > rolling + guide else "it cannot move on the flat: friction.static is below the resistance"
     yield Fact(
-        f"{name}: steepest slope that the ground holds", f"{grip:.0f}°", odd or _within(grip, 5, 60, "look at static")
+        f"{name}: steepest slope without sliding", f"{grip:.0f}°", odd or _within(grip, 5, 60, "look at static")
     )
     limit = robot.motor.voltage_limit
     if limit is None or not robot.knows(["motor.resistance"]):
         return
     pull = _torque(robot, float(robot.motor.current_stall(limit))) - float(load.track.loss_coulomb)
     climb = pull * sides / (radius * mass * GRAVITY) - rolling - guide
-    odd = "" if climb > 0 else "its motors cannot move it; look at mass, ratio, torque_constant and resistance"
+    odd = "" if climb > 0 else "its motors cannot move it; check mass, ratio, torque_constant and resistance"
     angle = "any" if climb >= 1 else f"{math.degrees(math.asin(max(climb, 0.0))):.0f}°"
     yield Fact(f"{name}: steepest slope that the stall torque holds at {three_digits(limit)} V", angle, odd)
     speed = limit / float(robot.motor.torque_constant) / float(robot.gearbox.ratio) * radius
-    odd = _within(speed, 0.005, 15, f"look at {name}.radius, gearbox.ratio and motor.torque_constant")
+    odd = _within(speed, 0.005, 15, f"check {name}.radius, gearbox.ratio and motor.torque_constant")
     yield Fact(f"{name}: speed without load at {three_digits(limit)} V", f"{three_digits(speed)} m/s", odd)
 
 
@@ -209,11 +213,10 @@ def doubtful_time(runs: Runs, robot: Robot) -> str:
                 continue
             lasts, column = time[rises[-1]] - time[rises[0]], runs.headings.get("time_s", "time_s")
             return (
-                f"{runs.source} rows {stretch.rows[rises[0]] + 1} to {stretch.rows[rises[-1]] + 1}: {channel.label} "
-                f"changes over {three_digits(lasts)} s at a constant voltage, where these motors take about "
-                f"{three_digits(longest / FAR)} s; is {column} in milliseconds? then name it time_ms, or "
-                "state [columns] "
-                f'time_ms = "{column}"'
+                f"{runs.source} rows {stretch.rows[rises[0]] + 1} to {stretch.rows[rises[-1]] + 1}: "
+                f"{channel.label} changes over {three_digits(lasts)} s at a constant voltage, while these motors "
+                f"need about {three_digits(longest / FAR)} s; is {column} in milliseconds? then name it time_ms, "
+                f'or state [columns] time_ms = "{column}"'
             )
     return ""
 
@@ -239,9 +242,8 @@ def doubtful_current(runs: Runs, robot: Robot) -> str:
         return ""
     theirs = runs.headings.get(column, column)
     return (
-        f"{runs.source}, {theirs}: up to {three_digits(largest)} A, where the file's numbers turn the load "
-        "slowly with "
-        f"{three_digits(needed)} A; is it in another unit (mA, mN·m)? then state [columns] {column} = "
+        f"{runs.source}, {theirs}: up to {three_digits(largest)} A, although by the file's numbers the load turns "
+        f"slowly at {three_digits(needed)} A; is it in another unit (mA, mN·m)? then state [columns] {column} = "
         f'{{column = "{theirs}", factor = ...}}'
     )
 
@@ -269,8 +271,8 @@ def gap_sentence(runs: Runs) -> str:
         more = f" (and {count_noun(int(long.sum()) - 1, 'other row')} after a gap)" if long.sum() > 1 else ""
         told = (
             f"{runs.source} row {rows[k + 1] + 1}, time_s: {three_digits(worst)} s after the row before it, where "
-            f"{three_digits(usual)} s is usual{more}; a fit holds the imposed quantity for that time; if rows are "
-            'missing, give the rows from there on another run_id, with start = "measured" in the rig\'s file'
+            f"{three_digits(usual)} s is usual{more}; a fit keeps the imposed quantity constant in the gap; if rows "
+            'are missing, give those after the gap another run_id, with start = "measured" in the rig\'s file'
         )
     return told
 
@@ -296,8 +298,8 @@ def jitter_sentence(runs: Runs) -> str:
             run = f" of run {name}" if name else ""
             return (
                 f"{runs.source} rows {rows[0] + 1} to {rows[-1] + 1}, time_s: the clock{run} jitters by "
-                f"{three_digits(spread / 2**0.5)} s about even rows; a fit takes its times as they are; give even "
-                f"ones, {three_digits(float(np.mean(steps)))} s apart"
+                f"{three_digits(spread / 2**0.5)} s around even spacing; a fit uses these times unchanged. "
+                f"Replace them by even times, {three_digits(float(np.mean(steps)))} s apart"
             )
     return ""
 
@@ -311,9 +313,10 @@ def one_level(runs: Runs) -> str:
     if any(len(np.unique(runs[c])) > 1 for c in conditions):
         return ""
     return (
-        f"{runs.source} rows 1 to {len(runs)}, {runs.headings.get(column, column)}: {three_digits(runs[column][0])} "
-        f"{column.rpartition('_')[2]} in every row; after the start one level shows one current and one speed, "
-        "which do not separate losses that rise with either; log three levels or more, both ways if it turns back"
+        f"{runs.source} rows 1 to {len(runs)}, {runs.headings.get(column, column)}: "
+        f"{three_digits(runs[column][0])} {column.rpartition('_')[2]} in every row; one level gives one steady "
+        "current and speed, which cannot separate losses that rise with current from losses that rise with "
+        "speed. Log three levels or more, in both directions if the drive reverses"
     )
 
 
@@ -352,10 +355,9 @@ def saturation_sentence(runs: Runs) -> str:
     row = int(np.flatnonzero(beyond)[0])
     column = "duty" if runs.has("duty") else runs.headings.get(SUPPLY, SUPPLY)
     return (
-        f"{runs.source} row {row + 1}, {column}: commands {three_digits(given[row])} V, where current and speed show "
-        f"{three_digits(limit)} V at most, and so in {100 * np.mean(beyond):.2g} % of the log; the driver "
-        "limits it: give "
-        f"the voltage that it applies, or limit the column to {three_digits(limit)} V"
+        f"{runs.source} row {row + 1}, {column}: commands {three_digits(given[row])} V, but current and speed "
+        f"show {three_digits(limit)} V at most, as in {100 * np.mean(beyond):.2g} % of the log; the driver limits "
+        f"the voltage. Give the voltage that it applies, or limit the column to {three_digits(limit)} V"
     )
 
 
@@ -385,9 +387,9 @@ def doubtful_speed(runs: Runs, robot: Robot) -> str:
     row = int(np.flatnonzero(is_shown)[0])
     theirs, supply = (runs.headings.get(c, c) for c in (column, SUPPLY))
     return (
-        f"{runs.source} row {row + 1}, {theirs}: got {three_digits(abs(read[row]))} rpm, where the file's torque "
-        f"constant turns the motors at up to {three_digits(reached[row])} rpm; check the units of {theirs} and "
-        f"{supply}, and motor.torque_constant"
+        f"{runs.source} row {row + 1}, {theirs}: got {three_digits(abs(read[row]))} rpm, but with the file's "
+        f"torque constant the motors reach at most {three_digits(reached[row])} rpm; check the units of {theirs} "
+        f"and {supply}, and motor.torque_constant"
     )
 
 
@@ -412,7 +414,7 @@ def doubtful_torque(runs: Runs, robot: Robot) -> str:
         return ""
     row, theirs = int(np.flatnonzero(beyond)[0]), runs.headings.get(LOAD, LOAD)
     return (
-        f"{runs.source} row {row + 1}, {theirs}: got {three_digits(runs[LOAD][row])} N·m, where the motors stall at "
+        f"{runs.source} row {row + 1}, {theirs}: got {three_digits(runs[LOAD][row])} N·m, but the motors stall at "
         f'{three_digits(stall[row])} N·m; is it in mN·m? then state [columns] load_torque_mNm = "{theirs}"'
     )
 
@@ -430,8 +432,8 @@ def still_sentence(runs: Runs) -> str:
         return ""
     columns = ", ".join(runs.headings.get(c, c) for c in (runs.channels[k].column for k in moving))
     return (
-        f"{runs.source}, {columns}: the same in every row, so nothing moves; the log shows at most the resistance of "
-        "windings; log a run in which the shaft turns, or name the column that shows it"
+        f"{runs.source}, {columns}: the same in every row, so nothing moves; the log determines at most the "
+        "winding resistance. Log a run in which the shaft turns, or name the column with its speed or angle"
     )
 
 
@@ -450,9 +452,9 @@ def held_sentence(runs: Runs) -> str:
                 if moves and end - begin > HELD * len(rows) and np.ptp(drive[rows[begin:end]]) > HELD * range_ > 0:
                     column, last = runs.headings.get(channel.column, channel.column), rows[end - 1] + 1
                     return (
-                        f"{runs.source} rows {rows[begin] + 1} to {last}, {column}: the same reading "
-                        f"while {runs.headings.get(imposed, imposed)} changes, as if held at the last value; "
-                        "empty these cells, and the other rows are used"
+                        f"{runs.source} rows {rows[begin] + 1} to {last}, {column}: the same reading while "
+                        f"{runs.headings.get(imposed, imposed)} changes, as if the last value was repeated; empty "
+                        "these cells to use the other rows"
                     )
     return ""
 
@@ -472,9 +474,8 @@ def swapped_sentence(runs: Runs) -> str:
             if channel.zero_at_rest and channel.settled and first * rest < 0 and min(abs(first), abs(rest)) > SWAPPED:
                 column = runs.headings.get(channel.column, channel.column)
                 return (
-                    f"{runs.source} row {rows[turn] + 2}, {column}: from here on it has the other sign compared with "
-                    f"{runs.headings.get(imposed, imposed)}; correct the sign of either half, or give each its own "
-                    "run_id and file"
+                    f"{runs.source} row {rows[turn] + 2}, {column}: from here on its sign is reversed relative to "
+                    f"{runs.headings.get(imposed, imposed)}; correct the sign in one of the two parts"
                 )
     return ""
 
@@ -502,7 +503,7 @@ class Origin:
     """Origin of a number of a robot.
 
     Attributes:
-        name: of the parameter, value [unit].
+        name: name of the parameter, value [unit].
         sd: as stated, None if the file states none.
         why: in words.
     """
@@ -531,11 +532,11 @@ def number_origins(file: RobotFile) -> list[Origin]:
         if not is_shown and not assumed:
             continue
         if p.name in stated:
-            why = "the file, by mass and travel of the linear unit" if head in file.linear else "the file"
+            why = "the file, from mass and travel of the linear unit" if head in file.linear else "the file"
         elif robot.rig.inherits:
             why = "its base"
         elif head == BATTERY and not robot.knows([p.name]):
-            why = "not stated: an example's; results on the battery depend on it"
+            why = "not stated: an example value; results on the battery depend on it"
         else:
             why = _default(p.name, rest if mine else "")
         origins.append(Origin(p.name, float(p.value), p.spec.unit, priors.get(p.name), why))

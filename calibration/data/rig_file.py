@@ -31,10 +31,10 @@ LOADS = ("shaft", "linear", "vehicle")
 LINEAR = {
     "mass_kg": "mass that it moves",
     "lead_mm": "travel of one turn of the output",
-    "drum_radius_mm": "radius of the drum or pulley, in place of the lead",
+    "drum_radius_mm": "radius of the drum or pulley, instead of the lead",
     "force_coulomb_N": "dry friction of guide and screw",
     "force_viscous_N_s_m": "viscous friction of guide and screw",
-    "force_constant_N": "force that acts against forward travel whatever the speed",
+    "force_constant_N": "constant force against forward travel",
     "incline_deg": "slope that forward travel climbs, positive uphill",
     "inertia": "inertia of parts that turn with the output, without the mass [kg·m^2]",
 }
@@ -44,8 +44,8 @@ _LEAST = {"mass_kg", *_TRAVEL}  # these must be more than 0
 #: Default values of a robot that starts from nothing, each with its reason. It has no limits and no other losses
 #: (`robots.blank`).
 DEFAULTS: dict[str, tuple[float, str]] = {
-    "motor.inertia": (0.0, "not stated: the load's inertia alone; histories from rest need it"),
-    "battery.current_other": (0.0, "not stated: nothing else is on the battery"),
+    "motor.inertia": (0.0, "not stated: only the load's inertia counts; time histories from rest need it"),
+    "battery.current_other": (0.0, "not stated: no other consumers on the battery"),
 }
 #: Time constant L / R of a winding whose inductance is not stated [s]: of small motors 0.05 to 1 ms.
 WINDING = 2e-4
@@ -54,19 +54,22 @@ WINDING_WHY = f"not stated: assumed, {1e3 * WINDING:g} ms of the resistance"
 VEHICLE: dict[str, tuple[float, str]] = {
     "track.loss_coulomb": (0.0, "not stated: wheels have no loss except rolling resistance"),
     "track.loss_viscous": (0.0, "not stated: no loss that rises with speed"),
-    "track.guide_friction": (0.0, "not stated: nothing rubs on a guide"),
+    "track.guide_friction": (0.0, "not stated: no guide friction"),
     "track.guide_share": (0.0, "not stated: pulleys or wheels carry all of the weight"),
-    "ground.friction.speed_static": (0.02, "not stated: assumed, a contact creeps up to this speed as it grips"),
+    "ground.friction.speed_static": (
+        0.02,
+        "not stated: assumed; a contact creeps at up to this speed while it grips",
+    ),
     "ground.friction.speed_dynamic": (0.2, "not stated: assumed, ten times speed_static"),
     "turning.width": (0.0, "not stated: only a robot that turns needs it"),
-    "turning.lateral": (1.0, "not stated: assumed, friction across the travel as along it"),
-    "turning.rule": (1.0, "not stated: assumed, friction against the sliding"),
+    "turning.lateral": (1.0, "not stated: assumed equal to friction along the travel"),
+    "turning.rule": (1.0, "not stated: assumed, friction opposite to the sliding velocity"),
     "turning.inertia": (0.0, "not stated: only a robot that turns needs it"),
 }
 #: Further required parameters of a vehicle that states its width, and so may turn.
 WIDTH, WHEELBASE = "turning.width", "running_gear.wheelbase"
 #: Parameter whose default value is taken from an example, and the reason.
-CENTRE, CENTRE_WHY = "running_gear.centre_height", "not stated: an example's; in turns it moves load"
+CENTRE, CENTRE_WHY = "running_gear.centre_height", "not stated: an example value; it shifts load in turns"
 #: Parameters of VEHICLE that tracks have to state.
 _OF_TRACKS = ("track.loss_coulomb",)
 DYNAMIC = "ground.friction.dynamic"
@@ -76,7 +79,7 @@ WHEELS = 0.05
 #: Reasons for default values of a vehicle that follow from other stated values.
 FOLLOWS = {
     DYNAMIC: f"not stated: assumed, {DYNAMIC_SHARE:g} of static",
-    "inertia": f"not stated: assumed, wheels that are disks of {100 * WHEELS:g} % of the mass",
+    "inertia": f"not stated: assumed, disk wheels with {100 * WHEELS:g} % of the mass",
 }
 
 
@@ -90,7 +93,7 @@ def linear_to_shaft(table: Json, name: str, where: str, sds: dict[str, float], s
     The sds are first order for independent inputs. Exact inputs give exact values.
 
     Args:
-        table: of the configuration `name`, without `load`.
+        table: table of the configuration `name`, without `load`.
         where: opens the message of an error.
         sds: stated, by dotted name.
         sides: drives that move it together.
@@ -105,8 +108,8 @@ def linear_to_shaft(table: Json, name: str, where: str, sds: dict[str, float], s
     travels = [key for key in _TRAVEL if key in values]
     if len(travels) != 1:
         raise BadConfiguration(
-            f"{where}: got {' and '.join(travels) or 'neither lead_mm nor drum_radius_mm'}; expected one of them, "
-            "the travel of one turn, or the radius of a drum or pulley"
+            f"{where}: got {' and '.join(travels) or 'neither lead_mm nor drum_radius_mm'}; expected one of the "
+            "two: the travel per turn, or the radius of a drum or pulley"
         )
     if "mass_kg" not in values:
         raise BadConfiguration(f"{where}.mass_kg: missing; expected the mass that it moves [kg]")
@@ -134,7 +137,7 @@ def linear_to_shaft(table: Json, name: str, where: str, sds: dict[str, float], s
 def _linear_value(table: Mapping[str, Any], key: str, where: str) -> float:
     value = table[key]
     if not is_number(value) or not math.isfinite(value) or (key in _LEAST and value <= 0):
-        least = "a number more than 0" if key in _LEAST else "a number"
+        least = "a number above 0" if key in _LEAST else "a number"
         raise BadConfiguration(f"{where}.{key}: got {value!r}; expected {least} ({LINEAR[key]})")
     return float(value)
 
@@ -155,7 +158,7 @@ def vehicle_defaults(on_tracks: bool, table: Mapping[str, Any], sides: float) ->
     """Returns default values of a vehicle that starts from nothing.
 
     Args:
-        table: that its file states of it.
+        table: table that its file states of it.
         sides: drives that move it together.
     """
 
@@ -192,7 +195,7 @@ def parse_rig(content: Json, where: str, loads: Sequence[str], *, travels: bool,
     names = _channels(content.pop("channels", [n for n in usual if n != imposed]), f"{where}, channels")
     if idle := {imposed, f"{imposed}_left", f"{imposed}_right"} & set(names):
         raise BadConfiguration(
-            f"{where}, channels: {min(idle)} is imposed, so it is no reading; remove it, or state imposed = "
+            f"{where}, channels: {min(idle)} is imposed, so it cannot be a reading; remove it, or set imposed = "
             f'"{next(word for word in IMPOSED if word != imposed)}"'
         )
     return Rig(
@@ -249,13 +252,13 @@ def _instruments(stated: Any, names: Sequence[str], where: str) -> tuple[Instrum
         channel = channels.find_channel(name)
         if not isinstance(signed, bool) and signed != FREE:
             raise BadConfiguration(
-                f"{here}.{name}.signed: got {signed!r}; expected true, false: shows magnitude alone, or {FREE!r}: "
-                "the table tells"
+                f"{here}.{name}.signed: got {signed!r}; expected true, false (shows only the magnitude), or {FREE!r} "
+                "(decided from the table)"
             )
         if quantum != FREE and not (is_number(quantum) and 0 <= quantum < math.inf):
             raise BadConfiguration(
-                f"{here}.{name}.quantum: got {quantum!r}; expected the step of its readings, 0 or more "
-                f"{channel.unit}, or {FREE!r}: the table tells"
+                f"{here}.{name}.quantum: got {quantum!r}; expected the resolution of its readings, 0 or more "
+                f"{channel.unit}, or {FREE!r} (decided from the table)"
             )
         step = None if quantum == FREE else float(quantum) * channel.factor
         instruments.append(Instrument(name, None if signed == FREE else signed, step))
@@ -287,7 +290,7 @@ def needed_parameters(rig: Rig, values: Iterable[tuple[str, Any]] = ()) -> Names
     """Required parameters of a robot that starts from nothing: of its drive, and of its turns if it turns.
 
     Args:
-        values: of its parameters, by dotted name.
+        values: values of its parameters, by dotted name.
     """
     turns = any(name.endswith(WIDTH) and is_number(value) and value > 0 for name, value in values)
     current = {"total_current", "motor_current", "winding_temperature"} & {*rig.channels, rig.imposed}
@@ -309,7 +312,7 @@ def needed_parameters(rig: Rig, values: Iterable[tuple[str, Any]] = ()) -> Names
 def refuse_missing(
     missing: Sequence[str], known: Mapping[str, params.Parameter], where: str, given: Iterable[str] = ()
 ) -> None:
-    """Refuse a robot that starts from nothing and does not state all required parameters.
+    """Reject a robot that starts from nothing and does not state all required parameters.
 
     Args:
         missing: names of parameters.
@@ -326,8 +329,8 @@ def refuse_missing(
         near = [(x, name) for name in missing for x in difflib.get_close_matches(name, strange, 1, 0.85)]
         misspelt = "".join(f"; is {x} meant to be {name}?" for x, name in near)
         raise BadConfiguration(
-            f'{where}: {each} {verb} missing, which a robot with base = "none" has to state (mmrjax rig new writes a '
-            f"file with every one){misspelt}"
+            f'{where}: {each} {verb} missing; a robot with base = "none" needs every parameter (mmrjax rig new '
+            f"writes a file with all of them){misspelt}"
         )
 
 
@@ -343,7 +346,7 @@ def with_priors(robot: Robot, sds: Mapping[str, float], where: str) -> Robot:
     parameters = {p.name: p for p in params.walk_parameters(robot)}
     for name in sds:
         if name not in parameters:
-            raise BadConfiguration(f"{where}, {name}: only parameters may have a ±; state the number")
+            raise BadConfiguration(f"{where}, {name}: only parameters may have a ±; give the number without it")
     priors = tuple((name, float(p.value), sds[name]) for name, p in parameters.items() if name in sds)
     return dataclasses.replace(robot, rig=dataclasses.replace(robot.rig, priors=priors))
 
@@ -373,7 +376,7 @@ def rig_lines(rig: Rig) -> tuple[list[str], dict[str, list[str]]]:
             for mine, theirs, factor in rig.columns
         ]
     if rig.surfaces:
-        tables["surfaces"] = ["# each differs from the other by its ground alone"]
+        tables["surfaces"] = ["# these differ only in their ground"]
         tables["surfaces"] += [f"{toml_value(name)} = {toml_value(other)}" for name, other in rig.surfaces]
     for instrument in rig.instruments:
         channel = channels.find_channel(instrument.channel)

@@ -32,7 +32,7 @@ from mmrjax.model.shaft import Shaft
 SCHEMA = "mmrjax.robot/2"
 #: Whole numbers of a robot, which no fit can free: least, greatest, meaning.
 COUNTS = {
-    "sides": (1, 12, "(motors driven alike)"),
+    "sides": (1, 12, "(motors with the same command)"),
     "battery.cells": (1, 100, "(cells of the battery in series)"),
 }
 
@@ -41,28 +41,48 @@ FACTORS = "scaled"
 
 #: Ratings by makers, which no fit can free: least, greatest, unit and meaning. Experiments stay within them.
 RATINGS = {
-    "motor.voltage_limit": (0.1, 1000.0, "V", "highest supply voltage; not stated: what the table used"),
+    "motor.voltage_limit": (0.1, 1000.0, "V", "highest supply voltage; not stated: the highest in the table"),
     "motor.speed_limit": (1.0, 1e5, "rad/s", "permissible speed of the motor"),
     "motor.temperature_limit": (30.0, 400.0, "°C", "permissible temperature of the winding"),
     "gearbox.speed_limit": (1.0, 1e5, "rad/s", "permissible speed at the gearbox input"),
-    "gearbox.torque_limit": (1e-3, 1e5, "N·m", "permissible torque for long, at the driving wheel; GP32C: 3 x 25/12"),
-    "battery.voltage_charge": (0.5, 10.0, "V", "highest voltage of a cell that is charged; Section 3.3"),
+    "gearbox.torque_limit": (
+        1e-3,
+        1e5,
+        "N·m",
+        "permissible continuous torque at the driving wheel; GP32C: 3 x 25/12",
+    ),
+    "battery.voltage_charge": (0.5, 10.0, "V", "highest voltage of a cell during charging; Section 3.3"),
     "battery.voltage_cutoff": (0.0, 10.0, "V", "lowest voltage of a cell under load; assumed, not in the paper"),
-    "battery.delay_cutoff": (0.0, 1e3, "s", "how long a cell may be below it, since a start draws more; assumed"),
-    "battery.current_limit": (1e-3, 1e4, "A", "largest current that a cell may give; not stated: none"),
-    "battery.current_charge": (0.0, 1e4, "A", "largest current that a cell may take; not stated: none"),
-    "controller.supply_voltage": (0.0, 1000.0, "V", "supply of the driver, for tables without its column; 0: none"),
-    "battery.capacity_curve": (1.0, 1e6, "C", "capacity of the cell whose curvature and slope are stated"),
+    "battery.delay_cutoff": (
+        0.0,
+        1e3,
+        "s",
+        "permitted time of a cell below its cut-off, since a start draws more current; assumed",
+    ),
+    "battery.current_limit": (1e-3, 1e4, "A", "largest discharge current of a cell; not stated: no limit"),
+    "battery.current_charge": (0.0, 1e4, "A", "largest charging current of a cell; not stated: no limit"),
+    "controller.supply_voltage": (
+        0.0,
+        1000.0,
+        "V",
+        "supply voltage of the driver, for tables without that column; 0: not used",
+    ),
+    "battery.capacity_curve": (1.0, 1e6, "C", "capacity of the cell to which curvature and slope belong"),
 }
 #: The parabola of a cell's no-load voltage; together with a capacity, it applies to a cell of this capacity.
 CURVE = {"battery.curvature", "battery.slope"}
 #: Switches of a robot, which no fit can free: meaning.
 SWITCHES = {
-    "gearbox.mesh_theory": "load driving the motor loses 2 - 1/η of the mesh's theory, else η",
-    "driver.returns_current": "supply and driver take back what the motors return, else a diode blocks it",
+    "gearbox.mesh_theory": "efficiency 2 - 1/η (gear mesh theory) when the load drives the motor, else η",
+    "driver.returns_current": "supply and driver accept returned current, else a diode blocks it",
 }
 #: Choices by word, which no fit can free: allowed words, meaning.
-CHOICES = {"driver.decay": (DECAYS, "between pulses the driver shorts the motors (slow) or lets them coast (fast)")}
+CHOICES = {
+    "driver.decay": (
+        DECAYS,
+        "between pulses the driver shorts the motors (slow decay) or lets them coast (fast decay)",
+    )
+}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,7 +94,7 @@ class RobotFile:
         source: path of its file, or name of a packaged robot. A packaged robot states no parameters.
         stated: names of the parameters that the file states. A linear unit's keys become parameters of its shaft.
         linear: configurations that it states as linear units.
-        text: of the file.
+        text: text of the file.
         remarks: sentences on the robot, for readers of its numbers.
     """
 
@@ -145,9 +165,9 @@ def parse_robot_file(path: Path, library: Library = effects.BY_NAME, notes: list
             A configuration that is not in the base states `like`, the base's configuration that it starts from.
             Otherwise it states `movers` (`tracks` or `wheels`) or `load` (see `rig_file.LOADS`), and every parameter
             without default.
-        parameters: in tables by dotted name in SI units, e.g. `[motor] resistance = 0.9`, or with the sd of their
-            prior as `"0.9 ± 5 %"`, which is wider while the number is a template's. RATINGS. SWITCHES, true or
-            false, and CHOICES.
+        parameters: parameters in tables by dotted name in SI units, e.g. `[motor] resistance = 0.9`, or with the sd
+            of their prior as `"0.9 ± 5 %"`, which is wider while the number is a template's. RATINGS. SWITCHES, true
+            or false, and CHOICES.
         effects: an effect is present if the file has its table `[effects.NAME]`. The table may name the
             `configurations` that the effect acts on, and scale its priors and limits by `scaled` (see
             `effects.scaled`).
@@ -163,7 +183,7 @@ def parse_robot_file(path: Path, library: Library = effects.BY_NAME, notes: list
     content = toml_content(text, path.name)
     if not content:
         raise BadConfiguration(
-            f"{path.name}: states nothing; expected tables of parameters such as [motor], or "
+            f"{path.name}: is empty; expected parameter tables such as [motor], or "
             'base = "nominal" for the packaged robot'
         )
     schema = content.pop("schema", SCHEMA)
@@ -249,11 +269,11 @@ def _of_size(library: Library, name: str, factors: Any, where: str) -> type[effe
     """
     here = f"{where}, effects.{name}.{FACTORS}"
     if name not in library:
-        raise BadConfiguration(f"{here}: a curve or wave has no prior size; remove the key")
+        raise BadConfiguration(f"{here}: a curve or wave has no prior for its size; remove the key")
     three = isinstance(factors, list) and len(factors) == 3
     if not three or not all(is_number(x) and 0 < x < math.inf for x in factors):
         raise BadConfiguration(
-            f"{here}: got {factors!r}; expected three numbers more than 0, each times the library's: [sd of the "
+            f"{here}: got {factors!r}; expected three factors above 0 on the library's values: [sd of the "
             "amplitude, shape, limits of the amplitude]"
         )
     return scaled_effect(library[name], (float(factors[0]), float(factors[1]), float(factors[2])))
@@ -298,7 +318,7 @@ def change_robot(robot: Robot, values: Mapping[str, Any], where: str, notes: lis
         notes: as for `find_robot_file`.
 
     Raises:
-        BadConfiguration: as `parse_robot_file`.
+        BadConfiguration: for the same reasons as `parse_robot_file`.
     """
     stated = dict(values)
     settings = (*COUNTS, *RATINGS, *SWITCHES, *CHOICES)
@@ -341,9 +361,7 @@ def _refused(name: str, value: Any, known: Mapping[str, params.Parameter]) -> st
         form = ', alone or with its standard deviation as "0.61 ± 0.03"' if isinstance(value, str) else ""
         return f"got {value!r}; expected a number, {allowed}{form}"
     if name == "gearbox.ratio" and 0 < value < 1:
-        return (
-            f"got {value:g}; expected turns of the motor for one of the output, at least 1; is {1 / value:g} meant?"
-        )
+        return f"got {value:g}; expected motor turns per output turn, at least 1; is {1 / value:g} meant?"
     if not math.isfinite(value) or not low <= value <= high:
         return f"got {value:g}; expected {allowed}"
     return ""
@@ -357,7 +375,8 @@ def _with_states(robot: Robot, where: str) -> Robot:
             key, unit = ("backlash", "rad") if load.backlash > 0 else ("stiffness", "N·m/rad")
             stated = f"{where}, {name}.{key}: got {float(getattr(load, key)):g} {unit}"
             raise BadConfiguration(
-                f"{stated}; motor and load then turn apart, so motor.inertia and {name}.inertia have to exceed 0"
+                f"{stated}; motor and load can then move relative to each other, so motor.inertia and "
+                f"{name}.inertia must be above 0"
             )
     own = robot.controller
     own = None if own is None else dataclasses.replace(own, lags=float(own.lag) > 0)
@@ -399,7 +418,7 @@ def _parameters(name: str, known: Collection[str]) -> str:
     single = ("base", "sides", "configurations", *rig_file.KEYS)
     if not name.count(".") and (close := difflib.get_close_matches(name, single, 1, 0.75)):
         hint = f"did you mean {close[0]}? "
-    return f"{hint}the robot has {', '.join(heads)}; a file may state {', '.join(single)} too"
+    return f"{hint}the robot has {', '.join(heads)}; a file may also contain {', '.join(single)}"
 
 
 def _check_pairs(robot: Robot, where: str) -> None:
@@ -453,7 +472,7 @@ def write_robot(robot: Robot, path: Path, *, note: str = "") -> None:
         tables.setdefault(title, []).append(line)
     lines = [f"# {printable(line)}" for line in note.splitlines()]
     lines += [f'schema = "{SCHEMA}"', f'base = "{"nominal" if whole else rig_file.NONE}"']
-    lines += [f"sides = {int(robot.sides)}  # motors driven alike", *head]
+    lines += [f"sides = {int(robot.sides)}  # motors with the same command", *head]
     lines.append(f"configurations = {toml_value(list(robot.configurations))}")
     for title, table in {**tables, **more}.items():
         if not (whole or table or title in robot.configurations):
@@ -465,7 +484,7 @@ def write_robot(robot: Robot, path: Path, *, note: str = "") -> None:
 def _lines_of_effect(effect: Effect) -> list[str]:
     """Keys of an effect's table other than its parameters."""
     named = effect.configurations or type(effect)().configurations
-    lines = [f"configurations = {toml_value(effect.configurations)}  # on which it acts"] if named else []
+    lines = [f"configurations = {toml_value(effect.configurations)}  # in which it acts"] if named else []
     if type(effect).plain is not None:
         lines.append(f"{FACTORS} = {list(type(effect).factors)}  # sd, shape, limits: times the library's")
     return lines

@@ -71,7 +71,7 @@ def used_once(values: np.ndarray, time: np.ndarray, run: np.ndarray | None = Non
 
     Args:
         values: NaN for a missing reading, shape (rows,).
-        time: of the rows.
+        time: time of the rows.
         run: name of the recording of each row. None: all are of one.
     """
     if (np.diff(values) == 0).sum() < LEAST * len(values):
@@ -115,8 +115,8 @@ def complete_columns(name: str, columns: Columns, rows: int, layout: Layout) -> 
     held = columns.get("held", np.zeros(1)) > 0.5
     for row in np.flatnonzero(held & (columns.get(LOAD, 0.0) != 0))[:1]:
         raise BadData(
-            f"{name} row {row + 1}, {LOAD}: got {columns[LOAD][row]:g} where held is 1; expected 0, as the "
-            "torque that a clamp carries is a reading: name its column output_torque"
+            f"{name} row {row + 1}, {LOAD}: got {columns[LOAD][row]:g} although held is 1; expected 0, since the "
+            "torque at a clamp is a reading: rename its column to output_torque"
         )
     _check_sides(name, columns, layout)
     if "total_mass_kg" in columns:
@@ -156,7 +156,10 @@ def without_copies(name: str, columns: Columns) -> tuple[np.ndarray, Names]:
         if again.size
         else ""
     )
-    note = f"{name}: {which} the row before once more, with its time; left out, rows are counted without them"
+    note = (
+        f"{name}: {which} a repetition of the row before, with the same time. Repetitions are left out and not "
+        "counted in row numbers"
+    )
     return kept, (note,) if again.size else ()
 
 
@@ -189,7 +192,7 @@ def _check_driving(name: str, columns: Columns) -> None:
     if wrong.any():
         row = int(np.argmax(wrong))
         if driven[row]:
-            raise BadData(f"{name} row {row + 1}, duty: got an empty cell; expected a number, -1 to 1")
+            raise BadData(f"{name} row {row + 1}, duty: got an empty cell; expected a number from -1 to 1")
         raise BadData(
             f"{name} row {row + 1}, duty: got {duty[row]:g} in mode {modes[row]}; expected 0 or an empty cell"
         )
@@ -200,11 +203,14 @@ def _check_sides(name: str, columns: Columns, layout: Layout) -> None:
     stated = [c for c in layout.sides if c in columns]
     if len(stated) == 1:
         (other,) = set(layout.sides) - set(stated)
-        raise BadData(f"{name}: column {other} is missing, {stated[0]} is stated; state the drive of both sides")
+        raise BadData(
+            f"{name}: column {other} is missing although {stated[0]} is present; give the command of both sides"
+        )
     if stated and set(columns) & {"duty", "mode"}:
         beside = min(set(columns) & {"duty", "mode"})
         raise BadData(
-            f"{name}: column {beside} in addition to {stated[0]}, which states the drive of both sides; keep one"
+            f"{name}: column {beside} in addition to {stated[0]}, which already gives the command of both sides; "
+            "keep one"
         )
 
 
@@ -217,19 +223,23 @@ def without_clamped(name: str, columns: Columns, kept: np.ndarray) -> tuple[Colu
     if "held" in columns and set(TIME) <= set(columns) and (held := columns.pop("held") > 0.5).any():
         if held.all():
             raise BadData(
-                f"{name}: held is 1 in each row of a log too fast for settled rows; expected slower or free rows"
+                f"{name}: held is 1 in every row, and rows follow too fast to be settled; log more slowly, or log "
+                "rows with a free output"
             )
         runs = columns.get("run_id", np.zeros(len(held), str))
         stretch = np.cumsum(np.append(0, np.diff(held.astype(int)) < 0)).astype(str)
         columns["run_id"] = np.char.add(runs, np.char.add(np.where(runs == "", "stretch ", ", stretch "), stretch))
         kept &= ~held
         left_out = f"{name}: a clamp holds the output in {held.sum()} of {len(held)} rows of a log; they are left out"
-        note = (f"{left_out}, and each stretch between them is a run; in a file of their own they are settled rows",)
+        note = (
+            f"{left_out}, and each segment between them becomes a run. To use them as settled rows, put them "
+            "in a separate file",
+        )
     return {c: values[kept] for c, values in columns.items()}, kept, note
 
 
 def too_light(where: str, total: float, payload: float) -> str:
-    included = f"more than the payload of {payload:g} kg that it includes"
+    included = f"more than the payload of {payload:g} kg, which it includes"
     return f"{where}, total_mass_kg: got {total:g}; expected {included}"
 
 
@@ -250,10 +260,10 @@ def settled_points(name: str, columns: Columns, layout: Layout, robot: Robot) ->
         return kept, ()
     for column in (*TIME, "run_id"):
         kept.pop(column, None)
-    note = f"rows are {three_digits(apart)} s apart or more, most at another setting"
+    note = f"rows are {three_digits(apart)} s or more apart, mostly at different settings"
     settle = f", and the motors settle in about {three_digits(CONSTANTS_APART * constant)} s" if constant > 0 else ""
     why = "the output is held in every row" if clamped else f"{note}{settle}"
-    return kept, (f"{name}: {why}: each row is read as a settled run, without its time",)
+    return kept, (f"{name}: {why}, so each row is read as a settled run and its time is ignored",)
 
 
 def _is_clamped(columns: Columns, layout: Layout) -> bool:
@@ -318,7 +328,7 @@ def driven_rows(name: str, columns: Columns, layout: Layout) -> tuple[Columns, n
     on the other ones.
 
     Raises:
-        BadData: as `_driven`, turns on a slope, or a reading without its sign.
+        BadData: for the same reasons as `_driven`, turns on a slope, or a reading without its sign.
     """
     driven, note = _driven(name, columns, layout)
     if note:
@@ -331,9 +341,9 @@ def driven_rows(name: str, columns: Columns, layout: Layout) -> tuple[Columns, n
                 f", and so in {np.count_nonzero(slope)} of {len(slope)} rows" if np.count_nonzero(slope) > 1 else ""
             )
             raise BadData(
-                f"{name} row {row + 1}, slope_deg: got {slope[row]:g} in a table of settled turns{more}; "
-                "expected 0, since on a slope the heading always changes and no turn settles; remove such rows, and "
-                "follow such a turn over time by simulate --model drive --left --right --slope"
+                f"{name} row {row + 1}, slope_deg: got {slope[row]:g} in a table of settled turns{more}; expected "
+                "0, since on a slope the heading keeps changing and a turn never settles. Remove these rows. To "
+                "simulate such a turn over time: simulate --model drive --left --right --slope"
             )
     if not set(layout.sides) & set(columns):
         _check_signs(name, columns, layout)
@@ -363,23 +373,27 @@ def _driven(name: str, columns: Columns, layout: Layout) -> tuple[np.ndarray, st
         moving = idle[np.abs(readings[idle]) > STILL * np.max(np.abs(readings))]
         if moving.size and moving.size < len(readings):
             raise BadData(
-                f"{name} row {moving[0] + 1}, {channel.column}: got {readings[moving[0]]:g} where "
-                f"{zero} is 0; expected what drives it, or remove the row"
+                f"{name} row {moving[0] + 1}, {channel.column}: got {readings[moving[0]]:g} although {zero} is 0; "
+                "give the command that drives it, or remove the row"
             )
     if idle.size == len(size):
-        clamp = '; for a held shaft state imposed = "motor_current" or "voltage", columns held = 1, output_torque'
+        clamp = (
+            '; if the shaft is locked, set imposed = "motor_current" or "voltage", and give the columns held '
+            "(1) and output_torque"
+        )
         raise BadData(
-            f"{name}: {zero} is 0 in every row, so nothing drives the motors; expected rows that are driven"
-            f"{clamp * (layout.imposed == 'motor_speed' and not layout.has_ground)}"
+            f"{name}: {zero} is 0 in every row, so nothing drives the motors; expected rows with a "
+            f"command{clamp * (layout.imposed == 'motor_speed' and not layout.has_ground)}"
         )
     which = f"row {idle[0] + 1} is" if idle.size == 1 else f"{idle.size} rows, the first row {idle[0] + 1}, are"
     return size != 0, (
-        f"{name}: {which} left out, as nothing drives the motors ({zero or column} 0); rows are counted without them"
+        f"{name}: {which} left out, since nothing drives the motors ({zero or column} is 0); row numbers do not "
+        "count them"
     )
 
 
 def _check_signs(name: str, columns: Columns, layout: Layout) -> None:
-    """Refuses readings without a sign in rows that drive the robot backward."""
+    """Rejects readings without a sign in rows that drive the robot backward."""
     column = layout.imposed_column
     imposed, unit = columns[column], column.split("_")[-1]
     if layout.imposed == "voltage":
@@ -393,7 +407,7 @@ def _check_signs(name: str, columns: Columns, layout: Layout) -> None:
             if wrong.size:
                 raise BadData(
                     f"{name} row {wrong[0] + 1}, {channel.column}: got {readings[wrong[0]]:g}; expected no "
-                    "negative reading, as the robot's file states that the instrument shows magnitude alone"
+                    "negative reading, since by the robot's file the instrument shows only the magnitude"
                 )
             continue
         # Gravity may drive a motor: only up the slope, or on the flat, its current has the sign of its voltage.
@@ -411,14 +425,13 @@ def _check_signs(name: str, columns: Columns, layout: Layout) -> None:
             row = int(against[0])
             alike = "" if channel not in channels.OF_TURNS else f"; a turn has {' and '.join(layout.sides)} too"
             raise BadData(
-                f"{name} row {row + 1}, {channel.column}: got {readings[row]:g} at "
-                f"{imposed[row]:g} {unit}; "
-                "nothing else drives the motors there, so expected a reading with the sign of the drive, the "
-                f"same in every row{alike}"
+                f"{name} row {row + 1}, {channel.column}: got {readings[row]:g} at {imposed[row]:g} {unit}; only "
+                "this drives the motors, so the reading should have its sign; use one sign convention in all "
+                f"rows{alike}"
             )
         if wrong.size:
             row = int(wrong[0])
-            alone = f"; or signed = false for {channel.name} in the robot's file, if it shows magnitude alone"
+            alone = f"; or signed = false for {channel.name} in the robot's file, if it shows only the magnitude"
             hint = alone if layout.crosses_zero else ""
             raise BadData(
                 f"{name} row {row + 1}, {channel.column}: got {readings[row]:g} at "
@@ -452,14 +465,14 @@ def missing_data_notes(name: str, columns: Columns, layout: Layout) -> Iterator[
     for channel in layout.channels:
         if channel.column not in columns:
             if layout.complete:
-                yield f"{name}: no column {channel.column}; nothing is known of its channel"
+                yield f"{name}: no column {channel.column}, so this channel has no readings"
             continue
         empty = np.flatnonzero(np.isnan(columns[channel.column]))
         if empty.size:
             count = f"{empty.size} of {len(columns[channel.column])}"
             yield (
-                f"{name}: {count} cells of {channel.column} are empty, the first in row {empty[0] + 1}; they weigh "
-                "nothing"
+                f"{name}: {count} cells of {channel.column} are empty, the first in row {empty[0] + 1}; they are "
+                "ignored"
             )
     alike: dict[tuple[Any, ...], list[int]] = {}
     settled = [] if set(TIME) & set(columns) else [c for c in columns if c not in ("run_id", *WHEN)]
@@ -470,7 +483,7 @@ def missing_data_notes(name: str, columns: Columns, layout: Layout) -> Iterator[
         others = f", and so {len(copied) - 1} more" if len(copied) > 1 else ""
         yield (
             f"{name}: rows {' and '.join(map(str, copied[0][:2]))} have the same conditions and readings{others}; "
-            "they count as repeats; remove copies, which make results look surer than they are"
+            "they count as repeats. Remove copies: they make results look more certain than they are"
         )
     if "run_id" in columns and not set(TIME) & set(columns):
         runs, times = np.unique(columns["run_id"], return_counts=True)
@@ -493,5 +506,5 @@ def driven_backward_notes(name: str, columns: Columns, layout: Layout) -> Iterat
         more = f", and so in {on.size} rows" if on.size > 1 else ""
         yield (
             f"{name} row {on[0] + 1}, {LOAD}: got {columns[LOAD][on[0]]:g} where the shaft is driven "
-            f"backward{more}: it turns the shaft on there; a brake's torque is negative backward"
+            f"backward{more}: here it drives the shaft. The torque of a brake is negative for backward motion"
         )

@@ -66,8 +66,9 @@ def read_runs(
             Arrow, spreadsheets, MATLAB, HDF5, NumPy, JSON, ROS bags, MCAP, ULog, MDF and WPILOG. A path of signals
             may follow `::`. A pattern such as `runs/*.csv` reads files that are a run each. Tables in memory are a
             pandas or polars DataFrame, an Arrow table, an xarray Dataset, a dict of arrays, or a list of records.
-        columns: of the source, where its names are not this program's: a packaged preset (`vesc,pole_pairs=7`), a
-            preset's file, or a dict such as `{"motor_speed_rpm": "speed"}`. They win over the robot's file.
+        columns: columns of the source, where its names are not this program's: a packaged preset
+            (`vesc,pole_pairs=7`), a preset's file, or a dict such as `{"motor_speed_rpm": "speed"}`. They win over
+            the robot's file.
         measured, battery, robot, of_turns: as for `of_arrays`.
 
     Raises:
@@ -143,7 +144,7 @@ def of_arrays(
         column_names.check_time(name, header, meanings, layout)
     column_names.check_units(arrays, meanings)
     if not len(arrays):
-        raise BadData(f"{name}: a header and no rows; expected at least one run")
+        raise BadData(f"{name}: a header without rows; expected at least one run")
     arrays = clock.recorded_rows(arrays, meanings)
     columns, changed = _columns(arrays, meanings, layout, battery)
     settled: Names = ()
@@ -170,8 +171,8 @@ def of_arrays(
     extras = {c: _extra(raw)[kept] for c, m, raw in zip(header, meanings, arrays.values, strict=True) if m is None}
     notes = (*notes, *capitals, *changed, *(row_checks.missing_data_notes(name, columns, layout) if measured else ()))
     notes = (*notes, *(
-        f"{name}: {channels.find_channel(i.channel).column} is positive where its side is driven backward; it is "
-        "taken to show magnitude alone, and magnitudes are compared" for i in unsigned
+        f"{name}: {channels.find_channel(i.channel).column} is positive although its side is driven backward; it "
+        "is assumed to show only the magnitude, so magnitudes are compared" for i in unsigned
     ))  # fmt: skip
     notes = (*notes, *row_checks.driven_backward_notes(name, columns, layout))
     headings = {m.column: m.shown for m in meanings if m is not None}
@@ -248,8 +249,8 @@ def _without_repeats(name: str, columns: Columns, layout: Layout) -> Iterator[st
         if rows:
             columns[channel.column] = values
             yield (
-                f"{name}: {channel.column} repeats each reading in {rows:.3g} rows, as of a slower sensor; each is "
-                "used once, in its first row"
+                f"{name}: {channel.column} repeats each reading in {rows:.3g} rows, like a slower sensor; each "
+                "reading is used once, in its first row"
             )
 
 
@@ -274,12 +275,12 @@ def _extra(raw: Raw) -> np.ndarray:
 
 
 def _refuse_idle(arrays: NamedArrays, meaning: Column, raw: Raw, layout: Layout) -> None:
-    """Refuses a condition that does not act on the robot's load, unless it is 0 or not stated."""
+    """Rejects a condition that does not act on the robot's load, unless it is 0 or not stated."""
     why = (
-        f"{NO_BRAKE}; state slope_deg or payload_kg, or describe the load as a shaft"
+        f"{NO_BRAKE}; give slope_deg or payload_kg, or describe the load as a shaft"
         if layout.has_ground
-        else "the robot's load is a shaft; no slope, payload or mass acts on it; remove the column, or describe "
-        "the load as a vehicle"
+        else "the robot's load is a shaft, on which no slope, payload or mass acts; remove the column, or "
+        "describe the load as a vehicle"
     )
     if isinstance(raw, np.ndarray):
         acts = np.flatnonzero(np.nan_to_num(raw.astype(float)) != 0)[:1].tolist()
@@ -290,16 +291,15 @@ def _refuse_idle(arrays: NamedArrays, meaning: Column, raw: Raw, layout: Layout)
 
 
 def _refuse_stated(arrays: NamedArrays, voltages: Raw) -> None:
-    """Refuses voltages of a supply next to a battery."""
+    """Rejects voltages of a supply next to a battery."""
     if isinstance(voltages, np.ndarray):
         stated = np.flatnonzero(~np.isnan(voltages.astype(float)))[:1].tolist()
     else:
         stated = [row for row, cell in enumerate(voltages) if cell][:1]
     for row in stated:
         raise BadData(
-            f"{arrays.row(row)}, supply_voltage_V: got {column_texts(voltages[row : row + 1])[0]} together "
-            "with --battery, "
-            "whose charge sets the voltage; expected an empty cell, or no such column"
+            f"{arrays.row(row)}, supply_voltage_V: got {column_texts(voltages[row : row + 1])[0]} together with "
+            "--battery, whose charge sets the voltage; leave the cell empty or remove the column"
         )
 
 

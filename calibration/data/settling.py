@@ -66,10 +66,10 @@ class Signal:
     """Readings of a channel in settled travel, sample by sample.
 
     Attributes:
-        channel: of the table of settled runs.
+        channel: channel of the table of settled runs.
         shown: its readings [unit of the column], NaN if missing or a glitch.
         angle: the angle whose rate it is [unit of its column], empty if the channel is read directly.
-        step: of its instrument [unit], 0 without.
+        step: step of its instrument [unit], 0 without.
         largest: size of its readings but for the last two in a hundred.
         glitches: True for readings far from the readings next to them, see `find_glitches`, shape (rows,).
     """
@@ -113,8 +113,8 @@ class Stretch:
         begin, end: of time [s].
         why: empty for a settled run, else one of `REASONS`.
         channel: the channel to blame, if there is one.
-        size: of its change, as a share.
-        mean, sd: of each channel, by name [unit of the column]. Only for a settled run.
+        size: size of its change, as a share.
+        mean, sd: mean and standard deviation of each channel, by name [unit of the column]. Only for a settled run.
         drift: change of each channel over it, by name [unit].
         imposed: mean of what drives the motors.
         glitches: readings of each channel that its mean leaves out, by name. Only channels that have some.
@@ -144,9 +144,9 @@ class Settled:
     """Settled travel of a log.
 
     Attributes:
-        runs: of the log.
+        runs: runs of the log.
         stretches: all of them, in the order of the log.
-        signals: of its channels.
+        signals: signals of its channels.
         shortest, drift: as requested.
         gaps: rows after which samples are missing.
         scatter: sd of each channel between stretches under the same conditions beyond their own sds, by name [unit].
@@ -263,7 +263,9 @@ def doubtful_sign(runs: Runs) -> str:
 def _divided(runs: Runs, shortest: float | None, drift: float, inertia: Mapping[str, Inertia] | None) -> Settled:
     """Stretches of a log with their means, before they are compared with each other."""
     if not runs.sampled:
-        raise BadData(f"{runs.source}: column time_s is missing, and a row is a settled run already; give it to loop")
+        raise BadData(
+            f"{runs.source}: column time_s is missing, so each row is already a settled run; use it with loop"
+        )
     each = _in_order(runs)
     step = float(np.median(np.concatenate([np.diff(runs["time_s"][rows]) for rows in each])))
     shortest = max(LEAST, 20 * step) if shortest is None else shortest
@@ -311,9 +313,8 @@ def _in_order(runs: Runs) -> list[np.ndarray]:
             row, was, now = int(rows[k + 1]) + 1, time[rows[k]], time[rows[k + 1]]
             if now == was:
                 raise BadData(
-                    f"{runs.source} row {row}, time_s: {now:g} s is repeated; give each sample "
-                    "its own time, "
-                    "with more digits if the clock has them, or remove one"
+                    f"{runs.source} row {row}, time_s: {now:g} s is repeated; give each sample its own time, with "
+                    "more digits if available, or remove one of them"
                 )
             raise BadData(
                 f"{runs.source} row {row}, time_s: goes back from {was:g} to {now:g} "
@@ -351,7 +352,7 @@ def _signals(
                 readings[rows] = _rate(runs["time_s"][rows], whole[rows], half)
             signals.append(Signal(channels.find_channel(rate), readings, whole, 0.0, _size(readings), off))
     if not signals:
-        raise BadData(f"{runs.source}: no channel with readings that settled travel shows")
+        raise BadData(f"{runs.source}: no channel has readings that can be used for settled travel")
     return tuple(signals)
 
 
@@ -371,7 +372,7 @@ def find_glitches(
         shown: readings, NaN where missing.
         levels: rows of each level, in the order of time.
         width: readings that a median is of.
-        step: of the instrument [unit of the readings].
+        step: step of the instrument [unit of the readings].
         drift: largest change of a mean within a stretch, as a share of it. None: the readings are an angle.
     """
     from scipy.ndimage import binary_opening, median_filter
@@ -432,8 +433,8 @@ def _check_alive(runs: Runs, signal: Signal) -> None:
             column, _, factor = next(x for x in RATES if x[1] == signal.channel.name)
             value, unit = signal.angle[np.isfinite(signal.angle)][0] / factor, column.rpartition("_")[2]
         raise BadData(
-            f"{runs.source} rows 1 to {len(runs)}, {column}: {value:g} {unit} in every row; the channel is "
-            "frozen or not connected; remove the column, or the channel from the rig's file"
+            f"{runs.source} rows 1 to {len(runs)}, {column}: {value:g} {unit} in every row, so the channel is "
+            "frozen or not connected; remove the column, or remove the channel from the rig's file"
         )
 
 
@@ -827,7 +828,7 @@ def _shows(found: Settled, s: Stretch, channel: Channel) -> str:
 
 
 def _check_signs(found: Settled) -> None:
-    """Refuse speeds and currents of stretches both ways that have one sign."""
+    """Reject speeds and currents of stretches both ways that have one sign."""
     layout, runs = found.runs.layout, found.runs
     for signal in (s for s in found.signals if runs.turns_round(s.channel)):
         channel = signal.channel
@@ -838,8 +839,9 @@ def _check_signs(found: Settled) -> None:
         turned = bool(wrong) and len(wrong) == len(ahead)
         if back and all(s.mean[channel.name] > 0 for s in back) and not turned:
             raise BadData(
-                f"{_shows(found, back[0], channel)}; expected readings with their signs, negative backward; or state "
-                f"[instruments.{channel.name}] signed = false in the rig's file, if it shows magnitude alone"
+                f"{_shows(found, back[0], channel)}; expected readings with their signs, negative backward; or "
+                f"set [instruments.{channel.name}] signed = false in the rig's file, if it shows only the "
+                "magnitude"
             )
         if (turned or (wrong and channel.zero_at_rest)) and not runs.pulled:
             cure = (
@@ -851,7 +853,7 @@ def _check_signs(found: Settled) -> None:
 
 
 def _check_units(found: Settled, rolling: Mapping[str, Mapping[str, float]]) -> None:
-    """Refuse speeds, and rates of angles, that differ from another channel's by the factor between two units."""
+    """Reject speeds, and rates of angles, that differ from another channel's by the factor between two units."""
     runs = found.runs
     angles = {rate: angle for angle, rate, _ in RATES}
     # The angle is doubted first, as its rate is not read directly.
@@ -873,11 +875,10 @@ def _check_units(found: Settled, rolling: Mapping[str, Mapping[str, float]]) -> 
             if unit is not None:
                 column = angles[one] if one in angles and not _read(runs, one) else channels.find_channel(one).column
                 raise BadData(
-                    f"{runs.source} rows {s.rows[0] + 1} to {s.rows[-1] + 1}, {column}: {off:.4g} times as fast as "
-                    f"{channels.find_channel(other).column} with the ratio of the rig's file; is it {unit}? "
-                    f"write all rows in its unit, "
-                    f"or state [columns] {column} = {{column = ..., factor = {1 / off:.3g}}} in "
-                    "the rig's file"
+                    f"{runs.source} rows {s.rows[0] + 1} to {s.rows[-1] + 1}, {column}: {off:.4g} times the value "
+                    f"that {channels.find_channel(other).column} and the gear ratio of the rig's file imply; is "
+                    f"it in {unit}? convert all rows to the unit in the column name, or set [columns] {column} = "
+                    f"{{column = ..., factor = {1 / off:.3g}}} in the rig's file"
                 )
 
 
@@ -896,7 +897,7 @@ def _nothing(found: Settled, loop: str) -> str:
     if why in ("changes", "short"):
         step = longest.lasts / max(len(longest.rows) - 1, 1)
         held, asked = f"{longest.lasts:.3g} s", f"{found.shortest:.3g} s"
-        cure = "hold each level longer or state --shortest"
+        cure = "hold each level longer or set a smaller --shortest"
         if len(longest.rows) < FEWEST or found.shortest > longest.lasts >= LEAST:  # too few samples
             needed = max(FEWEST, round(found.shortest / step) if step > 0 else FEWEST)
             held, asked = count_noun(len(longest.rows), "sample"), f"{needed}"
@@ -905,31 +906,33 @@ def _nothing(found: Settled, loop: str) -> str:
                 f"{FEWEST} samples), or remove time_s if each row is a settled run already"
             )
         return (
-            f"{source}: no settled stretch: the longest level has {held} ({rows}); expected at least {asked}; "
+            f"{source}: no settled segment: the longest level has {held} ({rows}); expected at least {asked}; "
             f"{direct}{cure}"
         )
     if why in ("settling", "accelerates"):
         return (
             f"{source}: never settles: at the end of its longest level ({rows}) {longest.channel or 'a channel'} "
-            f"still changes by {100 * longest.size:.2g} % ({100 * found.drift:g} % are allowed); {direct}hold each "
-            "level longer or state --drift"
+            f"still changes by {100 * longest.size:.2g} % (allowed: {100 * found.drift:g} %); {direct}hold each "
+            "level longer or set a larger --drift"
         )
     if why == "unread":
         each = " and ".join(f"{s.channel.column} in {100 * s.filled:.2g} %" for s in found.signals)
         return (
-            f"{source}: no settled stretch: no channel has enough readings ({each} of the rows); each level needs at "
+            f"{source}: no settled segment: no channel has enough readings ({each} of the rows); each level needs at "
             f"least {FEWEST}; {direct}log them more often"
         )
     imposed = found.runs.layout.imposed_column
     others = {
-        "idle": f"{imposed}: nothing drives the motors; log rows in which they are driven, or name the column that "
-        "drives them under [columns] in the rig's file",
-        "rest": "nothing moves beyond its noise at any level; drive it further",
-        "stuck": f"{longest.channel} shows one number for long: saturated or frozen; mend it or its range",
-        "glitches": f"{longest.channel} has many readings far from the others; mend it, or log its mean",
+        "idle": f"{imposed}: nothing drives the motors; log rows with a command, or name its column under "
+        "[columns] in the rig's file",
+        "rest": "no level shows motion above the noise; use larger commands",
+        "stuck": f"{longest.channel} shows the same number for a long time: saturated or frozen; repair the "
+        "instrument or change its range",
+        "glitches": f"{longest.channel} has many readings far from the others; repair the instrument, or log its "
+        "mean",
         "undriven": "the driver brakes or coasts in every row; log rows in which it drives the motors",
     }
-    return f"{source} {rows}, no settled stretch: {others[why]}"
+    return f"{source} {rows}, no settled segment: {others[why]}"
 
 
 # --- numbers of the robot that settling needs ---

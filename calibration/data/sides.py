@@ -47,26 +47,28 @@ def of_volts(name: str, columns: Columns, battery: bool) -> Names:
         return ()
     if battery:
         raise BadData(
-            f"{name}: column {stated[0]} together with --battery, whose voltage falls; state {' and '.join(SIDES)}, "
-            "the shares of it"
+            f"{name}: column {stated[0]} together with --battery, whose voltage falls; give {' and '.join(SIDES)} "
+            "instead"
         )
     if twin := next((c for c in (*SIDES, *DUTY) if c in columns), None):
         raise BadData(
-            f"{name}: column {twin} in addition to {stated[0]}, which states the drive of both sides; keep one"
+            f"{name}: column {twin} in addition to {stated[0]}, which already gives the command of both sides; "
+            "keep one"
         )
     if len(stated) == 1:
         (other,) = {*VOLTS} - {*stated}
-        raise BadData(f"{name}: column {other} is missing, {stated[0]} is stated; state the drive of both sides")
+        raise BadData(
+            f"{name}: column {other} is missing although {stated[0]} is present; give the command of both sides"
+        )
     volts = np.stack([columns.pop(c) for c in VOLTS])
     supply, parts = supply_and_shares(volts, columns.get(SUPPLY))
     beyond = np.abs(volts) > np.abs(supply) * (1 + ROUNDED)
     if beyond.any():
         side, row = (int(k[0]) for k in np.nonzero(beyond))
         raise BadData(
-            f"{name} row {row + 1}, {[*VOLTS][side]}: got {volts[side, row]:g} of a supply of "
-            f"{supply[row]:g} V; expected no more than {SUPPLY}, or no such column: the supply's "
-            "is then the "
-            "larger of both sides'"
+            f"{name} row {row + 1}, {[*VOLTS][side]}: got {volts[side, row]:g} of a supply of {supply[row]:g} V; "
+            f"expected no more than {SUPPLY}, or remove that column: the larger of the two side voltages is then "
+            "the supply voltage"
         )
     origin = SUPPLY if SUPPLY in columns else f"{SUPPLY}, the larger of both"
     columns |= {SUPPLY: supply, **dict(zip(SIDES, np.clip(parts, -1.0, 1.0), strict=True))}
@@ -74,7 +76,7 @@ def of_volts(name: str, columns: Columns, battery: bool) -> Names:
 
 
 def check_turns(runs: Runs) -> None:
-    """Refuses a table of turns with exchanged sides or a yaw rate of the other sign.
+    """Rejects a table of turns with exchanged sides or a yaw rate of the other sign.
 
     Raises:
         BadData: readings of a side that follow the drive of the other side, or a yaw rate that contradicts both.
@@ -91,12 +93,13 @@ def check_turns(runs: Runs) -> None:
         columns = f"{pair[0].column} and {pair[1].column}"
         _refuse_against(
             runs, columns, (one, other), other - one, drive,
-            "the larger one on the side that is driven faster: the sides of one pair of columns are exchanged",
+            "the larger value on the side that is driven faster; the left and right columns of one quantity are "
+            "exchanged",
         )  # fmt: skip
     for yaw in (c.column for c in channels.EVERY if c.sign == TURN and runs.has(c.column)):
         _refuse_against(
             runs, yaw, (runs[yaw],), runs[yaw], right - left,
-            "a positive one where the right side is the faster: turn its sign, in the robot's file by [columns] "
+            "a positive value if the right side is faster: reverse its sign, in the robot's file with [columns] "
             f"{yaw} = {{column, factor = -1}}, or exchange the columns of the sides",
         )  # fmt: skip
 
@@ -104,7 +107,7 @@ def check_turns(runs: Runs) -> None:
 def _refuse_against(
     runs: Runs, column: str, shown: tuple[np.ndarray, ...], readings: np.ndarray, drive: np.ndarray, expected: str
 ) -> None:
-    """Refuses readings that mostly have the other sign than their drive. The message names the clearest row.
+    """Rejects readings that mostly have the other sign than their drive. The message names the clearest row.
 
     Args:
         shown: values of the columns in every row.
@@ -117,8 +120,8 @@ def _refuse_against(
     got, at = (" and ".join(f"{float(f'{x[row]:.4g}'):g}" for x in sides) for sides in (shown, runs.of_sides))
     unit = runs.layout.imposed_column.rpartition("_")[2]
     raise BadData(
-        f"{runs.source} row {row + 1}, {column}: got {got} where left and right side are driven at {at} {unit}, "
-        f"and so in {against.sum()} of {told.sum()} rows; expected {expected}"
+        f"{runs.source} row {row + 1}, {column}: got {got} although the left and right sides are driven at {at} "
+        f"{unit} (as in {against.sum()} of {told.sum()} rows); expected {expected}"
     )
 
 
@@ -127,7 +130,7 @@ def unsigned_current_channels(columns: Columns, layout: Layout) -> tuple[Instrum
     their side backward.
 
     Args:
-        columns: of the table.
+        columns: columns of the table.
     """
     if not layout.sides or not set(layout.sides) <= set(columns):
         return ()

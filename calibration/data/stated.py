@@ -44,7 +44,7 @@ def stated_number(text: str, where: str) -> tuple[float, float]:
     if sd.strip().endswith("%"):
         if mean == 0 and size > 0:
             raise BadConfiguration(
-                f"{where}: got {text!r}; 0 has no percentage: state the standard deviation; {FORM}"
+                f"{where}: got {text!r}; a percentage of 0 is 0, so give the standard deviation itself; {FORM}"
             )
         size *= abs(mean) / 100
     return mean, float(f"{size:.12g}")  # a percentage leaves digits of rounding
@@ -54,7 +54,7 @@ def taken_apart(table: Json, where: str, prefix: str = "") -> dict[str, float]:
     """Replaces each `value ± sd` of a table and its subtables by the value. Returns the sds by dotted name.
 
     Raises:
-        BadConfiguration: as `stated_number`.
+        BadConfiguration: for the same reasons as `stated_number`.
     """
     sds: dict[str, float] = {}
     for key, value in table.items():

@@ -41,7 +41,7 @@ def drive_of_sides(columns: Columns, layout: Layout) -> np.ndarray:
     negative backward.
 
     Args:
-        columns: of a table that turns.
+        columns: columns of a table that turns.
     """
     alike = np.ones(len(next(iter(columns.values()))))
     each = np.stack([columns.get(name, columns.get("duty", alike)) for name in layout.sides])
@@ -113,8 +113,8 @@ class Runs:
         mine = {column for c in robot.channels for column in (c.column, c.sd_column)}
         if lost := [column for column in self.unknown if column in mine]:
             raise BadData(
-                f"{self.source}, {lost[0]}: left out as the table was read, but the robot has this channel; read the "
-                "table with robot=, the robot that it is of"
+                f"{self.source}, {lost[0]}: this channel of the robot was left out when the table was read; read "
+                "the table with robot=, set to this robot"
             )
         mine |= {self.layout.imposed_column, IMPOSED[robot.rig.imposed][0], *self.layout.sides}
         others = {column for c in channels.EVERY for column in (c.column, c.sd_column)} - mine
@@ -207,7 +207,9 @@ class Runs:
         for k, channel in enumerate(self.channels):
             lost = np.flatnonzero(np.isnan(self.measured()[:, k]))
             if not self.has(channel.column) or lost.size == len(self):
-                notes.append(f"{channel.column}: no readings; parameters that only they show are not fitted")
+                notes.append(
+                    f"{channel.column}: no readings; parameters that only this channel determines are not fitted"
+                )
             elif lost.size:
                 rows = rows_text(lost.tolist(), 8)
                 notes.append(f"{channel.column}: {lost.size} of {len(self)} readings are missing ({rows})")
@@ -256,7 +258,7 @@ class Runs:
             discharge: charge already taken from it [C].
 
         Raises:
-            BadData: as `configurations`.
+            BadData: for the same reasons as `configurations`.
         """
         from mmrjax.model.conditions import Conditions
 
@@ -275,7 +277,10 @@ class Runs:
         column, factor = IMPOSED[robot.rig.imposed]
         imposed = robot.rig.imposed != "voltage"
         if imposed and not self.has(column):
-            raise BadData(f"{self.source}: no {column}, which the robot's file states as imposed; give it in a table")
+            raise BadData(
+                f"{self.source}: no {column}, which is the imposed quantity in the robot's file; the "
+                "table must contain it"
+            )
         stated = {c.field: self[c.column] for c in quantities.SET if c.in_tables and c.field and self.has(c.column)}
         stated["duty"] = np.where(held, 0.0, stated.get("duty", 1.0))
         follows = imposed and not robot.rig.follows_goal

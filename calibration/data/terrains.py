@@ -126,7 +126,7 @@ def read_sequence(path: Path, robot: Robot, begins: tuple[float, float]) -> Sequ
     if (falls := np.flatnonzero(np.diff(abscissa) <= 0)).size:
         raise BadData(
             f"{path.name} row {falls[0] + 3}, {names[0]}: got {columns[names[0]][falls[0] + 1]:g} after "
-            f"{columns[names[0]][falls[0]]:g}; expected values that rise"
+            f"{columns[names[0]][falls[0]]:g}; expected increasing values"
         )
     over_time = names[0] == "time_s"
     if names[1:] == volts:
@@ -156,7 +156,7 @@ def lever_start_refusal(robot: Robot, angle: float) -> str:
     least = -float(np.degrees(np.arcsin((axle - gear.levers.roller) / gear.lever_length)))
     return (
         f"at {angle:.4g} deg they begin {-1000 * above:.0f} mm below the ground; expected at least {least:.1f} "
-        "deg there, where they lie on it (a sequence may press them down later)"
+        "deg, at which they touch it (a sequence may press them down later)"
     )
 
 

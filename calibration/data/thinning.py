@@ -24,7 +24,7 @@ def used_rows(runs: Runs, robot: Robot, most: int = ROWS) -> Runs:
 
     Raises:
         BadConfiguration: other objects than `Runs` and a `Robot`, or as `thin_rows`.
-        BadData: as `Runs.of` and `thin_rows`.
+        BadData: for the same reasons as `Runs.of` and `thin_rows`.
     """
     for name, value, kind in (("runs", runs, Runs), ("robot", robot, Robot)):
         if not isinstance(value, kind):
@@ -51,7 +51,7 @@ def thin_rows(runs: Runs, most: int = ROWS) -> Runs:
     if need > free:
         raise BadData(
             f"{runs.source}: {count_noun(min(len(runs), most), 'row')} need {need / 1e9:.3g} GB, and "
-            f"{free / 1e9:.3g} GB of memory are free; expected at most {free / ROW:.0f} rows; state --rows"
+            f"{free / 1e9:.3g} GB of memory are free, enough for {free / ROW:.0f} rows; set --rows"
         )
     if len(runs) <= most:
         return runs

@@ -35,14 +35,14 @@ def without_unread(runs: Runs, robot: Robot) -> Runs:
         if not_read.any():
             rows = rows_text(np.flatnonzero(not_read).tolist(), *SHOWN)
             notes.append(
-                f"{runs.source}, {channel.column}: 0 in {rows} at the current of a motor that turns;"
-                " it was not read and is taken for missing"
+                f"{runs.source}, {channel.column}: 0 in {rows} although the current is that of a turning motor; "
+                "these readings are treated as missing"
             )
     if beyond.any():
         rows = rows_text(np.flatnonzero(beyond).tolist(), *SHOWN)
         notes.append(
-            f"{runs.source}, {rows}: the readings no longer change while the drive rises, so supply or "
-            "driver are at a limit; set aside"
+            f"{runs.source}, {rows}: the readings no longer change while the command rises, so the supply or the "
+            "driver is at a limit; these rows are set aside"
         )
     return dataclasses.replace(runs, columns=columns, notes=tuple(notes))
 

@@ -40,8 +40,8 @@ class ActiveSet(eqx.Module):
     Attributes:
         base: coordinates of the base parameters.
         active: index into `names` of the effect in each slot, -1 if it is empty, shape (slots,).
-        sd: of each effect's amplitude, including the width.
-        scales: of each effect's shape, see `shape_scales`.
+        sd: standard deviation of each effect's amplitude, including the width.
+        scales: scales of each effect's shape, see `shape_scales`.
         names, shapes: names of the robot's effects, and of their shape parameters ("" for none).
     """
 

@@ -26,7 +26,7 @@ class AdequacyTest:
     settings: Settings
 
     def p(self, kind: str) -> float:
-        """Share of bootstrap tables with a statistic as strong, never below 1 / (replicates + 1)."""
+        """Fraction of bootstrap tables with a statistic at least as strong, never below 1 / (replicates + 1)."""
         null = getattr(self.null, kind)
         return (1 + int(np.sum(null >= float(getattr(self.found, kind))))) / (1 + len(null))
 
@@ -52,7 +52,8 @@ class AdequacyTest:
         return statistic > self.threshold(kind) + self.settings.margins[kind]
 
     def confirmed(self, gain: float) -> AdequacyTest:
-        """Test in which the strongest effect gains no more than its simulation does, nor do pairs with it [σ²]."""
+        """The test with the gain of the strongest effect, and of pairs with it, limited to the gain that its
+        simulation confirms [σ²]."""
         promised = float(self.found.single) ** 2
         pair = self.found.pair - max(promised - gain, 0.0)
         found = dataclasses.replace(self.found, single=np.sqrt(min(promised, gain)), pair=pair)
@@ -71,8 +72,8 @@ class Diagnosis:
 
     Attributes:
         linear: the fit, linearised.
-        scores: of effects and curves.
-        test: of the residuals.
+        scores: scores of effects and curves.
+        test: test of the residuals.
     """
 
     linear: Linearization

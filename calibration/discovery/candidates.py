@@ -47,7 +47,7 @@ def supplying_effects(space: CandidateSpace, active: Sequence[str], amplitude: n
 
     Args:
         active: name of the effect in each slot.
-        amplitude: of each.
+        amplitude: amplitude of each.
         z: coordinates of the fit.
     """
     negative = [n for n, a in zip(active, amplitude, strict=True) if n and a <= 0 and space.library[n].dissipative]
@@ -103,8 +103,8 @@ class Candidate:
         z: coordinates, see `ActiveSet`.
         sd: their posterior sds.
         cost: the objective [½σ²].
-        amplitude: in prior sds of each slot's effect (0 if empty).
-        size: of each slot over the largest plausible amplitude in its direction, 0 if empty.
+        amplitude: amplitude in prior sds of each slot's effect (0 if empty).
+        size: size of each slot over the largest plausible amplitude in its direction, 0 if empty.
         plausible: True if each amplitude has a plausible size, is off its bounds, and has a sign that physics allows.
         nearly: True if it is plausible except for amplitudes up to `settings.stretched` times the largest.
         converged: True if the fit is an optimum.
@@ -178,9 +178,9 @@ class BaseFit:
     """The base fitted without effects.
 
     Attributes:
-        candidate: without effects.
-        reading: of each row [SI], shape (rows, channels).
-        space: without the rows that it cannot reach.
+        candidate: candidate without effects.
+        reading: reading of each row [SI], shape (rows, channels).
+        space: space without the rows that it cannot reach.
         unusable: indices of those.
     """
 
@@ -231,7 +231,7 @@ def fit_base(space: CandidateSpace, settings: Settings, where: str, near: Candid
 
 
 def _beyond_adhesion(space: CandidateSpace) -> np.ndarray:
-    """True for rows in which the robot slides at any plausible adhesion, shape (rows,).
+    """True for rows in which the robot slides even at the largest plausible adhesion, shape (rows,).
 
     A search would increase the adhesion, and distort the whole base, until the robot grips in them.
     """
@@ -274,7 +274,7 @@ Proposal = tuple[Names, np.ndarray]
 
 
 def fit_candidates(space: CandidateSpace, proposals: Sequence[Proposal], settings: Settings) -> list[Candidate]:
-    """Fit each (active effects, start). Those known with other sds take a few steps from there."""
+    """Fits each pair of active effects and start. Fits known with other sds continue from there for a few steps."""
     if not proposals:
         return []
     problem, active = space.fitted_by(names for names, _ in proposals)

@@ -32,12 +32,12 @@ ROUNDS, PULL = 3, 0.3
 
 @dataclasses.dataclass(frozen=True)
 class Shift:
-    """A base parameter without its prior, instead of an effect.
+    """A base parameter that, fitted without its prior, replaces an effect.
 
     Attributes:
         name: dotted, of the parameter.
-        index: of its coordinate.
-        fit: of all other parameters. Its cost excludes the prior.
+        index: index of its coordinate.
+        fit: fit of all other parameters. Its cost excludes the prior.
     """
 
     name: str
@@ -50,7 +50,7 @@ def prior_shift_scores(jacobian: np.ndarray, residual: np.ndarray) -> tuple[np.n
     without its prior [prior sds].
 
     Args:
-        jacobian, residual: of a fit, the priors' residuals last.
+        jacobian, residual: Jacobian and residual of a fit, the priors' residuals last.
     """
     half = np.linalg.solve(np.linalg.cholesky(jacobian.T @ jacobian), jacobian.T)
     prior_rows = np.arange(len(residual) - jacobian.shape[1], len(residual))
@@ -129,7 +129,7 @@ SURE = 0.7
 
 @dataclasses.dataclass(frozen=True)
 class Classes:
-    """Alternatives that the data cannot separate.
+    """Alternatives that the data cannot distinguish.
 
     Attributes:
         members: for each effect of the best candidate, the effects indistinguishable from it, itself first.
@@ -145,7 +145,7 @@ class Classes:
 
     @property
     def alone(self) -> list[bool]:
-        """For each effect, True if the data separate it from everything else."""
+        """For each effect, True if the data distinguish it from every alternative."""
         return [
             len(m) == len(f) == 1 and not s for m, s, f in zip(self.members, self.stated, self.families, strict=True)
         ]
@@ -168,7 +168,7 @@ def find_classes(
     after: Diagnosis,
     settings: Settings,
 ) -> Classes:
-    """Effects and stated values that explain the data as well in place of each effect of the best fit.
+    """Effects and stated values that explain the data as well as each effect of the best fit.
 
     The forms of nature are not those of a library. So an alternative may explain less than an effect, by a share
     `settings.form` of the sigmas, or `form_family` within the same family.

@@ -120,7 +120,7 @@ def discover(
     keep: Keep = kept.keep_nothing,
     left: Callable[[], float | None] = lambda: None,
 ) -> DiscoveryResult:
-    """Find the model error of a robot against measured runs, and trace it to a balance or an effect.
+    """Finds the model error of a robot with respect to measured runs, and traces it to a balance or an effect.
 
     Args:
         runs: settled runs, or time histories from rest.
@@ -129,7 +129,7 @@ def discover(
             or without series a usual one, halved and doubled.
         stated: parameter → (mean, sd) [SI], priors that replace the fields'.
         library: effects to test.
-        replicates: of the bootstrap.
+        replicates: replicates of the bootstrap.
         seed: random seed.
         prefer: criterion for the leader of a class, `fit` or `held-out`.
         forbidden: kinds of experiments (`menu.KINDS`) and configurations that are not proposed.
@@ -198,14 +198,14 @@ class LoopInput:
     """Context of the loop's stages: a table, its robot, the settings, and callbacks.
 
     Attributes:
-        runs: without copies.
-        numbers: of the rows, as in messages.
+        runs: runs without copies.
+        numbers: numbers of the rows, as in messages.
         robot: as `preparation.prepare` returns it.
-        noise: of the readings.
+        noise: noise of the readings.
         stated: priors (mean, sd) [SI].
         settings: statistical.
         library: effects to test.
-        notes: on all of these.
+        notes: notes on all of these.
         at_first: those to report before the first fit.
         progress: callback for progress notes.
         keep: function that stores each stage when it ends. A stored stage contains the results of the stages before.
@@ -254,7 +254,7 @@ class LoopInput:
 
     @functools.cached_property
     def loses_motion(self) -> bool:
-        """True if the log shows a backlash that the robot does not have."""
+        """True if the log shows backlash but the robot has none."""
         return bool(lost_motion_notes(self.runs, self.robot))
 
     def screen(self, noise: Noise, before: BaseFit | None, ranked: list[Ranking]) -> Screening:
@@ -336,7 +336,7 @@ class Sds:
     """Noise of a verdict.
 
     Attributes:
-        noise: of the readings.
+        noise: noise of the readings.
         factors: changes of the given sds by channel, empty for none.
         remarks: notes on the noise.
     """
@@ -734,7 +734,7 @@ def has_pulses(runs: Runs) -> bool:
 
 
 def goes_both_ways(runs: Runs) -> bool:
-    """True if runs go both forward and backward, by any speed that they state or by their drive."""
+    """True if there are both forward and backward runs, judged by any measured speed or by the command."""
     moved = [c.column for c in channels.EVERY if c.zero_at_rest and c.directed]
     columns = [runs[name] for name in (*moved, runs.layout.imposed_column, "duty") if runs.has(name)]
     finite_columns = [x[np.isfinite(x)] for x in columns]
@@ -977,7 +977,7 @@ def assemble_result(given: LoopInput, traced: LoopStages) -> DiscoveryResult:
 
 
 def refit_worse(seen: ReadingsOfRows, noise: Noise, included: np.ndarray) -> list[Remark]:
-    """Channels with unstated sds and a refit that is worse than the robot as stated, beyond their noise.
+    """Channels without stated sds in which the refit is worse than the robot as stated, by more than the noise.
 
     The estimated sds then give some readings too much weight.
 
@@ -1050,7 +1050,7 @@ def _residuals(
 
     Args:
         linear: the fit at z, linearised.
-        reading: of each row [SI], shape (rows or more, channels).
+        reading: reading of each row [SI], shape (rows or more, channels).
     """
     rows, count = len(runs), len(runs.channels)
     counts = (space.weight[:rows] > 0) & np.isfinite(reading[:rows])
@@ -1084,7 +1084,7 @@ def _noise(runs: Runs, noise: Noise, kind: type[observers.Observer]) -> dict[str
 
 
 def loop_remarks(found: DiscoveryResult) -> Notes:
-    """Remarks of a careful engineer on a result."""
+    """Remarks on a result that a careful engineer would make."""
     remarks: list[Remark] = []
     for rows, why in ((found.unusable, "unusable"), (found.outliers, "outliers")):
         if rows:
@@ -1123,8 +1123,8 @@ def loop_remarks(found: DiscoveryResult) -> Notes:
 
 
 def _rests_on(found: DiscoveryResult, test: NameTest) -> Remark:
-    """Experiment to test the run that an effect depends on: a repeat, and half steps to either side along a series
-    of that run."""
+    """Experiment that tests the single run on which an effect depends: a repeat, and half steps to both sides of
+    it."""
     runs = found.runs
     if test.what == "run":
         return Remark("rests_on", test=test)

@@ -113,7 +113,7 @@ def _axis(variable: str) -> str:
 def refine_window(
     linear: Linearization, place: str, axis: str, included: np.ndarray
 ) -> tuple[bases_room.Window, float]:
-    """Window of an axis that explains most, and its decrease of χ² [σ²].
+    """Window along an axis that explains most of the misfit, and its decrease of χ² [σ²].
 
     Windows begin and end at the axis's instants and hold at most half of the rows. Those of the tests are coarser.
 
@@ -186,14 +186,14 @@ class Discrepancy:
     Attributes:
         balance, variable, unit: its place and variable, and the unit of the balance.
         effect: name of the curve among the effects of `robot`, the fitted robot with the curve.
-        defect: of the balance, by row, at the fit without the curve, None if single rows do not show it.
-        grid: of the variable [SI].
+        defect: error of the balance, by row, at the fit without the curve, None if single rows do not show it.
+        grid: grid of the variable [SI].
         curve, sd: there [unit], shape (points,). The 95 % band is ±1.96 sd. The band includes the uncertainty
             of the base, so it is wide if base parameters can replace the curve.
         chi2: twice the objective before and after [σ²], priors included.
         z, covariance: posterior of the coordinates of `problem`, the ordinates last.
-        problem: of the fit.
-        reading: of each row [SI], shape (rows, channels).
+        problem: problem of the fit.
+        reading: reading of each row [SI], shape (rows, channels).
         converged: True if the fit is an optimum.
         proposal: a formula for the curve.
     """
@@ -313,6 +313,6 @@ def _with_curve(space: CandidateSpace, base: Candidate, curve: Smooth) -> Proble
 
 
 def _present(robot: Robot, space: CandidateSpace, base: Candidate, curve: str) -> Robot:
-    """Robot with only the effects that are present: its own, those of the fit, and the curve."""
+    """Robot with only its own effects, those of the fit, and the curve."""
     names = {e.name for e in space.bare.base.effects} | set(base.effects) | {curve}
     return dataclasses.replace(robot, effects=tuple(e for e in robot.effects if e.name in names))

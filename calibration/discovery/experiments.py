@@ -55,10 +55,10 @@ class PredictedReadings:
     """Predictions of every reading of the menu, by alternative.
 
     Attributes:
-        names: of the alternatives, the best fit first.
+        names: names of the alternatives, the best fit first.
         experiments: the menu.
         value: readings [SI], shape (alternatives, readings).
-        sd: of the instruments [SI], shape (readings,).
+        sd: standard deviation of the instruments [SI], shape (readings,).
         half: J C^½, so that the covariance due to the fit is half halfᵀ. Shape
             (alternatives, readings, coordinates).
         exists: True for readings that every alternative has, shape (readings,).
@@ -107,12 +107,12 @@ class Ranked:
 
     @property
     def smallest(self) -> float:
-        """Separation of the pair that is separated worst [σ]."""
+        """Smallest separation of any pair [σ]."""
         return min(self.sigma, default=0.0)
 
     @property
     def told(self) -> tuple[float, ...]:
-        """Separations that are worth an experiment."""
+        """Separations that justify an experiment."""
         return tuple(s for s in self.sigma if s >= self.settings.worth)
 
     @property
@@ -128,7 +128,7 @@ class Ranked:
 
     @property
     def chance_worst(self) -> float:
-        """Least of `chances`."""
+        """Smallest of `chances`."""
         return float(self.chances.min())
 
     @property
@@ -310,7 +310,7 @@ def _rank_experiment(seen: PredictedReadings, *experiments: str) -> Ranked:
 
 
 def _usefulness(r: Ranked) -> tuple[bool, float]:
-    """True if it is worth an experiment for any pair, and the expected number of separated pairs."""
+    """True if an experiment separates any pair well enough, and the expected number of separated pairs."""
     return bool(r.told), float(np.sum(np.minimum(r.chances, r.settings.enough)))
 
 

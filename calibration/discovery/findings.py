@@ -72,7 +72,7 @@ def found_effects(
     """Each effect of the best candidate, with its class, amplitude and evidence.
 
     Args:
-        test: of the base fit. Its bootstrap gives the p-values.
+        test: test of the base fit. Its bootstrap gives the p-values.
     """
     # The unique contribution of each effect: the rise of χ² if it is removed and everything is refitted.
     others = [base] if len(best.effects) == 1 else without_each(space, best, settings, found.ladder)
@@ -179,7 +179,7 @@ def listed_alternatives(
     explain little.
 
     Args:
-        cost: of the proposal [½σ²].
+        cost: cost of the proposal [½σ²].
         best: the proposal, if it is a candidate.
     """
     near: tuple[list[Alternative], list[Alternative]] = ([], [])
@@ -240,7 +240,7 @@ def base_shift(space: CandidateSpace, before: np.ndarray, after: np.ndarray, sd:
 
     Args:
         before, after: coordinates, the base's first.
-        sd: of `after`.
+        sd: standard deviation of `after`.
     """
     coordinates, p = space.coordinates.base, space.free
     z = [np.asarray(x[:p]) for x in (before, after)]
@@ -326,7 +326,8 @@ def _plausible_score(
 
 
 def invisible_effects(space: CandidateSpace, scores: ScoreTable, settings: Settings) -> Names:
-    """Effects that the data cannot show: even the largest plausible amplitude changes the readings too little."""
+    """Effects that the data cannot reveal, because even the largest plausible amplitude changes the readings too
+    little."""
     largest_scores = space.library.largest(np.asarray(scores.left))
     return tuple(
         e.name

@@ -137,7 +137,7 @@ class Proposal:
         expression: as `ΔU = 0.42 V (I/2 A)^2`, "" if no single term explains `MOST` of the curve.
         mark: its label.
         terms: its monomials.
-        coefficients, sds: of each [unit of the balance].
+        coefficients, sds: coefficients and standard deviations of each [unit of the balance].
         variables: signals of the terms, without repeats.
         explained: decrease of χ² at the base fit.
         gain: BIC of the smooth curve less that of the formula. Positive favours the formula.
@@ -157,7 +157,7 @@ class Proposal:
 
     @property
     def formula(self) -> str:
-        """Its expression, or that there is none."""
+        """The expression, or a sentence that there is none."""
         return describe(self)
 
 
@@ -171,7 +171,7 @@ def propose_formula(
 
     Args:
         counts: True for included rows, shape (rows,).
-        curve: for comparison with the formula.
+        curve: curve for comparison with the formula.
         voltage: True for a rig with an imposed or measured voltage.
     """
     if curve.wave:

@@ -10,7 +10,7 @@ from calibration.discovery.settings import WITHOUT_NAME
 
 
 def headline(said: Summary, others: Sequence[tuple[float, Summary]] = ()) -> Headline:
-    """Deepest claims that hold in a verdict and in those at other noises.
+    """Most detailed claims that hold in the verdict at every noise level.
 
     Args:
         others: factor on the noise and verdict, of each.
@@ -54,7 +54,7 @@ def _mechanisms(said: Summary) -> list[Names]:
 
 
 def _places(said: Summary) -> list[Names]:
-    """Equations with a discrepancy, in words: families without their driver."""
+    """Equations with a discrepancy, in words, without the variable."""
     families = _mechanisms(said)
     if said.verdict in WITHOUT_NAME and said.where is not None:
         families.append((said.where.family,))

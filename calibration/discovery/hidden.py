@@ -28,13 +28,13 @@ SAME, MOST, ASKED = 4.0, 6, 2
 
 @dataclasses.dataclass(frozen=True)
 class Hidden:
-    """An effect that the names of a fit could hide.
+    """An effect that the named effects of a fit could hide.
 
     Attributes:
-        name: of the effect.
+        name: name of the effect.
         amplitude: the largest possible one in `unit`.
         sigmas: change of the readings by it, without the name [σ].
-        experiment: of the menu, that would show it, with the expected separation [σ]. "" and 0 for none.
+        experiment: experiment of the menu, that would show it, with the expected separation [σ]. "" and 0 for none.
     """
 
     name: str
@@ -55,7 +55,7 @@ def find_hidden_effects(
     *,
     ask: bool,
 ) -> tuple[Hidden, ...]:
-    """Effects that the names of the best candidate could hide, the largest first.
+    """Effects that the named effects of the best candidate could hide, the largest first.
 
     Args:
         alike: its classes, which list their members.

@@ -33,7 +33,7 @@ class DiscrepancyLocation:
 
     Attributes:
         place: balance with the curve that explains most, or channel with shifted readings.
-        variable: of the curve.
+        variable: variable of the curve.
         alike: places with curves that explain as much, or that represent balances without curves of their own.
         variables_alike: other variables with curves of similar significance there, the most significant first. Of
             temporary changes one along each axis.
@@ -53,22 +53,22 @@ class DiscrepancyLocation:
 
     @property
     def balance(self) -> str:
-        """The balance, `sensor` where it is in what an instrument shows."""
+        """The balance, or `sensor` if the error is in an instrument."""
         return bases.balance_of(self.place)
 
     @property
     def channel(self) -> str:
-        """The channel whose readings are off, empty for none."""
+        """The channel with wrong readings, empty for none."""
         return self.place if bases.is_channel_place(self.place) else ""
 
     @property
     def balances_alike(self) -> Names:
-        """Balances of the places that act alike."""
+        """Balances with the same effect on the readings."""
         return tuple(dict.fromkeys(map(bases.balance_of, self.alike)))
 
     @property
     def family(self) -> str:
-        """Its equation and what drives it, in the words of `Effect.family`."""
+        """Its equation and the variable that it depends on, in the words of `Effect.family`."""
         happens = bases.window_from_name(self.variable)
         variable = self.variable if happens is None else happens.axis
         what = bases.place_in_words(self.place) if self.channel else EQUATION[self.balance]

@@ -46,7 +46,7 @@ class NameTest:
 
     Attributes:
         effect: its name.
-        root: of its score in addition to curves of other equations [σ].
+        root: root of its score in addition to curves of other equations [σ].
         needed: critical value for the strongest effect [σ].
         curves: those of other equations.
         evidence: twice the log evidence of the effect over the best smooth curve of its own equation [σ²].
@@ -88,7 +88,8 @@ class NameTest:
 
     @property
     def rests_on(self) -> int | None:
-        """Number of the row without which it would fail, None if it needs no single row, or fails anyway."""
+        """Number of the row without which the test would fail. None if it depends on no single row, or fails
+        anyway."""
         if self.root < self.needed:
             return None
         return self.row if self.root_without < max(self.needed, KEPT[self.what] * self.root) else None
@@ -126,9 +127,9 @@ class NameSupport:
     Attributes:
         stands: whether one at least does.
         why: reason for the verdict, a row of `loop_words.REASONS`, "" for none.
-        effects: that this is said of.
-        curves: that were put beside, or do as well.
-        tests: of each effect.
+        effects: effects that this is said of.
+        curves: curves that were put beside, or do as well.
+        tests: tests of each effect.
     """
 
     stands: bool
@@ -168,7 +169,7 @@ class NameSupport:
         """Copy with row numbers as in messages.
 
         Args:
-            numbers: of the rows, in order.
+            numbers: numbers of the rows, in order.
         """
         named = (
             t if t.row is None or t.what == "run" else dataclasses.replace(t, row=int(numbers[t.row - 1]))
@@ -190,11 +191,11 @@ class Missing:
     """An effect that was found.
 
     Attributes:
-        names: that these data cannot separate.
+        names: names that these data cannot separate.
         values: stated values that may be wrong instead.
-        families: of the names.
+        families: families of the names.
         established: True if it is.
-        test: of its own, None without one.
+        test: test of its own, None without one.
     """
 
     names: Names
@@ -216,8 +217,8 @@ class Mechanism:
 
     Attributes:
         families: equation and driver in words, the best first, then those that explain as much.
-        effects: of the library in its place, () for a curve.
-        share: of the excess misfit, χ² less its expectation, that it explains [-].
+        effects: effects of the library in its place, () for a curve.
+        share: share of the excess misfit, χ² less its expectation, that it explains [-].
         gain, se: hold-out gain, over the readings that it changes [nat a reading].
         again: share of the informative blocks of runs without which it is found again [-].
         errors: standard error of the gain by kind of block [nat a reading].
@@ -304,15 +305,15 @@ class Summary:
 
 @dataclasses.dataclass(frozen=True)
 class Headline:
-    """Claims that hold at every noise that was tried.
+    """Claims that hold at every noise level tried.
 
     Attributes:
-        level: of the claims, a verdict, `open` if the noise decides whether an effect is missing.
+        level: level of the claims, a verdict, `open` if the noise decides whether an effect is missing.
         claims: laws, mechanisms or places, each with its indistinguishable alternatives.
-        factors: on the noise.
+        factors: factors on the noise.
         shared: number of the first members of each mechanism or place that hold at every noise. At some noises the
             others cannot be separated from these.
-        families: of each law, equation and driver in words.
+        families: families of each law, equation and driver in words.
         values: stated values that may be wrong instead of it.
     """
 
@@ -329,9 +330,9 @@ class RuledOut:
     """Reason why an effect is not plausible.
 
     Attributes:
-        name: of the effect.
+        name: name of the effect.
         why: its balance would supply `power`, its `size`, or it is within an sd of the `edge`.
-        size: over the largest plausible one.
+        size: size over the largest plausible one.
         check: values that this depends on.
     """
 
@@ -347,7 +348,7 @@ class Asked:
 
     Attributes:
         why: a discrepancy is `missing` an effect, effects are `found`, or some explain nearly as much (`near`).
-        balance, variable: of the discrepancy.
+        balance, variable: balance and variable of the discrepancy.
         effects: their names.
     """
 

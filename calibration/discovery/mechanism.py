@@ -49,7 +49,7 @@ def find_mechanism(
     predicted: Predicted,
     settings: Settings,
 ) -> Mechanism | None:
-    """Mechanism that explains most of the base's discrepancy.
+    """Mechanism that explains most of the discrepancy of the base fit.
 
     It is that of effects of one family of the library, or that of a smooth curve if none of them explains as
     much, None for histories if only a curve does.
@@ -254,7 +254,7 @@ def _within_seen_range(space: CandidateSpace, beside: CurveBeside, masks: Sequen
     """True for rows with a curve's variable within the range of the rows outside their block, shape (rows,).
 
     Args:
-        masks: of the rows of each block.
+        masks: masks of the rows of each block.
     """
     where, linear, rows = beside.where, beside.left.linear, len(masks[0])
     in_range = np.ones(rows, bool)

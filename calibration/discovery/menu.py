@@ -74,7 +74,7 @@ def bare(robot: Robot, brake: Scalar = 0.0) -> Robot:
 
 
 def blocked(robot: Robot, brake: Scalar = 0.0) -> Robot:
-    """The motors with their shafts held: U_e = E + I R at speed 0."""
+    """The motors with locked shafts: U_e = E + I R at speed 0."""
     return _with(lifted(robot), {"gearbox.friction_coulomb": BLOCKED})
 
 
@@ -116,10 +116,10 @@ class Act:
 
     Attributes:
         name: of it.
-        kinds: of `KINDS`.
+        kinds: kinds from `KINDS`.
         reading: function of a robot and of the settings [SI], shape (readings,).
         at: settings, one tuple a reading [SI]. Of `weigh`, the configuration's index and the payload.
-        sd: of a single reading [SI]. None: that of the table's readings of `channel`.
+        sd: standard deviation of a single reading [SI]. None: that of the table's readings of `channel`.
         repeats: number of readings that are averaged.
         channel: channel of the instrument for a reading of zero, "" for another act.
     """
@@ -135,14 +135,14 @@ class Act:
 
 @dataclasses.dataclass(frozen=True)
 class Run:
-    """Settled runs under conditions that the table does not have.
+    """Settled runs under conditions that are not in the table.
 
     Attributes:
         name: of them.
-        kinds: of `KINDS`, and the configuration where there is one.
+        kinds: kinds from `KINDS`, and the configuration where there is one.
         doing: a row of `experiment_words.DOING`.
         where: the configuration's name, "" for none.
-        motors: of the robot.
+        motors: motors of the robot.
         setup: how the robot is set up.
         voltage [V], slope [deg], payload [kg]: conditions of each run, shape (runs,).
         channels: names of the channels to read.
@@ -154,7 +154,7 @@ class Run:
         repeats: number of readings that are averaged.
         watch: risks of damage, with their indications.
         imposed: quantity instead of the voltage, see `Rig`. `motor_speed`: [rad/s]. `motor_current`: [A].
-        torque: of a brake on the output, against forward rotation [N·m], empty without a brake.
+        torque: torque of a brake on the output, against forward rotation [N·m], empty without a brake.
     """
 
     name: str
@@ -186,7 +186,7 @@ Experiment = Act | Run
 
 
 def round_significant(value: float, digits: int = 2) -> float:
-    """A number with so many significant digits, as a person sets it."""
+    """A number rounded to this many significant digits, as a person would set it."""
     return float(f"{value:.{digits - 1}e}")
 
 
@@ -215,7 +215,7 @@ def last_setting(most: float, step: float) -> float:
 
 
 def floor_significant(value: float) -> float:
-    """Largest number of two digits up to a positive one."""
+    """Largest number with two significant digits that does not exceed a positive number."""
     step = 10.0 ** (math.floor(math.log10(value)) - 1)
     return round_significant(math.floor(value / step + 1e-9) * step)
 
@@ -241,7 +241,7 @@ def _weighed(robot: Robot, at: Array) -> Array:
 
 @dataclasses.dataclass(frozen=True)
 class _Instrument:
-    """Readings of a channel's instrument where these signals have known values."""
+    """Readings of a channel's instrument for known values of these signals."""
 
     channel: str
     signals: Names
@@ -433,7 +433,7 @@ def _shaft_runs(reach: Reach, used: Used) -> tuple[Run, ...]:
 
 
 def check_forbidden(forbidden: Sequence[str], robot: Robot) -> None:
-    """Refuse names that are neither kinds of experiments nor configurations.
+    """Reject names that are neither kinds of experiments nor configurations.
 
     Raises:
         BadConfiguration: such a name, with the choices.
@@ -468,8 +468,8 @@ def restrict_run(run: Run, kept: np.ndarray, temperature: np.ndarray, speed: np.
 
     Args:
         kept: by `possible_runs`.
-        temperature: of a winding after long running [°C].
-        speed: of the motor shaft [rad/s]. Both predicted, shape (runs,).
+        temperature: temperature of a winding after long running [°C].
+        speed: speed of the motor shaft [rad/s]. Both predicted, shape (runs,).
     """
     voltage, slope, payload, torque = (
         tuple(v for v, k in zip(x, kept, strict=True) if k) if x else ()

@@ -46,7 +46,7 @@ class Cluster:
     Attributes:
         axis: column, or angle, of the cluster.
         low, high: its ends.
-        level: of a column of words or levels.
+        level: level of a column of words or levels.
         inside, of: number of outliers in it, and of all.
         p: p-value.
     """
@@ -141,7 +141,7 @@ class Screening:
     Attributes:
         base: the fit.
         outliers: indices of the excluded rows, in the order of their exclusion.
-        bases: of the curves for a discrepancy, at that fit.
+        bases: bases of the curves for a discrepancy, at that fit.
         diagnosed: the fit linearised, and scores of effects and curves on its residuals.
         cluster: common property of outliers, which were then not excluded, None for none.
     """
@@ -201,7 +201,7 @@ def compile_ahead(
 
 
 def screen_outliers(base: BaseFit, bases_at: Callable[[BaseFit], Bases], runs: Runs, settings: Settings) -> Screening:
-    """Exclude rows with an isolated wrong reading: its own shift is more significant than any effect or curve.
+    """Exclude rows with a single wrong reading, whose shift is more significant than any effect or curve.
 
     Outliers that form a cluster are not excluded. `cluster` describes it.
 
@@ -310,7 +310,7 @@ def _refit_without(base: BaseFit, rows: np.ndarray, settings: Settings, where: s
 
 
 def _set_gross_aside(base: BaseFit, settings: Settings, where: str) -> tuple[BaseFit, tuple[int, ...]]:
-    """Exclude rows so far from the fit that they distort it, and with it every score.
+    """Exclude rows that are so far from the fit that they distort it and every score.
 
     They are found at a robust fit: Cauchy's weights, iterated with a few steps each (Holland and Welsch 1977).
     """

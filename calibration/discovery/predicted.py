@@ -33,7 +33,7 @@ class Batch(eqx.Module):
     Attributes:
         acts: reading function of each.
         at: settings of each, see `Act`.
-        conditions: of the runs of all experiments, in order, shape (runs,).
+        conditions: conditions of the runs of all experiments, in order, shape (runs,).
         brake: torque of the brake in each run [N·m].
         set_up: distinct pairs of the robot's setup and the number of motors that are on.
         which: pair of each run.
@@ -55,12 +55,12 @@ class Predicted(eqx.Module):
     """Predicted readings of a batch.
 
     Attributes:
-        value: of each reading [SI].
+        value: value of each reading [SI].
         exists: True if the robot has it: not if it slides, or stands still instead of travelling, shape (readings,).
         does: the same for each run.
         grip: used share of the adhesion [-].
-        temperature: of a winding after long running [°C].
-        speed: of the motor shaft [rad/s], shape (runs,).
+        temperature: temperature of a winding after long running [°C].
+        speed: speed of the motor shaft [rad/s], shape (runs,).
     """
 
     value: Float[Array, " readings"]

@@ -107,7 +107,7 @@ def score_readings(
     Args:
         reading: kind of block → predictions of each row by a fit without its block, NaN for none.
         counts: True for included readings.
-        kinds: of blocks, label → mask of its rows each.
+        kinds: kinds of blocks, label → mask of its rows each.
     """
     by_kind, blocks = {}, {}
     norm = math.lgamma((FREEDOM + 1) / 2) - math.lgamma(FREEDOM / 2) - 0.5 * math.log(FREEDOM * math.pi)
@@ -120,7 +120,7 @@ def score_readings(
         density = norm - np.log(sd) - (FREEDOM + 1) / 2 * np.log1p(off**2 / FREEDOM)
         by_kind[kind] = np.where(counts & (block >= 0)[:, None], density, np.nan)
         blocks[kind] = block
-    return HeldOutScore(by_kind, blocks)
+    return HeldOutScore(by_kind, blocks, reading)
 
 
 #: `candidate_key` of a candidate → kind of block → hold-out predictions of each row.
@@ -138,7 +138,7 @@ def score_candidate(space: CandidateSpace, runs: Runs, candidate: Candidate) -> 
     measured, sd, counts = (np.asarray(x)[:rows] for x in (data.measured, data.sd, space.weight > 0))
     problem, z, active = space.fit_of(candidate.active, candidate.z)
     reading = {kind: predict_unseen(problem, z, list(by.values()), active).reading for kind, by in kinds.items()}
-    return dataclasses.replace(score_readings(reading, measured, sd, counts, kinds), reading=reading)
+    return score_readings(reading, measured, sd, counts, kinds)
 
 
 def smallest_predictive_set(

@@ -32,7 +32,7 @@ TOLD = 0.01
 def worse_predictions(
     readings: Mapping[str, tuple[np.ndarray, np.ndarray]], errors: Callable[[np.ndarray], Errors]
 ) -> tuple[Worse, ...]:
-    """Kinds of block and channels with a hold-out error that rises, over the rows that both fits predict.
+    """Kinds of block and channels whose hold-out error rises, over the rows that both fits predict.
 
     Args:
         readings: kind of block → readings before and after [SI], NaN if a fit predicts none.

@@ -37,7 +37,7 @@ class Projection:
 
 @dataclasses.dataclass(frozen=True)
 class Defect:
-    """Defect of a place in each row, after the free parameters have absorbed their part.
+    """Error of a balance or channel in each row, after the free parameters have absorbed their part.
 
     Attributes:
         value, sd: [unit of the place], shape (rows,), NaN if the readings do not show it.

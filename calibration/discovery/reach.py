@@ -22,11 +22,11 @@ LOADED, RUNNING = 0.3, 0.8
 
 @dataclasses.dataclass(frozen=True)
 class Used:
-    """Ranges that a table used of one configuration, each increasing and without repeats.
+    """Values of the conditions in a table for one configuration, increasing and without repeats.
 
     Attributes:
         configuration: its name.
-        index: in the robot.
+        index: index in the robot.
         voltages [V], slopes [deg], payloads [kg].
         mass: the largest total [kg].
     """
@@ -67,7 +67,7 @@ class Reach:
         resistance [ohm], torque_constant [N·m/A]: of one.
         hot: temperature limit of a winding [°C].
         imposed: quantity on the motors, see `Rig`.
-        levels: of speed [rad/s] or current [A] that the table used, if these are imposed.
+        levels: levels of speed [rad/s] or current [A] that the table used, if these are imposed.
         has_ground: True if it is carried by a ground.
         duties: magnitudes of the driver's duty that the table used [-].
         torques: magnitudes of a brake's torque that it used [N·m], empty without a brake.
@@ -108,7 +108,7 @@ def reach_of_table(robot: Robot, conditions: Conditions, measured: Names) -> Rea
 
     Args:
         robot: as in its file, or fitted.
-        conditions: of the table's runs, shape (runs,).
+        conditions: conditions of the table's runs, shape (runs,).
         measured: names of the channels in the table.
     """
     which, volts, slope, payload = (

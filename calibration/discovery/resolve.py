@@ -38,7 +38,7 @@ POPULATION, GENERATIONS = 128, 20
 
 
 def question_of_verdict(found: DiscoveryResult) -> Asked | None:
-    """Part of a verdict that the running gear could explain, None for none."""
+    """Part of a verdict that the running gear could explain, or None."""
     places = [w for w in (found.unnamed, found.remains) if w is not None]
     for place in places:
         for balance in (place.balance, *place.balances_alike):
@@ -59,7 +59,7 @@ def enters_gear_balance(name: str, found: DiscoveryResult) -> bool:
 
 
 def check_resolvable(runs: Runs, members: Path | None = None) -> None:
-    """Refuse unsuitable input of `resolve` before the loop that precedes it.
+    """Reject unsuitable input for `resolve` before the loop starts.
 
     Raises:
         BadConfiguration: the data are histories, or the file of members cannot be read.
@@ -85,7 +85,8 @@ def resolve(
     Args:
         found: by the loop, from settled rows.
         noise: as given to the loop.
-        population, generations, members, seed: of the search, see `calibrate`.
+        population, generations, members, seed: population, generations, members and seed of the search, see
+            `calibrate`.
         tell: callback for a progress note, or for a sentence of `calibrate`.
 
     Returns:

@@ -58,7 +58,7 @@ class Member:
 
     Attributes:
         amplitude: its own [unit].
-        size: over the largest plausible one.
+        size: size over the largest plausible one.
         rise_chi2: compared with the leader [σ²].
     """
 
@@ -72,7 +72,7 @@ class StatedValue:
     """A base parameter with a stated value that may be wrong, instead of an effect.
 
     Attributes:
-        value: that explains as much.
+        value: value that explains as much.
         stated: its prior mean, both in `unit`.
         prior_sds: distance from its prior.
         rise_chi2: compared with the effect [σ²].
@@ -90,16 +90,16 @@ class FoundEffect:
     """An effect of the verdict.
 
     Attributes:
-        name: of the leader of its class.
+        name: name of the leader of its class.
         members: effects that these data cannot separate from it, itself first.
         stated: base parameters that may be wrong instead, by name.
-        families: of the members, the leader's first. A single family identifies the equation and its driver.
-        balance, unit: of the balance that it enters.
+        families: families of the members, the leader's first. A single family identifies the equation and its driver.
+        balance, unit: balance and unit of the balance that it enters.
         equation, source: from its docstring.
         parameters: its amplitude and shape.
         p_value: compared with the strongest of all effects in each bootstrap table.
         score: rise of χ² without it after a refit [σ²].
-        share: of the excess misfit, χ² less its expectation, that it explains [-].
+        share: share of the excess misfit, χ² less its expectation, that it explains [-].
     """
 
     name: str
@@ -121,7 +121,7 @@ class UnnamedDiscrepancy(DiscrepancyLocation):
     """A discrepancy that no effect of the library explains.
 
     Attributes:
-        unit: of the balance.
+        unit: unit of the balance.
         families: equation and driver, in words, as in `FoundEffect`.
         window: axis, first and last place of a temporary change, None for other discrepancies.
         effect: name of the smooth curve in the proposed robot.
@@ -129,7 +129,7 @@ class UnnamedDiscrepancy(DiscrepancyLocation):
         score: decrease of χ² by the curve [σ²].
         score_free_in_each_run: by a wave with a phase for each run, None for other curves.
         at: of the variable [SI].
-        value, sd: of the curve there [unit].
+        value, sd: value and standard deviation of the curve there [unit].
         over, defect, defect_sd: for each row the fitted variable [SI] and the defect of the balance [unit]: the curve
             there plus the row's residual, along the travel, None if single rows do not show it.
         proposal: a formula.
@@ -158,9 +158,9 @@ class Alternative:
     Attributes:
         effects: amplitudes.
         prior_sds: the same in prior sds.
-        sizes: over the largest plausible ones.
-        rise_chi2: over the proposed fit [σ²], negative if they explain more.
-        reasons: for their implausibility.
+        sizes: sizes over the largest plausible ones.
+        rise_chi2: rise of χ² over the proposed fit [σ²], negative if they explain more.
+        reasons: reasons for their implausibility.
     """
 
     JSON = ("effects", "prior_sds", "sizes", "rise_chi2", "why")
@@ -213,10 +213,10 @@ class Ranked:
     """An effect by regression: all other parameters are refitted on the linearised equations of the base fit.
 
     Attributes:
-        name: of the effect.
+        name: name of the effect.
         family: equation and driver in words.
-        unit: of its amplitude.
-        score: that it alone would explain at plausible size [σ²].
+        unit: unit of its amplitude.
+        score: score that it alone would explain at plausible size [σ²].
         amplitude, sd: then [its unit].
         supplies: True if that sign would supply power, so that it explains nothing.
     """
@@ -236,7 +236,7 @@ class Ranking:
 
     Attributes:
         missing: True if an effect is missing.
-        p_value: of that test, family-wise.
+        p_value: p-value of that test, family-wise.
         chance: critical score of the strongest effect [σ²].
         effects: the strongest first, then those that would supply power.
         windows: number of equations of the log in weak form, 0 for a ranking by signatures along the base fit.
@@ -275,7 +275,7 @@ class ReadingsOfRows:
     """Readings of all rows [SI], shape (rows, channels), NaN if missing.
 
     Attributes:
-        measured, sd: of the table.
+        measured, sd: readings and standard deviation of the table.
         as_stated: by the robot before any fit, at its prior means.
         before, after: by the base and by the proposed robot, fitted to all rows.
         held_out: kind of block → (before, after), each row by fits without its block.
@@ -299,7 +299,7 @@ class Worse:
     """A channel with larger hold-out errors of the proposal than of the refit.
 
     Attributes:
-        kind: of the blocks held out.
+        kind: kind of the blocks held out.
         channel: its name.
         rows: number that both fits predict.
         before, after: rms error over these [%].
@@ -319,8 +319,8 @@ class HeldOutAlternative:
     Attributes:
         effects: its names.
         leads: True if it is the one proposed.
-        rise_chi2: of the fit to all rows, above the best one [σ²].
-        rms_sigma: over the readings of all kinds of blocks that every alternative predicts [σ].
+        rise_chi2: rise of χ² of the fit to all rows, above the best one [σ²].
+        rms_sigma: rms error over the readings of all kinds of blocks that every alternative predicts [σ].
         by_kind: of each.
         lost: number of held-out readings without a prediction, because its robot slides or fails there.
     """
@@ -340,18 +340,18 @@ class Resolved:
     Attributes:
         asked: the discrepancy, or the effects found, that it may explain.
         rows: number of fitted rows on tracks.
-        robot: for `--model track`, with the running gear that fits best.
-        constants: of the running gear and the friction, by name.
+        robot: robot for `--model track`, with the running gear that fits best.
+        constants: constants of the running gear and the friction, by name.
         alike: strongly correlated pairs of constants, with their correlation.
         outside: constants further than `PLAUSIBLE` prior sds from their priors.
         settled: True if both searches ended.
         fall: decrease of twice the objective by the running gear, priors included [σ²].
         p: its p-value.
-        chi2: of the readings with the gear as stated and with the best one [σ²].
+        chi2: χ² of the readings with the gear as stated and with the best one [σ²].
         readings: number included.
         rms_percent: by channel, with the gear as stated and with the best one [%].
         slip_rms: the same for the slip [percentage points].
-        remarks: of the search.
+        remarks: remarks of the search.
     """
 
     asked: Asked
@@ -413,17 +413,17 @@ class DiscoveryResult:
         verdict: `none`, `named`, `class`, `mechanism`, `place` or `undescribed`.
         summary: the verdict with all data of its statement.
         robot: as written.
-        refit: with nothing added.
+        refit: refit with nothing added.
         written: True if the robot has the proposal.
         gains: sets of effects, by their number, with their hold-out gain over the refit. The last one is the
             proposal. Empty if no block can be held out.
         converged: True if the fit of that robot is an optimum.
-        posterior: of all fitted parameters.
+        posterior: posterior of all fitted parameters.
         runs: the table.
-        numbers: of its rows, as in messages.
+        numbers: numbers of its rows, as in messages.
         included: True for included rows.
         outliers, unusable: numbers of excluded rows.
-        effects: in the model, established or tentative.
+        effects: effects in the model, established or tentative.
         unnamed: the discrepancy of that verdict.
         remains: the discrepancy that the effects leave.
         next_experiment: the most informative one, None if there are no alternatives to separate.
@@ -438,8 +438,8 @@ class DiscoveryResult:
         before, after: evidence in the residuals of base and proposed robot.
         chi2: twice the objective before and after [σ²].
         readings: number included.
-        base_shift: of every base parameter.
-        scores: of the library at the base fit, strongest first.
+        base_shift: base shift of every base parameter.
+        scores: scores of the library at the base fit, strongest first.
         cosine: |cos| between the projected signatures of two effects, shape (scores, scores), their order.
         detail: further findings for the kind of data: defects of equations by run, or memory, orders and drift.
         readings_of_rows: measured and simulated.
@@ -713,7 +713,7 @@ class Sensitivity:
     """Verdict with another noise.
 
     Attributes:
-        factor: on the assumed noise.
+        factor: factor on the assumed noise.
         near: True if its fits are a few Gauss-Newton steps from those with the assumed noise, for the same sets.
     """
 

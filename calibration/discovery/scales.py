@@ -91,8 +91,8 @@ def library_of_size(robot: Robot, conditions: Conditions, library: Library, turn
     """`library` with priors of a rig's size. Unchanged for robots that inherit the nominal one.
 
     Args:
-        robot: of the rig.
-        conditions: of its table, shape (runs,).
+        robot: robot of the rig.
+        conditions: conditions of its table, shape (runs,).
         turned: rotation of its output, see `output_rotation`. NaN: not known.
     """
     if robot.rig.inherits:
@@ -219,7 +219,7 @@ def _scale_effect(kind: type[Effect], mine: tuple[Robot, Signals], theirs: tuple
 
 
 def _at_rated_load(robot: Robot, signals: Signals) -> Signals:
-    """Operating points of a rig scaled to the largest load and speed of its motors, never reduced.
+    """Operating points of a rig, scaled up to the largest load and speed of its motors.
 
     That load is at the continuous current, or at a share of the stall current if resistance and voltage are known.
     """

@@ -50,8 +50,8 @@ class ScoreTable(eqx.Module):
         left: ‖r‖, the change of the readings by a prior sd in sigmas.
         pair: scores of pairs of instances (χ² with two degrees of freedom), shape (instances, instances).
             Zero if they can't be separated.
-        cosine: between two projected signatures.
-        curve: of each family, as a normal deviate, shape (families,).
+        cosine: cosine between two projected signatures.
+        curve: curve of each family, as a normal deviate, shape (families,).
         explained: its ridge score [σ²].
         row: signed root of the score of a shift of each single reading, shape (rows, channels).
         fall: further decrease of the objective predicted by a step of the fit [½σ²].
@@ -309,7 +309,7 @@ def bootstrap(
     Replicates with a refit that did not settle are omitted, so there may be fewer.
 
     Args:
-        problem: of the base only, z its fit.
+        problem: problem of the base only, z its fit.
         linear: the same fit, linearised.
         seed: random seed.
         freedom: degrees of freedom of each channel's estimated sd, infinite if it is known, None if all are known.

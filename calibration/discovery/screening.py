@@ -36,7 +36,8 @@ FURTHER = 3
 FAR = 1.5
 #: Distance of a start from the prior mean up to which a fit is not repeated from there [prior sd].
 BESIDE = 1.0
-#: Least gain by a set that needs another program, as a share of the largest gain of any set.
+#: Gain that a set must promise for another program, and that simulation may lack for no other set to be tried, as a
+#: share of the largest gain of any set.
 ANOTHER = 0.05
 #: Most steps of all runs for which a base fit in the program with effects costs less than a program of its own.
 BRIEF = 10_000
@@ -49,7 +50,7 @@ class Confirmed:
     """Sets of effects after a round of screening.
 
     Attributes:
-        candidates: of every set, by simulation if available, else by regression.
+        candidates: candidates of every set, by simulation if available, else by regression.
         asked: number of regressions that were simulated.
         otherwise: number of these that explained less than the regression by more than `Settings.same`.
         room: names of the effects in the program of these fits, see `CandidateSpace`.
@@ -122,8 +123,8 @@ def confirm_by_simulation(space: CandidateSpace, screened: Sequence[Candidate], 
 
     These are the plausible set that explains most, its nearest rival, the nearest of another family, and any
     implausible set that explains more. If the program has the first, rivals outside it stay regressions. If the first
-    explains less than its regression by more than `Settings.same`, the simulation decides, and the next by
-    regression is tried too. Further sets must be in the program, or must promise more.
+    explains less than its regression by more than `Settings.same` and `ANOTHER`, the simulation decides, and the next
+    by regression is tried too. Further sets must be in the program, or must promise more.
     """
     fits = lambda c: {*c.effects} <= {*space.room}  # noqa: E731
     # Sets outside the program need another program, and have to promise that much more. For verdicts at other noises
@@ -138,8 +139,8 @@ def confirm_by_simulation(space: CandidateSpace, screened: Sequence[Candidate], 
     space = space.with_room([*space.room, *(n for c in first for n in c.effects)])  # one program for all of them
     by_regression = {c.active: c for c in order}
 
-    def less(c: Candidate) -> bool:
-        return 2 * (c.cost - by_regression[c.active].cost) > settings.same
+    def less(c: Candidate, by: float) -> bool:
+        return c.cost - by_regression[c.active].cost > by
 
     def simulate(those: Sequence[Candidate]) -> None:
         """Simulate from the regression's coordinates.
@@ -151,7 +152,7 @@ def confirm_by_simulation(space: CandidateSpace, screened: Sequence[Candidate], 
         simulated.update({c.active: c for c in fits})
         new = [c for c in those if c.active not in space.near]
         elsewhere = [c for c in new if np.abs(c.z[: space.free]).max() > BESIDE]
-        doubted = [c for c in elsewhere if less(simulated[c.active])]
+        doubted = [c for c in elsewhere if less(simulated[c.active], more)]
         at_mean = [np.where(np.arange(len(c.z)) < space.free, 0.0, _start_of_simulation(space, c)) for c in doubted]
         refits = fit_candidates(space, [(c.active, z) for c, z in zip(doubted, at_mean, strict=True)], settings)
         simulated.update({c.active: c for c in refits if c.cost < simulated[c.active].cost})
@@ -162,12 +163,14 @@ def confirm_by_simulation(space: CandidateSpace, screened: Sequence[Candidate], 
         best = min((c.cost for c in simulated.values() if c.plausible), default=np.inf)
         not_simulated = [c for c in order if c.active not in simulated and c.plausible]
         promising = [c for c in not_simulated if c.cost < best or fits(c)]
-        if leader is None or not less(simulated[leader.active]) or not promising:
+        if leader is None or not less(simulated[leader.active], more) or not promising:
             break
         leader = promising[0]
         simulate([leader])
     confirmed = tuple(simulated.get(c.active, c) for c in screened)
-    return Confirmed(confirmed, len(simulated), sum(less(c) for c in simulated.values()), space.room)
+    return Confirmed(
+        confirmed, len(simulated), sum(less(c, settings.same / 2) for c in simulated.values()), space.room
+    )
 
 
 def _start_of_simulation(space: CandidateSpace, screened: Candidate) -> np.ndarray:
@@ -198,7 +201,7 @@ class Beforehand:
             equations do not show, so that a search should not begin there.
         room: effects in the program of all fits, if the equations show that one is missing and the log is `BRIEF`.
         alone: fits of each effect alone, by regression, the lowest first. Empty if nothing is missing.
-        scores: of every instance.
+        scores: scores of every instance.
         windows: number of equations.
         null: root of the strongest score of tables under the null hypothesis [σ], shape (replicates,).
     """

@@ -37,7 +37,7 @@ class Search:
     Attributes:
         ladder: every candidate that was fitted.
         best: the proposed one, None without a plausible one.
-        diagnosis: of its residuals.
+        diagnosis: diagnosis of its residuals.
         asked, otherwise: number of simulated sets that were screened by regression, and of unconfirmed ones
             among them, see `screening.Confirmed`.
         room: effects in the program of these fits.
@@ -146,12 +146,12 @@ def single_p_value(gain: float, null: np.ndarray) -> float:
 def without_each(
     space: CandidateSpace, best: Candidate, settings: Settings, ladder: Sequence[Candidate] = ()
 ) -> list[Candidate]:
-    """The candidate without each of its effects in turn, refitted.
+    """The candidate without each of its effects in turn, refitted. Those that remain take the first slots.
 
     Args:
         ladder: known fits, which are not repeated.
     """
-    fewer = [tuple("" if s == slot else n for s, n in enumerate(best.active)) for slot in range(len(best.effects))]
+    fewer = [fill_slots([n for n in best.effects if n != name], settings) for name in best.effects]
     simulated = {c.active: c for c in ladder if c.simulated}
     new = fit_candidates(
         space, [(w, start_of_fit(space, best, w, settings)) for w in fewer if w not in simulated], settings
@@ -220,7 +220,7 @@ def _best(candidates: Sequence[Candidate]) -> Candidate | None:
 
 
 def _accepted(c: Candidate | None, ladder: Sequence[Candidate], settings: Settings) -> Candidate | None:
-    """The candidate if each of its effects is needed: it explains clearly more than any with one effect fewer."""
+    """The candidate, if it explains clearly more than any candidate with one effect fewer."""
     if c is None:
         return None
     fewer = [x.cost for x in ladder if len(x.effects) == len(c.effects) - 1 and x.plausible]

@@ -31,7 +31,7 @@ class Settings:
     Attributes:
         shares: family-wise error by kind of evidence.
         margins: see `MARGINS`.
-        replicates: of the bootstrap.
+        replicates: replicates of the bootstrap.
         seed: random seed.
         slots: largest number of effects in a fit.
         rows_per_effect: rows that each needs.

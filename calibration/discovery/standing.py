@@ -500,7 +500,7 @@ def _chosen_again(
 
     Args:
         beside: Jacobian, residual and the effect's own signatures, as for `_root`.
-        signatures: of the library, there.
+        signatures: signatures of the library, there.
     """
     library, chosen_effects = space.library, []
     akin = np.array([library[name].family() in families for name in library.names])[library.of]

@@ -71,7 +71,7 @@ class Basis(eqx.Module):
     same number of columns.
 
     Attributes:
-        columns: of each family, shape (families, rows, terms).
+        columns: columns of each family, shape (families, rows, terms).
         places: place of each family. All are balances, or all are channels.
         variables: independent variable of each family.
     """
@@ -197,7 +197,7 @@ def curve_families(
     time or order.
 
     Args:
-        columns: of the table, with fitted readings.
+        columns: columns of the table, with fitted readings.
         weight: 0 for excluded rows, shape (rows,), or of points (see `Linearization`).
         robot: its channels and balances are searched.
         scope: None takes `Scope.of` the robot.
@@ -305,7 +305,7 @@ def window_families(
     Windows of time are at the same instants in all runs. Windows are omitted if the conditions explain time or order.
 
     Args:
-        columns: of the table.
+        columns: columns of the table.
         weight: 0 for excluded rows, shape (rows,).
         robot, scope, ways: as in `curve_families`.
     """
@@ -421,7 +421,7 @@ def wave_families(
 
     Args:
         on_tracks: True for rows of a run on tracks.
-        angle: of the driving shaft [rad], shape (rows,).
+        angle: angle of the driving shaft [rad], shape (rows,).
         rows: indices of each run's rows in the order of time, -1 beyond its last, shape (runs, samples).
         knots: rows between which a defect is linear, shape (runs, knots).
         robot: its balances are searched.

@@ -164,10 +164,10 @@ class HeldOut:
     """Readings of each row, predicted by the fit without its block.
 
     Attributes:
-        labels: of the blocks.
+        labels: labels of the blocks.
         block: index of each row's block, shape (rows,).
         reading: [SI], NaN if that fit's robot does not reach the row, shape (rows, channels).
-        status: of each row, shape (rows,).
+        status: status of each row, shape (rows,).
         z: of each block's fit, shape (blocks, parameters).
         converged: of each block's fit.
     """

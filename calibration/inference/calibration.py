@@ -191,7 +191,7 @@ class _Setting:
     Attributes:
         fidelity: its name.
         profiles: True to profile every parameter.
-        kinds: of the blocks that are held out.
+        kinds: kinds of the blocks that are held out.
         base: the robot at the prior means.
         of_product: priors of its guide frictions, see `_with_guide_priors`.
     """

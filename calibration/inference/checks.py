@@ -49,7 +49,7 @@ def unused_columns(runs: Runs) -> Names:
 
 
 def _varies(name: str, cells: np.ndarray) -> bool:
-    """True for a column of several numbers that neither counts the rows nor states when they were measured."""
+    """True for a varying column that is neither a row number nor a time."""
     if cells.dtype.kind != "f" or TIMES.search(name):
         return False
     levels = np.unique(cells[np.isfinite(cells)])
@@ -165,7 +165,7 @@ def copied_channels(runs: Runs, robot: Robot) -> list[Remark]:
 
 
 def check_data(runs: Runs, robot: Robot, names: Sequence[str], noise: Noise) -> list[Remark | str]:
-    """Refuse data that cannot be fitted. Return notes on data that can.
+    """Reject data that cannot be fitted, and return notes on the others.
 
     Raises:
         BadData: too few readings, a stuck channel, contradictory replicates, samples of one run under
@@ -201,7 +201,7 @@ WHITE = 1.5
 
 
 def _check_motion(runs: Runs, noise: Noise) -> None:
-    """Refuse a log with speeds that are only noise, except a locked shaft that is driven and has stated noise."""
+    """Reject a log whose speeds are only noise, except for a driven locked shaft with stated noise."""
     speeds = [(k, c) for k, c in enumerate(runs.channels) if c.zero_at_rest and runs.has(c.column)]
     if not runs.sampled or runs.turns or not speeds:
         return
@@ -248,7 +248,7 @@ def _check_enough_readings(runs: Runs, names: Sequence[str], noise: Noise) -> No
 
 
 def _check_stuck_channels(runs: Runs) -> list[Remark]:
-    """Refuses a channel with one value under several conditions. Returns notes for a motor voltage with one value."""
+    """Rejects a channel with one value under several conditions. Returns notes for a motor voltage with one value."""
     labels = () if runs.layout.complete else ("configuration", "surface")
     columns = [c for c in (*observers.observer_kind(runs).axes_of(runs), *labels) if runs.has(c)]
     varied = [np.unique(runs[c], return_inverse=True)[1] for c in columns]
@@ -289,13 +289,13 @@ def _constant_conditions(runs: Runs) -> list[Remark]:
 def infeasible_error(
     runs: Runs, robot: Robot, status: np.ndarray, lost: np.ndarray, names: Sequence[str]
 ) -> BadConfiguration:
-    """Error for rows that the model does not reach at the best point of all searches.
+    """Error for rows that the model cannot reproduce at the best point of all searches.
 
     Args:
-        robot: of that point.
-        status: of each row there, shape (rows,).
+        robot: robot of that point.
+        status: status of each row there, shape (rows,).
         lost: True for rows not reached, shape (rows,).
-        names: of the free parameters.
+        names: names of the free parameters.
     """
 
     def rows(which: np.ndarray) -> str:

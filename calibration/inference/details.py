@@ -57,7 +57,8 @@ class Memory:
 
 @dataclasses.dataclass(frozen=True)
 class Strongest:
-    """Balance in which a wave or a drift explains most: its score as a normal deviate, the decrease of χ² [σ²]."""
+    """Balance in which a wave or a drift explains most of the misfit: score as a normal deviate, and decrease of
+    χ² [σ²]."""
 
     balance: str
     deviate: float

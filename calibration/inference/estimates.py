@@ -58,8 +58,8 @@ def parameter_estimates(
         z: the optimum.
         beside: the optimum of the same problem with `steady`, or None.
         about, profile: the linear analysis there, and the profiles, if any.
-        sources: of priors other than the fields' own.
-        scans: of the scanned coordinates, whose intervals are those of their profiles.
+        sources: sources of priors other than the fields' own.
+        scans: scans of the scanned coordinates, whose intervals are those of their profiles.
     """
     coordinates = posed.coordinates
     point, sd = np.asarray(z), np.asarray(about.sd)

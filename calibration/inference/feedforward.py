@@ -47,8 +47,8 @@ class DriveLog:
         run: name of the run of each row.
         time: [s].
         voltage: [V].
-        position, velocity: in `unit`, per second.
-        current: of the motor [A].
+        position, velocity: position and velocity in `unit`, per second.
+        current: current of the motor [A].
         battery: its voltage at any times [V].
         unit: one of `UNITS`.
     """
@@ -71,8 +71,8 @@ class Tolerances:
         position: [unit].
         velocity: [unit/s].
         effort: [V].
-        period: of the loop [s].
-        delay: of the measurement [s].
+        period: period of the loop [s].
+        delay: delay of the measurement [s].
     """
 
     position: float = 1.0
@@ -89,7 +89,7 @@ class Feedforward:
     Attributes:
         constants, sds: by name, kS, kV, kA, and kG where it applies.
         missing: tests that the log lacks.
-        delay: of the motion behind the voltage, and of a speed's filter [s].
+        delay: delay of the motion behind the voltage, and of a speed's filter [s].
         gains: by name.
         windows: mean voltage, speed, acceleration, and True for one with little acceleration.
     """
@@ -123,7 +123,7 @@ class Feedforward:
 
 
 def interval(value: float, sd: float) -> list[float]:
-    """The interval of 95 %."""
+    """The 95 % interval."""
     return [value - Z95 * sd, value + Z95 * sd]
 
 
@@ -135,7 +135,7 @@ def units_of(unit: str) -> dict[str, str]:
 
 
 def fit_feedforward(log: DriveLog, mechanism: str = "simple", tolerances: Tolerances | None = None) -> Feedforward:
-    """Constants of a drive, gains and what stands in their way.
+    """Constants and gains of a drive, and reasons why some are missing.
 
     Raises:
         BadData: too little motion. The message names the missing tests.
@@ -315,7 +315,7 @@ def _windows(log: DriveLog, delay: float) -> Columns:
 
 
 def _driven(voltage: np.ndarray) -> np.ndarray:
-    """The voltages of a run that drive the motor."""
+    """Voltages of the samples of a run in which the motor is driven."""
     return voltage[np.abs(voltage) > 0.05 * np.abs(voltage).max()]
 
 

@@ -15,8 +15,8 @@ class Remark:
     """A remark on a table or a result, as data. `mmrjax.describe` makes its sentence.
 
     Attributes:
-        code: of its sentence in `calibration/words`.
-        values: of the sentence, by name. Each is an attribute too.
+        code: code of its sentence in `calibration/words`.
+        values: values of the sentence, by name. Each is an attribute too.
     """
 
     code: str
@@ -50,9 +50,9 @@ class Pair(NamedTuple):
 
     Attributes:
         one, other: their names.
-        correlation: of their posterior.
-        form: of the combination: their `ratio`, their `product`, or `linear`: `one` + `weight` · `other`.
-        weight: of `other` [unit of one / unit of other]. Negative if the difference is determined.
+        correlation: correlation of their posterior.
+        form: form of the combination: their `ratio`, their `product`, or `linear`: `one` + `weight` · `other`.
+        weight: weight of `other` [unit of one / unit of other]. Negative if the difference is determined.
     """
 
     one: str
@@ -67,7 +67,7 @@ class Pair(NamedTuple):
 
 
 class Determination(NamedTuple):
-    """Whether data determine a parameter.
+    """Result of the test whether data determine a parameter.
 
     Attributes:
         held: True if only its prior does.
@@ -79,7 +79,7 @@ class Determination(NamedTuple):
 
     @classmethod
     def of(cls, name: str, held: bool, pairs: Iterable[Pair]) -> Determination:
-        """From the pairs that data determine only in combination."""
+        """Determination of a parameter, from the pairs that data determine only in combination."""
         return cls(held, tuple(p.other if p.one == name else p.one for p in pairs if name in (p.one, p.other)))
 
 
@@ -98,7 +98,7 @@ class Shown(NamedTuple):
     """Finding of a test of adequacy. The order of the fields decides between equal p-values.
 
     Attributes:
-        channel: of the residuals, "" for all.
+        channel: channel of the residuals, "" for all.
         what: `repeats` or `stated` (residuals exceed the scatter of repeats or the stated noise), `follow` a
             variable, or `remember` the previous sample.
         variable: column or name.

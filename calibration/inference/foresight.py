@@ -35,12 +35,12 @@ MORE = ("motor_current", "output_speed", "motor_voltage")
 
 @dataclasses.dataclass(frozen=True)
 class Determined:
-    """Information that a table has on a free parameter.
+    """Information that a table contains on a free parameter.
 
     Attributes:
-        name: of the parameter.
+        name: name of the parameter.
         value: prior mean [unit].
-        prior_sd: of it [unit].
+        prior_sd: prior standard deviation of it [unit].
         share: posterior over prior sd [-].
         held: True if its prior holds it.
     """
@@ -55,11 +55,11 @@ class Determined:
 
 @dataclasses.dataclass(frozen=True)
 class Foresight:
-    """Information that a table has on a robot.
+    """Information that a table contains on a robot's parameters.
 
     Attributes:
-        parameters: that `loop` would free.
-        status: of each row, for the values in the file.
+        parameters: parameters that `loop` would free.
+        status: status of each row, for the values in the file.
         noise: source of each channel's sd.
         alike: strongly correlated pairs of parameters, with the correlation of their posterior.
         together: pairs of parameters that the data determine only in combination.

@@ -23,7 +23,7 @@ def search_each(
 
     Args:
         starts: coordinates.
-        weights: of the readings, (rows, channels) each.
+        weights: weights of the readings, (rows, channels) each.
         active: sets of effects, None for a problem without slots.
         most: largest number of steps of each, None for no limit.
 
@@ -40,9 +40,9 @@ class HeldOutFits:
     """Fits without each block.
 
     Attributes:
-        reading: of each row by the fit without its block [SI], NaN if no block holds the row or the fit does
+        reading: reading of each row by the fit without its block [SI], NaN if no block holds the row or the fit does
             not reach it, shape (rows, channels).
-        status: of each row, -1 if no block holds it.
+        status: status of each row, -1 if no block holds it.
         block: index of each row's block, -1 for none, shape (rows,).
         z: of each block's fit, shape (blocks, coordinates).
         converged: True if it is an optimum.
@@ -64,7 +64,8 @@ def hold_out_blocks(
         problem: as fitted to all rows.
         start: its optimum.
         active: its effects, for one with slots.
-        masks: of the rows of each block, shape (rows of the table,). The problem's rows may be padded beyond these.
+        masks: masks of the rows of each block, shape (rows of the table,). The problem's rows may be padded beyond
+            these.
     """
     rows, weight = len(masks[0]), np.asarray(problem.data.weight)
     out = [np.concatenate([m, np.zeros(len(weight) - rows, bool)]) for m in masks]

@@ -46,14 +46,14 @@ class Identifiability:
         names: names of the parameters.
         covariance: posterior covariance of z, shape (parameters, parameters).
         sd: posterior sd of z: posterior sd over prior sd.
-        singular_values: of the whitened Jacobian of the readings without priors: prior sd over data sd along each
-            direction, largest first. Above 1 the data are more informative than the prior.
+        singular_values: singular values of the whitened Jacobian of the readings without priors: prior sd over data
+            sd along each direction, largest first. Above 1 the data are more informative than the prior.
         directions: right singular vectors, one a row. Those beyond the rank as `separate_directions` returns them.
         rank: number of singular values above 1e-8 of the largest.
         sensitivity: norm of each column of that Jacobian: change of the readings by one prior sd, in data sds,
             0 for a parameter that nothing measures.
         leverage: share of each reading's variance that the fit explains, shape (rows, channels).
-        jacobian: of the whitened readings, row by row, shape (rows · channels, parameters).
+        jacobian: Jacobian of the whitened readings, row by row, shape (rows · channels, parameters).
     """
 
     names: Names
@@ -267,6 +267,6 @@ def determined_together(posterior: Posterior, held: Collection[str] = ()) -> tup
 
 
 def undetermined_names(held: Collection[str], pairs: Collection[Pair]) -> Names:
-    """Names held by priors, without names in a pair with a determined combination."""
+    """Names of parameters held by their priors, except those in a pair with a determined combination."""
     paired = {name for pair in pairs for name in (pair.one, pair.other)}
     return tuple(name for name in held if name not in paired)

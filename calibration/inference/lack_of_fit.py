@@ -60,13 +60,13 @@ class Adequacy:
     Attributes:
         adequate: None if it cannot be tested, or the search did not converge.
         chi2: misfit of the readings [σ²].
-        degrees_of_freedom: of the residuals.
+        degrees_of_freedom: degrees of freedom of the residuals.
         p_value: family-wise, of all tests made, None without tests.
         shown_by: the test with the smallest p.
         noise_known: True if χ² was among the tests.
         obstacle: reason why no test of residuals decides: the model is `undescribed`, the search `not converged`, or
             the fit `worse` than the file as stated with the same sds, "" if a test decides.
-        misses: of each channel.
+        misses: misses of each channel.
     """
 
     adequate: bool | None
@@ -97,7 +97,7 @@ class Residuals:
         simulated: fitted readings [SI].
         whitened: simulated less measured, in sds, 0 for excluded readings.
         counts: True for included readings, shape (rows, channels).
-        jacobian: of the whitened readings, row by row, shape (rows · channels, parameters).
+        jacobian: Jacobian of the whitened readings, row by row, shape (rows · channels, parameters).
         z: coordinates of the fit, shape (parameters,).
     """
 
@@ -162,7 +162,7 @@ def judge_adequacy(
 
     Args:
         as_stated: readings of the file as stated [SI].
-        sd: of the readings [SI], shape (rows, channels).
+        sd: standard deviation of the readings [SI], shape (rows, channels).
         estimated: True for channels with noise estimated from the misfit, shape (channels,).
         converged: True if the search converged.
     """

@@ -92,7 +92,7 @@ class ScoredEffect(eqx.Module):
     """One effect at each point of its shape's grid, with an amplitude of one prior sd.
 
     Attributes:
-        effect: of amplitude one sd.
+        effect: effect of amplitude one sd.
         shape: name of its shape parameter, "" for none.
         at: coordinates of the shape on the grid, in its sds.
         values: values of the shape there.
@@ -152,7 +152,7 @@ def effect_terms(robot: Robot, signals: Signals, effects: tuple[ScoredEffect, ..
     """Terms of effects in their balances at an instant, shape (instances,).
 
     Args:
-        memory: of each effect at each point of its grid. Any number for an effect without memory.
+        memory: memory of each effect at each point of its grid. Any number for an effect without memory.
     """
 
     def term(effect: Effect, remembered: Array) -> Array:
@@ -177,7 +177,7 @@ class Linearization(eqx.Module):
         signatures: by each instance's amplitude in prior sds, shape (readings, instances).
         defects: by a defect of each balance of `probed` [its unit]. Further axes depend on the observer.
         scale: change of a whitened reading per unit of the reading [1/SI], 0 if excluded, shape (rows, channels).
-        signals: of each row, at the fit.
+        signals: signals of each row, at the fit.
         channels: names of the readings' channels, in order.
         magnitudes: channels shown without a sign.
         probed: balances with known defects.
@@ -212,7 +212,7 @@ class Linearization(eqx.Module):
         return self.residual[: self.readings].reshape(self.rows, -1)
 
     def with_residual(self, residual: Array) -> Linearization:
-        """Copy with other residuals."""
+        """Copy with these residuals."""
         return dataclasses.replace(self, residual=residual)
 
     @property

@@ -23,7 +23,7 @@ SURE, REVERSALS, EXPLAINED = 6.0, 6, 0.3
 
 
 def lost_motion_notes(runs: Runs, robot: Robot) -> list[Remark]:
-    """Note on an angle that each reversal loses, of a log whose robot states no backlash."""
+    """Note on an angle that is lost at each reversal, for a log of a robot without backlash."""
     placed = [k for k, c in enumerate(runs.channels) if c.name in ("output_angle", "position") and runs.has(c.column)]
     turning = [k for k, c in enumerate(runs.channels) if c.name == "motor_speed" and runs.has(c.column)]
     if not runs.sampled or not placed or robot.has_ground or robot.loose:
@@ -86,7 +86,7 @@ def _changes_between_contacts(time: np.ndarray, angle: np.ndarray, drive: np.nda
 
 
 def _lost(moved: np.ndarray, reversed_: np.ndarray, others: np.ndarray) -> tuple[float, float, float, float]:
-    """Angle that a reversal loses next to other causes.
+    """Angle that is lost at a reversal in addition to other causes.
 
     Returns:
         The sum of squares that is left, the angle, its sd, and the share of the sum of squares that it explains.

@@ -81,7 +81,7 @@ class SearchResult:
     """Result of the searches.
 
     Attributes:
-        problem: with the noise (and stiffness) of the last round.
+        problem: problem with the noise (and stiffness) of the last round.
         best: its optimum.
         starts: outcome of the searches.
         shares: estimated sd of each channel as a share of its size, NaN if the sd was known.
@@ -109,7 +109,7 @@ def search_from_starts(
     The best optimum so far is one more start, so that every round runs the same compiled batch.
 
     Args:
-        solver: of optimistix, None for ours.
+        solver: solver of optimistix, None for ours.
     """
     by = functools.partial(optimizers.search_starts, solver=solver)
     z = points[0]
@@ -143,7 +143,7 @@ def search_one_by_one(
         posed: with the initial noise.
         shares: that noise as shares of the readings.
         tell: callback for progress after every step.
-        solver: of optimistix, None for ours.
+        solver: solver of optimistix, None for ours.
     """
     begun = time.perf_counter()
 

@@ -31,7 +31,7 @@ class Noise:
     """Standard deviations of the readings and their sources.
 
     Attributes:
-        channels: of the sds, in the order of arrays.
+        channels: channels of the sds, in the order of arrays.
         sd: [SI], shape (rows, channels). An initial guess if estimated, 1 for missing readings.
         estimated: True for channels with an sd to be estimated from the misfit, shape (channels,).
         source: one word a channel: `columns`, `stated`, `estimated`, `series`, `assumed`, or `no readings`.
@@ -115,7 +115,7 @@ def noise_from_table(runs: Runs, sizes: np.ndarray, stated: str | None = None) -
         stated: as `parse_noise`.
 
     Raises:
-        BadConfiguration: as `parse_noise`.
+        BadConfiguration: for the same reasons as `parse_noise`.
         BadData: a channel that reads zero everywhere and has no stated sd.
     """
     shares = parse_noise(stated, runs.channels) if stated else {}
@@ -161,7 +161,7 @@ def infer_noise(runs: Runs, sizes: np.ndarray, stated: str | None = None) -> Noi
     `default_noise` if the table has no series.
 
     Raises:
-        BadConfiguration, BadData: as `noise_from_table`.
+        BadConfiguration, BadData: for the same reasons as `noise_from_table`.
     """
     given = noise_from_table(runs, sizes, stated)
     if not given.estimated.any():

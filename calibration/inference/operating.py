@@ -32,7 +32,7 @@ def operating_readings(
 
     Args:
         conditions: shape (runs,).
-        names: of the channels. None: the robot's.
+        names: names of the channels. None: the robot's.
     """
     runs = conditions.shape[0]
     index = np.concatenate([np.arange(runs), np.zeros(-runs % PAD, int)])

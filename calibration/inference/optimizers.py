@@ -79,8 +79,8 @@ class Optimum(eqx.Module):
 
     Attributes:
         z: coordinates, shape (parameters,).
-        covariance: of z, from the Gauss-Newton curvature (JᵀJ)⁻¹ of readings and priors, shape (parameters,
-            parameters).
+        covariance: covariance of z, from the Gauss-Newton curvature (JᵀJ)⁻¹ of readings and priors, shape
+            (parameters, parameters).
         sd: root of its diagonal.
         cost: objective, half the sum of squares of misfit and prior [-].
         decrement: further decrease predicted by the Gauss-Newton step from here [-].
@@ -596,7 +596,7 @@ def search_rollouts(
 
     Args:
         starts: shape (members, coordinates).
-        weights: of each member's readings, shape (members, rows, channels).
+        weights: weights of each member's readings, shape (members, rows, channels).
         places: number of searches in parallel.
         within: distance from the lowest objective that matters, for members with the same readings. A search ends
             that cannot come so near: by `HOPELESS` times the predicted decrease of its step, or by the decrease of

@@ -61,7 +61,7 @@ class Generation:
         members: number of members run.
         failed: number with a row that could not be run or left the ground.
         lowest: objective of the best so far.
-        median: of this generation [½σ²].
+        median: median of this generation [½σ²].
     """
 
     members: int
@@ -76,10 +76,10 @@ class Population:
 
     Attributes:
         z: coordinates, shape (members, parameters).
-        reading: of each row [SI], shape (members, rows, channels).
+        reading: reading of each row [SI], shape (members, rows, channels).
         adhesion_used, status, flags: of each row, shape (members, rows).
         cost: objective with the final noise of the search [½σ²], inf for members without one.
-        generations: in order.
+        generations: generations in order.
     """
 
     z: Float[np.ndarray, "members parameters"]
@@ -149,7 +149,7 @@ class Members:
 
     Args:
         posed: the problem.
-        file: of members.
+        file: file of members.
         together: number of members in one batch, None takes `TOGETHER`.
 
     Raises:
@@ -264,8 +264,8 @@ def evolve(
 
     Args:
         members: runner of members.
-        objective: of members.
-        centre, covariance: of the first generation, in coordinates z.
+        objective: objective of members.
+        centre, covariance: centre and covariance of the first generation, in coordinates z.
         size: number of members in a generation.
         seed: random seed of the draws.
         beside: further points that are run with the first generation.
@@ -371,9 +371,9 @@ class Searched:
         found: all members.
         at: index of the best one.
         apart: names of parameters with derivatives of a run that disagree with finite differences.
-        slope: of the whitened readings, from the members, if derivatives are unreliable, else None.
+        slope: slope of the whitened readings, from the members, if derivatives are unreliable, else None.
         left: rms residual of the regression that gives the slope [σ], NaN without one.
-        edge: of the best member, see `parameters_at_edge`.
+        edge: edge of the best member, see `parameters_at_edge`.
     """
 
     found: Population

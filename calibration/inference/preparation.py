@@ -29,9 +29,9 @@ class Prepared:
     """A table and its robot, ready for a problem.
 
     Attributes:
-        robot: with instruments, configurations and mass from the table, and the initial states of its runs.
+        robot: robot with instruments, configurations and mass from the table, and the initial states of its runs.
         observe: the kind of the data.
-        noise: of the readings.
+        noise: noise of the readings.
         stated: priors by name of parameter, (mean, sd) [SI].
         names: free parameters that were chosen, see `prepare`.
         foreign: remarks on priors of another robot.

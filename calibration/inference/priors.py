@@ -97,9 +97,10 @@ class Coordinates(eqx.Module):
     parameter is held by its prior, which is on z and acts everywhere.
 
     Attributes:
-        location, spread, low, high: in units of θ, or of log θ for a scale, shape (parameters,).
-        names, units, scale: of each parameter.
-        ratios: of each parameter tied to a free one, to that one, shape (followers,).
+        location, spread, low, high: location, spread, lower limit and upper limit in units of θ, or of log θ for a
+            scale, shape (parameters,).
+        names, units, scale: names, units and scale of each parameter.
+        ratios: ratios of each parameter tied to a free one, to that one, shape (followers,).
         followers: (its name, index of the free one) of each.
     """
 
@@ -422,7 +423,7 @@ def parse_priors(texts: Sequence[str]) -> Priors:
     """Name → (mean, sd) of stated priors, each as `parse_prior`.
 
     Raises:
-        BadConfiguration: as `parse_prior`, or a name that is given twice.
+        BadConfiguration: for the same reasons as `parse_prior`, or a name that is given twice.
     """
     stated: dict[str, tuple[float, float]] = {}
     for text in texts:
@@ -444,7 +445,7 @@ def parameter_coordinates(
 
     Args:
         robot: its values are the prior means (medians for scales).
-        names: of the free parameters, from `choose_free_names`.
+        names: names of the free parameters, from `choose_free_names`.
         stated: name → (mean, sd) [SI]. These take precedence over the file's (`Rig.priors`), and those over the
             fields'.
         any_surface: True for the priors of `SURFACE` on ground friction without a stated prior.

@@ -31,9 +31,9 @@ class Observation(eqx.Module):
     """Simulated readings and statuses of all rows.
 
     Attributes:
-        reading: of each channel [SI], shape (rows, channels).
+        reading: reading of each channel [SI], shape (rows, channels).
         adhesion_used: demand on adhesion over its limit [-], 0 if irrelevant, shape (rows,).
-        status, flags: of the row's run, shape (rows,).
+        status, flags: status and flags of the row's run, shape (rows,).
     """
 
     reading: Float[Array, "rows channels"]
@@ -46,11 +46,12 @@ class Data(eqx.Module):
     """Readings and their weights. The part of a problem that varies between refits.
 
     Attributes:
-        measured, sd: of each channel [SI], shape (rows, channels). Arbitrary for missing readings.
+        measured, sd: readings and standard deviation of each channel [SI], shape (rows, channels). Arbitrary for
+            missing readings.
         weight: 1 for a fitted reading, 0 for a held-out or missing one, shape (rows, channels).
         centre: prior mean of z, shape (parameters,), 0 except in a bootstrap, which draws the bench
             values too.
-        stiffness: of the penalty on adhesion, see `Problem`, shape ().
+        stiffness: stiffness of the penalty on adhesion, see `Problem`, shape ().
     """
 
     measured: Float[Array, "rows channels"]

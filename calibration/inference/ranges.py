@@ -42,7 +42,7 @@ FOLLOWS = 0.9
 
 
 def check_ranges(runs: Runs, robot: Robot) -> list[Remark]:
-    """Refuse readings that no robot like this one has under these conditions. Return notes on other doubts.
+    """Reject readings that no robot like this one has under these conditions. Return notes on other doubts.
 
     Each channel's readings are compared with steady travel of the robot in its file, and with a tenth and four times
     its friction. The result is the median factor between the readings and that range. Of histories, only settled
@@ -191,7 +191,7 @@ def _slips(robot: Robot, channel: Channel, factor: float) -> bool:
 
 
 def _check_gear(runs: Runs, measured: np.ndarray, robot: Robot) -> None:
-    """Refuse a gear ratio that is the inverse of the ratio of the speeds of motor and output."""
+    """Reject a gear ratio that is the inverse of the ratio of the speeds of motor and output."""
     readings = dict(zip(channels.channel_names(robot.channels), measured.T, strict=True))
     conditions = runs.conditions(robot)
     which = np.asarray(conditions.configuration)
@@ -217,7 +217,7 @@ def _check_gear(runs: Runs, measured: np.ndarray, robot: Robot) -> None:
 
 
 def _check_masses(runs: Runs, robot: Robot) -> None:
-    """Refuse total masses that are impossible for this robot."""
+    """Reject total masses that are impossible for this robot."""
     if not runs.has("total_mass_kg"):
         return
     own_mass = np.asarray([float(c.mass) for c in robot.configurations.members])[runs.configurations(robot)]

@@ -48,7 +48,7 @@ class LevelMean:
     """Mean residual of the rows at one level of a column.
 
     Attributes:
-        level: of the column.
+        level: level of the column.
         within: of the label within which it was compared, "" for all rows.
         mean: simulated less measured [unit of the channel].
         rows: number of rows.
@@ -71,13 +71,13 @@ class ResidualCluster:
 
     Attributes:
         column: its name.
-        channel: of the residuals.
-        unit: of the channel.
+        channel: channel of the residuals.
+        unit: unit of the channel.
         within: label within whose levels the column matters, "" for all rows.
         reversing: True for opposite signs in the two directions of travel. Means are then of the residual times
             the sign of the reading.
         levels: means by level, empty for a column of many numbers.
-        correlation: of ranks, for such a column, else None.
+        correlation: correlation of ranks, for such a column, else None.
         p: family-wise.
         alike: other columns that explain these residuals no better once this one is known.
         coarser: columns whose levels this one divides further, with the share of the differences between its levels
@@ -189,7 +189,7 @@ class _Units:
         whitened: residuals.
         jacobian: by the free parameters, shape (units, channels, parameters).
         residual, simulated: [SI].
-        covariance: of z, (JᵀJ + 1)⁻¹.
+        covariance: covariance of z, (JᵀJ + 1)⁻¹.
     """
 
     runs: Runs
@@ -342,7 +342,7 @@ class _Channel:
         left: residuals after conditions and parameters are projected out, shape (units,).
         freedom: of these.
         taken: orthonormal directions of conditions and parameters, shape (units, directions).
-        tests: with orthonormal bases, after the same projection.
+        tests: tests with orthonormal bases, after the same projection.
     """
 
     left: np.ndarray

@@ -37,7 +37,7 @@ class Prior:
     Attributes:
         family: `normal` or `log-normal`.
         median: [SI].
-        interval: that holds 95 % [SI].
+        interval: interval that holds 95 % [SI].
         source: source of a field, in words, else a row of `fit_words.PRIORS`, or `stated`.
     """
 
@@ -56,7 +56,7 @@ class ProfileCurve:
     """Profile likelihood of one parameter: the objective minimised over all others.
 
     Attributes:
-        value: of the parameter, increasing [SI], shape (points,).
+        value: value of the parameter, increasing [SI], shape (points,).
         rise: twice the objective's rise above the optimum [σ²], shape (points,).
     """
 
@@ -89,15 +89,15 @@ class Estimate:
     """Estimate of one free parameter.
 
     Attributes:
-        value: at the optimum.
+        value: value at the optimum.
         sd: posterior, linear, both [unit].
-        interval: of 95 %, from the profile if there is one.
+        interval: interval of 95 %, from the profile if there is one.
         interval_linear: from the sd only [unit].
         interval_open: True if an end is beyond the last point of the profile.
         interval_shift: the ends of `interval` in prior sds from the prior's median.
-        unit, meaning: of its field.
-        prior: before the fit.
-        shift: of the value from the prior's median [prior sd].
+        unit, meaning: unit and meaning of its field.
+        prior: prior before the fit.
+        shift: shift of the value from the prior's median [prior sd].
         variance_ratio: posterior over prior variance [-].
         held_by_prior: True if it is, see `identifiability.held_by_prior`.
         at_bound: `lower`, `upper` or None.
@@ -149,9 +149,9 @@ class ChannelErrors:
 
     Attributes:
         rows: number of rows.
-        rms_percent, max_percent: of the channel's measured rms.
-        rms_sigma: in sds of the noise.
-        rms: in the channel's unit.
+        rms_percent, max_percent: rms errors and largest error of the channel's measured rms.
+        rms_sigma: rms error in sds of the noise.
+        rms: rms error in the channel's unit.
     """
 
     rows: int
@@ -177,7 +177,7 @@ class Block:
     """One held-out block.
 
     Attributes:
-        errors: of its rows.
+        errors: errors of its rows.
         unreachable_rows: those that the fit without it does not reach, counted from 1.
         converged: True if that fit converged.
     """
@@ -196,7 +196,7 @@ class HeldOut:
     """Hold-out predictions of all rows by fits without their block, for one kind of blocks.
 
     Attributes:
-        errors: of all rows.
+        errors: errors of all rows.
         unreachable_rows: those without a prediction, counted from 1.
         blocks: by label.
         reading: by channel [SI], NaN if the fit's robot does not reach the row, shape (rows,).
@@ -215,7 +215,7 @@ class ChannelReadings:
 
     Attributes:
         measured: [SI], NaN if missing.
-        sd: of each.
+        sd: standard deviation of each.
         before, after: of the robot as given and as calibrated [SI], NaN if it does not reach the row.
         percent, sigma: errors after.
     """
@@ -248,9 +248,9 @@ class CalibrationResult:
     Attributes:
         robot: calibrated.
         source: of the runs.
-        channels: of the readings, in order.
+        channels: channels of the readings, in order.
         model: the fidelity.
-        seed: of the starts.
+        seed: seed of the starts.
         parameters: the free ones, by name.
         tied: those tied to them, by name: the free one, and the ratio that they keep to it.
         noise: by channel.
@@ -261,15 +261,15 @@ class CalibrationResult:
         readings: by channel.
         status_before, status: word of each row, shape (rows,).
         adhesion_used: by the calibrated robot [-], shape (rows,).
-        objective: at the optimum [½σ²].
+        objective: objective at the optimum [½σ²].
         converged: True if the search converged.
         starts: outcome of all searches.
         searched: the population before them, None without.
-        chi_square: of the finite readings.
+        chi_square: χ² of the finite readings.
         adequacy: tests whether the residuals are consistent with noise.
         residual_clusters: clusters of the residuals by columns without a role.
         identifiability: the linear analysis.
-        posterior: of the free parameters.
+        posterior: posterior of the free parameters.
         remarks: notes to read before the result is used.
     """
 

@@ -138,17 +138,17 @@ class Rows(eqx.Module):
     Attributes:
         conditions: means over `cell`.
         shown: readings [SI], means of their rows.
-        sd: of these means.
+        sd: standard deviation of these means.
         rate: slope of the channel of the motion, if that is an angle [SI/s].
         way: of travel, 0 if it may be at rest.
-        angle: of the output since the run's first row [rad].
+        angle: angle of the output since the run's first row [rad].
         since: time since the point before [s], 0 for the first of a run.
-        time: since the run's start [s].
+        time: time since the run's start [s].
         first: a row of the table at the point.
-        delay: of the rig, at which the conditions were taken [s].
+        delay: delay of the rig, at which the conditions were taken [s].
         drift: their derivatives by the delay, by field.
         reach: change of the delay within which these hold [s].
-        memory: of the robot's effects that have one, by their names.
+        memory: memory of the robot's effects that have one, by their names.
     """
 
     conditions: Conditions
@@ -183,8 +183,8 @@ class Course:
     """Imposed quantities over time, as integrals, so that each interval has a mean at any delay.
 
     Attributes:
-        time: of knots of all runs, one run after the other [s].
-        values: from each on.
+        time: time of knots of all runs, one run after the other [s].
+        values: values from each on.
         integrals: up to each. Both by field of `Conditions`.
         cell: beginning and end of the interval of each point, in the same clock.
     """
@@ -242,9 +242,9 @@ def windows_of_run(time: np.ndarray, piece: np.ndarray, length: float) -> list[t
     """Returns the windows of one run, each as (indices of its points, their positions as shares of its length).
 
     Args:
-        time: of the points [s], increasing.
+        time: time of the points [s], increasing.
         piece: of each, -1 for points in no window. A window is within one piece.
-        length: of a window [s]. A shorter piece has one window of its own length.
+        length: length of a window [s]. A shorter piece has one window of its own length.
     """
     windows = list[tuple[np.ndarray, np.ndarray]]()
     starts = np.flatnonzero(np.r_[True, np.diff(piece) != 0])
@@ -343,7 +343,7 @@ class _Log:
         """Means of `size` rows of a run each, within stretches without a gap or a jump.
 
         Args:
-            delay: of jumps [s], None for stretches that contain them.
+            delay: delay of jumps [s], None for stretches that contain them.
 
         Returns:
             By name: row, time, shown, sd, cell as of `Rows`. Stretch of each, -1 for points in no window.
@@ -412,7 +412,7 @@ def rows_and_windows(
     """Returns the points of a log, what is imposed there over time, and the windows of its runs.
 
     Args:
-        delay: between the instant of a jump in its column and its action [s].
+        delay: delay between the instant of a jump in its column and its action [s].
         across: True for windows that contain jumps.
     """
     log = _Log(problem, plan)

@@ -116,7 +116,7 @@ class _Shown(eqx.Module):
         turning: motor speed [rad/s], current [A].
         unit: reading of the motion per motor speed.
         per_ampere: reading of the current.
-        errors: of the instruments, by channel.
+        errors: errors of the instruments, by channel.
     """
 
     turning: Scalar
@@ -484,7 +484,7 @@ class WeakForm:
 
     Attributes:
         z: coordinates of the base that minimise the squared residuals of windows and priors.
-        residual: of windows, then z - centre, shape (windows + coordinates,).
+        residual: residual of windows, then z - centre, shape (windows + coordinates,).
         jacobian: by the coordinates.
         signatures: derivatives of the windows by each instance's amplitude [prior sd].
         windows: number of equations, one or more for each window.
@@ -503,7 +503,7 @@ def weak_form(problem: Problem, effects: tuple[ScoredEffect, ...] = ()) -> WeakF
     None if the log does not show the states, or has too few windows.
 
     Args:
-        problem: of histories, without effects in its coordinates.
+        problem: problem of histories, without effects in its coordinates.
         effects: instances whose signatures are computed.
     """
     plan = plan_of(problem)
@@ -618,7 +618,7 @@ def disturbances(defect: np.ndarray, noise: np.ndarray, unit: np.ndarray) -> np.
     its fastest part, and parameters would follow that. 0 if the readings' noise explains the defects.
 
     Args:
-        defect: of each window, shape (windows, equations).
+        defect: error of each window, shape (windows, equations).
         noise: its variance by the readings.
         unit: by white noise of intensity 1.
     """

@@ -36,7 +36,7 @@ class Answer:
     """Outputs of many points.
 
     Attributes:
-        values: of each output [SI], NaN if its run did not converge, shape (points,).
+        values: values of each output [SI], NaN if its run did not converge, shape (points,).
         statuses: source (a fidelity, or a module of derived outputs) → codes, shape (points,).
     """
 
@@ -124,7 +124,7 @@ class Model:
     Attributes:
         robot: start of every point.
         columns: names of the varying parameters and conditions.
-        fidelity, options: of the simulation of outputs that are not derived.
+        fidelity, options: fidelity and options of the simulation of outputs that are not derived.
         outputs: to be computed.
     """
 

@@ -53,8 +53,8 @@ def elementary_effects(points: np.ndarray, values: np.ndarray) -> Effects | None
     """Elementary effects of an output.
 
     Args:
-        points: from `morris_design`.
-        values: of the output there.
+        points: points from `morris_design`.
+        values: values of the output there.
 
     Returns:
         None if fewer than two trajectories have values at all points.

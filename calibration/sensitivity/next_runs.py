@@ -22,7 +22,7 @@ class Choice:
     Attributes:
         rows: of the candidates.
         gain: bits that each adds to those before it, shape (runs,).
-        covariance: of the scores after each run, starting with no run, shape (runs + 1, inputs, inputs).
+        covariance: covariance of the scores after each run, starting with no run, shape (runs + 1, inputs, inputs).
     """
 
     rows: tuple[int, ...]
@@ -34,8 +34,8 @@ def fisher_information(jacobian: np.ndarray, sd: np.ndarray) -> np.ndarray:
     """Information of each run on the scores, shape (runs, inputs, inputs).
 
     Args:
-        jacobian: of its readings by the scores, shape (runs, channels, inputs), NaN for missing readings.
-        sd: of the readings, shape (runs, channels).
+        jacobian: Jacobian of its readings by the scores, shape (runs, channels, inputs), NaN for missing readings.
+        sd: standard deviation of the readings, shape (runs, channels).
     """
     with np.errstate(divide="ignore", invalid="ignore"):  # a share of a reading of zero is no information
         whitened = jacobian / sd[..., None]
@@ -47,7 +47,7 @@ def choose_runs(information: np.ndarray, count: int) -> Choice:
     """Runs that together are most informative, each candidate at most once.
 
     Args:
-        information: of each candidate, from `fisher_information`.
+        information: information of each candidate, from `fisher_information`.
         count: number of runs.
     """
     candidates, size, _ = information.shape

@@ -95,10 +95,10 @@ class Input:
     """An uncertain input.
 
     Attributes:
-        unit, meaning: of its field.
+        unit, meaning: unit and meaning of its field.
         distribution: log-normal, normal, uniform or posterior.
         median: [unit].
-        interval: of 95 % [unit].
+        interval: interval of 95 % [unit].
         sd: to first order [unit].
         inert: True if all computed derivatives of all outputs by it were exactly zero. It is then not sampled.
     """
@@ -118,13 +118,14 @@ class OutputStudy:
 
     Attributes:
         row: name, unit, label.
-        value: at the medians of the inputs [SI], shape (points,).
+        value: value at the medians of the inputs [SI], shape (points,).
         derivative: by each input [SI per its unit].
         elasticity: (x / y) ∂y/∂x [-].
         swing: output with each single input at the lower and upper end of its 95 % interval [SI], shape
             (2, points, inputs).
-        sd: of the output over all inputs [SI], shape (points,): to first order, or of the sample if there is one.
-        share: of the variance that involves an input, as the method defines it [-].
+        sd: standard deviation of the output over all inputs [SI], shape (points,): to first order, or of the sample
+            if there is one.
+        share: share of the variance that involves an input, as the method defines it [-].
         overall: indices of each input over all points together, name → Estimate of shape (inputs,).
         at_points: the same at each point, name → Estimate of shape (points, inputs).
         second: interactions over all points, Estimate of shape (inputs, inputs), None without.
@@ -187,7 +188,7 @@ class NextRuns:
         points: those chosen, in order.
         gain: bits that each adds, shape (runs,).
         noise: channel → sd as a share of the reading [-], and words for a person.
-        sd: of each input after so many runs, over that before any, shape (runs + 1, inputs).
+        sd: standard deviation of each input after so many runs, over that before any, shape (runs + 1, inputs).
         output_sd: output → its sd, root mean square over the points, after so many runs [SI], shape (runs + 1,).
     """
 

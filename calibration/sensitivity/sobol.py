@@ -128,7 +128,7 @@ def sobol_terms(design: Design, values: np.ndarray) -> Terms | None:
     approximately.
 
     Args:
-        values: of the output at the design's points.
+        values: values of the output at the design's points.
 
     Returns:
         None if fewer than two base points of some replicate remain.

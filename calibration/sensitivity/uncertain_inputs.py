@@ -152,7 +152,7 @@ def inputs_from_priors(robot: Robot, words: Sequence[str], ranges: Mapping[str, 
 
     Args:
         words: parameters, `motor.*` a group.
-        ranges: of conditions.
+        ranges: ranges of conditions.
 
     Raises:
         BadConfiguration: an unknown name, with the choices. One with a prior of zero width, or an invalid range.

@@ -53,7 +53,7 @@ class Design(eqx.Module):
     Attributes:
         continuous: logarithms of `CONTINUOUS`.
         drive, cell: numbers of `Options`, by name.
-        cells: in series.
+        cells: cells in series.
     """
 
     continuous: Float[Array, "... 3"]
@@ -106,10 +106,10 @@ class Task(eqx.Module):
     Attributes:
         robot: to be changed, with one cell (see `sheet`).
         configuration: to be sized.
-        base_mass: of the parts in the robot's mass [kg].
+        base_mass: base mass of the parts in the robot's mass [kg].
         points: shape (points,).
         middle: row of the middle of the envelope, for the energy.
-        demands: in order.
+        demands: demands in order.
     """
 
     robot: Robot

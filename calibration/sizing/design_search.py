@@ -57,7 +57,7 @@ class SizedDesign:
         objectives: by name of `OBJECTIVES`.
         margins: by label, shares of what is required or permitted.
         bounds: active bounds of the search.
-        robot: of the design.
+        robot: robot of the design.
     """
 
     JSON = (
@@ -97,8 +97,8 @@ class Sizing:
     """Result of a search.
 
     Attributes:
-        task, options: of the search.
-        objective: that is minimised, of a Pareto front the first.
+        task, options: task and options of the search.
+        objective: objective that is minimised, of a Pareto front the first.
         unmeetable: labels that no choice of parts meets, which were dropped.
         ideal: the best with any ratio and fraction of a cell, None without one.
         best: the best with a ratio of the sheets and whole cells.
@@ -142,7 +142,7 @@ def _descend(
     numbers. Steps are Adam's, clipped to bounds.
 
     Args:
-        weights: of the logarithms of the objectives in f.
+        weights: weights of the logarithms of the objectives in f.
         kept: 1 for included margins, 0 for others.
     """
     rate = optax.cosine_decay_schedule(RATE[0], STEPS, RATE[1] / RATE[0])
@@ -250,10 +250,10 @@ def size_robot(
     """Search ratio, radius, cells and motor of a robot so that it meets requirements.
 
     Args:
-        objectives: of `OBJECTIVES`, one to make small, or two for a Pareto front.
+        objectives: objectives from `OBJECTIVES`, one to make small, or two for a Pareto front.
         starts: searches in the batch.
         motors: names of those to choose from, empty: all.
-        seed: of the starts.
+        seed: seed of the starts.
         tell: callback for progress.
 
     Raises:
@@ -347,7 +347,7 @@ class _Search:
 
     Attributes:
         kept: True for limits that some design meets.
-        columns: of the objectives.
+        columns: columns of the objectives.
         evaluated: designs so far.
     """
 

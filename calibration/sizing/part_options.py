@@ -37,7 +37,7 @@ class Drive(NamedTuple):
 
     Attributes:
         motor: its sheet.
-        family, stages: of the gearbox.
+        family, stages: family and stages of the gearbox.
         ratios: total ones, ascending.
         gearbox: any of its sheets.
     """
@@ -81,7 +81,7 @@ class Options:
     Attributes:
         drives, cells: the sheets.
         drive, cell: columns, shapes (drives,) and (cells,).
-        base_mass: of the paper's two motors, two gearboxes and cells, which a robot's mass includes [kg].
+        base_mass: base mass of the paper's two motors, two gearboxes and cells, which a robot's mass includes [kg].
     """
 
     drives: tuple[Drive, ...]
@@ -100,7 +100,7 @@ def options_for_robot(robot: Robot, names: Names = ()) -> Options:
 
     Args:
         robot: source of friction, efficiencies and cells missing in sheets.
-        names: of motors, empty: all.
+        names: names of motors, empty: all.
     """
     chosen, packs = (
         drive_options(names),

@@ -50,7 +50,7 @@ class Change:
     Attributes:
         parameter: by dotted name.
         before, after: [unit].
-        unit: of its field.
+        unit: unit of its field.
         gradient: derivative of the quantity by the parameter at the worst corner [unit of quantity / unit].
         breaks: names of requirements that are met now and would be violated.
     """
@@ -70,9 +70,9 @@ class Outcome:
 
     Attributes:
         requirement: as stated, with its rating filled in.
-        value: of the quantity at the worst corner, in the unit of its name, None without a value there.
+        value: value of the quantity at the worst corner, in the unit of its name, None without a value there.
         margin: to the limit, negative if it is missed, None without a value.
-        status: of the worst corner, of `STATUSES`.
+        status: status of the worst corner, of `STATUSES`.
         at: the worst corner.
         change: single changes that would meet it, the smallest first, empty if it is met or none does.
     """
@@ -117,7 +117,7 @@ def with_ratings(robot: Robot, asked: Requirements) -> Requirements:
 
 
 def refuse_impossible(robot: Robot, asked: Requirements) -> None:
-    """Refuse requirements that cannot be evaluated for a robot of these configurations.
+    """Reject requirements that cannot be evaluated for a robot of these configurations.
 
     Raises:
         BadConfiguration: a configuration that the robot does not have. A turn that it cannot make. A posture of a

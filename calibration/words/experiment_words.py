@@ -52,12 +52,13 @@ def join_slopes(angles: Sequence[float]) -> str:
 
 #: Instructions for each calibration act, by its name; the setting fills the gap.
 ACTS = {
-    "zero current": "Switch the motors off; read the ammeter",
-    "zero reading": "Switch the motors off, at rest and with no load; read the {}",
-    "shunt": "Put a precision shunt and a load in the place of the robot, set {} by the shunt; read the ammeter",
-    "strobe": "Set the motor to {} by a stroboscope; read the tachometer",
-    "timing": "Time the robot by light gates over a distance measured with a tape, at {}; read the speed that the "
-    "bench shows",
+    "zero current": "Switch the motors off and read the ammeter",
+    "zero reading": "Switch the motors off, with the shaft at rest and unloaded, and read the {}",
+    "shunt": "Replace the robot with a load in series with a precision shunt, set {} on the shunt, and read the "
+    "ammeter",
+    "strobe": "Set the motor to {} with a stroboscope and read the tachometer",
+    "timing": "Drive at {} between two light gates a measured distance apart, and compare the timed speed with "
+    "the speed that the bench shows",
 }
 #: Units of what they set.
 UNITS = {"shunt": "A", "strobe": "rad/s", "timing": "m/s", "zero current": ""}
@@ -66,8 +67,8 @@ DOING = {
     "travel": "travel",
     "run": "run",
     "backwards": "travel backwards",
-    "other way": "run the other way round",
-    "about": "turn the slope about by the same inclinometer and travel forwards",
+    "other way": "run in the other direction",
+    "about": "reverse the slope, set with the same inclinometer, and travel forwards",
     "laden": "travel with {payload:g} kg",
     "lifted": "put it on stands, the movers in the air, and run",
     "one lifted": "put it on stands, {others}, and run",
@@ -89,8 +90,8 @@ def _act(act: menu.Act) -> str:
         each = {1: "", 2: "in both configurations, "}.get(len(configurations), "in each configuration, ")
         laden = f"unladen and with the payload of {payload:g} kg, " if payload > 0 else "unladen, "
         return (
-            f"Weigh the robot {each}{laden}on scales that are good to 20 g; read the total mass, and take the stated "
-            "one from it"
+            f"Weigh the robot {each}{laden}on scales accurate to 20 g; subtract the stated total mass from the "
+            "reading"
         )
     (kind,) = act.kinds
     if act.channel:
@@ -103,8 +104,8 @@ def _run(run: menu.Run) -> str:
     where = "" if run.setup in menu.WEIGHTLESS or level else f" {join_slopes(run.slope)}"
     read = join_words([channels.find_channel(c).label for c in run.channels])
     turning = [menu.round_significant(v / RPM) for v in run.voltage]
-    unit = {"voltage": "V", "motor_current": "A of each motor"}.get(run.imposed)
-    at = join_amounts(turning, "rpm of the motor") if unit is None else join_amounts(run.voltage, unit)
+    unit = {"voltage": "V", "motor_current": "A per motor"}.get(run.imposed)
+    at = join_amounts(turning, "rpm at the motor") if unit is None else join_amounts(run.voltage, unit)
     against = f" against a brake of {join_torques(run.torque)}" if any(run.torque) else ""
     text = f"{_doing(run)}{where} at {at}{against}; read {read}"
     return f"{text}. Watch {'; '.join(map(describe, run.watch))}" if run.watch else text
@@ -129,13 +130,13 @@ def heated_winding(temperature: float, allowed: float | None) -> str:
         allowed: limit, None if unknown [°C].
     """
     settles = math.isfinite(temperature)
-    would = f"would reach {temperature:.0f} °C" if settles else "would burn: no temperature settles"
+    would = f"would reach {temperature:.0f} °C" if settles else ("would burn out, as its temperature never settles")
     return f"a winding left on {would}{'' if allowed is None else _allowed(allowed)}"
 
 
 def _allowed(temperature: float) -> str:
     """Temperature limit of a winding, if stated."""
-    return f" ({temperature:.0f} °C is allowed)" if temperature < menu.UNLIMITED else ""
+    return f" (limit {temperature:.0f} °C)" if temperature < menu.UNLIMITED else ""
 
 
 # --- what is proposed -----------------------------------------------------------------------------------
@@ -146,9 +147,9 @@ def more_runs(what: SimpleNamespace) -> str:
     if what.variable in bases.ORDERS:
         three = [f"{menu.round_significant(v):g}" for v in (what.low, 0.5 * (what.low + what.high), what.high)]
         return (
-            "Mark the driving shaft, start every run from the mark, and record steady travel at "
-            f"{', '.join(three[:2])} and {three[2]} V with at least 20 samples a wave: what keeps its "
-            f"{what.variable} at every speed turns with that part"
+            "Mark the driving shaft, start every run with it at the mark, and record steady travel at "
+            f"{', '.join(three[:2])} and {three[2]} V with at least 20 samples per wave. A disturbance with the "
+            f"same {what.variable} at every speed comes from the part that turns at that rate"
         )
     happens = bases.window_from_name(what.variable)
     if happens is not None:
@@ -157,7 +158,7 @@ def more_runs(what: SimpleNamespace) -> str:
         by_kind = _of_level(what)
     else:
         by_kind = {} if what.within.has_ground else _of_shaft(what)
-    last = f"Repeat with {what.variable.replace('_', ' ')} in even small steps from its least to its largest"
+    last = f"Repeat with {what.variable.replace('_', ' ')} in small, equal steps over its whole range"
     return (_usual(what) | by_kind).get(what.variable, last)
 
 
@@ -165,11 +166,15 @@ def _again(happens: bases.Window) -> str:
     """The same runs, where something happens for a while or at one level."""
     if happens.axis == "order":
         return (
-            f"Make runs {happens.low:.0f} to {happens.high:.0f} again, and as many before and after them, in another "
-            "order: what comes back with them hangs on their conditions, what does not happened then"
+            f"Make runs {happens.low:.0f} to {happens.high:.0f} again, with as many runs before and after them, "
+            "in another order. An error that returns depends on the conditions of these runs; one that does not "
+            "was an event at that time"
         )
     if happens.axis != "time":
-        return f"Make the runs at {happens.words} again, on another day, and as many a little below and above that"
+        return (
+            f"Make the runs at {happens.words} again on another day, with as many runs slightly below and "
+            "slightly above that level"
+        )
     return (
         f"Repeat two of the runs, sampled as finely as the instruments allow from {happens.low:.3g} to "
         f"{happens.high:.3g} s; in one of them, switch nothing during that time"
@@ -205,19 +210,18 @@ def _usual(what: SimpleNamespace) -> dict[str, str]:
     )
     return {
         "voltage": f"Repeat at one slope and payload with {_steps(what) if by_duty else driven}",
-        "current": f"Repeat at {high:g} V with {loaded}, raised in small steps, so that the current rises evenly "
-        f"from no load to its largest, some {within.current * within.motors:.2g} A",
+        "current": f"Repeat at {high:g} V with {loaded}, raised in small steps, so that the current covers the "
+        f"range from no load to about {within.current * within.motors:.2g} A evenly",
         "speed_motor": f"Repeat on the level, unladen, with {crawl}",
         "slope": f"Repeat at one voltage and payload with the slope from 0 to {what.slope:g} deg in steps of "
         f"{angle:g} deg, and downhill",
         "payload": f"Repeat at one voltage and slope with the payload from 0 to {what.payload:g} kg in steps of "
         f"{mass:g} kg",
-        "speed": "Repeat on the level, unladen, with the travelling speed in even steps from crawl to its largest, "
-        f"some {within.speed:.2g} m/s at {high:g} V",
-        "time": f"Record one condition from a cold start for ten minutes, at {low:g} V rather than more, and again "
-        f"at once while everything is warm; watch the winding's temperature{_allowed(within.hot)}",
-        "order": "Repeat the table in another order, rows that were first last, and one condition again after every "
-        "fifth run",
+        "speed": "Repeat on the level, unladen, with the travelling speed in equal steps from a crawl to its "
+        f"maximum, about {within.speed:.2g} m/s at {high:g} V",
+        "time": f"Record one condition for ten minutes from a cold start, at no more than {low:g} V, and repeat "
+        f"it at once while everything is warm; watch the winding's temperature{_allowed(within.hot)}",
+        "order": "Repeat the table in reverse order, and repeat one condition after every fifth run",
     }
 
 
@@ -231,10 +235,10 @@ def _of_level(what: SimpleNamespace) -> dict[str, str]:
     turning = f"with the {one}{_up_to(levels[0], what.runs, levels[1])}"
     words = {
         "speed_motor": f"{level} {turning}",
-        "speed": f"{level} {turning}, and so the travelling speed",
+        "speed": f"{level} {turning}, which also varies the travelling speed",
         "slope": f"Repeat at one {one} and payload with the slope from 0 to {what.slope:g} deg, and downhill",
         "payload": f"Repeat at one {one} and slope with the payload from 0 to {what.payload:g} kg",
-        "time": f"Record one {one} from a cold start for ten minutes, and again at once while all is warm",
+        "time": f"Record one {one} for ten minutes from a cold start, and repeat it at once while everything is warm",
     }
     if not within.has_ground:
         words["current"] = (
@@ -263,28 +267,28 @@ def _of_shaft(what: SimpleNamespace) -> dict[str, str]:
 
 #: Code of an instruction or of what to watch → a sentence with its values, or a function that makes one.
 SAID: dict[str, str | Callable[..., str]] = {
-    "nothing_possible": "Every experiment of the menu is forbidden or beyond reach",
-    "no_menu": "The menu of experiments is of straight travel and has no {word}",
+    "nothing_possible": "Every experiment that the loop can propose is excluded or out of reach",
+    "no_menu": "The loop can propose experiments for straight travel only, not for {word}",
     "nothing_tells": lambda names, sigma: (
-        f"No experiment of the menu tells {' and '.join(names)} apart by {sigma:g} sigma"
+        f"No experiment that the loop can propose separates {' and '.join(names)} by {sigma:g} sigma"
     ),
-    "too_weak": "A series in {variable} would show what is missing by {sigma:.1f} sigma",
+    "too_weak": "A series of runs over {variable} would show the missing term with {sigma:.1f} sigma only",
     "carry_out": lambda experiments: ". And: ".join(map(experiment_sentences, experiments)),
     "more_runs": lambda **series: (
-        f"{more_runs(SimpleNamespace(**series))}; read every channel. "
-        f"What the {bases.place_in_words(series['place'])} lacks then shows its shape"
+        f"{more_runs(SimpleNamespace(**series))}; read every channel. The series shows the shape of the term that "
+        f"is missing in the {bases.place_in_words(series['place'])}"
     ),
     "overspeed": lambda speed, limit, voltage: (
-        f"the motor speed: about {speed / RPM:.0f} rpm without load at {voltage:g} V, and no more than "
+        f"the motor speed: expect about {speed / RPM:.0f} rpm unloaded at {voltage:g} V and do not exceed "
         f"{limit / RPM:.0f} rpm; raise the voltage slowly"
     ),
-    "overvoltage": "the supply: {voltage:g} V is more than the table's {used:g} V",
+    "overvoltage": "the supply: {voltage:g} V is above the highest voltage in the table, {used:g} V",
     "held_motor": lambda current, **heat: (
-        f"current × time: {current:.2g} A in a motor that does not turn, and so is not cooled; "
-        f"{heated_winding(**heat)}, so switch off within seconds and let it cool between readings"
+        f"the heating: {current:.2g} A flow through a stationary, uncooled motor; {heated_winding(**heat)}, so "
+        "switch off within seconds and let it cool between readings"
     ),
     "braked_motor": lambda **heat: (
-        f"the brake and the winding's temperature: {heated_winding(**heat)}; seconds are enough for a reading"
+        f"the brake and the winding's temperature: {heated_winding(**heat)}; a few seconds are enough for a reading"
     ),
     "hot_motor": lambda **heat: f"the winding's temperature: {heated_winding(**heat)}; keep the runs short",
 }
@@ -302,19 +306,20 @@ ISOLATED_BY = {
 }  # fmt: skip
 CHECKED_BY = {"total_current": ("zero current", "shunt"), "motor_speed": ("strobe",), "speed": ("timing",)}
 #: Test of any other channel.
-COMPARE = "Read a second instrument next to that of the {}, at several values"
+COMPARE = "Compare the instrument for the {} with a second one, at several values"
 #: Condition to vary, all others constant, so that a term that depends on a signal changes.
 VARY = {
     "speed": "the speed (the supply voltage)", "current": "the current (slope or payload at one voltage)",
     "load": "the load (slope or payload at one voltage)", "slope": "the slope", "weight": "the payload",
     "duty": "the duty at one supply voltage",
     "configuration": "the configuration", "direction": "the direction of travel",
-    "demand": "the demand on adhesion (slope or payload)", "angle": "nothing: sample each revolution",
-    THE_SIDE: "nothing: compare the sides in straight travel and in turns both ways",
-    "position": "the position: go over the whole travel both ways at one voltage",
-    "": "nothing: it is the same share everywhere",
+    "demand": "the demand on adhesion (slope or payload)", "angle": "nothing: sample fast enough to resolve one "
+                                                                    "revolution",
+    THE_SIDE: "nothing: compare the two sides in straight travel and in turns in both directions",
+    "position": "the position: cover the whole travel in both directions at one voltage",
+    "": "nothing: its share is the same in every run",
 }  # fmt: skip
-WEIGH = "Weigh the robot, unladen and laden, and take the stated mass from it"
+WEIGH = "Weigh the robot, unladen and laden, and subtract the stated mass"
 
 
 def effect_summary(effect: type[Effect]) -> tuple[str, str, str]:

@@ -17,8 +17,8 @@ def feedforward_statement(found: Feedforward) -> str:
 def _limit(level: float, current: float | None) -> str:
     most = "" if current is None else f" The current reaches {current:.3g} A."
     return (
-        f"A current limit was reached: above {level:.2g} V of accelerating voltage the acceleration rises "
-        f"no more.{most} Those windows are left out. Lower the voltage of the dynamic test, or raise the limit."
+        f"A current limit was reached: above {level:.2g} V of accelerating voltage the acceleration no longer "
+        f"increases.{most} Those windows are left out. Lower the voltage of the dynamic test, or raise the limit."
     )
 
 
@@ -26,15 +26,16 @@ def _limit(level: float, current: float | None) -> str:
 MEANT = dict(
     zip(
         WRONG_UNITS,
-        ("per minute", "per second, of a position in minutes", "in radians", "in rotations", "in degrees",
-         "in rotations", "in rotations per minute of a position in radians", "in millimetres", "in centimetres"),
+        ("per minute", "per second, while the position counts minutes", "in radians", "in rotations", "in degrees",
+         "in rotations", "in rotations per minute, while the position is in radians", "in millimetres",
+         "in centimetres"),
         strict=True,
     )
 )  # fmt: skip
 
 
 def _unit(ratio: float, near: float) -> str:
-    told = f"it is probably {MEANT[near]}" if near else "check gear and wheel in the conversion"
+    told = f"it is probably {MEANT[near]}" if near else ("check the gear ratio and the wheel size in the conversion")
     return (
         f"The velocity is {ratio:.4g} times the rate of the position: {told}. The constants are in the unit of the "
         "position."
@@ -44,23 +45,23 @@ def _unit(ratio: float, near: float) -> str:
 def _undetermined(share: float, missing: Sequence[str]) -> str:
     lack = f" ({', '.join(missing)} missing)" if missing else ""
     return (
-        f"kA is not determined: its interval is ± {100 * share:.0f} %{lack}. No feedback gains are given; run "
-        "dynamic tests with more acceleration and a faster log."
+        f"kA is not determined: its 95 % interval is ± {100 * share:.0f} %{lack}. No feedback gains are given; "
+        "run dynamic tests with more acceleration and a faster log."
     )
 
 
 SAID: dict[str, str | Callable[..., str]] = {
-    "feedforward_sign": "A positive voltage makes a negative velocity: motor or encoder is inverted. The voltage is "
-    "turned round here; set the inversion in the robot's code.",
-    "feedforward_speed_sign": "Velocity and position have opposite signs. The velocity is turned round here; invert "
-    "one of them in the robot's code.",
+    "feedforward_sign": "A positive voltage gives a negative velocity: the motor or the encoder is inverted. The "
+    "sign of the voltage is changed here; set the inversion in the robot's code.",
+    "feedforward_speed_sign": "Velocity and position have opposite signs. The sign of the velocity is changed "
+    "here; invert one of the two in the robot's code.",
     "feedforward_unit": _unit,
     "feedforward_delay": lambda delay: (
         f"The motion follows the voltage {1000 * delay:.0f} ms late. The constants are fitted with this delay."
     ),
     "feedforward_filter": lambda lag: (
-        f"The velocity is {1000 * lag:.0f} ms behind the position: it is filtered. The constants are fitted to the "
-        "position. Shorten the filter of the velocity before using kP."
+        f"The velocity lags the position by {1000 * lag:.0f} ms because it is filtered. The constants are fitted "
+        "to the position. Use a shorter velocity filter before you use kP."
     ),
     "feedforward_limit": _limit,
     "feedforward_skid": lambda level: (
@@ -68,16 +69,16 @@ SAID: dict[str, str | Callable[..., str]] = {
         "windows are left out. Lower the voltage of the dynamic test."
     ),
     "feedforward_direction": lambda forward, backward: (
-        f"kS differs by direction: {forward:.3g} V forward, {backward:.3g} V backward. A slope, a weight or a gear "
-        "that binds does this; WPILib's kS is their mean."
+        f"kS differs by direction: {forward:.3g} V forward, {backward:.3g} V backward. A slope, a weight or a "
+        "binding gear can cause this. WPILib's kS is the mean of the two."
     ),
     "feedforward_sag": lambda rest, low: (
-        f"The battery sagged from {rest:.3g} to {low:.3g} V. Unless the log has the voltage at the motor, kA and kV "
-        "are too large: use setVoltage, or a fresh battery."
+        f"The battery sagged from {rest:.3g} to {low:.3g} V. Unless the log contains the voltage at the motor, kA "
+        "and kV are too large. Use setVoltage, or a fresh battery."
     ),
     "feedforward_missing": "Tests are missing: {tests}.",
     "feedforward_no_kA": _undetermined,
     "feedforward_gains_delayed": lambda delay, slow, prompt: (
-        f"A delay of {1000 * delay:.0f} ms makes kP of the velocity smaller: {slow:.3g} in place of {prompt:.3g}."
+        f"A delay of {1000 * delay:.0f} ms reduces the velocity kP from {prompt:.3g} to {slow:.3g}."
     ),
 }

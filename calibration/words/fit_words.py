@@ -24,11 +24,11 @@ if TYPE_CHECKING:
 FAR = {
     "loop": "{} is implausible, {:.1f} prior sds from its prior: it probably absorbs a missing effect",
     "calibration": "{} lies {:.1f} prior sds from its prior: the prior or the model is wrong",
-    "edge": "{}: its posterior mean lies {:.1f} prior sds from its prior, at the edge of where the search looked: "
-    "widen the prior and search again, or doubt the model",
+    "edge": "{}: its posterior mean lies {:.1f} prior sds from its prior, at the edge of the searched range: "
+    "widen the prior and search again, or question the model",
 }
 #: Origin of a prior that is neither from a field nor stated.
-PRIORS = {"product": "its product with the share of the guides, as in the other fidelities"}
+PRIORS = {"product": "the prior of its product with the guide share in the other fidelities"}
 #: Reasons why a member of a population loses a row.
 LOST_AS = {
     "slides": "slide", "tips": "turn over", "failed": "leave the ground for good or cannot be computed",
@@ -40,12 +40,12 @@ def noise_off(channel: str, factor: float, source: str) -> str:
     """Ratio of residuals to their sds."""
     if not channel:
         return (
-            f"residuals are {factor:.2g} times the {source} sds in every channel and under all "
-            "conditions: are the sds right?"
+            f"in every channel and under all conditions, residuals are {factor:.2g} times the {source} sds: check "
+            "the sds"
         )
     return (
-        f"residuals of {channels.find_channel(channel).label} are {factor:.2g} times the {source} "
-        "sds, under all conditions: are these sds right?"
+        f"residuals of {channels.find_channel(channel).label} are {factor:.2g} times the {source} sds under all "
+        "conditions: check these sds"
     )
 
 
@@ -53,8 +53,8 @@ def estimated_noise(percent: tuple[tuple[str, float], ...]) -> str:
     """Channels whose noise was estimated."""
     each = ", ".join(f"{channel.replace('_', ' ')} {share:.1f} %" for channel, share in percent)
     return (
-        f"no noise was stated for {each}: estimated from the misfit, so it includes model error and cannot "
-        "test whether the model is adequate"
+        f"no noise was stated for {each}. It is estimated from the misfit, so it includes model error and cannot "
+        "be used to test the model"
     )
 
 
@@ -83,8 +83,8 @@ def of_rows(rows: tuple[int, ...], what: str, share: float = 0.0) -> str:
     listed = f"rows {', '.join(map(str, rows))}"
     if what == "limited":
         return (
-            f"{listed} are within {share:.0%} of the adhesion limit: it bounds their static friction from below, "
-            "and does not explain all of their slip"
+            f"{listed} are within {share:.0%} of the adhesion limit. They give a lower bound for static friction, "
+            "which does not explain all of their slip"
         )
     if what == "jumps":
         return f"{listed}: the calibrated robot's running gear jumps; it leaves the ground at times"
@@ -98,10 +98,10 @@ def search_agreement(starts: int, agree: int, elsewhere: int, more: float, open:
     if agree == starts:
         return f"all {starts} starts end at the same optimum"
     if open == starts:
-        return f"none of {starts} searches converged, so the best end is shown"
+        return f"none of {starts} searches converged; the best result is shown"
     parts = [f"{agree} of {starts} starts end at the best optimum"]
     if elsewhere:
-        parts.append(f"{elsewhere} at others (the next costs {more:.3g} more)")
+        parts.append(f"{elsewhere} at other optima (the next best has a cost higher by {more:.3g})")
     if open:
         parts.append(f"{open} did not converge")
     return ", ".join(parts)
@@ -111,8 +111,8 @@ def unsettled_search(names: Names) -> str:
     """A search that ended before it converged."""
     determined = f"these data do not determine {', '.join(names)}" if names else "the data determine them all"
     return (
-        f"the search ended before it converged: parameters are the best that it found, their intervals are not to be "
-        f"trusted, and {determined}"
+        "the search ended before it converged: the parameters are the best that it found, their intervals are "
+        f"unreliable, and {determined}"
     )
 
 
@@ -121,24 +121,24 @@ def unsettled_search(names: Names) -> str:
 
 def search_generations(members: int, generations: int, settled: bool) -> str:
     """Progress of a search."""
-    end = "the last gained nothing that counts"
+    end = "the last brought no significant gain"
     if not settled:
-        end = "the last still gained: go on with more --generations"
+        end = "the last still brought a gain: continue with more --generations"
     return f"{count_noun(members, 'member')} in {count_noun(generations, 'generation')}; {end}"
 
 
 def lost_rows(members: dict[str, int]) -> str:
     """Members with a row that is lost."""
     lost = ", ".join(f"{members[status]} {how}" for status, how in LOST_AS.items() if status in members)
-    return f"of the members, in some row: {lost}; a row that is lost costs a member its rank"
+    return f"members that fail in at least one row: {lost}; they rank below the others"
 
 
 def members_jump(members: int, best: tuple[int, ...]) -> str:
     """Members whose running gear jumps."""
     where = f"rows {', '.join(map(str, best))}" if best else "none"
     return (
-        f"{members} of the members jump in some row: their running gear drops between guides and pulleys and "
-        f"throws them off the ground at times; the best in {where}"
+        f"{members} members jump in at least one row: the weight passes between guides and pulleys so hard that "
+        f"they leave the ground at times; the best member does so in {where}"
     )
 
 
@@ -168,7 +168,7 @@ def shown_by(test: fit_notes.Shown) -> str:
 OBSTACLES = {
     "undescribed": "This model does not describe these runs: {large}. Check units, signs, sides, and columns that "
     "vary and are not used, before any parameter is read",
-    "not converged": "No verdict: the search did not converge, so its parameters are not the best ones ({every})",
+    "not converged": "No verdict: the search did not converge, so better parameters exist ({every})",
     "worse": "Not adequate: the fit is worse than the robot's file as stated ({every})",
 }
 
@@ -196,20 +196,21 @@ def adequacy_verdict(found: Adequacy) -> str:
     if found.adequate is None or found.p_value is None:
         return (
             "Adequacy cannot be tested: the noise was estimated from the misfit, and "
-            f"{found.degrees_of_freedom:.4g} degrees of freedom cannot show structure; state it with --noise"
+            f"{found.degrees_of_freedom:.4g} degrees of freedom are too few to show structure; state the noise "
+            "with --noise"
         )
     p = f"p = {found.p_value:.2g}" if found.p_value > 1e-6 else "p < 1e-6"
     if not found.adequate:
         why = f"{chi2}, {p}" if found.noise_known else f"{p}, the noise estimated from them"
         return (
-            f"Not adequate: {shown_by(found.shown_by)} ({why}), so something is missing and the parameters may "
-            "absorb it; run mmrjax loop to find it"
+            f"Not adequate: {shown_by(found.shown_by)} ({why}), so a term is missing and the parameters may "
+            "absorb its effect; run mmrjax loop to find it"
         )
     if found.noise_known:
         return f"Adequate: the residuals are consistent with the stated noise ({chi2}, {p})"
     return (
         f"Adequate as far as can be tested: the residuals show no structure ({p}); the noise was estimated from "
-        "them, so χ² tests nothing"
+        "them, so χ² is no test"
     )
 
 
@@ -233,7 +234,7 @@ def calibration_answer(found: CalibrationResult) -> str:
             rows[c.label] = int(both.sum())
             each.append((c.label, f"{c.label} {before:.1f} → {after:.1f} %"))
     if not each:
-        return f"{_VERDICTS[found.adequacy.adequate]}; no row is reached both before and after."
+        return f"{_VERDICTS[found.adequacy.adequate]}; the model reaches no row both before and after the fit."
     same = len(set(rows.values())) == 1
     errors = ", ".join(text + ("" if same else f" ({rows[label]} rows)") for label, text in each)
     where = f"the same {count_noun(max(rows.values()), 'row')}" if same else "the same rows"
@@ -253,8 +254,8 @@ def residual_cluster(c: ResidualCluster) -> str:
     role = "a column without a role" + (f" (as well by {', '.join(c.alike)})" if c.alike else "")
     if c.correlation is not None:
         return (
-            f"{what} go with {c.column}{within}{signs} (rank correlation {c.correlation:+.2f}; {p}), {role}: find "
-            "what differs with it"
+            f"{what} are correlated with {c.column}{within}{signs} (rank correlation {c.correlation:+.2f}; {p}), "
+            f"{role}: find what changes along with it"
         )
     if c.coarser:
         shares = ", ".join(f"{name} alone {share:.0%} of it" for name, share in c.coarser)
@@ -264,8 +265,8 @@ def residual_cluster(c: ResidualCluster) -> str:
     each = ", ".join(f"{m.name}: {m.mean:+.2g} {c.unit}" for m in kept)
     more = ", ..." if len(kept) < len(c.levels) else ""
     return (
-        f"{what} cluster by {c.column}{within}{signs} (simulated less measured at levels {each}{more}; {p}), {role}: "
-        "give each level its own configuration, or find what differs"
+        f"{what} differ between the levels of {c.column}{within}{signs} (simulated minus measured, by level: "
+        f"{each}{more}; {p}), {role}: give each level its own configuration, or find what differs between them"
     )
 
 
@@ -275,61 +276,61 @@ SAID: dict[str, str | Callable[..., str]] = {
     "only_together": only_together,
     "far_from_prior": lambda name, sds, kind: FAR[kind].format(name, sds),
     "noise_off": noise_off,
-    "not_profiled": "no profiles were made: intervals are linear, and too symmetric where the model is curved",
-    "no_covariance": "the posterior has no finite covariance: values stand, intervals do not",
-    "no_grip": "no run grips: static friction, and slip below it, are known by their priors alone",
+    "not_profiled": "no profiles were computed: intervals are from the linearized model, and too symmetric where "
+    "the model is nonlinear",
+    "no_covariance": "the posterior has no finite covariance: the values can be used, the intervals cannot",
+    "no_grip": "every run slides: static friction, and slip below it, are known only from their priors",
     "estimated_noise": estimated_noise,
-    "beside_steady": "{inside} of {total} parameters lie within their 95 % intervals of the same "
-    "problem's optimum "
-    "with steady; furthest apart is {furthest}, {sds:.2f} sd",
+    "beside_steady": "{inside} of {total} parameters agree with the optimum of the model steady within their 95 "
+    "% intervals; the largest difference is {sds:.2f} sd, for {furthest}",
     "of_rows": of_rows,
     "at_bound": "{name} is at its {side} bound",
     "after_steps": lambda channel, share, rows, total: (
-        f"{share:.0%} of the squared error of {channels.find_channel(channel).label} lies in the first sample after "
-        f"each step ({rows} of {total} rows; without them the rms error is {100 * (1 - share) ** 0.5:.0f} % of it): "
-        'readings and command may be offset in time; state [rig] delay = "0 ± 0.02" [s], which may be negative, and '
-        "calibrate fits it"
+        f"{share:.0%} of the squared error of {channels.find_channel(channel).label} lies in the first sample "
+        f"after each step ({rows} of {total} rows; without them the rms error falls to "
+        f"{100 * (1 - share) ** 0.5:.0f} % of its value). The readings may be offset in time from the command; "
+        'set [rig] delay = "0 ± 0.02" [s] (it may be negative), and calibrate fits it'
     ),
     "freed_delay": lambda channel, share: (
         f"without a delay, {share:.0%} of the squared error of {channels.find_channel(channel).label} lies in the "
         "first sample after each step; rig.delay is therefore fitted, unless the file has [rig] delay = '0 ± 0'"
     ),
     "shifted": lambda channel, share, shift: (
-        f"{share:.0%} of the squared error of {channels.find_channel(channel).label} is that of readings "
-        f"{abs(1e3 * shift):.2g} ms too {'late' if shift > 0 else 'early'}: state [rig] delay = "
-        f'"{shift:.2g} ± {max(abs(shift), 0.005):.2g}" [s], and calibrate fits it'
+        f"{share:.0%} of the squared error of {channels.find_channel(channel).label} is explained by readings "
+        f'that are {abs(1e3 * shift):.2g} ms {"late" if shift > 0 else "early"}: set [rig] delay = "{shift:.2g} '
+        f'± {max(abs(shift), 0.005):.2g}" [s], and calibrate fits it'
     ),
     "product_alone": lambda friction, share, free: (
-        f"only the product {friction} x {share} acts; the priors alone divide it"
+        f"the readings depend only on the product {friction} x {share}; its two factors are known only from their "
+        "priors"
         if free
-        else f"{share} is found with {friction} held: only their product acts"
+        else f"{share} is fitted with {friction} fixed, because the readings depend only on their product"
     ),
-    "prior_of_product": "{name}: its prior, {mean:.3g} ± {sd:.2g}, is that of its product with "
-    "the share of the "
-    "guides in the other fidelities; the track model puts {share:.0%} of the weight on them",
+    "prior_of_product": "{name}: its prior, {mean:.3g} ± {sd:.2g}, is the prior of its product with the guide "
+    "share in the other fidelities; in the track model the guides carry {share:.0%} of the "
+    "weight",
     "no_prediction": lambda kind, rows, total: (
-        f"held out by {blocks.kind_in_words(kind)}: {rows} of {total} rows have no prediction, because "
-        "the robot fitted without them slides there; the errors leave them out"
+        f"held out by {blocks.kind_in_words(kind)}: {rows} of {total} rows have no prediction, because the robot "
+        "fitted without them slides in them; the errors exclude these rows"
     ),
     "same_predictions": lambda kind, others: (
-        f"held out by {' or by '.join(blocks.kind_in_words(k) for k in others)}: the same predictions as held "
-        f"out by {blocks.kind_in_words(kind)}, shown in their place; these runs do not vary them separately"
+        f"held out by {' or by '.join(blocks.kind_in_words(k) for k in others)}: the same predictions as held out "
+        f"by {blocks.kind_in_words(kind)}, so shown once; these runs do not vary them separately"
     ),
     "block_not_converged": "a search without a block of {kind} did not converge",
     "agreement": search_agreement,
     "unsettled": unsettled_search,
     "elsewhere": "{searches} of {total} searches converged at other values of {names}",
-    "in_pieces": "{name}: the values within its 95 % interval are in {pieces} pieces, with worse ones between "
-    "them; samples closer together would distinguish them",
+    "in_pieces": "{name}: the values within its 95 % interval are in {pieces} pieces, with worse values between "
+    "them; readings taken closer together would separate them",
     "generations": search_generations,
     "lost_rows": lost_rows,
     "members_jump": members_jump,
     "ended_at_edge": lambda edge: (
-        "the search ended at the edge of what was allowed: its best member has "
+        "the search ended at the edge of the allowed range: its best member has "
         + ", ".join(f"{name} {prior_edge(at)}" for name, at in edge.items())
     ),
-    "read_from_members": "derivatives of the run by {names} are not those of its differences "
-    "(contacts open and "
-    "close): what the rows determine is read from a regression over the members near the best, which leaves "
-    "{left:.2g} sd rms",
+    "read_from_members": "derivatives of the run with respect to {names} disagree with finite differences "
+    "(contacts open and close). The determined parameters therefore come from a regression "
+    "over the members near the best, with residuals of {left:.2g} sd rms",
 }

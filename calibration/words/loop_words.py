@@ -58,7 +58,9 @@ def verdict_sentences(said: loop_notes.Summary) -> str:
     if said.noise:
         text = f"{text} But {'; '.join(map(describe, said.noise))}"
     if said.cluster is not None:
-        text = f"{text} {cluster_sentence(said.cluster).capitalize()}: that is a finding, so all of them are kept."
+        text = (
+            f"{text} {cluster_sentence(said.cluster).capitalize()}: that is a finding, so all of these rows are kept."
+        )
     return text
 
 
@@ -81,12 +83,12 @@ def _verdict(said: loop_notes.Summary) -> str:
             text += _tentative(said.missing, said.support)
         elif said.nearest:
             one = len(said.nearest) == 1
-            text += f" Nearest {'comes' if one else 'come'} {' and '.join(said.nearest)}, which "
-            text += f"{'does' if one else 'do'} not stand."
+            text += f" The nearest {'candidate is' if one else 'candidates are'} {' and '.join(said.nearest)}, but "
+            text += f"{'it is' if one else 'they are'} not supported by the tests."
         return text
     names = [_named(one) for one in said.missing if one.established]
     in_model = _tentative([one for one in said.missing if not one.established], said.support)
-    left = "" if where is None else f" Something remains in the {bases.place_in_words(where.place)}."
+    left = "" if where is None else f" An unexplained error remains in the {bases.place_in_words(where.place)}."
     return f"Missing: {'; '.join(names)} ({_evidence(said)}).{in_model}{left}"
 
 
@@ -110,7 +112,7 @@ def loop_answer(found: loop_notes.Headline) -> str:
     lacks = _are_missing([" or ".join(map(with_article, sure)) for sure in claims] or ["something"])
     laws = [_law(*law) for law in zip(found.claims, found.families, found.values, strict=False)]
     apart = "".join(
-        f" At some of these it may be {' or '.join(map(with_article, c[n:]))} instead."
+        f" At some of these noise levels it may be {' or '.join(map(with_article, c[n:]))} instead."
         for c, n in zip(found.claims, found.shared, strict=False)
         if n and c[n:]
     )
@@ -159,7 +161,9 @@ def _undescribed(said: loop_notes.Summary) -> str:
     check += [f"parameters far from their priors ({', '.join(said.far)})"] * bool(said.far)
     check += ["units, signs and sides of the columns"]
     if not each:
-        return "This model does not describe these runs: it has no backlash. No effect is named before it has one."
+        return (
+            "This model does not describe these runs: it lacks backlash. No effect is named until backlash is added."
+        )
     return (
         f"This model does not describe these runs: refitted, it misses {', '.join(each)}. No effect is named. "
         f"Check first: {'; '.join(check)}."
@@ -186,7 +190,7 @@ NO_MECHANISM = {
     "share": "it explains only {share:.0f} % of the excess misfit",
     "gain": "on held-out runs it gains {0.gain:.2g} ± {0.se:.2g} nat a reading",
     "again": "it is found again in only {again:.0f} % of the fits without one block",
-    "many": "{many} variables or equations may be its cause",
+    "many": "any of {many} variables or equations may be its cause",
 }
 
 
@@ -203,7 +207,7 @@ def curve_course(d: UnnamedDiscrepancy) -> str:
         return ""
     ends = [f"{d.value[k]:.2g} {d.unit} at {_level(d.variable, d.at[k])}" for k in (0, -1)]
     k = int(np.argmax(np.abs(d.value - np.interp(d.at, d.at[[0, -1]], d.value[[0, -1]]))))
-    between = f", by way of {d.value[k]:.2g} {d.unit} at {_level(d.variable, d.at[k])}"
+    between = f", passing {d.value[k]:.2g} {d.unit} at {_level(d.variable, d.at[k])}"
     bent = not min(d.value[0], d.value[-1]) <= d.value[k] <= max(d.value[0], d.value[-1])
     verb = "rises" if d.value[-1] > d.value[0] else "falls"
     return f"{verb} from {ends[0]} to {ends[1]}{between * bent}"
@@ -247,7 +251,7 @@ def at_other_noise(found: Sequence[Sensitivity]) -> str:
         f"with {' and with '.join(factors)} times that noise the verdict is {words}"
         for words, factors in same.items()
     ]
-    near = " (by fits a few steps from those with the stated noise)" if any(one.near for one in found) else ""
+    near = " (after a few steps from the fits with the stated noise)" if any(one.near for one in found) else ""
     return "; ".join(each) + near
 
 
@@ -273,7 +277,7 @@ def _tentative(those: Sequence[loop_notes.Missing], support: loop_notes.NameSupp
         else f"{_named(one)} ({support_reasons(support)})"
         for one in those
     ]
-    return f" Tentative, in the model since it predicts better: {'; '.join(each)}."
+    return f" Tentative, kept in the model because it improves predictions: {'; '.join(each)}."
 
 
 def verdict_line(stages: LoopStages) -> str:
@@ -294,7 +298,7 @@ def ranking_lines(found: Ranking, most: int = 5, brief: bool = False) -> list[st
     first = f"{by}, not yet confirmed: something is missing (family-wise p {p_value(found.p_value)})"
     beyond = [e for e in found.effects if e.score > found.chance and not e.supplies][:most]
     if not beyond:
-        return [f"{first}; no effect explains more than chance"]
+        return [f"{first}; no effect explains more than chance would"]
     if brief:
         return [f"{first}; strongest alone: {', '.join(e.name for e in beyond)}"]
     lines = [
@@ -310,7 +314,7 @@ def regression_verdict(found: Ranking) -> str:
     beyond = [e for e in found.effects if e.score > found.chance and not e.supplies]
     alike = [e for e in beyond if e.score >= beyond[0].score - Settings.alternative]
     families = " or ".join(dict.fromkeys(with_article(e.family) for e in alike))
-    lacks = f"{families} ({' or '.join(e.name for e in alike)})" if alike else "no effect explains it"
+    lacks = f"{families} ({' or '.join(e.name for e in alike)})" if alike else "but no effect explains it"
     lacks = f"something is missing, {lacks}" if found.missing else "no effect of the library exceeds chance"
     numbers = ", ".join(f"{name} {value:.4g} ± {sd:.2g}" for name, (value, sd) in found.parameters.items())
     numbers = f"; parameters [SI]: {numbers}" if numbers else ""
@@ -318,14 +322,17 @@ def regression_verdict(found: Ranking) -> str:
 
 
 #: Remark beside a regression that sees nothing, where the simulation does.
-DISAGREES = "by simulation something is missing: the refitted model leaves more than chance; trust the simulation"
+DISAGREES = (
+    "simulation disagrees: the refitted model leaves more error than chance would, so something is "
+    "missing; trust the simulation"
+)
 
 
 def so_far(effects: Sequence[str], families: Sequence[str]) -> str:
     """Findings of a search before its verdict is known."""
     return (
         f"so far, confirmed by simulation: {' and '.join(with_article(f) for f in dict.fromkeys(families))} "
-        f"({' and '.join(effects)}); which claim stands is not tested yet"
+        f"({' and '.join(effects)}); not yet tested further"
     )
 
 
@@ -357,7 +364,11 @@ def shown_over(variable: str, by_duty: bool = False) -> str:
     if variable == "side":
         return "unlike on the two sides"
     if happens is None:
-        return f"best shown over {variable.replace('_', ' ')}" if variable != "order" else "drifting from run to run"
+        return (
+            f"clearest when plotted over {variable.replace('_', ' ')}"
+            if variable != "order"
+            else "drifting from run to run"
+        )
     if happens.axis == "time":
         return f"from {happens.low:.3g} to {happens.high:.3g} s after the start of the runs"
     if happens.axis == "order":
@@ -401,7 +412,7 @@ def how_sure(found: DiscoveryResult, effect: FoundEffect) -> str:
             over = test.over.replace("_", " ")
             evidence += f"; accuracy of its form ±{100 * test.spread:.0f} % over {over}"
         return f"established{evidence}"
-    return f"tentative: it predicts, but {effect_doubts(test)}" if effect_doubts(test) else "tentative"
+    return f"tentative: it improves predictions, but {effect_doubts(test)}" if effect_doubts(test) else "tentative"
 
 
 def brief_answer(found: DiscoveryResult, moved: Sequence[str], next_step: str) -> Names:
@@ -422,11 +433,11 @@ def brief_answer(found: DiscoveryResult, moved: Sequence[str], next_step: str) -
     ]
     reached, total = max((int(e["rows"]) for e in stated.values()), default=0), len(found.runs)
     aside = f", {len(found.outliers)} set aside as outliers" * bool(found.outliers)
-    few = f" (as stated the model reaches {reached} rows)" * (reached < total)
+    few = f" (with the robot file as given, the model reaches {reached} rows)" * (reached < total)
     rows = f"{int(found.included.sum())} of {total} rows are used{aside}{few}"
     return (
         *filter(None, [changes.rstrip()]),
-        f"rms error as stated → now: {', '.join(errors)}; {rows}.",
+        f"rms error, robot file as given → after the loop: {', '.join(errors)}; {rows}.",
         f"Next: {next_step}",
     )
 
@@ -469,7 +480,7 @@ def largest_share(found: DiscoveryResult) -> str:
     row, k = np.unravel_index(int(np.nanargmax(squares)), squares.shape)
     columns = {c: runs[c][row] for c in ("configuration", *runs.axes) if runs.has(c)}
     where, label = _conditions(columns), found.channels[k].label
-    return f"Row {found.numbers[row]} ({where}): its {label} makes {share:.0f} % of the misfit that is left"
+    return f"Row {found.numbers[row]} ({where}): its {label} makes {share:.0f} % of the remaining misfit"
 
 
 def _conditions(columns: Mapping[str, str | float]) -> str:
@@ -501,10 +512,10 @@ NO_FORMULA = "no single term explains 90 % of it"
 #: Reasons for or against names.
 REASONS = {
     "": "",
-    "implausible": "no effect of the library that explains it is of a plausible size",
+    "implausible": "every effect of the library that explains it has an implausible size",
     "larger": "{effects} would explain more, but not at a plausible size",
-    "better curve": "one {curves} is the better explanation than {effects}",
-    "curve alone": "one {curves} leaves nothing",
+    "better curve": "one {curves} is a better explanation than {effects}",
+    "curve alone": "one {curves} leaves no significant misfit",
     "none by itself": "{lost}",
     "beside": "each one, added to the fit of the others, explains more than chance would: {strengths}",
 }
@@ -543,10 +554,13 @@ DOUBTS = {
     "curve": ("a curve", "is a worse explanation than a smooth curve in its place"),
     "row": ("{0.what} {0.rests_on}", "rests on {0.what} {0.rests_on}"),
     "blocks": ("blocks", "is chosen again in {again:.0f} % of the data with a block left out"),
-    "larger": ("size", "has a rival of an implausible size ({larger})"),
-    "remains": ("equation", "leaves something in its own equation"),
+    "larger": ("size", "has a better rival, but of implausible size ({larger})"),
+    "remains": ("equation", "leaves an error in its own equation"),
     "form": ("its form", "changes{spread} over {over_variable} ({0.varies:.1f} σ)"),
-    "noise": ("noise", "is {0.offset:.1%} of the readings of an instrument whose noise is not stated (--noise)"),
+    "noise": (
+        "noise",
+        "amounts to {0.offset:.1%} of the readings of an instrument whose noise is not stated (--noise)",
+    ),
 }
 
 
@@ -598,9 +612,9 @@ def tentative_reason(found: DiscoveryResult, effect: FoundEffect) -> str:
 
 #: Reasons why an effect is not plausible.
 RULED_OUT = {
-    "power": "{0.name} would make its balance supply power",
+    "power": "{0.name} would supply power instead of losing it",
     "size": "{0.name} at {0.size:.2g} times its largest plausible size; check {check}",
-    "edge": "{0.name} is within an sd of the largest plausible size",
+    "edge": "{0.name} is within one sd of its largest plausible size",
 }
 
 
@@ -623,7 +637,7 @@ def ruled_out(found: DiscoveryResult) -> str:
     gain = f"{misfit_text(-first.rise_chi2)} σ² more than {what}" if more else f"as much as {what}"
     are = "are" if len(first.effects) > 1 else "is"
     return (
-        f"{' and '.join(first.effects)} would explain {gain}, but {are} ruled out by size or sign alone: {first.why}."
+        f"{' and '.join(first.effects)} would explain {gain}, but {are} ruled out only by size or sign: {first.why}."
     )
 
 
@@ -639,7 +653,7 @@ def hidden_effects_sentence(found: DiscoveryResult) -> str:
         + (f" ({h.experiment} would show it)" if h.experiment else "")
         for h in found.hidden
     ]
-    return f"Could be hidden behind what was found: {', '.join(each)}."
+    return f"These data could hide, in addition: {', '.join(each)}."
 
 
 def moved_parameter(name: str, value: float, stated: float, unit: str, shift: float) -> str:
@@ -667,7 +681,7 @@ def indistinguishable_effects(found: DiscoveryResult, e: FoundEffect) -> str:
             + (f" (at {size:.2g} times its largest plausible size)" if (size := e.members[name].size) >= 1 else "")
             for name in in_order_of_parts(list(e.members)[1:])
         ]
-        + [f"{name} (time histories alone tell that)" for name in settled if name not in e.members]
+        + [f"{name} (only time histories can tell)" for name in settled if name not in e.members]
     )
     values = " or ".join(
         f"{freed_value(loop_notes.FreedValue(name, s.value, s.unit))} (stated {s.stated:.3g}, {s.prior_sds:+.1f} sds)"
@@ -707,7 +721,7 @@ def _change(before: float, after: float) -> str:
 def track_model_question(about: loop_notes.Asked) -> str:
     """Question to the track model."""
     return {
-        "missing": f"what is missing in the {about.balance} balance over {about.variable.replace('_', ' ')}",
+        "missing": f"the error of the {about.balance} balance over {about.variable.replace('_', ' ')}",
         "found": f"{', '.join(about.effects)}, found by the lumped model",
         "near": f"{', '.join(about.effects)}, which explains the readings nearly as well",
     }[about.why]
@@ -720,19 +734,19 @@ def track_model_answer(found: Resolved) -> str:
         f"{name.removeprefix('running_gear.')} {_estimate(e)}"
         for name, e in found.constants.items() if name.startswith("running_gear.")
     )  # fmt: skip
-    on = "" if found.settled else "; the search had not settled, go on with --members and more --generations"
+    on = "" if found.settled else ("; the search has not converged: continue with --members and more --generations")
     slip = f"slip of the {found.rows} rows on tracks {before:.2g} → {after:.2g} points rms"
     if not found.explains:
         why = f"; {', '.join(found.outside)} outside" if found.outside else ""
         return (
-            f"Track model, {track_model_question(found.asked)}: no running gear within its priors was found to "
-            f"leave it ({slip}, χ² falls by {found.fall:.0f}, p = {found.p:.2g}{why}){on}"
+            f"Track model, {track_model_question(found.asked)}: no running gear within its priors was found that "
+            f"explains this error ({slip}, χ² falls by {found.fall:.0f}, p = {found.p:.2g}{why}){on}"
         )
     held = len(found.constants) - len(found.known_from_rows)
     undetermined = f"not determined by these rows: {held} of {len(found.constants)} constants"
     return (
-        f"Track model, {track_model_question(found.asked)}: a running gear within its priors leaves it ({slip}, "
-        f"χ² falls by {found.fall:.0f}, p = {found.p:.2g}): {gear}; {undetermined}{on}"
+        f"Track model, {track_model_question(found.asked)}: a running gear within its priors explains this error "
+        f"({slip}, χ² falls by {found.fall:.0f}, p = {found.p:.2g}): {gear}; {undetermined}{on}"
     )
 
 
@@ -746,7 +760,7 @@ def in_parts(noise: SeriesNoise) -> str:
         f"{100 * noise.share:.2g} % of the reading" if noise.share else "",
     ]
     step = math.sqrt(12) * noise.least / noise.channel.factor
-    display = f" (its display steps by {step:.2g} {noise.channel.unit})" if noise.least > noise.floor else ""
+    display = f" (display resolution {step:.2g} {noise.channel.unit})" if noise.least > noise.floor else ""
     return " and ".join(filter(None, parts)) + display
 
 
@@ -772,8 +786,8 @@ def copied_rows(rows: tuple[int, ...]) -> str:
 def kept_out(rows: tuple[int, ...], why: str) -> str:
     """Rows that do not count."""
     reasons = {
-        "unusable": "are not used: the fitted model slides or fails there",
-        "outliers": "are outliers, which no effect explains; they are left out",
+        "unusable": "are not used, because the fitted model slides or fails in them",
+        "outliers": "are outliers that no effect explains; they are left out",
     }
     return f"rows {', '.join(map(str, rows))} {reasons[why]}"
 
@@ -782,8 +796,8 @@ def imposed_delay(delay: float, sd: float) -> str:
     """Delay of the imposed quantity, and the line for the rig's file."""
     when = "later" if delay > 0 else "earlier"
     return (
-        f"what is imposed acts {1e3 * abs(delay):.3g} ± {1e3 * sd:.2g} ms {when} than its column says, and "
-        f'the rig\'s file states no delay; state [rig] delay = "{delay:.3g} ± {sd:.2g}" to start the fit there'
+        f"the imposed quantity acts {1e3 * abs(delay):.3g} ± {1e3 * sd:.2g} ms {when} than its column says, and "
+        f'the rig file gives no delay; set [rig] delay = "{delay:.3g} ± {sd:.2g}" to start the fit from that value'
     )
 
 
@@ -800,17 +814,17 @@ def leader_choice(
 ) -> str:
     """Criterion that chose the leader of a class. A different choice by the other criterion is reported."""
     criteria = {
-        HELD_OUT: "errors held out",
+        HELD_OUT: "held-out errors",
         FIT: "the fit to all rows",
-        loop_notes.DRAW: f"the fit to all rows, as errors held out are within {told:.0%}",
+        loop_notes.DRAW: f"the fit to all rows, since held-out errors differ by less than {told:.0%}",
     }
     each = ", ".join(f"{n} {x:.2f} σ" for n, x in zip(names, rms_sigma, strict=True))
-    sentence = f"{names[leader]} comes first in its class by {criteria[by]}; errors held out: {each}"
+    sentence = f"{names[leader]} is listed first in its class because of {criteria[by]}; held-out errors: {each}"
     if prefer == HELD_OUT and leader != closest:
-        sentence += f"; by the fit to all rows {names[closest]} would, by Δχ² {rise_chi2:.1f}"
+        sentence += f"; the fit to all rows prefers {names[closest]}, by Δχ² {rise_chi2:.1f}"
     if leader != best:
         asked = prefer == HELD_OUT
-        why = "is not as adequate" if asked else f"would come first by --prefer {HELD_OUT}, where adequate"
+        why = "is not as adequate" if asked else (f"would come first with --prefer {HELD_OUT}, where it is adequate")
         sentence += f"; {names[best]} {why}"
     return sentence
 
@@ -830,8 +844,8 @@ def rests_on(
         else "runs at conditions on either side of it"
     )
     return (
-        f"{test.effect} rests on {test.what} {test.rests_on} ({test.root:.1f} σ with it, {test.root_without:.1f} σ "
-        f"without): repeat {run}, and {others}"
+        f"{test.effect} depends on {test.what} {test.rests_on} alone ({test.root:.1f} σ with it, "
+        f"{test.root_without:.1f} σ without): repeat {run}, and {others}"
     )
 
 
@@ -840,8 +854,8 @@ def unwritten_reason(curve: bool, gain: float, se: float) -> str:
     what = "the curve" if curve else "what was found"
     how = "no better than" if curve and gain > 0 else "worse than"
     return (
-        f"{what} predicts held-out runs {how} the refit ({gain:+.2f} ± {se:.2f} nat a "
-        "reading): robot.toml is the refit"
+        f"{what} predicts held-out runs {how} the refit ({gain:+.2f} ± {se:.2f} nat a reading), so robot.toml "
+        "contains the refit"
     )
 
 
@@ -850,12 +864,13 @@ SAID: dict[str, str | Callable[..., str]] = {
     "assumed_noise": "no sd is stated for {channels}: {usual} is assumed; state yours with --noise",
     "noise_from_series": noise_from_series,
     "refit_worse": "{channel}: the refit misses it by {refit:.0%} of its measured rms and the robot as stated by "
-    "{stated:.0%}, so the {word} noise gives some of its readings too large a weight; state the "
-    "instrument's with --noise",
+    "{stated:.0%}, so the {word} noise gives some of its readings too much weight; state the "
+    "instrument's noise with --noise",
     "copies": copied_rows,
     "kept_out": kept_out,
-    "phases_differ": "the wave stands at another angle in each run (it explains {free:.0f} σ² free in each, "
-    "{held:.0f} with one phase): robot.toml holds the mean; start runs from a mark",
+    "phases_differ": "the phase of the wave differs between runs (it explains {free:.0f} σ² with a free phase in "
+    "each run, {held:.0f} with a common one), so robot.toml contains the mean; start every run "
+    "with the shaft at a mark",
     "still_lacks": lambda place, variable: (
         f"not everything is explained: an error in the {bases.place_in_words(place)} that varies with "
         f"{variable.replace('_', ' ')} remains"
@@ -863,18 +878,16 @@ SAID: dict[str, str | Callable[..., str]] = {
     "late": imposed_delay,
     "led": leader_choice,
     "not_predictable": lambda kinds: (
-        f"not predictable from the others, so neither scored nor tested: blocks by "
+        "neither scored nor tested, because the other runs cannot predict them: blocks by "
         f"{' and by '.join(blocks.kind_in_words(kind) for kind in kinds)} that hold all runs of a configuration "
         "with parameters of its own"
     ),
-    "lost_replicates": "only {settled} of {asked} bootstrap tables could be fitted again; the thresholds are theirs",
+    "lost_replicates": "only {settled} of {asked} bootstrap tables could be refitted; the thresholds come from these",
     "outstanding": lambda factors, word: (
-        f"out of time: whether the verdict stands with {' and '.join(f'{f:g}' for f in factors)} times the {word} "
-        "noise is not known; run the same command without --within"
+        f"out of time: whether the verdict is the same with {' and '.join(f'{f:g}' for f in factors)} times the "
+        f"{word} noise is not known; run the same command without --within"
     ),
-    "too_few_replicates": "{settled} bootstrap tables are too few for every kind of evidence "
-    "to count; use 500 or "
-    "more",
+    "too_few_replicates": "{settled} bootstrap tables are too few to use every kind of evidence; use 500 or more",
     "rests_on": rests_on,
     "unwritten": unwritten_reason,
 }

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 #: Meaning of each method's result for an input.
 METHODS = {
     "local": "exact derivatives at the robot's own values",
-    "sobol": "shares of the variance, alone and with others",
+    "sobol": "shares of the variance, each input alone and together with others",
     "morris": "screening by elementary effects",
 }
 
@@ -42,7 +42,7 @@ def sensitivity_statement(found: SensitivityResult) -> str:
     """Inputs that matter most for each output, with their operating points."""
     leaders = found.leaders()
     if not leaders:
-        return "None of these inputs changes any of these outputs."
+        return "No input changes any of these outputs."
     verb, measure, note = _CAUSES.get(found.method, ("causes", "variance", ""))
     listed = "; ".join(
         f"{input_in_words(found, name)} {verb} {100 * outputs[0][1]:.0f} % of the {measure} of {outputs[0][0]}"
@@ -61,15 +61,19 @@ def points_studied(found: SensitivityResult) -> str:
     parts = {o.studied.tobytes(): o.studied for o in found.outputs.values() if not o.studied.all()}
     if not parts:
         return f"At {count_noun(total, 'operating point')}"
-    why = "the robot does not travel" if found.method == "local" else "too many robots of the sample do not travel"
+    why = (
+        "the robot does not travel"
+        if found.method == "local"
+        else ("too many robots of the sample do not travel there")
+    )
     fewest = min(int(x.sum()) for x in parts.values())
     if len(parts) > 1:
-        return f"At {fewest} to {total} of {total} operating points, by output (left out where {why})"
+        return f"At {fewest} to {total} of {total} operating points, by output (others are left out, because {why})"
     (studied,) = parts.values()
     whole = [o.row.label for o in found.outputs.values() if o.studied.all()]
     rest = f"; all {total} for {', '.join(whole)}" if whole else ""
     return (
-        f"At {fewest} of {total} operating points ({_in_words(found.points, ~studied)} left out, where {why}{rest})"
+        f"At {fewest} of {total} operating points ({_in_words(found.points, ~studied)} left out, because {why}{rest})"
     )
 
 
@@ -98,9 +102,9 @@ SAID: dict[str, str | Callable[..., str]] = {
     "sampling": lambda method, points: f"{METHODS[method]}, over {points} operating points",
     "points_left_out": points_left_out,
     "sample_left_out": lambda points, share, outputs: (
-        f"at {points} operating points up to {100 * share:.1f} % of the sample is left out, since the "
-        f"robot does not travel there: the indices are of robots that do ({', '.join(outputs)})"
+        f"at {points} operating points up to {100 * share:.1f} % of the sample is left out, since these robots do "
+        f"not travel there ({', '.join(outputs)}). The indices describe the others"
     ),
-    "inert": "not sampled, because every computed derivative by them is zero: {inputs}",
-    "tied": "kept at their ratio to another input, and part of what it does: {inputs}",
+    "inert": "not sampled, because every output has zero derivative with respect to them: {inputs}",
+    "tied": "scaled with another input, whose share includes theirs: {inputs}",
 }

@@ -13,14 +13,20 @@ OF_LEVELS = ("changes", "short", "settling", "accelerates")
 #: Finding and advice for each of `settling.REASONS`.
 WHY = {
     "changes": ("the imposed quantity changes all the time", "hold it at each level for a while"),
-    "short": ("the level is held too briefly", "hold it longer, or state --shortest"),
+    "short": ("the level is held too briefly", "hold it longer, or set a smaller --shortest"),
     "settling": ("still changes at the end of its level", "hold the level longer, or state --drift"),
     "accelerates": ("still accelerates at the end of its level", "hold the level longer, or state --drift"),
-    "idle": ("nothing drives the motors", "nothing: settled runs are driven ones"),
-    "rest": ("does not move", "nothing: friction holds it there; time histories use it"),
-    "stuck": ("shows one number for long: saturated or frozen", "mend the instrument or its range"),
-    "glitches": ("has many readings far from the others", "mend the instrument, or log its mean if it shows pulses"),
-    "unread": ("no channel has enough readings", "log more of them, or remove the rows that lack them"),
+    "idle": ("nothing drives the motors", "nothing: settled runs need a driven motor"),
+    "rest": ("the drive does not move", "nothing: friction holds it there; time histories use it"),
+    "stuck": (
+        "shows the same number for a long time: saturated or frozen",
+        "repair the instrument or change its range",
+    ),
+    "glitches": (
+        "has many readings far from the others",
+        "repair the instrument, or log its mean if it delivers pulses",
+    ),
+    "unread": ("no channel has enough readings", "log more readings, or remove the rows without them"),
     "undriven": ("the driver brakes or coasts", "nothing: time histories use it"),
 }
 
@@ -43,7 +49,7 @@ def left_out(stretches: Iterable[Stretch], few: bool = False) -> list[tuple[str,
         mine = [s for s in every if s.why == why]
         longest = max(mine, key=lambda s: len(s.rows))
         rows = f"{longest.rows[0] + 1}-{longest.rows[-1] + 1}"
-        cure = "nothing: the log as it is has them" if few and why in OF_LEVELS else WHY[why][1]
+        cure = "nothing: a fit to the log as it is uses these samples" if few and why in OF_LEVELS else WHY[why][1]
         causes.append((left_out_reason(longest), len(mine), sum(len(s.rows) for s in mine), rows, cure))
     return causes
 
@@ -54,8 +60,8 @@ def settle_statement(found: Settled) -> str:
     back = sum(s.imposed < 0 for s in kept)
     ways = f", {len(kept) - back} forward and {back} backward" if back else ""
     return (
-        f"{count_noun(len(kept), 'settled run')}{ways}, from {rows} of {len(found.runs)} samples "
-        f"(each at least {found.shortest:.3g} s long, its means steady to {100 * found.drift:g} %)."
+        f"{count_noun(len(kept), 'settled run')}{ways}, from {rows} of {len(found.runs)} samples (each at least "
+        f"{found.shortest:.3g} s long, with means steady to {100 * found.drift:g} %)."
     )
 
 
@@ -78,10 +84,10 @@ def too_few(found: Settled, fewest: int, loop: str) -> str:
     if len(found.kept) >= fewest:
         return ""
     if found.runs.turns:  # over time a turn is simulated, and not fitted
-        return f"The loop asks for {fewest} settled runs: hold more levels of both sides, or hold them longer."
+        return f"The loop needs {fewest} settled runs: hold more levels on both sides, or hold them longer."
     return (
-        f"The loop asks for {fewest} settled runs, so give it the log as it is: {loop}; calibrate in place of loop "
-        "fits the parameters alone."
+        f"The loop needs {fewest} settled runs, so run it on the log as it is: {loop}. With calibrate instead of "
+        "loop, only the parameters are fitted."
     )
 
 
@@ -94,10 +100,11 @@ def glitch_sentences(found: Settled) -> list[str]:
             counts = [s.glitches[channel.name] for s in mine]
             worst = mine[counts.index(max(counts))]
             sentences.append(
-                f"{channel.column}: {count_noun(sum(counts), 'reading')} in {count_noun(len(mine), 'settled run')} "
-                f"left out of the mean, far from the readings next to them; most in rows {worst.rows[0] + 1} to "
-                f"{worst.rows[-1] + 1} ({100 * max(counts) / len(worst.rows):.2g} %); look at the instrument, or log "
-                "a mean if they are pulses"
+                f"{channel.column}: {count_noun(sum(counts), 'reading')} in "
+                f"{count_noun(len(mine), 'settled run')} left out of the mean, because they are far from the "
+                f"readings next to them; most are in rows {worst.rows[0] + 1} to {worst.rows[-1] + 1} "
+                f"({100 * max(counts) / len(worst.rows):.2g} %); check the instrument, or log a mean if it "
+                "delivers pulses"
             )
     return sentences
 
@@ -106,19 +113,19 @@ def settle_remarks(found: Settled) -> list[str]:
     """Sentences on what should be looked at."""
     remarks = []
     if found.gaps:
-        remarks.append(f"samples are missing after {rows_text(found.gaps, 5)}; no stretch goes across")
+        remarks.append(f"samples are missing after {rows_text(found.gaps, 5)}; no segment spans such a gap")
     remarks += glitch_sentences(found)
     angles = {rate: angle for angle, rate, _ in RATES}
     for channel in (s.channel for s in found.signals):
         if channel not in found.runs.channels:
             remarks.append(
                 f"{channel.column} is the rate of {angles[channel.name]}; add {channel.name} to channels in the "
-                "rig's file, or these runs have no reading of it"
+                "rig's file, or these runs will lack its reading"
             )
     wide = {name: x for name, x in found.scatter.items() if x > 0}
     for signal in (s for s in found.signals if s.channel.name in wide):
         remarks.append(
-            f"{signal.channel.column}: levels that were held several times differ by "
-            f"{wide[signal.channel.name]:.2g} {signal.channel.unit} beyond their noise; the sds include it"
+            f"{signal.channel.column}: repeated levels differ by {wide[signal.channel.name]:.2g} "
+            f"{signal.channel.unit} more than their noise; the sds include this scatter"
         )
     return remarks

@@ -7,40 +7,40 @@ from mmrjax.errors import count_noun
 STEPS = {
     # the loop
     "base": "fitting the base model",
-    "sds": "the stated sds do not fit: the same with sds from the residuals",
-    "bootstrap": "bootstrap of {} tables: what would a complete model leave?",
-    "effects": "something is missing: fitting every effect that could explain it",
+    "sds": "the stated sds do not fit the residuals: refitting with sds from the residuals",
+    "bootstrap": "bootstrap of {} tables: the misfit that a complete model would leave",
+    "effects": "something is missing: fitting every candidate effect",
     "more effects": "{}: not everything is explained, fitting further effects",
-    "alone": "outlying rows found: the same without them",
-    "mechanism": "which mechanism explains most of it?",
-    "alike": "what else explains as much as {}?",
-    "held out": "which of those predicts held-out runs best?",
+    "alone": "outliers found: fitting again without them",
+    "mechanism": "mechanisms that explain most of the misfit",
+    "alike": "effects that explain as much as {}",
+    "held out": "predictions of held-out runs",
     "factors": "the verdict with {} times the {} noise, next to:",
-    "shape": "the shape of what is missing",
-    "errors": "errors on data held out",
+    "shape": "the shape of the missing term",
+    "errors": "errors on held-out data",
     "next": "the next experiment",
-    "others": "the verdicts with the other noises",
-    "gear stated": "resolved: friction through the track model, its running gear as stated",
-    "gear free": "resolved: the running gear free",
+    "others": "the verdicts at other noise levels",
+    "gear stated": "track model: fitting friction, with the running gear as stated",
+    "gear free": "track model: fitting the running gear",
     # a sensitivity study
     "points": "derivatives at every operating point",
     "evaluations": "{:,} model evaluations so far, {:,.0f} a second",
     # requirements and sizing
     "requirement": "requirement {} of {}: {}",
     "changes": "changes that would meet missed requirement {} of {}: {}",
-    "designs": "1 of 4, random designs of every choice of parts",
+    "designs": "1 of 4, random designs for every combination of parts",
     "descents": "2 of 4, {} searches by gradients",
-    "whole": "3 of 4, ratios of the sheets and whole cells",
-    "refined": "4 of 4, the best {} with any ratio and fractions of a cell",
+    "whole": "3 of 4, catalogue ratios and whole numbers of cells",
+    "refined": "4 of 4, the best {} designs, with ratio and number of cells continuous",
     # a calibration
     "optimum": "optimum found; now {}",
-    "steady": "the same with steady first, to begin from its optimum",
-    "delay": "the error lies in the first sample after each step: the same with a delay",
-    "derivatives": "population done; now derivatives against differences at the best",
+    "steady": "fitting the steady model first, to start from its optimum",
+    "delay": "the error lies in the first sample after each step: fitting again with a delay",
+    "derivatives": "population finished; comparing derivatives with finite differences at the best member",
     "search": "  step {}: objective {:.4f}, {:.1f} min",
     "round": "round {}: objective {:.4f} after {} steps, {:.1f} min",
     "start": "start {} of {}: objective {:.4f} after {} steps, {:.1f} min",
-    "basin": "a lower basin of {}: objective {:.4f}",
+    "basin": "a lower minimum in {}: objective {:.4f}",
     "members": "generation {}: {} of {} members, {:.1f} min",
     "generation": "generation {}: lowest objective {:.4g}, median {:.4g}, {} failed",
 }
@@ -67,7 +67,7 @@ def expected_time(text: str, seconds: float) -> float | None:
 
     Args:
         text: line of a stage that begins.
-        seconds: since the loop began.
+        seconds: seconds since the loop began.
     """
     stage, _, rest = text.partition(f" of {OF}, ")
     over = OVER.get(int(stage)) if rest and stage.isdigit() else None

@@ -10,14 +10,14 @@ from calibration.data import Names
 #: Measurements that determine a parameter which the data do not, by the start or end of its name.
 WOULD_MEASURE = {
     "battery.": "runs on the on-board battery (Source Mode 1)",
-    "motor.inductance": "a time history of the start-up current, with samples every tenth of a millisecond",
+    "motor.inductance": "a time history of the start-up current, sampled every 0.1 ms",
     "motor.inertia": "a time history of the start",
     ".inertia": "a time history of the start",
     "motor.resistance_thermal": "long runs at high current with the effect winding_heating present",
     "motor.temperature_ambient": "runs at several room temperatures with the effect winding_heating present",
     ".friction.dynamic": "a history in which the movers spin faster than V_d (a start on a slippery slope)",
     ".friction.speed_dynamic": "a history in which the movers spin faster than V_s (a start on a slippery slope)",
-    ".guide_share": "the fidelities steady and drive (the track model puts it out; free guide_friction there)",
+    ".guide_share": "the fidelities steady and drive (the track model computes it; fit guide_friction there)",
     ".mass": "a scale, or runs whose table does not state total_mass_kg",
 }
 #: Losses that data do not distinguish without variation of a condition.
@@ -34,7 +34,7 @@ def would_measure(name: str) -> str:
     for key, what in WOULD_MEASURE.items():
         if name.startswith(key) or name.endswith(key):
             return what
-    return "runs under conditions in which it acts"
+    return "runs under conditions in which it has an effect"
 
 
 def differing_repeats(
@@ -50,18 +50,19 @@ def differing_repeats(
     """Rows under the same conditions whose readings differ."""
     (first, second), (one, other) = rows, values
     reading = (
-        f"{source} rows {first} and {second}, {column}: the same conditions gave {one:g} and {other:g}, "
-        f"{apart} apart{f' (and so {more} more)' * bool(more)}"
+        f"{source} rows {first} and {second}, {column}: the same conditions gave {one:g} and {other:g}, {apart} "
+        f"apart{f' (and {more} more pairs like this)' * bool(more)}"
     )
     if unused:
         many = len(unused) > 1
-        name = f'state [columns] {near} = "{unused[0]}"' if near else "name it under [columns]"
+        name = f'set [columns] {near} = "{unused[0]}"' if near else "name it under [columns]"
         return (
-            f"{reading}; {', '.join(unused)} {'vary' if many else 'varies'} there and {'are' if many else 'is'} "
-            f"not used as a condition: {name}, or give each level of a load a configuration"
+            f"{reading}; {', '.join(unused)} {'vary' if many else 'varies'} between these rows and "
+            f"{'are' if many else 'is'} not used as a condition: {name}, or, for a load, give each level its own "
+            "configuration"
         )
-    wrong = f"{reading}; if one is wrong, remove it"
-    return f"{wrong}, else find what changed between such rows that the table does not state" if more else wrong
+    wrong = f"{reading}; remove a wrong one"
+    return f"{wrong}, or find what changed between such rows without a column in the table" if more else wrong
 
 
 def unused_columns(source: str, columns: tuple[tuple[str, str], ...]) -> str:
@@ -71,7 +72,7 @@ def unused_columns(source: str, columns: tuple[tuple[str, str], ...]) -> str:
     sentences_unused = [f"{source}: {', '.join(names)} {vary} from row to row and {are} not used"]
     for name, near in columns:
         if near:
-            sentences_unused.append(f'if {name} is {near}, state [columns] {near} = "{name}" in the robot\'s file')
+            sentences_unused.append(f'if {name} is {near}, set [columns] {near} = "{name}" in the robot\'s file')
     return "; ".join(sentences_unused)
 
 
@@ -84,7 +85,7 @@ def nothing_varies(source: str, rows: int, column: str, unused: Names = ()) -> s
     )
     name = f"{', '.join(unused)} {vary} and {are} not used: name {them} under [columns] if {if_conditions}, or "
     return (
-        f"{source}: nothing varies in these {rows} runs but noise, so nothing can be told from them; "
+        f"{source}: these {rows} runs differ only by noise, so they determine nothing; "
         f"{name * bool(unused)}record runs at several values of {column} or of the load"
     )
 
@@ -93,20 +94,20 @@ def copied_channel(source: str, column: str, other: str, intercept: float, slope
     """A channel that is a line of another."""
     start = f"{intercept:.4g} {'+' if slope >= 0 else '-'} " if intercept else ""
     factor = abs(slope) if intercept else slope
-    sentence = f"{source}, {column}: in every row {start}{factor:.4g} times {other}, to the last digit"
+    sentence = f"{source}, {column}: equals {start}{factor:.4g} times {other} in every row, to the last digit"
     if tied:
-        return f"{sentence}; if it is computed from it and no reading, remove it, as its noise then counts twice"
-    return (
-        f"{sentence}: it is computed from it and no reading; remove it from channels and table, or read an instrument"
-    )
+        return (
+            f"{sentence}; if it is computed rather than measured, remove it, since the noise of {other} counts twice"
+        )
+    return f"{sentence}, so it is computed, not measured; remove it from channels and table, or use an instrument"
 
 
 def ends_early(runs: Names, lasts: float, share: float) -> str:
     """Histories that end before the robot is under way."""
     at_speed = "" if math.isnan(share) else f", at {share:.0%} of the speed of steady travel"
     return (
-        f"{_runs(runs, 'ends', 'end')} after {lasts:.2g} s at the latest{at_speed}: before the robot is under "
-        "way, so only priors determine its resistance to travel; record until the speed is steady"
+        f"{_runs(runs, 'ends', 'end')} after {lasts:.2g} s at the latest{at_speed}, before the speed is steady. "
+        "Only priors then determine the resistance to travel; record until the speed is steady"
     )
 
 
@@ -119,9 +120,9 @@ def inherited_priors(part: str, changed: tuple[tuple[str, float, float], ...], k
     each = ", ".join(f"{name} {mine:g} for {nominal:g}" for name, mine, nominal in changed)
     one = len(kept) == 1
     return (
-        f"{part} is not the nominal robot's ({each}), but its {', '.join(kept)} still "
-        f"{'is' if one else 'are'}: {'that prior comes' if one else 'those priors come'} from another robot; state "
-        "yours in the robot's file or with --prior"
+        f"{part} differs from that of the nominal robot ({each}), but its {', '.join(kept)} still "
+        f"{'is' if one else 'are'}: {'that prior comes' if one else 'those priors come'} from another robot; set "
+        "your values in the robot's file or with --prior"
     )
 
 
@@ -129,7 +130,7 @@ def off_by(column: str, unit: str, factor: float, units: Names, others: Names, i
     """Readings that no robot like this one shows."""
     off, size = (factor, "large") if factor > 1 else (1 / factor, "small")
     what = f"{column}: readings are about {float(f'{off:.2g}'):g} times too {size} for this robot"
-    alike = f"; {' and '.join(others)} alike: check {imposed} and the robot's file" if others else ""
+    alike = f"; {' and '.join(others)} are off by as much: check {imposed} and the robot's file" if others else ""
     if units:
         return f"{what}; are they in {' or '.join(units)}? expected {unit}{alike}"
     return f"{what}{alike}" if others else f"{what}; check the unit, {unit}, and the robot's file"
@@ -138,51 +139,47 @@ def off_by(column: str, unit: str, factor: float, units: Names, others: Names, i
 #: Code of a remark → a sentence with its values, or a function that makes one.
 SAID: dict[str, str | Callable[..., str]] = {
     "unmeasured": lambda name: (
-        f"{name}: nothing in these data measures it; its value is its prior's. {would_measure(name)} would"
+        f"{name}: these data do not determine it, so it keeps its prior value. To measure it: {would_measure(name)}"
     ),
     "constant": lambda column, value, alike: (
         f"{column} is {value:g} in every row: {ALIKE[alike]}, so only their priors distinguish them"
     ),
     "repeats": differing_repeats,
-    "larger_noise": "{channel}: {pairs} pairs of rows at the same conditions scatter "
-    "{factor:.2g} times as much "
-    "as the {source} noise says; its sd is taken {factor:.2g} times as large. Check the repeats, or state the noise "
-    "with --noise",
+    "larger_noise": "{channel}: {pairs} pairs of rows at the same conditions scatter {factor:.2g} times as much "
+    "as the {source} noise predicts, so its sd is multiplied by {factor:.2g}. Check the repeats, "
+    "or state the noise with --noise",
     "unused": unused_columns,
     "no_load_gives": "{source}, {theirs}: friction and a constant torque of a load leave {share:.0%} of its "
-    "variance unexplained; if a brake sets it, it is a condition: state [columns] load_torque_Nm = "
-    '"{theirs}" in the robot\'s file, and take output_torque out of its channels',
+    "variance unexplained; if a brake sets it, it is a condition: set [columns] load_torque_Nm "
+    '= "{theirs}" in the robot\'s file, and take output_torque out of its channels',
     "nothing_varies": nothing_varies,
     "copied": copied_channel,
-    "turned": "{source}, {theirs}: off by {off:.2g} (rms) from what the file's numbers give, "
-    "with the other sign "
-    'by {turned:.2g}; if it is turned round, state [columns] {column} = {{column = "{theirs}", factor = -1}}',
+    "turned": "{source}, {theirs}: differs by {off:.2g} (rms) from the value that the robot file's numbers give, "
+    "but only by {turned:.2g} with the opposite sign; if the instrument is reversed, set [columns] "
+    '{column} = {{column = "{theirs}", factor = -1}}',
     "stiff_supply": "{column} is {value:g} in every row: treated as a stiff supply; if it was not "
     "measured, remove the column",
-    "lost_motion": "{source}, {column}: each of {reversals} reversals loses about {width:.2g} {unit} that friction, "
-    'inertia and delay do not explain: backlash, play or a soft coupling; state backlash = "{angle:.2g} ± 30 %" [rad '
-    "at the output] of the load in the robot's file",
+    "lost_motion": "{source}, {column}: at each of {reversals} reversals about {width:.2g} {unit} are lost that "
+    "friction, inertia and delay do not explain: backlash or a compliant coupling; set backlash = "
+    '"{angle:.2g} ± 30 %" (rad at the output) in the load\'s table of the robot file',
     "ends_early": ends_early,
     "never_grips": lambda runs, share: (
-        f"{_runs(runs, 'never grips', 'never grip')}: in the end the robot travels at {share:.0%} of the "
-        "speed of its movers, so what the ground holds before it slides is not measured there"
+        f"{_runs(runs, 'never grips', 'never grip')}: in the end the robot travels at {share:.0%} of the speed of "
+        "its movers, so these runs do not measure the grip of the ground before it slides"
     ),
-    "thinned": "{source}: readings of {kept} of {rows} rows are used, evenly in time, and "
-    "what drives the runs "
-    "in all of them; --rows uses more or fewer, and settle uses all",
-    "thinned_table": "{source}: {kept} of {rows} rows are used, spread evenly over the conditions; row "
-    "numbers count these; --rows uses more or fewer",
+    "thinned": "{source}: the fit uses readings of {kept} of {rows} rows, evenly spaced in time, and the imposed "
+    "quantity of all rows; --rows changes the number, and settle uses all rows",
+    "thinned_table": "{source}: {kept} of {rows} rows are used, spread evenly over the conditions; row numbers "
+    "refer to these; --rows changes the number",
     "coarse_steps": lambda lasts, step: (
-        f"runs of {lasts:.0f} s are followed in steps of {1e3 * step:.0f} ms: waves of a shaft faster than "
-        "some ten steps are not resolved; cut the runs to look for them"
+        f"runs of {lasts:.0f} s are simulated in steps of {1e3 * step:.0f} ms, so waves of a shaft with a period "
+        "below about ten steps are not resolved; use shorter runs to look for them"
     ),
-    "stops_on_slope": "run {runs}: the motors are not driven on a slope; histories have smooth "
-    "friction at rest, "
-    "and a robot that should stand there creeps by some mm/s. Leave rows at rest out where their readings are finer "
-    "than that",
+    "stops_on_slope": "run {runs}: the motors are not driven on a slope. Friction at rest is smoothed in time "
+    "histories, so a robot that should stand still creeps at a few mm/s. Leave out rows at "
+    "rest if their readings are more exact than that",
     "inherited_priors": inherited_priors,
     "off_by": off_by,
-    "slopes_in": "slope_deg: the current rises {rise:.2g} times as fast with the slope as "
-    "this robot's; are the "
-    "slopes in {unit}? expected degrees",
+    "slopes_in": "slope_deg: the current rises {rise:.2g} times as fast with the slope as for this robot; are "
+    "the slopes in {unit}? expected degrees",
 }

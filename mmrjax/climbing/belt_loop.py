@@ -21,9 +21,9 @@ class Loop(eqx.Module):
 
     Attributes:
         first, second: pitch radii of the pulleys [m], first >= second.
-        distance: of their axles [m].
-        grouser_height, grouser_length: over the pitch line, and along it [m].
-        grousers: their number.
+        distance: distance of their axles [m].
+        grouser_height, grouser_length: grouser height and grouser length over the pitch line, and along it [m].
+        grousers: number of grousers.
     """
 
     first: Scalar
@@ -152,7 +152,7 @@ class Corners(NamedTuple):
         gap: distance [m].
         normal: out of the belt, (n, 2).
         rate: displacement of the belt's material there per displacement of the belt, (n, 2).
-        place: on the path [m].
+        place: position on the path [m].
     """
 
     gap: Array

@@ -128,11 +128,12 @@ class ClimbRecord(eqx.Module):
     """An instant or a sample: means over it, and energy since the start of the run.
 
     Attributes:
-        current: of one motor [A].
-        total_current: of all motors, from the supply, I_s of (10) [A].
-        torque: of each drive on its pair of levers [N·m], lever_current [A] and lever_voltage [V] of its motor, up.
+        current: current of one motor [A].
+        total_current: current of all motors, from the supply, I_s of (10) [A].
+        torque: torque of each drive on its pair of levers [N·m], lever_current [A] and lever_voltage [V] of its
+            motor, up.
         holds: 1 if only its worm holds a pair, without current [-].
-        energy: in and lost, by the names of `SOURCES` and `LOSSES`, of the whole robot [J].
+        energy: energy in and lost, by the names of `SOURCES` and `LOSSES`, of the whole robot [J].
         stored: in motion, height, contacts and windings, of the whole robot [J].
         body: share of all normal force that the body carries [-].
         grip: traction of all rolling contacts over the limit of their friction [-].
@@ -686,8 +687,8 @@ def climb_batch(
     """Climbs over a batch of conditions, terrains and sequences (leading axis of every field), until all have ended.
 
     Args:
-        robot: of all runs, or with a leading axis in every parameter too.
-        duration: of the longest run [s].
+        robot: robot of all runs, or with a leading axis in every parameter too.
+        duration: duration of the longest run [s].
         step, sample: intervals of integration and of the record [s].
         part: length of run between two checks for the end of all runs [s].
         record: True to return all samples. False: only the last one.

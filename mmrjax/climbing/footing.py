@@ -85,7 +85,7 @@ class Footing(eqx.Module):
     Attributes:
         gap: distance [m].
         gap_rate: its rate [m/s].
-        normal: of the robot's contact, out of the ground.
+        normal: normal of the robot's contact, out of the ground.
         off, along: change of the contact's speed off the ground and along it (forward on level ground) per
             velocity of `COORDINATES`.
         carried: along it with the belts at rest.

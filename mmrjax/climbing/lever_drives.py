@@ -41,11 +41,11 @@ class LeverDrive(eqx.Module):
 
     Attributes:
         constant: i C_m [N·m/A, V·s/rad].
-        resistance: of the winding [ohm].
+        resistance: resistance of the winding [ohm].
         inertia: i² J_d [kg·m²].
         dry, viscous: i M_df0 [N·m], i² K_fd [N·m·s].
         ahead, back: c for T with the motion and against it [-].
-        current_limit: of the motor [A].
+        current_limit: current limit of the motor [A].
     """
 
     constant: Scalar
@@ -84,9 +84,9 @@ class Swing(NamedTuple):
     """Action of both pairs in a step, each (2,).
 
     Attributes:
-        torque: on the levers [N·m].
+        torque: torque on the levers [N·m].
         rate: after the step [rad/s].
-        voltage, current: of their motors [V], [A].
+        voltage, current: voltage and current of their motors [V], [A].
         holds: True if only its worm holds a pair, without current.
     """
 
@@ -118,7 +118,7 @@ def step_levers(
 
     Args:
         step: [s].
-        rate: before it [rad/s].
+        rate: rate before it [rad/s].
         free: after it, of levers without torque [rad/s].
         yields: [rad/(N·m·s)].
         asked: demanded rates after it [rad/s].

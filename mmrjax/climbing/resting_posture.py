@@ -42,7 +42,7 @@ class Outline(eqx.Module):
 
     Attributes:
         forward, up: centres of the circles, in the order of `CIRCLES` [m].
-        radius: of the circles as they roll on the ground: wheels, or belts over the grousers [m].
+        radius: radius of the circles as they roll on the ground: wheels, or belts over the grousers [m].
         belt: radius of the main belt over its grousers [m].
         tracked: 1 on tracks. On wheels there are no levers: their rollers are on the axles, with radius 0 [-].
         centre_forward, centre_up: centre of mass of all parts [m].
@@ -118,7 +118,7 @@ class Posture(eqx.Module):
 
     Attributes:
         pitch: nose up [rad].
-        height: of the middle of the wheelbase above the plane [m].
+        height: height of the middle of the wheelbase above the plane [m].
         rear, front: ends of the contact, ahead of the middle of the wheelbase along the plane [m].
         line: 1 if a belt carries load all along between them, 0 if only the ends do [-].
         centre_ahead: centre of mass ahead of the middle of the wheelbase, along the plane [m].
@@ -128,7 +128,7 @@ class Posture(eqx.Module):
         margin: distance along the plane from the intersection of gravity's line through the centre of mass to the
             nearer end of the contact. Negative if the robot tips [m].
         tips_back, tips_forward: tipping slopes, uphill and downhill [rad].
-        inertia: in pitch about the centre of mass [kg·m²].
+        inertia: inertia in pitch about the centre of mass [kg·m²].
     """
 
     pitch: Scalar
@@ -162,7 +162,7 @@ def posture(robot: Robot, conditions: Conditions, mass: Scalar | None = None) ->
     a negative `margin`. Postures with a pitch beyond `UPRIGHT` are excluded.
 
     Args:
-        mass: with payload [kg]. None: as stated.
+        mass: mass with payload [kg]. None: as stated.
     """
     inertia = robot.sides * posture_masses(robot, conditions, mass).inertia_pitch(robot.running_gear.wheelbase)
     return rest_outline(side_outline(robot, conditions, mass), conditions.slope, inertia)

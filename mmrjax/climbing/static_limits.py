@@ -31,7 +31,7 @@ class StepLimit(eqx.Module):
     """The highest step that carries a robot with its centre of mass over the edge.
 
     Attributes:
-        height: of the step [m].
+        height: height of the step [m].
         pitch: nose up [rad].
         side: the robot there, in a frame along the ground with the middle of its wheelbase as origin.
         base: height of that above the lower ground [m].
@@ -126,7 +126,7 @@ def find_highest_step(side: Outline, pitch: Scalar | None = None) -> StepLimit:
     slopes s over pitch on the other side: dH = (s_1 dH_2 - s_2 dH_1) / (s_1 - s_2).
 
     Args:
-        pitch: of the highest step [rad]. None: it is searched.
+        pitch: pitch of the highest step [rad]. None: it is searched.
     """
     still = jax.lax.stop_gradient(side)
     best = (

@@ -48,7 +48,7 @@ def compiled(function: Callable[P, T], *, options: dict[str, Any] | None = None)
     thread at a time. Programs run in parallel, and stored programs are also compiled in parallel.
 
     Args:
-        options: of XLA for programs that are stored: `SMALL`, `SELDOM` or None for the defaults.
+        options: options of XLA for programs that are stored: `SMALL`, `SELDOM` or None for the defaults.
     """
     inner, kept, traced = eqx.filter_jit(function), Programs(function, options), set[Hashable]()
 

@@ -275,7 +275,7 @@ def _name(function: Callable[..., Any], arguments: Any) -> str:
     """Name of a program: a hash of all inputs of its tracing.
 
     Args:
-        arguments: with shapes in place of arrays.
+        arguments: arguments with shapes in place of arrays.
 
     Raises:
         Unnamed: an object belongs to an unknown package.

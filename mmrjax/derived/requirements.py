@@ -33,8 +33,8 @@ class Ratings(eqx.Module):
     """Limits and counts that a robot holds as constants, in a form that can be batched.
 
     Attributes:
-        cells: in series [-].
-        voltage_cutoff: of a cell [V].
+        cells: cells in series [-].
+        voltage_cutoff: cutoff voltage of a cell [V].
         temperature: permissible winding temperature [°C].
         torque: permissible continuous torque of a gearbox [N·m], inf if not stated.
     """
@@ -61,14 +61,14 @@ class EnvelopePoint(eqx.Module):
     Attributes:
         configuration: index.
         battery: 1 on the battery.
-        adhesion, adhesion_lateral: of the surface as a ratio to the robot's own [-].
+        adhesion, adhesion_lateral: adhesion and lateral adhesion of the surface as a ratio to the robot's own [-].
         charge: state of charge [-], or voltage of an external supply [V].
         charge_end: state of charge at the end.
         share: share of time in motion, for the endurance. 0: standing still [-].
         slope_deg: [deg].
         payload: [kg].
         ambient: [°C].
-        tread: of stairs [m].
+        tread: tread of stairs [m].
     """
 
     configuration: Index
@@ -339,6 +339,6 @@ def evaluate_requirement(robot: Robot, point: EnvelopePoint, rated: Ratings, nam
         robot: its parameters may be tracers.
         point: scalars.
         rated: the robot's `ratings`, or others.
-        name: of `QUANTITIES`.
+        name: one of `QUANTITIES`.
     """
     return GROUPS[QUANTITIES[name].group](robot, point, rated, name)

@@ -65,7 +65,7 @@ def turning_columns(robot: Robot, reading: Mapping[str, Any], radius: np.ndarray
     """The columns of settled turns, from the readings of their channels [SI], arrays of one shape.
 
     Args:
-        radius: of the driving wheels [m].
+        radius: radius of the driving wheels [m].
     """
     turn = np.asarray(reading["yaw_rate"])
     # A value within rounding of zero is no radius.

@@ -63,7 +63,7 @@ class Facts:
         module: module that holds its `FIDELITY`.
         description: one line.
         chunk: largest number of runs in one call. A pair if it differs on an accelerator.
-        effort: of a calibration with it.
+        effort: effort of a calibration with it.
         options: its options.
         rollout: True if it integrates over time. Searches with it run one at a time and end sooner.
         histories: True if it can return a run over time.

@@ -33,7 +33,8 @@ class History(eqx.Module):
     """Runs over time. Fields have shape (runs, samples).
 
     Attributes:
-        time: in the clock of tables [s]. The imposed quantity acts the rig's `delay` later than its column states.
+        time: time in the clock of tables [s]. The imposed quantity acts the rig's `delay` later than its column
+            states.
         distance: travelled along the slope [m].
         signals: every signal.
         reading: readings [SI] by channel, of the channels that change in a history.
@@ -77,8 +78,8 @@ def in_table_time(rig: Rig, time: Float[Array, "runs samples"], values: T) -> tu
     """Runs over time in the clock of tables, which the rig's `delay` shifts.
 
     Args:
-        time: since the imposed quantity acts [s].
-        values: at those instants, a tree of shape (runs, samples, ...).
+        time: time since the imposed quantity acts [s].
+        values: values at those instants, a tree of shape (runs, samples, ...).
 
     Returns:
         Instants of the tables' clock, and the values there (`Rig.clock`, `Rig.before`).
@@ -113,7 +114,7 @@ class Run(eqx.Module):
     """A batch of runs.
 
     Attributes:
-        result: of each run, shape (runs,).
+        result: result of each run, shape (runs,).
         columns: outputs that only this fidelity has, by column of `runs.csv`, in the column's unit, shape (runs,).
         history: the runs over time, if requested.
     """

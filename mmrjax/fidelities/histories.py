@@ -170,7 +170,7 @@ class Lag(eqx.Module):
     Attributes:
         begin, end: of a step.
         decay: rate of the decay [1/s].
-        means: over the consecutive parts of a step that its stages weigh.
+        means: means over the consecutive parts of a step that its stages weigh.
     """
 
     begin: Float[Array, ""]
@@ -597,7 +597,7 @@ def history_signals(
             the robot.
         conditions: one run. Each field scalar, or of shape (times,): the value of an instant acts until the next one,
             and the signals of that instant use it.
-        times: from 0 on, as from `time_grid` [s]. Repeated instants are steps of no length.
+        times: times from 0 on, as from `time_grid` [s]. Repeated instants are steps of no length.
         known: the run, from `linearise_run`, if computed.
         at: indices of the instants to return. None: all.
 

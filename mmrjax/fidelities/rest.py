@@ -122,7 +122,7 @@ def standing_signals(robot: Robot, conditions: Conditions, state: State) -> Sign
 
     Args:
         conditions: voltage or current imposed, no speed.
-        state: with the current that flows at rest.
+        state: state with the current that flows at rest.
     """
     robot, conditions = robot.within(conditions.configuration), balances.commanded(robot, conditions, state)
     chassis, gear, still = robot.chassis(conditions.configuration), robot.gearbox, _still(state)
@@ -286,7 +286,7 @@ def is_at_rest(sense: Array, voltage: Scalar, theoretical: Scalar, speed: Scalar
 
     Args:
         sense: direction of possible travel, 1 or -1.
-        voltage: at the motors at rest [V].
+        voltage: voltage at the motors at rest [V].
         theoretical: r_k ω_k [m/s].
         rest: speed below which friction at rest is not resolved [m/s].
     """
@@ -299,8 +299,8 @@ def status_moving(robot: Robot, conditions: Conditions, end: Signals, voltage: S
     """Status of a run over time from its last instant, if friction does not hold the robot.
 
     Args:
-        conditions: at that instant.
-        voltage: of the driver at that instant [V].
+        conditions: conditions at that instant.
+        voltage: voltage of the driver at that instant [V].
 
     Returns:
         `not_settled` if the speed changes, or if the robot gains speed with movers sliding beyond V_s, `slides` if it

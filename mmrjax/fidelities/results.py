@@ -37,8 +37,8 @@ class Pending:
 
     Attributes:
         robot: concrete.
-        conditions: of any shape, configurations resolved.
-        fidelity: with `outputs`.
+        conditions: conditions of any shape, configurations resolved.
+        fidelity: fidelity with `outputs`.
     """
 
     robot: Robot
@@ -205,9 +205,9 @@ class Results:
     `results.status == "converged"` compares codes with a word of `STATUSES`, outside a trace.
 
     Attributes:
-        conditions: with configurations as indices.
-        total_mass: of robot and payload [kg], stated or the robot's own.
-        result: in SI units.
+        conditions: conditions with configurations as indices.
+        total_mass: total mass of robot and payload [kg], stated or the robot's own.
+        result: result in SI units.
         further: outputs that only this fidelity has, by column, in the column's unit.
         history: runs over time (`time`, `distance`, `signals`, `reading`), on their last axis, None if the fidelity
             has none or it was not requested.
@@ -215,7 +215,7 @@ class Results:
         model: the fidelity.
         mission: for runs over a profile, totals, segments and time history, None without a profile.
         stated: conditions that the profile states, which replace those of the runs.
-        channels: of the robot, in the order of columns.
+        channels: channels of the robot, in the order of columns.
     """
 
     conditions: Conditions
@@ -337,7 +337,7 @@ class Results:
         """Text table of the results, one line per run.
 
         Args:
-            columns: of `to_dict`. None: the conditions, the readings and a few more.
+            columns: columns of `to_dict`. None: the conditions, the readings and a few more.
             rows: largest number of lines.
         """
         content = {name: np.ravel(values) for name, values in self.to_dict().items()}

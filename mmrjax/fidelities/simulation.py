@@ -59,15 +59,15 @@ def simulate(
         robot: any robot. Its parameters may be tracers or, under `jax.vmap`, batches.
         conditions: fields of one shape, configurations by name or index.
         model: fidelity, one of `fidelities.NAMES`. Default `steady`, or `drive` with a profile.
-        duration: of a run [s]. Default 30 for `drive`, 1.5 for `track`.
-        step: of integration [s]. Default 1e-4 for `track`.
+        duration: duration of a run [s]. Default 30 for `drive`, 1.5 for `track`.
+        step: step of integration [s]. Default 1e-4 for `track`.
         history: True to return runs over time if the fidelity can. `track` then starts from standstill, else
             rolling at the steady speed.
         profile: a mission that every run follows (`mmrjax.profile`), only with `drive`. The conditions supply what it
             does not state. Results then have `mission`, and the columns of `missions.mission_batch.OUTPUTS`.
             Derivatives are forward, also with respect to its values and times. With tracers state `history=False`.
         start: state at the start of a mission. None: at rest at ambient temperature.
-        options: of a further fidelity, by name.
+        options: options of a further fidelity, by name.
 
     Returns:
         Results of the conditions' shape, each run with its status.

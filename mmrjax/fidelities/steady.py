@@ -329,7 +329,7 @@ def steady_outputs(robot: Robot, conditions: Conditions, names: tuple[str, ...])
     Args:
         robot: one robot, or parameters of shape (points,) among its numbers.
         conditions: shape (points,).
-        names: of `outputs.output_table`, `status` (code into `STATUSES`) and `flags` (bit mask over `FLAGS`).
+        names: names of `outputs.output_table`, `status` (code into `STATUSES`) and `flags` (bit mask over `FLAGS`).
 
     Returns:
         Arrays of shape (points,) by name [SI], NaN if a point has no such number, see `steady`.

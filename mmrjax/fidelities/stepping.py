@@ -44,8 +44,8 @@ def initial_state(robot: Robot, conditions: Conditions | None = None, *, rolling
 
     Args:
         robot: any robot. Its parameters may be tracers.
-        conditions: of one run, scalar fields. None: `Conditions()`. `discharge` is the charge taken from the battery
-            so far [C].
+        conditions: conditions of one run, scalar fields. None: `Conditions()`. `discharge` is the charge taken from
+            the battery so far [C].
         rolling: True for a robot that already travels under the voltage and duty of the conditions.
 
     Raises:
@@ -60,7 +60,7 @@ def rates(robot: Robot, state: State, command: Command, conditions: Conditions |
 
     Args:
         robot: any robot. Its parameters may be tracers.
-        state: from `initial_state` or a step.
+        state: state from `initial_state` or a step.
         command, conditions: as for `step`.
 
     Raises:
@@ -80,13 +80,13 @@ def step(robot: Robot, state: State, command: Command, dt: Scalar, conditions: C
 
     Args:
         robot: any robot, a vehicle or a shaft on a bench. Its parameters may be tracers.
-        state: from `initial_state` or an earlier step.
+        state: state from `initial_state` or an earlier step.
         command: duty of the driver, -1 to 1, or values by their names in `Conditions` that hold during the step, such
             as `{"voltage": 24.0, "slope_deg": 5.0}`. None: the conditions alone.
         dt: length of the step [s], above 0, 0.02 s or less. A step has no error control. In starts of the paper's
             robot, speeds are within 0.3 % at 0.02 s and at 0.05 s, and off by up to 6 % at 0.1 s. With a duty that
             jumps anywhere in its range at each step, they are within 3 % of the largest speed at 0.02 s.
-        conditions: of one run, scalar fields. None: `Conditions()`.
+        conditions: conditions of one run, scalar fields. None: `Conditions()`.
 
     Raises:
         UsageError: conditions of several runs, conditions that impose the motors' speed or drive the sides

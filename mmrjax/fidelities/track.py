@@ -127,7 +127,7 @@ def track(
     Args:
         robot: any robot. Its parameters may be tracers. Its `guide_share` is not used: it is an output.
         conditions: one run, scalar fields.
-        duration: of the run [s].
+        duration: duration of the run [s].
         step, sample: intervals of integration and of the record [s].
         rolling: True to start at the steady fidelity's speed, which settles sooner. False: from standstill.
 

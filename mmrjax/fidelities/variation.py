@@ -39,12 +39,12 @@ class Axis:
 
     Attributes:
         name: dotted parameter, or condition.
-        unit: of its values.
-        meaning: in words.
+        unit: unit of its values.
+        meaning: meaning in words.
         bounds: least and greatest value allowed [unit].
         value: the robot's, or the default of a condition [unit]. None: the robot's own mass plus the payload.
         prior_sd: standard deviation of the parameter's prior around `value` [unit], None for a condition.
-        spec: of the parameter's field, None for a condition.
+        spec: specification of the parameter's field, None for a condition.
     """
 
     name: str
@@ -61,7 +61,7 @@ class Variation(eqx.Module):
 
     Attributes:
         robot: common start of all points.
-        names: of what varies: dotted parameters as in `params.walk_parameters`, or conditions (`CONDITIONS`).
+        names: names of what varies: dotted parameters as in `params.walk_parameters`, or conditions (`CONDITIONS`).
 
     Raises:
         UsageError: an unknown name, or a name stated twice. The message suggests similar ones.
@@ -106,7 +106,7 @@ class Variation(eqx.Module):
         """The robot and the conditions of a point, or of a batch. The leaves that vary have the shape of the batch.
 
         Args:
-            values: in the order of `names`, in the axes' units. `configuration` is an index, rounded.
+            values: values in the order of `names`, in the axes' units. `configuration` is an index, rounded.
             conditions: values of the other conditions, names of configurations resolved.
         """
         given: dict[str, Any] = {name: values[..., k] for k, name in enumerate(self.names)}

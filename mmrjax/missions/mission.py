@@ -80,8 +80,8 @@ class Start(eqx.Module):
     """The state at the start of a mission. By default at rest and at ambient temperature.
 
     Attributes:
-        speed: of the robot, its movers rolling [m/s].
-        current: of one motor [A].
+        speed: speed of the robot, its movers rolling [m/s].
+        current: current of one motor [A].
         temperature_winding, temperature_housing: [°C], None: ambient.
     """
 
@@ -95,11 +95,11 @@ class Course(eqx.Module):
     """A mission over time: its accepted steps, shape (kept,). Entries after the last step are NaN.
 
     Attributes:
-        time: since the start of the mission [s].
+        time: time since the start of the mission [s].
         segment: index of the segment, -1 after the last.
         event: index into `MARKS` of the event at the end of a step, -1 for none.
         distance: along the ground, forward less backward [m].
-        path: in both directions [m].
+        path: path in both directions [m].
         temperature_winding, temperature_housing: [°C]. For a robot that turns, of each side, shape (kept, 2).
         energy: net energy taken from the source [J].
         signals: every signal. For a robot that turns, of left and right side, shape (kept, 2).
@@ -120,7 +120,7 @@ class Mission(eqx.Module):
     """A robot's run over a profile.
 
     Attributes:
-        total: of the mission.
+        total: total of the mission.
         segments: of each segment of each cycle, fields of shape (cycles, segments).
         peaks: by the names of the law's `PEAKS` (`cell_low` is the lowest voltage of a cell). Also of the segments.
         status: of each segment at its end, flags: of each segment, shape (cycles, segments).
@@ -128,10 +128,11 @@ class Mission(eqx.Module):
             end. `battery_empty`. `cut_off`: the cells stayed below their cut-off. `stalled`, `slides`, `rolls_back`
             or `tips`: status of the first segment with demanded motion that ends so. `failed`: the integrator gave
             up.
-        temperature_winding, temperature_housing: of the hottest side at the end [°C].
+        temperature_winding, temperature_housing: winding temperature and housing temperature of the hottest side at
+            the end [°C].
         discharge: [C].
         steps: number of steps, and number of rejected ones.
-        course: over time, if requested.
+        course: course over time, if requested.
     """
 
     total: Totals
@@ -222,7 +223,7 @@ def mission(
         profile: one mission.
         start: state at its start. None: at rest, at ambient temperature.
         tolerance: relative, and in `UNITS` absolute, error of a step.
-        most_steps: of one segment. A mission that needs more has `failed`.
+        most_steps: most steps of one segment. A mission that needs more has `failed`.
         keep: largest number of accepted steps in the recorded course, 0 for no course.
 
     Returns:

@@ -75,11 +75,11 @@ def driven(
     """Duty of a motor at an instant, and the state of its controller.
 
     Args:
-        mode: of the profile.
-        demand: of this side [rad/s or m/s].
-        conditions: of this side.
-        state: of this side.
-        integral: of its controller [rad].
+        mode: mode of the profile.
+        demand: demand of this side [rad/s or m/s].
+        conditions: conditions of this side.
+        state: state of this side.
+        integral: integral of its controller [rad].
 
     Returns:
         The duty [-], the rate of the controller's integral, and the error of the demand [rad/s]. For a ground speed,

@@ -44,19 +44,20 @@ class Profile(eqx.Module):
     """A mission as rows in time, with a segment between two rows. All numbers differentiable and batchable.
 
     Attributes:
-        time: of the rows, increasing [s], shape (rows,). The last row ends the mission.
+        time: time of the rows, increasing [s], shape (rows,). The last row ends the mission.
         mode: index into `MODES` of the segment that a row begins, shape (rows,).
         demand: motor speed [rad/s] or ground speed [m/s] for modes with a demand, else not used, shape (rows,).
-        voltage: of the external supply [V].
+        voltage: voltage of the external supply [V].
         duty: share of the supply's voltage [-].
         slope_deg: [deg].
         payload: [kg].
         adhesion, adhesion_lateral: as a ratio to the robot's surface, along and across [-].
-        load_torque: of a brake on the output of each drive, for a load on a shaft [N·m].
+        load_torque: torque of a brake on the output of each drive, for a load on a shaft [N·m].
         current_other: of other consumers on the battery [A]. Shape (rows,), or None: as in the conditions
             (for current_other, in the robot).
         duty_left, duty_right: as `duty`, of each side.
-        voltage_left, voltage_right: at the motors of each side [V], as a share of the no-load voltage of the source.
+        voltage_left, voltage_right: left and right voltage at the motors of each side [V], as a share of the no-load
+            voltage of the source.
         yaw_rate: demanded together with a ground speed, positive to the left [rad/s]. Stating any of them
             makes the robot free to turn.
         linear: True if values change linearly between rows, False if they hold until the next row.
@@ -146,8 +147,8 @@ def profile(
     """A profile from plain numbers, each one for all rows or one per row.
 
     Args:
-        time: of the rows [s].
-        mode: of `MODES`, one or one per row.
+        time: time of the rows [s].
+        mode: one of `MODES`, one or one per row.
         demand, linear, cycles: see `Profile`.
         values: its other fields, by name.
 

@@ -533,7 +533,7 @@ def resolved_signals(
 
     Args:
         mover: the contacts at this instant.
-        inertia: of all parts that turn rigidly with the driving shaft, in place of `chassis.inertia` [kg·m²].
+        inertia: inertia of all parts that turn rigidly with the driving shaft, in place of `chassis.inertia` [kg·m²].
 
     Returns:
         The signals, and the result of `mover.pull`.
@@ -591,7 +591,7 @@ def settled_signals(
     """All signals of steady travel: traction is the demand.
 
     Args:
-        direction: of travel, 1 forward or -1 backward. Friction acts against it, also at rest.
+        direction: direction of travel, 1 forward or -1 backward. Friction acts against it, also at rest.
 
     Returns:
         The signals, and the sliding speed that the friction law needs to carry the demand [m/s]. In steady travel
@@ -614,7 +614,8 @@ class Travel(eqx.Module):
     """All signals of one instant of a robot that turns.
 
     Attributes:
-        signals: of each side, a leading axis of 2: left, right. Both hold totals and motion of the whole robot.
+        signals: signals of each side, a leading axis of 2: left, right. Both hold totals and motion of the whole
+            robot.
         grip: forces of the ground on each side.
         acceleration, acceleration_lateral: dv_x/dt and dv_y/dt [m/s²].
         acceleration_yaw: dω/dt [rad/s²].

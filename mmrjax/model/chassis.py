@@ -21,7 +21,7 @@ class Chassis(eqx.Module):
         on_tracks: 1 on tracks, 0 on wheels [-].
         turning: parameters of the chassis that matter only in turns.
         lacks: balances that it does not have.
-        torque_constant, torque_gravity: of a `Shaft`, 0 here.
+        torque_constant, torque_gravity: torque constant and gravity torque of a `Shaft`, 0 here.
         has_two_bodies: False, motor and wheel turn together.
     """
 

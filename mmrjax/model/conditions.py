@@ -37,7 +37,7 @@ class Named(eqx.Module):
     """Configurations by name: a pytree, so that conditions by name pass `jax.jit` and `jax.vmap`.
 
     Attributes:
-        index: of the name of each run among `names`.
+        index: index of the name of each run among `names`.
         names: distinct ones.
     """
 
@@ -79,7 +79,7 @@ class Conditions(eqx.Module):
 
     Attributes:
         configuration: which of the robot's configurations, its index. Until `resolved` also by name (`Named`).
-        voltage: of the external supply [V]. Not used with `battery`.
+        voltage: voltage of the external supply [V]. Not used with `battery`.
         slope_deg: slope angle, positive uphill [deg].
         payload: additional load mass m_c [kg].
         battery: 0 external supply (Source Mode 2), 1 on-board battery (Source Mode 1), eq. (8).
@@ -91,21 +91,22 @@ class Conditions(eqx.Module):
         open: 1 if the motors' circuit is open, so that they coast, -1 if the driver shorts it, so that they brake at
             any duty.
         motor_speed: speed imposed on the motor shafts [rad/s]. The voltage follows. None: the voltage is imposed.
-        motor_acceleration: of an imposed speed [rad/s²]. None: 0.
+        motor_acceleration: acceleration of an imposed speed [rad/s²]. None: 0.
         motor_current: current imposed on each motor [A]. The voltage follows. None: the current follows.
         begin: index of the history's beginning in `Rig.begins`. None: it starts from rest.
         duty_left, duty_right: as `duty`, for each side. None: `duty`. Stating any condition of a side makes the robot
             free to turn.
         open_left, open_right: as `open`, for each side. None: `open`.
         motor_speed_left, motor_speed_right: as `motor_speed`, for each side. None: `motor_speed`.
-        heading_deg: at the start, from uphill, positive to the left [deg]. None: 0. It also frees the robot to turn.
+        heading_deg: heading at the start, from uphill, positive to the left [deg]. None: 0. It also frees the robot
+            to turn.
         adhesion_lateral: as `adhesion`, across the travel. None: `adhesion`.
         levers_front_deg, levers_rear_deg: lever angles, 0 along the wheelbase outward, positive up, 180 folded [deg].
             None: those of the running gear, folded as it states.
         load_torque: torque of a brake or load motor on the output of each drive [N·m]: positive against forward
             rotation, in both directions of rotation. Only for a load on a shaft. None: 0.
-        goal: of the robot's controller: angle [rad] or speed [rad/s] of the output, or current of each motor [A], as
-            the rig imposes. None: it is not controlled.
+        goal: goal of the robot's controller: angle [rad] or speed [rad/s] of the output, or current of each motor
+            [A], as the rig imposes. None: it is not controlled.
         held: 1 where a clamp holds the output of each drive at rest. `output_torque` is then what the clamp carries.
             Only for a load on a shaft at an imposed voltage or current, in settled runs. None: 0.
     """

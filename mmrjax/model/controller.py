@@ -22,7 +22,7 @@ class Controller(eqx.Module):
 
     Attributes:
         lags: True if the lag is more than 0, so that the duty is a state.
-        supply_voltage: of the driver, for tables without its column [V]. 0: they have the column.
+        supply_voltage: supply voltage of the driver, for tables without its column [V]. 0: they have the column.
     """
 
     kp: Scalar = parameter(

@@ -104,7 +104,7 @@ class Driver(eqx.Module):
         Args:
             duty: demanded [-], with the sign of the voltage that it gives.
             limited: after the current limit [-].
-            current: of a motor [A].
+            current: current of a motor [A].
             excess: the driver's voltage less E [V].
         """
         closed = jnp.where(jnp.asarray(open_circuit) > 0.5, 0.0, 1.0)

@@ -21,7 +21,7 @@ class Gearbox(eqx.Module):
 
     Attributes:
         mesh_theory: True: η_b = 2 - 1/η_rm, the theory of the mesh. False: η_b = η_rm.
-        speed_limit: at the input [rad/s].
+        speed_limit: speed limit at the input [rad/s].
         torque_limit: continuous, at the driving wheel, where the total ratio ends [N·m], None if not stated.
     """
 

@@ -71,7 +71,7 @@ class Quantity:
 
     Attributes:
         name: noun. With the unit, the name of its column.
-        unit: of its column.
+        unit: unit of its column.
         label: words of reports.
         range: least and greatest value [unit].
         factor: the SI value of one unit, if its values are not in SI. By default the unit's.
@@ -181,7 +181,7 @@ class Condition(Quantity):
 
     Attributes:
         field: field of `Conditions`, by default its name, empty if there is none.
-        heading: of its column on pages, empty if no page shows it.
+        heading: heading of its column on pages, empty if no page shows it.
         shown: format of a number there.
         in_tables: True if a table of runs may state it, under its own column.
         imposed: kinds of `rig.IMPOSED` whose tables may. Empty: all of them.

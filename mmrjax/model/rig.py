@@ -101,7 +101,7 @@ class Rig(eqx.Module):
         channels: names of the channels that its instruments show, see `channels.EVERY`.
         instruments: known properties of the instruments of some channels.
         delay: dead time between a value in the column and its action [s].
-        columns: of tables: (column name in this program, column name in the file, factor from its unit).
+        columns: columns of tables: (column name in this program, column name in the file, factor from its unit).
         priors: (parameter, mean, sd) [SI] stated in the file, which replace the parameters' own. Sd 0: exactly known.
         start: of histories: `rest`, `measured` (by the first samples) or `free` (the same as prior means).
         begins: of histories that do not begin at rest, once their table is known.
@@ -148,7 +148,7 @@ class Rig(eqx.Module):
         states.
 
         Args:
-            times: since the imposed quantity acts [s], increasing.
+            times: times since the imposed quantity acts [s], increasing.
             at: instants of the tables' clock [s], any shape.
         """
         wanted = at - self.delay

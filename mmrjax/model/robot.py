@@ -37,7 +37,7 @@ class Configurations(eqx.Module):
     """Loads by name, in a fixed order. Conditions hold an index.
 
     Attributes:
-        names: in order.
+        names: names in order.
         members: the loads, either all vehicles or all shafts.
         chosen: the load of the current configuration, within equations of one run (`Robot.within`).
     """
@@ -87,10 +87,10 @@ class Robot(eqx.Module):
         configurations: loads by name, at least one. Given as a mapping.
         effects: terms beyond the paper's model. An empty tuple gives the paper's model.
         sides: number of motors driven with the same input. Per-side quantities belong to one motor (assumption 3).
-        running_gear: of one side, further parameters of the track model.
-        driver: of the motors.
+        running_gear: running gear of one side, further parameters of the track model.
+        driver: driver of the motors.
         rig: imposed inputs and instruments.
-        controller: of the motors, if the rig imposes a goal.
+        controller: controller of the motors, if the rig imposes a goal.
     """
 
     battery: Battery

@@ -29,7 +29,7 @@ class Shaft(eqx.Module):
         speed_rest: of the output, within which friction is smoothed through rest [rad/s].
         lacks: balances that it lacks, having no ground.
         on_tracks: 0, neither tracks nor wheels.
-        mass: of a robot, 0.
+        mass: mass of a robot, 0.
         speed_grip: 0, nothing slides.
     """
 

@@ -48,11 +48,12 @@ class State(eqx.Module):
         speed_motor: motor shaft speed [rad/s].
         speed: speed of the robot along the slope V [m/s].
         discharge: charge taken from the battery C_b [C].
-        memory: of each effect that has one, by effect name, in its own unit, empty if not followed.
-        temperature: of the winding [°C], which sets its resistance. None: not followed, resistance as stated.
+        memory: memory of each effect that has one, by effect name, in its own unit, empty if not followed.
+        temperature: temperature of the winding [°C], which sets its resistance. None: not followed, resistance as
+            stated.
         distance: travelled since the start of the run [m]. Used by loads that depend on their angle.
         gap: of the output's motor side ahead of the load, from the middle of a backlash [rad]. None: rigid.
-        integral: of the controller's error over time, as in `Controller`. None: no controller.
+        integral: integral of the controller's error over time, as in `Controller`. None: no controller.
         command: duty of a controller with a lag [-]. None: without a lag.
     """
 
@@ -72,15 +73,15 @@ class PlaneMotion(eqx.Module):
     """State of a run of a robot that turns: of each side, left and right, and of the robot in the plane.
 
     Attributes:
-        current: of one motor of each side [A], shape (2,).
+        current: current of one motor of each side [A], shape (2,).
         speed_motor: motor shaft speeds [rad/s], shape (2,).
-        speed, speed_lateral: of the centre of mass, ahead and to the left [m/s].
+        speed, speed_lateral: speed and lateral speed of the centre of mass, ahead and to the left [m/s].
         yaw_rate: to the left [rad/s].
-        heading: from uphill, to the left [rad].
+        heading: heading from uphill, to the left [rad].
         place_x, place_y: uphill of the start, and to the left of it [m].
         discharge: charge taken from the battery C_b [C].
-        memory: of each effect that has one, by effect name, shape (2,).
-        temperature: of the windings of each side [°C], shape (2,). None: not followed.
+        memory: memory of each effect that has one, by effect name, shape (2,).
+        temperature: temperature of the windings of each side [°C], shape (2,). None: not followed.
     """
 
     current: Scalar
@@ -182,13 +183,13 @@ class Result(eqx.Module):
     """One settled operating point (or the end of a run), with its status.
 
     Attributes:
-        reading: of the instruments [SI], by channel name (`channels.EVERY`). Each is also an attribute:
+        reading: reading of the instruments [SI], by channel name (`channels.EVERY`). Each is also an attribute:
             `result.total_current`.
         theoretical_speed: r_k ω_k, eq. (32) [m/s].
         slip: 1 - V / V_theoretical, eq. (33) [-], 0 at rest.
-        voltage: at the motors [V].
+        voltage: voltage at the motors [V].
         mass: total [kg].
-        traction: of both sides [N].
+        traction: traction of both sides [N].
         adhesion_used: |demand| over the largest traction of the friction law [-]. Above 1 the robot slides.
         power_supply: P_e taken by the motors [W].
         power_motor: N_d at the motor shafts [W].
@@ -198,7 +199,7 @@ class Result(eqx.Module):
         efficiency_motor, efficiency_gear, efficiency_chassis: N_d/P_e, N_r/N_d, N_t/N_r [-], 0 at rest
             and if power does not flow that way.
         winding_settled: after long running at this current [°C], inf if it has no limit.
-        voltage_cell: of one cell of the battery [V], 0 on the external supply.
+        voltage_cell: voltage of one cell of the battery [V], 0 on the external supply.
         status: code into `STATUSES`.
         flags: bit mask over `FLAGS`.
     """

@@ -40,7 +40,7 @@ class _Loop(NamedTuple):
         """Returns the end of each of `size` members. A queued member replaces a finished one.
 
         Args:
-            numbers: of the members, with a leading axis where `batched`, a tree of booleans, is true.
+            numbers: numbers of the members, with a leading axis where `batched`, a tree of booleans, is true.
         """
         lanes = min(size, self.lanes)
         axes = jax.tree.map(lambda b: 0 if b else None, batched)

@@ -158,7 +158,7 @@ class _Secant(eqx.Module):
     Attributes:
         y: the unknowns that settle, and the loads.
         rates: `_balance` at y.
-        inverse: of minus its Jacobian, as approximated so far.
+        inverse: inverse of minus its Jacobian, as approximated so far.
         looks: number of evaluations of `_balance`.
         solved: True once the search has converged.
     """
@@ -174,7 +174,7 @@ class _Linear(eqx.Module):
     """`_balance` linearised at the end of a search.
 
     Attributes:
-        jacobian: of `_balance`.
+        jacobian: Jacobian of `_balance`.
         sound: True if that is a turn, and a stable one.
         known: True once this is computed.
     """

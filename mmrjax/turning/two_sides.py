@@ -57,7 +57,7 @@ class Turning(eqx.Module):
     """Parameters of a robot with two sides that matter only in turns.
 
     Attributes:
-        nodes: of a track's contact, see `Stance`.
+        nodes: nodes of a track's contact, see `Stance`.
     """
 
     width: Scalar = parameter(
@@ -83,15 +83,15 @@ class Stance(eqx.Module):
     """Position of a robot on its contacts.
 
     Attributes:
-        length: of the contact, or the wheelbase [m].
+        length: length of the contact, or the wheelbase [m].
         width: B [m].
-        height: of the centre of mass above the ground [m].
-        ahead: of it from the middle of the contact [m].
+        height: height of the centre of mass above the ground [m].
+        ahead: distance of it from the middle of the contact [m].
         on_tracks: 1 on tracks, whose contact is a line, 0 on wheels, with contacts only at its ends [-].
         lateral: λ on this ground [-].
         rule: a [-].
-        nodes: of a track's contact, even. The width of a turn on the spot under dry friction has an error of 3e-5
-            with 16 nodes and 1e-8 with 32.
+        nodes: nodes of a track's contact, even. The width of a turn on the spot under dry friction has an error of
+            3e-5 with 16 nodes and 1e-8 with 32.
     """
 
     length: Scalar
@@ -110,10 +110,10 @@ class Grip(eqx.Module):
     Attributes:
         normal: load of a side [N].
         ahead, aside: forces along x and y [N].
-        moment: of the lateral forces about the centre of mass, positive to the left [N·m].
+        moment: moment of the lateral forces about the centre of mass, positive to the left [N·m].
         across: power that lateral sliding turns into heat [W].
         moved: load transferred from the left side to the right one [N].
-        centre: of pressure, ahead of the middle of the contact [m].
+        centre: centre of pressure, ahead of the middle of the contact [m].
         lacking: excess of both over the values that these forces give: 0, except during a search for them [N, m].
     """
 
@@ -265,8 +265,8 @@ def grip(
     side is never negative.
 
     Args:
-        stance: of the robot.
-        friction: of the ground.
+        stance: stance of the robot.
+        friction: friction of the ground.
         adhesion: the surface's ratio [-].
         load: normal to the ground, of both sides [N].
         sliding: u_x of each side [m/s].

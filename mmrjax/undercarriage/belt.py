@@ -71,7 +71,7 @@ class Tips(eqx.Module):
         forward, up: position [m].
         rate_forward, rate_up: displacement per displacement of the belt [-].
         guided: share of a load on the grouser that passes to the lower guide, the rest to a pulley [-].
-        compliance: of the free belt between pulley and guide at unit tension [m], see `tips_on_path`.
+        compliance: compliance of the free belt between pulley and guide at unit tension [m], see `tips_on_path`.
     """
 
     forward: Numbers
@@ -121,7 +121,7 @@ class Runs(eqx.Module):
     Attributes:
         upper, lower: total tension, mean over the run [N].
         centrifugal: part that accelerates the belt's own mass round the pulleys, P_ct = m v² / length [N].
-        torque_front, torque_rear: on the pulleys, in the direction of running [N·m].
+        torque_front, torque_rear: front torque and rear torque on the pulleys, in the direction of running [N·m].
     """
 
     upper: Scalar

@@ -182,7 +182,7 @@ def linearize(
     `contact_shares`, one input at a time.
 
     Args:
-        path, chassis: of the run.
+        path, chassis: path and chassis of the run.
         given: values of `MOTION`, of `contact_inputs` and of `slip`.
         gained: Δv of the step, constant.
         constants: `contact_inputs` to differentiate with respect to.

@@ -67,9 +67,9 @@ class Motion(eqx.Module):
 
     Attributes:
         q, v: coordinates and velocities, see `undercarriage`.
-        current: of one motor [A].
+        current: current of one motor [A].
         discharge: charge taken from the battery [C].
-        memory: of each effect that has one, by effect name.
+        memory: memory of each effect that has one, by effect name.
     """
 
     q: Coordinates
@@ -104,7 +104,7 @@ class System(eqx.Module):
     """One run's constants, which `instant` and `advance` need in addition to the motion.
 
     Attributes:
-        chassis: of the run's configuration.
+        chassis: chassis of the run's configuration.
         model, data: MJX model with this member's constants, and data of the same structure.
         step: interval of integration [s].
     """

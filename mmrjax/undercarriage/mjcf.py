@@ -44,11 +44,11 @@ class Bodies(NamedTuple):
     """Bodies in the order of the model: chassis, then driving and driven pulley of each side.
 
     Attributes:
-        names: of the bodies.
+        names: names of the bodies.
         mass: [kg].
         inertia: about its own centre by x, y, z [kg·m²].
-        centre: in its own frame [m].
-        place: of its frame in that of the chassis, whose origin is the middle of the wheelbase [m].
+        centre: centre in its own frame [m].
+        place: position of its frame in that of the chassis, whose origin is the middle of the wheelbase [m].
     """
 
     names: tuple[str, ...]
@@ -186,8 +186,8 @@ def step_impulse(
 
     Args:
         half, wheelbase: masses and distance of the pulleys.
-        conditions: for the slope.
-        pitch: of the chassis [rad].
+        conditions: conditions for the slope.
+        pitch: pitch of the chassis [rad].
         rate: its rate [rad/s].
         rotating: the armature's inertia at its joint [kg·m²].
         gained: Δv.

@@ -35,7 +35,7 @@ class Mode(NamedTuple):
         low, high: its range over them [Hz].
         natural: undamped, |λ| / 2π, mean [Hz].
         damping: ratio ζ = -Re λ / |λ|, mean [-]. Negative: it is unstable.
-        share: of the kinetic energy in the coordinate of its name, mean [-].
+        share: share of the kinetic energy in the coordinate of its name, mean [-].
         positions: share of the positions that have the mode [-].
     """
 
@@ -77,7 +77,7 @@ def modes(robot: Robot, conditions: Conditions, positions: int = POSITIONS) -> l
 
     Args:
         robot, conditions: a batch of runs.
-        positions: of the belt, evenly over a pitch of the grousers.
+        positions: positions of the belt, evenly over a pitch of the grousers.
     """
     rates, masses = jax.device_get(_linearised(params.without_weak_types(robot), conditions, positions))
     return [_named(rate, mass) for rate, mass in zip(rates, masses, strict=True)]

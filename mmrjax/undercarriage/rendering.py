@@ -35,16 +35,16 @@ class Scene(NamedTuple):
 
     Attributes:
         slope: [rad].
-        name: of the configuration.
+        name: name of the configuration.
         wheeled: True on wheels.
         axle: half the wheelbase [m].
         wheel: its radius [m].
-        path: of the belt.
+        path: path of the belt.
         levers: tips in the chassis frame, empty on wheels.
         time, q, total_current, speed, theoretical: over the run.
         place, normal, guided, support: reactions over the run, of one side.
-        traction, resistance: of one side [N].
-        weight: of half the robot [N].
+        traction, resistance: traction and resistance of one side [N].
+        weight: weight of half the robot [N].
     """
 
     slope: float
@@ -305,7 +305,7 @@ def render(
     """Writes a picture (.png, at time `begin`) or a film (.gif, .mp4) of a scene.
 
     Args:
-        view: from `scene`, of this module or of `render_above`.
+        view: view from `scene`, of this module or of `render_above`.
         file: its suffix decides the format.
         begin, end: part of the run to film [s]. None: to its end.
         slow: slow-motion factor. A pitch lasts 36 ms at 1 m/s.

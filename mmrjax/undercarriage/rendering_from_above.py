@@ -31,14 +31,14 @@ class Above(NamedTuple):
     """Data for the pictures of one run, as plain arrays. A side axis of 2 is left, right.
 
     Attributes:
-        name: of the configuration.
+        name: name of the configuration.
         slope: [rad].
         length: wheelbase, width: between the contact lines [m].
-        time, q, v: over the run, see `both_sides`.
-        current: of each side's motor [A].
+        time, q, v: time, coordinates and velocities over the run, see `both_sides`.
+        current: current of each side's motor [A].
         belt: speed of each side's movers [m/s].
         along: of each contact ahead of the middle [m].
-        load: on it [N].
+        load: load on it [N].
     """
 
     name: str

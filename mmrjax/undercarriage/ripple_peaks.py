@@ -29,7 +29,7 @@ class Ripple(NamedTuple):
     Attributes:
         mean: [the signal's unit].
         amplitude: half of peak to peak over the mean [-].
-        period: of repetition [s]. NaN: no repetition within half the record.
+        period: period of repetition [s]. NaN: no repetition within half the record.
     """
 
     mean: float
@@ -69,7 +69,7 @@ class Fluctuation(NamedTuple):
     Attributes:
         mean: [the signal's unit].
         deviation: standard deviation over the mean [-].
-        frequency: of the strongest line of its spectrum [Hz]. NaN: it is constant.
+        frequency: frequency of the strongest line of its spectrum [Hz]. NaN: it is constant.
     """
 
     mean: float
@@ -148,8 +148,8 @@ class Passing(NamedTuple):
 
     Attributes:
         name: grousers or teeth.
-        pitch: of the belt [m].
-        travel: of the robot from one to the next, without slip [m].
+        pitch: pitch of the belt [m].
+        travel: travel of the robot from one to the next, without slip [m].
     """
 
     name: str
@@ -176,7 +176,7 @@ class Vibrations:
         read: True if the ripple is valid: the robot travels and at least `PERIODS` pitches passed.
         speed: mean [m/s].
         passing: frequency of grousers or teeth [Hz].
-        mean, deviation, frequency: of each of `SIGNALS`, see `Fluctuation`.
+        mean, deviation, frequency: mean, deviation and frequency of each of `SIGNALS`, see `Fluctuation`.
     """
 
     status: np.ndarray
@@ -198,7 +198,7 @@ def vibrations_of_runs(robot: Robot, runs: Trajectory, pitch: float) -> Vibratio
 
     Args:
         runs: fields have shape (runs, samples, ...).
-        pitch: of the passing parts [m].
+        pitch: pitch of the passing parts [m].
     """
     time, status = np.asarray(runs.time[0]), np.asarray(runs.result.status)
     tail = time > time[-1] - TAIL * (time[-1] - time[0])
@@ -221,13 +221,14 @@ class Peak(NamedTuple):
     """A peak of ripple over speed at one payload.
 
     Attributes:
-        signal: of `SIGNALS`.
+        signal: one of `SIGNALS`.
         payload: [kg].
-        speed, low, high: at the maximum, and limits of the range above 70 % of its rise [m/s].
+        speed, low, high: speed, lower limit and upper limit at the maximum, and limits of the range above 70 % of its
+            rise [m/s].
         ripple: the highest, standard deviation over mean [-].
-        rise: of the ripple over the higher of its two valleys [-].
+        rise: rise of the ripple over the higher of its two valleys [-].
         order: strongest multiple of the passing frequency. 0: not a whole one.
-        frequency: of the strongest line [Hz].
+        frequency: frequency of the strongest line [Hz].
         mode: natural vibration at that frequency, which confirms the crossing. Empty: no such mode.
     """
 
@@ -259,7 +260,7 @@ def peaks_over_speed(
 
     Args:
         speed, passing, deviation, frequency: of the valid runs, in the order of `speed`.
-        modes: at this payload.
+        modes: modes at this payload.
     """
     if len(speed) < 3:
         return []
@@ -307,8 +308,8 @@ class Crossing(NamedTuple):
     """A crossing of a harmonic of the passing frequency with a natural frequency.
 
     Attributes:
-        mode, order, payload: of the crossing [kg].
-        speed: at the mode's mean frequency [m/s].
+        mode, order, payload: mode, order and payload of the crossing [kg].
+        speed: speed at the mode's mean frequency [m/s].
         signals: signals with a ripple peak there. Empty: the crossing does not show.
     """
 
@@ -325,7 +326,7 @@ def find_crossings(
     """Crossings at one payload between two speeds [m/s], and the ripple peaks that confirm them.
 
     Args:
-        travel: of the robot from one passing to the next [m].
+        travel: travel of the robot from one passing to the next [m].
     """
     answer = []
     for mode in modes:
@@ -346,7 +347,7 @@ class Resonance(NamedTuple):
         speeds: least and greatest speed of the peaks [m/s].
         avoid: of their widths.
         frequencies: least and greatest of their lines [Hz].
-        payloads: of its peaks [kg].
+        payloads: payloads of its peaks [kg].
         ripple: the largest [-].
         rise: the largest over its surroundings [-].
     """

@@ -45,7 +45,7 @@ class Touch(eqx.Module):
         weight: share of the driven pulley in that belt speed [-].
         speed_x: its velocity over the ground, uphill [m/s].
         gap, gap_rate: height over the ground [m] and its rate [m/s].
-        compliance: of the belt under it at its tension [m/N].
+        compliance: compliance of the belt under it at its tension [m/N].
         force: normal force R_z [N].
         damped: its decrease with the gap's rate [N·s/m].
         guided: share of the force that passes to the lower guide [-].
@@ -96,7 +96,7 @@ def contact_state(path: Path, chassis: Chassis, q: Sequence[Scalar] | Array, v: 
 
     Args:
         path: the belt's path.
-        chassis: on tracks the grousers carry load, on wheels the wheels, of its radius.
+        chassis: chassis on tracks the grousers carry load, on wheels the wheels, of its radius.
         q, v: coordinates and velocities, see the module.
     """
     gear = path.gear
@@ -150,7 +150,7 @@ class Pull(eqx.Module):
         force: traction of each contact, uphill on the robot [N].
         guide: friction of the teeth on the lower guide F'_t, against forward running [N], eq. (26).
         guided: load on the lower guide [N].
-        load: of the belt, the ground and the guides on the driving shaft [N·m].
+        load: load of the belt, the ground and the guides on the driving shaft [N·m].
         generalized: forces on (x, z, θ, φ_2) [N, N, N·m, N·m]. The shaft's own torque is the gearbox's.
         aside: lateral force of each contact, to the left on a robot free to turn [N]. None: straight travel.
     """
@@ -191,7 +191,7 @@ def contact_forces(
         chassis: friction and guide coefficients.
         signals: those up to `balances.slip`. `speed_slip_terms` shifts the sliding of every contact.
         at: the contacts.
-        height: of the axle line over the ground [m].
+        height: height of the axle line over the ground [m].
         force: traction of each contact if contacts slide laterally too [N]. None: by Fig. 7.
     """
     if force is None:
@@ -213,8 +213,9 @@ class Reactions(eqx.Module):
         grouser: normal reaction of the ground on each grouser R_z [N].
         guided: part of it that passes to the lower guide [N].
         support: on front and rear pulley (6T2A) or wheel (4W2T) [N].
-        place: of the grousers on the belt's path [m].
-        tension: of the belt at as many positions as grousers, from half a pitch after the path's start on [N].
+        place: position of the grousers on the belt's path [m].
+        tension: tension of the belt at as many positions as grousers, from half a pitch after the path's start on
+            [N].
         centrifugal: P_ct of it [N].
     """
 

@@ -14,7 +14,7 @@ from sweeps.store import finish_run_folder, open_folder, print_report
 
 
 def execute(config: configuration.Calibrate, beside: configuration.FittedRuns) -> int:
-    """Calibrate a robot to a table and leave a run folder. Returns the exit code.
+    """Calibrate a robot to a table and write a run folder. Returns the exit code.
 
     0 done. 3 done, but the search or a fit without a block did not converge, or the solver failed at a row.
     """

@@ -41,8 +41,8 @@ def execute(config: configuration.Check, beside: configuration.FolderPart) -> in
     for r in demands.each:
         if lacking and r.name in OF_HEAT:
             raise BadConfiguration(
-                f"{demands.source}, {r.name}: rests on how warm the windings become, and the robot's file does not "
-                f"state {', '.join(lacking)}; state them, or leave the requirement out"
+                f"{demands.source}, {r.name}: depends on the winding temperature, for which the robot's file "
+                f"lacks {', '.join(lacking)}; add them, or remove the requirement"
             )
     with open_folder("check", config, robot, beside) as folder:
         with step_reporter(print_message, "reading the requirements") as heard:
@@ -65,7 +65,7 @@ def _check_charge(robot: Robot, asked: requirements_file.Requirements) -> None:
         depends = CHARGE in r.quantity.axes or r.quantity.group == "endurance"
         if depends and r.envelope.battery and not capabilities.has_battery(robot):
             raise BadConfiguration(
-                f"{asked.source}, {r.name}: the robot's file states no battery; add [battery] to it, or state "
+                f"{asked.source}, {r.name}: the robot's file has no battery; add [battery] to it, or set "
                 "supply_voltage_V in [envelope]"
             )
 

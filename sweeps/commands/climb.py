@@ -41,7 +41,7 @@ WIDTHS, WIDTH = {"payload": 0.2, "levers_front_deg": 1.0, "levers_rear_deg": 1.0
 
 
 def execute(config: configuration.Climb, beside: configuration.FolderPart) -> int:
-    """Climb and leave a run folder. Returns the exit code.
+    """Simulate a climb and write a run folder. Returns the exit code.
 
     0 done, whatever the verdict. 3 numbers went wrong.
     """
@@ -96,7 +96,7 @@ def _climbed(
     sequence: Sequence,
     along: Along | None,
 ) -> ClimbResult:
-    """The climb that a configuration asks for: of one obstacle, of the largest, or with derivatives along it."""
+    """The climb of a configuration: over one obstacle, a search for the largest one, or with derivatives."""
 
     def run(sizes: np.ndarray) -> tuple[Terrain, Climb]:
         every = [_terrain(config, float(size) / 1000)[0] for size in sizes]
@@ -218,7 +218,7 @@ def _searched(
 
 
 def _terrain(config: configuration.Climb, size: Scalar) -> tuple[Terrain, str]:
-    """The obstacle, of a search of a `size` [m], and what it is in words."""
+    """The obstacle (for a search, of this `size` [m]) and its description."""
     nose = config.nose_mm / 1000
     if config.terrain is not None:
         return terrains.read_terrain(config.terrain), f"the terrain of {config.terrain.name}"
@@ -269,8 +269,8 @@ def _sequence(config: configuration.Climb, robot: Robot, name: str) -> Sequence:
         sequence = terrains.read_sequence(config.sequence, robot, (angles[0], angles[1]))
         if sequence.begins is None and stated[1:] != (None, None):
             raise BadConfiguration(
-                f"--levers-front, --levers-rear: {config.sequence.name} states all angles; expected them only with "
-                "a sequence of voltages (front_V, rear_V)"
+                f"--levers-front, --levers-rear: {config.sequence.name} already gives all angles; give these "
+                "options only with a sequence of voltages (front_V, rear_V)"
             )
     if config.levers_voltage_V is not None:
         sequence = dataclasses.replace(sequence, supply=jnp.asarray(config.levers_voltage_V))

@@ -79,12 +79,12 @@ def _over_time(
     runs: records.Runs,
     beside: configuration.ComparedRuns,
 ) -> int:
-    """The same for time histories, each simulated from its beginning as in fits."""
+    """Comparison with time histories, each simulated from its beginning as in fits."""
     options = {"--own-mass": beside.own_mass, "--posterior": config.posterior, "--duration": config.duration_s}
     for option in (name for name, stated in options.items() if stated):
         raise BadConfiguration(
-            f"{option}: {Path(runs.source).name} holds time histories, which are followed sample by sample, with the "
-            "masses and times that they state; remove it"
+            f"{option}: {Path(runs.source).name} contains time histories, which are simulated sample by sample "
+            "with their own masses and times; remove this option"
         )
     model = None if config.model == fidelities.NAMES[0] else config.model
     ready = preparation.prepare(runs, file.robot)
@@ -131,13 +131,13 @@ def _second_robot(config: configuration.Compare, file: RobotFile) -> RobotFile |
     """The robot of `--against`, or None.
 
     Raises:
-        BadConfiguration: as `load_robot`, or its channels are not those of the first robot.
+        BadConfiguration: for the same reasons as `load_robot`, or its channels are not those of the first robot.
     """
     if config.against is None:
         return None
     second = load_robot(config.model_copy(update={"robot": config.against, "set": {}}))
     if second.robot.channels != file.robot.channels:
-        raise BadConfiguration(f"--against {config.against}: its channels are not those of {file.name}")
+        raise BadConfiguration(f"--against {config.against}: its channels differ from those of {file.name}")
     return second
 
 

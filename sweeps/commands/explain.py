@@ -59,7 +59,7 @@ def explain_name(name: str | None, files: Names = ()) -> int:
     if not explained:
         below = [p for p in names["parameters"] if p.endswith(f".{name}")]
         if below:
-            raise BadConfiguration(f"explain: got {name}; is one of these meant? {', '.join(below)}")
+            raise BadConfiguration(f"explain: got {name}; did you mean one of these? {', '.join(below)}")
         close = similar_words(name, [n for those in names.values() for n in those], 3)
         hint = f"did you mean {', '.join(close)}? " if close else ""
         raise BadConfiguration(f"explain: got {name}; {hint}mmrjax explain lists all names")
@@ -119,8 +119,8 @@ def _effect(name: str, library: Library) -> Iterator[Line]:
 
 def _histories(effect: type[Effect]) -> str:
     if effect.transient:
-        return "; only histories show it, settled runs do not"
-    return f"; settled runs cannot tell it from {effect.settles_to}" if effect.settles_to else ""
+        return "; visible only in time histories, not in settled runs"
+    return f"; settled runs cannot distinguish it from {effect.settles_to}" if effect.settles_to else ""
 
 
 def _changes(effect: Effect) -> Iterator[str]:
@@ -150,7 +150,7 @@ def _changes(effect: Effect) -> Iterator[str]:
                 shares[c.label] = 100 * (after / before - 1)
         if any(abs(x) > 5e-3 for x in shares.values()):
             changes = ", ".join(f"{label} {x:+.2g} %" for label, x in shares.items())
-            yield f"one typical size at {name}, 24 V, 5°, 3 kg: {changes}"
+            yield f"change for one typical size, for {name} at 24 V, 5°, 3 kg: {changes}"
 
 
 def _status(name: str, library: Library) -> Iterator[Line]:
@@ -159,12 +159,12 @@ def _status(name: str, library: Library) -> Iterator[Line]:
         yield "means", about.meaning
         if about.why != about.meaning:
             yield "in short", about.why
-        yield "exit code", "3, since a solver failed" if name == "failed" else "0: it is an answer"
+        yield "exit code", "3, since a solver failed" if name == "failed" else "0"
         yield "in files", "column status of runs.csv, counts in result.json"
 
 
 def _meaning(meanings: Mapping[str, str], where: str = "") -> Explain:
-    """Explains names that have a meaning each. `where` they are found in files."""
+    """Explanation of names from a table of meanings. `where` describes in which files they occur."""
 
     def about(name: str, library: Library) -> Iterator[Line]:
         if name in meanings:
@@ -180,11 +180,11 @@ def _channel(name: str, library: Library) -> Iterator[Line]:
     if c is None:
         return
     low, high = c.range
-    yield "is", f"{c.label} [{c.unit_shown}], as its instrument shows it{c.where and f': {c.where}'}"
+    yield "is", f"{c.label} [{c.unit_shown}], as shown by its instrument{c.where and f': {c.where}'}"
     yield "column", f"{c.column}, its standard deviation {c.sd_column}, {low:g} to {high:g}"
     if c.other_units:
         yield "other units", ", ".join(c.other_units)
-    yield "typical noise", f"{100 * c.sd_share:g} % of the reading, where nobody states it"
+    yield "typical noise", f"{100 * c.sd_share:g} % of the reading, assumed if none is stated"
     yield "shows in", " and ".join(["settled runs"] * c.settled + ["histories"] * c.over_time)
     wrong = [e for e in library.values() if e.channel == c.name and e.name not in effects.UNNAMED]
     if wrong:

@@ -26,7 +26,7 @@ ROTOR = "motor_speed_rpm", ""
 
 
 def execute(config: configuration.Calibrate, beside: configuration.FittedRuns) -> int:
-    """Fit the constants, print them and leave a run folder. Returns the exit code, 0."""
+    """Fit the constants, print them and write a run folder. Returns the exit code, 0."""
     if stated := config.robot != "nominal":
         robot = load_robot(config).robot
     else:
@@ -51,7 +51,7 @@ def execute(config: configuration.Calibrate, beside: configuration.FittedRuns) -
 
 
 def drive_log(runs: Runs, unit: str | None = None, as_logged: bool = False) -> DriveLog:
-    """Readings of a log in a unit of position. None: that of its first pair of channels.
+    """Readings of a log in a unit of position. None: the unit of its first pair of channels.
 
     Args:
         as_logged: True for a log of SysId, which is in units of its own. `unit` is their name.
@@ -75,15 +75,17 @@ def drive_log(runs: Runs, unit: str | None = None, as_logged: bool = False) -> D
             break
     else:
         raise BadData(
-            f"{runs.source}: has neither velocity nor position; expected output_speed_rpm, output_angle_deg, "
+            f"{runs.source}: no velocity and no position; expected output_speed_rpm, output_angle_deg, "
             "speed_mm_s, position_mm or motor_speed_rpm, or --columns sysid"
         )
     unit = unit or ("m" if pair[0] == "speed_mm_s" else "rotation")
     if (unit == "m") != (pair[0] == "speed_mm_s") and not as_logged:
-        raise BadConfiguration(f"--unit: got {unit}, but {pair[0]} is read; expected a unit of its position")
+        raise BadConfiguration(
+            f"--unit: got {unit}, but the log is read from {pair[0]}; expected a unit of that position"
+        )
     size = 2 * np.pi if as_logged else UNITS[unit] or 1.0
     if not runs.sampled:
-        raise BadData(f"{runs.source}: has no time; expected a column time_s")
+        raise BadData(f"{runs.source}: no time; expected a column time_s")
     order = np.concatenate(list(runs.rows_by_run().values()))
     duty = runs["duty"] if runs.has("duty") else 1.0
     voltage = np.asarray(runs["supply_voltage_V"] * duty, float)

@@ -39,7 +39,7 @@ def check_installation() -> int:
 
 
 def _run() -> str:
-    """A drive without losses on the flat turns at U / C_E and draws nothing: an answer known by hand."""
+    """Check against a known answer: on level ground, a drive without losses turns at U / C_E and draws no current."""
     import jax.numpy as jnp
 
     from mmrjax.fidelities.steady import steady_batch

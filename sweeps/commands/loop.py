@@ -15,6 +15,7 @@ import numpy as np
 
 import mmrjax as mm
 from calibration.data import Columns, effect_file, robot_file
+from calibration.data.runs import Runs
 from calibration.described import in_words
 from calibration.discovery import findings
 from calibration.discovery.discover import discover
@@ -30,6 +31,7 @@ from calibration.words.step_words import expected_time
 from mmrjax.model import params
 from mmrjax.model.robot import Robot
 from sweeps import config as configuration
+from sweeps import store
 from sweeps.console import print_message, print_output, step_reporter
 from sweeps.inputs import load_robot, read_runs
 from sweeps.report import loop_report
@@ -37,26 +39,36 @@ from sweeps.report.fit_tables import Change
 from sweeps.store import SOLVER_FAILED, RunFolder, finish_run_folder, open_folder, print_report
 
 T = TypeVar("T")
-#: File of what regression says before anything is confirmed, and its schema.
-SCREENING_FILE, SCREENING = "screening.json", "mmrjax.screening/1"
+#: Schema of the file of what regression says before anything is confirmed.
+SCREENING = "mmrjax.screening/1"
 
 
 def execute(config: configuration.Loop, beside: configuration.LoopBeside) -> int:
-    """Run the closed loop on a table and leave a run folder. Returns the exit code.
+    """Run the closed loop on a table and write a run folder. Returns the exit code.
 
     0 done, whatever the verdict. 3 done, but the fit that is proposed did not converge, or its time was out before
     there was a verdict. Stages are kept as they end, so that the same command goes on after that, or an interrupt.
+    With a model of several joints, each has a loop and a folder of its own.
     """
+    if config.model is not None:
+        from sweeps.commands import loop_joints
+
+        return loop_joints.run_joints(config, beside, _timed_loop)
+    robot = load_robot(config).robot
+    return _timed_loop(
+        config, beside, robot, read_runs(beside.data, robot, columns=config.columns, measured=True, series=True)
+    )
+
+
+def _timed_loop(config: configuration.Loop, beside: configuration.LoopBeside, robot: Robot, runs: Runs) -> int:
     try:
-        return _loop(config, beside)
+        return _loop(config, beside, robot, runs)
     except OutOfTime:
         return SOLVER_FAILED
 
 
-def _loop(config: configuration.Loop, beside: configuration.LoopBeside) -> int:
+def _loop(config: configuration.Loop, beside: configuration.LoopBeside, robot: Robot, runs: Runs) -> int:
     began, within = time.monotonic(), beside.seconds
-    robot = load_robot(config).robot
-    runs = read_runs(beside.data, robot, columns=config.columns, measured=True, series=True)
     stated = priors.parse_priors(config.prior)
     if config.resolve:
         check_resolvable(runs, beside.members)
@@ -87,7 +99,7 @@ def _loop(config: configuration.Loop, beside: configuration.LoopBeside) -> int:
             if name == "ranking":
                 _show_ranking(stages[name], folder, timed, brief=not beside.verbose)
             if name == "verdict":
-                timed(f"{loop_words.verdict_line(stages[name])}; next, errors held out and other noises")
+                timed(f"{loop_words.verdict_line(stages[name])}; next: held-out errors and other noise levels")
             return result
 
         try:
@@ -107,9 +119,7 @@ def _loop(config: configuration.Loop, beside: configuration.LoopBeside) -> int:
         document = loop_report.loop_document(verdict, config.robot, changes_by_effect(verdict))
         page = print_report(document, brief=not beside.verbose)
         if config.resolve and verdict.resolved is None:
-            print_output(
-                "The track model was not asked: nothing remains in slip, track or ground that it has a say in."
-            )
+            print_output("The track model was not run: no error remains in the slip, track or ground balance.")
         verdict.save(folder.results(), config.robot, folder.tables)
         if config.report:
             progress("writing the report")
@@ -120,7 +130,7 @@ def _loop(config: configuration.Loop, beside: configuration.LoopBeside) -> int:
 def _resolved(
     found: DiscoveryResult, config: configuration.Loop, members: Path | None, progress: Callable[[str], None]
 ) -> DiscoveryResult:
-    """The result, with its resistance resolved by the track model."""
+    """The result, with the track model's test added: does a different running gear explain the misfit?"""
     resolved = resolve(
         found, noise=config.noise or None, population=config.population, generations=config.generations,
         members=members, seed=config.seed, tell=in_words(progress),
@@ -129,9 +139,9 @@ def _resolved(
 
 
 def _say_out_of_time(within: float, begun: bool) -> None:
-    """Report that time was out before a verdict [s]. `begun`: a stage has ended."""
+    """Report that the time budget [s] ended before a verdict. `begun`: at least one stage has finished."""
     more = max(5, math.ceil(within / 30))  # twice as much
-    first = "" if begun else f", nor a fit of the base model; give it more, as --within {more}min"
+    first = "" if begun else f", and no fit of the base model; allow more time, such as --within {more}min"
     print_message(f"no verdict within {within:g} s{first}")
 
 
@@ -158,28 +168,28 @@ def _alarm(seconds: float, wanted: Callable[[], bool]) -> Iterator[None]:
 
 
 def _show_ranking(found: Ranking, folder: RunFolder, timed: Callable[[str], None], brief: bool) -> None:
-    """Print the ranking by regression, the first answer, and leave it in the run folder."""
+    """Print the ranking by regression, the first answer, and write it to the run folder."""
     first, *lines = loop_words.ranking_lines(found, brief=brief)
     timed(first)
     for line in lines:
         print_message(line)
     answer = loop_words.regression_verdict(found)
     content = {"schema": SCREENING, "confirmed": False, "answer": answer, **dataclasses.asdict(found)}
-    folder.write_json(SCREENING_FILE, content)
+    folder.write_json(store.SCREENING_FILE, content)
 
 
 def _say_kept(stages: Mapping[str, Any], folder: RunFolder, robot_name: str) -> None:
-    """Say which stages are kept, and leave the robot of the base fit where there is one but no verdict."""
+    """Print which stages are stored. Without a verdict, write the robot of the base fit if it is known."""
     if not stages:
         return
     kept = [name for name in stages if folder.keeps(name)]
     if not kept:
-        print_message(f"nothing could be kept of {', '.join(stages)}; the same command begins anew")
+        print_message(f"nothing could be saved of {', '.join(stages)}; the same command starts again")
         return
     print_message(f"kept: {', '.join(kept)}; to continue, run the same command with --out {folder.path}")
     if "verdict" in stages:
         traced = stages["verdict"]
-        print_message(f"{loop_words.verdict_line(traced)}; errors held out and other noises are outstanding")
+        print_message(f"{loop_words.verdict_line(traced)}; held-out errors and other noise levels are still missing")
         return
     if "ranking" in stages:
         for line in (*loop_words.ranking_lines(stages["ranking"]), loop_words.regression_verdict(stages["ranking"])):
@@ -198,7 +208,7 @@ def _say_kept(stages: Mapping[str, Any], folder: RunFolder, robot_name: str) -> 
     robot_file.write_robot(
         robot, folder.partial / REFIT_FILE, note=f"{robot_name}, fitted; the loop has no verdict yet"
     )
-    print_message(f"the best that is known so far is the refit, {folder.partial / REFIT_FILE}")
+    print_message(f"the best result so far is the refit, {folder.partial / REFIT_FILE}")
 
 
 def changes_by_effect(found: DiscoveryResult) -> dict[str, Change]:

@@ -37,7 +37,7 @@ _LASTING = MARKS.index("battery_empty")  # events from here on are kept in histo
 
 
 def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> int:
-    """Simulate runs of a file, or one of options, over a profile. Returns the exit code.
+    """Simulate runs from a file, or one run from options, over a profile. Returns the exit code.
 
     Raises:
         BadConfiguration: a condition that both the options and the profile state, a battery that is empty or below
@@ -50,19 +50,19 @@ def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> 
     if robot.rig.imposed != "voltage":
         what = imposed.SAID[robot.rig.imposed].words
         raise BadConfiguration(
-            f"--profile: the {what} is imposed on this robot, and a profile drives motors by their voltage; "
-            'simulate a table of runs, or state imposed = "voltage" in the robot\'s file'
+            f"--profile: the {what} is imposed on this robot, but a profile imposes the motor voltage; "
+            'simulate a table of runs, or set imposed = "voltage" in the robot\'s file'
         )
     if robot.loose:
         raise BadConfiguration(
-            "--profile: a profile does not follow a backlash or an elastic joint; set them to 0, or simulate over "
+            "--profile: profiles do not simulate backlash or an elastic joint; set them to 0, or simulate over "
             "time with --model drive"
         )
     for name, load in robot.configurations.items():
         if float(load.torque_gravity) > 0:
             raise BadConfiguration(
-                f"--profile: {name} is an arm whose gravity load varies with its angle, unlike a profile; "
-                "simulate it over time with --model drive"
+                f"--profile: {name} is an arm, whose gravity load varies with its angle; profiles do not cover "
+                "this. Simulate it over time with --model drive"
             )
     source = profiles.read_profile(config.profile)
     for note in source.notes:
@@ -74,22 +74,25 @@ def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> 
     imposed.check_acting(robot, ground, shaft)
     if "speed" in source.modes and not robot.shows_travel:
         raise BadConfiguration(
-            f"{source.source}, speed_mm_s: the robot's load is a shaft, so no channel shows a distance; state "
+            f"{source.source}, speed_mm_s: the robot's load is a shaft, so there is no travelling speed; give "
             "motor_speed_rpm or duty"
         )
     source.check_source(config.battery)
     for column in source.stated:
         if column in beside.stated:
             raise BadConfiguration(
-                f"{OPTIONS[column]}: got it beside {source.source}, which states {column}; expected one of the two"
+                f"{OPTIONS[column]}: got it in addition to {source.source}, which contains {column}; keep one of "
+                "the two"
             )
     _check_charge(robot, config)
     runs = given_runs(robot, beside, config, source.stated)
     for column in source.stated:
         if beside.runs is not None and runs.has(column):
-            print_message(f"{runs.source}, {column}: not used, {source.source} states it")
+            print_message(f"{runs.source}, {column}: not used, because {source.source} gives it")
     if "current_other" in source.values and not config.battery:
-        print_message(f"{source.source}, current_other_A: not used, other consumers are on the battery")
+        print_message(
+            f"{source.source}, current_other_A: not used, because other consumers are supplied by the battery"
+        )
     _check_turning(robot, runs, source)
     _check_cutoff(robot, runs, source, config)
     with open_folder("simulate", config, robot, beside, runs) as folder:
@@ -97,7 +100,9 @@ def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> 
         folder.write_table("segments.csv", capabilities.without_idle(robot, ended.segments))
         folder.write_table("history.csv", capabilities.without_idle(robot, ended.course))
         if not ended.whole:
-            print_message("history.csv ends before the mission does, which has taken more steps than are kept")
+            print_message(
+                "history.csv ends before the mission, because the mission took more steps than can be saved"
+            )
         result = run.SimulationResult("simulate", config.model, robot, runs, ended.table, ended.to_json())
         return run.write_run_folder(
             folder, config, result, print_report(mission_report.missions_document(file, ended), file)
@@ -105,11 +110,12 @@ def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> 
 
 
 def _check_turning(robot: Robot, runs: records.Runs, source: ProfileTable) -> None:
-    """Refuse a robot that cannot turn where the profile drives its sides apart, and more than the supply has."""
+    """Reject a robot that cannot turn if the profile drives its sides differently, and voltages above the supply
+    voltage."""
     if not source.turns:
         return
     names = sorted({str(name) for name in runs.configurations_named(robot)})
-    imposed.check_can_turn(robot, names, f"{source.source} drives the sides apart")
+    imposed.check_can_turn(robot, names, f"{source.source} drives the two sides differently")
     most = max((float(np.abs(source.values[name]).max()) for name in PAIRS[1] if name in source.values), default=0.0)
     supply = np.min(np.abs(source.values["voltage"] if "voltage" in source.values else runs[SUPPLY]))
     if most > supply:
@@ -120,7 +126,7 @@ def _check_turning(robot: Robot, runs: records.Runs, source: ProfileTable) -> No
 
 
 def _commanded(robot: Robot, runs: records.Runs, source: ProfileTable, config: configuration.Simulate) -> Conditions:
-    """Conditions of the runs. Of robots that turn with the lateral adhesion of a stated surface."""
+    """Conditions of the runs. For robots that turn, they include the lateral adhesion of a given surface."""
     conditions = run.conditions_of_runs(robot, runs, config)
     if not source.turns or not runs.has(profiles.SURFACE) or source.surface is not None:
         return conditions
@@ -140,7 +146,7 @@ def _check_charge(robot: Robot, config: configuration.Simulate) -> None:
 
 
 def _check_cutoff(robot: Robot, runs: records.Runs, source: ProfileTable, config: configuration.Simulate) -> None:
-    """Refuse missions that begin with cells below their cut-off."""
+    """Reject missions that begin with cells below their cut-off voltage."""
     if not config.battery:
         return
     conditions = run.conditions_of_runs(robot, runs, config)
@@ -189,7 +195,7 @@ def run_missions(robot: Robot, runs: records.Runs, source: ProfileTable, config:
 
 
 def _below(tables: list[Columns]) -> Columns:
-    """Tables of the same columns one below the other."""
+    """Concatenated tables with the same columns."""
     return {key: np.concatenate([table[key] for table in tables]) for key in tables[0]}
 
 
@@ -246,7 +252,7 @@ def _segments(
 
 
 def _segment_of(found: Mission, k: int) -> np.ndarray:
-    """Segment of each kept step of a run. Those after the last are of one beyond the end."""
+    """Segment of each stored step of a run. Steps after the last one get an index beyond the last segment."""
     assert found.course is not None  # it was asked for
     segment = np.asarray(found.course.segment[k])
     return np.where(segment < 0, np.iinfo(segment.dtype).max, segment)
@@ -257,7 +263,7 @@ def rows_to_keep(segment: np.ndarray, current: np.ndarray, most: int, marked: np
 
     Args:
         segment: of each row, not decreasing.
-        current: of each row.
+        current: current of each row.
         most: rows to keep at most.
         marked: rows to keep, of many the last ones.
     """

@@ -24,9 +24,8 @@ from sweeps.store import DONE, SOLVER_FAILED
 
 
 def execute(config: configuration.Render, picture: configuration.Picture) -> int:
-    """Draw one run from standstill, or a climb of a folder, as a picture or a film. Returns the exit code.
-
-    0 also where the run has not settled. 3 where it ends otherwise.
+    """Draw one run from standstill, or the climb in a folder, as a picture or film. Returns the exit code: 0 if
+    the run settles or is still accelerating, else 3.
     """
     file, begin, end, slow = picture.file, picture.begin, picture.end, picture.slow
     if picture.climb is not None:
@@ -80,11 +79,11 @@ def _check_free(picture: configuration.Picture) -> None:
     if file.exists() and not picture.force:
         raise BadConfiguration(f"FILE: {file} exists already; choose another name (--force replaces it)")
     if not file.parent.is_dir():
-        raise BadConfiguration(f"FILE: {file.parent} is no folder; choose another path")
+        raise BadConfiguration(f"FILE: {file.parent} is not a folder; choose another path")
 
 
 def _write(file: Path, draw: Callable[[Path], Any]) -> None:
-    """Draw into a file that is whole or not there."""
+    """Write a picture or film completely or not at all."""
     with replacing(file) as aside, progress_bar(1, quiet=False, doing="drawing") as advance:
         try:
             draw(aside)

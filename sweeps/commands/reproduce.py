@@ -24,7 +24,9 @@ def execute(config: configuration.Reproduce, beside: configuration.FolderPart) -
         document, rows = report.paper_document(file, gear)
         result = {"schema": "mmrjax.reproduce/1", "model": config.model, "rows": 0}
         if rows is None:
-            print_message(f"the paper's runs are of {', '.join(CONFIGURATIONS)}; none of them is this robot's")
+            print_message(
+                f"the paper's runs use the configurations {', '.join(CONFIGURATIONS)}; this robot has none of them"
+            )
         else:
             folder.write_table("rows.csv", data.paper_rows_table(rows))
             result |= {

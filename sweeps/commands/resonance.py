@@ -45,7 +45,7 @@ SHORTEST = 0.5  # [s], of a run
 
 
 def execute(config: configuration.Resonance, beside: configuration.FolderPart) -> int:
-    """Map the ripple of a robot and leave a run folder. Returns the exit code.
+    """Map the ripple of a robot and write a run folder. Returns the exit code.
 
     0 done. 3 done, but some runs did not settle, or slid, tipped or failed.
     """
@@ -62,15 +62,16 @@ def execute(config: configuration.Resonance, beside: configuration.FolderPart) -
         }
     )
     if config.voltages_V[0] <= 0:
-        raise BadConfiguration(f"--voltages: got {config.voltages_V[0]:g}; expected more than 0 to 100, forward")
+        raise BadConfiguration(f"--voltages: got {config.voltages_V[0]:g}; expected above 0 and up to 100, forward")
     if len(config.voltages_V) < FEWEST:
         raise BadConfiguration(
-            f"--voltages: got {len(config.voltages_V)} of them; expected at least {FEWEST}, or no peak over speed "
-            "can be told"
+            f"--voltages: got {len(config.voltages_V)} of them; expected at least {FEWEST}, or peaks over speed "
+            "cannot be found"
         )
     if config.options["duration"] < SHORTEST:
         raise BadConfiguration(
-            f"--duration: got {config.options['duration']:g} s; expected at least {SHORTEST:g} s, or no grousers pass"
+            f"--duration: got {config.options['duration']:g} s; expected at least {SHORTEST:g} s, so that "
+            "grousers pass"
         )
     runs, of_table8 = _points(config, robot)
     conditions = run.conditions_of_runs(robot, runs, config)
@@ -107,7 +108,7 @@ def _grid(config: configuration.Resonance, voltages: tuple[float, ...], payloads
 
 
 def _points(config: configuration.Resonance, robot: Robot) -> tuple[Runs, np.ndarray]:
-    """The grid, then those points of Table 8 that it lacks, and which rows are of Table 8."""
+    """Points of the grid and the missing points of Table 8, and the rows that belong to Table 8."""
     parts = [
         grid_conditions(_grid(config, v, p), robot)
         for v, p in ((config.voltages_V, config.payloads_kg), (VOLTAGES_V, PAYLOADS_KG))
@@ -124,7 +125,7 @@ def _points(config: configuration.Resonance, robot: Robot) -> tuple[Runs, np.nda
 def _rippled(
     folder: RunFolder, robot: Robot, conditions: Conditions, config: configuration.Resonance, what: Passing
 ) -> Columns:
-    """The columns of ripple, chunk by chunk. Chunks that an interrupted run left are not simulated again."""
+    """Ripple columns, computed in chunks. Chunks stored by an interrupted run are not simulated again."""
     total, parts = conditions.shape[0], []
     size = min(CHUNK, total)
     with progress_bar(total, quiet=False) as advance:
@@ -213,7 +214,7 @@ _COLUMNS = {
 
 
 def _rows(rows: Iterable[Json], kind: type) -> Columns:
-    """Rows of a named tuple as columns with units in their names, without rows the columns alone."""
+    """Columns, with units in their names, of a list of named tuples."""
     rows, unit = list(rows), "Hz" if kind is Mode else "m_s"
     keys = list(rows[0]) if rows else list(kind.__annotations__)
     names = _COLUMNS | {"low": f"low_{unit}", "high": f"high_{unit}"}

@@ -43,14 +43,14 @@ class RigCheck:
     """Result of `rig check`.
 
     Attributes:
-        file: that was read.
+        file: file that was read.
         robot: of it.
         examples: its lines that still hold an example's number.
-        origins: of its numbers.
-        facts: that follow from them.
-        runs: of the table, None without one.
+        origins: origins of its numbers.
+        facts: facts that follow from them.
+        runs: runs of the table, None without one.
         foresight: what it can determine.
-        doubts: of a log over time, a sentence each: signs that are wrong, time or current in another unit.
+        doubts: doubts of a log over time, a sentence each: signs that are wrong, time or current in another unit.
     """
 
     file: str
@@ -66,7 +66,7 @@ class RigCheck:
         """Sentences on the rig, its drive and its sensors."""
         robot, rig = self.robot, self.robot.rig
         count = int(robot.sides)
-        motors = "One motor drives" if count == 1 else f"{count} motors alike drive"
+        motors = "One motor drives" if count == 1 else f"{count} motors with the same command drive"
         gear = f"{'its' if count == 1 else 'their'} gearbox {float(robot.gearbox.ratio):g} : 1"
         loads = "; ".join(f"{name}: {_load(load)}" for name, load in robot.configurations.items())
         imposed = "the voltage (times the duty in histories)"
@@ -75,8 +75,8 @@ class RigCheck:
         imposed = words.get(rig.imposed, imposed)
         starts = {
             "rest": "start at rest",
-            "measured": "start as their first samples show",
-            "free": "start as a fit finds",
+            "measured": "start from the state in their first samples",
+            "free": "start from a fitted state",
         }
         delay = float(rig.delay)
         late = f", {delay:g} s late" if delay else ""
@@ -92,37 +92,39 @@ class RigCheck:
         notes = []
         if self.robot.rig.inherits:
             notes.append(
-                'what the file does not state is its base\'s, a packaged robot (base = "none" starts from nothing)'
+                "values that the file does not give come from its base, a packaged robot, unless base is none"
             )
         if self.examples:
             lines = ", ".join(map(str, self.examples))
             hold = f"{count_noun(len(self.examples), 'line')} still hold{'s' * (len(self.examples) == 1)}"
-            wide = f"where they have ±, a fit takes ± {100 * EXAMPLE_SHARE:g} %"
+            wide = f"for those with ±, a fit uses ± {100 * EXAMPLE_SHARE:g} %"
             notes.append(f"{hold} the number of an example ({EXAMPLE}): {lines}; {wide}")
         notes += self.doubts
         if self.runs is not None and self.runs.has("duty") and self.runs.has("total_current_A"):
             notes.append(
-                "with a duty, total_current is the supply current: the duty's share of the motors' current; a sensor "
-                "in a motor's leads measures motor_current"
+                "with a duty, total_current is the supply current: duty times the motor current; a sensor in the "
+                "motor leads measures motor_current"
             )
         notes += [f"{fact.what} {fact.value}: {fact.odd}" for fact in self.facts if fact.odd]
         loose = [
             _program(self.robot, o) for o in self.origins if o.why.startswith("the file") and o.sd is None and o.value
         ]
         if loose and not self.robot.rig.inherits:
-            notes.append(f"without ±, so with the program's: {', '.join(loose)}")
+            notes.append(f"without ±, so the default ± is used: {', '.join(loose)}")
         if not self.robot.knows(HEAT) and self.robot.motor.temperature_limit < UNLIMITED:
             lacking = " and ".join(self.robot.unknown(HEAT))
             notes.append(
-                f"motor.temperature_limit is stated, and not how warm the windings become: state {lacking}, without "
-                "which nothing is held against it"
+                "motor.temperature_limit is given, but the winding temperature cannot be computed without "
+                f"{lacking}: add {lacking}, or the limit is not checked"
             )
         if self.robot.motor.voltage_limit is None and self.robot.rig.imposed == "voltage":
-            notes.append("motor.voltage_limit is not stated: experiments are proposed up to what a table used")
+            notes.append(
+                "motor.voltage_limit is not given: experiments are proposed up to the highest voltage in the table"
+            )
         return notes
 
     def channels(self) -> list[Json]:
-        """Of each channel: name, the user's column, whether it is signed, its step [unit], source of its sd."""
+        """Name, column in the file, sign convention, resolution [unit] and source of the sd of each channel."""
         theirs = {name: column for name, column, _ in self.robot.rig.columns}
         rig, rows = (self if self.foresight is None else self.foresight).robot.rig, []
         for k, channel in enumerate(self.robot.channels):
@@ -141,7 +143,7 @@ class RigCheck:
         return rows
 
     def columns(self) -> list[Json]:
-        """Of each column of the table: what it is used for, its range."""
+        """Use and range of each column of the table."""
         if self.runs is None:
             return []
         rows, theirs = [], self.runs.headings
@@ -170,26 +172,27 @@ class RigCheck:
         return column in idle or (column == SUPPLY and self.robot.rig.imposed != "voltage")
 
     def unused(self) -> list[str]:
-        """Of each column that is not used, why."""
+        """Reason why each unused column is not used."""
         if self.runs is None:
             return []
         every = {c.column: c.name for c in channels.EVERY}
         notes = [
-            f"{name}: not among the rig's channels; add {every[name]} to channels in its file to use it"
+            f"{name}: not one of the rig's channels; to use it, add {every[name]} to channels in the rig's file"
             for name in self.runs.unknown
             if name in every
         ]
         others = [name for name in self.runs.unknown if name not in every]
         without = (
-            f"{', '.join(others)}: without a role, so residuals are tested for clusters by each; name one under "
+            f"{', '.join(others)}: without a role, so residuals are tested for differences between their values; "
+            "if one has a role, name it under "
         )
-        without += "[columns] in the rig's file if it has one"
+        without += "[columns] in the rig's file"
         return [*notes, *([without] if others else [])]
 
     def statement(self) -> str:
         """Sentence on the parameters that the table can determine."""
         if self.foresight is None:
-            return "Without data: give a table to see what it can determine."
+            return "No data given: add a table to see which parameters it can determine."
         pairs = self.foresight.together
         held = undetermined_names([p.name for p in self.foresight.parameters if p.held], pairs)
         traded = {name for pair in pairs for name in (pair.one, pair.other)}
@@ -198,16 +201,16 @@ class RigCheck:
         parts = [
             f"These data determine {', '.join(determined)}" if determined else "These data determine no parameter"
         ]
-        parts += [f"{', '.join(held)} would not be determined by these runs"] * bool(held)
+        parts += [f"{', '.join(held)} are not determined by these runs"] * bool(held)
         return "; ".join(parts) + "."
 
     def determined(self, parameter: Determined) -> str:
-        """`yes`, `no`, or with which parameters together the table determines one."""
+        """`yes`, `no`, or the parameters with which the table determines this one in combination."""
         assert self.foresight is not None
         return describe(Determination.of(parameter.name, parameter.held, self.foresight.together))
 
     def to_json(self) -> Json:
-        """The whole, for machines."""
+        """The whole check as JSON-able data."""
         runs = None
         if self.runs is not None:
             assert self.foresight is not None
@@ -243,14 +246,14 @@ class RigCheck:
 def _source(word: str, channel: Channel) -> str:
     """Origin of the sd of a channel, in words."""
     every = {
-        "columns": "of the table", "series": "estimated by how readings scatter along series of rows",
+        "columns": "of the table", "series": "estimated from the scatter of readings along series of rows",
         "assumed": f"assumed, {100 * channel.sd_share:g} %, as {channel.sd_column} is no column",
     }  # fmt: skip
     return every.get(word, word)
 
 
 def _program(robot: Robot, origin: Origin) -> str:
-    """A number stated without ±, with the width that the program gives it where a fit frees it."""
+    """A number without ±, with the default prior width that a fit gives it."""
     sd = float(priors.parameter_coordinates(robot, (origin.name,)).prior_sd[0])
     return f"{origin.name} (±{100 * sd / abs(origin.value):.2g} %)"
 
@@ -260,10 +263,10 @@ def _load(load: Any) -> str:
         on = "tracks" if float(load.on_tracks) > 0.5 else "wheels"
         return f"a vehicle of {float(load.mass):g} kg on {on}"
     words = [f"a shaft of {float(load.inertia):.3g} kg·m²"]
-    words += ["an arm that gravity pulls"] if float(load.torque_gravity) > 0 else []
+    words += ["an arm under gravity"] if float(load.torque_gravity) > 0 else []
     words += ["a constant torque"] if float(load.torque_constant) != 0 else []
     travel = float(load.radius)
-    words += [f"{2e3 * np.pi * travel:.4g} mm of travel a turn"] if travel != 1.0 else []
+    words += [f"{2e3 * np.pi * travel:.4g} mm of travel per turn"] if travel != 1.0 else []
     return ", ".join(words)
 
 
@@ -279,7 +282,7 @@ def _use(column: str, robot: Robot) -> str:
 
 
 def check_rig_file(file: Path, data: str | None, effects: Names, as_json: bool, columns: str | None = None) -> int:
-    """Report how a rig's file was read, and what a table can determine of it. Returns 0.
+    """Report how a rig's file was interpreted, and which parameters a table can determine. Returns 0.
 
     Raises:
         BadConfiguration: a file that cannot be read, or lacks something, with all that it lacks.
@@ -318,7 +321,7 @@ def examine_rig_file(file: Path, data: str | None, effects: Names = (), columns:
 
 
 def check_document(found: RigCheck) -> Document:
-    """All of it, for a person."""
+    """The whole check as a document."""
     signs = {None: FREE, True: "signed", False: "magnitude"}
     steps = (
         FREE if c["quantum"] is None else f"{c['quantum']:.3g} {c['unit']}" if c["quantum"] else ""
@@ -357,7 +360,7 @@ def _data_blocks(found: RigCheck, runs: Runs, seen: Foresight) -> tuple[Block, .
     notes_of_data = [*found.unused(), *runs.missing()]
     if len(seen.status) < len(runs):
         notes_of_data.insert(
-            0, f"loop and calibrate use the readings of {len(seen.status)} of them, evenly in time (--rows)"
+            0, f"loop and calibrate use {len(seen.status)} of these rows, evenly spaced in time (--rows)"
         )
     held = runs.has("held") or (runs.layout.imposed == "motor_speed" and not runs[runs.layout.imposed_column].any())
     settled = {*words.SETTLED, *(["stalled"] if held else [])}  # a shaft that is held stands still, as it should
@@ -366,8 +369,8 @@ def _data_blocks(found: RigCheck, runs: Runs, seen: Foresight) -> tuple[Block, .
     ]
     if others:
         notes_of_data.append(
-            f"with the file's numbers not every row settles ({', '.join(others)}); rows without a "
-            "steady state are not counted"
+            f"with the numbers of the file, some rows have no steady state ({', '.join(others)}); these are not "
+            "counted"
         )
     determined = [
         (p.name, p.value, p.prior_sd, p.unit, p.share, found.determined(p))
@@ -387,7 +390,7 @@ def _data_blocks(found: RigCheck, runs: Runs, seen: Foresight) -> tuple[Block, .
         *remarks(notes_of_data),
         Table(
             "determined", heads, determined,
-            "what these data can determine (posterior sd over prior sd, at the numbers of the file)",
+            "parameters that these data can determine (posterior sd over prior sd, at the values in the file)",
         ),
         Note(f"not determined: above {identifiability.HELD:g}", terminal=True),
         *remarks(alike),

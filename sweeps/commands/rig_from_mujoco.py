@@ -49,18 +49,26 @@ def read_mujoco_hinge(source: Path, joint: str | None) -> JointNumbers:
     Raises:
         BadConfiguration: a model that MuJoCo refuses, or a joint that it does not have or that is no hinge.
     """
+    return _Model(mujoco.mujoco_module(), read_mujoco_model(source), source.name).numbers(joint)
+
+
+def read_mujoco_model(source: Path) -> Any:
+    """Returns the model of a file, compiled by MuJoCo.
+
+    Raises:
+        BadConfiguration: a model that MuJoCo refuses.
+    """
     check_mujoco_model(source)
-    library = mujoco.mujoco_module()
     try:
-        model = library.MjModel.from_xml_path(str(source))
+        model = mujoco.mujoco_module().MjModel.from_xml_path(str(source))
     except (ValueError, RuntimeError) as error:
-        raise BadConfiguration(f"{source}: MuJoCo does not read it ({' '.join(str(error).split())})") from error
+        raise BadConfiguration(f"{source}: MuJoCo cannot read it ({' '.join(str(error).split())})") from error
     check_memory(source, VALUE * model.nv**2)  # of its matrix of inertia
-    return _Model(library, model, source.name).numbers(joint)
+    return model
 
 
 def check_mujoco_model(source: Path) -> None:
-    """Refuses a model with sizes or files for which MuJoCo's compiler does not end, before that compiler starts.
+    """Rejects a model with sizes or files for which MuJoCo's compiler does not end, before that compiler starts.
 
     Raises:
         BadConfiguration: numbers that are not finite, too many copies, elements or cells, or a file that is a pipe or
@@ -95,7 +103,7 @@ def _check_attributes(element: Element, file: Path, folder: Path, inside: Sequen
     """Returns the number of copies that an element makes of its content. Refuses its numbers and files.
 
     Args:
-        folder: of the model.
+        folder: folder of the model.
         inside: folders in it that may hold files.
     """
     tag, where, sizes = element.tag, f"{file}, <{element.tag}>", [1.0]
@@ -151,7 +159,7 @@ class _Model:
                 f"{allowed_words(joint, hinge_names) if hinge_names else 'the file has no named hinge'}"
             )
         if joint not in hinge_names:
-            raise BadConfiguration(f"--joint: got {joint}, which slides or is free; expected a hinge")
+            raise BadConfiguration(f"--joint: got {joint}, a slide or free joint; expected a hinge")
         return self.joints.index(joint)
 
     def numbers(self, name: str | None) -> JointNumbers:
@@ -161,7 +169,7 @@ class _Model:
         armature = float(model.dof_armature[dof])
         inertia, weight = self._load(joint, dof, armature)
         if not 0 < inertia < math.inf:
-            raise BadConfiguration(f"{self.file}, {named}: nothing with mass turns with it; expected an inertia")
+            raise BadConfiguration(f"{self.file}, {named}: no mass turns with it; expected an inertia")
         actuator = self.actuators.get(joint)
         gear = 1.0 if actuator is None else abs(float(model.actuator_gear[actuator, 0]))
         drive: dict[str, Stated] = {}
@@ -178,20 +186,20 @@ class _Model:
         weight = None if rolls else weight
         return JointNumbers(
             self.file, self.joints[joint], rolls,
-            mass=(float(model.body_subtreemass[root]), "mass of its tree of bodies"),
+            mass=(float(model.body_subtreemass[root]), "mass of its body tree"),
             sides=self._sides(joint, radius) if rolls else None, radius=radius,
-            inertia=(inertia, f"{named}, what turns with it, without armature"),
+            inertia=(inertia, f"{named}, inertia that turns with it, without armature"),
             ratio=(gear, f"{named}, gear of its actuator") if gear > 1 or drive else None,
             friction=stated(model.dof_frictionloss[dof], "frictionloss"),
             damping=stated(np.ravel(model.dof_damping[dof])[0], "damping"),
             armature=stated(armature, "armature"),
-            weight=None if weight is None else (weight[0], f"{named}, largest torque of its weight"),
-            angle=None if weight is None else (weight[1], f"{named}, where it hangs"),
+            weight=None if weight is None else (weight[0], f"{named}, largest torque from its weight"),
+            angle=None if weight is None else (weight[1], f"{named}, hanging position"),
             drive=drive,
         )  # fmt: skip
 
     def _load(self, joint: int, dof: int, armature: float) -> tuple[float, tuple[float, float] | None]:
-        """Inertia of what turns and its weight as `hanging`, other joints at rest in the reference pose."""
+        """Inertia of the rotating parts and their weight as `hanging`, with other joints in the reference pose."""
         model, data, place = self.model, self.data, self.model.jnt_qposadr[joint]
         weights = []
         for angle in (np.pi / 2, 0.0):
@@ -223,7 +231,7 @@ class _Model:
         return max(radii)[1:] if radii else None
 
     def _sides(self, joint: int, radius: Found | None) -> Found | None:
-        """Number of wheels of the same radius and parallel axis that are as driven as this one."""
+        """Number of driven wheels with the same radius and a parallel axis, including this one."""
         if radius is None:
             return None
         equal, driven = [], joint in self.actuators
@@ -250,7 +258,7 @@ def _dc_motor(model: Any, actuator: int, dof: int, ratio: float, file: str) -> d
         "motor.inertia": number(float(model.dof_armature[dof]) / ratio**2, "kg·m^2", "armature / gear²", "50 %"),
         "motor.friction_coulomb": number(0.0, "N·m", "all friction is at the joint"),
         "motor.friction_viscous": number(0.0, "N·m·s", "all damping is at the joint"),
-        "gearbox.efficiency_load": number(1.0, "-", "no loss in proportion to the torque: state one if you know it"),
+        "gearbox.efficiency_load": number(1.0, "-", "no loss proportional to the torque: add one if you know it"),
         "load.loss_coulomb": number(friction, "N·m", "frictionloss and lugre of the joint", "100 %"),
         "load.loss_viscous": number(np.ravel(model.dof_damping[dof])[0], "N·m·s", "damping of the joint", "100 %"),
     }

@@ -38,7 +38,7 @@ def _units(text: str) -> str:
 
 def _number(name: str, text: str) -> float:
     units = NUMBERS[name]
-    expected = f"expected a number more than 0 with its unit: {', '.join(units)}"
+    expected = f"expected a positive number with a unit: {', '.join(units)}"
     split = re.fullmatch(r"\s*([-+\d.][\d.]*(?:[eE][-+]?\d+)?)\s*(.*?)\s*", text)
     factor = None if split is None else {_units(u): f for u, f in units.items()}.get(_units(split[2]))
     try:
@@ -64,7 +64,9 @@ def read_data_sheet(stated: Mapping[str, str]) -> dict[str, Stated]:
     """
     if not stated:
         others = ", ".join(f"--{name}" for name in NUMBERS if name != "no-load-current")
-        raise BadConfiguration(f"--from-sheet: no numbers; expected --no-load-current and three or more of {others}")
+        raise BadConfiguration(
+            f"--from-sheet: no motor data; expected --no-load-current and at least three of {others}"
+        )
     sheet = {name: _number(name, text) for name, text in stated.items()}
     drop = _current(sheet)
     voltage, speed, idle, torque, stall, stated_resistance = map(sheet.get, NUMBERS)
@@ -96,7 +98,7 @@ def read_data_sheet(stated: Mapping[str, str]) -> dict[str, Stated]:
         "motor.friction_viscous": Stated(
             0.0,
             "N·m·s",
-            "the no-load current does not split friction; ± if half of it were viscous",
+            "the no-load current does not separate Coulomb and viscous friction; ± as if half of it were viscous",
             f"{0.5 * constant**2 * idle / back:.2g}",
         ),
     }
@@ -114,13 +116,13 @@ def _current(sheet: Mapping[str, float]) -> float:
     """
     voltage, speed, idle, torque, stall, resistance = map(sheet.get, NUMBERS)
     if idle is None:
-        raise BadConfiguration("--no-load-current: missing; the friction of the motor follows from it alone")
+        raise BadConfiguration("--no-load-current: missing; without it the motor friction cannot be computed")
     missing = [name for name in NUMBERS if name not in sheet]
     if speed is None and torque is None:
         raise BadConfiguration("--no-load-speed and --stall-torque: both missing; the torque constant needs one")
     totals = [x for x in (stall, _ratio(voltage, resistance)) if x is not None]
     if totals and min(totals) <= idle:
-        raise BadConfiguration(f"--no-load-current: got {three_digits(idle)} A, and the stall current is "
+        raise BadConfiguration(f"--no-load-current: got {three_digits(idle)} A, but the stall current is "
                                f"{three_digits(min(totals))} A; expected less")  # fmt: skip
     total = totals[0] if totals else None
     if total is not None and (resistance is not None or voltage is not None):
@@ -135,7 +137,7 @@ def _current(sheet: Mapping[str, float]) -> float:
             return (power + math.sqrt(power**2 + 4 * voltage * power * idle)) / (2 * voltage)
     lacking = ", ".join(f"--{name}" for name in missing)
     raise BadConfiguration(
-        f"--from-sheet: missing {lacking}; the others do not determine resistance and torque constant; state one more"
+        f"--from-sheet: missing {lacking}; the others do not determine resistance and torque constant; give one more"
     )
 
 
@@ -152,5 +154,7 @@ def _refuse_contradictions(*groups: tuple[list[tuple[float, str]], str, str]) ->
         if _difference(pairs) > LARGEST
     ]
     if faults:
-        raise BadConfiguration(f"--from-sheet: contradiction: {'; '.join(faults)}; expected {100 * LARGEST:.0f} % at "
-                               "most; all numbers must be of the motor's own shaft at one voltage")  # fmt: skip
+        raise BadConfiguration(
+            f"--from-sheet: contradiction: {'; '.join(faults)}; expected at most {100 * LARGEST:.0f} %; data must "
+            "be for the motor shaft at one voltage"
+        )

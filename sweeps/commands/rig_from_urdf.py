@@ -50,7 +50,9 @@ class _Urdf:
     def __init__(self, root: Element, file: str) -> None:
         self.root, self.file = root, file
         if any("xacro}" in element.tag for element in root.iter()):
-            raise BadConfiguration(f"{file}: has elements of xacro; run xacro {file} > robot.urdf, and use that file")
+            raise BadConfiguration(
+                f"{file}: contains xacro elements; run xacro {file} > robot.urdf, and use that file"
+            )
         self.links, self.joints = self._named("link"), self._named("joint")
         for name, element in self.joints.items():
             for end in ("parent", "child"):
@@ -113,7 +115,7 @@ class _Urdf:
         for name, pose in moved:
             mass, about, first = self._inertial(name, pose, axis)
             inertia, moment, count = inertia + about, moment + first, count + (mass > 0)
-        named = f"link {link}" if len(moved) == 1 else f"link {link} and {len(moved) - 1} that it carries"
+        named = f"link {link}" if len(moved) == 1 else (f"link {link} and the {len(moved) - 1} links that it carries")
         if count == 0:
             raise BadConfiguration(f"{self.file}, {named}: no <inertial>; expected its <mass> and <inertia>")
         if inertia < LEAST_INERTIA:
@@ -130,7 +132,7 @@ class _Urdf:
             friction=self._dynamics(element, "friction"), damping=self._dynamics(element, "damping"),
             armature=self._armature(joint),
             weight=None if weight is None else (weight[0], f"{named}, <mass> and its lever"),
-            angle=None if weight is None else (weight[1], f"{named}, where it hangs"),
+            angle=None if weight is None else (weight[1], f"{named}, hanging position"),
         )  # fmt: skip
 
     # --- frames
@@ -185,7 +187,7 @@ class _Urdf:
     def _mass(self) -> Found | None:
         masses = [self._link_mass(name) for name in self.links]
         stated = [m for m in masses if m]
-        lacking = f", {len(masses) - len(stated)} more state none" if len(stated) < len(masses) else ""
+        lacking = f", {len(masses) - len(stated)} more links have none" if len(stated) < len(masses) else ""
         return (math.fsum(stated), f"sum of <mass> of {len(stated)} links{lacking}") if stated else None
 
     def _link_mass(self, link: str) -> float:
@@ -228,7 +230,7 @@ class _Urdf:
         return None
 
     def _sides(self, joint: str, radius: Found | None) -> Found | None:
-        """Number of wheels of the same radius and parallel axis that are as driven as this one."""
+        """Number of driven wheels with the same radius and a parallel axis, including this one."""
         axis = self._to_root(joint)[0][0] @ self._axis(joint)
         equal = []
         for name, element in self.joints.items():
@@ -264,8 +266,8 @@ class _Urdf:
             name = f"transmission {element.get('name', '')}, <{stated[0][1]}>".replace(" ,", ",")
             ratio = math.prod(abs(self._parsed(text, name, "")) for text, _ in stated)
             if not ratio >= 1:
-                raise BadConfiguration(f"{self.file}, {name}: got {ratio:g}; expected turns of the motor for one of "
-                                       "the joint, 1 or more")  # fmt: skip
+                raise BadConfiguration(f"{self.file}, {name}: got {ratio:g}; expected motor turns per joint turn, "
+                                       "1 or more")  # fmt: skip
             return ratio, name + (": 1 is often a placeholder" if ratio == 1 else "")
         return None
 

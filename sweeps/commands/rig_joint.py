@@ -37,14 +37,14 @@ class JointNumbers:
     Attributes:
         file, joint: names.
         rolls: True if the joint turns a wheel of a body that is free to move.
-        mass: of the whole model.
+        mass: mass of the whole model.
         sides: joints that are equal, as a wheel on the other side.
-        inertia: of what turns with the joint, about its axis, without `armature`.
-        radius: of the wheel.
+        inertia: inertia of what turns with the joint, about its axis, without `armature`.
+        radius: radius of the wheel.
         ratio: turns of the motor for one of the joint.
-        friction, damping, armature: at the joint.
+        friction, damping, armature: friction, damping and armature at the joint.
         weight: largest torque of gravity.
-        angle: of the load at rest under gravity.
+        angle: angle of the load at rest under gravity.
         drive: numbers of the motor by dotted name. They replace what follows from the others.
     """
 
@@ -64,7 +64,7 @@ class JointNumbers:
     drive: Mapping[str, Stated] = dataclasses.field(default_factory=dict)
 
     def kind(self, stated: str | None) -> str:
-        """The kind of rig: `stated`, or else what the joint moves.
+        """The kind of rig: `stated`, or else the kind that fits the joint's load.
 
         Raises:
             BadConfiguration: a kind whose load slides.
@@ -72,7 +72,7 @@ class JointNumbers:
         if stated is None:
             return "wheeled" if self.rolls else "bench" if self.weight is None else "pendulum"
         if stated not in TURNING:
-            raise BadConfiguration(f"--kind: got {stated} with --from, which reads a joint that turns; "
+            raise BadConfiguration(f"--kind: got {stated} with --from, which reads a revolute joint; "
                                    f"{allowed_words(stated, TURNING)}")  # fmt: skip
         return stated
 
@@ -103,7 +103,7 @@ class JointNumbers:
             put("motor.inertia", "kg·m^2", "armature", rotor, " / ratio²")
         elif self.armature is not None:
             inertia = (inertia[0] + self.armature[0], f"{inertia[1]}, and armature")
-            by_name["motor.inertia"] = Stated(0.0, "kg·m^2", "no ratio found, so the load's inertia contains it")
+            by_name["motor.inertia"] = Stated(0.0, "kg·m^2", "no ratio found, so the load inertia includes it")
         put("load.inertia", "kg·m^2", "inertia", inertia)
         return by_name | {name.replace("load.loss", f"{losses}.loss"): number for name, number in self.drive.items()}
 
@@ -132,7 +132,7 @@ def free_unstated_losses(kind: str, numbers: Mapping[str, Stated]) -> dict[str, 
         if width > 0:
             freed[name] = Stated(0.0, unit, reason, f"{width:.2g}")
         elif name in freed:
-            held = f'{freed[name].source}; 0 is held at 0, "0.0 ± 0.01" frees it'
+            held = f'{freed[name].source}; a value of 0 stays fixed, "0.0 ± 0.01" is fitted'
             freed[name] = dataclasses.replace(freed[name], source=held)
     return freed
 
@@ -152,8 +152,8 @@ def is_round(centre: np.ndarray, axis: np.ndarray, radius: float, along: np.ndar
     """True if a cylinder or sphere turns about its own axis.
 
     Args:
-        centre: from a point of the joint's axis.
-        axis: of the joint.
+        centre: centre from a point of the joint's axis.
+        axis: axis of the joint.
         along: of the cylinder, None: a sphere. Axes are unit vectors, shape (3,).
     """
     off = np.linalg.norm(np.cross(axis, centre))

@@ -58,7 +58,7 @@ def new_rig_text(kind: str | None, source: Path | None, joint: str | None, sheet
         sheet: numbers by name.
 
     Raises:
-        BadConfiguration: as `joint_of` and `rig_from_sheet.read_data_sheet`.
+        BadConfiguration: for the same reasons as `joint_of` and `rig_from_sheet.read_data_sheet`.
     """
     numbers: dict[str, Stated] = {}
     origins = []
@@ -77,8 +77,10 @@ def new_rig_text(kind: str | None, source: Path | None, joint: str | None, sheet
         return rig_template(kind)
     if source is not None:
         numbers = free_unstated_losses(kind, numbers)
-    origin = f"kind {kind}, filled in from {' and '.join(origins)}"
-    return fill_rig_template(kind, numbers, f"{origin}; a comment names the source of each number, ± is a guess.")
+    origin = f"kind {kind}, filled from {' and '.join(origins)}"
+    return fill_rig_template(
+        kind, numbers, f"{origin}; comments name the source of each number, and each ± is a guess."
+    )
 
 
 def write_new_rig(
@@ -104,13 +106,15 @@ def write_new_rig(
         each = "; ".join(f"{name}: {what}" for name, what in KINDS.items())
         raise BadConfiguration(f"--kind: got {kind}; {allowed_words(kind, KINDS)} ({each})")
     if file.exists() and (file.is_dir() or not force):
-        what = "a folder; state a file, as my-rig.toml" if file.is_dir() else "there already; --force replaces it"
+        what = (
+            "a folder; give a file, such as my-rig.toml" if file.is_dir() else ("already exists; --force replaces it")
+        )
         raise BadConfiguration(f"{file}: {what}")
     if not file.parent.is_dir():
-        raise BadConfiguration(f"{file}: no such folder as {file.parent}; make it first")
+        raise BadConfiguration(f"{file}: the folder {file.parent} does not exist; create it first")
     written = new_rig_text(kind, source, joint, sheet)
     if source is None and sheet is None:
-        what = f"{KINDS[kind or USUAL]}. Fill in what is marked {EXAMPLE}, then"
+        what = f'{KINDS[kind or USUAL]}. Replace the numbers marked "{EXAMPLE}" with your own, then'
     else:
         lacking = ", ".join(f"{name} {unit}".rstrip() for name, unit in example_numbers(written).items())
         what = written.removeprefix("# ").partition("; a comment")[0]
@@ -118,6 +122,6 @@ def write_new_rig(
     try:
         write_text(file, written)
     except OSError as error:
-        raise BadConfiguration(f"{file}: cannot be written ({error.strerror}); state a file elsewhere") from error
+        raise BadConfiguration(f"{file}: cannot be written ({error.strerror}); choose another path") from error
     print_output(f"{file}: {what}: mmrjax rig check {file} [DATA.csv]")
     return 0

@@ -11,12 +11,12 @@ from calibration.data.stated import HEADER
 
 #: Kinds of rig, in words.
 KINDS = {
-    "bench": "a motor with its gearbox that turns a shaft: brake, disk, worm, winch",
-    "dyno": "a motor against a brake whose torque is set and read",
-    "pendulum": "a servo with an arm that gravity pulls",
-    "servo": "a servo driven by PWM, whose angle is logged",
+    "bench": "a motor with gearbox that drives a shaft: brake, disk, worm, winch",
+    "dyno": "a motor against a brake with set and measured torque",
+    "pendulum": "a servo with an arm under gravity",
+    "servo": "a servo driven by PWM, with its angle logged",
     "linear": "a carriage on a screw, a belt or a rope",
-    "carriage": "the same on an amplifier that controls the current, with its position logged",
+    "carriage": "a carriage on an amplifier that controls the current, with its position logged",
     "wheeled": "a robot on wheels",
     "tracked": "a robot on tracks",
 }
@@ -29,7 +29,7 @@ class Stated:
     """A number for a line of a rig's file.
 
     Attributes:
-        value: in `unit`.
+        value: value in `unit`.
         source: file and element.
         width: text after ±, empty: none.
     """

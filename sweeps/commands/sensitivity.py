@@ -55,7 +55,7 @@ AXES = {
 
 
 def execute(config: configuration.Sensitivity, beside: configuration.FolderPart) -> int:
-    """Study a robot and leave a run folder. Returns the exit code.
+    """Run a sensitivity study of a robot and write a run folder. Returns the exit code.
 
     0 done. 3 done, but the solver failed at some operating points.
     """
@@ -115,12 +115,10 @@ def _ranges(vary: Names) -> dict[str, tuple[float, float]]:
 def _operating_points(
     config: configuration.Sensitivity, robot: Robot, ranges: dict[str, tuple[float, float]]
 ) -> Runs:
-    """The grid of operating points. An axis that varies has one value, the middle of its range."""
+    """The grid of operating points. For a condition with --vary it contains one value, the middle of the range."""
     layout = Layout.of(robot)
     if layout.imposed == "motor_current":
-        raise BadConfiguration(
-            "sensitivity: the motors' current is imposed on this robot; simulate and sweep take it"
-        )
+        raise BadConfiguration("sensitivity: the motor current is imposed on this robot; use simulate or sweep")
     table8: dict[str, tuple[float, ...]] = {}
     if layout.table8:
         table8 = CORNERS if config.method in ("sobol", "morris") else WHOLE
@@ -132,15 +130,17 @@ def _operating_points(
         imposed.check_acting(robot, ground, shaft)
         if name in grid_room.AXIS and name != layout.imposed:
             raise BadConfiguration(
-                f"--vary {name}: the robot's file imposes the {words_of(layout.imposed)}; vary that"
+                f"--vary {name}: the robot's file imposes the {words_of(layout.imposed)}; vary it instead"
             )
     if config.battery and "voltage" in ranges:
-        raise BadConfiguration("--vary voltage: acts only without --battery, whose charge sets the voltage")
+        raise BadConfiguration(
+            "--vary voltage: has no effect on battery power, where the state of charge sets the voltage"
+        )
     for name, (low, high) in ranges.items():
         if name in AXES:
             if getattr(config, AXES[name]) is not None:
                 option = AXES[name].partition("_")[0]
-                raise BadConfiguration(f"--vary {name}: --{option} states it too; give one of them")
+                raise BadConfiguration(f"--vary {name}: --{option} sets it too; give one of them")
             axes[AXES[name]] = ((low + high) / 2 / (RPM if name == "motor_speed" else 1.0),)
     try:
         stated = GridPart(configurations=config.configurations, surface=config.surface, **axes)
@@ -168,7 +168,10 @@ def _inputs(
     robot, present = file.robot, tuple(dict.fromkeys(map(str, runs["configuration"])))
     if config.posterior:
         if config.parameters:
-            raise BadConfiguration("--posterior: says what is uncertain, and so does --parameters; give one of them")
+            raise BadConfiguration(
+                "--posterior: cannot be combined with --parameters, since both choose the "
+                "uncertain inputs; give one of them"
+            )
         return uncertain_inputs.inputs_from_posterior(robot, beside_robot(file), ranges)
     names = config.parameters or uncertain_inputs.default_input_names(
         robot, present, config.battery, config.model, not {*OF_TURNS}.isdisjoint(ranges)
@@ -177,7 +180,7 @@ def _inputs(
 
 
 def _candidates(config: configuration.Sensitivity, robot: Robot, points: Runs, turns: bool) -> Candidates:
-    """Runs of a table, or of Table 8 in every configuration. Of a rig, and of turns, its operating points."""
+    """Candidate runs: a table, or Table 8 in every configuration. For a rig or for turns, the operating points."""
     if config.candidates:
         runs = read_runs(config.candidates, robot, columns=config.columns, measured=False)
         source = runs.source

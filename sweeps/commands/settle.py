@@ -51,7 +51,8 @@ def execute(config: configuration.Settle, beside: configuration.SettledLog) -> i
 
 
 def stretches_table(found: Settled) -> Columns:
-    """Every stretch of a log, a row each: where it is, why it is left out, means, their sds, changes."""
+    """Table with a row for each segment of a log: position, reason if it was left out, means, their sds and
+    changes."""
     every = found.stretches
     table: Columns = {
         "run_id": np.array([s.run for s in every]),

@@ -52,7 +52,7 @@ PERMISSIBLE = "permissible_time_s"
 
 
 def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> int:
-    """Simulate runs of a file, or one of options. Leave a run folder. Returns the exit code.
+    """Simulate runs from a file, or one run from options, and write a run folder. Returns the exit code.
 
     Raises:
         BadConfiguration: more runs than histories can be kept of.
@@ -66,7 +66,7 @@ def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> 
     runs = given_runs(robot, beside, config)
     if fidelities.fidelity_facts(config.model).histories and len(runs) > _HISTORIES:
         raise BadConfiguration(
-            f"--runs: got {len(runs)} runs; --model {config.model} keeps at most {_HISTORIES} histories"
+            f"--runs: got {len(runs)} runs; --model {config.model} saves at most {_HISTORIES} histories"
         )
     posterior = None if config.posterior is None else beside_robot(file)
     with open_folder("simulate", config, robot, beside, runs) as folder:
@@ -192,7 +192,7 @@ def _permissible(motor: Motor, currents: Float[Array, " runs"]) -> Scalar:
 
 
 def motor_currents(robot: Robot, table: Columns) -> np.ndarray:
-    """Size of the current of one motor [A], of sides driven apart the larger, NaN where no column tells it."""
+    """Magnitude of the current of one motor [A], the larger one if the sides differ. NaN if no column contains it."""
     if all(column in table for column in _OF_SIDES):
         return np.asarray(np.max([np.abs(table[column]) for column in _OF_SIDES], axis=0))
     for column, motors in (("total_current_A", float(robot.sides)), ("motor_current_A", 1.0)):
@@ -212,8 +212,8 @@ def run_remarks(robot: Robot, table: Columns) -> list[str]:
         if "overvoltage" in flags:
             back = -float(robot.battery.current(table["total_current_A"][k]))
             remarks.append(
-                f"{name}overvoltage: {back:.2f} A flow into the battery, a cell at {cell:.2f} V, where "
-                f"{robot.battery.voltage_charge:g} V is the highest to charge it with"
+                f"{name}overvoltage: {back:.2f} A flow into the battery, a cell at {cell:.2f} V; the highest "
+                f"charging voltage is {robot.battery.voltage_charge:g} V"
             )
         if "cut_off" in flags:
             remarks.append(
@@ -229,14 +229,14 @@ def run_remarks(robot: Robot, table: Columns) -> list[str]:
         if np.isinf(table["winding_settled_C"][k]):
             current = float(motor_currents(robot, table)[k])
             remarks.append(
-                f"{name}winding, long running: {words.NONE_SETTLES} at {current:.2f} A a motor, as resistance "
-                "rises faster than its heat leaves; it stays permissible up to "
+                f"{name}winding, long running: {words.NONE_SETTLES} at {current:.2f} A per motor, because the "
+                "resistance rises faster than heat is removed; the permissible current is "
                 f"{float(robot.current_continuous):.2f} A"
             )
         if status == "battery_empty" and "time_end_s" in table:
             when, far = float(table["time_end_s"][k]), float(table["displacement_m"][k])
             remarks.append(
-                f"{name}battery_empty: after {when:.1f} s and {far:.2f} m; the numbers are those just before"
+                f"{name}battery_empty: after {when:.1f} s and {far:.2f} m; values are those just before"
                 if when > 0
                 else f"{name}battery_empty: empty before the start"
             )

@@ -59,7 +59,7 @@ def execute(config: configuration.Size, beside: configuration.FolderPart) -> int
             )
             charts: tuple[Chart, ...] = ()
             if config.report:
-                heard("charts of the limits")
+                heard("charts of limits")
                 robots = (robot,) if sizing.best is None else (best, robot)
                 charts = tuple(margin_chart(r, requirements, chart_extent(requirements)) for r in robots)
         result = SizeResult(requirements, robot, sizing, objectives, outcomes, charts)

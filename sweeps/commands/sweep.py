@@ -43,11 +43,12 @@ PROBED = 64
 
 
 def execute(config: Campaign | Sweep, options: StoreOptions) -> int:
-    """Simulate a design and leave a run folder, of a grid of up to `TABLE` runs with a table. Returns the exit code.
+    """Simulate a sweep and write a run folder, with a table if the grid has at most `TABLE` runs. Returns the exit
+    code.
 
     Args:
         config: the configuration.
-        options: of a store. With any of them a small grid leaves one too.
+        options: options of a store. With any of them a small grid leaves one too.
     """
     file = load_robot(config)
     if not isinstance(config, Sweep):
@@ -57,8 +58,8 @@ def execute(config: Campaign | Sweep, options: StoreOptions) -> int:
     count = math.prod(map(len, grid.grid_axes(resolved, file.robot, config.battery).values()))
     small = not options.of_store and (count <= TABLE or config.posterior is not None)
     if not options.of_store and not small:
-        print_message(f"{count:,} points: {STORE} in place of runs.csv, which a sweep of at most {TABLE:,} has; "
-             "the same command with --export csv writes it too")  # fmt: skip
+        print_message(f"{count:,} points: too many for runs.csv (limit {TABLE:,}), so results go to {STORE}; "
+             "add --export csv to get a CSV as well")  # fmt: skip
     for note in notes:
         print_message(note)
     if small:
@@ -167,11 +168,11 @@ def _free(path: Path) -> int:
 
 
 def _refuse_without_space(size: int, share: float, path: Path) -> None:
-    """Refuse a sweep whose results would not fit.
+    """Reject a sweep whose results would not fit on the disk.
 
     Args:
-        size: of the whole store [bytes].
-        share: of it that is still to be written.
+        size: size of the whole store [bytes].
+        share: share of it that is still to be written.
     """
     needed, free = math.ceil(size * share) + MARGIN, _free(path)
     if needed > free:
@@ -183,7 +184,7 @@ def _refuse_without_space(size: int, share: float, path: Path) -> None:
 
 
 def bytes_text(size: float) -> str:
-    """Bytes as a person reads them."""
+    """A number of bytes as text."""
     for unit in ("B", "kB", "MB", "GB", "TB"):
         if size < 1000 or unit == "TB":
             return f"{size:.3g} {unit}" if size < 1e6 else f"{size:,.0f} {unit}"
@@ -192,7 +193,7 @@ def bytes_text(size: float) -> str:
 
 
 def duration_text(seconds: float) -> str:
-    """Seconds as a person reads them."""
+    """A duration as text."""
     for unit, length in (("days", 86400.0), ("h", 3600.0), ("min", 60.0)):
         if seconds >= 2 * length:
             return f"{seconds / length:.1f} {unit}"
@@ -225,7 +226,7 @@ def simulate_chunks(store: SweepStore, job: scale.Job, options: StoreOptions, po
     total = sum(job.blocks.count(k) for k in own_chunks)
     before = total - sum(job.blocks.count(k) for k in left)
     if before:
-        print_message(f"{store.partial}: goes on after {before:,} of {total:,} points")
+        print_message(f"{store.partial}: resumes after {before:,} of {total:,} points")
     times = scale.Times()
     try:
         with progress_bar(total, quiet=False, done=before, rate=True) as advance:
@@ -245,7 +246,7 @@ def simulate_chunks(store: SweepStore, job: scale.Job, options: StoreOptions, po
 
 
 class DiskFull(InputError):
-    """No space left in the middle of a sweep, which can be taken up again."""
+    """The disk filled up during a sweep. The sweep can be resumed."""
 
 
 def finish_sweep(
@@ -275,8 +276,8 @@ def finish_sweep(
                 )
     done = store.done()
     if not store.finished:
-        print_output(f"{len(done)} of {len(job.blocks)} chunks of {store.partial} are done; the last share "
-            "finishes the sweep or the same command without --shard")  # fmt: skip
+        print_output(f"{len(done)} of {len(job.blocks)} chunks of {store.partial} are finished; the last share, "
+                     "or the same command without --shard, completes the sweep")  # fmt: skip
         return DONE
     if options.export:
         from sweeps.points import export

@@ -38,14 +38,16 @@ SHOWN = tuple(c.name for c in channels.OF_TURNS)
 
 
 def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> int:
-    """Simulate one run of options whose sides are driven apart. Leave a run folder. Returns the exit code.
+    """Simulate one run from options with different commands for the two sides, and write a run folder. Returns the
+    exit code.
 
     Raises:
         BadConfiguration: runs of a file, a robot that cannot turn, a turn without a steady state.
     """
     if beside.runs is not None:
-        raise BadConfiguration("--runs: got a file and --left, --right or --heading; state columns duty_left and "
-                               "duty_right in it, or one run by options")  # fmt: skip
+        raise BadConfiguration("--runs: got a file in addition to --left, --right or --heading; either put "
+                               "duty_left and duty_right columns in the file, or omit --runs and describe one "
+                               "run with options")  # fmt: skip
     file, given = load_robot(config), beside.stated
     robot = file.robot
     check_can_turn(robot, given.get("configuration") or robot.configurations.names[0])
@@ -150,7 +152,7 @@ def _demanded(robot: Robot, asked: Conditions, runs: Runs, config: configuration
         source = f"the {'battery' if config.battery else 'supply'} has {supply:.3g} V"
         why = (
             f"{demand} take {np.abs(volts).max():.3g} V at one motor" if np.isfinite(volts).all()
-            else f"no settled turn of {demand} was found"
+            else f"no settled turn with {demand} was found"
         )  # fmt: skip
         reaches = turn_words.turn_not_found_reason(config.speed_m_s, config.yaw_rate_rad_s, *at_full_voltage())
         raise BadConfiguration(f"--speed, --yaw-rate: {why}; {source}, {reaches}")
@@ -172,18 +174,18 @@ def _ended(history: History | None) -> dict[str, float] | None:
 
 
 def check_can_turn(robot: Robot, named: str) -> None:
-    """Refuse a robot that cannot turn, in this configuration.
+    """Reject a robot that cannot turn in this configuration.
 
     Raises:
         BadConfiguration: why.
     """
     imposed.check_can_turn(robot, (named,), "--left, --right, --heading")
     if robot.rig.imposed != "voltage":
-        raise BadConfiguration("--left, --right: the robot's file says that its motors are not driven by voltage")
+        raise BadConfiguration("--left, --right: in the robot's file the motors are not driven by voltage")
 
 
 def turn_columns(config: configuration.TurnPart, given: Json) -> Json:
-    """Columns of the run: duties of the supply's voltage, which is the larger one where it is not stated."""
+    """Columns of the run: both duties, and the supply voltage. Without --voltage it is the larger side voltage."""
     columns: Json = {} if config.heading_deg is None else {"heading_deg": config.heading_deg}
     if config.duty_left is not None:
         return columns | {"duty_left": config.duty_left, "duty_right": config.duty_right}
@@ -192,7 +194,7 @@ def turn_columns(config: configuration.TurnPart, given: Json) -> Json:
     most, supply = max(abs(config.left_V), abs(config.right_V)), given.get(SUPPLY)
     if supply is not None and supply < most:
         raise BadConfiguration(
-            f"--voltage: got {supply:g}; expected at least {most:g} V, what --left and --right ask"
+            f"--voltage: got {supply:g}; expected at least {most:g} V, the voltage of --left and --right"
         )
     volts = np.array([config.left_V, config.right_V])
     source, duties = sides.supply_and_shares(volts, None if supply is None else np.asarray(supply))

@@ -34,7 +34,7 @@ class FormatLaw(Protocol):
     """Law of a format in steady travel, with the parameters that a refit may change.
 
     Attributes:
-        names: of the parameters.
+        names: names of the parameters.
         start: their values by translation [SI], all positive or zero.
     """
 
@@ -51,7 +51,7 @@ class Fate:
     """Fate of an effect, or of a term of the base, in a format.
 
     Attributes:
-        name: of the effect or term.
+        name: name of the effect or term.
         verdict: `HELD`, `APPROXIMATED` or `DROPPED`.
         how: in words.
         kept: share of its change of current and speed that the exported drive shows [-], NaN where it has none.
@@ -78,10 +78,10 @@ class Comparison:
     Attributes:
         situation: the runs.
         translated, refitted: parameters of the format by name [SI], before and after the refit.
-        fates: of base terms and effects.
-        errors: of native, exported, translated, and exported without the effects.
+        fates: fates of base terms and effects.
+        errors: errors of native, exported, translated, and exported without the effects.
         reference: what errors are relative to, in words.
-        readings: of the exported drive [SI], (runs, channels).
+        readings: readings of the exported drive [SI], (runs, channels).
         exported: at the joint.
     """
 
@@ -114,7 +114,7 @@ def compare_format(
 
     Args:
         law_of: the format's law of a joint in which some amplitudes, by name of the effect, have other values.
-        fates: of terms that are no effects inside the joint.
+        fates: fates of terms that are no effects inside the joint.
         held: effects that the format holds by a term of its own → words for that term.
         approximated: words for the terms that replace an effect of a balance.
     """
@@ -130,7 +130,7 @@ def compare_format(
         verdict = HELD if effect.name in held else DROPPED if kept < LITTLE else APPROXIMATED
         how = held.get(effect.name) or approximated(effect.balance)
         if not np.isfinite(kept) and effect.name not in held:
-            verdict, how = DROPPED, "these runs do not show it, and the format has no term for it"
+            verdict, how = DROPPED, "it has no effect on these runs, and the format has no term for it"
         fates_found.append(Fate(effect.name, verdict, how, kept))
     exported = _at(law, theta, situation)
     models = {NATIVE: situation.native, EXPORTED: situation.readings(exported)}
@@ -201,7 +201,7 @@ def _refitted(law: FormatLaw, least: Any, command: Any, load: Any, way: Any, cur
 
 
 def share_kept(law: FormatLaw, bare: FormatLaw, situation: Situation, native: AtJoint, native_bare: AtJoint) -> float:
-    """Share of an effect's change of current and speed that a refitted format shows [-], at most 1.
+    """Fraction of an effect's change of current and speed that a refitted format reproduces [-], at most 1.
 
     1 less the rms of what the change of the format's error by the effect is, over that of the change itself. NaN
     where the effect changes nothing.

@@ -37,8 +37,8 @@ def export(
         data: runs to compare with, or the file of a table or log. None: a grid of operating points.
         configuration: which of the robot's. None: its first.
         joint: name of the joint in the simulator's model, for `mujoco`.
-        posterior: of a robot that comes from no file, as a calibration or the loop returns it.
-        draws, seed: of `randomization`.
+        posterior: posterior of a robot that comes from no file, as a calibration or the loop returns it.
+        draws, seed: draws and seed of `randomization`.
 
     Returns:
         The export: `files` by name, `comparison` with refitted parameters, fates of effects and errors in percent.

@@ -107,7 +107,8 @@ def apply_operation(op: str, *args: Symbol) -> Symbol:
 
 
 def choice_symbol(condition: Symbol, yes: Symbol, no: Symbol) -> Symbol:
-    """Returns the symbol of a choice. That of one branch where both are equal or the condition is known."""
+    """Returns the symbol of a choice. If both branches are equal or the condition is known, it is the symbol of
+    one branch."""
     if condition.is_const:
         return yes if condition.value else no
     return yes if yes is no else Symbol.of("where", (condition, yes, no))
@@ -288,8 +289,8 @@ def trace_function(function: Callable[..., Any], names: Sequence[str], what: str
         (result,) = _evaluated(closed.jaxpr, closed.consts, arguments)
     except NotImplementedError as error:
         raise BadConfiguration(
-            f"{what}: its equation uses {error or 'an operation'} of JAX, which has no closed form; rewrite it with "
-            "sums, products, powers and functions of numbers, or export without it"
+            f"{what}: its equation uses {error or 'an operation'} of JAX, which cannot be written as a formula; "
+            "rewrite it with sums, products, powers and scalar functions, or export without it"
         ) from error
     symbol: Any = result[()]
     return symbol
@@ -332,7 +333,7 @@ class Dialect:
 
 
 class Torch(Dialect):
-    """PyTorch, whose `maximum` takes tensors alone."""
+    """PyTorch, whose `maximum` accepts only tensors."""
 
     def __init__(self) -> None:
         super().__init__("torch")
@@ -355,7 +356,7 @@ def number_text(value: Any) -> str:
 
 
 def lines_of(result: Symbol, dialect: Dialect, spelled: Callable[[str], str], indent: str = "    ") -> list[str]:
-    """Lines of a function body that returns an expression. What is used more than once is a local variable.
+    """Lines of a function body that returns an expression. Repeated subexpressions become local variables.
 
     Args:
         spelled: text of a name.

@@ -53,7 +53,8 @@ class Map(eqx.Module):
 
 
 def symmetric_axis(largest: float) -> np.ndarray:
-    """Values from -`largest` to `largest`, 0 and both its neighbours close together, where friction turns round."""
+    """Values from -`largest` to `largest`, with both neighbours of 0 close to it, because friction changes sign
+    there."""
     half = np.linspace(0.0, largest, POINTS + 1)[1:]
     near = np.array([1e-3 * largest])
     return np.concatenate([-half[::-1], -near, [0.0], near, half])
@@ -83,7 +84,7 @@ def steady_state_map(module: ModuleType, params: Json, speed: np.ndarray, torque
 
 
 class TableLaw(eqx.Module):
-    """The tables, read with straight lines between their points. Attributes: as of `comparison.FormatLaw`."""
+    """The tables, with linear interpolation between points. Attributes: as of `comparison.FormatLaw`."""
 
     speed: jax.Array
     torque: jax.Array
@@ -111,7 +112,7 @@ class TableLaw(eqx.Module):
 
 
 def map_of(situation: Situation, constants: Sequence[Constant], amplitudes: Mapping[str, float] | None = None) -> Map:
-    """The tables of a drive, as far as the runs reach and a little beyond."""
+    """The tables of a drive, over the range of the runs and slightly beyond."""
     module = module_from_source(jax_source(situation.joint, constants))
     params = jax_actuator.steady_params(situation.joint, constants, amplitudes or {})
     reach = float(np.max(np.abs(situation.inside.speed))) * BEYOND
@@ -142,25 +143,25 @@ def fates_in_tables(joint: Joint, constants: Sequence[Constant]) -> list[Fate]:
     means = {c.name: c.value for c in constants}
     changed = []
     for fate in fates:
-        if fate.name == "friction by the joint's surroundings":
+        if fate.name == "friction from the joint's surroundings":
             values = ", ".join(f"{n.removeprefix('surroundings.')} = {means[n]:.4g}" for n in joint.surroundings())
             changed.append(Fate(fate.name, APPROXIMATED, f"their mean over the runs: {values}"))
         elif fate.name == mujoco.PLAY:
             play, twist = float(joint.load.backlash), float(joint.load.twist(1.0))
-            how = f"tables have no state: {play:.3g} rad of play and {twist:.3g} rad/(N·m) of twist"
+            how = f"tables have no state, so  {play:.3g} rad of play and {twist:.3g} rad/(N·m) of twist are ignored"
             changed.append(Fate(fate.name, DROPPED, how))
         elif fate.name == mujoco.CONTROLLER:
-            changed.append(Fate(fate.name, DROPPED, "tables give the voltage that it would find"))
+            changed.append(Fate(fate.name, DROPPED, "the tables give the voltage that it would produce"))
         else:
             changed.append(Fate(fate.name, fate.verdict, fate.how.replace("functions of the law", "the tables")))
-    how = "no table: add (armature) · acceleration to the torque"
-    lines = Fate("steady states", HELD, "straight lines between points")
+    how = "not in the tables: add armature · acceleration to the torque"
+    lines = Fate("steady states", HELD, "linear interpolation between points")
     return [*changed, Fate("rotor inertia", APPROXIMATED, how), lines]
 
 
 def effects_in_tables(joint: Joint) -> dict[str, str]:
-    """Words for each effect inside the joint without a memory. One with a memory is held at its settled value."""
-    settled = "its settled value: a table has no memory"
+    """Words for each effect inside the joint. Effects with a memory keep their settled value."""
+    settled = "its settled value, since a table has no state"
     return {e.name: settled if e.memory_size is not None else "the tables" for e in joint.inside}
 
 

@@ -26,12 +26,12 @@ from sweeps.export.situation import AtJoint, Situation, situation_of_joint
 
 #: Names of formats and their uses.
 FORMATS = {
-    "mujoco": "MJCF with <dcmotor>, and a scene that runs",
+    "mujoco": "MJCF with <dcmotor>, and a runnable scene",
     "jax": "an actuator function in JAX, as source and as a serialised program",
     "onnx": "the same step as an ONNX model, for Isaac Lab, Unity or C++",
     "mjlab": "an actuator configuration for law_source, in PyTorch",
     "table": "feed-forward and efficiency maps, as CSV and as a C header",
-    "randomization": "draws of the posterior in the parameters of MuJoCo and of the actuator",
+    "randomization": "samples from the posterior, as parameters of MuJoCo and of the actuator",
 }
 #: Goal of a start in MuJoCo [rad], and its length [s].
 GOAL, START = 0.5, 0.5
@@ -46,10 +46,10 @@ class Export:
     Attributes:
         format: one of `FORMATS`.
         joint: what is exported.
-        constants: of its law.
-        posterior: of the robot, if any.
+        constants: constants of its law.
+        posterior: posterior of the robot, if any.
         files: contents by name.
-        comparison: with the native model.
+        comparison: comparison with the native model.
         checks: numbers found with the files, by name.
     """
 
@@ -81,7 +81,7 @@ def export_format(
         configuration: name, None: the robot's first.
         data: runs, or the file of a table or log. None: a grid of operating points.
         at: name of the joint in the simulator's model.
-        draws, seed: of `randomization`.
+        draws, seed: draws and seed of `randomization`.
         posterior: of the robot. None: from the folder of its file.
 
     Raises:
@@ -108,10 +108,9 @@ def notes_of(runs: Situation) -> list[str]:
     """Sentences for the head of every file."""
     command = runs.command
     return [
-        f"Seen: {count_noun(len(command), 'run')} of {runs.source}, "
-        f"{np.min(command):.4g} to {np.max(command):.4g} V, "
-        f"{np.min(runs.load):.4g} to {np.max(runs.load):.4g} N·m at the joint. Nothing beyond was tested. "
-        "LAW.md has the equations, the intervals and what is lost."
+        f"Seen: {count_noun(len(command), 'run')} of {runs.source}, {np.min(command):.4g} to "
+        f"{np.max(command):.4g} V, {np.min(runs.load):.4g} to {np.max(runs.load):.4g} N·m at the joint. Other "
+        "conditions were not tested. LAW.md lists the equations, the intervals and the approximations."
     ]
 
 

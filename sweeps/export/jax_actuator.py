@@ -32,7 +32,7 @@ PLACES = "jax_traceback_in_locations_limit"
 class ActuatorLaw(eqx.Module):
     """The generated actuator in steady travel, without a refit. Attributes: as of `comparison.FormatLaw`.
 
-    params: of the actuator, of shape (runs,) where they differ.
+    params: parameters of the actuator, of shape (runs,) where they differ.
     guess: speed of the joint near the solution [rad/s].
     """
 
@@ -102,7 +102,7 @@ def fates_in_actuator(joint: Joint) -> list[Fate]:
     ]
     if joint.surroundings():
         names = ", ".join(joint.surroundings())
-        fates.append(Fate("friction by the joint's surroundings", HELD, f"parameters {names}, which you may change"))
+        fates.append(Fate("friction from the joint's surroundings", HELD, f"parameters {names}, free to change"))
     if robot.has_ground:
         how = "the simulator's own contact with the ground"
         fates.append(Fate("ground: slip and rolling resistance", DROPPED, how))

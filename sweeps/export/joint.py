@@ -46,8 +46,8 @@ class Part:
     Attributes:
         name: a word.
         balance: which it enters, or what it is.
-        unit: of its value.
-        equation, meaning: in words, from the docstring of what it is made of.
+        unit: unit of its value.
+        equation, meaning: equation and meaning in words, from the docstring of what it is made of.
         value: as an expression.
         slope: its derivative by the variable `by`.
         rate, rate_slope: of its memory.
@@ -74,7 +74,7 @@ class Joint:
     Attributes:
         file: the robot and what its file stated.
         configuration: name of its load.
-        robot: with this configuration and the effects inside alone.
+        robot: robot with this configuration and the effects inside alone.
         inside, outside: effects that enter the balances of a joint, and the others.
         idle: names of effects that do not act on this configuration.
         parts: equations of the law in their order.
@@ -102,7 +102,7 @@ class Joint:
 
     @property
     def limit(self) -> float | None:
-        """Largest current of one motor that the driver lets flow [A]. None: no limit."""
+        """Current limit of the driver per motor [A]. None: no limit."""
         limit = float(self.robot.driver.current_limit)
         return limit if limit < UNLIMITED else None
 
@@ -123,7 +123,8 @@ class Joint:
 
     @property
     def accelerates(self) -> bool:
-        """True if a loss depends on the torque at gearbox or wheel, which what turns before them takes a share of."""
+        """True if a loss depends on the torque at gearbox or wheel, which is reduced by the acceleration of the
+        parts before it."""
         gear = () if self.loose else self.of("gearbox")
         lossy = not self.loose and float(self.robot.gearbox.efficiency_load) != 1
         return lossy or any(p.by for p in (*gear, *self.of("track")))
@@ -202,22 +203,22 @@ def joint_of_robot(file: RobotFile, configuration: str | None = None) -> Joint:
         )
     if robot.unlike:
         raise BadConfiguration(
-            f"{file.name}: {', '.join(robot.unlike)} makes its sides differ, and one joint has one drive; expected a "
-            "robot with identical sides: export a robot file of each side, without this effect"
+            f"{file.name}: {', '.join(robot.unlike)} makes the two sides differ, but an export describes one "
+            "drive on one joint; export a separate robot file for each side, without this effect"
         )
     if robot.controller is not None and not robot.controller.supply_voltage:
         raise BadConfiguration(
-            f"{file.name}, controller.supply_voltage: missing, and an exported controller gives its motor a share of "
-            "it; state it [V]"
+            f"{file.name}, controller.supply_voltage: missing; the exported controller needs it to convert duty "
+            "to voltage; add it [V]"
         )
     if robot.rig.imposed != "voltage" and robot.controller is None:
         what = robot.rig.imposed.replace("_", " ")
         raise BadConfiguration(
             f"{file.name}, [rig] imposed: got {robot.rig.imposed}; expected voltage or a goal, the command of an "
-            f"exported drive. Where the {what} is imposed, the runs tell nothing about the winding"
+            f"exported drive. With an imposed {what}, the runs contain no information on the winding"
         )
     if lacking := [n for n in ("motor.resistance", "motor.torque_constant") if n in robot.rig.unknown]:
-        raise BadConfiguration(f"{file.name}: {', '.join(lacking)} is missing, and a drive's law needs it; state it")
+        raise BadConfiguration(f"{file.name}: {', '.join(lacking)} is missing; the drive law needs it; add it")
     members: Any = {name: robot.configurations[name]}
     one = dataclasses.replace(robot, configurations=members)
     acting = tuple(e for e in robot.effects if _acts(one, e))
@@ -253,7 +254,7 @@ class _Tracer:
         ]
 
     def __call__(self, function: Callable[[Robot, Signals], Any], what: str, balance: str, by: str = "") -> Symbol:
-        """Expression of a function of robot and signals. Of its derivative by a variable, where `by` names one."""
+        """Expression of a function of robot and signals, or of its derivative with respect to the variable `by`."""
         self.at_wheel = balance != "gearbox"
 
         def value(*numbers: Any) -> Any:
@@ -322,7 +323,7 @@ def _parts(joint: Joint) -> Iterator[Part]:
         ("gear_idle", "idle", "N·m", "M_i = M_rf0 sign ω + K_fr ω", "idle friction of the gearbox, at its input",
          "", lambda r, s: r.gearbox.torque_idle(s.speed_motor, s.direction)),
         ("gear_efficiency", "efficiency", "-", "η_rm where power flows to the wheel, 1/η_b where it flows back",
-         "share of the torque that the gearbox passes on; `load`: torque at its input", "",
+         "fraction of the torque that the gearbox transmits; `load`: torque at its input", "",
          lambda r, s: r.gearbox.efficiency_flow(s.torque_load, s.direction)),
         ("output_friction", "track", "N·m", friction,
          "friction between the gearbox and the wheel's rim, at the wheel", "pull",

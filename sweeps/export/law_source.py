@@ -28,7 +28,7 @@ from sweeps.export.joint import VARIABLES, Joint, Part, mean_surroundings
 
 #: Draws of the posterior by which intervals are found, and the shares of them below their ends.
 DRAWS, ENDS = 4000, (0.025, 0.975)
-OF_POSTERIOR, OF_PRIOR = "95 % interval", "prior, two sds either side: no posterior is known"
+OF_POSTERIOR, OF_PRIOR = "95 % interval", "from the prior (± two sds): no posterior available"
 
 
 def posterior_of(joint: Joint) -> Posterior | None:
@@ -50,7 +50,7 @@ def constants_of(joint: Joint, signals: Signals, posterior: Posterior | None) ->
     """Returns the numbers of the law: parameters of the robot, and means of the joint's surroundings over runs.
 
     Args:
-        signals: of the runs.
+        signals: signals of the runs.
     """
     ends = _intervals(posterior)
     constants = []
@@ -70,7 +70,7 @@ def constants_of(joint: Joint, signals: Signals, posterior: Posterior | None) ->
         constants.append(Constant(name, mean, unit, meaning, "mean over the compared runs"))
     if joint.controller is not None:
         volts = joint.controller.supply_voltage
-        constants.append(Constant(SUPPLY, volts, "V", "supply of the driver", "stated by the owner of the actuator"))
+        constants.append(Constant(SUPPLY, volts, "V", "supply of the driver", "given by the user of the actuator"))
     return tuple(constants)
 
 
@@ -91,7 +91,7 @@ def _interval(
     sd = stated[name][1] if name in stated else parameter.spec.prior_sd(value)
     if not sd:
         return None, None, ""
-    kind = "prior, two sds either side: not fitted" if fitted else OF_PRIOR
+    kind = "from the prior (± two sds): not fitted" if fitted else OF_PRIOR
     low, high = parameter.spec.bounds
     return max(value - 2 * sd, low), min(value + 2 * sd, high), kind
 
@@ -110,7 +110,7 @@ class Constant:
         value: [SI].
         unit, meaning, source: in words.
         low, high: limits of its interval, None: not known.
-        kind: of interval, in words.
+        kind: kind of interval, in words.
     """
 
     name: str
@@ -147,7 +147,7 @@ _TORCH = _Library(
 
 
 def function_arguments(symbol: Symbol) -> list[str]:
-    """Arguments of the function of an expression, besides its parameters."""
+    """Arguments of the function of an expression, in addition to its parameters."""
     used = names_of(symbol)
     used_arguments = [n for n in _ARGUMENTS if n in used]
     return [*used_arguments, "memory"] if any(n.startswith("memory.") for n in used) else used_arguments
@@ -478,14 +478,14 @@ def module_from_source(source: str, name: str = "exported_law") -> ModuleType:
     """
     tree = ast.parse(source)
     if not _states_a_law(tree):
-        raise BadConfiguration("export: the generated source would do more than state a law, so it is not executed")
+        raise BadConfiguration("export: the generated source contains more than the drive law, so it is not executed")
     module = ModuleType(name)
     exec(compile(tree, f"<{name}>", "exec"), module.__dict__)
     return module
 
 
 def _states_a_law(tree: ast.Module) -> bool:
-    """True if a source imports one library, assigns literals, and defines functions that call only these."""
+    """True if a source only imports one library, assigns literals, and defines functions that call nothing else."""
     defined = {node.name for node in tree.body if isinstance(node, ast.FunctionDef)} | {"range"}
     for node in tree.body:
         if isinstance(node, ast.Assign):

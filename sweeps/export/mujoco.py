@@ -30,7 +30,7 @@ FIRST = (3, 7, 0)
 #: Effects that the format has a term for, and which.
 TERMS = {
     "series_resistance": "resistance",
-    "supply_sag": "resistance, for all motors that draw as much",
+    "supply_sag": "resistance, for all motors together at equal currents",
     "armature_inductance": "inductance",
     "rotating_inertia": "armature of the joint",
     "thermal_drift": "thermal",
@@ -175,9 +175,9 @@ def fates_in_mujoco(joint: Joint, normal: float) -> list[Fate]:
     if float(gear.efficiency_load) != 1:
         fates.append(
             Fate(
-                "gearbox losses in proportion to the load", APPROXIMATED,
-                "resistance / η and current = act / η: exact while power flows to the load; where it flows back "
-                "(gravity, a heavy load that stops), the joint is braked less than the real one",
+                "gearbox losses proportional to the load", APPROXIMATED,
+                "resistance / η and current = act / η: exact while power flows to the load; while it flows back "
+                "(gravity, a heavy load that stops), the joint is braked less than in reality",
             )
         )  # fmt: skip
     if robot.has_ground:
@@ -202,22 +202,25 @@ def _controller_fate(joint: Joint, lag: float, ki: float) -> Fate:
     """Fate of a controller in `<dcmotor>`, whose own follows the motor's angle, at once, with a limited integral."""
     imposed = joint.robot.rig.imposed
     if imposed != "goal_angle":
-        how = f"<dcmotor> follows no {imposed.replace('_', ' ')} with such gains: LAW.md has them, give it voltages"
+        how = (
+            f"<dcmotor> has no {imposed.replace('_', ' ')} control with these gains: take them from LAW.md and "
+            "command voltages"
+        )
         return Fate(CONTROLLER, DROPPED, how)
     lost = [f"its lag of {lag:g} s is dropped"] * (lag > 0)
-    lost += ["its integral stops at a value, not where the duty is at its limit"] * (ki > 0)
-    lost += ["it reads the motor's side of the play"] * joint.loose
+    lost += ["its integral stops at a fixed value, not when the duty reaches its limit"] * (ki > 0)
+    lost += ["it measures the angle on the motor's side of the backlash"] * joint.loose
     return Fate(CONTROLLER, APPROXIMATED if lost else HELD, "; ".join(["gains and limit of voltage", *lost]))
 
 
 def fates_outside_joint(joint: Joint) -> list[Fate]:
-    """Fates of effects that no joint has."""
+    """Fates of effects that are not part of a joint."""
     where = {
-        "sensor": "an error of an instrument, no part of a drive",
-        "supply": "the battery; the command is a voltage, so reduce that",
-        "mass": "the mass of the robot; state it in the simulator's model",
+        "sensor": "an instrument error, not part of the drive",
+        "supply": "the battery; the command is a voltage, so reduce it accordingly",
+        "mass": "the mass of the robot; set it in the simulator's model",
     }
-    other = "a property of the ground, which the simulator's contact has to show"
+    other = "a property of the ground, which the simulator's contact model must provide"
     return [Fate(e.name, DROPPED, where.get(e.balance, other)) for e in joint.outside]
 
 
@@ -250,7 +253,7 @@ class Motor:
 
     @property
     def friction(self) -> float:
-        """Friction loss of the joint [N·m], without what `lugre` carries."""
+        """Friction loss of the joint [N·m], without the part in `lugre`."""
         return self.values[FRICTION] - (self.lugre[2] * self.ratio if self.lugre else 0.0)
 
 
@@ -348,8 +351,8 @@ def mjcf_fragment(
     Args:
         volts: highest voltage seen or allowed [V], which the control's range states and does not enforce.
         about: words for the source and interval of each attribute.
-        notes: of the header.
-        name: of the actuator and the default class.
+        notes: notes of the header.
+        name: name of the actuator and the default class.
         at: name of the joint.
     """
     v = found.values
@@ -414,8 +417,8 @@ def mjcf_scene(joint: Joint, mass: float, name: str, at: str, command: float, lo
     `load` gives the torque of slope and ground.
 
     Args:
-        mass: of the vehicle [kg].
-        command, load: of the key frame `run` [V or rad], [N·m].
+        mass: mass of the vehicle [kg].
+        command, load: command and load of the key frame `run` [V or rad], [N·m].
     """
     moved = joint.load
     if joint.robot.has_ground:
@@ -476,7 +479,7 @@ def _body(inertia: float, weight: float, angle: float) -> str:
 def attribute_notes(
     joint: Joint, constants: Sequence[Constant], translated: Mapping[str, float], values: Mapping[str, float]
 ) -> dict[str, str]:
-    """Words for where each attribute comes from, with intervals of what it is made of."""
+    """Origin of each attribute in words, with intervals of the parameters from which it is computed."""
     by_name = {c.name: c for c in constants}
 
     def made_of(*names: str) -> str:

@@ -31,7 +31,7 @@ def _library(name: str) -> Any:
 
 @contextlib.contextmanager
 def _single() -> Iterator[None]:
-    """Context of single precision, without JAX's warnings that a stated double becomes single."""
+    """Context of single precision, without JAX's warnings about doubles that become single."""
     with jax.enable_x64(False), warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Explicitly requested dtype", UserWarning)
         yield

@@ -34,8 +34,8 @@ class AtJoint:
     """Current and speed of a drive in each run, by one model, arrays of shape (runs,).
 
     Attributes:
-        current: of one motor [A].
-        speed: of the joint [rad/s].
+        current: current of one motor [A].
+        speed: speed of the joint [rad/s].
     """
 
     current: np.ndarray
@@ -50,9 +50,9 @@ class Situation:
         joint: the drive.
         source: of the runs, in words.
         runs: the table, its rows chosen.
-        conditions: of all rows of the table.
+        conditions: conditions of all rows of the table.
         kept: True for compared rows.
-        signals: of the joint's own model, with the effects inside alone, of shape (runs,).
+        signals: signals of the joint's own model, with the effects inside alone, of shape (runs,).
         native: readings of the whole model [SI], shape (runs, channels).
         measured: likewise, NaN if missing.
         command: mean voltage at the driver's output [V].
@@ -125,7 +125,7 @@ def _absent(joint: Joint, names: Names = ()) -> Robot:
 
 
 def _solved(robot: Robot, conditions: Conditions) -> tuple[np.ndarray, Signals]:
-    """Mask of the runs that end as their conditions ask, and the signals of all."""
+    """Mask of the runs that end in the commanded direction, and the signals of all runs."""
     result, signals = results_of_rows(robot, conditions)
     return np.asarray(is_done(result.status)), signals
 
@@ -141,8 +141,8 @@ def situation_of_joint(joint: Joint, data: Runs | str | None) -> Situation:
     if data is None:
         if not Layout.of(robot).table8 and imposed.imposed_limit(robot) is None:
             raise BadConfiguration(
-                f"--data: not stated, and {joint.file.name} has no motor.voltage_limit for a grid of operating "
-                "points; give a table of runs, or state the limit"
+                f"--data: not given, and {joint.file.name} has no motor.voltage_limit for a grid of operating "
+                "points; give a table of runs, or add the limit"
             )
         runs = export_grid(joint)
         source = "a grid of operating points in both directions, without readings"
@@ -157,7 +157,7 @@ def situation_of_joint(joint: Joint, data: Runs | str | None) -> Situation:
     native = np.stack([np.asarray(sensor_readings[c.name]) for c in channels], -1)
     kept = moves & turns & np.asarray(np.abs(signals.speed_motor) > 0) & (np.asarray(conditions.open) < 0.5)
     if not kept.any():
-        raise BadData(f"{source}: the model settles in none of its runs, so there is nothing to compare with")
+        raise BadData(f"{source}: the model settles in none of these runs, so no comparison is possible")
     signals = jax.tree.map(lambda x: x[kept] if np.shape(x) else x, signals)
     chosen = runs.where(kept)
     radius = float(joint.load.radius)
@@ -192,7 +192,8 @@ def export_grid(joint: Joint) -> Runs:
 
 
 def stall_torque(joint: Joint, voltage: np.ndarray) -> np.ndarray:
-    """Load at which a shaft's motor stalls [N·m], without effects, within the limits of driver and gearbox."""
+    """Load torque at which a shaft's motor stalls [N·m], without effects and within the limits of driver and
+    gearbox."""
     motor, gear, load = joint.robot.motor, joint.robot.gearbox, joint.load
     current = np.minimum(voltage / float(motor.resistance), float(joint.robot.driver.current_limit))
     torque = float(motor.torque_constant) * current - float(motor.friction_coulomb + gear.friction_coulomb)
@@ -206,18 +207,18 @@ def _measured(runs: Runs, channels: tuple[Any, ...]) -> np.ndarray:
 
 
 def _table(data: Runs | str, joint: Joint) -> Runs:
-    """Runs of a table in the joint's configuration. Of a log its settled stretches."""
+    """Runs of a table in the joint's configuration. For a log, its settled segments."""
     robot = joint.file.robot
     runs = read_runs(data, robot, measured=True, series=True) if isinstance(data, str) else data.of(robot)
     if runs.turns:
         raise BadData(
-            f"{runs.source}: its runs drive the sides independently, and one joint has one drive; expected straight "
-            "travel"
+            f"{runs.source}: its runs drive the two sides independently, but an export describes one drive; "
+            "expected straight travel"
         )
     if levers := [name for name in runs.axes if name.startswith("lever")]:
         raise BadData(
-            f"{runs.source}, {levers[0]}: the levers' posture moves the load, and one joint has one drive; expected "
-            "runs without columns of the levers"
+            f"{runs.source}, {levers[0]}: lever angles shift the load between drives, but an export describes one "
+            "drive; expected runs without lever columns"
         )
     if runs.sampled:
         from calibration.data import settling
@@ -226,5 +227,5 @@ def _table(data: Runs | str, joint: Joint) -> Runs:
         runs = settling.settle_log(runs, inertia=numbers[0], rolling=numbers[1]).settled_runs()
     here = runs.configurations_named(robot) == joint.configuration
     if not here.any():
-        raise BadData(f"{runs.source}: no run of {joint.configuration}; expected runs of the exported configuration")
+        raise BadData(f"{runs.source}: no run of {joint.configuration}; expected runs in the exported configuration")
     return runs.where(here)

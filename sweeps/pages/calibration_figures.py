@@ -21,7 +21,7 @@ SHOWN, ACROSS, WIDE = 6, 3, 0.5
 
 
 def draw_clusters(found: Sequence[ResidualCluster]) -> Figure:
-    """Residuals of each finding over its column, a dot a row. Bar: mean of a level."""
+    """Residuals of each finding over its column, one dot per row. Bars are means of a level."""
     found = found[:SHOWN]
     across = min(ACROSS, len(found))
     rows = -(-len(found) // across)
@@ -113,10 +113,10 @@ def draw_correlations(found: CalibrationResult) -> Figure:
     s = np.maximum(found.identifiability.singular_values, 1e-6)
     right.semilogy(np.arange(1, len(s) + 1), s, "o-", color=BLUE)
     right.axhline(1.0, color=ORANGE, lw=1)
-    right.text(len(s), 1.1, "below: the prior says more", fontsize=8.5, ha="right", va="bottom")
+    right.text(len(s), 1.1, "below: mainly determined by the prior", fontsize=8.5, ha="right", va="bottom")
     right.set_xticks(np.arange(1, len(s) + 1, 2))
     right.set(xlabel="direction", ylabel="singular value (prior sd / data sd)")
-    right.set_title("what the data tell apart")
+    right.set_title("combinations that the data determine")
     return fig
 
 

@@ -55,7 +55,7 @@ def varied_names(values: np.ndarray, layout: Layout) -> dict[str, Varied]:
 
 
 def draw_output(output: np.ndarray, label: str, values: np.ndarray, layout: Layout) -> Figure:
-    """How an output of a store spreads, and how it follows what varies."""
+    """Distribution of an output of a store, and its dependence on the varied quantities."""
     return draw_output_spread(output, label, varied_names(values, layout))
 
 
@@ -63,8 +63,8 @@ def draw_output_spread(output: np.ndarray, label: str, varied: Mapping[str, Vari
     """Histogram of an output, its median over the two names that it follows most, and over both together.
 
     Args:
-        output: of the points that settled.
-        label: with its unit.
+        output: output of the points that settled.
+        label: label with its unit.
         varied: by name, at these points.
     """
     names = sorted(varied, key=lambda name: -variance_share(varied[name].values, output))[:2]
@@ -107,8 +107,8 @@ def draw_grid_statuses(codes: np.ndarray, names: Sequence[str], across: Varied, 
     """Status of the points of a grid over two of its axes.
 
     Args:
-        codes: of the points.
-        names: of the codes.
+        codes: codes of the points.
+        names: names of the codes.
     """
     fig, axes = new_figure(1, 1, 4.2)
     ax = axes[0, 0]
@@ -127,7 +127,7 @@ def draw_grid_statuses(codes: np.ndarray, names: Sequence[str], across: Varied, 
 
 
 def _number(values: np.ndarray, most: int) -> int:
-    """Bins that so many values fill."""
+    """Number of bins for this many values."""
     return min(most, max(LEAST, len(values) // EACH))
 
 

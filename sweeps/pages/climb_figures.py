@@ -179,7 +179,7 @@ class Film(NamedTuple):
 
     @property
     def time(self) -> np.ndarray:
-        """Of the samples [s]."""
+        """Times of the samples [s]."""
         return self.found.table["time_s"]
 
     def sheet(self, k: int) -> Figure:
@@ -201,7 +201,8 @@ class Film(NamedTuple):
 def render_climb(
     found: Drawable, file: Path, begin: float | None = None, end: float | None = None, slow: float | None = None
 ) -> Path:
-    """The run as a film (.gif, .mp4) or a picture (.png), of the instant `begin` or else of the largest pitch."""
+    """The run as a film (.gif, .mp4), or a picture (.png) at the instant `begin`, by default that of the largest
+    pitch."""
     view = Film(found)
     if begin is None:
         begin = float(view.time[np.argmax(np.abs(found.table["pitch_deg"]))]) if file.suffix == ".png" else 0.0

@@ -87,7 +87,7 @@ def errors_over(
     in_units: bool = False,
     beside: Mapping[str, str] | None = None,
 ) -> Figure:
-    """Error (35) of each channel over each condition, over the rows where there is no condition.
+    """Error (35) of each channel over each condition, or over the row number if no condition varies.
 
     Args:
         beside: further columns than conditions, with their words, where errors are in units.
@@ -138,5 +138,5 @@ def errors_over(
 
 
 def _dots(axes: Axes, x: np.ndarray, y: np.ndarray, marker: str, **look: Any) -> None:
-    """Readings of a configuration. Very many of them as a picture."""
+    """Readings of a configuration as dots, rasterised if there are many."""
     axes.plot(x, y, marker, ms=5, mec="white", mew=0.5, rasterized=len(x) > 500, **look)

@@ -88,7 +88,7 @@ LINE = 0.2
 
 @contextmanager
 def figure_settings(width: float = WIDTH) -> Iterator[None]:
-    """The settings of every figure, for as long as the block lasts. At the width `NARROW` panels are stacked.
+    """Context with the settings of every figure. At the width `NARROW` panels are stacked.
 
     Matplotlib reads a file `matplotlibrc` of the working folder, which could change figures or run LaTeX.
     """
@@ -148,14 +148,13 @@ def can_stack(fig: Figure) -> bool:
 
 
 def colour_bar(fig: Any, drawn: ScalarMappable, axes: Any, **keywords: Any) -> Any:
-    """Scale of colours next to axes. Below them in a narrow figure."""
+    """Colour bar next to the axes, or below them in a narrow figure."""
     return fig.colorbar(drawn, ax=axes, location="bottom" if is_narrow() else "right", **keywords)
 
 
 def fit_for_phones(fig: Figure) -> Figure:
-    """A narrow figure with wrapped labels and titles. Stacked panels have the labels that they shared.
-
-    Legends next to their axes are above them.
+    """Adapts a narrow figure: wraps labels and titles, repeats shared labels on stacked panels, and moves legends
+    above their axes.
     """
     grid: Any = vars(fig)["panels"]
     for i, j in np.ndindex(grid.shape):
@@ -349,7 +348,7 @@ def _has_names(axis: Axis) -> bool:
 
 
 def _run(axis: Axis) -> Json:
-    """The ends of an axis, whether it is logarithmic, and its names where its ticks have any."""
+    """Ends of an axis, whether it is logarithmic, and the names of its ticks if they have names."""
     ends = [float(f"{end:.6g}") for end in axis.get_view_interval()]
     axis_facts: Json = {"ends": ends, "log": axis.get_scale() == "log"}
     if _has_names(axis):

@@ -37,10 +37,10 @@ class Gear:
     Attributes:
         name: heading.
         on_tracks: or on wheels, status.
-        radius: of the pulleys [m].
+        radius: radius of the pulleys [m].
         time: [s].
         signals, reactions: over it.
-        guide_share: on average at the end [-].
+        guide_share: guide share on average at the end [-].
     """
 
     name: str
@@ -85,7 +85,7 @@ def members_with_gear(
     Args:
         history: time, signals and reactions of the batch.
         status: codes of how its members ended.
-        guide_share: of each member [-].
+        guide_share: guide share of each member [-].
         which: index of each member's configuration in `robot`.
         names: headings of the members.
     """
@@ -102,7 +102,7 @@ def members_with_gear(
 
 
 def ripple_numbers(gear: Gear) -> Json:
-    """What ripples in a run, by how much and how often."""
+    """Size and frequency of the ripples in a run."""
     tail, signals = gear.tail(TAIL), gear.signals
     line, travel, reaction = (
         ripple_peaks.ripple(gear.time[tail], x[tail]) for x in (signals.total_current, signals.speed, signals.normal)
@@ -194,7 +194,7 @@ def draw_reactions(shown: list[Gear], title: str = "{}, one side") -> Figure:
         axes.set(ylim=(0, 1.25 * top), xlabel="time [ms]", ylabel="normal reaction [N]")
         axes.set_title(title.format(gear.name))
         if gear.on_tracks:
-            corner_note(axes, "orange: what the lower guide carries; above it: all grousers")
+            corner_note(axes, "orange: load on the lower guide; above it: load on all grousers")
         else:
             axes.set_xlim(0, 1.3e3 * SHOWN)
     return fig

@@ -82,7 +82,7 @@ def over_log(found: Settled) -> Figure:
 
 
 def _thinned(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A line of few points that looks the same: the least and the greatest sample of each group."""
+    """A line with fewer points that looks the same: the smallest and largest sample of each group."""
     size = -(-2 * len(x) // POINTS)
     if size <= 2:
         return x, y
@@ -97,7 +97,7 @@ _STAGES = (("I", "#fdebd0", "starting"), ("II", "#e3eef7", "slipping"), ("III", 
 
 
 def _largest(time: np.ndarray, values: np.ndarray) -> float:
-    """Value of the largest size of a sampled curve, between its samples too. NaN of none."""
+    """Value with the largest magnitude of a sampled curve, also between samples. NaN without samples."""
     if len(values) < 3:
         return float(values[np.argmax(np.abs(values))]) if values.size else np.nan
     return float(
@@ -112,9 +112,10 @@ class Start:
     Attributes:
         name: heading, configuration, status.
         time: [s].
-        current: of all motors [A].
+        current: current of all motors [A].
         speed, theoretical: V and r_k ω_k [mm/s].
-        stages: of the start. Current and speeds are drawn, and kept here, times its `sense`. None without numbers.
+        stages: stages of the start. Current and speeds are drawn, and kept here, times its `sense`. None without
+            numbers.
     """
 
     name: str
@@ -128,7 +129,7 @@ class Start:
 
     @property
     def sense(self) -> float:
-        """In which the shafts turn at the end, 1 or -1."""
+        """Direction in which the shafts turn at the end, 1 or -1."""
         return 1.0 if self.stages is None else self.stages.sense
 
     @property
@@ -361,7 +362,7 @@ def _stages(axes: Axes, start: Start, scale: float = 1.0) -> None:
 
 
 def _share(axes: Axes, text: str, size: float = 8.5) -> float:
-    """About the share of the axes' width that a text in bold takes [-]."""
+    """Approximate fraction of the axes' width that a bold text takes [-]."""
     return 0.72 * size * len(text) / 72 * axes.figure.dpi / axes.bbox.width
 
 
@@ -372,7 +373,7 @@ class Course:
     Attributes:
         name: heading, status.
         time: [s].
-        readings: of each channel by name, in the unit of its column.
+        readings: readings of each channel by name, in the unit of its column.
     """
 
     name: str
@@ -381,7 +382,7 @@ class Course:
     readings: Columns
 
     def largest(self, channel: str) -> float:
-        """Reading that is largest in size."""
+        """Reading with the largest magnitude."""
         return _largest(self.time, self.readings[channel])
 
     def last(self, channel: str) -> float:
@@ -395,7 +396,7 @@ def members_as_read(read: Iterable[Channel], history: Any, status: np.ndarray, n
 
     Args:
         read: channels of the robot.
-        history: of the batch.
+        history: history of the batch.
         status: codes of how its members ended.
         names: headings of the members.
     """
@@ -460,7 +461,7 @@ def draw_frequency_response(runs: Runs, read: Sequence[Channel], simulated: Mapp
     """Gain and phase of each channel over the frequency of the drive: measured as points, simulated as lines.
 
     Args:
-        runs: with measured and simulated columns.
+        runs: runs with measured and simulated columns.
         read: channels.
         simulated: prefixes of the simulated columns, and their names.
     """

@@ -42,7 +42,7 @@ from sweeps.report.run_tables import UNITS, imposed_column
 #: Effects on the ladder and on the map of look-alikes.
 RUNGS, ALIKE = 20, 14
 DEFECT_WORDS = {
-    "electrical": ("voltage missing", "V", "current_A", "current of all motors [A]"),
+    "electrical": ("voltage missing", "V", "current_A", "total motor current [A]"),
     "track": ("torque missing at the pulley", "N·m", "motor_speed_rpm", "motor speed [rpm]"),
     "slip": ("speed lost", "mm/s", "slope_deg", "slope [deg]"),
 }
@@ -95,7 +95,7 @@ def before_after(table: Columns, channels: Sequence[Channel], verdict: str) -> F
             axes.plot(x, before, "o", ms=4.5, color=BLUE, label="the fitted model")
         else:
             axes.plot(x, before, "o", ms=5.5, mfc="none", color=ORANGE, label="before: the fitted model")
-            axes.plot(x, after, "o", ms=4, color=BLUE, label="after: with what was found")
+            axes.plot(x, after, "o", ms=4, color=BLUE, label="after: with the effects found")
         for edge in edges:
             axes.axvline(edge - 0.5, color="#bbbbbb", lw=0.8, ls=":")
         axes.set_ylabel(f"{channel.label} [σ]")
@@ -228,7 +228,7 @@ def draw_gains(found: DiscoveryResult) -> Figure:
         axes.errorbar(len(names), gain.mean, error, fmt="o", ms=5.5, mfc=BLUE if proposed else "white", color=BLUE,
                       label="proposed, ± standard error" if proposed else None)  # fmt: skip
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-    axes.set(xlabel="effects added", ylabel="gain [nat a reading]")
+    axes.set(xlabel="effects added", ylabel="gain [nat per reading]")
     outer_legend(axes, "upper left")
     return fig
 
@@ -267,7 +267,7 @@ def draw_effect_scores(found: DiscoveryResult) -> Figure:
     axes.set_yticks(range(len(rungs)), [f"{r.name}  ({r.balance})" for r in rungs])
     axes.set_ylim(len(rungs) - 0.4, -1.8)
     axes.grid(axis="y", visible=False)
-    axes.set(xlabel="score: linear estimate of the misfit that the effect alone explains, at a plausible size [σ]")
+    axes.set(xlabel="score: linear estimate of the misfit that the effect alone explains at a plausible size [σ]")
     axes.set_title("blue: found; light blue: indistinguishable from a found effect in these data")
     return fig
 
@@ -361,8 +361,8 @@ def depends_on(table: Columns, change: np.ndarray, driver: str = "") -> tuple[np
     """Abscissa of an effect and its label: the condition or reading that makes the change of a reading smoothest.
 
     Args:
-        change: of the reading, shape (rows,), NaN where a row does not count.
-        driver: of the effect; variables with that word are preferred.
+        change: change of the reading, shape (rows,), NaN where a row does not count.
+        driver: driver of the effect; variables with that word are preferred.
     """
     use = np.isfinite(change)
     every = {k: np.asarray(v, float) for k, v in conditions_and_readings(table).items()}
@@ -509,7 +509,7 @@ def base_shift(found: DiscoveryResult) -> Figure:
     axes.invert_yaxis()
     axes.grid(axis="y", visible=False)
     axes.set(xlabel="shift from the prior [prior sds]")
-    axes.set_title("orange: before, blue: after; one far off probably absorbs a missing effect")
+    axes.set_title("orange: before, blue: after; a large shift probably absorbs a missing effect")
     return fig
 
 

@@ -40,7 +40,7 @@ def draw_mission_course(rows: Columns, cycle: float | None, limit: float, linear
     Args:
         rows: of history.csv, of one run.
         cycle: end of its first cycle [s], None where it has one only.
-        limit: of the winding's temperature [°C].
+        limit: limit of the winding's temperature [°C].
         linear: whether the profile's values are, between rows.
         sides: number of motors.
     """
@@ -176,7 +176,7 @@ def _near(rows: Columns, limit: float) -> bool:
 
 def _temperatures(axes: Axes, time: np.ndarray, rows: Columns, limit: float, legend: bool) -> None:
     if "housing_temperature_C" not in rows:
-        corner_note(axes, "not known: the robot's file does not\nstate how heat leaves the windings")
+        corner_note(axes, "not computed: the robot's file lacks\nthe thermal resistance of the windings")
         axes.set_yticks([])
         return
     axes.plot(time, rows["winding_temperature_C"], color=VERMILION, lw=1.4, label="winding")
@@ -210,9 +210,7 @@ def _source(axes: Axes, time: np.ndarray, rows: Columns) -> None:
     beside.plot(time, volts, color=BLUE, lw=0.8, alpha=0.8)
     for k in np.flatnonzero(rows["event"] == "below_cut_off")[-1:]:
         axes.axvline(time[k], color=VERMILION, lw=1.0, ls="--")
-        corner_note(
-            axes, "cells below their cut-off from the broken line on", x=0.02, y=0.06, va="bottom", color=FAINT
-        )
+        corner_note(axes, "broken line: cells fall below their cut-off", x=0.02, y=0.06, va="bottom", color=FAINT)
 
 
 def draw_mission_energy(run: Json, on_battery: bool, on_ground: bool = True) -> Figure:
@@ -226,7 +224,7 @@ def draw_mission_energy(run: Json, on_battery: bool, on_ground: bool = True) -> 
     bars: list[tuple[str, float, str]] = [(source, energy, INK)]
     for name in SINKS:
         bars.append((words.sink_labels(on_ground)[name], float(run[f"energy_to_{name}_Wh"]), _COLOURS[name]))
-    bars.append(("left in motion at the end", float(run["energy_stored_Wh"]), FAINT))
+    bars.append(("kinetic energy at the end", float(run["energy_stored_Wh"]), FAINT))
     bars.append(("returned to the source", float(run["energy_returned_Wh"]), GREEN))
     bars = [bar for bar in bars if abs(bar[1]) > 1e-5 * max(energy, 1e-12)]
     fig, grid = new_figure(1, 1, 0.9 + 0.34 * len(bars))

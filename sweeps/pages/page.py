@@ -103,14 +103,14 @@ def _section(file: RobotFile, nominal: Robot) -> Section:
     first, value = Column("parameter"), "{:.6g}"
     if not file.robot.rig.inherits:
         columns = (first, Column("value", form=value), *end, Column("source"))
-        text = "Its parameters (SI units). A loss or limit that its file does not state is absent."
+        text = "Its parameters (SI units). Losses and limits that are not in its file are left out."
         rows, table = capabilities.rig_parameters(file), "own"
     else:
         columns = (first, Column("this robot", form=value), Column("nominal", form=value), *end)
         text = "Parameters that differ from the nominal robot's (SI units):"
         rows, table = capabilities.changed_parameters(file.robot, nominal), "changed"
     if not rows:
-        text = "Every parameter is the nominal robot's (Tables 1-7 of the paper and the makers' sheets)."
+        text = "Every parameter has its value from the nominal robot (Tables 1-7 of the paper and data sheets)."
     return Section(
         "The robot", (Note(text), Table(table, columns, [(f"`{name}`", *rest) for name, *rest in rows])), "robot"
     )
@@ -147,7 +147,7 @@ def render_page(folder: Path, album: Album, **known: Any) -> Path:
 
 
 def _beside(folder: Path, meanings: dict[str, str]) -> dict[str, str]:
-    """Files that a run folder has, or is about to have, with what they are. What is known first."""
+    """Files of a run folder, including those still to be written, with their descriptions. Known files come first."""
     files = {p.name + "/" * p.is_dir() for p in folder.iterdir()} | {"manifest.json"}
     files = {name for name in files if name in meanings or "." in name} - {"report.html"}  # no locks, no chunks
     return {

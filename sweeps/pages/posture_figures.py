@@ -29,7 +29,7 @@ LONGEST = 100.0
 def draw_margins(found: CheckResult) -> Figure:
     """A bar for each requirement: its margin in percent of what is required, right where it is met.
 
-    The values reached are left out for phones, where the page's table shows them.
+    Phone versions omit the values, which are in the page's table.
     """
     rows = found.outcomes
     fig, axes = new_figure(1, 1, 0.9 + 0.42 * len(rows))

@@ -34,9 +34,8 @@ _DARK = (PURPLE, BLUE, GREEN, INK)
 
 
 def power_by_item(runs: Columns) -> Columns:
-    """Power [W] of each item, of every run, out of the powers of `runs.csv`.
-
-    Rolling resistance holds the acceleration where a run has not settled.
+    """Power [W] of each item in every run, from the powers in `runs.csv`. If a run has not settled, rolling
+    resistance includes the acceleration.
     """
     chain = [runs[f"power_{place}_W"] for place in ("supply", "motor", "gear", "ground", "lift")]
     losses = [above - below for above, below in itertools.pairwise(chain)]
@@ -45,7 +44,7 @@ def power_by_item(runs: Columns) -> Columns:
 
 
 def power_sources(runs: Columns) -> tuple[np.ndarray, np.ndarray]:
-    """Power [W] that the supply gives, and that the slope gives a run downhill."""
+    """Power [W] from the supply, and from the slope in runs downhill."""
     return np.maximum(runs["power_supply_W"], 0.0), np.maximum(-runs["power_lift_W"], 0.0)
 
 
@@ -99,7 +98,8 @@ INSIDE = ("duty", "supply", "electrical", "motor", "gearbox")
 def drive_curves(robot: Robot, voltage: float) -> Columns:
     """Torque at the gearbox output, speed, current and efficiency of one motor and gear at a supply voltage.
 
-    By the robot's own equations with a frictionless shaft as its load, from no load to the current limit or to stall.
+    They are computed with the robot's equations and a frictionless shaft as the load, from no load to the current
+    limit or to stall.
     """
     shaft = Shaft(inertia=1e-3, loss_coulomb=0.0)
     inside = tuple(e for e in robot.effects if e.balance in INSIDE and e.acts_everywhere)
@@ -155,7 +155,7 @@ def draw_chart_of_corners(robot: Robot, corners: Sequence[Json]) -> Figure:
 def draw_drive_chart(robot: Robot, voltages: Sequence[float], points: Columns) -> Figure:
     """Speed, current and efficiency of one motor and gear over the torque at the output.
 
-    Shaded are the torques up to the current that the winding bears continuously, and up to that of the driver.
+    Shaded areas are torques up to the winding's continuous current, and up to the driver's current limit.
     """
     fig, grid = new_figure(1, 3, 3.0, sharex=True)
     panels = {

@@ -36,7 +36,7 @@ _UNREAD = {"slides": ">", "failed": "x", "tips": "^", "stalled": "_", "too_slow"
 
 
 def resonance_map(found: ResonanceResult) -> Figure:
-    """Natural frequencies against harmonics of what passes. Below, ripple at every speed and payload."""
+    """Natural frequencies and harmonics of the passing frequency. Below them, ripple at every speed and payload."""
     rows = len(found.modes)
     heights = [4.4, *(0.5 + 0.2 * rows for _ in MAPS)]
     fig, grid = new_figure(4, 1, sum(heights) + 0.6, sharex=True, height_ratios=heights)
@@ -50,7 +50,7 @@ def resonance_map(found: ResonanceResult) -> Figure:
 
 
 def _top(found: ResonanceResult) -> float:
-    """Greatest frequency drawn [Hz]."""
+    """Largest frequency drawn [Hz]."""
     bands = [m.high for modes in found.modes.values() for m in modes if m.resonant]
     lines = [found.table[f"{name}_frequency_Hz"][found.read] for name in _MARKS]
     top = float(np.nanpercentile(np.concatenate(lines), 90)) if found.read.any() else 0.0
@@ -128,7 +128,7 @@ def _bands(axes: Axes, found: ResonanceResult) -> None:
 
 
 def ripple_map(axes: Axes, found: ResonanceResult, name: str) -> None:
-    """Ripple of one signal over speed, a row for each payload. Bars where a peak is to be avoided."""
+    """Ripple of one signal over speed, one row per payload. Bars mark peaks to avoid."""
     table, payloads = found.table, list(found.modes)
     ripple = table[f"{name}_ripple_percent"]
     settled = found.read & (table["status"] == "converged")
@@ -170,7 +170,7 @@ def ripple_map(axes: Axes, found: ResonanceResult, name: str) -> None:
     others = [s for s in dict.fromkeys(map(str, table["status"])) if s != "converged"]
     kinds = "; ".join(f"{_UNREAD.get(s, '·').replace('_', '–')} {words.short_status(s)}" for s in others)
     label = SIGNALS[name].label
-    remarks = [] if most >= 100 * MATTERS else [f"under {100 * MATTERS:g} %: no speed to avoid for it"]
+    remarks = [] if most >= 100 * MATTERS else [f"under {100 * MATTERS:g} %: too small to avoid the speed"]
     remarks += [kinds] if kinds else []
     axes.set_title(f"Ripple of {label}" + (f"   ({'; '.join(remarks)})" if remarks else ""))
     if len(axes.collections) and "mesh" in locals():

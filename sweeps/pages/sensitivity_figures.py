@@ -18,7 +18,7 @@ _MAP = "Blues"
 
 
 def leading_inputs(share: np.ndarray, most: int = SHOWN) -> np.ndarray:
-    """Indices of the inputs with the largest share, none that is negligible unless all are."""
+    """Indices of the inputs with the largest shares. Negligible inputs are left out unless all are negligible."""
     order = np.argsort(-share, kind="stable")
     kept = [k for k in order[:most] if share[k] >= NEGLIGIBLE]
     return np.array(kept or order[:1], int)
@@ -55,7 +55,7 @@ def _cells(ax: Axes, shares: np.ndarray, labelled: int) -> None:
 
 
 def draw_tornado(study: OutputStudy, found: SensitivityResult) -> Figure:
-    """The output with each input alone at the ends of its 95 % interval, at a few operating points."""
+    """The output with a single input at the ends of its 95 % interval, at a few operating points."""
     # Operating points of a tornado: of each configuration the gentlest and the hardest that it runs, or between
     points = found.points
     kinds = list(dict.fromkeys(map(str, points.configuration)))

@@ -16,7 +16,7 @@ _COLOURS = dict(zip(LIMITS, (BLUE, "#555555", VERMILION, PURPLE, ORANGE, "#8c564
 
 
 def draw_nearest_limits(found: SizeResult, charts: dict[str, Chart]) -> Figure:
-    """One panel a robot: the colour says which limit is nearest, the line where it is reached."""
+    """One panel per robot. The colour shows which limit is nearest, the line where it is reached."""
     fig, axes = new_figure(1, len(charts), 4.6, sharex=True, sharey=True)
     e = found.asked.envelope
     palette = ListedColormap([_COLOURS[name] for name in LIMITS])

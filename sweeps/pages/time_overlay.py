@@ -129,7 +129,7 @@ def time_overlay(table: Columns, channels: Sequence[Channel], simulated: Mapping
     """Overlay of a table of time histories, run by run.
 
     Args:
-        table: with `time_s`, `run_id` where there are several runs, measured and simulated columns.
+        table: table with `time_s`, `run_id` where there are several runs, measured and simulated columns.
         channels: channels to show. Those without any reading are left out.
         simulated: prefixes of the simulated columns and their names, as in `TimeOverlay`.
     """

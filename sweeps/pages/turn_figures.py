@@ -22,7 +22,7 @@ BEND = 0.05
 
 
 def _outline(axes: Axes, robot: Robot, row: Json, x: float, y: float, yaw: float, color: str) -> None:
-    """The robot from above: its contact lines, a bar between them and an arrow ahead."""
+    """The robot from above: its contact lines, a bar between them and an arrow pointing ahead."""
     length = float(robot.running_gear.wheelbase)
     width = float(robot.configurations[str(row["configuration"])].turning.width)
     ahead, left = np.array([np.cos(yaw), np.sin(yaw)]), np.array([-np.sin(yaw), np.cos(yaw)])
@@ -37,7 +37,7 @@ def _outline(axes: Axes, robot: Robot, row: Json, x: float, y: float, yaw: float
 def _plan(axes: Axes) -> None:
     axes.set_aspect("equal", adjustable="datalim")
     axes.set_xlabel("to the right of the start [m]", color=INK)
-    axes.set_ylabel("uphill, or ahead of the start [m]", color=INK)
+    axes.set_ylabel("uphill of the start, or ahead of it [m]", color=INK)
 
 
 def draw_turn_circle(robot: Robot, row: Json) -> Figure:
@@ -89,7 +89,7 @@ def path_arcs(
 
 
 def draw_path(robot: Robot, row: Json, x: np.ndarray, y: np.ndarray, yaw: np.ndarray) -> Figure:
-    """A path from above, the robot at its beginning and its end, and between."""
+    """A path from above, with the robot at its start, at its end and in between."""
     finite = np.isfinite(x)
     x, y, yaw = x[finite], y[finite], yaw[finite]
     fig, grid = new_figure(1, 1, 4.6)
@@ -127,7 +127,7 @@ def draw_turn_course(history: History) -> Figure:
 
 
 def over_yaw_rate(turns: Columns, row: Json) -> Figure:
-    """Current of either side and power over the yaw rate of settled turns, the one asked for marked."""
+    """Currents of both sides and power over the yaw rate of settled turns. The requested turn is marked."""
     fig, grid = new_figure(1, 2, 3.4)
 
     def rate(motion: Json) -> np.ndarray:

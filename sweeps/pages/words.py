@@ -14,31 +14,32 @@ class Status(NamedTuple):
     meaning: str
 
 
-#: What is said of a status of a model where it means something else, by both names.
+#: Phrases for a status that means something else in one model, by both names.
 VERDICTS = {("climb", "converged"): "came to a verdict"}
 STATUSES: dict[str, Status] = {
     "converged": Status("settled", "steady travel", "found a steady operating point"),
     "stalled": Status(
         "stands",
-        "friction holds it, or the motors cannot turn the load",
-        "the robot stands: friction at rest holds it, or the motors cannot turn against the load and draw "
+        "held by friction, or the motors cannot turn the load",
+        "the robot does not move: static friction holds it, or the motors cannot turn the load and draw "
         "their stall current",
     ),
     "slides": Status(
         "slides",
         "traction demand above the adhesion limit",
-        "slope and rolling resistance demand more traction than adhesion gives (demand above μ_s N), so the movers "
-        "spin and the robot does not climb; an operating point does not exist",
+        "slope and rolling resistance demand more traction than adhesion gives (demand above μ_s N), so the "
+        "movers "
+        "spin, the robot does not climb, and there is no operating point",
     ),
     "not_settled": Status(
         "not settled",
-        "still accelerating at the end of the run (try a longer --duration), or a turn that has no steady state, "
-        "which --model drive follows",
-        "still gaining speed when the simulated time ended, or a turn for which no steady state was found, as where "
-        "friction falls with sliding",
+        "still accelerating at the end of the run (try a longer --duration), or a turn without a steady state "
+        "(use --model drive to simulate it over time)",
+        "still accelerating at the end of the simulated time, or a turn for which no steady state was found, "
+        "for example because friction falls with sliding speed",
     ),
-    "battery_empty": Status("battery empty", "the battery has no charge left", "the battery's capacity is used up"),
-    "failed": Status("failed", "the solver gave up", "the solver found no answer; please report the conditions"),
+    "battery_empty": Status("battery empty", "the battery is empty", "the battery's capacity is used up"),
+    "failed": Status("failed", "the solver gave up", "the solver found no solution; please report the conditions"),
     "tips": Status(
         "tips over",
         "the robot turns over: its line of gravity passes outside the contacts, or its own motion throws it over",
@@ -47,52 +48,52 @@ STATUSES: dict[str, Status] = {
     "reverses": Status("reverses", "steady travel backward", "found a steady operating point, travelling backward"),
     "rolls_back": Status(
         "rolls back",
-        "gravity drives the robot, against its motors or without their voltage",
-        "gravity drives the robot, against its motors or without their voltage: it travels downhill steadily",
+        "gravity drives the robot, against its motors or with no voltage",
+        "gravity drives the robot, against its motors or with no voltage: it travels downhill steadily",
     ),
     "cut_off": Status(
         "cut off",
-        "a cell below its cut-off voltage, where the battery switches itself off",
-        "the cells stayed below their cut-off voltage for longer than they may, with charge left",
+        "a cell is below its cut-off voltage, so the battery switches off",
+        "the cells stayed below their cut-off voltage for longer than permitted, with charge left",
     ),
 }
 
-#: What lies in a run folder beside its page.
+#: Files of a run folder other than its page.
 FILES = {
     "drive.xml": "the drive for MuJoCo, for <include>",
-    "scene.xml": "a model that runs with it",
-    "actuator.py": "the law in JAX, which needs nothing else",
-    "actuator.jaxexport": "the same as a program, for jax.export.deserialize",
-    "actuator.onnx": "the law as an ONNX model",
-    "mjlab_actuator.py": "the law in PyTorch, with a configuration for mjlab",
+    "scene.xml": "a MuJoCo scene that includes drive.xml and can be run",
+    "actuator.py": "the drive law in JAX, without a dependency on mmrjax",
+    "actuator.jaxexport": "the same law as a compiled program, for jax.export.deserialize",
+    "actuator.onnx": "the drive law as an ONNX model",
+    "mjlab_actuator.py": "the drive law in PyTorch, with a configuration for mjlab",
     "feed_forward.csv": "voltage, current and losses over speed and torque",
     "feed_forward.h": "the same tables for C",
-    "draws.npz": "draws of the posterior, for NumPy",
-    "draws.json": "the same draws as JSON",
-    "LAW.md": "the law for people who have never seen this program",
+    "draws.npz": "samples from the posterior, for NumPy",
+    "draws.json": "the same samples as JSON",
+    "LAW.md": "description of the drive law for readers who do not know mmrjax",
     "robot.toml": "the robot; every command takes it with --robot",
     "runs.csv": "every run, one row each",
     "windows.csv": "windows of a log: voltage, velocity, acceleration",
-    "feedforward.json": "constants, gains and remarks",
+    "feedforward.json": "feedforward constants, gains and remarks",
     "rows.csv": "every row: measured, simulated, residuals",
     "comparison.csv": "every row: measured, simulated, errors",
     "history.csv": "every instant",
-    "reactions.csv": "loads inside the running gear, every instant",
+    "reactions.csv": "loads inside the running gear at every instant",
     "segments.csv": "every segment of the mission",
     "requirements.csv": "every requirement, one row each",
-    "requirements.toml": "what was required",
-    "posterior.nc": "what the fit leaves open, for --posterior",
+    "requirements.toml": "the requirements as given",
+    "posterior.nc": "posterior distribution of the fitted parameters, for --posterior",
     "points.csv": "every operating point",
-    "turns.csv": "settled turns from straight travel to the spot",
-    "posture.csv": "how the robot stands: its levers, what bears",
+    "turns.csv": "settled turns, from straight travel to turning on the spot",
+    "posture.csv": "posture: lever angles and contact loads",
     "derivatives.csv": "every derivative, one row each",
     "modes.csv": "every natural frequency",
-    "peaks.csv": "every peak of ripple",
+    "peaks.csv": "every ripple peak",
     "indices.csv": "every index, one row each",
     "settled.csv": "the settled runs, for loop and calibrate",
-    "stretches.csv": "every stretch of the log, and why it is left out",
+    "stretches.csv": "every segment of the log, with the reason if it was left out",
     "results.zarr/": "every point, as a Zarr store",
-    "identity.json": "what the store was made with, to go on with it",
+    "identity.json": "settings that the store was created with, needed to resume the sweep",
     "result.json": "everything on this page, for programs",
     "config.resolved.toml": "every option of the command",
     "manifest.json": "versions, machine, time, hashes",
@@ -102,23 +103,28 @@ FILES = {
 
 #: What `verdict` in result.json of the loop means, the least first; an alias after its word.
 LOOP_VERDICTS = {
-    "none": "nothing is missing as far as these runs can show: what the fitted model leaves is noise",
-    "undescribed": "the refitted model misses a channel by more than a quarter of its measured rms, or noise is "
-    "estimated as that large. No set of effects removes half of that error on unseen runs and leaves less than a "
-    "quarter. The statement says what to check first, and no effect is named",
-    "place": "something is missing in one equation, or in several that these data cannot separate; no more is known",
-    "unnamed": "former word for place; a mechanism was called so too until schema mmrjax.loop/3",
-    "mechanism": "what drives the missing term is established, and its equation; its exact law is not",
-    "class": "laws are established, and of at least one these data cannot tell which it is",
-    "named": "one law of the library is established for each thing that is missing",
+    "none": "nothing is missing as far as these runs can show: the residuals of the fitted model are noise",
+    "undescribed": "the error of the refitted model in one channel exceeds a quarter of the measured rms, or "
+    "the noise is "
+    "estimated to be that large. No set of effects halves that error on unseen runs and brings it below a "
+    "quarter. No effect is named, and the statement lists what to check first",
+    "place": "something is missing in one equation, or in one of several that these data cannot separate; no "
+    "more is known",
+    "unnamed": "former word for place; until schema mmrjax.loop/3 it also covered mechanism",
+    "mechanism": "the equation of the missing term and the variable that it depends on are established; its "
+    "exact law is not",
+    "class": "an effect is established for each missing term, but for at least one of them these data cannot "
+    "tell which of "
+    "several effects it is",
+    "named": "one effect of the library is established for each missing term",
 }
 
-#: Names of where the energy of a mission goes, as bars have room for.
+#: Uses of the energy of a mission, short enough for labels of bars.
 SINKS = {
-    "battery": "cells of the battery", "other": "other consumers", "driver": "driver",
-    "winding": "windings, brushes, leads", "motor": "friction of the motors", "gearbox": "gearboxes",
+    "battery": "battery cells", "other": "other consumers", "driver": "motor driver",
+    "winding": "windings, brushes, leads", "motor": "motor friction", "gearbox": "gearboxes",
     "track": "tracks and guides", "sliding": "sliding over the ground", "rolling": "rolling resistance",
-    "lift": "lift (net of what comes back)",
+    "lift": "lift (net of energy recovered downhill)",
 }  # fmt: skip
 
 
@@ -129,16 +135,22 @@ def sink_labels(on_ground: bool) -> dict[str, str]:
 
 #: Words of the pages, for docs/reference/glossary.md.
 GLOSSARY = {
-    "balance": "one equation of the model, for instance the voltages along the motor's circuit or the torques at the "
+    "balance": "one equation of the model, for instance the sum of voltages in the motor circuit or of "
+    "torques at the "
     "driving wheel. Every effect enters one balance",
-    "effect": "a term that the model may lack, with an equation and a size. `mmrjax explain NAME` gives both, and a "
-    "test for it",
+    "effect": "a term that the model may lack. `mmrjax explain NAME` prints its equation, its typical size and a "
+    "bench test for it",
     "established": "an effect that chance, a smooth curve, one run or one block of runs cannot explain",
-    "tentative": "an effect that improves predictions and is in the robot, although a listed test failed",
+    "tentative": "an effect that improves predictions and is included in robot.toml, although it failed one "
+    "of the listed tests",
     "class": "effects that these data cannot distinguish",
-    "mechanism": "the incomplete equation and its driver, without the exact law. It explains at least half of the "
-    "excess misfit, predicts held-out runs, and is found again when blocks of runs are left out",
-    "place": "the incomplete equation, or several that these data cannot distinguish. No mechanism is established",
+    "mechanism": "the equation that lacks a term and the variable that the term depends on, but not its exact "
+    "law. Such a "
+    "term explains at least half of the excess misfit, predicts held-out runs, and is found again when blocks "
+    "of runs "
+    "are left out",
+    "place": "the equation that lacks a term, or several that these data cannot distinguish. No mechanism is "
+    "established",
     "excess misfit": "χ² beyond the part that noise explains, which is about one per reading",
     "refit": "the same model with its parameters fitted to the runs, without new effects",
     "seen": "errors on the runs used in the fit",
@@ -155,31 +167,32 @@ GLOSSARY = {
 }
 
 FLAGS = {
-    "motor_overspeed": "motor faster than it is permitted to turn",
-    "gearbox_overspeed": "gearbox input faster than its catalogue permits",
+    "motor_overspeed": "motor above its permitted speed",
+    "gearbox_overspeed": "gearbox input above its permitted speed",
     "winding_hot": "winding hotter than permitted after long running at this current",
-    "slips": "slides faster than V_s on average, though it goes on steadily",
+    "slips": "slides faster than V_s on average, although it travels steadily",
     "jumps": "the weight passes between guides and pulleys so hard that the robot leaves the ground at times",
-    "overvoltage": "current flows back into the battery: its cells are above their charge voltage or take too much",
-    "cut_off": "a cell below its cut-off voltage",
-    "battery_overcurrent": "more current than a cell may give",
-    "current_limited": "the motor driver's current limit acts",
-    "gearbox_overload": "more torque than the gearbox may carry for long",
+    "overvoltage": "current flows back into the battery: the cells are above their charge voltage, or the "
+    "charging current is too high",
+    "cut_off": "a cell is below its cut-off voltage",
+    "battery_overcurrent": "a cell current above its limit",
+    "current_limited": "the motor driver limits the current",
+    "gearbox_overload": "torque above the gearbox's continuous rating",
     "too_hot": "winding hotter than permitted",
-    "demand_missed": "a demanded speed was not reached",
-    "voltage_rising": "a cell's voltage that rises as it discharges: the parabola of its curve has turned up",
-    "current_returned": "current flows back into the external supply, which few bench supplies take",
+    "demand_missed": "the commanded speed was not reached",
+    "voltage_rising": "a cell voltage rises during discharge: the parabola of its curve is past its minimum",
+    "current_returned": "current flows back into the external supply, which few bench supplies can absorb",
 }
 
 
-#: In place of a winding's temperature after long running, at a current that heats it without an end.
+#: Shown for the final temperature of a winding at a current for which the temperature never settles.
 NONE_SETTLES = "none settles"
-#: A current that never brings a winding to its limit.
+#: Shown for a current at which the winding never reaches its limit.
 FOR_EVER = "continuously"
 
-#: Statuses of runs that ended as their conditions ask, with numbers; `signals.DONE` by name.
+#: Statuses of runs that ended in a steady state; `signals.DONE` by name.
 SETTLED = ("converged", "reverses")
-#: Those of runs from standstill that get under way, so that there are stages of the start to tell apart.
+#: Statuses of runs from standstill in which the robot starts to move.
 UNDER_WAY = (*SETTLED, "rolls_back", "not_settled")
 
 
@@ -188,18 +201,21 @@ def every_run_solved(counted: Mapping[str, int]) -> bool:
     return not counted.get("failed")
 
 
-#: What a requirement's quantity may come to beside a status of a run: in one line.
+#: Outcomes of a requirement's quantity other than the status of a run, in one line.
 OUTCOMES = {
     "unbounded": "no value: the temperature never settles",
 }
 
 
-#: Why a settled turn has no value where none was found.
-NO_TURN = "no settled turn, as where friction falls with sliding; simulate --model drive follows it over time"
+#: Reason for a turn without a settled value.
+NO_TURN = (
+    "no settled turn, for example because friction falls with sliding speed; simulate --model drive computes it "
+    "over time"
+)
 
 
 def reason_without_value(outcome: str) -> str:
-    """In one line why a quantity has no value."""
+    """Reason why a quantity has no value, in one line."""
     return STATUSES[outcome].why if outcome in STATUSES else OUTCOMES[outcome]
 
 
@@ -222,5 +238,5 @@ def words_shown(name: str) -> str:
 
 
 def short_name(name: str) -> str:
-    """A parameter's name without the words that every such name has."""
+    """A parameter's name without the group names that carry no information."""
     return name.replace("ground.", "").replace("track.", "").replace("effects.", "")

@@ -30,12 +30,12 @@ MODES = {1: (15.0, 0.0), 2: (33.0, 0.0), 3: (33.0, 5.0), 4: (33.0, 8.0)}
 
 
 def paper_configurations(robot: Robot) -> Names:
-    """The paper's configurations that a robot has. Its runs on the bench can be set against these alone."""
+    """The paper's configurations that a robot has. Only these can be compared with the paper's bench runs."""
     return tuple(c for c in CONFIGURATIONS if c in robot.configurations)
 
 
 def shown_configurations(robot: Robot) -> Names:
-    """The configurations that are shown of a robot: the paper's, or where it has none of them its own."""
+    """Configurations to show for a robot: those of the paper, or its own if it has none of these."""
     return paper_configurations(robot) or robot.configurations.names
 
 
@@ -67,7 +67,7 @@ def operating_points(robot: Robot, asked: Conditions) -> Columns:
 
 
 def channels_of_paper() -> tuple[Channel, ...]:
-    """The channels that the paper's tables have."""
+    """Channels in the paper's tables."""
     table = runs.read_runs("measured")
     return tuple(c for c in table.channels if table.has(c.column))
 
@@ -79,7 +79,7 @@ def stack_channels(table: Columns) -> np.ndarray:
 
 @dataclasses.dataclass(frozen=True)
 class Rows:
-    """The rows of Tables A1 and A2 whose configuration a robot has, and what it says of each.
+    """Rows of Tables A1 and A2 with a configuration of the robot, and the robot's result for each.
 
     Attributes:
         conditions: the measured table.
@@ -328,7 +328,7 @@ SPLIT = ("winding", "motor friction", "gearbox", "track and guides", "slip", "ro
 
 
 def energy_split(robot: Robot, asked: Conditions) -> tuple[Columns, Columns]:
-    """Operating points and the power [W] that each item of `SPLIT` takes of the supply's power.
+    """Operating points, and the power [W] of each item of `SPLIT`.
 
     Returns:
         The points, and item → power. `other` is what effects beyond the paper's terms take.
@@ -367,10 +367,10 @@ class EnergyUse(NamedTuple):
     """Use of the supply's power at operating points.
 
     Attributes:
-        labels: of the points, with a star where the robot slides on its own adhesion, so that it is raised.
+        labels: labels of the points, with a star where the robot slides on its own adhesion, so that it is raised.
         power: item of `SPLIT`, and `other` → [W].
         total: power of the supply [W].
-        status: of each point.
+        status: status of each point.
     """
 
     labels: list[str]

@@ -76,10 +76,10 @@ def gear_blocks(robot: Robot) -> Iterator[Block]:
 
 
 def paper_document(file: RobotFile, gear: bool) -> tuple[Document, data.Rows | None]:
-    """The report of a robot and its nominal fellows.
+    """The report on a robot, next to the nominal robots.
 
     Args:
-        file: of any robot, without one of the paper's configurations it is not compared with the bench.
+        file: file of any robot, without one of the paper's configurations it is not compared with the bench.
         gear: whether its fidelity resolves the running gear, so that there are Figs. 23-27 from it too.
 
     Returns:
@@ -104,7 +104,7 @@ def paper_document(file: RobotFile, gear: bool) -> tuple[Document, data.Rows | N
         nominal = rows["nominal"]
         raised = data.raised_words(ROBOTS["nominal"](), nominal.ratio)
         row_blocks = catalogue.note("paper.row-by-row", raised), _row_table(nominal), catalogue.note("paper.reasons")
-        yield Section("The paper against itself, row by row", row_blocks, "rows-table")
+        yield Section("The paper compared with itself, row by row", row_blocks, "rows-table")
         starts = data.simulate_starts(robot)
         figure = catalogue.figure("paper.fig23_24_from_standstill", starts, data.FIG_23, data.FIG_24)
         yield Section("From standstill", (figure, starts_table(starts)), "start")
@@ -150,7 +150,7 @@ def error_answer(every: list[Json]) -> str:
         ", ".join(f"{c['rms_percent']:.1f} % {label}" for c, label in zip(e["cells"], labels, strict=True))
         for e in (raised, paper)
     )
-    few = f", with adhesion raised ({own['rows']} rows settle on its own)" if own["rows"] < own["of"] else ""
+    few = f", with adhesion raised ({own['rows']} rows settle without that)" if own["rows"] < own["of"] else ""
     return (
         f"rms error against {raised['rows']} of {raised['of']} measured rows: {mine}{few}. "
         f"The paper's own simulation: {theirs}."
@@ -204,9 +204,8 @@ def implied_resistance(robot: Robot, table: runs.Runs) -> np.ndarray:
 
 
 def _row_table(rows: data.Rows) -> Block:
-    """The 20 rows: bench, the paper's simulation, the nominal robot three ways, and letters that say why.
-
-    A wheeled row has a second one with the robot's own mass.
+    """The 20 rows: bench, the paper's simulation, three variants of the nominal robot, and letters for the reasons
+    of differences. Wheeled rows appear a second time with the robot's own mass.
     """
     table, own_mass = rows.conditions, rows.weighed["total_mass_kg"]
     own, raised, weighed = (data.stack_channels(t) for t in (rows.plain, rows.raised, rows.weighed))

@@ -38,7 +38,7 @@ def current_over_slope(robot: Robot, rows: data.Rows, certainty: Sequence[Sequen
     """Fig. 28: total current over slope in four loading modes, with the measured points and R² (A1).
 
     Args:
-        certainty: from `data.slope_certainty`.
+        certainty: certainty from `data.slope_certainty`.
     """
     slopes = np.linspace(0, 20, 81)
     lines = data.current_over_slope(robot, rows.ratio, slopes)

@@ -48,7 +48,8 @@ class Plan:
         design: the points.
         axes: unit and limits of each name.
         conditions: constant conditions by name, `configuration` as an index.
-        surface: of Table 5, which scales the adhesion by configuration, None where adhesion is stated or varies.
+        surface: surface of Table 5, which scales the adhesion by configuration, None where adhesion is stated or
+            varies.
         data: files of the design, in addition to the configuration.
         rows: conditions of the runs of a table, among which the axis `ROW` counts.
     """
@@ -62,11 +63,11 @@ class Plan:
 
     @staticmethod
     def of_rows(rows: Conditions, samples: Drawn | None = None) -> Plan:
-        """The runs of a table, of shape (runs,), each crossed with every sample."""
+        """The runs of a table, of shape (runs,), each combined with every sample."""
         return Plan(Design({ROW: np.arange(rows.shape[0], dtype=float)}, samples), {}, {}, rows=rows)
 
     def varied(self, robot: Robot) -> variation.Variation:
-        """The robot and what varies of it and of conditions, without axes that a task has of its own."""
+        """The robot and the varied parameters and conditions, without the axes that belong to a task."""
         names = variation.variable_names(robot)
         return variation.Variation(robot, tuple(name for name in self.design.names if name in names))
 
@@ -94,16 +95,17 @@ def plan_design(config: Campaign, robot: Robot, where: str) -> Plan:
     axes = {name: _axis(name, stated, robot, f"{where}, axes.{name}", extra) for name, stated in config.axes.items()}
     samples = _samples(config.samples, robot, f"{where}, samples", data)
     if not axes and samples is None:
-        raise BadConfiguration(f"{where}: got neither [axes] nor [samples]; expected at least one name that varies")
+        raise BadConfiguration(f"{where}: no [axes] or [samples]; specify at least one quantity to vary")
     design = Design(axes, samples)
     fixed, surface = _fixed(config.conditions, robot, f"{where}, conditions")
     fixed |= task.further({**{name: np.array([value]) for name, value in fixed.items()}, **axes}, robot, where)
     for k, name in enumerate(design.names):
         if name in fixed or name in design.names[:k]:
-            raise BadConfiguration(f"{where}, {name}: stated twice; expected it in one of conditions, axes, samples")
+            raise BadConfiguration(f"{where}, {name}: given twice; give it once, under conditions, axes or samples")
     if fixed.get("battery", 0.0) > 0.5 and "voltage" in {*fixed, *design.names}:
         raise BadConfiguration(
-            f"{where}, voltage: acts only without battery, whose charge sets the voltage; remove voltage or battery"
+            f"{where}: voltage has no effect on battery power, where the state of charge sets it; remove voltage "
+            "or battery"
         )
     _acting({*fixed, *design.names}, robot, where, surface)
     which = np.atleast_1d(axes.get(CONFIGURATION, fixed.get(CONFIGURATION, 0.0)))
@@ -118,7 +120,9 @@ def plan_design(config: Campaign, robot: Robot, where: str) -> Plan:
         level = imposed.imposed_default(robot, f"{where}, conditions.{own_axis}")
         fixed[own_axis] = level * OF_IMPOSED[own_axis][1]
     if surface is not None and "adhesion" in {*fixed, *design.names}:
-        raise BadConfiguration(f"{where}, conditions.surface: got {surface} beside adhesion; expected one of the two")
+        raise BadConfiguration(
+            f"{where}, conditions.surface: got {surface} in addition to adhesion; give one of the two"
+        )
     if design.points > MOST:
         raise BadConfiguration(f"{where}: got {design.points:.3g} points; expected at most {MOST:.3g}")
     plan = Plan(design, dict(extra), fixed, surface, tuple(data))
@@ -127,7 +131,7 @@ def plan_design(config: Campaign, robot: Robot, where: str) -> Plan:
 
 
 def _acting(names: set[str], robot: Robot, where: str, surface: str | None) -> None:
-    """Refuse conditions that do not act on a robot."""
+    """Reject conditions that do not act on a robot."""
     kinds = {
         "voltage": ("voltage", "duty", "open"), "motor_speed": ("motor_speed", "motor_acceleration"),
         "motor_current": ("motor_current",),
@@ -143,8 +147,8 @@ def _acting(names: set[str], robot: Robot, where: str, surface: str | None) -> N
     imposed.check_acting(robot, (f"{where}, {name}" for name in sorted(ground)), shaft)
     if surface is not None and not robot.rig.scales_adhesion:
         raise BadConfiguration(
-            f"{where}, conditions.surface: got {surface}; a rig's surfaces are configurations of its own "
-            f"({', '.join(robot.configurations)}); vary or state configuration"
+            f"{where}, conditions.surface: got {surface}; each surface of a rig is a configuration "
+            f"({', '.join(robot.configurations)}); vary or set configuration"
         )
 
 
@@ -203,7 +207,7 @@ def _axis(name: str, stated: Any, robot: Robot, where: str, extra: Mapping[str, 
     if not len(values):
         raise BadConfiguration(f"{where}: got no values; expected at least one")
     if len(values) > LONGEST:
-        raise BadConfiguration(f"{where}: got {len(values)} values; expected at most {LONGEST} (samples may be more)")
+        raise BadConfiguration(f"{where}: got {len(values)} values; expected at most {LONGEST} (except in [samples])")
     if len(np.unique(values)) < len(values):
         raise BadConfiguration(f"{where}: got a value twice; expected different values")
     _within(values, axis, where)
@@ -222,11 +226,11 @@ def _range(stated: Json, where: str) -> np.ndarray:
         raise BadConfiguration(f"{where}.scale: got {scale!r}; allowed: linear, log")
     if start > stop or (start == stop) != (number == 1):
         raise BadConfiguration(
-            f"{where}: got start {start:g}, stop {stop:g}, number {number}; expected start below stop and at least 2 "
-            "values, or one value alone"
+            f"{where}: got start {start:g}, stop {stop:g}, number {number}; expected start below stop and at "
+            "least 2 values, or a single value"
         )
     if scale == "log" and start <= 0:
-        raise BadConfiguration(f"{where}.start: got {start:g}; expected more than 0 with scale log")
+        raise BadConfiguration(f"{where}.start: got {start:g}; expected a number above 0 with scale log")
     return np.linspace(start, stop, number) if scale == "linear" else np.geomspace(start, stop, number)
 
 
@@ -278,7 +282,7 @@ def _samples(stated: Json, robot: Robot, where: str, data: list[str]) -> Samples
         raise BadConfiguration(f"{where}.seed: got {seed!r}; expected a whole number from 0 to {2**32 - 1}")
     over = stated.get("over", {})
     if not isinstance(over, dict):
-        raise BadConfiguration(f"{where}.over: got {over!r}; expected a table of names with their distributions")
+        raise BadConfiguration(f"{where}.over: got {over!r}; expected a table of names and distributions")
     marginals = {name: _quantile(name, d, robot, f"{where}.over.{name}") for name, d in over.items()}
     joint = None
     if "posterior" in stated:
@@ -316,7 +320,7 @@ def _quantile(name: str, stated: Any, robot: Robot, where: str) -> Quantile:
     """The quantile function of a distribution, cut off at the bounds of what is sampled."""
     axis = _known(name, robot, where)
     if name == CONFIGURATION:
-        raise BadConfiguration(f"{where}: cannot be sampled; expected it among axes or conditions")
+        raise BadConfiguration(f"{where}: cannot be sampled; put it under axes or conditions")
     table = {"distribution": stated} if isinstance(stated, str) else stated
     kind = table.get("distribution") if isinstance(table, dict) else None
     if not isinstance(kind, str) or kind not in DISTRIBUTIONS:
@@ -341,7 +345,7 @@ def _quantile(name: str, stated: Any, robot: Robot, where: str) -> Quantile:
 
 
 def _prior(name: str, robot: Robot) -> Quantile:
-    """The quantile function of a parameter's prior, the one with which `calibrate` and `sensitivity` work."""
+    """The quantile function of a parameter's prior, as in `calibrate` and `sensitivity`."""
     from scipy.special import ndtri
 
     from calibration.inference import priors
@@ -362,7 +366,7 @@ def _cut(kind: str, numbers: dict[str, float], bounds: tuple[float, float], wher
         if kind == "uniform":
             return lambda u: low + (high - low) * u
         if low <= 0:
-            raise BadConfiguration(f"{where}.low: got {low:g}; expected more than 0 with loguniform")
+            raise BadConfiguration(f"{where}.low: got {low:g}; expected a number above 0 with loguniform")
         return lambda u: low * np.exp(u * math.log(high / low))
     if kind == "triangular":
         low, mode, high = numbers["low"], numbers["mode"], numbers["high"]

@@ -44,7 +44,10 @@ AT_ONCE, SAMPLE = (64, 2048), 0.05
 #: middle from where the obstacle begins; 0 where nothing is got over.
 VERDICT, LARGEST = "verdict", "largest_mm"
 OUTPUTS: dict[str, tuple[str, str]] = {
-    VERDICT: ("", "how the climb ended; of a search, of the smallest obstacle that it does not get over"),
+    VERDICT: (
+        "",
+        "result of the climb; for a search, result for the smallest obstacle that the robot does not get over",
+    ),
     LARGEST: ("mm", "largest got over"),
     "time_s": ("s", "time to the verdict"),
     "furthest_mm": ("mm", "furthest place"),
@@ -89,7 +92,7 @@ def further_variation(obstacle: Obstacle, varied: Columns, robot: Robot, where: 
     if (why := climb_refusal(robot)) is not None:
         raise BadConfiguration(f"{where}, obstacle: {why}")
     if obstacle.find == (SIZE in varied):
-        wants = "find looks for it" if obstacle.find else f"expected an axis {SIZE}, or find = true"
+        wants = "find searches for it" if obstacle.find else f"expected an axis {SIZE}, or find = true"
         raise BadConfiguration(f"{where}, {SIZE}: got {'it' if obstacle.find else 'none'}; {wants}")
     sizes = varied.get(SIZE, ())
     if obstacle.kind == "stairs" and 2 * obstacle.nose_mm >= (least := min([obstacle.tread_mm, *sizes])):
@@ -100,7 +103,9 @@ def further_variation(obstacle: Obstacle, varied: Columns, robot: Robot, where: 
     one = None if obstacle.sequence is None else terrains.read_sequence(obstacle.sequence, robot, (0.0, 0.0))
     for name in ("levers_front_deg", "levers_rear_deg"):
         if name in varied and one is not None and one.begins is None:
-            raise BadConfiguration(f"{where}, {name}: {obstacle.sequence} states all angles; expected one of the two")
+            raise BadConfiguration(
+                f"{where}, {name}: {obstacle.sequence} already gives all angles; keep one of the two"
+            )
         for angle in varied.get(name, ()):
             if why := terrains.lever_angle_refusal(robot, angle) or terrains.lever_start_refusal(robot, angle):
                 raise BadConfiguration(f"{where}, {name}: {why}")
@@ -108,11 +113,11 @@ def further_variation(obstacle: Obstacle, varied: Columns, robot: Robot, where: 
 
 
 def climb_refusal(robot: Robot) -> str | None:
-    """Why a robot cannot climb. None: it can."""
+    """Reason why a robot cannot climb, or None."""
     if not robot.has_ground:
-        return "the robot's load is a shaft; expected one with ground under it"
+        return "the robot's load is a shaft; a climb needs a vehicle"
     if robot.rig.imposed != "voltage":
-        return "the robot's file says that its motors are not driven by voltage"
+        return "in the robot's file the motors are not driven by voltage"
     try:
         masses.check_parts(robot)
     except ValueError as error:
@@ -132,8 +137,8 @@ def compute_climbs(
 
     Args:
         conditions: what does not vary, of shape (points,).
-        values: of the variation, a row a point.
-        sizes: of the obstacles [mm]. None: they are searched for, all side by side.
+        values: values of the variation, a row a point.
+        sizes: sizes of the obstacles [mm]. None: they are searched for, all side by side.
         told: what share is done.
     """
     robot, conditions_there = variation.at(jnp.asarray(values), conditions)
@@ -207,7 +212,8 @@ def _numbers(found: Climb) -> Columns:
 
 
 def _searched(obstacle: Obstacle, points: int, run: Callable[..., Climb], told: Callable[[float], None]) -> Columns:
-    """The largest sizes that are got over, by bisection of all points side by side, and how the next one ends."""
+    """Largest sizes that are climbed, by simultaneous bisection for all points, and the result for the next larger
+    size."""
     low, high = SOUGHT[obstacle.kind]
     rounds = 1 + int(np.ceil(np.log2((high - low) / NEAR)))
     over, beyond, verdict, sizes = (

@@ -29,7 +29,7 @@ ANSWER, WORKER = 4.0, 60.0
 RETRIES = 5
 #: Chunks that wait at each worker beside the one that it computes.
 AHEAD = 1
-GONE = "--scheduler: it has gone away; start it again, and the same command goes on"
+GONE = "--scheduler: connection lost; restart the scheduler, and the same command resumes"
 
 
 class LostWorkers(InputError):
@@ -49,11 +49,11 @@ class Pool:
     device: str
 
     def close(self) -> None:
-        """Take leave of the scheduler."""
+        """Disconnects from the scheduler."""
         self.client.close()
 
     def produce(self, job: Job, chunks: Iterable[int]) -> Produced:
-        """Chunks as the workers finish them. A chunk is computed again where its worker is lost.
+        """Yields chunks as workers finish them. If a worker is lost, its chunk is computed again.
 
         Raises:
             LostWorkers: a chunk's workers were lost too often, none was left for a minute, or the scheduler is gone.
@@ -91,15 +91,15 @@ class Pool:
                 arrays = self._result(future)
             except TimeoutError as error:
                 raise LostWorkers(
-                    f"--scheduler: no worker has been there for {WORKER:g} s; start one, and the same command goes on"
+                    f"--scheduler: no worker for {WORKER:g} s; start one, and the same command resumes"
                 ) from error
             except (KilledWorker, CancelledError) as error:
                 if self.client.status != "running":
                     raise LostWorkers(GONE) from error
                 if tried[chunk] > RETRIES:
                     raise LostWorkers(
-                        f"--scheduler: chunk {chunk} lost its worker {tried[chunk]} times, perhaps short of memory; "
-                        "the same command goes on with workers that stay"
+                        f"--scheduler: chunk {chunk} lost its worker {tried[chunk]} times, perhaps because of too "
+                        "little memory; with stable workers the same command resumes"
                     ) from error
                 under_way.add(submit(chunk))
                 continue
@@ -155,7 +155,7 @@ class Pool:
 
 
 def _packed(job: Job) -> bytes:
-    """A job as bytes, with the source of effects that are the user's own: workers need none of the user's files."""
+    """A job as bytes. It includes the source of the user's own effects, so workers need no user files."""
     import cloudpickle
 
     own_modules = {
@@ -192,7 +192,7 @@ def connect_workers(address: str) -> Pool:
         for worker, (host, device) in client.run(introduce_worker).items():
             differ = identity_differences(here, host)
             if differ:
-                raise BadConfiguration(f"--scheduler: {worker} has another program; it differs in {differ}")
+                raise BadConfiguration(f"--scheduler: {worker} runs different software; it differs in {differ}")
             kinds.add(device)
         if len(kinds) > 1:
             raise BadConfiguration(
@@ -235,7 +235,7 @@ def _client(address: str) -> Any:
 
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
-    """Keep what dask logs of a failed connection off the console: the error says it in one sentence."""
+    """Suppresses dask's log of a failed connection, because the error message already reports it."""
     import logging
 
     loggers = [logging.getLogger(name) for name in ("distributed.comm", "distributed.client", "distributed.core")]
@@ -290,7 +290,9 @@ def compute_on_worker(work: bytes, name: str, chunk: int, expected: Json) -> Col
     host, device = introduce_worker()
     differ = identity_differences(expected, {**host, "device": {"device": device}})
     if differ:
-        raise BadConfiguration(f"--scheduler: a worker that came later has another program or device: {differ}")
+        raise BadConfiguration(
+            f"--scheduler: a worker that joined later runs different software or has another device: {differ}"
+        )
     from mmrjax.compile.precision import double_precision
     from sweeps.points.scale import Compiled, fetch_values
 

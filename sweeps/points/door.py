@@ -40,8 +40,8 @@ def sweep(
         voltages: [V], or for a rig that imposes it motor_speeds_rpm [rpm] or motor_currents_A [A].
         payloads: [kg].
         slopes_deg: [deg].
-        surface: of Table 5.
-        load_torques: of a load on a shaft [N·m].
+        surface: surface of Table 5.
+        load_torques: load torques of a load on a shaft [N·m].
         battery: True if the on-board battery feeds the motors.
         discharge: charge already taken from it [C].
         model, options: as for `simulate`.
@@ -51,7 +51,7 @@ def sweep(
 
     Raises:
         BadConfiguration: a configuration, axis or surface that the robot does not have.
-        UsageError: as `simulate`.
+        UsageError: for the same reasons as `simulate`.
     """
     names = (configurations,) if isinstance(configurations, str) else configurations
     config = GridPart.model_construct(

@@ -65,7 +65,7 @@ def resolve_grid(config: G, robot: Robot, battery: bool = False, notes: list[str
 
 
 def check_axes(config: GridPart, robot: Robot) -> None:
-    """Refuse axes that a robot does not have.
+    """Reject axes that a robot does not have.
 
     Raises:
         BadConfiguration: such an axis, or a surface not in Table 5 for a robot that takes its surfaces.
@@ -110,7 +110,7 @@ def grid_conditions(config: GridPart, robot: Robot, battery: bool = False) -> Ru
         battery: whether the runs are on the battery.
 
     Raises:
-        BadConfiguration: as `resolve_grid`.
+        BadConfiguration: for the same reasons as `resolve_grid`.
     """
     config = resolve_grid(config, robot, battery)
     values = grid_axes(config, robot, battery)

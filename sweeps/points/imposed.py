@@ -98,7 +98,7 @@ def imposed_levels(robot: Robot, option: str, notes: list[str] | None = None) ->
     levels = tuple(_digits(share * most) for share in SHARES)
     if notes is not None:
         level_text = ",".join(f"{v:g}" for v in levels)
-        notes.append(f"{option}: not stated; thirds of the {_of(robot)} of the robot's file are taken: {level_text}")
+        notes.append(f"{option}: not given; thirds of the {_of(robot)} in the robot's file are used: {level_text}")
     return levels
 
 
@@ -109,23 +109,23 @@ def _of(robot: Robot) -> str:
 def _missing(robot: Robot, option: str, example: str) -> str:
     unit = SAID[robot.rig.imposed].unit
     if robot.rig.imposed == "motor_current":  # which no file limits
-        return f"{option}: not stated; state it [{unit}], as {option} {example}"
+        return f"{option}: not given; give it [{unit}], such as {option} {example}"
     return (
-        f"{option}: not stated, and the robot's file has no motor.{_of(robot)} to take it from; state it "
-        f"[{unit}], as {option} {example}"
+        f"{option}: not given, and the robot's file has no motor.{_of(robot)}; give it [{unit}], such as {option} "
+        f"{example}"
     )
 
 
 def option_refusal(robot: Robot, option: str, instead: str) -> str:
-    """Why an option of what is not imposed is refused."""
+    """Reason why an option is rejected for a quantity that is not imposed."""
     reason = SAID[robot.rig.imposed]
     if robot.rig.imposed != "voltage":
-        return f"{option}: the {reason.words} is imposed on this robot; state {instead} [{reason.unit}]"
-    return f"{option}: the voltage is imposed on this robot, and its motors' speed follows; state {instead} [V]"
+        return f"{option}: the {reason.words} is imposed on this robot; give {instead} [{reason.unit}]"
+    return f"{option}: the voltage is imposed on this robot, and the motor speed follows; give {instead} [V]"
 
 
 def check_acting(robot: Robot, ground: Iterable[str] = (), shaft: Iterable[str] = ()) -> None:
-    """Refuse conditions of the ground for a load that has none, and those of a load on a shaft for a vehicle.
+    """Reject conditions of the ground for a load that has none, and those of a load on a shaft for a vehicle.
 
     Args:
         ground, shaft: options or places that state one.
@@ -134,38 +134,38 @@ def check_acting(robot: Robot, ground: Iterable[str] = (), shaft: Iterable[str] 
         BadConfiguration: the first of them.
     """
     for option in shaft if robot.has_ground else ground:
-        why = "the robot's load is a shaft, and slope, payload, mass and surface do not act on it; remove it"
+        why = "the robot's load is a shaft, on which slope, payload, mass and surface have no effect; remove it"
         raise BadConfiguration(f"{option}: {f'{NO_BRAKE}; remove it' if robot.has_ground else why}")
 
 
 def check_battery(robot: Robot) -> None:
-    """Refuse to run a rig on a battery that its file does not state.
+    """Reject to run a rig on a battery that its file does not state.
 
     Raises:
         BadConfiguration: its speed is imposed, or its file states no battery.
     """
     if robot.rig.imposed != "voltage":
         what = SAID[robot.rig.imposed].words
-        raise BadConfiguration(f"--battery: the {what} is imposed on this robot, with any supply; remove it")
+        raise BadConfiguration(f"--battery: the {what} is imposed on this robot, whatever the supply; remove it")
     if not capabilities.has_battery(robot):
-        raise BadConfiguration("--battery: the robot's file states no battery; add [battery], or state --voltage")
+        raise BadConfiguration("--battery: the robot's file has no battery; add [battery], or give --voltage")
 
 
 def check_on_ground(robot: Robot, command: str) -> None:
-    """Refuse a command of the running gear for a load that has none.
+    """Reject a command of the running gear for a load that has none.
 
     Raises:
         BadConfiguration: the load is a shaft.
     """
     if not robot.has_ground:
         raise BadConfiguration(
-            f"{command}: the robot's load is a shaft, which has no wheels or tracks on a ground; simulate, sweep, "
-            "compare, calibrate, loop and sensitivity take it"
+            f"{command}: the robot's load is a shaft, without wheels or tracks on the ground; use simulate, "
+            "sweep, compare, calibrate, loop or sensitivity"
         )
 
 
 def check_can_turn(robot: Robot, names: Iterable[str], where: str) -> None:
-    """Refuse a robot that cannot turn in some of these configurations.
+    """Reject a robot that cannot turn in some of these configurations.
 
     Raises:
         BadConfiguration: opens with `where`, and says why.
@@ -175,11 +175,11 @@ def check_can_turn(robot: Robot, names: Iterable[str], where: str) -> None:
 
 
 def check_turning(robot: Robot, stated: Collection[str], names: Iterable[str], where: str) -> None:
-    """Refuse conditions that free a robot to turn which cannot, or that leave open what drives a side.
+    """Reject conditions that free a robot to turn which cannot, or that leave open what drives a side.
 
     Args:
         stated: names of conditions.
-        names: of the configurations that are simulated.
+        names: names of the configurations that are simulated.
     """
     if not (freed := [name for name in OF_TURNS if name in stated]):
         return

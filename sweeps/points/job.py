@@ -31,7 +31,7 @@ ASKED = 48
 
 
 def showing_turns(robot: Robot, conditions: Collection[str]) -> Robot:
-    """The robot, with instruments of both sides and of its yaw where conditions of these names free it to turn."""
+    """The robot, with instruments for both sides and for yaw if conditions of these names let it turn."""
     return robot if set(OF_TURNS).isdisjoint(conditions) else robot.showing_turns()
 
 
@@ -47,7 +47,7 @@ def prepare_job(config: Campaign, robot: Robot, plan: axes.Plan, where: str) -> 
         raise BadConfiguration(f"{where}, outputs: got {repeated[0]} twice; expected each once")
     taken = [name for name in config.outputs if name in plan.design.names]
     if taken:
-        raise BadConfiguration(f"{where}, outputs: got {taken[0]}, which varies; expected what comes out of a run")
+        raise BadConfiguration(f"{where}, outputs: got {taken[0]}, which is varied; expected outputs of a run")
     task = task_of(config, robot, profile is not None and profile.turns)
     if unknown := [name for name in config.outputs if name not in task.attributes]:
         raise BadConfiguration(f"{where}, outputs: got {unknown[0]}; {allowed_words(unknown[0], task.attributes, 3)}")
@@ -55,7 +55,7 @@ def prepare_job(config: Campaign, robot: Robot, plan: axes.Plan, where: str) -> 
     for name in config.outputs:
         if lacking := [n for n in robot.unknown(rests.get(name, ())) if n not in plan.design.names]:
             raise BadConfiguration(
-                f"{where}, outputs: {name} cannot be computed, as the robot's file lacks {' and '.join(lacking)}"
+                f"{where}, outputs: {name} cannot be computed, because the robot's file lacks {' and '.join(lacking)}"
             )
     assert config.chunk is not None
     blocks = Blocks.of(plan.design.shape, config.chunk)
@@ -68,7 +68,7 @@ def _profile(name: str, robot: Robot, plan: axes.Plan, where: str) -> Profile:
     """The profile that every point follows.
 
     Raises:
-        BadData: as `profiles.read_profile`.
+        BadData: for the same reasons as `profiles.read_profile`.
         BadConfiguration: it states what the plan states too, a supply voltage where a point is on the battery, or
             surfaces.
     """
@@ -77,14 +77,17 @@ def _profile(name: str, robot: Robot, plan: axes.Plan, where: str) -> Profile:
         print_message(note)
     if source.surface is not None:
         raise BadConfiguration(
-            f"{where}, profile: got {source.source} with a column surface; state the surface in conditions"
+            f"{where}, profile: got {source.source}, which has a surface column; set the surface under "
+            "conditions instead"
         )
     if source.begins:
-        raise BadConfiguration(f"{where}, profile: got {source.source} with a start; points of a sweep begin at rest")
+        raise BadConfiguration(
+            f"{where}, profile: got {source.source}, which has a start column; points of a sweep start at rest"
+        )
     for field in source.values:
         if field in (*plan.conditions, *plan.design.names):
             raise BadConfiguration(
-                f"{where}, {field}: got it beside {source.source}, which states it; expected one of the two"
+                f"{where}, {field}: got it in addition to {source.source}, which contains it; keep one of the two"
             )
     on_battery = plan.conditions.get("battery", 0.0) or "battery" in plan.design.names
     source.check_source(bool(on_battery))
@@ -92,7 +95,7 @@ def _profile(name: str, robot: Robot, plan: axes.Plan, where: str) -> Profile:
 
 
 def _bearable(variation: Variation, task: Task, plan: axes.Plan) -> None:
-    """Ask the fidelity about points spread over the design, its corners among them.
+    """Lets the fidelity check points spread over the design, including its corners.
 
     Raises:
         BadConfiguration: a point that the fidelity refuses.
@@ -119,7 +122,7 @@ def laid_out(config: Campaign, job: scale.Job) -> Layout:
         for name in job.outputs
     ]
     meanings = {"flag_values": [*range(len(STATUSES)), ABSENT], "flag_meanings": " ".join((*STATUSES, "absent"))}
-    variables.append(Variable(STATUS, scale.KINDS[STATUS], {"long_name": "how the run ended", **meanings}))
+    variables.append(Variable(STATUS, scale.KINDS[STATUS], {"long_name": "status of the run", **meanings}))
     planned = job.plan.axes
     coordinates = {n: _in_store({"units": axis.unit, "long_name": axis.meaning}) for n, axis in planned.items()}
     for name in {axes.CONFIGURATION} & set(coordinates):

@@ -48,9 +48,9 @@ class SimulationResult:
     """Result of a simulating command. All its files are written from it.
 
     Attributes:
-        command: that simulated.
+        command: command that simulated.
         model: fidelity.
-        robot: that was simulated.
+        robot: robot that was simulated.
         runs: what was simulated.
         table: their conditions and outcomes, a column each as in `runs.csv`.
         further: what the command adds to `result.json`.
@@ -86,13 +86,13 @@ class SimulationResult:
 
 
 def ending_columns(robot: Robot, batch: Run) -> Columns:
-    """The columns of how a batch of runs ended, with those of its fidelity alone."""
+    """Columns with the results at the end of a batch of runs, including those specific to the fidelity."""
     result, further = jax.device_get((batch.result, batch.columns))
     return outputs.output_columns(result, robot.channels, further)
 
 
 def check_runs_bearable(robot: Robot, conditions: Conditions, config: FidelityPart) -> None:
-    """Refuse what some run could not bear, before the first is simulated.
+    """Reject options that do not suit every run, before the first run is simulated.
 
     Raises:
         BadConfiguration: no whole number of steps, a step too large for the stiffness, and the like.
@@ -141,7 +141,7 @@ def compute_chunks(
 
 
 def job_of(robot: Robot, runs: Runs, config: FidelityPart, samples: Drawn | None = None) -> Job:
-    """Every output of the runs of a table, each with every sample if there are any.
+    """Job for every output of the runs of a table, each combined with every sample if there are samples.
 
     Raises:
         BadConfiguration: a run that the fidelity could not bear.
@@ -230,10 +230,10 @@ def write_run_folder(
     result: SimulationResult,
     page: Page,
 ) -> int:
-    """Write what every simulating command leaves, and move the folder into place. Returns the exit code.
+    """Write the files common to all simulating commands, and move the folder into place. Returns the exit code.
 
     Args:
-        folder: of the command.
+        folder: folder of the command.
         config: its configuration, with the robot's name.
         page: its page.
     """

@@ -55,8 +55,8 @@ class Samples:
 
     Attributes:
         design: one of `DESIGNS`.
-        number: of points.
-        seed: of everything random.
+        number: number of points.
+        seed: seed of everything random.
         marginals: quantile function of each name, from (0, 1) to its unit.
         names: theirs.
         joint: further names that are sampled together, a posterior. They take the design's last dimensions.
@@ -97,7 +97,7 @@ class Samples:
 
 @dataclasses.dataclass(frozen=True)
 class Drawn:
-    """Sampled points that are at hand.
+    """Sampled points that are already available.
 
     Attributes:
         names: what is sampled.
@@ -121,7 +121,7 @@ def in_blocks(
     values: Callable[[Any], Any],
     normal_scores: Float[np.ndarray, "points coordinates"],
 ) -> Float[np.ndarray, "points names"]:
-    """Values of a jax function at many points, computed on the CPU whatever device the sweep uses."""
+    """Values of a JAX function at many points, computed on the CPU whatever device the sweep uses."""
     import jax
 
     points = len(normal_scores)
@@ -188,8 +188,8 @@ class Blocks:
     """The chunks of a sweep: equal boxes of consecutive points, those at the end of the split axis smaller.
 
     Attributes:
-        shape: of all points.
-        size: of one box, 1 along the axes before the split one and whole along those after.
+        shape: shape of all points.
+        size: size of one box, 1 along the axes before the split one and whole along those after.
     """
 
     shape: tuple[int, ...]
@@ -197,7 +197,7 @@ class Blocks:
 
     @staticmethod
     def of(shape: tuple[int, ...], most: int) -> Blocks:
-        """Boxes of at most `most` points, of nearly equal size."""
+        """Boxes with at most `most` points and nearly equal sizes."""
         size, inner = [1] * len(shape), 1
         for k in reversed(range(len(shape))):
             if inner * shape[k] > most:
@@ -245,7 +245,7 @@ Unit = Float[np.ndarray, "dimensions points"]
 
 
 def _key(seed: int, dimension: int, use: str) -> int:
-    """128 bits that no other dimension or use of the same seed has."""
+    """128 bits that are unique to a dimension and a use of a seed."""
     return int.from_bytes(hashlib.blake2b(f"{seed} {dimension} {use}".encode(), digest_size=16).digest(), "little")
 
 

@@ -50,14 +50,14 @@ KINDS = {STATUS: "uint8", FLAGS: "uint16", VERDICT: "uint8"}
 
 @dataclasses.dataclass(frozen=True)
 class Job:
-    """All that is needed to compute any chunk of a sweep, here or in another process.
+    """All data needed to compute any chunk of a sweep, in this or another process.
 
     Attributes:
-        robot: that is varied.
+        robot: robot that is varied.
         task: what every point does.
         outputs: names.
         storage: type that they are stored in.
-        profile: that every point follows, if any.
+        profile: profile that every point follows, if any.
     """
 
     robot: Robot
@@ -166,7 +166,7 @@ class _Asked(NamedTuple):
     """Outputs of each point by a fidelity with its options, and their form in the store.
 
     Attributes:
-        factors: of each output, the SI value of its unit in tables.
+        factors: factors of each output, the SI value of its unit in tables.
         surface: adhesion of each configuration as a ratio to the bench's.
     """
 
@@ -206,7 +206,7 @@ _one_device_kept = compiled(_one_device)
 
 
 def _stored(found: Mapping[str, Array], asked: _Asked) -> dict[str, Array]:
-    """Outputs in the units of tables, in the stored type, but those of `KINDS` in their own."""
+    """Outputs in the units of tables and in the stored type. Those in `KINDS` keep their own type."""
     stored = {n: (found[n] / factor).astype(asked.storage) for n, factor in asked.factors if n not in KINDS}
     named = (*(n for n, _ in asked.factors if n in KINDS), STATUS)
     return {**stored, **{n: found[n].astype(KINDS[n]) for n in named}}
@@ -237,12 +237,12 @@ def _split_among(mesh: Mesh) -> Callable[..., dict[str, Array]]:
 
 @dataclasses.dataclass(frozen=True)
 class Piece:
-    """A chunk under way.
+    """A chunk in progress.
 
     Attributes:
-        chunk: its number.
+        chunk: number of chunk.
         arrays: by variable, which may be on a device still.
-        values: of its points, a row each, where they are at hand.
+        values: values of its points, a row each, where they are at hand.
         told: points of it that count as done already.
     """
 

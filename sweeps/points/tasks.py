@@ -30,8 +30,8 @@ class Task:
 
     Attributes:
         model: its name.
-        options: of a fidelity.
-        attributes: of its outputs in a store, by name.
+        options: options of a fidelity.
+        attributes: attributes of its outputs in a store, by name.
         usual: those of a store where none are stated.
         slow: whether a call takes long and reports progress.
         at_once: points in one, on processors or accelerators.

@@ -36,8 +36,8 @@ class Intervals:
 
     Attributes:
         columns: as `simulate_draws` names them, arrays of shape (runs,).
-        draws: their number.
-        channels: of the robot.
+        draws: number of draws.
+        channels: channels of the robot.
     """
 
     columns: Columns
@@ -114,8 +114,8 @@ def interval_remarks(found: Intervals, place: str = "runs.csv") -> list[str]:
     if lost.any():
         share = 100 * (1 - found.columns[SHARE].min())
         remarks.append(
-            f"at {int(lost.sum())} of {len(lost)} runs up to {share:.0f} % of the draws do not converge; intervals "
-            "are from the others"
+            f"at {int(lost.sum())} of {len(lost)} runs up to {share:.0f} % of the draws do not converge; "
+            "intervals use the others"
         )
     return remarks
 

@@ -62,8 +62,8 @@ def job_identity(config: Part, robot: Robot, files: Iterable[str], device: str) 
     """Sections, each of words by key: configuration, data, code, versions, device.
 
     Args:
-        config: of the sweep, chunk and outputs resolved.
-        files: that it reads.
+        config: configuration of the sweep, chunk and outputs resolved.
+        files: files that it reads.
         device: kind of the devices.
 
     Raises:
@@ -149,8 +149,8 @@ class Variable:
     """An array of a store.
 
     Attributes:
-        name: of the array.
-        dtype: in NumPy's words.
+        name: name of the array.
+        dtype: data type in NumPy's words.
         attributes: units, long_name and the like.
     """
 
@@ -169,7 +169,7 @@ class Layout:
         variables: outputs, of all dimensions of the design.
         coordinates: units and long names of the varied names.
         labels: words of an axis in place of its numbers.
-        attributes: of the group.
+        attributes: attributes of the group.
         compression: `none` or `zstd`.
     """
 
@@ -203,7 +203,7 @@ class Done:
     """Journal entry of a finished chunk.
 
     Attributes:
-        chunk: its number.
+        chunk: number of chunk.
         statuses: number of points by status.
         ranges: least and greatest finite value of each output that has one.
         checks: checksum of the chunk's file of each array, CRC-32.
@@ -264,7 +264,7 @@ class SweepStore(Folder):
         mark = interrupted_run(self.partial)
         if mark is not None and mark["command"] not in ("", COMMAND) and not try_to_lock(self._lock):
             raise BadConfiguration(
-                f"--out: another process is at work on {self.partial}; wait for it, or choose another path"
+                f"--out: another process is using {self.partial}; wait for it, or choose another path"
             )
         with self._locked():
             if not self._present():
@@ -318,12 +318,12 @@ class SweepStore(Folder):
         differ = self._differs(folder)
         if differ == IDENTITY:
             raise BadData(
-                f"--out: {folder / 'identity.json'} is damaged; choose another path, or --force to begin anew"
+                f"--out: {folder / 'identity.json'} is damaged; choose another path, or use --force to start again"
             )
         if differ:
             raise BadConfiguration(
-                f"--out: {folder} holds another sweep, which differs in {differ}; choose another path, or --force to "
-                "begin anew"
+                f"--out: {folder} contains another sweep, which differs in {differ}; choose another path, or use "
+                "--force to start again"
             )
 
     @contextlib.contextmanager
@@ -370,7 +370,7 @@ class SweepStore(Folder):
             write_file(file, content, self._aside)
 
     def _refuse_damaged(self) -> None:
-        """Refuse a finished sweep with a damaged file.
+        """Reject a finished sweep with a damaged file.
 
         Raises:
             BadData: names the first file.
@@ -381,7 +381,7 @@ class SweepStore(Folder):
             records = self._records().get(lost, [])
             damaged = self._wrong_file(records[-1]) if records else self.path / JOURNAL
         if damaged is not None:
-            raise BadData(f"--out: {damaged} is damaged; choose another path, or --force to make the sweep anew")
+            raise BadData(f"--out: {damaged} is damaged; choose another path, or use --force to repeat the sweep")
 
     # --- chunks -----------------------------------------------------------------------------------
 
@@ -398,7 +398,7 @@ class SweepStore(Folder):
                 if self._finished_by_another():
                     return
                 raise BadConfiguration(
-                    f"--out: another process has removed {self.partial}; the same command begins anew"
+                    f"--out: another process has removed {self.partial}; the same command starts again"
                 )
             self._same(self.partial)
             journal = file.open("a+", encoding="utf-8")
@@ -416,7 +416,7 @@ class SweepStore(Folder):
 
     def _busy(self, name: str) -> BadConfiguration:
         return BadConfiguration(
-            f"--out: another process is at work on {self.partial}, share {name.replace('-', ' ')}; wait for it, or "
+            f"--out: another process is using {self.partial}, share {name.replace('-', ' ')}; wait for it, or "
             "choose another path"
         )
 

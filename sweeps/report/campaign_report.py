@@ -98,13 +98,13 @@ def _largest(values: np.ndarray, found: Columns, layout: Layout) -> str:
     sizes = found[LARGEST] if LARGEST in found else values[:, names.index(SIZE)] * (found[VERDICT] == OVER)
     k = int(np.argmax(sizes))
     if sizes[k] <= 0:
-        return "No obstacle is got over."
+        return "The robot gets over no obstacle."
     places = []
     for name, value in zip(names, values[k], strict=True):
         labels, unit = layout.labels.get(name), layout.coordinates[name].get("units", "").removeprefix("1")
         places.append(f"{name} {labels[int(value)] if labels else f'{value:.4g} {unit}'.strip()}")
     rest = ", ".join(words for name, words in zip(names, places, strict=True) if name != SIZE)
-    return f"The largest obstacle that is got over: {sizes[k]:.4g} mm{', at ' if rest else ''}{rest}."
+    return f"The largest obstacle that the robot gets over: {sizes[k]:.4g} mm{', at ' if rest else ''}{rest}."
 
 
 def sample_points(store: Path, layout: Layout) -> tuple[np.ndarray, Columns]:

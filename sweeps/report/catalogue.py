@@ -36,9 +36,9 @@ def figure(name: str, *drawn: Any, finding: str = "", words: Sequence[Any] = (),
     """A figure of the catalogue. What draws it is imported when it is drawn, as matplotlib costs half a second.
 
     Args:
-        name: in the catalogue, `report.name`.
+        name: name in the catalogue, `report.name`.
         drawn: arguments of the function that draws it.
-        finding: in words, if it depends on the result.
+        finding: finding in words, if it depends on the result.
         words: values in the caption.
         more: end of the caption.
     """
@@ -56,7 +56,7 @@ def table(name: str, rows: Sequence[Sequence[Any]], *more: Column | str, **field
     """A table of the catalogue.
 
     Args:
-        name: in the catalogue, `report.name`.
+        name: name in the catalogue, `report.name`.
         more: columns, or their titles, in the place of "..." there.
     """
     entry = _entry(name)

@@ -177,8 +177,8 @@ def _changes(found: CheckResult) -> tuple[Note | Table, ...]:
         rows += [(f"{requirement_label(o)} {required_value_text(o)}", *_change(c)) for c in o.change]
     hopeless = [f"{requirement_label(o)} {required_value_text(o)}" for o in found.missed if not o.change]
     more = f", {len(rows) - len(brief)} more in result.json" if len(rows) > len(brief) else ""
-    title = f"changes of one parameter that would meet them{more}"
-    none = f"No change of one parameter within its bounds meets {', '.join(hopeless)}."
+    title = f"changes of a single parameter that would meet them{more}"
+    none = f"No change of a single parameter within its bounds meets {', '.join(hopeless)}."
     return (
         catalogue.note("check.changes"),
         catalogue.table("check.change", rows, title=title, brief=brief),

@@ -29,11 +29,11 @@ from sweeps.report.document import Block, Document, Note, Section, Table
 VERDICTS: dict[str, tuple[str, str]] = {
     "over": ("gets over", "the rear axle is at least a wheel's radius past the obstacle"),
     "tips": ("tips over", "the robot pitched by more than 100 deg"),
-    "stalls": ("stalls", "it stops and its tracks stand still: the motors cannot turn them"),
-    "slides": ("slides", "it stops and its tracks slip: the ground has too little grip"),
-    "hangs": ("hangs", "it stops with its body on an edge, or has fallen into a gap"),
-    "unfinished": ("is under way", "the time was over while it still went on; take a longer --duration"),
-    "failed": ("failed", "numbers of the run went wrong, or its levers would begin below the ground"),
+    "stalls": ("stalls", "the robot and its tracks stop: the motors cannot turn the tracks"),
+    "slides": ("slides", "the robot stops while its tracks slip: the ground has too little grip"),
+    "hangs": ("hangs", "the robot stops with its body on an edge, or has fallen into a gap"),
+    "unfinished": ("is under way", "the robot was still moving when the time ended; use a longer --duration"),
+    "failed": ("failed", "the simulation broke down, or the levers would start below the ground"),
 }
 
 
@@ -54,8 +54,8 @@ class Along:
     """Variables of derivatives.
 
     Attributes:
-        names, units: of the values.
-        values, widths: in these units.
+        names, units: names and units of the values.
+        values, widths: values and widths in these units.
         given: the run that such values make.
     """
 
@@ -108,10 +108,10 @@ class ClimbResult:
     """Result of `climb`.
 
     Attributes:
-        robot, configuration, obstacle: of the run. The last in words.
-        terrain: of the run that is shown.
-        climb: that run, alone.
-        radius: of the pulleys [m].
+        robot, configuration, obstacle: robot, configuration and obstacle of the run. The last in words.
+        terrain: terrain of the run that is shown.
+        climb: climb that run, alone.
+        radius: radius of the pulleys [m].
         tried: sizes [mm] and verdicts of a search.
         largest: that it got over [mm], None: no search or none.
         sought: name of the searched size. Empty: no search.
@@ -204,7 +204,7 @@ class ClimbResult:
         if self.sought:
             if self.largest is None:
                 smallest = min(size for size, _ in self.tried)
-                return f"It gets over no {self.sought} that was tried, the smallest of {smallest:.0f} mm."
+                return f"It cannot climb any {self.sought} that was tried; the smallest was {smallest:.0f} mm."
             beyond = [(s, v) for s, v in self.tried if s > self.largest]
             least = min(beyond, default=None)
             why = "" if least is None else f"; at {least[0]:.0f} mm it {VERDICTS[least[1]][0]}"
@@ -261,7 +261,7 @@ SHOWN = ("margin_success", "crest_time_s", "crest_energy_J", "crest_current_rms_
 
 def climb_document(found: ClimbResult, file: RobotFile) -> Document:
     """The report of a climb."""
-    lead = f"**{found.configuration}**; {found.obstacle}, met squarely."
+    lead = f"**{found.configuration}**; {found.obstacle}, approached at a right angle."
     tried = ", ".join(f"{size:g} mm {VERDICTS[verdict][0]}" for size, verdict in found.tried)
     blocks: tuple[Block, ...] = (
         run_tables.lead_note(file, more=lead),

@@ -31,10 +31,10 @@ class Comparison:
     Attributes:
         table: conditions, `<column>` measured, `simulated_<column>`, `error_<channel>_percent`, `status`.
         summary: errors of all rows and of each configuration.
-        channels: of the readings.
+        channels: channels of the readings.
         source: name of the table.
         model: fidelity.
-        robot_name: of the simulated robot.
+        robot_name: robot name of the simulated robot.
         fit: `these` if the robot was fitted to these rows, `others` if to other rows, "" if no fit is recorded.
         over: further columns of histories for the axes of the errors, with their headings.
         notes: sentences on the table.
@@ -111,8 +111,8 @@ def _summary(channel: Channel, table: Columns) -> Json:
 
 
 _FITS = {
-    "these": "This robot was fitted to these rows: the errors are no prediction.",
-    "others": "This robot was fitted to other rows: the errors are a prediction.",
+    "these": "This robot was fitted to these rows, so the errors are not predictions.",
+    "others": "This robot was fitted to other rows, so the errors are those of a prediction.",
     "": "",
 }
 
@@ -128,7 +128,7 @@ def comparison_document(found: Comparison) -> Document:
         "comparison.parity",
         *table,
         False,
-        finding="Simulated less measured, on average: "
+        finding="Simulated minus measured, on average: "
         + "; ".join(
             f"{c.label} {np.nanmean(e):+.1f} %"
             for c in found.channels
@@ -185,7 +185,7 @@ def comparison_answer(found: Comparison) -> str:
     every, total = found.summary["all"], len(found.table["status"])
     each = [(c, every[c.name]) for c in found.channels if every[c.name]["rows"]]
     if not each:
-        return "No row has both a simulated and a measured number."
+        return "No row has both a simulated and a measured value."
     errors = ", ".join(f"{e['rms_percent']:.1f} % {c.label}" for c, e in each)
     rows, worst = max(e["rows"] for _, e in each), max(e["max_percent"] for _, e in each)
     what = f"{rows} of {total} rows" if rows < total else count_noun(total, "row")
@@ -200,7 +200,7 @@ def _second_robot(found: Comparison) -> str:
     both = found.rms_of_both
     shared = max(rows for rows, _, _ in both.values())
     if not shared:
-        return f"No row has numbers of this robot and of {found.against}."
+        return f"No row has values for both this robot and {found.against}."
     parts = [
         f"{c.label} {both[c.name][1]:.1f} and {both[c.name][2]:.1f} %" for c in found.channels if both[c.name][0]
     ]

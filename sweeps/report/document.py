@@ -33,7 +33,7 @@ class Note:
     Attributes:
         text: the paragraph, or a tuple of items.
         kind: its look on the page: "", `lead`, `key`, or `warn` for a warning.
-        name: of the element on the page.
+        name: name of the element on the page.
         terminal: True if the terminal prints it too.
     """
 
@@ -113,11 +113,11 @@ class Table:
     """A table. The page offers it as a CSV file.
 
     Attributes:
-        name: of the element and its CSV file.
+        name: name of the element and its CSV file.
         columns: its columns.
         rows: values or `Cell`s, one for each column.
-        title: for the terminal.
-        file: of the run folder with all rows, named where the table is cut.
+        title: title for the terminal.
+        file: file of the run folder with all rows, named where the table is cut.
         wide: True for small print on the page.
         terminal: True if the terminal shows it too.
         brief: numbers of the rows that the terminal shows, None for all.
@@ -177,7 +177,7 @@ class Figure:
     """A figure of the page.
 
     Attributes:
-        name: of its element and file.
+        name: name of its element and file.
         alternative: its finding in words, for who does not see it.
         caption: how to read it.
         draw: returns the matplotlib figure.
@@ -211,7 +211,7 @@ class Document:
     """The report of a command.
 
     Attributes:
-        title: of the page.
+        title: title of the page.
         answer: the result in a sentence or two.
         blocks: what follows it before the first heading.
         sections: the rest, in order.

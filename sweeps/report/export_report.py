@@ -21,7 +21,7 @@ def export_document(found: Export) -> Document:
     fates = catalogue.table("export.fates", kept)
     readings = catalogue.figure("export.readings", compared, finding=words.export_statement(found))
     sections = [
-        Section("What the format holds", (fates, catalogue.note("export.kept")), "holds"),
+        Section("What the format represents", (fates, catalogue.note("export.kept")), "holds"),
         Section(
             "Errors",
             (
@@ -47,7 +47,7 @@ def export_document(found: Export) -> Document:
         f"{found.joint.file.name} for {found.format}",
         words.export_statement(found),
         (Note(used, "lead"), *remarks(words.export_remarks(found))),
-        (*sections, _constants(found), Section("Conditions seen, and what was not tested", conditions)),
+        (*sections, _constants(found), Section("Conditions in the data, and what was not tested", conditions)),
     )
 
 

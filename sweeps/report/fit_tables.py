@@ -26,8 +26,8 @@ class Change(NamedTuple):
     """Change of the readings of the runs by an effect of the robot that is written.
 
     Attributes:
-        channel: with the largest change.
-        rms: of the change [% of the channel's measured rms].
+        channel: channel with the largest change.
+        rms: rms error of the change [% of the channel's measured rms].
         without, with_it: simulated without and with the effect, otherwise the same [SI], shape (rows,).
     """
 
@@ -103,7 +103,7 @@ def clusters_section(clusters: Sequence[ResidualCluster]) -> tuple[Section, ...]
     statements = (f"{c.statement}." for c in clusters)
     return (
         Section(
-            "What the residuals cluster by",
+            "Columns that the residuals depend on",
             (*remarks(statements, "clusters"), catalogue.figure("fit.clusters", clusters)),
         ),
     )

@@ -39,7 +39,7 @@ def loop_document(found: DiscoveryResult, robot_name: str, changes: Mapping[str,
 
     Args:
         robot_name: name or file of the robot that it began with.
-        changes: of settled runs by each effect.
+        changes: changes of settled runs by each effect.
     """
     missing, table = found.verdict not in ("none", "undescribed"), rows_of(found)
     moved, added = list(moved_parameters(found)), list(_findings(found, changes))
@@ -79,7 +79,7 @@ def _first_figure(found: DiscoveryResult, table: Columns, changes: Mapping[str, 
 
 def _simulated_lines(found: DiscoveryResult) -> dict[str, str]:
     """Prefixes of the simulated readings that figures over time show, with their names, the proposal's first."""
-    return {"after_": "simulated"} if found.refit_alone else {"after_": "with what was found", "before_": "before"}
+    return {"after_": "simulated"} if found.refit_alone else {"after_": "with the effects found", "before_": "before"}
 
 
 def rows_of(found: DiscoveryResult) -> Columns:
@@ -139,7 +139,7 @@ def _summary(found: DiscoveryResult) -> Table:
     total, before = len(found.runs), dict[str, tuple[float, int]]()
     lines = [("as stated", found.errors_as_stated, {}), ("fitted again", found.errors[0], unseen[0])]
     if not found.refit_alone:
-        lines.append(("with what was found", found.errors[1], unseen[1]))
+        lines.append(("with the effects found", found.errors[1], unseen[1]))
     rows = []
     for what, seen, held in lines:
         cells = []
@@ -191,7 +191,7 @@ def _advice(found: DiscoveryResult) -> Table:
     if after is not None and after.separates:
         more = f" It distinguishes {', '.join(after.separates)}; expected separation {after.expected_sigma:.1f} σ."
     if after is not None and found.headline.level == "class" and not after.settles:
-        more += " Some pairs stay undecided."
+        more += " Some pairs remain undecided."
     far = [
         describe(note)
         for note in with_codes(found.remarks, "after_steps", "shifted", "far_from_prior", "repeats", "copied")
@@ -221,7 +221,7 @@ def _effects(found: DiscoveryResult) -> Iterable[Block]:
     rows = []
     for e in found.to_json()["effects"]:
         effect = next((x for x in found.effects if x.name == e["name"]), None)
-        over = f"none of the library; shown over {str(e.get('variable')).replace('_', ' ')}"
+        over = f"none of the library; plotted over {str(e.get('variable')).replace('_', ' ')}"
         lowers, kinds = loop_words.misfit_text(e["score"]), ", or ".join(e["families"])
         if effect is None:
             alike = ", ".join(b for b in e["balances_alike"] if b != e["balance"])
@@ -266,7 +266,7 @@ def _certainty(found: DiscoveryResult, missing: bool) -> Table:
     if missing and found.gain is not None:
         better, error = found.gain.mean > 0, found.gain.se
         spread = f" ± {error:.2f}" if np.isfinite(error) else ""
-        gain = f"{found.gain.mean:+.2f}{spread} nat a reading that was held out"
+        gain = f"{found.gain.mean:+.2f}{spread} nat per held-out reading"
         robot = f"robot.toml is {'what was found' if found.written else 'the refit'}"
         verb = "better" if better else "worse"
         rows.append((Cell(f"predicts {verb} than the refit", "good" if better else "fair"), f"{gain}; {robot}"))
@@ -306,8 +306,8 @@ def _certain(found: DiscoveryResult, missing: bool) -> Iterable[Section]:
         *_effects(found),
         _certainty(found, missing),
     ]
-    yield Section("How sure that is", tuple(blocks))
-    yield Section("What to know before using it", remarks(filter(None, notes)))
+    yield Section("How certain the verdict is", tuple(blocks))
+    yield Section("Before you use it", remarks(filter(None, notes)))
     if found.resolved is not None:
         yield _resolved(found)
 
@@ -315,10 +315,10 @@ def _certain(found: DiscoveryResult, missing: bool) -> Iterable[Section]:
 def _sections(
     found: DiscoveryResult, table: Columns, changes: Mapping[str, Change], missing: bool
 ) -> Iterable[Section]:
-    looked_for = Section("What was looked for", tuple(_looked_for(found)))
+    looked_for = Section("Effects that were tested", tuple(_looked_for(found)))
     yield Section("Measured and simulated, run by run", tuple(_run_by_run(found, table, changes)))
     yield from [] if missing else [looked_for]
-    where = "Where it is missing" if missing else "What each equation lacks"
+    where = "Where the missing term acts" if missing else "What each equation lacks"
     yield Section(where, tuple(_where_missing(found, table, changes)))
     yield from fit_tables.clusters_section(found.residual_clusters)
     errors = catalogue.figure("loop.errors-figure", found, words=(OF_SIZE,))
@@ -327,11 +327,11 @@ def _sections(
     in_units = [fit_tables.rms_table(fits, found.channels)] if sized else []
     seen: list[Block] = [errors, held_out_table(found), catalogue.note("loop.fitted_again"), *in_units]
     seen += [catalogue.figure("loop.gains", found)] if len(found.gains) > 1 else []
-    yield Section("Errors on runs that the fit has seen, and has not", tuple(seen))
+    yield Section("Errors on runs used in the fit, and on held-out runs", tuple(seen))
     yield from _certain(found, missing)
     yield Section("Candidates", tuple(_candidates(found)))
     hidden = catalogue.figure("loop.null", found.before), catalogue.figure("loop.look_alikes", found)
-    yield Section("", hidden, folded="how thresholds were found, and which effects look alike")
+    yield Section("", hidden, folded="how thresholds were determined, and which effects are similar")
     yield from [looked_for] if missing else []
     yield Section("Parameters before and after", (catalogue.figure("loop.base_shift", found), _base(found)))
     first = {"row": table["row"]}
@@ -400,7 +400,7 @@ def _candidates(found: DiscoveryResult) -> Iterable[Block]:
     share, allowed = found.settings.shares["single"], found.settings.family_wise_error
     yield catalogue.figure("loop.ladder", found, words=(100 * (1 - share), 100 * (allowed - share)))
     several = [(_named(a.effects), a.rise_chi2) for a in found.alternatives]
-    curves = "; none of them is adequate, or curves are the better explanation"
+    curves = "; none of them is adequate, or curves explain the data better"
     sizes = [(_named(a.effects), _named(a.sizes), a.rise_chi2, a.why) for a in found.implausible]
     hidden = [
         (

@@ -81,7 +81,7 @@ _RUNS = (
 )  # fmt: skip
 #: Those of each segment.
 _OF_SEGMENTS = ("energy_Wh", "distance_m", "rms_current_A", "peak_current_A", "winding_peak_C")
-_NO_RETURN = "Nothing came back to the source"
+_NO_RETURN = "No energy returned to the source"
 
 
 def missions_document(file: RobotFile, found: Missions) -> Document:
@@ -144,8 +144,8 @@ def _sections(robot: Robot, found: Missions, first: Json, answer: str) -> Iterab
             "path-section",
         )
     back, on_battery = float(first["energy_returned_Wh"]), bool(np.isfinite(first["state_of_charge"]))
-    returned = f"{back:.3g} Wh came back to the source." if back > 1e-6 * first["energy_drawn_Wh"] else (
-        f"{_NO_RETURN}; what driven motors give feeds the other consumers first." if on_battery else f"{_NO_RETURN}."
+    returned = f"{back:.3g} Wh returned to the source." if back > 1e-6 * first["energy_drawn_Wh"] else (
+        f"{_NO_RETURN}; driven motors first supply the other consumers." if on_battery else f"{_NO_RETURN}."
     )  # fmt: skip
     source_name = "battery's charge" if on_battery else "supply", returned, abs(first["unaccounted_share"])
     energy = catalogue.figure(

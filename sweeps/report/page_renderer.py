@@ -15,7 +15,7 @@ def write_report_page(folder: Path, document: Document, file: RobotFile | None =
     """Write `report.html` and `figures/` of a document. Returns the path of the page.
 
     Args:
-        file: of the robot that the page is about: its parameters are the last section.
+        file: file of the robot that the page is about: its parameters are the last section.
     """
     album = Album(folder)
     document = dataclasses.replace(document, sections=(*document.page_sections(), *document.sections))

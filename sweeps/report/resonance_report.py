@@ -43,12 +43,12 @@ class ResonanceResult:
     """Result of `resonance`.
 
     Attributes:
-        configuration, slope_deg, surface: of the map.
+        configuration, slope_deg, surface: configuration, slope and surface of the map.
         passing: source of the excitation.
-        robot: that was simulated.
+        robot: robot that was simulated.
         table: a row a run, as in `points.csv`. The grid's first, then further points of Table 8.
         modes: by payload [kg].
-        peaks, crossings: at every payload.
+        peaks, crossings: peaks and crossings at every payload.
     """
 
     configuration: str
@@ -143,34 +143,36 @@ class ResonanceResult:
         """Sentences on speeds to avoid, the most important first."""
         low, high = self.speeds
         if not np.isfinite(low):
-            return [f"No run of {self.configuration} travels: there is no ripple to read (status says why)."]
+            return [f"No run of {self.configuration} travels, so there is no ripple (status gives the reason)."]
         parts = []
         named, bare = ([r for r in self.avoid if bool(r[2][0].mode) is has] for has in (True, False))
         if named:
-            loads = "" if len(self.modes) == 1 else "at one payload or another: "
+            loads = "" if len(self.modes) == 1 else "at least at one payload: "
             parts.append(f"Avoid {loads}{_ranges_in_words(named, self.passing.name)}.")
         elif not bare:
             largest = ", ".join(f"{s.label} {ripple_percent(self._largest(n))}" for n, s in SIGNALS.items())
             parts.append(
-                f"No speed to avoid for its ripple between {span_text(low, high)} mm/s: nothing peaks at a natural "
-                f"frequency (largest ripple: {largest})."
+                f"No speed to avoid for its ripple between {span_text(low, high)} mm/s: no ripple peak is at a "
+                f"natural frequency (largest ripple: {largest})."
             )
         if bare:
             also = "Ripple also peaks" if named else "Ripple peaks"
             parts.append(
-                f"{also}, with no natural frequency to name, at {_ranges_in_words(bare, self.passing.name)}."
+                f"{also}, without a natural frequency nearby, at {_ranges_in_words(bare, self.passing.name)}."
             )
         for name, lowest, highest in self._spread():
             parts.append(
-                f"{name.capitalize()} has no one frequency: {span_text(lowest, highest, 1)} Hz over the "
-                "belt's position."
+                f"{name.capitalize()} has no single frequency: {span_text(lowest, highest, 1)} Hz, depending on "
+                "the belt's position."
             )
         if self.restless:
             spans = ", ".join(span_text(*x) for x in self.restless)
             parts.append(f"Not every run settles at {spans} mm/s.")
         if self.avoid or self.restless:
             free = ", ".join(span_text(*x) for x in self.quiet)
-            parts.append(f"Free of all this: {free} mm/s." if free else "No speed is free of all this.")
+            parts.append(
+                f"Speeds without these problems: {free} mm/s." if free else "No speed is without these problems."
+            )
         if self._table8():
             parts.append(self._table8())
         if self.passing.name == "teeth":
@@ -297,7 +299,7 @@ def span_text(low: float, high: float, unit: float = MM) -> str:
     return ends[0] if ends[0] == ends[1] else f"{ends[0]}-{ends[1]}"
 
 
-_FEW = "travels, but fewer than {} {} passed while ripple was read; take a longer --duration"
+_FEW = "travels, but fewer than {} {} passed while ripple was measured; use a longer --duration"
 #: Most peaks that are shown unfolded.
 UNFOLDED = 30
 

@@ -65,7 +65,7 @@ _OTHERS = {
     "status": ("status", "", ""),
     "flags": ("limits exceeded", "", ""),
     "time_end_s": ("time at the end", "s", "{:.6g}"),
-    "permissible_time_s": ("permissible at this current for", "s", "{:.3g}"),
+    "permissible_time_s": ("permissible time at this current", "s", "{:.3g}"),
 }
 #: What a number that is infinite, or missing, means in some columns.
 _ENDLESS = {"permissible_time_s": words.FOR_EVER}
@@ -105,7 +105,7 @@ def quantity_table(name: str, table: Columns, names: Iterable[str], **options: A
     """The quantities `names` that a table of runs has numbers of, a row for each run.
 
     Args:
-        name: of the table.
+        name: name of the table.
         options: further fields of it, and its `first` columns with their cells.
     """
     first: Sequence[tuple[Column, Sequence[Any]]] = options.pop("first", ())
@@ -162,7 +162,7 @@ def endings_table(
 
     Args:
         counts: by status.
-        meanings: of statuses that are no fidelity's.
+        meanings: meanings of statuses that are no fidelity's.
         more: further columns, each by status.
     """
     total, reached = sum(counts.values()), [s for s, n in counts.items() if n]
@@ -212,5 +212,5 @@ def warming_share(value: float, limit: float, ambient: float) -> float:
 
 def _used(limit: Json) -> Cell | str:
     if limit["percent"] is None:
-        return f"not judged: the robot's file states no `{limit['unstated']}`"
+        return f"not checked: the robot's file has no `{limit['unstated']}`"
     return Cell(limit["percent"], "over" if limit["percent"] > 100 else "bar")

@@ -91,7 +91,7 @@ def _sentence(study: OutputStudy, found: SensitivityResult) -> str:
     """Sentence on the inputs that decide an output, with its spread."""
     share, row = study.overall_share, study.row
     if not _decided(study):
-        return "No number at any of these operating points, or nothing changes it."
+        return "No value at any of these operating points, or no input changes it."
     order = np.argsort(-share, kind="stable")[:3]
     top = [k for k in order if share[k] >= NEGLIGIBLE] or order[:1]
     who = ", ".join(f"{sensitivity_words.input_in_words(found, found.names[k])} {100 * share[k]:.0f} %" for k in top)
@@ -102,7 +102,7 @@ def _sentence(study: OutputStudy, found: SensitivityResult) -> str:
     low, high = value[finite].min(), value[finite].max()
     spans = f"from {low:.{digits}f} to {high:.{digits}f}{unit} over the operating points"
     spread = f"uncertain by ±{np.median(sd[finite]):.{digits}f}{unit} (one sd, median of the points)"
-    return f"{who[0].upper()}{who[1:]}. It goes {spans}, and is {spread}."
+    return f"{who[0].upper()}{who[1:]}. It ranges {spans}, and is {spread}."
 
 
 def _inputs(found: SensitivityResult) -> Table:
@@ -121,7 +121,7 @@ def _next_runs_in_words(found: SensitivityResult) -> Iterable[str]:
     n = found.next_runs
     if n is not None:
         labels = "; ".join(n.points.label(k) for k in range(len(n.points)))
-        yield f"next runs, of {n.candidates} ({n.source}), read to {n.noise}: {labels}"
+        yield f"next runs, of {n.candidates} candidates ({n.source}), measured to {n.noise}: {labels}"
 
 
 def _next_runs(found: SensitivityResult, n: NextRuns) -> Iterable[Block]:

@@ -44,7 +44,7 @@ class SizeResult:
     def statement(self) -> str:
         """The answer: the best design and its binding limits, or the nearest one and its misses."""
         s = self.sizing
-        left_out = f" No parts meet the requirement on {' or '.join(s.unmeetable)}; dropped." if s.unmeetable else ""
+        left_out = f" No parts meet the requirement on {' or '.join(s.unmeetable)} (dropped)." if s.unmeetable else ""
         if s.best is None:
             nearest = min(s.motors.values(), key=margin_shortfall, default=None)
             why = (

@@ -41,7 +41,7 @@ def turn_document(
     Args:
         run: its row of `runs.csv`.
         ended: its time, distance and angle at the end, of a run over time.
-        history: over time, of a fidelity that keeps it.
+        history: history over time, of a fidelity that keeps it.
         turns: settled ones of other duties of the slower side.
         notes: further remarks.
     """

@@ -36,7 +36,7 @@ def of_npz(path: Path, name: str) -> tuple[Signal, ...]:
     for member in archive.namelist():
         where = PurePosixPath(member.replace("\\", "/"))
         if where.is_absolute() or ".." in where.parts:
-            raise BadData(f"{name}, {member}: is a path that leads out of the archive; expected names of arrays")
+            raise BadData(f"{name}, {member}: is a path that points outside the archive; expected names of arrays")
         if where.suffix != ".npy":
             continue
         array = member.removesuffix(".npy")
@@ -92,7 +92,7 @@ def of_matlab(path: Path, name: str) -> tuple[Signal, ...]:
 
 
 def _check_matlab(path: Path, name: str) -> None:
-    """Refuses a file whose variables need more memory than is free. Reading one of them loads all.
+    """Rejects a file whose variables need more memory than is free. Reading one of them loads all.
 
     Raises:
         BadData: they do.

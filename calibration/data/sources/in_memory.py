@@ -53,7 +53,7 @@ def of_object(source: Any) -> tuple[str, tuple[Signal, ...]]:
         try:
             frame = source.collect() if kind == "LazyFrame" else source
         except Exception as error:  # polars has errors of its own
-            raise BadData(f"the LazyFrame: polars cannot compute it ({' '.join(str(error).split())})") from error
+            raise BadData(f"the LazyFrame: polars cannot evaluate it ({' '.join(str(error).split())})") from error
         return "the DataFrame", columnar.of_table(frame.to_arrow())
     if library == "pyarrow" and kind in ("Table", "RecordBatch"):
         import pyarrow as pa

@@ -86,7 +86,7 @@ def of_content(content: Any, name: str) -> tuple[Signal, ...]:
 
 def _collect(value: Any, at: str, arrays: Columns, name: str, depth: int) -> None:
     if depth > DEEPEST:
-        raise BadData(f"{name}, {at}: is nested too deep; expected at most {DEEPEST} levels")
+        raise BadData(f"{name}, {at}: is nested too deeply; expected at most {DEEPEST} levels")
     if isinstance(value, Mapping):
         value = _unfolded(value)
         if isinstance(value, list):
@@ -173,7 +173,7 @@ def _episodes(records: Sequence[Mapping[str, Any]]) -> Columns | None:
 
 def _leaves(record: Mapping[str, Any], at: str, name: str, depth: int) -> Iterable[tuple[str, Any]]:
     if depth > DEEPEST:
-        raise BadData(f"{name}, {at}: is nested too deep; expected at most {DEEPEST} levels")
+        raise BadData(f"{name}, {at}: is nested too deeply; expected at most {DEEPEST} levels")
     for key, value in record.items():
         here = f"{at}.{key}" if at else str(key)
         if isinstance(value, Mapping):

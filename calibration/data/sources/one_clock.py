@@ -27,10 +27,10 @@ class Elapsed(NamedTuple):
     """Times of a clock.
 
     Attributes:
-        time: since its first sample [s], shape (n,).
+        time: time since its first sample [s], shape (n,).
         first: that sample by the clock [s].
-        unit: of its numbers, empty for dates.
-        period: of a counter that wraps, else 0.
+        unit: unit of its numbers, empty for dates.
+        period: period of a counter that wraps, else 0.
     """
 
     time: np.ndarray
@@ -98,7 +98,7 @@ def on_one_grid(
     there. Other rows have none.
 
     Args:
-        name: of the source.
+        name: name of the source.
         chosen: signals by the name of their column, each with a clock.
         is_held: True for a column whose values are held.
         is_measured: True for a column of readings.
@@ -132,8 +132,8 @@ def on_one_grid(
     for key, time in times.items():
         if time[-1] < rows[kept][0] if kept.any() else True:
             raise BadData(
-                f"{name}: {clocks[key].name} ends at {time[-1]:g} s, before {clocks[main].name} and "
-                "every command have begun; expected clocks with a time in common"
+                f"{name}: {clocks[key].name} ends at {time[-1]:g} s, before {clocks[main].name} and every command "
+                "have begun; expected signals that overlap in time"
             )
     values: Columns = {}
     brought: dict[str, list[str]] = {}
@@ -154,11 +154,12 @@ def on_one_grid(
     if brought:
         how = {
             "held": "held from sample to sample",
-            "interpolated": "on the straight line between samples, each used once",
+            "interpolated": "interpolated linearly between samples, each used once",
         }
         each = "; ".join(f"{', '.join(columns)} {how[kind]}" for kind, columns in brought.items())
         notes.append(
-            f"{name}: signals have clocks of their own; rows are those of {clocks[main].name} ({_rate(rows)}): {each}"
+            f"{name}: signals have different clocks; rows are taken at the samples of {clocks[main].name} "
+            f"({_rate(rows)}): {each}"
         )
     if not kept.all():
         notes.append(f"{name}: {np.count_nonzero(~kept)} rows before the first command are left out")
@@ -166,12 +167,12 @@ def on_one_grid(
         unit, period = read[key].unit, read[key].period
         if key in late:
             notes.append(
-                f"{name}: {count_noun(late[key], 'sample')} of {clock.name} recorded late; sorted by their stamps"
+                f"{name}: {count_noun(late[key], 'sample')} of {clock.name} recorded late; sorted by time stamp"
             )
         if period:
             notes.append(f"{name}: {clock.name} wraps at {period:.10g}; counted on from there")
         if not clock.unit and unit not in ("", "s"):
-            notes.append(f"{name}: {clock.name} states no unit; its numbers are read as {unit} ({_rate(times[key])})")
+            notes.append(f"{name}: {clock.name} has no unit; its numbers are read as {unit} ({_rate(times[key])})")
     on = rows[kept]
     return on - on[0], values, tuple(notes)
 
@@ -181,7 +182,7 @@ def used_once(rows: np.ndarray, time: np.ndarray, values: np.ndarray) -> np.ndar
 
     Args:
         rows: time of the rows [s], shape (rows,).
-        time, values: of the samples, shape (samples,).
+        time, values: time and values of the samples, shape (samples,).
     """
     numbers = np.asarray(values, float)
     sound = np.isfinite(numbers)
@@ -223,7 +224,6 @@ def _check(name: str, clock: str, time: np.ndarray) -> None:
     if (back := np.flatnonzero(~(np.diff(time) >= 0))).size:
         row = int(back[0])
         raise BadData(
-            f"{name}, {clock}: goes back from {time[row]:g} to {time[row + 1]:g} s at "
-            f"sample {row + 2}; "
-            "expected time stamps that rise; sort the recording, or give each part its own file"
+            f"{name}, {clock}: goes back from {time[row]:g} to {time[row + 1]:g} s at sample {row + 2}; expected "
+            "increasing time stamps; sort the recording, or give each part its own file"
         )

@@ -57,8 +57,8 @@ class Format:
             if not self.library:
                 raise
             raise BadData(
-                f"{name}: is {self.kind}, which {self.library} reads, and it is not installed; install it with "
-                "pip install mmrjax[logs]"
+                f"{name}: is {self.kind}; reading it needs {self.library}, which is not installed: pip install "
+                "mmrjax[logs]"
             ) from error
         except Exception as error:  # each library has errors of its own
             raise unreadable_file(name, self.kind, error) from error
@@ -157,17 +157,17 @@ def open_signals(path: Path, within: str, name: str, form: Format) -> Source:
 
     Args:
         within: path of signals in it, empty for all.
-        name: of the file, for messages.
+        name: name of the file, for messages.
 
     Raises:
-        BadData: as `Format.signals`. No signal, or none below `within`.
+        BadData: for the same reasons as `Format.signals`. No signal, or none below `within`.
     """
     if path.is_dir():
         for item in path.iterdir():
             if item.is_symlink() and not (item.exists() and item.resolve().is_relative_to(path.resolve())):
-                raise BadData(f"{name}, {item.name}: is a link that leads out of the bag; expected the file itself")
+                raise BadData(f"{name}, {item.name}: is a link that points outside the bag; expected the file itself")
             if not stat.S_ISREG(item.stat().st_mode) and not item.is_dir():
-                raise BadData(f"{name}, {item.name}: is no regular file; expected the files of a bag")
+                raise BadData(f"{name}, {item.name}: is not a regular file; expected the files of a bag")
     signals = tuple(form.signals(path, name))
     if not signals:
         raise BadData(f"{name}: is {form.kind} without signals; expected at least one column or array")
@@ -180,7 +180,7 @@ def open_object(source: Any) -> Source:
     """The signals of a table in memory.
 
     Raises:
-        BadData: as `in_memory.of_object`.
+        BadData: for the same reasons as `in_memory.of_object`.
     """
     kind, signals = in_memory.of_object(source)
     return checked_source(kind, kind, signals)
@@ -202,7 +202,7 @@ def checked_source(
     size = input_files.VALUE * sum(signal.length for signal in signals)
     input_files.check_declared(name, len(signals), size, held)
     count = collections.Counter(signal.path for signal in signals)
-    why = "has the name of another signal; expected different names"
+    why = "has the same name as another signal; expected different names"
     signals = [s if count[s.path] == 1 else dataclasses.replace(s, refused=why) for s in signals]
     return Source(name, kind, _guarded(signals, name, kind), digest)
 

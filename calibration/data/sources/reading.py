@@ -55,7 +55,7 @@ def read_columns(source: Any, layout: Layout, columns: Preset | None = None, bet
     Args:
         source: a path, perhaps with `::` and the path of signals in the file, or a table in memory
             (`in_memory.EXPECTED`). A pattern such as `runs/*.csv` names files that are a run each.
-        layout: of the table's robot.
+        layout: layout of the table's robot.
         columns: names of the source's columns, in addition to the robot's. They win over these.
         between: `linear` if the imposed quantity follows straight lines between samples, as in `Rig.between_rows`.
 
@@ -115,7 +115,7 @@ def read_whole_table(path: Path, within: str = "") -> NamedArrays | None:
     """Returns every column of a table in a file, unchanged, None for text, whose comments have a meaning.
 
     Raises:
-        BadData: as `read_columns`. Signals with separate clocks, which do not form one table.
+        BadData: for the same reasons as `read_columns`. Signals with separate clocks, which do not form one table.
     """
     name = path.name or str(path)
     form = opening.format_of(path, name)
@@ -176,8 +176,8 @@ def weakened_field_notes(preset: Preset, values: Mapping[str, Raw]) -> Names:
             q, d = (np.sqrt(np.nanmean(column_numbers(values[c]) ** 2)) for c in (theirs, column.across))
             if d > WEAKENED * q:
                 notes.append(
-                    f"{preset.name}: {column.across} is {d / q:.0%} of {theirs}, so the field is weakened, "
-                    "which no DC motor does; leave those rows out"
+                    f"{preset.name}: {column.across} is {d / q:.0%} of {theirs}. The motor runs with field "
+                    "weakening there, which a DC motor model does not cover; leave those rows out"
                 )
     return tuple(notes)
 
@@ -258,7 +258,7 @@ def _chosen(source: Source, mapped: Mapped, layout: Layout) -> tuple[dict[str, S
             chosen[theirs] = find_signal(source.signals, theirs, source.name)
         else:
             near = suggested_paths(theirs, [s.path for s in source.signals])
-            missing.append(f"{source.name}: no signal {theirs}, which {mine} is read from; {near}")
+            missing.append(f"{source.name}: no signal {theirs}, from which {mine} is read; {near}")
     spellings = dataclasses.replace(layout, channels=channels.EVERY, mapped=()).spellings()
     spelled = {name.casefold() for name in spellings}
     taken = {id(signal) for signal in chosen.values()}
@@ -340,8 +340,8 @@ def _on_a_grid(
 def _how_to_name(source: Source) -> str:
     paths = [s.path for s in source.signals]
     return (
-        f"{suggested_paths('', paths)}; state their columns in the robot's file, [columns] supply_voltage_V = "
-        f'"{paths[0]}" (mmrjax inspect proposes the lines)'
+        f"{suggested_paths('', paths)}; give their columns in the robot's file, for example [columns] "
+        f'supply_voltage_V = "{paths[0]}" (mmrjax inspect proposes the lines)'
     )
 
 

@@ -38,7 +38,7 @@ class Clock:
     Attributes:
         name: path of the time stamps, for messages.
         load: returns them, shape (n,), numbers or `datetime64`.
-        unit: of the numbers, a key of `UNITS`, empty if the recording does not state it.
+        unit: unit of the numbers, a key of `UNITS`, empty if the recording does not state it.
     """
 
     name: str
@@ -185,7 +185,7 @@ def of_arrays(
     Args:
         source: name of it, for messages.
         arrays: by path: shape, kind of numbers, and a function that returns the array.
-        units: that the recording states, by path.
+        units: units that the recording states, by path.
 
     Raises:
         BadData: too many columns (`input_files.check_declared`).
@@ -266,9 +266,9 @@ class Source:
     """A recording or a table: its signals, and notes on its reading.
 
     Attributes:
-        name: for messages.
-        kind: of file, `a Parquet file` say.
-        signals: in the order of the recording.
+        name: name for messages.
+        kind: kind of file, `a Parquet file` say.
+        signals: signals in the order of the recording.
         digest: SHA-256 of the file, empty of data in memory.
         notes: sentences on its reading.
     """

@@ -78,8 +78,8 @@ def _check_messages(path: Path, name: str) -> dict[str, list[tuple[str, int]]]:
             byte = after
     if byte != size:
         raise BadData(
-            f"{name}: ends within a message, at byte {byte} of {size}, as if it is cut off; copy it again, or if the "
-            f"recorder lost its power, keep the whole messages: head -c {byte} {name}"
+            f"{name}: ends within a message, at byte {byte} of {size}, as if it was cut off; copy it again, or, "
+            f"if the recorder lost power, keep only the complete messages: head -c {byte} {name}"
         )
     return formats
 

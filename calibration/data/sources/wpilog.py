@@ -40,7 +40,7 @@ class _Entry:
                 self.name,
                 len(self.stamps),
                 lambda: np.zeros(0),
-                refused=f"has the type {self.kind}, which is not read",
+                refused=f"has the type {self.kind}, which is not supported",
             )
         stamps = np.array(self.stamps)
         if self.name.startswith("sysid-test-state-"):  # the end of a test carries the stamp of its last sample
@@ -61,7 +61,7 @@ def of_wpilog(path: Path, name: str) -> tuple[Signal, ...]:
     content = input_files.file_bytes(path, name)
     input_files.check_memory(name, OBJECTS * len(content))
     if content[7:8] != b"\x01":
-        raise BadData(f"{name}: is a WPILOG file of another version than 1; export it as CSV with DataLogTool")
+        raise BadData(f"{name}: is a WPILOG file with a version other than 1; export it as CSV with DataLogTool")
     place = HEADER + int.from_bytes(content[8:HEADER], "little")
     entries: dict[int, _Entry] = {}
     while place < len(content):
@@ -74,8 +74,8 @@ def of_wpilog(path: Path, name: str) -> tuple[Signal, ...]:
         entry, size, stamp = fields
         if begin + size > len(content):
             raise BadData(
-                f"{name}: ends within a record, at byte {place} of {len(content)}, as if it is cut off; copy it "
-                f"again, or keep the whole records: head -c {place} {name}"
+                f"{name}: ends within a record, at byte {place} of {len(content)}, as if it was cut off; copy it "
+                f"again, or keep only the complete records: head -c {place} {name}"
             )
         payload, place = content[begin : begin + size], begin + size
         if entry == 0 and payload[:1] == bytes([START]):

@@ -47,7 +47,7 @@ def pose_problem(
     """Inverse problem of these runs.
 
     Args:
-        sd: of the readings [SI], shape (rows, channels).
+        sd: standard deviation of the readings [SI], shape (rows, channels).
         model: name of the fidelity that simulates them. None takes the first that the kind of data allows.
 
     Raises:

@@ -89,7 +89,8 @@ class Observer(eqx.Module):
     """Readings of runs of one kind, and the facts about that kind that inference needs.
 
     Attributes:
-        conditions: of each run, shape (runs,). Conditions that change within a history, at each of its instants.
+        conditions: conditions of each run, shape (runs,). Conditions that change within a history, at each of its
+            instants.
         word: name of a row.
         fewest: rows needed to separate a missing effect from noise.
         axis: column of a table that orders the rows of a run, empty if a run is one row.
@@ -101,7 +102,7 @@ class Observer(eqx.Module):
         evidence: kinds of evidence for a missing effect.
         library: effects that such data show in addition to the library's.
         menu: True if the menu of experiments has runs of this kind.
-        searches: of a calibration. None takes the fidelity's.
+        searches: searches of a calibration. None takes the fidelity's.
         profiled: True if its parameters are profiled when the fidelity's are.
     """
 
@@ -145,7 +146,7 @@ class Observer(eqx.Module):
     @classmethod
     @abc.abstractmethod
     def check(cls, runs: Runs, noise: Noise) -> list[Remark | str]:
-        """Refuse runs that contradict each other. Return notes on the others.
+        """Reject runs that contradict each other. Return notes on the others.
 
         Raises:
             BadData: readings that cannot all be true.
@@ -154,7 +155,7 @@ class Observer(eqx.Module):
     @classmethod
     @abc.abstractmethod
     def check_start(cls, runs: Runs, noise: Noise, robot: Robot) -> list[Remark | str]:
-        """Refuse runs whose initial state the model cannot reproduce. Return notes on the length of the others.
+        """Reject runs whose initial state the model cannot reproduce. Return notes on the length of the others.
 
         Raises:
             BadData: a run does not begin in an initial state of the model.
@@ -168,7 +169,7 @@ class Observer(eqx.Module):
     @classmethod
     @abc.abstractmethod
     def check_settled(cls, runs: Runs) -> None:
-        """Refuse runs other than settled ones of one row each.
+        """Reject runs other than settled ones of one row each.
 
         Raises:
             BadData: time histories.
@@ -276,10 +277,10 @@ class Observer(eqx.Module):
         """Initial values of the bootstrap's replicates, leading axis the keys: the keys, or fits of tables drawn.
 
         Args:
-            problem: of the base only, at its fit z.
+            problem: problem of the base only, at its fit z.
             linear: the same fit, linearised.
             keys: random keys, as numbers, shape (replicates, words).
-            factors: on the sds of each replicate, shape (replicates, channels).
+            factors: factors on the sds of each replicate, shape (replicates, channels).
         """
         return keys
 
@@ -290,8 +291,8 @@ class Observer(eqx.Module):
         """One replicate of the bootstrap: a table drawn from the fit of the base, fitted again and linearised.
 
         Args:
-            problem: of the base only.
-            data: of the table.
+            problem: problem of the base only.
+            data: data of the table.
             linear: the fit, linearised.
             drawn: one of `draws`.
         """
@@ -302,7 +303,7 @@ class Observer(eqx.Module):
         """Initial coordinates of at most `count` searches of a base: the prior mean, and draws of the prior.
 
         Args:
-            problem: without effects in its coordinates.
+            problem: problem without effects in its coordinates.
             every: the same with all rows of a log that was thinned.
         """
         size = len(problem.coordinates)
@@ -344,7 +345,7 @@ class Observer(eqx.Module):
 
         Args:
             starts: shape (members, coordinates).
-            weights: of each member's readings, (members, rows, channels).
+            weights: weights of each member's readings, (members, rows, channels).
             active: set of effects of each member, see `ActiveSet`. None keeps the problem's.
             rivals: True if all search the same optimum, so that some may be stopped early.
             most: largest number of steps of each. None: the policy's.
@@ -371,7 +372,7 @@ class Observer(eqx.Module):
         """Bases of curves for the search for a discrepancy.
 
         Args:
-            columns: of the padded table, with fitted readings.
+            columns: columns of the padded table, with fitted readings.
             robot: fitted.
         """
 
@@ -380,7 +381,7 @@ class Observer(eqx.Module):
         """Further findings for data of this kind.
 
         Args:
-            bases: of curves.
+            bases: bases of curves.
             included: True for included rows of the table.
             before, after: diagnoses of base and proposed robot.
         """

@@ -152,7 +152,7 @@ class SettledRuns(Observer):
 
     @classmethod
     def check(cls, runs: Runs, noise: Noise) -> list[Remark | str]:
-        """Refuses a table of one condition with readings that differ. Notes the repeats that differ most."""
+        """Rejects a table of one condition with readings that differ. Notes the repeats that differ most."""
         measured, alike = runs.measured(), rows_of_same_conditions(runs)
         least, remarks = cls.least(runs), list[Remark]()
         shared = np.array([source == "series" for source in noise.source])

@@ -122,8 +122,8 @@ def starts_from_settled_ends(
     """Initial coordinates for searches of a base, the most promising first.
 
     Args:
-        problem: of histories, without effects in its coordinates.
-        draws: of the prior, tried in addition to the settled ends.
+        problem: problem of histories, without effects in its coordinates.
+        draws: draws of the prior, tried in addition to the settled ends.
         search: (problem, starts, most steps) → optima of a batch of searches.
     """
     ends = _fit_settled_ends(problem)

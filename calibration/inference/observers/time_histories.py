@@ -167,8 +167,8 @@ class HistoriesLinearization(Linearization):
     Attributes:
         rows_of: indices of each run's rows in the order of time, -1 beyond its last, shape (runs, samples).
         knots: rows between which a defect is linear, shape (runs, knots).
-        time: of each row since the start of its run [s].
-        angle: of the driving shaft since then [rad].
+        time: time of each row since the start of its run [s].
+        angle: angle of the driving shaft since then [rad].
     """
 
     rows_of: Int[Array, "runs samples"]
@@ -220,10 +220,11 @@ class Histories(Observer):
     parameter, so refits of a bootstrap stay within the linear range and are linear fits.
 
     Attributes:
-        conditions: of each run. A field that changes within a run has shape (runs, instants), else (runs,).
+        conditions: conditions of each run. A field that changes within a run has shape (runs, instants), else
+            (runs,).
         times: the grid of each run from 0, its last instant repeated to a common length, shape (runs, instants) [s].
         run: index of each row's run.
-        instant: of its sample in `times`, shape (rows,).
+        instant: instant of its sample in `times`, shape (rows,).
         rows_of: indices of each run's rows in the order of time, -1 beyond its last, shape (runs, samples).
         knots: rows between which a defect is linear, a run's last repeated, shape (runs, knots).
         delayed: True if imposed quantities may act later than their column says (`Rig.delay`), so that readings are
@@ -840,7 +841,7 @@ def _conditions_over_time(
     Args:
         of_rows: shape (rows,).
         each: rows of each run in the order of time.
-        time: of rows.
+        time: time of rows.
         times: instants of each run [s].
         on_lines: fields that are linear between rows: mean over the step that begins at each instant.
     """
@@ -946,7 +947,7 @@ def _merge_levels(x: np.ndarray) -> np.ndarray:
 
 
 def _check_signs(runs: Runs) -> None:
-    """Refuse unsigned speeds and currents of runs that are driven backward.
+    """Reject unsigned speeds and currents of runs that are driven backward.
 
     A rig's inertia may carry it forwards during one interval, but not during all of a table.
     """
@@ -1086,7 +1087,7 @@ def _may_pass_rest(speeds: np.ndarray, share: float) -> np.ndarray:
 
     Args:
         speeds: readings that are 0 at rest or their rates, shape (rows, channels).
-        share: of their largest, below which a run may pass through rest.
+        share: share of their largest, below which a run may pass through rest.
     """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # a channel without readings
@@ -1212,7 +1213,7 @@ def _responses(
 
     Args:
         observe: with known runs.
-        scale: of readings [1/SI], shape (rows, channels).
+        scale: scale of readings [1/SI], shape (rows, channels).
     """
     defects, by_effects = observe.changes(robot, tuple(balance_probe(b) for b in PROBED), effects)
     rows_of, rows = observe.rows_of, len(scale)
@@ -1229,7 +1230,7 @@ class _Probed(NamedTuple):
     Attributes:
         every: probes, those with requested defects first.
         size: number of these.
-        effects: with the robot's shapes.
+        effects: effects with the robot's shapes.
         entering: index of each instance's probe, shape (instances,).
         enters: 1 if that balance has a probe, else 0, shape (instances,).
         at_sensor: 1 if an instance is an error of a channel's instrument, else 0, shape (channels, instances).
@@ -1280,9 +1281,9 @@ class _Probed(NamedTuple):
         Args:
             clock: times of the knots [s].
             instants: numbers of the samples' instants.
-            times: of instants [s].
+            times: times of instants [s].
             along: the run.
-            time: of samples [s].
+            time: time of samples [s].
             delayed: True if readings are late.
         """
         robot, size, none = self.robot, self.size, jnp.zeros(len(self.every))

@@ -36,19 +36,19 @@ USE = {
         "{armature:.4g} kg·m²."
     ),
     "mjlab": (
-        "`from mjlab_actuator import DriveActuatorCfg`, then "
-        '`DriveActuatorCfg(target_names_expr=("{at}",))` among the actuators of an entity. The effort target is the '
-        "voltage [V]. It was tested against mjlab's interface by a stand-in, not within mjlab."
+        '`from mjlab_actuator import DriveActuatorCfg`, then `DriveActuatorCfg(target_names_expr=("{at}",))` '
+        "among the actuators of an entity. The effort target is the voltage [V]. It was tested against a "
+        "stand-in for mjlab's interface, not within mjlab."
     ),
     "table": (
-        "Read the voltage for a speed and a torque of the joint, and divide by the supply's voltage for the duty. "
-        "The torque is that at the joint; add (inertia · acceleration) of what turns: the rotor has {armature:.4g} "
-        "kg·m² at the joint."
+        "Read the voltage for a speed and a torque of the joint, and divide by the supply's voltage to get the "
+        "duty. The torque is the torque at the joint. Add inertia · acceleration of the rotating parts: the "
+        "rotor has {armature:.4g} kg·m² at the joint."
     ),
     "randomization": (
-        '`numpy.load("draws.npz")`: each array has one number a draw; take all numbers of one draw together, since '
-        "they are correlated. `mujoco/…` are attributes of `drive.xml` as the format mujoco writes it; `actuator/…` "
-        "are keys of `PARAMS`."
+        '`numpy.load("draws.npz")`: each array has one value per sample; use all values of one sample '
+        "together, since they are correlated. `mujoco/…` are attributes of `drive.xml` as the format mujoco "
+        "writes it; `actuator/…` are keys of `PARAMS`."
     ),
 }
 #: Readings that a controller compares with its goal, their units, and the last term of its duty.
@@ -59,9 +59,9 @@ GOALS = {
 }
 NOT_TESTED = (
     "Voltages, loads and temperatures outside the runs above.",
-    "Fast changes: the comparison is of settled runs, so inductance and inertia rest on their stated values.",
+    "Fast changes: only settled runs are compared, so inductance and inertia are the given values.",
 )
-BACKWARD = "Runs in which the load drives the motor: the runs above include none."
+BACKWARD = "Runs in which the load drives the motor: not among the runs above."
 
 
 def export_statement(found: Export) -> str:
@@ -77,7 +77,7 @@ def export_statement(found: Export) -> str:
     return (
         f"The drive of {drive.file.name}, {drive.configuration}, as {FORMATS[found.format]}: its error against "
         f"{compared.reference} over {count_noun(len(compared.situation.command), 'run')} is "
-        f"{channels_shown or 'unknown, since they have no reading of its current or speed'}."
+        f"{channels_shown or 'unknown, since these runs contain neither its current nor its speed'}."
     )
 
 
@@ -97,16 +97,18 @@ def export_remarks(found: Export) -> list[str]:
     compared, drive = found.comparison, found.joint
     said = []
     if not compared.situation.is_measured:
-        said.append("no readings were given, so the reference is the native model; give runs with --data")
+        said.append("no measurements were given, so the reference is the native model; give runs with --data")
     else:
-        said.append("the refit used no reading: these are hold-out errors if the robot was not fitted to these runs")
+        said.append(
+            "the refit used no measurements: these are hold-out errors if the robot was not fitted to these runs"
+        )
     lost = [f.name for f in compared.fates if f.verdict == DROPPED]
     if lost:
         said.append(f"dropped: {', '.join(lost)}")
     if drive.idle:
-        said.append(f"{', '.join(drive.idle)}: not exported, since it does not act on {drive.configuration}")
+        said.append(f"{', '.join(drive.idle)}: not exported, since it has no effect in {drive.configuration}")
     if found.posterior is None and drive.file.source.endswith(".toml"):
-        said.append("no posterior.nc next to the robot's file: intervals are those of the priors")
+        said.append("no posterior.nc next to the robot's file: intervals come from the priors")
     return said
 
 

@@ -29,7 +29,7 @@ class Drawn:
     """A robot from the side on the ground: lower, and from its centre of mass on higher by a step.
 
     Attributes:
-        side: in a frame along the ground.
+        side: side in a frame along the ground.
         base: height of its middle of the wheelbase [m].
         step: [m].
         slope: [rad].
@@ -175,11 +175,11 @@ def posture_sentences(found: Postures) -> str:
     """One or two sentences on the posture of the first run and its geometric limits."""
     one, most = {c: values[0] for c, values in found.table.items()}, found.over.step_mm.max()
     return (
-        f"posture: pitch {one['pitch_deg']:z.1f}°, on {one['contact_mm']:.0f} mm, which bear {one['bears']}; tips on "
-        f"slopes of {one['tips_back_deg']:.1f}° uphill, {one['tips_forward_deg']:.1f}° downhill, "
-        f"{one['tips_aside_deg']:.1f}° across. Its geometry allows steps up to {one['highest_step_mm']:.0f} mm and "
-        f"gaps up to {one['widest_gap_mm']:.0f} mm; the highest step in any posture is {most:.0f} mm "
-        f"(front {found.over.front_deg:g}°, rear {found.over.rear_deg:g}°)"
+        f"posture: pitch {one['pitch_deg']:z.1f}°, on {one['contact_mm']:.0f} mm, carried by {one['bears']}; tips "
+        f"on slopes of {one['tips_back_deg']:.1f}° uphill, {one['tips_forward_deg']:.1f}° downhill, "
+        f"{one['tips_aside_deg']:.1f}° across. Its geometry allows steps up to {one['highest_step_mm']:.0f} mm "
+        f"and gaps up to {one['widest_gap_mm']:.0f} mm; the highest step in any posture is {most:.0f} mm (front "
+        f"{found.over.front_deg:g}°, rear {found.over.rear_deg:g}°)"
     )
 
 
@@ -189,4 +189,7 @@ def tipping_remarks(found: Postures) -> list[str]:
     if not over.size:
         return []
     which = "the run" if len(found.table["margin_mm"]) == 1 else "runs " + ", ".join(str(k + 1) for k in over[:ROWS])
-    return [f"posture: {which} would tip over on that slope; currents and speeds are of a robot that is held on it"]
+    return [
+        f"posture: {which} would tip over on that slope; currents and speeds are for a robot that is held "
+        "upright on it"
+    ]

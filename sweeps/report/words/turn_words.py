@@ -54,21 +54,22 @@ def turn_not_found_reason(speed: float, rate: float, speeds: np.ndarray, rates: 
     Args:
         speed: demanded [m/s].
         rate: demanded yaw rate [rad/s].
-        speeds, rates: of settled turns at full voltage, from straight travel to the spot. NaN: no steady turn.
+        speeds, rates: speeds and rates of settled turns at full voltage, from straight travel to the spot. NaN: no
+            steady turn.
     """
     known = np.isfinite(speeds) & np.isfinite(rates)
     if not known.any():
-        return "and with all of that no turn settles"
+        return "and even with all of the supply no turn settles"
     ahead, round_ = np.abs(speeds[known]), np.abs(rates[known])
     most_rate = np.interp(abs(speed), ahead[::-1], round_[::-1], right=math.nan)
     most_speed = np.interp(abs(rate), round_, ahead, right=math.nan)
     if most_rate >= abs(rate):
-        return "which would do; friction that falls with sliding may have none there"
+        return "which would be enough; if friction falls with sliding speed, there may be no settled turn"
     told = [f"about {most_rate:.3g} rad/s at {abs(speed):g} m/s"] if speed and math.isfinite(most_rate) else []
     told += [f"about {most_speed:.3g} m/s at {abs(rate):g} rad/s"] if math.isfinite(most_speed) else []
     told += [f"no more than {ahead.max():.3g} m/s, straight"] if not math.isfinite(most_rate) else []
     told += [f"no more than {round_.max():.3g} rad/s, on the spot"] if not math.isfinite(most_speed) else []
-    return f"with which it reaches {' and '.join(told)}"
+    return f"which gives {' and '.join(told)}"
 
 
 def is_going(row: Json) -> bool:
@@ -80,7 +81,7 @@ def turn_answer(row: Json, ended: Mapping[str, float] | None) -> str:
     """A turn in a sentence.
 
     Args:
-        row: of the table of runs.
+        row: row of the table of runs.
         ended: of a run over time `time_s`, `displacement_m` and `turned_deg` at its end. None: a settled turn.
     """
     status = str(row["status"])
@@ -116,7 +117,7 @@ def _moves(row: Json) -> str:
     if _sloping(row):
         return (
             f"There {speed:.0f} mm/s ahead and {abs(rate):.2f} rad/s to the {_way(row)}: on a slope the heading "
-            "changes, and no turn is a circle."
+            "keeps changing, so a turn is not a circle."
         )
     if abs(speed) < SPOT:
         minute = 60 / FULL * abs(rate)
@@ -135,8 +136,8 @@ def turn_notes(robot: Robot, row: Json) -> list[str]:
     width = float(row["effective_width_mm"])
     if math.isfinite(width) and not _sloping(row) and row["status"] == "converged":
         notes.append(
-            f"effective track width {width:.0f} mm, {width / own:.2f} times the {own:.0f} mm between the sides: the "
-            "difference of the sides' speeds that a turn takes, over what it would take without sliding"
+            f"effective track width {width:.0f} mm, {width / own:.2f} times the {own:.0f} mm between the sides: "
+            "the speed difference that the turn needs, relative to the difference without sliding"
         )
     if robot.rig.inherits and not BETWEEN <= own * MM <= OVER:
         notes.append(
@@ -147,11 +148,11 @@ def turn_notes(robot: Robot, row: Json) -> list[str]:
         power, current = float(row[f"power_{side}_W"]), float(row[f"motor_current_{side}_A"])
         turning = float(row[f"motor_speed_{side}_rpm"])
         if abs(turning) < STANDS:
-            notes.append(f"the {side} motor stands at {abs(current):.2f} A")
+            notes.append(f"the {side} motor is stalled at {abs(current):.2f} A")
         elif turning * current < 0:
             back = f", {-power:.1f} W go back to the supply" if power < 0 else ""
-            notes.append(f"the {side} motor is driven by the turn: {abs(current):.2f} A brake it{back}")
+            notes.append(f"the {side} motor is driven by the turn and braked with {abs(current):.2f} A{back}")
     if float(row["power_supply_W"]) < 0:
-        notes.append("the supply has to take power back")
+        notes.append("the supply has to absorb power")
     notes += [f"{flag}: {words.FLAGS[flag]}" for flag in str(row["flags"]).split(";") if flag]
     return notes
