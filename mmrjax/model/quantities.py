@@ -297,7 +297,7 @@ def _winding_temperature(robot: Any, signals: Any) -> Any:
     return robot.motor.temperature_settled(signals.current)
 
 
-def _position(robot: Any, signals: Any) -> Any:
+def _rolled_path(robot: Any, signals: Any) -> Any:
     """Distance that the driven wheel has rolled [m]."""
     return robot.chassis(signals.configuration).radius * signals.angle
 
@@ -469,7 +469,7 @@ TABLE: dict[str, tuple[Quantity, ...]] = {
             sign="", settled=False,
         ),
         Channel(
-            "position", "mm", "position", _PLACES, 1e4, signal=_position, resolution=2, zero_at_rest=True, sign="",
+            "position", "mm", "position", _PLACES, 1e4, signal=_rolled_path, resolution=2, zero_at_rest=True, sign="",
             settled=False,
         ),
         _VOLTAGE,
