@@ -47,7 +47,7 @@ class Loads:
     """The loads of a robot file, before the parameters that it states.
 
     Attributes:
-        by_name: in order.
+        by_name: loads by name, in order.
         travels: true if they travel, as vehicles and linear units do.
         linear: names of linear units.
         missing: parameters without default that the file does not state.

@@ -30,7 +30,7 @@ class SignalFacts:
     """Facts about a signal of a file.
 
     Attributes:
-        path: of it.
+        path: path of the signal.
         unit: unit that the file states.
         samples: number of them.
         refused: why it cannot be read.
@@ -61,7 +61,7 @@ class Contents:
 
     Attributes:
         name, kind: name and kind of the file.
-        signals: of it.
+        signals: signals of the file.
         notes: notes on how it was read.
         preset: name of the packaged preset that its columns are of. Empty: none.
         proposed: lines of a table `[columns]`, for a person to check.

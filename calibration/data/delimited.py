@@ -187,7 +187,7 @@ def split_cells(name: str, lines: Sequence[str]) -> tuple[list[list[str]], Names
 
     Args:
         name: name of the file, for messages.
-        lines: of the file, its header first.
+        lines: lines of the file, header first.
 
     Raises:
         BadData: text that is no CSV, a column that has decimal commas and points, or marks that may stand between

@@ -215,9 +215,11 @@ def _check_sides(name: str, columns: Columns, layout: Layout) -> None:
 
 
 def without_clamped(name: str, columns: Columns, kept: np.ndarray) -> tuple[Columns, np.ndarray, Names]:
-    """Returns the kept rows of a log without those of a clamp, True for these rows, and a sentence on the others.
+    """Returns a log without the rows in which a clamp holds the output, a mask of the rows kept, and a note on the
+    others.
 
-    Each stretch between two clamps becomes a run, as the motors start again. Settled rows keep theirs.
+    Each segment between two clamped ones becomes a run, because the motors start again. Settled rows keep their
+    runs.
     """
     note: Names = ()
     if "held" in columns and set(TIME) <= set(columns) and (held := columns.pop("held") > 0.5).any():

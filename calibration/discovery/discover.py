@@ -353,7 +353,7 @@ class LoopStages:
     Attributes:
         verdict: `none`, `named`, `class`, `mechanism`, `place` or `undescribed`.
         screened: the base fit without outliers.
-        left: its diagnosis.
+        left: diagnosis of the base fit.
         sds: noise of the verdict.
         searched: the search.
         alike: effects that cannot be separated, if a name is given.

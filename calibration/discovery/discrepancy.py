@@ -152,7 +152,7 @@ class Shaped(eqx.Module):
     """Coordinates of a base fit, then those of a curve's ordinates: y = L z, all standard normal.
 
     Attributes:
-        base: of the base.
+        base: coordinates of the base.
         root: L, shape (ordinates, ordinates).
         names: dotted, of the ordinates.
         fitted_once: True, because few fits use such coordinates.
@@ -184,7 +184,7 @@ class Discrepancy:
     """A located discrepancy, as a smooth curve fitted together with the base.
 
     Attributes:
-        balance, variable, unit: its place and variable, and the unit of the balance.
+        balance, variable, unit: place and variable of the discrepancy, and the unit of the balance.
         effect: name of the curve among the effects of `robot`, the fitted robot with the curve.
         defect: error of the balance, by row, at the fit without the curve, None if single rows do not show it.
         grid: grid of the variable [SI].

@@ -92,7 +92,7 @@ class Ranked:
     """One experiment of the menu, or several carried out together.
 
     Attributes:
-        experiments: their names.
+        experiments: names of the experiments.
         sigma: separation of every two alternatives, in the order of `itertools.combinations`, so with the
             pairs of the best fit first [σ].
         separates: alternatives that they separate from the best fit, at `Settings.apart`.
@@ -275,7 +275,7 @@ def _possible(
     """Possible and allowed experiments of a menu, and True for their readings among those of the whole menu.
 
     Args:
-        found: of each alternative, the best fit first.
+        found: predictions of each alternative, the best fit first.
     """
     runs = [e for e in experiments if isinstance(e, menu.Run)]
     ends = dict(zip((r.name for r in runs), np.cumsum([len(r.voltage) for r in runs]).tolist(), strict=True))

@@ -115,7 +115,7 @@ class Act:
     """A calibration act: a reading that does not depend on a run.
 
     Attributes:
-        name: of it.
+        name: name of the act.
         kinds: kinds from `KINDS`.
         reading: function of a robot and of the settings [SI], shape (readings,).
         at: settings, one tuple a reading [SI]. Of `weigh`, the configuration's index and the payload.
@@ -138,13 +138,12 @@ class Run:
     """Settled runs under conditions that are not in the table.
 
     Attributes:
-        name: of them.
+        name: name of the runs.
         kinds: kinds from `KINDS`, and the configuration where there is one.
         doing: a row of `experiment_words.DOING`.
         where: the configuration's name, "" for none.
         motors: motors of the robot.
-        setup: how the robot is set up.
-        voltage [V], slope [deg], payload [kg]: conditions of each run, shape (runs,).
+        setup: setup of the robot. voltage [V], slope [deg], payload [kg]: conditions of each run, shape (runs,).
         channels: names of the channels to read.
         configuration: index of the robot's.
         sides: number of motors that are on. None: all.
@@ -467,7 +466,7 @@ def restrict_run(run: Run, kept: np.ndarray, temperature: np.ndarray, speed: np.
     """A run with only its possible conditions, and with the risks to watch.
 
     Args:
-        kept: by `possible_runs`.
+        kept: runs kept by `possible_runs`.
         temperature: temperature of a winding after long running [°C].
         speed: speed of the motor shaft [rad/s]. Both predicted, shape (runs,).
     """

@@ -83,7 +83,7 @@ def resolve(
     """Fit the track model to the rows of a verdict.
 
     Args:
-        found: by the loop, from settled rows.
+        found: result of the loop, from settled rows.
         noise: as given to the loop.
         population, generations, members, seed: population, generations, members and seed of the search, see
             `calibrate`.

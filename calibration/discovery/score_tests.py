@@ -52,7 +52,7 @@ class ScoreTable(eqx.Module):
             Zero if they can't be separated.
         cosine: cosine between two projected signatures.
         curve: curve of each family, as a normal deviate, shape (families,).
-        explained: its ridge score [σ²].
+        explained: ridge score of each family [σ²].
         row: signed root of the score of a shift of each single reading, shape (rows, channels).
         fall: further decrease of the objective predicted by a step of the fit [½σ²].
     """
@@ -269,7 +269,7 @@ def statistics_with_columns(
 
     Args:
         extra: columns over the readings, shape (readings, columns).
-        names: their places.
+        names: places of the columns.
     """
     wide: tuple[Any, Any] = augment_with_columns(linear, extra)
     scores, _ = _padded_scores(dataclasses.replace(linear, jacobian=wide[0], residual=wide[1]), bases)

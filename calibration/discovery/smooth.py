@@ -36,7 +36,7 @@ class Smooth:
     Attributes:
         effect, variable: name of the curve, and its variable.
         low, high: ends of its range.
-        scale: its amplitude.
+        scale: amplitude of the curve.
         root: L of the prior covariance L Lᵀ of the ordinates, shape (ordinates, ordinates).
         start: ordinates in prior coordinates, y = L z, shape (ordinates,).
         explained: decrease of χ².
@@ -148,7 +148,7 @@ class Surface:
     """A smooth discrepancy over two variables in a balance, linear at a fit.
 
     Attributes:
-        columns: its signatures, scaled to the prior of the greatest evidence, shape (readings, terms).
+        columns: signatures of the surface, scaled to the prior of the greatest evidence, shape (readings, terms).
         explained: decrease of χ² [σ²].
         evidence: as in `Smooth`.
     """

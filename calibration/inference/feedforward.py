@@ -49,7 +49,7 @@ class DriveLog:
         voltage: [V].
         position, velocity: position and velocity in `unit`, per second.
         current: current of the motor [A].
-        battery: its voltage at any times [V].
+        battery: battery voltage at any times [V].
         unit: one of `UNITS`.
     """
 

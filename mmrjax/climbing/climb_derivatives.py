@@ -116,9 +116,9 @@ class Derivatives(NamedTuple):
 
     Attributes:
         climb: the run.
-        found: its outputs.
-        by: their derivatives, of shape (values,).
-        slope, slope_sd: of straight lines through `BESIDE` runs along each value, and their standard deviations.
+        found: outputs of the run.
+        by: derivatives of the outputs, of shape (values,). slope, slope_sd: slopes and standard deviations of
+        straight lines through `BESIDE` runs along each value, and their standard deviations.
     """
 
     climb: Climb

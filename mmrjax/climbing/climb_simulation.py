@@ -134,7 +134,7 @@ class ClimbRecord(eqx.Module):
             motor, up.
         holds: 1 if only its worm holds a pair, without current [-].
         energy: energy in and lost, by the names of `SOURCES` and `LOSSES`, of the whole robot [J].
-        stored: in motion, height, contacts and windings, of the whole robot [J].
+        stored: energy stored in motion, height, contacts and windings of the whole robot [J].
         body: share of all normal force that the body carries [-].
         grip: traction of all rolling contacts over the limit of their friction [-].
         carried: share of the weight that all contacts carry [-].

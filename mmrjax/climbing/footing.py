@@ -40,7 +40,7 @@ class Shape(eqx.Module):
         main, lever: the belts of one side. Both levers have equal ones.
         gear: the running gear.
         on_tracks: 1 if levers carry load, 0 if wheels do [-].
-        wheel: their radius [m].
+        wheel: radius of the wheels [m].
         belly: height of the body's underside over the axles [m].
     """
 
@@ -84,14 +84,14 @@ class Footing(eqx.Module):
 
     Attributes:
         gap: distance [m].
-        gap_rate: its rate [m/s].
+        gap_rate: rate of the gap [m/s].
         normal: normal of the robot's contact, out of the ground.
         off, along: change of the contact's speed off the ground and along it (forward on level ground) per
             velocity of `COORDINATES`.
         carried: along it with the belts at rest.
         force: normal force [N].
-        damped: its decrease with the gap's rate [N·s/m].
-        elastic: its recoverable part [N].
+        damped: decrease of the force with the gap's rate [N·s/m].
+        elastic: recoverable part of the force [N].
         energy: stored in it [J].
         guided: share that passes to the lower guide [-].
         rolls: 1 but for the body [-].

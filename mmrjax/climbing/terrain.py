@@ -28,7 +28,7 @@ class Terrain(eqx.Module):
     """A polyline of ground.
 
     Attributes:
-        points: its vertices [m]. Repeated vertices count once.
+        points: vertices of the polyline [m]. Repeated vertices count once.
         nose: radius of its convex corners [m].
         finish: x of the end of the obstacle [m].
     """

@@ -39,7 +39,7 @@ class StartStages:
         starting: end of the first stage [s]: the slide has reached its maximum, the shafts have spun up.
         slipping: end of the second stage [s]: the slide stays within V_s from here, `starting` if it never left.
         settled: t' [s]: the speed is within 1 % of its last value, the mean over the last 0.15 s.
-        end: of the run [s].
+        end: end of the run [s].
         slip: of each stage, and over_settling: from 0 to t', by `mean_slip` [-], NaN for a stage of no length.
     """
 

@@ -48,14 +48,14 @@ class Variable:
 
     Attributes:
         unit: SI.
-        low, high: its ordinary range [unit].
+        low, high: usual range of the variable [unit].
         column: column of tables, or of points that stand for one.
         label: words of figures.
         unit_shown: unit shown in figures.
         shown: SI value of it.
         symbol: symbol in formulas. Empty: no formula has it.
         driver: word for it as the driver of an effect. Empty: its name.
-        sign: what turns its sign, see `quantities.Quantity`.
+        sign: what reverses its sign, see `quantities.Quantity`.
         levels: True if a person sets it, so that one of its levels may differ from the rest.
     """
 

@@ -121,9 +121,9 @@ class Mission(eqx.Module):
 
     Attributes:
         total: total of the mission.
-        segments: of each segment of each cycle, fields of shape (cycles, segments).
+        segments: totals of each segment in each cycle, fields of shape (cycles, segments).
         peaks: by the names of the law's `PEAKS` (`cell_low` is the lowest voltage of a cell). Also of the segments.
-        status: of each segment at its end, flags: of each segment, shape (cycles, segments).
+        status, flags: status at the end of each segment, and its flags, shape (cycles, segments).
         result: the end of the mission, with its status and all flags. `converged`: the profile was followed to its
             end. `battery_empty`. `cut_off`: the cells stayed below their cut-off. `stalled`, `slides`, `rolls_back`
             or `tips`: status of the first segment with demanded motion that ends so. `failed`: the integrator gave

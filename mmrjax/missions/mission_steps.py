@@ -314,7 +314,7 @@ class _TriedStep(NamedTuple):
 
     Attributes:
         y, q: unknowns and integrals at its end.
-        h: its length [s].
+        h: length of the step [s].
         last: True if it ends the segment or trips.
         good: True if its error is small enough.
         grown: length that its error permits for the next step [s].

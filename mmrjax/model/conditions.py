@@ -78,7 +78,7 @@ class Conditions(eqx.Module):
     """The conditions of one run or of a batch. All fields broadcast to one shape.
 
     Attributes:
-        configuration: which of the robot's configurations, its index. Until `resolved` also by name (`Named`).
+        configuration: index of the robot's configuration. Until `resolved` it may be a name (`Named`).
         voltage: voltage of the external supply [V]. Not used with `battery`.
         slope_deg: slope angle, positive uphill [deg].
         payload: additional load mass m_c [kg].

@@ -21,8 +21,8 @@ class Masses(eqx.Module):
 
     Attributes:
         chassis: mass of all parts that do not turn with the pulleys.
-        forward, up: its centre from the middle of the wheelbase.
-        inertia: its moment of inertia in pitch about that centre.
+        forward, up: centre of mass relative to the middle of the wheelbase.
+        inertia: moment of inertia in pitch about the centre of mass.
         body: mass without pulleys, wheels, tracks, levers and payload.
         pulley: mass on one axle that turns with it: main and additional pulley, in 4W2T the wheel.
         inertia_pulley: about its axle, front and rear equal: half of J_w of eq. (31) each.

@@ -101,7 +101,7 @@ def loop_until(
     Args:
         begun: state of arrays, from `own`.
         turn: the next state, from `own` and a state.
-        ended: of a state. They close over no traced number.
+        ended: function of a state, True if the member has ended. The functions close over no traced number.
         own: data of one member. Its numbers may be batched.
         kept: the part of the last state to return.
         most: number of members computed at a time, `LANES` if None.

@@ -32,7 +32,7 @@ class Mode(NamedTuple):
     Attributes:
         name: one of `NAMES`, by the kinetic energy in its eigenvector.
         frequency: damped natural frequency, mean over the positions that have the mode [Hz].
-        low, high: its range over them [Hz].
+        low, high: range of the frequency over the positions [Hz].
         natural: undamped, |λ| / 2π, mean [Hz].
         damping: ratio ζ = -Re λ / |λ|, mean [-]. Negative: it is unstable.
         share: share of the kinetic energy in the coordinate of its name, mean [-].
