@@ -38,8 +38,8 @@ def runs():
 def test_rounding_errors_are_nothing_that_a_robot_could_show():
     """Yaw rates of a robot that pulls aside at equal duties, and goes straight in simulation, are in no wrong unit."""
     yaw = np.array([0.02, -0.01])
-    assert ranges._factor(yaw, np.array([[1e-18, 0.0]])) == 1.0
-    assert ranges._factor(yaw, np.array([[1e-4, 1e-4]])) == pytest.approx(150.0)
+    assert ranges._range_factor(yaw, np.array([[1e-18, 0.0]])) == 1.0
+    assert ranges._range_factor(yaw, np.array([[1e-4, 1e-4]])) == pytest.approx(150.0)
 
 
 @pytest.fixture(scope="module")

@@ -272,7 +272,7 @@ KEPT = {
         "sweeps/points/cluster.py",
         "_compiled",
     ): "a worker's compiled job, by its name; computes the same when compiled again",
-    ("sweeps/points/cluster.py", "_start"): "where jax keeps programs, once a process",
+    ("sweeps/points/cluster.py", "_start_worker"): "where jax keeps programs, once a process",
     ("mmrjax/compile/programs.py", "source_hash"): "a hash of the files of this program",
     ("mmrjax/compile/programs.py", "_linear_algebra"): "lets jax find LAPACK, once a process",
     ("mmrjax/compile/programs.py", "_folder_is_private"): "that a folder is private, as it is first used",

@@ -260,7 +260,7 @@ def predict_menu(space: CandidateSpace, candidates: Mapping[str, Candidate], set
         _predicted(equipped, other, predicted.batch_experiments(all_experiments, shown_channels), active, z, informed)
     )
     predictions, half = jax.tree.map(lambda x: np.asarray(x)[: len(names)], (predictions, half))
-    experiments, kept = _possible(all_experiments, predictions, within, settings)
+    experiments, kept = _possible_experiments(all_experiments, predictions, within, settings)
     medians = np.median(np.asarray(space.equipped.data.sd), 0)
     sd = predicted.reading_sds(experiments, dict(zip(shown_channels, medians, strict=True)))
     value, half = np.nan_to_num(predictions.value[:, kept]), np.nan_to_num(half[:, kept])
@@ -269,7 +269,7 @@ def predict_menu(space: CandidateSpace, candidates: Mapping[str, Candidate], set
     )
 
 
-def _possible(
+def _possible_experiments(
     experiments: Sequence[menu.Experiment], found: predicted.Predicted, within: Reach, settings: Settings
 ) -> tuple[tuple[menu.Experiment, ...], np.ndarray]:
     """Possible and allowed experiments of a menu, and True for their readings among those of the whole menu.
