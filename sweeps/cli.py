@@ -519,8 +519,8 @@ def _prepare(resolved: Any, no_cache: bool = False) -> None:
     in XLA's CPU executor (jax 0.10.2). With one thread none of twelve did (docs/lab/figures.md). XLA_FLAGS set by
     the user, even if empty, takes precedence.
     """
-    model = getattr(resolved, "model", None)  # None: of a calibration, whose data decide
-    one_thread = model is not None and fidelities.fidelity_facts(model).one_thread
+    model = getattr(resolved, "model", None)  # a fidelity; of a calibration, whose data decide, None
+    one_thread = isinstance(model, str) and fidelities.fidelity_facts(model).one_thread
     options = (
         OF_LOOP if isinstance(resolved, config.Loop) else (OLDER_EMITTERS,) * isinstance(resolved, config.Calibrate)
     )

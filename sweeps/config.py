@@ -770,6 +770,18 @@ class Loop(RobotPart, DataPart, InferencePart, OutputPart):
     generations: Annotated[int, Field(ge=1, le=10_000)] | None = option_field(
         None, "Largest number of generations for --resolve", usual="20", solver=True
     )
+    model: Path | None = option_field(
+        None, "A MuJoCo model of several joints: a loop for each, with the model's torque as its load"
+    )
+    joints: Names = option_field(
+        (), "Joints of --model, comma-separated, or all that it drives; columns of the log are JOINT.output_angle_deg"
+    )
+
+    @model_validator(mode="after")
+    def _joints_of_a_model(self) -> Self:
+        if (self.model is None) == bool(self.joints):
+            raise PydanticCustomError("idle", "`model` and `joints` act only together; state both")
+        return self
 
 
 class RequirementsPart(Part):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from pathlib import Path
 
 from calibration.data import Json, Names, effect_file, posterior_file, robot_file, stated, surface_labels
@@ -144,7 +144,7 @@ def read_runs(
     robot: Robot,
     *,
     measured: bool,
-    columns: str | None = None,
+    columns: str | Mapping[str, str] | None = None,
     series: bool = False,
     battery: bool = False,
     of_turns: bool = False,
@@ -156,7 +156,7 @@ def read_runs(
         robot: has the configurations of the table.
         measured: whether readings are needed.
         series: whether time histories are taken.
-        columns: a preset or its file, see `records.read_runs`.
+        columns: a preset, its file or names by this program's, see `records.read_runs`.
         battery: whether the runs are on the battery, see `records.read_runs`.
         of_turns: whether a table of turns has each channel of both sides, and of the yaw, for which it has a column.
 

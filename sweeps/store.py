@@ -91,6 +91,8 @@ STORE, JOURNAL, IDENTITY, ASIDE = "results.zarr", "journal", "identity.json", "w
 PARTS = frozenset((LOCK, CHUNKS, REFIT_FILE, STORE, JOURNAL, IDENTITY, ASIDE))
 #: Endings of the files in `CHUNKS`.
 KEPT = (".npz", ".stage")
+#: File of what the loop's regression says before anything is confirmed.
+SCREENING_FILE = "screening.json"
 #: Key of the mark with the names of files that are not ours.
 FOREIGN = "foreign"
 #: First arguments of commands that fit a robot.
@@ -378,7 +380,7 @@ class RunFolder(Folder):
         """
         super().__init__(path)
         self._force, self._command = force, str(identity.get("command", ""))
-        self._digest = sha256_hex(json.dumps(identity, sort_keys=True, default=str).encode())
+        self._digest = identity_digest(identity)
         self._lock: TextIO | None = None
         self._taken_up = False
         self.refuse_taken(force)
@@ -506,6 +508,10 @@ class RunFolder(Folder):
     def _of_stage(self, name: str) -> Path:
         return self.partial / CHUNKS / f"{re.sub(r'[^a-z0-9.]', '-', name)}.stage"
 
+    def finish(self, manifest: Json, runs: Runs | None = None) -> Path:
+        """As of `Folder`, with the identity of the run in the manifest."""
+        return super().finish({**manifest, "identity": self._digest}, runs)
+
     def move_into_place(self) -> Path:
         """Drop the chunks, and move the folder to where it is to appear. The lock's file goes last.
 
@@ -537,11 +543,20 @@ def open_folder(
         beside: says where the folder is to appear, and if it replaces an existing one.
         runs: the table that it was given, if any.
     """
+    folder = RunFolder(
+        beside.out or default_path(command), run_identity(command, config, robot, runs), force=beside.force
+    )
+    folder.tables = getattr(config, "table", folder.tables)
+    return folder
+
+
+def run_identity(command: str, config: RobotPart, robot: Robot, runs: Runs | None) -> Json:
+    """Identity of a run: its configuration, its inputs and the program's source. Arguments: as of `open_folder`."""
     import jax
 
     from mmrjax.compile.programs import source_hash
 
-    identity = {
+    return {
         "command": command,
         "program": f"{source_hash()}, {jax.default_backend()}",
         "config": config.model_dump(exclude={"report", "table"}),
@@ -549,9 +564,16 @@ def open_folder(
         "runs": None if runs is None else {key: value.tolist() for key, value in runs.columns.items()},
         "effects": [sha256_hex(Path(file).read_bytes()) for file in config.effects],
     }
-    folder = RunFolder(beside.out or default_path(command), identity, force=beside.force)
-    folder.tables = getattr(config, "table", folder.tables)
-    return folder
+
+
+def is_finished(path: Path, identity: Json) -> bool:
+    """True if the finished run folder at a path has this identity."""
+    return bool(_json(path / "manifest.json").get("identity") == identity_digest(identity))
+
+
+def identity_digest(identity: Json) -> str:
+    """SHA-256 of the identity of a run."""
+    return sha256_hex(json.dumps(identity, sort_keys=True, default=str).encode())
 
 
 def rows_of_fit(robot: Path) -> frozenset[str]:

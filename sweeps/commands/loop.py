@@ -15,6 +15,7 @@ import numpy as np
 
 import mmrjax as mm
 from calibration.data import Columns, effect_file, robot_file
+from calibration.data.runs import Runs
 from calibration.described import in_words
 from calibration.discovery import findings
 from calibration.discovery.discover import discover
@@ -30,6 +31,7 @@ from calibration.words.step_words import expected_time
 from mmrjax.model import params
 from mmrjax.model.robot import Robot
 from sweeps import config as configuration
+from sweeps import store
 from sweeps.console import print_message, print_output, step_reporter
 from sweeps.inputs import load_robot, read_runs
 from sweeps.report import loop_report
@@ -37,8 +39,8 @@ from sweeps.report.fit_tables import Change
 from sweeps.store import SOLVER_FAILED, RunFolder, finish_run_folder, open_folder, print_report
 
 T = TypeVar("T")
-#: File of what regression says before anything is confirmed, and its schema.
-SCREENING_FILE, SCREENING = "screening.json", "mmrjax.screening/1"
+#: Schema of the file of what regression says before anything is confirmed.
+SCREENING = "mmrjax.screening/1"
 
 
 def execute(config: configuration.Loop, beside: configuration.LoopBeside) -> int:
@@ -46,17 +48,27 @@ def execute(config: configuration.Loop, beside: configuration.LoopBeside) -> int
 
     0 done, whatever the verdict. 3 done, but the fit that is proposed did not converge, or its time was out before
     there was a verdict. Stages are kept as they end, so that the same command goes on after that, or an interrupt.
+    With a model of several joints, each has a loop and a folder of its own.
     """
+    if config.model is not None:
+        from sweeps.commands import loop_joints
+
+        return loop_joints.run_joints(config, beside, _timed_loop)
+    robot = load_robot(config).robot
+    return _timed_loop(
+        config, beside, robot, read_runs(beside.data, robot, columns=config.columns, measured=True, series=True)
+    )
+
+
+def _timed_loop(config: configuration.Loop, beside: configuration.LoopBeside, robot: Robot, runs: Runs) -> int:
     try:
-        return _loop(config, beside)
+        return _loop(config, beside, robot, runs)
     except OutOfTime:
         return SOLVER_FAILED
 
 
-def _loop(config: configuration.Loop, beside: configuration.LoopBeside) -> int:
+def _loop(config: configuration.Loop, beside: configuration.LoopBeside, robot: Robot, runs: Runs) -> int:
     began, within = time.monotonic(), beside.seconds
-    robot = load_robot(config).robot
-    runs = read_runs(beside.data, robot, columns=config.columns, measured=True, series=True)
     stated = priors.parse_priors(config.prior)
     if config.resolve:
         check_resolvable(runs, beside.members)
@@ -163,7 +175,7 @@ def _show_ranking(found: Ranking, folder: RunFolder, timed: Callable[[str], None
         print_message(line)
     answer = loop_words.regression_verdict(found)
     content = {"schema": SCREENING, "confirmed": False, "answer": answer, **dataclasses.asdict(found)}
-    folder.write_json(SCREENING_FILE, content)
+    folder.write_json(store.SCREENING_FILE, content)
 
 
 def _say_kept(stages: Mapping[str, Any], folder: RunFolder, robot_name: str) -> None:

@@ -49,14 +49,22 @@ def read_mujoco_hinge(source: Path, joint: str | None) -> JointNumbers:
     Raises:
         BadConfiguration: a model that MuJoCo refuses, or a joint that it does not have or that is no hinge.
     """
+    return _Model(mujoco.mujoco_module(), read_mujoco_model(source), source.name).numbers(joint)
+
+
+def read_mujoco_model(source: Path) -> Any:
+    """Returns the model of a file, compiled by MuJoCo.
+
+    Raises:
+        BadConfiguration: a model that MuJoCo refuses.
+    """
     check_mujoco_model(source)
-    library = mujoco.mujoco_module()
     try:
-        model = library.MjModel.from_xml_path(str(source))
+        model = mujoco.mujoco_module().MjModel.from_xml_path(str(source))
     except (ValueError, RuntimeError) as error:
         raise BadConfiguration(f"{source}: MuJoCo cannot read it ({' '.join(str(error).split())})") from error
     check_memory(source, VALUE * model.nv**2)  # of its matrix of inertia
-    return _Model(library, model, source.name).numbers(joint)
+    return model
 
 
 def check_mujoco_model(source: Path) -> None:

@@ -1,0 +1,250 @@
+"""One loop for each joint of a MuJoCo model, with the torque of the moving model as the load of each joint."""
+
+from __future__ import annotations
+
+import json
+import math
+import warnings
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import numpy as np
+from scipy.interpolate import UnivariateSpline
+from scipy.ndimage import uniform_filter1d
+
+from calibration.data import Names, delimited
+from calibration.data import runs as records
+from calibration.data.columns import CURRENT, LOAD, SPEED
+from calibration.data.input_errors import BadConfiguration, BadData, allowed_words
+from calibration.data.named_arrays import NamedArrays, Raw, column_numbers, column_texts
+from calibration.data.runs import Runs
+from calibration.data.sources import reading
+from mmrjax.model.quantities import RPM
+from mmrjax.model.robot import Robot
+from sweeps import config as configuration
+from sweeps import store
+from sweeps.commands.rig_from_mujoco import read_mujoco_model
+from sweeps.console import print_message, print_output
+from sweeps.export import mujoco
+from sweeps.inputs import load_robot
+from sweeps.report import catalogue
+from sweeps.report.document import Document
+
+#: Columns of a joint's angle, and their units [rad].
+ANGLES = {"output_angle_deg": math.pi / 180, "output_angle_rad": 1.0}
+#: Stands for the name of a joint in the name of its robot's file.
+JOINT = "{joint}"
+#: Column of the current's sd, and rows over which that of the torque is averaged.
+SD, NEAR = "motor_current_sd_A", 21
+#: Fewest readings of a run whose motion is smoothed.
+FEWEST = 12
+#: Median of the magnitude of sixth differences of white noise [sd].
+QUANTILE = 0.6745 * math.sqrt(math.comb(12, 6))
+
+
+class Chain:
+    """A model whose joints are all hinges, without friction, damping, rotors and contacts."""
+
+    def __init__(self, source: Path) -> None:
+        """The model of a file.
+
+        Raises:
+            BadConfiguration: a model that MuJoCo refuses, with a joint that is no hinge or has several actuators, or
+                with loops that equality constraints close.
+        """
+        self.library, self.model = library, model = mujoco.mujoco_module(), read_mujoco_model(source)
+        names = [library.mj_id2name(model, library.mjtObj.mjOBJ_JOINT, k) or "" for k in range(model.njnt)]
+        on_joint = [int(library.mjtTrn.mjTRN_JOINT), int(library.mjtTrn.mjTRN_JOINTINPARENT)]
+        driven = [int(model.actuator_trnid[k, 0]) for k in range(model.nu) if model.actuator_trntype[k] in on_joint]
+        for k, name in enumerate(names):
+            if model.jnt_type[k] != int(library.mjtJoint.mjJNT_HINGE) or not name:
+                raise BadConfiguration(
+                    f"--model: {source.name}, joint {name or k + 1} slides, is free or has no name; expected hinges "
+                    "with names alone, whose measured angles give the whole motion"
+                )
+            if driven.count(k) > 1:
+                raise BadConfiguration(
+                    f"--model: {source.name}, joint {name} has several actuators; expected one drive a joint"
+                )
+        if model.neq or not names:
+            what = "closed loops (<equality>)" if names else "no joint"
+            raise BadConfiguration(f"--model: {source.name} has {what}; expected a chain or tree of hinges")
+        self.names: Names = tuple(names)
+        self.driven: Names = tuple(names[k] for k in sorted(driven))
+        for values in (model.dof_damping, model.dof_frictionloss, model.dof_armature):
+            values[:] = 0.0
+        model.opt.disableflags |= int(library.mjtDisableBit.mjDSBL_CONSTRAINT)
+
+    def torques(self, motion: np.ndarray) -> np.ndarray:
+        """Torque that each joint needs [N·m], shape (rows, joints), for angles [rad], speeds and accelerations.
+
+        Args:
+            motion: shape (3, rows, joints).
+        """
+        data, needed = self.library.MjData(self.model), np.empty_like(motion[0])
+        for row in range(len(needed)):
+            data.qpos[:], data.qvel[:], data.qacc[:] = motion[:, row]
+            self.library.mj_inverse(self.model, data)
+            needed[row] = data.qfrc_inverse
+        return needed
+
+
+def noise_of(readings: np.ndarray) -> float:
+    """Standard deviation of the noise of a slow signal, by its sixth differences."""
+    return float(np.nanmedian(np.abs(np.diff(readings, 6)))) / QUANTILE
+
+
+def smoothed_motion(time: np.ndarray, angle: np.ndarray, times: np.ndarray, degree: int) -> np.ndarray:
+    """Angle [rad], speed and acceleration at `times`, shape (3, times), by a spline that leaves the noise alone.
+
+    It has the fewest knots with which readings are off by their noise, at least that of the display's step if most
+    readings repeat others. At a jump of the torque, knots crowd, so that the acceleration jumps within a few samples.
+    """
+    noise, steps = noise_of(angle), np.diff(np.unique(np.round(angle, 9)))
+    if 0 < len(steps) < len(angle) / 2:
+        noise = max(noise, steps.min() / math.sqrt(12))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # that more knots would be needed, for readings without noise
+        curve = UnivariateSpline(time, angle, k=degree, s=len(time) * noise**2)
+    return np.stack([curve(times), curve.derivative(1)(times), curve.derivative(2)(times)])
+
+
+def smoothed_log(log: NamedArrays, chain: Chain, degree: int = 5) -> np.ndarray:
+    """Motion of all joints at each row of a log, shape (3, rows, joints), by splines of a degree.
+
+    Raises:
+        BadData: the log has no `time_s`, lacks the angle of a joint, or has too few readings of it in a run.
+    """
+    columns = dict(zip(log.header, log.values, strict=True))
+
+    def numbers(*names: str) -> tuple[str, np.ndarray]:
+        column = next((c for c in names if c in columns), None)
+        if column is None:
+            raise BadData(
+                f"{log.name}: has no column {' or '.join(names)}; expected time_s and the angle of each joint of the "
+                "model, because every joint's torque depends on the whole motion"
+            )
+        return column, column_numbers(columns[column])
+
+    time, motion = numbers("time_s")[1], np.empty((3, len(log), len(chain.names)))
+    runs = np.array(column_texts(columns["run_id"]) if "run_id" in columns else [""] * len(log))
+    for k, name in enumerate(chain.names):
+        column, angle = numbers(*(f"{name}.{c}" for c in ANGLES))
+        angle = ANGLES[column.removeprefix(f"{name}.")] * angle
+        for run in np.unique(runs):
+            rows = np.flatnonzero(runs == run)
+            seen = rows[np.isfinite(angle[rows])]
+            if len(seen) < FEWEST or not (np.diff(time[seen]) > 0).all():
+                raise BadData(
+                    f"{log.name}, {column}: has {len(seen)} readings in run {run or 1}; expected at least "
+                    f"{FEWEST} with a time_s that rises"
+                )
+            motion[:, rows, k] = smoothed_motion(time[seen], angle[seen], time[rows], degree)
+    return motion
+
+
+def runs_of_joint(log: NamedArrays, chain: Chain, name: str, robot: Robot) -> Runs:
+    """Runs of a joint, with the torque of the rest of the model as the torque of its load.
+
+    It is what the model needs less the inertia and the weight that the joint's own file states. The motor speed is
+    that of the smoothed motion. Its torque is less exact where the torque jumps, by about its difference from that of
+    cubic splines. Unless the log states the current's sd, it has twice this share, as neighbouring rows err alike.
+
+    Raises:
+        BadData: as `records.of_arrays`.
+    """
+    k, (load,) = chain.names.index(name), robot.configurations.members
+    own = {h.removeprefix(f"{name}."): v for h, v in zip(log.header, log.values, strict=True)}
+    kept = {h: v for h, v in own.items() if not h.startswith(tuple(f"{n}." for n in chain.names))}
+    motion = smoothed_log(log, chain)
+    torque, cubic = (chain.torques(x)[:, k] for x in (motion, smoothed_log(log, chain, 3)))
+    angle, speed, acceleration = motion[:, :, k]
+    stated = float(load.inertia) * acceleration + np.asarray(load.torque_load(angle))
+    per_ampere = float(robot.gearbox.ratio * robot.gearbox.efficiency_load * robot.motor.torque_constant)
+    columns: dict[str, Raw] = {**kept, LOAD: torque - stated, SPEED: speed * float(robot.gearbox.ratio) / RPM}
+    if CURRENT in kept and SD not in kept:
+        off = 2 * np.sqrt(uniform_filter1d((torque - cubic) ** 2, NEAR)) / per_ampere
+        columns[SD] = np.hypot(off, noise_of(column_numbers(kept[CURRENT])))
+    arrays = NamedArrays(f"{log.name}, joint {name}", tuple(columns), tuple(columns.values()), digest=log.digest)
+    return records.of_arrays(arrays, robot=robot)
+
+
+def robot_of_joint(config: configuration.Loop, joint: str) -> tuple[configuration.Loop, Robot]:
+    """Configuration of the loop of a joint, and its robot.
+
+    Raises:
+        BadConfiguration: no such file, or no rig of one shaft whose motor speed is imposed and current read.
+    """
+    named = f"{JOINT}.toml" if config.robot == "nominal" else config.robot
+    one = config.model_copy(update={"robot": named.replace(JOINT, joint), "joints": (joint,)})
+    robot = load_robot(one).robot
+    rig, shaft = robot.rig, not robot.has_ground and len(robot.configurations.members) == 1
+    if not shaft or (rig.imposed, rig.channels) != ("motor_speed", ("motor_current",)):
+        raise BadConfiguration(
+            f'--robot {one.robot}: expected the rig of one joint with load = "shaft", imposed = "motor_speed" and '
+            'channels = ["motor_current"]: the torque of the model holds for the measured motion alone; mmrjax rig '
+            f"new {joint}.toml --from {config.model} --joint {joint} --kind bench begins one"
+        )
+    return one, robot
+
+
+def run_joints(
+    config: configuration.Loop,
+    beside: configuration.LoopBeside,
+    loop: Callable[[configuration.Loop, configuration.LoopBeside, Robot, Runs], int],
+) -> int:
+    """Run the loop of each joint in a folder of its own, and write one page. Finished joints are kept.
+
+    Args:
+        loop: the loop of one joint.
+
+    Returns:
+        The exit code: the largest of the joints'.
+
+    Raises:
+        BadConfiguration: a joint that the model does not have or that nothing drives, or as `Chain` and
+            `robot_of_joint`.
+        BadData: no such file, or as `smoothed_log` and `runs_of_joint`.
+    """
+    assert config.model is not None
+    chain, data = Chain(config.model), Path(beside.data)
+    wanted = chain.driven if config.joints == ("all",) else config.joints
+    unknown = next((name for name in wanted if name not in chain.names), "" if wanted else "all")
+    if unknown:
+        raise BadConfiguration(
+            f"--joints: got {unknown}; {config.model.name} has no such driven joint; "
+            f"{allowed_words(unknown, chain.names)}"
+        )
+    robots = {name: robot_of_joint(config, name) for name in wanted}
+    if not data.is_file():
+        raise BadData(f"{data}: no such file; expected a log of the joints of {config.model.name}")
+    log = reading.read_whole_table(data) or delimited.read_csv_columns(data, data.name)
+    runs = {name: runs_of_joint(log, chain, name, robot) for name, (_, robot) in robots.items()}
+    folder = beside.out or store.default_path("loop")
+    code, rows = 0, []
+    for name, (one, robot) in robots.items():
+        place, table = folder / name, runs[name]
+        kept = not beside.force and store.is_finished(place, store.run_identity("loop", one, robot, table))
+        print_message(f"joint {name}{f': finished in {place}, kept' if kept else ''}")
+        for note in table.notes:
+            print_message(note)
+        if not kept:
+            code = max(code, loop(one, beside.model_copy(update={"out": place}), robot, table))
+        rows.append(_row(name, place))
+    answer = " ".join(f"{name}: {answer}" for name, answer, *_ in rows)
+    document = Document(f"Joints of {config.model.name}", answer, (catalogue.table("loop.joints", rows),))
+    store.print_report(document)(folder)
+    print_output(str(folder))
+    return code
+
+
+def _row(joint: str, place: Path) -> tuple[str, str, str, str]:
+    """Row of a joint: its name, answer, held-out errors and page."""
+    if not (place / "result.json").is_file():
+        ranked = place.with_name(f"{joint}.partial") / store.SCREENING_FILE
+        answer = json.loads(ranked.read_text(encoding="utf-8"))["answer"] if ranked.is_file() else ""
+        return joint, f"no verdict in time, the same command goes on; {answer}.", "", ""
+    result: Mapping = json.loads((place / "result.json").read_text(encoding="utf-8"))
+    before, after = (result["errors"][which]["held_out"] or {} for which in ("before", "after"))
+    errors = "; ".join(f"{c.replace('_', ' ')} {before[c]:.3g} → {after[c]:.3g}" for c in after if before.get(c))
+    return joint, result["statement"], errors, f"{joint}/report.html"

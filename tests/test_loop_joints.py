@@ -1,0 +1,178 @@
+"""Joints of a MuJoCo model, one loop after another: torques against MuJoCo, what is refused, and what is kept."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from calibration.data.delimited import read_csv_columns
+from sweeps.commands import loop_joints
+from tests.commands import ends, read_json, read_rig
+
+JOINTS = ("shoulder", "elbow")
+
+LINK = '<geom type="capsule" fromto="0 0 0 0 0 -{length}" size="0.02" mass="{mass}"/>'
+MODEL = f"""
+<mujoco><option timestep="0.001"/><worldbody><body>
+  <joint name="shoulder" axis="0 1 0" frictionloss="0.3" damping="0.1" armature="0.01"/>
+  {LINK.format(length=0.3, mass=0.8)}
+  <body pos="0 0 -0.3"><joint name="elbow" axis="0 1 0" armature="0.02" damping="0.2"/>
+    {LINK.format(length=0.25, mass=0.4)}</body>
+</body></worldbody>
+<actuator><motor joint="shoulder"/><motor joint="elbow"/></actuator></mujoco>
+"""
+RIG = """
+base = "none"
+sides = 1
+imposed = "motor_speed"
+channels = ["motor_current"]
+[motor]
+resistance = 4.0
+inductance = 1e-3
+torque_constant = "0.02 ± 10 %"
+inertia = 2e-6
+[gearbox]
+ratio = 50
+efficiency_load = 1.0
+[joint]
+load = "shaft"
+inertia = 0.05
+loss_coulomb = "0.1 ± 100 %"
+loss_viscous = "0.05 ± 100 %"
+"""
+#: Dry friction of each joint forward and backward [N·m], viscous friction [N·m·s], speed of smoothed rest [rad/s].
+DRY, VISCOUS, REST = np.array([[0.1, 0.1], [0.25, 0.1]]), 0.05, 2e-3
+
+
+def arm(seconds=4.0, every=0.005, seed=0):
+    """A log of the arm under steps of voltage, by own steps of motors and friction around MuJoCo's `mj_forward`."""
+    model = mujoco.MjModel.from_xml_string(MODEL)
+    model.dof_damping[:], model.dof_frictionloss[:], model.dof_armature[:] = 0, 0, 2e-6 * 50**2
+    data, rng, step = mujoco.MjData(model), np.random.default_rng(seed), 5e-5
+    volts = np.repeat(rng.choice([-1.0, 1.0], (40, 2)) * rng.uniform(2, 7, (40, 2)), 50, 0)
+    angle, speed, current, rows = np.zeros(2), np.zeros(2), np.zeros(2), []
+    for k in range(round(seconds / step)):
+        now = volts[int(k * step / every)] if k * step > 0.1 else np.zeros(2)
+        friction = np.where(speed > 0, DRY[:, 0], DRY[:, 1]) * np.tanh(speed / REST) + VISCOUS * speed
+        data.qpos[:], data.qvel[:], data.qfrc_applied[:] = angle, speed, 50 * 0.02 * current - friction
+        mujoco.mj_forward(model, data)
+        if k % round(every / step) == 0:
+            rows.append([k * step, *now, *current, *angle, *speed, *data.qacc])
+        current = current + step * (now - 4.0 * current - 0.02 * 50 * speed) / 1e-3
+        speed = speed + step * data.qacc
+        angle = angle + step * speed
+    return np.array(rows)
+
+
+def write(folder, rows, noise=0.0, model=MODEL):
+    """Model, a rig for each joint, and the log of `rows`."""
+    (folder / "arm.xml").write_text(model)
+    for name in JOINTS:
+        (folder / f"{name}.toml").write_text(RIG)
+    rng = np.random.default_rng(1)
+    angle, current = (
+        rows[:, k : k + 2] + sd * rng.standard_normal((len(rows), 2)) for k, sd in ((5, noise), (3, 30 * noise))
+    )
+    cells = np.column_stack([rows[:, 0], rows[:, 1:3], current, np.degrees(angle)])
+    columns = [f"{j}.{c}" for c in ("supply_voltage_V", "motor_current_A", "output_angle_deg") for j in JOINTS]
+    np.savetxt(folder / "log.csv", cells, "%.13g", ",", header=",".join(["time_s", *columns]), comments="")
+
+
+def test_torque_of_the_model_is_what_mujoco_was_given_without_friction_and_rotors(tmp_path):
+    """At states of the arm, MuJoCo's own forward dynamics with the torque gives the acceleration."""
+    (tmp_path / "arm.xml").write_text(MODEL)
+    chain, rows = loop_joints.Chain(tmp_path / "arm.xml"), arm(0.5)[::10]
+    friction = (
+        np.where(rows[:, 7:9] > 0, DRY[:, 0], DRY[:, 1]) * np.tanh(rows[:, 7:9] / REST) + VISCOUS * rows[:, 7:9]
+    )
+    given = 50 * 0.02 * rows[:, 3:5] - friction - 2e-6 * 50**2 * rows[:, 9:]
+    assert_allclose(chain.torques(rows[:, 5:].reshape(-1, 3, 2).swapaxes(0, 1)), given, atol=1e-9)
+
+
+def test_load_of_a_joint_is_that_torque_less_what_its_file_states(tmp_path):
+    """A smooth motion without noise, and the share of the noise of readings that ends in the torque."""
+    time = np.arange(0, 2, 0.002)
+    motion = np.stack([
+        np.column_stack([a * w**n * np.sin(w * time + n * np.pi / 2) for a, w in ((0.6, 3.0), (0.9, 2.0))])
+        for n in range(3)
+    ])  # fmt: skip
+    angle, speed, acceleration = motion[:, :, 1]
+    rows = np.column_stack([time, np.ones((len(time), 4)), motion[0]])
+    inner, errors = slice(100, -100), []
+    for noise in (0.0, 1e-3):
+        write(tmp_path, rows, noise)
+        robot = read_rig(tmp_path, RIG + "torque_gravity = 0.3\nangle_zero = 0.2\n")
+        chain, log = loop_joints.Chain(tmp_path / "arm.xml"), read_csv_columns(tmp_path / "log.csv", "log.csv")
+        runs = loop_joints.runs_of_joint(log, chain, "elbow", robot)
+        needed = chain.torques(motion)[:, 1]
+        expected = needed - 0.05 * acceleration - 0.3 * np.sin(angle - 0.2)
+        errors.append(np.abs(runs["load_torque_Nm"] - expected)[inner].max() / np.abs(needed).max())
+        assert_allclose(runs["motor_speed_rpm"][inner], 50 * 30 / np.pi * speed[inner], atol=3)
+    assert errors[0] < 1e-6 and 1e-4 < errors[1] < 0.02
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "joints", "message"),
+    [
+        ("", "", "wrist", r"--joints: got wrist; arm.xml has no such driven joint"),
+        ('name="elbow" axis="0 1 0"', 'name="elbow" type="slide"', "all", "joint elbow slides, is free"),
+        ('<body>\n  <joint name="shoulder"', '<body><freejoint name="base"/><geom size="1"/><body>\n  <joint name="shoulder"', "all", "joint base slides, is free"),
+        ('<motor joint="elbow"/>', '<motor joint="elbow"/><motor joint="elbow"/>', "all", "elbow has several actuators"),
+        ("</actuator>", '</actuator><equality><joint joint1="elbow" joint2="shoulder"/></equality>', "all", "closed loops"),
+    ],
+)  # fmt: skip
+def test_models_that_are_no_chain_of_driven_hinges_are_refused(old, new, joints, message, mmrjax, tmp_path):
+    model = MODEL.replace(old, new)
+    model = model.replace("</worldbody>", "</body></worldbody>") if "freejoint" in new else model
+    write(tmp_path, np.zeros((20, 7)), model=model)
+    ends(mmrjax("loop", tmp_path / "log.csv", "--model", tmp_path / "arm.xml", "--joints", joints), message)
+
+
+def test_what_a_joint_lacks_is_named(mmrjax, tmp_path):
+    rows = np.zeros((20, 7))
+    rows[:, 0] = np.arange(20) * 0.01
+    write(tmp_path, rows)
+    arguments = [
+        "loop",
+        tmp_path / "log.csv",
+        "--model",
+        tmp_path / "arm.xml",
+        "--robot",
+        f"{tmp_path}/{{joint}}.toml",
+    ]
+    ends(mmrjax(*arguments), "--model and --joints act only together")
+    log = (tmp_path / "log.csv").read_text()
+    (tmp_path / "log.csv").write_text(log.replace("elbow.output_angle_deg", "wrist.output_angle_deg"))
+    ends(
+        mmrjax(*arguments, "--joints", "shoulder"),
+        "has no column elbow.output_angle_deg or elbow.output_angle_rad",
+        code=4,
+    )
+    (tmp_path / "log.csv").write_text(log.replace("time_s", "moment"))
+    ends(mmrjax(*arguments, "--joints", "elbow"), "has no column time_s", code=4)
+    (tmp_path / "log.csv").write_text("\n".join(log.splitlines()[:6]))
+    ends(mmrjax(*arguments, "--joints", "elbow"), "shoulder.output_angle_deg: has 5 readings in run 1", code=4)
+    ends(mmrjax(*arguments[:-2], "--joints", "elbow", "--robot", "sm1"), "expected the rig of one joint")
+
+
+@pytest.mark.slow
+def test_each_joint_of_an_arm_has_its_loop_and_keeps_it(mmrjax, tmp_path):
+    write(tmp_path, arm(), 3e-4)
+    arguments = [
+        "loop",
+        tmp_path / "log.csv",
+        "--model",
+        tmp_path / "arm.xml",
+        "--robot",
+        f"{tmp_path}/{{joint}}.toml",
+    ]
+    arguments += ["--out", tmp_path / "found", "--joints"]
+    _, out, _ = ends(mmrjax(*arguments, "elbow"), code=0)
+    assert out.strip().endswith("found") and "elbow/report.html" in (tmp_path / "found" / "report.html").read_text()
+    began = read_json(tmp_path / "found" / "elbow" / "manifest.json")["started"]
+    ends(mmrjax(*arguments, "elbow"), "elbow: finished in", code=0)
+    assert read_json(tmp_path / "found" / "elbow" / "manifest.json")["started"] == began
+    (tmp_path / "elbow.toml").write_text(RIG.replace("ratio = 50", "ratio = 51"))
+    ends(mmrjax(*arguments, "elbow"), "exists already; choose another path")
