@@ -159,9 +159,17 @@ SAID: dict[str, str | Callable[..., str]] = {
     '{column} = {{column = "{theirs}", factor = -1}}',
     "stiff_supply": "{column} is {value:g} in every row: treated as a stiff supply; if it was not "
     "measured, remove the column",
-    "lost_motion": "{source}, {column}: at each of {reversals} reversals about {width:.2g} {unit} are lost that "
-    "friction, inertia and delay do not explain: backlash or a compliant coupling; set backlash = "
-    '"{angle:.2g} ± 30 %" (rad at the output) in the load\'s table of the robot file',
+    "lost_motion": lambda source, column, reversals, width, unit, angle, stiffness: (
+        f"{source}, {column}: "
+        + (
+            f"the output lags the motor by {width:.2g} {unit} rms in proportion to its acceleration: a compliant "
+            f'coupling, perhaps with backlash; set damping and stiffness = "{stiffness:.2g} ± 50 %" (N·m/rad'
+            if stiffness
+            else f"at each of {reversals} reversals about {width:.2g} {unit} are lost that friction, inertia and "
+            f'delay do not explain: backlash or a compliant coupling; set backlash = "{angle:.2g} ± 30 %" (rad'
+        )
+        + " at the output) in the load's table of the robot file"
+    ),
     "ends_early": ends_early,
     "never_grips": lambda runs, share: (
         f"{_runs(runs, 'never grips', 'never grip')}: in the end the robot travels at {share:.0%} of the speed of "
