@@ -269,7 +269,7 @@ def test_effect_and_curve_pay_for_what_was_searched_in_their_equation(monkeypatc
     best.z[2] = 5.0  # fifty sds
     curves = [(4.0, CurveOver("track", ("speed",))), (7.0, CurveOver("track", ("slope",)))]
     curves += [(90.0, CurveOver("electrical", (str(k),))) for k in range(5)]
-    monkeypatch.setattr("calibration.discovery.standing._curves", lambda *_: curves)
+    monkeypatch.setattr("calibration.discovery.standing._curve_evidence", lambda *_: curves)
     without = dataclasses.replace(best, cost=best.cost + 20.0)
     found = _evidence_over_curves(space, best, without, "e0", None, (), settings)
     own = sum(equation_of_place(p) == equation_of_place("track") for p in places)
