@@ -119,7 +119,9 @@ def test_smaller_factors_are_said_and_not_refused(runs, factor, is_said):
 
 def test_a_factor_that_all_speeds_share_points_to_the_voltage(runs):
     half = scaled(scaled(runs, "speed_mm_s", 1 / 6.5), "motor_speed_rpm", 1 / 6.5)
-    with pytest.raises(BadData, match=r"; the same factor in speed_mm_s: check supply_voltage_V and the robot's file"):
+    with pytest.raises(
+        BadData, match=r"; the same factor in speed_mm_s: check supply_voltage_V and the robot's file"
+    ):
         check_ranges(half, paper_robots.nominal())
 
 
