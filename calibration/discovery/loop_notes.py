@@ -244,7 +244,7 @@ class Mechanism:
 
     def _possible(self, part: int) -> Names:
         """Equations (0) or drivers (2) of the families. An error of an ammeter counts as the loss."""
-        losses = [f for f in self.families if f == self.families[0] or not f.startswith("reading")]
+        losses = [f for f in self.families if f == self.families[0] or " current that " not in f]
         return tuple(dict.fromkeys(f.partition(" that ")[part] for f in losses))
 
     @property
