@@ -142,7 +142,7 @@ def test_what_a_joint_lacks_is_named(mmrjax, tmp_path):
         "--robot",
         f"{tmp_path}/{{joint}}.toml",
     ]
-    ends(mmrjax(*arguments), "--model and --joints act only together")
+    ends(mmrjax(*arguments), "--model and --joints must be given together")
     log = (tmp_path / "log.csv").read_text()
     (tmp_path / "log.csv").write_text(log.replace("elbow.output_angle_deg", "wrist.output_angle_deg"))
     ends(
