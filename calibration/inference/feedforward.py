@@ -149,7 +149,7 @@ def fit_feedforward(log: DriveLog, mechanism: str = "simple", tolerances: Tolera
             f"the log has fewer than {WINDOWS} windows of {WINDOW:g} s in motion; expected the four tests of "
             f"SysId{lacking}"
         )
-    if _fit(windows, "simple")[0][1] < 0:
+    if _fit_constants(windows, "simple")[0][1] < 0:
         remarks.append(Remark("feedforward_sign"))
         log = dataclasses.replace(log, voltage=-log.voltage)
     delay, windows, level, bend = _delay_and_bend(log, mechanism)
@@ -162,7 +162,7 @@ def fit_feedforward(log: DriveLog, mechanism: str = "simple", tolerances: Tolera
         limited = Remark("feedforward_limit", level=level, current=most)
         remarks.append(limited if bend < 0 else Remark("feedforward_skid", level=level))
     kept = _rows(windows, windows["demand"] < level) if level else windows
-    values, covariance, _ = _fit(kept, mechanism)
+    values, covariance, _ = _fit_constants(kept, mechanism)
     sds = np.sqrt(np.diag(covariance))
     names = ("kS", "kV", "kA", "kG")[: len(values)]
     constants = {name: float(x) for name, x in zip(names, values, strict=True)}
@@ -334,7 +334,7 @@ def _matrix(w: Columns, mechanism: str) -> np.ndarray:
     return np.stack([w["u"], -w["s"], -w["x"], *(-x for x in more)], axis=1)
 
 
-def _fit(w: Columns, mechanism: str) -> tuple[np.ndarray, np.ndarray, float]:
+def _fit_constants(w: Columns, mechanism: str) -> tuple[np.ndarray, np.ndarray, float]:
     """Constants kS, kV, kA (and kG), their covariance, and the sum of squares.
 
     Windows overlap: the covariance holds for residuals that are correlated.
@@ -378,7 +378,7 @@ def _delay_and_bend(log: DriveLog, mechanism: str) -> tuple[float, Columns, floa
     shifts = [*np.arange(-8, 8) / 8, *np.arange(2, 2 * LONGEST / step) / 2]
     for delay in step * np.array(sorted(shifts, key=abs)):
         windows = _windows(log, float(delay))
-        plain = _fit(windows, mechanism)[2]
+        plain = _fit_constants(windows, mechanism)[2]
         level, bend, cost = _bend(windows, mechanism)
         trials += [(plain, float(delay), windows, 0.0, 0.0), (cost, float(delay), windows, level, bend)]
     count = 0.5 * len(trials[0][2]["u"]) / trials[0][2]["count"][0]
@@ -398,7 +398,7 @@ def _bend(w: Columns, mechanism: str) -> tuple[float, float, float]:
 
     Negative: less acceleration (a current limit), positive: more (wheels that slip). Sets `demand`.
     """
-    values, _, plain = _fit(w, mechanism)
+    values, _, plain = _fit_constants(w, mechanism)
     level, bend, cost, material = 0.0, 0.0, np.inf, False
     for _ in range(3):
         asked = (w["u"] - values[0] * w["s"] - values[1] * w["x"]) / w["T"]
@@ -422,7 +422,7 @@ def _bend(w: Columns, mechanism: str) -> tuple[float, float, float]:
 
 
 def _by_direction(w: Columns) -> Iterator[Remark]:
-    values, covariance, _ = _fit(w, "elevator")  # a constant voltage beside friction is half the difference
+    values, covariance, _ = _fit_constants(w, "elevator")  # a constant voltage beside friction is half the difference
     half, sd = values[3], np.sqrt(covariance[3, 3])
     if {*np.sign(w["s"])} == {1.0, -1.0} and abs(half) > 4 * sd and abs(half) > 0.05 * abs(values[0]):
         yield Remark("feedforward_direction", forward=float(values[0] + half), backward=float(values[0] - half))
