@@ -171,8 +171,8 @@ class HeldOut:
         block: index of each row's block, shape (rows,).
         reading: [SI], NaN if that fit's robot does not reach the row, shape (rows, channels).
         status: status of each row, shape (rows,).
-        z: of each block's fit, shape (blocks, parameters).
-        converged: of each block's fit.
+        z: coordinates of each block's fit, shape (blocks, parameters).
+        converged: True for each block whose fit converged.
     """
 
     labels: Names
@@ -188,7 +188,7 @@ def hold_out_by_kind(problem: Problem, start: np.ndarray, masks: dict[str, Colum
 
     Args:
         problem: as fitted to all rows.
-        start: its optimum.
+        start: optimum of the problem.
         masks: kind → label → mask, from `blocks_of_kind`. Kinds without blocks are omitted from the result.
     """
     answers = {}

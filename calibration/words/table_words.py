@@ -130,7 +130,7 @@ def off_by(column: str, unit: str, factor: float, units: Names, others: Names, i
     """Readings that no robot like this one shows."""
     off, size = (factor, "large") if factor > 1 else (1 / factor, "small")
     what = f"{column}: readings are about {float(f'{off:.2g}'):g} times too {size} for this robot"
-    alike = f"; {' and '.join(others)} are off by as much: check {imposed} and the robot's file" if others else ""
+    alike = f"; the same factor in {' and '.join(others)}: check {imposed} and the robot's file" if others else ""
     if units:
         return f"{what}; are they in {' or '.join(units)}? expected {unit}{alike}"
     return f"{what}{alike}" if others else f"{what}; check the unit, {unit}, and the robot's file"

@@ -69,7 +69,7 @@ def execute(config: configuration.Compare, beside: configuration.ComparedRuns) -
             comparison, summary, stated.channels, Path(runs.source).name, config.model, capabilities.shown_name(file),
             fit_of(file, runs), notes=(*notes, *of_draws), against=_name_of(config, file, second),
         )  # fmt: skip
-        return _written(folder, config, dataclasses.replace(file, robot=robot), runs, table, result, notes)
+        return _write_result(folder, config, dataclasses.replace(file, robot=robot), runs, table, result, notes)
 
 
 def _over_time(
@@ -107,10 +107,10 @@ def _over_time(
             comparison, summary, runs.channels, Path(runs.source).name, HISTORIES, capabilities.shown_name(file),
             fit_of(file, runs), OVER, notes, _name_of(config, file, second),
         )  # fmt: skip
-        return _written(folder, config, dataclasses.replace(file, robot=ready.robot), runs, table, result, notes)
+        return _write_result(folder, config, dataclasses.replace(file, robot=ready.robot), runs, table, result, notes)
 
 
-def _written(
+def _write_result(
     folder: RunFolder,
     config: configuration.Compare,
     file: RobotFile,
