@@ -771,16 +771,16 @@ class Loop(RobotPart, DataPart, InferencePart, OutputPart):
         None, "Largest number of generations for --resolve", usual="20", solver=True
     )
     model: Path | None = option_field(
-        None, "A MuJoCo model of several joints: a loop for each, with the model's torque as its load"
+        None, "MuJoCo model with several joints: runs one loop per joint, with the model's torque as its load"
     )
     joints: Names = option_field(
-        (), "Joints of --model, comma-separated, or all that it drives; columns of the log are JOINT.output_angle_deg"
+        (), "Joints of --model, comma-separated, or all; log columns are named JOINT.output_angle_deg"
     )
 
     @model_validator(mode="after")
     def _joints_of_a_model(self) -> Self:
         if (self.model is None) == bool(self.joints):
-            raise PydanticCustomError("idle", "`model` and `joints` act only together; state both")
+            raise PydanticCustomError("idle", "`model` and `joints` must be given together")
         return self
 
 

@@ -56,7 +56,7 @@ def test_score_of_a_log_that_its_simulation_refutes_is_no_finding(gain, simulate
     ladder = [SimpleNamespace(effects=("a",), cost=100 - gain / 2, simulated=simulated)]
     left = Diagnosis(None, SimpleNamespace(single=np.array([-4.4, 1.0])), AdequacyTest(found, null, settings))
     screened = SimpleNamespace(base=base, cluster=None)
-    confirmed = discover._confirmed(screened, left, SimpleNamespace(ladder=ladder))
+    confirmed = discover._confirm_gains(screened, left, SimpleNamespace(ladder=ladder))
     assert left.test.rejected and (confirmed is None) == stands
     if confirmed is not None:
         assert confirmed.test.found.single == pytest.approx(gain**0.5) and not confirmed.test.rejected

@@ -163,7 +163,7 @@ def test_a_positive_voltage_raises_either_lever():
     volts = jnp.full(2, 6.0)
     asked = Sequence(jnp.arange(2.0), volts, volts, over_time=True, begins=jnp.full(2, 0.5))
     run = climb_system(ROBOT, Conditions(0, voltage=6.0).resolved(ROBOT), terrain.flat_ground(), asked)
-    swung = climb._swung(run, climb.stand_before_obstacle(run), 0.5, 24.0, jnp.zeros(2), run.step * jnp.eye(2))
+    swung = climb._drive_action(run, climb.stand_before_obstacle(run), 0.5, 24.0, jnp.zeros(2), run.step * jnp.eye(2))
     assert swung.rate[0] > 0 > swung.rate[1]
     assert np.asarray(swung.voltage) == pytest.approx([6.0, -6.0])
 
@@ -234,7 +234,7 @@ def test_how_a_run_ends_is_read_off_its_motion():
             q = q.at[{"x": 0, "z": 1, "pitch": 2}[name]].set(value)
         at = dataclasses.replace(motion, q=q.at[3].set(turned))
         now = dataclasses.replace(passed, time=jnp.asarray(time), body=jnp.asarray(body))
-        found, after = climb._judged(run, motion, now, at, progress)
+        found, after = climb._update_verdict(run, motion, now, at, progress)
         assert np.isfinite(np.asarray(found.q)).all()
         return None if after.verdict < 0 else climb.NAMES[int(after.verdict)]
 

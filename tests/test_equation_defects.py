@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose
 
 import mmrjax as mm
 from calibration.inference.details import EquationDefects
-from calibration.inference.observers.settled import EQUATIONS, SettledLinearization, _defects
+from calibration.inference.observers.settled import EQUATIONS, SettledLinearization, _row_defects
 from calibration.inference.observers.turns import TurnLinearization
 from mmrjax import effects
 from mmrjax.model import channels
@@ -53,7 +53,7 @@ def slopes_of(sides, count=COUNT):
 def test_defects_that_readings_show_are_found():
     true = RANDOM.normal(size=(3, 1, ROWS)) * np.array([0.1, 0.01, 0.005])[:, None, None]
     included = np.arange(ROWS) != 4
-    found = _defects(linearised(SettledLinearization, slopes_of(1), true), included)
+    found = _row_defects(linearised(SettledLinearization, slopes_of(1), true), included)
     assert list(found) == list(EQUATIONS)
     for x, wanted, size in zip(found.values(), true[:, 0], SIZES.values(), strict=True):
         assert np.isnan(x[4]) and np.isfinite(x[included]).all()
@@ -66,7 +66,7 @@ def test_no_defect_is_a_residual_over_a_vanishing_slope(slope):
     slopes[2, 0, 3] *= slope  # the slip of one row
     linear = linearised(SettledLinearization, slopes, np.zeros((3, 1, ROWS)))
     noisy = dataclasses.replace(linear, residual=RANDOM.normal(size=ROWS * COUNT))
-    found = _defects(noisy, np.ones(ROWS, bool))["slip"]
+    found = _row_defects(noisy, np.ones(ROWS, bool))["slip"]
     assert abs(found[3]) < SIZES["speed_theoretical"]
 
 
@@ -74,7 +74,7 @@ def test_a_motor_that_turns_nothing_but_itself_may_lack_torque():
     """At the output there is none, of which a share would be nothing too."""
     true = np.zeros((3, 1, ROWS))
     true[1] = 0.1
-    found = _defects(linearised(SettledLinearization, slopes_of(1), true, torque_output=0.0), np.ones(ROWS, bool))
+    found = _row_defects(linearised(SettledLinearization, slopes_of(1), true, torque_output=0.0), np.ones(ROWS, bool))
     # Of most rows: where random slopes are nearly alike, a row's residual is shared out.
     assert np.median(found["track"]) == pytest.approx(0.1, rel=0.02)
     assert np.median(np.abs(found["electrical"])) < 0.005 * SIZES["voltage"]
@@ -83,7 +83,7 @@ def test_a_motor_that_turns_nothing_but_itself_may_lack_torque():
 def test_each_side_has_its_own_defects():
     true = np.zeros((3, 2, ROWS))
     true[0, 1] = 0.3  # the right one's voltage
-    found = _defects(linearised(TurnLinearization, slopes_of(2, 7), true), np.ones(ROWS, bool))
+    found = _row_defects(linearised(TurnLinearization, slopes_of(2, 7), true), np.ones(ROWS, bool))
     assert list(found) == [f"{b}_{side}" for b in EQUATIONS for side in ("left", "right")]
     for name, x in found.items():
         wanted, size = (0.3, 20.0) if name == "electrical_right" else (0.0, SIZES[EQUATIONS[name.rpartition("_")[0]]])

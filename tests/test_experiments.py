@@ -438,14 +438,14 @@ def test_other_voltages_are_those_that_the_table_lacks():
 
 
 def test_only_levels_that_the_robot_manages_are_left():
-    run = menu._runs(REACH, "x", "travel", voltages=(5.0, 10.0), slopes=(0.0, 10.0, 20.0))
+    run = menu._runs_under(REACH, "x", "travel", voltages=(5.0, 10.0), slopes=(0.0, 10.0, 20.0))
     does = np.array(
         [True, True, False, True, False, False]
     )  # at 5 V the slopes are too steep, and 20 deg at 10 V too
     kept = menu.possible_runs(run, does)
     assert [(run.slope[k], run.voltage[k]) for k in np.flatnonzero(kept)] == [(0.0, 5.0), (0.0, 10.0)]
     assert not menu.possible_runs(run, np.zeros(6, bool)).any() and menu.possible_runs(run, np.ones(6, bool)).all()
-    steepest = menu._runs(REACH, "x", "travel", voltages=(5.0,), slopes=(23.0, 21.5, 20.0), steepest=True)
+    steepest = menu._runs_under(REACH, "x", "travel", voltages=(5.0,), slopes=(23.0, 21.5, 20.0), steepest=True)
     kept = menu.possible_runs(steepest, np.array([False, True, True]))
     assert [steepest.slope[k] for k in np.flatnonzero(kept)] == [21.5]
 
@@ -564,6 +564,6 @@ def test_a_class_of_a_servos_log_has_no_experiment_of_the_menu():
     base = types.SimpleNamespace(rig=Rig(imposed="goal_angle"))
     space = types.SimpleNamespace(bare=types.SimpleNamespace(observe=seen, base=base))
     traced = types.SimpleNamespace(verdict="class", where=None, alike=object())
-    proposal = discover._proposal(space, traced, None)
+    proposal = discover._next_experiment(space, traced, None)
     assert proposal.experiments == (experiments.NONE,)
-    assert describe(proposal.instruction).endswith("has no goals of a controller")
+    assert describe(proposal.instruction).endswith("not for goals of a controller")

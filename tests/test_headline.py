@@ -90,7 +90,14 @@ def test_one_mechanism_is_claimed_once():
 def test_lost_motion_comes_before_what_the_library_explains():
     """A servo with backlash: no effect explains it, and the answer was a reading that changes with time."""
     lost = Remark(
-        "lost_motion", source="r.csv", column="output_angle_deg", reversals=20, width=0.958, unit="deg", angle=0.0167
+        "lost_motion",
+        source="r.csv",
+        column="output_angle_deg",
+        reversals=20,
+        width=0.958,
+        unit="deg",
+        angle=0.0167,
+        stiffness=0.0,
     )
     of = lambda *remarks: SimpleNamespace(remarks=remarks, headline=headline(law("a"), []))  # noqa: E731
     alone = DiscoveryResult.statement.fget(of())

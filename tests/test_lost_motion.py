@@ -7,8 +7,10 @@ import pytest
 
 from calibration.data import robot_file
 from calibration.data import runs as records
+from calibration.described import describe
 from calibration.discovery import discover
 from calibration.inference.lost_motion import lost_motion_notes
+from mmrjax.model import params
 from mmrjax.model.quantities import RPM
 from sweeps.commands.rig_check import check_rig_file
 
@@ -82,6 +84,29 @@ def test_play_is_found_and_measured(tmp_path, channels, off):
     assert note.reversals >= 10 and note.column == "output_angle_deg"
 
 
+@pytest.mark.parametrize("stiffness", [5.0, 8.0])
+def test_an_elastic_joint_is_found_with_its_stiffness(tmp_path, stiffness):
+    """Two inertias, a spring and a damper, by steps so short that both are right; an inertia of 6e-3 kg·m²."""
+    motor, load, step, log = 3e-7 * RATIO**2, 6e-3, 2.5e-4, []
+    speed = turned = faster = output = duty = 0.0
+    for k in range(round(12 / step)):
+        if k % round(0.01 / step) == 0:
+            wanted = 25 * np.sin(2 * np.pi * 0.23 * k * step) + 14 * np.sin(2 * np.pi * 0.71 * k * step)
+            shown = 0.088 * round(np.degrees(output) / 0.088)
+            duty = float(np.clip(4 * np.radians(wanted - shown) - 0.05 * speed, -1, 1))
+            log.append((k * step, round(duty, 3), RATIO * speed, shown))
+        torque = stiffness * (turned - output) + 0.02 * (speed - faster)
+        current = (12 * duty - 0.0072 * RATIO * speed) / 3.1
+        speed += step * (RATIO * 0.0072 * current - torque - 0.02 * np.tanh(speed / 0.02)) / motor
+        faster += step * (torque - 0.05 * np.tanh(faster / 0.02)) / load
+        turned, output = turned + step * speed, output + step * faster
+    runs, robot = read(tmp_path, np.array(log).T, '"output_angle", "motor_speed"')
+    robot = params.replace(robot, {"wheel.inertia": load})
+    (note,) = lost_motion_notes(runs, robot)
+    assert note.values["stiffness"] == pytest.approx(stiffness, rel=0.3)
+    assert "compliant coupling" in describe(note) and 'stiffness = "' in describe(note)
+
+
 @pytest.mark.parametrize("log", [{}, {"friction": 0.5}, {"delay": 1}], ids=["plain", "friction", "delay"])
 def test_friction_and_delay_are_no_play(tmp_path, log):
     for channels in ('"output_angle"', '"output_angle", "motor_speed"'):
@@ -108,7 +133,7 @@ def test_no_effect_stands_in_for_a_missing_backlash(lost, monkeypatch):
         steps.append(name)
         return ("base", rejected) if name == "bootstrap 0" else ("base", rejected, SimpleNamespace(diagnosis=None))
 
-    monkeypatch.setattr(discover, "_confirmed", lambda *stages: None)
+    monkeypatch.setattr(discover, "_confirm_gains", lambda *stages: None)
     task = SimpleNamespace(
         settings=SimpleNamespace(replicates=1), keep=keep, progress=lambda step: None, loses_motion=lost
     )

@@ -35,9 +35,10 @@ def test_a_mechanism_needs_each_of_its_tests():
         name: (name,) for name in worse
     }
     assert dataclasses.replace(stands, se=np.inf).fails == ("gain",)  # nothing could be held out
-    places = "loss torque", "resistance to travel", "mass", "voltage drop"
+    places = "loss torque", "resistance to travel", "mass", "reading of total current", "reading of motor voltage"
     everywhere = dataclasses.replace(stands, families=tuple(f"{x} that changes with slope" for x in places))
     assert everywhere.fails == ("many",)  # as of a table in which nothing was missing
+    assert dataclasses.replace(everywhere, families=everywhere.families[:-1]).fails == ()  # an ammeter as a loss
 
 
 def fitted(*effects, explains, plausible=True):

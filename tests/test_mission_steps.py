@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import pytest
 
 from mmrjax.missions import mission_straight, mission_turning
-from mmrjax.missions.mission_steps import _stayed_below, _top
+from mmrjax.missions.mission_steps import _peak_between, _stayed_below
 from mmrjax.missions.profile import profile
 from mmrjax.model import params
 
@@ -34,7 +34,7 @@ def test_the_largest_within_a_step_is_that_of_the_cubic(curve, top):
     h = 1e-6
     ends = [jnp.asarray(float(x)) for x in (curve(0.0), curve(1.0))]
     slopes = [jnp.asarray((curve(t + h) - curve(t - h)) / (2 * h)) for t in (0.0, 1.0)]
-    assert float(_top(*ends, *slopes)) == pytest.approx(top, rel=1e-6)
+    assert float(_peak_between(*ends, *slopes)) == pytest.approx(top, rel=1e-6)
 
 
 def test_a_current_within_a_step_counts_up_to_the_drivers_limit(robot):

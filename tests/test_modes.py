@@ -13,7 +13,7 @@ from mmrjax.model import params
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.signals import GRAVITY
 from mmrjax.undercarriage.half_robot import advance, centre_of_mass, half_robot_system, instant, roll, stand
-from mmrjax.undercarriage.modes import POSITIONS, Mode, _linearised, _named, modes
+from mmrjax.undercarriage.modes import POSITIONS, Mode, _linearised, _run_modes, modes
 
 PAYLOADS = [0.0, 8.0]
 
@@ -54,7 +54,7 @@ def test_bounce_on_tracks_is_that_of_a_mass_on_its_grousers(robot):
         _linearised(params.without_weak_types(robot), conditions(robot, "6T2A"), POSITIONS)
     )
     middle = POSITIONS // 2
-    found = named(_named(rates[0, middle : middle + 1], masses[0, middle : middle + 1]), "bounce")
+    found = named(_run_modes(rates[0, middle : middle + 1], masses[0, middle : middle + 1]), "bounce")
     along = 0.0175 + 0.035 * np.arange(9)
     lever = 0.15 - along
     nearer = np.clip(np.minimum(along, 0.3 - along), 0, 0.02) / 0.02

@@ -70,7 +70,7 @@ def alternative(name, rms, *, leads=False, rise=0.0, lost=0):
 )
 def test_order_of_alternatives(rms, lost, first):
     rows = [alternative(n, r, lost=m) for n, r, m in zip("abc", rms, lost, strict=True)]
-    assert preference._order(rows)[0] == first
+    assert preference._order_alternatives(rows)[0] == first
 
 
 def test_it_is_said_by_what_the_leader_was_chosen():

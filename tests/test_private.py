@@ -60,12 +60,12 @@ def test_a_folder_that_others_could_change_is_not_used_and_that_is_said(cache, c
         jax.config.update("jax_compilation_cache_dir", None)  # as in a process that begins
         assert compilation_cache.keep_programs() is None
         assert f"compiled programs are not cached: {reason}" in capsys.readouterr().err.replace("\n", " ")
-        assert not programs._private(str(cache))
+        assert not programs._folder_is_private(str(cache))
         assert compilation_cache.describe_cache() == f"{cache}: not used, since {reason}"
     finally:
         os.geteuid = mine
         jax.config.update("jax_compilation_cache_dir", kept)
-        programs._private.cache_clear()
+        programs._folder_is_private.cache_clear()
 
 
 def test_a_sticky_folder_above_is_no_danger(cache):
@@ -95,7 +95,7 @@ def test_a_program_of_an_exposed_folder_is_neither_read_nor_written(tmp_path, mo
     monkeypatch.setattr(programs.Programs, "_obtained", lambda *a: lambda: asked.append(a))
     assert programs.Programs(exposure_reason).of(((1.0,), {})) is None and not asked
     Path(tmp_path).chmod(0o700)
-    programs._private.cache_clear()
+    programs._folder_is_private.cache_clear()
     programs.Programs(exposure_reason).of(((1.0,), {}))
     assert asked
-    programs._private.cache_clear()
+    programs._folder_is_private.cache_clear()

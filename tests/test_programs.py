@@ -46,7 +46,7 @@ def untraceable(function):
 
 
 def named(function, *args):
-    return programs._name(function, jax.tree.map(programs._shape, (args, {})))
+    return programs._program_name(function, jax.tree.map(programs._leaf_structure, (args, {})))
 
 
 def test_a_second_process_finds_a_program_without_tracing(folder, compilations):

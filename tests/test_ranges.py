@@ -38,8 +38,8 @@ def runs():
 def test_rounding_errors_are_nothing_that_a_robot_could_show():
     """Yaw rates of a robot that pulls aside at equal duties, and goes straight in simulation, are in no wrong unit."""
     yaw = np.array([0.02, -0.01])
-    assert ranges._factor(yaw, np.array([[1e-18, 0.0]])) == 1.0
-    assert ranges._factor(yaw, np.array([[1e-4, 1e-4]])) == pytest.approx(150.0)
+    assert ranges._range_factor(yaw, np.array([[1e-18, 0.0]])) == 1.0
+    assert ranges._range_factor(yaw, np.array([[1e-4, 1e-4]])) == pytest.approx(150.0)
 
 
 @pytest.fixture(scope="module")
@@ -119,7 +119,9 @@ def test_smaller_factors_are_said_and_not_refused(runs, factor, is_said):
 
 def test_a_factor_that_all_speeds_share_points_to_the_voltage(runs):
     half = scaled(scaled(runs, "speed_mm_s", 1 / 6.5), "motor_speed_rpm", 1 / 6.5)
-    with pytest.raises(BadData, match=r"; speed_mm_s alike: check supply_voltage_V and the robot's file"):
+    with pytest.raises(
+        BadData, match=r"; the same factor in speed_mm_s: check supply_voltage_V and the robot's file"
+    ):
         check_ranges(half, paper_robots.nominal())
 
 

@@ -144,7 +144,7 @@ def test_ripple_of_reaction_is_that_of_the_track_model(robot, tracked):
     """Of every point, from the runs themselves, their drift left in."""
     found = tracked[1]
     again = config.resolve_configuration(config.Resonance, tracked[0] / "config.resolved.toml", {})
-    conditions = run.conditions_of_runs(robot, room._points(again, robot)[0], again)
+    conditions = run.conditions_of_runs(robot, room._grid_and_table_8(again, robot)[0], again)
     runs = track_batch(robot, conditions, duration=1.0, step=1e-4, rolling=True, progress=lambda share: None)
     normal = np.asarray(runs.signals.normal)[:, 500:]
     ripple = 100 * normal.std(axis=1) / normal.mean(axis=1)

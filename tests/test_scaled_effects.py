@@ -49,8 +49,8 @@ def with_all(robot, library, share):
 
 def test_a_size_is_a_size_however_small():
     """The square of a term that fades with speed may be zero, the term is not: no rig divides by that."""
-    assert scales._size([1e-200, 2e-200, 0.0, np.nan]) == pytest.approx(np.sqrt(2.5) * 1e-200, rel=1e-12, abs=0)
-    assert np.isnan(scales._size([0.0, np.nan]))
+    assert scales._rms_size([1e-200, 2e-200, 0.0, np.nan]) == pytest.approx(np.sqrt(2.5) * 1e-200, rel=1e-12, abs=0)
+    assert np.isnan(scales._rms_size([0.0, np.nan]))
 
 
 def test_offset_of_an_ammeter_follows_its_range_and_not_a_motor_without_load(tmp_path):

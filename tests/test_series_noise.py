@@ -10,7 +10,7 @@ from calibration.data.instruments import display_step
 from calibration.data.runs import Runs
 from calibration.data.table import Layout
 from calibration.data.thinning import thin_rows
-from calibration.discovery.score_tests import UNSURE, _factors
+from calibration.discovery.score_tests import UNSURE, _noise_factors
 from calibration.inference import noise, series_noise
 from calibration.inference.observers import SettledRuns
 from calibration.inference.observers.time_histories import Histories
@@ -155,13 +155,13 @@ def test_an_sd_in_per_cent_has_a_part_that_does_not_depend_on_the_reading(stated
 
 
 def test_replicates_are_drawn_with_sds_that_an_estimate_might_have_been_of():
-    factors = _factors(np.array([7.45, np.inf]), 2, 20_000, seed=3)
+    factors = _noise_factors(np.array([7.45, np.inf]), 2, 20_000, seed=3)
     assert np.all(factors[:, 1] == 1.0)
     # 1 / f² is χ² / ν: mean 1, variance 2 / ν, but for what is cut off
     assert np.mean(factors[:, 0] ** -2) == pytest.approx(1.0, abs=0.02)
     assert np.var(factors[:, 0] ** -2) == pytest.approx(2 / 7.45, rel=0.05)
     assert factors.min() >= UNSURE[0] and factors.max() <= UNSURE[1]
-    assert np.all(_factors(None, 3, 5, seed=0) == 1.0)
+    assert np.all(_noise_factors(None, 3, 5, seed=0) == 1.0)
 
 
 def test_readings_of_motors_at_rest_do_not_tell_the_noise_of_those_that_turn():

@@ -23,10 +23,10 @@ from calibration.discovery.settings import WITHOUT_NAME, settings_for
 from calibration.discovery.smooth import FALL, LENGTHS, PRODUCT, SIZES, WIDE, smooth_curve, smooth_surface
 from calibration.discovery.standing import (
     _chosen_again,
-    _curves,
+    _curve_evidence,
     _deficient_equations,
     _evidence_over_curves,
-    _root,
+    _largest_root,
     _varies_most,
     _weakest_run,
     cost_of_names,
@@ -116,7 +116,7 @@ def test_a_wave_is_weighed_as_curves_are_and_said_where_it_is_the_better_one(toy
     residual = np.concatenate([missing, np.asarray(toy.linear.residual)[len(missing) :]])
     linear = Turning(**known | {"signals": signals, "residual": residual})
     offered = (("track", "speed_motor"), ("track", "slope"), ("track", order))
-    found = _curves(SimpleNamespace(included=toy.counts), linear, (SimpleNamespace(names=offered),), set())
+    found = _curve_evidence(SimpleNamespace(included=toy.counts), linear, (SimpleNamespace(names=offered),), set())
     assert len(found) == 3 and max(found)[1].variables == (order,)
 
     scores = SimpleNamespace(curve=np.array([9.0, 5.0, 8.5]), explained=np.array([90.0, 50.0, 80.0]))
@@ -269,7 +269,7 @@ def test_effect_and_curve_pay_for_what_was_searched_in_their_equation(monkeypatc
     best.z[2] = 5.0  # fifty sds
     curves = [(4.0, CurveOver("track", ("speed",))), (7.0, CurveOver("track", ("slope",)))]
     curves += [(90.0, CurveOver("electrical", (str(k),))) for k in range(5)]
-    monkeypatch.setattr("calibration.discovery.standing._curves", lambda *_: curves)
+    monkeypatch.setattr("calibration.discovery.standing._curve_evidence", lambda *_: curves)
     without = dataclasses.replace(best, cost=best.cost + 20.0)
     found = _evidence_over_curves(space, best, without, "e0", None, (), settings)
     own = sum(equation_of_place(p) == equation_of_place("track") for p in places)
@@ -291,7 +291,7 @@ def test_root_is_that_of_what_a_column_explains_beside_others(toy):
         each = [known[:, 0] * (residual + a @ z) for a, z in zip((jacobian, whole), left, strict=True)]
         return np.sum(each[0] ** 2) - np.sum(each[1] ** 2)
 
-    assert _root(jacobian, residual, signature) ** 2 == pytest.approx(fall(np.ones(readings)), rel=1e-8)
+    assert _largest_root(jacobian, residual, signature) ** 2 == pytest.approx(fall(np.ones(readings)), rel=1e-8)
     space, rows = SimpleNamespace(included=toy.counts), np.arange(toy.rows)
     row, least = _weakest_run(space, toy.linear.runs(), jacobian, residual, signature)
     falls = [fall(np.repeat(rows != k, 3)) for k in rows]
@@ -306,7 +306,7 @@ def test_root_is_that_of_what_a_column_explains_beside_others(toy):
     )  # the others tell little
     same = -np.append(10.0 * of_one[:, 0], np.zeros(len(residual) - readings))
     alike = [_weakest_run(space, runs, jacobian, same, of_one, differ)[1] for differ in (False, True)]
-    assert alike[0] < 0.3 * _root(jacobian, same, of_one) < 0.9 * alike[1]
+    assert alike[0] < 0.3 * _largest_root(jacobian, same, of_one) < 0.9 * alike[1]
 
 
 @pytest.mark.parametrize(

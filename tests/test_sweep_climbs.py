@@ -30,7 +30,7 @@ def test_search_of_many_points_ends_within_a_millimetre_of_each_ones_limit():
             calls.append(sizes)
             self.verdict = np.where(sizes <= limits, OVER, np.where(sizes > 200, TIPS, SLIDES))
 
-    found = climbs._searched(
+    found = climbs._search_all(
         Obstacle(kind="step", find=True), 5, lambda sizes, told: Ended(sizes), lambda share: None
     )
     largest = found[climbs.LARGEST]

@@ -214,7 +214,7 @@ def test_runs_of_a_table_whose_sides_are_driven_apart_show_both_sides(tmp_path, 
         shown.extend(c.name for c in robot.channels)
         raise BadData("enough")
 
-    monkeypatch.setattr(simulate, "_simulated", simulated)
+    monkeypatch.setattr(simulate, "_simulate_table", simulated)
     path = tmp_path / "turns.csv"
     for cells, turns in (("33,0,0", False), ("33,0,0,1,0.5", True)):
         path.write_text(f"{HEADER if turns else HEADER.strip(',')}{SIDED if turns else ''}\n6T2A,{cells}\n")

@@ -63,8 +63,8 @@ def test_turns_are_found_past_kinks_of_friction_and_gears():
     def circled(values, stated):
         robot = params.replace(paper_robots.nominal(), values)
         run = mm.Conditions(**stated, open_right=0.0)
-        unknowns, solved = turning._unknowns(robot, run)
-        travel, motion = turning._circled(robot, run, unknowns)
+        unknowns, solved = turning._find_settled_unknowns(robot, run)
+        travel, motion = turning._signals_and_motion(robot, run, unknowns)
         gains = travel.acceleration, travel.acceleration_lateral, travel.acceleration_yaw
         return motion.speed, jnp.stack(gains), solved
 

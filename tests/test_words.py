@@ -144,7 +144,14 @@ SAMPLES = [
     Remark("constant", column="slope_deg", value=5.0, alike="guides"),
     Remark("constant", column="motor_speed_rpm", value=900.0, alike="speed"),
     Remark(
-        "lost_motion", source="r.csv", column="output_angle_deg", reversals=20, width=0.958, unit="deg", angle=0.0167
+        "lost_motion",
+        source="r.csv",
+        column="output_angle_deg",
+        reversals=20,
+        width=0.958,
+        unit="deg",
+        angle=0.0167,
+        stiffness=0.0,
     ),
     Remark("ends_early", runs=("a", "b"), lasts=0.01, share=0.4),
     Remark("ends_early", runs=("a",), lasts=0.01, share=float("nan")),

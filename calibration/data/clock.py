@@ -144,14 +144,16 @@ def from_the_first(name: str, meaning: Column, raw: Raw, runs: Sequence[str] | N
     """
     factor = meaning.value(1.0)
     clock = (
-        np.array([_seconds(cell) for cell in raw]) if isinstance(raw, list) and ":" in raw[0] else np.full(1, np.nan)
+        np.array([_date_seconds(cell) for cell in raw])
+        if isinstance(raw, list) and ":" in raw[0]
+        else np.full(1, np.nan)
     )
     of_day = bool(np.isfinite(clock).all())
     names, run = (np.array([""]), None) if runs is None else np.unique(runs, return_inverse=True)
     notes: Names = ()
     if not of_day:
         low, high = (limit * factor for limit in meaning.limits())
-        count, notes = _counted(name, meaning, column_numbers(raw), run)
+        count, notes = _unwrapped(name, meaning, column_numbers(raw), run)
         clock = count * factor
         of_day = bool((clock > high).all())
         if of_day and clock[0] > EPOCH[1]:
@@ -187,7 +189,7 @@ def from_the_first(name: str, meaning: Column, raw: Raw, runs: Sequence[str] | N
     )
 
 
-def _counted(name: str, meaning: Column, count: np.ndarray, run: np.ndarray | None) -> tuple[np.ndarray, Names]:
+def _unwrapped(name: str, meaning: Column, count: np.ndarray, run: np.ndarray | None) -> tuple[np.ndarray, Names]:
     """Numbers of a clock without wraps and without stamps that rows share, and notes on these."""
     step = np.diff(count)
     if not len(step) or (step > 0).all() or not np.isfinite(step).all():
@@ -209,23 +211,23 @@ def _past_midnight(clock: np.ndarray, cells: Sequence[str], run: np.ndarray) -> 
     """Adds a day [s] to times without a date that fall back by more than half a day within their run."""
     last: dict[int, float] = {}
     for k, (x, which) in enumerate(zip(clock.tolist(), run.tolist(), strict=True)):
-        if _alone(cells[k]) and which in last:
+        if _is_time_without_date(cells[k]) and which in last:
             clock[k] = x = x + _DAY * max(math.floor((last[which] - x) / _DAY + 0.5), 0)
         last[which] = x
 
 
-def _alone(cell: str) -> bool:
+def _is_time_without_date(cell: str) -> bool:
     """True if a cell has a time without a date."""
     return cell[2:3] == ":"
 
 
-def _seconds(cell: str) -> float:
+def _date_seconds(cell: str) -> float:
     """Seconds of a date and time since a fixed day, NaN for other cells."""
     if ":" not in cell:
         return math.nan
     dated = _WITH_POINTS.sub(r"\3-\2-\1", cell)
     try:
-        when = datetime.datetime.fromisoformat(_SOME_DAY + cell if _alone(cell) else dated)
+        when = datetime.datetime.fromisoformat(_SOME_DAY + cell if _is_time_without_date(cell) else dated)
     except ValueError:
         return math.nan
     return when.replace(tzinfo=when.tzinfo or datetime.UTC).timestamp()

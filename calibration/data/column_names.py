@@ -80,7 +80,7 @@ def refused_cell_sentence(where: str, meaning: Column, cell: str, layout: Layout
         allowed = _allowed_words(column, cell, layout)
     else:
         low, high = meaning.limits()
-        hint = _hint(meaning, cell, hints, (*layout.measured_columns, *layout.deviation_columns, *DUTY))
+        hint = _hint_about_cell(meaning, cell, hints, (*layout.measured_columns, *layout.deviation_columns, *DUTY))
         more = "more than " if column in layout.deviation_columns else ""
         allowed = f"{more}{low:g} to {high:g}"
         try:
@@ -90,7 +90,7 @@ def refused_cell_sentence(where: str, meaning: Column, cell: str, layout: Layout
     return f"{where}, {meaning.shown}: got {cell or 'an empty cell'}; {hint}expected {allowed}"
 
 
-def _hint(meaning: Column, cell: str, units: bool, readings: Names) -> str:
+def _hint_about_cell(meaning: Column, cell: str, units: bool, readings: Names) -> str:
     """Guess at the meaning of a rejected cell, ending in a semicolon. Empty without a guess."""
     if cell.lower() in NOTHING:
         return "leave the cell empty if there is no reading; " if meaning.column in readings else ""

@@ -111,7 +111,7 @@ class Layout:
         has_ground: True if a ground carries it, see `Robot.has_ground`.
         weight: True if a weight or a constant torque acts on it, which may drive its motors either way.
         inherits: True if a packaged robot gives the values that its file does not state.
-        configurations: their names.
+        configurations: names of the configurations.
         instruments: properties of instruments that are known.
         mapped: (column as this program calls it, column of the file, factor from its unit).
         channels: channels of its readings, in the order of arrays.

@@ -47,7 +47,7 @@ class Loads:
     """The loads of a robot file, before the parameters that it states.
 
     Attributes:
-        by_name: in order.
+        by_name: loads by name, in order.
         travels: true if they travel, as vehicles and linear units do.
         linear: names of linear units.
         missing: parameters without default that the file does not state.
@@ -97,19 +97,19 @@ def loads_from_tables(base: Robot | None, content: Json, sds: dict[str, float], 
         table, here = content.get(name, {}), f"{where}, {name}"
         if not isinstance(table, dict):
             raise BadConfiguration(f"{here}: got {table!r}; expected a table [{name}]")
-        kind = _kind(table, here)
+        kind = _load_kind(table, here)
         if kind == "linear":
-            rig_file.linear_to_shaft(table, name, here, sds, _sides(content, base))
+            rig_file.linear_to_shaft(table, name, here, sds, _number_of_drives(content, base))
             linear.add(name)
         if kind in ("linear", "shaft"):
-            by_name[name], lacking = _shaft(table)
+            by_name[name], lacking = _blank_shaft(table)
         elif base is None:
-            by_name[name], lacking = _vehicle(table, here, _sides(content, base))
+            by_name[name], lacking = _blank_vehicle(table, here, _number_of_drives(content, base))
         else:
-            by_name[name], lacking = _chassis(base, name, table, here), []
+            by_name[name], lacking = _chassis_of_base(base, name, table, here), []
         if lacking and base is not None:
             raise BadConfiguration(
-                f"{here}: without a base, the load must be described completely; {_listed(lacking)} missing"
+                f"{here}: without a base, the load must be described completely; {_list_in_words(lacking)} missing"
             )
         missing += [f"{name}.{key}" for key in lacking]
     shafts = [name for name, load in by_name.items() if isinstance(load, Shaft)]
@@ -134,18 +134,18 @@ def resolved_likes(content: Json, where: str) -> None:
         if "like" in table:
             like = table.pop("like")
             stated_word(like, own_names, f"{where}, {name}.like")
-            content[name] = _over(tables[like], table)
+            content[name] = _merge_tables(tables[like], table)
 
 
-def _over(below: Mapping[str, Any], above: Mapping[str, Any]) -> Json:
+def _merge_tables(below: Mapping[str, Any], above: Mapping[str, Any]) -> Json:
     """Two tables merged into one. Entries of `above` take precedence."""
     both = {
         key: value for key, value in below.items() if isinstance(value, dict) and isinstance(above.get(key), dict)
     }
-    return {**below, **above, **{key: _over(value, above[key]) for key, value in both.items()}}
+    return {**below, **above, **{key: _merge_tables(value, above[key]) for key, value in both.items()}}
 
 
-def _kind(table: Json, where: str) -> str:
+def _load_kind(table: Json, where: str) -> str:
     """Load that a table states. A vehicle by default."""
     if "load" not in table:
         return "vehicle"
@@ -159,13 +159,13 @@ def _kind(table: Json, where: str) -> str:
     return str(load)
 
 
-def _sides(content: Mapping[str, Any], base: Robot | None) -> float:
+def _number_of_drives(content: Mapping[str, Any], base: Robot | None) -> float:
     """Drives of a file. A value that is no count is refused later."""
     sides = content.get("sides", 1.0 if base is None else float(base.sides))
     return float(sides) if isinstance(sides, int | float) and sides >= 1 else 1.0
 
 
-def _shaft(table: Mapping[str, Any]) -> tuple[Shaft, list[str]]:
+def _blank_shaft(table: Mapping[str, Any]) -> tuple[Shaft, list[str]]:
     """A shaft before the parameters of its table apply, and the required parameters that the table lacks."""
     missing = [
         field.name
@@ -175,7 +175,7 @@ def _shaft(table: Mapping[str, Any]) -> tuple[Shaft, list[str]]:
     return Shaft(inertia=0.0, loss_coulomb=0.0), missing
 
 
-def _vehicle(table: Json, where: str, sides: float) -> tuple[Chassis, list[str]]:
+def _blank_vehicle(table: Json, where: str, sides: float) -> tuple[Chassis, list[str]]:
     """A vehicle before the parameters of its table apply, and the required parameters that the table lacks."""
     if "movers" not in table:
         raise BadConfiguration(
@@ -195,7 +195,7 @@ def _vehicle(table: Json, where: str, sides: float) -> tuple[Chassis, list[str]]
     missing = [
         p.name
         for p in params.walk_parameters(nothing)
-        if p.name not in defaults_of_kind and not _states(table, p.name)
+        if p.name not in defaults_of_kind and not _table_gives(table, p.name)
     ]
     return params.replace(
         nothing, {name: params.as_float(value) for name, value in defaults_of_kind.items()}
@@ -206,7 +206,7 @@ def _movers(stated: Any, where: str) -> float:
     return MOVERS[stated_word(stated, MOVERS, f"{where}.movers")]
 
 
-def _listed(names: list[str]) -> str:
+def _list_in_words(names: list[str]) -> str:
     return f"{', '.join(names)} {'are' if len(names) > 1 else 'is'}"
 
 
@@ -226,7 +226,7 @@ def _names(stated: Any, where: str) -> list[str]:
     return stated
 
 
-def _chassis(robot: Robot, name: str, table: Json, where: str) -> Chassis:
+def _chassis_of_base(robot: Robot, name: str, table: Json, where: str) -> Chassis:
     """Configuration of a robot with a base, before the parameters of its table apply."""
     like, movers = table.pop("like", None), table.pop("movers", None)
     have = robot.configurations
@@ -235,7 +235,7 @@ def _chassis(robot: Robot, name: str, table: Json, where: str) -> Chassis:
     if like is not None:
         return have[stated_word(like, have.names, f"{where}.like")]
     if movers is not None:
-        return _blank(have.members[0], _movers(movers, where), table, where)
+        return _blank_chassis(have.members[0], _movers(movers, where), table, where)
     if name in have:
         return have[name]
     raise BadConfiguration(
@@ -244,32 +244,32 @@ def _chassis(robot: Robot, name: str, table: Json, where: str) -> Chassis:
     )
 
 
-def _blank(pattern: Chassis, on_tracks: float, table: Mapping[str, Any], where: str) -> Chassis:
+def _blank_chassis(pattern: Chassis, on_tracks: float, table: Mapping[str, Any], where: str) -> Chassis:
     """A chassis with the default of every field that has one. The table must give all other fields."""
-    defaults = dict(_defaults(pattern))
-    missing = [name for name, default in defaults.items() if default is None and not _states(table, name)]
+    defaults = dict(_parameter_defaults(pattern))
+    missing = [name for name, default in defaults.items() if default is None and not _table_gives(table, name)]
     if missing:
         raise BadConfiguration(
             f"{where}: with movers instead of like, the configuration must be described "
-            f"completely; {_listed(missing)} missing"
+            f"completely; {_list_in_words(missing)} missing"
         )
     known_values = {name: params.as_float(default) for name, default in defaults.items() if default is not None}
     return params.replace(dataclasses.replace(pattern, on_tracks=on_tracks), known_values)
 
 
-def _defaults(component: eqx.Module, prefix: str = "") -> Iterator[tuple[str, float | None]]:
+def _parameter_defaults(component: eqx.Module, prefix: str = "") -> Iterator[tuple[str, float | None]]:
     """Default of every parameter below a component, None where it has none."""
     for field in dataclasses.fields(component):
         value = getattr(component, field.name)
         if "spec" in field.metadata:
             yield f"{prefix}{field.name}", None if field.default is dataclasses.MISSING else float(field.default)
         elif isinstance(value, eqx.Module):
-            yield from _defaults(value, f"{prefix}{field.name}.")
+            yield from _parameter_defaults(value, f"{prefix}{field.name}.")
 
 
-def _states(table: Mapping[str, Any], name: str) -> bool:
+def _table_gives(table: Mapping[str, Any], name: str) -> bool:
     """True if a table states a parameter by its dotted name."""
     head, _, rest = name.partition(".")
     if not rest:
         return head in table
-    return isinstance(table.get(head), dict) and _states(table[head], rest)
+    return isinstance(table.get(head), dict) and _table_gives(table[head], rest)

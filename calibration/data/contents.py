@@ -30,7 +30,7 @@ class SignalFacts:
     """Facts about a signal of a file.
 
     Attributes:
-        path: of it.
+        path: path of the signal.
         unit: unit that the file states.
         samples: number of them.
         refused: why it cannot be read.
@@ -61,7 +61,7 @@ class Contents:
 
     Attributes:
         name, kind: name and kind of the file.
-        signals: of it.
+        signals: signals of the file.
         notes: notes on how it was read.
         preset: name of the packaged preset that its columns are of. Empty: none.
         proposed: lines of a table `[columns]`, for a person to check.
@@ -109,7 +109,7 @@ def inspect_source(source: str | Path | Any) -> Contents:
     still = {fact.path for fact in facts if fact.least == fact.greatest}
     read = (dataclasses.replace(s, refused=f.refused) for s, f in zip(contents_found.signals, facts, strict=True))
     moving = sorted(read, key=lambda signal: signal.path in still)  # of several, the first that changes
-    lines = dict(_proposed(moving))
+    lines = dict(_proposed_columns(moving))
     proposed = tuple(lines[s.path] for s in contents_found.signals if s.path in lines)
     return Contents(contents_found.name, contents_found.kind, facts, tuple(notes), preset, () if preset else proposed)
 
@@ -189,12 +189,12 @@ def _seconds(clock: Clock) -> tuple[np.ndarray, str] | str:
     return seconds_found.time, seconds_found.unit
 
 
-def _proposed(signals: Sequence[Signal]) -> Iterator[tuple[str, str]]:
+def _proposed_columns(signals: Sequence[Signal]) -> Iterator[tuple[str, str]]:
     """Paths of signals that may be columns, each with its line of a table `[columns]`: the time, then the others."""
     spelled = set(Layout(channels=channels.EVERY).spellings())
     row_signals = [s for s in signals if s.clock is None and not s.refused]
     named = next((s for s in row_signals if _unit_of_time(s.name) is not None), None)
-    clock = named or next((s for s in row_signals if _rises(s)), None)
+    clock = named or next((s for s in row_signals if _is_rising_count(s)), None)
     rest = [s for s in signals if _unit_of_time(s.name) is None and s is not clock]
     elapsed = None
     if clock is not None:
@@ -225,7 +225,7 @@ def _proposed(signals: Sequence[Signal]) -> Iterator[tuple[str, str]]:
     yield from proposals.propose_columns(rest, spelled, seconds)
 
 
-def _rises(signal: Signal) -> bool:
+def _is_rising_count(signal: Signal) -> bool:
     """True if a signal is named after a count of time and rises from nearly every row to the next."""
     if signal.words or not _COUNT.search(signal.name.casefold()):
         return False

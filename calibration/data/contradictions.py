@@ -38,7 +38,7 @@ def check_contradictions(runs: Runs, robot: Robot) -> None:
         BadData: a vehicle has no mass. A robot turns that cannot turn, or its sides are exchanged. The stated voltage
             cannot turn the motors at the imposed speed. An angle wraps or changes its unit. Time sometimes goes back.
     """
-    _mass(runs, robot)
+    _check_mass(runs, robot)
     if runs.turns and (why := turn_error(robot, sorted({str(n) for n in runs.configurations_named(robot)}))):
         raise BadData(f"{runs.source}, {', '.join((*runs.layout.sides, *HEADING))}: {why}")
     if runs.turns:
@@ -48,11 +48,11 @@ def check_contradictions(runs: Runs, robot: Robot) -> None:
         raise BadData(f"{runs.source} row {row + 1}, {column}: {why}")
     if robot.rig.imposed == "motor_speed" and not runs.sampled and not runs.turns:
         for column in (SUPPLY, "motor_voltage_V"):
-            _voltage(runs, robot, column)
+            _check_voltage(runs, robot, column)
     if runs.sampled:
-        _time(runs)
+        _check_time_order(runs)
     if runs.sampled and runs.has("output_angle_deg"):
-        _angle(runs)
+        _check_angle(runs)
 
 
 def cannot_stand(robot: Robot) -> str | None:
@@ -102,7 +102,7 @@ def misplaced_levers(runs: Runs, robot: Robot) -> tuple[int, str, str] | None:
     return None
 
 
-def _mass(runs: Runs, robot: Robot) -> None:
+def _check_mass(runs: Runs, robot: Robot) -> None:
     if not robot.has_ground or runs.has("total_mass_kg"):
         return
     for name in np.unique(runs.configurations_named(robot)):
@@ -113,7 +113,7 @@ def _mass(runs: Runs, robot: Robot) -> None:
             )
 
 
-def _voltage(runs: Runs, robot: Robot, column: str) -> None:
+def _check_voltage(runs: Runs, robot: Robot, column: str) -> None:
     """Reject a voltage that contradicts the motors' back-EMF at the imposed speed.
 
     A bridge may reverse the supply. Motors that a load drives brake: their voltage is smaller by the voltage drop of
@@ -144,7 +144,7 @@ def _voltage(runs: Runs, robot: Robot, column: str) -> None:
         )
 
 
-def _time(runs: Runs) -> None:
+def _check_time_order(runs: Runs) -> None:
     """Reject a time that sometimes goes back, because of several recordings or a clock that was reset. Any order
     is allowed."""
     time, run = runs["time_s"], runs.run_names
@@ -159,13 +159,13 @@ def _time(runs: Runs) -> None:
             )
 
 
-def _beside(step: np.ndarray) -> np.ndarray:
+def _median_of_neighbours(step: np.ndarray) -> np.ndarray:
     """Median of the four steps next to each step, as a drive that mostly stands may be fast for a while."""
     wide = np.pad(step, 2, constant_values=np.nan)
     return np.nanmedian([wide[k : k + len(step)] for k in (0, 1, 3, 4)], axis=0)
 
 
-def _angle(runs: Runs) -> None:
+def _check_angle(runs: Runs) -> None:
     angle = runs["output_angle_deg"]
     for name in np.unique(runs.run_names):
         mine = runs.in_order(name)
@@ -173,7 +173,7 @@ def _angle(runs: Runs) -> None:
         step = np.diff(angle[mine])
         if step.size < 2:
             continue
-        usual = np.maximum(np.median(np.abs(step)), _beside(np.abs(step)))
+        usual = np.maximum(np.median(np.abs(step)), _median_of_neighbours(np.abs(step)))
         jumps = np.flatnonzero(
             (np.abs(step) > TURN) & (np.abs(step) < 2 * TURN + UNUSUAL * usual) & (np.abs(step) > UNUSUAL * usual)
         )

@@ -88,8 +88,8 @@ def divide_run(
     """The stretches of one run.
 
     Args:
-        rows: of the run, in the order of time.
-        time, conditions, applied: of every row of the table [s], [V].
+        rows: rows of the run, in the order of time. time, conditions, applied: time [s], conditions and applied
+        voltage [V] of every row of the table.
     """
     cuts = [0, *np.flatnonzero(differs_from_row_before(rows, conditions)).tolist(), len(rows)]
     begins = [0.0, *(float(time[rows[k]]) for k in cuts[1:-1]), float(time[rows[-1]])]

@@ -47,7 +47,7 @@ def read_csv_columns(path: Path, name: str) -> NamedArrays:
             length than the header.
     """
     content = input_files.csv_bytes(path, name)
-    if len(content) >= LONG and (plain := _plain(name, content)) is not None:
+    if len(content) >= LONG and (plain := _read_plain_table(name, content)) is not None:
         return plain
     decoded, encoded = decode_text(name, content)
     input_files.check_memory(name, CELL * sum(decoded.count(mark) for mark in (",", *SEPARATORS)))
@@ -75,7 +75,7 @@ def read_csv_columns(path: Path, name: str) -> NamedArrays:
     )
 
 
-def _plain(name: str, content: bytes) -> NamedArrays | None:
+def _read_plain_table(name: str, content: bytes) -> NamedArrays | None:
     """Columns of a plain table, numbers as arrays, None for any other table, which `split_cells` reads and checks.
 
     A plain table is in UTF-8 with commas, without comments, quotes and units.
@@ -187,7 +187,7 @@ def split_cells(name: str, lines: Sequence[str]) -> tuple[list[list[str]], Names
 
     Args:
         name: name of the file, for messages.
-        lines: of the file, its header first.
+        lines: lines of the file, header first.
 
     Raises:
         BadData: text that is no CSV, a column that has decimal commas and points, or marks that may stand between

@@ -31,7 +31,7 @@ from mmrjax.model.robot import Robot
 from mmrjax.model.signals import Signals, State
 
 
-def _witness(place: str, whose: str, seen: list[Signals]) -> Effect:
+def _recording_effect(place: str, whose: str, seen: list[Signals]) -> Effect:
     """An effect with a zero term, which records the signals that its balance passes to it."""
 
     class Witness(Effect):
@@ -56,7 +56,7 @@ def readable_signals(
         settled: in steady forward travel (`balances.settled_signals`), else in motion (`balances.moving_signals`).
     """
     seen: list[Signals] = []
-    watched = dataclasses.replace(robot, effects=(_witness(balance, channel, seen),))
+    watched = dataclasses.replace(robot, effects=(_recording_effect(balance, channel, seen),))
     order = balances.settled_signals if settled else balances.moving_signals
     signals = order(watched, conditions, state)
     balances.sensor(watched, signals[0] if isinstance(signals, tuple) else signals)
@@ -216,7 +216,7 @@ def _check(path: Path, effect: type[Effect]) -> None:
 
 
 @functools.cache
-def _instants(balance: str, channel: str, configuration: int) -> tuple[Signals, Signals, Signals]:
+def _test_points(balance: str, channel: str, configuration: int) -> tuple[Signals, Signals, Signals]:
     """Signals of the nominal robot on its battery.
 
     Returns:
@@ -247,7 +247,7 @@ def _check_term(refuse: Callable[[str], BadConfiguration], effect: type[Effect],
 
     for configuration in range(len(robot.configurations)):
         known, every, rest = (
-            dataclasses.replace(s, memory=memory) for s in _instants(effect.balance, effect.channel, configuration)
+            dataclasses.replace(s, memory=memory) for s in _test_points(effect.balance, effect.channel, configuration)
         )
         mirrored = dataclasses.replace(known, **{name: -value for name, value in TURN.items()})
         external = dataclasses.replace(known, battery=jnp.zeros(()))

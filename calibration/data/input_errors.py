@@ -40,7 +40,7 @@ def parse_number(text: str) -> float:
     """Returns the number that a text states in digits, without the underscores that Python allows.
 
     Raises:
-        ValueError: it states none.
+        ValueError: the text contains no number.
     """
     if "_" in text or not text.isascii():
         raise ValueError(f"could not convert {text!r} to a number")

@@ -24,7 +24,7 @@ GRAM_CM2 = 1e-7  # kg·m²
 COULOMB_PER_MAH = 3.6
 
 
-def _column(name: str, factor: float = 1.0) -> Any:
+def _column_field(name: str, factor: float = 1.0) -> Any:
     """A number of the table in the unit of the column's name. Times `factor` it is in SI, NaN for an empty cell."""
     return dataclasses.field(metadata={"column": name, "factor": factor})
 
@@ -33,7 +33,7 @@ def _text(name: str) -> Any:
     return dataclasses.field(metadata={"column": name, "text": True})
 
 
-def _texts(name: str) -> Any:
+def _text_field(name: str) -> Any:
     """Several names in one cell, separated by semicolons."""
     return dataclasses.field(metadata={"column": name, "list": True})
 
@@ -67,28 +67,28 @@ class MotorSheet:
     name: str = _text("name")
     maker: str = _text("maker")
     order_number: str = _text("order_number")
-    voltage_nominal: float = _column("nominal_voltage_V")
-    resistance: float = _column("terminal_resistance_ohm")
-    inductance: float = _column("terminal_inductance_mH", MILLI)
-    torque_constant: float = _column("torque_constant_mNm_per_A", MILLI)
-    speed_constant: float = _column("speed_constant_rpm_per_V", RPM)
-    speed_no_load: float = _column("no_load_speed_rpm", RPM)
-    current_no_load: float = _column("no_load_current_mA", MILLI)
-    speed_nominal: float = _column("nominal_speed_rpm", RPM)
-    torque_nominal: float = _column("nominal_torque_mNm", MILLI)
-    current_nominal: float = _column("nominal_current_A")
-    torque_stall: float = _column("stall_torque_mNm", MILLI)
-    current_stall: float = _column("stall_current_A")
-    inertia: float = _column("rotor_inertia_gcm2", GRAM_CM2)
-    speed_max: float = _column("max_speed_rpm", RPM)
-    resistance_thermal_housing: float = _column("thermal_resistance_housing_ambient_K_per_W")
-    resistance_thermal_winding: float = _column("thermal_resistance_winding_housing_K_per_W")
-    time_constant_winding: float = _column("thermal_time_constant_winding_s")
-    time_constant_motor: float = _column("thermal_time_constant_motor_s")
-    temperature_winding_max: float = _column("max_winding_temperature_C")
-    mass: float = _column("weight_g", MILLI)
-    price: float = _column("price_EUR")
-    gearboxes: tuple[str, ...] = _texts("gearboxes")
+    voltage_nominal: float = _column_field("nominal_voltage_V")
+    resistance: float = _column_field("terminal_resistance_ohm")
+    inductance: float = _column_field("terminal_inductance_mH", MILLI)
+    torque_constant: float = _column_field("torque_constant_mNm_per_A", MILLI)
+    speed_constant: float = _column_field("speed_constant_rpm_per_V", RPM)
+    speed_no_load: float = _column_field("no_load_speed_rpm", RPM)
+    current_no_load: float = _column_field("no_load_current_mA", MILLI)
+    speed_nominal: float = _column_field("nominal_speed_rpm", RPM)
+    torque_nominal: float = _column_field("nominal_torque_mNm", MILLI)
+    current_nominal: float = _column_field("nominal_current_A")
+    torque_stall: float = _column_field("stall_torque_mNm", MILLI)
+    current_stall: float = _column_field("stall_current_A")
+    inertia: float = _column_field("rotor_inertia_gcm2", GRAM_CM2)
+    speed_max: float = _column_field("max_speed_rpm", RPM)
+    resistance_thermal_housing: float = _column_field("thermal_resistance_housing_ambient_K_per_W")
+    resistance_thermal_winding: float = _column_field("thermal_resistance_winding_housing_K_per_W")
+    time_constant_winding: float = _column_field("thermal_time_constant_winding_s")
+    time_constant_motor: float = _column_field("thermal_time_constant_motor_s")
+    temperature_winding_max: float = _column_field("max_winding_temperature_C")
+    mass: float = _column_field("weight_g", MILLI)
+    price: float = _column_field("price_EUR")
+    gearboxes: tuple[str, ...] = _text_field("gearboxes")
     source: str = _text("source")
     note: str = _text("note")
 
@@ -115,16 +115,16 @@ class GearboxSheet:
     maker: str = _text("maker")
     order_number: str = _text("order_number")
     family: str = _text("family")
-    stages: float = _column("stages")
-    ratio: float = _column("ratio")
-    torque_max: float = _column("max_continuous_torque_Nm")
-    torque_intermittent_max: float = _column("max_intermittent_torque_Nm")
-    efficiency: float = _column("max_efficiency_percent", 1e-2)
-    inertia: float = _column("inertia_gcm2", GRAM_CM2)
-    speed_input_max: float = _column("max_continuous_input_speed_rpm", RPM)
-    power_max: float = _column("max_continuous_power_W")
-    mass: float = _column("weight_g", MILLI)
-    price: float = _column("price_EUR")
+    stages: float = _column_field("stages")
+    ratio: float = _column_field("ratio")
+    torque_max: float = _column_field("max_continuous_torque_Nm")
+    torque_intermittent_max: float = _column_field("max_intermittent_torque_Nm")
+    efficiency: float = _column_field("max_efficiency_percent", 1e-2)
+    inertia: float = _column_field("inertia_gcm2", GRAM_CM2)
+    speed_input_max: float = _column_field("max_continuous_input_speed_rpm", RPM)
+    power_max: float = _column_field("max_continuous_power_W")
+    mass: float = _column_field("weight_g", MILLI)
+    price: float = _column_field("price_EUR")
     source: str = _text("source")
     note: str = _text("note")
 
@@ -149,15 +149,15 @@ class CellSheet:
     name: str = _text("name")
     maker: str = _text("maker")
     chemistry: str = _text("chemistry")
-    cells: float = _column("cells")
-    capacity: float = _column("capacity_mAh", COULOMB_PER_MAH)
-    voltage_full: float = _column("full_voltage_V")
-    voltage_cut_off: float = _column("cut_off_voltage_V")
-    current_max: float = _column("max_continuous_current_A")
-    current_charge_max: float = _column("max_charge_current_A")
-    resistance: float = _column("resistance_mohm", MILLI)
-    impedance: float = _column("impedance_1kHz_mohm", MILLI)
-    mass: float = _column("weight_g", MILLI)
+    cells: float = _column_field("cells")
+    capacity: float = _column_field("capacity_mAh", COULOMB_PER_MAH)
+    voltage_full: float = _column_field("full_voltage_V")
+    voltage_cut_off: float = _column_field("cut_off_voltage_V")
+    current_max: float = _column_field("max_continuous_current_A")
+    current_charge_max: float = _column_field("max_charge_current_A")
+    resistance: float = _column_field("resistance_mohm", MILLI)
+    impedance: float = _column_field("impedance_1kHz_mohm", MILLI)
+    mass: float = _column_field("weight_g", MILLI)
     source: str = _text("source")
     note: str = _text("note")
 
@@ -165,7 +165,7 @@ class CellSheet:
 Sheet = TypeVar("Sheet", MotorSheet, GearboxSheet, CellSheet)
 
 
-def _value(text: str, where: str, field: dataclasses.Field[Any]) -> Any:
+def _cell(text: str, where: str, field: dataclasses.Field[Any]) -> Any:
     """A cell of the table as the field holds it."""
     if field.metadata.get("text"):
         return text
@@ -179,7 +179,7 @@ def _value(text: str, where: str, field: dataclasses.Field[Any]) -> Any:
         raise BadData(f"{where}, {field.metadata['column']}: got {text!r}; expected a number or nothing") from error
 
 
-def _rows(kind: type[Sheet], file: str) -> Iterator[Sheet]:
+def _read_sheets(kind: type[Sheet], file: str) -> Iterator[Sheet]:
     """The sheets of a table.
 
     Raises:
@@ -196,22 +196,22 @@ def _rows(kind: type[Sheet], file: str) -> Iterator[Sheet]:
             raise BadData(
                 f"{file} row {reader.line_num}: the number of cells differs from the number of columns, {len(wanted)}"
             )
-        yield kind(**{f.name: _value(row[f.metadata["column"]], f"{file} row {reader.line_num}", f) for f in fields})
+        yield kind(**{f.name: _cell(row[f.metadata["column"]], f"{file} row {reader.line_num}", f) for f in fields})
 
 
 @functools.cache
 def packaged_motors() -> tuple[MotorSheet, ...]:
     """The packaged motors, in the order of `parts/motors.csv`."""
-    return tuple(_rows(MotorSheet, "motors.csv"))
+    return tuple(_read_sheets(MotorSheet, "motors.csv"))
 
 
 @functools.cache
 def packaged_gearboxes() -> tuple[GearboxSheet, ...]:
     """The packaged gearboxes of up to three stages, by family and ratio."""
-    return tuple(_rows(GearboxSheet, "gearboxes.csv"))
+    return tuple(_read_sheets(GearboxSheet, "gearboxes.csv"))
 
 
 @functools.cache
 def packaged_cells() -> tuple[CellSheet, ...]:
     """The packaged cells. The first is the paper's, whose mass no sheet that was found states."""
-    return tuple(_rows(CellSheet, "cells.csv"))
+    return tuple(_read_sheets(CellSheet, "cells.csv"))

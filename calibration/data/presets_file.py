@@ -216,7 +216,7 @@ def parse_preset(text: str, where: str, given: Mapping[str, float]) -> Preset:
 def _parsed(content: Mapping[str, Any], where: str, given: Mapping[str, float]) -> Preset:
     for key in content:
         stated_word(key, KEYS, where, f"got the key {key}")
-    numbers = _numbers(content.get("ask", {}), where, given)
+    numbers = _preset_numbers(content.get("ask", {}), where, given)
     header = _texts(content.get("header", []), f"{where}, header")
     columns = content.get("columns", {})
     if not isinstance(columns, dict) or not columns:
@@ -235,7 +235,7 @@ def _parsed(content: Mapping[str, Any], where: str, given: Mapping[str, float]) 
     return Preset(where, tuple(entries), header)
 
 
-def _numbers(asked: Any, where: str, given: Mapping[str, float]) -> dict[str, float]:
+def _preset_numbers(asked: Any, where: str, given: Mapping[str, float]) -> dict[str, float]:
     """Numbers that the user must give for a preset, by name."""
     if not isinstance(asked, dict):
         raise BadConfiguration(f"{where}, ask: got {asked!r}; expected a table")
@@ -289,11 +289,11 @@ def _column(mine: str, theirs: Any, where: str, numbers: Mapping[str, float]) ->
             raise BadConfiguration(f"{where}.{key}: got {texts[key]!r}; expected {expected}")
     sign_bit = stated_count(table.get("sign_bit", 0), f"{where}.sign_bit", 0, 63)
     zero = stated_number(table.get("zero", 0.0), f"{where}.zero")
-    theirs = tuple(_filled(name, where, numbers) for name in names)
+    theirs = tuple(_filled_column_name(name, where, numbers) for name in names)
     return PresetColumn(mine, theirs, factor, sign_bit=sign_bit, zero=zero, **texts)
 
 
-def _filled(name: str, where: str, numbers: Mapping[str, float]) -> str:
+def _filled_column_name(name: str, where: str, numbers: Mapping[str, float]) -> str:
     """A column's name with whole numbers in place of the names in braces."""
     try:
         named = [field for _, field, _, _ in string.Formatter().parse(name) if field is not None]
@@ -316,11 +316,11 @@ def merge_columns(
 ) -> tuple[tuple[str, str, float], ...]:
     """Columns of two tables. `first` takes precedence if both have a column, or use the same source column."""
     first = tuple(first)
-    taken = {_bare(mine) for mine, _, _ in first} | {theirs for _, theirs, _ in first}
-    return (*first, *(c for c in others if _bare(c[0]) not in taken and c[1] not in taken))
+    taken = {_name_without_unit(mine) for mine, _, _ in first} | {theirs for _, theirs, _ in first}
+    return (*first, *(c for c in others if _name_without_unit(c[0]) not in taken and c[1] not in taken))
 
 
-def _bare(mine: str) -> str:
+def _name_without_unit(mine: str) -> str:
     """Name of a column without its unit, so that time_ms and time_s are the same."""
     layout = Layout(channels=channels.EVERY)
     quantities = layout.quantities()

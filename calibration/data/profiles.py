@@ -212,14 +212,14 @@ def read_profile(source: str | Path) -> ProfileTable:
     if table is None:
         return _of_text(input_files.csv_bytes(path, path.name or str(source)), path.name)
     rows = [list(table.header), *map(list, zip(*map(column_texts, table.values), strict=True))]
-    return _parsed(table.name, _settings(table.name, []), rows, table.digest, table.notes)
+    return _parsed(table.name, _header_settings(table.name, []), rows, table.digest, table.notes)
 
 
 def _of_text(content: bytes, name: str) -> ProfileTable:
     text, encoded = delimited.decode_text(name, content)
     lines = [line.strip() for line in text.splitlines() if line.strip()]
     above = next((k for k, line in enumerate(lines) if not line.startswith("#")), len(lines))
-    settings = _settings(name, lines[:above])
+    settings = _header_settings(name, lines[:above])
     rows, notes = delimited.split_cells(name, lines[above:])
     return _parsed(name, settings, rows, hashlib.sha256(content).hexdigest(), (*encoded, *notes))
 
@@ -228,7 +228,7 @@ def _parsed(name: str, settings: Json, rows: list[list[str]], digest: str, notes
     if not rows:
         raise BadData(f"{name}: the file is empty; expected a header that includes time_s, followed by data rows")
     header, body = rows[0], rows[1:]
-    columns = _columns(name, header)
+    columns = _profile_columns(name, header)
     if len(body) < 2:
         got = "one row" if body else "a header and no rows"
         raise BadData(f"{name}: got {got}; expected two rows or more, of which the last ends the mission")
@@ -242,7 +242,7 @@ def _parsed(name: str, settings: Json, rows: list[list[str]], digest: str, notes
     time = _time(cells)
     if why := sides_error(list(cells.columns), cells.has(MODES[SPEED]), cells.called):
         raise BadData(f"{name}: {why}")
-    modes, driven = _driven(cells)
+    modes, driven = _modes_and_demands(cells)
     demand = driven.pop("demand")
     values = {field: cells.held(field) for field in HELD if field in columns} | driven
     if len(time) * settings["cycles"] > LONGEST:
@@ -253,7 +253,7 @@ def _parsed(name: str, settings: Json, rows: list[list[str]], digest: str, notes
     )  # fmt: skip
 
 
-def _settings(name: str, comments: list[str]) -> Json:
+def _header_settings(name: str, comments: list[str]) -> Json:
     """Settings in the comment lines at the top: `cycles = 40`, `between_rows = "linear"`. Other lines are remarks."""
     stated: Json = {}
     for line in comments:
@@ -286,7 +286,7 @@ def _settings(name: str, comments: list[str]) -> Json:
     return {"cycles": cycles, "linear": between == "linear", "begins": begins}
 
 
-def _columns(name: str, header: list[str]) -> dict[str, tuple[str, str]]:
+def _profile_columns(name: str, header: list[str]) -> dict[str, tuple[str, str]]:
     """Column and unit of each field that the file has.
 
     Raises:
@@ -400,7 +400,7 @@ def _time(cells: _Cells) -> np.ndarray:
     return time
 
 
-def _driven(cells: _Cells) -> tuple[Names, Columns]:
+def _modes_and_demands(cells: _Cells) -> tuple[Names, Columns]:
     """Mode of each row, and by field of `Profile` its demand, and the duties, voltages and yaw rates that are stated.
 
     A cell of a demand column in a row of another mode ends the ramp that leads to this row, where values are linear
@@ -415,7 +415,7 @@ def _driven(cells: _Cells) -> tuple[Names, Columns]:
         before = modes[-1] if modes else ""
         filled = [field for field in DEMANDS if cells.text(field, row)]
         ends = {field for field in filled if cells.linear and before == DEMANDS[field]}
-        mode = _mode(cells, row, before, [f for f in filled if f not in ends] or filled)
+        mode = _mode_of_row(cells, row, before, [f for f in filled if f not in ends] or filled)
         demands = [field for field in filled if DEMANDS[field] == mode]
         _check_demands(cells, row, before, mode, demands, [f for f in filled if f not in demands and f not in ends])
         modes.append(mode)
@@ -438,7 +438,7 @@ def _driven(cells: _Cells) -> tuple[Names, Columns]:
     return tuple(modes), shares_found
 
 
-def _mode(cells: _Cells, row: int, before: str, filled: list[str]) -> str:
+def _mode_of_row(cells: _Cells, row: int, before: str, filled: list[str]) -> str:
     """The mode that a row states, or that its demand means, without either voltage, if no row has a demand."""
     stated = cells.text(MODE, row)
     if stated and stated not in MODES:

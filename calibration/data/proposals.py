@@ -127,7 +127,7 @@ def propose_columns(
         for signal, unit in zip(signals, units, strict=True)
         if signal.name not in spelled
         and (unit is None or unit in known_units)
-        and (candidate := _candidate(signal, unit, count[unit] == 1, columns)) is not None
+        and (candidate := _candidate_of_signal(signal, unit, count[unit] == 1, columns)) is not None
     ]
     units_of = dict(zip((signal.path for signal in signals), units, strict=True))
     groups: dict[str, list[Candidate]] = {}
@@ -141,12 +141,12 @@ def propose_columns(
         if others:
             rest = ", ".join(c.signal.path for c in others[:3])
             question = f"or {rest}: which one is the {quantity.replace('_', ' ')}?"
-        if joint := _joint(best.signal, signals):
+        if joint := _joint_name(best.signal, signals):
             question = f"joint {joint}{'; ' * bool(question)}{question}"
         yield best.signal.path, best.line(question)
 
 
-def _joint(signal: Signal, signals: Sequence[Signal]) -> str:
+def _joint_name(signal: Signal, signals: Sequence[Signal]) -> str:
     """Name of the joint that an element of a message of joints belongs to, empty if there is none."""
     element = re.search(r"\w+(\[\d+\])$", signal.path)
     if element is None:
@@ -156,7 +156,7 @@ def _joint(signal: Signal, signals: Sequence[Signal]) -> str:
     return str(names[0]) if len({*names.tolist()}) == 1 else ""
 
 
-def _candidate(
+def _candidate_of_signal(
     signal: Signal, unit: str | None, alone: bool, columns: Mapping[str, Mapping[str, str]]
 ) -> Candidate | None:
     """Quantity that a signal may show, None if its unit, its behaviour or its name excludes every one.
@@ -167,7 +167,7 @@ def _candidate(
     """
     if signal.refused:
         return None
-    name = _words(signal.path)
+    name = _path_words(signal.path)
     matches = [m.quantity for m in MEANINGS if m.pattern.search(name)]
     fitting = [q for q in matches if unit is None or unit in columns[q].values()]
     if not matches and unit is not None and alone:
@@ -208,7 +208,7 @@ def _candidate(
     return Candidate(signal, quantity, column, question)
 
 
-def _words(path: str) -> str:
+def _path_words(path: str) -> str:
     """A path in lower case, with underscores between words that capitals separate."""
     return re.sub(r"(?<=[a-z])(?=[A-Z])", "_", path).casefold()
 
@@ -260,7 +260,7 @@ def _by_rate(
 
     Args:
         stated: unit of each signal, by its path.
-        columns: as of `_candidate`.
+        columns: as of `_candidate_of_signal`.
     """
     agreed: dict[str, Candidate] = {}
     for place, rate in itertools.product(pool, pool):
@@ -298,7 +298,7 @@ def _units_of_place_and_rate(
     """
     turned = np.asarray(rate.load(), float)
     factor = _integral_factor(time, np.asarray(place.load(), float), turned)
-    turns = re.search(r"angle|theta|omega|rpm", _words(f"{place.path} {rate.path}"))
+    turns = re.search(r"angle|theta|omega|rpm", _path_words(f"{place.path} {rate.path}"))
     no_length = not any(stated) and (bool(turns) or float(np.nanmax(np.abs(turned))) > LARGEST_M_S)
     return [
         (of_place, of_rate)

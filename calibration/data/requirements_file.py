@@ -170,11 +170,11 @@ def parse_requirements(text: str, where: str) -> Requirements:
     stated = content.pop("envelope", {})
     if not isinstance(stated, dict):
         raise BadConfiguration(f"{where}, envelope: got {stated!r}; expected a table of {', '.join(KEYS)}")
-    envelope = _envelope(Envelope(), stated, f"{where}, envelope")
+    envelope = _updated_envelope(Envelope(), stated, f"{where}, envelope")
     each: list[Requirement] = []
     for name, value in content.items():
         if name not in QUANTITIES:
-            raise BadConfiguration(f"{where}, {_unknown(name, (*QUANTITIES, 'envelope'))}")
+            raise BadConfiguration(f"{where}, {_unknown_name_error(name, (*QUANTITIES, 'envelope'))}")
         tables = value if isinstance(value, list) else [value]
         if not tables:
             raise BadConfiguration(
@@ -182,23 +182,23 @@ def parse_requirements(text: str, where: str) -> Requirements:
             )
         for k, table in enumerate(tables):
             place = f"{where}, {name}" + (f" {k + 1}" if len(tables) > 1 else "")
-            each += _requirements(name, table, envelope, place)
+            each += _requirements_of_entry(name, table, envelope, place)
     if not each:
         raise BadConfiguration(f"{where}: contains no requirement; expected one of {', '.join(QUANTITIES)}")
     _contradictions(each, envelope, where)
     return Requirements(where, envelope, tuple(each), text)
 
 
-def _stem(name: str) -> str:
+def _stem_of_name(name: str) -> str:
     """A name without its unit."""
     units = ("_m_s", "_mm", "_deg", "_kg", "_min", "_C", "_Nm", "_rpm", "_A", "_Wh", "_V")
     return next((name.removesuffix(u) for u in units if name.endswith(u)), name)
 
 
-def _unknown(name: str, known: Iterable[str]) -> str:
+def _unknown_name_error(name: str, known: Iterable[str]) -> str:
     """Message about an unknown name."""
     known = tuple(known)
-    stems = {_stem(k): k for k in known if _stem(k) != k}
+    stems = {_stem_of_name(k): k for k in known if _stem_of_name(k) != k}
     if name in stems:
         return f"{name}: no unit in its name; write {stems[name]}"
     head = max((s for s in stems if name.startswith(f"{s}_")), key=len, default="")
@@ -217,13 +217,13 @@ def _range(value: Any, where: str, low: float, high: float, unit: str) -> Range:
     return first, last
 
 
-def _envelope(base: Envelope, stated: Mapping[str, Any], where: str) -> Envelope:
+def _updated_envelope(base: Envelope, stated: Mapping[str, Any], where: str) -> Envelope:
     """`base` with the stated values in place of its own."""
     envelope: Json = {}
     for key, value in stated.items():
         place = f"{where}.{key}"
         if key not in KEYS:
-            raise BadConfiguration(f"{where}, {_unknown(key, KEYS)}")
+            raise BadConfiguration(f"{where}, {_unknown_name_error(key, KEYS)}")
         if key in RANGES:
             envelope[key] = _range(value, place, *RANGES[key])
         elif key == "battery":
@@ -251,7 +251,7 @@ def _envelope(base: Envelope, stated: Mapping[str, Any], where: str) -> Envelope
     return merged
 
 
-def _requirements(name: str, value: Any, envelope: Envelope, where: str) -> list[Requirement]:
+def _requirements_of_entry(name: str, value: Any, envelope: Envelope, where: str) -> list[Requirement]:
     """The one or two requirements (least, most) of one entry."""
     quantity = QUANTITIES[name]
     table = dict(value) if isinstance(value, dict) else {"least" if quantity.least else "most": value}
@@ -262,7 +262,7 @@ def _requirements(name: str, value: Any, envelope: Envelope, where: str) -> list
     allowed = ("least", "most", "source", *KEYS, *own_keys)
     for key in table:
         if key not in allowed:
-            raise BadConfiguration(f"{where}, {_unknown(key, allowed)}")
+            raise BadConfiguration(f"{where}, {_unknown_name_error(key, allowed)}")
     for key in table:
         if key in AXES and key not in quantity.axes:
             raise BadConfiguration(f"{where}, {key}: {quantity.label} does not depend on it; remove it")
@@ -277,7 +277,7 @@ def _requirements(name: str, value: Any, envelope: Envelope, where: str) -> list
             f"{where}: stairs without a tread; expected a table such as {{ least = 170, {TREAD} = 290 }}"
         )
     depth = 0.0 if tread is None else stated_number(tread, f"{where}, {TREAD}", *TREADS, "mm")
-    own_envelope = _envelope(envelope, table, where)
+    own_envelope = _updated_envelope(envelope, table, where)
     if name == "endurance_min" and not own_envelope.battery:
         raise BadConfiguration(f"{where}: endurance needs the battery, but the envelope sets supply_voltage_V")
     if name == "speed_end_of_charge_m_s":

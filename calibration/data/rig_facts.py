@@ -53,7 +53,7 @@ def derived_facts(robot: Robot) -> list[Fact]:
     return facts
 
 
-def _within(value: float, low: float, high: float, why: str) -> str:
+def _outside(value: float, low: float, high: float, why: str) -> str:
     """`why` if a value is outside the usual range, else empty."""
     return "" if low <= value <= high else f"{why} (usual: {three_digits(low)} to {three_digits(high)})"
 
@@ -65,10 +65,10 @@ def _motor(robot: Robot) -> Iterator[Fact]:
     with_constant, with_resistance = robot.knows(["motor.torque_constant"]), robot.knows(["motor.resistance"])
     if with_constant:
         per_volt = 1 / constant / RPM
-        odd = _within(per_volt, 5, 20_000, "is torque_constant in N·m/A? 1 mN·m/A is 0.001")
+        odd = _outside(per_volt, 5, 20_000, "is torque_constant in N·m/A? 1 mN·m/A is 0.001")
         yield Fact("speed without load, of each volt", f"{three_digits(per_volt)} rpm/V", odd)
         idle = float(motor.friction_coulomb) / constant
-        odd = _within(idle, 0, 10, "is friction_coulomb in N·m? it is torque_constant times the no-load current")
+        odd = _outside(idle, 0, 10, "is friction_coulomb in N·m? it is torque_constant times the no-load current")
         yield Fact("current needed to overcome the motor's dry friction", f"{three_digits(idle)} A", odd)
     if with_constant and voltage is not None:
         fastest = voltage / constant
@@ -76,18 +76,18 @@ def _motor(robot: Robot) -> Iterator[Fact]:
         yield Fact(f"speed without load at {three_digits(voltage)} V", f"{three_digits(fastest / RPM)} rpm", odd)
     if with_resistance and voltage is not None:
         stall = float(motor.current_stall(voltage))
-        odd = _within(stall, 0.02, 1000, "look at motor.resistance")
+        odd = _outside(stall, 0.02, 1000, "look at motor.resistance")
         yield Fact(f"stall current at {three_digits(voltage)} V", f"{three_digits(stall)} A", odd)
     if with_constant and with_resistance:
         size = constant**2 / resistance
-        odd = _within(
+        odd = _outside(
             size, 1e-7, 1.0, "torque_constant and resistance are unlikely to belong to one motor; check their units"
         )
         yield Fact("torque over speed k²/R", f"{three_digits(size * 1e3)} mN·m·s", odd)
         if inertia > 0:
             constant_time = inertia / size
             why = "check motor.inertia (1 g·cm² is 1e-7 kg·m²), torque_constant and resistance"
-            odd = _within(constant_time, 5e-4, 0.5, why)
+            odd = _outside(constant_time, 5e-4, 0.5, why)
             yield Fact(
                 "mechanical time constant of the motor alone J R/k²", f"{three_digits(constant_time * 1e3)} ms", odd
             )
@@ -95,7 +95,7 @@ def _motor(robot: Robot) -> Iterator[Fact]:
 
 def _gearbox(robot: Robot) -> Iterator[Fact]:
     ratio, efficiency = float(robot.gearbox.ratio), float(robot.gearbox.efficiency_load)
-    odd = _within(ratio, 1, 3000, "expected motor turns per output turn")
+    odd = _outside(ratio, 1, 3000, "expected motor turns per output turn")
     if ratio >= STAGES and efficiency > EFFICIENCY:
         odd = f"an efficiency of {efficiency:g} is higher than usual for three or more stages (0.5 to {EFFICIENCY:g})"
     if ratio == 1 and efficiency < 0.9:
@@ -103,26 +103,26 @@ def _gearbox(robot: Robot) -> Iterator[Fact]:
     yield Fact("gearbox", f"{ratio:g} : 1 with efficiency {efficiency:g}", odd)
 
 
-def _torque(robot: Robot, current: float) -> float:
+def _output_torque_at(robot: Robot, current: float) -> float:
     """Torque at the output of one drive at a motor current, with its losses [N·m]."""
     motor, gear = robot.motor, robot.gearbox
     lost = float(motor.friction_coulomb) + float(gear.friction_coulomb)
     return (float(motor.torque_constant) * current - lost) * float(gear.ratio) * float(gear.efficiency_load)
 
 
-def _current(robot: Robot, torque: float) -> float:
+def _current_for_torque(robot: Robot, torque: float) -> float:
     """Motor current needed for a torque at its output, at low speed [A]."""
     motor, gear = robot.motor, robot.gearbox
     lost = float(motor.friction_coulomb) + float(gear.friction_coulomb)
     return (torque / (float(gear.ratio) * float(gear.efficiency_load)) + lost) / float(motor.torque_constant)
 
 
-def _drawn(robot: Robot, what: str, torque: float, places: str) -> Iterator[Fact]:
+def _current_fact(robot: Robot, what: str, torque: float, places: str) -> Iterator[Fact]:
     """Current needed for a torque, compared with the stall current if a voltage limit is given."""
     if not robot.knows(["motor.torque_constant"]):
         return
-    current, limit = _current(robot, torque), robot.motor.voltage_limit
-    odd = _within(current, 0, 200, f"check {places}, and the gearbox")
+    current, limit = _current_for_torque(robot, torque), robot.motor.voltage_limit
+    odd = _outside(current, 0, 200, f"check {places}, and the gearbox")
     if limit is not None and robot.knows(["motor.resistance"]):
         stall = float(robot.motor.current_stall(limit))
         if current > stall:
@@ -136,9 +136,9 @@ def _drawn(robot: Robot, what: str, torque: float, places: str) -> Iterator[Fact
 def _shaft(robot: Robot, name: str, load: Shaft) -> Iterator[Fact]:
     friction, constant, gravity = (float(x) for x in (load.loss_coulomb, load.torque_constant, load.torque_gravity))
     places = f"{name}.loss_coulomb [N·m, at the output]"
-    yield from _drawn(robot, f"{name}: current to turn it slowly", friction + max(constant, 0.0), places)
+    yield from _current_fact(robot, f"{name}: current to turn it slowly", friction + max(constant, 0.0), places)
     if gravity > 0:
-        yield from _drawn(
+        yield from _current_fact(
             robot, f"{name}: current to hold and lift the arm", friction + gravity, f"{name}.torque_gravity"
         )
         length = float(load.inertia) * GRAVITY / gravity
@@ -146,7 +146,7 @@ def _shaft(robot: Robot, name: str, load: Shaft) -> Iterator[Fact]:
         yield Fact(
             f"{name}: length of a pendulum with the same period",
             f"{three_digits(length * 1e3)} mm",
-            _within(length, 0.01, 3.0, why),
+            _outside(length, 0.01, 3.0, why),
         )
     if float(load.inertia) > 0 and float(robot.motor.inertia) > 0:
         share = float(load.inertia) / (float(robot.motor.inertia) * float(robot.gearbox.ratio) ** 2)
@@ -154,12 +154,14 @@ def _shaft(robot: Robot, name: str, load: Shaft) -> Iterator[Fact]:
         yield Fact(
             f"{name}: load inertia over motor inertia, both at the output",
             three_digits(share),
-            _within(share, 1e-4, 1e4, why),
+            _outside(share, 1e-4, 1e4, why),
         )
     if float(load.radius) != 1.0:
         travel = 2 * math.pi * float(load.radius)
         yield Fact(
-            f"{name}: travel per turn", f"{three_digits(travel * 1e3)} mm", _within(travel, 1e-4, 10.0, "look at it")
+            f"{name}: travel per turn",
+            f"{three_digits(travel * 1e3)} mm",
+            _outside(travel, 1e-4, 10.0, "look at it"),
         )
 
 
@@ -167,27 +169,29 @@ def _vehicle(robot: Robot, name: str) -> Iterator[Fact]:
     load = robot.configurations[name]
     sides, mass, radius = float(robot.sides), float(load.mass), float(load.radius)
     rolling, static = float(load.ground.rolling_resistance), float(load.ground.friction.static)
-    odd = _within(mass, 0.05, 2000, f"is {name}.mass in kg?")
+    odd = _outside(mass, 0.05, 2000, f"is {name}.mass in kg?")
     yield Fact(f"{name}: weight", f"{three_digits(mass)} kg, {three_digits(mass * GRAVITY)} N", odd)
     guide = float(load.track.guide_friction) * float(load.track.guide_share)
     torque = mass * GRAVITY * (rolling + guide) * radius / sides + float(load.track.loss_coulomb)
     places = f"{name}.ground.rolling_resistance and {name}.track.loss_coulomb"
-    yield from _drawn(robot, f"{name}: current to roll slowly on the flat", torque, places)
+    yield from _current_fact(robot, f"{name}: current to roll slowly on the flat", torque, places)
     grip = math.degrees(math.atan(static))
     odd = "" if static > rolling + guide else "it cannot move on the flat: friction.static is below the resistance"
     yield Fact(
-        f"{name}: steepest slope without sliding", f"{grip:.0f}°", odd or _within(grip, 5, 60, "look at static")
+        f"{name}: steepest slope without sliding",
+        f"{grip:.0f}°",
+        odd or _outside(grip, 5, 60, "look at static"),
     )
     limit = robot.motor.voltage_limit
     if limit is None or not robot.knows(["motor.resistance"]):
         return
-    pull = _torque(robot, float(robot.motor.current_stall(limit))) - float(load.track.loss_coulomb)
+    pull = _output_torque_at(robot, float(robot.motor.current_stall(limit))) - float(load.track.loss_coulomb)
     climb = pull * sides / (radius * mass * GRAVITY) - rolling - guide
     odd = "" if climb > 0 else "its motors cannot move it; check mass, ratio, torque_constant and resistance"
     angle = "any" if climb >= 1 else f"{math.degrees(math.asin(max(climb, 0.0))):.0f}°"
     yield Fact(f"{name}: steepest slope that the stall torque holds at {three_digits(limit)} V", angle, odd)
     speed = limit / float(robot.motor.torque_constant) / float(robot.gearbox.ratio) * radius
-    odd = _within(speed, 0.005, 15, f"check {name}.radius, gearbox.ratio and motor.torque_constant")
+    odd = _outside(speed, 0.005, 15, f"check {name}.radius, gearbox.ratio and motor.torque_constant")
     yield Fact(f"{name}: speed without load at {three_digits(limit)} V", f"{three_digits(speed)} m/s", odd)
 
 
@@ -235,7 +239,7 @@ def doubtful_current(runs: Runs, robot: Robot) -> str:
     if column != CURRENT or not loads:
         return ""
     torques = [[float(x) for x in (load.loss_coulomb, load.torque_constant, load.torque_gravity)] for load in loads]
-    needed = max(_current(robot, sum(map(abs, torque))) for torque in torques)
+    needed = max(_current_for_torque(robot, sum(map(abs, torque))) for torque in torques)
     turning = runs["held"] < 0.5 if runs.has("held") else np.full(len(runs), True)
     largest = float(np.nanmax(np.abs(runs[column][turning]), initial=0.0))
     if needed == 0 or not turning.any() or LEAST < largest / needed < MOST:
@@ -406,7 +410,7 @@ def doubtful_torque(runs: Runs, robot: Robot) -> str:
     if not runs.has(LOAD) or not (of_current or (robot.rig.imposed == "voltage" and robot.knows(VOLTAGE))):
         return ""
     current = np.abs(applied_drive(runs)) / (1.0 if of_current else float(robot.motor.resistance))
-    lost, made = (_torque(robot, x) for x in (0.0, 1.0))  # it rises with the current on a line
+    lost, made = (_output_torque_at(robot, x) for x in (0.0, 1.0))  # it rises with the current on a line
     stall = np.maximum(lost + (made - lost) * current, 0.0)
     braked = (runs[LOAD] != 0) & (current > 0)
     beyond = braked & (np.abs(runs[LOAD]) > BEYOND * stall)

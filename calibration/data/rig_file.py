@@ -287,7 +287,7 @@ def _columns(stated: Any, where: str) -> tuple[tuple[str, str, float], ...]:
 
 
 def needed_parameters(rig: Rig, values: Iterable[tuple[str, Any]] = ()) -> Names:
-    """Required parameters of a robot that starts from nothing: of its drive, and of its turns if it turns.
+    """Parameters that a robot without a base must have: those of its drive, and of turning if it turns.
 
     Args:
         values: values of its parameters, by dotted name.

@@ -253,7 +253,7 @@ def _without_parameters(
         robot = params.replace(robot, {"motor.inductance": params.as_float(rig_file.WINDING * resistance)})
     for name in given:
         if "." not in name and name not in COUNTS:
-            raise BadConfiguration(f"{where}, {name}: no such parameter; {_parameters(name, parameters)}")
+            raise BadConfiguration(f"{where}, {name}: no such parameter; {_parameter_choices(name, parameters)}")
     missing = [name for name in rig_file.needed_parameters(rig, given.items()) if name not in given]
     if not loads.travels and "speed" in rig.channels:
         missing += [f"{name}.radius" for name in loads.by_name if f"{name}.radius" not in given]
@@ -322,13 +322,13 @@ def change_robot(robot: Robot, values: Mapping[str, Any], where: str, notes: lis
     """
     stated = dict(values)
     settings = (*COUNTS, *RATINGS, *SWITCHES, *CHOICES)
-    ratings = {name: _setting(where, name, stated.pop(name)) for name in settings if name in stated}
+    ratings = {name: _checked_setting(where, name, stated.pop(name)) for name in settings if name in stated}
     if CURVE & stated.keys() and "battery.capacity" in stated:  # all of one cell, unless stated otherwise
         ratings.setdefault("battery.capacity_curve", stated["battery.capacity"])
     parameters = {p.name: p for p in params.walk_parameters(robot)}
     refused: dict[str, list[str]] = {}
     for name, value in stated.items():
-        if why := _refused(name, value, parameters):
+        if why := _refusal_reason(name, value, parameters):
             refused.setdefault(why, []).append(name)
     if refused:
         sentences = [f"{list_some(names, 80)}: {why}" for why, names in refused.items()]
@@ -350,10 +350,10 @@ def change_robot(robot: Robot, values: Mapping[str, Any], where: str, notes: lis
     return _with_states(robot, where)
 
 
-def _refused(name: str, value: Any, known: Mapping[str, params.Parameter]) -> str:
+def _refusal_reason(name: str, value: Any, known: Mapping[str, params.Parameter]) -> str:
     """Reason why a value of a parameter is refused, empty if it is allowed."""
     if name not in known:
-        return f"no such parameter; {_parameters(name, known)}"
+        return f"no such parameter; {_parameter_choices(name, known)}"
     spec = known[name].spec
     low, high = spec.bounds
     allowed = f"{low:g} to {high:g} {spec.unit} ({spec.meaning})"
@@ -383,7 +383,7 @@ def _with_states(robot: Robot, where: str) -> Robot:
     return dataclasses.replace(robot, rig=dataclasses.replace(robot.rig, loose=bool(loose)), controller=own)
 
 
-def _setting(where: str, name: str, value: Any) -> Any:
+def _checked_setting(where: str, name: str, value: Any) -> Any:
     """A count, a rating, a switch or a choice of a robot's file, checked."""
     if name in SWITCHES:
         allowed, expected = isinstance(value, bool), f"true or false ({SWITCHES[name]})"
@@ -407,7 +407,7 @@ def _setting(where: str, name: str, value: Any) -> Any:
     return value
 
 
-def _parameters(name: str, known: Collection[str]) -> str:
+def _parameter_choices(name: str, known: Collection[str]) -> str:
     """List of parts and parameters to choose from, for the message about an unknown parameter."""
     head = name.partition(".")[0]
     heads = list(dict.fromkeys(n.partition(".")[0] for n in known))

@@ -110,7 +110,7 @@ STILL = 0.02
 
 def complete_columns(name: str, columns: Columns, rows: int, layout: Layout) -> None:
     """Fills columns that a table may leave out, and refuses values that contradict each other."""
-    _fill(name, columns, rows, layout)
+    _add_default_columns(name, columns, rows, layout)
     _check_driving(name, columns)
     held = columns.get("held", np.zeros(1)) > 0.5
     for row in np.flatnonzero(held & (columns.get(LOAD, 0.0) != 0))[:1]:
@@ -163,7 +163,7 @@ def without_copies(name: str, columns: Columns) -> tuple[np.ndarray, Names]:
     return kept, (note,) if again.size else ()
 
 
-def _fill(name: str, columns: Columns, rows: int, layout: Layout) -> None:
+def _add_default_columns(name: str, columns: Columns, rows: int, layout: Layout) -> None:
     """Adds columns that a table of a rig may leave out: its only configuration, and conditions with a usual value."""
     if layout.complete:
         return
@@ -215,9 +215,11 @@ def _check_sides(name: str, columns: Columns, layout: Layout) -> None:
 
 
 def without_clamped(name: str, columns: Columns, kept: np.ndarray) -> tuple[Columns, np.ndarray, Names]:
-    """Returns the kept rows of a log without those of a clamp, True for these rows, and a sentence on the others.
+    """Returns a log without the rows in which a clamp holds the output, a mask of the rows kept, and a note on the
+    others.
 
-    Each stretch between two clamps becomes a run, as the motors start again. Settled rows keep theirs.
+    Each segment between two clamped ones becomes a run, because the motors start again. Settled rows keep their
+    runs.
     """
     note: Names = ()
     if "held" in columns and set(TIME) <= set(columns) and (held := columns.pop("held") > 0.5).any():
@@ -290,12 +292,12 @@ def _are_points(columns: Columns, layout: Layout, apart: float) -> bool:
     others = [columns[c] for c in settings if c not in (SUPPLY, "duty")]
 
     def left(readings: np.ndarray, k: int) -> float:
-        return _unexplained(readings[1:], [x[k : len(x) - 1 + k] for x in (drive, *others)])
+        return _unexplained_squares(readings[1:], [x[k : len(x) - 1 + k] for x in (drive, *others)])
 
     return all(left(columns[c.column], 1) <= 2 * left(columns[c.column], 0) for c in present)
 
 
-def _unexplained(readings: np.ndarray, settings: Sequence[np.ndarray]) -> float:
+def _unexplained_squares(readings: np.ndarray, settings: Sequence[np.ndarray]) -> float:
     """Sum of squares of readings that no linear function of the settings explains."""
     a = np.stack([np.ones(len(readings)), *settings], 1)
     sound = np.isfinite(readings)
@@ -328,9 +330,9 @@ def driven_rows(name: str, columns: Columns, layout: Layout) -> tuple[Columns, n
     on the other ones.
 
     Raises:
-        BadData: for the same reasons as `_driven`, turns on a slope, or a reading without its sign.
+        BadData: for the same reasons as `_driven_mask`, turns on a slope, or a reading without its sign.
     """
-    driven, note = _driven(name, columns, layout)
+    driven, note = _driven_mask(name, columns, layout)
     if note:
         columns = {column: values[driven] for column, values in columns.items()}
     if {*layout.sides, *HEADING} & set(columns):
@@ -350,7 +352,7 @@ def driven_rows(name: str, columns: Columns, layout: Layout) -> tuple[Columns, n
     return columns, driven, (note,) if note else ()
 
 
-def _driven(name: str, columns: Columns, layout: Layout) -> tuple[np.ndarray, str]:
+def _driven_mask(name: str, columns: Columns, layout: Layout) -> tuple[np.ndarray, str]:
     """True for rows of settled runs in which something drives the motors. A sentence on the other rows.
 
     Raises:
@@ -414,7 +416,7 @@ def _check_signs(name: str, columns: Columns, layout: Layout) -> None:
         backward = (imposed < 0) & ((columns["slope_deg"] <= 0) | channel.zero_at_rest)
         if not channel.zero_at_rest and (layout.weight or "duty" in columns or driven_on(columns, layout).any()):
             continue  # the load may drive a motor; a bridge that reverses the voltage reverses the supply's current
-        doubt = _doubt(columns, channel)
+        doubt = _largest_doubt(columns, channel)
         wrong = np.flatnonzero(backward & (readings > (doubt if layout.crosses_zero else 0.0)))
         if _rises_through_zero(imposed, readings, backward):
             wrong = wrong[:0]
@@ -453,7 +455,7 @@ def _rises_through_zero(imposed: np.ndarray, readings: np.ndarray, backward: np.
     return bool(slope * np.ptp(levels) > 2 * scatter)
 
 
-def _doubt(columns: Columns, channel: Channel) -> np.ndarray | float:
+def _largest_doubt(columns: Columns, channel: Channel) -> np.ndarray | float:
     """Largest excess of a reading beyond zero by noise: SIGN_SDS of its sd, or a share of the channel's rms."""
     readings = columns[channel.column]
     share = SIGN_SHARE * float(np.sqrt(np.nanmean(readings**2))) if np.isfinite(readings).any() else 0.0

@@ -146,7 +146,7 @@ def of_arrays(
     if not len(arrays):
         raise BadData(f"{name}: a header without rows; expected at least one run")
     arrays = clock.recorded_rows(arrays, meanings)
-    columns, changed = _columns(arrays, meanings, layout, battery)
+    columns, changed = _column_values(arrays, meanings, layout, battery)
     settled: Names = ()
     if measured and robot is not None:
         columns, settled = row_checks.settled_points(name, columns, layout, robot)
@@ -183,7 +183,7 @@ def of_arrays(
     return runs
 
 
-def _columns(
+def _column_values(
     arrays: NamedArrays, meanings: Sequence[Column | None], layout: Layout, battery: bool
 ) -> tuple[Columns, Names]:
     """Values of the columns with a meaning, and notes on cells that are read as another value."""
@@ -216,11 +216,11 @@ def _columns(
                 )
                 bad.append((k, j, refusal))
     if bad:
-        raise BadData(_listed(arrays.name, [sentence for _, _, sentence in sorted(bad)], count))
+        raise BadData(_join_cell_messages(arrays.name, [sentence for _, _, sentence in sorted(bad)], count))
     return columns, tuple(notes)
 
 
-def _listed(name: str, said: Sequence[str], count: int) -> str:
+def _join_cell_messages(name: str, said: Sequence[str], count: int) -> str:
     """Combines the messages on refused cells into one, in the order of the rows, each piece of advice once.
 
     Args:

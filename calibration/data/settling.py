@@ -233,9 +233,9 @@ def settle_log(
         BadData: time that does not increase. A channel with a single number. No stretch at all. Speeds or currents
             without a sign. Speeds or rates of angles in other units than their columns state.
     """
-    result = _divided(runs, shortest, drift, inertia)
+    result = _divide_log(runs, shortest, drift, inertia)
     if not result.kept:
-        raise BadData(_nothing(result, loop))
+        raise BadData(_nothing_settled_message(result, loop))
     _check_signs(result)  # by sds of their own: repeats whose signs differ widen them
     _check_units(result, rolling or {})
     return dataclasses.replace(
@@ -250,7 +250,7 @@ def settle_log(
 def doubtful_sign(runs: Runs) -> str:
     """Reason to doubt the sign of a channel of a log, from its settled stretches, empty without evidence."""
     try:
-        result = _divided(runs, None, DRIFT, None)
+        result = _divide_log(runs, None, DRIFT, None)
     except BadData:  # a log without a stretch
         return ""
     try:
@@ -260,7 +260,7 @@ def doubtful_sign(runs: Runs) -> str:
     return ""
 
 
-def _divided(runs: Runs, shortest: float | None, drift: float, inertia: Mapping[str, Inertia] | None) -> Settled:
+def _divide_log(runs: Runs, shortest: float | None, drift: float, inertia: Mapping[str, Inertia] | None) -> Settled:
     """Stretches of a log with their means, before they are compared with each other."""
     if not runs.sampled:
         raise BadData(
@@ -280,16 +280,16 @@ def _divided(runs: Runs, shortest: float | None, drift: float, inertia: Mapping[
         for part in np.split(rows, far + 1):
             found_in = [part]
             for driver in divided_by:
-                found_in = [x for level in found_in for x in _levels(runs, driver, level, shortest, drift, step)]
+                found_in = [x for level in found_in for x in _levels_of(runs, driver, level, shortest, drift, step)]
             levels += found_in
-    signals = _signals(runs, each, levels, half, drift)
+    signals = _settled_signals_of_log(runs, each, levels, half, drift)
     for signal in signals:
         _check_alive(runs, signal)
-    stuck = {s.channel.name: _stuck(s, each) for s in signals}
+    stuck = {s.channel.name: _stuck_rows(s, each) for s in signals}
     stretches = [
-        _settled(runs, signals, drives, level, shortest, drift, step, stuck, inertia or {}) for level in levels
+        _settled_end(runs, signals, drives, level, shortest, drift, step, stuck, inertia or {}) for level in levels
     ]
-    scatter = _scatter(runs, stretches, signals, float(np.max(np.abs(drives))))
+    scatter = _scatter_of(runs, stretches, signals, float(np.max(np.abs(drives))))
     return Settled(runs, tuple(stretches), signals, shortest, drift, tuple(gaps), scatter)
 
 
@@ -329,7 +329,7 @@ def _in_order(runs: Runs) -> list[np.ndarray]:
     return each
 
 
-def _signals(
+def _settled_signals_of_log(
     runs: Runs, each: list[np.ndarray], levels: list[np.ndarray], half: int, drift: float
 ) -> tuple[Signal, ...]:
     """Returns the settled readings of each channel of a log. Of an angle its rate, if no channel reads the rate."""
@@ -337,20 +337,22 @@ def _signals(
     signals = []
     for c in runs.channels:
         if c.settled and runs.has(c.column) and np.isfinite(runs[c.column]).any():
-            off = find_glitches(runs[c.column], levels, width, _step(runs, c, runs[c.column]), drift)
+            off = find_glitches(runs[c.column], levels, width, _step_of_instrument(runs, c, runs[c.column]), drift)
             readings = np.where(off, np.nan, runs[c.column])
-            signals.append(Signal(c, readings, none, _step(runs, c, readings), _size(readings), off))
+            signals.append(
+                Signal(c, readings, none, _step_of_instrument(runs, c, readings), _reading_size(readings), off)
+            )
     have = {s.channel.name for s in signals}
     for angle, rate, factor in RATES:
         if angle in runs.layout.measured_columns and runs.has(angle) and rate not in have:
             whole = np.full(len(runs), np.nan)
             readings = np.full(len(runs), np.nan)
             read = next(c for c in runs.channels if c.column == angle)
-            off = find_glitches(runs[angle], levels, width, _step(runs, read, runs[angle]), None)
+            off = find_glitches(runs[angle], levels, width, _step_of_instrument(runs, read, runs[angle]), None)
             for rows in each:
                 whole[rows] = np.where(off[rows], np.nan, runs[angle][rows] * factor)
-                readings[rows] = _rate(runs["time_s"][rows], whole[rows], half)
-            signals.append(Signal(channels.find_channel(rate), readings, whole, 0.0, _size(readings), off))
+                readings[rows] = _recent_rate(runs["time_s"][rows], whole[rows], half)
+            signals.append(Signal(channels.find_channel(rate), readings, whole, 0.0, _reading_size(readings), off))
     if not signals:
         raise BadData(f"{runs.source}: no channel has readings that can be used for settled travel")
     return tuple(signals)
@@ -377,7 +379,7 @@ def find_glitches(
     """
     from scipy.ndimage import binary_opening, median_filter
 
-    is_glitch, largest = np.zeros(len(shown), bool), _size(shown)
+    is_glitch, largest = np.zeros(len(shown), bool), _reading_size(shown)
     for rows in levels:
         rows = rows[np.isfinite(shown[rows])]
         if len(rows) < FEWEST:
@@ -405,7 +407,7 @@ def find_glitches(
 RATES = (("output_angle_deg", "output_speed", 1 / 6), ("position_mm", "speed", 1.0))
 
 
-def _step(runs: Runs, channel: Channel, shown: np.ndarray) -> float:
+def _step_of_instrument(runs: Runs, channel: Channel, shown: np.ndarray) -> float:
     """Step of a channel's instrument [unit of the column]: from its readings, else from the file.
 
     If neither has one, it is the smallest difference of readings that mostly repeat.
@@ -418,7 +420,7 @@ def _step(runs: Runs, channel: Channel, shown: np.ndarray) -> float:
     return float(np.median(np.diff(levels)[np.diff(levels) < 1.5 * np.diff(levels).min()])) if coarse else 0.0
 
 
-def _rate(time: np.ndarray, x: np.ndarray, half: int) -> np.ndarray:
+def _recent_rate(time: np.ndarray, x: np.ndarray, half: int) -> np.ndarray:
     """Rate over the last `2 * half` samples, so that samples after a level do not affect its end."""
     k = np.arange(len(x))
     before, now = np.maximum(k - 2 * half, 0), np.maximum(k, 1)
@@ -438,7 +440,7 @@ def _check_alive(runs: Runs, signal: Signal) -> None:
         )
 
 
-def _stuck(signal: Signal, each: list[np.ndarray]) -> np.ndarray:
+def _stuck_rows(signal: Signal, each: list[np.ndarray]) -> np.ndarray:
     """Rows in which a channel repeats one number for longer than its noise allows: saturated, or frozen."""
     held = np.zeros(len(signal.shown), bool)
     if len(signal.angle):
@@ -461,13 +463,13 @@ def _stuck(signal: Signal, each: list[np.ndarray]) -> np.ndarray:
 # --- levels and stretches -------------------------------------------------------------------------------
 
 
-def _noise(x: np.ndarray) -> float:
+def _change_noise(x: np.ndarray) -> float:
     """Sd of changes from sample to sample, robust to steps, 0 if most samples equal the sample before."""
     steps = np.diff(x[np.isfinite(x)])
     return 1.4826 * float(np.median(np.abs(steps - np.median(steps)))) / math.sqrt(2) if len(steps) else 0.0
 
 
-def _levels(
+def _levels_of(
     runs: Runs, drives: np.ndarray, rows: np.ndarray, shortest: float, drift: float, step: float
 ) -> Iterator[np.ndarray]:
     """Rows of a part without gaps, divided where a condition changes, or `drives` changes by more than its noise.
@@ -479,7 +481,7 @@ def _levels(
     cuts = differs_from_row_before(rows, (runs[name] for name in EXACT if runs.has(name)))
     cuts[0] = True
     x = drives[rows]
-    largest, noise = float(np.max(np.abs(drives))), _noise(x)
+    largest, noise = float(np.max(np.abs(drives))), _change_noise(x)
     size = 1 if noise <= 1e-9 * largest else max(1, min(round(shortest / step / 6), 64))
     sd = noise / math.sqrt(size)
     begin, mean, count = 0, float(x[0]), 0
@@ -520,7 +522,7 @@ class _End:
 _Why = tuple[str, str, float]
 
 
-def _settled(
+def _settled_end(
     runs: Runs,
     signals: tuple[Signal, ...],
     drives: np.ndarray,
@@ -548,7 +550,7 @@ def _settled(
     for signal in signals:
         if stuck[signal.channel.name][rows].mean() > 0.5:
             return out("stuck", signal.channel.name)
-    stretch = _end(signals, time, rows, shortest, drift)
+    stretch = _best_end(signals, time, rows, shortest, drift)
     unsettled, left_over = _unsettled(signals, rows, stretch, drift)
     if unsettled is not None:
         return out(*unsettled)
@@ -563,11 +565,11 @@ def _settled(
         return out("rest")
     acting = inertia.get(str(runs["configuration"][rows[0]]))
     lasts = float(time[stretch.rows[-1]] - time[stretch.rows[0]])
-    if acting is not None and (accelerates := _accelerates(acting, seen, lasts, imposed, drift)) is not None:
+    if acting is not None and (accelerates := _acceleration_reason(acting, seen, lasts, imposed, drift)) is not None:
         return out(*accelerates)
     every = {s.channel.name: seen.get(s.channel.name, (math.nan,) * 3) for s in signals}
     # A change continues after the end, a lag's tail by about as much again, and all channels with it.
-    further = {s.channel.name: left_over * _scale(s, every[s.channel.name][0]) for s in signals}
+    further = {s.channel.name: left_over * _scale_of(s, every[s.channel.name][0]) for s in signals}
     return dataclasses.replace(
         left,
         rows=stretch.rows,
@@ -579,18 +581,18 @@ def _settled(
     )
 
 
-def _end(signals: tuple[Signal, ...], time: np.ndarray, rows: np.ndarray, shortest: float, drift: float) -> _End:
+def _best_end(signals: tuple[Signal, ...], time: np.ndarray, rows: np.ndarray, shortest: float, drift: float) -> _End:
     """The end of a level whose means are most certain: a longer one has less noise, a shorter one changes less."""
-    parts = _parts(time[rows], shortest)
+    parts = _level_parts(time[rows], shortest)
     first = _first_steady(signals, rows, parts, drift)
     last = max(len(parts) - 3, first)
     ends: list[tuple[float, _End]] = []
     for k in sorted({first, *np.linspace(first, last, TRIES).astype(int).tolist()}):
         taken = rows[parts[k][0] :]
-        seen = {s.channel.name: _mean(s, time[taken], taken) for s in signals}
-        left_over = max(_certain(s, *seen[s.channel.name]) for s in signals)
+        seen = {s.channel.name: _segment_mean(s, time[taken], taken) for s in signals}
+        left_over = max(_certain_change(s, *seen[s.channel.name]) for s in signals)
         sds = [
-            sd / _scale(s, mean) for s in signals for mean, sd, _ in (seen[s.channel.name],) if math.isfinite(mean)
+            sd / _scale_of(s, mean) for s in signals for mean, sd, _ in (seen[s.channel.name],) if math.isfinite(mean)
         ]
         glitches = {s.channel.name: int(s.glitches[taken].sum()) for s in signals}
         ends.append((math.hypot(max(sds, default=0.0), left_over), _End(taken, seen, left_over, glitches)))
@@ -622,7 +624,7 @@ def _unsettled(signals: tuple[Signal, ...], rows: np.ndarray, end: _End, drift: 
     return None, left_over
 
 
-def _accelerates(
+def _acceleration_reason(
     acting: Inertia, seen: Mapping[str, tuple[float, float, float]], lasts: float, imposed: float, drift: float
 ) -> _Why | None:
     """Reason if acceleration takes too large a share of the current over so many seconds, else None."""
@@ -635,20 +637,20 @@ def _accelerates(
     return ("accelerates", acting.speed, share) if share > drift + SDS * noise else None
 
 
-def _scale(signal: Signal, mean: float) -> float:
+def _scale_of(signal: Signal, mean: float) -> float:
     """Scale of a channel's change [unit]: its mean, at least a tenth of its largest readings."""
     return max(abs(mean), 0.1 * signal.largest)
 
 
-def _certain(signal: Signal, mean: float, sd: float, change: float) -> float:
-    """Part of the change along a stretch that is not noise, as a share of `_scale`."""
+def _certain_change(signal: Signal, mean: float, sd: float, change: float) -> float:
+    """Part of the change along a stretch that is not noise, as a share of `_scale_of`."""
     if not math.isfinite(mean):
         return 0.0
-    return max(abs(change) - OF_CHANGE * sd, 0.0) / _scale(signal, mean)
+    return max(abs(change) - OF_CHANGE * sd, 0.0) / _scale_of(signal, mean)
 
 
 def _to_come(signal: Signal, rows: np.ndarray, mean: float) -> float:
-    """Change along a level that is still to come at its end, as a share of `_scale`.
+    """Change along a level that is still to come at its end, as a share of `_scale_of`.
 
     It is the tail of a lag. Changes between quarters of the level show its decay. Where noise hides the last change,
     it follows from those before.
@@ -666,16 +668,16 @@ def _to_come(signal: Signal, rows: np.ndarray, mean: float) -> float:
         return 0.0
     fades = min(later / earlier, 0.9)
     last = abs(last) if abs(last) >= seen else min(abs(later) * fades, seen)
-    return last * fades / (1 - fades) / _scale(signal, mean)
+    return last * fades / (1 - fades) / _scale_of(signal, mean)
 
 
-def _size(shown: np.ndarray) -> float:
+def _reading_size(shown: np.ndarray) -> float:
     """98th percentile of the magnitudes of a channel's finite readings, 0 if it has none."""
     sizes = np.abs(shown[np.isfinite(shown)])
     return float(np.quantile(sizes, 0.98)) if len(sizes) else 0.0
 
 
-def _parts(time: np.ndarray, shortest: float) -> list[tuple[int, int]]:
+def _level_parts(time: np.ndarray, shortest: float) -> list[tuple[int, int]]:
     """A level in parts of a third of the shortest stretch, `PART` samples at least, the last three a stretch."""
     size = max(shortest / 3, float(time[-1] - time[0]) / 300)
     part = ((time[-1] - time) / size).astype(int)  # counted from the end, so that the last parts are whole
@@ -741,7 +743,7 @@ def _correlation_time(x: np.ndarray) -> float:
     return max(total, 1.0)
 
 
-def _mean(signal: Signal, time: np.ndarray, rows: np.ndarray) -> tuple[float, float, float]:
+def _segment_mean(signal: Signal, time: np.ndarray, rows: np.ndarray) -> tuple[float, float, float]:
     """Mean of a channel over a stretch, sd of that mean, and its change from end to end by a straight line."""
     readings = signal.shown[rows]
     finite = np.isfinite(readings)
@@ -768,14 +770,14 @@ def _mean(signal: Signal, time: np.ndarray, rows: np.ndarray) -> tuple[float, fl
     return mean, max(sd, 1e-6 * abs(mean), 1e-9 * signal.largest), slope * float(np.ptp(t))
 
 
-def _scatter(runs: Runs, found: list[Stretch], signals: tuple[Signal, ...], largest: float) -> dict[str, float]:
+def _scatter_of(runs: Runs, found: list[Stretch], signals: tuple[Signal, ...], largest: float) -> dict[str, float]:
     """Scatter of stretches under the same conditions beyond their own sds, for each channel [unit], 0 with too few
     repeats."""
     alike = [c for c in EXACT if runs.has(c)]
     groups: list[list[Stretch]] = []
     where: tuple[object, ...] = ()
-    for s in sorted((s for s in found if not s.why), key=lambda s: (_held(runs, s), s.imposed)):
-        here = (_held(runs, s), *(runs[c][s.rows[0]] for c in alike))
+    for s in sorted((s for s in found if not s.why), key=lambda s: (_brake_levels(runs, s), s.imposed)):
+        here = (_brake_levels(runs, s), *(runs[c][s.rows[0]] for c in alike))
         if groups and here == where and abs(s.imposed - groups[-1][0].imposed) <= 0.2 * FINE * largest:
             groups[-1].append(s)
         else:
@@ -797,7 +799,7 @@ def _scatter(runs: Runs, found: list[Stretch], signals: tuple[Signal, ...], larg
     return scatter
 
 
-def _held(runs: Runs, stretch: Stretch) -> tuple[int, ...]:
+def _brake_levels(runs: Runs, stretch: Stretch) -> tuple[int, ...]:
     """Levels of the brake's torque in a stretch, and in a turn of the drive of each side, in steps of `DRIFT` of the
     largest."""
     signals = (*(runs.of_sides if runs.turns else ()), *([runs[LOAD]] if runs.has(LOAD) else []))
@@ -818,7 +820,7 @@ UNITS = {
 NEAR = 0.03
 
 
-def _shows(found: Settled, s: Stretch, channel: Channel) -> str:
+def _place_text(found: Settled, s: Stretch, channel: Channel) -> str:
     """Place of a stretch, with a channel's reading there and the imposed value, for a message."""
     reading, unit = _digits(s.mean[channel.name], 4), found.runs.layout.imposed_column.rpartition("_")[2]
     return (
@@ -839,7 +841,7 @@ def _check_signs(found: Settled) -> None:
         turned = bool(wrong) and len(wrong) == len(ahead)
         if back and all(s.mean[channel.name] > 0 for s in back) and not turned:
             raise BadData(
-                f"{_shows(found, back[0], channel)}; expected readings with their signs, negative backward; or "
+                f"{_place_text(found, back[0], channel)}; expected readings with their signs, negative backward; or "
                 f"set [instruments.{channel.name}] signed = false in the rig's file, if it shows only the "
                 "magnitude"
             )
@@ -849,7 +851,9 @@ def _check_signs(found: Settled) -> None:
                 if turned
                 else f"give {'duty' if runs.has('duty') else layout.imposed_column} the sign of its direction"
             )
-            raise BadData(f"{_shows(found, wrong[0], channel)}; expected the sign of the imposed quantity; {cure}")
+            raise BadData(
+                f"{_place_text(found, wrong[0], channel)}; expected the sign of the imposed quantity; {cure}"
+            )
 
 
 def _check_units(found: Settled, rolling: Mapping[str, Mapping[str, float]]) -> None:
@@ -873,7 +877,9 @@ def _check_units(found: Settled, rolling: Mapping[str, Mapping[str, float]]) -> 
             off = turns[one] / turns[other]
             unit = next((word for word, x in UNITS.items() if abs(math.log(off / x)) < NEAR), None)
             if unit is not None:
-                column = angles[one] if one in angles and not _read(runs, one) else channels.find_channel(one).column
+                column = (
+                    angles[one] if one in angles and not _direct(runs, one) else channels.find_channel(one).column
+                )
                 raise BadData(
                     f"{runs.source} rows {s.rows[0] + 1} to {s.rows[-1] + 1}, {column}: {off:.4g} times the value "
                     f"that {channels.find_channel(other).column} and the gear ratio of the rig's file imply; is "
@@ -882,12 +888,12 @@ def _check_units(found: Settled, rolling: Mapping[str, Mapping[str, float]]) -> 
                 )
 
 
-def _read(runs: Runs, channel: str) -> bool:
+def _direct(runs: Runs, channel: str) -> bool:
     """True if a channel is read directly, and is not the rate of an angle."""
     return runs.has(channels.find_channel(channel).column)
 
 
-def _nothing(found: Settled, loop: str) -> str:
+def _nothing_settled_message(found: Settled, loop: str) -> str:
     """Message on a log without settled stretch: main reason and advice. `loop` is the command that takes it."""
     direct = "" if found.runs.turns else f"use the log itself ({loop}), or "
     source, longest = found.runs.source, max(found.stretches, key=lambda s: s.lasts)
@@ -947,7 +953,7 @@ def rolling_readings(robot: Robot) -> dict[str, dict[str, float]]:
     for k, (name, load) in enumerate(robot.configurations.items()):
         none, turns = jnp.zeros(()), float(load.radius) / float(robot.gearbox.ratio)
         state = State(none, jnp.ones(()), jnp.asarray(turns), none)
-        speeds = {c.name: _shown(robot, k, c, state) for c in settled_channels(robot) if c.zero_at_rest}
+        speeds = {c.name: _reading(robot, k, c, state) for c in settled_channels(robot) if c.zero_at_rest}
         readings[name] = {n: x for n, x in speeds.items() if n != "speed" or not robot.has_ground}
     return readings
 
@@ -961,7 +967,9 @@ def acceleration_currents(robot: Robot) -> dict[str, Inertia]:
         none, one = jnp.zeros(()), jnp.ones(())
         rolling = float(load.radius) / ratio
         states = State(one, none, none, none), State(none, one, jnp.asarray(rolling), none)  # of 1 A, and of 1 rad/s
-        currents, speeds = ({c.name: _shown(robot, k, c, state) for c in settled_channels(robot)} for state in states)
+        currents, speeds = (
+            {c.name: _reading(robot, k, c, state) for c in settled_channels(robot)} for state in states
+        )
         current = next((n for n, x in currents.items() if x and not speeds[n]), "")
         speed = next((n for n, x in speeds.items() if x), "")
         is_known = current or robot.rig.imposed == "motor_current"
@@ -972,7 +980,7 @@ def acceleration_currents(robot: Robot) -> dict[str, Inertia]:
     return found
 
 
-def _shown(robot: Robot, configuration: int, channel: Channel, state: State) -> float:
+def _reading(robot: Robot, configuration: int, channel: Channel, state: State) -> float:
     """Reading of a channel that follows from a state alone [unit of its column], 0 for others."""
     signals = balances.begin_signals(robot, Conditions(configuration), state)
     try:

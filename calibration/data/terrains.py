@@ -44,7 +44,7 @@ def parse_stairs(text: str) -> tuple[float, float, int]:
     return rise / 1000, tread / 1000, int(count)
 
 
-def _read(path: Path, option: str, wanted: Rows[Rows[str]]) -> tuple[Columns, Rows[str]]:
+def _read_columns(path: Path, option: str, wanted: Rows[Rows[str]]) -> tuple[Columns, Rows[str]]:
     """Columns of the first of some headers that a file has."""
     if not path.exists():
         raise BadConfiguration(f"{option}: got {path}, no such file")
@@ -87,7 +87,7 @@ def read_terrain(path: Path) -> Terrain:
         BadData: columns without units, cells without numbers, ground that folds back, or metres mistaken for
             millimetres or the reverse.
     """
-    columns, names = _read(path, "--terrain", [("x_m", "z_m"), ("x_mm", "z_mm")])
+    columns, names = _read_columns(path, "--terrain", [("x_m", "z_m"), ("x_mm", "z_mm")])
     unit = names[0].rpartition("_")[2]
     x, z = (columns[name] * _LENGTHS[unit] for name in names)
     try:
@@ -121,7 +121,7 @@ def read_sequence(path: Path, robot: Robot, begins: tuple[float, float]) -> Sequ
     """
     angles, volts = ("front_deg", "rear_deg"), ("front_V", "rear_V")
     wanted = [(abscissa, *both) for both in (angles, volts) for abscissa in ("x_mm", "time_s")]
-    columns, names = _read(path, "--sequence", wanted)
+    columns, names = _read_columns(path, "--sequence", wanted)
     abscissa = columns[names[0]] * (1e-3 if names[0] == "x_mm" else 1.0)
     if (falls := np.flatnonzero(np.diff(abscissa) <= 0)).size:
         raise BadData(

@@ -62,11 +62,11 @@ def thin_rows(runs: Runs, most: int = ROWS) -> Runs:
     else:
         ordered = [np.lexsort([runs[column] for column in reversed(("configuration", *runs.axes))])]
     for rows in ordered:
-        kept.append(rows[_evenly(read[rows], apart)])
+        kept.append(rows[_evenly_spaced_rows(read[rows], apart)])
     return dataclasses.replace(runs.where(np.sort(np.concatenate(kept))), log=runs.whole)
 
 
-def _evenly(read: np.ndarray, apart: int) -> np.ndarray:
+def _evenly_spaced_rows(read: np.ndarray, apart: int) -> np.ndarray:
     """First rows, last row, and one of every `apart`.
 
     Args:

@@ -28,7 +28,7 @@ def without_unread(runs: Runs, robot: Robot) -> Runs:
     columns, notes = dict(runs.columns), list(runs.notes)
     drive = runs[SUPPLY] * (runs["duty"] if runs.has("duty") else 1.0)
     beyond = _beyond_limit(runs, np.abs(drive))
-    unread = _turning(runs, robot, drive) & ~beyond
+    unread = _turning_mask(runs, robot, drive) & ~beyond
     for channel in (c for c in runs.channels if runs.has(c.column)):
         not_read = unread & (runs[channel.column] == 0) & channel.zero_at_rest
         columns[channel.column] = np.where(beyond | not_read, np.nan, runs[channel.column])
@@ -47,7 +47,7 @@ def without_unread(runs: Runs, robot: Robot) -> Runs:
     return dataclasses.replace(runs, columns=columns, notes=tuple(notes))
 
 
-def _turning(runs: Runs, robot: Robot, drive: np.ndarray) -> np.ndarray:
+def _turning_mask(runs: Runs, robot: Robot, drive: np.ndarray) -> np.ndarray:
     """True for rows whose motor current is far from that at standstill and more than friction takes."""
     motor = robot.motor
     resistance, constant = float(motor.resistance), float(motor.torque_constant)

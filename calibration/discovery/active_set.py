@@ -101,7 +101,7 @@ class ScoredLibrary:
         effects: those that the data can show and the robot does not have yet.
         scored: the same, with their grids.
         of: index of each instance's effect.
-        at: its shape's coordinate, shape (instances,).
+        at: coordinate of each instance's shape, shape (instances,).
     """
 
     effects: tuple[Effect, ...]
@@ -143,7 +143,7 @@ class CandidateSpace:
 
     Attributes:
         bare: problem of the base only.
-        equipped: of the base and the effects in the slots, whichever these are.
+        equipped: problem of the base and the effects in the slots.
         library: the effects.
         room: names of effects that the program of every fit of histories includes, see `fitted_by`.
         near: coordinates of fits of the same histories with other sds, by their effects. Fits then start there and

@@ -17,7 +17,7 @@ class AdequacyTest:
 
     Attributes:
         found: the strongest statistics of the data.
-        null: of the bootstrap, shape (replicates,) each.
+        null: statistics of the bootstrap, shape (replicates,) each.
         settings: shares of the family-wise error, and margins.
     """
 

@@ -101,7 +101,7 @@ class Candidate:
     Attributes:
         active: name of the effect in each slot, "" if empty.
         z: coordinates, see `ActiveSet`.
-        sd: their posterior sds.
+        sd: posterior sds of the coordinates.
         cost: the objective [½σ²].
         amplitude: amplitude in prior sds of each slot's effect (0 if empty).
         size: size of each slot over the largest plausible amplitude in its direction, 0 if empty.

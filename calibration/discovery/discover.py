@@ -353,7 +353,7 @@ class LoopStages:
     Attributes:
         verdict: `none`, `named`, `class`, `mechanism`, `place` or `undescribed`.
         screened: the base fit without outliers.
-        left: its diagnosis.
+        left: diagnosis of the base fit.
         sds: noise of the verdict.
         searched: the search.
         alike: effects that cannot be separated, if a name is given.
@@ -503,7 +503,7 @@ def _search_until_clean(
         progress(next_step("effects"))
         screened, left, searched = keep(f"search {k}", functools.partial(_search_effects, given, screened, left))
         after = searched.diagnosis
-        if after is None and (confirmed := _confirmed(screened, left, searched)) is not None:
+        if after is None and (confirmed := _confirm_gains(screened, left, searched)) is not None:
             return screened, confirmed, None
         if after is None or not after.test.rejected_with_margin or screened.base.space.near:
             break
@@ -517,7 +517,7 @@ def _search_until_clean(
     return screened, left, searched
 
 
-def _confirmed(screened: Screening, left: Diagnosis, searched: Search) -> Diagnosis | None:
+def _confirm_gains(screened: Screening, left: Diagnosis, searched: Search) -> Diagnosis | None:
     """Diagnosis of a log's base fit with the gains that simulation confirms, None if these reject the base as well.
 
     Scores are linear and the contact of a vehicle is not, so a score beyond chance may vanish in a simulation.
@@ -938,7 +938,7 @@ def assemble_result(given: LoopInput, traced: LoopStages) -> DiscoveryResult:
         if beside is None or traced.where is None
         else findings.unnamed_discrepancy(beside, traced.where, left.test.p_value, len(runs)),
         remains=None if nameless or traced.alike is None else traced.where,
-        next_experiment=_proposal(space, traced, settings),
+        next_experiment=_next_experiment(space, traced, settings),
         cannot_see=findings.invisible_effects(space, left.scores, settings),
         needs_histories=tuple(sorted(name for name, e in given.library.items() if e.transient and not kind.shows(e))),
         needs_reverse=tuple(
@@ -965,7 +965,7 @@ def assemble_result(given: LoopInput, traced: LoopStages) -> DiscoveryResult:
         held_out_unpredictable=blocks_room.unpredictable_kinds(runs, space.bare),
         held_out_worse=preference.worse_predictions(seen.held_out, error),
         alternatives_held_out=compared,
-        noise=_noise(runs, noise, kind),
+        noise=_noise_by_channel(runs, noise, kind),
         settings=settings,
         replicates=len(left.test.null.single),
     )
@@ -1061,7 +1061,7 @@ def _residuals(
     )
 
 
-def _proposal(space: CandidateSpace, traced: LoopStages, settings: Settings) -> Proposal | None:
+def _next_experiment(space: CandidateSpace, traced: LoopStages, settings: Settings) -> Proposal | None:
     """Next experiment, None if there are no alternatives to separate, or if the model does not describe the runs."""
     if traced.verdict == "undescribed":
         return None
@@ -1072,7 +1072,7 @@ def _proposal(space: CandidateSpace, traced: LoopStages, settings: Settings) -> 
     return None if traced.alike is None else propose_separating(space, traced.best, traced.alike, settings)
 
 
-def _noise(runs: Runs, noise: Noise, kind: type[observers.Observer]) -> dict[str, dict[str, object]]:
+def _noise_by_channel(runs: Runs, noise: Noise, kind: type[observers.Observer]) -> dict[str, dict[str, object]]:
     """Channel → source of its sd, and its median share of the reading [%]."""
     with np.errstate(invalid="ignore"):
         share = 100 * noise.sd / np.maximum(kind.sizes(runs), 1e-12)

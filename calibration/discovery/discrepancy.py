@@ -97,14 +97,14 @@ def similar_variables(names: Sequence[tuple[str, str]], deviate: np.ndarray, pla
     """Other variables with curves of similar significance in a place, the most significant first."""
     by_variable = {names[j][1]: deviate[j] for j in np.argsort(-deviate) if names[j][0] == place}
     by_variable.pop(bases_room.CONDITIONS, None)
-    variable_of_axis: dict[str, str] = {_axis(variable): variable}
+    variable_of_axis: dict[str, str] = {_window_axis(variable): variable}
     for other, d in by_variable.items():
         if d > max(by_variable.values()) - ALIKE:
-            variable_of_axis.setdefault(_axis(other), other)
+            variable_of_axis.setdefault(_window_axis(other), other)
     return tuple(other for other in variable_of_axis.values() if other != variable)
 
 
-def _axis(variable: str) -> str:
+def _window_axis(variable: str) -> str:
     """Key shared by all windows along an axis. A smooth curve has a key of its own."""
     happens = bases_room.window_from_name(variable)
     return variable if happens is None else f"{happens.axis} for a while"
@@ -152,7 +152,7 @@ class Shaped(eqx.Module):
     """Coordinates of a base fit, then those of a curve's ordinates: y = L z, all standard normal.
 
     Attributes:
-        base: of the base.
+        base: coordinates of the base.
         root: L, shape (ordinates, ordinates).
         names: dotted, of the ordinates.
         fitted_once: True, because few fits use such coordinates.
@@ -184,7 +184,7 @@ class Discrepancy:
     """A located discrepancy, as a smooth curve fitted together with the base.
 
     Attributes:
-        balance, variable, unit: its place and variable, and the unit of the balance.
+        balance, variable, unit: place and variable of the discrepancy, and the unit of the balance.
         effect: name of the curve among the effects of `robot`, the fitted robot with the curve.
         defect: error of the balance, by row, at the fit without the curve, None if single rows do not show it.
         grid: grid of the variable [SI].
@@ -246,7 +246,7 @@ def fit_discrepancy(
         variable=variable,
         unit=PLACES[balance][0],
         effect=at_base.effect,
-        robot=_present(problem.robot(jnp.asarray(z)), space, base, at_base.effect),
+        robot=_with_present_effects(problem.robot(jnp.asarray(z)), space, base, at_base.effect),
         defect=defect_by_row(linear, balance) if space.bare.observe.rows_tell else None,
         grid=grid,
         curve=shape @ z[inner:],
@@ -312,7 +312,7 @@ def _with_curve(space: CandidateSpace, base: Candidate, curve: Smooth) -> Proble
     return dataclasses.replace(problem, base=robot, coordinates=shaped, data=data)
 
 
-def _present(robot: Robot, space: CandidateSpace, base: Candidate, curve: str) -> Robot:
+def _with_present_effects(robot: Robot, space: CandidateSpace, base: Candidate, curve: str) -> Robot:
     """Robot with only its own effects, those of the fit, and the curve."""
     names = {e.name for e in space.bare.base.effects} | set(base.effects) | {curve}
     return dataclasses.replace(robot, effects=tuple(e for e in robot.effects if e.name in names))

@@ -92,7 +92,7 @@ class Ranked:
     """One experiment of the menu, or several carried out together.
 
     Attributes:
-        experiments: their names.
+        experiments: names of the experiments.
         sigma: separation of every two alternatives, in the order of `itertools.combinations`, so with the
             pairs of the best fit first [σ].
         separates: alternatives that they separate from the best fit, at `Settings.apart`.
@@ -260,7 +260,7 @@ def predict_menu(space: CandidateSpace, candidates: Mapping[str, Candidate], set
         _predicted(equipped, other, predicted.batch_experiments(all_experiments, shown_channels), active, z, informed)
     )
     predictions, half = jax.tree.map(lambda x: np.asarray(x)[: len(names)], (predictions, half))
-    experiments, kept = _possible(all_experiments, predictions, within, settings)
+    experiments, kept = _possible_experiments(all_experiments, predictions, within, settings)
     medians = np.median(np.asarray(space.equipped.data.sd), 0)
     sd = predicted.reading_sds(experiments, dict(zip(shown_channels, medians, strict=True)))
     value, half = np.nan_to_num(predictions.value[:, kept]), np.nan_to_num(half[:, kept])
@@ -269,13 +269,13 @@ def predict_menu(space: CandidateSpace, candidates: Mapping[str, Candidate], set
     )
 
 
-def _possible(
+def _possible_experiments(
     experiments: Sequence[menu.Experiment], found: predicted.Predicted, within: Reach, settings: Settings
 ) -> tuple[tuple[menu.Experiment, ...], np.ndarray]:
     """Possible and allowed experiments of a menu, and True for their readings among those of the whole menu.
 
     Args:
-        found: of each alternative, the best fit first.
+        found: predictions of each alternative, the best fit first.
     """
     runs = [e for e in experiments if isinstance(e, menu.Run)]
     ends = dict(zip((r.name for r in runs), np.cumsum([len(r.voltage) for r in runs]).tolist(), strict=True))

@@ -85,7 +85,7 @@ def found_effects(
         listed.append(
             FoundEffect(
                 name=effect.name,
-                members={name: _member(space, best, found, slot, name) for name in members},
+                members={name: _class_member(space, best, found, slot, name) for name in members},
                 stated={s.name: _stated(space, best, s) for s in found.stated[slot]},
                 families=found.families[slot],
                 balance=effect.balance,
@@ -124,7 +124,7 @@ def _parameters(space: CandidateSpace, best: Candidate, slot: int, settings: Set
 _shaped = jax.jit(jax.value_and_grad(shape_at, argnums=1))
 
 
-def _member(space: CandidateSpace, best: Candidate, found: Classes, slot: int, name: str) -> Member:
+def _class_member(space: CandidateSpace, best: Candidate, found: Classes, slot: int, name: str) -> Member:
     """An effect of a class in place of the leader."""
     active_names = frozenset(name if s == slot else n for s, n in enumerate(best.active)) - {""}
     other = next(c for c in (best, *found.ladder) if c.key == active_names)
@@ -286,7 +286,7 @@ def effect_scores(space: CandidateSpace, scores: ScoreTable, settings: Settings)
 def rank_library(space: CandidateSpace, left: Diagnosis, settings: Settings) -> Ranking:
     """Ranking of the library by the share of the base's residuals that each single effect would explain."""
     test = left.test
-    listed = _ranked(space, left.scores, settings)
+    listed = _rank_effects(space, left.scores, settings)
     return Ranking(test.rejected, test.p_value, test.threshold("single") ** 2, listed)
 
 
@@ -294,14 +294,14 @@ def rank_by_weak_form(space: CandidateSpace, known: Beforehand, settings: Settin
     """Ranking by the equations of the log in weak form, before any simulation."""
     p = single_p_value(float(np.max(known.scores.single**2)), known.null)
     chance = float(np.quantile(known.null, 1 - settings.family_wise_error, method="higher")) ** 2
-    listed = _ranked(space, known.scores, settings)
+    listed = _rank_effects(space, known.scores, settings)
     fit = next((c for c in known.alone if c.plausible), known.base)
     moved = {} if fit is None else base_shift(space, fit.z, fit.z, fit.sd)
     parameters = {name: (shift.after, shift.sd_after) for name, shift in moved.items()}
     return Ranking(p <= settings.family_wise_error, p, chance, listed, known.windows, parameters)
 
 
-def _ranked(space: CandidateSpace, scores: ScoreTable, settings: Settings) -> tuple[Ranked, ...]:
+def _rank_effects(space: CandidateSpace, scores: ScoreTable, settings: Settings) -> tuple[Ranked, ...]:
     """Library sorted by score, with effects that would supply power last."""
     listed = []
     for s in effect_scores(space, scores, settings):

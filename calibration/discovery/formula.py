@@ -135,9 +135,9 @@ class Proposal:
 
     Attributes:
         expression: as `ΔU = 0.42 V (I/2 A)^2`, "" if no single term explains `MOST` of the curve.
-        mark: its label.
-        terms: its monomials.
-        coefficients, sds: coefficients and standard deviations of each [unit of the balance].
+        mark: label of the formula.
+        terms: monomials of the formula. coefficients, sds: coefficients and standard deviations of each [unit of
+        the balance].
         variables: signals of the terms, without repeats.
         explained: decrease of χ² at the base fit.
         gain: BIC of the smooth curve less that of the formula. Positive favours the formula.

@@ -58,7 +58,7 @@ def find_hidden_effects(
     """Effects that the named effects of the best candidate could hide, the largest first.
 
     Args:
-        alike: its classes, which list their members.
+        alike: classes of the candidate's effects.
         left: diagnosis of the base.
         after: diagnosis of that fit.
         ask: True to look for experiments that would show the effects.

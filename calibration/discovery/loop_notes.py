@@ -45,7 +45,7 @@ class NameTest:
     """Test of one effect of a candidate, at the fit of all the others.
 
     Attributes:
-        effect: its name.
+        effect: name of the effect.
         root: root of its score in addition to curves of other equations [σ].
         needed: critical value for the strongest effect [σ].
         curves: those of other equations.
@@ -58,7 +58,7 @@ class NameTest:
         remains: True if the largest set of the search leaves a discrepancy in its equation.
         what: name of a run, `row` or `run`.
         varies: root of the score of an amplitude that changes with a variable, in addition to the largest set [σ].
-        over: that variable.
+        over: variable of the largest change.
         by_chance: critical value for as many variables, independent of the library.
         spread: relative change of the amplitude to either end of that variable [-].
         offset: zero error of an instrument without a stated noise, over the rms of its readings [-], else infinite.
@@ -125,10 +125,10 @@ class NameSupport:
     """Tests of a candidate's names.
 
     Attributes:
-        stands: whether one at least does.
+        stands: True if at least one name is established.
         why: reason for the verdict, a row of `loop_words.REASONS`, "" for none.
-        effects: effects that this is said of.
-        curves: curves that were put beside, or do as well.
+        effects: effects to which this applies.
+        curves: curves that were added, or that explain as much.
         tests: tests of each effect.
     """
 
@@ -244,7 +244,7 @@ class Mechanism:
 
     def _possible(self, part: int) -> Names:
         """Equations (0) or drivers (2) of the families. An error of an ammeter counts as the loss."""
-        losses = [f for f in self.families if f == self.families[0] or not f.startswith("reading")]
+        losses = [f for f in self.families if f == self.families[0] or " current that " not in f]
         return tuple(dict.fromkeys(f.partition(" that ")[part] for f in losses))
 
     @property
@@ -331,7 +331,7 @@ class RuledOut:
 
     Attributes:
         name: name of the effect.
-        why: its balance would supply `power`, its `size`, or it is within an sd of the `edge`.
+        why: `power` (its balance would supply power), `size`, or `edge` (within an sd of the largest size).
         size: size over the largest plausible one.
         check: values that this depends on.
     """
@@ -349,7 +349,7 @@ class Asked:
     Attributes:
         why: a discrepancy is `missing` an effect, effects are `found`, or some explain nearly as much (`near`).
         balance, variable: balance and variable of the discrepancy.
-        effects: their names.
+        effects: names of the effects.
     """
 
     why: str

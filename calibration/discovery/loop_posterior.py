@@ -41,7 +41,7 @@ def posterior_of_curve(space: CandidateSpace, active: Names, curve: Discrepancy)
     inner = len(shaped.base)
     turn = np.eye(len(shaped))
     turn[inner:, inner:] = np.asarray(shaped.root)
-    base, kept_places = _parts(shaped.base, space, active, curve.z[:inner])
+    base, kept_places = _coordinate_groups(shaped.base, space, active, curve.z[:inner])
     spec = {p.name: p.spec for p in params.walk_parameters(curve.problem.base)}
     ordinates = _clipped_parameters(
         shaped.names, [spec[n] for n in shaped.names], np.asarray(shaped.root) @ curve.z[inner:]
@@ -58,11 +58,11 @@ def _of(
     z: np.ndarray,
     covariance: np.ndarray,
 ) -> Posterior:
-    parts, kept_places = _parts(coordinates, space, active, z)
+    parts, kept_places = _coordinate_groups(coordinates, space, active, z)
     return join_posteriors(parts, covariance[np.ix_(kept_places, kept_places)])
 
 
-def _parts(
+def _coordinate_groups(
     coordinates: Coordinates | ActiveSet, space: CandidateSpace, active: Names, z: np.ndarray
 ) -> tuple[list[Posterior], list[int]]:
     """Posteriors of a fit's groups of coordinates, and their indices in z, without empty slots and missing shapes."""

@@ -66,7 +66,7 @@ def find_mechanism(
         by_curve = beside.where.explained - OF_CURVE
     else:
         by_curve = beside.curve.chi2[0] - beside.curve.chi2[1] - OF_CURVE
-    pairs = _explained(space, base, ladder, best)
+    pairs = _explained_by_family(space, base, ladder, best)
     by_effects = {family: pair.explained for family, pair in pairs.items()}
     explained = by_effects | {own[0]: max(by_curve, by_effects.get(own[0], 0.0))}
     most = max(explained.values())
@@ -139,7 +139,7 @@ def _few_and_best(space: CandidateSpace, ladder: Sequence[Candidate], best: Cand
     return [best, *([min(sound, key=lambda c: c.cost)] if len(best.effects) > 1 and sound else [])]
 
 
-def _explained(
+def _explained_by_family(
     space: CandidateSpace, base: Candidate, ladder: Sequence[Candidate], best: dict[str, Candidate]
 ) -> dict[str, Pair]:
     """For each family the fits with and without its effects that differ most: alone, or with those of others."""

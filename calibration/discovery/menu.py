@@ -115,7 +115,7 @@ class Act:
     """A calibration act: a reading that does not depend on a run.
 
     Attributes:
-        name: of it.
+        name: name of the act.
         kinds: kinds from `KINDS`.
         reading: function of a robot and of the settings [SI], shape (readings,).
         at: settings, one tuple a reading [SI]. Of `weigh`, the configuration's index and the payload.
@@ -138,13 +138,12 @@ class Run:
     """Settled runs under conditions that are not in the table.
 
     Attributes:
-        name: of them.
+        name: name of the runs.
         kinds: kinds from `KINDS`, and the configuration where there is one.
         doing: a row of `experiment_words.DOING`.
         where: the configuration's name, "" for none.
         motors: motors of the robot.
-        setup: how the robot is set up.
-        voltage [V], slope [deg], payload [kg]: conditions of each run, shape (runs,).
+        setup: setup of the robot. voltage [V], slope [deg], payload [kg]: conditions of each run, shape (runs,).
         channels: names of the channels to read.
         configuration: index of the robot's.
         sides: number of motors that are on. None: all.
@@ -229,7 +228,7 @@ def spaced_settings(least: float, most: float, count: int) -> tuple[float, ...]:
 # --- acts -------------------------------------------------------------------------------------------
 
 
-def _weighed(robot: Robot, at: Array) -> Array:
+def _mass_difference(robot: Robot, at: Array) -> Array:
     """Mass in addition to the stated one, so that its origin does not matter."""
     still = State(*(jnp.zeros(()),) * 4)
     stated = without(robot, "mass")
@@ -260,7 +259,7 @@ def calibration_acts(reach: Reach) -> tuple[Act, ...]:
     turning = round_significant(0.25 * reach.motor_speed), round_significant(0.65 * reach.motor_speed)
     paces = round_significant(0.35 * reach.speed), round_significant(0.8 * reach.speed)
     settings = tuple((float(u.index), m) for u in reach.used for m in loads)
-    weighing = Act("weigh", ("weigh",), _weighed, settings, 0.02, repeats=1)
+    weighing = Act("weigh", ("weigh",), _mass_difference, settings, 0.02, repeats=1)
     shunted = _Instrument("total_current", ("total_current",))
     strobed = _Instrument("motor_speed", ("speed_motor",))
     ammeter = [
@@ -291,7 +290,7 @@ def _one_tuple_each(values: Sequence[float]) -> tuple[tuple[float, ...], ...]:
 TURNING, STANDING = ("total_current", "motor_speed"), ("total_current",)
 
 
-def _runs(
+def _runs_under(
     reach: Reach,
     name: str,
     doing: str,
@@ -353,7 +352,7 @@ def _travel_runs(reach: Reach, used: Used) -> tuple[Run, ...]:
     inclines = sorted({abs(s) for s in used.slopes if s}) or [0.0]
     some, more, most = inclines[(len(inclines) - 1) // 2], inclines[max(len(inclines) - 2, 0)], inclines[-1]
     air, payload = spaced_settings(0.2 * reach.geared, reach.geared, 5), round_significant(used.payload)
-    runs = functools.partial(_runs, reach, at=used)
+    runs = functools.partial(_runs_under, reach, at=used)
     experiments = [
         runs("reverse", "backwards", reversed_, voltages=ends, slopes=(0.0, -some)),
         runs("downhill", "about", voltages=ends, slopes=(-inclines[0], -some)),
@@ -381,11 +380,11 @@ def _motor_runs(reach: Reach) -> tuple[Run, ...]:
     )
     brake = round_significant(0.6 * reach.torque_constant * reach.current, 1)
     experiments = [
-        _runs(reach, "bare motor", "alone", bare, voltages=volts, read=TURNING),
-        _runs(reach, "stall", "held", blocked, voltages=stalling, read=STANDING),
-        _runs(reach, "stall, one motor", "one held", blocked, kinds=("stall", "one motor"), voltages=stalling,
+        _runs_under(reach, "bare motor", "alone", bare, voltages=volts, read=TURNING),
+        _runs_under(reach, "stall", "held", blocked, voltages=stalling, read=STANDING),
+        _runs_under(reach, "stall, one motor", "one held", blocked, kinds=("stall", "one motor"), voltages=stalling,
               read=STANDING, sides=1),
-        _runs(reach, "braked motor", "braked", braked,
+        _runs_under(reach, "braked motor", "braked", braked,
               voltages=spaced_settings(0.4 * reach.alone, reach.alone, 3), read=TURNING, brake=brake),
     ]  # fmt: skip
     return tuple(r for r in experiments if reach.motors > 1 or r.sides is None)
@@ -418,14 +417,14 @@ def _shaft_runs(reach: Reach, used: Used) -> tuple[Run, ...]:
     torques = other_torques(reach.torques)
     way = -1.0 if levels[-1] > 0 else 1.0  # also of a brake, which acts against the rotation
     experiments = [
-        _runs(reach, others_of[reach.imposed], "run", kinds=("other voltages",), at=used,
+        _runs_under(reach, others_of[reach.imposed], "run", kinds=("other voltages",), at=used,
               voltages=others),
         *([] if both else [
-            _runs(reach, "reverse", "other way", at=used, voltages=[way * x for x in (sizes[0], sizes[-1])],
+            _runs_under(reach, "reverse", "other way", at=used, voltages=[way * x for x in (sizes[0], sizes[-1])],
                   torques=[0.0, *(way * x for x in torques[1:2])])
         ]),
         *([
-            _runs(reach, "other torques", "run", at=used, voltages=[-way * x for x in (sizes[0], sizes[-1])],
+            _runs_under(reach, "other torques", "run", at=used, voltages=[-way * x for x in (sizes[0], sizes[-1])],
                   torques=[-way * x for x in torques])
         ] if max(reach.torques, default=0.0) > 0 else []),
     ]  # fmt: skip
@@ -467,7 +466,7 @@ def restrict_run(run: Run, kept: np.ndarray, temperature: np.ndarray, speed: np.
     """A run with only its possible conditions, and with the risks to watch.
 
     Args:
-        kept: by `possible_runs`.
+        kept: runs kept by `possible_runs`.
         temperature: temperature of a winding after long running [°C].
         speed: speed of the motor shaft [rad/s]. Both predicted, shape (runs,).
     """

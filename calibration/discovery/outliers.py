@@ -45,7 +45,7 @@ class Cluster:
 
     Attributes:
         axis: column, or angle, of the cluster.
-        low, high: its ends.
+        low, high: ends of the cluster.
         level: level of a column of words or levels.
         inside, of: number of outliers in it, and of all.
         p: p-value.

@@ -57,7 +57,7 @@ class Predicted(eqx.Module):
     Attributes:
         value: value of each reading [SI].
         exists: True if the robot has it: not if it slides, or stands still instead of travelling, shape (readings,).
-        does: the same for each run.
+        does: True for each run that the robot can do.
         grip: used share of the adhesion [-].
         temperature: temperature of a winding after long running [°C].
         speed: speed of the motor shaft [rad/s], shape (runs,).

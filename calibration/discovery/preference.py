@@ -92,7 +92,7 @@ def compare_alternatives(
     )
 
 
-def _order(table: Sequence[HeldOutAlternative]) -> list[int]:
+def _order_alternatives(table: Sequence[HeldOutAlternative]) -> list[int]:
     """Alternatives that predict no fewer readings than the best fit, which is the first, by their hold-out error.
 
     The best fit precedes others within `TOLD` of the smallest error, because hold-out errors do not decide there.
@@ -115,7 +115,7 @@ def _is_draw(a: HeldOutAlternative, b: HeldOutAlternative) -> bool:
 def prefer_by_held_out(
     space: CandidateSpace, runs: Runs, searched: Search, alike: Classes, bases: Bases, settings: Settings
 ) -> tuple[Search, Classes, tuple[HeldOutAlternative, ...]]:
-    """The search and its classes, led by the alternative with the best hold-out errors, see `_order`.
+    """The search and its classes, led by the alternative with the best hold-out errors, see `_order_alternatives`.
 
     An inadequate alternative does not lead if the best fit is adequate.
     """
@@ -126,7 +126,7 @@ def prefer_by_held_out(
     if not table:
         return searched, alike, ()
     fitted = {c.key: c for c in experiments.alternatives_of_class(best, alike, stated=False).values()}
-    for k in _order(table):
+    for k in _order_alternatives(table):
         leader = fitted[frozenset(table[k].effects)]
         if leader is best:
             break
@@ -175,7 +175,7 @@ def leader_remarks(table: Sequence[HeldOutAlternative], prefer: str) -> list[Rem
         return []
     shared = set.intersection(*(set(a.effects) for a in table))
     leader = next(k for k, a in enumerate(table) if a.leads)
-    wins = _order(table)[0]
+    wins = _order_alternatives(table)[0]
     alike = any(_is_draw(table[k], table[0]) for k in _full_predictors(table)[1:])
     return [
         Remark(

@@ -25,7 +25,7 @@ class Used:
     """Values of the conditions in a table for one configuration, increasing and without repeats.
 
     Attributes:
-        configuration: its name.
+        configuration: name of the configuration.
         index: index in the robot.
         voltages [V], slopes [deg], payloads [kg].
         mass: the largest total [kg].
@@ -55,10 +55,10 @@ class Reach:
     """Limits of experiments with a robot.
 
     Attributes:
-        used: of each configuration in the table.
+        used: ranges of each configuration in the table.
         measured: names of the channels in the table.
         voltage: highest of runs under load [V].
-        geared, alone: of motors with only their gearboxes, or with nothing.
+        geared, alone: limits of motors with only their gearboxes, or without any load.
         current: largest of one motor in steady travel [A], within its continuous limit.
         motor_speed [rad/s], speed [m/s]: largest in steady travel.
         limit_geared, limit_alone: speed limits of the motor shaft with its gearbox and alone, or the table's largest

@@ -83,7 +83,7 @@ def resolve(
     """Fit the track model to the rows of a verdict.
 
     Args:
-        found: by the loop, from settled rows.
+        found: result of the loop, from settled rows.
         noise: as given to the loop.
         population, generations, members, seed: population, generations, members and seed of the search, see
             `calibrate`.
@@ -109,7 +109,7 @@ def resolve(
     robot = dataclasses.replace(robot, effects=other_effects)
     friction = tuple(f"{name}.{part}" for name in tracked if name in present for part in FRICTION)
     gear = tuple(f"running_gear.{name}" for name in GEAR)
-    sds = _noise(found, noise)
+    sds = _noise_option(found, noise)
 
     size = POPULATION if population is None else population
     most = GENERATIONS if generations is None else generations
@@ -146,7 +146,7 @@ def resolve(
     )
 
 
-def _noise(found: DiscoveryResult, stated: str | None) -> str | None:
+def _noise_option(found: DiscoveryResult, stated: str | None) -> str | None:
     """Option `noise` of `calibrate` for the loop's sds."""
     assumed = [name for name, about in found.noise.items() if about["source"] == "assumed"]
     return (

@@ -57,7 +57,7 @@ class Member:
     """An effect of a class in place of the leader.
 
     Attributes:
-        amplitude: its own [unit].
+        amplitude: amplitude of this member [unit].
         size: size over the largest plausible one.
         rise_chi2: compared with the leader [σ²].
     """
@@ -73,7 +73,7 @@ class StatedValue:
 
     Attributes:
         value: value that explains as much.
-        stated: its prior mean, both in `unit`.
+        stated: prior mean. Both are in `unit`.
         prior_sds: distance from its prior.
         rise_chi2: compared with the effect [σ²].
     """
@@ -95,8 +95,8 @@ class FoundEffect:
         stated: base parameters that may be wrong instead, by name.
         families: families of the members, the leader's first. A single family identifies the equation and its driver.
         balance, unit: balance and unit of the balance that it enters.
-        equation, source: from its docstring.
-        parameters: its amplitude and shape.
+        equation, source: equation and source, from the effect's docstring.
+        parameters: amplitude and shape of the effect.
         p_value: compared with the strongest of all effects in each bootstrap table.
         score: rise of χ² without it after a refit [σ²].
         share: share of the excess misfit, χ² less its expectation, that it explains [-].
@@ -127,11 +127,10 @@ class UnnamedDiscrepancy(DiscrepancyLocation):
         effect: name of the smooth curve in the proposed robot.
         p_value: family-wise.
         score: decrease of χ² by the curve [σ²].
-        score_free_in_each_run: by a wave with a phase for each run, None for other curves.
-        at: of the variable [SI].
-        value, sd: value and standard deviation of the curve there [unit].
-        over, defect, defect_sd: for each row the fitted variable [SI] and the defect of the balance [unit]: the curve
-            there plus the row's residual, along the travel, None if single rows do not show it.
+        score_free_in_each_run: score of a wave with a phase for each run, None for other curves.
+        at: values of the variable [SI]. value, sd: value and standard deviation of the curve there [unit]. over,
+        defect, defect_sd: for each row the fitted variable [SI] and the defect of the balance [unit]: the curve
+        there plus the row's residual, along the travel, None if single rows do not show it.
         proposal: a formula.
     """
 
@@ -276,8 +275,8 @@ class ReadingsOfRows:
 
     Attributes:
         measured, sd: readings and standard deviation of the table.
-        as_stated: by the robot before any fit, at its prior means.
-        before, after: by the base and by the proposed robot, fitted to all rows.
+        as_stated: simulated by the robot before any fit, at its prior means. before, after: simulated by the base
+        and by the proposed robot, fitted to all rows.
         held_out: kind of block → (before, after), each row by fits without its block.
         blocks: kind of block → labels.
     """
@@ -300,7 +299,7 @@ class Worse:
 
     Attributes:
         kind: kind of the blocks held out.
-        channel: its name.
+        channel: name of the channel.
         rows: number that both fits predict.
         before, after: rms error over these [%].
     """
@@ -317,11 +316,11 @@ class HeldOutAlternative:
     """An alternative of a class, refitted without each block.
 
     Attributes:
-        effects: its names.
+        effects: names of its effects.
         leads: True if it is the one proposed.
         rise_chi2: rise of χ² of the fit to all rows, above the best one [σ²].
         rms_sigma: rms error over the readings of all kinds of blocks that every alternative predicts [σ].
-        by_kind: of each.
+        by_kind: the same for each kind of block.
         lost: number of held-out readings without a prediction, because its robot slides or fails there.
     """
 
@@ -346,7 +345,7 @@ class Resolved:
         outside: constants further than `PLAUSIBLE` prior sds from their priors.
         settled: True if both searches ended.
         fall: decrease of twice the objective by the running gear, priors included [σ²].
-        p: its p-value.
+        p: p-value of the decrease.
         chi2: χ² of the readings with the gear as stated and with the best one [σ²].
         readings: number included.
         rms_percent: by channel, with the gear as stated and with the best one [%].
@@ -412,7 +411,7 @@ class DiscoveryResult:
     Attributes:
         verdict: `none`, `named`, `class`, `mechanism`, `place` or `undescribed`.
         summary: the verdict with all data of its statement.
-        robot: as written.
+        robot: robot as written to `robot.toml`.
         refit: refit with nothing added.
         written: True if the robot has the proposal.
         gains: sets of effects, by their number, with their hold-out gain over the refit. The last one is the
@@ -428,9 +427,9 @@ class DiscoveryResult:
         remains: the discrepancy that the effects leave.
         next_experiment: the most informative one, None if there are no alternatives to separate.
         cannot_see: effects that the data cannot show.
-        needs_histories: that only histories can.
-        needs_reverse: that only runs in both directions can.
-        alternatives, implausible: candidates nearly as good. Those of implausible size or sign.
+        needs_histories: effects that only histories can show.
+        needs_reverse: effects that only runs in both directions can show. alternatives, implausible: candidates
+        nearly as good. Those of implausible size or sign.
         hidden: effects that the effects found could hide, the largest first.
         support: tests of the names, None if none was tested.
         cluster: common property of outliers, which were then not excluded, None for none.
@@ -447,8 +446,8 @@ class DiscoveryResult:
         errors, errors_held_out: rms by channel, before and after, over the rows that both predict. By kind of block.
         held_out_unpredictable: kinds with at least one block that the others cannot predict.
         held_out_worse: rises of hold-out errors.
-        alternatives_held_out: of a class, by hold-out errors, empty for a single one, or for histories unless
-            requested.
+        alternatives_held_out: alternatives of a class, by hold-out errors, empty for a single one, or for
+            histories unless requested.
         noise: channel → source and median sd [%].
         settings: the statistical constants.
         replicates: number of bootstrap tables with successful refits.

@@ -97,7 +97,7 @@ def library_of_size(robot: Robot, conditions: Conditions, library: Library, turn
     """
     if robot.rig.inherits:
         return library
-    signals = _signals(robot, _steady(robot, conditions))
+    signals = _signals(robot, _steady_conditions(robot, conditions))
     nominal, theirs = _nominal()
     sized = {}
     for name, kind in library.items():
@@ -125,7 +125,7 @@ def output_rotation(runs: Runs, robot: Robot) -> float:
     """Root mean square of the output's angles in a table [rad], NaN without such a channel."""
     measured_values = runs.measured()
     for k, channel in enumerate(runs.channels):
-        if channel.name in PLACED and math.isfinite(size := _size(measured_values[:, k])):
+        if channel.name in PLACED and math.isfinite(size := _rms_size(measured_values[:, k])):
             return size / (float(robot.configurations.members[0].radius) if channel.name == "position" else 1.0)
     return math.nan
 
@@ -147,7 +147,7 @@ def effect_applies(kind: type[Effect], robot: Robot) -> bool:
     return kind.balance != "sensor" or kind.channel in robot.rig.channels
 
 
-def _steady(robot: Robot, conditions: Conditions) -> Conditions:
+def _steady_conditions(robot: Robot, conditions: Conditions) -> Conditions:
     """Conditions at one instant of each run, for conditions that may change over time."""
     return jax.tree.map(lambda x: x if jnp.ndim(x) < 2 else x[:, x.shape[1] // 2], conditions)
 
@@ -172,7 +172,7 @@ def _nominal() -> tuple[Robot, Signals]:
     return robot, _signals(robot, Conditions(which.astype(int), volts, slopes, payloads))
 
 
-def _size(x: object) -> float:
+def _rms_size(x: object) -> float:
     """Root mean square of the finite values other than zero, however small, NaN without any."""
     sizes = np.abs(np.ravel(np.asarray(x, float)))
     sizes = sizes[np.isfinite(sizes) & (sizes > 0)]
@@ -180,7 +180,7 @@ def _size(x: object) -> float:
     return float(largest * np.sqrt(np.mean((sizes / largest) ** 2))) if sizes.size else math.nan
 
 
-def _ratio(mine: float, theirs: float) -> float:
+def _size_ratio(mine: float, theirs: float) -> float:
     """Ratio of two sizes, 1 if one of them is NaN."""
     return mine / theirs if math.isfinite(mine) and math.isfinite(theirs) else 1.0
 
@@ -196,22 +196,22 @@ def _scale_effect(kind: type[Effect], mine: tuple[Robot, Signals], theirs: tuple
             output = kind.balance in AT_THE_OUTPUT
             with_ = (lambda s: s.speed_wheel) if output else (lambda s: s.speed_motor)
         if with_ is not None:
-            stretch = _ratio(_size(with_(mine[1])), _size(with_(theirs[1])))
+            stretch = _size_ratio(_rms_size(with_(mine[1])), _rms_size(with_(theirs[1])))
     grown = effect if shape is None else params.replace(effect, {shape.name: jnp.asarray(stretch * shape.value)})
     factor, share = 1.0, _unit_share(grown, *mine)
     if kind.balance == "sensor":
         share = min(share, _unit_share(grown, mine[0], _at_rated_load(*mine)) / LEAST_SHOWN)
     if amplitude.spec.unit == BALANCES[kind.balance][0]:  # by its own size, even if operating points show none
         whole = WHOLE[kind.balance]
-        factor = _ratio(_size(whole(*mine)), _size(whole(*theirs)))
+        factor = _size_ratio(_rms_size(whole(*mine)), _rms_size(whole(*theirs)))
     elif amplitude.spec.unit != "-":
-        factor = _ratio(_unit_share(effect, *theirs), share)
+        factor = _size_ratio(_unit_share(effect, *theirs), share)
     slips = kind.balance == "slip" and amplitude.spec.unit == "-"
     factor *= SLIPPERY if slips else 1.0 if kind.balance == "mass" else UNKNOWN
     limits = factor
     if kind.balance != "sensor":
         rated = _unit_share(grown, mine[0], _at_rated_load(*mine))
-        limits = factor * min(1.0, _ratio(share, rated))
+        limits = factor * min(1.0, _size_ratio(share, rated))
     else:
         low, high = amplitude_of(grown).spec.bounds
         limits = min(factor, MOST_OFF / (max(-low, high) * share))
@@ -249,4 +249,4 @@ def _unit_share(effect: Effect, robot: Robot, signals: Signals) -> float:
         )
 
     term, total = jax.vmap(share)(signals)
-    return _size(term) / _size(total)
+    return _rms_size(term) / _rms_size(total)

@@ -52,7 +52,7 @@ class ScoreTable(eqx.Module):
             Zero if they can't be separated.
         cosine: cosine between two projected signatures.
         curve: curve of each family, as a normal deviate, shape (families,).
-        explained: its ridge score [σ²].
+        explained: ridge score of each family [σ²].
         row: signed root of the score of a shift of each single reading, shape (rows, channels).
         fall: further decrease of the objective predicted by a step of the fit [½σ²].
     """
@@ -269,7 +269,7 @@ def statistics_with_columns(
 
     Args:
         extra: columns over the readings, shape (readings, columns).
-        names: their places.
+        names: places of the columns.
     """
     wide: tuple[Any, Any] = augment_with_columns(linear, extra)
     scores, _ = _padded_scores(dataclasses.replace(linear, jacobian=wide[0], residual=wide[1]), bases)
@@ -288,7 +288,7 @@ def statistics_with_columns(
 
 
 @functools.partial(compiled, options=SELDOM)
-def _keys(seed: Array, batches: int, replicates: int) -> Array:
+def _replicate_keys(seed: Array, batches: int, replicates: int) -> Array:
     """A key for each replicate, shape (replicates, 2)."""
     keys = jax.random.key_data(jax.random.split(jax.random.key(seed), (batches, CHUNK)))
     return keys.reshape(batches * CHUNK, -1)[:replicates]
@@ -317,15 +317,15 @@ def bootstrap(
     """
     count = -(-replicates // CHUNK)
     draws = problem.observe.draws(
-        problem, jnp.asarray(z), linear, _keys(jnp.asarray(seed), count, replicates),
-        _factors(freedom, len(problem.channels), replicates, seed),
+        problem, jnp.asarray(z), linear, _replicate_keys(jnp.asarray(seed), count, replicates),
+        _noise_factors(freedom, len(problem.channels), replicates, seed),
     )  # fmt: skip
     # Padded to whole batches by repeats, which are cut off later.
     draws = jax.tree.map(lambda x: np.resize(np.asarray(x), (count, CHUNK, *x.shape[1:])), draws)
 
     def part(k: int) -> Statistics:
         draws_of_part = jax.tree.map(lambda x: x[k], draws)
-        return jax.device_get(_replicates(problem, linear, effects, bases, draws_of_part))
+        return jax.device_get(_replicate_batch(problem, linear, effects, bases, draws_of_part))
 
     # The first batch compiles the program of the others; a batch keeps one core busy.
     with Threads(CORES) as cores:
@@ -334,7 +334,7 @@ def bootstrap(
     return jax.tree.map(lambda x: x[statistics.settled], statistics)
 
 
-def _factors(freedom: np.ndarray | None, channels: int, replicates: int, seed: int) -> np.ndarray:
+def _noise_factors(freedom: np.ndarray | None, channels: int, replicates: int, seed: int) -> np.ndarray:
     """True sds over estimated ones, √(ν / χ²_ν), shape (replicates, channels)."""
     factors = np.ones((replicates, channels))
     if freedom is not None:
@@ -345,7 +345,7 @@ def _factors(freedom: np.ndarray | None, channels: int, replicates: int, seed: i
 
 
 @functools.partial(compiled, options=SMALL)
-def _replicates(
+def _replicate_batch(
     problem: Problem, linear: Linearization, effects: tuple[ScoredEffect, ...], bases: Bases, drawn: Any
 ) -> Statistics:
     """A batch of a bootstrap, from the observer's draws."""

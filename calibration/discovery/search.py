@@ -75,7 +75,7 @@ def search_effects(
         base: the fit without effects.
         left: its diagnosis.
     """
-    names = _ranked(space, left.scores)
+    names = _rank_by_score(space, left.scores)
     if not space.bare.observe.long:
         names = names[: _batch(space)]
     at, by = _linearised_fit(space, base, left, bases, settings)
@@ -94,7 +94,7 @@ def search_effects(
         ):
             break
         progress(next_step("more effects", best.effects))
-        rounds.append(_extend(space, best, diagnosis, at, by, settings))
+        rounds.append(_extend_set(space, best, diagnosis, at, by, settings))
         more, space = list(rounds[-1].candidates), space.with_room(rounds[-1].room)
         best = _accepted(_best(more), ladder, settings)
         ladder += more
@@ -160,7 +160,7 @@ def without_each(
     return [simulated[w] for w in fewer]
 
 
-def _ranked(space: CandidateSpace, scores: ScoreTable, without: Sequence[str] = ()) -> list[str]:
+def _rank_by_score(space: CandidateSpace, scores: ScoreTable, without: Sequence[str] = ()) -> list[str]:
     """Effects by their best |score|, the strongest first. Those in `without` come last."""
     strength = space.library.largest(np.abs(np.asarray(scores.single)))
     strength[list(space.library.indices(without))] = 0.0
@@ -181,7 +181,7 @@ def _batch(space: CandidateSpace) -> int:
     return space.bare.observe.policy.batch
 
 
-def _extend(
+def _extend_set(
     space: CandidateSpace,
     best: Candidate,
     left_by_best: Diagnosis,
@@ -190,17 +190,17 @@ def _extend(
     settings: Settings,
 ) -> Confirmed:
     """Sets with one more effect than the best, and pairs for another fit if that is the base."""
-    names = _ranked(space, left_by_best.scores, best.effects)[: _batch(space)]
+    names = _rank_by_score(space, left_by_best.scores, best.effects)[: _batch(space)]
     sources = {fill_slots([*best.effects, name], settings): (best, left_by_best) for name in names}
     if len(best.effects) == 1 and not at.effects:
-        for pair in _pairs(space, left.scores):
+        for pair in _pair_batch(space, left.scores):
             one, swapped = fill_slots(pair, settings), fill_slots(pair[::-1], settings)
             if one not in sources and swapped not in sources:
                 sources[one] = (at, left)
     return _fit_sets(space, [(w, at, by) for w, (at, by) in sources.items()], settings)
 
 
-def _pairs(space: CandidateSpace, scores: ScoreTable) -> list[tuple[str, str]]:
+def _pair_batch(space: CandidateSpace, scores: ScoreTable) -> list[tuple[str, str]]:
     """One batch of pairs of effects by their joint score, the strongest first."""
     effect, names = space.library.of, space.library.names
     pair = np.triu(np.asarray(scores.pair))

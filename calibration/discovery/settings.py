@@ -53,10 +53,9 @@ class Settings:
         outlier_error: family-wise error of an exclusion.
         gross: distance over the median row's beyond which a row cannot have been measured as stated [σ].
         cauchy: scale of Cauchy's weights [σ].
-        reweightings: their iterations.
-        worth, apart: least separation of an experiment to be worthwhile, and to separate two alternatives [σ].
-        enough, gain: probability above which a better separation is no gain. Least addition of a second experiment
-            to the expected number of separated pairs.
+        reweightings: number of reweighting iterations. worth, apart: least separation of an experiment to be
+        worthwhile, and to separate two alternatives [σ]. enough, gain: probability above which a better separation
+        is no gain. Least addition of a second experiment to the expected number of separated pairs.
         refuted: rise of χ² that refutes an alternative [σ²].
         prefer: one of `PREFERENCES`.
         forbidden: kinds of experiments, and configurations, that are not proposed (see `menu.KINDS`).

@@ -36,7 +36,7 @@ class Smooth:
     Attributes:
         effect, variable: name of the curve, and its variable.
         low, high: ends of its range.
-        scale: its amplitude.
+        scale: amplitude of the curve.
         root: L of the prior covariance L Lᵀ of the ordinates, shape (ordinates, ordinates).
         start: ordinates in prior coordinates, y = L z, shape (ordinates,).
         explained: decrease of χ².
@@ -113,7 +113,7 @@ def smooth_curve(linear: Linearization, balance: str, variable: str, counts: np.
     basis = _basis(variable, x, low, high)
     a, b = Projection(linear)(place_signature(linear, balance, way[:, None] * basis))
     size = 1 / np.sqrt(max(np.diag(a).max(), 1e-300))
-    roots = [np.eye(2)] if variable in ORDERS else [_smoothness(length, happens is not None) for length in LENGTHS]
+    roots = [np.eye(2)] if variable in ORDERS else [_prior_root(length, happens is not None) for length in LENGTHS]
     best: tuple[float, tuple] = (-np.inf, ())
     for root, sigmas in itertools.product(roots, SIZES):
         scale = sigmas * size
@@ -129,7 +129,7 @@ def smooth_curve(linear: Linearization, balance: str, variable: str, counts: np.
     return Smooth(name, variable, low, high, *best[1])
 
 
-def _smoothness(length: float, happening: bool = False) -> np.ndarray:
+def _prior_root(length: float, happening: bool = False) -> np.ndarray:
     """L of the prior covariance of the ordinates at a correlation length [spacings]. A temporary change is zero at
     its ends."""
     distance = np.subtract.outer(np.arange(len(ORDINATES)), np.arange(len(ORDINATES)))
@@ -148,7 +148,7 @@ class Surface:
     """A smooth discrepancy over two variables in a balance, linear at a fit.
 
     Attributes:
-        columns: its signatures, scaled to the prior of the greatest evidence, shape (readings, terms).
+        columns: signatures of the surface, scaled to the prior of the greatest evidence, shape (readings, terms).
         explained: decrease of χ² [σ²].
         evidence: as in `Smooth`.
     """

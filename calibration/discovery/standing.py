@@ -137,19 +137,19 @@ def _against_curves(
     equations = [equation_of_place(space.library[e].channel or space.library[e].balance) for e in best.effects]
     places = {place for place, _ in bases_room.family_names(bases)}
     crowded = {e for e in equations if equations.count(e) > 1 and e in places}
-    curves = _curves(space, linear, bases, crowded)
+    curves = _curve_evidence(space, linear, bases, crowded)
     if not curves:
         return NameSupport(True)
     curve, over = max(curves)
     # Curves are linear at the base, so names get the better of their fit and of their linear gain there.
-    fall = max(2 * (base.cost - best.cost), _linearly(space, best, linear, settings))
+    fall = max(2 * (base.cost - best.cost), _linear_explanation(space, best, linear, settings))
     names = fall - cost_of_names(space, best, settings)
     if curve - 2 * math.log(len(curves)) > names + settings.preferred:
         return NameSupport(False, "better curve", best.effects, (over,))
     return NameSupport(True)
 
 
-def _curves(
+def _curve_evidence(
     space: CandidateSpace, linear: Linearization, bases: Bases, crowded: set[str]
 ) -> list[tuple[float, CurveOver]]:
     """Evidence of each smooth curve and wave: of one variable in any place, of two in the crowded ones."""
@@ -181,7 +181,7 @@ def _varies(linear: Linearization, variable: str, included: np.ndarray) -> bool:
     return bool(np.all(np.isfinite(x)) and np.ptp(x) > 1e-9 * max(np.max(np.abs(x)), 1e-9))
 
 
-def _linearly(space: CandidateSpace, best: Candidate, linear: Linearization, settings: Settings) -> float:
+def _linear_explanation(space: CandidateSpace, best: Candidate, linear: Linearization, settings: Settings) -> float:
     """Decrease of χ² by the effects of a candidate at the base fit, at their nearest shapes [σ²]."""
     p, s = space.free, settings.slots
     chosen = []
@@ -209,7 +209,7 @@ def _one_curve(
 ) -> NameSupport:
     """Test whether a single curve is adequate where the names of a candidate are not."""
     names = bases_room.family_names(bases)
-    for k in _strongest(left, names):
+    for k in _strongest_families(left, names):
         statistics, _ = statistics_with_columns(
             left.linear, bases, family_columns(left.linear, bases, k), [names[k][0]]
         )
@@ -225,7 +225,7 @@ def _one_curve(
     return NameSupport(True)
 
 
-def _strongest(left: Diagnosis, names: Sequence[tuple[str, str]]) -> list[int]:
+def _strongest_families(left: Diagnosis, names: Sequence[tuple[str, str]]) -> list[int]:
     """The most significant family of curves of each place, the most significant of these first, at most `ALONE`."""
     deviate = np.asarray(left.scores.curve)
     first: dict[str, int] = {}
@@ -296,7 +296,7 @@ def name_tests(
         linear = linearizations[without.active]
         chosen, _ = _curves_beside(after.linear, after, bases, {equation}, CURVES, settings)
         beside = _with_curves(space, linear, bases, chosen, effect)
-        promised = _root(np.asarray(linear.jacobian), np.asarray(linear.residual), beside[2]) ** 2
+        promised = _largest_root(np.asarray(linear.jacobian), np.asarray(linear.residual), beside[2]) ** 2
         judged, signatures = beside, linear.signatures
         if promised < PROMISED * 2 * (without.cost - best.cost):
             judged = _put_back(space, best, effect, _with_curves(space, after.linear, bases, chosen, effect))
@@ -307,7 +307,7 @@ def name_tests(
         tests.append(
             NameTest(
                 effect,
-                _root(*beside),
+                _largest_root(*beside),
                 after.test.threshold("single"),
                 tuple(_curve_over(*names[k]) for k in chosen),
                 _evidence_over_curves(
@@ -380,7 +380,7 @@ def _varies_most(
         x = bases_room.scale_to_unit_range(np.nan_to_num(values), space.included.astype(float))
         changed = np.stack([(of_row * shape[:, None]).ravel() for shape in (x, 2 * x**2 - 1)], 1)
         projected_residual, scores = _projected_columns(jacobian, residual, changed)
-        for k, root in enumerate(_roots(jacobian, residual, changed)):
+        for k, root in enumerate(_score_roots(jacobian, residual, changed)):
             spread = abs(scores[k] / max(projected_residual[k], 1e-300) / best.z[slot]) if best.z[slot] else math.inf
             most = max(most, (float(root), variable, float(spread)))
     chance = NormalDist().inv_cdf(1 - share / (4 * max(len(variables), 1)))  # two shapes, either sign
@@ -409,7 +409,7 @@ def _evidence_over_curves(
     offered = sum(_equation(space, name) == equation for name in space.library.names)
     cost = _cost_of(space, best, best.active.index(effect), settings) + 2 * math.log(offered)
     same_equation = [
-        e for e, over in _curves(space, linear, bases, set()) if equation_of_place(over.place) == equation
+        e for e, over in _curve_evidence(space, linear, bases, set()) if equation_of_place(over.place) == equation
     ]
     return (
         2 * (without.cost - best.cost)
@@ -419,12 +419,12 @@ def _evidence_over_curves(
     )
 
 
-def _root(jacobian: np.ndarray, residual: np.ndarray, signatures: np.ndarray) -> float:
+def _largest_root(jacobian: np.ndarray, residual: np.ndarray, signatures: np.ndarray) -> float:
     """Largest root of the scores of several columns over the readings, after a refit [σ]."""
-    return float(np.max(_roots(jacobian, residual, signatures)))
+    return float(np.max(_score_roots(jacobian, residual, signatures)))
 
 
-def _roots(jacobian: np.ndarray, residual: np.ndarray, signatures: np.ndarray) -> np.ndarray:
+def _score_roots(jacobian: np.ndarray, residual: np.ndarray, signatures: np.ndarray) -> np.ndarray:
     """Root of the score of each column, 0 for columns that the fit imitates."""
     projected_residual, scores = _projected_columns(jacobian, residual, signatures)
     root = np.abs(scores) / np.sqrt(np.maximum(projected_residual, 1e-12))
@@ -480,7 +480,7 @@ def chosen_again(
     """
     effect, linear = best.effects[0], left.linear
     judged = _with_curves(space, linear, bases, (), effect)
-    if _root(*judged) ** 2 < PROMISED * 2 * (base.cost - best.cost):
+    if _largest_root(*judged) ** 2 < PROMISED * 2 * (base.cost - best.cost):
         linear = diagnose_candidate(space, best, bases, left.test.null, settings).linear
         judged = _put_back(space, best, effect, _with_curves(space, linear, bases, (), effect))
     return _chosen_again(space, families, judged, np.asarray(linear.signatures), blocks, settings)
@@ -499,7 +499,7 @@ def _chosen_again(
     The criterion is that of `classes`. Informative blocks leave half of the information on an effect, 1 without any.
 
     Args:
-        beside: Jacobian, residual and the effect's own signatures, as for `_root`.
+        beside: Jacobian, residual and the effect's own signatures, as for `_largest_root`.
         signatures: signatures of the library, there.
     """
     library, chosen_effects = space.library, []
@@ -511,7 +511,7 @@ def _chosen_again(
         j, e, kept_parts = _restrict_readings(kept_readings, *beside)
         if _projected_columns(j, e, kept_parts)[0].max() < 0.5 * best_score:
             continue
-        roots = _roots(j, e, kept_signatures)
+        roots = _score_roots(j, e, kept_signatures)
         most = np.max(roots) ** 2
         chosen_effects.append(np.max(roots[akin]) ** 2 >= most - max(settings.same, settings.form**2 * most))
     return float(np.mean(chosen_effects)) if chosen_effects else 1.0
@@ -540,7 +540,7 @@ def _weakest_run(
         out[rows] = True
         remaining = _restrict_readings(_kept_readings(space, out, len(signatures)), jacobian, residual, signatures)
         information = math.sqrt(np.max(_projected_columns(*remaining)[0]) / full_score) if differ else 1.0
-        root = _root(*remaining) / max(information, 1e-9)
+        root = _largest_root(*remaining) / max(information, 1e-9)
         least = (k + 1, root) if root < least[1] else least
     return least
 

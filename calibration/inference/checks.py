@@ -45,10 +45,10 @@ def unused_notes(runs: Runs) -> tuple[Remark, ...]:
 
 def unused_columns(runs: Runs) -> Names:
     """Names of the columns of numbers that vary and have no role."""
-    return tuple(name for name, cells in runs.extras.items() if _varies(name, cells))
+    return tuple(name for name, cells in runs.extras.items() if _is_varying(name, cells))
 
 
-def _varies(name: str, cells: np.ndarray) -> bool:
+def _is_varying(name: str, cells: np.ndarray) -> bool:
     """True for a varying column that is neither a row number nor a time."""
     if cells.dtype.kind != "f" or TIMES.search(name):
         return False

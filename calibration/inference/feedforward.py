@@ -49,7 +49,7 @@ class DriveLog:
         voltage: [V].
         position, velocity: position and velocity in `unit`, per second.
         current: current of the motor [A].
-        battery: its voltage at any times [V].
+        battery: battery voltage at any times [V].
         unit: one of `UNITS`.
     """
 
@@ -141,15 +141,15 @@ def fit_feedforward(log: DriveLog, mechanism: str = "simple", tolerances: Tolera
         BadData: too little motion. The message names the missing tests.
     """
     missing = missing_tests(log)
-    log, lag, remarks = _speeds(log)
-    windows = _windows(log, 0.0)
+    log, lag, remarks = _with_speed_of_position(log)
+    windows = _motion_windows(log, 0.0)
     if len(windows["u"]) < WINDOWS:
         lacking = f"; missing: {', '.join(missing)}" if missing else ""
         raise BadData(
             f"the log has fewer than {WINDOWS} windows of {WINDOW:g} s in motion; expected the four tests of "
             f"SysId{lacking}"
         )
-    if _fit(windows, "simple")[0][1] < 0:
+    if _fit_constants(windows, "simple")[0][1] < 0:
         remarks.append(Remark("feedforward_sign"))
         log = dataclasses.replace(log, voltage=-log.voltage)
     delay, windows, level, bend = _delay_and_bend(log, mechanism)
@@ -162,7 +162,7 @@ def fit_feedforward(log: DriveLog, mechanism: str = "simple", tolerances: Tolera
         limited = Remark("feedforward_limit", level=level, current=most)
         remarks.append(limited if bend < 0 else Remark("feedforward_skid", level=level))
     kept = _rows(windows, windows["demand"] < level) if level else windows
-    values, covariance, _ = _fit(kept, mechanism)
+    values, covariance, _ = _fit_constants(kept, mechanism)
     sds = np.sqrt(np.diag(covariance))
     names = ("kS", "kV", "kA", "kG")[: len(values)]
     constants = {name: float(x) for name, x in zip(names, values, strict=True)}
@@ -224,7 +224,7 @@ def missing_tests(log: DriveLog) -> Names:
     present = set()
     for name in dict.fromkeys(log.run.tolist()):
         named = next((t for t, old in TESTS.items() if t in name or old in name), None)
-        u = _driven(log.voltage[log.run == name])
+        u = _driven_voltages(log.voltage[log.run == name])
         if named is None and len(u) > WINDOWS:
             rises = np.mean(np.diff(np.abs(u)) >= 0) > 0.95
             kind = "dynamic" if not _is_ramp(u) else "quasistatic" if rises else ""
@@ -240,7 +240,7 @@ def _step(log: DriveLog) -> float:
     return float(np.median(steps[steps > 0]))
 
 
-def _speeds(log: DriveLog) -> tuple[DriveLog, float, list[Remark]]:
+def _with_speed_of_position(log: DriveLog) -> tuple[DriveLog, float, list[Remark]]:
     """The log with a speed that is the rate of the position, the lag of the log's own speed [s], and remarks."""
     if log.position is None:
         return log, 0.0, []
@@ -280,7 +280,7 @@ def _runs(log: DriveLog) -> Iterator[np.ndarray]:
         yield np.flatnonzero(log.run == name)
 
 
-def _windows(log: DriveLog, delay: float) -> Columns:
+def _motion_windows(log: DriveLog, delay: float) -> Columns:
     """Integrals over windows of motion one way: voltage u, path x, direction s, length T, change of speed dv."""
     windows: list[dict[str, object]] = []
     step, speeds = _step(log), np.asarray(log.velocity)
@@ -295,7 +295,7 @@ def _windows(log: DriveLog, delay: float) -> Columns:
         driven = np.interp(instants, t, whole) + np.minimum(instants - t[0], 0) * (0.0 if rests else u[0])
         driven += np.maximum(instants - t[-1], 0) * u[-1]
         place = np.zeros(len(t)) if log.position is None else log.position[rows] * UNITS[log.unit]
-        ramp = _is_ramp(_driven(u))
+        ramp = _is_ramp(_driven_voltages(u))
         for a in range(len(t) - count):
             b = a + count
             inside = v[a : b + 1]
@@ -314,7 +314,7 @@ def _windows(log: DriveLog, delay: float) -> Columns:
     return {key: np.array([w[key] for w in windows]) for key in keys}
 
 
-def _driven(voltage: np.ndarray) -> np.ndarray:
+def _driven_voltages(voltage: np.ndarray) -> np.ndarray:
     """Voltages of the samples of a run in which the motor is driven."""
     return voltage[np.abs(voltage) > 0.05 * np.abs(voltage).max()]
 
@@ -334,7 +334,7 @@ def _matrix(w: Columns, mechanism: str) -> np.ndarray:
     return np.stack([w["u"], -w["s"], -w["x"], *(-x for x in more)], axis=1)
 
 
-def _fit(w: Columns, mechanism: str) -> tuple[np.ndarray, np.ndarray, float]:
+def _fit_constants(w: Columns, mechanism: str) -> tuple[np.ndarray, np.ndarray, float]:
     """Constants kS, kV, kA (and kG), their covariance, and the sum of squares.
 
     Windows overlap: the covariance holds for residuals that are correlated.
@@ -377,9 +377,9 @@ def _delay_and_bend(log: DriveLog, mechanism: str) -> tuple[float, Columns, floa
     trials = []
     shifts = [*np.arange(-8, 8) / 8, *np.arange(2, 2 * LONGEST / step) / 2]
     for delay in step * np.array(sorted(shifts, key=abs)):
-        windows = _windows(log, float(delay))
-        plain = _fit(windows, mechanism)[2]
-        level, bend, cost = _bend(windows, mechanism)
+        windows = _motion_windows(log, float(delay))
+        plain = _fit_constants(windows, mechanism)[2]
+        level, bend, cost = _slope_change(windows, mechanism)
         trials += [(plain, float(delay), windows, 0.0, 0.0), (cost, float(delay), windows, level, bend)]
     count = 0.5 * len(trials[0][2]["u"]) / trials[0][2]["count"][0]
 
@@ -393,12 +393,12 @@ def _delay_and_bend(log: DriveLog, mechanism: str) -> tuple[float, Columns, floa
     return min(trials, key=penalised)[1:]
 
 
-def _bend(w: Columns, mechanism: str) -> tuple[float, float, float]:
+def _slope_change(w: Columns, mechanism: str) -> tuple[float, float, float]:
     """Accelerating voltage above which the slope changes [V], the change, and the sum of squares.
 
     Negative: less acceleration (a current limit), positive: more (wheels that slip). Sets `demand`.
     """
-    values, _, plain = _fit(w, mechanism)
+    values, _, plain = _fit_constants(w, mechanism)
     level, bend, cost, material = 0.0, 0.0, np.inf, False
     for _ in range(3):
         asked = (w["u"] - values[0] * w["s"] - values[1] * w["x"]) / w["T"]
@@ -422,7 +422,7 @@ def _bend(w: Columns, mechanism: str) -> tuple[float, float, float]:
 
 
 def _by_direction(w: Columns) -> Iterator[Remark]:
-    values, covariance, _ = _fit(w, "elevator")  # a constant voltage beside friction is half the difference
+    values, covariance, _ = _fit_constants(w, "elevator")  # a constant voltage beside friction is half the difference
     half, sd = values[3], np.sqrt(covariance[3, 3])
     if {*np.sign(w["s"])} == {1.0, -1.0} and abs(half) > 4 * sd and abs(half) > 0.05 * abs(values[0]):
         yield Remark("feedforward_direction", forward=float(values[0] + half), backward=float(values[0] - half))

@@ -49,7 +49,7 @@ class Pair(NamedTuple):
     """Two parameters that the data determine only in combination.
 
     Attributes:
-        one, other: their names.
+        one, other: names of the two parameters.
         correlation: correlation of their posterior.
         form: form of the combination: their `ratio`, their `product`, or `linear`: `one` + `weight` · `other`.
         weight: weight of `other` [unit of one / unit of other]. Negative if the difference is determined.

@@ -124,12 +124,12 @@ def predict_identifiability(runs: Runs, robot: Robot, noise: str | None = None, 
     )
     alike = tuple(about.correlated())
     separating = (
-        tuple(_separating(runs, posed, about, alike)) if robot.rig.follows_goal and alike else ((),) * len(alike)
+        tuple(_columns_apart(runs, posed, about, alike)) if robot.rig.follows_goal and alike else ((),) * len(alike)
     )
     return Foresight(estimates, statuses, table_noise.source, alike, together, robot, doubts, separating)
 
 
-def _separating(
+def _columns_apart(
     runs: Runs, posed: Problem, about: Identifiability, alike: Sequence[tuple[str, str, float]]
 ) -> Iterator[Names]:
     """Columns that separate each pair: with their readings it is neither correlated nor held by its priors.
@@ -153,10 +153,10 @@ def _separating(
             covariances[channel.column] = np.linalg.inv(rows.T @ rows)
     for one, other, _ in alike:
         pair = [about.names.index(one), about.names.index(other)]
-        yield tuple(column for column, c in covariances.items() if _apart(c[np.ix_(pair, pair)]))
+        yield tuple(column for column, c in covariances.items() if _are_separable(c[np.ix_(pair, pair)]))
 
 
-def _apart(covariance: np.ndarray) -> bool:
+def _are_separable(covariance: np.ndarray) -> bool:
     """True if two parameters are neither correlated nor held by their priors."""
     sd = np.sqrt(np.diag(covariance))
     correlation = abs(covariance[0, 1]) / (sd[0] * sd[1])

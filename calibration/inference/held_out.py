@@ -44,7 +44,7 @@ class HeldOutFits:
             not reach it, shape (rows, channels).
         status: status of each row, -1 if no block holds it.
         block: index of each row's block, -1 for none, shape (rows,).
-        z: of each block's fit, shape (blocks, coordinates).
+        z: coordinates of each block's fit, shape (blocks, coordinates).
         converged: True if it is an optimum.
     """
 
@@ -62,8 +62,8 @@ def hold_out_blocks(
 
     Args:
         problem: as fitted to all rows.
-        start: its optimum.
-        active: its effects, for one with slots.
+        start: optimum of the problem.
+        active: active effects, for a problem with slots.
         masks: masks of the rows of each block, shape (rows of the table,). The problem's rows may be padded beyond
             these.
     """

@@ -197,7 +197,7 @@ class Searching(eqx.Module):
         mixed: True if `mixed_step` leads there.
         region: state of the trust region.
         steps: evaluations so far.
-        rejected: those since y was found.
+        rejected: evaluations since y was found.
         over: True if the search has ended.
     """
 

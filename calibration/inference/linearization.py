@@ -173,9 +173,12 @@ class Linearization(eqx.Module):
     Attributes:
         residual: whitened residuals, shape (residuals,): readings (a channel after the other, row by row),
             adhesion (1 a row), priors.
-        jacobian: by the free coordinates, shape (residuals, coordinates).
-        signatures: by each instance's amplitude in prior sds, shape (readings, instances).
-        defects: by a defect of each balance of `probed` [its unit]. Further axes depend on the observer.
+        jacobian: derivatives of the residuals with respect to the free coordinates, shape (residuals,
+        coordinates).
+        signatures: derivatives with respect to each instance's amplitude in prior sds, shape (readings,
+        instances).
+        defects: derivatives with respect to a defect of each balance of `probed` [its unit]. Further axes depend
+        on the observer.
         scale: change of a whitened reading per unit of the reading [1/SI], 0 if excluded, shape (rows, channels).
         signals: signals of each row, at the fit.
         channels: names of the readings' channels, in order.

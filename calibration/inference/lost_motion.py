@@ -1,4 +1,4 @@
-"""Lost motion of an output: how much of its angle each reversal of a log loses."""
+"""Lost motion of an output: how much of its angle each reversal of a log loses, or its acceleration twists."""
 
 from __future__ import annotations
 
@@ -23,7 +23,10 @@ SURE, REVERSALS, EXPLAINED = 6.0, 6, 0.3
 
 
 def lost_motion_notes(runs: Runs, robot: Robot) -> list[Remark]:
-    """Note on an angle that is lost at each reversal, for a log of a robot without backlash."""
+    """Note on an angle that is lost at each reversal or by acceleration, for a log of a robot without backlash.
+
+    An elastic joint of stiffness k leaves the output J α / k behind the motor, if a log shows both.
+    """
     placed = [k for k, c in enumerate(runs.channels) if c.name in ("output_angle", "position") and runs.has(c.column)]
     turning = [k for k, c in enumerate(runs.channels) if c.name == "motor_speed" and runs.has(c.column)]
     if not runs.sampled or not placed or robot.has_ground or robot.loose:
@@ -36,19 +39,26 @@ def lost_motion_notes(runs: Runs, robot: Robot) -> list[Remark]:
         _changes_between_contacts(runs["time_s"][rows], measured_values[rows, placed[0]], drive[rows])
         for rows in map(runs.in_order, np.unique(runs.run_names))
     ]
-    moved, integral, clipped, faster, driven, reversed_ = (np.concatenate(x, -1) for x in zip(*changes, strict=True))
+    moved, integral, clipped, faster, driven, reversed_, bent, curved = (
+        np.concatenate(x, -1) for x in zip(*changes, strict=True)
+    )
     reversals = int(np.sum(np.abs(reversed_)))
     if reversals < REVERSALS or len(moved) < 2 * REVERSALS:
         return []
     sets = [[integral]] if turning else [[integral, taken, faster, driven] for taken in clipped]
     _, width, sd, explained = min(_lost(moved, reversed_, np.stack(x, 1)) for x in sets)
-    if not (width > SURE * sd and explained > EXPLAINED):
+    lost, stiffness, load = width > SURE * sd and explained > EXPLAINED, 0.0, robot.configurations.members[0]
+    radius = float(load.radius) if channel.name == "position" else 1.0
+    if turning:
+        _, late, sd, explained = _lost(curved, bent, np.stack([integral, faster, reversed_], 1))
+        if late > SURE * sd and explained > EXPLAINED:
+            stiffness, width = float(load.inertia) * radius / late, late * np.sqrt(np.mean(bent**2))
+    if not (lost or stiffness):
         return []
-    radius = float(robot.configurations.members[0].radius) if channel.name == "position" else 1.0
     return [
         Remark(
             "lost_motion", source=runs.source, column=channel.column, reversals=reversals,
-            width=width / channel.factor, unit=channel.unit, angle=width / radius,
+            width=width / channel.factor, unit=channel.unit, angle=width / radius, stiffness=stiffness,
         )
     ]  # fmt: skip
 
@@ -58,17 +68,20 @@ def _changes_between_contacts(time: np.ndarray, angle: np.ndarray, drive: np.nda
 
     Returns:
         Of the angle. Of the time integral of the drive, and of the drive clipped to each of `FRICTIONS`, of the
-        speed, of the drive, and of the direction, 1 or -1 for a reversal.
+        speed, of the drive, of the direction, 1 or -1 for a reversal, of the acceleration, and
+        of the angle of a parabola.
     """
     has_both = np.isfinite(angle) & np.isfinite(drive)
     time, angle, drive = time[has_both], angle[has_both], drive[has_both]
     count = len(time)
     if count < 4 * AROUND:
-        return tuple(np.zeros((*shape, 0)) for shape in ((), (), FRICTIONS.shape, (), (), ()))
+        return tuple(np.zeros((*shape, 0)) for shape in ((), (), FRICTIONS.shape, (), (), (), (), ()))
     steps = np.arange(-AROUND, AROUND + 1)
     around = np.clip(np.arange(count)[:, None] + steps, 0, count - 1)
     smooth = angle[around].mean(1)
     speed = angle[around] @ steps / np.maximum(time[around] @ steps, 1e-12)
+    square, bow = (time[around] - time[:, None]) ** 2, steps**2 - np.mean(steps**2)
+    bend = angle[around] @ bow / np.maximum(square @ bow / 2, 1e-12)
     usual = np.sqrt(np.mean(speed**2))
     way = np.where(np.abs(speed) > SLOW * usual, np.sign(speed), 0.0)
     way = way[np.maximum.accumulate(np.where(way != 0, np.arange(count), 0))]
@@ -81,7 +94,7 @@ def _changes_between_contacts(time: np.ndarray, angle: np.ndarray, drive: np.nda
     integral = lambda x: np.append(0.0, np.cumsum((x[1:] + x[:-1]) / 2 * np.diff(time)))  # noqa: E731
     levels = np.maximum(np.quantile(np.abs(drive), FRICTIONS), 1e-9 * np.max(np.abs(drive), initial=1e-300))
     clipped = np.array([integral(np.clip(drive / level, -1, 1)) for level in levels])
-    every = smooth, integral(drive), clipped, speed, drive, way / 2
+    every = smooth, integral(drive), clipped, speed, drive, way / 2, bend, smooth - bend * square.mean(1) / 2
     return tuple(np.diff(x[..., points]) for x in every)
 
 

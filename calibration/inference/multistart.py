@@ -82,7 +82,7 @@ class SearchResult:
 
     Attributes:
         problem: problem with the noise (and stiffness) of the last round.
-        best: its optimum.
+        best: best optimum.
         starts: outcome of the searches.
         shares: estimated sd of each channel as a share of its size, NaN if the sd was known.
         searched: the population that preceded the search, None without one.
@@ -140,8 +140,8 @@ def search_one_by_one(
     start once each. One that ends lower takes its place, and the noise settles again.
 
     Args:
-        posed: with the initial noise.
-        shares: that noise as shares of the readings.
+        posed: problem with the initial noise.
+        shares: initial noise as shares of the readings.
         tell: callback for progress after every step.
         solver: solver of optimistix, None for ours.
     """

@@ -114,7 +114,7 @@ Solver = optx.AbstractLeastSquaresSolver | optx.AbstractMinimiser
 Progress = tuple[Z, Searching]
 
 
-def _evaluated(problem: Problem, data: Data, pin: Pin, z: Z) -> tuple[Array, Array, Observation]:
+def _evaluate_residuals(problem: Problem, data: Data, pin: Pin, z: Z) -> tuple[Array, Array, Observation]:
     """Residuals (readings, penalties with their signs, then prior) at z, their Jacobian, and the observation.
 
     One evaluation gives all three.
@@ -125,10 +125,10 @@ def _evaluated(problem: Problem, data: Data, pin: Pin, z: Z) -> tuple[Array, Arr
 
 
 def residual_function(problem: Problem, data: Data, pin: Pin) -> Function:
-    """Residual function of optimistix with the residuals of `_evaluated`, and the observation as auxiliary output."""
+    """Residual function for optimistix, from `_evaluate_residuals`, with the observation as auxiliary output."""
 
     def function(z: Z, args: Any) -> tuple[Array, Observation]:
-        r, jacobian, observation = _evaluated(problem, data, pin, jax.lax.stop_gradient(z))
+        r, jacobian, observation = _evaluate_residuals(problem, data, pin, jax.lax.stop_gradient(z))
         return with_slope(z, r, jacobian), observation
 
     return function
@@ -194,7 +194,7 @@ def _step(solver: OneSidedLevenbergMarquardt, function: Function, at: Progress) 
     return y, state
 
 
-def _begun(problem: Problem, start: Z, data: Data) -> Progress:
+def _begin_search(problem: Problem, start: Z, data: Data) -> Progress:
     """State of a problem's search before its first evaluation."""
     size = penalty_slice(data).stop + start.shape[0]
     codes = jnp.zeros(data.measured.shape[0], int)
@@ -272,7 +272,7 @@ def _placeholder_searches(problem: Problem, members: Member) -> Progress:
     """States of searches that are over before they begin, as placeholders."""
 
     def one(member: Member) -> Progress:
-        y, state = _begun(problem, member.start, member.problem(problem).data)
+        y, state = _begin_search(problem, member.start, member.problem(problem).data)
         return y, dataclasses.replace(state, over=jnp.asarray(True))
 
     return jax.vmap(one)(members)
@@ -282,7 +282,7 @@ def _with_fresh(problem: Problem, members: Member, fresh: Numbers, at: Progress)
     """States of parallel searches, in which `fresh` ones are reset to their starts."""
 
     def begin(member: Member, fresh: Array, at: Progress) -> Progress:
-        begun = _begun(problem, member.start, member.problem(problem).data)
+        begun = _begin_search(problem, member.start, member.problem(problem).data)
         return jax.tree.map(lambda new, old: jnp.where(fresh, new, old), begun, at)
 
     return jax.vmap(begin)(members, fresh, at)
@@ -321,7 +321,7 @@ def _roots(problem: Problem, z: Numbers, active: Numbers | None) -> tuple[Array,
 
 
 @functools.partial(compiled, options=OVER_TIME)
-def _further(
+def _step_unfinished(
     problem: Problem, members: Member, at: Progress, roots: tuple[Array, Array], max_steps: Numbers
 ) -> tuple[Progress, Optimum]:
     """One step of each unfinished search with known roots, and the best point of each as an optimum."""
@@ -342,7 +342,7 @@ def _go_on_apart(
     """`_go_on` for observers with a separate program for roots (`Observer.apart`)."""
     at = _admitted(problem, members, fresh, at)
     while True:
-        at, results = _further(problem, members, at, _roots(problem, at[1].ahead, members.active), max_steps)
+        at, results = _step_unfinished(problem, members, at, _roots(problem, at[1].ahead, members.active), max_steps)
         if np.asarray(at[1].over).sum() >= enough:
             return at, results
 
@@ -508,7 +508,7 @@ def linearise_rollout(problem: Problem, z: Z, data: Data) -> tuple[Array, Array,
     derivative grows without limit. Such a reading counts as not computed if it has a weight.
     """
 
-    r, jacobian, observation = _evaluated(problem, data, no_pin(z.size), z)
+    r, jacobian, observation = _evaluate_residuals(problem, data, no_pin(z.size), z)
     return *mask_uncomputed(r, jacobian, data), observation
 
 
@@ -704,13 +704,13 @@ def search_with_solver(
     most = MOST_STEPS[isinstance(solver, optx.AbstractMinimiser)]
 
     def residual(z: Z, args: Any) -> Array:
-        r, jacobian, _ = _evaluated(problem, data, no_pin(z.size), jax.lax.stop_gradient(z))
+        r, jacobian, _ = _evaluate_residuals(problem, data, no_pin(z.size), jax.lax.stop_gradient(z))
         return with_slope(z, *clip_penalties(r, jacobian, data))
 
     def search(start: Z) -> tuple[Optimum, Observation, Observation]:
         solved: optx.Solution = optx.least_squares(residual, solver, start, max_steps=most, throw=False)
         z, pin = solved.value, no_pin(start.size)
-        r, jacobian, observation = _evaluated(problem, data, pin, z)
+        r, jacobian, observation = _evaluate_residuals(problem, data, pin, z)
         r, jacobian = mask_uncomputed(r, jacobian, data)
         optimum = _optimum(jacobian, r, z, data, pin, solved.stats["num_steps"])
         return optimum, problem.observation(start), observation

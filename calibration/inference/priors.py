@@ -146,7 +146,7 @@ class Coordinates(eqx.Module):
     def robot(self, base: Robot, z: Float[Array, " parameters"]) -> Robot:
         """`base` with the free parameters, and those tied to them, at coordinates z."""
         names = (*self.names, *(follower for follower, _ in self.followers))
-        return params.replace(base, dict(zip(names, _numbers(self, z), strict=True)))
+        return params.replace(base, dict(zip(names, _parameter_values(self, z), strict=True)))
 
     def beyond(self, z: np.ndarray) -> np.ndarray:
         """-1 or 1 if z is on or beyond its lower or upper bound, else 0, shape (parameters,)."""
@@ -161,7 +161,7 @@ def _slope(coordinates: Coordinates, z: Float[Array, " parameters"]) -> Float[Ar
 
 
 @functools.partial(compiled, options=SELDOM)
-def _numbers(coordinates: Coordinates, z: Float[Array, " parameters"]) -> tuple[Array, ...]:
+def _parameter_values(coordinates: Coordinates, z: Float[Array, " parameters"]) -> tuple[Array, ...]:
     """Parameters at coordinates z, and the tied ones, as scalars [SI]."""
     theta = coordinates.value(z)
     tied = coordinates.ratios * theta[np.array([k for _, k in coordinates.followers], int)]
@@ -286,7 +286,11 @@ def free_names(
     owned = (n for n in stated if not n.endswith(decided) and ".track." not in n and f".{GROUND}" not in n)
     return tuple(
         dict.fromkeys(
-            [*_uncertain(robot, (*_drive(robot, (*BENCH, *drive)), *names)), *owned, *initial_state_names(robot)]
+            [
+                *_uncertain(robot, (*_drive(robot, (*BENCH, *drive)), *names)),
+                *owned,
+                *initial_state_names(robot),
+            ]
         )
     )
 

@@ -70,19 +70,19 @@ def check_ranges(runs: Runs, robot: Robot) -> list[Remark]:
     possible = np.where(slow & np.isnan(possible) & np.isfinite(possible[0]), 0.0, possible)
     if not np.isfinite(possible).any():
         return []
-    factors = {c: _factor(measured[:, k], possible[:, :, k]) for k, c in enumerate(robot.channels)}
+    factors = {c: _range_factor(measured[:, k], possible[:, :, k]) for k, c in enumerate(robot.channels)}
     remarks: list[Remark] = []
     for k, (channel, factor) in enumerate(factors.items()):
         off = max(factor, 1 / factor)
         unknown = not robot.rig.inherits and channel.name in OF_TORQUE
         if off <= (FAR if unknown else SAID):
             continue
-        units = _units(channel, measured[:, k], possible[:, :, k], robot)
+        units = _possible_units(channel, measured[:, k], possible[:, :, k], robot)
         if not units and (
-            unknown or kind.axis or _slips(robot, channel, factor)
+            unknown or kind.axis or _may_be_slip(robot, channel, factor)
         ):  # a sliding vehicle may have other speeds
             continue
-        typical = _factor(measured[:, k], possible[1:2, :, k])
+        typical = _range_factor(measured[:, k], possible[1:2, :, k])
         channel_factors = factors[channel]
         remark = Remark(
             "off_by",
@@ -100,7 +100,7 @@ def check_ranges(runs: Runs, robot: Robot) -> list[Remark]:
         if off > REFUSED:
             raise BadData(f"{runs.source}, {describe(remark)}")
         remarks.append(remark)
-    return [*remarks, *_turned(runs, measured, possible), *_slopes(runs, measured, possible[1], robot)]
+    return [*remarks, *_signs_of_readings(runs, measured, possible), *_slope_note(runs, measured, possible[1], robot)]
 
 
 def turned_signs(runs: Runs, robot: Robot) -> list[Remark]:
@@ -112,14 +112,14 @@ def turned_signs(runs: Runs, robot: Robot) -> list[Remark]:
     if not runs.layout.weight or any(float(c.torque_gravity) > 0 for c in robot.configurations.members):
         return []
     conditions = runs.conditions(robot)
-    return _turned(
+    return _signs_of_readings(
         runs,
         runs.measured(),
         np.stack([operating_readings(_with_friction_factor(robot, f), conditions) for f in FRICTION]),
     )
 
 
-def _turned(runs: Runs, measured: np.ndarray, possible: np.ndarray) -> list[Remark]:
+def _signs_of_readings(runs: Runs, measured: np.ndarray, possible: np.ndarray) -> list[Remark]:
     """Result of `turned_signs` for readings [SI], shape (runs, channels), and for several robots, (robots, ...)."""
     remarks: list[Remark] = []
     for k, channel in enumerate(runs.channels if runs.layout.weight else ()):
@@ -156,7 +156,7 @@ def _with_friction_factor(robot: Robot, factor: float) -> Robot:
     return params.replace(robot, {p.name: factor * p.value for p in torques})
 
 
-def _factor(measured: np.ndarray, possible: np.ndarray) -> float:
+def _range_factor(measured: np.ndarray, possible: np.ndarray) -> float:
     """Median factor between readings and the possible range, 1 inside, or if it cannot be determined.
 
     Args:
@@ -176,16 +176,16 @@ def _factor(measured: np.ndarray, possible: np.ndarray) -> float:
     return float(np.median(x / np.clip(x, low, high)))
 
 
-def _units(channel: Channel, measured: np.ndarray, possible: np.ndarray, robot: Robot) -> list[str]:
-    """Units that would make the readings possible, the most probable first. Arguments as in `_factor`."""
+def _possible_units(channel: Channel, measured: np.ndarray, possible: np.ndarray, robot: Robot) -> list[str]:
+    """Units that would make the readings possible, the most probable first. Arguments as in `_range_factor`."""
     other_units = {unit: channel.factor / size for unit, size in channel.sizes.items() if size != channel.factor}
     if channel.name == "motor_speed" and robot.has_ground:
         other_units["rpm of the driving wheel"] = 1 / float(robot.gearbox.ratio)
-    distance = {unit: abs(math.log(_factor(measured / f, possible))) for unit, f in other_units.items()}
+    distance = {unit: abs(math.log(_range_factor(measured / f, possible))) for unit, f in other_units.items()}
     return sorted((u for u, x in distance.items() if x < math.log(ALIKE)), key=distance.__getitem__)
 
 
-def _slips(robot: Robot, channel: Channel, factor: float) -> bool:
+def _may_be_slip(robot: Robot, channel: Channel, factor: float) -> bool:
     """True if a low speed may be the slip of a vehicle's movers on an unspecified ground."""
     return not robot.rig.inherits and robot.has_ground and channel.name == "speed" and factor < 1
 
@@ -232,7 +232,7 @@ def _check_masses(runs: Runs, robot: Robot) -> None:
         )
 
 
-def _slopes(runs: Runs, measured: np.ndarray, possible: np.ndarray, robot: Robot) -> Iterator[Remark]:
+def _slope_note(runs: Runs, measured: np.ndarray, possible: np.ndarray, robot: Robot) -> Iterator[Remark]:
     """Note if the current rises with the slope as if the slope had another unit.
 
     Among runs that differ only in their slope, the current is nearly linear in it. The regression of measured on

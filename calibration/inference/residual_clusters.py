@@ -119,7 +119,7 @@ def residual_clusters(fit: Residuals, seed: int = 0) -> tuple[ResidualCluster, .
         fit: residuals of the fit. Of histories the mean of each run is tested.
         seed: random seed of the permutations.
     """
-    residuals = _by_run(fit) if fit.runs.sampled else _by_row(fit)
+    residuals = _by_run(fit) if fit.runs.sampled else _units_by_row(fit)
     columns = _without_role(residuals)
     if not columns:
         return ()
@@ -133,7 +133,7 @@ def residual_clusters(fit: Residuals, seed: int = 0) -> tuple[ResidualCluster, .
     significant = [one for one in every if one[0] < LEVEL]
     if not significant:
         return ()
-    strongest = _permuted(channel_tests, seed)
+    strongest = _permuted_p_values(channel_tests, seed)
     floor = 1 / (1 + len(strongest))
     answer: list[ResidualCluster] = []
     for k, tested in channel_tests:
@@ -156,21 +156,21 @@ def residual_clusters(fit: Residuals, seed: int = 0) -> tuple[ResidualCluster, .
 
 def _coarse_first(found: list[tuple[float, _Comparison]], columns: Columns) -> list[tuple[float, _Comparison]]:
     """Findings in the order of their p-values, but with a column before any finer division of its levels."""
-    words = {test.column: _words(columns[test.column]) for _, test in found}
+    words = {test.column: _column_words(columns[test.column]) for _, test in found}
     levels = {name for name in words if not _is_numeric(columns[name])}
     ordered: list[tuple[float, _Comparison]] = []
     waiting = list(found)
     while waiting:
         first = waiting[0]
         name = first[1].column
-        coarser = [one for one in waiting if name in levels and _divides(words[name], words[one[1].column])]
+        coarser = [one for one in waiting if name in levels and _determines(words[name], words[one[1].column])]
         first = coarser[0] if coarser else first
         ordered.append(first)
         waiting = [one for one in waiting if one is not first]
     return ordered
 
 
-def _divides(fine: np.ndarray, coarse: np.ndarray) -> bool:
+def _determines(fine: np.ndarray, coarse: np.ndarray) -> bool:
     """True if each level of one column determines that of another, which has fewer levels."""
     pairs = len(set(zip(fine.tolist(), coarse.tolist(), strict=True)))
     return len(np.unique(coarse)) < len(np.unique(fine)) == pairs
@@ -180,7 +180,7 @@ def _divides(fine: np.ndarray, coarse: np.ndarray) -> bool:
 
 
 @dataclasses.dataclass(frozen=True)
-class _Units:
+class _ComparisonUnits:
     """Units of comparison, each a settled row or a run of a history.
 
     Attributes:
@@ -201,17 +201,17 @@ class _Units:
     covariance: np.ndarray
 
 
-def _by_row(fit: Residuals) -> _Units:
+def _units_by_row(fit: Residuals) -> _ComparisonUnits:
     jacobian = np.where(fit.counts[..., None], fit.jacobian.reshape(*fit.counts.shape, -1), 0.0)
     flat = jacobian.reshape(fit.counts.size, -1)
     covariance = np.linalg.inv(flat.T @ flat + np.eye(flat.shape[1]))
     residual = np.where(fit.counts, fit.simulated - fit.runs.measured(), np.nan)
-    return _Units(fit.runs, fit.counts, fit.whitened, jacobian, residual, fit.simulated, covariance)
+    return _ComparisonUnits(fit.runs, fit.counts, fit.whitened, jacobian, residual, fit.simulated, covariance)
 
 
-def _by_run(fit: Residuals) -> _Units:
+def _by_run(fit: Residuals) -> _ComparisonUnits:
     """Means of each run. Whitened means times the root of their number of samples, so that noise has the sd 1."""
-    rows = _by_row(fit)
+    rows = _units_by_row(fit)
     run = fit.runs.run_names
     _, first, run_of = np.unique(run, return_index=True, return_inverse=True)
     member = run_of[:, None] == np.arange(len(first))  # (samples, runs)
@@ -229,7 +229,7 @@ def _by_run(fit: Residuals) -> _Units:
         for c, v in fit.runs.columns.items()
     }
     mean = np.maximum(counts, 1.0)
-    return _Units(
+    return _ComparisonUnits(
         runs=dataclasses.replace(fit.runs, columns=columns, extras=one),
         counts=counts > 0,
         whitened=total(rows.whitened) / weight,
@@ -240,13 +240,13 @@ def _by_run(fit: Residuals) -> _Units:
     )
 
 
-def _without_role(whole: _Units) -> Columns:
+def _without_role(whole: _ComparisonUnits) -> Columns:
     """Columns to test: with more than one level, and no ids, times or aliases of a condition."""
     runs, columns = whole.runs, {}
     # Simulated readings depend only on the conditions.
     conditions = [runs[c] for c in CONDITIONS if runs.has(c)] + list(whole.simulated.T)
     for name, cells in runs.extras.items():
-        words = _words(cells)
+        words = _column_words(cells)
         levels = np.unique(words[words != ""])
         if len(levels) < 2 or _is_time(name, cells) or _is_id(cells, len(levels)):
             continue
@@ -258,7 +258,7 @@ def _without_role(whole: _Units) -> Columns:
     return columns
 
 
-def _words(cells: np.ndarray) -> np.ndarray:
+def _column_words(cells: np.ndarray) -> np.ndarray:
     """A column as words, "" for empty cells."""
     if cells.dtype.kind == "f":
         return np.array(["" if np.isnan(x) else f"{x:g}" for x in cells])
@@ -269,13 +269,13 @@ def _columns_with_role(runs: Runs) -> Iterator[np.ndarray]:
     """Columns with a role, except readings and their sds, and the combinations of the labels."""
     readings = {name for c in runs.channels for name in (c.column, c.sd_column)}
     word_columns = {name: v.astype(str) for name, v in runs.columns.items() if name not in readings}
-    labels = [word_columns[name] for name in _labels(runs)]
+    labels = [word_columns[name] for name in _condition_labels(runs)]
     yield from word_columns.values()
     if len(labels) > 1:
         yield np.array(["|".join(words) for words in zip(*labels, strict=True)])
 
 
-def _labels(runs: Runs) -> list[str]:
+def _condition_labels(runs: Runs) -> list[str]:
     """Columns of words that describe the conditions, with more than one level."""
     return [
         name for name, v in runs.columns.items()
@@ -385,7 +385,7 @@ def _orthonormal(columns: np.ndarray, least: float = CLEAR) -> np.ndarray:
     return directions[:, size > least]
 
 
-def _channel(whole: _Units, k: int, columns: Columns) -> _Channel | None:
+def _channel(whole: _ComparisonUnits, k: int, columns: Columns) -> _Channel | None:
     """A channel and its tests, None with too few readings."""
     counts = whole.counts[:, k]
     if counts.sum() < FEWEST:
@@ -412,7 +412,7 @@ def _channel(whole: _Units, k: int, columns: Columns) -> _Channel | None:
     freedom = len(projected) - taken.shape[1]
     tests = []
     for name, cells in columns.items():
-        for within in ("", *_labels(runs)):
+        for within in ("", *_condition_labels(runs)):
             for reversing in (False, True)[: 1 + both]:
                 shape = _comparison_columns(cells[counts], runs[within] if within else None)
                 basis = scaled(shape * travel[:, None] if reversing else shape, forth)
@@ -434,7 +434,7 @@ def _is_numeric(cells: np.ndarray) -> bool:
     return cells.dtype.kind == "f" and len(np.unique(cells[np.isfinite(cells)])) > LEVELS
 
 
-def _ranks(cells: np.ndarray) -> np.ndarray:
+def _centred_ranks(cells: np.ndarray) -> np.ndarray:
     """Ranks minus their mean, 0 for missing numbers."""
     fine = np.isfinite(cells)
     ranks = np.zeros(len(cells))
@@ -450,9 +450,9 @@ def _comparison_columns(cells: np.ndarray, within: np.ndarray | None) -> np.ndar
     cell = np.zeros(len(cells), str) if within is None else within
     if _is_numeric(cells):
         return np.stack(
-            [np.where(cell == c, _ranks(np.where(cell == c, cells, np.nan)), 0.0) for c in np.unique(cell)], 1
+            [np.where(cell == c, _centred_ranks(np.where(cell == c, cells, np.nan)), 0.0) for c in np.unique(cell)], 1
         )
-    words = _words(cells)
+    words = _column_words(cells)
     both = [(words == w) & (cell == c) for w in np.unique(words) for c in np.unique(cell)]
     return np.stack([b for b in both if b.any()], 1).astype(float)
 
@@ -463,7 +463,7 @@ def _condition_columns(runs: Runs, simulated: np.ndarray, travel: np.ndarray | N
     A mean of each set of labels and direction, then smooth curves over conditions and readings, as many as the number
     of rows allows.
     """
-    labels = [runs[name] for name in _labels(runs)] + ([] if travel is None else [travel.astype(str)])
+    labels = [runs[name] for name in _condition_labels(runs)] + ([] if travel is None else [travel.astype(str)])
     cells = (
         np.array(["|".join(map(str, words)) for words in zip(*labels, strict=True)])
         if labels
@@ -484,7 +484,7 @@ def _condition_columns(runs: Runs, simulated: np.ndarray, travel: np.ndarray | N
     return indicators
 
 
-def _permuted(made: Sequence[tuple[int, _Channel]], seed: int) -> np.ndarray:
+def _permuted_p_values(made: Sequence[tuple[int, _Channel]], seed: int) -> np.ndarray:
     """Smallest p-value of all tests for each table of permuted residuals, shape (permutations,)."""
     random = np.random.default_rng(seed)
     longest = max(len(tested.left) for _, tested in made)
@@ -497,13 +497,13 @@ def _permuted(made: Sequence[tuple[int, _Channel]], seed: int) -> np.ndarray:
     return strongest
 
 
-def _report_cluster(whole: _Units, k: int, test: _Comparison, p: float, alike: Names) -> ResidualCluster:
+def _report_cluster(whole: _ComparisonUnits, k: int, test: _Comparison, p: float, alike: Names) -> ResidualCluster:
     """A finding in the units of its channel."""
     channel, counts = whole.runs.channels[k], whole.counts[:, k]
     cells, residual = whole.runs.extras[test.column][counts], whole.residual[counts, k] / channel.factor
     signed = residual * np.sign(whole.simulated[counts, k]) if test.reversing else residual
     within = whole.runs[test.within][counts] if test.within else np.zeros(int(counts.sum()), str)
-    words, correlation, places = _words(cells), None, cells
+    words, correlation, places = _column_words(cells), None, cells
     words = np.where(words == "", "not stated", words)
     levels: tuple[LevelMean, ...] = ()
     if _is_numeric(cells):
@@ -530,14 +530,14 @@ def _report_cluster(whole: _Units, k: int, test: _Comparison, p: float, alike: N
         correlation,
         p,
         alike,
-        () if _is_numeric(cells) else _coarser(whole, k, test.column, words, within, signed),
+        () if _is_numeric(cells) else _coarser_columns(whole, k, test.column, words, within, signed),
         places,
         signed,
     )
 
 
-def _coarser(
-    whole: _Units, k: int, column: str, words: np.ndarray, within: np.ndarray, residual: np.ndarray
+def _coarser_columns(
+    whole: _ComparisonUnits, k: int, column: str, words: np.ndarray, within: np.ndarray, residual: np.ndarray
 ) -> tuple[tuple[str, float], ...]:
     """Columns that a finding divides further and that explain most of its differences."""
 
@@ -555,8 +555,8 @@ def _coarser(
     for name, cells in whole.runs.extras.items():
         if name == column or _is_numeric(cells[counts]):
             continue
-        coarse = _words(cells[counts])
-        if len(np.unique(coarse)) > 1 and _divides(words, coarse) and all_of_it > 0:
+        coarse = _column_words(cells[counts])
+        if len(np.unique(coarse)) > 1 and _determines(words, coarse) and all_of_it > 0:
             share = between(coarse) / all_of_it
             coarser += [(name, float(share))] if share >= MOSTLY else []
     return tuple(sorted(coarser, key=lambda one: -one[1]))

@@ -216,8 +216,8 @@ class ChannelReadings:
     Attributes:
         measured: [SI], NaN if missing.
         sd: standard deviation of each.
-        before, after: of the robot as given and as calibrated [SI], NaN if it does not reach the row.
-        percent, sigma: errors after.
+        before, after: simulated by the robot as given and as calibrated [SI], NaN if it does not reach the row.
+        percent, sigma: errors after calibration, in % and in σ.
     """
 
     measured: np.ndarray

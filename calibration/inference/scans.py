@@ -202,8 +202,8 @@ def count_outside(scans: dict[int, Scan], z: np.ndarray | None, converged: np.nd
     """Number of converged searches that ended outside the profiles at the best optimum.
 
     Args:
-        z: end of each, shape (searches, parameters), None if not known.
-        converged: of each.
+        z: end of each search, shape (searches, parameters), None if not known.
+        converged: True for each converged search.
     """
     if z is None:
         return 0

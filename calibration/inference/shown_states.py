@@ -121,13 +121,13 @@ def plan_or_lacking(problem: Problem) -> Plan | Lacking:
     slips = [
         k
         for k in speeds[1:]
-        if robot.has_ground and _travels(channels_read[k]) and not _travels(channels_read[motion])
+        if robot.has_ground and _shows_travel(channels_read[k]) and not _shows_travel(channels_read[motion])
     ]
     others = (*slips, *(voltages if imposed == "motor_current" else ()))
-    return Plan(current, motion, not speeds, _travels(channels_read[motion]), others, imposed)
+    return Plan(current, motion, not speeds, _shows_travel(channels_read[motion]), others, imposed)
 
 
-def _travels(channel: Channel) -> bool:
+def _shows_travel(channel: Channel) -> bool:
     """True if a channel shows the motion of the load, not of a shaft."""
     return channel.unit_si in ("m", "m/s")
 
@@ -352,7 +352,7 @@ class _Log:
         times = self.time[rows]
         broken = np.r_[False, np.diff(times) > GAP * self.step][: len(rows)]
         # A reading at the instant of a jump still shows the state before it, as does the first of a run.
-        jumps = np.zeros(0) if delay is None else _jumps(self.observe, run) + delay
+        jumps = np.zeros(0) if delay is None else _jump_times(self.observe, run) + delay
         after = np.searchsorted(times, np.r_[times[:1], jumps] + 1e-9)
         if len(after) * FEWEST < len(rows):  # else a quantity that always jumps is one that changes smoothly
             broken[after[after < len(rows)]] = True
@@ -438,7 +438,7 @@ def rows_and_windows(
         wide, noise = slope_rows(log.time[longest], angle, float(np.median(sds)))
         wide = max(FEWEST, wide // size | 1)
         rate = slopes_of(time, readings[:, plan.motion], apart, wide)
-    way, speed = _ways(problem, plan, conditions, readings, sd, rate, noise)
+    way, speed = _travel_directions(problem, plan, conditions, readings, sd, rate, noise)
     usable = (way != 0) & (joined["stretch"] >= 0)
     piece = np.where(usable, np.cumsum(np.r_[False, (np.diff(apart) != 0) | (np.diff(way) != 0)]), -1)
     if plan.angle:
@@ -484,7 +484,7 @@ def _consistent(weights: np.ndarray, share: np.ndarray, length: float) -> np.nda
     return np.stack([w, *(x + w * (basis @ (normal @ c)) for x, c in zip(weights[1:], change, strict=True))])
 
 
-def _jumps(observe: Any, run: int) -> np.ndarray:
+def _jump_times(observe: Any, run: int) -> np.ndarray:
     """Times of jumps of a run's imposed quantities [s]."""
     conditions, times = observe.conditions, np.asarray(observe.times[run])
     jumps = np.zeros(len(times) - 1, bool)
@@ -497,7 +497,7 @@ def _jumps(observe: Any, run: int) -> np.ndarray:
     return times[1:][jumps]
 
 
-def _ways(
+def _travel_directions(
     problem: Problem,
     plan: Plan,
     conditions: Any,

@@ -165,7 +165,7 @@ def _shown_states(plan: Plan, robot: Robot, row: Rows, shown: Array) -> _Shown:
     return _Shown(turning, current, unit, per_ampere, errors)
 
 
-def _rolling(plan: Plan, robot: Robot, row: Rows, turning: Scalar, current: Scalar) -> tuple[Signals, Scalar]:
+def _rolling_signals(plan: Plan, robot: Robot, row: Rows, turning: Scalar, current: Scalar) -> tuple[Signals, Scalar]:
     """Signals of a row with these states, and its current, which the equations give if no channel shows it."""
     conditions = row.imposed(robot.rig.delay)
     radius = robot.chassis(conditions.configuration).radius
@@ -206,9 +206,9 @@ def row_terms(
                   distance=chassis.radius * row.angle),
         )  # fmt: skip
         if any(e.balance == "slip" and e.name not in probes for e in robot.effects):
-            first = _rolling(plan, robot, row, turning, states.current)[0]
+            first = _rolling_signals(plan, robot, row, turning, states.current)[0]
         turning = turning + balances.effects_sum(robot, first, "slip") * robot.gearbox.ratio / chassis.radius
-    signals, current = _rolling(plan, robot, row, turning, states.current)
+    signals, current = _rolling_signals(plan, robot, row, turning, states.current)
     f, y = [], []
     if plan.electrical:
         # Divided by the inductance, the rate of the current would be mostly noise, and a large inductance fit best.
@@ -250,7 +250,7 @@ def simulated_rows(problem: Problem, plan: Plan, rows: Rows, z: Array) -> Rows:
         (x, idle), (row, reading) = before, given
 
         def rates(x: Array) -> tuple[Array, tuple[Array, Signals]]:
-            signals = _rolling(plan, robot, row, x[0], jnp.append(x, reading[count:])[1])[0]
+            signals = _rolling_signals(plan, robot, row, x[0], jnp.append(x, reading[count:])[1])[0]
             rate = [signals.acceleration_wheel * robot.gearbox.ratio, signals.voltage_left][:count]
             stacked = jnp.stack([jnp.asarray(r, float) for r in rate])
             return stacked, (stacked, signals)
@@ -275,7 +275,7 @@ def simulated_rows(problem: Problem, plan: Plan, rows: Rows, z: Array) -> Rows:
 
 
 @functools.partial(compiled, options=SELDOM)
-def _terms(problem: Problem, plan: Plan, rows: Rows, z: Array, effects: tuple[ScoredEffect, ...]) -> Terms:
+def _row_terms(problem: Problem, plan: Plan, rows: Rows, z: Array, effects: tuple[ScoredEffect, ...]) -> Terms:
     """Returns the terms of each row at coordinates z, with derivatives by base parameters, readings and effects."""
     entering = tuple(dict.fromkeys(e.effect.balance for e in effects if e.effect.balance != "sensor"))
     probes = tuple(balance_probe(b) for b in entering)
@@ -519,7 +519,7 @@ def weak_form(problem: Problem, effects: tuple[ScoredEffect, ...] = ()) -> WeakF
     sd = np.asarray(rows.sd)
 
     def terms(rows: Rows, z: np.ndarray) -> Terms:
-        return jax.device_get(_terms(problem, plan, rows, jnp.asarray(z), effects))  # one program for all of them
+        return jax.device_get(_row_terms(problem, plan, rows, jnp.asarray(z), effects))  # one program for all of them
 
     def whole(factors: list[np.ndarray], given: Terms) -> np.ndarray:
         each = zip(factors, cut, strict=True)
@@ -530,14 +530,14 @@ def weak_form(problem: Problem, effects: tuple[ScoredEffect, ...] = ()) -> WeakF
         smooth = simulated_rows(problem, plan, rows, jnp.asarray(z))
         terms_there = terms(smooth, z)
         read, none = terms(rows, z), np.zeros(equations)
-        plain = [_factor(plan, w, sd, terms_there, none) for w in cut]
+        plain = [_covariance_factor(plan, w, sd, terms_there, none) for w in cut]
         each = [
             (integrals(plan, w, read)[:, 0], np.sum(x**2, 1), np.tile(np.sum(w.weight**2 / w.steps, 1), equations))
             for w, x in zip(cut, plain, strict=True)
         ]
         by_equation = (np.concatenate([x.reshape(equations, -1).T for x in part]) for part in zip(*each, strict=True))
         unknown = disturbances(*by_equation)
-        factors = [_factor(plan, w, sd, terms_there, unknown) for w in cut]
+        factors = [_covariance_factor(plan, w, sd, terms_there, unknown) for w in cut]
         offset = whole(factors, read)[:, 0] - whole(factors, terms_there)[:, 0]
 
         last: list[tuple[np.ndarray, np.ndarray]] = []
@@ -591,7 +591,7 @@ def _slopes(plan: Plan, w: Windows, equations: int) -> list[np.ndarray]:
     return [-w.bend if plan.angle and k == plan.electrical else w.slope for k in range(equations)]
 
 
-def _factor(plan: Plan, w: Windows, sd: np.ndarray, terms: Terms, unknown: np.ndarray) -> np.ndarray:
+def _covariance_factor(plan: Plan, w: Windows, sd: np.ndarray, terms: Terms, unknown: np.ndarray) -> np.ndarray:
     """Factor of the covariance of some windows. `unknown`: torque and voltage without a model (`disturbances`)."""
     equations, (points, channels) = terms.f.shape[1], sd.shape
     by, also = terms.by_reading

@@ -29,7 +29,7 @@ class Part:
     studied: np.ndarray
 
 
-def _sampled(study: Study, unit: np.ndarray, which: np.ndarray) -> np.ndarray:
+def _sampled_scores(study: Study, unit: np.ndarray, which: np.ndarray) -> np.ndarray:
     """Scores of all inputs at points of the unit cube of some of them."""
     whole = np.full((len(unit), len(study.inputs)), 0.5)
     whole[:, which] = unit
@@ -64,7 +64,7 @@ def sobol_indices(study: Study, moving: np.ndarray, evaluations: int, seed: int)
     for which, group in group_points(study, moving).items():
         size = sobol.base_points(evaluations / points, len(which), True)
         design = sobol.sobol_design(len(which), size, seed)
-        scores = _sampled(study, design.points, np.array(which))
+        scores = _sampled_scores(study, design.points, np.array(which))
         for k, made in study.sample(study.values_at(scores), group):
             spent[k] = len(design.points)
             for name in names:
@@ -112,7 +112,7 @@ def morris_screening(study: Study, moving: np.ndarray, evaluations: int, seed: i
     for which, group in group_points(study, moving).items():
         count = max(int(np.ceil(evaluations / points / (len(which) + 1))), 10)
         unit = morris.morris_design(len(which), count, seed)
-        scores = np.array(_sampled(study, 0.025 + 0.95 * unit, np.array(which)))
+        scores = np.array(_sampled_scores(study, 0.025 + 0.95 * unit, np.array(which)))
         # Trajectories have equal steps in the scores, between the ends of the 95 % interval.
         normal = np.arange(d) < len(study.inputs.parameters)
         for j, i in enumerate(which):

@@ -205,15 +205,15 @@ class Model:
             count = min(size, points - first)
             part, rows = values[first : first + count], spread
             if not alike:
-                rows = jax.tree.map(lambda x, f=first, n=count: _padded(x[f : f + n], size), spread)
-            part = function(jnp.asarray(_padded(part, size)), rows)
+                rows = jax.tree.map(lambda x, f=first, n=count: _pad_rows(x[f : f + n], size), spread)
+            part = function(jnp.asarray(_pad_rows(part, size)), rows)
             parts.append({name: np.asarray(x)[:count] for name, x in part.items()})
         if len(parts) == 1:
             return parts[0]
         return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
 
-def _padded(rows: np.ndarray, size: int) -> np.ndarray:
+def _pad_rows(rows: np.ndarray, size: int) -> np.ndarray:
     """Rows padded by repeats of the last to a given size."""
     if len(rows) == size:
         return rows

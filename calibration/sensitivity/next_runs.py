@@ -54,13 +54,13 @@ def choose_runs(information: np.ndarray, count: int) -> Choice:
     count = min(count, candidates)
     chosen: list[int] = []
     for _ in range(count):
-        chosen.append(_best(information, chosen))
+        chosen.append(_best_candidate(information, chosen))
     improved = True
     while improved:
         improved = False
         for place in range(count):
             others = chosen[:place] + chosen[place + 1 :]
-            best = _best(information, others)
+            best = _best_candidate(information, others)
             if _value(information, [*others, best]) > _value(information, chosen) + 1e-9:
                 chosen = [*others, best]
                 improved = True
@@ -79,7 +79,7 @@ def _value(information: np.ndarray, rows: list[int]) -> float:
     return float(np.linalg.slogdet(total)[1])
 
 
-def _best(information: np.ndarray, rows: list[int]) -> int:
+def _best_candidate(information: np.ndarray, rows: list[int]) -> int:
     """Candidate outside `rows` that adds most information to them."""
     total = np.eye(information.shape[1]) + information[rows].sum(0)
     value = np.linalg.slogdet(total + information)[1]

@@ -297,7 +297,7 @@ def size_robot(
         different.setdefault((int(choice.drive[real.rows[k]]), int(choice.cell[real.rows[k]])), k)
     best = [found(real, k) for k in list(different.values())[:8]]
     ideal = int(np.argmin(search.cost(free)))
-    front = [found(real, k) for k in _undominated(real.f[:, columns], good)] if len(columns) == 2 else []
+    front = [found(real, k) for k in _pareto_front(real.f[:, columns], good)] if len(columns) == 2 else []
     return Sizing(
         problem, chosen, objectives[0], unmeetable,
         found(free, ideal) if np.all(free.g[ideal][kept] >= 0) else None,
@@ -383,8 +383,8 @@ class _Search:
         return 5 * np.sum(np.maximum(-drawn.g[:, self.kept], 0.0), axis=1)
 
     def refined(self, rows: np.ndarray, x: np.ndarray, weights: np.ndarray, free: np.ndarray) -> _Designs:
-        """Designs refined on shrinking boxes around them, see `_refine`."""
-        x, count = _refine(self.problem, self.choice, rows, x, self.kept, weights, free)
+        """Designs refined on shrinking boxes around them, see `_refine_designs`."""
+        x, count = _refine_designs(self.problem, self.choice, rows, x, self.kept, weights, free)
         self.evaluated += count
         return self.designs(rows, x)
 
@@ -393,7 +393,7 @@ class _Search:
         choice, misses = self.choice, self.misses(drawn)
         shares = [len(s) for s in np.array_split(np.arange(len(weights)), len(self.columns))]
         picked = [
-            _starts(choice, drawn.rows, np.log(drawn.f[:, c]) + misses, n)
+            _start_designs(choice, drawn.rows, np.log(drawn.f[:, c]) + misses, n)
             for c, n in zip(self.columns, shares, strict=True)
         ]
         rows, x = drawn.rows[np.concatenate(picked)], drawn.x[np.concatenate(picked)]
@@ -421,7 +421,7 @@ class _Search:
         return self.refined(rows, x, w, np.array([0.0, 1.0, 0.0]))
 
 
-def _starts(choice: Space, rows: np.ndarray, merit: np.ndarray, count: int) -> np.ndarray:
+def _start_designs(choice: Space, rows: np.ndarray, merit: np.ndarray, count: int) -> np.ndarray:
     """Best designs as starts: some of each motor, then the best of all, few of one choice."""
     order = np.argsort(np.where(np.isfinite(merit), merit, 1e9))
     motor = [choice.options.drives[d].motor.name for d in choice.drive]
@@ -448,7 +448,7 @@ def _cost(f: np.ndarray, g: np.ndarray, kept: np.ndarray, weights: np.ndarray) -
     return np.where(np.isfinite(value), value + np.where(short > 0, 100 + short, 0.0), 1e6)
 
 
-def _refine(
+def _refine_designs(
     problem: Task,
     choice: Space,
     rows: np.ndarray,
@@ -511,7 +511,7 @@ def _best_buildable(
     return every[best], x[best], len(every)
 
 
-def _undominated(f: np.ndarray, among: list[int]) -> list[int]:
+def _pareto_front(f: np.ndarray, among: list[int]) -> list[int]:
     """Pareto front of two objectives, sorted by the first."""
     order = sorted(among, key=lambda k: (f[k, 0], f[k, 1]))
     front: list[int] = []

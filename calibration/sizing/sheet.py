@@ -178,14 +178,14 @@ def envelope_points(robot: Robot, requirement: Requirement) -> EnvelopePoint:
     )  # fmt: skip
 
 
-def _changed(robot: Robot, rated: Ratings, names: Names, theta: Array) -> tuple[Robot, Ratings]:
+def _robot_with(robot: Robot, rated: Ratings, names: Names, theta: Array) -> tuple[Robot, Ratings]:
     """Robot with parameters from a vector, and its ratings, which include `battery.cells`."""
     values = dict(zip(names, theta, strict=True))
     cells = values.pop(CELLS)
     return params.replace(robot, values), dataclasses.replace(rated, cells=cells)
 
 
-def _unrated(robot: Robot) -> Robot:
+def _robot_without_ratings(robot: Robot) -> Robot:
     """Robot with one cell and default ratings.
 
     Cells and ratings are separate numbers, so that all robots share one program.
@@ -218,7 +218,7 @@ def _quantity_over(
     """Values and outcomes of a quantity over robots (rows of parameters) and points, shape (rows, points)."""
 
     def one(theta: Array, point: EnvelopePoint) -> tuple[Array, Array]:
-        changed, changed_ratings = _changed(robot, rated, names, theta)
+        changed, changed_ratings = _robot_with(robot, rated, names, theta)
         quantity = evaluate_requirement(changed, point, changed_ratings, name)
         return quantity.value, quantity.outcome
 
@@ -230,7 +230,7 @@ def _gradient(robot: Robot, rated: Ratings, names: Names, theta: Array, at: Enve
     """Derivative of a quantity at one point by the parameters."""
 
     def value(theta: Array) -> Array:
-        changed, changed_ratings = _changed(robot, rated, names, theta)
+        changed, changed_ratings = _robot_with(robot, rated, names, theta)
         return evaluate_requirement(changed, at, changed_ratings, name).value
 
     return jax.grad(value)(theta)
@@ -251,7 +251,7 @@ class _QuantityOfRobot:
     def over(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Values in the unit of the name, outcomes, and margins (-inf without a value), shape (rows, points)."""
         r, at, parts = self.requirement, self.at, []
-        robot, rated = _unrated(self.robot), ratings(self.robot)
+        robot, rated = _robot_without_ratings(self.robot), ratings(self.robot)
         for first in range(0, len(rows), ROWS):
             chosen = rows[np.minimum(np.arange(first, first + ROWS), len(rows) - 1)]
             found = jax.device_get(
@@ -332,11 +332,15 @@ def _outcome(held: _QuantityOfRobot) -> Outcome:
     if not counts and status == STATUSES[CONVERGED]:  # a value beyond all bounds: a temperature that never settles
         status = "unbounded"
     return Outcome(
-        r, float(value[k]) if counts else None, float(margin[k]) if counts else None, status, _corner(held, k)
+        r,
+        float(value[k]) if counts else None,
+        float(margin[k]) if counts else None,
+        status,
+        _named_corner(held, k),
     )
 
 
-def _corner(held: _QuantityOfRobot, k: int) -> Json:
+def _named_corner(held: _QuantityOfRobot, k: int) -> Json:
     """A point in the names of a file."""
     r, at = held.requirement, held.at
     e = r.envelope
@@ -399,7 +403,7 @@ def _changes(held: _QuantityOfRobot, outcome: Outcome) -> list[Change]:
     point = jax.tree.map(lambda x: x[worst], held.at)
     slopes = np.asarray(
         _gradient(
-            _unrated(held.robot),
+            _robot_without_ratings(held.robot),
             ratings(held.robot),
             names,
             jnp.asarray(now),
@@ -423,7 +427,7 @@ def _changes(held: _QuantityOfRobot, outcome: Outcome) -> list[Change]:
             continue  # the quantity does not depend on it
         # Without a value the derivative is not informative, so both directions are tried.
         ends = (low, high) if outcome.margin is None or uphill == 0 else (high if uphill > 0 else low,)
-        options = [v for end in ends if (v := _nearest(held, name, now[k], end)) is not None]
+        options = [v for end in ends if (v := _nearest_value(held, name, now[k], end)) is not None]
         if options:
             after = min(options, key=lambda v: abs(math.log(v / now[k])))
             sense = 1 if held.requirement.least else -1
@@ -431,7 +435,7 @@ def _changes(held: _QuantityOfRobot, outcome: Outcome) -> list[Change]:
     return changes
 
 
-def _nearest(held: _QuantityOfRobot, name: str, begin: float, end: float) -> float | None:
+def _nearest_value(held: _QuantityOfRobot, name: str, begin: float, end: float) -> float | None:
     """Value of a parameter nearest to `begin` towards `end` that meets the requirement, None without one."""
     if begin == end:
         return None

@@ -131,10 +131,10 @@ def heated_winding(temperature: float, allowed: float | None) -> str:
     """
     settles = math.isfinite(temperature)
     would = f"would reach {temperature:.0f} °C" if settles else ("would burn out, as its temperature never settles")
-    return f"a winding left on {would}{'' if allowed is None else _allowed(allowed)}"
+    return f"a winding left on {would}{'' if allowed is None else _temperature_limit(allowed)}"
 
 
-def _allowed(temperature: float) -> str:
+def _temperature_limit(temperature: float) -> str:
     """Temperature limit of a winding, if stated."""
     return f" (limit {temperature:.0f} °C)" if temperature < menu.UNLIMITED else ""
 
@@ -153,16 +153,16 @@ def more_runs(what: SimpleNamespace) -> str:
         )
     happens = bases.window_from_name(what.variable)
     if happens is not None:
-        return _again(happens)
+        return _repeat_instruction(happens)
     if what.within.imposed != "voltage":
         by_kind = _of_level(what)
     else:
         by_kind = {} if what.within.has_ground else _of_shaft(what)
     last = f"Repeat with {what.variable.replace('_', ' ')} in small, equal steps over its whole range"
-    return (_usual(what) | by_kind).get(what.variable, last)
+    return (_advice_by_variable(what) | by_kind).get(what.variable, last)
 
 
-def _again(happens: bases.Window) -> str:
+def _repeat_instruction(happens: bases.Window) -> str:
     """The same runs, where something happens for a while or at one level."""
     if happens.axis == "order":
         return (
@@ -196,7 +196,7 @@ def _up_to(most: float, runs: int, unit: str = "", first: str = "") -> str:
     return f" from {first} to {last} in steps of {by}" if first else f" up to {last} in steps of {by}"
 
 
-def _usual(what: SimpleNamespace) -> dict[str, str]:
+def _advice_by_variable(what: SimpleNamespace) -> dict[str, str]:
     """Advice by variable, for a vehicle with an imposed voltage."""
     low, high, within = what.low, what.high, what.within
     load = [f"a payload up to {what.payload:g} kg"] * bool(what.payload > 0)
@@ -220,7 +220,7 @@ def _usual(what: SimpleNamespace) -> dict[str, str]:
         "speed": "Repeat on the level, unladen, with the travelling speed in equal steps from a crawl to its "
         f"maximum, about {within.speed:.2g} m/s at {high:g} V",
         "time": f"Record one condition for ten minutes from a cold start, at no more than {low:g} V, and repeat "
-        f"it at once while everything is warm; watch the winding's temperature{_allowed(within.hot)}",
+        f"it at once while everything is warm; watch the winding's temperature{_temperature_limit(within.hot)}",
         "order": "Repeat the table in reverse order, and repeat one condition after every fifth run",
     }
 

@@ -73,7 +73,7 @@ def _verdict(said: loop_notes.Summary) -> str:
     if said.verdict in WITHOUT_NAME and where is not None:
         mechanism = said.mechanism
         if said.verdict == "mechanism" and mechanism is not None:
-            within = _within(where) if where.family in mechanism.families else ""
+            within = _window_words(where) if where.family in mechanism.families else ""
             text = f"Missing: {_mechanism(mechanism, within)} ({_evidence(said)}). "
             text += "No law of the library is established."
         else:
@@ -86,7 +86,7 @@ def _verdict(said: loop_notes.Summary) -> str:
             text += f" The nearest {'candidate is' if one else 'candidates are'} {' and '.join(said.nearest)}, but "
             text += f"{'it is' if one else 'they are'} not supported by the tests."
         return text
-    names = [_named(one) for one in said.missing if one.established]
+    names = [_effect_and_rivals(one) for one in said.missing if one.established]
     in_model = _tentative([one for one in said.missing if not one.established], said.support)
     left = "" if where is None else f" An unexplained error remains in the {bases.place_in_words(where.place)}."
     return f"Missing: {'; '.join(names)} ({_evidence(said)}).{in_model}{left}"
@@ -255,7 +255,7 @@ def at_other_noise(found: Sequence[Sensitivity]) -> str:
     return "; ".join(each) + near
 
 
-def _named(one: loop_notes.Missing) -> str:
+def _effect_and_rivals(one: loop_notes.Missing) -> str:
     """An effect, with what it cannot be told from."""
     readings = [with_article(f) for f in one.families[1:] if f.startswith("reading")]
     if len(one.names) + len(one.values) + len(readings) == 1:
@@ -272,9 +272,9 @@ def _tentative(those: Sequence[loop_notes.Missing], support: loop_notes.NameSupp
     if not those:
         return ""
     each = [
-        f"{_named(one)}, which {effect_doubts(one.test)}"
+        f"{_effect_and_rivals(one)}, which {effect_doubts(one.test)}"
         if effect_doubts(one.test)
-        else f"{_named(one)} ({support_reasons(support)})"
+        else f"{_effect_and_rivals(one)} ({support_reasons(support)})"
         for one in those
     ]
     return f" Tentative, kept in the model because it improves predictions: {'; '.join(each)}."
@@ -352,7 +352,7 @@ def _shown(where: DiscrepancyLocation) -> str:
     return shown_over(where.variable, where.by_duty) + (f" (as well {', '.join(well)})" if well else "")
 
 
-def _within(where: DiscrepancyLocation) -> str:
+def _window_words(where: DiscrepancyLocation) -> str:
     """The window of what happens for a while, after a comma, empty for other discrepancies."""
     return "" if bases.window_from_name(where.variable) is None else f", {_shown(where)}"
 
@@ -528,7 +528,7 @@ def support_reasons(support: loop_notes.NameSupport | None) -> str:
     return REASONS[support.why].format(
         effects=" and ".join(support.effects),
         curves=" and ".join(map(_curve, support.curves)),
-        strengths=", ".join(map(_strength, support.tests)),
+        strengths=", ".join(map(_score_words, support.tests)),
         lost="; ".join(f"{t.effect} {effect_doubts(t)}" for t in support.tests if t.fails),
     )
 
@@ -542,7 +542,7 @@ def naming_reasons(found: DiscoveryResult) -> str:
     return "; ".join([REASONS["curve alone"].format(curves=_curve(over)), *[reasons] * bool(reasons)])
 
 
-def _strength(test: loop_notes.NameTest) -> str:
+def _score_words(test: loop_notes.NameTest) -> str:
     """Score of an effect, with the threshold of chance and the score without its strongest row."""
     less = "" if test.row is None else f", without {test.what} {test.row} {test.root_without:.1f}"
     return f"{test.effect} {test.root:.1f} σ (chance {test.needed:.1f}{less})"
@@ -568,7 +568,7 @@ def effect_doubts(test: loop_notes.NameTest | None) -> str:
     """Reasons against an effect, empty for none."""
     if test is None or not test.fails:
         return ""
-    over = ", ".join(_over(c.place, *c.variables) for c in test.curves)
+    over = ", ".join(_place_over(c.place, *c.variables) for c in test.curves)
     doubts = {"beside": over and f" next to smooth curves ({over})", "larger": " and ".join(test.larger)}
     doubts |= {"over_variable": test.over.replace("_", " ")}
     doubts["spread"] = f" by ±{100 * test.spread:.0f} %" if math.isfinite(test.spread) else ""
@@ -579,10 +579,10 @@ def effect_doubts(test: loop_notes.NameTest | None) -> str:
 def _curve(c: loop_notes.CurveOver) -> str:
     if bases.window_from_name(c.variables[0]) is not None:
         return f"constant in the {bases.place_in_words(c.place)} {shown_over(c.variables[0])}"
-    return f"smooth {'curve' if len(c.variables) == 1 else 'surface'} in the {_over(c.place, *c.variables)}"
+    return f"smooth {'curve' if len(c.variables) == 1 else 'surface'} in the {_place_over(c.place, *c.variables)}"
 
 
-def _over(place: str, *variables: str) -> str:
+def _place_over(place: str, *variables: str) -> str:
     """`slip balance over speed motor and slope`."""
     return f"{bases.place_in_words(place)} over {' and '.join(v.replace('_', ' ') for v in variables)}"
 
@@ -699,7 +699,7 @@ def rising_errors_sentence(found: Sequence[Worse], predicted: Mapping[str, tuple
     parts = []
     for kind, (before, after) in predicted.items():
         mine = [w for w in found if w.kind == kind]
-        changes = [f"{channels.find_channel(w.channel).label} {_change(w.before, w.after)} %" for w in mine]
+        changes = [f"{channels.find_channel(w.channel).label} {_two_numbers(w.before, w.after)} %" for w in mine]
         if mine:
             changes[-1] += f" (same {min(w.rows for w in mine)} rows)"
         if before > after:
@@ -709,7 +709,7 @@ def rising_errors_sentence(found: Sequence[Worse], predicted: Mapping[str, tuple
     return f"Predicts worse on held-out rows: {'; '.join(parts)}." if parts else ""
 
 
-def _change(before: float, after: float) -> str:
+def _two_numbers(before: float, after: float) -> str:
     """Two numbers with as many digits as tell them apart."""
     texts = [(f"{before:.{k}f}", f"{after:.{k}f}") for k in range(1, 6)]
     return " → ".join(next((pair for pair in texts if pair[0] != pair[1]), texts[-1]))

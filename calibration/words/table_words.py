@@ -130,7 +130,7 @@ def off_by(column: str, unit: str, factor: float, units: Names, others: Names, i
     """Readings that no robot like this one shows."""
     off, size = (factor, "large") if factor > 1 else (1 / factor, "small")
     what = f"{column}: readings are about {float(f'{off:.2g}'):g} times too {size} for this robot"
-    alike = f"; {' and '.join(others)} are off by as much: check {imposed} and the robot's file" if others else ""
+    alike = f"; the same factor in {' and '.join(others)}: check {imposed} and the robot's file" if others else ""
     if units:
         return f"{what}; are they in {' or '.join(units)}? expected {unit}{alike}"
     return f"{what}{alike}" if others else f"{what}; check the unit, {unit}, and the robot's file"
@@ -159,9 +159,17 @@ SAID: dict[str, str | Callable[..., str]] = {
     '{column} = {{column = "{theirs}", factor = -1}}',
     "stiff_supply": "{column} is {value:g} in every row: treated as a stiff supply; if it was not "
     "measured, remove the column",
-    "lost_motion": "{source}, {column}: at each of {reversals} reversals about {width:.2g} {unit} are lost that "
-    "friction, inertia and delay do not explain: backlash or a compliant coupling; set backlash = "
-    '"{angle:.2g} ± 30 %" (rad at the output) in the load\'s table of the robot file',
+    "lost_motion": lambda source, column, reversals, width, unit, angle, stiffness: (
+        f"{source}, {column}: "
+        + (
+            f"the output lags the motor by {width:.2g} {unit} rms in proportion to its acceleration: a compliant "
+            f'coupling, perhaps with backlash; set damping and stiffness = "{stiffness:.2g} ± 50 %" (N·m/rad'
+            if stiffness
+            else f"at each of {reversals} reversals about {width:.2g} {unit} are lost that friction, inertia and "
+            f'delay do not explain: backlash or a compliant coupling; set backlash = "{angle:.2g} ± 30 %" (rad'
+        )
+        + " at the output) in the load's table of the robot file"
+    ),
     "ends_early": ends_early,
     "never_grips": lambda runs, share: (
         f"{_runs(runs, 'never grips', 'never grip')}: in the end the robot travels at {share:.0%} of the speed of "

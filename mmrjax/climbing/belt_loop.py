@@ -113,8 +113,8 @@ class Loop(eqx.Module):
         on_first, on_second = along < 0, along > self.run
         height = jnp.where(
             on_first,
-            _size(at) - self.first,
-            jnp.where(on_second, _size(from_second) - self.second, at[..., 0] * sin + beside * cos - self.first),
+            _norm(at) - self.first,
+            jnp.where(on_second, _norm(from_second) - self.second, at[..., 0] * sin + beside * cos - self.first),
         )
         straight = jnp.where(upper, b + along, jnp.mod(a - along, self.length))
         place = jnp.where(
@@ -190,5 +190,5 @@ def running_direction(normal: Array) -> Array:
     return jnp.stack([normal[..., 1], -normal[..., 0]], axis=-1)
 
 
-def _size(vector: Array) -> Array:
+def _norm(vector: Array) -> Array:
     return jnp.sqrt(jnp.sum(vector**2, axis=-1) + 1e-300)

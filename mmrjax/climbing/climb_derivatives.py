@@ -116,9 +116,9 @@ class Derivatives(NamedTuple):
 
     Attributes:
         climb: the run.
-        found: its outputs.
-        by: their derivatives, of shape (values,).
-        slope, slope_sd: of straight lines through `BESIDE` runs along each value, and their standard deviations.
+        found: outputs of the run.
+        by: derivatives of the outputs, of shape (values,). slope, slope_sd: slopes and standard deviations of
+        straight lines through `BESIDE` runs along each value, and their standard deviations.
     """
 
     climb: Climb
@@ -147,8 +147,8 @@ def climb_derivatives(
     directions = jnp.eye(len(values))
     parts, samples, steps = climb.divide_run(duration, step, sample, part)
     interval, each = jnp.asarray(step, float), jnp.asarray(steps)
-    run, turned = _along(given, values, directions)
-    state, moved = _along(functools.partial(_initial, step=interval), run, turned)
+    run, turned = _value_and_derivatives_along(given, values, directions)
+    state, moved = _value_and_derivatives_along(functools.partial(_initial, step=interval), run, turned)
     records: list[Any] = []
     for k in range(parts):
         first = jnp.asarray(k * samples * steps * step)
@@ -166,7 +166,7 @@ def climb_derivatives(
     ran = jax.tree.map(jnp.asarray, whole.run(0))
     count = len(ran.time)
     top = crest_sample(run.terrain, ran, verdict == OVER)
-    gradients, by = _along(
+    gradients, by = _value_and_derivatives_along(
         lambda run_of: climb_outputs(run_of[0].robot, run_of[0].terrain, run_of[1], top),
         (run, ran),
         (turned, jax.tree.map(lambda x: x[:, :count], changed)),
@@ -199,7 +199,7 @@ def outputs_of_run(robot: Robot, terrain: Terrain, ended: Climb, k: int) -> Scal
     return climb_outputs(robot, terrain, record, crest_sample(terrain, record, bool(ended.verdict[k] == OVER)))
 
 
-def _along(function: Callable[[Any], Any], at: Any, directions: Any) -> tuple[Any, Any]:
+def _value_and_derivatives_along(function: Callable[[Any], Any], at: Any, directions: Any) -> tuple[Any, Any]:
     """A function's value and its derivatives along `directions`, leaves with a leading axis (None: zero)."""
     numbers, rest = eqx.partition(at, eqx.is_inexact_array)
     further: list[Any] = []
@@ -229,4 +229,4 @@ def _sampled(at: tuple[ClimbInputs, Any], first: Scalar, step: Scalar, steps: Sc
 @functools.partial(compiled, options=SELDOM)
 def _part(at: Any, directions: Any, first: Scalar, step: Scalar, steps: Scalar, samples: int) -> Any:
     along = functools.partial(_sampled, first=first, step=step, steps=steps, samples=samples)
-    return _along(along, at, directions)
+    return _value_and_derivatives_along(along, at, directions)

@@ -83,7 +83,7 @@ class Sequence(eqx.Module):
     @property
     def first(self) -> Pair:
         """Initial ψ of both levers [rad]."""
-        return _turned(*(self.asked(-jnp.inf, 0.0) if self.begins is None else self.begins))
+        return _convert_lever_angles(*(self.asked(-jnp.inf, 0.0) if self.begins is None else self.begins))
 
     def asked(self, place: Scalar, time: Scalar) -> tuple[Array, Array]:
         """Demanded angles of front and rear [rad], or voltages of their motors, positive up [V]."""
@@ -91,7 +91,7 @@ class Sequence(eqx.Module):
         return jnp.interp(abscissa, self.at, self.front), jnp.interp(abscissa, self.at, self.rear)
 
 
-def _turned(front: Array, rear: Array) -> Pair:
+def _convert_lever_angles(front: Array, rear: Array) -> Pair:
     """Converts between ψ of both levers and their angles, see `footing` [rad]."""
     return jnp.stack([front, jnp.pi - rear])
 
@@ -134,7 +134,7 @@ class ClimbRecord(eqx.Module):
             motor, up.
         holds: 1 if only its worm holds a pair, without current [-].
         energy: energy in and lost, by the names of `SOURCES` and `LOSSES`, of the whole robot [J].
-        stored: in motion, height, contacts and windings, of the whole robot [J].
+        stored: energy stored in motion, height, contacts and windings of the whole robot [J].
         body: share of all normal force that the body carries [-].
         grip: traction of all rolling contacts over the limit of their friction [-].
         carried: share of the weight that all contacts carry [-].
@@ -336,7 +336,7 @@ def _lever_loss(run: System, speed: Array) -> Array:
     return jnp.asarray(run.lever_track.torque_loss(speed, rolls))
 
 
-def _loaded(run: System, motion: Motion) -> System:
+def _with_lever_current(run: System, motion: Motion) -> System:
     """The run with the current of the levers' motors added to the battery's other consumers, I_s of eq. (10)."""
     battery = run.robot.battery
     battery = dataclasses.replace(battery, current_other=battery.current_other + motion.drawn)
@@ -349,12 +349,12 @@ def demanded_lever_rates(run: System, motion: Motion, time: Scalar) -> Pair:
     They lead to the sequence's angles, limited by the levers' rate. Levers at their angle stand.
     """
     rate = run.robot.running_gear.levers.rate
-    toward = (_turned(*run.sequence.asked(motion.q[0], time)) - motion.q[LED]) / (4 * _SWINGS)
+    toward = (_convert_lever_angles(*run.sequence.asked(motion.q[0], time)) - motion.q[LED]) / (4 * _SWINGS)
     speed = motion.v[LED] + run.step / _SWINGS * (jnp.clip(toward, -rate, rate) - motion.v[LED])
     return jnp.where((jnp.abs(toward) < _STILL) & (jnp.abs(motion.v[LED]) < _STILL), 0.0, speed)
 
 
-def _swung(run: System, motion: Motion, time: Scalar, source: Scalar, free: Array, yields: Array) -> Swing:
+def _drive_action(run: System, motion: Motion, time: Scalar, source: Scalar, free: Array, yields: Array) -> Swing:
     """Action of the drives on the levers in a step, without it they have the rates `free` afterwards [rad/s]."""
     levers, sequence = run.robot.running_gear.levers, run.sequence
     most = jnp.abs(source) if sequence.supply is None else sequence.supply
@@ -366,7 +366,7 @@ def _swung(run: System, motion: Motion, time: Scalar, source: Scalar, free: Arra
         front, rear = sequence.asked(motion.q[0], time)
         low = high = jnp.clip(jnp.stack([front, -rear]), low, high)
     # beyond its range a lever is not driven further
-    angles = _turned(*motion.q[LED])
+    angles = _convert_lever_angles(*motion.q[LED])
     above, below = angles > levers.angle_most + 1e-3, angles < levers.angle_least - 1e-3
     up, down = jnp.stack([above[0], below[1]]), jnp.stack([below[0], above[1]])
     low, high = (jnp.where(up, jnp.minimum(x, 0.0), jnp.where(down, jnp.maximum(x, 0.0), x)) for x in (low, high))
@@ -383,7 +383,7 @@ def advance_climb(run: System, motion: Motion, time: Scalar, energy: Energy) -> 
     Returns:
         Motion and energy after the step, and the record of the instant before it.
     """
-    run, on = _loaded(run, motion), jnp.clip((time - SETTLES) / RISES, 0.0, 1.0)
+    run, on = _with_lever_current(run, motion), jnp.clip((time - SETTLES) / RISES, 0.0, 1.0)
     signals, touching, pulled, share = climb_instant(run, motion, on)
     robot, step, radius = run.robot, run.step, run.shape.main.first
     matrix, bias, height = mass_matrix_and_bias(run, motion.q, motion.v)
@@ -415,7 +415,7 @@ def advance_climb(run: System, motion: Motion, time: Scalar, energy: Energy) -> 
         left[0, 0] * left[1, 1] - left[0, 1] * left[1, 0]
     )
     alone = motion.v[LED] + inverse @ (pushed[4:] - whole[4:, :4] @ moved)
-    swung = _swung(run, motion, time, signals.voltage_source, alone, step * inverse / robot.sides)
+    swung = _drive_action(run, motion, time, signals.voltage_source, alone, step * inverse / robot.sides)
     led = swung.rate - motion.v[LED]
     gained = jnp.concatenate([moved - coupling @ led, led])
     v = motion.v + gained
@@ -476,12 +476,12 @@ def advance_climb(run: System, motion: Motion, time: Scalar, energy: Energy) -> 
         grip=jnp.sum(jnp.abs(pulled.force) * touching.rolls) / jnp.maximum(held, 1e-9),
         carried=total / (GRAVITY * matrix[0, 0]),
         centre=centre,
-        base=_base(centre, touching),
+        base=_contact_ends(centre, touching),
     )
     return after, spent, passed
 
 
-def _base(centre: Scalar, at: Footing) -> Pair:
+def _contact_ends(centre: Scalar, at: Footing) -> Pair:
     """Distances of the outermost contacts behind and ahead of the centre of mass [m], assuming level ground below."""
     bears, ahead = at.force > 0, at.place - centre
     return jnp.stack([jnp.max(jnp.where(bears, way, -jnp.inf)) for way in (-ahead, ahead)])
@@ -532,7 +532,7 @@ def stand_before_obstacle(run: System, clear: float = 0.1) -> Motion:
     return Motion(q, jnp.zeros(COORDINATES), zero, run.conditions.discharge + zero, zero)
 
 
-def _judged(
+def _update_verdict(
     run: System, before: Motion, passed: ClimbRecord, motion: Motion, progress: Progress
 ) -> tuple[Motion, Progress]:
     """Updates the verdict of a run after a sample. A run that has ended keeps its state."""
@@ -571,7 +571,7 @@ def begin_climb(run: System, motion: Motion | None = None) -> tuple[Motion, Ener
 
     The verdict is `failed` if the levers would begin below the ground, else the run goes on.
     """
-    angles, gear = _turned(*run.sequence.first), run.shape.gear
+    angles, gear = _convert_lever_angles(*run.sequence.first), run.shape.gear
     under = roller_clearance(run.shape.main.first + gear.grouser_height, gear, angles) < -ON_GROUND
     buried = jnp.any(under & (run.shape.on_tracks > 0.5)) & (motion is None)
     motion = stand_before_obstacle(run) if motion is None else motion
@@ -600,7 +600,7 @@ def advance_samples(run: System, state: Any, first: Scalar, steps: Scalar, sampl
         nothing = jax.tree.map(lambda x: jnp.full(x.shape, -jnp.inf, x.dtype), nothing)
         after, spent, passed = jax.lax.fori_loop(0, steps, small, (motion, energy, nothing))
         ended = progress.verdict != _RUNNING
-        after, progress = _judged(run, motion, passed, after, progress)
+        after, progress = _update_verdict(run, motion, passed, after, progress)
         kept = jax.tree.map(lambda new, old: jnp.where(ended, old, new), spent, energy)
         return (after, kept, progress), passed
 
@@ -640,7 +640,7 @@ class Climb(eqx.Module):
         return jax.tree.map(lambda x: x[k, :count], self.record)
 
 
-def _alike(robot: Robot) -> int | None:
+def _robot_axis(robot: Robot) -> int | None:
     """Axis of the runs in a robot's parameters, None if all runs have one robot."""
     return 0 if jnp.ndim(robot.sides) else None
 
@@ -652,7 +652,7 @@ def _begin(
     def one(robot: Robot, conditions: Conditions, terrain: Terrain, sequence: Sequence, motion: Motion | None) -> Any:
         return begin_climb(climb_system(robot, conditions, terrain, sequence, step), motion)
 
-    return jax.vmap(one, in_axes=(_alike(robot), 0, 0, 0, 0))(robot, conditions, terrain, sequence, motion)
+    return jax.vmap(one, in_axes=(_robot_axis(robot), 0, 0, 0, 0))(robot, conditions, terrain, sequence, motion)
 
 
 def _part(
@@ -662,7 +662,7 @@ def _part(
     def one(robot: Robot, conditions: Conditions, terrain: Terrain, sequence: Sequence, state: Any) -> Any:
         return advance_samples(climb_system(robot, conditions, terrain, sequence, step), state, first, steps, samples)
 
-    each = (_alike(robot), 0, 0, 0, 0)
+    each = (_robot_axis(robot), 0, 0, 0, 0)
     parts: tuple[Any, ClimbRecord] = jax.vmap(one, in_axes=each)(robot, conditions, terrain, sequence, state)
     return parts
 

@@ -40,7 +40,7 @@ class Shape(eqx.Module):
         main, lever: the belts of one side. Both levers have equal ones.
         gear: the running gear.
         on_tracks: 1 if levers carry load, 0 if wheels do [-].
-        wheel: their radius [m].
+        wheel: radius of the wheels [m].
         belly: height of the body's underside over the axles [m].
     """
 
@@ -84,14 +84,14 @@ class Footing(eqx.Module):
 
     Attributes:
         gap: distance [m].
-        gap_rate: its rate [m/s].
+        gap_rate: rate of the gap [m/s].
         normal: normal of the robot's contact, out of the ground.
         off, along: change of the contact's speed off the ground and along it (forward on level ground) per
             velocity of `COORDINATES`.
         carried: along it with the belts at rest.
         force: normal force [N].
-        damped: its decrease with the gap's rate [N·s/m].
-        elastic: its recoverable part [N].
+        damped: decrease of the force with the gap's rate [N·s/m].
+        elastic: recoverable part of the force [N].
         energy: stored in it [J].
         guided: share that passes to the lower guide [-].
         rolls: 1 but for the body [-].
@@ -140,14 +140,14 @@ def part_frames(shape: Shape, q: Sequence[Scalar] | Array) -> tuple[Frame, Frame
     return body, levers[0], levers[1]
 
 
-def _guided(shape: Shape, place: Array) -> Array:
+def _guided_share(shape: Shape, place: Array) -> Array:
     """Share of a load on the main belt at `place` that passes to the lower guide [-], as in `belt.tips_on_path`."""
     run, length = shape.main.run, shape.main.length
     off = jnp.minimum(place, length - place)  # from the middle of the lower run
     return jnp.asarray(contact.cubic_step(run / 2 - off, 0.0, 0.0, shape.gear.guide_gap, 1.0))
 
 
-def _belt(shape: Shape, terrain: Terrain, belt: Loop, frame: Frame, drawn: Scalar, bears: Scalar) -> list[_Group]:
+def _on_belt(shape: Shape, terrain: Terrain, belt: Loop, frame: Frame, drawn: Scalar, bears: Scalar) -> list[_Group]:
     """Grousers on the ground, and corners of the ground on the belt between grousers and on their flanks."""
     radius, main = shape.main.first, frame.turns is None
     place = belt.places(drawn)
@@ -156,7 +156,7 @@ def _belt(shape: Shape, terrain: Terrain, belt: Loop, frame: Frame, drawn: Scala
     gap, normal = terrain.distance(points)
 
     def group(at: Array, gap: Array, normal: Array, rate: Array, place: Array) -> _Group:
-        guided = _guided(shape, place) if main else jnp.zeros_like(gap)
+        guided = _guided_share(shape, place) if main else jnp.zeros_like(gap)
         return _Group(at, gap, normal, radius * rate, frame.turns, guided, bears * jnp.ones_like(gap))
 
     groups = [group(points, gap, normal, frame.along(tips.rate), place)]
@@ -169,7 +169,7 @@ def _belt(shape: Shape, terrain: Terrain, belt: Loop, frame: Frame, drawn: Scala
     return groups
 
 
-def _wheels(shape: Shape, terrain: Terrain, body: Frame) -> list[_Group]:
+def _on_wheels(shape: Shape, terrain: Terrain, body: Frame) -> list[_Group]:
     """Wheels on edges of the ground and on its corners."""
     a, b = terrain.points[:-1], terrain.points[1:]
     along = b - a
@@ -197,7 +197,7 @@ def _wheels(shape: Shape, terrain: Terrain, body: Frame) -> list[_Group]:
 FAR_OFF = 1e3
 
 
-def _body(shape: Shape, terrain: Terrain, body: Frame) -> _Group:
+def _under_body(shape: Shape, terrain: Terrain, body: Frame) -> _Group:
     """Corners under the body."""
     local = body.within(terrain.corners)
     over = jnp.abs(local[:, 0]) < shape.half
@@ -212,13 +212,13 @@ def footing(shape: Shape, terrain: Terrain, q: Array, v: Array) -> Footing:
     body, front, rear = part_frames(shape, q)
     radius = shape.main.first
     rear_axle = body._replace(origin=rear.origin)  # origin of the main belt's loop
-    groups = _belt(shape, terrain, shape.main, rear_axle, radius * q[SHAFT], jnp.ones(()))
+    groups = _on_belt(shape, terrain, shape.main, rear_axle, radius * q[SHAFT], jnp.ones(()))
     for lever in (front, rear):
         assert lever.turns is not None
         drawn = radius * (q[SHAFT] + q[lever.turns])
-        groups += _belt(shape, terrain, shape.lever, lever, drawn, shape.on_tracks)
-    groups += _wheels(shape, terrain, body)
-    groups.append(_body(shape, terrain, body))
+        groups += _on_belt(shape, terrain, shape.lever, lever, drawn, shape.on_tracks)
+    groups += _on_wheels(shape, terrain, body)
+    groups.append(_under_body(shape, terrain, body))
 
     points, normal, rate = (jnp.concatenate([getattr(g, name) for g in groups]) for name in ("at", "normal", "rate"))
     gap, guided, bears = (jnp.concatenate([getattr(g, name) for g in groups]) for name in ("gap", "guided", "bears"))
@@ -226,12 +226,12 @@ def footing(shape: Shape, terrain: Terrain, q: Array, v: Array) -> Footing:
     along = belt_loop.running_direction(normal)
     carried, own_loads = [], []
     for direction in (normal, along):
-        columns = [direction[:, 0], direction[:, 1], _turned(direction, points - body.origin)]
+        columns = [direction[:, 0], direction[:, 1], _speed_about_axle(direction, points - body.origin)]
         belt = jnp.sum(direction * rate, axis=1)
         levers, with_belt = [], []
         for lever in (front, rear):
             on = np.concatenate([np.full(len(g.gap), g.turns == lever.turns) for g in groups])
-            turned = jnp.where(on, -_turned(direction, points - lever.origin), 0.0)
+            turned = jnp.where(on, -_speed_about_axle(direction, points - lever.origin), 0.0)
             levers.append(turned)
             with_belt.append(turned + jnp.where(on, belt, 0.0))
         carried.append(jnp.stack([*columns, 0 * belt, *levers], axis=1))
@@ -259,7 +259,7 @@ def footing(shape: Shape, terrain: Terrain, q: Array, v: Array) -> Footing:
     )
 
 
-def _turned(direction: Array, arm: Array) -> Array:
+def _speed_about_axle(direction: Array, arm: Array) -> Array:
     """Speed along directions of points at `arm` that rotate about an axle nose down, per angular speed [m]."""
     return direction[:, 0] * arm[:, 1] - direction[:, 1] * arm[:, 0]
 

@@ -85,8 +85,7 @@ class Swing(NamedTuple):
 
     Attributes:
         torque: torque on the levers [N·m].
-        rate: after the step [rad/s].
-        voltage, current: voltage and current of their motors [V], [A].
+        rate: angular speed after the step [rad/s]. voltage, current: voltage and current of their motors [V], [A].
         holds: True if only its worm holds a pair, without current.
     """
 
@@ -119,7 +118,7 @@ def step_levers(
     Args:
         step: [s].
         rate: rate before it [rad/s].
-        free: after it, of levers without torque [rad/s].
+        free: angular speed after the step without torque [rad/s].
         yields: [rad/(N·m·s)].
         asked: demanded rates after it [rad/s].
         least, most: voltages of the motors [V].

@@ -28,7 +28,7 @@ class Terrain(eqx.Module):
     """A polyline of ground.
 
     Attributes:
-        points: its vertices [m]. Repeated vertices count once.
+        points: vertices of the polyline [m]. Repeated vertices count once.
         nose: radius of its convex corners [m].
         finish: x of the end of the obstacle [m].
     """
@@ -41,7 +41,7 @@ class Terrain(eqx.Module):
     def corners(self) -> Float[Array, "corners 2"]:
         """Convex corners, centres of the noses [m]. Concave ones are out of reach."""
         before, middle, after = self.points[:-2], self.points[1:-1], self.points[2:]
-        turn = _cross(middle - before, after - middle)
+        turn = _cross_product(middle - before, after - middle)
         # A repeated vertex has no edge; its next different vertex gives the direction.
         return jnp.where((turn < -1e-15)[:, None], middle, jnp.asarray(_NOWHERE))
 
@@ -49,7 +49,7 @@ class Terrain(eqx.Module):
         """True for points below the polyline."""
         a, b = self.points[:-1], self.points[1:]
         under = (at[:, None, 0] >= a[:, 0]) & (at[:, None, 0] < b[:, 0])
-        return jnp.any(under & (_cross(b - a, at[:, None] - a) < 0), axis=1)
+        return jnp.any(under & (_cross_product(b - a, at[:, None] - a) < 0), axis=1)
 
     def distance(self, at: Float[Array, "n 2"]) -> tuple[Float[Array, " n"], Float[Array, "n 2"]]:
         """Distance of points from the ground [m], negative within it, and the ground's normal at the nearest point.
@@ -73,7 +73,7 @@ class Terrain(eqx.Module):
         return jnp.where(within, jnp.sum(edge * off, axis=1), sign * length) - self.nose, normal
 
 
-def _cross(a: Array, b: Array) -> Array:
+def _cross_product(a: Array, b: Array) -> Array:
     return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
 
 

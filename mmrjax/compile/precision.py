@@ -63,8 +63,8 @@ def in_double(function: Callable[P, T]) -> Callable[P, T]:
         if is_double() or in_trace(args, named):
             return function(*args, **named)
         with jax.enable_x64(True):
-            given: Any = [_widened(x) for x in args]
-            by_name: Any = {name: _widened(x) for name, x in named.items()}
+            given: Any = [_in_double_precision(x) for x in args]
+            by_name: Any = {name: _in_double_precision(x) for name, x in named.items()}
             return on_host(function(*given, **by_name))
 
     return call
@@ -93,7 +93,7 @@ def as_floats(tree: T) -> T:
     return jax.tree.map(cast, tree)
 
 
-def _widened(argument: Any) -> Any:
+def _in_double_precision(argument: Any) -> Any:
     """Returns a module with its floating-point numbers as JAX arrays in double precision, others unchanged."""
     return as_floats(argument) if isinstance(argument, eqx.Module) else argument
 

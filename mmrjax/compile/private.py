@@ -21,7 +21,7 @@ def exposure_reason(folder: Path) -> str:
     place = folder.absolute()
     try:
         for part in (place, *place.parents):
-            if part.exists() and (reason := _reason(part, part == place)):
+            if part.exists() and (reason := _folder_exposure_reason(part, part == place)):
                 return reason
         if place.resolve() != place:
             return exposure_reason(place.resolve())
@@ -33,7 +33,7 @@ def exposure_reason(folder: Path) -> str:
     return ""
 
 
-def _reason(part: Path, itself: bool) -> str:
+def _folder_exposure_reason(part: Path, itself: bool) -> str:
     """Reason why another user could replace a folder above, or place files in the folder itself."""
     state = part.stat(follow_symlinks=itself)
     if state.st_uid != os.geteuid() and (itself or state.st_uid != 0):

@@ -61,7 +61,7 @@ class Unnamed(Exception):
     """Raised for arguments that have no name in other processes."""
 
 
-class _Place:
+class _ArrayPlaceholder:
     """Placeholder of an array in a result."""
 
 
@@ -71,7 +71,7 @@ class Program:
 
     Attributes:
         executable: maps the list of arrays among the arguments to the list of arrays in the result.
-        result: result of the function, with a `_Place` for every array.
+        result: result of the function, with a `_ArrayPlaceholder` for every array.
     """
 
     executable: Callable[..., list[Any]]
@@ -80,7 +80,7 @@ class Program:
     def __call__(self, arguments: Any) -> Any:
         """Calls the function with arguments of this structure."""
         outputs = iter(self.executable(*_arrays(jax.tree.leaves(arguments))))
-        return jax.tree.map(lambda x: next(outputs) if isinstance(x, _Place) else x, self.result)
+        return jax.tree.map(lambda x: next(outputs) if isinstance(x, _ArrayPlaceholder) else x, self.result)
 
 
 def compile_with_options(lowered: Any, options: dict[str, Any]) -> Any:
@@ -120,7 +120,7 @@ class Programs:
     def of_structure(self, structure: Hashable | None, arguments: tuple[tuple, dict[str, Any]]) -> Program | None:
         """The program for arguments of known structure (`structure_of`), None if it may not be stored."""
         folder = os.environ.get(VARIABLE, "")
-        if structure is None or not folder or not _keeps() or not _private(folder):
+        if structure is None or not folder or not _may_store_programs() or not _folder_is_private(folder):
             return None
         existing = self._found.get(structure)
         if existing is not None:
@@ -147,7 +147,7 @@ class Programs:
     def _obtained(self, folder: Path, leaves: list[Any], tree: Any) -> Callable[[], Program | None]:
         """Returns a function that gives the program: read from the folder, or traced here, compiled and stored."""
         try:
-            name = _name(self.function, tree.unflatten([_shape(x) for x in leaves]))
+            name = _program_name(self.function, tree.unflatten([_leaf_structure(x) for x in leaves]))
         except (Unnamed, pickle.PicklingError, AttributeError, TypeError, RecursionError):
             return lambda: None
         place, loaded = folder / f"{name}.program", None
@@ -156,13 +156,13 @@ class Programs:
         arrays = _arrays(leaves)
         if loaded is not None:
             result, compiled = loaded
-            executable = _loaded(folder, compiled, len(arrays), result)
+            executable = _load_executable(folder, compiled, len(arrays), result)
             if executable is not None:
                 return functools.partial(Program, executable, result)
         result, lowered = self._lowered(leaves, tree)
         text = lowered.as_text()
         compiled = hashlib.sha256(f"{sorted(self.options.items())}{text}".encode()).hexdigest()
-        executable = _loaded(folder, compiled, len(arrays), result)
+        executable = _load_executable(folder, compiled, len(arrays), result)
 
         def make() -> Program:
             """Compiles in parallel with other threads that trace and compile."""
@@ -176,9 +176,9 @@ class Programs:
                     return Program(program, result)
                 with contextlib.suppress(Exception):  # an unwritable program, for any reason, is not stored
                     written = serialize_executable.serialize(program)[0]
-                    _write(_executable(folder, compiled), zlib.compress(written, 1))
+                    _write_atomically(_executable(folder, compiled), zlib.compress(written, 1))
             with contextlib.suppress(pickle.PicklingError, AttributeError, TypeError):
-                _write(place, pickle.dumps((result, compiled)))
+                _write_atomically(place, pickle.dumps((result, compiled)))
             return Program(program, result)
 
         return make
@@ -191,7 +191,7 @@ class Programs:
             given = iter(arrays)
             args, named = tree.unflatten([next(given) if eqx.is_array(x) else x for x in leaves])
             out, shape = jax.tree.flatten(self.function(*args, **named))
-            returned.append(jax.tree.unflatten(shape, [_Place() if eqx.is_array(x) else x for x in out]))
+            returned.append(jax.tree.unflatten(shape, [_ArrayPlaceholder() if eqx.is_array(x) else x for x in out]))
             return _arrays(out)
 
         flat.__name__ = f"kept_{getattr(self.function, '__name__', 'function')}"
@@ -206,7 +206,7 @@ def structure_of(arguments: Any) -> Hashable | None:
     if has_tracer(leaves):
         return None
     try:
-        structure = tree, tuple(_shape(x) for x in leaves)
+        structure = tree, tuple(_leaf_structure(x) for x in leaves)
         hash(structure)
     except (TypeError, Unnamed):
         return None
@@ -223,17 +223,17 @@ def _arrays(leaves: list[Any]) -> list[Any]:
 
 
 @functools.cache
-def _private(folder: str) -> bool:
+def _folder_is_private(folder: str) -> bool:
     """True if nobody but the user can change a folder and its files, as checked at first use."""
     return not exposure_reason(Path(folder))
 
 
-def _keeps() -> bool:
+def _may_store_programs() -> bool:
     """True if programs of this process may be stored: double precision, on the single device of a CPU."""
     return bool(jnp.result_type(float) == jnp.float64) and jax.default_backend() == "cpu" and jax.device_count() == 1
 
 
-def _shape(leaf: Any) -> Any:
+def _leaf_structure(leaf: Any) -> Any:
     """Structure of a leaf: shape and kind of an array. Any other leaf is returned unchanged.
 
     Raises:
@@ -257,13 +257,13 @@ class _Describer(pickle.Pickler):
         by_name = isinstance(thing, type | types.FunctionType | types.BuiltinFunctionType)
         if by_name and (thing.__module__ or "").partition(".")[0] not in _KNOWN:
             raise Unnamed
-        if isinstance(thing, type) and _found(thing) is not thing:  # made by a function, such as the curves
+        if isinstance(thing, type) and _class_object(thing) is not thing:  # made by a function, such as the curves
             facts = sorted((k, v) for k, v in vars(thing).items() if isinstance(v, str | int | float | tuple))
             return tuple, ((thing.__module__, thing.__qualname__, thing.__bases__, *facts),)
         return NotImplemented
 
 
-def _found(thing: type) -> Any:
+def _class_object(thing: type) -> Any:
     """The object that a module holds under the name of a class."""
     scope: Any = sys.modules.get(thing.__module__)
     for name in thing.__qualname__.split("."):
@@ -271,7 +271,7 @@ def _found(thing: type) -> Any:
     return scope
 
 
-def _name(function: Callable[..., Any], arguments: Any) -> str:
+def _program_name(function: Callable[..., Any], arguments: Any) -> str:
     """Name of a program: a hash of all inputs of its tracing.
 
     Args:
@@ -284,11 +284,11 @@ def _name(function: Callable[..., Any], arguments: Any) -> str:
     if named[0].partition(".")[0] not in OWN or "<" in named[1]:
         raise Unnamed
     file = io.BytesIO()
-    _Describer(file).dump((named, _settings(), arguments))
+    _Describer(file).dump((named, _compile_settings(), arguments))
     return hashlib.sha256(source_hash().encode() + file.getvalue()).hexdigest()
 
 
-def _settings() -> tuple[tuple[str, str], ...]:
+def _compile_settings() -> tuple[tuple[str, str], ...]:
     """JAX's settings and environment variables that change compilation."""
     chosen = {k: str(v) for k, v in jax.config.values.items() if not k.startswith(_ASIDE)}
     chosen |= {k: v for k, v in os.environ.items() if k.startswith(_HEEDED)}
@@ -313,9 +313,9 @@ def _executable(folder: Path, name: str) -> Path:
     return folder / f"{name}.executable"
 
 
-def _loaded(folder: Path, name: str, arrays: int, result: Any) -> Callable[..., list[Any]] | None:
+def _load_executable(folder: Path, name: str, arrays: int, result: Any) -> Callable[..., list[Any]] | None:
     """The executable with that name for this number of arrays, None if it is missing or unreadable."""
-    out = sum(isinstance(x, _Place) for x in jax.tree.leaves(result))
+    out = sum(isinstance(x, _ArrayPlaceholder) for x in jax.tree.leaves(result))
     try:
         written = zlib.decompress(_executable(folder, name).read_bytes())
         _linear_algebra()
@@ -348,7 +348,7 @@ def _read_from_cache() -> Iterator[list[str]]:
         jax.monitoring.unregister_event_listener(listen)
 
 
-def _write(path: Path, content: bytes) -> None:
+def _write_atomically(path: Path, content: bytes) -> None:
     """Writes a file completely or not at all. Ignores a folder without write permission."""
     partial = path.with_name(f"{path.name}.{os.getpid()}.{threading.get_ident()}")
     with contextlib.suppress(OSError):

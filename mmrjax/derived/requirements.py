@@ -107,7 +107,7 @@ def with_cells(robot: Robot, cells: Scalar) -> Robot:
     return dataclasses.replace(robot, battery=battery)
 
 
-def _at(robot: Robot, point: EnvelopePoint, rated: Ratings) -> tuple[Robot, Conditions]:
+def _robot_and_conditions_at(robot: Robot, point: EnvelopePoint, rated: Ratings) -> tuple[Robot, Conditions]:
     """The robot with its winding at ambient temperature, as at the start of a run, and the conditions of a point."""
     warm = robot.motor.resistance * robot.motor.resistance_ratio(point.ambient)
     motor = dataclasses.replace(robot.motor, resistance=warm)
@@ -125,14 +125,14 @@ def _at(robot: Robot, point: EnvelopePoint, rated: Ratings) -> tuple[Robot, Cond
 def heat_left(robot: Robot, point: EnvelopePoint, current: Scalar, limit: Scalar) -> Scalar:
     """Relative thermal margin of a winding for continuous `current` [-]: 0 if it settles at `limit` [°C].
 
-    1 - I² R_th R (1 + α (T - 25 °C)) / (T - T_a). `robot` as stated, not as returned by `_at`.
+    1 - I² R_th R (1 + α (T - 25 °C)) / (T - T_a). `robot` as stated, not as returned by `_robot_and_conditions_at`.
     """
     motor = robot.motor
     hot = motor.resistance * motor.resistance_ratio(limit)
     return 1 - current**2 * motor.resistance_thermal * hot / jnp.maximum(limit - point.ambient, 1.0)
 
 
-def _cell(rated: Ratings, signals: Signals, point: EnvelopePoint) -> Scalar:
+def _cell_margin(rated: Ratings, signals: Signals, point: EnvelopePoint) -> Scalar:
     """Margin of a cell above its cut-off voltage [V], inf on an external supply."""
     return jnp.where(point.battery > 0.5, signals.voltage_source / rated.cells - rated.voltage_cutoff, jnp.inf)
 
@@ -143,9 +143,9 @@ def travel_quantities(robot: Robot, point: EnvelopePoint, rated: Ratings) -> tup
     Further entries are the `current` of one motor and of the `battery` [A] and three margins: `left` of traction and
     speed, `adhesion` alone [-], and `cell`, above the cut-off voltage [V].
     """
-    here, conditions = _at(robot, point, rated)
+    here, conditions = _robot_and_conditions_at(robot, point, rated)
     signals, status, _ = operating_state(here, conditions)
-    outcome = jnp.where((status == CONVERGED) & (_cell(rated, signals, point) < 0), CUT_OFF, status)
+    outcome = jnp.where((status == CONVERGED) & (_cell_margin(rated, signals, point) < 0), CUT_OFF, status)
     warm = dataclasses.replace(robot.motor, temperature_ambient=point.ambient)  # its resistance as stated
     moving = jnp.where(jnp.abs(signals.speed) > 1e-6, signals.speed, 1e-6)
     turns = jnp.abs(signals.speed_motor)
@@ -162,7 +162,7 @@ def travel_quantities(robot: Robot, point: EnvelopePoint, rated: Ratings) -> tup
         "battery": here.battery.current(signals.total_current),
         "adhesion": 1 - signals.demand / signals.adhesion_limit,
         "left": steepest_slope.travel_margin(here, signals),
-        "cell": _cell(rated, signals, point),
+        "cell": _cell_margin(rated, signals, point),
     }
     return {name: jnp.asarray(x) for name, x in quantities.items()}, outcome
 
@@ -173,7 +173,7 @@ def _travel(robot: Robot, point: EnvelopePoint, rated: Ratings, name: str) -> Qu
 
 
 def _slope(robot: Robot, point: EnvelopePoint, rated: Ratings, name: str) -> QuantityValue:
-    here, conditions = _at(robot, point, rated)
+    here, conditions = _robot_and_conditions_at(robot, point, rated)
     answer = steepest_slope.compute(here, conditions)
     held = jnp.isfinite(answer["steepest_slope"])
     return QuantityValue(jnp.where(held, answer["steepest_slope"], 0.0), answer["status"])
@@ -183,7 +183,7 @@ def _slope(robot: Robot, point: EnvelopePoint, rated: Ratings, name: str) -> Qua
 HALVINGS = 26
 
 
-def _payload(robot: Robot, point: EnvelopePoint, rated: Ratings, name: str) -> QuantityValue:
+def _largest_payload(robot: Robot, point: EnvelopePoint, rated: Ratings, name: str) -> QuantityValue:
     """The largest payload for continuous travel.
 
     The robot travels, its winding settles at a permissible temperature, its gearboxes stay within their torque limit
@@ -193,21 +193,21 @@ def _payload(robot: Robot, point: EnvelopePoint, rated: Ratings, name: str) -> Q
 
     def left(robot: Robot, payload: Scalar) -> Scalar:
         loaded_point = dataclasses.replace(point, payload=payload)
-        here, conditions = _at(robot, loaded_point, rated)
+        here, conditions = _robot_and_conditions_at(robot, loaded_point, rated)
         signals, _, _ = operating_state(here, conditions)
         hot = heat_left(robot, loaded_point, signals.current, rated.temperature)
         torque = 1 - jnp.abs(signals.torque_gear) / rated.torque
-        each = [steepest_slope.travel_margin(here, signals), hot, torque, _cell(rated, signals, point)]
+        each = [steepest_slope.travel_margin(here, signals), hot, torque, _cell_margin(rated, signals, point)]
         return functools.reduce(jnp.minimum, each)
 
-    found, holds = _edge(left, robot, jnp.zeros(()), jnp.asarray(most))
-    here, conditions = _at(robot, dataclasses.replace(point, payload=jnp.zeros(())), rated)
+    found, holds = _sign_change(left, robot, jnp.zeros(()), jnp.asarray(most))
+    here, conditions = _robot_and_conditions_at(robot, dataclasses.replace(point, payload=jnp.zeros(())), rated)
     signals, status, _ = operating_state(here, conditions)
-    outcome = jnp.where((status == CONVERGED) & (_cell(rated, signals, point) < 0), CUT_OFF, status)
+    outcome = jnp.where((status == CONVERGED) & (_cell_margin(rated, signals, point) < 0), CUT_OFF, status)
     return QuantityValue(jnp.where(holds, found, 0.0), outcome)
 
 
-def _edge(left, robot: Robot, low: Array, high: Array) -> tuple[Array, Array]:  # type: ignore[no-untyped-def]
+def _sign_change(left, robot: Robot, low: Array, high: Array) -> tuple[Array, Array]:  # type: ignore[no-untyped-def]
     """Point between low and high where `left` becomes negative, and whether `left` is positive at low.
 
     `high` if it does not become negative. Derivatives are implicit, forward and reverse.
@@ -246,7 +246,7 @@ def _endurance(robot: Robot, point: EnvelopePoint, rated: Ratings, name: str) ->
 
     def drawn(robot: Robot, discharge: Scalar) -> tuple[Scalar, Scalar, Array]:
         """Mean battery current [A], margin above the cut-off [V], status."""
-        here, conditions = _at(robot, point, rated)
+        here, conditions = _robot_and_conditions_at(robot, point, rated)
         conditions = dataclasses.replace(conditions, discharge=jnp.asarray(discharge))
         signals, status, _ = operating_state(here, conditions)
         stands = point.share <= 0
@@ -255,7 +255,7 @@ def _endurance(robot: Robot, point: EnvelopePoint, rated: Ratings, name: str) ->
         current = here.battery.current(point.share * motors)
         return current, cell, jnp.where(stands, CONVERGED, status)
 
-    end, begins = _edge(lambda robot, c: drawn(robot, c)[1], robot, first, last)
+    end, begins = _sign_change(lambda robot, c: drawn(robot, c)[1], robot, first, last)
     nodes, weights = np.polynomial.legendre.leggauss(NODES)
     discharges = first + (end - first) * jnp.asarray((nodes + 1) / 2)
     current, _, status = jax.vmap(lambda c: drawn(robot, c))(discharges)
@@ -275,15 +275,15 @@ def _mass(robot: Robot, point: EnvelopePoint, rated: Ratings, name: str) -> Quan
 DUTY_LEFT = {"turn_in_place_rad_s": -1.0, "turning_radius_mm": 0.0}
 
 
-def _turn(robot: Robot, point: EnvelopePoint, rated: Ratings, name: str) -> QuantityValue:
+def _settled_turn(robot: Robot, point: EnvelopePoint, rated: Ratings, name: str) -> QuantityValue:
     """A settled turn on level ground at full voltage: on the spot with opposite sides, or around a braked side."""
-    here, conditions = _at(robot, point, rated)
+    here, conditions = _robot_and_conditions_at(robot, point, rated)
     conditions = dataclasses.replace(
         conditions, slope_deg=jnp.zeros(()), adhesion_lateral=jnp.asarray(point.adhesion_lateral),
         duty_left=jnp.asarray(DUTY_LEFT[name]), duty_right=jnp.asarray(1.0),
     )  # fmt: skip
     signals, motion, status = circling_signals(here, conditions)
-    low = jnp.any(jnp.asarray(_cell(rated, signals.signals, point)) < 0)
+    low = jnp.any(jnp.asarray(_cell_margin(rated, signals.signals, point)) < 0)
     turns = jnp.where(jnp.abs(motion.yaw_rate) > 1e-6, motion.yaw_rate, 1e-6)
     rolls = motion.speed**2 + motion.speed_lateral**2
     # A root of 0 has no derivative.
@@ -291,13 +291,13 @@ def _turn(robot: Robot, point: EnvelopePoint, rated: Ratings, name: str) -> Quan
     return QuantityValue(jnp.asarray(value), jnp.where((status == CONVERGED) & low, CUT_OFF, status))
 
 
-def _across(robot: Robot, point: EnvelopePoint, rated: Ratings, name: str) -> QuantityValue:
+def _side_slope(robot: Robot, point: EnvelopePoint, rated: Ratings, name: str) -> QuantityValue:
     """Steepest side slope [deg] that a robot travels across without sliding or tipping.
 
     Rolling resistance takes a share f/φ_x of the friction ellipse: tan α = φ_y √(1 - (f/φ_x)²). It tips at
     tan α = B / (2 h). For a rigid robot whose load does not shift.
     """
-    here, conditions = _at(robot, point, rated)
+    here, conditions = _robot_and_conditions_at(robot, point, rated)
     conditions = dataclasses.replace(conditions, adhesion_lateral=jnp.asarray(point.adhesion_lateral))
     chassis = here.chassis(conditions.configuration)
     stands = balances.stance(here, conditions, chassis, chassis.mass + point.payload)
@@ -309,7 +309,7 @@ def _across(robot: Robot, point: EnvelopePoint, rated: Ratings, name: str) -> Qu
     return QuantityValue(jnp.degrees(jnp.arctan(jnp.minimum(slides, tips))), jnp.asarray(CONVERGED))
 
 
-def _posture(robot: Robot, point: EnvelopePoint, rated: Ratings, name: str) -> QuantityValue:
+def _posture_limits_of(robot: Robot, point: EnvelopePoint, rated: Ratings, name: str) -> QuantityValue:
     """Geometric limits of a robot on level ground, see `static_limits`.
 
     The highest step in any posture of its levers, stairs and gaps with its levers flush, its size with them folded.
@@ -328,8 +328,8 @@ def _posture(robot: Robot, point: EnvelopePoint, rated: Ratings, name: str) -> Q
 
 
 #: Function of each group of quantities: (robot, point, ratings, name) -> Found.
-GROUPS = {"travel": _travel, "slope": _slope, "payload": _payload, "endurance": _endurance, "mass": _mass,
-          "turn": _turn, "across": _across, "posture": _posture}  # fmt: skip
+GROUPS = {"travel": _travel, "slope": _slope, "payload": _largest_payload, "endurance": _endurance, "mass": _mass,
+          "turn": _settled_turn, "across": _side_slope, "posture": _posture_limits_of}  # fmt: skip
 
 
 def evaluate_requirement(robot: Robot, point: EnvelopePoint, rated: Ratings, name: str) -> QuantityValue:

@@ -39,7 +39,7 @@ class StartStages:
         starting: end of the first stage [s]: the slide has reached its maximum, the shafts have spun up.
         slipping: end of the second stage [s]: the slide stays within V_s from here, `starting` if it never left.
         settled: t' [s]: the speed is within 1 % of its last value, the mean over the last 0.15 s.
-        end: of the run [s].
+        end: end of the run [s].
         slip: of each stage, and over_settling: from 0 to t', by `mean_slip` [-], NaN for a stage of no length.
     """
 
@@ -70,7 +70,7 @@ class StartStages:
         }
 
 
-def _smoothed(time: np.ndarray, values: np.ndarray, period: float) -> np.ndarray:
+def _moving_means(time: np.ndarray, values: np.ndarray, period: float) -> np.ndarray:
     """Means over a `period` about each instant of evenly spaced samples. At the ends, of the nearest whole period."""
     count = min(round(period / (time[-1] / len(time))) | 1, len(values) | 1) if time[-1] > 0 else 1
     if count < 3 or count > len(values):
@@ -116,7 +116,7 @@ def stages_of_start(
     """
     sense = -1.0 if theoretical[-1] < -1e-4 else 1.0
     starting = float(time[int(np.argmax(sense * sliding))])
-    sliding, even = (_smoothed(time, x, way / max(abs(float(theoretical[-1])), 1e-3)) for x in (sliding, speed))
+    sliding, even = (_moving_means(time, x, way / max(abs(float(theoretical[-1])), 1e-3)) for x in (sliding, speed))
     beyond = np.flatnonzero((sense * sliding > speed_static) & (time >= starting))
     slipping = float(time[min(int(beyond[-1]) + 1, len(time) - 1)]) if beyond.size else starting
     last = speed[last_samples(time)].mean()

@@ -48,14 +48,14 @@ class Variable:
 
     Attributes:
         unit: SI.
-        low, high: its ordinary range [unit].
+        low, high: usual range of the variable [unit].
         column: column of tables, or of points that stand for one.
         label: words of figures.
         unit_shown: unit shown in figures.
         shown: SI value of it.
         symbol: symbol in formulas. Empty: no formula has it.
         driver: word for it as the driver of an effect. Empty: its name.
-        sign: what turns its sign, see `quantities.Quantity`.
+        sign: what reverses its sign, see `quantities.Quantity`.
         levels: True if a person sets it, so that one of its levels may differ from the rest.
     """
 
@@ -153,7 +153,7 @@ _EXTENDED[1, :3] = _EXTENDED[-2, :-4:-1] = 3.0, -3.0, 1.0
 _EXTENDED[0, :3] = _EXTENDED[-1, :-4:-1] = 6.0, -8.0, 3.0
 
 
-def _level(u: Scalar) -> Float[Array, "..."]:
+def _level_below_zero(u: Scalar) -> Float[Array, "..."]:
     """u if positive. Below 0 a parabola with slope 1 at 0 that is level from u = -LEVEL _LAST on."""
     width = LEVEL * _LAST
     below = jnp.clip(u, -width, 0.0)
@@ -167,8 +167,8 @@ def ordinate_weights(x: Scalar, low: Scalar, high: Scalar) -> Float[Array, "... 
         x: the variable.
         low, high: position of the first and the last ordinate [its unit].
     """
-    u = _level((x - low) / (high - low) * _LAST)
-    u = _LAST - _level(_LAST - u)
+    u = _level_below_zero((x - low) / (high - low) * _LAST)
+    u = _LAST - _level_below_zero(_LAST - u)
     t = jnp.abs(u[..., None] - jnp.arange(-2, _LAST + 3))
     near = 1.5 * t**3 - 2.5 * t**2 + 1
     far = -0.5 * t**3 + 2.5 * t**2 - 4 * t + 2
@@ -185,7 +185,7 @@ def _size(unit: str, size: float) -> Scalar:
     )
 
 
-def _description(place: str, over: str) -> str:
+def _curve_docstring(place: str, over: str) -> str:
     """Docstring of a curve: its equation with its units, and its source."""
     where = f"the readings of `{place}`" if place in READINGS else f"the balance `{place}`"
     unit, unit_x = PLACES[place][0], EVERY_VARIABLE[over].unit
@@ -198,7 +198,7 @@ def _description(place: str, over: str) -> str:
     """
 
 
-def _curve(place: str, over: str) -> type[Effect]:
+def _curve_class(place: str, over: str) -> type[Effect]:
     """The curve of one variable in one balance, or in the readings of one channel."""
     is_reading = place in READINGS
     unit, size, _ = PLACES[place]
@@ -245,11 +245,11 @@ def _curve(place: str, over: str) -> type[Effect]:
             """The memory long after the start, at the curve's last value."""
             return self.high + jnp.zeros_like(signals.speed_motor)
 
-    Curve.__doc__ = _description(place, over)
+    Curve.__doc__ = _curve_docstring(place, over)
     return name_class(Curve, "".join(w.capitalize() for w in Curve.name.split("_")))
 
 
-def _wave(place: str) -> type[Effect]:
+def _wave_class(place: str) -> type[Effect]:
     """The wave of one balance."""
     unit, size, _ = BALANCES[place]
 
@@ -285,18 +285,18 @@ def _wave(place: str) -> type[Effect]:
 
 
 #: The wave of every balance that has curves; a time series shows it as an order.
-WAVES: dict[str, type[Effect]] = {effect.name: effect for effect in map(_wave, BALANCES)}
+WAVES: dict[str, type[Effect]] = {effect.name: effect for effect in map(_wave_class, BALANCES)}
 
 #: Every curve by name. Robot files accept them; the library that is scored does not contain them.
 CURVES: dict[str, type[Effect]] = {
     effect.name: effect
-    for effect in (_curve(place, over) for place in (*BALANCES, *channels.USUAL) for over in VARIABLES)
+    for effect in (_curve_class(place, over) for place in (*BALANCES, *channels.USUAL) for over in VARIABLES)
 }
 #: Curves of the readings of all other channels, over the variables that the loop tries for them.
 CURVES_SHOWN: dict[str, type[Effect]] = {
     effect.name: effect
     for effect in (
-        _curve(place, over)
+        _curve_class(place, over)
         for place in READINGS
         for over in (*DRIFT, READ_BY.get(place))
         if over is not None and place not in channels.USUAL
@@ -306,8 +306,8 @@ CURVES_SHOWN: dict[str, type[Effect]] = {
 CURVES_ROUND: dict[str, type[Effect]] = {
     effect.name: effect
     for effect in (
-        *(_curve(place, over) for place in (*BALANCES, *ROUND) for over in VARIABLES_ROUND),
-        *(_curve(place, over) for place in ROUND for over in IN_TURNS),
+        *(_curve_class(place, over) for place in (*BALANCES, *ROUND) for over in VARIABLES_ROUND),
+        *(_curve_class(place, over) for place in ROUND for over in IN_TURNS),
     )
 }
 #: All of them by class name, see `made`.

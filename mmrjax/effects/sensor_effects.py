@@ -99,7 +99,7 @@ class SpeedGain(SensorEffect):
     )  # fmt: skip
 
 
-def _error(read: Channel, of_zero: bool) -> type[Effect]:
+def _sensor_error(read: Channel, of_zero: bool) -> type[Effect]:
     """The error of scale or zero of a channel's instrument."""
     largest, unit = (10 * read.zero_error, read.unit_si) if of_zero else (0.2, "-")
     source = "limits of error of instruments, IEC 60051-2", "class of the instrument: 0.5 to 2.5 %"
@@ -127,18 +127,18 @@ def _error(read: Channel, of_zero: bool) -> type[Effect]:
     return name_class(Error, "".join(word.capitalize() for word in Error.name.split("_")))
 
 
-def _errors() -> Iterator[type[Effect]]:
+def _sensor_errors() -> Iterator[type[Effect]]:
     """Yields the errors of every channel that the classes above do not cover.
 
     First those of scale, except of temperatures, whose zero is a convention. Then those of zero. Random numbers
     depend on the position: add new ones at the end.
     """
     further = [c for c in channels.EVERY if c not in channels.usual_channels()]
-    yield from (_error(c, of_zero=c.unit_shown == "°C") for c in further)
-    yield from (_error(c, of_zero=True) for c in further if c.misses_zero)
+    yield from (_sensor_error(c, of_zero=c.unit_shown == "°C") for c in further)
+    yield from (_sensor_error(c, of_zero=True) for c in further if c.misses_zero)
 
 
 #: A rig has the errors of its channels.
-OF_CHANNELS: dict[str, type[Effect]] = {effect.name: effect for effect in _errors()}
+OF_CHANNELS: dict[str, type[Effect]] = {effect.name: effect for effect in _sensor_errors()}
 #: The same by class name, see `made`.
 Made = SimpleNamespace(**{effect.__name__: effect for effect in OF_CHANNELS.values()})

@@ -60,9 +60,9 @@ class History(eqx.Module):
         Signals with a further axis of left and right side are averaged over it.
         """
         if jnp.ndim(signals.current) > jnp.ndim(time):
-            reading, signals = _shown(robot, signals, apart=True), balances.mean_of_sides(signals)
+            reading, signals = _channel_readings(robot, signals, apart=True), balances.mean_of_sides(signals)
         else:
-            reading = _shown(robot, signals)
+            reading = _channel_readings(robot, signals)
         if not robot.knows(VOLTAGE):
             nan = jnp.full_like(signals.current, jnp.nan)
             volts = ("voltage", "voltage_source", "voltage_drop", "voltage_left", "inductance")
@@ -89,11 +89,11 @@ def in_table_time(rig: Rig, time: Float[Array, "runs samples"], values: T) -> tu
     values = jax.tree.map(lambda x: jnp.broadcast_to(x, time.shape) if jnp.ndim(x) < 2 else jnp.asarray(x), values)
     clock = rig.clock(time)
     places = _before(rig, time, clock)
-    return clock, jax.tree.map(lambda x: _between(x, *places), values)
+    return clock, jax.tree.map(lambda x: _between_for_batch(x, *places), values)
 
 
 @compiled
-def _shown(robot: Robot, signals: Signals, apart: bool = False) -> Scalars:
+def _channel_readings(robot: Robot, signals: Signals, apart: bool = False) -> Scalars:
     """Readings of the channels that change in a history. `apart`: from signals of left and right side."""
     every = balances.readings_of_sides(robot, signals) if apart else balances.sensor(robot, signals)
     return {c.name: every[c.name] for c in channels.EVERY if c.over_time}
@@ -105,7 +105,7 @@ def _before(rig: Rig, time: Array, clock: Array) -> tuple[Array, Array]:
 
 
 @compiled
-def _between(values: Array, k: Array, share: Array) -> Array:
+def _between_for_batch(values: Array, k: Array, share: Array) -> Array:
     """`Rig.between` for a batch, compiled once for each shape."""
     return jax.vmap(Rig.between)(values, k, share)
 

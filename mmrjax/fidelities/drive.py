@@ -133,7 +133,7 @@ def drive_start(robot: Robot, conditions: Conditions, rolling: bool = False) -> 
         if not robot.has_ground:  # only a ground has a speed of grip
             rest = rest.at[2].set(load.radius / robot.gearbox.ratio * conditions.motor_speed / size[2])
     if robot.rig.begins is not None and conditions.begin is not None:
-        first = _initial(robot, conditions)
+        first = _initial_unknowns(robot, conditions)
         angle = first[3] / load.radius
         memory = [effect.initial(robot, angle) for effect in robot.remembering]
         begin = jnp.stack([*first, jnp.asarray(conditions.discharge, size.dtype), *memory])
@@ -152,7 +152,7 @@ def drive_start(robot: Robot, conditions: Conditions, rolling: bool = False) -> 
     return jnp.where(jnp.all(jnp.isfinite(y)), y, rest)
 
 
-def _initial(robot: Robot, conditions: Conditions) -> Array:
+def _initial_unknowns(robot: Robot, conditions: Conditions) -> Array:
     """Current, motor speed, speed and distance [SI] at the start of a history that does not begin at rest.
 
     The load rolls with the shafts. The current is in equilibrium with the voltage, which it reaches within
@@ -204,13 +204,13 @@ def drive(
         Derivatives are forward (`jax.jvp`, `jax.jacfwd`).
     """
     if conditions.turns:
-        return _turning(robot, conditions, times, tolerance, max_steps, rolling)
+        return _drive_turning(robot, conditions, times, tolerance, max_steps, rolling)
     y0 = drive_start(robot, conditions, rolling)
     imposed = conditions.motor_speed is not None
     driven = rolling or imposed or robot.controller is not None  # a controller may turn it later
     parked = jnp.asarray(False) if driven else holds(robot, conditions)
     moves = jnp.where(parked, jnp.zeros_like(y0).at[jnp.asarray([0, 4])].set(1.0), 1.0)
-    ys, went = _integrated(drive_rates, _norm, robot, conditions, moves, y0, times, tolerance, max_steps)
+    ys, went = _integrate_unknowns(drive_rates, _norm, robot, conditions, moves, y0, times, tolerance, max_steps)
     signals = jax.vmap(lambda y: balances.moving_signals(robot, conditions, state_of_unknowns(robot, y)))(ys)
     if not imposed:
         static = jax.vmap(lambda y: standing_signals(robot, conditions, state_of_unknowns(robot, y)))(ys)
@@ -218,7 +218,7 @@ def drive(
     end = jax.tree.map(lambda x: x[-1], signals)
     last = balances.commanded(robot, conditions, state_of_unknowns(robot, ys[-1]))
     status = _status(robot, last, end, parked, went)
-    return _kept(
+    return _recorded_part(
         robot,
         conditions,
         times,
@@ -229,7 +229,7 @@ def drive(
     )
 
 
-def _kept(
+def _recorded_part(
     robot: Robot, conditions: Conditions, times: Array, away: Array, signals: Signals, discharge: Scalar, end: Result
 ) -> Trajectory:
     """The recorded part of a run: it ends with an empty battery, and all later numbers are NaN.
@@ -245,7 +245,7 @@ def _kept(
     return Trajectory(times, away, signals, answer)
 
 
-def _integrated(
+def _integrate_unknowns(
     law: Callable[[Robot, Conditions, Array], Array],
     size: Callable[[Array], Scalar],
     robot: Robot,
@@ -289,14 +289,14 @@ def _integrated(
     return solution.ys, solution.result == diffrax.RESULTS.successful
 
 
-def _turning(
+def _drive_turning(
     robot: Robot, conditions: Conditions, times: Array, tolerance: float, max_steps: int, rolling: bool
 ) -> Trajectory:
     """`drive` for a robot with independently driven sides. Its signals have a last axis of left and right side."""
     y0 = circling.turning_start(robot, conditions, rolling)
     parked = jnp.asarray(False) if rolling else circling.holds(robot, conditions)
     moves = jnp.where(parked, circling.changing_at_rest(y0), 1.0)
-    ys, went = _integrated(
+    ys, went = _integrate_unknowns(
         circling.turning_rates, circling.norm, robot, conditions, moves, y0, times, tolerance, max_steps, len(SIDES)
     )
     motion = jax.vmap(lambda y: circling.motion_of(robot, y))(ys)
@@ -305,7 +305,7 @@ def _turning(
     status = jnp.where(parked, STALLED, circling.status_moving(robot, conditions, *end))
     status = jnp.where(went, status, FAILED)
     away, answer = jnp.hypot(motion.place_x, motion.place_y), circling.result_of(robot, end[0], status)
-    return _kept(robot, conditions, times, away, travel.signals, motion.discharge, answer)
+    return _recorded_part(robot, conditions, times, away, travel.signals, motion.discharge, answer)
 
 
 def _status(robot: Robot, conditions: Conditions, end: Signals, parked: Array, done: Array) -> Array:
@@ -340,7 +340,7 @@ def _run(robot: Robot, conditions: Conditions, options: Mapping[str, float], pro
     return Run(drive_batch(robot, conditions, jnp.asarray([0.0, options["duration"]])).result)
 
 
-def _instants(duration: float) -> np.ndarray:
+def _history_instants(duration: float) -> np.ndarray:
     """Times of a history [s] from 0 to `duration`, denser while the current rises to its peak."""
     early = np.linspace(0.0, min(TIME_INRUSH, duration), SAMPLES_INRUSH, endpoint=False)
     first = np.linspace(0.0, min(TIME_RISE, duration), SAMPLES_RISE, endpoint=False)
@@ -350,7 +350,7 @@ def _instants(duration: float) -> np.ndarray:
 def _histories(
     robot: Robot, conditions: Conditions, options: Mapping[str, float], progress: Progress | None = None
 ) -> Run:
-    kept = drive_batch(robot, conditions, jnp.asarray(_instants(options["duration"])))
+    kept = drive_batch(robot, conditions, jnp.asarray(_history_instants(options["duration"])))
     return Run(kept.result, history=History.of(robot, kept.time, kept.distance, kept.signals))
 
 

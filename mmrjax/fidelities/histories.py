@@ -87,7 +87,7 @@ def time_grid(
 
     Args:
         changes: instants of changes of the motors' input [s].
-        sizes: their size relative to a usual change. The first step after a smaller change is longer.
+        sizes: size of each change relative to a usual one. The first step after a smaller change is longer.
         longest: longest step, if `STEPS` permit it [s]. An array: for each interval between `times`.
         start, change: first step and growth of the steps after the start and after changes.
         parts: number of equal steps in place of each.
@@ -168,7 +168,7 @@ class Lag(eqx.Module):
     """Excess of a current after a jump of its voltage. It decays within a step.
 
     Attributes:
-        begin, end: of a step.
+        begin, end: lag at the beginning and the end of a step.
         decay: rate of the decay [1/s].
         means: means over the consecutive parts of a step that its stages weigh.
     """
@@ -310,7 +310,7 @@ class RunStates(eqx.Module):
 
     Attributes:
         stages: unknowns at both stages of every step, without lags.
-        ends: at its end.
+        ends: states at the end of each step.
         sides: direction of a shaft (see `shaft_direction`) at the start and end of a step. They differ if it
             stops or leaves rest within the step.
         before: time in such a step until it stops, or leaves rest [s].
@@ -334,9 +334,8 @@ class _Part(eqx.Module):
             still holds the shaft, and the remaining part.
         begin: unknowns at its start.
         lag: of the current there.
-        since, length: its start and length [s].
-        side, then: direction in which a shaft turns, and after it has waited.
-        before, stages, end: see `RunStates`.
+        since, length: start and length of the part [s]. side, then: direction in which a shaft turns, and after it
+        has waited. before, stages, end: see `RunStates`.
     """
 
     turn: Array

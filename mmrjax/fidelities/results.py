@@ -99,8 +99,8 @@ def _in_chunks(fidelity: Fidelity, function: Callable[[Conditions], T], conditio
     every = flatten_conditions(conditions)
     if runs <= size:
         return reshape_runs(function(every), conditions.shape)
-    parts = [function(_rows(every, np.asarray(first), size)) for first in range(0, runs, size)]
-    return reshape_runs(_joined(parts, runs), conditions.shape)
+    parts = [function(_chunk_of_runs(every, np.asarray(first), size)) for first in range(0, runs, size)]
+    return reshape_runs(_join_chunks(parts, runs), conditions.shape)
 
 
 def flatten_conditions(conditions: Conditions) -> Conditions:
@@ -124,13 +124,13 @@ def _reshaped(tree: T, shape: tuple[int, ...]) -> T:
 
 
 @compiled
-def _rows(conditions: Conditions, first: np.ndarray, size: int) -> Conditions:
+def _chunk_of_runs(conditions: Conditions, first: np.ndarray, size: int) -> Conditions:
     """`size` runs starting with `first`, or the last ones if fewer remain."""
     return jax.tree.map(lambda x: jax.lax.dynamic_slice_in_dim(x, first, size), conditions)
 
 
 @compiled
-def _joined(parts: list[T], runs: int) -> T:
+def _join_chunks(parts: list[T], runs: int) -> T:
     """Joins chunks of one size. Drops the part of the last chunk that repeats the previous one."""
     return jax.tree.map(lambda *x: jnp.concatenate([*x[:-1], x[-1][(len(x) * len(x[-1]) - runs) :]]), *parts)
 
@@ -169,16 +169,16 @@ class StatusCodes(np.ndarray):
     __hash__ = None  # as for every array
 
     def __eq__(self, other: Any) -> Any:
-        return np.asarray(self) == _codes(other)
+        return np.asarray(self) == _status_codes(other)
 
     def __ne__(self, other: Any) -> Any:
-        return np.asarray(self) != _codes(other)
+        return np.asarray(self) != _status_codes(other)
 
     def __getitem__(self, key: Any) -> Any:
         return np.asarray(np.asarray(self)[key]).view(StatusCodes)
 
 
-def _codes(words: Any) -> Any:
+def _status_codes(words: Any) -> Any:
     """Codes of words of `STATUSES`. Other values are returned unchanged.
 
     Raises:
@@ -231,7 +231,7 @@ class Results:
 
     def __post_init__(self) -> None:
         result = self.result
-        if isinstance(result, Result) and (coded := _compared(result.status)) is not result.status:
+        if isinstance(result, Result) and (coded := _comparable_codes(result.status)) is not result.status:
             object.__setattr__(self, "result", dataclasses.replace(result, status=coded))
 
     @staticmethod
@@ -260,13 +260,13 @@ class Results:
             cache[name] = batch.total_mass()
         elif "result" not in cache and name in (*channel_names(batch.robot.channels), "status"):
             columns = cache.get("_shown") or batch.shown()
-            cache["_shown"] = {**columns, STATUS: _compared(columns[STATUS])}
+            cache["_shown"] = {**columns, STATUS: _comparable_codes(columns[STATUS])}
             cache.update(cache["_shown"])
         elif "result" not in cache:
             whole = batch.result()
             columns = cache.get("_shown", {})
             reading = {k: columns.get(k, x) for k, x in whole.reading.items()}
-            status = columns.get(STATUS, _compared(whole.status))
+            status = columns.get(STATUS, _comparable_codes(whole.status))
             cache["result"] = dataclasses.replace(whole, reading=reading, status=status)
 
     def __getattr__(self, name: str) -> Any:
@@ -385,7 +385,7 @@ class Results:
         return f"Results of {self.model}, {count_noun(max(self.status.size, 1), 'run')}\n{self.table()}"
 
 
-def _compared(status: Any) -> Any:
+def _comparable_codes(status: Any) -> Any:
     """Codes that compare with words. Tracers and values that are not arrays are returned unchanged."""
     is_array = isinstance(status, np.ndarray | jax.Array) and not isinstance(status, jax.core.Tracer)
     return np.asarray(status).view(StatusCodes) if is_array else status

@@ -223,7 +223,7 @@ def check_robot(robot: Robot) -> None:
             )
 
 
-def _resolved(robot: Robot, conditions: Conditions) -> Conditions:
+def _resolve_conditions(robot: Robot, conditions: Conditions) -> Conditions:
     """Conditions with configuration names replaced by indices, checked against the robot's configurations."""
     names, which = robot.configurations.names, conditions.configuration
     if isinstance(which, Named):
@@ -231,7 +231,7 @@ def _resolved(robot: Robot, conditions: Conditions) -> Conditions:
             return dataclasses.replace(conditions, configuration=which.among(names))
         except KeyError as error:
             raise UsageError(f"configuration: got {error.args[0]}; {allowed_words(error.args[0], names)}") from error
-    if not has_tracer(which) and which.size and not _within(_ends(which), 0, len(names) - 1):
+    if not has_tracer(which) and which.size and not _all_within(_smallest_and_largest(which), 0, len(names) - 1):
         wrong = _first_outside(which, 0, len(names) - 1)
         assert wrong is not None
         listed = ", ".join(f"{k} ({name})" for k, name in enumerate(names))
@@ -245,7 +245,7 @@ def check_conditions(robot: Robot, conditions: Conditions) -> Conditions:
     Raises:
         UsageError: a configuration that the robot lacks, a value out of range or NaN, or values that contradict.
     """
-    conditions = _resolved(robot, conditions)
+    conditions = _resolve_conditions(robot, conditions)
     if (conditions.goal is None) != (robot.controller is None):
         raise UsageError(
             "goal: got one, and the robot has no controller; leave it out"
@@ -271,8 +271,8 @@ def _check_conditions(conditions: Conditions) -> None:
         condition = CONDITIONS[field.name]
         (low, high), unit = condition.range, condition.unit_shown
         if id(value) not in ends:
-            ends[id(value)] = _ends(value)
-        if not _within(ends[id(value)], low, high):
+            ends[id(value)] = _smallest_and_largest(value)
+        if not _all_within(ends[id(value)], low, high):
             wrong = _first_outside(value, low, high)
             assert wrong is not None
             raise UsageError(
@@ -289,7 +289,7 @@ def _check_conditions(conditions: Conditions) -> None:
         raise UsageError(f"total_mass{wrong[0]}: got {mass:g} kg; expected more than the payload, {load:g} kg")
 
 
-def _ends(values: jax.Array | np.ndarray) -> tuple[float, float]:
+def _smallest_and_largest(values: jax.Array | np.ndarray) -> tuple[float, float]:
     """Least and greatest of some numbers, computed by the library that holds them, NaN if one of them is."""
     on_host = not isinstance(values, jax.Array) or all(device.platform == "cpu" for device in values.devices())
     numbers = np.asarray(values) if on_host else values
@@ -297,7 +297,7 @@ def _ends(values: jax.Array | np.ndarray) -> tuple[float, float]:
     return float(least), float(most)
 
 
-def _within(ends: tuple[float, float], low: float, high: float) -> bool:
+def _all_within(ends: tuple[float, float], low: float, high: float) -> bool:
     """True if every number is finite and within the limits."""
     return low <= ends[0] and ends[1] <= high and math.isfinite(ends[0]) and math.isfinite(ends[1])
 

@@ -65,7 +65,7 @@ def _settled_at(
     the torque that the clamp carries, in place of the motor speed.
     """
     speed, wanted, third = unknowns
-    conditions, speed_motor = _clamped(conditions, third)
+    conditions, speed_motor = _clamped_conditions(conditions, third)
     current, held = admitted_current(robot, conditions, _CURRENT * wanted)
     state = State(current, _SPEED_MOTOR * speed_motor, _SPEED * speed, conditions.discharge)
     signals, creep = _balanced(without_diode(robot), conditions, state, sense)
@@ -94,7 +94,7 @@ def _is_held(conditions: Conditions) -> Bool[Array, "..."]:
     return jnp.asarray(0.0 if conditions.held is None else conditions.held) > 0.5
 
 
-def _clamped(conditions: Conditions, third: Scalar) -> tuple[Conditions, Scalar]:
+def _clamped_conditions(conditions: Conditions, third: Scalar) -> tuple[Conditions, Scalar]:
     """Conditions with the clamp's torque as the load, and the motor speed in the unit of its unknown."""
     if conditions.held is None:
         return conditions, third
@@ -107,7 +107,7 @@ def _clamped(conditions: Conditions, third: Scalar) -> tuple[Conditions, Scalar]
 def _residual(unknowns: Vector, robot: Robot, own: tuple[Conditions, Array]) -> Vector:
     conditions, sense = own
     robot = robot.within(conditions.configuration)
-    return _settled_at(robot, _sound(robot, conditions)[1], unknowns, sense)[2]
+    return _settled_at(robot, _conditions_are_sound(robot, conditions)[1], unknowns, sense)[2]
 
 
 def _residual_unlimited(unknowns: Vector, robot: Robot, own: tuple[Conditions, Array]) -> Vector:
@@ -115,7 +115,7 @@ def _residual_unlimited(unknowns: Vector, robot: Robot, own: tuple[Conditions, A
     return _residual(unknowns, dataclasses.replace(robot, driver=robot.driver.unlimited()), own)
 
 
-def _sound(robot: Robot, conditions: Conditions) -> tuple[Array, Conditions]:
+def _conditions_are_sound(robot: Robot, conditions: Conditions) -> tuple[Array, Conditions]:
     """Returns whether a run's conditions are finite and its mass positive, and the conditions, set to 1 if not.
 
     A NaN in the residual would reach the derivatives of the whole batch, as 0 * NaN.
@@ -145,13 +145,13 @@ def _start(robot: Robot, conditions: Conditions) -> Vector:
     )
 
 
-def _root(robot: Robot, conditions: Conditions, large: bool = True) -> tuple[Vector, Array]:
+def _root_of_balances(robot: Robot, conditions: Conditions, large: bool = True) -> tuple[Vector, Array]:
     """The root of the balances, and whether the search converged. Derivatives are implicit.
 
     `large` selects the program for large batches. The other compiles sooner.
     """
     tolerance = float(jnp.finfo(jnp.result_type(conditions.voltage)).eps) ** 0.85
-    sound = _sound(robot, conditions)[1]
+    sound = _conditions_are_sound(robot, conditions)[1]
     start = jax.lax.stop_gradient(_start(robot, sound))
     inputs = conditions, travel_direction(robot, sound)
     linear = _residual_unlimited if large and not robot.effects else None
@@ -170,8 +170,8 @@ def operating_signals(robot: Robot, conditions: Conditions) -> Signals:
     """
     if conditions.turns:
         return _circled(robot, conditions)
-    unknowns, _ = _root(robot, conditions)
-    _, sound = _sound(robot, conditions)
+    unknowns, _ = _root_of_balances(robot, conditions)
+    _, sound = _conditions_are_sound(robot, conditions)
     return _settled_at(robot, sound, unknowns, travel_direction(robot, sound))[1]
 
 
@@ -226,7 +226,7 @@ def operating_point(robot: Robot, conditions: Conditions) -> tuple[Result, Array
     speed as if the ground held, the robot V_s slower than r_k ω_k, and no derivative of the speed in μ_s.
 
     Returns:
-        The result, and whether robot and conditions are sound (see `_sound`).
+        The result, and whether robot and conditions are sound (see `_conditions_are_sound`).
     """
     if conditions.turns:
         return circling.operating_point(robot, conditions)
@@ -236,12 +236,12 @@ def operating_point(robot: Robot, conditions: Conditions) -> tuple[Result, Array
 
 def _slides_in_place(robot: Robot, conditions: Conditions) -> Array:
     robot = robot.within(conditions.configuration)
-    return slides_in_place(robot, _sound(robot, conditions)[1])
+    return slides_in_place(robot, _conditions_are_sound(robot, conditions)[1])
 
 
 def operating_state(robot: Robot, conditions: Conditions) -> tuple[Signals, Array, Array]:
     """Every signal of `operating_point`, its status, and whether robot and conditions are sound."""
-    unknowns, solved = _root(robot, conditions)
+    unknowns, solved = _root_of_balances(robot, conditions)
     return _operating_at(robot, conditions, unknowns, solved)[:3]
 
 
@@ -255,7 +255,7 @@ def _operating_at(
     """
     given = jax.lax.stop_gradient((robot, conditions))  # nothing is stored for a loop that rarely runs
     robot = robot.within(conditions.configuration)
-    sound, conditions = _sound(robot, conditions)
+    sound, conditions = _conditions_are_sound(robot, conditions)
     sense = travel_direction(robot, conditions)
     state, signals, left = _settled_at(robot, conditions, unknowns, sense)
     rest = robot.chassis(conditions.configuration).speed_still
@@ -271,7 +271,7 @@ def _operating_at(
     if conditions.motor_speed is None:
         stands_still = (status == STALLED) & (jnp.abs(signals.speed_theoretical) < 1e-9)
         stands_still &= ~_is_held(conditions) | (sense * unknowns[2] <= 1e-9)  # friction leaves the clamp nothing
-        static = standing_signals(robot, _clamped(conditions, 0.0)[0], state)
+        static = standing_signals(robot, _clamped_conditions(conditions, 0.0)[0], state)
         signals = jax.tree.map(lambda rest, travel: jnp.where(stands_still, rest, travel), static, signals)
     status = jnp.where(_is_held(conditions), CONVERGED, status)
     status = jnp.where(solved, status, FAILED)
@@ -281,7 +281,7 @@ def _operating_at(
     return signals, status, sound, left
 
 
-def _axes(tree: Any) -> Any:
+def _vmap_axes(tree: Any) -> Any:
     """Axes for `jax.vmap`: 0 for arrays with a leading axis of points, else None."""
     return jax.tree.map(lambda x: 0 if jnp.ndim(x) else None, tree)
 
@@ -292,7 +292,7 @@ BLOCK = 32_768
 
 def _over_points(function: Callable[..., Any], *arguments: Any) -> Any:
     """`function` of scalars, mapped over the leading axis of all arrays that have one. On a CPU block by block."""
-    batched = jax.vmap(function, in_axes=_axes(arguments))
+    batched = jax.vmap(function, in_axes=_vmap_axes(arguments))
     leaves, tree = jax.tree.flatten(arguments)
     points = max((len(x) for x in leaves if jnp.ndim(x)), default=0)
     # Blocks of equal size share a program; a number of points without a suitable divisor is computed at once.
@@ -355,7 +355,7 @@ def _settled(robot: Robot, conditions: Conditions) -> Result:
 def _solve(robot: Robot, conditions: Conditions) -> tuple[Unknowns, Bool[Array, ""]]:
     if conditions.turns:
         return circling.solve_turn(robot, conditions)
-    unknowns, is_root = _root(robot, conditions, large=False)
+    unknowns, is_root = _root_of_balances(robot, conditions, large=False)
     return jax.lax.stop_gradient((jnp.stack(unknowns), is_root))
 
 
@@ -401,7 +401,7 @@ def _run(robot: Robot, conditions: Conditions, options: Mapping[str, float], pro
     return Run(steady_batch(robot, conditions))
 
 
-def _check(robot: Robot, conditions: Conditions, options: Mapping[str, float]) -> None:
+def _check_run(robot: Robot, conditions: Conditions, options: Mapping[str, float]) -> None:
     """Raises for runs without a steady state: an arm with gravity over its angle, or a turn on a slope.
 
     Such an arm turns unevenly, or hangs at an angle that its friction decides.
@@ -420,4 +420,4 @@ def _check(robot: Robot, conditions: Conditions, options: Mapping[str, float]) -
             )
 
 
-FIDELITY = Fidelity("steady", settled=_settled, implicit=IMPLICIT, run=_run, outputs=steady_outputs, check=_check)
+FIDELITY = Fidelity("steady", settled=_settled, implicit=IMPLICIT, run=_run, outputs=steady_outputs, check=_check_run)

@@ -51,7 +51,7 @@ def initial_state(robot: Robot, conditions: Conditions | None = None, *, rolling
     Raises:
         UsageError: an argument that `step` refuses too.
     """
-    robot, conditions = as_floats((robot, _commanded(robot, None, conditions)))
+    robot, conditions = as_floats((robot, _commanded_conditions(robot, None, conditions)))
     return drive.state_of_unknowns(robot, _begun(robot, conditions, rolling))
 
 
@@ -66,8 +66,8 @@ def rates(robot: Robot, state: State, command: Command, conditions: Conditions |
     Raises:
         UsageError: an argument that `step` refuses too.
     """
-    robot, conditions = as_floats((robot, _commanded(robot, command, conditions)))
-    return drive.state_of_unknowns(robot, drive.drive_rates(robot, conditions, _vector(robot, state)))
+    robot, conditions = as_floats((robot, _commanded_conditions(robot, command, conditions)))
+    return drive.state_of_unknowns(robot, drive.drive_rates(robot, conditions, _unknowns_of_state(robot, state)))
 
 
 def step(robot: Robot, state: State, command: Command, dt: Scalar, conditions: Conditions | None = None) -> State:
@@ -93,9 +93,9 @@ def step(robot: Robot, state: State, command: Command, dt: Scalar, conditions: C
             independently, a value out of range or NaN, a configuration that the robot lacks, a command that is no
             number or names no condition, a state of another robot, a `dt` that is not above 0. Tracers pass.
     """
-    robot, conditions = as_floats((robot, _commanded(robot, command, conditions)))
-    y = _vector(robot, state)
-    return drive.state_of_unknowns(robot, _stepped(robot, conditions, y, _seconds(dt)))
+    robot, conditions = as_floats((robot, _commanded_conditions(robot, command, conditions)))
+    y = _unknowns_of_state(robot, state)
+    return drive.state_of_unknowns(robot, _unknowns_after_step(robot, conditions, y, _step_length(dt)))
 
 
 @compiled
@@ -104,7 +104,7 @@ def _begun(robot: Robot, conditions: Conditions, rolling: bool) -> Unknowns:
 
 
 @compiled
-def _stepped(robot: Robot, conditions: Conditions, y: Unknowns, dt: Scalar) -> Unknowns:
+def _unknowns_after_step(robot: Robot, conditions: Conditions, y: Unknowns, dt: Scalar) -> Unknowns:
     """The unknowns of `drive` after a step. A robot that has stopped is held if friction at rest can hold it."""
     speeds = np.isin(np.arange(len(y)), (drive.MOTOR, drive.GROUND))
     last = len(y) - robot.loose
@@ -124,7 +124,7 @@ def _stepped(robot: Robot, conditions: Conditions, y: Unknowns, dt: Scalar) -> U
     return jnp.where(rests & speeds, 0.0, after)
 
 
-def _commanded(robot: Robot, command: Command, conditions: Conditions | None) -> Conditions:
+def _commanded_conditions(robot: Robot, command: Command, conditions: Conditions | None) -> Conditions:
     """Conditions of one run under a command, checked, with the index of their configuration."""
     if not isinstance(robot, Robot):
         raise UsageError(f"robot: got {type(robot).__name__}; expected a Robot such as mmrjax.nominal()")
@@ -139,7 +139,7 @@ def _commanded(robot: Robot, command: Command, conditions: Conditions | None) ->
         raise UsageError(f"command: got {unknown}; {allowed_words(str(unknown), field_names)}")
     for name, value in values.items():
         if name != "configuration" and _shape(value) is None:
-            raise UsageError(f"command, {name}: got {_named(value)}; expected a number")
+            raise UsageError(f"command, {name}: got {_text_of_value(value)}; expected a number")
         if shape := _shape(value):
             raise UsageError(f"command, {name}: got shape {shape}; expected one number, or jax.vmap over several")
     if conditions.turns or not values.keys().isdisjoint(OF_TURNS):
@@ -164,19 +164,19 @@ def _shape(value: Any) -> tuple[int, ...] | None:
         return None
 
 
-def _named(value: Any) -> str:
+def _text_of_value(value: Any) -> str:
     """A number or a word as written, of anything else its type."""
     return f"{value!r:.40}" if isinstance(value, str | float | int) else type(value).__name__
 
 
-def _seconds(dt: Scalar) -> Scalar:
+def _step_length(dt: Scalar) -> Scalar:
     """The length of a step, checked unless it is a tracer."""
     if _shape(dt) != () or not (has_tracer(dt) or 0 < float(dt) < math.inf):
-        raise UsageError(f"dt: got {_named(dt)}; expected a number of seconds above 0")
+        raise UsageError(f"dt: got {_text_of_value(dt)}; expected a number of seconds above 0")
     return jnp.asarray(dt, float)
 
 
-def _vector(robot: Robot, state: State) -> Unknowns:
+def _unknowns_of_state(robot: Robot, state: State) -> Unknowns:
     """The unknowns of `drive` for a state, the inverse of `drive.state_of_unknowns`."""
     if not isinstance(state, State):
         raise UsageError(f"state: got {type(state).__name__}; expected one from mmrjax.initial_state or a step")

@@ -79,7 +79,7 @@ class Trajectory(eqx.Module):
     result: Result
 
 
-def _average(
+def _period_averages(
     run: System, time: Array, travelled: Array, sums: tuple[Any, Array]
 ) -> tuple[Any, Scalar, Array, Changes]:
     """Means of signals (or `Travel`) and guides' load, number of periods, and change and size of three signals."""
@@ -146,19 +146,19 @@ def track(
     return _trajectory(run, start, end, record, sample)
 
 
-def _kind(conditions: Conditions) -> ModuleType:
+def _moving_system_module(conditions: Conditions) -> ModuleType:
     """The module of the moving system: half a robot, or a whole robot free to turn."""
     return both_sides if conditions.turns else half_robot
 
 
 def _start(run: System, rolling: bool) -> Motion:
-    kind = _kind(run.conditions)
+    kind = _moving_system_module(run.conditions)
     start: Motion = kind.roll(run) if rolling else kind.stand(run)
     return start
 
 
 def _record(run: System, start: Motion, steps: int, samples: int) -> tuple[Motion, Record]:
-    kind = _kind(run.conditions)
+    kind = _moving_system_module(run.conditions)
 
     def small(motion: Motion, _: None) -> tuple[Motion, tuple[Any, Array]]:
         after, passed, guided = kind.advance(run, motion)
@@ -174,10 +174,10 @@ def _record(run: System, start: Motion, steps: int, samples: int) -> tuple[Motio
 
 
 def _trajectory(run: System, start: Motion, end: Motion, record: Record, sample: float) -> Trajectory:
-    kind, motions = _kind(run.conditions), record.motions
+    kind, motions = _moving_system_module(run.conditions), record.motions
     time = sample * jnp.arange(len(motions.q) + 1)
     travelled = run.path.radius * jnp.concatenate([start.q[None, kind.SHAFTS], motions.q[:, kind.SHAFTS]])
-    averages = kind.averaged(functools.partial(_average, run, time), travelled, record.passed, record.guided)
+    averages = kind.averaged(functools.partial(_period_averages, run, time), travelled, record.passed, record.guided)
     status = kind.status(run, averages, end)
     valid = (status != FAILED) & (status != TIPS)
     window = time[1:] > time[-1] - WINDOW * (time[-1] - time[0])
@@ -322,7 +322,7 @@ def _histories(
     robot: Robot, conditions: Conditions, options: Mapping[str, float], progress: Progress | None = None
 ) -> Run:
     runs = track_batch(robot, conditions, duration=options["duration"], step=options["step"], progress=progress)
-    away, reactions = _kind(conditions).away(runs.q, runs.reactions)
+    away, reactions = _moving_system_module(conditions).away(runs.q, runs.reactions)
     history = History.of(robot, runs.time, away, runs.signals, reactions)
     return Run(runs.result, {"guide_share": runs.steady.guide_share}, history)
 

@@ -121,9 +121,9 @@ class Mission(eqx.Module):
 
     Attributes:
         total: total of the mission.
-        segments: of each segment of each cycle, fields of shape (cycles, segments).
+        segments: totals of each segment in each cycle, fields of shape (cycles, segments).
         peaks: by the names of the law's `PEAKS` (`cell_low` is the lowest voltage of a cell). Also of the segments.
-        status: of each segment at its end, flags: of each segment, shape (cycles, segments).
+        status, flags: status at the end of each segment, and its flags, shape (cycles, segments).
         result: the end of the mission, with its status and all flags. `converged`: the profile was followed to its
             end. `battery_empty`. `cut_off`: the cells stayed below their cut-off. `stalled`, `slides`, `rolls_back`
             or `tips`: status of the first segment with demanded motion that ends so. `failed`: the integrator gave
@@ -170,7 +170,7 @@ def initial_unknowns(law: MotionLaw, robot: Robot, conditions: Conditions, start
     return y
 
 
-def _ends(
+def _segment_status(
     law: MotionLaw,
     robot: Robot,
     otherwise: Conditions,
@@ -200,7 +200,7 @@ def _ends(
     return status, missed
 
 
-def _ending(c: Carry) -> Array:
+def _early_end_status(c: Carry) -> Array:
     """Status of a mission that ended before its profile did."""
     return jnp.where(c.failed, FAILED, jnp.where(c.cut_off, CUT_OFF, BATTERY_EMPTY))
 
@@ -245,7 +245,7 @@ def mission(
 
     order = jnp.tile(jnp.arange(profile.segments), profile.cycles)
     c, each = jax.lax.scan(one, _at_start(law, robot, conditions, begin, nothing, keep), order)
-    return _mission(law, robot, conditions, profile, c, each)
+    return _assemble_mission(law, robot, conditions, profile, c, each)
 
 
 class _Segment(NamedTuple):
@@ -262,7 +262,7 @@ class _Segment(NamedTuple):
     kept: Array
 
 
-def _charge(law: MotionLaw, y: Array) -> Array:
+def _charge_taken(law: MotionLaw, y: Array) -> Array:
     """Charge taken [C]."""
     return y[law.DISCHARGE] * law.UNITS[law.DISCHARGE]
 
@@ -289,20 +289,20 @@ def _segment_end(
 ) -> _Segment:
     """A segment at its end `c`, from the state `before` it and its first instant."""
     signals, _, _, asked = law.instant(robot, conditions, segment, c.y, c.stands)
-    status, missed = _ends(law, robot, conditions, segment, signals, asked, c.stands)
-    status = jnp.where(c.ended, _ending(c), status)
+    status, missed = _segment_status(law, robot, conditions, segment, signals, asked, c.stands)
+    status = jnp.where(c.ended, _early_end_status(c), status)
     slips = law.exceeded(robot, signals)["slips"] & ~c.stands
     flags = c.flags | flag_mask({"demand_missed": missed & ~c.ended, "slips": slips})
     rise = law.stored(robot, signals) - law.stored(robot, beginning)
     drawn, returned = (c.q[list(law.TOTALS).index(name)] for name in ("drawn", "returned"))
-    first, last = (robot.battery.energy(_charge(law, x.y)) for x in (before, c))
+    first, last = (robot.battery.energy(_charge_taken(law, x.y)) for x in (before, c))
     given = jnp.where(conditions.battery > 0.5, last - first, drawn - returned)
     ran = ~before.ended
     time, rise, given = (jnp.where(ran, x, 0.0) for x in (c.y[law.CLOCK], rise, given))
     return _Segment(time, jnp.where(ran, c.q, 0.0), rise, given, c.peaks, status, flags, signals, c.kept)
 
 
-def _mission(
+def _assemble_mission(
     law: MotionLaw, robot: Robot, conditions: Conditions, profile: Profile, c: Carry, ends: _Segment
 ) -> Mission:
     """The mission from its last state `c` and the ends of its segments, (cycles · segments, ...)."""
@@ -313,7 +313,7 @@ def _mission(
     bad = (status == STALLED) | (status == SLIDES) | (status == ROLLS_BACK) | (status == TIPS)
     first = jnp.argmax(bad)
     outcome = jnp.where(jnp.any(bad), status[first], CONVERGED)
-    outcome = jnp.where(c.ended, _ending(c), outcome)
+    outcome = jnp.where(c.ended, _early_end_status(c), outcome)
     end = jax.tree.map(lambda x: x[-1], ends.found)
     answer = withhold_numbers(law.RESULT(robot, end, outcome), outcome != FAILED, outcome != FAILED)
     answer = dataclasses.replace(answer, flags=c.flags)
@@ -325,17 +325,17 @@ def _mission(
     course = None
     if c.buffer is not None:
         course = _course(law, robot, conditions, profile, c, each, ends.kept)
-    winding, housing = _temperatures(law, c.y)
+    winding, housing = _winding_and_housing_temperatures(law, c.y)
     return Mission(
         total=total, segments=each, peaks=named(c.peaks), segment_peaks=named(ends.peaks.reshape(*shape, -1)),
         status=status.reshape(shape), flags=ends.flags.reshape(shape), result=answer,
-        temperature_winding=jnp.max(winding), temperature_housing=jnp.max(housing), discharge=_charge(law, c.y),
+        temperature_winding=jnp.max(winding), temperature_housing=jnp.max(housing), discharge=_charge_taken(law, c.y),
         steps=c.accepted + c.rejected, rejected=c.rejected,
         course=course,
     )  # fmt: skip
 
 
-def _temperatures(law: MotionLaw, y: Array) -> tuple[Array, Array]:
+def _winding_and_housing_temperatures(law: MotionLaw, y: Array) -> tuple[Array, Array]:
     """Temperatures of windings and housings [°C]."""
     winding, housing = (np.asarray(law.UNITS)[k] * y[..., k] for k in (law.WINDING, law.HOUSING))
     return winding, housing
@@ -360,7 +360,7 @@ def _course(
         return balances.signals_of(law.instant(robot, conditions, profile.row(k % profile.segments), y, stands)[0])
 
     every = law.at_places(jax.vmap(signals)(ys, stood, segment), so_far)
-    winding, housing = _temperatures(law, ys)
+    winding, housing = _winding_and_housing_temperatures(law, ys)
 
     def shown(x: Array) -> Array:
         return jnp.where(within.reshape(-1, *[1] * (x.ndim - 1)), x, jnp.nan)

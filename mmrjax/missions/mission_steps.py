@@ -161,7 +161,7 @@ class MotionLaw(Protocol):
         ...
 
 
-def _firmly(
+def _holding_margins(
     law: MotionLaw, robot: Robot, otherwise: Conditions, segment: Profile, y: Array, stands: Array
 ) -> tuple[Array, Array]:
     """Margins of the friction that would hold the robot, now and at the later current.
@@ -172,11 +172,11 @@ def _firmly(
     at_rest = law.asked_at(robot, otherwise, segment, y, jnp.asarray(True))
     current = law.AT_REST.current_at_rest(at_rest.robot, at_rest.conditions, law.state_of(at_rest.robot, y, stands))
     settled = y.at[law.CURRENT].set(current / law.UNITS[0])
-    firm = _firm(law, asked, y, stands)
-    return firm, smallest(firm, _firm(law, at_rest, settled, stands))
+    firm = _holding_margin(law, asked, y, stands)
+    return firm, smallest(firm, _holding_margin(law, at_rest, settled, stands))
 
 
-def _firm(law: MotionLaw, asked: SegmentInputs, y: Array, stands: Array) -> Array:
+def _holding_margin(law: MotionLaw, asked: SegmentInputs, y: Array, stands: Array) -> Array:
     """Margin of the friction that would hold the robot [-], see `rest.firmness`."""
     return jnp.asarray(law.AT_REST.firmness(asked.robot, asked.conditions, law.state_of(asked.robot, y, stands)))
 
@@ -201,7 +201,7 @@ class Carry(NamedTuple):
     buffer: tuple[Array, ...] | None
 
 
-def _top(before: Array, after: Array, rise: Array, fall: Array) -> Array:
+def _peak_between(before: Array, after: Array, rise: Array, fall: Array) -> Array:
     """Largest magnitude of a curve between two values, on the cubic with slopes `rise` and `fall` at its ends."""
     sign = jnp.sign(after)
     x0, x1, d0, d1 = sign * before, sign * after, sign * rise, sign * fall
@@ -233,7 +233,7 @@ def event_functions(
 
     none = -jnp.ones_like(slow)
     here = (robot, otherwise, segment, y, stands)
-    firm, stays = compute_rarely(near, functools.partial(_firmly, law), here, (none, none))
+    firm, stays = compute_rarely(near, functools.partial(_holding_margins, law), here, (none, none))
     standing = smallest(slow, grips, stays - FIRMLY)
     battery, discharge = asked.robot.battery, law.drawn(asked, y, stands)[1]
     empty = jnp.where(asked.conditions.battery > 0.5, (discharge / battery.capacity - 1) / OF_CHARGE, -1.0)
@@ -242,7 +242,7 @@ def event_functions(
     return jnp.stack([jnp.where(stands, -1.0, standing), jnp.where(stands, -firm, -1.0), empty, falls, recovers])
 
 
-def _onto(
+def _move_to_event(
     law: MotionLaw,
     robot: Robot,
     otherwise: Conditions,
@@ -294,7 +294,7 @@ def integrate_segment(
     """Integrates one segment until its end, or until the mission ends."""
     length = (segment.time[1] - segment.time[0]).astype(carry.y.dtype)
     limit = step_longest(robot, otherwise)
-    leg = _Leg(law, robot, otherwise, segment, tolerance, length, jnp.inf if limit is None else limit)
+    leg = _SegmentLeg(law, robot, otherwise, segment, tolerance, length, jnp.inf if limit is None else limit)
     first, nearly = carry.accepted + carry.rejected, length * (1 - 1e-12 if carry.y.dtype == float else 1 - 1e-6)
 
     def going(c: Carry) -> Array:
@@ -309,12 +309,12 @@ def integrate_segment(
     return c._replace(failed=failed, ended=c.ended | failed)
 
 
-class _Tried(NamedTuple):
+class _TriedStep(NamedTuple):
     """A step before it is accepted or rejected.
 
     Attributes:
         y, q: unknowns and integrals at its end.
-        h: its length [s].
+        h: length of the step [s].
         last: True if it ends the segment or trips.
         good: True if its error is small enough.
         grown: length that its error permits for the next step [s].
@@ -328,7 +328,7 @@ class _Tried(NamedTuple):
     grown: Array
 
 
-class _Landed(NamedTuple):
+class _StepToEvent(NamedTuple):
     """A step with the event at its end.
 
     Attributes:
@@ -354,7 +354,7 @@ class _Landed(NamedTuple):
     step: Array
 
 
-class _Leg(NamedTuple):
+class _SegmentLeg(NamedTuple):
     """One segment of a mission, with its length and the longest step [s]."""
 
     law: MotionLaw
@@ -371,7 +371,7 @@ class _Leg(NamedTuple):
         # The inputs of the segment may exceed the friction that held the robot.
         y = carry.y.at[law.CLOCK].set(0.0)
         asked = law.asked_at(robot, otherwise, segment, y, carry.stands)
-        stands = carry.stands & (_firm(law, asked, y, carry.stands) >= 0)
+        stands = carry.stands & (_holding_margin(law, asked, y, carry.stands) >= 0)
         # They may also change the cell voltage across its cut-off.
         below = jnp.asarray(_cell_above(law, asked, y, stands) < 0)
         low = jnp.where(below & carry.below, carry.low, 0.0)
@@ -384,7 +384,7 @@ class _Leg(NamedTuple):
         )  # fmt: skip
         return begin._replace(slope=law.instant(robot, otherwise, segment, y, stands)[1])
 
-    def tried(self, c: Carry) -> _Tried:
+    def tried(self, c: Carry) -> _TriedStep:
         """A step of the planned length, limited by the end of the segment and by the cut-off time of the cells."""
         law, robot, otherwise, segment, *_ = self
 
@@ -404,9 +404,9 @@ class _Leg(NamedTuple):
         size = law.norm(error_across_kink(u[-1], c.y, y, kink) / scale)
         size = jax.lax.stop_gradient(jnp.where(jnp.isfinite(size), size, 1e6))
         grown = h * jnp.clip(0.9 * jnp.maximum(size, 1e-12) ** -0.25, 0.1, 6.0)
-        return _Tried(y, q, h, last, size <= 1, grown)
+        return _TriedStep(y, q, h, last, size <= 1, grown)
 
-    def landed(self, c: Carry, tried: _Tried) -> _Landed:
+    def landed(self, c: Carry, tried: _TriedStep) -> _StepToEvent:
         """The step, shortened to its first event if it contains one."""
         law, robot, otherwise, segment, *_ = self
         y, q, h, last, good, grown = tried
@@ -420,7 +420,7 @@ class _Leg(NamedTuple):
         event = taken & jnp.any(happened)
         here = (robot, otherwise, segment, y, q, c.stands, c.below, after, h)
         none = (y, q, c.stands, c.below, jnp.asarray(-1, jnp.argmin(after).dtype), jnp.zeros_like(h))
-        y, q, stands, below, which, back = compute_rarely(event, functools.partial(_onto, law), here, none)
+        y, q, stands, below, which, back = compute_rarely(event, functools.partial(_move_to_event, law), here, none)
         y, q = jnp.where(taken, y, c.y), jnp.where(taken, q, c.q)
         stands = jnp.where(taken, stands, c.stands)
         low = jnp.where(below & c.below, c.low + jnp.where(taken, h + back, 0.0), 0.0)
@@ -430,16 +430,16 @@ class _Leg(NamedTuple):
         step = jnp.where(good & far, h * jnp.clip(jnp.min(share), 0.02, 0.99), step)
         step = jnp.where(event, FIRST, step)
         step = jnp.clip(jax.lax.stop_gradient(step), SHORTEST, self.longest)
-        return _Landed(y, q, stands, below, low, which, cut_off, after, taken, event, step)
+        return _StepToEvent(y, q, stands, below, low, which, cut_off, after, taken, event, step)
 
-    def after(self, c: Carry, h: Array, good: Array, landed: _Landed) -> Carry:
+    def after(self, c: Carry, h: Array, good: Array, landed: _StepToEvent) -> Carry:
         """The state after a step of length h [s], with its contributions to peaks, flags and the course."""
         law, robot, otherwise, segment, *_ = self
         y, stands, below, taken, cut_off = landed.y, landed.stands, landed.below, landed.taken, landed.cut_off
         signals, dy, _, _ = law.instant(robot, otherwise, segment, y, stands)
         # Current and heat may peak within the step. Speeds are different: at the end of a long step their slopes
         # belong to the stiff part of the solution, and a cubic would oscillate.
-        tops = _top(c.y, y, h * c.slope, h * dy)
+        tops = _peak_between(c.y, y, h * c.slope, h * dy)
         within = law.peaks_within(robot, y, tops)
         highest = jnp.stack([jnp.where(taken, within.get(name, -jnp.inf), -jnp.inf) for name in law.PEAKS])
         each = law.peaks(robot, signals)

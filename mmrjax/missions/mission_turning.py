@@ -142,7 +142,7 @@ def instant(
     goes = energy.sink_powers_turning(asked.robot, asked.conditions, travel)
     cos, sin = jnp.cos(motion.heading), jnp.sin(motion.heading)
     totals = [
-        motion.speed, _size(motion), jnp.maximum(power, 0.0), jnp.maximum(-power, 0.0),
+        motion.speed, _ground_speed(motion), jnp.maximum(power, 0.0), jnp.maximum(-power, 0.0),
         robot.sides**2 * sum_of_sides(current) / 2, sum_of_sides(torque) / 2,
         *(goes[name] for name in energy.SINKS),
         motion.speed * cos - motion.speed_lateral * sin, motion.speed * sin + motion.speed_lateral * cos,
@@ -156,7 +156,7 @@ def instant(
     )
 
 
-def _size(motion: PlaneMotion) -> Scalar:
+def _ground_speed(motion: PlaneMotion) -> Scalar:
     """Speed of the robot over the ground [m/s], with a derivative at rest."""
     square = jnp.asarray(motion.speed) ** 2 + jnp.asarray(motion.speed_lateral) ** 2
     return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
@@ -187,7 +187,7 @@ def stored(robot: Robot, found: TurningInstant) -> Scalar:
 def peaks(robot: Robot, found: TurningInstant) -> Scalars:
     each = jax.vmap(lambda s: mission_straight.peaks(robot, s))(found.signals)
     most: Scalars = {name: jnp.max(jnp.asarray(x)) for name, x in each.items()}
-    most |= {"current": sum_of_sides(jnp.asarray(each["current"])) / 2, "speed": _size(found.motion)}
+    most |= {"current": sum_of_sides(jnp.asarray(each["current"])) / 2, "speed": _ground_speed(found.motion)}
     return {**most, "yaw_rate": jnp.abs(found.motion.yaw_rate), **_of_sides(robot, each)}
 
 

@@ -53,11 +53,10 @@ class Profile(eqx.Module):
         payload: [kg].
         adhesion, adhesion_lateral: as a ratio to the robot's surface, along and across [-].
         load_torque: torque of a brake on the output of each drive, for a load on a shaft [N·m].
-        current_other: of other consumers on the battery [A]. Shape (rows,), or None: as in the conditions
-            (for current_other, in the robot).
-        duty_left, duty_right: as `duty`, of each side.
-        voltage_left, voltage_right: left and right voltage at the motors of each side [V], as a share of the no-load
-            voltage of the source.
+        current_other: current of other consumers on the battery [A]. Shape (rows,), or None: as in the conditions
+            (for current_other, in the robot). duty_left, duty_right: as `duty`, of each side. voltage_left,
+            voltage_right: left and right voltage at the motors of each side [V], as a share of the no-load voltage
+            of the source.
         yaw_rate: demanded together with a ground speed, positive to the left [rad/s]. Stating any of them
             makes the robot free to turn.
         linear: True if values change linearly between rows, False if they hold until the next row.
@@ -150,7 +149,7 @@ def profile(
         time: time of the rows [s].
         mode: one of `MODES`, one or one per row.
         demand, linear, cycles: see `Profile`.
-        values: its other fields, by name.
+        values: other fields of the profile, by name.
 
     Raises:
         UsageError: fewer than two rows, a time that does not increase, an unknown mode or field, a length that

@@ -116,11 +116,11 @@ def commanded(robot: Robot, conditions: Conditions, state: State) -> Conditions:
     """Conditions with the duty that a controller demands in a state, in the place of its goal."""
     if conditions.goal is None or robot.controller is None:
         return conditions
-    duty = conditions.duty * (_wanted(robot, conditions, state) if state.command is None else state.command)
+    duty = conditions.duty * (_controller_duty(robot, conditions, state) if state.command is None else state.command)
     return eqx.tree_at(lambda c: (c.duty, c.goal), conditions, (duty, None), is_leaf=lambda x: x is None)
 
 
-def _wanted(robot: Robot, conditions: Conditions, state: State) -> Scalar:
+def _controller_duty(robot: Robot, conditions: Conditions, state: State) -> Scalar:
     """Duty that a controller wants [-]."""
     assert robot.controller is not None and conditions.goal is not None
     shown, speed = shown_to_controller(robot, conditions, state)
@@ -133,7 +133,7 @@ def controller_rates(robot: Robot, conditions: Conditions, state: State) -> list
     """Rates of a controller's states: the error, unless it would drive the duty beyond its limit, and the duty's."""
     if conditions.goal is None or robot.controller is None:
         return [jnp.zeros_like(state.speed)] * robot.controller_size
-    duty = _wanted(robot, conditions, state)
+    duty = _controller_duty(robot, conditions, state)
     error = conditions.goal - shown_to_controller(robot, conditions, state)[0]
     limited = (jnp.abs(duty) >= robot.controller.limit) & (duty * error > 0)
     integrated = jnp.where(limited | (conditions.open > 0.5), 0.0, error)
@@ -313,7 +313,7 @@ def gearbox(
 
     def at_output(torque: Scalar) -> Signals:
         carrying = _fill(signals, torque_carried=torque)
-        return _accelerated(robot, chassis, carrying, load, effects_sum(robot, carrying, "gearbox"))
+        return _gearbox_signals(robot, chassis, carrying, load, effects_sum(robot, carrying, "gearbox"))
 
     def surplus(torque: Scalar) -> Scalar:
         signals = at_output(torque)
@@ -328,7 +328,7 @@ def gearbox(
     return at_output(torque)
 
 
-def _accelerated(robot: Robot, chassis: Load, signals: Signals, load: Scalar, own: Scalar) -> Signals:
+def _gearbox_signals(robot: Robot, chassis: Load, signals: Signals, load: Scalar, own: Scalar) -> Signals:
     """Signals of a gearbox whose effects lose `own` under a load [N·m].
 
     Let A be the motor torque less the idle loss, and B the load at the output. The transmitted torque has the sign of
@@ -371,7 +371,7 @@ def _to_slip(robot: Robot, conditions: Conditions, chassis: Load, signals: Signa
     return slip(robot, travel(robot, chassis, motor(robot, signals)))
 
 
-def _pulled(robot: Robot, signals: Signals, traction: Scalar) -> Signals:
+def _traction_and_net_force(robot: Robot, signals: Signals, traction: Scalar) -> Signals:
     """Traction [N] and the force left to accelerate the robot, eq. (1)."""
     acceleration = (traction - signals.demand) / (signals.mass / robot.sides)
     return _fill(signals, traction=traction, acceleration=acceleration)
@@ -387,7 +387,7 @@ def moving_signals(robot: Robot, conditions: Conditions, state: State, way: Scal
     """
     conditions = commanded(robot, conditions, state)
     if conditions.motor_speed is not None:
-        state = dataclasses.replace(state, current=_current(robot, conditions, state, way))
+        state = dataclasses.replace(state, current=_current_for_acceleration(robot, conditions, state, way))
     return _moving(robot, conditions, state, way)
 
 
@@ -422,7 +422,7 @@ def _one_way(signals: Signals, way: Scalar | None) -> Signals:
 CURRENT_STEPS = 4
 
 
-def _current(robot: Robot, conditions: Conditions, state: State, way: Scalar | None) -> Scalar:
+def _current_for_acceleration(robot: Robot, conditions: Conditions, state: State, way: Scalar | None) -> Scalar:
     """Motor current that gives the imposed acceleration [A]."""
 
     def at(given: tuple[Robot, Conditions, State], current: Scalar) -> Signals:
@@ -478,7 +478,7 @@ def _moving(robot: Robot, conditions: Conditions, state: State, way: Scalar | No
         signals = gearbox(robot, chassis, track(robot, chassis, signals))
         return _fill(signals, acceleration=chassis.radius * signals.acceleration_wheel)
     traction = chassis.ground.traction(signals.speed_sliding, signals.normal, signals.adhesion)
-    signals = _pulled(robot, signals, traction)
+    signals = _traction_and_net_force(robot, signals, traction)
     return gearbox(robot, chassis, track(robot, chassis, signals))
 
 
@@ -543,13 +543,13 @@ def resolved_signals(
     signals = _fill(begin_signals(robot, conditions, state), normal=mover.normal)
     signals = _to_slip(robot, conditions, chassis, signals)
     pull = mover.pull(chassis, signals)
-    return _drawn(robot, chassis, signals, pull), pull
+    return _side_signals(robot, chassis, signals, pull), pull
 
 
-def _drawn(robot: Robot, chassis: Chassis, signals: Signals, pull: Any) -> Signals:
+def _side_signals(robot: Robot, chassis: Chassis, signals: Signals, pull: Any) -> Signals:
     """Signals of one side whose sliding is known, with the forces of its contacts."""
     traction, guide = pull.traction, jnp.sum(pull.guide)
-    signals = track(robot, chassis, _pulled(robot, signals, traction), guide)
+    signals = track(robot, chassis, _traction_and_net_force(robot, signals, traction), guide)
     return gearbox(robot, chassis, signals, pull.load - guide * chassis.radius)
 
 
@@ -566,7 +566,7 @@ def resolved_sides(
     signals = _fill(_begin_sides(robot, conditions, sides, motion), normal=mover.normal)
     signals = jax.vmap(lambda c, s: _to_slip(robot, c, chassis, s))(sides, signals)
     pull = mover.pull(chassis, signals)
-    return jax.vmap(lambda s, p: _drawn(robot, chassis, s, p))(signals, pull), pull
+    return jax.vmap(lambda s, p: _side_signals(robot, chassis, s, p))(signals, pull), pull
 
 
 def driven_signals(robot: Robot, conditions: Conditions, state: State, direction: Scalar | None) -> Signals:
@@ -668,7 +668,7 @@ def lateral_friction(conditions: Conditions, chassis: Chassis) -> Scalar:
     return lateral if stated is None else lateral * stated / conditions.adhesion
 
 
-def _both(x: Scalar) -> Array:
+def _for_both(x: Scalar) -> Array:
     """The same value for left and right side."""
     return jnp.broadcast_to(x, SIDES.shape)
 
@@ -679,19 +679,21 @@ def _begin_sides(robot: Robot, conditions: Conditions, own: Conditions, motion: 
     signals = jax.vmap(functools.partial(begin_signals, robot))(own, states_of_sides(robot, conditions, motion))
     return _fill(
         signals,
-        total_current=_both(sum_of_sides(jnp.asarray(signals.total_current)) / 2),
+        total_current=_for_both(sum_of_sides(jnp.asarray(signals.total_current)) / 2),
         side=jnp.sign(SIDES),
-        direction_turn=_both(contact.smooth_sign(motion.yaw_rate * chassis.turning.width / 2, chassis.speed_still)),
-        slope=_both(jnp.arcsin(sine(conditions.slope) * cosine(motion.heading))),
-        **{name: _both(getattr(motion, name)) for name in IN_PLANE},
+        direction_turn=_for_both(
+            contact.smooth_sign(motion.yaw_rate * chassis.turning.width / 2, chassis.speed_still)
+        ),
+        slope=_for_both(jnp.arcsin(sine(conditions.slope) * cosine(motion.heading))),
+        **{name: _for_both(getattr(motion, name)) for name in IN_PLANE},
     )
 
 
-def added_in_plane(robot: Robot, signals: Signals) -> tuple[Scalar, Scalar]:
+def lateral_and_yaw_effects(robot: Robot, signals: Signals) -> tuple[Scalar, Scalar]:
     """Sums of the robot's effects in the balances `lateral` [N] and `yaw` [N·m], over both sides."""
 
     def of(balance: str) -> Scalar:
-        each = _both(jax.vmap(lambda s: effects_sum(robot, s, balance))(signals))
+        each = _for_both(jax.vmap(lambda s: effects_sum(robot, s, balance))(signals))
         return robot.sides / 2 * sum_of_sides(each)
 
     return of("lateral"), of("yaw")
@@ -725,7 +727,7 @@ def turning_signals(
     own_load = jax.vmap(lambda s: travel(robot, chassis, s))(
         _fill(even, normal=held.normal / units, moment_lateral=held.moment / units)
     )
-    lateral, yaw = added_in_plane(robot, own_load)
+    lateral, yaw = lateral_and_yaw_effects(robot, own_load)
     pull = held.ahead - units * own_load.resistance
     along = sum_of_sides(pull) - mass * GRAVITY * sine_slope * cosine(motion.heading)
     across = sum_of_sides(held.aside) + mass * GRAVITY * sine_slope * sine(motion.heading) - lateral
@@ -737,7 +739,7 @@ def turning_signals(
         pulled = jax.vmap(lambda s: gearbox(robot, chassis, s))(pulled)
     else:
         pulled = jax.vmap(lambda c, s: _speed_imposed(robot, c, chassis, s))(sides, pulled)
-        pulled = _fill(pulled, total_current=_both(sum_of_sides(jnp.asarray(pulled.total_current)) / 2))
+        pulled = _fill(pulled, total_current=_for_both(sum_of_sides(jnp.asarray(pulled.total_current)) / 2))
     return Travel(
         pulled,
         held,

@@ -78,7 +78,7 @@ class Conditions(eqx.Module):
     """The conditions of one run or of a batch. All fields broadcast to one shape.
 
     Attributes:
-        configuration: which of the robot's configurations, its index. Until `resolved` also by name (`Named`).
+        configuration: index of the robot's configuration. Until `resolved` it may be a name (`Named`).
         voltage: voltage of the external supply [V]. Not used with `battery`.
         slope_deg: slope angle, positive uphill [deg].
         payload: additional load mass m_c [kg].
@@ -181,25 +181,25 @@ class Conditions(eqx.Module):
         if not isinstance(configuration, jax.Array | Named):
             words = np.asarray(configuration)
             which = Named.of(words) if words.dtype.kind == "U" else configuration
-        which = which if isinstance(which, Named) else _number("configuration", which, int)
-        numbers = {name: _number(name, x) for name, x in stated.items()}
+        which = which if isinstance(which, Named) else _number_array("configuration", which, int)
+        numbers = {name: _number_array(name, x) for name, x in stated.items()}
         shapes = {name: x.shape for name, x in {"configuration": which, **numbers}.items()}
         try:
             shape = np.broadcast_shapes(*shapes.values())
         except ValueError:
             listed = ", ".join(f"{name} {s}" for name, s in shapes.items() if s)
             raise ValueError(f"Conditions: shapes do not broadcast to one another: {listed}") from None
-        self.configuration = jax.tree.map(lambda x: _broadcast(x, shape), which)
-        self.begin = None if begin is None else _broadcast(_number("begin", begin, int), shape)
+        self.configuration = jax.tree.map(lambda x: _broadcast_array(x, shape), which)
+        self.begin = None if begin is None else _broadcast_array(_number_array("begin", begin, int), shape)
         # an equal number for all runs is stored once: most fields of a large batch are 0 or 1
         shared: dict[float, Array] = {}
         for name in CONDITIONS:
             if isinstance(value := stated.get(name), float):
                 if value not in shared:
-                    shared[value] = _broadcast(numbers[name], shape)
+                    shared[value] = _broadcast_array(numbers[name], shape)
                 setattr(self, name, shared[value])
             else:
-                setattr(self, name, None if value is None else _broadcast(numbers[name], shape))
+                setattr(self, name, None if value is None else _broadcast_array(numbers[name], shape))
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -276,7 +276,7 @@ def sides_contradiction(stated: Collection[str]) -> str:
     return f"{stated_fields}: got it without {lacking}; state both"
 
 
-def _number(name: str, x: Any, kind: type = float) -> Any:
+def _number_array(name: str, x: Any, kind: type = float) -> Any:
     """Array of numbers of that kind. NumPy input stays NumPy's, so that no JAX operation is compiled for it.
 
     Raises:
@@ -295,7 +295,7 @@ def _number(name: str, x: Any, kind: type = float) -> Any:
     return stated.astype(kind)
 
 
-def _broadcast(x: Any, shape: tuple[int, ...]) -> Any:
+def _broadcast_array(x: Any, shape: tuple[int, ...]) -> Any:
     """Array of that shape. NumPy input stays NumPy's if JAX computes in single precision, to keep its digits."""
     if isinstance(x, jax.Array):
         return jnp.broadcast_to(x, shape)

@@ -115,7 +115,7 @@ def force_contact(
 
     Args:
         gap: distance q [m].
-        gap_rate: its rate q̇ [m/s].
+        gap_rate: rate of the gap q̇ [m/s].
         gap_free: q_0 = r_1 + r_2 [m], eq. (29).
         stiffness: c [N/m^e].
         exponent: e [-].

@@ -103,7 +103,7 @@ class Driver(eqx.Module):
 
         Args:
             duty: demanded [-], with the sign of the voltage that it gives.
-            limited: after the current limit [-].
+            limited: duty after the current limit [-].
             current: current of a motor [A].
             excess: the driver's voltage less E [V].
         """

@@ -21,8 +21,8 @@ class Masses(eqx.Module):
 
     Attributes:
         chassis: mass of all parts that do not turn with the pulleys.
-        forward, up: its centre from the middle of the wheelbase.
-        inertia: its moment of inertia in pitch about that centre.
+        forward, up: centre of mass relative to the middle of the wheelbase.
+        inertia: moment of inertia in pitch about the centre of mass.
         body: mass without pulleys, wheels, tracks, levers and payload.
         pulley: mass on one axle that turns with it: main and additional pulley, in 4W2T the wheel.
         inertia_pulley: about its axle, front and rear equal: half of J_w of eq. (31) each.
@@ -67,7 +67,7 @@ class _Part(NamedTuple):
     inertia: Scalar
 
 
-def _together(parts: list[_Part]) -> _Part:
+def _joined_parts(parts: list[_Part]) -> _Part:
     """Parts joined rigidly: Σ J + Σ m d² about their common centre (Huygens and Steiner)."""
     mass = sum(p.mass for p in parts)
     forward = sum(p.mass * p.forward for p in parts) / mass
@@ -76,7 +76,7 @@ def _together(parts: list[_Part]) -> _Part:
     return _Part(mass, forward, up, inertia)
 
 
-def _belt(gear: RunningGear, radius: Scalar) -> _Part:
+def _belt_part(gear: RunningGear, radius: Scalar) -> _Part:
     """A main track round its pulleys. Its inertia is reduced by m r², which is in J_w and turns with the pulleys."""
     base, mass = gear.wheelbase, gear.belt_mass
     straights = 2 * base * (base**2 / 12 + radius**2)
@@ -98,7 +98,7 @@ def lever_angles(gear: RunningGear, conditions: Conditions) -> tuple[Scalar, Sca
     )
 
 
-def _levers(gear: RunningGear, tracked: Scalar, front: Scalar, rear: Scalar) -> list[_Part]:
+def _lever_parts(gear: RunningGear, tracked: Scalar, front: Scalar, rear: Scalar) -> list[_Part]:
     """The levers of one side at their angles [rad], see `lever_angles`."""
     mass, inertia, half = gear.lever_mass * tracked, gear.lever_inertia * tracked, gear.wheelbase / 2
     along = gear.lever_centre
@@ -116,13 +116,13 @@ def masses_of_parts(robot: Robot, conditions: Conditions, mass: Scalar) -> Masse
     with folded levers and without payload (`inertia_tracked`, `inertia_wheeled`). The body's is then the difference.
     """
     fixed, levers, body, pulley, inertia_pulley = _of_robot(robot, conditions, mass)
-    return Masses(*_together([*fixed, *levers]), body, pulley, inertia_pulley)
+    return Masses(*_joined_parts([*fixed, *levers]), body, pulley, inertia_pulley)
 
 
 def without_levers(robot: Robot, conditions: Conditions, mass: Scalar) -> Masses:
     """Same as `masses_of_parts` without the levers, which rest on their axles."""
     fixed, _, body, pulley, inertia_pulley = _of_robot(robot, conditions, mass)
-    return Masses(*_together(fixed), body, pulley, inertia_pulley)
+    return Masses(*_joined_parts(fixed), body, pulley, inertia_pulley)
 
 
 def _of_robot(
@@ -134,8 +134,8 @@ def _of_robot(
     wheeled = 1 - tracked
     pulley = gear.pulley_mass + gear.additional_pulley_mass + gear.wheel_mass * wheeled
     inertia_pulley = kind.inertia / 2
-    belt = _belt(gear, robot.radius_pulley)
-    levers = _levers(gear, tracked, *lever_angles(gear, conditions))
+    belt = _belt_part(gear, robot.radius_pulley)
+    levers = _lever_parts(gear, tracked, *lever_angles(gear, conditions))
     nothing = jnp.zeros_like(belt.mass)
     payload = _Part(conditions.payload / robot.sides, gear.payload_offset, gear.payload_height, nothing)
     weighs = mass / robot.sides - 2 * pulley - belt.mass - sum(p.mass for p in levers) - payload.mass
@@ -145,11 +145,11 @@ def _of_robot(
     folded = [
         body._replace(inertia=nothing),
         belt,
-        *_levers(gear, tracked, jnp.pi, jnp.pi),
+        *_lever_parts(gear, tracked, jnp.pi, jnp.pi),
         *pulleys,
     ]
     stated = jnp.where(wheeled > 0.5, gear.inertia_wheeled, gear.inertia_tracked) / robot.sides
-    left = stated - _together(folded).inertia
+    left = stated - _joined_parts(folded).inertia
     body = body._replace(inertia=jnp.where(left > 0, left, body.inertia))
 
     return [body, belt, payload], levers, body.mass, pulley, inertia_pulley

@@ -112,7 +112,7 @@ def blank_robot(configurations: Configurations, sides: float = 1.0, rig: Rig | N
     return params.replace(dataclasses.replace(robot, rig=rig), _NOTHING)
 
 
-def _simplified(track_torque: float) -> Robot:
+def _simplified_robot(track_torque: float) -> Robot:
     """Constant losses as in Table A4. The wheeled chassis, which the table leaves out, in proportion."""
     constant = {
         "motor.friction_coulomb": 4.2e-3,
@@ -135,12 +135,12 @@ def _simplified(track_torque: float) -> Robot:
 
 def sm1() -> Robot:
     """Simplified model 1: constant losses, track torque about a third of M_t0 (Tables A3, A4)."""
-    return _simplified(0.108)
+    return _simplified_robot(0.108)
 
 
 def sm2() -> Robot:
     """Simplified model 2: constant losses, track torque about M_t0 (Tables A3, A4)."""
-    return _simplified(0.300)
+    return _simplified_robot(0.300)
 
 
 #: Robots by their name on the command line.

@@ -79,13 +79,13 @@ class Quantity:
         written: unit as people write it, if it differs from `unit`.
         percent: True if per cent are accepted too.
         stem: start of the names of its columns, if it differs from `name`.
-        sign: what turns its sign: `TRAVEL` or `TURN`. Empty: nothing does.
+        sign: what reverses its sign: `TRAVEL`, `TURN`, or nothing (empty).
         in_profiles: True if a mission's profile may state it.
         rests_on: dotted names of the parameters that it depends on. It is unknown if one of them is.
         group: computation that gives it: a module of `mmrjax.derived`, or one of `requirements.GROUPS`.
         ignores: columns of conditions that it does not depend on, because its computation solves for them or sets
             them.
-        least: of a requirement: True if a bare number is a lower limit, False if it is an upper limit.
+        least: True if a single number in a requirement is a lower limit, False if it is an upper limit.
     """
 
     name: str
@@ -187,7 +187,7 @@ class Condition(Quantity):
         imposed: kinds of `rig.IMPOSED` whose tables may. Empty: all of them.
         acts: load on which it acts: `GROUND` or `SHAFT`. `VEHICLE`: on the ground too, and no other load has it.
             Empty: any.
-        usual: its value in a table that does not state it. None: none stands for it.
+        usual: value for a table without the condition. None: the table must contain it.
     """
 
     _: dataclasses.KW_ONLY
@@ -297,7 +297,7 @@ def _winding_temperature(robot: Any, signals: Any) -> Any:
     return robot.motor.temperature_settled(signals.current)
 
 
-def _position(robot: Any, signals: Any) -> Any:
+def _rolled_path(robot: Any, signals: Any) -> Any:
     """Distance that the driven wheel has rolled [m]."""
     return robot.chassis(signals.configuration).radius * signals.angle
 
@@ -469,7 +469,7 @@ TABLE: dict[str, tuple[Quantity, ...]] = {
             sign="", settled=False,
         ),
         Channel(
-            "position", "mm", "position", _PLACES, 1e4, signal=_position, resolution=2, zero_at_rest=True, sign="",
+            "position", "mm", "position", _PLACES, 1e4, signal=_rolled_path, resolution=2, zero_at_rest=True, sign="",
             settled=False,
         ),
         _VOLTAGE,

@@ -103,9 +103,10 @@ class Rig(eqx.Module):
         delay: dead time between a value in the column and its action [s].
         columns: columns of tables: (column name in this program, column name in the file, factor from its unit).
         priors: (parameter, mean, sd) [SI] stated in the file, which replace the parameters' own. Sd 0: exactly known.
-        start: of histories: `rest`, `measured` (by the first samples) or `free` (the same as prior means).
-        begins: of histories that do not begin at rest, once their table is known.
-        between_rows: of histories, one of `BETWEEN`. An imposed speed is always interpolated linearly.
+        start: start of histories: `rest`, `measured` (by the first samples) or `free` (the same as prior means).
+        begins: initial states of histories that do not begin at rest, once their table is known.
+        between_rows: course of the imposed quantity between rows of histories, one of `BETWEEN`. An imposed speed
+        is always interpolated linearly.
         surfaces: (configuration, another configuration that differs only by its ground).
         inherits: True if a packaged robot supplies what the file leaves open. False: nothing comes from another.
         unknown: parameters that nobody stated and that have no substitute. Their fields hold a packaged robot's value

@@ -26,7 +26,7 @@ class Shaft(eqx.Module):
     tracks, eq. (24).
 
     Attributes:
-        speed_rest: of the output, within which friction is smoothed through rest [rad/s].
+        speed_rest: output speed below which friction is smoothed through rest [rad/s].
         lacks: balances that it lacks, having no ground.
         on_tracks: 0, neither tracks nor wheels.
         mass: mass of a robot, 0.
@@ -111,9 +111,9 @@ class Shaft(eqx.Module):
         oscillate at `MESH_FREQUENCY`, damped by `MESH_DAMPING`.
 
         Args:
-            gap: of the output's motor side ahead of the load, from the middle [rad].
-            closing: its rate [rad/s].
-            inertia_motor: of the motor side at the output [kg·m²].
+            gap: angle of the output's motor side ahead of the load, from the middle [rad].
+            closing: rate of the gap [rad/s].
+            inertia_motor: inertia of the motor side at the output [kg·m²].
         """
         inertia = inertia_motor * self.inertia / (inertia_motor + self.inertia)
         elastic = jnp.asarray(self.stiffness) > 0

@@ -52,7 +52,7 @@ class State(eqx.Module):
         temperature: temperature of the winding [°C], which sets its resistance. None: not followed, resistance as
             stated.
         distance: travelled since the start of the run [m]. Used by loads that depend on their angle.
-        gap: of the output's motor side ahead of the load, from the middle of a backlash [rad]. None: rigid.
+        gap: angle of the output's motor side ahead of the load, from the middle of a backlash [rad]. None: rigid.
         integral: integral of the controller's error over time, as in `Controller`. None: no controller.
         command: duty of a controller with a lag [-]. None: without a lag.
     """
@@ -198,7 +198,7 @@ class Result(eqx.Module):
         power_lift: against gravity [W].
         efficiency_motor, efficiency_gear, efficiency_chassis: N_d/P_e, N_r/N_d, N_t/N_r [-], 0 at rest
             and if power does not flow that way.
-        winding_settled: after long running at this current [°C], inf if it has no limit.
+        winding_settled: winding temperature after long running at this current [°C], inf if it has no limit.
         voltage_cell: voltage of one cell of the battery [V], 0 on the external supply.
         status: code into `STATUSES`.
         flags: bit mask over `FLAGS`.

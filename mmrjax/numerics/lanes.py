@@ -18,7 +18,7 @@ T = TypeVar("T")
 LANES = 256
 
 
-class _Loop(NamedTuple):
+class _MemberLoop(NamedTuple):
     """A loop of one member, see `loop_until`: functions of its numbers.
 
     Attributes:
@@ -101,7 +101,7 @@ def loop_until(
     Args:
         begun: state of arrays, from `own`.
         turn: the next state, from `own` and a state.
-        ended: of a state. They close over no traced number.
+        ended: function of a state, True if the member has ended. The functions close over no traced number.
         own: data of one member. Its numbers may be batched.
         kept: the part of the last state to return.
         most: number of members computed at a time, `LANES` if None.
@@ -112,7 +112,7 @@ def loop_until(
         return eqx.combine(numbers, rest)
 
     lanes = LANES if most is None else most
-    loop = _Loop(lambda x: begun(of(x)), lambda x, state: turn(of(x), state), ended, kept, lanes)
+    loop = _MemberLoop(lambda x: begun(of(x)), lambda x, state: turn(of(x), state), ended, kept, lanes)
 
     def many(numbers: Any, batched: Any, size: int) -> T:
         """The end of each of `size` members. If these are batched again, all members share the same lanes."""

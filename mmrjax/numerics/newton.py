@@ -57,14 +57,14 @@ def _linearised(fn: Function, y: Vector, args: Any, apart: bool) -> tuple[Matrix
 
         def along(x: Array, k: int = k, moved: set[int] = moved) -> Vector:
             values = fn((*y[:k], x, *y[k + 1 :]), args)[0]
-            return tuple(_watched(v, i, moved) for i, v in enumerate(values))
+            return tuple(_watch_derivative(v, i, moved) for i, v in enumerate(values))
 
         value, column = jax.jvp(along, (y[k],), (jnp.ones_like(y[k]),))
         columns.append([x if i in moved else None for i, x in enumerate(column)])
     return list(zip(*columns, strict=True)), value
 
 
-def _watched(value: Array, index: int, moved: set[int]) -> Array:
+def _watch_derivative(value: Array, index: int, moved: set[int]) -> Array:
     """`value`. While it is differentiated, `index` is added to `moved` if it has a derivative."""
 
     @jax.custom_jvp
@@ -88,7 +88,7 @@ def _solution(factors: list, value: Vector) -> Vector:
     return tuple(jnp.zeros(()) if x is None else x for x in substitute(factors, value))
 
 
-def _less(y: Vector, step: Vector) -> Vector:
+def _subtract_step(y: Vector, step: Vector) -> Vector:
     """y - step, with unknowns unchanged that would not be finite."""
     return tuple(jnp.where(jnp.isfinite(b), a - b, a) for a, b in zip(y, step, strict=True))
 
@@ -126,7 +126,7 @@ class Turning(eqx.Module):
         aside = (*_solution([row[:-1] for row in factors[:-1]], value[:-1]), jnp.zeros_like(here))
         alone = late & ~others & ~solved
         taken = tuple(jnp.where(alone, b, jnp.where(leaves, share * a, a)) for a, b in zip(step, aside, strict=True))
-        return Turning(_less(self.y, taken), solved, self.turns + 1, low, high)
+        return Turning(_subtract_step(self.y, taken), solved, self.turns + 1, low, high)
 
 
 class FewUnknowns(optx.AbstractRootFinder[Vector, Vector, Any, Turning]):
@@ -135,8 +135,7 @@ class FewUnknowns(optx.AbstractRootFinder[Vector, Vector, Any, Turning]):
     A member is solved after a step whose square is below `atol`.
 
     Attributes:
-        atol: of f.
-        rtol, norm: not read.
+        atol: absolute tolerance of f. rtol, norm: not read.
         apart: True to compute ∂f/∂y one unknown after another, which is faster over large batches. False: all
             together, a program of a third of the size.
     """
@@ -228,7 +227,7 @@ def root(
     if linear is None:
         return search(start, shared, own)
     jacobian, value = _linearised(_function(linear), start, (shared, own), apart)
-    y = _less(start, _solution(factorise(jacobian), value))
+    y = _subtract_step(start, _solution(factorise(jacobian), value))
     solved = _small(residual(y, shared, own), tolerance)
     return compute_rarely(~solved, search, (y, shared, own), (y, solved))
 

@@ -99,7 +99,7 @@ def rosenbrock_stages(
     u, v, y, q = [inverted @ f], [], y0, q0
     v.append(h * _GAMMA * (g + jacobian_q @ u[0]))
     if looped:
-        return _looped(rates, inverted, jacobian_q, y0, q0, h, u[0], v[0])
+        return _loop_over_stages(rates, inverted, jacobian_q, y0, q0, h, u[0], v[0])
     for stage in range(1, 6):
         y = y + u[-1] if stage == 5 else y0 + sum(a * x for a, x in zip(_A[stage - 1], u, strict=True))
         q = q + v[-1] if stage == 5 else q0 + sum(a * x for a, x in zip(_A[stage - 1], v, strict=True))
@@ -111,7 +111,7 @@ def rosenbrock_stages(
     return y + u[-1], q + v[-1], u, v
 
 
-def _looped(
+def _loop_over_stages(
     rates: Callable[[Array], tuple[Array, Array]],
     inverted: Array,
     jacobian_q: Array,

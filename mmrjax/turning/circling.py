@@ -128,8 +128,8 @@ def turning_start(robot: Robot, conditions: Conditions, rolling: bool = False) -
         y = y.at[2:4].set(sides.motor_speed)
     if not rolling:
         return y / size
-    unknowns, solved = _unknowns(robot, conditions)
-    travel, settled = _circled(robot, conditions, unknowns)
+    unknowns, solved = _find_settled_unknowns(robot, conditions)
+    travel, settled = _signals_and_motion(robot, conditions, unknowns)
     signals = travel.signals
     memory = [jax.vmap(lambda s, e=e: e.settled(robot, s))(signals) for e in robot.remembering]
     flat = [settled.current, settled.speed_motor, *(jnp.reshape(getattr(settled, name), 1) for name in _OF_ROBOT)]
@@ -140,7 +140,7 @@ def turning_start(robot: Robot, conditions: Conditions, rolling: bool = False) -
 # --- circling
 
 
-def _guess(robot: Robot, conditions: Conditions) -> Float[Array, " 11"]:
+def _initial_guess(robot: Robot, conditions: Conditions) -> Float[Array, " 11"]:
     """Motors near their no-load speed, and the turn of a robot of twice the width without slip."""
     sides, chassis = conditions.of_sides(), robot.chassis(conditions.configuration)
     shafts = 0.9 * jax.vmap(lambda c: voltage_at_rest(robot, c))(sides) / robot.motor.torque_constant
@@ -157,9 +157,9 @@ class _Secant(eqx.Module):
 
     Attributes:
         y: the unknowns that settle, and the loads.
-        rates: `_balance` at y.
+        rates: `_scaled_balance` at y.
         inverse: inverse of minus its Jacobian, as approximated so far.
-        looks: number of evaluations of `_balance`.
+        looks: number of evaluations of `_scaled_balance`.
         solved: True once the search has converged.
     """
 
@@ -171,10 +171,10 @@ class _Secant(eqx.Module):
 
 
 class _Linear(eqx.Module):
-    """`_balance` linearised at the end of a search.
+    """`_scaled_balance` linearised at the end of a search.
 
     Attributes:
-        jacobian: Jacobian of `_balance`.
+        jacobian: Jacobian of `_scaled_balance`.
         sound: True if that is a turn, and a stable one.
         known: True once this is computed.
     """
@@ -189,7 +189,7 @@ class _Search(eqx.Module):
 
     Attributes:
         y: the unknowns that settle, and the loads.
-        rates: `_balance` at y.
+        rates: `_scaled_balance` at y.
         jacobian: derivative of these.
         step: length of the next step [s].
         turns: steps taken.
@@ -204,18 +204,18 @@ class _Search(eqx.Module):
     solved: Array
 
 
-def _balance(robot: Robot, conditions: Conditions, y: Settling) -> Settling:
+def _scaled_balance(robot: Robot, conditions: Conditions, y: Settling) -> Settling:
     """Rates of the unknowns that settle [1/s], and minus the errors of the loads."""
-    return _left(robot, conditions, y, _circled(robot, conditions, y)[0])
+    return _imbalance_of_sides(robot, conditions, y, _signals_and_motion(robot, conditions, y)[0])
 
 
-def _left(robot: Robot, conditions: Conditions, y: Settling, travel: balances.Travel) -> Settling:
-    """`_balance` from the signals of both sides."""
+def _imbalance_of_sides(robot: Robot, conditions: Conditions, y: Settling, travel: balances.Travel) -> Settling:
+    """`_scaled_balance` from the signals of both sides."""
     lacking = travel.grip.lacking / _load_units(robot, conditions)
-    return jnp.concatenate([_rates(robot, conditions, _whole(conditions, y), travel)[:SETTLING], -lacking])
+    return jnp.concatenate([_rates(robot, conditions, _all_unknowns(conditions, y), travel)[:SETTLING], -lacking])
 
 
-def _whole(conditions: Conditions, y: Settling) -> Float[Array, " 11"]:
+def _all_unknowns(conditions: Conditions, y: Settling) -> Float[Array, " 11"]:
     """All unknowns of a robot that has not left its place."""
     charge = jnp.zeros(len(_UNITS) - SETTLING).at[-1].set(conditions.discharge / _UNITS[-1])
     return jnp.concatenate([y[:SETTLING], charge])
@@ -229,7 +229,7 @@ def _turning_round(robot: Robot, conditions: Conditions, y: Settling) -> Float[A
     return jnp.concatenate([sides, movers]) / chassis.speed_still
 
 
-def _share(robot: Robot, conditions: Conditions, y: Array, step: Array) -> Scalar:
+def _step_share(robot: Robot, conditions: Conditions, y: Array, step: Array) -> Scalar:
     """Share of a step that changes no unknown by more than `FAR` and does not cross a reversal of friction."""
     share = jnp.minimum(1.0, FAR / jnp.max(jnp.abs(step[:SETTLING])))
     now, then = (_turning_round(robot, conditions, state_there) for state_there in (y, y + share * step))
@@ -246,14 +246,14 @@ def _loads(robot: Robot, conditions: Conditions, y: Settling) -> Pair:
     return y[SETTLING:] * _load_units(robot, conditions)
 
 
-def _moves(conditions: Conditions) -> np.ndarray:
+def _is_searched(conditions: Conditions) -> np.ndarray:
     """True for the unknowns of a search, False for imposed speeds and their currents, shape (9,)."""
     return np.arange(SETTLING + len(SIDES)) >= (0 if conditions.of_sides().motor_speed is None else 4)
 
 
 def _begins(robot: Robot, conditions: Conditions) -> Settling:
     """Initial unknowns of a search. Imposed speeds keep these values."""
-    return jnp.concatenate([_guess(robot, conditions)[:SETTLING], jnp.zeros(len(SIDES))])
+    return jnp.concatenate([_initial_guess(robot, conditions)[:SETTLING], jnp.zeros(len(SIDES))])
 
 
 def _secant(held: tuple[Robot, Conditions]) -> _Secant:
@@ -261,15 +261,15 @@ def _secant(held: tuple[Robot, Conditions]) -> _Secant:
     return _Secant(start, jnp.zeros_like(start), jnp.eye(start.size), jnp.asarray(0), jnp.asarray(False))
 
 
-def _look(held: tuple[Robot, Conditions], search: _Secant) -> _Secant:
+def _probe(held: tuple[Robot, Conditions], search: _Secant) -> _Secant:
     """Evaluates at the start, then along each unknown from there, then along the secants."""
     size = search.y.size
     aside = search.looks <= size
     step = (search.inverse * search.rates).sum(-1)
-    taken = step * _share(*held, search.y, step)
+    taken = step * _step_share(*held, search.y, step)
     taken = jnp.where(aside, ALONG * (np.arange(size) == search.looks - 1), taken)
-    residual = _balance(*held, search.y + taken)
-    residual = jnp.where(_moves(held[1]), residual, _begins(*held) - search.y - taken)
+    residual = _scaled_balance(*held, search.y + taken)
+    residual = jnp.where(_is_searched(held[1]), residual, _begins(*held) - search.y - taken)
     gone = search.inverse @ (search.rates - residual)
     row = taken @ search.inverse
     change = jnp.outer(taken - gone, row) / (taken @ gone)
@@ -279,24 +279,24 @@ def _look(held: tuple[Robot, Conditions], search: _Secant) -> _Secant:
     return _Secant(y, rates, inverse, search.looks + 1, ~aside & (jnp.max(jnp.abs(step)) < NEAR))
 
 
-def _still(conditions: Conditions) -> Float[np.ndarray, "9 9"]:
+def _jacobian_at_rest(conditions: Conditions) -> Float[np.ndarray, "9 9"]:
     """The Jacobian where nothing moves."""
-    return -np.eye(len(_moves(conditions)))
+    return -np.eye(len(_is_searched(conditions)))
 
 
-def _around(robot: Robot, conditions: Conditions, y: Array) -> tuple[Array, Array]:
-    """The Jacobian of `_balance`, and its value. Imposed unknowns have no equation."""
-    slope, residual = jax.jacfwd(lambda y: (_balance(robot, conditions, y),) * 2, has_aux=True)(y)
-    return jnp.where(_moves(conditions)[:, None], slope, _still(conditions)), residual
+def _jacobian_and_value(robot: Robot, conditions: Conditions, y: Array) -> tuple[Array, Array]:
+    """The Jacobian of `_scaled_balance`, and its value. Imposed unknowns have no equation."""
+    slope, residual = jax.jacfwd(lambda y: (_scaled_balance(robot, conditions, y),) * 2, has_aux=True)(y)
+    return jnp.where(_is_searched(conditions)[:, None], slope, _jacobian_at_rest(conditions)), residual
 
 
 def _unknown(held: tuple[Robot, Conditions, Array, Array]) -> _Linear:
-    return _Linear(jnp.asarray(_still(held[1])), jnp.asarray(False), jnp.asarray(False))
+    return _Linear(jnp.asarray(_jacobian_at_rest(held[1])), jnp.asarray(False), jnp.asarray(False))
 
 
 def _linear(held: tuple[Robot, Conditions, Array, Array], _: _Linear) -> _Linear:
     y, solved = held[2:]
-    slope, residual = _around(*held[:2], y)
+    slope, residual = _jacobian_and_value(*held[:2], y)
     inverted, determinant = inverse(-slope)
     close = jnp.max(jnp.abs(inverted @ residual)) < CLOSE
     return _Linear(slope, solved & close & (determinant > 0), jnp.asarray(True))
@@ -306,16 +306,16 @@ def _follow(held: tuple[Robot, Conditions, Array, _Linear]) -> _Search:
     """State before the first step, which has length 0 and only evaluates."""
     y, unknowns = held[2:]
     y = jnp.where(unknowns.sound, y, _begins(*held[:2]))
-    slope = jnp.where(unknowns.sound, unknowns.jacobian, _still(held[1]))
+    slope = jnp.where(unknowns.sound, unknowns.jacobian, _jacobian_at_rest(held[1]))
     return _Search(y, jnp.zeros_like(y), slope, jnp.asarray(FIRST), jnp.asarray(0), unknowns.sound)
 
 
-def _turn(held: tuple[Robot, Conditions, Array, _Linear], search: _Search) -> _Search:
+def _euler_step(held: tuple[Robot, Conditions, Array, _Linear], search: _Search) -> _Search:
     """One step of implicit Euler along the run, taken back where the rates grow or an unknown goes too far."""
     slow = np.diag(np.arange(search.y.size) < SETTLING)
     step = inverse(jnp.asarray(slow) / search.step - search.jacobian)[0] @ search.rates
     largest, next_y = jnp.max(jnp.abs(step)), search.y + step
-    slope, residual = _around(*held[:2], next_y)
+    slope, residual = _jacobian_and_value(*held[:2], next_y)
     before, after = jnp.linalg.norm(search.rates), jnp.linalg.norm(residual)
     worse = (~(after <= WORSE * before + SMALL) | (largest > FAR)) & (search.turns > 0)
     worse &= search.step > SHORTEST
@@ -328,7 +328,7 @@ def _turn(held: tuple[Robot, Conditions, Array, _Linear], search: _Search) -> _S
     return _Search(y, residual, slope, length, search.turns + 1, ended)
 
 
-def _unknowns(robot: Robot, conditions: Conditions) -> tuple[Settling, Bool[Array, ""]]:
+def _find_settled_unknowns(robot: Robot, conditions: Conditions) -> tuple[Settling, Bool[Array, ""]]:
     """The unknowns of a settled turn on level ground, see `_Search`, and whether it was found.
 
     Broyden's method, which first evaluates along each unknown, finds most. If it does not converge, or converges to
@@ -339,22 +339,22 @@ def _unknowns(robot: Robot, conditions: Conditions) -> tuple[Settling, Bool[Arra
     each member ends on its own (`lanes`), while a search by `optimistix.root_find` lasts as long as its slowest.
     """
     held = robot, conditions
-    first = lanes.loop_until(_secant, _look, lambda s: (s.looks >= SOON) | s.solved, held, lambda s: (s.y, s.solved))
+    first = lanes.loop_until(_secant, _probe, lambda s: (s.looks >= SOON) | s.solved, held, lambda s: (s.y, s.solved))
     solution = lanes.loop_until(_unknown, _linear, lambda s: s.known, (*held, *first))
     end = lanes.loop_until(
-        _follow, _turn, lambda s: (s.turns >= TURNS) | s.solved, (*held, first[0], solution), most=FEW
+        _follow, _euler_step, lambda s: (s.turns >= TURNS) | s.solved, (*held, first[0], solution), most=FEW
     )
     sound = end.solved & jnp.all(jnp.isfinite(end.jacobian))
-    slope = jnp.where(sound, end.jacobian, jnp.asarray(_still(conditions)))
-    return end.y + inverse(-slope)[0] @ jnp.where(sound, _balance(robot, conditions, end.y), 0.0), sound
+    slope = jnp.where(sound, end.jacobian, jnp.asarray(_jacobian_at_rest(conditions)))
+    return end.y + inverse(-slope)[0] @ jnp.where(sound, _scaled_balance(robot, conditions, end.y), 0.0), sound
 
 
-def _circled(robot: Robot, conditions: Conditions, y: Settling) -> tuple[balances.Travel, PlaneMotion]:
+def _signals_and_motion(robot: Robot, conditions: Conditions, y: Settling) -> tuple[balances.Travel, PlaneMotion]:
     """Signals of both sides and motion at the unknowns of a search.
 
     Their currents are those that the duties alone would drive, see `rest.admitted_current`.
     """
-    motion = motion_of(robot, _whole(conditions, y))
+    motion = motion_of(robot, _all_unknowns(conditions, y))
     current, held = jax.vmap(lambda c, x: rest.admitted_current(robot, c, x))(conditions.of_sides(), motion.current)
     motion = dataclasses.replace(motion, current=current)
     travel = _turning(rest.without_diode(robot), conditions, motion, _loads(robot, conditions, y))
@@ -365,16 +365,16 @@ def _circled(robot: Robot, conditions: Conditions, y: Settling) -> tuple[balance
 
 def solve_turn(robot: Robot, conditions: Conditions) -> tuple[Settling, Bool[Array, ""]]:
     """The unknowns of a settled turn, and whether they were found, see `Implicit.solve`."""
-    return jax.lax.stop_gradient(_unknowns(*jax.lax.stop_gradient((robot, conditions))))
+    return jax.lax.stop_gradient(_find_settled_unknowns(*jax.lax.stop_gradient((robot, conditions))))
 
 
 def turn_results(
     robot: Robot, conditions: Conditions, unknowns: Settling, found: Bool[Array, ""]
 ) -> tuple[Result, Signals, Settling]:
     """Result, signals of both sides and residuals of the balances at given unknowns, see `Implicit.shown`."""
-    travel, motion = _circled(robot, conditions, unknowns)
+    travel, motion = _signals_and_motion(robot, conditions, unknowns)
     stays = unknowns - jax.lax.stop_gradient(_begins(robot, conditions))
-    left = jnp.where(_moves(conditions), _left(robot, conditions, unknowns, travel), stays)
+    left = jnp.where(_is_searched(conditions), _imbalance_of_sides(robot, conditions, unknowns, travel), stays)
     status = _status(robot, conditions, travel, motion, found)
     return result_of(robot, travel, status), travel.signals, left
 
@@ -391,8 +391,8 @@ def circling_signals(robot: Robot, conditions: Conditions) -> tuple[balances.Tra
         `battery_empty`. `not_settled`: no settled turn was found. Possibly none exists, because friction falls with
         sliding.
     """
-    unknowns, solved = _unknowns(robot, conditions)
-    travel, motion = _circled(robot, conditions, unknowns)
+    unknowns, solved = _find_settled_unknowns(robot, conditions)
+    travel, motion = _signals_and_motion(robot, conditions, unknowns)
     return travel, motion, _status(robot, conditions, travel, motion, solved)
 
 
@@ -404,7 +404,7 @@ def _status(
     return jnp.where(found | (status == BATTERY_EMPTY), status, NOT_SETTLED)
 
 
-def _size(chassis: Chassis, ahead: Scalar, aside: Scalar, yaw: Scalar) -> Array:
+def _motion_size(chassis: Chassis, ahead: Scalar, aside: Scalar, yaw: Scalar) -> Array:
     """Size of a motion in the plane, or of its change, at the sides [m/s], [m/s²]."""
     return jnp.abs(ahead) + jnp.abs(aside) + jnp.abs(yaw) * chassis.turning.width / 2
 
@@ -413,7 +413,7 @@ def status_keeping(robot: Robot, conditions: Conditions, travel: balances.Travel
     """Status of a robot in steady motion."""
     chassis = robot.chassis(conditions.configuration)
     shafts = jnp.max(jnp.abs(travel.signals.speed_theoretical))
-    along = _size(chassis, motion.speed, motion.speed_lateral, motion.yaw_rate)
+    along = _motion_size(chassis, motion.speed, motion.speed_lateral, motion.yaw_rate)
     status = jnp.where(jnp.minimum(shafts, along) < chassis.speed_still, STALLED, CONVERGED)
     status = jnp.where(has_tipped(robot, travel), TIPS, status)
     empty = (conditions.battery > 0.5) & robot.battery.empty(motion.discharge)
@@ -426,8 +426,8 @@ def status_moving(robot: Robot, conditions: Conditions, travel: balances.Travel,
     Otherwise that of `status_keeping`.
     """
     chassis = robot.chassis(conditions.configuration)
-    size = _size(chassis, motion.speed, motion.speed_lateral, motion.yaw_rate)
-    change = _size(chassis, travel.acceleration, travel.acceleration_lateral, travel.acceleration_yaw)
+    size = _motion_size(chassis, motion.speed, motion.speed_lateral, motion.yaw_rate)
+    change = _motion_size(chassis, travel.acceleration, travel.acceleration_lateral, travel.acceleration_yaw)
     status = status_keeping(robot, conditions, travel, motion)
     return jnp.where((change * TIME > SHARE * size) & (status == CONVERGED), NOT_SETTLED, status)
 

@@ -279,7 +279,7 @@ def grip(
     if loads is not None:
         return _at_loads(loads, None, given)
     held = jax.lax.stop_gradient(given)
-    at, rise = _loads(held)
+    at, rise = _transferred_load(held)
     forces = _at_loads(at, None, given)
     # Only the last step carries derivatives, the implicit ones; it is so small that linear terms suffice.
     change = _step(forces.lacking, rise.lacking)
@@ -293,7 +293,7 @@ def _step(lacking: Pair, slope: Float[Array, "2 2"]) -> Pair:
     return jnp.stack([d * first - b * second, a * second - c * first]) / (a * d - b * c)
 
 
-def _loads(given: _Given) -> tuple[Pair, Grip]:
+def _transferred_load(given: _Given) -> tuple[Pair, Grip]:
     """The transferred load [N] and the centre of pressure [m], and the derivatives of `Grip` with respect to them.
 
     None of these carry derivatives. While the whole contact is loaded, the moments of its law do not depend on them.
@@ -313,13 +313,13 @@ def _loads(given: _Given) -> tuple[Pair, Grip]:
 
     nothing = load * given.sliding[0]
     begun = jnp.stack([jnp.zeros_like(nothing), stance.ahead * jnp.ones_like(nothing)])
-    even = law_moments(*_along(begun[1], given))
+    even = law_moments(*_moment_arguments(begun[1], given))
     found = steps(begun, given, even)
     lifts = (stance.on_tracks > 0.5) & (jnp.maximum(jnp.abs(begun[1]), jnp.abs(found[0][1])) > stance.length / 6)
     return compute_rarely(lifts, lambda at, given: steps(at, given, None), (begun, given), found)
 
 
-def _along(centre: Scalar, given: _Given) -> tuple[Law, Array, Scalar, Scalar]:
+def _moment_arguments(centre: Scalar, given: _Given) -> tuple[Law, Array, Scalar, Scalar]:
     """Arguments of `law_moments` for this centre of pressure."""
     stance, yaw = given.stance, given.yaw_rate
     place, half, _ = loaded_part(stance, centre)
@@ -337,7 +337,7 @@ def _at_loads(loads: Array, even: Array | None, given: _Given) -> Grip:
     normal = jnp.maximum(load / 2 - 2 * SIDES * moved, 0.0)
     place, half, tilt = loaded_part(stance, centre)
     arm = place - stance.ahead
-    law, sliding, middle, end = _along(centre, given)
+    law, sliding, middle, end = _moment_arguments(centre, given)
     even = law_moments(law, sliding, middle, end) if even is None else even
     zeroth, first, second = (even[:, k] + tilt * even[:, k + 1] for k in range(3))
     held, across = adhesion * normal, adhesion * normal * stance.lateral**stance.rule

@@ -76,7 +76,7 @@ def _width(run: System) -> Scalar:
     return run.chassis.turning.width
 
 
-def _ahead(run: System, v: Coordinates, yaw: Scalar) -> tuple[Scalar, Scalar]:
+def _mid_wheelbase_speeds(run: System, v: Coordinates, yaw: Scalar) -> tuple[Scalar, Scalar]:
     """Speeds of the middle of the wheelbase in the frame of the robot, ahead and to the left [m/s]."""
     cos, sin = cosine(yaw), sine(yaw)
     return cos * v[X] + sin * v[Y], cos * v[Y] - sin * v[X]
@@ -85,7 +85,7 @@ def _ahead(run: System, v: Coordinates, yaw: Scalar) -> tuple[Scalar, Scalar]:
 def plane_motion(run: System, motion: Motion) -> PlaneMotion:
     """The motion in the form of the other fidelities: speeds of the centre of mass, the robot level."""
     q, v = motion.q, motion.v
-    speed, lateral = _ahead(run, v, q[YAW])
+    speed, lateral = _mid_wheelbase_speeds(run, v, q[YAW])
     forward, up = run.half.centre
     return PlaneMotion(
         current=motion.current,
@@ -103,7 +103,7 @@ def plane_motion(run: System, motion: Motion) -> PlaneMotion:
 
 def _contacts(run: System, motion: Motion) -> _Sides:
     q, v = motion.q, motion.v
-    speed, lateral = _ahead(run, v, q[YAW])
+    speed, lateral = _mid_wheelbase_speeds(run, v, q[YAW])
     y = SIDES * _width(run)
     heights, rises = q[HEIGHT] + y * q[ROLL], v[HEIGHT] + y * v[ROLL]
     nothing = jnp.zeros_like(y)
@@ -166,7 +166,7 @@ def generalized(run: System, motion: Motion, signals: Signals, at: Touch, pulled
     """Generalized forces on q [N, N·m]."""
     cos, sin = cosine(motion.q[YAW]), sine(motion.q[YAW])
     y, several = SIDES * _width(run), run.robot.sides / 2
-    lateral, yaw = balances.added_in_plane(run.robot, _turned(run, signals, at, pulled))
+    lateral, yaw = balances.lateral_and_yaw_effects(run.robot, _with_lateral_moment(run, signals, at, pulled))
     forward, normal, moment, rear = pulled.generalized.T
     assert pulled.aside is not None
     ahead, aside = several * jnp.sum(forward), several * jnp.sum(pulled.aside) - lateral
@@ -178,7 +178,7 @@ def generalized(run: System, motion: Motion, signals: Signals, at: Touch, pulled
     return jnp.stack([*body, several * jnp.sum(moment), tilt, *pulleys])
 
 
-def _turned(run: System, signals: Signals, at: Touch, pulled: Pull) -> Signals:
+def _with_lateral_moment(run: System, signals: Signals, at: Touch, pulled: Pull) -> Signals:
     """The signals with the moment of the lateral forces about the centre of mass."""
     assert pulled.aside is not None
     moment = jnp.sum(pulled.aside * (at.lever_x - run.half.centre[0]), axis=-1)
@@ -283,14 +283,14 @@ def _differentiated(primals: tuple[System, Motion], tangents: tuple[Any, Any]) -
 
     def held(run: System, motion: Motion) -> tuple[Array, _Forces]:
         forces = _forces(run, motion, stored=True)
-        fallen = _fallen(run, motion, forces, gained)
+        fallen = _damping_product(run, motion, forces, gained)
         return forces.push - forces.mass @ gained - run.step * fallen, forces
 
     _, (left, changed) = eqx.filter_jvp(held, primals, tangents)
     return eqx.filter_jvp(_moved, (*primals, found, gained), (*tangents, changed, solve(left)))
 
 
-def _fallen(run: System, motion: Motion, found: _Forces, gained: Coordinates) -> Coordinates:
+def _damping_product(run: System, motion: Motion, found: _Forces, gained: Coordinates) -> Coordinates:
     """The product K Δv, see `resistance`, without forming K."""
     touching, pulled, levers = found.sides.at, found.pulled, found.levers
     assert pulled.aside is not None
@@ -320,7 +320,7 @@ def _moved(run: System, motion: Motion, found: _Forces, gained: Coordinates) -> 
 
     each = jax.vmap(later)(run.conditions.of_sides(), found.signals, motion.memory)
     after = Motion(motion.q + run.step * v, v, each.current, each.discharge[0], each.memory)
-    return after, _travel(run, motion, found, gained), found.pulled.guided
+    return after, _signals_after_step(run, motion, found, gained), found.pulled.guided
 
 
 def forces_after(
@@ -341,7 +341,7 @@ def forces_after(
     return ahead, aside, at.force - down
 
 
-def _travel(run: System, motion: Motion, found: _Forces, gained: Coordinates) -> balances.Travel:
+def _signals_after_step(run: System, motion: Motion, found: _Forces, gained: Coordinates) -> balances.Travel:
     """All signals of a step, with its forces at its end to first order."""
     sides, signals, touching, several = found.sides, found.signals, found.sides.at, run.robot.sides / 2
     ahead, aside, normal = forces_after(touching, found.pulled, found.levers, found.rises, gained)
@@ -350,8 +350,8 @@ def _travel(run: System, motion: Motion, found: _Forces, gained: Coordinates) ->
     load, moment = jnp.sum(normal, axis=-1), jnp.sum(aside * arm, axis=-1)
     signals = dataclasses.replace(signals, traction=jnp.sum(ahead, axis=-1), normal=load, moment_lateral=moment)
     # Of the centre of mass, in the rotating frame of the robot.
-    speed, lateral = _ahead(run, motion.v, motion.q[YAW])
-    ahead_gained, aside_gained = _ahead(run, gained / run.step, motion.q[YAW])
+    speed, lateral = _mid_wheelbase_speeds(run, motion.v, motion.q[YAW])
+    ahead_gained, aside_gained = _mid_wheelbase_speeds(run, gained / run.step, motion.q[YAW])
     turn = gained[YAW] / run.step
     y = SIDES * _width(run)
     acceleration = ahead_gained + motion.v[YAW] * lateral

@@ -62,11 +62,11 @@ class Sums(eqx.Module):
 
     Attributes:
         traction, normal: F and R [N].
-        moment, rear: of F - F~ and R - R~ on pitch and driven pulley [N·m].
-        front: of F and R on the driving pulley [N·m].
-        guide_front, guide_rear: of R's share on the guide, on both pulleys, for a coefficient of friction of 1 [N·m].
-        fallen_x, fallen_z, fallen_front: F~ and R~ along the ground and off it [N] and on the driving pulley [N·m].
-        rise, rise_front: rise of F with all sliding speeds [N·s/m], and of its part of `front` [N·s].
+        moment, rear: moments of F - F~ and R - R~ on pitch and driven pulley [N·m].
+        front: moments of F and R on the driving pulley [N·m]. guide_front, guide_rear: moments of R's share on the
+        guide, on both pulleys, for a coefficient of friction of 1 [N·m]. fallen_x, fallen_z, fallen_front: F~ and
+        R~ along the ground and off it [N] and on the driving pulley [N·m]. rise, rise_front: rise of F with all
+        sliding speeds [N·s/m], and of its part of `front` [N·s].
     """
 
     traction: Scalar
@@ -208,7 +208,7 @@ def linearize(
     return Linearized(_sums(values), slopes, {name: given[name] for name in names}, names)
 
 
-def _total(*products: tuple[Any, ...]) -> Any:
+def _sum_of_products(*products: tuple[Any, ...]) -> Any:
     """Sum of products. Those with a factor None are left out, which XLA would not do with zeros."""
     terms = [math.prod(factors[1:], start=factors[0]) for factors in products if all(f is not None for f in factors)]
     return sum(terms[1:], start=terms[0]) if terms else None
@@ -248,17 +248,17 @@ class _Law(eqx.Module):
         """
         touching, sinks = self.at, None if gap is None else -gap
         yields = None if compliance is None else -self.share * compliance
-        force = _total((self.by_depth, sinks), (-touching.damped, gap_rate), (touching.force, yields))
-        damped = _total((self.damped_by_depth, sinks), (touching.damped, yields))
-        turned = _total((self.bend * touching.force, slide), (self.rise, force))
-        down = _total((damped, self.off), (touching.damped, off))
-        fallen = _total(
+        force = _sum_of_products((self.by_depth, sinks), (-touching.damped, gap_rate), (touching.force, yields))
+        damped = _sum_of_products((self.damped_by_depth, sinks), (touching.damped, yields))
+        turned = _sum_of_products((self.bend * touching.force, slide), (self.rise, force))
+        down = _sum_of_products((damped, self.off), (touching.damped, off))
+        fallen = _sum_of_products(
             (jnp.where(self.rise > 0, self.along, 0.0), turned),
             (jnp.maximum(self.rise, 0.0) * touching.force, along),
             (self.rise * touching.damped * self.off, slide),
             (self.coefficient, down),
         )
-        pulled = _total((self.rise * touching.force, slide), (self.coefficient, force))
+        pulled = _sum_of_products((self.rise * touching.force, slide), (self.coefficient, force))
         moved_sums = (pulled, force, fallen, down, turned)
         return tuple(jnp.zeros_like(touching.force) if a is None else a for a in moved_sums)
 
@@ -300,7 +300,7 @@ class _Levers(eqx.Module):
         return cls(jnp.stack([unit, z, front[0], rear[0]]), jnp.stack([unit, x, *front[1:], *rear[1:]]))
 
 
-def _weighed(forces: Sequence[Forces], levers: Sequence[_Levers]) -> Float[Array, "forces levers sums"]:
+def _weighted_sums(forces: Sequence[Forces], levers: Sequence[_Levers]) -> Float[Array, "forces levers sums"]:
     """Sums over all contacts for every combination of forces and levers."""
     level, steep = jnp.stack([a.level for a in levers]), jnp.stack([a.steep for a in levers])
     pulls = jnp.stack([jnp.stack([row[0], row[2], row[4]]) for row in forces])
@@ -405,7 +405,7 @@ def _by_motion(
     ]
     forces, rates = law.forces(), (rate_x, rate_z, guided)
     here = _Levers.of(one, x, z, tuple(a * on_front for a in rates), tuple(a * on_rear for a in rates))
-    rows = _weighed([*changes, forces], [here])[:, 0]
+    rows = _weighted_sums([*changes, forces], [here])[:, 0]
     over_belt = levers(*belt, tip.guided)
     shift = tuple(path.radius * a * shared for a in rates)
     by_share = _Levers.of(jnp.zeros_like(x), 0 * x, 0 * x, tuple(-a for a in shift), shift)
@@ -414,7 +414,7 @@ def _by_motion(
         jax.tree.map(lambda a, b: a * by_front + b, over_belt, by_share),
         jax.tree.map(lambda a: a * by_rear, over_belt),
     ]
-    slopes = rows[: len(MOTION)].at[1:4].add(_weighed([forces], moved)[0])
+    slopes = rows[: len(MOTION)].at[1:4].add(_weighted_sums([forces], moved)[0])
     for k, name in enumerate(("front", "rear", "v_front", "v_rear")):
         by = jax.jvp(lambda a, k=k: free((*pulleys[:k], a, *pulleys[k + 1 :])), (pulleys[k],), (unit,))[1]
         slopes = slopes.at[MOTION.index(name)].add(by * rows[-2])

@@ -238,7 +238,7 @@ def contacts_resist(
     return (along.T * rises) @ along + (pushes.T * damped) @ off
 
 
-def _pushed(run: System, motion: Motion, signals: Signals, pulled: Pull) -> tuple[Coordinates, Float[Array, "5 5"]]:
+def _explicit(run: System, motion: Motion, signals: Signals, pulled: Pull) -> tuple[Coordinates, Float[Array, "5 5"]]:
     """Velocities after one explicit step, and the mass matrix."""
     force, armature = generalized(run, signals, pulled)
     data = run.data.replace(qpos=motion.q, qvel=motion.v, qfrc_applied=force)
@@ -250,7 +250,7 @@ def _pushed(run: System, motion: Motion, signals: Signals, pulled: Pull) -> tupl
 def mass_matrix(run: System, motion: Motion) -> Float[Array, "5 5"]:
     """Mass matrix M on v, including the rotors' armature [kg, kg·m, kg·m²]."""
     signals, _, pulled = instant(run, motion)
-    return _pushed(run, motion, signals, pulled)[1]
+    return _explicit(run, motion, signals, pulled)[1]
 
 
 class _Step(eqx.Module):
@@ -267,7 +267,7 @@ class _Step(eqx.Module):
 
 def _step(run: System, motion: Motion) -> _Step:
     signals, touching, pulled = instant(run, motion)
-    pushed, mass = _pushed(run, motion, signals, pulled)
+    pushed, mass = _explicit(run, motion, signals, pulled)
     damping = resistance(run, motion, signals, touching, pulled)
     factors = factorise(mass + run.step * damping)
     gained = solve_factorised(factors, mass @ (pushed - motion.v))
@@ -275,7 +275,7 @@ def _step(run: System, motion: Motion) -> _Step:
     return _Step(after, over, pulled.guided, damping, factors, gained, jnp.asarray(signals.speed_slip_terms))
 
 
-class _Later(eqx.Module):
+class _StateAfterStep(eqx.Module):
     """State after a step other than coordinates and velocities."""
 
     current: Scalar
@@ -283,20 +283,20 @@ class _Later(eqx.Module):
     memory: Mapping[str, Scalar]
 
 
-def state_after(run: System, motion: Motion, signals: Signals) -> _Later:
+def state_after(run: System, motion: Motion, signals: Signals) -> _StateAfterStep:
     """Currents, charge and memories after one step."""
     charge = balances.charge_drawn(run.robot, run.conditions, signals.total_current)
     memory = {
         effect.name: motion.memory[effect.name] + run.step * effect.rate(run.robot, signals)
         for effect in run.robot.remembering
     }
-    return _Later(
+    return _StateAfterStep(
         current_after(run.robot, run.conditions, run.step, signals), motion.discharge + run.step * charge, memory
     )
 
 
 def _moved(
-    motion: Motion, step: Scalar, later: _Later, fallen: Array, gained: Array, signals: Signals
+    motion: Motion, step: Scalar, later: _StateAfterStep, fallen: Array, gained: Array, signals: Signals
 ) -> tuple[Motion, Signals]:
     v = motion.v + gained
     after = Motion(motion.q + step * v, v, later.current, later.discharge, later.memory)
@@ -336,11 +336,11 @@ def _differentiated(
     # the contacts' sums with derivatives with respect to the motion and to the `changed` inputs
     constants = contact_sums.contact_inputs(d_run.path, d_run.chassis, d_run.conditions.adhesion)
     differentiated = tuple(name for name, change in constants.items() if change is not None)
-    given = _inputs(run, motion) | {"slip": step.slip}
+    given = _contact_inputs(run, motion) | {"slip": step.slip}
     linearized = contact_sums.linearize(run.path, run.chassis, given, step.gained, differentiated)
 
-    def held(run: System, motion: Motion) -> tuple[Array, Array, _Later, Signals, Scalar]:
-        return _held(run, motion, step.gained, linearized)
+    def held(run: System, motion: Motion) -> tuple[Array, Array, _StateAfterStep, Signals, Scalar]:
+        return _step_residual(run, motion, step.gained, linearized)
 
     (left, fallen, later, signals, _), d_held = eqx.filter_jvp(held, (run, motion), (d_run, d_motion))
     d_left, d_fallen, d_later, d_signals, d_guided = d_held
@@ -356,22 +356,22 @@ def _differentiated(
     return (step.after, step.signals, step.guided), (d_after, d_over, d_guided)
 
 
-def _inputs(run: System, motion: Motion) -> dict[str, Scalar]:
+def _contact_inputs(run: System, motion: Motion) -> dict[str, Scalar]:
     """Inputs of the contacts, by name."""
     moving = dict(zip(contact_sums.MOTION, (*motion.q[1:], *motion.v), strict=True))
     return moving | contact_sums.contact_inputs(run.path, run.chassis, run.conditions.adhesion)
 
 
-def _held(
+def _step_residual(
     run: System, motion: Motion, gained: Coordinates, linearized: Linearized
-) -> tuple[Array, Array, _Later, Signals, Scalar]:
+) -> tuple[Array, Array, _StateAfterStep, Signals, Scalar]:
     """Residual of a step with constant Δv, K Δv of x and z, and the remaining results of the step.
 
     The residual is Δt τ - Δt c - (M + Δt K) Δv, see `advance`.
     """
     q, v = motion.q, motion.v
     belt = belt_runs(run.path, (q[3], q[4]), (v[3], v[4]))
-    sums = linearized.near(_inputs(run, motion))
+    sums = linearized.near(_contact_inputs(run, motion))
     mover = contact_sums.Mover(linearized, sums, run.path.radius, belt.torque_front)
     signals, drawn = _resolved(run, motion, mover, v[0], v[3])
     sums = mover.shifted(signals.speed_slip_terms)

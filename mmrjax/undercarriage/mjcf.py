@@ -188,7 +188,7 @@ def step_impulse(
         half, wheelbase: masses and distance of the pulleys.
         conditions: conditions for the slope.
         pitch: pitch of the chassis [rad].
-        rate: its rate [rad/s].
+        rate: pitch rate [rad/s].
         rotating: the armature's inertia at its joint [kg·m²].
         gained: Δv.
         step: Δt [s].

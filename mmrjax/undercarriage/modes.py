@@ -32,7 +32,7 @@ class Mode(NamedTuple):
     Attributes:
         name: one of `NAMES`, by the kinetic energy in its eigenvector.
         frequency: damped natural frequency, mean over the positions that have the mode [Hz].
-        low, high: its range over them [Hz].
+        low, high: range of the frequency over the positions [Hz].
         natural: undamped, |λ| / 2π, mean [Hz].
         damping: ratio ζ = -Re λ / |λ|, mean [-]. Negative: it is unstable.
         share: share of the kinetic energy in the coordinate of its name, mean [-].
@@ -80,7 +80,7 @@ def modes(robot: Robot, conditions: Conditions, positions: int = POSITIONS) -> l
         positions: positions of the belt, evenly over a pitch of the grousers.
     """
     rates, masses = jax.device_get(_linearised(params.without_weak_types(robot), conditions, positions))
-    return [_named(rate, mass) for rate, mass in zip(rates, masses, strict=True)]
+    return [_run_modes(rate, mass) for rate, mass in zip(rates, masses, strict=True)]
 
 
 @compiled
@@ -100,7 +100,7 @@ def _linearised(
     return jax.vmap(one)(conditions)
 
 
-def _named(rates: Float[np.ndarray, "positions 11 11"], masses: Float[np.ndarray, "positions 5 5"]) -> list[Mode]:
+def _run_modes(rates: Float[np.ndarray, "positions 11 11"], masses: Float[np.ndarray, "positions 5 5"]) -> list[Mode]:
     """The modes of one run, from its linearisation at each position."""
     found: dict[str, list[tuple[complex, float]]] = {}
     for rate, mass in zip(rates, masses, strict=True):

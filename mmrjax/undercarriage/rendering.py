@@ -38,7 +38,7 @@ class Scene(NamedTuple):
         name: name of the configuration.
         wheeled: True on wheels.
         axle: half the wheelbase [m].
-        wheel: its radius [m].
+        wheel: radius of the wheels [m].
         path: path of the belt.
         levers: tips in the chassis frame, empty on wheels.
         time, q, total_current, speed, theoretical: over the run.

@@ -37,7 +37,7 @@ class Above(NamedTuple):
         time, q, v: time, coordinates and velocities over the run, see `both_sides`.
         current: current of each side's motor [A].
         belt: speed of each side's movers [m/s].
-        along: of each contact ahead of the middle [m].
+        along: distance of each contact ahead of the middle [m].
         load: load on it [N].
     """
 

@@ -41,13 +41,13 @@ class Touch(eqx.Module):
     """Position, motion and load of the contacts at an instant, grousers first.
     Attributes:
         lever_x, lever_z: contact point from the middle of the wheelbase [m].
-        rate_x, rate_z: its velocity per belt speed [-].
+        rate_x, rate_z: velocity of the contact per belt speed [-].
         weight: share of the driven pulley in that belt speed [-].
-        speed_x: its velocity over the ground, uphill [m/s].
-        gap, gap_rate: height over the ground [m] and its rate [m/s].
+        speed_x: velocity of the contact over the ground, uphill [m/s]. gap, gap_rate: height over the ground [m]
+        and its rate [m/s].
         compliance: compliance of the belt under it at its tension [m/N].
         force: normal force R_z [N].
-        damped: its decrease with the gap's rate [N·s/m].
+        damped: decrease of the force with the gap's rate [N·s/m].
         guided: share of the force that passes to the lower guide [-].
         belt: tensions of the runs.
     """

@@ -35,7 +35,7 @@ def step_derivative(run: System, at: Motion) -> Float[Array, "11 11"]:
 
 
 @compiled
-def _maps(
+def _step_derivatives(
     robot: Robot, conditions: Conditions, steps: Float[Array, "runs starts"]
 ) -> Float[Array, "runs starts 11 11"]:
     """Derivatives of (q, v, current) after one step with respect to (q, v, current), standing and rolling."""
@@ -75,7 +75,7 @@ def largest_step(robot: Robot, conditions: Conditions) -> Float[np.ndarray, " ru
     robot = params.without_weak_types(params.replace(robot, {p.name: jnp.maximum(p.value, LEAST) for p in laws}))
 
     def maps(steps: Float[np.ndarray, "runs starts"]) -> Float[np.ndarray, "runs starts 11 11"]:
-        transition_maps = np.asarray(_maps(robot, conditions, jnp.asarray(steps)))
+        transition_maps = np.asarray(_step_derivatives(robot, conditions, jnp.asarray(steps)))
         usable = np.isfinite(transition_maps).all(axis=(-2, -1), keepdims=True)
         return np.where(usable, transition_maps, 0.0)
 

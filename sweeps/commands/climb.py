@@ -57,7 +57,7 @@ def execute(config: configuration.Climb, beside: configuration.FolderPart) -> in
     config = config.model_copy(
         update={"configuration": name, "supply_voltage_V": None if config.battery else voltage}
     )
-    sequence = _sequence(config, robot, name)
+    sequence = _lever_sequence(config, robot, name)
     _, words = _terrain(config, 0.1)
     conditions = Conditions(
         name, voltage, payload=config.payload_kg, battery=config.battery, discharge=3.6 * config.discharge_mAh,
@@ -65,7 +65,7 @@ def execute(config: configuration.Climb, beside: configuration.FolderPart) -> in
     ).resolved(robot)  # fmt: skip
     along = _along(config, robot, conditions, sequence)
     with open_folder("climb", config, robot, beside) as folder:
-        climbed = _climbed(config, robot, name, words, conditions, sequence, along)
+        climbed = _climb_of_configuration(config, robot, name, words, conditions, sequence, along)
         folder.write_table("history.csv", climbed.table)
         if rows := climbed.slopes:
             folder.write_table("derivatives.csv", {name: np.array([row[name] for row in rows]) for name in rows[0]})
@@ -87,7 +87,7 @@ def execute(config: configuration.Climb, beside: configuration.FolderPart) -> in
         )
 
 
-def _climbed(
+def _climb_of_configuration(
     config: configuration.Climb,
     robot: Robot,
     name: str,
@@ -120,7 +120,7 @@ def _climbed(
     tried: tuple[tuple[float, str], ...] = ()
     derivatives: Derivatives | None = None
     if config.find is not None:
-        grounds, ended, chosen, tried, largest = _searched(config.find, run)
+        grounds, ended, chosen, tried, largest = _search_largest(config.find, run)
     elif along is None:
         grounds, ended = run(np.array([np.nan]))
     else:
@@ -193,7 +193,7 @@ def _along(config: configuration.Climb, robot: Robot, conditions: Conditions, se
     return Along(names, tuple(units[name] for name in names), jnp.array(values), jnp.array(widths), given)
 
 
-def _searched(
+def _search_largest(
     what: str, run: Callable[[np.ndarray], tuple[Terrain, Climb]]
 ) -> tuple[Terrain, Climb, int, tuple[tuple[float, str], ...], float | None]:
     """The largest size that is got over [mm]: rounds of sizes side by side, between the largest that was got over
@@ -241,7 +241,7 @@ def _terrain(config: configuration.Climb, size: Scalar) -> tuple[Terrain, str]:
     ), "a step" if config.step_mm is None else f"a step of {config.step_mm:g} mm"
 
 
-def _sequence(config: configuration.Climb, robot: Robot, name: str) -> Sequence:
+def _lever_sequence(config: configuration.Climb, robot: Robot, name: str) -> Sequence:
     """Returns the motion of the levers.
 
     Raises:

@@ -59,12 +59,12 @@ class Chain:
         for k, name in enumerate(names):
             if model.jnt_type[k] != int(library.mjtJoint.mjJNT_HINGE) or not name:
                 raise BadConfiguration(
-                    f"--model: {source.name}, joint {name or k + 1} slides, is free or has no name; expected hinges "
-                    "with names alone, whose measured angles give the whole motion"
+                    f"--model: {source.name}, joint {name or k + 1} slides, is free or has no name; expected only "
+                    "named hinges, whose measured angles give the whole motion"
                 )
             if driven.count(k) > 1:
                 raise BadConfiguration(
-                    f"--model: {source.name}, joint {name} has several actuators; expected one drive a joint"
+                    f"--model: {source.name}, joint {name} has several actuators; expected one drive per joint"
                 )
         if model.neq or not names:
             what = "closed loops (<equality>)" if names else "no joint"
@@ -137,7 +137,7 @@ def smoothed_log(log: NamedArrays, chain: Chain, degree: int = 5) -> np.ndarray:
             if len(seen) < FEWEST or not (np.diff(time[seen]) > 0).all():
                 raise BadData(
                     f"{log.name}, {column}: has {len(seen)} readings in run {run or 1}; expected at least "
-                    f"{FEWEST} with a time_s that rises"
+                    f"{FEWEST} with increasing time_s"
                 )
             motion[:, rows, k] = smoothed_motion(time[seen], angle[seen], time[rows], degree)
     return motion
@@ -181,9 +181,9 @@ def robot_of_joint(config: configuration.Loop, joint: str) -> tuple[configuratio
     rig, shaft = robot.rig, not robot.has_ground and len(robot.configurations.members) == 1
     if not shaft or (rig.imposed, rig.channels) != ("motor_speed", ("motor_current",)):
         raise BadConfiguration(
-            f'--robot {one.robot}: expected the rig of one joint with load = "shaft", imposed = "motor_speed" and '
-            'channels = ["motor_current"]: the torque of the model holds for the measured motion alone; mmrjax rig '
-            f"new {joint}.toml --from {config.model} --joint {joint} --kind bench begins one"
+            f'--robot {one.robot}: expected the rig of one joint with load = "shaft", imposed = "motor_speed" '
+            'and channels = ["motor_current"]: the model\'s torque is valid only for the measured motion; '
+            f"mmrjax rig new {joint}.toml --from {config.model} --joint {joint} --kind bench begins one"
         )
     return one, robot
 
@@ -243,7 +243,7 @@ def _row(joint: str, place: Path) -> tuple[str, str, str, str]:
     if not (place / "result.json").is_file():
         ranked = place.with_name(f"{joint}.partial") / store.SCREENING_FILE
         answer = json.loads(ranked.read_text(encoding="utf-8"))["answer"] if ranked.is_file() else ""
-        return joint, f"no verdict in time, the same command goes on; {answer}.", "", ""
+        return joint, f"no verdict in time; the same command continues; {answer}.", "", ""
     result: Mapping = json.loads((place / "result.json").read_text(encoding="utf-8"))
     before, after = (result["errors"][which]["held_out"] or {} for which in ("before", "after"))
     errors = "; ".join(f"{c.replace('_', ' ')} {before[c]:.3g} → {after[c]:.3g}" for c in after if before.get(c))

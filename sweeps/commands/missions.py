@@ -181,9 +181,9 @@ def run_missions(robot: Robot, runs: records.Runs, source: ProfileTable, config:
                     **outputs.status_words(batch.result.status, batch.result.flags),
                 }
             )
-            segments.append(_segments(robot, conditions_of_batch, source, batch, names[rows_done]))
+            segments.append(_segment_rows(robot, conditions_of_batch, source, batch, names[rows_done]))
             courses += [
-                _course(robot, conditions_of_batch, source, batch, k, str(names[done + k]), rows)
+                _course_rows(robot, conditions_of_batch, source, batch, k, str(names[done + k]), rows)
                 for k in range(count)
             ]
             assert batch.course is not None  # it was asked for
@@ -191,10 +191,10 @@ def run_missions(robot: Robot, runs: records.Runs, source: ProfileTable, config:
             done += count
             advance(count)
     about = _conditions(robot, runs, source, config)
-    return Missions({**about, **_below(tables)}, _below(segments), _below(courses), source, whole)
+    return Missions({**about, **_stacked(tables)}, _stacked(segments), _stacked(courses), source, whole)
 
 
-def _below(tables: list[Columns]) -> Columns:
+def _stacked(tables: list[Columns]) -> Columns:
     """Concatenated tables with the same columns."""
     return {key: np.concatenate([table[key] for table in tables]) for key in tables[0]}
 
@@ -210,7 +210,7 @@ def _conditions(robot: Robot, runs: records.Runs, source: ProfileTable, config: 
     return about
 
 
-def _segments(
+def _segment_rows(
     robot: Robot, conditions: Conditions, source: ProfileTable, found: Mission, names: np.ndarray
 ) -> Columns:
     """A row for each segment of each cycle of each run, up to where the run has ended."""
@@ -280,7 +280,7 @@ def rows_to_keep(segment: np.ndarray, current: np.ndarray, most: int, marked: np
     return np.unique(np.concatenate([peaks, spread]))
 
 
-def _course(
+def _course_rows(
     robot: Robot, conditions: Conditions, source: ProfileTable, found: Mission, k: int, name: str, most: int
 ) -> Columns:
     """Rows of history.csv of one run."""

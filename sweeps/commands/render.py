@@ -35,7 +35,7 @@ def execute(config: configuration.Render, picture: configuration.Picture) -> int
         climb = Seen.read(picture.climb)
         from sweeps.pages import climb_figures
 
-        _write(file, lambda aside: climb_figures.render_climb(climb, aside, begin, end, slow))
+        _write_whole(file, lambda aside: climb_figures.render_climb(climb, aside, begin, end, slow))
         print_output(str(file))
         return DONE
     still, given = file.suffix == ".png", picture.stated
@@ -67,7 +67,7 @@ def execute(config: configuration.Render, picture: configuration.Picture) -> int
         view = (rendering_from_above if config.turns else rendering).scene(robot, conditions, trajectory)
         rendering.render(view, aside, begin, end, slow)
 
-    _write(file, draw)
+    _write_whole(file, draw)
     status = STATUSES[int(trajectory.result.status)]
     print_output(f"{status}: {words.STATUSES[status].why}")
     print_output(str(file))
@@ -82,7 +82,7 @@ def _check_free(picture: configuration.Picture) -> None:
         raise BadConfiguration(f"FILE: {file.parent} is not a folder; choose another path")
 
 
-def _write(file: Path, draw: Callable[[Path], Any]) -> None:
+def _write_whole(file: Path, draw: Callable[[Path], Any]) -> None:
     """Write a picture or film completely or not at all."""
     with replacing(file) as aside, progress_bar(1, quiet=False, doing="drawing") as advance:
         try:

@@ -73,14 +73,14 @@ def execute(config: configuration.Resonance, beside: configuration.FolderPart) -
             f"--duration: got {config.options['duration']:g} s; expected at least {SHORTEST:g} s, so that "
             "grousers pass"
         )
-    runs, of_table8 = _points(config, robot)
+    runs, of_table8 = _grid_and_table_8(config, robot)
     conditions = run.conditions_of_runs(robot, runs, config)
     run.check_runs_bearable(robot, conditions, config)
     with open_folder("resonance", config, robot, beside, runs) as folder:
         what = passing_parts(robot, robot.configurations.names.index(name))
-        columns = _rippled(folder, robot, conditions, config, what)
+        columns = _ripple_columns(folder, robot, conditions, config, what)
         table = {**run.condition_table(robot, runs), "table8": of_table8, **columns}
-        result = _found(config, robot, what, table)
+        result = _modes_and_peaks(config, robot, what, table)
         _write(folder, config, result)
         document = print_report(resonance_report.resonance_document(result, file), file)
         manifest, solved = {"seed": None, "statuses": result.statuses}, words.every_run_solved(result.statuses)
@@ -107,7 +107,7 @@ def _grid(config: configuration.Resonance, voltages: tuple[float, ...], payloads
     )
 
 
-def _points(config: configuration.Resonance, robot: Robot) -> tuple[Runs, np.ndarray]:
+def _grid_and_table_8(config: configuration.Resonance, robot: Robot) -> tuple[Runs, np.ndarray]:
     """Points of the grid and the missing points of Table 8, and the rows that belong to Table 8."""
     parts = [
         grid_conditions(_grid(config, v, p), robot)
@@ -122,7 +122,7 @@ def _points(config: configuration.Resonance, robot: Robot) -> tuple[Runs, np.nda
     return runs, np.array(of_table8)
 
 
-def _rippled(
+def _ripple_columns(
     folder: RunFolder, robot: Robot, conditions: Conditions, config: configuration.Resonance, what: Passing
 ) -> Columns:
     """Ripple columns, computed in chunks. Chunks stored by an interrupted run are not simulated again."""
@@ -165,7 +165,7 @@ def _columns(robot: Robot, ended: Any, what: Passing) -> Columns:
     return columns
 
 
-def _found(config: configuration.Resonance, robot: Robot, what: Passing, table: Columns) -> ResonanceResult:
+def _modes_and_peaks(config: configuration.Resonance, robot: Robot, what: Passing, table: Columns) -> ResonanceResult:
     """Natural frequencies at the middle voltage, and peaks and crossings at each payload."""
     assert config.configuration is not None
     payloads, middle = config.payloads_kg, config.voltages_V[len(config.voltages_V) // 2]
@@ -202,9 +202,9 @@ def _write(folder: RunFolder, config: configuration.Resonance, found: ResonanceR
     folder.write_table("points.csv", found.table)
     folder.write_table(
         "modes.csv",
-        _rows([{"payload_kg": p, **m._asdict()} for p, modes in found.modes.items() for m in modes], Mode),
+        _tuple_columns([{"payload_kg": p, **m._asdict()} for p, modes in found.modes.items() for m in modes], Mode),
     )
-    folder.write_table("peaks.csv", _rows([p._asdict() for p in found.peaks], Peak))
+    folder.write_table("peaks.csv", _tuple_columns([p._asdict() for p in found.peaks], Peak))
     folder.write_json("result.json", found.to_json())
 
 
@@ -213,7 +213,7 @@ _COLUMNS = {
 }  # fmt: skip
 
 
-def _rows(rows: Iterable[Json], kind: type) -> Columns:
+def _tuple_columns(rows: Iterable[Json], kind: type) -> Columns:
     """Columns, with units in their names, of a list of named tuples."""
     rows, unit = list(rows), "Hz" if kind is Mode else "m_s"
     keys = list(rows[0]) if rows else list(kind.__annotations__)

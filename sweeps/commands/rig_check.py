@@ -137,7 +137,7 @@ class RigCheck:
                     "signed": instrument.signed,
                     "quantum": None if instrument.quantum is None else instrument.quantum / channel.factor,
                     "unit": channel.unit,
-                    "sd": usual if self.foresight is None else _source(self.foresight.noise[k], channel),
+                    "sd": usual if self.foresight is None else _source_of_sd(self.foresight.noise[k], channel),
                 }
             )
         return rows
@@ -243,7 +243,7 @@ class RigCheck:
         }
 
 
-def _source(word: str, channel: Channel) -> str:
+def _source_of_sd(word: str, channel: Channel) -> str:
     """Origin of the sd of a channel, in words."""
     every = {
         "columns": "of the table", "series": "estimated from the scatter of readings along series of rows",

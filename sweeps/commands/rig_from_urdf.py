@@ -124,7 +124,7 @@ class _Urdf:
         radius = self._radius(joint)
         level = abs(float((to_root[0] @ axis)[2])) <= LEVEL
         rolls = radius is not None and level and root_link != FIXED_ROOT and element.get("type") == "continuous"
-        weight = None if rolls else _weight(to_root[0].T @ [0.0, 0.0, -GRAVITY], axis, moment)
+        weight = None if rolls else _hanging_weight(to_root[0].T @ [0.0, 0.0, -GRAVITY], axis, moment)
         return JointNumbers(
             self.file, joint, rolls,
             mass=self._mass(), sides=self._sides(joint, radius) if rolls else None, radius=radius,
@@ -148,7 +148,7 @@ class _Urdf:
     def _origin(self, owner: Element, where: str) -> Pose:
         element = owner.find("origin")
         roll, pitch, yaw = self._vector(element, "rpy", f"{where}, <origin>", (0.0, 0.0, 0.0))
-        turned = _about(2, yaw) @ _about(1, pitch) @ _about(0, roll)
+        turned = _rotation_about(2, yaw) @ _rotation_about(1, pitch) @ _rotation_about(0, roll)
         return turned, self._vector(element, "xyz", f"{where}, <origin>", (0.0, 0.0, 0.0))
 
     def _moved(self, link: str, rigid: bool = False) -> Iterator[tuple[str, Pose]]:
@@ -160,7 +160,10 @@ class _Urdf:
             self._once(name, met)
             yield name, pose
             left += [
-                (self._link(self.joints[j], "child", j), _then(pose, self._origin(self.joints[j], f"joint {j}")))
+                (
+                    self._link(self.joints[j], "child", j),
+                    _compose(pose, self._origin(self.joints[j], f"joint {j}")),
+                )
                 for j in self.below[name]
                 if not rigid or self.joints[j].get("type") == "fixed"
             ]
@@ -176,7 +179,7 @@ class _Urdf:
         joint_name: str | None = joint
         link, met = "", set[str]()
         while joint_name is not None:
-            pose = _then(self._origin(self.joints[joint_name], f"joint {joint_name}"), pose)
+            pose = _compose(self._origin(self.joints[joint_name], f"joint {joint_name}"), pose)
             link = self._link(self.joints[joint_name], "parent", joint_name)
             self._once(link, met)
             joint_name = self.above.get(link)
@@ -200,7 +203,7 @@ class _Urdf:
         if inertial is None:
             return 0.0, 0.0, np.zeros(3)
         mass = self._link_mass(link)
-        turned, centre = _then(pose, self._origin(inertial, f"link {link}"))
+        turned, centre = _compose(pose, self._origin(inertial, f"link {link}"))
         entries = inertial.find("inertia")
         where = f"link {link}, <inertia>"
         xx, yy, zz = (self._number(entries, f"i{a}{a}", where, "kg·m²", 0.0) for a in "xyz")
@@ -218,7 +221,7 @@ class _Urdf:
             radii: list[Found] = []
             for name, pose in self._moved(link, rigid=True):
                 for shape in self.links[name].findall(tag):
-                    turned, centre = _then(pose, self._origin(shape, f"link {name}, <{tag}>"))
+                    turned, centre = _compose(pose, self._origin(shape, f"link {name}, <{tag}>"))
                     for kind, along in (("cylinder", turned[:, 2]), ("sphere", None)):
                         where = f"link {name}, <{tag}> <{kind}>"
                         element = shape.find(f"geometry/{kind}")
@@ -315,7 +318,7 @@ class _Urdf:
         return value
 
 
-def _about(axis: int, angle: float) -> np.ndarray:
+def _rotation_about(axis: int, angle: float) -> np.ndarray:
     """Rotation about a coordinate axis, shape (3, 3)."""
     one, other = (axis + 1) % 3, (axis + 2) % 3
     turned = np.eye(3)
@@ -325,12 +328,12 @@ def _about(axis: int, angle: float) -> np.ndarray:
     return turned
 
 
-def _then(outer: Pose, inner: Pose) -> Pose:
+def _compose(outer: Pose, inner: Pose) -> Pose:
     """A pose in the frame of another one."""
     return outer[0] @ inner[0], outer[1] + outer[0] @ inner[1]
 
 
-def _weight(gravity: np.ndarray, axis: np.ndarray, moment: np.ndarray) -> tuple[float, float] | None:
+def _hanging_weight(gravity: np.ndarray, axis: np.ndarray, moment: np.ndarray) -> tuple[float, float] | None:
     """As `hanging`, of a first moment [kg·m] under gravity [m/s²], both in the frame of the joint."""
     across = np.cross(axis, moment)
     flat = np.cross(across, axis)  # the moment without its part along the axis

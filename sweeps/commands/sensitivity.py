@@ -62,7 +62,7 @@ def execute(config: configuration.Sensitivity, beside: configuration.FolderPart)
     file = load_robot(config)
     if config.method not in METHODS:
         raise BadConfiguration(f"--method: got {config.method!r}; input should be one of {', '.join(METHODS)}")
-    ranges = _ranges(config.vary)
+    ranges = _varied_ranges(config.vary)
     freed = [name for name in ranges if name in OF_TURNS]
     robot = showing_turns(file.robot, freed)
     outputs = chosen_outputs(config.outputs, robot, bool(freed))
@@ -95,7 +95,7 @@ def execute(config: configuration.Sensitivity, beside: configuration.FolderPart)
         )
 
 
-def _ranges(vary: Names) -> dict[str, tuple[float, float]]:
+def _varied_ranges(vary: Names) -> dict[str, tuple[float, float]]:
     """`name=low:high` of every varied condition."""
     ranges: dict[str, tuple[float, float]] = {}
     for text in vary:

@@ -71,7 +71,7 @@ def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> 
     posterior = None if config.posterior is None else beside_robot(file)
     with open_folder("simulate", config, robot, beside, runs) as folder:
         shows_turns = showing_turns(robot, runs.axes)
-        table, histories = _simulated(folder, shows_turns, runs, config)
+        table, histories = _simulate_table(folder, shows_turns, runs, config)
         table[PERMISSIBLE] = permissible_durations(robot, table)
         stands = posture_words.posture_of_runs(robot, runs, run.conditions_of_runs(robot, runs, config))
         notes = run_remarks(robot, table) + capabilities.unknown_numbers_sentence(robot)
@@ -101,7 +101,7 @@ def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> 
         return run.write_run_folder(folder, config, result, print_report(document, of_page))
 
 
-def _simulated(
+def _simulate_table(
     folder: RunFolder, robot: Robot, runs: records.Runs, config: configuration.Simulate
 ) -> tuple[Columns, Run | None]:
     """The table of the runs. Where the fidelity keeps them over time these are written, and returned too."""

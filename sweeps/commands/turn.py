@@ -94,7 +94,7 @@ def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> 
             folder.write_table("posture.csv", stands.table)
             notes.append(posture_words.posture_sentences(stands))
         result = run.SimulationResult("simulate", config.model, robot, runs, table, {"turn": turn})
-        document = turn_report.turn_document(file, config.model, table, _ended(history), history, turns, notes)
+        document = turn_report.turn_document(file, config.model, table, _end_of_run(history), history, turns, notes)
         return run.write_run_folder(folder, config, result, print_report(document, file))
 
 
@@ -161,7 +161,7 @@ def _demanded(robot: Robot, asked: Conditions, runs: Runs, config: configuration
     return driven(volts), dataclasses.replace(runs, columns=columns)
 
 
-def _ended(history: History | None) -> dict[str, float] | None:
+def _end_of_run(history: History | None) -> dict[str, float] | None:
     """Time, distance from the start and angle turned by at the end of a run over time."""
     if history is None:
         return None

@@ -132,14 +132,14 @@ def compare_format(
         if not np.isfinite(kept) and effect.name not in held:
             verdict, how = DROPPED, "it has no effect on these runs, and the format has no term for it"
         fates_found.append(Fate(effect.name, verdict, how, kept))
-    exported = _at(law, theta, situation)
+    exported = _law_at(law, theta, situation)
     models = {NATIVE: situation.native, EXPORTED: situation.readings(exported)}
     if law.names:
-        models[TRANSLATED] = situation.readings(_at(law, law.start, situation))
+        models[TRANSLATED] = situation.readings(_law_at(law, law.start, situation))
     if names:
         plain = law_of(joint, dict.fromkeys(names, 0.0))
         bare = refit_parameters(plain, situation, situation.without(names))
-        models[WITHOUT] = situation.readings(_at(plain, bare, situation))
+        models[WITHOUT] = situation.readings(_law_at(plain, bare, situation))
     reference = situation.measured if situation.is_measured else situation.native
     return Comparison(
         situation, dict(zip(law.names, map(float, law.start), strict=True)),
@@ -156,7 +156,7 @@ def channel_errors(joint: Joint, shown: np.ndarray, reference: np.ndarray) -> di
     return {c.name: 100 * float(s) for c, s in zip(channels_of(joint), shares, strict=True) if np.isfinite(s)}
 
 
-def _at(law: FormatLaw, theta: Any, situation: Situation) -> AtJoint:
+def _law_at(law: FormatLaw, theta: Any, situation: Situation) -> AtJoint:
     current, speed = evaluate_law(law, jnp.asarray(theta), situation.command, situation.load, situation.way)
     return AtJoint(np.asarray(current), np.asarray(speed))
 
@@ -207,7 +207,7 @@ def share_kept(law: FormatLaw, bare: FormatLaw, situation: Situation, native: At
     where the effect changes nothing.
     """
     left = [
-        _stacked(exact) - _stacked(_at(model, refit_parameters(model, situation, exact), situation))
+        _stacked(exact) - _stacked(_law_at(model, refit_parameters(model, situation, exact), situation))
         for model, exact in ((law, native), (bare, native_bare))
     ]
     change = (_stacked(native) - _stacked(native_bare)) / (sizes := np.sqrt(np.mean(_stacked(native) ** 2, 0)))

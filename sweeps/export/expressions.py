@@ -177,7 +177,7 @@ _SIMPLE = {
 _SAME = frozenset(("copy", "copy_p", "stop_gradient", "optimization_barrier", "reduce_precision"))
 
 
-def _shaped(name: str, x: list[np.ndarray], p: Json) -> np.ndarray:
+def _shape_primitive(name: str, x: list[np.ndarray], p: Json) -> np.ndarray:
     """Result of a primitive that only moves or joins elements."""
     if name == "broadcast_in_dim":
         shape = [1] * len(p["shape"])
@@ -256,7 +256,7 @@ def _evaluated(jaxpr: Any, consts: Sequence[Any], arguments: Sequence[np.ndarray
             closed = hasattr(inner, "consts")
             results = _evaluated(inner.jaxpr if closed else inner, inner.consts if closed else (), x)
         else:
-            results = [_shaped(name, x, p)]
+            results = [_shape_primitive(name, x, p)]
         values.update(zip(eqn.outvars, results, strict=True))
     return [read(v) for v in jaxpr.outvars]
 
@@ -381,7 +381,7 @@ def lines_of(result: Symbol, dialect: Dialect, spelled: Callable[[str], str], in
             return f"({number})" if number.startswith("-") and outer >= 7 else number
         if x.op == "name":
             return spelled(x.value)
-        own_rank, written = _written(x, text, dialect)
+        own_rank, written = _operation_text(x, text, dialect)
         if uses[id(x)] > 1:
             local[id(x)] = f"x{len(local) + 1}"
             lines.append(f"{indent}{local[id(x)]} = {written}")
@@ -392,7 +392,7 @@ def lines_of(result: Symbol, dialect: Dialect, spelled: Callable[[str], str], in
     return [*lines, f"{indent}return {last}"]
 
 
-def _written(x: Symbol, text: Callable[..., str], dialect: Dialect) -> tuple[int, str]:
+def _operation_text(x: Symbol, text: Callable[..., str], dialect: Dialect) -> tuple[int, str]:
     """Precedence and text of an operation."""
     if x.op == "neg":
         return 7, f"-{text(x.args[0], 7)}"

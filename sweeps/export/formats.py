@@ -136,9 +136,9 @@ def _mujoco(begun: Export, runs: Situation, at: str, draws: int, seed: int) -> E
         }
 
     texts = texts_of(drive)
-    checks = _checked(texts_of(drive.steady), motor, runs, compared)
+    checks = _in_mujoco(texts_of(drive.steady), motor, runs, compared)
     if follows or (drive.loose and drive.controller is None):
-        checks |= _followed(drive, texts, GOAL if follows else volts, motor.ratio if follows else 1.0)
+        checks |= _start_difference(drive, texts, GOAL if follows else volts, motor.ratio if follows else 1.0)
     files: Mapping[str, str | bytes] = texts
     if begun.format == "randomization":
         values = randomization.draw_parameters(
@@ -148,7 +148,7 @@ def _mujoco(begun: Export, runs: Situation, at: str, draws: int, seed: int) -> E
     return dataclasses.replace(begun, files=files, comparison=compared, checks=checks)
 
 
-def _checked(texts: Mapping[str, str], motor: mujoco.Motor, runs: Situation, found: Comparison) -> dict[str, float]:
+def _in_mujoco(texts: Mapping[str, str], motor: mujoco.Motor, runs: Situation, found: Comparison) -> dict[str, float]:
     """Largest differences of MuJoCo C from the format's law, and errors of both on the same runs [%]."""
     rows = np.unique(np.linspace(0, len(runs.command) - 1, min(CHECKED, len(runs.command))).astype(int))
     got = mujoco.settle_in_mujoco(texts, motor, runs, found.exported, rows.tolist())
@@ -167,7 +167,7 @@ def _checked(texts: Mapping[str, str], motor: mujoco.Motor, runs: Situation, fou
     }
 
 
-def _followed(drive: Joint, texts: Mapping[str, str], command: float, ratio: float) -> dict[str, float]:
+def _start_difference(drive: Joint, texts: Mapping[str, str], command: float, ratio: float) -> dict[str, float]:
     """Difference of MuJoCo C from the native model over the start of a constant goal [rad] or voltage [V] at rest."""
     times = np.linspace(0.0, START, 26)
     own = drive.controller

@@ -90,7 +90,7 @@ class MujocoLaw(eqx.Module):
         return given[SHARE] * current, speed
 
 
-def _numbers(joint: Joint, amplitudes: Mapping[str, float]) -> dict[str, dict[str, float]]:
+def _effect_numbers(joint: Joint, amplitudes: Mapping[str, float]) -> dict[str, dict[str, float]]:
     """Parameters of each effect inside, by its name, with some amplitudes replaced."""
     numbers: dict[str, dict[str, float]] = {}
     for effect in joint.inside:
@@ -121,7 +121,7 @@ def translate_law(joint: Joint, normal: float, amplitudes: Mapping[str, float] |
     robot, load = joint.robot, joint.load
     motor, gear = robot.motor, robot.gearbox
     ratio, share = float(gear.ratio), float(gear.efficiency_load)
-    numbers_by_effect = _numbers(joint, amplitudes or {})
+    numbers_by_effect = _effect_numbers(joint, amplitudes or {})
     number = lambda name, key="amplitude": numbers_by_effect.get(name, {}).get(key, 0.0)  # noqa: E731
     resistance = float(motor.resistance) + number("series_resistance") + float(robot.sides) * number("supply_sag")
     at_output = ratio * share
@@ -259,7 +259,7 @@ class Motor:
 
 def mjcf_motor(joint: Joint, values: Mapping[str, float]) -> Motor:
     """Numbers of the MJCF for refitted parameters."""
-    robot, numbers = joint.robot, _numbers(joint, {})
+    robot, numbers = joint.robot, _effect_numbers(joint, {})
     gear, share = robot.gearbox, float(robot.gearbox.efficiency_load)
     ratio = float(gear.ratio)
     number = lambda name, key="amplitude": numbers.get(name, {}).get(key, 0.0)  # noqa: E731
@@ -304,7 +304,7 @@ def _controller(joint: Joint, found: Motor) -> tuple[float, ...]:
     return kp * torque, ki * torque, (kd + constant) * torque, 0.0, most, volts * found.ratio * float(own.limit)
 
 
-def _play(joint: Joint, found: Motor, name: str, at: str) -> str:
+def _backlash_body(joint: Joint, found: Motor, name: str, at: str) -> str:
     """Text of the motor's side as a body of its own, and of the tendon between its joint and the load's."""
     load, motor = joint.load, found.armature - found.added
     rate = 1 / motor + 1 / (float(load.inertia) + found.added)
@@ -398,7 +398,7 @@ def mjcf_fragment(
             for side, (dry, viscous, inertia), _ in sides
         )
         + "  </default>\n"
-        + (_play(joint, found, name, at) if joint.loose else "")
+        + (_backlash_body(joint, found, name, at) if joint.loose else "")
         + "  <actuator>\n"
         + _comment(about_motor, "    ")
         + f'    <dcmotor name="{name}" joint="{sides[-1][2]}" gear="{_digits(found.ratio)}"{written}{limits}/>\n'

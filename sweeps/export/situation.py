@@ -88,7 +88,7 @@ class Situation:
 
     def without(self, names: Names) -> AtJoint:
         """The joint's own model with amplitudes of some of its effects at 0."""
-        _, signals = _solved(_absent(self.joint, names), self.conditions)
+        _, signals = _solved(_with_absent_effects(self.joint, names), self.conditions)
         ratio = float(self.joint.robot.gearbox.ratio)
         return AtJoint(np.asarray(signals.current)[self.kept], np.asarray(signals.speed_motor)[self.kept] / ratio)
 
@@ -115,7 +115,7 @@ class Situation:
         return np.stack([np.asarray(sensor_readings[c.name]) for c in channels_of(self.joint)], -1)
 
 
-def _absent(joint: Joint, names: Names = ()) -> Robot:
+def _with_absent_effects(joint: Joint, names: Names = ()) -> Robot:
     """The whole robot with amplitudes at 0: of effects outside the joint, and of others by name.
 
     It keeps these effects, so that all models of a comparison are one compiled program.
@@ -147,11 +147,11 @@ def situation_of_joint(joint: Joint, data: Runs | str | None) -> Situation:
         runs = export_grid(joint)
         source = "a grid of operating points in both directions, without readings"
     else:
-        runs = _table(data, joint)
+        runs = _runs_of_joint(data, joint)
         source = runs.source
     conditions = runs.conditions(robot)
     moves, whole = _solved(robot, conditions)
-    turns, signals = _solved(_absent(joint), conditions) if joint.outside else (moves, whole)
+    turns, signals = _solved(_with_absent_effects(joint), conditions) if joint.outside else (moves, whole)
     channels = channels_of(joint)
     sensor_readings = jax.vmap(lambda s: balances.sensor(robot, s))(whole)
     native = np.stack([np.asarray(sensor_readings[c.name]) for c in channels], -1)
@@ -206,7 +206,7 @@ def _measured(runs: Runs, channels: tuple[Any, ...]) -> np.ndarray:
     return np.stack([by_name.get(c.name, np.full(len(runs), np.nan)) for c in channels], -1)
 
 
-def _table(data: Runs | str, joint: Joint) -> Runs:
+def _runs_of_joint(data: Runs | str, joint: Joint) -> Runs:
     """Runs of a table in the joint's configuration. For a log, its settled segments."""
     robot = joint.file.robot
     runs = read_runs(data, robot, measured=True, series=True) if isinstance(data, str) else data.of(robot)

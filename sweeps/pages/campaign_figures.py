@@ -69,7 +69,7 @@ def draw_output_spread(output: np.ndarray, label: str, varied: Mapping[str, Vari
     """
     names = sorted(varied, key=lambda name: -variance_share(varied[name].values, output))[:2]
     fig, ((histogram, *others),) = new_figure(1, 2 + len(names) if len(names) == 2 else 2, 2.9)
-    histogram.hist(output, bins=_number(output, BARS), color=BLUE)
+    histogram.hist(output, bins=_number_of_bins(output, BARS), color=BLUE)
     histogram.set(xlabel=label, ylabel="points", title="how often")
     for axes, name in zip(others, names, strict=False):
         values = varied[name].values
@@ -126,14 +126,14 @@ def draw_grid_statuses(codes: np.ndarray, names: Sequence[str], across: Varied, 
     return fig
 
 
-def _number(values: np.ndarray, most: int) -> int:
+def _number_of_bins(values: np.ndarray, most: int) -> int:
     """Number of bins for this many values."""
     return min(most, max(LEAST, len(values) // EACH))
 
 
 def bin_values(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Bin of each value, and the bins' middles: its levels where there are few, else equal numbers of points."""
-    levels, number = np.unique(values), _number(values, BINS)
+    levels, number = np.unique(values), _number_of_bins(values, BINS)
     if len(levels) <= number:
         return np.searchsorted(levels, values), levels
     edges = np.unique(np.quantile(values, np.linspace(0, 1, number + 1)))

@@ -234,7 +234,7 @@ def figure_as_svg(fig: Figure) -> str:
     text = re.sub(r"<metadata>.*?</metadata>\s*", "", text, flags=re.S).replace(
         "'DejaVu Sans'", "'DejaVu Sans', Verdana"
     )
-    axes = html.escape(json.dumps([_place(fig, a) for a in fig.axes if a.axison and a.get_visible()]))
+    axes = html.escape(json.dumps([_axes_position(fig, a) for a in fig.axes if a.axison and a.get_visible()]))
     return text.replace("<svg ", f'<svg data-axes="{axes}" ', 1)
 
 
@@ -324,7 +324,7 @@ def _luminance(channels: np.ndarray) -> float:
     return float(linear @ [0.2126, 0.7152, 0.0722])
 
 
-def _place(fig: Figure, axes: Axes) -> Json:
+def _axes_position(fig: Figure, axes: Axes) -> Json:
     """Position of axes in the drawing [pt from its upper left corner], and their ranges."""
     width, height = 72 * fig.get_size_inches()
     box = axes.get_position(original=False)
@@ -338,7 +338,7 @@ def _place(fig: Figure, axes: Axes) -> Json:
         ("y", axes.yaxis, row, fig.get_supylabel()),
     ):
         labels = (axis.get_label_text(), *(other.get_label_text() for other in beside), whole)
-        both[name] = {**_run(axis), "label": next(filter(None, labels), "").split("\n")[0]}
+        both[name] = {**_axis_ends(axis), "label": next(filter(None, labels), "").split("\n")[0]}
     return {"box": [round(v, 1) for v in place], **both}
 
 
@@ -347,7 +347,7 @@ def _has_names(axis: Axis) -> bool:
     return not isinstance(axis.get_major_formatter(), ScalarFormatter | LogFormatter | NullFormatter)
 
 
-def _run(axis: Axis) -> Json:
+def _axis_ends(axis: Axis) -> Json:
     """Ends of an axis, whether it is logarithmic, and the names of its ticks if they have names."""
     ends = [float(f"{end:.6g}") for end in axis.get_view_interval()]
     axis_facts: Json = {"ends": ends, "log": axis.get_scale() == "log"}

@@ -68,7 +68,7 @@ def over_log(found: Settled) -> Figure:
     ]
     fig, grid = new_figure(len(lines), 1, 1.9 * len(lines), sharex=True)
     for axes, (label, values), signal in zip(grid[:, 0], lines, (None, *found.signals), strict=True):
-        axes.plot(*_thinned(clock[order], values[order]), color=FAINT, lw=0.8)
+        axes.plot(*_thin_line(clock[order], values[order]), color=FAINT, lw=0.8)
         for s in found.stretches:
             ends = clock[s.rows[0]], clock[s.rows[-1]]
             if s.why:
@@ -81,7 +81,7 @@ def over_log(found: Settled) -> Figure:
     return fig
 
 
-def _thinned(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _thin_line(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """A line with fewer points that looks the same: the smallest and largest sample of each group."""
     size = -(-2 * len(x) // POINTS)
     if size <= 2:
@@ -96,7 +96,7 @@ INRUSH = 0.04  # s, shown enlarged
 _STAGES = (("I", "#fdebd0", "starting"), ("II", "#e3eef7", "slipping"), ("III", "#eaf5ea", "uniform"))
 
 
-def _largest(time: np.ndarray, values: np.ndarray) -> float:
+def _largest_magnitude(time: np.ndarray, values: np.ndarray) -> float:
     """Value with the largest magnitude of a sampled curve, also between samples. NaN without samples."""
     if len(values) < 3:
         return float(values[np.argmax(np.abs(values))]) if values.size else np.nan
@@ -155,7 +155,7 @@ class Start:
     @property
     def peak(self) -> float:
         """Largest current [A], with the sign that it is drawn with."""
-        return _largest(self.time, self.current)
+        return _largest_magnitude(self.time, self.current)
 
     @property
     def ended(self) -> tuple[float, float]:
@@ -383,7 +383,7 @@ class Course:
 
     def largest(self, channel: str) -> float:
         """Reading with the largest magnitude."""
-        return _largest(self.time, self.readings[channel])
+        return _largest_magnitude(self.time, self.readings[channel])
 
     def last(self, channel: str) -> float:
         """Reading at the end."""

@@ -373,10 +373,10 @@ def depends_on(table: Columns, change: np.ndarray, driver: str = "") -> tuple[np
 
 
 def draw_effect_laws(found: DiscoveryResult, table: Columns, changes: Mapping[str, Change]) -> Figure:
-    """Law of each effect found, on its readings less those of the robot without it.
+    """Law of each effect found, plotted over its condition: readings minus those of the robot without the effect.
 
-    Measured with ±2 sd, the refit with nothing added, and the law with the 95 % band of its amplitude. Runs backward
-    have hollow dots and a line of their own.
+    The figure shows measurements with ±2 sd, the refit without effects, and the law with the 95 % band of its
+    amplitude. Backward runs have hollow dots and a separate line.
     """
     fig, grid = new_figure(1, len(changes), 3.4)
     readings, used = found.readings_of_rows, found.included

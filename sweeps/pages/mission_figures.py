@@ -61,7 +61,7 @@ def draw_mission_course(rows: Columns, cycle: float | None, limit: float, linear
         unlimited = limit >= UNLIMITED or "housing_temperature_C" not in rows
         beyond = (
             ""
-            if unlimited or _near(shown_rows, limit)
+            if unlimited or _limit_is_near(shown_rows, limit)
             else f", the winding's limit of {limit:.0f} °C beyond the scale"
         )
         axes[2].set_title("temperatures" + (beyond if first else ""))
@@ -92,7 +92,7 @@ def of_sides(rows: Columns) -> Figure:
     return fig
 
 
-def _beside(axes: Axes, label: str, colour: str) -> Axes:
+def _right_axes(axes: Axes, label: str, colour: str) -> Axes:
     """Axes with a scale of their own at the right."""
     other = axes.twinx()
     other.grid(False)
@@ -138,7 +138,7 @@ def _speed(axes: Axes, time: np.ndarray, rows: Columns, linear: bool, legend: bo
         if legend:
             _legend(axes)
         return
-    slope = _beside(axes, "slope [°]", GREEN)
+    slope = _right_axes(axes, "slope [°]", GREEN)
     slope.plot(
         time, rows["slope_deg"], color=GREEN, lw=1.0, label="slope", drawstyle="default" if linear else "steps-post"
     )
@@ -155,7 +155,7 @@ def _current(axes: Axes, time: np.ndarray, rows: Columns, sides: float, legend: 
     top = int(np.argmax(np.abs(current)))
     axes.plot(time[top], current[top], marker="o", ms=4, color=INK, ls="none", label=f"peak {current[top]:.2f} A")
     axes.set_ylabel("current [A]")
-    duty = _beside(axes, "duty [%]", PURPLE)
+    duty = _right_axes(axes, "duty [%]", PURPLE)
     _curve(duty, time, 100 * driven, PURPLE, "duty", 0.9)
     low = -110 if (driven < 0).any() else 0
     duty.set_ylim(low, 110)
@@ -169,7 +169,7 @@ def of_motors(rows: Columns, name: str, unit: str) -> np.ndarray:
     return np.asarray(np.mean(of_sides, axis=0) if of_sides else rows[f"{name}{unit}"])
 
 
-def _near(rows: Columns, limit: float) -> bool:
+def _limit_is_near(rows: Columns, limit: float) -> bool:
     """True if the limit is near enough to be drawn. A far limit would flatten the curve."""
     return "housing_temperature_C" in rows and bool(np.max(rows["winding_temperature_C"]) > 0.6 * limit)
 
@@ -182,7 +182,7 @@ def _temperatures(axes: Axes, time: np.ndarray, rows: Columns, limit: float, leg
     axes.plot(time, rows["winding_temperature_C"], color=VERMILION, lw=1.4, label="winding")
     axes.plot(time, rows["housing_temperature_C"], color=ORANGE, lw=1.4, label="housing")
     top, bottom = float(np.max(rows["winding_temperature_C"])), float(np.min(rows["housing_temperature_C"]))
-    if _near(rows, limit):
+    if _limit_is_near(rows, limit):
         axes.axhline(limit, color=INK, lw=1.0, ls="--", label=f"limit {limit:.0f} °C")
         axes.set_ylim(bottom - 2, 1.1 * max(top, limit))
     else:
@@ -206,7 +206,7 @@ def _source(axes: Axes, time: np.ndarray, rows: Columns) -> None:
     span = float(charge.max() - charge.min())
     if span > 0.05:
         axes.set_ylim(0, 105)
-    beside = _beside(axes, "voltage [V]", BLUE)
+    beside = _right_axes(axes, "voltage [V]", BLUE)
     beside.plot(time, volts, color=BLUE, lw=0.8, alpha=0.8)
     for k in np.flatnonzero(rows["event"] == "below_cut_off")[-1:]:
         axes.axvline(time[k], color=VERMILION, lw=1.0, ls="--")

@@ -136,7 +136,7 @@ def render_page(folder: Path, album: Album, **known: Any) -> Path:
         "side_by_side": SIDE_BY_SIDE,
         "version": __version__,
     }
-    known["files"] = _beside(Path(folder), words.FILES | known.get("files", {}))
+    known["files"] = _files_of_folder(Path(folder), words.FILES | known.get("files", {}))
     template = environment.get_template("document.html.j2")
     page = template.render(pictures=album.pictures, overlays=album.overlays, **known)
     page = page.replace("<table", '<div class="scroll" tabindex="0"><table').replace("</table>", "</table></div>")
@@ -146,7 +146,7 @@ def render_page(folder: Path, album: Album, **known: Any) -> Path:
     return path
 
 
-def _beside(folder: Path, meanings: dict[str, str]) -> dict[str, str]:
+def _files_of_folder(folder: Path, meanings: dict[str, str]) -> dict[str, str]:
     """Files of a run folder, including those still to be written, with their descriptions. Known files come first."""
     files = {p.name + "/" * p.is_dir() for p in folder.iterdir()} | {"manifest.json"}
     files = {name for name in files if name in meanings or "." in name} - {"report.html"}  # no locks, no chunks

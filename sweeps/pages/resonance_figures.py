@@ -49,7 +49,7 @@ def resonance_map(found: ResonanceResult) -> Figure:
     return fig
 
 
-def _top(found: ResonanceResult) -> float:
+def _largest_frequency(found: ResonanceResult) -> float:
     """Largest frequency drawn [Hz]."""
     bands = [m.high for modes in found.modes.values() for m in modes if m.resonant]
     lines = [found.table[f"{name}_frequency_Hz"][found.read] for name in _MARKS]
@@ -59,7 +59,7 @@ def _top(found: ResonanceResult) -> float:
 
 def draw_campbell_diagram(axes: Axes, found: ResonanceResult) -> None:
     """Lines n × V / S, bands of natural frequencies, and the strongest line of each run, larger for more ripple."""
-    table, what, top = found.table, found.passing, _top(found)
+    table, what, top = found.table, found.passing, _largest_frequency(found)
     fastest = float(np.nanmax(table["speed_mean_mm_s"]))
     place = np.inf
     for order in range(1, ORDERS + 1):

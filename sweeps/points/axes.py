@@ -107,7 +107,7 @@ def plan_design(config: Campaign, robot: Robot, where: str) -> Plan:
             f"{where}: voltage has no effect on battery power, where the state of charge sets it; remove voltage "
             "or battery"
         )
-    _acting({*fixed, *design.names}, robot, where, surface)
+    _check_acting_conditions({*fixed, *design.names}, robot, where, surface)
     which = np.atleast_1d(axes.get(CONFIGURATION, fixed.get(CONFIGURATION, 0.0)))
     simulated = [robot.configurations.names[int(k)] for k in which]
     imposed.check_turning(robot, {*fixed, *design.names}, simulated, where)
@@ -130,7 +130,7 @@ def plan_design(config: Campaign, robot: Robot, where: str) -> Plan:
     return dataclasses.replace(plan, axes={name: varied[name] for name in design.names})
 
 
-def _acting(names: set[str], robot: Robot, where: str, surface: str | None) -> None:
+def _check_acting_conditions(names: set[str], robot: Robot, where: str, surface: str | None) -> None:
     """Reject conditions that do not act on a robot."""
     kinds = {
         "voltage": ("voltage", "duty", "open"), "motor_speed": ("motor_speed", "motor_acceleration"),
@@ -166,7 +166,7 @@ def _known(name: str, robot: Robot, where: str) -> Axis:
     return variation.Variation(robot, (name,)).axes[name]
 
 
-def _value(name: str, value: Any, where: str) -> float:
+def _axis_value(name: str, value: Any, where: str) -> float:
     """A number. Of the battery also true or false."""
     return float(value) if name == "battery" and isinstance(value, bool) else stated_number(value, where)
 
@@ -203,7 +203,7 @@ def _axis(name: str, stated: Any, robot: Robot, where: str, extra: Mapping[str, 
     elif isinstance(stated, str):
         values = np.array(parse_axis(where, stated))
     else:
-        values = np.array([_value(name, v, where) for v in (stated if isinstance(stated, list) else [stated])])
+        values = np.array([_axis_value(name, v, where) for v in (stated if isinstance(stated, list) else [stated])])
     if not len(values):
         raise BadConfiguration(f"{where}: got no values; expected at least one")
     if len(values) > LONGEST:
@@ -259,7 +259,7 @@ def _fixed(stated: Json, robot: Robot, where: str) -> tuple[dict[str, float], st
         elif name == CONFIGURATION:
             fixed[name] = _configuration(value, robot, place)
         else:
-            fixed[name] = _value(name, value, place)
+            fixed[name] = _axis_value(name, value, place)
             _within(np.array([fixed[name]]), _known(name, robot, place), place)
     return fixed, surface
 

@@ -168,7 +168,7 @@ def compute_climbs(
             progress=told,
         )  # fmt: skip
 
-    results = _numbers(run(sizes, told)) if sizes is not None else _searched(obstacle, points, run, told)
+    results = _until_verdict(run(sizes, told)) if sizes is not None else _search_all(obstacle, points, run, told)
     verdict = results[VERDICT]
     status = np.where(verdict == FAILED, FAILED_POINT, np.where(verdict == UNFINISHED, NOT_SETTLED, CONVERGED))
     told(1.0)
@@ -190,7 +190,7 @@ def _sequences(obstacle: Obstacle, robot: Robot, conditions: Conditions, points:
     return dataclasses.replace(sequences, supply=jnp.full(points, obstacle.levers_voltage_V))
 
 
-def _numbers(found: Climb) -> Columns:
+def _until_verdict(found: Climb) -> Columns:
     """Numbers of runs until their verdicts."""
     r, during = found.record, found.during
 
@@ -211,7 +211,7 @@ def _numbers(found: Climb) -> Columns:
     }
 
 
-def _searched(obstacle: Obstacle, points: int, run: Callable[..., Climb], told: Callable[[float], None]) -> Columns:
+def _search_all(obstacle: Obstacle, points: int, run: Callable[..., Climb], told: Callable[[float], None]) -> Columns:
     """Largest sizes that are climbed, by simultaneous bisection for all points, and the result for the next larger
     size."""
     low, high = SOUGHT[obstacle.kind]

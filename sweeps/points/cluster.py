@@ -220,7 +220,7 @@ def _client(address: str) -> Any:
         except BaseException as error:  # whatever comes of talking to something that is no scheduler
             failed.append(error)
 
-    with _quiet():
+    with _silence_dask():
         asking = threading.Thread(target=ask, daemon=True)
         asking.start()
         asking.join(ANSWER + 0.5)
@@ -234,7 +234,7 @@ def _client(address: str) -> Any:
 
 
 @contextlib.contextmanager
-def _quiet() -> Iterator[None]:
+def _silence_dask() -> Iterator[None]:
     """Suppresses dask's log of a failed connection, because the error message already reports it."""
     import logging
 
@@ -261,7 +261,7 @@ def program_identity() -> dict[str, dict[str, str]]:
 
 
 @functools.cache
-def _start() -> None:
+def _start_worker() -> None:
     """Compiled programs are kept, as in the command itself."""
     from sweeps import compilation_cache
 
@@ -270,7 +270,7 @@ def _start() -> None:
 
 def introduce_worker() -> tuple[dict[str, dict[str, str]], str]:
     """Software of a worker and its device."""
-    _start()
+    _start_worker()
     from sweeps.points.scale import device_kind
 
     return program_identity(), device_kind()

@@ -60,7 +60,7 @@ def prepare_job(config: Campaign, robot: Robot, plan: axes.Plan, where: str) -> 
     assert config.chunk is not None
     blocks = Blocks.of(plan.design.shape, config.chunk)
     if profile is None and task.run is None:
-        _bearable(plan.varied(robot), task, plan)
+        _check_with_fidelity(plan.varied(robot), task, plan)
     return scale.Job(robot, task, plan, config.outputs, config.storage, blocks, profile)
 
 
@@ -94,7 +94,7 @@ def _profile(name: str, robot: Robot, plan: axes.Plan, where: str) -> Profile:
     return source.profile(robot, plan.fixed())
 
 
-def _bearable(variation: Variation, task: Task, plan: axes.Plan) -> None:
+def _check_with_fidelity(variation: Variation, task: Task, plan: axes.Plan) -> None:
     """Lets the fidelity check points spread over the design, including its corners.
 
     Raises:

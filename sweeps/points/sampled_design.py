@@ -244,7 +244,7 @@ class Blocks:
 Unit = Float[np.ndarray, "dimensions points"]
 
 
-def _key(seed: int, dimension: int, use: str) -> int:
+def _random_key(seed: int, dimension: int, use: str) -> int:
     """128 bits that are unique to a dimension and a use of a seed."""
     return int.from_bytes(hashlib.blake2b(f"{seed} {dimension} {use}".encode(), digest_size=16).digest(), "little")
 
@@ -259,7 +259,7 @@ def philox_uniform(key: int, first: int, count: int) -> Float[np.ndarray, " poin
 
 def random_points(seed: int, number: int, dimensions: int, first: int, count: int) -> Unit:
     """Independent points."""
-    return np.array([philox_uniform(_key(seed, d, "random"), first, count) for d in range(dimensions)])
+    return np.array([philox_uniform(_random_key(seed, d, "random"), first, count) for d in range(dimensions)])
 
 
 def latin_hypercube(seed: int, number: int, dimensions: int, first: int, count: int) -> Unit:
@@ -269,9 +269,9 @@ def latin_hypercube(seed: int, number: int, dimensions: int, first: int, count: 
     """
     unit = np.empty((dimensions, count))
     for d in range(dimensions):
-        jitter = philox_uniform(_key(seed, d, "jitter"), first, count)
+        jitter = philox_uniform(_random_key(seed, d, "jitter"), first, count)
         points = np.minimum(np.arange(first, first + count, dtype=np.uint64), np.uint64(number - 1))
-        slices = keyed_permutation(_key(seed, d, "slices"), number, points)
+        slices = keyed_permutation(_random_key(seed, d, "slices"), number, points)
         unit[d] = (slices + jitter) / number
     return np.clip(unit, 2.0**-54, 1 - 2.0**-53)
 
@@ -301,8 +301,8 @@ def keyed_permutation(key: int, number: int, points: UInt64[np.ndarray, " points
             high, low = np.divmod(block[left], np.uint64(b))
             x, y = scratch[:, : len(left)]
             for k in range(0, ROUNDS, 2):
-                _add(high, _mixed(low, keys[k], x, y), np.uint64(a), y)
-                _add(low, _mixed(high, keys[k + 1], x, y), np.uint64(b), y)
+                _add_modulo(high, _mix_words(low, keys[k], x, y), np.uint64(a), y)
+                _add_modulo(low, _mix_words(high, keys[k + 1], x, y), np.uint64(b), y)
             high *= np.uint64(b)
             high += low
             block[left] = high
@@ -313,7 +313,7 @@ def keyed_permutation(key: int, number: int, points: UInt64[np.ndarray, " points
 Words = UInt64[np.ndarray, " n"]
 
 
-def _add(x: Words, word: Words, most: np.uint64, scratch: Words) -> None:
+def _add_modulo(x: Words, word: Words, most: np.uint64, scratch: Words) -> None:
     """x = x + r modulo `most` (below 2^32), r being what the upper half of a word is of 0 .. most - 1."""
     word >>= np.uint64(32)
     word *= most
@@ -323,7 +323,7 @@ def _add(x: Words, word: Words, most: np.uint64, scratch: Words) -> None:
     np.minimum(x, scratch, out=x)  # below 0 it wraps round to what is larger
 
 
-def _mixed(words: Words, key: np.uint64, x: Words, scratch: Words) -> Words:
+def _mix_words(words: Words, key: np.uint64, x: Words, scratch: Words) -> Words:
     """The finaliser of splitmix64 (Steele et al. 2014) on words and a key, in x.
 
     In place throughout: memory that each thread asks for anew keeps the others waiting.

@@ -114,7 +114,7 @@ class Compiled:
         self._split = NamedSharding(self.mesh, PartitionSpec(POINTS))
         factors = {row.name: row.factor for row in outputs.output_table(job.robot.channels)}
         surface = None if job.plan.surface is None else adhesion_ratios(job.robot, job.plan.surface)
-        self._asked = _Asked(
+        self._asked = _AskedOutputs(
             job.task.model, tuple(job.task.options.items()), tuple((n, factors.get(n, 1.0)) for n in job.outputs),
             job.storage, surface,
         )  # fmt: skip
@@ -162,7 +162,7 @@ class Compiled:
         return pick_outputs(run, robot.channels, self.job.outputs)
 
 
-class _Asked(NamedTuple):
+class _AskedOutputs(NamedTuple):
     """Outputs of each point by a fidelity with its options, and their form in the store.
 
     Attributes:
@@ -193,7 +193,7 @@ def _on_surface(
 
 
 def _one_device(
-    variation: Variation, conditions: Conditions, values: Array, asked: _Asked, profile: Profile | None
+    variation: Variation, conditions: Conditions, values: Array, asked: _AskedOutputs, profile: Profile | None
 ) -> dict[str, Array]:
     """Outputs of points as they are stored."""
     conditions = _on_surface(variation, conditions, values, asked.surface)
@@ -205,7 +205,7 @@ def _one_device(
 _one_device_kept = compiled(_one_device)
 
 
-def _stored(found: Mapping[str, Array], asked: _Asked) -> dict[str, Array]:
+def _stored(found: Mapping[str, Array], asked: _AskedOutputs) -> dict[str, Array]:
     """Outputs in the units of tables and in the stored type. Those in `KINDS` keep their own type."""
     stored = {n: (found[n] / factor).astype(asked.storage) for n, factor in asked.factors if n not in KINDS}
     named = (*(n for n, _ in asked.factors if n in KINDS), STATUS)
@@ -216,7 +216,7 @@ def _split_among(mesh: Mesh) -> Callable[..., dict[str, Array]]:
     """`_one_device` on each of several, its share of the points each."""
 
     def program(
-        variation: Variation, conditions: Conditions, values: Array, asked: _Asked, profile: Profile | None
+        variation: Variation, conditions: Conditions, values: Array, asked: _AskedOutputs, profile: Profile | None
     ) -> dict[str, Array]:
         arrays, rest = eqx.partition((variation, profile), eqx.is_array)
         each = PartitionSpec(POINTS) if conditions.shape else PartitionSpec()

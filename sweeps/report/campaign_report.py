@@ -49,7 +49,7 @@ def campaign_document(file: RobotFile, layout: Layout, result: Json, store: Path
 
 def _sections(store: Path, layout: Layout, extremes: Json) -> Iterable[Section]:
     values, points = sample_points(store, layout)
-    yield Section("What varies", (_varied(layout, values),), "varied")
+    yield Section("What varies", (_varied_rows(layout, values),), "varied")
     if VERDICT in points:
         codes, design = points[VERDICT].astype(int), layout.design
         meanings = next(v.attributes for v in layout.variables if v.name == VERDICT)["flag_meanings"].split()
@@ -60,7 +60,7 @@ def _sections(store: Path, layout: Layout, extremes: Json) -> Iterable[Section]:
         yield Section(
             "How the climbs ended",
             (
-                Note(_largest(values, points, layout), "answer", "largest"),
+                Note(_largest_obstacle(values, points, layout), "answer", "largest"),
                 catalogue.table("campaign.endings", rows),
                 *figures,
             ),
@@ -92,7 +92,7 @@ def _outputs(values: np.ndarray, found: Columns, layout: Layout, extremes: Json)
     yield from figures
 
 
-def _largest(values: np.ndarray, found: Columns, layout: Layout) -> str:
+def _largest_obstacle(values: np.ndarray, found: Columns, layout: Layout) -> str:
     """Largest obstacle climbed and its first point, in words."""
     names = layout.design.names
     sizes = found[LARGEST] if LARGEST in found else values[:, names.index(SIZE)] * (found[VERDICT] == OVER)
@@ -130,7 +130,7 @@ def sample_points(store: Path, layout: Layout) -> tuple[np.ndarray, Columns]:
     return np.concatenate(values), {name: np.concatenate(parts) for name, parts in values_by_name.items()}
 
 
-def _varied(layout: Layout, values: np.ndarray) -> Table:
+def _varied_rows(layout: Layout, values: np.ndarray) -> Table:
     """Varied names, in words, a row each."""
     rows = []
     for k, name in enumerate(layout.design.names):

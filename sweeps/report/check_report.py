@@ -48,7 +48,7 @@ class CheckResult:
 
     def statement(self) -> str:
         """The answer: how many requirements are met, and those missed by most in percent of their limits."""
-        number, missed = len(self.outcomes), sorted(self.missed, key=_share)
+        number, missed = len(self.outcomes), sorted(self.missed, key=_margin_share)
         if not missed:
             return f"All {number} requirements are met." if number > 1 else "The requirement is met."
         verb = "is" if len(missed) == 1 else "are"
@@ -68,7 +68,7 @@ class CheckResult:
         }
 
 
-def _share(outcome: Outcome) -> float:
+def _margin_share(outcome: Outcome) -> float:
     """Margin as a share of the limit [-]. The least for a requirement without a value."""
     return -math.inf if outcome.margin is None else outcome.margin / max(abs(requirement_limit(outcome)), 1e-12)
 

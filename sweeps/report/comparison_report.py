@@ -135,7 +135,7 @@ def comparison_document(found: Comparison) -> Document:
             if np.isfinite(e := found.table[f"error_{c.name}_percent"]).any()
         ),
     )
-    errors = catalogue.figure("comparison.errors", *table, True, found.over, finding=_trend(found))
+    errors = catalogue.figure("comparison.errors", *table, True, found.over, finding=_strongest_trend(found))
     status = found.table["status"]
     return Document(
         f"{found.robot_name} against {found.source}",
@@ -190,7 +190,7 @@ def comparison_answer(found: Comparison) -> str:
     rows, worst = max(e["rows"] for _, e in each), max(e["max_percent"] for _, e in each)
     what = f"{rows} of {total} rows" if rows < total else count_noun(total, "row")
     if found.over is not None:
-        what = f"{_seconds(found):.3g} s of log"
+        what = f"{_log_duration(found):.3g} s of log"
     sentence = f"{what}: rms error {errors} (worst reading {worst:.1f} %). {_FITS[found.fit]}".rstrip()
     return sentence if not found.against else f"{sentence} {_second_robot(found)}"
 
@@ -213,7 +213,7 @@ def _both_robots(found: Comparison) -> Table:
     return catalogue.table("comparison.robots", rows, *both)
 
 
-def _seconds(found: Comparison) -> float:
+def _log_duration(found: Comparison) -> float:
     """Duration of all histories of a log [s]."""
     time = found.table["time_s"]
     runs = found.table.get("run_id", np.zeros(len(time)))
@@ -250,7 +250,7 @@ def _status(status: str) -> Cell:
     return Cell(words.short_status(status), "" if status in words.SETTLED else "slides")
 
 
-def _trend(found: Comparison) -> str:
+def _strongest_trend(found: Comparison) -> str:
     """The channel and condition whose errors correlate most."""
     best, size = "No error changes with a condition", 0.0
     headings = {column: heading for column, (heading, _) in condition_formats(found.table).items()} | dict(

@@ -42,7 +42,7 @@ def loop_document(found: DiscoveryResult, robot_name: str, changes: Mapping[str,
         changes: changes of settled runs by each effect.
     """
     missing, table = found.verdict not in ("none", "undescribed"), rows_of(found)
-    moved, added = list(moved_parameters(found)), list(_findings(found, changes))
+    moved, added = list(moved_parameters(found)), list(_effect_findings(found, changes))
     rise = loop_words.rising_errors_sentence(found.held_out_worse, found.predicted)
     return Document(
         f"Is the {words.words_shown(Path(robot_name).name)} model complete?",
@@ -94,7 +94,7 @@ def _rows_are(found: DiscoveryResult) -> str:
     return "samples" if isinstance(found.detail, TimeStatistics) else "runs"
 
 
-def _findings(found: DiscoveryResult, changes: Mapping[str, Change]) -> Iterable[str]:
+def _effect_findings(found: DiscoveryResult, changes: Mapping[str, Change]) -> Iterable[str]:
     """Each effect of the model: what it is, how large, how sure, what else it could be."""
     for e in found.effects:
         size, other = loop_words.effect_amplitude(e), loop_words.indistinguishable_effects(found, e)
@@ -123,7 +123,7 @@ def moved_parameters(found: DiscoveryResult) -> Iterable[str]:
             yield loop_words.moved_parameter(name, value, stated.prior, stated.unit, shift)
 
 
-def _marked(text: str, change: float) -> Cell:
+def _arrow_cell(text: str, change: float) -> Cell:
     """A cell of errors with an arrow where they change."""
     if not abs(change) >= NOTABLE:
         return Cell(text)
@@ -147,7 +147,7 @@ def _summary(found: DiscoveryResult) -> Table:
             other = f" ({loop_words.percent_text(held[c])} %)" if c in held and held[c]["rows"] else ""
             last, rows_before = before.get(c, (e["rms_percent"], e["rows"]))
             change = e["rms_percent"] - last if rows_before == e["rows"] else 0.0
-            cells.append(_marked(f"{loop_words.percent_text(e)} %{other}", change) if e["rows"] else Cell("-"))
+            cells.append(_arrow_cell(f"{loop_words.percent_text(e)} %{other}", change) if e["rows"] else Cell("-"))
         before = {c: (float(e["rms_percent"]), int(e["rows"])) for c, e in seen.items()}
         reached, also = (max((int(e["rows"]) for e in by.values()), default=0) for by in (seen, held))
         rows.append((what, *cells, f"{reached}/{total}" + (f" ({also}/{total})" if also else "")))
@@ -166,7 +166,7 @@ def held_out_table(found: DiscoveryResult) -> Table:
             texts = [loop_words.percent_text(e[c]) for e in both[: 1 + many]]
             change = both[1][c]["rms_percent"] - both[0][c]["rms_percent"] if many else 0.0
             change_shown = np.inf if c in worse else change if not kind or change < 0 else 0.0
-            cells.append(_marked(" → ".join(texts), change_shown))
+            cells.append(_arrow_cell(" → ".join(texts), change_shown))
         reached = max(int(e["rows"]) for e in both[0].values())
         what = f"unseen: another {blocks.kind_in_words(kind)}" if kind else "seen by the fit"
         rows.append((what, *cells, f"{reached} of {total}"))
@@ -216,7 +216,7 @@ def _advice(found: DiscoveryResult) -> Table:
     return catalogue.table("loop.advice", rows)
 
 
-def _effects(found: DiscoveryResult) -> Iterable[Block]:
+def _effects_in_words(found: DiscoveryResult) -> Iterable[Block]:
     """What was found, effects and a discrepancy without a name."""
     rows = []
     for e in found.to_json()["effects"]:
@@ -288,7 +288,7 @@ def _resolved(found: DiscoveryResult) -> Section:
     return Section("What the track model says", (table, catalogue.note("loop.resolved-errors", rms, trade)))
 
 
-def _certain(found: DiscoveryResult, missing: bool) -> Iterable[Section]:
+def _certainty_sections(found: DiscoveryResult, missing: bool) -> Iterable[Section]:
     """Sections on the certainty of the answer and its limits."""
     reasons = {"standing": loop_words.support_sentence(found), "ruled_out": loop_words.ruled_out(found)}
     also = [loop_words.hidden_effects_sentence(found)] if found.hidden else []
@@ -303,7 +303,7 @@ def _certain(found: DiscoveryResult, missing: bool) -> Iterable[Section]:
         *(Note(text, name=name, terminal=True) for name, text in reasons.items() if text),
         *remarks(also, "also"),
         *([catalogue.note("loop.of-a-shaft")] if not found.robot.has_ground and found.effects else []),
-        *_effects(found),
+        *_effects_in_words(found),
         _certainty(found, missing),
     ]
     yield Section("How certain the verdict is", tuple(blocks))
@@ -319,7 +319,7 @@ def _sections(
     yield Section("Measured and simulated, run by run", tuple(_run_by_run(found, table, changes)))
     yield from [] if missing else [looked_for]
     where = "Where the missing term acts" if missing else "What each equation lacks"
-    yield Section(where, tuple(_where_missing(found, table, changes)))
+    yield Section(where, tuple(_blocks_of_missing_terms(found, table, changes)))
     yield from fit_tables.clusters_section(found.residual_clusters)
     errors = catalogue.figure("loop.errors-figure", found, words=(OF_SIZE,))
     fits = {when: by for when, by in found.rms.items() if not (found.refit_alone and "after" in when)}
@@ -328,7 +328,7 @@ def _sections(
     seen: list[Block] = [errors, held_out_table(found), catalogue.note("loop.fitted_again"), *in_units]
     seen += [catalogue.figure("loop.gains", found)] if len(found.gains) > 1 else []
     yield Section("Errors on runs used in the fit, and on held-out runs", tuple(seen))
-    yield from _certain(found, missing)
+    yield from _certainty_sections(found, missing)
     yield Section("Candidates", tuple(_candidates(found)))
     hidden = catalogue.figure("loop.null", found.before), catalogue.figure("loop.look_alikes", found)
     yield Section("", hidden, folded="how thresholds were determined, and which effects are similar")
@@ -352,7 +352,9 @@ def _run_by_run(found: DiscoveryResult, table: Columns, changes: Mapping[str, Ch
         yield catalogue.figure("loop.before_after", table, found.channels, verdict, words=("",))
 
 
-def _where_missing(found: DiscoveryResult, table: Columns, changes: Mapping[str, Change]) -> Iterable[Block]:
+def _blocks_of_missing_terms(
+    found: DiscoveryResult, table: Columns, changes: Mapping[str, Change]
+) -> Iterable[Block]:
     verdict, sized = "none" if found.refit_alone else found.verdict, Layout.of(found.robot).crosses_zero
     if len(changes) > 1:
         yield catalogue.figure("loop.laws", found, table, changes)
@@ -366,7 +368,9 @@ def _where_missing(found: DiscoveryResult, table: Columns, changes: Mapping[str,
     else:
         figure_input = table, verdict, sized
         yield catalogue.figure(
-            "loop.defects", *figure_input, words=(_closed(found, table) if sized else catalogue.text("loop.three"),)
+            "loop.defects",
+            *figure_input,
+            words=(_closed(found, table) if sized else catalogue.text("loop.three"),),
         )
     if found.unnamed is not None:
         if changes or isinstance(detail, TimeStatistics):  # else it is the first figure

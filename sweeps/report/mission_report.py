@@ -109,7 +109,7 @@ def missions_document(file: RobotFile, found: Missions) -> Document:
         (
             run_tables.lead_note(file, more=detail),
             Note(lead, terminal=True),
-            *remarks(_exceeded(found), "flags"),
+            *remarks(_exceeded_limits(found), "flags"),
             runs,
             *([] if whole else [endings]),
             *remarks(_charge_left(table)),
@@ -202,7 +202,7 @@ def mission_limits(robot: Robot, run: Json) -> list[Json]:
     return used
 
 
-def _exceeded(found: Missions) -> Iterable[str]:
+def _exceeded_limits(found: Missions) -> Iterable[str]:
     """Limits that were exceeded, in words, and in how many runs and segments."""
     raised = [str(f).split(";") for f in found.segments["flags"]]
     runs = [str(f).split(";") for f in found.table["flags"]]
@@ -242,7 +242,7 @@ def _segments(found: Missions, name: str, idle: set[str]) -> Table:
         shares = [100 * float(np.sum(segment_rows["energy_Wh"])) / whole if whole > 0 else None] if many else []
         answer.append(
             (
-                f"{k + 1}: {begin:g} to {end:g} s", source.modes[k].replace("_", " "), _demand(found, k),
+                f"{k + 1}: {begin:g} to {end:g} s", source.modes[k].replace("_", " "), _demand_in_words(found, k),
                 *(segment_rows[c][0] for c in shown_columns), *sums, *shares,
                 ", ".join(f"{s} ({n})" if many else s for s, n in ends.items()),
                 ", ".join(words.FLAGS[f] for f in flags) or "none",
@@ -256,7 +256,7 @@ def _segments(found: Missions, name: str, idle: set[str]) -> Table:
     return catalogue.table("mission.segments", answer, *heads)
 
 
-def _demand(found: Missions, k: int) -> str:
+def _demand_in_words(found: Missions, k: int) -> str:
     """Demand of the profile in a segment, in words."""
     source = found.source
     last = k + 1 if source.linear else k

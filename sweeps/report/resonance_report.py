@@ -112,7 +112,7 @@ class ResonanceResult:
             edges = np.concatenate([x[:1], (x[1:] + x[:-1]) / 2, x[-1:]])
             bad = self.table["status"][rows] != "converged"
             ranges += [(edges[k], edges[k + 1]) for k in np.flatnonzero(bad)]
-        return _merged(ranges)
+        return _merge_ranges(ranges)
 
     @property
     def travel(self) -> np.ndarray:
@@ -128,7 +128,7 @@ class ResonanceResult:
         """Ranges of speed without peaks to avoid, at any payload, where every run settles [m/s]."""
         low, high = self.speeds
         gaps = []
-        for begin, end in _merged([*((a, b) for a, b, _ in self.avoid), *self.restless]):
+        for begin, end in _merge_ranges([*((a, b) for a, b, _ in self.avoid), *self.restless]):
             if begin > low:
                 gaps.append((low, min(begin, high)))
             low = max(low, end)
@@ -263,7 +263,7 @@ class ResonanceResult:
         }  # fmt: skip
 
 
-def _merged(ranges: Iterable[tuple[float, float]]) -> list[tuple[float, float]]:
+def _merge_ranges(ranges: Iterable[tuple[float, float]]) -> list[tuple[float, float]]:
     """Ranges as few that do not overlap, lowest first."""
     merged: list[tuple[float, float]] = []
     for low, high in sorted(ranges):

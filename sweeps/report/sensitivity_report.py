@@ -54,7 +54,7 @@ def _sections(found: SensitivityResult) -> Iterable[Section]:
     yield Section("Output by output", (catalogue.note("sensitivity.legend"),), "outputs")
     for k, (name, study) in enumerate(found.outputs.items()):
         yield Section(study.row.label.capitalize(), (Note(_sentence(study, found)),), name, level=3)
-        if bool(study.studied.any()) and bool(np.isfinite(study.value).any()) and _decided(study):
+        if bool(study.studied.any()) and bool(np.isfinite(study.value).any()) and _any_influence(study):
             folded = "tornado, shares, where" if k >= UNFOLDED else ""
             yield Section("", tuple(_output(name, study, found)), folded=folded)
     if found.next_runs is not None:
@@ -65,7 +65,7 @@ def _sections(found: SensitivityResult) -> Iterable[Section]:
         yield Section("Convergence", (figure,), "convergence-of-indices")
 
 
-def _decided(study: OutputStudy) -> bool:
+def _any_influence(study: OutputStudy) -> bool:
     """True if any input changes an output."""
     return bool(study.overall_share.max(initial=0.0) > 0)
 
@@ -90,7 +90,7 @@ def _output(name: str, study: OutputStudy, found: SensitivityResult) -> Iterable
 def _sentence(study: OutputStudy, found: SensitivityResult) -> str:
     """Sentence on the inputs that decide an output, with its spread."""
     share, row = study.overall_share, study.row
-    if not _decided(study):
+    if not _any_influence(study):
         return "No value at any of these operating points, or no input changes it."
     order = np.argsort(-share, kind="stable")[:3]
     top = [k for k in order if share[k] >= NEGLIGIBLE] or order[:1]
@@ -142,12 +142,12 @@ def _next_runs(found: SensitivityResult, n: NextRuns) -> Iterable[Block]:
         if np.isfinite(sds).all() and sds[0] > 0:
             unit = "" if row.unit_shown == "-" else f" {row.unit_shown}"
             ends = sds[0] / row.factor, sds[-1] / row.factor
-            left.append((row.label, *(f"±{_two(sd)}{unit}" for sd in ends), 100 * ends[1] / ends[0]))
+            left.append((row.label, *(f"±{_two_digits(sd)}{unit}" for sd in ends), 100 * ends[1] / ends[0]))
     yield catalogue.table("sensitivity.left", left)
     yield catalogue.note("sensitivity.first-order")
 
 
-def _two(sd: float) -> str:
+def _two_digits(sd: float) -> str:
     """Two digits of an sd, without an exponent."""
     return f"{sd:.{int(np.clip(1 - np.floor(np.log10(sd)), 0, 6))}f}"
 

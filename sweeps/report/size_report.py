@@ -168,11 +168,11 @@ def _limits(found: SizeResult, robot_name: str) -> tuple[Figure, ...]:
     best = found.sizing.best
     names = [] if best is None else [f"best: {best.drive.motor.name}, ratio {best.ratio:.4g}"]
     charts = dict(zip([*names, f"as it is: {robot_name}"], found.charts, strict=True))
-    alternative = "; ".join(f"{name}: {_reach(c)}" for name, c in charts.items())
+    alternative = "; ".join(f"{name}: {_share_within_limits(c)}" for name, c in charts.items())
     return (catalogue.figure("size.limits", found, charts, finding=alternative),)
 
 
-def _reach(c: Chart) -> str:
+def _share_within_limits(c: Chart) -> str:
     """The share of a chart within all limits, and the limit that is most often nearest."""
     (most, _), *_ = Counter(c.nearest.ravel().tolist()).most_common(1)
     within = f"{100 * np.mean(c.margin >= 0):.0f} % of payloads up to {c.payload[-1]:.3g} kg and slopes up to "

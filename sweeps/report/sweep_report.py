@@ -24,7 +24,7 @@ def sweep_document(file: RobotFile, model: str, runs: Columns, notes: Sequence[s
     statuses = Counter(map(str, runs["status"]))
     statuses_known = [*words.STATUSES, *(statuses.keys() - words.STATUSES.keys())]
     over = {s: int(((runs["status"] == s) & (runs["flags"] != "")).sum()) for s in statuses_known}
-    where = {s: "" if s in words.SETTLED else _where(runs, runs["status"] == s) for s in statuses_known}
+    where = {s: "" if s in words.SETTLED else _ranges_of_runs(runs, runs["status"] == s) for s in statuses_known}
     maps = []
     for c in file.robot.channels:
         labels = c.label.capitalize(), c.unit
@@ -70,7 +70,7 @@ def _limits(runs: Columns) -> Table:
     for flag, meaning in words.FLAGS.items():
         over = np.array([flag in str(f).split(";") for f in kinds])[which]
         if over.any():
-            rows.append((f"{meaning} (`{flag}`)", int(over.sum()), _where(runs, over)))
+            rows.append((f"{meaning} (`{flag}`)", int(over.sum()), _ranges_of_runs(runs, over)))
     return catalogue.table("sweep.limits", rows)
 
 
@@ -92,7 +92,7 @@ def _levels(runs: Columns, name: str, pick: np.ndarray | slice = slice(None), mo
     return f"{column.heading} {', '.join(f'{v:.4g}' for v in levels)}{unit}"
 
 
-def _where(runs: Columns, pick: np.ndarray) -> str:
+def _ranges_of_runs(runs: Columns, pick: np.ndarray) -> str:
     """Ranges of slope and imposed quantity of the picked runs, by configuration, in words."""
     parts = []
     for kind in dict.fromkeys(map(str, runs["configuration"][pick])):

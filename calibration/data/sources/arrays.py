@@ -83,7 +83,7 @@ def of_matlab(path: Path, name: str) -> tuple[Signal, ...]:
     plain = {"double", "single", "logical", "char", *(f"{sign}int{n}" for sign in ("", "u") for n in (8, 16, 32, 64))}
     for variable, shape, kind in io.whosmat(path):
         if kind == "struct":
-            for field, value in _fields(variable, loaded()[variable]):
+            for field, value in _structure_fields(variable, loaded()[variable]):
                 arrays[field] = (value.shape, value.dtype, values_in_memory(value))
         else:
             dtype = np.dtype(float) if kind in plain - {"char"} else np.dtype(str) if kind == "char" else _OBJECTS
@@ -115,7 +115,7 @@ def _variable(loaded: Callable[[], Columns], name: str) -> Load:
     return lambda: loaded()[name]
 
 
-def _fields(path: str, value: np.ndarray) -> list[tuple[str, np.ndarray]]:
+def _structure_fields(path: str, value: np.ndarray) -> list[tuple[str, np.ndarray]]:
     """Arrays of a structure by path. Of an array of structures each has its index."""
     if value.dtype.names is None:
         return [(path, value)]
@@ -123,7 +123,7 @@ def _fields(path: str, value: np.ndarray) -> list[tuple[str, np.ndarray]]:
     for k, each in enumerate(np.ravel(value)):
         place = path if value.size == 1 else f"{path}[{k}]"
         for field in value.dtype.names:
-            fields += _fields(f"{place}.{field}", np.asarray(each[field]))
+            fields += _structure_fields(f"{place}.{field}", np.asarray(each[field]))
     return fields
 
 
@@ -139,7 +139,7 @@ def of_hdf5(path: Path, name: str) -> tuple[Signal, ...]:
     units: dict[str, str] = {}
     with h5py.File(path, "r") as file:
         matlab = any("MATLAB_class" in file[key].attrs for key in file if _inside(file, key, name))
-        _walk(file, "", name, arrays, units, path, matlab, h5py, set())
+        _add_group(file, "", name, arrays, units, path, matlab, h5py, set())
     return of_arrays(name, arrays, units)
 
 
@@ -155,7 +155,7 @@ def _inside(group: Any, key: str, name: str) -> bool:
     return not isinstance(link, h5py.SoftLink) and not key.startswith("#")
 
 
-def _walk(
+def _add_group(
     group: Any,
     at: str,
     name: str,
@@ -176,7 +176,7 @@ def _walk(
             continue
         item, here = group[key], f"{at}/{key}"
         if isinstance(item, h5py.Group):
-            _walk(item, here, name, arrays, units, path, matlab, h5py, seen)
+            _add_group(item, here, name, arrays, units, path, matlab, h5py, seen)
             continue
         if not isinstance(item, h5py.Dataset) or item.shape is None:
             continue

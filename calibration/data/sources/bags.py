@@ -63,19 +63,27 @@ def of_bag(path: Path, name: str) -> tuple[Signal, ...]:
                 )
                 continue
             first = _first(reader, topic)
-            stamped = any(field == _STAMP for field, _, _ in _fields(first, ""))
-            read = functools.cache(functools.partial(_topic, path, topic))
+            stamped = any(field == _STAMP for field, _, _ in _message_fields(first, ""))
+            read = functools.cache(functools.partial(_topic_values, path, topic))
             clock = Clock(f"{topic}.{_STAMP}" if stamped else f"{topic} (recorded)", _column(read, ""), "ns")
-            for field, words, refused in _fields(first, ""):
+            for field, words, refused in _message_fields(first, ""):
                 if field != _STAMP:
                     place = f"{topic}.{field}"
                     signals.append(
-                        Signal(place, count, _column(read, field), _unit(kind, field), clock, words, refused)
+                        Signal(
+                            place,
+                            count,
+                            _column(read, field),
+                            _field_unit(kind, field),
+                            clock,
+                            words,
+                            refused,
+                        )
                     )
     return tuple(signals)
 
 
-def _unit(kind: str, field: str) -> str:
+def _field_unit(kind: str, field: str) -> str:
     """Unit of a field by its type of message, empty if the type states none."""
     units = UNITS.get(kind, {})
     return next((unit for start, unit in units.items() if field.startswith(start)), "")
@@ -104,7 +112,7 @@ def _column(read: Callable[[], Columns], field: str) -> Load:
     return lambda: read()[field]
 
 
-def _topic(path: Path, topic: str) -> Columns:
+def _topic_values(path: Path, topic: str) -> Columns:
     """Values of every field of a topic, and under "" its time [ns]."""
     rows: list[tuple[Any, ...]] = []
     recorded: list[int] = []
@@ -133,7 +141,7 @@ def _topic(path: Path, topic: str) -> Columns:
     return columns | {"": stamps}
 
 
-def _fields(message: Any, at: str) -> Iterator[tuple[str, bool, str]]:
+def _message_fields(message: Any, at: str) -> Iterator[tuple[str, bool, str]]:
     """Path of each field, True for words, and the reason if it cannot be read."""
     for field, value in _values(message, at):
         yield field, isinstance(value, str), ""

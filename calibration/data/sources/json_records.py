@@ -75,7 +75,7 @@ def of_content(content: Any, name: str) -> tuple[Signal, ...]:
     """
     arrays: Json = {}
     _collect(content, "", arrays, name, 1)
-    arrays = _stacked({path: values for path, values in arrays.items() if values.size})
+    arrays = _join_tables({path: values for path, values in arrays.items() if values.size})
     if not arrays:
         raise BadData(
             f"{name}: holds no list of records and no arrays; expected "
@@ -88,7 +88,7 @@ def _collect(value: Any, at: str, arrays: Columns, name: str, depth: int) -> Non
     if depth > DEEPEST:
         raise BadData(f"{name}, {at}: is nested too deeply; expected at most {DEEPEST} levels")
     if isinstance(value, Mapping):
-        value = _unfolded(value)
+        value = _unfold_pandas_dict(value)
         if isinstance(value, list):
             arrays[at or "values"] = _array(value)
             return
@@ -97,7 +97,7 @@ def _collect(value: Any, at: str, arrays: Columns, name: str, depth: int) -> Non
         _add_time(value, at, arrays)
     elif isinstance(value, Sequence) and not isinstance(value, str | bytes):
         if value and all(isinstance(each, Mapping) for each in value):
-            _records(value, at, arrays, name)
+            _columns_of_records(value, at, arrays, name)
         elif value:
             arrays[at or "values"] = _array(value)
     elif hasattr(value, "__array__"):
@@ -120,7 +120,7 @@ def _add_time(value: Mapping[str, Any], at: str, arrays: Columns) -> None:
             arrays[f"{below}time_s"] = (np.arange(len(runs)) - first) * steps[0]
 
 
-def _unfolded(value: Mapping[str, Any]) -> Mapping[str, Any] | list[Any]:
+def _unfold_pandas_dict(value: Mapping[str, Any]) -> Mapping[str, Any] | list[Any]:
     """A dict as pandas writes it, as arrays by name: a column by the numbers of its rows, or names next to rows."""
     cells = [inner for inner in value.values() if isinstance(inner, str) or not isinstance(inner, Mapping | Sequence)]
     if value and len(cells) == len(value) and all(isinstance(key, str) and key.isdigit() for key in value):
@@ -133,9 +133,9 @@ def _unfolded(value: Mapping[str, Any]) -> Mapping[str, Any] | list[Any]:
     return dict(zip(map(str, names), map(list, zip(*rows, strict=True)), strict=True))
 
 
-def _records(records: Sequence[Mapping[str, Any]], at: str, arrays: Columns, name: str) -> None:
+def _columns_of_records(records: Sequence[Mapping[str, Any]], at: str, arrays: Columns, name: str) -> None:
     """Columns of records. A missing entry is a missing reading."""
-    if (episodes := _episodes(records)) is not None:
+    if (episodes := _columns_of_episodes(records)) is not None:
         arrays.update({f"{at}.{key}" if at else key: values for key, values in episodes.items()})
         return
     columns: dict[str, list[Any]] = {}
@@ -150,7 +150,7 @@ def _records(records: Sequence[Mapping[str, Any]], at: str, arrays: Columns, nam
         arrays[f"{at}.{key}" if at else key] = _array(values)
 
 
-def _episodes(records: Sequence[Mapping[str, Any]]) -> Columns | None:
+def _columns_of_episodes(records: Sequence[Mapping[str, Any]]) -> Columns | None:
     """Columns of records that each hold lists of numbers of one length, a run each, None for other records.
 
     A text that differs in every record names the runs, else their number does.
@@ -196,7 +196,7 @@ def _array(values: Sequence[Any]) -> np.ndarray:
     return array if array.dtype.kind in "biufUS" else array.astype(object)
 
 
-def _stacked(arrays: Columns) -> Columns:
+def _join_tables(arrays: Columns) -> Columns:
     """Joins tables with the same columns, one under each key, into one table with the key as `RUN`.
 
     A file of WPILib SysId has such tables: «slow-forward», «fast-backward», ... are lists of rows.

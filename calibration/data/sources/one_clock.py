@@ -114,7 +114,7 @@ def on_one_grid(
         raise BadData(f"{name}, {str(error).removeprefix(f'{name}, ')}") from error
     begin = min(elapsed.first for elapsed in read.values())
     times = {key: elapsed.time + (elapsed.first - begin) for key, elapsed in read.items()}
-    order = {key: _order(time) for key, time in times.items()}
+    order = {key: _sample_order(time) for key, time in times.items()}
     late = {key: int(np.count_nonzero(np.diff(times[key]) < 0)) for key, rows in order.items() if rows is not None}
     times = {key: time if order[key] is None else time[order[key]] for key, time in times.items()}
     same = {key: next(k for k in times if np.array_equal(times[k], time)) for key, time in times.items()}
@@ -200,7 +200,7 @@ def used_once(rows: np.ndarray, time: np.ndarray, values: np.ndarray) -> np.ndar
     return resampled
 
 
-def _order(time: np.ndarray) -> np.ndarray | None:
+def _sample_order(time: np.ndarray) -> np.ndarray | None:
     """Order of samples by their stamps if some were recorded slightly late, None if they are in order, or if the
     clock was set back."""
     step = np.diff(time)

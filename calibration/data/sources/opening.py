@@ -171,7 +171,7 @@ def open_signals(path: Path, within: str, name: str, form: Format) -> Source:
     signals = tuple(form.signals(path, name))
     if not signals:
         raise BadData(f"{name}: is {form.kind} without signals; expected at least one column or array")
-    held = sum(file.stat().st_size for file in _files(path))
+    held = sum(file.stat().st_size for file in _files_of_folder(path))
     source = checked_source(name, form.kind, signals, held, source_digest(path))
     return source.below(within) if within else source
 
@@ -204,10 +204,10 @@ def checked_source(
     count = collections.Counter(signal.path for signal in signals)
     why = "has the same name as another signal; expected different names"
     signals = [s if count[s.path] == 1 else dataclasses.replace(s, refused=why) for s in signals]
-    return Source(name, kind, _guarded(signals, name, kind), digest)
+    return Source(name, kind, _guarded_signals(signals, name, kind), digest)
 
 
-def _guarded(signals: Sequence[Signal], name: str, kind: str) -> tuple[Signal, ...]:
+def _guarded_signals(signals: Sequence[Signal], name: str, kind: str) -> tuple[Signal, ...]:
     """Signals that raise `BadData` if they are refused, too large for the memory, or if their library cannot read
     their values. Shared clocks stay shared."""
 
@@ -251,13 +251,13 @@ def _guarded(signals: Sequence[Signal], name: str, kind: str) -> tuple[Signal, .
 def source_digest(path: Path) -> str:
     """SHA-256 of a file, or of the files of a folder in the order of their names."""
     digest = hashlib.sha256()
-    for file in _files(path):
+    for file in _files_of_folder(path):
         with file.open("rb") as stream:
             while block := stream.read(2**20):
                 digest.update(block)
     return digest.hexdigest()
 
 
-def _files(path: Path) -> list[Path]:
+def _files_of_folder(path: Path) -> list[Path]:
     """Files of a folder in the order of their names, or the file itself."""
     return [file for file in sorted(path.iterdir()) if file.is_file()] if path.is_dir() else [path]

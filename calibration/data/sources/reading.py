@@ -130,7 +130,7 @@ def read_whole_table(path: Path, within: str = "") -> NamedArrays | None:
     values = _in_rows(source, signals)
     units = tuple(quantities.unit_in_column(signal.unit) for signal in signals.values())
     return NamedArrays(
-        name, tuple(values), tuple(map(_raw, values.values())), units, "the source", digest=source.digest
+        name, tuple(values), tuple(map(_raw_values, values.values())), units, "the source", digest=source.digest
     )
 
 
@@ -157,7 +157,7 @@ def _of_table(arrays: NamedArrays, layout: Layout, columns: Preset | None) -> Re
     columns.check_needed(mapped, layout.imposed_column, arrays.name)
     notes = (*arrays.notes, *notes, *weakened_field_notes(columns, by_name))
     read = map(columns.column_of, arrays.header)
-    values = tuple(map(_decoded, read, arrays.values))
+    values = tuple(map(_decode_raw_numbers, read, arrays.values))
     return Reading(
         dataclasses.replace(arrays, values=values, notes=notes), presets_file.merge_columns(mapped, layout.mapped)
     )
@@ -207,7 +207,7 @@ def _of_signals(source: Source, layout: Layout, columns: Preset | None, between:
     if columns is not None:
         columns.check_needed(mapped, layout.imposed_column, source.name)
     mapped = presets_file.merge_columns(mapped, layout.mapped)
-    chosen, clock, missing = _chosen(source, mapped, layout)
+    chosen, clock, missing = _chosen_signals(source, mapped, layout)
     for column, signal in chosen.items():
         if signal.refused:
             raise BadData(
@@ -215,7 +215,7 @@ def _of_signals(source: Source, layout: Layout, columns: Preset | None, between:
                 + ("" if column == signal.path else f" (read as {column})")
             )
     timed = [s for s in chosen.values() if s.clock is not None]
-    extras = _extras(source, chosen, timed)
+    extras = _extra_columns(source, chosen, timed)
     size = input_files.VALUE * sum(s.length for s in (*chosen.values(), *extras.values()))
     input_files.check_memory(source.name, size)
     if columns is not None:
@@ -233,7 +233,7 @@ def _of_signals(source: Source, layout: Layout, columns: Preset | None, between:
     arrays = NamedArrays(
         source.name,
         tuple(values),
-        tuple(map(_raw, values.values())),
+        tuple(map(_raw_values, values.values())),
         units,
         "the source",
         (*source.notes, *more, *notes, *missing),
@@ -242,7 +242,7 @@ def _of_signals(source: Source, layout: Layout, columns: Preset | None, between:
     return Reading(arrays, mapped)
 
 
-def _chosen(source: Source, mapped: Mapped, layout: Layout) -> tuple[dict[str, Signal], str, Names]:
+def _chosen_signals(source: Source, mapped: Mapped, layout: Layout) -> tuple[dict[str, Signal], str, Names]:
     """Signals by the name of their column, the clock stated as the grid, and notes on missing signals.
 
     A signal has a column if a table of columns names it, or if the last part of its path is a column's name.
@@ -269,7 +269,7 @@ def _chosen(source: Source, mapped: Mapped, layout: Layout) -> tuple[dict[str, S
     return chosen, clock, tuple(missing)
 
 
-def _decoded(column: PresetColumn, raw: Raw) -> Raw:
+def _decode_raw_numbers(column: PresetColumn, raw: Raw) -> Raw:
     """Raw numbers as signed numbers that count from zero. Cells without a number stay as they are."""
     if not (column.sign_bit or column.zero):
         return raw
@@ -282,10 +282,10 @@ def _decoded(column: PresetColumn, raw: Raw) -> Raw:
 
 def _decoded_signal(column: PresetColumn, signal: Signal) -> Signal:
     """A signal whose values are decoded before they are interpolated."""
-    return dataclasses.replace(signal, load=lambda: np.asarray(_decoded(column, signal.load())))
+    return dataclasses.replace(signal, load=lambda: np.asarray(_decode_raw_numbers(column, signal.load())))
 
 
-def _extras(source: Source, chosen: Mapping[str, Signal], own: Sequence[Signal]) -> dict[str, Signal]:
+def _extra_columns(source: Source, chosen: Mapping[str, Signal], own: Sequence[Signal]) -> dict[str, Signal]:
     """Further columns of a table, as long as the chosen ones, if there are few values."""
     taken = {id(signal) for signal in chosen.values()}
     longest = max((s.length for s in source.signals), default=0)
@@ -345,7 +345,7 @@ def _how_to_name(source: Source) -> str:
     )
 
 
-def _raw(values: np.ndarray) -> Raw:
+def _raw_values(values: np.ndarray) -> Raw:
     """Values in the form for the checks of a table: numbers as an array, words and dates as a list."""
     if values.dtype.kind in "US":
         return [str(value).strip() for value in values.tolist()]

@@ -61,7 +61,7 @@ def of_workbook(path: Path, name: str) -> tuple[Signal, ...]:
 
 def _cell_count(content: bytes) -> int:
     """Number of cells of the rectangle that a sheet's XML declares. Calamine allocates it whole."""
-    places = [(_letters(a), int(b)) for a, b in re.findall(rb'\br="([A-Z]{1,3})(\d{1,7})"', content)]  # of .xlsx
+    places = [(_column_no(a), int(b)) for a, b in re.findall(rb'\br="([A-Z]{1,3})(\d{1,7})"', content)]  # of .xlsx
     wide, tall = (max(numbers, default=0) for numbers in zip(*places, strict=True)) if places else (0, 0)
     if b"number-columns-repeated" in content or b"number-rows-repeated" in content:  # of .ods
         for row in re.findall(rb"<table:table-row.*?</table:table-row>", content, re.DOTALL):
@@ -73,7 +73,7 @@ def _cell_count(content: bytes) -> int:
     return wide * tall
 
 
-def _letters(column: bytes) -> int:
+def _column_no(column: bytes) -> int:
     """Number of a column of a sheet from 1, by its letters."""
     number = 0
     for letter in column:

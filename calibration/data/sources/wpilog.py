@@ -79,7 +79,7 @@ def of_wpilog(path: Path, name: str) -> tuple[Signal, ...]:
             )
         payload, place = content[begin : begin + size], begin + size
         if entry == 0 and payload[:1] == bytes([START]):
-            number, (title, kind) = int.from_bytes(payload[1:5], "little"), _texts(payload[5:])
+            number, (title, kind) = int.from_bytes(payload[1:5], "little"), _name_and_type(payload[5:])
             entries[number] = _Entry(title, kind)
         elif entry in entries and (width := np.dtype(NUMBERS.get(entries[entry].kind, "V0")).itemsize) in (0, size):
             entries[entry].stamps.append(stamp)
@@ -88,7 +88,7 @@ def of_wpilog(path: Path, name: str) -> tuple[Signal, ...]:
     return tuple(entry.signal(clocks) for entry in entries.values() if entry.stamps)
 
 
-def _texts(payload: bytes) -> tuple[str, str]:
+def _name_and_type(payload: bytes) -> tuple[str, str]:
     """Name and type at the beginning of a payload, each after its length."""
     texts = []
     for _ in range(2):

@@ -376,7 +376,7 @@ class SettledRuns(Observer):
         if CURRENT in columns and CURRENT in bases_room.axes_of(robot):  # imposed: no channel measures it
             columns = {**columns, bases_room.VARIABLES["current"]: columns[CURRENT]}
         columns = {**_unmeasured(self, robot, columns), **columns}
-        ways = dict.fromkeys(WAYS, np.asarray(_directions(self, robot)))
+        ways = dict.fromkeys(WAYS, np.asarray(_run_directions(self, robot)))
         base_arguments = columns, weight, robot, None, ways
         return (*bases_room.curve_families(*base_arguments), *bases_room.window_families(*base_arguments))
 
@@ -385,7 +385,7 @@ class SettledRuns(Observer):
 
         Residuals are simulated less measured. Sides have defects of their own if they are driven independently.
         """
-        return EquationDefects(_defects(before.linear, included), _defects(after.linear, included))
+        return EquationDefects(_row_defects(before.linear, included), _row_defects(after.linear, included))
 
 
 def _unmeasured(observe: SettledRuns, robot: Robot, columns: Columns) -> dict[str, Float[np.ndarray, " rows"]]:
@@ -399,10 +399,10 @@ def _unmeasured(observe: SettledRuns, robot: Robot, columns: Columns) -> dict[st
     fitted = {
         v: np.asarray(x, float) for v, x in zip(unmeasured, _signals(observe, robot, tuple(unmeasured)), strict=True)
     }
-    return {bases_room.VARIABLES[v]: x for v, x in fitted.items() if np.isfinite(x).all() and _varies(np.abs(x))}
+    return {bases_room.VARIABLES[v]: x for v, x in fitted.items() if np.isfinite(x).all() and _size_varies(np.abs(x))}
 
 
-def _varies(x: np.ndarray) -> bool:
+def _size_varies(x: np.ndarray) -> bool:
     """True if sizes differ by more than `VARIES` of the largest, unlike a current that only friction needs."""
     return bool(np.ptp(x) > VARIES * np.max(x))
 
@@ -415,7 +415,7 @@ def _signals(observe: SettledRuns, robot: Robot, names: Names) -> tuple[Float[Ar
     return tuple(jnp.broadcast_to(getattr(signals, name), rows) for name in names)
 
 
-def _defects(linear: Linearization, included: np.ndarray) -> Columns:
+def _row_defects(linear: Linearization, included: np.ndarray) -> Columns:
     """Defects along the travel that make the residual r of each row, of each side if sides are driven independently.
 
     They are the most probable δ of r = -S δ + noise of one sd: δ = -D Sᵀ (S D Sᵀ + 1)⁻¹ r. Their prior sds D^½ are
@@ -444,7 +444,7 @@ def _defects(linear: Linearization, included: np.ndarray) -> Columns:
 
 
 @functools.partial(compiled, options=SELDOM)
-def _directions(observe: SettledRuns, robot: Robot) -> Float[Array, " rows"]:
+def _run_directions(observe: SettledRuns, robot: Robot) -> Float[Array, " rows"]:
     """Direction of each run, 1 or -1."""
     return jax.vmap(lambda c: travel_direction(robot, c))(observe.conditions)
 

@@ -135,9 +135,9 @@ def starts_from_settled_ends(
     count = np.maximum(np.sum(np.asarray(data.weight) > 0, 0), 1)
     rms = np.sqrt(np.sum(np.asarray(data.weight > 0) * np.asarray(data.measured) ** 2, 0) / count)
     blunt = dataclasses.replace(problem, data=dataclasses.replace(data, sd=jnp.hypot(data.sd, BLUNT * rms)))
-    optima = search(blunt, _recombined(blunt, points)[:SEARCHES], STEPS_BLUNT)
+    optima = search(blunt, _recombine_points(blunt, points)[:SEARCHES], STEPS_BLUNT)
     ended = np.asarray(optima.z)[np.argsort(np.asarray(optima.cost))]
-    best = _recombined(blunt, ended)[:1]
+    best = _recombine_points(blunt, ended)[:1]
     return _distinct_points(np.concatenate([best, _with_peaked_friction(problem, best[0]), ended]))
 
 
@@ -172,7 +172,7 @@ def _distinct_points(points: np.ndarray) -> np.ndarray:
     return np.stack(distinct)
 
 
-def _recombined(problem: Problem, points: np.ndarray) -> np.ndarray:
+def _recombine_points(problem: Problem, points: np.ndarray) -> np.ndarray:
     """Points with the parameters of each configuration exchanged: the k-th point has the k-th best fit of its runs.
 
     Shared parameters are from the point that fits all runs best.
@@ -283,9 +283,9 @@ def _misfit_of_runs(problem: Problem, points: np.ndarray) -> np.ndarray:
     observe: Histories = problem.observe  # type: ignore[assignment]
     filled = np.resize(points, (-(-len(points) // TOGETHER) * TOGETHER, points.shape[1]))
     parts = filled.reshape(-1, TOGETHER, points.shape[1])
-    first = _misfits(problem, jnp.asarray(parts[0]))  # compiles the program
+    first = _reading_misfits(problem, jnp.asarray(parts[0]))  # compiles the program
     with Threads(CORES) as cores:
-        each = [first, *cores.map(lambda part: _misfits(problem, jnp.asarray(part)), parts[1:])]
+        each = [first, *cores.map(lambda part: _reading_misfits(problem, jnp.asarray(part)), parts[1:])]
     by_row = np.sum(np.concatenate([np.asarray(x) for x in each])[: len(points)] ** 2, 2)
     by_run = np.zeros((len(points), len(observe.rows_of)))
     np.add.at(by_run.T, np.asarray(observe.run), by_row.T)
@@ -293,7 +293,7 @@ def _misfit_of_runs(problem: Problem, points: np.ndarray) -> np.ndarray:
 
 
 @compiled
-def _misfits(problem: Problem, zs: Array) -> Array:
+def _reading_misfits(problem: Problem, zs: Array) -> Array:
     """Whitened residuals of the readings at each point, shape (points, rows, channels)."""
     shape = problem.data.measured.shape
     return jax.vmap(lambda z: problem.misfit(z, problem.data)[: problem.data.measured.size].reshape(shape))(zs)

@@ -769,7 +769,7 @@ class Histories(Observer):
         Curves over the voltage are over the motors' voltage if it differs from the supply's.
         """
         rows = self.of_rows
-        angle, electromotive, ways = jax.tree.map(lambda x: np.nan_to_num(np.asarray(x)), _turning(self, robot))
+        angle, electromotive, ways = jax.tree.map(lambda x: np.nan_to_num(np.asarray(x)), _shaft_motion(self, robot))
         if (rows.duty != 1).any():
             at_motors = np.where(rows.open > 0.5, electromotive, rows.voltage * rows.duty)
             columns = {**columns, "supply_voltage_V": at_motors}
@@ -919,7 +919,7 @@ def measure_initial_states(robot: Robot, runs: Runs, noise: Noise) -> Robot:
                 factor = 1 / float(
                     channel.read(robot, balances.begin_signals(robot, Conditions(configuration), rolling))
                 )
-                value, sd = _extrapolated(runs["time_s"][finite] - runs["time_s"][run_rows[0]], measured[finite, k])
+                value, sd = _value_at_zero(runs["time_s"][finite] - runs["time_s"][run_rows[0]], measured[finite, k])
                 least = float(np.median(noise.sd[finite, k]))
                 state[field] = factor * value, abs(factor) * max(sd, least)
         begins[key] = Begin(**{field: value for field, (value, _) in state.items()})
@@ -928,7 +928,7 @@ def measure_initial_states(robot: Robot, runs: Runs, noise: Noise) -> Robot:
     return dataclasses.replace(robot, rig=dataclasses.replace(robot.rig, begins=Begins(begins), priors=priors))
 
 
-def _extrapolated(time: np.ndarray, shown: np.ndarray) -> tuple[float, float]:
+def _value_at_zero(time: np.ndarray, shown: np.ndarray) -> tuple[float, float]:
     """Value at time 0 of a line through samples, and its standard error. The mean of fewer than three samples."""
     if len(time) < 3:
         return float(np.mean(shown)), 0.0
@@ -1120,7 +1120,7 @@ def _readings_within_steps(robot: Robot, steps: StepCourse) -> tuple[Array, ...]
 
 
 @functools.partial(compiled, options=OVER_TIME)
-def _turning(observe: Histories, robot: Robot) -> tuple[Array, Array, dict[str, Array]]:
+def _shaft_motion(observe: Histories, robot: Robot) -> tuple[Array, Array, dict[str, Array]]:
     """Angle of the driving shaft, back-EMF and ways of travel at each row."""
     whole_runs = observe.whole(robot)
     rows = observe.at_rows(whole_runs)
@@ -1287,7 +1287,7 @@ class _Probed(NamedTuple):
             delayed: True if readings are late.
         """
         robot, size, none = self.robot, self.size, jnp.zeros(len(self.every))
-        remembered, hat = _remembered(robot, conditions, along, self.effects), _hats(clock)
+        remembered, hat = _remembered(robot, conditions, along, self.effects), _hat_functions(clock)
 
         def terms(t: Array, y: Array, held: Conditions, way: Array | None = None) -> Array:
             signals = moving(robot, held, state_of_unknowns(robot, y), way)
@@ -1329,7 +1329,7 @@ class _Probed(NamedTuple):
         return knots.transpose(2, 3, 0, 1), by_effects
 
 
-def _hats(clock: Array) -> Callable[[Array], Array]:
+def _hat_functions(clock: Array) -> Callable[[Array], Array]:
     """Function of time with a hat for each knot: 1 there, falling linearly to 0 at its neighbours, shape (knots,)."""
     # A run that ended early repeats its last knot; only the first of these has a hat.
     real = jnp.concatenate([jnp.ones(1), (jnp.diff(clock) > 0).astype(clock.dtype)])
