@@ -159,7 +159,7 @@ def test_what_a_joint_lacks_is_named(mmrjax, tmp_path):
 
 @pytest.mark.slow
 def test_each_joint_of_an_arm_has_its_loop_and_keeps_it(mmrjax, tmp_path):
-    write(tmp_path, arm(), 3e-4)
+    write(tmp_path, arm(2.0), 3e-4)
     arguments = [
         "loop",
         tmp_path / "log.csv",
@@ -168,7 +168,7 @@ def test_each_joint_of_an_arm_has_its_loop_and_keeps_it(mmrjax, tmp_path):
         "--robot",
         f"{tmp_path}/{{joint}}.toml",
     ]
-    arguments += ["--out", tmp_path / "found", "--joints"]
+    arguments += ["--out", tmp_path / "found", "--within", "1h", "--joints"]
     _, out, _ = ends(mmrjax(*arguments, "elbow"), code=0)
     assert out.strip().endswith("found") and "elbow/report.html" in (tmp_path / "found" / "report.html").read_text()
     began = read_json(tmp_path / "found" / "elbow" / "manifest.json")["started"]
