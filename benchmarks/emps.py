@@ -74,13 +74,13 @@ def free_run(robot_file: Path, record: Path) -> float:
     from calibration.data import runs as records
     from calibration.inference.preparation import prepare
     from mmrjax.compile.precision import in_double
-    from sweeps.points.run import follow_histories
+    from sweeps.points.run import simulate_histories
 
     @in_double
     def error() -> float:
         robot = files.read_robot(robot_file)
         runs = records.read_runs(str(record), robot=robot)
-        shown = follow_histories(prepare(runs, robot).robot, runs, None)
+        shown = simulate_histories(prepare(runs, robot).robot, runs, None)
         off = np.asarray(shown["position_mm"]) - np.asarray(runs["position_mm"])
         return float(np.sqrt(np.mean(off[FIRST:] ** 2)))
 

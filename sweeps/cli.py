@@ -574,7 +574,7 @@ def main() -> None:
     """Run the command line. Every failure is one sentence on stderr and a documented exit code."""
     for number in (signal.SIGTERM, signal.SIGALRM):  # ended or interrupted: both can be taken up again
         signal.signal(number, signal.default_int_handler)
-    unraised, sys.unraisablehook = sys.unraisablehook, _obey_interrupt
+    unraised, sys.unraisablehook = sys.unraisablehook, _raise_lost_interrupt
     _replace_closed_streams()
     try:
         # Refuse names that are not UTF-8: neither pages nor JSON could show them
@@ -606,7 +606,7 @@ def main() -> None:
     sys.exit(code)
 
 
-def _obey_interrupt(ignored: Any) -> None:
+def _raise_lost_interrupt(ignored: Any) -> None:
     """Repeats an interrupt shortly afterwards, because an interrupt inside a callback (such as garbage collection)
     is lost."""
     if issubclass(ignored.exc_type, KeyboardInterrupt):

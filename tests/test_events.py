@@ -18,7 +18,7 @@ from mmrjax.model.conditions import Conditions
 from mmrjax.model.rig import Rig
 from mmrjax.model.robot import Configurations
 from mmrjax.model.shaft import Shaft
-from sweeps.points.run import follow_histories
+from sweeps.points.run import simulate_histories
 
 #: Forward, braked to rest, held by friction, back from rest, and forward through rest [V].
 VOLTS, CHANGES = np.array([6.0, 0.0, 1.0, -6.0, 6.0]), np.array([0.0, 0.4, 0.6, 0.8, 1.1])
@@ -116,7 +116,7 @@ def test_compare_follows_reversals_within_a_thousandth_of_scipys_rms():
         over = np.maximum(np.abs(current) / bench.current_limit - 1, 0) * np.sign(current * imposed)
         exact = {"total_current_A": current * (1 - STEEP * over), "motor_speed_rpm": motor * 30 / np.pi}
         log = runs.read_runs({"time_s": every, "supply_voltage_V": imposed, **exact}, robot=robot)
-        shown = follow_histories(prepare(log, robot).robot, log, None)
+        shown = simulate_histories(prepare(log, robot).robot, log, None)
         for column, readings in exact.items():
             assert np.abs(shown[column] - readings).max() < 1e-3 * np.sqrt(np.mean(readings**2)), (bench, column)
 

@@ -35,7 +35,7 @@ def test_table_is_read_as_turns_of_imposed_speeds(robot, runs):
 
 
 def test_runs_are_what_is_held_out_first(runs):
-    held = blocks.distinct_blocks(runs, SettledTurns.blocks)
+    held = blocks.distinct_held_out_blocks(runs, SettledTurns.blocks)
     assert next(iter(held)) == "run" and len(held["run"]) == len(set(runs["run_id"])) > 10
 
 

@@ -229,7 +229,7 @@ def settled_table(tmp_path, robot, dry):
 
 def test_levels_of_the_current_are_blocks_to_hold_out(robot, tmp_path):
     runs = settled_table(tmp_path, robot, DRY)
-    kinds = holdout.distinct_blocks(runs, observers.observer_kind(runs).blocks)
+    kinds = holdout.distinct_held_out_blocks(runs, observers.observer_kind(runs).blocks)
     assert list(kinds) == ["current"] and len(kinds["current"]) == 8
 
 

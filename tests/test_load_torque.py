@@ -264,7 +264,7 @@ def test_rows_are_held_out_by_levels_of_the_torque(tmp_path):
     torque = [0.1, 0.1003, 0.2, 0.2004, 0.4, 0.4001]
     lines = ["supply_voltage_V,motor_speed_rpm,load_torque_Nm", *(f"24,{4000 - 900 * m:.6g},{m}" for m in torque)]
     runs, _ = read(tmp_path, lines)
-    found = blocks.distinct_blocks(runs, SettledRuns.blocks)
+    found = blocks.distinct_held_out_blocks(runs, SettledRuns.blocks)
     assert list(found) == ["load_torque"] and [int(m.sum()) for m in found["load_torque"].values()] == [2, 2, 2]
     assert blocks.kind_in_words("load_torque") == "load torque"
 

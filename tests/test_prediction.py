@@ -13,7 +13,7 @@ from calibration.data.runs import Runs
 from calibration.discovery import findings, mechanism, prediction
 from calibration.discovery.discover import discover
 from calibration.discovery.prediction import Gain, HeldOutScore, score_readings, smallest_predictive_set
-from calibration.inference.blocks import distinct_blocks, predictable_blocks, unpredictable_kinds
+from calibration.inference.blocks import distinct_held_out_blocks, predictable_blocks, unpredictable_kinds
 from mmrjax.fidelities.steady import steady_batch
 from mmrjax.model import channels, paper_robots
 from sweeps.inputs import read_runs
@@ -58,7 +58,7 @@ def test_score_is_the_log_density_and_what_is_not_reached_counts(runs):
     reading["slope"][3, 1] = np.nan
     counts = np.ones((12, 2), bool)
     counts[5] = False
-    found = score_readings(reading, measured, sd, counts, distinct_blocks(runs, ("slope", "voltage")))
+    found = score_readings(reading, measured, sd, counts, distinct_held_out_blocks(runs, ("slope", "voltage")))
     for kind in reading:
         off = np.where(np.isfinite(reading[kind]), reading[kind], measured + prediction.UNREACHED * sd)
         wanted = stats.t.logpdf((off - measured) / sd, prediction.FREEDOM) - np.log(sd)

@@ -447,7 +447,7 @@ def test_blocks_of_a_duty_hold_data_out_where_it_alone_varies(tmp_path):
     rows = "".join(f"12,{d},{50 * d}\n" for d in (0.3, 0.3, 0.6, 0.6, 0.9, 0.9))
     runs = read(tmp_path, f"supply_voltage_V,duty,output_speed_rad_s\n{rows}", robot)
     assert [m.tolist().count(True) for m in blocks.blocks_of_kind(runs, "duty").values()] == [2, 2, 2]
-    assert "duty" in blocks.distinct_blocks(runs, observers.observer_kind(runs).blocks)
+    assert "duty" in blocks.distinct_held_out_blocks(runs, observers.observer_kind(runs).blocks)
 
 
 def test_curves_are_over_the_fitted_motor_speed_where_only_the_output_is_read(tmp_path):

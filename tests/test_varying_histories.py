@@ -18,7 +18,7 @@ from calibration.data.runs import Runs
 from calibration.discovery.reach import reach_of_table
 from calibration.discovery.settings import settings_for
 from calibration.inference import checks
-from calibration.inference.blocks import blocks_of_kind, distinct_blocks
+from calibration.inference.blocks import blocks_of_kind, distinct_held_out_blocks
 from calibration.inference.calibration import calibrate
 from calibration.inference.fit_notes import with_codes
 from calibration.inference.linearization import balance_probe
@@ -288,7 +288,7 @@ def test_blocks_of_runs_that_vary_are_whole_runs(runs):
     for mask in blocks_of_kind(more, "voltage").values():
         assert len(np.unique(more["run_id"][mask])) == 1
     assert blocks_of_kind(runs, "voltage") == {} and set(blocks_of_kind(runs, "slope")) == {"0.0", "4.0", "-3.0"}
-    assert "voltage" not in distinct_blocks(runs, Histories.blocks)
+    assert "voltage" not in distinct_held_out_blocks(runs, Histories.blocks)
     assert (
         rows_of_varying_runs(more).sum() == len(runs)
         and len(set(course_of_each_row(more))) == 4

@@ -116,7 +116,7 @@ def blocks_of_kind(runs: Runs, by: str) -> Columns:
     return {name: labels == name for name in names} if len(names) > 1 and not single else {}
 
 
-def distinct_blocks(runs: Runs, kinds: Sequence[str]) -> dict[str, Columns]:
+def distinct_held_out_blocks(runs: Runs, kinds: Sequence[str]) -> dict[str, Columns]:
     """Kind → blocks, for kinds that the data have, without kinds that divide the rows as an earlier one does."""
     blocks: dict[str, Columns] = {}
     divided = []
@@ -130,7 +130,7 @@ def distinct_blocks(runs: Runs, kinds: Sequence[str]) -> dict[str, Columns]:
 
 
 def predictable_blocks(runs: Runs, problem: Problem) -> dict[str, Columns]:
-    """Kind → blocks as from `distinct_blocks`, of the kinds of a problem's observer, that the other rows can predict.
+    """Kind → blocks of `distinct_held_out_blocks` that the other rows can predict, by the problem's observer.
 
     A block is omitted if it holds all rows of a configuration with free parameters of its own.
     """
@@ -142,14 +142,17 @@ def predictable_blocks(runs: Runs, problem: Problem) -> dict[str, Columns]:
     owned = [np.isin(names, list(owners)) for owners in informs if "" not in owners]
     kinds = {
         kind: {label: m for label, m in by.items() if not any(m[block_rows].all() for block_rows in owned)}
-        for kind, by in distinct_blocks(runs, problem.observe.blocks).items()
+        for kind, by in distinct_held_out_blocks(runs, problem.observe.blocks).items()
     }
     return {kind: by for kind, by in kinds.items() if by}
 
 
 def unpredictable_kinds(runs: Runs, problem: Problem) -> Names:
     """Kinds with at least one block that the other rows cannot predict."""
-    all_blocks, predictable = distinct_blocks(runs, problem.observe.blocks), predictable_blocks(runs, problem)
+    all_blocks, predictable = (
+        distinct_held_out_blocks(runs, problem.observe.blocks),
+        predictable_blocks(runs, problem),
+    )
     return tuple(kind for kind, by in all_blocks.items() if len(predictable.get(kind, {})) < len(by))
 
 

@@ -689,7 +689,7 @@ def _begin_sides(robot: Robot, conditions: Conditions, own: Conditions, motion: 
     )
 
 
-def added_in_plane(robot: Robot, signals: Signals) -> tuple[Scalar, Scalar]:
+def lateral_and_yaw_effects(robot: Robot, signals: Signals) -> tuple[Scalar, Scalar]:
     """Sums of the robot's effects in the balances `lateral` [N] and `yaw` [N·m], over both sides."""
 
     def of(balance: str) -> Scalar:
@@ -727,7 +727,7 @@ def turning_signals(
     own_load = jax.vmap(lambda s: travel(robot, chassis, s))(
         _fill(even, normal=held.normal / units, moment_lateral=held.moment / units)
     )
-    lateral, yaw = added_in_plane(robot, own_load)
+    lateral, yaw = lateral_and_yaw_effects(robot, own_load)
     pull = held.ahead - units * own_load.resistance
     along = sum_of_sides(pull) - mass * GRAVITY * sine_slope * cosine(motion.heading)
     across = sum_of_sides(held.aside) + mass * GRAVITY * sine_slope * sine(motion.heading) - lateral

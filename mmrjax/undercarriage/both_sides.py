@@ -166,7 +166,7 @@ def generalized(run: System, motion: Motion, signals: Signals, at: Touch, pulled
     """Generalized forces on q [N, N·m]."""
     cos, sin = cosine(motion.q[YAW]), sine(motion.q[YAW])
     y, several = SIDES * _width(run), run.robot.sides / 2
-    lateral, yaw = balances.added_in_plane(run.robot, _with_lateral_moment(run, signals, at, pulled))
+    lateral, yaw = balances.lateral_and_yaw_effects(run.robot, _with_lateral_moment(run, signals, at, pulled))
     forward, normal, moment, rear = pulled.generalized.T
     assert pulled.aside is not None
     ahead, aside = several * jnp.sum(forward), several * jnp.sum(pulled.aside) - lateral

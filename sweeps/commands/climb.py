@@ -57,7 +57,7 @@ def execute(config: configuration.Climb, beside: configuration.FolderPart) -> in
     config = config.model_copy(
         update={"configuration": name, "supply_voltage_V": None if config.battery else voltage}
     )
-    sequence = _sequence(config, robot, name)
+    sequence = _lever_sequence(config, robot, name)
     _, words = _terrain(config, 0.1)
     conditions = Conditions(
         name, voltage, payload=config.payload_kg, battery=config.battery, discharge=3.6 * config.discharge_mAh,
@@ -241,7 +241,7 @@ def _terrain(config: configuration.Climb, size: Scalar) -> tuple[Terrain, str]:
     ), "a step" if config.step_mm is None else f"a step of {config.step_mm:g} mm"
 
 
-def _sequence(config: configuration.Climb, robot: Robot, name: str) -> Sequence:
+def _lever_sequence(config: configuration.Climb, robot: Robot, name: str) -> Sequence:
     """Returns the motion of the levers.
 
     Raises:

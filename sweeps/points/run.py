@@ -185,7 +185,7 @@ def evaluate_runs(
     }
 
 
-def follow_histories(robot: Robot, runs: Runs, model: str | None) -> Table:
+def simulate_histories(robot: Robot, runs: Runs, model: str | None) -> Table:
     """Conditions and simulated outputs at every row of a table of time histories.
 
     Its steps are finer than those of fits, which use the grid up to thousands of times.

@@ -319,7 +319,7 @@ def _sections(
     yield Section("Measured and simulated, run by run", tuple(_run_by_run(found, table, changes)))
     yield from [] if missing else [looked_for]
     where = "Where the missing term acts" if missing else "What each equation lacks"
-    yield Section(where, tuple(_where_missing(found, table, changes)))
+    yield Section(where, tuple(_blocks_of_missing_terms(found, table, changes)))
     yield from fit_tables.clusters_section(found.residual_clusters)
     errors = catalogue.figure("loop.errors-figure", found, words=(OF_SIZE,))
     fits = {when: by for when, by in found.rms.items() if not (found.refit_alone and "after" in when)}
@@ -352,7 +352,9 @@ def _run_by_run(found: DiscoveryResult, table: Columns, changes: Mapping[str, Ch
         yield catalogue.figure("loop.before_after", table, found.channels, verdict, words=("",))
 
 
-def _where_missing(found: DiscoveryResult, table: Columns, changes: Mapping[str, Change]) -> Iterable[Block]:
+def _blocks_of_missing_terms(
+    found: DiscoveryResult, table: Columns, changes: Mapping[str, Change]
+) -> Iterable[Block]:
     verdict, sized = "none" if found.refit_alone else found.verdict, Layout.of(found.robot).crosses_zero
     if len(changes) > 1:
         yield catalogue.figure("loop.laws", found, table, changes)
