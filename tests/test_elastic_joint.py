@@ -13,7 +13,9 @@ from test_events import NAMES, SAMPLES
 from worlds.events import Bench, through
 
 from calibration.data import runs as records
+from calibration.discovery import discover
 from calibration.inference.calibration import calibrate
+from mmrjax.effects import BY_NAME
 from mmrjax.fidelities.drive import drive_batch, drive_rates, drive_start, drive_units
 from mmrjax.fidelities.steady import steady_batch
 from mmrjax.model import paper_robots, params
@@ -157,6 +159,21 @@ def test_a_rigid_model_takes_friction_away_and_an_elastic_one_finds_the_joint(lo
         entry = fit.parameters[name]
         assert entry.interval[0] < truth < entry.interval[1] and not entry.held_by_prior, name
     assert abs(fit.parameters["bench.stiffness"].value - bench.stiffness) < 0.02 * bench.stiffness
+
+
+@pytest.mark.nightly
+@pytest.mark.slow
+def test_the_loop_names_no_effect_for_a_joint_that_twists(log):
+    """The strongest effect of the library passes every threshold (117 of 3 σ) and explains a tenth of the misfit."""
+    folder, _ = log
+    robot = read_rig(folder, RIG)
+    runs = records.read_runs(folder / "log.csv", robot=robot)
+    names = ("bristle_load_loss", "stick_slip", "directional_friction", "series_resistance")
+    given = discover.prepare_loop(runs, robot, library={n: BY_NAME[n] for n in names})
+    traced = dataclasses.replace(given, settings=dataclasses.replace(given.settings, slots=1)).trace()
+    (test,) = traced.standing.tests
+    assert test.root > 10 * test.needed and not test.established
+    assert traced.verdict in ("place", "undescribed") and traced.members == ()
 
 
 def test_a_frequency_response_is_that_of_the_filter_that_made_it():

@@ -8,6 +8,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from calibration.data.delimited import read_csv_columns
+from sweeps import store
 from sweeps.commands import loop_joints
 from tests.commands import ends, read_json, read_rig
 
@@ -176,3 +177,38 @@ def test_each_joint_of_an_arm_has_its_loop_and_keeps_it(mmrjax, tmp_path):
     assert read_json(tmp_path / "found" / "elbow" / "manifest.json")["started"] == began
     (tmp_path / "elbow.toml").write_text(RIG.replace("ratio = 50", "ratio = 51"))
     ends(mmrjax(*arguments, "elbow"), "exists already; choose another path")
+
+
+def test_finished_joints_are_kept_and_all_are_on_one_page(mmrjax, tmp_path, monkeypatch):
+    """With a loop that only leaves a result."""
+    ran = []
+
+    def loop(one, beside, robot, runs):
+        ran.append(one.joints)
+        with store.open_folder("loop", one, robot, beside, runs) as folder:
+            errors = {
+                which: {"held_out": {"motor_current": {"rms_percent": x}}}
+                for which, x in (("before", 4.0), ("after", 2.0))
+            }
+            folder.write_json("result.json", {"statement": f"Friction of {runs.source}.", "errors": errors})
+            return store.finish_run_folder(folder, one, {}, robot=robot, runs=runs)
+
+    monkeypatch.setattr("sweeps.commands.loop._timed_loop", loop)
+    write(
+        tmp_path, np.column_stack([np.arange(40) * 0.01, np.zeros((40, 4)), np.random.default_rng(0).random((40, 2))])
+    )
+    arguments = [
+        "loop",
+        tmp_path / "log.csv",
+        "--model",
+        tmp_path / "arm.xml",
+        "--robot",
+        f"{tmp_path}/{{joint}}.toml",
+    ]
+    arguments += ["--joints", "all", "--out", tmp_path / "found"]
+    ends(mmrjax(*arguments), "4 → 2", code=0)
+    ends(mmrjax(*arguments), "joint shoulder: finished in", code=0)
+    page = (tmp_path / "found" / "report.html").read_text("utf-8")
+    assert ran == [("shoulder",), ("elbow",)] and all(f"{name}/report.html" in page for name in JOINTS)
+    (tmp_path / "elbow.toml").write_text(RIG.replace("ratio = 50", "ratio = 51"))
+    ends(mmrjax(*arguments), "found/elbow exists already")

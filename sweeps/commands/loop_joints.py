@@ -245,6 +245,7 @@ def _row(joint: str, place: Path) -> tuple[str, str, str, str]:
         answer = json.loads(ranked.read_text(encoding="utf-8"))["answer"] if ranked.is_file() else ""
         return joint, f"no verdict in time; the same command continues; {answer}.", "", ""
     result: Mapping = json.loads((place / "result.json").read_text(encoding="utf-8"))
-    before, after = (result["errors"][which]["held_out"] or {} for which in ("before", "after"))
-    errors = "; ".join(f"{c.replace('_', ' ')} {before[c]:.3g} → {after[c]:.3g}" for c in after if before.get(c))
+    held_out = (result["errors"][which]["held_out"] for which in ("before", "after"))
+    percent = [next(iter(x.values()))["rms_percent"] if x else None for x in held_out]  # of the current
+    errors = "" if None in percent else " → ".join(f"{x:.3g}" for x in percent)
     return joint, result["statement"], errors, f"{joint}/report.html"
