@@ -296,9 +296,9 @@ def loop() -> None:
 def sensitivity() -> None:
     """Rank parameters by influence, and propose the next runs.
 
-    Every method includes local derivatives and elasticities at every operating point. Methods that draw a sample take
-    the corners and middle of axes that are not stated. Writes result.json,
-    report.html, points.csv and indices.csv.
+    Every method includes local derivatives and elasticities at every operating point. With sobol and morris,
+    conditions that you do not give take only the ends of their usual range, and the slope also its middle. Writes
+    result.json, report.html, points.csv and indices.csv.
     """
 
 
@@ -646,7 +646,7 @@ def _answered(error: BaseException) -> int:
         from sweeps.console import OUTPUT
 
         place = str(error.filename or OUTPUT)  # run folders and tables name theirs
-        left = "" if place == OUTPUT else "; no run folder was written; finished parts are in its .partial"
+        left = "" if place == OUTPUT else f"; the run folder is incomplete: finished parts are in {place}.partial"
         return _fail(f"{place}: {error.strerror}{left}", 2)
     if isinstance(error, SystemExit) and isinstance(error.__context__, BrokenPipeError):
         return 1  # whoever reads the output has had enough: head, or a pager that was left

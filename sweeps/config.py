@@ -322,9 +322,11 @@ class Picture(OneRun):
 
 
 class AxesPart(Part):
-    """Axes of a grid. None leaves them to `sweeps.points.grid.resolve_grid`: Table 8 for the packaged robot.
+    """Axes of a grid. The default of an axis is from `sweeps.points.grid.resolve_grid`: Table 8 for the packaged
+    robot.
 
-    A robot has voltages or motor speeds, on the battery neither. Payloads, slopes and surface are of a vehicle.
+    The drive axis is voltage or motor speed, whichever the robot imposes. On the battery there is none. Payload,
+    slope and surface apply to vehicles only.
     """
 
     configurations: Several[str] | None = option_field(
@@ -569,7 +571,7 @@ class Resonance(RobotPart, FidelityPart, OutputPart):
     configuration: str | None = option_field(None, "One of the robot's", usual="its first")
     voltages_V: Several[Voltage] = option_field(
         tuple(10.0 + k for k in range(31)),
-        "Supply voltages (V) that set the speed, at least 5 of them",
+        "Supply voltages (V), which give the speeds of the map, at least 5 of them",
         usual="10:40:1, that is 31",
         minimum=0,
     )
@@ -623,8 +625,9 @@ class Climb(RobotPart, SupplyPart, OutputPart):
     )
     derivatives: Names = option_field(
         (),
-        "Derivatives of margins, time, energy and currents with respect to these, comma-separated: parameters, "
-        "adhesion, payload, voltage, levers_front_deg, levers_rear_deg, obstacle_mm",
+        "Derivatives of margins, time, energy and currents with respect to these, comma-separated: any parameter "
+        "(motor.resistance, ...), adhesion, payload, voltage (with --battery discharge), levers_front_deg, "
+        "levers_rear_deg, obstacle_mm",
     )
     film: bool = option_field(False, "Write climb.gif")
     duration_s: Annotated[float, positive(600)] = option_field(20.0, "Longest run")
@@ -814,7 +817,8 @@ class Size(RequirementsPart, RobotPart, OutputPart):
 
 
 class Sensitivity(RobotPart, DataPart, FidelityPart, SupplyPart, AxesPart, OutputPart):
-    """A sensitivity study. Methods that draw a sample take corners and middle of the axes that are not stated."""
+    """A sensitivity study. Methods that draw a sample take the ends of axes that are not stated, and of
+    slopes also the middle."""
 
     method: str = option_field(
         "sobol",

@@ -53,8 +53,8 @@ def load_robot(config: RobotPart) -> RobotFile:
     if examples and isinstance(config, Calibrate | Loop):  # `rig check` lists their lines
         wide = f"± {100 * stated.EXAMPLE_SHARE:g} %"
         notes.append(
-            f"{file.name}: still the example numbers of the template, so the fit uses {wide} for those "
-            f"with ±: {examples}"
+            f"{file.name}: these values are still example numbers of the template: {examples}. The fit widens each ± "
+            f"among them to {wide}"
         )
     for note in (*notes, *unlike):
         print_message(note)

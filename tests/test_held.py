@@ -182,7 +182,7 @@ def test_a_log_of_a_clamp_is_read_as_settled_rows(tmp_path):
     assert not log.sampled and any("held in every row, so each row is read as a settled run" in n for n in log.notes)
     same = records.read_runs(table(), robot=held)
     assert all((log[c] == same[c]).all() for c in ("motor_current_A", "held", *rows))
-    with pytest.raises(BadData, match="held is 1 in every row, and rows follow too fast to be settled"):
+    with pytest.raises(BadData, match="held is 1 in every row, and the rows are too close in time to be settled"):
         records.read_runs(table(time_s=1e-4 * np.arange(16.0)), robot=held)
     speed = rig(tmp_path, "motor_speed", '"motor_current", "motor_voltage"')
     columns = {c: v for c, v in table(held=False).items() if c != "output_torque_Nm"}

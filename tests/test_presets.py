@@ -239,7 +239,7 @@ WRONG = {
 FILES = {
     "another column": ('[columns]\nmotor_sped_rpm = "n"', "columns.motor_sped_rpm: no such column of a table"),
     "another key": ('[colums]\ntime_s = "t"', r"got the key colums; did you mean columns\?"),
-    "a list of numbers": ("[columns]\ntime_s = [1]", 'expected time_s = "THEIRS"'),
+    "a list of numbers": ("[columns]\ntime_s = [1]", 'expected time_s = "LOGGER COLUMN"'),
     "a factor of nothing": ('[columns]\ntime_s = {column = "t", factor = 0}', "factor: got 0; expected a number"),
     "a number without a name": (
         '[columns]\ntime_s = {column = "t", per = "n"}',

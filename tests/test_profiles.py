@@ -141,7 +141,7 @@ def test_supply_voltage_beside_the_battery_is_refused(read):
     table = read("time_s,supply_voltage_V\n0,24\n1,24\n")
     table.check_source(battery=False)
     with pytest.raises(
-        BadConfiguration, match=r"--battery: got it together with mission.csv, which contains supply_voltage_V"
+        BadConfiguration, match=r"--battery cannot be combined with mission.csv, which gives supply_voltage_V"
     ):
         table.check_source(battery=True)
 

@@ -391,7 +391,7 @@ REFUSED = {
     "no channels": (BENCH.replace('["total_current"]', "[]"), r"channels: got \[\]; expected a list of channels"),
     "unknown start": ('start = "still"' + BENCH, r"start: got still; allowed: rest, measured, free"),
     "unknown column": (BENCH + '[columns]\ntotal_curent_A = "I"', r"columns\.total_curent_A: no such column .*total_current_A"),
-    "odd column": (BENCH + "[columns]\ntotal_current_A = 3", r"columns\.total_current_A: got 3; expected MINE = \"THEIRS\""),
+    "odd column": (BENCH + "[columns]\ntotal_current_A = 3", r"columns\.total_current_A: got 3; expected total_current_A = \"LOGGER COLUMN\""),
     "factor 0": (
         BENCH + '[columns]\ntotal_current_A = {column = "I", factor = 0}',
         r"total_current_A\.factor: got 0; expected a number that is not 0",
@@ -483,10 +483,7 @@ def test_a_fit_says_which_numbers_are_a_templates(mmrjax, tmp_path):
     text = rig_new.rig_template("bench").replace('"2.0 ± 5 %"', '"2.2 ± 5 %"')
     (tmp_path / "rig.toml").write_text(text)
     _, _, err = ends(mmrjax("calibrate measured --robot rig.toml --out c"), code=4)
-    assert (
-        "rig.toml: still the example numbers of the template, so the fit uses ± 300 % for those with ±: motor.torque_constant, "
-        in err
-    )
+    assert "rig.toml: these values are still example numbers of the template: motor.torque_constant, " in err
     assert "motor.resistance" not in err
 
 

@@ -225,7 +225,7 @@ BAD = {
         ),
         r"motor_speed_rpm: shows -1001 rpm at 6 V; expected the sign of the imposed quantity; give duty the sign",
     ),
-    "nothing imposed": (lambda c: c | {"supply_voltage_V": np.zeros(600)}, r"rows 1 to 600, no settled segment: supply_voltage_V: nothing drives the motors; log rows"),
+    "nothing imposed": (lambda c: c | {"supply_voltage_V": np.zeros(600)}, r"rows 1 to 600, no settled segment: supply_voltage_V is about zero, so nothing drives the motors; log rows"),
     "never settles": (
         lambda c: (
             stairs((12.0,), 600) | {"motor_speed_rpm": 300 + 200 * c["time_s"]}

@@ -207,7 +207,7 @@ def test_what_does_not_go_with_a_profile_is_refused(mmrjax, capsys, monkeypatch,
 _VOLTS = "time_s,voltage_left_V,voltage_right_V\n0,20,10\n2,20,10\n"
 SIDES = {
     "more than the supply has": (_VOLTS, ["--voltage", "15"], r"voltage_left_V and voltage_right_V: got 20 V; the supply has 15 V"),
-    "voltages of a battery": (_VOLTS, ["--battery"], r"--battery: got it together with sides.csv, which contains voltage_left_V; .* duty_left and duty_right"),
+    "voltages of a battery": (_VOLTS, ["--battery"], r"--battery cannot be combined with sides.csv, which gives voltage_left_V; .* duty_left and duty_right"),
     "a robot of one side": (_VOLTS, ["--set", "sides=1"], r"sides.csv drives the two sides differently: got a robot of 1 side; expected sides = 2"),
     "options beside": (_VOLTS, ["--left", "10", "--right", "5"], r"--left cannot be combined with --profile"),
 }  # fmt: skip
@@ -226,7 +226,7 @@ def test_voltage_of_the_profile_beside_the_battery_is_refused(mmrjax, capsys, mo
     (mmrjax.folder / "volts.csv").write_text("time_s,supply_voltage_V\n0,24\n1,24\n")
     ends(
         mmrjax(capsys, monkeypatch, "simulate", "--profile", "volts.csv", "--battery"),
-        "--battery: got it together with volts.csv, which contains supply_voltage_V",
+        "--battery cannot be combined with volts.csv, which gives supply_voltage_V",
     )
 
 

@@ -241,7 +241,7 @@ BAD = {
     "truth of a voltage": ({"axes": {"voltage": [True]}}, r"axes\.voltage: got True; expected a number"),
     "no samples": ({"samples": SAMPLES | {"number": 0}}, r"samples\.number: got 0; expected a whole number from 1"),
     "negative seed": ({"samples": SAMPLES | {"seed": -1}}, r"samples\.seed: got -1; expected a whole number from 0"),
-    "nothing sampled": ({"samples": {"design": "sobol", "number": 8}}, r"samples: got no names; expected over, or a posterior"),
+    "nothing sampled": ({"samples": {"design": "sobol", "number": 8}}, r"samples: nothing to sample; give a table `over` of names and distributions, or `posterior`"),
     "unknown key of samples": ({"samples": SAMPLES | {"count": 3}}, r"samples\.count: no such key"),
     "over is a list": ({"samples": SAMPLES | {"over": ["payload"]}}, r"samples\.over: got \['payload'\]; expected a table"),
     "unknown distribution": ({"samples": SAMPLES | {"over": {"payload": "gauss"}}}, r"samples\.over\.payload\.distribution: got 'gauss'; allowed: uniform"),

@@ -237,8 +237,8 @@ def test_options_of_one_run_are_refused_beside_a_table(tmp_path, mmrjax):
 @pytest.mark.parametrize(
     ("told", "said"),
     [
-        ("motor_speed_left = 800", "motor_speed_left: got it without motor_speed_right; state both"),
-        ("duty = 0.5", "duty: got it together with duty_left and duty_right"),
+        ("motor_speed_left = 800", "motor_speed_left needs motor_speed_right too; give both"),
+        ("duty = 0.5", "duty cannot be combined with duty_left and duty_right"),
     ],
 )
 def test_a_sweep_refuses_what_leaves_open_what_drives_a_side(tmp_path, mmrjax, told, said):
@@ -271,7 +271,7 @@ def test_a_surface_of_which_nothing_is_known_is_refused(mmrjax):
 
 
 def test_one_imposed_speed_of_two_sides_is_refused():
-    with pytest.raises(mm.UsageError, match="motor_speed_left: got it without motor_speed_right; state both"):
+    with pytest.raises(mm.UsageError, match="motor_speed_left needs motor_speed_right too; give both"):
         mm.simulate(paper_robots.nominal(), mm.Conditions("6T2A", motor_speed_left=800.0))
 
 
@@ -371,14 +371,14 @@ def test_simulate_in_python_refuses_turns_as_the_command_line_does():
     alone = dataclasses.replace(mm.nominal(), sides=jnp.asarray(1.0))
     with pytest.raises(UsageError, match="duty_left: got a robot of 1 side"):
         mm.simulate(alone, mm.Conditions("6T2A", duty_left=1, duty_right=0.5))
-    with pytest.raises(UsageError, match="duty: got it together with duty_left and duty_right"):
+    with pytest.raises(UsageError, match="duty cannot be combined with duty_left and duty_right"):
         mm.simulate(mm.nominal(), mm.Conditions("6T2A", duty=0.5, duty_left=1, duty_right=0.5))
 
 
 @pytest.mark.parametrize("duty", [1, 1.0, 0.5, [1.0, 1.0]])
 def test_a_duty_written_beside_both_sides_is_refused_whatever_it_is(duty):
     with pytest.raises(
-        UsageError, match=r"^duty: got it together with duty_left and duty_right; expected one of the two"
+        UsageError, match=r"^duty cannot be combined with duty_left and duty_right; give one of the two"
     ):
         mm.Conditions("6T2A", duty=duty, duty_left=1, duty_right=0.5)
     alone = mm.Conditions(0, duty=duty, duty_left=0.5)  # of the right side

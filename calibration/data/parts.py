@@ -138,7 +138,7 @@ class CellSheet:
         name, maker, chemistry: name, maker and chemistry of the cell.
         cells: cells in series.
         capacity: [C].
-        voltage_full, voltage_cut_off: of one cell [V].
+        voltage_full, voltage_cut_off: voltages of one cell [V].
         current_max, current_charge_max: largest continuous currents [A].
         resistance: resistance of one cell to direct current [ohm].
         impedance: impedance of one cell at 1 kHz [ohm]. Smaller than the resistance.

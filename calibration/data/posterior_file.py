@@ -32,7 +32,7 @@ class Posterior:
 
     Attributes:
         coordinates: names of the parameters that have a coordinate each.
-        units: of them.
+        units: units of these parameters.
         mean, covariance: mean and covariance of z, shape (coordinates,) and (coordinates, coordinates).
         location, spread, low, high: location, spread, lower limit and upper limit of u, in the parameter's unit or
             its logarithm.

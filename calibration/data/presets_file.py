@@ -248,7 +248,8 @@ def _preset_numbers(asked: Any, where: str, given: Mapping[str, float]) -> dict[
         table = {"about": stated} if isinstance(stated, str) else stated
         if not isinstance(table, dict) or {*table} - {*KEYS_OF_NUMBER} or not isinstance(table.get("about"), str):
             raise BadConfiguration(
-                f'{where}, ask.{key}: got {stated!r}; expected a sentence, or {{about = "...", usual = 1.0}}'
+                f'{where}, ask.{key}: got {stated!r}; expected a description such as "number of the motor, from 0", '
+                f'or {{about = "DESCRIPTION", usual = 1.0}}'
             )
         if key not in given and "usual" not in table:
             raise BadConfiguration(
@@ -263,7 +264,7 @@ def _preset_numbers(asked: Any, where: str, given: Mapping[str, float]) -> dict[
 
 
 def _column(mine: str, theirs: Any, where: str, numbers: Mapping[str, float]) -> PresetColumn:
-    form = f'expected {mine} = "THEIRS", or {mine} = {{column = "THEIRS", factor = 0.001}}'
+    form = f'expected {mine} = "LOGGER COLUMN", or {mine} = {{column = "LOGGER COLUMN", factor = 0.001}}'
     table = theirs if isinstance(theirs, dict) else {"column": theirs}
     for key in table:
         stated_word(key, KEYS_OF_COLUMN, where, f"got the key {key}")

@@ -136,7 +136,7 @@ class ProfileTable:
         """Demanded ground speed [m/s], also from a demanded motor speed, NaN without a demand.
 
         Args:
-            segment: of one cycle, from 0.
+            segment: number of the segment in one cycle, from 0.
             elapsed: since it began [s]. Both of one shape.
             per_speed: motor speed over ground speed [rad/m].
         """
@@ -154,12 +154,12 @@ class ProfileTable:
         """
         if battery and PAIRS[1][0] in self.values:
             raise BadConfiguration(
-                f"--battery: got it together with {self.source}, which contains voltage_left_V; a battery's "
+                f"--battery cannot be combined with {self.source}, which gives voltage_left_V; a battery's "
                 "voltage falls, so give duty_left and duty_right instead"
             )
         if battery and "voltage" in self.values:
             raise BadConfiguration(
-                f"--battery: got it together with {self.source}, which contains supply_voltage_V; use one of the two"
+                f"--battery cannot be combined with {self.source}, which gives supply_voltage_V; use one of the two"
             )
 
     def profile(self, robot: Robot, conditions: Conditions) -> Profile:

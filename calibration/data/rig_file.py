@@ -267,7 +267,6 @@ def _instruments(stated: Any, names: Sequence[str], where: str) -> tuple[Instrum
 
 def _columns(stated: Any, where: str) -> tuple[tuple[str, str, float], ...]:
     here = f"{where}, columns"
-    form = 'expected MINE = "THEIRS", or MINE = {column = "THEIRS", factor = 0.001}'
     if not isinstance(stated, dict):
         raise BadConfiguration(f"{here}: got {stated!r}; expected a table [columns]")
     layout, entries = Layout(channels=channels.EVERY), []
@@ -278,7 +277,10 @@ def _columns(stated: Any, where: str) -> tuple[tuple[str, str, float], ...]:
             raise BadConfiguration(f"{here}.{mine}: no such column of a table; {listed}; also in other units")
         table = {"column": theirs} if isinstance(theirs, str) else theirs
         if not isinstance(table, dict) or not isinstance(table.get("column"), str) or {*table} - {"column", "factor"}:
-            raise BadConfiguration(f"{here}.{mine}: got {theirs!r}; {form}")
+            raise BadConfiguration(
+                f'{here}.{mine}: got {theirs!r}; expected {mine} = "LOGGER COLUMN", or '
+                f'{mine} = {{column = "LOGGER COLUMN", factor = 0.001}}'
+            )
         factor = table.get("factor", 1.0)
         if not is_number(factor) or not math.isfinite(factor) or not factor:
             raise BadConfiguration(f"{here}.{mine}.factor: got {factor!r}; expected a number that is not 0")
@@ -335,13 +337,14 @@ def refuse_missing(
 
 
 def with_priors(robot: Robot, sds: Mapping[str, float], where: str) -> Robot:
-    """The robot with the sds that its file states as priors around its values.
+    """The robot with a prior for each value whose sd its file states, centred on the value.
 
     Args:
-        sds: by dotted name [SI].
+        sds: standard deviations by dotted name [SI].
+        where: name of the file for messages.
 
     Raises:
-        BadConfiguration: an sd of a name that is no parameter.
+        BadConfiguration: an sd is given for something that is not a parameter.
     """
     parameters = {p.name: p for p in params.walk_parameters(robot)}
     for name in sds:
@@ -362,7 +365,7 @@ def moved_priors(robot: Robot, values: Mapping[str, float]) -> Robot:
 def rig_lines(rig: Rig) -> tuple[list[str], dict[str, list[str]]]:
     """Lines of a robot file that state a rig: those of its head, then those of each table."""
     head = [
-        f'imposed = "{rig.imposed}"  # on the drives: {", ".join(IMPOSED)}',
+        f'imposed = "{rig.imposed}"  # what sets the drives, one of {", ".join(IMPOSED)}',
         f"channels = {toml_value(list(rig.channels))}  # what its instruments show",
         f'start = "{rig.start}"  # of histories: rest, measured or free',
         f'between_rows = "{rig.between_rows}"  # what is imposed, in histories: held or linear',

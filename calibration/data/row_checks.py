@@ -225,8 +225,8 @@ def without_clamped(name: str, columns: Columns, kept: np.ndarray) -> tuple[Colu
     if "held" in columns and set(TIME) <= set(columns) and (held := columns.pop("held") > 0.5).any():
         if held.all():
             raise BadData(
-                f"{name}: held is 1 in every row, and rows follow too fast to be settled; log more slowly, or log "
-                "rows with a free output"
+                f"{name}: held is 1 in every row, and the rows are too close in time to be settled; log one row "
+                "for each settled state, or also rows in which the output is not clamped"
             )
         runs = columns.get("run_id", np.zeros(len(held), str))
         stretch = np.cumsum(np.append(0, np.diff(held.astype(int)) < 0)).astype(str)

@@ -105,18 +105,18 @@ class Inertia:
 
 @dataclasses.dataclass(frozen=True)
 class Stretch:
-    """Samples of a log that go together.
+    """Consecutive samples of a log that are judged as one run.
 
     Attributes:
-        run: name of.
+        run: name of the run.
         rows: indices in the table, in the order of time.
-        begin, end: of time [s].
+        begin, end: first and last time [s].
         why: empty for a settled run, else one of `REASONS`.
         channel: the channel to blame, if there is one.
-        size: size of its change, as a share.
+        size: relative size of its change [-].
         mean, sd: mean and standard deviation of each channel, by name [unit of the column]. Only for a settled run.
         drift: change of each channel over it, by name [unit].
-        imposed: mean of what drives the motors.
+        imposed: mean of the imposed quantity: voltage, speed or current.
         glitches: readings of each channel that its mean leaves out, by name. Only channels that have some.
     """
 
@@ -582,7 +582,8 @@ def _settled_end(
 
 
 def _best_end(signals: tuple[Signal, ...], time: np.ndarray, rows: np.ndarray, shortest: float, drift: float) -> _End:
-    """The end of a level whose means are most certain: a longer one has less noise, a shorter one changes less."""
+    """Final part of a level, of the length with the most certain means: a longer part averages out more noise, a
+    shorter one drifts less."""
     parts = _level_parts(time[rows], shortest)
     first = _first_steady(signals, rows, parts, drift)
     last = max(len(parts) - 3, first)
@@ -929,8 +930,8 @@ def _nothing_settled_message(found: Settled, loop: str) -> str:
         )
     imposed = found.runs.layout.imposed_column
     others = {
-        "idle": f"{imposed}: nothing drives the motors; log rows with a command, or name its column under "
-        "[columns] in the rig's file",
+        "idle": f"{imposed} is about zero, so nothing drives the motors; log rows in which they are driven, or, if "
+        "another column has the command, name that one under [columns] in the rig file",
         "rest": "no level shows motion above the noise; use larger commands",
         "stuck": f"{longest.channel} shows the same number for a long time: saturated or frozen; repair the "
         "instrument or change its range",

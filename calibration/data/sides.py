@@ -25,7 +25,7 @@ def supply_and_shares(volts: np.ndarray, supply: np.ndarray | None = None) -> tu
     """Returns the supply's voltage [V], by default the larger of both sides', and the share of each side.
 
     Args:
-        volts: of left and right side [V], shape (2, rows).
+        volts: voltages of left and right side [V], shape (2, rows).
         supply: shape (rows,).
     """
     source = np.max(np.abs(volts), 0) if supply is None else supply

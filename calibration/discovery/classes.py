@@ -254,9 +254,9 @@ def ammeter_families(
     the torque, by enough over its noise, separates a loss from an error of the ammeter.
 
     Args:
-        jacobian, residual: of the fit without the effects.
-        columns: of the effects over the readings.
-        family: of the effects.
+        jacobian, residual: Jacobian and residual of the fit without the effects.
+        columns: columns of the effects over the readings.
+        family: family of the effects.
     """
     names = channels.channel_names(space.bare.channels)
     if space.bare.base.rig.imposed != "motor_speed":

@@ -843,7 +843,7 @@ def verdict_summary(traced: LoopStages, numbers: np.ndarray) -> Summary:
 
 
 def missing_effects(space: CandidateSpace, alike: Classes, support: NameSupport | None) -> tuple[Missing, ...]:
-    """Effects in the model, each with its alternatives and whether it is established."""
+    """Effects that the search added to the model, each with its alternatives and whether it is established."""
     c, p = space.coordinates.base, space.free
     return tuple(
         Missing(

@@ -201,7 +201,7 @@ def curve_families(
         weight: 0 for excluded rows, shape (rows,), or of points (see `Linearization`).
         robot: its channels and balances are searched.
         scope: None takes `Scope.of` the robot.
-        ways: of each point, shape (rows,). None: all forward.
+        ways: direction of travel of each point, shape (rows,). None: all forward.
     """
     scope = (Scope.of(robot) if scope is None else scope).over(columns)
     balances = scope.balances

@@ -38,7 +38,8 @@ TORQUE = channels.find_channel("output_torque")
 
 
 def unused_notes(runs: Runs) -> tuple[Remark, ...]:
-    """A note on the columns of numbers that vary and have no role, without row numbers and times."""
+    """Remark that lists the numeric columns that vary and are not used, other than row numbers and times. Empty if
+    there are none."""
     columns = tuple((name, runs.layout.nearest(name, runs.columns)) for name in unused_columns(runs))
     return (Remark("unused", source=runs.source, columns=columns),) if columns else ()
 

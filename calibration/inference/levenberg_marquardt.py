@@ -42,7 +42,7 @@ Function = Callable[[Z, Any], tuple[Float[Array, " residuals"], Any]]
 
 @jax.custom_jvp
 def with_slope(y: Array, value: Array, slope: Array) -> Array:
-    """Returns `value` with `slope` as its derivative by y.
+    """Returns `value` with `slope` as its derivative with respect to y.
 
     Args:
         y: shape (n,).

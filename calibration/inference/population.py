@@ -77,7 +77,7 @@ class Population:
     Attributes:
         z: coordinates, shape (members, parameters).
         reading: reading of each row [SI], shape (members, rows, channels).
-        adhesion_used, status, flags: of each row, shape (members, rows).
+        adhesion_used, status, flags: values of each row, shape (members, rows).
         cost: objective with the final noise of the search [½σ²], inf for members without one.
         generations: generations in order.
     """

@@ -66,7 +66,7 @@ def data_from_readings(measured: np.ndarray, sd: np.ndarray, parameters: int) ->
 
     Args:
         measured: [SI], NaN for missing readings.
-        sd: of each, shapes (rows, channels).
+        sd: standard deviation of each, shapes (rows, channels).
         parameters: number of free parameters.
     """
     finite = np.isfinite(measured)

@@ -149,7 +149,7 @@ class ChannelErrors:
 
     Attributes:
         rows: number of rows.
-        rms_percent, max_percent: rms errors and largest error of the channel's measured rms.
+        rms_percent, max_percent: rms error and largest error, in percent of the channel's measured rms.
         rms_sigma: rms error in sds of the noise.
         rms: rms error in the channel's unit.
     """
@@ -247,7 +247,7 @@ class CalibrationResult:
 
     Attributes:
         robot: calibrated.
-        source: of the runs.
+        source: file of the runs.
         channels: channels of the readings, in order.
         model: the fidelity.
         seed: seed of the starts.
@@ -255,7 +255,7 @@ class CalibrationResult:
         tied: those tied to them, by name: the free one, and the ratio that they keep to it.
         noise: by channel.
         axis: column that orders the rows of a run.
-        errors_before, errors_after: of the robot as given and as calibrated, by channel.
+        errors_before, errors_after: errors of the robot as given and as calibrated, by channel.
         held_out: by kind of block, the most informative first.
         conditions: columns of the runs, as in their table.
         readings: by channel.

@@ -140,13 +140,13 @@ class Rows(eqx.Module):
         shown: readings [SI], means of their rows.
         sd: standard deviation of these means.
         rate: slope of the channel of the motion, if that is an angle [SI/s].
-        way: of travel, 0 if it may be at rest.
+        way: direction of travel, 0 if it may be at rest.
         angle: angle of the output since the run's first row [rad].
         since: time since the point before [s], 0 for the first of a run.
         time: time since the run's start [s].
         first: a row of the table at the point.
         delay: delay of the rig, at which the conditions were taken [s].
-        drift: their derivatives by the delay, by field.
+        drift: their derivatives with respect to the delay, by field.
         reach: change of the delay within which these hold [s].
         memory: memory of the robot's effects that have one, by their names.
     """
@@ -243,7 +243,7 @@ def windows_of_run(time: np.ndarray, piece: np.ndarray, length: float) -> list[t
 
     Args:
         time: time of the points [s], increasing.
-        piece: of each, -1 for points in no window. A window is within one piece.
+        piece: number of the piece of each point, -1 for points in no window. A window is within one piece.
         length: length of a window [s]. A shorter piece has one window of its own length.
     """
     windows = list[tuple[np.ndarray, np.ndarray]]()
@@ -323,7 +323,8 @@ class _Log:
         self.step = float(np.median(np.concatenate(long))) if long else 1.0
 
     def motion(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-        """Time and speed over rows of a run, in any unit, and the sd of its noise."""
+        """Time and speed in some rows of a run, and the sd of the noise of the speed. Speed is in the unit of the
+        reading."""
         plan, time = self.plan, self.time[rows]
         if not plan.mechanical:
             return time, np.asarray(self.of_rows.motor_speed)[rows], 0.0

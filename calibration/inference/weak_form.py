@@ -276,7 +276,8 @@ def simulated_rows(problem: Problem, plan: Plan, rows: Rows, z: Array) -> Rows:
 
 @functools.partial(compiled, options=SELDOM)
 def _row_terms(problem: Problem, plan: Plan, rows: Rows, z: Array, effects: tuple[ScoredEffect, ...]) -> Terms:
-    """Returns the terms of each row at coordinates z, with derivatives by base parameters, readings and effects."""
+    """Returns the terms of each row at coordinates z, with derivatives with respect to base parameters, readings
+    and effects."""
     entering = tuple(dict.fromkeys(e.effect.balance for e in effects if e.effect.balance != "sensor"))
     probes = tuple(balance_probe(b) for b in entering)
     size, names = z.size, channels.channel_names(problem.channels)
@@ -380,7 +381,7 @@ class Delay:
 
 @functools.partial(compiled, options=SELDOM)
 def _by_coordinates(problem: Problem, plan: Plan, rows: Rows, z: Array) -> Array:
-    """Terms f, y and their derivatives by z, shape (2, rows, equations, 1 + coordinates)."""
+    """Terms f, y and their derivatives with respect to z, shape (2, rows, equations, 1 + coordinates)."""
 
     def one(row: Rows) -> Array:
         def of(z: Array) -> tuple[Array, Array]:
@@ -587,7 +588,8 @@ def _integrated(plan: Plan, w: Windows, f: np.ndarray, y: np.ndarray) -> np.ndar
 
 
 def _slopes(plan: Plan, w: Windows, equations: int) -> list[np.ndarray]:
-    """Weights of y of each equation in the windows."""
+    """Factor of y in the windows of each equation: the derivative of the window, from integration by parts. For the
+    equation of an angle reading, minus its second derivative."""
     return [-w.bend if plan.angle and k == plan.electrical else w.slope for k in range(equations)]
 
 

@@ -77,7 +77,8 @@ def local_derivatives(study: Study) -> Local:
 
 
 def _by_inputs(inputs: Inputs, by_columns: np.ndarray) -> np.ndarray:
-    """Derivatives by inputs, shape (points, inputs), from those by columns. Tied parameters follow their leader."""
+    """Derivatives with respect to inputs, shape (points, inputs), from those by column. Tied parameters follow their
+    leader."""
     by_inputs = by_columns[:, inputs.places].copy()
     for j, (_, leader, ratio) in enumerate(inputs.parameters.tied):
         by_inputs[:, leader] += ratio * by_columns[:, len(inputs.parameters) + j]

@@ -241,7 +241,8 @@ class SensitivityResult:
         return tuple(self.inputs)
 
     def importance(self) -> np.ndarray:
-        """Largest share of each input over all outputs and points, upper ends of intervals, shape (inputs,)."""
+        """Largest share of the variance that each input causes, over all outputs and points, shape (inputs,). Shares
+        at single points count with the upper ends of their intervals."""
         most = np.zeros(len(self.inputs))
         for study in self.outputs.values():
             ends = [study.overall_share]

@@ -310,7 +310,7 @@ class _Designs:
     """Designs with their objectives and margins.
 
     Attributes:
-        rows: of the choice of parts, shape (designs,).
+        rows: row numbers of the choice of parts, shape (designs,).
         x: logarithms of ratio, radius and cells in parallel, shape (designs, 3).
         f, g: objectives and margins, shapes (designs, objectives) and (designs, limits).
     """

@@ -123,11 +123,11 @@ def _doing(run: menu.Run) -> str:
 
 
 def heated_winding(temperature: float, allowed: float | None) -> str:
-    """What becomes of a winding left on.
+    """Phrase for how hot a winding gets that stays energised.
 
     Args:
-        temperature: after long running, infinite if none settles.
-        allowed: limit, None if unknown [°C].
+        temperature: steady-state temperature, infinite if there is none [°C].
+        allowed: permitted temperature, None if unknown [°C].
     """
     settles = math.isfinite(temperature)
     would = f"would reach {temperature:.0f} °C" if settles else ("would burn out, as its temperature never settles")

@@ -416,7 +416,8 @@ def how_sure(found: DiscoveryResult, effect: FoundEffect) -> str:
 
 
 def brief_answer(found: DiscoveryResult, moved: Sequence[str], next_step: str) -> Names:
-    """Lines after the answer: what moved and what was added, errors with their rows, and the next step.
+    """Lines printed below the answer: parameters far from their stated values, effects added, errors with the number
+    of rows, and the next step.
 
     Args:
         moved: sentences on parameters far from their stated values.

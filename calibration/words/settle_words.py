@@ -84,7 +84,10 @@ def too_few(found: Settled, fewest: int, loop: str) -> str:
     if len(found.kept) >= fewest:
         return ""
     if found.runs.turns:  # over time a turn is simulated, and not fitted
-        return f"The loop needs {fewest} settled runs: hold more levels on both sides, or hold them longer."
+        return (
+            f"The loop needs {fewest} settled runs: hold more levels of the left and right command, or hold each "
+            "longer."
+        )
     return (
         f"The loop needs {fewest} settled runs, so run it on the log as it is: {loop}. With calibrate instead of "
         "loop, only the parameters are fitted."

@@ -176,10 +176,9 @@ def best_levers(robot: Robot, conditions: Conditions, pitch: Scalar) -> tuple[Sc
 def best_step(robot: Robot, conditions: Conditions) -> tuple[StepLimit, Scalar, Scalar]:
     """The highest step of one run in any posture within the levers' range, and the angles of front and rear levers.
 
-    The derivatives are those at these angles [rad]. The step is a limit for any slow sequence of postures if the wall
-    of the step carries no load. When the tail leaves the lower ground, the centre of mass must be over the step, and
-    the step is no higher than in the best posture. Only the pitch is searched. The levers' angles follow
-    (`best_levers`).
+    In derivatives the angles [rad] are constants. The step is a limit for any slow sequence of postures if the riser
+    carries no load: when the tail leaves the lower ground, the centre of mass must be over the step, and no posture
+    allows a higher step then. Only the pitch is searched. The levers' angles follow from it (`best_levers`).
     """
     still, run = jax.lax.stop_gradient((robot, conditions))
 

@@ -88,8 +88,8 @@ class QuantityValue(eqx.Module):
     """Value of a quantity at one point.
 
     Attributes:
-        value: [SI], a number at any outcome.
-        outcome: code into `STATUSES`. The value is valid if it is `converged`.
+        value: value [SI], a number for every outcome, not NaN.
+        outcome: index into `STATUSES`. The value is valid only for `converged`.
     """
 
     value: Float[Array, "..."]

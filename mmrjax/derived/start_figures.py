@@ -40,7 +40,7 @@ class StartStages:
         slipping: end of the second stage [s]: the slide stays within V_s from here, `starting` if it never left.
         settled: t' [s]: the speed is within 1 % of its last value, the mean over the last 0.15 s.
         end: end of the run [s].
-        slip: of each stage, and over_settling: from 0 to t', by `mean_slip` [-], NaN for a stage of no length.
+        slip: slip of each stage, and over_settling: from 0 to t', by `mean_slip` [-], NaN for a stage of no length.
     """
 
     sense: float

@@ -318,9 +318,9 @@ class AngleFriction(Periodic, TrackEffect):
     A bent shaft, a bearing or a guide that is tight at one place in each turn.
 
     Source: Popović and Goldenberg, Modeling of friction using spectral analysis, IEEE Trans. Robotics and Automation
-    14 (1998) 114: friction of a joint over its angle, here its first order. If a history begins at a measured angle,
-    the phase is that of the shaft, else of the start of each run. As friction it reverses with the speed. An
-    amplitude as large as M_t0 would not be a loss at every angle.
+    14 (1998) 114: friction of a joint over its angle, here its first order. If the log measures the angle, φ
+    refers to the zero of that angle, otherwise to the start of each run. As friction, it changes sign with the
+    speed. An amplitude as large as M_t0 would not be a loss at every angle.
     """
 
     driver = "angle"

@@ -333,7 +333,7 @@ class _Part(eqx.Module):
         turn: 0 for the whole step, 1 to `TURNS` for iterations of the part before rest. Then `WAITS` while friction
             still holds the shaft, and the remaining part.
         begin: unknowns at its start.
-        lag: of the current there.
+        lag: lag of the current at its start.
         since, length: start and length of the part [s]. side, then: direction in which a shaft turns, and after it
         has waited. before, stages, end: see `RunStates`.
     """

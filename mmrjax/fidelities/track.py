@@ -48,7 +48,13 @@ JUMPS, ALOFT = 0.01, 0.01
 
 
 class Record(eqx.Module):
-    """One sample of a run: motion and loads at its end, means over it (`guided`: of the guides' load)."""
+    """One sample interval of a run.
+
+    Attributes:
+        motions, reactions: motion and loads at its end.
+        passed: means over it.
+        guided: mean load of the guides over it.
+    """
 
     motions: Motion
     passed: Signals | balances.Travel

@@ -73,7 +73,7 @@ class MotionLaw(Protocol):
         STOPS: positions of unknowns that are 0 at rest.
         AT_REST: module for standing robots of its kind (`rest`, `turning`).
         RESULT: returns the result of a run at its end, from robot, instant and status.
-        UNITS: of the unknowns before the memories of effects.
+        UNITS: units of the unknowns before the memories of effects.
         LONG: True if an instant takes long to compile.
     """
 
@@ -114,7 +114,8 @@ class MotionLaw(Protocol):
         ...
 
     def slowness(self, asked: SegmentInputs, y: Array, stands: Array) -> tuple[Scalar, Scalar]:
-        """Relative distance of shafts and sliding contacts below the speed at which friction is resolved [-]."""
+        """1 - |v| / limit of the shafts and of the sliding speeds of contacts, with the speed at which friction is
+        resolved as limit: 1 at rest, negative above it [-]."""
         ...
 
     def drawn(self, asked: SegmentInputs, y: Array, stands: Array) -> tuple[Scalar, Scalar]:

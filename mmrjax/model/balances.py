@@ -341,7 +341,9 @@ def _gearbox_signals(robot: Robot, chassis: Load, signals: Signals, load: Scalar
     inertia_added = effects_sum(robot, signals, "inertia")
     # Shafts without inertia get a very small one, which decides the direction of power and the torque transmitted.
     inertia_wheel = chassis.inertia + inertia_added
-    next_to_none = LEAST_INERTIA + at_least(inertia_wheel, 0.0)  # keeps the derivative by an added inertia
+    next_to_none = LEAST_INERTIA + at_least(
+        inertia_wheel, 0.0
+    )  # keeps the derivative with respect to an added inertia
     inertia_wheel = jnp.where(inertia_wheel < LEAST_INERTIA, next_to_none, inertia_wheel)
     through = gear.ratio * inertia_motor
     side = (drive * inertia_wheel + through * load) / (inertia_wheel + through)

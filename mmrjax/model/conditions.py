@@ -268,12 +268,12 @@ def sides_contradiction(stated: Collection[str]) -> str:
     They do if only one side's motor speed is imposed, or if a side's duty is stated together with that of both.
     """
     if {"duty", *OF_SIDES[:2]} <= {*stated}:
-        return f"duty: got it together with {' and '.join(OF_SIDES[:2])}; expected one of the two"
+        return f"duty cannot be combined with {' and '.join(OF_SIDES[:2])}; give one of the two"
     left, right = (name in stated for name in OF_SIDES[-2:])
     if left == right or "motor_speed" in stated:
         return ""
     stated_fields, lacking = OF_SIDES[-2:] if left else OF_SIDES[:-3:-1]
-    return f"{stated_fields}: got it without {lacking}; state both"
+    return f"{stated_fields} needs {lacking} too; give both"
 
 
 def _number_array(name: str, x: Any, kind: type = float) -> Any:

@@ -113,7 +113,8 @@ def blank_robot(configurations: Configurations, sides: float = 1.0, rig: Rig | N
 
 
 def _simplified_robot(track_torque: float) -> Robot:
-    """Constant losses as in Table A4. The wheeled chassis, which the table leaves out, in proportion."""
+    """Constant losses as in Table A4. The table leaves out the wheeled chassis: its track loss is scaled by 70/350,
+    the ratio of the Coulomb losses of the nominal robot."""
     constant = {
         "motor.friction_coulomb": 4.2e-3,
         "motor.friction_viscous": 0.0,

@@ -345,7 +345,7 @@ class Resonance(NamedTuple):
     Attributes:
         mode: natural vibration that confirms them. Empty: no such mode.
         speeds: least and greatest speed of the peaks [m/s].
-        avoid: of their widths.
+        avoid: least and greatest speed of their widths [m/s].
         frequencies: least and greatest of their lines [Hz].
         payloads: payloads of its peaks [kg].
         ripple: the largest [-].

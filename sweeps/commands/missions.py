@@ -262,7 +262,7 @@ def rows_to_keep(segment: np.ndarray, current: np.ndarray, most: int, marked: np
     """Rows of a course to keep, in order: the peak of current of each segment, marked rows, evenly spread ones.
 
     Args:
-        segment: of each row, not decreasing.
+        segment: number of the segment of each row, not decreasing.
         current: current of each row.
         most: rows to keep at most.
         marked: rows to keep, of many the last ones.

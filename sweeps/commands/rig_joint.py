@@ -77,7 +77,7 @@ class JointNumbers:
         return stated
 
     def numbers(self, kind: str) -> dict[str, Stated]:
-        """Lines of a rig's file of a kind, by dotted name."""
+        """Numbers for the file of a rig of this kind, by dotted name."""
         by_name: dict[str, Stated] = {}
 
         def put(name: str, unit: str, key: str, number: Found | None, source: str = "") -> None:
@@ -141,7 +141,7 @@ def hanging_torque_and_angle(torque: float, torque_quarter: float) -> tuple[floa
     """Largest torque of gravity M and angle θ_0 where it hangs, of -M sin(θ - θ_0) [N·m], [rad]. None: no weight.
 
     Args:
-        torque, torque_quarter: of gravity about the axis at θ = 0 and at a quarter turn [N·m].
+        torque, torque_quarter: torques of gravity about the axis at θ = 0 and at a quarter turn [N·m].
     """
     weight = math.hypot(torque, torque_quarter)
     angle = math.atan2(torque, -torque_quarter) + 0.0  # not -0.0, which the file would show
@@ -154,7 +154,7 @@ def is_round(centre: np.ndarray, axis: np.ndarray, radius: float, along: np.ndar
     Args:
         centre: centre from a point of the joint's axis.
         axis: axis of the joint.
-        along: of the cylinder, None: a sphere. Axes are unit vectors, shape (3,).
+        along: axis of the cylinder, None: a sphere. Axes are unit vectors, shape (3,).
     """
     off = np.linalg.norm(np.cross(axis, centre))
     tilted = 0.0 if along is None else np.linalg.norm(np.cross(axis, along))

@@ -12,7 +12,7 @@ from calibration.data.stated import HEADER
 #: Kinds of rig, in words.
 KINDS = {
     "bench": "a motor with gearbox that drives a shaft: brake, disk, worm, winch",
-    "dyno": "a motor against a brake with set and measured torque",
+    "dyno": "a motor on a dynamometer: a brake whose torque is set and measured",
     "pendulum": "a servo with an arm under gravity",
     "servo": "a servo driven by PWM, with its angle logged",
     "linear": "a carriage on a screw, a belt or a rope",

@@ -38,7 +38,7 @@ from sweeps.points.run import check_runs_bearable
 from sweeps.report import sensitivity_report
 from sweeps.store import finish_run_folder, open_folder, print_report
 
-#: Operating points where a sample is drawn at each: corners and middle of Table 8.
+#: Operating points of methods that draw a sample at each: ends of Table 8, and the middle of its slopes.
 CORNERS = {
     "voltages_V": (VOLTAGES_V[0], VOLTAGES_V[-1]),
     "payloads_kg": (PAYLOADS_KG[0], PAYLOADS_KG[-1]),

@@ -203,7 +203,8 @@ def c_header(joint: Joint, found: Map, notes: Sequence[str]) -> str:
     words = (" ".join(printable(text).split()) for text in (origin, *notes))
     about = "\n * ".join(text.replace("*/", "* /").replace("/*", "/ *") for text in words)
     return f"""/* {about}
- * duty = {name}_get_voltage(speed, torque) / supply voltage; torque is that of the joint without its inertia.
+ * duty = {name}_get_voltage(speed, torque) / supply voltage; torque is that of steady motion.
+ * When accelerating, add armature * acceleration to it.
  */
 #ifndef {guard}
 #define {guard}

@@ -82,7 +82,7 @@ def export_format(
         data: runs, or the file of a table or log. None: a grid of operating points.
         at: name of the joint in the simulator's model.
         draws, seed: draws and seed of `randomization`.
-        posterior: of the robot. None: from the folder of its file.
+        posterior: posterior of the robot. None: that from the folder of its file.
 
     Raises:
         BadConfiguration, BadData: a format, a drive or a table that is refused.

@@ -49,8 +49,8 @@ class Part:
         unit: unit of its value.
         equation, meaning: equation and meaning in words, from the docstring of what it is made of.
         value: as an expression.
-        slope: its derivative by the variable `by`.
-        rate, rate_slope: of its memory.
+        slope: its derivative with respect to the variable `by`.
+        rate, rate_slope: rate of its memory, and the derivative of the rate with respect to the memory.
         effect: name of the effect that it is of. Empty: of the robot's base.
     """
 

@@ -204,11 +204,11 @@ def functions_text(joint: Joint, dialect: Dialect) -> str:
         document = f"{part.equation.rstrip('.')}{unit}. {meaning}".strip()
         texts.append(_function(part.name, part.value, document, dialect))
         if part.by:
-            what = f"Derivative of `{part.name}` by `{part.by}`."
+            what = f"Derivative of `{part.name}` with respect to `{part.by}`."
             texts.append(_function(f"{part.name}_slope", part.slope, what, dialect))
         if part.rate is not None:
             texts.append(_function(f"{part.name}_rate", part.rate, f"Rate of the memory of `{part.name}`.", dialect))
-            what = f"Derivative of that rate by the memory of `{part.name}`."
+            what = f"Derivative of `{part.name}_rate` with respect to the memory of `{part.name}`."
             texts.append(_function(f"{part.name}_rate_slope", part.rate_slope, what, dialect))
     return "\n\n\n".join(texts)
 

@@ -48,7 +48,7 @@ class Situation:
 
     Attributes:
         joint: the drive.
-        source: of the runs, in words.
+        source: source of the runs, in words.
         runs: the table, its rows chosen.
         conditions: conditions of all rows of the table.
         kept: True for compared rows.

@@ -38,7 +38,7 @@ def draw_mission_course(rows: Columns, cycle: float | None, limit: float, linear
     """A run over its profile, a row a subject. With several cycles, the first one is also drawn.
 
     Args:
-        rows: of history.csv, of one run.
+        rows: rows of history.csv of one run.
         cycle: end of its first cycle [s], None where it has one only.
         limit: limit of the winding's temperature [°C].
         linear: whether the profile's values are, between rows.
@@ -75,7 +75,7 @@ def of_sides(rows: Columns) -> Figure:
     """Current and duty of either side, and the yaw rate, over time.
 
     Args:
-        rows: of history.csv, of one run with sides.
+        rows: rows of history.csv of one run with sides.
     """
     fig, grid = new_figure(3, 1, 6.4, sharex=True)
     span = float(rows["time_s"][-1])

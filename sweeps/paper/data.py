@@ -87,7 +87,7 @@ class Rows:
         plain: this robot on its own adhesion, mass as printed.
         raised: the same on the raised adhesion.
         weighed: raised, and with the robot's own mass instead of the printed one.
-        ratio: raised adhesion over the robot's own, by configuration.
+        ratio: factor by which adhesion is raised, by configuration.
     """
 
     conditions: runs.Runs
@@ -364,7 +364,7 @@ def energy_split(robot: Robot, asked: Conditions) -> tuple[Columns, Columns]:
 
 
 class EnergyUse(NamedTuple):
-    """Use of the supply's power at operating points.
+    """Breakdown of the supply's power at operating points.
 
     Attributes:
         labels: labels of the points, with a star where the robot slides on its own adhesion, so that it is raised.
@@ -380,10 +380,10 @@ class EnergyUse(NamedTuple):
 
 
 def energy_use(robot: Robot, ratio: dict[str, float]) -> EnergyUse:
-    """Use of the supply's power at twelve operating points.
+    """Breakdown of the supply's power at twelve operating points.
 
     Args:
-        ratio: raised adhesion over the robot's own, by configuration.
+        ratio: factor by which adhesion is raised where the robot would slide, by configuration.
     """
     asked = [(c, u, p, s) for c in ratio for u, p in ((15.0, 0.0), (33.0, 8.0)) for s in (0.0, 10.0, 20.0)]
     kind, voltage, payload, slope = (np.array(v) for v in zip(*asked, strict=True))

@@ -136,7 +136,7 @@ _SPLIT_COLOURS = {
 
 
 def draw_energy(used: data.EnergyUse) -> Figure:
-    """Use of the supply's power at twelve operating points, in percent, with watts at the end."""
+    """Breakdown of the supply's power at twelve operating points, in percent, with watts at the end."""
     fig, grid = new_figure(1, 1, 5.2)
     axes = grid[0, 0]
     height = [float(k) + 0.6 * (k // 3) for k in range(len(used.labels))]

@@ -288,7 +288,9 @@ def _samples(stated: Json, robot: Robot, where: str, data: list[str]) -> Samples
     if "posterior" in stated:
         joint = _posterior(stated["posterior"], robot, f"{where}.posterior", data)
     if not marginals and joint is None:
-        raise BadConfiguration(f"{where}: got no names; expected over, or a posterior")
+        raise BadConfiguration(
+            f"{where}: nothing to sample; give a table `over` of names and distributions, or `posterior`"
+        )
     return Samples(design, number, seed, marginals, joint)
 
 

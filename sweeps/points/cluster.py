@@ -41,7 +41,7 @@ class Pool:
     """A scheduler with its workers.
 
     Attributes:
-        client: of dask.
+        client: client of dask.
         device: kind of the workers' devices.
     """
 
@@ -262,7 +262,7 @@ def program_identity() -> dict[str, dict[str, str]]:
 
 @functools.cache
 def _start_worker() -> None:
-    """Compiled programs are kept, as in the command itself."""
+    """Prepares a worker process: compiled programs are kept, as in the main process."""
     from sweeps import compilation_cache
 
     compilation_cache.keep_programs()
@@ -281,7 +281,7 @@ def compute_on_worker(work: bytes, name: str, chunk: int, expected: Json) -> Col
 
     Args:
         work: the job, packed.
-        name: of it.
+        name: name of the job.
         expected: program and device of the other workers.
 
     Raises:

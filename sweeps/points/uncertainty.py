@@ -114,7 +114,7 @@ def interval_remarks(found: Intervals, place: str = "runs.csv") -> list[str]:
     if lost.any():
         share = 100 * (1 - found.columns[SHARE].min())
         remarks.append(
-            f"at {int(lost.sum())} of {len(lost)} runs up to {share:.0f} % of the draws do not converge; "
+            f"in {int(lost.sum())} of {len(lost)} runs, some draws do not converge (up to {share:.0f} %); "
             "intervals use the others"
         )
     return remarks

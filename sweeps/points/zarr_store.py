@@ -150,7 +150,7 @@ class Variable:
 
     Attributes:
         name: name of the array.
-        dtype: data type in NumPy's words.
+        dtype: data type in NumPy's notation, such as `<f8`.
         attributes: units, long_name and the like.
     """
 

@@ -91,19 +91,19 @@ class Observer(eqx.Module):
     Attributes:
         conditions: conditions of each run, shape (runs,). Conditions that change within a history, at each of its
             instants.
-        word: name of a row.
+        word: noun for a row in messages.
         fewest: rows needed to separate a missing effect from noise.
         axis: column of a table that orders the rows of a run, empty if a run is one row.
         sizes_padded: numbers of rows to which tables are padded, so that those of similar size share compiled
-            programs. Beyond the last one, to a multiple of it, empty for no padding.
+            programs. Larger tables are padded to a multiple of the last one. Empty for no padding.
         blocks: kinds of blocks to hold out, the most informative first.
         policy: options of batched fits.
-        rows_tell: True if a single row shows a defect.
+        rows_tell: True if one row alone can reveal a missing effect.
         evidence: kinds of evidence for a missing effect.
         library: effects that such data show in addition to the library's.
         menu: True if the menu of experiments has runs of this kind.
-        searches: searches of a calibration. None takes the fidelity's.
-        profiled: True if its parameters are profiled when the fidelity's are.
+        searches: number of starts of a calibration. None: the default of the fidelity.
+        profiled: False if parameters are never profiled for this kind, whatever the fidelity states.
     """
 
     conditions: eqx.AbstractVar[Conditions]

@@ -1167,7 +1167,7 @@ def _evaluator(problem: Problem, weights: Numbers, active: Numbers | None) -> Ev
     """Function that evaluates members of a search, `TOGETHER` in a call, with calls in parallel on the cores.
 
     Args:
-        weights, active: of each member, see `Histories.search`.
+        weights, active: values for each member, see `Histories.search`.
     """
 
     weights, made = np.asarray(weights), threading.Event()

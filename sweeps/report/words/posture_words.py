@@ -46,7 +46,7 @@ class StepMap:
     """Highest steps and margins of tipping over angles of the levers.
 
     Attributes:
-        angles_deg: of front and rear. step_mm, margin_mm (at rest on the run's slope): shape (front, rear).
+        angles_deg: of front and rear levers. step_mm, margin_mm (at rest on the run's slope): shape (front, rear).
         best: the highest, drawn.
         front_deg, rear_deg: there.
         own_deg: the run's own angles, front and rear.
