@@ -39,14 +39,18 @@ def test_the_combination_is_the_one_that_varies_least(correlation, kinds, spread
     combined = {"ratio": np.log(a / b), "product": np.log(a * b), "linear": a + pair.weight * b}[form]
     alone = a if form == "linear" else np.log(a)
     assert np.std(combined) < 0.2 * np.std(alone)
-    assert [describe(Determination.of(n, False, (pair,))) for n in "abc"] == ["only with b", "only with a", "yes"]
+    assert [describe(Determination.from_pairs(n, False, (pair,))) for n in "abc"] == [
+        "only with b",
+        "only with a",
+        "yes",
+    ]
 
 
 def test_a_pair_that_priors_hold_or_that_hardly_trades_is_none():
     assert determined_together(posterior(0.94, (LOG, LOG))) == ()
     assert determined_together(posterior(0.99, (LOG, LOG)), held=("a", "b")) == ()
     (pair,) = determined_together(posterior(0.99, (LOG, LOG)), held=("a",))  # b is known by the prior of a
-    assert describe(Determination.of("a", True, (pair,))) == "only with b"
-    assert describe(Determination.of("c", True, (pair,))) == "no" and undetermined_names(("a", "c"), (pair,)) == (
-        "c",
-    )
+    assert describe(Determination.from_pairs("a", True, (pair,))) == "only with b"
+    assert describe(Determination.from_pairs("c", True, (pair,))) == "no" and undetermined_names(
+        ("a", "c"), (pair,)
+    ) == ("c",)

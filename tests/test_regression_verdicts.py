@@ -66,7 +66,7 @@ def answered(tmp_path_factory):
         runs = Runs("log.csv", log(**faults)).of(robot)
         sd = np.broadcast_to(SD[[0 if c.name == "motor_speed" else 1 for c in runs.channels]], runs.measured().shape)
         space = discover.pose_candidates(runs, robot, sd, SETTINGS, {}, library)
-        return findings.rank_by_weak_form(space, screening.screen_by_weak_form(space, SETTINGS), SETTINGS)
+        return findings.rank_effects_by_weak_form(space, screening.screen_by_weak_form(space, SETTINGS), SETTINGS)
 
     return of
 

@@ -99,7 +99,7 @@ def test_base_parameters_are_those_of_the_log(space, before):
 
 
 def test_the_effect_of_the_log_is_ranked_first_and_not_by_chance(space, before):
-    found = findings.rank_by_weak_form(space, before, SETTINGS)
+    found = findings.rank_effects_by_weak_form(space, before, SETTINGS)
     assert found.missing and found.windows == before.windows > 0
     assert "churning" in [e.name for e in found.effects[:2]]
     assert found.effects[0].score > found.chance
@@ -220,7 +220,7 @@ def test_a_current_or_a_speed_may_be_imposed(tmp_path, imposed, channel):
     names, value = mine.coordinates.base.names, mine.coordinates.base.value(found.base.z[: mine.free])
     ratio = value[names.index("motor.inertia")] / value[names.index("motor.torque_constant")]
     assert ratio == pytest.approx(TRUE["inertia"] / TRUE["torque_constant"], rel=0.03)
-    ranked = findings.rank_by_weak_form(mine, found, SETTINGS)
+    ranked = findings.rank_effects_by_weak_form(mine, found, SETTINGS)
     assert imposed == "motor_speed" or "churning" in [e.name for e in ranked.effects[:2]]
 
 

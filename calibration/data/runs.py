@@ -205,7 +205,7 @@ def _column_values(
         if battery and meaning.column == SUPPLY and layout.imposed == "voltage":
             _refuse_stated(arrays, raw)
         elif meaning.column in layout.idle:
-            _refuse_idle(arrays, meaning, raw, layout)
+            _reject_condition_without_effect(arrays, meaning, raw, layout)
         else:
             columns[meaning.column], refused = column_names.convert_column(meaning, raw, layout)
             wrong = np.flatnonzero(refused).tolist()
@@ -274,7 +274,7 @@ def _extra(raw: Raw) -> np.ndarray:
     return numbers if missing_readings(raw, lost).all() else np.array(raw)
 
 
-def _refuse_idle(arrays: NamedArrays, meaning: Column, raw: Raw, layout: Layout) -> None:
+def _reject_condition_without_effect(arrays: NamedArrays, meaning: Column, raw: Raw, layout: Layout) -> None:
     """Rejects a condition that does not act on the robot's load, unless it is 0 or not stated."""
     why = (
         f"{NO_BRAKE}; give slope_deg or payload_kg, or describe the load as a shaft"

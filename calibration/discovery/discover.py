@@ -270,7 +270,7 @@ class LoopInput:
             space, near = space.with_room(before.space.room), before.candidate
         else:
             if (ranking := screen_by_weak_form(space, self.settings)) is not None:
-                make = functools.partial(findings.rank_by_weak_form, space, ranking, self.settings)
+                make = functools.partial(findings.rank_effects_by_weak_form, space, ranking, self.settings)
                 ranked.append(self.keep("ranking", make))
                 begins = {c.active: c.z for c in [c for c in ranking.alone if c.plausible][:1]}
                 space, near = dataclasses.replace(space.with_room(ranking.room), begins=begins), ranking.base

@@ -290,7 +290,7 @@ def rank_library(space: CandidateSpace, left: Diagnosis, settings: Settings) -> 
     return Ranking(test.rejected, test.p_value, test.threshold("single") ** 2, listed)
 
 
-def rank_by_weak_form(space: CandidateSpace, known: Beforehand, settings: Settings) -> Ranking:
+def rank_effects_by_weak_form(space: CandidateSpace, known: Beforehand, settings: Settings) -> Ranking:
     """Ranking by the equations of the log in weak form, before any simulation."""
     p = single_p_value(float(np.max(known.scores.single**2)), known.null)
     chance = float(np.quantile(known.null, 1 - settings.family_wise_error, method="higher")) ** 2

@@ -137,11 +137,11 @@ def prefer_by_held_out(
         if sound:
             led = tuple(dataclasses.replace(a, leads=j == k) for j, a in enumerate(table))
             searched = dataclasses.replace(searched, best=leader, diagnosis=diagnosis)
-            return searched, _classes_of_leader(space, best, leader, alike, settings), led
+            return searched, _classes_led_by(space, best, leader, alike, settings), led
     return searched, alike, table
 
 
-def _classes_of_leader(
+def _classes_led_by(
     space: CandidateSpace, best: Candidate, leader: Candidate, alike: Classes, settings: Settings
 ) -> Classes:
     """Classes of another leader, with its effect first in its class. Missing members are fitted."""

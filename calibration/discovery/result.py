@@ -374,7 +374,7 @@ class Resolved:
         return tuple(name for name, e in self.constants.items() if not e.held_by_prior)
 
     @property
-    def explains(self) -> bool:
+    def gear_explains_discrepancy(self) -> bool:
         """True if a running gear within its priors explains the discrepancy significantly."""
         return self.p < RESOLVED_ERROR and not self.outside
 

@@ -78,7 +78,7 @@ class Determination(NamedTuple):
     others: Names
 
     @classmethod
-    def of(cls, name: str, held: bool, pairs: Iterable[Pair]) -> Determination:
+    def from_pairs(cls, name: str, held: bool, pairs: Iterable[Pair]) -> Determination:
         """Determination of a parameter, from the pairs that data determine only in combination."""
         return cls(held, tuple(p.other if p.one == name else p.one for p in pairs if name in (p.one, p.other)))
 

@@ -332,7 +332,7 @@ class CalibrationResult:
 
     def determined(self, name: str) -> str:
         """`yes`, `no`, or with which parameters together these data determine one."""
-        return describe(Determination.of(name, self.parameters[name].held_by_prior, self.together))
+        return describe(Determination.from_pairs(name, self.parameters[name].held_by_prior, self.together))
 
     @property
     def counts(self) -> dict[str, int]:

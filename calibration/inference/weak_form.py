@@ -251,8 +251,8 @@ def simulated_rows(problem: Problem, plan: Plan, rows: Rows, z: Array) -> Rows:
 
         def rates(x: Array) -> tuple[Array, tuple[Array, Signals]]:
             signals = _rolling_signals(plan, robot, row, x[0], jnp.append(x, reading[count:])[1])[0]
-            rate = [signals.acceleration_wheel * robot.gearbox.ratio, signals.voltage_left][:count]
-            stacked = jnp.stack([jnp.asarray(r, float) for r in rate])
+            state_rates = [signals.acceleration_wheel * robot.gearbox.ratio, signals.voltage_left][:count]
+            stacked = jnp.stack([jnp.asarray(r, float) for r in state_rates])
             return stacked, (stacked, signals)
 
         slope, (rate, signals) = jax.jacfwd(rates, has_aux=True)(x)

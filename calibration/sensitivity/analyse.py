@@ -80,7 +80,7 @@ def analyse_sensitivity(
         next_runs=proposed,
         evaluations=study.evaluations,
         seconds=round(study.seconds, 3),
-        remarks=_remarks(study, method, outputs, idle),
+        remarks=_study_remarks(study, method, outputs, idle),
     )
 
 
@@ -156,7 +156,9 @@ def _none_converges(study: Study, statuses: dict[str, dict[str, int]]) -> str:
     )
 
 
-def _remarks(study: Study, method: str, outputs: dict[str, OutputStudy], idle: np.ndarray) -> tuple[Remark, ...]:
+def _study_remarks(
+    study: Study, method: str, outputs: dict[str, OutputStudy], idle: np.ndarray
+) -> tuple[Remark, ...]:
     remarks: list[Remark] = []
     alike: dict[tuple[bytes, bytes], list[OutputStudy]] = {}
     for o in outputs.values():

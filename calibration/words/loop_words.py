@@ -737,7 +737,7 @@ def track_model_answer(found: Resolved) -> str:
     )  # fmt: skip
     on = "" if found.settled else ("; the search has not converged: continue with --members and more --generations")
     slip = f"slip of the {found.rows} rows on tracks {before:.2g} → {after:.2g} points rms"
-    if not found.explains:
+    if not found.gear_explains_discrepancy:
         why = f"; {', '.join(found.outside)} outside" if found.outside else ""
         return (
             f"Track model, {track_model_question(found.asked)}: no running gear within its priors was found that "

@@ -155,17 +155,17 @@ def _on_belt(shape: Shape, terrain: Terrain, belt: Loop, frame: Frame, drawn: Sc
     points = frame.world(tips.at)
     gap, normal = terrain.distance(points)
 
-    def group(at: Array, gap: Array, normal: Array, rate: Array, place: Array) -> _Group:
+    def contact_group(at: Array, gap: Array, normal: Array, rate: Array, place: Array) -> _Group:
         guided = _guided_share(shape, place) if main else jnp.zeros_like(gap)
         return _Group(at, gap, normal, radius * rate, frame.turns, guided, bears * jnp.ones_like(gap))
 
-    groups = [group(points, gap, normal, frame.along(tips.rate), place)]
+    groups = [contact_group(points, gap, normal, frame.along(tips.rate), place)]
     corners = terrain.corners
     local = frame.within(corners)
     for near in (belt_loop.gaps_to_belt(belt, local), belt_loop.gaps_to_grousers(belt, drawn, local)):
         normal = -frame.along(near.normal)
         points = corners + terrain.nose * -normal
-        groups.append(group(points, near.gap - terrain.nose, normal, frame.along(near.rate), near.place))
+        groups.append(contact_group(points, near.gap - terrain.nose, normal, frame.along(near.rate), near.place))
     return groups
 
 

@@ -333,7 +333,7 @@ def _histories(
     return Run(runs.result, {"guide_share": runs.steady.guide_share}, history)
 
 
-def _check(robot: Robot, conditions: Conditions, options: Mapping[str, float]) -> None:
+def _check_time_step_and_conditions(robot: Robot, conditions: Conditions, options: Mapping[str, float]) -> None:
     check_track_runs(robot, conditions, duration=options["duration"], step=options["step"])
 
 
@@ -353,7 +353,7 @@ FIDELITY = Fidelity(
     settled=_settled,
     run=_run,
     histories=_histories,
-    check=_check,
+    check=_check_time_step_and_conditions,
     cautions=_too_stiff,
     columns=("guide_share",),
 )

@@ -209,10 +209,10 @@ def simulate_batch(
     """
     axes = jax.tree.map(lambda x: 0 if x.ndim == 2 else None, profile)
 
-    def one(conditions: Conditions, profile: Profile) -> Mission:
+    def mission_of_run(conditions: Conditions, profile: Profile) -> Mission:
         return mission(robot, conditions, profile, start, tolerance=tolerance, keep=keep)
 
-    return jax.vmap(one, in_axes=(0, axes))(conditions, profile)
+    return jax.vmap(mission_of_run, in_axes=(0, axes))(conditions, profile)
 
 
 def run_missions(robot: Robot, conditions: Conditions, profile: Profile) -> Run:

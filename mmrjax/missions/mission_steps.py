@@ -118,7 +118,7 @@ class MotionLaw(Protocol):
         resolved as limit: 1 at rest, negative above it [-]."""
         ...
 
-    def drawn(self, asked: SegmentInputs, y: Array, stands: Array) -> tuple[Scalar, Scalar]:
+    def supply_current_and_charge(self, asked: SegmentInputs, y: Array, stands: Array) -> tuple[Scalar, Scalar]:
         """Current that the motors take from the source [A], and the charge taken [C]."""
         ...
 
@@ -220,7 +220,7 @@ def _peak_between(before: Array, after: Array, rise: Array, fall: Array) -> Arra
 def _cell_above(law: MotionLaw, asked: SegmentInputs, y: Array, stands: Array) -> Scalar:
     """Margin of a cell above its cut-off [V]. Large on an external supply."""
     battery = asked.robot.battery
-    cell = battery.voltage_cell(*law.drawn(asked, y, stands))
+    cell = battery.voltage_cell(*law.supply_current_and_charge(asked, y, stands))
     return jnp.where(asked.conditions.battery > 0.5, cell - battery.voltage_cutoff, 10.0)
 
 
@@ -236,7 +236,7 @@ def event_functions(
     here = (robot, otherwise, segment, y, stands)
     firm, stays = compute_rarely(near, functools.partial(_holding_margins, law), here, (none, none))
     standing = smallest(slow, grips, stays - FIRMLY)
-    battery, discharge = asked.robot.battery, law.drawn(asked, y, stands)[1]
+    battery, discharge = asked.robot.battery, law.supply_current_and_charge(asked, y, stands)[1]
     empty = jnp.where(asked.conditions.battery > 0.5, (discharge / battery.capacity - 1) / OF_CHARGE, -1.0)
     above = _cell_above(law, asked, y, stands)
     falls, recovers = jnp.where(below, -1.0, -above / OF_CELL), jnp.where(below, (above - RECOVERED) / OF_CELL, -1.0)

@@ -153,7 +153,7 @@ def slowness(asked: SegmentInputs, y: Array, stands: Array) -> tuple[Scalar, Sca
     return 1 - jnp.abs(rolling) / load.speed_still, 1 - jnp.abs(rolling - state.speed) / load.speed_grip
 
 
-def drawn(asked: SegmentInputs, y: Array, stands: Array) -> tuple[Scalar, Scalar]:
+def supply_current_and_charge(asked: SegmentInputs, y: Array, stands: Array) -> tuple[Scalar, Scalar]:
     robot, state = asked.robot, state_of(asked.robot, y, stands)
     duty = robot.driver.duty_limited(balances.duty_given(robot, asked.conditions), state.current)
     motors = robot.sides * state.current * robot.driver.share_drawn(duty)

@@ -172,7 +172,7 @@ def slowness(asked: SegmentInputs, y: Array, stands: Array) -> tuple[Scalar, Sca
     return smallest(*slow), smallest(*grips, 1 - across / load.speed_grip)
 
 
-def drawn(asked: SegmentInputs, y: Array, stands: Array) -> tuple[Scalar, Scalar]:
+def supply_current_and_charge(asked: SegmentInputs, y: Array, stands: Array) -> tuple[Scalar, Scalar]:
     robot, motion = asked.robot, state_of(asked.robot, y, stands)
     duty = robot.driver.duty_limited(balances.duty_given(robot, asked.conditions.of_sides()), motion.current)
     return robot.sides * sum_of_sides(

@@ -110,12 +110,12 @@ class Profile(eqx.Module):
         """Values of a profile of two rows `elapsed` seconds after the first. Its fields are scalars."""
         share = elapsed / (self.time[1] - self.time[0]) if self.linear else 0.0
 
-        def value(x: Array) -> Array:
+        def interpolate(x: Array) -> Array:
             return x[0] + (x[1] - x[0]) * share if self.linear else x[0]
 
         still: dict[str, Any] = {"time": self.time[0], "mode": self.mode[0]}
         nothing: dict[str, Any] = dict.fromkeys(still)
-        values = jax.tree.map(value, dataclasses.replace(self, **nothing))
+        values = jax.tree.map(interpolate, dataclasses.replace(self, **nothing))
         return dataclasses.replace(values, **still)
 
     def conditions(self, otherwise: Conditions) -> Conditions:

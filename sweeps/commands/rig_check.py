@@ -207,7 +207,7 @@ class RigCheck:
     def determined(self, parameter: Determined) -> str:
         """`yes`, `no`, or the parameters with which the table determines this one in combination."""
         assert self.foresight is not None
-        return describe(Determination.of(parameter.name, parameter.held, self.foresight.together))
+        return describe(Determination.from_pairs(parameter.name, parameter.held, self.foresight.together))
 
     def to_json(self) -> Json:
         """The whole check as JSON-able data."""

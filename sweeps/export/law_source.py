@@ -224,7 +224,7 @@ def step_lines(joint: Joint, library: _Library) -> list[str]:
     lines = [
         "p, angle, wheel_speed = params, joint_position, "
         + ('state["rotor_speed"]  # of the motor\'s side' if joint.loose else "joint_velocity"),
-        *(["voltage = command"] if joint.controller is None else _controller_lines(joint, library)),
+        *(["voltage = command"] if joint.controller is None else _controller_code(joint, library)),
         'motor_speed = p["gearbox.ratio"] * wheel_speed',
         f"way = {call_text(joint.of('way')[0])}",
         "# Current of the winding: L dI/dt = U - E - U_R - ..., one implicit Euler step, linear in the current.",
@@ -271,7 +271,7 @@ def step_lines(joint: Joint, library: _Library) -> list[str]:
     return lines
 
 
-def _controller_lines(joint: Joint, library: _Library) -> list[str]:
+def _controller_code(joint: Joint, library: _Library) -> list[str]:
     """Lines of the controller: the voltage for a goal, and the states after the step."""
     imposed, own, prefix = joint.robot.rig.imposed, joint.controller, library.dialect.prefix
     assert own is not None

@@ -103,7 +103,11 @@ def paper_document(file: RobotFile, gear: bool) -> tuple[Document, data.Rows | N
             yield _against_the_bench(robots, rows, name)
         nominal = rows["nominal"]
         raised = data.raised_words(ROBOTS["nominal"](), nominal.ratio)
-        row_blocks = catalogue.note("paper.row-by-row", raised), _row_table(nominal), catalogue.note("paper.reasons")
+        row_blocks = (
+            catalogue.note("paper.row-by-row", raised),
+            _paper_rows_table(nominal),
+            catalogue.note("paper.reasons"),
+        )
         yield Section("The paper compared with itself, row by row", row_blocks, "rows-table")
         starts = data.simulate_starts(robot)
         figure = catalogue.figure("paper.fig23_24_from_standstill", starts, data.FIG_23, data.FIG_24)
@@ -203,7 +207,7 @@ def implied_resistance(robot: Robot, table: runs.Runs) -> np.ndarray:
     return robot.sides * (table["supply_voltage_V"] - back) / current
 
 
-def _row_table(rows: data.Rows) -> Block:
+def _paper_rows_table(rows: data.Rows) -> Block:
     """The 20 rows: bench, the paper's simulation, three variants of the nominal robot, and letters for the reasons
     of differences. Wheeled rows appear a second time with the robot's own mass.
     """

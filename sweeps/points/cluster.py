@@ -124,13 +124,13 @@ class Pool:
         finished: list[Any] = []
         failed: list[BaseException] = []
 
-        def wait() -> None:
+        def take_next() -> None:
             try:
                 finished.append(next(under_way))
             except BaseException as error:
                 failed.append(error)
 
-        thread = threading.Thread(target=wait, daemon=True)
+        thread = threading.Thread(target=take_next, daemon=True)
         thread.start()
         while thread.is_alive():
             thread.join(WORKER / 4)

@@ -34,7 +34,7 @@ from sweeps.points import scale
 from sweeps.points.axes import Plan
 from sweeps.points.sampled_design import Blocks, Drawn
 from sweeps.points.scale import Job
-from sweeps.points.tasks import of_fidelity
+from sweeps.points.tasks import run_task
 from sweeps.store import Page, RunFolder, finish_run_folder
 
 Table = Columns
@@ -150,7 +150,7 @@ def job_of(robot: Robot, runs: Runs, config: FidelityPart, samples: Drawn | None
     check_runs_bearable(robot, rows, config)
     plan = Plan.of_rows(jax.tree.map(np.asarray, rows), samples)
     wanted = (*outputs.output_names(robot.channels), FLAGS_CODE, *fidelities.get_fidelity(config.model).columns)
-    task = of_fidelity(config.model, config.options, robot)
+    task = run_task(config.model, config.options, robot)
     chunk = getattr(config, "chunk", None) or scale.default_chunk(task)
     blocks = Blocks.of(plan.design.shape, chunk)
     return Job(robot, task, plan, wanted, "float64", blocks)

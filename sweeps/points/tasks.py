@@ -54,7 +54,7 @@ class Task:
 def task_of(config: Campaign, robot: Robot, turns: bool = False) -> Task:
     """The task that a configuration states. `turns`: whether its profile drives the sides apart."""
     if config.obstacle is None:
-        return of_fidelity(config.model, config.options, robot, config.profile is not None, turns)
+        return run_task(config.model, config.options, robot, config.profile is not None, turns)
     obstacle, attributes = config.obstacle, climbs.climb_attributes(config.obstacle)
     own_options = (
         {SIZE: climbs.SIZES[obstacle.kind]},
@@ -64,7 +64,7 @@ def task_of(config: Campaign, robot: Robot, turns: bool = False) -> Task:
     return Task("climb", {}, attributes, tuple(attributes), True, climbs.AT_ONCE, *own_options)
 
 
-def of_fidelity(
+def run_task(
     model: str, options: Mapping[str, float], robot: Robot, profiled: bool = False, turns: bool = False
 ) -> Task:
     """Task of a run. `profiled`: over a profile, with its totals as outputs. `turns`: with both sides."""

@@ -461,7 +461,8 @@ def _base(found: DiscoveryResult) -> Table:
     rows = [
         (
             f"`{name}`", p.prior, p.before, p.after, p.sd_after, p.unit, fit_tables.shift_cell(p.shift_before),
-            fit_tables.shift_cell(p.shift_after), describe(Determination.of(name, p.held_by_prior, found.together)),
+            fit_tables.shift_cell(p.shift_after),
+            describe(Determination.from_pairs(name, p.held_by_prior, found.together)),
             p.at_bound or "", p.meaning,
         )
         for name, p in found.base_shift.items()

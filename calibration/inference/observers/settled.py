@@ -224,9 +224,9 @@ class SettledRuns(Observer):
         return (), ()
 
     def __call__(self, robot: Robot) -> Observation:
-        return self._observed(robot, fidelities.get_fidelity(self.fidelity).settled(robot, self.conditions))
+        return self._simulated_readings(robot, fidelities.get_fidelity(self.fidelity).settled(robot, self.conditions))
 
-    def _observed(self, robot: Robot, result: Result) -> Observation:
+    def _simulated_readings(self, robot: Robot, result: Result) -> Observation:
         reading = jnp.stack([result.reading[name] for name in channels.channel_names(robot.channels)], -1)
         return Observation(reading, jnp.asarray(result.adhesion_used), result.status, jnp.asarray(result.flags))
 
@@ -242,7 +242,7 @@ class SettledRuns(Observer):
         assert self._implicit is not None
         one = functools.partial(self._implicit.shown, robot)
         result, signals, left = jax.vmap(one)(self.conditions, unknowns, found)
-        return self._observed(robot, result), signals, left
+        return self._simulated_readings(robot, result), signals, left
 
     def operating(self, robot: Robot) -> Signals | None:
         if self.long or self.conditions.turns:

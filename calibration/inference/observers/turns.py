@@ -112,8 +112,8 @@ class SettledTurns(SettledRuns):
     def free(cls) -> tuple[Names, Names]:
         return (), priors.OF_TURNS
 
-    def _observed(self, robot: Robot, result: Result) -> Observation:
-        observation = super()._observed(robot, result)
+    def _simulated_readings(self, robot: Robot, result: Result) -> Observation:
+        observation = super()._simulated_readings(robot, result)
         return dataclasses.replace(observation, adhesion_used=jnp.zeros_like(observation.adhesion_used))
 
     @property
@@ -121,7 +121,7 @@ class SettledTurns(SettledRuns):
         return True
 
     def read(self, robot: Robot) -> Observation:
-        return self._observed(robot, results_of_rows(robot, self.conditions)[0])
+        return self._simulated_readings(robot, results_of_rows(robot, self.conditions)[0])
 
     def draws(
         self, problem: Problem, z: Array, linear: Linearization, keys: Array, factors: np.ndarray
