@@ -646,7 +646,11 @@ def _answered(error: BaseException) -> int:
         from sweeps.console import OUTPUT
 
         place = str(error.filename or OUTPUT)  # run folders and tables name theirs
-        left = "" if place == OUTPUT else f"; the run folder is incomplete: finished parts are in {place}.partial"
+        left = (
+            ""
+            if place == OUTPUT
+            else "; no run folder was written; finished parts are in the folder that ends in .partial"
+        )
         return _fail(f"{place}: {error.strerror}{left}", 2)
     if isinstance(error, SystemExit) and isinstance(error.__context__, BrokenPipeError):
         return 1  # whoever reads the output has had enough: head, or a pager that was left
