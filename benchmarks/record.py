@@ -41,7 +41,7 @@ SOLVED, SEARCHED = 1e-6, 1e-3
 NOTHING = 1e-12
 #: Keys with time, place or program version.
 PROVENANCE = frozenset(
-    ("program", "arguments", "python", "versions", "devices", "float", "started", "seconds", "hashes")
+    ("program", "arguments", "python", "versions", "devices", "float", "started", "seconds", "hashes", "identity")
 )
 #: Longest list of numbers that is stored as it is.
 SHORT = 6

@@ -486,12 +486,12 @@ def test_axis_takes_values_and_ranges():
 
 def test_configuration_has_what_applies_to_its_command_alone():
     told = {kind: set(kind.model_fields) for kind in (config.Loop, config.Calibrate, config.Compare, config.Sweep)}
-    assert not told[config.Loop] & {"model", "duration_s", "step_s", "battery", "chunk", "voltages_V"}
+    assert not told[config.Loop] & {"duration_s", "step_s", "battery", "chunk", "voltages_V"}
     assert "model" in told[config.Calibrate] and not told[config.Calibrate] & {"duration_s", "battery", "chunk"}
     assert not told[config.Compare] & {"battery", "discharge_mAh", "chunk", "slopes_deg"}
-    assert "model" not in config.as_toml(config.resolve_configuration(config.Loop, None, {"seed": 1}))
-    with pytest.raises(BadConfiguration, match=r"^model: no such key"):
-        config.resolve_configuration(config.Loop, None, {"model": "steady"})
+    assert "duration_s" not in config.as_toml(config.resolve_configuration(config.Loop, None, {"seed": 1}))
+    with pytest.raises(BadConfiguration, match=r"^duration_s: no such key"):
+        config.resolve_configuration(config.Loop, None, {"duration_s": 1.0})
 
 
 @pytest.mark.parametrize("model, expected", [("steady", {}), ("drive", {"duration_s": 30.0}),

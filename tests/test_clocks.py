@@ -33,9 +33,9 @@ CLOCKS = {
     "a tick of 15 bits": ("time_ms", (SINCE // 1000 + 32_000) % 2**15, "wraps at 32768"),
     "wrapped before it was seconds": ("time_s", (SINCE + 2**32 - 700_000) % 2**32 * 1e-6, "wraps at 4294.967296"),
     "nanoseconds since 1970": ("time_ns", SINCE * 1000 + 17 * 10**17, "is a time of day"),
-    "milliseconds since 1970, called seconds": ("time_s", SINCE // 1000 + 17 * 10**11, "counts ms since 1970"),
+    "milliseconds since 1970, called seconds": ("time_s", SINCE // 1000 + 17 * 10**11, "is read as ms since 1970"),
     "since boot": ("time_ms", SINCE // 1000 + 3_600_000, "begins at 3.6e+06"),
-    "coarser than the rows": ("time_ms", SINCE // 20_000 * 20, "repeats, 2 rows a stamp"),
+    "coarser than the rows": ("time_ms", SINCE // 20_000 * 20, "repeats, 2 rows per time stamp"),
 }
 
 
@@ -89,7 +89,7 @@ def test_a_row_that_stands_twice_is_left_out(robot):
     twice = frame(time_s=TABLE["t"]).iloc[np.sort(np.r_[np.arange(200), 77, 120])]
     found = records.read_runs(twice, robot)
     assert len(found) == 200 and any(
-        "2 rows, the first row 79, are the row before once more" in n for n in found.notes
+        "2 rows, the first row 79, are a repetition of the row before" in n for n in found.notes
     )
     other = frame(time_s=TABLE["t"])
     other.loc[len(other) / 2 - 1, "time_s"] = other["time_s"][len(other) // 2]

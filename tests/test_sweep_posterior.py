@@ -54,5 +54,5 @@ def test_posterior_of_another_robot_and_a_folder_without_one_are_refused(folder,
         plan(tmp_path / "elsewhere")
     with pytest.raises(InputError, match=r"samples\.posterior: got 3; expected a run folder"):
         plan(folder, posterior=3)
-    with pytest.raises(InputError, match=r"plan\.toml, motor\.resistance: stated twice"):
+    with pytest.raises(InputError, match=r"plan\.toml, motor\.resistance: given twice"):
         plan(folder, over={"motor.resistance": "prior"})

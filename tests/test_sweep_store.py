@@ -761,13 +761,13 @@ def test_a_store_and_a_table_of_one_path_leave_each_other_alone(opened, tmp_path
     store = opened()
     store.begin()
     written(store, 0)
-    for force, why in ((False, "holds an interrupted sweep into a store"), (True, "another process is at work")):
+    for force, why in ((False, "holds an interrupted sweep into a store"), (True, "another process is using")):
         with pytest.raises(BadConfiguration, match=why):
             RunFolder(tmp_path / "s", {"command": "sweep"}, force=force)
     assert len(store.done()) == 1
     store.close()
     with RunFolder(tmp_path / "s", {"command": "sweep"}, force=True) as folder:
-        with pytest.raises(BadConfiguration, match="another process is at work"):
+        with pytest.raises(BadConfiguration, match="another process is using"):
             opened(force=True)
         folder.stage("base", lambda: 1)
     with pytest.raises(BadConfiguration, match="holds an interrupted sweep, which"):
@@ -863,7 +863,7 @@ def test_size_of_a_store_is_what_it_takes(whole):
 REFUSED = {
     "unknown output": ('outputs = ["currant"]\n' + CONFIG, [], r"plan.toml, outputs: got currant; did you mean"),
     "output twice": ('outputs = ["slip", "slip"]\n' + CONFIG, [], "plan.toml, outputs: got slip twice"),
-    "output that varies": ('outputs = ["voltage"]\n' + CONFIG, [], "plan.toml, outputs: got voltage, which varies"),
+    "output that varies": ('outputs = ["voltage"]\n' + CONFIG, [], "plan.toml, outputs: got voltage, which is varied"),
     "unknown key": ("axis = 3\n" + CONFIG, [], "plan.toml, axis: no such key; did you mean axes?"),
     "unknown storage": ('storage = "float16"\n' + CONFIG, [], "plan.toml, storage: got 'float16'"),
     "unknown name": (CONFIG.replace("slope_deg", "slope"), [], "axes.slope: neither a parameter of the robot nor a"),
@@ -873,7 +873,7 @@ REFUSED = {
     "shares of a cluster": (CONFIG, ["--shard", "1/2", "--scheduler", "tcp://x:1"], "--shard: not allowed with --scheduler"),
     "unknown export": (CONFIG, ["--export", "xls"], "--export: got 'xls'; expected 'csv' or 'parquet'"),
     "option of a grid": (CONFIG, ["--slopes", "3"], "--slopes: has an effect only with a grid given by options"),
-    "two configurations": (CONFIG, ["--config", "plan.toml"], "--config: got plan.toml beside plan.toml"),
+    "two configurations": (CONFIG, ["--config", "plan.toml"], "--config: got plan.toml in addition to plan.toml"),
     "not a scheduler": (CONFIG, ["--scheduler", "nonsense"], "--scheduler: got nonsense; no scheduler answers there"),
     "axes are no table": ("axes = 3\nreport = false\n", [], "plan.toml, axes: got 3"),
 }  # fmt: skip

@@ -75,7 +75,7 @@ def test_independent_readings_are_no_copies(tmp_path, robot):
         (
             {"torque": 1 - 0.64 * np.round(CURRENT, 4)},
             "output_torque_Nm",
-            "1 - 0.64 times motor_current_A, to the last digit: it is computed",
+            "1 - 0.64 times motor_current_A in every row, to the last digit, so it is computed",
         ),
     ],
 )
@@ -99,14 +99,14 @@ def test_what_follows_another_within_noise_or_a_display_or_on_a_curve_is_no_copy
 def test_a_measured_torque_that_is_a_multiple_of_a_current_is_left_out(tmp_path, robot, torque):
     runs = table(tmp_path, robot, torque=torque)
     assert not runs.has("output_torque_Nm") and runs.has("motor_current_A")
-    assert any("output_torque_Nm: in every row 0.64" in note and "it is left out" in note for note in runs.notes)
+    assert any("output_torque_Nm: equals 0.64" in note and "it is left out" in note for note in runs.notes)
 
 
 def test_a_load_that_is_a_multiple_of_a_current_is_left_out(tmp_path, robot):
     """The load is what leaves the gearbox at the current. Friction, a display and a meter's noise leave no multiple."""
     current = np.round(CURRENT, 5)
     runs = table(tmp_path, robot, current, load_torque_Nm=np.round(0.64 * current, 4))
-    (note,) = (note for note in runs.notes if "load_torque_Nm: in every row 0.64" in note)
+    (note,) = (note for note in runs.notes if "load_torque_Nm: equals 0.64" in note)
     assert "this current is not a reading either" in note and not runs.has("motor_current_A")
     output = 20 * 0.8 * (0.04 * current - 0.002) - 0.3
     assert_allclose(runs["load_torque_Nm"], output, rtol=1e-3)
@@ -153,7 +153,7 @@ def test_runs_of_one_condition_are_refused_by_the_loop(tmp_path, robot, foreseen
     assert (found is None) == varies
     if not varies:
         assert (found.rows, found.column, found.unused) == (12, "motor_speed_rpm", ("wind_V",))
-        with pytest.raises(BadData, match=r"t\.csv: these 12 runs differ only by noise,  .* wind_V varies and is"):
+        with pytest.raises(BadData, match=r"t\.csv: these 12 runs differ only by noise, .* wind_V varies and is"):
             discover.prepare_loop(
                 runs, robot, noise="motor_current=0.01A,output_torque=0.01Nm,output_speed=1rpm", replicates=192
             )

@@ -60,7 +60,7 @@ def test_speed_of_zero_at_the_current_of_a_turning_motor_is_missing(stand):
     speed, _ = propeller(DUTY * 12.0)
     runs = stand(speed=np.where(DUTY < 0.35, 0.0, speed))
     assert missing(runs) == {"total_current": [], "motor_speed": [1, 2, 3]}
-    assert any("0 in rows 1, 2, 3" in note and "not read" in note for note in runs.notes)
+    assert any("0 in rows 1, 2, 3" in note and "missing" in note for note in runs.notes)
 
 
 def test_motor_that_stands_keeps_its_speed_of_zero(stand):
