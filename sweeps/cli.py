@@ -71,7 +71,7 @@ def _command(
 
     Args:
         kind: the configuration.
-        beside: that of options that change no number. A file may state its `[solver]` only.
+        beside: type of the options that change no number. A file may state its `[solver]` only.
         group: heading in `--help`.
         room: the module, if it has another name.
         failure: meaning of exit code 3.

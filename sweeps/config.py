@@ -368,8 +368,7 @@ class InferencePart(Part):
         "",
         "Standard deviations of current, motor_speed and speed in % or in A, rpm, mm/s: current=2%,speed=5mm/s",
         usual="from the file's columns; else calibrate estimates them; loop estimates them from series of rows "
-        "(and tries 0.7 and 1.4 times), or without series assumes 2, 0.5 and 1 % (and tries half and "
-        "double)",
+        "or over time, and assumes 2, 0.5 and 1 % of settled rows without series",
     )
     rows: Annotated[int, Field(ge=100, le=1_000_000)] = option_field(
         ROWS, "Largest number of rows used; larger data are thinned evenly, logs in time, tables over conditions"
@@ -511,7 +510,7 @@ class ProfilePart(FidelityPart):
 
 
 class Simulate(RobotPart, DataPart, ProfilePart, SupplyPart, TurnPart, PosteriorPart, OutputPart):
-    """A few given runs. Those over time from standstill, or over a profile."""
+    """A few given runs. Runs over time begin at standstill, or follow a profile."""
 
     @model_validator(mode="after")
     def _certain(self) -> Self:
