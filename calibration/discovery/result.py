@@ -393,7 +393,9 @@ class Resolved:
         return json_value(
             {
                 "asked": describe(self.asked),
-                **entries_of(self, "statement", "explains", "rows", "constants", "known_from_rows"),
+                **entries_of(
+                    self, "statement", "explains=gear_explains_discrepancy", "rows", "constants", "known_from_rows"
+                ),
                 "alike": [{"a": a, "b": b, "correlation": r} for a, b, r in self.alike],
                 **entries_of(self, "outside", "settled", "fall_chi2=fall", "p"),
                 "chi2": {"before": self.chi2[0], "after": self.chi2[1], "readings": self.readings},
