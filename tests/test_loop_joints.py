@@ -15,6 +15,8 @@ from tests.commands import ends, read_json, read_rig
 JOINTS = ("shoulder", "elbow")
 
 LINK = '<geom type="capsule" fromto="0 0 0 0 0 -{length}" size="0.02" mass="{mass}"/>'
+#: The loop of an arm in a folder.
+COMMAND = "loop {0}/log.csv --model {0}/arm.xml --robot {0}/{{joint}}.toml"
 MODEL = f"""
 <mujoco><option timestep="0.001"/><worldbody><body>
   <joint name="shoulder" axis="0 1 0" frictionloss="0.3" damping="0.1" armature="0.01"/>
@@ -106,7 +108,7 @@ def test_load_of_a_joint_is_that_torque_less_what_its_file_states(tmp_path):
         write(tmp_path, rows, noise)
         robot = read_rig(tmp_path, RIG + "torque_gravity = 0.3\nangle_zero = 0.2\n")
         chain, log = loop_joints.Chain(tmp_path / "arm.xml"), read_csv_columns(tmp_path / "log.csv", "log.csv")
-        runs = loop_joints.runs_of_joint(log, chain, "elbow", robot)
+        runs = loop_joints.runs_of_joints(log, chain, {"elbow": robot})["elbow"]
         needed = chain.torques(motion)[:, 1]
         expected = needed - 0.05 * acceleration - 0.3 * np.sin(angle - 0.2)
         errors.append(np.abs(runs["load_torque_Nm"] - expected)[inner].max() / np.abs(needed).max())
@@ -135,14 +137,7 @@ def test_what_a_joint_lacks_is_named(mmrjax, tmp_path):
     rows = np.zeros((20, 7))
     rows[:, 0] = np.arange(20) * 0.01
     write(tmp_path, rows)
-    arguments = [
-        "loop",
-        tmp_path / "log.csv",
-        "--model",
-        tmp_path / "arm.xml",
-        "--robot",
-        f"{tmp_path}/{{joint}}.toml",
-    ]
+    arguments = COMMAND.format(tmp_path).split()
     ends(mmrjax(*arguments), "--model and --joints must be given together")
     log = (tmp_path / "log.csv").read_text()
     (tmp_path / "log.csv").write_text(log.replace("elbow.output_angle_deg", "wrist.output_angle_deg"))
@@ -161,15 +156,7 @@ def test_what_a_joint_lacks_is_named(mmrjax, tmp_path):
 @pytest.mark.slow
 def test_each_joint_of_an_arm_has_its_loop_and_keeps_it(mmrjax, tmp_path):
     write(tmp_path, arm(2.0), 3e-4)
-    arguments = [
-        "loop",
-        tmp_path / "log.csv",
-        "--model",
-        tmp_path / "arm.xml",
-        "--robot",
-        f"{tmp_path}/{{joint}}.toml",
-    ]
-    arguments += ["--out", tmp_path / "found", "--within", "1h", "--joints"]
+    arguments = [*COMMAND.format(tmp_path).split(), "--out", tmp_path / "found", "--within", "1h", "--joints"]
     _, out, _ = ends(mmrjax(*arguments, "elbow"), code=0)
     assert out.strip().endswith("found") and "elbow/report.html" in (tmp_path / "found" / "report.html").read_text()
     began = read_json(tmp_path / "found" / "elbow" / "manifest.json")["started"]
@@ -197,15 +184,7 @@ def test_finished_joints_are_kept_and_all_are_on_one_page(mmrjax, tmp_path, monk
     write(
         tmp_path, np.column_stack([np.arange(40) * 0.01, np.zeros((40, 4)), np.random.default_rng(0).random((40, 2))])
     )
-    arguments = [
-        "loop",
-        tmp_path / "log.csv",
-        "--model",
-        tmp_path / "arm.xml",
-        "--robot",
-        f"{tmp_path}/{{joint}}.toml",
-    ]
-    arguments += ["--joints", "all", "--out", tmp_path / "found"]
+    arguments = [*COMMAND.format(tmp_path).split(), "--joints", "all", "--out", tmp_path / "found"]
     ends(mmrjax(*arguments), "4 → 2", code=0)
     ends(mmrjax(*arguments), "joint shoulder: finished in", code=0)
     page = (tmp_path / "found" / "report.html").read_text("utf-8")

@@ -143,30 +143,37 @@ def smoothed_log(log: NamedArrays, chain: Chain, degree: int = 5) -> np.ndarray:
     return motion
 
 
-def runs_of_joint(log: NamedArrays, chain: Chain, name: str, robot: Robot) -> Runs:
-    """Runs of a joint, with the torque of the rest of the model as the torque of its load.
+def runs_of_joints(log: NamedArrays, chain: Chain, robots: Mapping[str, Robot]) -> dict[str, Runs]:
+    """Runs of each joint, with the torque of the rest of the model as the torque of its load.
 
-    It is what the model needs less the inertia and the weight that the joint's own file states. The motor speed is
+    It is what the model needs less the inertia and the weight that the joint's file states. The motor speed is
     that of the smoothed motion. Its torque is less exact where the torque jumps, by about its difference from that of
     cubic splines. Unless the log states the current's sd, it has twice this share, as neighbouring rows err alike.
 
+    Args:
+        robots: robot of each joint, by the joint's name.
+
     Raises:
-        BadData: as `records.of_arrays`.
+        BadData: as `smoothed_log` and `records.of_arrays`.
     """
-    k, (load,) = chain.names.index(name), robot.configurations.members
-    own = {h.removeprefix(f"{name}."): v for h, v in zip(log.header, log.values, strict=True)}
-    kept = {h: v for h, v in own.items() if not h.startswith(tuple(f"{n}." for n in chain.names))}
     motion = smoothed_log(log, chain)
-    torque, cubic = (chain.torques(x)[:, k] for x in (motion, smoothed_log(log, chain, 3)))
-    angle, speed, acceleration = motion[:, :, k]
-    stated = float(load.inertia) * acceleration + np.asarray(load.torque_load(angle))
-    per_ampere = float(robot.gearbox.ratio * robot.gearbox.efficiency_load * robot.motor.torque_constant)
-    columns: dict[str, Raw] = {**kept, LOAD: torque - stated, SPEED: speed * float(robot.gearbox.ratio) / RPM}
-    if CURRENT in kept and SD not in kept:
-        off = 2 * np.sqrt(uniform_filter1d((torque - cubic) ** 2, NEAR)) / per_ampere
-        columns[SD] = np.hypot(off, noise_of(column_numbers(kept[CURRENT])))
-    arrays = NamedArrays(f"{log.name}, joint {name}", tuple(columns), tuple(columns.values()), digest=log.digest)
-    return records.of_arrays(arrays, robot=robot)
+    torques, cubic = (chain.torques(x) for x in (motion, smoothed_log(log, chain, 3)))
+    doubt = 2 * np.sqrt(uniform_filter1d((torques - cubic) ** 2, NEAR, axis=0))
+    runs = {}
+    for name, robot in robots.items():
+        k, (load,) = chain.names.index(name), robot.configurations.members
+        named = {h.removeprefix(f"{name}."): v for h, v in zip(log.header, log.values, strict=True)}
+        kept = {h: v for h, v in named.items() if not h.startswith(tuple(f"{n}." for n in chain.names))}
+        angle, speed, acceleration = motion[:, :, k]
+        stated = float(load.inertia) * acceleration + np.asarray(load.torque_load(angle))
+        ratio = float(robot.gearbox.ratio)
+        per_ampere = ratio * float(robot.gearbox.efficiency_load * robot.motor.torque_constant)
+        columns: dict[str, Raw] = {**kept, LOAD: torques[:, k] - stated, SPEED: speed * ratio / RPM}
+        if CURRENT in kept and SD not in kept:
+            columns[SD] = np.hypot(doubt[:, k] / per_ampere, noise_of(column_numbers(kept[CURRENT])))
+        arrays = NamedArrays(f"{log.name}, joint {name}", tuple(columns), tuple(columns.values()), digest=log.digest)
+        runs[name] = records.of_arrays(arrays, robot=robot)
+    return runs
 
 
 def robot_of_joint(config: configuration.Loop, joint: str) -> tuple[configuration.Loop, Robot]:
@@ -204,7 +211,7 @@ def run_joints(
     Raises:
         BadConfiguration: a joint that the model does not have or that nothing drives, or as `Chain` and
             `robot_of_joint`.
-        BadData: no such file, or as `smoothed_log` and `runs_of_joint`.
+        BadData: no such file, or as `runs_of_joints`.
     """
     assert config.model is not None
     chain, data = Chain(config.model), Path(beside.data)
@@ -219,7 +226,7 @@ def run_joints(
     if not data.is_file():
         raise BadData(f"{data}: no such file; expected a log of the joints of {config.model.name}")
     log = reading.read_whole_table(data) or delimited.read_csv_columns(data, data.name)
-    runs = {name: runs_of_joint(log, chain, name, robot) for name, (_, robot) in robots.items()}
+    runs = runs_of_joints(log, chain, {name: robot for name, (_, robot) in robots.items()})
     folder = beside.out or store.default_path("loop")
     code, rows = 0, []
     for name, (one, robot) in robots.items():
