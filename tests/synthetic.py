@@ -19,12 +19,24 @@ from calibration.discovery.outliers import screen_outliers
 from calibration.discovery.settings import Settings, settings_for
 from calibration.inference import noise, observers
 from calibration.inference.calibration import calibrate
+from calibration.inference.fit_notes import Remark
 from calibration.inference.observers import SettledRuns
 from mmrjax.effects import BY_NAME, Effect
 from mmrjax.model import paper_robots
 
 #: The analyst's prior on the surface, which Table 5 does not know.
 STATED = {f"{c}.ground.friction.static": (0.6, 0.09) for c in ("6T2A", "4W2T")}
+#: A servo's output that loses a degree at each reversal.
+LOST_MOTION = Remark(
+    "lost_motion",
+    source="r.csv",
+    column="output_angle_deg",
+    reversals=20,
+    width=0.958,
+    unit="deg",
+    angle=0.0167,
+    stiffness=0.0,
+)
 
 
 def table(made):

@@ -3,12 +3,12 @@
 from types import SimpleNamespace
 
 import pytest
+from synthetic import LOST_MOTION
 
 from calibration.described import describe
 from calibration.discovery.headline import headline
 from calibration.discovery.loop_notes import Mechanism, Missing, Summary
 from calibration.discovery.result import DiscoveryResult
-from calibration.inference.fit_notes import Remark
 from calibration.words import loop_words
 
 DROP, SLIP = "voltage drop that changes with current", "slip that changes with demand"
@@ -89,17 +89,7 @@ def test_one_mechanism_is_claimed_once():
 
 def test_lost_motion_comes_before_what_the_library_explains():
     """A servo with backlash: no effect explains it, and the answer was a reading that changes with time."""
-    lost = Remark(
-        "lost_motion",
-        source="r.csv",
-        column="output_angle_deg",
-        reversals=20,
-        width=0.958,
-        unit="deg",
-        angle=0.0167,
-        stiffness=0.0,
-    )
     of = lambda *remarks: SimpleNamespace(remarks=remarks, headline=headline(law("a"), []))  # noqa: E731
     alone = DiscoveryResult.statement.fget(of())
-    first = DiscoveryResult.statement.fget(of("a note", lost))
-    assert first == f"{describe(lost)}. {alone}" and "at each of 20 reversals about 0.96 deg" in first
+    first = DiscoveryResult.statement.fget(of("a note", LOST_MOTION))
+    assert first == f"{describe(LOST_MOTION)}. {alone}" and "at each of 20 reversals about 0.96 deg" in first

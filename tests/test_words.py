@@ -11,6 +11,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from synthetic import LOST_MOTION
 
 from calibration.described import describe, in_words
 from calibration.discovery import loop_notes as of_loop
@@ -143,16 +144,7 @@ SAMPLES = [
     Remark("stiff_supply", column="motor_voltage_V", value=24.0),
     Remark("constant", column="slope_deg", value=5.0, alike="guides"),
     Remark("constant", column="motor_speed_rpm", value=900.0, alike="speed"),
-    Remark(
-        "lost_motion",
-        source="r.csv",
-        column="output_angle_deg",
-        reversals=20,
-        width=0.958,
-        unit="deg",
-        angle=0.0167,
-        stiffness=0.0,
-    ),
+    LOST_MOTION,
     Remark("ends_early", runs=("a", "b"), lasts=0.01, share=0.4),
     Remark("ends_early", runs=("a",), lasts=0.01, share=float("nan")),
     Remark("thinned", source="log.csv", rows=25000, kept=3600),
