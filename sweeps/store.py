@@ -175,7 +175,7 @@ class Folder:
             )
 
     def refuse_appeared(self, force: bool) -> None:
-        """Reject to move the finished folder to a path where something has appeared meanwhile.
+        """Reject a path where something has appeared since the run began.
 
         Raises:
             OSError: it has, the partial folder is left.

@@ -51,8 +51,8 @@ def find_mechanism(
 ) -> Mechanism | None:
     """Mechanism that explains most of the discrepancy of the base fit.
 
-    It is that of effects of one family of the library, or that of a smooth curve if none of them explains as
-    much, None for histories if only a curve does.
+    It is that of effects of one family of the library. If none of them explains as much as a smooth curve, it is that
+    of the curve, and None for histories.
 
     Args:
         left: diagnosis of the base.

@@ -67,9 +67,9 @@ def _changes_between_contacts(time: np.ndarray, angle: np.ndarray, drive: np.nda
     """Changes between instants at which one flank surely carries: three of each stroke, from its fastest to its end.
 
     Returns:
-        Of the angle. Of the time integral of the drive, and of the drive clipped to each of `FRICTIONS`, of the
-        speed, of the drive, of the direction, 1 or -1 for a reversal, of the acceleration, and
-        of the angle of a parabola.
+        Changes of the angle, of the drive's time integral, and of that of the drive clipped to each of `FRICTIONS`.
+        Then those of the speed, the drive, the direction (1 or -1 for a reversal), and the acceleration. The last
+        ones are of the angle less the bow of a parabola.
     """
     has_both = np.isfinite(angle) & np.isfinite(drive)
     time, angle, drive = time[has_both], angle[has_both], drive[has_both]

@@ -150,8 +150,8 @@ def _noise_of_channel(
         forms.append((likely, size, freedom))
     likely, size, freedom = np.array(forms).T
     probability = np.exp(likely - likely.max()) / np.exp(likely - likely.max()).sum()
-    floor, share = (*(np.sqrt(probability) * size * (probability > NEGLIGIBLE)), 0.0)[:2]
-    return SeriesNoise(channel, float(floor), float(share), float(probability @ freedom), axis, used, least)
+    floor, *share = (np.sqrt(probability) * size * (probability > NEGLIGIBLE)).tolist()
+    return SeriesNoise(channel, floor, sum(share, 0.0), float(probability @ freedom), axis, used, least)
 
 
 def _differences(measured: np.ndarray, x: np.ndarray, series: list[np.ndarray]) -> tuple[sparse.csr_array, int]:

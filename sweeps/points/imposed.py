@@ -139,7 +139,7 @@ def check_acting(robot: Robot, ground: Iterable[str] = (), shaft: Iterable[str] 
 
 
 def check_battery(robot: Robot) -> None:
-    """Reject to run a rig on a battery that its file does not state.
+    """Reject a battery that the file of a rig does not state.
 
     Raises:
         BadConfiguration: its speed is imposed, or its file states no battery.

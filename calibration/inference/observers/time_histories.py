@@ -724,9 +724,9 @@ class Histories(Observer):
         within = SAME if rivals else NEAR if of_same_readings else np.inf
 
         def searched(starts: Numbers, members: slice = slice(None)) -> tuple[Optimum, Observation]:
-            own = np.asarray(weights)[members]
-            evaluate = _evaluator(problem, own, None if active is None else np.asarray(active)[members])
-            return search_rollouts(evaluate, starts, data, own, steps, self.policy.batch, within=within)
+            weight = np.asarray(weights)[members]
+            evaluate = _evaluator(problem, weight, None if active is None else np.asarray(active)[members])
+            return search_rollouts(evaluate, starts, data, weight, steps, self.policy.batch, within=within)
 
         optima = searched(starts)
         near = np.asarray(optima[0].cost) < np.nanmin(optima[0].cost) + NEAR
