@@ -306,7 +306,7 @@ def infeasible_error(
     if not slides.any():
         words = ", ".join(STATUSES[k] for k in np.unique(status[lost]))
         return BadConfiguration(
-            f"no start is feasible: the model does not reach {runs.source} rows {rows(lost)} ({words} at the best "
+            f"no start is feasible: the model has no result in {runs.source} rows {rows(lost)} ({words} at the best "
             "point found); check their conditions, or widen the priors"
         )
     sliding = sorted(set(runs.configurations_named(robot)[slides]), key=robot.configurations.index)

@@ -131,7 +131,7 @@ class BristleLoadLoss(Bristle, GearboxEffect):
     settles_to = "gear_load_loss"
 
     amplitude: Scalar = amplitude(
-        "-", "share of the output torque lost through the bristle", (-0.2, 0.5), "as of `gear_load_loss`", sd=0.05
+        "-", "share of the output torque lost through the bristle", (-0.2, 0.5), "as for `gear_load_loss`", sd=0.05
     )
     angle_breakaway: Scalar = breakaway_parameter()
 
@@ -157,7 +157,7 @@ class BristleBackdrivingLoss(Bristle, GearboxEffect):
 
     amplitude: Scalar = amplitude(
         "-", "share of the load's torque lost through the bristle while the load drives", (-0.2, 1.0),
-        "as of `backdriving_loss`", sd=0.1,
+        "as for `backdriving_loss`", sd=0.1,
     )  # fmt: skip
     angle_breakaway: Scalar = breakaway_parameter()
 
