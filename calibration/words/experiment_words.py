@@ -339,7 +339,7 @@ def effect_declarations(effect: type[Effect]) -> Iterator[str]:
         "only on the battery" * effect.needs_battery,
         "only in runs in both directions" * effect.needs_reverse,
         "only at a duty below 1" * effect.needs_duty,
-        "changes sign with the direction of travel" * effect.odd_in_travel,
+        "same direction in forward and backward travel" * effect.odd_in_travel,
         f"only on {effect.movers}" * bool(effect.movers),
         f"proportional to `{', '.join(effect.rests_on)}`" * bool(effect.rests_on),
     ]

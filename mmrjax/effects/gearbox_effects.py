@@ -98,7 +98,7 @@ class BackdrivingLoss(GearboxEffect):
     Source: Duclusaud, Passault, Padois and Ly, Extended friction models for the physics simulation of servo
     actuators (2024, arXiv:2410.08650): directional models in which motor and load each have a share of friction.
     Niemann and Winter, Maschinenelemente II (2003): the backward efficiency 2 - 1/η is below η. A share 1 - a of the
-    load's torque reaches the gear, and eq. (19)'s η_b of that the motor. At a = 1 the gear is self-locking.
+    load's torque reaches the gear, and a share η_b of that, eq. (19), the motor. At a = 1 the gear is self-locking.
     The load excludes the rotor's inertia. The effect fades at rest with the shaft's smooth sign.
     """
 
