@@ -161,7 +161,7 @@ def elsewhere(given: Any, found: Any, runs: Any) -> dict[str, Any]:
     """
     from calibration.discovery import findings as results
     from calibration.discovery import prediction
-    from calibration.discovery.discover import pose_candidates
+    from calibration.discovery.discover import build_candidate_space
 
     space, base, best = found.screened.base.space, found.screened.base.candidate, found.best
     if best is base:

@@ -34,7 +34,7 @@ def space_of(world, folder):
     observer = observers.observer_kind(runs)
     library = scales.library_of_size(robot, runs.conditions(robot), effects.BY_NAME)
     sd = noise.noise_from_table(runs, observer.sizes(runs)).sd
-    return discover.pose_candidates(runs, robot, sd, settings_for(observer), library=library)
+    return discover.build_candidate_space(runs, robot, sd, settings_for(observer), library=library)
 
 
 @pytest.mark.nightly

@@ -398,8 +398,8 @@ def test_bootstrap_of_the_measured_runs_settles():
     """Of tables drawn from the fit to the packaged data nearly all can be fitted again."""
     runs, settings = read_runs("measured"), dataclasses.replace(SETTLED.settings, replicates=128)
     sd = noise.infer_noise(runs, SettledRuns.sizes(runs), None).sd
-    space = discover.pose_candidates(runs, paper_robots.nominal(), sd, settings, {}, SETTLED.library)
+    space = discover.build_candidate_space(runs, paper_robots.nominal(), sd, settings, {}, SETTLED.library)
     screened = screen_outliers(
         fit_base(space, settings, "measured"), lambda b: discover.bases_at_fit(runs, b), runs, settings
     )
-    assert len(discover.diagnosis_of_base(screened, settings).test.null.single) >= 0.98 * settings.replicates
+    assert len(discover.diagnose_base_by_bootstrap(screened, settings).test.null.single) >= 0.98 * settings.replicates

@@ -11,7 +11,7 @@ from synthetic import table
 from worlds import settled, tables
 
 from calibration.data.runs import Runs
-from calibration.discovery.discover import Sds, noise_remarks_before_verdict
+from calibration.discovery.discover import VerdictNoise, noise_remarks_before_verdict
 from calibration.inference import lack_of_fit
 from calibration.inference.calibration import calibrate
 from calibration.inference.fit_notes import Shown
@@ -167,7 +167,7 @@ def test_noise_of_one_channel_that_is_off_is_said_of_that_channel():
 def test_what_is_said_of_sds_beside_an_answer_is_of_what_it_leaves():
     """Before: 130 times the sds, everywhere. The answer leaves noise, or twice as much as was stated."""
     noise = SimpleNamespace(word="stated")
-    before = Sds(noise, {}, tuple(noise_remarks(toy(np.random.default_rng(7), noise=130.0))))
+    before = VerdictNoise(noise, {}, tuple(noise_remarks(toy(np.random.default_rng(7), noise=130.0))))
     assert (
         before.remarks[0].factor > 100 and noise_remarks_before_verdict(before, toy(np.random.default_rng(9))) == ()
     )

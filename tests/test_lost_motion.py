@@ -145,4 +145,4 @@ def test_task_of_the_loop_knows_of_lost_motion(tmp_path):
     for play in (1.0, 0.0):
         runs, robot = read(tmp_path, servo(play=play))
         given = discover.LoopInput(runs, None, robot, *[None] * 4)
-        assert given.loses_motion == (play > 0)
+        assert given.shows_unmodelled_backlash == (play > 0)

@@ -35,7 +35,7 @@ def space():
 
 
 def test_the_program_of_a_log_has_the_effects_that_are_asked_for_and_those_of_its_room(space):
-    problem, indices = space.with_room(["churning"]).fitted_by([("brush_drop", ""), ("", "churning")])
+    problem, indices = space.with_room(["churning"]).problem_for_sets([("brush_drop", ""), ("", "churning")])
     names = problem.coordinates.names
     assert set(names) == {"churning", "brush_drop"} == {e.name for e in problem.base.effects}
     assert [tuple(names[k] if k >= 0 else "" for k in each) for each in indices] == [
@@ -73,7 +73,7 @@ def test_the_base_of_a_log_is_fitted_in_the_program_of_its_room(space, monkeypat
 @pytest.mark.parametrize("lost", [False, True])
 def test_other_basins_of_a_log_are_searched_in_the_program_of_its_room(space, monkeypatch, lost):
     """With the priors of its coordinates, which are more than the base's. Not of a fit that is lost."""
-    problem, (empty,) = space.with_room(["churning"]).fitted_by([("", "")])
+    problem, (empty,) = space.with_room(["churning"]).problem_for_sets([("", "")])
     size, priors = space.free + 4, []
 
     def rollouts(evaluate, starts, data, weights, *_, **options):

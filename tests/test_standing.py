@@ -508,7 +508,7 @@ def stood(analyst, runs, effects):
     """Whether these effects, fitted together, would stand, whatever a search would have found."""
     screened = analyst.screened(runs)
     space, base, bases = screened.base.space, screened.base.candidate, screened.bases
-    left = discover.diagnosis_of_base(screened, analyst.settings)
+    left = discover.diagnose_base_by_bootstrap(screened, analyst.settings)
     active = fill_slots(effects, analyst.settings)
     first = start_of_fit(space, base, active, analyst.settings, left.scores)
     (best,) = fit_candidates(space, [(active, first)], analyst.settings)

@@ -245,7 +245,7 @@ def predict_menu(space: CandidateSpace, candidates: Mapping[str, Candidate], set
     all_parameters = priors.free_names(robot, robot.configurations.names)
     more = [n for n in all_parameters if n not in space.coordinates.base.names]
     other = priors.parameter_coordinates(robot, more) if more else None
-    equipped, indices = space.fitted_by(c.active for c in alternatives)
+    equipped, indices = space.problem_for_sets(c.active for c in alternatives)
     active = jnp.asarray(indices)
     z = jnp.asarray(np.stack([c.z for c in alternatives]))
     informed = jnp.stack(

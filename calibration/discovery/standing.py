@@ -19,7 +19,7 @@ import numpy as np
 from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.adequacy import AdequacyTest, Diagnosis
 from calibration.discovery.candidates import Candidate
-from calibration.discovery.classes import without_amplitude
+from calibration.discovery.classes import remove_effect
 from calibration.discovery.discrepancy import CurveBeside, locate_discrepancy
 from calibration.discovery.loop_notes import CurveOver, NameSupport, NameTest
 from calibration.discovery.projection import Projection
@@ -219,7 +219,7 @@ def _one_curve(
     if equation_of_place(where.place) in {_equation(space, e) for e in best.effects}:
         # A strong curve distorts the base fit, and names then absorb its residuals in the same equation.
         # If the result is highly significant, no closer look is compiled.
-        adequate = not left.test.beyond_doubt("chi2", beside.curve.chi2[1])
+        adequate = not left.test.exceeds_margin("chi2", beside.curve.chi2[1])
         if adequate and not beside.diagnosis.test.rejected_with_margin:
             return NameSupport(False, "curve alone", curves=(_curve_over(where.place, where.variable),))
     return NameSupport(True)
@@ -346,7 +346,7 @@ def _deficient_equations(space: CandidateSpace, seen: Diagnosis, bases: Bases) -
     if not seen.test.rejected_with_margin:
         return set()
     lacks = {equation_of_place(locate_discrepancy(seen, bases, space.included).place)}
-    if seen.test.beyond_doubt("single"):
+    if seen.test.exceeds_margin("single"):
         strongest = space.library.of[int(np.argmax(np.abs(np.asarray(seen.scores.single))))]
         lacks.add(_equation(space, space.library.names[strongest]))
     return lacks
@@ -458,7 +458,7 @@ def _put_back(
     confirm.
     """
     jacobian, residual, signatures = beside
-    return *without_amplitude(space, best, best.active.index(effect), jacobian, residual), signatures
+    return *remove_effect(space, best, best.active.index(effect), jacobian, residual), signatures
 
 
 def chosen_again(
