@@ -208,7 +208,9 @@ def base_of(given):
     from calibration.discovery.candidates import fit_base
     from calibration.discovery.discover import build_candidate_space
 
-    space = pose_candidates(given.runs, given.robot, given.noise.sd, given.settings, given.stated, given.library)
+    space = build_candidate_space(
+        given.runs, given.robot, given.noise.sd, given.settings, given.stated, given.library
+    )
     return fit_base(space, given.settings, given.runs.source)
 
 

@@ -167,7 +167,7 @@ def elsewhere(given: Any, found: Any, runs: Any) -> dict[str, Any]:
     if best is base:
         return {}
     measured, sd, rows = runs.measured(), runs.deviations(), len(runs)
-    there = pose_candidates(runs, given.robot, sd, given.settings, given.stated, given.library)
+    there = build_candidate_space(runs, given.robot, sd, given.settings, given.stated, given.library)
     if there.library.names != space.library.names or there.coordinates.base.names != space.coordinates.base.names:
         return {}
     off, score = [], []

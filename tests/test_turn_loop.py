@@ -13,7 +13,7 @@ from worlds import turns as planted
 
 import mmrjax as mm
 from calibration.data import runs as records
-from calibration.discovery.discover import discover, build_candidate_space, prepare_loop
+from calibration.discovery.discover import build_candidate_space, discover, prepare_loop
 from calibration.inference import bases as bases_room
 from calibration.inference.observers.turns import TurnLinearization
 from mmrjax import effects
@@ -35,7 +35,9 @@ def posed(tmp_path_factory):
     robot = mm.read_robot(str(file))
     library = {name: kind for name, kind in effects.BY_NAME.items() if name in SOME}
     ready = prepare_loop(records.read_runs(table, robot=robot), robot, noise=planted.NOISE, library=library)
-    space = build_candidate_space(ready.runs, ready.robot, ready.noise.sd, ready.settings, ready.stated, ready.library)
+    space = build_candidate_space(
+        ready.runs, ready.robot, ready.noise.sd, ready.settings, ready.stated, ready.library
+    )
     return space.bare, space
 
 

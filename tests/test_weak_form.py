@@ -65,7 +65,9 @@ def space(tmp_path_factory):
 
 def posed(runs, robot, sd=SD):
     library = {n: BY_NAME[n] for n in NAMES}
-    return discover.build_candidate_space(runs, robot, np.broadcast_to(sd, runs.measured().shape), SETTINGS, {}, library)
+    return discover.build_candidate_space(
+        runs, robot, np.broadcast_to(sd, runs.measured().shape), SETTINGS, {}, library
+    )
 
 
 @pytest.fixture(scope="module")

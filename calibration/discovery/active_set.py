@@ -179,7 +179,7 @@ class CandidateSpace:
         return np.asarray(self.bare.data.weight)
 
     def without(self, rows: np.ndarray) -> CandidateSpace:
-        """Copy in which some rows (a mask or indices) have weight 0."""
+        """Copy in which some rows (a mask or indices) are ignored."""
         weight = self.weight.copy()
         weight[rows] = 0.0
         return self.with_weights(weight)

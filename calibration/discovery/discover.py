@@ -538,7 +538,9 @@ def _confirm_gains(screened: Screening, left: Diagnosis, searched: Search) -> Di
     return None if confirmed.rejected else dataclasses.replace(left, test=confirmed)
 
 
-def _reach_verdict(given: LoopInput, screened: Screening, left: Diagnosis, sds: VerdictNoise, searched: Search) -> LoopStages:
+def _reach_verdict(
+    given: LoopInput, screened: Screening, left: Diagnosis, sds: VerdictNoise, searched: Search
+) -> LoopStages:
     """Verdict on a base with a discrepancy: effects, classes of effects, a mechanism, or a place."""
     runs, settings, progress = given.runs, given.settings, given.progress
     base, space, bases = screened.base.candidate, screened.base.space, screened.bases
