@@ -172,7 +172,7 @@ def elsewhere(given: Any, found: Any, runs: Any) -> dict[str, Any]:
         return {}
     off, score = [], []
     for candidate in (base, best):
-        fitted = results.Fitted(there.equipped, candidate.z, there.library.indices(candidate.active))
+        fitted = results.FittedProblem(there.equipped, candidate.z, there.library.indices(candidate.active))
         seen = fitted.observation()
         lost = there.equipped.observe.unreachable(np.asarray(seen.status))[:rows, None]
         off.append(np.where(lost, np.nan, (np.asarray(seen.reading)[:rows] - measured) / sd))

@@ -262,7 +262,7 @@ def _of_base(p: Posed) -> np.ndarray:
     from calibration.discovery import findings
 
     problem, z, active = p.space.fit_of(p.fitted.candidate.active, p.fitted.candidate.z)
-    return np.asarray(findings.Fitted(problem, z, active).observation().reading)[: len(p.measured)]
+    return np.asarray(findings.FittedProblem(problem, z, active).observation().reading)[: len(p.measured)]
 
 
 # --- regressions on what the refit leaves -----------------------------------------------------------------------

@@ -15,7 +15,7 @@ from worlds import settled, tables
 
 from calibration.data import robot_file
 from calibration.discovery import discover, discrepancy, formula
-from calibration.discovery.discrepancy import CurveBeside, fit_discrepancy, refine_window, similar_variables
+from calibration.discovery.discrepancy import BaseCurve, fit_discrepancy, refine_window, similar_variables
 from calibration.discovery.projection import defect_by_row
 from calibration.discovery.score_tests import diagnose_fit
 from calibration.discovery.smooth import smooth_curve
@@ -265,7 +265,7 @@ def test_a_curve_that_several_ask_for_is_fitted_once(monkeypatch):
     monkeypatch.setattr(discrepancy, "locate_discrepancy", lambda *given: where)
     monkeypatch.setattr(discrepancy, "fit_discrepancy", lambda *given: counted("curve", *given))
     monkeypatch.setattr(discrepancy, "diagnose_with_curve", lambda *given: counted("diagnosis", *given))
-    beside = CurveBeside(space, "base", left, "bases")
+    beside = BaseCurve(space, "base", left, "bases")
     assert not calls  # before it is asked for
     assert [beside.curve, beside.diagnosis, beside.curve, beside.diagnosis] == 2 * ["curve", "diagnosis"]
     fitted = ("curve", (space, "base", "linear", "track", "speed"))

@@ -20,7 +20,7 @@ from worlds import settled, tables
 
 from calibration.data.writing import json_value
 from calibration.discovery.discover import FAR
-from calibration.discovery.hidden import Hidden
+from calibration.discovery.hidden import HiddenEffect
 from calibration.discovery.loop_notes import Asked, NameSupport, NameTest, RuledOut
 from calibration.discovery.outliers import Cluster
 from calibration.discovery.result import Alternative, Estimate, Resolved, StatedValue, Worse
@@ -304,7 +304,7 @@ TOLD = {
         found, verdict="none", effects=(), support=None, summary=dataclasses.replace(found.summary, verdict="none")
     ),
     "hidden": lambda found: dataclasses.replace(found, hidden=(
-        Hidden("brush_drop", 0.21, "V", 5.5, "stall", 7.2), Hidden("load_slip", 1e-4, "1/N", 5.1, "", 0.0),
+        HiddenEffect("brush_drop", 0.21, "V", 5.5, "stall", 7.2), HiddenEffect("load_slip", 1e-4, "1/N", 5.1, "", 0.0),
     )),
     "worse": lambda found: dataclasses.replace(found, held_out_worse=(Worse("slope", "motor_speed", 10, 4.3, 4.7),)),
     "ruled_out": lambda found: dataclasses.replace(found, implausible=(Alternative(

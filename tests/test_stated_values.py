@@ -97,7 +97,7 @@ def test_resistance_freed_of_its_prior_is_the_right_one(wrong, truth, looks):
     found = {s.name: s for s in find_prior_shifts(fitted.space, fitted.candidate, NEEDED, analyst.settings)}
     assert "motor.resistance" in found
     shift = found["motor.resistance"]
-    said = findings._stated(fitted.space, fitted.candidate, shift)
+    said = findings._stated_value(fitted.space, fitted.candidate, shift)
     sd = shift.fit.sd[shift.index] * NOMINAL * 0.1
     assert abs(said.value - truth) < 0.05 * truth and sd < 0.05 * truth
     assert said.stated == pytest.approx(NOMINAL) and said.unit == "ohm" and said.prior_sds > 5

@@ -28,10 +28,10 @@ from calibration.discovery.adequacy import AdequacyTest, Diagnosis
 from calibration.discovery.candidates import BaseFit, Candidate, fill_slots, fit_base, fit_candidates, start_of_fit
 from calibration.discovery.classes import Classes, ammeter_families, find_classes, signature_cosines
 from calibration.discovery.description import missed_channels, remaining_errors, unused_inputs
-from calibration.discovery.discrepancy import CurveBeside, locate_discrepancy
+from calibration.discovery.discrepancy import BaseCurve, locate_discrepancy
 from calibration.discovery.experiments import Proposal, propose_denser_runs, propose_nothing, propose_separating
-from calibration.discovery.hidden import Hidden, find_hidden_effects
-from calibration.discovery.kept import Keep
+from calibration.discovery.hidden import HiddenEffect, find_hidden_effects
+from calibration.discovery.kept import StoreStage
 from calibration.discovery.location import DiscrepancyLocation, varied_by_duty
 from calibration.discovery.loop_notes import FreedValue, Mechanism, Missed, Missing, NameSupport, NameTest, Summary
 from calibration.discovery.loop_posterior import posterior_of_curve, posterior_of_fit
@@ -117,7 +117,7 @@ def discover(
     forbidden: Sequence[str] = (),
     rows: int = ROWS,
     progress: Callable[[str], None] = lambda text: None,
-    keep: Keep = kept.keep_nothing,
+    keep: StoreStage = kept.compute_without_storing,
     left: Callable[[], float | None] = lambda: None,
 ) -> DiscoveryResult:
     """Finds the model error of a robot with respect to measured runs, and traces it to a balance or an effect.
@@ -224,7 +224,7 @@ class LoopInput:
     notes: Notes = ()
     at_first: Notes = ()
     progress: Tell = lambda note: None
-    keep: Keep = kept.keep_nothing
+    keep: StoreStage = kept.compute_without_storing
     known: LoopStages | None = None
     others: contextlib.ExitStack | None = None
     later: list[Callable[[BaseFit], None]] = dataclasses.field(default_factory=list)
@@ -377,7 +377,7 @@ class LoopStages:
     where: DiscrepancyLocation | None = None
     standing: NameSupport | None = None
     held_out: tuple[HeldOutAlternative, ...] = ()
-    beside: CurveBeside | None = None
+    beside: BaseCurve | None = None
     predicted: Predicted = dataclasses.field(default_factory=dict)
     mechanism: Mechanism | None = None
     missed: tuple[Missed, ...] = ()
@@ -544,7 +544,7 @@ def _reach_verdict(
     """Verdict on a base with a discrepancy: effects, classes of effects, a mechanism, or a place."""
     runs, settings, progress = given.runs, given.settings, given.progress
     base, space, bases = screened.base.candidate, screened.base.space, screened.bases
-    beside, predicted = CurveBeside(space, base, left, bases), Predicted()
+    beside, predicted = BaseCurve(space, base, left, bases), Predicted()
     where = dataclasses.replace(beside.where, by_duty=varied_by_duty(runs))
     model, searched, stood = choose_effects(runs, screened, left, searched, settings, progress, beside, predicted)
     stages = functools.partial(LoopStages, beside=beside, predicted=predicted)
@@ -618,7 +618,7 @@ def choose_effects(
     searched: Search,
     settings: Settings,
     progress: Tell,
-    beside: CurveBeside,
+    beside: BaseCurve,
     predicted: Predicted,
 ) -> tuple[tuple[Candidate, Diagnosis] | None, Search, NameSupport]:
     """Effects to add to the model (None for no effects), the updated search, and the tests of their names.
@@ -881,14 +881,14 @@ def assemble_result(given: LoopInput, traced: LoopStages) -> DiscoveryResult:
     beside = traced.beside if nameless else None
     if beside is not None:
         progress(next_step("shape"))
-    before, curve = findings.Fitted(*space.fit_of(base.active, base.z)), None
+    before, curve = findings.FittedProblem(*space.fit_of(base.active, base.z)), None
     after, z, sd, cost = None, best.z, best.sd, best.cost
     if beside is not None and best is base:
         curve, ends = beside.curve, beside.diagnosis
         z, sd, cost = curve.z, np.sqrt(np.diag(curve.covariance)), curve.chi2[1] / 2
-        after = findings.Fitted(curve.problem, z, None)
+        after = findings.FittedProblem(curve.problem, z, None)
     elif best is not base:
-        after = findings.Fitted(*space.fit_of(best.active, z))
+        after = findings.FittedProblem(*space.fit_of(best.active, z))
     progress(next_step("errors"))
     predictions = [traced.predicted.get(prediction.candidate_key(c)) for c in (base, best)]
     kinds = blocks_room.predictable_blocks(runs, space.bare)
@@ -919,7 +919,7 @@ def assemble_result(given: LoopInput, traced: LoopStages) -> DiscoveryResult:
     ladder = ladder if traced.alike is None else traced.alike.ladder
     near, too_large = findings.listed_alternatives(space, best, cost, ladder, settings)
     found: tuple[FoundEffect, ...] = ()
-    concealed: tuple[Hidden, ...] = ()
+    concealed: tuple[HiddenEffect, ...] = ()
     if traced.alike is not None:
         found = findings.found_effects(space, base, best, traced.alike, left.test, settings)
         if not nameless:
@@ -963,7 +963,7 @@ def assemble_result(given: LoopInput, traced: LoopStages) -> DiscoveryResult:
         after=findings.evidence_of_test(ends.test, adequate=not ends.test.rejected_with_margin),
         chi2=(2 * base.cost, 2 * cost),
         readings=int(np.sum(space.weight > 0)),
-        base_shift=findings.base_shift(space, base.z, z, sd),
+        base_shift=findings.parameter_shifts(space, base.z, z, sd),
         scores=listed,
         cosine=signature_cosines(space, left.scores)[np.ix_(library_places, library_places)],
         detail=observe.detail(screened.bases, included, left, ends),

@@ -10,7 +10,7 @@ import numpy as np
 from calibration.data import Names
 from calibration.data.posterior_file import ANGLE, LOG, NORMAL, Posterior, join_posteriors
 from calibration.discovery.active_set import ActiveSet, CandidateSpace
-from calibration.discovery.discrepancy import Discrepancy, Shaped
+from calibration.discovery.discrepancy import CurveCoordinates, Discrepancy
 from calibration.inference.identifiability import posterior_of_coordinates
 from calibration.inference.linearization import Linearization, amplitude_of, shape_of, shape_scales
 from calibration.inference.optimizers import informative_residuals
@@ -37,7 +37,7 @@ def posterior_of_fit(space: CandidateSpace, active: Names, z: np.ndarray, linear
 
 def posterior_of_curve(space: CandidateSpace, active: Names, curve: Discrepancy) -> Posterior:
     """Posterior of a fit with a curve. The ordinates, linear in their coordinates, come last."""
-    shaped: Shaped = curve.problem.coordinates
+    shaped: CurveCoordinates = curve.problem.coordinates
     inner = len(shaped.base)
     turn = np.eye(len(shaped))
     turn[inner:, inner:] = np.asarray(shaped.root)

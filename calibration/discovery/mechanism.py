@@ -17,7 +17,7 @@ from calibration.discovery import prediction
 from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.adequacy import Diagnosis
 from calibration.discovery.candidates import Candidate, fit_candidates
-from calibration.discovery.discrepancy import CurveBeside
+from calibration.discovery.discrepancy import BaseCurve
 from calibration.discovery.location import DiscrepancyLocation
 from calibration.discovery.loop_notes import AGAIN, HALF, Mechanism
 from calibration.discovery.prediction import Gain, HeldOutScore, Predicted
@@ -45,7 +45,7 @@ def find_mechanism(
     left: Diagnosis,
     ladder: Sequence[Candidate],
     bases: Bases,
-    beside: CurveBeside,
+    beside: BaseCurve,
     predicted: Predicted,
     settings: Settings,
 ) -> Mechanism | None:
@@ -232,7 +232,7 @@ def _gain_over_changed(score: HeldOutScore, over: HeldOutScore, changed: np.ndar
 
 
 def _gain_of_curve(
-    space: CandidateSpace, runs: Runs, base: Candidate, beside: CurveBeside, predicted: Predicted
+    space: CandidateSpace, runs: Runs, base: Candidate, beside: BaseCurve, predicted: Predicted
 ) -> Gain:
     """Hold-out gain by the curve of the base's discrepancy, within the range of its variable in each fit.
 
@@ -250,7 +250,7 @@ def _gain_of_curve(
     return _gain_over_changed(score, scored_once(space, runs, base, predicted), changed)
 
 
-def _within_seen_range(space: CandidateSpace, beside: CurveBeside, masks: Sequence[np.ndarray]) -> np.ndarray:
+def _within_seen_range(space: CandidateSpace, beside: BaseCurve, masks: Sequence[np.ndarray]) -> np.ndarray:
     """True for rows with a curve's variable within the range of the rows outside their block, shape (rows,).
 
     Args:

@@ -17,7 +17,7 @@ from calibration.described import describe, sentences
 from calibration.discovery import formula
 from calibration.discovery.experiments import Proposal
 from calibration.discovery.headline import headline
-from calibration.discovery.hidden import Hidden
+from calibration.discovery.hidden import HiddenEffect
 from calibration.discovery.kept import REFIT_FILE
 from calibration.discovery.location import DiscrepancyLocation
 from calibration.discovery.loop_notes import Asked, Headline, NameSupport, RuledOut, Summary
@@ -480,7 +480,7 @@ class DiscoveryResult:
     needs_reverse: Names
     alternatives: tuple[Alternative, ...]
     implausible: tuple[Alternative, ...]
-    hidden: tuple[Hidden, ...]
+    hidden: tuple[HiddenEffect, ...]
     support: NameSupport | None
     cluster: Cluster | None
     residual_clusters: tuple[ResidualCluster, ...]

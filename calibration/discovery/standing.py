@@ -20,7 +20,7 @@ from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.adequacy import AdequacyTest, Diagnosis
 from calibration.discovery.candidates import Candidate
 from calibration.discovery.classes import remove_effect
-from calibration.discovery.discrepancy import CurveBeside, locate_discrepancy
+from calibration.discovery.discrepancy import BaseCurve, locate_discrepancy
 from calibration.discovery.loop_notes import CurveOver, NameSupport, NameTest
 from calibration.discovery.projection import Projection
 from calibration.discovery.score_tests import ABSORBED, augment_with_columns, family_columns, statistics_with_columns
@@ -60,7 +60,7 @@ def judge_names(
     settings: Settings,
     proposed: Proposed | None = None,
     blocks: Sequence[np.ndarray] = (),
-    beside: CurveBeside | None = None,
+    beside: BaseCurve | None = None,
 ) -> NameSupport:
     """Tests which effects of the best candidate of a search, or of a given proposal, may be named.
 
@@ -82,7 +82,7 @@ def judge_names(
     if adequate:
         support = _against_curves(space, base, best, left.linear, bases, settings)
     else:
-        beside = CurveBeside(space, base, left, bases) if beside is None else beside
+        beside = BaseCurve(space, base, left, bases) if beside is None else beside
         support = _one_curve(space, best, left, bases, settings, beside)
     fits = dataclasses.replace(searched, ladder=(base, *searched.ladder))
     tests = name_tests(space, best, fits, bases, after, settings, blocks, better)
@@ -205,7 +205,7 @@ def _equation(space: CandidateSpace, effect: str) -> str:
 
 
 def _one_curve(
-    space: CandidateSpace, best: Candidate, left: Diagnosis, bases: Bases, settings: Settings, beside: CurveBeside
+    space: CandidateSpace, best: Candidate, left: Diagnosis, bases: Bases, settings: Settings, beside: BaseCurve
 ) -> NameSupport:
     """Test whether a single curve is adequate where the names of a candidate are not."""
     names = bases_room.family_names(bases)
