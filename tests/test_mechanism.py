@@ -57,11 +57,11 @@ def found(monkeypatch):
     )  # fmt: skip
     score = HeldOutScore({}, {})
     monkeypatch.setattr(room.blocks_room, "predictable_blocks", lambda *_: {})
-    monkeypatch.setattr(room, "scored_once", lambda *_: score)
-    monkeypatch.setattr(room, "_scored", lambda *_: score)
-    monkeypatch.setattr(room, "_reading", lambda *_: None)
+    monkeypatch.setattr(room, "cached_hold_out_score", lambda *_: score)
+    monkeypatch.setattr(room, "_hold_out_score", lambda *_: score)
+    monkeypatch.setattr(room, "_simulated_reading", lambda *_: None)
     monkeypatch.setattr(room, "_changed_readings", lambda *_: None)
-    monkeypatch.setattr(room, "_curve_again", lambda *_: 0.9)
+    monkeypatch.setattr(room, "_curve_recurrence", lambda *_: 0.9)
     monkeypatch.setattr(room, "chosen_again", lambda *_: 1.0)
 
     def of(*ladder, curve, where=SPEED, long=False):

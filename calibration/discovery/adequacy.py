@@ -6,7 +6,7 @@ import dataclasses
 
 import numpy as np
 
-from calibration.discovery.score_tests import ScoreTable, Statistics
+from calibration.discovery.score_tests import ScoreTable, StrongestStatistics
 from calibration.discovery.settings import Settings
 from calibration.inference.linearization import Linearization
 
@@ -21,8 +21,8 @@ class AdequacyTest:
         settings: family-wise error of each kind of statistic, and margins.
     """
 
-    found: Statistics
-    null: Statistics
+    found: StrongestStatistics
+    null: StrongestStatistics
     settings: Settings
 
     def p(self, kind: str) -> float:

@@ -13,10 +13,10 @@ from calibration.data import Names
 from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.adequacy import Diagnosis
 from calibration.discovery.candidates import Candidate, candidate_of_fit, fit_candidates, start_of_fit
-from calibration.discovery.projection import explained_by
+from calibration.discovery.projection import explained_function
 from calibration.discovery.score_tests import ScoreTable
 from calibration.discovery.screening import fit_by_regression
-from calibration.discovery.search import without_each
+from calibration.discovery.search import refit_without_each
 from calibration.discovery.settings import Settings
 from calibration.inference.bases import place_in_words
 from calibration.inference.held_out import search_each
@@ -182,7 +182,7 @@ def find_classes(
         after: diagnosis of the best fit.
     """
     cosine, names = signature_cosines(space, left.scores), space.library.names
-    fewer = [base] if len(best.effects) == 1 else without_each(space, best, settings, ladder)
+    fewer = [base] if len(best.effects) == 1 else refit_without_each(space, best, settings, ladder)
     gains = [2 * (c.cost - best.cost) for c in fewer]
     requests: list[tuple[int, str, Names]] = []
     for slot, name in enumerate(best.effects):
@@ -266,7 +266,7 @@ def ammeter_families(
     names = channels.channel_names(space.bare.channels)
     if space.bare.base.rig.imposed != "motor_speed":
         return ()
-    explained = explained_by(jacobian, residual)
+    explained = explained_function(jacobian, residual)
     most = explained(columns)[0]
     least = most - max(settings.same, settings.form**2 * most)
     driver = family.partition(" that ")[2].replace("with load", "with current")

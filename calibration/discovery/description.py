@@ -9,7 +9,7 @@ import numpy as np
 from calibration.data import Names
 from calibration.data.runs import Runs
 from calibration.discovery.active_set import CandidateSpace
-from calibration.discovery.loop_notes import Missed
+from calibration.discovery.loop_notes import MissedChannel
 from calibration.discovery.prediction import HeldOutScore
 from calibration.inference import checks as unused_room
 from calibration.inference.lack_of_fit import EXPLAINED, UNDESCRIBED
@@ -20,7 +20,9 @@ from calibration.inference.noise import UNSTATED, Noise
 REMOVED = 0.5
 
 
-def missed_channels(space: CandidateSpace, runs: Runs, noise: Noise, refit: Linearization) -> tuple[Missed, ...]:
+def missed_channels(
+    space: CandidateSpace, runs: Runs, noise: Noise, refit: Linearization
+) -> tuple[MissedChannel, ...]:
     """Channels with a refit error above `UNDESCRIBED` of their measured rms, or with an estimated noise above it.
 
     If the stated noise of a channel is that large, residuals up to `EXPLAINED` times the noise are accepted.
@@ -37,15 +39,15 @@ def missed_channels(space: CandidateSpace, runs: Runs, noise: Noise, refit: Line
         noisy = np.sqrt(np.nansum(np.where(counts, noise.sd, 0.0) ** 2, 0) / np.nansum(measured_values**2, 0))
     noisy = np.where(has_stated_sd, 0.0, noisy)
     return tuple(
-        Missed(c.name, float(share[k]), float(noisy[k]))
+        MissedChannel(c.name, float(share[k]), float(noisy[k]))
         for k, c in enumerate(runs.channels)
         if large[k] or noisy[k] > UNDESCRIBED
     )
 
 
 def remaining_errors(
-    space: CandidateSpace, runs: Runs, missed: Sequence[Missed], refit: HeldOutScore, found: HeldOutScore
-) -> tuple[Missed, ...]:
+    space: CandidateSpace, runs: Runs, missed: Sequence[MissedChannel], refit: HeldOutScore, found: HeldOutScore
+) -> tuple[MissedChannel, ...]:
     """Hold-out errors of the missed channels after effects were added.
 
     None if the effects do not describe the runs either: more than `UNDESCRIBED` of a channel's rms remains, less than

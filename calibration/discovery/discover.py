@@ -33,9 +33,17 @@ from calibration.discovery.experiments import Proposal, propose_denser_runs, pro
 from calibration.discovery.hidden import HiddenEffect, find_hidden_effects
 from calibration.discovery.kept import StoreStage
 from calibration.discovery.location import DiscrepancyLocation, varied_by_duty
-from calibration.discovery.loop_notes import FreedValue, Mechanism, Missed, Missing, NameSupport, NameTest, Summary
+from calibration.discovery.loop_notes import (
+    AlternativeValue,
+    Mechanism,
+    MissedChannel,
+    MissingEffect,
+    NameSupport,
+    NameTest,
+    VerdictSummary,
+)
 from calibration.discovery.loop_posterior import posterior_of_curve, posterior_of_fit
-from calibration.discovery.mechanism import find_mechanism, scored_once
+from calibration.discovery.mechanism import cached_hold_out_score, find_mechanism
 from calibration.discovery.outliers import (
     Screening,
     compile_ahead,
@@ -46,16 +54,16 @@ from calibration.discovery.outliers import (
 from calibration.discovery.prediction import Predicted
 from calibration.discovery.result import (
     DiscoveryResult,
+    EffectRanking,
     Errors,
     FoundEffect,
     HeldOutAlternative,
-    Ranking,
+    NoiseVerdict,
     ReadingsOfRows,
-    Sensitivity,
 )
-from calibration.discovery.score_tests import Statistics, bootstrap, family_columns
-from calibration.discovery.screening import screen_by_weak_form, with_program_room
-from calibration.discovery.search import Search, best_of_each_size, diagnose_candidate, search_effects
+from calibration.discovery.score_tests import StrongestStatistics, bootstrap_statistics, family_columns
+from calibration.discovery.screening import include_likely_effects, screen_by_weak_form
+from calibration.discovery.search import SearchResult, best_of_each_size, diagnose_candidate, search_effects
 from calibration.discovery.settings import FIT, HELD_OUT, WITHOUT_NAME, Settings, settings_for
 from calibration.discovery.standing import judge_names
 from calibration.inference import bases as bases_room
@@ -158,7 +166,7 @@ def discover(
     factors = FACTORS.get(known.word, ())
     # Verdicts at other noises use the programs of the first one, so they run in parallel on other cores.
     threads = Threads(2)
-    sensitivity, outstanding = list[Sensitivity](), list[float]()
+    sensitivity, outstanding = list[NoiseVerdict](), list[float]()
     try:
         if factors:
             tell(next_step("factors", tuple(f"{f:g}" for f in factors), known.word))
@@ -241,7 +249,7 @@ class LoopInput:
         If the residuals have no structure but exceed the sds by the same factor everywhere, the sds are wrong. The
         stages are then repeated with sds estimated from the residuals.
         """
-        ranked = list[Ranking]()
+        ranked = list[EffectRanking]()
         with contextlib.ExitStack() as others:
             given = dataclasses.replace(self, others=others if ahead else None, later=[])
             screened, sds = self.keep("base", functools.partial(_fit_base_and_noise, given, ranked))
@@ -257,7 +265,7 @@ class LoopInput:
         """True if the log shows backlash but the robot has none."""
         return bool(lost_motion_notes(self.runs, self.robot))
 
-    def screen(self, noise: Noise, before: BaseFit | None, ranked: list[Ranking]) -> Screening:
+    def screen(self, noise: Noise, before: BaseFit | None, ranked: list[EffectRanking]) -> Screening:
         """Fits the base with this noise and excludes outliers. `before` is an earlier fit with other noise.
 
         For logs, the equations in weak form give the program and the start of the fit. Their ranking of the library
@@ -310,7 +318,7 @@ def prepare_loop(
             f"{runs.source}: {count_noun(len(distinct), kind.word)} cannot show what a model lacks; at least "
             f"{kind.fewest} are needed"
         )
-    with scales.nominal_ahead(robot):
+    with scales.compute_nominal_ahead(robot):
         ready = preparation.prepare(distinct, robot, noise, stated)
     for note in with_codes(ready.checked, "nothing_varies", "copied"):
         if note.code == "nothing_varies" or not note.tied:
@@ -320,7 +328,7 @@ def prepare_loop(
     turned = scales.output_rotation(distinct, ready.robot)
     channel_effects = {name: e for name, e in effects.OF_CHANNELS.items() if e.channel in ready.robot.rig.channels}
     library = {**library, **kind.library, **channel_effects}
-    library = scales.library_of_size(ready.robot, distinct.conditions(ready.robot), library, turned)
+    library = scales.scale_library(ready.robot, distinct.conditions(ready.robot), library, turned)
     settings = dataclasses.replace(
         settings_for(kind, replicates, seed, prefer),
         forbidden=tuple(forbidden),
@@ -372,7 +380,7 @@ class LoopStages:
     screened: Screening
     left: Diagnosis
     sds: VerdictNoise
-    searched: Search | None = None
+    searched: SearchResult | None = None
     alike: Classes | None = None
     where: DiscrepancyLocation | None = None
     standing: NameSupport | None = None
@@ -380,7 +388,7 @@ class LoopStages:
     beside: BaseCurve | None = None
     predicted: Predicted = dataclasses.field(default_factory=dict)
     mechanism: Mechanism | None = None
-    missed: tuple[Missed, ...] = ()
+    missed: tuple[MissedChannel, ...] = ()
     unused: Names = ()
 
     @property
@@ -452,7 +460,7 @@ class LoopStages:
         return self.searched.diagnosis
 
 
-def _fit_base_and_noise(given: LoopInput, ranked: list[Ranking]) -> tuple[Screening, VerdictNoise]:
+def _fit_base_and_noise(given: LoopInput, ranked: list[EffectRanking]) -> tuple[Screening, VerdictNoise]:
     """Fits the base. If its residuals have no structure but exceed the noise by one factor, rescales the noise."""
     known, noise = given.known, given.noise
     screened = given.screen(noise, None if known is None else known.screened.base, ranked)
@@ -474,7 +482,7 @@ def _test_base(given: LoopInput, sds: VerdictNoise, screened: Screening) -> tupl
     known, weight = given.known, screened.base.space.weight
     null = None if known is None or np.any(known.screened.base.space.weight != weight) else known.left.test.null
     base, (linear, scores, _) = screened.base, screened.diagnosed
-    space = with_program_room(base.space, base.candidate, linear, scores, given.settings)
+    space = include_likely_effects(base.space, base.candidate, linear, scores, given.settings)
     screened = dataclasses.replace(screened, base=dataclasses.replace(base, space=space))
     if np.max(np.abs(np.asarray(scores.single))) > LIKELY:
         for begin in given.later:
@@ -482,7 +490,9 @@ def _test_base(given: LoopInput, sds: VerdictNoise, screened: Screening) -> tupl
     return screened, diagnose_base_by_bootstrap(screened, given.settings, sds.noise.freedom, null)
 
 
-def _search_effects(given: LoopInput, screened: Screening, left: Diagnosis) -> tuple[Screening, Diagnosis, Search]:
+def _search_effects(
+    given: LoopInput, screened: Screening, left: Diagnosis
+) -> tuple[Screening, Diagnosis, SearchResult]:
     """Searches for effects that explain the residuals of the base fit."""
     base = screened.base
     searched = search_effects(base.space, base.candidate, left, screened.bases, given.settings, given.progress)
@@ -491,8 +501,8 @@ def _search_effects(given: LoopInput, screened: Screening, left: Diagnosis) -> t
 
 
 def _search_until_clean(
-    given: LoopInput, screened: Screening, sds: VerdictNoise, ranked: list[Ranking]
-) -> tuple[Screening, Diagnosis, Search | None]:
+    given: LoopInput, screened: Screening, sds: VerdictNoise, ranked: list[EffectRanking]
+) -> tuple[Screening, Diagnosis, SearchResult | None]:
     """Searches for effects, again whenever new outliers appear. No search if the base fits, or if the log shows
     backlash that the robot lacks.
     """
@@ -521,7 +531,7 @@ def _search_until_clean(
     return screened, left, searched
 
 
-def _confirm_gains(screened: Screening, left: Diagnosis, searched: Search) -> Diagnosis | None:
+def _confirm_gains(screened: Screening, left: Diagnosis, searched: SearchResult) -> Diagnosis | None:
     """Diagnosis of the base fit of a log after simulations of the strongest effects.
 
     Scores are linear but the contact of a vehicle is not, so a significant score may vanish in a simulation. None if
@@ -539,7 +549,7 @@ def _confirm_gains(screened: Screening, left: Diagnosis, searched: Search) -> Di
 
 
 def _reach_verdict(
-    given: LoopInput, screened: Screening, left: Diagnosis, sds: VerdictNoise, searched: Search
+    given: LoopInput, screened: Screening, left: Diagnosis, sds: VerdictNoise, searched: SearchResult
 ) -> LoopStages:
     """Verdict on a base with a discrepancy: effects, classes of effects, a mechanism, or a place."""
     runs, settings, progress = given.runs, given.settings, given.progress
@@ -548,13 +558,13 @@ def _reach_verdict(
     where = dataclasses.replace(beside.where, by_duty=varied_by_duty(runs))
     model, searched, stood = choose_effects(runs, screened, left, searched, settings, progress, beside, predicted)
     stages = functools.partial(LoopStages, beside=beside, predicted=predicted)
-    leaves: tuple[Missed, ...] = ()
+    leaves: tuple[MissedChannel, ...] = ()
     if missed := missed_channels(space, runs, sds.noise, left.linear):
         progress(next_step("held out"))
-        refit = scored_once(space, runs, base, predicted)
+        refit = cached_hold_out_score(space, runs, base, predicted)
         fits = {c.key: c for c in (model[0] if model else None, searched.best, *best_of_each_size(searched)) if c}
         for fit in fits.values():
-            leaves = remaining_errors(space, runs, missed, refit, scored_once(space, runs, fit, predicted))
+            leaves = remaining_errors(space, runs, missed, refit, cached_hold_out_score(space, runs, fit, predicted))
             if leaves:
                 break
         else:
@@ -582,7 +592,7 @@ def _reach_verdict(
         progress(next_step("held out"))
         searched, alike, compared = preference.prefer_by_held_out(space, runs, searched, alike, bases, settings)
         after = searched.diagnosis or after
-        stood = stood.renamed(dict(zip(best.active, (searched.best or best).active, strict=True)))
+        stood = stood.with_leaders(dict(zip(best.active, (searched.best or best).active, strict=True)))
     alone = all(one for one, name in zip(alike.alone, established_names, strict=True) if name)
     verdict = "named" if alone else "class"
     remains = locate_discrepancy(after, bases, space.included) if after.test.rejected_with_margin else None
@@ -615,12 +625,12 @@ def choose_effects(
     runs: Runs,
     screened: Screening,
     left: Diagnosis,
-    searched: Search,
+    searched: SearchResult,
     settings: Settings,
     progress: Tell,
     beside: BaseCurve,
     predicted: Predicted,
-) -> tuple[tuple[Candidate, Diagnosis] | None, Search, NameSupport]:
+) -> tuple[tuple[Candidate, Diagnosis] | None, SearchResult, NameSupport]:
     """Effects to add to the model (None for no effects), the updated search, and the tests of their names.
 
     The effects are those whose names are established, and those of the smallest set that predicts as well as any.
@@ -659,7 +669,9 @@ def choose_effects(
     else:
         proposed = best, after
     names = [e for e in proposed[0].effects if stood.established(e)]
-    added_effects = [e for e in (() if few is None else few.effects) if e not in names and not stood.stands_in(e)]
+    added_effects = [
+        e for e in (() if few is None else few.effects) if e not in names and not stood.imitates_curve(e)
+    ]
     names += added_effects[: settings.slots - len(names)]
     if not names:
         return None, searched, stood
@@ -771,7 +783,10 @@ def bases_at_fit(runs: Runs, base: BaseFit) -> Bases:
 
 
 def diagnose_base_by_bootstrap(
-    screened: Screening, settings: Settings, freedom: np.ndarray | None = None, null: Statistics | None = None
+    screened: Screening,
+    settings: Settings,
+    freedom: np.ndarray | None = None,
+    null: StrongestStatistics | None = None,
 ) -> Diagnosis:
     """Diagnosis of the base fit, with its own bootstrap.
 
@@ -782,7 +797,7 @@ def diagnose_base_by_bootstrap(
     space, base = screened.base.space, screened.base.candidate
     linear, scores, statistics = screened.diagnosed
     if null is None:
-        null = bootstrap(
+        null = bootstrap_statistics(
             space.bare, base.z[: space.free], linear, space.library.scored, screened.bases, settings.replicates,
             settings.seed, freedom,
         )  # fmt: skip
@@ -818,22 +833,22 @@ def remove_copies(runs: Runs) -> tuple[Runs, np.ndarray, list[Remark]]:
     return runs.where(np.asarray(keep)), np.asarray(keep) + 1, [Remark("copies", rows=tuple(k + 1 for k in copies))]
 
 
-def verdict_at_noise(factor: float, traced: LoopStages, numbers: np.ndarray) -> Sensitivity:
+def verdict_at_noise(factor: float, traced: LoopStages, numbers: np.ndarray) -> NoiseVerdict:
     """Verdict and summary at another noise level."""
     adequate = not traced.ends.test.rejected_with_margin
     near = bool(traced.screened.base.space.near)
-    return Sensitivity(factor, traced.verdict, verdict_summary(traced, numbers), traced.members, adequate, near)
+    return NoiseVerdict(factor, traced.verdict, verdict_summary(traced, numbers), traced.members, adequate, near)
 
 
-def verdict_summary(traced: LoopStages, numbers: np.ndarray) -> Summary:
+def verdict_summary(traced: LoopStages, numbers: np.ndarray) -> VerdictSummary:
     """Data from which the statement of a verdict is written. `numbers`: row numbers as used in messages."""
     space, alike = traced.screened.base.space, traced.alike
-    support = None if traced.standing is None else traced.standing.numbered(numbers)
+    support = None if traced.standing is None else traced.standing.with_row_numbers(numbers)
     best = None if traced.searched is None else traced.searched.best
     base = traced.screened.base.candidate
     aside, counting = len(traced.screened.outliers), int(space.included.sum())
     many = aside > MANY * (aside + counting)
-    return Summary(
+    return VerdictSummary(
         traced.verdict,
         traced.left.test.p_value,
         traced.where,
@@ -851,14 +866,15 @@ def verdict_summary(traced: LoopStages, numbers: np.ndarray) -> Summary:
     )
 
 
-def missing_effects(space: CandidateSpace, alike: Classes, support: NameSupport | None) -> tuple[Missing, ...]:
+def missing_effects(space: CandidateSpace, alike: Classes, support: NameSupport | None) -> tuple[MissingEffect, ...]:
     """Effects that the search added to the model, each with its alternatives and whether it is established."""
     c, p = space.coordinates.base, space.free
     return tuple(
-        Missing(
+        MissingEffect(
             names,
             tuple(
-                FreedValue(s.name, float(c.value(np.asarray(s.fit.z[:p]))[s.index]), c.units[s.index]) for s in shifts
+                AlternativeValue(s.name, float(c.value(np.asarray(s.fit.z[:p]))[s.index]), c.units[s.index])
+                for s in shifts
             ),
             families,
             support is None or support.established(names[0]),

@@ -23,9 +23,9 @@ from calibration.discovery.adequacy import AdequacyTest, Diagnosis
 from calibration.discovery.candidates import Candidate
 from calibration.discovery.formula import Proposal, propose_formula
 from calibration.discovery.location import DiscrepancyLocation
-from calibration.discovery.projection import Defect, Projection, defect_by_row
+from calibration.discovery.projection import BalanceError, Projection, balance_error_by_row
 from calibration.discovery.score_tests import diagnose_fit
-from calibration.discovery.smooth import Smooth, smooth_curve
+from calibration.discovery.smooth import SmoothCurve, fit_smooth_curve
 from calibration.inference import bases as bases_room
 from calibration.inference.bases import Bases
 from calibration.inference.held_out import search_each
@@ -79,7 +79,7 @@ def locate_discrepancy(left: Diagnosis, bases: Bases, included: np.ndarray) -> D
     j = k if for_a_while else max(over, key=lambda j: deviate[j])
     if names[j][1] in bases_room.VARIABLES:
         smoothly = [i for i in over if bases_room.window_from_name(names[i][1]) is None]
-        evidence = {i: smooth_curve(left.linear, *names[i], included).evidence for i in smoothly}
+        evidence = {i: fit_smooth_curve(left.linear, *names[i], included).evidence for i in smoothly}
         j = max(smoothly, key=lambda i: evidence[i] - INDIRECT * (names[i][1] == "voltage"))
     places = dict.fromkeys(names[i][0] for i in same_kind)
     best = {b: max(deviate[i] for i in same_kind if names[i][0] == b) for b in places}
@@ -206,7 +206,7 @@ class Discrepancy:
     unit: str
     effect: str
     robot: Robot
-    defect: Defect | None
+    defect: BalanceError | None
     grid: np.ndarray
     curve: np.ndarray
     sd: np.ndarray
@@ -231,7 +231,7 @@ def fit_discrepancy(
         variable: one of `bases.VARIABLES`, of `bases.ORDERS`, or a window.
     """
     included = space.included
-    at_base = smooth_curve(linear, balance, variable, included)
+    at_base = fit_smooth_curve(linear, balance, variable, included)
     problem = _problem_with_curve(space, base, at_base)
     inner = len(problem.coordinates.base)
     starts = np.zeros((STARTS, len(problem.coordinates)))
@@ -250,7 +250,7 @@ def fit_discrepancy(
         unit=PLACES[balance][0],
         effect=at_base.effect,
         robot=_without_absent_effects(problem.robot(jnp.asarray(z)), space, base, at_base.effect),
-        defect=defect_by_row(linear, balance) if space.bare.observe.rows_tell else None,
+        defect=balance_error_by_row(linear, balance) if space.bare.observe.rows_tell else None,
         grid=grid,
         curve=shape @ z[inner:],
         sd=np.sqrt(np.einsum("ij,jk,ik->i", shape, ordinates, shape)),
@@ -303,7 +303,7 @@ class BaseCurve:
         return diagnose_with_curve(self.space, self.curve, self.bases, self.left)
 
 
-def _problem_with_curve(space: CandidateSpace, base: Candidate, curve: Smooth) -> Problem:
+def _problem_with_curve(space: CandidateSpace, base: Candidate, curve: SmoothCurve) -> Problem:
     """Problem of the base and a smooth curve, whose ordinates are the last coordinates."""
     problem = space.problem(base.active) if base.effects else space.bare
     # A curve of this name from an earlier round is replaced, because its parameters have the same names.

@@ -198,11 +198,11 @@ def alternatives_of_class(best: Candidate, found: Classes, *, stated: bool = Tru
 def _predict_alternatives(
     problem: Problem,
     other: priors.Coordinates | None,
-    batch: predicted.Batch,
+    batch: predicted.ExperimentBatch,
     which: Array,
     z: Array,
     informed: Array,
-) -> tuple[predicted.Predicted, Array]:
+) -> tuple[predicted.MenuPrediction, Array]:
     """Readings of the menu for each alternative, and the square root of their covariance due to the fit.
 
     Args:
@@ -212,7 +212,7 @@ def _predict_alternatives(
 
     def predict_alternative(
         w: Array, z: Float[Array, " coordinates"], informed: Array
-    ) -> tuple[predicted.Predicted, Array]:
+    ) -> tuple[predicted.MenuPrediction, Array]:
         coordinates = problem.coordinates.with_effects(w)
 
         def robot(x: Array) -> Robot:
@@ -222,7 +222,7 @@ def _predict_alternatives(
         wide = jnp.concatenate([z, jnp.zeros(0 if other is None else len(other))])
         unknowns, solved = predicted.map_over_runs(IMPLICIT.solve, robot(wide), batch)
 
-        def readings(x: Array) -> tuple[Any, predicted.Predicted]:
+        def readings(x: Array) -> tuple[Any, predicted.MenuPrediction]:
             return predicted.predict_readings(robot(x[: wide.size]), batch, unknowns + x[wide.size :], solved)
 
         (acts, every, left), found = jax.jacfwd(readings, has_aux=True)(
@@ -275,7 +275,7 @@ def predict_menu(space: CandidateSpace, candidates: Mapping[str, Candidate], set
 
 
 def _possible_experiments(
-    experiments: Sequence[menu.Experiment], found: predicted.Predicted, within: Reach, settings: Settings
+    experiments: Sequence[menu.Experiment], found: predicted.MenuPrediction, within: Reach, settings: Settings
 ) -> tuple[tuple[menu.Experiment, ...], np.ndarray]:
     """Experiments of a menu that are possible and allowed, and a mask of their readings among all readings of the
     menu.
@@ -283,13 +283,13 @@ def _possible_experiments(
     Args:
         found: predictions for each alternative, the best fit first.
     """
-    runs = [e for e in experiments if isinstance(e, menu.Run)]
+    runs = [e for e in experiments if isinstance(e, menu.ProposedRuns)]
     ends = dict(zip((r.name for r in runs), np.cumsum([len(r.voltage) for r in runs]).tolist(), strict=True))
     possible_experiments: list[menu.Experiment] = []
     kept: list[np.ndarray] = []
     for e in experiments:
         rows = np.ones(predicted.reading_count(e), bool)
-        if isinstance(e, menu.Run):
+        if isinstance(e, menu.ProposedRuns):
             span = slice(ends[e.name] - len(e.voltage), ends[e.name])
             grips = np.abs(found.grip[:, span]) < np.where(np.asarray(e.slope) > e.beyond, menu.GRIP, np.inf)
             possible_runs = menu.possible_runs(e, np.all(found.does[:, span] & grips, 0))

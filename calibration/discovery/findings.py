@@ -20,25 +20,25 @@ from calibration.discovery.discrepancy import BaseCurve
 from calibration.discovery.location import DiscrepancyLocation
 from calibration.discovery.loop_notes import RuledOut
 from calibration.discovery.mechanism import excess_misfit, share_of_excess
-from calibration.discovery.projection import Defect, defect_by_row
+from calibration.discovery.projection import BalanceError, balance_error_by_row
 from calibration.discovery.result import (
-    Alternative,
-    BaseShift,
+    ClassMember,
+    EffectRanking,
     EffectScore,
-    Estimate,
     Evidence,
     FoundEffect,
     KindOfEvidence,
-    Member,
-    Ranked,
-    Ranking,
+    ParameterEstimate,
+    ParameterShift,
+    RankedEffect,
     ReadingsOfRows,
+    RejectedCandidate,
     StatedValue,
     UnnamedDiscrepancy,
 )
 from calibration.discovery.score_tests import ScoreTable
-from calibration.discovery.screening import Beforehand
-from calibration.discovery.search import single_p_value, without_each
+from calibration.discovery.screening import WeakFormScreening
+from calibration.discovery.search import refit_without_each, single_p_value
 from calibration.discovery.settings import Settings
 from calibration.inference import bases, priors
 from calibration.inference.estimates import SIDE_OF_BOUND
@@ -75,7 +75,7 @@ def found_effects(
         test: adequacy test of the base fit. Its bootstrap gives the p-values.
     """
     # The unique contribution of each effect: the rise of χ² if it is removed and everything is refitted.
-    others = [base] if len(best.effects) == 1 else without_each(space, best, settings, found.ladder)
+    others = [base] if len(best.effects) == 1 else refit_without_each(space, best, settings, found.ladder)
     gains = [2 * (c.cost - best.cost) for c in others]
     null, excess = np.asarray(test.null.single), excess_misfit(space, base)
     listed = []
@@ -101,13 +101,15 @@ def found_effects(
     return tuple(listed)
 
 
-def _effect_parameters(space: CandidateSpace, best: Candidate, slot: int, settings: Settings) -> dict[str, Estimate]:
+def _effect_parameters(
+    space: CandidateSpace, best: Candidate, slot: int, settings: Settings
+) -> dict[str, ParameterEstimate]:
     effect, p = space.library[best.active[slot]], space.free
     amplitude, unit = amplitude_of(effect), amplitude_unit(effect)
     sd = settings.width * best.sd[p + slot] * unit
     held_names = held_by_prior(best.sd)
     values = {
-        amplitude.name: Estimate(
+        amplitude.name: ParameterEstimate(
             float(best.amplitude[slot] * unit), float(sd), amplitude.spec.unit, bool(held_names[p + slot])
         )
     }
@@ -115,7 +117,7 @@ def _effect_parameters(space: CandidateSpace, best: Candidate, slot: int, settin
     if shape is not None:
         k, scales = p + settings.slots + slot, shape_scales(shape)
         value, slope = _shaped(scales, best.z[k])
-        values[shape.name] = Estimate(
+        values[shape.name] = ParameterEstimate(
             float(value), float(slope) * float(best.sd[k]), shape.spec.unit, bool(held_names[k])
         )
     return values
@@ -124,13 +126,13 @@ def _effect_parameters(space: CandidateSpace, best: Candidate, slot: int, settin
 _shaped = jax.jit(jax.value_and_grad(shape_at, argnums=1))
 
 
-def _class_member(space: CandidateSpace, best: Candidate, found: Classes, slot: int, name: str) -> Member:
+def _class_member(space: CandidateSpace, best: Candidate, found: Classes, slot: int, name: str) -> ClassMember:
     """Result entry of an alternative effect of a class."""
     active_names = frozenset(name if s == slot else n for s, n in enumerate(best.active)) - {""}
     other = next(c for c in (best, *found.ladder) if c.key == active_names)
     position = other.active.index(name)
     amplitude = other.amplitude[position] * amplitude_unit(space.library[name])
-    return Member(float(amplitude), float(other.size[position]), float(2 * (other.cost - best.cost)))
+    return ClassMember(float(amplitude), float(other.size[position]), float(2 * (other.cost - best.cost)))
 
 
 def _stated_value(space: CandidateSpace, best: Candidate, shift: Shift) -> StatedValue:
@@ -148,9 +150,9 @@ def unnamed_discrepancy(
     happens = bases.window_from_name(where.variable)
     x, way = linear.in_travel(found.balance, where.variable if happens is None else happens.axis)
     if found.defect is not None:
-        lacks = defect_by_row(linear, found.balance)
+        lacks = balance_error_by_row(linear, found.balance)
         turn = 2 * np.pi if where.variable in bases.ORDERS else None
-        lacks = Defect(np.interp(x, found.grid, found.curve, period=turn) + way * lacks.value, lacks.sd)
+        lacks = BalanceError(np.interp(x, found.grid, found.curve, period=turn) + way * lacks.value, lacks.sd)
     return UnnamedDiscrepancy(
         **dataclasses.asdict(where),
         unit=found.unit,
@@ -172,7 +174,7 @@ def unnamed_discrepancy(
 
 def listed_alternatives(
     space: CandidateSpace, best: Candidate, cost: float, ladder: Sequence[Candidate], settings: Settings
-) -> tuple[tuple[Alternative, ...], tuple[Alternative, ...]]:
+) -> tuple[tuple[RejectedCandidate, ...], tuple[RejectedCandidate, ...]]:
     """Simulated candidates that explain the data nearly as well as the proposal, and separately those of implausible
     size.
 
@@ -183,7 +185,7 @@ def listed_alternatives(
         cost: objective of the proposal [½σ²].
         best: the proposal, if it is a candidate.
     """
-    near: tuple[list[Alternative], list[Alternative]] = ([], [])
+    near: tuple[list[RejectedCandidate], list[RejectedCandidate]] = ([], [])
     simpler = {best.key: cost} if best.key else {}
     for c in sorted((c for c in ladder if c.simulated), key=lambda x: (len(x.effects), x.cost)):
         rise = 2 * (c.cost - cost)
@@ -197,7 +199,7 @@ def listed_alternatives(
     return plausible, ruled_out
 
 
-def _alternative(space: CandidateSpace, c: Candidate, rise: float, settings: Settings) -> Alternative:
+def _alternative(space: CandidateSpace, c: Candidate, rise: float, settings: Settings) -> RejectedCandidate:
     sds, sizes, why = {}, {}, list[RuledOut]()
     for slot, (name, amplitude, size) in enumerate(zip(c.active, c.amplitude, c.size, strict=True)):
         if not name:
@@ -212,7 +214,7 @@ def _alternative(space: CandidateSpace, c: Candidate, rise: float, settings: Set
         elif not c.plausible and size * (1 + sd / max(abs(float(amplitude)), 1e-12)) >= 1:
             why.append(RuledOut(name, "edge"))
     amplitudes = {name: a * amplitude_unit(space.library[name]) for name, a in sds.items()}
-    return Alternative(amplitudes, sds, sizes, float(rise), tuple(why))
+    return RejectedCandidate(amplitudes, sds, sizes, float(rise), tuple(why))
 
 
 def proposed_robot(space: CandidateSpace, best: Candidate) -> Robot:
@@ -238,7 +240,7 @@ def evidence_of_test(test: AdequacyTest, adequate: bool) -> Evidence:
 
 def parameter_shifts(
     space: CandidateSpace, before: np.ndarray, after: np.ndarray, sd: np.ndarray
-) -> dict[str, BaseShift]:
+) -> dict[str, ParameterShift]:
     """Every base parameter before and after effects were added, in its unit and in prior sds.
 
     Args:
@@ -252,7 +254,7 @@ def parameter_shifts(
     fields, held_names = priors.parameters_by_name(space.bare.base), held_by_prior(sd)
     bound = coordinates.beyond(z[1])
     return {
-        name: BaseShift(
+        name: ParameterShift(
             prior=float(value[0][k]),
             before=float(value[1][k]),
             after=float(value[2][k]),
@@ -288,14 +290,14 @@ def effect_scores(space: CandidateSpace, scores: ScoreTable, settings: Settings)
     return tuple(sorted(listed, key=lambda s: (-round(s.score, 9), s.name)))
 
 
-def rank_library(space: CandidateSpace, left: Diagnosis, settings: Settings) -> Ranking:
+def rank_library(space: CandidateSpace, left: Diagnosis, settings: Settings) -> EffectRanking:
     """Ranking of the library by the share of the base's misfit that each effect alone would explain."""
     test = left.test
     listed = _rank_effects(space, left.scores, settings)
-    return Ranking(test.rejected, test.p_value, test.threshold("single") ** 2, listed)
+    return EffectRanking(test.rejected, test.p_value, test.threshold("single") ** 2, listed)
 
 
-def rank_effects_by_weak_form(space: CandidateSpace, known: Beforehand, settings: Settings) -> Ranking:
+def rank_effects_by_weak_form(space: CandidateSpace, known: WeakFormScreening, settings: Settings) -> EffectRanking:
     """Ranking of the effects by the equations of a log in weak form, before any simulation."""
     p = single_p_value(float(np.max(known.scores.single**2)), known.null)
     chance = float(np.quantile(known.null, 1 - settings.family_wise_error, method="higher")) ** 2
@@ -303,10 +305,10 @@ def rank_effects_by_weak_form(space: CandidateSpace, known: Beforehand, settings
     fit = next((c for c in known.alone if c.plausible), known.base)
     moved = {} if fit is None else parameter_shifts(space, fit.z, fit.z, fit.sd)
     parameters = {name: (shift.after, shift.sd_after) for name, shift in moved.items()}
-    return Ranking(p <= settings.family_wise_error, p, chance, listed, known.windows, parameters)
+    return EffectRanking(p <= settings.family_wise_error, p, chance, listed, known.windows, parameters)
 
 
-def _rank_effects(space: CandidateSpace, scores: ScoreTable, settings: Settings) -> tuple[Ranked, ...]:
+def _rank_effects(space: CandidateSpace, scores: ScoreTable, settings: Settings) -> tuple[RankedEffect, ...]:
     """Effects sorted by score. Those that would supply power are last."""
     listed = []
     for s in effect_scores(space, scores, settings):
@@ -315,7 +317,7 @@ def _rank_effects(space: CandidateSpace, scores: ScoreTable, settings: Settings)
         unit = amplitude_of(effect).spec.unit
         # as in `candidates.supplying_effects`
         supplies = space.bare.observe.long and effect.dissipative and s.amplitude < 0
-        listed.append(Ranked(s.name, effect.family(), unit, s.score, s.amplitude, sd, supplies))
+        listed.append(RankedEffect(s.name, effect.family(), unit, s.score, s.amplitude, sd, supplies))
     return tuple(sorted(listed, key=lambda e: e.supplies))
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from calibration.data import Names
 from calibration.described import describe
 from calibration.discovery.projection import Projection
-from calibration.discovery.smooth import Smooth
+from calibration.discovery.smooth import SmoothCurve
 from calibration.inference.bases import ORDERS, place_signature
 from calibration.inference.linearization import Linearization
 from mmrjax.effects.curve import EVERY_VARIABLE, PLACES, READINGS
@@ -163,7 +163,7 @@ class Proposal:
 
 
 def propose_formula(
-    linear: Linearization, balance: str, counts: np.ndarray, curve: Smooth, *, voltage: bool = True
+    linear: Linearization, balance: str, counts: np.ndarray, curve: SmoothCurve, *, voltage: bool = True
 ) -> Proposal:
     """Term with the smallest BIC among those that explain `MOST` of the curve, or a simpler one with as much
     evidence.
@@ -224,7 +224,7 @@ def propose_formula(
     )
 
 
-def _wave_formula(balance: str, curve: Smooth) -> Proposal:
+def _wave_formula(balance: str, curve: SmoothCurve) -> Proposal:
     """Formula of a wave over the angle of a shaft."""
     sine, cosine = curve.scale * curve.root @ curve.start
     size, phase = float(np.hypot(sine, cosine)), float(np.arctan2(cosine, sine))
@@ -235,7 +235,7 @@ def _wave_formula(balance: str, curve: Smooth) -> Proposal:
     return Proposal(formula, (), (size,), (float("nan"),), ("angle of the driving shaft",), curve.explained, 0.0, 1)
 
 
-def _decay_formula(linear: Linearization, balance: str, counts: np.ndarray, curve: Smooth) -> Proposal:
+def _decay_formula(linear: Linearization, balance: str, counts: np.ndarray, curve: SmoothCurve) -> Proposal:
     """Formula of an exponential decay with time, or from run to run, without an offset.
 
     The time constant is searched on a grid scaled to the length of the runs, or of the table. No offset is fitted,

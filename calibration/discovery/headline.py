@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from calibration.data import Names
-from calibration.discovery.loop_notes import Headline, Summary
+from calibration.discovery.loop_notes import Headline, VerdictSummary
 from calibration.discovery.settings import WITHOUT_NAME
 
 
-def headline(said: Summary, others: Sequence[tuple[float, Summary]] = ()) -> Headline:
+def headline(said: VerdictSummary, others: Sequence[tuple[float, VerdictSummary]] = ()) -> Headline:
     """The most detailed claims on which the verdicts at all noise levels agree.
 
     Args:
@@ -38,12 +38,12 @@ def headline(said: Summary, others: Sequence[tuple[float, Summary]] = ()) -> Hea
     return Headline("place", places, factors, shared)
 
 
-def _verdict_without_claim(said: Summary) -> str:
+def _verdict_without_claim(said: VerdictSummary) -> str:
     """Verdict if it claims no missing effect (`none` or `undescribed`), otherwise empty."""
     return said.verdict if said.verdict in ("none", "undescribed") else ""
 
 
-def _claimed_families(said: Summary) -> list[Names]:
+def _claimed_families(said: VerdictSummary) -> list[Names]:
     """Families of each established law or mechanism."""
     families = [m.families for m in said.missing if m.established]
     return (
@@ -53,7 +53,7 @@ def _claimed_families(said: Summary) -> list[Names]:
     )
 
 
-def _claimed_equations(said: Summary) -> list[Names]:
+def _claimed_equations(said: VerdictSummary) -> list[Names]:
     """Equations with a discrepancy, in words, without their variable."""
     families = _claimed_families(said)
     if said.verdict in WITHOUT_NAME and said.where is not None:

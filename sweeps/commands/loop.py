@@ -20,8 +20,8 @@ from calibration.described import in_words
 from calibration.discovery import findings
 from calibration.discovery.discover import discover
 from calibration.discovery.kept import REFIT_FILE, OutOfTime
-from calibration.discovery.resolve import check_resolvable, resolve
-from calibration.discovery.result import DiscoveryResult, Ranking
+from calibration.discovery.resolve import check_resolvable, fit_track_model
+from calibration.discovery.result import DiscoveryResult, EffectRanking
 from calibration.discovery.settings import fewest_replicates
 from calibration.inference import observers, priors
 from calibration.inference.details import EquationDefects
@@ -131,7 +131,7 @@ def _resolved(
     found: DiscoveryResult, config: configuration.Loop, members: Path | None, progress: Callable[[str], None]
 ) -> DiscoveryResult:
     """The result, with the track model's test added: does a different running gear explain the misfit?"""
-    resolved = resolve(
+    resolved = fit_track_model(
         found, noise=config.noise or None, population=config.population, generations=config.generations,
         members=members, seed=config.seed, tell=in_words(progress),
     )  # fmt: skip
@@ -167,7 +167,7 @@ def _alarm(seconds: float, wanted: Callable[[], bool]) -> Iterator[None]:
         signal.signal(signal.SIGALRM, before)
 
 
-def _show_ranking(found: Ranking, folder: RunFolder, timed: Callable[[str], None], brief: bool) -> None:
+def _show_ranking(found: EffectRanking, folder: RunFolder, timed: Callable[[str], None], brief: bool) -> None:
     """Print the ranking by regression, the first answer, and write it to the run folder."""
     first, *lines = loop_words.ranking_lines(found, brief=brief)
     timed(first)
