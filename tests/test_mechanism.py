@@ -62,7 +62,7 @@ def found(monkeypatch):
     monkeypatch.setattr(room, "_simulated_reading", lambda *_: None)
     monkeypatch.setattr(room, "_changed_readings", lambda *_: None)
     monkeypatch.setattr(room, "_curve_recurrence", lambda *_: 0.9)
-    monkeypatch.setattr(room, "chosen_again", lambda *_: 1.0)
+    monkeypatch.setattr(room, "recurrence_of_families", lambda *_: 1.0)
 
     def of(*ladder, curve, where=SPEED, long=False):
         space.bare.observe.long = long

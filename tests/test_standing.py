@@ -386,7 +386,7 @@ def test_what_is_left_lies_where_its_curve_and_where_its_strongest_effect_would(
             }[name]
 
     space = SimpleNamespace(included=None, library=Library(names=("a", "b"), of=np.array([0, 1, 1])))
-    test = SimpleNamespace(rejected_with_margin=True, beyond_doubt=lambda kind: single > 3.7)
+    test = SimpleNamespace(rejected_with_margin=True, exceeds_margin=lambda kind: single > 3.7)
     seen = SimpleNamespace(test=test, scores=SimpleNamespace(single=np.array([1.0, 0.0, -single])))
     assert _deficient_equations(space, seen, ()) == lacks
     test.rejected_with_margin = False

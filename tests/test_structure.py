@@ -594,17 +594,20 @@ def test_front_door_loads_nothing_heavy():
 #: What `calibrate`, `discover` and `foresee` do to a table and a robot inside, from instruments to the base fit.
 INNER = {
     "with_inferred_instruments", "with_surface_configurations", "of_surfaces", "with_table_mass",
-    "with_initial_states", "measure_initial_states", "check_start", "infer_noise", "library_of_size", "settings_for",
-    "without_copies", "pose", "pose_problem", "pose_candidates", "fit_base", "trace",
+    "with_initial_states", "measure_initial_states", "check_start", "infer_noise", "scale_library", "settings_for",
+    "remove_copies", "pose", "pose_problem", "build_candidate_space", "fit_base", "trace",
 }  # fmt: skip
 #: Campaigns and notebooks that call a part of that all the same, and why.
 CALLED = {
     (
         "loop_baselines",
-        "pose_candidates",
+        "build_candidate_space",
     ): "other ways to select effects, on the loop's own problem after its own preparation",
     ("loop_baselines", "fit_base"): "the same",
-    ("loop_findings", "pose_candidates"): "further runs, read by fits that the loop made after its own preparation",
+    (
+        "loop_findings",
+        "build_candidate_space",
+    ): "further runs, read by fits that the loop made after its own preparation",
     ("track_table", "pose"): "a function of its own by that name: rows of the paper through a resolved running gear",
     ("track_table", "with_table_mass"): "the same rows, searched by members and not by `calibrate`",
 }
