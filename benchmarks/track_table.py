@@ -45,7 +45,7 @@ from scipy.optimize import least_squares  # noqa: E402
 from calibration.data import own_mass  # noqa: E402
 from calibration.data.runs import Runs, read_runs  # noqa: E402
 from calibration.inference import priors  # noqa: E402
-from calibration.inference.held_out import search_each  # noqa: E402
+from calibration.inference.held_out import fit_from_each_start  # noqa: E402
 from calibration.inference.observers.settled import SettledRuns  # noqa: E402
 from calibration.inference.population import Members, Rows  # noqa: E402
 from calibration.inference.problem import MARGIN, STIFFNESS, Observation, Problem, data_from_readings  # noqa: E402
@@ -297,7 +297,7 @@ def lumped(posed: Posed, robot: Robot, table: Runs, seen: list[np.ndarray]) -> t
     coordinates = priors.parameter_coordinates(robot, names, stated, any_surface=True)
     problem = Problem(params.without_weak_types(robot), coordinates, SettledRuns.of(table, robot, "steady"), data)
     weights = [np.asarray(data.weight) * s[:, None] for s in seen]
-    found, _ = search_each(problem, [np.zeros(len(names))] * len(seen), weights)
+    found, _ = fit_from_each_start(problem, [np.zeros(len(names))] * len(seen), weights)
     slope = jax.jit(jax.jacfwd(lambda z, data: problem.misfit(z, data)))
     spread = []
     for z, weight in zip(found.z, weights, strict=True):

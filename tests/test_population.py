@@ -14,7 +14,7 @@ from calibration.data import runs as records
 from calibration.data.input_errors import BadConfiguration
 from calibration.inference import identifiability, multistart, noise, observers, population, priors
 from calibration.inference.calibration import calibrate
-from calibration.inference.fit_notes import Edge, Remark, with_codes
+from calibration.inference.fit_notes import ReachedBound, Remark, remarks_with_codes
 from calibration.inference.observers.settled import SettledRuns
 from calibration.inference.population import Members, Rows
 from calibration.inference.problem import Observation
@@ -265,7 +265,7 @@ def test_parameter_at_the_edge_of_its_prior_or_at_a_bound_is_named(posed):
     assert population.parameters_at_edge(coordinates, np.array([2.4, -2.4, 0.0, 0.0])) == {}
     said = population.parameters_at_edge(coordinates, np.array([2.6, -3.0, 0.0, 9.0]))
     assert list(said) == [NAMES[0], NAMES[1], NAMES[3]]
-    assert [*said.values()] == [Edge("", 2.6), Edge("", -3.0), Edge("upper", 9.0)]
+    assert [*said.values()] == [ReachedBound("", 2.6), ReachedBound("", -3.0), ReachedBound("upper", 9.0)]
 
 
 @pytest.mark.slow
@@ -275,12 +275,17 @@ def test_what_members_did_is_counted_and_said(found):
     status[:3, 0], status[3, 1], status[4:6, 0] = TIPS, FAILED, SLIDES
     flags[[at, 7], 1] = 1 << FLAGS.index("jumps")
     told = population.Searched(
-        dataclasses.replace(found, status=status, flags=flags), at, (), None, np.nan, {"a": Edge("upper", 9.0)}
+        dataclasses.replace(found, status=status, flags=flags),
+        at,
+        (),
+        None,
+        np.nan,
+        {"a": ReachedBound("upper", 9.0)},
     )
     assert told.to_json()["outcomes"] == {"tips": 3, "failed": 1, "slides": 2, "jumps": 2}
     assert told.to_json()["at_edge"] == {"a": "at its upper bound"}
     assert told.remarks()[1:] == [
-        Remark("lost_rows", members={"slides": 2, "tips": 3, "failed": 1}), Remark("members_jump", members=2, best=(2,)), Remark("ended_at_edge", edge={"a": Edge("upper", 9.0)})
+        Remark("lost_rows", members={"slides": 2, "tips": 3, "failed": 1}), Remark("members_jump", members=2, best=(2,)), Remark("ended_at_edge", edge={"a": ReachedBound("upper", 9.0)})
     ]  # fmt: skip
 
 
@@ -297,7 +302,7 @@ def test_search_that_ends_at_the_edge_of_a_prior_says_so_in_the_result(runs):
     assert abs(best[0]) > population.EDGE and abs(found.parameters[name].shift) > population.EDGE
     assert list(found.searched.edge) == [name]
     assert list(found.to_json()["optimizer"]["population"]["at_edge"]) == [name]
-    (ended,) = with_codes(found.remarks, "ended_at_edge")
+    (ended,) = remarks_with_codes(found.remarks, "ended_at_edge")
     assert list(ended.edge) == [name] and ended.edge[name].sds > 0
     assert any(n.code == "far_from_prior" and n.name == name for n in found.remarks)
     assert np.isfinite(found.posterior.covariance).all()

@@ -15,7 +15,7 @@ from test_loop_command import commanded
 from calibration.data import runs as records
 from calibration.data.runs import Runs
 from calibration.inference.calibration import calibrate
-from calibration.inference.fit_notes import with_codes
+from calibration.inference.fit_notes import remarks_with_codes
 from calibration.inference.lack_of_fit import Residuals
 from calibration.inference.observers import Histories
 from calibration.inference.residual_clusters import LEVEL, residual_clusters
@@ -286,7 +286,7 @@ def test_the_loop_says_what_its_last_fit_leaves_clustered():
     found = SETTLED.discover(runs)
     document = found.to_json()
     assert [(c.column, c.channel) for c in found.residual_clusters] == [("idle_wheel", "speed")]
-    (remark,) = with_codes(found.remarks, "residual_cluster")
+    (remark,) = remarks_with_codes(found.remarks, "residual_cluster")
     assert remark.cluster is found.residual_clusters[0]
     assert document["residual_clusters"][0]["p"] < LEVEL
 

@@ -189,7 +189,9 @@ def test_rig_check_says_how_many_rows_are_used(tmp_path, monkeypatch, capsys):
 
     def foresee(runs, robot):
         runs = thin_rows(runs)
-        return foresight.Foresight((), ("converged",) * len(runs), ("columns",) * len(runs.channels), (), (), robot)
+        return foresight.InformationForecast(
+            (), ("converged",) * len(runs), ("columns",) * len(runs.channels), (), (), robot
+        )
 
     monkeypatch.setattr(rig_check.foresight, "predict_identifiability", foresee)
     found = rig_check.examine_rig_file(tmp_path / "rig.toml", str(tmp_path / "log.csv"))

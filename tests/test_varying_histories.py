@@ -20,7 +20,7 @@ from calibration.discovery.settings import settings_for
 from calibration.inference import checks
 from calibration.inference.blocks import blocks_of_kind, distinct_held_out_blocks
 from calibration.inference.calibration import calibrate
-from calibration.inference.fit_notes import with_codes
+from calibration.inference.fit_notes import remarks_with_codes
 from calibration.inference.linearization import balance_probe
 from calibration.inference.noise import Noise
 from calibration.inference.observers import Histories, settled_ends
@@ -330,7 +330,7 @@ def test_calibration_finds_the_truth_within_its_intervals(simulated):
         assert abs(estimate.value - truth) < 3 * estimate.sd, name
         assert estimate.sd < 0.05 * truth, name
     assert {"mode", "supply_voltage_V"} <= set(found.conditions)
-    assert len(with_codes(found.remarks, "stops_on_slope")) == 1
+    assert len(remarks_with_codes(found.remarks, "stops_on_slope")) == 1
 
 
 @pytest.mark.nightly

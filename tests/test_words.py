@@ -28,7 +28,7 @@ from calibration.discovery.loop_notes import (
 )
 from calibration.discovery.result import NoiseVerdict, WorseChannel
 from calibration.inference import fit_notes as of_fit
-from calibration.inference.fit_notes import Remark, Shown, next_step
+from calibration.inference.fit_notes import AdequacyFinding, Remark, progress_remark
 from calibration.inference.lack_of_fit import Adequacy
 from calibration.inference.residual_clusters import LevelMean, ResidualCluster
 from calibration.inference.series_noise import SeriesNoise
@@ -56,7 +56,10 @@ SAMPLES = [
     Remark("held_by_prior", names=("a",)),
     Remark(
         "only_together",
-        pairs=(of_fit.Pair("a", "b", 0.99, "ratio", -1.0), of_fit.Pair("a", "c", -1.0, "linear", 0.031)),
+        pairs=(
+            of_fit.DependentPair("a", "b", 0.99, "ratio", -1.0),
+            of_fit.DependentPair("a", "c", -1.0, "linear", 0.031),
+        ),
     ),
     Remark("held_by_prior", names=("a", "b")),
     Remark("far_from_prior", name="m", sds=3.2, kind="loop"),
@@ -195,7 +198,7 @@ SAMPLES = [
     Remark("generations", members=96, generations=8, settled=False),
     Remark("lost_rows", members={"tips": 3, "slides": 2, "failed": 1}),
     Remark("members_jump", members=2, best=(2, 5)),
-    Remark("ended_at_edge", edge={"a": of_fit.Edge("upper", 9.0), "b": of_fit.Edge("", -2.64)}),
+    Remark("ended_at_edge", edge={"a": of_fit.ReachedBound("upper", 9.0), "b": of_fit.ReachedBound("", -2.64)}),
     Remark("read_from_members", names=("a", "b"), left=0.4),
     Remark("assumed_noise", channels=("speed",), usual="speed=2%"),
     Remark(
@@ -281,9 +284,9 @@ SAMPLES = [
     Remark("sample_left_out", points=3, share=0.0123, outputs=("speed",)),
     Remark("inert", inputs=("a", "b")),
     Remark("tied", inputs=("a", "b")),
-    next_step("evaluations", 12345, 1234.6),
-    next_step("alike", ("a", "b")),
-    next_step("round", 2, 3.25, 7, 1.26),
+    progress_remark("evaluations", 12345, 1234.6),
+    progress_remark("alike", ("a", "b")),
+    progress_remark("round", 2, 3.25, 7, 1.26),
 ]
 
 
@@ -633,26 +636,26 @@ def test_what_the_track_model_is_asked_about(about, said):
     ("found", "said"),
     [
         (
-            Adequacy(False, 812.3, 600.0, 1e-9, Shown(what="stated"), True),
+            Adequacy(False, 812.3, 600.0, 1e-9, AdequacyFinding(what="stated"), True),
             "Not adequate: the residuals exceed the stated noise (χ² 812.3 on 600 degrees of freedom, p < 1e-6), so "
             "a term is missing and the parameters may absorb its effect; run mmrjax loop to find it",
         ),
         (
-            Adequacy(False, 60.0, 60.0, 0.0021, Shown("motor_speed", "follow", "slope_deg"), False),
+            Adequacy(False, 60.0, 60.0, 0.0021, AdequacyFinding("motor_speed", "follow", "slope_deg"), False),
             "Not adequate: the residuals of motor speed follow slope_deg (p = 0.0021, the noise estimated from them), "
             "so a term is missing and the parameters may absorb its effect; run mmrjax loop to find it",
         ),
         (
-            Adequacy(True, 61.0, 60.0, 0.4, Shown(what="repeats"), True),
+            Adequacy(True, 61.0, 60.0, 0.4, AdequacyFinding(what="repeats"), True),
             "Adequate: the residuals are consistent with the stated noise (χ² 61 on 60 degrees of freedom, p = 0.4)",
         ),
         (
-            Adequacy(True, 50.0, 50.0, 0.4, Shown(), False),
+            Adequacy(True, 50.0, 50.0, 0.4, AdequacyFinding(), False),
             "Adequate as far as can be tested: the residuals show no structure (p = 0.4); the noise was estimated from "
             "them, so χ² is no test",
         ),
         (
-            Adequacy(None, 5.0, 2.5, None, Shown(), False),
+            Adequacy(None, 5.0, 2.5, None, AdequacyFinding(), False),
             "Adequacy cannot be tested: the noise was estimated from the misfit, and 2.5 degrees of freedom are too few "
             "to show structure; state the noise with --noise",
         ),
@@ -706,9 +709,11 @@ def test_six_levels_that_are_furthest_off_are_listed():
 
 def test_tests_that_are_as_improbable_are_named_in_the_order_of_their_words():
     """Of several that are zero to rounding the first is named: data are compared as their sentences are."""
-    every = [Shown(what="stated"), Shown(what="repeats")]
-    every += [Shown(c, "follow", v) for c in ("total_current", "speed") for v in ("the fitted speed", "slope_deg")]
-    every += [Shown(c, "remember") for c in ("motor_speed", "total_current")]
+    every = [AdequacyFinding(what="stated"), AdequacyFinding(what="repeats")]
+    every += [
+        AdequacyFinding(c, "follow", v) for c in ("total_current", "speed") for v in ("the fitted speed", "slope_deg")
+    ]
+    every += [AdequacyFinding(c, "remember") for c in ("motor_speed", "total_current")]
     assert sorted(every) == sorted(every, key=fit_words.shown_by)
 
 

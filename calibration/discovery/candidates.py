@@ -17,7 +17,7 @@ from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.score_tests import ScoreTable
 from calibration.discovery.settings import Settings
 from calibration.inference import scans
-from calibration.inference.held_out import search_each
+from calibration.inference.held_out import fit_from_each_start
 from calibration.inference.linearization import amplitude_of
 from calibration.inference.observers import Observer
 from calibration.inference.optimizers import Optimum, observe_at
@@ -287,7 +287,7 @@ def fit_candidates(space: CandidateSpace, proposals: Sequence[Proposal], setting
         if not positions:
             continue
         starts = [space.near.get(*proposals[k]) for k in positions]
-        optima, _ = search_each(
+        optima, _ = fit_from_each_start(
             problem, starts, [space.weight] * len(positions), [active[k] for k in positions], most
         )
         for j, k in enumerate(positions):

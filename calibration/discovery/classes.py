@@ -19,7 +19,7 @@ from calibration.discovery.screening import fit_by_regression
 from calibration.discovery.search import refit_without_each
 from calibration.discovery.settings import Settings
 from calibration.inference.bases import place_in_words
-from calibration.inference.held_out import search_each
+from calibration.inference.held_out import fit_from_each_start
 from calibration.inference.linearization import Linearization
 from mmrjax.model import channels
 
@@ -104,7 +104,7 @@ def _fit_without_prior(
         start[k] = mean
         data = dataclasses.replace(equipped.data, centre=jnp.asarray(centre))
         problem = dataclasses.replace(equipped, data=data)
-        optima, _ = search_each(problem, [start], [space.weight], [indices])
+        optima, _ = fit_from_each_start(problem, [start], [space.weight], [indices])
         best = jax.tree.map(lambda x: x[0], optima)
         z = np.asarray(best.z)
         if not np.isfinite(best.cost):

@@ -72,7 +72,7 @@ from calibration.inference import noise as noise_room
 from calibration.inference import observers, preparation, priors, series_noise
 from calibration.inference.bases import Bases
 from calibration.inference.conduct import error_after_steps
-from calibration.inference.fit_notes import Notes, Remark, next_step, with_codes
+from calibration.inference.fit_notes import Notes, Remark, progress_remark, remarks_with_codes
 from calibration.inference.identifiability import undetermined_names
 from calibration.inference.lack_of_fit import Residuals
 from calibration.inference.linearization import Linearization
@@ -169,7 +169,7 @@ def discover(
     sensitivity, outstanding = list[NoiseVerdict](), list[float]()
     try:
         if factors:
-            tell(next_step("factors", tuple(f"{f:g}" for f in factors), known.word))
+            tell(progress_remark("factors", tuple(f"{f:g}" for f in factors), known.word))
 
         def trace_with_noise(factor: float) -> LoopStages:
             noise = known.scaled(dict.fromkeys(silent, factor))
@@ -178,7 +178,7 @@ def discover(
         verdicts = {f: threads.submit(trace_with_noise, f) for f in factors}
         found = keep("result", lambda: assemble_result(told, traced))
         if not all(verdict.done() for verdict in verdicts.values()):
-            tell(next_step("others"))
+            tell(progress_remark("others"))
         for f, verdict in verdicts.items():
             try:
                 sensitivity.append(verdict_at_noise(f, verdict.result(left()), ready.numbers))
@@ -284,7 +284,7 @@ class LoopInput:
                 space, near = dataclasses.replace(space.with_room(ranking.room), begins=begins), ranking.base
             if self.others is not None:
                 self.later.append(self.others.enter_context(compile_ahead(space, at, self.settings)))
-        self.progress(next_step("base"))
+        self.progress(progress_remark("base"))
         if known is not None and space.bare.observe.long:  # the same rows are included here
             space = dataclasses.replace(space.without(np.array(known.screened.outliers, int)), near=known.simulated)
             base = fit_base(space, self.settings, self.runs.source, near)
@@ -320,10 +320,10 @@ def prepare_loop(
         )
     with scales.compute_nominal_ahead(robot):
         ready = preparation.prepare(distinct, robot, noise, stated)
-    for note in with_codes(ready.checked, "nothing_varies", "copied"):
+    for note in remarks_with_codes(ready.checked, "nothing_varies", "copied"):
         if note.code == "nothing_varies" or not note.tied:
             raise BadData(describe(note))
-    at_first = (*ready.foreign, *ready.doubted, *with_codes(ready.checked, "lost_motion"))
+    at_first = (*ready.foreign, *ready.doubted, *remarks_with_codes(ready.checked, "lost_motion"))
     notes_so_far: Notes = (*notes, *ready.checked, *ready.begins, *ready.weighed, *ready.foreign, *ready.doubted)
     turned = scales.output_rotation(distinct, ready.robot)
     channel_effects = {name: e for name, e in effects.OF_CHANNELS.items() if e.channel in ready.robot.rig.channels}
@@ -434,7 +434,7 @@ class LoopStages:
         if happens is None or self.where is None:
             return ()
         linear = self.left.linear
-        x, _ = linear.in_travel(self.where.place, happens.axis)
+        x, _ = linear.curve_variable(self.where.place, happens.axis)
         inside = self.screened.base.space.included & linear.of_rows(happens.holds(x))
         rows = [int(k) + 1 for k in np.flatnonzero(inside)]
         return ({"axis": happens.axis, "window": (happens.low, happens.high), "rows": rows},)
@@ -469,7 +469,7 @@ def _fit_base_and_noise(given: LoopInput, ranked: list[EffectRanking]) -> tuple[
     factors = {} if screened.cluster is not None else common_factors(residuals)
     sds = VerdictNoise(noise, factors, tuple(noise_remarks(residuals, noise.word)))
     if factors:
-        given.progress(next_step("sds"))
+        given.progress(progress_remark("sds"))
         sds = dataclasses.replace(sds, noise=noise.scaled(factors))
         screened = given.screen(sds.noise, screened.base, ranked)
     return screened, sds
@@ -508,13 +508,13 @@ def _search_until_clean(
     """
     settings, keep, progress = given.settings, given.keep, given.progress
     for k in range(SCREENINGS):
-        progress(next_step("bootstrap", settings.replicates))
+        progress(progress_remark("bootstrap", settings.replicates))
         screened, left = keep(f"bootstrap {k}", functools.partial(_test_base, given, sds, screened))
         if k == 0 and not ranked:
             keep("ranking", functools.partial(findings.rank_library, screened.base.space, left, settings))
         if given.shows_unmodelled_backlash or (not left.test.rejected and screened.cluster is None):
             return screened, left, None  # effects of the library would only stand in for a backlash
-        progress(next_step("effects"))
+        progress(progress_remark("effects"))
         screened, left, searched = keep(f"search {k}", functools.partial(_search_effects, given, screened, left))
         after = searched.diagnosis
         if after is None and (confirmed := _confirm_gains(screened, left, searched)) is not None:
@@ -526,7 +526,7 @@ def _search_until_clean(
         )
         if more is None:
             break
-        progress(next_step("alone"))
+        progress(progress_remark("alone"))
         screened = more
     return screened, left, searched
 
@@ -560,7 +560,7 @@ def _reach_verdict(
     stages = functools.partial(LoopStages, beside=beside, predicted=predicted)
     leaves: tuple[MissedChannel, ...] = ()
     if missed := missed_channels(space, runs, sds.noise, left.linear):
-        progress(next_step("held out"))
+        progress(progress_remark("held out"))
         refit = cached_hold_out_score(space, runs, base, predicted)
         fits = {c.key: c for c in (model[0] if model else None, searched.best, *best_of_each_size(searched)) if c}
         for fit in fits.values():
@@ -573,7 +573,7 @@ def _reach_verdict(
     established_names = [] if model is None else [stood.established(e) for e in model[0].effects]
     level, mechanism = "", None
     if not any(established_names):
-        progress(next_step("mechanism"))
+        progress(progress_remark("mechanism"))
         ladder = [c for c in (*searched.ladder, *([] if model is None else model[:1]))]
         mechanism = find_mechanism(space, runs, base, left, ladder, bases, beside, predicted, settings)
         mechanism = mechanism and _with_ammeter_alternatives(space, mechanism, left.linear, bases, where, settings)
@@ -583,13 +583,13 @@ def _reach_verdict(
 
     searched = dataclasses.replace(searched, best=model[0], diagnosis=model[1])
     best, after = model
-    progress(next_step("alike", best.effects))
+    progress(progress_remark("alike", best.effects))
     alike = find_classes(space, base, best, searched.ladder, left, after, settings)
     if not any(established_names):
         return stages(level, screened, left, sds, searched, alike, where, standing=stood, mechanism=mechanism)
     compared: tuple[HeldOutAlternative, ...] = ()
     if settings.prefer == HELD_OUT:
-        progress(next_step("held out"))
+        progress(progress_remark("held out"))
         searched, alike, compared = preference.prefer_by_held_out(space, runs, searched, alike, bases, settings)
         after = searched.diagnosis or after
         stood = stood.with_leaders(dict(zip(best.active, (searched.best or best).active, strict=True)))
@@ -657,7 +657,7 @@ def choose_effects(
         return (best, after), searched, stood
     few = None
     if not (long and stood is not None and stood.stands):  # refits of histories take long
-        progress(next_step("held out"))
+        progress(progress_remark("held out"))
         few = prediction.smallest_predictive_set(space, runs, base, best_of_each_size(searched), predicted)
     if stood is None:
         judged = best if few is None else few
@@ -896,7 +896,7 @@ def assemble_result(given: LoopInput, traced: LoopStages) -> DiscoveryResult:
     # The fit of the result: with the named effects, or with the curve if no name is given.
     beside = traced.beside if nameless else None
     if beside is not None:
-        progress(next_step("shape"))
+        progress(progress_remark("shape"))
     before, curve = findings.FittedProblem(*space.fit_of(base.active, base.z)), None
     after, z, sd, cost = None, best.z, best.sd, best.cost
     if beside is not None and best is base:
@@ -905,7 +905,7 @@ def assemble_result(given: LoopInput, traced: LoopStages) -> DiscoveryResult:
         after = findings.FittedProblem(curve.problem, z, None)
     elif best is not base:
         after = findings.FittedProblem(*space.fit_of(best.active, z))
-    progress(next_step("errors"))
+    progress(progress_remark("errors"))
     predictions = [traced.predicted.get(prediction.candidate_key(c)) for c in (base, best)]
     kinds = blocks_room.predictable_blocks(runs, space.bare)
     seen = findings.readings_of_rows(
@@ -924,7 +924,7 @@ def assemble_result(given: LoopInput, traced: LoopStages) -> DiscoveryResult:
         fit, of_fit = (best, traced.ends) if written else (base, left)
         robot, converged = findings.proposed_robot(space, fit), fit.converged
         posterior = posterior_of_fit(space, fit.active, fit.z, of_fit.linear)
-    progress(next_step("next"))
+    progress(progress_remark("next"))
     remaining = _residual_tests(space, runs, ends.linear, seen.after, z)
 
     def error(simulated: np.ndarray) -> Errors:

@@ -28,7 +28,7 @@ from calibration.discovery.score_tests import diagnose_fit
 from calibration.discovery.smooth import SmoothCurve, fit_smooth_curve
 from calibration.inference import bases as bases_room
 from calibration.inference.bases import Bases
-from calibration.inference.held_out import search_each
+from calibration.inference.held_out import fit_from_each_start
 from calibration.inference.linearization import Linearization
 from calibration.inference.priors import Coordinates
 from calibration.inference.problem import Problem
@@ -122,7 +122,7 @@ def refine_window(
     Args:
         included: True for included rows, shape (rows,).
     """
-    (x, way), included = linear.in_travel(place, axis), linear.at_points(included)
+    (x, way), included = linear.curve_variable(place, axis), linear.at_points(included)
     levels, counts = np.unique(x[included], return_counts=True)
     merged = -(-len(levels) // INSTANTS)
     edges = levels[::merged]
@@ -237,7 +237,7 @@ def fit_discrepancy(
     starts = np.zeros((STARTS, len(problem.coordinates)))
     starts[:, :inner] = base.z[:inner]
     starts[:, inner:] = np.linspace(1.0, 0.0, STARTS)[:, None] * at_base.start
-    optima, observations = search_each(problem, list(starts), [space.weight] * STARTS)
+    optima, observations = fit_from_each_start(problem, list(starts), [space.weight] * STARTS)
     k = int(np.argmin(np.where(np.isfinite(optima.cost), optima.cost, np.inf)))
     z = np.asarray(optima.z[k])
     covariance = np.asarray(optima.covariance[k])

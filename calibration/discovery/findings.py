@@ -148,7 +148,7 @@ def unnamed_discrepancy(
     """Result entry of a discrepancy without a name. The curve and the errors of rows come from the same fit."""
     found, linear, lacks = beside.curve, beside.diagnosis.linear, None
     happens = bases.window_from_name(where.variable)
-    x, way = linear.in_travel(found.balance, where.variable if happens is None else happens.axis)
+    x, way = linear.curve_variable(found.balance, where.variable if happens is None else happens.axis)
     if found.defect is not None:
         lacks = balance_error_by_row(linear, found.balance)
         turn = 2 * np.pi if where.variable in bases.ORDERS else None

@@ -58,7 +58,7 @@ class Ratio:
         return dataclasses.replace(self, over=float(f"{most:.0e}")) if most > 0 else self
 
     def __call__(self, linear: Linearization, place: str) -> np.ndarray:
-        x, _ = linear.in_travel(place, self.of)
+        x, _ = linear.curve_variable(place, self.of)
         return (np.sin(x) if self.of == "slope" else x) / self.over
 
 
@@ -194,7 +194,7 @@ def propose_formula(
     if not terms:  # all runs have the same conditions
         return Proposal("", (), (), (), (), 0.0, 0.0, 0)
     shapes = np.zeros((linear.points, len(terms)))
-    _, way = linear.in_travel(balance, curve.variable)
+    _, way = linear.curve_variable(balance, curve.variable)
     for k, value in enumerate(dictionary.values()):
         shapes[counts, k] = way[counts] * value
     a, b = Projection(linear)(place_signature(linear, balance, shapes))
@@ -241,7 +241,7 @@ def _decay_formula(linear: Linearization, balance: str, counts: np.ndarray, curv
     The time constant is searched on a grid scaled to the length of the runs, or of the table. No offset is fitted,
     because the base parameters absorb it.
     """
-    (t, way), counts = linear.in_travel(balance, curve.variable), linear.at_points(counts)
+    (t, way), counts = linear.curve_variable(balance, curve.variable), linear.at_points(counts)
     symbol, unit = FADING[curve.variable]
     constants = np.geomspace(0.02, 2.0, 40) * max(float(t[counts].max()), 1e-9)
     best: tuple[float, tuple] = (np.inf, ())

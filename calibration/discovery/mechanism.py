@@ -266,7 +266,7 @@ def _within_seen_range(space: CandidateSpace, beside: BaseCurve, masks: Sequence
     in_range = np.ones(rows, bool)
     if where.variable not in bases_room.VARIABLES:
         return in_range
-    x = np.asarray(linear.in_travel(where.place, where.variable)[0], float)
+    x = np.asarray(linear.curve_variable(where.place, where.variable)[0], float)
     if len(x) != len(space.included):  # turns, with different sides
         return in_range
     for mask in masks:

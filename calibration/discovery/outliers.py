@@ -23,7 +23,7 @@ from calibration.discovery.score_tests import Diagnosed, ScoreTable, bootstrap_s
 from calibration.discovery.settings import Settings
 from calibration.inference import bases as bases_room
 from calibration.inference.bases import Bases
-from calibration.inference.held_out import search_each
+from calibration.inference.held_out import fit_from_each_start
 from mmrjax.compile.precision import Threads
 
 # --- clusters of outliers in time, angle, order or condition --------------------------------------
@@ -182,7 +182,7 @@ def compile_ahead(
         if space.bare.observe.long:  # its programs depend on the effects found, which are not known yet
             return
         looked.wait()  # needed last: compilation shares two cores with the base fit
-        search_each(space.equipped, [nothing], [space.weight], [space.library.indices(none)])
+        fit_from_each_start(space.equipped, [nothing], [space.weight], [space.library.indices(none)])
 
     def compile_fit_with_slots(base: BaseFit) -> None:
         problem, z = base.space.problem(none), jnp.asarray(nothing)
@@ -329,7 +329,9 @@ def _exclude_gross_errors(base: BaseFit, settings: Settings, where: str) -> tupl
         return base, ()
     for _ in range(settings.reweightings):
         robust = space.weight / np.sqrt(1 + (far / settings.cauchy) ** 2)[:, None]
-        optima, observations = search_each(problem, [start], [robust], None if active is None else [active], FEW)
+        optima, observations = fit_from_each_start(
+            problem, [start], [robust], None if active is None else [active], FEW
+        )
         far, start = largest_residual(np.asarray(observations.reading[0])), np.asarray(optima.z[0])
     gross = included & (far > settings.gross * max(1.0, float(np.median(far[included]))))
     if not gross.any() or gross.sum() > settings.outliers(int(included.sum())):

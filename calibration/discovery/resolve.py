@@ -21,7 +21,7 @@ from calibration.discovery.result import PLAUSIBLE, DiscoveryResult, ParameterEs
 from calibration.inference import noise as noise_room
 from calibration.inference import observers
 from calibration.inference.calibration import calibrate
-from calibration.inference.fit_notes import Remark, next_step
+from calibration.inference.fit_notes import Remark, progress_remark
 from calibration.inference.population import saved_members
 from calibration.inference.result import CalibrationResult
 from mmrjax.effects import UNNAMED
@@ -122,9 +122,9 @@ def fit_track_model(
             seed=seed, profiles=False, blocks=False, tell=tell,
         )  # fmt: skip
 
-    tell(next_step("gear stated"))
+    tell(progress_remark("gear stated"))
     fitted_robot = fit(friction)
-    tell(next_step("gear free"))
+    tell(progress_remark("gear free"))
     free = fit((*friction, *gear), members)
     fall = 2 * (fitted_robot.objective - free.objective)
     return TrackModelResult(

@@ -25,7 +25,7 @@ from calibration.discovery.outliers import OutlierCluster
 from calibration.discovery.prediction import Gain
 from calibration.discovery.settings import Settings
 from calibration.inference.details import Detail
-from calibration.inference.fit_notes import Notes, Pair, Remark, with_codes
+from calibration.inference.fit_notes import DependentPair, Notes, Remark, remarks_with_codes
 from calibration.inference.identifiability import determined_together
 from calibration.inference.residual_clusters import ResidualCluster
 from calibration.inference.simulation_errors import OF_SIZE
@@ -522,7 +522,7 @@ class DiscoveryResult:
         """The answer in a sentence or two. It begins with backlash or compliance that no effect of the library
         explains.
         """
-        lost = (f"{note}." for note in sentences(with_codes(self.remarks, "lost_motion")))
+        lost = (f"{note}." for note in sentences(remarks_with_codes(self.remarks, "lost_motion")))
         return " ".join((*lost, describe(self.headline)))
 
     @property
@@ -602,7 +602,7 @@ class DiscoveryResult:
         return (*base, *(name for name, p in parameters if p.held_by_prior))
 
     @property
-    def together(self) -> tuple[Pair, ...]:
+    def together(self) -> tuple[DependentPair, ...]:
         """Pairs of parameters, of the base or of effects, that the data determine only in combination."""
         shown_names = {*self.base_shift, *(f"effects.{e.name}.{name}" for e in self.effects for name in e.parameters)}
         pairs = determined_together(self.posterior, self.held_by_prior)

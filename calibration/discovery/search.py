@@ -24,7 +24,7 @@ from calibration.discovery.score_tests import ScoreTable, StrongestStatistics, d
 from calibration.discovery.screening import ScreenedSets, confirm_by_simulation, fit_by_regression
 from calibration.discovery.settings import Settings
 from calibration.inference.bases import Bases
-from calibration.inference.fit_notes import Remark, next_step
+from calibration.inference.fit_notes import Remark, progress_remark
 
 #: Largest number of pairs of instances that are examined for pairs of effects.
 PAIRS = 4000
@@ -93,7 +93,7 @@ def search_effects(
             min(settings.slots, max(1, space.included.sum() // settings.rows_per_effect))
         ):
             break
-        progress(next_step("more effects", best.effects))
+        progress(progress_remark("more effects", best.effects))
         rounds.append(_extend_set(space, best, diagnosis, at, by, settings))
         more, space = list(rounds[-1].candidates), space.with_room(rounds[-1].room)
         best = _accept_if_better(_best_plausible(more), ladder, settings)

@@ -105,7 +105,7 @@ def fit_smooth_curve(linear: Linearization, balance: str, variable: str, counts:
     """
     happens = window_from_name(variable)
     axis = variable if happens is None else happens.axis
-    (x, way), counts = linear.in_travel(balance, axis), linear.at_points(counts)
+    (x, way), counts = linear.curve_variable(balance, axis), linear.at_points(counts)
     low, high = (0.0, 2 * np.pi) if variable in ORDERS else (float(x[counts].min()), float(x[counts].max()))
     if happens is not None:
         beside = BESIDE * max(happens.high - happens.low, NARROW * (high - low))
@@ -172,7 +172,7 @@ def fit_smooth_surface(
         counts: True for included rows, shape (rows,).
     """
     weight = linear.at_points(counts).astype(float)
-    each, ways = zip(*(linear.in_travel(balance, v) for v in variables), strict=True)
+    each, ways = zip(*(linear.curve_variable(balance, v) for v in variables), strict=True)
     sides = [
         legendre.legvander(scale_to_unit_range(x, weight), PRODUCT - 1) * np.exp(-FALL * np.arange(PRODUCT))
         for x in each

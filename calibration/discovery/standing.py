@@ -182,7 +182,7 @@ def _curve_of_variable(place: str, variable: str) -> PlacedCurve:
 
 
 def _variable_varies(linear: Linearization, variable: str, included: np.ndarray) -> bool:
-    x = linear.in_travel(bases_room.SHAFTS, variable)[0][linear.at_points(included)]
+    x = linear.curve_variable(bases_room.SHAFTS, variable)[0][linear.at_points(included)]
     return bool(np.all(np.isfinite(x)) and np.ptp(x) > 1e-9 * max(np.max(np.abs(x)), 1e-9))
 
 
@@ -387,7 +387,7 @@ def _largest_variation(
     of_row = jacobian[: linear.readings, slot].reshape(linear.rows, -1)
     variables = [v for v in (*VARIABLES, "speed") if _variable_varies(linear, v, space.included)]
     for variable in variables:
-        values = linear.in_travel(bases_room.SHAFTS, variable)[0].reshape(-1, linear.rows).mean(0)
+        values = linear.curve_variable(bases_room.SHAFTS, variable)[0].reshape(-1, linear.rows).mean(0)
         x = bases_room.scale_to_unit_range(np.nan_to_num(values), space.included.astype(float))
         changed = np.stack([(of_row * shape[:, None]).ravel() for shape in (x, 2 * x**2 - 1)], 1)
         projected_residual, scores = _projected_columns(jacobian, residual, changed)

@@ -22,11 +22,11 @@ from calibration.inference.levenberg_marquardt import (
     NEAR,
     Function,
     OneSidedLevenbergMarquardt,
-    Searching,
+    SearchState,
     half_squares,
     linear_residual_function,
     one_sided_step,
-    with_slope,
+    with_derivative,
     zero_inactive_residuals,
 )
 from calibration.inference.problem import MISSING, Data, Observation, Problem
@@ -111,7 +111,7 @@ def informative_residuals(data: Data) -> np.ndarray:
 #: Least-squares solvers and minimisers of optimistix.
 Solver = optx.AbstractLeastSquaresSolver | optx.AbstractMinimiser
 #: A search between two steps: the best point so far and the solver's state.
-Progress = tuple[Z, Searching]
+Progress = tuple[Z, SearchState]
 
 
 def _evaluate_residuals(problem: Problem, data: Data, pin: Pin, z: Z) -> tuple[Array, Array, Observation]:
@@ -129,7 +129,7 @@ def residual_function(problem: Problem, data: Data, pin: Pin) -> Function:
 
     def function(z: Z, args: Any) -> tuple[Array, Observation]:
         r, jacobian, observation = _evaluate_residuals(problem, data, pin, jax.lax.stop_gradient(z))
-        return with_slope(z, r, jacobian), observation
+        return with_derivative(z, r, jacobian), observation
 
     return function
 
@@ -431,7 +431,7 @@ def search_refilling(problem: Problem, members: Member, max_steps: int, places: 
     return optima, state.aux
 
 
-def _refilled(problem: Problem, members: Member, max_steps: int, places: int) -> tuple[Optimum, Searching]:
+def _refilled(problem: Problem, members: Member, max_steps: int, places: int) -> tuple[Optimum, SearchState]:
     """Results as of `search_refilling`, with the solver's state at the end of each search."""
     count, most = len(members.start), np.asarray(max_steps)
     cores = min(CORES, -(-count // places))
@@ -705,7 +705,7 @@ def search_with_solver(
 
     def residual(z: Z, args: Any) -> Array:
         r, jacobian, _ = _evaluate_residuals(problem, data, no_pin(z.size), jax.lax.stop_gradient(z))
-        return with_slope(z, *clip_penalties(r, jacobian, data))
+        return with_derivative(z, *clip_penalties(r, jacobian, data))
 
     def search(start: Z) -> tuple[Optimum, Observation, Observation]:
         solved: optx.Solution = optx.least_squares(residual, solver, start, max_steps=most, throw=False)

@@ -28,7 +28,7 @@ from calibration.data.writing import entries_of, replacing
 from calibration.described import describe
 from calibration.inference import noise as noise_room
 from calibration.inference import series_noise
-from calibration.inference.fit_notes import Edge, Remark, next_step
+from calibration.inference.fit_notes import ReachedBound, Remark, progress_remark
 from calibration.inference.noise import Noise
 from calibration.inference.priors import Coordinates
 from calibration.inference.problem import MISSING, Observation, Problem
@@ -283,7 +283,7 @@ def evolve(
 
         def advance(done: int) -> None:
             minutes = (time.perf_counter() - begun) / 60
-            tell(next_step("members", number, done, len(points), minutes))  # noqa: B023
+            tell(progress_remark("members", number, done, len(points), minutes))  # noqa: B023
 
         now = members.run(points, advance)
         z = points if rows is None else np.concatenate([z, points])
@@ -298,7 +298,7 @@ def evolve(
         )
         failed = int(np.sum(members.lost(now).any(-1)))
         progress.append(Generation(len(points), failed, float(cost.min()), float(np.median(own_cost))))
-        tell(next_step("generation", number, cost.min(), np.median(own_cost), failed))
+        tell(progress_remark("generation", number, cost.min(), np.median(own_cost), failed))
         population = Population(z, *rows, cost, tuple(progress))
         if population.settled:
             break
@@ -351,15 +351,15 @@ def unreliable_derivatives(
     return ~np.isfinite(off) | ((off > APART * size) & (off > 1.0))
 
 
-def parameters_at_edge(coordinates: Coordinates, z: np.ndarray) -> dict[str, Edge]:
+def parameters_at_edge(coordinates: Coordinates, z: np.ndarray) -> dict[str, ReachedBound]:
     """Parameters at a bound, or further than `EDGE` from the middle of their prior, with that distance, by name."""
     bound = coordinates.beyond(z)
     at_edge = {}
     for name, shift, side in zip(coordinates.names, z, bound, strict=True):
         if side:
-            at_edge[name] = Edge("lower" if side < 0 else "upper", float(shift))
+            at_edge[name] = ReachedBound("lower" if side < 0 else "upper", float(shift))
         elif abs(shift) > EDGE:
-            at_edge[name] = Edge("", float(shift))
+            at_edge[name] = ReachedBound("", float(shift))
     return at_edge
 
 
@@ -381,7 +381,7 @@ class Searched:
     apart: Names
     slope: np.ndarray | None
     left: float
-    edge: dict[str, Edge] = dataclasses.field(default_factory=dict)
+    edge: dict[str, ReachedBound] = dataclasses.field(default_factory=dict)
 
     def outcomes(self) -> dict[str, int]:
         """Number of members with a row of each outcome, by the word of the status or flag, without zeros."""

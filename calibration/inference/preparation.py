@@ -16,7 +16,7 @@ from calibration.data.runs import Runs
 from calibration.inference import checks, observers, repeats
 from calibration.inference import noise as noise_room
 from calibration.inference.fit_notes import Notes
-from calibration.inference.foreign import inherited_priors
+from calibration.inference.foreign import inherited_friction_remarks
 from calibration.inference.noise import Noise
 from calibration.inference.observers import Observer
 from mmrjax.errors import UsageError
@@ -96,7 +96,7 @@ def prepare(
     return dataclasses.replace(
         result,
         names=names,
-        foreign=tuple(inherited_priors(robot, priors)),
+        foreign=tuple(inherited_friction_remarks(robot, priors)),
         checked=(*larger, *checked),
         begins=tuple(begins),
         doubted=rig_facts.log_doubts(runs, as_stated),

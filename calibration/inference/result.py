@@ -13,10 +13,10 @@ from calibration.data import Columns, Json, Names, writing
 from calibration.data import posterior_file as posterior
 from calibration.data.posterior_file import Posterior
 from calibration.described import describe, sentences
-from calibration.inference.fit_notes import Determination, Notes, Pair, Remark
+from calibration.inference.fit_notes import DependentPair, Determination, Notes, Remark
 from calibration.inference.identifiability import Identifiability, determined_together, undetermined_names
 from calibration.inference.lack_of_fit import Adequacy
-from calibration.inference.multistart import Starts
+from calibration.inference.multistart import StartOutcomes
 from calibration.inference.population import Searched
 from calibration.inference.residual_clusters import ResidualCluster
 from calibration.inference.simulation_errors import OF_SIZE
@@ -292,7 +292,7 @@ class CalibrationResult:
     adhesion_used: np.ndarray
     objective: float
     converged: bool
-    starts: Starts
+    starts: StartOutcomes
     searched: Searched | None
     chi_square: ChiSquare
     adequacy: Adequacy
@@ -321,7 +321,7 @@ class CalibrationResult:
         return tuple(name for name, p in self.parameters.items() if p.held_by_prior)
 
     @property
-    def together(self) -> tuple[Pair, ...]:
+    def together(self) -> tuple[DependentPair, ...]:
         """Pairs of parameters that these data determine only in combination."""
         return determined_together(self.posterior, self.held_by_prior)
 

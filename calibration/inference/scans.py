@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from calibration.inference.fit_notes import Remark, next_step
+from calibration.inference.fit_notes import Remark, progress_remark
 from calibration.inference.identifiability import Z95, Identifiability
 from calibration.inference.optimizers import Optimum, evaluate_residuals
 from calibration.inference.priors import parameters_by_name
@@ -172,7 +172,7 @@ def search_lower_basins(
             break
         found = lower
         over = " or ".join(problem.coordinates.names[k] for k in every)
-        tell(next_step("basin", over, float(found[0].cost)))
+        tell(progress_remark("basin", over, float(found[0].cost)))
     else:
         return dataclasses.replace(found[0], converged=jnp.asarray(False)), found[1]
     # A kink has a slope on either side, so an optimum there is a point with no lower point nearby.

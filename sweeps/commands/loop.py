@@ -24,7 +24,7 @@ from calibration.discovery.resolve import check_resolvable, fit_track_model
 from calibration.discovery.result import DiscoveryResult, EffectRanking
 from calibration.discovery.settings import fewest_replicates
 from calibration.inference import observers, priors
-from calibration.inference.details import EquationDefects
+from calibration.inference.details import EquationErrors
 from calibration.inference.simulation_errors import root_mean_square
 from calibration.words import loop_words
 from calibration.words.step_words import expected_time
@@ -214,7 +214,7 @@ def _say_kept(stages: Mapping[str, Any], folder: RunFolder, robot_name: str) -> 
 def changes_by_effect(found: DiscoveryResult) -> dict[str, Change]:
     """Change of settled runs by each effect, empty for histories and for effects that the written robot lacks."""
     added = [e.name for e in found.effects if e.name in {x.name for x in found.robot.effects}]
-    if not isinstance(found.detail, EquationDefects) or not added:
+    if not isinstance(found.detail, EquationErrors) or not added:
         return {}
     conditions = found.runs.conditions(found.robot)
 

@@ -20,7 +20,7 @@ from calibration.data.runs import Runs
 from calibration.described import describe
 from calibration.inference import bases as bases_room
 from calibration.inference.bases import Bases
-from calibration.inference.details import EquationDefects
+from calibration.inference.details import EquationErrors
 from calibration.inference.fit_notes import Remark
 from calibration.inference.linearization import Linearization, ScoredEffect, balance_probe, finite_or_zero
 from calibration.inference.noise import Noise
@@ -380,12 +380,12 @@ class SettledRuns(Observer):
         base_arguments = columns, weight, robot, None, ways
         return (*bases_room.curve_families(*base_arguments), *bases_room.window_families(*base_arguments))
 
-    def detail(self, bases: Bases, included: np.ndarray, before: Diagnosis, after: Diagnosis) -> EquationDefects:
+    def detail(self, bases: Bases, included: np.ndarray, before: Diagnosis, after: Diagnosis) -> EquationErrors:
         """Defects of `electrical`, `track` and `slip` that together make each row's residual.
 
         Residuals are simulated less measured. Sides have defects of their own if they are driven independently.
         """
-        return EquationDefects(_row_defects(before.linear, included), _row_defects(after.linear, included))
+        return EquationErrors(_row_defects(before.linear, included), _row_defects(after.linear, included))
 
 
 def _unmeasured(observe: SettledRuns, robot: Robot, columns: Columns) -> dict[str, Float[np.ndarray, " rows"]]:

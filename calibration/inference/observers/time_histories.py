@@ -36,7 +36,7 @@ from calibration.data.runs import Runs
 from calibration.inference import bases as bases_room
 from calibration.inference import scans
 from calibration.inference.bases import Bases
-from calibration.inference.details import Memory, Strongest, TimeSide, TimeStatistics
+from calibration.inference.details import FitOverTime, ResidualMemory, StrongestWave, TimeStatistics
 from calibration.inference.fit_notes import Remark
 from calibration.inference.linearization import (
     PROBED,
@@ -786,20 +786,20 @@ class Histories(Observer):
         names = bases_room.family_names(bases)
         orders = [w for w in bases_room.ORDERS if any(n[1] == w for n in names)]
 
-        def strongest(diagnosis: Diagnosis, variable: str) -> Strongest | None:
+        def strongest(diagnosis: Diagnosis, variable: str) -> StrongestWave | None:
             same_variable = [k for k, n in enumerate(names) if n[1] == variable]
             if not same_variable:
                 return None
             k = max(same_variable, key=lambda j: np.asarray(diagnosis.scores.curve)[j])
-            return Strongest(names[k][0], float(diagnosis.scores.curve[k]), float(diagnosis.scores.explained[k]))
+            return StrongestWave(names[k][0], float(diagnosis.scores.curve[k]), float(diagnosis.scores.explained[k]))
 
-        def side(diagnosis: Diagnosis) -> TimeSide:
+        def side(diagnosis: Diagnosis) -> FitOverTime:
             lags = min(LAGS, self.rows_of.shape[1] // 4)
             test = diagnosis.test
             x = np.asarray(diagnosis.linear.series())
             power = np.maximum(np.sum(x**2, (0, 1)), 1e-12)
             by_lag = [np.sum(x[:, k:] * x[:, :-k], (0, 1)) / power for k in range(1, lags + 1)]
-            memory = Memory(
+            memory = ResidualMemory(
                 float(test.found.white),
                 test.threshold("white"),
                 test.p("white"),
@@ -807,7 +807,7 @@ class Histories(Observer):
                 {name: [float(lag[k]) for lag in by_lag] for k, name in enumerate(diagnosis.linear.channels)},
             )
             waves = {(w, bases_room.ORDERS[w][0]): wave for w in orders if (wave := strongest(diagnosis, w))}
-            return TimeSide(memory, waves, strongest(diagnosis, "time"))
+            return FitOverTime(memory, waves, strongest(diagnosis, "time"))
 
         samples = int((np.asarray(self.rows_of) >= 0).sum())
         unresolved = tuple(w for w in bases_room.ORDERS if w not in orders)

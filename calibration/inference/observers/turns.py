@@ -161,7 +161,7 @@ class SettledTurns(SettledRuns):
             points,
             weight,
             robot,
-            bases_room.Scope(lacking, axes),
+            bases_room.CurveScope(lacking, axes),
             {way: signal_values[way] for way in WAYS},
         )
         return (*bases_room.curve_families(*base_arguments), *bases_room.window_families(*base_arguments))
