@@ -71,7 +71,7 @@ def _dissipates(power: np.ndarray | None) -> bool:
 @functools.partial(compiled, options=SELDOM)
 def _dissipated_power(observe: Observer, robot: Robot) -> Float[Array, "balances rows"] | None:
     """Power that each balance of `SINK` dissipates in each row [W], None if rows have no operating point."""
-    signals = observe.operating(robot)
+    signals = observe.operating_points(robot)
     if signals is None:
         return None
     power = jax.vmap(lambda run, at: sink_powers(robot, run, at))(observe.conditions, signals)

@@ -384,7 +384,7 @@ def propose_denser_runs(space: CandidateSpace, where: DiscrepancyLocation, setti
     Its expected separation from no discrepancy is the χ² per run of the table times the number of proposed runs [σ].
     """
     variable, within = where.variable, reach_of_space(space)
-    runs = space.bare.observe.runs_counting(space.included)
+    runs = space.bare.observe.number_of_included_runs(space.included)
     sigma = float(np.sqrt(max(where.strongest, 0.0) * SERIES * REPEATS / max(runs, 1)))
     if sigma < settings.worth:
         return Proposal((NONE,), Remark("too_weak", variable=variable, sigma=sigma), (), 0.0, False, ())

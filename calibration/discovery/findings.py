@@ -358,7 +358,7 @@ class FittedProblem:
 
     def observation(self) -> Observation:
         """Simulated observation at the fit."""
-        return self.problem.observe.observed(self.problem, self.z, self.active)
+        return self.problem.observe.observation_at(self.problem, self.z, self.active)
 
 
 #: Kind of block → hold-out predictions of each row, shape (rows, channels).

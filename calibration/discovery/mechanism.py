@@ -296,7 +296,7 @@ def _hold_out_score(space: CandidateSpace, runs: Runs, reading: Columns) -> Held
 
 def _simulated_reading(space: CandidateSpace, candidate: Candidate) -> np.ndarray:
     problem, z, active = space.fit_of(candidate.active, candidate.z)
-    return np.asarray(problem.observe.observed(problem, z, active).reading)
+    return np.asarray(problem.observe.observation_at(problem, z, active).reading)
 
 
 def _whitened_residuals(space: CandidateSpace, candidate: Candidate) -> np.ndarray:

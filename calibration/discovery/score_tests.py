@@ -354,7 +354,7 @@ def _replicate_batch(
     """Statistics of one batch of bootstrap replicates."""
 
     def statistics_of_replicate(drawn: Any) -> StrongestStatistics:
-        replicate = problem.observe.replicate(problem, problem.data, effects, linear, drawn)
+        replicate = problem.observe.fit_replicate(problem, problem.data, effects, linear, drawn)
         return strongest_statistics(score_tests(replicate, bases), replicate)
 
     return jax.vmap(statistics_of_replicate)(drawn)

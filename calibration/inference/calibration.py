@@ -268,7 +268,7 @@ def _population_size(posed: Problem, names: Sequence[str], runs: Runs, populatio
         population = POPULATION if fidelities.unread_parameters("steady", names, runs.turns) else 0
     if more and not population:
         raise BadConfiguration("--generations, --members: there is no population; state --population")
-    if population and not posed.observe.eased:
+    if population and not posed.observe.starts_from_steady:
         raise BadConfiguration(
             f"--population: got {population}; a population search needs settled rows and --model drive or track"
         )
@@ -298,7 +298,7 @@ def _search(
     points = posed.observe.starts(posed, rng, starts, every)
     if not posed.observe.long:
         return multistart.search_from_starts(posed, known, points, solver), None
-    if not posed.observe.eased:
+    if not posed.observe.starts_from_steady:
         shares = multistart.initial_noise_shares(known)
         return multistart.search_one_by_one(posed, known, points, shares, tell, solver), None
     tell(progress_remark("steady"))

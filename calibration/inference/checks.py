@@ -303,14 +303,14 @@ def infeasible_error(
         names: names of the free parameters.
     """
 
-    def row_numbers(which: np.ndarray) -> str:
+    def listed(which: np.ndarray) -> str:
         return ", ".join(str(k + 1) for k in np.flatnonzero(which))
 
     slides = lost & (status == SLIDES)
     if not slides.any():
         words = ", ".join(STATUSES[k] for k in np.unique(status[lost]))
         return BadConfiguration(
-            f"no start is feasible: the model does not reach {runs.source} rows {row_numbers(lost)} ({words} at the best "
+            f"no start is feasible: the model does not reach {runs.source} rows {listed(lost)} ({words} at the best "
             "point found); check their conditions, or widen the priors"
         )
     sliding = sorted(set(runs.configurations_named(robot)[slides]), key=robot.configurations.index)
@@ -318,6 +318,6 @@ def infeasible_error(
     frictions = ", ".join(f"{float(robot.configurations[c].ground.friction.static):.3g}" for c in sliding)
     cure = "free it, or raise it in --robot" if set(parameter.values()) - set(names) else "widen its prior"
     return BadConfiguration(
-        f"no start is feasible: {runs.source} rows {row_numbers(slides)} were measured in steady travel, but the model "
+        f"no start is feasible: {runs.source} rows {listed(slides)} were measured in steady travel, but the model "
         f"slides there ({' and '.join(parameter.values())} = {frictions} cannot carry the demand); {cure}"
     )

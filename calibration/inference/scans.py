@@ -99,7 +99,7 @@ def scan_coordinate(problem: Problem, z: np.ndarray, data: Data, k: int) -> Scan
 
     Without z an interval could begin beyond a narrow minimum that no other point is in.
     """
-    count = problem.observe.scan_points(problem, k)
+    count = problem.observe.number_of_scan_points(problem, k)
     scan = _scan_values(problem, z, data, k, np.append(np.linspace(-RANGE, RANGE, count - 1), z[k]))
     around, few = np.array([z[k], *scan.at[scan.basins()]])[:CLOSER], count // CLOSER
     close = (around[:, None] + 2 * RANGE / (count - 1) * np.linspace(-1, 1, few)).ravel()

@@ -30,7 +30,7 @@ def observer_kind(runs: Runs) -> type[Observer]:
     """Observer class of a table: time histories if it has `time_s`, otherwise settled turns or settled straight
     runs.
     """
-    return next(k for k in KINDS if k.observes(runs))
+    return next(k for k in KINDS if k.accepts_table(runs))
 
 
 def facts_of_fidelity(model: str) -> Facts:

@@ -132,7 +132,7 @@ class Observer(eqx.Module):
 
     @classmethod
     @abc.abstractmethod
-    def observes(cls, runs: Runs) -> bool:
+    def accepts_table(cls, runs: Runs) -> bool:
         """True if a table is of this kind."""
 
     @classmethod
@@ -230,7 +230,7 @@ class Observer(eqx.Module):
         """
         raise NotImplementedError
 
-    def operating(self, robot: Robot) -> Signals | None:
+    def operating_points(self, robot: Robot) -> Signals | None:
         """Signals of a robot at the operating point of each row. None if rows have no operating point."""
         return None
 
@@ -241,7 +241,7 @@ class Observer(eqx.Module):
 
     @property
     @abc.abstractmethod
-    def eased(self) -> bool:
+    def starts_from_steady(self) -> bool:
         """True if a search may start at the optimum of the same problem with `steady`."""
 
     @abc.abstractmethod
@@ -258,7 +258,7 @@ class Observer(eqx.Module):
         return []
 
     @abc.abstractmethod
-    def runs_counting(self, included: np.ndarray) -> int:
+    def number_of_included_runs(self, included: np.ndarray) -> int:
         """Number of runs with at least one included row."""
 
     def noise_misfit(self, off: Callable[[], np.ndarray], counts: Bool[np.ndarray, "rows channels"]) -> float:
@@ -292,7 +292,7 @@ class Observer(eqx.Module):
         return keys
 
     @abc.abstractmethod
-    def replicate(
+    def fit_replicate(
         self, problem: Problem, data: Data, effects: tuple[ScoredEffect, ...], linear: Linearization, drawn: Any
     ) -> Linearization:
         """Linearization of one bootstrap replicate: a table that is drawn from the fit of the base and refitted.
@@ -323,7 +323,7 @@ class Observer(eqx.Module):
         """
         return ()
 
-    def scan_points(self, problem: Problem, k: int) -> int:
+    def number_of_scan_points(self, problem: Problem, k: int) -> int:
         """Number of values at which a coordinate is scanned, a multiple of `scans.CLOSER`."""
         raise NotImplementedError
 
@@ -362,7 +362,7 @@ class Observer(eqx.Module):
             scanned: problem of the base, whose coordinates come first and are scanned. None: the problem itself.
         """
 
-    def observed(self, problem: Problem, z: Numbers, active: Numbers | None = None) -> Observation:
+    def observation_at(self, problem: Problem, z: Numbers, active: Numbers | None = None) -> Observation:
         """Simulated observation in each row at z.
 
         Args:

@@ -121,7 +121,7 @@ class SettledRuns(Observer):
     fidelity: str = eqx.field(static=True)
 
     @classmethod
-    def observes(cls, runs: Runs) -> bool:
+    def accepts_table(cls, runs: Runs) -> bool:
         return not runs.has("time_s")
 
     @classmethod
@@ -244,7 +244,7 @@ class SettledRuns(Observer):
         result, signals, left = jax.vmap(one)(self.conditions, unknowns, found)
         return self._simulated_readings(robot, result), signals, left
 
-    def operating(self, robot: Robot) -> Signals | None:
+    def operating_points(self, robot: Robot) -> Signals | None:
         if self.long or self.conditions.turns:
             return None
         return jax.vmap(functools.partial(operating_signals, robot))(self.conditions)
@@ -254,13 +254,13 @@ class SettledRuns(Observer):
         return fidelities.fidelity_facts(self.fidelity).rollout
 
     @property
-    def eased(self) -> bool:
+    def starts_from_steady(self) -> bool:
         return self.long
 
     def unreachable(self, status: np.ndarray) -> np.ndarray:
         return np.isin(status, (SLIDES, FAILED, TIPS))
 
-    def runs_counting(self, included: np.ndarray) -> int:
+    def number_of_included_runs(self, included: np.ndarray) -> int:
         return int(included.sum())
 
     def cautions(self, robot: Robot) -> list[str]:
@@ -332,7 +332,7 @@ class SettledRuns(Observer):
         refits, _ = search_refilling(problem, members, self.policy.steps, self.places(problem))
         return measured, centre, refits.z
 
-    def replicate(
+    def fit_replicate(
         self,
         problem: Problem,
         data: Data,

@@ -251,7 +251,7 @@ class Histories(Observer):
     known: LinearisedRun | None = None
 
     @classmethod
-    def observes(cls, runs: Runs) -> bool:
+    def accepts_table(cls, runs: Runs) -> bool:
         return runs.has("time_s")
 
     @classmethod
@@ -583,13 +583,13 @@ class Histories(Observer):
         return True
 
     @property
-    def eased(self) -> bool:
+    def starts_from_steady(self) -> bool:
         return False
 
     def unreachable(self, status: np.ndarray) -> np.ndarray:
         return status == FAILED
 
-    def runs_counting(self, included: np.ndarray) -> int:
+    def number_of_included_runs(self, included: np.ndarray) -> int:
         return self.rows_of.shape[0]
 
     def noise_misfit(self, off: Callable[[], np.ndarray], counts: np.ndarray) -> float:
@@ -646,7 +646,7 @@ class Histories(Observer):
         simulated = _evaluate(problem, *members)[3]
         return dataclasses.replace(self, known=jax.tree.map(lambda x: x[0], simulated))
 
-    def replicate(
+    def fit_replicate(
         self, problem: Problem, data: Data, effects: tuple[ScoredEffect, ...], linear: Linearization, drawn: Array
     ) -> Linearization:
         jacobian = linear.jacobian
@@ -682,7 +682,7 @@ class Histories(Observer):
     def scanned(self, problem: Problem) -> tuple[int, ...]:
         return scans.coordinates_beyond_a_basin(problem)
 
-    def scan_points(self, problem: Problem, k: int) -> int:
+    def number_of_scan_points(self, problem: Problem, k: int) -> int:
         """Number of values of a scan.
 
         A delay has a spacing of at most half a current's rise time L/R or an eighth of a sample, within `DELAYS`.
@@ -753,7 +753,7 @@ class Histories(Observer):
         best = dataclasses.replace(best, z=optimum.z.at[:size].set(best.z), sd=optimum.sd.at[:size].set(best.sd))
         return jax.tree.map(lambda every, mine: jnp.asarray(every).at[k].set(mine), optima, (best, seen))
 
-    def observed(self, problem: Problem, z: Numbers, active: Numbers | None = None) -> Observation:
+    def observation_at(self, problem: Problem, z: Numbers, active: Numbers | None = None) -> Observation:
         return self.at(problem, z, active)[2]
 
     def at(self, problem: Problem, z: Numbers, active: Numbers | None = None) -> tuple[Numbers, Numbers, Observation]:

@@ -88,8 +88,8 @@ class SettledTurns(SettledRuns):
     shape_sides: ClassVar[tuple[int, ...]] = (2,)
 
     @classmethod
-    def observes(cls, runs: Runs) -> bool:
-        return runs.turns and super().observes(runs)
+    def accepts_table(cls, runs: Runs) -> bool:
+        return runs.turns and super().accepts_table(runs)
 
     @classmethod
     def of(cls, runs: Runs, robot: Robot, fidelity: str | None = None) -> SettledTurns:
@@ -130,7 +130,7 @@ class SettledTurns(SettledRuns):
         samples = super().draws(problem, z, linear, keys, factors)
         return *samples, solve_roots(problem, samples[2])
 
-    def replicate(
+    def fit_replicate(
         self,
         problem: Problem,
         data: Data,
@@ -139,7 +139,7 @@ class SettledTurns(SettledRuns):
         drawn: tuple[Any, ...],
     ) -> Linearization:
         rooted = dataclasses.replace(problem, roots=drawn[-1])
-        return super().replicate(rooted, data, effects, linear, drawn[:-1])
+        return super().fit_replicate(rooted, data, effects, linear, drawn[:-1])
 
     def unreachable(self, status: np.ndarray) -> np.ndarray:
         return super().unreachable(status) | (status == NOT_SETTLED)
