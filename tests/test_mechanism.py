@@ -195,7 +195,7 @@ def test_equations_that_act_alike_are_listed(found):
 
 def test_a_curve_is_asked_within_the_range_that_its_fit_has_seen():
     speed = np.array([1.0, 2.0, 3.0, 4.0, 2.5, 5.0])
-    linear = SimpleNamespace(in_travel=lambda place, variable: (speed, 1.0))
+    linear = SimpleNamespace(curve_variable=lambda place, variable: (speed, 1.0))
     beside = SimpleNamespace(where=SPEED, left=SimpleNamespace(linear=linear))
     space = SimpleNamespace(included=np.ones(6, bool))
     masks = [np.isin(np.arange(6), rows) for rows in ((0, 4), (1, 2), (3, 5))]

@@ -238,6 +238,6 @@ static = 0.6
 """
     freed = []
     for mass in ('"10 ± 20 %"', "10"):
-        freed.append(priors.free_names(read_rig(tmp_path, text.format(mass=mass)), ["rover"]))
+        freed.append(priors.loop_parameter_names(read_rig(tmp_path, text.format(mass=mass)), ["rover"]))
     assert set(freed[0]) - set(freed[1]) == {"rover.mass"}
     assert "motor.inertia" not in freed[0]  # settled runs do not show it

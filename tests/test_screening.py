@@ -238,7 +238,7 @@ def test_fits_with_other_sds_are_few_steps_from_those_that_are_known(space, monk
             np.array(starts), one + 1, np.zeros((1, size, size)), one[:, 0], one[:, 0], one[:, 0], one[:, 0]
         ), None
 
-    monkeypatch.setattr(candidates, "search_each", search)
+    monkeypatch.setattr(candidates, "fit_from_each_start", search)
     near = dataclasses.replace(space, near={known: at})
     found = candidates.fit_candidates(near, [(known, 0 * at), (other, 0 * at)], ANALYST.settings)
     assert [c.active for c in found] == [known, other]

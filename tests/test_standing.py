@@ -347,7 +347,7 @@ def test_amplitude_that_changes_with_a_variable_is_seen_and_one_that_does_not_is
     variables = {"slope": x, "current": current}
     linear = SimpleNamespace(
         readings=2 * rows, rows=rows, at_points=lambda counts: counts,
-        in_travel=lambda place, name: (variables.get(name, np.ones(rows)), np.ones(rows)),
+        curve_variable=lambda place, name: (variables.get(name, np.ones(rows)), np.ones(rows)),
     )  # fmt: skip
     space = SimpleNamespace(
         free=0, included=np.ones(rows, bool), bare=SimpleNamespace(observe=SimpleNamespace(long=False))

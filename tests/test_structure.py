@@ -260,7 +260,7 @@ KEPT = {
     ("calibration/data/stated.py", "_template_numbers"): "packaged files",
     ("calibration/data/parts.py", "packaged_gearboxes"): "a packaged table",
     ("calibration/data/parts.py", "packaged_cells"): "a packaged table",
-    ("calibration/discovery/scales.py", "_nominal"): "pure: signals of the nominal robot",
+    ("calibration/discovery/scales.py", "_nominal_signals"): "pure: signals of the nominal robot",
     ("sweeps/report/catalogue.py", "_content"): "a packaged file",
     ("sweeps/cli.py", "os.environ"): "set for jax, before it is imported",
     ("sweeps/cli.py", "sys.unraisablehook"): "repeats an interrupt that a callback lost, while a command works",

@@ -353,7 +353,7 @@ def test_a_sentence_is_its_own_words_and_what_is_no_note_says_so():
 
 @pytest.mark.parametrize(
     ("kind", "rows"),
-    [("next_step", step_words.STEPS), ("RuledOut", loop_words.RULED_OUT)],
+    [("progress_remark", step_words.STEPS), ("RuledOut", loop_words.RULED_OUT)],
 )
 def test_names_of_rows_are_those_of_the_code(kind, rows):
     """A name without a row would fail only where it is said, and a row without a name is never said."""
@@ -362,7 +362,7 @@ def test_names_of_rows_are_those_of_the_code(kind, rows):
         for file in (ROOT / "calibration" / room).rglob("*.py"):
             for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
                 if isinstance(node, ast.Call) and ast.unparse(node.func) == kind and node.args:
-                    at = 0 if kind == "next_step" else 1
+                    at = 0 if kind == "progress_remark" else 1
                     used |= {node.args[at].value} if len(node.args) > at else {""}
     assert used | ({""} & set(rows)) == set(rows)
 

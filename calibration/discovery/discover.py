@@ -79,7 +79,7 @@ from calibration.inference.linearization import Linearization
 from calibration.inference.lost_motion import lost_motion_notes
 from calibration.inference.noise import Noise
 from calibration.inference.noise_factor import common_factors, noise_remarks
-from calibration.inference.residual_clusters import residual_clusters
+from calibration.inference.residual_clusters import find_residual_clusters
 from calibration.inference.simulation_errors import channel_errors
 from mmrjax import effects, fidelities
 from mmrjax.compile.precision import SINGLE, Threads, in_double, is_double
@@ -208,7 +208,7 @@ class LoopInput:
     Attributes:
         runs: runs without exact copies.
         numbers: row numbers as used in messages.
-        robot: robot from `preparation.prepare`.
+        robot: robot from `preparation.prepare_input`.
         noise: noise of the readings.
         stated: priors (mean, sd) that replace those of the fields [SI].
         settings: statistical settings.
@@ -319,7 +319,7 @@ def prepare_loop(
             f"{kind.fewest} are needed"
         )
     with scales.compute_nominal_ahead(robot):
-        ready = preparation.prepare(distinct, robot, noise, stated)
+        ready = preparation.prepare_input(distinct, robot, noise, stated)
     for note in remarks_with_codes(ready.checked, "nothing_varies", "copied"):
         if note.code == "nothing_varies" or not note.tied:
             raise BadData(describe(note))
@@ -711,7 +711,7 @@ def build_candidate_space(
     kind = observers.observer_kind(runs)
     index, real = padded_rows(len(runs), kind.sizes_padded)
     idle = (*(() if kind.axis else priors.OVER_TIME), *(f"{n}.mass" for n in own_mass.stated_masses(robot, runs)))
-    names = priors.free_names(robot, runs.configurations_named(robot), *kind.free(), idle)
+    names = priors.loop_parameter_names(robot, runs.configurations_named(robot), *kind.free(), idle)
     unread = fidelities.unread_parameters("drive" if kind.axis else "steady", names, runs.turns)
     names = tuple(n for n in names if n not in unread)
     coordinates = priors.parameter_coordinates(robot, names, dict(stated or {}), any_surface=True)
@@ -974,7 +974,7 @@ def assemble_result(given: LoopInput, traced: LoopStages) -> DiscoveryResult:
         hidden=concealed,
         support=summary.support,
         cluster=screened.cluster,
-        residual_clusters=residual_clusters(remaining, settings.seed),
+        residual_clusters=find_residual_clusters(remaining, settings.seed),
         before=findings.evidence_of_test(left.test, adequate=not left.test.rejected),
         after=findings.evidence_of_test(ends.test, adequate=not ends.test.rejected_with_margin),
         chi2=(2 * base.cost, 2 * cost),

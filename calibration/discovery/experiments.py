@@ -245,7 +245,7 @@ def predict_menu(space: CandidateSpace, candidates: Mapping[str, Candidate], set
     names, alternatives = list(candidates), list(candidates.values())
     alternatives += [alternatives[0]] * (-len(alternatives) % PAD)
     robot = space.bare.base
-    all_parameters = priors.free_names(robot, robot.configurations.names)
+    all_parameters = priors.loop_parameter_names(robot, robot.configurations.names)
     more = [n for n in all_parameters if n not in space.coordinates.base.names]
     other = priors.parameter_coordinates(robot, more) if more else None
     equipped, indices = space.problem_for_sets(c.active for c in alternatives)

@@ -21,7 +21,7 @@ from jaxtyping import Array, Float
 
 from calibration.inference.bases import Bases, place_signature
 from calibration.inference.linearization import Linearization, ScoredEffect
-from calibration.inference.optimizers import CORES, with_roots
+from calibration.inference.optimizers import CORES, with_solved_rows
 from calibration.inference.problem import Problem
 from mmrjax.compile.compiling import SELDOM, SMALL, compiled
 from mmrjax.compile.precision import Threads
@@ -199,7 +199,7 @@ def diagnose_fit(
             curve hardly changes them.
     """
     if not problem.observe.long:
-        linear = _linearised(with_roots(problem, z), z, effects)
+        linear = _linearised(with_solved_rows(problem, z), z, effects)
     elif near is None:  # by separate programs
         linear = problem.observe.linearise(problem, z, problem.data, effects)
     else:

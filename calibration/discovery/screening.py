@@ -23,7 +23,7 @@ from calibration.discovery.score_tests import ABSORBED, ScoreTable
 from calibration.discovery.settings import Settings
 from calibration.inference.linearization import Linearization
 from calibration.inference.optimizers import Optimum
-from calibration.inference.weak_form import WeakForm, weak_form
+from calibration.inference.weak_form import WeakFormFit, fit_weak_form
 
 #: Number of sets that are simulated in a round: the first by regression and its nearest rivals, one of them from
 #: another family.
@@ -74,7 +74,7 @@ class LinearisedFits:
         self,
         space: CandidateSpace,
         at: Candidate,
-        linear: Linearization | WeakForm,
+        linear: Linearization | WeakFormFit,
         scores: ScoreTable,
         settings: Settings,
     ) -> None:
@@ -219,10 +219,10 @@ class WeakFormScreening:
 
 def screen_by_weak_form(space: CandidateSpace, settings: Settings) -> WeakFormScreening | None:
     """Fits base parameters and effects by regression on a log's equations in weak form. None if the log does not show
-    its states (`weak_form`).
+    its states (`fit_weak_form`).
     """
     problem = space.bare
-    equations = weak_form(problem, space.library.scored) if problem.observe.long else None
+    equations = fit_weak_form(problem, space.library.scored) if problem.observe.long else None
     if equations is None:
         return None
     q = np.linalg.qr(equations.jacobian)[0]
@@ -279,7 +279,11 @@ def include_likely_effects(
 
 
 def _fit_single_effects(
-    space: CandidateSpace, base: Candidate, linear: Linearization | WeakForm, scores: ScoreTable, settings: Settings
+    space: CandidateSpace,
+    base: Candidate,
+    linear: Linearization | WeakFormFit,
+    scores: ScoreTable,
+    settings: Settings,
 ) -> tuple[Candidate, ...]:
     """Fits with one effect each, by regression, the best first."""
     beside = LinearisedFits(space, base, linear, scores, settings)

@@ -39,10 +39,10 @@ from calibration.inference.multistart import MultistartResult
 from calibration.inference.noise import Noise
 from calibration.inference.noise_factor import noise_remarks
 from calibration.inference.population import GENERATIONS, LEAST
-from calibration.inference.preparation import Prepared, prepare
+from calibration.inference.preparation import PreparedInput, prepare_input
 from calibration.inference.problem import Problem
 from calibration.inference.remarks import calibration_remarks, row_numbers
-from calibration.inference.residual_clusters import residual_clusters
+from calibration.inference.residual_clusters import find_residual_clusters
 from calibration.inference.result import CalibrationResult
 from mmrjax import fidelities
 from mmrjax.compile.precision import SINGLE, in_double, is_double
@@ -134,7 +134,7 @@ def calibrate(
     blocks = effort.blocks if blocks is None else blocks
     kinds = (observe.blocks if blocks else ()) if isinstance(blocks, bool) else tuple(blocks)
     choose = functools.partial(_free_names, runs, observe, fidelity, free, fix)
-    ready = prepare(runs, robot, noise, stated, assume=False, choose=choose)
+    ready = prepare_input(runs, robot, noise, stated, assume=False, choose=choose)
     for note in (*ready.foreign, *ready.doubted):
         progress(note)
     base, of_product = _with_guide_priors(runs, ready, fidelity)
@@ -155,7 +155,7 @@ def _free_names(
     fidelity: str,
     free: Sequence[str],
     fix: Sequence[str],
-    prepared: Prepared,
+    prepared: PreparedInput,
 ) -> Names:
     """Names of the free parameters.
 
@@ -204,12 +204,12 @@ class _CalibrationInput:
     fidelity: str
     profiles: bool
     kinds: Names
-    ready: Prepared
+    ready: PreparedInput
     base: Robot
     of_product: Priors
 
 
-def _with_guide_priors(runs: Runs, ready: Prepared, fidelity: str) -> tuple[Robot, Priors]:
+def _with_guide_priors(runs: Runs, ready: PreparedInput, fidelity: str) -> tuple[Robot, Priors]:
     """Robot with the guide load that the fidelity computes, and priors for free guide frictions that have no stated
     prior.
     """
@@ -303,7 +303,7 @@ def _search(
         return multistart.search_one_by_one(posed, known, points, shares, tell, solver), None
     tell(progress_remark("steady"))
     if size:
-        population.Members(posed, members_file)  # refuses another calibration's file before the search of steady
+        population.MemberRunner(posed, members_file)  # refuses another calibration's file before the search of steady
     draws = rng.standard_normal((fidelities.fidelity_facts("steady").effort.starts, len(posed.coordinates)))
     draws[0] = 0.0
     easy = multistart.search_from_starts(
@@ -320,14 +320,14 @@ def _search(
     friction = np.array([FRICTION in name for name in easy.problem.coordinates.names])
     covariance[friction] = covariance[:, friction] = 0.0
     covariance[friction, friction] = 1.0
-    members = population.Members(posed, members_file)
-    everyone = population.evolve(
+    members = population.MemberRunner(posed, members_file)
+    everyone = population.run_evolution(
         members, population.member_objective(posed, known), beside, covariance, size=size, generations=generations,
         seed=seed, beside=points, tell=tell,
     )  # fmt: skip
     best_member = int(everyone.order[0])
     if not np.isfinite(everyone.cost[best_member]):
-        ended = population.Searched(everyone, best_member, (), None, np.nan).outcomes()
+        ended = population.PopulationSearch(everyone, best_member, (), None, np.nan).outcomes()
         endings = ", ".join(f"{count} {word.replace('_', ' ')}" for word, count in ended.items())
         raise BadConfiguration(
             f"--population: none of {len(everyone.z)} members can be run in every row (members with a row that ended "
@@ -340,7 +340,7 @@ def _search(
     names = tuple(n for n, apart in zip(posed.coordinates.names, off, strict=True) if apart)
     slope, left = population.local_regression(posed, everyone, best_member) if names else (None, np.nan)
     edge = population.parameters_at_edge(posed.coordinates, everyone.z[best_member])
-    searched = population.Searched(everyone, best_member, names, slope, left, edge)
+    searched = population.PopulationSearch(everyone, best_member, names, slope, left, edge)
     return multistart.optimum_of_population(posed, known, shares, searched, tell, solver), beside
 
 
@@ -377,7 +377,7 @@ def _calibration_result(
     about = identifiability.analyse_identifiability(
         posed, jnp.asarray(z), slope=None if searched is None else searched.slope
     )
-    scanned = scans.scan_all(posed, z)
+    scanned = scans.scans_at_optimum(posed, z)
     about = scans.with_scanned_sds(about, scanned)
     notes = [*ready.foreign, *ready.doubted, *ready.checked, *ready.weighed]
     notes += [
@@ -433,7 +433,7 @@ def _calibration_result(
         adequacy=lack_of_fit.judge_adequacy(
             residuals, seen_before, sd, estimated=noise.estimated, converged=converged
         ),
-        residual_clusters=residual_clusters(residuals, seed),
+        residual_clusters=find_residual_clusters(residuals, seed),
         identifiability=about,
         posterior=posterior_of_coordinates(posed.coordinates, z, about.covariance),
         remarks=(

@@ -16,15 +16,15 @@ from calibration.inference.noise import Noise
 from calibration.inference.observers import Observer
 from calibration.inference.problem import Problem
 from calibration.inference.result import (
-    Block,
+    BlockErrors,
     ChannelErrors,
     ChannelNoise,
     ChannelReadings,
     ChiSquare,
     Errors,
     Estimate,
-    HeldOut,
-    Prior,
+    HeldOutErrors,
+    PriorSummary,
     ProfileCurve,
     SteadyEstimate,
 )
@@ -89,7 +89,7 @@ def parameter_estimates(
             interval_shift=_float_pair(shift),
             unit=coordinates.units[k],
             meaning=fields[name].spec.meaning,
-            prior=Prior(
+            prior=PriorSummary(
                 "log-normal" if coordinates.scale[k] else "normal",
                 float(median[k]),
                 _float_pair(wide[k]),
@@ -144,20 +144,22 @@ def _channel_errors(
     }
 
 
-def hold_out_errors(posed: Problem, held: holdout.HeldOutReadings, measured: np.ndarray, sd: np.ndarray) -> HeldOut:
+def hold_out_errors(
+    posed: Problem, held: holdout.HeldOutReadings, measured: np.ndarray, sd: np.ndarray
+) -> HeldOutErrors:
     """Hold-out errors of all rows together and of each block."""
     percent, lost = sized_error(held.reading, measured), posed.observe.unreachable(held.status)
     blocks = {}
     for k, label in enumerate(held.labels):
         inside = held.block == k
         alone = [np.where(inside[:, None], x, np.nan) for x in (held.reading, percent)]
-        blocks[label] = Block(
+        blocks[label] = BlockErrors(
             _channel_errors(posed.channels, alone[0], measured, sd, alone[1]),
             _row_numbers(inside & lost),
             bool(held.converged[k]),
         )
     reading = dict(zip(channels.channel_names(posed.channels), held.reading.T, strict=True))
-    return HeldOut(
+    return HeldOutErrors(
         _channel_errors(posed.channels, held.reading, measured, sd, percent), _row_numbers(lost), blocks, reading
     )
 

@@ -16,7 +16,7 @@ from calibration.data.thinning import used_rows
 from calibration.inference import identifiability, observers, optimizers, priors
 from calibration.inference.fit_notes import DependentPair, Notes, remarks_with_codes
 from calibration.inference.identifiability import Identifiability, determined_together, posterior_of_coordinates
-from calibration.inference.preparation import prepare
+from calibration.inference.preparation import prepare_input
 from calibration.inference.problem import Problem
 from mmrjax import fidelities
 from mmrjax.model.robot import Robot
@@ -63,7 +63,7 @@ class InformationForecast:
         noise: source of each channel's sd.
         alike: strongly correlated pairs of parameters, with the correlation of their posterior.
         together: pairs of parameters that the data determine only in combination.
-        robot: robot completed from the table, see `preparation.prepare`.
+        robot: robot completed from the table, see `preparation.prepare_input`.
         doubts: remarks that should be checked before a fit.
         separating: for each pair in `alike`, columns that the log lacks and that would each separate the pair.
     """
@@ -96,10 +96,10 @@ def predict_identifiability(
         BadConfiguration: no parameter of the robot can be fitted.
     """
     runs = used_rows(runs, robot, rows)
-    ready = prepare(runs, robot, noise)
+    ready = prepare_input(runs, robot, noise)
     observe, robot, table_noise = ready.observe, ready.robot, ready.noise
     present = {robot.configurations.names[k] for k in runs.configurations(robot)}
-    names = priors.free_names(robot, present, *observe.free(), () if observe.axis else priors.OVER_TIME)
+    names = priors.loop_parameter_names(robot, present, *observe.free(), () if observe.axis else priors.OVER_TIME)
     if not observe.axis:
         names = tuple(n for n in names if n not in fidelities.unread_parameters("steady", names, runs.turns))
     if not names:

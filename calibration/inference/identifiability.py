@@ -135,7 +135,7 @@ def analyse_identifiability(
         jacobian = np.asarray(optimizers.linearise(problem, z, data)[1])
         all_slopes, readings = jacobian[optimizers.informative_residuals(data)], jacobian[: data.measured.size]
     else:
-        all_slopes, readings = (np.asarray(j) for j in _jacobians(optimizers.with_roots(problem, z), z, data))
+        all_slopes, readings = (np.asarray(j) for j in _jacobians(optimizers.with_solved_rows(problem, z), z, data))
     _, s, v = np.linalg.svd(all_slopes, full_matrices=False)
     covariance = (v.T / s**2) @ v
     _, singular, directions = np.linalg.svd(readings, full_matrices=False)

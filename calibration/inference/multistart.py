@@ -17,7 +17,7 @@ from calibration.inference import identifiability, optimizers, scans, series_noi
 from calibration.inference import noise as noise_room
 from calibration.inference.fit_notes import Remark, progress_remark
 from calibration.inference.noise import Noise
-from calibration.inference.population import Population, Searched, most_probable_noise
+from calibration.inference.population import Population, PopulationSearch, most_probable_noise
 from calibration.inference.problem import Data, Observation, Problem
 from mmrjax.model.robot import Robot
 
@@ -92,7 +92,7 @@ class MultistartResult:
     best: optimizers.Optimum
     starts: StartOutcomes
     shares: np.ndarray
-    searched: Searched | None = None
+    searched: PopulationSearch | None = None
 
 
 def unreachable_rows(posed: Problem, status: np.ndarray) -> np.ndarray:
@@ -164,7 +164,7 @@ def search_one_by_one(
             )
 
         optima, start, end = one(points[0])
-        optima, end = scans.search_lower_basins(posed, (optima, end), data, lambda z: one(z)[::2], tell)
+        optima, end = scans.search_lower_minima(posed, (optima, end), data, lambda z: one(z)[::2], tell)
         optima, start, end = jax.tree.map(lambda x: jnp.asarray(x)[None], (optima, start, end))
         return optima, start.status, end.status
 
@@ -223,7 +223,7 @@ def optimum_of_population(
     posed: Problem,
     noise: Noise,
     shares: np.ndarray,
-    searched: Searched,
+    searched: PopulationSearch,
     tell: Callable[[Remark], None],
     solver: optimizers.Solver | None = None,
 ) -> MultistartResult:

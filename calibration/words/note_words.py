@@ -46,7 +46,7 @@ RESULTS: dict[type, Callable[..., str]] = {
     Adequacy: fit_words.adequacy_verdict,
     ResidualCluster: fit_words.residual_cluster,
     fit_results.CalibrationResult: lambda found: fit_words.adequacy_verdict(found.adequacy),
-    fit_results.Prior: lambda prior: fit_words.PRIORS.get(prior.source, prior.source),
+    fit_results.PriorSummary: lambda prior: fit_words.PRIORS.get(prior.source, prior.source),
     loop_notes.TrackModelQuestion: loop_words.track_model_question,
     loop_notes.Headline: loop_words.loop_answer,
     loop_notes.VerdictSummary: loop_words.verdict_sentences,

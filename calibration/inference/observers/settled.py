@@ -26,9 +26,9 @@ from calibration.inference.linearization import Linearization, ScoredEffect, bal
 from calibration.inference.noise import Noise
 from calibration.inference.observers.base import Diagnosis, Observer, SearchPolicy
 from calibration.inference.optimizers import (
-    Member,
     Numbers,
     Optimum,
+    SearchMember,
     penalty_slice,
     search_refilling,
     zero_inactive_residuals,
@@ -328,7 +328,7 @@ class SettledRuns(Observer):
         clean = data.measured + data.sd * linear.by_row()  # for included readings
         measured, centre = jax.device_get(_draw_tables(clean, data.sd, z, keys, jnp.asarray(factors)))
         start, weight = (np.repeat(np.asarray(x)[None], count, 0) for x in (z, data.weight))
-        members = Member(start, weight, measured, centre)
+        members = SearchMember(start, weight, measured, centre)
         refits, _ = search_refilling(problem, members, self.policy.steps, self.places(problem))
         return measured, centre, refits.z
 
@@ -358,7 +358,7 @@ class SettledRuns(Observer):
         data, count = problem.data, len(starts)
         measured, centre = (np.repeat(np.asarray(x)[None], count, 0) for x in (data.measured, data.centre))
         own = np.asarray(starts), np.asarray(weights), measured, centre
-        members = Member(*own, active=None if active is None else np.asarray(active))
+        members = SearchMember(*own, active=None if active is None else np.asarray(active))
         steps = self.policy.steps if most is None else most
         return search_refilling(problem, members, steps, self.places(problem))
 

@@ -1,4 +1,4 @@
-"""Settled turns: one row a run of a robot with independently driven sides, read when it circles."""
+"""Settled turns: one row for each run of a robot with independently driven sides, read while it circles."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from calibration.inference.linearization import PROBED, Linearization, ScoredEff
 from calibration.inference.observers.base import SearchPolicy
 from calibration.inference.observers.settled import SettledLinearization, SettledRuns, side_shares
 from calibration.inference.observers.time_histories import Histories
-from calibration.inference.optimizers import solve_roots
+from calibration.inference.optimizers import solve_rows_at
 from calibration.inference.problem import Data, Observation, Problem
 from mmrjax import effects, fidelities
 from mmrjax.effects import Effect
@@ -46,7 +46,7 @@ def signal_by_point(signals: Signals, name: str) -> Float[Array, " points"]:
 
 
 class TurnLinearization(SettledLinearization):
-    """Linearization of settled turns: each side of each row is a point. `signals` have the sides as last axis."""
+    """Linearization of settled turns. Each side of each row is a point. The last axis of `signals` is the side."""
 
     probed: ClassVar[Names] = (*PROBED, *ROUND)
 
@@ -72,7 +72,7 @@ class TurnLinearization(SettledLinearization):
 class SettledTurns(SettledRuns):
     """Observer of settled turns.
 
-    Contacts slide sideways as far as the turn requires. So the demand on adhesion, a limit of straight travel, is no
+    In a turn, contacts slide sideways as far as the turn requires. Adhesion, which limits straight travel, is no
     limit here.
     """
 
@@ -101,7 +101,7 @@ class SettledTurns(SettledRuns):
 
     @classmethod
     def sizes(cls, runs: Runs) -> np.ndarray:
-        """Root mean square of each channel: readings of turns in either direction cross zero."""
+        """Root mean square of each channel, because readings cross zero between turns in both directions."""
         return Histories.sizes(runs)
 
     @classmethod
@@ -128,7 +128,7 @@ class SettledTurns(SettledRuns):
     ) -> tuple[Any, ...]:
         """Draws as in the protocol, with the roots at each refit."""
         samples = super().draws(problem, z, linear, keys, factors)
-        return *samples, solve_roots(problem, samples[2])
+        return *samples, solve_rows_at(problem, samples[2])
 
     def fit_replicate(
         self,
@@ -145,9 +145,9 @@ class SettledTurns(SettledRuns):
         return super().unreachable(status) | (status == NOT_SETTLED)
 
     def bases(self, columns: Columns, included: np.ndarray, robot: Robot) -> Bases:
-        """Bases as in the protocol, in the same balances of both sides and in those of the turn.
+        """Bases of curves, see `Observer.bases`, in the balances of both sides and of the turn.
 
-        Curves are over each side's signals, the yaw rate, and the side.
+        Curves are over the signals of each side, the yaw rate, and the side.
         """
         names = [v for v in VARIABLES if v != "voltage" or robot.rig.shows_voltage]
         signals = results_of_rows(robot, self.conditions)[1]
