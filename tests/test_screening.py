@@ -85,7 +85,7 @@ def test_other_basins_of_a_log_are_searched_in_the_program_of_its_room(space, mo
     monkeypatch.setattr(time_histories, "search_rollouts", rollouts)
     monkeypatch.setattr(time_histories.scans, "scanned_coordinates", lambda problem: (0,))
     monkeypatch.setattr(
-        time_histories.scans, "search_lower_basins", lambda problem, end, data, search, tell: search(end[0].z + 1)
+        time_histories.scans, "search_lower_minima", lambda problem, end, data, search, tell: search(end[0].z + 1)
     )
     weights, which = space.weight[None], np.asarray(empty)[None]
     best, _ = space.bare.observe.search(

@@ -663,7 +663,7 @@ def test_a_campaign_of_its_own_way_is_found():
 
 
 def test_one_preparation_serves_all():
-    """What fits or foresees calls `prepare`, and no other room does to a table what that does."""
+    """What fits or foresees calls `prepare_input`, and no other room does to a table what that does."""
     inner = {"with_inferred_instruments", "with_surface_configurations", "with_initial_states", "check_start"}
     allowed = {"calibration/inference/preparation.py", "sweeps/commands/compare.py"}  # which fits nothing
     found = {
@@ -677,7 +677,7 @@ def test_one_preparation_serves_all():
     for room in ("inference/calibration", "inference/foresight", "discovery/discover"):
         tree = ast.parse((ROOT / f"calibration/{room}.py").read_text(encoding="utf-8"))
         calls = {ast.unparse(n.func).rpartition(".")[2] for n in walked(tree) if isinstance(n, ast.Call)}
-        assert "prepare" in calls, room
+        assert "prepare_input" in calls, room
 
 
 def circle(root):

@@ -10,8 +10,8 @@ Dukic, Bull. Math. Biol. 85 (2023) 110). No window contains a jump of an imposed
 
 Readings are regressors too, and their noise biases the parameters. So derivatives are those of simulated states
 (`with_smooth_states`), as instruments. Largest bias of a parameter over 100 logs of each kind, in posterior sds: a
-motor with voltage, current and speed, a carriage with force and speed, an angle alone, also with coarse instruments. An
-independent NumPy regression with exact states as instruments has 0.21 (standard error 0.1), and 91 to 99 % of its
+motor with voltage, current and speed, a carriage with force and speed, an angle alone, also with coarse instruments.
+An independent NumPy regression with exact states as instruments has 0.21 (standard error 0.1), and 91 to 99 % of its
 intervals hold. An iterated covariance has 0.97 (82 %), on the motor with its log-determinant as much as without. With
 windows of sin⁴, the covariance used before has 0.90 (72 %), and one that changes within the fit 0.29 (56 %).
 """
