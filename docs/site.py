@@ -285,7 +285,7 @@ def modules() -> str:
         folders: dict[str, list[tuple[str, str]]] = {}
         for path in sorted((DOCS.parent / package).rglob("*.py")):
             doc = ast.get_docstring(ast.parse(path.read_text("utf-8"))) or ""
-            first = re.split(r"(?<=[.:;])\s", " ".join(doc.partition("\n\n")[0].split()), maxsplit=1)[0]
+            first = re.split(r"(?<=[.])\s", " ".join(doc.partition("\n\n")[0].split()), maxsplit=1)[0]
             if first:
                 folder = str(path.parent.relative_to(DOCS.parent))
                 folders.setdefault(folder, []).append((f"`{path.name}`", first))
