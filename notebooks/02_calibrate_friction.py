@@ -92,10 +92,10 @@ for what, errors in lines.items():
 
 # %% [markdown]
 # ## What friction cannot explain
-# The remaining errors are not random. At 15 V the motors turn 5-10 % slower than in the model, whatever the
-# friction, so an electrical effect is missing. On slopes the current of the wheeled robot is 10-15 % too high; its
-# printed mass of 13.1 kg contradicts Table 7. And a single slip speed V_s cannot describe both voltages. The loop
-# (`mm.discover`) finds such effects; freeing electrical parameters here would only hide them.
+# The remaining errors are not random. At 15 V most measured motor speeds are 6-11 % lower than simulated, whatever
+# the friction, so an electrical effect is missing. On slopes the simulated current on wheels is 10-19 % too high;
+# its printed mass of 13.1 kg contradicts Table 7. And a single slip speed V_s cannot describe both voltages. The
+# loop (`mm.discover`) finds such effects; freeing electrical parameters here would only hide them.
 
 # %%
 table = found.rows()

@@ -59,8 +59,8 @@ plt.show()
 
 # %% [markdown]
 # ## Does the robot predict unseen runs?
-# Each slope is left out in turn and predicted by a fit to the other slopes. Errors are in percent of the rms
-# reading.
+# Each slope is left out in turn and predicted by a fit to the other slopes. Errors are in percent of the rms of the
+# readings.
 
 # %%
 before, after = found.errors_held_out["slope"]
