@@ -25,6 +25,8 @@ import numpy as np
 
 #: Samples that a free run may begin from.
 FIRST = 20
+#: Wall-clock limit of the loop. A loaded core needs more than its usual ten minutes.
+LONGEST = "40min"
 #: Torque on the screw for a force of 1 N [N·m]: any lead gives the same force on the carriage.
 LEAD = 5.0
 ROBOT = f"""
@@ -135,7 +137,9 @@ def main() -> int:
         robot.write_text(ROBOT, encoding="utf-8")
         train = str(given.data / "train.csv")
         listing, _ = command("inspect", train)
-        told, seconds = command("loop", train, "--robot", str(robot), "--out", str(folder), "--force", "--no-report")
+        told, seconds = command(
+            "loop", train, "--robot", str(robot), "--out", str(folder), "--force", "--no-report", "--within", LONGEST
+        )
         print(told)
         if not (folder / "result.json").exists():
             return 1
