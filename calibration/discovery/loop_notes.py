@@ -222,6 +222,7 @@ class Mechanism:
         gain, se: hold-out gain, over the readings that it changes [nat a reading].
         again: share of the informative blocks of runs without which it is found again [-].
         errors: standard error of the gain by kind of block [nat a reading].
+        ammeter: those families that are errors of an ammeter beside a loss.
     """
 
     families: Names
@@ -231,6 +232,7 @@ class Mechanism:
     se: float
     again: float
     errors: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    ammeter: Names = ()
 
     @property
     def drivers(self) -> Names:
@@ -244,7 +246,7 @@ class Mechanism:
 
     def _possible(self, part: int) -> Names:
         """Equations (0) or drivers (2) of the families. An error of an ammeter counts as the loss."""
-        losses = [f for f in self.families if f == self.families[0] or " current that " not in f]
+        losses = [f for f in self.families if f not in self.ammeter]
         return tuple(dict.fromkeys(f.partition(" that ")[part] for f in losses))
 
     @property
