@@ -75,7 +75,7 @@ def free_run(robot_file: Path, record: Path) -> float:
     """Rms error of the position of a free run, after the samples that it begins from [mm]."""
     from calibration.data import robot_file as files
     from calibration.data import runs as records
-    from calibration.inference.preparation import prepare
+    from calibration.inference.preparation import prepare_input
     from mmrjax.compile.precision import in_double
     from sweeps.points.run import simulate_histories
 
@@ -83,7 +83,7 @@ def free_run(robot_file: Path, record: Path) -> float:
     def error() -> float:
         robot = files.read_robot(robot_file)
         runs = records.read_runs(str(record), robot=robot)
-        shown = simulate_histories(prepare(runs, robot).robot, runs, None)
+        shown = simulate_histories(prepare_input(runs, robot).robot, runs, None)
         off = np.asarray(shown["position_mm"]) - np.asarray(runs["position_mm"])
         return float(np.sqrt(np.mean(off[FIRST:] ** 2)))
 
@@ -114,7 +114,9 @@ def page(folder: Path, listing: str, seconds: float, record: Path) -> str:
     return "\n".join(
         [
             "# EMPS: a public benchmark\n",
-            "`python benchmarks/emps.py --data DIR` made this page. The loop saw `train.csv` alone.\n",
+            "EMPS is a public record of a carriage on a ball screw: force and position, 24 841 rows at 1 kHz, with "
+            "an official division into training and test data (Janot, Gautier and Brunot 2019). "
+            "`python benchmarks/emps.py --data DIR` made this page. No choice depends on `test.csv`.\n",
             f"**{found['headline']['statement']}** {seconds:.0f} s on the wall, other noises included.\n",
             *effects,
             "",
