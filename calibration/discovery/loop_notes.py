@@ -25,7 +25,7 @@ class PlacedCurve(NamedTuple):
 
 
 #: Advantage in evidence of a smooth curve of an effect's own equation that refutes its name [σ²]
-#: (docs/lab/findings.md, "The price of a name").
+#: (docs/lab/findings.md, "Why the constants are what they are").
 BETTER = 5.0
 #: Least share of its root that an effect keeps without any one row of a table, which may have a wrong reading.
 KEPT = 1 / math.sqrt(3)
