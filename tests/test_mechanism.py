@@ -8,11 +8,13 @@ import pytest
 
 from calibration.discovery import mechanism as room
 from calibration.discovery.candidates import Candidate
+from calibration.discovery.classes import errors_of_ammeters
 from calibration.discovery.location import DiscrepancyLocation
 from calibration.discovery.loop_notes import Mechanism
 from calibration.discovery.prediction import Gain, HeldOutScore
 from calibration.discovery.settings import settings_for
 from calibration.inference.observers import SettledRuns
+from mmrjax.model.channels import channels_named
 
 ROWS, BASE = 30, 1000.0
 FAMILIES = {
@@ -36,9 +38,13 @@ def test_a_mechanism_needs_each_of_its_tests():
     }
     assert dataclasses.replace(stands, se=np.inf).fails == ("gain",)  # nothing could be held out
     places = "loss torque", "resistance to travel", "mass", "reading of total current", "reading of motor voltage"
-    everywhere = dataclasses.replace(stands, families=tuple(f"{x} that changes with slope" for x in places))
+    families = tuple(f"{x} that changes with slope" for x in places)
+    space = SimpleNamespace(bare=SimpleNamespace(channels=channels_named(["total_current", "motor_speed"])))
+    ammeter = errors_of_ammeters(space, families)
+    assert ammeter == families[3:4] and errors_of_ammeters(space, families[3:]) == ()
+    everywhere = dataclasses.replace(stands, families=families, ammeter=ammeter)
     assert everywhere.fails == ("many",)  # as of a table in which nothing was missing
-    assert dataclasses.replace(everywhere, families=everywhere.families[:-1]).fails == ()  # an ammeter as a loss
+    assert dataclasses.replace(everywhere, families=families[:-1]).fails == ()  # an ammeter as a loss
 
 
 def fitted(*effects, explains, plausible=True):
@@ -53,16 +59,16 @@ def found(monkeypatch):
     library = {n: SimpleNamespace(family=lambda f=f: f) for n, f in FAMILIES.items()}
     space = SimpleNamespace(
         weight=np.ones((ROWS, 1)), library=library, included=np.ones(ROWS, bool),
-        bare=SimpleNamespace(observe=SimpleNamespace(long=False, blocks=("speed",), noise_misfit=lambda off, counts: counts.sum())),
+        bare=SimpleNamespace(channels=(), observe=SimpleNamespace(long=False, blocks=("speed",), noise_misfit=lambda off, counts: counts.sum())),
     )  # fmt: skip
     score = HeldOutScore({}, {})
     monkeypatch.setattr(room.blocks_room, "predictable_blocks", lambda *_: {})
-    monkeypatch.setattr(room, "scored_once", lambda *_: score)
-    monkeypatch.setattr(room, "_scored", lambda *_: score)
-    monkeypatch.setattr(room, "_reading", lambda *_: None)
+    monkeypatch.setattr(room, "cached_hold_out_score", lambda *_: score)
+    monkeypatch.setattr(room, "_hold_out_score", lambda *_: score)
+    monkeypatch.setattr(room, "_simulated_reading", lambda *_: None)
     monkeypatch.setattr(room, "_changed_readings", lambda *_: None)
-    monkeypatch.setattr(room, "_curve_again", lambda *_: 0.9)
-    monkeypatch.setattr(room, "chosen_again", lambda *_: 1.0)
+    monkeypatch.setattr(room, "_curve_recurrence", lambda *_: 0.9)
+    monkeypatch.setattr(room, "recurrence_of_families", lambda *_: 1.0)
 
     def of(*ladder, curve, where=SPEED, long=False):
         space.bare.observe.long = long
@@ -195,7 +201,7 @@ def test_equations_that_act_alike_are_listed(found):
 
 def test_a_curve_is_asked_within_the_range_that_its_fit_has_seen():
     speed = np.array([1.0, 2.0, 3.0, 4.0, 2.5, 5.0])
-    linear = SimpleNamespace(in_travel=lambda place, variable: (speed, 1.0))
+    linear = SimpleNamespace(curve_variable=lambda place, variable: (speed, 1.0))
     beside = SimpleNamespace(where=SPEED, left=SimpleNamespace(linear=linear))
     space = SimpleNamespace(included=np.ones(6, bool))
     masks = [np.isin(np.arange(6), rows) for rows in ((0, 4), (1, 2), (3, 5))]

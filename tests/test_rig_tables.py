@@ -389,7 +389,7 @@ def test_what_is_not_the_ground_follows_the_first_surface(tmp_path):
     robot = vehicle()
     runs = read(tmp_path, ON, robot)
     apart = surfaces.with_surface_configurations(robot, runs)
-    names = priors.free_names(apart, runs.configurations_named(apart))
+    names = priors.loop_parameter_names(apart, runs.configurations_named(apart))
     assert "rig-felt.radius" in names and "rig-tiles.radius" not in names
     assert {"rig-felt.ground.rolling_resistance", "rig-tiles.ground.rolling_resistance"} <= set(names)
     coordinates = priors.parameter_coordinates(apart, names)
@@ -584,6 +584,12 @@ def test_three_motors_forward_and_reverse_are_calibrated(tmp_path):
 )
 def test_step_of_readings_is_their_common_divisor(readings, step):
     assert instruments.step_of(np.array(readings)) == pytest.approx(step, rel=1e-9)
+
+
+def test_step_of_an_encoder_is_found_in_a_log_that_is_printed_to_nine_digits():
+    """648.632813 for 648.6328125: the step was not found, and its rounding was not in the noise."""
+    angle = np.round(360 / 1024 * np.cumsum(np.random.default_rng(0).integers(1, 9, 400)), 6)
+    assert angle.max() > 500 and instruments.step_of(angle) == pytest.approx(360 / 1024, rel=1e-4)
 
 
 def test_an_instrument_left_free_is_what_its_table_shows(tmp_path):

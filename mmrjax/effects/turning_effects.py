@@ -127,8 +127,8 @@ class LateralGrip(Effect):
     Grousers dig in, or loose ground piles up at the tracks, more at higher lateral speed. The lateral force
     itself, which matters only for the path in a settled turn, does not change.
 
-    Source: a friction ratio that is linear in the yaw rate. Wong, Theory of Ground Vehicles, chapter 6: the coefficient
-    of lateral resistance is not constant. It differs from `turning_resistance` where contacts creep.
+    Source: a friction ratio that is linear in the yaw rate. Wong, Theory of Ground Vehicles, chapter 6: the
+    coefficient of lateral resistance is not constant. It differs from `turning_resistance` where contacts creep.
     """
 
     balance = "yaw"
