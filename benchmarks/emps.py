@@ -58,8 +58,16 @@ PUBLISHED = (
     ("linear state space, pNARX", "5.53, 5.17", "the same"),
     ("structure chosen by a language-model agent, 15 runs of half an hour", "4.10", "Piga and Forgione 2026"),
     ("dynoNet", "2.64", "Forgione and Piga 2021"),
-    ("mass, Coulomb and viscous friction, offset, by least squares on the simulated position", "4.9 to 5.0", "own"),
-    ("viscous friction by direction, by SciPy on the simulated position, and with an offset", "6.6, 4.4", "own"),
+    (
+        "mass, Coulomb and viscous friction, offset, by least squares on the simulated position",
+        "4.9 to 5.0",
+        "independent fit",
+    ),
+    (
+        "viscous friction by direction, by least squares on the simulated position; with an offset in addition",
+        "6.6, 4.4",
+        "independent fit",
+    ),
 )
 COMMAND = "import sys; from sweeps.cli import main; sys.exit(main())"
 
@@ -105,10 +113,10 @@ def page(folder: Path, listing: str, seconds: float, record: Path) -> str:
     files = sorted(p for p in folder.glob("*.toml") if not p.name.startswith("config"))
     scores = [(p.name, free_run(p, record)) for p in files]
     effects = [
-        f"* {e['name']}{', ' + e['standing'] if 'standing' in e else ''}: {', '.join(e['families'])}"
+        f"* `{e['name']}`{', ' + e['standing'] if 'standing' in e else ''}: {', or '.join(e['families'])}"
         for e in found["effects"]
     ]
-    rows = [f"| {name} of this run | {error:.2f} | `benchmarks/emps.py` |" for name, error in scores]
+    rows = [f"| `{name}` below | {error:.2f} | this run |" for name, error in scores]
     rows += [f"| {name} | {error} | {source} |" for name, error, source in PUBLISHED]
     fitted = [f"## `{p.name}`\n\n```toml\n" + "\n".join(parameters(p)) + "\n```\n" for p in files]
     return "\n".join(
@@ -117,15 +125,15 @@ def page(folder: Path, listing: str, seconds: float, record: Path) -> str:
             "EMPS is a public record of a carriage on a ball screw: force and position, 24 841 rows at 1 kHz, with "
             "an official division into training and test data (Janot, Gautier and Brunot 2019). "
             "`python benchmarks/emps.py --data DIR` made this page. No choice depends on `test.csv`.\n",
-            f"**{found['headline']['statement']}** {seconds:.0f} s on the wall, other noises included.\n",
+            f"**{found['headline']['statement']}** The command took {seconds:.0f} s. The model contains:\n",
             *effects,
             "",
-            "| model | free-run rms on `test.csv` [mm] | source |",
+            "| model | rms error of a free simulation of `test.csv` [mm] | source |",
             "|---|---|---|",
             *rows,
             "",
             *fitted,
-            "A better fit to `train.csv` does not predict `test.csv` better.\n",
+            "A better fit to `train.csv` does not lead to a better prediction of `test.csv`.\n",
             "## `mmrjax inspect train.csv`\n\n```\n" + listing.strip() + "\n```\n",
         ]
     )
