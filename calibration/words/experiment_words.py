@@ -70,8 +70,8 @@ DOING = {
     "other way": "run in the other direction",
     "about": "reverse the slope, set with the same inclinometer, and travel forwards",
     "laden": "travel with {payload:g} kg",
-    "lifted": "put it on stands, the movers in the air, and run",
-    "one lifted": "put it on stands, {others}, and run",
+    "lifted": "put the robot on stands, the movers in the air, and run",
+    "one lifted": "put the robot on stands, {others}, and run",
     "alone": "Uncouple the {gears} and run the motors alone",
     "braked": "Uncouple the {gears} and put a brake of {brake:g} mN·m on each motor shaft, and run",
     "held": "Hold {shafts} in a vice and switch on for a moment,",
@@ -148,8 +148,8 @@ def more_runs(what: SimpleNamespace) -> str:
         three = [f"{menu.round_significant(v):g}" for v in (what.low, 0.5 * (what.low + what.high), what.high)]
         return (
             "Mark the driving shaft, start every run with it at the mark, and record steady travel at "
-            f"{', '.join(three[:2])} and {three[2]} V with at least 20 samples per wave. A disturbance with the "
-            f"same {what.variable} at every speed comes from the part that turns at that rate"
+            f"{', '.join(three[:2])} and {three[2]} V with at least 20 samples per wave. A disturbance that "
+            f"keeps {what.variable} at every speed comes from the part that turns at that rate"
         )
     happens = bases.window_from_name(what.variable)
     if happens is not None:
@@ -167,8 +167,8 @@ def _repeat_instruction(happens: bases.Window) -> str:
     if happens.axis == "order":
         return (
             f"Make runs {happens.low:.0f} to {happens.high:.0f} again, with as many runs before and after them, "
-            "in another order. An error that returns depends on the conditions of these runs; one that does not "
-            "was an event at that time"
+            "in another order. An error that returns depends on the conditions of these runs. An error that does "
+            "not return was an event at that time"
         )
     if happens.axis != "time":
         return (
@@ -193,7 +193,7 @@ def _up_to(most: float, runs: int, unit: str = "", first: str = "") -> str:
     """` from crawl to 12 V in steps of 1 V`: levels that a person can set."""
     step = menu.step_of_settings(most, runs)
     last, by = (f"{x:g} {unit}".rstrip() for x in (menu.last_setting(most, step), step))
-    return f" from {first} to {last} in steps of {by}" if first else f" up to {last} in steps of {by}"
+    return f" from a {first} to {last} in steps of {by}" if first else f" up to {last} in steps of {by}"
 
 
 def _advice_by_variable(what: SimpleNamespace) -> dict[str, str]:
@@ -206,7 +206,7 @@ def _advice_by_variable(what: SimpleNamespace) -> dict[str, str]:
     by_duty = what.by_duty
     driven = f"the supply voltage from {low:g} to {high:g} V in steps of {volts:g} V"
     crawl = (
-        _steps(what, "crawl") if by_duty else f"the supply voltage in steps of {volts:g} V from crawl to {high:g} V"
+        _steps(what, "crawl") if by_duty else f"the supply voltage in steps of {volts:g} V from a crawl to {high:g} V"
     )
     return {
         "voltage": f"Repeat at one slope and payload with {_steps(what) if by_duty else driven}",
@@ -273,10 +273,10 @@ SAID: dict[str, str | Callable[..., str]] = {
         f"No experiment that the loop can propose separates {' and '.join(names)} by {sigma:g} sigma"
     ),
     "too_weak": "A series of runs over {variable} would show the missing term with {sigma:.1f} sigma only",
-    "carry_out": lambda experiments: ". Second experiment: ".join(map(experiment_sentences, experiments)),
+    "carry_out": lambda experiments: ". Then: ".join(map(experiment_sentences, experiments)),
     "more_runs": lambda **series: (
-        f"{more_runs(SimpleNamespace(**series))}; read every channel. The series shows the shape of the term that "
-        f"is missing in the {bases.place_in_words(series['place'])}"
+        f"{more_runs(SimpleNamespace(**series))}. Read every channel: the series shows the shape of the term that is "
+        f"missing in the {bases.place_in_words(series['place'])}"
     ),
     "overspeed": lambda speed, limit, voltage: (
         f"the motor speed: expect about {speed / RPM:.0f} rpm unloaded at {voltage:g} V and do not exceed "

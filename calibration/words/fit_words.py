@@ -40,12 +40,12 @@ def noise_off(channel: str, factor: float, source: str) -> str:
     """Ratio of residuals to their sds."""
     if not channel:
         return (
-            f"in every channel and under all conditions, residuals are {factor:.2g} times the {source} sds: check "
-            "the sds"
+            f"in every channel and under all conditions, residuals are {factor:.2g} times the {source} noise: "
+            "check the noise"
         )
     return (
-        f"residuals of {channels.find_channel(channel).label} are {factor:.2g} times the {source} sds under all "
-        "conditions: check these sds"
+        f"residuals of {channels.find_channel(channel).label} are {factor:.2g} times the {source} noise under all "
+        "conditions: check the noise"
     )
 
 
@@ -87,7 +87,7 @@ def of_rows(rows: tuple[int, ...], what: str, share: float = 0.0) -> str:
             "which does not explain all of their slip"
         )
     if what == "jumps":
-        return f"{listed}: the calibrated robot's running gear jumps; it leaves the ground at times"
+        return f"{listed}: the calibrated robot's running gear jumps off the ground at times"
     return f"{listed}: {what} with the calibrated robot"
 
 
@@ -317,7 +317,7 @@ SAID: dict[str, str | Callable[..., str]] = {
         f"held out by {' or by '.join(blocks.kind_in_words(k) for k in others)}: the same predictions as held out "
         f"by {blocks.kind_in_words(kind)}, so shown once; these runs do not vary them separately"
     ),
-    "block_not_converged": "a search without a block of {kind} did not converge",
+    "block_not_converged": "a search with one block of {kind} left out did not converge",
     "agreement": search_agreement,
     "unsettled": unsettled_search,
     "elsewhere": "{searches} of {total} searches converged at other values of {names}",

@@ -61,7 +61,7 @@ def differing_repeats(
             f"{'are' if many else 'is'} not used as a condition: {name}, or, for a load, give each level its own "
             "configuration"
         )
-    wrong = f"{reading}; remove a wrong one"
+    wrong = f"{reading}; remove the wrong row"
     return f"{wrong}, or find what changed between such rows without a column in the table" if more else wrong
 
 
@@ -99,7 +99,7 @@ def copied_channel(source: str, column: str, other: str, intercept: float, slope
         return (
             f"{sentence}; if it is computed rather than measured, remove it, since the noise of {other} counts twice"
         )
-    return f"{sentence}, so it is computed, not measured; remove it from channels and table, or use an instrument"
+    return f"{sentence}, so it is computed, not measured; remove it from channels and table, or measure it"
 
 
 def ends_early(runs: Names, lasts: float, share: float) -> str:

@@ -29,7 +29,7 @@ STATUSES: dict[str, Status] = {
         "traction demand above the adhesion limit",
         "slope and rolling resistance demand more traction than adhesion gives (demand above μ_s N), so the "
         "movers "
-        "spin, the robot does not climb, and there is no operating point",
+        "spin and the robot does not climb",
     ),
     "not_settled": Status(
         "not settled",
