@@ -38,8 +38,8 @@ ALONE = 4
 #: Least share of an effect's gain that the slopes without it must predict for them to be used for other effects.
 PROMISED = 0.8
 #: Balances with curves of another balance, those of one equation. A positive error of a speed meter has the same
-#: effect as negative slip.
-EQUATION = {"mass": "ground", "speed": "slip"} | {
+#: effect as negative slip. A duty that the bridge does not give is a voltage drop.
+EQUATION = {"mass": "ground", "speed": "slip", "duty": "electrical"} | {
     other: b for b, others in bases_room.STANDS_FOR.items() for other in others
 }
 #: Variables of surfaces, in pairs.
