@@ -72,7 +72,7 @@ def free_run(robot_file: Path, record: Path) -> float:
     """Rms error of the position of a free run, after the samples that it begins from [mm]."""
     from calibration.data import robot_file as files
     from calibration.data import runs as records
-    from calibration.inference.preparation import prepare
+    from calibration.inference.preparation import prepare_input
     from mmrjax.compile.precision import in_double
     from sweeps.points.run import simulate_histories
 
@@ -80,7 +80,7 @@ def free_run(robot_file: Path, record: Path) -> float:
     def error() -> float:
         robot = files.read_robot(robot_file)
         runs = records.read_runs(str(record), robot=robot)
-        shown = simulate_histories(prepare(runs, robot).robot, runs, None)
+        shown = simulate_histories(prepare_input(runs, robot).robot, runs, None)
         off = np.asarray(shown["position_mm"]) - np.asarray(runs["position_mm"])
         return float(np.sqrt(np.mean(off[FIRST:] ** 2)))
 

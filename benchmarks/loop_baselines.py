@@ -206,9 +206,11 @@ def sindy_refit(space, linear, scores, sees=None) -> list[str]:
 def base_of(given):
     """The base fit of the result of `discover.prepare_loop`, with which the loop begins: `candidates.BaseFit`."""
     from calibration.discovery.candidates import fit_base
-    from calibration.discovery.discover import pose_candidates
+    from calibration.discovery.discover import build_candidate_space
 
-    space = pose_candidates(given.runs, given.robot, given.noise.sd, given.settings, given.stated, given.library)
+    space = build_candidate_space(
+        given.runs, given.robot, given.noise.sd, given.settings, given.stated, given.library
+    )
     return fit_base(space, given.settings, given.runs.source)
 
 

@@ -161,18 +161,18 @@ def elsewhere(given: Any, found: Any, runs: Any) -> dict[str, Any]:
     """
     from calibration.discovery import findings as results
     from calibration.discovery import prediction
-    from calibration.discovery.discover import pose_candidates
+    from calibration.discovery.discover import build_candidate_space
 
     space, base, best = found.screened.base.space, found.screened.base.candidate, found.best
     if best is base:
         return {}
     measured, sd, rows = runs.measured(), runs.deviations(), len(runs)
-    there = pose_candidates(runs, given.robot, sd, given.settings, given.stated, given.library)
+    there = build_candidate_space(runs, given.robot, sd, given.settings, given.stated, given.library)
     if there.library.names != space.library.names or there.coordinates.base.names != space.coordinates.base.names:
         return {}
     off, score = [], []
     for candidate in (base, best):
-        fitted = results.Fitted(there.equipped, candidate.z, there.library.indices(candidate.active))
+        fitted = results.FittedProblem(there.equipped, candidate.z, there.library.indices(candidate.active))
         seen = fitted.observation()
         lost = there.equipped.observe.unreachable(np.asarray(seen.status))[:rows, None]
         off.append(np.where(lost, np.nan, (np.asarray(seen.reading)[:rows] - measured) / sd))

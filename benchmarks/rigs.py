@@ -129,7 +129,7 @@ def identified(found, case: gr.Case) -> dict[str, dict]:
     from calibration.discovery import findings
 
     space, best = found.screened.base.space, found.screened.base.candidate
-    shifts = findings.base_shift(space, best.z, best.z, best.sd)
+    shifts = findings.parameter_shifts(space, best.z, best.z, best.sd)
     own = case.label["sd_over_prior"]
     return {
         name: {"ratio": float(best.sd[k]), "held": shift.held_by_prior, "own": own.get(name)}

@@ -115,7 +115,7 @@ def posed(robot: str, table: Any, seed: int, replicates: int, case: Any = None) 
     from calibration.data import runs as records
     from calibration.discovery.discover import prepare_loop
     from calibration.inference import blocks
-    from calibration.inference.held_out import search_each
+    from calibration.inference.held_out import fit_from_each_start
 
     rig = robot_file.load_robot(robot)
     runs = records.read_runs(table, robot=rig)
@@ -130,7 +130,7 @@ def posed(robot: str, table: Any, seed: int, replicates: int, case: Any = None) 
     if masks:
         out = [np.concatenate([m, np.zeros(len(weight) - rows, bool)]) for _, m in masks]
         start = [np.asarray(fitted.candidate.z)[: space.free]] * len(masks)
-        best, seen = search_each(problem, start, [weight * ~m[:, None] for m in out])
+        best, seen = fit_from_each_start(problem, start, [weight * ~m[:, None] for m in out])
         for k, (kind, mask) in enumerate(masks):
             lost = problem.observe.unreachable(np.asarray(seen.status[k]))[:rows, None]
             reading = np.where(lost, np.nan, np.asarray(seen.reading[k])[:rows])
@@ -262,7 +262,7 @@ def _of_base(p: Posed) -> np.ndarray:
     from calibration.discovery import findings
 
     problem, z, active = p.space.fit_of(p.fitted.candidate.active, p.fitted.candidate.z)
-    return np.asarray(findings.Fitted(problem, z, active).observation().reading)[: len(p.measured)]
+    return np.asarray(findings.FittedProblem(problem, z, active).observation().reading)[: len(p.measured)]
 
 
 # --- regressions on what the refit leaves -----------------------------------------------------------------------

@@ -45,9 +45,9 @@ from scipy.optimize import least_squares  # noqa: E402
 from calibration.data import own_mass  # noqa: E402
 from calibration.data.runs import Runs, read_runs  # noqa: E402
 from calibration.inference import priors  # noqa: E402
-from calibration.inference.held_out import search_each  # noqa: E402
+from calibration.inference.held_out import fit_from_each_start  # noqa: E402
 from calibration.inference.observers.settled import SettledRuns  # noqa: E402
-from calibration.inference.population import Members, Rows  # noqa: E402
+from calibration.inference.population import MemberObservations, MemberRunner  # noqa: E402
 from calibration.inference.problem import MARGIN, STIFFNESS, Observation, Problem, data_from_readings  # noqa: E402
 from mmrjax.effects.electrical_effects import BrushDrop, SeriesResistance  # noqa: E402
 from mmrjax.effects.mass_effects import MassOffset  # noqa: E402
@@ -216,7 +216,7 @@ class Posed:
         with np.errstate(all="ignore"):
             return 100 * (1 - speed * ratio / (motor * radius))
 
-    def cost(self, z: np.ndarray, found: Rows, search: Search) -> np.ndarray:
+    def cost(self, z: np.ndarray, found: MemberObservations, search: Search) -> np.ndarray:
         """Half the sum of squares of members, over the rows that a search sees."""
         current, motor, speed = (channels.USUAL.index(n) for n in ("total_current", "motor_speed", "speed"))
         error = self.percent(found.reading)
@@ -297,7 +297,7 @@ def lumped(posed: Posed, robot: Robot, table: Runs, seen: list[np.ndarray]) -> t
     coordinates = priors.parameter_coordinates(robot, names, stated, any_surface=True)
     problem = Problem(params.without_weak_types(robot), coordinates, SettledRuns.of(table, robot, "steady"), data)
     weights = [np.asarray(data.weight) * s[:, None] for s in seen]
-    found, _ = search_each(problem, [np.zeros(len(names))] * len(seen), weights)
+    found, _ = fit_from_each_start(problem, [np.zeros(len(names))] * len(seen), weights)
     slope = jax.jit(jax.jacfwd(lambda z, data: problem.misfit(z, data)))
     spread = []
     for z, weight in zip(found.z, weights, strict=True):
@@ -362,7 +362,7 @@ def begun(posed: Posed, arguments: argparse.Namespace, robot: Robot, table: Runs
     return searches
 
 
-def generations(posed: Posed, searches: list[Search], members: Members, arguments: argparse.Namespace) -> int:
+def generations(posed: Posed, searches: list[Search], members: MemberRunner, arguments: argparse.Namespace) -> int:
     """Runs generations of all searches together, returns their number."""
     start = time.perf_counter()
     for number in range(arguments.generations):
@@ -372,7 +372,7 @@ def generations(posed: Posed, searches: list[Search], members: Members, argument
         found = members.run(np.concatenate(drawn))
         for k, (search, z) in enumerate(zip(searches, drawn, strict=True)):
             here = slice(k * arguments.population, (k + 1) * arguments.population)
-            cost = posed.cost(z, Rows(*(x[here] for x in found)), search)
+            cost = posed.cost(z, MemberObservations(*(x[here] for x in found)), search)
             search.z.append(z)
             search.cost.append(cost)
             search.cma.tell([(a, float(min(c, 1e6))) for a, c in zip(z, cost, strict=True)])
@@ -389,11 +389,11 @@ def _again(problem: Problem, points: Array) -> Observation:
     return jax.vmap(problem.observation)(points)
 
 
-def finer(posed: Posed, points: np.ndarray, parts: int) -> Rows:
+def finer(posed: Posed, points: np.ndarray, parts: int) -> MemberObservations:
     """Readings of members at a fraction of the step."""
     observe = dataclasses.replace(posed.problem.observe, parts=parts)
     seen = jax.device_get(_again(dataclasses.replace(posed.problem, observe=observe), jnp.asarray(points)))
-    return Rows(*(np.asarray(getattr(seen, name)) for name in Rows._fields))
+    return MemberObservations(*(np.asarray(getattr(seen, name)) for name in MemberObservations._fields))
 
 
 def lumped_slip(arguments: argparse.Namespace) -> None:
@@ -458,7 +458,7 @@ def timed(arguments: argparse.Namespace) -> dict[str, Any]:
     def advance(done: int) -> None:
         print(f"{done} members, {time.perf_counter() - start:.0f} s", file=sys.stderr, flush=True)
 
-    found = Members(problem, arguments.members).run(points, advance)
+    found = MemberRunner(problem, arguments.members).run(points, advance)
     took = time.perf_counter() - start
     statuses = dict(zip(*map(np.ndarray.tolist, np.unique(found.status, return_counts=True)), strict=True))
     run = {"gears": len(points), "rows": len(table), "run_s": DURATION, "step": STEP}
@@ -470,7 +470,7 @@ def rms(error: np.ndarray) -> list[float]:
     return np.sqrt(np.mean(error**2, 0)).round(3).tolist()
 
 
-def determined(posed: Posed, z: np.ndarray, found: list[Rows], seen: np.ndarray) -> list[float]:
+def determined(posed: Posed, z: np.ndarray, found: list[MemberObservations], seen: np.ndarray) -> list[float]:
     """Singular values of the slip of tracked rows [its sd] by the constants [prior sd], from a regression."""
     slip = np.mean([posed.mean(posed.slip(s.reading)[..., None])[..., 0] for s in found], 0)[:, seen & posed.tracked]
     usable = np.isfinite(slip).all(1)
@@ -507,7 +507,7 @@ def main() -> None:
         searches = begun(posed, arguments, robot, table)
         if arguments.only:
             searches = [s for s in searches if re.search(arguments.only, s.name)]
-    members = Members(posed.problem, together=arguments.population * len(searches))
+    members = MemberRunner(posed.problem, together=arguments.population * len(searches))
     start = time.perf_counter()
     count = generations(posed, searches, members, arguments)
     took = time.perf_counter() - start
@@ -523,7 +523,7 @@ def main() -> None:
     held: dict[str, list[np.ndarray]] = {}
     for k, search in enumerate(searches):
         here = slice(k * finalists, (k + 1) * finalists)
-        own = [Rows(*(x[here] for x in s)) for s in steps]
+        own = [MemberObservations(*(x[here] for x in s)) for s in steps]
         cost = np.mean([posed.cost(points[here], s, search) for s in own], 0)
         at = int(np.argmin(cost))
         seen = search.seen > 0

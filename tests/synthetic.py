@@ -63,7 +63,7 @@ class Analyst:
 
     def space(self, runs):
         """What can be fitted to a table."""
-        return discover.pose_candidates(
+        return discover.build_candidate_space(
             runs, paper_robots.nominal(), known(runs).sd, self.settings, self.stated, self.library
         )
 

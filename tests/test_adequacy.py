@@ -7,7 +7,7 @@ import pytest
 
 from calibration.discovery import discover
 from calibration.discovery.adequacy import AdequacyTest, Diagnosis
-from calibration.discovery.score_tests import Statistics
+from calibration.discovery.score_tests import StrongestStatistics
 
 SETTINGS = SimpleNamespace(
     shares={"single": 0.05, "curve": 0.1}, margins={"single": 1.0, "curve": 2.0}, family_wise_error=0.15
@@ -47,9 +47,11 @@ def test_rejected_with_margin_is_above_the_threshold_by_the_margin():
 def test_score_of_a_log_that_its_simulation_refutes_is_no_finding(gain, simulated, long, chi2, stands):
     """A start of a vehicle that slips is not linear: 4.4 sigma of a score were 2.3 in the simulation."""
     zeros = np.zeros(99)
-    null = Statistics(np.linspace(1, 4, 99), np.linspace(1, 20, 99), zeros, np.linspace(1, 9, 99), zeros, zeros)
+    null = StrongestStatistics(
+        np.linspace(1, 4, 99), np.linspace(1, 20, 99), zeros, np.linspace(1, 9, 99), zeros, zeros
+    )
     settings = SimpleNamespace(shares={"single": 0.03, "pair": 0.03, "chi2": 0.03}, family_wise_error=0.05)
-    found = Statistics(np.asarray(4.4), np.asarray(30.0), *(np.asarray(float(x)) for x in (0, chi2, 0, 1)))
+    found = StrongestStatistics(np.asarray(4.4), np.asarray(30.0), *(np.asarray(float(x)) for x in (0, chi2, 0, 1)))
     library = SimpleNamespace(names=("a", "b"), best_instance=lambda name, scores: "ab".index(name))
     space = SimpleNamespace(library=library, bare=SimpleNamespace(observe=SimpleNamespace(long=long)))
     base = SimpleNamespace(space=space, candidate=SimpleNamespace(cost=100.0))

@@ -11,7 +11,7 @@ from worlds import settled, tables
 
 from calibration.data.runs import Runs
 from calibration.inference.conduct import conduct_notes
-from calibration.inference.fit_notes import Remark, with_codes
+from calibration.inference.fit_notes import Remark, remarks_with_codes
 from mmrjax.model import paper_robots, params
 
 CLIMBING = params.replace(paper_robots.nominal(), settled.CLIMBING)
@@ -126,4 +126,4 @@ def test_loop_says_that_sds_are_ten_times_too_small():
     found = SETTLED.discover(tenth(tables.narrow(seed=3)))
     off = found.remarks[0]
     assert off == Remark("noise_off", channel="", factor=off.factor, source="stated") and 9.0 < off.factor < 11.0
-    assert not with_codes(SETTLED.discover(table(tables.narrow(seed=3))).remarks, "noise_off")
+    assert not remarks_with_codes(SETTLED.discover(table(tables.narrow(seed=3))).remarks, "noise_off")

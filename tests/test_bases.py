@@ -76,7 +76,7 @@ def test_order_of_a_sorted_table_is_no_driver(driven):
         "configuration": np.full(30, "bench"), "supply_voltage_V": np.full(30, 24.0), "order": np.arange(30.0),
         "total_current_A": RNG.uniform(1, 5, 30), driven: level / level[-1],
     }  # fmt: skip
-    scope = bases.Scope(("electrical", "track"), ("supply_voltage_V",))
+    scope = bases.CurveScope(("electrical", "track"), ("supply_voltage_V",))
     assert "order" not in variables(curve_families(columns, np.ones(30), scope=scope))
     assert not [v for v in variables(window_families(columns, np.ones(30), scope=scope)) if v.startswith("order")]
     for seed in range(5):
@@ -86,7 +86,7 @@ def test_order_of_a_sorted_table_is_no_driver(driven):
 def test_time_of_a_single_ramp_is_no_driver():
     time = np.arange(40.0)
     columns = {"configuration": np.full(40, "bench"), "time_s": time, "total_current_A": RNG.uniform(1, 5, 40)}
-    scope = bases.Scope(("electrical",), ("supply_voltage_V",))
+    scope = bases.CurveScope(("electrical",), ("supply_voltage_V",))
     for voltage, expected in ((time / 4, False), (np.full(40, 9.0), True), (np.abs(time - 19.5), True)):
         logged = columns | {"supply_voltage_V": voltage}, np.ones(40)
         assert ("time" in variables(curve_families(*logged, scope=scope))) == expected
@@ -208,7 +208,7 @@ def test_a_table_without_order_or_levels_has_no_windows():
 def test_an_order_that_the_only_condition_tells_has_no_curves():
     order = np.arange(1.0, ROWS + 1)
     columns = {"configuration": np.full(ROWS, "bench"), "motor_current_A": order, "order": order}
-    alone = bases.Scope(("electrical", "track"), ("motor_current_A",))
+    alone = bases.CurveScope(("electrical", "track"), ("motor_current_A",))
     assert {v for _, v in family_names(curve_families(columns, COUNTS, scope=alone))} == {bases.CONDITIONS}
 
 

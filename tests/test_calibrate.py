@@ -26,7 +26,7 @@ from calibration.inference.calibration import calibrate
 from calibration.inference.fit_notes import Remark
 from calibration.inference.observers import SettledRuns
 from calibration.inference.remarks import calibration_remarks
-from calibration.inference.result import CalibrationResult, ChannelErrors, HeldOut
+from calibration.inference.result import CalibrationResult, ChannelErrors, HeldOutErrors
 from calibration.inference.simulation_errors import relative_error, root_mean_square
 from mmrjax.fidelities.results import Results
 from mmrjax.fidelities.steady import steady_batch
@@ -135,7 +135,7 @@ def test_blocks_that_tell_nothing_of_their_own_are_said_and_not_shown(found, cap
     """Three identical rows of the table were once printed without a word."""
     reading = {name: r.after for name, r in found.readings.items()}
     other = {name: r.after + 0.02 * r.sd for name, r in found.readings.items()}
-    held = [HeldOut(found.errors_after, (), {}, x) for x in (reading, other, reading, reading)]
+    held = [HeldOutErrors(found.errors_after, (), {}, x) for x in (reading, other, reading, reading)]
     kinds = ("voltage_configuration", "slope", "voltage", "payload")
     found = dataclasses.replace(found, held_out=dict(zip(kinds, held, strict=True)))
     assert found.held_out_alike == {"voltage_configuration": ("voltage", "payload"), "slope": ()}

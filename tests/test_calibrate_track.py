@@ -13,7 +13,7 @@ from calibration.inference import noise as noise_room
 from calibration.inference import observers, priors
 from calibration.inference import optimizers as fit
 from calibration.inference.calibration import calibrate
-from calibration.inference.fit_notes import with_codes
+from calibration.inference.fit_notes import remarks_with_codes
 from calibration.inference.priors import GUIDED
 from calibration.words import table_words
 from mmrjax import fidelities
@@ -111,8 +111,8 @@ def test_track_calibration_recovers_the_guide_friction(found, made, told):
     assert answer.prior.source == "product"
     assert not found.profiled and not found.held_out  # minutes each, so only when asked for
     assert any("round 1" in t for t in told) and any("start 2 of 2" in t for t in told)
-    (product,) = with_codes(found.remarks, "prior_of_product")
-    (beside,) = with_codes(found.remarks, "beside_steady")
+    (product,) = remarks_with_codes(found.remarks, "prior_of_product")
+    (beside,) = remarks_with_codes(found.remarks, "beside_steady")
     assert f"{product.share:.0%}" == "98%" and (beside.inside, beside.total) == (2, 2)
 
 

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import pytest
 
 from calibration.described import describe
-from calibration.inference.fit_notes import next_step
+from calibration.inference.fit_notes import progress_remark
 from calibration.words import step_words as steps
 from calibration.words.step_words import still_running_sentence
 from sweeps import console
@@ -52,7 +52,7 @@ def test_a_terminal_writes_one_line_again_and_a_file_gets_none(monkeypatch, caps
 
 
 def test_a_stage_of_the_loop_has_a_number_and_what_is_left():
-    text = describe(next_step("bootstrap", 500))
+    text = describe(progress_remark("bootstrap", 500))
     assert text.startswith(f"2 of {steps.OF}, bootstrap of 500")
     assert steps.expected_time(text, 45.0) == pytest.approx(55.0)  # 45 % are over when it begins
     assert steps.expected_time("writing the report", 45.0) is steps.expected_time("1 of 7, fitting", 9.0) is None

@@ -7,7 +7,7 @@ import pytest
 
 from calibration.data.runs import Runs
 from calibration.discovery.description import missed_channels, remaining_errors, unused_inputs
-from calibration.discovery.loop_notes import Missed, Missing, Summary
+from calibration.discovery.loop_notes import MissedChannel, MissingEffect, VerdictSummary
 from calibration.inference.blocks import predictable_blocks
 from calibration.inference.observers import Histories
 from calibration.words import loop_words
@@ -73,8 +73,8 @@ def test_effects_describe_what_the_refit_misses_if_unseen_errors_are_halved(refi
         reading[3] = np.nan  # a row that the fit does not reach
         return SimpleNamespace(reading={"voltage": reading, "slope": reading})
 
-    left = remaining_errors(space, runs, (Missed("total_current", 0.27, noise),), unseen(refit), unseen(found))
-    assert left == (() if remains is None else (Missed("total_current", pytest.approx(remains), noise),))
+    left = remaining_errors(space, runs, (MissedChannel("total_current", 0.27, noise),), unseen(refit), unseen(found))
+    assert left == (() if remains is None else (MissedChannel("total_current", pytest.approx(remains), noise),))
 
 
 @pytest.mark.parametrize("configurations", [("a",), ("a", "b"), ("a", "a")])
@@ -98,9 +98,9 @@ def test_a_run_without_others_is_held_out_in_parts_of_its_time(configurations, m
 
 
 def test_the_first_sentence_has_the_error_that_remains():
-    law = Missing(("windage",), (), ("loss torque that changes with speed",))
+    law = MissingEffect(("windage",), (), ("loss torque that changes with speed",))
     said = loop_words.verdict_sentences(
-        Summary("named", 0.002, None, (law,), missed=(Missed("total_current", 0.104, 0.0),))
+        VerdictSummary("named", 0.002, None, (law,), missed=(MissedChannel("total_current", 0.104, 0.0),))
     )
     assert "on unseen runs this model still misses total current by 10 % of its measured rms" in said.split(". ")[0]
 
@@ -108,9 +108,9 @@ def test_the_first_sentence_has_the_error_that_remains():
 def test_what_to_check_first_is_said_with_the_columns_that_are_not_used():
     extras = {"brake_Nm": np.linspace(0, 1, 4), "constant": np.ones(4), "who": np.array(list("abab"))}
     assert unused_inputs(Runs("runs.csv", {"order": np.arange(4.0)}, extras=extras)) == ("brake_Nm",)
-    missed = (Missed("total_current", 0.484, 0.02),)
+    missed = (MissedChannel("total_current", 0.484, 0.02),)
     said = loop_words.verdict_sentences(
-        Summary("undescribed", 0.004, None, missed=missed, unused=("brake_Nm",), far=("motor.r",))
+        VerdictSummary("undescribed", 0.004, None, missed=missed, unused=("brake_Nm",), far=("motor.r",))
     )
     assert said == (
         "This model does not describe these runs: refitted, it misses total current by 48 % of its measured rms. No "

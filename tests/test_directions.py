@@ -96,11 +96,11 @@ def test_what_a_duty_drives_is_known_and_its_effect_looked_for_in_such_alone(sup
     columns = {"configuration": np.full(3, "6T2A"), "supply_voltage_V": np.array(supply)}
     columns |= {} if duty is None else {"duty": np.array(duty)}
     runs = Runs("synthetic", columns)
-    assert discover.has_pulses(runs) is below_one and varied_by_duty(runs) is alone
+    assert discover.has_partial_duty(runs) is below_one and varied_by_duty(runs) is alone
     names = {
         e.name
         for e in discover.visible_effects(
-            BY_NAME, paper_robots.nominal(), SettledRuns, True, discover.has_pulses(runs)
+            BY_NAME, paper_robots.nominal(), SettledRuns, True, discover.has_partial_duty(runs)
         )
     }
     assert ("coast_decay" in names) is below_one

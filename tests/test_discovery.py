@@ -16,7 +16,7 @@ from calibration.data.runs import read_runs as read_runs
 from calibration.discovery import discover
 from calibration.discovery.candidates import fit_base
 from calibration.discovery.outliers import screen_outliers
-from calibration.discovery.score_tests import bootstrap, diagnose_fit, normal_deviate, score_tests
+from calibration.discovery.score_tests import bootstrap_statistics, diagnose_fit, normal_deviate, score_tests
 from calibration.discovery.settings import WITHOUT_NAME
 from calibration.inference import bases, noise
 from calibration.inference.held_out import hold_out_blocks
@@ -383,7 +383,7 @@ def test_null_of_one_column_is_normal(clean):
     space = clean.space
     one = (with_shape_grid(space.library["ammeter_offset"]),)
     problem, z = space.bare, clean.base.z[: space.free]
-    null = bootstrap(problem, z, clean.left.linear, one, clean.bases[:1], 384, 0)
+    null = bootstrap_statistics(problem, z, clean.left.linear, one, clean.bases[:1], 384, 0)
     assert len(null.single) > 370
     assert stats.kstest(null.single, stats.halfnorm.cdf).pvalue > 0.02
     for factor in (0.8, 1.25):  # the test can fail
@@ -398,8 +398,8 @@ def test_bootstrap_of_the_measured_runs_settles():
     """Of tables drawn from the fit to the packaged data nearly all can be fitted again."""
     runs, settings = read_runs("measured"), dataclasses.replace(SETTLED.settings, replicates=128)
     sd = noise.infer_noise(runs, SettledRuns.sizes(runs), None).sd
-    space = discover.pose_candidates(runs, paper_robots.nominal(), sd, settings, {}, SETTLED.library)
+    space = discover.build_candidate_space(runs, paper_robots.nominal(), sd, settings, {}, SETTLED.library)
     screened = screen_outliers(
         fit_base(space, settings, "measured"), lambda b: discover.bases_at_fit(runs, b), runs, settings
     )
-    assert len(discover.diagnosis_of_base(screened, settings).test.null.single) >= 0.98 * settings.replicates
+    assert len(discover.diagnose_base_by_bootstrap(screened, settings).test.null.single) >= 0.98 * settings.replicates

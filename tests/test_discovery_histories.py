@@ -16,7 +16,7 @@ from calibration.data.input_errors import BadData
 from calibration.data.runs import Runs
 from calibration.discovery.adequacy import AdequacyTest
 from calibration.discovery.discrepancy import fit_discrepancy, locate_discrepancy
-from calibration.discovery.score_tests import bootstrap, diagnose_fit
+from calibration.discovery.score_tests import bootstrap_statistics, diagnose_fit
 from calibration.discovery.settings import WITHOUT_NAME, settings_for
 from calibration.discovery.standing import judge_names
 from calibration.inference import bases, noise
@@ -223,7 +223,7 @@ def test_bootstrap_leaves_what_noise_leaves(seen):
     share = np.asarray(seen.linear.time) / 0.8
     over_time = bases.Basis.of(np.stack([share, share**2], -1)[None], (("track", "time"),))
     effects = seen.space.library.scored
-    null = bootstrap(seen.problem, np.asarray(seen.z), seen.linear, effects, (over_time,), 100, 0)
+    null = bootstrap_statistics(seen.problem, np.asarray(seen.z), seen.linear, effects, (over_time,), 100, 0)
     readings = 3 * len(seen.runs)
     assert len(null.chi2) > 90 and abs(np.mean(null.chi2) - readings) < 4 * np.sqrt(2 * readings / len(null.chi2))
     assert stats.kstest(null.chi2, stats.chi2(readings).cdf).pvalue > 0.01

@@ -15,10 +15,10 @@ from worlds import settled, tables
 
 from calibration.data import robot_file
 from calibration.discovery import discover, discrepancy, formula
-from calibration.discovery.discrepancy import CurveBeside, fit_discrepancy, refine_window, similar_variables
-from calibration.discovery.projection import defect_by_row
+from calibration.discovery.discrepancy import BaseCurve, fit_discrepancy, refine_window, similar_variables
+from calibration.discovery.projection import balance_error_by_row
 from calibration.discovery.score_tests import diagnose_fit
-from calibration.discovery.smooth import smooth_curve
+from calibration.discovery.smooth import fit_smooth_curve
 from calibration.inference import bases
 from calibration.inference.held_out import hold_out_blocks
 from calibration.inference.linearization import PROBED
@@ -138,7 +138,7 @@ def test_defect_of_each_row_shows_the_discrepancy(found):
     residual = np.zeros_like(np.asarray(found.linear.residual))
     residual[: change.size] = -change.ravel()
     clean = eqx.tree_at(lambda linear: linear.residual, found.linear, residual)
-    expected = defect_by_row(clean, found.what.balance).value[:rows]
+    expected = balance_error_by_row(clean, found.what.balance).value[:rows]
     pull = (shown.value[:rows] - expected) / shown.sd[:rows]
     assert 0.7 < np.sqrt(np.mean(pull**2)) < 1.3
     assert np.corrcoef(expected, shown.value[:rows])[0, 1] > 0.5
@@ -156,7 +156,7 @@ def test_formula_finds_the_variable(found):
         return
     assert found.what.variable in proposal.variables
     assert len(proposal.terms) == 1 and proposal.mark == "a proposal, not a finding"
-    curve = smooth_curve(found.linear, found.what.balance, found.what.variable, found.space.included)
+    curve = fit_smooth_curve(found.linear, found.what.balance, found.what.variable, found.space.included)
     assert proposal.explained >= formula.MOST * curve.explained > 100
     assert all(abs(c) > 3 * s for c, s in zip(proposal.coefficients, proposal.sds, strict=True))
     unit = found.what.unit
@@ -215,10 +215,10 @@ def test_every_place_of_a_curve_has_a_symbol():
 
 def test_no_formula_is_proposed_where_nothing_shows(found):
     blind = eqx.tree_at(lambda linear: linear.defects, found.linear, 0 * np.asarray(found.linear.defects))
-    curve = smooth_curve(found.linear, found.what.balance, found.what.variable, found.space.included)
+    curve = fit_smooth_curve(found.linear, found.what.balance, found.what.variable, found.space.included)
     proposal = formula.propose_formula(blind, found.what.balance, found.space.included, curve)
     assert proposal.expression == "" and proposal.terms == ()
-    assert np.isnan(defect_by_row(blind, found.what.balance).value).all()
+    assert np.isnan(balance_error_by_row(blind, found.what.balance).value).all()
 
 
 def test_variables_over_which_a_curve_is_as_improbable_are_told():
@@ -265,7 +265,7 @@ def test_a_curve_that_several_ask_for_is_fitted_once(monkeypatch):
     monkeypatch.setattr(discrepancy, "locate_discrepancy", lambda *given: where)
     monkeypatch.setattr(discrepancy, "fit_discrepancy", lambda *given: counted("curve", *given))
     monkeypatch.setattr(discrepancy, "diagnose_with_curve", lambda *given: counted("diagnosis", *given))
-    beside = CurveBeside(space, "base", left, "bases")
+    beside = BaseCurve(space, "base", left, "bases")
     assert not calls  # before it is asked for
     assert [beside.curve, beside.diagnosis, beside.curve, beside.diagnosis] == 2 * ["curve", "diagnosis"]
     fitted = ("curve", (space, "base", "linear", "track", "speed"))

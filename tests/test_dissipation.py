@@ -46,7 +46,7 @@ def space(tmp_path_factory):
     runs = Runs("runs.csv", columns).of(robot)
     library = {n: BY_NAME[n] for n in ("backdriving_loss", "brush_drop", "stribeck_motor")}
     settings = settings_for(observers.observer_kind(runs))
-    return discover.pose_candidates(runs, robot, np.full((12, 1), 0.01), settings, {}, library), settings
+    return discover.build_candidate_space(runs, robot, np.full((12, 1), 0.01), settings, {}, library), settings
 
 
 @pytest.mark.parametrize(

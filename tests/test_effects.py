@@ -492,7 +492,7 @@ def test_a_run_backward_is_read_as_one_forward_of_the_robot_turned_about(signed)
     """A zero error keeps its sign in space. One of an instrument that shows magnitudes is the same both ways."""
     volts, slope = np.array([12.0, 24.0]), np.array([3.0, 8.0])
     back = steady_batch(metered(signed), Conditions(voltage=-volts, slope_deg=-slope))
-    ahead = steady_batch(menu.reversed_(metered(signed)), Conditions(voltage=volts, slope_deg=slope))
+    ahead = steady_batch(menu.facing_backward(metered(signed)), Conditions(voltage=volts, slope_deg=slope))
     read, as_forward = (np.asarray(r.reading["motor_current"]) for r in (back, ahead))
     assert (read * (-1 if signed else 1) > 0).all()
     assert_allclose(as_forward, np.abs(read), rtol=1e-9)

@@ -9,7 +9,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import mmrjax as mm
-from calibration.inference.details import EquationDefects
+from calibration.inference.details import EquationErrors
 from calibration.inference.observers.settled import EQUATIONS, SettledLinearization, _row_defects
 from calibration.inference.observers.turns import TurnLinearization
 from mmrjax import effects
@@ -154,7 +154,7 @@ def test_change_of_a_reading_that_crosses_zero_is_of_its_size(monkeypatch):
     rates = [np.array([1.0, -1.0, 1e-9]), np.array([1.1, -1.1, 0.1])]
     monkeypatch.setattr(page.mm, "simulate", lambda *_: SimpleNamespace(yaw_rate=rates.pop(0)))
     found = SimpleNamespace(
-        effects=[SimpleNamespace(name="iron_loss")], robot=robot, detail=EquationDefects({}, {}), channels=(yaw,),
+        effects=[SimpleNamespace(name="iron_loss")], robot=robot, detail=EquationErrors({}, {}), channels=(yaw,),
         runs=SimpleNamespace(conditions=lambda robot: None), included=np.ones(3, bool),
         readings_of_rows=SimpleNamespace(measured=np.array([[1.0], [-1.0], [0.0]])),
     )  # fmt: skip

@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from worlds.events import STEEP, Bench, through
 
 from calibration.data import runs
-from calibration.inference.preparation import prepare
+from calibration.inference.preparation import prepare_input
 from mmrjax.fidelities.drive import drive_batch
 from mmrjax.fidelities.histories import CHANGE, history_signals, time_grid
 from mmrjax.model import paper_robots, params
@@ -116,7 +116,7 @@ def test_compare_follows_reversals_within_a_thousandth_of_scipys_rms():
         over = np.maximum(np.abs(current) / bench.current_limit - 1, 0) * np.sign(current * imposed)
         exact = {"total_current_A": current * (1 - STEEP * over), "motor_speed_rpm": motor * 30 / np.pi}
         log = runs.read_runs({"time_s": every, "supply_voltage_V": imposed, **exact}, robot=robot)
-        shown = simulate_histories(prepare(log, robot).robot, log, None)
+        shown = simulate_histories(prepare_input(log, robot).robot, log, None)
         for column, readings in exact.items():
             assert np.abs(shown[column] - readings).max() < 1e-3 * np.sqrt(np.mean(readings**2)), (bench, column)
 

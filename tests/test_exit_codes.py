@@ -108,11 +108,11 @@ def test_an_interrupt_within_a_callback_is_obeyed(monkeypatch, capsys):
 
 
 def test_no_thread_outlives_a_refusal(monkeypatch):
-    monkeypatch.setattr(scales, "_nominal", lambda: time.sleep(0.3))
+    monkeypatch.setattr(scales, "_nominal_signals", lambda: time.sleep(0.3))
     robot = dataclasses.replace(
         paper_robots.nominal(), rig=dataclasses.replace(paper_robots.nominal().rig, inherits=False)
     )
-    with pytest.raises(InputError, match="refused"), scales.nominal_ahead(robot):
+    with pytest.raises(InputError, match="refused"), scales.compute_nominal_ahead(robot):
         assert any(t.name.startswith(WORKER) for t in threading.enumerate())
         raise InputError("refused")
     assert not any(t.name.startswith(WORKER) for t in threading.enumerate())

@@ -324,7 +324,7 @@ ROVERS_TABLE = grid([6.0, 9.0, 12.0], [0.0, 8.0], [0.0, 1.0])
 
 
 def runs_of(table):
-    return [e for e in table if isinstance(e, menu.Run)]
+    return [e for e in table if isinstance(e, menu.ProposedRuns)]
 
 
 @pytest.mark.slow
@@ -438,14 +438,14 @@ def test_other_voltages_are_those_that_the_table_lacks():
 
 
 def test_only_levels_that_the_robot_manages_are_left():
-    run = menu._runs_under(REACH, "x", "travel", voltages=(5.0, 10.0), slopes=(0.0, 10.0, 20.0))
+    run = menu._combined_runs(REACH, "x", "travel", voltages=(5.0, 10.0), slopes=(0.0, 10.0, 20.0))
     does = np.array(
         [True, True, False, True, False, False]
     )  # at 5 V the slopes are too steep, and 20 deg at 10 V too
     kept = menu.possible_runs(run, does)
     assert [(run.slope[k], run.voltage[k]) for k in np.flatnonzero(kept)] == [(0.0, 5.0), (0.0, 10.0)]
     assert not menu.possible_runs(run, np.zeros(6, bool)).any() and menu.possible_runs(run, np.ones(6, bool)).all()
-    steepest = menu._runs_under(REACH, "x", "travel", voltages=(5.0,), slopes=(23.0, 21.5, 20.0), steepest=True)
+    steepest = menu._combined_runs(REACH, "x", "travel", voltages=(5.0,), slopes=(23.0, 21.5, 20.0), steepest=True)
     kept = menu.possible_runs(steepest, np.array([False, True, True]))
     assert [steepest.slope[k] for k in np.flatnonzero(kept)] == [21.5]
 
@@ -506,7 +506,7 @@ def test_runs_against_a_brake_have_its_torque():
     made = menu.experiment_menu(within)
     batch = predicted.batch_experiments(made, within.measured)
     torque = np.asarray(batch.conditions.load_torque)
-    assert torque.tolist() == [m for r in made if isinstance(r, menu.Run) for m in r.torque]
+    assert torque.tolist() == [m for r in made if isinstance(r, menu.ProposedRuns) for m in r.torque]
     assert torque.max() == 0.5 and (torque * np.asarray(batch.conditions.voltage) >= 0).all()  # it brakes either way
     run = next(r for r in made if "other torques" in r.kinds)
     done = np.asarray(run.torque) < 0.5  # it stalls the motor
@@ -555,7 +555,7 @@ def test_finer_steps_are_within_the_tables_ranges(rover):
 def test_every_experiment_is_kept_in_a_stage(tmp_path):
     stage_files.write_stage(tmp_path / "menu", MENU)
     assert stage_files.read_stage(tmp_path / "menu") == MENU
-    assert {type(e) for e in MENU} == {menu.Act, menu.Run}
+    assert {type(e) for e in MENU} == {menu.CalibrationAct, menu.ProposedRuns}
 
 
 def test_a_class_of_a_servos_log_has_no_experiment_of_the_menu():

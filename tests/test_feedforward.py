@@ -11,7 +11,7 @@ from test_more_formats import wpilog
 
 from calibration.data.input_errors import BadData
 from calibration.described import sentences
-from calibration.inference.feedforward import DriveLog, Tolerances, feedback, fit_feedforward
+from calibration.inference.feedforward import DriveLog, Tolerances, feedback_gains, fit_feedforward
 
 TESTS = ("quasistatic-forward", "quasistatic-reverse", "dynamic-forward", "dynamic-reverse")
 STEP, FINE = 0.02, 5
@@ -139,8 +139,8 @@ def test_gains_solve_the_riccati_equation_by_iteration():
     for _ in range(2000):
         k = a * b * p / (1 / r**2 + b * b * p)
         p = 1 / q**2 + a * a * p - a * b * p * k
-    assert_allclose(feedback(kV, kA, Tolerances())["velocity_kP"], k, rtol=1e-9)
-    late = feedback(kV, kA, Tolerances(delay=0.05))["velocity_kP"]
+    assert_allclose(feedback_gains(kV, kA, Tolerances())["velocity_kP"], k, rtol=1e-9)
+    late = feedback_gains(kV, kA, Tolerances(delay=0.05))["velocity_kP"]
     assert_allclose(late, k * (a - b * k) ** 2.5, rtol=1e-9)
 
 

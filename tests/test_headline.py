@@ -7,7 +7,7 @@ from synthetic import LOST_MOTION
 
 from calibration.described import describe
 from calibration.discovery.headline import headline
-from calibration.discovery.loop_notes import Mechanism, Missing, Summary
+from calibration.discovery.loop_notes import Mechanism, MissingEffect, VerdictSummary
 from calibration.discovery.result import DiscoveryResult
 from calibration.words import loop_words
 
@@ -18,16 +18,16 @@ def law(*names, families=(DROP,), established=True):
     """A verdict with one effect, and what it cannot be told from."""
     verdict = "place" if not established else "named" if len(names) == 1 else "class"
     place = SimpleNamespace(family=DROP) if not established else None
-    return Summary(verdict, 0.001, place, (Missing(names, (), families, established),))
+    return VerdictSummary(verdict, 0.001, place, (MissingEffect(names, (), families, established),))
 
 
 def of_mechanism(*families):
     place = SimpleNamespace(family=families[0])
-    return Summary("mechanism", 0.001, place, mechanism=Mechanism(families, (), 0.9, 1.0, 0.1, 1.0))
+    return VerdictSummary("mechanism", 0.001, place, mechanism=Mechanism(families, (), 0.9, 1.0, 0.1, 1.0))
 
 
 def nothing(verdict="none"):
-    return Summary(verdict, 0.5, None)
+    return VerdictSummary(verdict, 0.5, None)
 
 
 @pytest.mark.parametrize(
@@ -83,7 +83,7 @@ def test_what_only_some_noises_cannot_tell_apart_comes_after_what_all_list():
 
 def test_one_mechanism_is_claimed_once():
     """Two laws of one family, of which another noise leaves the mechanism alone."""
-    two = Summary("class", 0.001, None, (*law("a").missing, *law("b").missing))
+    two = VerdictSummary("class", 0.001, None, (*law("a").missing, *law("b").missing))
     assert headline(two, [(0.7, of_mechanism(DROP, SLIP))]).claims == ((DROP, SLIP),)
 
 

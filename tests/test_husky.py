@@ -43,11 +43,11 @@ def test_loop_frees_the_friction_that_turns_show(robot, runs):
     """Of each surface. In straight travel nothing but a speed shows it."""
     ours = surfaces.with_surface_configurations(robot, runs)
     present = runs.configurations_named(ours)
-    freed = priors.free_names(ours, present, *SettledTurns.free())
+    freed = priors.loop_parameter_names(ours, present, *SettledTurns.free())
     of_ground = {f"{name}.ground.friction.{number}" for name in present for number in ("static", "speed_static")}
     assert len(of_ground) == 6 and of_ground < set(freed)
     straight = dataclasses.replace(ours, rig=dataclasses.replace(ours.rig, channels=("motor_current",)))
-    assert not of_ground & set(priors.free_names(straight, present))
+    assert not of_ground & set(priors.loop_parameter_names(straight, present))
 
 
 @pytest.mark.nightly

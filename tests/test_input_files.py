@@ -10,7 +10,7 @@ from numpy.testing import assert_array_equal
 from calibration.data import input_files
 from calibration.data import runs as records
 from calibration.data.input_errors import BadConfiguration, BadData, InputError
-from calibration.discovery.discover import without_copies
+from calibration.discovery.discover import remove_copies
 from calibration.inference.checks import _check_stuck_channels
 from calibration.inference.fit_notes import Remark
 from mmrjax.errors import count_noun
@@ -142,7 +142,7 @@ ROWS = "4,0.3,700{}\n6,0.4,1100{}\n6,0.4,1100{}\n"
 )
 def test_rows_alike_are_repeats_and_the_same_run_twice_is_a_copy(tmp_path, head, rows, kept):
     found = table(tmp_path, f"supply_voltage_V,motor_current_A,output_speed_rpm{head}\n{rows}", bench(tmp_path))
-    assert len(without_copies(found)[0]) == kept
+    assert len(remove_copies(found)[0]) == kept
 
 
 def test_a_stiff_supply_is_no_stuck_instrument(tmp_path):

@@ -11,10 +11,10 @@ from synthetic import table
 from worlds import settled, tables
 
 from calibration.data.runs import Runs
-from calibration.discovery.discover import Sds, noise_remarks_before_verdict
+from calibration.discovery.discover import VerdictNoise, noise_remarks_before_verdict
 from calibration.inference import lack_of_fit
 from calibration.inference.calibration import calibrate
-from calibration.inference.fit_notes import Shown
+from calibration.inference.fit_notes import AdequacyFinding
 from calibration.inference.lack_of_fit import Residuals, adequacy_of_residuals
 from calibration.inference.noise_factor import noise_factors, noise_remarks
 from calibration.inference.observers import SettledRuns
@@ -95,13 +95,13 @@ def test_a_trend_is_found_with_and_without_stated_noise(estimated):
 
 def test_noise_that_is_larger_than_stated_is_not_adequate():
     found = judged(toy(np.random.default_rng(3), noise=1.5))
-    assert not found.adequate and found.shown_by == Shown(what="stated")
+    assert not found.adequate and found.shown_by == AdequacyFinding(what="stated")
 
 
 def test_replicates_tell_what_the_noise_is():
     made = toy(np.random.default_rng(4), missing=1.5, repeats=2)
     found = lack_of_fit._replicate_test(made)
-    assert found[0] < 0.01 and found[1] == Shown(what="repeats")
+    assert found[0] < 0.01 and found[1] == AdequacyFinding(what="repeats")
     clean = toy(np.random.default_rng(5), repeats=2)
     assert judged(clean, estimated=True).adequate
 
@@ -167,7 +167,7 @@ def test_noise_of_one_channel_that_is_off_is_said_of_that_channel():
 def test_what_is_said_of_sds_beside_an_answer_is_of_what_it_leaves():
     """Before: 130 times the sds, everywhere. The answer leaves noise, or twice as much as was stated."""
     noise = SimpleNamespace(word="stated")
-    before = Sds(noise, {}, tuple(noise_remarks(toy(np.random.default_rng(7), noise=130.0))))
+    before = VerdictNoise(noise, {}, tuple(noise_remarks(toy(np.random.default_rng(7), noise=130.0))))
     assert (
         before.remarks[0].factor > 100 and noise_remarks_before_verdict(before, toy(np.random.default_rng(9))) == ()
     )

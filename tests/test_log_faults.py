@@ -119,7 +119,7 @@ def test_a_delay_is_freed_if_the_error_lies_after_the_steps(robot, tmp_path, mon
     monkeypatch.setattr(calibration.scans, "place_at_minimum", lambda problem, starts: starts)
     seen = SimpleNamespace(reading=runs.measured() + off)
     monkeypatch.setattr(calibration.optimizers, "observe_at", lambda *_: seen)
-    monkeypatch.setattr(calibration, "_result", lambda setting, search, *_: (setting, search))
+    monkeypatch.setattr(calibration, "_calibration_result", lambda setting, search, *_: (setting, search))
     setting, found = calibration.calibrate(runs, robot, **options)
     first, *again = searches
     assert "rig.delay" not in first and [set(x) - set(first) for x in again] == [{"rig.delay"}] * freed

@@ -8,7 +8,7 @@ from calibration.data import runs as records
 from calibration.data.stated import EXAMPLE
 from calibration.data.thinning import thin_rows
 from calibration.inference import bases, observers
-from calibration.inference.preparation import prepare
+from calibration.inference.preparation import prepare_input
 from sweeps.commands import rig_new
 from sweeps.points import run as points
 
@@ -105,7 +105,7 @@ def test_the_model_follows_such_a_log_with_the_numbers_that_it_was_made_of(tmp_p
     if kind == "carriage":
         robot = robot_file.change_robot(robot, {"carriage.loss_viscous": 400.0 * (5e-3 / (2 * np.pi)) ** 2}, "a test")
     runs = records.read_runs(tmp_path / "log.csv", robot=robot)
-    ready = prepare(runs, robot)
+    ready = prepare_input(runs, robot)
     shown = points.simulate_histories(ready.robot, runs, None)
     error = np.std(shown[column] - runs[column])
     assert error < 0.01 * np.ptp(runs[column]) and error > 0.1 * least

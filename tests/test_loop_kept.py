@@ -214,4 +214,4 @@ def test_a_loop_of_kept_stages_finds_what_it_found(tmp_path):
 
 
 def test_nothing_is_kept_where_nobody_asks():
-    assert kept.keep_nothing("base", lambda: 3) == 3
+    assert kept.compute_without_storing("base", lambda: 3) == 3

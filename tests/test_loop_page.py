@@ -20,10 +20,16 @@ from worlds import settled, tables
 
 from calibration.data.writing import json_value
 from calibration.discovery.discover import FAR
-from calibration.discovery.hidden import Hidden
-from calibration.discovery.loop_notes import Asked, NameSupport, NameTest, RuledOut
-from calibration.discovery.outliers import Cluster
-from calibration.discovery.result import Alternative, Estimate, Resolved, StatedValue, Worse
+from calibration.discovery.hidden import HiddenEffect
+from calibration.discovery.loop_notes import NameSupport, NameTest, RuledOut, TrackModelQuestion
+from calibration.discovery.outliers import OutlierCluster
+from calibration.discovery.result import (
+    ParameterEstimate,
+    RejectedCandidate,
+    StatedValue,
+    TrackModelResult,
+    WorseChannel,
+)
 from calibration.discovery.settings import WITHOUT_NAME
 from calibration.inference.identifiability import HELD
 from calibration.words import loop_words as words
@@ -271,10 +277,10 @@ def test_what_is_held_by_its_prior_is_said_everywhere(shown, capsys, tmp_path, n
 def resolved(found, p, outside=(), settled=True):
     """The result with what the track model says of a slip."""
     constants = {
-        "running_gear.guide_recess": Estimate(3.1e-4, 4e-5, "m", False), "x.static": Estimate(0.58, 0.02, "-", True)
+        "running_gear.guide_recess": ParameterEstimate(3.1e-4, 4e-5, "m", False), "x.static": ParameterEstimate(0.58, 0.02, "-", True)
     }  # fmt: skip
-    return dataclasses.replace(found, resolved=Resolved(
-        asked=Asked("missing", "slip", "slope"), rows=10, robot=found.robot, constants=constants, alike=(("a", "b", -0.95),),
+    return dataclasses.replace(found, resolved=TrackModelResult(
+        asked=TrackModelQuestion("missing", "slip", "slope"), rows=10, robot=found.robot, constants=constants, alike=(("a", "b", -0.95),),
         outside=outside, settled=settled, fall=61.0, p=p, chi2=(90.0, 29.0), readings=30, rms_percent={"speed": (4.0, 1.2)},
         slip_rms=(3.3, 0.6), remarks=("said too",),
     ))  # fmt: skip
@@ -295,7 +301,7 @@ TOLD = {
     "value": lambda found: with_effect(
         found, stated={"motor.resistance": StatedValue(1.411, 0.611, "ohm", 13.1, 0.4)}, families=("losses", "leads")
     ),
-    "tentative": lambda found: judged(found, True, "beside", cluster=Cluster("time", 0.6, 0.7, "", 12, 13, 1e-5)),
+    "tentative": lambda found: judged(found, True, "beside", cluster=OutlierCluster("time", 0.6, 0.7, "", 12, 13, 1e-5)),
     "perhaps": lambda found: judged(found, False, "beside"),
     "two_of_a_kind": lambda found: judged(
         found, False, "beside", effects=(*found.effects, dataclasses.replace(found.effects[0], name="windage"))
@@ -304,10 +310,10 @@ TOLD = {
         found, verdict="none", effects=(), support=None, summary=dataclasses.replace(found.summary, verdict="none")
     ),
     "hidden": lambda found: dataclasses.replace(found, hidden=(
-        Hidden("brush_drop", 0.21, "V", 5.5, "stall", 7.2), Hidden("load_slip", 1e-4, "1/N", 5.1, "", 0.0),
+        HiddenEffect("brush_drop", 0.21, "V", 5.5, "stall", 7.2), HiddenEffect("load_slip", 1e-4, "1/N", 5.1, "", 0.0),
     )),
-    "worse": lambda found: dataclasses.replace(found, held_out_worse=(Worse("slope", "motor_speed", 10, 4.3, 4.7),)),
-    "ruled_out": lambda found: dataclasses.replace(found, implausible=(Alternative(
+    "worse": lambda found: dataclasses.replace(found, held_out_worse=(WorseChannel("slope", "motor_speed", 10, 4.3, 4.7),)),
+    "ruled_out": lambda found: dataclasses.replace(found, implausible=(RejectedCandidate(
         {"brush_drop": 0.9}, {"brush_drop": 0.9}, {"brush_drop": 2.9}, -8.0,
         (RuledOut("brush_drop", "size", 2.9, ("motor.resistance",)),),
     ),)),

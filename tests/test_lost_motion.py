@@ -135,7 +135,7 @@ def test_no_effect_stands_in_for_a_missing_backlash(lost, monkeypatch):
 
     monkeypatch.setattr(discover, "_confirm_gains", lambda *stages: None)
     task = SimpleNamespace(
-        settings=SimpleNamespace(replicates=1), keep=keep, progress=lambda step: None, loses_motion=lost
+        settings=SimpleNamespace(replicates=1), keep=keep, progress=lambda step: None, shows_unmodelled_backlash=lost
     )
     searched = discover._search_until_clean(task, SimpleNamespace(cluster=None), None, ["a ranking"])[2]
     assert (searched is None) == lost and steps == ["bootstrap 0", "search 0"][: 1 if lost else 2]
@@ -145,4 +145,4 @@ def test_task_of_the_loop_knows_of_lost_motion(tmp_path):
     for play in (1.0, 0.0):
         runs, robot = read(tmp_path, servo(play=play))
         given = discover.LoopInput(runs, None, robot, *[None] * 4)
-        assert given.loses_motion == (play > 0)
+        assert given.shows_unmodelled_backlash == (play > 0)

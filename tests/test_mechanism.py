@@ -57,12 +57,12 @@ def found(monkeypatch):
     )  # fmt: skip
     score = HeldOutScore({}, {})
     monkeypatch.setattr(room.blocks_room, "predictable_blocks", lambda *_: {})
-    monkeypatch.setattr(room, "scored_once", lambda *_: score)
-    monkeypatch.setattr(room, "_scored", lambda *_: score)
-    monkeypatch.setattr(room, "_reading", lambda *_: None)
+    monkeypatch.setattr(room, "cached_hold_out_score", lambda *_: score)
+    monkeypatch.setattr(room, "_hold_out_score", lambda *_: score)
+    monkeypatch.setattr(room, "_simulated_reading", lambda *_: None)
     monkeypatch.setattr(room, "_changed_readings", lambda *_: None)
-    monkeypatch.setattr(room, "_curve_again", lambda *_: 0.9)
-    monkeypatch.setattr(room, "chosen_again", lambda *_: 1.0)
+    monkeypatch.setattr(room, "_curve_recurrence", lambda *_: 0.9)
+    monkeypatch.setattr(room, "recurrence_of_families", lambda *_: 1.0)
 
     def of(*ladder, curve, where=SPEED, long=False):
         space.bare.observe.long = long
@@ -195,7 +195,7 @@ def test_equations_that_act_alike_are_listed(found):
 
 def test_a_curve_is_asked_within_the_range_that_its_fit_has_seen():
     speed = np.array([1.0, 2.0, 3.0, 4.0, 2.5, 5.0])
-    linear = SimpleNamespace(in_travel=lambda place, variable: (speed, 1.0))
+    linear = SimpleNamespace(curve_variable=lambda place, variable: (speed, 1.0))
     beside = SimpleNamespace(where=SPEED, left=SimpleNamespace(linear=linear))
     space = SimpleNamespace(included=np.ones(6, bool))
     masks = [np.isin(np.arange(6), rows) for rows in ((0, 4), (1, 2), (3, 5))]

@@ -8,7 +8,7 @@ from pages import Tables
 from test_documents import check, comparison, size
 
 from calibration.described import describe
-from calibration.discovery.loop_notes import FreedValue, Headline
+from calibration.discovery.loop_notes import AlternativeValue, Headline
 from calibration.words import loop_words
 from sweeps.report import page_renderer, terminal_renderer
 from sweeps.report.document import plain_text
@@ -56,7 +56,7 @@ def test_the_answer_of_the_loop_is_the_claim_that_holds_at_every_noise(level):
 
 
 def test_the_answer_states_a_value_that_may_be_wrong_before_the_effect_that_imitates_it():
-    value = FreedValue("gearbox.efficiency_load", 0.685, "-")
+    value = AlternativeValue("gearbox.efficiency_load", 0.685, "-")
     found = Headline(
         "class", (("gear_load_loss",),), (1.0,), (), (("loss torque that changes with load",),), ((value,),)
     )

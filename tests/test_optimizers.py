@@ -125,7 +125,7 @@ def bent():
     data = problem.data_from_readings(rng.standard_normal((6, 2)), np.full((6, 2), 0.1), 4)
     measured = rng.standard_normal((9, 6, 2))
     weight = (rng.random((9, 6, 2)) > 0.1).astype(float)
-    members = fit.Member(rng.standard_normal((9, 4)), weight, measured, 0.1 * rng.standard_normal((9, 4)))
+    members = fit.SearchMember(rng.standard_normal((9, 4)), weight, measured, 0.1 * rng.standard_normal((9, 4)))
     posed = problem.Problem(None, Plain(), Bent(), data)
     return posed, members, alone(posed, members, 40)
 

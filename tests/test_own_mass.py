@@ -83,7 +83,7 @@ def fits(tmp_path_factory):
     robot = robot_file.with_effects(paper_robots.nominal(), UNSEEN)
     robot = params.replace(robot, {f"effects.{n}.amplitude": 0.3 * _sd(BY_NAME[n]) for n in UNSEEN})
     sd = 0.02 * np.abs(runs.measured())
-    space = discover.pose_candidates(runs, robot, sd, SETTLED.settings, stated, BY_NAME)
+    space = discover.build_candidate_space(runs, robot, sd, SETTLED.settings, stated, BY_NAME)
     z = np.zeros(len(space.coordinates))
     z[: space.free] = np.random.default_rng(3).normal(0.0, 0.5, space.free)
     # The exponent of sinkage is then beyond its bounds, which a file could not state.

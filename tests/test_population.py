@@ -14,9 +14,9 @@ from calibration.data import runs as records
 from calibration.data.input_errors import BadConfiguration
 from calibration.inference import identifiability, multistart, noise, observers, population, priors
 from calibration.inference.calibration import calibrate
-from calibration.inference.fit_notes import Edge, Remark, with_codes
+from calibration.inference.fit_notes import ReachedBound, Remark, remarks_with_codes
 from calibration.inference.observers.settled import SettledRuns
-from calibration.inference.population import Members, Rows
+from calibration.inference.population import MemberObservations, MemberRunner
 from calibration.inference.problem import Observation
 from mmrjax.model import channels, paper_robots
 from mmrjax.model.signals import FAILED, FLAGS, SLIDES, TIPS
@@ -64,9 +64,9 @@ def posed(runs, truth, known):
 
 
 def evolve(posed, known, generations=30, file=None, seed=3):
-    members = Members(posed, file)
+    members = MemberRunner(posed, file)
     size = len(NAMES)
-    return population.evolve(
+    return population.run_evolution(
         members, population.member_objective(posed, known), np.zeros(size), np.eye(size), size=SIZE, seed=seed,
         generations=generations,
     )  # fmt: skip
@@ -96,7 +96,7 @@ def test_same_seed_same_members_and_another_seed_others(posed, known, found):
 
 @pytest.mark.slow
 def test_objective_is_the_misfit_where_the_noise_is_known(posed, known, found):
-    rows = Rows(found.reading[:3], found.adhesion_used[:3], found.status[:3], found.flags[:3])
+    rows = MemberObservations(found.reading[:3], found.adhesion_used[:3], found.status[:3], found.flags[:3])
     for z, cost in zip(found.z[:3], population.member_objective(posed, known)(found.z[:3], rows), strict=True):
         readings = np.asarray(posed.misfit(jnp.asarray(z), posed.data))[: posed.data.measured.size]
         lost = np.isin(np.asarray(posed.observation(jnp.asarray(z)).status), (2, 3, 4))
@@ -110,7 +110,9 @@ def test_objective_with_noise_to_be_estimated_takes_the_most_probable(posed, run
     """n ln s is, but for a constant, ½ Σ (e/σ)² + n ln σ at the σ that makes it smallest."""
     unknown = noise.noise_from_table(runs, SettledRuns.sizes(runs))
     worst = found.order[-2:]  # far above the least share that is taken for noise
-    rows = Rows(found.reading[worst], found.adhesion_used[worst], found.status[worst], found.flags[worst])
+    rows = MemberObservations(
+        found.reading[worst], found.adhesion_used[worst], found.status[worst], found.flags[worst]
+    )
     costs = population.member_objective(posed, unknown)(found.z[worst], rows)
     size, measured = SettledRuns.sizes(runs), np.asarray(posed.data.measured)
 
@@ -135,7 +137,7 @@ GRID = np.geomspace(1.2e-3, 1.0, 80)
 def test_row_that_is_not_reached_costs_and_a_reading_that_is_missing_ends_it(posed, known, found):
     status = found.status[:1].copy()
     status[0, 0] = 2
-    reached = Rows(found.reading[:1], found.adhesion_used[:1], np.zeros_like(status), found.flags[:1])
+    reached = MemberObservations(found.reading[:1], found.adhesion_used[:1], np.zeros_like(status), found.flags[:1])
     lost = reached._replace(status=status)
     cost = population.member_objective(posed, known)
     assert cost(found.z[:1], lost) - cost(found.z[:1], reached) == pytest.approx(population.LOST)
@@ -151,8 +153,8 @@ def test_kept_members_are_not_run_again_and_an_ended_search_goes_on(posed, known
     file = tmp_path / "members.npz"
     evolve(posed, known, 2, file)
     run = []
-    true = population._observed
-    monkeypatch.setattr(population, "_observed", lambda *a: run.append(1) or true(*a))
+    true = population._observe_points
+    monkeypatch.setattr(population, "_observe_points", lambda *a: run.append(1) or true(*a))
     whole = evolve(posed, known, len(found.generations), file)
     assert_array_equal(whole.z, found.z)
     assert_array_equal(whole.cost, found.cost)
@@ -170,9 +172,9 @@ def test_members_of_another_calibration_are_refused(posed, known, tmp_path):
     evolve(posed, known, 1, file)
     other = dataclasses.replace(posed, data=dataclasses.replace(posed.data, measured=posed.data.measured * 1.01))
     with pytest.raises(BadConfiguration, match="its members belong to another calibration"):
-        Members(other, file)
+        MemberRunner(other, file)
     noisier = dataclasses.replace(posed, data=dataclasses.replace(posed.data, sd=2 * posed.data.sd))
-    assert len(Members(noisier, file)._kept) == SIZE  # the noise is none of what was run
+    assert len(MemberRunner(noisier, file)._kept) == SIZE  # the noise is none of what was run
 
 
 @pytest.mark.quick(1)
@@ -181,7 +183,7 @@ def test_file_that_holds_no_members_is_refused(posed, tmp_path, content):
     file = tmp_path / "members.npz"
     file.write_bytes(content)
     with pytest.raises(BadConfiguration, match="not a readable file of members"):
-        Members(posed, file)
+        MemberRunner(posed, file)
 
 
 def never(*_, **__):
@@ -231,7 +233,7 @@ def test_regression_over_members_is_the_derivative_of_a_smooth_model(posed, foun
     about = identifiability.analyse_identifiability(posed, jnp.asarray(found.z[at]))
     slope, left = population.local_regression(posed, found, at)
     assert np.linalg.norm(slope - about.jacobian) < 0.15 * np.linalg.norm(about.jacobian) and left < 1.0
-    members = Members(posed)
+    members = MemberRunner(posed)
     assert not population.unreliable_derivatives(posed, members, found.z[at], about.jacobian, about.sd).any()
 
 
@@ -242,18 +244,22 @@ def test_parameter_across_whose_threshold_differences_lead_is_named(posed, found
         lambda p: p.observe, posed, Stepped(posed.observe.conditions, "steady"), is_leaf=lambda x: x is posed.observe
     )
     about = identifiability.analyse_identifiability(stepped, jnp.zeros(len(NAMES)))
-    off = population.unreliable_derivatives(stepped, Members(stepped), np.zeros(len(NAMES)), about.jacobian, about.sd)
+    off = population.unreliable_derivatives(
+        stepped, MemberRunner(stepped), np.zeros(len(NAMES)), about.jacobian, about.sd
+    )
     assert off.tolist() == [True, False, False, False]
 
 
 @pytest.mark.slow
 def test_statements_say_whether_it_settled_and_what_derivatives_are_worth(found):
     at = int(found.order[0])
-    calm = population.Searched(found, at, (), None, np.nan)
+    calm = population.PopulationSearch(found, at, (), None, np.nan)
     assert calm.remarks()[0] == Remark(
         "generations", members=len(found.z), generations=len(found.generations), settled=found.settled
     )
-    torn = population.Searched(dataclasses.replace(found, generations=found.generations[:2]), at, ("a",), None, 0.4)
+    torn = population.PopulationSearch(
+        dataclasses.replace(found, generations=found.generations[:2]), at, ("a",), None, 0.4
+    )
     assert not torn.remarks()[0].settled and torn.remarks()[-1] == Remark("read_from_members", names=("a",), left=0.4)
     assert calm.to_json()["regression_rms_sd"] is None and torn.to_json()["derivatives_apart"] == ["a"]
 
@@ -265,7 +271,7 @@ def test_parameter_at_the_edge_of_its_prior_or_at_a_bound_is_named(posed):
     assert population.parameters_at_edge(coordinates, np.array([2.4, -2.4, 0.0, 0.0])) == {}
     said = population.parameters_at_edge(coordinates, np.array([2.6, -3.0, 0.0, 9.0]))
     assert list(said) == [NAMES[0], NAMES[1], NAMES[3]]
-    assert [*said.values()] == [Edge("", 2.6), Edge("", -3.0), Edge("upper", 9.0)]
+    assert [*said.values()] == [ReachedBound("", 2.6), ReachedBound("", -3.0), ReachedBound("upper", 9.0)]
 
 
 @pytest.mark.slow
@@ -274,13 +280,18 @@ def test_what_members_did_is_counted_and_said(found):
     status, flags = np.zeros_like(found.status), np.zeros_like(found.flags)
     status[:3, 0], status[3, 1], status[4:6, 0] = TIPS, FAILED, SLIDES
     flags[[at, 7], 1] = 1 << FLAGS.index("jumps")
-    told = population.Searched(
-        dataclasses.replace(found, status=status, flags=flags), at, (), None, np.nan, {"a": Edge("upper", 9.0)}
+    told = population.PopulationSearch(
+        dataclasses.replace(found, status=status, flags=flags),
+        at,
+        (),
+        None,
+        np.nan,
+        {"a": ReachedBound("upper", 9.0)},
     )
     assert told.to_json()["outcomes"] == {"tips": 3, "failed": 1, "slides": 2, "jumps": 2}
     assert told.to_json()["at_edge"] == {"a": "at its upper bound"}
     assert told.remarks()[1:] == [
-        Remark("lost_rows", members={"slides": 2, "tips": 3, "failed": 1}), Remark("members_jump", members=2, best=(2,)), Remark("ended_at_edge", edge={"a": Edge("upper", 9.0)})
+        Remark("lost_rows", members={"slides": 2, "tips": 3, "failed": 1}), Remark("members_jump", members=2, best=(2,)), Remark("ended_at_edge", edge={"a": ReachedBound("upper", 9.0)})
     ]  # fmt: skip
 
 
@@ -297,7 +308,7 @@ def test_search_that_ends_at_the_edge_of_a_prior_says_so_in_the_result(runs):
     assert abs(best[0]) > population.EDGE and abs(found.parameters[name].shift) > population.EDGE
     assert list(found.searched.edge) == [name]
     assert list(found.to_json()["optimizer"]["population"]["at_edge"]) == [name]
-    (ended,) = with_codes(found.remarks, "ended_at_edge")
+    (ended,) = remarks_with_codes(found.remarks, "ended_at_edge")
     assert list(ended.edge) == [name] and ended.edge[name].sds > 0
     assert any(n.code == "far_from_prior" and n.name == name for n in found.remarks)
     assert np.isfinite(found.posterior.covariance).all()
@@ -305,7 +316,7 @@ def test_search_that_ends_at_the_edge_of_a_prior_says_so_in_the_result(runs):
 
 @pytest.mark.slow
 def test_population_of_which_no_member_can_be_run_is_refused(runs, monkeypatch):
-    true = population._observed
+    true = population._observe_points
 
     def broken(posed, points):
         seen = true(posed, points)
@@ -313,7 +324,7 @@ def test_population_of_which_no_member_can_be_run_is_refused(runs, monkeypatch):
             jnp.full_like(seen.reading, jnp.nan), seen.adhesion_used, jnp.full_like(seen.status, TIPS), seen.flags
         )
 
-    monkeypatch.setattr(population, "_observed", broken)
+    monkeypatch.setattr(population, "_observe_points", broken)
     name = "6T2A.ground.rolling_resistance"
     with pytest.raises(BadConfiguration, match=r"none of \d+ members can be run in every row .*: \d+ tips"):
         calibrate(runs, paper_robots.nominal(), model="drive", free=(name,), population=4, generations=1)

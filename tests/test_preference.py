@@ -10,7 +10,7 @@ from worlds import tables
 from calibration.data.input_errors import BadConfiguration
 from calibration.discovery import preference
 from calibration.discovery.loop_notes import DRAW
-from calibration.discovery.result import HeldOutAlternative, Worse
+from calibration.discovery.result import HeldOutAlternative, WorseChannel
 from calibration.discovery.settings import HELD_OUT, settings_for
 from calibration.inference.fit_notes import Remark
 from calibration.inference.observers import SettledRuns
@@ -37,7 +37,7 @@ def test_an_error_that_rises_is_listed_and_said():
     readings = held_out(4.3, 4.3)
     readings["voltage"][1][:, 1] = 4.72
     found = preference.worse_predictions(readings, errors)
-    assert found == (Worse("voltage", "motor_speed", 10, pytest.approx(4.3), pytest.approx(4.72)),)
+    assert found == (WorseChannel("voltage", "motor_speed", 10, pytest.approx(4.3), pytest.approx(4.72)),)
 
 
 def test_an_error_that_falls_or_stays_is_not_said():

@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose
 from calibration.data.input_errors import BadConfiguration
 from calibration.inference import priors
 from calibration.inference.fit_notes import Remark
-from calibration.inference.foreign import inherited_priors
+from calibration.inference.foreign import inherited_friction_remarks
 from mmrjax.effects import ALL
 from mmrjax.model import paper_robots, params
 from tests.commands import read_rig
@@ -182,7 +182,7 @@ def read(tmp_path, text):
 
 def test_friction_left_in_from_another_robot_is_said(tmp_path):
     text = 'configurations = ["rover"]\n[rover]\nlike = "4W2T"\nmass = 3.0\n[motor]\ntorque_constant = 0.012\n'
-    motor, rover = inherited_priors(read(tmp_path, text))
+    motor, rover = inherited_friction_remarks(read(tmp_path, text))
     assert motor == Remark(
         "inherited_priors",
         part="motor",
@@ -195,20 +195,20 @@ def test_friction_left_in_from_another_robot_is_said(tmp_path):
 
 def test_friction_that_the_file_or_a_prior_states_is_not_another_robots(tmp_path):
     stated = "[motor]\nresistance = 1.2\nfriction_coulomb = 1e-3\nfriction_viscous = 1e-6\n"
-    assert inherited_priors(read(tmp_path, stated)) == []
+    assert inherited_friction_remarks(read(tmp_path, stated)) == []
     half = "[motor]\nresistance = 1.2\nfriction_coulomb = 1e-3\n"
-    (said,) = inherited_priors(read(tmp_path, half))
+    (said,) = inherited_friction_remarks(read(tmp_path, half))
     assert said.kept == ("motor.friction_viscous",)
-    assert inherited_priors(read(tmp_path, half), ["motor.friction_viscous"]) == []
+    assert inherited_friction_remarks(read(tmp_path, half), ["motor.friction_viscous"]) == []
 
 
 def test_robots_of_the_paper_and_small_changes_are_their_own(tmp_path):
-    assert [inherited_priors(make()) for make in paper_robots.ROBOTS.values()] == [[], [], []]
-    assert inherited_priors(read(tmp_path, "[motor]\nresistance = 0.7\n[4W2T]\nmass = 13.1\n")) == []
+    assert [inherited_friction_remarks(make()) for make in paper_robots.ROBOTS.values()] == [[], [], []]
+    assert inherited_friction_remarks(read(tmp_path, "[motor]\nresistance = 0.7\n[4W2T]\nmass = 13.1\n")) == []
 
 
 def test_heavier_robot_on_tracks_is_compared_with_the_tracks_it_is_like(tmp_path):
-    (said,) = inherited_priors(read(tmp_path, "[6T2A]\nmass = 30.0\n"))
+    (said,) = inherited_friction_remarks(read(tmp_path, "[6T2A]\nmass = 30.0\n"))
     assert (said.part, said.changed) == ("6T2A", (("mass", 30.0, 13.1),)) and "6T2A.track.guide_share" in said.kept
 
 
@@ -238,6 +238,6 @@ static = 0.6
 """
     freed = []
     for mass in ('"10 ± 20 %"', "10"):
-        freed.append(priors.free_names(read_rig(tmp_path, text.format(mass=mass)), ["rover"]))
+        freed.append(priors.loop_parameter_names(read_rig(tmp_path, text.format(mass=mass)), ["rover"]))
     assert set(freed[0]) - set(freed[1]) == {"rover.mass"}
     assert "motor.inertia" not in freed[0]  # settled runs do not show it

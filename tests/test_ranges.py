@@ -74,7 +74,7 @@ def test_a_current_that_one_sign_explains_beside_a_weight_is_doubted(tmp_path, s
     lifts = np.array([30.0, 120.0, 240.0, -30.0, -120.0, -240.0])
     current = sign * np.where(lifts > 0, 4.7, 3.2)
     rows = "".join(f"{n},{i}\n" for n, i in zip(lifts, current, strict=True))
-    found = ranges.turned_signs(
+    found = ranges.remarks_on_signs(
         read_table(tmp_path, f"motor_speed_rpm,motor_current_A\n{rows}", robot, "t.csv"),
         robot,
     )

@@ -65,7 +65,7 @@ def answered(tmp_path_factory):
     def of(**faults):
         runs = Runs("log.csv", log(**faults)).of(robot)
         sd = np.broadcast_to(SD[[0 if c.name == "motor_speed" else 1 for c in runs.channels]], runs.measured().shape)
-        space = discover.pose_candidates(runs, robot, sd, SETTINGS, {}, library)
+        space = discover.build_candidate_space(runs, robot, sd, SETTINGS, {}, library)
         return findings.rank_effects_by_weak_form(space, screening.screen_by_weak_form(space, SETTINGS), SETTINGS)
 
     return of

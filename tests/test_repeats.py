@@ -11,9 +11,9 @@ from calibration.data.runs import Runs
 from calibration.data.table import Layout
 from calibration.discovery import discover
 from calibration.inference import noise, repeats
-from calibration.inference.fit_notes import with_codes
+from calibration.inference.fit_notes import remarks_with_codes
 from calibration.inference.observers import SettledRuns
-from calibration.inference.preparation import prepare
+from calibration.inference.preparation import prepare_input
 
 
 def table(sd, times=4, seed=0):
@@ -69,8 +69,8 @@ def test_the_probability_of_a_median_is_right(count):
 
 def test_every_command_takes_the_larger_noise():
     runs = table(0.2)
-    ready = prepare(runs, robot_file.load_robot("nominal"), "current=0.02A,motor_speed=0.5%")
-    assert with_codes(ready.checked[:1], "larger_noise")
+    ready = prepare_input(runs, robot_file.load_robot("nominal"), "current=0.02A,motor_speed=0.5%")
+    assert remarks_with_codes(ready.checked[:1], "larger_noise")
     assert ready.noise.sd[0, 0] > 0.1
 
 

@@ -15,10 +15,10 @@ from test_loop_command import commanded
 from calibration.data import runs as records
 from calibration.data.runs import Runs
 from calibration.inference.calibration import calibrate
-from calibration.inference.fit_notes import with_codes
+from calibration.inference.fit_notes import remarks_with_codes
 from calibration.inference.lack_of_fit import Residuals
 from calibration.inference.observers import Histories
-from calibration.inference.residual_clusters import LEVEL, residual_clusters
+from calibration.inference.residual_clusters import LEVEL, find_residual_clusters
 from mmrjax.fidelities.steady import steady_batch
 from mmrjax.model import paper_robots
 from sweeps.report import calibration_report, page_renderer
@@ -70,7 +70,7 @@ def left(seed, columns=None, shift=None, channel=SPEED):
 @pytest.mark.slow
 def test_clean_residuals_cluster_no_more_often_than_stated():
     """Of 300 tables of five columns, three channels and tests over all rows and by configuration."""
-    assert sum(bool(residual_clusters(left(s), seed=s)) for s in range(300)) <= 0.015 * 300
+    assert sum(bool(find_residual_clusters(left(s), seed=s)) for s in range(300)) <= 0.015 * 300
 
 
 @pytest.mark.slow
@@ -83,7 +83,7 @@ def test_wild_residuals_make_no_cluster():
         noise = (free @ rng.standard_t(2.5, 3 * ROWS)).reshape(ROWS, 3)
         return leaving(made, noise)
 
-    assert sum(bool(residual_clusters(wild(s), seed=s)) for s in range(200)) <= 0.015 * 200
+    assert sum(bool(find_residual_clusters(wild(s), seed=s)) for s in range(200)) <= 0.015 * 200
 
 
 def by_wheel(size):
@@ -94,7 +94,7 @@ def by_wheel(size):
 @pytest.mark.parametrize("channel", [*(pytest.param(c, marks=pytest.mark.slow) for c in (CURRENT, MOTOR)), SPEED])
 def test_a_hidden_column_is_found_in_its_channel(channel):
     name = ("total_current", "motor_speed", "speed")[channel]
-    hits = [residual_clusters(left(s, shift=by_wheel(1.5), channel=channel)) for s in range(20)]
+    hits = [find_residual_clusters(left(s, shift=by_wheel(1.5), channel=channel)) for s in range(20)]
     assert sum(bool(f) and (f[0].column, f[0].channel, f[0].within) == ("idle_wheel", name, "") for f in hits) >= 19
     others = [c.column for f in hits for c in f if c.column != "idle_wheel"]
     assert len(others) <= 1  # what goes with it by chance is said beside it, not as a finding of its own
@@ -102,7 +102,7 @@ def test_a_hidden_column_is_found_in_its_channel(channel):
 
 def test_levels_are_said_in_the_unit_of_the_channel():
     made = left(3, shift=by_wheel(4.0))
-    (found,) = residual_clusters(made)
+    (found,) = find_residual_clusters(made)
     mean = {m.level: m.mean for m in found.levels}
     assert list(mean) == ["1", "2", "3"] and sum(m.rows for m in found.levels) == ROWS and found.unit == "mm/s"
     # simulated less measured, 3 mm/s of noise each: -14.4, 3.6, 10.8 mm/s but for the mean that the fit takes up
@@ -116,7 +116,7 @@ def test_levels_that_differ_in_one_configuration_alone_are_found_within_it():
         side = np.where(runs["configuration"] == "6T2A", 1.0, -1.0)
         return 2.0 * side * np.where(columns["who"] == "Ann", 1.0, -1.0)
 
-    hits = [residual_clusters(left(s, shift=shift)) for s in range(10)]
+    hits = [find_residual_clusters(left(s, shift=shift)) for s in range(10)]
     assert all((f[0].column, f[0].within) == ("who", "configuration") for f in hits)
     assert {m.within for m in hits[0][0].levels} == {"6T2A", "4W2T"}
 
@@ -130,14 +130,14 @@ def test_levels_whose_sign_follows_the_travel_are_found():
         made = dataclasses.replace(made, simulated=made.simulated * travel[:, None])
         return leaving(made, made.whitened + added[:, None] * [0, 0, 1])
 
-    hits = [residual_clusters(both_ways(s, 1.5)) for s in range(10)]
+    hits = [find_residual_clusters(both_ways(s, 1.5)) for s in range(10)]
     assert all(f[0].column == "who" and f[0].reversing and f[0].channel == "speed" for f in hits)
-    assert sum(bool(residual_clusters(both_ways(s, 0.0))) for s in range(30)) <= 1
+    assert sum(bool(find_residual_clusters(both_ways(s, 0.0))) for s in range(30)) <= 1
 
 
 def test_a_column_of_many_numbers_is_found_by_ranks():
     shift = lambda runs, columns: 2.0 * np.tanh(columns["yaw_rate_deg_s"])  # noqa: E731
-    hits = [residual_clusters(left(s, shift=shift)) for s in range(10)]
+    hits = [find_residual_clusters(left(s, shift=shift)) for s in range(10)]
     assert all(f[0].column == "yaw_rate_deg_s" and not f[0].levels and f[0].correlation < -0.4 for f in hits)
 
 
@@ -146,7 +146,7 @@ def test_what_shows_through_another_column_is_said_beside_it():
     rng = np.random.default_rng(1)
     direction = 60.0 * rng.integers(0, 6, ROWS)
     columns = {"idle_wheel": 1 + (direction / 60) % 3, "direction_deg": direction}
-    (found,) = residual_clusters(left(1, columns, by_wheel(2.0)))
+    (found,) = find_residual_clusters(left(1, columns, by_wheel(2.0)))
     assert found.column == "idle_wheel" and found.alike == ("direction_deg",)
 
 
@@ -172,12 +172,12 @@ def test_columns_that_have_a_role_after_all_are_let_be(case):
     made = left(0, {})
     column = ALIASES[case](made.runs, hidden)
     e = made.whitened + 5.0 * (hidden - 1)[:, None]
-    assert residual_clusters(dataclasses.replace(made, whitened=e)) == ()
+    assert find_residual_clusters(dataclasses.replace(made, whitened=e)) == ()
     runs = dataclasses.replace(made.runs, extras={name: column})
-    assert residual_clusters(dataclasses.replace(made, whitened=e, runs=runs)) == ()
+    assert find_residual_clusters(dataclasses.replace(made, whitened=e, runs=runs)) == ()
     if case in ("a time by its name", "dates"):  # the same residuals are no secret to a plain column
         runs = dataclasses.replace(made.runs, extras={"other": hidden})
-        assert residual_clusters(dataclasses.replace(made, whitened=e, runs=runs))
+        assert find_residual_clusters(dataclasses.replace(made, whitened=e, runs=runs))
 
 
 def test_structure_over_the_conditions_is_not_taken_for_a_column():
@@ -188,7 +188,7 @@ def test_structure_over_the_conditions_is_not_taken_for_a_column():
     e = made.whitened + (4 * (slope / 10 - 1) ** 2 + volts / 8)[:, None]
     column = np.round(volts / 12 + slope / 10 + 0.3 * rng.standard_normal(ROWS))
     runs = dataclasses.replace(made.runs, extras={"effort": column})
-    assert residual_clusters(dataclasses.replace(made, whitened=e, runs=runs)) == ()
+    assert find_residual_clusters(dataclasses.replace(made, whitened=e, runs=runs)) == ()
 
 
 def test_empty_cells_and_missing_readings_are_let_be():
@@ -196,11 +196,13 @@ def test_empty_cells_and_missing_readings_are_let_be():
     columns["idle_wheel"][:9] = np.nan
     made = left(8, columns, lambda r, c: np.nan_to_num(by_wheel(3.0)(r, {"idle_wheel": np.nan_to_num(c["idle_wheel"], nan=1.0)})))  # fmt: skip
     there = made.counts & (np.arange(ROWS) % 7 > 0)[:, None]
-    found = residual_clusters(dataclasses.replace(made, counts=there, whitened=np.where(there, made.whitened, 0.0)))
+    found = find_residual_clusters(
+        dataclasses.replace(made, counts=there, whitened=np.where(there, made.whitened, 0.0))
+    )
     assert found[0].column == "idle_wheel" and "not stated" in {m.level for m in found[0].levels}
     assert sum(m.rows for m in found[0].levels) == there[:, SPEED].sum()
     nobody = dataclasses.replace(made, counts=np.zeros_like(there), whitened=np.zeros_like(made.whitened))
-    assert residual_clusters(nobody) == ()
+    assert find_residual_clusters(nobody) == ()
 
 
 def test_histories_are_compared_by_the_means_of_their_runs():
@@ -223,9 +225,9 @@ def test_histories_are_compared_by_the_means_of_their_runs():
         runs = Runs("toy", columns, extras={"wheel": wheel, "sample": np.tile(np.arange(samples) * 1.0, runs_of)})
         return leaving(Residuals(Histories, runs, simulated, e, np.ones(e.shape, bool), jacobian, np.zeros(2)), e)
 
-    false = [residual_clusters(made(s, 0.0), seed=s) for s in range(100)]
+    false = [find_residual_clusters(made(s, 0.0), seed=s) for s in range(100)]
     assert sum(map(bool, false)) <= 3
-    found = residual_clusters(made(1, 4.0))
+    found = find_residual_clusters(made(1, 4.0))
     assert [c.column for c in found] == ["wheel"] and sum(m.rows for m in found[0].levels) == runs_of
     assert len(found[0].residual) == runs_of
 
@@ -286,14 +288,14 @@ def test_the_loop_says_what_its_last_fit_leaves_clustered():
     found = SETTLED.discover(runs)
     document = found.to_json()
     assert [(c.column, c.channel) for c in found.residual_clusters] == [("idle_wheel", "speed")]
-    (remark,) = with_codes(found.remarks, "residual_cluster")
+    (remark,) = remarks_with_codes(found.remarks, "residual_cluster")
     assert remark.cluster is found.residual_clusters[0]
     assert document["residual_clusters"][0]["p"] < LEVEL
 
 
 def clustered():
     """What residuals cluster by where one wheel in three idles, of a linear fit."""
-    (found,) = residual_clusters(left(0, shift=by_wheel(2.0)))
+    (found,) = find_residual_clusters(left(0, shift=by_wheel(2.0)))
     return found
 
 

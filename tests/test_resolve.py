@@ -10,7 +10,7 @@ from calibration.data import runs as records
 from calibration.data.input_errors import BadConfiguration
 from calibration.discovery import resolve as room
 from calibration.discovery.location import DiscrepancyLocation
-from calibration.discovery.loop_notes import Asked
+from calibration.discovery.loop_notes import TrackModelQuestion
 from mmrjax.effects import ALL, BY_NAME
 from mmrjax.model import paper_robots
 
@@ -32,11 +32,11 @@ def where(balance, alike=()):
 @pytest.mark.parametrize(
     ("case", "asked"),
     [
-        (dict(unnamed=where("slip")), Asked("missing", "slip", "slope")),
-        (dict(unnamed=where("motor", ("gearbox", "track"))), Asked("missing", "track", "slope")),
-        (dict(remains=where("ground")), Asked("missing", "ground", "slope")),
-        (dict(effects=("nonlinear_slip",)), Asked("found", effects=("nonlinear_slip",))),
-        (dict(alternatives=(SimpleNamespace(effects={"vibration_slip": 1.0}),)), Asked("near", effects=("vibration_slip",))),
+        (dict(unnamed=where("slip")), TrackModelQuestion("missing", "slip", "slope")),
+        (dict(unnamed=where("motor", ("gearbox", "track"))), TrackModelQuestion("missing", "track", "slope")),
+        (dict(remains=where("ground")), TrackModelQuestion("missing", "ground", "slope")),
+        (dict(effects=("nonlinear_slip",)), TrackModelQuestion("found", effects=("nonlinear_slip",))),
+        (dict(alternatives=(SimpleNamespace(effects={"vibration_slip": 1.0}),)), TrackModelQuestion("near", effects=("vibration_slip",))),
         (dict(unnamed=where("electrical"), effects=("series_resistance",)), None),
         (dict(), None),
     ],
@@ -47,10 +47,10 @@ def test_it_is_asked_about_slip_track_and_ground_alone(case, asked):
 
 def test_nothing_is_run_where_it_has_no_say(monkeypatch):
     monkeypatch.setattr(room, "calibrate", lambda *a, **k: pytest.fail("it was asked"))
-    assert room.resolve(found()) is None
+    assert room.fit_track_model(found()) is None
     wheels = found(unnamed=where("slip"))
     wheels.included = np.asarray(wheels.runs["configuration"] == "4W2T")
-    assert room.resolve(wheels) is None
+    assert room.fit_track_model(wheels) is None
 
 
 def test_histories_are_refused():
@@ -59,7 +59,7 @@ def test_histories_are_refused():
         series.runs, columns=series.runs.columns | {"time_s": np.zeros(len(series.runs))}
     )
     with pytest.raises(BadConfiguration, match="histories"):
-        room.resolve(series)
+        room.fit_track_model(series)
 
 
 def test_what_the_track_model_has_by_itself_is_left_out_of_the_robot(monkeypatch):
@@ -75,7 +75,7 @@ def test_what_the_track_model_has_by_itself_is_left_out_of_the_robot(monkeypatch
 
     monkeypatch.setattr(room, "calibrate", fit)
     with pytest.raises(KeyboardInterrupt):
-        room.resolve(asked, noise="speed=1%")
+        room.fit_track_model(asked, noise="speed=1%")
     rows, robot, options = seen[0]
     assert [e.name for e in robot.effects] == ["series_resistance"] and set(rows["configuration"]) == {"6T2A"}
     assert options["model"] == "track" and options["noise"] == "speed=1%"

@@ -262,10 +262,13 @@ def test_what_is_known_exactly_is_never_freed(tmp_path):
     robot = read(tmp_path, lifted)
     assert robot.rig.exact == {"bench.radius"} and same(again(tmp_path, robot), robot)
     unsure = read(tmp_path, lifted.replace("0.02 ± 0", "0.02 ± 1 %"))
-    freed, held = (priors.free_names(r, ["bench"]) for r in (unsure, robot))
+    freed, held = (priors.loop_parameter_names(r, ["bench"]) for r in (unsure, robot))
     assert set(freed) - set(held) == {"bench.radius"}
     dry = read(tmp_path, BENCH.replace("0.1 ± 0.05", "0.1 ± 0"))
-    assert "bench.loss_coulomb" not in (*priors.default_names(["bench"], dry), *priors.free_names(dry, ["bench"]))
+    assert "bench.loss_coulomb" not in (
+        *priors.default_names(["bench"], dry),
+        *priors.loop_parameter_names(dry, ["bench"]),
+    )
     assert "bench.radius" not in uncertain_inputs.default_input_names(robot, ["bench"], battery=False)
     with pytest.raises(BadConfiguration, match=r"--free bench\.radius: the robot's file states it as exact \(± 0\)"):
         priors.parameter_coordinates(robot, ["bench.radius"])
@@ -660,6 +663,6 @@ force_viscous_N_s_m = 40.0
     assert sds["carriage.radius"] == 0.0 == sds["motor.torque_constant"]
     assert sds["carriage.inertia"] == pytest.approx(0.05) and sds["carriage.loss_coulomb"] == pytest.approx(6.0)
     assert "carriage.loss_viscous" not in sds  # which stands without ±
-    assert "carriage.radius" not in priors.free_names(robot, ["carriage"])
+    assert "carriage.radius" not in priors.loop_parameter_names(robot, ["carriage"])
     freed = read(tmp_path, unit.replace('"1000 ± 0"', "1000.0"))
     assert "carriage.radius" not in freed.rig.stated

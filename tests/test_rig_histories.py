@@ -266,7 +266,7 @@ def test_a_defect_moves_the_current_of_an_imposed_speed_at_once(tmp_path):
         ).reading
 
     expected = np.asarray(jax.jit(jax.jacfwd(readings))(jnp.asarray(0.0)))[:, 0]
-    found = np.asarray(jax.jit(lambda r: observer.defective(r, (effect,)))(robot))[0, 0]
+    found = np.asarray(jax.jit(lambda r: observer.response_to_errors(r, (effect,)))(robot))[0, 0]
     assert_allclose(found.sum(0)[:, 0], expected, rtol=1e-7)
     assert_allclose(np.diag(found[:, :, 0]), expected, rtol=1e-7)  # of the knot at each sample alone
     assert (np.abs(expected) > 0.9).all()  # 1 / (16 × 0.05 N·m/A), over or by an efficiency of 0.8
@@ -353,9 +353,9 @@ def test_the_loop_looks_for_a_delay_that_no_file_rules_out(tmp_path, stated, fre
     robot = robot_file.load_robot(
         text_file(path, text.replace('delay = "0 ± 0.05"', f"delay = {stated}" if stated else ""))
     )
-    names = priors.free_names(robot, ("bench",), *observers.Histories.free())
+    names = priors.loop_parameter_names(robot, ("bench",), *observers.Histories.free())
     assert ("rig.delay" in names) == free and "motor.inertia" in names
-    of_settled = priors.free_names(robot, ("bench",), *observers.KINDS[1].free())
+    of_settled = priors.loop_parameter_names(robot, ("bench",), *observers.KINDS[1].free())
     assert "rig.delay" not in of_settled
 
 

@@ -389,7 +389,7 @@ def test_what_is_not_the_ground_follows_the_first_surface(tmp_path):
     robot = vehicle()
     runs = read(tmp_path, ON, robot)
     apart = surfaces.with_surface_configurations(robot, runs)
-    names = priors.free_names(apart, runs.configurations_named(apart))
+    names = priors.loop_parameter_names(apart, runs.configurations_named(apart))
     assert "rig-felt.radius" in names and "rig-tiles.radius" not in names
     assert {"rig-felt.ground.rolling_resistance", "rig-tiles.ground.rolling_resistance"} <= set(names)
     coordinates = priors.parameter_coordinates(apart, names)

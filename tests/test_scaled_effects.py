@@ -31,7 +31,7 @@ def rig(kind, imposed, folder):
     rigs.case(world).write(folder)
     robot = robot_file.read_robot(folder / "rig.toml")
     runs = records.read_runs(folder / "table.csv", robot=robot)
-    return robot, runs, scales.library_of_size(robot, runs.conditions(robot), effects.BY_NAME)
+    return robot, runs, scales.scale_library(robot, runs.conditions(robot), effects.BY_NAME)
 
 
 def with_all(robot, library, share):
@@ -63,7 +63,7 @@ def test_offset_of_an_ammeter_follows_its_range_and_not_a_motor_without_load(tmp
     )
     robot = robot_file.read_robot(file)
     size = mm.Conditions(0, voltage=[6.0, 12.0, 24.0])
-    library = scales.library_of_size(robot, size, effects.BY_NAME | effects.OF_CHANNELS)
+    library = scales.scale_library(robot, size, effects.BY_NAME | effects.OF_CHANNELS)
     spec = amplitude_of(library["motor_current_offset"]()).spec
     assert 0.4 < spec.bounds[1] < 1.5 and spec.sd * 4 > 0.4
 
@@ -157,7 +157,7 @@ def test_a_motor_that_states_what_it_bears_is_judged_by_that(tmp_path):
         able = dataclasses.replace(robot, motor=dataclasses.replace(robot.motor, temperature_limit=hot))
         path = {"motor.resistance_thermal_winding": 4.0, "motor.resistance_thermal_housing": 400.0}
         able = params.replace(able, {name: jnp.asarray(value) for name, value in path.items()})
-        kind = scales.library_of_size(able, runs.conditions(able), effects.BY_NAME)["torque_constant_saturation"]
+        kind = scales.scale_library(able, runs.conditions(able), effects.BY_NAME)["torque_constant_saturation"]
         limits.append(amplitude_of(kind()).spec.bounds[1] * float(able.current_continuous) ** 2)
     assert limits[0] == pytest.approx(limits[1], rel=1e-6)
 
@@ -187,13 +187,13 @@ def test_friction_along_the_travel_is_sized_by_the_travel_and_looked_for_where_a
     turned = scales.output_rotation(runs, robot)
     assert turned == pytest.approx(2 * np.pi * np.sqrt((1 + 4 + 4) / 3))
     kinds = [
-        scales.library_of_size(robot, runs.conditions(robot), effects.BY_NAME, x)["position_friction"]
+        scales.scale_library(robot, runs.conditions(robot), effects.BY_NAME, x)["position_friction"]
         for x in (turned, 2 * turned)
     ]
     one, two = (amplitude_of(kind()).spec for kind in kinds)
     assert two.sd == pytest.approx(0.5 * one.sd) and two.bounds[1] == pytest.approx(0.5 * one.bounds[1])
     # At its sd it is as large over the travel as a torque of the same share.
-    offset = scales.library_of_size(robot, runs.conditions(robot), effects.BY_NAME, turned)["presliding"]
+    offset = scales.scale_library(robot, runs.conditions(robot), effects.BY_NAME, turned)["presliding"]
     assert one.sd * turned == pytest.approx(amplitude_of(offset()).spec.sd, rel=0.2)
     blind = dataclasses.replace(robot, rig=dataclasses.replace(robot.rig, channels=("output_speed",)))
     assert not scales.effect_applies(effects.BY_NAME["position_friction"], blind)

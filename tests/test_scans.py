@@ -55,7 +55,7 @@ def test_a_search_finds_a_delay_between_coarse_samples(coarse):
     found = multistart.search_one_by_one(
         problem, known, starts, multistart.initial_noise_shares(known), lambda said: None
     )
-    low, high = (0.02 * z for z in scans.scan_all(problem, found.best.z)[1].interval())
+    low, high = (0.02 * z for z in scans.scans_at_optimum(problem, found.best.z)[1].interval())
     assert found.best.converged
     assert low <= TRUTH <= high and 0.02 < low < high < 0.04
     assert abs(0.02 * found.best.z[1] - TRUTH) < 4 * 0.02 * found.best.sd[1] < 0.01
@@ -92,7 +92,7 @@ def test_a_scan_is_as_fine_as_the_rise_of_a_current(coarse):
     robot, runs = coarse
     problem = posed(robot, runs)
     assert scans.scanned_coordinates(problem) == (1,)
-    count = problem.observe.scan_points(problem, 1)
+    count = problem.observe.number_of_scan_points(problem, 1)
     assert 2 * scans.RANGE * 0.02 / count <= 0.5 * 1e-3 / 3.0
 
 
@@ -105,7 +105,7 @@ def test_the_interval_of_a_scan_holds_every_basin_that_may_be():
     assert low == pytest.approx(-1 - 0.1 * (1.96**2 - 1) ** 0.5, abs=0.01)
     assert high == pytest.approx(1 + 0.1 * 1.96, abs=0.01)
     assert seen.parts() == 2 and seen.open() == (False, False)
-    assert [round(at[k], 2) for k in seen.basins()] == [1.0, -1.0, 3.0]
+    assert [round(at[k], 2) for k in seen.local_minima()] == [1.0, -1.0, 3.0]
     weights = np.array([1.0, np.exp(-0.5), np.exp(-3.0)])
     places = np.array([1.0, -1.0, 3.0])
     middle = weights @ places / weights.sum()
@@ -146,7 +146,7 @@ def test_a_fit_that_may_be_proposed_goes_on_until_it_is_an_optimum(monkeypatch):
         ), None
 
     monkeypatch.setattr(time_histories, "search_rollouts", ended)
-    monkeypatch.setattr(time_histories, "_evaluator", lambda *_: None)
+    monkeypatch.setattr(time_histories, "_parallel_evaluator", lambda *_: None)
     observer = SimpleNamespace(policy=SimpleNamespace(steps=30, batch=8))
     search = functools.partial(time_histories.Histories.search, observer, SimpleNamespace(data=None))
     found, _ = search(np.zeros((3, 2)), np.ones(3))
@@ -167,6 +167,6 @@ def test_a_scan_sees_a_minimum_that_no_point_of_its_grid_is_in():
         cost = np.minimum(0.5 * ((x - at) / width) ** 2, 800.0 + 100.0 * x)
         return cost, np.stack([x, np.zeros_like(x)], 1)
 
-    problem = SimpleNamespace(observe=SimpleNamespace(scan_points=lambda problem, k: 32, scan=scan))
+    problem = SimpleNamespace(observe=SimpleNamespace(number_of_scan_points=lambda problem, k: 32, scan=scan))
     low, high = scans.scan_coordinate(problem, np.array([at, 0.0]), None, 0).interval()
     assert_allclose([low, high], [at - Z95 * width, at + Z95 * width], atol=0.2 * width)

@@ -12,7 +12,7 @@ from worlds import histories, rigs
 
 from calibration.discovery import candidates, screening, search
 from calibration.discovery.candidates import Candidate, fill_slots
-from calibration.discovery.result import Ranked, Ranking
+from calibration.discovery.result import EffectRanking, RankedEffect
 from calibration.discovery.score_tests import ScoreTable
 from calibration.discovery.settings import settings_for
 from calibration.inference.held_out import predict_unseen
@@ -35,7 +35,7 @@ def space():
 
 
 def test_the_program_of_a_log_has_the_effects_that_are_asked_for_and_those_of_its_room(space):
-    problem, indices = space.with_room(["churning"]).fitted_by([("brush_drop", ""), ("", "churning")])
+    problem, indices = space.with_room(["churning"]).problem_for_sets([("brush_drop", ""), ("", "churning")])
     names = problem.coordinates.names
     assert set(names) == {"churning", "brush_drop"} == {e.name for e in problem.base.effects}
     assert [tuple(names[k] if k >= 0 else "" for k in each) for each in indices] == [
@@ -73,7 +73,7 @@ def test_the_base_of_a_log_is_fitted_in_the_program_of_its_room(space, monkeypat
 @pytest.mark.parametrize("lost", [False, True])
 def test_other_basins_of_a_log_are_searched_in_the_program_of_its_room(space, monkeypatch, lost):
     """With the priors of its coordinates, which are more than the base's. Not of a fit that is lost."""
-    problem, (empty,) = space.with_room(["churning"]).fitted_by([("", "")])
+    problem, (empty,) = space.with_room(["churning"]).problem_for_sets([("", "")])
     size, priors = space.free + 4, []
 
     def rollouts(evaluate, starts, data, weights, *_, **options):
@@ -85,7 +85,7 @@ def test_other_basins_of_a_log_are_searched_in_the_program_of_its_room(space, mo
     monkeypatch.setattr(time_histories, "search_rollouts", rollouts)
     monkeypatch.setattr(time_histories.scans, "scanned_coordinates", lambda problem: (0,))
     monkeypatch.setattr(
-        time_histories.scans, "search_lower_basins", lambda problem, end, data, search, tell: search(end[0].z + 1)
+        time_histories.scans, "search_lower_minima", lambda problem, end, data, search, tell: search(end[0].z + 1)
     )
     weights, which = space.weight[None], np.asarray(empty)[None]
     best, _ = space.bare.observe.search(
@@ -111,7 +111,7 @@ def linear_world(space, seed=3):
     at = Candidate(("", ""), np.zeros(p + 4), np.ones(p + 4), 0.5 * float(residual @ residual), np.zeros(2),
                    np.zeros(2), True, True, True)  # fmt: skip
     linear = SimpleNamespace(jacobian=jacobian, residual=residual, signatures=signatures)
-    return screening.Regression(space, at, linear, scores, ANALYST.settings), at, linear, m
+    return screening.LinearisedFits(space, at, linear, scores, ANALYST.settings), at, linear, m
 
 
 def test_a_regression_is_the_least_squares_fit_of_base_amplitudes_and_their_priors(space):
@@ -140,7 +140,7 @@ def test_a_regression_takes_an_effect_of_the_other_fit_away(space):
     residual = np.concatenate([linear.residual[:80], np.zeros(p + 4)]) + wide @ there
     fitted = dataclasses.replace(at, active=("churning", ""), z=there, cost=0.5 * float(residual @ residual))
     after = SimpleNamespace(jacobian=wide, residual=residual, signatures=linear.signatures)
-    back = screening.Regression(space, fitted, after, beside.scores, ANALYST.settings)(("", ""))
+    back = screening.LinearisedFits(space, fitted, after, beside.scores, ANALYST.settings)(("", ""))
     assert back.cost == pytest.approx(beside(("", "")).cost, rel=1e-9)
     assert_allclose(back.z, beside(("", "")).z, atol=1e-9)
 
@@ -238,7 +238,7 @@ def test_fits_with_other_sds_are_few_steps_from_those_that_are_known(space, monk
             np.array(starts), one + 1, np.zeros((1, size, size)), one[:, 0], one[:, 0], one[:, 0], one[:, 0]
         ), None
 
-    monkeypatch.setattr(candidates, "search_each", search)
+    monkeypatch.setattr(candidates, "fit_from_each_start", search)
     near = dataclasses.replace(space, near={known: at})
     found = candidates.fit_candidates(near, [(known, 0 * at), (other, 0 * at)], ANALYST.settings)
     assert [c.active for c in found] == [known, other]
@@ -276,11 +276,11 @@ def test_a_refit_without_a_block_is_a_step_of_gauss_and_newton():
 
 # --- the first answer -------------------------------------------------------------------------------------
 
-RANKING = Ranking(
+RANKING = EffectRanking(
     True, 0.002, 9.0,
-    (Ranked("churning", "loss torque that changes with speed", "N·m", 412.0, 0.0123, 0.0004),
-     Ranked("brush_drop", "voltage drop that changes with current", "V", 4.0, 0.1, 0.05),
-     Ranked("bending_loss", "loss torque that changes with speed", "N·m", 430.0, -0.01, 0.001, True)),
+    (RankedEffect("churning", "loss torque that changes with speed", "N·m", 412.0, 0.0123, 0.0004),
+     RankedEffect("brush_drop", "voltage drop that changes with current", "V", 4.0, 0.1, 0.05),
+     RankedEffect("bending_loss", "loss torque that changes with speed", "N·m", 430.0, -0.01, 0.001, True)),
 )  # fmt: skip
 
 
@@ -377,8 +377,8 @@ def test_effects_are_ranked_at_the_set_of_the_equations_where_the_base_is_far(mo
         SimpleNamespace(test=SimpleNamespace(null=0)),
     )
     wanted = (best, "its diagnosis") if begun else (base, left)
-    assert search._linearised_fit(space, base, left, (), settings) == wanted
-    assert len(fits) == (far > 4) and search._linearised_fit(
+    assert search._fit_to_rank_at(space, base, left, (), settings) == wanted
+    assert len(fits) == (far > 4) and search._fit_to_rank_at(
         SimpleNamespace(begins={}, free=1), base, left, (), settings
     ) == (base, left)
 
@@ -395,6 +395,6 @@ def test_effects_that_remain_without_another_take_the_first_slots(monkeypatch):
     settings = dataclasses.replace(ANALYST.settings, slots=3)
     z, zeros = np.arange(2 + 6.0), np.zeros(3)  # two base parameters, then amplitudes and shapes
     best = Candidate(("churning", "brush_drop", ""), z, z, 0.0, zeros, zeros, True, True, True)
-    fewer = search.without_each(SimpleNamespace(free=2), best, settings)
+    fewer = search.refit_without_each(SimpleNamespace(free=2), best, settings)
     assert [c.active for c in fewer] == [("brush_drop", "", ""), ("churning", "", "")]
     assert_allclose(asked[0][1], [0, 1, 3, 0, 0, 6, 0, 0])

@@ -82,12 +82,12 @@ def test_uneven_steps_and_repeats_count_as_they_are():
     """A straight line leaves nothing whatever its steps. Of repeats, what they differ by."""
     uneven = table(0.0, slopes=np.array([0.0, 1.0, 7.0, 9.0, 20.0]), seed=1)
     straight = 1 + 0.1 * uneven["slope_deg"]
-    weights, used = series_noise._differences(
+    weights, used = series_noise._differences_from_neighbours(
         straight, uneven["slope_deg"], series_noise.series_along(uneven, "slope_deg")
     )
     assert used == 4 and np.abs(weights @ straight).max() < 1e-12
     repeats = np.array([3.0, 3.0, 3.0])
-    weights, _ = series_noise._differences(np.array([1.0, 2.0, 4.0]), repeats, [np.arange(3)])
+    weights, _ = series_noise._differences_from_neighbours(np.array([1.0, 2.0, 4.0]), repeats, [np.arange(3)])
     assert_allclose(weights.toarray(), [[-0.5, 1.0, -0.5]])
 
 
@@ -136,10 +136,10 @@ def test_series_that_go_backward_are_others():
 def test_voltages_that_differ_by_the_sag_of_the_supply_are_one_level():
     sagging = np.array([11.989, 11.408, 10.828, 17.988, 17.408, 16.827, 23.988, 23.407, 22.827])
     levels = np.repeat([11.989, 17.988, 23.988], 3)
-    assert_array_equal(series_noise.without_sag(sagging), levels)
+    assert_array_equal(series_noise.voltage_levels(sagging), levels)
     for kept in (np.array([12.0, 12.0, 24.0, 24.0]), np.linspace(5, 24, 20)):
-        assert_array_equal(series_noise.without_sag(kept), kept)
-    assert_array_equal(series_noise.without_sag(np.array([36.5, 36.1, 35.6])), np.full(3, 36.5))
+        assert_array_equal(series_noise.voltage_levels(kept), kept)
+    assert_array_equal(series_noise.voltage_levels(np.array([36.5, 36.1, 35.6])), np.full(3, 36.5))
 
 
 @pytest.mark.parametrize("stated", [None, "current=2%,motor_speed=0.5%"])

@@ -19,7 +19,7 @@ from calibration.data.input_errors import BadData
 from calibration.data.settling import rolling_readings
 from calibration.inference import checks, observers
 from calibration.inference import noise as noises
-from calibration.inference.foresight import Foresight
+from calibration.inference.foresight import InformationForecast
 from calibration.words import settle_words as words
 from sweeps.commands import rig_check
 from tests.commands import csv_text, ends, read_rig, text_file
@@ -305,7 +305,7 @@ def test_signs_and_units_that_cannot_be_are_said_with_rows_and_remedy(tmp_path, 
 
 
 #: What a fit would say of a table, where none is made.
-NOTHING_FORESEEN = Foresight((), (), (), (), (), None)
+NOTHING_FORESEEN = InformationForecast((), (), (), (), (), None)
 SIGNS = [case for case in WRONG if "sign" in case or "round" in case]
 
 

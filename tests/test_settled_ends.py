@@ -81,7 +81,7 @@ def gripping():
 def ends_of(runs, p):
     """The ends of six starts on a ground, which of them slide, and what settled travel of the true robot shows."""
     problem = ANALYST.space(runs).bare
-    ends = settled_ends.settled_ends(problem)
+    ends = settled_ends.settled_ends_of_runs(problem)
     truth, sound = settled.readings(histories.starts(p), p)
     return ends, settled_ends._slides_at_end(problem, ends), truth.T, sound
 
@@ -113,6 +113,6 @@ def test_a_reading_that_still_changes_has_no_settled_end(gripping):
     current = runs["total_current_A"].copy()
     current[mine] += 2.0 * runs["time_s"][mine]  # 2 A/s
     changed = dataclasses.replace(runs, columns=runs.columns | {"total_current_A": current})
-    before, after = (settled_ends.settled_ends(ANALYST.space(r).bare).mean for r in (runs, changed))
+    before, after = (settled_ends.settled_ends_of_runs(ANALYST.space(r).bare).mean for r in (runs, changed))
     assert np.isfinite(before[4, 0]) and np.isnan(after[4, 0])
     assert_array_equal(np.delete(before, 4, 0), np.delete(after, 4, 0))

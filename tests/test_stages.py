@@ -77,11 +77,11 @@ def test_our_own_classes_come_back_by_name(tmp_path):
     robot = paper_robots.nominal()
     strong = scaled_effect(effects.BY_NAME["iron_loss"], (2.0, 1.0, 3.0))
     robot = dataclasses.replace(robot, effects=(strong(), next(iter(curve.CURVES.values()))()))
-    now = again(tmp_path, (robot, Noise, channels.find_channel("speed"), menu.blocked, records.read_runs("measured")))
+    now = again(tmp_path, (robot, Noise, channels.find_channel("speed"), menu.locked, records.read_runs("measured")))
     assert jax.tree.structure(now[0]) == jax.tree.structure(robot)
     assert all(map(np.array_equal, jax.tree.leaves(now[0]), jax.tree.leaves(robot)))
     assert type(now[0].effects[0]) is strong
-    assert now[1] is Noise and now[2] is channels.find_channel("speed") and now[3] is menu.blocked
+    assert now[1] is Noise and now[2] is channels.find_channel("speed") and now[3] is menu.locked
     assert list(now[4].columns) == list(records.read_runs("measured").columns)
 
 

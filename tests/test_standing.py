@@ -15,20 +15,20 @@ from worlds import histories, laws, settled, tables
 from calibration.discovery import discover, standing
 from calibration.discovery.candidates import Candidate, fill_slots, fit_candidates, start_of_fit
 from calibration.discovery.discrepancy import locate_discrepancy
-from calibration.discovery.loop_notes import CurveOver, NameSupport, NameTest
+from calibration.discovery.loop_notes import NameSupport, NameTest, PlacedCurve
 from calibration.discovery.projection import Projection
 from calibration.discovery.score_tests import augment_with_columns
-from calibration.discovery.search import Search, diagnose_candidate
+from calibration.discovery.search import SearchResult, diagnose_candidate
 from calibration.discovery.settings import WITHOUT_NAME, settings_for
-from calibration.discovery.smooth import FALL, LENGTHS, PRODUCT, SIZES, WIDE, smooth_curve, smooth_surface
+from calibration.discovery.smooth import FALL, LENGTHS, PRODUCT, SIZES, WIDE, fit_smooth_curve, fit_smooth_surface
 from calibration.discovery.standing import (
-    _chosen_again,
     _curve_evidence,
     _deficient_equations,
     _evidence_over_curves,
     _largest_root,
-    _varies_most,
-    _weakest_run,
+    _largest_variation,
+    _most_influential_run,
+    _recurrence,
     cost_of_names,
     equation_of_place,
     evidence_of_names,
@@ -75,7 +75,7 @@ def gained(toy, columns):
 
 
 def test_evidence_of_a_curve_is_the_largest_marginal_likelihood(toy):
-    found = smooth_curve(toy.linear, "track", "speed_motor", toy.counts)
+    found = fit_smooth_curve(toy.linear, "track", "speed_motor", toy.counts)
     raw = bases.place_signature(toy.linear, "track", found.basis(toy.linear.variable("speed_motor")))
     assert found.evidence == pytest.approx(gained(toy, found.scale * raw @ found.root), rel=1e-6)
     # no other prior that is tried makes the readings more likely
@@ -87,7 +87,7 @@ def test_evidence_of_a_curve_is_the_largest_marginal_likelihood(toy):
         root = np.linalg.cholesky(prior + 1e-6 * np.eye(6))
         scale = size / np.sqrt(np.diag(a).max())
         assert gained(toy, scale * raw @ root) < found.evidence + 1e-6
-    others = [smooth_curve(toy.linear, *at, toy.counts) for at in (("slip", "slope"), ("track", "slope"))]
+    others = [fit_smooth_curve(toy.linear, *at, toy.counts) for at in (("slip", "slope"), ("track", "slope"))]
     assert found.evidence > 1.5 * max(o.evidence for o in others) > 0  # what is missing is where it is
 
 
@@ -95,7 +95,7 @@ def test_a_curve_of_rows_in_mirror_image_is_the_same(toy):
     way = np.where(np.arange(toy.rows) % 2, 1.0, -1.0)
     signals = SimpleNamespace(speed_motor=way * toy.linear.signals.speed_motor, direction=way)
     turned = dataclasses.replace(toy.linear, defects=toy.linear.defects * way[:, None], signals=signals)
-    found, wanted = (smooth_curve(linear, "track", "speed_motor", toy.counts) for linear in (turned, toy.linear))
+    found, wanted = (fit_smooth_curve(linear, "track", "speed_motor", toy.counts) for linear in (turned, toy.linear))
     assert (found.low, found.high) == (wanted.low, wanted.high) and wanted.evidence > 10
     assert found.evidence == pytest.approx(wanted.evidence, rel=1e-9)
 
@@ -183,7 +183,7 @@ def test_a_constant_is_weighed_against_waves_of_which_runs_show_a_piece(law, nam
 
 
 def test_evidence_of_a_surface_is_the_largest_marginal_likelihood(toy):
-    found = smooth_surface(toy.linear, "track", ("speed_motor", "slope"), toy.counts, Projection(toy.linear))
+    found = fit_smooth_surface(toy.linear, "track", ("speed_motor", "slope"), toy.counts, Projection(toy.linear))
     assert found.evidence == pytest.approx(gained(toy, found.columns), rel=1e-6)
     sides = []
     for name in ("speed_motor", "slope"):
@@ -267,8 +267,8 @@ def test_effect_and_curve_pay_for_what_was_searched_in_their_equation(monkeypatc
     space = SimpleNamespace(free=2, library=Library(range(12)))
     settings, best = SimpleNamespace(slots=4), names_of(0.01 * np.eye(1), 2)
     best.z[2] = 5.0  # fifty sds
-    curves = [(4.0, CurveOver("track", ("speed",))), (7.0, CurveOver("track", ("slope",)))]
-    curves += [(90.0, CurveOver("electrical", (str(k),))) for k in range(5)]
+    curves = [(4.0, PlacedCurve("track", ("speed",))), (7.0, PlacedCurve("track", ("slope",)))]
+    curves += [(90.0, PlacedCurve("electrical", (str(k),))) for k in range(5)]
     monkeypatch.setattr("calibration.discovery.standing._curve_evidence", lambda *_: curves)
     without = dataclasses.replace(best, cost=best.cost + 20.0)
     found = _evidence_over_curves(space, best, without, "e0", None, (), settings)
@@ -293,19 +293,19 @@ def test_root_is_that_of_what_a_column_explains_beside_others(toy):
 
     assert _largest_root(jacobian, residual, signature) ** 2 == pytest.approx(fall(np.ones(readings)), rel=1e-8)
     space, rows = SimpleNamespace(included=toy.counts), np.arange(toy.rows)
-    row, least = _weakest_run(space, toy.linear.runs(), jacobian, residual, signature)
+    row, least = _most_influential_run(space, toy.linear.runs(), jacobian, residual, signature)
     falls = [fall(np.repeat(rows != k, 3)) for k in rows]
     assert row == 1 + int(np.argmin(falls)) and least**2 == pytest.approx(min(falls), rel=1e-8)
     runs = np.split(rows, 4)  # as of histories
-    run, least = _weakest_run(space, runs, jacobian, residual, signature)
+    run, least = _most_influential_run(space, runs, jacobian, residual, signature)
     falls = [fall(np.repeat(~np.isin(rows, run), 3)) for run in runs]
     assert run == 1 + int(np.argmin(falls)) and least**2 == pytest.approx(min(falls), rel=1e-8)
-    assert _weakest_run(space, runs[:2], jacobian, residual, signature) == (None, math.inf)
+    assert _most_influential_run(space, runs[:2], jacobian, residual, signature) == (None, math.inf)
     of_one = np.where(
         np.repeat(np.isin(rows, runs[1]), 3)[:, None], signature, 0.1 * signature
     )  # the others tell little
     same = -np.append(10.0 * of_one[:, 0], np.zeros(len(residual) - readings))
-    alike = [_weakest_run(space, runs, jacobian, same, of_one, differ)[1] for differ in (False, True)]
+    alike = [_most_influential_run(space, runs, jacobian, same, of_one, differ)[1] for differ in (False, True)]
     assert alike[0] < 0.3 * _largest_root(jacobian, same, of_one) < 0.9 * alike[1]
 
 
@@ -335,7 +335,7 @@ def test_name_stands_by_its_score_its_curves_and_its_rows(root, without, evidenc
     # the other runs of a log test one effect that is chosen already
     of_runs = [dataclasses.replace(test, what="run", root_without=x).rests_on for x in (2.5, 2.7)]
     assert of_runs == [10 if root >= 3.3 else None, None]
-    renumbered = NameSupport(True, tests=(test,)).numbered(np.arange(1, 21) * 2)
+    renumbered = NameSupport(True, tests=(test,)).with_row_numbers(np.arange(1, 21) * 2)
     assert renumbered.rests_on("a") == (None if rests_on is None else 20) and renumbered.rests_on("b") is None
 
 
@@ -347,7 +347,7 @@ def test_amplitude_that_changes_with_a_variable_is_seen_and_one_that_does_not_is
     variables = {"slope": x, "current": current}
     linear = SimpleNamespace(
         readings=2 * rows, rows=rows, at_points=lambda counts: counts,
-        in_travel=lambda place, name: (variables.get(name, np.ones(rows)), np.ones(rows)),
+        curve_variable=lambda place, name: (variables.get(name, np.ones(rows)), np.ones(rows)),
     )  # fmt: skip
     space = SimpleNamespace(
         free=0, included=np.ones(rows, bool), bare=SimpleNamespace(observe=SimpleNamespace(long=False))
@@ -357,7 +357,7 @@ def test_amplitude_that_changes_with_a_variable_is_seen_and_one_that_does_not_is
     sized = dataclasses.replace(candidate_of("a"), z=np.ones(12))
     for share, seen in ((0.0, False), (0.5, True)):
         linear.residual = np.append(noise + column * share * np.repeat(x, 2), 0.0)
-        varies, over, by_chance, spread = _varies_most(space, sized, "a", linear, 0.03)
+        varies, over, by_chance, spread = _largest_variation(space, sized, "a", linear, 0.03)
         assert not seen or spread == pytest.approx(0.5, abs=0.05)  # of an amplitude of 1
         assert (varies > by_chance) == seen and (not seen or over == "slope")
         assert by_chance == pytest.approx(2.67, abs=0.01)  # two variables, along a line or bent: 0.03 / 4, both sides
@@ -369,7 +369,7 @@ def test_amplitude_that_changes_with_a_variable_is_seen_and_one_that_does_not_is
         ]
         assert not seen or varies**2 == pytest.approx(left[0] - left[1], rel=1e-8)
     space.bare.observe.long = True  # a history's readings answer to all of its past
-    assert _varies_most(space, candidate_of("a"), "a", linear, 0.03) == (0.0, "", math.inf, math.inf)
+    assert _largest_variation(space, candidate_of("a"), "a", linear, 0.03) == (0.0, "", math.inf, math.inf)
 
 
 @pytest.mark.parametrize(("single", "lacks"), [(3.4, {"slip"}), (5.0, {"slip", "track"})])
@@ -386,7 +386,7 @@ def test_what_is_left_lies_where_its_curve_and_where_its_strongest_effect_would(
             }[name]
 
     space = SimpleNamespace(included=None, library=Library(names=("a", "b"), of=np.array([0, 1, 1])))
-    test = SimpleNamespace(rejected_with_margin=True, beyond_doubt=lambda kind: single > 3.7)
+    test = SimpleNamespace(rejected_with_margin=True, exceeds_margin=lambda kind: single > 3.7)
     seen = SimpleNamespace(test=test, scores=SimpleNamespace(single=np.array([1.0, 0.0, -single])))
     assert _deficient_equations(space, seen, ()) == lacks
     test.rejected_with_margin = False
@@ -412,16 +412,16 @@ def test_effect_has_to_be_the_strongest_again_without_blocks_that_leave_half_of_
     both = np.concatenate([a, b], 1)
     few, most, others = rows < 4, rows < 11, rows >= 16
     settings, family = SETTLED.settings, (space.library["a"].family(),)
-    again = lambda *blocks: _chosen_again(space, family, (jacobian, residual, a), both, blocks, settings)  # noqa: E731
+    again = lambda *blocks: _recurrence(space, family, (jacobian, residual, a), both, blocks, settings)  # noqa: E731
     assert again(few, others) == 1.0 and again(most) == 1.0 and again() == 1.0
     b3 = np.append(2.0 * a[:, 0] * (at < 4) + 2.5 * b[:, 0], np.zeros(2))  # only the first rows show it
-    assert _chosen_again(space, family, (jacobian, b3, a), both, (few, others), settings) == 0.5
+    assert _recurrence(space, family, (jacobian, b3, a), both, (few, others), settings) == 0.5
     # What data cannot tell from it, of whatever family, does not take its place.
     near = a * (1 + 0.05 * random.standard_normal(a.shape))
     of_near = np.append(2.0 * near[:, 0], np.zeros(2))  # which is the stronger of the two
-    assert _chosen_again(space, family, (jacobian, of_near, a), np.concatenate([a, near], 1), (few,), settings) == 1.0
+    assert _recurrence(space, family, (jacobian, of_near, a), np.concatenate([a, near], 1), (few,), settings) == 1.0
     none = dataclasses.replace(settings, same=0.0, form=0.0)
-    assert _chosen_again(space, family, (jacobian, of_near, a), np.concatenate([a, near], 1), (few,), none) == 0.0
+    assert _recurrence(space, family, (jacobian, of_near, a), np.concatenate([a, near], 1), (few,), none) == 0.0
 
 
 def candidate_of(*effects):
@@ -472,7 +472,7 @@ def test_model_holds_what_is_established_and_what_predicts(monkeypatch, adequate
         base=SimpleNamespace(candidate=candidate_of(), space=SimpleNamespace(bare=bare)), bases=()
     )
     left = SimpleNamespace(test=SimpleNamespace(null=None), scores=None)
-    searched = Search((candidate_of("a"), candidate_of("b"), best), best, seen)
+    searched = SearchResult((candidate_of("a"), candidate_of("b"), best), best, seen)
     found, _, stood = discover.choose_effects(
         None, screened, left, searched, SETTLED.settings, lambda note: None, None, None
     )
@@ -484,9 +484,9 @@ def test_model_holds_what_is_established_and_what_predicts(monkeypatch, adequate
 
 def test_a_class_stands_whoever_leads_it():
     support = NameSupport(True, "beside", tests=(NameTest("a", 9.0, 3.0, (), 0.0), NameTest("b", 1.0, 3.0, (), 0.0)))
-    other = support.renamed({"a": "c", "b": "b", "": ""})
+    other = support.with_leaders({"a": "c", "b": "b", "": ""})
     assert other.established("c") and not other.established("a") and not other.established("b")
-    assert support.renamed({}) == support
+    assert support.with_leaders({}) == support
 
 
 # --- settled runs ---------------------------------------------------------------------------------------
@@ -509,12 +509,12 @@ def stood(analyst, runs, effects):
     """Whether these effects, fitted together, would stand, whatever a search would have found."""
     screened = analyst.screened(runs)
     space, base, bases = screened.base.space, screened.base.candidate, screened.bases
-    left = discover.diagnosis_of_base(screened, analyst.settings)
+    left = discover.diagnose_base_by_bootstrap(screened, analyst.settings)
     active = fill_slots(effects, analyst.settings)
     first = start_of_fit(space, base, active, analyst.settings, left.scores)
     (best,) = fit_candidates(space, [(active, first)], analyst.settings)
     after = diagnose_candidate(space, best, bases, left.test.null, analyst.settings)
-    return judge_names(space, base, Search((best,), best, after), left, bases, analyst.settings), best, after
+    return judge_names(space, base, SearchResult((best,), best, after), left, bases, analyst.settings), best, after
 
 
 @pytest.mark.nightly
@@ -604,8 +604,8 @@ def test_small_offset_of_an_instrument_without_a_stated_noise_is_not_established
     best = SimpleNamespace(active=("offset", "gain"), amplitude=np.array([0.31, 0.5]))
     stated = settings_for(SettledRuns)
     silent = dataclasses.replace(stated, silent=("total_current",))
-    share = standing._offset_share(space, best, "offset", silent)
+    share = standing._relative_zero_error(space, best, "offset", silent)
     assert share == pytest.approx(0.031 / np.sqrt(np.nanmean(current**2)))
     assert not NameTest("offset", 9.0, 3.0, (), 0.0, offset=share).established
-    assert standing._offset_share(space, best, "offset", stated) == math.inf
-    assert standing._offset_share(space, best, "gain", silent) == math.inf
+    assert standing._relative_zero_error(space, best, "offset", stated) == math.inf
+    assert standing._relative_zero_error(space, best, "gain", silent) == math.inf

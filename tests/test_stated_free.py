@@ -64,7 +64,7 @@ def test_a_log_shows_how_a_vehicle_grips_though_no_channel_shows_its_speed(tmp_p
     vehicle += '[bench.ground.friction]\nstatic = "0.6 ± 30 %"\n'
     robot = bench(tmp_path, lambda text: text.partition('load = "shaft"')[0] + vehicle)
     grip = {f"bench.{n}" for n in ("mass", "ground.friction.static")}
-    log, settled = (priors.free_names(robot, ["bench"], *kind.free(), idle) for kind, idle in KINDS)
+    log, settled = (priors.loop_parameter_names(robot, ["bench"], *kind.free(), idle) for kind, idle in KINDS)
     assert grip < set(log) and grip & set(settled) == {"bench.mass"}
 
 
@@ -140,6 +140,6 @@ def test_what_lies_far_from_its_prior_is_not_said_to_be_held_by_it():
         parameters={"near": parameter(0.5), "far": parameter(-6.5)}, held_by_prior=("near", "far"), searched=None,
         together=(), undetermined=("near", "far"),
     )  # fmt: skip
-    said = list(remarks._parameters(found))
+    said = list(remarks._parameter_remarks(found))
     assert [n.names for n in said if n.code == "held_by_prior"] == [("near",)]
     assert [(n.name, n.sds) for n in said if n.code == "far_from_prior"] == [("far", 6.5)]

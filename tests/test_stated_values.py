@@ -10,7 +10,7 @@ from worlds import laws, settled, tables
 
 from calibration.discovery import discover, findings
 from calibration.discovery.classes import find_prior_shifts, prior_shift_scores
-from calibration.discovery.loop_notes import FreedValue
+from calibration.discovery.loop_notes import AlternativeValue
 from calibration.words import loop_words as words
 
 NOMINAL = settled.CLIMBING["motor.resistance"]
@@ -97,7 +97,7 @@ def test_resistance_freed_of_its_prior_is_the_right_one(wrong, truth, looks):
     found = {s.name: s for s in find_prior_shifts(fitted.space, fitted.candidate, NEEDED, analyst.settings)}
     assert "motor.resistance" in found
     shift = found["motor.resistance"]
-    said = findings._stated(fitted.space, fitted.candidate, shift)
+    said = findings._stated_value(fitted.space, fitted.candidate, shift)
     sd = shift.fit.sd[shift.index] * NOMINAL * 0.1
     assert abs(said.value - truth) < 0.05 * truth and sd < 0.05 * truth
     assert said.stated == pytest.approx(NOMINAL) and said.unit == "ohm" and said.prior_sds > 5
@@ -105,7 +105,7 @@ def test_resistance_freed_of_its_prior_is_the_right_one(wrong, truth, looks):
     assert said.rise_chi2 < -NEEDED
     readings = 3 * len(runs)
     assert 2 * shift.fit.cost < readings + 4 * np.sqrt(2 * readings)
-    freed = FreedValue("motor.resistance", said.value, said.unit)
+    freed = AlternativeValue("motor.resistance", said.value, said.unit)
     assert words.freed_value(freed) == f"motor.resistance is {said.value:.3g} ohm"
     assert words.freed_value(freed._replace(unit="-")) == f"motor.resistance is {said.value:.3g}"
 

@@ -260,7 +260,7 @@ KEPT = {
     ("calibration/data/stated.py", "_template_numbers"): "packaged files",
     ("calibration/data/parts.py", "packaged_gearboxes"): "a packaged table",
     ("calibration/data/parts.py", "packaged_cells"): "a packaged table",
-    ("calibration/discovery/scales.py", "_nominal"): "pure: signals of the nominal robot",
+    ("calibration/discovery/scales.py", "_nominal_signals"): "pure: signals of the nominal robot",
     ("sweeps/report/catalogue.py", "_content"): "a packaged file",
     ("sweeps/cli.py", "os.environ"): "set for jax, before it is imported",
     ("sweeps/cli.py", "sys.unraisablehook"): "repeats an interrupt that a callback lost, while a command works",
@@ -594,17 +594,20 @@ def test_front_door_loads_nothing_heavy():
 #: What `calibrate`, `discover` and `foresee` do to a table and a robot inside, from instruments to the base fit.
 INNER = {
     "with_inferred_instruments", "with_surface_configurations", "of_surfaces", "with_table_mass",
-    "with_initial_states", "measure_initial_states", "check_start", "infer_noise", "library_of_size", "settings_for",
-    "without_copies", "pose", "pose_problem", "pose_candidates", "fit_base", "trace",
+    "with_initial_states", "measure_initial_states", "check_start", "infer_noise", "scale_library", "settings_for",
+    "remove_copies", "pose", "pose_problem", "build_candidate_space", "fit_base", "trace",
 }  # fmt: skip
 #: Campaigns and notebooks that call a part of that all the same, and why.
 CALLED = {
     (
         "loop_baselines",
-        "pose_candidates",
+        "build_candidate_space",
     ): "other ways to select effects, on the loop's own problem after its own preparation",
     ("loop_baselines", "fit_base"): "the same",
-    ("loop_findings", "pose_candidates"): "further runs, read by fits that the loop made after its own preparation",
+    (
+        "loop_findings",
+        "build_candidate_space",
+    ): "further runs, read by fits that the loop made after its own preparation",
     ("track_table", "pose"): "a function of its own by that name: rows of the paper through a resolved running gear",
     ("track_table", "with_table_mass"): "the same rows, searched by members and not by `calibrate`",
 }
@@ -660,7 +663,7 @@ def test_a_campaign_of_its_own_way_is_found():
 
 
 def test_one_preparation_serves_all():
-    """What fits or foresees calls `prepare`, and no other room does to a table what that does."""
+    """What fits or foresees calls `prepare_input`, and no other room does to a table what that does."""
     inner = {"with_inferred_instruments", "with_surface_configurations", "with_initial_states", "check_start"}
     allowed = {"calibration/inference/preparation.py", "sweeps/commands/compare.py"}  # which fits nothing
     found = {
@@ -674,7 +677,7 @@ def test_one_preparation_serves_all():
     for room in ("inference/calibration", "inference/foresight", "discovery/discover"):
         tree = ast.parse((ROOT / f"calibration/{room}.py").read_text(encoding="utf-8"))
         calls = {ast.unparse(n.func).rpartition(".")[2] for n in walked(tree) if isinstance(n, ast.Call)}
-        assert "prepare" in calls, room
+        assert "prepare_input" in calls, room
 
 
 def circle(root):

@@ -189,7 +189,9 @@ def test_rig_check_says_how_many_rows_are_used(tmp_path, monkeypatch, capsys):
 
     def foresee(runs, robot):
         runs = thin_rows(runs)
-        return foresight.Foresight((), ("converged",) * len(runs), ("columns",) * len(runs.channels), (), (), robot)
+        return foresight.InformationForecast(
+            (), ("converged",) * len(runs), ("columns",) * len(runs.channels), (), (), robot
+        )
 
     monkeypatch.setattr(rig_check.foresight, "predict_identifiability", foresee)
     found = rig_check.examine_rig_file(tmp_path / "rig.toml", str(tmp_path / "log.csv"))
@@ -200,7 +202,9 @@ def test_rig_check_says_how_many_rows_are_used(tmp_path, monkeypatch, capsys):
 
 
 @pytest.mark.parametrize("rows", [100, None])
-@pytest.mark.parametrize("way", [(calibrate, "prepare"), (discover, "preparation.prepare"), (foresight, "prepare")])
+@pytest.mark.parametrize(
+    "way", [(calibrate, "prepare_input"), (discover, "preparation.prepare_input"), (foresight, "prepare_input")]
+)
 def test_python_takes_as_many_rows_as_the_command_line(monkeypatch, way, rows):
     """Of the same log the same rows, whoever asks. Each row once thinned is still of the whole log."""
     room, before = way

@@ -120,7 +120,7 @@ def test_one_evaluation_of_turns_has_the_derivatives_of_the_root(robot, of_world
         return (posed.signed(posed.observation(z), posed.data),) * 2
 
     z = jnp.asarray([0.3, -0.4, 0.2])
-    apart = fit.with_roots(posed, z)
+    apart = fit.with_solved_rows(posed, z)
     r, jacobian = jax.jit(lambda z: apart.linearised(apart.robot, z, apart.data)[:2])(z)
     wanted, value = jax.jit(jax.jacfwd(through, has_aux=True))(z)
     assert_allclose(r, value, rtol=1e-6, atol=1e-6)

@@ -13,7 +13,7 @@ from worlds import turns as planted
 
 import mmrjax as mm
 from calibration.data import runs as records
-from calibration.discovery.discover import discover, pose_candidates, prepare_loop
+from calibration.discovery.discover import build_candidate_space, discover, prepare_loop
 from calibration.inference import bases as bases_room
 from calibration.inference.observers.turns import TurnLinearization
 from mmrjax import effects
@@ -35,7 +35,9 @@ def posed(tmp_path_factory):
     robot = mm.read_robot(str(file))
     library = {name: kind for name, kind in effects.BY_NAME.items() if name in SOME}
     ready = prepare_loop(records.read_runs(table, robot=robot), robot, noise=planted.NOISE, library=library)
-    space = pose_candidates(ready.runs, ready.robot, ready.noise.sd, ready.settings, ready.stated, ready.library)
+    space = build_candidate_space(
+        ready.runs, ready.robot, ready.noise.sd, ready.settings, ready.stated, ready.library
+    )
     return space.bare, space
 
 
@@ -99,7 +101,7 @@ def test_signature_is_what_the_effect_does(posed, linear, shown, name):
 def test_column_of_a_curve_is_what_the_curve_does(linear, shown, name):
     """A curve that the loop fits is the one whose columns it scored."""
     _, balance, variable = name.split("_", 2)
-    x, way = linear.in_travel(balance, variable)
+    x, way = linear.curve_variable(balance, variable)
     assert x.shape == (linear.points,)
     ordinates = {"y0": 1.0, "y1": 0.4, "y2": 0.1, "y3": 0.0, "y4": -0.3, "y5": -0.2}
     ends = {"low": float(x.min()), "high": float(x.max())}
@@ -122,7 +124,7 @@ def test_points_are_each_side_of_each_row(posed, linear):
     assert linear.at_points(space.included).sum() == 2 * COUNT
     side = linear.variable("side")
     assert (side[: linear.rows] == 1).all() and (side[linear.rows :] == -1).all()
-    assert (linear.in_travel("track", "speed_motor")[0] > 0).all()  # counted along the motion of its side
+    assert (linear.curve_variable("track", "speed_motor")[0] > 0).all()  # counted along the motion of its side
 
 
 def test_what_a_channel_of_one_side_shows_is_off_by_that_side_alone(linear):

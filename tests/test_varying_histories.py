@@ -20,7 +20,7 @@ from calibration.discovery.settings import settings_for
 from calibration.inference import checks
 from calibration.inference.blocks import blocks_of_kind, distinct_held_out_blocks
 from calibration.inference.calibration import calibrate
-from calibration.inference.fit_notes import with_codes
+from calibration.inference.fit_notes import remarks_with_codes
 from calibration.inference.linearization import balance_probe
 from calibration.inference.noise import Noise
 from calibration.inference.observers import Histories, settled_ends
@@ -252,7 +252,7 @@ def test_defects_of_all_knots_are_a_constant_defect(observer):
         return observer(dataclasses.replace(robot, effects=put)).reading
 
     derivative = np.asarray(jax.jit(jax.jacfwd(readings))(jnp.zeros(len(effects))))
-    defects = np.asarray(jax.jit(lambda r: observer.defective(r, effects))(robot))
+    defects = np.asarray(jax.jit(lambda r: observer.response_to_errors(r, effects))(robot))
     rows = np.asarray(observer.rows_of)
     for k in range(len(effects)):
         found, expected = defects[k].sum(1), derivative[..., k]
@@ -299,7 +299,7 @@ def test_blocks_of_runs_that_vary_are_whole_runs(runs):
 
 def test_ends_are_those_of_stretches_driven_forwards(runs):
     analyst = Analyst(settings_for(Histories, 300), {"windage": BY_NAME["windage"]}, {})
-    ends = settled_ends.settled_ends(analyst.space(runs).bare)
+    ends = settled_ends.settled_ends_of_runs(analyst.space(runs).bare)
     volts = np.asarray(ends.conditions.voltage)
     assert sorted(volts.tolist()) == [12.0, 15.0, 18.0, 24.0, 24.0, 24.0, 33.0, 33.0]  # none that brakes or reverses
     assert np.isfinite(ends.mean).any(1).sum() >= 4
@@ -330,7 +330,7 @@ def test_calibration_finds_the_truth_within_its_intervals(simulated):
         assert abs(estimate.value - truth) < 3 * estimate.sd, name
         assert estimate.sd < 0.05 * truth, name
     assert {"mode", "supply_voltage_V"} <= set(found.conditions)
-    assert len(with_codes(found.remarks, "stops_on_slope")) == 1
+    assert len(remarks_with_codes(found.remarks, "stops_on_slope")) == 1
 
 
 @pytest.mark.nightly

@@ -65,7 +65,9 @@ def space(tmp_path_factory):
 
 def posed(runs, robot, sd=SD):
     library = {n: BY_NAME[n] for n in NAMES}
-    return discover.pose_candidates(runs, robot, np.broadcast_to(sd, runs.measured().shape), SETTINGS, {}, library)
+    return discover.build_candidate_space(
+        runs, robot, np.broadcast_to(sd, runs.measured().shape), SETTINGS, {}, library
+    )
 
 
 @pytest.fixture(scope="module")
@@ -130,17 +132,17 @@ def test_the_ranking_comes_before_the_base_fit_which_begins_there(space, before,
 def test_noise_of_windows_is_that_of_their_readings(space, before):
     """Without an effect that the base lacks what is left is a χ² of the windows."""
     quiet = Runs("synthetic", motor(seed=5, quadratic=0.0)).of(space.bare.base)
-    found = weak_form.weak_form(posed(quiet, space.bare.base).bare)
+    found = weak_form.fit_weak_form(posed(quiet, space.bare.base).bare)
     chi2 = np.sum(found.residual**2)
     assert abs(chi2 - found.windows) < 4 * np.sqrt(2 * found.windows)
 
 
 def test_noise_that_windows_and_equations_share_is_correlated(space, before):
     """As in a Monte Carlo of the motor's two equations, in NumPy, with noise in both readings."""
-    problem, plan = space.bare, shown_states.plan_of(space.bare)
-    rows, _, (w, *_) = shown_states.rows_and_windows(problem, plan)
+    problem, plan = space.bare, shown_states.state_plan(space.bare)
+    rows, _, (w, *_) = shown_states.points_and_windows(problem, plan)
     w, z, sd = w.part(np.arange(12)), before.base.z[: space.free], np.asarray(rows.sd)
-    terms = weak_form._row_terms(problem, plan, rows, z, ())
+    terms = weak_form._terms_with_derivatives(problem, plan, rows, z, ())
     factor = weak_form._covariance_factor(plan, w, sd, jax.device_get(terms), np.zeros(2))
     value = dict(zip(problem.coordinates.names, np.asarray(problem.coordinates.value(z)), strict=True))
     r, k, inertia = (float(value[f"motor.{name}"]) for name in TRUE)
@@ -168,10 +170,10 @@ def test_a_delay_of_many_rows_is_found(space, rows):
         for name, x in columns.items()
     }
     delayed = posed(Runs("synthetic", shifted).of(space.bare.base), space.bare.base).bare
-    plan = shown_states.plan_of(delayed)
-    delay = weak_form.search_delay(delayed, plan)
+    plan = shown_states.state_plan(delayed)
+    delay = weak_form.fit_delay(delayed, plan)
     assert delay.value == pytest.approx(rows * EVERY, abs=EVERY) and not delay.ended
-    found = weak_form.weak_form(delayed)
+    found = weak_form.fit_weak_form(delayed)
     value = delayed.coordinates.value(found.z)
     for name, true in TRUE.items():
         assert value[delayed.coordinates.names.index(f"motor.{name}")] == pytest.approx(true, rel=0.02)
@@ -181,10 +183,10 @@ def test_noise_of_simulated_states_is_not_that_of_readings(space):
     """So it does not bias parameters."""
     noisy, quiet = (posed(Runs("synthetic", motor(seed=4, noise=n, quadratic=0.0)).of(space.bare.base),
                           space.bare.base).bare for n in ((1.0, 1.0), (1e-6, 1e-6)))  # fmt: skip
-    plan = shown_states.plan_of(noisy)
-    z = weak_form.weak_form(noisy).z
-    rows, exact = (shown_states.rows_and_windows(p, plan)[0] for p in (noisy, quiet))
-    smooth = weak_form.simulated_rows(noisy, plan, rows, z)
+    plan = shown_states.state_plan(noisy)
+    z = weak_form.fit_weak_form(noisy).z
+    rows, exact = (shown_states.points_and_windows(p, plan)[0] for p in (noisy, quiet))
+    smooth = weak_form.with_smooth_states(noisy, plan, rows, z)
     moving = np.asarray(rows.way) != 0
     off, read = ((np.asarray(x.shown) - np.asarray(exact.shown))[moving] for x in (smooth, rows))
     for k in range(off.shape[1]):
@@ -193,14 +195,14 @@ def test_noise_of_simulated_states_is_not_that_of_readings(space):
 
 
 def test_windows_across_a_jump_are_wrong(space, before, monkeypatch):
-    names, plan = space.bare.coordinates.names, shown_states.plan_of(space.bare)
-    rows, _, cut = shown_states.rows_and_windows(space.bare, plan)
+    names, plan = space.bare.coordinates.names, shown_states.state_plan(space.bare)
+    rows, _, cut = shown_states.points_and_windows(space.bare, plan)
     volts = np.asarray(rows.conditions.voltage)
     for w in cut:
         assert np.max(np.ptp(np.where(w.weight > 0, volts[w.rows], volts[w.rows[:, 4:5]]), axis=1)) < 1e-9
     monkeypatch.setattr(shown_states, "JUMP", 9.0)
     monkeypatch.setattr(weak_form, "CHANCE", np.inf)  # else they count less, as noise that no reading has
-    wrong, k = weak_form.weak_form(space.bare).z, names.index("motor.inductance")
+    wrong, k = weak_form.fit_weak_form(space.bare).z, names.index("motor.inductance")
     right, wrong = (space.coordinates.base.value(z[: space.free])[k] for z in (before.base.z, wrong))
     assert right == pytest.approx(4e-4, rel=0.3) and wrong > 3 * right
 
@@ -229,16 +231,16 @@ def test_logs_of_an_angle_alone_are_twice_integrated(tmp_path, kind, made):
     made = made(np.random.default_rng(1), levels=(0.8, 1.0, -0.9) if kind == "servo" else (1.2, 2.0, -1.6))
     robot = written(tmp_path, kind, made)
     runs = records.read_runs(str(tmp_path / "log.csv"), robot=robot).of(robot)
-    found = weak_form.weak_form(posed(runs, robot, np.maximum(0.003 * Histories.sizes(runs), 1e-9)).bare)
+    found = weak_form.fit_weak_form(posed(runs, robot, np.maximum(0.003 * Histories.sizes(runs), 1e-9)).bare)
     if kind == "servo":  # whose log has no noise
         assert np.all(np.abs(found.z) < 0.1)
     assert found is not None and np.all(np.abs(found.z) < 4)
 
 
 def test_a_log_that_does_not_show_its_states_is_none(space):
-    assert weak_form.weak_form(without(space.bare, "motor_speed")) is None
-    assert shown_states.plan_or_lacking(without(space.bare, "motor_speed")) is shown_states.Lacking.MOTION
-    assert shown_states.plan_of(without(space.bare, "motor_current")).electrical is False
+    assert weak_form.fit_weak_form(without(space.bare, "motor_speed")) is None
+    assert shown_states.state_plan_or_reason(without(space.bare, "motor_speed")) is shown_states.MissingStates.MOTION
+    assert shown_states.state_plan(without(space.bare, "motor_current")).electrical is False
 
 
 def without(problem, channel):

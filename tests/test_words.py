@@ -17,18 +17,18 @@ from calibration.described import describe, in_words
 from calibration.discovery import loop_notes as of_loop
 from calibration.discovery.formula import Proposal
 from calibration.discovery.loop_notes import (
-    CurveOver,
-    FreedValue,
+    AlternativeValue,
     Mechanism,
-    Missing,
+    MissingEffect,
     NameSupport,
     NameTest,
+    PlacedCurve,
     RuledOut,
-    Summary,
+    VerdictSummary,
 )
-from calibration.discovery.result import Sensitivity, Worse
+from calibration.discovery.result import NoiseVerdict, WorseChannel
 from calibration.inference import fit_notes as of_fit
-from calibration.inference.fit_notes import Remark, Shown, next_step
+from calibration.inference.fit_notes import AdequacyFinding, Remark, progress_remark
 from calibration.inference.lack_of_fit import Adequacy
 from calibration.inference.residual_clusters import LevelMean, ResidualCluster
 from calibration.inference.series_noise import SeriesNoise
@@ -56,7 +56,10 @@ SAMPLES = [
     Remark("held_by_prior", names=("a",)),
     Remark(
         "only_together",
-        pairs=(of_fit.Pair("a", "b", 0.99, "ratio", -1.0), of_fit.Pair("a", "c", -1.0, "linear", 0.031)),
+        pairs=(
+            of_fit.DependentPair("a", "b", 0.99, "ratio", -1.0),
+            of_fit.DependentPair("a", "c", -1.0, "linear", 0.031),
+        ),
     ),
     Remark("held_by_prior", names=("a", "b")),
     Remark("far_from_prior", name="m", sds=3.2, kind="loop"),
@@ -195,7 +198,7 @@ SAMPLES = [
     Remark("generations", members=96, generations=8, settled=False),
     Remark("lost_rows", members={"tips": 3, "slides": 2, "failed": 1}),
     Remark("members_jump", members=2, best=(2, 5)),
-    Remark("ended_at_edge", edge={"a": of_fit.Edge("upper", 9.0), "b": of_fit.Edge("", -2.64)}),
+    Remark("ended_at_edge", edge={"a": of_fit.ReachedBound("upper", 9.0), "b": of_fit.ReachedBound("", -2.64)}),
     Remark("read_from_members", names=("a", "b"), left=0.4),
     Remark("assumed_noise", channels=("speed",), usual="speed=2%"),
     Remark(
@@ -281,9 +284,9 @@ SAMPLES = [
     Remark("sample_left_out", points=3, share=0.0123, outputs=("speed",)),
     Remark("inert", inputs=("a", "b")),
     Remark("tied", inputs=("a", "b")),
-    next_step("evaluations", 12345, 1234.6),
-    next_step("alike", ("a", "b")),
-    next_step("round", 2, 3.25, 7, 1.26),
+    progress_remark("evaluations", 12345, 1234.6),
+    progress_remark("alike", ("a", "b")),
+    progress_remark("round", 2, 3.25, 7, 1.26),
 ]
 
 
@@ -350,7 +353,7 @@ def test_a_sentence_is_its_own_words_and_what_is_no_note_says_so():
 
 @pytest.mark.parametrize(
     ("kind", "rows"),
-    [("next_step", step_words.STEPS), ("RuledOut", loop_words.RULED_OUT)],
+    [("progress_remark", step_words.STEPS), ("RuledOut", loop_words.RULED_OUT)],
 )
 def test_names_of_rows_are_those_of_the_code(kind, rows):
     """A name without a row would fail only where it is said, and a row without a name is never said."""
@@ -359,7 +362,7 @@ def test_names_of_rows_are_those_of_the_code(kind, rows):
         for file in (ROOT / "calibration" / room).rglob("*.py"):
             for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
                 if isinstance(node, ast.Call) and ast.unparse(node.func) == kind and node.args:
-                    at = 0 if kind == "next_step" else 1
+                    at = 0 if kind == "progress_remark" else 1
                     used |= {node.args[at].value} if len(node.args) > at else {""}
     assert used | ({""} & set(rows)) == set(rows)
 
@@ -385,7 +388,7 @@ def test_a_size_has_a_unit_where_there_is_one(unit, said):
 
 # --- verdicts -------------------------------------------------------------------------------------------
 
-OVER = CurveOver("slip", ("slope",))
+OVER = PlacedCurve("slip", ("slope",))
 
 
 @pytest.mark.parametrize(
@@ -396,7 +399,7 @@ OVER = CurveOver("slip", ("slope",))
         (NameSupport(False, "implausible"), "every effect of the library that explains it has an implausible size"),
         (NameSupport(False, "larger", ("a", "b")), "a and b would explain more, but not at a plausible size"),
         (
-            NameSupport(False, "better curve", ("a",), (CurveOver("speed", ("speed_motor", "slope")),)),
+            NameSupport(False, "better curve", ("a",), (PlacedCurve("speed", ("speed_motor", "slope")),)),
             "one smooth surface in the reading of speed over speed motor and slope is a better explanation than a",
         ),
         (
@@ -440,16 +443,18 @@ def test_why_names_stand_or_not(support, said):
 def test_verdict_of_a_complete_model():
     off = Remark("noise_off", channel="", factor=2.0, source="stated")
     said = "Nothing is missing: the residuals are consistent with noise (family-wise p = 0.4)."
-    assert loop_words.verdict_sentences(Summary("none", 0.4, None)) == said
-    assert loop_words.verdict_sentences(Summary("none", 0.4, None, noise=(off,))) == f"{said} But {describe(off)}"
-    aside = loop_words.verdict_sentences(Summary("none", 0.4, None, aside=10, of=100))
+    assert loop_words.verdict_sentences(VerdictSummary("none", 0.4, None)) == said
+    assert (
+        loop_words.verdict_sentences(VerdictSummary("none", 0.4, None, noise=(off,))) == f"{said} But {describe(off)}"
+    )
+    aside = loop_words.verdict_sentences(VerdictSummary("none", 0.4, None, aside=10, of=100))
     assert aside == f"10 of 100 rows (10 %) are outliers and are set aside. {said}"
 
 
 def test_verdict_tells_what_is_tentative():
     test = NameTest("b", 5.0, 3.4, (), 9.0, 10, 2.0)
-    sure, tentative = Missing(("a",), (), ("drop",)), Missing(("b",), (), ("slip",), False, test)
-    assert loop_words.verdict_sentences(Summary("named", 0.001, None, (sure, tentative))) == (
+    sure, tentative = MissingEffect(("a",), (), ("drop",)), MissingEffect(("b",), (), ("slip",), False, test)
+    assert loop_words.verdict_sentences(VerdictSummary("named", 0.001, None, (sure, tentative))) == (
         "Missing: a (family-wise p ≤ 0.001). Tentative, kept in the model because it improves predictions: b, which rests on row 10."
     )
     # where no name stands and it was not tested by itself, what speaks against all of them
@@ -457,8 +462,8 @@ def test_verdict_tells_what_is_tentative():
     place = SimpleNamespace(
         place="slip", variable="slope", alike=("slip",), variables_alike=(), family="slip", by_duty=False
     )
-    only = Missing(("b",), (), ("slip",), False)
-    said = loop_words.verdict_sentences(Summary("place", 0.001, place, (only,), support=curve))
+    only = MissingEffect(("b",), (), ("slip",), False)
+    said = loop_words.verdict_sentences(VerdictSummary("place", 0.001, place, (only,), support=curve))
     assert "no effect of the library is established" in said
     assert said.endswith(
         "improves predictions: b (one smooth curve in the slip balance over slope leaves no significant misfit)."
@@ -470,18 +475,18 @@ def test_a_mechanism_is_stated_with_what_it_explains_and_predicts():
     place = SimpleNamespace(
         place="track", variable="speed_motor", alike=("track",), variables_alike=(), family="x", by_duty=False
     )
-    said = loop_words.verdict_sentences(Summary("mechanism", 0.001, place, mechanism=found))
+    said = loop_words.verdict_sentences(VerdictSummary("mechanism", 0.001, place, mechanism=found))
     assert said.startswith(
         "Missing: a loss torque that changes with speed or a slip, established as a mechanism: it "
     )
     assert "explains 99 % of the excess misfit, gains 0.8 nat" in said and "8.0 standard errors" in said
     weak = dataclasses.replace(found, families=("slip",), share=0.3, gain=0.1)
-    said = loop_words.verdict_sentences(Summary("place", 0.001, place, mechanism=weak))
+    said = loop_words.verdict_sentences(VerdictSummary("place", 0.001, place, mechanism=weak))
     assert (
         "No mechanism is established: the best one is a slip, but it explains only 30 % of the excess misfit and"
         in said
     )
-    assert loop_words.brief_verdict(Summary("mechanism", 0.001, place, mechanism=weak)) == "mechanism: slip"
+    assert loop_words.brief_verdict(VerdictSummary("mechanism", 0.001, place, mechanism=weak)) == "mechanism: slip"
 
 
 def test_a_mechanism_is_stated_with_its_window_and_why_no_name_stands():
@@ -491,7 +496,7 @@ def test_a_mechanism_is_stated_with_its_window_and_why_no_name_stands():
         family="slip that changes with order", window={"axis": "order", "low": 30.0, "high": 44.0},
     )  # fmt: skip
     mechanism = Mechanism((here.family,), (), 0.99, 0.8, 0.1, 1.0)
-    summary = Summary("mechanism", 0.001, here, mechanism=mechanism)
+    summary = VerdictSummary("mechanism", 0.001, here, mechanism=mechanism)
     within = "order, in runs 30 to 44 (as well in runs 31 to 44)"
     assert loop_words.verdict_sentences(summary).startswith(
         f"Missing: a slip that changes with {within}, established as a mechanism"
@@ -529,9 +534,9 @@ def test_the_course_of_a_curve_is_told_by_its_ends(value, said):
 
 def test_verdicts_at_other_noise_are_one_sentence():
     def other(factor, verdict, *missing):
-        return Sensitivity(factor, verdict, Summary(verdict, 0.01, None, missing), (), True)
+        return NoiseVerdict(factor, verdict, VerdictSummary(verdict, 0.01, None, missing), (), True)
 
-    sure, weak = Missing(("a", "c"), (), ("x",)), Missing(("b",), (), ("y",), False)
+    sure, weak = MissingEffect(("a", "c"), (), ("x",)), MissingEffect(("b",), (), ("y",), False)
     assert loop_words.at_other_noise(()) == ""
     assert loop_words.at_other_noise([other(0.7, "class", sure, weak), other(1.4, "class", sure, weak)]) == (
         "with 0.7 and with 1.4 times that noise the verdict is class: a established, b tentative"
@@ -542,16 +547,16 @@ def test_verdicts_at_other_noise_are_one_sentence():
 
 
 def test_verdict_lists_what_cannot_be_told_apart():
-    value = FreedValue("motor.resistance", 1.9377, "ohm")
-    one = Missing(("a",), (value,), ("losses",))
-    two = Missing(("b", "c"), (), ("leads", "supply"))
-    assert loop_words.verdict_sentences(Summary("class", 0.0004, None, (one, two))) == (
+    value = AlternativeValue("motor.resistance", 1.9377, "ohm")
+    one = MissingEffect(("a",), (value,), ("losses",))
+    two = MissingEffect(("b", "c"), (), ("leads", "supply"))
+    assert loop_words.verdict_sentences(VerdictSummary("class", 0.0004, None, (one, two))) == (
         "Missing: losses, a, or motor.resistance is 1.94 ohm (these data cannot tell which); one of b, c (these data "
         "cannot tell which) (family-wise p ≤ 0.0004)."
     )
-    assert loop_words.verdict_sentences(Summary("named", 0.002, None, (Missing(("a",), (), ("x",)),))) == (
-        "Missing: a (family-wise p ≤ 0.002)."
-    )
+    assert loop_words.verdict_sentences(
+        VerdictSummary("named", 0.002, None, (MissingEffect(("a",), (), ("x",)),))
+    ) == ("Missing: a (family-wise p ≤ 0.002).")
 
 
 @pytest.mark.parametrize(("sampled", "said"), [
@@ -607,7 +612,7 @@ def test_names_say_what_would_explain_more_than_they():
     ],
 )
 def test_what_is_predicted_worse_is_said_with_its_rows(found, predicted, said):
-    worse = () if found is None else (Worse("voltage", "motor_speed", *found),)
+    worse = () if found is None else (WorseChannel("voltage", "motor_speed", *found),)
     whole = f"Predicts worse on held-out rows: by voltage {said}."
     assert loop_words.rising_errors_sentence(worse, {"voltage": predicted}) == (whole if said else "")
 
@@ -621,7 +626,7 @@ def test_what_is_predicted_worse_is_said_with_its_rows(found, predicted, said):
     ],
 )
 def test_what_the_track_model_is_asked_about(about, said):
-    assert loop_words.track_model_question(of_loop.Asked(*about)) == said
+    assert loop_words.track_model_question(of_loop.TrackModelQuestion(*about)) == said
 
 
 # --- whether a fit is adequate --------------------------------------------------------------------------
@@ -631,26 +636,26 @@ def test_what_the_track_model_is_asked_about(about, said):
     ("found", "said"),
     [
         (
-            Adequacy(False, 812.3, 600.0, 1e-9, Shown(what="stated"), True),
+            Adequacy(False, 812.3, 600.0, 1e-9, AdequacyFinding(what="stated"), True),
             "Not adequate: the residuals exceed the stated noise (χ² 812.3 on 600 degrees of freedom, p < 1e-6), so "
             "a term is missing and the parameters may absorb its effect; run mmrjax loop to find it",
         ),
         (
-            Adequacy(False, 60.0, 60.0, 0.0021, Shown("motor_speed", "follow", "slope_deg"), False),
+            Adequacy(False, 60.0, 60.0, 0.0021, AdequacyFinding("motor_speed", "follow", "slope_deg"), False),
             "Not adequate: the residuals of motor speed follow slope_deg (p = 0.0021, the noise estimated from them), "
             "so a term is missing and the parameters may absorb its effect; run mmrjax loop to find it",
         ),
         (
-            Adequacy(True, 61.0, 60.0, 0.4, Shown(what="repeats"), True),
+            Adequacy(True, 61.0, 60.0, 0.4, AdequacyFinding(what="repeats"), True),
             "Adequate: the residuals are consistent with the stated noise (χ² 61 on 60 degrees of freedom, p = 0.4)",
         ),
         (
-            Adequacy(True, 50.0, 50.0, 0.4, Shown(), False),
+            Adequacy(True, 50.0, 50.0, 0.4, AdequacyFinding(), False),
             "Adequate as far as can be tested: the residuals show no structure (p = 0.4); the noise was estimated from "
             "them, so χ² is no test",
         ),
         (
-            Adequacy(None, 5.0, 2.5, None, Shown(), False),
+            Adequacy(None, 5.0, 2.5, None, AdequacyFinding(), False),
             "Adequacy cannot be tested: the noise was estimated from the misfit, and 2.5 degrees of freedom are too few "
             "to show structure; state the noise with --noise",
         ),
@@ -704,9 +709,11 @@ def test_six_levels_that_are_furthest_off_are_listed():
 
 def test_tests_that_are_as_improbable_are_named_in_the_order_of_their_words():
     """Of several that are zero to rounding the first is named: data are compared as their sentences are."""
-    every = [Shown(what="stated"), Shown(what="repeats")]
-    every += [Shown(c, "follow", v) for c in ("total_current", "speed") for v in ("the fitted speed", "slope_deg")]
-    every += [Shown(c, "remember") for c in ("motor_speed", "total_current")]
+    every = [AdequacyFinding(what="stated"), AdequacyFinding(what="repeats")]
+    every += [
+        AdequacyFinding(c, "follow", v) for c in ("total_current", "speed") for v in ("the fitted speed", "slope_deg")
+    ]
+    every += [AdequacyFinding(c, "remember") for c in ("motor_speed", "total_current")]
     assert sorted(every) == sorted(every, key=fit_words.shown_by)
 
 

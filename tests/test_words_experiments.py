@@ -8,21 +8,21 @@ from pages import recorded
 from calibration.described import describe
 from calibration.discovery import menu
 from calibration.discovery.experiments import denser_runs_instruction
-from calibration.discovery.reach import Reach, Used
+from calibration.discovery.reach import Reach, UsedConditions
 from calibration.inference.fit_notes import Remark
 from calibration.words import experiment_words as words
 
-TRACKED = Used("6T2A", 0, (15.0, 24.0, 33.0), (0.0, 10.0, 20.0), (0.0, 8.0), 21.1)
+TRACKED = UsedConditions("6T2A", 0, (15.0, 24.0, 33.0), (0.0, 10.0, 20.0), (0.0, 8.0), 21.1)
 WHEELED = dataclasses.replace(TRACKED, configuration="4W2T", index=1)
 REACH = Reach(
     (TRACKED, WHEELED), ("total_current", "motor_speed", "speed"), 36.0, 32.5, 33.4, 1.9, 760.0, 0.71, 1250.0, 1290.0, 2,
     0.61, 0.0259, 125.0,
 )  # fmt: skip
 ONE = Reach(
-    (Used("rover", 0, (6.0, 9.0, 12.0), (0.0, 8.0), (0.0, 1.0), 4.0),), ("speed",), 12.0, 12.0, 12.0, 0.9, 760.0, 0.3,
+    (UsedConditions("rover", 0, (6.0, 9.0, 12.0), (0.0, 8.0), (0.0, 1.0), 4.0),), ("speed",), 12.0, 12.0, 12.0, 0.9, 760.0, 0.3,
     1250.0, 1290.0, 1, 1.2, 0.012, 125.0,
 )  # fmt: skip
-LEVEL = dataclasses.replace(ONE, used=(Used("rover", 0, (12.0,), (0.0,), (0.0,), 4.0),))
+LEVEL = dataclasses.replace(ONE, used=(UsedConditions("rover", 0, (12.0,), (0.0,), (0.0,), 4.0),))
 BENCH = dataclasses.replace(LEVEL, has_ground=False)
 DRIVEN = dataclasses.replace(BENCH, imposed="motor_speed", levels=(52.36, 209.44))
 BRAKED = dataclasses.replace(BENCH, measured=("motor_current", "motor_speed"), torques=(0.0, 0.4, 0.8))
@@ -104,9 +104,17 @@ def test_runs_of_one_motor_and_of_many_name_the_shafts():
 
 def test_every_kind_of_runs_has_words():
     reaches = (REACH, ONE, BENCH, DRIVEN)
-    assert {e.doing for r in reaches for e in menu.experiment_menu(r) if isinstance(e, menu.Run)} == set(words.DOING)
+    assert {e.doing for r in reaches for e in menu.experiment_menu(r) if isinstance(e, menu.ProposedRuns)} == set(
+        words.DOING
+    )
     metered = dataclasses.replace(BENCH, measured=("motor_current", "output_torque"))
-    acts = {k for r in (REACH, metered) for e in menu.experiment_menu(r) if isinstance(e, menu.Act) for k in e.kinds}
+    acts = {
+        k
+        for r in (REACH, metered)
+        for e in menu.experiment_menu(r)
+        if isinstance(e, menu.CalibrationAct)
+        for k in e.kinds
+    }
     assert acts == {"weigh", *words.ACTS} and set(words.ACTS) == {*words.UNITS, "zero reading"}
 
 

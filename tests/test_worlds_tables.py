@@ -447,7 +447,7 @@ def test_laws_follow_the_size_of_the_robot():
 
 def test_priors_are_those_of_the_fields_and_truths_are_where_the_package_has_them():
     robot = robot_file.load_robot("nominal")
-    c = priors.parameter_coordinates(robot, priors.free_names(robot, ("6T2A", "4W2T")))
+    c = priors.parameter_coordinates(robot, priors.loop_parameter_names(robot, ("6T2A", "4W2T")))
     assert set(c.names) == set(PAPER.free)
     known = {p.name: p for p in params.walk_parameters(robot)}
     for name in c.names:

@@ -61,17 +61,17 @@ class ActiveSet(eqx.Module):
         return len(self.base) + 2 * self.slots
 
     def parts(self, z: Array) -> tuple[Array, Array, Array]:
-        """z of the base, of the amplitudes and of the shapes."""
+        """Coordinates z, split into those of the base, of the amplitudes and of the shapes."""
         p, s = len(self.base), self.slots
         return z[..., :p], z[..., p : p + s], z[..., p + s :]
 
     def held(self) -> Float[Array, "slots effects"]:
-        """Matrix with 1 for the effect in each slot, else 0."""
+        """Matrix with a 1 in each slot's row, in the column of its effect, and zeros elsewhere."""
         return jnp.asarray(self.active[:, None] == jnp.arange(len(self.names)), float)
 
     def robot(self, robot: Robot, z: Float[Array, " coordinates"]) -> Robot:
-        """`robot`, which has all effects of `names`, at coordinates z."""
-        base, amplitudes, shapes = _parts(self, z)
+        """Returns the robot at coordinates z. `robot` must have all effects of `names`."""
+        base, amplitudes, shapes = _scaled_parts(self, z)
         values = {f"effects.{name}.amplitude": amplitudes[k] for k, name in enumerate(self.names)}
         pairs = enumerate(zip(self.names, self.shapes, strict=True))
         values |= {f"effects.{n}.{s}": shapes[k] for k, (n, s) in pairs if s}
@@ -84,8 +84,8 @@ class ActiveSet(eqx.Module):
 
 
 @functools.partial(compiled, options=SELDOM)
-def _parts(space: ActiveSet, z: Array) -> tuple[Array, tuple[Array, ...], tuple[Array, ...]]:
-    """Coordinates of the base, and amplitude and shape of each effect."""
+def _scaled_parts(space: ActiveSet, z: Array) -> tuple[Array, tuple[Array, ...], tuple[Array, ...]]:
+    """Base coordinates, and the amplitude and shape value of each effect."""
     base, amplitude, shape = space.parts(z)
     held_vector = space.held()
     amplitudes = space.sd * (amplitude @ held_vector)
@@ -95,13 +95,13 @@ def _parts(space: ActiveSet, z: Array) -> tuple[Array, tuple[Array, ...], tuple[
 
 @dataclasses.dataclass(frozen=True)
 class ScoredLibrary:
-    """The effects of a search, each at every point of its shape's grid (an instance).
+    """Effects that a search may add, each at every point of the grid of its shape parameter.
 
     Attributes:
-        effects: those that the data can show and the robot does not have yet.
-        scored: the same, with their grids.
-        of: index of each instance's effect.
-        at: coordinate of each instance's shape, shape (instances,).
+        effects: effects that the data can reveal and that the robot does not have yet.
+        scored: the same effects with the grids of their shapes. An effect at one grid point is an instance.
+        of: index of the effect of each instance.
+        at: shape coordinate of each instance, shape (instances,).
     """
 
     effects: tuple[Effect, ...]
@@ -126,29 +126,29 @@ class ScoredLibrary:
         return tuple(index_of_name[n] for n in names)
 
     def largest(self, instances: np.ndarray) -> np.ndarray:
-        """Maximum of a non-negative number over each effect's instances, shape (effects,)."""
+        """Largest value among the instances of each effect, shape (effects,). Values must not be negative."""
         largest_scores = np.zeros(len(self))
         np.maximum.at(largest_scores, self.of, instances)
         return largest_scores
 
     def best_instance(self, name: str, single: np.ndarray) -> int:
-        """The instance of an effect with the largest |score|."""
+        """Index of the instance of an effect that has the largest |score|."""
         instances = np.flatnonzero(self.of == self.names.index(name))
         return int(instances[np.argmax(np.abs(np.asarray(single)[instances]))])
 
 
 @dataclasses.dataclass(frozen=True)
 class CandidateSpace:
-    """Problems of a search: the base, and the base with any effects of a library in a few slots.
+    """The fitting problems of a search: the base alone, and the base with effects of the library in a few slots.
 
     Attributes:
-        bare: problem of the base only.
+        bare: problem of the base alone.
         equipped: problem of the base and the effects in the slots.
-        library: the effects.
-        room: names of effects that the program of every fit of histories includes, see `fitted_by`.
-        near: coordinates of fits of the same histories with other sds, by their effects. Fits then start there and
-            take a few steps, and none has effects beyond `room`.
-        begins: coordinates of the first set of effects by the log's equations, by its effects.
+        library: effects that the slots can hold.
+        room: names of the effects that the compiled fits of time histories include, see `problem_for_sets`.
+        near: coordinates of earlier fits of the same histories with other sds, by their effects. Fits then start
+            there and take a few steps, and none has effects beyond `room`.
+        begins: start of the first set of effects, from the log's equations in weak form, by its effects.
     """
 
     bare: Problem
@@ -170,7 +170,7 @@ class CandidateSpace:
 
     @property
     def included(self) -> np.ndarray:
-        """True for rows with any included reading, shape (rows,)."""
+        """True for each row with at least one reading of positive weight, shape (rows,)."""
         return np.asarray(self.bare.data.weight).max(1) > 0
 
     @property
@@ -179,13 +179,13 @@ class CandidateSpace:
         return np.asarray(self.bare.data.weight)
 
     def without(self, rows: np.ndarray) -> CandidateSpace:
-        """Copy without some rows (a mask or indices)."""
+        """Copy in which some rows (a mask or indices) are ignored."""
         weight = self.weight.copy()
         weight[rows] = 0.0
-        return self.weighted(weight)
+        return self.with_weights(weight)
 
-    def weighted(self, weight: np.ndarray) -> CandidateSpace:
-        """Copy with these weights of the readings."""
+    def with_weights(self, weight: np.ndarray) -> CandidateSpace:
+        """Copy with these weights of the readings, shape (rows, channels)."""
 
         def with_weight(problem: Problem) -> Problem:
             return dataclasses.replace(problem, data=dataclasses.replace(problem.data, weight=jnp.asarray(weight)))
@@ -193,15 +193,15 @@ class CandidateSpace:
         return dataclasses.replace(self, bare=with_weight(self.bare), equipped=with_weight(self.equipped))
 
     def with_room(self, names: Sequence[str]) -> CandidateSpace:
-        """Copy with these effects in the program of every fit of histories."""
+        """Copy whose compiled fits of time histories include these effects."""
         return dataclasses.replace(self, room=tuple(n for n in self.library.names if n in names))
 
-    def fitted_by(self, sets: Iterable[Sequence[str]]) -> tuple[Problem, list[tuple[int, ...]]]:
-        """Problem whose program fits sets of effects, and the indices of each set in it.
+    def problem_for_sets(self, sets: Iterable[Sequence[str]]) -> tuple[Problem, list[tuple[int, ...]]]:
+        """One problem that can fit all these sets of effects, and the indices of each set in it.
 
-        For settled runs it has the whole library, and one program serves every set. A step of a fit of histories
-        takes longer with each effect, and so does its compilation. So its program has only those of `room` and of
-        the sets.
+        For settled runs, the problem has the whole library, so one compiled program serves every set. For time
+        histories, each further effect makes steps and compilation slower. Their problem has only the effects of
+        `room` and of the sets.
         """
         sets = [tuple(names) for names in sets]
         if not self.bare.observe.long:
@@ -225,26 +225,26 @@ class CandidateSpace:
         return problem, [tuple(index[n] for n in each) for each in sets]
 
     def fit_of(self, active: Sequence[str], z: np.ndarray) -> tuple[Problem, np.ndarray, tuple[int, ...] | None]:
-        """Problem, coordinates and indices of the effects of a fit.
+        """Problem, coordinates and indices of the effects for one fit.
 
-        For a fit without effects those of the base only, whose steps cost at most a third, unless the program of
-        `room` serves it too.
+        A fit without effects uses the problem of the base, because its steps take at most a third of the time. If
+        `room` has effects, their program serves this fit too.
         """
         if not any(active) and not self.room:
             return self.bare, np.asarray(z)[: self.free], None
-        problem, (indices,) = self.fitted_by([active])
+        problem, (indices,) = self.problem_for_sets([active])
         return problem, np.asarray(z), indices
 
     def problem(self, active: Sequence[str]) -> Problem:
-        """Problem with these effects in the slots."""
-        problem, (indices,) = self.fitted_by([active])
+        """Problem with these effects in its slots."""
+        problem, (indices,) = self.problem_for_sets([active])
         return dataclasses.replace(problem, coordinates=problem.coordinates.with_effects(indices))
 
 
 def candidate_space(
     bare: Problem, effects: Sequence[Effect], library: Library, slots: int, width: float
 ) -> CandidateSpace:
-    """Space of the base problem and these effects of a library, with a number of slots (see `Settings`)."""
+    """Candidate space of a base problem, with slots for effects of a library (number of slots: see `Settings`)."""
     shapes = [shape_of(e) for e in effects]
     scales = [shape_scales(s) for s in shapes]
     value, spread, sd, low, high = (jnp.asarray([s[k] for s in scales]) for k in range(5))

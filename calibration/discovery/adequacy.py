@@ -6,54 +6,59 @@ import dataclasses
 
 import numpy as np
 
-from calibration.discovery.score_tests import ScoreTable, Statistics
+from calibration.discovery.score_tests import ScoreTable, StrongestStatistics
 from calibration.discovery.settings import Settings
 from calibration.inference.linearization import Linearization
 
 
 @dataclasses.dataclass(frozen=True)
 class AdequacyTest:
-    """Test of a fit's residuals against its bootstrap.
+    """Compares the residuals of a fit with those of bootstrap tables without a missing effect.
 
     Attributes:
-        found: the strongest statistics of the data.
-        null: statistics of the bootstrap, shape (replicates,) each.
-        settings: shares of the family-wise error, and margins.
+        found: the strongest statistics of the measured data.
+        null: the same statistics of the bootstrap tables, shape (replicates,) each.
+        settings: family-wise error of each kind of statistic, and margins.
     """
 
-    found: Statistics
-    null: Statistics
+    found: StrongestStatistics
+    null: StrongestStatistics
     settings: Settings
 
     def p(self, kind: str) -> float:
-        """Fraction of bootstrap tables with a statistic at least as strong, never below 1 / (replicates + 1)."""
+        """p-value of one kind of statistic: share of bootstrap tables with a statistic at least as large. At least 1
+        / (replicates + 1).
+        """
         null = getattr(self.null, kind)
         return (1 + int(np.sum(null >= float(getattr(self.found, kind))))) / (1 + len(null))
 
     def threshold(self, kind: str) -> float:
-        """Critical value of the strongest statistic of a kind."""
+        """Critical value of one kind of statistic."""
         return float(np.quantile(getattr(self.null, kind), 1 - self.settings.shares[kind], method="higher"))
 
     @property
     def rejected(self) -> bool:
-        """True if an effect is missing, at the family-wise error of the settings."""
+        """True if the test finds that an effect is missing, at the family-wise error of the settings."""
         return any(self.p(kind) <= level for kind, level in self.settings.shares.items())
 
     @property
     def rejected_with_margin(self) -> bool:
-        """True if the residuals are highly significant, so that the fit is incomplete."""
-        return any(map(self.beyond_doubt, self.settings.shares))
+        """True if a statistic exceeds its critical value by its margin, so that the fit is certainly incomplete."""
+        return any(map(self.exceeds_margin, self.settings.shares))
 
-    def beyond_doubt(self, kind: str, found: float | None = None) -> bool:
-        """True if a statistic of a kind exceeds its threshold by the margin. None takes the strongest one."""
+    def exceeds_margin(self, kind: str, found: float | None = None) -> bool:
+        """True if a statistic exceeds its critical value by its margin. With `found` = None, the statistic of the
+        data is tested.
+        """
         if kind not in self.settings.shares:
             return False
         statistic = float(getattr(self.found, kind)) if found is None else found
         return statistic > self.threshold(kind) + self.settings.margins[kind]
 
     def confirmed(self, gain: float) -> AdequacyTest:
-        """The test with the gain of the strongest effect, and of pairs with it, limited to the gain that its
-        simulation confirms [σ²]."""
+        """The test after a simulation: the scores of the strongest effect and of its pairs are reduced to the gain
+        that the simulation confirms [σ²].
+        """
         promised = float(self.found.single) ** 2
         pair = self.found.pair - max(promised - gain, 0.0)
         found = dataclasses.replace(self.found, single=np.sqrt(min(promised, gain)), pair=pair)
@@ -61,19 +66,19 @@ class AdequacyTest:
 
     @property
     def p_value(self) -> float:
-        """Family-wise p-value: the smallest of its kinds, each over its share of the error."""
+        """Family-wise p-value: the smallest p-value over the kinds, each divided by its share of the error."""
         total = self.settings.family_wise_error
         return min(1.0, min(self.p(kind) * total / level for kind, level in self.settings.shares.items()))
 
 
 @dataclasses.dataclass(frozen=True)
 class Diagnosis:
-    """Diagnosis of a fit's residuals.
+    """The residuals of a fit, tested for missing effects.
 
     Attributes:
-        linear: the fit, linearised.
-        scores: scores of effects and curves.
-        test: test of the residuals.
+        linear: linearization of the fit.
+        scores: scores of effects and of smooth curves on the residuals.
+        test: adequacy test of the residuals.
     """
 
     linear: Linearization

@@ -17,7 +17,7 @@ from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.score_tests import ScoreTable
 from calibration.discovery.settings import Settings
 from calibration.inference import scans
-from calibration.inference.held_out import search_each
+from calibration.inference.held_out import fit_from_each_start
 from calibration.inference.linearization import amplitude_of
 from calibration.inference.observers import Observer
 from calibration.inference.optimizers import Optimum, observe_at
@@ -40,14 +40,15 @@ ROUNDING = 1e-9
 
 
 def supplying_effects(space: CandidateSpace, active: Sequence[str], amplitude: np.ndarray, z: np.ndarray) -> Names:
-    """Dissipative effects of negative amplitude with a balance that would supply power in an included row.
+    """Names of dissipative effects with a negative amplitude for which a balance would supply power in an included
+    row.
 
-    An effect corrects the law of its balance. A negative one means that the law takes too much. Histories and turns
-    have no operating point for each row and are judged only by the sign of the term.
+    A negative amplitude only corrects the law of its balance, as long as the balance as a whole dissipates. Time
+    histories and turns have no operating point for each row, so there the sign of the term decides.
 
     Args:
         active: name of the effect in each slot.
-        amplitude: amplitude of each.
+        amplitude: amplitude in each slot.
         z: coordinates of the fit.
     """
     negative = [n for n, a in zip(active, amplitude, strict=True) if n and a <= 0 and space.library[n].dissipative]
@@ -61,7 +62,7 @@ def supplying_effects(space: CandidateSpace, active: Sequence[str], amplitude: n
 
 
 def _dissipates(power: np.ndarray | None) -> bool:
-    """True if a balance takes power in every row with a known power, and there is at least one."""
+    """True if a balance never supplies power in the rows where its power is known, and if there is such a row."""
     if power is None or not np.isfinite(power).any():
         return False
     return bool(np.nanmin(power) >= -ROUNDING * np.nanmax(np.abs(power)))
@@ -69,8 +70,8 @@ def _dissipates(power: np.ndarray | None) -> bool:
 
 @functools.partial(compiled, options=SELDOM)
 def _dissipated_power(observe: Observer, robot: Robot) -> Float[Array, "balances rows"] | None:
-    """Power that each balance of `SINK` takes in each row [W], None if rows have no operating point."""
-    signals = observe.operating(robot)
+    """Power that each balance of `SINK` dissipates in each row [W], None if rows have no operating point."""
+    signals = observe.operating_points(robot)
     if signals is None:
         return None
     power = jax.vmap(lambda run, at: sink_powers(robot, run, at))(observe.conditions, signals)
@@ -96,20 +97,20 @@ STUCK = 0.1
 
 @dataclasses.dataclass(frozen=True)
 class Candidate:
-    """A set of effects, fitted with the base.
+    """Fit of the base together with a set of effects.
 
     Attributes:
         active: name of the effect in each slot, "" if empty.
-        z: coordinates, see `ActiveSet`.
-        sd: posterior sds of the coordinates.
-        cost: the objective [½σ²].
+        z: coordinates of the fit, see `ActiveSet`.
+        sd: posterior standard deviation of each coordinate.
+        cost: objective of the fit [½σ²].
         amplitude: amplitude in prior sds of each slot's effect (0 if empty).
-        size: size of each slot over the largest plausible amplitude in its direction, 0 if empty.
-        plausible: True if each amplitude has a plausible size, is off its bounds, and has a sign that physics allows.
-        nearly: True if it is plausible except for amplitudes up to `settings.stretched` times the largest.
+        size: amplitude of each slot, relative to the largest plausible one of its sign [-]. 0 if the slot is empty.
+        plausible: True if each amplitude has a plausible size, is not at a bound, and has a physically possible sign.
+        nearly: True if it would be plausible with `settings.stretched` times larger amplitudes.
         converged: True if the fit is an optimum.
-        supplying: effects that would make their balance supply power.
-        simulated: True for a fit of the model, False for one of its linearised equations (`screening`).
+        supplying: effects that would make a balance supply power.
+        simulated: True for a fit of the model, False for a fit of linearised equations (`screening`).
     """
 
     active: Names
@@ -126,12 +127,12 @@ class Candidate:
 
     @property
     def effects(self) -> Names:
-        """Names of the effects that are present."""
+        """Names of the effects in its slots."""
         return tuple(name for name in self.active if name)
 
     @property
     def key(self) -> frozenset[str]:
-        """Identity of the candidate: its set of effects."""
+        """Set of its effects, which identifies the candidate."""
         return frozenset(self.effects)
 
 
@@ -141,12 +142,12 @@ def empty_slots(settings: Settings) -> Names:
 
 
 def fill_slots(effects: Sequence[str], settings: Settings) -> Names:
-    """Slots with these effects first."""
+    """Slots with these effects first and empty slots after them."""
     return (*effects, *("",) * (settings.slots - len(effects)))
 
 
 def candidate_of_fit(space: CandidateSpace, active: Names, best: Optimum, settings: Settings) -> Candidate:
-    """Candidate from a fit of the effects in its slots."""
+    """Candidate with the result of a fit and the plausibility of its amplitudes."""
     amplitude = settings.width * np.asarray(space.coordinates.parts(best.z)[1])
     spread = settings.width * np.asarray(space.coordinates.parts(best.sd)[1])
     amplitude = np.where([bool(name) for name in active], amplitude, 0.0)
@@ -166,7 +167,7 @@ def candidate_of_fit(space: CandidateSpace, active: Names, best: Optimum, settin
 
 
 def _relative_amplitude(space: CandidateSpace, name: str, amplitude: float, settings: Settings) -> float:
-    """An amplitude [prior sds] over the largest plausible one in its direction."""
+    """Amplitude relative to the largest plausible one of its sign [-]. The amplitude is given in prior sds."""
     spec = amplitude_of(space.library[name]).spec
     unit = spec.prior_sd(0.0)
     bound = max(spec.bounds[1] if amplitude > 0 else -spec.bounds[0], 0.0) / unit
@@ -175,13 +176,13 @@ def _relative_amplitude(space: CandidateSpace, name: str, amplitude: float, sett
 
 @dataclasses.dataclass(frozen=True)
 class BaseFit:
-    """The base fitted without effects.
+    """Fit of the base without any effects.
 
     Attributes:
         candidate: candidate without effects.
-        reading: reading of each row [SI], shape (rows, channels).
-        space: space without the rows that it cannot reach.
-        unusable: indices of those.
+        reading: simulated reading of each row [SI], shape (rows, channels).
+        space: candidate space without the rows in `unusable`.
+        unusable: indices of rows that the robot cannot reach at any plausible parameters.
     """
 
     candidate: Candidate
@@ -191,14 +192,14 @@ class BaseFit:
 
 
 def fit_base(space: CandidateSpace, settings: Settings, where: str, near: Candidate | None = None) -> BaseFit:
-    """Best fit of the base without effects, from the prior mean and from draws of the prior.
+    """Fits the base without effects, from its prior mean and from random draws of its prior.
 
-    Rows that it cannot reach at all are excluded, and it is fitted again.
+    If the robot cannot reach some rows at all, they are excluded and the fit is repeated.
 
     Args:
         where: first words of the error message.
-        near: a fit of the same runs with other weights or sds, or by regression. For long runs the only start,
-            unless a regression is `UNLIKELY`.
+        near: fit of the same runs with other weights or sds, or by regression. For long runs it is the only start,
+            unless a regression ends `UNLIKELY` far from its prior.
 
     Raises:
         BadData: too few rows remain.
@@ -207,7 +208,7 @@ def fit_base(space: CandidateSpace, settings: Settings, where: str, near: Candid
     unusable = tuple(map(int, np.flatnonzero(lost)))
     space = space.without(lost) if unusable else space
     while True:
-        optima, observations = _base_searches(space, settings, near)
+        optima, observations = _best_starts(space, settings, near)
         # The first of those that end in one place, because rounding decides which of them is the lowest.
         cost = np.where(np.isfinite(optima.cost), optima.cost, np.inf)
         k = int(np.argmax(cost <= np.min(cost) + ALIKE))
@@ -233,7 +234,7 @@ def fit_base(space: CandidateSpace, settings: Settings, where: str, near: Candid
 def _beyond_adhesion(space: CandidateSpace) -> np.ndarray:
     """True for rows in which the robot slides even at the largest plausible adhesion, shape (rows,).
 
-    A search would increase the adhesion, and distort the whole base, until the robot grips in them.
+    If they stayed, the fit would raise the adhesion, and distort all other parameters, until the robot grips in them.
     """
     problem = space.bare
     if problem.observe.long:
@@ -243,10 +244,10 @@ def _beyond_adhesion(space: CandidateSpace) -> np.ndarray:
     return (np.asarray(observation.status) == SLIDES) & space.included
 
 
-def _base_searches(space: CandidateSpace, settings: Settings, near: Candidate | None) -> tuple[Optimum, Observation]:
-    """Optima of the base's searches from the starts that its data propose, and their observations.
+def _best_starts(space: CandidateSpace, settings: Settings, near: Candidate | None) -> tuple[Optimum, Observation]:
+    """Best fit of the base from several starts that the data suggest, and the simulated observation there.
 
-    Fits of histories run in the program of `CandidateSpace.room`, if it is known, with empty slots.
+    If `CandidateSpace.room` is known, fits of time histories use that program with empty slots.
     """
     observe, bare = space.bare.observe, space.bare
     few = bool(space.near)
@@ -262,7 +263,7 @@ def _base_searches(space: CandidateSpace, settings: Settings, near: Candidate | 
     weights = np.repeat(space.weight[None], len(starts), 0)
     problem, which = bare, None
     if space.room:
-        problem, (empty,) = space.fitted_by([empty_slots(settings)])
+        problem, (empty,) = space.problem_for_sets([empty_slots(settings)])
         starts = np.pad(starts, ((0, 0), (0, 2 * settings.slots)))
         which = np.repeat(np.asarray(empty)[None], len(starts), 0)
     search_inputs = jnp.asarray(starts), jnp.asarray(weights), which
@@ -274,17 +275,19 @@ Proposal = tuple[Names, np.ndarray]
 
 
 def fit_candidates(space: CandidateSpace, proposals: Sequence[Proposal], settings: Settings) -> list[Candidate]:
-    """Fits each pair of active effects and start. Fits known with other sds continue from there for a few steps."""
+    """Fits each set of effects from its start. A set that was fitted before with other sds continues from that fit
+    for a few steps.
+    """
     if not proposals:
         return []
-    problem, active = space.fitted_by(names for names, _ in proposals)
+    problem, active = space.problem_for_sets(names for names, _ in proposals)
     candidates: dict[int, Candidate] = {}
     for most in (None, FEW):
         positions = [k for k, (names, _) in enumerate(proposals) if (names in space.near) == (most is not None)]
         if not positions:
             continue
         starts = [space.near.get(*proposals[k]) for k in positions]
-        optima, _ = search_each(
+        optima, _ = fit_from_each_start(
             problem, starts, [space.weight] * len(positions), [active[k] for k in positions], most
         )
         for j, k in enumerate(positions):
@@ -296,14 +299,15 @@ def fit_candidates(space: CandidateSpace, proposals: Sequence[Proposal], setting
 def fit_in_addition(
     space: CandidateSpace, wanted: Sequence[tuple[Names, Candidate, ScoreTable]], settings: Settings
 ) -> list[Candidate]:
-    """Fit effects in addition to those of another fit, from the starts that their scores give.
+    """Fits effects in addition to those of a previous fit. Their scores give the start.
 
-    A fit that explains less than that fit, which has the effects at amplitude 0, started where no solution exists. It
-    is repeated from the other fit. The lowest one is also fitted from the prior mean, because a model error may have
-    led the search without the effect elsewhere.
+    A result that is worse than the previous fit started where no solution exists. It is repeated from the previous
+    fit. The best result is also fitted from the prior mean, because without the effect the search may have gone
+    astray.
 
     Args:
-        wanted: (active effects, the other fit, scores of its residuals). All of its effects are active.
+        wanted: (active effects, previous fit, scores of its residuals). The active effects include those of the
+            previous fit.
     """
     fits = fit_candidates(space, [(w, start_of_fit(space, at, w, settings, by)) for w, at, by in wanted], settings)
     stuck = [k for k, (_, at, _) in enumerate(wanted) if not fits[k].cost <= at.cost + STUCK]
@@ -323,7 +327,9 @@ def start_of_fit(
     settings: Settings,
     scores: ScoreTable | None = None,
 ) -> np.ndarray:
-    """Start of a fit of `active`: another fit, with new effects at their score's estimate."""
+    """Start of a fit of `active`: coordinates of another fit, with each new effect at the amplitude that its score
+    estimates.
+    """
     p, s = space.free, settings.slots
     z = np.zeros(p + 2 * s)
     z[:p] = at.z[:p]

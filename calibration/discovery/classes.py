@@ -1,4 +1,4 @@
-"""Classes: for each effect found, the effects and stated values that the same data cannot separate from it."""
+"""Alternatives to each effect found: other effects and stated values that explain the same data as well."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from calibration.data import Names
 from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.adequacy import Diagnosis
 from calibration.discovery.candidates import Candidate, candidate_of_fit, fit_candidates, start_of_fit
-from calibration.discovery.projection import explained_by
+from calibration.discovery.projection import explained_function
 from calibration.discovery.score_tests import ScoreTable
 from calibration.discovery.screening import fit_by_regression
-from calibration.discovery.search import without_each
+from calibration.discovery.search import refit_without_each
 from calibration.discovery.settings import Settings
 from calibration.inference.bases import place_in_words
-from calibration.inference.held_out import search_each
+from calibration.inference.held_out import fit_from_each_start
 from calibration.inference.linearization import Linearization
 from mmrjax.model import channels
 
@@ -32,12 +32,12 @@ ROUNDS, PULL = 3, 0.3
 
 @dataclasses.dataclass(frozen=True)
 class Shift:
-    """A base parameter that, fitted without its prior, replaces an effect.
+    """A base parameter that explains the data in place of an effect, if its prior is dropped.
 
     Attributes:
-        name: dotted, of the parameter.
+        name: dotted name of the parameter.
         index: index of its coordinate.
-        fit: fit of all other parameters. Its cost excludes the prior.
+        fit: the fit with the parameter free of its prior. Its cost excludes that prior.
     """
 
     name: str
@@ -46,11 +46,12 @@ class Shift:
 
 
 def prior_shift_scores(jacobian: np.ndarray, residual: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Score of a shift of the mean of each coordinate's prior [σ²], and the linear estimate of each coordinate
-    without its prior [prior sds].
+    """Gain by dropping the prior of each coordinate.
+
+    Returns the linear estimate of the decrease of χ² [σ²] and of the coordinate without its prior [prior sds].
 
     Args:
-        jacobian, residual: Jacobian and residual of a fit, the priors' residuals last.
+        jacobian, residual: Jacobian and residual of a fit, with the residuals of the priors last.
     """
     half = np.linalg.solve(np.linalg.cholesky(jacobian.T @ jacobian), jacobian.T)
     prior_rows = np.arange(len(residual) - jacobian.shape[1], len(residual))
@@ -66,14 +67,14 @@ def prior_shift_scores(jacobian: np.ndarray, residual: np.ndarray) -> tuple[np.n
 def find_prior_shifts(
     space: CandidateSpace, at: Candidate, needed: float, settings: Settings, linear: Linearization | None = None
 ) -> list[Shift]:
-    """Base parameters that, without their prior, would explain at least `needed` σ² of a fit's discrepancy.
+    """Base parameters that reduce the χ² of a fit by at least `needed` [σ²] if their prior is dropped.
 
     Args:
-        at: the fit. Its effects stay.
-        linear: the same, linearised, if known.
+        at: the fit. Its effects remain in the model.
+        linear: linearization of that fit, if known.
     """
     if linear is None:
-        problem, (active,) = space.fitted_by([at.active])
+        problem, (active,) = space.problem_for_sets([at.active])
         residual, jacobian, _ = problem.observe.at(problem, at.z, active)
     else:
         residual, jacobian = linear.residual, linear.jacobian
@@ -82,28 +83,28 @@ def find_prior_shifts(
     for k in np.argsort(-explained[: space.free]):
         if explained[k] < needed:
             break
-        fit = _without_prior(space, at, int(k), float(values[k]), settings)
+        fit = _fit_without_prior(space, at, int(k), float(values[k]), settings)
         if fit is not None:
             shifts.append(Shift(space.coordinates.base.names[k], int(k), fit))
     return shifts
 
 
-def _without_prior(
+def _fit_without_prior(
     space: CandidateSpace, at: Candidate, k: int, value: float, settings: Settings
 ) -> Candidate | None:
-    """Fit without the prior of coordinate k: the prior's mean is moved to the data's estimate.
+    """Fit without the prior of coordinate k: the mean of the prior is moved to the estimate from the data.
 
-    None if that is beyond the parameter's bounds, or without an optimum.
+    None if the estimate is outside the bounds of the parameter, or if the fit does not converge.
     """
     p, mean, start = space.free, value, np.array(at.z)
-    equipped, (indices,) = space.fitted_by([at.active])
+    equipped, (indices,) = space.problem_for_sets([at.active])
     for _ in range(ROUNDS):
         centre = np.zeros(len(start))
         centre[k] = mean
         start[k] = mean
         data = dataclasses.replace(equipped.data, centre=jnp.asarray(centre))
         problem = dataclasses.replace(equipped, data=data)
-        optima, _ = search_each(problem, [start], [space.weight], [indices])
+        optima, _ = fit_from_each_start(problem, [start], [space.weight], [indices])
         best = jax.tree.map(lambda x: x[0], optima)
         z = np.asarray(best.z)
         if not np.isfinite(best.cost):
@@ -129,12 +130,13 @@ SURE = 0.7
 
 @dataclasses.dataclass(frozen=True)
 class Classes:
-    """Alternatives that the data cannot distinguish.
+    """Alternatives that the data cannot distinguish from the best candidate.
 
     Attributes:
-        members: for each effect of the best candidate, the effects indistinguishable from it, itself first.
-        stated: for each, base parameters whose stated value may be wrong instead.
-        families: for each, the families of its members, the leader's first, then those of `ammeter_families`.
+        members: for each effect of the best candidate, the effect itself and all effects that explain the data as
+            well.
+        stated: for each effect, base parameters whose stated value may be wrong instead.
+        families: for each effect, the families of its alternatives, its own first, then those of `ammeter_families`.
         ladder: all candidates that were fitted, including those of the search.
     """
 
@@ -152,7 +154,9 @@ class Classes:
 
 
 def signature_cosines(space: CandidateSpace, scores: ScoreTable) -> np.ndarray:
-    """Largest |cos| between the projected signatures of two effects, over their shapes, (effects, effects)."""
+    """Similarity of every two effects: largest |cos| of the angle between their projected signatures, over their
+    shapes. Shape (effects, effects).
+    """
     cosine, effect, count = np.abs(np.asarray(scores.cosine)), space.library.of, len(space.library)
     cosines = np.zeros((count, count))
     np.maximum.at(cosines, (effect[:, None], effect[None, :]), cosine)
@@ -170,15 +174,15 @@ def find_classes(
 ) -> Classes:
     """Effects and stated values that explain the data as well as each effect of the best fit.
 
-    The forms of nature are not those of a library. So an alternative may explain less than an effect, by a share
-    `settings.form` of the sigmas, or `form_family` within the same family.
+    Real losses need not have the exact form of a library effect. So an alternative may explain less than the effect
+    by a share `settings.form` of its sigmas, or by `form_family` if it is of the same family.
 
     Args:
-        left: diagnosis of the base.
+        left: diagnosis of the base fit.
         after: diagnosis of the best fit.
     """
     cosine, names = signature_cosines(space, left.scores), space.library.names
-    fewer = [base] if len(best.effects) == 1 else without_each(space, best, settings, ladder)
+    fewer = [base] if len(best.effects) == 1 else refit_without_each(space, best, settings, ladder)
     gains = [2 * (c.cost - best.cost) for c in fewer]
     requests: list[tuple[int, str, Names]] = []
     for slot, name in enumerate(best.effects):
@@ -215,7 +219,7 @@ def find_classes(
                 same.append(other)
         members.append(tuple(same))
         column = jacobian[: after.linear.readings, space.free + slot, None]
-        rest = without_amplitude(space, best, slot, jacobian, residual)
+        rest = remove_effect(space, best, slot, jacobian, residual)
         ammeter.append(ammeter_families(space, *rest, column, family, settings))
         linear = left.linear if len(best.effects) == 1 else None
         shifts = find_prior_shifts(space, fewer[slot], SURE * gain, settings, linear)
@@ -228,14 +232,14 @@ def find_classes(
 
 
 def families_of_members(space: CandidateSpace, members: Sequence[str]) -> Names:
-    """Families of the members of a class, the leader's first."""
+    """Families of the effects of a class, without repeats. The family of the leading effect is first."""
     return tuple(dict.fromkeys(space.library[m].family() for m in members))
 
 
-def without_amplitude(
+def remove_effect(
     space: CandidateSpace, best: Candidate, slot: int, jacobian: np.ndarray, residual: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Jacobian and residual of a fit without one of its effects, whose contribution the residual gets back."""
+    """Jacobian and residual of a fit after the effect in one slot is removed, to first order."""
     k = space.free + slot
     return np.delete(jacobian, [k, k + len(best.active)], 1), residual - jacobian[:, k] * best.z[k]
 
@@ -248,20 +252,21 @@ def ammeter_families(
     family: str,
     settings: Settings,
 ) -> Names:
-    """Families of errors of an ammeter that explain as much as effects do, by the same change of its readings alone.
+    """Families of ammeter errors that explain the data as well as these effects, by changing the current readings
+    alone.
 
-    Where the speed is imposed, the current is the first reading of a torque. Only a further one that responds to
-    the torque, by enough over its noise, separates a loss from an error of the ammeter.
+    If the speed is imposed, the current is the main indicator of torque. Only another reading that responds clearly
+    to torque can separate a loss from an ammeter error.
 
     Args:
         jacobian, residual: Jacobian and residual of the fit without the effects.
-        columns: columns of the effects over the readings.
+        columns: change of the readings per unit of each effect.
         family: family of the effects.
     """
     names = channels.channel_names(space.bare.channels)
     if space.bare.base.rig.imposed != "motor_speed":
         return ()
-    explained = explained_by(jacobian, residual)
+    explained = explained_function(jacobian, residual)
     most = explained(columns)[0]
     least = most - max(settings.same, settings.form**2 * most)
     driver = family.partition(" that ")[2].replace("with load", "with current")

@@ -1,4 +1,4 @@
-"""Check that a model describes the runs at all, otherwise no effect is named."""
+"""Check that a model describes the runs at all. If it does not, no effect is named."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from calibration.data import Names
 from calibration.data.runs import Runs
 from calibration.discovery.active_set import CandidateSpace
-from calibration.discovery.loop_notes import Missed
+from calibration.discovery.loop_notes import MissedChannel
 from calibration.discovery.prediction import HeldOutScore
 from calibration.inference import checks as unused_room
 from calibration.inference.lack_of_fit import EXPLAINED, UNDESCRIBED
@@ -20,13 +20,15 @@ from calibration.inference.noise import UNSTATED, Noise
 REMOVED = 0.5
 
 
-def missed_channels(space: CandidateSpace, runs: Runs, noise: Noise, refit: Linearization) -> tuple[Missed, ...]:
-    """Channels that the refit misses by more than `UNDESCRIBED` of their rms, or with estimated noise that large.
+def missed_channels(
+    space: CandidateSpace, runs: Runs, noise: Noise, refit: Linearization
+) -> tuple[MissedChannel, ...]:
+    """Channels with a refit error above `UNDESCRIBED` of their measured rms, or with an estimated noise above it.
 
-    A channel with stated noise that large is described by residuals up to `EXPLAINED` times its sds.
+    If the stated noise of a channel is that large, residuals up to `EXPLAINED` times the noise are accepted.
 
     Args:
-        refit: the fit without effects, linearised.
+        refit: linearization of the fit without effects.
     """
     has_stated_sd = np.array([source not in UNSTATED for source in noise.source])
     share, sigma = _error_shares(space, runs, noise, refit)
@@ -37,25 +39,25 @@ def missed_channels(space: CandidateSpace, runs: Runs, noise: Noise, refit: Line
         noisy = np.sqrt(np.nansum(np.where(counts, noise.sd, 0.0) ** 2, 0) / np.nansum(measured_values**2, 0))
     noisy = np.where(has_stated_sd, 0.0, noisy)
     return tuple(
-        Missed(c.name, float(share[k]), float(noisy[k]))
+        MissedChannel(c.name, float(share[k]), float(noisy[k]))
         for k, c in enumerate(runs.channels)
         if large[k] or noisy[k] > UNDESCRIBED
     )
 
 
 def remaining_errors(
-    space: CandidateSpace, runs: Runs, missed: Sequence[Missed], refit: HeldOutScore, found: HeldOutScore
-) -> tuple[Missed, ...]:
-    """Errors on unseen runs, of channels that the refit misses, with the effects found.
+    space: CandidateSpace, runs: Runs, missed: Sequence[MissedChannel], refit: HeldOutScore, found: HeldOutScore
+) -> tuple[MissedChannel, ...]:
+    """Hold-out errors of the missed channels after effects were added.
 
-    None if these do not describe the runs either: more than `UNDESCRIBED` of a channel's rms remains, or less than
-    `REMOVED` of the refit's error is gone, or the noise is estimated as that large.
+    None if the effects do not describe the runs either: more than `UNDESCRIBED` of a channel's rms remains, less than
+    `REMOVED` of the refit's error has gone, or the noise itself is estimated to be that large.
 
     Args:
-        missed: as from `missed_channels`.
+        missed: channels from `missed_channels`.
         refit, found: hold-out predictions without and with the effects.
     """
-    before, after = _unseen_errors(space, runs, refit, found)
+    before, after = _hold_out_error_shares(space, runs, refit, found)
     index = {c.name: k for k, c in enumerate(runs.channels)}
     remaining = [m._replace(error=float(after[index[m.channel]])) for m in missed]
     described = all(
@@ -65,9 +67,10 @@ def remaining_errors(
     return tuple(remaining) if described else ()
 
 
-def _unseen_errors(space: CandidateSpace, runs: Runs, *scores: HeldOutScore) -> np.ndarray:
-    """rms error of each fit on unseen runs over each channel's measured rms [-], over the readings that all predict,
-    NaN without any, shape (fits, channels)."""
+def _hold_out_error_shares(space: CandidateSpace, runs: Runs, *scores: HeldOutScore) -> np.ndarray:
+    """Hold-out rms error of each fit, divided by the measured rms of the channel [-]. Only readings that all fits
+    predict count. NaN if there is none. Shape (fits, channels).
+    """
     measured_values = runs.measured()
     counts = space.weight[: len(runs)] > 0
     off = [[np.where(counts, reading - measured_values, np.nan) for reading in s.reading.values()] for s in scores]
@@ -81,7 +84,9 @@ def _unseen_errors(space: CandidateSpace, runs: Runs, *scores: HeldOutScore) -> 
 def _error_shares(
     space: CandidateSpace, runs: Runs, noise: Noise, fit: Linearization
 ) -> tuple[np.ndarray, np.ndarray]:
-    """rms error of each channel over its measured rms [-], and in sds [σ], over included readings, 0 without any."""
+    """rms error and noise of each channel, both divided by its measured rms [-]. Only included readings count. 0 if
+    there is none.
+    """
     rows = len(runs)
     counts = space.weight[:rows] > 0
     off = np.where(counts, np.asarray(fit.by_row())[:rows], 0.0)
@@ -91,6 +96,6 @@ def _error_shares(
 
 
 def unused_inputs(runs: Runs) -> Names:
-    """Columns of numbers that vary and have no role, and an output torque that a brake may impose."""
+    """Numeric columns that vary but have no role, and an output torque that may be imposed by a brake."""
     torques = (f"{note.theirs} as a condition" for note in unused_room.unexplained_torque_notes(runs))
     return (*unused_room.unused_columns(runs), *torques)

@@ -1,4 +1,4 @@
-"""The closed loop: fit, outliers, score tests, adequacy, search, classes, discrepancy, next experiment, in order.
+"""The closed loop, in order: fit, outliers, score tests, adequacy, search, classes, discrepancy, next experiment.
 
 Each stage is a pure function of the results of the stages before it.
 """
@@ -28,14 +28,22 @@ from calibration.discovery.adequacy import AdequacyTest, Diagnosis
 from calibration.discovery.candidates import BaseFit, Candidate, fill_slots, fit_base, fit_candidates, start_of_fit
 from calibration.discovery.classes import Classes, ammeter_families, find_classes, signature_cosines
 from calibration.discovery.description import missed_channels, remaining_errors, unused_inputs
-from calibration.discovery.discrepancy import CurveBeside, locate_discrepancy
+from calibration.discovery.discrepancy import BaseCurve, locate_discrepancy
 from calibration.discovery.experiments import Proposal, propose_denser_runs, propose_nothing, propose_separating
-from calibration.discovery.hidden import Hidden, find_hidden_effects
-from calibration.discovery.kept import Keep
+from calibration.discovery.hidden import HiddenEffect, find_hidden_effects
+from calibration.discovery.kept import StoreStage
 from calibration.discovery.location import DiscrepancyLocation, varied_by_duty
-from calibration.discovery.loop_notes import FreedValue, Mechanism, Missed, Missing, NameSupport, NameTest, Summary
+from calibration.discovery.loop_notes import (
+    AlternativeValue,
+    Mechanism,
+    MissedChannel,
+    MissingEffect,
+    NameSupport,
+    NameTest,
+    VerdictSummary,
+)
 from calibration.discovery.loop_posterior import posterior_of_curve, posterior_of_fit
-from calibration.discovery.mechanism import find_mechanism, scored_once
+from calibration.discovery.mechanism import cached_hold_out_score, find_mechanism
 from calibration.discovery.outliers import (
     Screening,
     compile_ahead,
@@ -46,16 +54,16 @@ from calibration.discovery.outliers import (
 from calibration.discovery.prediction import Predicted
 from calibration.discovery.result import (
     DiscoveryResult,
+    EffectRanking,
     Errors,
     FoundEffect,
     HeldOutAlternative,
-    Ranking,
+    NoiseVerdict,
     ReadingsOfRows,
-    Sensitivity,
 )
-from calibration.discovery.score_tests import Statistics, bootstrap, family_columns
-from calibration.discovery.screening import screen_by_weak_form, with_program_room
-from calibration.discovery.search import Search, best_of_each_size, diagnose_candidate, search_effects
+from calibration.discovery.score_tests import StrongestStatistics, bootstrap_statistics, family_columns
+from calibration.discovery.screening import include_likely_effects, screen_by_weak_form
+from calibration.discovery.search import SearchResult, best_of_each_size, diagnose_candidate, search_effects
 from calibration.discovery.settings import FIT, HELD_OUT, WITHOUT_NAME, Settings, settings_for
 from calibration.discovery.standing import judge_names
 from calibration.inference import bases as bases_room
@@ -64,14 +72,14 @@ from calibration.inference import noise as noise_room
 from calibration.inference import observers, preparation, priors, series_noise
 from calibration.inference.bases import Bases
 from calibration.inference.conduct import error_after_steps
-from calibration.inference.fit_notes import Notes, Remark, next_step, with_codes
+from calibration.inference.fit_notes import Notes, Remark, progress_remark, remarks_with_codes
 from calibration.inference.identifiability import undetermined_names
 from calibration.inference.lack_of_fit import Residuals
 from calibration.inference.linearization import Linearization
 from calibration.inference.lost_motion import lost_motion_notes
 from calibration.inference.noise import Noise
 from calibration.inference.noise_factor import common_factors, noise_remarks
-from calibration.inference.residual_clusters import residual_clusters
+from calibration.inference.residual_clusters import find_residual_clusters
 from calibration.inference.simulation_errors import channel_errors
 from mmrjax import effects, fidelities
 from mmrjax.compile.precision import SINGLE, Threads, in_double, is_double
@@ -117,27 +125,27 @@ def discover(
     forbidden: Sequence[str] = (),
     rows: int = ROWS,
     progress: Callable[[str], None] = lambda text: None,
-    keep: Keep = kept.keep_nothing,
+    keep: StoreStage = kept.compute_without_storing,
     left: Callable[[], float | None] = lambda: None,
 ) -> DiscoveryResult:
     """Finds the model error of a robot with respect to measured runs, and traces it to a balance or an effect.
 
     Args:
         runs: settled runs, or time histories from rest.
-        robot: its values are the prior means. A mass in the table replaces its own.
-        noise: sds as `noise.parse_noise`. None takes the file's columns, else an estimate from series of conditions,
-            or without series a usual one, halved and doubled.
-        stated: parameter → (mean, sd) [SI], priors that replace the fields'.
+        robot: robot model. Its values are the prior means. A mass in the table replaces the robot's mass.
+        noise: standard deviations, in the format of `noise.parse_noise`. None: from columns of the file, or else
+            estimated from series of conditions, or else assumed, halved and doubled.
+        stated: parameter → (mean, sd) [SI]. These priors replace those of the fields.
         library: effects to test.
-        replicates: replicates of the bootstrap.
+        replicates: number of bootstrap tables.
         seed: random seed.
-        prefer: criterion for the leader of a class, `fit` or `held-out`.
-        forbidden: kinds of experiments (`menu.KINDS`) and configurations that are not proposed.
-        rows: number of rows above which they are thinned evenly, those of a log in time and those of a table over its
-            conditions. A note reports it.
+        prefer: criterion for the leading effect of a class, `fit` or `held-out`.
+        forbidden: kinds of experiments (`menu.KINDS`) and configurations that must not be proposed.
+        rows: largest number of rows. Larger tables are thinned evenly: logs in time, tables over their conditions. A
+            note reports it.
         progress: callback for progress messages.
-        keep: function that stores each stage when it ends.
-        left: remaining time after the verdict [s], for which verdicts at other noises are awaited. None: no limit.
+        keep: function that stores the result of each finished stage.
+        left: time left after the verdict [s] for verdicts at other noise levels. None: no limit.
 
     Raises:
         BadData, BadConfiguration: data that contradict themselves or are too few, invalid priors, unknown
@@ -158,22 +166,22 @@ def discover(
     factors = FACTORS.get(known.word, ())
     # Verdicts at other noises use the programs of the first one, so they run in parallel on other cores.
     threads = Threads(2)
-    sensitivity, outstanding = list[Sensitivity](), list[float]()
+    sensitivity, outstanding = list[NoiseVerdict](), list[float]()
     try:
         if factors:
-            tell(next_step("factors", tuple(f"{f:g}" for f in factors), known.word))
+            tell(progress_remark("factors", tuple(f"{f:g}" for f in factors), known.word))
 
-        def other(factor: float) -> LoopStages:
+        def trace_with_noise(factor: float) -> LoopStages:
             noise = known.scaled(dict.fromkeys(silent, factor))
             return keep(f"noise {factor:g}", dataclasses.replace(ready, noise=noise, known=traced).trace)
 
-        verdicts = {f: threads.submit(other, f) for f in factors}
+        verdicts = {f: threads.submit(trace_with_noise, f) for f in factors}
         found = keep("result", lambda: assemble_result(told, traced))
         if not all(verdict.done() for verdict in verdicts.values()):
-            tell(next_step("others"))
+            tell(progress_remark("others"))
         for f, verdict in verdicts.items():
             try:
-                sensitivity.append(brief_verdict(f, verdict.result(left()), ready.numbers))
+                sensitivity.append(verdict_at_noise(f, verdict.result(left()), ready.numbers))
             except concurrent.futures.TimeoutError:
                 outstanding.append(f)
     finally:  # an interruption or the time limit waits for none of them
@@ -195,22 +203,23 @@ def discover(
 
 @dataclasses.dataclass(frozen=True)
 class LoopInput:
-    """Context of the loop's stages: a table, its robot, the settings, and callbacks.
+    """Input of the stages of the loop: runs, robot, settings and callbacks.
 
     Attributes:
-        runs: runs without copies.
-        numbers: numbers of the rows, as in messages.
-        robot: as `preparation.prepare` returns it.
+        runs: runs without exact copies.
+        numbers: row numbers as used in messages.
+        robot: robot from `preparation.prepare_input`.
         noise: noise of the readings.
-        stated: priors (mean, sd) [SI].
-        settings: statistical.
+        stated: priors (mean, sd) that replace those of the fields [SI].
+        settings: statistical settings.
         library: effects to test.
-        notes: notes on all of these.
-        at_first: those to report before the first fit.
-        progress: callback for progress notes.
+        notes: remarks on the input.
+        at_first: remarks to report before the first fit.
+        progress: callback for progress messages.
         keep: function that stores each stage when it ends. A stored stage contains the results of the stages before.
-        known: stages of the same table with other sds.
-        others: open while programs of later stages are compiled on other cores, which `later` begins, or None.
+        known: results for the same table with other sds.
+        others: open while later programs are compiled on other cores, see `later`. None if there is nothing to
+            compile.
     """
 
     runs: Runs
@@ -223,47 +232,46 @@ class LoopInput:
     notes: Notes = ()
     at_first: Notes = ()
     progress: Tell = lambda note: None
-    keep: Keep = kept.keep_nothing
+    keep: StoreStage = kept.compute_without_storing
     known: LoopStages | None = None
     others: contextlib.ExitStack | None = None
     later: list[Callable[[BaseFit], None]] = dataclasses.field(default_factory=list)
 
     def trace(self, ahead: bool = False) -> LoopStages:
-        """Stages of the loop up to a verdict, in order.
+        """Runs the stages of the loop up to the verdict.
 
-        With `ahead`, programs of later stages are compiled on other cores once a log's equations are ranked.
+        With `ahead`, later programs are compiled on other cores as soon as the equations of a log are ranked.
 
-        The bootstrap's statistics, in units of their sds, depend only weakly on the sds. If the stages of the same
-        table with other sds are `known`, with the same included rows, their replicates are reused. Fits of histories
-        then take a few Gauss-Newton steps from those. Sets of effects outside their program are not simulated, and no
-        further row is excluded.
+        If results with other sds are `known` for the same included rows, their bootstrap replicates are reused: in
+        units of the sds, the statistics hardly depend on the sds. Fits of time histories then take a few Gauss-Newton
+        steps from the known fits. No new sets of effects are compiled and no further row is excluded.
 
-        If the residuals have no structure and exceed the sds by the same factor everywhere, the sds are wrong. The
-        stages are then repeated with sds from the residuals.
+        If the residuals have no structure but exceed the sds by the same factor everywhere, the sds are wrong. The
+        stages are then repeated with sds estimated from the residuals.
         """
-        ranked = list[Ranking]()
+        ranked = list[EffectRanking]()
         with contextlib.ExitStack() as others:
             given = dataclasses.replace(self, others=others if ahead else None, later=[])
             screened, sds = self.keep("base", functools.partial(_fit_base_and_noise, given, ranked))
             screened, left, searched = _search_until_clean(given, screened, sds, ranked)
             if searched is None:
                 missed = missed_channels(screened.base.space, self.runs, sds.noise, left.linear)
-                word = "undescribed" if missed or self.loses_motion else "none"
+                word = "undescribed" if missed or self.shows_unmodelled_backlash else "none"
                 return LoopStages(word, screened, left, sds, missed=missed, unused=unused_inputs(self.runs))
-            return _verdict(given, screened, left, sds, searched)
+            return _reach_verdict(given, screened, left, sds, searched)
 
     @functools.cached_property
-    def loses_motion(self) -> bool:
+    def shows_unmodelled_backlash(self) -> bool:
         """True if the log shows backlash but the robot has none."""
         return bool(lost_motion_notes(self.runs, self.robot))
 
-    def screen(self, noise: Noise, before: BaseFit | None, ranked: list[Ranking]) -> Screening:
-        """The base fit with this noise, from one with another if given, and its outliers.
+    def screen(self, noise: Noise, before: BaseFit | None, ranked: list[EffectRanking]) -> Screening:
+        """Fits the base with this noise and excludes outliers. `before` is an earlier fit with other noise.
 
-        A log's equations in weak form give the program and the start of its fit. Their ranking of the library is
-        appended to `ranked`.
+        For logs, the equations in weak form give the program and the start of the fit. Their ranking of the library
+        is appended to `ranked`.
         """
-        space = pose_candidates(self.runs, self.robot, noise.sd, self.settings, self.stated, self.library)
+        space = build_candidate_space(self.runs, self.robot, noise.sd, self.settings, self.stated, self.library)
         known, at = self.known, functools.partial(bases_at_fit, self.runs)
         near = None
         if before is not None:
@@ -276,7 +284,7 @@ class LoopInput:
                 space, near = dataclasses.replace(space.with_room(ranking.room), begins=begins), ranking.base
             if self.others is not None:
                 self.later.append(self.others.enter_context(compile_ahead(space, at, self.settings)))
-        self.progress(next_step("base"))
+        self.progress(progress_remark("base"))
         if known is not None and space.bare.observe.long:  # the same rows are included here
             space = dataclasses.replace(space.without(np.array(known.screened.outliers, int)), near=known.simulated)
             base = fit_base(space, self.settings, self.runs.source, near)
@@ -297,30 +305,30 @@ def prepare_loop(
     forbidden: Sequence[str] = (),
     rows: int = ROWS,
 ) -> LoopInput:
-    """Input of the stages from the arguments of `discover`. Arguments and errors as there.
+    """Prepares the input of the stages from the arguments of `discover`, and raises its errors.
 
-    A campaign that needs only verdicts continues with `LoopInput.trace`, and so follows the same path as users.
+    A campaign that needs only verdicts continues with `LoopInput.trace`, so it computes the same as the command.
     """
     menu.check_forbidden(forbidden, robot)
     runs = used_rows(runs, robot, rows)
-    distinct, numbers, notes = without_copies(runs)
+    distinct, numbers, notes = remove_copies(runs)
     kind = observers.observer_kind(distinct)
     if len(distinct) < kind.fewest:
         raise BadData(
             f"{runs.source}: {count_noun(len(distinct), kind.word)} cannot show what a model lacks; at least "
             f"{kind.fewest} are needed"
         )
-    with scales.nominal_ahead(robot):
-        ready = preparation.prepare(distinct, robot, noise, stated)
-    for note in with_codes(ready.checked, "nothing_varies", "copied"):
+    with scales.compute_nominal_ahead(robot):
+        ready = preparation.prepare_input(distinct, robot, noise, stated)
+    for note in remarks_with_codes(ready.checked, "nothing_varies", "copied"):
         if note.code == "nothing_varies" or not note.tied:
             raise BadData(describe(note))
-    at_first = (*ready.foreign, *ready.doubted, *with_codes(ready.checked, "lost_motion"))
+    at_first = (*ready.foreign, *ready.doubted, *remarks_with_codes(ready.checked, "lost_motion"))
     notes_so_far: Notes = (*notes, *ready.checked, *ready.begins, *ready.weighed, *ready.foreign, *ready.doubted)
     turned = scales.output_rotation(distinct, ready.robot)
     channel_effects = {name: e for name, e in effects.OF_CHANNELS.items() if e.channel in ready.robot.rig.channels}
     library = {**library, **kind.library, **channel_effects}
-    library = scales.library_of_size(ready.robot, distinct.conditions(ready.robot), library, turned)
+    library = scales.scale_library(ready.robot, distinct.conditions(ready.robot), library, turned)
     settings = dataclasses.replace(
         settings_for(kind, replicates, seed, prefer),
         forbidden=tuple(forbidden),
@@ -332,12 +340,12 @@ def prepare_loop(
 
 
 @dataclasses.dataclass(frozen=True)
-class Sds:
-    """Noise of a verdict.
+class VerdictNoise:
+    """Noise on which a verdict is based.
 
     Attributes:
         noise: noise of the readings.
-        factors: changes of the given sds by channel, empty for none.
+        factors: factors on the given sds by channel, empty if they are unchanged.
         remarks: notes on the noise.
     """
 
@@ -348,44 +356,44 @@ class Sds:
 
 @dataclasses.dataclass(frozen=True)
 class LoopStages:
-    """Results of the stages up to a verdict.
+    """Results of the stages of the loop up to the verdict.
 
     Attributes:
         verdict: `none`, `named`, `class`, `mechanism`, `place` or `undescribed`.
-        screened: the base fit without outliers.
+        screened: base fit without outliers.
         left: diagnosis of the base fit.
-        sds: noise of the verdict.
-        searched: the search.
-        alike: effects that cannot be separated, if a name is given.
-        where: location of the discrepancy, or of the remaining one.
-        standing: tests of the names.
-        held_out: alternatives by hold-out errors, if these chose the leader.
-        beside: the curve of the base's discrepancy, if there is one.
+        sds: noise on which the verdict is based.
+        searched: result of the search for effects.
+        alike: alternatives to the effects found, if effects are named.
+        where: location of the discrepancy, or of the rest that the effects leave.
+        standing: tests of the effects' names.
+        held_out: alternatives ordered by hold-out error, if these errors chose the leading effect.
+        beside: smooth curve of the discrepancy of the base, if there is one.
         predicted: hold-out predictions of fits, as from `prediction.smallest_predictive_set`.
-        mechanism: if no name is established. It may not be established either.
-        missed: channels that the refit does not describe, except for `undescribed` with the error that the
-            effects leave on unseen runs.
-        unused: columns that vary and have no role.
+        mechanism: equation and driving variable, if no effect is established. They need not be established either.
+        missed: channels that the refit does not describe. For other verdicts than `undescribed`, with the error that
+            remains after adding effects.
+        unused: numeric columns that vary and have no role.
     """
 
     verdict: str
     screened: Screening
     left: Diagnosis
-    sds: Sds
-    searched: Search | None = None
+    sds: VerdictNoise
+    searched: SearchResult | None = None
     alike: Classes | None = None
     where: DiscrepancyLocation | None = None
     standing: NameSupport | None = None
     held_out: tuple[HeldOutAlternative, ...] = ()
-    beside: CurveBeside | None = None
+    beside: BaseCurve | None = None
     predicted: Predicted = dataclasses.field(default_factory=dict)
     mechanism: Mechanism | None = None
-    missed: tuple[Missed, ...] = ()
+    missed: tuple[MissedChannel, ...] = ()
     unused: Names = ()
 
     @property
     def members(self) -> tuple[Names, ...]:
-        """For each established effect, those that these data cannot separate from it, itself first."""
+        """For each established effect, the effect and those that the data cannot separate from it."""
         return tuple(m for m, name in zip(self._classes, self._named, strict=True) if name)
 
     @property
@@ -398,12 +406,12 @@ class LoopStages:
 
     @property
     def noise_factor(self) -> float | None:
-        """Factor of the sds, the geometric mean of the channels, None if they are unchanged."""
+        """Geometric mean over channels of the factor on the sds, None if they are unchanged."""
         return float(np.exp(np.mean(np.log(list(self.sds.factors.values()))))) if self.sds.factors else None
 
     @property
     def families(self) -> Names:
-        """Families of the members of each established class, or of the location of an unnamed discrepancy."""
+        """Families of the members of each established class, or of the location of a discrepancy without a name."""
         if self.alike is not None and self.verdict not in WITHOUT_NAME:
             return tuple(f for each, name in zip(self.alike.families, self._named, strict=True) if name for f in each)
         if self.verdict == "mechanism" and self.mechanism is not None:
@@ -412,76 +420,80 @@ class LoopStages:
 
     @property
     def events(self) -> tuple[Json, ...]:
-        """Temporary changes: axis and window, and numbers of the rows in it."""
-        return () if self.where is None else self._happening(self.where.variable)
+        """Temporary changes: each with its axis, its window, and the numbers of the rows in it."""
+        return () if self.where is None else self._event_entries(self.where.variable)
 
     @property
     def events_alike(self) -> tuple[Json, ...]:
-        """Temporary changes that cannot be separated from `events`, in the same form."""
+        """Other temporary changes that explain the data as well, in the form of `events`."""
         alike = () if self.where is None else self.where.variables_alike
-        return tuple(event for variable in alike for event in self._happening(variable))
+        return tuple(event for variable in alike for event in self._event_entries(variable))
 
-    def _happening(self, variable: str) -> tuple[Json, ...]:
+    def _event_entries(self, variable: str) -> tuple[Json, ...]:
         happens = bases_room.window_from_name(variable)
         if happens is None or self.where is None:
             return ()
         linear = self.left.linear
-        x, _ = linear.in_travel(self.where.place, happens.axis)
+        x, _ = linear.curve_variable(self.where.place, happens.axis)
         inside = self.screened.base.space.included & linear.of_rows(happens.holds(x))
         rows = [int(k) + 1 for k in np.flatnonzero(inside)]
         return ({"axis": happens.axis, "window": (happens.low, happens.high), "rows": rows},)
 
     @property
     def simulated(self) -> dict[Names, np.ndarray]:
-        """Coordinates of each simulated fit, by its effects."""
+        """Coordinates of each fit by simulation, by its effects."""
         all_candidates = (self.screened.base.candidate, *(() if self.searched is None else self.searched.ladder))
         return {c.active: c.z for c in reversed(all_candidates) if c.simulated and np.isfinite(c.cost)}
 
     @property
     def best(self) -> Candidate:
-        """The proposed candidate: the base if no effect is named."""
+        """Proposed candidate: the base fit if no effect is named."""
         if self.alike is None or self.searched is None or self.searched.best is None:
             return self.screened.base.candidate
         return self.searched.best
 
     @property
     def ends(self) -> Diagnosis:
-        """Diagnosis of that candidate."""
+        """Diagnosis of the proposed candidate."""
         if self.alike is None or self.searched is None or self.searched.diagnosis is None:
             return self.left
         return self.searched.diagnosis
 
 
-def _fit_base_and_noise(given: LoopInput, ranked: list[Ranking]) -> tuple[Screening, Sds]:
-    """The base fit and the noise, rescaled if residuals without structure exceed it by one factor."""
+def _fit_base_and_noise(given: LoopInput, ranked: list[EffectRanking]) -> tuple[Screening, VerdictNoise]:
+    """Fits the base. If its residuals have no structure but exceed the noise by one factor, rescales the noise."""
     known, noise = given.known, given.noise
     screened = given.screen(noise, None if known is None else known.screened.base, ranked)
     base, free = screened.base, screened.base.space.free
-    residuals = _residuals(base.space, given.runs, screened.diagnosed[0], base.reading, base.candidate.z[:free])
+    residuals = _residual_tests(base.space, given.runs, screened.diagnosed[0], base.reading, base.candidate.z[:free])
     factors = {} if screened.cluster is not None else common_factors(residuals)
-    sds = Sds(noise, factors, tuple(noise_remarks(residuals, noise.word)))
+    sds = VerdictNoise(noise, factors, tuple(noise_remarks(residuals, noise.word)))
     if factors:
-        given.progress(next_step("sds"))
+        given.progress(progress_remark("sds"))
         sds = dataclasses.replace(sds, noise=noise.scaled(factors))
         screened = given.screen(sds.noise, screened.base, ranked)
     return screened, sds
 
 
-def _test_base(given: LoopInput, sds: Sds, screened: Screening) -> tuple[Screening, Diagnosis]:
-    """A base fit with the sets of effects to be simulated in its program, and the bootstrap of its residuals."""
+def _test_base(given: LoopInput, sds: VerdictNoise, screened: Screening) -> tuple[Screening, Diagnosis]:
+    """Tests the base fit by bootstrap. The returned fit also has a program for the sets of effects to be
+    simulated.
+    """
     known, weight = given.known, screened.base.space.weight
     null = None if known is None or np.any(known.screened.base.space.weight != weight) else known.left.test.null
     base, (linear, scores, _) = screened.base, screened.diagnosed
-    space = with_program_room(base.space, base.candidate, linear, scores, given.settings)
+    space = include_likely_effects(base.space, base.candidate, linear, scores, given.settings)
     screened = dataclasses.replace(screened, base=dataclasses.replace(base, space=space))
     if np.max(np.abs(np.asarray(scores.single))) > LIKELY:
         for begin in given.later:
             begin(screened.base)
-    return screened, diagnosis_of_base(screened, given.settings, sds.noise.freedom, null)
+    return screened, diagnose_base_by_bootstrap(screened, given.settings, sds.noise.freedom, null)
 
 
-def _search_effects(given: LoopInput, screened: Screening, left: Diagnosis) -> tuple[Screening, Diagnosis, Search]:
-    """Search for effects that explain the residuals of the base."""
+def _search_effects(
+    given: LoopInput, screened: Screening, left: Diagnosis
+) -> tuple[Screening, Diagnosis, SearchResult]:
+    """Searches for effects that explain the residuals of the base fit."""
     base = screened.base
     searched = search_effects(base.space, base.candidate, left, screened.bases, given.settings, given.progress)
     base = dataclasses.replace(base, space=base.space.with_room(searched.room))
@@ -489,18 +501,20 @@ def _search_effects(given: LoopInput, screened: Screening, left: Diagnosis) -> t
 
 
 def _search_until_clean(
-    given: LoopInput, screened: Screening, sds: Sds, ranked: list[Ranking]
-) -> tuple[Screening, Diagnosis, Search | None]:
-    """Search, repeated while it leaves outliers, None if the base leaves no discrepancy or lacks a backlash."""
+    given: LoopInput, screened: Screening, sds: VerdictNoise, ranked: list[EffectRanking]
+) -> tuple[Screening, Diagnosis, SearchResult | None]:
+    """Searches for effects, again whenever new outliers appear. No search if the base fits, or if the log shows
+    backlash that the robot lacks.
+    """
     settings, keep, progress = given.settings, given.keep, given.progress
     for k in range(SCREENINGS):
-        progress(next_step("bootstrap", settings.replicates))
+        progress(progress_remark("bootstrap", settings.replicates))
         screened, left = keep(f"bootstrap {k}", functools.partial(_test_base, given, sds, screened))
         if k == 0 and not ranked:
             keep("ranking", functools.partial(findings.rank_library, screened.base.space, left, settings))
-        if given.loses_motion or (not left.test.rejected and screened.cluster is None):
+        if given.shows_unmodelled_backlash or (not left.test.rejected and screened.cluster is None):
             return screened, left, None  # effects of the library would only stand in for a backlash
-        progress(next_step("effects"))
+        progress(progress_remark("effects"))
         screened, left, searched = keep(f"search {k}", functools.partial(_search_effects, given, screened, left))
         after = searched.diagnosis
         if after is None and (confirmed := _confirm_gains(screened, left, searched)) is not None:
@@ -512,15 +526,16 @@ def _search_until_clean(
         )
         if more is None:
             break
-        progress(next_step("alone"))
+        progress(progress_remark("alone"))
         screened = more
     return screened, left, searched
 
 
-def _confirm_gains(screened: Screening, left: Diagnosis, searched: Search) -> Diagnosis | None:
-    """Diagnosis of a log's base fit with the gains that simulation confirms, None if these reject the base as well.
+def _confirm_gains(screened: Screening, left: Diagnosis, searched: SearchResult) -> Diagnosis | None:
+    """Diagnosis of the base fit of a log after simulations of the strongest effects.
 
-    Scores are linear and the contact of a vehicle is not, so a score beyond chance may vanish in a simulation.
+    Scores are linear but the contact of a vehicle is not, so a significant score may vanish in a simulation. None if
+    the base is rejected with the simulated gains too.
     """
     space, test, scores = screened.base.space, left.test, np.asarray(left.scores.single)
     gains = {c.effects: 2 * (screened.base.candidate.cost - c.cost) for c in searched.ladder if c.simulated}
@@ -533,21 +548,23 @@ def _confirm_gains(screened: Screening, left: Diagnosis, searched: Search) -> Di
     return None if confirmed.rejected else dataclasses.replace(left, test=confirmed)
 
 
-def _verdict(given: LoopInput, screened: Screening, left: Diagnosis, sds: Sds, searched: Search) -> LoopStages:
-    """Verdict on a base with a discrepancy: names, classes, a mechanism or a place."""
+def _reach_verdict(
+    given: LoopInput, screened: Screening, left: Diagnosis, sds: VerdictNoise, searched: SearchResult
+) -> LoopStages:
+    """Verdict on a base with a discrepancy: effects, classes of effects, a mechanism, or a place."""
     runs, settings, progress = given.runs, given.settings, given.progress
     base, space, bases = screened.base.candidate, screened.base.space, screened.bases
-    beside, predicted = CurveBeside(space, base, left, bases), Predicted()
+    beside, predicted = BaseCurve(space, base, left, bases), Predicted()
     where = dataclasses.replace(beside.where, by_duty=varied_by_duty(runs))
     model, searched, stood = choose_effects(runs, screened, left, searched, settings, progress, beside, predicted)
     stages = functools.partial(LoopStages, beside=beside, predicted=predicted)
-    leaves: tuple[Missed, ...] = ()
+    leaves: tuple[MissedChannel, ...] = ()
     if missed := missed_channels(space, runs, sds.noise, left.linear):
-        progress(next_step("held out"))
-        refit = scored_once(space, runs, base, predicted)
+        progress(progress_remark("held out"))
+        refit = cached_hold_out_score(space, runs, base, predicted)
         fits = {c.key: c for c in (model[0] if model else None, searched.best, *best_of_each_size(searched)) if c}
         for fit in fits.values():
-            leaves = remaining_errors(space, runs, missed, refit, scored_once(space, runs, fit, predicted))
+            leaves = remaining_errors(space, runs, missed, refit, cached_hold_out_score(space, runs, fit, predicted))
             if leaves:
                 break
         else:
@@ -556,33 +573,33 @@ def _verdict(given: LoopInput, screened: Screening, left: Diagnosis, sds: Sds, s
     established_names = [] if model is None else [stood.established(e) for e in model[0].effects]
     level, mechanism = "", None
     if not any(established_names):
-        progress(next_step("mechanism"))
+        progress(progress_remark("mechanism"))
         ladder = [c for c in (*searched.ladder, *([] if model is None else model[:1]))]
         mechanism = find_mechanism(space, runs, base, left, ladder, bases, beside, predicted, settings)
-        mechanism = mechanism and _or_ammeter(space, mechanism, left.linear, bases, where, settings)
+        mechanism = mechanism and _with_ammeter_alternatives(space, mechanism, left.linear, bases, where, settings)
         level = "place" if mechanism is None or mechanism.fails else "mechanism"
     if model is None:
         return stages(level, screened, left, sds, searched, where=where, standing=stood, mechanism=mechanism)
 
     searched = dataclasses.replace(searched, best=model[0], diagnosis=model[1])
     best, after = model
-    progress(next_step("alike", best.effects))
+    progress(progress_remark("alike", best.effects))
     alike = find_classes(space, base, best, searched.ladder, left, after, settings)
     if not any(established_names):
         return stages(level, screened, left, sds, searched, alike, where, standing=stood, mechanism=mechanism)
     compared: tuple[HeldOutAlternative, ...] = ()
     if settings.prefer == HELD_OUT:
-        progress(next_step("held out"))
+        progress(progress_remark("held out"))
         searched, alike, compared = preference.prefer_by_held_out(space, runs, searched, alike, bases, settings)
         after = searched.diagnosis or after
-        stood = stood.renamed(dict(zip(best.active, (searched.best or best).active, strict=True)))
+        stood = stood.with_leaders(dict(zip(best.active, (searched.best or best).active, strict=True)))
     alone = all(one for one, name in zip(alike.alone, established_names, strict=True) if name)
     verdict = "named" if alone else "class"
     remains = locate_discrepancy(after, bases, space.included) if after.test.rejected_with_margin else None
     return stages(verdict, screened, left, sds, searched, alike, remains, standing=stood, held_out=compared)
 
 
-def _or_ammeter(
+def _with_ammeter_alternatives(
     space: CandidateSpace,
     found: Mechanism,
     linear: Linearization,
@@ -590,11 +607,11 @@ def _or_ammeter(
     where: DiscrepancyLocation,
     settings: Settings,
 ) -> Mechanism:
-    """A mechanism with the errors of an ammeter that explain as much, see `ammeter_families`.
+    """The mechanism with ammeter errors that explain the data as well, see `ammeter_families`.
 
     Args:
-        linear: the base fit, linearised.
-        where: location of its discrepancy, the curve of a mechanism without effects.
+        linear: linearization of the base fit.
+        where: location of its discrepancy. It defines the curve of a mechanism without effects.
     """
     columns = np.asarray(linear.signatures)[:, [space.library.names[k] in found.effects for k in space.library.of]]
     if not found.effects:
@@ -608,22 +625,22 @@ def choose_effects(
     runs: Runs,
     screened: Screening,
     left: Diagnosis,
-    searched: Search,
+    searched: SearchResult,
     settings: Settings,
     progress: Tell,
-    beside: CurveBeside,
+    beside: BaseCurve,
     predicted: Predicted,
-) -> tuple[tuple[Candidate, Diagnosis] | None, Search, NameSupport]:
-    """Effects that belong in the model, the updated search, and the tests of their names.
+) -> tuple[tuple[Candidate, Diagnosis] | None, SearchResult, NameSupport]:
+    """Effects to add to the model (None for no effects), the updated search, and the tests of their names.
 
-    They are those with an established name, and those of the smallest set that predicts as well as any, except
-    stand-ins for a curve, None for no effects. If the largest set leaves no discrepancy, its effects are judged, else
-    those of the set that predicts.
+    The effects are those whose names are established, and those of the smallest set that predicts as well as any.
+    Effects that only imitate a curve are left out. If the largest set leaves no discrepancy, its effects are tested,
+    otherwise those of the predictive set.
 
     Args:
-        left: diagnosis of the base.
-        beside: its curve.
-        predicted: collects hold-out predictions of fits.
+        left: diagnosis of the base fit.
+        beside: smooth curve of its discrepancy.
+        predicted: cache of hold-out predictions of fits. This function adds to it.
     """
     base, space, bases = screened.base.candidate, screened.base.space, screened.bases
     best, after, long = searched.best, searched.diagnosis, space.bare.observe.long
@@ -640,7 +657,7 @@ def choose_effects(
         return (best, after), searched, stood
     few = None
     if not (long and stood is not None and stood.stands):  # refits of histories take long
-        progress(next_step("held out"))
+        progress(progress_remark("held out"))
         few = prediction.smallest_predictive_set(space, runs, base, best_of_each_size(searched), predicted)
     if stood is None:
         judged = best if few is None else few
@@ -652,7 +669,9 @@ def choose_effects(
     else:
         proposed = best, after
     names = [e for e in proposed[0].effects if stood.established(e)]
-    added_effects = [e for e in (() if few is None else few.effects) if e not in names and not stood.stands_in(e)]
+    added_effects = [
+        e for e in (() if few is None else few.effects) if e not in names and not stood.imitates_curve(e)
+    ]
     names += added_effects[: settings.slots - len(names)]
     if not names:
         return None, searched, stood
@@ -674,7 +693,7 @@ def choose_effects(
 # --- stages without a module of their own ---------------------------------------------------------------
 
 
-def pose_candidates(
+def build_candidate_space(
     runs: Runs,
     robot: Robot,
     sd: np.ndarray,
@@ -682,22 +701,22 @@ def pose_candidates(
     stated: Priors | None = None,
     library: Library = effects.BY_NAME,
 ) -> CandidateSpace:
-    """Base problem of a table, with slots for the effects that its data can show.
+    """Base problem of a table, with slots for the effects that its data can reveal.
 
-    Rows are padded to one of a few sizes, so that tables of similar size share compiled programs. Padding has weight
-    0. A mass in the table replaces the robot's own. Ground friction without a stated prior has that of any surface,
-    because the prior of another surface would bias parameters that depend on slip.
+    Tables are padded with rows of weight 0 to one of a few sizes, so that tables of similar size share compiled
+    programs. A mass in the table replaces the robot's mass. Ground friction without a stated prior gets a wide one
+    for any surface, because the prior of a wrong surface would bias parameters that depend on slip.
     """
     robot = own_mass.with_table_mass(robot, runs)
     kind = observers.observer_kind(runs)
     index, real = padded_rows(len(runs), kind.sizes_padded)
     idle = (*(() if kind.axis else priors.OVER_TIME), *(f"{n}.mass" for n in own_mass.stated_masses(robot, runs)))
-    names = priors.free_names(robot, runs.configurations_named(robot), *kind.free(), idle)
+    names = priors.loop_parameter_names(robot, runs.configurations_named(robot), *kind.free(), idle)
     unread = fidelities.unread_parameters("drive" if kind.axis else "steady", names, runs.turns)
     names = tuple(n for n in names if n not in unread)
     coordinates = priors.parameter_coordinates(robot, names, dict(stated or {}), any_surface=True)
     bare = observers.pose_problem(runs.where(index), robot, coordinates, sd[index])
-    visible = visible_effects(library, robot, kind, goes_both_ways(runs), has_pulses(runs))
+    visible = visible_effects(library, robot, kind, goes_both_ways(runs), has_partial_duty(runs))
     space = candidate_space(bare, visible, library, settings.slots, settings.width)
     return space.without(~real)
 
@@ -709,11 +728,11 @@ def visible_effects(
     either_way: bool = True,
     at_duties: bool = False,
 ) -> tuple[Effect, ...]:
-    """Effects of a library that such data can show and the robot does not have yet.
+    """Effects of a library that this kind of data can reveal and that the robot does not have yet.
 
     Args:
-        either_way: True if the runs go both ways, see `goes_both_ways`.
-        at_duties: see `has_pulses`.
+        either_way: True if there are forward and backward runs, see `goes_both_ways`.
+        at_duties: True if some runs have a duty below 1, see `has_partial_duty`.
     """
     have = {e.name for e in robot.effects}
     return tuple(
@@ -727,14 +746,14 @@ def visible_effects(
     )
 
 
-def has_pulses(runs: Runs) -> bool:
-    """True if some runs have a duty below 1."""
+def has_partial_duty(runs: Runs) -> bool:
+    """True if some runs have a duty below 1, so that the supply is pulsed."""
     duties = [runs[name] for name in ("duty", *SIDES) if runs.has(name)]
     return any((np.abs(x) < 1).any() for x in duties)
 
 
 def goes_both_ways(runs: Runs) -> bool:
-    """True if there are both forward and backward runs, judged by any measured speed or by the command."""
+    """True if there are forward and backward runs, according to a measured speed or the command."""
     moved = [c.column for c in channels.EVERY if c.zero_at_rest and c.directed]
     columns = [runs[name] for name in (*moved, runs.layout.imposed_column, "duty") if runs.has(name)]
     finite_columns = [x[np.isfinite(x)] for x in columns]
@@ -742,15 +761,17 @@ def goes_both_ways(runs: Runs) -> bool:
 
 
 def padded_rows(rows: int, sizes: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Row indices padded by repeats of the first to the next of `sizes` (or a multiple of the last), and True for
-    the real rows."""
+    """Row indices, padded to the next of `sizes` (or a multiple of the last one) by repeating the first row.
+
+    Also returns True for each index that is not padding.
+    """
     size = next((s for s in sizes if s >= rows), rows + (-rows % sizes[-1] if sizes else 0))
     index = np.concatenate([np.arange(rows), np.zeros(size - rows, int)])
     return index, np.arange(len(index)) < rows
 
 
 def bases_at_fit(runs: Runs, base: BaseFit) -> Bases:
-    """Bases of curves over the fitted readings, because curves over measured ones would share their noise."""
+    """Bases of smooth curves over the fitted readings. Curves over measured readings would share their noise."""
     problem, z, active = base.space.fit_of(base.candidate.active, base.candidate.z)
     problem = problem if active is None else base.space.problem(base.candidate.active)
     index, _ = padded_rows(len(runs), problem.observe.sizes_padded)
@@ -761,19 +782,22 @@ def bases_at_fit(runs: Runs, base: BaseFit) -> Bases:
     return observe.bases(columns, base.space.included, problem.robot(jnp.asarray(z)))
 
 
-def diagnosis_of_base(
-    screened: Screening, settings: Settings, freedom: np.ndarray | None = None, null: Statistics | None = None
+def diagnose_base_by_bootstrap(
+    screened: Screening,
+    settings: Settings,
+    freedom: np.ndarray | None = None,
+    null: StrongestStatistics | None = None,
 ) -> Diagnosis:
-    """Diagnosis of the base by its own bootstrap.
+    """Diagnosis of the base fit, with its own bootstrap.
 
     Args:
         freedom: degrees of freedom of the sd of each channel.
-        null: replicates, if known.
+        null: statistics of bootstrap tables, if already known.
     """
     space, base = screened.base.space, screened.base.candidate
     linear, scores, statistics = screened.diagnosed
     if null is None:
-        null = bootstrap(
+        null = bootstrap_statistics(
             space.bare, base.z[: space.free], linear, space.library.scored, screened.bases, settings.replicates,
             settings.seed, freedom,
         )  # fmt: skip
@@ -781,16 +805,16 @@ def diagnosis_of_base(
 
 
 def _rows_until_repeat(columns: Sequence[np.ndarray]) -> int:
-    """Number of rows after which a table repeats itself exactly."""
+    """Number of rows after which a table repeats itself exactly, or all of its rows."""
     rows = list(zip(*(column.astype(str).tolist() for column in columns), strict=True))
     return next(n for n in range(1, len(rows) + 1) if len(rows) % n == 0 and rows[:-n] == rows[n:])
 
 
-def without_copies(runs: Runs) -> tuple[Runs, np.ndarray, list[Remark]]:
-    """Runs without exact copies of each other, their row numbers, and notes on the copies.
+def remove_copies(runs: Runs) -> tuple[Runs, np.ndarray, list[Remark]]:
+    """Runs without exact copies, their row numbers, and remarks on the copies.
 
-    Equal rows that a file does not distinguish by name, order or time are repeats, perhaps read from a coarse
-    display. They are copies only if the whole table repeats: the same rows in the same sequence, several times.
+    Equal rows may be repeated measurements, for instance from a coarse display. They count as copies only if the
+    whole table consists of the same sequence of rows, repeated.
     """
     columns = [*(runs[c] for c in observers.observer_kind(runs).identity(runs)), *runs.extras.values()]
     seen_columns: set[Names] = set()
@@ -809,22 +833,22 @@ def without_copies(runs: Runs) -> tuple[Runs, np.ndarray, list[Remark]]:
     return runs.where(np.asarray(keep)), np.asarray(keep) + 1, [Remark("copies", rows=tuple(k + 1 for k in copies))]
 
 
-def brief_verdict(factor: float, traced: LoopStages, numbers: np.ndarray) -> Sensitivity:
-    """Verdict and summary for another noise."""
+def verdict_at_noise(factor: float, traced: LoopStages, numbers: np.ndarray) -> NoiseVerdict:
+    """Verdict and summary at another noise level."""
     adequate = not traced.ends.test.rejected_with_margin
     near = bool(traced.screened.base.space.near)
-    return Sensitivity(factor, traced.verdict, verdict_summary(traced, numbers), traced.members, adequate, near)
+    return NoiseVerdict(factor, traced.verdict, verdict_summary(traced, numbers), traced.members, adequate, near)
 
 
-def verdict_summary(traced: LoopStages, numbers: np.ndarray) -> Summary:
-    """Summary of a verdict, as data of its statement. `numbers` as in `assemble_result`."""
+def verdict_summary(traced: LoopStages, numbers: np.ndarray) -> VerdictSummary:
+    """Data from which the statement of a verdict is written. `numbers`: row numbers as used in messages."""
     space, alike = traced.screened.base.space, traced.alike
-    support = None if traced.standing is None else traced.standing.numbered(numbers)
+    support = None if traced.standing is None else traced.standing.with_row_numbers(numbers)
     best = None if traced.searched is None else traced.searched.best
     base = traced.screened.base.candidate
     aside, counting = len(traced.screened.outliers), int(space.included.sum())
     many = aside > MANY * (aside + counting)
-    return Summary(
+    return VerdictSummary(
         traced.verdict,
         traced.left.test.p_value,
         traced.where,
@@ -842,14 +866,15 @@ def verdict_summary(traced: LoopStages, numbers: np.ndarray) -> Summary:
     )
 
 
-def missing_effects(space: CandidateSpace, alike: Classes, support: NameSupport | None) -> tuple[Missing, ...]:
+def missing_effects(space: CandidateSpace, alike: Classes, support: NameSupport | None) -> tuple[MissingEffect, ...]:
     """Effects that the search added to the model, each with its alternatives and whether it is established."""
     c, p = space.coordinates.base, space.free
     return tuple(
-        Missing(
+        MissingEffect(
             names,
             tuple(
-                FreedValue(s.name, float(c.value(np.asarray(s.fit.z[:p]))[s.index]), c.units[s.index]) for s in shifts
+                AlternativeValue(s.name, float(c.value(np.asarray(s.fit.z[:p]))[s.index]), c.units[s.index])
+                for s in shifts
             ),
             families,
             support is None or support.established(names[0]),
@@ -863,7 +888,7 @@ def missing_effects(space: CandidateSpace, alike: Classes, support: NameSupport 
 
 
 def assemble_result(given: LoopInput, traced: LoopStages) -> DiscoveryResult:
-    """Result of a verdict, with the final computations: hold-out errors, and the next experiment."""
+    """Result of the loop. Computes the hold-out errors and the next experiment."""
     runs, numbers, settings, progress = given.runs, given.numbers, given.settings, given.progress
     screened, left, noise, nameless = traced.screened, traced.left, traced.sds.noise, traced.verdict in WITHOUT_NAME
     space, base, best, ends = screened.base.space, screened.base.candidate, traced.best, traced.ends
@@ -871,16 +896,16 @@ def assemble_result(given: LoopInput, traced: LoopStages) -> DiscoveryResult:
     # The fit of the result: with the named effects, or with the curve if no name is given.
     beside = traced.beside if nameless else None
     if beside is not None:
-        progress(next_step("shape"))
-    before, curve = findings.Fitted(*space.fit_of(base.active, base.z)), None
+        progress(progress_remark("shape"))
+    before, curve = findings.FittedProblem(*space.fit_of(base.active, base.z)), None
     after, z, sd, cost = None, best.z, best.sd, best.cost
     if beside is not None and best is base:
         curve, ends = beside.curve, beside.diagnosis
         z, sd, cost = curve.z, np.sqrt(np.diag(curve.covariance)), curve.chi2[1] / 2
-        after = findings.Fitted(curve.problem, z, None)
+        after = findings.FittedProblem(curve.problem, z, None)
     elif best is not base:
-        after = findings.Fitted(*space.fit_of(best.active, z))
-    progress(next_step("errors"))
+        after = findings.FittedProblem(*space.fit_of(best.active, z))
+    progress(progress_remark("errors"))
     predictions = [traced.predicted.get(prediction.candidate_key(c)) for c in (base, best)]
     kinds = blocks_room.predictable_blocks(runs, space.bare)
     seen = findings.readings_of_rows(
@@ -889,7 +914,7 @@ def assemble_result(given: LoopInput, traced: LoopStages) -> DiscoveryResult:
     compared = traced.held_out
     if traced.alike is not None and not nameless and not compared and not observe.long:
         compared = preference.compare_alternatives(space, runs, best, traced.alike)
-    gains = _gains(space, runs, traced, seen)
+    gains = _hold_out_gains(space, runs, traced, seen)
     gain = gains[-1][1] if gains and after is not None else None
     # What is written never predicts worse than the refit. A curve, which claims no cause, has to predict better.
     written = gain is None or (gain.mean > gain.se if best is base else gain.mean >= -prediction.WORSE)
@@ -899,8 +924,8 @@ def assemble_result(given: LoopInput, traced: LoopStages) -> DiscoveryResult:
         fit, of_fit = (best, traced.ends) if written else (base, left)
         robot, converged = findings.proposed_robot(space, fit), fit.converged
         posterior = posterior_of_fit(space, fit.active, fit.z, of_fit.linear)
-    progress(next_step("next"))
-    remaining = _residuals(space, runs, ends.linear, seen.after, z)
+    progress(progress_remark("next"))
+    remaining = _residual_tests(space, runs, ends.linear, seen.after, z)
 
     def error(simulated: np.ndarray) -> Errors:
         simulated = np.where(included[:, None], simulated, np.nan)
@@ -910,7 +935,7 @@ def assemble_result(given: LoopInput, traced: LoopStages) -> DiscoveryResult:
     ladder = ladder if traced.alike is None else traced.alike.ladder
     near, too_large = findings.listed_alternatives(space, best, cost, ladder, settings)
     found: tuple[FoundEffect, ...] = ()
-    concealed: tuple[Hidden, ...] = ()
+    concealed: tuple[HiddenEffect, ...] = ()
     if traced.alike is not None:
         found = findings.found_effects(space, base, best, traced.alike, left.test, settings)
         if not nameless:
@@ -949,19 +974,19 @@ def assemble_result(given: LoopInput, traced: LoopStages) -> DiscoveryResult:
         hidden=concealed,
         support=summary.support,
         cluster=screened.cluster,
-        residual_clusters=residual_clusters(remaining, settings.seed),
+        residual_clusters=find_residual_clusters(remaining, settings.seed),
         before=findings.evidence_of_test(left.test, adequate=not left.test.rejected),
         after=findings.evidence_of_test(ends.test, adequate=not ends.test.rejected_with_margin),
         chi2=(2 * base.cost, 2 * cost),
         readings=int(np.sum(space.weight > 0)),
-        base_shift=findings.base_shift(space, base.z, z, sd),
+        base_shift=findings.parameter_shifts(space, base.z, z, sd),
         scores=listed,
         cosine=signature_cosines(space, left.scores)[np.ix_(library_places, library_places)],
         detail=observe.detail(screened.bases, included, left, ends),
         readings_of_rows=seen,
         errors_as_stated=error(seen.as_stated),
-        errors=on_same_rows(seen.before, seen.after, error),
-        errors_held_out={k: on_same_rows(*both, error) for k, both in seen.held_out.items()},
+        errors=errors_on_common_rows(seen.before, seen.after, error),
+        errors_held_out={k: errors_on_common_rows(*both, error) for k, both in seen.held_out.items()},
         held_out_unpredictable=blocks_room.unpredictable_kinds(runs, space.bare),
         held_out_worse=preference.worse_predictions(seen.held_out, error),
         alternatives_held_out=compared,
@@ -972,14 +997,14 @@ def assemble_result(given: LoopInput, traced: LoopStages) -> DiscoveryResult:
     # A temporary change is not uniform.
     of_noise = noise_remarks_before_verdict(traced.sds, remaining) if traced.sds.factors or not traced.events else ()
     return dataclasses.replace(
-        result, remarks=(*of_noise, *refit_worse(seen, noise, included), *loop_remarks(result))
+        result, remarks=(*of_noise, *worse_than_stated(seen, noise, included), *loop_remarks(result))
     )
 
 
-def refit_worse(seen: ReadingsOfRows, noise: Noise, included: np.ndarray) -> list[Remark]:
-    """Channels without stated sds in which the refit is worse than the robot as stated, by more than the noise.
+def worse_than_stated(seen: ReadingsOfRows, noise: Noise, included: np.ndarray) -> list[Remark]:
+    """Remarks on channels that the refit describes worse than the robot file did, by more than the noise.
 
-    The estimated sds then give some readings too much weight.
+    Their assumed noise then gives some other readings too much weight. Channels with stated noise are not reported.
 
     Args:
         included: True for included rows, shape (rows,).
@@ -1006,27 +1031,28 @@ def refit_worse(seen: ReadingsOfRows, noise: Noise, included: np.ndarray) -> lis
     return worse_channels
 
 
-def on_same_rows(
+def errors_on_common_rows(
     before: np.ndarray, after: np.ndarray, error: Callable[[np.ndarray], Errors]
 ) -> tuple[Errors, Errors]:
-    """Errors of readings before and after, over the rows that both fits predict."""
+    """Errors of two sets of readings, over the readings that both fits predict."""
     in_both = np.isfinite(before) & np.isfinite(after)
     return error(np.where(in_both, before, np.nan)), error(np.where(in_both, after, np.nan))
 
 
-def noise_remarks_before_verdict(sds: Sds, remaining: Residuals) -> tuple[Remark, ...]:
-    """Remarks on sds that are reported before the verdict: from the residuals of the final fit, or that the sds were
-    changed if those residuals agree with them."""
+def noise_remarks_before_verdict(sds: VerdictNoise, remaining: Residuals) -> tuple[Remark, ...]:
+    """Remarks on wrong sds to report before the verdict: from the residuals of the final fit, or, if those agree with
+    the sds, that the sds were changed.
+    """
     off = tuple(noise_remarks(remaining, sds.noise.word)) if sds.remarks else ()
     if sds.factors:
         return () if off else sds.remarks
     return off
 
 
-def _gains(
+def _hold_out_gains(
     space: CandidateSpace, runs: Runs, traced: LoopStages, seen: ReadingsOfRows
 ) -> tuple[tuple[Names, prediction.Gain], ...]:
-    """Gains of the predictions of sets of effects over the refit's, by the number of effects, the proposal's last.
+    """Hold-out gain of each set of effects over the refit, ordered by the number of effects. The proposal is last.
 
     Empty if no block can be held out.
     """
@@ -1043,14 +1069,14 @@ def _gains(
     return tuple((names, score(reading).gain(score(refit))) for names, reading in scored)
 
 
-def _residuals(
+def _residual_tests(
     space: CandidateSpace, runs: Runs, linear: Linearization, reading: np.ndarray, z: np.ndarray
 ) -> Residuals:
-    """Residuals of a fit, by reading.
+    """Residuals of a fit, with their statistics, by channel.
 
     Args:
-        linear: the fit at z, linearised.
-        reading: reading of each row [SI], shape (rows or more, channels).
+        linear: linearization of the fit at z.
+        reading: simulated reading of each row [SI], shape (rows or more, channels).
     """
     rows, count = len(runs), len(runs.channels)
     counts = (space.weight[:rows] > 0) & np.isfinite(reading[:rows])
@@ -1062,7 +1088,7 @@ def _residuals(
 
 
 def _next_experiment(space: CandidateSpace, traced: LoopStages, settings: Settings) -> Proposal | None:
-    """Next experiment, None if there are no alternatives to separate, or if the model does not describe the runs."""
+    """Next experiment. None if there are no alternatives to separate, or if the model does not describe the runs."""
     if traced.verdict == "undescribed":
         return None
     if not space.bare.observe.menu or space.bare.base.rig.follows_goal:
@@ -1073,7 +1099,7 @@ def _next_experiment(space: CandidateSpace, traced: LoopStages, settings: Settin
 
 
 def _noise_by_channel(runs: Runs, noise: Noise, kind: type[observers.Observer]) -> dict[str, dict[str, object]]:
-    """Channel → source of its sd, and its median share of the reading [%]."""
+    """Source and median relative size [%] of the sd of each channel."""
     with np.errstate(invalid="ignore"):
         share = 100 * noise.sd / np.maximum(kind.sizes(runs), 1e-12)
     return {
@@ -1084,7 +1110,7 @@ def _noise_by_channel(runs: Runs, noise: Noise, kind: type[observers.Observer]) 
 
 
 def loop_remarks(found: DiscoveryResult) -> Notes:
-    """Remarks on a result that a careful engineer would make."""
+    """Remarks on the result that help to judge it."""
     remarks: list[Remark] = []
     for rows, why in ((found.unusable, "unusable"), (found.outliers, "outliers")):
         if rows:
@@ -1110,7 +1136,7 @@ def loop_remarks(found: DiscoveryResult) -> Notes:
     names = [e.name for e in found.effects]
     for t in () if found.support is None else found.support.tests:
         if t.rests_on is not None and t.effect in names:
-            remarks.append(_rests_on(found, t))
+            remarks.append(_repeat_run_remark(found, t))
     if not found.written and found.gain is not None:
         remarks.append(Remark("unwritten", curve=not found.effects, gain=found.gain.mean, se=found.gain.se))
     remarks += preference.leader_remarks(found.alternatives_held_out, found.settings.prefer)
@@ -1122,9 +1148,10 @@ def loop_remarks(found: DiscoveryResult) -> Notes:
     return tuple(remarks)
 
 
-def _rests_on(found: DiscoveryResult, test: NameTest) -> Remark:
-    """Experiment that tests the single run on which an effect depends: a repeat, and half steps to both sides of
-    it."""
+def _repeat_run_remark(found: DiscoveryResult, test: NameTest) -> Remark:
+    """Remark that proposes an experiment if an effect depends on a single run: repeat the run, and add runs half a
+    step away from it.
+    """
     runs = found.runs
     if test.what == "run":
         return Remark("rests_on", test=test)
@@ -1141,13 +1168,13 @@ def _rests_on(found: DiscoveryResult, test: NameTest) -> Remark:
 
 
 def neighbouring_levels(x: np.ndarray, here: float) -> tuple[float, ...]:
-    """Levels half a step below and above one of a series, rounded to practical values.
+    """Levels half a step below and above one level of a series, rounded to practical values.
 
-    Empty if all other levels are within `LEVEL` of its range.
+    Empty if all other levels are closer than `LEVEL` of the range of the series.
 
     Args:
         x: levels of the series.
-        here: level of the row.
+        here: level of the run.
     """
     apart = np.abs(x - here)
     other_levels = apart[apart > LEVEL * np.ptp(x)]

@@ -23,12 +23,12 @@ from calibration.discovery.adequacy import AdequacyTest, Diagnosis
 from calibration.discovery.candidates import Candidate
 from calibration.discovery.formula import Proposal, propose_formula
 from calibration.discovery.location import DiscrepancyLocation
-from calibration.discovery.projection import Defect, Projection, defect_by_row
+from calibration.discovery.projection import BalanceError, Projection, balance_error_by_row
 from calibration.discovery.score_tests import diagnose_fit
-from calibration.discovery.smooth import Smooth, smooth_curve
+from calibration.discovery.smooth import SmoothCurve, fit_smooth_curve
 from calibration.inference import bases as bases_room
 from calibration.inference.bases import Bases
-from calibration.inference.held_out import search_each
+from calibration.inference.held_out import fit_from_each_start
 from calibration.inference.linearization import Linearization
 from calibration.inference.priors import Coordinates
 from calibration.inference.problem import Problem
@@ -55,9 +55,10 @@ ALIKE = 1.0
 
 
 def locate_discrepancy(left: Diagnosis, bases: Bases, included: np.ndarray) -> DiscrepancyLocation:
-    """Location of a discrepancy: place, variable, and the places that are indistinguishable.
+    """Location of a discrepancy: its balance or channel, its variable, and the places that explain the data as well.
 
-    The place is that of the most significant curve. The variable is that of the curve with most evidence there.
+    The place is that of the most significant smooth curve. The variable is that of the curve with most evidence
+    there.
 
     Args:
         left: diagnosis of a fit.
@@ -78,7 +79,7 @@ def locate_discrepancy(left: Diagnosis, bases: Bases, included: np.ndarray) -> D
     j = k if for_a_while else max(over, key=lambda j: deviate[j])
     if names[j][1] in bases_room.VARIABLES:
         smoothly = [i for i in over if bases_room.window_from_name(names[i][1]) is None]
-        evidence = {i: smooth_curve(left.linear, *names[i], included).evidence for i in smoothly}
+        evidence = {i: fit_smooth_curve(left.linear, *names[i], included).evidence for i in smoothly}
         j = max(smoothly, key=lambda i: evidence[i] - INDIRECT * (names[i][1] == "voltage"))
     places = dict.fromkeys(names[i][0] for i in same_kind)
     best = {b: max(deviate[i] for i in same_kind if names[i][0] == b) for b in places}
@@ -94,7 +95,7 @@ def locate_discrepancy(left: Diagnosis, bases: Bases, included: np.ndarray) -> D
 
 
 def similar_variables(names: Sequence[tuple[str, str]], deviate: np.ndarray, place: str, variable: str) -> Names:
-    """Other variables with curves of similar significance in a place, the most significant first."""
+    """Other variables whose curves in a place are of similar significance, the most significant first."""
     by_variable = {names[j][1]: deviate[j] for j in np.argsort(-deviate) if names[j][0] == place}
     by_variable.pop(bases_room.CONDITIONS, None)
     variable_of_axis: dict[str, str] = {_window_axis(variable): variable}
@@ -105,7 +106,7 @@ def similar_variables(names: Sequence[tuple[str, str]], deviate: np.ndarray, pla
 
 
 def _window_axis(variable: str) -> str:
-    """Key shared by all windows along an axis. A smooth curve has a key of its own."""
+    """Key shared by all windows of one axis. A smooth curve has a key of its own."""
     happens = bases_room.window_from_name(variable)
     return variable if happens is None else f"{happens.axis} for a while"
 
@@ -115,12 +116,13 @@ def refine_window(
 ) -> tuple[bases_room.Window, float]:
     """Window along an axis that explains most of the misfit, and its decrease of χ² [σ²].
 
-    Windows begin and end at the axis's instants and hold at most half of the rows. Those of the tests are coarser.
+    The window begins and ends at instants of the axis and holds at most half of the rows. The windows of the tests
+    are coarser.
 
     Args:
         included: True for included rows, shape (rows,).
     """
-    (x, way), included = linear.in_travel(place, axis), linear.at_points(included)
+    (x, way), included = linear.curve_variable(place, axis), linear.at_points(included)
     levels, counts = np.unique(x[included], return_counts=True)
     merged = -(-len(levels) // INSTANTS)
     edges = levels[::merged]
@@ -148,14 +150,15 @@ def refine_window(
 # --- the curve ------------------------------------------------------------------------------------------
 
 
-class Shaped(eqx.Module):
-    """Coordinates of a base fit, then those of a curve's ordinates: y = L z, all standard normal.
+class CurveCoordinates(eqx.Module):
+    """Coordinates of a fit with a smooth curve: those of the base, then those of the curve's ordinates. y = L z, all
+    standard normal.
 
     Attributes:
         base: coordinates of the base.
         root: L, shape (ordinates, ordinates).
-        names: dotted, of the ordinates.
-        fitted_once: True, because few fits use such coordinates.
+        names: dotted names of the ordinates.
+        fitted_once: True, because such coordinates serve few fits.
     """
 
     fitted_once: ClassVar[bool] = True
@@ -167,33 +170,33 @@ class Shaped(eqx.Module):
         return len(self.base) + len(self.names)
 
     def robot(self, robot: Robot, z: Float[Array, " coordinates"]) -> Robot:
-        """`robot`, which has the curve, at coordinates z."""
-        base, ordinates = _ordinates(self, z)
+        """Returns the robot at coordinates z. `robot` must have the curve."""
+        base, ordinates = _base_and_ordinates(self, z)
         return params.replace(self.base.robot(robot, base), dict(zip(self.names, ordinates, strict=True)))
 
 
 @compiled
-def _ordinates(shaped: Shaped, z: Array) -> tuple[Array, tuple[Array, ...]]:
-    """Coordinates of the base, and the ordinates of the curve."""
+def _base_and_ordinates(shaped: CurveCoordinates, z: Array) -> tuple[Array, tuple[Array, ...]]:
+    """Coordinates of the base, and values of the curve's ordinates."""
     y = shaped.root @ z[len(shaped.base) :]
     return z[: len(shaped.base)], tuple(y[k] for k in range(len(shaped.names)))
 
 
 @dataclasses.dataclass(frozen=True)
 class Discrepancy:
-    """A located discrepancy, as a smooth curve fitted together with the base.
+    """A located discrepancy, described by a smooth curve that is fitted together with the base.
 
     Attributes:
         balance, variable, unit: place and variable of the discrepancy, and the unit of the balance.
         effect: name of the curve among the effects of `robot`, the fitted robot with the curve.
-        defect: error of the balance, by row, at the fit without the curve, None if single rows do not show it.
-        grid: grid of the variable [SI].
-        curve, sd: there [unit], shape (points,). The 95 % band is ±1.96 sd. The band includes the uncertainty
-            of the base, so it is wide if base parameters can replace the curve.
-        chi2: twice the objective before and after [σ²], priors included.
-        z, covariance: posterior of the coordinates of `problem`, the ordinates last.
-        problem: problem of the fit.
-        reading: reading of each row [SI], shape (rows, channels).
+        defect: error of the balance in each row, at the fit without the curve. None if single rows do not show it.
+        grid: values of the variable at which the curve is given [SI].
+        curve, sd: there [unit], shape (points,). The 95 % band is ±1.96 sd. The band includes the uncertainty of the
+            base, so it is wide if base parameters can replace the curve.
+        chi2: twice the objective without and with the curve [σ²], priors included.
+        z, covariance: posterior of the coordinates of `problem`. The ordinates are last.
+        problem: problem of the fit with the curve.
+        reading: simulated reading of each row [SI], shape (rows, channels).
         converged: True if the fit is an optimum.
         proposal: a formula for the curve.
     """
@@ -203,7 +206,7 @@ class Discrepancy:
     unit: str
     effect: str
     robot: Robot
-    defect: Defect | None
+    defect: BalanceError | None
     grid: np.ndarray
     curve: np.ndarray
     sd: np.ndarray
@@ -219,22 +222,22 @@ class Discrepancy:
 def fit_discrepancy(
     space: CandidateSpace, base: Candidate, linear: Linearization, balance: str, variable: str
 ) -> Discrepancy:
-    """Discrepancy of a balance over a variable: its defects, its curve, a formula.
+    """Fits a smooth curve over a variable in a balance together with the base, and proposes a formula for it.
 
     Args:
-        base: the fit without the curve.
-        linear: the same, linearised.
+        base: fit without the curve.
+        linear: linearization of that fit.
         balance: one of `bases.BALANCES`, or a channel.
         variable: one of `bases.VARIABLES`, of `bases.ORDERS`, or a window.
     """
     included = space.included
-    at_base = smooth_curve(linear, balance, variable, included)
-    problem = _with_curve(space, base, at_base)
+    at_base = fit_smooth_curve(linear, balance, variable, included)
+    problem = _problem_with_curve(space, base, at_base)
     inner = len(problem.coordinates.base)
     starts = np.zeros((STARTS, len(problem.coordinates)))
     starts[:, :inner] = base.z[:inner]
     starts[:, inner:] = np.linspace(1.0, 0.0, STARTS)[:, None] * at_base.start
-    optima, observations = search_each(problem, list(starts), [space.weight] * STARTS)
+    optima, observations = fit_from_each_start(problem, list(starts), [space.weight] * STARTS)
     k = int(np.argmin(np.where(np.isfinite(optima.cost), optima.cost, np.inf)))
     z = np.asarray(optima.z[k])
     covariance = np.asarray(optima.covariance[k])
@@ -246,8 +249,8 @@ def fit_discrepancy(
         variable=variable,
         unit=PLACES[balance][0],
         effect=at_base.effect,
-        robot=_with_present_effects(problem.robot(jnp.asarray(z)), space, base, at_base.effect),
-        defect=defect_by_row(linear, balance) if space.bare.observe.rows_tell else None,
+        robot=_without_absent_effects(problem.robot(jnp.asarray(z)), space, base, at_base.effect),
+        defect=balance_error_by_row(linear, balance) if space.bare.observe.rows_tell else None,
         grid=grid,
         curve=shape @ z[inner:],
         sd=np.sqrt(np.einsum("ij,jk,ik->i", shape, ordinates, shape)),
@@ -262,20 +265,21 @@ def fit_discrepancy(
 
 
 def diagnose_with_curve(space: CandidateSpace, found: Discrepancy, bases: Bases, left: Diagnosis) -> Diagnosis:
-    """Diagnosis of the fit with a curve, with the thresholds of the base, which `left` has."""
+    """Diagnosis of the fit with a curve. Its critical values are those of the base (`left`)."""
     z, effects = jnp.asarray(found.z), space.library.scored
     linear, scores, strongest = diagnose_fit(found.problem, z, effects, bases, near=left.linear)
     return Diagnosis(linear, scores, AdequacyTest(strongest, left.test.null, left.test.settings))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class CurveBeside:
-    """Smooth curve of the base's discrepancy and its diagnosis, each computed once when it is first needed.
+class BaseCurve:
+    """Smooth curve of the discrepancy of the base, and its diagnosis. Each is computed when it is first needed, and
+    once.
 
     Both the verdict and its result may need them.
 
     Attributes:
-        space, base, left, bases: as in `fit_discrepancy` and `diagnose_with_curve`.
+        space, base, left, bases: arguments of `fit_discrepancy` and `diagnose_with_curve`.
     """
 
     space: CandidateSpace
@@ -285,12 +289,12 @@ class CurveBeside:
 
     @functools.cached_property
     def where(self) -> DiscrepancyLocation:
-        """Location, as from `locate_discrepancy`."""
+        """Location of the discrepancy, from `locate_discrepancy`."""
         return locate_discrepancy(self.left, self.bases, self.space.included)
 
     @functools.cached_property
     def curve(self) -> Discrepancy:
-        """The curve, fitted with the base."""
+        """The curve, fitted together with the base."""
         return fit_discrepancy(self.space, self.base, self.left.linear, self.where.place, self.where.variable)
 
     @functools.cached_property
@@ -299,20 +303,20 @@ class CurveBeside:
         return diagnose_with_curve(self.space, self.curve, self.bases, self.left)
 
 
-def _with_curve(space: CandidateSpace, base: Candidate, curve: Smooth) -> Problem:
-    """Problem of the base and a curve. The coordinates of the curve's ordinates come last."""
+def _problem_with_curve(space: CandidateSpace, base: Candidate, curve: SmoothCurve) -> Problem:
+    """Problem of the base and a smooth curve, whose ordinates are the last coordinates."""
     problem = space.problem(base.active) if base.effects else space.bare
     # A curve of this name from an earlier round is replaced, because its parameters have the same names.
     other_effects = tuple(e for e in problem.base.effects if e.name != curve.effect)
     added = params.replace(UNNAMED[curve.effect](), {n: jnp.asarray(v) for n, v in curve.values.items()})
     robot = dataclasses.replace(problem.base, effects=(*other_effects, added))
     names = tuple(f"effects.{curve.effect}.{n}" for n in curve.ordinates)
-    shaped = Shaped(problem.coordinates, jnp.asarray(curve.root), names)
+    shaped = CurveCoordinates(problem.coordinates, jnp.asarray(curve.root), names)
     data = dataclasses.replace(problem.data, centre=jnp.zeros(len(shaped)))
     return dataclasses.replace(problem, base=robot, coordinates=shaped, data=data)
 
 
-def _with_present_effects(robot: Robot, space: CandidateSpace, base: Candidate, curve: str) -> Robot:
+def _without_absent_effects(robot: Robot, space: CandidateSpace, base: Candidate, curve: str) -> Robot:
     """Robot with only its own effects, those of the fit, and the curve."""
     names = {e.name for e in space.bare.base.effects} | set(base.effects) | {curve}
     return dataclasses.replace(robot, effects=tuple(e for e in robot.effects if e.name in names))

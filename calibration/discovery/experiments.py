@@ -52,16 +52,16 @@ NONE = "none on this menu"
 
 @dataclasses.dataclass(frozen=True)
 class PredictedReadings:
-    """Predictions of every reading of the menu, by alternative.
+    """Predicted readings of all experiments of the menu, for each alternative.
 
     Attributes:
-        names: names of the alternatives, the best fit first.
-        experiments: the menu.
-        value: readings [SI], shape (alternatives, readings).
-        sd: standard deviation of the instruments [SI], shape (readings,).
-        half: J C^½, so that the covariance due to the fit is half halfᵀ. Shape
-            (alternatives, readings, coordinates).
-        exists: True for readings that every alternative has, shape (readings,).
+        names: names of the alternatives. The best fit is first.
+        experiments: experiments of the menu.
+        value: predicted readings [SI], shape (alternatives, readings).
+        sd: standard deviation of each instrument's reading [SI], shape (readings,).
+        half: factor J C^½ of the covariance that is due to the fit, which is half halfᵀ. Shape (alternatives,
+            readings, coordinates).
+        exists: True for readings that exist for every alternative, shape (readings,).
         settings: thresholds of the separation.
     """
 
@@ -74,7 +74,7 @@ class PredictedReadings:
     settings: Settings
 
     def apart(self, a: int, b: int, *experiments: str) -> float:
-        """Expected separation of two alternatives by experiments, all carried out [σ]."""
+        """Expected separation of two alternatives if all of these experiments are carried out [σ]."""
         where = predicted.reading_spans(self.experiments)
         spans = [where[e] for e in experiments]
         columns = np.concatenate([np.flatnonzero(self.exists[k]) + k.start for k in spans])
@@ -88,15 +88,15 @@ def _covariance(half: np.ndarray, sd: np.ndarray) -> np.ndarray:
 
 
 @dataclasses.dataclass(frozen=True)
-class Ranked:
-    """One experiment of the menu, or several carried out together.
+class RankedExperiment:
+    """An experiment of the menu, or several carried out together, with its power to separate alternatives.
 
     Attributes:
         experiments: names of the experiments.
-        sigma: separation of every two alternatives, in the order of `itertools.combinations`, so with the
-            pairs of the best fit first [σ].
-        separates: alternatives that they separate from the best fit, at `Settings.apart`.
-        settings: thresholds of the separation.
+        sigma: separation of every two alternatives [σ], in the order of `itertools.combinations`. The pairs with the
+            best fit are first.
+        separates: alternatives that it separates from the best fit by at least `Settings.apart`.
+        settings: critical values of the separation.
     """
 
     JSON = ("name", "smallest_sigma=smallest", "separates", "chance_worst", "chance_mean")
@@ -107,17 +107,17 @@ class Ranked:
 
     @property
     def smallest(self) -> float:
-        """Smallest separation of any pair [σ]."""
+        """Smallest separation of any pair of alternatives [σ]."""
         return min(self.sigma, default=0.0)
 
     @property
     def told(self) -> tuple[float, ...]:
-        """Separations that justify an experiment."""
+        """Separations that are large enough to justify the experiment [σ]."""
         return tuple(s for s in self.sigma if s >= self.settings.worth)
 
     @property
     def chances(self) -> np.ndarray:
-        """Probability for each pair that the false one is refuted if either is true."""
+        """For each pair of alternatives, the probability that the wrong one is refuted if the other is true."""
         sigma = np.maximum(self.sigma, 1e-9)
         return ndtr((sigma**2 - self.settings.refuted) / (2 * sigma))
 
@@ -139,15 +139,15 @@ class Ranked:
 
 @dataclasses.dataclass(frozen=True)
 class Proposal:
-    """The next experiment, or two if one is not enough.
+    """The proposed next experiment, or two experiments if one is not enough.
 
     Attributes:
         experiments: names of the experiments. Only `NONE` if no experiment helps.
         instruction: instruction for the experimenter.
         separates: alternatives that it separates from the best fit.
-        expected_sigma: smallest separation of a pair that is worth an experiment, 0 for none.
-        settles: True if it separates every two alternatives, at `Settings.apart`.
-        table: the whole menu, the most useful experiment first.
+        expected_sigma: smallest separation among the pairs that justify an experiment [σ], 0 for none.
+        settles: True if it separates every two alternatives by at least `Settings.apart`.
+        table: all experiments of the menu, the most useful first.
     """
 
     JSON = ("name", "experiments", "description", "separates", "expected_sigma", "settles", "menu=table")
@@ -156,7 +156,7 @@ class Proposal:
     separates: Names
     expected_sigma: float
     settles: bool
-    table: tuple[Ranked, ...]
+    table: tuple[RankedExperiment, ...]
 
     @property
     def name(self) -> str:
@@ -165,7 +165,7 @@ class Proposal:
 
     @property
     def description(self) -> str:
-        """What to do and what to read."""
+        """Instruction in words: what to do and what to read."""
         return describe(self.instruction)
 
 
@@ -173,10 +173,10 @@ class Proposal:
 
 
 def alternatives_of_class(best: Candidate, found: Classes, *, stated: bool = True) -> dict[str, Candidate]:
-    """Candidates that the table cannot separate, by the names of their effects. The best fit first.
+    """Candidates that the data cannot separate, by the names of their effects. The best fit is first.
 
     Args:
-        stated: True to include stated values that may be wrong instead of an effect, by their names.
+        stated: True to include stated values that may be wrong in place of an effect. Their key is the value's name.
     """
     fitted = {c.key: c for c in sorted(found.ladder, key=lambda c: -c.cost)}
     alternatives = {best.active: best}
@@ -195,21 +195,24 @@ def alternatives_of_class(best: Candidate, found: Classes, *, stated: bool = Tru
 
 
 @functools.partial(compiled, options=SELDOM)
-def _predicted(
+def _predict_alternatives(
     problem: Problem,
     other: priors.Coordinates | None,
-    batch: predicted.Batch,
+    batch: predicted.ExperimentBatch,
     which: Array,
     z: Array,
     informed: Array,
-) -> tuple[predicted.Predicted, Array]:
-    """Readings of the menu, and the square root of their covariance due to the fit, by alternative.
+) -> tuple[predicted.MenuPrediction, Array]:
+    """Readings of the menu for each alternative, and the square root of their covariance due to the fit.
 
-    `other` are coordinates that the table does not show at all, known only by their priors. `informed` is the
-    Jacobian of the readings and priors of each fit.
+    Args:
+        other: coordinates that the data do not determine at all and that keep their priors.
+        informed: Jacobian of the readings and priors at each fit.
     """
 
-    def one(w: Array, z: Float[Array, " coordinates"], informed: Array) -> tuple[predicted.Predicted, Array]:
+    def predict_alternative(
+        w: Array, z: Float[Array, " coordinates"], informed: Array
+    ) -> tuple[predicted.MenuPrediction, Array]:
         coordinates = problem.coordinates.with_effects(w)
 
         def robot(x: Array) -> Robot:
@@ -219,7 +222,7 @@ def _predicted(
         wide = jnp.concatenate([z, jnp.zeros(0 if other is None else len(other))])
         unknowns, solved = predicted.map_over_runs(IMPLICIT.solve, robot(wide), batch)
 
-        def readings(x: Array) -> tuple[Any, predicted.Predicted]:
+        def readings(x: Array) -> tuple[Any, predicted.MenuPrediction]:
             return predicted.predict_readings(robot(x[: wide.size]), batch, unknowns + x[wide.size :], solved)
 
         (acts, every, left), found = jax.jacfwd(readings, has_aux=True)(
@@ -230,22 +233,22 @@ def _predicted(
         exists = found.exists & jnp.all(jnp.isfinite(half), 1) & jnp.isfinite(found.value)
         return dataclasses.replace(found, exists=exists), half
 
-    return jax.vmap(one)(which, z, informed)
+    return jax.vmap(predict_alternative)(which, z, informed)
 
 
 def predict_menu(space: CandidateSpace, candidates: Mapping[str, Candidate], settings: Settings) -> PredictedReadings:
-    """Predictions of the menu by these alternatives, with instruments as good as those of the table.
+    """Predicted readings of the menu for these alternatives. The instruments are as accurate as those of the table.
 
-    The menu has the experiments within reach of the table that the robots of all alternatives can do and that
-    are not forbidden.
+    The menu holds the experiments within reach of the table that every alternative robot can do, without forbidden
+    ones.
     """
     names, alternatives = list(candidates), list(candidates.values())
     alternatives += [alternatives[0]] * (-len(alternatives) % PAD)
     robot = space.bare.base
-    all_parameters = priors.free_names(robot, robot.configurations.names)
+    all_parameters = priors.loop_parameter_names(robot, robot.configurations.names)
     more = [n for n in all_parameters if n not in space.coordinates.base.names]
     other = priors.parameter_coordinates(robot, more) if more else None
-    equipped, indices = space.fitted_by(c.active for c in alternatives)
+    equipped, indices = space.problem_for_sets(c.active for c in alternatives)
     active = jnp.asarray(indices)
     z = jnp.asarray(np.stack([c.z for c in alternatives]))
     informed = jnp.stack(
@@ -257,7 +260,9 @@ def predict_menu(space: CandidateSpace, candidates: Mapping[str, Candidate], set
     within = reach_of_space(space, space.bare.robot(jnp.asarray(alternatives[0].z[: space.free])))
     all_experiments, shown_channels = menu.experiment_menu(within), channels.channel_names(space.bare.channels)
     predictions, half = jax.device_get(
-        _predicted(equipped, other, predicted.batch_experiments(all_experiments, shown_channels), active, z, informed)
+        _predict_alternatives(
+            equipped, other, predicted.batch_experiments(all_experiments, shown_channels), active, z, informed
+        )
     )
     predictions, half = jax.tree.map(lambda x: np.asarray(x)[: len(names)], (predictions, half))
     experiments, kept = _possible_experiments(all_experiments, predictions, within, settings)
@@ -270,20 +275,21 @@ def predict_menu(space: CandidateSpace, candidates: Mapping[str, Candidate], set
 
 
 def _possible_experiments(
-    experiments: Sequence[menu.Experiment], found: predicted.Predicted, within: Reach, settings: Settings
+    experiments: Sequence[menu.Experiment], found: predicted.MenuPrediction, within: Reach, settings: Settings
 ) -> tuple[tuple[menu.Experiment, ...], np.ndarray]:
-    """Possible and allowed experiments of a menu, and True for their readings among those of the whole menu.
+    """Experiments of a menu that are possible and allowed, and a mask of their readings among all readings of the
+    menu.
 
     Args:
-        found: predictions of each alternative, the best fit first.
+        found: predictions for each alternative, the best fit first.
     """
-    runs = [e for e in experiments if isinstance(e, menu.Run)]
+    runs = [e for e in experiments if isinstance(e, menu.ProposedRuns)]
     ends = dict(zip((r.name for r in runs), np.cumsum([len(r.voltage) for r in runs]).tolist(), strict=True))
     possible_experiments: list[menu.Experiment] = []
     kept: list[np.ndarray] = []
     for e in experiments:
         rows = np.ones(predicted.reading_count(e), bool)
-        if isinstance(e, menu.Run):
+        if isinstance(e, menu.ProposedRuns):
             span = slice(ends[e.name] - len(e.voltage), ends[e.name])
             grips = np.abs(found.grip[:, span]) < np.where(np.asarray(e.slope) > e.beyond, menu.GRIP, np.inf)
             possible_runs = menu.possible_runs(e, np.all(found.does[:, span] & grips, 0))
@@ -302,26 +308,31 @@ def _possible_experiments(
 # --- the choice -------------------------------------------------------------------------------------
 
 
-def _rank_experiment(seen: PredictedReadings, *experiments: str) -> Ranked:
+def _rank_experiment(seen: PredictedReadings, *experiments: str) -> RankedExperiment:
     pairs = itertools.combinations(range(len(seen.names)), 2)
     sigma = tuple(seen.apart(a, b, *experiments) for a, b in pairs)
     separations = zip(seen.names[1:], sigma, strict=False)  # the pairs of the best fit come first
-    return Ranked(experiments, sigma, tuple(n for n, s in separations if s >= seen.settings.apart), seen.settings)
+    return RankedExperiment(
+        experiments, sigma, tuple(n for n, s in separations if s >= seen.settings.apart), seen.settings
+    )
 
 
-def _usefulness(r: Ranked) -> tuple[bool, float]:
-    """True if an experiment separates any pair well enough, and the expected number of separated pairs."""
+def _usefulness(r: RankedExperiment) -> tuple[bool, float]:
+    """Sort key of an experiment: True if it separates any pair well enough, then the expected number of separated
+    pairs.
+    """
     return bool(r.told), float(np.sum(np.minimum(r.chances, r.settings.enough)))
 
 
-def rank_experiments(seen: PredictedReadings) -> tuple[Ranked, ...]:
-    """The whole menu by the expected number of separated pairs. Ties, within `Settings.enough`, keep the menu's
-    order, the least effort first."""
+def rank_experiments(seen: PredictedReadings) -> tuple[RankedExperiment, ...]:
+    """Experiments of the menu, sorted by the expected number of separated pairs. Ties, within `Settings.enough`, keep
+    the order of the menu, which begins with the least effort.
+    """
     return tuple(sorted((_rank_experiment(seen, e.name) for e in seen.experiments), key=_usefulness, reverse=True))
 
 
 def choose_experiment(seen: PredictedReadings) -> Proposal:
-    """The experiment of the menu that separates most pairs, with a second one if that adds enough."""
+    """Experiment that separates most pairs of alternatives, with a second one if that helps enough."""
     table = rank_experiments(seen)
     if not table:
         return Proposal((NONE,), Remark("nothing_possible"), (), 0.0, False, ())
@@ -347,10 +358,10 @@ SERIES, REPEATS = 15, 3
 
 
 def denser_runs_instruction(place: str, variable: str, within: Reach, by_duty: bool = False) -> Remark:
-    """Instruction to cover the variable of a curve more densely, within reach of the table.
+    """Instruction to measure more levels of the variable of a curve, within reach of the table.
 
-    Its values: `low` and `high`, the range of the series' voltages, `top`, the highest voltage of the table [V],
-    `slope` [deg] and `payload` [kg], the largest ones, and `steps` of voltage, slope and payload.
+    Its values: `low` and `high`, the range of the voltages, `top`, the highest voltage of the table [V], `slope`
+    [deg] and `payload` [kg], the largest ones, and `steps` of voltage, slope and payload.
     """
     volts = within.voltages
     low, high = (volts[0], volts[-1]) if volts[-1] > volts[0] else (menu.round_significant(0.5 * volts[0]), volts[0])
@@ -368,12 +379,12 @@ def denser_runs_instruction(place: str, variable: str, within: Reach, by_duty: b
 
 
 def propose_denser_runs(space: CandidateSpace, where: DiscrepancyLocation, settings: Settings) -> Proposal:
-    """Proposal of more runs along the variable of an unnamed discrepancy.
+    """Proposal to measure more levels of the variable of a discrepancy without a name.
 
-    Its expected separation from no discrepancy is the table's χ² per run, times the runs of the series [σ].
+    Its expected separation from no discrepancy is the χ² per run of the table times the number of proposed runs [σ].
     """
     variable, within = where.variable, reach_of_space(space)
-    runs = space.bare.observe.runs_counting(space.included)
+    runs = space.bare.observe.number_of_included_runs(space.included)
     sigma = float(np.sqrt(max(where.strongest, 0.0) * SERIES * REPEATS / max(runs, 1)))
     if sigma < settings.worth:
         return Proposal((NONE,), Remark("too_weak", variable=variable, sigma=sigma), (), 0.0, False, ())
@@ -386,12 +397,12 @@ def propose_denser_runs(space: CandidateSpace, where: DiscrepancyLocation, setti
 
 
 def propose_nothing(space: CandidateSpace) -> Proposal:
-    """Empty proposal, because the menu has no runs of the table's kind."""
+    """Proposal without experiments, because the menu has none for this kind of data."""
     word = "goals of a controller" if space.bare.base.rig.follows_goal else space.bare.observe.word
     return Proposal((NONE,), Remark("no_menu", word=word), (), 0.0, False, ())
 
 
 def propose_separating(space: CandidateSpace, best: Candidate, found: Classes, settings: Settings) -> Proposal | None:
-    """Experiment that separates the alternatives of a class, None if each effect has one name."""
+    """Experiment that separates the alternatives of a class. None if each effect has only one candidate name."""
     alternatives = alternatives_of_class(best, found)
     return choose_experiment(predict_menu(space, alternatives, settings)) if len(alternatives) > 1 else None

@@ -1,4 +1,4 @@
-"""Parts of the loop's result from its stages: effects, evidence, shifts and errors, by name and in their units."""
+"""Entries of the loop's result: effects, evidence, shifts and errors, by name and in their units."""
 
 from __future__ import annotations
 
@@ -16,29 +16,29 @@ from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.adequacy import AdequacyTest, Diagnosis
 from calibration.discovery.candidates import Candidate
 from calibration.discovery.classes import Classes, Shift
-from calibration.discovery.discrepancy import CurveBeside
+from calibration.discovery.discrepancy import BaseCurve
 from calibration.discovery.location import DiscrepancyLocation
 from calibration.discovery.loop_notes import RuledOut
 from calibration.discovery.mechanism import excess_misfit, share_of_excess
-from calibration.discovery.projection import Defect, defect_by_row
+from calibration.discovery.projection import BalanceError, balance_error_by_row
 from calibration.discovery.result import (
-    Alternative,
-    BaseShift,
+    ClassMember,
+    EffectRanking,
     EffectScore,
-    Estimate,
     Evidence,
     FoundEffect,
     KindOfEvidence,
-    Member,
-    Ranked,
-    Ranking,
+    ParameterEstimate,
+    ParameterShift,
+    RankedEffect,
     ReadingsOfRows,
+    RejectedCandidate,
     StatedValue,
     UnnamedDiscrepancy,
 )
 from calibration.discovery.score_tests import ScoreTable
-from calibration.discovery.screening import Beforehand
-from calibration.discovery.search import single_p_value, without_each
+from calibration.discovery.screening import WeakFormScreening
+from calibration.discovery.search import refit_without_each, single_p_value
 from calibration.discovery.settings import Settings
 from calibration.inference import bases, priors
 from calibration.inference.estimates import SIDE_OF_BOUND
@@ -69,13 +69,13 @@ def equation_and_source(effect: Effect) -> tuple[str, str]:
 def found_effects(
     space: CandidateSpace, base: Candidate, best: Candidate, found: Classes, test: AdequacyTest, settings: Settings
 ) -> tuple[FoundEffect, ...]:
-    """Each effect of the best candidate, with its class, amplitude and evidence.
+    """Result entry of each effect of the best candidate: its class, its parameters and its evidence.
 
     Args:
-        test: test of the base fit. Its bootstrap gives the p-values.
+        test: adequacy test of the base fit. Its bootstrap gives the p-values.
     """
     # The unique contribution of each effect: the rise of χ² if it is removed and everything is refitted.
-    others = [base] if len(best.effects) == 1 else without_each(space, best, settings, found.ladder)
+    others = [base] if len(best.effects) == 1 else refit_without_each(space, best, settings, found.ladder)
     gains = [2 * (c.cost - best.cost) for c in others]
     null, excess = np.asarray(test.null.single), excess_misfit(space, base)
     listed = []
@@ -86,13 +86,13 @@ def found_effects(
             FoundEffect(
                 name=effect.name,
                 members={name: _class_member(space, best, found, slot, name) for name in members},
-                stated={s.name: _stated(space, best, s) for s in found.stated[slot]},
+                stated={s.name: _stated_value(space, best, s) for s in found.stated[slot]},
                 families=found.families[slot],
                 balance=effect.balance,
                 unit=BALANCES[effect.balance][0],
                 equation=words,
                 source=source,
-                parameters=_parameters(space, best, slot, settings),
+                parameters=_effect_parameters(space, best, slot, settings),
                 p_value=single_p_value(gains[slot], null),
                 score=float(gains[slot]),
                 share=share_of_excess(excess, float(gains[slot])),
@@ -101,13 +101,15 @@ def found_effects(
     return tuple(listed)
 
 
-def _parameters(space: CandidateSpace, best: Candidate, slot: int, settings: Settings) -> dict[str, Estimate]:
+def _effect_parameters(
+    space: CandidateSpace, best: Candidate, slot: int, settings: Settings
+) -> dict[str, ParameterEstimate]:
     effect, p = space.library[best.active[slot]], space.free
     amplitude, unit = amplitude_of(effect), amplitude_unit(effect)
     sd = settings.width * best.sd[p + slot] * unit
     held_names = held_by_prior(best.sd)
     values = {
-        amplitude.name: Estimate(
+        amplitude.name: ParameterEstimate(
             float(best.amplitude[slot] * unit), float(sd), amplitude.spec.unit, bool(held_names[p + slot])
         )
     }
@@ -115,7 +117,7 @@ def _parameters(space: CandidateSpace, best: Candidate, slot: int, settings: Set
     if shape is not None:
         k, scales = p + settings.slots + slot, shape_scales(shape)
         value, slope = _shaped(scales, best.z[k])
-        values[shape.name] = Estimate(
+        values[shape.name] = ParameterEstimate(
             float(value), float(slope) * float(best.sd[k]), shape.spec.unit, bool(held_names[k])
         )
     return values
@@ -124,16 +126,16 @@ def _parameters(space: CandidateSpace, best: Candidate, slot: int, settings: Set
 _shaped = jax.jit(jax.value_and_grad(shape_at, argnums=1))
 
 
-def _class_member(space: CandidateSpace, best: Candidate, found: Classes, slot: int, name: str) -> Member:
-    """An effect of a class in place of the leader."""
+def _class_member(space: CandidateSpace, best: Candidate, found: Classes, slot: int, name: str) -> ClassMember:
+    """Result entry of an alternative effect of a class."""
     active_names = frozenset(name if s == slot else n for s, n in enumerate(best.active)) - {""}
     other = next(c for c in (best, *found.ladder) if c.key == active_names)
     position = other.active.index(name)
     amplitude = other.amplitude[position] * amplitude_unit(space.library[name])
-    return Member(float(amplitude), float(other.size[position]), float(2 * (other.cost - best.cost)))
+    return ClassMember(float(amplitude), float(other.size[position]), float(2 * (other.cost - best.cost)))
 
 
-def _stated(space: CandidateSpace, best: Candidate, shift: Shift) -> StatedValue:
+def _stated_value(space: CandidateSpace, best: Candidate, shift: Shift) -> StatedValue:
     coordinates, p, k = space.coordinates.base, space.free, shift.index
     value = [float(coordinates.value(np.asarray(z))[k]) for z in (shift.fit.z[:p], np.zeros(p))]
     rise = float(2 * (shift.fit.cost - best.cost))
@@ -141,16 +143,16 @@ def _stated(space: CandidateSpace, best: Candidate, shift: Shift) -> StatedValue
 
 
 def unnamed_discrepancy(
-    beside: CurveBeside, where: DiscrepancyLocation, p_value: float, rows: int
+    beside: BaseCurve, where: DiscrepancyLocation, p_value: float, rows: int
 ) -> UnnamedDiscrepancy:
-    """Discrepancy of a verdict without a name, over the rows of the table. Curve and rows are of one fit."""
+    """Result entry of a discrepancy without a name. The curve and the errors of rows come from the same fit."""
     found, linear, lacks = beside.curve, beside.diagnosis.linear, None
     happens = bases.window_from_name(where.variable)
-    x, way = linear.in_travel(found.balance, where.variable if happens is None else happens.axis)
+    x, way = linear.curve_variable(found.balance, where.variable if happens is None else happens.axis)
     if found.defect is not None:
-        lacks = defect_by_row(linear, found.balance)
+        lacks = balance_error_by_row(linear, found.balance)
         turn = 2 * np.pi if where.variable in bases.ORDERS else None
-        lacks = Defect(np.interp(x, found.grid, found.curve, period=turn) + way * lacks.value, lacks.sd)
+        lacks = BalanceError(np.interp(x, found.grid, found.curve, period=turn) + way * lacks.value, lacks.sd)
     return UnnamedDiscrepancy(
         **dataclasses.asdict(where),
         unit=found.unit,
@@ -172,17 +174,18 @@ def unnamed_discrepancy(
 
 def listed_alternatives(
     space: CandidateSpace, best: Candidate, cost: float, ladder: Sequence[Candidate], settings: Settings
-) -> tuple[tuple[Alternative, ...], tuple[Alternative, ...]]:
-    """Simulated candidates that explain the data nearly as well as the proposal, and those of implausible size.
+) -> tuple[tuple[RejectedCandidate, ...], tuple[RejectedCandidate, ...]]:
+    """Simulated candidates that explain the data nearly as well as the proposal, and separately those of implausible
+    size.
 
-    A candidate that only adds effects to the proposal, or to another candidate of the list, is omitted if they
-    explain little.
+    A candidate that only adds effects to the proposal, or to another listed candidate, is omitted if these explain
+    little.
 
     Args:
-        cost: cost of the proposal [½σ²].
+        cost: objective of the proposal [½σ²].
         best: the proposal, if it is a candidate.
     """
-    near: tuple[list[Alternative], list[Alternative]] = ([], [])
+    near: tuple[list[RejectedCandidate], list[RejectedCandidate]] = ([], [])
     simpler = {best.key: cost} if best.key else {}
     for c in sorted((c for c in ladder if c.simulated), key=lambda x: (len(x.effects), x.cost)):
         rise = 2 * (c.cost - cost)
@@ -196,7 +199,7 @@ def listed_alternatives(
     return plausible, ruled_out
 
 
-def _alternative(space: CandidateSpace, c: Candidate, rise: float, settings: Settings) -> Alternative:
+def _alternative(space: CandidateSpace, c: Candidate, rise: float, settings: Settings) -> RejectedCandidate:
     sds, sizes, why = {}, {}, list[RuledOut]()
     for slot, (name, amplitude, size) in enumerate(zip(c.active, c.amplitude, c.size, strict=True)):
         if not name:
@@ -211,11 +214,11 @@ def _alternative(space: CandidateSpace, c: Candidate, rise: float, settings: Set
         elif not c.plausible and size * (1 + sd / max(abs(float(amplitude)), 1e-12)) >= 1:
             why.append(RuledOut(name, "edge"))
     amplitudes = {name: a * amplitude_unit(space.library[name]) for name, a in sds.items()}
-    return Alternative(amplitudes, sds, sizes, float(rise), tuple(why))
+    return RejectedCandidate(amplitudes, sds, sizes, float(rise), tuple(why))
 
 
 def proposed_robot(space: CandidateSpace, best: Candidate) -> Robot:
-    """Fitted base with the effects of the proposal and no other."""
+    """Fitted robot with the effects of the proposal and no others of the library."""
     robot = space.problem(best.active).robot(jnp.asarray(best.z))
     keep = set(best.effects) | {e.name for e in space.bare.base.effects}
     return dataclasses.replace(robot, effects=tuple(e for e in robot.effects if e.name in keep))
@@ -225,7 +228,7 @@ def proposed_robot(space: CandidateSpace, best: Candidate) -> Robot:
 
 
 def evidence_of_test(test: AdequacyTest, adequate: bool) -> Evidence:
-    """Strongest statistic of each kind, its critical value, and its p-value among bootstrap tables."""
+    """Strongest statistic of each kind, its critical value, and its p-value by bootstrap."""
     kinds = {
         kind: KindOfEvidence(
             float(getattr(test.found, kind)), test.threshold(kind), test.p(kind), np.asarray(getattr(test.null, kind))
@@ -235,11 +238,13 @@ def evidence_of_test(test: AdequacyTest, adequate: bool) -> Evidence:
     return Evidence(kinds, test.p_value, adequate)
 
 
-def base_shift(space: CandidateSpace, before: np.ndarray, after: np.ndarray, sd: np.ndarray) -> dict[str, BaseShift]:
-    """Every base parameter before and after, in its unit and in prior sds.
+def parameter_shifts(
+    space: CandidateSpace, before: np.ndarray, after: np.ndarray, sd: np.ndarray
+) -> dict[str, ParameterShift]:
+    """Every base parameter before and after effects were added, in its unit and in prior sds.
 
     Args:
-        before, after: coordinates, the base's first.
+        before, after: coordinates of both fits. Those of the base are first.
         sd: standard deviation of `after`.
     """
     coordinates, p = space.coordinates.base, space.free
@@ -249,7 +254,7 @@ def base_shift(space: CandidateSpace, before: np.ndarray, after: np.ndarray, sd:
     fields, held_names = priors.parameters_by_name(space.bare.base), held_by_prior(sd)
     bound = coordinates.beyond(z[1])
     return {
-        name: BaseShift(
+        name: ParameterShift(
             prior=float(value[0][k]),
             before=float(value[1][k]),
             after=float(value[2][k]),
@@ -266,10 +271,12 @@ def base_shift(space: CandidateSpace, before: np.ndarray, after: np.ndarray, sd:
 
 
 def effect_scores(space: CandidateSpace, scores: ScoreTable, settings: Settings) -> tuple[EffectScore, ...]:
-    """Every effect at its best shape and plausible size, strongest first. Equal scores are sorted by name."""
+    """Score of each effect at its best shape and a plausible amplitude, strongest first. Equal scores are sorted by
+    name.
+    """
     listed = []
     for effect in space.library.effects:
-        amplitude, explained = _plausible_score(space, effect, scores, settings)
+        amplitude, explained = _plausible_amplitude_and_score(space, effect, scores, settings)
         m = space.library.best_instance(effect.name, np.asarray(scores.single))
         listed.append(
             EffectScore(
@@ -283,26 +290,26 @@ def effect_scores(space: CandidateSpace, scores: ScoreTable, settings: Settings)
     return tuple(sorted(listed, key=lambda s: (-round(s.score, 9), s.name)))
 
 
-def rank_library(space: CandidateSpace, left: Diagnosis, settings: Settings) -> Ranking:
-    """Ranking of the library by the share of the base's residuals that each single effect would explain."""
+def rank_library(space: CandidateSpace, left: Diagnosis, settings: Settings) -> EffectRanking:
+    """Ranking of the library by the share of the base's misfit that each effect alone would explain."""
     test = left.test
     listed = _rank_effects(space, left.scores, settings)
-    return Ranking(test.rejected, test.p_value, test.threshold("single") ** 2, listed)
+    return EffectRanking(test.rejected, test.p_value, test.threshold("single") ** 2, listed)
 
 
-def rank_effects_by_weak_form(space: CandidateSpace, known: Beforehand, settings: Settings) -> Ranking:
-    """Ranking by the equations of the log in weak form, before any simulation."""
+def rank_effects_by_weak_form(space: CandidateSpace, known: WeakFormScreening, settings: Settings) -> EffectRanking:
+    """Ranking of the effects by the equations of a log in weak form, before any simulation."""
     p = single_p_value(float(np.max(known.scores.single**2)), known.null)
     chance = float(np.quantile(known.null, 1 - settings.family_wise_error, method="higher")) ** 2
     listed = _rank_effects(space, known.scores, settings)
     fit = next((c for c in known.alone if c.plausible), known.base)
-    moved = {} if fit is None else base_shift(space, fit.z, fit.z, fit.sd)
+    moved = {} if fit is None else parameter_shifts(space, fit.z, fit.z, fit.sd)
     parameters = {name: (shift.after, shift.sd_after) for name, shift in moved.items()}
-    return Ranking(p <= settings.family_wise_error, p, chance, listed, known.windows, parameters)
+    return EffectRanking(p <= settings.family_wise_error, p, chance, listed, known.windows, parameters)
 
 
-def _rank_effects(space: CandidateSpace, scores: ScoreTable, settings: Settings) -> tuple[Ranked, ...]:
-    """Library sorted by score, with effects that would supply power last."""
+def _rank_effects(space: CandidateSpace, scores: ScoreTable, settings: Settings) -> tuple[RankedEffect, ...]:
+    """Effects sorted by score. Those that would supply power are last."""
     listed = []
     for s in effect_scores(space, scores, settings):
         effect = space.library[s.name]
@@ -310,14 +317,14 @@ def _rank_effects(space: CandidateSpace, scores: ScoreTable, settings: Settings)
         unit = amplitude_of(effect).spec.unit
         # as in `candidates.supplying_effects`
         supplies = space.bare.observe.long and effect.dissipative and s.amplitude < 0
-        listed.append(Ranked(s.name, effect.family(), unit, s.score, s.amplitude, sd, supplies))
+        listed.append(RankedEffect(s.name, effect.family(), unit, s.score, s.amplitude, sd, supplies))
     return tuple(sorted(listed, key=lambda e: e.supplies))
 
 
-def _plausible_score(
+def _plausible_amplitude_and_score(
     space: CandidateSpace, effect: Effect, scores: ScoreTable, settings: Settings
 ) -> tuple[float, float]:
-    """Plausible amplitude [prior sds] and the decrease of χ² that it explains [σ²]."""
+    """Best amplitude within plausible limits [prior sds], and the decrease of χ² that it explains [σ²]."""
     m = space.library.best_instance(effect.name, np.asarray(scores.single))
     wanted, left = float(scores.amplitude[m]), float(scores.left[m])
     low = max(-settings.plausible, amplitude_of(effect).spec.bounds[0] / amplitude_unit(effect))
@@ -326,14 +333,15 @@ def _plausible_score(
 
 
 def invisible_effects(space: CandidateSpace, scores: ScoreTable, settings: Settings) -> Names:
-    """Effects that the data cannot reveal, because even the largest plausible amplitude changes the readings too
-    little."""
+    """Effects that the data cannot reveal, because even their largest plausible amplitude hardly changes the
+    readings.
+    """
     largest_scores = space.library.largest(np.asarray(scores.left))
     return tuple(
         e.name
         for e, x in zip(space.library.effects, largest_scores, strict=True)
         if settings.plausible * x < settings.visible
-        and _plausible_score(space, e, scores, settings)[1] < settings.visible**2
+        and _plausible_amplitude_and_score(space, e, scores, settings)[1] < settings.visible**2
     )
 
 
@@ -341,16 +349,16 @@ def invisible_effects(space: CandidateSpace, scores: ScoreTable, settings: Setti
 
 
 @dataclasses.dataclass(frozen=True)
-class Fitted:
-    """A fit with its problem, coordinates and active effects (None without slots)."""
+class FittedProblem:
+    """A problem with the coordinates of its fit and the active effects (None without slots)."""
 
     problem: Problem
     z: np.ndarray
     active: tuple[int, ...] | None
 
     def observation(self) -> Observation:
-        """Observation of the fit."""
-        return self.problem.observe.observed(self.problem, self.z, self.active)
+        """Simulated observation at the fit."""
+        return self.problem.observe.observation_at(self.problem, self.z, self.active)
 
 
 #: Kind of block → hold-out predictions of each row, shape (rows, channels).
@@ -361,35 +369,36 @@ def readings_of_rows(
     runs: Runs,
     sd: np.ndarray,
     kinds: Mapping[str, Columns],
-    before: Fitted,
-    after: Fitted | None,
+    before: FittedProblem,
+    after: FittedProblem | None,
     known_before: HeldOutReadings | None = None,
     known_after: HeldOutReadings | None = None,
 ) -> ReadingsOfRows:
-    """Fitted and held-out readings, for every kind of block. `after` None is the same as before.
+    """Simulated readings of both fits for all rows, fitted and held out for each kind of block. `after` = None: both
+    are equal.
 
     Args:
-        kinds: blocks, as from `blocks.predictable_blocks`.
+        kinds: blocks from `blocks.predictable_blocks`.
         known_before, known_after: hold-out readings, if they are already known.
     """
     rows = len(runs)
 
-    def seen(fitted: Fitted) -> np.ndarray:
+    def fitted_reading(fitted: FittedProblem) -> np.ndarray:
         observation = fitted.observation()
         lost = fitted.problem.observe.unreachable(np.asarray(observation.status))[:rows, None]
         return np.where(lost, np.nan, np.asarray(observation.reading)[:rows])
 
-    def left_out(fitted: Fitted, masks: list[np.ndarray]) -> np.ndarray:
+    def held_out_reading(fitted: FittedProblem, masks: list[np.ndarray]) -> np.ndarray:
         return predict_unseen(fitted.problem, fitted.z, masks, fitted.active).reading
 
     held, labels = {}, {}
     for kind, by in kinds.items():
         masks = list(by.values())
-        first = left_out(before, masks) if known_before is None else known_before[kind]
+        first = held_out_reading(before, masks) if known_before is None else known_before[kind]
         later = first
         if after is not None:
-            later = left_out(after, masks) if known_after is None else known_after[kind]
+            later = held_out_reading(after, masks) if known_after is None else known_after[kind]
         held[kind], labels[kind] = (first, later), tuple(by)
-    stated, fitted = seen(dataclasses.replace(before, z=np.zeros_like(before.z))), seen(before)
-    later = fitted if after is None else seen(after)
+    stated, fitted = fitted_reading(dataclasses.replace(before, z=np.zeros_like(before.z))), fitted_reading(before)
+    later = fitted if after is None else fitted_reading(after)
     return ReadingsOfRows(runs.measured(), sd[:rows], stated, fitted, later, held, labels)

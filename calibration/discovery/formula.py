@@ -10,7 +10,7 @@ import numpy as np
 from calibration.data import Names
 from calibration.described import describe
 from calibration.discovery.projection import Projection
-from calibration.discovery.smooth import Smooth
+from calibration.discovery.smooth import SmoothCurve
 from calibration.inference.bases import ORDERS, place_signature
 from calibration.inference.linearization import Linearization
 from mmrjax.effects.curve import EVERY_VARIABLE, PLACES, READINGS
@@ -38,7 +38,7 @@ MARK = "a proposal, not a finding"
 
 @dataclasses.dataclass(frozen=True)
 class Ratio:
-    """A signal over a value in its unit: dimensionless."""
+    """A dimensionless variable: a signal divided by a reference value in the same unit."""
 
     symbol: str
     unit: str
@@ -47,17 +47,18 @@ class Ratio:
 
     @property
     def value(self) -> str:
-        """Divisor of the signal, with its unit."""
+        """Reference value with its unit, as text."""
         return f"{self.over:g} {self.unit}".rstrip()
 
     def scaled(self, x: np.ndarray) -> Ratio:
-        """Ratio over the largest of these values, rounded to one digit, so that coefficients have the size of the
-        term."""
+        """Ratio whose reference value is the largest of these values, rounded to one digit. Coefficients then have
+        the size of the term.
+        """
         most = float(np.max(np.abs(x), initial=0.0)) * self.over
         return dataclasses.replace(self, over=float(f"{most:.0e}")) if most > 0 else self
 
     def __call__(self, linear: Linearization, place: str) -> np.ndarray:
-        x, _ = linear.in_travel(place, self.of)
+        x, _ = linear.curve_variable(place, self.of)
         return (np.sin(x) if self.of == "slope" else x) / self.over
 
 
@@ -73,14 +74,14 @@ FOREIGN = 2 * float(np.log(len(RATIOS)))
 
 @dataclasses.dataclass(frozen=True)
 class Monomial:
-    """A product of powers of ratios: (index into `ratios`, exponent) of each factor."""
+    """A product of powers of ratios. Each factor is (index into `ratios`, exponent)."""
 
     factors: tuple[tuple[int, float], ...]
     ratios: tuple[Ratio, ...] = RATIOS
 
     @property
     def complexity(self) -> float:
-        """Penalty for factors, and for exponents other than one."""
+        """Penalty for the number of factors, and for exponents other than one."""
         return sum(1 + 0.1 * abs(p - 1) for _, p in self.factors)
 
     @property
@@ -94,29 +95,29 @@ class Monomial:
 
 
 def monomial_dictionary(ratios: np.ndarray, kinds: tuple[Ratio, ...] = RATIOS) -> dict[Monomial, np.ndarray]:
-    """Monomials that are defined for these ratios, with their values by row.
+    """Monomials that are defined for these ratios, with their value in each row.
 
-    A root needs ratios that are never negative, an inverse needs ratios away from zero. A ratio that does not vary
-    is omitted, and so are all but the first of several proportional monomials.
+    A root needs ratios that are never negative. An inverse needs ratios that stay away from zero. A ratio that does
+    not vary is omitted, and of several proportional monomials only the first is kept.
 
     Args:
-        ratios: values, shape (rows, ratios).
-        kinds: signal and scale of each.
+        ratios: values of the ratios, shape (rows, ratios).
+        kinds: signal and reference value of each ratio.
     """
     low, high = ratios.min(0), ratios.max(0)
     lively = [k for k in range(ratios.shape[1]) if high[k] - low[k] > 1e-6 * max(abs(high[k]), abs(low[k]), 1e-9)]
 
-    def safe(k: int, p: float) -> bool:
+    def is_defined(k: int, p: float) -> bool:
         if p < 0:
             return low[k] > SAFE * high[k]
         return low[k] >= 0 or p == int(p)
 
-    single: list[tuple[tuple[int, float], ...]] = [((k, p),) for k in lively for p in POWERS if safe(k, p)]
+    single: list[tuple[tuple[int, float], ...]] = [((k, p),) for k in lively for p in POWERS if is_defined(k, p)]
     double: list[tuple[tuple[int, float], ...]] = [
         ((j, p), (k, q))
         for j, k in itertools.combinations(lively, 2)
         for p, q in itertools.product(POWERS_PRODUCT, repeat=2)
-        if safe(j, p) and safe(k, q)
+        if is_defined(j, p) and is_defined(k, q)
     ]
     monomials: dict[Monomial, np.ndarray] = {}
     directions: list[np.ndarray] = []
@@ -134,14 +135,14 @@ class Proposal:
     """A formula for a discrepancy: one term of a dictionary of dimensionless monomials.
 
     Attributes:
-        expression: as `ΔU = 0.42 V (I/2 A)^2`, "" if no single term explains `MOST` of the curve.
+        expression: text such as `ΔU = 0.42 V (I/2 A)^2`, "" if no single term explains `MOST` of the curve.
         mark: label of the formula.
         terms: monomials of the formula. coefficients, sds: coefficients and standard deviations of each [unit of
         the balance].
         variables: signals of the terms, without repeats.
         explained: decrease of χ² at the base fit.
-        gain: BIC of the smooth curve less that of the formula. Positive favours the formula.
-        tried: size of the dictionary: a larger one makes a good formula less significant.
+        gain: BIC of the smooth curve minus BIC of the formula. A positive value favours the formula.
+        tried: number of monomials tried. The more were tried, the less a good formula means.
     """
 
     JSON = ("formula", "mark", "coefficients", "sds", "bic_gain_over_curve=gain", "tried")
@@ -162,16 +163,17 @@ class Proposal:
 
 
 def propose_formula(
-    linear: Linearization, balance: str, counts: np.ndarray, curve: Smooth, *, voltage: bool = True
+    linear: Linearization, balance: str, counts: np.ndarray, curve: SmoothCurve, *, voltage: bool = True
 ) -> Proposal:
-    """Term with the least BIC that explains `MOST` of the curve, or a simpler one without loss of evidence.
+    """Term with the smallest BIC among those that explain `MOST` of the curve, or a simpler one with as much
+    evidence.
 
-    The formula is empty if no single term does. The curve is then described by its values. Variables other than
-    the curve's add a penalty.
+    If no single term explains enough, the formula is empty and the curve is described by its values. Variables other
+    than the one of the curve are penalised.
 
     Args:
         counts: True for included rows, shape (rows,).
-        curve: curve for comparison with the formula.
+        curve: smooth curve that the formula is compared with.
         voltage: True for a rig with an imposed or measured voltage.
     """
     if curve.wave:
@@ -192,7 +194,7 @@ def propose_formula(
     if not terms:  # all runs have the same conditions
         return Proposal("", (), (), (), (), 0.0, 0.0, 0)
     shapes = np.zeros((linear.points, len(terms)))
-    _, way = linear.in_travel(balance, curve.variable)
+    _, way = linear.curve_variable(balance, curve.variable)
     for k, value in enumerate(dictionary.values()):
         shapes[counts, k] = way[counts] * value
     a, b = Projection(linear)(place_signature(linear, balance, shapes))
@@ -222,8 +224,8 @@ def propose_formula(
     )
 
 
-def _wave_formula(balance: str, curve: Smooth) -> Proposal:
-    """Formula of a wave."""
+def _wave_formula(balance: str, curve: SmoothCurve) -> Proposal:
+    """Formula of a wave over the angle of a shaft."""
     sine, cosine = curve.scale * curve.root @ curve.start
     size, phase = float(np.hypot(sine, cosine)), float(np.arctan2(cosine, sine))
     order, unit = ORDERS[curve.variable][0], PLACES[balance][0]
@@ -233,13 +235,13 @@ def _wave_formula(balance: str, curve: Smooth) -> Proposal:
     return Proposal(formula, (), (size,), (float("nan"),), ("angle of the driving shaft",), curve.explained, 0.0, 1)
 
 
-def _decay_formula(linear: Linearization, balance: str, counts: np.ndarray, curve: Smooth) -> Proposal:
-    """Formula of a decay with time or from run to run: an exponential without offset.
+def _decay_formula(linear: Linearization, balance: str, counts: np.ndarray, curve: SmoothCurve) -> Proposal:
+    """Formula of an exponential decay with time, or from run to run, without an offset.
 
     The time constant is searched on a grid scaled to the length of the runs, or of the table. No offset is fitted,
     because the base parameters absorb it.
     """
-    (t, way), counts = linear.in_travel(balance, curve.variable), linear.at_points(counts)
+    (t, way), counts = linear.curve_variable(balance, curve.variable), linear.at_points(counts)
     symbol, unit = FADING[curve.variable]
     constants = np.geomspace(0.02, 2.0, 40) * max(float(t[counts].max()), 1e-9)
     best: tuple[float, tuple] = (np.inf, ())

@@ -1,19 +1,19 @@
-"""The main claim of a verdict: established at every noise that was tried."""
+"""The main claim of a result: the most detailed one that holds at every noise level tried."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
 from calibration.data import Names
-from calibration.discovery.loop_notes import Headline, Summary
+from calibration.discovery.loop_notes import Headline, VerdictSummary
 from calibration.discovery.settings import WITHOUT_NAME
 
 
-def headline(said: Summary, others: Sequence[tuple[float, Summary]] = ()) -> Headline:
-    """Most detailed claims that hold in the verdict at every noise level.
+def headline(said: VerdictSummary, others: Sequence[tuple[float, VerdictSummary]] = ()) -> Headline:
+    """The most detailed claims on which the verdicts at all noise levels agree.
 
     Args:
-        others: factor on the noise and verdict, of each.
+        others: factor on the noise, and verdict, of each other noise level.
     """
     every = [said, *(summary for _, summary in others)]
     factors = tuple(sorted([1.0, *(factor for factor, _ in others)]))
@@ -31,19 +31,19 @@ def headline(said: Summary, others: Sequence[tuple[float, Summary]] = ()) -> Hea
         ]
         families, values = tuple(m.families for m in effects_of_laws), tuple(m.values for m in effects_of_laws)
         return Headline("named" if alone else "class", laws, factors, (), families, values)
-    mechanisms, shared = _shared_claims([_mechanisms(s) for s in every])
+    mechanisms, shared = _shared_claims([_claimed_families(s) for s in every])
     if mechanisms:
         return Headline("mechanism", mechanisms, factors, shared)
-    places, shared = _shared_claims([_places(s) for s in every])
+    places, shared = _shared_claims([_claimed_equations(s) for s in every])
     return Headline("place", places, factors, shared)
 
 
-def _verdict_without_claim(said: Summary) -> str:
-    """Verdict of a table without a claim of a missing effect, empty for other verdicts."""
+def _verdict_without_claim(said: VerdictSummary) -> str:
+    """Verdict if it claims no missing effect (`none` or `undescribed`), otherwise empty."""
     return said.verdict if said.verdict in ("none", "undescribed") else ""
 
 
-def _mechanisms(said: Summary) -> list[Names]:
+def _claimed_families(said: VerdictSummary) -> list[Names]:
     """Families of each established law or mechanism."""
     families = [m.families for m in said.missing if m.established]
     return (
@@ -53,9 +53,9 @@ def _mechanisms(said: Summary) -> list[Names]:
     )
 
 
-def _places(said: Summary) -> list[Names]:
-    """Equations with a discrepancy, in words, without the variable."""
-    families = _mechanisms(said)
+def _claimed_equations(said: VerdictSummary) -> list[Names]:
+    """Equations with a discrepancy, in words, without their variable."""
+    families = _claimed_families(said)
     if said.verdict in WITHOUT_NAME and said.where is not None:
         families.append((said.where.family,))
     return [tuple(dict.fromkeys(f.partition(" that ")[0] for f in those)) for those in families]
@@ -64,10 +64,10 @@ def _places(said: Summary) -> list[Names]:
 def _shared_claims(
     claims: Sequence[Sequence[Names]],
 ) -> tuple[tuple[Names, ...], tuple[int, ...]]:
-    """Claims of the first verdict that share a member with a claim of each other verdict, and their shared members.
+    """Claims of the first verdict that every other verdict shares at least in part.
 
-    Members in all verdicts come first, then any that some noises cannot separate from them. A claim within another
-    is omitted. The second result is the number of shared members of each claim.
+    Members on which all verdicts agree come first, then those that some noise levels cannot separate from them. A
+    claim that is part of another is omitted. The second result is the number of agreed members of each claim.
     """
     counts: dict[Names, int] = {}
     for claim in claims[0]:

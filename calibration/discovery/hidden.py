@@ -1,4 +1,4 @@
-"""Effects that a name could hide: they may be present in addition, as large as would be visible without it.
+"""Effects that may be present in addition to the named ones, but that the named ones would hide.
 
 At the fit with a name, a further effect may have any amplitude that raises the objective by no more than `same` [σ²]:
 b̂ ± √same sd. The name hides the effect if the largest plausible such amplitude, without the name, would change the
@@ -27,14 +27,15 @@ SAME, MOST, ASKED = 4.0, 6, 2
 
 
 @dataclasses.dataclass(frozen=True)
-class Hidden:
+class HiddenEffect:
     """An effect that the named effects of a fit could hide.
 
     Attributes:
         name: name of the effect.
-        amplitude: the largest possible one in `unit`.
-        sigmas: change of the readings by it, without the name [σ].
-        experiment: experiment of the menu, that would show it, with the expected separation [σ]. "" and 0 for none.
+        amplitude: largest amplitude that would stay hidden, in `unit`.
+        sigmas: change of the readings by that amplitude, if the named effects were fixed [σ].
+        experiment: experiment of the menu that would show it, with its expected separation [σ]. "" and 0 if there is
+            none.
     """
 
     name: str
@@ -54,14 +55,14 @@ def find_hidden_effects(
     settings: Settings,
     *,
     ask: bool,
-) -> tuple[Hidden, ...]:
+) -> tuple[HiddenEffect, ...]:
     """Effects that the named effects of the best candidate could hide, the largest first.
 
     Args:
         alike: classes of the candidate's effects.
-        left: diagnosis of the base.
-        after: diagnosis of that fit.
-        ask: True to look for experiments that would show the effects.
+        left: diagnosis of the base fit.
+        after: diagnosis of the best fit.
+        ask: True to look for experiments that would show the hidden effects.
     """
     hidden_effects, named_effects = [], {n for members in alike.members for n in members}
     for effect in space.library.effects:
@@ -78,20 +79,22 @@ def find_hidden_effects(
         size = float(ends[np.argmax(np.abs(ends))])
         if abs(size) * alone >= settings.needed and abs(size) * beside <= 2 * np.sqrt(SAME):
             hidden_effects.append(
-                Hidden(effect.name, size * amplitude_unit(effect), amplitude_of(effect).spec.unit, abs(size) * alone)
+                HiddenEffect(
+                    effect.name, size * amplitude_unit(effect), amplitude_of(effect).spec.unit, abs(size) * alone
+                )
             )
     hidden_effects = sorted(hidden_effects, key=lambda h: -h.sigmas)[:MOST]
     if not ask or len(best.effects) >= settings.slots:
         return tuple(hidden_effects)
     return tuple(
-        _with_experiment(space, best, h, after, settings) if k < ASKED else h for k, h in enumerate(hidden_effects)
+        _add_experiment(space, best, h, after, settings) if k < ASKED else h for k, h in enumerate(hidden_effects)
     )
 
 
-def _with_experiment(
-    space: CandidateSpace, best: Candidate, what: Hidden, after: Diagnosis, settings: Settings
-) -> Hidden:
-    """Hidden effect with the experiment that separates the fit with its largest amplitude from the fit without it."""
+def _add_experiment(
+    space: CandidateSpace, best: Candidate, what: HiddenEffect, after: Diagnosis, settings: Settings
+) -> HiddenEffect:
+    """Adds the experiment that best separates the fit with the largest hidden amplitude from the fit without it."""
     slot = best.active.index("")
     active = tuple(what.name if s == slot else n for s, n in enumerate(best.active))
     (joint,) = fit_candidates(space, [(active, start_of_fit(space, best, active, settings, after.scores))], settings)

@@ -10,16 +10,16 @@ T = TypeVar("T")
 REFIT_FILE = "fitted.toml"
 
 
-class Keep(Protocol):
-    """Function that returns the stored result of a stage by name, or else computes and stores it."""
+class StoreStage(Protocol):
+    """Type of a function that returns the stored result of a stage, or else computes and stores it."""
 
     def __call__(self, name: str, make: Callable[[], T]) -> T: ...
 
 
-def keep_nothing(name: str, make: Callable[[], T]) -> T:
+def compute_without_storing(name: str, make: Callable[[], T]) -> T:
     """Computes the result of a stage without storing it."""
     return make()
 
 
 class OutOfTime(KeyboardInterrupt):
-    """The loop's time budget is spent before a verdict. It ends as if interrupted."""
+    """Raised if the time budget is spent before a verdict. The loop then ends as if interrupted."""

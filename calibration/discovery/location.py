@@ -20,7 +20,7 @@ SAGS = 0.3
 
 
 def varied_by_duty(runs: Runs) -> bool:
-    """True if a table varies the motors' voltage by the duty, at nearly constant supply voltage (which may sag)."""
+    """True if a table varies the motor voltage by the duty, while the supply voltage is constant except for sag."""
     if not (runs.has("duty") and runs.has(SUPPLY)):
         return False
     duty, supply = (float(np.ptp(x) / max(np.max(x), 1e-300)) for x in map(np.abs, (runs["duty"], runs[SUPPLY])))
@@ -29,17 +29,17 @@ def varied_by_duty(runs: Runs) -> bool:
 
 @dataclasses.dataclass(frozen=True)
 class DiscrepancyLocation:
-    """Location of a discrepancy.
+    """Balance or channel of a discrepancy, and the variable that it depends on.
 
     Attributes:
         place: balance with the curve that explains most, or channel with shifted readings.
         variable: variable of the curve.
-        alike: places with curves that explain as much, or that represent balances without curves of their own.
-        variables_alike: other variables with curves of similar significance there, the most significant first. Of
-            temporary changes one along each axis.
+        alike: other places whose curves explain as much, or whose balances have no curves of their own.
+        variables_alike: other variables whose curves there are of similar significance, the most significant first.
+            Temporary changes have one entry for each axis.
         explained: decrease of χ² by the curves of that balance and variable [σ²].
-        strongest: by the most significant family.
-        by_duty: True if the motors' voltage varied only with the duty.
+        strongest: decrease of χ² by the most significant family of curves [σ²].
+        by_duty: True if the voltage of the motors varied only with the duty.
     """
 
     JSON = ("balance", "channel", "balances_alike", "variable", "variables_alike")
@@ -53,22 +53,22 @@ class DiscrepancyLocation:
 
     @property
     def balance(self) -> str:
-        """The balance, or `sensor` if the error is in an instrument."""
+        """Balance of the discrepancy, or `sensor` if an instrument is in error."""
         return bases.balance_of(self.place)
 
     @property
     def channel(self) -> str:
-        """The channel with wrong readings, empty for none."""
+        """Channel with wrong readings, empty if the discrepancy is in a balance."""
         return self.place if bases.is_channel_place(self.place) else ""
 
     @property
     def balances_alike(self) -> Names:
-        """Balances with the same effect on the readings."""
+        """Balances in which the same error would change the readings in the same way."""
         return tuple(dict.fromkeys(map(bases.balance_of, self.alike)))
 
     @property
     def family(self) -> str:
-        """Its equation and the variable that it depends on, in the words of `Effect.family`."""
+        """Equation and driving variable, in the words of `Effect.family`."""
         happens = bases.window_from_name(self.variable)
         variable = self.variable if happens is None else happens.axis
         what = bases.place_in_words(self.place) if self.channel else EQUATION[self.balance]

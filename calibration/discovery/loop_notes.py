@@ -11,14 +11,14 @@ import numpy as np
 
 from calibration.data import Names
 from calibration.discovery.location import DiscrepancyLocation
-from calibration.discovery.outliers import Cluster
+from calibration.discovery.outliers import OutlierCluster
 from calibration.inference.fit_notes import Remark
 
 # --- the verdict ----------------------------------------------------------------------------------------
 
 
-class CurveOver(NamedTuple):
-    """A smooth curve of one variable, or a surface of two, in a place of the model: a balance or a channel."""
+class PlacedCurve(NamedTuple):
+    """A smooth curve of one variable, or a surface of two, in a balance or a channel of the model."""
 
     place: str
     variables: Names
@@ -45,32 +45,35 @@ AGAIN = 0.8
 
 @dataclasses.dataclass(frozen=True)
 class NameTest:
-    """Test of one effect of a candidate, at the fit of all the others.
+    """Test of one effect of a candidate, with all its other effects fitted.
 
     Attributes:
         effect: name of the effect.
-        root: root of its score in addition to curves of other equations [σ].
-        needed: critical value for the strongest effect [σ].
-        curves: those of other equations.
-        evidence: twice the log evidence of the effect over the best smooth curve of its own equation [σ²].
-        row: number of the run with the smallest root when left out, None if none was.
-        root_without: that root. A settled run is a row of its table, see `what`. For histories it is scaled
-            to the remaining runs.
-        again: share of the informative blocks without which an effect of its family is still the strongest.
-        larger: effects of a set without it that is the better explanation, but not of a plausible size.
-        remains: True if the largest set of the search leaves a discrepancy in its equation.
+        root: square root of the effect's score if curves of other equations are fitted too [σ].
+        needed: critical value of that root for the strongest effect of the library [σ].
+        curves: the curves of other equations.
+        evidence: twice the log evidence for the effect over the best smooth curve of its own equation [σ²].
+        row: number of the run whose omission reduces the root most. None if no run was left out.
+        root_without: root without that run. A settled run is a row of its table, see `what`. For histories, the root
+            is scaled to the number of remaining runs.
+        again: share of the informative blocks for which a fit without the block still finds an effect of its family
+            strongest.
+        larger: effects that explain the data better, but not at a plausible size.
+        remains: True if the largest set of the search still leaves a discrepancy in the equation of the effect.
         what: name of a run, `row` or `run`.
-        varies: root of the score of an amplitude that changes with a variable, in addition to the largest set [σ].
-        over: variable of the largest change.
-        by_chance: critical value for as many variables, independent of the library.
-        spread: relative change of the amplitude to either end of that variable [-].
-        offset: zero error of an instrument without a stated noise, over the rms of its readings [-], else infinite.
+        varies: square root of the score if the amplitude may change with a variable, in addition to the largest set
+            [σ].
+        over: variable with which the amplitude changes most.
+        by_chance: critical value of `varies` for that number of variables, whatever the library.
+        spread: relative change of the amplitude at an end of that variable [-].
+        offset: zero error of an instrument without a stated noise, divided by the rms of its readings [-]. Otherwise
+            infinite.
     """
 
     effect: str
     root: float
     needed: float
-    curves: tuple[CurveOver, ...]
+    curves: tuple[PlacedCurve, ...]
     evidence: float
     row: int | None = None
     root_without: float = math.inf
@@ -86,13 +89,14 @@ class NameTest:
 
     @property
     def stands(self) -> bool:
-        """True if it is significant, and explains as much as any curve in its place."""
+        """True if the effect is significant and explains at least as much as any curve in its place."""
         return self.root >= self.needed and self.evidence >= -BETTER
 
     @property
     def rests_on(self) -> int | None:
-        """Number of the row without which the test would fail. None if it depends on no single row, or fails
-        anyway."""
+        """Number of the run without which the test would fail. None if no single run decides, or if the test fails
+        anyway.
+        """
         if self.root < self.needed:
             return None
         least = max(self.needed, KEPT * self.root) if self.what == "row" else CHOSEN
@@ -100,7 +104,7 @@ class NameTest:
 
     @property
     def fails(self) -> Names:
-        """Reasons against the name, rows of `loop_words.DOUBTS`, empty for an established one."""
+        """Reasons against the name, as rows of `loop_words.DOUBTS`. Empty if the name is established."""
         doubts = {
             "chance": self.root < self.needed,
             "curve": self.evidence < -BETTER,
@@ -115,12 +119,12 @@ class NameTest:
 
     @property
     def shows_form(self) -> bool:
-        """True if a change of its amplitude over a variable is significant."""
+        """True if its amplitude changes significantly with a variable, so that the law has another form."""
         return self.varies > max(self.needed, self.by_chance)
 
     @property
     def established(self) -> bool:
-        """True if it fails no test."""
+        """True if there is no reason against the name."""
         return not self.fails
 
 
@@ -130,50 +134,50 @@ class NameSupport:
 
     Attributes:
         stands: True if at least one name is established.
-        why: reason for the verdict, a row of `loop_words.REASONS`, "" for none.
-        effects: effects to which this applies.
-        curves: curves that were added, or that explain as much.
-        tests: tests of each effect.
+        why: reason for the verdict on the names, a row of `loop_words.REASONS`, "" for none.
+        effects: effects to which the reason applies.
+        curves: curves that were added to the fit, or that explain as much.
+        tests: test of each effect.
     """
 
     stands: bool
     why: str = ""
     effects: Names = ()
-    curves: tuple[CurveOver, ...] = ()
+    curves: tuple[PlacedCurve, ...] = ()
     tests: tuple[NameTest, ...] = ()
 
     def test_of(self, effect: str) -> NameTest | None:
         """Test of an effect, None if it was not tested."""
         return next((t for t in self.tests if t.effect == effect), None)
 
-    def stands_in(self, effect: str) -> bool:
-        """True if an effect is a stand-in for a curve, which claims no cause.
+    def imitates_curve(self, effect: str) -> bool:
+        """True if an effect only imitates a smooth curve, so that it names no cause.
 
-        It explains nothing in addition to curves of other equations, and a curve of its own equation explains more.
+        It explains nothing beyond curves of other equations, and a curve of its own equation explains more.
         """
         test = self.test_of(effect)
         return test is not None and {"chance", "curve"} <= set(test.fails)
 
     def established(self, effect: str) -> bool:
-        """True if the name of an effect is established, by a test of its own if it had one."""
+        """True if the name of an effect is established, by its own test if there is one."""
         test = self.test_of(effect)
         return self.stands and (not self.tests if test is None else test.established)
 
     def rests_on(self, effect: str) -> int | None:
-        """Number of the row that an effect depends on, None if it depends on none, or was not tested."""
+        """Number of the run that decides about an effect. None if there is no such run, or no test."""
         test = self.test_of(effect)
         return None if test is None else test.rests_on
 
-    def renamed(self, names: Mapping[str, str]) -> NameSupport:
-        """Copy with other leaders of the effects' classes, because a test is one of the class."""
+    def with_leaders(self, names: Mapping[str, str]) -> NameSupport:
+        """Copy in which classes have other leading effects. A test applies to the whole class."""
         tests = tuple(dataclasses.replace(t, effect=names.get(t.effect, t.effect)) for t in self.tests)
         return dataclasses.replace(self, tests=tests)
 
-    def numbered(self, numbers: np.ndarray) -> NameSupport:
-        """Copy with row numbers as in messages.
+    def with_row_numbers(self, numbers: np.ndarray) -> NameSupport:
+        """Copy with row numbers as used in messages.
 
         Args:
-            numbers: numbers of the rows, in order.
+            numbers: number of each row.
         """
         named = (
             t if t.row is None or t.what == "run" else dataclasses.replace(t, row=int(numbers[t.row - 1]))
@@ -182,8 +186,8 @@ class NameSupport:
         return dataclasses.replace(self, tests=tuple(named))
 
 
-class FreedValue(NamedTuple):
-    """A base parameter at the value that explains as much as an effect, in `unit`."""
+class AlternativeValue(NamedTuple):
+    """A base parameter whose value, if changed, explains as much as an effect. `value` is in `unit`."""
 
     name: str
     value: float
@@ -191,19 +195,19 @@ class FreedValue(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
-class Missing:
-    """An effect that was found.
+class MissingEffect:
+    """An effect that the loop found, with its alternatives.
 
     Attributes:
-        names: names that these data cannot separate.
+        names: the effect and those that the data cannot separate from it.
         values: stated values that may be wrong instead.
-        families: families of the names.
-        established: True if it is.
-        test: test of its own, None without one.
+        families: families of these effects.
+        established: True if its name is established.
+        test: test of its name, None if it was not tested.
     """
 
     names: Names
-    values: tuple[FreedValue, ...]
+    values: tuple[AlternativeValue, ...]
     families: Names
     established: bool = True
     test: NameTest | None = None
@@ -217,15 +221,15 @@ FEW = 3
 
 @dataclasses.dataclass(frozen=True)
 class Mechanism:
-    """An equation with a discrepancy and its driver, from the effects or the smooth curve that explain most of it.
+    """An equation with a discrepancy and the variable that drives it, without an exact law.
 
     Attributes:
-        families: equation and driver in words, the best first, then those that explain as much.
-        effects: effects of the library in its place, () for a curve.
-        share: share of the excess misfit, χ² less its expectation, that it explains [-].
-        gain, se: hold-out gain, over the readings that it changes [nat a reading].
-        again: share of the informative blocks of runs without which it is found again [-].
-        errors: standard error of the gain by kind of block [nat a reading].
+        families: equation and driving variable in words. The best is first, then those that explain as much.
+        effects: effects of the library that show the mechanism, () if a smooth curve shows it.
+        share: share of the excess misfit (χ² minus its expectation) that it explains [-].
+        gain, se: hold-out gain and its standard error, over the readings that it changes [nat per reading].
+        again: share of the informative blocks for which a fit without the block finds it again [-].
+        errors: standard error of the gain for each kind of block [nat per reading].
     """
 
     families: Names
@@ -238,22 +242,24 @@ class Mechanism:
 
     @property
     def drivers(self) -> Names:
-        """Possible drivers."""
-        return self._possible(2)
+        """Variables that may drive it."""
+        return self._family_parts(2)
 
     @property
     def candidates(self) -> int:
-        """Number of possible drivers or equations, whichever is larger."""
-        return max(len(self._possible(0)), len(self.drivers))
+        """Number of possible driving variables or of possible equations, whichever is larger."""
+        return max(len(self._family_parts(0)), len(self.drivers))
 
-    def _possible(self, part: int) -> Names:
-        """Equations (0) or drivers (2) of the families. An error of an ammeter counts as the loss."""
+    def _family_parts(self, part: int) -> Names:
+        """Equations (part 0) or driving variables (part 2) of its families. An ammeter error counts as the loss that
+        it imitates.
+        """
         losses = [f for f in self.families if f == self.families[0] or " current that " not in f]
         return tuple(dict.fromkeys(f.partition(" that ")[part] for f in losses))
 
     @property
     def fails(self) -> Names:
-        """Reasons against the mechanism, rows of `loop_words.NO_MECHANISM`, empty for an established one."""
+        """Reasons against the mechanism, as rows of `loop_words.NO_MECHANISM`. Empty if it is established."""
         doubts = {
             "share": self.share < HALF,
             "gain": not self.gain > SURE * self.se,
@@ -263,8 +269,10 @@ class Mechanism:
         return tuple(doubt for doubt, holds in doubts.items() if holds)
 
 
-class Missed(NamedTuple):
-    """A channel with a bad refit: rms error, or what effects leave of it, and noise, over its measured rms [-]."""
+class MissedChannel(NamedTuple):
+    """A channel that the model does not describe. The rms error (of the refit, or what effects leave) and the noise
+    are divided by its measured rms [-].
+    """
 
     channel: str
     error: float
@@ -272,37 +280,37 @@ class Missed(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
-class Summary:
-    """A verdict and all data of its statement.
+class VerdictSummary:
+    """A verdict with all data from which its statement is written.
 
     Attributes:
         verdict: `none`, `named`, `class`, `mechanism`, `place` or `undescribed`.
-        p: family-wise.
-        where: location of the discrepancy, or of the remaining one.
-        missing: the effects found, established or tentative. Only tentative ones without names.
-        nearest: effects that fit best if none may be named.
+        p: family-wise p-value.
+        where: location of the discrepancy, or of the rest that the effects leave.
+        missing: effects found, established or tentative. If no name is established, all are tentative.
+        nearest: effects that fit best, if none may be named.
         support: tests of the names.
-        aside, of: number of isolated outliers if they are many (else 0), and of all rows.
-        noise: wrong sds, if they are the only finding.
-        cluster: common property of outliers.
-        mechanism: if no name is established. It may not be established either.
-        missed: as of `LoopStages`.
+        aside, of: number of isolated outliers if they are many (otherwise 0), and number of all rows.
+        noise: remark on wrong sds, if they are the only finding.
+        cluster: property that the outliers share.
+        mechanism: equation and driving variable, if no effect is established. They need not be established either.
+        missed: channels that the model does not describe, as in `LoopStages`.
         unused: columns of numbers that vary and are not used.
-        far: base parameters beyond three prior sds.
+        far: base parameters more than three prior sds from their priors.
     """
 
     verdict: str
     p: float
     where: DiscrepancyLocation | None
-    missing: tuple[Missing, ...] = ()
+    missing: tuple[MissingEffect, ...] = ()
     nearest: Names = ()
     support: NameSupport | None = None
     aside: int = 0
     of: int = 0
     noise: tuple[Remark, ...] = ()
-    cluster: Cluster | None = None
+    cluster: OutlierCluster | None = None
     mechanism: Mechanism | None = None
-    missed: tuple[Missed, ...] = ()
+    missed: tuple[MissedChannel, ...] = ()
     unused: Names = ()
     far: Names = ()
 
@@ -312,12 +320,13 @@ class Headline:
     """Claims that hold at every noise level tried.
 
     Attributes:
-        level: level of the claims, a verdict, `open` if the noise decides whether an effect is missing.
-        claims: laws, mechanisms or places, each with its indistinguishable alternatives.
-        factors: factors on the noise.
-        shared: number of the first members of each mechanism or place that hold at every noise. At some noises the
-            others cannot be separated from these.
-        families: families of each law, equation and driver in words.
+        level: verdict on which all noise levels agree. `open` if the noise level decides whether an effect is
+            missing.
+        claims: laws, mechanisms or places, each with its alternatives.
+        factors: noise levels tried, as factors on the noise.
+        shared: for each mechanism or place, the number of its first members on which all noise levels agree. At some
+            noise levels, the others cannot be separated from these.
+        families: equation and driving variable of each law, in words.
         values: stated values that may be wrong instead of it.
     """
 
@@ -326,18 +335,18 @@ class Headline:
     factors: tuple[float, ...]
     shared: tuple[int, ...] = ()
     families: tuple[Names, ...] = ()
-    values: tuple[tuple[FreedValue, ...], ...] = ()
+    values: tuple[tuple[AlternativeValue, ...], ...] = ()
 
 
 @dataclasses.dataclass(frozen=True)
 class RuledOut:
-    """Reason why an effect is not plausible.
+    """Reason why an effect is implausible.
 
     Attributes:
         name: name of the effect.
-        why: `power` (its balance would supply power), `size`, or `edge` (within an sd of the largest size).
-        size: size over the largest plausible one.
-        check: values that this depends on.
+        why: `power` (a balance would supply power), `size`, or `edge` (within an sd of the largest plausible size).
+        size: amplitude relative to the largest plausible one [-].
+        check: stated values on which the size depends.
     """
 
     name: str
@@ -347,11 +356,12 @@ class RuledOut:
 
 
 @dataclasses.dataclass(frozen=True)
-class Asked:
-    """Reason for a question to the track model.
+class TrackModelQuestion:
+    """Question to the track model: the finding that a different running gear may explain.
 
     Attributes:
-        why: a discrepancy is `missing` an effect, effects are `found`, or some explain nearly as much (`near`).
+        why: `missing`: an effect is missing. `found`: effects were found. `near`: some effects explain nearly as
+            much.
         balance, variable: balance and variable of the discrepancy.
         effects: names of the effects.
     """

@@ -10,7 +10,7 @@ import numpy as np
 from calibration.data import Names
 from calibration.data.posterior_file import ANGLE, LOG, NORMAL, Posterior, join_posteriors
 from calibration.discovery.active_set import ActiveSet, CandidateSpace
-from calibration.discovery.discrepancy import Discrepancy, Shaped
+from calibration.discovery.discrepancy import CurveCoordinates, Discrepancy
 from calibration.inference.identifiability import posterior_of_coordinates
 from calibration.inference.linearization import Linearization, amplitude_of, shape_of, shape_scales
 from calibration.inference.optimizers import informative_residuals
@@ -20,24 +20,26 @@ from mmrjax.model.params import Spec
 
 
 def posterior_of_fit(space: CandidateSpace, active: Names, z: np.ndarray, linear: Linearization) -> Posterior:
-    """Posterior of a fit of the base with the active effects, from its linearization.
+    """Posterior distribution of a fit of the base with effects, from its linearization.
 
     Args:
         active: effect in each slot, "" if empty.
-        z: its coordinates, those of the base only or of all.
-        linear: of that fit.
+        z: coordinates of the fit, of the base only or of all.
+        linear: linearization of the fit.
     """
     jacobian = np.asarray(linear.jacobian)
     size = jacobian.shape[1]
     problem = space.bare if size == space.free else space.equipped
     informed = jacobian[informative_residuals(problem.data)]
     covariance = np.linalg.inv(informed.T @ informed)
-    return _of(problem.coordinates, space, active, np.asarray(z)[:size], covariance)
+    return _posterior_of_coordinates(problem.coordinates, space, active, np.asarray(z)[:size], covariance)
 
 
 def posterior_of_curve(space: CandidateSpace, active: Names, curve: Discrepancy) -> Posterior:
-    """Posterior of a fit with a curve. The ordinates, linear in their coordinates, come last."""
-    shaped: Shaped = curve.problem.coordinates
+    """Posterior distribution of a fit with a smooth curve. The ordinates are linear in their coordinates and come
+    last.
+    """
+    shaped: CurveCoordinates = curve.problem.coordinates
     inner = len(shaped.base)
     turn = np.eye(len(shaped))
     turn[inner:, inner:] = np.asarray(shaped.root)
@@ -51,7 +53,7 @@ def posterior_of_curve(space: CandidateSpace, active: Names, curve: Discrepancy)
     return join_posteriors([*base, ordinates], covariance)
 
 
-def _of(
+def _posterior_of_coordinates(
     coordinates: Coordinates | ActiveSet,
     space: CandidateSpace,
     active: Names,
@@ -65,7 +67,9 @@ def _of(
 def _coordinate_groups(
     coordinates: Coordinates | ActiveSet, space: CandidateSpace, active: Names, z: np.ndarray
 ) -> tuple[list[Posterior], list[int]]:
-    """Posteriors of a fit's groups of coordinates, and their indices in z, without empty slots and missing shapes."""
+    """Posterior of each group of coordinates, and the indices of these coordinates in z. Empty slots and missing
+    shapes are left out.
+    """
     if not isinstance(coordinates, ActiveSet):
         return [posterior_of_coordinates(coordinates, z, np.eye(len(z)))], list(range(len(z)))
     p, slots = len(coordinates.base), coordinates.slots

@@ -1,4 +1,4 @@
-"""Mechanisms: the equation with a discrepancy and its driver, if no exact law is established.
+"""Mechanisms: equation and driving variable of a discrepancy, if no exact law is established.
 
 No law is exactly true of a machine, so with precise data every name fails a test of its form. The share that a
 mechanism explains, its predictions, and its repetition without parts of the data do not depend on the exact form.
@@ -17,14 +17,14 @@ from calibration.discovery import prediction
 from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.adequacy import Diagnosis
 from calibration.discovery.candidates import Candidate, fit_candidates
-from calibration.discovery.discrepancy import CurveBeside
+from calibration.discovery.discrepancy import BaseCurve
 from calibration.discovery.location import DiscrepancyLocation
 from calibration.discovery.loop_notes import AGAIN, HALF, Mechanism
 from calibration.discovery.prediction import Gain, HeldOutScore, Predicted
-from calibration.discovery.projection import explained_by
+from calibration.discovery.projection import explained_function
 from calibration.discovery.score_tests import family_columns
 from calibration.discovery.settings import Settings
-from calibration.discovery.standing import chosen_again
+from calibration.discovery.standing import recurrence_of_families
 from calibration.inference import bases as bases_room
 from calibration.inference import blocks as blocks_room
 from calibration.inference.bases import Bases
@@ -45,23 +45,23 @@ def find_mechanism(
     left: Diagnosis,
     ladder: Sequence[Candidate],
     bases: Bases,
-    beside: CurveBeside,
+    beside: BaseCurve,
     predicted: Predicted,
     settings: Settings,
 ) -> Mechanism | None:
     """Mechanism that explains most of the discrepancy of the base fit.
 
-    It is that of effects of one family of the library. If none of them explains as much as a smooth curve, it is that
-    of the curve, and None for histories.
+    It is the family of library effects that explains most. If no family explains as much as a smooth curve, it is the
+    equation and variable of the curve. For time histories the result is then None.
 
     Args:
-        left: diagnosis of the base.
+        left: diagnosis of the base fit.
         ladder: candidates that were fitted.
-        beside: the curve of the discrepancy.
-        predicted: known hold-out predictions of fits.
+        beside: smooth curve of the discrepancy.
+        predicted: hold-out predictions of fits that are already known.
     """
     ladder = simulate_leading_families(space, base, ladder, settings)
-    best, own = _of_one_family(space, ladder), _families_of(beside.where)
+    best, own = _best_by_family(space, ladder), _families_of_location(beside.where)
     if space.bare.observe.long:  # fits of curves take long
         by_curve = beside.where.explained - OF_CURVE
     else:
@@ -82,19 +82,19 @@ def find_mechanism(
     for leader in (*by_name[:1], *curve, *by_name[1:]):
         others = alike if leader in by_name else [*alike, *over]
         families = (leader, *(f for f in others if f != leader))
-        families = tuple(dict.fromkeys((*families, *_in_equations_alike(leader, beside.where))))
+        families = tuple(dict.fromkeys((*families, *_same_driver_elsewhere(leader, beside.where))))
         if leader in by_name:
-            alone = _few_and_best(space, ladder, best[leader])
-            compared = [*(Pair(c, base) for c in alone), pairs[leader]]
-            gains = {pair: _gain_of(space, runs, pair, predicted) for pair in compared}
+            alone = _best_and_single(space, ladder, best[leader])
+            compared = [*(FitsWithAndWithout(c, base) for c in alone), pairs[leader]]
+            gains = {pair: _hold_out_gain(space, runs, pair, predicted) for pair in compared}
             pair, gain = max(gains.items(), key=lambda one: one[1].mean / max(one[1].se, 1e-12))
             effects = tuple(n for n in pair.having.effects if space.library[n].family() == leader)
-            again = chosen_again(space, base, best[leader], left, families, bases, blocks, settings)
+            again = recurrence_of_families(space, base, best[leader], left, families, bases, blocks, settings)
             if again < AGAIN:  # several effects together may be found again only by their sum
-                again = max(again, _curve_again(space, left, bases, families, blocks, settings))
+                again = max(again, _curve_recurrence(space, left, bases, families, blocks, settings))
         else:
-            gain, effects = _gain_of_curve(space, runs, base, beside, predicted), ()
-            again = _curve_again(space, left, bases, families, blocks, settings)
+            gain, effects = _hold_out_gain_of_curve(space, runs, base, beside, predicted), ()
+            again = _curve_recurrence(space, left, bases, families, blocks, settings)
         share = share_of_excess(excess, explained.get(leader, 0.0))
         mechanisms.append(Mechanism(families, effects, share, gain.mean, gain.se, again, gain.errors))
         if not mechanisms[-1].fails:
@@ -105,10 +105,10 @@ def find_mechanism(
 def simulate_leading_families(
     space: CandidateSpace, base: Candidate, ladder: Sequence[Candidate], settings: Settings
 ) -> list[Candidate]:
-    """Candidates in which the best one of each family that may explain most is simulated, not a regression."""
+    """Candidates, with the best one of each leading family simulated where it was only fitted by regression."""
     candidates = list(ladder)
     while True:
-        best = _of_one_family(space, candidates).values()
+        best = _best_by_family(space, candidates).values()
         lowest = min((c.cost for c in best), default=0.0)
         within = max(settings.same, settings.form**2 * 2 * (base.cost - lowest))
         near = [c for c in best if not c.simulated and 2 * (c.cost - lowest) <= within]
@@ -119,20 +119,20 @@ def simulate_leading_families(
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Pair:
-    """Fits with and without the effects of a mechanism."""
+class FitsWithAndWithout:
+    """Fits with and without the effects of one family."""
 
     having: Candidate
     without: Candidate
 
     @property
     def explained(self) -> float:
-        """Decrease of χ² [σ²]."""
+        """Decrease of χ² by the effects [σ²]."""
         return 2 * (self.without.cost - self.having.cost)
 
 
-def _few_and_best(space: CandidateSpace, ladder: Sequence[Candidate], best: Candidate) -> list[Candidate]:
-    """Best candidate of a family, and if it has several effects the best single one, which may predict better."""
+def _best_and_single(space: CandidateSpace, ladder: Sequence[Candidate], best: Candidate) -> list[Candidate]:
+    """Best candidate of a family. If it has several effects, also the best single one, which may predict better."""
     family = space.library[best.effects[0]].family()
     single = [c for c in ladder if len(c.effects) == 1 and space.library[c.effects[0]].family() == family]
     sound = [c for c in single if c.plausible and np.isfinite(c.cost)]
@@ -141,39 +141,42 @@ def _few_and_best(space: CandidateSpace, ladder: Sequence[Candidate], best: Cand
 
 def _explained_by_family(
     space: CandidateSpace, base: Candidate, ladder: Sequence[Candidate], best: dict[str, Candidate]
-) -> dict[str, Pair]:
-    """For each family the fits with and without its effects that differ most: alone, or with those of others."""
+) -> dict[str, FitsWithAndWithout]:
+    """For each family, the two fits with and without its effects that differ most in χ²."""
     simulated = {c.key: c for c in (base, *ladder) if np.isfinite(c.cost) and not c.supplying}
-    pairs = {family: Pair(alone, base) for family, alone in best.items()}
+    pairs = {family: FitsWithAndWithout(alone, base) for family, alone in best.items()}
     for effects, having in simulated.items():
         for family in {space.library[name].family() for name in effects} & set(pairs):
             others = frozenset(n for n in effects if space.library[n].family() != family)
             if others in simulated:
-                pairs[family] = max(pairs[family], Pair(having, simulated[others]), key=lambda pair: pair.explained)
+                pairs[family] = max(
+                    pairs[family], FitsWithAndWithout(having, simulated[others]), key=lambda pair: pair.explained
+                )
     return pairs
 
 
 def excess_misfit(space: CandidateSpace, base: Candidate) -> float:
-    """χ² of the base, priors included, less its expectation from noise (`Observer.noise_misfit`) [σ²]."""
+    """χ² of the base fit, including priors, minus its expectation from noise (`Observer.noise_misfit`) [σ²]."""
     counts = np.asarray(space.weight > 0)
-    return 2 * base.cost - space.bare.observe.noise_misfit(lambda: _whitened(space, base), counts)
+    return 2 * base.cost - space.bare.observe.noise_misfit(lambda: _whitened_residuals(space, base), counts)
 
 
 def share_of_excess(excess: float, explained: float) -> float:
-    """Share of the excess misfit that is explained [-], at most 1: if the stated noise is too large, the excess is
-    smaller than the decrease of χ².
+    """Share of the excess misfit that is explained, at most 1 [-].
+
+    If the stated noise is too large, the excess is smaller than the decrease of χ².
 
     Args:
-        excess: see `excess_misfit`.
+        excess: excess misfit, see `excess_misfit` [σ²].
         explained: decrease of χ² [σ²].
     """
     return float(explained / max(excess, explained, 1e-300))
 
 
-def _of_one_family(space: CandidateSpace, ladder: Sequence[Candidate]) -> dict[str, Candidate]:
-    """Best candidate of each family among those with effects of one family, of plausible size if there is one.
+def _best_by_family(space: CandidateSpace, ladder: Sequence[Candidate]) -> dict[str, Candidate]:
+    """Best candidate of each family, among candidates whose effects are all of one family.
 
-    The size of a mechanism is not claimed.
+    Candidates of plausible size are preferred but not required, because a mechanism claims no size.
     """
     best: dict[str, Candidate] = {}
     for c in ladder:
@@ -185,8 +188,8 @@ def _of_one_family(space: CandidateSpace, ladder: Sequence[Candidate]) -> dict[s
     return best
 
 
-def _in_equations_alike(family: str, where: DiscrepancyLocation) -> Names:
-    """Family with the same driver in each equation that these data cannot separate from its own."""
+def _same_driver_elsewhere(family: str, where: DiscrepancyLocation) -> Names:
+    """Families with the same driving variable in the other equations that the data cannot separate."""
     places = [p for p in where.alike if not bases_room.is_channel_place(p)]  # instruments are excluded
     equations = [dataclasses.replace(where, place=p).family.partition(" that ") for p in places]
     what, joint, driver = family.partition(" that ")
@@ -194,8 +197,8 @@ def _in_equations_alike(family: str, where: DiscrepancyLocation) -> Names:
     return tuple(f"{other}{joint}{driver}" for other in alike) if what in alike else ()
 
 
-def _families_of(where: DiscrepancyLocation) -> Names:
-    """Family of a curve, and those of the places and variables with curves of similar significance."""
+def _families_of_location(where: DiscrepancyLocation) -> Names:
+    """Family of a discrepancy's location, and families of the places and variables that explain the data as well."""
     places = [dataclasses.replace(where, place=p) for p in where.alike]
     others = [dataclasses.replace(where, variable=v) for v in where.variables_alike]
     return tuple(dict.fromkeys(x.family for x in (where, *places, *others)))
@@ -204,18 +207,20 @@ def _families_of(where: DiscrepancyLocation) -> Names:
 # --- hold-out errors ------------------------------------------------------------------------------------
 
 
-def _gain_of(space: CandidateSpace, runs: Runs, pair: Pair, predicted: Predicted) -> Gain:
-    """Hold-out gain by the effects of a mechanism, over the readings that they change."""
-    scores, before = (scored_once(space, runs, c, predicted) for c in (pair.having, pair.without))
-    changed = _changed_readings(space, runs, _reading(space, pair.without), _reading(space, pair.having))
+def _hold_out_gain(space: CandidateSpace, runs: Runs, pair: FitsWithAndWithout, predicted: Predicted) -> Gain:
+    """Hold-out gain by the effects of a family, over the readings that they change."""
+    scores, before = (cached_hold_out_score(space, runs, c, predicted) for c in (pair.having, pair.without))
+    changed = _changed_readings(
+        space, runs, _simulated_reading(space, pair.without), _simulated_reading(space, pair.having)
+    )
     return _gain_over_changed(scores, before, changed)
 
 
 def _gain_over_changed(score: HeldOutScore, over: HeldOutScore, changed: np.ndarray) -> Gain:
-    """Gain of a score, over the readings that a mechanism changes.
+    """Gain of one hold-out score over another, over the changed readings only.
 
-    Each kind of block omits the same readings, so errors of kinds do not average out. The standard error is the
-    mean of theirs, weighted by readings.
+    The kinds of blocks leave out the same readings, so their errors are correlated. The standard error is therefore
+    the mean over the kinds, weighted by readings.
     """
     kinds = score.by_kind
     if not kinds:
@@ -231,36 +236,37 @@ def _gain_over_changed(score: HeldOutScore, over: HeldOutScore, changed: np.ndar
     return Gain(mean, se, {k: gain.se for k, gain in by_kind.items()})
 
 
-def _gain_of_curve(
-    space: CandidateSpace, runs: Runs, base: Candidate, beside: CurveBeside, predicted: Predicted
+def _hold_out_gain_of_curve(
+    space: CandidateSpace, runs: Runs, base: Candidate, beside: BaseCurve, predicted: Predicted
 ) -> Gain:
-    """Hold-out gain by the curve of the base's discrepancy, within the range of its variable in each fit.
+    """Hold-out gain by the smooth curve of the base's discrepancy.
 
-    A curve does not extrapolate.
+    Only rows within the range of the curve's variable in each fit count, because a curve does not extrapolate.
     """
     curve, kinds = beside.curve, blocks_room.predictable_blocks(runs, space.bare)
     predictions = {
         kind: predict_unseen(curve.problem, curve.z, list(by.values())).reading for kind, by in kinds.items()
     }
-    changed = _changed_readings(space, runs, _reading(space, base), curve.reading)
-    score = _scored(space, runs, predictions)
+    changed = _changed_readings(space, runs, _simulated_reading(space, base), curve.reading)
+    score = _hold_out_score(space, runs, predictions)
     in_seen_range = {kind: _within_seen_range(space, beside, list(by.values())) for kind, by in kinds.items()}
     inside = {kind: np.where(in_seen_range[kind][:, None], x, np.nan) for kind, x in score.by_kind.items()}
     score = dataclasses.replace(score, by_kind=inside)
-    return _gain_over_changed(score, scored_once(space, runs, base, predicted), changed)
+    return _gain_over_changed(score, cached_hold_out_score(space, runs, base, predicted), changed)
 
 
-def _within_seen_range(space: CandidateSpace, beside: CurveBeside, masks: Sequence[np.ndarray]) -> np.ndarray:
-    """True for rows with a curve's variable within the range of the rows outside their block, shape (rows,).
+def _within_seen_range(space: CandidateSpace, beside: BaseCurve, masks: Sequence[np.ndarray]) -> np.ndarray:
+    """True for rows whose value of the curve's variable lies within the range of the rows outside their block, shape
+    (rows,).
 
     Args:
-        masks: masks of the rows of each block.
+        masks: mask of the rows of each block.
     """
     where, linear, rows = beside.where, beside.left.linear, len(masks[0])
     in_range = np.ones(rows, bool)
     if where.variable not in bases_room.VARIABLES:
         return in_range
-    x = np.asarray(linear.in_travel(where.place, where.variable)[0], float)
+    x = np.asarray(linear.curve_variable(where.place, where.variable)[0], float)
     if len(x) != len(space.included):  # turns, with different sides
         return in_range
     for mask in masks:
@@ -270,37 +276,42 @@ def _within_seen_range(space: CandidateSpace, beside: CurveBeside, masks: Sequen
     return in_range
 
 
-def scored_once(space: CandidateSpace, runs: Runs, candidate: Candidate, predicted: Predicted) -> HeldOutScore:
-    """Hold-out scores of a candidate. Its predictions are taken from `predicted`, or added to it."""
+def cached_hold_out_score(
+    space: CandidateSpace, runs: Runs, candidate: Candidate, predicted: Predicted
+) -> HeldOutScore:
+    """Hold-out scores of a candidate. Its predictions come from `predicted` or are added to it."""
     prediction_before = predicted.get(prediction.candidate_key(candidate))
     if prediction_before is not None:
-        return _scored(space, runs, prediction_before)
+        return _hold_out_score(space, runs, prediction_before)
     score = prediction.score_candidate(space, runs, candidate)
     predicted[prediction.candidate_key(candidate)] = score.reading
     return score
 
 
-def _scored(space: CandidateSpace, runs: Runs, reading: Columns) -> HeldOutScore:
+def _hold_out_score(space: CandidateSpace, runs: Runs, reading: Columns) -> HeldOutScore:
     data, rows = space.equipped.data, len(runs)
     measured, sd, counts = (np.asarray(x)[:rows] for x in (data.measured, data.sd, space.weight > 0))
     return prediction.score_readings(reading, measured, sd, counts, blocks_room.predictable_blocks(runs, space.bare))
 
 
-def _reading(space: CandidateSpace, candidate: Candidate) -> np.ndarray:
+def _simulated_reading(space: CandidateSpace, candidate: Candidate) -> np.ndarray:
     problem, z, active = space.fit_of(candidate.active, candidate.z)
-    return np.asarray(problem.observe.observed(problem, z, active).reading)
+    return np.asarray(problem.observe.observation_at(problem, z, active).reading)
 
 
-def _whitened(space: CandidateSpace, candidate: Candidate) -> np.ndarray:
-    """Residuals of a candidate in sds, 0 for excluded readings, shape (rows, channels)."""
+def _whitened_residuals(space: CandidateSpace, candidate: Candidate) -> np.ndarray:
+    """Residuals of a candidate divided by their sds, 0 for excluded readings, shape (rows, channels)."""
     data = space.equipped.data
-    off = (_reading(space, candidate) - np.asarray(data.measured)) / np.asarray(data.sd)
+    off = (_simulated_reading(space, candidate) - np.asarray(data.measured)) / np.asarray(data.sd)
     return np.where(np.asarray(space.weight) > 0, np.nan_to_num(off), 0.0)
 
 
 def _changed_readings(space: CandidateSpace, runs: Runs, before: np.ndarray, after: np.ndarray) -> np.ndarray:
-    """True for readings that a mechanism changes by at least `CHANGED` of the rms of the most changed channel, in
-    sds. Others would dilute its gain, shape (rows, channels)."""
+    """True for readings that a mechanism changes noticeably, shape (rows, channels).
+
+    The change in sds is at least `CHANGED` of the rms change of the most changed channel. Other readings would dilute
+    the gain of the mechanism.
+    """
     rows = len(runs)
     sd, counts = np.asarray(space.bare.data.sd)[:rows], space.weight[:rows] > 0
     moved = np.where(counts, np.abs(after[:rows] - before[:rows]) / sd, 0.0)
@@ -312,7 +323,7 @@ def _changed_readings(space: CandidateSpace, runs: Runs, before: np.ndarray, aft
 # --- hold-out blocks ------------------------------------------------------------------------------------
 
 
-def _curve_again(
+def _curve_recurrence(
     space: CandidateSpace,
     left: Diagnosis,
     bases: Bases,
@@ -320,9 +331,9 @@ def _curve_again(
     blocks: Sequence[np.ndarray],
     settings: Settings,
 ) -> float:
-    """Share of the informative blocks without which a smooth curve of these families explains as much as any.
+    """Share of the informative blocks for which, without the block, a curve of these families still explains most.
 
-    1 without such blocks. An informative block leaves half of the information on the curve.
+    A block is informative if half of the information on the curve remains without it. 1 if there is no such block.
     """
     linear, names = left.linear, bases_room.family_names(bases)
     smooth = [k for k, (_, v) in enumerate(names) if v in bases_room.VARIABLES]
@@ -332,7 +343,7 @@ def _curve_again(
     ]
     columns = [family_columns(linear, bases, k) for k in smooth]
     jacobian, residual = np.asarray(linear.jacobian), np.asarray(linear.residual)
-    explains = explained_by(jacobian, residual)
+    explains = explained_function(jacobian, residual)
     explained_before = [
         explains(c)[1] for c, explained_by_akin in zip(columns, akin, strict=True) if explained_by_akin
     ]
@@ -342,7 +353,7 @@ def _curve_again(
         kept_readings = np.repeat(~rows, linear.readings // len(rows))
         kept_residuals = np.concatenate([kept_readings, np.ones(len(residual) - len(kept_readings), bool)])
         explained = [
-            explained_by(jacobian[kept_residuals], residual[kept_residuals])(c[kept_readings]) for c in columns
+            explained_function(jacobian[kept_residuals], residual[kept_residuals])(c[kept_readings]) for c in columns
         ]
         explained_by_akin = [f for f, a in zip(explained, akin, strict=True) if a]
         if not explained_by_akin or max(told for _, told in explained_by_akin) < 0.5 * max(explained_before):

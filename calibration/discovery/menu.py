@@ -14,7 +14,7 @@ from jaxtyping import Array
 
 from calibration.data import Names
 from calibration.data.input_errors import stated_word
-from calibration.discovery.reach import SLOPE, Reach, Used
+from calibration.discovery.reach import SLOPE, Reach, UsedConditions
 from calibration.inference.fit_notes import Remark
 from mmrjax.model import balances, channels, params
 from mmrjax.model.conditions import Conditions
@@ -34,57 +34,57 @@ BLOCKED = 1e3
 Setup = Callable[[Robot, Scalar], Robot]
 
 
-def _with(robot: Robot, values: Mapping[str, Scalar]) -> Robot:
+def _with_values(robot: Robot, values: Mapping[str, Scalar]) -> Robot:
     return params.replace(robot, {k: jnp.asarray(v, float) for k, v in values.items()})
 
 
-def without(robot: Robot, *closed: str) -> Robot:
-    """The robot without the effects that enter the balances `closed`."""
-    return _with(robot, {f"effects.{e.name}.amplitude": 0.0 for e in robot.effects if e.balance in closed})
+def without_effects_of(robot: Robot, *closed: str) -> Robot:
+    """The robot with all effects of the balances `closed` set to zero."""
+    return _with_values(robot, {f"effects.{e.name}.amplitude": 0.0 for e in robot.effects if e.balance in closed})
 
 
 def on_ground(robot: Robot, brake: Scalar = 0.0) -> Robot:
-    """The unchanged robot. All setups except `braked` ignore the brake."""
+    """The unchanged robot. Only the setup `braked` uses `brake`."""
     return robot
 
 
-def reversed_(robot: Robot, brake: Scalar = 0.0) -> Robot:
-    """The robot turned about, so that its travel is forward again.
+def facing_backward(robot: Robot, brake: Scalar = 0.0) -> Robot:
+    """The robot turned around, so that a run backwards is a run forward.
 
-    With the negative of the slope as condition, friction, slip and meters are unchanged, because they follow the
-    travel. Effects that are odd in travel change sign: an error of the slope remains but now drives, and so does
-    the zero error of an instrument with signed readings.
+    The run must have the negative slope. Friction, slip and instruments follow the direction of travel, so they do
+    not change. Effects that are odd in travel change sign, for instance a slope error, or the zero error of a signed
+    instrument.
     """
     odd = (e for e in robot.effects if e.odd_in_travel and e.channel not in robot.rig.magnitudes)
     biased = {f"effects.{e.name}.amplitude": -e.amplitude for e in odd}
-    return _with(robot, biased)
+    return _with_values(robot, biased)
 
 
 def lifted(robot: Robot, brake: Scalar = 0.0) -> Robot:
-    """The robot on stands, with its movers in the air: no normal load, no ground."""
+    """The robot on stands: tracks or wheels turn freely, without normal load or ground."""
     rolling = {f"{c}.ground.rolling_resistance": 0.0 for c in robot.configurations}
-    return _with(without(robot, "mass", "ground", "slip"), rolling)
+    return _with_values(without_effects_of(robot, "mass", "ground", "slip"), rolling)
 
 
-def bare(robot: Robot, brake: Scalar = 0.0) -> Robot:
-    """The motors with their gearboxes uncoupled. Only supply, electrical and motor balances remain."""
+def uncoupled(robot: Robot, brake: Scalar = 0.0) -> Robot:
+    """The motors without gearboxes and load. Only the supply, electrical and motor balances remain."""
     losses = {f"{c}.track.loss_{kind}": 0.0 for c in robot.configurations for kind in ("coulomb", "viscous")}
     gear = {"gearbox.friction_coulomb": 0.0, "gearbox.friction_viscous": 0.0, "gearbox.efficiency_load": 1.0}
-    return _with(without(lifted(robot), "gearbox", "track"), losses | gear)
+    return _with_values(without_effects_of(lifted(robot), "gearbox", "track"), losses | gear)
 
 
-def blocked(robot: Robot, brake: Scalar = 0.0) -> Robot:
+def locked(robot: Robot, brake: Scalar = 0.0) -> Robot:
     """The motors with locked shafts: U_e = E + I R at speed 0."""
-    return _with(lifted(robot), {"gearbox.friction_coulomb": BLOCKED})
+    return _with_values(lifted(robot), {"gearbox.friction_coulomb": BLOCKED})
 
 
 def braked(robot: Robot, brake: Scalar = 0.0) -> Robot:
-    """The bare motors, each against a brake of constant torque [N·m]."""
-    return _with(bare(robot), {"gearbox.friction_coulomb": brake})
+    """The uncoupled motors, each with a brake of constant torque [N·m]."""
+    return _with_values(uncoupled(robot), {"gearbox.friction_coulomb": brake})
 
 
 #: Setups that carry no weight.
-WEIGHTLESS = (lifted, bare, blocked, braked)
+WEIGHTLESS = (lifted, uncoupled, locked, braked)
 
 
 # --- the menu -------------------------------------------------------------------------------------
@@ -111,17 +111,17 @@ WARM, FAST = 25.0, 0.85
 
 
 @dataclasses.dataclass(frozen=True)
-class Act:
-    """A calibration act: a reading that does not depend on a run.
+class CalibrationAct:
+    """A reading that calibrates an instrument or a mass without a run of the robot.
 
     Attributes:
-        name: name of the act.
+        name: name of the calibration.
         kinds: kinds from `KINDS`.
-        reading: function of a robot and of the settings [SI], shape (readings,).
-        at: settings, one tuple a reading [SI]. Of `weigh`, the configuration's index and the payload.
-        sd: standard deviation of a single reading [SI]. None: that of the table's readings of `channel`.
+        reading: function that returns the readings of a robot at these settings [SI], shape (readings,).
+        at: settings of each reading [SI]. For `weigh`: index of the configuration, and payload.
+        sd: standard deviation of a single reading [SI]. None: as in the table for `channel`.
         repeats: number of readings that are averaged.
-        channel: channel of the instrument for a reading of zero, "" for another act.
+        channel: channel of the instrument if its zero is read, "" otherwise.
     """
 
     name: str
@@ -134,26 +134,27 @@ class Act:
 
 
 @dataclasses.dataclass(frozen=True)
-class Run:
+class ProposedRuns:
     """Settled runs under conditions that are not in the table.
 
     Attributes:
         name: name of the runs.
         kinds: kinds from `KINDS`, and the configuration where there is one.
-        doing: a row of `experiment_words.DOING`.
-        where: the configuration's name, "" for none.
-        motors: motors of the robot.
+        doing: row of `experiment_words.DOING` that describes them.
+        where: name of the configuration, "" for none.
+        motors: number of motors of the robot.
         setup: setup of the robot. voltage [V], slope [deg], payload [kg]: conditions of each run, shape (runs,).
         channels: names of the channels to read.
-        configuration: index of the robot's.
+        configuration: index of the configuration.
         sides: number of motors that are on. None: all.
-        brake: torque on each motor shaft [N·m].
-        beyond: angle above which a slope is steeper than any of the table [deg].
-        steepest: True if only the steepest slope that the robot climbs is informative.
+        brake: brake torque on each motor shaft [N·m].
+        beyond: largest slope of the table [deg].
+        steepest: True if only the steepest slope that the robot can climb is informative.
         repeats: number of readings that are averaged.
-        watch: risks of damage, with their indications.
-        imposed: quantity instead of the voltage, see `Rig`. `motor_speed`: [rad/s]. `motor_current`: [A].
-        torque: torque of a brake on the output, against forward rotation [N·m], empty without a brake.
+        watch: remarks on risks of damage.
+        imposed: quantity imposed on the motors, see `Rig`. Its levels are in `voltage`: [V], [rad/s] for
+            `motor_speed`, [A] for `motor_current`.
+        torque: torque of a brake on the output, positive against forward rotation [N·m]. Empty without a brake.
     """
 
     name: str
@@ -177,15 +178,15 @@ class Run:
     torque: tuple[float, ...] = ()
 
     def read(self, shown: Names) -> tuple[int, ...]:
-        """Positions of the channels to read among all channels."""
+        """Positions of its channels among all channels."""
         return tuple(shown.index(c) for c in self.channels)
 
 
-Experiment = Act | Run
+Experiment = CalibrationAct | ProposedRuns
 
 
 def round_significant(value: float, digits: int = 2) -> float:
-    """A number rounded to this many significant digits, as a person would set it."""
+    """The number, rounded to this many significant digits."""
     return float(f"{value:.{digits - 1}e}")
 
 
@@ -198,7 +199,7 @@ ABOUT = 0.01
 
 
 def step_of_settings(span: float, count: int) -> float:
-    """The step of `STEPS` nearest in ratio to that of `count` even steps over a span, 0 for no span."""
+    """Step from `STEPS` that is nearest to an even division of a span into `count` parts. 0 for no span."""
     if span <= 0:
         return 0.0
     step = span / count
@@ -207,20 +208,22 @@ def step_of_settings(span: float, count: int) -> float:
 
 
 def last_setting(most: float, step: float) -> float:
-    """Largest multiple of a step up to a number, within the tolerance `ABOUT`. The number itself without a step."""
+    """Largest multiple of a step that is at most `most`, with the tolerance `ABOUT`. `most` itself if the step
+    is 0.
+    """
     if step == 0:
         return most
     return float(f"{step * math.floor(most * (1 + ABOUT) / step + 1e-9):.6g}")
 
 
 def floor_significant(value: float) -> float:
-    """Largest number with two significant digits that does not exceed a positive number."""
+    """Positive number, rounded down to two significant digits."""
     step = 10.0 ** (math.floor(math.log10(value)) - 1)
     return round_significant(math.floor(value / step + 1e-9) * step)
 
 
 def spaced_settings(least: float, most: float, count: int) -> tuple[float, ...]:
-    """Evenly spaced settings of two digits, none above `most`."""
+    """Evenly spaced settings, rounded to two digits, none above `most`."""
     top = floor_significant(most)
     return tuple(sorted({min(round_significant(v), top) for v in np.linspace(least, top, count).tolist() if v > 0}))
 
@@ -229,9 +232,9 @@ def spaced_settings(least: float, most: float, count: int) -> tuple[float, ...]:
 
 
 def _mass_difference(robot: Robot, at: Array) -> Array:
-    """Mass in addition to the stated one, so that its origin does not matter."""
+    """Mass of the loaded robot minus the mass that its file states."""
     still = State(*(jnp.zeros(()),) * 4)
-    stated = without(robot, "mass")
+    stated = without_effects_of(robot, "mass")
     loads = [Conditions(configuration=k.astype(int), payload=m) for k, m in at]
     return jnp.stack(
         [balances.begin_signals(robot, c, still).mass - balances.begin_signals(stated, c, still).mass for c in loads]
@@ -240,7 +243,7 @@ def _mass_difference(robot: Robot, at: Array) -> Array:
 
 @dataclasses.dataclass(frozen=True)
 class _Instrument:
-    """Readings of a channel's instrument for known values of these signals."""
+    """Function that returns the readings of an instrument at known values of these signals."""
 
     channel: str
     signals: Names
@@ -250,8 +253,8 @@ class _Instrument:
         return jnp.stack([jnp.asarray(balances.sensor(robot, s)[self.channel]) for s in shown])
 
 
-def calibration_acts(reach: Reach) -> tuple[Act, ...]:
-    """Calibration acts, the least effort first, without those of instruments that the table's bench lacks."""
+def calibration_acts(reach: Reach) -> tuple[CalibrationAct, ...]:
+    """Calibrations that are possible with the instruments of the table, those of least effort first."""
     payload = round_significant(max(u.payloads[-1] for u in reach.used))
     loads = (0.0, payload) if payload > 0 else (0.0,)
     total = reach.current * reach.motors
@@ -259,20 +262,22 @@ def calibration_acts(reach: Reach) -> tuple[Act, ...]:
     turning = round_significant(0.25 * reach.motor_speed), round_significant(0.65 * reach.motor_speed)
     paces = round_significant(0.35 * reach.speed), round_significant(0.8 * reach.speed)
     settings = tuple((float(u.index), m) for u in reach.used for m in loads)
-    weighing = Act("weigh", ("weigh",), _mass_difference, settings, 0.02, repeats=1)
+    weighing = CalibrationAct("weigh", ("weigh",), _mass_difference, settings, 0.02, repeats=1)
     shunted = _Instrument("total_current", ("total_current",))
     strobed = _Instrument("motor_speed", ("speed_motor",))
     ammeter = [
-        Act("zero current", ("zero current",), shunted, ((0.0,),), 0.02),
-        Act("shunt", ("shunt",), shunted, _one_tuple_each(amperes), 0.02),
+        CalibrationAct("zero current", ("zero current",), shunted, ((0.0,),), 0.02),
+        CalibrationAct("shunt", ("shunt",), shunted, _one_tuple_each(amperes), 0.02),
     ]
-    strobe = Act("strobe", ("strobe",), strobed, _one_tuple_each(turning), 5 * RPM)
-    timing = Act("timing", ("timing",), _Instrument("speed", ("speed",)), _one_tuple_each(paces), 3e-3)
+    strobe = CalibrationAct("strobe", ("strobe",), strobed, _one_tuple_each(turning), 5 * RPM)
+    timing = CalibrationAct("timing", ("timing",), _Instrument("speed", ("speed",)), _one_tuple_each(paces), 3e-3)
     acts = [weighing] * reach.has_ground
     acts += ammeter * ("total_current" in reach.measured)
     meters = [c for c in channels.channels_named(reach.measured) if c.misses_zero]
     acts += [
-        Act(f"zero of {c.label}", ("zero reading",), _Instrument(c.name, STILL), ((0.0,),), None, channel=c.name)
+        CalibrationAct(
+            f"zero of {c.label}", ("zero reading",), _Instrument(c.name, STILL), ((0.0,),), None, channel=c.name
+        )
         for c in meters
     ]
     acts += [strobe] * ("motor_speed" in reach.measured)
@@ -290,7 +295,7 @@ def _one_tuple_each(values: Sequence[float]) -> tuple[tuple[float, ...], ...]:
 TURNING, STANDING = ("total_current", "motor_speed"), ("total_current",)
 
 
-def _runs_under(
+def _combined_runs(
     reach: Reach,
     name: str,
     doing: str,
@@ -301,17 +306,17 @@ def _runs_under(
     slopes: Sequence[float] = (0.0,),
     payload: float = 0.0,
     read: Names = (),
-    at: Used | None = None,
+    at: UsedConditions | None = None,
     sides: int | None = None,
     brake: float = 0.0,
     steepest: bool = False,
     torques: Sequence[float] = (0.0,),
-) -> Run:
-    """Runs under every combination of slopes, voltages and, with a brake, its torques."""
+) -> ProposedRuns:
+    """Runs at every combination of slopes, voltages and brake torques."""
     each = list(itertools.product(dict.fromkeys(slopes), dict.fromkeys(voltages), dict.fromkeys(torques)))
     slope, voltage, torque = (tuple(x) for x in zip(*each, strict=True))
     stated = (at.configuration,) if at is not None else ()
-    return Run(
+    return ProposedRuns(
         ", ".join((name, *stated)), (*(kinds or (name,)), *stated), doing, setup, voltage, slope,
         (payload,) * len(each),
         tuple(c for c in (read or reach.measured) if c in reach.measured), 0 if at is None else at.index, sides,
@@ -321,7 +326,9 @@ def _runs_under(
 
 
 def other_voltages(reach: Reach, used: tuple[float, ...]) -> tuple[float, ...]:
-    """Four voltages missing in a table: below its lowest, in its widest gaps, above if the motors allow it."""
+    """Four voltages that the table lacks: one below its range, one above it if the motors allow, and others in the
+    widest gaps.
+    """
     voltages = [round_significant(0.55 * used[0])]
     if reach.voltage > used[-1]:
         voltages.append(floor_significant(reach.voltage))
@@ -334,7 +341,7 @@ def other_voltages(reach: Reach, used: tuple[float, ...]) -> tuple[float, ...]:
 
 
 def other_torques(used: Sequence[float]) -> tuple[float, ...]:
-    """Three brake torques missing in a table, in its widest gaps from zero, and the largest that it used."""
+    """Brake torques that the table lacks, in the widest gaps above zero, and the largest one that it used."""
     levels = sorted({0.0, *used})
     torques: list[float] = []
     while len(torques) < 3 and levels[-1] > 0:
@@ -344,17 +351,17 @@ def other_torques(used: Sequence[float]) -> tuple[float, ...]:
     return tuple(sorted({*torques, floor_significant(levels[-1]) if levels[-1] > 0 else 0.0}))
 
 
-def _travel_runs(reach: Reach, used: Used) -> tuple[Run, ...]:
-    """Runs with one configuration."""
+def _travel_runs(reach: Reach, used: UsedConditions) -> tuple[ProposedRuns, ...]:
+    """Runs of the robot with one configuration."""
 
     volts = used.voltages
     ends, three = (volts[0], volts[-1]), (volts[0], volts[len(volts) // 2], volts[-1])
     inclines = sorted({abs(s) for s in used.slopes if s}) or [0.0]
     some, more, most = inclines[(len(inclines) - 1) // 2], inclines[max(len(inclines) - 2, 0)], inclines[-1]
     air, payload = spaced_settings(0.2 * reach.geared, reach.geared, 5), round_significant(used.payload)
-    runs = functools.partial(_runs_under, reach, at=used)
+    runs = functools.partial(_combined_runs, reach, at=used)
     experiments = [
-        runs("reverse", "backwards", reversed_, voltages=ends, slopes=(0.0, -some)),
+        runs("reverse", "backwards", facing_backward, voltages=ends, slopes=(0.0, -some)),
         runs("downhill", "about", voltages=ends, slopes=(-inclines[0], -some)),
         runs("lifted", "lifted", lifted, voltages=air, read=TURNING),
         runs("one motor", "one lifted", lifted, kinds=("one motor", "lifted"), voltages=air, sides=1,
@@ -372,7 +379,7 @@ def _travel_runs(reach: Reach, used: Used) -> tuple[Run, ...]:
     return tuple(r for r in experiments if not lacks.get(r.kinds[0], False))
 
 
-def _motor_runs(reach: Reach) -> tuple[Run, ...]:
+def _motor_runs(reach: Reach) -> tuple[ProposedRuns, ...]:
     """Runs of the motors without the robot."""
     volts = spaced_settings(0.2 * reach.alone, reach.alone, 5)
     stalling = spaced_settings(
@@ -380,30 +387,31 @@ def _motor_runs(reach: Reach) -> tuple[Run, ...]:
     )
     brake = round_significant(0.6 * reach.torque_constant * reach.current, 1)
     experiments = [
-        _runs_under(reach, "bare motor", "alone", bare, voltages=volts, read=TURNING),
-        _runs_under(reach, "stall", "held", blocked, voltages=stalling, read=STANDING),
-        _runs_under(reach, "stall, one motor", "one held", blocked, kinds=("stall", "one motor"), voltages=stalling,
+        _combined_runs(reach, "bare motor", "alone", uncoupled, voltages=volts, read=TURNING),
+        _combined_runs(reach, "stall", "held", locked, voltages=stalling, read=STANDING),
+        _combined_runs(reach, "stall, one motor", "one held", locked, kinds=("stall", "one motor"), voltages=stalling,
               read=STANDING, sides=1),
-        _runs_under(reach, "braked motor", "braked", braked,
+        _combined_runs(reach, "braked motor", "braked", braked,
               voltages=spaced_settings(0.4 * reach.alone, reach.alone, 3), read=TURNING, brake=brake),
     ]  # fmt: skip
     return tuple(r for r in experiments if reach.motors > 1 or r.sides is None)
 
 
 def experiment_menu(reach: Reach) -> tuple[Experiment, ...]:
-    """Experiments within reach, in the order of their effort, the least first.
+    """All experiments within reach of the table, those of least effort first.
 
-    Limits of the robot (steep slopes, low voltages) show only in its predicted readings: see `possible_runs`.
+    Some slopes or voltages may still be impossible for the robot. Only its predicted readings show this, see
+    `possible_runs`.
     """
     if reach.imposed != "voltage" or not reach.has_ground:
-        runs: tuple[Run, ...] = tuple(r for used in reach.used for r in _shaft_runs(reach, used))
+        runs: tuple[ProposedRuns, ...] = tuple(r for used in reach.used for r in _shaft_runs(reach, used))
     else:
         runs = (*_motor_runs(reach), *(r for used in reach.used for r in _travel_runs(reach, used)))
     return (*calibration_acts(reach), *(r for r in runs if r.channels))
 
 
-def _shaft_runs(reach: Reach, used: Used) -> tuple[Run, ...]:
-    """Runs of a load on a shaft, or with imposed speed or current: at other levels, and in the other direction."""
+def _shaft_runs(reach: Reach, used: UsedConditions) -> tuple[ProposedRuns, ...]:
+    """Runs of a load on a shaft, or at imposed speed or current: at other levels and in the other direction."""
     others_of = {"voltage": "other voltages", "motor_speed": "other speeds", "motor_current": "other currents"}
     levels = used.voltages if reach.imposed == "voltage" else reach.levels
     high = round_significant(max(map(abs, levels), default=0.0)) or 1.0
@@ -417,14 +425,14 @@ def _shaft_runs(reach: Reach, used: Used) -> tuple[Run, ...]:
     torques = other_torques(reach.torques)
     way = -1.0 if levels[-1] > 0 else 1.0  # also of a brake, which acts against the rotation
     experiments = [
-        _runs_under(reach, others_of[reach.imposed], "run", kinds=("other voltages",), at=used,
+        _combined_runs(reach, others_of[reach.imposed], "run", kinds=("other voltages",), at=used,
               voltages=others),
         *([] if both else [
-            _runs_under(reach, "reverse", "other way", at=used, voltages=[way * x for x in (sizes[0], sizes[-1])],
+            _combined_runs(reach, "reverse", "other way", at=used, voltages=[way * x for x in (sizes[0], sizes[-1])],
                   torques=[0.0, *(way * x for x in torques[1:2])])
         ]),
         *([
-            _runs_under(reach, "other torques", "run", at=used, voltages=[-way * x for x in (sizes[0], sizes[-1])],
+            _combined_runs(reach, "other torques", "run", at=used, voltages=[-way * x for x in (sizes[0], sizes[-1])],
                   torques=[-way * x for x in torques])
         ] if max(reach.torques, default=0.0) > 0 else []),
     ]  # fmt: skip
@@ -432,10 +440,10 @@ def _shaft_runs(reach: Reach, used: Used) -> tuple[Run, ...]:
 
 
 def check_forbidden(forbidden: Sequence[str], robot: Robot) -> None:
-    """Reject names that are neither kinds of experiments nor configurations.
+    """Rejects names that are neither kinds of experiments nor configurations.
 
     Raises:
-        BadConfiguration: such a name, with the choices.
+        BadConfiguration: a name is unknown. The message lists the allowed ones.
     """
     allowed = (*KINDS, *robot.configurations)
     for name in forbidden:
@@ -445,8 +453,8 @@ def check_forbidden(forbidden: Sequence[str], robot: Robot) -> None:
 # --- possible experiments -----------------------------------------------------------------------------
 
 
-def possible_runs(run: Run, does: np.ndarray) -> np.ndarray:
-    """True for runs to carry out: only slopes, voltages and payloads in all combinations that the robot can do.
+def possible_runs(run: ProposedRuns, does: np.ndarray) -> np.ndarray:
+    """True for runs to carry out: slopes, voltages and payloads that the robot can do in all combinations.
 
     Args:
         does: True for runs that the robot can do, shape (runs,).
@@ -462,13 +470,15 @@ def possible_runs(run: Run, does: np.ndarray) -> np.ndarray:
     return possible
 
 
-def restrict_run(run: Run, kept: np.ndarray, temperature: np.ndarray, speed: np.ndarray, reach: Reach) -> Run:
-    """A run with only its possible conditions, and with the risks to watch.
+def restrict_run(
+    run: ProposedRuns, kept: np.ndarray, temperature: np.ndarray, speed: np.ndarray, reach: Reach
+) -> ProposedRuns:
+    """Runs without impossible conditions, with remarks on risks of damage.
 
     Args:
-        kept: runs kept by `possible_runs`.
-        temperature: temperature of a winding after long running [°C].
-        speed: speed of the motor shaft [rad/s]. Both predicted, shape (runs,).
+        kept: mask from `possible_runs`.
+        temperature: predicted winding temperature after a long time [°C], shape (runs,).
+        speed: predicted speed of the motor shaft [rad/s], shape (runs,).
     """
     voltage, slope, payload, torque = (
         tuple(v for v, k in zip(x, kept, strict=True) if k) if x else ()
@@ -477,14 +487,14 @@ def restrict_run(run: Run, kept: np.ndarray, temperature: np.ndarray, speed: np.
     watch: list[Remark] = []
     hottest, fastest, highest = float(temperature[kept].max()), float(np.abs(speed[kept]).max()), max(voltage)
     allowed = reach.hot if reach.hot < UNLIMITED else None
-    if run.setup is blocked:
+    if run.setup is locked:
         watch.append(Remark("held_motor", temperature=hottest, allowed=allowed, current=highest / reach.resistance))
     elif run.setup is braked:
         watch.append(Remark("braked_motor", temperature=hottest, allowed=allowed))
     elif hottest > reach.hot - WARM:
         watch.append(Remark("hot_motor", temperature=hottest, allowed=allowed))
-    limit = reach.limit_alone if run.setup in (bare, braked) else reach.limit_geared
-    if run.setup in (bare, lifted) and fastest > FAST * limit:
+    limit = reach.limit_alone if run.setup in (uncoupled, braked) else reach.limit_geared
+    if run.setup in (uncoupled, lifted) and fastest > FAST * limit:
         watch.append(Remark("overspeed", speed=fastest, limit=limit, voltage=highest))
     if run.imposed == "voltage" and highest > reach.voltages[-1]:
         watch.append(Remark("overvoltage", voltage=highest, used=reach.voltages[-1]))

@@ -19,11 +19,11 @@ from calibration.data.runs import Runs
 from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.candidates import FEW, BaseFit, Candidate, empty_slots, fit_base
 from calibration.discovery.experiments import predict_menu
-from calibration.discovery.score_tests import Diagnosed, ScoreTable, bootstrap, diagnose_fit
+from calibration.discovery.score_tests import Diagnosed, ScoreTable, bootstrap_statistics, diagnose_fit
 from calibration.discovery.settings import Settings
 from calibration.inference import bases as bases_room
 from calibration.inference.bases import Bases
-from calibration.inference.held_out import search_each
+from calibration.inference.held_out import fit_from_each_start
 from mmrjax.compile.precision import Threads
 
 # --- clusters of outliers in time, angle, order or condition --------------------------------------
@@ -40,15 +40,15 @@ LEVELS = ("configuration", "supply_voltage_V", "slope_deg", "payload_kg", "run_i
 
 
 @dataclasses.dataclass(frozen=True)
-class Cluster:
-    """Outliers that are close together.
+class OutlierCluster:
+    """Outliers that share a condition, or lie close together along an axis.
 
     Attributes:
-        axis: column, or angle, of the cluster.
-        low, high: ends of the cluster.
-        level: level of a column of words or levels.
-        inside, of: number of outliers in it, and of all.
-        p: p-value.
+        axis: column, or angle, along which they lie close together.
+        low, high: ends of the cluster on the axis.
+        level: the shared level, for a column of words or levels.
+        inside, of: number of outliers in the cluster, and number of all outliers.
+        p: p-value of the cluster.
     """
 
     axis: str
@@ -67,13 +67,13 @@ def find_cluster(
     levels: Columns,
     error: float,
     seed: int,
-) -> Cluster | None:
-    """Most significant cluster of outliers, None if it is consistent with chance.
+) -> OutlierCluster | None:
+    """Most significant cluster of outliers. None if their positions are consistent with chance.
 
     Args:
-        outliers, included: True for outliers, and for other included rows, shape (rows,).
-        axes: positions of rows along continuous variables.
-        levels: columns of conditions.
+        outliers, included: True for outliers, and for the other included rows, shape (rows,).
+        axes: positions of the rows along continuous variables.
+        levels: columns of conditions with few levels.
         error: family-wise error.
         seed: random seed of the permutations.
     """
@@ -82,7 +82,7 @@ def find_cluster(
     if len(outlier_rows) < FEWEST:
         return None
     clusters = [_cluster_along_axis(name, np.asarray(x, float), outlier_rows, pool, seed) for name, x in axes.items()]
-    clusters += [c for name, x in levels.items() for c in _at_levels(name, np.asarray(x), outlier_rows, pool)]
+    clusters += [c for name, x in levels.items() for c in _clusters_by_level(name, np.asarray(x), outlier_rows, pool)]
     if not clusters:
         return None
     best = min(clusters, key=lambda c: c.p)
@@ -90,12 +90,12 @@ def find_cluster(
     return dataclasses.replace(best, p=p) if p < error else None
 
 
-def _cluster_along_axis(name: str, x: np.ndarray, mine: np.ndarray, pool: np.ndarray, seed: int) -> Cluster:
-    """The fullest window of an axis, compared with random draws of as many rows."""
+def _cluster_along_axis(name: str, x: np.ndarray, mine: np.ndarray, pool: np.ndarray, seed: int) -> OutlierCluster:
+    """Window of an axis with most outliers, compared with random draws of as many rows."""
     low, high = x[pool].min(), x[pool].max()
     random = np.random.default_rng(seed)
     permutations = np.stack([random.choice(pool, len(mine), replace=False) for _ in range(PERMUTATIONS)])
-    clusters: list[Cluster] = []
+    clusters: list[OutlierCluster] = []
     for share in WINDOWS:
         width = share * (high - low)
         count, first = _fullest_window(x[mine][None], width)
@@ -104,20 +104,22 @@ def _cluster_along_axis(name: str, x: np.ndarray, mine: np.ndarray, pool: np.nda
         if p == 1 / (1 + PERMUTATIONS):  # beyond the resolution of permutations: a normal approximation
             p = min(p, float(ndtr((null.mean() - count[0]) / max(null.std(), 0.3))))
         inside = x[mine][(x[mine] >= first[0]) & (x[mine] <= first[0] + width)]
-        clusters.append(Cluster(name, float(inside.min()), float(inside.max()), "", int(count[0]), len(mine), p))
+        clusters.append(
+            OutlierCluster(name, float(inside.min()), float(inside.max()), "", int(count[0]), len(mine), p)
+        )
     best = min(clusters, key=lambda c: c.p)
     return dataclasses.replace(best, p=min(1.0, best.p * len(WINDOWS)))
 
 
 def _fullest_window(x: np.ndarray, width: float) -> tuple[np.ndarray, np.ndarray]:
-    """Largest number of places within a window of a width, for each set, and the start of that window."""
+    """Largest number of points in a window of given width, for each set of points, and the start of that window."""
     x = np.sort(x, 1)
     inside = np.stack([np.searchsorted(row, row + width, side="right") - np.arange(len(row)) for row in x])
     return inside.max(1), x[np.arange(len(x)), inside.argmax(1)]
 
 
-def _at_levels(name: str, x: np.ndarray, mine: np.ndarray, pool: np.ndarray) -> list[Cluster]:
-    """Each level of a column, with the hypergeometric p-value of its number of outliers."""
+def _clusters_by_level(name: str, x: np.ndarray, mine: np.ndarray, pool: np.ndarray) -> list[OutlierCluster]:
+    """A cluster for each level of a column, with the hypergeometric p-value of its number of outliers."""
     values = np.unique(x[pool])
     if not 1 < len(values) <= 0.5 * len(pool):
         return []
@@ -127,7 +129,7 @@ def _at_levels(name: str, x: np.ndarray, mine: np.ndarray, pool: np.ndarray) -> 
     for value in values:
         inside, size = int(np.sum(x[mine] == value)), int(np.sum(x[pool] == value))
         p = float(hypergeom.sf(inside - 1, len(pool), size, len(mine)))
-        answers.append(Cluster(name, np.nan, np.nan, str(value), inside, len(mine), min(1.0, p * len(values))))
+        answers.append(OutlierCluster(name, np.nan, np.nan, str(value), inside, len(mine), min(1.0, p * len(values))))
     return answers
 
 
@@ -136,32 +138,32 @@ def _at_levels(name: str, x: np.ndarray, mine: np.ndarray, pool: np.ndarray) -> 
 
 @dataclasses.dataclass(frozen=True)
 class Screening:
-    """The base fit after isolated outliers were excluded.
+    """Base fit without isolated outliers.
 
     Attributes:
-        base: the fit.
-        outliers: indices of the excluded rows, in the order of their exclusion.
-        bases: bases of the curves for a discrepancy, at that fit.
-        diagnosed: the fit linearised, and scores of effects and curves on its residuals.
-        cluster: common property of outliers, which were then not excluded, None for none.
+        base: the base fit.
+        outliers: indices of the excluded rows, in order of exclusion.
+        bases: bases of the smooth curves at that fit.
+        diagnosed: linearization of the fit, and scores of effects and curves on its residuals.
+        cluster: property that the outliers share. They were then not excluded. None if there is none.
     """
 
     base: BaseFit
     outliers: tuple[int, ...]
     bases: Bases
     diagnosed: Diagnosed
-    cluster: Cluster | None = None
+    cluster: OutlierCluster | None = None
 
 
 @contextlib.contextmanager
 def compile_ahead(
     space: CandidateSpace, bases_at: Callable[[BaseFit], Bases], settings: Settings
 ) -> Iterator[Callable[[BaseFit], None]]:
-    """Context that compiles programs on other cores, in parallel with the base fit.
+    """Context manager that compiles later programs on other cores during the base fit.
 
-    It runs a first diagnosis at the prior's mean, a replicate of a bootstrap there and a fit with slots for effects.
-    The function that it gives takes the base fit. It compiles the prediction of experiments too, or for long runs the
-    fits with slots for effects. All results are discarded.
+    It compiles a diagnosis, one bootstrap replicate and a fit with slots, all at the prior mean. It yields a function
+    of the base fit that compiles the predictions of experiments or, for long runs, the fits with slots. All results
+    are discarded.
     """
     nothing, none = np.zeros(len(space.coordinates)), empty_slots(settings)
     mean = Candidate(none, nothing, nothing, np.inf, nothing, nothing, False, False, False)
@@ -169,45 +171,45 @@ def compile_ahead(
 
     looked = threading.Event()
 
-    def look() -> None:
+    def compile_diagnosis() -> None:
         try:
             bases, (linear, _, _) = _diagnose_base(start, bases_at, settings)
         finally:
             looked.set()
-        bootstrap(space.bare, nothing[: space.free], linear, space.library.scored, bases, 1, settings.seed)
+        bootstrap_statistics(space.bare, nothing[: space.free], linear, space.library.scored, bases, 1, settings.seed)
 
-    def fit() -> None:
+    def compile_fit() -> None:
         if space.bare.observe.long:  # its programs depend on the effects found, which are not known yet
             return
         looked.wait()  # needed last: compilation shares two cores with the base fit
-        search_each(space.equipped, [nothing], [space.weight], [space.library.indices(none)])
+        fit_from_each_start(space.equipped, [nothing], [space.weight], [space.library.indices(none)])
 
-    def make_room(base: BaseFit) -> None:
+    def compile_fit_with_slots(base: BaseFit) -> None:
         problem, z = base.space.problem(none), jnp.asarray(nothing)
         problem.observe.linearise(problem, z, problem.data, base.space.library.scored)
 
-    def foresee(base: BaseFit) -> None:
+    def compile_predictions(base: BaseFit) -> None:
         if space.bare.observe.long:
             if not space.room:
-                jobs.append(others.submit(make_room, base))
+                jobs.append(others.submit(compile_fit_with_slots, base))
         elif space.bare.observe.menu:
             jobs.append(others.submit(predict_menu, base.space, {"": base.candidate}, settings))
 
     with Threads(2) as others:
-        jobs: list[concurrent.futures.Future[Any]] = [others.submit(look), others.submit(fit)]
-        yield foresee
+        jobs: list[concurrent.futures.Future[Any]] = [others.submit(compile_diagnosis), others.submit(compile_fit)]
+        yield compile_predictions
     for job in jobs:
         job.result()
 
 
 def screen_outliers(base: BaseFit, bases_at: Callable[[BaseFit], Bases], runs: Runs, settings: Settings) -> Screening:
-    """Exclude rows with a single wrong reading, whose shift is more significant than any effect or curve.
+    """Excludes rows with a single wrong reading: its shift is more significant than any effect or curve.
 
-    Outliers that form a cluster are not excluded. `cluster` describes it.
+    Outliers that form a cluster are not excluded. `cluster` of the result describes it.
 
     Args:
-        bases_at: bases of curves at a fit of the base.
-        runs: the table.
+        bases_at: function that returns the bases of curves at a fit of the base.
+        runs: the runs.
     """
     where = runs.source
     screened = _exclude_outliers(base, bases_at, settings, where)
@@ -223,16 +225,16 @@ def screen_outliers(base: BaseFit, bases_at: Callable[[BaseFit], Bases], runs: R
 def screen_known_rows(
     base: BaseFit, bases_at: Callable[[BaseFit], Bases], known: Screening, settings: Settings
 ) -> Screening:
-    """Diagnosis of a base fit to the included rows of another trace of the same table. No further row is excluded.
+    """Diagnosis of a base fit with the outliers of an earlier trace of the same table. No further row is excluded.
 
     Args:
-        base: fitted without the rows that `known` excludes.
+        base: fit without the rows that `known` excludes.
     """
     return Screening(base, known.outliers, *_diagnose_base(base, bases_at, settings), known.cluster)
 
 
-def _common_property(found: Screening, outliers: np.ndarray, runs: Runs, settings: Settings) -> Cluster | None:
-    """Common property of outliers."""
+def _common_property(found: Screening, outliers: np.ndarray, runs: Runs, settings: Settings) -> OutlierCluster | None:
+    """Property that the outliers share."""
     rows = len(runs)
     axes = {a: runs[c] for a, c in (("time", "time_s"), ("order", "order")) if runs.has(c)}
     turned = found.diagnosed[0].turned()
@@ -246,12 +248,12 @@ def _common_property(found: Screening, outliers: np.ndarray, runs: Runs, setting
 def screen_with_effects(
     found: Screening, left: ScoreTable, bases_at: Callable[[BaseFit], Bases], runs: Runs, settings: Settings
 ) -> Screening | None:
-    """Exclude rows that are outliers of a fit with effects, whose absence hid them before.
+    """Excludes rows that are outliers only after effects are added.
 
-    None if there are no further ones, or if they form a cluster.
+    None if there are no such rows, or if they form a cluster.
 
     Args:
-        left: scores of that fit's residuals.
+        left: scores of the residuals of the fit with effects.
     """
     counting = found.base.space.included.sum() + len(found.outliers)
     allowed = settings.outliers(int(counting)) - len(found.outliers)
@@ -266,7 +268,7 @@ def screen_with_effects(
 
 
 def _isolated_rows(base: BaseFit, scores: ScoreTable, bases: Bases, allowed: int, settings: Settings) -> np.ndarray:
-    """Indices of at most `allowed` rows with a reading's shift more significant than any effect or curve."""
+    """Indices of at most `allowed` rows with one reading whose shift is more significant than any effect or curve."""
     included = base.space.included
     level = -ndtri(settings.outlier_error / 2 / (base.space.weight.shape[1] * included.sum()))
     alone = (np.abs(np.asarray(scores.row)) * included[:, None]).max(1)
@@ -282,7 +284,7 @@ def _exclude_outliers(
 ) -> Screening:
     """Base fit without rows whose own shift is more significant than any effect or curve."""
     allowed = settings.outliers(int(base.space.included.sum()))
-    base, outliers = _set_gross_aside(base, settings, where)
+    base, outliers = _exclude_gross_errors(base, settings, where)
     bases, diagnosis = _diagnose_base(base, bases_at, settings)
     while len(outliers) < allowed:
         far = _isolated_rows(base, diagnosis[1], bases, allowed - len(outliers), settings)
@@ -309,26 +311,28 @@ def _refit_without(base: BaseFit, rows: np.ndarray, settings: Settings, where: s
     return dataclasses.replace(again, unusable=tuple(sorted({*base.unusable, *again.unusable})))
 
 
-def _set_gross_aside(base: BaseFit, settings: Settings, where: str) -> tuple[BaseFit, tuple[int, ...]]:
-    """Exclude rows that are so far from the fit that they distort it and every score.
+def _exclude_gross_errors(base: BaseFit, settings: Settings, where: str) -> tuple[BaseFit, tuple[int, ...]]:
+    """Excludes rows so far from the fit that they distort it and every score.
 
-    They are found at a robust fit: Cauchy's weights, iterated with a few steps each (Holland and Welsch 1977).
+    They are detected at a robust fit with Cauchy's weights, reweighted every few steps (Holland and Welsch 1977).
     """
     space = base.space
     data, included = space.bare.data, space.included
     sd, measured, weight = (np.asarray(x) for x in (data.sd, data.measured, data.weight))
 
-    def off(reading: np.ndarray) -> np.ndarray:
+    def largest_residual(reading: np.ndarray) -> np.ndarray:
         return np.max(np.abs((reading - measured) / sd) * (weight > 0), 1)
 
     problem, start, active = space.fit_of(base.candidate.active, base.candidate.z)
-    far = off(base.reading)
+    far = largest_residual(base.reading)
     if far[included].max() < settings.gross:
         return base, ()
     for _ in range(settings.reweightings):
         robust = space.weight / np.sqrt(1 + (far / settings.cauchy) ** 2)[:, None]
-        optima, observations = search_each(problem, [start], [robust], None if active is None else [active], FEW)
-        far, start = off(np.asarray(observations.reading[0])), np.asarray(optima.z[0])
+        optima, observations = fit_from_each_start(
+            problem, [start], [robust], None if active is None else [active], FEW
+        )
+        far, start = largest_residual(np.asarray(observations.reading[0])), np.asarray(optima.z[0])
     gross = included & (far > settings.gross * max(1.0, float(np.median(far[included]))))
     if not gross.any() or gross.sum() > settings.outliers(int(included.sum())):
         return base, ()

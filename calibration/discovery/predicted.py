@@ -1,4 +1,4 @@
-"""Predictions of a menu's experiments for any robot, in one batch."""
+"""Predicted readings of all experiments of a menu for one robot, in one batch."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float
 
 from calibration.data import Names
 from calibration.discovery import menu
-from calibration.discovery.menu import Act, Experiment, Run, Setup
+from calibration.discovery.menu import CalibrationAct, Experiment, ProposedRuns, Setup
 from mmrjax.fidelities.steady import IMPLICIT
 from mmrjax.model import channels
 from mmrjax.model.conditions import Conditions
@@ -27,18 +27,18 @@ T = TypeVar("T")
 UNLOADED = 1e-9
 
 
-class Batch(eqx.Module):
+class ExperimentBatch(eqx.Module):
     """Experiments as one batch. The compiled program depends on their kinds and sizes, not on their conditions.
 
     Attributes:
-        acts: reading function of each.
-        at: settings of each, see `Act`.
+        acts: reading function of each calibration.
+        at: settings of each calibration, see `CalibrationAct`.
         conditions: conditions of the runs of all experiments, in order, shape (runs,).
         brake: torque of the brake in each run [N·m].
-        set_up: distinct pairs of the robot's setup and the number of motors that are on.
-        which: pair of each run.
-        read: positions of the channels to read in each experiment, and its number of runs.
-        order: position of each experiment among the acts followed by the runs.
+        set_up: distinct pairs of a setup and a number of motors that are on.
+        which: index of each run's pair in `set_up`.
+        read: positions of the channels to read in each run experiment, and its number of runs.
+        order: position of each experiment in a list of calibrations followed by runs.
     """
 
     acts: tuple[Callable[[Robot, Array], Array], ...] = eqx.field(static=True)
@@ -51,16 +51,16 @@ class Batch(eqx.Module):
     order: tuple[int, ...] = eqx.field(static=True)
 
 
-class Predicted(eqx.Module):
-    """Predicted readings of a batch.
+class MenuPrediction(eqx.Module):
+    """Predicted readings of a batch of experiments.
 
     Attributes:
         value: value of each reading [SI].
-        exists: True if the robot has it: not if it slides, or stands still instead of travelling, shape (readings,).
+        exists: True if the robot gives that reading, False if it slides or stalls in the run, shape (readings,).
         does: True for each run that the robot can do.
-        grip: used share of the adhesion [-].
-        temperature: temperature of a winding after long running [°C].
-        speed: speed of the motor shaft [rad/s], shape (runs,).
+        grip: used share of the adhesion in each run [-].
+        temperature: winding temperature after a long time in each run [°C].
+        speed: speed of the motor shaft in each run [rad/s], shape (runs,).
     """
 
     value: Float[Array, " readings"]
@@ -71,14 +71,14 @@ class Predicted(eqx.Module):
     speed: Float[Array, " runs"]
 
 
-def batch_experiments(experiments: Sequence[Experiment], shown: Names) -> Batch:
-    """These experiments as one batch, for a robot with these channels."""
-    acts = [e for e in experiments if isinstance(e, Act)]
-    runs = [e for e in experiments if isinstance(e, Run)]
+def batch_experiments(experiments: Sequence[Experiment], shown: Names) -> ExperimentBatch:
+    """Collects experiments in one batch, for a robot with these channels."""
+    acts = [e for e in experiments if isinstance(e, CalibrationAct)]
+    runs = [e for e in experiments if isinstance(e, ProposedRuns)]
     set_up = list(dict.fromkeys((r.setup, r.sides) for r in runs))
     several = [(r, len(r.voltage)) for r in runs]
-    each = [jax.tree.map(lambda x: np.atleast_1d(np.asarray(x)), _conditions(r)) for r in runs]
-    return Batch(
+    each = [jax.tree.map(lambda x: np.atleast_1d(np.asarray(x)), _conditions_of_runs(r)) for r in runs]
+    return ExperimentBatch(
         acts=tuple(a.reading for a in acts),
         at=tuple(jnp.asarray(a.at, float) for a in acts),
         conditions=jax.tree.map(lambda *x: jnp.asarray(np.concatenate(x)), *each),
@@ -86,11 +86,13 @@ def batch_experiments(experiments: Sequence[Experiment], shown: Names) -> Batch:
         set_up=tuple(set_up),
         which=tuple(k for r, n in several for k in [set_up.index((r.setup, r.sides))] * n),
         read=tuple((r.read(shown), n) for r, n in several),
-        order=tuple(acts.index(e) if isinstance(e, Act) else len(acts) + runs.index(e) for e in experiments),
+        order=tuple(
+            acts.index(e) if isinstance(e, CalibrationAct) else len(acts) + runs.index(e) for e in experiments
+        ),
     )
 
 
-def _conditions(run: Run) -> Conditions:
+def _conditions_of_runs(run: ProposedRuns) -> Conditions:
     # None would mean the robot's own mass, which cannot be in a batch with other masses.
     mass = UNLOADED if run.setup in menu.WEIGHTLESS else math.nan
     torque = run.torque or None
@@ -102,9 +104,10 @@ def _conditions(run: Run) -> Conditions:
     return Conditions(run.configuration, run.voltage, run.slope, run.payload, total_mass=mass, load_torque=torque)
 
 
-def map_over_runs(function: Callable[..., T], robot: Robot, experiments: Batch, *own: Array) -> T:
-    """`function` of the robot as set up for each run, its conditions, and further values of each run. The leading
-    axis is the runs."""
+def map_over_runs(function: Callable[..., T], robot: Robot, experiments: ExperimentBatch, *own: Array) -> T:
+    """Applies `function` to the robot as set up for each run, to its conditions and to further values of each run.
+    The first axis of the result is the run.
+    """
     conditions = experiments.conditions
     mass = jax.vmap(lambda k: robot.chassis(k).mass)(conditions.configuration) + conditions.payload
     stated = jnp.asarray(conditions.total_mass)
@@ -116,37 +119,44 @@ def map_over_runs(function: Callable[..., T], robot: Robot, experiments: Batch, 
     ]
     which = np.asarray(experiments.which)
 
-    def same(*x: Any) -> bool:  # in all setups
+    def all_identical(*x: Any) -> bool:  # in all setups
         return all(v is x[0] for v in x)
 
-    robots = jax.tree.map(lambda *x: x[0] if same(*x) else jnp.stack([jnp.asarray(v) for v in x])[which], *each)
-    axes = jax.tree.map(lambda *x: None if same(*x) else 0, *each)
+    robots = jax.tree.map(
+        lambda *x: x[0] if all_identical(*x) else jnp.stack([jnp.asarray(v) for v in x])[which], *each
+    )
+    axes = jax.tree.map(lambda *x: None if all_identical(*x) else 0, *each)
     return jax.vmap(function, in_axes=(axes, 0, *[0] * len(own)))(robots, conditions, *own)
 
 
 def predict_readings(
-    robot: Robot, experiments: Batch, unknowns: Float[Array, "runs unknowns"], found: Bool[Array, " runs"]
-) -> tuple[tuple[tuple[Array, ...], Array, Array], Predicted]:
-    """Readings of each act, readings of each run at some unknowns, shape (runs, channels), residuals of its equations
-    there, (runs, unknowns), and all predictions."""
+    robot: Robot, experiments: ExperimentBatch, unknowns: Float[Array, "runs unknowns"], found: Bool[Array, " runs"]
+) -> tuple[tuple[tuple[Array, ...], Array, Array], MenuPrediction]:
+    """Predicted readings of a batch.
+
+    Returns the readings of each calibration, the readings of each run at the given unknowns, shape (runs, channels),
+    the residuals of the equations there, shape (runs, unknowns), and all predictions.
+    """
     acts = tuple(act(robot, at) for act, at in zip(experiments.acts, experiments.at, strict=True))
     result, _, left = map_over_runs(IMPLICIT.shown, robot, experiments, unknowns, found)
     all_readings = jnp.stack([result.reading[c] for c in channels.channel_names(robot.channels)], -1)
-    is_held = np.array([experiments.set_up[k][0] is menu.blocked for k in experiments.which])
+    is_held = np.array([experiments.set_up[k][0] is menu.locked for k in experiments.which])
     does = jnp.where(jnp.asarray(is_held), result.status == STALLED, is_done(result.status))
     exists = arrange_readings(
         experiments, [jnp.ones(a.shape, bool) for a in acts], jnp.broadcast_to(does[:, None], all_readings.shape)
     )
     speed = jnp.where(jnp.asarray(is_held), 0.0, result.reading["motor_speed"])
-    predicted_readings = Predicted(
+    predicted_readings = MenuPrediction(
         arrange_readings(experiments, acts, all_readings), exists, does, jnp.asarray(result.adhesion_used),
         jnp.asarray(result.winding_settled), speed,
     )  # fmt: skip
     return (acts, all_readings, left), predicted_readings
 
 
-def arrange_readings(experiments: Batch, acts: Sequence[Array], every: Float[Array, "runs channels ..."]) -> Array:
-    """Values of each act, and of each run by channel, in the order of the readings."""
+def arrange_readings(
+    experiments: ExperimentBatch, acts: Sequence[Array], every: Float[Array, "runs channels ..."]
+) -> Array:
+    """Readings of calibrations and runs, in the order of the experiments."""
     parts, first = list(acts), 0
     for read, runs in experiments.read:
         of_run = every[first : (first := first + runs)][:, list(read)]
@@ -158,29 +168,31 @@ def arrange_readings(experiments: Batch, acts: Sequence[Array], every: Float[Arr
 
 
 def reading_count(experiment: Experiment) -> int:
-    """Number of readings of an experiment, with repeats averaged."""
-    if isinstance(experiment, Act):
+    """Number of readings of an experiment. Repeated readings are averaged and count once."""
+    if isinstance(experiment, CalibrationAct):
         return len(experiment.at)
     return len(experiment.voltage) * len(experiment.channels)
 
 
 def reading_spans(experiments: Sequence[Experiment]) -> dict[str, slice]:
-    """Slice of each experiment's readings among all readings."""
+    """Slice of each experiment in the array of all readings."""
     ends = np.cumsum([reading_count(e) for e in experiments]).tolist()
     return {e.name: slice(end - reading_count(e), end) for e, end in zip(experiments, ends, strict=True)}
 
 
 def reading_sds(experiments: Sequence[Experiment], of_channels: Mapping[str, float]) -> np.ndarray:
-    """Sd of each reading [SI], with repeats averaged. Runs, and zeros, are read with the instruments of the table.
+    """Standard deviation of each reading after averaging its repeats [SI].
+
+    Runs and zero readings use the instruments of the table.
 
     Args:
-        of_channels: sds of its channels [SI], by name.
+        of_channels: standard deviation of each channel of the table [SI], by name.
     """
     sds = [np.zeros(0)]
     for e in experiments:
         one = (
             [of_channels[e.channel] if e.sd is None else e.sd] * len(e.at)
-            if isinstance(e, Act)
+            if isinstance(e, CalibrationAct)
             else np.tile([of_channels[c] for c in e.channels], len(e.voltage))
         )
         sds.append(np.asarray(one, float) / math.sqrt(e.repeats))

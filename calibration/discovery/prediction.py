@@ -31,12 +31,12 @@ Readings = Float[np.ndarray, "rows channels"]
 
 @dataclasses.dataclass(frozen=True)
 class HeldOutScore:
-    """Hold-out scores of a fit.
+    """Hold-out scores of a fit: log densities of readings that were left out of the fit.
 
     Attributes:
-        by_kind: kind of block → log density of each reading, NaN for excluded ones, shape (rows, channels).
-        blocks: kind of block → index of each row's block, -1 for none.
-        reading: kind of block → the scored predictions.
+        by_kind: kind of block → log density of each reading, NaN if excluded, shape (rows, channels).
+        blocks: kind of block → index of the block of each row, -1 for none.
+        reading: kind of block → hold-out predictions of the readings.
     """
 
     by_kind: dict[str, Readings]
@@ -44,17 +44,18 @@ class HeldOutScore:
     reading: dict[str, Readings] = dataclasses.field(default_factory=dict)
 
     def only(self, kind: str) -> HeldOutScore:
-        """Scores of one kind of block."""
+        """Scores for one kind of block."""
         return HeldOutScore({kind: self.by_kind[kind]}, {kind: self.blocks[kind]})
 
     def gain(
         self, over: HeldOutScore, where: Bool[np.ndarray, "rows channels"] | None = None, fewest: int = 2
     ) -> Gain:
-        """Gain over another score, over the readings of both.
+        """Gain of this score over another one, over the readings that both have.
 
         Args:
-            where: True for included readings. None: all.
-            fewest: fewest blocks of a kind whose scatter counts: that of two has one degree of freedom.
+            where: True for readings that count. None: all.
+            fewest: smallest number of blocks whose scatter gives a standard error. Two blocks have one degree of
+                freedom.
         """
         if not self.by_kind:
             return Gain(0.0, np.inf)
@@ -76,10 +77,10 @@ class HeldOutScore:
 
 @dataclasses.dataclass(frozen=True)
 class Gain:
-    """Difference of two scores and its standard error [nat a reading].
+    """Difference of two hold-out scores and its standard error [nat per reading].
 
     Attributes:
-        errors: standard error by kind of block, if `se` is their mean, else empty.
+        errors: standard error for each kind of block if `se` is their mean, otherwise empty.
     """
 
     mean: float
@@ -88,7 +89,7 @@ class Gain:
 
 
 def _clustered_standard_error(off: np.ndarray, groups: np.ndarray) -> float:
-    """Standard error of a sum with terms correlated within groups."""
+    """Standard error of a sum whose terms are correlated within groups."""
     _, which = np.unique(groups, return_inverse=True)
     count = which.max() + 1
     sums = np.bincount(which, off)
@@ -102,12 +103,12 @@ def score_readings(
     counts: Bool[np.ndarray, "rows channels"],
     kinds: Mapping[str, Columns],
 ) -> HeldOutScore:
-    """Scores of hold-out predictions.
+    """Scores hold-out predictions by their log density.
 
     Args:
-        reading: kind of block → predictions of each row by a fit without its block, NaN for none.
+        reading: kind of block → prediction of each row by a fit without its block, NaN for none.
         counts: True for included readings.
-        kinds: kinds of blocks, label → mask of its rows each.
+        kinds: kind of block → label of each block → mask of its rows.
     """
     by_kind, blocks = {}, {}
     norm = math.lgamma((FREEDOM + 1) / 2) - math.lgamma(FREEDOM / 2) - 0.5 * math.log(FREEDOM * math.pi)
@@ -128,12 +129,12 @@ Predicted = dict[tuple[Names, bytes], dict[str, Readings]]
 
 
 def candidate_key(candidate: Candidate) -> tuple[Names, bytes]:
-    """Key of a candidate's hold-out predictions."""
+    """Key under which the hold-out predictions of a candidate are cached."""
     return candidate.active, np.asarray(candidate.z).tobytes()
 
 
 def score_candidate(space: CandidateSpace, runs: Runs, candidate: Candidate) -> HeldOutScore:
-    """Scores of a candidate, refitted without each block of each kind."""
+    """Hold-out scores of a candidate, which is refitted without each block of each kind."""
     data, rows, kinds = space.equipped.data, len(runs), blocks_room.predictable_blocks(runs, space.bare)
     measured, sd, counts = (np.asarray(x)[:rows] for x in (data.measured, data.sd, space.weight > 0))
     problem, z, active = space.fit_of(candidate.active, candidate.z)
@@ -148,14 +149,14 @@ def smallest_predictive_set(
     path: Sequence[Candidate],
     predicted: Predicted | None = None,
 ) -> Candidate | None:
-    """Smallest set of effects that predicts as well as the best one, within one standard error.
+    """Smallest set of effects whose hold-out score is within one standard error of the best (Breiman et al. 1984,
+    sec. 3.4.3).
 
-    The rule is that of Breiman, Friedman, Olshen and Stone 1984, sec. 3.4.3. None if it is the base, or if no block
-    can be held out.
+    None if that set is empty, or if no block can be held out.
 
     Args:
-        path: candidates by the number of their effects.
-        predicted: collects the hold-out predictions of each.
+        path: candidates ordered by their number of effects.
+        predicted: cache of hold-out predictions. This function adds to it.
     """
     if not blocks_room.predictable_blocks(runs, space.bare):
         return None

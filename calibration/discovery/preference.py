@@ -1,4 +1,6 @@
-"""Use of hold-out errors: errors that rise with the effects found, and the choice of a class's leader."""
+"""Choice of a class's leading effect by hold-out errors, and report of hold-out errors that rise with the effects
+found.
+"""
 
 from __future__ import annotations
 
@@ -14,8 +16,8 @@ from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.candidates import Candidate, fit_candidates, start_of_fit
 from calibration.discovery.classes import Classes, families_of_members
 from calibration.discovery.loop_notes import DRAW
-from calibration.discovery.result import Errors, HeldOutAlternative, Worse
-from calibration.discovery.search import Search, diagnose_candidate
+from calibration.discovery.result import Errors, HeldOutAlternative, WorseChannel
+from calibration.discovery.search import SearchResult, diagnose_candidate
 from calibration.discovery.settings import HELD_OUT, Settings
 from calibration.inference import blocks as blocks_room
 from calibration.inference.bases import Bases
@@ -31,12 +33,13 @@ TOLD = 0.01
 
 def worse_predictions(
     readings: Mapping[str, tuple[np.ndarray, np.ndarray]], errors: Callable[[np.ndarray], Errors]
-) -> tuple[Worse, ...]:
-    """Kinds of block and channels whose hold-out error rises, over the rows that both fits predict.
+) -> tuple[WorseChannel, ...]:
+    """Channels whose hold-out error rises with the effects, for each kind of block. Only rows that both fits predict
+    count.
 
     Args:
-        readings: kind of block → readings before and after [SI], NaN if a fit predicts none.
-        errors: function of readings to their errors, by channel.
+        readings: kind of block → hold-out readings without and with the effects [SI], NaN for no prediction.
+        errors: function that returns the errors of readings, by channel.
     """
     worse = []
     for kind, (before, after) in readings.items():
@@ -45,7 +48,7 @@ def worse_predictions(
         for channel, e in now.items():
             old, new = float(was[channel]["rms_percent"]), float(e["rms_percent"])
             if new > (1 + TOLD) * old:
-                worse.append(Worse(kind, channel, int(e["rows"]), old, new))
+                worse.append(WorseChannel(kind, channel, int(e["rows"]), old, new))
     return tuple(worse)
 
 
@@ -55,9 +58,10 @@ def worse_predictions(
 def compare_alternatives(
     space: CandidateSpace, runs: Runs, best: Candidate, alike: Classes
 ) -> tuple[HeldOutAlternative, ...]:
-    """Hold-out errors of a fit and of those with one effect replaced by a member of its class, that fit first.
+    """Hold-out errors of the best fit and of fits in which one effect is replaced by an alternative. The best fit is
+    first.
 
-    Members that are not plausible cannot lead, and are omitted. Empty for a single one, or without blocks.
+    Implausible alternatives are omitted. Empty if no alternative remains, or if there are no blocks.
     """
     alternatives = [c for c in experiments.alternatives_of_class(best, alike, stated=False).values() if c.plausible]
     data, rows = space.equipped.data, len(runs)
@@ -66,12 +70,12 @@ def compare_alternatives(
     if len(alternatives) < 2 or not kinds:
         return ()
 
-    def sigma(c: Candidate, masks: list[np.ndarray]) -> np.ndarray:
+    def residuals_in_sds(c: Candidate, masks: list[np.ndarray]) -> np.ndarray:
         problem, z, active = space.fit_of(c.active, c.z)
         reading = predict_unseen(problem, z, masks, active).reading
         return np.where(counts, (reading - measured) / sd, np.nan)
 
-    errors = [{kind: sigma(c, list(by.values())) for kind, by in kinds.items()} for c in alternatives]
+    errors = [{kind: residuals_in_sds(c, list(by.values())) for kind, by in kinds.items()} for c in alternatives]
     held_out = {kind: counts & np.any(list(by.values()), 0)[:, None] for kind, by in kinds.items()}
     common = {kind: np.all([np.isfinite(e[kind]) for e in errors], 0) for kind in kinds}
 
@@ -93,9 +97,10 @@ def compare_alternatives(
 
 
 def _order_alternatives(table: Sequence[HeldOutAlternative]) -> list[int]:
-    """Alternatives that predict no fewer readings than the best fit, which is the first, by their hold-out error.
+    """Indices of the alternatives that predict at least as many readings as the best fit, by hold-out error.
 
-    The best fit precedes others within `TOLD` of the smallest error, because hold-out errors do not decide there.
+    The best fit (index 0) is first if its error is within `TOLD` of the smallest one, because such a difference
+    decides nothing.
     """
     able = _full_predictors(table)
     least = min((table[k] for k in able), key=lambda a: a.rms_sigma)
@@ -103,21 +108,21 @@ def _order_alternatives(table: Sequence[HeldOutAlternative]) -> list[int]:
 
 
 def _full_predictors(table: Sequence[HeldOutAlternative]) -> list[int]:
-    """Indices of alternatives that predict no fewer readings than the first."""
+    """Indices of alternatives that predict at least as many readings as the first."""
     return [k for k, a in enumerate(table) if a.lost <= table[0].lost]
 
 
 def _is_draw(a: HeldOutAlternative, b: HeldOutAlternative) -> bool:
-    """True if hold-out errors do not decide between two."""
+    """True if the hold-out errors of two alternatives differ too little to decide."""
     return not a.rms_sigma > (1 + TOLD) * b.rms_sigma
 
 
 def prefer_by_held_out(
-    space: CandidateSpace, runs: Runs, searched: Search, alike: Classes, bases: Bases, settings: Settings
-) -> tuple[Search, Classes, tuple[HeldOutAlternative, ...]]:
-    """The search and its classes, led by the alternative with the best hold-out errors, see `_order_alternatives`.
+    space: CandidateSpace, runs: Runs, searched: SearchResult, alike: Classes, bases: Bases, settings: Settings
+) -> tuple[SearchResult, Classes, tuple[HeldOutAlternative, ...]]:
+    """Replaces the best fit by the alternative with the smallest hold-out error, see `_order_alternatives`.
 
-    An inadequate alternative does not lead if the best fit is adequate.
+    An alternative with significant residuals does not replace a best fit without them.
     """
     best, before = searched.best, searched.diagnosis
     if best is None or before is None:
@@ -137,14 +142,14 @@ def prefer_by_held_out(
         if sound:
             led = tuple(dataclasses.replace(a, leads=j == k) for j, a in enumerate(table))
             searched = dataclasses.replace(searched, best=leader, diagnosis=diagnosis)
-            return searched, _classes_led_by(space, best, leader, alike, settings), led
+            return searched, _classes_with_leader(space, best, leader, alike, settings), led
     return searched, alike, table
 
 
-def _classes_led_by(
+def _classes_with_leader(
     space: CandidateSpace, best: Candidate, leader: Candidate, alike: Classes, settings: Settings
 ) -> Classes:
-    """Classes of another leader, with its effect first in its class. Missing members are fitted."""
+    """Alternatives of another leading effect, with that effect first in its class. Missing members are fitted."""
     members = dict(zip(best.effects, alike.members, strict=True))
     (new,), (old,) = leader.key - best.key, best.key - leader.key
     members[new] = (new, *(n for n in members.pop(old) if n != new))
@@ -170,7 +175,9 @@ def _classes_led_by(
 
 
 def leader_remarks(table: Sequence[HeldOutAlternative], prefer: str) -> list[Remark]:
-    """Notes on the choice of the leader, and whether the other criterion would have chosen another."""
+    """Remark on the choice of the leading effect. It also reports if the other criterion would have chosen
+    differently.
+    """
     if not table:
         return []
     shared = set.intersection(*(set(a.effects) for a in table))

@@ -1,4 +1,4 @@
-"""Linear algebra at a fit: columns projected against the free parameters, and the defect of a balance by row."""
+"""Linear algebra at a fit: projection orthogonal to the free parameters, and the error of a balance in each row."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from calibration.inference.linearization import Linearization
 
 
 class Projection:
-    """Projection of columns on the complement of the free parameters, as if these were fitted again.
+    """Projects columns orthogonally to the free parameters, as if these were fitted again.
 
     Args:
-        linear: at the base fit of settled rows. Its prior rows are those of the free parameters.
+        linear: linearization of the base fit of settled rows. Its prior rows belong to the free parameters.
     """
 
     def __init__(self, linear: Linearization) -> None:
@@ -26,7 +26,7 @@ class Projection:
         self.left = (residual - half.T @ (half @ residual))[: self.readings]
 
     def __call__(self, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """A = Cᵀ (I - P) C and b = -Cᵀ (I - P) e: coefficients a explain 2 bᵀa - aᵀA a of χ².
+        """A = Cᵀ (I - P) C and b = -Cᵀ (I - P) e. Coefficients a of the columns C reduce χ² by 2 bᵀa - aᵀA a.
 
         Args:
             columns: whitened change of the readings per unit, shape (readings, columns).
@@ -36,18 +36,19 @@ class Projection:
 
 
 @dataclasses.dataclass(frozen=True)
-class Defect:
-    """Error of a balance or channel in each row, after the free parameters have absorbed their part.
+class BalanceError:
+    """Error of a balance or channel in each row that the free parameters cannot absorb.
 
     Attributes:
-        value, sd: [unit of the place], shape (rows,), NaN if the readings do not show it.
+        value, sd: error and its standard deviation [unit of the balance or channel], shape (rows,). NaN if the
+            readings do not show it.
     """
 
     value: np.ndarray
     sd: np.ndarray
 
 
-def defect_by_row(linear: Linearization, place: str) -> Defect:
+def balance_error_by_row(linear: Linearization, place: str) -> BalanceError:
     """Error of one balance equation in each row, by least squares that also refits the free parameters.
 
     δ_i = -(r_i·e) / ‖r_i‖² with the sd 1/‖r_i‖ and r_i = (I - P) g_i. The residuals are e. All readings change by g_i
@@ -64,17 +65,20 @@ def defect_by_row(linear: Linearization, place: str) -> Defect:
     norm2 = np.where(is_visible, norm2, np.nan)
     value, sd = np.full(linear.rows, np.nan), np.full(linear.rows, np.nan)
     value[places], sd[places] = b / norm2, 1 / np.sqrt(norm2)
-    return Defect(value, sd)
+    return BalanceError(value, sd)
 
 
-def explained_by(jacobian: np.ndarray, residual: np.ndarray) -> Callable[[np.ndarray], tuple[float, float]]:
-    """Function of columns over the readings: decrease of χ² and remaining sensitivity of all columns [σ²]."""
+def explained_function(jacobian: np.ndarray, residual: np.ndarray) -> Callable[[np.ndarray], tuple[float, float]]:
+    """Function that returns how much columns over the readings explain of a fit's residuals.
+
+    Its results are the decrease of χ² by all columns, and their sensitivity that the free parameters leave [σ²].
+    """
     half = np.linalg.solve(np.linalg.cholesky(jacobian.T @ jacobian), jacobian.T)
     projected_residual = residual - half.T @ (half @ residual)
 
-    def of(columns: np.ndarray) -> tuple[float, float]:
+    def explained(columns: np.ndarray) -> tuple[float, float]:
         inside = half[:, : len(columns)] @ columns
         inner, told = columns.T @ columns - inside.T @ inside, columns.T @ projected_residual[: len(columns)]
         return float(told @ np.linalg.lstsq(inner, told, rcond=1e-9)[0]), float(np.trace(inner))
 
-    return of
+    return explained

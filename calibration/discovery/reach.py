@@ -1,4 +1,4 @@
-"""Reach of whoever measured a table: the ranges that it used, and limits of the robot's makers."""
+"""Reach of a bench: the ranges of conditions that a table used, and the limits of motors and robot."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ LOADED, RUNNING = 0.3, 0.8
 
 
 @dataclasses.dataclass(frozen=True)
-class Used:
-    """Values of the conditions in a table for one configuration, increasing and without repeats.
+class UsedConditions:
+    """Conditions that a table used with one configuration, each increasing and without repeats.
 
     Attributes:
         configuration: name of the configuration.
-        index: index in the robot.
+        index: index of the configuration in the robot.
         voltages [V], slopes [deg], payloads [kg].
-        mass: the largest total [kg].
+        mass: largest total mass [kg].
     """
 
     configuration: str
@@ -40,40 +40,40 @@ class Used:
 
     @property
     def steepest(self) -> float:
-        """Largest angle of the slope, in either direction [deg]."""
+        """Largest magnitude of the slope [deg]."""
         return max(abs(s) for s in self.slopes)
 
     @property
     def payload(self) -> float:
-        """Largest payload that the robot may carry [kg]: 0 if the table has none."""
+        """Largest payload that a proposed run may use [kg]. 0 if the table has none."""
         most = self.payloads[-1]
         return min(PAYLOAD * most, most + MASS * self.mass)
 
 
 @dataclasses.dataclass(frozen=True)
 class Reach:
-    """Limits of experiments with a robot.
+    """Limits within which experiments are proposed.
 
     Attributes:
-        used: ranges of each configuration in the table.
+        used: conditions of the table, for each configuration.
         measured: names of the channels in the table.
-        voltage: highest of runs under load [V].
-        geared, alone: limits of motors with only their gearboxes, or without any load.
-        current: largest of one motor in steady travel [A], within its continuous limit.
-        motor_speed [rad/s], speed [m/s]: largest in steady travel.
-        limit_geared, limit_alone: speed limits of the motor shaft with its gearbox and alone, or the table's largest
-            speed [rad/s].
-        motors: number of motors driven in the same way.
-        resistance [ohm], torque_constant [N·m/A]: of one.
+        voltage: highest voltage of proposed runs under load [V].
+        geared, alone: highest voltage of motors with only their gearboxes, and of motors without any load [V].
+        current: largest steady current of one motor [A], within its continuous limit.
+        motor_speed [rad/s], speed [m/s]: largest steady speeds of motor shaft and robot.
+        limit_geared, limit_alone: speed limits of the motor shaft with its gearbox and alone, or the largest speed of
+            the table [rad/s].
+        motors: number of motors that are driven in the same way.
+        resistance [ohm], torque_constant [N·m/A]: constants of one motor.
         hot: temperature limit of a winding [°C].
-        imposed: quantity on the motors, see `Rig`.
-        levels: levels of speed [rad/s] or current [A] that the table used, if these are imposed.
-        has_ground: True if it is carried by a ground.
-        duties: magnitudes of the driver's duty that the table used [-].
-        torques: magnitudes of a brake's torque that it used [N·m], empty without a brake.
+        imposed: quantity imposed on the motors, see `Rig`.
+        levels: levels of the imposed speed [rad/s] or current [A] in the table.
+        has_ground: True if a ground carries the robot.
+        duties: magnitudes of the driver's duty in the table [-].
+        torques: magnitudes of the brake torque in the table [N·m], empty without a brake.
     """
 
-    used: tuple[Used, ...]
+    used: tuple[UsedConditions, ...]
     measured: Names
     voltage: float
     geared: float
@@ -95,7 +95,7 @@ class Reach:
 
     @property
     def voltages(self) -> tuple[float, ...]:
-        """All voltages that the table used [V]."""
+        """All voltages of the table [V]."""
         return tuple(sorted({v for u in self.used for v in u.voltages}))
 
 
@@ -104,12 +104,12 @@ def _levels(x: np.ndarray) -> tuple[float, ...]:
 
 
 def reach_of_table(robot: Robot, conditions: Conditions, measured: Names) -> Reach:
-    """Limits of the next experiments with a table's robot.
+    """Limits of the next experiments, from the conditions of a table and its robot.
 
     Args:
-        robot: as in its file, or fitted.
+        robot: robot of the file, or the fitted robot.
         conditions: conditions of the table's runs, shape (runs,).
-        measured: names of the channels in the table.
+        measured: names of the measured channels.
     """
     which, volts, slope, payload = (
         np.asarray(x)
@@ -119,7 +119,9 @@ def reach_of_table(robot: Robot, conditions: Conditions, measured: Names) -> Rea
     total_mass = conditions.total_mass
     mass = masses[which] + payload if total_mass is None else np.asarray(total_mass)
     used = tuple(
-        Used(name, k, _levels(volts[rows]), _levels(slope[rows]), _levels(payload[rows]), float(mass[rows].max()))
+        UsedConditions(
+            name, k, _levels(volts[rows]), _levels(slope[rows]), _levels(payload[rows]), float(mass[rows].max())
+        )
         for k, name in enumerate(robot.configurations)
         if (rows := which == k).any()
     )
@@ -147,7 +149,7 @@ def reach_of_table(robot: Robot, conditions: Conditions, measured: Names) -> Rea
 
 
 def reach_of_space(space: CandidateSpace, robot: Robot | None = None) -> Reach:
-    """Limits of the next experiments with the robot of a space, or with a fitted one if given."""
+    """Limits of the next experiments with the robot of a candidate space, or with `robot` if given."""
     weight = space.weight
     measured_channels = tuple(
         c for k, c in enumerate(channels.channel_names(space.bare.channels)) if weight[:, k].any()

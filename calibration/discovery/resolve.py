@@ -1,4 +1,4 @@
-"""Test whether a resolved running gear within its priors explains a discrepancy in slip, track or ground.
+"""Test of whether a different running gear, in the track model, explains a discrepancy in slip, track or ground.
 
 The lumped laws assume smooth contacts. The track model has grousers and guides, and vibrates. Friction is fitted
 through it twice to the rows on tracks, once with the running gear as stated and once with its constants free.
@@ -16,12 +16,12 @@ from scipy.special import chdtrc
 from calibration.data import Names
 from calibration.data.input_errors import BadConfiguration
 from calibration.data.runs import Runs
-from calibration.discovery.loop_notes import Asked
-from calibration.discovery.result import PLAUSIBLE, DiscoveryResult, Estimate, Resolved
+from calibration.discovery.loop_notes import TrackModelQuestion
+from calibration.discovery.result import PLAUSIBLE, DiscoveryResult, ParameterEstimate, TrackModelResult
 from calibration.inference import noise as noise_room
 from calibration.inference import observers
 from calibration.inference.calibration import calibrate
-from calibration.inference.fit_notes import Remark, next_step
+from calibration.inference.fit_notes import Remark, progress_remark
 from calibration.inference.population import saved_members
 from calibration.inference.result import CalibrationResult
 from mmrjax.effects import UNNAMED
@@ -37,29 +37,31 @@ FRICTION = ("ground.friction.static", "ground.friction.dynamic", "ground.frictio
 POPULATION, GENERATIONS = 128, 20
 
 
-def question_of_verdict(found: DiscoveryResult) -> Asked | None:
-    """Part of a verdict that the running gear could explain, or None."""
+def question_of_verdict(found: DiscoveryResult) -> TrackModelQuestion | None:
+    """Finding that a different running gear could explain. None if there is none."""
     places = [w for w in (found.unnamed, found.remains) if w is not None]
     for place in places:
         for balance in (place.balance, *place.balances_alike):
             if balance in BALANCES:
-                return Asked("missing", balance, place.variable)
+                return TrackModelQuestion("missing", balance, place.variable)
     balance_effects = [e.name for e in found.effects if e.balance in BALANCES]
     if balance_effects:
-        return Asked("found", effects=tuple(balance_effects))
+        return TrackModelQuestion("found", effects=tuple(balance_effects))
     weighed = [a for a in found.alternatives if any(enters_gear_balance(name, found) for name in a.effects)]
     if weighed:
-        return Asked("near", effects=tuple(n for n in weighed[0].effects if enters_gear_balance(n, found)))
+        return TrackModelQuestion(
+            "near", effects=tuple(n for n in weighed[0].effects if enters_gear_balance(n, found))
+        )
     return None
 
 
 def enters_gear_balance(name: str, found: DiscoveryResult) -> bool:
-    """True if an effect of the library enters one of `BALANCES`."""
+    """True if an effect of the library enters a balance of the running gear (`BALANCES`)."""
     return any(s.name == name and s.balance in BALANCES for s in found.scores)
 
 
 def check_resolvable(runs: Runs, members: Path | None = None) -> None:
-    """Reject unsuitable input for `resolve` before the loop starts.
+    """Rejects input that `fit_track_model` cannot use, before the loop starts.
 
     Raises:
         BadConfiguration: the data are histories, or the file of members cannot be read.
@@ -70,7 +72,7 @@ def check_resolvable(runs: Runs, members: Path | None = None) -> None:
         saved_members(members)
 
 
-def resolve(
+def fit_track_model(
     found: DiscoveryResult,
     *,
     noise: str | None = None,
@@ -79,18 +81,18 @@ def resolve(
     members: Path | None = None,
     seed: int = 0,
     tell: Callable[[Remark | str], None] = lambda note: None,
-) -> Resolved | None:
-    """Fit the track model to the rows of a verdict.
+) -> TrackModelResult | None:
+    """Fits the track model to the rows on tracks, to test if a different running gear explains the finding of the
+    loop.
 
     Args:
         found: result of the loop, from settled rows.
-        noise: as given to the loop.
-        population, generations, members, seed: population, generations, members and seed of the search, see
-            `calibrate`.
-        tell: callback for a progress note, or for a sentence of `calibrate`.
+        noise: noise option as given to the loop.
+        population, generations, members, seed: options of the search, see `calibrate`.
+        tell: callback for progress messages.
 
     Returns:
-        None if it does not apply: no discrepancy in slip, track or ground, or no row on tracks.
+        None if there is no finding in slip, track or ground, or no row on tracks.
 
     Raises:
         BadConfiguration: the data are histories.
@@ -120,16 +122,16 @@ def resolve(
             seed=seed, profiles=False, blocks=False, tell=tell,
         )  # fmt: skip
 
-    tell(next_step("gear stated"))
+    tell(progress_remark("gear stated"))
     fitted_robot = fit(friction)
-    tell(next_step("gear free"))
+    tell(progress_remark("gear free"))
     free = fit((*friction, *gear), members)
     fall = 2 * (fitted_robot.objective - free.objective)
-    return Resolved(
+    return TrackModelResult(
         asked=reason,
         rows=len(rows),
         robot=free.robot,
-        constants={n: Estimate(p.value, p.sd, p.unit, p.held_by_prior) for n, p in free.parameters.items()},
+        constants={n: ParameterEstimate(p.value, p.sd, p.unit, p.held_by_prior) for n, p in free.parameters.items()},
         alike=tuple(free.identifiability.correlated()),
         outside=tuple(n for n, p in free.parameters.items() if n in gear and abs(p.shift) > PLAUSIBLE),
         settled=fitted_robot.converged and free.converged,
@@ -147,7 +149,7 @@ def resolve(
 
 
 def _noise_option(found: DiscoveryResult, stated: str | None) -> str | None:
-    """Option `noise` of `calibrate` for the loop's sds."""
+    """Option `noise` of `calibrate` that gives the same sds as the loop used."""
     assumed = [name for name, about in found.noise.items() if about["source"] == "assumed"]
     return (
         ",".join(part for part in (stated, noise_room.default_noise(channels.channels_named(assumed))) if part)
@@ -156,7 +158,9 @@ def _noise_option(found: DiscoveryResult, stated: str | None) -> str | None:
 
 
 def _slip_rms(fitted: CalibrationResult, robot: Robot) -> float:
-    """Rms difference of the slip 1 - V / (r_k ω_k) [percentage points], over rows with both speeds."""
+    """rms difference of measured and simulated slip 1 - V / (r_k ω_k) [percentage points], over rows with both
+    speeds.
+    """
     motor = fitted.readings["motor_speed"]
     speed = fitted.readings["speed"]
     ratio = float(robot.gearbox.ratio) / float(robot.radius_pulley)

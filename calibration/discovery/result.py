@@ -1,4 +1,4 @@
-"""Result of the closed loop: typed, by name, self-contained. JSON and tables are made from it without computation."""
+"""Result of the closed loop as data by name. JSON and tables are written from it without further computation."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from calibration.described import describe, sentences
 from calibration.discovery import formula
 from calibration.discovery.experiments import Proposal
 from calibration.discovery.headline import headline
-from calibration.discovery.hidden import Hidden
+from calibration.discovery.hidden import HiddenEffect
 from calibration.discovery.kept import REFIT_FILE
 from calibration.discovery.location import DiscrepancyLocation
-from calibration.discovery.loop_notes import Asked, Headline, NameSupport, RuledOut, Summary
-from calibration.discovery.outliers import Cluster
+from calibration.discovery.loop_notes import Headline, NameSupport, RuledOut, TrackModelQuestion, VerdictSummary
+from calibration.discovery.outliers import OutlierCluster
 from calibration.discovery.prediction import Gain
 from calibration.discovery.settings import Settings
 from calibration.inference.details import Detail
-from calibration.inference.fit_notes import Notes, Pair, Remark, with_codes
+from calibration.inference.fit_notes import DependentPair, Notes, Remark, remarks_with_codes
 from calibration.inference.identifiability import determined_together
 from calibration.inference.residual_clusters import ResidualCluster
 from calibration.inference.simulation_errors import OF_SIZE
@@ -43,8 +43,10 @@ PLAUSIBLE = 3.0
 
 
 @dataclasses.dataclass(frozen=True)
-class Estimate:
-    """A parameter with its standard deviation, both in `unit`, and True if it is held by its prior."""
+class ParameterEstimate:
+    """Fitted value of a parameter with its standard deviation, both in `unit`. `held_by_prior`: True if the data do
+    not determine it.
+    """
 
     value: float
     sd: float
@@ -53,13 +55,13 @@ class Estimate:
 
 
 @dataclasses.dataclass(frozen=True)
-class Member:
-    """An effect of a class in place of the leader.
+class ClassMember:
+    """An effect that explains the data as well as the leading effect of its class.
 
     Attributes:
-        amplitude: amplitude of this member [unit].
-        size: size over the largest plausible one.
-        rise_chi2: compared with the leader [σ²].
+        amplitude: fitted amplitude [unit].
+        size: amplitude relative to the largest plausible one [-].
+        rise_chi2: rise of χ² compared with the leading effect [σ²].
     """
 
     amplitude: float
@@ -69,13 +71,13 @@ class Member:
 
 @dataclasses.dataclass(frozen=True)
 class StatedValue:
-    """A base parameter with a stated value that may be wrong, instead of an effect.
+    """A stated value of the robot that may be wrong, in place of a missing effect.
 
     Attributes:
-        value: value that explains as much.
-        stated: prior mean. Both are in `unit`.
-        prior_sds: distance from its prior.
-        rise_chi2: compared with the effect [σ²].
+        value: value that explains the data.
+        stated: stated value, the mean of its prior. Both are in `unit`.
+        prior_sds: their distance in prior sds.
+        rise_chi2: rise of χ² compared with the effect [σ²].
     """
 
     value: float
@@ -87,30 +89,31 @@ class StatedValue:
 
 @dataclasses.dataclass(frozen=True)
 class FoundEffect:
-    """An effect of the verdict.
+    """An effect that the loop added to the model, with its alternatives and evidence.
 
     Attributes:
-        name: name of the leader of its class.
-        members: effects that these data cannot separate from it, itself first.
-        stated: base parameters that may be wrong instead, by name.
-        families: families of the members, the leader's first. A single family identifies the equation and its driver.
-        balance, unit: balance and unit of the balance that it enters.
+        name: name of the leading effect of its class.
+        members: the effect and all effects that the data cannot separate from it.
+        stated: base parameters, by name, whose stated value may be wrong instead.
+        families: families of the members, the leading one first. If there is only one, the equation and its driving
+            variable are known.
+        balance, unit: balance that the effect enters, and its unit.
         equation, source: equation and source, from the effect's docstring.
-        parameters: amplitude and shape of the effect.
-        p_value: compared with the strongest of all effects in each bootstrap table.
-        score: rise of χ² without it after a refit [σ²].
-        share: share of the excess misfit, χ² less its expectation, that it explains [-].
+        parameters: fitted amplitude and shape.
+        p_value: share of bootstrap tables in which the strongest effect explains as much.
+        score: rise of χ² if the effect is removed and the rest refitted [σ²].
+        share: share of the excess misfit (χ² minus its expectation) that it explains [-].
     """
 
     name: str
-    members: dict[str, Member]
+    members: dict[str, ClassMember]
     stated: dict[str, StatedValue]
     families: Names
     balance: str
     unit: str
     equation: str
     source: str
-    parameters: dict[str, Estimate]
+    parameters: dict[str, ParameterEstimate]
     p_value: float
     score: float
     share: float
@@ -122,16 +125,16 @@ class UnnamedDiscrepancy(DiscrepancyLocation):
 
     Attributes:
         unit: unit of the balance.
-        families: equation and driver, in words, as in `FoundEffect`.
-        window: axis, first and last place of a temporary change, None for other discrepancies.
+        families: equation and driving variable in words, as in `FoundEffect`.
+        window: axis, begin and end of a temporary change. None for other discrepancies.
         effect: name of the smooth curve in the proposed robot.
-        p_value: family-wise.
+        p_value: family-wise p-value.
         score: decrease of χ² by the curve [σ²].
-        score_free_in_each_run: score of a wave with a phase for each run, None for other curves.
+        score_free_in_each_run: score of a wave with its own phase in each run. None for other curves.
         at: values of the variable [SI]. value, sd: value and standard deviation of the curve there [unit]. over,
         defect, defect_sd: for each row the fitted variable [SI] and the defect of the balance [unit]: the curve
         there plus the row's residual, along the travel, None if single rows do not show it.
-        proposal: a formula.
+        proposal: proposed formula.
     """
 
     unit: str
@@ -151,15 +154,15 @@ class UnnamedDiscrepancy(DiscrepancyLocation):
 
 
 @dataclasses.dataclass(frozen=True)
-class Alternative:
-    """Effects that were fitted and are not proposed.
+class RejectedCandidate:
+    """Effects that were fitted but are not proposed.
 
     Attributes:
-        effects: amplitudes.
-        prior_sds: the same in prior sds.
-        sizes: sizes over the largest plausible ones.
-        rise_chi2: rise of χ² over the proposed fit [σ²], negative if they explain more.
-        reasons: reasons for their implausibility.
+        effects: amplitude of each effect.
+        prior_sds: the same amplitudes in prior sds.
+        sizes: amplitudes relative to the largest plausible ones [-].
+        rise_chi2: χ² minus that of the proposed fit [σ²]. Negative if these effects explain more.
+        reasons: reasons why they are implausible.
     """
 
     JSON = ("effects", "prior_sds", "sizes", "rise_chi2", "why")
@@ -171,17 +174,18 @@ class Alternative:
 
     @property
     def why(self) -> str:
-        """Reasons for not being plausible, as a sentence."""
+        """Reasons why they are implausible, as a sentence."""
         return describe(self)
 
 
 @dataclasses.dataclass(frozen=True)
-class BaseShift:
-    """A base parameter before and after, in its unit, and as shifts from its prior [prior sds].
+class ParameterShift:
+    """A base parameter before and after effects were added: value in its unit, and distance from its prior [prior
+    sds].
 
     Attributes:
-        held_by_prior: True if it is after, see `identifiability.held_by_prior`.
-        at_bound: bound that it reached after, `lower`, `upper` or None.
+        held_by_prior: True if the data do not determine it after, see `identifiability.held_by_prior`.
+        at_bound: bound at which it is after, `lower`, `upper` or None.
     """
 
     prior: float
@@ -198,7 +202,9 @@ class BaseShift:
 
 @dataclasses.dataclass(frozen=True)
 class EffectScore:
-    """An effect of the library at its best shape: score [σ²], amplitude [its unit], sigmas per prior sd."""
+    """Score of a library effect at its best shape [σ²], its amplitude [own unit], and its change of the readings per
+    prior sd [σ].
+    """
 
     name: str
     balance: str
@@ -208,16 +214,16 @@ class EffectScore:
 
 
 @dataclasses.dataclass(frozen=True)
-class Ranked:
-    """An effect by regression: all other parameters are refitted on the linearised equations of the base fit.
+class RankedEffect:
+    """An effect of the ranking. All other parameters are refitted on the linearised equations of the base fit.
 
     Attributes:
         name: name of the effect.
-        family: equation and driver in words.
+        family: equation and driving variable in words.
         unit: unit of its amplitude.
-        score: score that it alone would explain at plausible size [σ²].
-        amplitude, sd: then [its unit].
-        supplies: True if that sign would supply power, so that it explains nothing.
+        score: decrease of χ² by the effect alone, at plausible size [σ²].
+        amplitude, sd: its amplitude and standard deviation [unit].
+        supplies: True if its sign would supply power. It then explains nothing.
     """
 
     name: str
@@ -230,29 +236,31 @@ class Ranked:
 
 
 @dataclasses.dataclass(frozen=True)
-class Ranking:
-    """Ranking of the library by regression before any set of effects is fitted, unconfirmed.
+class EffectRanking:
+    """Ranking of the library by regression, before any set of effects is fitted. It is not confirmed by simulation.
 
     Attributes:
         missing: True if an effect is missing.
-        p_value: p-value of that test, family-wise.
+        p_value: family-wise p-value of the test for a missing effect.
         chance: critical score of the strongest effect [σ²].
-        effects: the strongest first, then those that would supply power.
-        windows: number of equations of the log in weak form, 0 for a ranking by signatures along the base fit.
-        parameters: base parameters next to the first effect, each with its sd [SI].
+        effects: effects by score, strongest first. Those that would supply power are last.
+        windows: number of equations in weak form. 0 if the ranking uses the sensitivities of the base fit.
+        parameters: base parameters fitted together with the first effect, with their sds [SI].
     """
 
     missing: bool
     p_value: float
     chance: float
-    effects: tuple[Ranked, ...]
+    effects: tuple[RankedEffect, ...]
     windows: int = 0
     parameters: dict[str, tuple[float, float]] = dataclasses.field(default_factory=dict)
 
 
 @dataclasses.dataclass(frozen=True)
 class KindOfEvidence:
-    """Strongest statistic of one kind, its critical value, its p-value, and those of the bootstrap tables."""
+    """Strongest statistic of one kind: its value, critical value and p-value, and its values for the bootstrap
+    tables.
+    """
 
     found: float
     threshold: float
@@ -262,7 +270,9 @@ class KindOfEvidence:
 
 @dataclasses.dataclass(frozen=True)
 class Evidence:
-    """Evidence in one fit's residuals, by kind and family-wise. A fit without significant evidence is `adequate`."""
+    """Evidence for a missing effect in the residuals of a fit, by kind and family-wise. `adequate`: True if none is
+    significant.
+    """
 
     kinds: dict[str, KindOfEvidence]
     p_value: float
@@ -274,11 +284,11 @@ class ReadingsOfRows:
     """Readings of all rows [SI], shape (rows, channels), NaN if missing.
 
     Attributes:
-        measured, sd: readings and standard deviation of the table.
+        measured, sd: measured readings and their standard deviations.
         as_stated: simulated by the robot before any fit, at its prior means. before, after: simulated by the base
         and by the proposed robot, fitted to all rows.
-        held_out: kind of block → (before, after), each row by fits without its block.
-        blocks: kind of block → labels.
+        held_out: kind of block → readings (before, after), where each row is predicted by fits without its block.
+        blocks: kind of block → label of each row's block.
     """
 
     measured: np.ndarray
@@ -294,14 +304,14 @@ Errors = dict[str, dict[str, float | int]]
 
 
 @dataclasses.dataclass(frozen=True)
-class Worse:
-    """A channel with larger hold-out errors of the proposal than of the refit.
+class WorseChannel:
+    """A channel whose hold-out error is larger with the effects than without them.
 
     Attributes:
-        kind: kind of the blocks held out.
+        kind: kind of block that was left out.
         channel: name of the channel.
-        rows: number that both fits predict.
-        before, after: rms error over these [%].
+        rows: number of rows that both fits predict.
+        before, after: rms error over these rows, without and with the effects [%].
     """
 
     kind: str
@@ -313,15 +323,15 @@ class Worse:
 
 @dataclasses.dataclass(frozen=True)
 class HeldOutAlternative:
-    """An alternative of a class, refitted without each block.
+    """An alternative set of effects, refitted without each block of runs.
 
     Attributes:
         effects: names of its effects.
-        leads: True if it is the one proposed.
-        rise_chi2: rise of χ² of the fit to all rows, above the best one [σ²].
-        rms_sigma: rms error over the readings of all kinds of blocks that every alternative predicts [σ].
-        by_kind: the same for each kind of block.
-        lost: number of held-out readings without a prediction, because its robot slides or fails there.
+        leads: True if it is the proposed one.
+        rise_chi2: χ² of its fit to all rows, minus that of the best one [σ²].
+        rms_sigma: rms hold-out error over the readings that every alternative predicts [σ].
+        by_kind: the same error for each kind of block [σ].
+        lost: number of held-out readings that it cannot predict, because its robot slides or fails there.
     """
 
     effects: Names
@@ -333,30 +343,30 @@ class HeldOutAlternative:
 
 
 @dataclasses.dataclass(frozen=True)
-class Resolved:
-    """Result of the track model's fits.
+class TrackModelResult:
+    """Result of the track model: does a different running gear explain the finding of the loop?
 
     Attributes:
-        asked: the discrepancy, or the effects found, that it may explain.
-        rows: number of fitted rows on tracks.
-        robot: robot for `--model track`, with the running gear that fits best.
-        constants: constants of the running gear and the friction, by name.
+        asked: the discrepancy, or the effects, that the running gear may explain.
+        rows: number of rows on tracks that were fitted.
+        robot: robot for `--model track` with the best running gear.
+        constants: fitted constants of running gear and friction, by name.
         alike: strongly correlated pairs of constants, with their correlation.
         outside: constants further than `PLAUSIBLE` prior sds from their priors.
-        settled: True if both searches ended.
-        fall: decrease of twice the objective by the running gear, priors included [σ²].
-        p: p-value of the decrease.
-        chi2: χ² of the readings with the gear as stated and with the best one [σ²].
-        readings: number included.
-        rms_percent: by channel, with the gear as stated and with the best one [%].
+        settled: True if both searches converged.
+        fall: decrease of twice the objective by the best running gear, priors included [σ²].
+        p: p-value of that decrease.
+        chi2: χ² of the readings with the running gear of the file, and with the best one [σ²].
+        readings: number of included readings.
+        rms_percent: error of each channel with the running gear of the file, and with the best one [%].
         slip_rms: the same for the slip [percentage points].
         remarks: remarks of the search.
     """
 
-    asked: Asked
+    asked: TrackModelQuestion
     rows: int
     robot: Robot
-    constants: dict[str, Estimate]
+    constants: dict[str, ParameterEstimate]
     alike: tuple[tuple[str, str, float], ...]
     outside: Names
     settled: bool
@@ -370,7 +380,7 @@ class Resolved:
 
     @property
     def known_from_rows(self) -> Names:
-        """Constants not held by their priors."""
+        """Names of the constants that the rows determine."""
         return tuple(name for name, e in self.constants.items() if not e.held_by_prior)
 
     @property
@@ -380,7 +390,7 @@ class Resolved:
 
     @property
     def statement(self) -> str:
-        """In a sentence or two."""
+        """The result in a sentence or two."""
         return describe(self)
 
     @property
@@ -412,54 +422,55 @@ class DiscoveryResult:
 
     Attributes:
         verdict: `none`, `named`, `class`, `mechanism`, `place` or `undescribed`.
-        summary: the verdict with all data of its statement.
-        robot: robot as written to `robot.toml`.
-        refit: refit with nothing added.
-        written: True if the robot has the proposal.
-        gains: sets of effects, by their number, with their hold-out gain over the refit. The last one is the
-            proposal. Empty if no block can be held out.
-        converged: True if the fit of that robot is an optimum.
+        summary: the verdict with all data from which its statement is written.
+        robot: fitted robot with the proposal if `written`, as saved in `robot.toml`.
+        refit: fitted robot without additions.
+        written: True if `robot` includes the proposed effects.
+        gains: each set of effects by its size, with its hold-out gain over the refit. The proposal is last. Empty if
+            no block can be held out.
+        converged: True if the fit of `robot` is an optimum.
         posterior: posterior of all fitted parameters.
-        runs: the table.
-        numbers: numbers of its rows, as in messages.
+        runs: the measured runs.
+        numbers: row numbers as used in messages.
         included: True for included rows.
-        outliers, unusable: numbers of excluded rows.
-        effects: effects in the model, established or tentative.
-        unnamed: the discrepancy of that verdict.
+        outliers, unusable: row numbers of outliers, and of rows that the robot cannot reach.
+        effects: effects added to the model, established or tentative.
+        unnamed: discrepancy that no effect explains, if the verdict names none.
         remains: the discrepancy that the effects leave.
-        next_experiment: the most informative one, None if there are no alternatives to separate.
-        cannot_see: effects that the data cannot show.
-        needs_histories: effects that only histories can show.
+        next_experiment: most informative experiment. None if there are no alternatives to separate.
+        cannot_see: effects that the data cannot reveal.
+        needs_histories: effects that only time histories can reveal.
         needs_reverse: effects that only runs in both directions can show. alternatives, implausible: candidates
         nearly as good. Those of implausible size or sign.
-        hidden: effects that the effects found could hide, the largest first.
-        support: tests of the names, None if none was tested.
-        cluster: common property of outliers, which were then not excluded, None for none.
-        residual_clusters: clusters of the proposed robot's residuals by columns without a role.
-        before, after: evidence in the residuals of base and proposed robot.
-        chi2: twice the objective before and after [σ²].
-        readings: number included.
-        base_shift: base shift of every base parameter.
+        hidden: effects that the effects found would hide, the largest first.
+        support: tests of the effects' names. None if no name was tested.
+        cluster: property that the outliers share. They were then not excluded. None if there is none.
+        residual_clusters: groups of rows with similar residuals, by columns without a role.
+        before, after: evidence for a missing effect in the residuals without and with the proposal.
+        chi2: twice the objective without and with the proposal [σ²].
+        readings: number of included readings.
+        base_shift: each base parameter without and with the proposal.
         scores: scores of the library at the base fit, strongest first.
-        cosine: |cos| between the projected signatures of two effects, shape (scores, scores), their order.
-        detail: further findings for the kind of data: defects of equations by run, or memory, orders and drift.
-        readings_of_rows: measured and simulated.
-        errors_as_stated: rms by channel, of the robot before any fit.
+        cosine: |cos| between the projected signatures of every two effects, shape (scores, scores), in the order of
+            `scores`.
+        detail: further findings for this kind of data: errors of equations by run, or memory, orders and drift.
+        readings_of_rows: measured and simulated readings of each row.
+        errors_as_stated: rms error of each channel for the robot before any fit.
         errors, errors_held_out: rms by channel, before and after, over the rows that both predict. By kind of block.
-        held_out_unpredictable: kinds with at least one block that the others cannot predict.
-        held_out_worse: rises of hold-out errors.
-        alternatives_held_out: alternatives of a class, by hold-out errors, empty for a single one, or for
-            histories unless requested.
-        noise: channel → source and median sd [%].
-        settings: the statistical constants.
-        replicates: number of bootstrap tables with successful refits.
+        held_out_unpredictable: kinds of block with at least one block that the others cannot predict.
+        held_out_worse: channels whose hold-out error rises.
+        alternatives_held_out: alternatives with their hold-out errors. Empty if there is only one, or for histories
+            unless requested.
+        noise: channel → source of its sd, and its median relative size [%].
+        settings: statistical constants of the loop.
+        replicates: number of bootstrap tables whose refit converged.
         remarks: notes on the result.
-        sensitivity: verdicts with other assumed noise.
-        resolved: result of the track model, None if it was not run, or does not apply.
+        sensitivity: verdicts at other levels of the assumed noise.
+        resolved: result of the track model. None if it was not run, or does not apply.
     """
 
     verdict: str
-    summary: Summary
+    summary: VerdictSummary
     robot: Robot
     refit: Robot
     gains: tuple[tuple[Names, Gain], ...]
@@ -478,17 +489,17 @@ class DiscoveryResult:
     cannot_see: Names
     needs_histories: Names
     needs_reverse: Names
-    alternatives: tuple[Alternative, ...]
-    implausible: tuple[Alternative, ...]
-    hidden: tuple[Hidden, ...]
+    alternatives: tuple[RejectedCandidate, ...]
+    implausible: tuple[RejectedCandidate, ...]
+    hidden: tuple[HiddenEffect, ...]
     support: NameSupport | None
-    cluster: Cluster | None
+    cluster: OutlierCluster | None
     residual_clusters: tuple[ResidualCluster, ...]
     before: Evidence
     after: Evidence
     chi2: tuple[float, float]
     readings: int
-    base_shift: dict[str, BaseShift]
+    base_shift: dict[str, ParameterShift]
     scores: tuple[EffectScore, ...]
     cosine: np.ndarray
     detail: Detail
@@ -497,19 +508,21 @@ class DiscoveryResult:
     errors: tuple[Errors, Errors]
     errors_held_out: dict[str, tuple[Errors, Errors]]
     held_out_unpredictable: Names
-    held_out_worse: tuple[Worse, ...]
+    held_out_worse: tuple[WorseChannel, ...]
     alternatives_held_out: tuple[HeldOutAlternative, ...]
     noise: dict[str, Json]
     settings: Settings
     replicates: int
     remarks: Notes = ()
-    sensitivity: tuple[Sensitivity, ...] = ()
-    resolved: Resolved | None = None
+    sensitivity: tuple[NoiseVerdict, ...] = ()
+    resolved: TrackModelResult | None = None
 
     @property
     def statement(self) -> str:
-        """The answer in a sentence or two, after lost motion, which no effect of the library explains."""
-        lost = (f"{note}." for note in sentences(with_codes(self.remarks, "lost_motion")))
+        """The answer in a sentence or two. It begins with backlash or compliance that no effect of the library
+        explains.
+        """
+        lost = (f"{note}." for note in sentences(remarks_with_codes(self.remarks, "lost_motion")))
         return " ".join((*lost, describe(self.headline)))
 
     @property
@@ -519,7 +532,7 @@ class DiscoveryResult:
 
     @property
     def headline(self) -> Headline:
-        """Claim that holds at every noise factor tried."""
+        """The claims that hold at every noise level tried."""
         return headline(self.summary, [(s.factor, s.summary) for s in self.sensitivity])
 
     @property
@@ -529,12 +542,12 @@ class DiscoveryResult:
 
     @property
     def refit_alone(self) -> bool:
-        """True if nothing is proposed in addition to the refit."""
+        """True if the loop proposes no effect and no curve."""
         return self.verdict in ("none", "undescribed")
 
     @property
     def standing(self) -> str:
-        """Reasons for or against the names, as a sentence, "" for none."""
+        """Reasons for or against the effects' names, as a sentence, "" for none."""
         return describe(self, "standing")
 
     @property
@@ -549,9 +562,9 @@ class DiscoveryResult:
 
     @property
     def chi2_of_readings(self) -> tuple[float, float]:
-        """Sum of squared residuals of the included readings, before and after [σ²].
+        """Sum of squared residuals of the included readings, without and with the proposal [σ²].
 
-        `chi2` also contains the parameters' distances from their priors, and penalties.
+        Unlike `chi2`, it excludes the distances of parameters from their priors, and penalties.
         """
         readings = self.readings_of_rows
         before, after = (
@@ -566,7 +579,7 @@ class DiscoveryResult:
 
     @property
     def predicted(self) -> dict[str, tuple[int, int]]:
-        """Kind of block → number of rows with hold-out predictions, before and after."""
+        """Kind of block → number of rows with hold-out predictions, without and with the proposal."""
 
         def rows(reading: np.ndarray) -> int:
             return int(np.sum(np.isfinite(reading).any(1) & self.included))
@@ -575,7 +588,7 @@ class DiscoveryResult:
 
     @property
     def rms(self) -> dict[str, dict[str, float]]:
-        """rms errors by fit and channel with readings [unit of the channel], over the rows of the percent errors."""
+        """rms error of each fit and channel [unit of the channel], over the rows of the percentage errors."""
         fits = dict(zip(("before", "after"), self.errors, strict=True))
         main = next(iter(self.errors_held_out.values()), ())
         fits |= dict(zip(("held_out_before", "held_out_after"), main, strict=False))
@@ -583,20 +596,20 @@ class DiscoveryResult:
 
     @property
     def held_by_prior(self) -> Names:
-        """Names of the fitted parameters of the proposed robot that are held by their priors."""
+        """Names of the fitted parameters that the data do not determine, so that their priors do."""
         base = [name for name, p in self.base_shift.items() if p.held_by_prior]
         parameters = [(f"effects.{e.name}.{name}", p) for e in self.effects for name, p in e.parameters.items()]
         return (*base, *(name for name, p in parameters if p.held_by_prior))
 
     @property
-    def together(self) -> tuple[Pair, ...]:
-        """Pairs of base parameters and effects' parameters that the data determine only in combination."""
+    def together(self) -> tuple[DependentPair, ...]:
+        """Pairs of parameters, of the base or of effects, that the data determine only in combination."""
         shown_names = {*self.base_shift, *(f"effects.{e.name}.{name}" for e in self.effects for name in e.parameters)}
         pairs = determined_together(self.posterior, self.held_by_prior)
         return tuple(pair for pair in pairs if shown_names >= {pair.one, pair.other})
 
     def to_json(self) -> Json:
-        """Everything as JSON-able data, as docs/schemas/loop.schema.json describes it."""
+        """The whole result as JSON data, as described in docs/schemas/loop.schema.json."""
         mechanism, main = self.summary.mechanism, next(iter(self.errors_held_out.values()), (None, None))
         return json_value(
             {
@@ -618,8 +631,8 @@ class DiscoveryResult:
                 "rows": len(self.runs),
                 "rows_used": int(self.included.sum()),
                 **entries_of(self, "rows_unusable=unusable", "rows_outliers=outliers"),
-                "effects": [_effect(e, self.support) for e in self.effects]
-                + ([] if self.unnamed is None else [_unnamed(self.unnamed)]),
+                "effects": [_effect_json(e, self.support) for e in self.effects]
+                + ([] if self.unnamed is None else [_unnamed_json(self.unnamed)]),
                 **entries_of(self, "next_experiment", "remains", "cannot_see", "needs_series=needs_histories"),
                 "needs_reverse": self.needs_reverse,
                 **self.detail.to_json(),
@@ -643,7 +656,7 @@ class DiscoveryResult:
                     "written": "found" if self.written else "refit",
                 },
                 "adequate": entries_of(self, "before=before.adequate", "after=after.adequate"),
-                "evidence": {"before": _evidence(self.before), "after": _evidence(self.after)},
+                "evidence": {"before": _evidence_json(self.before), "after": _evidence_json(self.after)},
                 "chi2": {
                     "before": self.chi2[0],
                     "after": self.chi2[1],
@@ -660,7 +673,9 @@ class DiscoveryResult:
         )
 
     def rows_table(self) -> Columns:
-        """Table by row: conditions, readings measured, simulated before and after and held out, defects if known."""
+        """Table with one line for each row: conditions, readings (measured, simulated without and with the proposal,
+        held out), and errors of balances if known.
+        """
         readings = self.readings_of_rows
         known_columns = ("run_id", *WHEN, "configuration", *self.runs.axes, *DRIVING)
         table = {"row": self.numbers, **{k: self.runs[k] for k in known_columns if self.runs.has(k)}}
@@ -687,14 +702,15 @@ class DiscoveryResult:
         return table
 
     def save(self, folder: Path | str, robot_name: str = "", tables: str = "csv") -> None:
-        """Write `result.json`, `rows.csv`, `posterior.nc`, `robot.toml` and `fitted.toml` (with nothing added).
+        """Writes `result.json`, `rows.csv`, `posterior.nc`, `robot.toml` and `fitted.toml` (the refit without
+        additions).
 
-        `robot_track.toml` is also written if the track model was run.
+        If the track model was run, it also writes `robot_track.toml`.
 
         Args:
-            folder: created if missing.
+            folder: folder for the files, created if missing.
             robot_name: name of the initial robot.
-            tables: as for `write_table`.
+            tables: formats, as in `write_table`.
         """
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
@@ -710,17 +726,17 @@ class DiscoveryResult:
 
 
 @dataclasses.dataclass(frozen=True)
-class Sensitivity:
-    """Verdict with another noise.
+class NoiseVerdict:
+    """Verdict at another noise level.
 
     Attributes:
         factor: factor on the assumed noise.
-        near: True if its fits are a few Gauss-Newton steps from those with the assumed noise, for the same sets.
+        near: True if its fits start from those at the assumed noise and take a few Gauss-Newton steps.
     """
 
     factor: float
     verdict: str
-    summary: Summary
+    summary: VerdictSummary
     classes: tuple[Names, ...]
     adequate_after: bool
     near: bool = False
@@ -736,7 +752,7 @@ class Sensitivity:
         return entries | ({"near": True} if self.near else {})
 
 
-def _effect(e: FoundEffect, support: NameSupport | None) -> Json:
+def _effect_json(e: FoundEffect, support: NameSupport | None) -> Json:
     test = None if support is None else support.test_of(e.name)
     return {
         "name": e.name,
@@ -756,7 +772,7 @@ def _effect(e: FoundEffect, support: NameSupport | None) -> Json:
     }
 
 
-def _unnamed(d: UnnamedDiscrepancy) -> Json:
+def _unnamed_json(d: UnnamedDiscrepancy) -> Json:
     return {
         "name": "unnamed",
         "class": [],
@@ -771,6 +787,6 @@ def _unnamed(d: UnnamedDiscrepancy) -> Json:
     }
 
 
-def _evidence(e: Evidence) -> Json:
+def _evidence_json(e: Evidence) -> Json:
     kinds = {name: {"found": k.found, "threshold": k.threshold, "p": k.p} for name, k in e.kinds.items()}
     return {**kinds, "p_value": e.p_value}

@@ -1,11 +1,10 @@
-"""Sizes of effects on a rig: the library's priors are for the nominal robot and are scaled to the rig's size.
+"""Scale of the library's priors: they are stated for the nominal robot and are scaled to the size of a rig.
 
 A loss of 0.7 mN·m is a fifth of the friction of a motor of 60 W and negligible in one of 1 kW. The share of a term in
 its balance carries over from rig to rig. So the prior sd of an amplitude is scaled: a term of one sd has the same
-share of its balance at the rig's operating points as on the nominal robot over Table 8. A shape parameter
-that is a speed or a current is scaled with those of the rig. The limits of an amplitude hold up to the motors' rated
-values. Otherwise a saturation visible at a tenth of the rated current would leave no torque constant at the rated
-one.
+share of its balance at the rig's operating points as on the nominal robot over Table 8. A shape parameter that is a
+speed or a current is scaled with those of the rig. The limits of an amplitude hold up to the motors' rated values.
+Otherwise a saturation visible at a tenth of the rated current would leave no torque constant at the rated one.
 """
 
 from __future__ import annotations
@@ -87,42 +86,42 @@ LOADS = (
 SPEEDS = ("speed_motor", "speed_wheel", "speed_theoretical", "speed", "speed_output")
 
 
-def library_of_size(robot: Robot, conditions: Conditions, library: Library, turned: float = math.nan) -> Library:
-    """`library` with priors of a rig's size. Unchanged for robots that inherit the nominal one.
+def scale_library(robot: Robot, conditions: Conditions, library: Library, turned: float = math.nan) -> Library:
+    """The library with priors scaled to a rig. Unchanged for robots that are variants of the nominal one.
 
     Args:
         robot: robot of the rig.
-        conditions: conditions of its table, shape (runs,).
-        turned: rotation of its output, see `output_rotation`. NaN: not known.
+        conditions: conditions of its runs, shape (runs,).
+        turned: rms angle of its output [rad], see `output_rotation`. NaN: unknown.
     """
     if robot.rig.inherits:
         return library
-    signals = _signals(robot, _steady_conditions(robot, conditions))
-    nominal, theirs = _nominal()
+    signals = _operating_signals(robot, _steady_conditions(robot, conditions))
+    nominal, theirs = _nominal_signals()
     sized = {}
     for name, kind in library.items():
         if not effect_applies(kind, robot):
             continue
         sized[name] = _scale_effect(
-            kind, (robot, _at_position(signals, kind, turned)), (nominal, _at_position(theirs, kind))
+            kind, (robot, _signals_at_angle(signals, kind, turned)), (nominal, _signals_at_angle(theirs, kind))
         )
     return sized
 
 
 @contextlib.contextmanager
-def nominal_ahead(robot: Robot) -> Iterator[None]:
-    """Context that computes the nominal robot's signals for `library_of_size` on another core.
+def compute_nominal_ahead(robot: Robot) -> Iterator[None]:
+    """Context manager that computes the nominal robot's signals for `scale_library` on another core.
 
-    It waits for them also after an error: a thread at work in XLA aborts a process that ends.
+    It waits for them even after an error, because a process that ends while a thread works in XLA would abort.
     """
     with Threads(1) as core:
         if not robot.rig.inherits:
-            core.submit(in_double(_nominal))
+            core.submit(in_double(_nominal_signals))
         yield
 
 
 def output_rotation(runs: Runs, robot: Robot) -> float:
-    """Root mean square of the output's angles in a table [rad], NaN without such a channel."""
+    """rms angle of the output over a table [rad]. NaN if no channel measures it."""
     measured_values = runs.measured()
     for k, channel in enumerate(runs.channels):
         if channel.name in PLACED and math.isfinite(size := _rms_size(measured_values[:, k])):
@@ -130,8 +129,10 @@ def output_rotation(runs: Runs, robot: Robot) -> float:
     return math.nan
 
 
-def _at_position(signals: Signals, kind: type[Effect], turned: float | None = None) -> Signals:
-    """Signals with an effect of position at an angle, by default its reference angle. Unchanged for other effects."""
+def _signals_at_angle(signals: Signals, kind: type[Effect], turned: float | None = None) -> Signals:
+    """Signals at which an effect that depends on position is evaluated, by default at its reference angle. Unchanged
+    for other effects.
+    """
     if kind.driver != "position" or kind.memory_size is None:
         return signals
     positions = jnp.full(jnp.shape(signals.speed_motor), kind.memory_size if turned is None else turned)
@@ -139,7 +140,7 @@ def _at_position(signals: Signals, kind: type[Effect], turned: float | None = No
 
 
 def effect_applies(kind: type[Effect], robot: Robot) -> bool:
-    """True if a rig has the balance that an effect enters, and the parts that it needs there."""
+    """True if a rig has the balance that an effect enters, and the parts that the effect needs."""
     if kind.balance in absent_balances(robot) or (not robot.has_ground and (kind.movers or kind.needs_belt)):
         return False
     if kind.driver == "position" and not set(PLACED) & set(robot.rig.channels):
@@ -148,32 +149,34 @@ def effect_applies(kind: type[Effect], robot: Robot) -> bool:
 
 
 def _steady_conditions(robot: Robot, conditions: Conditions) -> Conditions:
-    """Conditions at one instant of each run, for conditions that may change over time."""
+    """Conditions at one instant in the middle of each run, where they may vary in time."""
     return jax.tree.map(lambda x: x if jnp.ndim(x) < 2 else x[:, x.shape[1] // 2], conditions)
 
 
-def _signals(robot: Robot, conditions: Conditions) -> Signals:
-    return results_of_rows(robot, conditions)[1] if conditions.turns else _travelling(robot, conditions)
+def _operating_signals(robot: Robot, conditions: Conditions) -> Signals:
+    return (
+        results_of_rows(robot, conditions)[1] if conditions.turns else _operating_signals_of_travel(robot, conditions)
+    )
 
 
 @functools.partial(compiled, options=OVER_TIME)
-def _travelling(robot: Robot, conditions: Conditions) -> Signals:
+def _operating_signals_of_travel(robot: Robot, conditions: Conditions) -> Signals:
     return jax.vmap(lambda c: operating_signals(robot, c))(conditions)
 
 
 @functools.cache
-def _nominal() -> tuple[Robot, Signals]:
-    """The nominal robot and its signals over Table 8."""
+def _nominal_signals() -> tuple[Robot, Signals]:
+    """The nominal robot and its signals under the conditions of Table 8."""
     robot = params.without_weak_types(paper_robots.nominal())
     axes = np.meshgrid(
         paper_robots.VOLTAGES_V, paper_robots.SLOPES_DEG, paper_robots.PAYLOADS_KG, (0, 1), indexing="ij"
     )
     volts, slopes, payloads, which = (a.ravel() for a in axes)
-    return robot, _signals(robot, Conditions(which.astype(int), volts, slopes, payloads))
+    return robot, _operating_signals(robot, Conditions(which.astype(int), volts, slopes, payloads))
 
 
 def _rms_size(x: object) -> float:
-    """Root mean square of the finite values other than zero, however small, NaN without any."""
+    """Root mean square of the finite nonzero values, however small. NaN if there are none."""
     sizes = np.abs(np.ravel(np.asarray(x, float)))
     sizes = sizes[np.isfinite(sizes) & (sizes > 0)]
     largest = np.max(sizes, initial=0.0)  # squares of less than 1e-162 are zero
@@ -181,12 +184,12 @@ def _rms_size(x: object) -> float:
 
 
 def _size_ratio(mine: float, theirs: float) -> float:
-    """Ratio of two sizes, 1 if one of them is NaN."""
+    """Ratio of two sizes. 1 if one of them is NaN."""
     return mine / theirs if math.isfinite(mine) and math.isfinite(theirs) else 1.0
 
 
 def _scale_effect(kind: type[Effect], mine: tuple[Robot, Signals], theirs: tuple[Robot, Signals]) -> type[Effect]:
-    """The effect with its priors scaled from one robot to another."""
+    """Effect class with priors scaled from one robot to another."""
     effect = kind()
     shape, amplitude = shape_of(effect), amplitude_of(effect)
     stretch = 1.0
@@ -200,7 +203,7 @@ def _scale_effect(kind: type[Effect], mine: tuple[Robot, Signals], theirs: tuple
     grown = effect if shape is None else params.replace(effect, {shape.name: jnp.asarray(stretch * shape.value)})
     factor, share = 1.0, _unit_share(grown, *mine)
     if kind.balance == "sensor":
-        share = min(share, _unit_share(grown, mine[0], _at_rated_load(*mine)) / LEAST_SHOWN)
+        share = min(share, _unit_share(grown, mine[0], _scale_to_rated_load(*mine)) / LEAST_SHOWN)
     if amplitude.spec.unit == BALANCES[kind.balance][0]:  # by its own size, even if operating points show none
         whole = WHOLE[kind.balance]
         factor = _size_ratio(_rms_size(whole(*mine)), _rms_size(whole(*theirs)))
@@ -210,7 +213,7 @@ def _scale_effect(kind: type[Effect], mine: tuple[Robot, Signals], theirs: tuple
     factor *= SLIPPERY if slips else 1.0 if kind.balance == "mass" else UNKNOWN
     limits = factor
     if kind.balance != "sensor":
-        rated = _unit_share(grown, mine[0], _at_rated_load(*mine))
+        rated = _unit_share(grown, mine[0], _scale_to_rated_load(*mine))
         limits = factor * min(1.0, _size_ratio(share, rated))
     else:
         low, high = amplitude_of(grown).spec.bounds
@@ -218,8 +221,8 @@ def _scale_effect(kind: type[Effect], mine: tuple[Robot, Signals], theirs: tuple
     return scaled_effect(kind, (float(factor), float(stretch), float(limits)))
 
 
-def _at_rated_load(robot: Robot, signals: Signals) -> Signals:
-    """Operating points of a rig, scaled up to the largest load and speed of its motors.
+def _scale_to_rated_load(robot: Robot, signals: Signals) -> Signals:
+    """Signals of a rig's operating points, scaled up to the largest load and speed of its motors.
 
     That load is at the continuous current, or at a share of the stall current if resistance and voltage are known.
     """
@@ -237,7 +240,7 @@ def _at_rated_load(robot: Robot, signals: Signals) -> Signals:
 
 
 def _unit_share(effect: Effect, robot: Robot, signals: Signals) -> float:
-    """Share of a term of amplitude one in its balance [1/unit of the amplitude]."""
+    """Share of the balance that the effect's term has at amplitude one [1/unit of the amplitude]."""
     one = params.replace(effect, {amplitude_of(effect).name: jnp.asarray(1.0)})
     robot_with_effect = dataclasses.replace(robot, effects=(one,))
 

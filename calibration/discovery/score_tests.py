@@ -1,9 +1,9 @@
-"""Score tests of residuals for every effect, and for every smooth curve in a balance.
+"""Score tests of a fit's residuals: for every effect, every smooth curve in a balance, and every single reading.
 
 Everything is linear algebra at one fit. It has whitened residuals e (readings, the limit on adhesion, priors) and
 their Jacobian J by the free parameters. An effect has the signature g = ∂e/∂a. After the free parameters have been
-fitted again, r = (I - P) g remains of g, with P = J (JᵀJ)⁻¹ Jᵀ. The score of the effect is (r·e)² / ‖r‖², χ²
-with one degree of freedom under the null hypothesis (Rao 1948).
+fitted again, r = (I - P) g remains of g, with P = J (JᵀJ)⁻¹ Jᵀ. The score of the effect is (r·e)² / ‖r‖², χ² with one
+degree of freedom under the null hypothesis (Rao 1948).
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from jaxtyping import Array, Float
 
 from calibration.inference.bases import Bases, place_signature
 from calibration.inference.linearization import Linearization, ScoredEffect
-from calibration.inference.optimizers import CORES, with_roots
+from calibration.inference.optimizers import CORES, with_solved_rows
 from calibration.inference.problem import Problem
 from mmrjax.compile.compiling import SELDOM, SMALL, compiled
 from mmrjax.compile.precision import Threads
@@ -42,19 +42,19 @@ CHUNK = 64
 
 
 class ScoreTable(eqx.Module):
-    """Scores of candidates on a fit's residuals.
+    """Scores of effects, pairs, curves and readings on the residuals e of a fit. r is a projected signature.
 
     Attributes:
-        single: signed root of each instance's score, -(r·e)/‖r‖, shape (instances,).
-        amplitude: -(r·e)/‖r‖², in prior sds.
-        left: ‖r‖, the change of the readings by a prior sd in sigmas.
-        pair: scores of pairs of instances (χ² with two degrees of freedom), shape (instances, instances).
-            Zero if they can't be separated.
-        cosine: cosine between two projected signatures.
-        curve: curve of each family, as a normal deviate, shape (families,).
+        single: signed square root of the score of each instance, -(r·e)/‖r‖, shape (instances,).
+        amplitude: estimated amplitude of each instance, -(r·e)/‖r‖² [prior sds].
+        left: ‖r‖, change of the readings per prior sd of the amplitude [σ].
+        pair: score of each pair of instances (χ² with two degrees of freedom), shape (instances, instances). Zero if
+            the two cannot be separated.
+        cosine: cosine of the angle between every two projected signatures.
+        curve: score of each family of curves as a normal deviate, shape (families,).
         explained: ridge score of each family [σ²].
-        row: signed root of the score of a shift of each single reading, shape (rows, channels).
-        fall: further decrease of the objective predicted by a step of the fit [½σ²].
+        row: signed square root of the score of a shift of each single reading, shape (rows, channels).
+        fall: decrease of the objective that a further step of the fit would give [½σ²].
     """
 
     single: Float[Array, " instances"]
@@ -68,8 +68,8 @@ class ScoreTable(eqx.Module):
     fall: Float[Array, ""]
 
 
-class Fit(eqx.Module):
-    """Factors of a fit for projections, L Lᵀ = JᵀJ.
+class ProjectionFactors(eqx.Module):
+    """Factors for projections at a fit with Jacobian J and residuals e, where L Lᵀ = JᵀJ.
 
     Attributes:
         half: L⁻¹ Jᵀ of the readings, shape (coordinates, readings).
@@ -82,23 +82,23 @@ class Fit(eqx.Module):
     left: Float[Array, " readings"]
 
     @staticmethod
-    def of(linear: Linearization) -> Fit:
+    def of(linear: Linearization) -> ProjectionFactors:
         """Factors of a linearisation."""
         jacobian, e, readings = linear.jacobian, linear.residual, linear.readings
         right_sides = jnp.concatenate([jacobian[:readings].T, (jacobian.T @ e)[:, None]], 1)
         solved = solve_lower(jacobian.T @ jacobian, right_sides)
         half, step = solved[:, :-1], solved[:, -1]
-        return Fit(half, step, e[:readings] - half.T @ step)
+        return ProjectionFactors(half, step, e[:readings] - half.T @ step)
 
     def projected(self, columns: Array) -> tuple[Array, Array]:
-        """Projected columns over the readings: their products with e, and those with each other."""
+        """Products of projected columns with e, and with each other."""
         inside = self.half @ columns
         return columns.T @ self.left, columns.T @ columns - inside.T @ inside
 
 
 def score_tests(linear: Linearization, bases: Bases) -> ScoreTable:
-    """Scores of each instance, pair, curve and reading."""
-    g, fit = linear.signatures, Fit.of(linear)
+    """Scores of each instance, pair of instances, curve and reading."""
+    g, fit = linear.signatures, ProjectionFactors.of(linear)
     dots, products = fit.projected(g)
     total_norm = jnp.sum(g**2, 0)
     norm2 = jnp.maximum(jnp.diag(products), 0.0)
@@ -124,10 +124,10 @@ def score_tests(linear: Linearization, bases: Bases) -> ScoreTable:
     return ScoreTable(single, amplitude, jnp.sqrt(norm2), pair, cosine, deviate, explained, row, fall)
 
 
-def _curve_score(fit: Fit, columns: Array) -> tuple[Array, Array]:
-    """(rᵀe)ᵀ (rᵀr + I)⁻¹ (rᵀe), as a normal deviate and in σ².
+def _curve_score(fit: ProjectionFactors, columns: Array) -> tuple[Array, Array]:
+    """Score (rᵀe)ᵀ (rᵀr + I)⁻¹ (rᵀe) of several columns, as a normal deviate and in σ².
 
-    The columns are scaled so that each one changes the readings by ten sigmas, as a prior of the discrepancy's size.
+    The columns are scaled so that each changes the readings by ten sigmas, which acts as a prior on their size.
     """
     dots, products = fit.projected(columns)
     norm2 = jnp.diag(products)
@@ -145,11 +145,11 @@ def _curve_score(fit: Fit, columns: Array) -> tuple[Array, Array]:
 
 
 def normal_deviate(chi2: Array, freedom: Array) -> Array:
-    """Standard normal deviate with the same p-value as χ² with so many degrees of freedom, [-].
+    """Standard normal deviate that has the same p-value as a χ² with this many degrees of freedom [-].
 
-    Modified signed root, Barndorff-Nielsen (1986), of a gamma distribution: within 0.03 from 1 to 20 degrees of
-    freedom and for any p-value. Wilson and Hilferty's cube root gives much too little for a large χ² with few degrees
-    of freedom. The cube root is used near the mean, where the root is 0/0.
+    Modified signed root of a gamma distribution (Barndorff-Nielsen 1986). It is accurate to 0.03 from 1 to 20 degrees
+    of freedom, for any p-value. The cube root of Wilson and Hilferty is much too small for a large χ² with few
+    degrees of freedom. It is used only near the mean, where the signed root is 0/0.
     """
     x, k = jnp.maximum(chi2, 1e-12) / 2, freedom / 2
     spread = 1 / (9 * k)
@@ -160,8 +160,8 @@ def normal_deviate(chi2: Array, freedom: Array) -> Array:
     return jnp.where(near, cube, root + jnp.log((x - k) / jnp.sqrt(k) / root) / root)
 
 
-class Statistics(eqx.Module):
-    """Strongest statistics: |single|, pair [σ²], curve [normal deviate], χ² and memory of the residuals.
+class StrongestStatistics(eqx.Module):
+    """Strongest statistics of a fit: |single|, pair [σ²], curve [normal deviate], and χ² and memory of the residuals.
 
     `settled` is True if the fit is an optimum. `white` is `Linearization.memory`.
     """
@@ -174,9 +174,9 @@ class Statistics(eqx.Module):
     settled: Array
 
 
-def strongest_statistics(scores: ScoreTable, linear: Linearization) -> Statistics:
-    """Largest statistics of a table. A bootstrap draws their distribution."""
-    return Statistics(
+def strongest_statistics(scores: ScoreTable, linear: Linearization) -> StrongestStatistics:
+    """Largest statistic of each kind."""
+    return StrongestStatistics(
         jnp.max(jnp.abs(scores.single)),
         jnp.max(scores.pair),
         jnp.max(scores.curve),
@@ -186,20 +186,20 @@ def strongest_statistics(scores: ScoreTable, linear: Linearization) -> Statistic
     )
 
 
-Diagnosed = tuple[Linearization, ScoreTable, Statistics]
+Diagnosed = tuple[Linearization, ScoreTable, StrongestStatistics]
 
 
 def diagnose_fit(
     problem: Problem, z: Array, effects: tuple[ScoredEffect, ...], bases: Bases, near: Linearization | None = None
 ) -> Diagnosed:
-    """A linearised fit, the scores of effects and curves on its residuals, and the strongest of these.
+    """Linearization of a fit, scores of effects and curves on its residuals, and the strongest statistics.
 
     Args:
-        near: linearization of a fit nearby. Its signatures and defects are reused for long runs, because a curve
-            changes the residuals, but barely the signatures.
+        near: linearization of a similar fit. For long runs, its sensitivities to effects are reused, because an added
+            curve hardly changes them.
     """
     if not problem.observe.long:
-        linear = _linearised(with_roots(problem, z), z, effects)
+        linear = _linearised(with_solved_rows(problem, z), z, effects)
     elif near is None:  # by separate programs
         linear = problem.observe.linearise(problem, z, problem.data, effects)
     else:
@@ -213,10 +213,10 @@ def _linearised(problem: Problem, z: Array, effects: tuple[ScoredEffect, ...]) -
     return problem.observe.linearise(problem, z, problem.data, effects)
 
 
-def _padded_scores(linear: Linearization, bases: Bases) -> tuple[ScoreTable, Statistics]:
-    """Scores and the strongest of them, by a program that serves fits of any number of coordinates.
+def _padded_scores(linear: Linearization, bases: Bases) -> tuple[ScoreTable, StrongestStatistics]:
+    """Scores of a fit and the strongest of them, by a program that serves any number of coordinates.
 
-    Coordinates are padded by ones without influence on the readings, so that there are few sizes.
+    The coordinates are padded with ones that do not influence the readings, so that only a few sizes are compiled.
     """
     filled = np.zeros((linear.readings, -linear.jacobian.shape[1] % FILLED))
     jacobian, residual = augment_with_columns(linear, filled)
@@ -225,13 +225,14 @@ def _padded_scores(linear: Linearization, bases: Bases) -> tuple[ScoreTable, Sta
 
 
 @functools.partial(compiled, options=SELDOM)
-def _scores_and_strongest(linear: Linearization, bases: Bases) -> tuple[ScoreTable, Statistics]:
+def _scores_and_strongest(linear: Linearization, bases: Bases) -> tuple[ScoreTable, StrongestStatistics]:
     scores = score_tests(linear, bases)
     return scores, strongest_statistics(scores, linear)
 
 
 def family_columns(linear: Linearization, bases: Bases, chosen: int) -> np.ndarray:
-    """Signatures of one family's columns, each of a wide prior sd, shape (readings, terms).
+    """Sensitivity of the readings to each term of one family of curves, scaled by a wide prior sd, shape (readings,
+    terms).
 
     Args:
         chosen: index of the family, in the order of `ScoreTable.curve`.
@@ -247,7 +248,7 @@ def family_columns(linear: Linearization, bases: Bases, chosen: int) -> np.ndarr
 
 
 def augment_with_columns(linear: Linearization, extra: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Jacobian and residuals of a fit with further columns, each with prior mean 0 and sd 1.
+    """Jacobian and residuals of a fit with additional columns, each with prior mean 0 and sd 1.
 
     Args:
         extra: columns over the readings, shape (readings, columns).
@@ -263,20 +264,21 @@ def augment_with_columns(linear: Linearization, extra: np.ndarray) -> tuple[np.n
 
 def statistics_with_columns(
     linear: Linearization, bases: Bases, extra: np.ndarray, names: Sequence[str]
-) -> tuple[Statistics, np.ndarray]:
-    """Strongest statistics after further columns are fitted with the free parameters, and the normal deviate of each
-    family of curves, -inf for families in the columns' own places.
+) -> tuple[StrongestStatistics, np.ndarray]:
+    """Strongest statistics after additional columns are fitted together with the free parameters.
+
+    Also returns the normal deviate of each family of curves, -inf for families in the places of the columns.
 
     Args:
         extra: columns over the readings, shape (readings, columns).
-        names: places of the columns.
+        names: place of each column.
     """
     wide: tuple[Any, Any] = augment_with_columns(linear, extra)
     scores, _ = _padded_scores(dataclasses.replace(linear, jacobian=wide[0], residual=wide[1]), bases)
     balances = np.array([n[0] for b in bases for n in b.names])
     deviate = np.where(np.isin(balances, list(names)), -np.inf, np.asarray(scores.curve))
     nothing = jnp.asarray(-jnp.inf)
-    statistics = Statistics(
+    statistics = StrongestStatistics(
         single=np.max(np.abs(np.asarray(scores.single))),
         pair=np.max(np.asarray(scores.pair)),
         curve=np.max(deviate, initial=-np.inf),
@@ -289,12 +291,12 @@ def statistics_with_columns(
 
 @functools.partial(compiled, options=SELDOM)
 def _replicate_keys(seed: Array, batches: int, replicates: int) -> Array:
-    """A key for each replicate, shape (replicates, 2)."""
+    """Random key of each bootstrap replicate, shape (replicates, 2)."""
     keys = jax.random.key_data(jax.random.split(jax.random.key(seed), (batches, CHUNK)))
     return keys.reshape(batches * CHUNK, -1)[:replicates]
 
 
-def bootstrap(
+def bootstrap_statistics(
     problem: Problem,
     z: np.ndarray,
     linear: Linearization,
@@ -303,17 +305,18 @@ def bootstrap(
     replicates: int,
     seed: int,
     freedom: np.ndarray | None = None,
-) -> Statistics:
-    """Statistics of `replicates` tables drawn from the fitted base and fitted again, shape (replicates,).
+) -> StrongestStatistics:
+    """Statistics of tables that are drawn from the fitted base and refitted, shape (replicates,).
 
-    Replicates with a refit that did not settle are omitted, so there may be fewer.
+    Replicates whose refit does not converge are omitted, so there may be fewer.
 
     Args:
-        problem: problem of the base only, z its fit.
-        linear: the same fit, linearised.
+        problem: problem of the base.
+        z: coordinates of its fit.
+        linear: linearization of that fit.
         seed: random seed.
-        freedom: degrees of freedom of each channel's estimated sd, infinite if it is known, None if all are known.
-            Each table is drawn with random true sds, given such estimates.
+        freedom: degrees of freedom of the estimated sd of each channel, infinite if the sd is known. None: all are
+            known. The true sds of each table are drawn given these estimates.
     """
     count = -(-replicates // CHUNK)
     draws = problem.observe.draws(
@@ -323,19 +326,19 @@ def bootstrap(
     # Padded to whole batches by repeats, which are cut off later.
     draws = jax.tree.map(lambda x: np.resize(np.asarray(x), (count, CHUNK, *x.shape[1:])), draws)
 
-    def part(k: int) -> Statistics:
+    def statistics_of_batch(k: int) -> StrongestStatistics:
         draws_of_part = jax.tree.map(lambda x: x[k], draws)
         return jax.device_get(_replicate_batch(problem, linear, effects, bases, draws_of_part))
 
     # The first batch compiles the program of the others; a batch keeps one core busy.
     with Threads(CORES) as cores:
-        parts = [part(0), *cores.map(part, range(1, count))]
+        parts = [statistics_of_batch(0), *cores.map(statistics_of_batch, range(1, count))]
     statistics = jax.tree.map(lambda *x: np.concatenate(x)[:replicates], *parts)
     return jax.tree.map(lambda x: x[statistics.settled], statistics)
 
 
 def _noise_factors(freedom: np.ndarray | None, channels: int, replicates: int, seed: int) -> np.ndarray:
-    """True sds over estimated ones, √(ν / χ²_ν), shape (replicates, channels)."""
+    """Random ratios of true to estimated sds, √(ν / χ²_ν), shape (replicates, channels)."""
     factors = np.ones((replicates, channels))
     if freedom is not None:
         random = np.random.default_rng(seed)
@@ -347,11 +350,11 @@ def _noise_factors(freedom: np.ndarray | None, channels: int, replicates: int, s
 @functools.partial(compiled, options=SMALL)
 def _replicate_batch(
     problem: Problem, linear: Linearization, effects: tuple[ScoredEffect, ...], bases: Bases, drawn: Any
-) -> Statistics:
-    """A batch of a bootstrap, from the observer's draws."""
+) -> StrongestStatistics:
+    """Statistics of one batch of bootstrap replicates."""
 
-    def one(drawn: Any) -> Statistics:
-        replicate = problem.observe.replicate(problem, problem.data, effects, linear, drawn)
+    def statistics_of_replicate(drawn: Any) -> StrongestStatistics:
+        replicate = problem.observe.fit_replicate(problem, problem.data, effects, linear, drawn)
         return strongest_statistics(score_tests(replicate, bases), replicate)
 
-    return jax.vmap(one)(drawn)
+    return jax.vmap(statistics_of_replicate)(drawn)

@@ -1,4 +1,4 @@
-"""Screening by regression for long runs: fits of sets of effects on the linearised equations of one fit.
+"""Screening for long runs: sets of effects are fitted to linearised equations before any of them is simulated.
 
 A signature is the derivative of the readings by an amplitude. With the signatures at one fit, a fit of any set of
 effects is a least-squares problem of a few unknowns. (Gautier and Khalil 1990 do so with torques, their inverse
@@ -23,7 +23,7 @@ from calibration.discovery.score_tests import ABSORBED, ScoreTable
 from calibration.discovery.settings import Settings
 from calibration.inference.linearization import Linearization
 from calibration.inference.optimizers import Optimum
-from calibration.inference.weak_form import WeakForm, weak_form
+from calibration.inference.weak_form import WeakFormFit, fit_weak_form
 
 #: Number of sets that are simulated in a round: the first by regression and its nearest rivals, one of them from
 #: another family.
@@ -46,13 +46,13 @@ ROOM, NEAR = 8, 5
 
 
 @dataclasses.dataclass(frozen=True)
-class Confirmed:
-    """Sets of effects after a round of screening.
+class ScreenedSets:
+    """Sets of effects after a round of screening, with the most promising ones simulated.
 
     Attributes:
-        candidates: candidates of every set, by simulation if available, else by regression.
-        asked: number of regressions that were simulated.
-        otherwise: number of these that explained less than the regression by more than `Settings.same`.
+        candidates: one candidate for each set: the simulated fit if there is one, otherwise the regression.
+        asked: number of sets that were simulated.
+        otherwise: number of these that explain less than their regression by more than `Settings.same`.
         room: names of the effects in the program of these fits, see `CandidateSpace`.
     """
 
@@ -62,8 +62,8 @@ class Confirmed:
     room: Names = ()
 
 
-class Regression:
-    """Fits of sets of effects on the linearisation of a fit.
+class LinearisedFits:
+    """Fits sets of effects to the linearised equations of one fit.
 
     Args:
         at: the fit.
@@ -74,7 +74,7 @@ class Regression:
         self,
         space: CandidateSpace,
         at: Candidate,
-        linear: Linearization | WeakForm,
+        linear: Linearization | WeakFormFit,
         scores: ScoreTable,
         settings: Settings,
     ) -> None:
@@ -83,7 +83,7 @@ class Regression:
         self.signatures = np.asarray(linear.signatures)
 
     def __call__(self, active: Names) -> Candidate:
-        """Candidate with these effects in the slots. New ones have the shape of their grid with the best score."""
+        """Candidate with these effects. New effects have the shape of their grid with the best score."""
         p, s, at = self.space.free, self.settings.slots, self.at
         size = self.jacobian.shape[1]  # residuals of the priors come last, in the order of the coordinates
         slopes, residual, prior_residual = self.jacobian[:-size], self.residual[:-size].copy(), self.residual[-size:]
@@ -118,13 +118,13 @@ class Regression:
         return dataclasses.replace(candidate_of_fit(self.space, active, optimum, self.settings), simulated=False)
 
 
-def confirm_by_simulation(space: CandidateSpace, screened: Sequence[Candidate], settings: Settings) -> Confirmed:
-    """Simulate the first sets of a round that was screened by regression.
+def confirm_by_simulation(space: CandidateSpace, screened: Sequence[Candidate], settings: Settings) -> ScreenedSets:
+    """Simulates the most promising sets of a round that was screened by regression.
 
-    These are the plausible set that explains most, its nearest rival, the nearest of another family, and any
-    implausible set that explains more. If the program has the first, rivals outside it stay regressions. If the first
-    explains less than its regression by more than `Settings.same` and `ANOTHER`, the simulation decides, and the next
-    by regression is tried too. Further sets must be in the program, or must promise more.
+    These are the best plausible set, its closest competitor, the closest one of another family, and any implausible
+    set that explains more. If the compiled program has the best set but not a competitor, that stays a regression. If
+    the best set explains less than its regression by more than `Settings.same` and `ANOTHER`, the simulation decides,
+    and the next best set is tried. Further sets must be in the program, or must promise more.
     """
     fits = lambda c: {*c.effects} <= {*space.room}  # noqa: E731
     # Sets outside the program need another program, and have to promise that much more. For verdicts at other noises
@@ -139,20 +139,20 @@ def confirm_by_simulation(space: CandidateSpace, screened: Sequence[Candidate], 
     space = space.with_room([*space.room, *(n for c in first for n in c.effects)])  # one program for all of them
     by_regression = {c.active: c for c in order}
 
-    def less(c: Candidate, by: float) -> bool:
+    def explains_less(c: Candidate, by: float) -> bool:
         return c.cost - by_regression[c.active].cost > by
 
     def simulate(those: Sequence[Candidate]) -> None:
-        """Simulate from the regression's coordinates.
+        """Simulates these sets from the coordinates of their regressions.
 
-        Sets that explain less there are repeated from the prior mean, unless that is near: a model error may have led
-        the fit without the effect elsewhere.
+        A set that then explains less is repeated from the prior mean, unless that is near, because without the effect
+        the fit may have gone astray.
         """
         fits = fit_candidates(space, [(c.active, _start_of_simulation(space, c)) for c in those], settings)
         simulated.update({c.active: c for c in fits})
         new = [c for c in those if c.active not in space.near]
         elsewhere = [c for c in new if np.abs(c.z[: space.free]).max() > BESIDE]
-        doubted = [c for c in elsewhere if less(simulated[c.active], more)]
+        doubted = [c for c in elsewhere if explains_less(simulated[c.active], more)]
         at_mean = [np.where(np.arange(len(c.z)) < space.free, 0.0, _start_of_simulation(space, c)) for c in doubted]
         refits = fit_candidates(space, [(c.active, z) for c, z in zip(doubted, at_mean, strict=True)], settings)
         simulated.update({c.active: c for c in refits if c.cost < simulated[c.active].cost})
@@ -163,25 +163,27 @@ def confirm_by_simulation(space: CandidateSpace, screened: Sequence[Candidate], 
         best = min((c.cost for c in simulated.values() if c.plausible), default=np.inf)
         not_simulated = [c for c in order if c.active not in simulated and c.plausible]
         promising = [c for c in not_simulated if c.cost < best or fits(c)]
-        if leader is None or not less(simulated[leader.active], more) or not promising:
+        if leader is None or not explains_less(simulated[leader.active], more) or not promising:
             break
         leader = promising[0]
         simulate([leader])
     confirmed = tuple(simulated.get(c.active, c) for c in screened)
-    return Confirmed(
-        confirmed, len(simulated), sum(less(c, settings.same / 2) for c in simulated.values()), space.room
+    return ScreenedSets(
+        confirmed, len(simulated), sum(explains_less(c, settings.same / 2) for c in simulated.values()), space.room
     )
 
 
 def _start_of_simulation(space: CandidateSpace, screened: Candidate) -> np.ndarray:
-    """Start of a simulation of a screened set: amplitudes limited to the largest step of a search."""
+    """Start of a simulation of a screened set: its regression, with amplitudes limited to the largest step of a
+    search.
+    """
     z, p, slots = screened.z.copy(), space.free, len(screened.active)
     z[p : p + slots] = np.clip(z[p : p + slots], -FAR, FAR)
     return z
 
 
 def _first_to_simulate(space: CandidateSpace, order: Sequence[Candidate]) -> list[Candidate]:
-    """Sets that are simulated first, from those sorted by what they explain."""
+    """Sets that are simulated first. `order`: the sets by what they explain."""
     families = lambda c: frozenset(space.library[n].family() for n in c.effects)  # noqa: E731
     sound = [c for c in order if c.plausible]
     if not sound:
@@ -193,17 +195,18 @@ def _first_to_simulate(space: CandidateSpace, order: Sequence[Candidate]) -> lis
 
 
 @dataclasses.dataclass(frozen=True)
-class Beforehand:
-    """Results of a log's equations in weak form before any simulation.
+class WeakFormScreening:
+    """Results from a log's equations in weak form, before any simulation.
 
     Attributes:
-        base: the fit without effects, by regression. None if the load may slide on its ground, which the
-            equations do not show, so that a search should not begin there.
-        room: effects in the program of all fits, if the equations show that one is missing and the log is `BRIEF`.
-        alone: fits of each effect alone, by regression, the lowest first. Empty if nothing is missing.
-        scores: scores of every instance.
+        base: fit without effects, by regression. None if the load may slide on its ground: the equations do not show
+            sliding, so a search must not start there.
+        room: effects for the program of all fits, if the equations show that one is missing and the log is `BRIEF`.
+        alone: fits with one effect each, by regression, the best first. Empty if nothing is missing.
+        scores: score of every instance.
         windows: number of equations.
-        null: root of the strongest score of tables under the null hypothesis [σ], shape (replicates,).
+        null: square root of the strongest score of bootstrap tables without a missing effect [σ], shape
+            (replicates,).
     """
 
     base: Candidate | None
@@ -214,11 +217,12 @@ class Beforehand:
     null: np.ndarray
 
 
-def screen_by_weak_form(space: CandidateSpace, settings: Settings) -> Beforehand | None:
-    """Base parameters and effects by regression on a log's equations in weak form, None if it does not show its
-    states (`weak_form`)."""
+def screen_by_weak_form(space: CandidateSpace, settings: Settings) -> WeakFormScreening | None:
+    """Fits base parameters and effects by regression on a log's equations in weak form. None if the log does not show
+    its states (`fit_weak_form`).
+    """
     problem = space.bare
-    equations = weak_form(problem, space.library.scored) if problem.observe.long else None
+    equations = fit_weak_form(problem, space.library.scored) if problem.observe.long else None
     if equations is None:
         return None
     q = np.linalg.qr(equations.jacobian)[0]
@@ -244,49 +248,55 @@ def screen_by_weak_form(space: CandidateSpace, settings: Settings) -> Beforehand
     slides = problem.base.has_ground and problem.base.rig.imposed == "voltage"
     missing = np.mean(null >= np.max(np.abs(single))) < settings.family_wise_error
     brief = problem.observe.times.size <= BRIEF  # type: ignore[attr-defined]  # of histories
-    alone = _each_alone(space, base, equations, scores, settings) if missing else ()
-    room = _program_room(space, alone, scores, settings) if missing and brief else ()
-    return Beforehand(None if slides else base, room, alone, scores, equations.windows, null)
+    alone = _fit_single_effects(space, base, equations, scores, settings) if missing else ()
+    room = _likely_effects(space, alone, scores, settings) if missing and brief else ()
+    return WeakFormScreening(None if slides else base, room, alone, scores, equations.windows, null)
 
 
 def fit_by_regression(
     space: CandidateSpace, wanted: Sequence[tuple[Names, Candidate, Diagnosis]], settings: Settings
 ) -> list[Candidate]:
-    """Sets of effects by regression, each in addition to another fit.
+    """Fits sets of effects by regression, each in addition to another fit.
 
     Args:
-        wanted: (active effects, the other fit, its diagnosis).
+        wanted: (active effects, other fit, its diagnosis).
     """
-    regressions = {id(left): Regression(space, at, left.linear, left.scores, settings) for _, at, left in wanted}
+    regressions = {id(left): LinearisedFits(space, at, left.linear, left.scores, settings) for _, at, left in wanted}
     return [regressions[id(left)](active) for active, _, left in wanted]
 
 
-def with_program_room(
+def include_likely_effects(
     space: CandidateSpace, base: Candidate, linear: Linearization, scores: ScoreTable, settings: Settings
 ) -> CandidateSpace:
-    """Space with a program for the effects that are likely, see `_program_room`.
+    """Candidate space whose program includes the effects that are likely to be needed, see `_likely_effects`.
 
-    Unchanged unless runs are long and their program is not known yet.
+    Unchanged unless the runs are long and the program is not chosen yet.
     """
     if not space.bare.observe.long or space.room:
         return space
-    alone = _each_alone(space, base, linear, scores, settings)
-    return space.with_room(_program_room(space, alone, scores, settings))
+    alone = _fit_single_effects(space, base, linear, scores, settings)
+    return space.with_room(_likely_effects(space, alone, scores, settings))
 
 
-def _each_alone(
-    space: CandidateSpace, base: Candidate, linear: Linearization | WeakForm, scores: ScoreTable, settings: Settings
+def _fit_single_effects(
+    space: CandidateSpace,
+    base: Candidate,
+    linear: Linearization | WeakFormFit,
+    scores: ScoreTable,
+    settings: Settings,
 ) -> tuple[Candidate, ...]:
-    """Fits of each effect alone, by regression, the lowest first."""
-    beside = Regression(space, base, linear, scores, settings)
+    """Fits with one effect each, by regression, the best first."""
+    beside = LinearisedFits(space, base, linear, scores, settings)
     return tuple(sorted((beside(fill_slots([name], settings)) for name in space.library.names), key=lambda c: c.cost))
 
 
-def _program_room(space: CandidateSpace, order: Sequence[Candidate], scores: ScoreTable, settings: Settings) -> Names:
-    """Effects to be simulated first, similar ones, and the best of other families.
+def _likely_effects(
+    space: CandidateSpace, order: Sequence[Candidate], scores: ScoreTable, settings: Settings
+) -> Names:
+    """Effects for the compiled program: those to be simulated first, similar ones, and the best of other families.
 
     Args:
-        order: fits of each effect alone, the lowest first.
+        order: fits with one effect each, the best first.
     """
     library = space.library
     first = [c.active[0] for c in _first_to_simulate(space, order)]

@@ -1,4 +1,4 @@
-"""Search for effects: single ones, then further ones in addition to the best, while the fit is rejected."""
+"""Search for effects: one at a time, in addition to the best set, as long as the residuals are significant."""
 
 from __future__ import annotations
 
@@ -20,26 +20,26 @@ from calibration.discovery.candidates import (
     fit_in_addition,
     start_of_fit,
 )
-from calibration.discovery.score_tests import ScoreTable, Statistics, diagnose_fit
-from calibration.discovery.screening import Confirmed, confirm_by_simulation, fit_by_regression
+from calibration.discovery.score_tests import ScoreTable, StrongestStatistics, diagnose_fit
+from calibration.discovery.screening import ScreenedSets, confirm_by_simulation, fit_by_regression
 from calibration.discovery.settings import Settings
 from calibration.inference.bases import Bases
-from calibration.inference.fit_notes import Remark, next_step
+from calibration.inference.fit_notes import Remark, progress_remark
 
 #: Largest number of pairs of instances that are examined for pairs of effects.
 PAIRS = 4000
 
 
 @dataclasses.dataclass(frozen=True)
-class Search:
-    """Outcome of the search.
+class SearchResult:
+    """Result of a search for effects.
 
     Attributes:
-        ladder: every candidate that was fitted.
-        best: the proposed one, None without a plausible one.
-        diagnosis: diagnosis of its residuals.
-        asked, otherwise: number of simulated sets that were screened by regression, and of unconfirmed ones
-            among them, see `screening.Confirmed`.
+        ladder: all candidates that were fitted.
+        best: proposed candidate. None if no candidate is plausible.
+        diagnosis: diagnosis of the proposed candidate.
+        asked, otherwise: number of simulated sets, and of those that simulation did not confirm, see
+            `screening.ScreenedSets`.
         room: effects in the program of these fits.
     """
 
@@ -52,9 +52,9 @@ class Search:
 
 
 def diagnose_candidate(
-    space: CandidateSpace, fitted: Candidate, bases: Bases, null: Statistics, settings: Settings
+    space: CandidateSpace, fitted: Candidate, bases: Bases, null: StrongestStatistics, settings: Settings
 ) -> Diagnosis:
-    """Diagnosis of a fit."""
+    """Linearises a candidate's fit and tests its residuals."""
     z = jnp.asarray(fitted.z)
     diagnosis = diagnose_fit(space.problem(fitted.active), z, space.library.scored, bases)
     linear, scores, statistics = jax.device_get(diagnosis)
@@ -68,22 +68,22 @@ def search_effects(
     bases: Bases,
     settings: Settings,
     progress: Callable[[Remark], None],
-) -> Search:
-    """Smallest set of effects that explains the discrepancy of the base to within the test's margin.
+) -> SearchResult:
+    """Smallest set of effects that explains the discrepancy of the base to within the margin of the test.
 
     Args:
-        base: the fit without effects.
-        left: its diagnosis.
+        base: fit without effects.
+        left: diagnosis of that fit.
     """
     names = _rank_by_score(space, left.scores)
     if not space.bare.observe.long:
-        names = names[: _batch(space)]
-    at, by = _linearised_fit(space, base, left, bases, settings)
+        names = names[: _batch_size(space)]
+    at, by = _fit_to_rank_at(space, base, left, bases, settings)
     rounds = [_fit_sets(space, [(fill_slots([name], settings), at, by) for name in names], settings)]
     space = space.with_room(rounds[0].room)
     ladder = list(rounds[0].candidates)
     null = np.asarray(left.test.null.single)
-    best, diagnosis, diagnosed = _best(ladder), None, None
+    best, diagnosis, diagnosed = _best_plausible(ladder), None, None
     if best is not None and single_p_value(2 * (base.cost - best.cost), null) > settings.family_wise_error:
         best = None
     while best is not None:
@@ -93,28 +93,28 @@ def search_effects(
             min(settings.slots, max(1, space.included.sum() // settings.rows_per_effect))
         ):
             break
-        progress(next_step("more effects", best.effects))
+        progress(progress_remark("more effects", best.effects))
         rounds.append(_extend_set(space, best, diagnosis, at, by, settings))
         more, space = list(rounds[-1].candidates), space.with_room(rounds[-1].room)
-        best = _accepted(_best(more), ladder, settings)
+        best = _accept_if_better(_best_plausible(more), ladder, settings)
         ladder += more
         if best is not None:
-            fewer = without_each(space, best, settings)
+            fewer = refit_without_each(space, best, settings)
             ladder += fewer
             gains = [2 * (c.cost - best.cost) for c in fewer]
             if any(single_p_value(gain, null) > settings.family_wise_error for gain in gains):
                 best = None
     simulated_count, otherwise = (sum(getattr(r, name) for r in rounds) for name in ("asked", "otherwise"))
-    return Search(tuple(ladder), diagnosed, diagnosis, simulated_count, otherwise, space.room)
+    return SearchResult(tuple(ladder), diagnosed, diagnosis, simulated_count, otherwise, space.room)
 
 
-def _linearised_fit(
+def _fit_to_rank_at(
     space: CandidateSpace, base: Candidate, left: Diagnosis, bases: Bases, settings: Settings
 ) -> tuple[Candidate, Diagnosis]:
-    """Fit whose linearised equations rank the effects, and its diagnosis.
+    """Fit at which the effects are ranked, and its diagnosis.
 
-    The base, unless it ends `UNLIKELY` far from its prior: the signatures there are no guide. Then the set that the
-    log's equations rank first, simulated from their coordinates.
+    It is the base fit, unless that is `UNLIKELY` far from its prior and its sensitivities mislead. Then it is the set
+    that the log's equations rank first, simulated from the coordinates of the equations.
     """
     if not space.begins or np.abs(base.z[: space.free]).max() <= UNLIKELY:
         return base, left
@@ -124,32 +124,34 @@ def _linearised_fit(
     return fitted, diagnose_candidate(space, fitted, bases, left.test.null, settings)
 
 
-def best_of_each_size(found: Search) -> list[Candidate]:
-    """Best plausible candidate of each number of effects, up to the number in the search's proposal."""
+def best_of_each_size(found: SearchResult) -> list[Candidate]:
+    """Best plausible candidate with each number of effects, up to that of the proposal."""
     if found.best is None:
         return []
     sizes = range(1, len(found.best.effects))
-    smaller = [_best([c for c in found.ladder if len(c.effects) == size]) for size in sizes]
+    smaller = [_best_plausible([c for c in found.ladder if len(c.effects) == size]) for size in sizes]
     return [*(c for c in smaller if c is not None), found.best]
 
 
 def single_p_value(gain: float, null: np.ndarray) -> float:
-    """Share of bootstrap tables in which the strongest single effect explains as much [σ²], never below
-    1 / (replicates + 1).
+    """p-value of a single effect: share of bootstrap tables in which the strongest effect explains as much.
+
+    At least 1 / (replicates + 1).
 
     Args:
-        null: root of its score in each table [σ].
+        gain: decrease of χ² by the effect [σ²].
+        null: square root of the strongest score of each bootstrap table [σ].
     """
     return (1 + int(np.sum(null**2 >= gain))) / (1 + len(null))
 
 
-def without_each(
+def refit_without_each(
     space: CandidateSpace, best: Candidate, settings: Settings, ladder: Sequence[Candidate] = ()
 ) -> list[Candidate]:
-    """The candidate without each of its effects in turn, refitted. Those that remain take the first slots.
+    """Refits a candidate without each of its effects in turn. The remaining effects are in the first slots.
 
     Args:
-        ladder: known fits, which are not repeated.
+        ladder: fits that are already known.
     """
     fewer = [fill_slots([n for n in best.effects if n != name], settings) for name in best.effects]
     simulated = {c.active: c for c in ladder if c.simulated}
@@ -161,7 +163,7 @@ def without_each(
 
 
 def _rank_by_score(space: CandidateSpace, scores: ScoreTable, without: Sequence[str] = ()) -> list[str]:
-    """Effects by their best |score|, the strongest first. Those in `without` come last."""
+    """Names of effects by their best |score|, strongest first. Effects in `without` are last."""
     strength = space.library.largest(np.abs(np.asarray(scores.single)))
     strength[list(space.library.indices(without))] = 0.0
     return [space.library.names[k] for k in np.argsort(-strength)]
@@ -169,15 +171,14 @@ def _rank_by_score(space: CandidateSpace, scores: ScoreTable, without: Sequence[
 
 def _fit_sets(
     space: CandidateSpace, wanted: Sequence[tuple[Names, Candidate, Diagnosis]], settings: Settings
-) -> Confirmed:
-    """Sets of effects, each in addition to another fit and its diagnosis. For long runs first screened by
-    regression."""
+) -> ScreenedSets:
+    """Fits sets of effects, each in addition to another fit. For long runs they are first screened by regression."""
     if not space.bare.observe.long:
-        return Confirmed(tuple(fit_in_addition(space, [(w, at, by.scores) for w, at, by in wanted], settings)))
+        return ScreenedSets(tuple(fit_in_addition(space, [(w, at, by.scores) for w, at, by in wanted], settings)))
     return confirm_by_simulation(space, fit_by_regression(space, wanted, settings), settings)
 
 
-def _batch(space: CandidateSpace) -> int:
+def _batch_size(space: CandidateSpace) -> int:
     return space.bare.observe.policy.batch
 
 
@@ -188,20 +189,20 @@ def _extend_set(
     at: Candidate,
     left: Diagnosis,
     settings: Settings,
-) -> Confirmed:
-    """Sets with one more effect than the best, and pairs for another fit if that is the base."""
-    names = _rank_by_score(space, left_by_best.scores, best.effects)[: _batch(space)]
+) -> ScreenedSets:
+    """Fits the best set with one more effect and, if the best is the base, also pairs of effects."""
+    names = _rank_by_score(space, left_by_best.scores, best.effects)[: _batch_size(space)]
     sources = {fill_slots([*best.effects, name], settings): (best, left_by_best) for name in names}
     if len(best.effects) == 1 and not at.effects:
-        for pair in _pair_batch(space, left.scores):
+        for pair in _best_pairs(space, left.scores):
             one, swapped = fill_slots(pair, settings), fill_slots(pair[::-1], settings)
             if one not in sources and swapped not in sources:
                 sources[one] = (at, left)
     return _fit_sets(space, [(w, at, by) for w, (at, by) in sources.items()], settings)
 
 
-def _pair_batch(space: CandidateSpace, scores: ScoreTable) -> list[tuple[str, str]]:
-    """One batch of pairs of effects by their joint score, the strongest first."""
+def _best_pairs(space: CandidateSpace, scores: ScoreTable) -> list[tuple[str, str]]:
+    """As many pairs of effects as fit in one batch, by their joint score, strongest first."""
     effect, names = space.library.of, space.library.names
     pair = np.triu(np.asarray(scores.pair))
     pairs: list[tuple[str, str]] = []
@@ -209,18 +210,18 @@ def _pair_batch(space: CandidateSpace, scores: ScoreTable) -> list[tuple[str, st
         i, j = sorted((int(effect[flat // len(effect)]), int(effect[flat % len(effect)])))
         if i != j and (names[i], names[j]) not in pairs:
             pairs.append((names[i], names[j]))
-        if len(pairs) == _batch(space):
+        if len(pairs) == _batch_size(space):
             break
     return pairs
 
 
-def _best(candidates: Sequence[Candidate]) -> Candidate | None:
+def _best_plausible(candidates: Sequence[Candidate]) -> Candidate | None:
     sound = [c for c in candidates if c.plausible and c.simulated and np.isfinite(c.cost)]
     return min(sound, key=lambda c: c.cost) if sound else None
 
 
-def _accepted(c: Candidate | None, ladder: Sequence[Candidate], settings: Settings) -> Candidate | None:
-    """The candidate, if it explains clearly more than any candidate with one effect fewer."""
+def _accept_if_better(c: Candidate | None, ladder: Sequence[Candidate], settings: Settings) -> Candidate | None:
+    """The candidate, if it explains clearly more than every candidate with one effect fewer. Otherwise None."""
     if c is None:
         return None
     fewer = [x.cost for x in ladder if len(x.effects) == len(c.effects) - 1 and x.plausible]

@@ -1,4 +1,4 @@
-"""Statistical constants of the closed loop, recorded in one place."""
+"""Statistical constants of the closed loop."""
 
 from __future__ import annotations
 
@@ -30,36 +30,37 @@ class Settings:
 
     Attributes:
         shares: family-wise error by kind of evidence.
-        margins: see `MARGINS`.
-        replicates: replicates of the bootstrap.
+        margins: margins by kind of evidence, see `MARGINS`.
+        replicates: number of bootstrap tables.
         seed: random seed.
         slots: largest number of effects in a fit.
-        rows_per_effect: rows that each needs.
-        width: prior sd of an amplitude in a fit, in sds of its field: wide enough not to shrink a visible effect.
-        plausible: largest plausible amplitude in sds of its field.
-        stretched: factor on that for effects listed next to a plausible one of their family, because their
-            size is equally uncertain.
-        visible: least change of the readings by the largest plausible amplitude of a visible effect [σ].
+        rows_per_effect: number of rows required for each effect.
+        width: prior sd of an amplitude in a fit, relative to the sd of its field. It is wide enough not to shrink a
+            visible effect.
+        plausible: largest plausible amplitude, in sds of its field.
+        stretched: factor on the largest plausible amplitude for alternatives of the same family, because their size
+            is uncertain too.
+        visible: an effect is visible if its largest plausible amplitude changes the readings by at least this [σ].
         same, same_parallel: largest rise of the objective for another effect that explains the data as well, and the
             same if |cos| of the signatures is above `parallel` [σ²].
         form, form_family: share of an effect's sigmas that another one may lack and still differ only in its form.
             The same within one family.
         alike: |cos| above which an effect is tried in place of another one.
-        needed: least contribution of each of two effects, given the other, for both to be named [σ].
-        preferred: advantage in evidence of a smooth curve that refutes names [σ²].
-        alternative: largest rise of the objective for a listed candidate [σ²].
-        outlier_share: largest share of excluded rows.
-        outlier_few: largest number in a short table, up to a fifth of it.
+        needed: smallest contribution of each of two effects, given the other, for both to be named [σ].
+        preferred: a smooth curve with this much more evidence refutes names [σ²].
+        alternative: largest rise of χ² at which a candidate is listed as an alternative [σ²].
+        outlier_share: largest share of rows that may be excluded.
+        outlier_few: in a short table, this many rows may be excluded, up to a fifth of it.
         outlier_error: family-wise error of an exclusion.
-        gross: distance over the median row's beyond which a row cannot have been measured as stated [σ].
-        cauchy: scale of Cauchy's weights [σ].
+        gross: a row this far beyond the median row's distance cannot have been measured as stated [σ].
+        cauchy: scale of the Cauchy weights [σ].
         reweightings: number of reweighting iterations. worth, apart: least separation of an experiment to be
         worthwhile, and to separate two alternatives [σ]. enough, gain: probability above which a better separation
         is no gain. Least addition of a second experiment to the expected number of separated pairs.
         refuted: rise of χ² that refutes an alternative [σ²].
-        prefer: one of `PREFERENCES`.
-        forbidden: kinds of experiments, and configurations, that are not proposed (see `menu.KINDS`).
-        silent: channels whose noise nobody states.
+        prefer: criterion for the leading effect, one of `PREFERENCES`.
+        forbidden: kinds of experiments (`menu.KINDS`) and configurations that must not be proposed.
+        silent: channels without a stated noise.
     """
 
     shares: dict[str, float]
@@ -107,18 +108,19 @@ class Settings:
 
 
 def fewest_replicates(kind: type[Observer]) -> int:
-    """Least number of bootstrap tables for which every kind of evidence of such data can be significant.
+    """Smallest number of bootstrap tables for which each kind of evidence can be significant.
 
-    The p-value of a statistic is never below 1 / (1 + tables).
+    The p-value of a statistic is at least 1 / (1 + tables).
     """
     return math.ceil(1 / min(SHARES[kind.evidence])) - 1
 
 
 def settings_for(kind: type[Observer], replicates: int = 500, seed: int = 0, prefer: str = FIT) -> Settings:
-    """Settings for data of a kind.
+    """Settings of the loop for one kind of data.
 
     Raises:
-        BadConfiguration: `prefer` is not one of `PREFERENCES`. A number of replicates or a seed that is not allowed.
+        BadConfiguration: `prefer` is not one of `PREFERENCES`, or the number of replicates or the seed is out of
+            range.
     """
     stated_count(replicates, "replicates", 1, 100_000)
     stated_count(seed, "seed", 0, SEEDS)

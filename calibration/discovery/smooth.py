@@ -1,4 +1,6 @@
-"""Smooth curves over a variable in a balance, linear at a fit, with the prior of the greatest evidence."""
+"""Smooth curves over a variable in a balance, linearised at a fit. The size and length of their prior maximise the
+evidence.
+"""
 
 from __future__ import annotations
 
@@ -30,18 +32,18 @@ WIDE = 3.0
 
 
 @dataclasses.dataclass(frozen=True)
-class Smooth:
-    """A smooth curve (or a wave) at the base fit, with the prior of the greatest evidence.
+class SmoothCurve:
+    """A smooth curve (or a wave) at the base fit. The size and length of its prior maximise the evidence.
 
     Attributes:
         effect, variable: name of the curve, and its variable.
-        low, high: ends of its range.
-        scale: amplitude of the curve.
+        low, high: range of the variable.
+        scale: amplitude of the curve [unit of the balance].
         root: L of the prior covariance L Lᵀ of the ordinates, shape (ordinates, ordinates).
         start: ordinates in prior coordinates, y = L z, shape (ordinates,).
-        explained: decrease of χ².
+        explained: decrease of χ² [σ²].
         freedom: effective number of parameters.
-        evidence: twice the log of the marginal likelihood over that without a curve [σ²].
+        evidence: twice the log of the marginal likelihood ratio of curve and no curve [σ²].
     """
 
     effect: str
@@ -62,27 +64,27 @@ class Smooth:
 
     @property
     def happening(self) -> bool:
-        """True for a temporary change."""
+        """True if it describes a temporary change."""
         return window_from_name(self.variable) is not None
 
     @property
     def ordinates(self) -> Names:
-        """Parameters of the effect that define its shape."""
+        """Names of the parameters that define its shape."""
         return ("y_sin", "y_cos") if self.wave else ORDINATES
 
     @property
     def values(self) -> dict[str, float]:
-        """The other parameters of the effect."""
+        """Its other parameters, by name."""
         if self.wave:
             return {"amplitude": self.scale, "order_shaft": ORDERS[self.variable][0]}
         return {"amplitude": self.scale, "low": self.low, "high": self.high}
 
     def basis(self, x: np.ndarray) -> np.ndarray:
         """Weight of each ordinate at x, shape (points, ordinates)."""
-        return _basis(self.variable, x, self.low, self.high)
+        return _basis_functions(self.variable, x, self.low, self.high)
 
 
-def _basis(variable: str, x: np.ndarray, low: float, high: float) -> np.ndarray:
+def _basis_functions(variable: str, x: np.ndarray, low: float, high: float) -> np.ndarray:
     if variable in ORDERS:
         return np.stack([np.sin(x), np.cos(x)], 1)
     return np.asarray(_weights(np.asarray(x), np.asarray(low), np.asarray(high)))
@@ -91,26 +93,26 @@ def _basis(variable: str, x: np.ndarray, low: float, high: float) -> np.ndarray:
 _weights: Callable[..., Array] = compiled(ordinate_weights)
 
 
-def smooth_curve(linear: Linearization, balance: str, variable: str, counts: np.ndarray) -> Smooth:
-    """Curve over a variable in a balance, linear at the base fit.
+def fit_smooth_curve(linear: Linearization, balance: str, variable: str, counts: np.ndarray) -> SmoothCurve:
+    """Smooth curve over a variable in a balance, fitted at the linearised base fit.
 
-    The ordinates are a Gaussian process with covariance s² exp(-½ (Δ/l)²) over their distance Δ. A level
-    and a trend WIDE times as large are added, which base parameters can hide. Size s and length l have the
-    greatest evidence (Rasmussen and Williams 2006, eqs. (2.39), (5.8)). Sine and cosine of a wave are independent.
+    The ordinates are a Gaussian process with covariance s² exp(-½ (Δ/l)²) at distance Δ. A level and a trend, WIDE
+    times as large, are added because base parameters can absorb them. Size s and length l maximise the evidence
+    (Rasmussen and Williams 2006, eqs. (2.39), (5.8)). A wave has independent sine and cosine.
 
     Args:
         counts: True for included rows, shape (rows,).
     """
     happens = window_from_name(variable)
     axis = variable if happens is None else happens.axis
-    (x, way), counts = linear.in_travel(balance, axis), linear.at_points(counts)
+    (x, way), counts = linear.curve_variable(balance, axis), linear.at_points(counts)
     low, high = (0.0, 2 * np.pi) if variable in ORDERS else (float(x[counts].min()), float(x[counts].max()))
     if happens is not None:
         beside = BESIDE * max(happens.high - happens.low, NARROW * (high - low))
         low, high = happens.low - beside, happens.high + beside
     if not high - low > 1e-9 * max(abs(high), abs(low), 1e-9):
         high = low + max(abs(low), 1.0)  # a constant variable: only an offset can be seen
-    basis = _basis(variable, x, low, high)
+    basis = _basis_functions(variable, x, low, high)
     a, b = Projection(linear)(place_signature(linear, balance, way[:, None] * basis))
     size = 1 / np.sqrt(max(np.diag(a).max(), 1e-300))
     roots = [np.eye(2)] if variable in ORDERS else [_prior_root(length, happens is not None) for length in LENGTHS]
@@ -126,12 +128,13 @@ def smooth_curve(linear: Linearization, balance: str, variable: str, counts: np.
             degrees_taken = float(np.trace(np.linalg.solve(information, inner)))
             best = evidence, (scale, root, z, float(explained), degrees_taken, 2 * float(evidence))
     name = f"wave_{balance}" if variable in ORDERS else f"curve_{balance}_{axis}"
-    return Smooth(name, variable, low, high, *best[1])
+    return SmoothCurve(name, variable, low, high, *best[1])
 
 
 def _prior_root(length: float, happening: bool = False) -> np.ndarray:
-    """L of the prior covariance of the ordinates at a correlation length [spacings]. A temporary change is zero at
-    its ends."""
+    """L of the prior covariance L Lᵀ of the ordinates for one correlation length [spacings of the ordinates]. A
+    temporary change is zero at its ends.
+    """
     distance = np.subtract.outer(np.arange(len(ORDINATES)), np.arange(len(ORDINATES)))
     across = np.linspace(-1.0, 1.0, len(ORDINATES))
     if happening:
@@ -144,13 +147,13 @@ def _prior_root(length: float, happening: bool = False) -> np.ndarray:
 
 
 @dataclasses.dataclass(frozen=True)
-class Surface:
-    """A smooth discrepancy over two variables in a balance, linear at a fit.
+class SmoothSurface:
+    """A smooth discrepancy over two variables in a balance, linearised at a fit.
 
     Attributes:
-        columns: signatures of the surface, scaled to the prior of the greatest evidence, shape (readings, terms).
+        columns: sensitivity of the readings to each term, scaled by its prior sd, shape (readings, terms).
         explained: decrease of χ² [σ²].
-        evidence: as in `Smooth`.
+        evidence: evidence as in `SmoothCurve`.
     """
 
     columns: np.ndarray
@@ -158,18 +161,18 @@ class Surface:
     evidence: float
 
 
-def smooth_surface(
+def fit_smooth_surface(
     linear: Linearization, balance: str, variables: tuple[str, str], counts: np.ndarray, project: Projection
-) -> Surface:
-    """Discrepancy over two variables, as products of Legendre polynomials.
+) -> SmoothSurface:
+    """Smooth discrepancy over two variables, as a sum of products of Legendre polynomials.
 
-    The prior sd of a term decreases with its degree. The common size has the greatest evidence.
+    The prior sd of a term decreases with its degree. The common size of all terms maximises the evidence.
 
     Args:
         counts: True for included rows, shape (rows,).
     """
     weight = linear.at_points(counts).astype(float)
-    each, ways = zip(*(linear.in_travel(balance, v) for v in variables), strict=True)
+    each, ways = zip(*(linear.curve_variable(balance, v) for v in variables), strict=True)
     sides = [
         legendre.legvander(scale_to_unit_range(x, weight), PRODUCT - 1) * np.exp(-FALL * np.arange(PRODUCT))
         for x in each
@@ -186,4 +189,4 @@ def smooth_surface(
         evidence = scale * b @ z - np.linalg.slogdet(information)[1]
         if evidence > best[0]:
             best = float(evidence), scale, float(2 * scale * b @ z - scale**2 * z @ a @ z)
-    return Surface(best[1] * columns, best[2], best[0])
+    return SmoothSurface(best[1] * columns, best[2], best[0])

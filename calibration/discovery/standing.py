@@ -1,9 +1,9 @@
-"""Tests of names against smooth curves that would explain as much, or take their significance away.
+"""Tests of effects' names against smooth curves that explain as much, or that make the effects insignificant.
 
-A name is a claim about a cause. A curve claims only a place and a shape. Effects selected from many
-can together imitate a law that the library lacks. So names are compared with curves by evidence that includes the
-number of alternatives (MacKay, Information Theory, Inference, and Learning Algorithms, 2003, ch. 28). If a fit with
-effects is not adequate, each has to keep its significance in addition to the best curves.
+A name is a claim about a cause. A curve claims only a place and a shape. Effects selected from many can together
+imitate a law that the library lacks. So names are compared with curves by evidence that includes the number of
+alternatives (MacKay, Information Theory, Inference, and Learning Algorithms, 2003, ch. 28). If a fit with effects is
+not adequate, each has to keep its significance in addition to the best curves.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ import numpy as np
 from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.adequacy import AdequacyTest, Diagnosis
 from calibration.discovery.candidates import Candidate
-from calibration.discovery.classes import without_amplitude
-from calibration.discovery.discrepancy import CurveBeside, locate_discrepancy
-from calibration.discovery.loop_notes import CurveOver, NameSupport, NameTest
+from calibration.discovery.classes import remove_effect
+from calibration.discovery.discrepancy import BaseCurve, locate_discrepancy
+from calibration.discovery.loop_notes import NameSupport, NameTest, PlacedCurve
 from calibration.discovery.projection import Projection
 from calibration.discovery.score_tests import ABSORBED, augment_with_columns, family_columns, statistics_with_columns
-from calibration.discovery.search import Search, diagnose_candidate, without_each
+from calibration.discovery.search import SearchResult, diagnose_candidate, refit_without_each
 from calibration.discovery.settings import Settings
-from calibration.discovery.smooth import smooth_curve, smooth_surface
+from calibration.discovery.smooth import fit_smooth_curve, fit_smooth_surface
 from calibration.inference import bases as bases_room
 from calibration.inference.bases import Bases
 from calibration.inference.linearization import Linearization, amplitude_of
@@ -47,55 +47,55 @@ VARIABLES = ("voltage", "current", "speed_motor", "slope", "payload")
 
 
 def equation_of_place(place: str) -> str:
-    """Place with the curves that represent effects in a balance, or in the readings of a channel."""
+    """Balance, or channel, whose smooth curves compete with the effects of a place."""
     return EQUATION.get(place, place)
 
 
 def judge_names(
     space: CandidateSpace,
     base: Candidate,
-    searched: Search,
+    searched: SearchResult,
     left: Diagnosis,
     bases: Bases,
     settings: Settings,
     proposed: Proposed | None = None,
     blocks: Sequence[np.ndarray] = (),
-    beside: CurveBeside | None = None,
+    beside: BaseCurve | None = None,
 ) -> NameSupport:
-    """Tests which effects of the best candidate of a search, or of a given proposal, may be named.
+    """Tests which effects of a candidate may be named: of the best candidate of a search, or of a given proposal.
 
-    An adequate set is compared with curves, an inadequate one with a single curve. Then each
-    effect is tested independently (`name_tests`).
+    A set that leaves no significant residuals is compared with curves. Another set is compared with a single curve.
+    Then each effect is tested on its own (`judge_each_name`).
 
     Args:
-        left: diagnosis of the base.
-        blocks: masks of rows that are left out in turn, each of shape (rows,).
-        beside: the curve of the base's discrepancy, if it is shared with others.
+        left: diagnosis of the base fit.
+        blocks: mask of the rows of each block that is left out in turn, shape (rows,).
+        beside: smooth curve of the base's discrepancy, if it is computed already.
     """
     best, after = (searched.best, searched.diagnosis) if proposed is None else proposed
     if best is None or after is None:
         return NameSupport(False, "implausible")
-    better = _ruled_out(space, base, searched.best or best, searched.ladder, settings)
+    better = _better_but_implausible(space, base, searched.best or best, searched.ladder, settings)
     adequate = not after.test.rejected_with_margin
     if len(best.effects) == 1 and adequate and better:
         return NameSupport(False, "larger", better[0].effects)
     if adequate:
-        support = _against_curves(space, base, best, left.linear, bases, settings)
+        support = _compare_with_curves(space, base, best, left.linear, bases, settings)
     else:
-        beside = CurveBeside(space, base, left, bases) if beside is None else beside
-        support = _one_curve(space, best, left, bases, settings, beside)
+        beside = BaseCurve(space, base, left, bases) if beside is None else beside
+        support = _compare_with_single_curve(space, best, left, bases, settings, beside)
     fits = dataclasses.replace(searched, ladder=(base, *searched.ladder))
-    tests = name_tests(space, best, fits, bases, after, settings, blocks, better)
+    tests = judge_each_name(space, best, fits, bases, after, settings, blocks, better)
     if support.stands:
         support = NameSupport(any(t.established for t in tests))
         support = dataclasses.replace(support, why="beside" if support.stands else "none by itself")
     return dataclasses.replace(support, tests=tests)
 
 
-def _ruled_out(
+def _better_but_implausible(
     space: CandidateSpace, base: Candidate, best: Candidate, ladder: Sequence[Candidate], settings: Settings
 ) -> list[Candidate]:
-    """Candidates with better evidence that are excluded only by their size, best first."""
+    """Candidates with more evidence that only their size excludes, the best first."""
     names = evidence_of_names(space, base, best, settings)
     fits = [c for c in ladder if c.simulated and np.isfinite(c.cost) and len(c.effects) <= len(best.effects)]
     ruled_out = [c for c in fits if not c.plausible]
@@ -108,17 +108,18 @@ def _ruled_out(
 
 
 def cost_of_names(space: CandidateSpace, best: Candidate, settings: Settings) -> float:
-    """Penalty on a set's decrease of χ² [σ²]: for its free amplitudes and shapes, and the number of sets of its size.
+    """Penalty on the decrease of χ² by a set of effects [σ²], for its free parameters and for the number of sets of
+    its size.
 
-    As for a curve, the prior of an amplitude has the size of the greatest evidence, which is its own.
+    The prior of an amplitude has the size of greatest evidence, as for a curve.
     """
     slots = [slot for slot, name in enumerate(best.active) if name]
     sets = 2 * math.log(math.comb(len(space.library), len(slots)))
-    return sum(_cost_of(space, best, slot, settings) for slot in slots) + sets
+    return sum(_cost_of_effect(space, best, slot, settings) for slot in slots) + sets
 
 
-def _cost_of(space: CandidateSpace, best: Candidate, slot: int, settings: Settings) -> float:
-    """Penalty for the free amplitude and shape of an effect [σ²]."""
+def _cost_of_effect(space: CandidateSpace, best: Candidate, slot: int, settings: Settings) -> float:
+    """Penalty for the free amplitude and shape of one effect [σ²]."""
     sds = np.clip(np.asarray(best.sd), 1e-6, 1.0)
     k = space.free + slot
     amplitude = min(-2 * math.log(sds[k]), 1 + math.log1p((float(best.z[k]) / sds[k]) ** 2))
@@ -126,14 +127,16 @@ def _cost_of(space: CandidateSpace, best: Candidate, slot: int, settings: Settin
 
 
 def evidence_of_names(space: CandidateSpace, base: Candidate, best: Candidate, settings: Settings) -> float:
-    """Twice the log of the evidence for a set of effects over none [σ²]."""
+    """Twice the log evidence for a set of effects against no effects [σ²]."""
     return 2 * (base.cost - best.cost) - cost_of_names(space, best, settings)
 
 
-def _against_curves(
+def _compare_with_curves(
     space: CandidateSpace, base: Candidate, best: Candidate, linear: Linearization, bases: Bases, settings: Settings
 ) -> NameSupport:
-    """Test of names against one smooth curve of one variable anywhere, or of two in a balance with several names."""
+    """Compares names with one smooth curve: of one variable anywhere, or of two variables in a balance with several
+    names.
+    """
     equations = [equation_of_place(space.library[e].channel or space.library[e].balance) for e in best.effects]
     places = {place for place, _ in bases_room.family_names(bases)}
     crowded = {e for e in equations if equations.count(e) > 1 and e in places}
@@ -151,38 +154,42 @@ def _against_curves(
 
 def _curve_evidence(
     space: CandidateSpace, linear: Linearization, bases: Bases, crowded: set[str]
-) -> list[tuple[float, CurveOver]]:
-    """Evidence of each smooth curve and wave: of one variable in any place, of two in the crowded ones."""
+) -> list[tuple[float, PlacedCurve]]:
+    """Evidence of each smooth curve and wave: of one variable in any place, of two variables in the places of
+    `crowded`.
+    """
     included, offered = space.included, dict.fromkeys(bases_room.family_names(bases))
     known_curves = [
         v
         for v in (*bases_room.VARIABLES, *bases_room.ORDERS)
-        if any(v == over for _, over in offered) and _varies(linear, v, included)
+        if any(v == over for _, over in offered) and _variable_varies(linear, v, included)
     ]
     curves = []
     for place, variable in offered:
         if variable in known_curves:
-            curve = smooth_curve(linear, place, variable, included)
-            curves.append((curve.evidence, CurveOver(place, (variable,))))
+            curve = fit_smooth_curve(linear, place, variable, included)
+            curves.append((curve.evidence, PlacedCurve(place, (variable,))))
     project = Projection(linear)
     for place in sorted(crowded):
         for pair in itertools.combinations([v for v in VARIABLES if v in known_curves], 2):
-            over = smooth_surface(linear, place, pair, included, project)
-            curves.append((over.evidence, CurveOver(place, pair)))
+            over = fit_smooth_surface(linear, place, pair, included, project)
+            curves.append((over.evidence, PlacedCurve(place, pair)))
     return curves
 
 
-def _curve_over(place: str, variable: str) -> CurveOver:
-    return CurveOver(place, (variable,))
+def _curve_of_variable(place: str, variable: str) -> PlacedCurve:
+    return PlacedCurve(place, (variable,))
 
 
-def _varies(linear: Linearization, variable: str, included: np.ndarray) -> bool:
-    x = linear.in_travel(bases_room.SHAFTS, variable)[0][linear.at_points(included)]
+def _variable_varies(linear: Linearization, variable: str, included: np.ndarray) -> bool:
+    x = linear.curve_variable(bases_room.SHAFTS, variable)[0][linear.at_points(included)]
     return bool(np.all(np.isfinite(x)) and np.ptp(x) > 1e-9 * max(np.max(np.abs(x)), 1e-9))
 
 
 def _linear_explanation(space: CandidateSpace, best: Candidate, linear: Linearization, settings: Settings) -> float:
-    """Decrease of χ² by the effects of a candidate at the base fit, at their nearest shapes [σ²]."""
+    """Decrease of χ² by the effects of a candidate, to first order at the base fit and at their nearest grid shapes
+    [σ²].
+    """
     p, s = space.free, settings.slots
     chosen = []
     for slot, name in enumerate(best.active):
@@ -200,33 +207,33 @@ def _linear_explanation(space: CandidateSpace, best: Candidate, linear: Lineariz
 Proposed = tuple[Candidate, Diagnosis]
 
 
-def _equation(space: CandidateSpace, effect: str) -> str:
+def _equation_of_effect(space: CandidateSpace, effect: str) -> str:
     return equation_of_place(space.library[effect].channel or space.library[effect].balance)
 
 
-def _one_curve(
-    space: CandidateSpace, best: Candidate, left: Diagnosis, bases: Bases, settings: Settings, beside: CurveBeside
+def _compare_with_single_curve(
+    space: CandidateSpace, best: Candidate, left: Diagnosis, bases: Bases, settings: Settings, beside: BaseCurve
 ) -> NameSupport:
-    """Test whether a single curve is adequate where the names of a candidate are not."""
+    """Tests if a single smooth curve fits the data where the effects of a candidate do not."""
     names = bases_room.family_names(bases)
     for k in _strongest_families(left, names):
         statistics, _ = statistics_with_columns(
             left.linear, bases, family_columns(left.linear, bases, k), [names[k][0]]
         )
         if not AdequacyTest(statistics, left.test.null, settings).rejected_with_margin:
-            return NameSupport(False, "curve alone", curves=(_curve_over(*names[k]),))
+            return NameSupport(False, "curve alone", curves=(_curve_of_variable(*names[k]),))
     where = beside.where
-    if equation_of_place(where.place) in {_equation(space, e) for e in best.effects}:
+    if equation_of_place(where.place) in {_equation_of_effect(space, e) for e in best.effects}:
         # A strong curve distorts the base fit, and names then absorb its residuals in the same equation.
         # If the result is highly significant, no closer look is compiled.
-        adequate = not left.test.beyond_doubt("chi2", beside.curve.chi2[1])
+        adequate = not left.test.exceeds_margin("chi2", beside.curve.chi2[1])
         if adequate and not beside.diagnosis.test.rejected_with_margin:
-            return NameSupport(False, "curve alone", curves=(_curve_over(where.place, where.variable),))
+            return NameSupport(False, "curve alone", curves=(_curve_of_variable(where.place, where.variable),))
     return NameSupport(True)
 
 
 def _strongest_families(left: Diagnosis, names: Sequence[tuple[str, str]]) -> list[int]:
-    """The most significant family of curves of each place, the most significant of these first, at most `ALONE`."""
+    """Indices of the most significant family of curves in each place, the most significant first, at most `ALONE`."""
     deviate = np.asarray(left.scores.curve)
     first: dict[str, int] = {}
     for k in np.argsort(-deviate):
@@ -234,14 +241,15 @@ def _strongest_families(left: Diagnosis, names: Sequence[tuple[str, str]]) -> li
     return list(first.values())[:ALONE]
 
 
-def _curves_beside(
+def _add_curves(
     linear: Linearization, seen: Diagnosis, bases: Bases, without: set[str], most: int, settings: Settings
 ) -> tuple[list[int], AdequacyTest]:
-    """Families of curves, the most significant first, until the residuals with them are noise, and that test.
+    """Adds families of curves, the most significant first, until the residuals are noise. Also returns the test of
+    the residuals.
 
     Args:
         seen: diagnosis of the fit.
-        without: equations without curves.
+        without: equations in which no curve is added.
         most: largest number of curves.
     """
     places = [n[0] for n in bases_room.family_names(bases)]
@@ -256,26 +264,26 @@ def _curves_beside(
     return chosen, test
 
 
-def name_tests(
+def judge_each_name(
     space: CandidateSpace,
     best: Candidate,
-    searched: Search,
+    searched: SearchResult,
     bases: Bases,
     after: Diagnosis,
     settings: Settings,
     blocks: Sequence[np.ndarray] = (),
     better: Sequence[Candidate] = (),
 ) -> tuple[NameTest, ...]:
-    """Independent test of each effect, at the fit of the others.
+    """Tests each effect on its own, with all other effects fitted.
 
     A test has the root of the effect's score in addition to curves of other equations, and its most influential row.
     It also has the share of hold-out blocks that find the effect again, and its evidence against curves of its own
     equation.
 
-    The test uses a score instead of an amplitude over its sd. With a free shape that ratio stays small, however
-    much an effect explains (Hauck and Donner, J. Am. Stat. Assoc. 72 (1977). Davies, Biometrika 64 (1977)). Curves in
-    the effect's own equation would absorb it. So they are compared with it in addition to the largest set of
-    the search. Without that set, a curve would represent its other effects in the same equation.
+    The test uses a score instead of an amplitude over its sd. With a free shape that ratio stays small, however much
+    an effect explains (Hauck and Donner, J. Am. Stat. Assoc. 72 (1977). Davies, Biometrika 64 (1977)). Curves in the
+    effect's own equation would absorb it. So they are compared with it in addition to the largest set of the search.
+    Without that set, a curve would represent its other effects in the same equation.
 
     Args:
         after: diagnosis of the fit with all of them.
@@ -285,23 +293,25 @@ def name_tests(
     names, largest, tests = bases_room.family_names(bases), searched.best or best, []
     most = searched.diagnosis or after
     lacks = _deficient_equations(space, most, bases)
-    fewer = dict(zip(largest.effects, without_each(space, largest, settings, searched.ladder), strict=True))
-    without_effect = without_each(space, best, settings, searched.ladder)
+    fewer = dict(zip(largest.effects, refit_without_each(space, largest, settings, searched.ladder), strict=True))
+    without_effect = refit_without_each(space, best, settings, searched.ladder)
     fits = {c.active: c for c in (*without_effect, *(c for e, c in fewer.items() if e in best.effects))}
     linearizations = {
         at: diagnose_candidate(space, c, bases, after.test.null, settings).linear for at, c in fits.items()
     }
     for effect, without in zip(best.effects, without_effect, strict=True):
-        equation = _equation(space, effect)
+        equation = _equation_of_effect(space, effect)
         linear = linearizations[without.active]
-        chosen, _ = _curves_beside(after.linear, after, bases, {equation}, CURVES, settings)
-        beside = _with_curves(space, linear, bases, chosen, effect)
+        chosen, _ = _add_curves(after.linear, after, bases, {equation}, CURVES, settings)
+        beside = _augment_with_curves(space, linear, bases, chosen, effect)
         promised = _largest_root(np.asarray(linear.jacobian), np.asarray(linear.residual), beside[2]) ** 2
         judged, signatures = beside, linear.signatures
         if promised < PROMISED * 2 * (without.cost - best.cost):
-            judged = _put_back(space, best, effect, _with_curves(space, after.linear, bases, chosen, effect))
+            judged = _restore_effect(
+                space, best, effect, _augment_with_curves(space, after.linear, bases, chosen, effect)
+            )
             signatures = after.linear.signatures
-        run, root_without = _weakest_run(space, linear.runs(), *beside, differ=space.bare.observe.long)
+        run, root_without = _most_influential_run(space, linear.runs(), *beside, differ=space.bare.observe.long)
         full_fit, other_fit = (largest, fewer[effect]) if effect in fewer else (best, without)
         beside_all = most.linear if effect in fewer else after.linear
         tests.append(
@@ -309,27 +319,29 @@ def name_tests(
                 effect,
                 _largest_root(*beside),
                 after.test.threshold("single"),
-                tuple(_curve_over(*names[k]) for k in chosen),
+                tuple(_curve_of_variable(*names[k]) for k in chosen),
                 _evidence_over_curves(
                     space, full_fit, other_fit, effect, linearizations[other_fit.active], bases, settings
                 ),
                 run,
                 root_without,
-                _chosen_again(
+                _recurrence(
                     space, (space.library[effect].family(),), judged, np.asarray(signatures), blocks, settings
                 ),
                 next((c.effects for c in better if effect not in c.effects), ()),
                 equation in lacks,
                 "run" if space.bare.observe.long else "row",
-                *_varies_most(space, full_fit, effect, beside_all, settings.shares["single"]),
-                offset=_offset_share(space, best, effect, settings),
+                *_largest_variation(space, full_fit, effect, beside_all, settings.shares["single"]),
+                offset=_relative_zero_error(space, best, effect, settings),
             )
         )
     return tuple(tests)
 
 
-def _offset_share(space: CandidateSpace, best: Candidate, effect: str, settings: Settings) -> float:
-    """Zero error of an instrument without a stated noise over the rms of its readings [-], else infinite."""
+def _relative_zero_error(space: CandidateSpace, best: Candidate, effect: str, settings: Settings) -> float:
+    """Zero error of an instrument without a stated noise, divided by the rms of its readings [-]. Otherwise
+    infinite.
+    """
     kind = space.library[effect]
     if kind.channel not in settings.silent or not getattr(kind, "of_zero", False):
         return math.inf
@@ -341,18 +353,17 @@ def _offset_share(space: CandidateSpace, best: Candidate, effect: str, settings:
 
 
 def _deficient_equations(space: CandidateSpace, seen: Diagnosis, bases: Bases) -> set[str]:
-    """Equations with a significant discrepancy of a fit: those of the most significant curve and of the strongest
-    effect."""
+    """Equations with a significant discrepancy: those of the most significant curve and of the strongest effect."""
     if not seen.test.rejected_with_margin:
         return set()
     lacks = {equation_of_place(locate_discrepancy(seen, bases, space.included).place)}
-    if seen.test.beyond_doubt("single"):
+    if seen.test.exceeds_margin("single"):
         strongest = space.library.of[int(np.argmax(np.abs(np.asarray(seen.scores.single))))]
-        lacks.add(_equation(space, space.library.names[strongest]))
+        lacks.add(_equation_of_effect(space, space.library.names[strongest]))
     return lacks
 
 
-def _varies_most(
+def _largest_variation(
     space: CandidateSpace, best: Candidate, effect: str, linear: Linearization, share: float
 ) -> tuple[float, str, float, float]:
     """Largest change of an effect's amplitude over a variable, as a line or a parabola.
@@ -374,9 +385,9 @@ def _varies_most(
     jacobian, residual = np.asarray(linear.jacobian), np.asarray(linear.residual)
     slot = space.free + best.active.index(effect)
     of_row = jacobian[: linear.readings, slot].reshape(linear.rows, -1)
-    variables = [v for v in (*VARIABLES, "speed") if _varies(linear, v, space.included)]
+    variables = [v for v in (*VARIABLES, "speed") if _variable_varies(linear, v, space.included)]
     for variable in variables:
-        values = linear.in_travel(bases_room.SHAFTS, variable)[0].reshape(-1, linear.rows).mean(0)
+        values = linear.curve_variable(bases_room.SHAFTS, variable)[0].reshape(-1, linear.rows).mean(0)
         x = bases_room.scale_to_unit_range(np.nan_to_num(values), space.included.astype(float))
         changed = np.stack([(of_row * shape[:, None]).ravel() for shape in (x, 2 * x**2 - 1)], 1)
         projected_residual, scores = _projected_columns(jacobian, residual, changed)
@@ -398,16 +409,16 @@ def _evidence_over_curves(
 ) -> float:
     """Twice the log Bayes factor of an effect over the best smooth curve in its equation [σ²].
 
-    Each is penalised for the number of its alternatives in that equation: effects, or curves.
+    Effect and curve are each penalised for the number of their alternatives in that equation.
 
     Args:
         best: candidate with the effect.
         without: the same candidate without the effect.
         linear: linearization at `without`.
     """
-    equation = _equation(space, effect)
-    offered = sum(_equation(space, name) == equation for name in space.library.names)
-    cost = _cost_of(space, best, best.active.index(effect), settings) + 2 * math.log(offered)
+    equation = _equation_of_effect(space, effect)
+    offered = sum(_equation_of_effect(space, name) == equation for name in space.library.names)
+    cost = _cost_of_effect(space, best, best.active.index(effect), settings) + 2 * math.log(offered)
     same_equation = [
         e for e, over in _curve_evidence(space, linear, bases, set()) if equation_of_place(over.place) == equation
     ]
@@ -420,12 +431,12 @@ def _evidence_over_curves(
 
 
 def _largest_root(jacobian: np.ndarray, residual: np.ndarray, signatures: np.ndarray) -> float:
-    """Largest root of the scores of several columns over the readings, after a refit [σ]."""
+    """Largest square root of the scores of several columns, with the free parameters refitted [σ]."""
     return float(np.max(_score_roots(jacobian, residual, signatures)))
 
 
 def _score_roots(jacobian: np.ndarray, residual: np.ndarray, signatures: np.ndarray) -> np.ndarray:
-    """Root of the score of each column, 0 for columns that the fit imitates."""
+    """Square root of the score of each column [σ]. 0 for columns that the free parameters can imitate."""
     projected_residual, scores = _projected_columns(jacobian, residual, signatures)
     root = np.abs(scores) / np.sqrt(np.maximum(projected_residual, 1e-12))
     return np.where(projected_residual > ABSORBED**2 * np.sum(signatures**2, 0), root, 0.0)
@@ -434,34 +445,35 @@ def _score_roots(jacobian: np.ndarray, residual: np.ndarray, signatures: np.ndar
 def _projected_columns(
     jacobian: np.ndarray, residual: np.ndarray, signatures: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Squared norm of columns over the readings after projection, and their product with the residual."""
+    """Squared norm of each column after projection, and its product with the residual."""
     half = np.linalg.solve(np.linalg.cholesky(jacobian.T @ jacobian), jacobian.T)
     projected_residual, inside = residual - half.T @ (half @ residual), half[:, : len(signatures)] @ signatures
     return np.sum(signatures**2, 0) - np.sum(inside**2, 0), signatures.T @ projected_residual[: len(signatures)]
 
 
-def _with_curves(
+def _augment_with_curves(
     space: CandidateSpace, linear: Linearization, bases: Bases, curves: Sequence[int], effect: str
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Jacobian and residual of a fit with additional families of curves, and an effect's signatures."""
+    """Jacobian and residual of a fit with additional families of curves, and the sensitivities to one effect."""
     columns = [np.zeros((linear.readings, 0)), *(family_columns(linear, bases, k) for k in curves)]
     own_columns = np.asarray(linear.signatures)[:, space.library.of == space.library.names.index(effect)]
     return *augment_with_columns(linear, np.concatenate(columns, 1)), own_columns
 
 
-def _put_back(
+def _restore_effect(
     space: CandidateSpace, best: Candidate, effect: str, beside: tuple[np.ndarray, np.ndarray, np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The same for a fit with the effect, after its contribution is restored by its amplitude.
+    """The arrays of `_augment_with_curves` for a fit with the effect, with the effect's own contribution restored to
+    the residual.
 
-    If it explains much, the fit without it may be so far off that its slopes predict nothing that a fit would
-    confirm.
+    If the effect explains much, the fit without it may be so far off that its linearization predicts nothing
+    reliable.
     """
     jacobian, residual, signatures = beside
-    return *without_amplitude(space, best, best.active.index(effect), jacobian, residual), signatures
+    return *remove_effect(space, best, best.active.index(effect), jacobian, residual), signatures
 
 
-def chosen_again(
+def recurrence_of_families(
     space: CandidateSpace,
     base: Candidate,
     best: Candidate,
@@ -471,22 +483,23 @@ def chosen_again(
     blocks: Sequence[np.ndarray],
     settings: Settings,
 ) -> float:
-    """Share of the informative blocks without which an effect of these families explains as much as any.
+    """Share of the informative blocks for which, without the block, an effect of these families still explains most.
 
-    1 without such blocks. An informative block leaves half of the information on the candidate's first effect.
+    A block is informative if half of the information on the candidate's first effect remains without it. 1 if there
+    is none.
 
     Args:
-        left: diagnosis of the base.
+        left: diagnosis of the base fit.
     """
     effect, linear = best.effects[0], left.linear
-    judged = _with_curves(space, linear, bases, (), effect)
+    judged = _augment_with_curves(space, linear, bases, (), effect)
     if _largest_root(*judged) ** 2 < PROMISED * 2 * (base.cost - best.cost):
         linear = diagnose_candidate(space, best, bases, left.test.null, settings).linear
-        judged = _put_back(space, best, effect, _with_curves(space, linear, bases, (), effect))
-    return _chosen_again(space, families, judged, np.asarray(linear.signatures), blocks, settings)
+        judged = _restore_effect(space, best, effect, _augment_with_curves(space, linear, bases, (), effect))
+    return _recurrence(space, families, judged, np.asarray(linear.signatures), blocks, settings)
 
 
-def _chosen_again(
+def _recurrence(
     space: CandidateSpace,
     families: Sequence[str],
     beside: tuple[np.ndarray, ...],
@@ -494,13 +507,14 @@ def _chosen_again(
     blocks: Sequence[np.ndarray],
     settings: Settings,
 ) -> float:
-    """Share of the informative blocks without which an effect of these families explains as much as any other.
+    """Share of the informative blocks for which, without the block, an effect of these families still explains most.
 
-    The criterion is that of `classes`. Informative blocks leave half of the information on an effect, 1 without any.
+    The criterion is that of `classes`. A block is informative if half of the information on the effect remains
+    without it. 1 if there is none.
 
     Args:
-        beside: Jacobian, residual and the effect's own signatures, as for `_largest_root`.
-        signatures: signatures of the library, there.
+        beside: Jacobian, residual and the effect's own sensitivities, as for `_largest_root`.
+        signatures: sensitivities to all effects of the library.
     """
     library, chosen_effects = space.library, []
     akin = np.array([library[name].family() in families for name in library.names])[library.of]
@@ -517,7 +531,7 @@ def _chosen_again(
     return float(np.mean(chosen_effects)) if chosen_effects else 1.0
 
 
-def _weakest_run(
+def _most_influential_run(
     space: CandidateSpace,
     runs: Sequence[np.ndarray],
     jacobian: np.ndarray,
@@ -525,12 +539,13 @@ def _weakest_run(
     signatures: np.ndarray,
     differ: bool = False,
 ) -> tuple[int | None, float]:
-    """Number of the run without which the root is smallest, and that root, None for fewer than three runs.
+    """Number of the run whose omission reduces the root most, and the root without it. None for fewer than three
+    runs.
 
     Args:
-        runs: rows of each.
-        differ: True for runs of different information, as histories have. The root is then scaled to the
-            information of all runs.
+        runs: rows of each run.
+        differ: True if runs carry different information, as histories do. The root is then scaled to the information
+            of all runs.
     """
     least: tuple[int | None, float] = None, math.inf
     full_score = np.max(_projected_columns(jacobian, residual, signatures)[0]) if differ else 1.0
@@ -546,7 +561,7 @@ def _weakest_run(
 
 
 def _kept_readings(space: CandidateSpace, out: np.ndarray, readings: int) -> np.ndarray:
-    """True for readings that remain without some rows, which are padded, shape (readings,)."""
+    """True for readings that remain after some rows are left out, including padding, shape (readings,)."""
     rows = np.concatenate([out, np.zeros(len(space.included) - len(out), bool)])
     return np.repeat(~rows, readings // len(rows))
 
@@ -554,6 +569,6 @@ def _kept_readings(space: CandidateSpace, out: np.ndarray, readings: int) -> np.
 def _restrict_readings(
     kept: np.ndarray, jacobian: np.ndarray, residual: np.ndarray, signatures: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Jacobian, residual and signatures of the remaining readings, and of all further residuals."""
+    """Jacobian, residual and sensitivities, restricted to the remaining readings. Residuals of priors are kept."""
     kept_residuals = np.concatenate([kept, np.ones(len(residual) - len(kept), bool)])
     return jacobian[kept_residuals], residual[kept_residuals], signatures[kept]

@@ -1,4 +1,4 @@
-"""Bases of smooth curves over the rows. The search for a discrepancy that no effect explains uses them."""
+"""Bases of smooth curves over the rows. They describe a discrepancy that no effect explains."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ RESOLVED = 2.5
 
 
 class Basis(eqx.Module):
-    """Families of smooth curves, each a combination of columns over the rows.
+    """Families of smooth curves. Each curve of a family is a combination of the family's columns over the rows.
 
     A curve is a defect of one balance, or an error of one channel's readings. All families of one `Basis` have the
     same number of columns.
@@ -92,13 +92,15 @@ class Basis(eqx.Module):
         return tuple(zip(self.places, self.variables, strict=True))
 
     def for_equations(self) -> Basis:
-        """Copy without the names of the variables, because a window's name depends on the table."""
+        """Copy without the names of the variables. The name of a window depends on the table, which would prevent
+        reuse of compiled programs.
+        """
         return dataclasses.replace(self, variables=())
 
     def signatures(self, linear: Linearization) -> Float[Array, "families readings terms"]:
         """Change of the whitened readings per unit of each column.
 
-        Families are computed one at a time, because each takes a copy of a balance's defects for histories.
+        Families are computed one at a time to save memory.
         """
         of_channels = is_channel_place(self.places[0])
         places_known, change = (linear.channels, linear.shown) if of_channels else (linear.probed, linear.columns)
@@ -110,23 +112,25 @@ Bases = tuple[Basis, ...]
 
 
 def is_channel_place(place: str) -> bool:
-    """True if a place is a channel, whose readings have an error, False if it is a balance."""
+    """True if a place is a channel (whose readings are in error), False if it is a balance."""
     return place not in (*BALANCES, *OF_TURNS) and place in channels.channel_names(channels.EVERY)
 
 
 def balance_of(place: str) -> str:
-    """The balance of a place, `sensor` for a channel."""
+    """Balance of a place, or `sensor` if the place is a channel."""
     return "sensor" if is_channel_place(place) else place
 
 
 def place_in_words(place: str) -> str:
-    """Name of a place in words: `slip balance`, `reading of motor speed`. Benches too have an output shaft."""
+    """Name of a place in words, such as `slip balance` or `reading of motor speed`. The track balance is called
+    output shaft.
+    """
     words = "output shaft" if place == "track" else place
     return f"reading of {place}".replace("_", " ") if is_channel_place(place) else f"{words} balance"
 
 
 def place_signature(linear: Linearization, place: str, shapes: np.ndarray) -> np.ndarray:
-    """Change of the readings, shape (readings, terms), by defects of one place with shapes (rows, terms)."""
+    """Change of the readings by errors of one place, for errors of shape (rows, terms). Shape (readings, terms)."""
     if is_channel_place(place):
         return np.asarray(linear.shown(linear.channels.index(place), shapes))
     return np.asarray(linear.columns(linear.probed.index(place), shapes))
@@ -140,37 +144,37 @@ def scale_to_unit_range(x: np.ndarray, weight: np.ndarray) -> np.ndarray:
 
 
 def balances_of(robot: Robot | None, among: Sequence[str] = BALANCES) -> Names:
-    """Balances of `among` that a robot has. All for None."""
+    """Balances of `among` that a robot has. For None, all of them."""
     if robot is None:
         return tuple(among)
     return tuple(b for b in among if b not in absent_balances(robot))
 
 
 def channels_of(robot: Robot | None) -> tuple[Channel, ...]:
-    """Channels of a robot. For None, of the packaged one."""
+    """Channels of a robot. For None, those of the packaged robot."""
     return Layout.of(robot).channels
 
 
 def axes_of(robot: Robot | None) -> Names:
-    """Columns of conditions that are variables of a robot's curves. For None, of the packaged robot's."""
+    """Columns of conditions over which a robot's curves are defined. For None, those of the packaged robot."""
     axes = Layout.of(robot).axes
     return tuple(c for c in (SPEED, CURRENT, *EVERY_AXIS) if c in axes)
 
 
 @dataclasses.dataclass(frozen=True)
-class Scope:
-    """Scope of a search for curves: balances that can have a defect, and columns of the conditions."""
+class CurveScope:
+    """Balances and condition columns in which smooth curves are searched."""
 
     balances: Names
     axes: Names
 
     @classmethod
-    def of(cls, robot: Robot | None) -> Scope:
-        """All balances and conditions of a robot's straight travel. For None, of the packaged one."""
+    def of(cls, robot: Robot | None) -> CurveScope:
+        """All balances and conditions of a robot that travels straight. For None, of the packaged robot."""
         return cls(balances_of(robot), axes_of(robot))
 
-    def over(self, columns: Columns) -> Scope:
-        """Scope that includes a brake's torque among the conditions if the table has it."""
+    def over(self, columns: Columns) -> CurveScope:
+        """Scope that includes the brake torque among the conditions, if the table has that column."""
         return dataclasses.replace(self, axes=(*self.axes, LOAD)) if LOAD in columns else self
 
 
@@ -179,8 +183,8 @@ Ways = Columns
 SHAFTS = "electrical"
 
 
-def forward_ways(points: int) -> Ways:
-    """Ways of travel that is always forward."""
+def forward_directions(points: int) -> Ways:
+    """Directions for runs that always travel forward."""
     return dict.fromkeys(WAYS, np.ones(points))
 
 
@@ -188,24 +192,24 @@ def curve_families(
     columns: Columns,
     weight: np.ndarray,
     robot: Robot | None = None,
-    scope: Scope | None = None,
+    scope: CurveScope | None = None,
     ways: Ways | None = None,
 ) -> Bases:
-    """Curves of one variable and polynomials in all conditions, in each balance, and curves of a channel's error.
+    """Curves of one variable, and polynomials in all conditions, in each balance, and curves of each channel's error.
 
-    The polynomials are separate for each configuration. A channel's error is a curve over its reading, and over
-    time or order.
+    Each configuration has its own polynomials. The error of a channel is a curve over its reading, and over time or
+    order.
 
     Args:
         columns: columns of the table, with fitted readings.
-        weight: 0 for excluded rows, shape (rows,), or of points (see `Linearization`).
-        robot: its channels and balances are searched.
-        scope: None takes `Scope.of` the robot.
+        weight: 0 for excluded rows or points (see `Linearization`), shape (rows,).
+        robot: robot whose channels and balances are used.
+        scope: balances and conditions. None: `CurveScope.of_robot`.
         ways: direction of travel of each point, shape (rows,). None: all forward.
     """
-    scope = (Scope.of(robot) if scope is None else scope).over(columns)
+    scope = (CurveScope.of(robot) if scope is None else scope).over(columns)
     balances = scope.balances
-    ways = forward_ways(len(weight)) if ways is None else ways
+    ways = forward_directions(len(weight)) if ways is None else ways
     unsigned = robot.rig.magnitudes if robot else ()
     over: dict[str, str] = {}  # a variable, and the one that takes its place
     for variable, column in VARIABLES.items():
@@ -248,9 +252,9 @@ def curve_families(
 
 
 def condition_polynomials(
-    columns: Columns, weight: np.ndarray, scope: Scope, ways: Ways, place: str
+    columns: Columns, weight: np.ndarray, scope: CurveScope, ways: Ways, place: str
 ) -> Float[np.ndarray, "points terms"]:
-    """Polynomials in all conditions for each configuration. Arguments as in `curve_families`."""
+    """Polynomials in all conditions, for each configuration. Arguments as in `curve_families`."""
     of_column = {column: variable for variable, column in VARIABLES.items()}
     of_column |= {CURRENT: "current", LOAD: "current"}  # its sign is also that of the torque that drives the shafts
     along = (in_travel_frame(place, of_column[c], np.asarray(columns[c]), ways.__getitem__)[0] for c in scope.axes)
@@ -266,7 +270,7 @@ def condition_polynomials(
 
 @dataclasses.dataclass(frozen=True)
 class Window:
-    """Interval of an axis, `time` [s] or `order` [-], in which something happens, or a level of a condition [SI]."""
+    """Interval of an axis, `time` [s] or `order` [-], with a temporary change, or one level of a condition [SI]."""
 
     axis: str
     low: float
@@ -276,19 +280,19 @@ class Window:
         return f"{self.axis} {self.low:.5g} to {self.high:.5g}"
 
     def holds(self, x: np.ndarray) -> np.ndarray:
-        """True for places of the axis in the window. Its ends are rounded to five digits."""
+        """True for points of the axis within the window. The ends are rounded to five digits."""
         slack = 1e-4 * max(abs(self.low), abs(self.high), 1e-9)
         return (x >= self.low - slack) & (x <= self.high + slack)
 
     @property
     def words(self) -> str:
-        """Window in words: `15 deg of slope`."""
+        """The window in words, such as `15 deg of slope`."""
         factor, unit = LEVELS.get(self.axis, (1.0, ""))
         return f"{self.low / factor:.4g} {unit} of {self.axis}"
 
 
 def window_from_name(variable: str) -> Window | None:
-    """Window that a variable's name describes, None if the name is no window's."""
+    """Window that the name of a variable describes. None if the name describes no window."""
     match = re.fullmatch(rf"({'|'.join((*AXES, *LEVELS))}) (\S+) to (\S+)", variable)
     return None if match is None else Window(match[1], float(match[2]), float(match[3]))
 
@@ -297,12 +301,12 @@ def window_families(
     columns: Columns,
     weight: np.ndarray,
     robot: Robot | None = None,
-    scope: Scope | None = None,
+    scope: CurveScope | None = None,
     ways: Ways | None = None,
 ) -> Bases:
     """Windows of time or of the order of runs, and levels of conditions, in each balance and channel.
 
-    Windows of time are at the same instants in all runs. Windows are omitted if the conditions explain time or order.
+    Windows of time are at the same instants in all runs. They are omitted if the conditions determine time or order.
 
     Args:
         columns: columns of the table.
@@ -310,8 +314,8 @@ def window_families(
         robot, scope, ways: as in `curve_families`.
     """
     counts = weight > 0
-    scope = (Scope.of(robot) if scope is None else scope).over(columns)
-    ways = forward_ways(len(weight)) if ways is None else ways
+    scope = (CurveScope.of(robot) if scope is None else scope).over(columns)
+    ways = forward_directions(len(weight)) if ways is None else ways
     facing = {name: np.where(way < 0, -1.0, 1.0) for name, way in ways.items()}  # also for starts from rest
     offered: list[tuple[str, np.ndarray, np.ndarray]] = []  # axis, its values, which rows are inside
     axis = next((a for a in AXES if VARIABLES[a] in columns), None)
@@ -363,10 +367,10 @@ def order_collinearity(
 ) -> float:
     """Share of the variance of the order of runs, or of their time, that their conditions explain (R²).
 
-    At 1, drift from run to run cannot be separated from effects of the conditions. Conditions enter as a polynomial
-    of the slope and a level for each combination of configuration, imposed quantity, duty and payload. If these
-    combinations are many compared with the runs, they enter instead as a level for each configuration and direction,
-    and polynomials of the others and of their ranks.
+    If it is 1, drift from run to run cannot be separated from effects of the conditions. Conditions enter as a
+    polynomial of the slope and a level for each combination of configuration, imposed quantity, duty and payload. If
+    these combinations are many compared with the runs, they enter instead as a level for each configuration and
+    direction, and polynomials of the others and of their ranks.
 
     Args:
         columns, weight: as in `curve_families`.
@@ -404,7 +408,7 @@ def order_collinearity(
 
 
 def _level_sums(level: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Sum of the rows of each level, shape (levels, columns)."""
+    """Sum over the rows of each level, shape (levels, columns)."""
     sums = np.zeros((int(level.max()) + 1, values.shape[1]))
     np.add.at(sums, level, values)
     return sums
@@ -415,16 +419,16 @@ def wave_families(
 ) -> Bases:
     """Waves of the orders that the samples of histories resolve, in each balance.
 
-    A wave has its own amplitude and phase in each run of at least two periods, because the position of the parts at
-    its start is unknown. Shorter runs show only part of a wave, and parts with free phases could fit any level
-    and trend. If all runs are shorter, a wave has one amplitude and phase, as if all runs began at a mark.
+    A wave has its own amplitude and phase in each run of at least two periods, because the angle at the start of a
+    run is unknown. Shorter runs are left out: part of a wave with a free phase could fit any level and trend. If all
+    runs are shorter, a wave has one amplitude and phase, as if all runs began at the same angle.
 
     Args:
         on_tracks: True for rows of a run on tracks.
         angle: angle of the driving shaft [rad], shape (rows,).
-        rows: indices of each run's rows in the order of time, -1 beyond its last, shape (runs, samples).
-        knots: rows between which a defect is linear, shape (runs, knots).
-        robot: its balances are searched.
+        rows: indices of each run's rows in order of time, padded with -1, shape (runs, samples).
+        knots: rows between which an error is linear, shape (runs, knots).
+        robot: robot whose balances are used.
     """
     bases, words = [], []
     for word, (order, belted) in ORDERS.items():

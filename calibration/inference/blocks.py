@@ -32,7 +32,7 @@ TURN, PART = "turn", "part"
 
 
 def kind_in_words(by: str, joint: str = " and ") -> str:
-    """Name of a kind of blocks in words. `joint` joins two conditions."""
+    """Name of a kind of block in words. `joint` is put between two conditions."""
     for one in ("motor_speed", "load_torque"):
         by = by.replace(one, one.replace("_", " "))
     return by.replace("_", joint)
@@ -48,9 +48,9 @@ APART, PARTS = 0.1, 4
 
 
 def group_into_levels(x: np.ndarray) -> np.ndarray:
-    """Level of each number: the median of those of similar size, to four digits.
+    """Level of each number: the median of numbers of similar size, to four digits.
 
-    Numbers that vary continuously are split into `PARTS` parts of about the same number of values.
+    Numbers that vary continuously are split into `PARTS` groups of about equal size.
     """
     order = np.argsort(x, kind="stable")
     step = np.diff(x[order])
@@ -64,9 +64,9 @@ def group_into_levels(x: np.ndarray) -> np.ndarray:
 
 
 def blocks_by_sharpness(runs: Runs) -> Columns:
-    """Label → mask of its rows, for `PARTS` groups of turns from turning on the spot to straight travel.
+    """Label → mask of its rows, for `PARTS` groups of turns, from turning on the spot to straight travel.
 
-    Turns are sorted by the drive of the slower side over that of the faster side, -1 to 1.
+    Turns are sorted by the ratio of the slower side's command to that of the faster side, -1 to 1.
     """
     slow, fast = np.sort(np.abs(runs.of_sides), 0)
     share = np.round(slow / np.maximum(fast, 1e-12) * np.sign(np.prod(runs.of_sides, 0)), 6)
@@ -76,9 +76,9 @@ def blocks_by_sharpness(runs: Runs) -> Columns:
 
 
 def parts_over_time(runs: Runs) -> Columns:
-    """Label → mask of its rows, for `PARTS` consecutive parts of the time of each run.
+    """Label → mask of its rows, for `PARTS` consecutive parts of each run.
 
-    Empty if a configuration has several runs, because these are blocks.
+    Empty if a configuration has several runs, because then whole runs are blocks.
     """
     names, run = np.unique(runs.run_names, return_inverse=True)
     if len(names) > len(np.unique(runs["configuration"])):
@@ -92,9 +92,9 @@ def parts_over_time(runs: Runs) -> Columns:
 
 
 def blocks_of_kind(runs: Runs, by: str) -> Columns:
-    """Label → mask of its rows, for each block of `by`, empty if the data do not vary in it.
+    """Label → mask of its rows, for each block of the kind `by`. Empty if the data do not vary in that quantity.
 
-    A run of a history in which the quantity changes is a block of its own, empty if it changes in all runs.
+    A run in which the quantity changes is a block of its own. If it changes in all runs, the result is empty.
     """
     if by == TURN:
         return blocks_by_sharpness(runs) if runs.turns else {}
@@ -117,7 +117,9 @@ def blocks_of_kind(runs: Runs, by: str) -> Columns:
 
 
 def distinct_held_out_blocks(runs: Runs, kinds: Sequence[str]) -> dict[str, Columns]:
-    """Kind → blocks, for kinds that the data have, without kinds that divide the rows as an earlier one does."""
+    """Kind → blocks, for the kinds that the data have. A kind that divides the rows as an earlier one does is
+    omitted.
+    """
     blocks: dict[str, Columns] = {}
     divided = []
     for kind in kinds:
@@ -130,9 +132,9 @@ def distinct_held_out_blocks(runs: Runs, kinds: Sequence[str]) -> dict[str, Colu
 
 
 def predictable_blocks(runs: Runs, problem: Problem) -> dict[str, Columns]:
-    """Kind → blocks of `distinct_held_out_blocks` that the other rows can predict, by the problem's observer.
+    """Kind → blocks that can be predicted from the other rows.
 
-    A block is omitted if it holds all rows of a configuration with free parameters of its own.
+    A block with all rows of a configuration is omitted if that configuration has free parameters of its own.
     """
     names = runs.configurations_named(problem.base)
     coordinates = problem.coordinates
@@ -157,19 +159,19 @@ def unpredictable_kinds(runs: Runs, problem: Problem) -> Names:
 
 
 def _configuration_of_parameter(parameter: str, configurations: np.ndarray) -> str:
-    """Configuration that a parameter belongs to, among those of a table's rows, empty for none."""
+    """Configuration to which a parameter belongs, empty if it belongs to none."""
     first = parameter.partition(".")[0]
     return first if first in configurations else ""
 
 
 @dataclasses.dataclass(frozen=True)
-class HeldOut:
-    """Readings of each row, predicted by the fit without its block.
+class HeldOutReadings:
+    """Readings of each row, predicted by a fit without the row's block.
 
     Attributes:
         labels: labels of the blocks.
         block: index of each row's block, shape (rows,).
-        reading: [SI], NaN if that fit's robot does not reach the row, shape (rows, channels).
+        reading: predicted readings [SI], shape (rows, channels). NaN if the fitted robot does not reach the row.
         status: status of each row, shape (rows,).
         z: coordinates of each block's fit, shape (blocks, parameters).
         converged: True for each block whose fit converged.
@@ -183,13 +185,13 @@ class HeldOut:
     converged: np.ndarray
 
 
-def hold_out_by_kind(problem: Problem, start: np.ndarray, masks: dict[str, Columns]) -> dict[str, HeldOut]:
-    """Refit without each block of each kind in turn (with the given sds), and predict the omitted rows.
+def hold_out_by_kind(problem: Problem, start: np.ndarray, masks: dict[str, Columns]) -> dict[str, HeldOutReadings]:
+    """Refits without each block of each kind in turn, with the same sds, and predicts the rows that were left out.
 
     Args:
-        problem: as fitted to all rows.
-        start: optimum of the problem.
-        masks: kind → label → mask, from `blocks_of_kind`. Kinds without blocks are omitted from the result.
+        problem: problem of the fit to all rows.
+        start: its optimum.
+        masks: kind → label → mask, from `blocks_of_kind`. Kinds without blocks are missing in the result.
     """
     answers = {}
     fits: dict[tuple[bytes, ...], refits.HeldOutFits] = {}  # shared by kinds that divide the rows in the same way
@@ -197,7 +199,7 @@ def hold_out_by_kind(problem: Problem, start: np.ndarray, masks: dict[str, Colum
         if by:
             parts = tuple(m.tobytes() for m in by.values())
             held_out = fits[parts] = fits.get(parts) or refits.hold_out_blocks(problem, start, list(by.values()))
-            answers[kind] = HeldOut(
+            answers[kind] = HeldOutReadings(
                 tuple(by), held_out.block, held_out.reading, held_out.status, held_out.z, held_out.converged
             )
     return answers

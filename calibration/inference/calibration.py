@@ -1,4 +1,6 @@
-"""A calibration from table to result: noise, starts, optimum, its analysis, errors on fitted and held-out rows."""
+"""A calibration from table to result: noise, starts, optimum, its analysis, and errors of fitted and held-out
+rows.
+"""
 
 from __future__ import annotations
 
@@ -31,16 +33,16 @@ from calibration.inference import (
     solvers,
 )
 from calibration.inference.conduct import error_after_steps
-from calibration.inference.fit_notes import Remark, next_step, with_codes
+from calibration.inference.fit_notes import Remark, progress_remark, remarks_with_codes
 from calibration.inference.identifiability import posterior_of_coordinates
-from calibration.inference.multistart import SearchResult
+from calibration.inference.multistart import MultistartResult
 from calibration.inference.noise import Noise
 from calibration.inference.noise_factor import noise_remarks
 from calibration.inference.population import GENERATIONS, LEAST
-from calibration.inference.preparation import Prepared, prepare
+from calibration.inference.preparation import PreparedInput, prepare_input
 from calibration.inference.problem import Problem
 from calibration.inference.remarks import calibration_remarks, row_numbers
-from calibration.inference.residual_clusters import residual_clusters
+from calibration.inference.residual_clusters import find_residual_clusters
 from calibration.inference.result import CalibrationResult
 from mmrjax import fidelities
 from mmrjax.compile.precision import SINGLE, in_double, is_double
@@ -78,31 +80,32 @@ def calibrate(
     solver: str | optimizers.Solver | None = None,
     tell: Callable[[str], None] = lambda sentence: None,
 ) -> CalibrationResult:
-    """Calibrate `robot` to measured runs.
+    """Fits parameters of `robot` to measured runs.
 
     Args:
-        runs: rows of settled runs, or of time histories.
-        robot: its values are the prior means. A mass in the table replaces its own.
-        free, fix: parameter names, see `priors.choose_free_names`.
-        stated: priors that replace the fields', (mean, sd) [SI].
-        noise: as `noise.parse_noise`. None takes the file's sd columns, or estimates.
-        model: name of a fidelity. None takes `drive` for time histories and `steady` for settled runs.
-        starts: number of searches, from the prior mean and `starts - 1` draws from the prior. For settled rows with
-            a rollout, they begin at the optimum of `steady` and at draws from its posterior.
-        population: members of each generation of a search without gradients, which precedes a rollout's search.
-            None takes `POPULATION` if parameters are free that `steady` does not read, else 0.
-        generations: largest number of generations, None `population.GENERATIONS`.
-        members: file that stores the members run so far, so that the same calibration can resume.
-        seed: random seed of the starts and of all other draws.
-        profiles: True to profile each parameter.
-        blocks: kinds of blocks to hold out. True: all that are informative for such data.
-            Defaults of these two depend on the kind of data and the fidelity.
-        rows: number of rows above which they are thinned evenly, those of a log in time and those of a table over its
-            conditions. A note reports it.
-        solver: an optimistix solver, or the name of one (`solvers.NAMES`), for the searches from the starts. None
-            takes ours, which also serves all fits that begin at the optimum (profiles, blocks). For any other
-            solver, penalties on adhesion are cut off at 0.
-        tell: callback for progress messages of a long calibration.
+        runs: settled runs or time histories.
+        robot: robot model. Its values are the prior means. A mass in the table replaces the robot's mass.
+        free, fix: names of parameters to fit or not, see `priors.choose_free_names`.
+        stated: parameter → (mean, sd) [SI]. These priors replace those of the fields.
+        noise: standard deviations, in the format of `noise.parse_noise`. None: from the sd columns of the file, or
+            estimated.
+        model: name of the fidelity. None: `drive` for time histories, `steady` for settled runs.
+        starts: number of searches: one from the prior mean, the others from random draws of the prior. For settled
+            rows with a rollout, they start at the optimum of `steady` and at draws from its posterior.
+        population: number of members of each generation of a search without gradients, which precedes the search with
+            a rollout. None: `POPULATION` if parameters are free that `steady` does not use, otherwise 0.
+        generations: largest number of generations. None: `population.GENERATIONS`.
+        members: file in which the members are stored, so that the same calibration can resume.
+        seed: random seed of the starts and all other draws.
+        profiles: True to compute a profile likelihood of each parameter.
+        blocks: kinds of blocks to hold out. True: all that are informative for such data. Defaults of these two
+            depend on the kind of data and the fidelity.
+        rows: largest number of rows. Larger tables are thinned evenly: logs in time, tables over their conditions. A
+            note reports it.
+        solver: solver of optimistix, or its name (`solvers.NAMES`), for the searches from the starts. None: the
+            solver of this package, which also serves all fits that begin at the optimum (profiles, blocks). Other
+            solvers ignore adhesion penalties below zero.
+        tell: callback for progress messages.
 
     Raises:
         BadData: data that cannot be fitted, see `checks.check_data`.
@@ -125,13 +128,13 @@ def calibrate(
     runs, progress = used_rows(runs, robot, rows), in_words(tell)
     observe = observers.observer_kind(runs)
     fidelity = model or (OF_HISTORIES if observe.axis else fidelities.NAMES[0])
-    effort = observers.fidelity_facts(fidelity).effort
+    effort = observers.facts_of_fidelity(fidelity).effort
     starts = (observe.searches or effort.starts) if starts is None else starts
     profiles = effort.profiles and observe.profiled if profiles is None else profiles
     blocks = effort.blocks if blocks is None else blocks
     kinds = (observe.blocks if blocks else ()) if isinstance(blocks, bool) else tuple(blocks)
     choose = functools.partial(_free_names, runs, observe, fidelity, free, fix)
-    ready = prepare(runs, robot, noise, stated, assume=False, choose=choose)
+    ready = prepare_input(runs, robot, noise, stated, assume=False, choose=choose)
     for note in (*ready.foreign, *ready.doubted):
         progress(note)
     base, of_product = _with_guide_priors(runs, ready, fidelity)
@@ -140,10 +143,10 @@ def calibrate(
     more = members is not None or generations is not None
     evolved = _population_size(posed, ready.names, runs, population, more), generations or GENERATIONS, members
     search, beside = _search(runs, base, posed, ready.noise, starts, *evolved, seed, progress, solver)
-    setting = _Setting(runs, observe, fidelity, profiles, kinds, ready, base, of_product)
+    setting = _CalibrationInput(runs, observe, fidelity, profiles, kinds, ready, base, of_product)
     if not free and priors.DELAY not in (*fix, *ready.names):
-        setting, search = _with_delay(setting, search, progress, solver)
-    return _result(setting, search, beside, seed, progress)
+        setting, search = _free_delay_if_needed(setting, search, progress, solver)
+    return _calibration_result(setting, search, beside, seed, progress)
 
 
 def _free_names(
@@ -152,16 +155,16 @@ def _free_names(
     fidelity: str,
     free: Sequence[str],
     fix: Sequence[str],
-    prepared: Prepared,
+    prepared: PreparedInput,
 ) -> Names:
     """Names of the free parameters.
 
     Raises:
-        BadConfiguration: an unknown name, or one that the fidelity does not read.
+        BadConfiguration: a name is unknown, or the fidelity does not use the parameter.
     """
-    robot, computes = prepared.robot, observers.fidelity_facts(fidelity).computes
+    robot, computes = prepared.robot, observers.facts_of_fidelity(fidelity).computes
     words = [surfaces.names_of_surfaces(names, robot, runs) for names in (free, fix)]
-    present = _present(runs, robot)
+    present = _configurations_present(runs, robot)
     default = priors.default_names(present, robot, computed=computes, turns=runs.turns)
     owned = priors.names_to_fit(robot, present, () if observe.axis else priors.OVER_TIME)
     held = {*default, *fidelities.unread_parameters(fidelity, owned, runs.turns)}
@@ -179,21 +182,21 @@ def _free_names(
     return names
 
 
-def _present(runs: Runs, robot: Robot) -> set[str]:
+def _configurations_present(runs: Runs, robot: Robot) -> set[str]:
     """Names of the configurations present in the runs."""
     return {robot.configurations.names[k] for k in runs.configurations(robot)}
 
 
 @dataclasses.dataclass(frozen=True)
-class _Setting:
-    """Table, robot and settings of a calibration, completed by the kind of data and the fidelity.
+class _CalibrationInput:
+    """Table, robot and options of a calibration, after defaults of the kind of data and the fidelity.
 
     Attributes:
-        fidelity: its name.
-        profiles: True to profile every parameter.
-        kinds: kinds of the blocks that are held out.
-        base: the robot at the prior means.
-        of_product: priors of its guide frictions, see `_with_guide_priors`.
+        fidelity: name of the fidelity.
+        profiles: True to compute a profile likelihood of each parameter.
+        kinds: kinds of block that are held out.
+        base: robot at the prior means.
+        of_product: priors of its guide friction, see `_with_guide_priors`.
     """
 
     runs: Runs
@@ -201,18 +204,19 @@ class _Setting:
     fidelity: str
     profiles: bool
     kinds: Names
-    ready: Prepared
+    ready: PreparedInput
     base: Robot
     of_product: Priors
 
 
-def _with_guide_priors(runs: Runs, ready: Prepared, fidelity: str) -> tuple[Robot, Priors]:
-    """Robot with the guides' share that the fidelity computes, and priors of the free guide frictions without a
-    stated prior."""
+def _with_guide_priors(runs: Runs, ready: PreparedInput, fidelity: str) -> tuple[Robot, Priors]:
+    """Robot with the guide load that the fidelity computes, and priors for free guide frictions that have no stated
+    prior.
+    """
     robot, guide_priors = ready.robot, dict[str, tuple[float, float]]()
-    if priors.GUIDE_SHARE not in observers.fidelity_facts(fidelity).computes:
+    if priors.GUIDE_SHARE not in observers.facts_of_fidelity(fidelity).computes:
         return robot, guide_priors
-    present = _present(runs, robot)
+    present = _configurations_present(runs, robot)
     for name, chassis in ready.robot.configurations.items():
         if name in present and float(chassis.on_tracks) > 0.5:
             robot, more = priors.with_guide_share(robot, name)
@@ -222,19 +226,22 @@ def _with_guide_priors(runs: Runs, ready: Prepared, fidelity: str) -> tuple[Robo
     }
 
 
-def _with_delay(
-    setting: _Setting, found: SearchResult, tell: Callable[[Remark], None], solver: optimizers.Solver | None
-) -> tuple[_Setting, SearchResult]:
-    """The setting and a search that also frees the delay, if the error of a log lies in the samples after steps.
+def _free_delay_if_needed(
+    setting: _CalibrationInput,
+    found: MultistartResult,
+    tell: Callable[[Remark], None],
+    solver: optimizers.Solver | None,
+) -> tuple[_CalibrationInput, MultistartResult]:
+    """Repeats the search with a free delay, if the error of a log is concentrated in the samples after steps.
 
-    No other parameter explains such an error, and the others absorb it.
+    No other parameter explains such an error, but other parameters would be distorted by it.
     """
     runs, ready, rig = setting.runs, setting.ready, setting.base.rig
     reading = np.asarray(optimizers.observe_at(found.problem, found.best.z).reading)
-    late = with_codes(error_after_steps(runs, reading - runs.measured()), "after_steps")
+    late = remarks_with_codes(error_after_steps(runs, reading - runs.measured()), "after_steps")
     if not late or rig.inherits or priors.DELAY in rig.exact:
         return setting, found
-    tell(next_step("delay"))
+    tell(progress_remark("delay"))
     note = Remark("freed_delay", channel=late[0].channel, share=late[0].share)
     ready = dataclasses.replace(ready, names=(*ready.names, priors.DELAY), weighed=(*ready.weighed, note))
     coordinates = priors.parameter_coordinates(setting.base, ready.names, {**setting.of_product, **ready.stated})
@@ -248,20 +255,20 @@ def _with_delay(
 
 
 def _population_size(posed: Problem, names: Sequence[str], runs: Runs, population: int | None, more: bool) -> int:
-    """Members of each generation of a search by generations, 0 for none.
+    """Number of members of each generation, 0 for no search by generations.
 
     Args:
-        population: as for `calibrate`.
-        more: True if other options of that search are stated.
+        population: argument of `calibrate`.
+        more: True if other options of that search are given.
 
     Raises:
-        BadConfiguration: options of a population without one, or for data that no population search supports.
+        BadConfiguration: options are given but there is no population, or the data do not support such a search.
     """
     if population is None:
         population = POPULATION if fidelities.unread_parameters("steady", names, runs.turns) else 0
     if more and not population:
         raise BadConfiguration("--generations, --members: there is no population; state --population")
-    if population and not posed.observe.eased:
+    if population and not posed.observe.starts_from_steady:
         raise BadConfiguration(
             f"--population: got {population}; a population search needs settled rows and --model drive or track"
         )
@@ -282,8 +289,8 @@ def _search(
     seed: int,
     tell: Callable[[Remark], None],
     solver: optimizers.Solver | None,
-) -> tuple[SearchResult, np.ndarray | None]:
-    """The searches of a problem, and where they began at the optimum of `steady`, that optimum."""
+) -> tuple[MultistartResult, np.ndarray | None]:
+    """Searches for the optimum. Also returns the optimum of `steady` if the searches started there."""
     rng, every = np.random.default_rng(seed), None
     if runs.log is not None:
         sd = np.broadcast_to(np.median(known.sd, 0), runs.log.measured().shape)
@@ -291,12 +298,12 @@ def _search(
     points = posed.observe.starts(posed, rng, starts, every)
     if not posed.observe.long:
         return multistart.search_from_starts(posed, known, points, solver), None
-    if not posed.observe.eased:
+    if not posed.observe.starts_from_steady:
         shares = multistart.initial_noise_shares(known)
         return multistart.search_one_by_one(posed, known, points, shares, tell, solver), None
-    tell(next_step("steady"))
+    tell(progress_remark("steady"))
     if size:
-        population.Members(posed, members_file)  # refuses another calibration's file before the search of steady
+        population.MemberRunner(posed, members_file)  # refuses another calibration's file before the search of steady
     draws = rng.standard_normal((fidelities.fidelity_facts("steady").effort.starts, len(posed.coordinates)))
     draws[0] = 0.0
     easy = multistart.search_from_starts(
@@ -313,33 +320,33 @@ def _search(
     friction = np.array([FRICTION in name for name in easy.problem.coordinates.names])
     covariance[friction] = covariance[:, friction] = 0.0
     covariance[friction, friction] = 1.0
-    members = population.Members(posed, members_file)
-    everyone = population.evolve(
+    members = population.MemberRunner(posed, members_file)
+    everyone = population.run_evolution(
         members, population.member_objective(posed, known), beside, covariance, size=size, generations=generations,
         seed=seed, beside=points, tell=tell,
     )  # fmt: skip
     best_member = int(everyone.order[0])
     if not np.isfinite(everyone.cost[best_member]):
-        ended = population.Searched(everyone, best_member, (), None, np.nan).outcomes()
+        ended = population.PopulationSearch(everyone, best_member, (), None, np.nan).outcomes()
         endings = ", ".join(f"{count} {word.replace('_', ' ')}" for word, count in ended.items())
         raise BadConfiguration(
             f"--population: none of {len(everyone.z)} members can be run in every row (members with a row that ended "
             f"in: {endings or 'none'}); begin from another robot, or free fewer parameters"
         )
     posed, shares = multistart.reestimate_noise_at(posed, known, everyone, best_member)
-    tell(next_step("derivatives"))
+    tell(progress_remark("derivatives"))
     about = identifiability.analyse_identifiability(posed, jnp.asarray(everyone.z[best_member]))
     off = population.unreliable_derivatives(posed, members, everyone.z[best_member], about.jacobian, about.sd)
     names = tuple(n for n, apart in zip(posed.coordinates.names, off, strict=True) if apart)
     slope, left = population.local_regression(posed, everyone, best_member) if names else (None, np.nan)
     edge = population.parameters_at_edge(posed.coordinates, everyone.z[best_member])
-    searched = population.Searched(everyone, best_member, names, slope, left, edge)
+    searched = population.PopulationSearch(everyone, best_member, names, slope, left, edge)
     return multistart.optimum_of_population(posed, known, shares, searched, tell, solver), beside
 
 
-def _result(
-    setting: _Setting,
-    found: SearchResult,
+def _calibration_result(
+    setting: _CalibrationInput,
+    found: MultistartResult,
     beside: np.ndarray | None,
     seed: int,
     tell: Callable[[Remark], None],
@@ -347,10 +354,10 @@ def _result(
     """Result of a calibration: linear analysis, scans, profiles and held-out blocks at the optimum.
 
     Args:
-        beside: the optimum of `steady` that the search began from, if any.
+        beside: optimum of `steady` from which the search started, if any.
 
     Raises:
-        BadConfiguration: the model reaches no operating point in some row at the optimum.
+        BadConfiguration: at the optimum, the model has no operating point in some row.
     """
     runs, ready, observe, noise = setting.runs, setting.ready, setting.observe, setting.ready.noise
     posed, z, searched = found.problem, np.asarray(found.best.z), found.searched
@@ -366,11 +373,11 @@ def _result(
     )
     if posed.observe.long:
         doing = ["the linear analysis", *["profiles"] * setting.profiles, *["blocks held out"] * bool(setting.kinds)]
-        tell(next_step("optimum", ", ".join(doing)))
+        tell(progress_remark("optimum", ", ".join(doing)))
     about = identifiability.analyse_identifiability(
         posed, jnp.asarray(z), slope=None if searched is None else searched.slope
     )
-    scanned = scans.scan_all(posed, z)
+    scanned = scans.scans_at_optimum(posed, z)
     about = scans.with_scanned_sds(about, scanned)
     notes = [*ready.foreign, *ready.doubted, *ready.checked, *ready.weighed]
     notes += [
@@ -426,7 +433,7 @@ def _result(
         adequacy=lack_of_fit.judge_adequacy(
             residuals, seen_before, sd, estimated=noise.estimated, converged=converged
         ),
-        residual_clusters=residual_clusters(residuals, seed),
+        residual_clusters=find_residual_clusters(residuals, seed),
         identifiability=about,
         posterior=posterior_of_coordinates(posed.coordinates, z, about.covariance),
         remarks=(

@@ -1,4 +1,6 @@
-"""Checks that data can be fitted, with one sentence for each failure, and notes on data that can."""
+"""Checks of data before a fit: each failure is reported in one sentence, and remarks describe data that can be
+fitted.
+"""
 
 from __future__ import annotations
 
@@ -45,12 +47,12 @@ def unused_notes(runs: Runs) -> tuple[Remark, ...]:
 
 
 def unused_columns(runs: Runs) -> Names:
-    """Names of the columns of numbers that vary and have no role."""
+    """Names of numeric columns that vary and have no role."""
     return tuple(name for name, cells in runs.extras.items() if _is_varying(name, cells))
 
 
 def _is_varying(name: str, cells: np.ndarray) -> bool:
-    """True for a varying column that is neither a row number nor a time."""
+    """True for a numeric column that varies and is neither a row number nor a time."""
     if cells.dtype.kind != "f" or TIMES.search(name):
         return False
     levels = np.unique(cells[np.isfinite(cells)])
@@ -59,10 +61,10 @@ def _is_varying(name: str, cells: np.ndarray) -> bool:
 
 
 def unexplained_torque_notes(runs: Runs) -> tuple[Remark, ...]:
-    """A note on a measured output torque with a variation that no load on a shaft causes.
+    """Remark on a measured output torque that varies in a way that no load on a shaft can explain.
 
-    A load takes M_0 sign ω + K ω + M_c with M_0 and K of at least 0. If the best such load in each configuration
-    leaves more than `BRAKED` of the variance of the readings, a brake imposes the torque.
+    A load takes M_0 sign ω + K ω + M_c with M_0, K ≥ 0. If the best such load of each configuration leaves more than
+    `BRAKED` of the variance of the readings, a brake imposes the torque.
     """
     column = TORQUE.column
     if (
@@ -102,7 +104,7 @@ def unexplained_torque_notes(runs: Runs) -> tuple[Remark, ...]:
 
 
 def _unexplained_torque(torque: np.ndarray, speed: np.ndarray, way: np.ndarray) -> float:
-    """Sum of squared residuals of a torque after the best load, for magnitudes of a speed and its directions."""
+    """Sum of squared residuals of a torque after fitting the best load. `speed`: magnitudes. `way`: directions."""
     w, ones = speed / max(float(speed.max()), 1e-12), np.ones(len(speed))
     return float(nnls(np.stack([way, way * w, ones, -ones], 1), torque)[1] ** 2)
 
@@ -115,9 +117,9 @@ RANGE = 8.0
 
 
 def nothing_varies(runs: Runs, robot: Robot, noise: Noise) -> Remark | None:
-    """Note that readings and predictions are the same in all rows within the noise.
+    """Remark that readings and predictions are the same in all rows, to within the noise.
 
-    None if a channel differs by more, or if the file's robot does not reach a row.
+    None if a channel differs by more, or if the robot of the file does not reach some row.
     """
     if len(runs) < 2 or any(float(c.torque_gravity) > 0 for c in robot.configurations.members):
         return None
@@ -138,7 +140,7 @@ def nothing_varies(runs: Runs, robot: Robot, noise: Noise) -> Remark | None:
 
 
 def copied_channels(runs: Runs, robot: Robot) -> list[Remark]:
-    """Channels that are a linear function of another channel in all rows, to the digits of the file."""
+    """Remarks on channels that are a linear function of another channel in all rows, to the digits of the file."""
     copied, copies = list[Remark](), set[str]()
     names = [c for c in runs.channels if runs.has(c.column)]
     for one, other in itertools.combinations(names, 2):
@@ -166,12 +168,12 @@ def copied_channels(runs: Runs, robot: Robot) -> list[Remark]:
 
 
 def check_data(runs: Runs, robot: Robot, names: Sequence[str], noise: Noise) -> list[Remark | str]:
-    """Reject data that cannot be fitted, and return notes on the others.
+    """Rejects data that cannot be fitted. Returns remarks on data that can.
 
     Raises:
-        BadData: too few readings, a stuck channel, contradictory replicates, samples of one run under
-            different conditions, a configuration that `robot` does not have, readings in other units.
-        BadConfiguration: a free parameter of a configuration that has no rows.
+        BadData: too few readings, a stuck channel, contradictory replicates, samples of one run under different
+            conditions, a configuration that `robot` does not have, or readings in other units.
+        BadConfiguration: a free parameter belongs to a configuration without rows.
     """
     present = {robot.configurations.names[k] for k in np.unique(runs.configurations(robot))}
     for name in names:
@@ -202,7 +204,7 @@ WHITE = 1.5
 
 
 def _check_motion(runs: Runs, noise: Noise) -> None:
-    """Reject a log whose speeds are only noise, except for a driven locked shaft with stated noise."""
+    """Rejects a log whose speeds are only noise, except for a driven, locked shaft with stated noise."""
     speeds = [(k, c) for k, c in enumerate(runs.channels) if c.zero_at_rest and runs.has(c.column)]
     if not runs.sampled or runs.turns or not speeds:
         return
@@ -249,7 +251,9 @@ def _check_enough_readings(runs: Runs, names: Sequence[str], noise: Noise) -> No
 
 
 def _check_stuck_channels(runs: Runs) -> list[Remark]:
-    """Rejects a channel with one value under several conditions. Returns notes for a motor voltage with one value."""
+    """Rejects a channel that has the same value under different conditions. Returns a remark if this is the motor
+    voltage.
+    """
     labels = () if runs.layout.complete else ("configuration", "surface")
     columns = [c for c in (*observers.observer_kind(runs).axes_of(runs), *labels) if runs.has(c)]
     varied = [np.unique(runs[c], return_inverse=True)[1] for c in columns]
@@ -290,23 +294,23 @@ def _constant_conditions(runs: Runs) -> list[Remark]:
 def infeasible_error(
     runs: Runs, robot: Robot, status: np.ndarray, lost: np.ndarray, names: Sequence[str]
 ) -> BadConfiguration:
-    """Error for rows that the model cannot reproduce at the best point of all searches.
+    """Error message for rows that the model cannot reproduce even at the best point of all searches.
 
     Args:
-        robot: robot of that point.
-        status: status of each row there, shape (rows,).
-        lost: True for rows not reached, shape (rows,).
+        robot: robot at the best point.
+        status: status of each row, shape (rows,).
+        lost: True for rows that are not reached, shape (rows,).
         names: names of the free parameters.
     """
 
-    def rows(which: np.ndarray) -> str:
+    def listed(which: np.ndarray) -> str:
         return ", ".join(str(k + 1) for k in np.flatnonzero(which))
 
     slides = lost & (status == SLIDES)
     if not slides.any():
         words = ", ".join(STATUSES[k] for k in np.unique(status[lost]))
         return BadConfiguration(
-            f"no start is feasible: the model does not reach {runs.source} rows {rows(lost)} ({words} at the best "
+            f"no start is feasible: the model does not reach {runs.source} rows {listed(lost)} ({words} at the best "
             "point found); check their conditions, or widen the priors"
         )
     sliding = sorted(set(runs.configurations_named(robot)[slides]), key=robot.configurations.index)
@@ -314,6 +318,6 @@ def infeasible_error(
     frictions = ", ".join(f"{float(robot.configurations[c].ground.friction.static):.3g}" for c in sliding)
     cure = "free it, or raise it in --robot" if set(parameter.values()) - set(names) else "widen its prior"
     return BadConfiguration(
-        f"no start is feasible: {runs.source} rows {rows(slides)} were measured in steady travel, but the model "
+        f"no start is feasible: {runs.source} rows {listed(slides)} were measured in steady travel, but the model "
         f"slides there ({' and '.join(parameter.values())} = {frictions} cannot carry the demand); {cure}"
     )

@@ -1,4 +1,4 @@
-"""Conduct of histories as far as it limits their information: runs that end early, and runs that never grip."""
+"""Behaviour of runs that limits their information: they end early, or the robot never grips."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ STEP, MOST_ERROR, FEW_ROWS = 0.1, 0.5, 0.1
 
 
 def error_after_steps(runs: Runs, off: np.ndarray) -> list[Remark]:
-    """Notes on channels whose error is concentrated in the first sample with or after each step of the drive.
+    """Remarks on channels whose error is concentrated in the first sample at or after each step of the command.
 
     Args:
-        off: simulated minus measured [SI], NaN where either is missing, shape (rows, channels).
+        off: simulated minus measured reading [SI], NaN where one is missing, shape (rows, channels).
     """
     if not observers.observer_kind(runs).axis:
         return []
@@ -48,11 +48,13 @@ def error_after_steps(runs: Runs, off: np.ndarray) -> list[Remark]:
             notes.append(
                 Remark("after_steps", channel=channel.name, share=most / squares.sum(), rows=count, total=len(runs))
             )
-    return notes or _time_shifts(runs, off)
+    return notes or _time_shift_remarks(runs, off)
 
 
-def _time_shifts(runs: Runs, off: np.ndarray) -> list[Remark]:
-    """Notes on channels whose error is mostly that of a shift in time: proportional to the simulated rate."""
+def _time_shift_remarks(runs: Runs, off: np.ndarray) -> list[Remark]:
+    """Remarks on channels whose error is mostly a shift in time: it is proportional to the simulated rate of
+    change.
+    """
     notes, time = [], runs["time_s"]
     rows_of_runs = list(runs.rows_by_run().values())
     for k, channel in enumerate(runs.channels):
@@ -68,7 +70,7 @@ def _time_shifts(runs: Runs, off: np.ndarray) -> list[Remark]:
 
 
 def conduct_notes(runs: Runs, robot: Robot) -> list[Remark]:
-    """Notes on runs that end before they reach steady travel, and on runs that never grip."""
+    """Remarks on runs that end before steady travel, and on runs in which the robot never grips."""
     runs = runs.of(robot)
     kind = observers.observer_kind(runs)
     ends, readings, lasts = kind.settled(runs)

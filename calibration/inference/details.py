@@ -1,4 +1,4 @@
-"""Further findings of one kind of data: defects of each run's equations, or memory, orders and drift over time."""
+"""Further findings for one kind of data: errors of equations in each run, or memory, orders and drift over time."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from calibration.data import Columns, Json, Names
 
 @dataclasses.dataclass(frozen=True)
 class Detail(abc.ABC):
-    """Further findings of one kind of data. Reports select their section by its type."""
+    """Further findings for one kind of data. Reports choose the section by its type."""
 
     @abc.abstractmethod
     def to_json(self) -> Json:
@@ -22,12 +22,12 @@ class Detail(abc.ABC):
 
 
 @dataclasses.dataclass(frozen=True)
-class EquationDefects(Detail):
-    """Defect of each equation in each run [its balance's unit], NaN for excluded rows.
+class EquationErrors(Detail):
+    """Error of each equation in each run [unit of its balance], NaN for excluded rows.
 
     Attributes:
-        before, after: balance, with its side if sides are driven independently (`track_left`) → values, shape
-            (rows,), that would cancel the readings' residuals.
+        before, after: balance → error of each row that would cancel the residuals of the readings, shape (rows,).
+            With the side in its name if sides are driven independently (`track_left`).
     """
 
     before: Columns
@@ -42,10 +42,11 @@ class EquationDefects(Detail):
 
 
 @dataclasses.dataclass(frozen=True)
-class Memory:
-    """Autocorrelation of the residuals: the Ljung-Box statistic as a normal deviate, with threshold and p.
+class ResidualMemory:
+    """Autocorrelation of the residuals: the Ljung-Box statistic as a normal deviate, with its critical value and
+    p-value.
 
-    Threshold and p are from bootstrap tables. `autocorrelation` is each channel's, at lags 1 to `lags`.
+    These come from bootstrap tables. `autocorrelation`: of each channel, at lags 1 to `lags`.
     """
 
     deviate: float
@@ -56,9 +57,10 @@ class Memory:
 
 
 @dataclasses.dataclass(frozen=True)
-class Strongest:
-    """Balance in which a wave or a drift explains most of the misfit: score as a normal deviate, and decrease of
-    χ² [σ²]."""
+class StrongestWave:
+    """Balance in which a wave or a drift explains most of the misfit, with its score (normal deviate) and decrease of
+    χ² [σ²].
+    """
 
     balance: str
     deviate: float
@@ -66,15 +68,16 @@ class Strongest:
 
 
 @dataclasses.dataclass(frozen=True)
-class TimeSide:
-    """Statistics of one fit over time: memory. Order (word, waves a turn of the driving shaft) → score, drift.
+class FitOverTime:
+    """Statistics of one fit over time: memory of the residuals, waves and drift.
 
-    Without drift if the other conditions determine the time (see `bases.COLLINEAR`).
+    `orders`: (name, periods per turn of the driving shaft) → score. There is no drift if the other conditions
+    determine the time (see `bases.COLLINEAR`).
     """
 
-    memory: Memory
-    orders: dict[tuple[str, float], Strongest]
-    drift: Strongest | None
+    memory: ResidualMemory
+    orders: dict[tuple[str, float], StrongestWave]
+    drift: StrongestWave | None
 
     def to_json(self) -> Json:
         """Entries of `result.json`."""
@@ -84,19 +87,19 @@ class TimeSide:
 
 @dataclasses.dataclass(frozen=True)
 class TimeStatistics(Detail):
-    """Statistics that only histories have.
+    """Statistics that only time histories have.
 
     Attributes:
-        runs, samples: counts.
-        orders_unresolved: waves that the samples do not resolve.
-        before, after: statistics of the base and of the proposed robot.
+        runs, samples: number of runs and samples.
+        orders_unresolved: waves that the sampling does not resolve.
+        before, after: statistics without and with the proposal.
     """
 
     runs: int
     samples: int
     orders_unresolved: Names
-    before: TimeSide
-    after: TimeSide
+    before: FitOverTime
+    after: FitOverTime
 
     def to_json(self) -> Json:
         return {"series": vars(self)}

@@ -1,4 +1,4 @@
-"""Parts of a calibration's result: parameters, noise and errors after a finished search."""
+"""Entries of a calibration's result: parameters, noise and errors at the optimum."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ from calibration.data.columns import DRIVING
 from calibration.data.runs import Runs
 from calibration.inference import blocks as holdout
 from calibration.inference import priors
-from calibration.inference.identifiability import Z95, Identifiability, Profile
+from calibration.inference.identifiability import Z95, Identifiability, ProfileLikelihoods
 from calibration.inference.noise import Noise
 from calibration.inference.observers import Observer
 from calibration.inference.problem import Problem
 from calibration.inference.result import (
-    Block,
+    BlockErrors,
     ChannelErrors,
     ChannelNoise,
     ChannelReadings,
     ChiSquare,
     Errors,
     Estimate,
-    HeldOut,
-    Prior,
+    HeldOutErrors,
+    PriorSummary,
     ProfileCurve,
     SteadyEstimate,
 )
@@ -46,7 +46,7 @@ def parameter_estimates(
     base: Robot,
     z: np.ndarray,
     about: Identifiability,
-    profile: Profile | None,
+    profile: ProfileLikelihoods | None,
     beside: np.ndarray | None,
     sources: dict[str, str],
     scans: Mapping[int, Scan],
@@ -54,12 +54,12 @@ def parameter_estimates(
     """Estimate of each free parameter, by name.
 
     Args:
-        posed, base: the problem, and the robot whose values are the prior means.
-        z: the optimum.
-        beside: the optimum of the same problem with `steady`, or None.
-        about, profile: the linear analysis there, and the profiles, if any.
-        sources: sources of priors other than the fields' own.
-        scans: scans of the scanned coordinates, whose intervals are those of their profiles.
+        posed, base: the problem, and the robot at the prior means.
+        z: coordinates of the optimum.
+        about, profile: linear analysis at the optimum, and profile likelihoods, if any.
+        beside: optimum of the same problem with `steady`, or None.
+        sources: source of each prior that is not from a field.
+        scans: scans of coordinates. Their intervals replace those of the profiles.
     """
     coordinates = posed.coordinates
     point, sd = np.asarray(z), np.asarray(about.sd)
@@ -83,16 +83,16 @@ def parameter_estimates(
         estimates[name] = Estimate(
             value=float(value[k]),
             sd=float(about.sd[k] * slope[k]),
-            interval=_pair(interval),
-            interval_linear=_pair(linear[k]),
+            interval=_float_pair(interval),
+            interval_linear=_float_pair(linear[k]),
             interval_open=is_open,
-            interval_shift=_pair(shift),
+            interval_shift=_float_pair(shift),
             unit=coordinates.units[k],
             meaning=fields[name].spec.meaning,
-            prior=Prior(
+            prior=PriorSummary(
                 "log-normal" if coordinates.scale[k] else "normal",
                 float(median[k]),
-                _pair(wide[k]),
+                _float_pair(wide[k]),
                 sources.get(name, fields[name].spec.source),
             ),
             shift=float(z[k]),
@@ -108,12 +108,12 @@ def parameter_estimates(
     return estimates
 
 
-def _pair(ends: np.ndarray) -> tuple[float, float]:
+def _float_pair(ends: np.ndarray) -> tuple[float, float]:
     return float(ends[0]), float(ends[1])
 
 
 def channel_noise(posed: Problem, known: Noise, shares: np.ndarray, measured: np.ndarray) -> dict[str, ChannelNoise]:
-    """Source and size of each channel's sd, by channel."""
+    """Source and size of the noise of each channel."""
     share = np.where(np.isfinite(measured), np.asarray(posed.data.sd) / np.maximum(np.abs(measured), 1e-12), np.nan)
     return {
         name: ChannelNoise(
@@ -128,11 +128,11 @@ def channel_noise(posed: Problem, known: Noise, shares: np.ndarray, measured: np
 def errors_by_channel(
     shown: Sequence[Channel], simulated: np.ndarray, measured: np.ndarray, sd: np.ndarray
 ) -> Errors:
-    """Errors by channel, arrays of shape (rows, channels)."""
-    return _errors(shown, simulated, measured, sd, sized_error(simulated, measured))
+    """Errors of each channel. Arguments have shape (rows, channels)."""
+    return _channel_errors(shown, simulated, measured, sd, sized_error(simulated, measured))
 
 
-def _errors(
+def _channel_errors(
     shown: Sequence[Channel], simulated: np.ndarray, measured: np.ndarray, sd: np.ndarray, percent: np.ndarray
 ) -> Errors:
     errors = channel_errors(shown, simulated, measured, sd, percent)
@@ -144,24 +144,28 @@ def _errors(
     }
 
 
-def hold_out_errors(posed: Problem, held: holdout.HeldOut, measured: np.ndarray, sd: np.ndarray) -> HeldOut:
-    """Hold-out errors, overall and for each block."""
+def hold_out_errors(
+    posed: Problem, held: holdout.HeldOutReadings, measured: np.ndarray, sd: np.ndarray
+) -> HeldOutErrors:
+    """Hold-out errors of all rows together and of each block."""
     percent, lost = sized_error(held.reading, measured), posed.observe.unreachable(held.status)
     blocks = {}
     for k, label in enumerate(held.labels):
         inside = held.block == k
         alone = [np.where(inside[:, None], x, np.nan) for x in (held.reading, percent)]
-        blocks[label] = Block(
-            _errors(posed.channels, alone[0], measured, sd, alone[1]),
+        blocks[label] = BlockErrors(
+            _channel_errors(posed.channels, alone[0], measured, sd, alone[1]),
             _row_numbers(inside & lost),
             bool(held.converged[k]),
         )
     reading = dict(zip(channels.channel_names(posed.channels), held.reading.T, strict=True))
-    return HeldOut(_errors(posed.channels, held.reading, measured, sd, percent), _row_numbers(lost), blocks, reading)
+    return HeldOutErrors(
+        _channel_errors(posed.channels, held.reading, measured, sd, percent), _row_numbers(lost), blocks, reading
+    )
 
 
 def _row_numbers(rows: np.ndarray) -> tuple[int, ...]:
-    """Row numbers of a mask, from 1."""
+    """Row numbers of a mask, counted from 1."""
     return tuple((np.flatnonzero(rows) + 1).tolist())
 
 
@@ -172,7 +176,9 @@ def readings_by_channel(
     before: np.ndarray,
     after: np.ndarray,
 ) -> dict[str, ChannelReadings]:
-    """Readings by channel, arrays of shape (rows, channels), NaN for missing ones."""
+    """Measured and simulated readings of each channel. Arguments have shape (rows, channels), NaN for missing
+    readings.
+    """
     percent, sigma = sized_error(after, measured), (after - measured) / sd
     return {
         name: ChannelReadings(*(x[:, k] for x in (measured, sd, before, after, percent, sigma)))
@@ -183,7 +189,7 @@ def readings_by_channel(
 def chi_square(
     after: np.ndarray, measured: np.ndarray, sd: np.ndarray, about: Identifiability, known: Noise
 ) -> ChiSquare:
-    """χ² of the finite readings, and the degrees of freedom left by the fit."""
+    """χ² of the finite readings, and the degrees of freedom that the fit leaves."""
     finite = np.isfinite(measured)
     misfit = np.where(finite, (after - measured) / sd, 0.0)
     freedom = float(finite.sum() - about.leverage.sum())
@@ -191,7 +197,7 @@ def chi_square(
 
 
 def condition_columns(observe: type[Observer], runs: Runs) -> Columns:
-    """Columns that identify the rows."""
+    """Columns that identify the rows: run, conditions, surface."""
     others = (axis for axis in observe.axes_of(runs) if axis not in runs.axes)
     columns = ("run_id", *others, "configuration", *runs.axes, *DRIVING, "surface")
     return {column: runs[column] for column in columns if runs.has(column)}

@@ -1,4 +1,4 @@
-"""Feedforward constants of a drive, V = kS·sgn(v) + kV·v + kA·a + kG, from a log, and feedback gains from them.
+"""Feedforward constants of a drive, V = kS·sgn(v) + kV·v + kA·a + kG, fitted to a log, and feedback gains.
 
 The law is integrated over windows: Δv = (∫u - kS ∫sgn(v) - kV ∫v - kG T) / kA. No acceleration is computed from noisy
 speeds, and the noise stands on the left side alone.
@@ -41,15 +41,15 @@ WRONG_UNITS = (60.0, 1 / 60, 2 * np.pi, 1 / (2 * np.pi), 360.0, 1 / 360, 60 / (2
 
 @dataclasses.dataclass(frozen=True)
 class DriveLog:
-    """Readings of a drive. Those of `velocity`, `position` and `current` may be missing (None).
+    """Recorded signals of a drive. `velocity`, `position` and `current` may be missing (None).
 
     Attributes:
-        run: name of the run of each row.
-        time: [s].
-        voltage: [V].
-        position, velocity: position and velocity in `unit`, per second.
-        current: current of the motor [A].
-        battery: battery voltage at any times [V].
+        run: name of the run in each row.
+        time: time [s].
+        voltage: motor voltage [V].
+        position, velocity: position [unit] and velocity [unit/s].
+        current: motor current [A].
+        battery: battery voltage, at its own times [V].
         unit: one of `UNITS`.
     """
 
@@ -65,13 +65,14 @@ class DriveLog:
 
 @dataclasses.dataclass(frozen=True)
 class Tolerances:
-    """Weights of the regulator (Bryson's rule) and its clock. Defaults are those of WPILib's SysId.
+    """Tolerances that define the weights of the regulators (Bryson's rule), and their timing. Defaults as in SysId of
+    WPILib.
 
     Attributes:
-        position: [unit].
-        velocity: [unit/s].
-        effort: [V].
-        period: period of the loop [s].
+        position: tolerated error of position [unit].
+        velocity: tolerated error of velocity [unit/s].
+        effort: largest voltage [V].
+        period: period of the control loop [s].
         delay: delay of the measurement [s].
     """
 
@@ -84,14 +85,14 @@ class Tolerances:
 
 @dataclasses.dataclass(frozen=True)
 class Feedforward:
-    """Constants of a drive with their standard deviations, and gains.
+    """Feedforward constants of a drive with their standard deviations, and feedback gains.
 
     Attributes:
-        constants, sds: by name, kS, kV, kA, and kG where it applies.
-        missing: tests that the log lacks.
-        delay: delay of the motion behind the voltage, and of a speed's filter [s].
-        gains: by name.
-        windows: mean voltage, speed, acceleration, and True for one with little acceleration.
+        constants, sds: constants kS, kV, kA and, where it applies, kG, and their standard deviations, by name.
+        missing: SysId tests that the log lacks.
+        delay: delay between voltage and motion, including a filter of the speed [s].
+        gains: feedback gains by name.
+        windows: for each time window: mean voltage, speed and acceleration, and True if the acceleration is small.
     """
 
     mechanism: str
@@ -107,13 +108,18 @@ class Feedforward:
     remarks: tuple[Remark, ...]
 
     def to_json(self) -> Json:
-        """The content of `feedforward.json`. Intervals are of 95 %."""
-        units = units_of(self.unit)
+        """Content of `feedforward.json`. Intervals are 95 % intervals."""
+        units = constant_units(self.unit)
         return {
             "schema": "mmrjax.feedforward/1",
             "mechanism": self.mechanism,
             "feedforward": {
-                name: {"value": x, "sd": self.sds[name], "interval": interval(x, self.sds[name]), "unit": units[name]}
+                name: {
+                    "value": x,
+                    "sd": self.sds[name],
+                    "interval": interval_95(x, self.sds[name]),
+                    "unit": units[name],
+                }
                 for name, x in self.constants.items()
             },
             "feedback": {name: {"value": x, "unit": units[name.split("_")[-1]]} for name, x in self.gains.items()},
@@ -122,12 +128,12 @@ class Feedforward:
         }
 
 
-def interval(value: float, sd: float) -> list[float]:
-    """The 95 % interval."""
+def interval_95(value: float, sd: float) -> list[float]:
+    """95 % interval of a normal distribution."""
     return [value - Z95 * sd, value + Z95 * sd]
 
 
-def units_of(unit: str) -> dict[str, str]:
+def constant_units(unit: str) -> dict[str, str]:
     """Unit of each constant and gain."""
     return {
         "kS": "V", "kG": "V", "kV": f"V·s/{unit}", "kA": f"V·s²/{unit}", "kP": f"V/{unit}", "kD": f"V·s/{unit}",
@@ -135,13 +141,13 @@ def units_of(unit: str) -> dict[str, str]:
 
 
 def fit_feedforward(log: DriveLog, mechanism: str = "simple", tolerances: Tolerances | None = None) -> Feedforward:
-    """Constants and gains of a drive, and reasons why some are missing.
+    """Fits the constants of a drive and computes feedback gains, or gives reasons why some cannot be computed.
 
     Raises:
-        BadData: too little motion. The message names the missing tests.
+        BadData: there is too little motion. The message names the missing tests.
     """
     missing = missing_tests(log)
-    log, lag, remarks = _with_speed_of_position(log)
+    log, lag, remarks = _speed_from_position(log)
     windows = _motion_windows(log, 0.0)
     if len(windows["u"]) < WINDOWS:
         lacking = f"; missing: {', '.join(missing)}" if missing else ""
@@ -152,8 +158,8 @@ def fit_feedforward(log: DriveLog, mechanism: str = "simple", tolerances: Tolera
     if _fit_constants(windows, "simple")[0][1] < 0:
         remarks.append(Remark("feedforward_sign"))
         log = dataclasses.replace(log, voltage=-log.voltage)
-    delay, windows, level, bend = _delay_and_bend(log, mechanism)
-    if delay > LATE * _step(log):
+    delay, windows, level, bend = _fit_delay_and_slope_change(log, mechanism)
+    if delay > LATE * _median_time_step(log):
         remarks.append(Remark("feedforward_delay", delay=delay))
     else:
         delay = 0.0
@@ -161,15 +167,15 @@ def fit_feedforward(log: DriveLog, mechanism: str = "simple", tolerances: Tolera
         most = None if log.current is None else float(np.nanmax(np.abs(log.current)))
         limited = Remark("feedforward_limit", level=level, current=most)
         remarks.append(limited if bend < 0 else Remark("feedforward_skid", level=level))
-    kept = _rows(windows, windows["demand"] < level) if level else windows
+    kept = _select_windows(windows, windows["demand"] < level) if level else windows
     values, covariance, _ = _fit_constants(kept, mechanism)
     sds = np.sqrt(np.diag(covariance))
     names = ("kS", "kV", "kA", "kG")[: len(values)]
     constants = {name: float(x) for name, x in zip(names, values, strict=True)}
     spread = {name: float(x) for name, x in zip(names, sds, strict=True)}
     if mechanism == "simple":
-        remarks += _by_direction(kept)
-    remarks += _battery(log)
+        remarks += _direction_remarks(kept)
+    remarks += _battery_remarks(log)
     if missing:
         remarks.append(Remark("feedforward_missing", tests=missing))
     determined = 0 < Z95 * spread["kA"] < 0.5 * constants["kA"]
@@ -178,9 +184,9 @@ def fit_feedforward(log: DriveLog, mechanism: str = "simple", tolerances: Tolera
         remarks.append(Remark("feedforward_no_kA", share=spread["kA"] * Z95 / abs(constants["kA"]), missing=slow))
     asked = tolerances or Tolerances()
     asked = dataclasses.replace(asked, delay=delay + lag) if asked.delay is None else asked
-    gains = feedback(constants["kV"], constants["kA"], asked) if determined and constants["kV"] > 0 else {}
+    gains = feedback_gains(constants["kV"], constants["kA"], asked) if determined and constants["kV"] > 0 else {}
     if gains and asked.delay:
-        prompt = feedback(constants["kV"], constants["kA"], dataclasses.replace(asked, delay=0.0))
+        prompt = feedback_gains(constants["kV"], constants["kA"], dataclasses.replace(asked, delay=0.0))
         remarks.append(Remark("feedforward_gains_delayed", delay=asked.delay, slow=gains["velocity_kP"],
                               prompt=prompt["velocity_kP"]))  # fmt: skip
     figures = {
@@ -196,19 +202,19 @@ def fit_feedforward(log: DriveLog, mechanism: str = "simple", tolerances: Tolera
     )  # fmt: skip
 
 
-def feedback(kV: float, kA: float, tolerances: Tolerances) -> dict[str, float]:
-    """Gains of the regulators of speed and of position.
+def feedback_gains(kV: float, kA: float, tolerances: Tolerances) -> dict[str, float]:
+    """Gains of the velocity and position regulators (LQR).
 
-    Those of WPILib: state cost 1/q², effort cost 1/r², held voltage, and K (A - B K)^(delay / period) for a delay
-    (`FeedbackAnalysis.cpp` and `LinearQuadraticRegulator::LatencyCompensate` of wpilibsuite/allwpilib).
+    As in WPILib: state cost 1/q², effort cost 1/r², voltage held over a period, and K (A - B K)^(delay / period) for
+    a delay (`FeedbackAnalysis.cpp` and `LinearQuadraticRegulator::LatencyCompensate` of wpilibsuite/allwpilib).
     """
     t = tolerances
-    speed = _regulator(np.array([[-kV / kA]]), np.array([[1 / kA]]), [t.velocity], t)
-    place = _regulator(np.array([[0, 1], [0, -kV / kA]]), np.array([[0], [1 / kA]]), [t.position, t.velocity], t)
+    speed = _lqr_gains(np.array([[-kV / kA]]), np.array([[1 / kA]]), [t.velocity], t)
+    place = _lqr_gains(np.array([[0, 1], [0, -kV / kA]]), np.array([[0], [1 / kA]]), [t.position, t.velocity], t)
     return {"velocity_kP": speed[0], "position_kP": place[0], "position_kD": place[1]}
 
 
-def _regulator(a: np.ndarray, b: np.ndarray, tolerated: list[float], t: Tolerances) -> list[float]:
+def _lqr_gains(a: np.ndarray, b: np.ndarray, tolerated: list[float], t: Tolerances) -> list[float]:
     n = len(a)
     held = scipy.linalg.expm(np.block([[a, b], [np.zeros((1, n + 1))]]) * t.period)
     a, b = held[:n, :n], held[:n, n:]
@@ -220,7 +226,7 @@ def _regulator(a: np.ndarray, b: np.ndarray, tolerated: list[float], t: Toleranc
 
 
 def missing_tests(log: DriveLog) -> Names:
-    """Tests of SysId that a log lacks. None of a log whose voltage is neither ramp nor step."""
+    """SysId tests that a log lacks. Empty if the voltage is neither a ramp nor a step."""
     present = set()
     for name in dict.fromkeys(log.run.tolist()):
         named = next((t for t, old in TESTS.items() if t in name or old in name), None)
@@ -235,17 +241,17 @@ def missing_tests(log: DriveLog) -> Names:
     return tuple(t for t in TESTS if t not in present)
 
 
-def _step(log: DriveLog) -> float:
+def _median_time_step(log: DriveLog) -> float:
     steps = np.diff(log.time)[log.run[1:] == log.run[:-1]]
     return float(np.median(steps[steps > 0]))
 
 
-def _with_speed_of_position(log: DriveLog) -> tuple[DriveLog, float, list[Remark]]:
-    """The log with a speed that is the rate of the position, the lag of the log's own speed [s], and remarks."""
+def _speed_from_position(log: DriveLog) -> tuple[DriveLog, float, list[Remark]]:
+    """Log whose speed is the derivative of its position, the lag of its recorded speed [s], and remarks."""
     if log.position is None:
         return log, 0.0, []
-    step, rate = _step(log), np.zeros(len(log.time))
-    for rows in _runs(log):
+    step, rate = _median_time_step(log), np.zeros(len(log.time))
+    for rows in _rows_of_runs(log):
         t, x = log.time[rows], log.position[rows]
         rate[rows] = np.nan  # at the ends
         rate[rows[1:-1]] = (x[2:] - x[:-2]) / np.maximum(t[2:] - t[:-2], 1e-9)
@@ -265,7 +271,7 @@ def _with_speed_of_position(log: DriveLog) -> tuple[DriveLog, float, list[Remark
     lags = np.arange(0, LONGEST, step / 4)
     misfit = [
         sum(np.nansum((rate[r] - np.interp(log.time[r] + lag, log.time[r], speed[r]))[: -int(LONGEST / step)] ** 2)
-            for r in _runs(log) if len(r) > 2 * LONGEST / step)
+            for r in _rows_of_runs(log) if len(r) > 2 * LONGEST / step)
         for lag in lags
     ]  # fmt: skip
     best = int(np.argmin(misfit))
@@ -275,18 +281,20 @@ def _with_speed_of_position(log: DriveLog) -> tuple[DriveLog, float, list[Remark
     return dataclasses.replace(log, velocity=speed), 0.0, remarks
 
 
-def _runs(log: DriveLog) -> Iterator[np.ndarray]:
+def _rows_of_runs(log: DriveLog) -> Iterator[np.ndarray]:
     for name in dict.fromkeys(log.run.tolist()):
         yield np.flatnonzero(log.run == name)
 
 
 def _motion_windows(log: DriveLog, delay: float) -> Columns:
-    """Integrals over windows of motion one way: voltage u, path x, direction s, length T, change of speed dv."""
+    """Integrals over time windows of motion in one direction: voltage u, path x, direction s, length T, change of
+    speed dv.
+    """
     windows: list[dict[str, object]] = []
-    step, speeds = _step(log), np.asarray(log.velocity)
+    step, speeds = _median_time_step(log), np.asarray(log.velocity)
     least = MOVES * np.nanmax(np.abs(speeds))
     count = max(FEWEST, round(WINDOW / step))
-    for rows in _runs(log):
+    for rows in _rows_of_runs(log):
         t, u, v = log.time[rows], log.voltage[rows], speeds[rows]
         whole = np.r_[0, np.cumsum(u[:-1] * np.diff(t))]
         path = np.r_[0, np.cumsum((v[1:] + v[:-1]) / 2 * np.diff(t))] if log.position is None else log.position[rows]
@@ -315,31 +323,31 @@ def _motion_windows(log: DriveLog, delay: float) -> Columns:
 
 
 def _driven_voltages(voltage: np.ndarray) -> np.ndarray:
-    """Voltages of the samples of a run in which the motor is driven."""
+    """Voltages of a run while the motor is driven."""
     return voltage[np.abs(voltage) > 0.05 * np.abs(voltage).max()]
 
 
 def _is_ramp(driven: np.ndarray) -> bool:
-    """True for a test whose driving voltages change, False for a step."""
+    """True if the driving voltages of a test change, False for a voltage step."""
     size = np.abs(driven)
     return bool(len(size) and size.std() > 0.1 * size.mean())
 
 
-def _rows(windows: Columns, kept: np.ndarray) -> Columns:
+def _select_windows(windows: Columns, kept: np.ndarray) -> Columns:
     return {key: x[kept] for key, x in windows.items()}
 
 
-def _matrix(w: Columns, mechanism: str) -> np.ndarray:
+def _regression_matrix(w: Columns, mechanism: str) -> np.ndarray:
     more = {"simple": (), "elevator": (w["T"],), "arm": (w["cos"], w["sin"])}[mechanism]
     return np.stack([w["u"], -w["s"], -w["x"], *(-x for x in more)], axis=1)
 
 
 def _fit_constants(w: Columns, mechanism: str) -> tuple[np.ndarray, np.ndarray, float]:
-    """Constants kS, kV, kA (and kG), their covariance, and the sum of squares.
+    """Fits the constants kS, kV, kA (and kG). Returns them, their covariance and the sum of squares.
 
-    Windows overlap: the covariance holds for residuals that are correlated.
+    Windows overlap, so the covariance allows for correlated residuals.
     """
-    matrix = _matrix(w, mechanism)
+    matrix = _regression_matrix(w, mechanism)
     solved, *_ = np.linalg.lstsq(matrix, w["dv"], rcond=None)
     rest = w["dv"] - matrix @ solved
     inverse = np.linalg.pinv(matrix.T @ matrix)
@@ -368,12 +376,13 @@ def _fit_constants(w: Columns, mechanism: str) -> tuple[np.ndarray, np.ndarray, 
     return np.array(names), by @ spread @ by.T, float(rest @ rest)
 
 
-def _delay_and_bend(log: DriveLog, mechanism: str) -> tuple[float, Columns, float, float]:
-    """The delay [s], windows with it, the accelerating voltage above which the slope changes [V], and its change.
+def _fit_delay_and_slope_change(log: DriveLog, mechanism: str) -> tuple[float, Columns, float, float]:
+    """Delay [s], the windows with it, the accelerating voltage above which the slope changes [V], and that change.
 
-    Each is 0 unless the likelihood needs it: a limit looks like a delay, so the better one is taken first.
+    Each is 0 unless the likelihood requires it. A current limit looks like a delay, so the better of both is fitted
+    first.
     """
-    step = _step(log)
+    step = _median_time_step(log)
     trials = []
     shifts = [*np.arange(-8, 8) / 8, *np.arange(2, 2 * LONGEST / step) / 2]
     for delay in step * np.array(sorted(shifts, key=abs)):
@@ -394,9 +403,9 @@ def _delay_and_bend(log: DriveLog, mechanism: str) -> tuple[float, Columns, floa
 
 
 def _slope_change(w: Columns, mechanism: str) -> tuple[float, float, float]:
-    """Accelerating voltage above which the slope changes [V], the change, and the sum of squares.
+    """Accelerating voltage above which the slope changes [V], that change, and the sum of squares.
 
-    Negative: less acceleration (a current limit), positive: more (wheels that slip). Sets `demand`.
+    A negative change is less acceleration (a current limit), a positive one more (slipping wheels). Sets `demand`.
     """
     values, _, plain = _fit_constants(w, mechanism)
     level, bend, cost, material = 0.0, 0.0, np.inf, False
@@ -409,7 +418,7 @@ def _slope_change(w: Columns, mechanism: str) -> tuple[float, float, float]:
             above = w["demand"] > limit
             if above.sum() >= 3 and (~above).sum() >= WINDOWS:
                 hinge = np.sign(asked) * np.maximum(w["demand"] - limit, 0) * w["T"]
-                matrix = np.column_stack([_matrix(w, mechanism), hinge])
+                matrix = np.column_stack([_regression_matrix(w, mechanism), hinge])
                 slope = np.linalg.lstsq(matrix, w["dv"], rcond=None)[0]
                 trials.append((float(np.sum((w["dv"] - matrix @ slope) ** 2)), float(limit), slope))
         if not trials:
@@ -421,14 +430,14 @@ def _slope_change(w: Columns, mechanism: str) -> tuple[float, float, float]:
     return level, bend, cost if material else np.inf
 
 
-def _by_direction(w: Columns) -> Iterator[Remark]:
+def _direction_remarks(w: Columns) -> Iterator[Remark]:
     values, covariance, _ = _fit_constants(w, "elevator")  # a constant voltage beside friction is half the difference
     half, sd = values[3], np.sqrt(covariance[3, 3])
     if {*np.sign(w["s"])} == {1.0, -1.0} and abs(half) > 4 * sd and abs(half) > 0.05 * abs(values[0]):
         yield Remark("feedforward_direction", forward=float(values[0] + half), backward=float(values[0] - half))
 
 
-def _battery(log: DriveLog) -> Iterator[Remark]:
+def _battery_remarks(log: DriveLog) -> Iterator[Remark]:
     if log.battery is not None and np.isfinite(log.battery).any():
         rest, low = float(np.nanmax(log.battery)), float(np.nanmin(log.battery))
         if low < 0.9 * rest:

@@ -1,4 +1,4 @@
-"""Notes on a table or a fit, as data: names, tests and numbers. `mmrjax.describe` makes their sentences."""
+"""Remarks on a table or a fit, as data: names, tests and numbers. `mmrjax.describe` writes their sentences."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from calibration.described import describe
 
 @dataclasses.dataclass(frozen=True, init=False)
 class Remark:
-    """A remark on a table or a result, as data. `mmrjax.describe` makes its sentence.
+    """A remark on a table or a result, as data. `mmrjax.describe` writes its sentence.
 
     Attributes:
         code: code of its sentence in `calibration/words`.
-        values: values of the sentence, by name. Each is an attribute too.
+        values: values in the sentence, by name. Each is an attribute too.
     """
 
     code: str
@@ -35,17 +35,19 @@ class Remark:
 Notes = tuple[Remark | str, ...]
 
 
-def with_codes(remarks: Iterable[Remark | str], *codes: str) -> list[Remark]:
-    """The remarks that have one of these codes."""
+def remarks_with_codes(remarks: Iterable[Remark | str], *codes: str) -> list[Remark]:
+    """Remarks that have one of these codes."""
     return [x for x in remarks if isinstance(x, Remark) and x.code in codes]
 
 
-def next_step(name: str, *about: object) -> Remark:
-    """Next step of a long computation: a row of `step_words.STEPS`, and values for its sentence in order."""
+def progress_remark(name: str, *about: object) -> Remark:
+    """Remark on the next step of a long computation: a row of `step_words.STEPS`, and the values for its sentence in
+    order.
+    """
     return Remark("step", name=name, about=about)
 
 
-class Pair(NamedTuple):
+class DependentPair(NamedTuple):
     """Two parameters that the data determine only in combination.
 
     Attributes:
@@ -62,30 +64,31 @@ class Pair(NamedTuple):
     weight: float
 
     def to_json(self) -> dict[str, object]:
-        """As in `together` of result.json."""
+        """Entry of `together` in result.json."""
         return {"a": self.one, "b": self.other, "correlation": self.correlation, "determined": describe(self)}
 
 
 class Determination(NamedTuple):
-    """Result of the test whether data determine a parameter.
+    """Result of the test of whether data determine a parameter.
 
     Attributes:
-        held: True if only its prior does.
-        others: parameters that it is determined together with.
+        held: True if only its prior determines it.
+        others: parameters with which it is determined in combination.
     """
 
     held: bool
     others: Names
 
     @classmethod
-    def from_pairs(cls, name: str, held: bool, pairs: Iterable[Pair]) -> Determination:
-        """Determination of a parameter, from the pairs that data determine only in combination."""
+    def from_pairs(cls, name: str, held: bool, pairs: Iterable[DependentPair]) -> Determination:
+        """Determination of a parameter, given all pairs that data determine only in combination."""
         return cls(held, tuple(p.other if p.one == name else p.one for p in pairs if name in (p.one, p.other)))
 
 
-class Edge(NamedTuple):
-    """Bound that a parameter reached, `lower`, `upper` or "", and its distance from the middle of its prior [prior
-    sd]."""
+class ReachedBound(NamedTuple):
+    """Bound that a parameter reached, `lower`, `upper` or "", and its distance from the middle of the prior [prior
+    sds].
+    """
 
     bound: str
     sds: float
@@ -94,14 +97,14 @@ class Edge(NamedTuple):
 # --- whether a fit is adequate --------------------------------------------------------------------------
 
 
-class Shown(NamedTuple):
-    """Finding of a test of adequacy. The order of the fields decides between equal p-values.
+class AdequacyFinding(NamedTuple):
+    """Finding of an adequacy test. Among equal p-values, the order of the fields decides.
 
     Attributes:
-        channel: channel of the residuals, "" for all.
+        channel: channel of the residuals, "" if all.
         what: `repeats` or `stated` (residuals exceed the scatter of repeats or the stated noise), `follow` a
             variable, or `remember` the previous sample.
-        variable: column or name.
+        variable: column, or name of the variable.
     """
 
     channel: str = ""

@@ -1,4 +1,6 @@
-"""Priors inherited from another robot: a file changes a part of the nominal robot, but not that part's friction."""
+"""Priors inherited from another robot: a file changes a part of the nominal robot but not the friction of that
+part.
+"""
 
 from __future__ import annotations
 
@@ -19,13 +21,14 @@ CHASSIS, GUIDES = (("mass", "radius"), FRICTION), (GUIDE_SHARE, GUIDE_FRICTION)
 DIFFERS = 0.2
 
 
-def inherited_priors(robot: Robot, stated: Collection[str] = ()) -> list[Remark]:
-    """Parts that differ from the nominal robot's but have the same friction. None for a rig without inheritance.
+def inherited_friction_remarks(robot: Robot, stated: Collection[str] = ()) -> list[Remark]:
+    """Remarks on parts that differ from those of the nominal robot but have the same friction. Empty for a rig
+    without inheritance.
 
     A configuration is compared with the one of the nominal robot that has the same friction.
 
     Args:
-        stated: names of parameters whose priors the user states.
+        stated: names of the parameters whose priors the user states.
     """
     if not robot.rig.inherits:
         return []

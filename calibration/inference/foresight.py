@@ -1,4 +1,4 @@
-"""Parameters that a table can determine, before any fit: posterior over prior sd, at the prior mean."""
+"""Which parameters a table can determine, before any fit: ratio of posterior to prior sd at the prior mean."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from calibration.data.input_errors import BadConfiguration
 from calibration.data.runs import Runs
 from calibration.data.thinning import used_rows
 from calibration.inference import identifiability, observers, optimizers, priors
-from calibration.inference.fit_notes import Notes, Pair, with_codes
+from calibration.inference.fit_notes import DependentPair, Notes, remarks_with_codes
 from calibration.inference.identifiability import Identifiability, determined_together, posterior_of_coordinates
-from calibration.inference.preparation import prepare
+from calibration.inference.preparation import prepare_input
 from calibration.inference.problem import Problem
 from mmrjax import fidelities
 from mmrjax.model.robot import Robot
@@ -34,15 +34,15 @@ MORE = ("motor_current", "output_speed", "motor_voltage")
 
 
 @dataclasses.dataclass(frozen=True)
-class Determined:
-    """Information that a table contains on a free parameter.
+class ParameterInformation:
+    """Information on a free parameter in a table.
 
     Attributes:
         name: name of the parameter.
         value: prior mean [unit].
-        prior_sd: prior standard deviation of it [unit].
-        share: posterior over prior sd [-].
-        held: True if its prior holds it.
+        prior_sd: prior standard deviation [unit].
+        share: posterior sd over prior sd [-].
+        held: True if the table does not determine it, so that its prior does.
     """
 
     name: str
@@ -54,48 +54,52 @@ class Determined:
 
 
 @dataclasses.dataclass(frozen=True)
-class Foresight:
-    """Information that a table contains on a robot's parameters.
+class InformationForecast:
+    """Information on a robot's parameters in a table, before any fit.
 
     Attributes:
-        parameters: parameters that `loop` would free.
-        status: status of each row, for the values in the file.
+        parameters: parameters that `loop` would fit.
+        status: status of each row, with the values of the robot file.
         noise: source of each channel's sd.
         alike: strongly correlated pairs of parameters, with the correlation of their posterior.
         together: pairs of parameters that the data determine only in combination.
-        robot: completed from the table, see `preparation.prepare`.
-        doubts: notes to look at before a fit.
-        separating: for each of `alike`, columns that the log lacks, each of which would separate the pair.
+        robot: robot completed from the table, see `preparation.prepare_input`.
+        doubts: remarks that should be checked before a fit.
+        separating: for each pair in `alike`, columns that the log lacks and that would each separate the pair.
     """
 
-    parameters: tuple[Determined, ...]
+    parameters: tuple[ParameterInformation, ...]
     status: Names
     noise: Names
     alike: tuple[tuple[str, str, float], ...]
-    together: tuple[Pair, ...]
+    together: tuple[DependentPair, ...]
     robot: Robot
     doubts: Notes = ()
     separating: tuple[Names, ...] = ()
 
 
-def predict_identifiability(runs: Runs, robot: Robot, noise: str | None = None, rows: int = ROWS) -> Foresight:
-    """Returns which parameters of `robot` `runs` can determine, from the linear analysis at the robot's own values.
+def predict_identifiability(
+    runs: Runs, robot: Robot, noise: str | None = None, rows: int = ROWS
+) -> InformationForecast:
+    """Predicts which parameters of `robot` the runs can determine, from the linear analysis at the values of its
+    file.
 
     Rows that the robot does not reach with these values are ignored.
 
     Args:
-        noise: as `noise.parse_noise`. None takes the file's sd columns, or shares of the readings.
-        rows: number of rows above which they are thinned.
+        noise: standard deviations, in the format of `noise.parse_noise`. None: from the sd columns of the file, or
+            shares of the readings.
+        rows: largest number of rows. Larger tables are thinned.
 
     Raises:
         BadData: data that cannot be used.
-        BadConfiguration: no parameter of the robot can be freed.
+        BadConfiguration: no parameter of the robot can be fitted.
     """
     runs = used_rows(runs, robot, rows)
-    ready = prepare(runs, robot, noise)
+    ready = prepare_input(runs, robot, noise)
     observe, robot, table_noise = ready.observe, ready.robot, ready.noise
     present = {robot.configurations.names[k] for k in runs.configurations(robot)}
-    names = priors.free_names(robot, present, *observe.free(), () if observe.axis else priors.OVER_TIME)
+    names = priors.loop_parameter_names(robot, present, *observe.free(), () if observe.axis else priors.OVER_TIME)
     if not observe.axis:
         names = tuple(n for n in names if n not in fidelities.unread_parameters("steady", names, runs.turns))
     if not names:
@@ -113,28 +117,33 @@ def predict_identifiability(runs: Runs, robot: Robot, noise: str | None = None, 
     fields = priors.parameters_by_name(robot)
     width = coordinates.prior_sd
     estimates = tuple(
-        Determined(n, fields[n].spec.unit, float(fields[n].value), float(width[k]), float(about.sd[k]), bool(held[k]))
+        ParameterInformation(
+            n, fields[n].spec.unit, float(fields[n].value), float(width[k]), float(about.sd[k]), bool(held[k])
+        )
         for k, n in enumerate(names)
     )
     statuses = tuple(STATUSES[int(s)] for s in np.asarray(observation.status))
-    doubts = tuple(with_codes(ready.checked, *DOUBTS))
+    doubts = tuple(remarks_with_codes(ready.checked, *DOUBTS))
     priors_hold = [p.name for p in estimates if p.held]
     together = determined_together(
         posterior_of_coordinates(coordinates, np.asarray(z), about.covariance), priors_hold
     )
     alike = tuple(about.correlated())
     separating = (
-        tuple(_columns_apart(runs, posed, about, alike)) if robot.rig.follows_goal and alike else ((),) * len(alike)
+        tuple(_separating_columns(runs, posed, about, alike))
+        if robot.rig.follows_goal and alike
+        else ((),) * len(alike)
     )
-    return Foresight(estimates, statuses, table_noise.source, alike, together, robot, doubts, separating)
+    return InformationForecast(estimates, statuses, table_noise.source, alike, together, robot, doubts, separating)
 
 
-def _columns_apart(
+def _separating_columns(
     runs: Runs, posed: Problem, about: Identifiability, alike: Sequence[tuple[str, str, float]]
 ) -> Iterator[Names]:
-    """Columns that separate each pair: with their readings it is neither correlated nor held by its priors.
+    """For each pair, columns that would separate it: with their readings, it is neither correlated nor held by its
+    priors.
 
-    The sensitivities of these readings are simulated, as if each sample had one.
+    Each sample is assumed to have such a reading, and its sensitivity is simulated.
     """
     own, rig = posed.base.channels, posed.base.rig
     wide = dataclasses.replace(posed.base, rig=dataclasses.replace(rig, channels=(*rig.channels, *MORE)))

@@ -1,4 +1,4 @@
-"""Hold-out fits: predictions of rows by fits without their block."""
+"""Hold-out fits: each block of rows is predicted by a fit to the other rows."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ from calibration.inference.optimizers import Optimum
 from calibration.inference.problem import Observation, Problem
 
 
-def search_each(
+def fit_from_each_start(
     problem: Problem,
     starts: Sequence[np.ndarray],
     weights: Sequence[np.ndarray],
     active: Sequence | None = None,
     most: int | None = None,
 ) -> tuple[Optimum, Observation]:
-    """Fits from several starts, each with its own weights.
+    """Fits a problem from several starts, each with its own weights.
 
     Args:
-        starts: coordinates.
-        weights: weights of the readings, (rows, channels) each.
-        active: sets of effects, None for a problem without slots.
-        most: largest number of steps of each, None for no limit.
+        starts: coordinates of each start.
+        weights: weights of the readings for each start, shape (rows, channels).
+        active: set of effects of each start, None for a problem without slots.
+        most: largest number of steps, None for no limit.
 
     Returns:
         Optimum of each search and the model's observation there. The leading axis is the starts.
@@ -37,15 +37,15 @@ def search_each(
 
 @dataclasses.dataclass(frozen=True)
 class HeldOutFits:
-    """Fits without each block.
+    """Fits without each block, and their predictions of the block.
 
     Attributes:
-        reading: reading of each row by the fit without its block [SI], NaN if no block holds the row or the fit does
-            not reach it, shape (rows, channels).
+        reading: reading of each row, predicted by the fit without its block [SI], shape (rows, channels). NaN if no
+            block holds the row, or if the fitted robot does not reach it.
         status: status of each row, -1 if no block holds it.
         block: index of each row's block, -1 for none, shape (rows,).
         z: coordinates of each block's fit, shape (blocks, coordinates).
-        converged: True if it is an optimum.
+        converged: True for each block whose fit is an optimum.
     """
 
     reading: np.ndarray
@@ -58,19 +58,20 @@ class HeldOutFits:
 def hold_out_blocks(
     problem: Problem, start: np.ndarray, masks: Sequence[np.ndarray], active: Sequence[int] | None = None
 ) -> HeldOutFits:
-    """Refit without each block in turn, and predict the omitted rows.
+    """Refits without each block in turn, and predicts the rows that were left out.
 
     Args:
-        problem: as fitted to all rows.
-        start: optimum of the problem.
+        problem: problem of the fit to all rows.
+        start: its optimum.
+        masks: masks of the rows of each block, shape (rows of the table,). The problem may have more, padded rows.
         active: active effects, for a problem with slots.
-        masks: masks of the rows of each block, shape (rows of the table,). The problem's rows may be padded beyond
-            these.
     """
     rows, weight = len(masks[0]), np.asarray(problem.data.weight)
     out = [np.concatenate([m, np.zeros(len(weight) - rows, bool)]) for m in masks]
     which = None if active is None else [active] * len(masks)
-    optima, observations = search_each(problem, [start] * len(masks), [weight * ~m[:, None] for m in out], which)
+    optima, observations = fit_from_each_start(
+        problem, [start] * len(masks), [weight * ~m[:, None] for m in out], which
+    )
     reading, status = np.full((rows, weight.shape[1]), np.nan), np.full(rows, -1)
     block = np.full(rows, -1)
     for k, mask in enumerate(masks):
@@ -83,10 +84,12 @@ def hold_out_blocks(
 def predict_unseen(
     problem: Problem, start: np.ndarray, masks: Sequence[np.ndarray], active: Sequence[int] | None = None
 ) -> HeldOutFits:
-    """Hold-out fits as `hold_out_blocks`. For long runs each refit is one Gauss-Newton step from the fit to all rows.
+    """Hold-out fits as in `hold_out_blocks`. For long runs, each refit is a single Gauss-Newton step from the fit to
+    all rows.
 
-    A log has hundreds of readings a parameter, and without one block a fit stays within the linear range. The step
-    that remains with all rows is subtracted: where a load sticks, slopes promise a gain that does not exist.
+    A log has hundreds of readings per parameter, so without one block the fit stays within the linear range. The step
+    that remains with all rows is subtracted, because where a load sticks, derivatives promise a gain that does not
+    exist.
     """
     if not problem.observe.long:
         return hold_out_blocks(problem, start, masks, active)

@@ -1,4 +1,4 @@
-"""Information of data and priors on each parameter: covariance, rank, profiles, coverage."""
+"""What data and priors tell about each parameter: covariance, rank, profile likelihoods, coverage."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from jaxtyping import Array
 from calibration.data import Names
 from calibration.data.posterior_file import LOG, NORMAL, Posterior
 from calibration.inference import optimizers
-from calibration.inference.fit_notes import Pair
+from calibration.inference.fit_notes import DependentPair
 from calibration.inference.optimizers import Pin
 from calibration.inference.priors import SOFTNESS, Coordinates
 from calibration.inference.problem import Data, Problem
@@ -30,28 +30,29 @@ PROFILE_STEPS = (0.1, 0.25, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 6.0)
 
 
 def held_by_prior(sd: np.ndarray) -> np.ndarray:
-    """True for each parameter held by its prior: its posterior sd is above `HELD` of its prior sd, or not known.
+    """True for each parameter that the data do not determine: its posterior sd exceeds `HELD` of its prior sd, or is
+    unknown.
 
     Args:
-        sd: posterior, of coordinates whose prior sd is 1 (of a log-normal prior: of the logarithm), any shape.
+        sd: posterior sds of coordinates with prior sd 1 (for a log-normal prior, of the logarithm), any shape.
     """
     return ~(np.asarray(sd) <= HELD)
 
 
 @dataclasses.dataclass(frozen=True)
 class Identifiability:
-    """The linear analysis at the optimum, in coordinates z (one prior sd each).
+    """Linear analysis at the optimum, in coordinates z with prior sd 1.
 
     Attributes:
         names: names of the parameters.
         covariance: posterior covariance of z, shape (parameters, parameters).
-        sd: posterior sd of z: posterior sd over prior sd.
+        sd: posterior sd of z, which is posterior sd over prior sd.
         singular_values: singular values of the whitened Jacobian of the readings without priors: prior sd over data
             sd along each direction, largest first. Above 1 the data are more informative than the prior.
-        directions: right singular vectors, one a row. Those beyond the rank as `separate_directions` returns them.
+        directions: right singular vectors, one in each row. Those beyond the rank are from `separate_directions`.
         rank: number of singular values above 1e-8 of the largest.
-        sensitivity: norm of each column of that Jacobian: change of the readings by one prior sd, in data sds,
-            0 for a parameter that nothing measures.
+        sensitivity: change of the readings by one prior sd of each parameter, in data sds. 0 if nothing measures the
+            parameter.
         leverage: share of each reading's variance that the fit explains, shape (rows, channels).
         jacobian: Jacobian of the whitened readings, row by row, shape (rows · channels, parameters).
     """
@@ -73,7 +74,7 @@ class Identifiability:
 
     @property
     def held_by_prior(self) -> np.ndarray:
-        """True for each parameter held by its prior, shape (parameters,)."""
+        """True for each parameter that the data do not determine, shape (parameters,)."""
         return held_by_prior(self.sd)
 
     def correlated(self) -> list[tuple[str, str, float]]:
@@ -85,7 +86,9 @@ class Identifiability:
         return sorted((p for p in pairs if abs(p[2]) > CORRELATED), key=lambda p: -abs(p[2]))
 
     def weak_directions(self) -> list[tuple[float, dict[str, float]]]:
-        """Directions in which the prior is more informative: singular value, main components in prior sds."""
+        """Directions in which the prior is more informative than the data: singular value, and main components in
+        prior sds.
+        """
         weak = []
         for s, v in zip(self.singular_values, self.directions, strict=True):
             if s < 1:
@@ -95,13 +98,13 @@ class Identifiability:
 
 
 def separate_directions(directions: np.ndarray) -> np.ndarray:
-    """Orthonormal basis of a subspace with each direction as close to one parameter as possible.
+    """Orthonormal basis of a subspace in which each vector is as close as possible to one parameter.
 
-    The parameter with the largest component in the subspace comes first. The result does not depend on the basis
-    given, and so not on rounding.
+    The parameter with the largest component in the subspace is first. The result does not depend on the given basis,
+    and so not on rounding.
 
     Args:
-        directions: orthonormal, shape (directions, parameters), as the result.
+        directions: orthonormal vectors that span the subspace, shape (directions, parameters).
     """
     projector, separated = directions.T @ directions, np.zeros_like(directions)
     for row in separated:
@@ -132,7 +135,7 @@ def analyse_identifiability(
         jacobian = np.asarray(optimizers.linearise(problem, z, data)[1])
         all_slopes, readings = jacobian[optimizers.informative_residuals(data)], jacobian[: data.measured.size]
     else:
-        all_slopes, readings = (np.asarray(j) for j in _jacobians(optimizers.with_roots(problem, z), z, data))
+        all_slopes, readings = (np.asarray(j) for j in _jacobians(optimizers.with_solved_rows(problem, z), z, data))
     _, s, v = np.linalg.svd(all_slopes, full_matrices=False)
     covariance = (v.T / s**2) @ v
     _, singular, directions = np.linalg.svd(readings, full_matrices=False)
@@ -153,15 +156,16 @@ def analyse_identifiability(
 
 
 @dataclasses.dataclass(frozen=True)
-class Profile:
-    """Profile likelihood of each parameter: the objective minimised over all others.
+class ProfileLikelihoods:
+    """Profile likelihood of each parameter: the objective, minimised over all other parameters.
 
     Attributes:
-        z: coordinate of the profiled parameter, shape (parameters, points), increasing.
-        value: the parameter there [SI].
-        rise: twice the objective's rise above the optimum [σ²], χ² with one degree of freedom.
+        z: coordinates of the profiled parameter, increasing, shape (parameters, points).
+        value: value of the parameter there [SI].
+        rise: rise of twice the objective above the optimum [σ²]: χ² with one degree of freedom.
         low, high: ends of the 95 % interval, where the rise is 3.84 [SI], shape (parameters,).
-        open: True if an end is beyond the last point (the interval is at least that wide), (parameters, 2).
+        open: True if an end lies beyond the last point, so that the interval is at least that wide, shape
+            (parameters, 2).
         better: largest decrease below the given optimum among the refits [½σ²], 0 if the optimum is the best.
     """
 
@@ -181,11 +185,11 @@ def _profiles(problem: Problem, data: Data, starts: Array, pins: Pin) -> optimiz
 
 def profile_likelihoods(
     problem: Problem, z: Array, cost: float, about: Identifiability, data: Data | None = None
-) -> Profile:
-    """Profiles of all parameters. All points of all profiles are one vmapped batch of refits.
+) -> ProfileLikelihoods:
+    """Profile likelihoods of all parameters. All points of all profiles are refitted in one batch.
 
-    Each refit starts on the line along which the linear analysis moves the other parameters. The end of an
-    interval is interpolated on the signed root of the rise, which is straight for a linear model.
+    Each refit starts where the linear analysis expects the other parameters. The ends of an interval are interpolated
+    on the signed square root of the rise, which is straight for a linear model.
     """
     data = problem.data if data is None else data
     centre, size = np.asarray(z), len(about.names)
@@ -205,11 +209,11 @@ def profile_likelihoods(
     value = np.asarray(jax.vmap(problem.coordinates.value)(jnp.asarray(at_all.T))).T
     low, high = np.asarray(jax.vmap(problem.coordinates.value)(jnp.asarray(ends.T)))
     is_open = np.stack([root_all[:, 0] > -Z95, root_all[:, -1] < Z95], 1)
-    return Profile(at_all, value, root_all**2, low, high, is_open, float(max(0.0, -rise.min() / 2)))
+    return ProfileLikelihoods(at_all, value, root_all**2, low, high, is_open, float(max(0.0, -rise.min() / 2)))
 
 
 def _interval_ends(at: np.ndarray, root: np.ndarray) -> tuple[float, float]:
-    """Coordinates where a profile's signed root reaches ∓Z95. Its end points if it does not reach them."""
+    """Coordinates at which a profile's signed root reaches ∓Z95, or its end points if it does not."""
     rising = np.maximum.accumulate(root)
     return float(np.interp(-Z95, rising, at)), float(np.interp(Z95, rising, at))
 
@@ -224,7 +228,7 @@ EVEN = 1.25
 
 
 def posterior_of_coordinates(coordinates: Coordinates, z: np.ndarray, covariance: np.ndarray) -> Posterior:
-    """Posterior of a fit with optimum z and this covariance."""
+    """Posterior distribution of a fit with optimum z and this covariance."""
     size = len(coordinates)
     return Posterior(
         coordinates=coordinates.names,
@@ -241,12 +245,14 @@ def posterior_of_coordinates(coordinates: Coordinates, z: np.ndarray, covariance
     )
 
 
-def determined_together(posterior: Posterior, held: Collection[str] = ()) -> tuple[Pair, ...]:
-    """Pairs of parameters with a posterior correlation beyond `TOGETHER`, strongest first, and their combination.
+def determined_together(posterior: Posterior, held: Collection[str] = ()) -> tuple[DependentPair, ...]:
+    """Pairs of parameters whose posterior correlation exceeds `TOGETHER`, strongest first, with the combination that
+    is known.
 
     Args:
-        held: names of parameters held by their priors. A pair of two of these is omitted. In a pair with one of them,
-            the other is known only as well as that prior, and the data determine only their combination.
+        held: names of parameters that only their priors determine. A pair of two such parameters is omitted. In a
+            pair with one of them, the other is known only as well as that prior, and the data determine only their
+            combination.
     """
     sd = np.sqrt(np.diag(posterior.covariance))
     value = posterior.at(posterior.mean)
@@ -262,11 +268,13 @@ def determined_together(posterior: Posterior, held: Collection[str] = ()) -> tup
         weight = -np.sign(correlation) * abs(size[i] / size[j])
         even = log[i] and log[j] and 1 / EVEN < spread[i] / spread[j] < EVEN
         form = "linear" if not even else "ratio" if correlation > 0 else "product"
-        groups.append(Pair(one, other, correlation, form, float(weight)))
+        groups.append(DependentPair(one, other, correlation, form, float(weight)))
     return tuple(sorted(groups, key=lambda pair: -abs(pair.correlation)))
 
 
-def undetermined_names(held: Collection[str], pairs: Collection[Pair]) -> Names:
-    """Names of parameters held by their priors, except those in a pair with a determined combination."""
+def undetermined_names(held: Collection[str], pairs: Collection[DependentPair]) -> Names:
+    """Names of parameters that only their priors determine, except those in a pair whose combination the data
+    determine.
+    """
     paired = {name for pair in pairs for name in (pair.one, pair.other)}
     return tuple(name for name in held if name not in paired)

@@ -1,4 +1,4 @@
-"""Tests of a fit's adequacy: χ² if the noise is known, and structure of the residuals over the conditions.
+"""Adequacy tests of a fit: χ² if the noise is known, and structure of the residuals over the conditions.
 
 Columns of a smooth curve are projected on the complement of the whitened Jacobian J, priors included, which removes
 the part that free parameters could take up. Without a lack of fit, the decrease of χ² that they explain then has a χ²
@@ -20,7 +20,7 @@ from calibration.data import Names
 from calibration.data.courses import course_of_each_row
 from calibration.data.runs import DUTY, Runs
 from calibration.described import describe
-from calibration.inference.fit_notes import Shown
+from calibration.inference.fit_notes import AdequacyFinding
 from calibration.inference.observers import Observer
 from calibration.inference.simulation_errors import share_of_measured
 
@@ -40,11 +40,11 @@ WORSE = 1.0
 
 
 @dataclasses.dataclass(frozen=True)
-class Miss:
-    """Error of a channel over its measured rms [-]: of the fit, and of the robot's file as stated.
+class RelativeError:
+    """Error of a channel divided by its measured rms [-], for the fit and for the robot file as given.
 
     Attributes:
-        large: True if it is larger than stated noise, and than `UNDESCRIBED`.
+        large: True if the error of the fit exceeds the stated noise and `UNDESCRIBED`.
     """
 
     channel: str
@@ -55,28 +55,29 @@ class Miss:
 
 @dataclasses.dataclass(frozen=True)
 class Adequacy:
-    """Result of the tests whether a fit's residuals are consistent with noise.
+    """Result of the tests of whether residuals are consistent with noise.
 
     Attributes:
-        adequate: None if it cannot be tested, or the search did not converge.
+        adequate: True or False. None if it cannot be tested, or if the search did not converge.
         chi2: misfit of the readings [σ²].
         degrees_of_freedom: degrees of freedom of the residuals.
-        p_value: family-wise, of all tests made, None without tests.
-        shown_by: the test with the smallest p.
+        p_value: family-wise p-value of all tests, None without tests.
+        shown_by: finding of the test with the smallest p-value.
         noise_known: True if χ² was among the tests.
-        obstacle: reason why no test of residuals decides: the model is `undescribed`, the search `not converged`, or
-            the fit `worse` than the file as stated with the same sds, "" if a test decides.
-        misses: misses of each channel.
+        obstacle: reason why no test of residuals decides. `undescribed`: the model does not describe the runs. `not
+            converged`: the search did not end. `worse`: the fit is worse than the robot file with the same sds. "" if
+            a test decides.
+        misses: relative error of each channel.
     """
 
     adequate: bool | None
     chi2: float
     degrees_of_freedom: float
     p_value: float | None
-    shown_by: Shown
+    shown_by: AdequacyFinding
     noise_known: bool
     obstacle: str = ""
-    misses: tuple[Miss, ...] = ()
+    misses: tuple[RelativeError, ...] = ()
 
     @property
     def statement(self) -> str:
@@ -90,12 +91,12 @@ class Adequacy:
 
 @dataclasses.dataclass(frozen=True)
 class Residuals:
-    """Residuals of a fit.
+    """Residuals of a fit and what is needed to test them.
 
     Attributes:
-        observe: kind of the runs.
-        simulated: fitted readings [SI].
-        whitened: simulated less measured, in sds, 0 for excluded readings.
+        observe: observer of the runs.
+        simulated: fitted readings [SI], shape (rows, channels).
+        whitened: simulated minus measured readings, in sds, 0 if excluded, shape (rows, channels).
         counts: True for included readings, shape (rows, channels).
         jacobian: Jacobian of the whitened readings, row by row, shape (rows · channels, parameters).
         z: coordinates of the fit, shape (parameters,).
@@ -111,12 +112,14 @@ class Residuals:
 
     @functools.cached_property
     def taken(self) -> np.ndarray:
-        """Orthonormal directions that the free parameters take up, shape (readings + parameters, parameters)."""
+        """Orthonormal directions in which the free parameters absorb residuals, shape (readings + parameters,
+        parameters).
+        """
         return np.asarray(np.linalg.qr(np.concatenate([self.jacobian, np.eye(self.jacobian.shape[1])]))[0])
 
     @property
     def freedom(self) -> np.ndarray:
-        """Degrees of freedom left by the fit, by channel, shape (channels,)."""
+        """Degrees of freedom that the fit leaves in each channel, shape (channels,)."""
         leverage = np.sum(self.taken[: self.counts.size] ** 2, 1).reshape(self.counts.shape)
         return np.sum(np.where(self.counts, 1.0 - leverage, 0.0), 0)
 
@@ -125,11 +128,11 @@ class Residuals:
         """Misfit of each channel [σ²], shape (channels,)."""
         return np.sum(self.whitened**2, 0)
 
-    def misses(self, as_stated: np.ndarray, stated: np.ndarray) -> tuple[Miss, ...]:
-        """Errors over the measured rms of each channel with readings.
+    def misses(self, as_stated: np.ndarray, stated: np.ndarray) -> tuple[RelativeError, ...]:
+        """Error of each channel with readings, relative to its measured rms.
 
         Args:
-            as_stated: readings of the robot's file before any fit [SI], shape (rows, channels).
+            as_stated: readings of the robot file before any fit [SI], shape (rows, channels).
             stated: True for channels with stated noise, shape (channels,).
         """
         counts = self.counts & np.isfinite(as_stated)
@@ -138,13 +141,13 @@ class Residuals:
         sigma = np.sqrt(self.chi2 / np.maximum(self.counts.sum(0), 1))
         large = (fitted > UNDESCRIBED) & ~(stated & (sigma <= EXPLAINED))
         return tuple(
-            Miss(c.name, float(fitted[k]), float(before[k]), bool(large[k]))
+            RelativeError(c.name, float(fitted[k]), float(before[k]), bool(large[k]))
             for k, c in enumerate(self.runs.channels)
             if np.isfinite(fitted[k])
         )
 
     def rescaled(self) -> Residuals:
-        """Residuals with each channel's sds rescaled to its own misfit."""
+        """Residuals in units of each channel's own scatter, instead of the stated sds."""
         factor = np.sqrt(np.maximum(self.chi2, 1e-300) / np.maximum(self.freedom, 1e-9))
         factor = np.where(self.counts.any(0) & (self.freedom > 0), factor, 1.0)
         whitened = self.whitened / factor
@@ -155,15 +158,15 @@ class Residuals:
 def judge_adequacy(
     fit: Residuals, as_stated: np.ndarray, sd: np.ndarray, *, estimated: np.ndarray, converged: bool
 ) -> Adequacy:
-    """Adequacy of a fit, with the obstacles that make tests of its residuals meaningless.
+    """Adequacy of a fit. It first checks for obstacles that make tests of the residuals meaningless.
 
-    A fit minimises χ² plus the distance to the priors, so with the same sds its χ² cannot be above that at the prior
-    means.
+    A fit minimises χ² plus the distance from the priors. With the same sds, its χ² is therefore not above that of the
+    robot at its prior means.
 
     Args:
-        as_stated: readings of the file as stated [SI].
+        as_stated: readings of the robot file before any fit [SI].
         sd: standard deviation of the readings [SI], shape (rows, channels).
-        estimated: True for channels with noise estimated from the misfit, shape (channels,).
+        estimated: True for channels whose noise is estimated from the misfit, shape (channels,).
         converged: True if the search converged.
     """
     misses = fit.misses(as_stated, ~estimated)
@@ -181,25 +184,27 @@ def judge_adequacy(
 
 
 def adequacy_of_residuals(fit: Residuals, *, known: bool) -> Adequacy:
-    """Tests of a fit's residuals.
+    """Tests if the residuals of a fit are consistent with noise.
 
     Args:
-        known: True if the noise of every channel is known, not estimated from the misfit.
+        known: True if the noise of every channel is known and not estimated from the misfit.
     """
     chi2, freedom = float(fit.chi2.sum()), float(fit.freedom.sum())
     tests = structure_tests(fit, known=known)
     if known and freedom > 0:
-        tests.append((float(chdtrc(freedom, chi2)), Shown(what="stated")))
+        tests.append((float(chdtrc(freedom, chi2)), AdequacyFinding(what="stated")))
     if not tests:
-        return Adequacy(None, chi2, freedom, None, Shown(), known)
+        return Adequacy(None, chi2, freedom, None, AdequacyFinding(), known)
     p, finding = min(tests)
     p = min(1.0, p * len(tests))
     return Adequacy(p > LEVEL, chi2, freedom, p, finding, known)
 
 
-def structure_tests(fit: Residuals, *, known: bool) -> list[tuple[float, Shown]]:
-    """Tests of structure: p-value and finding of curves over the conditions, memory and replicates."""
-    families = {finding: _p_value(fit, columns, known) for finding, columns in _curve_columns(fit).items()}
+def structure_tests(fit: Residuals, *, known: bool) -> list[tuple[float, AdequacyFinding]]:
+    """Tests for structure in the residuals: over the conditions, in time, and against replicates. Each has a p-value
+    and a finding.
+    """
+    families = {finding: _p_value_of_columns(fit, columns, known) for finding, columns in _curve_columns(fit).items()}
     tested = [(p, finding) for finding, p in families.items() if p is not None]
     tests = []
     if tested:
@@ -208,8 +213,10 @@ def structure_tests(fit: Residuals, *, known: bool) -> list[tuple[float, Shown]]
     return [*tests, *(test for test in (_autocorrelation_test(fit), _replicate_test(fit)) if test is not None)]
 
 
-def _p_value(fit: Residuals, columns: np.ndarray, known: bool) -> float | None:
-    """p-value of the misfit that columns (readings, terms) explain, None if too few degrees of freedom remain."""
+def _p_value_of_columns(fit: Residuals, columns: np.ndarray, known: bool) -> float | None:
+    """p-value of the misfit that the columns, shape (readings, terms), explain. None if too few degrees of freedom
+    remain.
+    """
     parameters = fit.jacobian.shape[1]
     wide = np.concatenate([columns, np.zeros((parameters, columns.shape[1]))])
     size = np.linalg.norm(wide, axis=0)
@@ -227,8 +234,10 @@ def _p_value(fit: Residuals, columns: np.ndarray, known: bool) -> float | None:
     return float(fdtrc(terms, freedom - terms, explained / terms / rest))
 
 
-def _curve_columns(fit: Residuals) -> dict[Shown, np.ndarray]:
-    """Columns over the readings, by finding: for each channel, curves over each variable, by configuration."""
+def _curve_columns(fit: Residuals) -> dict[AdequacyFinding, np.ndarray]:
+    """Finding → columns over the readings: for each channel and variable, curves over the variable by
+    configuration.
+    """
     observe, runs, simulated, counts = fit.observe, fit.runs, fit.simulated, fit.counts
     variables = {c: (runs[c], TERMS) for c in (*runs.axes, *DUTY) if runs.has(c)}
     if observe.axis:
@@ -252,12 +261,12 @@ def _curve_columns(fit: Residuals) -> dict[Shown, np.ndarray]:
             own_curves = [curve * ((which == c) & rows)[:, None] for c in np.unique(which)]
             columns = np.zeros((*counts.shape, sum(o.shape[1] for o in own_curves)))
             columns[:, k] = np.concatenate(own_curves, 1)
-            families[Shown(channel.name, "follow", name)] = columns.reshape(counts.size, -1)
+            families[AdequacyFinding(channel.name, "follow", name)] = columns.reshape(counts.size, -1)
     return families
 
 
-def _autocorrelation_test(fit: Residuals) -> tuple[float, Shown] | None:
-    """Test of autocorrelation at lag 1 within runs, None if the rows of a run have no order."""
+def _autocorrelation_test(fit: Residuals) -> tuple[float, AdequacyFinding] | None:
+    """Tests for autocorrelation at lag 1 within runs. None if the rows of a run have no order."""
     observe, runs, residual, counts = fit.observe, fit.runs, fit.whitened, fit.counts
     if not observe.axis:
         return None
@@ -271,15 +280,17 @@ def _autocorrelation_test(fit: Residuals) -> tuple[float, Shown] | None:
         power = float(np.sum(e[ok] ** 2))
         if both.sum() >= 20 and power > 0:
             r = float(np.sum(e[1:][both] * e[:-1][both])) / power
-            tests.append((float(ndtr(-r * np.sqrt(both.sum()))), Shown(channel.name, "remember")))
+            tests.append((float(ndtr(-r * np.sqrt(both.sum()))), AdequacyFinding(channel.name, "remember")))
     if not tests:
         return None
     p, finding = min(tests)
     return min(1.0, p * len(tests)), finding
 
 
-def _replicate_test(fit: Residuals) -> tuple[float, Shown] | None:
-    """Test of the residuals against the scatter of rows under the same conditions, None with too few replicates."""
+def _replicate_test(fit: Residuals) -> tuple[float, AdequacyFinding] | None:
+    """Tests the residuals against the scatter of rows under the same conditions. None if there are too few
+    replicates.
+    """
     observe, runs, residual, counts = fit.observe, fit.runs, fit.whitened, fit.counts
     freedom, chi2 = float(fit.freedom.sum()), float(fit.chi2.sum())
     columns = [c for c in ("configuration", *observe.axes_of(runs), "surface") if runs.has(c)]
@@ -296,4 +307,4 @@ def _replicate_test(fit: Residuals) -> tuple[float, Shown] | None:
     if own < REPLICATES or freedom - own < 1 or pure <= 0:
         return None
     quotient = max(chi2 - pure, 0.0) / (freedom - own) / (pure / own)
-    return float(fdtrc(freedom - own, own, quotient)), Shown(what="repeats")
+    return float(fdtrc(freedom - own, own, quotient)), AdequacyFinding(what="repeats")

@@ -1,4 +1,4 @@
-"""Linearised fit: residuals, Jacobian, and changes of the readings by effects and by defects of balances."""
+"""Linearised fit: residuals, Jacobian, and changes of the readings by effects and by errors of balances."""
 
 from __future__ import annotations
 
@@ -31,7 +31,9 @@ PROBED = ("mass", "supply", "electrical", "motor", "gearbox", "track", "ground",
 
 
 def balance_probe(whose: str) -> Effect:
-    """Effect that adds its amplitude to a balance: one number for all sides, or shape (2,): left, right."""
+    """Effect that adds its amplitude to a balance: one number for all sides, or two, shape (2,), for left and
+    right.
+    """
 
     class Probe(Effect):
         name: ClassVar[str] = f"probe_{whose}"
@@ -59,9 +61,10 @@ Scales = tuple[Scalar, Scalar, Scalar, Scalar, Scalar]
 
 
 def shape_scales(shape: Parameter | None) -> tuple[float, float, float, float, float]:
-    """(value, spread, sd, low, high) of a shape parameter, value · exp(spread · z) + sd · z at coordinate z.
+    """Scales (value, spread, sd, low, high) of a shape parameter. At coordinate z it is value · exp(spread · z) + sd
+    · z.
 
-    A phase is shifted, a scale multiplied. `shape_at` applies the bounds.
+    A phase is shifted (sd), other parameters are multiplied (spread). `shape_at` applies the bounds.
     """
     if shape is None:
         return 1.0, 0.0, 0.0, -math.inf, math.inf
@@ -72,9 +75,9 @@ def shape_scales(shape: Parameter | None) -> tuple[float, float, float, float, f
 
 
 def shape_at(scales: Scales, z: Array) -> Array:
-    """Shape parameter at coordinate z, with `scales` from `shape_scales`, within the bounds of a robot file.
+    """Shape parameter at coordinate z, within the bounds of its field. `scales` is from `shape_scales`.
 
-    A phase is wrapped by whole turns, a scale clipped.
+    A phase is wrapped by whole turns. Other parameters are clipped.
     """
     value, spread, sd, low, high = scales
     moved = value * jnp.exp(spread * z) + sd * z
@@ -89,13 +92,13 @@ TURN = tuple(float(x) for x in np.arange(-2, 3) * math.pi / 10)
 
 
 class ScoredEffect(eqx.Module):
-    """One effect at each point of its shape's grid, with an amplitude of one prior sd.
+    """One effect at each point of the grid of its shape parameter, with an amplitude of one prior sd.
 
     Attributes:
-        effect: effect of amplitude one sd.
+        effect: the effect with an amplitude of one prior sd.
         shape: name of its shape parameter, "" for none.
-        at: coordinates of the shape on the grid, in its sds.
-        values: values of the shape there.
+        at: grid coordinates of the shape, in its sds.
+        values: values of the shape on the grid.
     """
 
     effect: Effect
@@ -109,14 +112,14 @@ class ScoredEffect(eqx.Module):
         return eqx.tree_at(lambda e: e.amplitude, self.effect, jnp.zeros_like(jnp.asarray(self.effect.amplitude)))
 
     def each(self, function: Callable[[Effect], Array]) -> Array:
-        """`function` of the effect at each point of the grid, along a new leading axis."""
+        """Applies `function` to the effect at each point of the grid, along a new first axis."""
         if not self.shape:
             return function(self.effect)[None]
         return jax.vmap(lambda v: function(params.replace(self.effect, {self.shape: v})))(self.values)
 
 
 def with_shape_grid(effect: Effect, grid: Sequence[float] = GRID) -> ScoredEffect:
-    """Effect with the grid of its shape parameter, clipped at the bounds."""
+    """Effect with the grid of its shape parameter, clipped at the parameter's bounds."""
     shape, amplitude = shape_of(effect), amplitude_of(effect)
     unit = params.replace(effect, {amplitude.name: jnp.asarray(amplitude.spec.prior_sd(0.0))})
     if shape is None:
@@ -130,7 +133,7 @@ _shape_at: Callable[..., Array] = compiled(shape_at)
 
 
 def with_shape_of_robot(robot: Robot, scored: ScoredEffect) -> ScoredEffect:
-    """Effect with its grid, or with the shape that it has in `robot` if it is present there."""
+    """Effect with its grid or, if the robot has the effect, with its shape in the robot."""
     effect_of_robot = next((e for e in robot.effects if e.name == scored.effect.name), None)
     if effect_of_robot is None or not scored.shape:
         return scored
@@ -141,7 +144,9 @@ def with_shape_of_robot(robot: Robot, scored: ScoredEffect) -> ScoredEffect:
 
 
 def map_over_shapes(scored: ScoredEffect, function: Callable[[Effect, Array], Array], given: Array) -> Array:
-    """A function of an effect and of the value in `given`, shape (grid,), at each point of its shape's grid."""
+    """Applies a function to the effect at each point of its grid and to the matching value in `given`, shape
+    (grid,).
+    """
     if not scored.shape:
         return function(scored.effect, given[0])[None]
     of_shape = lambda v, x: function(params.replace(scored.effect, {scored.shape: v}), x)  # noqa: E731
@@ -149,7 +154,7 @@ def map_over_shapes(scored: ScoredEffect, function: Callable[[Effect, Array], Ar
 
 
 def effect_terms(robot: Robot, signals: Signals, effects: tuple[ScoredEffect, ...], memory: list[Array]) -> Array:
-    """Terms of effects in their balances at an instant, shape (instances,).
+    """Terms of effects in their balances at one instant, shape (instances,).
 
     Args:
         memory: memory of each effect at each point of its grid. Any number for an effect without memory.
@@ -171,19 +176,19 @@ class Linearization(eqx.Module):
     """A linearised fit.
 
     Attributes:
-        residual: whitened residuals, shape (residuals,): readings (a channel after the other, row by row),
-            adhesion (1 a row), priors.
+        residual: whitened residuals, shape (residuals,): readings (row by row), adhesion (one per row), priors.
         jacobian: derivatives of the residuals with respect to the free coordinates, shape (residuals,
         coordinates).
         signatures: derivatives with respect to each instance's amplitude in prior sds, shape (readings,
         instances).
-        defects: derivatives with respect to a defect of each balance of `probed` [its unit]. Further axes depend
+        defects: derivatives with respect to an error of each balance in `probed` [unit of the balance]. Further axes
+            depend on the observer.
         on the observer.
         scale: change of a whitened reading per unit of the reading [1/SI], 0 if excluded, shape (rows, channels).
-        signals: signals of each row, at the fit.
+        signals: signals of each row at the fit.
         channels: names of the readings' channels, in order.
-        magnitudes: channels shown without a sign.
-        probed: balances with known defects.
+        magnitudes: channels whose readings have no sign.
+        probed: balances whose errors are known.
 
     A defect of a balance has a value at each point: one for each row, or for a robot with independently driven sides
     one for each row and side, with the left side of all rows first.
@@ -220,11 +225,11 @@ class Linearization(eqx.Module):
 
     @property
     def points(self) -> int:
-        """Number of points where a balance may have a defect."""
+        """Number of points at which a balance may have an error."""
         return self.rows
 
     def at_points(self, rows: np.ndarray) -> np.ndarray:
-        """Values by row, repeated at each point, shape (points,)."""
+        """Values of rows, repeated for each point of the row, shape (points,)."""
         return rows
 
     def of_rows(self, points: np.ndarray) -> np.ndarray:
@@ -232,34 +237,34 @@ class Linearization(eqx.Module):
         return points
 
     def columns(self, balance: Scalar | int, shapes: Array | np.ndarray) -> Float[Array, "readings terms"]:
-        """Change of the whitened readings by defects of a balance. Each column is a defect over the points.
+        """Change of the whitened readings by errors of a balance. Each column is an error over the points.
 
         Args:
             balance: index into `probed`.
-            shapes: shape (points, terms).
+            shapes: errors, shape (points, terms).
         """
         raise NotImplementedError
 
     def shown(self, channel: Scalar | int, shapes: Array | np.ndarray) -> Float[Array, "readings terms"]:
-        """Change of the whitened readings by errors of a channel's readings [SI]. Each column is over the points.
+        """Change of the whitened readings by errors of one channel [SI]. Each column is an error over the points.
 
         Args:
-            channel: position in the table of channels.
-            shapes: shape (points, terms).
+            channel: index of the channel.
+            shapes: errors, shape (points, terms).
         """
         channel_scale = self.scale * (np.arange(self.scale.shape[1]) == channel)
         return (channel_scale[:, :, None] * shapes[:, None, :]).reshape(-1, shapes.shape[1])
 
     def places(self) -> np.ndarray:
-        """Indices of the rows with an identifiable defect of a single row."""
+        """Indices of the rows in which a single row reveals an error."""
         raise NotImplementedError
 
     def variable(self, name: str) -> np.ndarray:
-        """Variable of a curve, by point [SI]: a signal, or another quantity of the observer."""
+        """Variable of a curve at each point [SI]: a signal, or another quantity of the observer."""
         return np.broadcast_to(np.asarray(getattr(self.signals, name), float), (self.rows,))
 
-    def in_travel(self, place: str, variable: str) -> tuple[np.ndarray, np.ndarray]:
-        """Variable of a curve in a place [SI] and its factor, by point, as `effects.curve` uses both."""
+    def curve_variable(self, place: str, variable: str) -> tuple[np.ndarray, np.ndarray]:
+        """Variable of a curve in a place [SI] and its factor at each point, as `effects.curve` uses them."""
         x, way = in_travel_frame(place, variable, self.variable(variable), self.variable, self.magnitudes)
         return np.asarray(x), np.broadcast_to(way, (self.points,))
 
@@ -268,23 +273,23 @@ class Linearization(eqx.Module):
         return list(np.arange(self.rows)[:, None])
 
     def turned(self) -> np.ndarray | None:
-        """Angle of the driving shaft at each row since the start of its run [rad], None for settled runs."""
+        """Angle of the driving shaft in each row since the start of its run [rad]. None for settled runs."""
         return None
 
     def series(self) -> Float[Array, "runs samples channels"]:
-        """Whitened residuals of the readings of each run in the order of time. A settled row is a run."""
+        """Whitened residuals of each run in order of time. A settled row is a run."""
         return self.by_row()[:, None]
 
     def memory(self) -> Array:
-        """Test of autocorrelation of the residuals, as a normal deviate. -inf if their order has no meaning."""
+        """Test of autocorrelation of the residuals, as a normal deviate. -inf if the order of rows has no meaning."""
         return jnp.asarray(-jnp.inf)
 
 
 def finite_or_zero(x: Array) -> Array:
-    """x with 0 for non-finite values."""
+    """x, with 0 in place of non-finite values."""
     return jnp.where(jnp.isfinite(x), x, 0.0)
 
 
 def amplitude_unit(effect: Effect) -> float:
-    """One prior sd of an effect's amplitude [its unit]."""
+    """Prior sd of an effect's amplitude [unit of the amplitude]."""
     return amplitude_of(effect).spec.prior_sd(0.0)

@@ -1,4 +1,4 @@
-"""Lost motion of an output: how much of its angle each reversal of a log loses, or its acceleration twists."""
+"""Lost motion of an output: the angle lost at each reversal of a log, or twisted by acceleration."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ SURE, REVERSALS, EXPLAINED = 6.0, 6, 0.3
 
 
 def lost_motion_notes(runs: Runs, robot: Robot) -> list[Remark]:
-    """Note on an angle that is lost at each reversal or by acceleration, for a log of a robot without backlash.
+    """Remark on an angle that is lost at each reversal or by acceleration, for a log of a robot without backlash.
 
-    An elastic joint of stiffness k leaves the output J α / k behind the motor, if a log shows both.
+    With an elastic joint of stiffness k, the output lags the motor by J α / k, if a log shows both.
     """
     placed = [k for k, c in enumerate(runs.channels) if c.name in ("output_angle", "position") and runs.has(c.column)]
     turning = [k for k, c in enumerate(runs.channels) if c.name == "motor_speed" and runs.has(c.column)]
@@ -46,11 +46,11 @@ def lost_motion_notes(runs: Runs, robot: Robot) -> list[Remark]:
     if reversals < REVERSALS or len(moved) < 2 * REVERSALS:
         return []
     sets = [[integral]] if turning else [[integral, taken, faster, driven] for taken in clipped]
-    _, width, sd, explained = min(_lost(moved, reversed_, np.stack(x, 1)) for x in sets)
+    _, width, sd, explained = min(_fit_lost_angle(moved, reversed_, np.stack(x, 1)) for x in sets)
     lost, stiffness, load = width > SURE * sd and explained > EXPLAINED, 0.0, robot.configurations.members[0]
     radius = float(load.radius) if channel.name == "position" else 1.0
     if turning:
-        _, late, sd, explained = _lost(curved, bent, np.stack([integral, faster, reversed_], 1))
+        _, late, sd, explained = _fit_lost_angle(curved, bent, np.stack([integral, faster, reversed_], 1))
         if late > SURE * sd and explained > EXPLAINED:
             stiffness, width = float(load.inertia) * radius / late, late * np.sqrt(np.mean(bent**2))
     if not (lost or stiffness):
@@ -64,12 +64,15 @@ def lost_motion_notes(runs: Runs, robot: Robot) -> list[Remark]:
 
 
 def _changes_between_contacts(time: np.ndarray, angle: np.ndarray, drive: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Changes between instants at which one flank surely carries: three of each stroke, from its fastest to its end.
+    """Changes between instants at which one tooth flank surely carries load. Each stroke has three, from its fastest
+    to its end.
 
     Returns:
-        Changes of the angle, of the drive's time integral, and of that of the drive clipped to each of `FRICTIONS`.
-        Then those of the speed, the drive, the direction (1 or -1 for a reversal), and the acceleration. The last
-        ones are of the angle less the bow of a parabola.
+        Changes of the angle, of the time integral of the drive, and of that integral with the drive clipped at each
+        of
+        `FRICTIONS`. Then changes of speed, drive, direction (1 or -1 at a reversal) and acceleration. The last one is
+        of the
+        angle minus the curvature of a parabola.
     """
     has_both = np.isfinite(angle) & np.isfinite(drive)
     time, angle, drive = time[has_both], angle[has_both], drive[has_both]
@@ -98,11 +101,13 @@ def _changes_between_contacts(time: np.ndarray, angle: np.ndarray, drive: np.nda
     return tuple(np.diff(x[..., points]) for x in every)
 
 
-def _lost(moved: np.ndarray, reversed_: np.ndarray, others: np.ndarray) -> tuple[float, float, float, float]:
-    """Angle that is lost at a reversal in addition to other causes.
+def _fit_lost_angle(
+    moved: np.ndarray, reversed_: np.ndarray, others: np.ndarray
+) -> tuple[float, float, float, float]:
+    """Fits the angle that is lost at a reversal, in addition to other causes.
 
     Returns:
-        The sum of squares that is left, the angle, its sd, and the share of the sum of squares that it explains.
+        Remaining sum of squares, the angle, its sd, and the share of the sum of squares that the angle explains.
     """
     terms = np.column_stack([others / np.maximum(np.linalg.norm(others, axis=0), 1e-300), -reversed_])
     causes = terms[:, :-1]

@@ -1,4 +1,4 @@
-"""Searches from several starts, with an estimate of the noise between searches if nobody states it."""
+"""Searches from several starts. Noise that is not stated is estimated between searches."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ import numpy as np
 from calibration.described import describe
 from calibration.inference import identifiability, optimizers, scans, series_noise
 from calibration.inference import noise as noise_room
-from calibration.inference.fit_notes import Remark, next_step
+from calibration.inference.fit_notes import Remark, progress_remark
 from calibration.inference.noise import Noise
-from calibration.inference.population import Population, Searched, most_probable_noise
+from calibration.inference.population import Population, PopulationSearch, most_probable_noise
 from calibration.inference.problem import Data, Observation, Problem
 from mmrjax.model.robot import Robot
 
@@ -33,14 +33,14 @@ T = TypeVar("T")
 
 
 @dataclasses.dataclass(frozen=True)
-class Starts:
-    """Outcome of searches from several starts.
+class StartOutcomes:
+    """Outcomes of searches from several starts.
 
     Attributes:
-        cost: objective of each [½σ²], shape (starts,).
-        converged: True for converged searches.
-        infeasible: number of starts where some row slides or fails.
-        z: end of each search, shape (starts, parameters), None if not kept.
+        cost: objective at the end of each search [½σ²], shape (starts,).
+        converged: True for each search that converged.
+        infeasible: number of starts at whose end a row slides or fails.
+        z: end of each search, shape (starts, parameters). None if not kept.
     """
 
     cost: np.ndarray
@@ -59,7 +59,7 @@ class Starts:
 
     @property
     def agreement(self) -> Remark:
-        """Agreement of the starts, as a note."""
+        """Remark on how well the starts agree."""
         other = self.converged & ~self._at_best
         more = float(self.cost[other].min() - self.cost.min()) if other.any() else 0.0
         return Remark(
@@ -72,44 +72,44 @@ class Starts:
         )
 
     def statement(self) -> str:
-        """Whether the starts agree, as a sentence."""
+        """Agreement of the starts, as a sentence."""
         return describe(self.agreement)
 
 
 @dataclasses.dataclass(frozen=True)
-class SearchResult:
-    """Result of the searches.
+class MultistartResult:
+    """Result of searches from several starts.
 
     Attributes:
-        problem: problem with the noise (and stiffness) of the last round.
-        best: best optimum.
-        starts: outcome of the searches.
-        shares: estimated sd of each channel as a share of its size, NaN if the sd was known.
-        searched: the population that preceded the search, None without one.
+        problem: problem with the noise (and penalty stiffness) of the last round.
+        best: best optimum found.
+        starts: outcome of each search.
+        shares: estimated sd of each channel, relative to its size. NaN if the sd was known.
+        searched: population of the search by generations that came first, None without one.
     """
 
     problem: Problem
     best: optimizers.Optimum
-    starts: Starts
+    starts: StartOutcomes
     shares: np.ndarray
-    searched: Searched | None = None
+    searched: PopulationSearch | None = None
 
 
 def unreachable_rows(posed: Problem, status: np.ndarray) -> np.ndarray:
-    """True for rows with readings for which the model has no operating point, shape of `status`, (..., rows)."""
+    """True for rows with readings for which the model has no operating point, shape as `status`."""
     return posed.observe.unreachable(np.asarray(status)) & (np.asarray(posed.data.weight).max(1) > 0)
 
 
 def search_from_starts(
     posed: Problem, noise: Noise, points: np.ndarray, solver: optimizers.Solver | None = None
-) -> SearchResult:
-    """Search from all points in one batch. Where the noise is not known, estimate it and search again until it
+) -> MultistartResult:
+    """Searches from all points in one batch. Unknown noise is estimated and the search repeated until the noise
     settles.
 
-    The best optimum so far is one more start, so that every round runs the same compiled batch.
+    The best optimum so far is one more start, so that every round runs the same compiled program.
 
     Args:
-        solver: solver of optimistix, None for ours.
+        solver: solver of optimistix. None: the solver of this package.
     """
     by = functools.partial(optimizers.search_starts, solver=solver)
     z = points[0]
@@ -123,7 +123,7 @@ def search_from_starts(
             break
         shares = new
         posed = _with_noise_shares(posed, noise, shares)
-    return SearchResult(
+    return MultistartResult(
         posed, best, _outcome_of_searches(jax.tree.map(lambda x: x[:-1], optima), feasible[:-1]), shares
     )
 
@@ -135,19 +135,21 @@ def search_one_by_one(
     shares: np.ndarray,
     tell: Callable[[Remark], None],
     solver: optimizers.Solver | None = None,
-) -> SearchResult:
-    """As `search_from_starts`, one search at a time: the noise settles on the first point's optimum, then the others
-    start once each. One that ends lower takes its place, and the noise settles again.
+) -> MultistartResult:
+    """Searches from several points as `search_from_starts`, but one after another.
+
+    The noise settles at the optimum of the first point. Then each other point is searched once. If one ends lower, it
+    becomes the optimum and the noise settles again.
 
     Args:
         posed: problem with the initial noise.
-        shares: initial noise as shares of the readings.
+        shares: initial noise, relative to the readings.
         tell: callback for progress after every step.
-        solver: solver of optimistix, None for ours.
+        solver: solver of optimistix. None: the solver of this package.
     """
     begun = time.perf_counter()
 
-    def minutes() -> float:
+    def elapsed_minutes() -> float:
         return (time.perf_counter() - begun) / 60
 
     def step(posed: Problem, points: np.ndarray, data: Data) -> tuple[optimizers.Optimum, np.ndarray, np.ndarray]:
@@ -155,11 +157,14 @@ def search_one_by_one(
             if solver is not None:
                 return _pick_member(optimizers.search_with_solver(posed, jnp.asarray(z)[None], data, solver), 0)
             return optimizers.search_rollout(
-                posed, jnp.asarray(z), data, tell=lambda *done: tell(next_step("search", *done, minutes()))
+                posed,
+                jnp.asarray(z),
+                data,
+                tell=lambda *done: tell(progress_remark("search", *done, elapsed_minutes())),
             )
 
         optima, start, end = one(points[0])
-        optima, end = scans.search_lower_basins(posed, (optima, end), data, lambda z: one(z)[::2], tell)
+        optima, end = scans.search_lower_minima(posed, (optima, end), data, lambda z: one(z)[::2], tell)
         optima, start, end = jax.tree.map(lambda x: jnp.asarray(x)[None], (optima, start, end))
         return optima, start.status, end.status
 
@@ -169,7 +174,7 @@ def search_one_by_one(
         for round_ in range(1, ROUNDS + 1):
             posed, optima, feasible = _search_until_feasible(posed, z[None], step)
             z = np.asarray(optima.z[0])
-            tell(next_step("round", round_, optima.cost[0], optima.steps[0], minutes()))
+            tell(progress_remark("round", round_, optima.cost[0], optima.steps[0], elapsed_minutes()))
             new = _reestimate_shares(posed, noise, z, shares)
             if new is None:
                 break
@@ -180,24 +185,24 @@ def search_one_by_one(
             end, status, _ = step(posed, point[None], posed.data)
             ends.append(end)
             feasibles.append(~np.any(unreachable_rows(posed, status), axis=1))
-            tell(next_step("start", k, len(points), end.cost[0], end.steps[0], minutes()))
+            tell(progress_remark("start", k, len(points), end.cost[0], end.steps[0], elapsed_minutes()))
         optima = jax.tree.map(lambda *x: jnp.concatenate(x), *ends)
         k = int(np.nanargmin(optima.cost))
         if not optima.cost[k] < optima.cost[0] - AGREE * (1 + optima.cost[0]):
             k = 0
             break
         first = np.asarray(optima.z[k])
-    return SearchResult(
+    return MultistartResult(
         posed, _pick_member(optima, k), _outcome_of_searches(optima, np.concatenate(feasibles)), shares
     )
 
 
 def starts_from_posterior(easy: Problem, z: np.ndarray, rng: np.random.Generator, count: int) -> np.ndarray:
-    """Starts of a rollout's searches, drawn from the posterior of `steady` at its optimum z.
+    """Starts of the searches of a rollout, drawn from the posterior of `steady` at its optimum z.
 
-    Draws are kept if no row slides and no friction law is steeper at rest than the base's, or else if they are the
-    nearest to that. Draws from the prior would need hundreds of rollouts along the limit of adhesion to recover. The
-    starts of `steady` show whether the problem has several optima.
+    A draw is kept if no row slides and if no friction law is steeper at rest than that of the base. If there are too
+    few, the nearest ones are kept. Draws from the prior would need hundreds of rollouts along the limit of adhesion
+    to recover. The starts of `steady` already show if the problem has several optima.
     """
     spread = np.linalg.cholesky(identifiability.analyse_identifiability(easy, jnp.asarray(z)).covariance)
     draws = z + rng.standard_normal((DRAWS, len(z))) @ spread.T
@@ -206,10 +211,10 @@ def starts_from_posterior(easy: Problem, z: np.ndarray, rng: np.random.Generator
         laws = [chassis.ground.friction for chassis in robot.configurations.members]
         return jnp.stack([law.static / law.speed_static for law in laws])
 
-    def seen(z: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def status_and_steepness(z: jax.Array) -> tuple[jax.Array, jax.Array]:
         return easy.observation(z).status, steepness(easy.robot(z)) > 1.001 * steepness(easy.base)
 
-    status, steep = jax.jit(jax.vmap(seen))(jnp.asarray(draws))
+    status, steep = jax.jit(jax.vmap(status_and_steepness))(jnp.asarray(draws))
     lost = unreachable_rows(easy, status).sum(1) + np.asarray(steep).sum(1)
     return draws[np.argsort(lost, kind="stable")[:count]]
 
@@ -218,11 +223,13 @@ def optimum_of_population(
     posed: Problem,
     noise: Noise,
     shares: np.ndarray,
-    searched: Searched,
+    searched: PopulationSearch,
     tell: Callable[[Remark], None],
     solver: optimizers.Solver | None = None,
-) -> SearchResult:
-    """What a population found, its best member searched on by gradients where those are to be trusted."""
+) -> MultistartResult:
+    """Result of a population, after a further search by gradients from its best member where gradients are
+    reliable.
+    """
     z = searched.found.z[searched.at]
     if searched.slope is None:
         optima = search_one_by_one(posed, noise, z[None], shares, tell, solver)
@@ -235,18 +242,18 @@ def optimum_of_population(
     best = optimizers.optimum_at_point(np.concatenate([searched.slope, rows, np.eye(len(z))]), error, z, posed.data)
     settled = np.array([searched.found.settled])
     best = dataclasses.replace(best, converged=jnp.asarray(searched.found.settled))
-    ended = Starts(np.array([float(best.cost)]), settled, sum(g.failed for g in searched.found.generations))
-    return SearchResult(posed, best, ended, shares, searched)
+    ended = StartOutcomes(np.array([float(best.cost)]), settled, sum(g.failed for g in searched.found.generations))
+    return MultistartResult(posed, best, ended, shares, searched)
 
 
 def reestimate_noise_at(posed: Problem, noise: Noise, searched: Population, at: int) -> tuple[Problem, np.ndarray]:
-    """Problem with the noise that is most probable for a member, and that noise as shares of the readings."""
+    """Problem with the most probable noise at a member of the population, and that noise relative to the readings."""
     shares = most_probable_noise(posed, noise, searched.reading[at])
     return _with_noise_shares(posed, noise, shares), shares
 
 
 def initial_noise_shares(noise: Noise) -> np.ndarray:
-    """Initial estimated shares, NaN if the sd is known, shape (channels,)."""
+    """Initial noise relative to the readings, NaN if the sd is known, shape (channels,)."""
     return np.where(noise.estimated, noise_room.START, np.nan)
 
 
@@ -254,13 +261,13 @@ def _pick_member(found: T, k: int) -> T:
     return jax.tree.map(lambda x: x[k], found)
 
 
-def _outcome_of_searches(found: optimizers.Optimum, feasible: np.ndarray) -> Starts:
+def _outcome_of_searches(found: optimizers.Optimum, feasible: np.ndarray) -> StartOutcomes:
     cost = np.where(np.isfinite(found.cost), found.cost, np.inf)
-    return Starts(cost, np.asarray(found.converged), int(np.sum(~feasible)), np.asarray(found.z))
+    return StartOutcomes(cost, np.asarray(found.converged), int(np.sum(~feasible)), np.asarray(found.z))
 
 
 def _reestimate_shares(posed: Problem, noise: Noise, z: np.ndarray, shares: np.ndarray) -> np.ndarray | None:
-    """New estimates of the shares at z, None without unknown noise, or if the shares have settled."""
+    """New estimate of the relative noise at z. None if all noise is known, or if the estimate has settled."""
     if not noise.estimated.any():
         return None
     new = _estimate_shares(posed, noise, z)
@@ -275,10 +282,10 @@ def _with_noise_shares(posed: Problem, noise: Noise, shares: np.ndarray) -> Prob
 def _search_until_feasible(
     posed: Problem, points: np.ndarray, search: Callable[..., Any]
 ) -> tuple[Problem, optimizers.Optimum, np.ndarray]:
-    """Search from all points, with the penalty on adhesion stiffer until no row slides at the best.
+    """Searches from all points. The penalty on adhesion becomes stiffer until no row slides at the best point.
 
     Returns:
-        The problem, the searches, and True for feasible starts.
+        The problem, the searches, and True for each feasible start.
     """
     for _ in range(TIGHTENINGS + 1):
         optima, status_start, status_end = search(posed, jnp.asarray(points), posed.data)
@@ -291,10 +298,11 @@ def _search_until_feasible(
 
 
 def _estimate_shares(posed: Problem, noise: Noise, z: np.ndarray) -> np.ndarray:
-    """Sd over size of each channel from the misfit, corrected for degrees of freedom, NaN if known.
+    """Noise of each channel relative to its size, estimated from the misfit and corrected for degrees of freedom. NaN
+    if known.
 
-    s² = Σ (error / size)² / (readings - Σ leverage). It contains model error as well as noise, so a fit with it can't
-    be tested for adequacy.
+    s² = Σ (error / size)² / (readings - Σ leverage). It contains model error as well as noise, so a fit that uses it
+    cannot be tested for adequacy.
     """
     data = posed.data
     size = noise.sd / noise_room.START  # the reference of an estimated share

@@ -1,4 +1,4 @@
-"""Standard deviations of the measured channels: from the file's columns, as stated, or estimated."""
+"""Standard deviations of the measured channels: from columns of the file, as stated, or estimated."""
 
 from __future__ import annotations
 
@@ -31,11 +31,12 @@ class Noise:
     """Standard deviations of the readings and their sources.
 
     Attributes:
-        channels: channels of the sds, in the order of arrays.
-        sd: [SI], shape (rows, channels). An initial guess if estimated, 1 for missing readings.
-        estimated: True for channels with an sd to be estimated from the misfit, shape (channels,).
-        source: one word a channel: `columns`, `stated`, `estimated`, `series`, `assumed`, or `no readings`.
-        along_series: estimates, for channels with the source `series`.
+        channels: channels, in the order of the arrays.
+        sd: standard deviations [SI], shape (rows, channels). An initial guess if they will be estimated, 1 for
+            missing readings.
+        estimated: True for channels whose sd is to be estimated from the misfit, shape (channels,).
+        source: source of each channel's sd: `columns`, `stated`, `estimated`, `series`, `assumed`, or `no readings`.
+        along_series: noise estimates of channels with the source `series`.
     """
 
     channels: tuple[Channel, ...]
@@ -46,28 +47,29 @@ class Noise:
 
     @property
     def word(self) -> str:
-        """Source of the sds, for messages."""
+        """Source of the sds, as a word for messages."""
         return next((w for source, w in UNSTATED.items() if source in self.source), "stated")
 
     @property
     def silent(self) -> tuple[Channel, ...]:
-        """Channels with an sd that nobody states."""
+        """Channels whose noise is not stated."""
         return tuple(c for c, source in zip(self.channels, self.source, strict=True) if source in UNSTATED)
 
     @property
     def freedom(self) -> Float[np.ndarray, " channels"]:
-        """Degrees of freedom of each channel's sd. Infinite if it is stated or assumed."""
+        """Degrees of freedom of each channel's sd, infinite if it is stated or assumed."""
         freedoms = {s.channel: s.freedom for s in self.along_series}
         return np.array([freedoms.get(c, np.inf) for c in self.channels])
 
     def scaled(self, factors: Mapping[str, float]) -> Noise:
-        """Noise with the sds of some channels multiplied by a factor, by channel name."""
+        """Noise with the sds of some channels multiplied by a factor. `factors`: by channel name."""
         factor = np.array([factors.get(name, 1.0) for name in channels.channel_names(self.channels)])
         return dataclasses.replace(self, sd=self.sd * factor)
 
 
 def parse_noise(text: str, shown: tuple[Channel, ...]) -> dict[int, tuple[float, bool]]:
-    """Reads `current=2%,motor_speed=0.5%,speed=1%` (or `current=0.05A,motor_speed=30rpm,speed=5mm/s`).
+    """Reads noise given as text, such as `current=2%,motor_speed=0.5%,speed=1%` or
+    `current=0.05A,motor_speed=30rpm,speed=5mm/s`.
 
     Args:
         shown: the available channels.
@@ -106,17 +108,18 @@ def parse_noise(text: str, shown: tuple[Channel, ...]) -> dict[int, tuple[float,
 
 
 def noise_from_table(runs: Runs, sizes: np.ndarray, stated: str | None = None) -> Noise:
-    """Noise of a table: as stated, else from the file's sd columns, else to be estimated.
+    """Noise of a table: as stated, otherwise from the sd columns of the file, otherwise to be estimated.
 
     Known sds include the quantisation error of the instrument, `Instrument.variance`.
 
     Args:
-        sizes: reference size of each reading [SI] for shares, see `Observer.sizes`, shape (rows, channels).
-        stated: as `parse_noise`.
+        sizes: reference size of each reading [SI] for noise stated as a share, see `Observer.sizes`, shape (rows,
+            channels).
+        stated: result of `parse_noise`.
 
     Raises:
         BadConfiguration: for the same reasons as `parse_noise`.
-        BadData: a channel that reads zero everywhere and has no stated sd.
+        BadData: a channel reads zero everywhere and has no stated sd.
     """
     shares = parse_noise(stated, runs.channels) if stated else {}
     measured, columns = runs.measured(), runs.deviations()
@@ -147,7 +150,7 @@ def noise_from_table(runs: Runs, sizes: np.ndarray, stated: str | None = None) -
 
 
 def default_noise(shown: Iterable[Channel]) -> str:
-    """Default sds of the loop if neither the file nor the user states them.
+    """Default noise of the loop, used if neither the file nor the user states any.
 
     They are for averages of at least three repeats, printed to 0.05 A, 10 rpm and 10 mm/s, as in Tables A1 and A2.
     """
@@ -155,10 +158,10 @@ def default_noise(shown: Iterable[Channel]) -> str:
 
 
 def infer_noise(runs: Runs, sizes: np.ndarray, stated: str | None = None) -> Noise:
-    """Noise as `noise_from_table`, but known before any fit.
+    """Noise of a table, as in `noise_from_table`, but known before any fit.
 
-    Instead of an estimate from the misfit it takes the scatter along series or over time (`series_noise`), or
-    `default_noise` if the table has no series.
+    Noise that is not stated is the scatter along series or over time (`series_noise`) or, without series,
+    `default_noise`.
 
     Raises:
         BadConfiguration, BadData: for the same reasons as `noise_from_table`.

@@ -1,4 +1,4 @@
-"""Check of the stated sds: factor between them and residuals without structure."""
+"""Check of the stated sds: the factor by which residuals without structure exceed them."""
 
 from __future__ import annotations
 
@@ -20,12 +20,13 @@ ALIKE = 1.3
 
 
 def noise_factors(fit: Residuals, level: float = LEVEL) -> dict[str, float]:
-    """Ratios of the residuals of each channel to its sds, if significant, empty if they have structure.
+    """Ratio of the residuals of each channel to its sds, if it differs significantly from 1. Empty if they have
+    structure.
 
-    Structure is tested with sds estimated from the misfit, so that it does not depend on the stated ones.
+    Structure is tested with sds estimated from the misfit, so that the result does not depend on the stated sds.
 
     Args:
-        level: family-wise significance of that test.
+        level: family-wise significance level of that test.
     """
     tests = structure_tests(fit.rescaled(), known=False)
     if tests and min(p for p, _ in tests) * len(tests) < level:
@@ -42,10 +43,10 @@ def noise_factors(fit: Residuals, level: float = LEVEL) -> dict[str, float]:
 
 
 def common_factors(fit: Residuals) -> dict[str, float]:
-    """`noise_factors` if every channel has the same one. Empty otherwise, or with too few readings.
+    """The `noise_factors`, if every channel has the same factor. Otherwise, or with too few readings, empty.
 
-    A model error affects some channels more than others. So structure has to be highly significant to refute a
-    factor that is common to all channels.
+    A model error affects some channels more than others. So a factor that is common to all channels is rejected only
+    by highly significant structure.
     """
     factors = noise_factors(fit, BEYOND_DOUBT)
     enough = bool(np.all(fit.freedom[fit.counts.any(0)] >= FEWEST))
@@ -53,13 +54,13 @@ def common_factors(fit: Residuals) -> dict[str, float]:
 
 
 def _is_common_factor(fit: Residuals, factors: dict[str, float]) -> bool:
-    """True if every measured channel has a factor, and the factors are the same."""
+    """True if every measured channel has a factor and the factors agree."""
     count = int(fit.counts.any(0).sum())
     return len(factors) == count > 1 and max(factors.values()) < ALIKE**2 * min(factors.values())
 
 
 def noise_remarks(fit: Residuals, source: str = "stated") -> list[Remark]:
-    """Notes on sds that are wrong by a factor. `source` is the origin of the sds."""
+    """Remarks on sds that are wrong by a factor. `source`: source of the sds."""
     factors = noise_factors(fit)
     if _is_common_factor(fit, factors):
         return [

@@ -26,13 +26,13 @@ GRIPPING = 20.0
 def operating_readings(
     robot: Robot, conditions: Conditions, names: Names | None = None
 ) -> Float[np.ndarray, "runs channels"]:
-    """Readings of steady travel on a surface that grips, and of turns on their own surface [SI].
+    """Predicted readings of steady travel without sliding, and of turns on their own surface [SI].
 
     NaN if the robot cannot move.
 
     Args:
-        conditions: shape (runs,).
-        names: names of the channels. None: the robot's.
+        conditions: conditions of the runs, shape (runs,).
+        names: names of the channels. None: those of the robot.
     """
     runs = conditions.shape[0]
     index = np.concatenate([np.arange(runs), np.zeros(-runs % PAD, int)])
@@ -46,7 +46,7 @@ def operating_readings(
         posed = conditions
     padded = jax.tree.map(lambda x: jax.device_put(np.asarray(x)[index]), posed)
     strong = params.without_weak_types(robot)
-    readings = results_of_rows(strong, padded)[0] if conditions.turns else _settled(strong, padded)
+    readings = results_of_rows(strong, padded)[0] if conditions.turns else _steady_results(strong, padded)
     reading = np.stack([np.asarray(readings.reading[c]) for c in names or channels.channel_names(robot.channels)], 1)[
         :runs
     ]
@@ -55,5 +55,5 @@ def operating_readings(
 
 
 @functools.partial(compiled, options=SELDOM)
-def _settled(robot: Robot, conditions: Conditions) -> Result:
+def _steady_results(robot: Robot, conditions: Conditions) -> Result:
     return jax.vmap(lambda c: steady(robot, c))(conditions)

@@ -1,4 +1,4 @@
-"""Maximum a posteriori by least squares with exact Jacobians, from many starts at once.
+"""Maximum a posteriori estimation: least squares with exact Jacobians, from many starts at once.
 
 Searches use solvers of optimistix. The default is ours (`levenberg_marquardt`).
 """
@@ -22,11 +22,11 @@ from calibration.inference.levenberg_marquardt import (
     NEAR,
     Function,
     OneSidedLevenbergMarquardt,
-    Searching,
+    SearchState,
     half_squares,
     linear_residual_function,
     one_sided_step,
-    with_slope,
+    with_derivative,
     zero_inactive_residuals,
 )
 from calibration.inference.problem import MISSING, Data, Observation, Problem
@@ -60,7 +60,7 @@ Numbers = Any
 
 
 class Pin(eqx.Module):
-    """Coordinates held at a value: `z[k] = at[k]` for `held[k]`."""
+    """Coordinates that are held at a value: `z[k] = at[k]` where `held[k]` is True."""
 
     held: Bool[Array, " parameters"]
     at: Z
@@ -81,11 +81,11 @@ class Optimum(eqx.Module):
         z: coordinates, shape (parameters,).
         covariance: covariance of z, from the Gauss-Newton curvature (JᵀJ)⁻¹ of readings and priors, shape
             (parameters, parameters).
-        sd: root of its diagonal.
-        cost: objective, half the sum of squares of misfit and prior [-].
-        decrement: further decrease predicted by the Gauss-Newton step from here [-].
+        sd: standard deviations, from the diagonal of `covariance`.
+        cost: objective: half the sum of squared residuals of readings and priors [-].
+        decrement: further decrease that the Gauss-Newton step predicts [-].
         converged: True if the decrement is small (see `DECREMENT`), whatever the solver reports.
-        steps: iterations taken.
+        steps: number of iterations.
     """
 
     z: Z
@@ -98,12 +98,12 @@ class Optimum(eqx.Module):
 
 
 def penalty_slice(data: Data) -> slice:
-    """Slice of the residuals that are penalties on adhesion, one a row, between readings and priors."""
+    """Slice of the adhesion penalties among the residuals: one for each row, between readings and priors."""
     return slice(data.measured.size, data.measured.size + data.measured.shape[0])
 
 
 def informative_residuals(data: Data) -> np.ndarray:
-    """Indices of the residuals that carry information: readings and priors, not the penalty on adhesion."""
+    """Indices of the residuals of readings and priors, without the adhesion penalties."""
     held = penalty_slice(data)
     return np.r_[: held.start, held.stop : held.stop + data.centre.size]
 
@@ -111,13 +111,13 @@ def informative_residuals(data: Data) -> np.ndarray:
 #: Least-squares solvers and minimisers of optimistix.
 Solver = optx.AbstractLeastSquaresSolver | optx.AbstractMinimiser
 #: A search between two steps: the best point so far and the solver's state.
-Progress = tuple[Z, Searching]
+Progress = tuple[Z, SearchState]
 
 
 def _evaluate_residuals(problem: Problem, data: Data, pin: Pin, z: Z) -> tuple[Array, Array, Observation]:
-    """Residuals (readings, penalties with their signs, then prior) at z, their Jacobian, and the observation.
+    """Residuals (readings, penalties with their signs, priors) at z, their Jacobian, and the observation.
 
-    One evaluation gives all three.
+    All three come from one evaluation of the model.
     """
     r, jacobian, observation, _ = problem.linearised(lambda x: problem.robot(pin.apply(x)), z, data)
     prior = jnp.where(pin.held, z - pin.at, z - data.centre)
@@ -125,27 +125,27 @@ def _evaluate_residuals(problem: Problem, data: Data, pin: Pin, z: Z) -> tuple[A
 
 
 def residual_function(problem: Problem, data: Data, pin: Pin) -> Function:
-    """Residual function for optimistix, from `_evaluate_residuals`, with the observation as auxiliary output."""
+    """Residual function for optimistix, from `_evaluate_residuals`. Its auxiliary output is the observation."""
 
     def function(z: Z, args: Any) -> tuple[Array, Observation]:
         r, jacobian, observation = _evaluate_residuals(problem, data, pin, jax.lax.stop_gradient(z))
-        return with_slope(z, r, jacobian), observation
+        return with_derivative(z, r, jacobian), observation
 
     return function
 
 
-def _solver(data: Data, long: bool) -> OneSidedLevenbergMarquardt:
-    """Solver of fits to such data. Of rollouts if `long`."""
+def _least_squares_solver(data: Data, long: bool) -> OneSidedLevenbergMarquardt:
+    """Solver for fits to such data. `long`: True for rollouts."""
     held, tolerance = penalty_slice(data), TOLERANCE_LONG if long else TOLERANCE
     return OneSidedLevenbergMarquardt(
         tolerance, tolerance, held.start, held.stop, near=0.0 if long else NEAR, rough=long
     )
 
 
-def _optimum(
+def _optimum_at(
     jacobian: Array, r: Array, z: Array, data: Data, pin: Pin, steps: Array, slope: Array | None = None
 ) -> Optimum:
-    """A point as an optimum. `slope` predicts its decrement, None for the Jacobian."""
+    """Optimum record of a point. `slope` is the Jacobian that predicts its decrement, None for `jacobian`."""
     slope = jacobian if slope is None else slope
     held_rows = penalty_slice(data)
     informed = jacobian[informative_residuals(data)]
@@ -167,17 +167,17 @@ def _optimum(
 
 
 def optimum_at_point(jacobian: np.ndarray, residual: np.ndarray, z: np.ndarray, data: Data) -> Optimum:
-    """A point as an optimum, from its residuals (misfit, then prior) and their Jacobian, of any origin."""
+    """Optimum record of a point, from its residuals (misfit, then priors) and their Jacobian."""
     j, r, point = (jnp.asarray(x, float) for x in (jacobian, residual, z))
-    return _optimum(j, r, point, data, no_pin(len(z)), jnp.asarray(0))
+    return _optimum_at(j, r, point, data, no_pin(len(z)), jnp.asarray(0))
 
 
-def _begin(solver: OneSidedLevenbergMarquardt, start: Z, size: int, aux: Any) -> Progress:
+def _initial_progress(solver: OneSidedLevenbergMarquardt, start: Z, size: int, aux: Any) -> Progress:
     """State of a search before its first evaluation.
 
     Args:
         size: number of residuals.
-        aux: shapes and dtypes of an evaluation's auxiliary output.
+        aux: shapes and dtypes of the auxiliary output of an evaluation.
     """
     struct = jax.ShapeDtypeStruct((size,), start.dtype)
     return start, solver.init(_unevaluated, start, None, {}, struct, aux, frozenset())
@@ -188,8 +188,8 @@ def _unevaluated(z: Z, args: Any) -> tuple[Array, Any]:
     raise NotImplementedError
 
 
-def _step(solver: OneSidedLevenbergMarquardt, function: Function, at: Progress) -> Progress:
-    """The next step of a search."""
+def _solver_step(solver: OneSidedLevenbergMarquardt, function: Function, at: Progress) -> Progress:
+    """One step of a search by the solver."""
     y, state, _ = solver.step(function, at[0], None, {}, at[1], frozenset())
     return y, state
 
@@ -198,58 +198,61 @@ def _begin_search(problem: Problem, start: Z, data: Data) -> Progress:
     """State of a problem's search before its first evaluation."""
     size = penalty_slice(data).stop + start.shape[0]
     codes = jnp.zeros(data.measured.shape[0], int)
-    return _begin(
-        _solver(data, problem.observe.long),
+    return _initial_progress(
+        _least_squares_solver(data, problem.observe.long),
         start,
         size,
         jax.eval_shape(lambda: Observation(data.measured, data.measured[:, 0], codes, codes)),
     )
 
 
-def _advance(problem: Problem, at: Progress, data: Data, max_steps: int | Numbers) -> Progress:
-    """One step of a search.
+def _advance_search(problem: Problem, at: Progress, data: Data, max_steps: int | Numbers) -> Progress:
+    """One step of a problem's search.
 
-    The program evaluates the model in one place, at the start of a step. The point accepted there is the search's
-    result, with its residuals, Jacobian and observation.
+    The compiled program evaluates the model in one place, at the start of a step. The point that is accepted there is
+    the result of the search, with its residuals, Jacobian and observation.
     """
-    solver, function = _solver(data, problem.observe.long), residual_function(problem, data, no_pin(at[0].shape[0]))
-    y, state = _step(solver, function, at)
+    solver, function = (
+        _least_squares_solver(data, problem.observe.long),
+        residual_function(problem, data, no_pin(at[0].shape[0])),
+    )
+    y, state = _solver_step(solver, function, at)
     done, _ = solver.terminate(function, y, None, {}, state, frozenset())
     over = done | (state.steps >= max_steps) | ~jnp.all(jnp.isfinite(y))
     return y, dataclasses.replace(state, over=over)
 
 
-def _ended(at: Progress, data: Data, pin: Pin) -> Optimum:
+def _optimum_of_progress(at: Progress, data: Data, pin: Pin) -> Optimum:
     y, state = at
     # optimistix takes no step from a start that is not finite.
     r = jnp.where(jnp.all(jnp.isfinite(y)), state.found.residual, jnp.nan)
-    return _optimum(state.found.jacobian, r, y, data, pin, state.steps, state.slope)
+    return _optimum_at(state.found.jacobian, r, y, data, pin, state.steps, state.slope)
 
 
 def levenberg_marquardt(
     problem: Problem, start: Z, data: Data, pin: Pin | None = None, max_steps: int = 100
 ) -> tuple[Optimum, Observation]:
-    """Optimum of one search, and the observation there. For `vmap` over starts, data and pins."""
+    """Optimum of one search, and the observation there. It can be vmapped over starts, data and pins."""
     pin = no_pin(start.shape[0]) if pin is None else pin
     function: Any = residual_function(problem, data, pin)
     solution: optx.Solution = optx.least_squares(
         function,
-        _solver(data, problem.observe.long),
+        _least_squares_solver(data, problem.observe.long),
         pin.apply(start),
         has_aux=True,
         max_steps=max_steps,
         throw=False,
     )
-    return _ended((solution.value, solution.state), data, pin), solution.aux
+    return _optimum_of_progress((solution.value, solution.state), data, pin), solution.aux
 
 
-class Member(eqx.Module):
-    """Data of one of many searches of a problem, with a leading axis for many.
+class SearchMember(eqx.Module):
+    """Data of one of many searches of a problem. For many, each field has a first axis of members.
 
     Attributes:
         start: initial coordinates, shape (parameters,).
-        weight, measured, centre: as in `Data`.
-        active: its effects, see `ActiveSet`, None for those of the problem.
+        weight, measured, centre: fields of `Data`.
+        active: set of effects, see `ActiveSet`. None: those of the problem.
     """
 
     start: Numbers
@@ -259,7 +262,7 @@ class Member(eqx.Module):
     active: Numbers | None = None
 
     def problem(self, problem: Problem) -> Problem:
-        """The problem of its search."""
+        """Problem of this search."""
         data = dataclasses.replace(problem.data, weight=self.weight, measured=self.measured, centre=self.centre)
         coordinates = problem.coordinates
         if self.active is not None:
@@ -268,113 +271,119 @@ class Member(eqx.Module):
 
 
 @functools.partial(compiled, options=SELDOM)
-def _placeholder_searches(problem: Problem, members: Member) -> Progress:
-    """States of searches that are over before they begin, as placeholders."""
+def _placeholder_searches(problem: Problem, members: SearchMember) -> Progress:
+    """States of searches that have already ended, as placeholders."""
 
-    def one(member: Member) -> Progress:
+    def placeholder(member: SearchMember) -> Progress:
         y, state = _begin_search(problem, member.start, member.problem(problem).data)
         return y, dataclasses.replace(state, over=jnp.asarray(True))
 
-    return jax.vmap(one)(members)
+    return jax.vmap(placeholder)(members)
 
 
-def _with_fresh(problem: Problem, members: Member, fresh: Numbers, at: Progress) -> Progress:
-    """States of parallel searches, in which `fresh` ones are reset to their starts."""
+def _start_fresh_searches(problem: Problem, members: SearchMember, fresh: Numbers, at: Progress) -> Progress:
+    """States of parallel searches after the `fresh` ones were reset to their starts."""
 
-    def begin(member: Member, fresh: Array, at: Progress) -> Progress:
+    def begin(member: SearchMember, fresh: Array, at: Progress) -> Progress:
         begun = _begin_search(problem, member.start, member.problem(problem).data)
         return jax.tree.map(lambda new, old: jnp.where(fresh, new, old), begun, at)
 
     return jax.vmap(begin)(members, fresh, at)
 
 
-_admitted = compiled(_with_fresh, options=SELDOM)
+_admitted = compiled(_start_fresh_searches, options=SELDOM)
 
 
-def _go_on(
-    problem: Problem, members: Member, fresh: Numbers, at: Progress, enough: Numbers, max_steps: Numbers
+def _continue_searches(
+    problem: Problem, members: SearchMember, fresh: Numbers, at: Progress, enough: Numbers, max_steps: Numbers
 ) -> tuple[Progress, Optimum]:
-    """Continue parallel searches until `enough` of them are over. `fresh` ones begin at their starts."""
+    """Continues parallel searches until `enough` of them have ended. `fresh` ones begin at their starts."""
     pin = no_pin(members.start.shape[-1])
 
-    def advance(member: Member, at: Progress) -> Progress:
+    def advance(member: SearchMember, at: Progress) -> Progress:
         here = member.problem(problem)
-        new = _advance(here, at, here.data, max_steps)
+        new = _advance_search(here, at, here.data, max_steps)
         return jax.tree.map(lambda new, old: jnp.where(at[1].over, old, new), new, at)
 
-    at = _with_fresh(problem, members, fresh, at)
+    at = _start_fresh_searches(problem, members, fresh, at)
     at = jax.lax.while_loop(lambda at: jnp.sum(at[1].over) < enough, lambda at: jax.vmap(advance)(members, at), at)
-    return at, jax.vmap(lambda member, at: _ended(at, member.problem(problem).data, pin))(members, at)
+    return at, jax.vmap(lambda member, at: _optimum_of_progress(at, member.problem(problem).data, pin))(members, at)
 
 
 @functools.partial(compiled, options=OVER_TIME)
-def _roots(problem: Problem, z: Numbers, active: Numbers | None) -> tuple[Array, Array]:
-    """Result of `Observer.solve` at each of several z. Arguments as in `Member`."""
+def _solve_rows(problem: Problem, z: Numbers, active: Numbers | None) -> tuple[Array, Array]:
+    """Result of `Observer.solve` at each of several z. Arguments as in `SearchMember`."""
 
-    def one(z: Array, active: Array | None) -> tuple[Array, Array] | None:
+    def solve_member(z: Array, active: Array | None) -> tuple[Array, Array] | None:
         coordinates = problem.coordinates if active is None else problem.coordinates.with_effects(active)
         return problem.observe.solve(coordinates.robot(problem.base, z))
 
-    solutions = jax.vmap(one)(z, active)
+    solutions = jax.vmap(solve_member)(z, active)
     assert solutions is not None  # of an observer that is `apart`
     return solutions
 
 
 @functools.partial(compiled, options=OVER_TIME)
 def _step_unfinished(
-    problem: Problem, members: Member, at: Progress, roots: tuple[Array, Array], max_steps: Numbers
+    problem: Problem, members: SearchMember, at: Progress, roots: tuple[Array, Array], max_steps: Numbers
 ) -> tuple[Progress, Optimum]:
-    """One step of each unfinished search with known roots, and the best point of each as an optimum."""
+    """One step of each unfinished search, given its solved rows, and the best point of each search."""
     pin = no_pin(members.start.shape[-1])
 
-    def advance(member: Member, at: Progress, roots: tuple[Array, Array]) -> tuple[Progress, Optimum]:
+    def advance(member: SearchMember, at: Progress, roots: tuple[Array, Array]) -> tuple[Progress, Optimum]:
         here = dataclasses.replace(member.problem(problem), roots=roots)
-        new = _advance(here, at, here.data, max_steps)
+        new = _advance_search(here, at, here.data, max_steps)
         new = jax.tree.map(lambda new, old: jnp.where(at[1].over, old, new), new, at)
-        return new, _ended(new, here.data, pin)
+        return new, _optimum_of_progress(new, here.data, pin)
 
     return jax.vmap(advance)(members, at, roots)
 
 
-def _go_on_apart(
-    problem: Problem, members: Member, fresh: Numbers, at: Progress, enough: Numbers, max_steps: Numbers
+def _continue_searches_separately(
+    problem: Problem, members: SearchMember, fresh: Numbers, at: Progress, enough: Numbers, max_steps: Numbers
 ) -> tuple[Progress, Optimum]:
-    """`_go_on` for observers with a separate program for roots (`Observer.apart`)."""
+    """`_continue_searches` for observers whose rows are solved by a separate program (`Observer.apart`)."""
     at = _admitted(problem, members, fresh, at)
     while True:
-        at, results = _step_unfinished(problem, members, at, _roots(problem, at[1].ahead, members.active), max_steps)
+        at, results = _step_unfinished(
+            problem, members, at, _solve_rows(problem, at[1].ahead, members.active), max_steps
+        )
         if np.asarray(at[1].over).sum() >= enough:
             return at, results
 
 
-def with_roots(problem: Problem, z: Z) -> Problem:
-    """Problem with its roots at z, found by the program of searches. Unchanged if its observer is not `apart`."""
+def with_solved_rows(problem: Problem, z: Z) -> Problem:
+    """Problem with its rows solved at z, by the program of the searches. Unchanged if its observer needs no separate
+    program.
+    """
     if not problem.observe.apart:
         return problem
     active = getattr(problem.coordinates, "active", None)
     many = [
         None if x is None else np.repeat(np.asarray(x)[None], problem.observe.places(problem), 0) for x in (z, active)
     ]
-    return dataclasses.replace(problem, roots=jax.tree.map(lambda x: x[0], _roots(problem, *many)))
+    return dataclasses.replace(problem, roots=jax.tree.map(lambda x: x[0], _solve_rows(problem, *many)))
 
 
-def solve_roots(problem: Problem, zs: Numbers) -> tuple[np.ndarray, np.ndarray]:
-    """Roots at several z, by the program of searches, of a problem without slots. The leading axis is z."""
+def solve_rows_at(problem: Problem, zs: Numbers) -> tuple[np.ndarray, np.ndarray]:
+    """Solutions of the rows at several z (first axis), by the program of the searches. For a problem without
+    slots.
+    """
     places = problem.observe.places(problem)
     filled = np.resize(zs, (-(-len(zs) // places) * places, zs.shape[1]))
-    parts = [jax.device_get(_roots(problem, part, None)) for part in filled.reshape(-1, places, zs.shape[1])]
+    parts = [jax.device_get(_solve_rows(problem, part, None)) for part in filled.reshape(-1, places, zs.shape[1])]
     return jax.tree.map(lambda *x: np.concatenate(x)[: len(zs)], *parts)
 
 
-_go_on_often = compiled(_go_on, options=SMALL)
-_go_on_seldom = compiled(_go_on, options=SELDOM)
+_go_on_often = compiled(_continue_searches, options=SMALL)
+_go_on_seldom = compiled(_continue_searches, options=SELDOM)
 
 
-class Places:
-    """Members of parallel searches. Finished members are replaced by queued ones.
+class SearchQueue:
+    """Queue of members for a fixed number of parallel searches. Finished members are replaced by waiting ones.
 
     Attributes:
-        holds: member in each place, -1 for none.
+        holds: member in each place, -1 if the place is empty.
         ended: result of each finished member.
     """
 
@@ -393,55 +402,59 @@ class Places:
 
     @property
     def taken(self) -> np.ndarray:
-        """True for places that hold a member."""
+        """True for places with a member."""
         return self.holds >= 0
 
     @property
     def member(self) -> np.ndarray:
-        """Member in each place. An arbitrary one in empty places."""
+        """Member in each place. An arbitrary member in empty places."""
         return np.maximum(self.holds, 0)
 
     def fill(self) -> np.ndarray:
-        """Move queued members into empty places. Returns these places."""
+        """Moves waiting members into empty places. Returns these places."""
         fresh = np.flatnonzero(~self.taken)[: len(self._waiting)]
         self.holds[fresh] = [self._waiting.pop() for _ in fresh]
         return fresh
 
     def leave(self, over: np.ndarray, found: Any) -> None:
-        """Remove members whose search is over, and keep their results. The leading axis is the places."""
+        """Removes members whose search has ended, and keeps their results. The first axis of `found` is the place."""
         for place in np.flatnonzero(over & self.taken):
             self.ended[int(self.holds[place])] = jax.tree.map(lambda x: x[place], found)  # noqa: B023
             self.holds[place] = -1
 
 
-def search_refilling(problem: Problem, members: Member, max_steps: int, places: int) -> tuple[Optimum, Observation]:
-    """`levenberg_marquardt` for any number of members, with a fixed number in parallel.
+def search_refilling(
+    problem: Problem, members: SearchMember, max_steps: int, places: int
+) -> tuple[Optimum, Observation]:
+    """Searches for any number of members, as `levenberg_marquardt`, with a fixed number in parallel.
 
-    Finished members are replaced by queued ones, whereas a batch would wait for its slowest member. One program
-    serves any number.
+    Finished members are replaced by waiting ones, so no batch waits for its slowest member. One compiled program
+    serves any number of members.
 
     Args:
-        members: leading axis the searches, NumPy arrays.
-        places: number of searches in parallel on each core.
+        members: members along the first axis, as NumPy arrays.
+        places: number of parallel searches on each core.
 
     Returns:
-        End of each search, and the observation there.
+        The end of each search, and the observation there.
     """
-    optima, state = _refilled(problem, members, max_steps, places)
+    optima, state = _search_with_states(problem, members, max_steps, places)
     return optima, state.aux
 
 
-def _refilled(problem: Problem, members: Member, max_steps: int, places: int) -> tuple[Optimum, Searching]:
-    """Results as of `search_refilling`, with the solver's state at the end of each search."""
+def _search_with_states(
+    problem: Problem, members: SearchMember, max_steps: int, places: int
+) -> tuple[Optimum, SearchState]:
+    """Results of `search_refilling`, with the state of the solver at the end of each search."""
     count, most = len(members.start), np.asarray(max_steps)
     cores = min(CORES, -(-count // places))
     first = jax.tree.map(lambda x: np.repeat(x[:1], places, 0), members)
     idle = _placeholder_searches(problem, first)
     go_on = _go_on_seldom if getattr(problem.coordinates, "fitted_once", False) else _go_on_often
-    go_on = _go_on_apart if problem.observe.apart else go_on
+    go_on = _continue_searches_separately if problem.observe.apart else go_on
 
-    def some(core: int) -> dict[int, Any]:
-        assigned, at = Places(range(core, count, cores), places), idle
+    def search_on_core(core: int) -> dict[int, Any]:
+        assigned, at = SearchQueue(range(core, count, cores), places), idle
         while assigned:
             fresh = np.isin(np.arange(places), assigned.fill())
             own_members = jax.tree.map(lambda x: x[assigned.member], members)
@@ -454,12 +467,12 @@ def _refilled(problem: Problem, members: Member, max_steps: int, places: int) ->
     if cores > 1:  # compiles the program once, by a call that takes no step
         go_on(problem, first, np.zeros(places, bool), idle, np.asarray(0), most)
     with Threads(cores) as pool:
-        ended = {k: result for part in pool.map(some, range(cores)) for k, result in part.items()}
+        ended = {k: result for part in pool.map(search_on_core, range(cores)) for k, result in part.items()}
     return jax.tree.map(lambda *x: np.stack(x), *(ended[k] for k in range(count)))
 
 
 def linearise(problem: Problem, z: Z, data: Data) -> tuple[Array, Array, Observation]:
-    """Residuals (misfit, then prior) at z, their Jacobian, and the observation."""
+    """Residuals (misfit, then priors) at z, their Jacobian, and the observation."""
     r, jacobian, observation = (linearise_rollout if problem.observe.long else _linearise_by_search_program)(
         problem, z, data
     )
@@ -467,25 +480,25 @@ def linearise(problem: Problem, z: Z, data: Data) -> tuple[Array, Array, Observa
 
 
 def _linearise_by_search_program(problem: Problem, z: Z, data: Data) -> tuple[Array, Array, Observation]:
-    """Result of `linearise` with the signs of penalties, by the compiled program of the searches."""
+    """Result of `linearise`, with the signs of the penalties, by the compiled program of the searches."""
     active = getattr(problem.coordinates, "active", None)
     one_member = [np.asarray(x)[None] for x in (z, data.weight, data.measured, data.centre)]
-    members = Member(
+    members = SearchMember(
         one_member[0],
         one_member[1],
         one_member[2],
         one_member[3],
         None if active is None else np.asarray(active)[None],
     )
-    _, ended = _refilled(problem, members, 1, problem.observe.places(problem))
+    _, ended = _search_with_states(problem, members, 1, problem.observe.places(problem))
     state = jax.tree.map(lambda x: jnp.asarray(x[0]), ended)
     return state.found.residual, state.found.jacobian, state.aux
 
 
 def clip_penalties(r: Array, jacobian: Array, data: Data) -> tuple[Array, Array]:
-    """Residuals and Jacobian with penalties cut off at 0, for solvers without one-sided residuals.
+    """Residuals and Jacobian with penalties clipped at 0, for solvers without one-sided residuals.
 
-    Readings with a non-finite slope count as not computed.
+    A reading with a non-finite derivative counts as not computed.
     """
     return zero_inactive_residuals(*mask_uncomputed(r, jacobian, data), penalty_slice(data))
 
@@ -494,7 +507,7 @@ _clip_penalties = compiled(clip_penalties, options=SELDOM)
 
 
 def mask_uncomputed(r: Array, jacobian: Array, data: Data) -> tuple[Array, Array]:
-    """Residuals and Jacobian. A reading with a non-finite row of the Jacobian counts as not computed."""
+    """Residuals and Jacobian in which a reading with a non-finite derivative counts as not computed."""
     counts = jnp.concatenate([data.weight.ravel() > 0, jnp.ones(data.measured.shape[0] + jacobian.shape[1], bool)])
     computed = jnp.all(jnp.isfinite(jacobian), axis=1)
     return jnp.where(computed, r, MISSING * counts), jnp.where(computed[:, None], jacobian, 0.0)
@@ -502,10 +515,10 @@ def mask_uncomputed(r: Array, jacobian: Array, data: Data) -> tuple[Array, Array
 
 @functools.partial(compiled, options=OVER_TIME)
 def linearise_rollout(problem: Problem, z: Z, data: Data) -> tuple[Array, Array, Observation]:
-    """`linearise` of a rollout with the signs of penalties, and with the slopes of negative ones.
+    """Result of `linearise` for a rollout, with negative penalties and their derivatives.
 
-    If a rollout's step is too long for its friction law (V_s small compared with μ_s), the run oscillates and its
-    derivative grows without limit. Such a reading counts as not computed if it has a weight.
+    If a step of the rollout is too long for its friction law (V_s small compared with μ_s), the run oscillates and
+    its derivative grows without limit. Such a reading counts as not computed, if it has a weight.
     """
 
     r, jacobian, observation = _evaluate_residuals(problem, data, no_pin(z.size), z)
@@ -513,14 +526,16 @@ def linearise_rollout(problem: Problem, z: Z, data: Data) -> tuple[Array, Array,
 
 
 def evaluate_residuals(problem: Problem, z: Z, data: Data) -> Array:
-    """Residuals of `linearise` without the Jacobian, by the program of `observe_robot`, which saves a compilation."""
+    """Residuals of `linearise` without the Jacobian. It uses the program of `observe_robot`, which saves a
+    compilation.
+    """
     observation = observe_robot(problem, problem.robot(z))
     return jnp.concatenate([problem.whitened(observation, data), z - data.centre])
 
 
 @eqx.filter_jit
-def _stepped(solver: OneSidedLevenbergMarquardt, at: Progress, r: Array, jacobian: Array) -> Progress:
-    return _step(solver, linear_residual_function(r, jacobian), at)
+def _linearised_step(solver: OneSidedLevenbergMarquardt, at: Progress, r: Array, jacobian: Array) -> Progress:
+    return _solver_step(solver, linear_residual_function(r, jacobian), at)
 
 
 def search_rollout(
@@ -530,16 +545,16 @@ def search_rollout(
     max_steps: int = 100,
     tell: Callable[[int, float], None] = lambda steps, cost: None,
 ) -> tuple[Optimum, Observation, Observation]:
-    """`levenberg_marquardt` with its steps in Python, so that a rollout is compiled only once.
+    """Search as `levenberg_marquardt`, with its loop in Python so that the rollout is compiled only once.
 
     It also ends if the next step would bring no relevant gain (a tenth of `DECREMENT`).
 
     Returns:
         The optimum, and the observations at the start and at the end.
     """
-    pin, solver = no_pin(start.shape[0]), _solver(data, long=True)
+    pin, solver = no_pin(start.shape[0]), _least_squares_solver(data, long=True)
     size = penalty_slice(data).stop + start.shape[0]
-    progress, first, last = _begin(solver, start, size, None), None, None
+    progress, first, last = _initial_progress(solver, start, size, None), None, None
     best: Optimum | None = None
     for steps in range(1, max_steps + 1):
         ahead = progress[1].ahead
@@ -548,10 +563,10 @@ def search_rollout(
         if r is None or best is None or 0.5 * jnp.sum(r**2) < best.cost:
             r, jacobian, observation = linearise_rollout(problem, ahead, data)
         first = observation if first is None else first
-        progress = _stepped(solver, progress, r, jacobian)
+        progress = _linearised_step(solver, progress, r, jacobian)
         done = bool(progress[1].over)
         if progress[1].rejected == 0:
-            best, last = _optimum(jacobian, r, progress[0], data, pin, jnp.asarray(steps)), observation
+            best, last = _optimum_at(jacobian, r, progress[0], data, pin, jnp.asarray(steps)), observation
             done |= bool(best.decrement < 0.1 * (DECREMENT + DECREMENT_SHARE * best.cost))
         assert best is not None  # the first step only evaluates the start, and accepts it
         tell(steps, float(best.cost))
@@ -567,16 +582,18 @@ Evaluate = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray, Obse
 
 
 @functools.partial(compiled, options=SELDOM)
-def _steps(at: Progress, found: tuple[Array, Array, Any], data: Data, weights: Array) -> tuple[Progress, Optimum]:
-    """Next step of each search, and its best point as an optimum."""
+def _step_searches(
+    at: Progress, found: tuple[Array, Array, Any], data: Data, weights: Array
+) -> tuple[Progress, Optimum]:
+    """Next step of each search, and its best point."""
 
-    solver, pin = _solver(data, long=True), no_pin(at[0].shape[-1])
+    solver, pin = _least_squares_solver(data, long=True), no_pin(at[0].shape[-1])
 
-    def one(at: Progress, found: tuple[Array, Array, Any], weight: Array) -> tuple[Progress, Optimum]:
-        new = _step(solver, linear_residual_function(*found), at)
-        return new, _ended(new, dataclasses.replace(data, weight=weight), pin)
+    def step_search(at: Progress, found: tuple[Array, Array, Any], weight: Array) -> tuple[Progress, Optimum]:
+        new = _solver_step(solver, linear_residual_function(*found), at)
+        return new, _optimum_of_progress(new, dataclasses.replace(data, weight=weight), pin)
 
-    return jax.vmap(one)(at, found, weights)
+    return jax.vmap(step_search)(at, found, weights)
 
 
 def search_rollouts(
@@ -589,25 +606,27 @@ def search_rollouts(
     *,
     within: float = np.inf,
 ) -> tuple[Optimum, Observation]:
-    """`levenberg_marquardt` of any number of members with its steps in Python, so that rollouts are compiled once.
+    """Searches of any number of members, as `levenberg_marquardt`, with the loop in Python so that rollouts are
+    compiled once.
 
-    Finished members are not evaluated again, and are replaced by queued ones. A search ends
-    whose last steps lowered its objective by too little (`STALLED`).
+    Finished members are replaced by waiting ones. A search also ends if its last steps lowered the objective by too
+    little (`STALLED`).
 
     Args:
-        starts: shape (members, coordinates).
+        evaluate: function that evaluates the model for members.
+        starts: initial coordinates, shape (members, coordinates).
         weights: weights of each member's readings, shape (members, rows, channels).
-        places: number of searches in parallel.
-        within: distance from the lowest objective that matters, for members with the same readings. A search ends
-            that cannot come so near: by `HOPELESS` times the predicted decrease of its step, or by the decrease of
+        places: number of parallel searches.
+        within: distance from the lowest objective within which members with the same readings matter. A search ends
+            if it cannot come that near: by `HOPELESS` times the predicted decrease of its step, or by the decrease of
             its last `LATELY` steps. `SAME` if all search the same optimum. All then end once `AGREE` of them have
-            ended in one place and no other is lower.
+            ended at one point and no other is lower.
 
     Returns:
-        End of each search, and the observation there.
+        The end of each search, and the observation there.
     """
-    starts, weights, solver = np.asarray(starts), np.asarray(weights), _solver(data, long=True)
-    assigned = Places(range(len(starts)), max(places, len(starts) * (within <= SAME)))
+    starts, weights, solver = np.asarray(starts), np.asarray(weights), _least_squares_solver(data, long=True)
+    assigned = SearchQueue(range(len(starts)), max(places, len(starts) * (within <= SAME)))
     cost, ahead = np.full(len(starts), np.inf), starts[assigned.member]
     trail = np.full((2 * LATELY, len(assigned.member)), np.nan)
     progress: Progress | None = None
@@ -623,12 +642,12 @@ def search_rollouts(
         if len(fresh):
             trail[:, fresh] = np.nan
             aux = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), optima[2])
-            begin = functools.partial(_begin, solver, size=optima[0].shape[1], aux=aux)
+            begin = functools.partial(_initial_progress, solver, size=optima[0].shape[1], aux=aux)
             begun = jax.device_get(jax.vmap(begin)(jnp.asarray(ahead)))
             put = lambda old, new: _with_values(old, fresh, new[fresh])  # noqa: B023, E731
             progress = begun if progress is None else jax.tree.map(put, progress, begun)
         assert progress is not None  # the first searches are fresh
-        progress, ends = jax.device_get(_steps(progress, optima, data, weights[assigned.member]))
+        progress, ends = jax.device_get(_step_searches(progress, optima, data, weights[assigned.member]))
         state = progress[1]
         ahead, observation = state.ahead, state.aux
         small = 0.1 * (DECREMENT + DECREMENT_SHARE * ends.cost)
@@ -658,9 +677,9 @@ def _with_values(x: np.ndarray, places: np.ndarray, values: np.ndarray) -> np.nd
 def search_starts(
     problem: Problem, starts: Float[Array, "starts parameters"], data: Data, solver: Solver | None = None
 ) -> tuple[Optimum, Int[Array, "starts rows"], Int[Array, "starts rows"]]:
-    """A search from each start: in vmapped batches by our solver, one after another by any other `solver`.
+    """Searches from each start: in batches by the solver of this package, one after another by another `solver`.
 
-    Batches of `AT_ONCE` rows bound the memory, and an interrupt is obeyed between them.
+    Batches of `AT_ONCE` rows limit the memory. An interrupt takes effect between them.
 
     Returns:
         The end of each search, and the status of each row at its start and at its end.
@@ -674,7 +693,7 @@ def search_starts(
         parts = [jax.device_get(_search_starts(problem, z, data)) for z in filled.reshape(-1, size, starts.shape[1])]
         return jax.tree.map(lambda *x: np.concatenate(x)[: len(starts)], *parts)
     tables = (np.repeat(np.asarray(x)[None], len(starts), 0) for x in (data.weight, data.measured, data.centre))
-    members = Member(np.asarray(starts), *tables)
+    members = SearchMember(np.asarray(starts), *tables)
     problem = dataclasses.replace(problem, data=data)
     # A search of one step evaluates its start.
     begun, ended = (search_refilling(problem, members, steps, problem.observe.places(problem)) for steps in (1, 100))
@@ -694,32 +713,32 @@ def _search_starts(problem: Problem, starts: Array | np.ndarray, data: Data) -> 
 def search_with_solver(
     problem: Problem, starts: Float[Array, "starts parameters"], data: Data, solver: Solver
 ) -> tuple[Optimum, Observation, Observation]:
-    """Searches by a solver of optimistix, one after another.
+    """Searches with a solver of optimistix, one after another.
 
-    Its linear algebra is LAPACK's, and batched calls of that have deadlocked (`linear_equations`).
+    Such solvers call LAPACK, and batched calls of LAPACK have deadlocked (`linear_equations`).
 
     Returns:
-        End of each search, and the observations at its start and at its end.
+        The end of each search, and the observations at its start and at its end.
     """
     most = MOST_STEPS[isinstance(solver, optx.AbstractMinimiser)]
 
     def residual(z: Z, args: Any) -> Array:
         r, jacobian, _ = _evaluate_residuals(problem, data, no_pin(z.size), jax.lax.stop_gradient(z))
-        return with_slope(z, *clip_penalties(r, jacobian, data))
+        return with_derivative(z, *clip_penalties(r, jacobian, data))
 
     def search(start: Z) -> tuple[Optimum, Observation, Observation]:
         solved: optx.Solution = optx.least_squares(residual, solver, start, max_steps=most, throw=False)
         z, pin = solved.value, no_pin(start.size)
         r, jacobian, observation = _evaluate_residuals(problem, data, pin, z)
         r, jacobian = mask_uncomputed(r, jacobian, data)
-        optimum = _optimum(jacobian, r, z, data, pin, solved.stats["num_steps"])
+        optimum = _optimum_at(jacobian, r, z, data, pin, solved.stats["num_steps"])
         return optimum, problem.observation(start), observation
 
     return jax.lax.map(search, starts)
 
 
 def observe_robot(problem: Problem, robot: Robot) -> Observation:
-    """Observation of any robot in each row of the problem, compiled."""
+    """Observation of any robot in each row of the problem, by a compiled program."""
     return problem.observe.read(robot) if problem.observe.apart else _simulated_readings(problem, robot)
 
 
@@ -729,7 +748,7 @@ def _simulated_readings(problem: Problem, robot: Robot) -> Observation:
 
 
 def observe_at(problem: Problem, z: Z) -> Observation:
-    """Observation at z, by a program that the search has already compiled if it is long."""
+    """Observation at z. For rollouts, by a program that the search has already compiled."""
     return (
         linearise(problem, z, problem.data)[2] if problem.observe.long else observe_robot(problem, problem.robot(z))
     )

@@ -1,4 +1,4 @@
-"""Searches without gradients: a population of robots, run in one batch, in generations.
+"""Search without gradients: generations of a population of robots, simulated in batches.
 
 A rollout has thresholds (contacts that open and close, regimes of vibration), across which gradients are no guide.
 Members are drawn by CMA-ES (Hansen and Ostermeier 2001; the library `cmaes`). All results of a member's run are kept.
@@ -28,7 +28,7 @@ from calibration.data.writing import entries_of, replacing
 from calibration.described import describe
 from calibration.inference import noise as noise_room
 from calibration.inference import series_noise
-from calibration.inference.fit_notes import Edge, Remark, next_step
+from calibration.inference.fit_notes import ReachedBound, Remark, progress_remark
 from calibration.inference.noise import Noise
 from calibration.inference.priors import Coordinates
 from calibration.inference.problem import MISSING, Observation, Problem
@@ -55,13 +55,13 @@ STEP, APART = 0.2, 0.25
 
 @dataclasses.dataclass(frozen=True)
 class Generation:
-    """Outcome of a generation.
+    """Summary of one generation.
 
     Attributes:
-        members: number of members run.
-        failed: number with a row that could not be run or left the ground.
-        lowest: objective of the best so far.
-        median: median of this generation [½σ²].
+        members: number of members.
+        failed: number of members with a row that failed or left the ground.
+        lowest: lowest objective so far [½σ²].
+        median: median objective of this generation [½σ²].
     """
 
     members: int
@@ -72,14 +72,14 @@ class Generation:
 
 @dataclasses.dataclass(frozen=True)
 class Population:
-    """All members of a search.
+    """All members of a search by generations.
 
     Attributes:
         z: coordinates, shape (members, parameters).
         reading: reading of each row [SI], shape (members, rows, channels).
         adhesion_used, status, flags: values of each row, shape (members, rows).
-        cost: objective with the final noise of the search [½σ²], inf for members without one.
-        generations: generations in order.
+        cost: objective with the final noise of the search [½σ²], inf if a member has none.
+        generations: summary of each generation.
     """
 
     z: Float[np.ndarray, "members parameters"]
@@ -92,7 +92,7 @@ class Population:
 
     @property
     def order(self) -> Int[np.ndarray, " members"]:
-        """Members by their cost, the lowest first."""
+        """Indices of the members by their objective, the lowest first."""
         return np.argsort(self.cost, kind="stable")
 
     @property
@@ -102,8 +102,8 @@ class Population:
         return len(lowest) > PATIENCE and lowest[-PATIENCE - 1] - lowest[-1] < GAIN
 
 
-class Rows(NamedTuple):
-    """Observations of each row, for members: see `Population`."""
+class MemberObservations(NamedTuple):
+    """Observation of each row for several members, see `Population`."""
 
     reading: Float[np.ndarray, "members rows channels"]
     adhesion_used: Float[np.ndarray, "members rows"]
@@ -112,12 +112,12 @@ class Rows(NamedTuple):
 
 
 #: Arrays in a file of members.
-KEPT = ("z", *Rows._fields)
-Objective = Callable[[np.ndarray, Rows], Float[np.ndarray, " members"]]
+KEPT = ("z", *MemberObservations._fields)
+Objective = Callable[[np.ndarray, MemberObservations], Float[np.ndarray, " members"]]
 
 
 def problem_hash(posed: Problem) -> str:
-    """Hash of a problem's data, base robot, coordinates and model."""
+    """Hash of the data, base robot, coordinates and model of a problem."""
     arrays, rest = eqx.partition(posed, eqx.is_array_like)
     digest = hashlib.sha256(str(rest).encode())
     for leaf in jax.tree.leaves(arrays):
@@ -126,10 +126,10 @@ def problem_hash(posed: Problem) -> str:
 
 
 def saved_members(file: Path) -> tuple[str, list[np.ndarray]]:
-    """Identity of the problem of a file of members, and its arrays in the order of `KEPT`.
+    """Contents of a file of members: hash of its problem, and arrays in the order of `KEPT`.
 
     Raises:
-        BadConfiguration: it is not a file of members, or is damaged.
+        BadConfiguration: it is not a file of members, or it is damaged.
     """
     try:
         with file.open("rb") as bytes_, np.load(bytes_, allow_pickle=False) as saved:
@@ -144,13 +144,13 @@ def saved_members(file: Path) -> tuple[str, list[np.ndarray]]:
     return own_identity, arrays
 
 
-class Members:
-    """Runs members and stores their results, optionally in a file, so that a search can resume.
+class MemberRunner:
+    """Simulates members and stores their results, optionally in a file, so that a search can resume.
 
     Args:
         posed: the problem.
         file: file of members.
-        together: number of members in one batch, None takes `TOGETHER`.
+        together: number of members in one batch. None: `TOGETHER`.
 
     Raises:
         BadConfiguration: the file is not a file of members, belongs to another problem, or cannot be written.
@@ -187,35 +187,37 @@ class Members:
         except OSError as error:
             raise BadConfiguration(f"--members {self._file}: cannot be written: {error.strerror}") from None
 
-    def lost(self, seen: Rows) -> Bool[np.ndarray, "members rows"]:
-        """Measured rows that the model does not reach."""
+    def lost(self, seen: MemberObservations) -> Bool[np.ndarray, "members rows"]:
+        """True for measured rows that the model does not reach."""
         return self._posed.observe.unreachable(seen.status) & (np.asarray(self._posed.data.weight).max(1) > 0)
 
-    def run(self, points: np.ndarray, advance: Callable[[int], None] = lambda _: None) -> Rows:
-        """Observation of each row for each point."""
+    def run(self, points: np.ndarray, advance: Callable[[int], None] = lambda _: None) -> MemberObservations:
+        """Simulates the rows for each point."""
         keys = [np.ascontiguousarray(z, float).tobytes() for z in points]
         new = [z for key, z in zip(keys, points, strict=True) if key not in self._kept]
         together = self._together
         for first in range(0, len(new), together):
             part = np.array(new[first : first + together])
             filled = np.concatenate([part, np.repeat(part[-1:], together - len(part), 0)])
-            observed = jax.device_get(_observed(self._posed, jnp.asarray(filled)))
-            for z, *row in zip(part, *(getattr(observed, name) for name in Rows._fields), strict=False):
+            observed = jax.device_get(_observe_points(self._posed, jnp.asarray(filled)))
+            for z, *row in zip(part, *(getattr(observed, name) for name in MemberObservations._fields), strict=False):
                 self._kept[z.tobytes()] = tuple(map(np.asarray, row))
             self._save()
             advance(len(points) - len(new) + first + len(part))
-        return Rows(*map(np.array, zip(*map(self._kept.__getitem__, keys), strict=True)))
+        return MemberObservations(*map(np.array, zip(*map(self._kept.__getitem__, keys), strict=True)))
 
 
 @compiled
-def _observed(posed: Problem, points: Float[Array, "points parameters"]) -> Observation:
+def _observe_points(posed: Problem, points: Float[Array, "points parameters"]) -> Observation:
     return jax.vmap(posed.observation)(points)
 
 
 def most_probable_noise(
     posed: Problem, noise: Noise, reading: Float[np.ndarray, "... rows channels"]
 ) -> Float[np.ndarray, "... channels"]:
-    """Most probable sd of each channel for given readings, as a share of its size, NaN if it is known."""
+    """Most probable noise of each channel given these readings, relative to the size of the channel. NaN if it is
+    known.
+    """
     weight, size = np.asarray(posed.data.weight), noise.sd / noise_room.START
     error = np.where(weight > 0, (reading - np.asarray(posed.data.measured)) / size, 0.0)
     share = np.sqrt(np.sum(weight * error**2, -2) / np.maximum(weight.sum(0), 1.0))
@@ -223,16 +225,16 @@ def most_probable_noise(
 
 
 def member_objective(posed: Problem, noise: Noise) -> Objective:
-    """Objective of members: half the sum of squares of misfit and prior.
+    """Function that returns the objective of members: half the sum of squared residuals of readings and priors.
 
     If the sd of a channel is unknown, the most probable one for each member is used: n ln s replaces the squares,
-    with s the rms of the errors as shares of the readings. A measured row that a member does not reach costs `LOST`.
-    A member with an included reading that could not be computed costs inf.
+    where s is the relative rms error. A measured row that a member does not reach costs `LOST`. A member with an
+    included reading that could not be computed costs inf.
     """
     data = posed.data
     weight, measured, sd = np.asarray(data.weight), np.asarray(data.measured), np.asarray(data.sd)
 
-    def of(z: np.ndarray, seen: Rows) -> Float[np.ndarray, " members"]:
+    def of(z: np.ndarray, seen: MemberObservations) -> Float[np.ndarray, " members"]:
         error = np.where(weight > 0, seen.reading - measured, 0.0)
         squares = np.sum((z - np.asarray(data.centre)) ** 2, -1)
         shares = most_probable_noise(posed, noise, seen.reading)
@@ -248,8 +250,8 @@ def member_objective(posed: Problem, noise: Noise) -> Objective:
     return of
 
 
-def evolve(
-    members: Members,
+def run_evolution(
+    members: MemberRunner,
     objective: Objective,
     centre: np.ndarray,
     covariance: np.ndarray,
@@ -260,15 +262,16 @@ def evolve(
     beside: np.ndarray | None = None,
     tell: Callable[[Remark], None] = lambda step: None,
 ) -> Population:
-    """Search by generations.
+    """Searches by generations: each is drawn around the best members of the generations before.
 
     Args:
         members: runner of members.
         objective: objective of members.
         centre, covariance: centre and covariance of the first generation, in coordinates z.
         size: number of members in a generation.
-        seed: random seed of the draws.
-        beside: further points that are run with the first generation.
+        seed: random seed.
+        generations: largest number of generations.
+        beside: further points to simulate with the first generation.
         tell: callback for progress after every batch.
     """
     from cmaes import CMA
@@ -283,11 +286,11 @@ def evolve(
 
         def advance(done: int) -> None:
             minutes = (time.perf_counter() - begun) / 60
-            tell(next_step("members", number, done, len(points), minutes))  # noqa: B023
+            tell(progress_remark("members", number, done, len(points), minutes))  # noqa: B023
 
         now = members.run(points, advance)
         z = points if rows is None else np.concatenate([z, points])
-        rows = now if rows is None else Rows(*map(np.concatenate, zip(rows, now, strict=True)))
+        rows = now if rows is None else MemberObservations(*map(np.concatenate, zip(rows, now, strict=True)))
         cost = np.concatenate([cost, objective(points, now)])
         own_cost = cost[-size:]
         search.tell(
@@ -298,7 +301,7 @@ def evolve(
         )
         failed = int(np.sum(members.lost(now).any(-1)))
         progress.append(Generation(len(points), failed, float(cost.min()), float(np.median(own_cost))))
-        tell(next_step("generation", number, cost.min(), np.median(own_cost), failed))
+        tell(progress_remark("generation", number, cost.min(), np.median(own_cost), failed))
         population = Population(z, *rows, cost, tuple(progress))
         if population.settled:
             break
@@ -308,13 +311,13 @@ def evolve(
 def local_regression(
     posed: Problem, found: Population, at: int
 ) -> tuple[Float[np.ndarray, "readings parameters"], float]:
-    """Slope of the whitened readings by z near a member, by least squares over the nearest members.
+    """Derivative of the whitened readings with respect to z near a member, by least squares over its nearest members.
 
-    If contacts open and close, the derivative of a run excludes these events. The regression includes them, over the
-    distance of the members.
+    Contacts that open or close change a run abruptly. The derivative of a run excludes these events, the regression
+    includes them over the distance of the members.
 
     Returns:
-        The slope, shape (rows · channels, parameters), and the rms of the residuals [σ].
+        The derivative, shape (rows · channels, parameters), and the rms of the residuals [σ].
     """
     finite = np.isfinite(found.cost)
     z, reading = found.z[finite], found.reading[finite]
@@ -333,12 +336,12 @@ def local_regression(
 
 
 def unreliable_derivatives(
-    posed: Problem, members: Members, z: np.ndarray, jacobian: np.ndarray, sd: np.ndarray
+    posed: Problem, members: MemberRunner, z: np.ndarray, jacobian: np.ndarray, sd: np.ndarray
 ) -> Bool[np.ndarray, " parameters"]:
-    """True for parameters with derivatives of a run that disagree with finite differences, shape (parameters,).
+    """True for parameters whose derivatives of a run disagree with finite differences, shape (parameters,).
 
-    Differences are central, `STEP` of the posterior sd to either side. A column disagrees if the difference exceeds
-    `APART` of its size and one data sd per posterior sd.
+    Differences are central, with `STEP` of the posterior sd to either side. A derivative disagrees if the difference
+    exceeds both `APART` of its size and one data sd per posterior sd.
     """
     steps = STEP * np.diag(sd)
     rows = members.run(np.concatenate([z + steps, z - steps]))
@@ -351,29 +354,30 @@ def unreliable_derivatives(
     return ~np.isfinite(off) | ((off > APART * size) & (off > 1.0))
 
 
-def parameters_at_edge(coordinates: Coordinates, z: np.ndarray) -> dict[str, Edge]:
+def parameters_at_edge(coordinates: Coordinates, z: np.ndarray) -> dict[str, ReachedBound]:
     """Parameters at a bound, or further than `EDGE` from the middle of their prior, with that distance, by name."""
     bound = coordinates.beyond(z)
     at_edge = {}
     for name, shift, side in zip(coordinates.names, z, bound, strict=True):
         if side:
-            at_edge[name] = Edge("lower" if side < 0 else "upper", float(shift))
+            at_edge[name] = ReachedBound("lower" if side < 0 else "upper", float(shift))
         elif abs(shift) > EDGE:
-            at_edge[name] = Edge("", float(shift))
+            at_edge[name] = ReachedBound("", float(shift))
     return at_edge
 
 
 @dataclasses.dataclass(frozen=True)
-class Searched:
-    """Outcome of a search by generations.
+class PopulationSearch:
+    """Result of a search by generations.
 
     Attributes:
         found: all members.
-        at: index of the best one.
-        apart: names of parameters with derivatives of a run that disagree with finite differences.
-        slope: slope of the whitened readings, from the members, if derivatives are unreliable, else None.
-        left: rms residual of the regression that gives the slope [σ], NaN without one.
-        edge: edge of the best member, see `parameters_at_edge`.
+        at: index of the best member.
+        apart: names of parameters whose derivatives of a run disagree with finite differences.
+        slope: derivative of the whitened readings by regression over members, if those of a run are unreliable,
+            otherwise None.
+        left: rms residual of that regression [σ], NaN without one.
+        edge: parameters of the best member at the edge of their range, see `parameters_at_edge`.
     """
 
     found: Population
@@ -381,10 +385,10 @@ class Searched:
     apart: Names
     slope: np.ndarray | None
     left: float
-    edge: dict[str, Edge] = dataclasses.field(default_factory=dict)
+    edge: dict[str, ReachedBound] = dataclasses.field(default_factory=dict)
 
     def outcomes(self) -> dict[str, int]:
-        """Number of members with a row of each outcome, by the word of the status or flag, without zeros."""
+        """Number of members with at least one row of each status or flag. Zeros are omitted."""
         status, flags = self.found.status, self.found.flags
         ended = {word: int((status == k).any(1).sum()) for k, word in enumerate(STATUSES) if k}
         ended["jumps"] = int(self._jumps(flags).any(1).sum())
@@ -404,7 +408,7 @@ class Searched:
         }
 
     def remarks(self) -> list[Remark]:
-        """Notes on the search."""
+        """Remarks on the search."""
         notes: list[Remark] = [
             Remark(
                 "generations",

@@ -1,4 +1,4 @@
-"""Preparation of a table and a robot before any fit, in one order for all fits and predictions.
+"""Preparation of a table and a robot before any fit or prediction, always in the same order.
 
 `calibrate`, `discover` (so `loop` and its campaigns) and `foresee` (so `rig check`) share this one function. It
 completes the robot's instruments and surfaces from the table and renames priors accordingly. Then it takes the mass
@@ -16,7 +16,7 @@ from calibration.data.runs import Runs
 from calibration.inference import checks, observers, repeats
 from calibration.inference import noise as noise_room
 from calibration.inference.fit_notes import Notes
-from calibration.inference.foreign import inherited_priors
+from calibration.inference.foreign import inherited_friction_remarks
 from calibration.inference.noise import Noise
 from calibration.inference.observers import Observer
 from mmrjax.errors import UsageError
@@ -25,20 +25,20 @@ from mmrjax.model.robot import Robot
 
 
 @dataclasses.dataclass(frozen=True)
-class Prepared:
-    """A table and its robot, ready for a problem.
+class PreparedInput:
+    """A table and its robot, completed and checked before a fit.
 
     Attributes:
         robot: robot with instruments, configurations and mass from the table, and the initial states of its runs.
-        observe: the kind of the data.
+        observe: observer class for the data.
         noise: noise of the readings.
-        stated: priors by name of parameter, (mean, sd) [SI].
-        names: free parameters that were chosen, see `prepare`.
-        foreign: remarks on priors of another robot.
-        checked: on the table.
-        begins: on the beginnings of its runs.
-        weighed: on the masses that it states.
-        doubted: on units that may be others.
+        stated: priors, parameter → (mean, sd) [SI].
+        names: names of the free parameters.
+        foreign: remarks on friction inherited from another robot.
+        checked: remarks on the table.
+        begins: remarks on the beginnings of its runs.
+        weighed: remarks on the masses that it states.
+        doubted: remarks on units that may be wrong.
     """
 
     robot: Robot
@@ -53,27 +53,27 @@ class Prepared:
     doubted: Notes = ()
 
 
-def prepare(
+def prepare_input(
     runs: Runs,
     robot: Robot,
     noise: str | None = None,
     stated: Priors | None = None,
     *,
     assume: bool = True,
-    choose: Callable[[Prepared], Sequence[str]] = lambda prepared: (),
-) -> Prepared:
-    """A table and a robot, prepared for any fit.
+    choose: Callable[[PreparedInput], Sequence[str]] = lambda prepared: (),
+) -> PreparedInput:
+    """Completes the robot from the table and checks both, before any fit.
 
     Args:
-        noise: as `noise.parse_noise`.
+        noise: standard deviations, in the format of `noise.parse_noise`.
         stated: parameter → (mean, sd) [SI], by the names that the user knows.
-        assume: True to take a usual sd for a channel without one, False to let the fit estimate it.
-        choose: function from the preparation to the names of the free parameters.
+        assume: True to assume a usual sd for channels without one, False to let the fit estimate it.
+        choose: function from the prepared input to the names of the free parameters.
 
     Raises:
-        BadData: a table that contradicts itself, its robot or its model, see `checks.check_data`.
-        BadConfiguration: parameters that are no single number within their bounds, an invalid noise or prior, or any
-            raised by `choose`.
+        BadData: the table contradicts itself, its robot or its model, see `checks.check_data`.
+        BadConfiguration: a parameter is out of bounds or not a single number, or the noise, a prior or the choice of
+            parameters is invalid.
     """
     try:
         check_robot(robot)
@@ -88,7 +88,7 @@ def prepare(
     noise_sds = (noise_room.infer_noise if assume else noise_room.noise_from_table)(runs, observe.sizes(runs), noise)
     noise_sds, larger = repeats.enlarge_noise(noise_sds, runs)
     robot = observe.with_initial_states(robot, runs, noise_sds)
-    result = Prepared(robot, observe, noise_sds, priors, (), (), (), (), tuple(weighed))
+    result = PreparedInput(robot, observe, noise_sds, priors, (), (), (), (), tuple(weighed))
     names = tuple(choose(result))
     # The table's masses are compared with those of the file, which are not yet replaced there.
     checked = checks.check_data(runs, as_stated, names, noise_sds)
@@ -96,7 +96,7 @@ def prepare(
     return dataclasses.replace(
         result,
         names=names,
-        foreign=tuple(inherited_priors(robot, priors)),
+        foreign=tuple(inherited_friction_remarks(robot, priors)),
         checked=(*larger, *checked),
         begins=tuple(begins),
         doubted=rig_facts.log_doubts(runs, as_stated),

@@ -77,7 +77,9 @@ SOFTNESS = 0.05  # of a prior sd: the width over which a bound is rounded
 
 
 def clip_softly(u: Array, low: Array | np.ndarray, high: Array | np.ndarray, width: Array | np.ndarray) -> Array:
-    """u + w S((low - u)/w) - w S((u - high)/w), S softplus, within low and high. Clipped there for w = 0."""
+    """Smooth clip of u to the range from low to high: u + w S((low - u)/w) - w S((u - high)/w) with S softplus. A
+    sharp clip for w = 0.
+    """
     xp = np if isinstance(u, np.ndarray) else jnp
     w = xp.where(xp.asarray(width) > 0, width, 1.0)
     soft = u + w * xp.logaddexp((low - u) / w, 0.0) - w * xp.logaddexp((u - high) / w, 0.0)
@@ -87,21 +89,21 @@ def clip_softly(u: Array, low: Array | np.ndarray, high: Array | np.ndarray, wid
 class Coordinates(eqx.Module):
     """Free parameters θ as coordinates z with a standard normal prior.
 
-    u = location + spread · z, and θ = clip(u), or exp(clip(u)) for a scale parameter. The clip is smooth:
-    clip(u) = u + w S((low - u)/w) - w S((u - high)/w), S softplus, w = spread / 20.
+    u = location + spread · z, and θ = clip(u), or exp(clip(u)) for a scale parameter. The clip is smooth: clip(u) = u
+    + w S((low - u)/w) - w S((u - high)/w), S softplus, w = spread / 20.
 
-    A parameter is a scale if its field states a relative sd and it cannot be negative: its prior is
-    log-normal with the nominal value as median. Every other one is normal. The clip is the identity
-    inside the bounds (to e^-20 an sd away), has slope ½ on a bound, and is never flat: an amplitude with
-    prior mean zero, or a share with its nominal value on its bound, starts with a live gradient. Beyond a bound, a
-    parameter is held by its prior, which is on z and acts everywhere.
+    A parameter is a scale if its field states a relative sd and it cannot be negative: its prior is log-normal with
+    the nominal value as median. Every other one is normal. The clip is the identity inside the bounds (to e^-20 an sd
+    away), has slope ½ on a bound, and is never flat: an amplitude with prior mean zero, or a share with its nominal
+    value on its bound, starts with a live gradient. Beyond a bound, a parameter is held by its prior, which is on z
+    and acts everywhere.
 
     Attributes:
         location, spread, low, high: location, spread, lower limit and upper limit in units of θ, or of log θ for a
             scale, shape (parameters,).
         names, units, scale: names, units and scale of each parameter.
-        ratios: ratios of each parameter tied to a free one, to that one, shape (followers,).
-        followers: (its name, index of the free one) of each.
+        ratios: for each parameter that is tied to a free one, its ratio to that one, shape (followers,).
+        followers: name of each tied parameter, and index of the free one.
     """
 
     location: Float[Array, " parameters"]
@@ -119,37 +121,39 @@ class Coordinates(eqx.Module):
 
     @property
     def tied(self) -> tuple[tuple[str, int, float], ...]:
-        """(Follower, index of its leader, ratio) of each parameter tied to a free one."""
+        """For each tied parameter: its name, the index of the free one, and the ratio."""
         ratios = np.asarray(self.ratios)
         return tuple((name, k, float(ratios[n])) for n, (name, k) in enumerate(self.followers))
 
     def value(self, z: Float[Array | np.ndarray, "... parameters"]) -> Any:
-        """Parameters θ [SI] at coordinates z. NumPy in, NumPy out."""
+        """Parameters θ [SI] at coordinates z. The result is a NumPy array if z is one."""
         xp, arrays = (np, jax.tree.map(np.asarray, self)) if isinstance(z, np.ndarray) else (jnp, self)
         u = clip_softly(arrays.location + arrays.spread * z, arrays.low, arrays.high, SOFTNESS * arrays.spread)
         return xp.where(xp.asarray(self.scale), xp.exp(u), u)
 
     @property
     def prior_sd(self) -> np.ndarray:
-        """Prior sd of each parameter [SI], as files state it.
+        """Prior sd of each parameter [SI], as written in files.
 
-        For a log-normal prior m √(e^s² - 1) with median m, as a file's "m ± sd" is read.
+        For a log-normal prior with median m it is m √(e^s² - 1), as for "m ± sd" in a file.
         """
         arrays = jax.tree.map(np.asarray, self)
         size = np.exp(np.where(arrays.scale, arrays.location, 0.0))
         return np.where(arrays.scale, size * np.sqrt(np.expm1(arrays.spread**2)), arrays.spread)
 
     def slope(self, z: Float[Array, " parameters"]) -> Float[Array, " parameters"]:
-        """dθ/dz [SI]."""
+        """Derivative dθ/dz [SI]."""
         return _slope(self, jnp.asarray(z))
 
     def robot(self, base: Robot, z: Float[Array, " parameters"]) -> Robot:
-        """`base` with the free parameters, and those tied to them, at coordinates z."""
+        """Robot with the free parameters, and those tied to them, at coordinates z."""
         names = (*self.names, *(follower for follower, _ in self.followers))
         return params.replace(base, dict(zip(names, _parameter_values(self, z), strict=True)))
 
     def beyond(self, z: np.ndarray) -> np.ndarray:
-        """-1 or 1 if z is on or beyond its lower or upper bound, else 0, shape (parameters,)."""
+        """-1 if a parameter is at or below its lower bound, 1 if at or above its upper bound, otherwise 0. Shape
+        (parameters,).
+        """
         arrays = jax.tree.map(np.asarray, self)
         u = arrays.location + arrays.spread * z
         return np.where(u <= arrays.low, -1, np.where(u >= arrays.high, 1, 0))
@@ -162,36 +166,36 @@ def _slope(coordinates: Coordinates, z: Float[Array, " parameters"]) -> Float[Ar
 
 @functools.partial(compiled, options=SELDOM)
 def _parameter_values(coordinates: Coordinates, z: Float[Array, " parameters"]) -> tuple[Array, ...]:
-    """Parameters at coordinates z, and the tied ones, as scalars [SI]."""
+    """Free and tied parameters at coordinates z, as scalars [SI]."""
     theta = coordinates.value(z)
     tied = coordinates.ratios * theta[np.array([k for _, k in coordinates.followers], int)]
     return (*params.split_numbers(theta), *params.split_numbers(tied))
 
 
 def parameters_by_name(robot: Robot) -> dict[str, Parameter]:
-    """Parameters of the robot by dotted name."""
+    """Parameters of the robot, by dotted name."""
     return {p.name: p for p in params.walk_parameters(robot)}
 
 
 def friction_names(robot: Robot, configuration: str) -> Names:
-    """Friction parameters of a configuration that are free by default.
+    """Friction parameters of a configuration that are fitted by default.
 
-    Parameters that are zero, or that no channel can show, are fixed. The ground's friction shows in the speed, as
-    slip. In turns it shows in all channels.
+    Parameters that are zero, or that no channel shows, are not fitted. In straight travel, ground friction shows only
+    in the speed, as slip. In turns it shows in all channels.
     """
     names = [*FRICTION, *SHAFT]
     if float(robot.configurations[configuration].on_tracks) > 0.5:
         names.insert(2, GUIDE_SHARE)
     if not (robot.rig.inherits or robot.rig.turns or "speed" in robot.rig.channels):
         names = [n for n in names if not n.startswith("ground.friction.")]
-    return _uncertain(robot, (f"{configuration}.{name}" for name in names))
+    return _uncertain_names(robot, (f"{configuration}.{name}" for name in names))
 
 
-def _uncertain(robot: Robot, names: Iterable[str]) -> Names:
-    """Uncertain ones of a robot's parameters: neither exact in the rig's file nor zero.
+def _uncertain_names(robot: Robot, names: Iterable[str]) -> Names:
+    """Names of those parameters that are uncertain: neither stated as exact nor zero.
 
-    A zero is uncertain if the file states its sd. The delay of a rig is uncertain unless it is exact, because a log
-    may be late without its author's knowledge.
+    A zero is uncertain if the file states its sd. The delay of a rig is uncertain unless stated as exact, because a
+    log may be late without the knowledge of its author.
     """
     fields, exact = parameters_by_name(robot), robot.rig.exact
     stated = robot.rig.stated if robot.rig.inherits else {*robot.rig.stated, DELAY}
@@ -200,44 +204,46 @@ def _uncertain(robot: Robot, names: Iterable[str]) -> Names:
 
 
 def names_to_fit(robot: Robot, configurations: Iterable[str], idle: Names = ()) -> Names:
-    """Parameters that a robot's file states with a ± other than 0, which is a request to fit them.
+    """Parameters that the robot file states with a nonzero ±, which requests a fit.
 
-    They must be parameters of the robot, belong to configurations in the data, show in the data, and follow no other
-    parameter.
+    Only parameters that the robot has, whose configuration is in the data, that the data can show, and that are not
+    tied to another parameter.
 
     Args:
-        idle: ends of the names of parameters that the data do not show.
+        idle: endings of the names of parameters that the data do not show.
     """
     others = set(robot.configurations) - set(configurations)
     fields = parameters_by_name(robot)  # a prior may be of an effect that the robot no longer has
     own_names = [
         n for n, _, sd in robot.rig.priors if sd > 0 and n in fields and n.partition(".")[0] not in {"rig", *others}
     ]
-    return _drive(robot, (n for n in own_names if _leader(robot, n) is None and not n.endswith(idle)))
+    return _drive_names(
+        robot, (n for n in own_names if _leading_parameter(robot, n) is None and not n.endswith(idle))
+    )
 
 
 def default_names(
     configurations: Iterable[str], robot: Robot, *, computed: Sequence[str] = (), turns: bool = False
 ) -> Names:
-    """Default set of free parameters for data of these configurations.
+    """Names of the parameters that are fitted by default, for data of these configurations.
 
     Args:
-        computed: parameters of a configuration that the fidelity computes, see `fidelities.Facts`. The guide
-            friction μ_t then replaces the guides' share.
+        computed: parameters of a configuration that the fidelity computes, see `fidelities.Facts`. The guide friction
+            μ_t is then fitted in place of the guide load share.
         turns: True for data of turns.
     """
     present = set(configurations)
     names = [n for c in robot.configurations if c in present for n in friction_names(robot, c)]
     if turns:
-        names += _uncertain(robot, (f"{c}.{n}" for c in robot.configurations if c in present for n in OF_TURNS))
-    names = [n for n in names if _leader(robot, n) is None]
+        names += _uncertain_names(robot, (f"{c}.{n}" for c in robot.configurations if c in present for n in OF_TURNS))
+    names = [n for n in names if _leading_parameter(robot, n) is None]
     if GUIDE_SHARE in computed:
         names = [n.replace(GUIDE_SHARE, GUIDE_FRICTION) for n in names]
     return (*names, *(f"effects.{e.name}.amplitude" for e in robot.effects), *initial_state_names(robot))
 
 
 def initial_state_names(robot: Robot) -> Names:
-    """Initial speeds and angles of histories, if a rig leaves them free."""
+    """Names of the initial speeds and angles of histories, if the rig leaves them free."""
     if robot.rig.begins is None or robot.rig.start != "free":
         return ()
     every = (f"rig.{run}.{field}" for run in robot.rig.begins.names for field in ("motor_speed", "angle"))
@@ -256,18 +262,18 @@ BENCH = (
 )
 
 
-def free_names(
+def loop_parameter_names(
     robot: Robot,
     configurations: Iterable[str],
     drive: Sequence[str] = (),
     chassis: Sequence[str] = (),
     idle: Names = OVER_TIME,
 ) -> Names:
-    """Parameters that the loop frees for data of these configurations, among them all that the file states with ±.
+    """Parameters that the loop fits for data of these configurations, including all that the file states with ±.
 
     Args:
         drive, chassis: further parameters that the data determine, see `Observer.free`.
-        idle: as of `names_to_fit`.
+        idle: as in `names_to_fit`.
     """
     present = set(configurations)
     names = [
@@ -276,18 +282,18 @@ def free_names(
         if c in present
         for name in (
             *friction_names(robot, c),
-            *_radius(robot, c),
+            *_radius_name(robot, c),
             *(f"{c}.{n}" for n in chassis if _has_nonzero(robot, c, n)),
         )
     ]
-    names = [n for n in names if _leader(robot, n) is None]
+    names = [n for n in names if _leading_parameter(robot, n) is None]
     decided = (*(f".{n}" for n in (*SHAFT, *OF_TURNS)), ".radius")  # above, by what the channels show
     stated = names_to_fit(robot, present, idle)
     owned = (n for n in stated if not n.endswith(decided) and ".track." not in n and f".{GROUND}" not in n)
     return tuple(
         dict.fromkeys(
             [
-                *_uncertain(robot, (*_drive(robot, (*BENCH, *drive)), *names)),
+                *_uncertain_names(robot, (*_drive_names(robot, (*BENCH, *drive)), *names)),
                 *owned,
                 *initial_state_names(robot),
             ]
@@ -295,21 +301,23 @@ def free_names(
     )
 
 
-def _leader(robot: Robot, name: str) -> str | None:
-    """Parameter of another configuration that this one follows, because the two differ only by their surface."""
+def _leading_parameter(robot: Robot, name: str) -> str | None:
+    """Parameter of another configuration to which this one is tied, because the configurations differ only by their
+    surface.
+    """
     configuration, _, rest = name.partition(".")
     leader = dict(robot.rig.surfaces).get(configuration)
     return None if leader is None or rest.startswith(GROUND) else f"{leader}.{rest}"
 
 
 def _has_nonzero(robot: Robot, configuration: str, name: str) -> bool:
-    """True if a load has a parameter that is not zero."""
+    """True if a load has a parameter of this name that is not zero."""
     field = parameters_by_name(robot).get(f"{configuration}.{name}")
     return field is not None and float(field.value) != 0.0
 
 
-def _radius(robot: Robot, configuration: str) -> Names:
-    """Radius of a configuration, unless no channel shows the travel of its shaft."""
+def _radius_name(robot: Robot, configuration: str) -> Names:
+    """Name of a configuration's radius, unless no channel shows the travel of its shaft."""
     return (f"{configuration}.radius",) if robot.shows_travel else ()
 
 
@@ -317,21 +325,21 @@ def _radius(robot: Robot, configuration: str) -> Names:
 ELECTRICAL = ("motor.resistance", "motor.inductance")
 
 
-def _drive(robot: Robot, names: Iterable[str]) -> Names:
-    """Parameters of the drive, without those of the voltage if it is neither imposed nor measured."""
+def _drive_names(robot: Robot, names: Iterable[str]) -> Names:
+    """Names of drive parameters. Electrical ones are left out if the voltage is neither imposed nor measured."""
     if robot.rig.shows_voltage:
         return tuple(names)
     return tuple(n for n in names if n not in ELECTRICAL)
 
 
 def with_guide_share(robot: Robot, configuration: str) -> tuple[Robot, Priors]:
-    """`robot` with the track model's guide share, and the resulting prior of its guide friction.
+    """Robot with the guide load share of the track model, and the prior of its guide friction that follows from it.
 
-    The prior is that of the product of friction and share, because all fidelities agree on the product. Table 4
-    measured the friction only, and its 0.20 on all of the weight contradicts every measured current.
+    The prior keeps the product of friction and share, on which all fidelities agree. Table 4 measured the friction
+    only. With all of the weight on the guides, its value of 0.20 contradicts every measured current.
 
     Args:
-        configuration: one on tracks.
+        configuration: a configuration on tracks.
 
     Returns:
         The robot, and (mean, sd) of the guide friction by its name.
@@ -346,13 +354,13 @@ def with_guide_share(robot: Robot, configuration: str) -> tuple[Robot, Priors]:
 def choose_free_names(
     robot: Robot, default: Sequence[str], free: Sequence[str] = (), fix: Sequence[str] = ()
 ) -> Names:
-    """Names of the free parameters: `free` if it has any, else the default set, less `fix`.
+    """Names of the free parameters: `free` if given, otherwise the default ones, in both cases without `fix`.
 
-    In `free`, `default` means the default set. A name that ends in `.*` means all parameters below it.
+    In `free`, `default` stands for the default names. A name that ends in `.*` stands for all parameters below it.
 
     Raises:
-        BadConfiguration: an unknown name (with the choices), a name that is both freed and fixed by name,
-            or nothing left to fit.
+        BadConfiguration: a name is unknown (the message lists the choices), a name is both freed and fixed, or
+            nothing is left to fit.
     """
     everything = list(parameters_by_name(robot))
     chosen: list[str] = []
@@ -374,10 +382,10 @@ def choose_free_names(
 
 
 def expand_name(word: str, everything: list[str], option: str) -> list[str]:
-    """Parameters that a word names: one, or with `.*` at its end all below it.
+    """Parameters that a word stands for: one parameter or, if it ends in `.*`, all below that name.
 
     Raises:
-        BadConfiguration: no parameter of that name. The message has the option and the choices.
+        BadConfiguration: there is no such parameter. The message names the option and the choices.
     """
     if word.endswith(".*"):
         below = [n for n in everything if n.startswith(word[:-1])]
@@ -393,7 +401,7 @@ def expand_name(word: str, everything: list[str], option: str) -> list[str]:
 
 
 def _similar_names(word: str, everything: list[str]) -> list[str]:
-    """The names to list for an unknown one: those that share its last part or its group, else all."""
+    """Names to suggest for an unknown one: those with the same last part, or of the same group, or all."""
     last = word.rsplit(".", 1)[-1]
     near = [n for n in everything if last and (n.endswith(f".{last}") or last in n)]
     return near or [n for n in everything if n.split(".")[0] == word.split(".")[0]] or everything
@@ -406,7 +414,7 @@ def parse_prior(text: str) -> tuple[str, float, float]:
     """Reads `name=value±sd` (also `+-`, and an sd in %) as name, mean and sd in SI units.
 
     Raises:
-        BadConfiguration: another form, no number, or an sd that is not positive.
+        BadConfiguration: the form is different, a number is missing, or the sd is not positive.
     """
     form = "expected name=value±sd in SI units, e.g. 6T2A.ground.friction.static=0.45±0.05 or ...=0.45±10%"
     match = _PRIOR.match(text.strip())
@@ -424,10 +432,10 @@ def parse_prior(text: str) -> tuple[str, float, float]:
 
 
 def parse_priors(texts: Sequence[str]) -> Priors:
-    """Name → (mean, sd) of stated priors, each as `parse_prior`.
+    """Reads stated priors as name → (mean, sd). Each text is in the format of `parse_prior`.
 
     Raises:
-        BadConfiguration: for the same reasons as `parse_prior`, or a name that is given twice.
+        BadConfiguration: for the same reasons as `parse_prior`, or if a name is given twice.
     """
     stated: dict[str, tuple[float, float]] = {}
     for text in texts:
@@ -445,18 +453,18 @@ def parameter_coordinates(
     *,
     any_surface: bool = False,
 ) -> Coordinates:
-    """Coordinates of the named parameters, with priors from their fields around `robot`'s values, or as stated.
+    """Coordinates of parameters, with priors as stated or from their fields, around the values of the robot.
 
     Args:
-        robot: its values are the prior means (medians for scales).
+        robot: robot whose values are the prior means (medians for log-normal priors).
         names: names of the free parameters, from `choose_free_names`.
-        stated: name → (mean, sd) [SI]. These take precedence over the file's (`Rig.priors`), and those over the
-            fields'.
-        any_surface: True for the priors of `SURFACE` on ground friction without a stated prior.
+        stated: name → (mean, sd) [SI]. They take precedence over priors of the file (`Rig.priors`), and these over
+            those of the fields.
+        any_surface: True to use the priors of `SURFACE` for ground friction without a stated prior.
 
     Raises:
-        BadConfiguration: a stated prior for an unknown or a fixed parameter. A mean out of bounds, or a free
-            parameter with a prior of zero width (nominal value 0 with a relative sd, or stated as exact).
+        BadConfiguration: a stated prior belongs to an unknown or fixed parameter, a mean is out of bounds, or the
+            prior of a free parameter has zero width (value 0 with a relative sd, or stated as exact).
     """
     stated = stated or {}
     fields = parameters_by_name(robot)
@@ -490,7 +498,7 @@ def parameter_coordinates(
     )
     tied += tuple(
         (follower, names.index(leader), float(fields[follower].value / fields[leader].value))
-        for follower, leader in ((n, _leader(robot, n)) for n in fields)
+        for follower, leader in ((n, _leading_parameter(robot, n)) for n in fields)
         if leader is not None and leader in names and follower not in names
     )
     return Coordinates(

@@ -1,4 +1,4 @@
-"""The calibration problem: data, simulated readings, and whitened residuals."""
+"""The inverse problem of a fit: data, simulated readings, and whitened residuals."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ MISSING = 1e3
 
 
 class Observation(eqx.Module):
-    """Simulated readings and statuses of all rows.
+    """Simulated readings and status of each row.
 
     Attributes:
-        reading: reading of each channel [SI], shape (rows, channels).
-        adhesion_used: demand on adhesion over its limit [-], 0 if irrelevant, shape (rows,).
-        status, flags: status and flags of the row's run, shape (rows,).
+        reading: simulated reading of each channel [SI], shape (rows, channels).
+        adhesion_used: used share of the adhesion [-], 0 if irrelevant, shape (rows,).
+        status, flags: status and flags of each row's run, shape (rows,).
     """
 
     reading: Float[Array, "rows channels"]
@@ -46,11 +46,10 @@ class Data(eqx.Module):
     """Readings and their weights. The part of a problem that varies between refits.
 
     Attributes:
-        measured, sd: readings and standard deviation of each channel [SI], shape (rows, channels). Arbitrary for
-            missing readings.
+        measured, sd: measured readings and their standard deviations [SI], shape (rows, channels). Arbitrary where a
+            reading is missing.
         weight: 1 for a fitted reading, 0 for a held-out or missing one, shape (rows, channels).
-        centre: prior mean of z, shape (parameters,), 0 except in a bootstrap, which draws the bench
-            values too.
+        centre: prior mean of z, shape (parameters,). 0 except in a bootstrap, which draws the prior means too.
         stiffness: stiffness of the penalty on adhesion, see `Problem`, shape ().
     """
 
@@ -62,11 +61,11 @@ class Data(eqx.Module):
 
 
 def data_from_readings(measured: np.ndarray, sd: np.ndarray, parameters: int) -> Data:
-    """Data of a table in which every reading that is present has full weight.
+    """Data in which every present reading has full weight.
 
     Args:
-        measured: [SI], NaN for missing readings.
-        sd: standard deviation of each, shapes (rows, channels).
+        measured: readings [SI], NaN if missing, shape (rows, channels).
+        sd: standard deviation of each reading [SI], shape (rows, channels).
         parameters: number of free parameters.
     """
     finite = np.isfinite(measured)
@@ -110,27 +109,28 @@ class Problem(eqx.Module):
         return self.observe(self.coordinates.robot(self.base, z))
 
     def misfit(self, z: Float[Array, " parameters"], data: Data) -> Float[Array, " residuals"]:
-        """Whitened residuals of the readings, then of adhesion, shape (rows (channels + 1),)."""
+        """Whitened residuals of the readings, then adhesion penalties, at z. Shape (rows (channels + 1),)."""
         return self.whitened(self.observation(z), data)
 
     def whitened(self, seen: Observation, data: Data) -> Float[Array, " residuals"]:
-        """Whitened residuals of an observation: readings, then adhesion, shape (rows (channels + 1),)."""
+        """Whitened residuals of an observation: readings, then adhesion penalties. Shape (rows (channels + 1),)."""
         error = (seen.reading - data.measured) / data.sd
         error = data.weight * jnp.where(jnp.isfinite(error), error, MISSING)
         return jnp.concatenate([error.ravel(), jax.nn.relu(self.excess(seen, data))])
 
     def signed(self, seen: Observation, data: Data) -> Float[Array, " residuals"]:
-        """Residuals as of `whitened`, with that of adhesion negative if a row leaves some of its margin."""
+        """Residuals as in `whitened`, but the adhesion penalty is negative for rows within their margin."""
         return jnp.concatenate([self.whitened(seen, data)[: data.measured.size], self.excess(seen, data)])
 
     def linearised(
         self, robot: Callable[[Array], Robot], x: Float[Array, " x"], data: Data
     ) -> tuple[Array, Array, Observation, Signals | None]:
-        """Residuals of a robot that depends on x, and their slopes, by one evaluation.
+        """Residuals of a robot that depends on x, and their derivatives, by one evaluation.
 
         Returns:
-            Residuals of readings, then of adhesion with their signs. Their Jacobian by x. The observation, and the
-            signals of each row, if the observer solves its equations (`Observer.solve`).
+            Residuals of readings, then adhesion penalties with their signs. Their Jacobian with respect to x. The
+            observation.
+            The signals of each row, if the observer solves its equations (`Observer.solve`), otherwise None.
         """
         solved = self.observe.solve(robot(x)) if self.roots is None else self.roots
         if solved is None:
@@ -158,7 +158,7 @@ class Problem(eqx.Module):
         return r, jnp.concatenate([by_row[:, :count].reshape(-1, size), by_row[:, count]]), observed, signals
 
     def excess(self, seen: Observation, data: Data) -> Float[Array, " rows"]:
-        """Demand on adhesion above its margin, in units of the penalty. Negative if a row leaves some."""
+        """Used adhesion above the margin, in units of the penalty, shape (rows,). Negative within the margin."""
         over = (seen.adhesion_used - (1 - MARGIN)) * jnp.max(data.weight, 1) / data.stiffness
         return jnp.where(jnp.isfinite(over), over, 0.0)
 

@@ -1,4 +1,4 @@
-"""Check before any fit that a table's readings are possible for its robot. Most failures are wrong units."""
+"""Check before any fit of whether readings are possible for the robot. Most failures are wrong units."""
 
 from __future__ import annotations
 
@@ -42,14 +42,14 @@ FOLLOWS = 0.9
 
 
 def check_ranges(runs: Runs, robot: Robot) -> list[Remark]:
-    """Reject readings that no robot like this one has under these conditions. Return notes on other doubts.
+    """Rejects readings that no similar robot gives under these conditions. Returns remarks on other doubts.
 
-    Each channel's readings are compared with steady travel of the robot in its file, and with a tenth and four times
-    its friction. The result is the median factor between the readings and that range. Of histories, only settled
-    ones are compared.
+    The readings of each channel are compared with steady travel of the robot, and of the robot with a tenth and four
+    times its friction. The median factor between readings and that range decides. Of histories, only settled ends are
+    compared.
 
     Raises:
-        BadData: a factor beyond `REFUSED`. For histories, which may not reach steady travel, only if a known
+        BadData: a factor is beyond `REFUSED`. For histories, which may not reach steady travel, only if a known
             confusion of units explains it.
     """
     runs = runs.of(robot)
@@ -100,32 +100,39 @@ def check_ranges(runs: Runs, robot: Robot) -> list[Remark]:
         if off > REFUSED:
             raise BadData(f"{runs.source}, {describe(remark)}")
         remarks.append(remark)
-    return [*remarks, *_signs_of_readings(runs, measured, possible), *_slope_note(runs, measured, possible[1], robot)]
+    return [
+        *remarks,
+        *_sign_remarks_of_readings(runs, measured, possible),
+        *_slope_unit_remark(runs, measured, possible[1], robot),
+    ]
 
 
-def turned_signs(runs: Runs, robot: Robot) -> list[Remark]:
-    """Returns the channels of settled runs with readings that are `NEARER` to the file's robot with the other sign.
+def remarks_on_signs(runs: Runs, robot: Robot) -> list[Remark]:
+    """Remarks on channels of settled runs that agree better (by `NEARER`) with the robot file if their sign is
+    changed.
 
-    It needs a robot with a weight. Without a weight signs are checked row by row as a table is read.
+    For robots with a weight only. Without a weight, signs are checked row by row while a table is read.
     """
     runs = runs.of(robot)
     if not runs.layout.weight or any(float(c.torque_gravity) > 0 for c in robot.configurations.members):
         return []
     conditions = runs.conditions(robot)
-    return _signs_of_readings(
+    return _sign_remarks_of_readings(
         runs,
         runs.measured(),
         np.stack([operating_readings(_with_friction_factor(robot, f), conditions) for f in FRICTION]),
     )
 
 
-def _signs_of_readings(runs: Runs, measured: np.ndarray, possible: np.ndarray) -> list[Remark]:
-    """Result of `turned_signs` for readings [SI], shape (runs, channels), and for several robots, (robots, ...)."""
+def _sign_remarks_of_readings(runs: Runs, measured: np.ndarray, possible: np.ndarray) -> list[Remark]:
+    """Remarks of `remarks_on_signs` for readings [SI], shape (runs, channels), and several robots, shape (robots,
+    ...).
+    """
     remarks: list[Remark] = []
     for k, channel in enumerate(runs.channels if runs.layout.weight else ()):
         if not channel.directed or runs.layout.magnitude(channel.name):
             continue
-        off, turned = (_rms(sign * measured[:, k] - possible[:, :, k]) for sign in (1.0, -1.0))
+        off, turned = (_smallest_rms(sign * measured[:, k] - possible[:, :, k]) for sign in (1.0, -1.0))
         if turned * NEARER < off:
             theirs = runs.headings.get(channel.column, channel.column)
             remarks.append(
@@ -141,13 +148,13 @@ def _signs_of_readings(runs: Runs, measured: np.ndarray, possible: np.ndarray) -
     return remarks if len(remarks) == 1 else []  # with several, the file's values may be wrong instead
 
 
-def _rms(off: np.ndarray) -> float:
-    """Least root mean square over the rows among several robots, shape (robots, rows), inf without numbers."""
+def _smallest_rms(off: np.ndarray) -> float:
+    """Smallest root mean square over the rows among several robots, shape (robots, rows). inf without numbers."""
     return min((float(np.sqrt(np.nanmean(x**2))) for x in off if np.isfinite(x).any()), default=math.inf)
 
 
 def _with_friction_factor(robot: Robot, factor: float) -> Robot:
-    """Robot with its friction torques and its ground's rolling resistance multiplied by a factor."""
+    """Robot whose friction torques and rolling resistance are multiplied by a factor."""
     torques = [
         p
         for p in params.walk_parameters(robot)
@@ -157,11 +164,11 @@ def _with_friction_factor(robot: Robot, factor: float) -> Robot:
 
 
 def _range_factor(measured: np.ndarray, possible: np.ndarray) -> float:
-    """Median factor between readings and the possible range, 1 inside, or if it cannot be determined.
+    """Median factor between readings and their possible range. 1 inside the range, or if it cannot be determined.
 
     Args:
-        measured: shape (runs,).
-        possible: of several robots, NaN if one does not move, shape (robots, runs).
+        measured: readings, shape (runs,).
+        possible: readings of several robots, NaN if one does not move, shape (robots, runs).
     """
     finite = np.isfinite(measured) & np.isfinite(possible).any(0)
     if not finite.any():
@@ -177,7 +184,7 @@ def _range_factor(measured: np.ndarray, possible: np.ndarray) -> float:
 
 
 def _possible_units(channel: Channel, measured: np.ndarray, possible: np.ndarray, robot: Robot) -> list[str]:
-    """Units that would make the readings possible, the most probable first. Arguments as in `_range_factor`."""
+    """Units in which the readings would be possible, the most probable first. Arguments as in `_range_factor`."""
     other_units = {unit: channel.factor / size for unit, size in channel.sizes.items() if size != channel.factor}
     if channel.name == "motor_speed" and robot.has_ground:
         other_units["rpm of the driving wheel"] = 1 / float(robot.gearbox.ratio)
@@ -186,12 +193,12 @@ def _possible_units(channel: Channel, measured: np.ndarray, possible: np.ndarray
 
 
 def _may_be_slip(robot: Robot, channel: Channel, factor: float) -> bool:
-    """True if a low speed may be the slip of a vehicle's movers on an unspecified ground."""
+    """True if a low speed may be due to slip of tracks or wheels on an unspecified ground."""
     return not robot.rig.inherits and robot.has_ground and channel.name == "speed" and factor < 1
 
 
 def _check_gear(runs: Runs, measured: np.ndarray, robot: Robot) -> None:
-    """Reject a gear ratio that is the inverse of the ratio of the speeds of motor and output."""
+    """Rejects a gear ratio if its inverse is the ratio of motor and output speeds."""
     readings = dict(zip(channels.channel_names(robot.channels), measured.T, strict=True))
     conditions = runs.conditions(robot)
     which = np.asarray(conditions.configuration)
@@ -217,7 +224,7 @@ def _check_gear(runs: Runs, measured: np.ndarray, robot: Robot) -> None:
 
 
 def _check_masses(runs: Runs, robot: Robot) -> None:
-    """Reject total masses that are impossible for this robot."""
+    """Rejects total masses that are impossible for the robot."""
     if not runs.has("total_mass_kg"):
         return
     own_mass = np.asarray([float(c.mass) for c in robot.configurations.members])[runs.configurations(robot)]
@@ -232,8 +239,8 @@ def _check_masses(runs: Runs, robot: Robot) -> None:
         )
 
 
-def _slope_note(runs: Runs, measured: np.ndarray, possible: np.ndarray, robot: Robot) -> Iterator[Remark]:
-    """Note if the current rises with the slope as if the slope had another unit.
+def _slope_unit_remark(runs: Runs, measured: np.ndarray, possible: np.ndarray, robot: Robot) -> Iterator[Remark]:
+    """Remark if the current rises with the slope as if the slope had another unit.
 
     Among runs that differ only in their slope, the current is nearly linear in it. The regression of measured on
     possible readings has the coefficient 1 for slopes in degrees.

@@ -1,4 +1,4 @@
-"""Remarks of a careful engineer on a calibration, computed from its result."""
+"""Remarks on a calibration that help to judge it, computed from its result."""
 
 from __future__ import annotations
 
@@ -21,23 +21,23 @@ FAR = 3.0
 def calibration_remarks(found: CalibrationResult) -> list[Remark]:
     """All remarks."""
     return [
-        *_noise(found),
-        *_search(found),
+        *_noise_remarks(found),
+        *_search_remarks(found),
         *(Remark("residual_cluster", cluster=c) for c in found.residual_clusters),
-        *_statuses(found),
-        *_parameters(found),
-        *_limits(found),
-        *_blocks(found),
+        *_status_remarks(found),
+        *_parameter_remarks(found),
+        *_limit_remarks(found),
+        *_block_remarks(found),
     ]
 
 
-def _noise(found: CalibrationResult) -> Iterator[Remark]:
+def _noise_remarks(found: CalibrationResult) -> Iterator[Remark]:
     shares = ((c.name, found.noise[c.name].estimated_percent) for c in found.channels)
     if estimated := tuple((name, percent) for name, percent in shares if percent is not None):
         yield Remark("estimated_noise", percent=estimated)
 
 
-def _search(found: CalibrationResult) -> Iterator[Remark]:
+def _search_remarks(found: CalibrationResult) -> Iterator[Remark]:
     if not found.converged:
         yield Remark("unsettled", names=found.undetermined)
     apart = {n: abs(p.with_steady.apart_in_sd) for n, p in found.parameters.items() if p.with_steady is not None}
@@ -56,13 +56,13 @@ def _search(found: CalibrationResult) -> Iterator[Remark]:
         yield found.starts.agreement
 
 
-def _statuses(found: CalibrationResult) -> Iterator[Remark]:
+def _status_remarks(found: CalibrationResult) -> Iterator[Remark]:
     for k, word in enumerate(STATUSES):
         if k not in DONE and np.any(found.status == word):
             yield Remark("of_rows", rows=row_numbers(found.status == word), what=word)
 
 
-def _parameters(found: CalibrationResult) -> Iterator[Remark]:
+def _parameter_remarks(found: CalibrationResult) -> Iterator[Remark]:
     far = {name for name, p in found.parameters.items() if abs(p.shift) > FAR}  # these get a remark of their own
     if held := tuple(name for name in found.undetermined if name not in far):
         yield Remark("held_by_prior", names=held)
@@ -79,7 +79,7 @@ def _parameters(found: CalibrationResult) -> Iterator[Remark]:
             yield Remark("far_from_prior", name=name, sds=abs(p.shift), kind="edge")
 
 
-def _limits(found: CalibrationResult) -> Iterator[Remark]:
+def _limit_remarks(found: CalibrationResult) -> Iterator[Remark]:
     limited = found.adhesion_used > 1 - MARGIN
     if limited.any():
         yield Remark("of_rows", rows=row_numbers(limited), what="limited", share=MARGIN)
@@ -90,7 +90,7 @@ def _limits(found: CalibrationResult) -> Iterator[Remark]:
             yield Remark("product_alone", friction=friction, share=share, free=friction in found.parameters)
 
 
-def _blocks(found: CalibrationResult) -> Iterator[Remark]:
+def _block_remarks(found: CalibrationResult) -> Iterator[Remark]:
     for kind, held in found.held_out.items():
         if held.unreachable_rows:
             yield Remark("no_prediction", kind=kind, rows=len(held.unreachable_rows), total=len(found))
@@ -103,5 +103,5 @@ def _blocks(found: CalibrationResult) -> Iterator[Remark]:
 
 
 def row_numbers(which: np.ndarray) -> tuple[int, ...]:
-    """Row numbers of a mask, from 1."""
+    """Row numbers of a mask, counted from 1."""
     return tuple(int(k) + 1 for k in np.flatnonzero(which))

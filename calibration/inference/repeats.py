@@ -22,7 +22,7 @@ MEDIAN = 0.6745
 
 
 def rows_of_same_conditions(runs: Runs) -> list[Int[np.ndarray, " rows"]]:
-    """Rows of each set of equal conditions, including single rows."""
+    """Rows of each set of equal conditions. A set may have a single row."""
     columns = [c for c in ("configuration", *runs.axes, "surface") if runs.has(c)]
     alike: dict[Names, list[int]] = {}
     for row, key in enumerate(zip(*(runs[c].astype(str).tolist() for c in columns), strict=True)):
@@ -31,10 +31,10 @@ def rows_of_same_conditions(runs: Runs) -> list[Int[np.ndarray, " rows"]]:
 
 
 def enlarge_noise(noise: Noise, runs: Runs) -> tuple[Noise, list[Remark]]:
-    """Noise that is consistent with repeats in a table, and a note for each channel with an enlarged sd.
+    """Noise that is consistent with the repeats in a table, and a remark for each channel whose sd was enlarged.
 
-    The median of the differences between neighbouring repeats decides, so that a few wrong readings have no effect.
-    An estimate along series already includes the repeats.
+    The median difference between neighbouring repeats decides, so that a few wrong readings have no effect. Noise
+    estimated along series already includes the repeats.
     """
     if runs.sampled:
         return noise, []
@@ -64,6 +64,6 @@ def enlarge_noise(noise: Noise, runs: Runs) -> tuple[Noise, list[Remark]]:
 
 
 def _median_tail(median: float, count: int) -> float:
-    """Probability that the median of `count` magnitudes of standard normal numbers is at least `median`."""
+    """Probability that the median magnitude of `count` standard normal numbers is at least `median`."""
     beyond, least = math.erfc(median / math.sqrt(2)), (count + 1) // 2
     return sum(math.comb(count, k) * beyond**k * (1 - beyond) ** (count - k) for k in range(least, count + 1))

@@ -1,4 +1,4 @@
-"""Test of whether the residuals of a fit cluster by a column of the table without a role.
+"""Test of whether the residuals of a fit differ between levels of a column without a role.
 
 A column that the model does not read may still explain which rows differ: which wheel idles, who measured, which
 battery was in. For each channel a variance ratio (Seber and Lee, Linear Regression Analysis (2003), 4.3) compares the
@@ -49,8 +49,8 @@ class LevelMean:
 
     Attributes:
         level: level of the column.
-        within: of the label within which it was compared, "" for all rows.
-        mean: simulated less measured [unit of the channel].
+        within: level of the label within which it was compared, "" for all rows.
+        mean: mean of simulated minus measured [unit of the channel].
         rows: number of rows.
     """
 
@@ -61,30 +61,30 @@ class LevelMean:
 
     @property
     def name(self) -> str:
-        """The level, and the label within which it was compared."""
+        """The level, with the label within which it was compared."""
         return f"{self.level} at {self.within}" if self.within else self.level
 
 
 @dataclasses.dataclass(frozen=True)
 class ResidualCluster:
-    """Residuals of a channel that are associated with a column without a role.
+    """Residuals of a channel that depend on a column without a role.
 
     Attributes:
-        column: its name.
+        column: name of the column.
         channel: channel of the residuals.
         unit: unit of the channel.
-        within: label within whose levels the column matters, "" for all rows.
-        reversing: True for opposite signs in the two directions of travel. Means are then of the residual times
-            the sign of the reading.
-        levels: means by level, empty for a column of many numbers.
-        correlation: correlation of ranks, for such a column, else None.
-        p: family-wise.
-        alike: other columns that explain these residuals no better once this one is known.
-        coarser: columns whose levels this one divides further, with the share of the differences between its levels
-            that they explain, from `MOSTLY` on.
-        at: the column, or name of the level, of each row.
-        residual: simulated less measured [unit], or that times the sign of the reading, shape (rows,), of
-            histories (runs,).
+        within: label within whose levels the residuals depend on the column, "" for all rows.
+        reversing: True if the residuals have opposite signs in the two directions of travel. Means are then of the
+            residual times the sign of the reading.
+        levels: mean for each level, empty for a numeric column with many values.
+        correlation: rank correlation for such a column, otherwise None.
+        p: family-wise p-value.
+        alike: other columns that explain nothing further about these residuals once this one is known.
+        coarser: columns whose levels this one subdivides, with the share of the differences between its levels that
+            they explain, if at least `MOSTLY`.
+        at: value of the column, or name of its level, in each row.
+        residual: simulated minus measured [unit], or that times the sign of the reading, shape (rows,). For histories
+            (runs,).
     """
 
     column: str
@@ -102,29 +102,31 @@ class ResidualCluster:
 
     @property
     def statement(self) -> str:
-        """In a sentence."""
+        """The finding in a sentence."""
         return describe(self)
 
     def to_json(self) -> dict[str, object]:
-        """Entries of `residual_clusters` in result.json."""
+        """Entries of `find_residual_clusters` in result.json."""
         document = vars(self) | {"statement": self.statement}
         document |= {"coarser": [{"column": name, "share": share} for name, share in self.coarser]}
         return {name: x for name, x in document.items() if name not in ("at", "residual")}
 
 
-def residual_clusters(fit: Residuals, seed: int = 0) -> tuple[ResidualCluster, ...]:
-    """Clusters of a fit's residuals by columns without a role, the most significant first.
+def find_residual_clusters(fit: Residuals, seed: int = 0) -> tuple[ResidualCluster, ...]:
+    """Columns without a role on which the residuals of a fit depend, the most significant first.
 
     Args:
-        fit: residuals of the fit. Of histories the mean of each run is tested.
+        fit: residuals of the fit. For histories, the mean of each run is tested.
         seed: random seed of the permutations.
     """
-    residuals = _by_run(fit) if fit.runs.sampled else _units_by_row(fit)
-    columns = _without_role(residuals)
+    residuals = _units_by_run(fit) if fit.runs.sampled else _units_by_row(fit)
+    columns = _columns_to_test(residuals)
     if not columns:
         return ()
     channel_tests = [
-        (k, seen) for k in range(fit.counts.shape[1]) if (seen := _channel(residuals, k, columns)) is not None
+        (k, seen)
+        for k in range(fit.counts.shape[1])
+        if (seen := _tests_of_channel(residuals, k, columns)) is not None
     ]
     count = sum(len(tested.tests) for _, tested in channel_tests)
     every = [
@@ -155,8 +157,8 @@ def residual_clusters(fit: Residuals, seed: int = 0) -> tuple[ResidualCluster, .
 
 
 def _coarse_first(found: list[tuple[float, _Comparison]], columns: Columns) -> list[tuple[float, _Comparison]]:
-    """Findings in the order of their p-values, but with a column before any finer division of its levels."""
-    words = {test.column: _column_words(columns[test.column]) for _, test in found}
+    """Findings by their p-values, but with each column before any finer subdivision of its levels."""
+    words = {test.column: _column_as_words(columns[test.column]) for _, test in found}
     levels = {name for name in words if not _is_numeric(columns[name])}
     ordered: list[tuple[float, _Comparison]] = []
     waiting = list(found)
@@ -171,7 +173,7 @@ def _coarse_first(found: list[tuple[float, _Comparison]], columns: Columns) -> l
 
 
 def _determines(fine: np.ndarray, coarse: np.ndarray) -> bool:
-    """True if each level of one column determines that of another, which has fewer levels."""
+    """True if each level of `fine` determines the level of `coarse`, which has fewer levels."""
     pairs = len(set(zip(fine.tolist(), coarse.tolist(), strict=True)))
     return len(np.unique(coarse)) < len(np.unique(fine)) == pairs
 
@@ -180,15 +182,16 @@ def _determines(fine: np.ndarray, coarse: np.ndarray) -> bool:
 
 
 @dataclasses.dataclass(frozen=True)
-class _ComparisonUnits:
-    """Units of comparison, each a settled row or a run of a history.
+class _ResidualUnits:
+    """Units that are compared: settled rows, or runs of a history.
 
     Attributes:
-        runs: their table.
+        runs: table of the units.
         counts: True for included readings.
         whitened: residuals.
-        jacobian: by the free parameters, shape (units, channels, parameters).
-        residual, simulated: [SI].
+        jacobian: derivatives of the residuals with respect to the free parameters, shape (units, channels,
+            parameters).
+        residual, simulated: residuals and simulated readings [SI].
         covariance: covariance of z, (JᵀJ + 1)⁻¹.
     """
 
@@ -201,16 +204,18 @@ class _ComparisonUnits:
     covariance: np.ndarray
 
 
-def _units_by_row(fit: Residuals) -> _ComparisonUnits:
+def _units_by_row(fit: Residuals) -> _ResidualUnits:
     jacobian = np.where(fit.counts[..., None], fit.jacobian.reshape(*fit.counts.shape, -1), 0.0)
     flat = jacobian.reshape(fit.counts.size, -1)
     covariance = np.linalg.inv(flat.T @ flat + np.eye(flat.shape[1]))
     residual = np.where(fit.counts, fit.simulated - fit.runs.measured(), np.nan)
-    return _ComparisonUnits(fit.runs, fit.counts, fit.whitened, jacobian, residual, fit.simulated, covariance)
+    return _ResidualUnits(fit.runs, fit.counts, fit.whitened, jacobian, residual, fit.simulated, covariance)
 
 
-def _by_run(fit: Residuals) -> _ComparisonUnits:
-    """Means of each run. Whitened means times the root of their number of samples, so that noise has the sd 1."""
+def _units_by_run(fit: Residuals) -> _ResidualUnits:
+    """Mean of each run as a unit. Whitened means are multiplied by the square root of the number of samples, so that
+    their noise has sd 1.
+    """
     rows = _units_by_row(fit)
     run = fit.runs.run_names
     _, first, run_of = np.unique(run, return_index=True, return_inverse=True)
@@ -229,7 +234,7 @@ def _by_run(fit: Residuals) -> _ComparisonUnits:
         for c, v in fit.runs.columns.items()
     }
     mean = np.maximum(counts, 1.0)
-    return _ComparisonUnits(
+    return _ResidualUnits(
         runs=dataclasses.replace(fit.runs, columns=columns, extras=one),
         counts=counts > 0,
         whitened=total(rows.whitened) / weight,
@@ -240,13 +245,13 @@ def _by_run(fit: Residuals) -> _ComparisonUnits:
     )
 
 
-def _without_role(whole: _ComparisonUnits) -> Columns:
-    """Columns to test: with more than one level, and no ids, times or aliases of a condition."""
+def _columns_to_test(whole: _ResidualUnits) -> Columns:
+    """Columns to test: those with more than one level that are no ids, times or copies of a condition."""
     runs, columns = whole.runs, {}
     # Simulated readings depend only on the conditions.
     conditions = [runs[c] for c in CONDITIONS if runs.has(c)] + list(whole.simulated.T)
     for name, cells in runs.extras.items():
-        words = _column_words(cells)
+        words = _column_as_words(cells)
         levels = np.unique(words[words != ""])
         if len(levels) < 2 or _is_time(name, cells) or _is_id(cells, len(levels)):
             continue
@@ -258,8 +263,8 @@ def _without_role(whole: _ComparisonUnits) -> Columns:
     return columns
 
 
-def _column_words(cells: np.ndarray) -> np.ndarray:
-    """A column as words, "" for empty cells."""
+def _column_as_words(cells: np.ndarray) -> np.ndarray:
+    """Cells of a column as words, "" for empty cells."""
     if cells.dtype.kind == "f":
         return np.array(["" if np.isnan(x) else f"{x:g}" for x in cells])
     return cells.astype(str)
@@ -276,7 +281,7 @@ def _columns_with_role(runs: Runs) -> Iterator[np.ndarray]:
 
 
 def _condition_labels(runs: Runs) -> list[str]:
-    """Columns of words that describe the conditions, with more than one level."""
+    """Columns of words that describe conditions and have more than one level."""
     return [
         name for name, v in runs.columns.items()
         if v.dtype.kind == "U" and name not in ("run_id", "mode") and len(np.unique(v)) > 1
@@ -284,13 +289,13 @@ def _condition_labels(runs: Runs) -> list[str]:
 
 
 def _are_equivalent(one: np.ndarray, other: np.ndarray) -> bool:
-    """True if each level of one column determines that of the other, and the reverse."""
+    """True if each level of one column determines the level of the other, in both directions."""
     pairs = len(set(zip(one.tolist(), other.tolist(), strict=True)))
     return pairs == len(np.unique(one)) == len(np.unique(other))
 
 
 def _are_steps_of_condition(cells: np.ndarray, words: np.ndarray, conditions: Sequence[np.ndarray]) -> bool:
-    """True if a column's levels divide the values of a condition into intervals that do not overlap."""
+    """True if the levels of a column divide the values of a condition into intervals that do not overlap."""
     if cells.dtype.kind != "f" or len(np.unique(words)) > LEVELS:
         return False
     for x in conditions:
@@ -303,7 +308,7 @@ def _are_steps_of_condition(cells: np.ndarray, words: np.ndarray, conditions: Se
 
 
 def _is_time(name: str, cells: np.ndarray) -> bool:
-    """True if a column is a time: by its name, by its words, or as numbers that only rise or only fall."""
+    """True if a column is a time, by its name, its words, or because its numbers only rise or only fall."""
     if TIMES.search(name):
         return True
     if cells.dtype.kind == "f":
@@ -326,7 +331,9 @@ def _is_id(cells: np.ndarray, levels: int) -> bool:
 
 @dataclasses.dataclass(frozen=True, order=True)
 class _Comparison:
-    """One test of one channel: a column, within the levels of a label or over all, reversing with travel or not."""
+    """One test of one channel: a column, within the levels of a label or over all rows, and reversed with the travel
+    or not.
+    """
 
     column: str
     within: str
@@ -335,14 +342,14 @@ class _Comparison:
 
 
 @dataclasses.dataclass(frozen=True)
-class _Channel:
-    """Residuals of a channel, transformed to be independent with equal variance, and their tests.
+class _ChannelTests:
+    """Residuals of a channel, transformed to independent values of equal variance, and their tests.
 
     Attributes:
-        left: residuals after conditions and parameters are projected out, shape (units,).
-        freedom: of these.
+        left: residuals after projecting out conditions and parameters, shape (units,).
+        freedom: degrees of freedom of these residuals.
         taken: orthonormal directions of conditions and parameters, shape (units, directions).
-        tests: tests with orthonormal bases, after the same projection.
+        tests: tests, each with an orthonormal basis after the same projection.
     """
 
     left: np.ndarray
@@ -355,13 +362,13 @@ class _Channel:
         total = np.sum(residuals**2, 0)
         return [(test, _variance_ratio_test(test.basis, residuals, total, self.freedom)) for test in self.tests]
 
-    def cleared(self, residuals: np.ndarray) -> np.ndarray:
-        """Residuals after conditions and parameters are projected out."""
+    def project_out(self, residuals: np.ndarray) -> np.ndarray:
+        """Residuals after projecting out conditions and parameters."""
         return residuals - self.taken @ (self.taken.T @ residuals)
 
     def beside(self, test: _Comparison, other: _Comparison) -> float:
-        """p-value of a test after another one is projected out too, 1 if nothing is left to test."""
-        basis = _orthonormal(test.basis - other.basis @ (other.basis.T @ test.basis))
+        """p-value of a test after another one is projected out too. 1 if nothing is left to test."""
+        basis = _orthonormal_basis(test.basis - other.basis @ (other.basis.T @ test.basis))
         residual = self.left - other.basis @ (other.basis.T @ self.left)
         freedom = self.freedom - other.basis.shape[1]
         if basis.shape[1] == 0 or freedom - basis.shape[1] < LEAST:
@@ -370,23 +377,23 @@ class _Channel:
 
 
 def _variance_ratio_test(basis: np.ndarray, residuals: np.ndarray, total: np.ndarray, freedom: int) -> np.ndarray:
-    """p-value of the part of residuals that an orthonormal basis explains, by the variance ratio."""
+    """p-value (F test) of the part of the residuals that an orthonormal basis explains."""
     terms = basis.shape[1]
     explained = np.sum((basis.T @ residuals) ** 2, 0)
     rest = np.maximum(total - explained, 1e-300) / (freedom - terms)
     return np.asarray(fdtrc(terms, freedom - terms, explained / terms / rest))
 
 
-def _orthonormal(columns: np.ndarray, least: float = CLEAR) -> np.ndarray:
-    """Orthonormal directions of columns, without those smaller than `least`."""
+def _orthonormal_basis(columns: np.ndarray, least: float = CLEAR) -> np.ndarray:
+    """Orthonormal basis of columns, without directions smaller than `least`."""
     if columns.shape[1] == 0:
         return columns
     directions, size, _ = np.linalg.svd(columns, full_matrices=False)
     return directions[:, size > least]
 
 
-def _channel(whole: _ComparisonUnits, k: int, columns: Columns) -> _Channel | None:
-    """A channel and its tests, None with too few readings."""
+def _tests_of_channel(whole: _ResidualUnits, k: int, columns: Columns) -> _ChannelTests | None:
+    """Tests of a channel. None if it has too few readings."""
     counts = whole.counts[:, k]
     if counts.sum() < FEWEST:
         return None
@@ -406,7 +413,7 @@ def _channel(whole: _ComparisonUnits, k: int, columns: Columns) -> _Channel | No
     travel = np.sign(whole.simulated[counts, k])
     both = min(np.sum(travel > 0), np.sum(travel < 0)) >= 2
     smooth = _condition_columns(runs, whole.simulated[counts], travel if both else None)
-    taken = _orthonormal(np.concatenate([directions[:, ~open_], _unit_columns(scaled(smooth, forth))], 1))
+    taken = _orthonormal_basis(np.concatenate([directions[:, ~open_], _unit_columns(scaled(smooth, forth))], 1))
     whitened = scaled(whole.whitened[counts, k][:, None], back)[:, 0]
     projected = whitened - taken @ (taken.T @ whitened)
     freedom = len(projected) - taken.shape[1]
@@ -416,15 +423,15 @@ def _channel(whole: _ComparisonUnits, k: int, columns: Columns) -> _Channel | No
             for reversing in (False, True)[: 1 + both]:
                 shape = _comparison_columns(cells[counts], runs[within] if within else None)
                 basis = scaled(shape * travel[:, None] if reversing else shape, forth)
-                basis = _orthonormal(_unit_columns(basis))
-                basis = _orthonormal(basis - taken @ (taken.T @ basis), OWN)
+                basis = _orthonormal_basis(_unit_columns(basis))
+                basis = _orthonormal_basis(basis - taken @ (taken.T @ basis), OWN)
                 if basis.shape[1] and freedom - basis.shape[1] >= LEAST:
                     tests.append(_Comparison(name, within, reversing, basis))
-    return _Channel(projected, freedom, taken, tuple(tests)) if tests else None
+    return _ChannelTests(projected, freedom, taken, tuple(tests)) if tests else None
 
 
 def _unit_columns(columns: np.ndarray) -> np.ndarray:
-    """Columns normalised to length 1, without zero ones."""
+    """Columns normalised to length 1, without zero columns."""
     size = np.linalg.norm(columns, axis=0)
     return columns[:, size > 1e-9] / size[size > 1e-9]
 
@@ -446,22 +453,22 @@ def _centred_ranks(cells: np.ndarray) -> np.ndarray:
 
 
 def _comparison_columns(cells: np.ndarray, within: np.ndarray | None) -> np.ndarray:
-    """Functions of a column: a mean of each level, or a slope over ranks, at each level of `within`."""
+    """Regressors of a column: a mean for each of its levels, or a slope over ranks, for each level of `within`."""
     cell = np.zeros(len(cells), str) if within is None else within
     if _is_numeric(cells):
         return np.stack(
             [np.where(cell == c, _centred_ranks(np.where(cell == c, cells, np.nan)), 0.0) for c in np.unique(cell)], 1
         )
-    words = _column_words(cells)
+    words = _column_as_words(cells)
     both = [(words == w) & (cell == c) for w in np.unique(words) for c in np.unique(cell)]
     return np.stack([b for b in both if b.any()], 1).astype(float)
 
 
 def _condition_columns(runs: Runs, simulated: np.ndarray, travel: np.ndarray | None) -> np.ndarray:
-    """Functions of the conditions, shape (units, columns).
+    """Regressors of the conditions, shape (units, columns).
 
-    A mean of each set of labels and direction, then smooth curves over conditions and readings, as many as the number
-    of rows allows.
+    A mean for each set of labels and direction, then smooth curves over conditions and readings, as many as the
+    number of rows allows.
     """
     labels = [runs[name] for name in _condition_labels(runs)] + ([] if travel is None else [travel.astype(str)])
     cells = (
@@ -484,26 +491,26 @@ def _condition_columns(runs: Runs, simulated: np.ndarray, travel: np.ndarray | N
     return indicators
 
 
-def _permuted_p_values(made: Sequence[tuple[int, _Channel]], seed: int) -> np.ndarray:
-    """Smallest p-value of all tests for each table of permuted residuals, shape (permutations,)."""
+def _permuted_p_values(made: Sequence[tuple[int, _ChannelTests]], seed: int) -> np.ndarray:
+    """Smallest p-value of all tests for each permutation of the residuals, shape (permutations,)."""
     random = np.random.default_rng(seed)
     longest = max(len(tested.left) for _, tested in made)
     times = max(PERMUTATIONS // 4, min(PERMUTATIONS, AT_ONCE // longest))
     strongest = np.ones(times)
     for _, tested in made:
         permuted = random.permuted(np.repeat(tested.left[:, None], times, 1), axis=0)
-        for _, p in tested.p_values(tested.cleared(permuted)):
+        for _, p in tested.p_values(tested.project_out(permuted)):
             strongest = np.minimum(strongest, p)
     return strongest
 
 
-def _report_cluster(whole: _ComparisonUnits, k: int, test: _Comparison, p: float, alike: Names) -> ResidualCluster:
-    """A finding in the units of its channel."""
+def _report_cluster(whole: _ResidualUnits, k: int, test: _Comparison, p: float, alike: Names) -> ResidualCluster:
+    """Finding in the units of its channel."""
     channel, counts = whole.runs.channels[k], whole.counts[:, k]
     cells, residual = whole.runs.extras[test.column][counts], whole.residual[counts, k] / channel.factor
     signed = residual * np.sign(whole.simulated[counts, k]) if test.reversing else residual
     within = whole.runs[test.within][counts] if test.within else np.zeros(int(counts.sum()), str)
-    words, correlation, places = _column_words(cells), None, cells
+    words, correlation, places = _column_as_words(cells), None, cells
     words = np.where(words == "", "not stated", words)
     levels: tuple[LevelMean, ...] = ()
     if _is_numeric(cells):
@@ -537,9 +544,9 @@ def _report_cluster(whole: _ComparisonUnits, k: int, test: _Comparison, p: float
 
 
 def _coarser_columns(
-    whole: _ComparisonUnits, k: int, column: str, words: np.ndarray, within: np.ndarray, residual: np.ndarray
+    whole: _ResidualUnits, k: int, column: str, words: np.ndarray, within: np.ndarray, residual: np.ndarray
 ) -> tuple[tuple[str, float], ...]:
-    """Columns that a finding divides further and that explain most of its differences."""
+    """Columns that the column of a finding subdivides and that explain most of its differences."""
 
     def between(labels: np.ndarray) -> float:
         """Sum of squares between levels, within the levels of the label."""
@@ -555,7 +562,7 @@ def _coarser_columns(
     for name, cells in whole.runs.extras.items():
         if name == column or _is_numeric(cells[counts]):
             continue
-        coarse = _column_words(cells[counts])
+        coarse = _column_as_words(cells[counts])
         if len(np.unique(coarse)) > 1 and _determines(words, coarse) and all_of_it > 0:
             share = between(coarse) / all_of_it
             coarser += [(name, float(share))] if share >= MOSTLY else []

@@ -1,4 +1,4 @@
-"""Result of a calibration, by name, and its plain-data forms for files."""
+"""Result of a calibration, by name, and its form in files."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from calibration.data import Columns, Json, Names, writing
 from calibration.data import posterior_file as posterior
 from calibration.data.posterior_file import Posterior
 from calibration.described import describe, sentences
-from calibration.inference.fit_notes import Determination, Notes, Pair, Remark
+from calibration.inference.fit_notes import DependentPair, Determination, Notes, Remark
 from calibration.inference.identifiability import Identifiability, determined_together, undetermined_names
 from calibration.inference.lack_of_fit import Adequacy
-from calibration.inference.multistart import Starts
-from calibration.inference.population import Searched
+from calibration.inference.multistart import StartOutcomes
+from calibration.inference.population import PopulationSearch
 from calibration.inference.residual_clusters import ResidualCluster
 from calibration.inference.simulation_errors import OF_SIZE
 from mmrjax.model.channels import Channel
@@ -31,14 +31,14 @@ Interval = tuple[float, float]
 
 
 @dataclasses.dataclass(frozen=True)
-class Prior:
+class PriorSummary:
     """Prior of a parameter.
 
     Attributes:
         family: `normal` or `log-normal`.
-        median: [SI].
-        interval: interval that holds 95 % [SI].
-        source: source of a field, in words, else a row of `fit_words.PRIORS`, or `stated`.
+        median: median [SI].
+        interval: 95 % interval [SI].
+        source: source as stated in the field, or a row of `fit_words.PRIORS`, or `stated`.
     """
 
     family: str
@@ -47,7 +47,7 @@ class Prior:
     source: str
 
     def to_json(self) -> Json:
-        """As in result.json."""
+        """Entry of result.json."""
         return {**dataclasses.asdict(self), "source": describe(self)}
 
 
@@ -57,7 +57,7 @@ class ProfileCurve:
 
     Attributes:
         value: value of the parameter, increasing [SI], shape (points,).
-        rise: twice the objective's rise above the optimum [σ²], shape (points,).
+        rise: rise of twice the objective above the optimum [σ²], shape (points,).
     """
 
     value: np.ndarray
@@ -66,11 +66,11 @@ class ProfileCurve:
 
 @dataclasses.dataclass(frozen=True)
 class SteadyEstimate:
-    """A parameter at the optimum of the same problem with `steady`.
+    """Value of a parameter at the optimum of the same problem with `steady`.
 
     Attributes:
-        value: there [SI].
-        apart_in_sd: distance of the estimate from it [posterior sd].
+        value: the value [SI].
+        apart_in_sd: distance of the estimate from this value [posterior sd].
     """
 
     value: float
@@ -90,20 +90,20 @@ class Estimate:
 
     Attributes:
         value: value at the optimum.
-        sd: posterior, linear, both [unit].
-        interval: interval of 95 %, from the profile if there is one.
-        interval_linear: from the sd only [unit].
-        interval_open: True if an end is beyond the last point of the profile.
-        interval_shift: the ends of `interval` in prior sds from the prior's median.
-        unit, meaning: unit and meaning of its field.
-        prior: prior before the fit.
-        shift: shift of the value from the prior's median [prior sd].
-        variance_ratio: posterior over prior variance [-].
-        held_by_prior: True if it is, see `identifiability.held_by_prior`.
-        at_bound: `lower`, `upper` or None.
-        measured_by_data: True if any reading depends on it.
-        profile: None without profiles.
-        with_steady: None unless the search began at the optimum of `steady`.
+        sd: posterior standard deviation from the linear analysis [unit].
+        interval: 95 % interval, from the profile likelihood if there is one [unit].
+        interval_linear: 95 % interval from the sd only [unit].
+        interval_open: True for each end that lies beyond the last point of the profile.
+        interval_shift: ends of `interval`, as distances from the prior median [prior sds].
+        unit, meaning: unit and meaning of the parameter.
+        prior: prior of the parameter.
+        shift: distance of the value from the prior median [prior sds].
+        variance_ratio: posterior variance over prior variance [-].
+        held_by_prior: True if the data do not determine it, see `identifiability.held_by_prior`.
+        at_bound: bound at which it is, `lower`, `upper` or None.
+        measured_by_data: True if at least one reading depends on it.
+        profile: profile likelihood, None if not computed.
+        with_steady: estimate with `steady`, None unless the search started there.
     """
 
     value: float
@@ -114,7 +114,7 @@ class Estimate:
     interval_shift: Interval
     unit: str
     meaning: str
-    prior: Prior
+    prior: PriorSummary
     shift: float
     variance_ratio: float
     held_by_prior: bool
@@ -130,12 +130,12 @@ class Estimate:
 
 @dataclasses.dataclass(frozen=True)
 class ChannelNoise:
-    """The sd of a channel.
+    """Standard deviation of a channel's noise.
 
     Attributes:
         source: `stated`, `columns`, `estimated` (from the misfit), or `no readings`.
-        median_percent: median over the readings of sd over reading.
-        estimated_percent: as a share of the channel's size, see `Observer.sizes`, None unless estimated.
+        median_percent: median of sd over reading [%].
+        estimated_percent: estimated sd relative to the channel's size (`Observer.sizes`) [%]. None unless estimated.
     """
 
     source: str
@@ -161,7 +161,7 @@ class ChannelErrors:
     rms: float
 
     def __getitem__(self, name: str) -> float:
-        """A number by its name, as in the errors of `discover`."""
+        """Number by its name, as in the errors of `discover`."""
         if name not in self.__dataclass_fields__:
             raise KeyError(name)
         number: float = getattr(self, name)
@@ -173,13 +173,13 @@ Errors = dict[str, ChannelErrors]
 
 
 @dataclasses.dataclass(frozen=True)
-class Block:
-    """One held-out block.
+class BlockErrors:
+    """Hold-out errors of one block.
 
     Attributes:
         errors: errors of its rows.
-        unreachable_rows: those that the fit without it does not reach, counted from 1.
-        converged: True if that fit converged.
+        unreachable_rows: numbers of the rows that the fit without it does not reach, counted from 1.
+        converged: True if the fit without it converged.
     """
 
     errors: Errors
@@ -192,32 +192,32 @@ class Block:
 
 
 @dataclasses.dataclass(frozen=True)
-class HeldOut:
-    """Hold-out predictions of all rows by fits without their block, for one kind of blocks.
+class HeldOutErrors:
+    """Hold-out predictions of all rows, each by a fit without its block, for one kind of block.
 
     Attributes:
         errors: errors of all rows.
-        unreachable_rows: those without a prediction, counted from 1.
-        blocks: by label.
-        reading: by channel [SI], NaN if the fit's robot does not reach the row, shape (rows,).
+        unreachable_rows: numbers of the rows without a prediction, counted from 1.
+        blocks: errors of each block, by label.
+        reading: predicted readings by channel [SI], NaN if the fitted robot does not reach the row, shape (rows,).
     """
 
     JSON = ("all=errors", "unreachable_rows", "blocks")
     errors: Errors
     unreachable_rows: tuple[int, ...]
-    blocks: dict[str, Block]
+    blocks: dict[str, BlockErrors]
     reading: Columns
 
 
 @dataclasses.dataclass(frozen=True)
 class ChannelReadings:
-    """Readings of one channel, all arrays of shape (rows,).
+    """Readings of one channel. All arrays have shape (rows,).
 
     Attributes:
-        measured: [SI], NaN if missing.
-        sd: standard deviation of each.
-        before, after: simulated by the robot as given and as calibrated [SI], NaN if it does not reach the row.
-        percent, sigma: errors after calibration, in % and in σ.
+        measured: measured [SI], NaN if missing.
+        sd: standard deviation of each reading [SI].
+        before, after: simulated by the robot as given, and as calibrated [SI], NaN if it does not reach the row.
+        percent, sigma: errors after calibration [%] and [σ].
     """
 
     measured: np.ndarray
@@ -230,10 +230,10 @@ class ChannelReadings:
 
 @dataclasses.dataclass(frozen=True)
 class ChiSquare:
-    """Misfit of the readings [σ²], and the degrees of freedom left by the fit.
+    """χ² of the readings [σ²], and the degrees of freedom that the fit leaves.
 
     Attributes:
-        tests_adequacy: False if noise was estimated from the misfit.
+        tests_adequacy: False if noise was estimated from the misfit, so that χ² tests nothing.
     """
 
     value: float
@@ -243,34 +243,34 @@ class ChiSquare:
 
 @dataclasses.dataclass(frozen=True)
 class CalibrationResult:
-    """Result of `calibrate`. All files and figures are made from it.
+    """Result of `calibrate`, from which all files and figures are made.
 
     Attributes:
-        robot: calibrated.
+        robot: calibrated robot.
         source: file of the runs.
         channels: channels of the readings, in order.
-        model: the fidelity.
-        seed: seed of the starts.
-        parameters: the free ones, by name.
-        tied: those tied to them, by name: the free one, and the ratio that they keep to it.
-        noise: by channel.
+        model: name of the fidelity.
+        seed: random seed of the starts.
+        parameters: estimate of each free parameter, by name.
+        tied: parameters tied to free ones, by name: the free one, and the ratio to it.
+        noise: noise of each channel, by name.
         axis: column that orders the rows of a run.
         errors_before, errors_after: errors of the robot as given and as calibrated, by channel.
-        held_out: by kind of block, the most informative first.
-        conditions: columns of the runs, as in their table.
-        readings: by channel.
-        status_before, status: word of each row, shape (rows,).
-        adhesion_used: by the calibrated robot [-], shape (rows,).
+        held_out: hold-out errors by kind of block, the most informative kind first.
+        conditions: columns with the conditions of the runs.
+        readings: readings by channel.
+        status_before, status: status of each row before and after calibration, as a word, shape (rows,).
+        adhesion_used: used share of the adhesion, calibrated robot [-], shape (rows,).
         objective: objective at the optimum [½σ²].
         converged: True if the search converged.
         starts: outcome of all searches.
-        searched: the population before them, None without.
+        searched: population of the search by generations before them, None without one.
         chi_square: χ² of the finite readings.
-        adequacy: tests whether the residuals are consistent with noise.
-        residual_clusters: clusters of the residuals by columns without a role.
-        identifiability: the linear analysis.
+        adequacy: tests of whether the residuals are consistent with noise.
+        residual_clusters: columns without a role on which residuals depend.
+        identifiability: linear analysis at the optimum.
         posterior: posterior of the free parameters.
-        remarks: notes to read before the result is used.
+        remarks: remarks to read before the result is used.
     """
 
     robot: Robot
@@ -284,7 +284,7 @@ class CalibrationResult:
     axis: str
     errors_before: Errors
     errors_after: Errors
-    held_out: dict[str, HeldOut]
+    held_out: dict[str, HeldOutErrors]
     conditions: Columns
     readings: dict[str, ChannelReadings]
     status_before: np.ndarray
@@ -292,8 +292,8 @@ class CalibrationResult:
     adhesion_used: np.ndarray
     objective: float
     converged: bool
-    starts: Starts
-    searched: Searched | None
+    starts: StartOutcomes
+    searched: PopulationSearch | None
     chi_square: ChiSquare
     adequacy: Adequacy
     residual_clusters: tuple[ResidualCluster, ...]
@@ -312,26 +312,28 @@ class CalibrationResult:
 
     @property
     def profiled(self) -> bool:
-        """True if profiles were computed."""
+        """True if profile likelihoods were computed."""
         return any(p.profile is not None for p in self.parameters.values())
 
     @property
     def held_by_prior(self) -> Names:
-        """Names of the parameters held by their priors."""
+        """Names of the parameters that the data do not determine, so that their priors do."""
         return tuple(name for name, p in self.parameters.items() if p.held_by_prior)
 
     @property
-    def together(self) -> tuple[Pair, ...]:
-        """Pairs of parameters that these data determine only in combination."""
+    def together(self) -> tuple[DependentPair, ...]:
+        """Pairs of parameters that the data determine only in combination."""
         return determined_together(self.posterior, self.held_by_prior)
 
     @property
     def undetermined(self) -> Names:
-        """Names of the parameters that only their priors determine, without those of a pair in `together`."""
+        """Names of the parameters that only their priors determine, except those of a pair in `together`."""
         return undetermined_names(self.held_by_prior, self.together)
 
     def determined(self, name: str) -> str:
-        """`yes`, `no`, or with which parameters together these data determine one."""
+        """Whether the data determine a parameter: `yes`, `no`, or the parameters with which only a combination is
+        determined.
+        """
         return describe(Determination.from_pairs(name, self.parameters[name].held_by_prior, self.together))
 
     @property
@@ -341,35 +343,36 @@ class CalibrationResult:
 
     @property
     def held_out_alike(self) -> dict[str, Names]:
-        """Distinct kinds of blocks, each with the later kinds that predict every row in the same way (to 1 % of a
-        reading's sd)."""
+        """Distinct kinds of block, each with later kinds whose predictions are the same (to 1 % of a reading's
+        sd).
+        """
         groups: dict[str, Names] = {}
         for kind, held in self.held_out.items():
             like = next((k for k in groups if self._same(self.held_out[k], held)), None)
             groups |= {kind: ()} if like is None else {like: (*groups[like], kind)}
         return groups
 
-    def _same(self, one: HeldOut, other: HeldOut) -> bool:
+    def _same(self, one: HeldOutErrors, other: HeldOutErrors) -> bool:
         return all(
             np.allclose(one.reading[name] / r.sd, other.reading[name] / r.sd, rtol=0, atol=0.01, equal_nan=True)
             for name, r in self.readings.items()
         )
 
     @property
-    def main_blocks(self) -> HeldOut | None:
-        """The most informative kind of held-out blocks."""
+    def main_blocks(self) -> HeldOutErrors | None:
+        """Hold-out errors of the most informative kind of block, None if there is none."""
         return next(iter(self.held_out.values()), None)
 
     @property
     def rms(self) -> dict[str, dict[str, float]]:
-        """rms errors before, after and held out, by fit and channel with readings [unit of the channel]."""
+        """rms errors of each fit (before, after, held out) and channel [unit of the channel]."""
         fits = {"before": self.errors_before, "after": self.errors_after}
         if self.main_blocks is not None:
             fits["held_out"] = self.main_blocks.errors
         return {fit: {name: e.rms for name, e in by.items() if e.rows} for fit, by in fits.items()}
 
     def to_json(self) -> Json:
-        """Entries of result.json, docs/schemas/calibrate.schema.json."""
+        """Content of result.json, as described in docs/schemas/calibrate.schema.json."""
         about, main, entries = self.identifiability, self.main_blocks, functools.partial(writing.entries_of, self)
         return writing.json_value(
             {
@@ -415,7 +418,9 @@ class CalibrationResult:
         )
 
     def rows(self) -> Columns:
-        """Table of the rows: conditions, readings before, after and held out, errors in percent and in σ."""
+        """Table with one line for each row: conditions, readings (before, after, held out), errors in percent and in
+        σ.
+        """
         return {**self.conditions, **dict(self._readings()), "status": self.status}
 
     def rows_table(self) -> Columns:
@@ -436,11 +441,11 @@ class CalibrationResult:
             yield f"error_{channel.name}_sigma", r.sigma
 
     def save(self, folder: Path | str, robot_name: str = "a robot", tables: str = "csv") -> None:
-        """Write robot.toml, posterior.nc, result.json and rows.csv into a folder, which is created if missing.
+        """Writes robot.toml, posterior.nc, result.json and rows.csv into a folder, which is created if missing.
 
         Args:
-            robot_name: name of the initial robot, for the head of robot.toml.
-            tables: as for `write_table`.
+            robot_name: name of the initial robot, for the first lines of robot.toml.
+            tables: formats, as in `write_table`.
         """
         from calibration.data import robot_file
 

@@ -1,10 +1,10 @@
-"""Scans of parameters with a misfit that is a staircase or has several local minima: a dead time, a phase, a gap.
+"""Scans of parameters whose misfit is a staircase or has several local minima: a dead time, a phase, backlash.
 
-If a current rises within L/R and is sampled at a twentieth of that rate, the misfit over a delay is a staircase.
-It steps where a sample passes the rise. A gradient has no information on what is beyond the next step, and a
-curvature is that of the current step only. So the misfit is scanned over all of the parameter's prior, before and
-after a search, while the other parameters move with it according to their linearisation. The parameter's posterior is
-taken from that profile.
+If a current rises within L/R and is sampled at a twentieth of that rate, the misfit over a delay is a staircase. It
+steps where a sample passes the rise. A gradient has no information on what is beyond the next step, and a curvature
+is that of the current step only. So the misfit is scanned over all of the parameter's prior, before and after a
+search, while the other parameters move with it according to their linearisation. The parameter's posterior is taken
+from that profile.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from calibration.inference.fit_notes import Remark, next_step
+from calibration.inference.fit_notes import Remark, progress_remark
 from calibration.inference.identifiability import Z95, Identifiability
 from calibration.inference.optimizers import Optimum, evaluate_residuals
 from calibration.inference.priors import parameters_by_name
@@ -35,45 +35,45 @@ class Scan:
     """Misfit over one coordinate.
 
     Attributes:
-        at: values of the coordinate, increasing, shape (points,).
-        cost: objective there, with the others at the minimum of their linearisation [½σ²], shape (points,).
-        others: all coordinates there, shape (points, parameters).
+        at: scanned values of the coordinate, increasing, shape (points,).
+        cost: objective at each value, with the other coordinates at their linearised minimum [½σ²], shape (points,).
+        others: all coordinates at each value, shape (points, parameters).
     """
 
     at: Float[np.ndarray, " points"]
     cost: Float[np.ndarray, " points"]
     others: Float[np.ndarray, "points parameters"]
 
-    def basins(self) -> np.ndarray:
+    def local_minima(self) -> np.ndarray:
         """Indices of the local minima, the lowest first."""
         padded = np.concatenate([[np.inf], self.cost, [np.inf]])
         lowest = np.flatnonzero((self.cost <= padded[:-2]) & (self.cost < padded[2:]))
         return lowest[np.argsort(self.cost[lowest], kind="stable")]
 
     def interval(self) -> tuple[float, float]:
-        """Ends of the smallest interval with all points within 95 % (a rise of 3.84 σ²)."""
+        """Smallest interval that contains all points within 95 % (a rise of up to 3.84 σ²)."""
         inside = np.flatnonzero(2 * (self.cost - self.cost.min()) <= Z95**2)
         return self._crossing(inside[0], -1), self._crossing(inside[-1], 1)
 
     def _crossing(self, k: int, side: int) -> float:
-        """Coordinate where the rise passes 3.84 between the inner k-th point and the next, or the end point."""
+        """Coordinate between point k (inside) and the next one at which the rise is 3.84, or the end point."""
         if not 0 <= k + side < len(self.at):
             return float(self.at[k])
         one, two = (np.sqrt(max(2 * (self.cost[j] - self.cost.min()), 0.0)) for j in (k, k + side))
         return float(self.at[k] + (self.at[k + side] - self.at[k]) * (Z95 - one) / max(two - one, 1e-12))
 
     def open(self) -> tuple[bool, bool]:
-        """True for each end of the interval that may be beyond the first or the last point."""
+        """True for each end of the interval that may lie beyond the scanned range."""
         inside = 2 * (self.cost - self.cost.min()) <= Z95**2
         return bool(inside[0]), bool(inside[-1])
 
     def parts(self) -> int:
-        """Number of separate pieces of the 95 % region."""
+        """Number of separate parts of the 95 % region."""
         inside = 2 * (self.cost - self.cost.min()) <= Z95**2
         return int(np.sum(inside & ~np.concatenate([[False], inside[:-1]])))
 
     def sd(self) -> float:
-        """Standard deviation of exp(-rise / 2) as a density over the coordinate."""
+        """Standard deviation of the coordinate, with exp(-rise / 2) as its density."""
         width = np.gradient(self.at)
         mass = width * np.exp(self.cost.min() - self.cost)
         middle = np.sum(mass * self.at) / np.sum(mass)
@@ -81,12 +81,14 @@ class Scan:
 
 
 def scanned_coordinates(problem: Problem) -> tuple[int, ...]:
-    """Coordinates that are scanned: their fields request it, and the data are histories."""
+    """Indices of the coordinates that are scanned: those whose fields request it, if the data are histories."""
     return problem.observe.scanned(problem)
 
 
-def coordinates_beyond_a_basin(problem: Problem) -> tuple[int, ...]:
-    """Coordinates with a prior wider than one basin of the misfit, according to their fields (`Spec.scanned`)."""
+def wide_coordinates(problem: Problem) -> tuple[int, ...]:
+    """Indices of the coordinates whose prior is wider than one local minimum of the misfit, according to their fields
+    (`Spec.scanned`).
+    """
     fields, c = parameters_by_name(problem.base), problem.coordinates
     values = [c.value(np.full(len(c), side * RANGE)) for side in (-1.0, 1.0)]
     half = 0.5 * (values[1] - values[0])
@@ -95,23 +97,23 @@ def coordinates_beyond_a_basin(problem: Problem) -> tuple[int, ...]:
 
 
 def scan_coordinate(problem: Problem, z: np.ndarray, data: Data, k: int) -> Scan:
-    """Misfit over coordinate k: at z, evenly over the prior's range, and more closely near minima.
+    """Scan of coordinate k: at z, evenly over the range of the prior, and more closely near minima.
 
-    Without z an interval could begin beyond a narrow minimum that no other point is in.
+    Without the point at z, a narrow minimum that contains no other point could be missed.
     """
-    count = problem.observe.scan_points(problem, k)
-    scan = _scan_values(problem, z, data, k, np.append(np.linspace(-RANGE, RANGE, count - 1), z[k]))
-    around, few = np.array([z[k], *scan.at[scan.basins()]])[:CLOSER], count // CLOSER
+    count = problem.observe.number_of_scan_points(problem, k)
+    scan = _scan_at(problem, z, data, k, np.append(np.linspace(-RANGE, RANGE, count - 1), z[k]))
+    around, few = np.array([z[k], *scan.at[scan.local_minima()]])[:CLOSER], count // CLOSER
     close = (around[:, None] + 2 * RANGE / (count - 1) * np.linspace(-1, 1, few)).ravel()
     if few > 2:
-        scan = _join_scans(scan, _scan_values(problem, z, data, k, np.resize(close, count)))
+        scan = _join_scans(scan, _scan_at(problem, z, data, k, np.resize(close, count)))
     low, high = scan.interval()
     return _join_scans(
-        scan, _scan_values(problem, z, data, k, np.linspace(1.5 * low - 0.5 * high, 1.5 * high - 0.5 * low, count))
+        scan, _scan_at(problem, z, data, k, np.linspace(1.5 * low - 0.5 * high, 1.5 * high - 0.5 * low, count))
     )
 
 
-def _scan_values(problem: Problem, z: np.ndarray, data: Data, k: int, at: np.ndarray) -> Scan:
+def _scan_at(problem: Problem, z: np.ndarray, data: Data, k: int, at: np.ndarray) -> Scan:
     at = np.clip(at, -RANGE, RANGE)
     cost, others = problem.observe.scan(problem, jnp.asarray(z), data, k, jnp.asarray(at))
     return _sorted_scan(at, np.asarray(cost), np.asarray(others))
@@ -129,7 +131,9 @@ def _sorted_scan(at: np.ndarray, cost: np.ndarray, others: np.ndarray) -> Scan:
 
 
 def place_at_minimum(problem: Problem, starts: Float[np.ndarray, "starts z"]) -> Float[np.ndarray, "starts z"]:
-    """Starts with the scanned coordinates at the lowest misfit near the first start. Others are unchanged."""
+    """Starts whose scanned coordinates are moved to the lowest misfit near the first start. Other coordinates are
+    unchanged.
+    """
     starts = np.array(starts, float)
     for k in scanned_coordinates(problem):
         scan = scan_coordinate(problem, starts[0], problem.data, k)
@@ -140,12 +144,13 @@ def place_at_minimum(problem: Problem, starts: Float[np.ndarray, "starts z"]) ->
 Found = tuple[Optimum, Observation]
 
 
-def search_lower_basins(
+def search_lower_minima(
     problem: Problem, found: Found, data: Data, search: Callable[[np.ndarray], Found], tell: Callable[[Remark], None]
 ) -> Found:
-    """Optimum of a search that is scanned afterwards, and repeated from lower basins.
+    """Scans the optimum of a search, and repeats the search from any lower minimum.
 
-    It has converged if no basin is lower and the other coordinates bring no gain, whatever the gradient at a step is.
+    It has converged if no scanned minimum is lower and the other coordinates bring no gain, even if the gradient at a
+    step of the staircase is not zero.
 
     Args:
         found: optimum of a search, and the observation there.
@@ -164,7 +169,7 @@ def search_lower_basins(
         looked = {k: scan_coordinate(problem, z, data, k) for k in every}
         lower = found
         for k, scan in looked.items():
-            for j in [j for j in scan.basins() if scan.cost[j] < cost_here - WORTH][:TRIED]:
+            for j in [j for j in scan.local_minima() if scan.cost[j] < cost_here - WORTH][:TRIED]:
                 alone = np.where(np.arange(len(z)) == k, scan.at[j], z)
                 end = search(min((scan.others[j], alone), key=objective))
                 lower = min(lower, end, key=lambda f: float(f[0].cost))
@@ -172,7 +177,7 @@ def search_lower_basins(
             break
         found = lower
         over = " or ".join(problem.coordinates.names[k] for k in every)
-        tell(next_step("basin", over, float(found[0].cost)))
+        tell(progress_remark("basin", over, float(found[0].cost)))
     else:
         return dataclasses.replace(found[0], converged=jnp.asarray(False)), found[1]
     # A kink has a slope on either side, so an optimum there is a point with no lower point nearby.
@@ -184,13 +189,13 @@ def search_lower_basins(
     return dataclasses.replace(found[0], converged=jnp.asarray(settled), sd=jnp.asarray(sd)), found[1]
 
 
-def scan_all(problem: Problem, z: np.ndarray) -> dict[int, Scan]:
-    """Scans at an optimum, by coordinate."""
+def scans_at_optimum(problem: Problem, z: np.ndarray) -> dict[int, Scan]:
+    """Scan of each scanned coordinate at an optimum."""
     return {k: scan_coordinate(problem, z, problem.data, k) for k in scanned_coordinates(problem)}
 
 
 def with_scanned_sds(about: Identifiability, scans: dict[int, Scan]) -> Identifiability:
-    """Linear analysis with the sds of scanned coordinates from their profiles. Correlations are kept."""
+    """Linear analysis in which the sds of scanned coordinates come from their scans. Correlations are kept."""
     sd = about.sd.copy()
     for k, scan in scans.items():
         sd[k] = scan.sd()
@@ -199,7 +204,8 @@ def with_scanned_sds(about: Identifiability, scans: dict[int, Scan]) -> Identifi
 
 
 def count_outside(scans: dict[int, Scan], z: np.ndarray | None, converged: np.ndarray) -> int:
-    """Number of converged searches that ended outside the profiles at the best optimum.
+    """Number of converged searches that ended outside the 95 % intervals of the scans at the best optimum. `z`: end
+    of each search, shape (searches, parameters), None if unknown.
 
     Args:
         z: end of each search, shape (searches, parameters), None if not known.

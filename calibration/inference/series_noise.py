@@ -1,10 +1,10 @@
-"""Estimate of unstated noise from the scatter of readings along series of conditions, or over time.
+"""Noise that nobody states, estimated from the scatter of readings along series of conditions or over time.
 
 Along a series, rows that differ in one condition only, a model's readings are smooth. So they are over time, except
-after a step of what is imposed, whose few differences are left out. The difference of a reading
-from the line between its neighbours is noise, plus curvature if the steps are wide. So the estimate may be too
-large, never too small (second differences: von Neumann, Ann. Math. Stat. 12 (1941). Gasser, Sroka and
-Jennen-Steinmetz, Biometrika 73 (1986), for any spacing).
+after a step of what is imposed, whose few differences are left out. The difference of a reading from the line between
+its neighbours is noise, plus curvature if the steps are wide. So the estimate may be too large, never too small
+(second differences: von Neumann, Ann. Math. Stat. 12 (1941). Gasser, Sroka and Jennen-Steinmetz, Biometrika 73
+(1986), for any spacing).
 """
 
 from __future__ import annotations
@@ -38,16 +38,16 @@ LABELS = ("configuration", "surface", "mode")
 
 @dataclasses.dataclass(frozen=True)
 class SeriesNoise:
-    """Noise of a channel.
+    """Noise of a channel, estimated along series.
 
     Attributes:
-        channel: its channel.
+        channel: the channel.
         floor: constant part of the sd [SI].
-        share: part in proportion to the reading [-]. They add as squares.
+        share: part of the sd that is proportional to the reading [-]. Both parts add as squares.
         freedom: degrees of freedom of the estimate.
-        axis: column along which the series are.
+        axis: column along which the series run.
         count: number of series.
-        least: sd of rounding by the step of the display [SI].
+        least: sd of rounding to the resolution of the display [SI].
     """
 
     channel: Channel
@@ -59,15 +59,17 @@ class SeriesNoise:
     least: float = 0.0
 
     def sd(self, sizes: Float[np.ndarray, " rows"]) -> Float[np.ndarray, " rows"]:
-        """Sd of readings of these sizes [SI], at least the display's rounding and `FLOOR` of the reading."""
+        """Standard deviation of readings of these sizes [SI]. At least that of rounding, and at least `FLOOR` of the
+        reading.
+        """
         return np.maximum(np.hypot(self.floor, self.share * sizes), np.maximum(self.least, FLOOR * sizes))
 
 
 def estimate_noise(runs: Runs, sizes: Float[np.ndarray, "rows channels"]) -> tuple[SeriesNoise | None, ...]:
-    """Noise of each channel, None if too few rows are along series.
+    """Noise of each channel, None if too few rows belong to series.
 
     Args:
-        sizes: reference size of each reading for shares [SI].
+        sizes: reference size of each reading for relative noise [SI].
     """
     if runs.sampled:  # of all rows of a thinned log, with sizes that are those of the channels
         runs = runs.whole
@@ -85,12 +87,12 @@ def estimate_noise(runs: Runs, sizes: Float[np.ndarray, "rows channels"]) -> tup
 
 
 def series_along(runs: Runs, axis: str) -> list[np.ndarray]:
-    """Rows of each series along an axis, three or more. Backward travel is a separate series.
+    """Rows of each series along an axis, at least three. Backward travel is a separate series.
 
-    Voltages that differ only by the sag of the supply are the same level.
+    Voltages that differ only by the sag of the supply are one level.
     """
     others = [c for c in (*LABELS, *runs.axes) if runs.has(c) and c != axis]
-    level = {c: without_sag(runs[c]) if c == SUPPLY else runs[c] for c in others}
+    level = {c: voltage_levels(runs[c]) if c == SUPPLY else runs[c] for c in others}
     driving = [c for c in (*runs.layout.axes[:1], "supply_voltage_V", "duty") if runs.has(c)]
     keys: list[tuple] = [
         (*(str(level[c][row]) for c in others), *(float(np.sign(runs[c][row])) for c in driving))
@@ -104,11 +106,11 @@ def series_along(runs: Runs, axis: str) -> list[np.ndarray]:
     return [np.array(rows) for rows in together.values() if len(rows) > 2]
 
 
-def without_sag(voltage: np.ndarray) -> np.ndarray:
-    """Level of each voltage: the largest of its group.
+def voltage_levels(voltage: np.ndarray) -> np.ndarray:
+    """Level of each voltage: the largest voltage of its group.
 
-    Groups are narrower than `SAG` and than a third of the distance to the next. Without such groups each voltage is
-    its own level.
+    A group is narrower than `SAG` and narrower than a third of the distance to the next group. Without such groups,
+    each voltage is its own level.
     """
     levels = np.unique(voltage)
     gaps = np.diff(levels)
@@ -123,14 +125,14 @@ def without_sag(voltage: np.ndarray) -> np.ndarray:
 def _noise_of_channel(
     channel: Channel, measured: np.ndarray, sizes: np.ndarray, x: np.ndarray, axis: str, series: list[np.ndarray]
 ) -> SeriesNoise | None:
-    """Noise as a mixture of two forms, a constant sd and a share of the reading, by their likelihood.
+    """Noise of a channel as a likelihood-weighted mixture of two forms: a constant sd, and a share of the reading.
 
-    A few series do not decide between the forms, and a pure share would give the smallest readings a far too large
-    weight. With four series of five, its smallest sd is too small by a factor of 3.7 in one table of twenty. The
-    mixture's is too small by 2.2. Motors at rest show 0 without noise, so such readings do not count.
+    A few series do not decide between the forms, and a pure share would give the smallest readings far too large a
+    weight. With four series of five readings, its smallest sd is too small by a factor of 3.7 in one table of twenty,
+    that of the mixture by 2.2. Instruments of motors at rest show 0 without noise, so such readings do not count.
     """
     measured = np.where(channel.zero_at_rest & (measured == 0), np.nan, measured)
-    weights, used = _differences(measured, x, series)
+    weights, used = _differences_from_neighbours(measured, x, series)
     if not used:
         return None
     difference = weights @ np.nan_to_num(measured)
@@ -140,7 +142,7 @@ def _noise_of_channel(
         scale = weights.multiply(sizes[None]) if in_share else weights
         spread = np.sqrt(scale.power(2).sum(1))
         unit, scale = difference / spread, sparse.csr_array(scale.multiply(1 / spread[:, None]))
-        sound = _without_wrong_readings(unit)
+        sound = _sound_differences(unit)
         unit, scale = unit[sound], scale[sound]
         count = len(unit)
         size = float(np.sqrt(np.mean(unit**2)))
@@ -154,9 +156,14 @@ def _noise_of_channel(
     return SeriesNoise(channel, floor, sum(share, 0.0), float(probability @ freedom), axis, used, least)
 
 
-def _differences(measured: np.ndarray, x: np.ndarray, series: list[np.ndarray]) -> tuple[sparse.csr_array, int]:
-    """Difference of each reading from the line between its neighbours, as weights of all readings, shape
-    (differences, rows), and the number of series with any."""
+def _differences_from_neighbours(
+    measured: np.ndarray, x: np.ndarray, series: list[np.ndarray]
+) -> tuple[sparse.csr_array, int]:
+    """Difference of each reading from the line between its neighbours, as weights of the readings, and the number of
+    series.
+
+    The weights have the shape (differences, rows). Only series with at least one difference are counted.
+    """
     differences, used = [], 0
     for rows in series:
         rows = rows[np.isfinite(measured[rows])]
@@ -172,7 +179,7 @@ def _differences(measured: np.ndarray, x: np.ndarray, series: list[np.ndarray]) 
     return sparse.csr_array(sparse.vstack(differences)) if differences else sparse.csr_array((0, len(measured))), used
 
 
-def _without_wrong_readings(unit: np.ndarray) -> np.ndarray:
-    """True for differences without a wrong reading. All True if too many would be wrong."""
+def _sound_differences(unit: np.ndarray) -> np.ndarray:
+    """True for differences that are not outliers. All True if too many would be outliers."""
     sound = np.abs(unit) <= WRONG * 1.4826 * np.median(np.abs(unit))
     return sound if np.mean(~sound) <= MOST else np.ones(len(unit), bool)

@@ -1,4 +1,4 @@
-"""States that a log shows, and windows of its runs for the equations.
+"""States of the equations that a log shows, and the time windows of its runs.
 
 A point is the mean of neighbouring rows, so that no row is left out of a long log and a window has a few dozen
 points. No window contains a jump of an imposed quantity, a gap between rows, or rest. After a jump the current rises
@@ -44,8 +44,8 @@ EDGE = 1e-4
 IMPOSED = "voltage", "duty", "motor_current", "motor_speed", "motor_acceleration", "load_torque"
 
 
-class Lacking(StrEnum):
-    """Reasons why a log does not show the states of its equations."""
+class MissingStates(StrEnum):
+    """Reason why a log does not show the states of its equations."""
 
     MOTION = "motion"  # no speed or angle
     SIGN = "sign"  # an instrument shows only a magnitude
@@ -55,16 +55,16 @@ class Lacking(StrEnum):
     FOLLOWER = "follower"  # a speed is imposed, and no channel follows it
 
 
-class Plan(eqx.Module):
-    """States that a log shows, as indices of its channels.
+class StatePlan(eqx.Module):
+    """Channels from which the states of the equations are taken.
 
     Attributes:
-        current: index of the channel of the current, -1 if it follows from an imposed quantity.
-        motion: index of the channel of the motion, -1 if it is imposed.
-        angle: True if it is an angle, which enters integrated twice.
-        travels: True for motion of the load, not of a shaft.
-        others: channels that follow from the states.
-        imposed: as in `Rig.imposed`.
+        current: index of the current channel, -1 if the current follows from an imposed quantity.
+        motion: index of the motion channel, -1 if the motion is imposed.
+        angle: True if the motion channel is an angle. It enters integrated twice.
+        travels: True if the motion is that of the load, not of a shaft.
+        others: indices of channels that follow from the states.
+        imposed: imposed quantity, as in `Rig.imposed`.
     """
 
     current: int = eqx.field(static=True)
@@ -81,28 +81,28 @@ class Plan(eqx.Module):
 
     @property
     def mechanical(self) -> bool:
-        """True if the balance of torques is an equation of the log."""
+        """True if the torque balance is an equation of the log."""
         return self.imposed != "motor_speed"
 
 
-def plan_of(problem: Problem) -> Plan | None:
-    """Returns the plan of a log, None if the log does not show the states."""
-    plan = plan_or_lacking(problem)
-    return plan if isinstance(plan, Plan) else None
+def state_plan(problem: Problem) -> StatePlan | None:
+    """State plan of a log. None if the log does not show the states."""
+    plan = state_plan_or_reason(problem)
+    return plan if isinstance(plan, StatePlan) else None
 
 
-def plan_or_lacking(problem: Problem) -> Plan | Lacking:
-    """Returns the plan of a log, or the reason why there is none."""
+def state_plan_or_reason(problem: Problem) -> StatePlan | MissingStates:
+    """State plan of a log, or the reason why there is none."""
     robot, counts = problem.base, np.asarray(problem.data.weight).sum(0) > 0
     channels_read = {k: c for k, c in enumerate(problem.channels) if counts[k]}
     if robot.rig.turns:
-        return Lacking.TURN
+        return MissingStates.TURN
     if robot.rig.follows_goal:
-        return Lacking.GOAL
+        return MissingStates.GOAL
     if robot.loose:
-        return Lacking.SLACK
+        return MissingStates.SLACK
     if {c.name for c in channels_read.values()} & robot.rig.magnitudes:
-        return Lacking.SIGN
+        return MissingStates.SIGN
     imposed = robot.rig.imposed
     pulsed = np.ptp(np.asarray(problem.observe.of_rows.duty)) > 0  # type: ignore[attr-defined]
     current_channel = "total_current"  # proportional to the duty of pulses
@@ -112,11 +112,11 @@ def plan_or_lacking(problem: Problem) -> Plan | Lacking:
     angles = [k for k, c in channels_read.items() if c.zero_at_rest and not c.settled]
     if imposed == "motor_speed":
         others = (*currents, *voltages)
-        return Plan(-1, -1, False, False, others, imposed) if others else Lacking.FOLLOWER
+        return StatePlan(-1, -1, False, False, others, imposed) if others else MissingStates.FOLLOWER
     current = next(iter(sorted(currents, key=lambda k: currents[k])), -1) if imposed == "voltage" else -1
     current = -1 if current >= 0 and pulsed and currents[current] else current
     if not (speeds or angles):
-        return Lacking.MOTION
+        return MissingStates.MOTION
     motion = (*speeds, *angles)[0]
     slips = [
         k
@@ -124,7 +124,7 @@ def plan_or_lacking(problem: Problem) -> Plan | Lacking:
         if robot.has_ground and _shows_travel(channels_read[k]) and not _shows_travel(channels_read[motion])
     ]
     others = (*slips, *(voltages if imposed == "motor_current" else ()))
-    return Plan(current, motion, not speeds, _shows_travel(channels_read[motion]), others, imposed)
+    return StatePlan(current, motion, not speeds, _shows_travel(channels_read[motion]), others, imposed)
 
 
 def _shows_travel(channel: Channel) -> bool:
@@ -132,23 +132,23 @@ def _shows_travel(channel: Channel) -> bool:
     return channel.unit_si in ("m", "m/s")
 
 
-class Rows(eqx.Module):
+class LogPoints(eqx.Module):
     """Conditions, readings and states at each point of a log, shape (points, ...).
 
     Attributes:
-        conditions: means over `cell`.
-        shown: readings [SI], means of their rows.
-        sd: standard deviation of these means.
-        rate: slope of the channel of the motion, if that is an angle [SI/s].
-        way: direction of travel, 0 if it may be at rest.
-        angle: angle of the output since the run's first row [rad].
-        since: time since the point before [s], 0 for the first of a run.
-        time: time since the run's start [s].
-        first: a row of the table at the point.
-        delay: delay of the rig, at which the conditions were taken [s].
-        drift: their derivatives with respect to the delay, by field.
-        reach: change of the delay within which these hold [s].
-        memory: memory of the robot's effects that have one, by their names.
+        conditions: mean conditions over the interval of each point.
+        shown: readings [SI], averaged over the rows of each point.
+        sd: standard deviation of these averages.
+        rate: time derivative of the motion channel, if that is an angle [SI/s].
+        way: direction of travel, 0 if the robot may be at rest.
+        angle: angle of the output since the first row of the run [rad].
+        since: time since the previous point [s], 0 for the first of a run.
+        time: time since the start of the run [s].
+        first: index of a table row at the point.
+        delay: delay of the rig for which the conditions were computed [s].
+        drift: derivatives of the conditions with respect to the delay, by field.
+        reach: change of the delay within which these derivatives hold [s].
+        memory: memory of each of the robot's effects that has one, by name.
     """
 
     conditions: Conditions
@@ -166,27 +166,27 @@ class Rows(eqx.Module):
     memory: Mapping[str, Float[Array, " points"]] = eqx.field(default_factory=dict)
 
     def imposed(self, delay: Scalar) -> Conditions:
-        """Conditions at another delay, or the nearest within `reach` of theirs, traceable."""
+        """Conditions at another delay, limited to `reach`. Can be differentiated."""
         conditions, late = self.conditions, jnp.clip(delay - self.delay, -self.reach, self.reach)
         for name, drift in self.drift.items():
-            conditions = replaced(conditions, name, getattr(conditions, name) + late * drift)
+            conditions = with_condition(conditions, name, getattr(conditions, name) + late * drift)
         return conditions
 
 
-def replaced(conditions: Conditions, name: str, value: Any) -> Conditions:
-    """Conditions with another value of a field. Unlike a new one, this changes no shape of others."""
+def with_condition(conditions: Conditions, name: str, value: Any) -> Conditions:
+    """Conditions with another value of one field. Shapes of other fields are unchanged."""
     return eqx.tree_at(operator.attrgetter(name), conditions, value)
 
 
 @dataclasses.dataclass(frozen=True)
-class Course:
-    """Imposed quantities over time, as integrals, so that each interval has a mean at any delay.
+class ImposedCourse:
+    """Imposed quantities over time as integrals, so that each interval has a mean at any delay.
 
     Attributes:
-        time: time of knots of all runs, one run after the other [s].
-        values: values from each on.
-        integrals: up to each. Both by field of `Conditions`.
-        cell: beginning and end of the interval of each point, in the same clock.
+        time: times at which they change, for all runs one after the other [s].
+        values: values from each of these times on, by field of `Conditions`.
+        integrals: integrals up to each of these times, by field of `Conditions`.
+        cell: begin and end of the interval of each point, on the same time axis.
     """
 
     time: np.ndarray
@@ -195,7 +195,9 @@ class Course:
     cell: np.ndarray
 
     def at(self, delay: float) -> tuple[Columns, Columns]:
-        """Mean of each quantity at each point, if it acts `delay` [s] later than its column states, and its slope."""
+        """Mean of each quantity over the interval of each point, if it acts `delay` [s] later than its column states,
+        and the derivative of the mean with respect to the delay.
+        """
         low, high = (edge - delay for edge in self.cell.T)
         mean, drift = {}, {}
         for name, x in self.integrals.items():
@@ -206,8 +208,9 @@ class Course:
 
 
 @dataclasses.dataclass(frozen=True)
-class Windows:
-    """Windows of one run: indices of their points, and Δt w, Δt w', Δt w'' and Δt there, shape (windows, length).
+class RunWindows:
+    """Time windows of one run: indices of their points, and Δt w, Δt w', Δt w'' and Δt there, shape (windows,
+    length).
 
     The last point of a shorter window is repeated with zero weights.
     """
@@ -219,17 +222,21 @@ class Windows:
     bend: np.ndarray
     steps: np.ndarray
 
-    def part(self, which: np.ndarray) -> Windows:
-        """Some of the windows."""
+    def part(self, which: np.ndarray) -> RunWindows:
+        """Copy with some of the windows."""
         arrays = self.rows, self.weight, self.slope, self.bend, self.steps
-        return Windows(self.run, *(x[which] for x in arrays))
+        return RunWindows(self.run, *(x[which] for x in arrays))
 
 
 def window_function(share: np.ndarray, length: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """w = sin⁸ π s, w' and w'' of a window at shares s of its length [s], 0 outside.
+    """Window w = sin⁸ π s with its derivatives w' and w'', where s is the position in the window (0 to 1). 0 outside.
 
-    Sums over rows integrate w'' times an angle without bias only if the window ends smoothly. With sin⁴ the inertia
-    of 100 logs of an angle alone was off by 6 posterior sds, with sin⁸ by 0.1.
+    Sums over rows integrate w'' times an angle without bias only if the window ends smoothly. With sin⁴, the inertia
+    from 100 logs with only an angle was wrong by 6 posterior sds, with sin⁸ by 0.1.
+
+    Args:
+        share: positions s.
+        length: length of the window [s].
     """
     s, c = np.sin(np.pi * share), np.cos(np.pi * share)
     inside = (share > 0) & (share < 1)
@@ -239,12 +246,12 @@ def window_function(share: np.ndarray, length: float) -> tuple[np.ndarray, np.nd
 
 
 def windows_of_run(time: np.ndarray, piece: np.ndarray, length: float) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Returns the windows of one run, each as (indices of its points, their positions as shares of its length).
+    """Windows of one run, each as (indices of its points, their positions in the window from 0 to 1).
 
     Args:
-        time: time of the points [s], increasing.
-        piece: number of the piece of each point, -1 for points in no window. A window is within one piece.
-        length: length of a window [s]. A shorter piece has one window of its own length.
+        time: times of the points [s], increasing.
+        piece: number of the segment of each point, -1 for points in no window. A window lies within one segment.
+        length: length of a window [s]. A shorter segment has one window of its own length.
     """
     windows = list[tuple[np.ndarray, np.ndarray]]()
     starts = np.flatnonzero(np.r_[True, np.diff(piece) != 0])
@@ -262,10 +269,11 @@ def windows_of_run(time: np.ndarray, piece: np.ndarray, length: float) -> list[t
 
 
 def correlation_time(time: np.ndarray, speed: np.ndarray, noise: float) -> float:
-    """Lag at which the mean squared change of a speed equals its variance [s], 0 if shorter than the time of a row.
+    """Correlation time of a speed: lag at which its mean squared change equals its variance [s]. 0 if shorter than a
+    time step.
 
     Args:
-        noise: sd of the readings of the speed, which does not count.
+        noise: standard deviation of the speed readings, which is subtracted.
     """
     size = float(np.var(speed)) - noise**2
     if len(time) < FEWEST or size <= 0:
@@ -277,8 +285,8 @@ def correlation_time(time: np.ndarray, speed: np.ndarray, noise: float) -> float
     return 0.0 if lag == 1 else float(lag * np.median(np.diff(time)))
 
 
-def slopes_of(time: np.ndarray, values: np.ndarray, piece: np.ndarray, count: int) -> np.ndarray:
-    """Slope at each point of a cubic over the `count` points around it, within its piece."""
+def local_slopes(time: np.ndarray, values: np.ndarray, piece: np.ndarray, count: int) -> np.ndarray:
+    """Slope at each point of a cubic through the `count` points around it, within its segment."""
     out = np.zeros(len(time))
     starts = np.flatnonzero(np.r_[len(piece) > 0, np.diff(piece) != 0])
     for begin, end in zip(starts.tolist(), [*starts[1:].tolist(), len(piece)], strict=True):
@@ -299,7 +307,11 @@ def slopes_of(time: np.ndarray, values: np.ndarray, piece: np.ndarray, count: in
 
 
 def slope_rows(time: np.ndarray, angle: np.ndarray, sd: float) -> tuple[int, float]:
-    """Number of rows over which the slope of an angle has little noise, `STEEP` of its size, and the sd of that."""
+    """Number of rows over which the slope of an angle is little affected by noise, and the standard deviation of that
+    slope.
+
+    The noise of the slope is then `STEEP` of its size.
+    """
     step, far = float(np.median(np.diff(time))), max(len(time) // 20, 1)
     speed = float(np.sqrt(np.mean((angle[far:] - angle[:-far]) ** 2))) / (far * step)
     rows = np.ceil((12 * (sd / max(STEEP * speed * step, 1e-300)) ** 2) ** (1 / 3))
@@ -307,10 +319,10 @@ def slope_rows(time: np.ndarray, angle: np.ndarray, sd: float) -> tuple[int, flo
     return rows, sd * (75 / rows**3) ** 0.5 / step  # of a cubic
 
 
-class _Log:
+class _LogArrays:
     """Arrays of a log, by table row."""
 
-    def __init__(self, problem: Problem, plan: Plan) -> None:
+    def __init__(self, problem: Problem, plan: StatePlan) -> None:
         observe: Any = problem.observe
         self.problem, self.plan, self.observe = problem, plan, observe
         self.time, self.of_rows = np.asarray(observe.time, float), observe.of_rows
@@ -323,8 +335,9 @@ class _Log:
         self.step = float(np.median(np.concatenate(long))) if long else 1.0
 
     def motion(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-        """Time and speed in some rows of a run, and the sd of the noise of the speed. Speed is in the unit of the
-        reading."""
+        """Time and speed in some rows of a run, and the noise of the speed (sd). The speed is in the unit of the
+        motion channel.
+        """
         plan, time = self.plan, self.time[rows]
         if not plan.mechanical:
             return time, np.asarray(self.of_rows.motor_speed)[rows], 0.0
@@ -336,18 +349,19 @@ class _Log:
         return time, readings, sd
 
     def length(self) -> float:
-        """Length of a window [s], by the bandwidth of the motion."""
+        """Length of a window [s], from the bandwidth of the motion."""
         lasting = [correlation_time(*self.motion(rows)) for rows in self.each if len(rows) > 2 * FEWEST]
         return max(CORRELATED * float(np.median(lasting)) if lasting else 0.0, LONG * self.step)
 
     def points(self, run: int, size: int, delay: float | None) -> Columns:
-        """Means of `size` rows of a run each, within stretches without a gap or a jump.
+        """Averages of `size` rows each in a run, within segments without a gap or a jump.
 
         Args:
-            delay: delay of jumps [s], None for stretches that contain them.
+            delay: delay of the jumps [s]. None: segments may contain jumps.
 
         Returns:
-            By name: row, time, shown, sd, cell as of `Rows`. Stretch of each, -1 for points in no window.
+            By name: row, time, shown, sd and cell as in `LogPoints`, and the segment of each point, -1 for points in
+                no window.
         """
         rows = self.each[run]
         times = self.time[rows]
@@ -381,8 +395,8 @@ class _Log:
             "stretch": np.where(count == size, stretch[first], -1),
         }
 
-    def course(self, cells: list[np.ndarray]) -> Course:
-        """Imposed quantities over time. `cells`: of the points of each run."""
+    def course(self, cells: list[np.ndarray]) -> ImposedCourse:
+        """Imposed quantities over time. `cells`: intervals of the points of each run."""
         changing = {
             name: np.asarray(x, float)
             for name in IMPOSED
@@ -404,19 +418,19 @@ class _Log:
             knots.append(time + begin)
             moved.append(cell + begin)
         held, summed = ({n: np.concatenate(x) for n, x in each.items()} for each in (values, integrals))
-        return Course(np.concatenate(knots), held, summed, np.concatenate(moved))
+        return ImposedCourse(np.concatenate(knots), held, summed, np.concatenate(moved))
 
 
-def rows_and_windows(
-    problem: Problem, plan: Plan, delay: float = 0.0, *, across: bool = False
-) -> tuple[Rows, Course, list[Windows]]:
-    """Returns the points of a log, what is imposed there over time, and the windows of its runs.
+def points_and_windows(
+    problem: Problem, plan: StatePlan, delay: float = 0.0, *, across: bool = False
+) -> tuple[LogPoints, ImposedCourse, list[RunWindows]]:
+    """Points of a log, the imposed quantities over time, and the windows of its runs.
 
     Args:
-        delay: delay between the instant of a jump in its column and its action [s].
-        across: True for windows that contain jumps.
+        delay: delay between a jump in its column and its action [s].
+        across: True for windows that may contain jumps.
     """
-    log = _Log(problem, plan)
+    log = _LogArrays(problem, plan)
     length = log.length()
     size = max(1, int(length / (POINTS * log.step)))
     parts = [log.points(run, size, None if across else delay) for run in range(len(log.each))]
@@ -427,7 +441,7 @@ def rows_and_windows(
     mean, drift = course.at(delay)
     conditions: Any = jax.tree.map(lambda x: np.asarray(x)[joined["row"]], log.of_rows)
     for name, x in mean.items():
-        conditions = replaced(conditions, name, x)
+        conditions = with_condition(conditions, name, x)
     time, readings, sd = joined["time"], joined["shown"], joined["sd"]
     since = np.where(np.diff(run, prepend=-1) != 0, 0.0, np.diff(time, prepend=0.0))
     # Points of different runs or on both sides of a jump are apart for slopes, and those of both ways for windows.
@@ -438,25 +452,26 @@ def rows_and_windows(
         angle, sds = (x[longest, plan.motion] for x in (log.measured, log.sd))
         wide, noise = slope_rows(log.time[longest], angle, float(np.median(sds)))
         wide = max(FEWEST, wide // size | 1)
-        rate = slopes_of(time, readings[:, plan.motion], apart, wide)
+        rate = local_slopes(time, readings[:, plan.motion], apart, wide)
     way, speed = _travel_directions(problem, plan, conditions, readings, sd, rate, noise)
     usable = (way != 0) & (joined["stretch"] >= 0)
     piece = np.where(usable, np.cumsum(np.r_[False, (np.diff(apart) != 0) | (np.diff(way) != 0)]), -1)
     if plan.angle:
-        rate = slopes_of(time, readings[:, plan.motion], piece, wide)
+        rate = local_slopes(time, readings[:, plan.motion], piece, wide)
     turned = np.cumsum(np.where(since > 0, 0.5 * (speed + np.roll(speed, 1)) * since, 0.0))
     none = np.zeros(len(run))
     arrays = readings, sd, rate, way, turned - turned[count[:-1]][run], since, time, joined["row"]
     late = none + delay, none + log.step, drift
     windows = [
-        _weights(r, time, windows_of_run(time, np.where(run == r, piece, -1), length)) for r in range(len(parts))
+        _weight_windows(r, time, windows_of_run(time, np.where(run == r, piece, -1), length))
+        for r in range(len(parts))
     ]
-    rows = Rows(*jax.tree.map(jnp.asarray, (conditions, *arrays, *late)))
+    rows = LogPoints(*jax.tree.map(jnp.asarray, (conditions, *arrays, *late)))
     return rows, course, [w for w in windows if len(w.rows)]
 
 
-def _weights(run: int, time: np.ndarray, windows: list[tuple[np.ndarray, np.ndarray]]) -> Windows:
-    """Weights of the windows of a run at their points."""
+def _weight_windows(run: int, time: np.ndarray, windows: list[tuple[np.ndarray, np.ndarray]]) -> RunWindows:
+    """Windows of a run with their weights at the points."""
     longest = max((len(rows) for rows, _ in windows), default=0)
     index, values = np.zeros((len(windows), longest), int), np.zeros((4, len(windows), longest))
     values[3] = 1.0
@@ -466,14 +481,15 @@ def _weights(run: int, time: np.ndarray, windows: list[tuple[np.ndarray, np.ndar
         index[k, :n] = rows
         values[3, k, :n] = np.gradient(time[rows])
         plain = np.array(window_function(share, length)) * values[3, k, :n]
-        values[:3, k, :n] = _consistent(plain, share, length)
-    return Windows(run, index, *values)
+        values[:3, k, :n] = _exact_weights(plain, share, length)
+    return RunWindows(run, index, *values)
 
 
-def _consistent(weights: np.ndarray, share: np.ndarray, length: float) -> np.ndarray:
-    """Weights w, w', w'' of a window that integrate polynomials up to the third degree by parts without error.
+def _exact_weights(weights: np.ndarray, share: np.ndarray, length: float) -> np.ndarray:
+    """Window weights w, w', w'', corrected so that integration by parts is exact for polynomials up to the third
+    degree.
 
-    Sums over rows at irregular times would not, and an angle is far from 0, so that its sum would be mostly error.
+    Plain sums over rows at irregular times are not exact. For an angle far from 0, the sum would be mostly error.
     """
     w, powers, scaled_place = weights[0], np.arange(4), 2 * share[:, None] - 1
     basis = scaled_place**powers
@@ -486,7 +502,7 @@ def _consistent(weights: np.ndarray, share: np.ndarray, length: float) -> np.nda
 
 
 def _jump_times(observe: Any, run: int) -> np.ndarray:
-    """Times of jumps of a run's imposed quantities [s]."""
+    """Times at which the imposed quantities of a run jump [s]."""
     conditions, times = observe.conditions, np.asarray(observe.times[run])
     jumps = np.zeros(len(times) - 1, bool)
     imposed = "voltage", "motor_current", "duty", "open", "load_torque", "slope_deg", "payload", "total_mass"
@@ -500,7 +516,7 @@ def _jump_times(observe: Any, run: int) -> np.ndarray:
 
 def _travel_directions(
     problem: Problem,
-    plan: Plan,
+    plan: StatePlan,
     conditions: Any,
     shown: np.ndarray,
     sd: np.ndarray,
@@ -510,7 +526,7 @@ def _travel_directions(
     """Direction of travel at each point, 0 if the robot may be at rest, and the speed of the output [rad/s].
 
     Args:
-        noise: sd of `rate`.
+        noise: standard deviation of `rate`.
     """
     if plan.imposed == "motor_speed":
         speed, off = conditions.motor_speed / float(problem.base.gearbox.ratio), np.zeros(len(shown))

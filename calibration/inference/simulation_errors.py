@@ -1,4 +1,4 @@
-"""Errors of a simulation: equation (35), its summary per channel, and R² of (A1)."""
+"""Errors of a simulation: relative error of equation (35), its summary by channel, and R² of (A1)."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ OF_SIZE = "channel's measured root mean square"
 
 
 def sized_error(simulated: np.ndarray, measured: np.ndarray) -> np.ndarray:
-    """(CV - EV) / rms(EV) · 100 [%], with the rms over the rows that have both.
+    """Error relative to the measured rms: (CV - EV) / rms(EV) · 100 [%]. Only rows with both values count.
 
     Args:
-        simulated, measured: shape (rows, ...).
+        simulated, measured: CV and EV, shape (rows, ...).
     """
     both = np.isfinite(simulated) & np.isfinite(measured)
     with np.errstate(divide="ignore", invalid="ignore"):  # NaN for a channel without readings
@@ -31,9 +31,8 @@ def sized_error(simulated: np.ndarray, measured: np.ndarray) -> np.ndarray:
 
 
 def share_of_measured(simulated: np.ndarray, measured: np.ndarray) -> np.ndarray:
-    """rms error over the rms of the measured values [-], by channel over the rows with both, shape (channels,).
-
-    NaN without such a row.
+    """rms error divided by the measured rms [-], shape (channels,). Only rows with both values count. NaN if there is
+    none.
 
     Args:
         simulated, measured: shape (rows, channels), or shapes that broadcast to it.
@@ -46,13 +45,13 @@ def share_of_measured(simulated: np.ndarray, measured: np.ndarray) -> np.ndarray
 
 
 def root_mean_square(errors: np.ndarray) -> float:
-    """Root mean square of the finite errors, NaN without any."""
+    """Root mean square of the finite errors, NaN if there are none."""
     finite = errors[np.isfinite(errors)]
     return float(np.sqrt(np.mean(finite**2))) if finite.size else float("nan")
 
 
 def error_summary(errors: np.ndarray) -> dict[str, float | int]:
-    """Root mean square and largest magnitude of finite errors (35) [%], and their count."""
+    """Root mean square and largest magnitude of the finite errors (35) [%], and their number."""
     finite = errors[np.isfinite(errors)]
     if finite.size == 0:
         return {"rows": 0, "rms_percent": float("nan"), "max_percent": float("nan")}
@@ -83,13 +82,13 @@ def channel_errors(
     sd: np.ndarray,
     percent: np.ndarray | None = None,
 ) -> dict[str, dict[str, float | int]]:
-    """Errors of each channel over the rows with a simulated and a measured value: in percent, in sigmas and, as
-    `rms`, in the channel's unit.
+    """Errors of each channel over rows with a simulated and a measured value: in percent, in sds, and as `rms` in its
+    unit.
 
     Args:
         shown: the channels.
-        simulated, measured, sd: [SI], NaN if missing, shape (rows, channels).
-        percent: errors of the same shape. None takes `sized_error`.
+        simulated, measured, sd: readings and standard deviations [SI], NaN if missing, shape (rows, channels).
+        percent: percentage errors of the same shape. None: `sized_error`.
     """
     percent = sized_error(simulated, measured) if percent is None else percent
     off = simulated - measured

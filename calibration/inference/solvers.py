@@ -1,4 +1,4 @@
-"""Solvers of optimistix and optax by the names in `calibrate --solver`. Importable without jax."""
+"""Solvers of optimistix and optax, by the names in `calibrate --solver`. This module does not import jax."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ RATE = 0.02
 
 
 def solver_by_name(name: str) -> optx.AbstractLeastSquaresSolver | optx.AbstractMinimiser:
-    """Returns the solver of a name, one of `NAMES`.
+    """Solver with one of the names in `NAMES`.
 
     Raises:
-        BadConfiguration: an unknown name.
+        BadConfiguration: the name is unknown.
     """
     stated_word(name, NAMES, "solver")
     import optax

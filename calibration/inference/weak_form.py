@@ -1,18 +1,17 @@
-"""Regression of base parameters and effects on the equations of a log in weak form, without a simulation.
+"""Regression of base parameters and effects on the equations of a log in weak form, without any simulation.
 
-If a log shows the states, the balances give their rates at its readings. The equation y' = f(y) is
-multiplied by smooth windows w(t) and integrated by parts: ∫ w f(y) dt + ∫ w' y dt = 0. No derivative of a noisy
-reading is taken. References: modulating functions, Preisig and Rippin, Comput. Chem. Eng. 17 (1993) 1. Inverse
-dynamic identification, Gautier and Khalil, IEEE Trans. Robot. Autom. 6 (1990) 368. Weak SINDy, Messenger and Bortz,
-Multiscale Model. Simul. 19 (2021) 1474. Both terms contain readings, and overlapping windows share their noise. The
-covariance of this noise follows from the sds of the readings and the steps of their instruments, and weights the
-windows (Bortz, Messenger and Dukic, Bull. Math. Biol. 85 (2023) 110). No window contains a jump of an imposed
-quantity, a gap, or rest.
+If a log shows the states, the balances give their rates at its readings. The equation y' = f(y) is multiplied by
+smooth windows w(t) and integrated by parts: ∫ w f(y) dt + ∫ w' y dt = 0. No derivative of a noisy reading is taken.
+References: modulating functions, Preisig and Rippin, Comput. Chem. Eng. 17 (1993) 1. Inverse dynamic identification,
+Gautier and Khalil, IEEE Trans. Robot. Autom. 6 (1990) 368. Weak SINDy, Messenger and Bortz, Multiscale Model. Simul.
+19 (2021) 1474. Both terms contain readings, and overlapping windows share their noise. The covariance of this noise
+follows from the sds of the readings and the steps of their instruments, and weights the windows (Bortz, Messenger and
+Dukic, Bull. Math. Biol. 85 (2023) 110). No window contains a jump of an imposed quantity, a gap, or rest.
 
 Readings are regressors too, and their noise biases the parameters. So derivatives are those of simulated states
-(`simulated_rows`), as instruments. Largest bias of a parameter over 100 logs of each kind, in posterior sds: a motor
-with voltage, current and speed, a carriage with force and speed, an angle alone, also with coarse instruments. An
-independent NumPy regression with exact states as instruments has 0.21 (standard error 0.1), and 91 to 99 % of its
+(`with_smooth_states`), as instruments. Largest bias of a parameter over 100 logs of each kind, in posterior sds: a
+motor with voltage, current and speed, a carriage with force and speed, an angle alone, also with coarse instruments.
+An independent NumPy regression with exact states as instruments has 0.21 (standard error 0.1), and 91 to 99 % of its
 intervals hold. An iterated covariance has 0.97 (82 %), on the motor with its log-determinant as much as without. With
 windows of sin⁴, the covariance used before has 0.90 (72 %), and one that changes within the fit 0.29 (56 %).
 """
@@ -39,12 +38,12 @@ from calibration.inference.priors import DELAY
 from calibration.inference.problem import Problem
 from calibration.inference.shown_states import (
     APART,
-    Plan,
-    Rows,
-    Windows,
-    plan_of,
-    replaced,
-    rows_and_windows,
+    LogPoints,
+    RunWindows,
+    StatePlan,
+    points_and_windows,
+    state_plan,
+    with_condition,
 )
 from mmrjax.compile.compiling import SELDOM, compiled
 from mmrjax.effects import Effect
@@ -78,12 +77,13 @@ TOGETHER, PROFILED = 400, 300
 CHANCE = 3.0
 
 
-class Terms(eqx.Module):
+class EquationTerms(eqx.Module):
     """Terms f and y of the equations Σ w f Δt + Σ w' y Δt = 0 at each row, shape (rows, equations, ...).
 
     Attributes:
-        f, y: at the readings.
-        by_z, by_reading, by_effects: their derivatives, those of f first.
+        f, y: terms at the measured readings.
+        by_z, by_reading, by_effects: derivatives of f and y with respect to coordinates, readings and effects'
+            amplitudes.
     """
 
     f: Array
@@ -93,8 +93,8 @@ class Terms(eqx.Module):
     by_effects: tuple[Array, Array]
 
 
-def _current(robot: Robot, conditions: Conditions, state: State, way: Scalar) -> Scalar:
-    """Current of the voltage balance by Newton's method. Its derivatives are those of the last step."""
+def _solve_current(robot: Robot, conditions: Conditions, state: State, way: Scalar) -> Scalar:
+    """Current that satisfies the voltage balance, by Newton's method. Its derivatives are those of the last step."""
 
     def left(robot: Robot, state: State, current: Scalar) -> Scalar:
         state_there = dataclasses.replace(state, current=current)
@@ -109,13 +109,13 @@ def _current(robot: Robot, conditions: Conditions, state: State, way: Scalar) ->
     return current
 
 
-class _Shown(eqx.Module):
-    """States that the readings of a row show.
+class _MeasuredStates(eqx.Module):
+    """States that follow from the readings of one point.
 
     Attributes:
-        turning: motor speed [rad/s], current [A].
-        unit: reading of the motion per motor speed.
-        per_ampere: reading of the current.
+        turning: motor speed [rad/s] and current [A].
+        unit: reading of the motion channel per motor speed.
+        per_ampere: reading of the current channel per ampere.
         errors: errors of the instruments, by channel.
     """
 
@@ -126,8 +126,8 @@ class _Shown(eqx.Module):
     errors: dict[int, Scalar]
 
 
-def _shown_states(plan: Plan, robot: Robot, row: Rows, shown: Array) -> _Shown:
-    """States that the readings of a row show, without slip between them."""
+def _measured_states(plan: StatePlan, robot: Robot, row: LogPoints, shown: Array) -> _MeasuredStates:
+    """States that follow from the readings of one point, without slip."""
     conditions, names = row.imposed(robot.rig.delay), channels.channel_names(robot.channels)
     chassis = robot.chassis(conditions.configuration)
     none, one = jnp.zeros(()), jnp.ones(())
@@ -162,41 +162,45 @@ def _shown_states(plan: Plan, robot: Robot, row: Rows, shown: Array) -> _Shown:
         current = current - errors[plan.current] / per_ampere
     if plan.motion >= 0 and not plan.angle:
         turning = turning - errors[plan.motion] / unit
-    return _Shown(turning, current, unit, per_ampere, errors)
+    return _MeasuredStates(turning, current, unit, per_ampere, errors)
 
 
-def _rolling_signals(plan: Plan, robot: Robot, row: Rows, turning: Scalar, current: Scalar) -> tuple[Signals, Scalar]:
-    """Signals of a row with these states, and its current, which the equations give if no channel shows it."""
+def _rolling_signals(
+    plan: StatePlan, robot: Robot, row: LogPoints, turning: Scalar, current: Scalar
+) -> tuple[Signals, Scalar]:
+    """Signals of a point with these states, and its current. If no channel shows the current, it follows from the
+    equations.
+    """
     conditions = row.imposed(robot.rig.delay)
     radius = robot.chassis(conditions.configuration).radius
     rolls, distance = radius * turning / robot.gearbox.ratio, radius * row.angle
     state = State(current, turning, rolls, jnp.zeros(()), row.memory, distance=distance)
     if plan.imposed == "voltage" and plan.current < 0:
-        current = _current(robot, row.conditions, state, row.way)
+        current = _solve_current(robot, row.conditions, state, row.way)
     return balances.rolling_signals(
         robot, row.conditions, dataclasses.replace(state, current=current), row.way
     ), current
 
 
-def _inertia(robot: Robot, chassis: Any, signals: Signals) -> Scalar:
-    """Inertia at the driving wheel of all that moves with it, driven forward [kg·m²]."""
+def _total_inertia(robot: Robot, chassis: Any, signals: Signals) -> Scalar:
+    """Total inertia at the driving wheel, of everything that moves with it when driven forward [kg·m²]."""
     carried = chassis.radius**2 * signals.mass / robot.sides if robot.has_ground else 0.0
     gear, turning = robot.gearbox, chassis.inertia + signals.inertia_added + carried
     return inertia_reduced(robot.motor.inertia, gear.ratio, gear.efficiency_load, turning)
 
 
-def row_terms(
-    plan: Plan, robot: Robot, row: Rows, shown: Array, probes: frozenset[str] = frozenset()
+def equation_terms(
+    plan: StatePlan, robot: Robot, row: LogPoints, shown: Array, probes: frozenset[str] = frozenset()
 ) -> tuple[Array, Array, Signals]:
-    """Returns terms f and y of one row's equations, and its signals.
+    """Terms f and y of the equations at one point, and its signals.
 
     Args:
-        row: one of `Rows`, without its leading axis.
+        row: one point of `LogPoints`, without the first axis.
         shown: its readings [SI], shape (channels,).
         probes: names of effects that read no signal.
     """
     names, chassis = channels.channel_names(robot.channels), robot.chassis(row.conditions.configuration)
-    states, none = _shown_states(plan, robot, row, shown), jnp.zeros(())
+    states, none = _measured_states(plan, robot, row, shown), jnp.zeros(())
     turning = states.turning
     if robot.has_ground and plan.mechanical and plan.travels:
         # The wheels turn faster than the load travels because of slip.
@@ -217,7 +221,7 @@ def row_terms(
     if plan.mechanical:
         # A torque, not an acceleration: the derivative by an inertia is then the motion, which states without noise
         # give. That of an acceleration is a torque, whose model error would enter its own instrument.
-        inertia = _inertia(robot, chassis, signals)
+        inertia = _total_inertia(robot, chassis, signals)
         read = (shown[plan.motion] - states.errors[plan.motion]) / states.unit if plan.angle else turning
         f.append(inertia * signals.acceleration_wheel)
         y.append(inertia * read / robot.gearbox.ratio)
@@ -233,20 +237,20 @@ def row_terms(
 
 
 @functools.partial(compiled, options=SELDOM)
-def simulated_rows(problem: Problem, plan: Plan, rows: Rows, z: Array) -> Rows:
-    """Returns the points with the readings of states without noise, which the equations give at coordinates z.
+def with_smooth_states(problem: Problem, plan: StatePlan, rows: LogPoints, z: Array) -> LogPoints:
+    """Points whose state readings are replaced by states without noise, from the equations at coordinates z.
 
-    Each state follows its equation from point to point, by linearly implicit steps, and is slowly pulled to its
-    readings. It begins at them in each run and after rest. Such states are instruments: their noise is not that of
-    the readings (Janot, Vandanjon and Gautier, Control Eng. Pract. 25 (2014) 85).
+    Each state follows its equation from point to point by linearly implicit steps, and is slowly pulled towards its
+    readings. It starts at the readings in each run and after rest. Such states serve as instruments: their noise is
+    independent of that of the readings (Janot, Vandanjon and Gautier, Control Eng. Pract. 25 (2014) 85).
     """
     if not plan.mechanical:
         return rows
     robot = problem.coordinates.robot(problem.base, z)
-    units = jax.vmap(lambda row: _shown_states(plan, robot, row, row.shown))(rows)
+    units = jax.vmap(lambda row: _measured_states(plan, robot, row, row.shown))(rows)
     read, count = jnp.stack([units.turning, units.current], 1), 1 + plan.electrical
 
-    def step(before: tuple[Array, Array], given: tuple[Rows, Array]) -> tuple[tuple[Array, Array], Array]:
+    def step(before: tuple[Array, Array], given: tuple[LogPoints, Array]) -> tuple[tuple[Array, Array], Array]:
         (x, idle), (row, reading) = before, given
 
         def rates(x: Array) -> tuple[Array, tuple[Array, Signals]]:
@@ -275,27 +279,32 @@ def simulated_rows(problem: Problem, plan: Plan, rows: Rows, z: Array) -> Rows:
 
 
 @functools.partial(compiled, options=SELDOM)
-def _row_terms(problem: Problem, plan: Plan, rows: Rows, z: Array, effects: tuple[ScoredEffect, ...]) -> Terms:
-    """Returns the terms of each row at coordinates z, with derivatives with respect to base parameters, readings
-    and effects."""
+def _terms_with_derivatives(
+    problem: Problem, plan: StatePlan, rows: LogPoints, z: Array, effects: tuple[ScoredEffect, ...]
+) -> EquationTerms:
+    """Terms at each point for coordinates z, with derivatives with respect to base parameters, readings and
+    effects.
+    """
     entering = tuple(dict.fromkeys(e.effect.balance for e in effects if e.effect.balance != "sensor"))
     probes = tuple(balance_probe(b) for b in entering)
     size, names = z.size, channels.channel_names(problem.channels)
 
-    def one(row: Rows) -> tuple[Any, tuple[Any, Signals]]:
+    def terms_of_point(row: LogPoints) -> tuple[Any, tuple[Any, Signals]]:
         def both(x: Array) -> tuple[Any, tuple[Any, Signals]]:
             base = problem.coordinates.robot(problem.base, x[:size])
             amplitude = x[size : size + len(probes)]
             put = tuple(eqx.tree_at(lambda e: e.amplitude, p, a) for p, a in zip(probes, amplitude, strict=True))
             robot = dataclasses.replace(base, effects=(*base.effects, *put))
-            f, y, signals = row_terms(plan, robot, row, x[size + len(probes) :], frozenset(p.name for p in probes))
+            f, y, signals = equation_terms(
+                plan, robot, row, x[size + len(probes) :], frozenset(p.name for p in probes)
+            )
             return (f, y), ((f, y), signals)
 
         return jax.jacfwd(both, has_aux=True)(jnp.concatenate([z, jnp.zeros(len(probes)), row.shown]))
 
-    slopes, (values, signals) = jax.vmap(one)(rows)
+    slopes, (values, signals) = jax.vmap(terms_of_point)(rows)
     base = problem.coordinates.robot(problem.base, z)
-    memory = memory_by_row(base, rows, signals, effects)
+    memory = memory_by_point(base, rows, signals, effects)
     entered = jax.vmap(lambda s, m: effect_terms(base, s, effects, m))(signals, memory)
     # An effect changes an equation like a defect of its balance. An effect of an instrument changes it like a
     # negative reading, or like a defect of that equation if the reading follows from the states.
@@ -317,7 +326,7 @@ def _row_terms(problem: Problem, plan: Plan, rows: Rows, z: Array, effects: tupl
     def both(part: Callable[[Array, bool], Array]) -> tuple[Array, Array]:
         return part(slopes[0], True), part(slopes[1], False)
 
-    return Terms(
+    return EquationTerms(
         values[0],
         values[1],
         both(lambda s, _: s[:, :, :size]),
@@ -326,8 +335,10 @@ def _row_terms(problem: Problem, plan: Plan, rows: Rows, z: Array, effects: tupl
     )
 
 
-def memory_by_row(robot: Robot, rows: Rows, signals: Signals, effects: tuple[ScoredEffect, ...]) -> list[Array]:
-    """Returns the memory of each effect at each row and point of its grid, shape (rows, grid)."""
+def memory_by_point(
+    robot: Robot, rows: LogPoints, signals: Signals, effects: tuple[ScoredEffect, ...]
+) -> list[Array]:
+    """Memory of each effect at each point of the log and of the effect's grid, shape (points, grid)."""
     count = rows.since.shape[0]
     nothing = [jnp.zeros((count, len(e.at))) for e in effects]
 
@@ -357,13 +368,13 @@ def memory_by_row(robot: Robot, rows: Rows, signals: Signals, effects: tuple[Sco
 
 
 @dataclasses.dataclass(frozen=True)
-class Delay:
+class FittedDelay:
     """Delay at which the equations of a log fit best.
 
     Attributes:
-        value: later action of the imposed quantity than its column states [s], negative for an earlier one.
-        limit: largest that was searched [s].
-        ended: True if the best is there.
+        value: time by which the imposed quantity acts later than its column states [s]. Negative if earlier.
+        limit: largest delay that was tried [s].
+        ended: True if the best delay is at that limit.
     """
 
     value: float
@@ -371,7 +382,7 @@ class Delay:
     ended: bool
 
     def start(self, problem: Problem) -> np.ndarray:
-        """Prior mean with this delay, as coordinates: windows without jumps may not show it."""
+        """Coordinates of the prior mean with this delay, which windows without jumps may not show."""
         coordinates, z = problem.coordinates, np.array(problem.data.centre)
         if DELAY in coordinates.names:
             k = coordinates.names.index(DELAY)
@@ -380,12 +391,12 @@ class Delay:
 
 
 @functools.partial(compiled, options=SELDOM)
-def _by_coordinates(problem: Problem, plan: Plan, rows: Rows, z: Array) -> Array:
-    """Terms f, y and their derivatives with respect to z, shape (2, rows, equations, 1 + coordinates)."""
+def _terms_by_coordinates(problem: Problem, plan: StatePlan, rows: LogPoints, z: Array) -> Array:
+    """Terms f and y and their derivatives with respect to z, shape (2, points, equations, 1 + coordinates)."""
 
-    def one(row: Rows) -> Array:
+    def one(row: LogPoints) -> Array:
         def of(z: Array) -> tuple[Array, Array]:
-            both = jnp.stack(row_terms(plan, problem.coordinates.robot(problem.base, z), row, row.shown)[:2])
+            both = jnp.stack(equation_terms(plan, problem.coordinates.robot(problem.base, z), row, row.shown)[:2])
             return both, both
 
         slope, value = jax.jacfwd(of, has_aux=True)(z)
@@ -394,28 +405,28 @@ def _by_coordinates(problem: Problem, plan: Plan, rows: Rows, z: Array) -> Array
     return jnp.moveaxis(jax.vmap(one)(rows), 1, 0)
 
 
-def _with_imposed(rows: Rows, given: Columns) -> Rows:
-    """Points with other imposed quantities, which no delay changes."""
+def _with_imposed(rows: LogPoints, given: Columns) -> LogPoints:
+    """Points with other imposed quantities, which do not depend on a delay."""
     conditions = rows.conditions
     for name, x in given.items():
-        conditions = replaced(conditions, name, jnp.asarray(x))
+        conditions = with_condition(conditions, name, jnp.asarray(x))
     return dataclasses.replace(rows, conditions=conditions, drift={})
 
 
-def search_delay(problem: Problem, plan: Plan) -> Delay:
-    """Returns the delay of a log by a profile of its regression, over a tenth of a run either way.
+def fit_delay(problem: Problem, plan: StatePlan) -> FittedDelay:
+    """Fits the delay of a log by a profile of its regression, over a tenth of a run in either direction.
 
-    The terms are nearly affine in what is imposed, so few evaluations serve all delays. Windows contain jumps here,
-    because these show a delay best. If no delay fits as well, or shorter ones, as with a periodic input, the shortest
+    The terms are nearly affine in the imposed quantities, so a few evaluations serve all delays. The windows contain
+    jumps, because jumps show a delay best. If several delays fit equally well, as with a periodic input, the shortest
     is returned.
     """
     stated = float(np.max(np.asarray(problem.base.rig.delay)))
     if DELAY not in problem.coordinates.names:
-        return Delay(stated, 0.0, False)
-    rows, course, cut = rows_and_windows(problem, plan, across=True)
+        return FittedDelay(stated, 0.0, False)
+    rows, course, cut = points_and_windows(problem, plan, across=True)
     time, since = np.asarray(rows.time), np.asarray(rows.since)
     if not (cut and rows.drift):
-        return Delay(stated, 0.0, False)
+        return FittedDelay(stated, 0.0, False)
     step = float(np.median(since[since > 0]))
     apart = -(-sum(len(w.rows) for w in cut) // PROFILED)
     cut = [w.part(np.arange(0, len(w.rows), apart)) for w in cut]
@@ -427,12 +438,12 @@ def search_delay(problem: Problem, plan: Plan) -> Delay:
     free = [k for k, name in enumerate(problem.coordinates.names) if name != DELAY]
     z, centre = np.zeros(len(problem.coordinates)), np.asarray(problem.data.centre)
 
-    def fits(delays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def profile(delays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Half of what -2 log L of the windows exceeds its least, and the coordinates, at each delay."""
         prompt = course.at(0.0)[0]
         moves = [prompt, *({**prompt, n: x + np.ptp(x)} for n, x in prompt.items())]
         fixed, *others = (
-            np.asarray(_by_coordinates(problem, plan, _with_imposed(rows, x), jnp.asarray(z))) for x in moves
+            np.asarray(_terms_by_coordinates(problem, plan, _with_imposed(rows, x), jnp.asarray(z))) for x in moves
         )
         change = {n: (other - fixed) / np.ptp(x) for (n, x), other in zip(prompt.items(), others, strict=True)}
         # In units of what is imposed, whose factor then is 1: other residuals would shrink with a larger inertia.
@@ -445,7 +456,7 @@ def search_delay(problem: Problem, plan: Plan) -> Delay:
             means = course.at(float(delay))[0]
             moved = {n: (means[n] - prompt[n])[:, None, None] for n in change}
             f, y = (fixed[k] + sum(moved[n] * change[n][k] for n in change) for k in range(2))
-            all_integrals = np.concatenate([_integrated(plan, w, f, y) for w in cut], 1)[
+            all_integrals = np.concatenate([_integrate_terms(plan, w, f, y) for w in cut], 1)[
                 acts
             ]  # (equations, windows, 1 + z)
             all_integrals[..., 1:] -= all_integrals[..., :1] * growth
@@ -467,27 +478,28 @@ def search_delay(problem: Problem, plan: Plan) -> Delay:
     best = 0.0
     for delays in (grid, grid, None):
         delays = best + np.linspace(-step, step, 17) if delays is None else delays
-        cost, ends = fits(delays)
+        cost, ends = profile(delays)
         inner = np.r_[np.inf, cost, np.inf]
         lows = (inner[1:-1] <= inner[:-2]) & (inner[1:-1] <= inner[2:]) & (cost < SAME)
         k = int(np.argmin(np.abs(delays)))
         k = k if cost[k] < SAME else int(np.argmin(np.where(lows, np.abs(delays), np.inf)))
         best, z = float(delays[k]), np.clip(ends[k], -NEAR, NEAR)
-    return Delay(best if abs(best) > RESOLVED * step else 0.0, limit, bool(abs(best) > limit - step))
+    return FittedDelay(best if abs(best) > RESOLVED * step else 0.0, limit, bool(abs(best) > limit - step))
 
 
 # --- the regression -------------------------------------------------------------------------------------------
 
 
 @dataclasses.dataclass(frozen=True)
-class WeakForm:
-    """Whitened residuals of the windows of a log at base coordinates z, with their derivatives.
+class WeakFormFit:
+    """Regression of a log in weak form: whitened residuals of its windows at the fitted coordinates, with
+    derivatives.
 
     Attributes:
-        z: coordinates of the base that minimise the squared residuals of windows and priors.
-        residual: residual of windows, then z - centre, shape (windows + coordinates,).
-        jacobian: by the coordinates.
-        signatures: derivatives of the windows by each instance's amplitude [prior sd].
+        z: base coordinates that minimise the squared residuals of windows and priors.
+        residual: residuals of windows, then z - centre, shape (windows + coordinates,).
+        jacobian: derivatives with respect to the coordinates.
+        signatures: derivatives of the windows with respect to the amplitude of each instance [prior sd].
         windows: number of equations, one or more for each window.
     """
 
@@ -498,20 +510,20 @@ class WeakForm:
     windows: int
 
 
-def weak_form(problem: Problem, effects: tuple[ScoredEffect, ...] = ()) -> WeakForm | None:
-    """Returns the regression of a log's base parameters on its equations in weak form.
+def fit_weak_form(problem: Problem, effects: tuple[ScoredEffect, ...] = ()) -> WeakFormFit | None:
+    """Fits the base parameters of a log to its equations in weak form.
 
     None if the log does not show the states, or has too few windows.
 
     Args:
-        problem: problem of histories, without effects in its coordinates.
-        effects: instances whose signatures are computed.
+        problem: problem of time histories, without effects in its coordinates.
+        effects: effects whose signatures are computed.
     """
-    plan = plan_of(problem)
+    plan = state_plan(problem)
     if plan is None:
         return None
-    late = search_delay(problem, plan)
-    rows, _, cut = rows_and_windows(problem, plan, late.value)
+    late = fit_delay(problem, plan)
+    rows, _, cut = points_and_windows(problem, plan, late.value)
     cut = [w.part(k) for w in cut for k in np.array_split(np.arange(len(w.rows)), -(-len(w.rows) // TOGETHER))]
     equations = plan.electrical + plan.mechanical + len(plan.others)
     if equations * sum(len(w.rows) for w in cut) < ENOUGH * len(problem.coordinates):
@@ -519,25 +531,31 @@ def weak_form(problem: Problem, effects: tuple[ScoredEffect, ...] = ()) -> WeakF
 
     sd = np.asarray(rows.sd)
 
-    def terms(rows: Rows, z: np.ndarray) -> Terms:
-        return jax.device_get(_row_terms(problem, plan, rows, jnp.asarray(z), effects))  # one program for all of them
+    def terms(rows: LogPoints, z: np.ndarray) -> EquationTerms:
+        return jax.device_get(
+            _terms_with_derivatives(problem, plan, rows, jnp.asarray(z), effects)
+        )  # one program for all of them
 
-    def whole(factors: list[np.ndarray], given: Terms) -> np.ndarray:
+    def whole(factors: list[np.ndarray], given: EquationTerms) -> np.ndarray:
         each = zip(factors, cut, strict=True)
-        return np.concatenate([solve_triangular(x, integrals(plan, w, given), lower=True) for x, w in each])
+        return np.concatenate([solve_triangular(x, window_errors(plan, w, given), lower=True) for x, w in each])
 
     def of(z: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
         """Residuals and their derivatives, with the covariance and the states without noise at z."""
-        smooth = simulated_rows(problem, plan, rows, jnp.asarray(z))
+        smooth = with_smooth_states(problem, plan, rows, jnp.asarray(z))
         terms_there = terms(smooth, z)
         read, none = terms(rows, z), np.zeros(equations)
         plain = [_covariance_factor(plan, w, sd, terms_there, none) for w in cut]
         each = [
-            (integrals(plan, w, read)[:, 0], np.sum(x**2, 1), np.tile(np.sum(w.weight**2 / w.steps, 1), equations))
+            (
+                window_errors(plan, w, read)[:, 0],
+                np.sum(x**2, 1),
+                np.tile(np.sum(w.weight**2 / w.steps, 1), equations),
+            )
             for w, x in zip(cut, plain, strict=True)
         ]
         by_equation = (np.concatenate([x.reshape(equations, -1).T for x in part]) for part in zip(*each, strict=True))
-        unknown = disturbances(*by_equation)
+        unknown = disturbance_intensities(*by_equation)
         factors = [_covariance_factor(plan, w, sd, terms_there, unknown) for w in cut]
         offset = whole(factors, read)[:, 0] - whole(factors, terms_there)[:, 0]
 
@@ -570,35 +588,41 @@ def weak_form(problem: Problem, effects: tuple[ScoredEffect, ...] = ()) -> WeakF
     except (np.linalg.LinAlgError, ValueError):  # non-finite numbers
         return None
     count = len(both) - size
-    return WeakForm(z, both[:, 0], both[:, 1 : size + 1], both[:count, size + 1 :], count)
+    return WeakFormFit(z, both[:, 0], both[:, 1 : size + 1], both[:count, size + 1 :], count)
 
 
-def integrals(plan: Plan, w: Windows, terms: Terms) -> np.ndarray:
-    """Defects of a run's windows, their derivatives and signatures, (windows, 1 + coordinates + instances)."""
+def window_errors(plan: StatePlan, w: RunWindows, terms: EquationTerms) -> np.ndarray:
+    """Errors of the equations in a run's windows, with their derivatives and signatures, shape (windows, 1 +
+    coordinates + instances).
+    """
     given = (terms.f[..., None], terms.y[..., None]), terms.by_z, terms.by_effects
-    each = np.concatenate([_integrated(plan, w, np.asarray(f), np.asarray(y)) for f, y in given], 2)
+    each = np.concatenate([_integrate_terms(plan, w, np.asarray(f), np.asarray(y)) for f, y in given], 2)
     return each.reshape(-1, each.shape[2])
 
 
-def _integrated(plan: Plan, w: Windows, f: np.ndarray, y: np.ndarray) -> np.ndarray:
+def _integrate_terms(plan: StatePlan, w: RunWindows, f: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Integrals of terms over a run's windows, shape (equations, windows, ...)."""
-    slopes = enumerate(_slopes(plan, w, f.shape[1]))
+    slopes = enumerate(_derivative_weights(plan, w, f.shape[1]))
     integral = functools.partial(np.einsum, "wk,wk...->w...")
     return np.stack([integral(w.weight, f[w.rows, k]) + integral(slope, y[w.rows, k]) for k, slope in slopes])
 
 
-def _slopes(plan: Plan, w: Windows, equations: int) -> list[np.ndarray]:
+def _derivative_weights(plan: StatePlan, w: RunWindows, equations: int) -> list[np.ndarray]:
     """Factor of y in the windows of each equation: the derivative of the window, from integration by parts. For the
     equation of an angle reading, minus its second derivative."""
     return [-w.bend if plan.angle and k == plan.electrical else w.slope for k in range(equations)]
 
 
-def _covariance_factor(plan: Plan, w: Windows, sd: np.ndarray, terms: Terms, unknown: np.ndarray) -> np.ndarray:
-    """Factor of the covariance of some windows. `unknown`: torque and voltage without a model (`disturbances`)."""
+def _covariance_factor(
+    plan: StatePlan, w: RunWindows, sd: np.ndarray, terms: EquationTerms, unknown: np.ndarray
+) -> np.ndarray:
+    """Cholesky factor of the covariance of some windows. `unknown`: torque and voltage that the model does not
+    explain (`disturbance_intensities`).
+    """
     equations, (points, channels) = terms.f.shape[1], sd.shape
     by, also = terms.by_reading
     noise = []
-    for k, slope in enumerate(_slopes(plan, w, equations)):
+    for k, slope in enumerate(_derivative_weights(plan, w, equations)):
         changed = w.weight[..., None] * by[w.rows, k] + slope[..., None] * also[w.rows, k]
         own_equations = np.zeros((*w.rows.shape, equations))
         own_equations[..., k] = unknown[k] * w.weight / np.sqrt(w.steps)
@@ -613,16 +637,16 @@ def _covariance_factor(plan: Plan, w: Windows, sd: np.ndarray, terms: Terms, unk
     return np.linalg.cholesky(covariance + np.diag(FLOOR * np.maximum(np.diag(covariance), 1e-300)))
 
 
-def disturbances(defect: np.ndarray, noise: np.ndarray, unit: np.ndarray) -> np.ndarray:
-    """Intensities of white noise in the terms of each equation, in addition to that of the readings.
+def disturbance_intensities(defect: np.ndarray, noise: np.ndarray, unit: np.ndarray) -> np.ndarray:
+    """Intensity of white noise in the terms of each equation, in addition to the noise of the readings.
 
-    A model error is not white, but windows that the readings of a precise instrument weight would see only
-    its fastest part, and parameters would follow that. 0 if the readings' noise explains the defects.
+    A model error is not white. But without such noise, windows weighted for a precise instrument would see only the
+    fastest part of the error, and parameters would follow it. 0 if the noise of the readings explains the errors.
 
     Args:
         defect: error of each window, shape (windows, equations).
-        noise: its variance by the readings.
-        unit: by white noise of intensity 1.
+        noise: variance of these errors due to the readings.
+        unit: variance due to white noise of intensity 1.
     """
     more = np.mean(defect**2 - noise, 0)
     chance = CHANCE * np.sqrt(2 * np.sum(noise**2, 0) / APART) / len(defect)

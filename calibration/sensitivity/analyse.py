@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from calibration.data.input_errors import BadConfiguration
-from calibration.inference.fit_notes import Remark, next_step
+from calibration.inference.fit_notes import Remark, progress_remark
 from calibration.inference.identifiability import Z95
 from calibration.sensitivity.local import Local, correlated_directions, inert_inputs, local_derivatives
 from calibration.sensitivity.methods import Part, morris_screening, sobol_indices
@@ -49,7 +49,7 @@ def analyse_sensitivity(
     evaluations = usual if evaluations is None else evaluations
     if evaluations < LEAST:
         raise BadConfiguration(f"--evaluations: got {evaluations}; expected {LEAST} or more")
-    study.tell(next_step("points"))
+    study.tell(progress_remark("points"))
     studies = local_derivatives(study)
     if not any(np.isfinite(x).any() for x in studies.value.values()):
         raise BadConfiguration(_none_converges(study, studies.statuses))

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from calibration.data import Columns
-from calibration.inference.fit_notes import Remark, next_step
+from calibration.inference.fit_notes import Remark, progress_remark
 from calibration.sensitivity.model import Answer, Model, count_statuses
 from calibration.sensitivity.result import Points
 from calibration.sensitivity.uncertain_inputs import Inputs
@@ -105,7 +105,7 @@ class Study:
             if time.perf_counter() - self.told > SILENCE:
                 self.told = time.perf_counter()
                 rate = self.evaluations / max(self.seconds, 1e-9)
-                self.tell(next_step("evaluations", self.evaluations, rate))
+                self.tell(progress_remark("evaluations", self.evaluations, rate))
             yield k, answer.values
 
     def _count(self, answer: Answer, rows: int, began: float) -> None:

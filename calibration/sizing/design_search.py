@@ -18,7 +18,7 @@ from calibration.data import Names
 from calibration.data.input_errors import stated_word
 from calibration.data.parts import CellSheet
 from calibration.data.requirements_file import Requirements
-from calibration.inference.fit_notes import Remark, next_step
+from calibration.inference.fit_notes import Remark, progress_remark
 from calibration.sizing import sheet
 from calibration.sizing.design import CONTINUOUS, OBJECTIVES, Design, Task, build_robot, evaluate_design, sizing_task
 from calibration.sizing.part_options import Drive, Options, options_for_robot
@@ -266,17 +266,17 @@ def size_robot(
     problem = sizing_task(robot, asked, chosen)
     choice = choice_space(robot, problem, chosen)
     columns = [list(OBJECTIVES).index(name) for name in objectives]
-    tell(next_step("designs"))
+    tell(progress_remark("designs"))
     drawn = _random_designs(problem, choice, "cost" in objectives, np.random.default_rng(seed))
     kept = drawn.g.max(axis=0) >= 0
     unmeetable = tuple(label for label, k in zip(problem.labels, kept, strict=True) if not k)
     search = _Search(problem, choice, kept, columns)
     weights = search.weights(starts)
-    tell(next_step("descents", starts))
+    tell(progress_remark("descents", starts))
     free = search.descended(drawn, weights)
-    tell(next_step("whole"))
+    tell(progress_remark("whole"))
     real = search.real(drawn, free, weights)
-    tell(next_step("refined", REFINED))
+    tell(progress_remark("refined", REFINED))
     # The best of these with any ratio and parts of a cell: no search may have begun from their choice of parts.
     top = np.argsort(search.cost(real))[:REFINED]
     free = free + search.refined(real.rows[top], real.x[top], search.first(len(top)), np.ones(3))

@@ -15,7 +15,7 @@ from calibration.data import Json, Names
 from calibration.data.contradictions import cannot_stand
 from calibration.data.input_errors import BadConfiguration, allowed_words
 from calibration.data.requirements_file import STAIRS, TREAD, Envelope, Requirement, Requirements
-from calibration.inference.fit_notes import Remark, next_step
+from calibration.inference.fit_notes import Remark, progress_remark
 from mmrjax.compile.compiling import compiled
 from mmrjax.derived.requirements import EnvelopePoint, Ratings, evaluate_requirement, ratings
 from mmrjax.model import params
@@ -306,13 +306,13 @@ def check_requirements(
         )
     outcomes = []
     for k, h in enumerate(held, 1):
-        tell(next_step("requirement", k, len(held), h.requirement.quantity.label))
+        tell(progress_remark("requirement", k, len(held), h.requirement.quantity.label))
         outcomes.append(_outcome(h))
     if not changes:
         return tuple(outcomes)
     missed, answer = [k for k, o in enumerate(outcomes) if not o.met], list(outcomes)
     for n, k in enumerate(missed, 1):
-        tell(next_step("changes", n, len(missed), held[k].requirement.quantity.label))
+        tell(progress_remark("changes", n, len(missed), held[k].requirement.quantity.label))
         answer[k] = _with_changes(held[k], outcomes[k], held, outcomes)
     return tuple(answer)
 

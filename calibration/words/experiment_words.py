@@ -81,10 +81,10 @@ DOING = {
 
 def experiment_sentences(e: menu.Experiment) -> str:
     """Instruction of one experiment: the run, the readings, and the limits to watch."""
-    return _act(e) if isinstance(e, menu.Act) else _run(e)
+    return _act(e) if isinstance(e, menu.CalibrationAct) else _run(e)
 
 
-def _act(act: menu.Act) -> str:
+def _act(act: menu.CalibrationAct) -> str:
     if act.name == "weigh":
         configurations, payload = {k for k, _ in act.at}, max(m for _, m in act.at)
         each = {1: "", 2: "in both configurations, "}.get(len(configurations), "in each configuration, ")
@@ -99,7 +99,7 @@ def _act(act: menu.Act) -> str:
     return ACTS[kind].format(join_amounts([v for (v,) in act.at], UNITS[kind]))
 
 
-def _run(run: menu.Run) -> str:
+def _run(run: menu.ProposedRuns) -> str:
     level = (run.imposed != "voltage" or bool(run.torque)) and not any(run.slope)
     where = "" if run.setup in menu.WEIGHTLESS or level else f" {join_slopes(run.slope)}"
     read = join_words([channels.find_channel(c).label for c in run.channels])
@@ -111,7 +111,7 @@ def _run(run: menu.Run) -> str:
     return f"{text}. Watch {'; '.join(map(describe, run.watch))}" if run.watch else text
 
 
-def _doing(run: menu.Run) -> str:
+def _doing(run: menu.ProposedRuns) -> str:
     doing = DOING[run.doing].format(
         payload=run.payload[0],
         brake=1e3 * run.brake,

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-from calibration.inference.feedforward import WRONG_UNITS, Feedforward, units_of
+from calibration.inference.feedforward import WRONG_UNITS, Feedforward, constant_units
 
 
 def feedforward_statement(found: Feedforward) -> str:
     """Each constant with ± (95 %) and unit."""
-    units = units_of(found.unit)
+    units = constant_units(found.unit)
     listed = (f"{n} = {x:.4g} ± {1.96 * found.sds[n]:.2g} {units[n]}" for n, x in found.constants.items())
     return ", ".join(listed) + "."
 

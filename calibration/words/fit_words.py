@@ -15,7 +15,7 @@ from mmrjax.errors import count_noun
 from mmrjax.model import channels
 
 if TYPE_CHECKING:
-    from calibration.inference.lack_of_fit import Adequacy, Miss
+    from calibration.inference.lack_of_fit import Adequacy, RelativeError
     from calibration.inference.residual_clusters import ResidualCluster
     from calibration.inference.result import CalibrationResult
 
@@ -58,7 +58,7 @@ def estimated_noise(percent: tuple[tuple[str, float], ...]) -> str:
     )
 
 
-def determined_combination(two: fit_notes.Pair) -> str:
+def determined_combination(two: fit_notes.DependentPair) -> str:
     """Combination of two parameters that data determine: `the ratio of a and b`, `a + 0.03 · b`."""
     if two.form != "linear":
         return f"the {two.form} of {two.one} and {two.other}"
@@ -72,7 +72,7 @@ def is_determined_answer(found: fit_notes.Determination) -> str:
     return "no" if found.held else "yes"
 
 
-def only_together(pairs: tuple[fit_notes.Pair, ...]) -> str:
+def only_together(pairs: tuple[fit_notes.DependentPair, ...]) -> str:
     """Parameters that are not determined separately, with what is."""
     each = [f"{determined_combination(p)} (correlation {p.correlation:+.3f})" for p in pairs]
     return f"determined only together: {', '.join(each)}"
@@ -142,7 +142,7 @@ def members_jump(members: int, best: tuple[int, ...]) -> str:
     )
 
 
-def prior_edge(at: fit_notes.Edge) -> str:
+def prior_edge(at: fit_notes.ReachedBound) -> str:
     """Bound of a parameter, or its distance from the middle of its prior."""
     if at.bound:
         return f"at its {at.bound} bound"
@@ -152,7 +152,7 @@ def prior_edge(at: fit_notes.Edge) -> str:
 # --- what residuals show --------------------------------------------------------------------------------
 
 
-def shown_by(test: fit_notes.Shown) -> str:
+def shown_by(test: fit_notes.AdequacyFinding) -> str:
     """Result of the most significant test of residuals."""
     whose = f"the residuals of {channels.find_channel(test.channel).label}" if test.channel else ""
     return {
@@ -173,7 +173,7 @@ OBSTACLES = {
 }
 
 
-def _misses(those: Sequence[Miss]) -> str:
+def _misses(those: Sequence[RelativeError]) -> str:
     """`total current 74 % of its measured rms (32 % with the file as stated)`."""
     each = [
         f"{channels.find_channel(m.channel).label} {_percent(m.fitted)} of its measured rms ({_percent(m.as_stated)} "

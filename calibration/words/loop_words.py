@@ -14,7 +14,7 @@ from calibration.data.input_errors import three_digits
 from calibration.described import describe
 from calibration.discovery import loop_notes
 from calibration.discovery.location import DiscrepancyLocation
-from calibration.discovery.outliers import Cluster
+from calibration.discovery.outliers import OutlierCluster
 from calibration.discovery.settings import FIT, HELD_OUT, WITHOUT_NAME, Settings
 from calibration.inference import bases, blocks
 from calibration.inference.series_noise import SeriesNoise
@@ -27,14 +27,14 @@ if TYPE_CHECKING:
     from calibration.discovery.discover import LoopStages
     from calibration.discovery.result import (
         DiscoveryResult,
+        EffectRanking,
         Errors,
-        Estimate,
         FoundEffect,
-        Ranking,
-        Resolved,
-        Sensitivity,
+        NoiseVerdict,
+        ParameterEstimate,
+        TrackModelResult,
         UnnamedDiscrepancy,
-        Worse,
+        WorseChannel,
     )
 
 #: χ² from which on its digits are not printed [σ²].
@@ -49,7 +49,7 @@ def misfit_text(chi2: float) -> str:
 # --- the verdict ----------------------------------------------------------------------------------------
 
 
-def verdict_sentences(said: loop_notes.Summary) -> str:
+def verdict_sentences(said: loop_notes.VerdictSummary) -> str:
     """A verdict in a sentence or a few."""
     text = _verdict(said)
     if said.aside:
@@ -64,7 +64,7 @@ def verdict_sentences(said: loop_notes.Summary) -> str:
     return text
 
 
-def _verdict(said: loop_notes.Summary) -> str:
+def _verdict(said: loop_notes.VerdictSummary) -> str:
     where = said.where
     if said.verdict == "undescribed":
         return _undescribed(said)
@@ -92,7 +92,7 @@ def _verdict(said: loop_notes.Summary) -> str:
     return f"Missing: {'; '.join(names)} ({_evidence(said)}).{in_model}{left}"
 
 
-def _evidence(said: loop_notes.Summary) -> str:
+def _evidence(said: loop_notes.VerdictSummary) -> str:
     """p-value, and the errors that remain where the refit misses a channel."""
     remaining = [
         f"{channels.find_channel(m.channel).label} by {100 * m.error:.0f} % of its measured rms" for m in said.missed
@@ -127,7 +127,7 @@ def loop_answer(found: loop_notes.Headline) -> str:
     }[found.level]
 
 
-def _law(names: Sequence[str], families: Sequence[str], values: Sequence[loop_notes.FreedValue]) -> str:
+def _law(names: Sequence[str], families: Sequence[str], values: Sequence[loop_notes.AlternativeValue]) -> str:
     """`a loss torque that changes with speed (churning or windage; these data cannot tell which)`."""
     each = [*map(freed_value, values), *in_order_of_parts(names)]
     which = "; these data cannot tell which" if len(each) + len(families) > 2 else ""
@@ -150,7 +150,7 @@ def _are_missing(nouns: Sequence[str]) -> str:
     return f"{' and '.join(nouns)} {'is' if len(nouns) == 1 else 'are'} missing"
 
 
-def _undescribed(said: loop_notes.Summary) -> str:
+def _undescribed(said: loop_notes.VerdictSummary) -> str:
     """Sentence on a model that does not describe the runs: the misfit and the checks."""
     each = [
         f"{channels.find_channel(m.channel).label} by {100 * m.error:.0f} % of its measured rms"
@@ -231,7 +231,7 @@ def _level(variable: str, x: float) -> str:
     return f"{float(f'{x / factor:.3g}'):g} {unit}".rstrip()
 
 
-def brief_verdict(said: loop_notes.Summary) -> str:
+def brief_verdict(said: loop_notes.VerdictSummary) -> str:
     """A verdict, and the effects in the model by their leaders."""
     phrases = []
     if said.verdict == "mechanism" and said.mechanism is not None:
@@ -242,7 +242,7 @@ def brief_verdict(said: loop_notes.Summary) -> str:
     return ": ".join([said.verdict, *[", ".join(phrases)] * bool(phrases)])
 
 
-def at_other_noise(found: Sequence[Sensitivity]) -> str:
+def at_other_noise(found: Sequence[NoiseVerdict]) -> str:
     """The verdicts with other noise, in a sentence, empty for none."""
     same: dict[str, list[str]] = {}
     for one in found:
@@ -255,7 +255,7 @@ def at_other_noise(found: Sequence[Sensitivity]) -> str:
     return "; ".join(each) + near
 
 
-def _effect_and_rivals(one: loop_notes.Missing) -> str:
+def _effect_and_rivals(one: loop_notes.MissingEffect) -> str:
     """An effect, with what it cannot be told from."""
     readings = [with_article(f) for f in one.families[1:] if f.startswith("reading")]
     if len(one.names) + len(one.values) + len(readings) == 1:
@@ -267,7 +267,7 @@ def _effect_and_rivals(one: loop_notes.Missing) -> str:
     return f"{family}{', or '.join([listed, *values, *readings])} (these data cannot tell which)"
 
 
-def _tentative(those: Sequence[loop_notes.Missing], support: loop_notes.NameSupport | None) -> str:
+def _tentative(those: Sequence[loop_notes.MissingEffect], support: loop_notes.NameSupport | None) -> str:
     """Effects that are in the model without a name of their own, each with what speaks against it."""
     if not those:
         return ""
@@ -288,7 +288,7 @@ def verdict_line(stages: LoopStages) -> str:
     return f"at one noise: {', '.join((stages.verdict, *sure))}"
 
 
-def ranking_lines(found: Ranking, most: int = 5, brief: bool = False) -> list[str]:
+def ranking_lines(found: EffectRanking, most: int = 5, brief: bool = False) -> list[str]:
     """Lines of the ranking by regression: whether an effect is missing, and the strongest, `brief` by name alone."""
     by = f"by regression on {found.windows} windows of the log" if found.windows else "by regression"
     if not found.missing:
@@ -309,7 +309,7 @@ def ranking_lines(found: Ranking, most: int = 5, brief: bool = False) -> list[st
     return [f"{first}; strongest effects, each added alone:", *lines]
 
 
-def regression_verdict(found: Ranking) -> str:
+def regression_verdict(found: EffectRanking) -> str:
     """Answer of a ranking to a loop without a verdict: never more than a mechanism, and the base parameters."""
     beyond = [e for e in found.effects if e.score > found.chance and not e.supplies]
     alike = [e for e in beyond if e.score >= beyond[0].score - Settings.alternative]
@@ -376,7 +376,7 @@ def shown_over(variable: str, by_duty: bool = False) -> str:
     return f"in the runs at {happens.words}"
 
 
-def freed_value(v: loop_notes.FreedValue) -> str:
+def freed_value(v: loop_notes.AlternativeValue) -> str:
     """`motor.resistance is 1.94 ohm`."""
     return f"{v.name} is {v.value:.3g} {v.unit}".rstrip(" -")
 
@@ -389,7 +389,7 @@ def p_value(p: float) -> str:
     return f"≤ {math.ceil(p / step - 1e-9) * step:.1g}"
 
 
-def cluster_sentence(c: Cluster) -> str:
+def cluster_sentence(c: OutlierCluster) -> str:
     """Sentence on the common level of outlying rows."""
     where = f"at {c.axis} {c.level}" if c.level else f"at {c.axis} {c.low:.3g} to {c.high:.3g}"
     return f"{c.inside} of {c.of} outlying rows cluster {where} (p = {c.p:.1g})"
@@ -539,7 +539,7 @@ def naming_reasons(found: DiscoveryResult) -> str:
     reasons, lacks = support_reasons(found.support), found.unnamed
     if lacks is None or not found.after.adequate or (found.support is not None and found.support.curves):
         return reasons
-    over = loop_notes.CurveOver(lacks.place, (lacks.variable,))
+    over = loop_notes.PlacedCurve(lacks.place, (lacks.variable,))
     return "; ".join([REASONS["curve alone"].format(curves=_curve(over)), *[reasons] * bool(reasons)])
 
 
@@ -577,7 +577,7 @@ def effect_doubts(test: loop_notes.NameTest | None) -> str:
     return f"{', '.join(first)} and {last}" if first else last
 
 
-def _curve(c: loop_notes.CurveOver) -> str:
+def _curve(c: loop_notes.PlacedCurve) -> str:
     if bases.window_from_name(c.variables[0]) is not None:
         return f"constant in the {bases.place_in_words(c.place)} {shown_over(c.variables[0])}"
     return f"smooth {'curve' if len(c.variables) == 1 else 'surface'} in the {_place_over(c.place, *c.variables)}"
@@ -660,7 +660,7 @@ def hidden_effects_sentence(found: DiscoveryResult) -> str:
 def moved_parameter(name: str, value: float, stated: float, unit: str, shift: float) -> str:
     """`motor.friction_viscous is 1.2e-05 N·m·s, 3 times the stated 4e-06 (+2.3 prior sds)`."""
     ratio = f"{value / stated:.2g} times the " if stated and value / stated > 0 else ""
-    now = freed_value(loop_notes.FreedValue(f"`{name}`", value, unit))
+    now = freed_value(loop_notes.AlternativeValue(f"`{name}`", value, unit))
     return f"{now}, {ratio}stated {stated:.3g} ({shift:+.1f} prior sds)"
 
 
@@ -669,7 +669,7 @@ def effect_amplitude(e: FoundEffect) -> str:
     return _estimate(e.parameters["amplitude"])
 
 
-def _estimate(found: Estimate) -> str:
+def _estimate(found: ParameterEstimate) -> str:
     return f"{found.value:.3g} ± {found.sd:.2g} {found.unit}".rstrip(" -")
 
 
@@ -685,13 +685,14 @@ def indistinguishable_effects(found: DiscoveryResult, e: FoundEffect) -> str:
         + [f"{name} (only time histories can tell)" for name in settled if name not in e.members]
     )
     values = " or ".join(
-        f"{freed_value(loop_notes.FreedValue(name, s.value, s.unit))} (stated {s.stated:.3g}, {s.prior_sds:+.1f} sds)"
+        f"{freed_value(loop_notes.AlternativeValue(name, s.value, s.unit))} "
+        f"(stated {s.stated:.3g}, {s.prior_sds:+.1f} sds)"
         for name, s in e.stated.items()
     )
     return ", or ".join(words for words in (others, values) if words)
 
 
-def rising_errors_sentence(found: Sequence[Worse], predicted: Mapping[str, tuple[int, int]]) -> str:
+def rising_errors_sentence(found: Sequence[WorseChannel], predicted: Mapping[str, tuple[int, int]]) -> str:
     """Sentence on errors that rise and on rows that are no longer predicted, empty for none.
 
     Args:
@@ -719,7 +720,7 @@ def _two_numbers(before: float, after: float) -> str:
 # --- the track model ------------------------------------------------------------------------------------
 
 
-def track_model_question(about: loop_notes.Asked) -> str:
+def track_model_question(about: loop_notes.TrackModelQuestion) -> str:
     """Question to the track model."""
     return {
         "missing": f"the error of the {about.balance} balance over {about.variable.replace('_', ' ')}",
@@ -728,7 +729,7 @@ def track_model_question(about: loop_notes.Asked) -> str:
     }[about.why]
 
 
-def track_model_answer(found: Resolved) -> str:
+def track_model_answer(found: TrackModelResult) -> str:
     """Answer of the track model."""
     before, after = found.slip_rms
     gear = ", ".join(

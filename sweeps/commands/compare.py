@@ -87,13 +87,13 @@ def _over_time(
             "with their own masses and times; remove this option"
         )
     model = None if config.model == fidelities.NAMES[0] else config.model
-    ready = preparation.prepare(runs, file.robot)
+    ready = preparation.prepare_input(runs, file.robot)
     with open_folder("compare", config, ready.robot, beside, runs) as folder:
         table = run.simulate_histories(ready.robot, runs, model)
         comparison, summary = compare_readings(runs, table, ready.robot)
         comparison |= {column: runs[column] for column in (*OVER, "run_id") if runs.has(column)}
         if second is not None:
-            other = preparation.prepare(runs, second.robot).robot
+            other = preparation.prepare_input(runs, second.robot).robot
             comparison = add_second_robot(comparison, runs.channels, run.simulate_histories(other, runs, model))
         folder.write_table("comparison.csv", comparison)
         readings = ((comparison[f"simulated_{c.column}"], comparison[c.column]) for c in runs.channels)

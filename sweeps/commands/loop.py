@@ -20,11 +20,11 @@ from calibration.described import in_words
 from calibration.discovery import findings
 from calibration.discovery.discover import discover
 from calibration.discovery.kept import REFIT_FILE, OutOfTime
-from calibration.discovery.resolve import check_resolvable, resolve
-from calibration.discovery.result import DiscoveryResult, Ranking
+from calibration.discovery.resolve import check_resolvable, fit_track_model
+from calibration.discovery.result import DiscoveryResult, EffectRanking
 from calibration.discovery.settings import fewest_replicates
 from calibration.inference import observers, priors
-from calibration.inference.details import EquationDefects
+from calibration.inference.details import EquationErrors
 from calibration.inference.simulation_errors import root_mean_square
 from calibration.words import loop_words
 from calibration.words.step_words import expected_time
@@ -131,7 +131,7 @@ def _resolved(
     found: DiscoveryResult, config: configuration.Loop, members: Path | None, progress: Callable[[str], None]
 ) -> DiscoveryResult:
     """The result, with the track model's test added: does a different running gear explain the misfit?"""
-    resolved = resolve(
+    resolved = fit_track_model(
         found, noise=config.noise or None, population=config.population, generations=config.generations,
         members=members, seed=config.seed, tell=in_words(progress),
     )  # fmt: skip
@@ -167,7 +167,7 @@ def _alarm(seconds: float, wanted: Callable[[], bool]) -> Iterator[None]:
         signal.signal(signal.SIGALRM, before)
 
 
-def _show_ranking(found: Ranking, folder: RunFolder, timed: Callable[[str], None], brief: bool) -> None:
+def _show_ranking(found: EffectRanking, folder: RunFolder, timed: Callable[[str], None], brief: bool) -> None:
     """Print the ranking by regression, the first answer, and write it to the run folder."""
     first, *lines = loop_words.ranking_lines(found, brief=brief)
     timed(first)
@@ -214,7 +214,7 @@ def _say_kept(stages: Mapping[str, Any], folder: RunFolder, robot_name: str) -> 
 def changes_by_effect(found: DiscoveryResult) -> dict[str, Change]:
     """Change of settled runs by each effect, empty for histories and for effects that the written robot lacks."""
     added = [e.name for e in found.effects if e.name in {x.name for x in found.robot.effects}]
-    if not isinstance(found.detail, EquationDefects) or not added:
+    if not isinstance(found.detail, EquationErrors) or not added:
         return {}
     conditions = found.runs.conditions(found.robot)
 

@@ -19,7 +19,7 @@ from calibration.data.stated import EXAMPLE, EXAMPLE_SHARE, is_example
 from calibration.described import describe, sentences
 from calibration.inference import foresight, identifiability, priors
 from calibration.inference.fit_notes import Determination
-from calibration.inference.foresight import Determined, Foresight
+from calibration.inference.foresight import InformationForecast, ParameterInformation
 from calibration.inference.identifiability import undetermined_names
 from calibration.words import fit_words
 from mmrjax.errors import count_noun
@@ -59,7 +59,7 @@ class RigCheck:
     origins: tuple[Origin, ...]
     facts: tuple[Fact, ...]
     runs: Runs | None = None
-    foresight: Foresight | None = None
+    foresight: InformationForecast | None = None
     doubts: Names = ()
 
     def understood(self) -> list[str]:
@@ -204,7 +204,7 @@ class RigCheck:
         parts += [f"{', '.join(held)} are not determined by these runs"] * bool(held)
         return "; ".join(parts) + "."
 
-    def determined(self, parameter: Determined) -> str:
+    def determined(self, parameter: ParameterInformation) -> str:
         """`yes`, `no`, or the parameters with which the table determines this one in combination."""
         assert self.foresight is not None
         return describe(Determination.from_pairs(parameter.name, parameter.held, self.foresight.together))
@@ -348,7 +348,7 @@ def check_document(found: RigCheck) -> Document:
     )
 
 
-def _data_blocks(found: RigCheck, runs: Runs, seen: Foresight) -> tuple[Block, ...]:
+def _data_blocks(found: RigCheck, runs: Runs, seen: InformationForecast) -> tuple[Block, ...]:
     used = [
         (
             c["column"] if c["theirs"] in ("", c["column"]) else f"{c['column']}, yours {c['theirs']}",

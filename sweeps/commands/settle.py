@@ -37,7 +37,7 @@ def execute(config: configuration.Settle, beside: configuration.SettledLog) -> i
         folder.write_table("settled.csv", settled.table())
         folder.write_table("stretches.csv", stretches_table(settled))
         folder.write_json("result.json", to_json(settled, few))
-        turned = sentences(ranges.turned_signs(settled.settled_runs(), robot))
+        turned = sentences(ranges.remarks_on_signs(settled.settled_runs(), robot))
         document = print_report(settle_report.settle_document(settled, few, turned))
         return finish_run_folder(
             folder,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from calibration.described import sentences
-from calibration.inference.feedforward import Feedforward, interval, units_of
+from calibration.inference.feedforward import Feedforward, constant_units, interval_95
 from calibration.words import feedforward_words
 from sweeps.report import catalogue
 from sweeps.report.document import Block, Document, Section, remarks
@@ -11,8 +11,8 @@ from sweeps.report.document import Block, Document, Section, remarks
 
 def feedforward_document(found: Feedforward) -> Document:
     """Constants, gains, remarks and the two figures."""
-    units, t = units_of(found.unit), found.tolerances
-    constants = [(n, x, interval(x, found.sds[n])[1] - x, units[n]) for n, x in found.constants.items()]
+    units, t = constant_units(found.unit), found.tolerances
+    constants = [(n, x, interval_95(x, found.sds[n])[1] - x, units[n]) for n, x in found.constants.items()]
     gains = [(*name.split("_"), x, units[name.split("_")[1]]) for name, x in found.gains.items()]
     asked = (
         f"Gains for tolerances of {t.position:g} {found.unit}, {t.velocity:g} {found.unit}/s and {t.effort:g} V, a "

@@ -15,7 +15,7 @@ from calibration.discovery.result import DiscoveryResult
 from calibration.discovery.settings import WITHOUT_NAME
 from calibration.inference import blocks
 from calibration.inference.details import TimeStatistics
-from calibration.inference.fit_notes import Determination, with_codes
+from calibration.inference.fit_notes import Determination, remarks_with_codes
 from calibration.inference.simulation_errors import OF_SIZE
 from calibration.words import loop_words
 from mmrjax.effects import BY_NAME
@@ -194,7 +194,7 @@ def _advice(found: DiscoveryResult) -> Table:
         more += " Some pairs remain undecided."
     far = [
         describe(note)
-        for note in with_codes(found.remarks, "after_steps", "shifted", "far_from_prior", "repeats", "copied")
+        for note in remarks_with_codes(found.remarks, "after_steps", "shifted", "far_from_prior", "repeats", "copied")
     ]
     against = [note for note in found.remarks if isinstance(note, str)]
     sentences = [

@@ -376,8 +376,8 @@ def signature(
 
 #: How a run of the menu is carried out (see `_free`), by the name of its setup.
 HOW = {
-    "on_ground": "travel", "reversed_": "reverse", "lifted": "lifted", "bare": "motor", "braked": "brake",
-    "blocked": "stall",
+    "on_ground": "travel", "facing_backward": "reverse", "lifted": "lifted", "uncoupled": "motor", "braked": "brake",
+    "locked": "stall",
 }  # fmt: skip
 #: Channel whose instrument a calibration act reads; `weigh` reads the scales.
 _SHOWS = {"shunt": 0, "zero current": 0, "strobe": 1, "timing": 2}

@@ -1,4 +1,4 @@
-"""Observers: readings of runs, settled or over time, and the treatment of each kind in inference. One file a kind.
+"""Observers: how inference treats each kind of data, settled runs or time histories. Each kind has its own file.
 
 No other room tests which kind a table has (tests/test_structure.py checks the code for it).
 """
@@ -27,12 +27,14 @@ KINDS: tuple[type[Observer], ...] = (Histories, SettledTurns, SettledRuns)
 
 
 def observer_kind(runs: Runs) -> type[Observer]:
-    """The observer of a table: time histories where it has `time_s`, else settled turns or straight runs."""
-    return next(k for k in KINDS if k.observes(runs))
+    """Observer class of a table: time histories if it has `time_s`, otherwise settled turns or settled straight
+    runs.
+    """
+    return next(k for k in KINDS if k.accepts_table(runs))
 
 
-def fidelity_facts(model: str) -> Facts:
-    """Facts about a fidelity, by its name.
+def facts_of_fidelity(model: str) -> Facts:
+    """Properties of a fidelity, by its name.
 
     Raises:
         BadConfiguration: no such fidelity.
@@ -48,14 +50,14 @@ def pose_problem(
 
     Args:
         sd: standard deviation of the readings [SI], shape (rows, channels).
-        model: name of the fidelity that simulates them. None takes the first that the kind of data allows.
+        model: name of the fidelity that simulates them. None: the first one that the kind of data allows.
 
     Raises:
-        BadConfiguration: no such fidelity, or one that cannot simulate data of this kind.
+        BadConfiguration: no such fidelity, or one that cannot simulate this kind of data.
         BadData: a configuration that `base` does not have.
     """
     if model is not None:
-        fidelity_facts(model)
+        facts_of_fidelity(model)
     observe = observer_kind(runs).of(runs, base, model)
     return Problem(
         params.without_weak_types(base),

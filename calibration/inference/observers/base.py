@@ -1,4 +1,4 @@
-"""Protocol of observers."""
+"""Interface of observers: readings of one kind of runs, and how inference treats them."""
 
 from __future__ import annotations
 
@@ -32,10 +32,10 @@ class SearchPolicy:
     """Options of batched fits for one kind of data.
 
     Attributes:
-        batch: fits in one batch.
-        steps: largest number of steps of one.
+        batch: number of fits in one batch.
+        steps: largest number of steps of a fit.
         searches: number of searches of the base.
-        one_by_one: True if outliers are removed one at a time, with a fit after each.
+        one_by_one: True if outliers are removed one at a time, with a refit after each.
     """
 
     batch: int = 16
@@ -45,7 +45,9 @@ class SearchPolicy:
 
 
 class CurveScores(Protocol):
-    """Scores of curves in the residuals: normal deviates, and decrease of χ² by each [σ²], shape (families,)."""
+    """Scores of smooth curves on the residuals: normal deviate, and decrease of χ² [σ²], of each family, shape
+    (families,).
+    """
 
     @property
     def curve(self) -> Array: ...
@@ -55,14 +57,14 @@ class CurveScores(Protocol):
 
 
 class Statistics(Protocol):
-    """Strongest statistics of a fit. `white` measures the memory of its residuals."""
+    """Strongest statistics of a fit. `white` measures the autocorrelation of its residuals."""
 
     @property
     def white(self) -> Any: ...
 
 
 class AdequacyTest(Protocol):
-    """Test of a fit's residuals, by kind of statistic."""
+    """Test of a fit's residuals, for each kind of statistic."""
 
     @property
     def found(self) -> Statistics: ...
@@ -73,7 +75,7 @@ class AdequacyTest(Protocol):
 
 
 class Diagnosis(Protocol):
-    """Parts of a fit and its residuals that an observer reads, see `discovery.adequacy.Diagnosis`."""
+    """Parts of a diagnosis that an observer reads, see `discovery.adequacy.Diagnosis`."""
 
     @property
     def linear(self) -> Linearization: ...
@@ -86,21 +88,21 @@ class Diagnosis(Protocol):
 
 
 class Observer(eqx.Module):
-    """Readings of runs of one kind, and the facts about that kind that inference needs.
+    """Readings of one kind of runs, and the properties of that kind that inference needs.
 
     Attributes:
-        conditions: conditions of each run, shape (runs,). Conditions that change within a history, at each of its
-            instants.
+        conditions: conditions of each run, shape (runs,). Conditions that change within a history have a value at
+            each instant.
         word: noun for a row in messages.
-        fewest: rows needed to separate a missing effect from noise.
-        axis: column of a table that orders the rows of a run, empty if a run is one row.
+        fewest: smallest number of rows that can separate a missing effect from noise.
+        axis: column that orders the rows of a run, empty if each run is one row.
         sizes_padded: numbers of rows to which tables are padded, so that those of similar size share compiled
             programs. Larger tables are padded to a multiple of the last one. Empty for no padding.
-        blocks: kinds of blocks to hold out, the most informative first.
+        blocks: kinds of block to hold out, the most informative first.
         policy: options of batched fits.
         rows_tell: True if one row alone can reveal a missing effect.
         evidence: kinds of evidence for a missing effect.
-        library: effects that such data show in addition to the library's.
+        library: effects that only such data can reveal, in addition to the library.
         menu: True if the menu of experiments has runs of this kind.
         searches: number of starts of a calibration. None: the default of the fidelity.
         profiled: False if parameters are never profiled for this kind, whatever the fidelity states.
@@ -125,28 +127,28 @@ class Observer(eqx.Module):
 
     @classmethod
     def axes_of(cls, runs: Runs) -> Names:
-        """Columns of a table that its readings vary with."""
+        """Columns of a table with which its readings vary."""
         return (*runs.axes, *([cls.axis] if cls.axis else []))
 
     @classmethod
     @abc.abstractmethod
-    def observes(cls, runs: Runs) -> bool:
+    def accepts_table(cls, runs: Runs) -> bool:
         """True if a table is of this kind."""
 
     @classmethod
     @abc.abstractmethod
     def of(cls, runs: Runs, robot: Robot, fidelity: str | None = None) -> Observer:
-        """Observer of a table. See `observers.pose_problem`."""
+        """Creates the observer of a table. Arguments as in `observers.pose_problem`."""
 
     @classmethod
     @abc.abstractmethod
     def sizes(cls, runs: Runs) -> np.ndarray:
-        """Reference sizes of noise stated as a share [SI], shape (rows, channels)."""
+        """Reference size of each reading [SI] for noise stated as a share, shape (rows, channels)."""
 
     @classmethod
     @abc.abstractmethod
     def check(cls, runs: Runs, noise: Noise) -> list[Remark | str]:
-        """Reject runs that contradict each other. Return notes on the others.
+        """Rejects runs that contradict each other. Returns remarks on the others.
 
         Raises:
             BadData: readings that cannot all be true.
@@ -155,7 +157,7 @@ class Observer(eqx.Module):
     @classmethod
     @abc.abstractmethod
     def check_start(cls, runs: Runs, noise: Noise, robot: Robot) -> list[Remark | str]:
-        """Reject runs whose initial state the model cannot reproduce. Return notes on the length of the others.
+        """Rejects runs whose initial state the model cannot reproduce. Returns remarks on the length of the others.
 
         Raises:
             BadData: a run does not begin in an initial state of the model.
@@ -163,13 +165,13 @@ class Observer(eqx.Module):
 
     @classmethod
     def with_initial_states(cls, robot: Robot, runs: Runs, noise: Noise) -> Robot:
-        """`robot` with the initial states of runs that do not begin at rest. Unchanged for settled runs."""
+        """Robot with the initial states of runs that do not begin at rest. Unchanged for settled runs."""
         return robot
 
     @classmethod
     @abc.abstractmethod
     def check_settled(cls, runs: Runs) -> None:
-        """Reject runs other than settled ones of one row each.
+        """Rejects data other than settled runs with one row each.
 
         Raises:
             BadData: time histories.
@@ -178,87 +180,92 @@ class Observer(eqx.Module):
     @classmethod
     @abc.abstractmethod
     def settled(cls, runs: Runs, steady: bool = False) -> tuple[Runs, np.ndarray, np.ndarray]:
-        """One row a run, its final readings [SI], shape (runs, channels), and its duration [s].
+        """One row for each run, the final readings of the run [SI], shape (runs, channels), and its duration [s].
 
         Args:
-            steady: True to omit runs with a speed that still changes as it does below half of steady travel.
+            steady: True to omit runs whose speed still changes as much as it does below half of steady travel.
         """
 
     @classmethod
     @abc.abstractmethod
     def identity(cls, runs: Runs) -> Names:
-        """Columns in which duplicates of a row agree."""
+        """Columns in which copies of a row agree."""
 
     @classmethod
     @abc.abstractmethod
     def shows(cls, effect: type[Effect]) -> bool:
-        """True if data of this kind with an external supply can show an effect."""
+        """True if data of this kind, with an external supply, can reveal an effect."""
 
     @classmethod
     @abc.abstractmethod
     def free(cls) -> tuple[Names, Names]:
-        """Further parameters that such data determine: of the drive, and of each chassis."""
+        """Names of further parameters that such data determine: of the drive, and of each chassis."""
 
     # --- of robots
 
     @abc.abstractmethod
     def __call__(self, robot: Robot) -> Observation:
-        """Observation of a robot in each row."""
+        """Simulated observation of a robot in each row."""
 
     def solve(self, robot: Robot) -> tuple[Array, Array] | None:
-        """Unknowns of each row, shape (rows, unknowns), and True if found, None if rows are no roots of equations."""
+        """Unknowns of each row, shape (rows, unknowns), and True if a solution was found. None if rows are not
+        solutions of equations.
+        """
         return None
 
     @property
     def apart(self) -> bool:
-        """True if `solve` takes much longer to compile than `shown`, so that it is a program of its own."""
+        """True if `solve` takes much longer to compile than `shown`, so that it is compiled as a separate program."""
         return False
 
     def read(self, robot: Robot) -> Observation:
-        """Observation of a robot in each row. Only for observers with `apart`."""
+        """Simulated observation of a robot in each row. Only for observers with a separate program for `solve`."""
         raise NotImplementedError
 
     def shown(self, robot: Robot, unknowns: Array, found: Array) -> tuple[Observation, Signals, Array]:
-        """Observation of a robot in each row at given unknowns, its signals, and the residuals of its equations,
-        shape (rows, unknowns)."""
+        """Observation of a robot in each row at given unknowns, its signals, and the residuals of its equations
+        there.
+
+        The residuals have the shape (rows, unknowns).
+        """
         raise NotImplementedError
 
-    def operating(self, robot: Robot) -> Signals | None:
-        """Signals of a robot at each row's operating point, None for rows without one."""
+    def operating_points(self, robot: Robot) -> Signals | None:
+        """Signals of a robot at the operating point of each row. None if rows have no operating point."""
         return None
 
     @property
     @abc.abstractmethod
     def long(self) -> bool:
-        """True if the model is a rollout: searches then run one at a time, and end sooner."""
+        """True if the model is a rollout. Searches then run one at a time and end sooner."""
 
     @property
     @abc.abstractmethod
-    def eased(self) -> bool:
-        """True if a search may begin at the optimum of the same problem with `steady`."""
+    def starts_from_steady(self) -> bool:
+        """True if a search may start at the optimum of the same problem with `steady`."""
 
     @abc.abstractmethod
     def unreachable(self, status: np.ndarray) -> np.ndarray:
-        """True for rows without an operating point of the required kind."""
+        """True for rows whose status is not a valid operating point."""
 
     @property
     def driven(self) -> Conditions:
-        """Conditions under which the robot was driven, as if forwards, shape (cases,)."""
+        """Conditions under which the robot was driven, all taken as forward, shape (cases,)."""
         return self.conditions
 
     def cautions(self, robot: Robot) -> list[str]:
-        """Cautions about the readings of a calibrated robot, as sentences."""
+        """Warnings about the readings of a calibrated robot, as sentences."""
         return []
 
     @abc.abstractmethod
-    def runs_counting(self, included: np.ndarray) -> int:
+    def number_of_included_runs(self, included: np.ndarray) -> int:
         """Number of runs with at least one included row."""
 
     def noise_misfit(self, off: Callable[[], np.ndarray], counts: Bool[np.ndarray, "rows channels"]) -> float:
-        """Expected χ² of noise alone: one for each reading of settled runs, because their rows are independent.
+        """Expected χ² of noise alone. For settled runs it is one for each reading, because rows are independent.
 
         Args:
-            off: returns the whitened residuals of a fit, shape (rows, channels).
+            off: function that returns the whitened residuals of a fit, shape (rows, channels).
             counts: True for included readings.
         """
         return float(counts.sum())
@@ -267,66 +274,69 @@ class Observer(eqx.Module):
 
     @abc.abstractmethod
     def linearise(self, problem: Problem, z: Array, data: Data, effects: tuple[ScoredEffect, ...]) -> Linearization:
-        """Residuals, Jacobian and signatures at z."""
+        """Residuals, Jacobian and sensitivities to effects at z."""
 
     def at_fit(self, problem: Problem, z: Numbers) -> Observer:
-        """Observer updated by the facts about its runs that a fit has determined."""
+        """Observer with facts about its runs that a fit has determined."""
         return self
 
     def draws(self, problem: Problem, z: Array, linear: Linearization, keys: Array, factors: np.ndarray) -> Any:
-        """Initial values of the bootstrap's replicates, leading axis the keys: the keys, or fits of tables drawn.
+        """Random input of each bootstrap replicate, first axis the replicates: the keys, or fits of drawn tables.
 
         Args:
-            problem: problem of the base only, at its fit z.
-            linear: the same fit, linearised.
-            keys: random keys, as numbers, shape (replicates, words).
+            problem: problem of the base, with its fit z.
+            linear: linearization of that fit.
+            keys: random keys as numbers, shape (replicates, words).
             factors: factors on the sds of each replicate, shape (replicates, channels).
         """
         return keys
 
     @abc.abstractmethod
-    def replicate(
+    def fit_replicate(
         self, problem: Problem, data: Data, effects: tuple[ScoredEffect, ...], linear: Linearization, drawn: Any
     ) -> Linearization:
-        """One replicate of the bootstrap: a table drawn from the fit of the base, fitted again and linearised.
+        """Linearization of one bootstrap replicate: a table that is drawn from the fit of the base and refitted.
 
         Args:
-            problem: problem of the base only.
+            problem: problem of the base.
             data: data of the table.
-            linear: the fit, linearised.
-            drawn: one of `draws`.
+            linear: linearization of the fit.
+            drawn: one element of `draw_replicates`.
         """
 
     def starts(
         self, problem: Problem, random: np.random.Generator, count: int, every: Problem | None = None
     ) -> Float[np.ndarray, "starts z"]:
-        """Initial coordinates of at most `count` searches of a base: the prior mean, and draws of the prior.
+        """Initial coordinates for at most `count` searches of a base: the prior mean, and draws of the prior.
 
         Args:
             problem: problem without effects in its coordinates.
-            every: the same with all rows of a log that was thinned.
+            every: the same problem with all rows of a log that was thinned.
         """
         size = len(problem.coordinates)
         return np.concatenate([np.zeros((1, size)), random.standard_normal((max(count, 1) - 1, size))])
 
     def scanned(self, problem: Problem) -> tuple[int, ...]:
-        """Coordinates with an objective that is scanned over the prior's range, see `scans`.
+        """Coordinates whose objective is scanned over the range of the prior, see `scans`.
 
-        Empty for a kind of data with enough starts drawn from the prior to reach every basin.
+        Empty if enough starts are drawn from the prior to reach every local optimum.
         """
         return ()
 
-    def scan_points(self, problem: Problem, k: int) -> int:
-        """Number of values of a coordinate that are scanned, a multiple of `scans.CLOSER`."""
+    def number_of_scan_points(self, problem: Problem, k: int) -> int:
+        """Number of values at which a coordinate is scanned, a multiple of `scans.CLOSER`."""
         raise NotImplementedError
 
     def scan(self, problem: Problem, z: Array, data: Data, k: int, values: Array) -> tuple[Array, Array]:
-        """Objective, shape (values,), at each of `values` of coordinate k, and all coordinates there, (values,
-        coordinates). The others move from z to the minimum of their linearisation."""
+        """Objective at each of `values` of coordinate k, shape (values,), and all coordinates there, shape (values,
+        coordinates).
+
+        The other coordinates move from z to the minimum of the linearised objective.
+        """
         raise NotImplementedError
 
     def places(self, problem: Problem) -> int:
-        """Number of searches of a problem that run together on a core, by `searches_refilled`."""
+        """Number of searches of a problem that run together on a core, see `searches_refilled`."""
         raise NotImplementedError
 
     @abc.abstractmethod
@@ -341,22 +351,22 @@ class Observer(eqx.Module):
         most: int | None = None,
         scanned: Problem | None = None,
     ) -> tuple[Optimum, Observation]:
-        """Optima of any number of fits, each with its own weights, and their observations.
+        """Fits from any number of starts, each with its own weights, and the observations at their optima.
 
         Args:
-            starts: shape (members, coordinates).
-            weights: weights of each member's readings, (members, rows, channels).
-            active: set of effects of each member, see `ActiveSet`. None keeps the problem's.
-            rivals: True if all search the same optimum, so that some may be stopped early.
-            most: largest number of steps of each. None: the policy's.
-            scanned: problem of the base only, whose coordinates are scanned and come first. None: the problem itself.
+            starts: initial coordinates, shape (members, coordinates).
+            weights: weights of the readings of each member, shape (members, rows, channels).
+            active: set of effects of each member, see `ActiveSet`. None: those of the problem.
+            rivals: True if all members search the same optimum, so that some may be stopped early.
+            most: largest number of steps. None: that of the policy.
+            scanned: problem of the base, whose coordinates come first and are scanned. None: the problem itself.
         """
 
-    def observed(self, problem: Problem, z: Numbers, active: Numbers | None = None) -> Observation:
-        """Observation of the model in each row at z.
+    def observation_at(self, problem: Problem, z: Numbers, active: Numbers | None = None) -> Observation:
+        """Simulated observation in each row at z.
 
         Args:
-            active: its effects, for a problem with slots.
+            active: effects in the slots, for a problem with slots.
         """
         if not self.long:
             return self.at(problem, z, active)[2]
@@ -364,26 +374,26 @@ class Observer(eqx.Module):
         return observe_robot(problem, problem.robot(jnp.asarray(z)))
 
     def at(self, problem: Problem, z: Numbers, active: Numbers | None = None) -> tuple[Numbers, Numbers, Observation]:
-        """Residuals, their Jacobian and the observation at z. Arguments as in `observed`."""
+        """Residuals, their Jacobian and the observation at z. Arguments as in `observation_at`."""
         return linearise(_with_effects(problem, active), jnp.asarray(z), problem.data)
 
     @abc.abstractmethod
     def bases(self, columns: Columns, included: Bool[np.ndarray, " rows"], robot: Robot) -> Bases:
-        """Bases of curves for the search for a discrepancy.
+        """Bases of smooth curves that describe a discrepancy.
 
         Args:
             columns: columns of the padded table, with fitted readings.
-            robot: fitted.
+            robot: fitted robot.
         """
 
     @abc.abstractmethod
     def detail(self, bases: Bases, included: np.ndarray, before: Diagnosis, after: Diagnosis) -> Detail:
-        """Further findings for data of this kind.
+        """Further findings for this kind of data.
 
         Args:
-            bases: bases of curves.
+            bases: bases of smooth curves.
             included: True for included rows of the table.
-            before, after: diagnoses of base and proposed robot.
+            before, after: diagnoses without and with the proposal.
         """
 
 

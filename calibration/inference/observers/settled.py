@@ -20,15 +20,15 @@ from calibration.data.runs import Runs
 from calibration.described import describe
 from calibration.inference import bases as bases_room
 from calibration.inference.bases import Bases
-from calibration.inference.details import EquationDefects
+from calibration.inference.details import EquationErrors
 from calibration.inference.fit_notes import Remark
 from calibration.inference.linearization import Linearization, ScoredEffect, balance_probe, finite_or_zero
 from calibration.inference.noise import Noise
 from calibration.inference.observers.base import Diagnosis, Observer, SearchPolicy
 from calibration.inference.optimizers import (
-    Member,
     Numbers,
     Optimum,
+    SearchMember,
     penalty_slice,
     search_refilling,
     zero_inactive_residuals,
@@ -121,7 +121,7 @@ class SettledRuns(Observer):
     fidelity: str = eqx.field(static=True)
 
     @classmethod
-    def observes(cls, runs: Runs) -> bool:
+    def accepts_table(cls, runs: Runs) -> bool:
         return not runs.has("time_s")
 
     @classmethod
@@ -244,7 +244,7 @@ class SettledRuns(Observer):
         result, signals, left = jax.vmap(one)(self.conditions, unknowns, found)
         return self._simulated_readings(robot, result), signals, left
 
-    def operating(self, robot: Robot) -> Signals | None:
+    def operating_points(self, robot: Robot) -> Signals | None:
         if self.long or self.conditions.turns:
             return None
         return jax.vmap(functools.partial(operating_signals, robot))(self.conditions)
@@ -254,13 +254,13 @@ class SettledRuns(Observer):
         return fidelities.fidelity_facts(self.fidelity).rollout
 
     @property
-    def eased(self) -> bool:
+    def starts_from_steady(self) -> bool:
         return self.long
 
     def unreachable(self, status: np.ndarray) -> np.ndarray:
         return np.isin(status, (SLIDES, FAILED, TIPS))
 
-    def runs_counting(self, included: np.ndarray) -> int:
+    def number_of_included_runs(self, included: np.ndarray) -> int:
         return int(included.sum())
 
     def cautions(self, robot: Robot) -> list[str]:
@@ -328,11 +328,11 @@ class SettledRuns(Observer):
         clean = data.measured + data.sd * linear.by_row()  # for included readings
         measured, centre = jax.device_get(_draw_tables(clean, data.sd, z, keys, jnp.asarray(factors)))
         start, weight = (np.repeat(np.asarray(x)[None], count, 0) for x in (z, data.weight))
-        members = Member(start, weight, measured, centre)
+        members = SearchMember(start, weight, measured, centre)
         refits, _ = search_refilling(problem, members, self.policy.steps, self.places(problem))
         return measured, centre, refits.z
 
-    def replicate(
+    def fit_replicate(
         self,
         problem: Problem,
         data: Data,
@@ -358,7 +358,7 @@ class SettledRuns(Observer):
         data, count = problem.data, len(starts)
         measured, centre = (np.repeat(np.asarray(x)[None], count, 0) for x in (data.measured, data.centre))
         own = np.asarray(starts), np.asarray(weights), measured, centre
-        members = Member(*own, active=None if active is None else np.asarray(active))
+        members = SearchMember(*own, active=None if active is None else np.asarray(active))
         steps = self.policy.steps if most is None else most
         return search_refilling(problem, members, steps, self.places(problem))
 
@@ -380,12 +380,12 @@ class SettledRuns(Observer):
         base_arguments = columns, weight, robot, None, ways
         return (*bases_room.curve_families(*base_arguments), *bases_room.window_families(*base_arguments))
 
-    def detail(self, bases: Bases, included: np.ndarray, before: Diagnosis, after: Diagnosis) -> EquationDefects:
+    def detail(self, bases: Bases, included: np.ndarray, before: Diagnosis, after: Diagnosis) -> EquationErrors:
         """Defects of `electrical`, `track` and `slip` that together make each row's residual.
 
         Residuals are simulated less measured. Sides have defects of their own if they are driven independently.
         """
-        return EquationDefects(_row_defects(before.linear, included), _row_defects(after.linear, included))
+        return EquationErrors(_row_defects(before.linear, included), _row_defects(after.linear, included))
 
 
 def _unmeasured(observe: SettledRuns, robot: Robot, columns: Columns) -> dict[str, Float[np.ndarray, " rows"]]:

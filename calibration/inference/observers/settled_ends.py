@@ -1,4 +1,4 @@
-"""Starts of fits of histories, from their settled ends, for any adhesion of the ground.
+"""Starts of fits of time histories: fits to their settled ends, at several adhesions of the ground.
 
 The misfit of a start has several valleys: a run that grips although the measured one slides (or the reverse) keeps
 doing so during the descent. At its end, a run's dependence on this is through its creep only. So the base is first
@@ -63,12 +63,13 @@ SLIDING = "ground.friction.dynamic", "ground.friction.speed_dynamic"
 
 
 @dataclasses.dataclass(frozen=True)
-class Ends:
-    """Means over the settled ends of runs, and of the intervals of runs with changing conditions.
+class SettledEnds:
+    """Mean readings over the settled ends of runs, and of the intervals of runs whose conditions change.
 
     Attributes:
-        conditions: shape (ends,).
-        mean, sd: [SI], NaN if a channel is not measured or not settled, shape (ends, channels).
+        conditions: conditions at each end, shape (ends,).
+        mean, sd: means and their standard deviations [SI], shape (ends, channels). NaN if a channel is not measured
+            or not settled.
         shown: the same means, whether settled or not.
     """
 
@@ -78,8 +79,8 @@ class Ends:
     shown: np.ndarray
 
 
-def settled_ends(problem: Problem) -> Ends:
-    """Settled readings at the ends of a problem's runs, driven forwards."""
+def settled_ends_of_runs(problem: Problem) -> SettledEnds:
+    """Settled readings at the ends of a problem's runs, all taken as forward."""
     observe: Histories = problem.observe  # type: ignore[assignment]
     data = problem.data
     measured, sd, weight = (np.asarray(x) for x in (data.measured, data.sd, data.weight))
@@ -113,7 +114,7 @@ def settled_ends(problem: Problem) -> Ends:
         duty=jnp.where(driven, conditions.duty, 1.0),
         open=jnp.where(driven, conditions.open, 0.0),
     )
-    return Ends(conditions, mean, np.where(np.isfinite(error), np.maximum(error, 1e-12), np.nan), shown)
+    return SettledEnds(conditions, mean, np.where(np.isfinite(error), np.maximum(error, 1e-12), np.nan), shown)
 
 
 def starts_from_settled_ends(
@@ -122,9 +123,9 @@ def starts_from_settled_ends(
     """Initial coordinates for searches of a base, the most promising first.
 
     Args:
-        problem: problem of histories, without effects in its coordinates.
-        draws: draws of the prior, tried in addition to the settled ends.
-        search: (problem, starts, most steps) → optima of a batch of searches.
+        problem: problem of time histories, without effects in its coordinates.
+        draws: random draws of the prior, tried in addition to the settled ends.
+        search: function (problem, starts, largest number of steps) → optima of a batch of searches.
     """
     ends = _fit_settled_ends(problem)
     friction = np.array(["ground.friction." in n for n in problem.coordinates.names])
@@ -142,10 +143,10 @@ def starts_from_settled_ends(
 
 
 def _with_peaked_friction(problem: Problem, z: np.ndarray) -> np.ndarray:
-    """Copies of z with a friction that falls from a peak, with the same creep and sliding friction.
+    """Copies of z whose friction falls from a peak, with unchanged creep and sliding friction, shape (points,
+    parameters).
 
-    Their μ_s, V_s and V_d have the nominal ratios to μ_d and to each other, in one configuration or in all,
-    shape (points, parameters).
+    μ_s, V_s and V_d have their nominal ratios to μ_d and to each other, in one configuration or in all.
     """
     c, out, every = problem.coordinates, [], z.copy()
     value, nominal = np.asarray(c.value(z)), np.asarray(c.value(np.zeros(len(c))))
@@ -159,7 +160,7 @@ def _with_peaked_friction(problem: Problem, z: np.ndarray) -> np.ndarray:
         new |= {k: new[creep] * nominal[k] / nominal[creep] for k in sliding}
         out.append(z.copy())
         for k, x in new.items():
-            out[-1][k] = every[k] = _coordinate(problem, k, x)
+            out[-1][k] = every[k] = _coordinate_of_value(problem, k, x)
     return np.stack([*out, every])
 
 
@@ -173,9 +174,9 @@ def _distinct_points(points: np.ndarray) -> np.ndarray:
 
 
 def _recombine_points(problem: Problem, points: np.ndarray) -> np.ndarray:
-    """Points with the parameters of each configuration exchanged: the k-th point has the k-th best fit of its runs.
+    """New points from the best parameters of each configuration: the k-th point has the k-th best fit of its runs.
 
-    Shared parameters are from the point that fits all runs best.
+    Shared parameters come from the point that fits all runs best.
     """
     by_run = _misfit_of_runs(problem, points)
     mixed = np.tile(points[int(np.argmin(by_run.sum(1)))], (len(points), 1))
@@ -189,8 +190,10 @@ def _recombine_points(problem: Problem, points: np.ndarray) -> np.ndarray:
 
 
 def _spread_over_surfaces(problem: Problem, draws: np.ndarray) -> np.ndarray:
-    """Draws with adhesion and V_s spread evenly (in logarithms) over the ranges of surfaces, and with dynamic values
-    in their nominal ratio to static ones."""
+    """Random draws whose adhesion and V_s are spread evenly (in logarithms) over the ranges of all surfaces.
+
+    Dynamic friction values keep their nominal ratio to static ones.
+    """
     out = []
     for z in draws:
         z = z.copy()
@@ -198,23 +201,23 @@ def _spread_over_surfaces(problem: Problem, draws: np.ndarray) -> np.ndarray:
             for suffix, (low, high) in SURFACES.items():
                 if name.endswith(suffix):
                     share = ndtr(z[k])
-                    z[k] = _coordinate(problem, k, low * (high / low) ** share)
-        out.append(_with_sliding(problem, z, 1.0))
+                    z[k] = _coordinate_of_value(problem, k, low * (high / low) ** share)
+        out.append(_with_friction_slope(problem, z, 1.0))
     return np.stack(out)
 
 
-def _coordinate(problem: Problem, k: int, value: float) -> float:
-    """Coordinate of a parameter's value [SI]."""
+def _coordinate_of_value(problem: Problem, k: int, value: float) -> float:
+    """Coordinate at which a parameter has this value [SI]."""
     c = problem.coordinates
     location, spread, scale = (np.asarray(x)[k] for x in (c.location, c.spread, c.scale))
     return float(((np.log(value) if scale else value) - location) / spread)
 
 
 def _fit_settled_ends(problem: Problem) -> Float[np.ndarray, "starts parameters"]:
-    """Fits to the settled ends: with each adhesion of the grid, and with a free adhesion."""
+    """Fits to the settled ends: one at each adhesion of the grid, and one with a free adhesion."""
     names = problem.coordinates.names
     statics = [k for k, n in enumerate(names) if n.endswith(STATIC)]
-    ends = settled_ends(problem)
+    ends = settled_ends_of_runs(problem)
     mean = np.where(_slides_at_end(problem, ends)[:, None], np.nan, ends.mean)
     observe = SettledRuns(ends.conditions, "steady")
     ends_problem = Problem(problem.base, problem.coordinates, observe, data_from_readings(mean, ends.sd, len(names)))
@@ -225,11 +228,11 @@ def _fit_settled_ends(problem: Problem) -> Float[np.ndarray, "starts parameters"
     free = jax.device_get(_fit_pinned(ends_problem, jnp.asarray(fitted.z), jnp.zeros(held.shape, bool)))
     best = free.z[int(np.argmin(np.where(np.isfinite(free.cost), free.cost, np.inf)))]
     finite_points = [z for z in (best, *fitted.z) if np.all(np.isfinite(z))]
-    return np.stack([_with_sliding(problem, z, share) for z in finite_points for share in FINER])
+    return np.stack([_with_friction_slope(problem, z, share) for z in finite_points for share in FINER])
 
 
-def _slides_at_end(problem: Problem, ends: Ends) -> np.ndarray:
-    """True if a run's movers spin at its end, also while it still gains speed, forwards or back, shape (runs,)."""
+def _slides_at_end(problem: Problem, ends: SettledEnds) -> np.ndarray:
+    """True for each run whose tracks or wheels spin at its end, even if it still gains speed, shape (runs,)."""
     if not {"motor_speed", "speed"} <= set(problem.base.rig.channels):
         return np.zeros(len(ends.mean), bool)
     turning, travelling = (
@@ -244,16 +247,18 @@ def _slides_at_end(problem: Problem, ends: Ends) -> np.ndarray:
 
 
 def _with_adhesion(problem: Problem, z: np.ndarray, adhesion: float) -> np.ndarray:
-    """z with this adhesion in every configuration."""
+    """Coordinates z with this adhesion in every configuration."""
     z, c = z.copy(), problem.coordinates
     for k, name in enumerate(c.names):
         if name.endswith(STATIC):
-            z[k] = _coordinate(problem, k, adhesion)
+            z[k] = _coordinate_of_value(problem, k, adhesion)
     return z
 
 
-def _with_sliding(problem: Problem, z: np.ndarray, share: float) -> np.ndarray:
-    """z with a share of its V_s, and with parameters that settled ends do not show in the nominal ratio to others."""
+def _with_friction_slope(problem: Problem, z: np.ndarray, share: float) -> np.ndarray:
+    """Coordinates z with a share of their V_s. Parameters that settled ends do not determine keep their nominal ratio
+    to others.
+    """
     c = problem.coordinates
     value = np.array(c.value(np.asarray(z)))
     nominal = c.value(np.zeros(len(c)))
@@ -272,14 +277,14 @@ def _with_sliding(problem: Problem, z: np.ndarray, share: float) -> np.ndarray:
 
 @compiled
 def _fit_pinned(problem: Problem, starts: Array, held: Array) -> Optimum:
-    def one(z: Array, held: Array) -> Optimum:
+    def fit_one(z: Array, held: Array) -> Optimum:
         return levenberg_marquardt(problem, z, problem.data, Pin(held, z), max_steps=STEPS)[0]
 
-    return jax.vmap(one)(starts, held)
+    return jax.vmap(fit_one)(starts, held)
 
 
 def _misfit_of_runs(problem: Problem, points: np.ndarray) -> np.ndarray:
-    """Sum of squares of each run's residuals at each point [σ²], infinite if a run fails, shape (points, runs)."""
+    """Sum of squared residuals of each run at each point [σ²], infinite if a run fails, shape (points, runs)."""
     observe: Histories = problem.observe  # type: ignore[assignment]
     filled = np.resize(points, (-(-len(points) // TOGETHER) * TOGETHER, points.shape[1]))
     parts = filled.reshape(-1, TOGETHER, points.shape[1])

@@ -1,4 +1,4 @@
-"""Time histories: one run from standstill for each `run_id`, one row a sample.
+"""Time histories: each `run_id` is a run from standstill, each row is a sample.
 
 The conditions of a run may change from sample to sample. Each value holds from its sample until the next. An imposed
 quantity is instead linear between samples if the rig's file says so (`Rig.between_rows`).
@@ -36,7 +36,7 @@ from calibration.data.runs import Runs
 from calibration.inference import bases as bases_room
 from calibration.inference import scans
 from calibration.inference.bases import Bases
-from calibration.inference.details import Memory, Strongest, TimeSide, TimeStatistics
+from calibration.inference.details import FitOverTime, ResidualMemory, StrongestWave, TimeStatistics
 from calibration.inference.fit_notes import Remark
 from calibration.inference.linearization import (
     PROBED,
@@ -65,7 +65,7 @@ from calibration.inference.optimizers import (
 )
 from calibration.inference.priors import DELAY
 from calibration.inference.problem import MISSING, Data, Observation, Problem
-from calibration.inference.weak_form import weak_form
+from calibration.inference.weak_form import fit_weak_form
 from mmrjax import fidelities
 from mmrjax.compile.compiling import OVER_TIME, SELDOM, compiled
 from mmrjax.compile.precision import Threads
@@ -147,7 +147,9 @@ ROUNDING = 1e-3
 def _to_rows(
     of_runs: Float[Array, "runs samples ..."], rows_of: Int[Array, "runs samples"], rows: int
 ) -> Float[Array, "rows ..."]:
-    """Values of each sample of the runs, by the table's rows. Values beyond a run's last row are dropped."""
+    """Values of the samples of runs, rearranged into the rows of the table. Padding after the end of a run is
+    dropped.
+    """
     place = jnp.where(rows_of < 0, rows, rows_of)
     return jnp.zeros((rows, *of_runs.shape[2:]), of_runs.dtype).at[place].set(of_runs, mode="drop")
 
@@ -160,15 +162,16 @@ NEAR = 3.0
 
 
 class HistoriesLinearization(Linearization):
-    """Linearization of histories.
+    """Linearization of time histories.
 
-    `defects` has shape (balances, runs, knots, samples, channels), with a defect at each knot of a run.
+    `defects` has shape (balances, runs, knots, samples, channels): the error of a balance has a value at each knot of
+    a run.
 
     Attributes:
-        rows_of: indices of each run's rows in the order of time, -1 beyond its last, shape (runs, samples).
-        knots: rows between which a defect is linear, shape (runs, knots).
+        rows_of: indices of each run's rows in order of time, padded with -1, shape (runs, samples).
+        knots: rows between which an error is linear, shape (runs, knots).
         time: time of each row since the start of its run [s].
-        angle: angle of the driving shaft since then [rad].
+        angle: angle of the driving shaft since the start of the run [rad].
     """
 
     rows_of: Int[Array, "runs samples"]
@@ -199,7 +202,7 @@ class HistoriesLinearization(Linearization):
         return jnp.where(self.rows_of[:, :, None] < 0, 0.0, self.by_row()[self.rows_of])
 
     def memory(self) -> Array:
-        """Ljung and Box's (1978) statistic over all runs, as a normal deviate. The largest of the channels."""
+        """Statistic of Ljung and Box (1978) over all runs, as a normal deviate. The largest of the channels."""
         x, rows = self.series(), self.rows_of
         count = jnp.sum(rows >= 0, 1)[:, None]
         power = jnp.sum(x**2, 1)
@@ -214,22 +217,22 @@ class HistoriesLinearization(Linearization):
 
 
 class Histories(Observer):
-    """Observer of time histories: one run of `drive` from standstill for each `run_id`, one row a sample.
+    """Observer of time histories: each `run_id` is a run of `drive` from standstill, each row is a sample.
 
-    Sliding during a start is part of the run, so adhesion is not penalised. Histories have hundreds of readings a
-    parameter, so refits of a bootstrap stay within the linear range and are linear fits.
+    Sliding during a start is part of the run, so adhesion is not penalised. Histories have hundreds of readings per
+    parameter, so the refits of a bootstrap stay within the linear range and are linear.
 
     Attributes:
-        conditions: conditions of each run. A field that changes within a run has shape (runs, instants), else
+        conditions: conditions of each run. A field that changes within a run has shape (runs, instants), others have
             (runs,).
-        times: the grid of each run from 0, its last instant repeated to a common length, shape (runs, instants) [s].
+        times: times of each run from 0 [s], shape (runs, instants). The last one is repeated up to a common length.
         run: index of each row's run.
-        instant: instant of its sample in `times`, shape (rows,).
-        rows_of: indices of each run's rows in the order of time, -1 beyond its last, shape (runs, samples).
-        knots: rows between which a defect is linear, a run's last repeated, shape (runs, knots).
-        delayed: True if imposed quantities may act later than their column says (`Rig.delay`), so that readings are
-            taken that much earlier, between the instants.
-        known: the simulated runs of the observed robot. None: not yet known.
+        instant: index of its sample in `times`, shape (rows,).
+        rows_of: indices of each run's rows in order of time, padded with -1, shape (runs, samples).
+        knots: rows between which an error is linear, padded with the last one of the run, shape (runs, knots).
+        delayed: True if imposed quantities may act later than their column states (`Rig.delay`). Readings are then
+            taken earlier by the delay, between instants.
+        known: simulated runs of the observed robot. None: not yet simulated.
     """
 
     word: ClassVar[str] = "sample"
@@ -251,12 +254,13 @@ class Histories(Observer):
     known: LinearisedRun | None = None
 
     @classmethod
-    def observes(cls, runs: Runs) -> bool:
+    def accepts_table(cls, runs: Runs) -> bool:
         return runs.has("time_s")
 
     @classmethod
     def of(cls, runs: Runs, robot: Robot, fidelity: str | None = None, parts: int = 1) -> Histories:
-        """Observer of a table. Rows may be in any order, and constant conditions of a run are its first row's.
+        """Observer of a table. Rows may be in any order. A condition that is constant in a run is taken from its
+        first row.
 
         Args: as for `Observer`. `parts`: number of steps in place of each step of a fit.
         """
@@ -280,8 +284,8 @@ class Histories(Observer):
         ]
         longest_steps = _longest_steps(runs, robot)
         if smooth:
-            noted = [n | _step_begins(whole["time_s"][rows], n) for n, rows in zip(noted, every, strict=True)]
-            whole = _averaged_drive(whole, every, noted)
+            noted = [n | _begins_new_step(whole["time_s"][rows], n) for n, rows in zip(noted, every, strict=True)]
+            whole = _average_imposed_current(whole, every, noted)
         steps = [np.minimum.reduceat(h, np.flatnonzero(n)[:-1]) for h, n in zip(longest_steps, noted, strict=True)]
         change = LOOSE if robot.loose else CHANGE
         grids = [
@@ -308,7 +312,9 @@ class Histories(Observer):
 
     @classmethod
     def sizes(cls, runs: Runs) -> np.ndarray:
-        """Root mean square of each channel: histories pass through zero, and the error of an instrument does not."""
+        """Root mean square of each channel, because histories pass through zero but the error of an instrument does
+        not.
+        """
         measured = runs.measured()
         finite = np.isfinite(measured)
         power = np.sum(np.where(finite, measured, 0.0) ** 2, 0) / np.maximum(finite.sum(0), 1)
@@ -336,7 +342,7 @@ class Histories(Observer):
         thinned: list[Remark | str] = []
         if runs.log is not None:
             thinned.append(Remark("thinned", source=runs.source, rows=len(runs.log), kept=len(runs)))
-        return [*thinned, *_stop_notes(runs)]
+        return [*thinned, *_undriven_remarks(runs)]
 
     @classmethod
     def with_initial_states(cls, robot: Robot, runs: Runs, noise: Noise) -> Robot:
@@ -392,9 +398,9 @@ class Histories(Observer):
 
     @classmethod
     def settled(cls, runs: Runs, steady: bool = False) -> tuple[Runs, np.ndarray, np.ndarray]:
-        """Medians of the later half of each run, which has settled if the run is long enough.
+        """Medians over the later half of each run. The run has settled if it is long enough.
 
-        For a run with changing conditions, of the longest interval in which it is driven forwards, if long enough.
+        In a run with changing conditions, the longest interval of forward drive counts, if it is long enough.
         """
         time, measured = runs["time_s"], runs.measured()
         each = [
@@ -417,7 +423,7 @@ class Histories(Observer):
 
     @classmethod
     def identity(cls, runs: Runs) -> Names:
-        """All columns, including the run: repeats have the same beginning, at rest."""
+        """All columns, including the run, because repeated runs begin equally, at rest."""
         return tuple(runs.columns)
 
     @classmethod
@@ -428,35 +434,37 @@ class Histories(Observer):
     def free(cls) -> tuple[Names, Names]:
         return ("motor.inductance", "motor.inertia", DELAY), ("inertia", settled_ends.STATIC, *settled_ends.SLIDING)
 
-    def defective(
+    def response_to_errors(
         self, robot: Robot, probes: tuple[Effect, ...]
     ) -> Float[Array, "probes runs knots samples channels"]:
-        """Change of the readings by a defect of each probe's balance [its unit]. A probe has amplitude 1.
+        """Change of the readings by an error of the balance of each probe [unit of the balance]. A probe has
+        amplitude 1.
 
-        The defect is 1 at a knot of a run and falls linearly to 0 at the neighbouring knots.
+        The error is 1 at a knot of a run and falls linearly to 0 at the neighbouring knots.
         """
         return self.changes(robot, probes, ())[0]
 
     def changes(
         self, robot: Robot, probes: tuple[Effect, ...], effects: tuple[ScoredEffect, ...]
     ) -> tuple[Float[Array, "probes runs knots samples channels"], Float[Array, "runs samples channels instances"]]:
-        """Changes of the readings as `defective`, and by each effect at each point of its shape's grid.
+        """Changes of the readings by errors of balances, as in `response_to_errors`, and by each effect at each point
+        of its grid.
 
-        An effect enters one balance with one amplitude. So it changes a run in the same way as a defect of that
-        balance with the values of its term. Its memory follows from the run too. Between two instants its change of
-        a reading is linear.
+        An effect with one amplitude enters one balance. So it changes a run as an error of that balance would, with
+        the values of its term. Its memory follows from the run too. Between two instants, its change of a reading is
+        linear.
         """
-        every = _Probed.of(robot, probes, effects)
+        every = _ProbedRobot.of(robot, probes, effects)
         clock = self.times[jnp.arange(len(self.times))[:, None], self.instant[self.knots]]
         rows = jnp.where(self.rows_of < 0, 0, self.rows_of)
-        followed_signals = self.following(robot).known
+        followed_signals = self.with_simulated_runs(robot).known
         assert followed_signals is not None
         # One run at a time: each has a wide array, by its knots.
         given = self.conditions, clock, self.instant[rows], followed_signals, self.times, self.time[rows]
         knots, by_effects = jax.lax.map(lambda of_run: every.changes(*of_run, delayed=self.delayed), given)
         return jnp.moveaxis(knots, 0, 1), by_effects
 
-    def following(self, robot: Robot) -> Histories:
+    def with_simulated_runs(self, robot: Robot) -> Histories:
         """Observer with the simulated runs of a robot."""
         if self.known is not None:
             return self
@@ -480,7 +488,7 @@ class Histories(Observer):
         return self.times[self.run, self.instant]
 
     def angle(self, whole: Signals) -> Float[Array, " rows"]:
-        """Angle of the driving shaft at each row, since the start of its run [rad]."""
+        """Angle of the driving shaft in each row since the start of its run [rad]."""
         speed = jnp.asarray(whole.speed_wheel)
         turned = 0.5 * (speed[:, 1:] + speed[:, :-1]) * jnp.diff(self.times)
         angle = jnp.concatenate([jnp.zeros((len(turned), 1)), jnp.cumsum(turned, 1)], 1)
@@ -488,7 +496,7 @@ class Histories(Observer):
 
     @property
     def of_rows(self) -> Any:
-        """Conditions of each row, with fields of NumPy, shape (rows,)."""
+        """Conditions of each row as NumPy arrays, shape (rows,)."""
         run, instant = np.asarray(self.run), np.asarray(self.instant)
         held = jax.tree.map(np.asarray, self.conditions)
         return jax.tree.map(lambda x: x[run] if x.ndim == 1 else x[run, instant], held)
@@ -499,7 +507,7 @@ class Histories(Observer):
         return any(x.ndim > 1 for x in jax.tree.leaves(self.conditions))
 
     def stretches(self) -> list[list[Stretch]]:
-        """Intervals of unchanged conditions, for each run."""
+        """Intervals of constant conditions in each run."""
         rows_of, time, of_rows = np.asarray(self.rows_of), np.asarray(self.time), self.of_rows
         volts = np.where(of_rows.open > 0.5, 0.0, of_rows.voltage * of_rows.duty)
         volts = volts if of_rows.motor_current is None else of_rows.motor_current
@@ -508,10 +516,9 @@ class Histories(Observer):
 
     @property
     def driven(self) -> Conditions:
-        """Conditions of driven travel as in the protocol.
+        """Conditions under which the robot was driven, see `Observer.driven`.
 
-        Driving backward on a slope is the same as driving forward on it. Levels of changing conditions are merged
-        if they are close.
+        Backward travel on a slope is the same as forward travel on the opposite slope. Similar levels are merged.
         """
         if not self.varying:
             return self.conditions
@@ -545,10 +552,11 @@ class Histories(Observer):
         return _conditions_of_rows(turned, cases)
 
     def late(self, every: tuple[Array, ...], rig: Rig) -> Float[Array, "rows ..."]:
-        """Values within a step at the time of each row less the rig's delay.
+        """Values within steps at the time of each row minus the delay of the rig.
 
         Args:
-            every: arguments of `Within.read` for every step, shape (runs, steps, ...) each.
+            every: arguments of `StepCourse.read` for every step, shape (runs, steps, ...) each.
+            rig: rig with the delay.
         """
 
         def of_run(times: Array, every: tuple[Array, ...], time: Array) -> Array:
@@ -562,7 +570,7 @@ class Histories(Observer):
         def of_run(
             conditions: Conditions, times: Array, known: LinearisedRun | None, instants: Array, time: Array
         ) -> Array:
-            """Readings of a run's rows."""
+            """Readings in the rows of a run."""
 
             if not self.delayed:
                 return _readings(robot, history_signals(robot, conditions, times, known, instants))
@@ -583,19 +591,21 @@ class Histories(Observer):
         return True
 
     @property
-    def eased(self) -> bool:
+    def starts_from_steady(self) -> bool:
         return False
 
     def unreachable(self, status: np.ndarray) -> np.ndarray:
         return status == FAILED
 
-    def runs_counting(self, included: np.ndarray) -> int:
+    def number_of_included_runs(self, included: np.ndarray) -> int:
         return self.rows_of.shape[0]
 
     def noise_misfit(self, off: Callable[[], np.ndarray], counts: np.ndarray) -> float:
-        """Expected χ² of noise, larger than in the protocol if neighbouring samples show that the sds are too small.
+        """Expected χ² of noise. It is larger than the number of readings if neighbouring samples show that the sds
+        are too small.
 
-        A model error nearly cancels in the differences of neighbours (von Neumann, Ann. Math. Stat. 12 (1941)).
+        Model errors nearly cancel in the differences of neighbouring samples (von Neumann, Ann. Math. Stat. 12
+        (1941)).
         """
         residual, rows, total = off(), np.asarray(self.rows_of), 0.0
         first, second = rows[:, :-1].ravel(), rows[:, 1:].ravel()
@@ -610,10 +620,10 @@ class Histories(Observer):
     def linearise(
         self, problem: Problem, z: Array, data: Data, effects: tuple[ScoredEffect, ...]
     ) -> HistoriesLinearization:
-        """Linearization as in the protocol.
+        """Linearization at z, see `Observer.linearise`.
 
-        Residuals and Jacobian are from the program of the searches. The changes by defects and effects (`changes`)
-        are computed along its run.
+        Residuals and Jacobian come from the program of the searches. The changes by errors and effects (`responses`)
+        are computed along its runs.
         """
         problem = dataclasses.replace(problem, data=data)
         which = getattr(problem.coordinates, "active", None)
@@ -646,7 +656,7 @@ class Histories(Observer):
         simulated = _evaluate(problem, *members)[3]
         return dataclasses.replace(self, known=jax.tree.map(lambda x: x[0], simulated))
 
-    def replicate(
+    def fit_replicate(
         self, problem: Problem, data: Data, effects: tuple[ScoredEffect, ...], linear: Linearization, drawn: Array
     ) -> Linearization:
         jacobian = linear.jacobian
@@ -657,32 +667,33 @@ class Histories(Observer):
     def starts(
         self, problem: Problem, random: np.random.Generator, count: int, every: Problem | None = None
     ) -> Float[np.ndarray, "starts z"]:
-        """Starts as in the protocol: only the fit of the log's equations in weak form, if it shows its states.
+        """Starts of searches, see `Observer.starts`: the fit of the log's equations in weak form, if the log shows
+        its states.
 
-        On ground where the robot may slide, which they do not show, also a start of `settled_ends`.
+        The equations do not show sliding. On ground where the robot may slide, a start from `settled_ends` is added.
         """
 
-        def search(blunt: Problem, starts: np.ndarray, steps: int) -> Optimum:
+        def search_batch(blunt: Problem, starts: np.ndarray, steps: int) -> Optimum:
             weights = np.repeat(np.asarray(blunt.data.weight)[None], len(starts), 0)
-            evaluate = _evaluator(blunt, weights, None)
+            evaluate = _parallel_evaluator(blunt, weights, None)
             # The best parameters of each configuration are combined, so a search may be the best of one only.
             within = NEAR if len(blunt.base.configurations) == 1 else np.inf
             return search_rollouts(evaluate, starts, blunt.data, weights, steps, self.policy.batch, within=within)[0]
 
-        regression = weak_form(problem if every is None else every)
+        regression = fit_weak_form(problem if every is None else every)
         begins = np.zeros((0, len(problem.coordinates))) if regression is None else regression.z[None]
         if problem.base.has_ground and problem.base.rig.imposed == "voltage":
             draws = random.standard_normal((settled_ends.DRAWS, len(problem.coordinates)))
-            ends = settled_ends.starts_from_settled_ends(problem, draws, search)
+            ends = settled_ends.starts_from_settled_ends(problem, draws, search_batch)
             begins = np.concatenate([begins, ends[: max(1, count - len(begins)) if regression is None else 1]])
         elif regression is None:
             begins = super().starts(problem, random, count)
         return scans.place_at_minimum(problem, begins[:count])
 
     def scanned(self, problem: Problem) -> tuple[int, ...]:
-        return scans.coordinates_beyond_a_basin(problem)
+        return scans.wide_coordinates(problem)
 
-    def scan_points(self, problem: Problem, k: int) -> int:
+    def number_of_scan_points(self, problem: Problem, k: int) -> int:
         """Number of values of a scan.
 
         A delay has a spacing of at most half a current's rise time L/R or an eighth of a sample, within `DELAYS`.
@@ -696,9 +707,11 @@ class Histories(Observer):
         return int(2 ** np.clip(np.ceil(np.log2(steps_needed)), *np.log2(DELAYS)))
 
     def scan(self, problem: Problem, z: Array, data: Data, k: int, values: Array) -> tuple[Array, Array]:
-        """Scan as in the protocol. A delay only shifts the readings of a run, so one run serves all its values."""
+        """Scan of a coordinate, see `Observer.scan`. A delay only shifts the readings of a run, so one run serves all
+        its values.
+        """
         if problem.coordinates.names[k] == DELAY:
-            return _over_delays(problem, z, data, jnp.arange(len(z)) == k, values)
+            return _scan_delays(problem, z, data, jnp.arange(len(z)) == k, values)
         scans_found = [
             _minimum_with_one_held(
                 *linearise(problem, z.at[k].set(v), data)[:2], z.at[k].set(v), jnp.arange(len(z)) == k
@@ -718,14 +731,14 @@ class Histories(Observer):
         most: int | None = None,
         scanned: Problem | None = None,
     ) -> tuple[Optimum, Observation]:
-        """Searches as in the protocol. The runs are compiled once for all steps."""
+        """Fits from several starts, see `Observer.search`. The runs are compiled once for all steps."""
         data, steps = problem.data, self.policy.steps if most is None else most
         of_same_readings = bool(np.all(weights == np.asarray(weights)[:1]))
         within = SAME if rivals else NEAR if of_same_readings else np.inf
 
         def searched(starts: Numbers, members: slice = slice(None)) -> tuple[Optimum, Observation]:
             weight = np.asarray(weights)[members]
-            evaluate = _evaluator(problem, weight, None if active is None else np.asarray(active)[members])
+            evaluate = _parallel_evaluator(problem, weight, None if active is None else np.asarray(active)[members])
             return search_rollouts(evaluate, starts, data, weight, steps, self.policy.batch, within=within)
 
         optima = searched(starts)
@@ -740,33 +753,35 @@ class Histories(Observer):
         if most is not None and not optima[0].converged[k] and np.abs(optima[0].z[k]).max() > LOST:
             return optima
 
-        def one(every: tuple[Optimum, Observation], k: int) -> tuple[Optimum, Observation]:
+        def result_of_member(every: tuple[Optimum, Observation], k: int) -> tuple[Optimum, Observation]:
             best, seen = jax.tree.map(lambda leaf: leaf[k], every)
             return dataclasses.replace(best, z=best.z[:size], sd=best.sd[:size]), seen
 
-        def again(z: np.ndarray) -> tuple[Optimum, Observation]:
-            return one(searched(np.pad(z, (0, np.shape(starts)[1] - size))[None], slice(k, k + 1)), 0)
+        def search_again(z: np.ndarray) -> tuple[Optimum, Observation]:
+            return result_of_member(searched(np.pad(z, (0, np.shape(starts)[1] - size))[None], slice(k, k + 1)), 0)
 
         scan_data = dataclasses.replace(bare.data, weight=weights[k])
-        best, seen = scans.search_lower_basins(bare, one(optima, k), scan_data, again, lambda _: None)
+        best, seen = scans.search_lower_minima(
+            bare, result_of_member(optima, k), scan_data, search_again, lambda _: None
+        )
         optimum = jax.tree.map(lambda leaf: jnp.asarray(leaf[k]), optima[0])
         best = dataclasses.replace(best, z=optimum.z.at[:size].set(best.z), sd=optimum.sd.at[:size].set(best.sd))
         return jax.tree.map(lambda every, mine: jnp.asarray(every).at[k].set(mine), optima, (best, seen))
 
-    def observed(self, problem: Problem, z: Numbers, active: Numbers | None = None) -> Observation:
+    def observation_at(self, problem: Problem, z: Numbers, active: Numbers | None = None) -> Observation:
         return self.at(problem, z, active)[2]
 
     def at(self, problem: Problem, z: Numbers, active: Numbers | None = None) -> tuple[Numbers, Numbers, Observation]:
-        """Residuals, Jacobian and observation as in the protocol, by the program of the searches."""
+        """Residuals, Jacobian and observation, see `Observer.at`, by the program of the searches."""
         which = None if active is None else np.asarray(active)[None]
-        evaluate = _evaluator(problem, np.asarray(problem.data.weight)[None], which)
+        evaluate = _parallel_evaluator(problem, np.asarray(problem.data.weight)[None], which)
         r, jacobian, seen = jax.tree.map(lambda x: x[0], evaluate(np.asarray(z)[None], np.zeros(1, int)))
         return *zero_inactive_residuals(jnp.asarray(r), jnp.asarray(jacobian), penalty_slice(problem.data)), seen
 
     def bases(self, columns: Columns, included: np.ndarray, robot: Robot) -> Bases:
-        """Curves and windows as for settled runs, also over time, and waves over the angle of a shaft.
+        """Bases of curves and windows as for settled runs, also over time, and waves over the angle of a shaft.
 
-        Curves over the voltage are over the motors' voltage if it differs from the supply's.
+        Curves over the voltage use the motor voltage if it differs from the supply voltage.
         """
         rows = self.of_rows
         angle, electromotive, ways = jax.tree.map(lambda x: np.nan_to_num(np.asarray(x)), _shaft_motion(self, robot))
@@ -786,20 +801,20 @@ class Histories(Observer):
         names = bases_room.family_names(bases)
         orders = [w for w in bases_room.ORDERS if any(n[1] == w for n in names)]
 
-        def strongest(diagnosis: Diagnosis, variable: str) -> Strongest | None:
+        def strongest(diagnosis: Diagnosis, variable: str) -> StrongestWave | None:
             same_variable = [k for k, n in enumerate(names) if n[1] == variable]
             if not same_variable:
                 return None
             k = max(same_variable, key=lambda j: np.asarray(diagnosis.scores.curve)[j])
-            return Strongest(names[k][0], float(diagnosis.scores.curve[k]), float(diagnosis.scores.explained[k]))
+            return StrongestWave(names[k][0], float(diagnosis.scores.curve[k]), float(diagnosis.scores.explained[k]))
 
-        def side(diagnosis: Diagnosis) -> TimeSide:
+        def statistics_of_fit(diagnosis: Diagnosis) -> FitOverTime:
             lags = min(LAGS, self.rows_of.shape[1] // 4)
             test = diagnosis.test
             x = np.asarray(diagnosis.linear.series())
             power = np.maximum(np.sum(x**2, (0, 1)), 1e-12)
             by_lag = [np.sum(x[:, k:] * x[:, :-k], (0, 1)) / power for k in range(1, lags + 1)]
-            memory = Memory(
+            memory = ResidualMemory(
                 float(test.found.white),
                 test.threshold("white"),
                 test.p("white"),
@@ -807,15 +822,17 @@ class Histories(Observer):
                 {name: [float(lag[k]) for lag in by_lag] for k, name in enumerate(diagnosis.linear.channels)},
             )
             waves = {(w, bases_room.ORDERS[w][0]): wave for w in orders if (wave := strongest(diagnosis, w))}
-            return TimeSide(memory, waves, strongest(diagnosis, "time"))
+            return FitOverTime(memory, waves, strongest(diagnosis, "time"))
 
         samples = int((np.asarray(self.rows_of) >= 0).sum())
         unresolved = tuple(w for w in bases_room.ORDERS if w not in orders)
-        return TimeStatistics(self.rows_of.shape[0], samples, unresolved, side(before), side(after))
+        return TimeStatistics(
+            self.rows_of.shape[0], samples, unresolved, statistics_of_fit(before), statistics_of_fit(after)
+        )
 
 
 def _drive_jumps(runs: Runs, each: list[np.ndarray], rig: Rig) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Times of jumps of the drive of each run's motors [s], and the jumps as shares of its largest value."""
+    """Times of jumps of the motors' command in each run [s], and each jump relative to the run's largest command."""
     driven, time = applied_drive(runs), runs["time_s"]
     # An imposed speed determines the current; a linear drive does not jump; an unknown drive is refused later.
     jumps_known = (
@@ -839,11 +856,11 @@ def _conditions_over_time(
     """Conditions of runs from those of rows, shape (runs,), or (runs, instants) if they change within a run.
 
     Args:
-        of_rows: shape (rows,).
-        each: rows of each run in the order of time.
-        time: time of rows.
+        of_rows: conditions of each row, shape (rows,).
+        each: rows of each run in order of time.
+        time: time of each row [s].
         times: instants of each run [s].
-        on_lines: fields that are linear between rows: mean over the step that begins at each instant.
+        on_lines: fields that are linear between rows. They are averaged over the step that begins at each instant.
     """
     middle = np.concatenate([0.5 * (times[:, 1:] + times[:, :-1]), times[:, -1:]], 1)
     conditions_there = np.stack(
@@ -876,17 +893,17 @@ def _conditions_over_time(
 
 
 def _conditions_of_rows(conditions: Conditions, rows: np.ndarray) -> Conditions:
-    """Conditions of some rows, selected by NumPy so that nothing is compiled."""
+    """Conditions of some rows, selected with NumPy so that nothing is compiled."""
     return jax.tree.map(lambda x: jnp.asarray(np.asarray(x)[rows]), conditions)
 
 
 def _interpolate_at_instants(x: np.ndarray, each: list[np.ndarray], time: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Values at instants of each run, by linear interpolation between its rows, shape (runs, instants)."""
+    """Values at instants of each run, interpolated linearly between its rows, shape (runs, instants)."""
     return np.stack([np.interp(t, time[rows], x[rows]) for rows, t in zip(each, at, strict=True)])
 
 
 def initial_state_name(run: str) -> str:
-    """Name of a run's initial state among the parameters of a rig."""
+    """Name of a run's initial state among the parameters of the rig."""
     return f"begin_{re.sub(r'[^A-Za-z0-9_-]', '_', run)}"
 
 
@@ -895,9 +912,10 @@ FIRST_SAMPLES = 5
 
 
 def measure_initial_states(robot: Robot, runs: Runs, noise: Noise) -> Robot:
-    """`robot` with the initial states of a table's runs, if its rig says that they do not begin at rest.
+    """Robot with the initial states of a table's runs, if its rig states that they do not begin at rest.
 
-    Speed and angle of the first samples are extrapolated to the first. The error of that is the prior of free ones.
+    Speed and angle are extrapolated from the first samples to the first one. The error of this is the prior sd of an
+    initial state that is fitted.
     """
     if robot.rig.start == "rest" or not runs.sampled:
         return robot
@@ -929,7 +947,9 @@ def measure_initial_states(robot: Robot, runs: Runs, noise: Noise) -> Robot:
 
 
 def _value_at_zero(time: np.ndarray, shown: np.ndarray) -> tuple[float, float]:
-    """Value at time 0 of a line through samples, and its standard error. The mean of fewer than three samples."""
+    """Value at time 0 of a line through samples, and its standard error. With fewer than three samples, their
+    mean.
+    """
     if len(time) < 3:
         return float(np.mean(shown)), 0.0
     matrix = np.stack([np.ones_like(time), time], 1)
@@ -939,7 +959,7 @@ def _value_at_zero(time: np.ndarray, shown: np.ndarray) -> tuple[float, float]:
 
 
 def _merge_levels(x: np.ndarray) -> np.ndarray:
-    """Numbers, moved to the nearest of `LEVELS` levels if they have more distinct values."""
+    """The numbers, each replaced by the nearest of `LEVELS` levels if there are more distinct values than that."""
     if len(np.unique(x)) <= LEVELS:
         return x
     levels = np.linspace(x.min(), x.max(), LEVELS)
@@ -947,9 +967,9 @@ def _merge_levels(x: np.ndarray) -> np.ndarray:
 
 
 def _check_signs(runs: Runs) -> None:
-    """Reject unsigned speeds and currents of runs that are driven backward.
+    """Rejects unsigned speeds and currents if runs are driven backward.
 
-    A rig's inertia may carry it forwards during one interval, but not during all of a table.
+    Inertia may carry a rig forward during one interval of backward drive, but not during all of a table.
     """
     if runs.layout.imposed in GOALS:  # an output may turn away from its goal
         return
@@ -973,8 +993,8 @@ def _check_signs(runs: Runs) -> None:
                     )
 
 
-def _stop_notes(runs: Runs) -> list[Remark | str]:
-    """Note on runs with motors that are not driven on a slope."""
+def _undriven_remarks(runs: Runs) -> list[Remark | str]:
+    """Remark on runs on a slope whose motors are not driven."""
     still = (applied_drive(runs) == 0) & (runs["slope_deg"] != 0)
     if not still.any():
         return []
@@ -984,17 +1004,19 @@ def _stop_notes(runs: Runs) -> list[Remark | str]:
 
 
 def _choose_knots(rows: np.ndarray, most: int) -> np.ndarray:
-    """At most `most` of a run's rows, evenly spaced, with its first and last. The last is repeated as padding."""
+    """At most `most` rows of a run, evenly spaced, including its first and last. The last one is repeated as
+    padding.
+    """
     chosen = rows[np.unique(np.round(np.linspace(0, len(rows) - 1, most)).astype(int))]
     return np.concatenate([chosen, np.repeat(chosen[-1], most - len(chosen))])
 
 
 def _changes_still(speeds: np.ndarray, half: np.ndarray, quarter: np.ndarray) -> bool:
-    """True if a speed still changes by more than `STILL` in the later half of an interval.
+    """True if a speed changes by more than `STILL` in the later half of an interval.
 
     Args:
-        speeds: shape (rows, channels).
-        half, quarter: rows of the later half and of the last quarter.
+        speeds: speed readings, shape (rows, channels).
+        half, quarter: rows of the later half, and of the last quarter.
     """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # a channel without readings
@@ -1003,7 +1025,9 @@ def _changes_still(speeds: np.ndarray, half: np.ndarray, quarter: np.ndarray) ->
 
 
 def _drive_changes(runs: Runs, rows: np.ndarray, share: float = 0.0) -> np.ndarray:
-    """True for rows of a run with a change of its drive (of the motors' supply: above a share of its largest)."""
+    """True for rows of a run at which its command changes. For the supply of motors, only changes above a share of
+    the largest value count.
+    """
     supplied = (runs.layout.imposed_column, SUPPLY, "duty")
     changes = differs_from_row_before(
         rows, (runs[column] for column in changing_columns(runs) if column not in supplied)
@@ -1012,15 +1036,15 @@ def _drive_changes(runs: Runs, rows: np.ndarray, share: float = 0.0) -> np.ndarr
     return changes
 
 
-def _step_begins(time: np.ndarray, noted: np.ndarray) -> np.ndarray:
-    """True for rows that divide the time between noted ones into parts of at most the usual longest step."""
+def _begins_new_step(time: np.ndarray, noted: np.ndarray) -> np.ndarray:
+    """True for rows that divide the time between noted rows into parts of at most the usual longest step."""
     begin = time[np.maximum.accumulate(np.where(noted, np.arange(len(time)), 0))]
     part = np.floor((time - begin) / (FAST * LONGEST) + 1e-9)
     return np.diff(part, prepend=0.0) > 0
 
 
-def _averaged_drive(runs: Runs, each: list[np.ndarray], noted: list[np.ndarray]) -> Runs:
-    """Runs with the mean of the imposed current between noted rows, which moves the load as much."""
+def _average_imposed_current(runs: Runs, each: list[np.ndarray], noted: list[np.ndarray]) -> Runs:
+    """Runs whose imposed current is averaged between noted rows. The mean moves the load by the same amount."""
     column, time = runs.layout.imposed_column, runs["time_s"]
     drive = runs[column].copy()
     for rows, begins in zip(each, noted, strict=True):
@@ -1032,23 +1056,23 @@ def _averaged_drive(runs: Runs, each: list[np.ndarray], noted: list[np.ndarray])
 
 
 def _relative_jumps(driven: np.ndarray) -> np.ndarray:
-    """Change of a run's drive from row to row, as a share of its largest value."""
+    """Change of a run's command from row to row, relative to its largest value."""
     return np.abs(np.diff(driven)) / max(float(np.abs(driven).max(initial=0.0)), 1e-300)
 
 
 def _usual_interval(apart: np.ndarray) -> float:
-    """Median of the times between a run's rows. Infinite for a single row."""
+    """Median time between a run's rows [s]. Infinite for a single row."""
     return float(np.median(apart)) if len(apart) else np.inf
 
 
 def _longest_steps(runs: Runs, robot: Robot) -> list[np.ndarray]:
-    """Longest step after each row of a run's log except the last, for each run in the order of their names [s].
+    """Longest allowed step after each row of a log except the last, for each run in order of their names [s].
 
-    With an imposed speed only the memory of effects is simulated. If the drive of a run changes its sign and shafts
-    and load do not move as one, friction jumps as a speed passes through zero. Steps then have to be
-    short compared with the time between readings, near each such passage and as much earlier as the rig's delay may
-    be. A passage is where the table's speeds, or the rates of its angles and positions, are low or change their sign.
-    It may be anywhere in a table without these.
+    With an imposed speed, only the memory of effects is simulated. If the command of a run changes its sign, and
+    shafts and load do not move as one, friction jumps when a speed passes through zero. Steps must then be short
+    compared with the time between readings: near each such passage, and earlier by the largest delay of the rig. A
+    passage is where the measured speeds, or the rates of measured angles and positions, are low or change their sign.
+    Without such readings it may be anywhere.
     """
     whole, rig, exact = runs.whole, robot.rig, robot.rig.imposed == "motor_speed"
     moved = [k for k, c in enumerate(runs.channels) if c.zero_at_rest and (c.directed or not c.settled)]
@@ -1083,11 +1107,11 @@ def _longest_steps(runs: Runs, robot: Robot) -> list[np.ndarray]:
 
 
 def _may_pass_rest(speeds: np.ndarray, share: float) -> np.ndarray:
-    """True between rows where a run may pass through rest. All True if no reading shows it.
+    """True between rows where a run may pass through rest. All True if no reading can tell.
 
     Args:
-        speeds: readings that are 0 at rest or their rates, shape (rows, channels).
-        share: share of their largest, below which a run may pass through rest.
+        speeds: readings that are 0 at rest, or rates of readings, shape (rows, channels).
+        share: a run may pass through rest below this share of the largest reading.
     """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # a channel without readings
@@ -1097,7 +1121,7 @@ def _may_pass_rest(speeds: np.ndarray, share: float) -> np.ndarray:
 
 
 def _common_length(instants: int) -> int:
-    """The next common length of grids, at eighths of powers of two.
+    """Next common length of a time grid, in eighths of powers of two.
 
     Logs of similar length then share compiled programs, at the cost of at most an eighth more steps, of length zero.
     """
@@ -1115,13 +1139,13 @@ def _readings(robot: Robot, signals: Signals) -> Float[Array, "instants channels
 
 
 def _readings_within_steps(robot: Robot, steps: StepCourse) -> tuple[Array, ...]:
-    """Readings as arguments of `Within.read`."""
+    """Readings, as arguments of `StepCourse.read`."""
     return *(_readings(robot, s) for s in (steps.first, steps.begin, steps.end)), steps.decays
 
 
 @functools.partial(compiled, options=OVER_TIME)
 def _shaft_motion(observe: Histories, robot: Robot) -> tuple[Array, Array, dict[str, Array]]:
-    """Angle of the driving shaft, back-EMF and ways of travel at each row."""
+    """Angle of the driving shaft, back-EMF and directions of travel in each row."""
     whole_runs = observe.whole(robot)
     rows = observe.at_rows(whole_runs)
     ways = {name: jnp.broadcast_to(getattr(rows, name), jnp.shape(rows.speed_motor)) for name in WAYS}
@@ -1129,7 +1153,7 @@ def _shaft_motion(observe: Histories, robot: Robot) -> tuple[Array, Array, dict[
 
 
 @functools.partial(compiled, options=OVER_TIME)
-def _over_delays(problem: Problem, z: Array, data: Data, scanned: Array, values: Array) -> tuple[Array, Array]:
+def _scan_delays(problem: Problem, z: Array, data: Data, scanned: Array, values: Array) -> tuple[Array, Array]:
     observe: Histories = problem.observe  # type: ignore[assignment]
 
     def shown(z: Array) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
@@ -1157,14 +1181,15 @@ def _over_delays(problem: Problem, z: Array, data: Data, scanned: Array, values:
 
 @compiled
 def _minimum_with_one_held(residual: Array, jacobian: Array, z: Array, held: Array) -> tuple[Array, Array]:
-    """Objective at the minimum of a linearisation with one coordinate held, and the coordinates there."""
+    """Minimum of a linearised objective with one coordinate held, and the coordinates there."""
     free = jnp.where(held, 0.0, jacobian)
     step = -solve(free.T @ free + jnp.diag(held.astype(float)), free.T @ residual)
     return 0.5 * jnp.sum((residual + free @ step) ** 2), z + step
 
 
-def _evaluator(problem: Problem, weights: Numbers, active: Numbers | None) -> Evaluate:
-    """Function that evaluates members of a search, `TOGETHER` in a call, with calls in parallel on the cores.
+def _parallel_evaluator(problem: Problem, weights: Numbers, active: Numbers | None) -> Evaluate:
+    """Function that evaluates the model for members of a search. A call takes `TOGETHER` of them, calls run in
+    parallel.
 
     Args:
         weights, active: values for each member, see `Histories.search`.
@@ -1172,7 +1197,7 @@ def _evaluator(problem: Problem, weights: Numbers, active: Numbers | None) -> Ev
 
     weights, made = np.asarray(weights), threading.Event()
 
-    def some(z: np.ndarray, members: np.ndarray) -> tuple[np.ndarray, np.ndarray, Observation]:
+    def evaluate_together(z: np.ndarray, members: np.ndarray) -> tuple[np.ndarray, np.ndarray, Observation]:
         filled = np.resize(np.arange(len(members)), TOGETHER)
         slots = None if active is None else np.asarray(active)[members[filled]]
         return jax.device_get(_evaluate(problem, z[filled], weights[members[filled]], slots)[:3])
@@ -1180,7 +1205,7 @@ def _evaluator(problem: Problem, weights: Numbers, active: Numbers | None) -> Ev
     def evaluate(z: np.ndarray, members: np.ndarray) -> tuple[np.ndarray, np.ndarray, Observation]:
         parts = [(z[k : k + TOGETHER], members[k : k + TOGETHER]) for k in range(0, len(members), TOGETHER)]
         with Threads(CORES if made.is_set() else 1) as cores:
-            results = list(cores.map(lambda part: some(*part), parts))
+            results = list(cores.map(lambda part: evaluate_together(*part), parts))
         made.set()  # the first call has compiled the program
         return jax.tree.map(lambda *x: np.concatenate(x)[: len(members)], *results)
 
@@ -1191,29 +1216,32 @@ def _evaluator(problem: Problem, weights: Numbers, active: Numbers | None) -> Ev
 def _evaluate(
     problem: Problem, z: Numbers, weights: Numbers, active: Numbers | None
 ) -> tuple[Array, Array, Observation, LinearisedRun]:
-    """Result of `linearise_rollout` for members of a search, and their runs."""
+    """Result of `linearise_rollout` for members of a search, and their simulated runs."""
 
-    def one(z: Array, weight: Array, which: Array | None) -> tuple[Array, Array, Observation, LinearisedRun]:
+    def evaluate_member(
+        z: Array, weight: Array, which: Array | None
+    ) -> tuple[Array, Array, Observation, LinearisedRun]:
         problem_there = problem
         if which is not None:
             problem_there = dataclasses.replace(problem, coordinates=problem.coordinates.with_effects(which))
-        observe: Histories = problem.observe.following(problem_there.robot(z))  # type: ignore[attr-defined]
+        observe: Histories = problem.observe.with_simulated_runs(problem_there.robot(z))  # type: ignore[attr-defined]
         problem_there = dataclasses.replace(problem_there, observe=observe)
         assert observe.known is not None
         return *linearise_rollout(problem_there, z, dataclasses.replace(problem.data, weight=weight)), observe.known
 
-    return jax.vmap(one)(z, weights, active)
+    return jax.vmap(evaluate_member)(z, weights, active)
 
 
 @functools.partial(compiled, options=SELDOM)
 def _responses(
     observe: Histories, robot: Robot, effects: tuple[ScoredEffect, ...], scale: Array
 ) -> tuple[Array, Array, Signals, Array]:
-    """Signatures and defects of `HistoriesLinearization`, signals of each row, and the shaft's angle there.
+    """Signatures and balance errors for `HistoriesLinearization`, signals of each row, and the angle of the shaft
+    there.
 
     Args:
-        observe: with known runs.
-        scale: scale of readings [1/SI], shape (rows, channels).
+        observe: observer with simulated runs.
+        scale: scale of the readings [1/SI], shape (rows, channels).
     """
     defects, by_effects = observe.changes(robot, tuple(balance_probe(b) for b in PROBED), effects)
     rows_of, rows = observe.rows_of, len(scale)
@@ -1224,16 +1252,16 @@ def _responses(
     return finite_or_zero(by_reading), finite_or_zero(defects), observe.at_rows(runs), observe.angle(runs)
 
 
-class _Probed(NamedTuple):
-    """A robot with probes of balances, and the effects that change its readings through them.
+class _ProbedRobot(NamedTuple):
+    """A robot with probes in its balances, and the effects that change its readings through them.
 
     Attributes:
-        every: probes, those with requested defects first.
-        size: number of these.
-        effects: effects with the robot's shapes.
-        entering: index of each instance's probe, shape (instances,).
-        enters: 1 if that balance has a probe, else 0, shape (instances,).
-        at_sensor: 1 if an instance is an error of a channel's instrument, else 0, shape (channels, instances).
+        every: all probes. Those whose errors are requested come first.
+        size: number of the requested ones.
+        effects: effects, with the shapes that the robot has.
+        entering: index of the probe of each instance's balance, shape (instances,).
+        enters: 1 if that balance has a probe, otherwise 0, shape (instances,).
+        at_sensor: 1 if an instance is an error of the channel's instrument, otherwise 0, shape (channels, instances).
     """
 
     robot: Robot
@@ -1245,8 +1273,8 @@ class _Probed(NamedTuple):
     at_sensor: np.ndarray
 
     @classmethod
-    def of(cls, robot: Robot, probes: tuple[Effect, ...], effects: tuple[ScoredEffect, ...]) -> _Probed:
-        """Probes, with further ones for the balances that the effects enter."""
+    def of(cls, robot: Robot, probes: tuple[Effect, ...], effects: tuple[ScoredEffect, ...]) -> _ProbedRobot:
+        """Robot with these probes and further ones for the balances that the effects enter."""
         others = dict.fromkeys(e.effect.balance for e in effects if e.effect.balance != "sensor")
         entered = tuple(balance_probe(b) for b in others if b not in {p.balance for p in probes})
         every, size = (*probes, *entered), len(probes)
@@ -1276,18 +1304,19 @@ class _Probed(NamedTuple):
         *,
         delayed: bool,
     ) -> tuple[Array, Array]:
-        """Changes of a run's readings by a defect at each knot, and by each effect.
+        """Changes of a run's readings by an error at each knot, and by each effect.
 
         Args:
+            conditions: conditions of the run.
             clock: times of the knots [s].
-            instants: numbers of the samples' instants.
-            times: times of instants [s].
-            along: the run.
-            time: time of samples [s].
-            delayed: True if readings are late.
+            instants: index of the instant of each sample.
+            along: the simulated run.
+            times: times of the instants [s].
+            time: times of the samples [s].
+            delayed: True if readings are delayed.
         """
         robot, size, none = self.robot, self.size, jnp.zeros(len(self.every))
-        remembered, hat = _remembered(robot, conditions, along, self.effects), _hat_functions(clock)
+        remembered, hat = _memory_along_run(robot, conditions, along, self.effects), _hat_functions(clock)
 
         def terms(t: Array, y: Array, held: Conditions, way: Array | None = None) -> Array:
             signals = moving(robot, held, state_of_unknowns(robot, y), way)
@@ -1330,27 +1359,30 @@ class _Probed(NamedTuple):
 
 
 def _hat_functions(clock: Array) -> Callable[[Array], Array]:
-    """Function of time with a hat for each knot: 1 there, falling linearly to 0 at its neighbours, shape (knots,)."""
+    """Function of time that returns the hat function of each knot, shape (knots,).
+
+    A hat is 1 at its knot and falls linearly to 0 at the neighbouring knots.
+    """
     # A run that ended early repeats its last knot; only the first of these has a hat.
     real = jnp.concatenate([jnp.ones(1), (jnp.diff(clock) > 0).astype(clock.dtype)])
     before = jnp.concatenate([clock[:1], clock[:-1]])
     after = jnp.concatenate([clock[1:], clock[-1:] + 1.0])
 
-    def hat(t: Array) -> Array:
+    def hats(t: Array) -> Array:
         rising = ((t - before) / jnp.maximum(clock - before, 1e-12)).at[0].set(1.0)
         falling = jnp.where(after > clock, (after - t) / jnp.where(after > clock, after - clock, 1.0), 1.0)
         return real * jnp.clip(jnp.minimum(rising, falling), 0.0, 1.0)
 
-    return hat
+    return hats
 
 
-def _remembered(
+def _memory_along_run(
     robot: Robot, conditions: Conditions, along: LinearisedRun, effects: tuple[ScoredEffect, ...]
 ) -> Callable[[Array], list[Array]]:
-    """Memory of effects along a known run, at each point of their grids, as a function of time.
+    """Function of time that returns the memory of each effect along a simulated run, at each point of its grid.
 
-    It follows the stages of the run (`histories.linearise_run`). A memory's rate is linear in the memory, or nearly
-    so.
+    It follows the stages of the run (`histories.linearise_run`). The rate of a memory is linear, or nearly so, in the
+    memory.
     """
     with_memory = [e for e in effects if e.effect.memory_size is not None]
     counts = np.cumsum([len(e.at) for e in with_memory])
@@ -1361,7 +1393,7 @@ def _remembered(
     def split(memory: Array) -> list[Array]:
         return jnp.split(memory, counts[:-1])
 
-    def speeds(y: Array, held: Conditions, way: Array, memory: Array) -> Array:
+    def memory_rates(y: Array, held: Conditions, way: Array, memory: Array) -> Array:
         signals = moving(robot, held, state_of_unknowns(robot, y), way)
 
         def rate(effect: Effect, remembered: Array) -> Array:
@@ -1378,7 +1410,7 @@ def _remembered(
         held, spans, passes = taken.held(constant), jnp.diff(state_there.clock), state_there.passes
 
         def stage(memory: Array, span: Array, y: Array, way: Array) -> Array:
-            law = lambda m: speeds(y, held, way, m)  # noqa: E731
+            law = lambda m: memory_rates(y, held, way, m)  # noqa: E731
             speed, slope = jax.jvp(law, (memory,), (jnp.ones_like(memory),))
             return memory + span * speed / (1 - span * slope)
 

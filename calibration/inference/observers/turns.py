@@ -1,4 +1,4 @@
-"""Settled turns: one row a run of a robot with independently driven sides, read when it circles."""
+"""Settled turns: one row for each run of a robot with independently driven sides, read while it circles."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from calibration.inference.linearization import PROBED, Linearization, ScoredEff
 from calibration.inference.observers.base import SearchPolicy
 from calibration.inference.observers.settled import SettledLinearization, SettledRuns, side_shares
 from calibration.inference.observers.time_histories import Histories
-from calibration.inference.optimizers import solve_roots
+from calibration.inference.optimizers import solve_rows_at
 from calibration.inference.problem import Data, Observation, Problem
 from mmrjax import effects, fidelities
 from mmrjax.effects import Effect
@@ -46,7 +46,7 @@ def signal_by_point(signals: Signals, name: str) -> Float[Array, " points"]:
 
 
 class TurnLinearization(SettledLinearization):
-    """Linearization of settled turns: each side of each row is a point. `signals` have the sides as last axis."""
+    """Linearization of settled turns. Each side of each row is a point. The last axis of `signals` is the side."""
 
     probed: ClassVar[Names] = (*PROBED, *ROUND)
 
@@ -72,7 +72,7 @@ class TurnLinearization(SettledLinearization):
 class SettledTurns(SettledRuns):
     """Observer of settled turns.
 
-    Contacts slide sideways as far as the turn requires. So the demand on adhesion, a limit of straight travel, is no
+    In a turn, contacts slide sideways as far as the turn requires. Adhesion, which limits straight travel, is no
     limit here.
     """
 
@@ -88,8 +88,8 @@ class SettledTurns(SettledRuns):
     shape_sides: ClassVar[tuple[int, ...]] = (2,)
 
     @classmethod
-    def observes(cls, runs: Runs) -> bool:
-        return runs.turns and super().observes(runs)
+    def accepts_table(cls, runs: Runs) -> bool:
+        return runs.turns and super().accepts_table(runs)
 
     @classmethod
     def of(cls, runs: Runs, robot: Robot, fidelity: str | None = None) -> SettledTurns:
@@ -101,7 +101,7 @@ class SettledTurns(SettledRuns):
 
     @classmethod
     def sizes(cls, runs: Runs) -> np.ndarray:
-        """Root mean square of each channel: readings of turns in either direction cross zero."""
+        """Root mean square of each channel, because readings cross zero between turns in both directions."""
         return Histories.sizes(runs)
 
     @classmethod
@@ -128,9 +128,9 @@ class SettledTurns(SettledRuns):
     ) -> tuple[Any, ...]:
         """Draws as in the protocol, with the roots at each refit."""
         samples = super().draws(problem, z, linear, keys, factors)
-        return *samples, solve_roots(problem, samples[2])
+        return *samples, solve_rows_at(problem, samples[2])
 
-    def replicate(
+    def fit_replicate(
         self,
         problem: Problem,
         data: Data,
@@ -139,15 +139,15 @@ class SettledTurns(SettledRuns):
         drawn: tuple[Any, ...],
     ) -> Linearization:
         rooted = dataclasses.replace(problem, roots=drawn[-1])
-        return super().replicate(rooted, data, effects, linear, drawn[:-1])
+        return super().fit_replicate(rooted, data, effects, linear, drawn[:-1])
 
     def unreachable(self, status: np.ndarray) -> np.ndarray:
         return super().unreachable(status) | (status == NOT_SETTLED)
 
     def bases(self, columns: Columns, included: np.ndarray, robot: Robot) -> Bases:
-        """Bases as in the protocol, in the same balances of both sides and in those of the turn.
+        """Bases of curves, see `Observer.bases`, in the balances of both sides and of the turn.
 
-        Curves are over each side's signals, the yaw rate, and the side.
+        Curves are over the signals of each side, the yaw rate, and the side.
         """
         names = [v for v in VARIABLES if v != "voltage" or robot.rig.shows_voltage]
         signals = results_of_rows(robot, self.conditions)[1]
@@ -161,7 +161,7 @@ class SettledTurns(SettledRuns):
             points,
             weight,
             robot,
-            bases_room.Scope(lacking, axes),
+            bases_room.CurveScope(lacking, axes),
             {way: signal_values[way] for way in WAYS},
         )
         return (*bases_room.curve_families(*base_arguments), *bases_room.window_families(*base_arguments))
