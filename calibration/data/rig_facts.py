@@ -66,17 +66,17 @@ def _motor(robot: Robot) -> Iterator[Fact]:
     if with_constant:
         per_volt = 1 / constant / RPM
         odd = _outside(per_volt, 5, 20_000, "is torque_constant in N·m/A? 1 mN·m/A is 0.001")
-        yield Fact("speed without load, of each volt", f"{three_digits(per_volt)} rpm/V", odd)
+        yield Fact("no-load speed per volt", f"{three_digits(per_volt)} rpm/V", odd)
         idle = float(motor.friction_coulomb) / constant
         odd = _outside(idle, 0, 10, "is friction_coulomb in N·m? it is torque_constant times the no-load current")
         yield Fact("current needed to overcome the motor's dry friction", f"{three_digits(idle)} A", odd)
     if with_constant and voltage is not None:
         fastest = voltage / constant
         odd = "" if fastest < 2 * motor.speed_limit else ("more than twice motor.speed_limit; check torque_constant")
-        yield Fact(f"speed without load at {three_digits(voltage)} V", f"{three_digits(fastest / RPM)} rpm", odd)
+        yield Fact(f"no-load speed at {three_digits(voltage)} V", f"{three_digits(fastest / RPM)} rpm", odd)
     if with_resistance and voltage is not None:
         stall = float(motor.current_stall(voltage))
-        odd = _outside(stall, 0.02, 1000, "look at motor.resistance")
+        odd = _outside(stall, 0.02, 1000, "check motor.resistance")
         yield Fact(f"stall current at {three_digits(voltage)} V", f"{three_digits(stall)} A", odd)
     if with_constant and with_resistance:
         size = constant**2 / resistance
@@ -161,7 +161,7 @@ def _shaft(robot: Robot, name: str, load: Shaft) -> Iterator[Fact]:
         yield Fact(
             f"{name}: travel per turn",
             f"{three_digits(travel * 1e3)} mm",
-            _outside(travel, 1e-4, 10.0, "look at it"),
+            _outside(travel, 1e-4, 10.0, "check the travel"),
         )
 
 
@@ -180,7 +180,7 @@ def _vehicle(robot: Robot, name: str) -> Iterator[Fact]:
     yield Fact(
         f"{name}: steepest slope without sliding",
         f"{grip:.0f}°",
-        odd or _outside(grip, 5, 60, "look at static"),
+        odd or _outside(grip, 5, 60, "check friction.static"),
     )
     limit = robot.motor.voltage_limit
     if limit is None or not robot.knows(["motor.resistance"]):
@@ -192,7 +192,7 @@ def _vehicle(robot: Robot, name: str) -> Iterator[Fact]:
     yield Fact(f"{name}: steepest slope that the stall torque holds at {three_digits(limit)} V", angle, odd)
     speed = limit / float(robot.motor.torque_constant) / float(robot.gearbox.ratio) * radius
     odd = _outside(speed, 0.005, 15, f"check {name}.radius, gearbox.ratio and motor.torque_constant")
-    yield Fact(f"{name}: speed without load at {three_digits(limit)} V", f"{three_digits(speed)} m/s", odd)
+    yield Fact(f"{name}: no-load speed at {three_digits(limit)} V", f"{three_digits(speed)} m/s", odd)
 
 
 def doubtful_time(runs: Runs, robot: Robot) -> str:

@@ -90,8 +90,8 @@ def _act(act: menu.CalibrationAct) -> str:
         each = {1: "", 2: "in both configurations, "}.get(len(configurations), "in each configuration, ")
         laden = f"unladen and with the payload of {payload:g} kg, " if payload > 0 else "unladen, "
         return (
-            f"Weigh the robot {each}{laden}on scales accurate to 20 g; subtract the stated total mass from the "
-            "reading"
+            f"Weigh the robot {each}{laden}on scales accurate to 20 g, and compare the readings with the total mass "
+            "in the robot file"
         )
     (kind,) = act.kinds
     if act.channel:
@@ -131,7 +131,7 @@ def heated_winding(temperature: float, allowed: float | None) -> str:
     """
     settles = math.isfinite(temperature)
     would = f"would reach {temperature:.0f} °C" if settles else ("would burn out, as its temperature never settles")
-    return f"a winding left on {would}{'' if allowed is None else _temperature_limit(allowed)}"
+    return f"an energised winding {would}{'' if allowed is None else _temperature_limit(allowed)}"
 
 
 def _temperature_limit(temperature: float) -> str:
@@ -238,7 +238,7 @@ def _of_level(what: SimpleNamespace) -> dict[str, str]:
         "speed": f"{level} {turning}, which also varies the travelling speed",
         "slope": f"Repeat at one {one} and payload with the slope from 0 to {what.slope:g} deg, and downhill",
         "payload": f"Repeat at one {one} and slope with the payload from 0 to {what.payload:g} kg",
-        "time": f"Record one {one} for ten minutes from a cold start, and repeat it at once while everything is warm",
+        "time": f"Repeat at one {one} for ten minutes from a cold start, and again at once while everything is warm",
     }
     if not within.has_ground:
         words["current"] = (
@@ -273,7 +273,7 @@ SAID: dict[str, str | Callable[..., str]] = {
         f"No experiment that the loop can propose separates {' and '.join(names)} by {sigma:g} sigma"
     ),
     "too_weak": "A series of runs over {variable} would show the missing term with {sigma:.1f} sigma only",
-    "carry_out": lambda experiments: ". And: ".join(map(experiment_sentences, experiments)),
+    "carry_out": lambda experiments: ". Second experiment: ".join(map(experiment_sentences, experiments)),
     "more_runs": lambda **series: (
         f"{more_runs(SimpleNamespace(**series))}; read every channel. The series shows the shape of the term that "
         f"is missing in the {bases.place_in_words(series['place'])}"
@@ -319,7 +319,7 @@ VARY = {
     "position": "the position: cover the whole travel in both directions at one voltage",
     "": "nothing: its share is the same in every run",
 }  # fmt: skip
-WEIGH = "Weigh the robot, unladen and laden, and subtract the stated mass"
+WEIGH = "Weigh the robot, unladen and laden, and compare the readings with the mass in the robot file"
 
 
 def effect_summary(effect: type[Effect]) -> tuple[str, str, str]:
@@ -333,15 +333,15 @@ def effect_declarations(effect: type[Effect]) -> Iterator[str]:
     """Declarations of an effect in addition to its equation."""
     words = [
         "dissipative" * effect.dissipative,
-        "in histories alone" * effect.transient,
-        "in turns alone" * (effect.name in OF_TURNS),
+        "only in time histories" * effect.transient,
+        "only in turns" * (effect.name in OF_TURNS),
         f"settles to `{effect.settles_to}`" * bool(effect.settles_to),
-        "on the battery alone" * effect.needs_battery,
-        "in runs both ways alone" * effect.needs_reverse,
-        "at a duty below 1 alone" * effect.needs_duty,
-        "odd in travel" * effect.odd_in_travel,
-        f"on {effect.movers} alone" * bool(effect.movers),
-        f"rests on `{', '.join(effect.rests_on)}`" * bool(effect.rests_on),
+        "only on the battery" * effect.needs_battery,
+        "only in runs in both directions" * effect.needs_reverse,
+        "only at a duty below 1" * effect.needs_duty,
+        "same direction in forward and backward travel" * effect.odd_in_travel,
+        f"only on {effect.movers}" * bool(effect.movers),
+        f"proportional to `{', '.join(effect.rests_on)}`" * bool(effect.rests_on),
     ]
     yield from filter(None, words)
 

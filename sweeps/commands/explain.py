@@ -106,7 +106,7 @@ def _effect(name: str, library: Library) -> Iterator[Line]:
         else:
             yield f"  {p.name}", f"{float(p.value):g} {p.spec.unit}: {p.spec.meaning}"
     if declarations := ", ".join(experiment_words.effect_declarations(effect)):
-        yield "declares", declarations
+        yield "properties", declarations
     yield "in data", f"{effect.family()}{_histories(effect)}"
     for line in _changes(example):
         yield "", line
