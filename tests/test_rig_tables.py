@@ -583,7 +583,7 @@ def test_three_motors_forward_and_reverse_are_calibrated(tmp_path):
     ],
 )
 def test_step_of_readings_is_their_common_divisor(readings, step):
-    assert instruments.step_of(np.array(readings)) == pytest.approx(step, rel=1e-9)
+    assert instruments.common_step(np.array(readings)) == pytest.approx(step, rel=1e-9)
 
 
 def test_an_instrument_left_free_is_what_its_table_shows(tmp_path):

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from calibration.data import Columns, Names
-from calibration.data.contradictions import cannot_stand
+from calibration.data.contradictions import reason_without_stance
 from calibration.data.input_errors import BadConfiguration, allowed_words
 from mmrjax import derived, fidelities
 from mmrjax.compile.compiling import compiled
@@ -111,7 +111,7 @@ def chosen_outputs(words: Names, robot: Robot, turns: bool = False) -> tuple[Qua
                 raise BadConfiguration(
                     f"--outputs {word}: only for straight travel; the varied inputs make the robot turn"
                 )
-            if row in derived.OF_POSTURE and (why := cannot_stand(robot)):
+            if row in derived.OF_POSTURE and (why := reason_without_stance(robot)):
                 raise BadConfiguration(f"--outputs {name}: {why}")
             chosen.append(row)
     return tuple(dict.fromkeys(chosen))

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from calibration.data import Json, Names
-from calibration.data.contradictions import cannot_stand
+from calibration.data.contradictions import reason_without_stance
 from calibration.data.input_errors import BadConfiguration, allowed_words
 from calibration.data.requirements_file import STAIRS, TREAD, Envelope, Requirement, Requirements
 from calibration.inference.fit_notes import Remark, progress_remark
@@ -135,7 +135,7 @@ def refuse_impossible(robot: Robot, asked: Requirements) -> None:
         turns = r.quantity.group in ("turn", "across")
         if turns and (why := turn_error(robot, (_configuration(robot, e),))):
             raise BadConfiguration(f"{where}: {why}")
-        if r.quantity.group == "posture" and (why := cannot_stand(robot)):
+        if r.quantity.group == "posture" and (why := reason_without_stance(robot)):
             raise BadConfiguration(f"{where}: {why}")
         chassis = robot.configurations[_configuration(robot, e)]
         friction = float(chassis.ground.friction.static) * adhesion_ratio(e.surface, float(chassis.on_tracks) > 0.5)

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array
 
 from calibration.data import terrains
-from calibration.data.contradictions import without_levers
+from calibration.data.contradictions import reason_without_levers
 from calibration.data.input_errors import BadConfiguration
 from mmrjax.climbing import climb_simulation, terrain
 from mmrjax.climbing.climb_derivatives import ClimbInputs, Derivatives, climb_derivatives
@@ -154,7 +154,7 @@ def _along(config: configuration.Climb, robot: Robot, conditions: Conditions, se
     kind = next((k for k, size in sizes.items() if size is not None), None)
     levers = {"levers_front_deg": "front", "levers_rear_deg": "rear"}
     variables = ["adhesion", "payload", "discharge" if config.battery else "voltage"]
-    moved = sequence.begins is None and not without_levers(robot, config.configuration or "")
+    moved = sequence.begins is None and not reason_without_levers(robot, config.configuration or "")
     variables += [*(levers if moved else ()), *([SIZE] if kind is not None else [])]
     for k, name in enumerate(names):
         if name in names[:k]:
@@ -252,7 +252,7 @@ def _lever_sequence(config: configuration.Climb, robot: Robot, name: str) -> Seq
     gear = robot.running_gear
     tracked = bool(np.asarray(robot.configurations[name].on_tracks) > 0.5)
     if not tracked and stated != (None, None, None):
-        raise BadConfiguration(f"--levers-front, --levers-rear, --sequence: {without_levers(robot, name)}")
+        raise BadConfiguration(f"--levers-front, --levers-rear, --sequence: {reason_without_levers(robot, name)}")
     folded_angles = (
         float(np.degrees(np.asarray(gear.lever_front))),
         180 - float(np.degrees(np.asarray(gear.lever_rear))),

@@ -77,7 +77,7 @@ def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> 
             f"{source.source}, speed_mm_s: the robot's load is a shaft, so there is no travelling speed; give "
             "motor_speed_rpm or duty"
         )
-    source.check_source(config.battery)
+    source.check_supply(config.battery)
     for column in source.stated:
         if column in beside.stated:
             raise BadConfiguration(

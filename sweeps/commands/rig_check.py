@@ -12,7 +12,7 @@ import numpy as np
 from calibration.data import Json, Names, rig_facts, settling
 from calibration.data.columns import IMPOSED, SUPPLY, Layout
 from calibration.data.input_errors import BadConfiguration
-from calibration.data.rig_facts import Fact, Origin
+from calibration.data.rig_facts import DerivedFact, NumberOrigin
 from calibration.data.rig_file import FREE
 from calibration.data.runs import Runs
 from calibration.data.stated import EXAMPLE, EXAMPLE_SHARE, is_example
@@ -56,8 +56,8 @@ class RigCheck:
     file: str
     robot: Robot
     examples: tuple[int, ...]
-    origins: tuple[Origin, ...]
-    facts: tuple[Fact, ...]
+    origins: tuple[NumberOrigin, ...]
+    facts: tuple[DerivedFact, ...]
     runs: Runs | None = None
     foresight: InformationForecast | None = None
     doubts: Names = ()
@@ -252,7 +252,7 @@ def _source_of_sd(word: str, channel: Channel) -> str:
     return every.get(word, word)
 
 
-def _program(robot: Robot, origin: Origin) -> str:
+def _program(robot: Robot, origin: NumberOrigin) -> str:
     """A number without ±, with the default prior width that a fit gives it."""
     sd = float(priors.parameter_coordinates(robot, (origin.name,)).prior_sd[0])
     return f"{origin.name} (±{100 * sd / abs(origin.value):.2g} %)"

@@ -14,7 +14,7 @@ from jaxtyping import Float
 from calibration.data import Json, Names
 from calibration.data.columns import IMPOSED as OF_IMPOSED
 from calibration.data.columns import LEVERS
-from calibration.data.contradictions import without_levers
+from calibration.data.contradictions import reason_without_levers
 from calibration.data.input_errors import BadConfiguration, allowed_words, stated_count, stated_number, stated_word
 from mmrjax.fidelities import variation
 from mmrjax.fidelities.variation import Axis
@@ -113,7 +113,7 @@ def plan_design(config: Campaign, robot: Robot, where: str) -> Plan:
     imposed.check_turning(robot, {*fixed, *design.names}, simulated, where)
     if levers := sorted({*fixed, *design.names} & {*LEVERS}):
         for name in simulated:
-            if why := without_levers(robot, name):
+            if why := reason_without_levers(robot, name):
                 raise BadConfiguration(f"{where}, {levers[0]}: {why}")
     own_axis = AXIS[robot.rig.imposed]
     if not robot.rig.inherits and own_axis not in {*fixed, *design.names} and fixed.get("battery", 0.0) <= 0.5:

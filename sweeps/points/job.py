@@ -90,7 +90,7 @@ def _profile(name: str, robot: Robot, plan: axes.Plan, where: str) -> Profile:
                 f"{where}, {field}: got it in addition to {source.source}, which contains it; keep one of the two"
             )
     on_battery = plan.conditions.get("battery", 0.0) or "battery" in plan.design.names
-    source.check_source(bool(on_battery))
+    source.check_supply(bool(on_battery))
     return source.profile(robot, plan.fixed())
 
 

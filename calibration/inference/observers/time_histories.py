@@ -24,12 +24,12 @@ from jaxtyping import Array, Float, Int
 from calibration.data import Columns, Names
 from calibration.data.columns import SUPPLY
 from calibration.data.courses import (
-    Stretch,
+    ConstantInterval,
     applied_drive,
     changing_columns,
-    course_stretches,
     differs_from_row_before,
     divide_run,
+    intervals_by_run,
 )
 from calibration.data.input_errors import BadConfiguration, BadData
 from calibration.data.runs import Runs
@@ -405,7 +405,7 @@ class Histories(Observer):
         time, measured = runs["time_s"], runs.measured()
         each = [
             max((s for s in run if s.driven or s.whole), key=lambda s: s.lasts, default=run[0])
-            for run in course_stretches(runs)
+            for run in intervals_by_run(runs)
         ]
         each = [s for s in each if s.driven and (s.whole or s.lasts >= LASTING)]
         if steady:
@@ -506,7 +506,7 @@ class Histories(Observer):
         """True if some conditions change within a run."""
         return any(x.ndim > 1 for x in jax.tree.leaves(self.conditions))
 
-    def stretches(self) -> list[list[Stretch]]:
+    def stretches(self) -> list[list[ConstantInterval]]:
         """Intervals of constant conditions in each run."""
         rows_of, time, of_rows = np.asarray(self.rows_of), np.asarray(self.time), self.of_rows
         volts = np.where(of_rows.open > 0.5, 0.0, of_rows.voltage * of_rows.duty)
@@ -978,7 +978,7 @@ def _check_signs(runs: Runs) -> None:
     unsigned = np.nanmin(measured, 0, initial=0.0) >= -RESTING * size
     unsigned &= [runs.turns_round(c) for c in runs.channels]
     unit = runs.layout.imposed_column.rpartition("_")[2]
-    for run in course_stretches(runs):
+    for run in intervals_by_run(runs):
         for s in (s for s in run if volts[s.rows[0]] < 0 and s.lasts >= LASTING):
             rows = s.after(time, 0.5)
             for k in np.flatnonzero(unsigned):
