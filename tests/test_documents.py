@@ -16,7 +16,7 @@ from calibration.data import runs as records
 from calibration.data.parts import packaged_cells
 from calibration.data.robot_file import RobotFile
 from calibration.sizing import sheet
-from calibration.sizing.design_search import SizedDesign, Sizing
+from calibration.sizing.design_search import SizedDesign, SizingResult
 from calibration.sizing.part_options import drive_options
 from mmrjax.model.paper_robots import nominal
 from sweeps import store
@@ -40,14 +40,14 @@ def outcomes():
     asked = requirements_file.parse_requirements("speed_m_s = 1\nmass_kg = 15\nslope_deg = 20\n", "aims.toml")
     at = {"configuration": "6T2A", "surface": "lacquered_wood", "payload_kg": 8.0, "slope_deg": 10.0}
     changes = (
-        sheet.Change("gearbox.ratio", 48.0, 45.27, "-", -0.02),
-        sheet.Change("battery.capacity", 7920.0, 16210.0, "C", 1e-5, ("mass_kg",)),
+        sheet.ParameterChange("gearbox.ratio", 48.0, 45.27, "-", -0.02),
+        sheet.ParameterChange("battery.capacity", 7920.0, 16210.0, "C", 1e-5, ("mass_kg",)),
     )
     speed, mass, slope = asked.each
     return (
-        sheet.Outcome(speed, 0.947, -0.053, "converged", at, changes),
-        sheet.Outcome(mass, 13.1, 1.9, "converged", {k: at[k] for k in ("configuration", "surface")}),
-        sheet.Outcome(slope, None, None, "slides", at),
+        sheet.RequirementOutcome(speed, 0.947, -0.053, "converged", at, changes),
+        sheet.RequirementOutcome(mass, 13.1, 1.9, "converged", {k: at[k] for k in ("configuration", "surface")}),
+        sheet.RequirementOutcome(slope, None, None, "slides", at),
     )
 
 
@@ -64,7 +64,7 @@ def size():
         {"winding": 0.002, "cell current": 0.4}, ("largest ratio",), robot,
     )  # fmt: skip
     short = dataclasses.replace(best, margins={"winding": -0.08}, objectives={"mass": 13.7}, bounds=())
-    sizing = Sizing(
+    sizing = SizingResult(
         None, None, "mass", ("steepest slope held",), best, best, (), {"a": best, "b": short}, (), 256, 31000
     )  # fmt: skip
     return size_report.size_document(SizeResult(asked, robot, sizing, ("mass",), outcomes()), "nominal (PM)")

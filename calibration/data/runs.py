@@ -41,7 +41,7 @@ from mmrjax.model import channels
 from mmrjax.model.quantities import MM, RPM
 from mmrjax.model.robot import NO_BRAKE, Robot
 
-__all__ = ["CONDITIONS", "DUTY", "MM", "RPM", "WHEN", "Runs", "runs_of_arrays", "read_runs", "single_run"]
+__all__ = ["CONDITIONS", "DUTY", "MM", "RPM", "WHEN", "Runs", "read_runs", "runs_of_arrays", "single_run"]
 
 
 #: Tables that come with the package.

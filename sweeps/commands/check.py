@@ -9,7 +9,7 @@ import numpy as np
 
 from calibration.data import requirements_file
 from calibration.data.input_errors import BadConfiguration
-from calibration.described import in_words
+from calibration.described import report_in_words
 from calibration.sizing import sheet
 from mmrjax.derived.requirements import OF_HEAT
 from mmrjax.model.quantities import CHARGE, HEAT
@@ -35,7 +35,7 @@ def execute(config: configuration.Check, beside: configuration.FolderPart) -> in
     file = load_robot(config)
     robot = file.robot
     imposed.check_on_ground(robot, "check")
-    sheet.refuse_impossible(robot, demands)
+    sheet.reject_impossible(robot, demands)
     _check_charge(robot, demands)
     lacking = robot.unknown(HEAT)
     for r in demands.each:
@@ -46,7 +46,7 @@ def execute(config: configuration.Check, beside: configuration.FolderPart) -> in
             )
     with open_folder("check", config, robot, beside) as folder:
         with step_reporter(print_message, "reading the requirements") as heard:
-            outcomes = sheet.check_requirements(robot, demands, changes=config.changes, tell=in_words(heard))
+            outcomes = sheet.check_requirements(robot, demands, changes=config.changes, tell=report_in_words(heard))
             result = CheckResult(demands, robot, outcomes, posture_words.of_requirements(robot, outcomes))
         _write(folder, config, result)
         document = print_report(

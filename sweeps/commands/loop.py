@@ -16,7 +16,7 @@ import numpy as np
 import mmrjax as mm
 from calibration.data import Columns, effect_file, robot_file
 from calibration.data.runs import Runs
-from calibration.described import in_words
+from calibration.described import report_in_words
 from calibration.discovery import findings
 from calibration.discovery.discover import discover
 from calibration.discovery.kept import REFIT_FILE, OutOfTime
@@ -133,7 +133,7 @@ def _resolved(
     """The result, with the track model's test added: does a different running gear explain the misfit?"""
     resolved = fit_track_model(
         found, noise=config.noise or None, population=config.population, generations=config.generations,
-        members=members, seed=config.seed, tell=in_words(progress),
+        members=members, seed=config.seed, tell=report_in_words(progress),
     )  # fmt: skip
     return dataclasses.replace(found, resolved=resolved)
 

@@ -11,15 +11,15 @@ from calibration.data.columns import Layout
 from calibration.data.input_errors import BadConfiguration
 from calibration.data.robot_file import RobotFile
 from calibration.data.runs import Runs
-from calibration.described import in_words
+from calibration.described import report_in_words
 from calibration.inference import noise
 from calibration.sensitivity import uncertain_inputs
 from calibration.sensitivity.analyse import analyse_sensitivity
 from calibration.sensitivity.model import chosen_outputs
-from calibration.sensitivity.next_runs import Candidates
-from calibration.sensitivity.result import METHODS, Points
-from calibration.sensitivity.study import Study, Supply
-from calibration.sensitivity.uncertain_inputs import Inputs
+from calibration.sensitivity.next_runs import CandidateRuns
+from calibration.sensitivity.result import METHODS, OperatingPoints
+from calibration.sensitivity.study import PointSupply, Study
+from calibration.sensitivity.uncertain_inputs import UncertainInputs
 from mmrjax.model.conditions import OF_TURNS
 from mmrjax.model.paper_tables import PAYLOADS_KG, SLOPES_DEG, VOLTAGES_V
 from mmrjax.model.power import COULOMB_PER_MAH
@@ -72,9 +72,18 @@ def execute(config: configuration.Sensitivity, beside: configuration.FolderPart)
     conditions = runs.conditions(robot)
     turned: Json = {name: np.full(len(runs), np.mean(ranges[name])) for name in freed}
     check_runs_bearable(robot, dataclasses.replace(conditions, **turned), config)
-    supply = Supply(float(config.battery), config.discharge_mAh * COULOMB_PER_MAH, np.asarray(conditions.adhesion))
+    supply = PointSupply(
+        float(config.battery), config.discharge_mAh * COULOMB_PER_MAH, np.asarray(conditions.adhesion)
+    )
     study = Study(
-        robot, inputs, Points.of(runs), outputs, config.model, config.options, supply, in_words(print_message)
+        robot,
+        inputs,
+        OperatingPoints.of(runs),
+        outputs,
+        config.model,
+        config.options,
+        supply,
+        report_in_words(print_message),
     )
     with open_folder("sensitivity", config, robot, beside, runs) as folder:
         result = analyse_sensitivity(study, config.method, config.evaluations, config.seed, candidates)
@@ -164,7 +173,7 @@ def words_of(name: str) -> str:
 
 def _inputs(
     config: configuration.Sensitivity, file: RobotFile, runs: Runs, ranges: dict[str, tuple[float, float]]
-) -> Inputs:
+) -> UncertainInputs:
     robot, present = file.robot, tuple(dict.fromkeys(map(str, runs["configuration"])))
     if config.posterior:
         if config.parameters:
@@ -179,7 +188,7 @@ def _inputs(
     return uncertain_inputs.inputs_from_priors(robot, names, ranges)
 
 
-def _candidates(config: configuration.Sensitivity, robot: Robot, points: Runs, turns: bool) -> Candidates:
+def _candidates(config: configuration.Sensitivity, robot: Robot, points: Runs, turns: bool) -> CandidateRuns:
     """Candidate runs: a table, or Table 8 in every configuration. For a rig or for turns, the operating points."""
     if config.candidates:
         runs = read_runs(config.candidates, robot, columns=config.columns, measured=False)
@@ -193,6 +202,12 @@ def _candidates(config: configuration.Sensitivity, robot: Robot, points: Runs, t
     stated = noise.parse_noise(usual, robot.channels)
     if config.noise:
         stated |= noise.parse_noise(config.noise, robot.channels)
-    return Candidates(
-        Points.of(runs), runs.conditions(robot), source, stated, config.noise or usual, runs.deviations(), config.runs
+    return CandidateRuns(
+        OperatingPoints.of(runs),
+        runs.conditions(robot),
+        source,
+        stated,
+        config.noise or usual,
+        runs.deviations(),
+        config.runs,
     )

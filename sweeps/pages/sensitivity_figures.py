@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from calibration.sensitivity.replicates import Estimate
+from calibration.sensitivity.replicates import IntervalEstimate
 from calibration.sensitivity.result import NEGLIGIBLE, NextRuns, OutputStudy, SensitivityResult
 from mmrjax.errors import count_noun
 from sweeps.pages.figure_style import BLUE, GREEN, INK, ORANGE, VERMILION, corner_note, legend_columns, new_figure
@@ -117,7 +117,7 @@ _WORDS = {
 
 
 def _bars(ax: Axes, study: OutputStudy, found: SensitivityResult, top: np.ndarray) -> None:
-    estimates: dict[str, Estimate | None] = {key: e for key, e in study.overall.items() if key in _WORDS}
+    estimates: dict[str, IntervalEstimate | None] = {key: e for key, e in study.overall.items() if key in _WORDS}
     estimates = estimates or {"": None}
     height = 0.8 / len(estimates)
     for j, (key, estimate) in enumerate(estimates.items()):

@@ -11,7 +11,7 @@ import numpy as np
 from calibration.data import Columns
 from calibration.data.columns import LEVERS
 from calibration.data.table import Runs
-from calibration.sizing.sheet import Outcome
+from calibration.sizing.sheet import RequirementOutcome
 from mmrjax.climbing import resting_posture, static_limits
 from mmrjax.climbing.resting_posture import Outline
 from mmrjax.model.conditions import Conditions
@@ -118,7 +118,7 @@ def posture_of_runs(robot: Robot, runs: Runs, conditions: Conditions) -> Posture
     )
 
 
-def of_requirements(robot: Robot, outcomes: Sequence[Outcome]) -> dict[str, tuple[Drawn, float, float]]:
+def of_requirements(robot: Robot, outcomes: Sequence[RequirementOutcome]) -> dict[str, tuple[Drawn, float, float]]:
     """A robot as requirements of its geometry ask about it, by their names: drawn, and angles of its levers [deg].
 
     The best posture on a step, levers flush with the belt over a gap, folded for its size.
