@@ -339,7 +339,7 @@ def example(result: Path) -> str:
         + "."
         for e in d["effects"]
     )
-    after = d["next_experiment"]
+    steps = "\n".join(f"1. {step}." for step in d["next_experiment"]["description"].split(". And: "))
     return f"""# A table of runs
 
 Twenty settled runs of the robot were measured, in two configurations, at 15 and 33 V, on slopes from 0 to 20°. Does the
@@ -349,7 +349,7 @@ paper's model describe them? One command answers in a minute on two cores:
 mmrjax loop measured --out found
 ```
 
-All figures below are from `found/result.json`; `found/report.html` shows them with more detail. For your own runs, write a
+All numbers below are from `found/result.json`; `found/report.html` shows them with more detail. For your own runs, write a
 [table](../reference/tables.md) and replace `measured` by its path.
 
 ## Is it complete?
@@ -362,12 +362,13 @@ All figures below are from `found/result.json`; `found/report.html` shows them w
 |---|---|---|---|---|
 {table}
 
-A run is *reached* if the robot has a steady state there. Otherwise the robot slides or does not move.
+*As stated* is the model with the unchanged robot file, *refitted* the same model fitted to these runs. A run is *reached*
+if the simulated robot has a steady state at its conditions. Otherwise it slides or does not move.
 
 ![Residuals of every reading, before and after](figures/before_after.svg)
 
-Each dot is one reading: simulated minus measured, in standard deviations of the instrument. Orange is the model with its
-parameters fitted again, blue the model with the effects. The grey band is noise.
+Each dot is one reading: simulated minus measured, in standard deviations of the instrument. Orange is the refitted model,
+blue the model with the effects. The grey band is ± 2 standard deviations.
 
 ![Influence of each effect on its readings](figures/laws.svg)
 
@@ -377,8 +378,8 @@ real, the line follows the dots.
 
 ## May I use the robot?
 
-Each block of runs is left out in turn and predicted by a fit to the others. Use the robot where these errors are
-small:
+Each block of runs, such as all runs on one slope, is left out in turn and predicted by a fit to the other runs. These
+errors show how well the robot file predicts conditions that were not measured:
 
 | rms error of unseen runs [%] | model | {" | ".join(labels.values())} | reached |
 |---|---|---|---|---|---|
@@ -388,7 +389,9 @@ small:
 
 ## What next?
 
-**{after["name"].capitalize()}.** {after["description"]}.
+The report proposes:
+
+{steps}
 
 ```sh
 mmrjax sweep --robot found/robot.toml

@@ -31,7 +31,7 @@ RECIPES = dict(
 
 
 def test_the_page_has_its_four_recipes():
-    assert [name.split()[-1] for name in RECIPES] == ["own", "steps", "robots", "actuator"]
+    assert [name.split()[-1] for name in RECIPES] == ["own", "steps", "robots", "environment"]
     assert all("assert" in code and "import mmrjax as mm" in code for code in RECIPES.values())
 
 

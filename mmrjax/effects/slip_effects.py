@@ -145,8 +145,8 @@ class PulleyEccentricity(Periodic, SlipEffect):
 class VibrationSlip(SlipEffect):
     """ΔV = a √((V_teor / V_1)² + 0.001²)^p u / √((1 - |u|)² + 0.05²), on tracks only.
 
-    u is the demand over the adhesion limit of eq. (6). Shaking contacts slide while their load is small. Dry
-    friction becomes an apparent viscous friction.
+    V_teor is the speed without slip, V_1 = 1 m/s, and u is the demand over the adhesion limit of eq. (6). Vibrating
+    contacts slide while their load is small, so dry friction acts like viscous friction.
 
     Source: Section 3.2.4 and its ref. [46]. Blekhman, Vibrational Mechanics (2000). The law of Fig. 7 is averaged
     over contacts that oscillate by s (`mmrjax.vibration`), for V_s small compared with s. The slip is proportional to
