@@ -41,7 +41,7 @@ from mmrjax.model.paper_robots import nominal
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import GRAVITY, State
 from mmrjax.undercarriage import mjcf
-from mmrjax.undercarriage.ripple_peaks import period_pitch, ripple
+from mmrjax.undercarriage.ripple_peaks import measure_ripple, period_pitch
 from mmrjax.undercarriage.running_gear import GROUSERS, TEETH_BELT, TEETH_PULLEY, RunningGear
 
 # [s]; half of it changes the share by less than the scatter of two windows. Explicit: the damping of a grouser on the
@@ -290,7 +290,7 @@ def measure(
     normal = np.asarray(sums.normal)[tail]
     clock, whole = sample * np.arange(len(normal)), max(round(1e-3 / sample), 1)
     coarse = normal[len(normal) % whole :].reshape(-1, whole).mean(1)
-    found = ripple(clock, normal)
+    found = measure_ripple(clock, normal)
     weight = float(c.half.chassis + 2 * c.half.pulley + gear.belt_mass) * GRAVITY
     return {
         "guide_share": mean["guide"] / mean["normal"],
@@ -333,8 +333,8 @@ def beside(gears: list[RunningGear], robot: Robot | None = None) -> list[dict]:
             {
                 "guide_share": float(answer.steady.guide_share[0]),
                 "normal_std_over_mean": float(normal.std() / normal.mean()),
-                "ripple_amplitude": ripple(np.asarray(answer.time[0, -300:]), normal).amplitude,
-                "ripple_period_s": ripple(np.asarray(answer.time[0, -300:]), normal).period,
+                "ripple_amplitude": measure_ripple(np.asarray(answer.time[0, -300:]), normal).amplitude,
+                "ripple_period_s": measure_ripple(np.asarray(answer.time[0, -300:]), normal).period,
                 "period_34_s": period,
                 "line_of_34": harmonics(normal[-round(periods * period / 1e-3) :], periods),
                 "speed_wheel": fast,

@@ -1065,7 +1065,7 @@ def test_instant_of_half_robot_with_all_effects_has_finite_derivatives_by_every_
     """What `track` integrates, at standstill."""
 
     def outputs(robot, run):
-        system = half_robot.half_robot_system(robot, run, 1e-4)
+        system = half_robot.build_system(robot, run, 1e-4)
         signals, _, pulled = half_robot.instant(system, half_robot.stand(system))
         leaves = [jnp.asarray(x) for x in jax.tree.leaves((signals, pulled))]
         return jnp.concatenate([x.ravel() for x in leaves if x.dtype == THETA.dtype])

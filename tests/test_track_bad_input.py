@@ -13,7 +13,7 @@ from mmrjax.model import params
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.signals import CONVERGED, FAILED, FLAGS, TIPS
 from mmrjax.undercarriage import stability
-from mmrjax.undercarriage.half_robot import half_robot_system, stand, tipping_margin
+from mmrjax.undercarriage.half_robot import build_system, stand, tipping_margin
 from mmrjax.undercarriage.stability import _whole, largest_step
 from sweeps import config as configuration
 from sweeps.points import run
@@ -112,7 +112,7 @@ def test_posture_that_cannot_stand_has_a_negative_margin(robot):
     loaded = params.replace(robot, place)
     for payload, stands in ((0.0, True), (8.0, False)):
         run = Conditions(slope_deg=20.0, payload=payload)
-        assert (float(tipping_margin(half_robot_system(loaded, run, 1e-4))) > 0) is stands
+        assert (float(tipping_margin(build_system(loaded, run, 1e-4))) > 0) is stands
 
 
 def test_standing_robot_is_in_balance(robot):
@@ -121,9 +121,7 @@ def test_standing_robot_is_in_balance(robot):
 
     loaded = params.replace(robot, {"running_gear.payload_offset": 0.05})
     for wheeled in (0.0, 1.0):
-        run = half_robot_system(
-            loaded, Conditions(slope_deg=np.degrees(0.1), payload=5.0, configuration=wheeled), 1e-4
-        )
+        run = build_system(loaded, Conditions(slope_deg=np.degrees(0.1), payload=5.0, configuration=wheeled), 1e-4)
         _, at, _ = instant(run, stand(run))
         weight = (run.half.chassis + 2 * run.half.pulley) * 9.80665 * np.cos(0.1)
         assert float(at.normal) == pytest.approx(float(weight), rel=1e-9)
@@ -204,10 +202,7 @@ def test_robot_thrown_over_by_its_own_motion_tips_and_harms_no_other(robot):
     }
     tall = changed(robot, high)
     runs = Conditions(voltage=[33.0, 15.0], slope_deg=[20.0, 0.0], payload=[8.0, 0.0])
-    assert (
-        float(tipping_margin(half_robot_system(tall, Conditions(voltage=33.0, slope_deg=20.0, payload=8.0), 1e-4)))
-        > 0
-    )
+    assert float(tipping_margin(build_system(tall, Conditions(voltage=33.0, slope_deg=20.0, payload=8.0), 1e-4))) > 0
     answer = _batch(tall, runs, 1.0, 1e-4, 1e-3, False).result
     assert answer.status.tolist() == [TIPS, CONVERGED]
     assert np.isnan(float(answer.reading["speed"][0])) and np.isfinite(float(answer.reading["speed"][1]))

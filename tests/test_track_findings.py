@@ -10,8 +10,8 @@ from mmrjax.fidelities.track import _batch, track_batch
 from mmrjax.model import params
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.signals import FLAGS, STATUSES
-from mmrjax.undercarriage.belt import Path
-from mmrjax.undercarriage.ripple_peaks import period_pitch, ripple, touchdowns
+from mmrjax.undercarriage.belt import BeltPath
+from mmrjax.undercarriage.ripple_peaks import measure_ripple, period_pitch, touchdowns
 
 pytestmark = pytest.mark.slow
 
@@ -49,7 +49,7 @@ def series(runs, k, name):
 
 
 def tail(runs, k, name):
-    return ripple(runs.time[k, TAIL], series(runs, k, name)[TAIL])
+    return measure_ripple(runs.time[k, TAIL], series(runs, k, name)[TAIL])
 
 
 def test_statuses_are_each_member_s_own(runs):
@@ -99,7 +99,7 @@ def test_unpowered_robot_stands_still(runs):
 @pytest.mark.parametrize("name", ["total_current", "speed"])
 def test_tracked_ripple_has_the_grousers_period(runs, robot, k, name):
     """Eq. (34) within 2 %."""
-    path = Path(robot.configurations["6T2A"].radius, robot.running_gear)
+    path = BeltPath(robot.configurations["6T2A"].radius, robot.running_gear)
     wheel = series(runs, k, "speed_wheel")[TAIL].mean()
     assert tail(runs, k, name).period == pytest.approx(
         period_pitch(float(path.pitch), wheel, float(robot.configurations["6T2A"].radius)), rel=0.02

@@ -10,7 +10,7 @@ from PIL import Image
 
 from mmrjax.fidelities.track import _batch
 from mmrjax.model.conditions import Conditions
-from mmrjax.undercarriage.rendering import render, scene
+from mmrjax.undercarriage.rendering import render, scene_of_run
 
 RUNS = Conditions(voltage=[33.0, 24.0, np.nan], slope_deg=np.degrees(0.1), configuration=[0, 1, 0])
 
@@ -47,7 +47,7 @@ def scenes(request, robot):
     runs = rolling() if request.param == "rolling" else _batch(robot, RUNS, 0.04, 1e-4, 1e-3, True)
 
     def one(k):
-        return scene(robot, jax.tree.map(lambda x: x[k], RUNS), _member(runs, k))
+        return scene_of_run(robot, jax.tree.map(lambda x: x[k], RUNS), _member(runs, k))
 
     return one
 

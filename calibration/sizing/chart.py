@@ -12,7 +12,7 @@ from jaxtyping import Array
 from calibration.data.requirements_file import Requirement, Requirements
 from calibration.sizing import sheet
 from mmrjax.compile.compiling import compiled
-from mmrjax.derived.requirements import EnvelopePoint, Ratings, heat_left, ratings, travel_quantities
+from mmrjax.derived.requirements import EnvelopePoint, Ratings, ratings, thermal_margin, travel_quantities
 from mmrjax.model import params
 from mmrjax.model.robot import Robot
 
@@ -56,7 +56,7 @@ def _margins(robot: Robot, rated: Ratings, points: EnvelopePoint, speeds: Array,
         turns = state["motor_speed_rpm"]
         each = [
             state["adhesion"], jnp.clip(state["left"], -1.0, 1.0),
-            heat_left(robot, point, state["current"], rated.temperature),
+            thermal_margin(robot, point, state["current"], rated.temperature),
             1 - turns / speeds[0], 1 - turns / speeds[1], 1 - state["gearbox_Nm"] / rated.torque,
             jnp.minimum(state["cell"] / rated.voltage_cutoff, 1.0),
             jnp.where(wanted > 0, state["speed_m_s"] / jnp.where(wanted > 0, wanted, 1.0) - 1, 1.0),

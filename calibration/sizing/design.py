@@ -20,7 +20,7 @@ from mmrjax.derived.requirements import (
     QUANTITIES,
     EnvelopePoint,
     Ratings,
-    heat_left,
+    thermal_margin,
     travel_quantities,
 )
 from mmrjax.derived.requirements import evaluate_requirement as requirement
@@ -266,7 +266,7 @@ def _positive_limit(r: Requirement) -> float:
 
 
 def _heat_margins(robot: Robot, points: EnvelopePoint, current: Array, limit: Array) -> Array:
-    return jax.vmap(lambda p, i: jnp.asarray(heat_left(robot, p, i, limit)))(points, current)
+    return jax.vmap(lambda p, i: jnp.asarray(thermal_margin(robot, p, i, limit)))(points, current)
 
 
 def _endurance_margin(r: Requirement, robot: Robot, ratings: Ratings, at: Mapping[str, Array]) -> Array:

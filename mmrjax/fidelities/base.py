@@ -21,7 +21,7 @@ from mmrjax.model.quantities import VOLTAGE
 from mmrjax.model.rig import Rig
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import Result, Signals
-from mmrjax.undercarriage.side_contacts import Reactions
+from mmrjax.undercarriage.side_contacts import GearReactions
 
 T = TypeVar("T")
 
@@ -45,7 +45,7 @@ class History(eqx.Module):
     distance: Float[Array, "runs samples"]
     signals: Signals
     reading: Scalars
-    reactions: Reactions | None = None
+    reactions: GearReactions | None = None
 
     @staticmethod
     def of(
@@ -53,7 +53,7 @@ class History(eqx.Module):
         time: Array,
         distance: Array,
         signals: Signals,
-        reactions: Reactions | None = None,
+        reactions: GearReactions | None = None,
     ) -> History:
         """A history with its readings, from runs known at `time` since the imposed quantity acts.
 

@@ -299,12 +299,12 @@ def _drive_turning(
     ys, went = _integrate_unknowns(
         circling.turning_rates, circling.norm, robot, conditions, moves, y0, times, tolerance, max_steps, len(SIDES)
     )
-    motion = jax.vmap(lambda y: circling.motion_of(robot, y))(ys)
+    motion = jax.vmap(lambda y: circling.motion_of_unknowns(robot, y))(ys)
     travel = jax.vmap(lambda m: balances.turning_signals(robot, conditions, m))(motion)
     end = jax.tree.map(lambda x: x[-1], (travel, motion))
-    status = jnp.where(parked, STALLED, circling.status_moving(robot, conditions, *end))
+    status = jnp.where(parked, STALLED, circling.status_after_run(robot, conditions, *end))
     status = jnp.where(went, status, FAILED)
-    away, answer = jnp.hypot(motion.place_x, motion.place_y), circling.result_of(robot, end[0], status)
+    away, answer = jnp.hypot(motion.place_x, motion.place_y), circling.result_of_turn(robot, end[0], status)
     return _recorded_part(robot, conditions, times, away, travel.signals, motion.discharge, answer)
 
 

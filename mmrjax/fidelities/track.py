@@ -32,8 +32,8 @@ from mmrjax.model.signals import (
     Signals,
 )
 from mmrjax.undercarriage import both_sides, half_robot
-from mmrjax.undercarriage.half_robot import Changes, Motion, Steady, System, half_robot_system
-from mmrjax.undercarriage.side_contacts import Reactions
+from mmrjax.undercarriage.half_robot import Changes, HalfRobotState, HalfRobotSystem, SteadyAverages, build_system
+from mmrjax.undercarriage.side_contacts import GearReactions
 from mmrjax.undercarriage.stability import check_track_step, largest_step
 
 STEP = fidelities.fidelity_facts("track").resolved()["step"]  # [s]
@@ -56,10 +56,10 @@ class Record(eqx.Module):
         guided: mean load of the guides over it.
     """
 
-    motions: Motion
+    motions: HalfRobotState
     passed: Signals | balances.Travel
     guided: Float[Array, "samples ..."]
-    reactions: Reactions
+    reactions: GearReactions
 
 
 class Trajectory(eqx.Module):
@@ -80,13 +80,13 @@ class Trajectory(eqx.Module):
     q: Float[Array, "samples coordinates"]
     v: Float[Array, "samples coordinates"]
     signals: Signals
-    reactions: Reactions
-    steady: Steady
+    reactions: GearReactions
+    steady: SteadyAverages
     result: Result
 
 
 def _period_averages(
-    run: System, time: Array, travelled: Array, sums: tuple[Any, Array]
+    run: HalfRobotSystem, time: Array, travelled: Array, sums: tuple[Any, Array]
 ) -> tuple[Any, Scalar, Array, Changes]:
     """Means of signals (or `Travel`) and guides' load, number of periods, and change and size of three signals."""
     # Weights over the belt's travel that rise over one pitch and fall over another by the cubic step. Each adds up to
@@ -146,7 +146,7 @@ def track(
         numbers are no longer finite, or the robot has left the ground. `failed` and `tips` withhold the result's
         numbers. Flag `jumps`: the robot has no contact for more than a hundredth of the averaging window.
     """
-    run = half_robot_system(robot, conditions, step)
+    run = build_system(robot, conditions, step)
     start = _start(run, rolling)
     end, record = _record(run, start, round(sample / step), round(duration / sample))
     return _trajectory(run, start, end, record, sample)
@@ -157,21 +157,21 @@ def _moving_system_module(conditions: Conditions) -> ModuleType:
     return both_sides if conditions.turns else half_robot
 
 
-def _start(run: System, rolling: bool) -> Motion:
+def _start(run: HalfRobotSystem, rolling: bool) -> HalfRobotState:
     kind = _moving_system_module(run.conditions)
-    start: Motion = kind.roll(run) if rolling else kind.stand(run)
+    start: HalfRobotState = kind.roll(run) if rolling else kind.stand(run)
     return start
 
 
-def _record(run: System, start: Motion, steps: int, samples: int) -> tuple[Motion, Record]:
+def _record(run: HalfRobotSystem, start: HalfRobotState, steps: int, samples: int) -> tuple[HalfRobotState, Record]:
     kind = _moving_system_module(run.conditions)
 
-    def small(motion: Motion, _: None) -> tuple[Motion, tuple[Any, Array]]:
+    def small(motion: HalfRobotState, _: None) -> tuple[HalfRobotState, tuple[Any, Array]]:
         after, passed, guided = kind.advance(run, motion)
         return after, (passed, guided)
 
     @jax.checkpoint  # reverse mode keeps one motion per sample and recomputes the steps in between
-    def interval(motion: Motion, _: None) -> tuple[Motion, Record]:
+    def interval(motion: HalfRobotState, _: None) -> tuple[HalfRobotState, Record]:
         after, every = jax.lax.scan(small, motion, None, length=steps)
         passed, guided = jax.tree.map(lambda x: jnp.mean(x, axis=0), every)
         return after, Record(after, passed, guided, kind.loads(run, *kind.instant(run, after)[1:]))
@@ -179,11 +179,15 @@ def _record(run: System, start: Motion, steps: int, samples: int) -> tuple[Motio
     return jax.lax.scan(interval, start, None, length=samples)
 
 
-def _trajectory(run: System, start: Motion, end: Motion, record: Record, sample: float) -> Trajectory:
+def _trajectory(
+    run: HalfRobotSystem, start: HalfRobotState, end: HalfRobotState, record: Record, sample: float
+) -> Trajectory:
     kind, motions = _moving_system_module(run.conditions), record.motions
     time = sample * jnp.arange(len(motions.q) + 1)
     travelled = run.path.radius * jnp.concatenate([start.q[None, kind.SHAFTS], motions.q[:, kind.SHAFTS]])
-    averages = kind.averaged(functools.partial(_period_averages, run, time), travelled, record.passed, record.guided)
+    averages = kind.steady_averages(
+        functools.partial(_period_averages, run, time), travelled, record.passed, record.guided
+    )
     status = kind.status(run, averages, end)
     valid = (status != FAILED) & (status != TIPS)
     window = time[1:] > time[-1] - WINDOW * (time[-1] - time[0])
@@ -281,16 +285,16 @@ def _batch(
 
 
 @compiled
-def _begin(robot: Robot, conditions: Conditions, step: float, rolling: bool) -> Motion:
-    return jax.vmap(lambda one: _start(half_robot_system(robot, one, step), rolling))(conditions)
+def _begin(robot: Robot, conditions: Conditions, step: float, rolling: bool) -> HalfRobotState:
+    return jax.vmap(lambda one: _start(build_system(robot, one, step), rolling))(conditions)
 
 
 @compiled
 def _part(
-    robot: Robot, conditions: Conditions, motions: Motion, step: float, sample: float, samples: int
-) -> tuple[Motion, Record]:
-    def one(conditions: Conditions, motion: Motion) -> tuple[Motion, Record]:
-        return _record(half_robot_system(robot, conditions, step), motion, round(sample / step), samples)
+    robot: Robot, conditions: Conditions, motions: HalfRobotState, step: float, sample: float, samples: int
+) -> tuple[HalfRobotState, Record]:
+    def one(conditions: Conditions, motion: HalfRobotState) -> tuple[HalfRobotState, Record]:
+        return _record(build_system(robot, conditions, step), motion, round(sample / step), samples)
 
     return jax.vmap(one)(conditions, motions)
 
@@ -299,16 +303,16 @@ def _part(
 def _end(
     robot: Robot,
     conditions: Conditions,
-    starts: Motion,
+    starts: HalfRobotState,
     records: list[Record],
     step: float,
     sample: float,
     samples: int,
 ) -> Trajectory:
-    def one(conditions: Conditions, start: Motion, parts: list[Record]) -> Trajectory:
+    def one(conditions: Conditions, start: HalfRobotState, parts: list[Record]) -> Trajectory:
         record = jax.tree.map(lambda *x: jnp.concatenate(x)[:samples], *parts)
         end = jax.tree.map(lambda x: x[-1], record.motions)
-        return _trajectory(half_robot_system(robot, conditions, step), start, end, record, sample)
+        return _trajectory(build_system(robot, conditions, step), start, end, record, sample)
 
     return jax.vmap(one)(conditions, starts, records)
 
@@ -328,7 +332,7 @@ def _histories(
     robot: Robot, conditions: Conditions, options: Mapping[str, float], progress: Progress | None = None
 ) -> Run:
     runs = track_batch(robot, conditions, duration=options["duration"], step=options["step"], progress=progress)
-    away, reactions = _moving_system_module(conditions).away(runs.q, runs.reactions)
+    away, reactions = _moving_system_module(conditions).distance_and_reactions(runs.q, runs.reactions)
     history = History.of(robot, runs.time, away, runs.signals, reactions)
     return Run(runs.result, {"guide_share": runs.steady.guide_share}, history)
 

@@ -27,7 +27,7 @@ from mmrjax.model.shaft import Shaft
 from mmrjax.model.signals import GRAVITY, PlaneMotion, Signals, State
 from mmrjax.numerics.one_sided import at_least, clip
 from mmrjax.numerics.trigonometry import cosine, sine
-from mmrjax.turning.two_sides import SIDES, Grip, Stance, grip, sum_of_sides
+from mmrjax.turning.two_sides import SIDES, GroundForces, Stance, ground_forces, sum_of_sides
 
 #: Each balance with its unit and its equation.
 BALANCES = {
@@ -624,7 +624,7 @@ class Travel(eqx.Module):
     """
 
     signals: Signals
-    grip: Grip
+    grip: GroundForces
     acceleration: Scalar
     acceleration_lateral: Scalar
     acceleration_yaw: Scalar
@@ -710,7 +710,7 @@ def turning_signals(
     with the load divided equally between the sides.
 
     Args:
-        loads: normal loads of both sides [N], see `turning.grip`.
+        loads: normal loads of both sides [N], see `turning.ground_forces`.
     """
     robot = robot.within(conditions.configuration)
     chassis, sides = robot.chassis(conditions.configuration), conditions.of_sides()
@@ -722,7 +722,7 @@ def turning_signals(
     units = robot.sides / 2
     stands = stance(robot, conditions, chassis, mass)
     load, sliding = sum_of_sides(units * jnp.asarray(even.normal)), jnp.asarray(even.speed_sliding)
-    held = grip(
+    held = ground_forces(
         stands, chassis.ground.friction, conditions.adhesion, load, sliding, motion.speed_lateral, motion.yaw_rate,
         jnp.asarray(rolling), loads,
     )  # fmt: skip

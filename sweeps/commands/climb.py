@@ -14,8 +14,8 @@ from calibration.data import terrains
 from calibration.data.contradictions import reason_without_levers
 from calibration.data.input_errors import BadConfiguration
 from mmrjax.climbing import climb_simulation, terrain
-from mmrjax.climbing.climb_derivatives import ClimbInputs, Derivatives, climb_derivatives
-from mmrjax.climbing.climb_simulation import Climb, Sequence, climb_batch
+from mmrjax.climbing.climb_derivatives import ClimbDerivatives, ClimbInputs, climb_derivatives
+from mmrjax.climbing.climb_simulation import ClimbRuns, LeverSequence, climb_batch
 from mmrjax.climbing.terrain import Terrain
 from mmrjax.errors import similar_words
 from mmrjax.fidelities.variation import Variation
@@ -93,12 +93,12 @@ def _climb_of_configuration(
     name: str,
     words: str,
     conditions: Conditions,
-    sequence: Sequence,
+    sequence: LeverSequence,
     along: Along | None,
 ) -> ClimbResult:
     """The climb of a configuration: over one obstacle, a search for the largest one, or with derivatives."""
 
-    def run(sizes: np.ndarray) -> tuple[Terrain, Climb]:
+    def run(sizes: np.ndarray) -> tuple[Terrain, ClimbRuns]:
         every = [_terrain(config, float(size) / 1000)[0] for size in sizes]
         grounds = jax.tree.map(lambda *x: jnp.stack(x), *every)
         alike = [jax.tree.map(lambda x: jnp.stack([jnp.asarray(x)] * len(sizes)), c) for c in (conditions, sequence)]
@@ -118,7 +118,7 @@ def _climb_of_configuration(
 
     chosen, largest = 0, None
     tried: tuple[tuple[float, str], ...] = ()
-    derivatives: Derivatives | None = None
+    derivatives: ClimbDerivatives | None = None
     if config.find is not None:
         grounds, ended, chosen, tried, largest = _search_largest(config.find, run)
     elif along is None:
@@ -139,7 +139,9 @@ def _climb_of_configuration(
     )  # fmt: skip
 
 
-def _along(config: configuration.Climb, robot: Robot, conditions: Conditions, sequence: Sequence) -> Along | None:
+def _along(
+    config: configuration.Climb, robot: Robot, conditions: Conditions, sequence: LeverSequence
+) -> Along | None:
     """Variables of the derivatives. None: no derivatives.
 
     Raises:
@@ -194,14 +196,14 @@ def _along(config: configuration.Climb, robot: Robot, conditions: Conditions, se
 
 
 def _search_largest(
-    what: str, run: Callable[[np.ndarray], tuple[Terrain, Climb]]
-) -> tuple[Terrain, Climb, int, tuple[tuple[float, str], ...], float | None]:
+    what: str, run: Callable[[np.ndarray], tuple[Terrain, ClimbRuns]]
+) -> tuple[Terrain, ClimbRuns, int, tuple[tuple[float, str], ...], float | None]:
     """The largest size that is got over [mm]: rounds of sizes side by side, between the largest that was got over
     below all that were not and the next. The run of the largest, or of the smallest tried, is shown."""
     low, high = SOUGHT[what]
     sizes = np.linspace(low, high, ROUND)
     tried: dict[float, str] = {}
-    kept: tuple[Terrain, Climb, int] | None = None
+    kept: tuple[Terrain, ClimbRuns, int] | None = None
     while True:
         grounds, ended = run(sizes)
         tried |= {float(s): v for s, v in zip(sizes, ended.names, strict=True)}
@@ -241,7 +243,7 @@ def _terrain(config: configuration.Climb, size: Scalar) -> tuple[Terrain, str]:
     ), "a step" if config.step_mm is None else f"a step of {config.step_mm:g} mm"
 
 
-def _lever_sequence(config: configuration.Climb, robot: Robot, name: str) -> Sequence:
+def _lever_sequence(config: configuration.Climb, robot: Robot, name: str) -> LeverSequence:
     """Returns the motion of the levers.
 
     Raises:

@@ -20,9 +20,9 @@ from mmrjax.model.signals import STATUSES
 from mmrjax.undercarriage.modes import Mode, modes
 from mmrjax.undercarriage.ripple_peaks import (
     SIGNALS,
-    Passing,
-    Peak,
-    confirm_peaks,
+    PassingParts,
+    RipplePeak,
+    drop_unconfirmed_modes,
     find_crossings,
     passing_parts,
     peaks_over_speed,
@@ -123,7 +123,7 @@ def _grid_and_table_8(config: configuration.Resonance, robot: Robot) -> tuple[Ru
 
 
 def _ripple_columns(
-    folder: RunFolder, robot: Robot, conditions: Conditions, config: configuration.Resonance, what: Passing
+    folder: RunFolder, robot: Robot, conditions: Conditions, config: configuration.Resonance, what: PassingParts
 ) -> Columns:
     """Ripple columns, computed in chunks. Chunks stored by an interrupted run are not simulated again."""
     total, parts = conditions.shape[0], []
@@ -147,7 +147,7 @@ def _ripple_columns(
     return {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
 
 
-def _columns(robot: Robot, ended: Any, what: Passing) -> Columns:
+def _columns(robot: Robot, ended: Any, what: PassingParts) -> Columns:
     """Ripple of a batch of runs, in the units of the table."""
     vibrations = vibrations_of_runs(robot, ended, what.pitch)
     status = np.array(STATUSES)[vibrations.status]
@@ -165,14 +165,16 @@ def _columns(robot: Robot, ended: Any, what: Passing) -> Columns:
     return columns
 
 
-def _modes_and_peaks(config: configuration.Resonance, robot: Robot, what: Passing, table: Columns) -> ResonanceResult:
+def _modes_and_peaks(
+    config: configuration.Resonance, robot: Robot, what: PassingParts, table: Columns
+) -> ResonanceResult:
     """Natural frequencies at the middle voltage, and peaks and crossings at each payload."""
     assert config.configuration is not None
     payloads, middle = config.payloads_kg, config.voltages_V[len(config.voltages_V) // 2]
     middle_runs = _grid(config, (middle,), payloads)
     linear = modes(robot, run.conditions_of_runs(robot, grid_conditions(middle_runs, robot), config))
     by_payload = dict(zip(payloads, linear, strict=True))
-    tops: list[Peak] = []
+    tops: list[RipplePeak] = []
     ends: dict[float, tuple[float, float]] = {}
     for payload, peaks in by_payload.items():
         gridded = (table["payload_kg"] == payload) & np.isin(table["supply_voltage_V"], config.voltages_V)
@@ -191,7 +193,7 @@ def _modes_and_peaks(config: configuration.Resonance, robot: Robot, what: Passin
         ]  # fmt: skip
         tops += here
         ends[payload] = float(speed[0]), float(speed[-1])
-    tops = confirm_peaks(tops, by_payload)
+    tops = drop_unconfirmed_modes(tops, by_payload)
     meets = [c for p, peaks in ends.items() for c in find_crossings(by_payload[p], p, what.travel, *peaks, tops)]
     return ResonanceResult(
         config.configuration, config.slope_deg, config.surface, what, robot, table, by_payload, tops, meets
@@ -204,7 +206,7 @@ def _write(folder: RunFolder, config: configuration.Resonance, found: ResonanceR
         "modes.csv",
         _tuple_columns([{"payload_kg": p, **m._asdict()} for p, modes in found.modes.items() for m in modes], Mode),
     )
-    folder.write_table("peaks.csv", _tuple_columns([p._asdict() for p in found.peaks], Peak))
+    folder.write_table("peaks.csv", _tuple_columns([p._asdict() for p in found.peaks], RipplePeak))
     folder.write_json("result.json", found.to_json())
 
 

@@ -44,7 +44,7 @@ def _outlines(found: Drawable, q: np.ndarray) -> list[tuple[np.ndarray, np.ndarr
     """Closed outlines of the belts, and tips of their grousers, in the world [m]."""
     robot = found.robot
     chassis = robot.configurations[found.configuration]
-    shape = footing.contact_shape(chassis, robot.running_gear, robot.radius_pulley)
+    shape = footing.contact_shape_of_robot(chassis, robot.running_gear, robot.radius_pulley)
     body, front, rear = footing.part_frames(shape, jnp.asarray(q))
     belts = [(shape.main, body._replace(origin=rear.origin), q[SHAFT])]
     if np.asarray(chassis.on_tracks) > 0.5:
@@ -74,7 +74,7 @@ def _draw(axes: Any, found: Drawable, q: np.ndarray, colour: str = BLUE) -> None
     outlines = _outlines(found, q)
     cos, sin = np.cos(-q[PITCH]), np.sin(-q[PITCH])
     chassis = found.robot.configurations[found.configuration]
-    shape = footing.contact_shape(chassis, found.robot.running_gear, found.robot.radius_pulley)
+    shape = footing.contact_shape_of_robot(chassis, found.robot.running_gear, found.robot.radius_pulley)
     half, under = float(shape.half), float(shape.belly)
     top = under + BODY_HEIGHT
     box = np.array([(-half, under), (half, under), (half + 0.01, top), (-half - 0.01, top)])

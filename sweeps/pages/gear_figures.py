@@ -105,7 +105,8 @@ def ripple_numbers(gear: Gear) -> Json:
     """Size and frequency of the ripples in a run."""
     tail, signals = gear.tail(TAIL), gear.signals
     line, travel, reaction = (
-        ripple_peaks.ripple(gear.time[tail], x[tail]) for x in (signals.total_current, signals.speed, signals.normal)
+        ripple_peaks.measure_ripple(gear.time[tail], x[tail])
+        for x in (signals.total_current, signals.speed, signals.normal)
     )
     return {
         "configuration": gear.name,

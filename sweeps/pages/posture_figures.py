@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Polygon
 from scipy.spatial import ConvexHull
 
-from mmrjax.climbing.resting_posture import BELTS, FRONT_AXLE, REAR_AXLE, Outline
+from mmrjax.climbing.resting_posture import BELTS, FRONT_AXLE, REAR_AXLE, SideOutline
 from mmrjax.model.quantities import MM
 from sweeps.pages.figure_style import BLUE, FAINT, GREEN, INK, ORANGE, VERMILION, colour_bar, is_narrow, new_figure
 from sweeps.report.check_report import (
@@ -67,7 +67,7 @@ _ROUND = np.linspace(0.0, 2 * np.pi, 181)
 _CIRCLE = np.stack([np.cos(_ROUND), np.sin(_ROUND)], 1)
 
 
-def belt_outline(side: Outline, belt: tuple[int, int]) -> np.ndarray:
+def belt_outline(side: SideOutline, belt: tuple[int, int]) -> np.ndarray:
     """Corners of the belt around a pair of circles, over its grousers [m]."""
     wide = [float(side.belt) if k in (REAR_AXLE, FRONT_AXLE) else float(side.radius[k]) for k in belt]
     outline = [np.array([float(side.forward[k]), float(side.up[k])]) for k in belt]

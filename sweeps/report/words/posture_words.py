@@ -13,7 +13,7 @@ from calibration.data.columns import LEVERS
 from calibration.data.table import Runs
 from calibration.sizing.sheet import RequirementOutcome
 from mmrjax.climbing import resting_posture, static_limits
-from mmrjax.climbing.resting_posture import Outline
+from mmrjax.climbing.resting_posture import SideOutline
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.masses import lever_angles
 from mmrjax.model.quantities import MM
@@ -35,7 +35,7 @@ class Drawn:
         slope: [rad].
     """
 
-    side: Outline
+    side: SideOutline
     base: float
     step: float
     slope: float = 0.0
@@ -136,9 +136,9 @@ def of_requirements(robot: Robot, outcomes: Sequence[RequirementOutcome]) -> dic
             drawn = _on_step(step)
         else:
             front = rear = float(static_limits.flush_lever_angle(robot)) if name == "gap_mm" else np.pi
-            stands = static_limits.with_levers(conditions, front, rear)
+            stands = static_limits.with_lever_angles(conditions, front, rear)
             rests, side = resting_posture.level_posture(robot, stands), resting_posture.side_outline(robot, stands)
-            drawn = Drawn(jax.device_get(side.pitched(rests.pitch)), float(rests.height), 0.0)
+            drawn = Drawn(jax.device_get(side.with_pitch(rests.pitch)), float(rests.height), 0.0)
         found[name] = drawn, float(np.degrees(front)), float(np.degrees(rear))
     return found
 
