@@ -40,7 +40,7 @@ def _power(run, motion):
     after, travel, _ = b.advance(run, motion)
     gained = after.v - motion.v
     mean, at = motion.v + gained / 2, sides.at
-    ahead, aside, normal = b.forces_after(at, pulled, levers, rises, gained)
+    ahead, aside, normal = b.contact_forces_after_step(at, pulled, levers, rises, gained)
     moves = [jnp.einsum("sci,si->sc", x, mean[b.OF_SIDE]) for x in (levers.along, levers.across, levers.off)]
     front, rear = mean[b.PULLEYS].T
     belt = run.path.radius * (front[:, None] * (1 - at.weight) + rear[:, None] * at.weight)
