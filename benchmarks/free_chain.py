@@ -33,7 +33,7 @@ import jax.numpy as jnp
 import numpy as np
 from shaking import shaking
 
-from mmrjax.fidelities.track import _batch
+from mmrjax.fidelities.track import _simulate_batch
 from mmrjax.model import balances, masses, params
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.contact import cubic_step, force_contact
@@ -325,7 +325,7 @@ def beside(gears: list[RunningGear], robot: Robot | None = None) -> list[dict]:
     found = []
     for gear in gears:
         one = dataclasses.replace(nominal() if robot is None else robot, running_gear=gear)
-        answer = _batch(one, runs, 0.8, 1e-4, 1e-3, True)
+        answer = _simulate_batch(one, runs, 0.8, 1e-4, 1e-3, True)
         normal, fast = np.asarray(answer.signals.normal[0, -300:]), float(answer.v[0, -300:, 3].mean())
         period = period_pitch(35e-3, fast, float(nominal().radius_pulley))
         periods = int(0.3 / period)

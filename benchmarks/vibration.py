@@ -26,7 +26,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from measure import machine
 
-from mmrjax.fidelities.track import STEP, Trajectory, track
+from mmrjax.fidelities.track import STEP, TrackTrajectory, track
 from mmrjax.model import paper_robots, params
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.contact import Friction
@@ -124,7 +124,7 @@ class Ripple(eqx.Module):
     demanded: Scalar
 
 
-def ripple(robot: Robot, conditions: Conditions, run: Trajectory, window: float = 0.8) -> Ripple:
+def ripple(robot: Robot, conditions: Conditions, run: TrackTrajectory, window: float = 0.8) -> Ripple:
     """Ripple of one run on tracks (scalar fields) over its last `window` [s], from samples of at most 0.2 ms."""
     half = build_system(robot, conditions, STEP)
 

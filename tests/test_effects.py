@@ -32,7 +32,7 @@ from mmrjax.fidelities.steady import steady, steady_batch
 from mmrjax.model import balances, channels, paper_robots, params
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.params import Scalar, parameter
-from mmrjax.model.rig import Begin, Begins, Instrument
+from mmrjax.model.rig import Instrument, RunStart, RunStarts
 from mmrjax.model.robot import Configurations
 from mmrjax.model.shaft import Shaft
 from mmrjax.model.signals import CONVERGED, STALLED, Signals, State
@@ -930,7 +930,7 @@ def test_friction_by_the_position_begins_where_a_history_does():
     names = ("position_friction", "angle_friction", "presliding")
     load = Shaft(inertia=1e-3, loss_coulomb=0.05, loss_viscous=1e-3)
     robot = paper_robots.blank_robot(Configurations({"bench": load}))
-    begins = Begins({"begin_a": Begin(angle=1.5), "begin_b": Begin(angle=-2.0)})
+    begins = RunStarts({"begin_a": RunStart(angle=1.5), "begin_b": RunStart(angle=-2.0)})
     rig = dataclasses.replace(robot.rig, begins=begins, start="measured")
     robot = dataclasses.replace(with_effects(*(BY_NAME[n]() for n in names), robot=robot), rig=rig)
     for begin, angle in enumerate((1.5, -2.0)):

@@ -26,7 +26,7 @@ from mmrjax.compile.compiling import SMALL, compiled
 from mmrjax.model import balances, contact
 from mmrjax.model.chassis import Chassis
 from mmrjax.model.conditions import Conditions
-from mmrjax.model.masses import Masses, without_levers
+from mmrjax.model.masses import HalfRobotMasses, without_levers
 from mmrjax.model.params import Pair, Scalar
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import GRAVITY, Signals, State
@@ -183,7 +183,7 @@ class ClimbSystem(eqx.Module):
     terrain: Terrain
     sequence: LeverSequence
     shape: ContactShape
-    half: Masses
+    half: HalfRobotMasses
     lever: Float[Array, " 3"]
     chassis: Chassis
     lever_track: Track

@@ -80,7 +80,7 @@ def rotate_to_ground(forward: Scalar, up: Scalar, pitch: Scalar) -> tuple[Array,
     return jnp.asarray(forward * cosine - up * sine), jnp.asarray(forward * sine + up * cosine)
 
 
-def posture_masses(robot: Robot, conditions: Conditions, mass: Scalar | None = None) -> masses.Masses:
+def posture_masses(robot: Robot, conditions: Conditions, mass: Scalar | None = None) -> masses.HalfRobotMasses:
     """Masses of half a robot with its levers at the angles of the conditions.
 
     Args:

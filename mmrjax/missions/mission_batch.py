@@ -12,7 +12,7 @@ from jaxtyping import Array
 
 from mmrjax.compile.compiling import compiled
 from mmrjax.compile.programs import has_tracer
-from mmrjax.fidelities.base import Run
+from mmrjax.fidelities.base import RunBatch
 from mmrjax.missions.mission import TOLERANCE, Mission, Start, Totals, mission
 from mmrjax.missions.profile import Profile
 from mmrjax.model.channels import SIDES
@@ -217,7 +217,7 @@ def simulate_batch(
     return jax.vmap(mission_of_run, in_axes=(0, axes))(conditions, profile)
 
 
-def run_missions(robot: Robot, conditions: Conditions, profile: Profile) -> Run:
+def run_missions(robot: Robot, conditions: Conditions, profile: Profile) -> RunBatch:
     """Missions of a batch as runs of a fidelity, with their numbers as columns."""
     missions = missions_of_runs(robot, conditions, profile)
-    return Run(missions.result, numbers_by_column(mission_numbers(robot, conditions, missions)))
+    return RunBatch(missions.result, numbers_by_column(mission_numbers(robot, conditions, missions)))

@@ -15,14 +15,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from mmrjax.fidelities.rest import smallest
+from mmrjax.fidelities.rest import smallest_of
 from mmrjax.fidelities.result import flag_mask
 from mmrjax.missions.profile import Profile
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.params import Scalar, Scalars
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import Signals
-from mmrjax.numerics.rarely import compute_rarely
+from mmrjax.numerics.rarely import compute_if_needed
 from mmrjax.numerics.rosenbrock import error_across_kink, rosenbrock_stages, step_longest
 
 #: The first step of a segment [s], and the shortest.
@@ -177,7 +177,7 @@ def _holding_margins(
     current = law.AT_REST.current_at_rest(at_rest.robot, at_rest.conditions, law.state_of(at_rest.robot, y, stands))
     settled = y.at[law.CURRENT].set(current / law.UNITS[0])
     firm = _holding_margin(law, asked, y, stands)
-    return firm, smallest(firm, _holding_margin(law, at_rest, settled, stands))
+    return firm, smallest_of(firm, _holding_margin(law, at_rest, settled, stands))
 
 
 def _holding_margin(law: MotionLaw, asked: SegmentInputs, y: Array, stands: Array) -> Array:
@@ -237,8 +237,8 @@ def event_functions(
 
     none = -jnp.ones_like(slow)
     here = (robot, otherwise, segment, y, stands)
-    firm, stays = compute_rarely(near, functools.partial(_holding_margins, law), here, (none, none))
-    standing = smallest(slow, grips, stays - FIRMLY)
+    firm, stays = compute_if_needed(near, functools.partial(_holding_margins, law), here, (none, none))
+    standing = smallest_of(slow, grips, stays - FIRMLY)
     battery, discharge = asked.robot.battery, law.supply_current_and_charge(asked, y, stands)[1]
     empty = jnp.where(asked.conditions.battery > 0.5, (discharge / battery.capacity - 1) / OF_CHARGE, -1.0)
     above = _cell_margin(law, asked, y, stands)
@@ -425,7 +425,9 @@ class _SegmentIntegrator(NamedTuple):
         event = taken & jnp.any(happened)
         here = (robot, otherwise, segment, y, q, c.stands, c.below, after, h)
         none = (y, q, c.stands, c.below, jnp.asarray(-1, jnp.argmin(after).dtype), jnp.zeros_like(h))
-        y, q, stands, below, which, back = compute_rarely(event, functools.partial(_move_to_event, law), here, none)
+        y, q, stands, below, which, back = compute_if_needed(
+            event, functools.partial(_move_to_event, law), here, none
+        )
         y, q = jnp.where(taken, y, c.y), jnp.where(taken, q, c.q)
         stands = jnp.where(taken, stands, c.stands)
         low = jnp.where(below & c.below, c.low + jnp.where(taken, h + back, 0.0), 0.0)
@@ -459,7 +461,7 @@ class _SegmentIntegrator(NamedTuple):
         ended = c.ended | cut_off | (landed.which == EMPTY) | failed
         now = (robot, otherwise, segment, y, stands, below)
         unchanged = jnp.where(taken, landed.after, c.events)
-        events_now = compute_rarely(landed.event, functools.partial(event_functions, law), now, unchanged)
+        events_now = compute_if_needed(landed.event, functools.partial(event_functions, law), now, unchanged)
         kept, buffer = c.kept, c.buffer
         if buffer is not None:
             slot = jnp.where(taken, kept, buffer[0].shape[0])  # beyond the end: dropped

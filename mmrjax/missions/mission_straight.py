@@ -155,7 +155,7 @@ def slowness(asked: SegmentInputs, y: Array, stands: Array) -> tuple[Scalar, Sca
 
 def supply_current_and_charge(asked: SegmentInputs, y: Array, stands: Array) -> tuple[Scalar, Scalar]:
     robot, state = asked.robot, state_of(asked.robot, y, stands)
-    duty = robot.driver.duty_limited(balances.duty_given(robot, asked.conditions), state.current)
+    duty = robot.driver.duty_limited(balances.bridge_duty(robot, asked.conditions), state.current)
     motors = robot.sides * state.current * robot.driver.share_drawn(duty)
     return motors, state.discharge
 

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from mmrjax.compile.compiling import compiled
-from mmrjax.fidelities.rest import smallest
+from mmrjax.fidelities.rest import smallest_of
 from mmrjax.missions import mission_straight
 from mmrjax.missions.mission_steps import SegmentInputs
 from mmrjax.missions.profile import SPEED, VOLTAGE, Profile
@@ -171,12 +171,12 @@ def slowness(asked: SegmentInputs, y: Array, stands: Array) -> tuple[Scalar, Sca
     along = jnp.abs(rolling - balances.states_of_sides(robot, conditions, motion).speed)
     across = jnp.abs(motion.speed_lateral) + jnp.abs(motion.yaw_rate) * robot.running_gear.wheelbase / 2
     slow, grips = 1 - jnp.abs(rolling) / load.speed_still, 1 - along / load.speed_grip
-    return smallest(*slow), smallest(*grips, 1 - across / load.speed_grip)
+    return smallest_of(*slow), smallest_of(*grips, 1 - across / load.speed_grip)
 
 
 def supply_current_and_charge(asked: SegmentInputs, y: Array, stands: Array) -> tuple[Scalar, Scalar]:
     robot, motion = asked.robot, state_of(asked.robot, y, stands)
-    duty = robot.driver.duty_limited(balances.duty_given(robot, asked.conditions.of_sides()), motion.current)
+    duty = robot.driver.duty_limited(balances.bridge_duty(robot, asked.conditions.of_sides()), motion.current)
     return robot.sides * sum_of_sides(
         jnp.asarray(motion.current * robot.driver.share_drawn(duty))
     ) / 2, motion.discharge

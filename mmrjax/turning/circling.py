@@ -474,7 +474,7 @@ def firmness(robot: Robot, conditions: Conditions, motion: PlaneMotion) -> Scala
     chassis = robot.chassis(conditions.configuration)
     level = chassis.ground.friction.static * conditions.adhesion * balances.lateral_friction(conditions, chassis)
     aside = jnp.abs(jnp.tan(conditions.slope) * jnp.sin(motion.heading))
-    return rest.smallest(sides[0], sides[1], jnp.where(aside > 0, level - aside, jnp.inf))
+    return rest.smallest_of(sides[0], sides[1], jnp.where(aside > 0, level - aside, jnp.inf))
 
 
 def holds(robot: Robot, conditions: Conditions) -> Array:

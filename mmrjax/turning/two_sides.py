@@ -23,7 +23,7 @@ from jaxtyping import Array, Float
 
 from mmrjax.model.contact import Friction
 from mmrjax.model.params import Pair, Scalar, parameter
-from mmrjax.numerics.rarely import compute_rarely
+from mmrjax.numerics.rarely import compute_if_needed
 
 #: Position of a side's contact line from the middle of the robot, in shares of B [-]: left, right.
 SIDES = np.array([0.5, -0.5])
@@ -320,7 +320,7 @@ def _solve_loads(given: _GroundForceInputs) -> tuple[Pair, GroundForces]:
     even = law_moments(*_moment_arguments(begun[1], given))
     found = steps(begun, given, even)
     lifts = (stance.on_tracks > 0.5) & (jnp.maximum(jnp.abs(begun[1]), jnp.abs(found[0][1])) > stance.length / 6)
-    return compute_rarely(lifts, lambda at, given: steps(at, given, None), (begun, given), found)
+    return compute_if_needed(lifts, lambda at, given: steps(at, given, None), (begun, given), found)
 
 
 def _moment_arguments(centre: Scalar, given: _GroundForceInputs) -> tuple[ContactLaw, Array, Scalar, Scalar]:

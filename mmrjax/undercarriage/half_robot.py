@@ -21,7 +21,7 @@ from mmrjax.fidelities.steady import steady
 from mmrjax.model import balances
 from mmrjax.model.chassis import Chassis, inertia_reduced
 from mmrjax.model.conditions import Conditions
-from mmrjax.model.masses import Masses, masses_of_parts
+from mmrjax.model.masses import HalfRobotMasses, masses_of_parts
 from mmrjax.model.params import Scalar
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import (
@@ -112,7 +112,7 @@ class HalfRobotSystem(eqx.Module):
     robot: Robot
     conditions: Conditions
     path: BeltPath
-    half: Masses
+    half: HalfRobotMasses
     chassis: Chassis
     model: Any
     data: Any

@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 
 from mmrjax.model import channels
 from mmrjax.model.conditions import Conditions
-from mmrjax.model.masses import Masses, masses_of_parts
+from mmrjax.model.masses import HalfRobotMasses, masses_of_parts
 from mmrjax.model.params import Scalar
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import GRAVITY
@@ -58,7 +58,7 @@ class ModelBodies(NamedTuple):
     place: Float[Array, "bodies 3"]
 
 
-def robot_bodies(robot: Robot, half: Masses, conditions: Conditions) -> ModelBodies:
+def robot_bodies(robot: Robot, half: HalfRobotMasses, conditions: Conditions) -> ModelBodies:
     """Bodies of half a robot, or of a whole robot that is free to turn (`Conditions.turns`).
 
     In the plane of travel only the moments about y count, and the others are set equal. The moment of yaw is
@@ -170,7 +170,7 @@ def _numbers_text(numbers: Array) -> str:
 
 
 def step_impulse(
-    half: Masses,
+    half: HalfRobotMasses,
     wheelbase: Scalar,
     conditions: Conditions,
     pitch: Scalar,

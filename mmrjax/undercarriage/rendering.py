@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from mmrjax.fidelities.track import Trajectory
+from mmrjax.fidelities.track import TrackTrajectory
 from mmrjax.model import params
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.paper_tables import BODY_HEIGHT
@@ -85,7 +85,7 @@ class RunView(Protocol):
         ...
 
 
-def check_finite(run: Trajectory) -> None:
+def check_finite(run: TrackTrajectory) -> None:
     """Rejects a run that cannot be drawn.
 
     Raises:
@@ -95,7 +95,7 @@ def check_finite(run: Trajectory) -> None:
         raise ValueError("run: its coordinates are not finite and cannot be drawn; expected a run that ended")
 
 
-def scene_of_run(robot: Robot, conditions: Conditions, run: Trajectory) -> RunScene:
+def scene_of_run(robot: Robot, conditions: Conditions, run: TrackTrajectory) -> RunScene:
     """Collects the data of one run for drawing (scalar conditions, one member of a batch).
 
     Raises:

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from mmrjax.fidelities.track import Trajectory
+from mmrjax.fidelities.track import TrackTrajectory
 from mmrjax.model import channels
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.robot import Robot
@@ -58,7 +58,7 @@ class TopViewScene(NamedTuple):
         return figure_of_sample(self, k)
 
 
-def scene_of_run(robot: Robot, conditions: Conditions, run: Trajectory) -> TopViewScene:
+def scene_of_run(robot: Robot, conditions: Conditions, run: TrackTrajectory) -> TopViewScene:
     """Collects the data of one run for drawing (scalar conditions, one member of a batch).
 
     Raises:

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.signal import find_peaks, peak_widths
 
-from mmrjax.fidelities.track import Trajectory
+from mmrjax.fidelities.track import TrackTrajectory
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import CONVERGED, NOT_SETTLED
 from mmrjax.undercarriage.belt import BeltPath
@@ -199,7 +199,7 @@ class Vibrations:
         return self.read & (self.status == CONVERGED)
 
 
-def vibrations_of_runs(robot: Robot, runs: Trajectory, pitch: float) -> Vibrations:
+def vibrations_of_runs(robot: Robot, runs: TrackTrajectory, pitch: float) -> Vibrations:
     """Ripple at the end of each run of a batch.
 
     Args:

@@ -18,7 +18,7 @@ from mmrjax import fidelities
 from mmrjax.compile.compiling import SELDOM, compiled
 from mmrjax.derived.start_figures import curve_peak, stages_of_histories
 from mmrjax.fidelities import outputs
-from mmrjax.fidelities.base import History, Run
+from mmrjax.fidelities.base import History, RunBatch
 from mmrjax.fidelities.result import result_of_signals
 from mmrjax.model import channels, ground, quantities
 from mmrjax.model.motor import Motor
@@ -103,7 +103,7 @@ def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> 
 
 def _simulate_table(
     folder: RunFolder, robot: Robot, runs: records.Runs, config: configuration.Simulate
-) -> tuple[Columns, Run | None]:
+) -> tuple[Columns, RunBatch | None]:
     """The table of the runs. Where the fidelity keeps them over time these are written, and returned too."""
     fidelity = fidelities.get_fidelity(config.model)
     if fidelity.histories is None:
@@ -135,7 +135,7 @@ def _simulate_table(
     return {**run.condition_table(robot, runs), **over_time(robot, batch)}, batch
 
 
-def over_time(robot: Robot, batch: Run) -> Columns:
+def over_time(robot: Robot, batch: RunBatch) -> Columns:
     """The columns of how runs that were kept over time ended, with what they came to.
 
     Of a run whose battery went empty they are those of its last instant before, and `time_end_s` is when: the charge

@@ -16,7 +16,7 @@ from calibration.data.table import Runs
 from mmrjax import fidelities
 from mmrjax.derived import turning_figures
 from mmrjax.fidelities import outputs
-from mmrjax.fidelities.base import History, Run
+from mmrjax.fidelities.base import History, RunBatch
 from mmrjax.fidelities.rest import voltage_at_rest
 from mmrjax.model import channels, quantities
 from mmrjax.model.channels import Channel
@@ -207,7 +207,7 @@ def _channels(robot: Robot, settled: bool) -> tuple[Channel, ...]:
     return tuple(c for c in every if c.settled or not settled)
 
 
-def _with_others(robot: Robot, asked: Conditions) -> tuple[Run, Conditions]:
+def _with_others(robot: Robot, asked: Conditions) -> tuple[RunBatch, Conditions]:
     """The requested settled turn and turns at other duties of the slower side, in one batch."""
     left, right = (float(np.asarray(getattr(asked, name))[0]) for name in SIDES)
     outer, shares = max(left, right, key=abs), len(SHARES)
@@ -221,7 +221,7 @@ def _with_others(robot: Robot, asked: Conditions) -> tuple[Run, Conditions]:
     return jax.device_get(fidelities.get_fidelity(fidelities.NAMES[0]).run(robot, rows, {})), rows
 
 
-def _columns(robot: Robot, shown: tuple[Channel, ...], conditions: Conditions, batch: Run) -> Columns:
+def _columns(robot: Robot, shown: tuple[Channel, ...], conditions: Conditions, batch: RunBatch) -> Columns:
     radii = np.array([float(c.radius) for c in robot.configurations.members])
     reading = batch.result.reading
     return {

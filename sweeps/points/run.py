@@ -17,7 +17,7 @@ from calibration.inference.problem import Observation
 from mmrjax import fidelities
 from mmrjax.compile.compiling import compiled
 from mmrjax.fidelities import outputs
-from mmrjax.fidelities.base import Run
+from mmrjax.fidelities.base import RunBatch
 from mmrjax.fidelities.variation import FLAGS as FLAGS_CODE
 from mmrjax.fidelities.variation import STATUS
 from mmrjax.model import params
@@ -85,7 +85,7 @@ class SimulationResult:
         }
 
 
-def ending_columns(robot: Robot, batch: Run) -> Columns:
+def ending_columns(robot: Robot, batch: RunBatch) -> Columns:
     """Columns with the results at the end of a batch of runs, including those specific to the fidelity."""
     result, further = jax.device_get((batch.result, batch.columns))
     return outputs.output_columns(result, robot.channels, further)

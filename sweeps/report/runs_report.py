@@ -11,7 +11,7 @@ import numpy as np
 
 from calibration.data import Columns, Json
 from calibration.data.robot_file import RobotFile
-from mmrjax.fidelities.base import Run
+from mmrjax.fidelities.base import RunBatch
 from mmrjax.model.channels import Channel
 from mmrjax.model.quantities import MM, RPM, VOLTAGE
 from mmrjax.model.robot import Robot
@@ -38,7 +38,7 @@ def runs_document(
     file: RobotFile,
     model: str,
     runs: Columns,
-    histories: Run | None = None,
+    histories: RunBatch | None = None,
     stands: Postures | None = None,
     notes: Sequence[str] = (),
 ) -> Document:
@@ -128,7 +128,7 @@ def conditions_in_words(table: Columns, row: int) -> str:
     return ", ".join(parts)
 
 
-def _histories(robot: Robot, runs: Columns, names: list[str], histories: Run) -> Iterable[Section]:
+def _histories(robot: Robot, runs: Columns, names: list[str], histories: RunBatch) -> Iterable[Section]:
     """Runs over time: as instruments show them, or from standstill on a ground, with what the running gear does."""
     from sweeps.pages import gear_figures, history_figures
 
