@@ -34,9 +34,9 @@ MIRRORED, ALIKE = (0, 1), 4
 def _power(run, motion):
     """A step, and where its power goes [W], of the whole robot. What is stored after it [J]."""
     robot, b = run.robot, both_sides
-    sides, plane = b._contacts(run, motion), b.plane_motion(run, motion)
-    signals, pulled = b._resolved(run, plane, sides)
-    _, levers, rises = b.resistance(run, motion, signals, sides, pulled)
+    sides, plane = b._contacts_of_sides(run, motion), b.plane_motion(run, motion)
+    signals, pulled = b._resolve_signals(run, plane, sides)
+    _, levers, rises = b.damping_matrix(run, motion, signals, sides, pulled)
     after, travel, _ = b.advance(run, motion)
     gained = after.v - motion.v
     mean, at = motion.v + gained / 2, sides.at
@@ -44,7 +44,7 @@ def _power(run, motion):
     moves = [jnp.einsum("sci,si->sc", x, mean[b.OF_SIDE]) for x in (levers.along, levers.across, levers.off)]
     front, rear = mean[b.PULLEYS].T
     belt = run.path.radius * (front[:, None] * (1 - at.weight) + rear[:, None] * at.weight)
-    losses = b._losses(run, plane, sides)
+    losses = b._loss_derivatives(run, plane, sides)
     motor, rate = robot.gearbox.ratio * front, robot.gearbox.ratio * gained[b.PULLEYS[:, 0]] / STEP
     mesh = signals.torque_motor - signals.torque_idle - robot.motor.inertia * rate
     charge = after.current + motion.current
@@ -72,7 +72,7 @@ def _power(run, motion):
 def _stored(run, motion):
     robot, b, q, v = run.robot, both_sides, motion.q, motion.v
     none = jnp.zeros(b.COORDINATES)
-    mass, _ = b.dynamics(run, motion, none[:2])
+    mass, _ = b.mass_matrix_and_bias(run, motion, none[:2])
     forward, up = run.half.centre
     rotors = robot.motor.inertia * (robot.gearbox.ratio * v[b.PULLEYS[:, 0]]) ** 2
     level = forward * jnp.cos(q[b.PITCH]) + up * jnp.sin(q[b.PITCH])
@@ -174,7 +174,7 @@ def test_forces_do_the_work_of_contacts_and_friction_takes_it(robot):
     def all_of(motion):
         run = build_system(robot, conditions, STEP)
         found = b.instant(run, motion)
-        return run.path, run.chassis, b._contacts(run, motion), *found, b.generalized(run, motion, *found)
+        return run.path, run.chassis, b._contacts_of_sides(run, motion), *found, b.generalized_forces(run, motion, *found)
 
     motion = half_robot.HalfRobotState(jnp.asarray(q), jnp.asarray(v), jnp.zeros(2), jnp.zeros(()))
     path, chassis, sides, signals, at, pulled, forces = jax.device_get(all_of(motion))
