@@ -342,8 +342,8 @@ def example(result: Path) -> str:
     steps = "\n".join(f"1. {step}." for step in d["next_experiment"]["description"].split(". And: "))
     return f"""# A table of runs
 
-Twenty settled runs of the robot were measured, in two configurations, at 15 and 33 V, on slopes from 0 to 20°. Does the
-paper's model describe them? One command answers in a minute on two cores:
+Twenty settled runs of the packaged robot were measured, on tracks (6T2A) and wheels (4W2T), at 15 V without payload and
+33 V with 8 kg, on slopes from 0 to 20°. Does the paper's model describe them? One command answers in a minute:
 
 ```sh
 mmrjax loop measured --out found
@@ -398,8 +398,8 @@ mmrjax sweep --robot found/robot.toml
 mmrjax explain {d["effects"][0]["name"]}
 ```
 
-The first command simulates the new robot over voltages, payloads and slopes. The second prints an effect's equation,
-its usual size, and a test for it. [Read a verdict](../howto/read-a-verdict.md) explains the other verdicts.
+The first command simulates the new robot over voltages, payloads and slopes. The second prints the equation, usual size
+and bench test of an effect. [Read a verdict](../howto/read-a-verdict.md) explains the other verdicts.
 """
 
 

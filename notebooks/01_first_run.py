@@ -14,9 +14,9 @@
 # %% [markdown]
 # # First run
 #
-# One small robot, one climb, and what the simulator says of it; then a thousand climbs in one call, and the
-# derivative of a current with respect to a friction coefficient. You need no JAX for this: a *batch* is an
-# array of conditions, and a *gradient* is one more thing a function can return.
+# This notebook simulates one climb of a small robot, then a thousand climbs in one call. Then it computes the
+# derivative of a current with respect to a friction coefficient. You do not need to know JAX: a *batch* is an array
+# of conditions, and a *gradient* is computed by a function.
 
 # %%
 import jax
@@ -29,7 +29,8 @@ jax.config.update("jax_enable_x64", True)  # within jax.jit and jax.grad too
 
 # %% [markdown]
 # ## One operating point
-# The robot is a tree of parameters, each with its unit and source. Conditions say what is set from outside.
+# The robot is a tree of parameters, each with its unit and source. Conditions are the quantities that are set from
+# outside, such as voltage and slope.
 
 # %%
 robot = mm.nominal()
@@ -43,8 +44,9 @@ print(f"speed        {answer.speed * 1e3:.0f} mm/s  (measured: 400 mm/s)")
 
 # %% [markdown]
 # ## Every slope at once, and a status for each
-# On lacquered wood Table 5 gives the tracks an adhesion of 0.32. That is less than tan 20° = 0.36, so beyond
-# some slope there is no steady travel: the status says `slides`, and there is no number to be misled by.
+# On lacquered wood, Table 5 of the paper gives the tracks an adhesion coefficient of 0.32. This is less than tan
+# 20° = 0.36. So above some slope the robot cannot travel at a steady speed: its status is `slides`, and its outputs
+# are NaN.
 
 # %%
 slopes = np.linspace(0.0, 25.0, 1001)
@@ -63,9 +65,9 @@ plt.show()
 
 # %% [markdown]
 # ## A gradient
-# How much more current does a hundredth more of rolling resistance cost? The answer is exact: it comes from
-# the balances at the solution (the implicit function theorem), not from running the model twice. Running it
-# twice is only how we check.
+# By how much does the current rise if the coefficient of rolling resistance rises by 0.01? The derivative is exact:
+# it is computed from the balance equations at the solution (implicit function theorem). As a check, the cell also
+# simulates the robot with two neighbouring values.
 
 # %%
 name = "6T2A.ground.rolling_resistance"

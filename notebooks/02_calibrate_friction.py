@@ -14,11 +14,11 @@
 # %% [markdown]
 # # Calibrate friction
 #
-# Twenty measured runs of a real robot (Tables A1 and A2 of the paper): current, motor speed and speed, on
-# tracks and on wheels, at two voltages and five slopes. Which friction coefficients do they imply, how sure
-# are we, and what can no friction coefficient explain?
+# The package contains twenty measured runs of a real robot (Tables A1 and A2 of the paper): current, motor speed
+# and speed, on tracks and on wheels, at two voltages and five slopes. Which friction coefficients do these runs
+# imply, how certain are they, and what can friction not explain?
 #
-# The same from the command line: `mmrjax calibrate measured --out fitted`.
+# The command `mmrjax calibrate measured --out fitted` does the same.
 
 # %%
 import jax
@@ -34,20 +34,21 @@ print(f"{len(runs)} runs of {', '.join(np.unique(runs['configuration']))}")
 
 # %% [markdown]
 # ## What is free, and what is known beforehand
-# The motor and gearbox stay at their makers' data and the masses as printed: a winding resistance that
-# quietly absorbs missing friction is the classic failure. Free are the friction coefficients. Each has a
-# *prior*: the value of the bench test, with the width that its field states.
+# Motor and gearbox keep their data-sheet values, and the masses are those of the table. If the winding resistance
+# were free, it could absorb missing friction. The friction coefficients are free. Each has a *prior*: the value
+# from a bench test, with a standard deviation.
 #
-# Guide friction and guide share act only as a product, so no data can separate them; the friction stays at
-# its measured 0.20 and the share is free.
+# The model depends only on the product of the guide friction and the share of the weight on the guides, so no data
+# can separate the two. The friction keeps its measured value of 0.20, and the share is free.
 
 # %% [markdown]
 # ## Fit
-# The objective is a sum of squares: each reading's error over its standard deviation, and each parameter's
-# shift over its prior's. Levenberg-Marquardt follows exact derivatives of all 60 readings with respect to all
-# parameters; 64 searches start at once from 64 draws of the priors, because one search can end in the wrong
-# valley. Six rows *slide* at the nominal adhesion, though the robot climbed them: there the objective is kept
-# finite and a penalty leads back to robots that can climb.
+# The objective is a sum of squares: the error of each reading divided by its standard deviation, and the shift of
+# each parameter divided by the standard deviation of its prior. The Levenberg-Marquardt method uses exact
+# derivatives of all 60 readings with respect to all parameters. A single search can end in a local minimum, so 64
+# searches start from 64 draws of the priors. With the nominal adhesion the simulated robot *slides* in six rows,
+# although the real robot climbed. In these rows the objective stays finite, and a penalty leads the search back to
+# robots that climb.
 
 # %%
 found = mm.calibrate(runs, base)
@@ -58,10 +59,10 @@ for name, p in found.parameters.items():
     print(f"{name:<40}{p.value:>9.4g}  [{low:.3g}, {high:.3g}]  {prior}")
 
 # %% [markdown]
-# ## How sure
-# A *profile* holds one parameter at a value and fits all others again. Where the curve lies below the line,
-# the data (and priors) allow it. The static friction is one-sided: less of it and the robot could not climb
-# 20 degrees at all; more of it is hardly contradicted.
+# ## How certain
+# A *profile* fixes one parameter at a value and fits all other parameters. Values at which the curve is below the
+# line are within the 95 % interval. The interval of static friction is one-sided: with less friction the robot
+# could not climb 20° at all, but more friction hardly contradicts the data.
 
 # %%
 profiled = {name: p for name, p in found.parameters.items() if p.profile is not None}
@@ -76,9 +77,9 @@ assert all(np.isfinite(line.get_ydata()).any() for panel in plt.gcf().axes for l
 plt.show()
 
 # %% [markdown]
-# ## Errors, and on data not seen
-# A fit is judged on rows that it has not seen: leave out a whole slope, voltage or configuration, fit again,
-# predict it.
+# ## Errors, also on unseen runs
+# A fit should be judged on runs that it has not seen. So each slope, voltage or configuration is left out in turn
+# and predicted by a fit to the other runs.
 
 # %%
 lines = {"before": found.errors_before, "fitted": found.errors_after}
@@ -91,10 +92,10 @@ for what, errors in lines.items():
 
 # %% [markdown]
 # ## What friction cannot explain
-# The errors that stay are not noise; they have a shape. The motors turn 5-10 % slower than the model at 15 V
-# whatever the friction (something in the electrics is missing), the wheeled robot's current is 10-15 % too
-# high on slopes (its mass as printed, 13.1 kg, contradicts Table 7), and one sliding speed V_s cannot serve
-# both voltages. Finding those effects is another tool's work; freeing the electrics here would only hide them.
+# The remaining errors are not random. At 15 V most measured motor speeds are 6-11 % lower than simulated, whatever
+# the friction, so an electrical effect is missing. On slopes the simulated current on wheels is 10-19 % too high;
+# its printed mass of 13.1 kg contradicts Table 7. And a single slip speed V_s cannot describe both voltages. The
+# loop (`mm.discover`) finds such effects; freeing electrical parameters here would only hide them.
 
 # %%
 table = found.rows()
@@ -114,9 +115,9 @@ for note in found.notes:
     print("-", note)
 
 # %% [markdown]
-# ## The gradient, by hand
-# Nothing in this is hidden. The derivative of one row's current with respect to a parameter of the calibrated
-# robot, by the implicit function theorem, against running the model twice:
+# ## Check a derivative
+# The cell computes the derivative of one row's current with respect to a parameter of the calibrated robot, once by
+# the implicit function theorem and once by simulating two neighbouring values.
 
 # %%
 name, row = "6T2A.track.guide_share", 2

@@ -14,12 +14,14 @@
 # %% [markdown]
 # # Through the track
 #
-# The track model runs half a robot in MuJoCo MJX: 24 grousers strike the ground one after another, the belt
-# rubs on its guides, two motors push. Thousands of small steps lead from a friction coefficient to a measured
-# current. Can a *derivative* be taken through all of them, so that the coefficient is found from the current?
+# The track model simulates half a robot in MuJoCo MJX: 24 grousers strike the ground one after another, the belt
+# rubs on its guides, and the motor pushes. Thousands of small time steps lie between a friction coefficient and a
+# measured current. Can one compute a *derivative* through all these steps, and use it to find the coefficient from
+# the current?
 #
-# It depends on how the belt is modelled. This notebook takes the derivative through two models of the same
-# belt: one in which it is useless, and one in which it calibrates a friction coefficient in a few steps.
+# The answer depends on how the belt is modelled. This notebook computes the derivative for two models of the same
+# belt. With one model the derivative is useless; with the other it calibrates a friction coefficient in a few
+# steps.
 
 # %%
 import sys
@@ -35,13 +37,13 @@ import mmrjax as mm
 jax.config.update("jax_enable_x64", True)  # within jax.jit and jax.grad too
 
 # %% [markdown]
-# ## A run, and its derivative beside it
-# The robot: nominal, with enough adhesion to climb. The runs: four measured ones of the tracked robot at 33 V
-# (Table A1 of the paper). The parameter: the friction coefficient $\mu_t$ of the belt's teeth on their guides.
+# ## A run and its derivative
+# The robot is the nominal one, with enough adhesion to climb. The runs are four measured runs of the tracked robot
+# at 33 V (Table A1 of the paper). The parameter is the friction coefficient $\mu_t$ between the belt teeth and
+# their guides.
 #
-# `jax.jvp` runs a function and, with each number it computes, carries along how fast that number changes when
-# the input does. It needs no formula from us and no second run; each elementary operation knows its own
-# derivative, and the chain rule does the rest, through 6000 steps of 0.1 ms as well as through one.
+# `jax.jvp` evaluates a function together with its derivative: each elementary operation knows its own derivative,
+# and the chain rule combines them over all 6000 steps of 0.1 ms.
 
 # %%
 measured = mm.read_runs("measured")
@@ -71,7 +73,7 @@ for k in range(len(rows)):
     )
 
 # %% [markdown]
-# Is the derivative right? Run the model twice, a little to each side, and compare.
+# Is the derivative right? The next cell compares it with a difference quotient of two runs.
 
 # %%
 h = 2e-5
@@ -83,11 +85,11 @@ print("run twice:    ", twice.round(4))
 
 # %% [markdown]
 # ## Why averages
-# The first run again, from standstill and over time. Its current is not constant (left): each grouser that strikes
-# the ground makes it rise. More friction slows the belt a little, so each strike is later than it was by a little
-# more than the one before, and the derivative of the current *at an instant* swings more and more (middle). Nobody
-# reads that off an ammeter. The reading is an average over whole grouser periods, and the derivative of such an
-# average settles (right).
+# The first run again, from standstill and over time. The current ripples (left), because it rises whenever a
+# grouser strikes the ground. With more friction the belt is a little slower, so each strike comes later, and the
+# delay grows from strike to strike. Therefore the derivative of the current *at an instant* oscillates more and
+# more (middle). An ammeter shows the average over whole grouser periods, and the derivative of this average settles
+# (right).
 
 # %%
 flat = rows.where(rows["slope_deg"] == 0)
@@ -113,12 +115,12 @@ plt.show()
 
 # %% [markdown]
 # ## The belt as a free chain: a derivative that is exact and useless
-# The obvious model of a belt is a chain: 168 masses joined by stiff springs, each free to move. It is written
-# down in `benchmarks/free_chain.py`, with the same contact laws, and its *averages* are good: the guides carry
-# the share of the weight that the track model says.
+# The obvious model of a belt is a chain of 168 masses that are joined by stiff springs and free to move.
+# `benchmarks/free_chain.py` implements it with the same contact laws. Its *averages* are good: the guides carry the
+# same share of the weight as in the track model.
 #
-# But such a chain is chaotic, like dice: start it twice with guide frictions that differ in the twelfth digit,
-# and within a few hundredths of a second the two chains shake differently.
+# But the motion of this chain is chaotic. If two chains have guide frictions that differ by 1e-12, their motions
+# differ completely after a few hundredths of a second.
 
 # %%
 sys.path.insert(0, str(Path(mm.__file__).parents[1] / "benchmarks"))
@@ -155,23 +157,23 @@ assert all(np.isfinite(line.get_ydata()).any() for panel in plt.gcf().axes for l
 plt.show()
 
 # %% [markdown]
-# The derivative that JAX carries through the chain is *exact*: it is the derivative of that run. It grows
-# tenfold every two or three milliseconds, as the difference of the two runs does, but goes on where the
-# difference ends, with two chains that differ as much as they ever will. It says, truly, that an infinitesimal
-# change of friction changes how the chain shakes; it says nothing of how the average load changes. Following it
-# would be following noise, and running twice gives another number for each step $h$.
+# The derivative that JAX computes for the chain is *exact* for this run. Like the difference of the two runs, it
+# grows tenfold every two or three milliseconds. The difference stops growing when the two chains differ as much as
+# they can; the derivative keeps growing. It describes correctly how an infinitesimal change of friction changes the
+# vibration of the chain, but it says nothing about the average load. So it cannot guide a calibration. A difference
+# quotient does not help either: it gives another number for each step $h$.
 #
 # ## The belt on its path
-# The track model therefore does not let the belt choose where to go. The belt runs on its path (two straight
-# runs, two arcs): where each grouser is follows from the angles of the two pulleys, its tension from their
-# difference, and every contact acts on the robot through that path. Five coordinates in place of 336 and more:
-# a small disturbance dies out instead of growing. What is left in the derivative on the right is the timing of
-# the strikes, which grows with time and no faster, and which averages over whole periods do not see.
+# In the track model the belt therefore follows a fixed path of two straight sections and two arcs. The angles of
+# the two pulleys determine the position of each grouser and the tension of the belt. The model has five coordinates
+# instead of at least 336, and small disturbances decay instead of growing. The remaining oscillation of the
+# derivative (right) comes from the timing of the strikes. It does not grow exponentially, and averages over whole
+# periods do not contain it.
 
 # %% [markdown]
 # ## A calibration by gradient
-# Now the question can be turned round: which $\mu_t$ meets the four measured currents? With the derivative at
-# hand, each step solves the problem as if the model were a straight line (Gauss-Newton), and four steps do.
+# Which $\mu_t$ gives the four measured currents? With the derivative, each step solves a linearised problem
+# (Gauss-Newton). Four steps are enough.
 
 # %%
 target, sd = rows["total_current_A"], 0.05 * rows["total_current_A"]
@@ -185,9 +187,9 @@ for step in range(5):
     mu = mu - move
 
 # %% [markdown]
-# The steady fidelity, which has no grousers and solves three equations instead, gets the same from the same
-# currents. In it only the *product* of friction and the guides' share of the weight acts; the track model puts
-# out that share, 0.98, by itself.
+# `steady` has no grousers and solves only three equations. It gives the same result for the same currents. In
+# `steady` only the *product* of the friction and the share of the weight on the guides matters; the track model
+# computes this share (0.98).
 
 # %%
 lumped = jnp.asarray(0.20)
@@ -203,9 +205,10 @@ print(
 print(f"steady:      mu_t x share = {float(lumped) * 0.98:.4f}")
 
 # %% [markdown]
-# So $\mu_t$ is about a third of the 0.20 that Table 4 of the paper prints: with 0.20 on nearly all of the weight
-# every measured current would be far exceeded (first cell of results). All friction coefficients at once, on
-# all twenty rows, with priors and intervals: `mmrjax calibrate measured --model track`, some minutes.
+# So $\mu_t$ is about a third of the 0.20 that Table 4 of the paper prints. With 0.20 and nearly all of the weight
+# on the guides, the simulated currents are far above the measured ones (see the first output). `mmrjax calibrate
+# measured --model track` fits all friction coefficients to all twenty rows, with priors and intervals, in some
+# minutes.
 
 # %%
 assert np.allclose(exact, twice, rtol=0.01)  # through 6000 steps

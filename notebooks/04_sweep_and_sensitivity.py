@@ -14,9 +14,9 @@
 # %% [markdown]
 # # A sweep, and which parameters matter
 #
-# What does a robot do over a range of conditions, how sure is that, and which of its parameters would one have to
-# know better? `mmrjax sweep` and `mmrjax sensitivity` answer this from the command line, for all parameters at once
-# and with confidence intervals; here is what they do, in a few lines each.
+# How does a robot behave over a range of conditions, how certain is this prediction, and which parameters would
+# have to be known better? The commands `mmrjax sweep` and `mmrjax sensitivity` answer this for all parameters, with
+# confidence intervals. This notebook shows in a few lines what they compute.
 
 # %%
 import tempfile
@@ -36,8 +36,8 @@ robot = mm.nominal()
 
 # %% [markdown]
 # ## A sweep
-# `mm.sweep` takes a grid of conditions. A parameter of the robot can vary too: `mm.replace` changes it by its name,
-# and `jax.vmap` runs all robots in one call.
+# `mm.sweep` simulates a grid of conditions. To vary a parameter of the robot as well, change it by name with
+# `mm.replace` and simulate all robots in one call with `jax.vmap`.
 
 # %%
 slopes, shares = np.linspace(0, 12, 25), np.linspace(0, 1, 21)
@@ -58,7 +58,8 @@ print(f"current {np.nanmin(current):.2f} to {np.nanmax(current):.2f} A")
 
 # %% [markdown]
 # ## Its store
-# Arrays with names and units. `mmrjax sweep CONFIG.toml` writes such a store in chunks, for any number of points.
+# The results are arrays with names and units. `mmrjax sweep CONFIG.toml` writes such a store in chunks, for any
+# number of points.
 
 # %%
 store = xr.Dataset(
@@ -72,9 +73,9 @@ again["total_current"].sel(slope_deg=[0, 6, 12]).sel(guide_share=[0.0, 0.5, 1.0]
 
 # %% [markdown]
 # ## Which parameters matter, at the robot's own values
-# Suppose that six parameters are known to the tolerances below. A derivative says what each of them does to a
-# reading: the *elasticity*, percent of current or speed for one percent of the parameter. Derivatives are exact and
-# come with the run, so all of them at four operating points are one call.
+# Suppose that six parameters are known to the tolerances below. The *elasticity* of a reading is its change in
+# percent for a change of 1 % in a parameter. Derivatives are exact, so one call computes all elasticities at four
+# operating points.
 
 # %%
 known = {  # relative standard deviation
@@ -115,9 +116,10 @@ plt.show()
 
 # %% [markdown]
 # ## Over the whole range
-# Derivatives hold near one robot. *Sobol indices* look at all robots that the tolerances allow: which share of a
-# reading's variance does each parameter cause? First order: by itself. Total: with all that it acts together with.
-# Two independent sets of robots are drawn, and one parameter at a time of the first is replaced by that of the second
+# Derivatives describe small changes of one robot. *Sobol indices* describe all robots that the tolerances allow:
+# they give the share of each parameter in the variance of a reading. The first-order index is the share of the
+# parameter alone; the total index includes its interactions with other parameters. The method draws two independent
+# sets of robots. Then it replaces one parameter at a time in the first set by its values from the second set
 # (Saltelli 2010, Jansen 1999).
 
 # %%
@@ -157,10 +159,10 @@ assert all(np.isfinite(bar.get_width()) for panel in plt.gcf().axes for bar in p
 plt.show()
 
 # %% [markdown]
-# The guides' share of the weight is what one would have to know better to predict the current; the torque constant
-# sets the speed, since the no-load speed is voltage over torque constant. A settled run does not depend on the
-# inductance at all. `mmrjax sensitivity --outputs total_current,speed,slip` does the same for every parameter that
-# has a prior, and proposes the runs that would tell most.
+# To predict the current better, one would have to know the share of the weight on the guides better. The torque
+# constant determines the speed, because the no-load speed is voltage divided by torque constant. A settled run does
+# not depend on the inductance at all. `mmrjax sensitivity --outputs total_current,speed,slip` does the same for
+# every parameter that has a prior, and proposes the most informative runs to measure.
 
 # %%
 share, constant, inductance = (

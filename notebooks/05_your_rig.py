@@ -14,12 +14,12 @@
 # %% [markdown]
 # # Your own rig
 #
-# A robot that nobody here built, measured by somebody else: Robotino, three omni wheels, on four surfaces, with its
-# motor speeds controlled and its voltages not recorded (`docs/rigs/robotino/README.md` says where the data are from).
-# What it takes: a file that describes the rig, and the table as it is.
+# This notebook uses a robot that other people built and measured: Robotino, with three omni wheels, on four
+# surfaces. Its motor speeds were controlled; its voltages were not recorded. (`docs/rigs/robotino/README.md` gives
+# the source of the data.) mmrjax needs two files: a description of the rig, and the table as it is.
 #
-# From the command line: `mmrjax rig check robotino.toml settled.csv`, then
-# `mmrjax loop settled.csv --robot robotino.toml --noise current=5%,speed=10%`.
+# The same on the command line: `mmrjax rig check robotino.toml settled.csv`, then `mmrjax loop settled.csv --robot
+# robotino.toml --noise current=5%,speed=10%`.
 
 # %%
 import tempfile
@@ -38,10 +38,10 @@ print(f"{len(runs)} runs on {', '.join(np.unique(runs['surface']))}; imposed: {r
 print(f"channels: {', '.join(rig.rig.channels)}; columns without a role: {', '.join(runs.unknown)}")
 
 # %% [markdown]
-# ## What the model says of it
-# Friction of each surface is free (its adhesion, the speed at which it slides, its resistance to rolling). The law of
-# the model is that the demand on a surface sets the speed at which the contact slides, however fast the wheels turn.
-# At 0.3 m/s that is wrong by far.
+# ## The model without effects
+# The friction of each surface is free: its adhesion, its slip speed and its rolling resistance. In this model the
+# traction demand on a surface determines the sliding speed of a contact, no matter how fast the wheels turn. At 0.3
+# m/s this is far from the measurements.
 
 
 # %%
@@ -66,10 +66,11 @@ print(
 )
 
 # %% [markdown]
-# ## What it lacks
-# `mm.discover(runs, rig)` finds, without being told, that slip goes with the speed (`nonlinear_slip`: a share of the
-# speed that depends on how much of the adhesion is used). That takes a minute or two; here its answer is put into the
-# rig's file and fitted. `scaled` widens the library's prior and limits, which are for tracks on wood.
+# ## What the model lacks
+# `mm.discover(runs, rig)` finds that slip grows with the speed: the effect `nonlinear_slip` is a share of the speed
+# that depends on how much of the adhesion is used. The search takes a minute or two. To save time, this notebook
+# adds the effect to the robot file and fits it. `scaled` widens the library's prior and limits, which were chosen
+# for tracks on wood.
 
 # %%
 SLIP = """
@@ -111,8 +112,8 @@ assert all(np.isfinite(line.get_ydata()).any() for panel in plt.gcf().axes for l
 plt.show()
 
 # %% [markdown]
-# ## What is left clusters
-# Residuals go with a column that was given no role: which of the three wheels idles. Nobody said that it matters.
+# ## What the remaining errors depend on
+# The residuals depend on a column that the model does not use: which of the three wheels idles.
 
 # %%
 for cluster in found.residual_clusters:

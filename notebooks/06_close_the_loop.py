@@ -14,8 +14,8 @@
 # %% [markdown]
 # # Close the loop
 #
-# Twenty runs were measured. What does the model lack, how sure is that, and does the robot that has it predict
-# runs that it has not seen? The same as `mmrjax loop measured`, from Python.
+# Twenty runs were measured. Which effects does the model lack, how certain are they, and does the improved robot
+# predict runs that it has not seen? The command `mmrjax loop measured` does the same.
 
 # %%
 import matplotlib.pyplot as plt
@@ -30,7 +30,7 @@ print(found.statement)
 
 # %% [markdown]
 # ## What was found
-# An effect has an equation, a size and a standing: *established*, or *tentative* with what speaks against it.
+# Each effect has an equation and a size. It is either *established*, or *tentative* with a reason.
 
 # %%
 for effect in found.effects:
@@ -42,7 +42,7 @@ for note in found.notes:
 
 # %% [markdown]
 # ## Before and after, run by run
-# Simulated less measured, in standard deviations of the instruments.
+# The figure shows simulated minus measured values, in standard deviations of the instruments.
 
 # %%
 table = found.rows_table()
@@ -58,8 +58,9 @@ assert all(np.isfinite(line.get_ydata()).any() for panel in plt.gcf().axes for l
 plt.show()
 
 # %% [markdown]
-# ## Does it predict?
-# Each slope is left out in turn and predicted by a fit that has not seen it. Errors are in percent of the reading.
+# ## Does the robot predict unseen runs?
+# Each slope is left out in turn and predicted by a fit to the other slopes. Errors are in percent of the rms of the
+# readings.
 
 # %%
 before, after = found.errors_held_out["slope"]
@@ -67,8 +68,8 @@ for name in before:
     print(f"{name:15s} {before[name]['rms_percent']:5.1f} % -> {after[name]['rms_percent']:5.1f} %")
 
 # %% [markdown]
-# ## Use what was found
-# The robot that was found is one like any other.
+# ## Use the improved robot
+# `found.robot` can be used like any other robot.
 
 # %%
 slopes = np.linspace(0.0, 20.0, 81)

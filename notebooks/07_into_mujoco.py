@@ -14,9 +14,9 @@
 # %% [markdown]
 # # Into MuJoCo
 #
-# A drive that the loop has found goes where people train and control: as a `<dcmotor>` into MuJoCo, and as an
-# actuator function into MJX. How much does each format lose? The same as `mmrjax loop measured --out found`, then
-# `mmrjax export found/robot.toml --to mujoco --configuration 4W2T --data measured`.
+# This notebook takes a drive that the loop has improved into two other simulators: into MuJoCo as a `<dcmotor>`,
+# and into MJX as an actuator function. How accurate is each format? On the command line: `mmrjax loop measured
+# --out found`, then `mmrjax export found/robot.toml --to mujoco --configuration 4W2T --data measured`.
 
 # %%
 import importlib.util
@@ -38,9 +38,10 @@ found = mm.discover(runs, mm.nominal())
 print(found.statement)
 
 # %% [markdown]
-# ## Export, and what is lost
-# Parameters of `<dcmotor>` are refitted to the native model over the measured runs on wheels. Errors are against the
-# measured readings: of the native model, of the export, and of the export without what the loop found.
+# ## Export, and its errors
+# The parameters of `<dcmotor>` are refitted to the mmrjax model at the conditions of the measured runs on wheels.
+# The errors are relative to the measured readings: for the mmrjax model, for the export, and for an export without
+# the effects that the loop found.
 
 # %%
 folder = Path(tempfile.mkdtemp())
@@ -55,8 +56,8 @@ print(drive.files["drive.xml"][start:].splitlines()[0])
 
 # %% [markdown]
 # ## In MuJoCo C
-# The scene that comes with the export: one side of the robot rolls on its wheel. The torque of slope and ground is
-# the actuator `load`. Runs of Table 8 on wheels, each until it has settled, against `mm.simulate`.
+# In the exported scene, one side of the robot rolls on its wheel. The actuator `load` applies the torque of slope
+# and ground. The cell simulates runs of Table 8 on wheels until they settle, and compares them with `mm.simulate`.
 
 # %%
 model = mujoco.MjModel.from_xml_path(str(folder / "scene.xml"))
@@ -85,8 +86,8 @@ print(f"largest difference from mm.simulate: current {100 * errors_c[0]:.2f} %, 
 
 # %% [markdown]
 # ## In MJX, many at the same time
-# MJX has no `<dcmotor>`. The export `jax` is one file of plain JAX, and its torque goes into `qfrc_applied`. Each
-# environment has another voltage and load; the scene has no constraints, so derivatives are cheap.
+# MJX has no `<dcmotor>`. The export `jax` is a file of plain JAX; its torque is added to `qfrc_applied`. Each
+# environment has a different voltage and load. The scene has no constraints, so derivatives are cheap.
 
 # %%
 mm.export(found.robot, "jax", out=folder / "jax", **wheels)
@@ -142,8 +143,9 @@ assert all(np.isfinite(line.get_ydata()).any() for panel in plt.gcf().axes for l
 plt.show()
 
 # %% [markdown]
-# ## A move that takes little energy
-# Half a metre in one second, from rest to rest, with the least energy: gradients go through actuator and joint.
+# ## A move with little energy
+# The robot has to travel half a metre in one second, from rest to rest, with the least energy. Gradients go through
+# the actuator and the joint.
 
 # %%
 STEPS, DT, KNOTS, TARGET = 200, 0.005, 21, 0.5

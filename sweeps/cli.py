@@ -240,7 +240,7 @@ def render() -> None:
     config.FittedRuns,
     group=DATA,
     example="mmrjax calibrate measured --noise current=2%,motor_speed=0.5%,speed=1% --out fitted",
-    failure="the search, or one without a block, did not converge, or the solver failed at a row. An inadequate "
+    failure="the fit, or a fit with a block left out, did not converge, or the solver failed at a row. An inadequate "
     "fit and rows that slide give 0",
 )
 def calibrate() -> None:

@@ -27,6 +27,7 @@ def site():
 SITE = site()
 #: Pages that programs write: they count as reference and not as prose.
 MADE = {f"reference/{name}.md" for name in (*SITE.PAGES, "effects")} | {
+    "lab/emps.md",
     "lab/gears.md",
     *(f"actuators/{p.name}" for p in (DOCS / "actuators").glob("*.md")),
 }

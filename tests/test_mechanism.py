@@ -8,11 +8,13 @@ import pytest
 
 from calibration.discovery import mechanism as room
 from calibration.discovery.candidates import Candidate
+from calibration.discovery.classes import errors_of_ammeters
 from calibration.discovery.location import DiscrepancyLocation
 from calibration.discovery.loop_notes import Mechanism
 from calibration.discovery.prediction import Gain, HeldOutScore
 from calibration.discovery.settings import settings_for
 from calibration.inference.observers import SettledRuns
+from mmrjax.model.channels import channels_named
 
 ROWS, BASE = 30, 1000.0
 FAMILIES = {
@@ -36,9 +38,13 @@ def test_a_mechanism_needs_each_of_its_tests():
     }
     assert dataclasses.replace(stands, se=np.inf).fails == ("gain",)  # nothing could be held out
     places = "loss torque", "resistance to travel", "mass", "reading of total current", "reading of motor voltage"
-    everywhere = dataclasses.replace(stands, families=tuple(f"{x} that changes with slope" for x in places))
+    families = tuple(f"{x} that changes with slope" for x in places)
+    space = SimpleNamespace(bare=SimpleNamespace(channels=channels_named(["total_current", "motor_speed"])))
+    ammeter = errors_of_ammeters(space, families)
+    assert ammeter == families[3:4] and errors_of_ammeters(space, families[3:]) == ()
+    everywhere = dataclasses.replace(stands, families=families, ammeter=ammeter)
     assert everywhere.fails == ("many",)  # as of a table in which nothing was missing
-    assert dataclasses.replace(everywhere, families=everywhere.families[:-1]).fails == ()  # an ammeter as a loss
+    assert dataclasses.replace(everywhere, families=families[:-1]).fails == ()  # an ammeter as a loss
 
 
 def fitted(*effects, explains, plausible=True):
@@ -53,7 +59,7 @@ def found(monkeypatch):
     library = {n: SimpleNamespace(family=lambda f=f: f) for n, f in FAMILIES.items()}
     space = SimpleNamespace(
         weight=np.ones((ROWS, 1)), library=library, included=np.ones(ROWS, bool),
-        bare=SimpleNamespace(observe=SimpleNamespace(long=False, blocks=("speed",), noise_misfit=lambda off, counts: counts.sum())),
+        bare=SimpleNamespace(channels=(), observe=SimpleNamespace(long=False, blocks=("speed",), noise_misfit=lambda off, counts: counts.sum())),
     )  # fmt: skip
     score = HeldOutScore({}, {})
     monkeypatch.setattr(room.blocks_room, "predictable_blocks", lambda *_: {})

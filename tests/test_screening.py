@@ -398,3 +398,31 @@ def test_effects_that_remain_without_another_take_the_first_slots(monkeypatch):
     fewer = search.refit_without_each(SimpleNamespace(free=2), best, settings)
     assert [c.active for c in fewer] == [("brush_drop", "", ""), ("churning", "", "")]
     assert_allclose(asked[0][1], [0, 1, 3, 0, 0, 6, 0, 0])
+
+
+@pytest.mark.parametrize("converged", [False, True])
+def test_a_search_from_a_regression_that_does_not_converge_is_repeated_from_the_mean(monkeypatch, converged):
+    """From a regression 2.9 prior sds away, a log with the angle alone ended at an efficiency of 0.26 for 0.74."""
+    begun = []
+
+    def optima(problem, starts, *_, **__):
+        begun.append(np.asarray(starts))
+        there = np.asarray(starts)[:, 0] != 0
+        each = np.ones(len(starts))
+        cost = jnp.asarray(np.where(there, 931.0, 408.0))
+        return Optimum(starts, starts, starts, cost, each, jnp.asarray(converged | ~there), each), each
+
+    monkeypatch.setattr(candidates.scans, "place_at_minimum", lambda bare, starts: starts)
+    observe = SimpleNamespace(long=True, policy=SimpleNamespace(steps=60), search=optima)
+    space = SimpleNamespace(
+        bare=SimpleNamespace(observe=observe),
+        near={},
+        free=2,
+        begins={("churning", ""): 0},
+        room=(),
+        weight=np.ones(3),
+    )
+    regression = SimpleNamespace(z=np.array([-2.9, 1.0, 0.0]), simulated=False)
+    optima_found, _ = candidates._best_starts(space, ANALYST.settings, regression)
+    assert [b.tolist() for b in begun] == [[[-2.9, 1.0]]] + [[[0.0, 0.0]]] * (not converged)
+    assert np.min(optima_found.cost) == (931.0 if converged else 408.0)

@@ -267,7 +267,7 @@ SAMPLES = [
     Remark("outstanding", factors=(0.5, 2.0), word="assumed"),
     Remark("not_predictable", kinds=("configuration",)),
     Remark("lost_replicates", settled=400, asked=500),
-    Remark("rests_on", test=NameTest("slip", 10.57, 3.3, (), 0.0, 2, 2.9, what="run")),
+    Remark("rests_on", test=NameTest("slip", 10.57, 3.3, (), 0.0, 2, 2.4, what="run")),
     Remark(
         "rests_on",
         test=NameTest("slip", 10.57, 3.3, (), 0.0, 10, 4.3),

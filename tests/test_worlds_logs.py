@@ -97,6 +97,17 @@ def test_a_speed_that_still_rises_is_no_matter_of_units(tmp_path, monkeypatch):
     assert len(kind.settled(runs)[0]) > len(kind.settled(runs, steady=True)[0]) == 0
 
 
+def test_the_file_of_a_coarse_log_states_the_noise_without_its_steps(tmp_path):
+    """The loop adds them. With sds that contain them a right fit left 594 of 800."""
+    rig = logs.rig(np.random.default_rng(5), "motor_current", 0.005, coarse=True)
+    assert rig.steps["motor_speed"] > 2 * rig.noise("motor_speed")
+    case = logs.case(rig, "", 0.0, 5)
+    case.write(tmp_path)
+    runs = records.read_runs(tmp_path / "table.csv", robot=robot_file.read_robot(tmp_path / "rig.toml"))
+    known = noise.noise_from_table(runs, observers.observer_kind(runs).sizes(runs))
+    np.testing.assert_allclose(known.sd[0] / [c.factor for c in runs.channels], [*rig.sd.values()], rtol=2e-3)
+
+
 def test_logs_of_about_one_length_share_what_is_compiled():
     lengths = [_common_length(n) for n in range(1, 5000)]
     assert all(n <= long <= 1.125 * n for n, long in enumerate(lengths, 1))

@@ -14,8 +14,8 @@ from mmrjax.model.channels import Channel
 from mmrjax.model.rig import Instrument
 from mmrjax.model.robot import Robot
 
-#: Smallest step, and largest rounding of a difference, as shares of the largest difference.
-SMALLEST, ROUNDING = 1e-5, 1e-9
+#: Smallest step, and largest rounding of a printed reading, as shares of the largest difference.
+SMALLEST, ROUNDING = 1e-5, 1e-7
 #: Fewest different readings that show a step: the common divisor of so many random multiples is the step itself in
 #: 99 % of tables, of four multiples in 83 %.
 FEWEST = 8

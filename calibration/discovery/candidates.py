@@ -248,27 +248,36 @@ def _best_starts(space: CandidateSpace, settings: Settings, near: Candidate | No
     """Best fit of the base from several starts that the data suggest, and the simulated observation there.
 
     If `CandidateSpace.room` is known, fits of time histories use that program with empty slots.
+    A search from a regression that does not converge is repeated from the prior mean.
     """
     observe, bare = space.bare.observe, space.bare
-    few = bool(space.near)
+    few, regression = bool(space.near), False
     if near is not None and (few or observe.long):
-        starts = near.z[None, : space.free]
-        if not near.simulated:
+        starts, regression = near.z[None, : space.free], not near.simulated
+        if regression:
             # If an effect is missing, the fits with effects begin at the mean too, and the base explains too little.
             doubted = np.abs(starts).max() > UNLIKELY and not space.begins
             mean = [np.zeros(space.free)] if doubted else []
             starts = scans.place_at_minimum(bare, np.stack([*starts, *mean]))
     else:
         starts = observe.starts(bare, np.random.default_rng(settings.seed), observe.policy.searches)
-    weights = np.repeat(space.weight[None], len(starts), 0)
-    problem, which = bare, None
-    if space.room:
-        problem, (empty,) = space.problem_for_sets([empty_slots(settings)])
-        starts = np.pad(starts, ((0, 0), (0, 2 * settings.slots)))
-        which = np.repeat(np.asarray(empty)[None], len(starts), 0)
-    search_inputs = jnp.asarray(starts), jnp.asarray(weights), which
     most = FEW if few else observe.policy.steps if space.begins else None
-    return jax.device_get(observe.search(problem, *search_inputs, rivals=not few, most=most, scanned=bare))
+
+    def search(starts: np.ndarray) -> tuple[Optimum, Observation]:
+        weights = np.repeat(space.weight[None], len(starts), 0)
+        problem, which = bare, None
+        if space.room:
+            problem, (empty,) = space.problem_for_sets([empty_slots(settings)])
+            starts = np.pad(starts, ((0, 0), (0, 2 * settings.slots)))
+            which = np.repeat(np.asarray(empty)[None], len(starts), 0)
+        search_inputs = jnp.asarray(starts), jnp.asarray(weights), which
+        return jax.device_get(observe.search(problem, *search_inputs, rivals=not few, most=most, scanned=bare))
+
+    found = search(starts)
+    if regression and len(starts) == 1 and not np.all(found[0].converged):
+        from_mean = search(scans.place_at_minimum(bare, np.zeros((1, space.free))))
+        found = jax.tree.map(lambda *x: np.concatenate(x), found, from_mean)
+    return found
 
 
 Proposal = tuple[Names, np.ndarray]

@@ -276,3 +276,11 @@ def ammeter_families(
         if name.endswith("current")
         and explained(columns * (np.arange(len(columns)) % len(names) == k)[:, None])[0] >= least
     )
+
+
+def errors_of_ammeters(space: CandidateSpace, families: Names) -> Names:
+    """Those of the families after the first that are errors of an ammeter, for a `Mechanism`."""
+    names = channels.channel_names(space.bare.channels)
+    return tuple(
+        f for f in families[1:] if f.startswith(tuple(place_in_words(n) for n in names if n.endswith("current")))
+    )

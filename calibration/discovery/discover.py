@@ -26,7 +26,13 @@ from calibration.discovery import findings, kept, menu, prediction, preference, 
 from calibration.discovery.active_set import CandidateSpace, candidate_space
 from calibration.discovery.adequacy import AdequacyTest, Diagnosis
 from calibration.discovery.candidates import BaseFit, Candidate, fill_slots, fit_base, fit_candidates, start_of_fit
-from calibration.discovery.classes import Classes, ammeter_families, find_classes, signature_cosines
+from calibration.discovery.classes import (
+    Classes,
+    ammeter_families,
+    errors_of_ammeters,
+    find_classes,
+    signature_cosines,
+)
 from calibration.discovery.description import missed_channels, remaining_errors, unused_inputs
 from calibration.discovery.discrepancy import BaseCurve, locate_discrepancy
 from calibration.discovery.experiments import Proposal, propose_denser_runs, propose_nothing, propose_separating
@@ -618,7 +624,8 @@ def _with_ammeter_alternatives(
         columns = family_columns(linear, bases, bases_room.family_names(bases).index((where.place, where.variable)))
     fit = np.asarray(linear.jacobian), np.asarray(linear.residual)
     also = ammeter_families(space, *fit, columns, found.families[0], settings)
-    return dataclasses.replace(found, families=tuple(dict.fromkeys((*found.families, *also))))
+    families = tuple(dict.fromkeys((*found.families, *also)))
+    return dataclasses.replace(found, families=families, ammeter=errors_of_ammeters(space, families))
 
 
 def choose_effects(

@@ -25,7 +25,7 @@ class PlacedCurve(NamedTuple):
 
 
 #: Advantage in evidence of a smooth curve of an effect's own equation that refutes its name [σ²]
-#: (docs/lab/findings.md, "The price of a name").
+#: (docs/lab/findings.md, "Why the constants are what they are").
 BETTER = 5.0
 #: Least share of its root that an effect keeps without any one row of a table, which may have a wrong reading.
 KEPT = 1 / math.sqrt(3)
@@ -230,6 +230,7 @@ class Mechanism:
         gain, se: hold-out gain and its standard error, over the readings that it changes [nat per reading].
         again: share of the informative blocks for which a fit without the block finds it again [-].
         errors: standard error of the gain for each kind of block [nat per reading].
+        ammeter: those families that are errors of an ammeter beside a loss.
     """
 
     families: Names
@@ -239,6 +240,7 @@ class Mechanism:
     se: float
     again: float
     errors: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    ammeter: Names = ()
 
     @property
     def drivers(self) -> Names:
@@ -254,7 +256,7 @@ class Mechanism:
         """Equations (part 0) or driving variables (part 2) of its families. An ammeter error counts as the loss that
         it imitates.
         """
-        losses = [f for f in self.families if f == self.families[0] or " current that " not in f]
+        losses = [f for f in self.families if f not in self.ammeter]
         return tuple(dict.fromkeys(f.partition(" that ")[part] for f in losses))
 
     @property

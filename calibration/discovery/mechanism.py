@@ -17,6 +17,7 @@ from calibration.discovery import prediction
 from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.adequacy import Diagnosis
 from calibration.discovery.candidates import Candidate, fit_candidates
+from calibration.discovery.classes import errors_of_ammeters
 from calibration.discovery.discrepancy import BaseCurve
 from calibration.discovery.location import DiscrepancyLocation
 from calibration.discovery.loop_notes import AGAIN, HALF, Mechanism
@@ -96,7 +97,8 @@ def find_mechanism(
             gain, effects = _hold_out_gain_of_curve(space, runs, base, beside, predicted), ()
             again = _curve_recurrence(space, left, bases, families, blocks, settings)
         share = share_of_excess(excess, explained.get(leader, 0.0))
-        mechanisms.append(Mechanism(families, effects, share, gain.mean, gain.se, again, gain.errors))
+        ammeters = errors_of_ammeters(space, families)
+        mechanisms.append(Mechanism(families, effects, share, gain.mean, gain.se, again, gain.errors, ammeters))
         if not mechanisms[-1].fails:
             return mechanisms[-1]
     return mechanisms[0] if mechanisms else None

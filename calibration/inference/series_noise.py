@@ -1,10 +1,10 @@
 """Noise that nobody states, estimated from the scatter of readings along series of conditions or over time.
 
 Along a series, rows that differ in one condition only, a model's readings are smooth. So they are over time, except
-after a step of what is imposed, whose few differences are left out. The difference of a reading from the line between
-its neighbours is noise, plus curvature if the steps are wide. So the estimate may be too large, never too small
-(second differences: von Neumann, Ann. Math. Stat. 12 (1941). Gasser, Sroka and Jennen-Steinmetz, Biometrika 73
-(1986), for any spacing).
+where what is imposed or dry friction jumps, and these few differences are left out. The difference of a reading
+from the line between its neighbours is noise, plus curvature if the steps are wide. So the estimate may be too
+large, never too small (second differences: von Neumann, Ann. Math. Stat. 12 (1941). Gasser, Sroka and
+Jennen-Steinmetz, Biometrika 73 (1986), for any spacing).
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float
 from scipy import sparse
+from scipy.special import ndtr
 
 from calibration.data.columns import DRIVEN, SUPPLY
 from calibration.data.instruments import display_step
@@ -24,12 +25,15 @@ from mmrjax.model.channels import Channel
 FIRST = "slope_deg"
 #: Least sd as a share of its reading [-].
 FLOOR = 1e-3
+#: The axis of a log.
+TIME = "time_s"
 #: Fewest degrees of freedom of an estimate.
 FEWEST = 4.0
 #: Probability of a form below which it is omitted.
 NEGLIGIBLE = 0.01
-#: Size of a difference with a wrong reading, in scales of the median, and the largest share of such differences.
-WRONG, MOST = 5.0, 0.25
+#: Size of a difference with a wrong reading, and of one over time with a jump, in sds; the largest share of such
+#: differences; repeats of their exclusion.
+WRONG, JUMP, MOST, CUTS = 5.0, 3.0, 0.25, 10
 #: Largest range of a voltage that sags with the load, over its largest value [-].
 SAG = 0.15
 #: Columns that distinguish rows in addition to the axes.
@@ -73,7 +77,7 @@ def estimate_noise(runs: Runs, sizes: Float[np.ndarray, "rows channels"]) -> tup
     """
     if runs.sampled:  # of all rows of a thinned log, with sizes that are those of the channels
         runs = runs.whole
-        sizes, by_axis = np.tile(sizes[:1], (len(runs), 1)), {"time_s": list(runs.rows_by_run().values())}
+        sizes, by_axis = np.tile(sizes[:1], (len(runs), 1)), {TIME: list(runs.rows_by_run().values())}
     else:
         by_axis = {axis: series_along(runs, axis) for axis in sorted(runs.axes, key=lambda axis: axis != FIRST)}
     measured = runs.measured()
@@ -142,10 +146,8 @@ def _noise_of_channel(
         scale = weights.multiply(sizes[None]) if in_share else weights
         spread = np.sqrt(scale.power(2).sum(1))
         unit, scale = difference / spread, sparse.csr_array(scale.multiply(1 / spread[:, None]))
-        sound = _sound_differences(unit)
-        unit, scale = unit[sound], scale[sound]
-        count = len(unit)
-        size = float(np.sqrt(np.mean(unit**2)))
+        sound, size = _sound_differences(unit, JUMP if axis == TIME else WRONG)
+        scale, count = scale[sound], int(sound.sum())
         together = scale @ scale.T
         freedom = count**2 / float(together.power(2).sum())
         likely = -freedom * float(np.mean(np.log(np.maximum(size * spread[sound], np.finfo(float).tiny))))
@@ -179,7 +181,17 @@ def _differences_from_neighbours(
     return sparse.csr_array(sparse.vstack(differences)) if differences else sparse.csr_array((0, len(measured))), used
 
 
-def _sound_differences(unit: np.ndarray) -> np.ndarray:
-    """True for differences that are not outliers. All True if too many would be outliers."""
-    sound = np.abs(unit) <= WRONG * 1.4826 * np.median(np.abs(unit))
-    return sound if np.mean(~sound) <= MOST else np.ones(len(unit), bool)
+def _sound_differences(unit: np.ndarray, limit: float) -> tuple[np.ndarray, float]:
+    """True for differences within so many of their sds, and this sd, that of a normal distribution so truncated.
+
+    All differences if too many would lie beyond.
+    """
+    density = np.exp(-(limit**2) / 2) / np.sqrt(2 * np.pi)
+    share = np.sqrt(1 - 2 * limit * density / (2 * ndtr(limit) - 1))
+    size = 1.4826 * float(np.median(np.abs(unit)))
+    for _ in range(CUTS):
+        sound = np.abs(unit) <= limit * size
+        if np.mean(~sound) > MOST:
+            return np.ones(len(unit), bool), float(np.sqrt(np.mean(unit**2)))
+        size = float(np.sqrt(np.mean(unit[sound] ** 2)) / share)
+    return sound, size

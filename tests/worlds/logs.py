@@ -98,6 +98,10 @@ class Rig:
         own = {"voltage": ("total_current", "motor_speed"), "motor_current": ("motor_speed", "output_angle")}
         return own.get(self.imposed, ("total_current",))
 
+    def noise(self, name: str) -> float:
+        """Sd of a channel without the rounding by its step, which is what a file with that step states."""
+        return float(np.sqrt(self.sd[name] ** 2 - self.steps.get(name, 0.0) ** 2 / 12))
+
     @property
     def names(self) -> tuple[str, ...]:
         """Constants that act."""
@@ -363,7 +367,7 @@ def case(r: Rig, name: str, sigmas: float, seed: int, *, stated: bool = True) ->
     The label says how many a refit really leaves.
 
     Args:
-        stated: True for a table with the sds of its readings.
+        stated: True for a table with the sds of its readings, without the rounding by the stated steps.
     """
     rng = np.random.default_rng([98, seed])
     terms: tuple[Term, ...] = ()
@@ -401,7 +405,7 @@ def case(r: Rig, name: str, sigmas: float, seed: int, *, stated: bool = True) ->
         head, _, unit = CHANNELS[n][0].rpartition("_")
         table[CHANNELS[n][0]] = np.array([typed(x, 9) for x in measured[n].ravel()])
         if stated:
-            table[f"{head}_sd_{unit}"] = np.full(RUNS * ROWS, r.sd[n])
+            table[f"{head}_sd_{unit}"] = np.full(RUNS * ROWS, r.noise(n))
     label = {
         "kind": "clean" if not name else "library" if LAWS[name].cls else "outside", "seed": seed, "stratum": r.imposed, "imposed": r.imposed,
         "every": r.every, "delay": r.delay, "effects": effects, "constants": r.p, "alone": r.alone,
@@ -414,7 +418,7 @@ def case(r: Rig, name: str, sigmas: float, seed: int, *, stated: bool = True) ->
 def _read(r: Rig, name: str, shown: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Readings of a channel: with noise, and rounded by a coarse instrument."""
     step = r.steps.get(name, 0.0)
-    noisy = shown + np.sqrt(r.sd[name] ** 2 - step**2 / 12) * rng.standard_normal(shown.shape)
+    noisy = shown + r.noise(name) * rng.standard_normal(shown.shape)
     return step * np.round(noisy / step) if step else noisy
 
 
