@@ -174,7 +174,13 @@ def test_forces_do_the_work_of_contacts_and_friction_takes_it(robot):
     def all_of(motion):
         run = build_system(robot, conditions, STEP)
         found = b.instant(run, motion)
-        return run.path, run.chassis, b._contacts_of_sides(run, motion), *found, b.generalized_forces(run, motion, *found)
+        return (
+            run.path,
+            run.chassis,
+            b._contacts_of_sides(run, motion),
+            *found,
+            b.generalized_forces(run, motion, *found),
+        )
 
     motion = half_robot.HalfRobotState(jnp.asarray(q), jnp.asarray(v), jnp.zeros(2), jnp.zeros(()))
     path, chassis, sides, signals, at, pulled, forces = jax.device_get(all_of(motion))
