@@ -20,7 +20,7 @@ from calibration.sizing.design_search import SizedDesign, SizingResult
 from calibration.sizing.part_options import drive_options
 from mmrjax.model.paper_robots import nominal
 from sweeps import store
-from sweeps.inputs import fit_of
+from sweeps.inputs import recorded_fit
 from sweeps.report import (
     check_report,
     comparison_report,
@@ -163,18 +163,18 @@ def test_a_robot_is_fitted_to_the_rows_that_its_folder_records(tmp_path):
     robot, runs = tmp_path / "robot.toml", records.read_runs("measured")
     robot.write_text("# a robot\n")
     file = RobotFile(nominal(), str(robot))
-    assert fit_of(file, runs) == "" == fit_of(RobotFile(nominal(), "nominal"), runs)
+    assert recorded_fit(file, runs) == "" == recorded_fit(RobotFile(nominal(), "nominal"), runs)
     manifest = {
         "arguments": ["loop", "x.csv"],
         "hashes": {"robot": store.sha256_hex(robot.read_bytes()), "x.csv": runs.digest},
     }
     (tmp_path / "manifest.json").write_text(json.dumps(manifest))
-    assert fit_of(file, runs) == "these"
-    assert fit_of(file, records.Runs("other", runs.columns)) == "others"
+    assert recorded_fit(file, runs) == "these"
+    assert recorded_fit(file, records.Runs("other", runs.columns)) == "others"
     robot.write_text("# changed by hand\n")
-    assert fit_of(file, runs) == ""
+    assert recorded_fit(file, runs) == ""
     (tmp_path / "manifest.json").write_text(json.dumps(manifest | {"arguments": ["compare", "x.csv"]}))
-    assert fit_of(file, runs) == ""
+    assert recorded_fit(file, runs) == ""
 
 
 def test_page_terminal_and_csv_show_the_same_cells(tmp_path, capsys):

@@ -448,7 +448,7 @@ def test_pages_order_the_rows_of_a_run_as_the_table_does(named):
     columns |= {"configuration": np.repeat("6T2A", 6), "supply_voltage_V": 5 * time}
     table = columns | {"after_total_current_A": time, "residual_after_total_current_sigma": time}
     shown = channels.channels_named(["total_current"])
-    loop = loop_figures.over_time(Runs("t", columns), table, shown, "none")
+    loop = loop_figures.draw_residuals_over_time(Runs("t", columns), table, shown, "none")
     fit = time_overlay(table, shown, {"after_": "calibrated"}).draw()
     drawn = [
         np.asarray(line.get_xdata(), float)

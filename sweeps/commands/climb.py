@@ -1,4 +1,4 @@
-"""The command `climb`: a robot over an obstacle, or the largest obstacle that it gets over."""
+"""The command `climb`: a robot over an obstacle, or the largest obstacle that it can climb."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ WIDTHS, WIDTH = {"payload": 0.2, "levers_front_deg": 1.0, "levers_rear_deg": 1.0
 
 
 def execute(config: configuration.Climb, beside: configuration.FolderPart) -> int:
-    """Simulate a climb and write a run folder. Returns the exit code.
+    """Simulates a climb and writes a run folder. Returns the exit code.
 
     0 done, whatever the verdict. 3 numbers went wrong.
     """
@@ -58,12 +58,12 @@ def execute(config: configuration.Climb, beside: configuration.FolderPart) -> in
         update={"configuration": name, "supply_voltage_V": None if config.battery else voltage}
     )
     sequence = _lever_sequence(config, robot, name)
-    _, words = _terrain(config, 0.1)
+    _, words = _obstacle_terrain(config, 0.1)
     conditions = Conditions(
         name, voltage, payload=config.payload_kg, battery=config.battery, discharge=3.6 * config.discharge_mAh,
         adhesion=adhesion_ratio(config.surface, bool(np.asarray(robot.configurations[name].on_tracks) > 0.5)),
     ).resolved(robot)  # fmt: skip
-    along = _along(config, robot, conditions, sequence)
+    along = _derivative_variables(config, robot, conditions, sequence)
     with open_folder("climb", config, robot, beside) as folder:
         climbed = _climb_of_configuration(config, robot, name, words, conditions, sequence, along)
         folder.write_table("history.csv", climbed.table)
@@ -99,7 +99,7 @@ def _climb_of_configuration(
     """The climb of a configuration: over one obstacle, a search for the largest one, or with derivatives."""
 
     def run(sizes: np.ndarray) -> tuple[Terrain, ClimbRuns]:
-        every = [_terrain(config, float(size) / 1000)[0] for size in sizes]
+        every = [_obstacle_terrain(config, float(size) / 1000)[0] for size in sizes]
         grounds = jax.tree.map(lambda *x: jnp.stack(x), *every)
         alike = [jax.tree.map(lambda x: jnp.stack([jnp.asarray(x)] * len(sizes)), c) for c in (conditions, sequence)]
         with progress_bar(1, quiet=False) as advance:
@@ -139,10 +139,10 @@ def _climb_of_configuration(
     )  # fmt: skip
 
 
-def _along(
+def _derivative_variables(
     config: configuration.Climb, robot: Robot, conditions: Conditions, sequence: LeverSequence
 ) -> Along | None:
-    """Variables of the derivatives. None: no derivatives.
+    """Variables with respect to which derivatives are computed. None: no derivatives.
 
     Raises:
         BadConfiguration: an unknown name, or one without effect on this climb.
@@ -187,7 +187,9 @@ def _along(
             for name, end in levers.items()
             if name in value_of
         }
-        ground = _terrain(searched, value_of[SIZE] / 1000) if SIZE in value_of else _terrain(config, 0.1)
+        ground = (
+            _obstacle_terrain(searched, value_of[SIZE] / 1000) if SIZE in value_of else _obstacle_terrain(config, 0.1)
+        )
         return ClimbInputs(changed_robot, run, ground[0], dataclasses.replace(sequence, **moved))
 
     values = [usual[name] for name in names]
@@ -198,8 +200,11 @@ def _along(
 def _search_largest(
     what: str, run: Callable[[np.ndarray], tuple[Terrain, ClimbRuns]]
 ) -> tuple[Terrain, ClimbRuns, int, tuple[tuple[float, str], ...], float | None]:
-    """The largest size that is got over [mm]: rounds of sizes side by side, between the largest that was got over
-    below all that were not and the next. The run of the largest, or of the smallest tried, is shown."""
+    """Largest size of an obstacle that is climbed [mm], by rounds of sizes in parallel.
+
+    Each round divides the interval between the largest size below which all were climbed, and the next one. The run
+    of the largest climbed size, or of the smallest tried, is reported.
+    """
     low, high = SOUGHT[what]
     sizes = np.linspace(low, high, ROUND)
     tried: dict[float, str] = {}
@@ -219,8 +224,8 @@ def _search_largest(
         sizes = np.unique(np.round(inner, 1))
 
 
-def _terrain(config: configuration.Climb, size: Scalar) -> tuple[Terrain, str]:
-    """The obstacle (for a search, of this `size` [m]) and its description."""
+def _obstacle_terrain(config: configuration.Climb, size: Scalar) -> tuple[Terrain, str]:
+    """Obstacle (in a search, of this `size` [m]) and its description."""
     nose = config.nose_mm / 1000
     if config.terrain is not None:
         return terrains.read_terrain(config.terrain), f"the terrain of {config.terrain.name}"

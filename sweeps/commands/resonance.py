@@ -1,4 +1,4 @@
-"""The command `resonance`: ripple over speed and payload, and which speeds to avoid."""
+"""The command `resonance`: ripple over speed and payload, and the speeds to avoid."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ def execute(config: configuration.Resonance, beside: configuration.FolderPart) -
         columns = _ripple_columns(folder, robot, conditions, config, what)
         table = {**run.condition_table(robot, runs), "table8": of_table8, **columns}
         result = _modes_and_peaks(config, robot, what, table)
-        _write(folder, config, result)
+        _write_folder(folder, config, result)
         document = print_report(resonance_report.resonance_document(result, file), file)
         manifest, solved = {"seed": None, "statuses": result.statuses}, words.every_run_solved(result.statuses)
         return finish_run_folder(
@@ -96,7 +96,9 @@ def execute(config: configuration.Resonance, beside: configuration.FolderPart) -
         )
 
 
-def _grid(config: configuration.Resonance, voltages: tuple[float, ...], payloads: tuple[float, ...]) -> GridPart:
+def _speed_grid(
+    config: configuration.Resonance, voltages: tuple[float, ...], payloads: tuple[float, ...]
+) -> GridPart:
     assert config.configuration is not None
     return GridPart(
         configurations=(config.configuration,),
@@ -110,7 +112,7 @@ def _grid(config: configuration.Resonance, voltages: tuple[float, ...], payloads
 def _grid_and_table_8(config: configuration.Resonance, robot: Robot) -> tuple[Runs, np.ndarray]:
     """Points of the grid and the missing points of Table 8, and the rows that belong to Table 8."""
     parts = [
-        grid_conditions(_grid(config, v, p), robot)
+        grid_conditions(_speed_grid(config, v, p), robot)
         for v, p in ((config.voltages_V, config.payloads_kg), (VOLTAGES_V, PAYLOADS_KG))
     ]
     pairs = [list(zip(part["supply_voltage_V"], part["payload_kg"], strict=True)) for part in parts]
@@ -138,7 +140,7 @@ def _ripple_columns(
                 chosen = jax.tree.map(lambda x, rows=rows: x[rows], conditions)
                 options = {key: config.options[key] for key in ("duration", "step")}
                 ended = track_batch(robot, chosen, rolling=True, progress=counter, **options)
-                part = {key: x[:count] for key, x in _columns(robot, ended, what).items()}
+                part = {key: x[:count] for key, x in _ripple_of_batch(robot, ended, what).items()}
                 folder.keep_chunk(name, part)
                 counter(1.0)
             else:
@@ -147,7 +149,7 @@ def _ripple_columns(
     return {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
 
 
-def _columns(robot: Robot, ended: Any, what: PassingParts) -> Columns:
+def _ripple_of_batch(robot: Robot, ended: Any, what: PassingParts) -> Columns:
     """Ripple of a batch of runs, in the units of the table."""
     vibrations = vibrations_of_runs(robot, ended, what.pitch)
     status = np.array(STATUSES)[vibrations.status]
@@ -171,7 +173,7 @@ def _modes_and_peaks(
     """Natural frequencies at the middle voltage, and peaks and crossings at each payload."""
     assert config.configuration is not None
     payloads, middle = config.payloads_kg, config.voltages_V[len(config.voltages_V) // 2]
-    middle_runs = _grid(config, (middle,), payloads)
+    middle_runs = _speed_grid(config, (middle,), payloads)
     linear = modes(robot, run.conditions_of_runs(robot, grid_conditions(middle_runs, robot), config))
     by_payload = dict(zip(payloads, linear, strict=True))
     tops: list[RipplePeak] = []
@@ -200,7 +202,7 @@ def _modes_and_peaks(
     )
 
 
-def _write(folder: RunFolder, config: configuration.Resonance, found: ResonanceResult) -> None:
+def _write_folder(folder: RunFolder, config: configuration.Resonance, found: ResonanceResult) -> None:
     folder.write_table("points.csv", found.table)
     folder.write_table(
         "modes.csv",

@@ -63,16 +63,17 @@ def execute(config: configuration.Size, beside: configuration.FolderPart) -> int
                 robots = (robot,) if sizing.best is None else (best, robot)
                 charts = tuple(margin_chart(r, requirements, chart_extent(requirements)) for r in robots)
         result = SizeResult(requirements, robot, sizing, objectives, outcomes, charts)
-        _write(folder, config, result)
+        _write_folder(folder, config, result)
         document = print_report(
-            size_report.size_document(result, capabilities.shown_name(file)), dataclasses.replace(file, robot=best)
+            size_report.size_document(result, capabilities.displayed_name(file)),
+            dataclasses.replace(file, robot=best),
         )
         manifest = {"seed": config.seed, "feasible": sizing.best is not None}
         solved = words.every_run_solved(Counter(o.status for o in outcomes))
         return finish_run_folder(folder, config, manifest, solved=solved, page=document)
 
 
-def _write(folder: RunFolder, config: configuration.Size, found: SizeResult) -> None:
+def _write_folder(folder: RunFolder, config: configuration.Size, found: SizeResult) -> None:
     best = found.sizing.best
     folder.write_text("requirements.toml", found.asked.text)
     note = f"the robot that was changed, {config.robot}: no design meets the requirements"

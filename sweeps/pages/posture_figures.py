@@ -107,7 +107,7 @@ def draw_silhouette(axes: Axes, shown: Drawn, title: str) -> None:
 ASKED = {"step_mm": "On its highest step", "gap_mm": "Flush over a gap", "length_mm": "Folded"}
 
 
-def asked_about(drawn: Mapping[str, tuple[Drawn, float, float]]) -> Figure:
+def draw_required_postures(drawn: Mapping[str, tuple[Drawn, float, float]]) -> Figure:
     """Side views of the robot, one for each geometric requirement, in the posture that it refers to."""
     fig, grid = new_figure(1, max(len(drawn), 2), 3.6)
     for axes, (name, (shown, front, rear)) in zip(grid[0], drawn.items(), strict=False):
@@ -118,7 +118,7 @@ def asked_about(drawn: Mapping[str, tuple[Drawn, float, float]]) -> Figure:
     return fig
 
 
-def rest_and_step(found: Postures) -> Figure:
+def draw_rest_and_step(found: Postures) -> Figure:
     """The first run at rest on its slope, and where its centre of mass is over the edge of its highest step."""
     fig, grid = new_figure(1, 2, 3.6)
     pitch, contact, step = (found.table[c][0] for c in ("pitch_deg", "contact_mm", "highest_step_mm"))

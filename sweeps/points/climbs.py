@@ -152,7 +152,7 @@ def compute_climbs(
             robot,
             base,
         )
-    sequence = _sequences(obstacle, robot, conditions_there, points)
+    sequence = _lever_sequences(obstacle, robot, conditions_there, points)
 
     def run(sizes: np.ndarray, told: Callable[[float], None]) -> ClimbRuns:
         # Terrains of sizes [mm]
@@ -175,7 +175,7 @@ def compute_climbs(
     return {**results, VERDICT: verdict.astype(np.uint8), STATUS: status.astype(np.uint8)}
 
 
-def _sequences(obstacle: Obstacle, robot: Robot, conditions: Conditions, points: int) -> LeverSequence:
+def _lever_sequences(obstacle: Obstacle, robot: Robot, conditions: Conditions, points: int) -> LeverSequence:
     each = 0 if jnp.ndim(robot.sides) else None
     angles = jax.vmap(lambda r, c: masses.lever_angles(r.running_gear, c), in_axes=(each, 0))(robot, conditions)
     front, rear = (jnp.broadcast_to(x, (points,)) for x in angles)
@@ -225,7 +225,7 @@ def _search_all(
         np.full(points, low),
     )
     for k in range(rounds):
-        ended = run(sizes, functools.partial(_share, told, k, rounds)).verdict
+        ended = run(sizes, functools.partial(_report_share, told, k, rounds)).verdict
         gone = ended == OVER
         over, beyond = np.where(gone, sizes, over), np.where(gone, beyond, sizes)
         verdict = np.where(gone, verdict, ended)
@@ -233,5 +233,5 @@ def _search_all(
     return {VERDICT: verdict, LARGEST: over}
 
 
-def _share(told: Callable[[float], None], k: int, rounds: int, share: float) -> None:
+def _report_share(told: Callable[[float], None], k: int, rounds: int, share: float) -> None:
     told((k + share) / rounds)
