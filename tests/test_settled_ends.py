@@ -1,6 +1,7 @@
 """Base fits of histories end in the lowest valley, whatever the ground: what settled ends tell, and what they do not."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import jax.numpy as jnp
 import numpy as np
@@ -11,7 +12,7 @@ from worlds import histories, settled
 
 from calibration.discovery.candidates import fit_base
 from calibration.discovery.settings import settings_for
-from calibration.inference.observers import Histories, settled_ends
+from calibration.inference.observers import Histories, settled_ends, time_histories
 from mmrjax.effects import BY_NAME
 
 #: An analyst who knows nothing of the ground but what the nominal robot's file says (0.32 and 0.38, 20 mm/s).
@@ -116,3 +117,27 @@ def test_a_reading_that_still_changes_has_no_settled_end(gripping):
     before, after = (settled_ends.settled_ends_of_runs(ANALYST.space(r).bare).mean for r in (runs, changed))
     assert np.isfinite(before[4, 0]) and np.isnan(after[4, 0])
     assert_array_equal(np.delete(before, 4, 0), np.delete(after, 4, 0))
+
+
+@pytest.mark.parametrize(
+    ("configurations", "regression", "tries"), [(1, True, (4, 2)), (2, True, (96, 8)), (1, False, (96, 8))]
+)
+def test_beside_the_regression_of_one_configuration_few_searches_are_tried(
+    monkeypatch, configurations, regression, tries
+):
+    """On a public record of a drivetrain, 118 points and 8 searches took 72 s and gave the objective of 2 searches."""
+    asked = []
+
+    def settled(problem, draws, search, searches):
+        asked.append((len(draws), searches))
+        return np.ones((3, 2))
+
+    weak = SimpleNamespace(z=np.zeros(2)) if regression else None
+    monkeypatch.setattr(time_histories, "fit_weak_form", lambda problem: weak)
+    monkeypatch.setattr(settled_ends, "starts_from_settled_ends", settled)
+    monkeypatch.setattr(time_histories.scans, "place_at_minimum", lambda problem, starts: starts)
+    rig = SimpleNamespace(imposed="voltage")
+    base = SimpleNamespace(has_ground=True, rig=rig, configurations=("a", "b")[:configurations])
+    problem = SimpleNamespace(base=base, coordinates=("x", "y"))
+    starts = Histories.starts(SimpleNamespace(), problem, np.random.default_rng(0), 2)
+    assert asked == [tries] and len(starts) == 2 and starts[0].any() == (not regression)

@@ -262,6 +262,7 @@ def _best_starts(space: CandidateSpace, settings: Settings, near: Candidate | No
     else:
         starts = observe.starts(bare, np.random.default_rng(settings.seed), observe.policy.searches)
     most = FEW if few else observe.policy.steps if space.begins else None
+    rivals = not few and (regression or near is None or not observe.long)  # a fit of the same runs has scanned them
 
     def search(starts: np.ndarray) -> tuple[Optimum, Observation]:
         weights = np.repeat(space.weight[None], len(starts), 0)
@@ -271,7 +272,7 @@ def _best_starts(space: CandidateSpace, settings: Settings, near: Candidate | No
             starts = np.pad(starts, ((0, 0), (0, 2 * settings.slots)))
             which = np.repeat(np.asarray(empty)[None], len(starts), 0)
         search_inputs = jnp.asarray(starts), jnp.asarray(weights), which
-        return jax.device_get(observe.search(problem, *search_inputs, rivals=not few, most=most, scanned=bare))
+        return jax.device_get(observe.search(problem, *search_inputs, rivals=rivals, most=most, scanned=bare))
 
     found = search(starts)
     if regression and len(starts) == 1 and not np.all(found[0].converged):

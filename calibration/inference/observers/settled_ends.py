@@ -47,12 +47,14 @@ SLIDES = 0.4
 FLOOR = 0.01
 #: Shares of V_s that are tried: at settled ends, creep the size of the noise does not determine it.
 FINER = (1.0, 0.25)
-#: Steps of a fit to settled ends; steps and number of fits with blunt instruments.
-STEPS, STEPS_BLUNT, SEARCHES = 40, 20, 8
+#: Steps of a fit to settled ends, and of one with blunt instruments.
+STEPS, STEPS_BLUNT = 40, 20
 #: Sd of a blunt instrument, over its channel's root mean square [-].
 BLUNT = 0.03
-#: Draws of the prior, in addition to the settled ends.
-DRAWS = 96
+
+#: Draws of the prior in addition to the settled ends, and number of fits with blunt instruments: without a regression
+#: or over several configurations, and beside the regression of one.
+MANY, FEW = (96, 8), (4, 2)
 #: Points simulated in one call; calls run together on the cores.
 TOGETHER = 16
 #: Distance in a coordinate from which two starts are distinct [prior sds].
@@ -118,7 +120,7 @@ def settled_ends_of_runs(problem: Problem) -> SettledEnds:
 
 
 def starts_from_settled_ends(
-    problem: Problem, draws: Float[np.ndarray, "draws parameters"], search: Callable[..., Optimum]
+    problem: Problem, draws: Float[np.ndarray, "draws parameters"], search: Callable[..., Optimum], searches: int
 ) -> Float[np.ndarray, "starts parameters"]:
     """Initial coordinates for searches of a base, the most promising first.
 
@@ -126,6 +128,7 @@ def starts_from_settled_ends(
         problem: problem of time histories, without effects in its coordinates.
         draws: random draws of the prior, tried in addition to the settled ends.
         search: function (problem, starts, largest number of steps) → optima of a batch of searches.
+        searches: number of searches with blunt instruments.
     """
     ends = _fit_settled_ends(problem)
     friction = np.array(["ground.friction." in n for n in problem.coordinates.names])
@@ -136,7 +139,7 @@ def starts_from_settled_ends(
     count = np.maximum(np.sum(np.asarray(data.weight) > 0, 0), 1)
     rms = np.sqrt(np.sum(np.asarray(data.weight > 0) * np.asarray(data.measured) ** 2, 0) / count)
     blunt = dataclasses.replace(problem, data=dataclasses.replace(data, sd=jnp.hypot(data.sd, BLUNT * rms)))
-    optima = search(blunt, _recombine_points(blunt, points)[:SEARCHES], STEPS_BLUNT)
+    optima = search(blunt, _recombine_points(blunt, points)[:searches], STEPS_BLUNT)
     ended = np.asarray(optima.z)[np.argsort(np.asarray(optima.cost))]
     best = _recombine_points(blunt, ended)[:1]
     return _distinct_points(np.concatenate([best, _with_peaked_friction(problem, best[0]), ended]))

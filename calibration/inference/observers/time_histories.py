@@ -683,8 +683,11 @@ class Histories(Observer):
         regression = fit_weak_form(problem if every is None else every)
         begins = np.zeros((0, len(problem.coordinates))) if regression is None else regression.z[None]
         if problem.base.has_ground and problem.base.rig.imposed == "voltage":
-            draws = random.standard_normal((settled_ends.DRAWS, len(problem.coordinates)))
-            ends = settled_ends.starts_from_settled_ends(problem, draws, search_batch)
+            # Configurations are combined from many points. A regression already determines the drive of a single one.
+            alone = regression is not None and len(problem.base.configurations) == 1
+            count_of_draws, searches = settled_ends.FEW if alone else settled_ends.MANY
+            draws = random.standard_normal((count_of_draws, len(problem.coordinates)))
+            ends = settled_ends.starts_from_settled_ends(problem, draws, search_batch, searches)
             begins = np.concatenate([begins, ends[: max(1, count - len(begins)) if regression is None else 1]])
         elif regression is None:
             begins = super().starts(problem, random, count)
