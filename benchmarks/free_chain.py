@@ -84,7 +84,7 @@ class Chain(NamedTuple):
     """Constants of one side."""
 
     gear: RunningGear
-    half: mjcf.Masses
+    half: mjcf.HalfRobotMasses
     ground: object
     guide_friction: float
     radius: float  # of the pulley's polygon, at the masses

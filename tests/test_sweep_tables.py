@@ -71,7 +71,7 @@ def test_points_of_a_table_are_its_runs_each_with_every_draw(robot, runs, poster
 @pytest.mark.parametrize("chunk", [None, 3])
 def test_table_has_each_run_as_it_is_by_itself(robot, runs, chunk):
     found = run.evaluate_runs(robot, runs, chunked(chunk), None)
-    alone = run.ending_columns(robot, run.Run(steady_batch(robot, runs.conditions(robot))))
+    alone = run.ending_columns(robot, run.SimulationResult(steady_batch(robot, runs.conditions(robot))))
     same({name: found[name] for name in alone}, alone, rtol=1e-12)
     assert found["status"].tolist() == ["converged"] * 3 + ["slides"]
     assert found["total_mass_kg"][1] == float(robot.configurations.members[1].mass) + 3
