@@ -357,7 +357,7 @@ def test_a_film_begins_at_the_start_and_a_start_that_still_gains_speed_is_done(m
     from sweeps.commands import render
 
     drawn = []
-    monkeypatch.setattr(render.rendering, "scene", lambda *a: None)
+    monkeypatch.setattr(render.rendering, "scene_of_run", lambda *a: None)
     monkeypatch.setattr(
         render.rendering, "render", lambda view, file, begin, *rest: (file.touch(), drawn.append(begin))
     )

@@ -64,7 +64,7 @@ def execute(config: configuration.Render, picture: configuration.Picture) -> int
     trajectory, conditions = jax.tree.map(lambda x: x[0], (trajectory, conditions))
 
     def draw(aside: Path) -> None:
-        view = (rendering_from_above if config.turns else rendering).scene(robot, conditions, trajectory)
+        view = (rendering_from_above if config.turns else rendering).scene_of_run(robot, conditions, trajectory)
         rendering.render(view, aside, begin, end, slow)
 
     _write_completely(file, draw)
