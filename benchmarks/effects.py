@@ -168,11 +168,11 @@ def _section(effect: type[Effect]) -> str:
     equation, meaning, source = _about(effect)
     declared = list(words.effect_declarations(effect))
     lines = [
-        f"### `{effect.name}`", "", equation, "", f"{meaning} {source}".strip(), "",
+        f"### `{effect.name}`", "", equation, "", f"{meaning} {source[:1].upper()}{source[1:]}".strip(), "",
         f"- Balance `{where}`. Family: {effect.family()}.",
         f"- Amplitude [{spec.unit}]: prior standard deviation {spec.prior_sd(0.0):g}, bounds {low:g} to {high:g}.",
         *[f"- Shape: {'; '.join(shapes)}."] * bool(shapes),
-        *[f"- Declares: {', '.join(declared)}."] * bool(declared),
+        *[f"- Properties: {', '.join(declared)}."] * bool(declared),
     ]  # fmt: skip
     return "\n".join([*lines, ""])
 

@@ -339,7 +339,7 @@ def example(result: Path) -> str:
         + "."
         for e in d["effects"]
     )
-    steps = "\n".join(f"1. {step}." for step in d["next_experiment"]["description"].split(". And: "))
+    steps = "\n".join(f"1. {step}." for step in d["next_experiment"]["description"].split(". Then: "))
     return f"""# A table of runs
 
 Twenty settled runs of the packaged robot were measured, on tracks (6T2A) and wheels (4W2T), at 15 V without payload and

@@ -238,9 +238,7 @@ class SupplyPart(Part):
         return self
 
 
-SURFACE = (
-    "Surface of Table 5, which scales the adhesion (given for lacquered_wood); for a rig, one of its own surfaces"
-)
+SURFACE = "Surface of Table 5, which scales the adhesion of lacquered_wood; for a rig, one of its own surfaces"
 
 
 def _values_text(values: Iterable[float]) -> str:
@@ -567,12 +565,12 @@ class Resonance(RobotPart, FidelityPart, OutputPart):
 
     model: Literal["track"] = "track"
     duration_s: Duration | None = option_field(
-        None, "Length of a run (s); ripple is read in its second half", usual="1.5", minimum=0.5
+        None, "Length of a run (s); ripple is evaluated in its second half", usual="1.5", minimum=0.5
     )
-    configuration: str | None = option_field(None, "One of the robot's", usual="its first")
+    configuration: str | None = option_field(None, "Configuration of the robot", usual="its first")
     voltages_V: Several[Voltage] = option_field(
         tuple(10.0 + k for k in range(31)),
-        "Supply voltages (V), which give the speeds of the map, at least 5 of them",
+        "Supply voltages (V), which give the speeds of the map; at least 5",
         usual="10:40:1, that is 31",
         minimum=0,
     )
@@ -590,7 +588,7 @@ Height = Annotated[float, positive_number(5000)]
 class Climb(RobotPart, SupplyPart, OutputPart):
     """One robot over an obstacle, or the largest that it gets over."""
 
-    configuration: str | None = option_field(None, "One of the robot's", usual="its first")
+    configuration: str | None = option_field(None, "Configuration of the robot", usual="its first")
     step_mm: Height | None = option_field(None, "Height of a step")
     stairs: str | None = option_field(None, "RISExTREADxCOUNT in mm, such as 170x290x3")
     gap_mm: Height | None = option_field(None, "Width of a trench")
@@ -626,9 +624,9 @@ class Climb(RobotPart, SupplyPart, OutputPart):
     )
     derivatives: Names = option_field(
         (),
-        "Derivatives of margins, time, energy and currents with respect to these, comma-separated: any parameter "
-        "(motor.resistance, ...), adhesion, payload, voltage (with --battery discharge), levers_front_deg, "
-        "levers_rear_deg, obstacle_mm",
+        "Also compute derivatives of margins, time, energy and currents with respect to these, comma-separated: any "
+        "parameter (motor.resistance, ...), adhesion, payload, voltage (with --battery: discharge), "
+        "levers_front_deg, levers_rear_deg, obstacle_mm",
     )
     film: bool = option_field(False, "Write climb.gif")
     duration_s: Annotated[float, positive_number(600)] = option_field(20.0, "Longest run")
@@ -676,7 +674,7 @@ class FeedforwardPart(Part):
         1.0, "Tolerance of the position regulator [unit]"
     )
     velocity_error: Annotated[float, positive_number(1e6)] = option_field(1.5, "Tolerance of the velocity [unit/s]")
-    effort_V: Annotated[float, positive_number(1e4)] = option_field(7.0, "Voltage that the gains may use (V)")
+    effort_V: Annotated[float, positive_number(1e4)] = option_field(7.0, "Voltage that the feedback may use (V)")
     period_s: Annotated[float, positive_number(10)] = option_field(0.02, "Period of the controller (s)")
     measurement_delay_s: Annotated[float, number_between(0, 10)] | None = option_field(
         None, "Delay of the measurement (s)", usual="from the log"
@@ -692,7 +690,7 @@ class Calibrate(RobotPart, DataPart, InferencePart, FeedforwardPart, OutputPart)
     free: Names = option_field((), "Parameters to fit, comma-separated, or a group such as motor.*")
     fix: Names = option_field((), "Parameters to keep fixed, comma-separated")
     starts: Annotated[int, Field(ge=1, le=100_000)] | None = option_field(
-        None, "Searches", usual="64; histories 8; settled turns 4; rows with drive or track 1"
+        None, "Number of searches", usual="64; histories 8; settled turns 4; rows with drive or track 1"
     )
     population: Annotated[int, Field(ge=0, le=1_000_000)] | None = option_field(
         None,
@@ -748,7 +746,7 @@ class Export(RobotPart, OutputPart):
     draws: Annotated[int, Field(ge=1, le=100_000)] = option_field(
         1000, "Samples from the posterior, for randomization"
     )
-    seed: Seed = option_field(0, "Of the draws")
+    seed: Seed = option_field(0, "Random seed of the samples")
 
 
 class Loop(RobotPart, DataPart, InferencePart, OutputPart):
@@ -815,8 +813,8 @@ class Size(RequirementsPart, RobotPart, OutputPart):
     objective: str = option_field("mass", "Quantity to minimise: mass (kg), energy (Wh/m), cost (EUR)")
     pareto: Names = option_field((), "Two objectives, comma-separated, for a Pareto front instead")
     motors: Names = option_field((), "Motors to choose from, comma-separated", usual="all in the catalogue")
-    starts: Annotated[int, Field(ge=1, le=100_000)] = option_field(256, "Searches in one batch")
-    seed: Seed = option_field(0, "Of the starts")
+    starts: Annotated[int, Field(ge=1, le=100_000)] = option_field(256, "Number of searches, in one batch")
+    seed: Seed = option_field(0, "Random seed of the starts")
 
 
 class Sensitivity(RobotPart, DataPart, FidelityPart, SupplyPart, AxesPart, OutputPart):
@@ -843,7 +841,7 @@ class Sensitivity(RobotPart, DataPart, FidelityPart, SupplyPart, AxesPart, Outpu
     evaluations: Annotated[int, Field(ge=1, le=1_000_000_000)] | None = option_field(
         None, "Smallest total number of model evaluations", usual="1000000; for runs over time 100000"
     )
-    seed: Seed = option_field(0, "Of the sample")
+    seed: Seed = option_field(0, "Random seed of the sample")
     posterior: bool = option_field(False, "Use the posterior.nc of the calibrated --robot as inputs")
     candidates: str = option_field(
         "",
@@ -852,7 +850,7 @@ class Sensitivity(RobotPart, DataPart, FidelityPart, SupplyPart, AxesPart, Outpu
         format="path",
     )
     runs: Annotated[int, Field(ge=1, le=100)] = option_field(5, "Number of runs to propose")
-    noise: str = option_field("", "Noise (sd) of their readings", usual="current=2%,motor_speed=0.5%,speed=1%")
+    noise: str = option_field("", "Noise (sd) of the readings", usual="current=2%,motor_speed=0.5%,speed=1%")
 
     @model_validator(mode="before")
     @classmethod

@@ -165,12 +165,12 @@ class Folder:
             )
         if foreign := sorted(self._foreign()):
             raise BadConfiguration(
-                f"--out: {self.partial} holds {foreign[0]}, which its command did not write; move it, or choose "
-                "another path"
+                f"--out: {self.partial} contains {foreign[0]}, which its command did not write; move that file, or "
+                "choose another path"
             )
         if mark["command"] not in ("", command) and not force and holds_work(self.partial):
             raise BadConfiguration(
-                f"--out: {self.partial} holds an interrupted {mark['command']}, which the same command resumes; "
+                f"--out: {self.partial} contains an interrupted {mark['command']}, which the same command resumes; "
                 "choose another path, or use --force to start again"
             )
 

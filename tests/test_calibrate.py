@@ -314,7 +314,7 @@ def test_unknown_fidelity_lists_the_choices(measured):
 
 
 def test_what_a_fidelity_does_not_read_is_not_freed(measured):
-    says = "--free running_gear.guide_recess: --model drive does not read it; allowed: --model track"
+    says = "--free running_gear.guide_recess: --model drive does not use it; allowed: --model track"
     with pytest.raises(BadConfiguration, match=re.escape(says)):
         quick(measured, model="drive", free=["default", "running_gear.guide_recess"])
 

@@ -137,7 +137,7 @@ def test_time_histories_are_not_taken_for_steady_runs(mmrjax, tmp_path):
     (tmp_path / "runs.csv").write_text(f"{HEADER},run_id,time_s\n6T2A,15,13.1,0,5,2.75,4800,400,a,0.1\n")
     ends(
         mmrjax("simulate --runs runs.csv --out x"),
-        "column time_s: time histories are for calibrate, compare and loop",
+        "time_s: only calibrate, compare and loop take time histories",
         code=4,
     )
 
@@ -201,7 +201,7 @@ def test_shares_of_a_batch_add_up_to_its_runs():
 def test_render_writes_a_picture_and_refuses_other_names(mmrjax, tmp_path):
     ends(mmrjax("render robot.bmp"), "expected a name that ends in .png, .gif, .mp4")
     for words, message in (
-        (("robot.png", "--begin", "2"), "render: begin: got 2 s; expected times within 0 to 1.5 s, the run's"),
+        (("robot.png", "--begin", "2"), "render: begin: got 2 s; expected times within the run, 0 to 1.5 s"),
         (("robot.png", "--begin", "nan"), "render: begin: got nan s"),
         (("robot.gif", "--begin", "0.2", "--end", "0.1"), "render: begin, end: got 0.2 to 0.1 s"),
         (("robot.mp4", "--slow", "inf"), "render: slow: got inf, a film of inf pictures; expected at most 10000"),

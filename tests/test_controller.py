@@ -148,7 +148,11 @@ def test_a_robot_file_keeps_its_controller(actuator, tmp_path):
 
 REFUSED = {
     "no gain": ("kp = 8.0\n", "", r"controller\.kp"),
-    "no goal": ('imposed = "goal_angle"\n', "", r"controller: got it with imposed = .voltage.*goal_angle"),
+    "no goal": (
+        'imposed = "goal_angle"\n',
+        "",
+        r"controller: cannot be combined with imposed = .voltage.*goal_angle",
+    ),
     "no such gain": ("kd = 0.1", "kq = 0.1", r"controller\.kq: no such parameter.*controller\.k"),
     "a limit beyond the supply": ("limit = 0.9", "limit = 1.5", r"controller\.limit: got 1\.5; expected 0\.01 to 1"),
 }

@@ -116,8 +116,8 @@ def test_robot_file_without_the_users_library_says_so(tmp_path):
 REFUSED = {
     "code fails": ("import nothing_of_this_name", r"mine\.py: its code fails \(ModuleNotFoundError"),
     "syntax": ("def (", r"mine\.py: its code fails \(SyntaxError"),
-    "no effect": ("x = 1", r"mine\.py: holds no effect; expected a class derived from mmrjax\.effects\.Effect$"),
-    "no term": (GOOD.replace("def term", "def other"), r"holds no effect; .*; SealDrag defines no term"),
+    "no effect": ("x = 1", r"mine\.py: contains no effect; expected a class derived from mmrjax\.effects\.Effect$"),
+    "no term": (GOOD.replace("def term", "def other"), r"contains no effect; .*; SealDrag defines no term"),
     "name": (stating('name = "seal drag"'), r"name: got 'seal drag'; expected lower-case words"),
     "no name": (stating("name = None"), r"mine\.py, SealDrag, name: got None"),
     "name taken": (GOOD.replace("SealDrag", "Churning"), r"name: churning is already used; choose another"),

@@ -109,7 +109,7 @@ def turns():
     [
         (lambda t: t["supply_voltage_V"] ** 2, "supply voltage [V]"),
         (lambda t: np.abs(t["motor_current_right_A"]), "motor current, right [A]"),
-        (lambda t: t["motor_current_left_A"] - t["motor_current_right_A"], "left less right: motor current [A]"),
+        (lambda t: t["motor_current_left_A"] - t["motor_current_right_A"], "left minus right: motor current [A]"),
         (lambda t: np.sin(t["motor_current_left_A"] + t["motor_current_right_A"]), "mean of both sides: motor current [A]"),
         (lambda t: np.cos(t["slope_deg"]) + t["motor_current_left_A"], "motor current, left [A]"),
     ],

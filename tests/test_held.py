@@ -77,7 +77,7 @@ def test_a_shaft_at_rest_pushes_against_its_load():
 @pytest.mark.parametrize("wrong", [{"motor_speed": 3.0, "held": 1}, {"held": True, "model": "drive"}])
 def test_a_clamp_elsewhere_is_refused(wrong):
     model = wrong.pop("model", "steady")
-    with pytest.raises(UsageError, match="held: a clamp holds the output of a shaft in settled runs"):
+    with pytest.raises(UsageError, match="held: a clamp needs settled runs of a shaft"):
         mm.simulate(bench(), Conditions(**wrong), model)
 
 

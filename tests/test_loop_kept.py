@@ -132,7 +132,7 @@ def test_what_cannot_be_kept_is_not_said_to_be(rig, mmrjax, monkeypatch, tmp_pat
 
     monkeypatch.setattr(command, "discover", first)
     monkeypatch.setattr(command.loop_words, "verdict_line", lambda found: found.verdict)
-    _, _, err = ends(mmrjax(*rig), "nothing could be saved of verdict; the same command starts again", code=130)
+    _, _, err = ends(mmrjax(*rig), "verdict could not be saved; the same command starts from the beginning", code=130)
     assert "kept: verdict" not in err and not (tmp_path / "found.partial").exists()
 
 

@@ -68,6 +68,7 @@ def found(monkeypatch):
     monkeypatch.setattr(room, "_simulated_reading", lambda *_: None)
     monkeypatch.setattr(room, "_changed_readings", lambda *_: None)
     monkeypatch.setattr(room, "_curve_recurrence", lambda *_: 0.9)
+    monkeypatch.setattr(room, "evidence_over_curves", lambda *_: 0.0)
     monkeypatch.setattr(room, "recurrence_of_families", lambda *_: 1.0)
 
     def of(*ladder, curve, where=SPEED, long=False):
@@ -75,7 +76,7 @@ def found(monkeypatch):
         drawn = SimpleNamespace(chi2=(2 * BASE, 2 * BASE - curve), problem=None, z=None, reading=None)
         beside = SimpleNamespace(where=where, curve=drawn)
         return room.find_mechanism(
-            space, None, fitted(explains=0.0), None, ladder, (), beside, {}, settings_for(SettledRuns)
+            space, None, fitted(explains=0.0), SimpleNamespace(linear=None), ladder, (), beside, {}, settings_for(SettledRuns)
         )  # fmt: skip
 
     return of
@@ -125,6 +126,15 @@ def test_a_curve_that_explains_more_takes_the_place_of_effects_of_another_mechan
     where = dataclasses.replace(SPEED, explained=1900.0)  # histories: by what it explains linearly
     assert found(fitted("leads", explains=1500.0), curve=np.nan, where=where, long=True) is None
     assert found(fitted("stribeck", explains=1500.0), curve=np.nan, where=where, long=True).effects == ("stribeck",)
+
+
+def test_an_effect_that_a_curve_refutes_is_listed_with_the_drivers_of_curves(found, monkeypatch):
+    """As a saturated duty that imitates a bump of a loss torque over the speed."""
+    effect = fitted("leads", explains=1880.0)
+    assert found(effect, curve=1700.0).families == (FAMILIES["leads"],)
+    monkeypatch.setattr(room, "evidence_over_curves", lambda *_: -room.BETTER - 1)
+    refuted = found(effect, curve=1700.0)
+    assert refuted.families == (FAMILIES["leads"], SPEED.family) and refuted.effects == ("leads",)
 
 
 def test_what_it_explains_next_to_others_counts(found):

@@ -187,7 +187,7 @@ def test_a_file_runs_no_code_unless_it_is_trusted(mmrjax, tmp_path, command, tex
     assert not out and sorted(p.name for p in tmp_path.iterdir()) == ["own.py", "plan.toml"]
     if option == "--effects":
         for how in (("--trust",), ("--effects", "own.py")):
-            ends(mmrjax(*asks, *how), "own.py: holds no effect")
+            ends(mmrjax(*asks, *how), "own.py: contains no effect")
             (tmp_path / "harmed").unlink()
 
 

@@ -198,8 +198,8 @@ def test_a_mass_that_varies_is_said_and_its_median_written(robot):
     runs.columns["total_mass_kg"][:6] += [0.0, 0.0, 0.1, 0.2, 0.3, 0.4]
     (said, _) = own_mass.mass_notes(robot, runs)
     assert said == (
-        "6T2A: total_mass_kg less payload_kg varies from 14.2 to 14.6 kg: the fit used the table's, row by row; "
-        "14.35 kg, their median, is written, and with it rows of another mass are not as fitted"
+        "6T2A: total_mass_kg minus payload_kg varies from 14.2 to 14.6 kg. The fit used the mass of each row; "
+        "robot.toml contains the median, 14.35 kg, and does not reproduce the fit in rows of another mass"
     )
     assert float(own_mass.with_table_mass(robot, runs).configurations["6T2A"].mass) == 14.35
 
@@ -222,13 +222,13 @@ def test_a_surface_other_than_the_robots_is_said(robot):
 
 def test_a_mass_that_no_robot_has_is_refused(robot):
     runs = table({"6T2A": 0.003, "4W2T": 13.1})
-    says = r"runs\.csv row 1, total_mass_kg: got 0\.003 with a payload of 0 kg; expected a robot of 0\.01 to 10000 kg without"
+    says = r"runs\.csv row 1, total_mass_kg: got 0\.003 with a payload of 0 kg; expected 0\.01 to 10000 kg without"
     with pytest.raises(BadData, match=says):
         own_mass.with_table_mass(robot, runs)
 
 
 def test_a_prior_of_a_mass_that_the_table_states_is_refused(robot):
-    says = r"--prior 4W2T\.mass: runs\.csv states total_mass_kg, .* remove that column to fit the mass, or the prior"
+    says = r"--prior 4W2T\.mass: runs\.csv has a column total_mass_kg, .* remove that column, else remove the prior"
     with pytest.raises(BadConfiguration, match=says):
         calibrate(table(), robot, free=["default", "4W2T.mass"], stated={"4W2T.mass": (12.0, 0.1)})
     own_mass.check_priors(["4W2T.mass"], robot, unweighed(table()))

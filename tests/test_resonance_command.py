@@ -207,7 +207,7 @@ def test_shaking_gear_says_what_does_not_settle(tmp_path):
         (("--set", "running_gear.guide_reces=1e-4"), "guide_recess"),
         (("--voltages", ""), "--voltages: got nothing; expected numbers such as 0,5,10"),
         (("--voltages", "36:10:1"), "--voltages: got 36:10:1, which ends before it begins; expected first:last:step"),
-        (("--voltages", "24,24,33"), "--voltages: got 2 of them; expected at least 5"),
+        (("--voltages", "24,24,33"), "--voltages: got 2 values; expected at least 5"),
         (("--voltages", "0:30:5"), "--voltages: got 0; expected above 0 and up to 100"),
         (("--payloads", "0,-1"), "--payloads: got -1.0; expected 0 to 300"),
         (("--slope", "60"), "--slope: got 60.0; expected -45 to 45"),

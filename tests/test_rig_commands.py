@@ -356,7 +356,7 @@ def test_loop_takes_one_channel_both_ways(mmrjax, tmp_path, bench):
     defects = (tmp_path / "found" / "figures" / "defects.svg").read_text()
     assert "torque missing at the output" in defects and "voltage missing" not in defects and "slip" not in defects
     page = (tmp_path / "found" / "report.html").read_text()
-    assert "The channels close 1 equation: torque." in page
+    assert "The channels determine the defects of 1 equation: torque." in page
     assert words_of_others(*left_in(tmp_path / "found"), told, err) == []
 
 

@@ -509,7 +509,7 @@ def test_rig_check_says_what_a_file_is(mmrjax, bench):
     code, out, err = mmrjax("rig check my-rig.toml")
     assert (code, err) == (0, "")
     assert "One motor drives, through its gearbox 20 : 1, bench: a shaft of 0.002 kg·m²." in out
-    assert "10 lines still hold the number of an example" in out
+    assert "10 lines with the template's example number" in out
     assert "382 rpm/V" in out and "LOOK" not in out and "No data given" in out
 
 
@@ -604,7 +604,7 @@ def test_facts_of_an_arm_and_a_vehicle_by_hand(tmp_path):
     rover = read(tmp_path, ROVER.replace("[gearbox]", "voltage_limit = 12.0\n[gearbox]"))
     found = {f.what: f for f in rig_facts.derived_facts(rover)}
     assert found["rover: steepest slope without sliding"].value == "27°"
-    assert found["rover: speed without load at 12 V"].value == f"{12 / 0.05 / 16 * 0.04:.3g} m/s"
+    assert found["rover: no-load speed at 12 V"].value == f"{12 / 0.05 / 16 * 0.04:.3g} m/s"
     assert found["rover: steepest slope that the stall torque holds at 12 V"].value == "any"
 
 

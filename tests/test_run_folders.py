@@ -91,7 +91,7 @@ def test_a_partial_folder_that_is_a_link_is_left_alone(tmp_path):
 def test_interrupted_work_of_another_command_is_left_alone(tmp_path, capsys):
     partial = interrupted(tmp_path / "x")
     with pytest.raises(
-        BadConfiguration, match=r"x\.partial holds an interrupted loop, which the same command resumes"
+        BadConfiguration, match=r"x\.partial contains an interrupted loop, which the same command resumes"
     ):
         RunFolder(tmp_path / "x", SWEEP)
     other = LOOP | {"seed": 2}
@@ -115,7 +115,7 @@ def test_a_foreign_file_in_our_partial_folder_is_left_alone(tmp_path, place, ide
     partial = interrupted(tmp_path / "x")
     (partial / place).write_text("years of work")
     before = names(tmp_path)
-    with pytest.raises(BadConfiguration, match=rf"x\.partial holds {place}, which its command did not write"):
+    with pytest.raises(BadConfiguration, match=rf"x\.partial contains {place}, which its command did not write"):
         RunFolder(tmp_path / "x", identity, force=True)
     assert names(tmp_path) == before
 
@@ -202,7 +202,7 @@ def test_a_second_process_is_refused_at_once_and_disturbs_nothing(tmp_path):
         first.stage("base", lambda: 1)
         before = names(tmp_path)
         for identity in (LOOP, LOOP | {"seed": 2}, SWEEP):
-            with pytest.raises(BadConfiguration, match=r"(another process is using|holds an interrupted loop)"):
+            with pytest.raises(BadConfiguration, match=r"(another process is using|contains an interrupted loop)"):
                 RunFolder(tmp_path / "x", identity)
             with pytest.raises(BadConfiguration, match=r"another process is using \S*x\.partial; wait for it"):
                 RunFolder(tmp_path / "x", identity, force=True)

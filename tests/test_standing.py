@@ -24,7 +24,6 @@ from calibration.discovery.smooth import FALL, LENGTHS, PRODUCT, SIZES, WIDE, fi
 from calibration.discovery.standing import (
     _curve_evidence,
     _deficient_equations,
-    _evidence_over_curves,
     _largest_root,
     _largest_variation,
     _most_influential_run,
@@ -32,6 +31,7 @@ from calibration.discovery.standing import (
     cost_of_names,
     equation_of_place,
     evidence_of_names,
+    evidence_over_curves,
     judge_names,
 )
 from calibration.inference import bases
@@ -178,7 +178,7 @@ def test_a_constant_is_weighed_against_waves_of_which_runs_show_a_piece(law, nam
 
     space = SimpleNamespace(free=p, library=Library(["e0"]), included=np.ones(n, bool))
     offered = (*waves, SimpleNamespace(names=(("track", "speed_motor"),)))
-    found = _evidence_over_curves(space, best, without, "e0", linear, offered, SimpleNamespace(slots=4))
+    found = evidence_over_curves(space, best, without, ("e0",), linear, offered, SimpleNamespace(slots=4))
     assert NameTest("e0", 9.0, 3.3, (), found).stands == named
 
 
@@ -271,10 +271,11 @@ def test_effect_and_curve_pay_for_what_was_searched_in_their_equation(monkeypatc
     curves += [(90.0, PlacedCurve("electrical", (str(k),))) for k in range(5)]
     monkeypatch.setattr("calibration.discovery.standing._curve_evidence", lambda *_: curves)
     without = dataclasses.replace(best, cost=best.cost + 20.0)
-    found = _evidence_over_curves(space, best, without, "e0", None, (), settings)
+    evidence = evidence_over_curves(space, best, without, ("e0",), None, (), settings)
     own = sum(equation_of_place(p) == equation_of_place("track") for p in places)
     of_effect = 2 * 20.0 + 2 * math.log(0.1) - 2 * math.log(own)
-    assert found == pytest.approx(of_effect - (7.0 - 2 * math.log(2)), rel=1e-12)
+    assert evidence == pytest.approx(of_effect - (7.0 - 2 * math.log(2)), rel=1e-12)
+    assert equation_of_place("duty") == "electrical"  # an equation without curves would pass by itself
 
 
 def test_root_is_that_of_what_a_column_explains_beside_others(toy):
@@ -332,9 +333,8 @@ def test_name_stands_by_its_score_its_curves_and_its_rows(root, without, evidenc
     assert dataclasses.replace(test, varies=9.0, spread=0.31).established is False
     # of a library of three effects chance reaches less than in a dozen looks at the amplitude
     assert dataclasses.replace(test, varies=3.4, by_chance=3.5).established == test.established
-    # the other runs of a log test one effect that is chosen already
-    of_runs = [dataclasses.replace(test, what="run", root_without=x).rests_on for x in (2.5, 2.7)]
-    assert of_runs == [10 if root >= 3.3 else None, None]
+    of_runs = dataclasses.replace(test, what="run")  # of histories: chance alone
+    assert of_runs.rests_on == (10 if without < 3.3 <= root else None)
     renumbered = NameSupport(True, tests=(test,)).with_row_numbers(np.arange(1, 21) * 2)
     assert renumbered.rests_on("a") == (None if rests_on is None else 20) and renumbered.rests_on("b") is None
 

@@ -173,7 +173,7 @@ WRONG = {
     "conditions: got runs of shape (2,); expected one, and jax.vmap over several": dict(
         conditions=mm.Conditions(voltage=[15.0, 24.0])
     ),
-    "conditions: the sides are driven apart; a step is of straight travel, use mmrjax.simulate": dict(
+    "conditions: got a command for each side; a step travels straight, use mmrjax.simulate": dict(
         conditions=mm.Conditions(duty_left=1.0, duty_right=0.5)
     ),
     "conditions: the motors' speed is imposed; a step needs a voltage or a current": dict(

@@ -761,7 +761,7 @@ def test_a_store_and_a_table_of_one_path_leave_each_other_alone(opened, tmp_path
     store = opened()
     store.begin()
     written(store, 0)
-    for force, why in ((False, "holds an interrupted sweep into a store"), (True, "another process is using")):
+    for force, why in ((False, "contains an interrupted sweep into a store"), (True, "another process is using")):
         with pytest.raises(BadConfiguration, match=why):
             RunFolder(tmp_path / "s", {"command": "sweep"}, force=force)
     assert len(store.done()) == 1
@@ -770,7 +770,7 @@ def test_a_store_and_a_table_of_one_path_leave_each_other_alone(opened, tmp_path
         with pytest.raises(BadConfiguration, match="another process is using"):
             opened(force=True)
         folder.stage("base", lambda: 1)
-    with pytest.raises(BadConfiguration, match="holds an interrupted sweep, which"):
+    with pytest.raises(BadConfiguration, match="contains an interrupted sweep, which"):
         opened()
     store = opened(force=True)
     assert read_json(store.partial / LOCK)["command"] == zarr_store.COMMAND and not store.done()

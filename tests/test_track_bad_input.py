@@ -98,7 +98,7 @@ def test_step_that_is_proposed_can_be_typed_in(limit):
 @pytest.mark.parametrize(
     "keywords, message",
     [
-        (dict(sample=1.5e-4), "step: got 0.0001 s; expected 0.00015 s, a sample, divided by a whole number"),
+        (dict(sample=1.5e-4), "step: got 0.0001 s; expected the sample time, 0.00015 s, divided by a whole number"),
         (dict(duration=0.0), "duration: got 0 s; expected a whole number of samples of 0.001 s"),
     ],
 )

@@ -220,7 +220,7 @@ def test_the_packaged_robot_turns_by_voltages_of_its_sides_without_a_supply(tmp_
         ("voltage_left_V", (3,), "column voltage_right_V is missing although voltage_left_V is present; give the command of both"),
         ("voltage_left_V,voltage_right_V,duty_left,duty_right", (3, 6, 0.5, 1), "column duty_left in addition to voltage_left"),
         ("voltage_left_V,voltage_right_V,duty", (3, 6, 1), "column duty in addition to voltage_left_V, .* keep one"),
-        ("voltage_left_V,voltage_right_V,supply_voltage_V", (3, 13, 12), "row 2, voltage_right_V: got 13 of a supply "
+        ("voltage_left_V,voltage_right_V,supply_voltage_V", (3, 13, 12), "row 2, voltage_right_V: got 13 V at a supply "
          "of 12 V; expected no more than supply_voltage_V, or remove that column"),
         ("voltage_left_V,voltage_right_V", ("", 3), "row 2, voltage_left_V: got an empty cell; expected a number, -100"),
     ],

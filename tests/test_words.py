@@ -396,15 +396,15 @@ OVER = PlacedCurve("slip", ("slope",))
     [
         (None, ""),
         (NameSupport(True), ""),
-        (NameSupport(False, "implausible"), "every effect of the library that explains it has an implausible size"),
-        (NameSupport(False, "larger", ("a", "b")), "a and b would explain more, but not at a plausible size"),
+        (NameSupport(False, "implausible"), "every effect that explains the discrepancy has an implausible size"),
+        (NameSupport(False, "larger", ("a", "b")), "a and b would explain more, but only at an implausible size"),
         (
             NameSupport(False, "better curve", ("a",), (PlacedCurve("speed", ("speed_motor", "slope")),)),
-            "one smooth surface in the reading of speed over speed motor and slope is a better explanation than a",
+            "a smooth surface in the reading of speed over speed motor and slope explains the data better than a",
         ),
         (
             NameSupport(False, "curve alone", curves=(OVER,)),
-            "one smooth curve in the slip balance over slope leaves no significant misfit",
+            "a single smooth curve in the slip balance over slope leaves no significant misfit",
         ),
         (
             NameSupport(
@@ -417,9 +417,9 @@ OVER = PlacedCurve("slip", ("slope",))
                 ),
             ),
             "a explains 1.2 σ next to smooth curves (slip balance over slope); chance alone reaches 3.4; b is a worse "
-            "explanation than a smooth curve in its place and rests on row 10; c is chosen again in 75 % of the data "
-            "with a block left out, has a better rival, but of implausible size (d and e) and leaves an error in its own "
-            "equation",
+            "explanation than a smooth curve in its place and depends on row 10 alone; c is chosen again in only 75 % of the "
+            "fits with one block left out, explains less than d and e at an implausible size and leaves an error in "
+            "its own equation",
         ),
         (
             NameSupport(False, "none by itself", tests=(NameTest("a", 1.2, 3.41, (), 0.0),)),
@@ -431,7 +431,7 @@ OVER = PlacedCurve("slip", ("slope",))
                 "beside",
                 tests=(NameTest("a", 6.91, 3.27, (OVER,), 1.0, 11, 5.8), NameTest("b", 5.0, 3.27, (), 0.0)),
             ),
-            "each one, added to the fit of the others, explains more than chance would: a 6.9 σ (chance 3.3, without row 11 "
+            "each effect, added to the fit of the others, explains more than chance would: a 6.9 σ (chance 3.3, without row 11 "
             "5.8), b 5.0 σ (chance 3.3)",
         ),
     ],
@@ -455,7 +455,7 @@ def test_verdict_tells_what_is_tentative():
     test = NameTest("b", 5.0, 3.4, (), 9.0, 10, 2.0)
     sure, tentative = MissingEffect(("a",), (), ("drop",)), MissingEffect(("b",), (), ("slip",), False, test)
     assert loop_words.verdict_sentences(VerdictSummary("named", 0.001, None, (sure, tentative))) == (
-        "Missing: a (family-wise p ≤ 0.001). Tentative, kept in the model because it improves predictions: b, which rests on row 10."
+        "Missing: a (family-wise p ≤ 0.001). Tentative, kept in the model because it improves predictions: b, which depends on row 10 alone."
     )
     # where no name stands and it was not tested by itself, what speaks against all of them
     curve = NameSupport(False, "curve alone", curves=(OVER,))
@@ -466,7 +466,7 @@ def test_verdict_tells_what_is_tentative():
     said = loop_words.verdict_sentences(VerdictSummary("place", 0.001, place, (only,), support=curve))
     assert "no effect of the library is established" in said
     assert said.endswith(
-        "improves predictions: b (one smooth curve in the slip balance over slope leaves no significant misfit)."
+        "improves predictions: b (a single smooth curve in the slip balance over slope leaves no significant misfit)."
     )
 
 
@@ -479,11 +479,14 @@ def test_a_mechanism_is_stated_with_what_it_explains_and_predicts():
     assert said.startswith(
         "Missing: a loss torque that changes with speed or a slip, established as a mechanism: it "
     )
-    assert "explains 99 % of the excess misfit, gains 0.8 nat" in said and "8.0 standard errors" in said
+    assert (
+        "explains 99 % of the misfit beyond noise, raises the log likelihood of held-out runs by 0.8 per" in said
+        and "8.0 standard errors" in said
+    )
     weak = dataclasses.replace(found, families=("slip",), share=0.3, gain=0.1)
     said = loop_words.verdict_sentences(VerdictSummary("place", 0.001, place, mechanism=weak))
     assert (
-        "No mechanism is established: the best one is a slip, but it explains only 30 % of the excess misfit and"
+        "No mechanism is established: the best candidate is a slip, but it explains only 30 % of the misfit beyond noise and"
         in said
     )
     assert loop_words.brief_verdict(VerdictSummary("mechanism", 0.001, place, mechanism=weak)) == "mechanism: slip"
@@ -507,7 +510,7 @@ def test_a_mechanism_is_stated_with_its_window_and_why_no_name_stands():
     found = SimpleNamespace(
         verdict="mechanism", summary=summary, effects=(), unnamed=here, support=support, after=SimpleNamespace(adequate=True)
     )  # fmt: skip
-    said = "one constant in the slip balance in runs 30 to 44 leaves no significant misfit; a explains 1.2 σ; chance alone reaches 3.4"
+    said = "a single constant in the slip balance in runs 30 to 44 leaves no significant misfit; a explains 1.2 σ; chance alone reaches 3.4"
     assert loop_words.naming_reasons(found) == said
     found.after.adequate = False
     assert loop_words.naming_reasons(found) == loop_words.support_reasons(support)
@@ -539,10 +542,10 @@ def test_verdicts_at_other_noise_are_one_sentence():
     sure, weak = MissingEffect(("a", "c"), (), ("x",)), MissingEffect(("b",), (), ("y",), False)
     assert loop_words.at_other_noise(()) == ""
     assert loop_words.at_other_noise([other(0.7, "class", sure, weak), other(1.4, "class", sure, weak)]) == (
-        "with 0.7 and with 1.4 times that noise the verdict is class: a established, b tentative"
+        "with 0.7 and with 1.4 times the noise the verdict is class: a established, b tentative"
     )
     assert loop_words.at_other_noise([other(0.5, "place", weak), other(2, "none")]) == (
-        "with 0.5 times that noise the verdict is place: b tentative; with 2 times that noise the verdict is none"
+        "with 0.5 times the noise the verdict is place: b tentative; with 2 times the noise the verdict is none"
     )
 
 
@@ -572,7 +575,7 @@ def test_what_settled_runs_cannot_tell_from_an_effect_is_said_of_them_alone(samp
 
 
 def test_a_formula_without_terms_says_so():
-    assert Proposal("", (), (), (), (), 0.0, 0.0, 9).formula == "no single term explains 90 % of it"
+    assert Proposal("", (), (), (), (), 0.0, 0.0, 9).formula == "no single term explains 90 % of the curve"
     assert Proposal("ΔU = 1 V", (), (1.0,), (0.1,), (), 0.0, 3.0, 9).formula == "ΔU = 1 V"
 
 
@@ -606,14 +609,14 @@ def test_names_say_what_would_explain_more_than_they():
         ((10, 4.3, 4.72), (10, 10), "motor speed 4.3 → 4.7 % (same 10 rows)"),
         ((10, 0.141, 0.149), (10, 10), "motor speed 0.14 → 0.15 % (same 10 rows)"),
         ((8, 4.0, 5.0), (8, 10), "motor speed 4.0 → 5.0 % (same 8 rows)"),
-        (None, (10, 8), "2 rows fewer predicted"),
-        (None, (10, 9), "1 row fewer predicted"),
+        (None, (10, 8), "2 rows can no longer be predicted"),
+        (None, (10, 9), "1 row can no longer be predicted"),
         (None, (10, 10), ""),
     ],
 )
 def test_what_is_predicted_worse_is_said_with_its_rows(found, predicted, said):
     worse = () if found is None else (WorseChannel("voltage", "motor_speed", *found),)
-    whole = f"Predicts worse on held-out rows: by voltage {said}."
+    whole = f"Predictions of held-out rows get worse: by voltage {said}."
     assert loop_words.rising_errors_sentence(worse, {"voltage": predicted}) == (whole if said else "")
 
 
@@ -642,7 +645,7 @@ def test_what_the_track_model_is_asked_about(about, said):
         ),
         (
             Adequacy(False, 60.0, 60.0, 0.0021, AdequacyFinding("motor_speed", "follow", "slope_deg"), False),
-            "Not adequate: the residuals of motor speed follow slope_deg (p = 0.0021, the noise estimated from them), "
+            "Not adequate: the residuals of motor speed depend on slope_deg (p = 0.0021, the noise estimated from them), "
             "so a term is missing and the parameters may absorb its effect; run mmrjax loop to find it",
         ),
         (
@@ -694,7 +697,7 @@ def clustered(levels, **other):
         (
             clustered({}, correlation=-0.456),
             "residuals of speed are correlated with wheel (rank correlation -0.46; p = 2e-07), a column without a role: find "
-            "what changes along with it",
+            "what changes with it",
         ),
     ],
 )

@@ -157,7 +157,7 @@ def read_effect_file(path: Path) -> tuple[type[Effect], ...]:
         partial = [v.__name__ for v in own_classes if issubclass(v, Effect)]
         missing = f"; {partial[0]} defines no term" if partial else ""
         raise BadConfiguration(
-            f"{path.name}: holds no effect; expected a class derived from mmrjax.effects.Effect{missing}"
+            f"{path.name}: contains no effect; expected a class derived from mmrjax.effects.Effect{missing}"
         )
     for effect in concrete:
         _check_effect(path, effect)

@@ -63,8 +63,7 @@ def stated_masses(robot: Robot, runs: Runs) -> dict[str, StatedMass]:
         raise BadData(
             f"{runs.source} row {row + 1}, total_mass_kg: got {runs['total_mass_kg'][row]:g} "
             "with a payload of "
-            f"{runs['payload_kg'][row]:g} kg; expected a robot of {low:g} to "
-            f"{high:g} kg without it"
+            f"{runs['payload_kg'][row]:g} kg; expected {low:g} to {high:g} kg without the payload"
         )
     masses = {}
     for index in np.unique(which):
@@ -99,9 +98,9 @@ def mass_notes(robot: Robot, runs: Runs) -> list[str]:
         if stated.varies:
             why = "; does total_mass_kg leave the payload out?" if stated.unladen else ""
             notes.append(
-                f"{name}: total_mass_kg less payload_kg varies from {stated.low:.4g} to {stated.high:.4g} kg: the "
-                f"fit used the table's, row by row; {stated.median:.4g} kg, their median, is written, and with it "
-                f"rows of another mass are not as fitted{why}"
+                f"{name}: total_mass_kg minus payload_kg varies from {stated.low:.4g} to {stated.high:.4g} kg. The "
+                f"fit used the mass of each row; robot.toml contains the median, {stated.median:.4g} kg, and does "
+                f"not reproduce the fit in rows of another mass{why}"
             )
         elif abs(stated.median - mass) > ROUNDING:
             notes.append(
@@ -132,6 +131,6 @@ def check_priors(stated: Iterable[str], robot: Robot, runs: Runs) -> None:
     for name in stated_masses(robot, runs):
         if f"{name}.mass" in stated:
             raise BadConfiguration(
-                f"--prior {name}.mass: {runs.source} states total_mass_kg, which its runs are simulated with; remove "
-                "that column to fit the mass, or the prior"
+                f"--prior {name}.mass: {runs.source} has a column total_mass_kg, which sets the mass of each run; to "
+                "fit the mass, remove that column, else remove the prior"
             )

@@ -66,7 +66,7 @@ def _motor_facts(robot: Robot) -> Iterator[DerivedFact]:
     if with_constant:
         per_volt = 1 / constant / RPM
         odd = _reason_if_outside(per_volt, 5, 20_000, "is torque_constant in N·m/A? 1 mN·m/A is 0.001")
-        yield DerivedFact("speed without load, of each volt", f"{three_digits(per_volt)} rpm/V", odd)
+        yield DerivedFact("no-load speed per volt", f"{three_digits(per_volt)} rpm/V", odd)
         idle = float(motor.friction_coulomb) / constant
         odd = _reason_if_outside(
             idle, 0, 10, "is friction_coulomb in N·m? it is torque_constant times the no-load current"
@@ -75,12 +75,10 @@ def _motor_facts(robot: Robot) -> Iterator[DerivedFact]:
     if with_constant and voltage is not None:
         fastest = voltage / constant
         odd = "" if fastest < 2 * motor.speed_limit else ("more than twice motor.speed_limit; check torque_constant")
-        yield DerivedFact(
-            f"speed without load at {three_digits(voltage)} V", f"{three_digits(fastest / RPM)} rpm", odd
-        )
+        yield DerivedFact(f"no-load speed at {three_digits(voltage)} V", f"{three_digits(fastest / RPM)} rpm", odd)
     if with_resistance and voltage is not None:
         stall = float(motor.current_stall(voltage))
-        odd = _reason_if_outside(stall, 0.02, 1000, "look at motor.resistance")
+        odd = _reason_if_outside(stall, 0.02, 1000, "check motor.resistance")
         yield DerivedFact(f"stall current at {three_digits(voltage)} V", f"{three_digits(stall)} A", odd)
     if with_constant and with_resistance:
         size = constant**2 / resistance
@@ -165,7 +163,7 @@ def _shaft_facts(robot: Robot, name: str, load: Shaft) -> Iterator[DerivedFact]:
         yield DerivedFact(
             f"{name}: travel per turn",
             f"{three_digits(travel * 1e3)} mm",
-            _reason_if_outside(travel, 1e-4, 10.0, "look at it"),
+            _reason_if_outside(travel, 1e-4, 10.0, "check the travel"),
         )
 
 
@@ -184,7 +182,7 @@ def _vehicle_facts(robot: Robot, name: str) -> Iterator[DerivedFact]:
     yield DerivedFact(
         f"{name}: steepest slope without sliding",
         f"{grip:.0f}°",
-        odd or _reason_if_outside(grip, 5, 60, "look at static"),
+        odd or _reason_if_outside(grip, 5, 60, "check friction.static"),
     )
     limit = robot.motor.voltage_limit
     if limit is None or not robot.knows(["motor.resistance"]):
@@ -196,7 +194,7 @@ def _vehicle_facts(robot: Robot, name: str) -> Iterator[DerivedFact]:
     yield DerivedFact(f"{name}: steepest slope that the stall torque holds at {three_digits(limit)} V", angle, odd)
     speed = limit / float(robot.motor.torque_constant) / float(robot.gearbox.ratio) * radius
     odd = _reason_if_outside(speed, 0.005, 15, f"check {name}.radius, gearbox.ratio and motor.torque_constant")
-    yield DerivedFact(f"{name}: speed without load at {three_digits(limit)} V", f"{three_digits(speed)} m/s", odd)
+    yield DerivedFact(f"{name}: no-load speed at {three_digits(limit)} V", f"{three_digits(speed)} m/s", odd)
 
 
 def doubtful_time(runs: Runs, robot: Robot) -> str:

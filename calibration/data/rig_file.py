@@ -371,8 +371,8 @@ def rig_lines(rig: Rig) -> tuple[list[str], dict[str, list[str]]]:
     head = [
         f'imposed = "{rig.imposed}"  # what sets the drives, one of {", ".join(IMPOSED)}',
         f"channels = {toml_value(list(rig.channels))}  # what its instruments show",
-        f'start = "{rig.start}"  # of histories: rest, measured or free',
-        f'between_rows = "{rig.between_rows}"  # what is imposed, in histories: held or linear',
+        f'start = "{rig.start}"  # start of time histories: rest, measured or free',
+        f'between_rows = "{rig.between_rows}"  # imposed quantity between rows of time histories: held or linear',
     ]
     tables: dict[str, list[str]] = {}
     if rig.columns:

@@ -234,8 +234,8 @@ def _robot_before_parameters(
     rig = rig_file.parse_rig(content, where, list(loads.by_name), travels=loads.travels, inherits=base is not None)
     if "controller" in content and not rig.follows_goal:
         raise BadConfiguration(
-            f"{where}, controller: got it with imposed = {toml_value(rig.imposed)}; a controller needs an imposed "
-            f"goal: {', '.join(GOALS)}"
+            f"{where}, controller: cannot be combined with imposed = {toml_value(rig.imposed)}; a controller needs "
+            f"an imposed goal: {', '.join(GOALS)}"
         )
     controller = Controller() if rig.follows_goal else None
     if base is not None:

@@ -354,7 +354,7 @@ def _settled_signals_of_log(
                 readings[rows] = _recent_rate(runs["time_s"][rows], whole[rows], half)
             signals.append(Signal(channels.find_channel(rate), readings, whole, 0.0, _reading_size(readings), off))
     if not signals:
-        raise BadData(f"{runs.source}: no channel has readings that can be used for settled travel")
+        raise BadData(f"{runs.source}: no channel has readings that can be used for settled runs")
     return tuple(signals)
 
 

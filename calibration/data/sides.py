@@ -66,7 +66,7 @@ def of_volts(name: str, columns: Columns, battery: bool) -> Names:
     if beyond.any():
         side, row = (int(k[0]) for k in np.nonzero(beyond))
         raise BadData(
-            f"{name} row {row + 1}, {[*VOLTS][side]}: got {volts[side, row]:g} of a supply of {supply[row]:g} V; "
+            f"{name} row {row + 1}, {[*VOLTS][side]}: got {volts[side, row]:g} V at a supply of {supply[row]:g} V; "
             f"expected no more than {SUPPLY}, or remove that column: the larger of the two side voltages is then "
             "the supply voltage"
         )

@@ -104,7 +104,7 @@ def read_terrain(path: Path) -> Terrain:
     elif largest <= LARGEST:
         wrong = f"has a wall of {wall:g} m; expected at most {WALL:g} m"
     # too small in the smaller unit, or too large in the larger one
-    hint = "" if other == unit else f"; is the file in {word}? Name its columns x_{other} and z_{other} then"
+    hint = "" if other == unit else f"; is the file in {word}? Then name its columns x_{other} and z_{other}"
     raise BadData(f"{path.name}: {wrong}{hint}")
 
 

@@ -228,7 +228,7 @@ def fit_base(space: CandidateSpace, settings: Settings, where: str, near: Candid
         space = space.without(lost)
         if space.included.sum() < FEWEST:
             rows = ", ".join(str(r + 1) for r in unusable[:12])
-            raise BadData(f"{where}: the model reaches too few rows to trace anything (not rows {rows})")
+            raise BadData(f"{where}: too few rows for a search, since the model has no result in rows {rows}")
 
 
 def _beyond_adhesion(space: CandidateSpace) -> np.ndarray:

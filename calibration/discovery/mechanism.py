@@ -20,12 +20,12 @@ from calibration.discovery.candidates import Candidate, fit_candidates
 from calibration.discovery.classes import errors_of_ammeters
 from calibration.discovery.discrepancy import BaseCurve
 from calibration.discovery.location import DiscrepancyLocation
-from calibration.discovery.loop_notes import AGAIN, HALF, Mechanism
+from calibration.discovery.loop_notes import AGAIN, BETTER, HALF, Mechanism
 from calibration.discovery.prediction import Gain, HeldOutScore, Predicted
 from calibration.discovery.projection import explained_function
 from calibration.discovery.score_tests import family_columns
 from calibration.discovery.settings import Settings
-from calibration.discovery.standing import recurrence_of_families
+from calibration.discovery.standing import evidence_over_curves, recurrence_of_families
 from calibration.inference import bases as bases_room
 from calibration.inference import blocks as blocks_room
 from calibration.inference.bases import Bases
@@ -81,7 +81,8 @@ def find_mechanism(
     excess = excess_misfit(space, base)
     curve = () if space.bare.observe.long or own[0] in by_name or own[0] not in alike else own[:1]
     for leader in (*by_name[:1], *curve, *by_name[1:]):
-        others = alike if leader in by_name else [*alike, *over]
+        refuted = leader in by_name and _refuted_by_curve(space, base, best[leader], left, bases, settings)
+        others = [*alike, *own] if refuted else alike if leader in by_name else [*alike, *over]
         families = (leader, *(f for f in others if f != leader))
         families = tuple(dict.fromkeys((*families, *_same_driver_elsewhere(leader, beside.where))))
         if leader in by_name:
@@ -197,6 +198,16 @@ def _same_driver_elsewhere(family: str, where: DiscrepancyLocation) -> Names:
     what, joint, driver = family.partition(" that ")
     alike = dict.fromkeys(equation for equation, *_ in equations)
     return tuple(f"{other}{joint}{driver}" for other in alike) if what in alike else ()
+
+
+def _refuted_by_curve(
+    space: CandidateSpace, base: Candidate, best: Candidate, left: Diagnosis, bases: Bases, settings: Settings
+) -> bool:
+    """True if a smooth curve in their equation refutes the form of a family's effects.
+
+    Their driver is then no better than those that smooth curves cannot separate.
+    """
+    return evidence_over_curves(space, best, base, best.effects, left.linear, bases, settings) < -BETTER
 
 
 def _families_of_location(where: DiscrepancyLocation) -> Names:

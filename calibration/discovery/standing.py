@@ -16,6 +16,7 @@ from statistics import NormalDist
 
 import numpy as np
 
+from calibration.data import Names
 from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.adequacy import AdequacyTest, Diagnosis
 from calibration.discovery.candidates import Candidate
@@ -38,8 +39,8 @@ ALONE = 4
 #: Least share of an effect's gain that the slopes without it must predict for them to be used for other effects.
 PROMISED = 0.8
 #: Balances with curves of another balance, those of one equation. A positive error of a speed meter has the same
-#: effect as negative slip.
-EQUATION = {"mass": "ground", "speed": "slip"} | {
+#: effect as negative slip. A duty that the bridge does not give is a voltage drop.
+EQUATION = {"mass": "ground", "speed": "slip", "duty": "electrical"} | {
     other: b for b, others in bases_room.STANDS_FOR.items() for other in others
 }
 #: Variables of surfaces, in pairs.
@@ -320,8 +321,8 @@ def judge_each_name(
                 _largest_root(*beside),
                 after.test.threshold("single"),
                 tuple(_curve_of_variable(*names[k]) for k in chosen),
-                _evidence_over_curves(
-                    space, full_fit, other_fit, effect, linearizations[other_fit.active], bases, settings
+                evidence_over_curves(
+                    space, full_fit, other_fit, (effect,), linearizations[other_fit.active], bases, settings
                 ),
                 run,
                 root_without,
@@ -398,27 +399,29 @@ def _largest_variation(
     return *most[:2], chance, most[2]
 
 
-def _evidence_over_curves(
+def evidence_over_curves(
     space: CandidateSpace,
     best: Candidate,
     without: Candidate,
-    effect: str,
+    effects: Names,
     linear: Linearization,
     bases: Bases,
     settings: Settings,
 ) -> float:
-    """Twice the log Bayes factor of an effect over the best smooth curve in its equation [σ²].
+    """Twice the log Bayes factor of effects of one equation over the best smooth curve in it [σ²].
 
-    Effect and curve are each penalised for the number of their alternatives in that equation.
+    Effects and curve are each penalised for the number of their alternatives in that equation.
 
     Args:
-        best: candidate with the effect.
-        without: the same candidate without the effect.
+        best: candidate with the effects.
+        without: the same candidate without them.
         linear: linearization at `without`.
     """
-    equation = _equation_of_effect(space, effect)
+    equation = _equation_of_effect(space, effects[0])
     offered = sum(_equation_of_effect(space, name) == equation for name in space.library.names)
-    cost = _cost_of_effect(space, best, best.active.index(effect), settings) + 2 * math.log(offered)
+    cost = sum(
+        _cost_of_effect(space, best, best.active.index(name), settings) + 2 * math.log(offered) for name in effects
+    )
     same_equation = [
         e for e, over in _curve_evidence(space, linear, bases, set()) if equation_of_place(over.place) == equation
     ]

@@ -174,11 +174,11 @@ def _free_names(
     names = priors.choose_free_names(robot, default, *words)
     if unread := fidelities.unread_parameters(fidelity, names, runs.turns):
         if fidelities.OF_TURNS in unread[0]:
-            raise BadConfiguration(f"--free {unread[0]}: these runs are straight, which do not show it")
+            raise BadConfiguration(f"--free {unread[0]}: only turns depend on it, and these runs are straight")
         reads = ", ".join(
             other for other in fidelities.NAMES if not fidelities.unread_parameters(other, unread, runs.turns)
         )
-        raise BadConfiguration(f"--free {unread[0]}: --model {fidelity} does not read it; allowed: --model {reads}")
+        raise BadConfiguration(f"--free {unread[0]}: --model {fidelity} does not use it; allowed: --model {reads}")
     return names
 
 
@@ -267,7 +267,7 @@ def _population_size(posed: Problem, names: Sequence[str], runs: Runs, populatio
     if population is None:
         population = POPULATION if fidelities.unread_parameters("steady", names, runs.turns) else 0
     if more and not population:
-        raise BadConfiguration("--generations, --members: there is no population; state --population")
+        raise BadConfiguration("--generations, --members: have an effect only with --population; give it too")
     if population and not posed.observe.starts_from_steady:
         raise BadConfiguration(
             f"--population: got {population}; a population search needs settled rows and --model drive or track"

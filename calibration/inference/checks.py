@@ -310,8 +310,8 @@ def infeasible_error(
     if not slides.any():
         words = ", ".join(STATUSES[k] for k in np.unique(status[lost]))
         return BadConfiguration(
-            f"no start is feasible: the model does not reach {runs.source} rows {listed(lost)} ({words} at the best "
-            "point found); check their conditions, or widen the priors"
+            f"no start is feasible: the model has no result in {runs.source} rows {listed(lost)} ({words} at the "
+            "best point found); check their conditions, or widen the priors"
         )
     sliding = sorted(set(runs.configurations_named(robot)[slides]), key=robot.configurations.index)
     parameter = {c: f"{c}.ground.friction.static" for c in sliding}

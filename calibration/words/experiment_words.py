@@ -70,8 +70,8 @@ DOING = {
     "other way": "run in the other direction",
     "about": "reverse the slope, set with the same inclinometer, and travel forwards",
     "laden": "travel with {payload:g} kg",
-    "lifted": "put it on stands, the movers in the air, and run",
-    "one lifted": "put it on stands, {others}, and run",
+    "lifted": "put the robot on stands, the movers in the air, and run",
+    "one lifted": "put the robot on stands, {others}, and run",
     "alone": "Uncouple the {gears} and run the motors alone",
     "braked": "Uncouple the {gears} and put a brake of {brake:g} mN·m on each motor shaft, and run",
     "held": "Hold {shafts} in a vice and switch on for a moment,",
@@ -90,8 +90,8 @@ def _act(act: menu.CalibrationAct) -> str:
         each = {1: "", 2: "in both configurations, "}.get(len(configurations), "in each configuration, ")
         laden = f"unladen and with the payload of {payload:g} kg, " if payload > 0 else "unladen, "
         return (
-            f"Weigh the robot {each}{laden}on scales accurate to 20 g; subtract the stated total mass from the "
-            "reading"
+            f"Weigh the robot {each}{laden}on scales accurate to 20 g, and compare the readings with the total mass "
+            "in the robot file"
         )
     (kind,) = act.kinds
     if act.channel:
@@ -131,7 +131,7 @@ def heated_winding(temperature: float, allowed: float | None) -> str:
     """
     settles = math.isfinite(temperature)
     would = f"would reach {temperature:.0f} °C" if settles else ("would burn out, as its temperature never settles")
-    return f"a winding left on {would}{'' if allowed is None else _temperature_limit(allowed)}"
+    return f"an energised winding {would}{'' if allowed is None else _temperature_limit(allowed)}"
 
 
 def _temperature_limit(temperature: float) -> str:
@@ -148,8 +148,8 @@ def more_runs(what: SimpleNamespace) -> str:
         three = [f"{menu.round_significant(v):g}" for v in (what.low, 0.5 * (what.low + what.high), what.high)]
         return (
             "Mark the driving shaft, start every run with it at the mark, and record steady travel at "
-            f"{', '.join(three[:2])} and {three[2]} V with at least 20 samples per wave. A disturbance with the "
-            f"same {what.variable} at every speed comes from the part that turns at that rate"
+            f"{', '.join(three[:2])} and {three[2]} V with at least 20 samples per wave. A disturbance that "
+            f"keeps {what.variable} at every speed comes from the part that turns at that rate"
         )
     happens = bases.window_from_name(what.variable)
     if happens is not None:
@@ -167,8 +167,8 @@ def _repeat_instruction(happens: bases.Window) -> str:
     if happens.axis == "order":
         return (
             f"Make runs {happens.low:.0f} to {happens.high:.0f} again, with as many runs before and after them, "
-            "in another order. An error that returns depends on the conditions of these runs; one that does not "
-            "was an event at that time"
+            "in another order. An error that returns depends on the conditions of these runs. An error that does "
+            "not return was an event at that time"
         )
     if happens.axis != "time":
         return (
@@ -193,7 +193,7 @@ def _up_to(most: float, runs: int, unit: str = "", first: str = "") -> str:
     """` from crawl to 12 V in steps of 1 V`: levels that a person can set."""
     step = menu.step_of_settings(most, runs)
     last, by = (f"{x:g} {unit}".rstrip() for x in (menu.last_setting(most, step), step))
-    return f" from {first} to {last} in steps of {by}" if first else f" up to {last} in steps of {by}"
+    return f" from a {first} to {last} in steps of {by}" if first else f" up to {last} in steps of {by}"
 
 
 def _advice_by_variable(what: SimpleNamespace) -> dict[str, str]:
@@ -206,7 +206,7 @@ def _advice_by_variable(what: SimpleNamespace) -> dict[str, str]:
     by_duty = what.by_duty
     driven = f"the supply voltage from {low:g} to {high:g} V in steps of {volts:g} V"
     crawl = (
-        _steps(what, "crawl") if by_duty else f"the supply voltage in steps of {volts:g} V from crawl to {high:g} V"
+        _steps(what, "crawl") if by_duty else f"the supply voltage in steps of {volts:g} V from a crawl to {high:g} V"
     )
     return {
         "voltage": f"Repeat at one slope and payload with {_steps(what) if by_duty else driven}",
@@ -238,7 +238,7 @@ def _of_level(what: SimpleNamespace) -> dict[str, str]:
         "speed": f"{level} {turning}, which also varies the travelling speed",
         "slope": f"Repeat at one {one} and payload with the slope from 0 to {what.slope:g} deg, and downhill",
         "payload": f"Repeat at one {one} and slope with the payload from 0 to {what.payload:g} kg",
-        "time": f"Record one {one} for ten minutes from a cold start, and repeat it at once while everything is warm",
+        "time": f"Repeat at one {one} for ten minutes from a cold start, and again at once while everything is warm",
     }
     if not within.has_ground:
         words["current"] = (
@@ -273,10 +273,10 @@ SAID: dict[str, str | Callable[..., str]] = {
         f"No experiment that the loop can propose separates {' and '.join(names)} by {sigma:g} sigma"
     ),
     "too_weak": "A series of runs over {variable} would show the missing term with {sigma:.1f} sigma only",
-    "carry_out": lambda experiments: ". And: ".join(map(experiment_sentences, experiments)),
+    "carry_out": lambda experiments: ". Then: ".join(map(experiment_sentences, experiments)),
     "more_runs": lambda **series: (
-        f"{more_runs(SimpleNamespace(**series))}; read every channel. The series shows the shape of the term that "
-        f"is missing in the {bases.place_in_words(series['place'])}"
+        f"{more_runs(SimpleNamespace(**series))}. Read every channel: the series shows the shape of the term that is "
+        f"missing in the {bases.place_in_words(series['place'])}"
     ),
     "overspeed": lambda speed, limit, voltage: (
         f"the motor speed: expect about {speed / RPM:.0f} rpm unloaded at {voltage:g} V and do not exceed "
@@ -319,7 +319,7 @@ VARY = {
     "position": "the position: cover the whole travel in both directions at one voltage",
     "": "nothing: its share is the same in every run",
 }  # fmt: skip
-WEIGH = "Weigh the robot, unladen and laden, and subtract the stated mass"
+WEIGH = "Weigh the robot, unladen and laden, and compare the readings with the mass in the robot file"
 
 
 def effect_summary(effect: type[Effect]) -> tuple[str, str, str]:
@@ -333,15 +333,15 @@ def effect_declarations(effect: type[Effect]) -> Iterator[str]:
     """Declarations of an effect in addition to its equation."""
     words = [
         "dissipative" * effect.dissipative,
-        "in histories alone" * effect.transient,
-        "in turns alone" * (effect.name in OF_TURNS),
+        "only in time histories" * effect.transient,
+        "only in turns" * (effect.name in OF_TURNS),
         f"settles to `{effect.settles_to}`" * bool(effect.settles_to),
-        "on the battery alone" * effect.needs_battery,
-        "in runs both ways alone" * effect.needs_reverse,
-        "at a duty below 1 alone" * effect.needs_duty,
-        "odd in travel" * effect.odd_in_travel,
-        f"on {effect.movers} alone" * bool(effect.movers),
-        f"rests on `{', '.join(effect.rests_on)}`" * bool(effect.rests_on),
+        "only on the battery" * effect.needs_battery,
+        "only in runs in both directions" * effect.needs_reverse,
+        "only at a duty below 1" * effect.needs_duty,
+        "same direction in forward and backward travel" * effect.odd_in_travel,
+        f"only on {effect.movers}" * bool(effect.movers),
+        f"proportional to `{', '.join(effect.rests_on)}`" * bool(effect.rests_on),
     ]
     yield from filter(None, words)
 

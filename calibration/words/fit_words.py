@@ -40,12 +40,12 @@ def noise_off(channel: str, factor: float, source: str) -> str:
     """Ratio of residuals to their sds."""
     if not channel:
         return (
-            f"in every channel and under all conditions, residuals are {factor:.2g} times the {source} sds: check "
-            "the sds"
+            f"in every channel and under all conditions, residuals are {factor:.2g} times the {source} noise: "
+            "check the noise"
         )
     return (
-        f"residuals of {channels.find_channel(channel).label} are {factor:.2g} times the {source} sds under all "
-        "conditions: check these sds"
+        f"residuals of {channels.find_channel(channel).label} are {factor:.2g} times the {source} noise under all "
+        "conditions: check the noise"
     )
 
 
@@ -87,7 +87,7 @@ def of_rows(rows: tuple[int, ...], what: str, share: float = 0.0) -> str:
             "which does not explain all of their slip"
         )
     if what == "jumps":
-        return f"{listed}: the calibrated robot's running gear jumps; it leaves the ground at times"
+        return f"{listed}: the calibrated robot's running gear jumps off the ground at times"
     return f"{listed}: {what} with the calibrated robot"
 
 
@@ -121,9 +121,9 @@ def unsettled_search(names: Names) -> str:
 
 def search_generations(members: int, generations: int, settled: bool) -> str:
     """Progress of a search."""
-    end = "the last brought no significant gain"
+    end = "the last generation brought no significant gain"
     if not settled:
-        end = "the last still brought a gain: continue with more --generations"
+        end = "the last generation still brought a gain: continue with more --generations"
     return f"{count_noun(members, 'member')} in {count_noun(generations, 'generation')}; {end}"
 
 
@@ -159,7 +159,7 @@ def shown_by(test: fit_notes.AdequacyFinding) -> str:
         "": "",
         "stated": "the residuals exceed the stated noise",
         "repeats": "the residuals exceed the scatter of repeated runs",
-        "follow": f"{whose} follow {test.variable}",
+        "follow": f"{whose} depend on {test.variable}",
         "remember": f"{whose} show autocorrelation",
     }[test.what]
 
@@ -167,17 +167,17 @@ def shown_by(test: fit_notes.AdequacyFinding) -> str:
 #: Reasons why no test of residuals decides on the adequacy of a fit.
 OBSTACLES = {
     "undescribed": "This model does not describe these runs: {large}. Check units, signs, sides, and columns that "
-    "vary and are not used, before any parameter is read",
+    "vary and are not used, before you use a parameter",
     "not converged": "No verdict: the search did not converge, so better parameters exist ({every})",
-    "worse": "Not adequate: the fit is worse than the robot's file as stated ({every})",
+    "worse": "Not adequate: the fit is worse than the robot file as given ({every})",
 }
 
 
 def _misses(those: Sequence[RelativeError]) -> str:
-    """`total current 74 % of its measured rms (32 % with the file as stated)`."""
+    """`total current 74 % of its measured rms (32 % with the file as given)`."""
     each = [
         f"{channels.find_channel(m.channel).label} {_percent(m.fitted)} of its measured rms ({_percent(m.as_stated)} "
-        "with the file as stated)"
+        "with the file as given)"
         for m in those
     ]
     return ", ".join(each)
@@ -255,7 +255,7 @@ def residual_cluster(c: ResidualCluster) -> str:
     if c.correlation is not None:
         return (
             f"{what} are correlated with {c.column}{within}{signs} (rank correlation {c.correlation:+.2f}; {p}), "
-            f"{role}: find what changes along with it"
+            f"{role}: find what changes with it"
         )
     if c.coarser:
         shares = ", ".join(f"{name} alone {share:.0%} of it" for name, share in c.coarser)
@@ -279,9 +279,9 @@ SAID: dict[str, str | Callable[..., str]] = {
     "not_profiled": "no profiles were computed: intervals are from the linearized model, and too symmetric where "
     "the model is nonlinear",
     "no_covariance": "the posterior has no finite covariance: the values can be used, the intervals cannot",
-    "no_grip": "every run slides: static friction, and slip below it, are known only from their priors",
+    "no_grip": "every run slides: static friction, and slip below its limit, are known only from their priors",
     "estimated_noise": estimated_noise,
-    "beside_steady": "{inside} of {total} parameters agree with the optimum of the model steady within their 95 "
+    "beside_steady": "{inside} of {total} parameters agree with the optimum of the steady model within their 95 "
     "% intervals; the largest difference is {sds:.2f} sd, for {furthest}",
     "of_rows": of_rows,
     "at_bound": "{name} is at its {side} bound",
@@ -317,12 +317,12 @@ SAID: dict[str, str | Callable[..., str]] = {
         f"held out by {' or by '.join(blocks.kind_in_words(k) for k in others)}: the same predictions as held out "
         f"by {blocks.kind_in_words(kind)}, so shown once; these runs do not vary them separately"
     ),
-    "block_not_converged": "a search without a block of {kind} did not converge",
+    "block_not_converged": "a search with one block of {kind} left out did not converge",
     "agreement": search_agreement,
     "unsettled": unsettled_search,
     "elsewhere": "{searches} of {total} searches converged at other values of {names}",
-    "in_pieces": "{name}: the values within its 95 % interval are in {pieces} pieces, with worse values between "
-    "them; readings taken closer together would separate them",
+    "in_pieces": "{name}: its 95 % interval consists of {pieces} parts, with worse values between them; readings "
+    "at more closely spaced conditions would tell the parts apart",
     "generations": search_generations,
     "lost_rows": lost_rows,
     "members_jump": members_jump,

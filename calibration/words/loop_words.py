@@ -180,16 +180,17 @@ def mechanism_evidence(found: loop_notes.Mechanism) -> str:
     """Evidence for a mechanism: share of the misfit, gain on held-out runs, and repeatability."""
     errors = f", {found.gain / found.se:.1f} standard errors" if 0 < found.se < math.inf else ""
     return (
-        f"explains {100 * found.share:.0f} % of the excess misfit, gains {found.gain:.2g} nat per affected reading "
-        f"on held-out runs{errors}, and is found again in {100 * found.again:.0f} % of the fits without one block"
+        f"explains {100 * found.share:.0f} % of the misfit beyond noise, raises the log likelihood of held-out runs "
+        f"by {found.gain:.2g} per affected reading{errors}, and is found again in {100 * found.again:.0f} % of the "
+        "fits with one block left out"
     )
 
 
 #: Evidence against a mechanism.
 NO_MECHANISM = {
-    "share": "it explains only {share:.0f} % of the excess misfit",
-    "gain": "on held-out runs it gains {0.gain:.2g} ± {0.se:.2g} nat a reading",
-    "again": "it is found again in only {again:.0f} % of the fits without one block",
+    "share": "it explains only {share:.0f} % of the misfit beyond noise",
+    "gain": "it changes the log likelihood of held-out runs by {0.gain:+.2g} ± {0.se:.2g} per reading",
+    "again": "it is found again in only {again:.0f} % of the fits with one block left out",
     "many": "any of {many} variables or equations may be its cause",
 }
 
@@ -198,7 +199,7 @@ def no_mechanism(found: loop_notes.Mechanism) -> str:
     """Reasons against the best mechanism."""
     numbers = {"share": 100 * found.share, "again": 100 * found.again, "many": found.candidates}
     why = [NO_MECHANISM[name].format(found, **numbers) for name in found.fails]
-    return f"the best one is a {found.families[0]}, but {' and '.join(why)}"
+    return f"the best candidate is a {found.families[0]}, but {' and '.join(why)}"
 
 
 def curve_course(d: UnnamedDiscrepancy) -> str:
@@ -248,8 +249,7 @@ def at_other_noise(found: Sequence[NoiseVerdict]) -> str:
     for one in found:
         same.setdefault(brief_verdict(one.summary), []).append(f"{one.factor:g}")
     each = [
-        f"with {' and with '.join(factors)} times that noise the verdict is {words}"
-        for words, factors in same.items()
+        f"with {' and with '.join(factors)} times the noise the verdict is {words}" for words, factors in same.items()
     ]
     near = " (after a few steps from the fits with the stated noise)" if any(one.near for one in found) else ""
     return "; ".join(each) + near
@@ -281,11 +281,11 @@ def _tentative(those: Sequence[loop_notes.MissingEffect], support: loop_notes.Na
 
 
 def verdict_line(stages: LoopStages) -> str:
-    """The verdict at one noise: `at one noise: class, series_resistance or supply_sag`."""
+    """The verdict at one noise level: `at one noise level: class, series_resistance or supply_sag`."""
     sure = [" or ".join(members) for members in stages.members] or [
         with_article(family) for family in stages.families
     ]
-    return f"at one noise: {', '.join((stages.verdict, *sure))}"
+    return f"at one noise level: {', '.join((stages.verdict, *sure))}"
 
 
 def ranking_lines(found: EffectRanking, most: int = 5, brief: bool = False) -> list[str]:
@@ -362,7 +362,7 @@ def shown_over(variable: str, by_duty: bool = False) -> str:
     variable = "duty" if by_duty and variable == "voltage" else variable
     happens = bases.window_from_name(variable)
     if variable == "side":
-        return "unlike on the two sides"
+        return "different on the two sides"
     if happens is None:
         return (
             f"clearest when plotted over {variable.replace('_', ' ')}"
@@ -410,7 +410,7 @@ def how_sure(found: DiscoveryResult, effect: FoundEffect) -> str:
         evidence = "" if test is None else f": {test.root:.1f} σ (chance: {test.needed:.1f})"
         if test is not None and test.shows_form:
             over = test.over.replace("_", " ")
-            evidence += f"; accuracy of its form ±{100 * test.spread:.0f} % over {over}"
+            evidence += f"; its size varies by ±{100 * test.spread:.0f} % over {over}"
         return f"established{evidence}"
     return f"tentative: it improves predictions, but {effect_doubts(test)}" if effect_doubts(test) else "tentative"
 
@@ -434,7 +434,7 @@ def brief_answer(found: DiscoveryResult, moved: Sequence[str], next_step: str) -
     ]
     reached, total = max((int(e["rows"]) for e in stated.values()), default=0), len(found.runs)
     aside = f", {len(found.outliers)} set aside as outliers" * bool(found.outliers)
-    few = f" (with the robot file as given, the model reaches {reached} rows)" * (reached < total)
+    few = f" (with the robot file as given, only {reached} rows can be simulated)" * (reached < total)
     rows = f"{int(found.included.sum())} of {total} rows are used{aside}{few}"
     return (
         *filter(None, [changes.rstrip()]),
@@ -464,9 +464,9 @@ def _rms(errors: Errors, total: int) -> str:
     """Largest rms error of any channel, the worst reading, and the rows reached if not all are."""
     non_empty = [e for e in errors.values() if e["rows"]]
     if not non_empty:
-        return "no row is reached"
+        return "no row can be simulated"
     rms, worst, rows = (max(float(e[name]) for e in non_empty) for name in ("rms_percent", "max_percent", "rows"))
-    few = f" ({rows:.0f}/{total} reached)" if rows < total else ""
+    few = f" ({rows:.0f} of {total} rows simulated)" if rows < total else ""
     return f"rms ≤ {rms:.1f} %, worst {worst:.1f} %{few}"
 
 
@@ -481,7 +481,7 @@ def largest_share(found: DiscoveryResult) -> str:
     row, k = np.unravel_index(int(np.nanargmax(squares)), squares.shape)
     columns = {c: runs[c][row] for c in ("configuration", *runs.axes) if runs.has(c)}
     where, label = _conditions(columns), found.channels[k].label
-    return f"Row {found.numbers[row]} ({where}): its {label} makes {share:.0f} % of the remaining misfit"
+    return f"Row {found.numbers[row]} ({where}): its {label} causes {share:.0f} % of the remaining misfit"
 
 
 def _conditions(columns: Mapping[str, str | float]) -> str:
@@ -506,19 +506,19 @@ def refit_header(found: DiscoveryResult, robot_name: str) -> str:
 
 
 #: In the place of a formula.
-NO_FORMULA = "no single term explains 90 % of it"
+NO_FORMULA = "no single term explains 90 % of the curve"
 
 # --- whether names stand --------------------------------------------------------------------------------
 
 #: Reasons for or against names.
 REASONS = {
     "": "",
-    "implausible": "every effect of the library that explains it has an implausible size",
-    "larger": "{effects} would explain more, but not at a plausible size",
-    "better curve": "one {curves} is a better explanation than {effects}",
-    "curve alone": "one {curves} leaves no significant misfit",
+    "implausible": "every effect that explains the discrepancy has an implausible size",
+    "larger": "{effects} would explain more, but only at an implausible size",
+    "better curve": "a {curves} explains the data better than {effects}",
+    "curve alone": "a single {curves} leaves no significant misfit",
     "none by itself": "{lost}",
-    "beside": "each one, added to the fit of the others, explains more than chance would: {strengths}",
+    "beside": "each effect, added to the fit of the others, explains more than chance would: {strengths}",
 }
 
 
@@ -553,14 +553,14 @@ def _score_words(test: loop_notes.NameTest) -> str:
 DOUBTS = {
     "chance": ("chance", "explains {0.root:.1f} σ{beside}; chance alone reaches {0.needed:.1f}"),
     "curve": ("a curve", "is a worse explanation than a smooth curve in its place"),
-    "row": ("{0.what} {0.rests_on}", "rests on {0.what} {0.rests_on}"),
-    "blocks": ("blocks", "is chosen again in {again:.0f} % of the data with a block left out"),
-    "larger": ("size", "has a better rival, but of implausible size ({larger})"),
+    "row": ("{0.what} {0.rests_on}", "depends on {0.what} {0.rests_on} alone"),
+    "blocks": ("blocks", "is chosen again in only {again:.0f} % of the fits with one block left out"),
+    "larger": ("size", "explains less than {larger} at an implausible size"),
     "remains": ("equation", "leaves an error in its own equation"),
-    "form": ("its form", "changes{spread} over {over_variable} ({0.varies:.1f} σ)"),
+    "form": ("its form", "changes in size{spread} over {over_variable} ({0.varies:.1f} σ)"),
     "noise": (
         "noise",
-        "amounts to {0.offset:.1%} of the readings of an instrument whose noise is not stated (--noise)",
+        "is only {0.offset:.1%} of the readings of an instrument whose noise is not stated (--noise)",
     ),
 }
 
@@ -658,10 +658,10 @@ def hidden_effects_sentence(found: DiscoveryResult) -> str:
 
 
 def moved_parameter(name: str, value: float, stated: float, unit: str, shift: float) -> str:
-    """`motor.friction_viscous is 1.2e-05 N·m·s, 3 times the stated 4e-06 (+2.3 prior sds)`."""
+    """`motor.friction_viscous is 1.2e-05 N·m·s, 3 times the stated value 4e-06 (+2.3 prior sds)`."""
     ratio = f"{value / stated:.2g} times the " if stated and value / stated > 0 else ""
     now = freed_value(loop_notes.AlternativeValue(f"`{name}`", value, unit))
-    return f"{now}, {ratio}stated {stated:.3g} ({shift:+.1f} prior sds)"
+    return f"{now}, {ratio}stated value {stated:.3g} ({shift:+.1f} prior sds)"
 
 
 def effect_amplitude(e: FoundEffect) -> str:
@@ -686,7 +686,7 @@ def indistinguishable_effects(found: DiscoveryResult, e: FoundEffect) -> str:
     )
     values = " or ".join(
         f"{freed_value(loop_notes.AlternativeValue(name, s.value, s.unit))} "
-        f"(stated {s.stated:.3g}, {s.prior_sds:+.1f} sds)"
+        f"(stated value {s.stated:.3g}, {s.prior_sds:+.1f} sds)"
         for name, s in e.stated.items()
     )
     return ", or ".join(words for words in (others, values) if words)
@@ -705,10 +705,10 @@ def rising_errors_sentence(found: Sequence[WorseChannel], predicted: Mapping[str
         if mine:
             changes[-1] += f" (same {min(w.rows for w in mine)} rows)"
         if before > after:
-            changes.append(f"{count_noun(before - after, 'row')} fewer predicted")
+            changes.append(f"{count_noun(before - after, 'row')} can no longer be predicted")
         if changes:
             parts.append(f"by {blocks.kind_in_words(kind)} {', '.join(changes)}")
-    return f"Predicts worse on held-out rows: {'; '.join(parts)}." if parts else ""
+    return f"Predictions of held-out rows get worse: {'; '.join(parts)}." if parts else ""
 
 
 def _two_numbers(before: float, after: float) -> str:
@@ -737,9 +737,9 @@ def track_model_answer(found: TrackModelResult) -> str:
         for name, e in found.constants.items() if name.startswith("running_gear.")
     )  # fmt: skip
     on = "" if found.settled else ("; the search has not converged: continue with --members and more --generations")
-    slip = f"slip of the {found.rows} rows on tracks {before:.2g} → {after:.2g} points rms"
+    slip = f"rms slip error of the {found.rows} rows on tracks {before:.2g} → {after:.2g} percentage points"
     if not found.gear_explains_discrepancy:
-        why = f"; {', '.join(found.outside)} outside" if found.outside else ""
+        why = f"; outside their priors: {', '.join(found.outside)}" if found.outside else ""
         return (
             f"Track model, {track_model_question(found.asked)}: no running gear within its priors was found that "
             f"explains this error ({slip}, χ² falls by {found.fall:.0f}, p = {found.p:.2g}{why}){on}"
@@ -773,8 +773,7 @@ def noise_from_series(noise: tuple[SeriesNoise, ...]) -> str:
     freedom = min(s.freedom for s in noise)
     return (
         f"no sd is stated for {', '.join(s.channel.name for s in noise)}: {', '.join(parts)} are estimated "
-        f"from how readings scatter along {' and '.join(along)} ({freedom:.1f} degrees of freedom); state yours with "
-        "--noise"
+        f"from the scatter along {' and '.join(along)} ({freedom:.1f} degrees of freedom); state yours with --noise"
     )
 
 
@@ -856,8 +855,8 @@ def unwritten_reason(curve: bool, gain: float, se: float) -> str:
     what = "the curve" if curve else "what was found"
     how = "no better than" if curve and gain > 0 else "worse than"
     return (
-        f"{what} predicts held-out runs {how} the refit ({gain:+.2f} ± {se:.2f} nat a reading), so robot.toml "
-        "contains the refit"
+        f"{what} predicts held-out runs {how} the refit (log likelihood {gain:+.2f} ± {se:.2f} per reading), so "
+        "robot.toml contains the refit"
     )
 
 
@@ -865,13 +864,13 @@ def unwritten_reason(curve: bool, gain: float, se: float) -> str:
 SAID: dict[str, str | Callable[..., str]] = {
     "assumed_noise": "no sd is stated for {channels}: {usual} is assumed; state yours with --noise",
     "noise_from_series": noise_from_series,
-    "refit_worse": "{channel}: the refit misses it by {refit:.0%} of its measured rms and the robot as stated by "
-    "{stated:.0%}, so the {word} noise gives some of its readings too much weight; state the "
+    "refit_worse": "{channel}: the refit made its error larger ({stated:.0%} of the measured rms with the robot file "
+    "as given, {refit:.0%} after the refit). The {word} noise gives some of its readings too much weight; state the "
     "instrument's noise with --noise",
     "copies": copied_rows,
     "kept_out": kept_out,
     "phases_differ": "the phase of the wave differs between runs (it explains {free:.0f} σ² with a free phase in "
-    "each run, {held:.0f} with a common one), so robot.toml contains the mean; start every run "
+    "each run, {held:.0f} with a common phase), so robot.toml contains the mean phase; start every run "
     "with the shaft at a mark",
     "still_lacks": lambda place, variable: (
         f"not everything is explained: an error in the {bases.place_in_words(place)} that varies with "
@@ -880,16 +879,17 @@ SAID: dict[str, str | Callable[..., str]] = {
     "late": imposed_delay,
     "led": leader_choice,
     "not_predictable": lambda kinds: (
-        "neither scored nor tested, because the other runs cannot predict them: blocks by "
-        f"{' and by '.join(blocks.kind_in_words(kind) for kind in kinds)} that hold all runs of a configuration "
-        "with parameters of its own"
+        f"blocks by {' and by '.join(blocks.kind_in_words(kind) for kind in kinds)} that contain all runs of a "
+        "configuration with its own parameters are neither scored nor tested, because the other runs cannot predict "
+        "them"
     ),
     "lost_replicates": "only {settled} of {asked} bootstrap tables could be refitted; the thresholds come from these",
     "outstanding": lambda factors, word: (
         f"out of time: whether the verdict is the same with {' and '.join(f'{f:g}' for f in factors)} times the "
         f"{word} noise is not known; run the same command without --within"
     ),
-    "too_few_replicates": "{settled} bootstrap tables are too few to use every kind of evidence; use 500 or more",
+    "too_few_replicates": "{settled} bootstrap tables are too few to use every kind of evidence; use 500 or more "
+    "(--replicates)",
     "rests_on": rests_on,
     "unwritten": unwritten_reason,
 }

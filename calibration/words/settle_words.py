@@ -14,10 +14,10 @@ OF_LEVELS = ("changes", "short", "settling", "accelerates")
 WHY = {
     "changes": ("the imposed quantity changes all the time", "hold it at each level for a while"),
     "short": ("the level is held too briefly", "hold it longer, or set a smaller --shortest"),
-    "settling": ("still changes at the end of its level", "hold the level longer, or state --drift"),
-    "accelerates": ("still accelerates at the end of its level", "hold the level longer, or state --drift"),
+    "settling": ("still changes at the end of its level", "hold the level longer, or set a larger --drift"),
+    "accelerates": ("still accelerates at the end of its level", "hold the level longer, or set a larger --drift"),
     "idle": ("nothing drives the motors", "nothing: settled runs need a driven motor"),
-    "rest": ("the drive does not move", "nothing: friction holds it there; time histories use it"),
+    "rest": ("the drive does not move", "nothing: friction holds the drive; a fit to the log uses these samples"),
     "stuck": (
         "shows the same number for a long time: saturated or frozen",
         "repair the instrument or change its range",
@@ -27,7 +27,7 @@ WHY = {
         "repair the instrument, or log its mean if it delivers pulses",
     ),
     "unread": ("no channel has enough readings", "log more readings, or remove the rows without them"),
-    "undriven": ("the driver brakes or coasts", "nothing: time histories use it"),
+    "undriven": ("the driver brakes or coasts", "nothing: a fit to the log uses these samples"),
 }
 
 

@@ -15,7 +15,7 @@ STEPS = {
     "mechanism": "mechanisms that explain most of the misfit",
     "alike": "effects that explain as much as {}",
     "held out": "predictions of held-out runs",
-    "factors": "the verdict with {} times the {} noise, next to:",
+    "factors": "at the same time, the verdict with {} times the {} noise",
     "shape": "the shape of the missing term",
     "errors": "errors on held-out data",
     "next": "the next experiment",

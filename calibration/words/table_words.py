@@ -61,7 +61,7 @@ def differing_repeats(
             f"{'are' if many else 'is'} not used as a condition: {name}, or, for a load, give each level its own "
             "configuration"
         )
-    wrong = f"{reading}; remove a wrong one"
+    wrong = f"{reading}; remove the wrong row"
     return f"{wrong}, or find what changed between such rows without a column in the table" if more else wrong
 
 
@@ -86,7 +86,7 @@ def nothing_varies(source: str, rows: int, column: str, unused: Names = ()) -> s
     name = f"{', '.join(unused)} {vary} and {are} not used: name {them} under [columns] if {if_conditions}, or "
     return (
         f"{source}: these {rows} runs differ only by noise, so they determine nothing; "
-        f"{name * bool(unused)}record runs at several values of {column} or of the load"
+        f"{name * bool(unused)}record runs at several values of {column} or at several loads"
     )
 
 
@@ -99,7 +99,7 @@ def copied_channel(source: str, column: str, other: str, intercept: float, slope
         return (
             f"{sentence}; if it is computed rather than measured, remove it, since the noise of {other} counts twice"
         )
-    return f"{sentence}, so it is computed, not measured; remove it from channels and table, or use an instrument"
+    return f"{sentence}, so it is computed, not measured; remove it from channels and table, or measure it"
 
 
 def ends_early(runs: Names, lasts: float, share: float) -> str:
@@ -117,12 +117,10 @@ def _runs(names: Names, one: str, several: str) -> str:
 
 def inherited_priors(part: str, changed: tuple[tuple[str, float, float], ...], kept: Names) -> str:
     """A part that is not the nominal robot's while friction of it is."""
-    each = ", ".join(f"{name} {mine:g} for {nominal:g}" for name, mine, nominal in changed)
-    one = len(kept) == 1
+    each = ", ".join(f"{name} {mine:g} instead of {nominal:g}" for name, mine, nominal in changed)
     return (
-        f"{part} differs from that of the nominal robot ({each}), but its {', '.join(kept)} still "
-        f"{'is' if one else 'are'}: {'that prior comes' if one else 'those priors come'} from another robot; set "
-        "your values in the robot's file or with --prior"
+        f"{part} differs from that of the nominal robot ({each}), but the prior of its {', '.join(kept)} is still "
+        "the nominal robot's; set your values in the robot's file or with --prior"
     )
 
 
@@ -150,7 +148,7 @@ SAID: dict[str, str | Callable[..., str]] = {
     "or state the noise with --noise",
     "unused": unused_columns,
     "no_load_gives": "{source}, {theirs}: friction and a constant torque of a load leave {share:.0%} of its "
-    "variance unexplained; if a brake sets it, it is a condition: set [columns] load_torque_Nm "
+    "variance unexplained; if a brake sets this torque, it is a condition: set [columns] load_torque_Nm "
     '= "{theirs}" in the robot\'s file, and take output_torque out of its channels',
     "nothing_varies": nothing_varies,
     "copied": copied_channel,

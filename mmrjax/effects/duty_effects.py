@@ -38,7 +38,7 @@ class DutyExponent(DutyEffect):
     """
 
     amplitude: Scalar = amplitude(
-        "-", "exponent of the command beyond 1", (-0.8, 2.0), "throttle curves of hobby controllers: 0.5 to 2", sd=0.2
+        "-", "exponent of the command minus 1", (-0.8, 2.0), "throttle curves of hobby controllers: 0.5 to 2", sd=0.2
     )
     exponent: Scalar = parameter(
         1.0, "-", "exponent n of the command", (0.2, 4.0), "1 plus the amplitude for a pure power", relative_sd=0.3
@@ -62,7 +62,9 @@ class DutyDeadBand(DutyEffect):
     (blanking time). The sign is smooth within a duty of 0.001.
     """
 
-    amplitude: Scalar = amplitude("-", "dead band d over 1 - d", (-0.2, 1.0), "a few percent of the command", sd=0.05)
+    amplitude: Scalar = amplitude(
+        "-", "dead band d as d / (1 - d)", (-0.2, 1.0), "a few percent of the command", sd=0.05
+    )
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:
         size = jnp.abs(signals.command)
@@ -79,7 +81,7 @@ class DutySaturation(DutyEffect):
     """
 
     amplitude: Scalar = amplitude(
-        "-", "share of the duty above D_s that is lost", (-1.0, 1.0), "1 at a limit that holds", sd=0.5
+        "-", "share of the duty above D_s that is lost", (-1.0, 1.0), "1 if the voltage stops rising at D_s", sd=0.5
     )
     duty_full: Scalar = parameter(
         0.8, "-", "duty D_s at which the limit begins", (0.3, 0.99), "end points of speed controllers: 0.8 to 1",

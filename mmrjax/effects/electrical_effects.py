@@ -96,7 +96,7 @@ class ThermalDrift(ElectricalEffect):
     The winding warms up while the run lasts.
 
     Source: IEC 60028 for α. The maker's sheet of RE30 310007 for τ and R_wh. The housing, with 593 s, keeps its
-    temperature during a run. Its share is `winding_heating`, which steady travel cannot distinguish from this.
+    temperature during a run. In steady travel this effect looks like `winding_heating`.
     The memory is T [K]. Without a memory the settled value is used. If the winding's temperature is followed
     (missions), its resistance follows that, and the effect adds 0.
     """

@@ -98,7 +98,7 @@ class BackdrivingLoss(GearboxEffect):
     Source: Duclusaud, Passault, Padois and Ly, Extended friction models for the physics simulation of servo
     actuators (2024, arXiv:2410.08650): directional models in which motor and load each have a share of friction.
     Niemann and Winter, Maschinenelemente II (2003): the backward efficiency 2 - 1/η is below η. A share 1 - a of the
-    load's torque reaches the gear, and eq. (19)'s η_b of that the motor. At a = 1 the gear is self-locking.
+    load's torque reaches the gear, and a share η_b of that, eq. (19), the motor. At a = 1 the gear is self-locking.
     The load excludes the rotor's inertia. The effect fades at rest with the shaft's smooth sign.
     """
 
@@ -131,7 +131,7 @@ class BristleLoadLoss(Bristle, GearboxEffect):
     settles_to = "gear_load_loss"
 
     amplitude: Scalar = amplitude(
-        "-", "share of the output torque lost through the bristle", (-0.2, 0.5), "as of `gear_load_loss`", sd=0.05
+        "-", "share of the output torque lost through the bristle", (-0.2, 0.5), "as for `gear_load_loss`", sd=0.05
     )
     angle_breakaway: Scalar = breakaway_parameter()
 
@@ -157,7 +157,7 @@ class BristleBackdrivingLoss(Bristle, GearboxEffect):
 
     amplitude: Scalar = amplitude(
         "-", "share of the load's torque lost through the bristle while the load drives", (-0.2, 1.0),
-        "as of `backdriving_loss`", sd=0.1,
+        "as for `backdriving_loss`", sd=0.1,
     )  # fmt: skip
     angle_breakaway: Scalar = breakaway_parameter()
 

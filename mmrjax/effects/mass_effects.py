@@ -19,7 +19,7 @@ class MassEffect(Effect):
 class MassError(MassEffect):
     """ΔM = a M: the stated mass, payload included, times 1 + a.
 
-    The true mass of robot and load differs from the stated one by a share.
+    The true mass of robot and load differs from the stated mass by a constant percentage.
 
     Source: calibration error of the scales (OIML R 76 class IIII: a few tenths of a percent; a spring
     balance: percents). Weight, adhesion, guide load and inertia all follow from the mass, so it enters only

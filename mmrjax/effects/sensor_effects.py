@@ -85,9 +85,9 @@ class EncoderScale(SensorEffect):
 class SpeedGain(SensorEffect):
     """ΔV = a V in the reading.
 
-    The distance that the robot is timed over differs from the stated one.
+    The measured distance over which the robot is timed is wrong.
 
-    Source: speed as distance over time (Section 4 of the paper): both errors are relative ones.
+    Source: speed as distance over time (Section 4 of the paper): the relative errors of both add.
     """
 
     channel = "speed"

@@ -23,7 +23,7 @@ class SlipEffect(Effect):
 class RollingRadius(SlipEffect):
     """ΔV = -a r_k ω_k: the robot travels (1 + a) r_k per radian, at the same lever arm of the traction.
 
-    The distance rolled per turn differs from the nominal radius.
+    The distance rolled per turn is not that of the nominal radius.
 
     Source: kinematic rolling radius against loaded radius (Wong, Theory of Ground Vehicles, 2008, ch. 1).
     The difference is kinematic and not dissipative: a > 0 reduces the loss in slip.
@@ -86,7 +86,7 @@ class SpeedSlip(SlipEffect):
 
     Slip that grows with speed.
 
-    Source: first term of an expansion of the slip in speed. Treads that lift off between impacts. The loss
+    Source: first term of an expansion of the slip in speed. Treads lift off between impacts. The loss
     is kinematic: on a descent it removes no power.
     """
 

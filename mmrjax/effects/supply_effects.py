@@ -20,7 +20,7 @@ class SupplySag(SupplyEffect):
     Leads and internal resistance that both motors share.
 
     Source: Fig. 20 of the paper (supply, leads and ammeter of the bench). Ohm (1827). With equal sides
-    (assumption 3) it equals `series_resistance` of twice its size: only a run with one motor off
+    (assumption 3) it acts as a `series_resistance` of 2 a: only a run with one motor off
     distinguishes the two.
     """
 

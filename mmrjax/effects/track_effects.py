@@ -292,7 +292,7 @@ class TorqueOffset(TrackEffect):
 class Presliding(Bristle, TrackEffect):
     """ΔM_t = a (z - sign ω_k), θ_s z' = ω_k - |ω_k| z, z(0) = 0: a share a of the dry loss acts through bristles.
 
-    Dry friction builds up over a small angle instead of at once, as contacts yield before they slide.
+    Dry friction builds up over a small angle instead of at once, because contacts yield before they slide.
 
     Source: Dahl, A solid friction model (1968), with exponent 1. It is the first order of Canudas de Wit, Olsson,
     Åström and Lischinsky (1995) without their damping of the bristles. Settled z = sign ω_k: steady travel does not

@@ -124,11 +124,11 @@ class SideRadius(Effect):
 class LateralGrip(Effect):
     """ΔM_ψ = a |ω| M_y against the turn, M_y the moment of each side's lateral forces: φ_y (1 + a |ω|) in the turn.
 
-    Grousers dig in, or loose ground piles up at the tracks, more at higher lateral speed. The change of the lateral
-    force, which matters only for the path in a settled turn, is left to the sliding.
+    Grousers dig in, or loose ground piles up at the tracks, more at higher lateral speed. The lateral force
+    itself, which matters only for the path in a settled turn, does not change.
 
-    Source: a ratio of frictions linear in the yaw rate. Wong, Theory of Ground Vehicles, chapter 6: the coefficient
-    of lateral resistance is not constant. It differs from `turning_resistance` where contacts creep.
+    Source: a friction ratio that is linear in the yaw rate. Wong, Theory of Ground Vehicles, chapter 6: the
+    coefficient of lateral resistance is not constant. It differs from `turning_resistance` where contacts creep.
     """
 
     balance = "yaw"

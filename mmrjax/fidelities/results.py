@@ -69,7 +69,7 @@ def run_batch(
     """Simulates a batch of any shape."""
     runs = math.prod(conditions.shape)
     if history and runs > HISTORIES:
-        raise UsageError(f"history: got {runs} runs; at most {HISTORIES} can be kept over time; state history=False")
+        raise UsageError(f"history: got {runs} runs; at most {HISTORIES} can be kept over time; set history=False")
     simulate = fidelity.histories if history else fidelity.run
     assert simulate is not None
     if has_tracer((robot, conditions)):

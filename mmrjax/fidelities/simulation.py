@@ -96,8 +96,8 @@ def simulate(
     _check_turning(robot, conditions, profile)
     if conditions.held is not None and (model != "steady" or robot.has_ground or conditions.motor_speed is not None):
         raise UsageError(
-            "held: a clamp holds the output of a shaft in settled runs at an imposed voltage or current; expected "
-            "such runs, or leave held out"
+            "held: a clamp needs settled runs of a shaft at an imposed voltage or current; use model='steady' with "
+            "such a rig, or omit held"
         )
     braked = conditions.load_torque is not None or (profile is not None and profile.load_torque is not None)
     if braked and robot.has_ground:
@@ -215,7 +215,7 @@ def check_robot(robot: Robot) -> None:
         spec = parameter.spec
         if np.ndim(value) or np.asarray(value).dtype.kind not in "biuf":
             got = f"shape {np.shape(value)}" if np.ndim(value) else repr(value)
-            raise UsageError(f"{parameter.name}: got {got}; expected one number; of several robots use jax.vmap")
+            raise UsageError(f"{parameter.name}: got {got}; expected one number; for several robots use jax.vmap")
         wrong = _first_outside(value, *spec.bounds)
         if wrong is not None:
             low, high = spec.bounds

@@ -143,7 +143,7 @@ def _commanded_conditions(robot: Robot, command: Command, conditions: Conditions
         if shape := _shape_of_numbers(value):
             raise UsageError(f"command, {name}: got shape {shape}; expected one number, or jax.vmap over several")
     if conditions.turns or not values.keys().isdisjoint(OF_TURNS):
-        raise UsageError("conditions: the sides are driven apart; a step is of straight travel, use mmrjax.simulate")
+        raise UsageError("conditions: got a command for each side; a step travels straight, use mmrjax.simulate")
     if conditions.shape:
         raise UsageError(f"conditions: got runs of shape {conditions.shape}; expected one, and jax.vmap over several")
     conditions = check_conditions(robot, dataclasses.replace(conditions, **values))

@@ -222,7 +222,7 @@ def check_track_runs(
     if conditions.motor_speed is not None or (conditions.turns and conditions.of_sides().motor_speed is not None):
         raise ValueError("motor_speed: got an imposed speed; this model drives the motors by their voltage")
     if sample < step or abs(sample / step - round(sample / step)) > 1e-6:
-        raise ValueError(f"step: got {step:g} s; expected {sample:g} s, a sample, divided by a whole number")
+        raise ValueError(f"step: got {step:g} s; expected the sample time, {sample:g} s, divided by a whole number")
     if duration < sample or abs(duration / sample - round(duration / sample)) > 1e-6:
         raise ValueError(f"duration: got {duration:g} s; expected a whole number of samples of {sample:g} s")
     if has_tracer((robot, conditions)):

@@ -324,8 +324,10 @@ def gearbox(
         return torque - load - (chassis.inertia + signals.inertia_added) * signals.acceleration_wheel
 
     torque, output = load, at_output(load)
-    if settled or not any(e.balance == "gearbox" for e in robot.effects):
+    if settled:
         return output
+    if not any(e.balance == "gearbox" for e in robot.effects):
+        return _fill_unset(output, torque_carried=torque - surplus(torque))
     for _ in range(TORQUE_STEPS):
         left, rise = jax.jvp(surplus, (torque,), (jnp.ones_like(torque),))
         torque = torque - left / rise

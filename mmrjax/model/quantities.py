@@ -404,7 +404,7 @@ TABLE: dict[str, tuple[Quantity, ...]] = {
         ),
         Condition("battery", "", "on-board battery instead of the external supply", (0.0, 1.0)),
         Condition("discharge", "C", "charge already taken from the battery", (0.0, 360_000.0)),
-        Condition("adhesion", "", "adhesion as a ratio to the one the robot is stated for", _RATIO),
+        Condition("adhesion", "", "adhesion relative to that in the robot's file", _RATIO),
         Condition("order", "", "place in the sequence of runs", (0.0, 1e9), in_tables=True),
         Condition(
             "duty", "", "share of the supply's voltage that the driver gives the motors", _SHARE, percent=True,
@@ -430,7 +430,7 @@ TABLE: dict[str, tuple[Quantity, ...]] = {
             field="heading_deg", heading="heading from uphill [°]", in_tables=True,
             imposed=(*_BY_VOLTAGE, "motor_speed"), acts=VEHICLE,
         ),
-        Condition("adhesion_lateral", "", "the same as adhesion, across the travel", _RATIO),
+        Condition("adhesion_lateral", "", "lateral adhesion relative to that in the robot's file", _RATIO),
         *(
             Condition(
                 f"levers_{end}", "deg",
@@ -542,7 +542,7 @@ TABLE: dict[str, tuple[Quantity, ...]] = {
     "mission": (
         Quantity("duration", "s", "duration", resolution=1),
         Quantity("distance", "m", "distance travelled, either way", resolution=2),
-        Quantity("displacement", "m", "displacement, forward less backward", resolution=2),
+        Quantity("displacement", "m", "displacement, forward minus backward", resolution=2),
         Quantity("energy", "Wh", "energy"),
         Quantity("energy_per_metre", "Wh/m", "energy per metre", resolution=5),
         Quantity("energy_drawn", "Wh", "energy drawn"),
@@ -562,7 +562,7 @@ TABLE: dict[str, tuple[Quantity, ...]] = {
         Quantity("range", "m", "range at this duty", resolution=0),
         *(Quantity(f"energy_to_{sink}", "Wh", f"energy to: {meaning}") for sink, meaning in SINKS.items()),
         Quantity("energy_stored", "Wh", "rise of the energy in motion"),
-        Quantity("unaccounted_share", "-", "energy unaccounted for, of that turned over", resolution=9),
+        Quantity("unaccounted_share", "-", "energy error of the integration, of the energy converted", resolution=9),
     ),
     "mission of sides": (
         Quantity("turned", "deg", "turned by, positive to the left", resolution=1),

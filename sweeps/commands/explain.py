@@ -106,7 +106,7 @@ def _effect_lines(name: str, library: Library) -> Iterator[Line]:
         else:
             yield f"  {p.name}", f"{float(p.value):g} {p.spec.unit}: {p.spec.meaning}"
     if declarations := ", ".join(experiment_words.effect_declarations(effect)):
-        yield "declares", declarations
+        yield "properties", declarations
     yield "in data", f"{effect.family()}{_histories_sentence(effect)}"
     for line in _change_sentences(example):
         yield "", line

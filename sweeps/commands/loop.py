@@ -188,7 +188,7 @@ def _report_stored_stages(stages: Mapping[str, Any], folder: RunFolder, robot_na
         return
     kept = [name for name in stages if folder.keeps(name)]
     if not kept:
-        print_message(f"nothing could be saved of {', '.join(stages)}; the same command starts again")
+        print_message(f"{', '.join(stages)} could not be saved; the same command starts from the beginning")
         return
     print_message(f"kept: {', '.join(kept)}; to continue, run the same command with --out {folder.path}")
     if "verdict" in stages:

@@ -11,6 +11,7 @@ import numpy as np
 from calibration.data import Columns, Json
 from calibration.data.input_errors import BadConfiguration
 from calibration.data.runs import Runs
+from mmrjax.errors import count_noun
 from mmrjax.fidelities.track import track_batch
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.paper_tables import PAYLOADS_KG, VOLTAGES_V
@@ -65,8 +66,8 @@ def execute(config: configuration.Resonance, beside: configuration.FolderPart) -
         raise BadConfiguration(f"--voltages: got {config.voltages_V[0]:g}; expected above 0 and up to 100, forward")
     if len(config.voltages_V) < FEWEST:
         raise BadConfiguration(
-            f"--voltages: got {len(config.voltages_V)} of them; expected at least {FEWEST}, or peaks over speed "
-            "cannot be found"
+            f"--voltages: got {count_noun(len(config.voltages_V), 'value')}; expected at least {FEWEST}, so that "
+            "peaks over speed can be found"
         )
     if config.options["duration"] < SHORTEST:
         raise BadConfiguration(

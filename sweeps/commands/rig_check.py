@@ -82,11 +82,11 @@ class RigCheck:
         }
         delay = float(rig.delay)
         late = f", {delay:g} s late" if delay else ""
-        lines = ", on straight lines between the rows of histories" * (rig.between_rows == "linear")
+        lines = ", interpolated between the rows of time histories" * (rig.between_rows == "linear")
         coasts = "; between the pulses of a duty the motors coast" * (self.robot.driver.decay == FAST)
         return [
             f"{motors}, through {gear}, {loads}.",
-            f"Imposed is {imposed}{late}{lines}{coasts}; histories {starts[rig.start]}.",
+            f"Imposed: {imposed}{late}{lines}{coasts}. Time histories {starts[rig.start]}.",
         ]
 
     def remarks(self) -> list[str]:
@@ -94,13 +94,13 @@ class RigCheck:
         notes = []
         if self.robot.rig.inherits:
             notes.append(
-                "values that the file does not give come from its base, a packaged robot, unless base is none"
+                'values missing in the file come from its base, a packaged robot; base = "none" prevents this'
             )
         if self.examples:
             lines = ", ".join(map(str, self.examples))
-            hold = f"{count_noun(len(self.examples), 'line')} still hold{'s' * (len(self.examples) == 1)}"
-            wide = f"for those with ±, a fit uses ± {100 * EXAMPLE_SHARE:g} %"
-            notes.append(f"{hold} the number of an example ({EXAMPLE}): {lines}; {wide}")
+            count = count_noun(len(self.examples), "line")
+            wide = f"a fit widens each ± among them to {100 * EXAMPLE_SHARE:g} %"
+            notes.append(f"{count} with the template's example number ({EXAMPLE}): {lines}; {wide}")
         notes += self.doubts
         if self.runs is not None and self.runs.has("duty") and self.runs.has("total_current_A"):
             notes.append(
@@ -114,7 +114,7 @@ class RigCheck:
             if o.why.startswith("the file") and o.sd is None and o.value
         ]
         if loose and not self.robot.rig.inherits:
-            notes.append(f"without ±, so the default ± is used: {', '.join(loose)}")
+            notes.append(f"no ± is given, so the default ± is used: {', '.join(loose)}")
         if not self.robot.knows(HEAT) and self.robot.motor.temperature_limit < UNLIMITED:
             lacking = " and ".join(self.robot.unknown(HEAT))
             notes.append(

@@ -153,7 +153,7 @@ def _run_for_demand(
         demand = f"{config.speed_m_s:g} m/s and {config.yaw_rate_rad_s:g} rad/s"
         source = f"the {'battery' if config.battery else 'supply'} has {supply:.3g} V"
         why = (
-            f"{demand} take {np.abs(volts).max():.3g} V at one motor" if np.isfinite(volts).all()
+            f"{demand} need {np.abs(volts).max():.3g} V at one motor" if np.isfinite(volts).all()
             else f"no settled turn with {demand} was found"
         )  # fmt: skip
         reaches = turn_words.turn_not_found_reason(config.speed_m_s, config.yaw_rate_rad_s, *at_full_voltage())

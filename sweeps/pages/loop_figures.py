@@ -228,7 +228,7 @@ def draw_gains(found: DiscoveryResult) -> Figure:
         axes.errorbar(len(names), gain.mean, error, fmt="o", ms=5.5, mfc=BLUE if proposed else "white", color=BLUE,
                       label="proposed, ± standard error" if proposed else None)  # fmt: skip
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-    axes.set(xlabel="effects added", ylabel="gain [nat per reading]")
+    axes.set(xlabel="effects added", ylabel="gain in log likelihood per reading")
     outer_legend(axes, "upper left")
     return fig
 
@@ -267,7 +267,7 @@ def draw_effect_scores(found: DiscoveryResult) -> Figure:
     axes.set_yticks(range(len(rungs)), [f"{r.name}  ({r.balance})" for r in rungs])
     axes.set_ylim(len(rungs) - 0.4, -1.8)
     axes.grid(axis="y", visible=False)
-    axes.set(xlabel="score: linear estimate of the misfit that the effect alone explains at a plausible size [σ]")
+    axes.set(xlabel="score: misfit that the effect alone explains, limited to a plausible size [σ]")
     axes.set_title("blue: found; light blue: indistinguishable from a found effect in these data")
     return fig
 
@@ -353,7 +353,7 @@ def conditions_and_readings(table: Columns) -> Columns:
     for label, left in list(columns.items()):
         if (right := columns.get(label.replace(", left", ", right"))) is not None and ", left" in label:
             both = label.replace(", left", "")
-            columns |= {f"mean of both sides: {both}": (left + right) / 2, f"left less right: {both}": left - right}
+            columns |= {f"mean of both sides: {both}": (left + right) / 2, f"left minus right: {both}": left - right}
     return columns
 
 

@@ -170,7 +170,7 @@ def draw_ripple_map(axes: Axes, found: ResonanceResult, name: str) -> None:
     others = [s for s in dict.fromkeys(map(str, table["status"])) if s != "converged"]
     kinds = "; ".join(f"{_UNREAD.get(s, '·').replace('_', '–')} {words.short_status(s)}" for s in others)
     label = SIGNALS[name].label
-    remarks = [] if most >= 100 * MATTERS else [f"under {100 * MATTERS:g} %: too small to avoid the speed"]
+    remarks = [] if most >= 100 * MATTERS else [f"under {100 * MATTERS:g} %: no speed to avoid"]
     remarks += [kinds] if kinds else []
     axes.set_title(f"Ripple of {label}" + (f"   ({'; '.join(remarks)})" if remarks else ""))
     if len(axes.collections) and "mesh" in locals():

@@ -29,7 +29,7 @@ STATUSES: dict[str, StatusWords] = {
         "traction demand above the adhesion limit",
         "slope and rolling resistance demand more traction than adhesion gives (demand above μ_s N), so the "
         "movers "
-        "spin, the robot does not climb, and there is no operating point",
+        "spin and the robot does not climb",
     ),
     "not_settled": StatusWords(
         "not settled",
@@ -150,12 +150,12 @@ GLOSSARY = {
     "class": "effects that these data cannot distinguish",
     "mechanism": "the equation that lacks a term and the variable that the term depends on, but not its exact "
     "law. Such a "
-    "term explains at least half of the excess misfit, predicts held-out runs, and is found again when blocks "
+    "term explains at least half of the misfit beyond noise, predicts held-out runs, and is found again when blocks "
     "of runs "
     "are left out",
     "place": "the equation that lacks a term, or several that these data cannot distinguish. No mechanism is "
     "established",
-    "excess misfit": "χ² beyond the part that noise explains, which is about one per reading",
+    "misfit beyond noise": "χ² minus the part that noise explains, which is about one per reading",
     "refit": "the same model with its parameters fitted to the runs, without new effects",
     "seen": "errors on the runs used in the fit",
     "held out": "errors on runs left out of the fit, one slope, voltage or configuration at a time",
@@ -165,8 +165,9 @@ GLOSSARY = {
     "χ²": "sum of (simulated minus measured)² / σ² over all readings. Noise alone gives about one per reading",
     "prior": "value and standard deviation of a parameter from a bench or a data sheet, before any run is used",
     "p": "probability that noise alone gives a result as extreme as this one",
-    "nat": "unit of log probability of held-out readings. With 60 readings, a gain of 0.1 per reading is significant",
-    "reached": "runs in which the robot has a steady state. In the others it slides or does not move",
+    "log likelihood": "logarithm of the probability of readings. With 60 readings, a gain of 0.1 per held-out "
+    "reading is significant",
+    "reached": "runs in which the simulated robot has a steady state. In the others it slides or does not move",
     "voltage_limit": "largest voltage that the loop may propose for an experiment, from `[motor]` of the robot file",
 }
 

@@ -108,7 +108,7 @@ def _effect_findings(found: DiscoveryResult, changes: Mapping[str, Change]) -> I
 
 def _noise_alone(found: DiscoveryResult) -> str:
     """Opening of a claim that does not hold at every noise tried, "" for one that does."""
-    return "" if found.headline.level == found.verdict else "At 1 times the noise alone: "
+    return "" if found.headline.level == found.verdict else "Only at 1 times the noise: "
 
 
 def moved_parameters(found: DiscoveryResult) -> Iterable[str]:
@@ -221,7 +221,7 @@ def _effects_in_words(found: DiscoveryResult) -> Iterable[Block]:
     rows = []
     for e in found.to_json()["effects"]:
         effect = next((x for x in found.effects if x.name == e["name"]), None)
-        over = f"none of the library; plotted over {str(e.get('variable')).replace('_', ' ')}"
+        over = f"not in the library; plotted over {str(e.get('variable')).replace('_', ' ')}"
         lowers, kinds = loop_words.misfit_text(e["score"]), ", or ".join(e["families"])
         if effect is None:
             alike = ", ".join(b for b in e["balances_alike"] if b != e["balance"])
@@ -247,7 +247,7 @@ def _certainty(found: DiscoveryResult, missing: bool) -> Table:
     priors = f"{before:.0f} → {after:.0f}" if missing else f"{before:.0f}"
     adequate, level = bool(found.after.adequate), found.headline.level
     left, set_aside = len(found.unusable), len(found.outliers)
-    aside = f"{left} not reached by the fitted model, {set_aside} set aside as outliers"
+    aside = f"{left} without a result of the fitted model, {set_aside} set aside as outliers"
     p = loop_words.p_value(found.before.p_value)
     rows = [
         (
@@ -256,7 +256,7 @@ def _certainty(found: DiscoveryResult, missing: bool) -> Table:
         ),
         (
             Cell("adequate" if adequate else "residuals exceed the noise", "good" if adequate else "fair"),
-            f"squares of {found.readings} readings {chi} σ², with priors {priors} σ²",
+            f"χ² of {found.readings} readings {chi} σ², with priors {priors} σ²",
         ),
         (
             f"{int(found.included.sum())} of {len(found.runs)} {_rows_are(found)}",
@@ -266,8 +266,8 @@ def _certainty(found: DiscoveryResult, missing: bool) -> Table:
     if missing and found.gain is not None:
         better, error = found.gain.mean > 0, found.gain.se
         spread = f" ± {error:.2f}" if np.isfinite(error) else ""
-        gain = f"{found.gain.mean:+.2f}{spread} nat per held-out reading"
-        robot = f"robot.toml is {'what was found' if found.written else 'the refit'}"
+        gain = f"log likelihood {found.gain.mean:+.2f}{spread} per held-out reading"
+        robot = f"robot.toml contains {'what was found' if found.written else 'the refit'}"
         verb = "better" if better else "worse"
         rows.append((Cell(f"predicts {verb} than the refit", "good" if better else "fair"), f"{gain}; {robot}"))
     return catalogue.table("loop.certainty", rows)

@@ -393,7 +393,7 @@ class Histories(Observer):
     @classmethod
     def check_settled(cls, runs: Runs) -> None:
         raise BadData(
-            f"{runs.source}: column time_s: time histories are for calibrate, compare and loop; expected a row a run"
+            f"{runs.source}, time_s: only calibrate, compare and loop take time histories; expected one row per run"
         )
 
     @classmethod
