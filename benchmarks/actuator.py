@@ -31,11 +31,11 @@ def law(file: str | None) -> Any:
         return types.SimpleNamespace(**runpy.run_path(file))
     from calibration.data import robot_file
     from sweeps.export.joint import joint_of_robot
-    from sweeps.export.law_source import Constant, jax_source, module_from_source
+    from sweeps.export.law_source import LawConstant, jax_source, module_from_source
 
     drive = joint_of_robot(robot_file.find_robot_file("nominal"))
-    known = [Constant(n, float(p.value), "", "", "") for n, p in drive.parameters().items()]
-    known += [Constant(n, 30.0, "N", "", "") for n in drive.surroundings()]
+    known = [LawConstant(n, float(p.value), "", "", "") for n, p in drive.parameters().items()]
+    known += [LawConstant(n, 30.0, "N", "", "") for n in drive.surroundings()]
     return module_from_source(jax_source(drive, known))
 
 

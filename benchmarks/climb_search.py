@@ -23,7 +23,7 @@ import numpy as np
 
 from calibration.data import terrains
 from mmrjax.climbing import terrain
-from mmrjax.climbing.climb_simulation import NAMES, OVER, Sequence, climb_batch
+from mmrjax.climbing.climb_simulation import NAMES, OVER, LeverSequence, climb_batch
 from mmrjax.model import paper_robots, params
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.paper_tables import SURFACES, adhesion_ratio
@@ -56,13 +56,13 @@ def run(
     front, rear = (jnp.asarray(np.radians(angles[:, k])) for k in range(2))
     supply = None if levers is None else jnp.full(n, levers)
     knots = jnp.broadcast_to(jnp.asarray(KNOTS), front.shape)
-    sequence = Sequence(knots, front, rear, over_time=True, supply=supply)
+    sequence = LeverSequence(knots, front, rear, over_time=True, supply=supply)
     return climb_batch(
         robot, conditions, grounds, sequence, duration=LENGTH, step=step, sample=0.05, part=1.0, record=False
     )
 
 
-def begotten(random: np.random.Generator, begin: Sequence, stretch: float, n: int) -> np.ndarray:
+def begotten(random: np.random.Generator, begin: LeverSequence, stretch: float, n: int) -> np.ndarray:
     """Angles of a first generation: those of a sequence over time, slowed down, and perturbed in all but one."""
     at = stretch * np.asarray(begin.at)
     own = np.stack([np.interp(KNOTS, at, np.degrees(np.asarray(a))) for a in (begin.front, begin.rear)])

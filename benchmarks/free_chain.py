@@ -33,7 +33,7 @@ import jax.numpy as jnp
 import numpy as np
 from shaking import shaking
 
-from mmrjax.fidelities.track import _batch
+from mmrjax.fidelities.track import _simulate_batch
 from mmrjax.model import balances, masses, params
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.contact import cubic_step, force_contact
@@ -41,7 +41,7 @@ from mmrjax.model.paper_robots import nominal
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import GRAVITY, State
 from mmrjax.undercarriage import mjcf
-from mmrjax.undercarriage.ripple_peaks import period_pitch, ripple
+from mmrjax.undercarriage.ripple_peaks import measure_ripple, period_pitch
 from mmrjax.undercarriage.running_gear import GROUSERS, TEETH_BELT, TEETH_PULLEY, RunningGear
 
 # [s]; half of it changes the share by less than the scatter of two windows. Explicit: the damping of a grouser on the
@@ -84,7 +84,7 @@ class Chain(NamedTuple):
     """Constants of one side."""
 
     gear: RunningGear
-    half: mjcf.Masses
+    half: mjcf.HalfRobotMasses
     ground: object
     guide_friction: float
     radius: float  # of the pulley's polygon, at the masses
@@ -290,7 +290,7 @@ def measure(
     normal = np.asarray(sums.normal)[tail]
     clock, whole = sample * np.arange(len(normal)), max(round(1e-3 / sample), 1)
     coarse = normal[len(normal) % whole :].reshape(-1, whole).mean(1)
-    found = ripple(clock, normal)
+    found = measure_ripple(clock, normal)
     weight = float(c.half.chassis + 2 * c.half.pulley + gear.belt_mass) * GRAVITY
     return {
         "guide_share": mean["guide"] / mean["normal"],
@@ -325,7 +325,7 @@ def beside(gears: list[RunningGear], robot: Robot | None = None) -> list[dict]:
     found = []
     for gear in gears:
         one = dataclasses.replace(nominal() if robot is None else robot, running_gear=gear)
-        answer = _batch(one, runs, 0.8, 1e-4, 1e-3, True)
+        answer = _simulate_batch(one, runs, 0.8, 1e-4, 1e-3, True)
         normal, fast = np.asarray(answer.signals.normal[0, -300:]), float(answer.v[0, -300:, 3].mean())
         period = period_pitch(35e-3, fast, float(nominal().radius_pulley))
         periods = int(0.3 / period)
@@ -333,8 +333,8 @@ def beside(gears: list[RunningGear], robot: Robot | None = None) -> list[dict]:
             {
                 "guide_share": float(answer.steady.guide_share[0]),
                 "normal_std_over_mean": float(normal.std() / normal.mean()),
-                "ripple_amplitude": ripple(np.asarray(answer.time[0, -300:]), normal).amplitude,
-                "ripple_period_s": ripple(np.asarray(answer.time[0, -300:]), normal).period,
+                "ripple_amplitude": measure_ripple(np.asarray(answer.time[0, -300:]), normal).amplitude,
+                "ripple_period_s": measure_ripple(np.asarray(answer.time[0, -300:]), normal).period,
                 "period_34_s": period,
                 "line_of_34": harmonics(normal[-round(periods * period / 1e-3) :], periods),
                 "speed_wheel": fast,

@@ -103,7 +103,7 @@ def by_numpy(values: np.ndarray) -> np.ndarray:
     return np.stack([2 * current, motor, radius * motor / ratio - creep], -1)
 
 
-def ours() -> tuple[room.Inputs, Model, Conditions]:
+def ours() -> tuple[room.UncertainInputs, Model, Conditions]:
     """Inputs, model and operating point of the same study in this project."""
     from mmrjax.model import params
 

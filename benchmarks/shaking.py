@@ -29,12 +29,12 @@ from mmrjax.model.robot import Robot  # noqa: E402
 from mmrjax.model.signals import STATUSES, State  # noqa: E402
 from mmrjax.undercarriage import mjcf  # noqa: E402
 from mmrjax.undercarriage.half_robot import (  # noqa: E402
-    Motion,
+    HalfRobotState,
     advance,
-    generalized,
-    half_robot_system,
+    build_system,
+    damping_matrix,
+    generalized_forces,
     instant,
-    resistance,
     roll,
 )
 from mmrjax.undercarriage.ripple_peaks import period_pitch, touchdowns  # noqa: E402
@@ -182,23 +182,23 @@ def native(voltage: float, slope: float, payload: float) -> dict[str, Any]:
     data = mujoco.MjData(model)
 
     @jax.jit
-    def forces(motion: Motion) -> tuple[Any, ...]:
-        constants = half_robot_system(robot, run, STEP)
+    def forces(motion: HalfRobotState) -> tuple[Any, ...]:
+        constants = build_system(robot, run, STEP)
         signals, at, pulled = instant(constants, motion)
         after, _, _ = advance(constants, motion)
-        damping = resistance(constants, motion, signals, at, pulled)
-        return *generalized(constants, signals, pulled), damping, after, at.normal
+        damping = damping_matrix(constants, motion, signals, at, pulled)
+        return *generalized_forces(constants, signals, pulled), damping, after, at.normal
 
     @jax.jit
-    def ours(motion: Motion) -> jax.Array:
-        constants = half_robot_system(robot, run, STEP)
+    def ours(motion: HalfRobotState) -> jax.Array:
+        constants = build_system(robot, run, STEP)
 
-        def small(m: Motion, _: None) -> tuple[Motion, tuple[jax.Array, jax.Array]]:
+        def small(m: HalfRobotState, _: None) -> tuple[HalfRobotState, tuple[jax.Array, jax.Array]]:
             return advance(constants, m)[0], (instant(constants, m)[1].normal, m.v[0])
 
         return jax.lax.scan(small, motion, None, length=STEPS)[1]
 
-    motion = roll(half_robot_system(robot, run, STEP))
+    motion = roll(build_system(robot, run, STEP))
     normal, speed = map(np.asarray, ours(motion))
     data.qpos[:], data.qvel[:] = motion.q, motion.v
     full, theirs, fast = np.zeros((model.nv, model.nv)), np.empty(STEPS), np.empty(STEPS)
@@ -212,7 +212,7 @@ def native(voltage: float, slope: float, payload: float) -> dict[str, Any]:
         data.qvel[:] += np.linalg.solve(full + STEP * np.asarray(damping), STEP * full @ data.qacc)
         mujoco.mj_integratePos(model, data.qpos, data.qvel, STEP)
         # Its current is ours: the next value depends only on this instant.
-        motion = Motion(jnp.asarray(data.qpos), jnp.asarray(data.qvel), after.current, after.discharge)
+        motion = HalfRobotState(jnp.asarray(data.qpos), jnp.asarray(data.qvel), after.current, after.discharge)
     last = slice(STEPS // 2, None)
     apart = np.abs(theirs - normal) > 0.01 * normal.mean()
     return {

@@ -18,7 +18,7 @@ import numpy as np  # noqa: E402
 
 from calibration.data import requirements_file  # noqa: E402
 from calibration.sizing import design_search  # noqa: E402
-from calibration.sizing.design import OBJECTIVES, sizing_task  # noqa: E402
+from calibration.sizing.design import OBJECTIVES, build_sizing_task  # noqa: E402
 from calibration.sizing.part_options import options_for_robot  # noqa: E402
 from mmrjax.model import paper_robots  # noqa: E402
 
@@ -27,8 +27,8 @@ def grid(objective: str, points: int, kept: np.ndarray) -> tuple[float, int, flo
     """The best feasible objective of a grid, its number of designs, and seconds."""
     robot, asked = paper_robots.nominal(), requirements_file.load_requirements(None)
     chosen = options_for_robot(robot)
-    of = sizing_task(robot, asked, chosen)
-    choice = design_search.choice_space(robot, of, chosen)
+    of = build_sizing_task(robot, asked, chosen)
+    choice = design_search.enumerate_choices(robot, of, chosen)
     n = len(choice.drive)
     along = max(2, round((points / n) ** (1 / 3)))
     counts = (max(2, round(points / n / along**2)), along, along)

@@ -108,7 +108,7 @@ def sweep(arguments: argparse.Namespace, points: int, devices: list[Any] | None 
 
     from sweeps.commands import sweep as command
     from sweeps.points import scale
-    from sweeps.points.job import laid_out
+    from sweeps.points.job import store_layout
     from sweeps.points.zarr_store import SweepStore
 
     devices = jax.local_devices() if devices is None else devices
@@ -121,7 +121,7 @@ def sweep(arguments: argparse.Namespace, points: int, devices: list[Any] | None 
         begin = time.perf_counter()
         scale.fetch_values(compiled(compiled.points(0)), 1)
         first = time.perf_counter() - begin
-        times, layout = scale.Times(), laid_out(config, job)
+        times, layout = scale.Times(), store_layout(config, job)
         begin = time.perf_counter()
         store = SweepStore(folder / "s", {}, layout)
         store.begin()

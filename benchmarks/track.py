@@ -21,7 +21,7 @@ jax.config.update("jax_enable_x64", True)
 import jax.numpy as jnp
 import numpy as np
 
-from mmrjax.fidelities.track import TIME_ROLLED, _batch, track
+from mmrjax.fidelities.track import TIME_ROLLED, _simulate_batch, track
 from mmrjax.model import paper_robots, params
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.signals import STATUSES
@@ -77,9 +77,9 @@ def speed(batches: list[int]) -> dict:
     robot, found = paper_robots.nominal(), {}
     for size in batches:
         commands = table8(size)
-        first = timed(lambda commands=commands: _batch(robot, commands, 1.5, 1e-4, 1e-3, False))
-        again = timed(lambda commands=commands: _batch(robot, commands, 1.5, 1e-4, 1e-3, False))
-        status = np.asarray(_batch(robot, commands, 1.5, 1e-4, 1e-3, False).result.status)
+        first = timed(lambda commands=commands: _simulate_batch(robot, commands, 1.5, 1e-4, 1e-3, False))
+        again = timed(lambda commands=commands: _simulate_batch(robot, commands, 1.5, 1e-4, 1e-3, False))
+        status = np.asarray(_simulate_batch(robot, commands, 1.5, 1e-4, 1e-3, False).result.status)
         found[size] = {
             "compile_s": first[0] - again[0],
             "run_s": again[0],
@@ -169,8 +169,8 @@ def turning(size: int = 32) -> dict:
     alike = Conditions("6T2A", voltage=np.linspace(12.0, 33.0, size)).resolved(robot)
     apart = dataclasses.replace(alike, duty_left=jnp.ones(size), duty_right=jnp.linspace(-1.0, 1.0, size))
     for name, runs in (("half_robot", alike), ("both_sides", apart)):
-        first = timed(lambda runs=runs: _batch(robot, runs, 0.1, 1e-4, 1e-3, False))
-        took = min(timed(lambda runs=runs: _batch(robot, runs, 0.1, 1e-4, 1e-3, False))[1] for _ in range(5))
+        first = timed(lambda runs=runs: _simulate_batch(robot, runs, 0.1, 1e-4, 1e-3, False))
+        took = min(timed(lambda runs=runs: _simulate_batch(robot, runs, 0.1, 1e-4, 1e-3, False))[1] for _ in range(5))
         found[name] = {"compile_cpu_s": first[1], "step_us": 1e6 * took / (1000 * size)}
     return found
 

@@ -21,7 +21,7 @@ from mmrjax.fidelities import drive, steady, track
 from mmrjax.model import params
 from mmrjax.model.paper_tables import SURFACES, adhesion_ratio, lateral_ratio
 from mmrjax.model.signals import NOT_SETTLED, STATUSES
-from mmrjax.undercarriage.belt import Path, tips_on_path
+from mmrjax.undercarriage.belt import BeltPath, tips_on_path
 
 jax.config.update("jax_enable_x64", True)
 
@@ -96,7 +96,7 @@ def tracks() -> None:
     half = found.time.shape[1] // 2
     load, place = (np.asarray(x)[:, half:] for x in (found.reactions.grouser, found.reactions.place))
     along = np.asarray(
-        tips_on_path(Path(robot.radius_pulley, robot.running_gear), jnp.asarray(place.ravel())).forward
+        tips_on_path(BeltPath(robot.radius_pulley, robot.running_gear), jnp.asarray(place.ravel())).forward
     )
     spread = (load * along.reshape(place.shape) ** 2).sum((1, 2, 3)) / np.maximum(load.sum((1, 2, 3)), 1e-9)
     lengths = np.where(np.asarray(runs.configuration) == 0, np.sqrt(12 * spread), robot.running_gear.wheelbase)

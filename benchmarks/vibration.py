@@ -26,7 +26,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from measure import machine
 
-from mmrjax.fidelities.track import STEP, Trajectory, track
+from mmrjax.fidelities.track import STEP, TrackTrajectory, track
 from mmrjax.model import paper_robots, params
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.contact import Friction
@@ -34,7 +34,7 @@ from mmrjax.model.params import Scalar
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import CONVERGED, NOT_SETTLED
 from mmrjax.undercarriage import side_contacts as undercarriage
-from mmrjax.undercarriage.half_robot import half_robot_system
+from mmrjax.undercarriage.half_robot import build_system
 from mmrjax.undercarriage.side_contacts import GROUSERS
 
 #: The tracked rows of the paper's tables: 15 V without payload, 33 V with 8 kg, at 0 to 20 deg.
@@ -124,12 +124,12 @@ class Ripple(eqx.Module):
     demanded: Scalar
 
 
-def ripple(robot: Robot, conditions: Conditions, run: Trajectory, window: float = 0.8) -> Ripple:
+def ripple(robot: Robot, conditions: Conditions, run: TrackTrajectory, window: float = 0.8) -> Ripple:
     """Ripple of one run on tracks (scalar fields) over its last `window` [s], from samples of at most 0.2 ms."""
-    half = half_robot_system(robot, conditions, STEP)
+    half = build_system(robot, conditions, STEP)
 
     def contacts(q: Float[Array, " 5"], v: Float[Array, " 5"]) -> tuple[Array, Array]:
-        at = undercarriage.contact_state(half.path, half.chassis, q, v)
+        at = undercarriage.compute_contacts(half.path, half.chassis, q, v)
         return at.force[:GROUSERS], -at.speed_x[:GROUSERS]
 
     late = run.time > run.time[-1] - window

@@ -13,15 +13,15 @@ def describe(found: Any, part: str = "", *about: str) -> str:
     """English sentence of a note or a result, such as a calibration's `remarks` or what `discover` returns.
 
     Args:
-        found: a note, a result, or a sentence, which is returned as it is.
-        part: part of a result: `header` of its robot's file, or `standing` of the loop's names. "": its answer.
-        about: the robot's name, for a header.
+        found: a remark, a result, or a sentence, which is returned unchanged.
+        part: part of a result: `header` of its robot file, or `standing` of the names in the loop. "": its answer.
+        about: name of the robot, for a header.
 
     Returns:
-        The sentence, "" where there is nothing to report.
+        The sentence, "" if there is nothing to report.
 
     Raises:
-        TypeError: nothing is known about this kind of object or part.
+        TypeError: there is no sentence for this kind of object or part.
     """
     if isinstance(found, str):
         return found
@@ -41,10 +41,10 @@ def describe(found: Any, part: str = "", *about: str) -> str:
 
 
 def sentences(notes: Iterable[object]) -> Names:
-    """Sentence of each note, in order."""
+    """Sentence of each remark, in order."""
     return tuple(map(describe, notes))
 
 
-def in_words(tell: Callable[[str], None]) -> Callable[[object], None]:
-    """A callback for notes that passes their sentences on to `tell`."""
+def report_in_words(tell: Callable[[str], None]) -> Callable[[object], None]:
+    """Callback for remarks that passes their sentences to `tell`."""
     return lambda note: tell(describe(note))

@@ -1,4 +1,4 @@
-"""Numbers that a robot has: a shaft has no ground, and a rig only what its file states."""
+"""Results that a robot can have: a shaft has no ground, and a rig has only what its file states."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ OF_TRAVEL = (
 RESTS_ON = {q.column: q.rests_on for rows in quantities.TABLE.values() for q in rows if q.rests_on}
 
 
-def _nothing(robot: Robot) -> dict[str, float]:
+def _parameters_of_bare_rig(robot: Robot) -> dict[str, float]:
     """Parameters of a rig whose file describes only its loads."""
     return {p.name: float(p.value) for p in params.walk_parameters(blank_robot(robot.configurations, rig=robot.rig))}
 
@@ -61,7 +61,7 @@ def unknown_numbers_sentence(robot: Robot) -> list[str]:
     return [f"cannot be computed: the robot's file does not give {', '.join(lacking)}: {labels}"] if gone else []
 
 
-def idle_columns(robot: Robot) -> set[str]:
+def inapplicable_columns(robot: Robot) -> set[str]:
     """Columns of runs and histories that do not apply to a robot."""
     idle: set[str] = set()
     if not robot.has_ground:
@@ -76,18 +76,18 @@ def idle_columns(robot: Robot) -> set[str]:
     return idle
 
 
-def without_idle(robot: Robot, table: Columns) -> Columns:
-    """A table without the columns that do not apply to the robot. Columns of its channels are kept."""
-    idle = idle_columns(robot) - {c.column for c in robot.channels}
+def drop_inapplicable_columns(robot: Robot, table: Columns) -> Columns:
+    """Table without the columns that do not apply to the robot. Columns of its channels are kept."""
+    idle = inapplicable_columns(robot) - {c.column for c in robot.channels}
     ends = ("", "_sd", "_lower", "_upper")
     gone = {column + end for column in idle for end in ends}
     return {column: values for column, values in table.items() if column not in gone}
 
 
 def rig_parameters(file: RobotFile) -> list[tuple[str, float, str, str, str]]:
-    """Parameters that a rig's file states, and others with an effect: name, value, unit, meaning, source."""
+    """Parameters that a rig file states, and others with an effect: name, value, unit, meaning, source."""
     robot = file.robot
-    nothing, stated_parameters = _nothing(robot), []
+    nothing, stated_parameters = _parameters_of_bare_rig(robot), []
     for p in params.walk_parameters(robot):
         head = p.name.partition(".")[0]
         load = head in robot.configurations
@@ -113,8 +113,8 @@ def changed_parameters(robot: Robot, nominal: Robot) -> list[tuple[Any, ...]]:
     ]
 
 
-def shown_name(file: RobotFile) -> str:
-    """A robot's name as pages show it. A packaged robot with other parameters is called changed."""
+def displayed_name(file: RobotFile) -> str:
+    """Name of a robot as pages show it. A packaged robot with other parameters is marked as changed."""
     from mmrjax.model.paper_robots import ROBOTS
 
     name = file.name
@@ -122,4 +122,4 @@ def shown_name(file: RobotFile) -> str:
         return name
     if name in ROBOTS and changed_parameters(file.robot, ROBOTS[name]()):
         return f"{name}, changed"
-    return words.words_shown(name)
+    return words.displayed_robot_name(name)

@@ -91,13 +91,13 @@ def _command(
             if "plan" in given:
                 given["plan"] = file
             stated, others = made.take_options(kind, given), made.take_options(beside, given)
-            aside = config.resolve_beside(beside, file, others, trust)
+            aside = config.resolve_further_options(beside, file, others, trust)
             if resolve is None:
                 resolved = config.resolve_configuration(kind, file, stated, beside, trust)
             else:
                 resolved = resolve(file, stated, trust)
             with report_working(name):
-                _prepare(resolved, given["no_cache"])
+                _prepare_environment(resolved, given["no_cache"])
                 code: int = importlib.import_module(f"sweeps.commands.{room or name}").execute(resolved, aside)
                 return code
 
@@ -512,12 +512,12 @@ def explain(
     return room.explain_name(" ".join(name) if name else None, tuple(effects or ()))
 
 
-def _prepare(resolved: Any, no_cache: bool = False) -> None:
-    """Prepare the environment before a command of this configuration imports jax.
+def _prepare_environment(resolved: Any, no_cache: bool = False) -> None:
+    """Prepares the process before a command with this configuration imports jax.
 
-    With several threads, one sweep of the track model in seven hung forever on two cores, with every thread asleep
-    in XLA's CPU executor (jax 0.10.2). With one thread none of twelve did (docs/lab/figures.md). XLA_FLAGS set by
-    the user, even if empty, takes precedence.
+    With several threads, one sweep of the track model in seven hung forever on two cores, with every thread asleep in
+    XLA's CPU executor (jax 0.10.2). With one thread none of twelve did (docs/lab/figures.md). XLA_FLAGS set by the
+    user, even if empty, takes precedence.
     """
     model = getattr(resolved, "model", None)  # a fidelity; of a calibration, whose data decide, None
     one_thread = isinstance(model, str) and fidelities.fidelity_facts(model).one_thread
@@ -586,7 +586,7 @@ def main() -> None:
         if code == INTERRUPTED:  # the option parser has caught the interrupt
             raise KeyboardInterrupt
     except BaseException as error:
-        code = _answered(error)
+        code = _report_failure(error)
     signal.setitimer(signal.ITIMER_REAL, 0)
     sys.unraisablehook = unraised
     code = code if isinstance(code, int) else 0
@@ -597,7 +597,9 @@ def main() -> None:
         except OSError as error:  # Python would try again as it ends
             lost.append(stream)
             if code == 0 and stream is sys.stdout:
-                code = 1 if isinstance(error, BrokenPipeError) else _fail(f"{stream.name}: {error.strerror}", 2)
+                code = (
+                    1 if isinstance(error, BrokenPipeError) else _print_failure(f"{stream.name}: {error.strerror}", 2)
+                )
     working = any(t.name.startswith(WORKER) for t in threading.enumerate())  # for whom nobody waits
     spent = code == 3 and "loop" in sys.argv[1:2]  # perhaps out of time, which interrupts a step too
     # XLA may still be at work, and has crashed when Python was taken down around it
@@ -627,21 +629,21 @@ def _replace_closed_streams() -> None:
     sys.stderr = sys.stderr or open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115
 
 
-def _answered(error: BaseException) -> int:
+def _report_failure(error: BaseException) -> int:
     """Report why a command failed. Returns its exit code."""
     if isinstance(error, typer.Abort) and isinstance(error.__context__, EOFError):
         error = error.__context__  # of a file, which the option parser takes for the end of its own input
     if isinstance(error, InputError):
-        return _fail(str(error), error.exit_code)
+        return _print_failure(str(error), error.exit_code)
     if isinstance(error, typer.Abort | KeyboardInterrupt):
         advice = "no run folder was written"
         if "sweep" in sys.argv[1:2]:
             advice = "the same command with the same --out resumes the sweep after its last complete chunk"
         if "loop" in sys.argv[1:2]:
             advice = "the same command with the same --out resumes the loop after its last complete stage"
-        return _fail(f"interrupted; {advice}", INTERRUPTED)
+        return _print_failure(f"interrupted; {advice}", INTERRUPTED)
     if _memory_exhausted(error):
-        return _fail("out of memory; use fewer points at a time (--chunk), fewer rows, or more memory", 2)
+        return _print_failure("out of memory; use fewer points at a time (--chunk), fewer rows, or more memory", 2)
     if isinstance(error, OSError):
         from sweeps.console import OUTPUT
 
@@ -651,18 +653,18 @@ def _answered(error: BaseException) -> int:
             if place == OUTPUT
             else "; no run folder was written; finished parts are in the folder that ends in .partial"
         )
-        return _fail(f"{place}: {error.strerror}{left}", 2)
+        return _print_failure(f"{place}: {error.strerror}{left}", 2)
     if isinstance(error, SystemExit) and isinstance(error.__context__, BrokenPipeError):
         return 1  # whoever reads the output has had enough: head, or a pager that was left
     if isinstance(error, SystemExit):
-        return _fail("--effects: the code in an effects file ended the program; remove that call", 2)
+        return _print_failure("--effects: the code in an effects file ended the program; remove that call", 2)
     if hasattr(error, "format_message") and hasattr(error, "exit_code"):  # a usage error of the option parser
-        return _fail(_no_number(error) or error.format_message(), error.exit_code)
+        return _print_failure(_not_a_number_message(error) or error.format_message(), error.exit_code)
     import traceback
 
     with contextlib.suppress(OSError):
         print(printable("".join(traceback.format_exception(error))), end="", file=sys.stderr)
-    return _fail(f"internal error: {error}", 1)
+    return _print_failure(f"internal error: {error}", 1)
 
 
 def _memory_exhausted(error: BaseException | None) -> bool:
@@ -675,8 +677,8 @@ def _memory_exhausted(error: BaseException | None) -> bool:
     return False
 
 
-def _no_number(error: Any) -> str:
-    """Error message for a text instead of a number. Usually the text includes a unit."""
+def _not_a_number_message(error: Any) -> str:
+    """Error message for a text in place of a number. Often the text includes a unit."""
     option = getattr(error, "param", None)
     if option is None or not re.search(r"valid (number|float|integer)", str(getattr(error, "message", ""))):
         return ""
@@ -684,7 +686,7 @@ def _no_number(error: Any) -> str:
     return f"{option.opts[0]}: got no number; expected one without its unit. {help_text}"
 
 
-def _fail(message: str, code: int) -> int:
+def _print_failure(message: str, code: int) -> int:
     with contextlib.suppress(OSError):  # of a standard error that takes no more
         print(f"mmrjax: {shorten(printable(' '.join(message.splitlines())))}", file=sys.stderr)
     return code

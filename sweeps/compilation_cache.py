@@ -1,4 +1,4 @@
-"""The compilation cache: programs that XLA has compiled, kept on disk so that the next process reads them.
+"""Compilation cache: programs compiled by XLA, stored on disk so that later processes can read them.
 
 Folder: `$MMRJAX_CACHE`, else `$XDG_CACHE_HOME/mmrjax`, else `~/.cache/mmrjax`. `MMRJAX_CACHE=off` switches it off.
 JAX keys an entry by program, compiler version, flags and device. A folder of its own for each version of jaxlib and
@@ -28,7 +28,7 @@ LIMIT = 4 * 2**30
 
 
 def cache_location(path: Path | None = None) -> Path | None:
-    """Folder of the cache, which may not exist yet, None if it is switched off or has no known place.
+    """Folder of the cache, which need not exist yet. None if the cache is switched off or has no known place.
 
     Args:
         path: folder to hold caches. None takes it from the environment.
@@ -70,7 +70,7 @@ def keep_programs() -> Path | None:
     Returns:
         The folder, None if the cache is switched off, its place cannot be written to or others could change it.
     """
-    if _refused(os.environ.get(PROGRAMS, "")):
+    if _is_unsafe(os.environ.get(PROGRAMS, "")):
         os.environ[PROGRAMS] = ""
     folder = cache_location()
     if folder is None:
@@ -85,7 +85,7 @@ def keep_programs() -> Path | None:
 
     own_folder = jax.config.values["jax_compilation_cache_dir"]
     if own_folder is not None:
-        if "://" not in own_folder and _refused(own_folder):
+        if "://" not in own_folder and _is_unsafe(own_folder):
             jax.config.update("jax_enable_compilation_cache", False)
             return None
         return Path(own_folder)
@@ -93,9 +93,9 @@ def keep_programs() -> Path | None:
         folder.mkdir(parents=True, exist_ok=True, mode=0o700)
     except OSError:
         return None
-    if not os.access(folder, os.W_OK | os.X_OK) or _refused(str(folder)):
+    if not os.access(folder, os.W_OK | os.X_OK) or _is_unsafe(str(folder)):
         return None
-    _prune(folder.parent)
+    _delete_oldest(folder.parent)
     warnings.filterwarnings("ignore", message="Error (reading|writing) persistent compilation cache entry")
     jax.config.update("jax_compilation_cache_dir", str(folder))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
@@ -105,7 +105,7 @@ def keep_programs() -> Path | None:
     return folder
 
 
-def _refused(folder: str) -> bool:
+def _is_unsafe(folder: str) -> bool:
     """True if other users could change a folder of compiled programs and so run their code. This is reported."""
     reason = exposure_reason(Path(folder)) if folder else ""
     if reason:
@@ -118,7 +118,7 @@ def _refused(folder: str) -> bool:
     return bool(reason)
 
 
-def _entries(folder: Path) -> list[tuple[float, int, Path]]:
+def _cache_entries(folder: Path) -> list[tuple[float, int, Path]]:
     """Time of writing, size [bytes] and path of every entry."""
     entries = []
     for path in folder.iterdir() if folder.is_dir() else ():
@@ -131,9 +131,9 @@ def _entries(folder: Path) -> list[tuple[float, int, Path]]:
     return entries
 
 
-def _prune(caches: Path) -> None:
+def _delete_oldest(caches: Path) -> None:
     """Delete the oldest entries of all versions if there are too many."""
-    entries = [entry for folder in caches.glob("xla-*") for entry in _entries(folder)]
+    entries = [entry for folder in caches.glob("xla-*") for entry in _cache_entries(folder)]
     size = sum(entry[1] for entry in entries)
     if size <= LIMIT:
         return
@@ -151,5 +151,5 @@ def describe_cache(path: Path | None = None) -> str:
         return f"off ({VARIABLE}=off)" if os.environ.get(VARIABLE) else "off"
     if exposed := exposure_reason(folder):
         return f"{folder}: not used, since {exposed}"
-    entries = _entries(folder)
+    entries = _cache_entries(folder)
     return f"{folder}: {len(entries)} programs, {sum(entry[1] for entry in entries) / 1e6:.1f} MB"

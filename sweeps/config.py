@@ -23,26 +23,26 @@ from mmrjax.model.quantities import CONDITIONS
 from sweeps.options import options_of_fields, schema_facts
 
 
-def between(low: float, high: float) -> Any:
+def number_between(low: float, high: float) -> Any:
     """Bounds of a finite number."""
     return Field(ge=low, le=high, allow_inf_nan=False)
 
 
-def positive(most: float) -> Any:
+def positive_number(most: float) -> Any:
     """Bounds of a finite number above 0."""
     return Field(gt=0, le=most, allow_inf_nan=False)
 
 
 T = TypeVar("T")
 Several = Annotated[tuple[T, ...], Field(min_length=1)]
-Slope = Annotated[float, between(*CONDITIONS["slope_deg"].range)]
-Payload = Annotated[float, between(*CONDITIONS["payload"].range)]
-LoadTorque = Annotated[float, between(*CONDITIONS["load_torque"].range)]
-Voltage = Annotated[float, between(*CONDITIONS["voltage"].range)]
-Duty = Annotated[float, between(*CONDITIONS["duty_left"].range)]
-Heading = Annotated[float, between(*CONDITIONS["heading_deg"].range)]
-MotorCurrent = Annotated[float, between(*channels.find_channel("motor_current").range)]
-MotorSpeed = Annotated[float, between(*channels.find_channel("motor_speed").range)]
+Slope = Annotated[float, number_between(*CONDITIONS["slope_deg"].range)]
+Payload = Annotated[float, number_between(*CONDITIONS["payload"].range)]
+LoadTorque = Annotated[float, number_between(*CONDITIONS["load_torque"].range)]
+Voltage = Annotated[float, number_between(*CONDITIONS["voltage"].range)]
+Duty = Annotated[float, number_between(*CONDITIONS["duty_left"].range)]
+Heading = Annotated[float, number_between(*CONDITIONS["heading_deg"].range)]
+MotorCurrent = Annotated[float, number_between(*channels.find_channel("motor_current").range)]
+MotorSpeed = Annotated[float, number_between(*channels.find_channel("motor_speed").range)]
 #: The fidelity that follows profiles.
 PROFILED = "drive"
 #: Longest run of `simulate` where none is stated [s]: short enough that the start is seen.
@@ -134,63 +134,65 @@ class ModelPart(Part):
     @field_validator("model")
     @classmethod
     def _known(cls, model: str) -> str:
-        return _fidelity(model)
+        return _check_fidelity(model)
 
 
-def _fidelity(model: str) -> str:
+def _check_fidelity(model: str) -> str:
     """The name of a fidelity. Unknown names are rejected."""
     if model not in fidelities.TABLE:
-        raise PydanticCustomError("unknown", f"input should be {_either(map(repr, fidelities.TABLE))}")
+        raise PydanticCustomError("unknown", f"input should be {_join_with_or(map(repr, fidelities.TABLE))}")
     return model
 
 
-def _solver(name: str) -> str:
+def _check_solver(name: str) -> str:
     """The name of a solver for fits. Unknown names are rejected."""
     if name not in solvers.NAMES:
         raise PydanticCustomError("unknown", allowed_words(name, solvers.NAMES))
     return name
 
 
-def _either(names: Iterable[str]) -> str:
+def _join_with_or(names: Iterable[str]) -> str:
     """«a, b or c»."""
     *others, last = names
     return f"{', '.join(others)} or {last}" if others else last
 
 
-def _having(option: str) -> dict[str, fidelities.Option]:
+def _fidelities_with_option(option: str) -> dict[str, fidelities.Option]:
     """The fidelities that have an option, with their kind of it."""
     return {name: o for name, facts in fidelities.TABLE.items() for o in facts.options if o.name == option}
 
 
-def _most(option: str) -> float:
-    return max(o.most for o in _having(option).values())
+def _largest_value(option: str) -> float:
+    return max(o.most for o in _fidelities_with_option(option).values())
 
 
-def _usual(option: str, shown: float = math.inf) -> str:
+def _default_text(option: str, shown: float = math.inf) -> str:
     """Default of a fidelity's option by fidelity. Of `simulate` at most `shown`."""
-    defaults = {name: o.default for name, o in _having(option).items()}
+    defaults = {name: o.default for name, o in _fidelities_with_option(option).items()}
     capped = {name: f"{v:g}" + (f", simulate {shown:g}" if v > shown else "") for name, v in defaults.items()}
     return "; ".join([f"{name} {text}" for name, text in capped.items()] if len(defaults) > 1 else capped.values())
 
 
-Duration = Annotated[float, positive(_most("duration"))]
+Duration = Annotated[float, positive_number(_largest_value("duration"))]
 
 
 class FidelityPart(ModelPart):
     """Fidelity of the simulation and its options. None takes the fidelity's default."""
 
-    duration_s: Duration | None = option_field(None, "Length of a run", usual=_usual("duration", SHOWN))
-    step_s: Annotated[float, positive(_most("step"))] | None = option_field(
-        None, "Integration step", usual=_usual("step")
+    duration_s: Duration | None = option_field(None, "Length of a run", usual=_default_text("duration", SHOWN))
+    step_s: Annotated[float, positive_number(_largest_value("step"))] | None = option_field(
+        None, "Integration step", usual=_default_text("step")
     )
 
     @model_validator(mode="after")
     def _acts(self) -> Self:
         for name in ("duration", "step"):
-            value, having = getattr(self, f"{name}_s"), _having(name)
+            value, having = getattr(self, f"{name}_s"), _fidelities_with_option(name)
             usual = {option.default for option in having.values()}
             if value is not None and self.model not in having and value not in usual:
-                raise PydanticCustomError("idle", f"`{name}_s` has an effect only with `model` {_either(having)}")
+                raise PydanticCustomError(
+                    "idle", f"`{name}_s` has an effect only with `model` {_join_with_or(having)}"
+                )
             if value is not None and self.model in having and value > having[self.model].most:
                 most = having[self.model]
                 raise PydanticCustomError(
@@ -239,12 +241,12 @@ class SupplyPart(Part):
 SURFACE = "Surface of Table 5, which scales the adhesion of lacquered_wood; for a rig, one of its own surfaces"
 
 
-def _shown(values: Iterable[float]) -> str:
+def _values_text(values: Iterable[float]) -> str:
     return ",".join(f"{v:g}" for v in values)
 
 
 class OneRun(Part):
-    """The conditions of one run, by the columns of a table of runs. None is left to the robot.
+    """Conditions of one run, by the columns of tables of runs. None: decided by the robot.
 
     The run itself checks its values (`inputs.one_run`), like a row of a table.
     """
@@ -331,16 +333,16 @@ class AxesPart(Part):
         None, "Configurations of the robot, comma-separated", usual="all configurations"
     )
     voltages_V: Several[Voltage] | None = option_field(
-        None, "Supply voltages (V); for a rig thirds of its voltage_limit", usual=_shown(VOLTAGES_V)
+        None, "Supply voltages (V); for a rig thirds of its voltage_limit", usual=_values_text(VOLTAGES_V)
     )
     motor_speeds_rpm: Several[MotorSpeed] | None = option_field(
         None, "Motor speeds (rpm), for rigs with imposed motor speed", usual="thirds of speed_limit"
     )
     payloads_kg: Several[Payload] | None = option_field(
-        None, "Additional load masses (kg); for a rig 0", usual=_shown(PAYLOADS_KG)
+        None, "Additional load masses (kg); for a rig 0", usual=_values_text(PAYLOADS_KG)
     )
     slopes_deg: Several[Slope] | None = option_field(
-        None, "Slopes (deg), positive uphill; 0 for a rig", usual=_shown(SLOPES_DEG)
+        None, "Slopes (deg), positive uphill; 0 for a rig", usual=_values_text(SLOPES_DEG)
     )
     surface: str | None = option_field(None, SURFACE, usual=f"{BENCH}; for a rig none")
 
@@ -410,10 +412,10 @@ class TurnPart(Part):
         None, "Duty of the left motor (share of the supply voltage), instead of --left"
     )
     duty_right: Duty | None = option_field(None, "Duty of the right motor (share of the supply voltage)")
-    speed_m_s: Annotated[float, between(-100, 100)] | None = option_field(
+    speed_m_s: Annotated[float, number_between(-100, 100)] | None = option_field(
         None, "Speed of the settled turn (m/s); with --yaw-rate it determines --left and --right"
     )
-    yaw_rate_rad_s: Annotated[float, between(-100, 100)] | None = option_field(
+    yaw_rate_rad_s: Annotated[float, number_between(-100, 100)] | None = option_field(
         None, "Yaw rate of the settled turn (rad/s), positive to the left; with --speed"
     )
     heading_deg: Heading | None = option_field(None, "Heading at the start, relative to uphill, positive to the left")
@@ -579,8 +581,8 @@ class Resonance(RobotPart, FidelityPart, OutputPart):
     )
 
 
-Angle = Annotated[float, between(-360, 360)]
-Height = Annotated[float, positive(5000)]
+Angle = Annotated[float, number_between(-360, 360)]
+Height = Annotated[float, positive_number(5000)]
 
 
 class Climb(RobotPart, SupplyPart, OutputPart):
@@ -593,7 +595,7 @@ class Climb(RobotPart, SupplyPart, OutputPart):
     terrain: Path | None = option_field(
         None, "CSV of a ground profile (polyline) with columns x_m and z_m, or x_mm and z_mm", format="path"
     )
-    nose_mm: Annotated[float, between(0, 500)] = option_field(0.0, "Radius of the edges of a step or stairs")
+    nose_mm: Annotated[float, number_between(0, 500)] = option_field(0.0, "Radius of the edges of a step or stairs")
     levers_front_deg: Angle | None = option_field(
         None,
         "Angle of the front levers (0: extended along the wheelbase, positive: up, 180: folded)",
@@ -607,7 +609,7 @@ class Climb(RobotPart, SupplyPart, OutputPart):
               "or voltages of the lever motors, front_V, rear_V, starting from the given angles",
         format="path",
     )  # fmt: skip
-    levers_voltage_V: Annotated[float, positive(1e6)] | None = option_field(
+    levers_voltage_V: Annotated[float, positive_number(1e6)] | None = option_field(
         None, "Highest voltage of the levers' motors (V)", usual="that of the supply"
     )
     supply_voltage_V: Voltage | None = option_field(None, "Supply voltage (V)", usual="12", flag="--voltage")
@@ -627,8 +629,8 @@ class Climb(RobotPart, SupplyPart, OutputPart):
         "levers_front_deg, levers_rear_deg, obstacle_mm",
     )
     film: bool = option_field(False, "Write climb.gif")
-    duration_s: Annotated[float, positive(600)] = option_field(20.0, "Longest run")
-    time_step_s: Annotated[float, positive(1e-3)] = option_field(1e-4, "Integration step", solver=True)
+    duration_s: Annotated[float, positive_number(600)] = option_field(20.0, "Longest run")
+    time_step_s: Annotated[float, positive_number(1e-3)] = option_field(1e-4, "Integration step", solver=True)
 
     @model_validator(mode="after")
     def _one_obstacle(self) -> Self:
@@ -668,11 +670,13 @@ class FeedforwardPart(Part):
     unit: Literal["rotation", "rad", "degree", "m"] | None = option_field(
         None, "Unit of position for kV and kA, with --feedforward", usual="rotation; for a travel m"
     )
-    position_error: Annotated[float, positive(1e6)] = option_field(1.0, "Tolerance of the position regulator [unit]")
-    velocity_error: Annotated[float, positive(1e6)] = option_field(1.5, "Tolerance of the velocity [unit/s]")
-    effort_V: Annotated[float, positive(1e4)] = option_field(7.0, "Voltage that the feedback may use (V)")
-    period_s: Annotated[float, positive(10)] = option_field(0.02, "Period of the controller (s)")
-    measurement_delay_s: Annotated[float, between(0, 10)] | None = option_field(
+    position_error: Annotated[float, positive_number(1e6)] = option_field(
+        1.0, "Tolerance of the position regulator [unit]"
+    )
+    velocity_error: Annotated[float, positive_number(1e6)] = option_field(1.5, "Tolerance of the velocity [unit/s]")
+    effort_V: Annotated[float, positive_number(1e4)] = option_field(7.0, "Voltage that the feedback may use (V)")
+    period_s: Annotated[float, positive_number(10)] = option_field(0.02, "Period of the controller (s)")
+    measurement_delay_s: Annotated[float, number_between(0, 10)] | None = option_field(
         None, "Delay of the measurement (s)", usual="from the log"
     )
 
@@ -680,7 +684,7 @@ class FeedforwardPart(Part):
 class Calibrate(RobotPart, DataPart, InferencePart, FeedforwardPart, OutputPart):
     """Options of a calibration. For None the fidelity or the data decide."""
 
-    model: Annotated[str, AfterValidator(_fidelity)] | None = option_field(
+    model: Annotated[str, AfterValidator(_check_fidelity)] | None = option_field(
         None, f"Fidelity: {', '.join(fidelities.NAMES)}", usual="drive for a log over time, else steady"
     )
     free: Names = option_field((), "Parameters to fit, comma-separated, or a group such as motor.*")
@@ -697,7 +701,7 @@ class Calibrate(RobotPart, DataPart, InferencePart, FeedforwardPart, OutputPart)
     generations: Annotated[int, Field(ge=1, le=10_000)] | None = option_field(
         None, "Largest number of generations of the population", usual="30", solver=True
     )
-    solver: Annotated[str, AfterValidator(_solver)] | None = option_field(
+    solver: Annotated[str, AfterValidator(_check_solver)] | None = option_field(
         None,
         f"Solver of the searches, of optimistix ({', '.join(solvers.OF_OPTIMISTIX)}) or optax "
         f"({', '.join(solvers.OF_OPTAX)})",
@@ -713,7 +717,7 @@ class Calibrate(RobotPart, DataPart, InferencePart, FeedforwardPart, OutputPart)
 class Settle(RobotPart, DataPart, OutputPart):
     """Options for extracting settled runs from a log over time."""
 
-    shortest_s: Annotated[float, positive(3600)] | None = option_field(
+    shortest_s: Annotated[float, positive_number(3600)] | None = option_field(
         None, "Shortest segment that counts as settled", usual="0.3, and at least 20 samples"
     )
     drift: Annotated[float, Field(gt=0, le=0.5)] = option_field(
@@ -870,12 +874,13 @@ def read_toml(file: Path) -> Json:
 
 
 def fields_with(kind: type[Part], fact: str) -> list[str]:
-    """Names of the fields whose `option_field` has a property, such as `solver` (the keys of `[solver]` in a
-    file)."""
+    """Names of the fields whose `option_field` has a given property, such as `solver` (the keys of `[solver]` in a
+    file).
+    """
     return [name for name, facts in schema_facts(kind).items() if facts.get(fact)]
 
 
-def _keys(kind: type[Part], file: Path, beside: type[Part] | None) -> Json:
+def _file_keys(kind: type[Part], file: Path, beside: type[Part] | None) -> Json:
     """The keys of a file for a configuration, those of its table `[solver]` among them."""
     values = read_toml(file)
     table = values.pop("solver", {})
@@ -891,8 +896,8 @@ def _keys(kind: type[Part], file: Path, beside: type[Part] | None) -> Json:
     return {**values, **{key: value for key, value in table.items() if key in own_fields}}
 
 
-def resolve_beside(kind: type[C], file: Path | None, options: Json, trust: bool = False) -> C:
-    """Returns the options of a command outside its configuration. A file may state their `[solver]` keys only.
+def resolve_further_options(kind: type[C], file: Path | None, options: Json, trust: bool = False) -> C:
+    """Options of a command that are not part of its configuration. A file may state only their `[solver]` keys.
 
     Args:
         trust: as of `resolve_configuration`.
@@ -902,7 +907,7 @@ def resolve_beside(kind: type[C], file: Path | None, options: Json, trust: bool 
     """
     table = {} if file is None else read_toml(file).get("solver", {})
     stated = {key: table[key] for key in fields_with(kind, "solver") if key in table}
-    return _checked(kind, file, stated, options, trust)
+    return _check_values(kind, file, stated, options, trust)
 
 
 def resolve_configuration(
@@ -921,10 +926,10 @@ def resolve_configuration(
     Raises:
         BadConfiguration: unreadable file, unknown key, a value out of range, or what a file may not state.
     """
-    return _checked(kind, file, {} if file is None else _keys(kind, file, beside), options, trust)
+    return _check_values(kind, file, {} if file is None else _file_keys(kind, file, beside), options, trust)
 
 
-def _checked(kind: type[C], file: Path | None, values: Json, options: Json, trust: bool) -> C:
+def _check_values(kind: type[C], file: Path | None, values: Json, options: Json, trust: bool) -> C:
     given = {k: v for k, v in options.items() if v is not None}
     for name in fields_with(kind, "executes"):
         if file is not None and values.get(name) and name not in given and not trust:
@@ -940,10 +945,10 @@ def _checked(kind: type[C], file: Path | None, values: Json, options: Json, trus
     try:
         return kind.model_validate({**values, **given})
     except ValidationError as error:
-        raise BadConfiguration(_sentence(kind, error, file, given)) from None
+        raise BadConfiguration(_error_sentence(kind, error, file, given)) from None
 
 
-def _sentence(kind: type[Part], error: ValidationError, file: Path | None, given: Json) -> str:
+def _error_sentence(kind: type[Part], error: ValidationError, file: Path | None, given: Json) -> str:
     first, options = error.errors()[0], options_of_fields(kind)
 
     def called(name: str) -> str:

@@ -144,7 +144,7 @@ class StoreOptions(FolderPart):
 def resolve_campaign(file: Path | None, options: Json, trust: bool = False) -> Campaign | Sweep:
     """The configuration of a sweep into a store: of its file, or the grid of the options (or of such a file).
 
-    A grid is one of a store's once the robot is known (`of_grid`).
+    A grid is one of a store's once the robot is known (`campaign_of_grid`).
 
     Raises:
         BadConfiguration: for the same reasons as `resolve`. An option of the grid with a file that has its own axes.
@@ -163,8 +163,8 @@ def resolve_campaign(file: Path | None, options: Json, trust: bool = False) -> C
     return resolve_configuration(Sweep, file, options, StoreOptions, trust)
 
 
-def of_grid(grid: Sweep) -> Campaign:
-    """The configuration of a store with the axes of a grid that are stated, in `variation`'s units."""
+def campaign_of_grid(grid: Sweep) -> Campaign:
+    """Campaign whose axes are the stated axes of a grid, in the units of `variation`."""
     speeds = grid.motor_speeds_rpm
     axes: dict[str, tuple[float, ...] | None] = {
         "voltage": None if grid.battery else grid.voltages_V,

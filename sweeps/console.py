@@ -38,8 +38,10 @@ SILENCE, FIRST = 2.0, 1.0
 OUTPUT = "standard output"
 
 
-class _Outlet(Console):
-    """A console that replaces what a terminal would obey: names, units and cells come from files of others."""
+class _SafeConsole(Console):
+    """Console that replaces characters which a terminal would interpret, because names, units and cells may come from
+    others.
+    """
 
     def render(self, renderable: Any, options: Any = None) -> Iterator[Segment]:
         """Segments of text, each `printable`."""
@@ -48,11 +50,11 @@ class _Outlet(Console):
 
 
 _WIDTH = None if sys.stdout is not None and sys.stdout.isatty() else 160  # a file has no width of its own
-_out = _Outlet(highlight=False, soft_wrap=True, markup=False, width=_WIDTH)
+_out = _SafeConsole(highlight=False, soft_wrap=True, markup=False, width=_WIDTH)
 
 
-class _Messages(io.TextIOBase):
-    """Standard error. Messages that cannot be written, for instance because the disk is full, are lost."""
+class _ErrorStream(io.TextIOBase):
+    """Standard error. Messages that cannot be written, for instance because the disk is full, are dropped."""
 
     def write(self, text: str) -> int:
         with contextlib.suppress(OSError):
@@ -70,8 +72,8 @@ class _Messages(io.TextIOBase):
         return sys.stderr.fileno()
 
 
-MESSAGES = _Messages()
-_err = _Outlet(file=cast(IO[str], MESSAGES), highlight=False, soft_wrap=True, markup=False)
+MESSAGES = _ErrorStream()
+_err = _SafeConsole(file=cast(IO[str], MESSAGES), highlight=False, soft_wrap=True, markup=False)
 
 
 def print_output(what: Any) -> None:
@@ -127,8 +129,8 @@ def report_working(name: str) -> Iterator[None]:
 def step_reporter(
     tell: Callable[[str], None], doing: str, silence: float = SILENCE, again: Callable[[str], None] = rewrite_line
 ) -> Iterator[Callable[[str], None]]:
-    """A function that prints the current step. After a silence the step is repeated with its time and the number of
-    programs compiled.
+    """Yields a function that prints the current step. After a silence, the step is printed again with its time and
+    the number of programs compiled.
 
     Args:
         tell: prints a line.

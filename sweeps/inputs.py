@@ -48,7 +48,7 @@ def load_robot(config: RobotPart) -> RobotFile:
             f"--robot {file.name}: its controller follows a goal over time, which this command does not simulate; "
             "use calibrate, compare, loop or rig check with a log, export, or mmrjax.simulate in Python"
         )
-    unlike = () if getattr(config, "turns", False) else _unlike(file.name, robot)
+    unlike = () if getattr(config, "turns", False) else _unlike_sides_sentence(file.name, robot)
     examples = list_some(stated.example_numbers(file.text))
     if examples and isinstance(config, Calibrate | Loop):  # `rig check` lists their lines
         wide = f"± {100 * stated.EXAMPLE_SHARE:g} %"
@@ -71,7 +71,7 @@ def load_robot(config: RobotPart) -> RobotFile:
     return dataclasses.replace(file, robot=robot, remarks=unlike)
 
 
-def _unlike(name: str, robot: Robot) -> Names:
+def _unlike_sides_sentence(name: str, robot: Robot) -> Names:
     """Sentence for straight travel: how a robot with different sides turns if both are driven the same."""
     if not robot.unlike or not robot.has_ground:
         return ()
@@ -83,8 +83,8 @@ def _unlike(name: str, robot: Robot) -> Names:
     return (turn_words.unlike_sides_note(name, robot.unlike, turns),) if turns else ()
 
 
-def beside_robot(file: RobotFile) -> Posterior:
-    """Posterior from the folder of a calibrated robot's file.
+def posterior_beside_robot(file: RobotFile) -> Posterior:
+    """Posterior from the folder of a calibrated robot file.
 
     Raises:
         BadConfiguration: the robot is not from a file.
@@ -101,8 +101,8 @@ def beside_robot(file: RobotFile) -> Posterior:
     return posterior
 
 
-def fit_of(file: RobotFile, runs: records.Runs) -> str:
-    """`these` if the robot's folder records a fit to these rows, `others` for a fit to other rows, "" for no fit."""
+def recorded_fit(file: RobotFile, runs: records.Runs) -> str:
+    """`these` if the robot's folder records a fit to these rows, `others` for a fit to other rows, "" for none."""
     fitted = store.rows_of_fit(Path(file.source))
     return "" if not fitted else "these" if runs.digest in fitted else "others"
 

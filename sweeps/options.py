@@ -46,12 +46,12 @@ def schema_facts(kind: type[BaseModel]) -> dict[str, Json]:
 
 def option_of_field(name: str, fact: Json) -> str:
     """The option of a field: `--discharge` of `discharge_mAh`."""
-    stem, _ = of_unit(name)
+    stem, _ = split_unit(name)
     return str(fact.get("flag") or "--" + stem.replace("_", "-"))
 
 
-def of_unit(name: str) -> tuple[str, str]:
-    """A field's name without its unit, and the unit (empty if it has none)."""
+def split_unit(name: str) -> tuple[str, str]:
+    """Name of a field without its unit, and the unit (empty if it has none)."""
     return next(
         ((name.removesuffix(f"_{end}"), unit) for end, unit in UNITS.items() if name.endswith(f"_{end}")), (name, "")
     )
@@ -68,18 +68,18 @@ _LISTS = {"number": str, "string": list[str]}  # an axis is one text
 
 def option_help(name: str, fact: Json) -> str:
     """Help text of a field: meaning, unit, choices, bounds and default."""
-    _, unit = of_unit(name)
+    _, unit = split_unit(name)
     texts = [str(fact.get("description", name)).rstrip(".")]
     if unit and f"({unit})" not in texts[0]:
         texts[0] += f" ({unit})"
     if "enum" in fact:
         texts[0] += f": {', '.join(map(str, fact['enum']))}"
     texts[0] += "."
-    texts += [f"[{text}]" for text in (_bounds(fact), _default(name, fact)) if text]
+    texts += [f"[{text}]" for text in (_bounds_text(fact), _default_text(name, fact)) if text]
     return "  ".join(texts).replace("[", "\\[")  # a word in brackets would be markup
 
 
-def _bounds(fact: Json) -> str:
+def _bounds_text(fact: Json) -> str:
     limits = {**fact.get("items", {}), **fact}
     ends = [f"{limits[key]:.10g}" if key in limits else "" for key in ("minimum", "maximum")]
     if all(ends):
@@ -88,7 +88,7 @@ def _bounds(fact: Json) -> str:
     return ", ".join(f"{word} {limits[key]:.10g}" for key, word in words.items() if key in limits)
 
 
-def _default(name: str, fact: Json) -> str:
+def _default_text(name: str, fact: Json) -> str:
     value = fact.get("usual", fact.get("default"))
     if isinstance(value, bool):
         return "default: " + option_of_field(name, fact).removeprefix("--") if value else ""
@@ -104,11 +104,11 @@ def option_parameters(kind: type[BaseModel]) -> Iterator[inspect.Parameter]:
     for name, fact in schema_facts(kind).items():
         if "const" in fact:  # one choice is none
             continue
-        default, annotation = None, _type(fact) | None
+        default, annotation = None, _option_type(fact) | None
         if fact.get("argument"):
             declared: Any = typer.Argument(metavar=fact.get("metavar"), help=option_help(name, fact))
             if "default" not in fact:
-                default, annotation = inspect.Parameter.empty, _type(fact)
+                default, annotation = inspect.Parameter.empty, _option_type(fact)
         else:
             word = option_of_field(name, fact)
             pair = fact.get("type") == "boolean" and fact.get("default") is not False
@@ -118,7 +118,7 @@ def option_parameters(kind: type[BaseModel]) -> Iterator[inspect.Parameter]:
         yield inspect.Parameter(name, keyword, default=default, annotation=Annotated[annotation, declared])
 
 
-def _type(fact: Json) -> Any:
+def _option_type(fact: Json) -> Any:
     if fact.get("format") == "path":
         return Path
     return _LISTS[fact["items"]["type"]] if fact["type"] == "array" else _TYPES[fact["type"]]
@@ -130,10 +130,10 @@ def take_options(kind: type[BaseModel], values: Json) -> Json:
     Raises:
         BadConfiguration: an axis or a change that cannot be read.
     """
-    return {name: _read(name, fact, values.pop(name, None)) for name, fact in schema_facts(kind).items()}
+    return {name: _parse_option(name, fact, values.pop(name, None)) for name, fact in schema_facts(kind).items()}
 
 
-def _read(name: str, fact: Json, value: Any) -> Any:
+def _parse_option(name: str, fact: Json, value: Any) -> Any:
     if value is None or value == []:
         return None
     if fact["type"] == "object":
@@ -159,14 +159,14 @@ def help_all(kinds: tuple[type[BaseModel], ...]) -> Iterator[inspect.Parameter]:
     ]
     if hidden:
         option = typer.Option(
-            "--help-all", is_eager=True, callback=_show_all,
+            "--help-all", is_eager=True, callback=_show_full_help,
             help=f"Also show {', '.join(hidden)}, which \\[solver] of --config may contain.",
         )  # fmt: skip
         kind = inspect.Parameter.KEYWORD_ONLY
         yield inspect.Parameter("help_all", kind, default=False, annotation=Annotated[bool, option])
 
 
-def _show_all(context: typer.Context, wanted: bool) -> None:
+def _show_full_help(context: typer.Context, wanted: bool) -> None:
     if wanted:
         shown_context = copy.copy(context.command)
         shown_context.params = [copy.copy(p) for p in shown_context.params]

@@ -175,7 +175,7 @@ def accepted(*_, **__):
 HEAVY = (
     "calibration.sizing.sheet.check_requirements", "sweeps.commands.missions.run_missions", "sweeps.commands.climb.climb_batch",
     "sweeps.commands.loop.discover", "sweeps.commands.calibrate.run", "sweeps.commands.sensitivity.analyse_sensitivity",
-    "sweeps.commands.size.search", "sweeps.commands.render._write_whole",
+    "sweeps.commands.size.search", "sweeps.commands.render._write_completely",
 )  # fmt: skip
 
 

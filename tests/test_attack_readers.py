@@ -589,7 +589,7 @@ def test_models_that_mujoco_does_not_end_with_are_refused(tmp_path, monkeypatch,
         os.mkfifo(tmp_path / pipe)
     (tmp_path / "model.xml").write_text(MODELS[kind])
     before = set(os.listdir())
-    wrong, refused = asked(lambda: rig_new.joint_of(tmp_path / "model.xml", None))
+    wrong, refused = asked(lambda: rig_new.joint_numbers(tmp_path / "model.xml", None))
     assert not wrong and refused and set(os.listdir()) == before, wrong
 
 
@@ -597,7 +597,7 @@ def test_a_sound_model_is_read_and_leaves_no_file(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "part.xml").write_text('<mujoco><option timestep="0.001"/></mujoco>')
     assert (
-        rig_new.joint_of(
+        rig_new.joint_numbers(
             text_file(
                 tmp_path / "model.xml", MODEL % ('<size njmax="5000" nconmax="2000"/><include file="part.xml"/>', "")
             ),
@@ -635,5 +635,5 @@ def test_many_joints_are_named_in_a_short_sentence(tmp_path):
         for k in range(200)
     )
     (tmp_path / "robot.urdf").write_text(URDF.replace("</robot>", f"{joints}</robot>"))
-    wrong, refused = asked(lambda: rig_new.joint_of(tmp_path / "robot.urdf", None))
+    wrong, refused = asked(lambda: rig_new.joint_numbers(tmp_path / "robot.urdf", None))
     assert not wrong and refused[0].endswith("expected the name of one joint")

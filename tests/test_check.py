@@ -355,7 +355,7 @@ def test_what_no_robot_can_do_is_refused(robot, tmp_path, capsys):
         "mmrjax: r.toml, speed_m_s: the envelope's slope_deg goes up to 20; lacquered_wood holds 6T2A up to "
         f"{steepest:.1f} deg at most (adhesion 0.32), whatever drives it\n"
     )
-    sheet.refuse_impossible(robot, read('speed_m_s = 1\n[envelope]\nslope_deg = 20\nsurface = "concrete"'))
+    sheet.reject_impossible(robot, read('speed_m_s = 1\n[envelope]\nslope_deg = 20\nsurface = "concrete"'))
     file.write_text('speed_m_s = 1\n[envelope]\nconfiguration = "4W2"\n')
     assert command(["check", file, "--out", tmp_path / "run"]) == 2
     assert "the robot has no configuration 4W2; did you mean 4W2T?" in capsys.readouterr().err
@@ -365,11 +365,11 @@ def test_what_no_robot_can_do_is_refused(robot, tmp_path, capsys):
 
 
 def test_rated_is_what_the_parts_permit(robot):
-    asked = sheet.with_ratings(robot, read("winding_C = 'rated'\nmotor_speed_rpm = { most = 'rated' }"))
+    asked = sheet.fill_in_ratings(robot, read("winding_C = 'rated'\nmotor_speed_rpm = { most = 'rated' }"))
     assert [r.limit for r in asked.each] == pytest.approx([125.0, 12000.0])
     robot = dataclasses.replace(robot, gearbox=dataclasses.replace(robot.gearbox, torque_limit=None))
     with pytest.raises(BadConfiguration, match=r"^r.toml, gearbox_Nm: the robot states no rating; state a number$"):
-        sheet.with_ratings(robot, read("gearbox_Nm = 'rated'"))
+        sheet.fill_in_ratings(robot, read("gearbox_Nm = 'rated'"))
 
 
 def test_contradictions_are_those_of_one_use():
@@ -445,7 +445,7 @@ def test_posture_of_a_robot_that_states_no_running_gear_is_not_known(robot):
     gear = tuple(p.name for p in params.walk_parameters(robot) if p.name.startswith("running_gear."))
     bare = dataclasses.replace(robot, rig=dataclasses.replace(robot.rig, unknown=gear))
     with pytest.raises(BadConfiguration, match="step_mm: the robot's file has no running_gear"):
-        sheet.refuse_impossible(bare, requirements_file.parse_requirements("step_mm = 100", "posture.toml"))
+        sheet.reject_impossible(bare, requirements_file.parse_requirements("step_mm = 100", "posture.toml"))
 
 
 def test_heat_that_the_file_does_not_state_is_asked_for(tmp_path, capsys):

@@ -395,7 +395,7 @@ def test_track_model_runs_xla_on_one_thread_unless_told_otherwise(monkeypatch, g
     if given is None:
         monkeypatch.delenv("XLA_FLAGS")
     resolved = config.resolve_configuration(config.Sweep, None, {"model": model})
-    cli._prepare(resolved)
+    cli._prepare_environment(resolved)
     ours = "--xla_cpu_multi_thread_eigen=false" if model == "track" else None
     assert os.environ.get("XLA_FLAGS") == (ours if given is None else given)
 
@@ -529,8 +529,8 @@ def test_memory_exhausted_is_one_sentence_and_leaves_nothing(mmrjax, tmp_path, m
 
 def test_a_message_has_at_most_400_characters_and_keeps_its_end(capsys):
     whole = f"{'/data' * 30}/log.csv: got none; run mmrjax loop {'/data' * 30}/log.csv"
-    assert cli._fail(whole, 4) == 4 and capsys.readouterr().err == f"mmrjax: {whole}\n"
-    assert cli._fail(f"x: got {'many words ' * 99}; expected fewer", 2) == 2
+    assert cli._print_failure(whole, 4) == 4 and capsys.readouterr().err == f"mmrjax: {whole}\n"
+    assert cli._print_failure(f"x: got {'many words ' * 99}; expected fewer", 2) == 2
     err = capsys.readouterr().err
     assert len(err) <= len("mmrjax: \n") + errors.LONGEST == 409 and err.endswith("; expected fewer\n")
 

@@ -13,7 +13,14 @@ from numpy.testing import assert_allclose
 
 from mmrjax.climbing import climb_simulation as climb
 from mmrjax.climbing import footing, resting_posture, static_limits, terrain
-from mmrjax.climbing.climb_simulation import LOSSES, SOURCES, Sequence, climb_batch, climb_system, constant_angles
+from mmrjax.climbing.climb_simulation import (
+    LOSSES,
+    SOURCES,
+    LeverSequence,
+    build_climb_system,
+    climb_batch,
+    constant_angles,
+)
 from mmrjax.fidelities.steady import steady
 from mmrjax.model import params
 from mmrjax.model.conditions import Conditions
@@ -30,7 +37,7 @@ def batch(runs, robot=ROBOT, **options):
     """Runs of (terrain, front, rear in degrees, volts, further conditions). Pairs of angles are at 0.1 and 0.6 s."""
     grounds = jax.tree.map(lambda *x: jnp.stack(x), *[r[0] for r in runs])
     angles = [[jnp.asarray(np.radians(np.broadcast_to(a, 2))) for a in r[1:3]] for r in runs]
-    sequences = [Sequence(jnp.array([0.1, 0.6]), *pair, over_time=True) for pair in angles]
+    sequences = [LeverSequence(jnp.array([0.1, 0.6]), *pair, over_time=True) for pair in angles]
     sequences = jax.tree.map(lambda *x: jnp.stack(x), *sequences)
     more = [r[4] if len(r) > 4 else {} for r in runs]
     of = {
@@ -95,7 +102,7 @@ def test_parts_of_a_run_follow_on_each_other_and_end_with_it(monkeypatch, durati
         parts.append((float(first), float(steps * step), samples))
         return state, jnp.zeros((1, samples))
 
-    running = None, None, climb.Progress(jnp.array([climb._RUNNING]), *[jnp.zeros(1)] * 4)
+    running = None, None, climb.VerdictState(jnp.array([climb._RUNNING]), *[jnp.zeros(1)] * 4)
     monkeypatch.setattr(climb, "_begin", lambda *a: running)
     monkeypatch.setattr(climb, "_compiled", part)
     climb_batch(ROBOT, None, None, None, duration=duration, step=step)
@@ -106,7 +113,7 @@ def test_parts_of_a_run_follow_on_each_other_and_end_with_it(monkeypatch, durati
 
 
 def test_samples_have_all_their_steps_each_at_its_time(monkeypatch):
-    run = climb_system(
+    run = build_climb_system(
         ROBOT, Conditions(0, voltage=6.0).resolved(ROBOT), terrain.flat_ground(), constant_angles(0.5, 0.3)
     )
     motion, energy, progress = climb.begin_climb(run)
@@ -126,7 +133,7 @@ def test_samples_have_all_their_steps_each_at_its_time(monkeypatch):
 def test_tracks_of_levers_lose_what_table_3_says_at_their_own_speed():
     """(350 - 70) / 2 mN·m and (16 - 3) / 2 mN·m·s each. All three as one where the levers stand."""
     wheeled, tracked = (
-        climb_system(
+        build_climb_system(
             ROBOT, Conditions(k, voltage=6.0).resolved(ROBOT), terrain.flat_ground(), constant_angles(0.5, 0.3)
         )
         for k in (1, 0)
@@ -140,7 +147,7 @@ def test_tracks_of_levers_lose_what_table_3_says_at_their_own_speed():
 
 def test_motors_of_levers_load_the_battery():
     """I_b = I_s + I_p (10), with I_s of all four motors: the voltage falls by 8 x 49 mΩ an ampere."""
-    run = climb_system(
+    run = build_climb_system(
         ROBOT, Conditions(0, battery=True).resolved(ROBOT), terrain.flat_ground(), constant_angles(0.5, 0.3)
     )
     motion = climb.stand_before_obstacle(run)
@@ -161,8 +168,8 @@ def test_motors_of_levers_load_the_battery():
 def test_a_positive_voltage_raises_either_lever():
     """Angles are positive up. Of the rear pair ψ falls then."""
     volts = jnp.full(2, 6.0)
-    asked = Sequence(jnp.arange(2.0), volts, volts, over_time=True, begins=jnp.full(2, 0.5))
-    run = climb_system(ROBOT, Conditions(0, voltage=6.0).resolved(ROBOT), terrain.flat_ground(), asked)
+    asked = LeverSequence(jnp.arange(2.0), volts, volts, over_time=True, begins=jnp.full(2, 0.5))
+    run = build_climb_system(ROBOT, Conditions(0, voltage=6.0).resolved(ROBOT), terrain.flat_ground(), asked)
     swung = climb._drive_action(run, climb.stand_before_obstacle(run), 0.5, 24.0, jnp.zeros(2), run.step * jnp.eye(2))
     assert swung.rate[0] > 0 > swung.rate[1]
     assert np.asarray(swung.voltage) == pytest.approx([6.0, -6.0])
@@ -221,7 +228,7 @@ def test_largest_step_is_the_same_to_a_millimetre_with_half_the_step_of_time():
 
 @pytest.mark.slow
 def test_how_a_run_ends_is_read_off_its_motion():
-    run = climb_system(
+    run = build_climb_system(
         ROBOT, Conditions(0, voltage=6.0).resolved(ROBOT), terrain.single_step(0.08), constant_angles(0.5, 0.3)
     )
     motion, _, progress = climb.begin_climb(run)
@@ -251,7 +258,7 @@ def test_how_a_run_ends_is_read_off_its_motion():
 def test_dynamics_are_those_of_mujoco():
     """Mass matrix and bias of chassis, pulleys and levers as hinged bodies, at random states."""
     conditions = Conditions(0, voltage=6.0, slope_deg=12.0, payload=5.0).resolved(ROBOT)
-    run = climb_system(ROBOT, conditions, terrain.flat_ground(), constant_angles(0.5, 0.3))
+    run = build_climb_system(ROBOT, conditions, terrain.flat_ground(), constant_angles(0.5, 0.3))
     model = mujoco.MjModel.from_xml_string(_bodies(run, 12.0))
     data = mujoco.MjData(model)
     random = np.random.default_rng(5)
@@ -276,7 +283,9 @@ def beside_mujoco(slope, ground, angles, volts, clear):
     """
     conditions = Conditions(0, voltage=volts, slope_deg=slope, payload=5.0).resolved(ROBOT)
     pairs = (jnp.radians(jnp.array(pair)) for pair in angles)
-    run = climb_system(ROBOT, conditions, ground(), Sequence(jnp.array([0.1, 0.8]), *pairs, over_time=True))
+    run = build_climb_system(
+        ROBOT, conditions, ground(), LeverSequence(jnp.array([0.1, 0.8]), *pairs, over_time=True)
+    )
     steps = 10_000
 
     @jax.jit
@@ -319,7 +328,7 @@ def test_steps_across_a_corner_are_those_of_mujoco_until_contacts_first_differ()
     run, ours, theirs = beside_mujoco(0.0, ground, ((45.0, 45.0), (-8.4, -8.4)), 24.0, 0.01)
 
     def touching(q):
-        at = footing.footing(run.shape, run.terrain, q, 0 * q)
+        at = footing.contacts_with_terrain(run.shape, run.terrain, q, 0 * q)
         return at.force > 0, jnp.any((at.force > 0) & (at.place == 0.0))  # the corner is at 0
 
     touch = jax.jit(jax.vmap(touching))
@@ -359,7 +368,7 @@ def _bodies(run, slope):
 
 def test_rates_of_all_gaps_are_the_derivatives_of_the_gaps():
     """Each contact moves as its distance changes, so that elastic contacts keep what they store."""
-    run = climb_system(
+    run = build_climb_system(
         ROBOT,
         Conditions(0, voltage=6.0).resolved(ROBOT),
         terrain.single_step(0.08, nose=0.01),
@@ -369,9 +378,9 @@ def test_rates_of_all_gaps_are_the_derivatives_of_the_gaps():
     v = jnp.array([0.3, -0.2, 0.7, 2.0, 0.4, -0.5])
 
     def gaps(t):
-        return footing.footing(run.shape, run.terrain, q + t * v, v).gap
+        return footing.contacts_with_terrain(run.shape, run.terrain, q + t * v, v).gap
 
-    rates = np.asarray(footing.footing(run.shape, run.terrain, q, v).gap_rate)
+    rates = np.asarray(footing.contacts_with_terrain(run.shape, run.terrain, q, v).gap_rate)
     numeric = np.asarray((gaps(1e-6) - gaps(-1e-6)) / 2e-6)
     near = np.abs(np.asarray(gaps(0.0))) < 0.5
     off = np.abs(rates - numeric)[near]
@@ -384,9 +393,9 @@ def test_polyline_of_constant_slope_is_tilted_gravity():
     angle = np.radians(10.0)
     conditions = [Conditions(0, voltage=10.0, slope_deg=slope).resolved(ROBOT) for slope in (0.0, 10.0)]
     end_point = terrain.FAR * np.array([np.cos(angle), np.sin(angle)])
-    grounds = terrain._terrain([-end_point, end_point], 0.0), terrain.flat_ground()
+    grounds = terrain._terrain_of_points([-end_point, end_point], 0.0), terrain.flat_ground()
     raised, level = (
-        climb_system(ROBOT, *of, constant_angles(np.pi, np.pi)) for of in zip(conditions, grounds, strict=True)
+        build_climb_system(ROBOT, *of, constant_angles(np.pi, np.pi)) for of in zip(conditions, grounds, strict=True)
     )
     start = climb.stand_before_obstacle(level)
     cos, sin = np.cos(angle), np.sin(angle)
@@ -417,14 +426,14 @@ def test_level_ground_is_travelled_as_settled_balances_have_it():
     `track`, whose belt yields, has another share and another ripple, and so other means (docs/explanation/climbing.md).
     """
     conditions = Conditions(0, voltage=15.0, slope_deg=5.0).resolved(ROBOT)
-    run = climb_system(ROBOT, conditions, terrain.flat_ground(), constant_angles(np.pi, np.pi))
+    run = build_climb_system(ROBOT, conditions, terrain.flat_ground(), constant_angles(np.pi, np.pi))
     none = dict.fromkeys((*SOURCES, *LOSSES), jnp.zeros(()))
 
     @jax.jit
     def driven(motion, first):
         def one(motion, k):
             after, _, passed = climb.advance_climb(run, motion, first + k * run.step, none)
-            at = footing.footing(run.shape, run.terrain, motion.q, motion.v)
+            at = footing.contacts_with_terrain(run.shape, run.terrain, motion.q, motion.v)
             load = jnp.stack([jnp.sum(at.guided * at.force), jnp.sum(at.force)])
             return after, (motion.q[3], passed.current, motion.v[0], load)
 
@@ -445,7 +454,7 @@ def test_level_ground_is_travelled_as_settled_balances_have_it():
 def test_pairs_of_the_paper_s_full_model_are_counted_on_the_belts_of_its_geometry():
     """1680 (Section 3.4.5): grousers on the ground and teeth on two guides, of two main and four levers' belts. The climb
     resolves the grousers alone, each beside corners of the ground. Its teeth run rigidly."""
-    run = climb_system(
+    run = build_climb_system(
         ROBOT, Conditions(0, voltage=6.0).resolved(ROBOT), terrain.flat_ground(), constant_angles(0.5, 0.3)
     )
     pairs = {}
@@ -454,7 +463,7 @@ def test_pairs_of_the_paper_s_full_model_are_counted_on_the_belts_of_its_geometr
         assert float(belt.length) == pytest.approx(teeth * PITCH_TOOTH, abs=1e-3)
         pairs[name] = count * belt.grousers, count * 2 * teeth
     assert sum(pairs["main"]) == 720 and sum(pairs["main"]) + sum(pairs["lever"]) == 1680
-    at = footing.footing(run.shape, run.terrain, climb.stand_before_obstacle(run).q, jnp.zeros(6))
+    at = footing.contacts_with_terrain(run.shape, run.terrain, climb.stand_before_obstacle(run).q, jnp.zeros(6))
     # grousers of one side, then what corners of a terrain and wheels meet
     tips = (pairs["main"][0] + pairs["lever"][0]) // 2
     near = np.abs(np.asarray(at.gap)) < 1.0
@@ -464,7 +473,7 @@ def test_pairs_of_the_paper_s_full_model_are_counted_on_the_belts_of_its_geometr
 @jax.jit
 def lowest(run, q):
     """Least gap of all contacts [m]."""
-    return jnp.min(footing.footing(run.shape, run.terrain, q, 0 * q).gap)
+    return jnp.min(footing.contacts_with_terrain(run.shape, run.terrain, q, 0 * q).gap)
 
 
 def leant(run, pitch):
@@ -490,7 +499,7 @@ def nose_up():
     outer, inner = float(ROBOT.radius_pulley + gear.grouser_height), float(ROBOT.radius_pulley)
     front = np.radians(60.0)
     conditions = Conditions(0, voltage=4.0).resolved(ROBOT)
-    run = climb_system(ROBOT, conditions, terrain.flat_ground(), constant_angles(front, np.pi))
+    run = build_climb_system(ROBOT, conditions, terrain.flat_ground(), constant_angles(front, np.pi))
     q = jnp.zeros(6).at[4].set(front).at[5].set(0.0)
     matrix, *_ = climb.mass_matrix_and_bias(run, q, jnp.zeros(6))
     ahead = float(-matrix[1, 2] / matrix[0, 0]) + float(gear.wheelbase) / 2
@@ -517,7 +526,7 @@ def test_static_limits_of_steps_and_gaps_are_those_of_the_dynamics():
         assert 1e3 * float(low.height) == pytest.approx({0.0: 232, 8.0: 203}[payload], abs=1)
         for height in (float(low.height) - 0.004, float(high.height) + 0.006):
             ground = terrain.single_step(height, size=POINTS)
-            run = climb_system(
+            run = build_climb_system(
                 ROBOT,
                 Conditions(0, voltage=4.0, **of).resolved(ROBOT),
                 ground,
@@ -531,7 +540,7 @@ def test_static_limits_of_steps_and_gaps_are_those_of_the_dynamics():
     for front, widths in ((180.0, (0.144, 0.21)), (flush, (0.346, 0.38))):
         grounds += [(terrain.gap(width), front, front) for width in widths]
     for ground, front, rear in grounds:
-        run = climb_system(
+        run = build_climb_system(
             ROBOT,
             Conditions(0, voltage=4.0).resolved(ROBOT),
             ground,
@@ -541,7 +550,7 @@ def test_static_limits_of_steps_and_gaps_are_those_of_the_dynamics():
         starts.append(climb.stand_before_obstacle(run).q)
     starts += starts[-1:] * (MEMBERS - len(starts))
     zero = np.zeros(len(starts))
-    start = climb.Motion(jnp.stack(starts), jnp.zeros((len(starts), 6)), *map(jnp.asarray, (zero, zero, zero)))
+    start = climb.ClimbMotion(jnp.stack(starts), jnp.zeros((len(starts), 6)), *map(jnp.asarray, (zero, zero, zero)))
     found = whole_climbs(runs, duration=16.0, step=2e-4, start=start)
     over = [name == "over" for name in found.names[: len(runs)]]
     assert over == [True, False] * 5, found.names

@@ -8,7 +8,7 @@ import pytest
 from mmrjax.climbing import climb_derivatives as room
 from mmrjax.climbing import climb_simulation as climb
 from mmrjax.climbing import terrain
-from mmrjax.climbing.climb_simulation import ClimbRecord, Motion
+from mmrjax.climbing.climb_simulation import ClimbMotion, ClimbRecord
 from mmrjax.fidelities.variation import Variation
 from mmrjax.model import params
 from mmrjax.model.conditions import Conditions
@@ -31,7 +31,7 @@ def passed(count, place, **other):
     of = {name: zero for name in ClimbRecord.__dataclass_fields__}
     of |= dict(time=0.5 * jnp.arange(count), voltage=zero + 12.0, current=zero + 2.0, centre=jnp.asarray(place))
     of |= dict(energy={"supply": 10.0 * jnp.arange(count), "levers": zero}, lever_current=jnp.zeros((count, 2)))
-    of |= dict(motion=Motion(jnp.zeros((count, 6)), jnp.zeros((count, 6)), zero, zero, zero), grip=zero + 0.25)
+    of |= dict(motion=ClimbMotion(jnp.zeros((count, 6)), jnp.zeros((count, 6)), zero, zero, zero), grip=zero + 0.25)
     return ClimbRecord(**(of | other))
 
 

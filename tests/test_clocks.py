@@ -126,14 +126,14 @@ def test_the_period_of_a_slow_sensor_is_found(rows):
 @pytest.mark.parametrize("case", EVERY_ROW)
 def test_coarse_readings_are_no_repeats(case):
     values = EVERY_ROW[case]
-    found, rows = row_checks.used_once(values, np.arange(len(values)))
+    found, rows = row_checks.drop_repeated_readings(values, np.arange(len(values)))
     assert rows == 0 and found is values
 
 
 def test_each_reading_of_a_slow_sensor_is_used_once():
     walk = WALK.copy()
     walk[50] = walk[49]  # the same reading twice is two readings
-    found, rows = row_checks.used_once(held(walk, 15), np.arange(3000))
+    found, rows = row_checks.drop_repeated_readings(held(walk, 15), np.arange(3000))
     assert rows == 15
     assert_array_equal(np.flatnonzero(np.isfinite(found)), np.arange(0, 3000, 15))
     assert_array_equal(found[::15], walk)

@@ -129,8 +129,8 @@ def test_oldest_entries_are_dropped(tmp_path, monkeypatch):
         os.utime(entry, (k, k))
     (tmp_path / "xla-0" / "xla_gpu_per_fusion_autotune_cache_dir").mkdir()  # XLA's own, where there is a GPU
     os.utime(tmp_path / "xla-0" / "xla_gpu_per_fusion_autotune_cache_dir", (0, 0))
-    compilation_cache._prune(tmp_path)
+    compilation_cache._delete_oldest(tmp_path)
     left = sorted(int(path.name.rpartition("-")[2]) for path in tmp_path.rglob("program-*"))
     assert left == [7, 8, 9, 10, 11]
-    compilation_cache._prune(tmp_path)
+    compilation_cache._delete_oldest(tmp_path)
     assert len(list(tmp_path.rglob("program-*"))) == 5

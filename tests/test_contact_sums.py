@@ -13,8 +13,8 @@ from mmrjax.effects import BY_NAME
 from mmrjax.model import params
 from mmrjax.model.conditions import Conditions
 from mmrjax.undercarriage import contact_sums, half_robot, mjcf, side_contacts
-from mmrjax.undercarriage.belt import Path
-from mmrjax.undercarriage.half_robot import Motion, advance, generalized, half_robot_system, instant
+from mmrjax.undercarriage.belt import BeltPath
+from mmrjax.undercarriage.half_robot import HalfRobotState, advance, build_system, generalized_forces, instant
 from mmrjax.undercarriage.mjcf import mjx
 
 RUNS = {
@@ -48,7 +48,7 @@ def eventful(recessed):
 def motion_of(robot, run, k):
     """In mid-run, no two parts alike. Which of the contacts slip beyond V_s differs with `k`."""
     draw = np.random.default_rng(k)
-    setup = half_robot_system(robot, run, STEP)
+    setup = build_system(robot, run, STEP)
     low = float(half_robot.axle_height(setup))
     q = jnp.asarray([0.1, low - 2e-4, 1e-3 * draw.normal(), 0.3 + draw.random(), 0.0])
     q = q.at[4].set(q[3] - 1e-4)
@@ -56,21 +56,23 @@ def motion_of(robot, run, k):
     speed = turning * float(setup.chassis.radius) * [0.9, 0.99, 0.7][k % 3]
     v = jnp.asarray([speed, 2e-3 * draw.normal(), 0.02 * draw.normal(), turning, turning * 1.002])
     memory = {e.name: jnp.asarray(0.3 + 0.1 * draw.random()) for e in robot.remembering}
-    return Motion(q, v, jnp.asarray(1.5 + draw.random()), jnp.asarray(20.0), memory)
+    return HalfRobotState(q, v, jnp.asarray(1.5 + draw.random()), jnp.asarray(20.0), memory)
 
 
 def _summed(setup, given, gained):
     """The sums over the contacts, as computed, from the inputs of `contact_sums.linearize`."""
     gear = dataclasses.replace(setup.path.gear, **{n: given[n] for n in contact_sums.GEAR})
-    path, chassis = Path(given["pulley"], gear), setup.chassis
+    path, chassis = BeltPath(given["pulley"], gear), setup.chassis
     laws = {n: given[f"friction_{n}"] for n in contact_sums.FRICTION}
     ground = dataclasses.replace(chassis.ground, friction=dataclasses.replace(chassis.ground.friction, **laws))
     own = {n: given[f"chassis_{n}"] for n in contact_sums.CHASSIS}
     chassis = dataclasses.replace(chassis, ground=ground, **own)
     q = jnp.stack([jnp.zeros(()), *(given[n] for n in contact_sums.MOTION[:4])])
     v = jnp.stack([given[n] for n in contact_sums.MOTION[4:]])
-    at = side_contacts.contact_state(path, chassis, q, v)
-    return contact_sums.contact_shares(path, chassis, at, given["slip"], given["adhesion"], gained).sum(axis=-1)
+    at = side_contacts.compute_contacts(path, chassis, q, v)
+    return contact_sums.contributions_of_contacts(path, chassis, at, given["slip"], given["adhesion"], gained).sum(
+        axis=-1
+    )
 
 
 @pytest.mark.slow
@@ -78,7 +80,7 @@ def _summed(setup, given, gained):
 def test_slopes_of_the_sums_are_their_derivatives(recessed, name):
     """By the motion, the slip and every constant of the contacts, to 1e-9 of the largest of each sum's slopes."""
     run = Conditions(**RUNS[name])
-    setup = half_robot_system(recessed, run, STEP)
+    setup = build_system(recessed, run, STEP)
     gained = 1e-3 * jnp.asarray([0.3, -1.0, 0.5, 20.0, 30.0])
     constants = contact_sums.contact_inputs(setup.path, setup.chassis, run.adhesion)
     found = jax.jit(lambda x: contact_sums.linearize(setup.path, setup.chassis, x, gained, tuple(constants)))
@@ -101,9 +103,9 @@ def pushed():
 
     @eqx.filter_jit
     def both(robot, run, motion):
-        setup = half_robot_system(robot, run, STEP)
+        setup = build_system(robot, run, STEP)
         signals, _, pulled = instant(setup, motion)
-        force, armature = generalized(setup, signals, pulled)
+        force, armature = generalized_forces(setup, signals, pulled)
         model = setup.model.replace(dof_armature=armature)
         data = mjx.step(model, setup.data.replace(qpos=motion.q, qvel=motion.v, qfrc_applied=force))
         gained, wheelbase = data.qvel - motion.v, setup.path.gear.wheelbase
@@ -124,11 +126,11 @@ def test_impulse_is_that_of_mjx(recessed, pushed, name):
 
 
 def _stepped(robot, run, motion, step, forward):
-    return forward(half_robot_system(robot, run, step), motion)
+    return forward(build_system(robot, run, step), motion)
 
 
 def _as_computed(run, motion):
-    step = half_robot._step(run, motion)
+    step = half_robot._implicit_step(run, motion)
     return step.after, step.signals, step.guided
 
 
@@ -218,7 +220,7 @@ def test_second_derivatives_are_those_of_what_is_computed(recessed):
 
     def slope(v, step):
         def after(v):
-            return step(half_robot_system(recessed, run, STEP), dataclasses.replace(motion, v=v))[0].v
+            return step(build_system(recessed, run, STEP), dataclasses.replace(motion, v=v))[0].v
 
         return jax.jacfwd(jax.jacfwd(after))(v)
 

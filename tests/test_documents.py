@@ -16,11 +16,11 @@ from calibration.data import runs as records
 from calibration.data.parts import packaged_cells
 from calibration.data.robot_file import RobotFile
 from calibration.sizing import sheet
-from calibration.sizing.design_search import SizedDesign, Sizing
+from calibration.sizing.design_search import SizedDesign, SizingResult
 from calibration.sizing.part_options import drive_options
 from mmrjax.model.paper_robots import nominal
 from sweeps import store
-from sweeps.inputs import fit_of
+from sweeps.inputs import recorded_fit
 from sweeps.report import (
     check_report,
     comparison_report,
@@ -40,14 +40,14 @@ def outcomes():
     asked = requirements_file.parse_requirements("speed_m_s = 1\nmass_kg = 15\nslope_deg = 20\n", "aims.toml")
     at = {"configuration": "6T2A", "surface": "lacquered_wood", "payload_kg": 8.0, "slope_deg": 10.0}
     changes = (
-        sheet.Change("gearbox.ratio", 48.0, 45.27, "-", -0.02),
-        sheet.Change("battery.capacity", 7920.0, 16210.0, "C", 1e-5, ("mass_kg",)),
+        sheet.ParameterChange("gearbox.ratio", 48.0, 45.27, "-", -0.02),
+        sheet.ParameterChange("battery.capacity", 7920.0, 16210.0, "C", 1e-5, ("mass_kg",)),
     )
     speed, mass, slope = asked.each
     return (
-        sheet.Outcome(speed, 0.947, -0.053, "converged", at, changes),
-        sheet.Outcome(mass, 13.1, 1.9, "converged", {k: at[k] for k in ("configuration", "surface")}),
-        sheet.Outcome(slope, None, None, "slides", at),
+        sheet.RequirementOutcome(speed, 0.947, -0.053, "converged", at, changes),
+        sheet.RequirementOutcome(mass, 13.1, 1.9, "converged", {k: at[k] for k in ("configuration", "surface")}),
+        sheet.RequirementOutcome(slope, None, None, "slides", at),
     )
 
 
@@ -64,7 +64,7 @@ def size():
         {"winding": 0.002, "cell current": 0.4}, ("largest ratio",), robot,
     )  # fmt: skip
     short = dataclasses.replace(best, margins={"winding": -0.08}, objectives={"mass": 13.7}, bounds=())
-    sizing = Sizing(
+    sizing = SizingResult(
         None, None, "mass", ("steepest slope held",), best, best, (), {"a": best, "b": short}, (), 256, 31000
     )  # fmt: skip
     return size_report.size_document(SizeResult(asked, robot, sizing, ("mass",), outcomes()), "nominal (PM)")
@@ -163,18 +163,18 @@ def test_a_robot_is_fitted_to_the_rows_that_its_folder_records(tmp_path):
     robot, runs = tmp_path / "robot.toml", records.read_runs("measured")
     robot.write_text("# a robot\n")
     file = RobotFile(nominal(), str(robot))
-    assert fit_of(file, runs) == "" == fit_of(RobotFile(nominal(), "nominal"), runs)
+    assert recorded_fit(file, runs) == "" == recorded_fit(RobotFile(nominal(), "nominal"), runs)
     manifest = {
         "arguments": ["loop", "x.csv"],
         "hashes": {"robot": store.sha256_hex(robot.read_bytes()), "x.csv": runs.digest},
     }
     (tmp_path / "manifest.json").write_text(json.dumps(manifest))
-    assert fit_of(file, runs) == "these"
-    assert fit_of(file, records.Runs("other", runs.columns)) == "others"
+    assert recorded_fit(file, runs) == "these"
+    assert recorded_fit(file, records.Runs("other", runs.columns)) == "others"
     robot.write_text("# changed by hand\n")
-    assert fit_of(file, runs) == ""
+    assert recorded_fit(file, runs) == ""
     (tmp_path / "manifest.json").write_text(json.dumps(manifest | {"arguments": ["compare", "x.csv"]}))
-    assert fit_of(file, runs) == ""
+    assert recorded_fit(file, runs) == ""
 
 
 def test_page_terminal_and_csv_show_the_same_cells(tmp_path, capsys):

@@ -11,7 +11,7 @@ from scipy.integrate import cumulative_simpson
 from worlds import paper
 
 from mmrjax.effects.electrical_effects import ThermalDrift
-from mmrjax.fidelities.drive import _status, drive, drive_batch
+from mmrjax.fidelities.drive import _status_of_run, drive, drive_batch
 from mmrjax.fidelities.result import movers_slip
 from mmrjax.fidelities.steady import steady, steady_batch
 from mmrjax.model import balances, params
@@ -258,7 +258,7 @@ def test_status_follows_from_what_the_robot_does(robot, gain, sliding, status):
     run = Conditions()
     end = balances.moving_signals(robot, run, State(1.0, 900.0, 0.7, 0.0))
     end = dataclasses.replace(end, speed_sliding=jnp.asarray(sliding), acceleration=jnp.asarray(gain))
-    assert STATUSES[int(_status(robot, run, end, jnp.asarray(False), jnp.asarray(True)))] == status
+    assert STATUSES[int(_status_of_run(robot, run, end, jnp.asarray(False), jnp.asarray(True)))] == status
     assert bool(movers_slip(robot, end)) is (sliding > 0.02)
 
 

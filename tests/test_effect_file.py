@@ -210,7 +210,7 @@ def test_missing_effect_file_is_refused(tmp_path):
 @pytest.mark.slow
 def test_packaged_effects_pass_the_users_checks():
     for effect in BY_NAME.values():
-        effect_file._check(Path("library"), effect)
+        effect_file._check_effect(Path("library"), effect)
 
 
 # --- configurations in robot files ----------------------------------------------------------------------
@@ -232,9 +232,9 @@ def test_robot_file_names_the_configurations_of_an_effect(tmp_path):
 
 def test_robot_file_may_undo_the_configurations_of_a_class(tmp_path):
     library = effect_file.effect_library([written(tmp_path, stating('configurations = ("4W2T",)'))])
-    robot = robot_file.with_effects(paper_robots.nominal(), ("seal_drag",), library)
+    robot = robot_file.add_effects(paper_robots.nominal(), ("seal_drag",), library)
     assert robot.effects[0].configurations == ("4W2T",)
-    robot = robot_file.with_effects(paper_robots.nominal(), ("seal_drag",), library, {"seal_drag": []})
+    robot = robot_file.add_effects(paper_robots.nominal(), ("seal_drag",), library, {"seal_drag": []})
     assert robot.effects[0].configurations == ()
     robot_file.write_robot(robot, tmp_path / "robot.toml")
     assert robot_file.read_robot(tmp_path / "robot.toml", library).effects[0].configurations == ()

@@ -32,7 +32,7 @@ from mmrjax.fidelities.steady import steady, steady_batch
 from mmrjax.model import balances, channels, paper_robots, params
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.params import Scalar, parameter
-from mmrjax.model.rig import Begin, Begins, Instrument
+from mmrjax.model.rig import Instrument, RunStart, RunStarts
 from mmrjax.model.robot import Configurations
 from mmrjax.model.shaft import Shaft
 from mmrjax.model.signals import CONVERGED, STALLED, Signals, State
@@ -930,7 +930,7 @@ def test_friction_by_the_position_begins_where_a_history_does():
     names = ("position_friction", "angle_friction", "presliding")
     load = Shaft(inertia=1e-3, loss_coulomb=0.05, loss_viscous=1e-3)
     robot = paper_robots.blank_robot(Configurations({"bench": load}))
-    begins = Begins({"begin_a": Begin(angle=1.5), "begin_b": Begin(angle=-2.0)})
+    begins = RunStarts({"begin_a": RunStart(angle=1.5), "begin_b": RunStart(angle=-2.0)})
     rig = dataclasses.replace(robot.rig, begins=begins, start="measured")
     robot = dataclasses.replace(with_effects(*(BY_NAME[n]() for n in names), robot=robot), rig=rig)
     for begin, angle in enumerate((1.5, -2.0)):
@@ -1065,7 +1065,7 @@ def test_instant_of_half_robot_with_all_effects_has_finite_derivatives_by_every_
     """What `track` integrates, at standstill."""
 
     def outputs(robot, run):
-        system = half_robot.half_robot_system(robot, run, 1e-4)
+        system = half_robot.build_system(robot, run, 1e-4)
         signals, _, pulled = half_robot.instant(system, half_robot.stand(system))
         leaves = [jnp.asarray(x) for x in jax.tree.leaves((signals, pulled))]
         return jnp.concatenate([x.ravel() for x in leaves if x.dtype == THETA.dtype])

@@ -118,7 +118,7 @@ def test_what_was_found_is_drawn_over_what_it_depends_on(change, label):
     table = turns()
     y = change(table)
     y[3] = np.nan  # a row that does not count
-    x, said = loop_figures.depends_on(table, y)
+    x, said = loop_figures.driving_variable(table, y)
     assert said == label and x.shape == y.shape
 
 
@@ -131,7 +131,10 @@ def test_voltage_of_a_side_is_its_share_of_the_supply():
 def test_where_a_driver_passes_on_a_share_of_one_voltage_that_is_the_axis():
     duty = RANDOM.uniform(-1, 1, 8)
     table = {"configuration": np.full(8, "rig"), "supply_voltage_V": np.full(8, 48.0), "duty": duty}
-    for x, label in (loop_figures.depends_on(table, duty**3), loop_figures._over(table, "slope_deg", "slope [deg]")):
+    for x, label in (
+        loop_figures.driving_variable(table, duty**3),
+        loop_figures._defect_variable(table, "slope_deg", "slope [deg]"),
+    ):
         assert np.array_equal(x, 48.0 * duty) and label == "voltage given to the motors [V]"
 
 

@@ -20,7 +20,7 @@ def said(kind, name):
 @pytest.fixture
 def unsimulated(monkeypatch):
     """Without the runs that say what an effect changes: a program of its own each."""
-    monkeypatch.setattr(explain, "_changes", lambda effect: iter(["as simulated"]))
+    monkeypatch.setattr(explain, "_change_sentences", lambda effect: iter(["as simulated"]))
 
 
 def test_every_name_has_an_explanation_of_its_kind(unsimulated):
@@ -52,12 +52,12 @@ def test_an_effect_of_ones_own_may_go_with_anything():
 @pytest.mark.slow
 def test_a_typical_size_is_simulated(robot):
     """0.5 ohm in series take 0.5 V/A · I of 24 V less what drives: the motors slow down by that."""
-    changes = list(explain._changes(effects.BY_NAME["series_resistance"]()))
+    changes = list(explain._change_sentences(effects.BY_NAME["series_resistance"]()))
     assert len(changes) == 2 and changes[0].startswith(
         "change for one typical size, for 6T2A at 24 V, 5°, 3 kg: total current -"
     )
     assert "motor speed -3.3 %" in changes[0]
-    assert list(explain._changes(effects.BY_NAME["armature_inductance"]())) == []
+    assert list(explain._change_sentences(effects.BY_NAME["armature_inductance"]())) == []
 
 
 def test_parameters_and_channels_are_explained_by_their_rows():

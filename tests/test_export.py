@@ -66,7 +66,7 @@ def compared(file):
     """A drive on wheels and the native model over Table 8."""
     drive = joints.joint_of_robot(file, WHEELS)
     runs = situation.situation_of_joint(drive, None)
-    return drive, runs, law_source.constants_of(drive, runs.signals, None)
+    return drive, runs, law_source.law_constants(drive, runs.signals, None)
 
 
 @pytest.fixture(scope="module")
@@ -84,7 +84,11 @@ def translated(drive, runs):
     """Comparison with MuJoCo, its files and its numbers."""
     normal = float(np.mean(runs.signals.normal))
     found = comparison.compare_format(
-        runs, mujoco.law_of(normal), mujoco.fates_in_mujoco(drive, normal), mujoco.TERMS, mujoco.approximated_terms
+        runs,
+        mujoco.mujoco_law_function(normal),
+        mujoco.fates_in_mujoco(drive, normal),
+        mujoco.TERMS,
+        mujoco.approximated_terms,
     )
     motor = mujoco.mjcf_motor(drive, found.refitted)
     about = dict.fromkeys(("frictionloss", "damping", "armature"), "")
@@ -141,7 +145,7 @@ def test_text_of_every_effect_computes_what_the_balances_do():
 def expressions_text(drive):
     """Function from part, suffix and signals to the number that its text computes."""
     known = [
-        law_source.Constant(n, x, "", "", "")
+        law_source.LawConstant(n, x, "", "", "")
         for n, x in {
             **{n: float(p.value) for n, p in drive.parameters().items()},
             **dict.fromkeys(drive.surroundings(), 0.7),
@@ -219,7 +223,7 @@ def test_stated_loss_of_mujoco_is_the_measured_one(with_effects):
 
 def test_actuator_is_the_native_law_and_needs_jax_alone(with_effects):
     drive, runs, known = with_effects
-    law = jax_actuator.law_of(runs, known)(drive, {})
+    law = jax_actuator.actuator_law_function(runs, known)(drive, {})
     current, speed = comparison.evaluate_law(law, law.start, runs.command, runs.load, runs.way)
     assert_allclose(current, runs.inside.current, rtol=1e-9)
     assert_allclose(speed, runs.inside.speed, rtol=1e-9)
@@ -289,7 +293,7 @@ def test_serialised_actuator_computes_what_its_source_does(with_effects):
 
 def test_tables_read_in_c_as_in_csv(with_effects, tmp_path):
     drive, runs, known = with_effects
-    found = feed_forward.map_of(runs, known)
+    found = feed_forward.map_of_drive(runs, known)
     files = feed_forward.table_files(drive, found, [])
     rows = list(csv.DictReader(io.StringIO(files["feed_forward.csv"])))
     assert len(rows) == len(found.speed) * len(found.torque)
@@ -297,7 +301,7 @@ def test_tables_read_in_c_as_in_csv(with_effects, tmp_path):
     given = {n: float(v) for n, v in row.items()}
     lost = sum(v for n, v in given.items() if n.startswith("lost"))
     assert given["power_W"] == pytest.approx(given["joint_speed_rad_s"] * given["joint_torque_Nm"] + lost, rel=1e-5)
-    law = feed_forward.law_of(runs, known)(drive, {})
+    law = feed_forward.table_law_function(runs, known)(drive, {})
     current, speed = comparison.evaluate_law(law, law.start, runs.command, runs.load, runs.way)
     assert (
         apart(np.asarray(speed), runs.inside.speed) < 2e-3 and apart(np.asarray(current), runs.inside.current) < 1e-2
@@ -498,7 +502,7 @@ def test_start_of_the_actuator_is_that_of_the_model_with_losses_by_load(rig, vol
     rig.write_text(arm + LOSSES)
     file = robot_file.find_robot_file(str(rig))
     drive = joints.joint_of_robot(file)
-    module = law_source.module_from_source(law_source.jax_source(drive, law_source.constants_of(drive, None, None)))
+    module = law_source.module_from_source(law_source.jax_source(drive, law_source.law_constants(drive, None, None)))
     step, inertia = 2e-5, float(drive.load.inertia + module.armature(module.PARAMS))
 
     def advance(at, _):
@@ -643,7 +647,7 @@ def test_error_without_data_is_that_of_mujoco_under_load_and_backward(rig):
     near = comparison.evaluate_law(law, theta, other.command, other.load, other.way)
     motor = mujoco.mjcf_motor(found.joint, found.comparison.refitted)
     got = mujoco.settle_in_mujoco(
-        found.files, motor, other, situation.AtJoint(*map(np.asarray, near)), range(len(other.load))
+        found.files, motor, other, situation.JointResult(*map(np.asarray, near)), range(len(other.load))
     )
     stated = found.comparison.of(comparison.EXPORTED)
     assert len(other.load) >= 6
@@ -735,7 +739,7 @@ def test_exported_servo_and_play_move_as_the_drive(name, rig):
     if in_mujoco is not None:
         angles = mujoco.angles_in_mujoco(xml_of(rig), command * (200 if goal else 1), times, 1e-4)
         assert np.abs(angles - native).max() < in_mujoco
-    module = law_source.module_from_source(law_source.jax_source(drive, law_source.constants_of(drive, None, None)))
+    module = law_source.module_from_source(law_source.jax_source(drive, law_source.law_constants(drive, None, None)))
     inertia, step = float(drive.load.inertia) + float(module.armature(module.PARAMS)), 5e-5
     resisting = float(drive.load.torque_constant)
 
@@ -752,7 +756,7 @@ def test_exported_servo_and_play_move_as_the_drive(name, rig):
 def test_stated_fate_of_a_controller_and_of_play_is_by_format(rig):
     rig.write_text(APART["servo with an integral and a lag"][0] + "backlash = 0.03\n")
     drive = joints.joint_of_robot(robot_file.find_robot_file(str(rig)))
-    known = law_source.constants_of(drive, None, None)
+    known = law_source.law_constants(drive, None, None)
     verdicts = [
         {f.name: f for f in fates}
         for fates in (mujoco.fates_in_mujoco(drive, 0.0), jax_actuator.fates_in_actuator(drive), feed_forward.fates_in_tables(drive, known))
@@ -771,7 +775,7 @@ def test_mjlab_actuator_of_a_servo_with_play_is_that_of_jax(monkeypatch, rig):
     stand_in(monkeypatch)
     rig.write_text(APART["servo with an integral and a lag"][0] + "backlash = 0.03\n")
     drive = joints.joint_of_robot(robot_file.find_robot_file(str(rig)))
-    known = law_source.constants_of(drive, None, None)
+    known = law_source.law_constants(drive, None, None)
     ours, theirs = (
         law_source.module_from_source(f(drive, known)) for f in (law_source.jax_source, law_source.torch_source)
     )

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from mmrjax import fidelities
-from mmrjax.fidelities import Effort, Facts, Option
-from mmrjax.fidelities.base import Fidelity, History, Run
+from mmrjax.fidelities import Effort, FidelityFacts, Option
+from mmrjax.fidelities.base import Fidelity, History, RunBatch
 from mmrjax.fidelities.steady import operating_point, steady_batch
 from mmrjax.model import channels, params
 from mmrjax.model.conditions import Conditions
@@ -60,7 +60,7 @@ def settles_traceably(fidelity, robot):
 
 def runs_batches(fidelity, robot):
     done = fidelity.run(robot, RUNS, short(fidelity))
-    assert isinstance(done, Run) and done.history is None
+    assert isinstance(done, RunBatch) and done.history is None
     assert all(x.shape == (2,) for x in jax.tree.leaves(done))
     assert set(np.asarray(done.result.status)) <= set(range(len(STATUSES)))
     assert set(done.result.reading) == {c.name for c in channels.EVERY}
@@ -114,7 +114,7 @@ def _one_row(robot, conditions):
 
 
 def _no_readings(robot, conditions, options, progress=None):
-    return Run(dataclasses.replace(steady_batch(robot, conditions), reading={}))
+    return RunBatch(dataclasses.replace(steady_batch(robot, conditions), reading={}))
 
 
 def _from_the_middle(robot, conditions, options, progress=None):
@@ -154,7 +154,9 @@ def toy(monkeypatch):
     """A fidelity in a file of its own, by a line of the table: the steady one, in another unit of effort."""
 
     def run(robot, conditions, options, progress=None):
-        return Run(steady_batch(robot, conditions), {"patience": options["patience"] * jnp.ones(conditions.shape)})
+        return RunBatch(
+            steady_batch(robot, conditions), {"patience": options["patience"] * jnp.ones(conditions.shape)}
+        )
 
     def settled(robot, conditions):
         return jax.vmap(lambda c: operating_point(robot, c)[0])(conditions)
@@ -162,7 +164,7 @@ def toy(monkeypatch):
     module = types.ModuleType("toy_fidelity")
     module.FIDELITY = Fidelity("toy", settled=settled, run=run)
     monkeypatch.setitem(sys.modules, "toy_fidelity", module)
-    line = Facts(
+    line = FidelityFacts(
         "toy_fidelity", "steady, and patient", chunk=8, effort=Effort(2, True, False),
         options=(Option("patience", "s", 3.0, 10.0, "time that it takes"),),
     )  # fmt: skip

@@ -52,7 +52,7 @@ def drive():
     named = dataclasses.replace(robot, configurations=Configurations({ALL: robot.configurations.members[0]}))
     joint = joints.joint_of_robot(dataclasses.replace(file, robot=named, source=f"{ALL.replace('/', '')}.toml"), ALL)
     known = [
-        law_source.Constant(n, x, ALL, ALL, ALL)
+        law_source.LawConstant(n, x, ALL, ALL, ALL)
         for n, x in {
             **{n: float(p.value) for n, p in joint.parameters().items()},
             **dict.fromkeys(joint.surroundings(), 0.7),
@@ -95,7 +95,9 @@ def test_models_headers_and_pages_of_an_export_have_names_as_words(drive):
     for text in (fragment, mujoco.mjcf_scene(joint, 1.0, f"{joint.name}_drive", "drive", 12.0, 0.1)):
         assert "boom" not in {node.tag for node in ElementTree.fromstring(text).iter()}
         assert not obeyed(text)
-    points = feed_forward.Map(np.arange(2.0), np.arange(2.0), dict.fromkeys(feed_forward.COLUMNS, np.zeros((2, 2))))
+    points = feed_forward.SteadyMap(
+        np.arange(2.0), np.arange(2.0), dict.fromkeys(feed_forward.COLUMNS, np.zeros((2, 2)))
+    )
     header = feed_forward.c_header(joint, points, [ALL])
     assert "boom" not in re.sub(r"/\*.*?\*/", "", header, flags=re.S).replace(joint.name, "")
     assert joint.name.isidentifier() and not obeyed(header)

@@ -27,7 +27,7 @@ from mmrjax.model.conditions import Conditions
 from mmrjax.model.rig import Rig
 from mmrjax.model.signals import STATUSES, State
 from sweeps.config import Sweep
-from sweeps.config_campaign import of_grid
+from sweeps.config_campaign import campaign_of_grid
 from tests.commands import read_table, text_file
 
 VOLTS = np.array([24.0, 6.0, -12.0, 12.0])
@@ -307,7 +307,7 @@ def test_a_profile_and_a_sweep_state_the_torque(tmp_path):
     assert (braked < free).all() and "load torque" in str(made)
     with pytest.raises(BadConfiguration, match="--load-torques: the robot is a vehicle"):
         mm.sweep(mm.nominal(), load_torques=[0.5])
-    stated = of_grid(Sweep(load_torques_Nm=(0.0, 0.5), voltages_V=(12.0,), robot="rig.toml")).axes
+    stated = campaign_of_grid(Sweep(load_torques_Nm=(0.0, 0.5), voltages_V=(12.0,), robot="rig.toml")).axes
     assert stated["load_torque"] == [0.0, 0.5]
 
 

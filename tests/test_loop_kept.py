@@ -78,7 +78,7 @@ def test_a_budget_has_a_unit(text, seconds):
 def test_a_budget_of_no_time_is_refused():
     assert config.LoopBeside().seconds == 600.0
     with pytest.raises(BadConfiguration, match="within: got '5 weeks'"):
-        config.resolve_beside(config.LoopBeside, None, {"within": "5 weeks"})
+        config.resolve_further_options(config.LoopBeside, None, {"within": "5 weeks"})
 
 
 @pytest.fixture
@@ -167,9 +167,9 @@ def test_a_budget_that_was_too_small_is_answered_by_a_larger_one(rig, mmrjax, mo
 
 
 def test_a_budget_ends_a_step_that_says_nothing():
-    with pytest.raises(OutOfTime), command._alarm(0.05, lambda: True):
+    with pytest.raises(OutOfTime), command._time_limit(0.05, lambda: True):
         time.sleep(5.0)
-    with command._alarm(0.01, lambda: False):
+    with command._time_limit(0.01, lambda: False):
         time.sleep(0.05)
 
 

@@ -12,8 +12,8 @@ from scipy.optimize import fsolve
 from mmrjax.model import params
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.signals import GRAVITY
-from mmrjax.undercarriage.half_robot import advance, centre_of_mass, half_robot_system, instant, roll, stand
-from mmrjax.undercarriage.modes import POSITIONS, Mode, _linearised, _run_modes, modes
+from mmrjax.undercarriage.half_robot import advance, build_system, centre_of_mass, instant, roll, stand
+from mmrjax.undercarriage.modes import POSITIONS, Mode, _linearised_steps, _run_modes, modes
 
 PAYLOADS = [0.0, 8.0]
 
@@ -51,7 +51,7 @@ def test_bounce_on_wheels_is_that_of_a_mass_on_two_springs(robot, wheeled, k):
 def test_bounce_on_tracks_is_that_of_a_mass_on_its_grousers(robot):
     """Nine grousers half a pitch from the arcs. Towards the ends the belt yields as a string of 100 N."""
     rates, masses = jax.device_get(
-        _linearised(params.without_weak_types(robot), conditions(robot, "6T2A"), POSITIONS)
+        _linearised_steps(params.without_weak_types(robot), conditions(robot, "6T2A"), POSITIONS)
     )
     middle = POSITIONS // 2
     found = named(_run_modes(rates[0, middle : middle + 1], masses[0, middle : middle + 1]), "bounce")
@@ -77,7 +77,7 @@ def test_bounce_on_tracks_is_that_of_a_mass_on_its_grousers(robot):
 @pytest.mark.slow
 def test_a_small_vibration_rings_at_the_damped_frequency(robot, wheeled):
     """4W2T rolls, 2 µm up, and its height against that of the same run undisturbed."""
-    run = half_robot_system(robot, jax.tree.map(lambda x: x[0], conditions(robot, "4W2T")), 1e-4)
+    run = build_system(robot, jax.tree.map(lambda x: x[0], conditions(robot, "4W2T")), 1e-4)
     start = roll(run)
     lifted = dataclasses.replace(start, q=start.q.at[1].add(2e-6))
 
@@ -127,7 +127,7 @@ def test_mode_over_an_octave_is_no_frequency_to_meet():
 def test_standing_robot_is_in_balance_wherever_its_belt_stands(robot, recess):
     """Normal force to the weight. With a recess some grousers bear alone."""
     gear = params.replace(robot, {"running_gear.guide_recess": jnp.asarray(recess)})
-    run = half_robot_system(gear, jax.tree.map(lambda x: x[1], conditions(gear, "6T2A")), 1e-4)
+    run = build_system(gear, jax.tree.map(lambda x: x[1], conditions(gear, "6T2A")), 1e-4)
     weight = centre_of_mass(run)[2] * GRAVITY
 
     @jax.jit

@@ -65,7 +65,7 @@ def test_every_field_that_can_be_chosen_is_an_option_that_says_what_the_schema_s
                 continue
             shown = parameters[command][name]
             assert fact["description"].rstrip(".").partition(" (")[0] in shown.help.replace("\\", ""), name
-            _, unit = options.of_unit(name)
+            _, unit = options.split_unit(name)
             assert not unit or f"({unit})" in shown.help, name
             assert all(choice in shown.help for choice in fact.get("enum", ()))
             assert shown.default is None, name  # what is not given is the configuration's affair
@@ -110,8 +110,8 @@ def test_solver_table_of_a_file_is_read_and_options_win(tmp_path):
     found = config.resolve_configuration(config.Loop, file, {}, config.MembersPart)
     assert (found.seed, found.replicates, found.population) == (3, 300, 8)
     assert config.resolve_configuration(config.Loop, file, {"population": 16}, config.MembersPart).population == 16
-    assert config.resolve_beside(config.MembersPart, file, {}).members == Path("kept.npz")
-    assert config.resolve_beside(config.MembersPart, file, {"members": "other"}).members == Path("other")
+    assert config.resolve_further_options(config.MembersPart, file, {}).members == Path("kept.npz")
+    assert config.resolve_further_options(config.MembersPart, file, {"members": "other"}).members == Path("other")
     # what a former version left, whose keys all stand at the top, says the same
     flat = _file(tmp_path, "seed = 3\nreplicates = 300\npopulation = 8\n")
     assert config.resolve_configuration(config.Loop, flat, {}) == found

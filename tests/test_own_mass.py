@@ -80,7 +80,7 @@ def fits(tmp_path_factory):
     """The loop's fits to a table, by effect, and the robot of each through its file."""
     runs = table()
     stated = {n: (m, 0.2) for n, (m, _) in STATED.items()}
-    robot = robot_file.with_effects(paper_robots.nominal(), UNSEEN)
+    robot = robot_file.add_effects(paper_robots.nominal(), UNSEEN)
     robot = params.replace(robot, {f"effects.{n}.amplitude": 0.3 * _sd(BY_NAME[n]) for n in UNSEEN})
     sd = 0.02 * np.abs(runs.measured())
     space = discover.build_candidate_space(runs, robot, sd, SETTLED.settings, stated, BY_NAME)
@@ -160,7 +160,7 @@ def curves(tmp_path_factory):
     written = Written(runs, tmp_path_factory.mktemp("curves"), every)
 
     def of(name):
-        with_it = robot_file.with_effects(robot, [name])
+        with_it = robot_file.add_effects(robot, [name])
         values = {f"effects.{name}.amplitude": 0.2 * _sd(UNNAMED[name])}
         values |= {f"effects.{name}.y{k}": 0.3 * k for k in range(6) if name.startswith("curve")}
         with_it = params.replace(with_it, values)

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 from pages import recorded
 
-from calibration.sensitivity.result import Points
+from calibration.sensitivity.result import OperatingPoints
 from calibration.words import fit_words, sensitivity_words
 from mmrjax.model import channels
 from sweeps.paper import report
@@ -44,7 +44,7 @@ def study(*studied, method="local"):
         for label, mask in zip(("total current", "slip"), studied, strict=True)
     ]
     return SimpleNamespace(
-        method=method, points=Points(np.full(6, "6T2A"), volts, np.zeros(6), slopes), negligible=("b",),
+        method=method, points=OperatingPoints(np.full(6, "6T2A"), volts, np.zeros(6), slopes), negligible=("b",),
         outputs=dict(enumerate(outputs)), leaders=lambda: {"6T2A.share": [("total current", 0.56), ("slip", 0.4)]},
         inputs={
             "6T2A.share": SimpleNamespace(meaning="share of the weight (the rest is elsewhere), eq. (26)"),

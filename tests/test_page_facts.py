@@ -75,7 +75,7 @@ def test_an_inrush_is_judged_or_it_is_said_that_nobody_stated_its_limit():
 def test_ticks_of_a_map_are_round_numbers_at_their_places(levels, ticks):
     """They were once 4.1, 8.2 and 12.3."""
     seen = {}
-    sweep_figures._ticks(lambda places, names: seen.update(zip(names, places, strict=True)), levels)
+    sweep_figures._set_ticks(lambda places, names: seen.update(zip(names, places, strict=True)), levels)
     assert list(seen) == ticks
     np.testing.assert_allclose(
         np.interp(list(seen.values()), np.arange(levels.size), levels), [float(t) for t in ticks]

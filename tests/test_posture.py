@@ -20,7 +20,7 @@ FLUSH = -math.degrees(math.asin((world.TRACK - world.ROLLER) / world.LEVER))
 RADIUS, HALF, UP, UP_LOADED = 0.0437, 0.15, 5e-3, (13.1 * 5e-3 + 8 * 73e-3) / 21.1
 
 highest_step, limits, rest = (
-    jax.jit(f) for f in (static_limits.find_highest_step, static_limits.posture_limits, resting_posture.rest_outline)
+    jax.jit(f) for f in (static_limits.find_highest_step, static_limits.posture_limits, resting_posture.rest_on_slope)
 )
 
 

@@ -139,11 +139,11 @@ def test_surface_scales_the_adhesion_of_each_runs_movers(read):
 
 def test_supply_voltage_beside_the_battery_is_refused(read):
     table = read("time_s,supply_voltage_V\n0,24\n1,24\n")
-    table.check_source(battery=False)
+    table.check_supply(battery=False)
     with pytest.raises(
         BadConfiguration, match=r"--battery cannot be combined with mission.csv, which gives supply_voltage_V"
     ):
-        table.check_source(battery=True)
+        table.check_supply(battery=True)
 
 
 # --- what is refused ------------------------------------------------------------------------------------------------

@@ -74,7 +74,7 @@ def test_points_that_the_motors_do_not_settle_between_are_a_log(tmp_path):
     """The wheel's inertia is raised until five time constants are more than a step."""
     _, file = made("micromouse", tmp_path)
     robot = robot_file.read_robot(file)
-    columns, _ = row_checks.settled_points(
+    columns, _ = row_checks.drop_time_of_settled_rows(
         "t", table(3.0, 0), runs.read_runs(table(3.0, 0), robot, columns=OWN).layout, robot
     )
     assert "time_s" not in columns

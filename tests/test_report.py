@@ -158,7 +158,7 @@ def test_blocks_cover_each_cell_once():
     for joined in (True, False):
         covered = [
             (i + p, j + q)
-            for i, j, wide, tall in sweep_figures._blocks(cells, joined)
+            for i, j, wide, tall in sweep_figures._cover_cells(cells, joined)
             for p in range(wide)
             for q in range(tall)
         ]

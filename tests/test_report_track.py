@@ -75,9 +75,7 @@ def test_section_says_why_its_current_is_not_that_of_the_steady_model(robot, wri
 @pytest.fixture(scope="module")
 def gears(robot, written):
     run = written[2]
-    return gear_figures.members_with_gear(
-        robot, run, run.result.status, run.steady.guide_share, (0, 1), ("6T2A", "4W2T")
-    )
+    return gear_figures.gear_runs(robot, run, run.result.status, run.steady.guide_share, (0, 1), ("6T2A", "4W2T"))
 
 
 @pytest.mark.slow

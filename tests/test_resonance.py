@@ -10,11 +10,11 @@ from mmrjax.model.signals import CONVERGED, FAILED, SLIDES
 from mmrjax.undercarriage.modes import Mode
 from mmrjax.undercarriage.ripple_peaks import (
     SIGNALS,
-    Peak,
-    confirm_peaks,
+    RipplePeak,
+    drop_unconfirmed_modes,
     find_crossings,
-    fluctuation,
     group_resonances,
+    measure_fluctuation,
     passing_parts,
     peaks_over_speed,
     strongest_resonances,
@@ -35,11 +35,11 @@ def response(natural=90.0, order=3):
 def test_fluctuation_reads_mean_deviation_and_strongest_line():
     time = np.arange(0.001, 0.75, 0.001)
     values = 10 + 0.3 * time + 0.5 * np.sin(2 * np.pi * 61.3 * time) + 0.2 * np.sin(2 * np.pi * 20 * time)
-    found = fluctuation(time, values)
+    found = measure_fluctuation(time, values)
     assert found.frequency == pytest.approx(61.3, abs=0.1)
     assert found.deviation * found.mean == pytest.approx(np.hypot(0.5, 0.2) / np.sqrt(2), rel=0.01)
-    assert np.isnan(fluctuation(time, np.full_like(time, 3.0)).frequency)
-    assert np.isnan(fluctuation(time, np.full_like(time, np.nan)).deviation)
+    assert np.isnan(measure_fluctuation(time, np.full_like(time, 3.0)).frequency)
+    assert np.isnan(measure_fluctuation(time, np.full_like(time, np.nan)).deviation)
 
 
 def test_peak_at_a_crossing_names_mode_and_order():
@@ -78,15 +78,15 @@ def test_ripple_too_small_to_notice_has_no_peaks():
 def test_peaks_that_move_against_a_mode_are_not_confirmed_by_it(lines, mode):
     natural = {0.0: [BOUNCE._replace(frequency=94.0)], 8.0: [BOUNCE._replace(frequency=81.0)]}
     found = [
-        Peak("reaction", payload, 1.0, 0.9, 1.1, 0.1, 0.05, 3, line, "bounce")
+        RipplePeak("reaction", payload, 1.0, 0.9, 1.1, 0.1, 0.05, 3, line, "bounce")
         for payload, line in zip((0.0, 8.0), lines, strict=True)
     ]
-    assert {p.mode for p in confirm_peaks(found, natural)} == {mode}
+    assert {p.mode for p in drop_unconfirmed_modes(found, natural)} == {mode}
 
 
 def test_strongest_leaves_small_and_weak_ones_out():
     def peak(ripple, rise, order):
-        return Peak("current", 0.0, 1.0, 0.9, 1.1, ripple, rise, order, 50.0, "pitch")
+        return RipplePeak("current", 0.0, 1.0, 0.9, 1.1, ripple, rise, order, 50.0, "pitch")
 
     found = group_resonances([peak(0.05, 0.02, 2), peak(0.04, 0.005, 3), peak(0.005, 0.003, 5)])
     assert [r.order for r in found] == [2, 3, 5] and [r.order for r in strongest_resonances(found)] == [2]

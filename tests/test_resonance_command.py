@@ -15,7 +15,7 @@ from mmrjax.model.signals import CONVERGED
 from mmrjax.undercarriage.modes import Mode
 from sweeps import config
 from sweeps.commands import resonance as room
-from sweeps.pages.resonance_figures import resonance_map
+from sweeps.pages.resonance_figures import draw_resonance_map
 from sweeps.points import run
 from tests.commands import command, read_json, rows
 from tests.pages import Tables, drawn, outside
@@ -164,7 +164,7 @@ def test_runs_without_ripple_are_shown_as_what_they_are(tracked):
     partly = dataclasses.replace(found, table=table)
     assert "Not every run settles at" in partly.statement()
     assert partly.statuses["failed"] == len(bad) - 1 and partly.statuses["slides"] == 1
-    assert "failed" in resonance_map(partly).axes[1].get_title()
+    assert "failed" in draw_resonance_map(partly).axes[1].get_title()
     json.dumps(partly.to_json())
     table["status"][:] = "failed"
     for key in table:

@@ -436,7 +436,7 @@ def test_bad_rigs_are_refused_in_one_sentence(tmp_path, case):
 
 
 def test_packaged_robot_is_as_it_was(tmp_path):
-    robot = robot_file.with_effects(paper_robots.nominal(), tuple(effects.BY_NAME))
+    robot = robot_file.add_effects(paper_robots.nominal(), tuple(effects.BY_NAME))
     assert same(again(tmp_path, robot), robot) and "[rig]" not in (tmp_path / "again.toml").read_text()
 
 

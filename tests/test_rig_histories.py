@@ -23,7 +23,7 @@ from mmrjax.effects import UNNAMED
 from mmrjax.fidelities import histories as integrator
 from mmrjax.model import balances, channels, params, quantities
 from mmrjax.model.conditions import Conditions
-from mmrjax.model.rig import Begin, Begins, Rig
+from mmrjax.model.rig import Rig, RunStart, RunStarts
 from mmrjax.model.signals import State
 from tests.commands import ends, read_rig, read_table, text_file
 
@@ -161,7 +161,9 @@ def test_the_beginning_of_an_arm_in_motion_is_found(tmp_path):
         DRIVE.format(imposed="voltage", channels='"total_current", "motor_speed", "output_angle"', start="free")
         + ARM,
     )
-    begins = Begins({"begin_a": Begin(motor_speed=30.0, angle=0.3), "begin_b": Begin(motor_speed=-20.0, angle=0.1)})
+    begins = RunStarts(
+        {"begin_a": RunStart(motor_speed=30.0, angle=0.3), "begin_b": RunStart(motor_speed=-20.0, angle=0.1)}
+    )
     truth = params.replace(robot, {"arm.torque_gravity": 0.66, "arm.loss_coulomb": 0.08})
     truth = dataclasses.replace(truth, rig=dataclasses.replace(truth.rig, begins=begins))
     t = np.arange(0, 3, 0.03)

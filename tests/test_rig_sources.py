@@ -77,7 +77,7 @@ def test_urdf_agrees_with_mujoco_in_any_frames(seed, tmp_path):
     (tmp_path / "r.urdf").write_text(text + "</robot>")
     for joint in ("j2", "j4"):
         ours, theirs = (
-            rig_new.joint_of(tmp_path / "r.urdf", joint),
+            rig_new.joint_numbers(tmp_path / "r.urdf", joint),
             rig_from_mujoco.read_mujoco_hinge(tmp_path / "r.urdf", joint),
         )
         for key in ("inertia", "weight", "angle", "friction", "damping"):

@@ -16,7 +16,7 @@ def values(robot):
 
 @pytest.mark.parametrize("name", paper_robots.ROBOTS)
 def test_robot_written_and_read_is_the_same(tmp_path, name):
-    robot = robot_file.with_effects(robot_file.load_robot(name), tuple(effects.BY_NAME))
+    robot = robot_file.add_effects(robot_file.load_robot(name), tuple(effects.BY_NAME))
     robot = robot_file.change_robot(robot, {"effects.churning.amplitude": 1e-4}, where="test")
     robot_file.write_robot(robot, tmp_path / "robot.toml", note="a note")
     assert values(robot_file.load_robot(str(tmp_path / "robot.toml"))) == values(robot)

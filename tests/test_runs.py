@@ -120,7 +120,7 @@ def of_arrays(columns, **stated):
 
 
 def test_arrays_of_numbers_are_read_as_their_texts_are(tmp_path):
-    numbers = records.of_arrays(of_arrays(ARRAYS))
+    numbers = records.runs_of_arrays(of_arrays(ARRAYS))
     rows = zip(*([str(x) for x in np.asarray(values).tolist()] for values in ARRAYS.values()), strict=True)
     texts = records.read_runs(write(tmp_path, "\n".join([",".join(ARRAYS), *map(",".join, rows)])))
     assert numbers.unknown == texts.unknown == ("room_C",) and numbers.headings == texts.headings
@@ -145,7 +145,7 @@ def test_arrays_of_numbers_are_read_as_their_texts_are(tmp_path):
 )
 def test_arrays_out_of_range_are_refused_with_their_row(column, values, says):
     with pytest.raises(BadData, match=says):
-        records.of_arrays(of_arrays(ARRAYS | {column: values}))
+        records.runs_of_arrays(of_arrays(ARRAYS | {column: values}))
 
 
 def test_a_unit_that_a_source_states_has_to_be_its_columns():
@@ -158,10 +158,10 @@ def test_a_unit_that_a_source_states_has_to_be_its_columns():
         stated = tuple((units | wrong).get(column, "") for column in ARRAYS)
         arrays = of_arrays(ARRAYS, units=stated, units_from="the topic")
         if not says:
-            assert len(records.of_arrays(arrays)) == 2
+            assert len(records.runs_of_arrays(arrays)) == 2
             continue
         with pytest.raises(BadData, match=says):
-            records.of_arrays(arrays)
+            records.runs_of_arrays(arrays)
 
 
 def test_a_clock_of_numbers_counts_from_the_first_row_of_its_run():
@@ -170,8 +170,8 @@ def test_a_clock_of_numbers_counts_from_the_first_row_of_its_run():
         "configuration": ["6T2A"] * 5, "run_id": np.array([1, 1, 2, 1, 2]), "time_s": time,
     }  # fmt: skip
     with pytest.raises(BadData, match=r"log.bag row 3, time_s: got 1700000000; is it in us\? .* expected 0 to 1e"):
-        records.of_arrays(of_arrays(columns))
-    found = records.of_arrays(of_arrays(columns | {"time_s": np.where(time < 1e6, 1.7e9 + time, time)}))
+        records.runs_of_arrays(of_arrays(columns))
+    found = records.runs_of_arrays(of_arrays(columns | {"time_s": np.where(time < 1e6, 1.7e9 + time, time)}))
     assert found["time_s"].tolist() == [0.0, 2.5, 0.0, 0.25, 0.125] and found["run_id"].tolist() == list("11212")
 
 
@@ -448,7 +448,7 @@ def test_pages_order_the_rows_of_a_run_as_the_table_does(named):
     columns |= {"configuration": np.repeat("6T2A", 6), "supply_voltage_V": 5 * time}
     table = columns | {"after_total_current_A": time, "residual_after_total_current_sigma": time}
     shown = channels.channels_named(["total_current"])
-    loop = loop_figures.over_time(Runs("t", columns), table, shown, "none")
+    loop = loop_figures.draw_residuals_over_time(Runs("t", columns), table, shown, "none")
     fit = time_overlay(table, shown, {"after_": "calibrated"}).draw()
     drawn = [
         np.asarray(line.get_xdata(), float)

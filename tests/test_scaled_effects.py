@@ -36,7 +36,7 @@ def rig(kind, imposed, folder):
 
 def with_all(robot, library, share):
     """A robot with every effect, each at a share of its limits, its shape at the middle of them."""
-    robot = robot_file.with_effects(robot, tuple(library), library)
+    robot = robot_file.add_effects(robot, tuple(library), library)
     values = {}
     for effect in robot.effects:
         amplitude, shape = amplitude_of(effect), shape_of(effect)

@@ -315,7 +315,7 @@ def test_what_is_found_before_the_verdict_is_said_to_be_untested(capsys):
     library = {"churning": BY_NAME["churning"]()}
     base = SimpleNamespace(base=SimpleNamespace(space=SimpleNamespace(library=library)))
     folder = SimpleNamespace(keeps=lambda name: True, path="found")
-    command._say_kept({"ranking": RANKING, "search 0": (base, None, found)}, folder, "rig.toml")
+    command._report_stored_stages({"ranking": RANKING, "search 0": (base, None, found)}, folder, "rig.toml")
     said = capsys.readouterr().err
     assert "so far, confirmed by simulation: a loss torque that changes with speed (churning);" in said
     assert said.index("by regression") < said.index("so far")
@@ -326,7 +326,7 @@ def test_a_simulation_that_contradicts_the_regression_is_said_to(missing, capsys
     folder = SimpleNamespace(keeps=lambda name: True, path="found")
     left = SimpleNamespace(test=SimpleNamespace(rejected=True))
     ranking = dataclasses.replace(RANKING, missing=missing)
-    command._say_kept({"ranking": ranking, "bootstrap 0": (None, left)}, folder, "rig.toml")
+    command._report_stored_stages({"ranking": ranking, "bootstrap 0": (None, left)}, folder, "rig.toml")
     assert (words.DISAGREES in capsys.readouterr().err) is not missing
 
 

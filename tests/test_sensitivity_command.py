@@ -21,7 +21,7 @@ from calibration.sensitivity import uncertain_inputs as room
 from calibration.sensitivity.analyse import analyse_sensitivity
 from calibration.sensitivity.local import inert_inputs, local_derivatives
 from calibration.sensitivity.model import chosen_outputs
-from calibration.sensitivity.result import Points
+from calibration.sensitivity.result import OperatingPoints
 from calibration.sensitivity.study import Study
 from mmrjax.fidelities.steady import steady_batch
 from mmrjax.model import params
@@ -43,7 +43,7 @@ SMALL = (
 @pytest.fixture(scope="module")
 def study(robot):
     inputs = room.inputs_from_priors(robot, NAMES, {})
-    points = Points(
+    points = OperatingPoints(
         np.array(["6T2A", "4W2T", "6T2A", "6T2A"]), np.array([24.0, 15, 33, 24]), np.array([3.0, 0, 8, 0]),
         np.array([0.0, 5, 0, 25]),
     )  # fmt: skip
@@ -131,7 +131,7 @@ def test_inputs_of_a_posterior_that_do_nothing_are_found_whatever_their_variance
     inputs = room.inputs_from_posterior(
         robot, posterior_of_coordinates(coordinates, np.zeros(2), np.diag(variances)), {}
     )
-    points = Points(*(x[:1] for x in study.points.columns().values()))
+    points = OperatingPoints(*(x[:1] for x in study.points.columns().values()))
     one = Study(robot, inputs, points, chosen_outputs(("speed",), robot))
     assert_array_equal(inert_inputs(one, local_derivatives(one), 0), [False, True])
 

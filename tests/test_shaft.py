@@ -15,7 +15,7 @@ from mmrjax.fidelities.histories import history_signals, time_grid
 from mmrjax.fidelities.steady import steady_batch, steady_outputs
 from mmrjax.model import balances, paper_robots, params
 from mmrjax.model.conditions import Conditions
-from mmrjax.model.rig import Begin, Begins, Instrument, Rig
+from mmrjax.model.rig import Instrument, Rig, RunStart, RunStarts
 from mmrjax.model.robot import Configurations
 from mmrjax.model.shaft import Shaft
 from mmrjax.model.signals import STATUSES, Signals, State
@@ -110,7 +110,7 @@ def test_derivatives_at_an_imposed_speed_are_those_of_the_formula():
 def test_a_pendulum_swings_as_the_textbook_says():
     """Motors open, no friction: small swings with ω² = m g l / (J + i² J_d)."""
     load = {"inertia": 0.02, "loss_coulomb": 0.0, "loss_viscous": 0.0, "torque_gravity": 0.5}
-    robot = bench(rig=Rig(begins=Begins({"begin": Begin(angle=0.05)})), **load)
+    robot = bench(rig=Rig(begins=RunStarts({"begin": RunStart(angle=0.05)})), **load)
     robot = params.replace(
         robot,
         {"gearbox.efficiency_load": 1.0, "motor.friction_coulomb": 0.0, "motor.friction_viscous": 0.0},
@@ -157,7 +157,7 @@ def test_derivatives_of_an_imposed_history_are_differences():
 @pytest.mark.slow
 def test_the_beginning_of_a_history_has_derivatives():
     def speed(x):
-        rig = Rig(begins=Begins({"begin": Begin(motor_speed=x)}))
+        rig = Rig(begins=RunStarts({"begin": RunStart(motor_speed=x)}))
         conditions = dataclasses.replace(Conditions(voltage=6.0), begin=jnp.asarray(0))
         return history_signals(bench(rig=rig), conditions, jnp.asarray(time_grid(np.linspace(0, 0.2, 5)))).speed_motor
 

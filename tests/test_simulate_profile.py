@@ -15,7 +15,7 @@ from mmrjax.missions.profile import profile
 from mmrjax.model import energy
 from mmrjax.model.signals import STATUSES
 from sweeps import cli
-from sweeps.commands.missions import rows_to_keep
+from sweeps.commands.missions import select_course_rows
 from tests.commands import ends, read_json
 
 #: Up a slope, to a stop, and back; twice.
@@ -236,13 +236,13 @@ def test_voltage_of_the_profile_beside_the_battery_is_refused(mmrjax, capsys, mo
 def test_thinning_keeps_the_peak_of_each_segment():
     rng = np.random.default_rng(0)
     segment, current = np.repeat(np.arange(50), 200), rng.normal(size=10_000)
-    kept = rows_to_keep(segment, current, 400)
+    kept = select_course_rows(segment, current, 400)
     assert len(kept) <= 400 and (np.diff(kept) > 0).all()
     peaks = [k * 200 + np.argmax(np.abs(current[k * 200 : (k + 1) * 200])) for k in range(50)]
     assert set(peaks) <= set(kept) and kept[-1] == 9999
     assert np.diff(kept).max() <= 30  # evenly spread beside them
-    assert (rows_to_keep(segment, current, 20_000) == np.arange(10_000)).all()
-    few = rows_to_keep(segment, current, 40)
+    assert (select_course_rows(segment, current, 20_000) == np.arange(10_000)).all()
+    few = select_course_rows(segment, current, 40)
     assert len(few) <= 40 and np.argmax(np.abs(current)) in few
 
 

@@ -13,7 +13,7 @@ import pytest
 from calibration.data import requirements_file, robot_file
 from calibration.data.parts import packaged_gearboxes, packaged_motors
 from calibration.sizing import chart, design_search, sheet
-from calibration.sizing.design import OBJECTIVES, build_robot, evaluate_design, sizing_task
+from calibration.sizing.design import OBJECTIVES, build_robot, build_sizing_task, evaluate_design
 from calibration.sizing.part_options import BELT_STAGE, MOTOR, drive_options, options_for_robot
 from mmrjax.derived.requirements import QUANTITIES
 from mmrjax.model import params
@@ -64,8 +64,8 @@ def folder(text, tmp_path_factory):
 
 
 def space(robot, asked, found):
-    of = sizing_task(robot, asked, found.options)
-    return of, design_search.choice_space(robot, of, found.options)
+    of = build_sizing_task(robot, asked, found.options)
+    return of, design_search.enumerate_choices(robot, of, found.options)
 
 
 def meets(f, asked):
@@ -163,8 +163,8 @@ def test_margins_are_differentiable(robot, asked, found):
 def test_paper_parts_make_the_papers_robot(robot, asked):
     """Its own motor, gearbox, ratio, radius and cells give back its numbers. The sheet's where the paper's are others."""
     chosen = options_for_robot(robot)
-    of = sizing_task(robot, asked, chosen)
-    choice = design_search.choice_space(robot, of, chosen)
+    of = build_sizing_task(robot, asked, chosen)
+    choice = design_search.enumerate_choices(robot, of, chosen)
     name = next(
         d for d in range(len(chosen.drives)) if chosen.drives[d].motor.name == MOTOR and chosen.drives[d].stages == 2
     )
@@ -247,7 +247,7 @@ def test_step_that_is_asked_for_decides_the_design(robot):
 def test_ratings_of_parts_are_asked_somewhere_whatever_else_is(robot, name):
     """Of a robot that only has to turn, climb or be light too."""
     limit = {"endurance_min": '{ least = 9, duty = "driving" }', "stairs_rise_mm": "{ least = 9, tread_mm = 290 }"}
-    of = sizing_task(
+    of = build_sizing_task(
         robot,
         requirements_file.parse_requirements(f"{name} = {limit.get(name, 9)}", "r.toml"),
         options_for_robot(robot),

@@ -274,7 +274,7 @@ KEPT = {
     ): "a worker's compiled job, by its name; computes the same when compiled again",
     ("sweeps/points/cluster.py", "_start_worker"): "where jax keeps programs, once a process",
     ("mmrjax/compile/programs.py", "source_hash"): "a hash of the files of this program",
-    ("mmrjax/compile/programs.py", "_linear_algebra"): "lets jax find LAPACK, once a process",
+    ("mmrjax/compile/programs.py", "_load_lapack"): "lets jax find LAPACK, once a process",
     ("mmrjax/compile/programs.py", "_folder_is_private"): "that a folder is private, as it is first used",
     ("sweeps/compilation_cache.py", "os.environ"): "set for jax, before it is imported",
     ("sweeps/compilation_cache.py", "jax.config"): "where jax keeps programs",

@@ -14,7 +14,7 @@ from mmrjax.fidelities.variation import STATUS, Variation
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.paper_robots import nominal
 from sweeps.config_campaign import Campaign, Obstacle
-from sweeps.pages.campaign_figures import Varied, draw_grid_statuses
+from sweeps.pages.campaign_figures import VariedQuantity, draw_grid_statuses
 from sweeps.points import axes, climbs, scale
 from tests.commands import ends, read_json
 
@@ -108,7 +108,7 @@ def test_map_of_verdicts_has_each_point_in_its_colour():
     angles, sizes = np.meshgrid([0.0, 30.0, 60.0], [50.0, 100.0], indexing="ij")
     codes = np.array([OVER, SLIDES, OVER, TIPS, OVER, OVER])
     figure = draw_grid_statuses(
-        codes, NAMES, Varied(angles.ravel(), "angle [deg]"), Varied(sizes.ravel(), "obstacle_mm [mm]")
+        codes, NAMES, VariedQuantity(angles.ravel(), "angle [deg]"), VariedQuantity(sizes.ravel(), "obstacle_mm [mm]")
     )
     (axes,) = figure.axes
     shown = axes.collections[0].get_array().reshape(2, 3)

@@ -309,7 +309,7 @@ def test_workers_of_several_kinds_are_refused(monkeypatch):
             self.closed = True
 
     client = Client()
-    monkeypatch.setattr(cluster, "_client", lambda _: client)
+    monkeypatch.setattr(cluster, "_connect_client", lambda _: client)
     with pytest.raises(
         BadConfiguration, match=r"workers have different devices, cpu: cpu, gpu: H200; expected one kind"
     ):

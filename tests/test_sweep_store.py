@@ -29,7 +29,7 @@ from sweeps import cli
 from sweeps.commands import sweep as command
 from sweeps.config_campaign import Campaign
 from sweeps.points import axes, scale, zarr_store
-from sweeps.points.job import laid_out, prepare_job
+from sweeps.points.job import prepare_job, store_layout
 from sweeps.points.tasks import task_of
 from sweeps.store import LOCK, MANIFEST, RunFolder
 from tests.commands import ends, read_json
@@ -539,7 +539,7 @@ def layout():
     """Three chunks of one point each."""
     config = Campaign(axes={"voltage": [15, 24, 33]}, chunk=1, outputs=("speed",))
     robot = paper_robots.nominal()
-    return laid_out(config, prepare_job(config, robot, axes.plan_design(config, robot, "x"), "x"))
+    return store_layout(config, prepare_job(config, robot, axes.plan_design(config, robot, "x"), "x"))
 
 
 @pytest.fixture
@@ -842,7 +842,7 @@ def laid_out_of(text):
     stated = tomllib.loads(text)
     config, robot = Campaign(**stated), paper_robots.nominal()
     config = config.model_copy(update={"outputs": task_of(config, robot).usual})
-    return laid_out(config, prepare_job(config, robot, axes.plan_design(config, robot, "x"), "x"))
+    return store_layout(config, prepare_job(config, robot, axes.plan_design(config, robot, "x"), "x"))
 
 
 def test_full_disk_is_refused_before_anything_is_written(sweep, monkeypatch, tmp_path):
@@ -903,7 +903,7 @@ def test_layout_counts_its_bytes_without_writing(whole):
     config = Campaign(axes={"voltage": np.linspace(15, 33, 4_000_000).tolist()}, chunk=10**6, outputs=("speed",))
     robot = paper_robots.nominal()
     job = prepare_job(config, robot, axes.plan_design(config, robot, "x"), "x")
-    assert laid_out(config, job).size == pytest.approx((9 + 8) * 4e6, rel=2e-3)
+    assert store_layout(config, job).size == pytest.approx((9 + 8) * 4e6, rel=2e-3)
 
 
 @pytest.mark.slow

@@ -13,7 +13,7 @@ from mmrjax.fidelities.steady import steady_batch
 from mmrjax.model import paper_robots, params
 from sweeps import config
 from sweeps.points import run, scale, uncertainty
-from sweeps.points.sampled_design import Drawn
+from sweeps.points.sampled_design import DrawnSamples
 from sweeps.store import RunFolder
 
 NAMES = ("motor.resistance", "motor.friction_coulomb")
@@ -59,7 +59,7 @@ def same(one, other, rtol=0.0):
 
 
 def test_points_of_a_table_are_its_runs_each_with_every_draw(robot, runs, posterior):
-    drawn = Drawn(posterior.names, posterior.draw(DRAWS, 0).T)
+    drawn = DrawnSamples(posterior.names, posterior.draw(DRAWS, 0).T)
     job = run.job_of(robot, runs, chunked(5), drawn)
     assert job.plan.design.shape == (4, DRAWS) and job.blocks.size == (1, 4)
     points = job.plan.design.block((slice(1, 3), slice(2, 5)))
@@ -71,7 +71,7 @@ def test_points_of_a_table_are_its_runs_each_with_every_draw(robot, runs, poster
 @pytest.mark.parametrize("chunk", [None, 3])
 def test_table_has_each_run_as_it_is_by_itself(robot, runs, chunk):
     found = run.evaluate_runs(robot, runs, chunked(chunk), None)
-    alone = run.ending_columns(robot, run.Run(steady_batch(robot, runs.conditions(robot))))
+    alone = run.ending_columns(robot, run.SimulationResult(steady_batch(robot, runs.conditions(robot))))
     same({name: found[name] for name in alone}, alone, rtol=1e-12)
     assert found["status"].tolist() == ["converged"] * 3 + ["slides"]
     assert found["total_mass_kg"][1] == float(robot.configurations.members[1].mass) + 3

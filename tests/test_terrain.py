@@ -98,7 +98,7 @@ def test_polylines_that_are_none_are_refused(x, z, message):
 def lever():
     gear = nominal().running_gear
     roller = gear.levers.roller - gear.grouser_height
-    return belt_loop.Loop(
+    return belt_loop.BeltLoop(
         nominal().radius_pulley, roller, gear.lever_length, gear.grouser_height, gear.grouser_length, 16
     )
 
@@ -112,10 +112,10 @@ def test_levers_track_closes_and_its_pitch_is_that_of_the_main_track():
 def test_belt_of_equal_pulleys_is_the_main_track_of_the_track_model():
     robot = nominal()
     gear = robot.running_gear
-    main = belt_loop.Loop(
+    main = belt_loop.BeltLoop(
         robot.radius_pulley, robot.radius_pulley, gear.wheelbase, gear.grouser_height, gear.grouser_length, 24
     )
-    path = belt.Path(robot.radius_pulley, gear)
+    path = belt.BeltPath(robot.radius_pulley, gear)
     place = np.concatenate([np.linspace(0, 0.23, 60), np.linspace(0.61, 0.83, 60)])  # all but the upper run's ends
     mine = belt_loop.grouser_tips(main, jnp.asarray(place))
     theirs = belt.tips_on_path(path, jnp.mod(jnp.asarray(place) + gear.wheelbase / 2, path.length))

@@ -75,7 +75,7 @@ def test_panels_are_stacked_for_phones(tmp_path, monkeypatch, stated):
         drawn.append((fig, grid))
         return fig
 
-    album = page.Album(tmp_path)
+    album = page.FigureAlbum(tmp_path)
     album.add("panels", draw)
     assert album.pictures["panels"].count("<svg") == len(drawn) == 1 + stated
     if stated:
@@ -86,7 +86,7 @@ def test_panels_are_stacked_for_phones(tmp_path, monkeypatch, stated):
 
 
 def test_a_colour_scale_is_not_inverted_in_the_dark(tmp_path):
-    album = page.Album(tmp_path)
+    album = page.FigureAlbum(tmp_path)
 
     def draw(scale):
         fig, grid = figure_style.new_figure(1, 1, 2.0)

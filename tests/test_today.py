@@ -236,9 +236,7 @@ def test_a_start_is_drawn_of_the_run_that_was_asked_for(climb):
     robot, found = climb
     heading = runs_report.run_headings(found.to_dict())
     assert heading == ["6T2A, 33 V, 0 kg, 10°", "6T2A, -33 V, 0 kg, -10°"]
-    up, back = history_figures.members_from_standstill(
-        robot, found.history, np.asarray(found.status), [0, 0], heading
-    )
+    up, back = history_figures.start_runs(robot, found.history, np.asarray(found.status), [0, 0], heading)
     for k, start in enumerate((up, back)):
         assert start.ended[0] == pytest.approx(abs(float(found.total_current[k])), rel=1e-6)
         assert start.ended[1] == pytest.approx(1e3 * abs(float(found.speed[k])), rel=1e-6)
@@ -359,7 +357,7 @@ def test_a_film_begins_at_the_start_and_a_start_that_still_gains_speed_is_done(m
     from sweeps.commands import render
 
     drawn = []
-    monkeypatch.setattr(render.rendering, "scene", lambda *a: None)
+    monkeypatch.setattr(render.rendering, "scene_of_run", lambda *a: None)
     monkeypatch.setattr(
         render.rendering, "render", lambda view, file, begin, *rest: (file.touch(), drawn.append(begin))
     )
@@ -370,5 +368,5 @@ def test_a_film_begins_at_the_start_and_a_start_that_still_gains_speed_is_done(m
 def test_a_run_without_current_is_drawn():
     """Nothing drives its motors: no scale of nothing."""
     time = np.linspace(0.0, 1.0, 30)
-    still = history_figures.Start("run 1", "6T2A", "stalled", time, *3 * [0 * time], stages=None)
-    figure_style.figure_as_svg(history_figures.from_standstill([still]))
+    still = history_figures.StartRun("run 1", "6T2A", "stalled", time, *3 * [0 * time], stages=None)
+    figure_style.figure_as_svg(history_figures.draw_starts([still]))

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from calibration.data.input_errors import BadConfiguration
-from mmrjax.fidelities.track import _batch, track_batch
+from mmrjax.fidelities.track import _simulate_batch, track_batch
 from mmrjax.model import params
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.signals import CONVERGED, FAILED, FLAGS, TIPS
 from mmrjax.undercarriage import stability
-from mmrjax.undercarriage.half_robot import half_robot_system, stand, tipping_margin
+from mmrjax.undercarriage.half_robot import build_system, stand, tipping_margin
 from mmrjax.undercarriage.stability import _whole, largest_step
 from sweeps import config as configuration
 from sweeps.points import run
@@ -57,7 +57,7 @@ def test_beyond_the_largest_step_a_run_goes_wrong_and_below_it_does_not(robot):
     stiff = params.replace(robot, {"running_gear.contact_stiffness": 3e10})
     limit = float(largest_step(stiff, TWO)[0])
     assert 2e-4 < limit < 3e-4
-    below, beyond = (_batch(stiff, TWO, 0.3, step, 1e-3, True).result for step in (1e-4, 5e-4))
+    below, beyond = (_simulate_batch(stiff, TWO, 0.3, step, 1e-3, True).result for step in (1e-4, 5e-4))
     assert int(below.status[0]) != FAILED and int(beyond.status[0]) == FAILED
 
 
@@ -68,7 +68,7 @@ def test_small_v_s_is_neither_refused_nor_wrong(robot, speed_static):
     small = params.replace(robot, {"6T2A.ground.friction.speed_static": jnp.asarray(speed_static)})
     runs = Conditions(voltage=[15.0, 33.0], slope_deg=[5.0, 10.0])
     assert largest_step(small, runs).min() > 1e-4
-    slip = [np.asarray(_batch(small, runs, 0.5, step, 1e-3, True).result.slip) for step in (1e-4, 1e-5)]
+    slip = [np.asarray(_simulate_batch(small, runs, 0.5, step, 1e-3, True).result.slip) for step in (1e-4, 1e-5)]
     np.testing.assert_allclose(slip[0], slip[1], atol=5e-4)
 
 
@@ -112,7 +112,7 @@ def test_posture_that_cannot_stand_has_a_negative_margin(robot):
     loaded = params.replace(robot, place)
     for payload, stands in ((0.0, True), (8.0, False)):
         run = Conditions(slope_deg=20.0, payload=payload)
-        assert (float(tipping_margin(half_robot_system(loaded, run, 1e-4))) > 0) is stands
+        assert (float(tipping_margin(build_system(loaded, run, 1e-4))) > 0) is stands
 
 
 def test_standing_robot_is_in_balance(robot):
@@ -121,9 +121,7 @@ def test_standing_robot_is_in_balance(robot):
 
     loaded = params.replace(robot, {"running_gear.payload_offset": 0.05})
     for wheeled in (0.0, 1.0):
-        run = half_robot_system(
-            loaded, Conditions(slope_deg=np.degrees(0.1), payload=5.0, configuration=wheeled), 1e-4
-        )
+        run = build_system(loaded, Conditions(slope_deg=np.degrees(0.1), payload=5.0, configuration=wheeled), 1e-4)
         _, at, _ = instant(run, stand(run))
         weight = (run.half.chassis + 2 * run.half.pulley) * 9.80665 * np.cos(0.1)
         assert float(at.normal) == pytest.approx(float(weight), rel=1e-9)
@@ -186,7 +184,7 @@ def changed(robot, values):
 def test_gear_that_throws_the_robot_off_the_ground_is_flagged(robot):
     """Set S at 33 V on 15 deg leaves the ground for a twentieth of the time. At 15 V it shakes and stays on it."""
     runs = Conditions(voltage=[15.0, 33.0], slope_deg=[10.0, 15.0], payload=[0.0, 8.0])
-    answer = _batch(changed(robot, SHAKING), runs, 0.6, 1e-4, 1e-3, True)
+    answer = _simulate_batch(changed(robot, SHAKING), runs, 0.6, 1e-4, 1e-3, True)
     jumps = np.asarray(answer.result.flags) >> FLAGS.index("jumps") & 1
     assert jumps.tolist() == [0, 1]
     window = np.asarray(answer.signals.normal)[:, -240:]
@@ -204,11 +202,8 @@ def test_robot_thrown_over_by_its_own_motion_tips_and_harms_no_other(robot):
     }
     tall = changed(robot, high)
     runs = Conditions(voltage=[33.0, 15.0], slope_deg=[20.0, 0.0], payload=[8.0, 0.0])
-    assert (
-        float(tipping_margin(half_robot_system(tall, Conditions(voltage=33.0, slope_deg=20.0, payload=8.0), 1e-4)))
-        > 0
-    )
-    answer = _batch(tall, runs, 1.0, 1e-4, 1e-3, False).result
+    assert float(tipping_margin(build_system(tall, Conditions(voltage=33.0, slope_deg=20.0, payload=8.0), 1e-4))) > 0
+    answer = _simulate_batch(tall, runs, 1.0, 1e-4, 1e-3, False).result
     assert answer.status.tolist() == [TIPS, CONVERGED]
     assert np.isnan(float(answer.reading["speed"][0])) and np.isfinite(float(answer.reading["speed"][1]))
 

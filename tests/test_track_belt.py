@@ -12,13 +12,13 @@ from mmrjax.model import balances, params
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.signals import State
 from mmrjax.undercarriage import side_contacts
-from mmrjax.undercarriage.belt import POLYGON, Path, belt_runs, belt_travel, tension_along, tips_on_path
+from mmrjax.undercarriage.belt import POLYGON, BeltPath, belt_runs, belt_travel, tension_along, tips_on_path
 from mmrjax.undercarriage.running_gear import GROUSERS, TEETH_BELT
 
 
 @pytest.fixture(scope="module")
 def path(robot):
-    return Path(robot.configurations["6T2A"].radius, robot.running_gear)
+    return BeltPath(robot.configurations["6T2A"].radius, robot.running_gear)
 
 
 def test_belt_is_840_mm_with_grousers_every_35(path):
@@ -31,7 +31,7 @@ def test_belt_is_840_mm_with_grousers_every_35(path):
 @pytest.mark.parametrize("recess", [0.0, 3e-4])
 def test_tip_rates_are_derivatives_of_its_place(path, recess):
     gear = params.replace(path.gear, {"guide_recess": jnp.asarray(recess)})
-    path = Path(path.radius, gear)
+    path = BeltPath(path.radius, gear)
     places = jnp.linspace(1e-3, 0.8391, 517)  # off the joints of the path
     slope = jax.vmap(jax.jacfwd(lambda p: jnp.stack([tips_on_path(path, p).forward, tips_on_path(path, p).up])))(
         places
@@ -119,14 +119,14 @@ def test_generalized_forces_do_the_work_of_the_contacts(path, robot, wheeled):
     q, v = _posture(path, wheeled, robot)
     run = Conditions(configuration=wheeled)
     chassis = robot.chassis(run.configuration)
-    at = side_contacts.contact_state(path, chassis, q, v)
+    at = side_contacts.compute_contacts(path, chassis, q, v)
     signals = balances.begin_signals(robot, run, State(jnp.asarray(3.0), 48 * v[3], v[0], jnp.asarray(0.0)))
     signals = dataclasses.replace(signals, resistance=jnp.asarray(5.0), speed_slip_terms=jnp.asarray(0.0))
     done = side_contacts.contact_forces(path, chassis, signals, at, q[1])
     assert float(at.normal) > 10.0 and float(jnp.abs(done.traction)) > 0.1
 
     def point(q):  # of each contact in the world
-        now = side_contacts.contact_state(path, chassis, q, v)
+        now = side_contacts.compute_contacts(path, chassis, q, v)
         return q[0] + now.lever_x, q[1] + now.lever_z
 
     slope_x, slope_z = jax.jacfwd(point)(q)
@@ -148,7 +148,7 @@ def test_contact_pairs_are_720_on_tracks_and_4_on_wheels(path, robot):
         q = q.at[1].add(-1.0).at[2].set(0.0)  # under the ground, so that every contact that can bear does
         run = Conditions(configuration=wheeled)
         chassis = robot.chassis(run.configuration)
-        at = side_contacts.contact_state(path, chassis, q, 0 * v)
+        at = side_contacts.compute_contacts(path, chassis, q, 0 * v)
         signals = balances.begin_signals(robot, run, State(*(jnp.asarray(0.0) for _ in range(4))))
         done = side_contacts.contact_forces(path, chassis, signals, at, q[1])
         teeth = side_contacts.inner_loads(path, at, done).teeth(path)
@@ -159,7 +159,7 @@ def test_contact_pairs_are_720_on_tracks_and_4_on_wheels(path, robot):
 
 def test_teeth_carry_what_the_guide_carries(path, robot):
     q, v = _posture(path, 0.0, robot)
-    at = side_contacts.contact_state(path, robot.configurations["6T2A"], q, v)
+    at = side_contacts.compute_contacts(path, robot.configurations["6T2A"], q, v)
     signals = balances.begin_signals(robot, Conditions(), State(*(jnp.asarray(0.0) for _ in range(4))))
     loads = side_contacts.inner_loads(
         path, at, side_contacts.contact_forces(path, robot.configurations["6T2A"], signals, at, q[1])

@@ -115,9 +115,9 @@ def test_robot_at_rest_is_borne_with_exact_derivatives():
 
     def borne(payload, slope_deg, configuration):
         conditions = Conditions(configuration, voltage=24.0, slope_deg=slope_deg, payload=payload)
-        run = half_robot.half_robot_system(robot, conditions, 1e-4)
+        run = half_robot.build_system(robot, conditions, 1e-4)
         q = half_robot.stand(run, 0.1).q
-        at = half_robot.side_contacts.contact_state(run.path, run.chassis, q, jnp.zeros(5))
+        at = half_robot.side_contacts.compute_contacts(run.path, run.chassis, q, jnp.zeros(5))
         return q[1:3], at.normal / (half_robot.centre_of_mass(run)[2] * GRAVITY * jnp.cos(run.conditions.slope))
 
     both = jax.jit(jax.vmap(lambda *given: (*borne(*given), jax.jacrev(borne)(*given)[0])))

@@ -12,7 +12,7 @@ from mmrjax.model import params
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.signals import GRAVITY
 from mmrjax.undercarriage.belt import belt_travel
-from mmrjax.undercarriage.half_robot import advance, centre_of_mass, half_robot_system, instant, stand
+from mmrjax.undercarriage.half_robot import advance, build_system, centre_of_mass, instant, stand
 
 RUNS = Conditions(
     voltage=[33.0, 15.0, 24.0, 33.0],
@@ -29,7 +29,7 @@ def ledger(robot):
     @jax.jit
     @jax.vmap
     def run(command):
-        setup = half_robot_system(robot, command, 1e-4)
+        setup = build_system(robot, command, 1e-4)
         radius, gear = setup.path.radius, setup.path.gear
         chassis = robot.chassis(command.configuration)
 

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from mmrjax.fidelities.track import _batch, track_batch
+from mmrjax.fidelities.track import _simulate_batch, track_batch
 from mmrjax.model import params
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.signals import FLAGS, STATUSES
-from mmrjax.undercarriage.belt import Path
-from mmrjax.undercarriage.ripple_peaks import period_pitch, ripple, touchdowns
+from mmrjax.undercarriage.belt import BeltPath
+from mmrjax.undercarriage.ripple_peaks import measure_ripple, period_pitch, touchdowns
 
 pytestmark = pytest.mark.slow
 
@@ -39,9 +39,9 @@ def runs(robot):
     wheeled, slope, payload, voltage = np.array(RUNS, float).T
     commands = Conditions(voltage=voltage, slope_deg=slope, payload=payload, configuration=wheeled)
     # Not through the door's check of the step, whose own compilation test_track_bad_input pays.
-    from mmrjax.fidelities.track import _batch
+    from mmrjax.fidelities.track import _simulate_batch
 
-    return jax.tree.map(np.asarray, _batch(robot, commands, 1.5, 1e-4, 1e-3, False))
+    return jax.tree.map(np.asarray, _simulate_batch(robot, commands, 1.5, 1e-4, 1e-3, False))
 
 
 def series(runs, k, name):
@@ -49,7 +49,7 @@ def series(runs, k, name):
 
 
 def tail(runs, k, name):
-    return ripple(runs.time[k, TAIL], series(runs, k, name)[TAIL])
+    return measure_ripple(runs.time[k, TAIL], series(runs, k, name)[TAIL])
 
 
 def test_statuses_are_each_member_s_own(runs):
@@ -79,7 +79,7 @@ def test_robot_that_slips_on_average_and_goes_on_steadily_has_settled(robot):
         },
     )  # fmt: skip
     commands = Conditions(voltage=[15.0, 15.0], slope_deg=[10.0, 20.0])
-    answer = _batch(shaking, commands, 1.5, 1e-4, 1e-3, True)
+    answer = _simulate_batch(shaking, commands, 1.5, 1e-4, 1e-3, True)
     assert [STATUSES[s] for s in answer.result.status] == ["converged"] * 2
     slips = 1 << FLAGS.index("slips")
     assert [bool(f & slips) for f in np.asarray(answer.result.flags)] == [False, True]
@@ -99,7 +99,7 @@ def test_unpowered_robot_stands_still(runs):
 @pytest.mark.parametrize("name", ["total_current", "speed"])
 def test_tracked_ripple_has_the_grousers_period(runs, robot, k, name):
     """Eq. (34) within 2 %."""
-    path = Path(robot.configurations["6T2A"].radius, robot.running_gear)
+    path = BeltPath(robot.configurations["6T2A"].radius, robot.running_gear)
     wheel = series(runs, k, "speed_wheel")[TAIL].mean()
     assert tail(runs, k, name).period == pytest.approx(
         period_pitch(float(path.pitch), wheel, float(robot.configurations["6T2A"].radius)), rel=0.02
@@ -221,13 +221,13 @@ def test_fidelities_agree_over_the_climbable_rows_of_table_8(robot, grid):
     `drive` ends on `steady` (test_drive).
     """
     from mmrjax.fidelities.steady import steady
-    from mmrjax.fidelities.track import _batch
+    from mmrjax.fidelities.track import _simulate_batch
     from mmrjax.model import params
 
     rows = grid[grid[:, 1] <= np.where(grid[:, 0] > 0.5, 15.0, 10.0)]
     wheeled, slope, payload, voltage = rows.T
     commands = Conditions(voltage=voltage, slope_deg=slope, payload=payload, configuration=wheeled)
-    ours = _batch(robot, commands, 0.6, 1e-4, 5e-3, True)
+    ours = _simulate_batch(robot, commands, 0.6, 1e-4, 5e-3, True)
     assert {STATUSES[s] for s in np.asarray(ours.result.status)} == {"converged"}
 
     def lumped(share, run):
@@ -242,12 +242,12 @@ def test_fidelities_agree_over_the_climbable_rows_of_table_8(robot, grid):
 
 def test_batch_is_its_members(robot):
     """vmap = loop: a run does not depend on who runs beside it."""
-    from mmrjax.fidelities.track import _batch
+    from mmrjax.fidelities.track import _simulate_batch
 
     two = Conditions(voltage=[33.0, 15.0], configuration=[0.0, 1.0])
     twin = jax.tree.map(lambda x: x[::-1], two)
-    a = _batch(robot, two, 0.05, 1e-4, 1e-3, False)
-    b = _batch(robot, twin, 0.05, 1e-4, 1e-3, False)
+    a = _simulate_batch(robot, two, 0.05, 1e-4, 1e-3, False)
+    b = _simulate_batch(robot, twin, 0.05, 1e-4, 1e-3, False)
     assert_allclose(a.q, b.q[::-1], rtol=1e-9, atol=1e-12)
 
 
@@ -262,11 +262,11 @@ def test_batch_compiles_once(robot, compilations):
 
 def test_run_in_parts_is_the_run_in_one(robot):
     """What a progress bar asks for: the same numbers, also where the parts do not divide the run."""
-    from mmrjax.fidelities.track import PARTS, _batch
+    from mmrjax.fidelities.track import PARTS, _simulate_batch
 
     two = Conditions(voltage=[33.0, 15.0], configuration=[0.0, 1.0])
     shares = []
-    whole = _batch(robot, two, 0.047, 1e-4, 1e-3, False)
+    whole = _simulate_batch(robot, two, 0.047, 1e-4, 1e-3, False)
     parts = track_batch(robot, two, duration=0.047, progress=shares.append)
     assert shares[-1] == 1.0 and len(shares) <= PARTS and (np.diff(shares) > 0).all()
     assert jax.tree.structure(whole) == jax.tree.structure(parts)

@@ -11,7 +11,7 @@ from mmrjax.model import balances, params
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.signals import State
 from mmrjax.undercarriage import mjcf
-from mmrjax.undercarriage.half_robot import advance, generalized, half_robot_system, instant, resistance, stand
+from mmrjax.undercarriage.half_robot import advance, build_system, damping_matrix, generalized_forces, instant, stand
 
 RUNS = {
     "tracked": dict(voltage=33.0, slope_deg=5.0, payload=3.0),
@@ -32,7 +32,7 @@ def test_member_has_the_constants_that_mujoco_compiles(robot, name):
     """Against stale derived constants (mujoco issue 1607): MJX's are replaced, MuJoCo's compiled afresh."""
     changes = {"running_gear.lever_front": jnp.asarray(2.5), "running_gear.centre_offset": jnp.asarray(0.01)}
     changed, run = params.replace(robot, changes), Conditions(**RUNS[name])
-    ours, theirs = half_robot_system(changed, run, STEP).model, native(changed, run)
+    ours, theirs = build_system(changed, run, STEP).model, native(changed, run)
     for field in ("body_mass", "body_subtreemass", "body_inertia", "body_ipos", "body_pos", "jnt_axis"):
         assert_allclose(getattr(ours, field), getattr(theirs, field), rtol=1e-12, atol=1e-15, err_msg=field)
     assert_allclose(ours.opt.gravity, theirs.opt.gravity, rtol=1e-12, atol=1e-15)
@@ -43,7 +43,7 @@ def test_member_has_the_constants_that_mujoco_compiles(robot, name):
 @pytest.mark.parametrize("name", sorted(RUNS))
 def test_masses_make_up_the_robot(robot, name):
     run = Conditions(**RUNS[name])
-    half = half_robot_system(robot, run, STEP).half
+    half = build_system(robot, run, STEP).half
     chassis = robot.chassis(run.configuration)
     assert float(half.chassis + 2 * half.pulley) == pytest.approx(float(chassis.mass + run.payload) / 2)
     assert float(2 * half.inertia_pulley) == pytest.approx(float(chassis.inertia))
@@ -54,10 +54,14 @@ def test_masses_make_up_the_robot(robot, name):
 def step_both(robot):
     @jax.jit
     def forces(run, motion):
-        constants = half_robot_system(robot, run, STEP)
+        constants = build_system(robot, run, STEP)
         signals, at, pulled = instant(constants, motion)
         after, _, _ = advance(constants, motion)
-        return *generalized(constants, signals, pulled), resistance(constants, motion, signals, at, pulled), after
+        return (
+            *generalized_forces(constants, signals, pulled),
+            damping_matrix(constants, motion, signals, at, pulled),
+            after,
+        )
 
     return forces
 
@@ -77,7 +81,7 @@ def test_c_mujoco_agrees_over_a_second(robot, step_both, name):
     def second(motion):
         return jax.lax.scan(lambda m, _: (step_both(run, m)[-1], None), motion, None, length=10_000)[0]
 
-    start = stand(half_robot_system(robot, run, STEP))
+    start = stand(build_system(robot, run, STEP))
     end = second(start)
     data.qpos[:], motion = start.q, start
     mass = np.zeros((model.nv, model.nv))

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mmrjax.fidelities.track import _batch
+from mmrjax.fidelities.track import _simulate_batch
 from mmrjax.model.conditions import Conditions
-from mmrjax.undercarriage.rendering import render, scene
+from mmrjax.undercarriage.rendering import render, scene_of_run
 
 RUNS = Conditions(voltage=[33.0, 24.0, np.nan], slope_deg=np.degrees(0.1), configuration=[0, 1, 0])
 
@@ -44,10 +44,10 @@ KINDS = ["rolling", pytest.param("track", marks=pytest.mark.slow)]
 
 @pytest.fixture(scope="module", params=KINDS)
 def scenes(request, robot):
-    runs = rolling() if request.param == "rolling" else _batch(robot, RUNS, 0.04, 1e-4, 1e-3, True)
+    runs = rolling() if request.param == "rolling" else _simulate_batch(robot, RUNS, 0.04, 1e-4, 1e-3, True)
 
     def one(k):
-        return scene(robot, jax.tree.map(lambda x: x[k], RUNS), _member(runs, k))
+        return scene_of_run(robot, jax.tree.map(lambda x: x[k], RUNS), _member(runs, k))
 
     return one
 

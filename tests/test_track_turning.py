@@ -13,9 +13,9 @@ from mmrjax.model import balances, params
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.masses import masses_of_parts
 from mmrjax.model.signals import CONVERGED, GRAVITY, State
-from mmrjax.turning.two_sides import SIDES, Law
+from mmrjax.turning.two_sides import SIDES, ContactLaw
 from mmrjax.undercarriage import both_sides, half_robot, mjcf, rendering_from_above
-from mmrjax.undercarriage.half_robot import half_robot_system
+from mmrjax.undercarriage.half_robot import build_system
 
 STEP, STEPS = 1e-4, 3000
 #: Two turns that mirror one another, one on the spot across a slope, one of wheels under load, and sides alike.
@@ -34,17 +34,17 @@ MIRRORED, ALIKE = (0, 1), 4
 def _power(run, motion):
     """A step, and where its power goes [W], of the whole robot. What is stored after it [J]."""
     robot, b = run.robot, both_sides
-    sides, plane = b._contacts(run, motion), b.plane_motion(run, motion)
-    signals, pulled = b._resolved(run, plane, sides)
-    _, levers, rises = b.resistance(run, motion, signals, sides, pulled)
+    sides, plane = b._contacts_of_sides(run, motion), b.plane_motion(run, motion)
+    signals, pulled = b._resolve_signals(run, plane, sides)
+    _, levers, rises = b.damping_matrix(run, motion, signals, sides, pulled)
     after, travel, _ = b.advance(run, motion)
     gained = after.v - motion.v
     mean, at = motion.v + gained / 2, sides.at
-    ahead, aside, normal = b.forces_after(at, pulled, levers, rises, gained)
+    ahead, aside, normal = b.contact_forces_after_step(at, pulled, levers, rises, gained)
     moves = [jnp.einsum("sci,si->sc", x, mean[b.OF_SIDE]) for x in (levers.along, levers.across, levers.off)]
     front, rear = mean[b.PULLEYS].T
     belt = run.path.radius * (front[:, None] * (1 - at.weight) + rear[:, None] * at.weight)
-    losses = b._losses(run, plane, sides)
+    losses = b._loss_derivatives(run, plane, sides)
     motor, rate = robot.gearbox.ratio * front, robot.gearbox.ratio * gained[b.PULLEYS[:, 0]] / STEP
     mesh = signals.torque_motor - signals.torque_idle - robot.motor.inertia * rate
     charge = after.current + motion.current
@@ -72,7 +72,7 @@ def _power(run, motion):
 def _stored(run, motion):
     robot, b, q, v = run.robot, both_sides, motion.q, motion.v
     none = jnp.zeros(b.COORDINATES)
-    mass, _ = b.dynamics(run, motion, none[:2])
+    mass, _ = b.mass_matrix_and_bias(run, motion, none[:2])
     forward, up = run.half.centre
     rotors = robot.motor.inertia * (robot.gearbox.ratio * v[b.PULLEYS[:, 0]]) ** 2
     level = forward * jnp.cos(q[b.PITCH]) + up * jnp.sin(q[b.PITCH])
@@ -89,7 +89,7 @@ def runs(robot):
     @jax.jit
     @jax.vmap
     def every(conditions):
-        run = half_robot_system(robot, conditions, STEP)
+        run = build_system(robot, conditions, STEP)
 
         def step(motion, _):
             after, powers, travel = _power(run, motion)
@@ -146,7 +146,7 @@ def test_sides_swapped_mirror(runs):
 def test_sides_alike_are_the_half_robot(robot, runs):
     """To 1e-6 of every coordinate's and rate's size, and of the current. Nothing to the side."""
     straight = jax.tree.map(lambda x: x[ALIKE], RUNS).straight()
-    run = half_robot_system(robot, straight, STEP)
+    run = build_system(robot, straight, STEP)
 
     def step(motion, _):
         after = half_robot.advance(run, motion)[0]
@@ -172,11 +172,17 @@ def test_forces_do_the_work_of_contacts_and_friction_takes_it(robot):
 
     @jax.jit
     def all_of(motion):
-        run = half_robot_system(robot, conditions, STEP)
+        run = build_system(robot, conditions, STEP)
         found = b.instant(run, motion)
-        return run.path, run.chassis, b._contacts(run, motion), *found, b.generalized(run, motion, *found)
+        return (
+            run.path,
+            run.chassis,
+            b._contacts_of_sides(run, motion),
+            *found,
+            b.generalized_forces(run, motion, *found),
+        )
 
-    motion = half_robot.Motion(jnp.asarray(q), jnp.asarray(v), jnp.zeros(2), jnp.zeros(()))
+    motion = half_robot.HalfRobotState(jnp.asarray(q), jnp.asarray(v), jnp.zeros(2), jnp.zeros(()))
     path, chassis, sides, signals, at, pulled, forces = jax.device_get(all_of(motion))
     front, rear = v[b.PULLEYS].T
     belt = path.radius * (front[:, None] * (1 - at.weight) + rear[:, None] * at.weight)
@@ -224,7 +230,7 @@ def test_bodies_are_the_robot_that_mujoco_compiles(robot, configuration):
 
 @pytest.mark.parametrize("rule", [1.0, 2.0])
 def test_friction_rises_as_differences_say_and_never_falls_along_its_sliding(robot, rule):
-    law = Law(robot.configurations["6T2A"].ground.friction, 1.3 ** (2 * rule - 2), 1.0, 16)
+    law = ContactLaw(robot.configurations["6T2A"].ground.friction, 1.3 ** (2 * rule - 2), 1.0, 16)
     slow, fast = jnp.asarray([[0.004, -0.003]]), jnp.asarray([[0.05, 0.03]])
 
     def forces(u):
@@ -253,7 +259,7 @@ def test_a_turn_is_seen_from_above(contacts):
     v[:, [0, 3]] = 0.2, 1.0
     along = np.broadcast_to(np.linspace(0.15, -0.15, contacts), load.shape)
     time, belt = np.array([0.1, 0.2]), np.array([[0.2 - 0.1215, 0.5]] * 2)
-    view = rendering_from_above.Above("6T2A", 0.1, 0.3, 0.243, time, q, v, np.ones((2, 2)), belt, along, load)
+    view = rendering_from_above.TopViewScene("6T2A", 0.1, 0.3, 0.243, time, q, v, np.ones((2, 2)), belt, along, load)
     axes = view.sheet(0).axes[0]
     assert "slope 6°, t = 0.100 s" in axes.get_title()
     bars = [line for line in axes.lines if line.get_zorder() == 4]

@@ -113,11 +113,11 @@ def test_a_turn_beyond_the_supply_is_refused_with_what_it_reaches(monkeypatch, s
         reading = {"speed": ROLLS * volts.mean(0), "yaw_rate": ROLLS * (volts[1] - volts[0]) / WIDE}
         return types.SimpleNamespace(result=types.SimpleNamespace(reading=reading)), asked
 
-    monkeypatch.setattr(turn_room, "_with_others", rolling)
+    monkeypatch.setattr(turn_room, "_turns_to_compare", rolling)
     robot, demand = paper_robots.nominal(), config.Simulate(speed_m_s=speed, yaw_rate_rad_s=rate)
     runs = inputs.one_run(robot, {"supply_voltage_V": 24.0, **turn_room.turn_columns(demand, {})})
     with pytest.raises(BadConfiguration, match=f"{speed:g} m/s and {rate:g} rad/s .*{says}"):
-        turn_room._demanded(robot, runs.conditions(robot), runs, demand)
+        turn_room._run_for_demand(robot, runs.conditions(robot), runs, demand)
 
 
 def test_a_required_turn_without_a_steady_state_is_not_told_of_options_of_runs():
@@ -348,8 +348,8 @@ def test_a_sweep_over_duties_leaves_yaw_rates(tmp_path, mmrjax):
 def test_currents_of_a_turn_on_the_spot_do_not_cancel_on_the_page_of_a_mission():
     sides = {f"motor_current_{side}_A": np.array([sign * 1.6, 1.0]) for side, sign in (("left", -1), ("right", 1))}
     rows = {"motor_current_A": np.array([0.0, 1.0])}
-    assert_allclose(mission_figures.of_motors(rows | sides, "motor_current", "_A"), [1.6, 1.0])
-    assert_allclose(mission_figures.of_motors(rows, "motor_current", "_A"), [0.0, 1.0])
+    assert_allclose(mission_figures.mean_of_motors(rows | sides, "motor_current", "_A"), [1.6, 1.0])
+    assert_allclose(mission_figures.mean_of_motors(rows, "motor_current", "_A"), [0.0, 1.0])
 
 
 @pytest.mark.slow

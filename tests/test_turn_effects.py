@@ -116,7 +116,7 @@ def test_energy_is_kept_and_resistance_to_turning_takes_it():
 
     @jax.jit
     def powers(m):
-        rate = circling.motion_of(robot, circling.turning_rates(robot, RUN, flat(m)))
+        rate = circling.motion_of_unknowns(robot, circling.turning_rates(robot, RUN, flat(m)))
         travel = balances.turning_signals(robot, RUN, m)
         source = jnp.mean(jax.vmap(lambda c, s: energy.source_power(robot, c, s))(RUN.of_sides(), travel.signals))
         return source, energy.sink_powers_turning(robot, RUN, travel), jax.jvp(stored, (m,), (rate,))[1]

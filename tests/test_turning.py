@@ -18,7 +18,7 @@ from mmrjax.turning import circling as turning
 from mmrjax.turning import two_sides as room
 from mmrjax.turning.two_sides import Stance
 
-grip = jax.jit(room.grip)
+grip = jax.jit(room.ground_forces)
 CONFIGURATIONS = ("6T2A", "4W2T")
 #: Duties of left and right: one side slower, one held, on the spot, one driven backward by the turn, slow.
 DUTIES = ((1.0, 0.5), (0.8, 0.0), (-1.0, 1.0), (0.3, -0.1), (0.25, 0.2))
@@ -121,7 +121,7 @@ def test_every_turn_settles(turns):
 @pytest.mark.slow
 def test_nothing_is_settled_on_a_slope_where_the_heading_changes(robot, monkeypatch):
     run = mm.Conditions("6T2A", voltage=33.0, duty_left=1.0, duty_right=0.5, slope_deg=5.0).resolved(robot)
-    motion = turning.motion_of(robot, turning.turning_start(robot, run).at[4].set(0.5))
+    motion = turning.motion_of_unknowns(robot, turning.turning_start(robot, run).at[4].set(0.5))
     found = balances.turning_signals(robot, run, motion), motion, jnp.asarray(STATUSES.index("converged"))
     monkeypatch.setattr(turning, "circling_signals", lambda *_: found)
     assert STATUSES[int(turning.operating_point(robot, run)[0].status)] == "not_settled"
@@ -150,7 +150,7 @@ def test_energy_in_is_what_sinks_take_and_what_is_stored(robot, configuration):
 
     @jax.jit
     def powers(m):
-        rate = turning.motion_of(robot, turning.turning_rates(robot, run, flat(m)))
+        rate = turning.motion_of_unknowns(robot, turning.turning_rates(robot, run, flat(m)))
         # What is stored in shafts and windings changes with their rates; inductance and inertias do not.
         _, change = jax.jvp(stored, (m,), (rate,))
         travel = balances.turning_signals(robot, run, m)

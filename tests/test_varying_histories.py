@@ -12,7 +12,7 @@ from synthetic import Analyst
 
 from calibration.data import runs as records
 from calibration.data.columns import DRIVEN
-from calibration.data.courses import applied_drive, course_of_each_row, course_stretches, rows_of_varying_runs
+from calibration.data.courses import applied_drive, course_of_each_row, intervals_by_run, rows_of_varying_runs
 from calibration.data.input_errors import BadData
 from calibration.data.runs import Runs
 from calibration.discovery.reach import reach_of_table
@@ -270,7 +270,7 @@ def test_one_supply_voltage_is_said_only_where_the_duty_is_one_too(runs):
 
 
 def test_stretches_are_the_segments(runs, observer):
-    for found in (course_stretches(runs), observer.stretches()):
+    for found in (intervals_by_run(runs), observer.stretches()):
         assert [len(run) for run in found] == [4, 4, 4]
         for run in found:
             assert_allclose([s.begin for s in run], SEGMENTS[:4], atol=1e-12)

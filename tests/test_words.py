@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from synthetic import LOST_MOTION
 
-from calibration.described import describe, in_words
+from calibration.described import describe, report_in_words
 from calibration.discovery import loop_notes as of_loop
 from calibration.discovery.formula import Proposal
 from calibration.discovery.loop_notes import (
@@ -309,7 +309,7 @@ def test_notes_of_a_kind_read_as_recorded(kind):
 
 def test_a_callback_for_notes_passes_their_sentences_on():
     told = []
-    in_words(told.append)(SAMPLES[0])
+    report_in_words(told.append)(SAMPLES[0])
     assert told == [describe(SAMPLES[0])]
 
 

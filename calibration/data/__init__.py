@@ -1,4 +1,4 @@
-"""Data from outside: tables of runs, noise, robot and effect files, and the checks at the door."""
+"""Input data: tables of runs, noise, robot files and effect files, with the checks of everything that is read."""
 
 from __future__ import annotations
 

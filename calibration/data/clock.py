@@ -1,4 +1,4 @@
-"""Clocks of loggers, counted from the first row of each recording, and faults of clocks that count."""
+"""Times of loggers, counted from the first row of each recording, and corrections of their clocks."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ SHARED, ODD = 0.1, 0.1
 
 
 def unwrap_counter(count: np.ndarray, run: np.ndarray) -> tuple[np.ndarray, float]:
-    """Returns a counter without wraps, and its period (0 if it does not wrap).
+    """A counter without its wraps, and its period (0 if it does not wrap).
 
-    A counter wraps where it falls from its last numbers to its first ones, within `LACKING` usual steps, and never
-    goes back otherwise.
+    A counter wraps if it falls from its last numbers to its first ones, within `LACKING` usual steps, and never goes
+    back otherwise.
 
     Args:
-        count: as logged, shape (rows,).
+        count: counter as logged, shape (rows,).
         run: index of the recording of each row, shape (rows,).
     """
     same = np.diff(run) == 0
@@ -61,13 +61,13 @@ def unwrap_counter(count: np.ndarray, run: np.ndarray) -> tuple[np.ndarray, floa
 
 
 def spread_shared_stamps(time: np.ndarray, run: np.ndarray) -> tuple[np.ndarray, float]:
-    """Returns times with rows of equal stamps spread evenly up to the next stamp, and the number of rows per
+    """Times in which rows with equal time stamps are spread evenly up to the next stamp, and the number of rows per
     stamp.
 
     The number of rows is 0 if nothing was changed.
 
     Args:
-        time: time of rows in order, shape (rows,).
+        time: time of the rows in order, shape (rows,).
         run: index of the recording of each row, shape (rows,).
     """
     if len(time) < 3:
@@ -99,11 +99,11 @@ EPOCH, PARTS = (6.3e8, 4.2e9), {"ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 _WITH_POINTS = re.compile(r"(\d\d)\.(\d\d)\.(\d{4})(?=[ T])")
 
 
-def recorded_rows(arrays: NamedArrays, meanings: Sequence[Column | None]) -> NamedArrays:
-    """Returns the columns without empty rows, and a note that counts these rows.
+def drop_empty_rows(arrays: NamedArrays, meanings: Sequence[Column | None]) -> NamedArrays:
+    """The columns without empty rows, and a note with the number of these rows.
 
-    Every cell of such a row is missing, or it is at the end of a log whose clock is back at 0 there: a logger writes
-    all of its memory.
+    A row is empty if all of its cells are missing, or if it is at the end of a log whose clock has returned to 0:
+    such a logger writes all of its memory.
     """
     empty = np.arange(len(arrays))
     for raw in arrays.values:
@@ -127,20 +127,20 @@ def recorded_rows(arrays: NamedArrays, meanings: Sequence[Column | None]) -> Nam
     return arrays.rows(kept, note)
 
 
-def from_the_first(name: str, meaning: Column, raw: Raw, runs: Sequence[str] | None) -> tuple[Raw, Names]:
-    """Returns a column of time as the time since the first row of each run, and notes on the changes.
+def time_since_start(name: str, meaning: Column, raw: Raw, runs: Sequence[str] | None) -> tuple[Raw, Names]:
+    """A column of time, converted to the time since the first row of each run, and notes on the changes.
 
     A run begins at its first row, whatever its clock shows there: the time since a controller started, or a time of
-    day. Times of day follow ISO 8601, or have a date as 25.11.2026, or are numbers beyond the largest time. These
-    count seconds since 1970, or ms, µs or ns, as their size tells. Times without a date that fall back by more than
-    half a day have passed midnight. A counter that wraps at the end of its digits goes on. Rows that share a stamp
-    are set evenly between it and the next (`counters`). A column with a cell that is no time is returned as it is,
-    and the reader refuses that cell.
+    day. Times of day follow ISO 8601, or have a date as 25.11.2026, or are numbers beyond the largest time. Such
+    numbers count s, ms, µs or ns since 1970, depending on their size. Times without a date that fall back by more
+    than half a day have passed midnight. A counter that wraps at the end of its digits goes on. Rows that share a
+    time stamp are spread evenly up to the next stamp. A column with a cell that is no time is returned unchanged, and
+    the reader rejects that cell.
 
     Args:
         name: name of the source.
         meaning: meaning of the column.
-        runs: `run_id` of each cell. None: all are of one run.
+        runs: `run_id` of each cell. None: all cells belong to one run.
     """
     factor = meaning.value(1.0)
     clock = (
@@ -153,7 +153,7 @@ def from_the_first(name: str, meaning: Column, raw: Raw, runs: Sequence[str] | N
     notes: Names = ()
     if not of_day:
         low, high = (limit * factor for limit in meaning.limits())
-        count, notes = _unwrapped(name, meaning, column_numbers(raw), run)
+        count, notes = _unwrap_clock(name, meaning, column_numbers(raw), run)
         clock = count * factor
         of_day = bool((clock > high).all())
         if of_day and clock[0] > EPOCH[1]:
@@ -166,7 +166,7 @@ def from_the_first(name: str, meaning: Column, raw: Raw, runs: Sequence[str] | N
             return raw, ()
     run = np.zeros(len(clock), int) if run is None else run
     if isinstance(raw, list):
-        _past_midnight(clock, raw, run)
+        _add_days_after_midnight(clock, raw, run)
     first = np.full(len(names), np.inf)
     if len(names) > 1:
         np.minimum.at(first, run, clock)
@@ -189,8 +189,8 @@ def from_the_first(name: str, meaning: Column, raw: Raw, runs: Sequence[str] | N
     )
 
 
-def _unwrapped(name: str, meaning: Column, count: np.ndarray, run: np.ndarray | None) -> tuple[np.ndarray, Names]:
-    """Numbers of a clock without wraps and without stamps that rows share, and notes on these."""
+def _unwrap_clock(name: str, meaning: Column, count: np.ndarray, run: np.ndarray | None) -> tuple[np.ndarray, Names]:
+    """Numbers of a clock without wraps and without shared time stamps, and notes on both."""
     step = np.diff(count)
     if not len(step) or (step > 0).all() or not np.isfinite(step).all():
         return count, ()
@@ -207,8 +207,8 @@ def _unwrapped(name: str, meaning: Column, count: np.ndarray, run: np.ndarray | 
     return count, tuple(notes)
 
 
-def _past_midnight(clock: np.ndarray, cells: Sequence[str], run: np.ndarray) -> None:
-    """Adds a day [s] to times without a date that fall back by more than half a day within their run."""
+def _add_days_after_midnight(clock: np.ndarray, cells: Sequence[str], run: np.ndarray) -> None:
+    """Adds a day [s] to times without a date after they fall back by more than half a day within their run."""
     last: dict[int, float] = {}
     for k, (x, which) in enumerate(zip(clock.tolist(), run.tolist(), strict=True)):
         if _is_time_without_date(cells[k]) and which in last:

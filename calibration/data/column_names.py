@@ -27,10 +27,9 @@ _WITH_UNIT = re.compile(r"([+-]?\d*\.?\d+(?:[eE][+-]?\d+)?)\s*([^\d\s.,].*)")
 
 
 def convert_column(meaning: Column, raw: Raw, layout: Layout) -> tuple[np.ndarray, np.ndarray]:
-    """Returns a column's values in its unit (NaN without a reading), and True for each cell that is rejected.
+    """Values of a column in its unit (NaN without a reading), and True for each rejected cell.
 
-    All cells are read at once, since a log may have a million rows. `refused_cell_sentence` makes the sentence about
-    one of them.
+    All cells are read at once, because a log may have a million rows. `refused_cell_sentence` explains one of them.
     """
     if meaning.column in WORDS:
         words = column_texts(raw)
@@ -47,18 +46,18 @@ def convert_column(meaning: Column, raw: Raw, layout: Layout) -> tuple[np.ndarra
     ):
         refused[refused] = ~missing_readings(raw, np.flatnonzero(refused))
     np.clip(numbers, low, high, out=numbers)
-    return numbers if meaning.as_named else _in_its_unit(meaning, numbers), refused
+    return numbers if meaning.as_named else _convert_to_unit(meaning, numbers), refused
 
 
-def _in_its_unit(meaning: Column, written: np.ndarray) -> np.ndarray:
-    """Numbers of cells in the unit of the column, as `Column.value` of each."""
+def _convert_to_unit(meaning: Column, written: np.ndarray) -> np.ndarray:
+    """Numbers of cells, converted to the unit of the column as by `Column.value`."""
     if meaning.quantity.percent and meaning.unit == quantities.PERCENT:  # not proportional
         return np.array([meaning.value(x) for x in written.tolist()])
     return written * meaning.factor * meaning.quantity.units[meaning.unit]
 
 
 def _allowed_words(column: str, word: str, layout: Layout) -> str:
-    """Allowed words, for the error message about a word. Empty if the word itself is allowed."""
+    """Allowed words, for the error message about a wrong one. Empty if the word is allowed."""
     if column == "surface":
         return surfaces.allowed_labels(word, layout)
     if column == "mode" and word not in DRIVEN:
@@ -69,11 +68,11 @@ def _allowed_words(column: str, word: str, layout: Layout) -> str:
 
 
 def refused_cell_sentence(where: str, meaning: Column, cell: str, layout: Layout, *, hints: bool = True) -> str:
-    """Returns the sentence about a cell that `convert_column` refuses.
+    """Sentence that explains why `convert_column` rejects a cell.
 
     Args:
-        where: opens it.
-        hints: True to guess the unit that was meant.
+        where: beginning of the sentence.
+        hints: True to guess the intended unit.
     """
     column, hint = meaning.column, ""
     if column in WORDS:
@@ -91,7 +90,7 @@ def refused_cell_sentence(where: str, meaning: Column, cell: str, layout: Layout
 
 
 def _hint_about_cell(meaning: Column, cell: str, units: bool, readings: Names) -> str:
-    """Guess at the meaning of a rejected cell, ending in a semicolon. Empty without a guess."""
+    """Guess at what a rejected cell means, ending in a semicolon. Empty without a guess."""
     if cell.lower() in NOTHING:
         return "leave the cell empty if there is no reading; " if meaning.column in readings else ""
     quantity, mine = meaning.quantity, meaning.unit
@@ -117,7 +116,7 @@ def _hint_about_cell(meaning: Column, cell: str, units: bool, readings: Names) -
 
 
 def _unit_hint(value: str, written: str, mine: str, named: Mapping[str, str]) -> str:
-    """Advice on a unit next to a number. `mine`: the column's own unit. `named`: columns by their units."""
+    """Advice on a unit written next to a number. `mine`: unit of the column. `named`: columns by their units."""
     unit = quantities.unit_in_column(written)
     if unit == mine:
         return f"write {value}, since the unit is in the column's name; "
@@ -135,14 +134,14 @@ _SIDE = {"l": "left", "lh": "left", "lft": "left", "port": "left", "r": "right",
 def match_column_names(
     name: str, header: Sequence[str], layout: Layout, *, inferred: bool, of_turns: bool
 ) -> tuple[list[str], Layout, Names]:
-    """Returns the names of columns in this program's spelling, the layout with their channels, and notes.
+    """Names of the columns in this program's spelling, the layout with their channels, and notes.
 
     A note reports each name that differs in case.
 
     Raises:
-        BadData: a repeated name.
+        BadData: a name occurs twice.
     """
-    named, notes = _in_case(name, header, layout, inferred)
+    named, notes = _match_case(name, header, layout, inferred)
     repeated = sorted({c for c in named if named.count(c) > 1})
     if repeated:
         raise BadData(f"{name}: column {repeated[0]} is present {named.count(repeated[0])} times; expected once")
@@ -153,8 +152,8 @@ def match_column_names(
     return named, layout, tuple(notes)
 
 
-def _in_case(name: str, header: Sequence[str], layout: Layout, inferred: bool) -> tuple[list[str], Names]:
-    """A header with the capitals of the columns' names, and notes on changed names."""
+def _match_case(name: str, header: Sequence[str], layout: Layout, inferred: bool) -> tuple[list[str], Names]:
+    """Header with the capitals of the known column names, and notes on changed names."""
     full_layout = dataclasses.replace(layout, channels=channels.EVERY) if inferred else layout
     spelled: dict[str, set[str]] = {}
     for column in full_layout.spellings():
@@ -171,7 +170,7 @@ def _in_case(name: str, header: Sequence[str], layout: Layout, inferred: bool) -
 
 
 def _with_channels(name: str, header: list[str], layout: Layout, more: Sequence[Channel]) -> Layout:
-    """`layout` with each of `more` for which the file has a column."""
+    """Layout with each channel of `more` for which the file has a column."""
     meanings = dataclasses.replace(layout, channels=channels.EVERY).meanings(name, header)
     stated = {m.column for m in meanings if m is not None}
     with_channels = tuple(c for c in channels.EVERY if c in layout.channels or (c in more and c.column in stated))
@@ -206,11 +205,11 @@ def check_header(
                 )
             raise BadData(
                 f"{name}: column {layout.expected(column)} is missing{got} (required: {', '.join(required)})"
-                + ("" if close else _other_names(strange, column))
+                + ("" if close else _advice_on_unknown_columns(strange, column))
             )
     if measured and not any(c in stated for c in layout.measured_columns):
         expected = ", ".join(layout.measured_columns)
-        other = _other_names(strange, layout.measured_columns[0])
+        other = _advice_on_unknown_columns(strange, layout.measured_columns[0])
         turning = {c.column: c.name for c in channels.OF_TURNS}
         if of_turns := [c for c in strange if c in turning]:
             names = ", ".join(f'"{turning[c]}"' for c in of_turns)
@@ -222,20 +221,21 @@ def check_header(
             raise BadData(f"{name}: unknown column {column}; did you mean {close[0]}? rename or remove it")
 
 
-def check_time(name: str, header: list[str], meanings: list[Column | None], layout: Layout) -> None:
-    """Rejects readings of a log without a column of time."""
+def check_has_time(name: str, header: list[str], meanings: list[Column | None], layout: Layout) -> None:
+    """Rejects readings of a log without a time column."""
     stated = {m.column: m.shown for m in meanings if m is not None}
     over_time = [stated[c.column] for c in layout.channels if c.column in stated and not c.settled]
     if over_time and stated.keys().isdisjoint(TIME):
         strange = [c for c, m in zip(header, meanings, strict=True) if m is None]
         raise BadData(
             f"{name}: column {layout.expected('time_s')} is missing, and {over_time[0]} can be used only in a "
-            f"time history; if these are settled runs, remove {over_time[0]}{_other_names(strange, 'time_s')}"
+            f"time history; if these are settled runs, remove {over_time[0]}"
+            f"{_advice_on_unknown_columns(strange, 'time_s')}"
         )
 
 
-def _other_names(strange: list[str], column: str) -> str:
-    """Advice on columns with unknown names, for a message, empty without such columns."""
+def _advice_on_unknown_columns(strange: list[str], column: str) -> str:
+    """Advice on columns with unknown names, for an error message. Empty if there are none."""
     if not strange:
         return ""
     unit = column.rpartition("_")[2]
@@ -249,20 +249,22 @@ def _other_names(strange: list[str], column: str) -> str:
 
 
 def _check_names_of_sides(name: str, strange: list[str], stated: set[str], layout: Layout) -> None:
-    """Rejects columns that name a side with other words, or in another place of the column's name."""
+    """Rejects columns that name the side with other words, or at another place in the name."""
 
-    def words(column: str) -> list[str]:
+    def sorted_words(column: str) -> list[str]:
         return sorted(_SIDE.get(word.casefold(), word.casefold()) for word in column.split("_"))
 
-    columns_of_sides = {tuple(words(c)): c for c in layout.known() if set(channels.SIDES) & set(words(c))}
+    columns_of_sides = {
+        tuple(sorted_words(c)): c for c in layout.known() if set(channels.SIDES) & set(sorted_words(c))
+    }
     for column in strange:
-        meant = columns_of_sides.get(tuple(words(column)))
+        meant = columns_of_sides.get(tuple(sorted_words(column)))
         if meant is not None and meant not in stated:
             raise BadData(
                 f"{name}: column {column}: the two sides must be called left and right; rename it to {meant}, or "
                 f'set [columns] {meant} = "{column}" in the robot\'s file'
             )
-        side = next((side for side in channels.SIDES if side in words(column)), None)
+        side = next((side for side in channels.SIDES if side in sorted_words(column)), None)
         turns = set(SIDES) <= set(columns_of_sides.values()) and not stated.isdisjoint(
             c.column for c in channels.OF_TURNS
         )
@@ -274,7 +276,7 @@ def _check_names_of_sides(name: str, strange: list[str], stated: set[str], layou
 
 
 def check_units(arrays: NamedArrays, meanings: Sequence[Column | None]) -> None:
-    """Rejects a column if its name or its source gives a unit other than the one in which it is read."""
+    """Rejects a column whose name or source states another unit than the one in which it is read."""
     below = [""] * len(meanings)
     for j, (unit, meaning) in enumerate(zip(arrays.units, meanings, strict=bool(arrays.units))):
         if meaning is None or meaning.column in WORDS:

@@ -1,4 +1,4 @@
-"""Columns of tables of runs, derived from the rows of `quantities` and `channels`."""
+"""Columns of tables of runs, derived from the tables `quantities` and `channels`."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ IMPOSED |= {c.name: (c.column, c.factor) for c in quantities.SET if c.name in GO
 ROWS = 4000
 
 
-def _conditions(*loads: str) -> dict[str, Condition]:
-    """Conditions that a table may state of some loads, by column."""
+def _conditions_of_loads(*loads: str) -> dict[str, Condition]:
+    """Conditions of these loads that a table may contain, by column."""
     return {c.column: c for c in quantities.SET if c.in_tables and c.acts in loads}
 
 
 #: Conditions that act on a vehicle alone, and on a load on a shaft alone.
-ON_GROUND, ON_SHAFT = tuple(_conditions(GROUND)), tuple(_conditions(SHAFT))
+ON_GROUND, ON_SHAFT = tuple(_conditions_of_loads(GROUND)), tuple(_conditions_of_loads(SHAFT))
 #: Conditions that the packaged robot's tables state, and default values of optional ones.
-CONDITIONS = {SUPPLY: BY_COLUMN[SUPPLY], **_conditions(GROUND)}
+CONDITIONS = {SUPPLY: BY_COLUMN[SUPPLY], **_conditions_of_loads(GROUND)}
 DEFAULTS = {c.column: c.usual for c in CONDITIONS.values() if c.usual is not None}
 TIME = {"time_s": BY_COLUMN["time_s"]}
 #: Statements of a time history about its motors' driver: the share of the supply's voltage that they get, negative
@@ -63,18 +63,18 @@ WORDS = tuple(label.column for label in quantities.LABELS)
 ALIKE = 0.6
 
 
-def _of_channel(channel: Channel) -> tuple[Quantity, Quantity]:
+def _reading_and_deviation(channel: Channel) -> tuple[Quantity, Quantity]:
     return channel, channel.deviation
 
 
 @dataclasses.dataclass(frozen=True)
 class Column:
-    """A quantity in a column of a file.
+    """A column of a file and the quantity that it holds.
 
     Attributes:
         shown: name of the column in the file.
-        unit: unit that it states.
-        factor: factor from its cells to that unit.
+        unit: unit of the column.
+        factor: factor that converts its cells to that unit.
     """
 
     quantity: Quantity
@@ -84,7 +84,7 @@ class Column:
 
     @property
     def column(self) -> str:
-        """Its name in this program."""
+        """Name of the column in this program."""
         return self.quantity.column
 
     @property
@@ -93,11 +93,11 @@ class Column:
         return self.factor == 1.0 and self.unit == next(iter(self.quantity.units))
 
     def value(self, written: float) -> float:
-        """Returns a cell's number in the unit of `column`."""
+        """Number of a cell in the unit of `column`."""
         return self.quantity.value(written * self.factor, self.unit)
 
     def limits(self) -> tuple[float, float]:
-        """Returns the least and greatest number that a cell may hold."""
+        """Smallest and largest number that a cell may have."""
         low, high = (x / self.factor for x in self.quantity.limits(self.unit))
         return (low, high) if self.factor > 0 else (high, low)
 
@@ -107,15 +107,15 @@ class Layout:
     """Properties of a robot that determine the columns of its tables.
 
     Attributes:
-        imposed: quantity imposed on its motors, one of `rig.IMPOSED`.
-        has_ground: True if a ground carries it, see `Robot.has_ground`.
-        weight: True if a weight or a constant torque acts on it, which may drive its motors either way.
-        inherits: True if a packaged robot gives the values that its file does not state.
+        imposed: quantity imposed on the motors, one of `rig.IMPOSED`.
+        has_ground: True if a ground carries the robot, see `Robot.has_ground`.
+        weight: True if a weight or a constant torque acts on the robot and may drive its motors in either direction.
+        inherits: True if values that the robot file does not state come from a packaged robot.
         configurations: names of the configurations.
-        instruments: properties of instruments that are known.
-        mapped: (column as this program calls it, column of the file, factor from its unit).
-        channels: channels of its readings, in the order of arrays.
-        supply: voltage of a controller's driver in tables without its column [V]. 0: tables have it.
+        instruments: known properties of instruments.
+        mapped: for each renamed column: its name in this program, its name in the file, and the factor from its unit.
+        channels: channels of the readings, in the order of the arrays.
+        supply: driver voltage of a controller, for tables without that column [V]. 0: tables have the column.
     """
 
     imposed: str = "voltage"
@@ -130,7 +130,7 @@ class Layout:
 
     @classmethod
     def of(cls, robot: Robot | None) -> Layout:
-        """Returns the layout of a robot. None: of the packaged robot."""
+        """Layout of a robot. None: of the packaged robot."""
         if robot is None:
             return cls()
         rig = robot.rig
@@ -143,7 +143,7 @@ class Layout:
 
     @property
     def table8(self) -> bool:
-        """True if it is driven as the paper's robot, so that the conditions of Table 8 apply to it."""
+        """True if the robot is driven as the paper's robot, so that the conditions of Table 8 apply."""
         return self.inherits and self.has_ground and self.imposed == "voltage"
 
     @property
@@ -153,13 +153,13 @@ class Layout:
 
     @property
     def crosses_zero(self) -> bool:
-        """True if readings may cross zero, so that errors are percent of a channel's size and not of the reading."""
+        """True if readings may cross zero. Errors are then relative to a channel's size and not to the reading."""
         return not self.table8 or not set(channels.OF_TURNS).isdisjoint(self.channels)
 
     @functools.cached_property
     def idle(self) -> Names:
-        """Columns of conditions that do not act on its load."""
-        return ON_SHAFT if self.has_ground else (*_conditions(GROUND, VEHICLE), "surface")
+        """Columns of conditions that do not act on the robot's load."""
+        return ON_SHAFT if self.has_ground else (*_conditions_of_loads(GROUND, VEHICLE), "surface")
 
     @property
     def imposed_column(self) -> str:
@@ -168,13 +168,13 @@ class Layout:
 
     @property
     def sides(self) -> Names:
-        """Columns of the drive of the left and the right side. None for a robot that cannot turn."""
+        """Columns of the commands of the left and right side. Empty if the robot cannot turn."""
         imposed = {"voltage": tuple(SIDES), "motor_speed": SPEEDS}.get(self.imposed, ())
         return imposed if self.has_ground else ()
 
     @property
     def axes(self) -> Names:
-        """Columns of the conditions of its runs, the imposed quantity first."""
+        """Columns of the conditions of a run. The imposed quantity is first."""
         return (self.imposed_column, *(c for c in ON_GROUND if c not in self.idle))
 
     @property
@@ -192,11 +192,11 @@ class Layout:
         return any(i.channel == channel and i.signed is False for i in self.instruments)
 
     def variance(self, channel: str) -> float:
-        """Returns the variance of the error by the step of a channel's instrument [SI²]."""
+        """Variance of the quantisation error of a channel's instrument [SI²]."""
         return sum(i.variance for i in self.instruments if i.channel == channel)
 
     def known(self) -> Names:
-        """Every column with a meaning."""
+        """Every column that has a meaning."""
         read = (SUPPLY, *self.measured_columns, *self.deviation_columns)
         labels = [word for word in WORDS if word != "mode" or self.imposed in ("voltage", *GOALS)]
         set_ = [c.column for c in quantities.SET if c.in_tables and self.imposed in (c.imposed or IMPOSED)]
@@ -204,7 +204,7 @@ class Layout:
         return tuple(dict.fromkeys(c for c in every if c not in self.idle))
 
     def required(self, *, measured: bool, battery: bool) -> Names:
-        """Columns that a table has to have, besides channels."""
+        """Columns that a table must have, in addition to channels."""
         if self.complete:
             further = (() if measured else ("total_mass_kg",)) + ((SUPPLY,) if battery else ())
             return tuple(c for c in ("configuration", *CONDITIONS) if c not in further)
@@ -213,30 +213,33 @@ class Layout:
         return (("configuration",) if len(self.configurations) != 1 else ()) + imposed
 
     def quantities(self) -> dict[str, Quantity]:
-        """Quantities of the columns of its tables, by column, including conditions that do not act on its load."""
+        """Quantity of each column, including conditions that do not act on the load."""
         shown_channels = [
             c for c in channels.EVERY if c in self.channels or c.column in (self.imposed_column, *self.sides)
         ]
-        rows = (*quantities.LABELS, *quantities.SET, *(q for c in shown_channels for q in _of_channel(c)))
+        rows = (*quantities.LABELS, *quantities.SET, *(q for c in shown_channels for q in _reading_and_deviation(c)))
         known_columns = {*self.known(), *ON_GROUND, *ON_SHAFT}
         return {q.column: q for q in rows if q.column in known_columns}
 
     def meanings(self, source: str, header: list[str]) -> list[Column | None]:
-        """Returns the quantity of each column of a file, None for an unknown column. Names may state another unit.
+        """Quantity of each column of a file, None for an unknown column. A name may state any unit of its quantity.
 
         Raises:
-            BadData: two columns of one quantity.
+            BadData: two columns hold the same quantity.
         """
         by_name = self._by_name
         theirs = {column: (mine, factor) for mine, column, factor in self.mapped if column in header}
-        taken = {_standard(by_name, mine) for mine, _ in theirs.values()}
+        taken = {_standard_name(by_name, mine) for mine, _ in theirs.values()}
         meanings_found: list[Column | None] = []
         for column in header:
             if column in theirs:
                 mine, factor = theirs[column]
                 meant = by_name.get(mine)
                 if meant is None and mine in {
-                    name for channel in channels.EVERY for q in _of_channel(channel) for name in q.columns()
+                    name
+                    for channel in channels.EVERY
+                    for q in _reading_and_deviation(channel)
+                    for name in q.columns()
                 }:  # a channel that is not read
                     meanings_found.append(None)
                     continue
@@ -264,16 +267,16 @@ class Layout:
         return {name: Column(quantity, name, unit) for quantity in held for name, unit in quantity.columns().items()}
 
     def spellings(self) -> Names:
-        """Every name of a column with a meaning, in any unit."""
+        """Every possible name of a known column, in any unit."""
         return (*self._by_name, *(column for _, column, _ in self.mapped))
 
     def nearest(self, name: str, stated: Collection[str]) -> str:
-        """Returns the column, in the unit of `name`, that a column without a role is most similar to.
+        """Known column that is most similar to a column without a role, in the unit of `name`.
 
-        It is the column with a similar name, else the only condition in its unit, empty if there is neither.
+        It has a similar name, or it is the only condition in that unit. Empty if there is none.
 
         Args:
-            stated: columns that the table has, which are left out.
+            stated: columns that the table already has, which are left out.
         """
         none = {*stated, *self.idle, *self.deviation_columns, *WHEN, *WORDS, "held"}
         lacking = {column: quantity for column, quantity in self.quantities().items() if column not in none}
@@ -287,10 +290,12 @@ class Layout:
         return alone[0] if len(alone) == 1 else ""
 
     def expected(self, column: str) -> str:
-        """Returns the column, with its source column if the robot's file states one."""
-        theirs = next((their for mine, their, _ in self.mapped if _standard(self._by_name, mine) == column), None)
+        """Name of the column, with the name in the source if the robot file states one."""
+        theirs = next(
+            (their for mine, their, _ in self.mapped if _standard_name(self._by_name, mine) == column), None
+        )
         return column if theirs is None else f"{column} (in the robot's file: {theirs})"
 
 
-def _standard(by_name: Mapping[str, Column], name: str) -> str:
+def _standard_name(by_name: Mapping[str, Column], name: str) -> str:
     return by_name[name].column if name in by_name else name

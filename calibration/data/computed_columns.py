@@ -1,4 +1,4 @@
-"""Torques that were computed from a current and not measured, which are left out of a table."""
+"""Torques that were computed from a current instead of measured. They are removed from a table."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from calibration.data.columns import LOAD
 from calibration.data.contradictions import CURRENTS
 from calibration.data.input_errors import BadData
-from calibration.data.instruments import FEWEST, step_of
+from calibration.data.instruments import FEWEST, common_step
 from calibration.data.table import Runs
 from mmrjax.model.robot import Robot
 
@@ -25,15 +25,15 @@ SEARCH, ERROR = 8, 1e-3
 TORQUE = "output_torque_Nm"
 
 
-def without_computed_torques(runs: Runs, robot: Robot) -> Runs:
+def drop_computed_torques(runs: Runs, robot: Robot) -> Runs:
     """The table without a torque column that is an exact multiple of a current in all rows.
 
-    A motor's friction leaves an offset between current and torque, so a torque that was set or read is no multiple.
-    If no load torque is set, the load of each row is found from its current by the balances of the file's robot. The
+    Friction of a motor leaves an offset between current and torque, so a measured or set torque is no exact multiple.
+    If no load torque is set, the load of each row is computed from its current with the balances of the robot. The
     current is then no longer a reading.
 
     Raises:
-        BadData: a computed load of a log, of a table of an imposed current, or without another channel.
+        BadData: the load of a log is computed, the current is imposed, or there is no other channel.
     """
     columns, notes = dict(runs.columns), list(runs.notes)
     shown_columns = {c.column: c.name for c in runs.channels if runs.has(c.column)}
@@ -57,7 +57,7 @@ def without_computed_torques(runs: Runs, robot: Robot) -> Runs:
                 "brake"
             )
         else:
-            columns[torque] = _load_at(runs, robot, shown_columns[current], runs[current])
+            columns[torque] = _load_for_current(runs, robot, shown_columns[current], runs[current])
             columns.pop(current)
             notes.append(
                 f"{computed}; it is left out. The load of each row follows from {current} and the robot's file, "
@@ -66,11 +66,11 @@ def without_computed_torques(runs: Runs, robot: Robot) -> Runs:
     return dataclasses.replace(runs, columns=columns, notes=tuple(notes))
 
 
-def _load_at(runs: Runs, robot: Robot, channel: str, current: np.ndarray) -> np.ndarray:
-    """Load torque of each row at which the robot of the file draws the current that was read [N·m].
+def _load_for_current(runs: Runs, robot: Robot, channel: str, current: np.ndarray) -> np.ndarray:
+    """Load torque in each row at which the robot draws the measured current [N·m].
 
     Raises:
-        BadData: the robot draws this current at no load in a row.
+        BadData: no load gives this current in a row.
     """
     from mmrjax.fidelities.simulation import simulate
 
@@ -93,14 +93,14 @@ def _load_at(runs: Runs, robot: Robot, channel: str, current: np.ndarray) -> np.
 
 
 def line_through(x: np.ndarray, y: np.ndarray) -> tuple[float, float] | None:
-    """Intercept and slope of a line through all points, within their digits, None without such a line."""
+    """Intercept and slope of a line through all points, to within their digits. None if there is no such line."""
     both = np.isfinite(x) & np.isfinite(y)
     x, y = x[both], y[both]
     if len(x) < ROWS or min(len(np.unique(x)), len(np.unique(y))) < LEVELS:
         return None
     slope, intercept = np.polyfit(x - x.mean(), y, 1)
     intercept -= slope * x.mean()
-    rounding = step_of(y) + abs(slope) * step_of(x)
+    rounding = common_step(y) + abs(slope) * common_step(x)
     allowed = 0.75 * rounding + ROUNDED * (np.ptp(y) + np.max(np.abs(y)))
     if np.ptp(y) < STEPS * rounding or np.max(np.abs(y - intercept - slope * x)) > allowed:
         return None

@@ -1,4 +1,4 @@
-"""Configurations of a robot from the tables of its file: their names, and the values that each starts from."""
+"""Configurations from the tables of a robot file: their names, and the values from which each starts."""
 
 from __future__ import annotations
 
@@ -43,14 +43,14 @@ _EXAMPLE = 'configurations = ["rover"]'
 
 
 @dataclasses.dataclass(frozen=True)
-class Loads:
-    """The loads of a robot file, before the parameters that it states.
+class ConfigurationLoads:
+    """Loads of a robot file, before the parameters that the file states are applied.
 
     Attributes:
         by_name: loads by name, in order.
-        travels: true if they travel, as vehicles and linear units do.
+        travels: true if the loads travel, as vehicles and linear units do.
         linear: names of linear units.
-        missing: parameters without default that the file does not state.
+        missing: required parameters that the file does not state.
     """
 
     by_name: dict[str, Load]
@@ -59,22 +59,23 @@ class Loads:
     missing: Names
 
 
-def loads_from_tables(base: Robot | None, content: Json, sds: dict[str, float], where: str) -> Loads:
-    """Returns the loads that the file's content states, in its order.
+def loads_from_tables(base: Robot | None, content: Json, sds: dict[str, float], where: str) -> ConfigurationLoads:
+    """Loads that a robot file states, in its order.
 
-    Takes `configurations` and every configuration's `load`, `like` and `movers` out of `content`, and replaces linear
-    units by shafts. The remaining keys are parameters. Without `configurations` a robot keeps the configurations of
-    its base. Without a base, each table is a configuration.
+    It removes `configurations`, and each configuration's `load`, `like` and `movers`, from `content`, and replaces
+    linear units by shafts. The remaining keys are parameters. Without `configurations`, a robot has the
+    configurations of its base. Without a base, each table is a configuration.
 
     Args:
-        base: None starts from nothing, else `like` names one of its configurations.
-        sds: stated ±, by dotted name.
-        where: opens the message of an error.
+        base: base robot, whose configurations `like` may name. None: there is no base.
+        content: content of the file.
+        sds: stated standard deviations, by dotted name.
+        where: beginning of the error message.
 
     Raises:
         BadConfiguration: `configurations` is no list of names, or has a repeated or reserved name. A table belongs to
-            no configuration. `load`, `like` or `movers` is unknown, contradicts another one, or all are missing.
-            A file has both shafts and vehicles. A robot with a base lacks a parameter without default.
+            no configuration. `load`, `like` or `movers` is unknown, contradicts another one, or all are missing. A
+            file has both shafts and vehicles. A robot with a base lacks a required parameter.
     """
     load_names = [n for n, table in content.items() if n not in TAKEN and isinstance(table, dict)]
     usual = load_names if base is None else list(base.configurations)
@@ -119,14 +120,14 @@ def loads_from_tables(base: Robot | None, content: Json, sds: dict[str, float], 
             f"{where}: {shafts[0]} is a shaft and {vehicles[0]} a vehicle; a file can describe only one kind; use "
             "two files"
         )
-    return Loads(by_name, not shafts or bool(linear), frozenset(linear), tuple(missing))
+    return ConfigurationLoads(by_name, not shafts or bool(linear), frozenset(linear), tuple(missing))
 
 
-def resolved_likes(content: Json, where: str) -> None:
-    """Replace each `like` of a file that starts from nothing by the other table of the file that it names.
+def resolve_likes(content: Json, where: str) -> None:
+    """Replaces each `like` of a file without a base by the table that it names.
 
     Raises:
-        BadConfiguration: a `like` that names no other table, or a table with a `like` of its own.
+        BadConfiguration: a `like` names no other table, or a table that has a `like` itself.
     """
     tables = {n: dict(table) for n, table in content.items() if n not in TAKEN and isinstance(table, dict)}
     own_names = [name for name, table in tables.items() if "like" not in table]
@@ -146,7 +147,7 @@ def _merge_tables(below: Mapping[str, Any], above: Mapping[str, Any]) -> Json:
 
 
 def _load_kind(table: Json, where: str) -> str:
-    """Load that a table states. A vehicle by default."""
+    """Kind of load that a table states, a vehicle by default."""
     if "load" not in table:
         return "vehicle"
     load = table.pop("load")
@@ -160,13 +161,13 @@ def _load_kind(table: Json, where: str) -> str:
 
 
 def _number_of_drives(content: Mapping[str, Any], base: Robot | None) -> float:
-    """Drives of a file. A value that is no count is refused later."""
+    """Number of drives that a file states. An invalid value is rejected later."""
     sides = content.get("sides", 1.0 if base is None else float(base.sides))
     return float(sides) if isinstance(sides, int | float) and sides >= 1 else 1.0
 
 
 def _blank_shaft(table: Mapping[str, Any]) -> tuple[Shaft, list[str]]:
-    """A shaft before the parameters of its table apply, and the required parameters that the table lacks."""
+    """Shaft before the parameters of its table are applied, and the required parameters that the table lacks."""
     missing = [
         field.name
         for field in dataclasses.fields(Shaft)
@@ -176,7 +177,7 @@ def _blank_shaft(table: Mapping[str, Any]) -> tuple[Shaft, list[str]]:
 
 
 def _blank_vehicle(table: Json, where: str, sides: float) -> tuple[Chassis, list[str]]:
-    """A vehicle before the parameters of its table apply, and the required parameters that the table lacks."""
+    """Vehicle before the parameters of its table are applied, and the required parameters that the table lacks."""
     if "movers" not in table:
         raise BadConfiguration(
             f"{where}: the kind of load is missing; set load = one of {', '.join(rig_file.LOADS)}, or movers = "
@@ -195,7 +196,7 @@ def _blank_vehicle(table: Json, where: str, sides: float) -> tuple[Chassis, list
     missing = [
         p.name
         for p in params.walk_parameters(nothing)
-        if p.name not in defaults_of_kind and not _table_gives(table, p.name)
+        if p.name not in defaults_of_kind and not _table_states(table, p.name)
     ]
     return params.replace(
         nothing, {name: params.as_float(value) for name, value in defaults_of_kind.items()}
@@ -227,7 +228,7 @@ def _names(stated: Any, where: str) -> list[str]:
 
 
 def _chassis_of_base(robot: Robot, name: str, table: Json, where: str) -> Chassis:
-    """Configuration of a robot with a base, before the parameters of its table apply."""
+    """Configuration of a robot with a base, before the parameters of its table are applied."""
     like, movers = table.pop("like", None), table.pop("movers", None)
     have = robot.configurations
     if like is not None and movers is not None:
@@ -245,9 +246,9 @@ def _chassis_of_base(robot: Robot, name: str, table: Json, where: str) -> Chassi
 
 
 def _blank_chassis(pattern: Chassis, on_tracks: float, table: Mapping[str, Any], where: str) -> Chassis:
-    """A chassis with the default of every field that has one. The table must give all other fields."""
+    """Chassis with the default of every field that has one. The table must state all others."""
     defaults = dict(_parameter_defaults(pattern))
-    missing = [name for name, default in defaults.items() if default is None and not _table_gives(table, name)]
+    missing = [name for name, default in defaults.items() if default is None and not _table_states(table, name)]
     if missing:
         raise BadConfiguration(
             f"{where}: with movers instead of like, the configuration must be described "
@@ -258,7 +259,7 @@ def _blank_chassis(pattern: Chassis, on_tracks: float, table: Mapping[str, Any],
 
 
 def _parameter_defaults(component: eqx.Module, prefix: str = "") -> Iterator[tuple[str, float | None]]:
-    """Default of every parameter below a component, None where it has none."""
+    """Default of every parameter of a component, None if there is none."""
     for field in dataclasses.fields(component):
         value = getattr(component, field.name)
         if "spec" in field.metadata:
@@ -267,9 +268,9 @@ def _parameter_defaults(component: eqx.Module, prefix: str = "") -> Iterator[tup
             yield from _parameter_defaults(value, f"{prefix}{field.name}.")
 
 
-def _table_gives(table: Mapping[str, Any], name: str) -> bool:
-    """True if a table states a parameter by its dotted name."""
+def _table_states(table: Mapping[str, Any], name: str) -> bool:
+    """True if a table states a parameter, given by its dotted name."""
     head, _, rest = name.partition(".")
     if not rest:
         return head in table
-    return isinstance(table.get(head), dict) and _table_gives(table[head], rest)
+    return isinstance(table.get(head), dict) and _table_states(table[head], rest)

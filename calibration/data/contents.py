@@ -1,4 +1,4 @@
-"""Contents of a file of data: its signals with unit, rate, range and gaps, and their possible columns."""
+"""Description of a data file: its signals with unit, rate, range and gaps, and columns that they may be."""
 
 from __future__ import annotations
 
@@ -27,18 +27,18 @@ _COUNT, RISING = re.compile(r"time|tick|stamp"), 0.9
 
 @dataclasses.dataclass(frozen=True)
 class SignalFacts:
-    """Facts about a signal of a file.
+    """Properties of a signal of a file.
 
     Attributes:
         path: path of the signal.
         unit: unit that the file states.
-        samples: number of them.
-        refused: why it cannot be read.
-        rate: rate of its clock [Hz], NaN where it has none.
-        gaps: number of steps of more than `GAP` usual ones, NaN without a clock.
-        least, greatest: smallest and largest of its numbers, NaN where it has none.
-        missing: samples without a number.
-        words: some of its words, of a signal of words.
+        samples: number of samples.
+        refused: reason why it cannot be read.
+        rate: sampling rate [Hz], NaN without a clock.
+        gaps: number of steps longer than `GAP` usual ones, NaN without a clock.
+        least, greatest: smallest and largest number, NaN if there is none.
+        missing: number of samples without a number.
+        words: some of its words, if its samples are words.
         clock: name of its clock.
     """
 
@@ -56,15 +56,15 @@ class SignalFacts:
 
 
 @dataclasses.dataclass(frozen=True)
-class Contents:
-    """Contents of a file.
+class FileContents:
+    """Description of a data file.
 
     Attributes:
         name, kind: name and kind of the file.
         signals: signals of the file.
         notes: notes on how it was read.
-        preset: name of the packaged preset that its columns are of. Empty: none.
-        proposed: lines of a table `[columns]`, for a person to check.
+        preset: name of the packaged preset that matches its columns, empty if none does.
+        proposed: lines of a proposed table `[columns]`, to be checked by a person.
     """
 
     name: str
@@ -79,11 +79,11 @@ class Contents:
         return {"schema": "mmrjax.inspect/1", **dataclasses.asdict(self)}
 
 
-def inspect_source(source: str | Path | Any) -> Contents:
-    """Returns the contents of a file or of a table in memory.
+def inspect_source(source: str | Path | Any) -> FileContents:
+    """Describes the contents of a file or of a table in memory.
 
     Raises:
-        BadData: no such file, an unreadable one, or one without columns.
+        BadData: the file does not exist, cannot be read, or has no columns.
     """
     contents_found = _source(source)
     times: dict[int, tuple[np.ndarray, str] | str] = {}
@@ -111,7 +111,9 @@ def inspect_source(source: str | Path | Any) -> Contents:
     moving = sorted(read, key=lambda signal: signal.path in still)  # of several, the first that changes
     lines = dict(_proposed_columns(moving))
     proposed = tuple(lines[s.path] for s in contents_found.signals if s.path in lines)
-    return Contents(contents_found.name, contents_found.kind, facts, tuple(notes), preset, () if preset else proposed)
+    return FileContents(
+        contents_found.name, contents_found.kind, facts, tuple(notes), preset, () if preset else proposed
+    )
 
 
 def _source(source: Any) -> Source:
@@ -124,14 +126,14 @@ def _source(source: Any) -> Source:
     form = opening.format_of(path, name)
     if form is not None:
         return opening.open_signals(path, within, name, form)
-    table = _of_text(delimited.read_csv_columns(path, name))
+    table = _signals_of_text(delimited.read_csv_columns(path, name))
     if not table.signals:
         raise BadData(f"{name}: the file is empty; expected a header and rows")
     return table.below(within) if within else table
 
 
-def _of_text(arrays: NamedArrays) -> Source:
-    """A table of texts as signals: numbers where most cells are."""
+def _signals_of_text(arrays: NamedArrays) -> Source:
+    """Table of texts as signals: a column is numeric if most of its cells are numbers."""
     signals = []
     for k, (name, raw) in enumerate(zip(arrays.header, arrays.values, strict=True)):
         values = column_numbers(raw)
@@ -143,7 +145,7 @@ def _of_text(arrays: NamedArrays) -> Source:
 
 
 def _unit_of_time(name: str) -> str | None:
-    """Unit of a clock by its name, also by names of loggers, None if it is not a clock."""
+    """Unit of a clock according to its name, including names that loggers use. None if it is no clock."""
     bare = name.casefold().replace("time (", "time_").rstrip(")")
     return "ms" if bare == "ms_today" else unit_of_clock(bare)
 
@@ -202,7 +204,7 @@ def _proposed_columns(signals: Sequence[Signal]) -> Iterator[tuple[str, str]]:
         elapsed = None if clock.words else np.asarray(clock.load(), float) * UNITS[unit]
         line = f'time_{unit} = "{clock.path}"'
         if named is None and elapsed is not None:
-            each = proposals.seconds_of_a_count(rest, np.asarray(clock.load(), float))
+            each = proposals.seconds_per_count(rest, np.asarray(clock.load(), float))
             question = f"compared with a position, it counts {1 / each:.3g} per second"
             if math.isnan(each):
                 each, question = UNITS[unit], "unit of the counts? give the seconds per count"
@@ -226,7 +228,7 @@ def _proposed_columns(signals: Sequence[Signal]) -> Iterator[tuple[str, str]]:
 
 
 def _is_rising_count(signal: Signal) -> bool:
-    """True if a signal is named after a count of time and rises from nearly every row to the next."""
+    """True if a signal is named like a time counter and rises in nearly every row."""
     if signal.words or not _COUNT.search(signal.name.casefold()):
         return False
     step = np.diff(np.asarray(signal.load(), float))

@@ -1,4 +1,4 @@
-"""Contradictions within a table of a rig's runs, one sentence for each."""
+"""Contradictions within a table of runs, or between table and robot, one sentence for each."""
 
 from __future__ import annotations
 
@@ -32,11 +32,11 @@ RADIAN, ALIKE = 180 / np.pi, 0.03
 
 
 def check_contradictions(runs: Runs, robot: Robot) -> None:
-    """Reject a table that contradicts itself or its robot.
+    """Rejects a table that contradicts itself or its robot.
 
     Raises:
-        BadData: a vehicle has no mass. A robot turns that cannot turn, or its sides are exchanged. The stated voltage
-            cannot turn the motors at the imposed speed. An angle wraps or changes its unit. Time sometimes goes back.
+        BadData: a vehicle has no mass, a robot turns that cannot turn, its sides are exchanged, the stated voltage
+            cannot turn the motors at the imposed speed, an angle wraps or changes its unit, or time goes back.
     """
     _check_mass(runs, robot)
     if runs.turns and (why := turn_error(robot, sorted({str(n) for n in runs.configurations_named(robot)}))):
@@ -55,8 +55,8 @@ def check_contradictions(runs: Runs, robot: Robot) -> None:
         _check_angle(runs)
 
 
-def cannot_stand(robot: Robot) -> str | None:
-    """Reason why the stance of a robot is unknown, None if it is known."""
+def reason_without_stance(robot: Robot) -> str | None:
+    """Reason why the stance of a robot is unknown. None if it is known."""
     if not robot.has_ground:
         return "the robot's load is a shaft, which has no contact with the ground"
     if not any(robot.knows([f"running_gear.{p.name}"]) for p in params.walk_parameters(robot.running_gear)):
@@ -64,7 +64,7 @@ def cannot_stand(robot: Robot) -> str | None:
     return None
 
 
-def without_levers(robot: Robot, configuration: str) -> str:
+def reason_without_levers(robot: Robot, configuration: str) -> str:
     """Reason why a configuration has no levers, empty if it has levers."""
     have = [name for name, c in robot.configurations.items() if float(c.on_tracks) > 0.5]
     others = f"configurations with levers: {', '.join(have)}" if have else "no configuration of the robot has"
@@ -72,19 +72,19 @@ def without_levers(robot: Robot, configuration: str) -> str:
 
 
 def misplaced_levers(runs: Runs, robot: Robot) -> tuple[int, str, str] | None:
-    """Row and column of an impossible lever angle, and the reason, None if there is no such row.
+    """Row and column of the first impossible lever angle, and the reason. None if all angles are possible.
 
     The reason is a configuration without levers, or an angle beyond their range.
     """
     stated = [name for name in LEVERS if runs.has(name)]
     if not stated:
         return None
-    if why := cannot_stand(robot):
+    if why := reason_without_stance(robot):
         return 0, stated[0], why
     on_tracks = np.array([float(c.on_tracks) > 0.5 for c in robot.configurations.members])[runs.configurations(robot)]
     if not on_tracks.all():
         row = int(np.argmin(on_tracks))
-        return row, stated[0], without_levers(robot, runs["configuration"][row])
+        return row, stated[0], reason_without_levers(robot, runs["configuration"][row])
     levers = robot.running_gear.levers
     low, high = (float(np.degrees(x)) for x in (levers.angle_least, levers.angle_most))
     for name in stated:
@@ -114,10 +114,10 @@ def _check_mass(runs: Runs, robot: Robot) -> None:
 
 
 def _check_voltage(runs: Runs, robot: Robot, column: str) -> None:
-    """Reject a voltage that contradicts the motors' back-EMF at the imposed speed.
+    """Rejects a voltage that contradicts the back-EMF of the motors at the imposed speed.
 
-    A bridge may reverse the supply. Motors that a load drives brake: their voltage is smaller by the voltage drop of
-    their current. Without readings of current, a share of the rows may be such rows.
+    A bridge may reverse the supply. Motors that a load drives act as brakes: their voltage is lower by the voltage
+    drop of their current. Without current readings, a share of the rows may be such rows.
     """
     if not runs.has(column) or not np.nan_to_num(runs[column]).any() or not robot.knows(CURRENT):
         return
@@ -145,8 +145,9 @@ def _check_voltage(runs: Runs, robot: Robot, column: str) -> None:
 
 
 def _check_time_order(runs: Runs) -> None:
-    """Reject a time that sometimes goes back, because of several recordings or a clock that was reset. Any order
-    is allowed."""
+    """Rejects a time that sometimes goes back, because of several recordings or a reset clock. A consistent order,
+    rising or falling, is accepted.
+    """
     time, run = runs["time_s"], runs.run_names
     for name in np.unique(run):
         mine = np.flatnonzero(run == name)
@@ -160,7 +161,7 @@ def _check_time_order(runs: Runs) -> None:
 
 
 def _median_of_neighbours(step: np.ndarray) -> np.ndarray:
-    """Median of the four steps next to each step, as a drive that mostly stands may be fast for a while."""
+    """Median of the four steps around each step."""
     wide = np.pad(step, 2, constant_values=np.nan)
     return np.nanmedian([wide[k : k + len(step)] for k in (0, 1, 3, 4)], axis=0)
 

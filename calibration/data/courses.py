@@ -1,4 +1,4 @@
-"""Conditions that change within a run of a time history: each value holds from its sample until the next."""
+"""Conditions that change within a run of a time history. Each value holds from its sample until the next."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ CHANGING = ("supply_voltage_V", "slope_deg", "payload_kg", "total_mass_kg", LOAD
 
 
 @dataclasses.dataclass(frozen=True)
-class Stretch:
-    """Samples of a run, one after the other, under the same conditions.
+class ConstantInterval:
+    """Consecutive samples of a run under the same conditions.
 
     Attributes:
-        rows: indices of the samples in the order of time, shape (samples,).
-        begin, end: when these conditions began, and when others follow or the run ends, since its start [s].
-        driven: true if the motors are driven forwards.
-        whole: true if the run has no other stretch.
+        rows: indices of the samples in order of time, shape (samples,).
+        begin, end: times since the start of the run at which these conditions begin and end [s].
+        driven: true if the motors are driven forward.
+        whole: true if it is the whole run.
     """
 
     rows: np.ndarray
@@ -34,23 +34,23 @@ class Stretch:
 
     @property
     def lasts(self) -> float:
-        """[s]."""
+        """Duration [s]."""
         return self.end - self.begin
 
     def after(self, time: np.ndarray, share: float) -> np.ndarray:
-        """Rows later than a share of its time. `time` is of every row of the table [s]."""
+        """Rows later than a share of its duration. `time`: of every row of the table [s]."""
         return self.rows[time[self.rows] >= self.begin + share * (self.end - self.begin)]
 
 
 def changing_columns(runs: Runs) -> Names:
-    """Columns of a table that are among `CHANGING` or are imposed."""
+    """Columns of a table that are imposed or may change within a run (`CHANGING`)."""
     return tuple(c for c in dict.fromkeys((runs.layout.imposed_column, *CHANGING)) if runs.has(c))
 
 
 def applied_drive(runs: Runs) -> np.ndarray:
     """Voltage of the motors in every row, or the imposed speed or current, shape (rows,) [V], [rpm] or [A].
 
-    The voltage is 0 where the driver brakes or coasts. In turns it is the magnitude of the larger of both sides'.
+    The voltage is 0 if the driver brakes or coasts. In turns it is the larger magnitude of both sides.
     """
     if runs.turns:
         return np.abs(runs.of_sides).max(0)
@@ -61,7 +61,9 @@ def applied_drive(runs: Runs) -> np.ndarray:
 
 
 def rows_of_varying_runs(runs: Runs, columns: Names | None = None) -> np.ndarray:
-    """True for rows in whose run one of these columns changes, shape (rows,). By default the columns that may."""
+    """True for rows of runs in which one of these columns changes, shape (rows,). By default the columns that may
+    change.
+    """
     columns = changing_columns(runs) if columns is None else columns
     varies = np.zeros(len(runs), bool)
     if not runs.sampled:
@@ -84,23 +86,25 @@ def differs_from_row_before(rows: np.ndarray, conditions: Iterable[np.ndarray]) 
 
 def divide_run(
     rows: np.ndarray, time: np.ndarray, conditions: Sequence[np.ndarray], applied: np.ndarray
-) -> list[Stretch]:
-    """The stretches of one run.
+) -> list[ConstantInterval]:
+    """Divides a run into intervals of constant conditions.
 
     Args:
-        rows: rows of the run, in the order of time. time, conditions, applied: time [s], conditions and applied
-        voltage [V] of every row of the table.
+        rows: rows of the run in order of time.
+        time: time of every row of the table [s].
+        conditions: conditions of every row of the table.
+        applied: applied voltage of every row of the table [V].
     """
     cuts = [0, *np.flatnonzero(differs_from_row_before(rows, conditions)).tolist(), len(rows)]
     begins = [0.0, *(float(time[rows[k]]) for k in cuts[1:-1]), float(time[rows[-1]])]
     return [
-        Stretch(rows[low:high], begin, end, bool(applied[rows[low]] > 0), len(cuts) == 2)
+        ConstantInterval(rows[low:high], begin, end, bool(applied[rows[low]] > 0), len(cuts) == 2)
         for low, high, begin, end in zip(cuts[:-1], cuts[1:], begins[:-1], begins[1:], strict=True)
     ]
 
 
-def course_stretches(runs: Runs) -> list[list[Stretch]]:
-    """The stretches of every run, runs in the order of their names."""
+def intervals_by_run(runs: Runs) -> list[list[ConstantInterval]]:
+    """Intervals of constant conditions for every run, in the order of the runs' names."""
     stretches = []
     time, volts = runs["time_s"], applied_drive(runs)
     columns = [runs[c] for c in changing_columns(runs)]
@@ -110,14 +114,14 @@ def course_stretches(runs: Runs) -> list[list[Stretch]]:
 
 
 def course_of_each_row(runs: Runs) -> np.ndarray:
-    """Name of the course of conditions of each row's run, shape (rows,). Empty if the conditions do not change.
+    """Short name of the sequence of conditions in each row's run, shape (rows,). Empty if no conditions change.
 
-    A name is short: a course with thousands of changes, written in each of its rows, took gigabytes.
+    The name is short because a sequence with thousands of changes, written into each row, took gigabytes.
     """
     courses, names = np.full(len(runs), "", dtype=object), dict[str, str]()
     if rows_of_varying_runs(runs).any():
         columns = changing_columns(runs)
-        for run in (r for r in course_stretches(runs) if len(r) > 1):
+        for run in (r for r in intervals_by_run(runs) if len(r) > 1):
             descriptions = [f"{s.begin:g}: {', '.join(str(runs[c][s.rows[0]]) for c in columns)}" for s in run]
             name = names.setdefault("; ".join(descriptions), f"course {len(names) + 1}")
             courses[np.concatenate([s.rows for s in run])] = name

@@ -1,4 +1,4 @@
-"""Cells of a table as text: their encoding, their separators, and the decimal mark of their numbers."""
+"""Tables as text: their encoding, their separators, and the decimal mark of their numbers."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ _THOUSANDS, _BELOW = re.compile(r"[+-]?[1-9]\d{0,2}[,.]\d{3}"), re.compile(r"[+-
 
 
 def read_csv_columns(path: Path, name: str) -> NamedArrays:
-    """Returns the columns of a CSV file as texts.
+    """Columns of a CSV file, as texts or, for a plain table, as numbers.
 
     Args:
         name: name of the file, for messages.
@@ -51,7 +51,7 @@ def read_csv_columns(path: Path, name: str) -> NamedArrays:
         return plain
     decoded, encoded = decode_text(name, content)
     input_files.check_memory(name, CELL * sum(decoded.count(mark) for mark in (",", *SEPARATORS)))
-    lines = below_comments([line for line in decoded.splitlines() if line.strip()])
+    lines = drop_comments([line for line in decoded.splitlines() if line.strip()])
     rows, notes = split_cells(name, lines)
     header, body = (rows[0], rows[1:]) if rows else ([], [])
     input_files.check_declared(name, len(header))
@@ -76,7 +76,7 @@ def read_csv_columns(path: Path, name: str) -> NamedArrays:
 
 
 def _read_plain_table(name: str, content: bytes) -> NamedArrays | None:
-    """Columns of a plain table, numbers as arrays, None for any other table, which `split_cells` reads and checks.
+    """Columns of a plain table with numbers as arrays. None for other tables, which `split_cells` reads and checks.
 
     A plain table is in UTF-8 with commas, without comments, quotes and units.
     """
@@ -126,8 +126,10 @@ def _read_plain_table(name: str, content: bytes) -> NamedArrays | None:
 
 
 def row_of_units(header: Sequence[str], first: Sequence[str]) -> Names:
-    """Returns the units that the first row below a header states, empty if it states none, () if it is a run: a
-    cell of it is a number, or no cell of a column of numbers is a unit."""
+    """Units in the first row below a header. A unit is empty if the row states none for that column.
+
+    () if the row is a data row: one of its cells is a number, or no cell above numbers is a unit.
+    """
     if len(first) != len(header) or any(math.isfinite(cell_number(cell)) for cell in first):
         return ()
     units = tuple(quantities.unit_in_column(cell.strip("[]()")).strip("-") for cell in first)
@@ -139,11 +141,11 @@ def row_of_units(header: Sequence[str], first: Sequence[str]) -> Names:
 
 
 def decode_text(name: str, content: bytes) -> tuple[str, Names]:
-    """Returns the text of a file in UTF-8, in UTF-16 that begins with its mark, or in Windows-1252, and a note if it
-    is not in UTF-8.
+    """Text of a file, and a note if it is not in UTF-8. Other encodings are UTF-16 with a byte order mark, and
+    Windows-1252.
 
     Raises:
-        BadData: bytes that are no text.
+        BadData: the bytes are no text.
     """
     try:
         if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
@@ -159,10 +161,10 @@ def decode_text(name: str, content: bytes) -> tuple[str, Names]:
     raise BadData(wrong)
 
 
-def below_comments(lines: Sequence[str]) -> list[str]:
-    """Returns the lines of a table, its header first, without comments above, which begin with # or %.
+def drop_comments(lines: Sequence[str]) -> list[str]:
+    """Lines of a table from its header on, without the comments above, which begin with # or %.
 
-    If numbers follow the comments, the last comment with as many cells is the header. It may have units below it.
+    If numbers follow the comments, the last comment with as many cells is the header. A row of units may follow it.
     """
     first = next((k for k, line in enumerate(lines) if not line.startswith(COMMENTS)), len(lines))
     below = list(lines[first:])
@@ -181,17 +183,17 @@ def below_comments(lines: Sequence[str]) -> list[str]:
 
 
 def split_cells(name: str, lines: Sequence[str]) -> tuple[list[list[str]], Names]:
-    """Returns rows of cells without blanks around them, numbers with points, and notes on separators and marks.
+    """Rows of cells without surrounding blanks, numbers with decimal points, and notes on separators and decimal
+    marks.
 
-    Semicolons or tabs separate cells where the header has no comma. Numbers may have decimal commas then.
+    Semicolons or tabs separate cells if the header has no comma. Numbers may then have decimal commas.
 
     Args:
         name: name of the file, for messages.
         lines: lines of the file, header first.
 
     Raises:
-        BadData: text that is no CSV, a column that has decimal commas and points, or marks that may stand between
-            thousands.
+        BadData: the text is no CSV, a column has both decimal commas and points, or a mark may separate thousands.
     """
     header = lines[0] if lines else ""
     mark = next((m for m in SEPARATORS if m in header and "," not in header), ",")

@@ -1,4 +1,6 @@
-"""Effects of users: classes in a Python file, checked against the contract and added to the library."""
+"""Effects of users: classes in a Python file, checked against the rules of `effects.Effect` and added to the
+library.
+"""
 
 from __future__ import annotations
 
@@ -31,8 +33,8 @@ from mmrjax.model.robot import Robot
 from mmrjax.model.signals import Signals, State
 
 
-def _recording_effect(place: str, whose: str, seen: list[Signals]) -> Effect:
-    """An effect with a zero term, which records the signals that its balance passes to it."""
+def _effect_that_records_signals(place: str, whose: str, seen: list[Signals]) -> Effect:
+    """Effect without influence that records the signals which its balance passes to it."""
 
     class Witness(Effect):
         balance = place
@@ -49,14 +51,15 @@ def _recording_effect(place: str, whose: str, seen: list[Signals]) -> Effect:
 def readable_signals(
     robot: Robot, conditions: Conditions, state: State, balance: str, channel: str = "", *, settled: bool = False
 ) -> Signals:
-    """The signals that an effect of this balance may read: those computed before it. The others are `UNSET`.
+    """Signals that an effect of this balance may read, namely those computed before it. Others are `UNSET`.
 
     Args:
         conditions, state: one run at one instant, scalars, not traced.
-        settled: in steady forward travel (`balances.settled_signals`), else in motion (`balances.moving_signals`).
+        settled: True for steady forward travel (`balances.settled_signals`), False for motion
+            (`balances.moving_signals`).
     """
     seen: list[Signals] = []
-    watched = dataclasses.replace(robot, effects=(_recording_effect(balance, channel, seen),))
+    watched = dataclasses.replace(robot, effects=(_effect_that_records_signals(balance, channel, seen),))
     order = balances.settled_signals if settled else balances.moving_signals
     signals = order(watched, conditions, state)
     balances.sensor(watched, signals[0] if isinstance(signals, tuple) else signals)
@@ -97,10 +100,10 @@ TURN: Json = {
 
 
 def effect_library(paths: Sequence[Path | str] = ()) -> Library:
-    """Returns the packaged effects and the effects of the files, by name.
+    """Packaged effects together with the effects of the files, by name.
 
     Raises:
-        BadConfiguration: for the same reasons as `read_effect_file`. A repeated name. An effect that settles to an
+        BadConfiguration: for the same reasons as `read_effect_file`, a repeated name, or an effect that settles to an
             unknown effect.
     """
     library = dict(effects.BY_NAME)
@@ -119,25 +122,27 @@ def effect_library(paths: Sequence[Path | str] = ()) -> Library:
     return library
 
 
-class _FromSource(importlib.machinery.SourceFileLoader):
-    """Runs the file itself. Compiled bytes next to it may differ from its text. They are not read and not written."""
+class _SourceLoader(importlib.machinery.SourceFileLoader):
+    """Loader that runs the source file itself. Compiled files next to it may differ from it. They are neither read
+    nor written.
+    """
 
     def get_code(self, fullname: str) -> types.CodeType:
         return self.source_to_code(self.get_data(self.path), self.path)
 
 
 def read_effect_file(path: Path) -> tuple[type[Effect], ...]:
-    """Returns the effect classes that a Python file defines, in its order. The file's code is run.
+    """Effect classes that a Python file defines, in its order. The code of the file is run.
 
     Raises:
-        BadConfiguration: no such file, code that fails, no effect in it, or an effect that breaks the contract of
-            `effects.Effect`. The sentence has file, class, attribute, the value and the expected value.
+        BadConfiguration: there is no such file, its code fails, it has no effect, or an effect breaks the rules of
+            `effects.Effect`. The message has file, class, attribute, value and expected value.
     """
     if not path.is_file():
         raise BadConfiguration(f"--effects: got {path}, no such file; expected a Python file with Effect classes")
     # A unique name: two files may have the same name, and no file may hide a module of the package.
     name = OWN_MODULE + hashlib.sha256(os.fsencode(path.resolve())).hexdigest()[:16]
-    spec = importlib.util.spec_from_file_location(name, path, loader=_FromSource(name, str(path)))
+    spec = importlib.util.spec_from_file_location(name, path, loader=_SourceLoader(name, str(path)))
     if path.suffix != ".py" or spec is None or spec.loader is None:
         raise BadConfiguration(f"--effects: got {path.name}; expected a file whose name ends in .py")
     module = importlib.util.module_from_spec(spec)
@@ -155,7 +160,7 @@ def read_effect_file(path: Path) -> tuple[type[Effect], ...]:
             f"{path.name}: contains no effect; expected a class derived from mmrjax.effects.Effect{missing}"
         )
     for effect in concrete:
-        _check(path, effect)
+        _check_effect(path, effect)
     return concrete
 
 
@@ -163,7 +168,7 @@ def _where(path: Path, effect: type[Effect]) -> str:
     return f"{path.name}, {effect.__name__}"
 
 
-def _check(path: Path, effect: type[Effect]) -> None:
+def _check_effect(path: Path, effect: type[Effect]) -> None:
     where = _where(path, effect)
 
     def refuse(what: str) -> BadConfiguration:
@@ -217,11 +222,12 @@ def _check(path: Path, effect: type[Effect]) -> None:
 
 @functools.cache
 def _test_points(balance: str, channel: str, configuration: int) -> tuple[Signals, Signals, Signals]:
-    """Signals of the nominal robot on its battery.
+    """Signals of the nominal robot on its battery, at which the terms of effects are tested.
 
     Returns:
-        Three sets of signals. While the robot climbs and turns to the left: the signals that a term of the left side
-        may read, and all signals. At rest: the signals that a term may read.
+        Signals that a term of the left side may read while the robot climbs and turns left, all signals at that
+        point, and
+        the signals that a term may read at rest.
     """
     robot = paper_robots.nominal()
     run = Conditions(configuration, slope_deg=6.0, payload=2.0, battery=1.0, discharge=100.0)

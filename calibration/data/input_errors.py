@@ -1,4 +1,4 @@
-"""Errors of input from outside, files and arguments. Each has its exit code."""
+"""Errors in user input, files and arguments. Each kind has its exit code."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class InputError(Exception):
     """Error in user input. The message is a sentence for the user."""
 
     def __init__(self, message: str) -> None:
-        """Keeps the message, `shorten` and `printable`."""
+        """Stores the message, shortened and without unprintable characters."""
         super().__init__(shorten(printable(message)))
 
     exit_code = 2
@@ -37,10 +37,10 @@ class BadData(InputError):
 
 
 def parse_number(text: str) -> float:
-    """Returns the number that a text states in digits, without the underscores that Python allows.
+    """Number that a text states in digits, without the underscores that Python allows.
 
     Raises:
-        ValueError: the text contains no number.
+        ValueError: the text is no number.
     """
     if "_" in text or not text.isascii():
         raise ValueError(f"could not convert {text!r} to a number")
@@ -50,7 +50,7 @@ def parse_number(text: str) -> float:
 def rows_text(rows: Sequence[int], most: int, rest: str = ", ...") -> str:
     """Row numbers as text, such as `row 4` or `rows 4, 5`, from indices that begin at 0.
 
-    `rest` stands for rows after the first `most`. `{}` in it is their number.
+    `rest` replaces the rows after the first `most`. `{}` in it is replaced by their number.
     """
     listed = ", ".join(str(k + 1) for k in rows[:most]) + rest.format(len(rows) - most) * (len(rows) > most)
     return f"row{'s' * (len(rows) > 1)} {listed}"
@@ -62,15 +62,15 @@ def three_digits(value: float) -> str:
 
 
 def is_number(value: Any) -> bool:
-    """True if a value of a TOML file or of Python is a number. True and false are not."""
+    """True if a value from TOML or Python is a number. True and False are not numbers."""
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
 def stated_count(value: Any, where: str, low: int, high: int) -> int:
-    """A whole number of a TOML file or of Python.
+    """Checks and returns a whole number from TOML or Python.
 
     Raises:
-        BadConfiguration: something else, or out of bounds.
+        BadConfiguration: it is something else, or out of bounds.
     """
     if isinstance(value, bool) or not isinstance(value, numbers.Integral) or not low <= int(value) <= high:
         raise BadConfiguration(f"{where}: got {value!r}; expected a whole number from {low} to {high}")
@@ -81,7 +81,7 @@ def stated_word(value: Any, known: Iterable[str], where: str, wrong: str = "") -
     """Checks a word of a file or of an argument against the known ones, and returns it.
 
     Args:
-        wrong: beginning of the message for an unknown word. Empty: the message quotes the word.
+        wrong: beginning of the message about an unknown word. If empty, the message quotes the word.
 
     Raises:
         BadConfiguration: an unknown word. The message lists the nearest ones.
@@ -94,14 +94,14 @@ def stated_word(value: Any, known: Iterable[str], where: str, wrong: str = "") -
 def stated_number(
     value: Any, where: str, low: float = -math.inf, high: float = math.inf, unit: str | None = None
 ) -> float:
-    """A number of a TOML file.
+    """Checks and returns a number of a TOML file.
 
     Args:
         low, high: bounds.
-        unit: unit of the number, empty or `-` for none. None: unknown, the message leaves it out.
+        unit: unit of the number, empty or `-` if it has none. None: not known, so the message omits it.
 
     Raises:
-        BadConfiguration: no number, or a number that is not finite or out of bounds.
+        BadConfiguration: it is no number, not finite, or out of bounds.
     """
     if not is_number(value) or (math.isinf(high - low) and not math.isfinite(value)):
         kind = "a number" if unit is None else f"a number [{unit or '-'}]"

@@ -1,4 +1,4 @@
-"""Opening of input files: every table, profile and TOML file is opened here."""
+"""Opening of input files. Every table, profile and TOML file is opened here."""
 
 from __future__ import annotations
 
@@ -41,22 +41,23 @@ _KINDS = {stat.S_ISDIR: "a folder", stat.S_ISFIFO: "a pipe", stat.S_ISSOCK: "a s
 
 
 def file_bytes(path: Path, where: str | Path, kind: type[InputError] = BadData, largest: int = LARGEST) -> bytes:
-    """Returns the bytes of a regular file.
+    """Bytes of a regular file.
 
     Args:
-        where: opens the message of an error.
-        kind: kind of the error.
-        largest: number of bytes.
+        where: beginning of the error message.
+        kind: class of the exception.
+        largest: largest allowed size [bytes].
 
     Raises:
-        InputError: a folder, a pipe, a device, a file larger than `largest`, or a file that the system does not open.
+        InputError: the path is a folder, a pipe or a device, the file is larger than `largest`, or it cannot be
+            opened.
     """
     with _opened(path, where, kind, largest) as stream:
         return stream.read()
 
 
 def first_bytes(path: Path, where: str | Path, kind: type[InputError] = BadData, length: int = 4096) -> bytes:
-    """Returns the first bytes of a regular file of any size.
+    """First bytes of a regular file of any size.
 
     Args:
         where: beginning of the error message.
@@ -87,16 +88,16 @@ def _opened(path: Path, where: str | Path, kind: type[InputError], largest: floa
 
 
 def check_declared(where: str | Path, columns: int, size: float = 0.0, held: float = math.inf) -> None:
-    """Rejects sizes that a source declares, before its values are read.
+    """Rejects implausible sizes that a source declares, before its values are read.
 
     Args:
-        where: opens the message of an error.
+        where: beginning of the error message.
         columns: number of signals or columns.
         size: size of all values [bytes].
-        held: size of the file that has them [bytes].
+        held: size of the file with these values [bytes].
 
     Raises:
-        BadData: more than `COLUMNS` columns, or more values than a file of this size can hold.
+        BadData: there are more than `COLUMNS` columns, or more values than a file of this size can hold.
     """
     if columns > COLUMNS:
         raise BadData(f"{where}: has {columns:,} columns; expected at most {COLUMNS:,}; export those that you need")
@@ -111,11 +112,11 @@ def check_memory(where: str | Path, size: float) -> None:
     """Rejects values that need more than `SHARE` of the free memory, before they are read.
 
     Args:
-        where: opens the message of an error.
+        where: beginning of the error message.
         size: size of the values [bytes].
 
     Raises:
-        BadData: they do.
+        BadData: the values need more memory than that.
     """
     if size > SHARE * (free := available_memory()):
         raise BadData(
@@ -125,7 +126,7 @@ def check_memory(where: str | Path, size: float) -> None:
 
 
 def available_memory() -> float:
-    """Free memory of this process [bytes]: of the system, and below a limit of its address space (`ulimit -v`).
+    """Free memory for this process [bytes], considering the system and the limit of its address space (`ulimit -v`).
 
     Infinite if the system does not report it.
     """
@@ -146,10 +147,10 @@ def available_memory() -> float:
 
 
 def csv_bytes(path: Path, where: str | Path) -> bytes:
-    """Returns the bytes of a file that should be CSV.
+    """Bytes of a file that should be CSV.
 
     Raises:
-        BadData: for the same reasons as `file_bytes`, or another format, which the message names.
+        BadData: for the same reasons as `file_bytes`, or the file has another format, which the message names.
     """
     content = file_bytes(path, where)
     what = next((word for begin, word in BINARY.items() if content.startswith(begin)), None)
@@ -164,13 +165,13 @@ def csv_bytes(path: Path, where: str | Path) -> bytes:
 
 
 def toml_text(path: Path, where: str | Path) -> str:
-    """Returns the text of a TOML file.
+    """Text of a TOML file.
 
     Args:
-        where: opens the message of an error.
+        where: beginning of the error message.
 
     Raises:
-        BadConfiguration: for the same reasons as `file_bytes`, or text that is not UTF-8.
+        BadConfiguration: for the same reasons as `file_bytes`, or the text is not in UTF-8.
     """
     try:
         return file_bytes(path, where, BadConfiguration, LARGEST_TOML).decode("utf-8-sig")
@@ -179,15 +180,15 @@ def toml_text(path: Path, where: str | Path) -> str:
 
 
 def toml_content(text: str, where: str | Path, kind: type[InputError] = BadConfiguration) -> Json:
-    """Returns the keys and tables of a TOML text.
+    """Keys and tables of a TOML text.
 
     Args:
-        where: opens the message of an error.
-        kind: kind of the error.
+        where: beginning of the error message.
+        kind: class of the exception.
 
     Raises:
-        InputError: it is no TOML, has more than `KEYS` keys or `DEEPEST` tables within one another, or a whole number
-            of more than 64 bits.
+        InputError: the text is no TOML, has more than `KEYS` keys, is nested deeper than `DEEPEST` tables, or has a
+            whole number of more than 64 bits.
     """
     try:
         content = tomllib.loads(text)

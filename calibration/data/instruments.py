@@ -1,4 +1,4 @@
-"""Sign and step of instruments, inferred from the readings of a table where a rig's file leaves them free."""
+"""Sign and resolution of instruments, inferred from the readings of a table if the rig file does not state them."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ FEWEST = 8
 COARSEST = 0.25
 
 
-def step_of(readings: np.ndarray) -> float:
-    """Returns the largest common divisor of all differences between readings, by Euclid's algorithm.
+def common_step(readings: np.ndarray) -> float:
+    """Largest step of which all differences between readings are multiples (Euclid's algorithm).
 
-    It is 0 if the divisor is no larger than rounding, or if there are too few different readings. A ladder of levels
-    from its first rung on, each as often, at most one left out, was set by a person: it shows no display.
+    0 if that step is not larger than rounding errors, or if there are too few different readings. Readings at even
+    levels, each equally often and at most one left out, were set by a person and show no resolution of a display.
     """
     levels, counts = np.unique(readings[np.isfinite(readings)], return_counts=True)
     if levels.size < FEWEST:
@@ -47,15 +47,16 @@ def step_of(readings: np.ndarray) -> float:
 
 
 def display_step(readings: np.ndarray, channel: Channel) -> float:
-    """Step of the display of a channel [SI], 0 if the readings show no step.
+    """Resolution of the display of a channel [SI]. 0 if the readings show none.
 
-    It is the result of `step_of`. With too few different readings, it is the largest power of ten that divides all of
-    them in the unit of their column. It is at most `COARSEST` of the largest reading.
+    It is the `common_step`. With too few different readings, it is the largest power of ten, in the unit of the
+    column, that divides all of them. It is at most `COARSEST` of the largest reading.
 
     Args:
-        readings: [SI].
+        readings: readings [SI].
+        channel: the channel.
     """
-    step = step_of(readings)
+    step = common_step(readings)
     levels = np.unique(readings[np.isfinite(readings)]) / channel.factor
     if step or not 2 <= levels.size < FEWEST:
         return step
@@ -66,9 +67,9 @@ def display_step(readings: np.ndarray, channel: Channel) -> float:
 
 
 def infer_instruments(instruments: tuple[Instrument, ...], columns: Columns) -> tuple[Instrument, ...]:
-    """Instruments with sign and step inferred from the readings where they are free.
+    """Instruments whose sign and resolution are inferred from the readings, where they are not stated.
 
-    An instrument shows magnitude alone if no reading is negative although some runs go backward.
+    An instrument shows only the magnitude if no reading is negative although some runs go backward.
 
     Args:
         columns: columns of the table, in their units.
@@ -82,13 +83,13 @@ def infer_instruments(instruments: tuple[Instrument, ...], columns: Columns) -> 
         if signed is None:
             signed = not back or bool((readings < 0).any())
         if quantum is None:
-            quantum = step_of(readings) * channel.factor
+            quantum = common_step(readings) * channel.factor
         inferred.append(Instrument(instrument.channel, signed, quantum))
     return tuple(inferred)
 
 
 def with_inferred_instruments(robot: Robot, runs: Runs) -> Robot:
-    """Returns `robot` with the instruments that its table shows."""
+    """Robot with the instruments that its table shows."""
     mine = robot.rig.instruments
     all_instruments = runs.layout.instruments if any(i.free for i in mine) else mine
     named = {i.channel for i in all_instruments}

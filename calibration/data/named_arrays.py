@@ -1,4 +1,4 @@
-"""Columns of a source by name with raw values, before they have a meaning. Every reader of a format makes them."""
+"""Raw columns of a source, by name, before they have a meaning. Every reader of a format returns them."""
 
 from __future__ import annotations
 
@@ -18,18 +18,19 @@ MISSING = frozenset({"", "nan", "na", "n/a", "#n/a", "<na>", "none", "null"})
 
 @dataclasses.dataclass(frozen=True)
 class NamedArrays:
-    """Named columns of one source. `runs.of_arrays` checks them and makes `Runs` of them.
+    """Named columns of one source. `runs.of_arrays` checks them and converts them to `Runs`.
 
-    Messages count rows from 1. A reader that leaves out rows says so in `notes`.
+    Messages count rows from 1. A reader that leaves out rows reports it in `notes`.
 
     Attributes:
-        name: name of the source, which opens every message.
-        header: names of the columns, as the source states them.
-        values: one for each column, all of one length.
-        units: one for each column, spelled by `quantities.unit_in_column`, empty if unknown, or no units at all.
-        units_from: place where the source states them, for messages.
-        notes: sentences on reading.
-        digest: SHA-256 of the source's bytes, empty if it has none.
+        name: name of the source, with which every message begins.
+        header: names of the columns, as in the source.
+        values: values of each column, all of one length.
+        units: unit of each column, spelled as by `quantities.unit_in_column`, empty if unknown. May be empty
+            altogether.
+        units_from: place in which the source states the units, for messages.
+        notes: sentences on the reading of the source.
+        digest: SHA-256 of the source, empty if it has none.
     """
 
     name: str
@@ -44,7 +45,7 @@ class NamedArrays:
         return len(self.values[0]) if self.values else 0
 
     def rows(self, kept: np.ndarray, note: str) -> NamedArrays:
-        """Copy with some of the rows, and a note on the others.
+        """Copy with some of the rows, and a note on the omitted ones.
 
         Args:
             kept: True for each row that is kept, shape (rows,).
@@ -54,19 +55,19 @@ class NamedArrays:
         return dataclasses.replace(self, values=values, notes=(*self.notes, f"{self.name}: {note}"))
 
     def row(self, index: int) -> str:
-        """Name of a row in messages, by its index from 0."""
+        """Label of a row in messages, by its index from 0."""
         return f"{self.name} row {index + 1}"
 
 
 def column_texts(raw: Raw) -> list[str]:
-    """Returns the values of a column as texts, whole numbers without a point."""
+    """Values of a column as texts. Whole numbers have no decimal point."""
     if isinstance(raw, list):
         return raw
     return [f"{x:.15g}" if isinstance(x, float) else str(x) for x in raw.tolist()]
 
 
 def cell_number(cell: str) -> float:
-    """Returns a cell's number, NaN if it contains none."""
+    """Number in a cell, NaN if it has none."""
     try:
         return parse_number(cell)
     except ValueError:
@@ -74,7 +75,7 @@ def cell_number(cell: str) -> float:
 
 
 def column_numbers(raw: Raw) -> np.ndarray:
-    """Returns the numbers in a column's cells, NaN for a cell without a number."""
+    """Numbers in the cells of a column, NaN for a cell without a number."""
     if isinstance(raw, np.ndarray):
         return raw.astype(float)
     try:
@@ -86,7 +87,7 @@ def column_numbers(raw: Raw) -> np.ndarray:
 
 
 def missing_readings(raw: Raw, rows: np.ndarray) -> np.ndarray:
-    """Returns True for each row without a reading, shape (rows,)."""
+    """True for each row without a reading, shape (rows,)."""
     if isinstance(raw, np.ndarray):
         return np.isnan(raw[rows].astype(float))
     return np.array([raw[row].lower() in MISSING for row in rows.tolist()], bool)

@@ -1,4 +1,4 @@
-"""Mass of a robot without payload: the mass of its file, or the mass that a table of runs states instead.
+"""Mass of a robot without payload: from its file, or from a table of runs.
 
 A table that states `total_mass_kg` is simulated with that mass, whatever the robot's own mass. A robot that is fitted
 to the table needs the same mass. Otherwise the fit would identify an effect on the mass relative to the table's mass,
@@ -26,11 +26,11 @@ ROUNDING = 1e-6
 
 @dataclasses.dataclass(frozen=True)
 class StatedMass:
-    """Mass of one configuration without payload, `total_mass_kg` less `payload_kg`.
+    """Mass of one configuration without payload, according to a table: `total_mass_kg` minus `payload_kg`.
 
     Attributes:
-        median, low, high: median, lower limit and upper limit over the rows of the configuration [kg].
-        unladen: true if it varies although `total_mass_kg` is constant, as if that column leaves the payload out.
+        median, low, high: median, smallest and largest value over the rows of the configuration [kg].
+        unladen: true if it varies while `total_mass_kg` is constant, as if that column excluded the payload.
     """
 
     median: float
@@ -45,10 +45,10 @@ class StatedMass:
 
 
 def stated_masses(robot: Robot, runs: Runs) -> dict[str, StatedMass]:
-    """Returns the masses that a table states of its configurations. None if it has no `total_mass_kg`.
+    """Masses that a table states for its configurations. Empty without `total_mass_kg`.
 
     Raises:
-        BadData: a mass beyond the bounds of the robot's, or a configuration that the robot does not have.
+        BadData: a mass is out of bounds, or the robot lacks a configuration.
     """
     if not runs.has("total_mass_kg"):
         return {}
@@ -76,7 +76,7 @@ def stated_masses(robot: Robot, runs: Runs) -> dict[str, StatedMass]:
 
 
 def with_table_mass(robot: Robot, runs: Runs) -> Robot:
-    """`robot` with each configuration's own mass from the table, the median over its rows.
+    """Robot whose configurations have the masses of the table, each the median over its rows.
 
     Raises:
         BadData: for the same reasons as `stated_masses`.
@@ -87,10 +87,10 @@ def with_table_mass(robot: Robot, runs: Runs) -> Robot:
 
 
 def mass_notes(robot: Robot, runs: Runs) -> list[str]:
-    """Returns notes on masses of the table that differ from the robot's, and on the mass that is written.
+    """Notes on masses of the table that differ from those of the robot, and on the mass that is written.
 
     Args:
-        robot: as given, before `with_table_mass`.
+        robot: robot as given, before `with_table_mass`.
     """
     notes = []
     for name, stated in stated_masses(robot, runs).items():
@@ -120,10 +120,10 @@ def mass_notes(robot: Robot, runs: Runs) -> list[str]:
 
 
 def check_priors(stated: Iterable[str], robot: Robot, runs: Runs) -> None:
-    """Reject a prior of a mass that the table contains, because the fit uses the mass in the table.
+    """Rejects a prior of a mass that the table states, because the fit uses the mass in the table.
 
     Args:
-        stated: names of parameters.
+        stated: names of the parameters with stated priors.
 
     Raises:
         BadConfiguration: one of them is such a mass.

@@ -1,4 +1,4 @@
-"""Packaged sheets of parts for sizing: motors, gearboxes and cells, each value from a sheet that its row names.
+"""Packaged data sheets for sizing: motors, gearboxes and cells. Each row names the sheet of its values.
 
 The tables are in `parts/*.csv` in the units of the sheets. The reader gives SI. Values missing in a sheet are NaN.
 `docs/reference/parts.md` has the origin of the sheets, and checks of their consistency.
@@ -24,17 +24,17 @@ GRAM_CM2 = 1e-7  # kg·m²
 COULOMB_PER_MAH = 3.6
 
 
-def _column_field(name: str, factor: float = 1.0) -> Any:
-    """A number of the table in the unit of the column's name. Times `factor` it is in SI, NaN for an empty cell."""
+def _number_field(name: str, factor: float = 1.0) -> Any:
+    """Field read from a numeric column. Cells times `factor` are in SI, NaN for an empty cell."""
     return dataclasses.field(metadata={"column": name, "factor": factor})
 
 
-def _text(name: str) -> Any:
+def _text_field(name: str) -> Any:
     return dataclasses.field(metadata={"column": name, "text": True})
 
 
-def _text_field(name: str) -> Any:
-    """Several names in one cell, separated by semicolons."""
+def _list_field(name: str) -> Any:
+    """Field read from a column with several names in a cell, separated by semicolons."""
     return dataclasses.field(metadata={"column": name, "list": True})
 
 
@@ -46,51 +46,52 @@ class MotorSheet:
         name, maker, order_number: name, maker and order number of the winding.
         voltage_nominal: voltage of the no-load and stall values [V].
         resistance, inductance: terminal resistance [ohm] and inductance [H].
-        torque_constant: C_m [N·m/A].
-        speed_constant: [rad/(s·V)], the inverse of C_m but for rounding.
-        speed_no_load, current_no_load: no-load speed and no-load current at the nominal voltage [rad/s], [A].
-        speed_nominal, torque_nominal, current_nominal: nominal speed, nominal torque and nominal current at the
-            largest continuous torque [rad/s], [N·m], [A].
-        torque_stall, current_stall: stall torque and stall current at the nominal voltage [N·m], [A].
+        torque_constant: torque constant C_m [N·m/A].
+        speed_constant: speed constant [rad/(s·V)], the inverse of C_m except for rounding.
+        speed_no_load, current_no_load: no-load speed [rad/s] and current [A] at the nominal voltage.
+        speed_nominal, torque_nominal, current_nominal: speed [rad/s], torque [N·m] and current [A] at the largest
+            continuous torque.
+        torque_stall, current_stall: stall torque [N·m] and current [A] at the nominal voltage.
         inertia: inertia of the rotor [kg·m²].
         speed_max: largest permissible speed [rad/s].
-        resistance_thermal_housing, resistance_thermal_winding: housing to ambient, winding to housing [K/W].
-        time_constant_winding, time_constant_motor: time constants [s].
+        resistance_thermal_housing, resistance_thermal_winding: thermal resistances from housing to ambient, and from
+            winding to housing [K/W].
+        time_constant_winding, time_constant_motor: thermal time constants of winding and motor [s].
         temperature_winding_max: largest permissible winding temperature [°C].
-        mass: [kg].
+        mass: mass [kg].
         price: price of one piece without tax [EUR of 2020].
-        gearboxes: families of `packaged_gearboxes()` that the source combines it with, among those packaged.
-        source: sheet and where it was read.
+        gearboxes: families of packaged gearboxes with which the source combines it.
+        source: data sheet, and where it was read.
         note: further facts.
     """
 
-    name: str = _text("name")
-    maker: str = _text("maker")
-    order_number: str = _text("order_number")
-    voltage_nominal: float = _column_field("nominal_voltage_V")
-    resistance: float = _column_field("terminal_resistance_ohm")
-    inductance: float = _column_field("terminal_inductance_mH", MILLI)
-    torque_constant: float = _column_field("torque_constant_mNm_per_A", MILLI)
-    speed_constant: float = _column_field("speed_constant_rpm_per_V", RPM)
-    speed_no_load: float = _column_field("no_load_speed_rpm", RPM)
-    current_no_load: float = _column_field("no_load_current_mA", MILLI)
-    speed_nominal: float = _column_field("nominal_speed_rpm", RPM)
-    torque_nominal: float = _column_field("nominal_torque_mNm", MILLI)
-    current_nominal: float = _column_field("nominal_current_A")
-    torque_stall: float = _column_field("stall_torque_mNm", MILLI)
-    current_stall: float = _column_field("stall_current_A")
-    inertia: float = _column_field("rotor_inertia_gcm2", GRAM_CM2)
-    speed_max: float = _column_field("max_speed_rpm", RPM)
-    resistance_thermal_housing: float = _column_field("thermal_resistance_housing_ambient_K_per_W")
-    resistance_thermal_winding: float = _column_field("thermal_resistance_winding_housing_K_per_W")
-    time_constant_winding: float = _column_field("thermal_time_constant_winding_s")
-    time_constant_motor: float = _column_field("thermal_time_constant_motor_s")
-    temperature_winding_max: float = _column_field("max_winding_temperature_C")
-    mass: float = _column_field("weight_g", MILLI)
-    price: float = _column_field("price_EUR")
-    gearboxes: tuple[str, ...] = _text_field("gearboxes")
-    source: str = _text("source")
-    note: str = _text("note")
+    name: str = _text_field("name")
+    maker: str = _text_field("maker")
+    order_number: str = _text_field("order_number")
+    voltage_nominal: float = _number_field("nominal_voltage_V")
+    resistance: float = _number_field("terminal_resistance_ohm")
+    inductance: float = _number_field("terminal_inductance_mH", MILLI)
+    torque_constant: float = _number_field("torque_constant_mNm_per_A", MILLI)
+    speed_constant: float = _number_field("speed_constant_rpm_per_V", RPM)
+    speed_no_load: float = _number_field("no_load_speed_rpm", RPM)
+    current_no_load: float = _number_field("no_load_current_mA", MILLI)
+    speed_nominal: float = _number_field("nominal_speed_rpm", RPM)
+    torque_nominal: float = _number_field("nominal_torque_mNm", MILLI)
+    current_nominal: float = _number_field("nominal_current_A")
+    torque_stall: float = _number_field("stall_torque_mNm", MILLI)
+    current_stall: float = _number_field("stall_current_A")
+    inertia: float = _number_field("rotor_inertia_gcm2", GRAM_CM2)
+    speed_max: float = _number_field("max_speed_rpm", RPM)
+    resistance_thermal_housing: float = _number_field("thermal_resistance_housing_ambient_K_per_W")
+    resistance_thermal_winding: float = _number_field("thermal_resistance_winding_housing_K_per_W")
+    time_constant_winding: float = _number_field("thermal_time_constant_winding_s")
+    time_constant_motor: float = _number_field("thermal_time_constant_motor_s")
+    temperature_winding_max: float = _number_field("max_winding_temperature_C")
+    mass: float = _number_field("weight_g", MILLI)
+    price: float = _number_field("price_EUR")
+    gearboxes: tuple[str, ...] = _list_field("gearboxes")
+    source: str = _text_field("source")
+    note: str = _text_field("note")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -98,75 +99,74 @@ class GearboxSheet:
     """Data sheet of a planetary gearbox. NaN marks values that the sheet does not give.
 
     Attributes:
-        name, maker, order_number, family: one row a ratio of a family.
+        name, maker, order_number, family: identification. A family has one row for each ratio.
         stages: number of stages.
-        ratio: exact where the sheet gives a fraction.
+        ratio: gear ratio, exact if the sheet gives a fraction.
         torque_max, torque_intermittent_max: largest continuous and intermittent output torque [N·m].
-        efficiency: largest efficiency, as the sheets give it.
+        efficiency: largest efficiency, as stated in the sheet.
         inertia: inertia at the input shaft [kg·m²].
         speed_input_max: largest continuous input speed [rad/s].
         power_max: largest continuous power [W].
-        mass: [kg].
+        mass: mass [kg].
         price: price of one piece without tax [EUR of 2020].
-        source, note: as of `MotorSheet`.
+        source, note: as in `MotorSheet`.
     """
 
-    name: str = _text("name")
-    maker: str = _text("maker")
-    order_number: str = _text("order_number")
-    family: str = _text("family")
-    stages: float = _column_field("stages")
-    ratio: float = _column_field("ratio")
-    torque_max: float = _column_field("max_continuous_torque_Nm")
-    torque_intermittent_max: float = _column_field("max_intermittent_torque_Nm")
-    efficiency: float = _column_field("max_efficiency_percent", 1e-2)
-    inertia: float = _column_field("inertia_gcm2", GRAM_CM2)
-    speed_input_max: float = _column_field("max_continuous_input_speed_rpm", RPM)
-    power_max: float = _column_field("max_continuous_power_W")
-    mass: float = _column_field("weight_g", MILLI)
-    price: float = _column_field("price_EUR")
-    source: str = _text("source")
-    note: str = _text("note")
+    name: str = _text_field("name")
+    maker: str = _text_field("maker")
+    order_number: str = _text_field("order_number")
+    family: str = _text_field("family")
+    stages: float = _number_field("stages")
+    ratio: float = _number_field("ratio")
+    torque_max: float = _number_field("max_continuous_torque_Nm")
+    torque_intermittent_max: float = _number_field("max_intermittent_torque_Nm")
+    efficiency: float = _number_field("max_efficiency_percent", 1e-2)
+    inertia: float = _number_field("inertia_gcm2", GRAM_CM2)
+    speed_input_max: float = _number_field("max_continuous_input_speed_rpm", RPM)
+    power_max: float = _number_field("max_continuous_power_W")
+    mass: float = _number_field("weight_g", MILLI)
+    price: float = _number_field("price_EUR")
+    source: str = _text_field("source")
+    note: str = _text_field("note")
 
 
 @dataclasses.dataclass(frozen=True)
 class CellSheet:
-    """Data sheet of a battery cell, or of a pack of `cells` in series. NaN marks values that the sheet does not
-    give.
+    """Data sheet of a battery cell, or of a pack of `cells` in series. NaN marks values that the sheet does not give.
 
     Attributes:
         name, maker, chemistry: name, maker and chemistry of the cell.
-        cells: cells in series.
-        capacity: [C].
-        voltage_full, voltage_cut_off: voltages of one cell [V].
-        current_max, current_charge_max: largest continuous currents [A].
-        resistance: resistance of one cell to direct current [ohm].
-        impedance: impedance of one cell at 1 kHz [ohm]. Smaller than the resistance.
+        cells: number of cells in series.
+        capacity: capacity [C].
+        voltage_full, voltage_cut_off: voltage of one full cell, and cut-off voltage of one cell [V].
+        current_max, current_charge_max: largest continuous discharge and charge currents [A].
+        resistance: DC resistance of one cell [ohm].
+        impedance: impedance of one cell at 1 kHz [ohm]. It is smaller than the resistance.
         mass: mass of all cells [kg].
-        source, note: as of `MotorSheet`.
+        source, note: as in `MotorSheet`.
     """
 
-    name: str = _text("name")
-    maker: str = _text("maker")
-    chemistry: str = _text("chemistry")
-    cells: float = _column_field("cells")
-    capacity: float = _column_field("capacity_mAh", COULOMB_PER_MAH)
-    voltage_full: float = _column_field("full_voltage_V")
-    voltage_cut_off: float = _column_field("cut_off_voltage_V")
-    current_max: float = _column_field("max_continuous_current_A")
-    current_charge_max: float = _column_field("max_charge_current_A")
-    resistance: float = _column_field("resistance_mohm", MILLI)
-    impedance: float = _column_field("impedance_1kHz_mohm", MILLI)
-    mass: float = _column_field("weight_g", MILLI)
-    source: str = _text("source")
-    note: str = _text("note")
+    name: str = _text_field("name")
+    maker: str = _text_field("maker")
+    chemistry: str = _text_field("chemistry")
+    cells: float = _number_field("cells")
+    capacity: float = _number_field("capacity_mAh", COULOMB_PER_MAH)
+    voltage_full: float = _number_field("full_voltage_V")
+    voltage_cut_off: float = _number_field("cut_off_voltage_V")
+    current_max: float = _number_field("max_continuous_current_A")
+    current_charge_max: float = _number_field("max_charge_current_A")
+    resistance: float = _number_field("resistance_mohm", MILLI)
+    impedance: float = _number_field("impedance_1kHz_mohm", MILLI)
+    mass: float = _number_field("weight_g", MILLI)
+    source: str = _text_field("source")
+    note: str = _text_field("note")
 
 
 Sheet = TypeVar("Sheet", MotorSheet, GearboxSheet, CellSheet)
 
 
-def _cell(text: str, where: str, field: dataclasses.Field[Any]) -> Any:
-    """A cell of the table as the field holds it."""
+def _parse_cell(text: str, where: str, field: dataclasses.Field[Any]) -> Any:
+    """Value of a cell in the form of its field."""
     if field.metadata.get("text"):
         return text
     if field.metadata.get("list"):
@@ -180,10 +180,10 @@ def _cell(text: str, where: str, field: dataclasses.Field[Any]) -> Any:
 
 
 def _read_sheets(kind: type[Sheet], file: str) -> Iterator[Sheet]:
-    """The sheets of a table.
+    """Data sheets in a packaged table.
 
     Raises:
-        BadData: other columns than the sheet's fields, or a cell that is not a number.
+        BadData: the columns differ from the fields of the sheet, or a cell is not a number.
     """
     fields = dataclasses.fields(kind)
     wanted = [f.metadata["column"] for f in fields]
@@ -196,7 +196,9 @@ def _read_sheets(kind: type[Sheet], file: str) -> Iterator[Sheet]:
             raise BadData(
                 f"{file} row {reader.line_num}: the number of cells differs from the number of columns, {len(wanted)}"
             )
-        yield kind(**{f.name: _cell(row[f.metadata["column"]], f"{file} row {reader.line_num}", f) for f in fields})
+        yield kind(
+            **{f.name: _parse_cell(row[f.metadata["column"]], f"{file} row {reader.line_num}", f) for f in fields}
+        )
 
 
 @functools.cache
@@ -213,5 +215,5 @@ def packaged_gearboxes() -> tuple[GearboxSheet, ...]:
 
 @functools.cache
 def packaged_cells() -> tuple[CellSheet, ...]:
-    """The packaged cells. The first is the paper's, whose mass no sheet that was found states."""
+    """Packaged cells. The first is the paper's, whose mass is in no data sheet that was found."""
     return tuple(_read_sheets(CellSheet, "cells.csv"))

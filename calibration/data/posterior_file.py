@@ -1,4 +1,4 @@
-"""The posterior of a calibrated robot: uncertainty of the fitted parameters, and its file `posterior.nc`."""
+"""Posterior of a calibrated robot: the uncertainty of the fitted parameters, and its file `posterior.nc`."""
 
 from __future__ import annotations
 
@@ -25,20 +25,21 @@ APART = 0.05
 
 @dataclasses.dataclass(frozen=True)
 class Posterior:
-    """A normal distribution of coordinates z, and their parameters.
+    """Joint posterior of parameters: a normal distribution of coordinates z, and the parameters as functions of z.
 
-    u = location + spread · z, held within low and high (softly over `softness` of the spread, as in
-    `calibration.inference.priors.Coordinates`; 0 cuts), and θ = u, exp u, or u within half a turn.
+    u = location + spread · z, clipped to the range from low to high. The clip is smooth over `softness` of the
+    spread, as in `calibration.inference.priors.Coordinates`, or sharp for 0. The parameter is θ = u, exp u, or u
+    wrapped to half a turn.
 
     Attributes:
-        coordinates: names of the parameters that have a coordinate each.
+        coordinates: name of the parameter of each coordinate.
         units: units of these parameters.
         mean, covariance: mean and covariance of z, shape (coordinates,) and (coordinates, coordinates).
         location, spread, low, high: location, spread, lower limit and upper limit of u, in the parameter's unit or
             its logarithm.
-        softness: [-].
-        kinds: `NORMAL`, `LOG` or `ANGLE`, of each.
-        tied: (follower, index of the coordinate that it follows, ratio).
+        softness: width of the smooth clip, relative to the spread [-].
+        kinds: kind of each parameter: `NORMAL`, `LOG` or `ANGLE`.
+        tied: for each tied parameter: its name, the index of its coordinate, and the ratio.
     """
 
     coordinates: Names
@@ -54,24 +55,24 @@ class Posterior:
     tied: tuple[tuple[str, int, float], ...] = ()
 
     def __len__(self) -> int:
-        """Number of coordinates, which are columns of normal scores."""
+        """Number of coordinates."""
         return len(self.coordinates)
 
     @property
     def names(self) -> Names:
-        """Every parameter that it sets: the parameters of its coordinates, then parameters tied to a coordinate."""
+        """Names of all parameters: those of the coordinates, then tied ones."""
         return (*self.coordinates, *(follower for follower, _, _ in self.tied))
 
     @property
     def root(self) -> np.ndarray:
-        """L with L Lᵀ = covariance, also where a coordinate does not vary."""
+        """L with L Lᵀ = covariance, even if a coordinate does not vary."""
         values, vectors = np.linalg.eigh((self.covariance + self.covariance.T) / 2)
         return vectors * np.sqrt(np.maximum(values, 0.0))
 
     def at(self, z: Any) -> Any:
-        """Parameters [SI] in the order of `names` at coordinates z, shape (..., coordinates).
+        """Parameters [SI] at coordinates z, in the order of `names`. z has the shape (..., coordinates).
 
-        For a NumPy array it computes in NumPy, without compilation, otherwise it is traceable.
+        A NumPy array is computed with NumPy, without compilation. Anything else can be traced by JAX.
         """
         import jax.numpy as jnp
 
@@ -102,13 +103,13 @@ class Posterior:
         return self.values(np.random.default_rng(seed).standard_normal((draws, len(self))))
 
     def check(self, robot: Robot, where: str) -> None:
-        """Reject a posterior that is not this robot's.
+        """Rejects a posterior that belongs to another robot.
 
         Args:
-            where: opens the message.
+            where: beginning of the error message.
 
         Raises:
-            BadData: a parameter that the robot does not have, or a value far from the centre of the posterior.
+            BadData: the robot lacks a parameter, or its value is far from the centre of the posterior.
         """
         from mmrjax.model import params
 
@@ -132,7 +133,7 @@ class Posterior:
 
     @property
     def sd(self) -> np.ndarray:
-        """Standard deviation of each parameter of `names` to first order [SI]."""
+        """Standard deviation of each parameter in `names`, to first order [SI]."""
         import jax
 
         slopes = np.asarray(jax.jit(jax.jacfwd(self.at))(np.asarray(self.mean)))
@@ -140,7 +141,7 @@ class Posterior:
 
 
 def write_posterior(posterior: Posterior, path: Path | str) -> None:
-    """Write a posterior as NetCDF 3, which `xarray.open_dataset` reads with units and long names."""
+    """Writes a posterior as NetCDF 3, which `xarray.open_dataset` reads with units and long names."""
     from scipy.io import netcdf_file
 
     p, square = posterior, ("coordinate", "coordinate_2")
@@ -185,10 +186,10 @@ def write_posterior(posterior: Posterior, path: Path | str) -> None:
 
 
 def read_posterior(path: Path | str) -> Posterior:
-    """Read `posterior.nc`.
+    """Reads a `posterior.nc`.
 
     Raises:
-        BadData: no such file, or a file that is damaged or no posterior.
+        BadData: there is no such file, or it is damaged or no posterior.
     """
     import xarray as xr
 
@@ -198,7 +199,7 @@ def read_posterior(path: Path | str) -> Posterior:
     try:
         with xr.open_dataset(path, engine="scipy") as data:
             data.load()
-        posterior = _of(data)
+        posterior = _posterior_of_dataset(data)
     except Exception as error:  # whatever a damaged file makes the reader raise
         why = f"{type(error).__name__}: {error}".splitlines()[0]
         raise BadData(f"{path}: not a posterior that can be read ({why})") from error
@@ -223,7 +224,7 @@ def _words(values: Any) -> Names:
     return tuple(v.decode() if isinstance(v, bytes) else str(v) for v in np.asarray(values).tolist())
 
 
-def _of(data: Any) -> Posterior:
+def _posterior_of_dataset(data: Any) -> Posterior:
     if data.attrs.get("schema") != SCHEMA:
         raise ValueError(f"schema {data.attrs.get('schema')}, expected {SCHEMA}")
     tied: tuple[tuple[str, int, float], ...] = ()
@@ -243,7 +244,7 @@ def _of(data: Any) -> Posterior:
 
 
 def join_posteriors(parts: Sequence[Posterior], covariance: np.ndarray) -> Posterior:
-    """Joins sets of coordinates into one. `covariance` is the covariance of all of them."""
+    """Joint posterior of several sets of coordinates. `covariance`: of all coordinates."""
     fields = {
         f: np.concatenate([getattr(p, f) for p in parts])
         for f in ("mean", "location", "spread", "low", "high", "softness")

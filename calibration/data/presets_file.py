@@ -1,4 +1,4 @@
-"""Presets: TOML files with the meanings of the columns of a logger's files, with unit and sign."""
+"""Presets: TOML files that state what the columns of a logger's files mean, with unit and sign."""
 
 from __future__ import annotations
 
@@ -43,17 +43,17 @@ SEPARATOR = ","
 
 @dataclasses.dataclass(frozen=True)
 class PresetColumn:
-    """A column of this program, and its source in a logger's file.
+    """A column of this program, and the column of a logger's file from which it is read.
 
     Attributes:
-        mine: name of the column.
-        theirs: names that it may have in the file, `*` for any text. The first that the file has is read.
+        mine: name of the column in this program.
+        theirs: possible names in the file, `*` for any text. The first one that the file has is read.
         factor: factor from its unit to the unit of `mine`.
-        note: its meaning, for a note.
-        needs: column of this program without which it is not what drives the motor. Empty: none.
-        across: column of the file with the current along d, zero where the field is not weakened. Empty: none.
-        sign_bit: bit that is set in raw numbers below zero, whose other bits are the magnitude. 0: none.
-        zero: raw number that stands for zero.
+        note: its meaning, for a note to the user.
+        needs: column of this program without which it does not describe what drives the motor. Empty: none.
+        across: column of the file with the d-axis current, which is zero without field weakening. Empty: none.
+        sign_bit: sign bit of raw numbers whose other bits are the magnitude. 0: none.
+        zero: raw number that means zero.
     """
 
     mine: str
@@ -68,12 +68,12 @@ class PresetColumn:
 
 @dataclasses.dataclass(frozen=True)
 class Preset:
-    """Columns of a logger's files.
+    """Meaning of the columns of a logger's files.
 
     Attributes:
         name: name of the preset or its file.
-        columns: columns in its order.
-        header: names of the columns of a file without a header. Empty: every file has one.
+        columns: columns, in the order of the preset.
+        header: names of the columns of files without a header. Empty: every file has one.
     """
 
     name: str
@@ -83,11 +83,11 @@ class Preset:
     def mapped(
         self, found: Callable[[str], str | None], has_readings: Callable[[str], bool] | None = None
     ) -> tuple[tuple[tuple[str, str, float], ...], Names]:
-        """Returns columns of a source in the form of `Layout.mapped`, and notes on their meaning.
+        """Columns of a source in the form of `Layout.mapped`, and notes on their meaning.
 
         Args:
-            found: name of the source's column that a name means. None: it has none.
-            has_readings: False for a column of the source that is empty.
+            found: function that returns the source column with a name, None if there is none.
+            has_readings: function that returns False for an empty source column.
         """
         mapped, notes = [], []
         for column in self.columns:
@@ -103,20 +103,20 @@ class Preset:
         return tuple(mapped), tuple(notes)
 
     def column_of(self, name: str) -> PresetColumn:
-        """Returns the column that is read from a column of the source, an empty one if none is."""
-        read = (c for c in self.columns if any(_among(theirs, {name}) for theirs in c.theirs))
+        """Preset column that is read from a source column. An empty one if none is."""
+        read = (c for c in self.columns if any(_matches_any(theirs, {name}) for theirs in c.theirs))
         return next(read, PresetColumn("", ()))
 
     def check_needed(self, mapped: Iterable[tuple[str, str, float]], imposed: str, name: str) -> None:
-        """Rejects a source whose imposed column cannot be used without another column that the source lacks.
+        """Rejects a source whose imposed column is useless without another column that the source lacks.
 
         Args:
             mapped: columns of the source.
-            imposed: the column that drives the motor.
+            imposed: column that drives the motor.
             name: name of the source.
 
         Raises:
-            BadData: it lacks that column.
+            BadData: the other column is missing.
         """
         present = {mine: theirs for mine, theirs, _ in mapped}
         by_name = {column.mine: column for column in self.columns}
@@ -130,8 +130,8 @@ class Preset:
                 )
 
 
-def of_columns(columns: Mapping[str, Any], where: str = "the stated table") -> Preset:
-    """Returns the columns that a table `[columns]` states.
+def preset_of_table(columns: Mapping[str, Any], where: str = "the stated table") -> Preset:
+    """Preset from a table `[columns]`.
 
     Raises:
         BadConfiguration: for the same reasons as `parse_preset`.
@@ -140,13 +140,13 @@ def of_columns(columns: Mapping[str, Any], where: str = "the stated table") -> P
 
 
 def find_preset(stated: str | Path) -> Preset:
-    """Returns a packaged preset by its name, or the preset of a file. Numbers that it asks for may follow.
+    """Packaged preset with a name, or the preset in a file. Numbers that the preset asks for may follow.
 
     Args:
-        stated: `vesc,pole_pairs=7`, `mine.toml`.
+        stated: text such as `vesc,pole_pairs=7` or `mine.toml`.
 
     Raises:
-        BadConfiguration: no such preset or file, a number that is missing or unknown, or as `parse_preset`.
+        BadConfiguration: there is no such preset or file, a number is missing or unknown, or as in `parse_preset`.
     """
     name, *others = str(stated).split(SEPARATOR)
     given: dict[str, float] = {}
@@ -160,7 +160,7 @@ def find_preset(stated: str | Path) -> Preset:
                 f"--columns {name}: got {got}; expected a name and a number, such as pole_pairs=7"
             ) from error
     if name in PACKAGED:
-        return parse_preset(_packaged(name), name, given)
+        return parse_preset(_packaged_text(name), name, given)
     path = Path(name)
     if not path.exists():
         raise BadConfiguration(
@@ -170,7 +170,7 @@ def find_preset(stated: str | Path) -> Preset:
 
 
 def recognise_preset(names: Sequence[str]) -> str:
-    """Returns the packaged preset with most columns in a source, at least `OF_A_PRESET`, empty if no preset has.
+    """Packaged preset that has most columns in common with a source, at least `OF_A_PRESET`. Empty if there is none.
 
     Args:
         names: names of the source's columns, or paths of its signals.
@@ -179,36 +179,35 @@ def recognise_preset(names: Sequence[str]) -> str:
     ends = {*names, *(re.split(r"[/.]", name)[-1] for name in names)}
     for name in PACKAGED:
         preset = find_preset(SEPARATOR.join([name, *(f"{key}=1" for key in numbers_to_state(name))]))
-        count = sum(any(_among(theirs, ends) for theirs in column.theirs) for column in preset.columns)
+        count = sum(any(_matches_any(theirs, ends) for theirs in column.theirs) for column in preset.columns)
         if count > most:
             best, most = name, count
     return best
 
 
-def _among(theirs: str, names: set[str]) -> bool:
+def _matches_any(theirs: str, names: set[str]) -> bool:
     return bool(fnmatch.filter(names, theirs)) if "*" in theirs else theirs in names
 
 
 def numbers_to_state(name: str) -> Names:
-    """Returns names of the numbers that a packaged preset needs and for which it has no default."""
-    numbers = input_files.toml_content(_packaged(name), name).get("ask", {})
+    """Names of the numbers that the user must give for a packaged preset."""
+    numbers = input_files.toml_content(_packaged_text(name), name).get("ask", {})
     return tuple(key for key, stated in numbers.items() if isinstance(stated, str) or "usual" not in stated)
 
 
-def _packaged(name: str) -> str:
+def _packaged_text(name: str) -> str:
     return (resources.files("calibration") / "data" / "presets" / f"{name}.toml").read_text("utf-8")
 
 
 def parse_preset(text: str, where: str, given: Mapping[str, float]) -> Preset:
-    """Returns the preset that a TOML text states.
+    """Reads a preset from a TOML text.
 
     Args:
-        where: opens the message of an error.
-        given: numbers that it asks for, by name.
+        where: beginning of the error message.
+        given: numbers given by the user, by name.
 
     Raises:
-        BadConfiguration: no TOML, an unknown key, a column that this program does not have, or a number that it asks
-            for and does not get.
+        BadConfiguration: the text is no TOML, a key or a column is unknown, or a required number is missing.
     """
     return _parsed(input_files.toml_content(text, where), where, given)
 
@@ -217,7 +216,7 @@ def _parsed(content: Mapping[str, Any], where: str, given: Mapping[str, float]) 
     for key in content:
         stated_word(key, KEYS, where, f"got the key {key}")
     numbers = _preset_numbers(content.get("ask", {}), where, given)
-    header = _texts(content.get("header", []), f"{where}, header")
+    header = _list_of_texts(content.get("header", []), f"{where}, header")
     columns = content.get("columns", {})
     if not isinstance(columns, dict) or not columns:
         raise BadConfiguration(
@@ -231,12 +230,12 @@ def _parsed(content: Mapping[str, Any], where: str, given: Mapping[str, float]) 
             raise BadConfiguration(
                 f"{where}, columns.{mine}: no such column of a table; {listed}; other units are allowed too"
             )
-        entries.append(_column(mine, theirs, f"{where}, columns.{mine}", numbers))
+        entries.append(_parse_column(mine, theirs, f"{where}, columns.{mine}", numbers))
     return Preset(where, tuple(entries), header)
 
 
 def _preset_numbers(asked: Any, where: str, given: Mapping[str, float]) -> dict[str, float]:
-    """Numbers that the user must give for a preset, by name."""
+    """Numbers that the user gives for a preset, or their defaults, by name."""
     if not isinstance(asked, dict):
         raise BadConfiguration(f"{where}, ask: got {asked!r}; expected a table")
     for key in given:
@@ -263,13 +262,13 @@ def _preset_numbers(asked: Any, where: str, given: Mapping[str, float]) -> dict[
     return numbers
 
 
-def _column(mine: str, theirs: Any, where: str, numbers: Mapping[str, float]) -> PresetColumn:
+def _parse_column(mine: str, theirs: Any, where: str, numbers: Mapping[str, float]) -> PresetColumn:
     form = f'expected {mine} = "LOGGER COLUMN", or {mine} = {{column = "LOGGER COLUMN", factor = 0.001}}'
     table = theirs if isinstance(theirs, dict) else {"column": theirs}
     for key in table:
         stated_word(key, KEYS_OF_COLUMN, where, f"got the key {key}")
     stated = table.get("column")
-    names = _texts([stated] if isinstance(stated, str) else stated, f"{where}.column", form)
+    names = _list_of_texts([stated] if isinstance(stated, str) else stated, f"{where}.column", form)
     factor = stated_number(table.get("factor", 1.0), f"{where}.factor")
     for key in ("per", "times"):
         if key in table:
@@ -290,12 +289,12 @@ def _column(mine: str, theirs: Any, where: str, numbers: Mapping[str, float]) ->
             raise BadConfiguration(f"{where}.{key}: got {texts[key]!r}; expected {expected}")
     sign_bit = stated_count(table.get("sign_bit", 0), f"{where}.sign_bit", 0, 63)
     zero = stated_number(table.get("zero", 0.0), f"{where}.zero")
-    theirs = tuple(_filled_column_name(name, where, numbers) for name in names)
+    theirs = tuple(_fill_in_numbers(name, where, numbers) for name in names)
     return PresetColumn(mine, theirs, factor, sign_bit=sign_bit, zero=zero, **texts)
 
 
-def _filled_column_name(name: str, where: str, numbers: Mapping[str, float]) -> str:
-    """A column's name with whole numbers in place of the names in braces."""
+def _fill_in_numbers(name: str, where: str, numbers: Mapping[str, float]) -> str:
+    """Name of a column, with numbers in place of the names in braces."""
     try:
         named = [field for _, field, _, _ in string.Formatter().parse(name) if field is not None]
     except ValueError:
@@ -306,7 +305,7 @@ def _filled_column_name(name: str, where: str, numbers: Mapping[str, float]) -> 
     return name
 
 
-def _texts(stated: Any, where: str, form: str = "expected a list of names") -> Names:
+def _list_of_texts(stated: Any, where: str, form: str = "expected a list of names") -> Names:
     if not isinstance(stated, list) or not all(isinstance(each, str) and each for each in stated):
         raise BadConfiguration(f"{where}: got {stated!r}; {form}")
     return tuple(stated)
@@ -315,14 +314,14 @@ def _texts(stated: Any, where: str, form: str = "expected a list of names") -> N
 def merge_columns(
     first: Iterable[tuple[str, str, float]], others: Iterable[tuple[str, str, float]]
 ) -> tuple[tuple[str, str, float], ...]:
-    """Columns of two tables. `first` takes precedence if both have a column, or use the same source column."""
+    """Columns of two tables. `first` takes precedence if both have a column, or read the same source column."""
     first = tuple(first)
     taken = {_name_without_unit(mine) for mine, _, _ in first} | {theirs for _, theirs, _ in first}
     return (*first, *(c for c in others if _name_without_unit(c[0]) not in taken and c[1] not in taken))
 
 
 def _name_without_unit(mine: str) -> str:
-    """Name of a column without its unit, so that time_ms and time_s are the same."""
+    """Name of a column without its unit, so that time_ms and time_s are equal."""
     layout = Layout(channels=channels.EVERY)
     quantities = layout.quantities()
     return next((column for column, quantity in quantities.items() if mine in quantity.columns()), mine)

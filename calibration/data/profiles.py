@@ -76,18 +76,18 @@ SETTINGS = ("cycles", "between_rows", *STARTS)
 
 @dataclasses.dataclass(frozen=True)
 class ProfileTable:
-    """A profile as its file states it, checked.
+    """A mission profile as read from its file.
 
     Attributes:
         source: name of the file or of the packaged profile, for messages.
-        time: time of the rows [s].
-        modes: modes from `MODES`, one a row.
-        demand: motor speed [rad/s] or speed [m/s], shape (rows,).
-        values: fields of `mmrjax.missions.profile.Profile` that it states, by name, shape (rows,).
-        surface: surface of Table 5, one a row, None where it states none.
-        linear, cycles: as of `mmrjax.missions.profile.Profile`.
+        time: times of the rows [s].
+        modes: mode of each row, one of `MODES`.
+        demand: demanded motor speed [rad/s] or speed [m/s], shape (rows,).
+        values: fields of `mmrjax.missions.profile.Profile` in the file, by name, shape (rows,).
+        surface: surface of Table 5 in each row, None if the file states none.
+        linear, cycles: as in `mmrjax.missions.profile.Profile`.
         digest: SHA-256 of the file.
-        begins: fields of `Start` that it states [SI, °C]. Rolling speed, temperatures of winding and housing.
+        begins: fields of `Start` in the file [SI, °C]: rolling speed, temperatures of winding and housing.
         notes: sentences on how the file was read.
     """
 
@@ -105,12 +105,12 @@ class ProfileTable:
 
     @property
     def start(self) -> Start | None:
-        """The state that the mission begins in. None: at rest at ambient temperature."""
+        """State in which the mission begins. None: at rest at ambient temperature."""
         return Start(**self.begins) if self.begins else None
 
     @property
     def segments(self) -> int:
-        """Segments of one cycle."""
+        """Number of segments of one cycle."""
         return len(self.time) - 1
 
     @property
@@ -120,12 +120,12 @@ class ProfileTable:
 
     @property
     def turns(self) -> bool:
-        """True if it drives the sides apart."""
+        """True if it drives the sides independently."""
         return any(name in self.values for name in APART)
 
     @property
     def stated(self) -> Names:
-        """Columns of conditions that it states, as a table of runs names them."""
+        """Columns of conditions that it states, by their names in tables of runs."""
         names = {"voltage": SUPPLY, "slope_deg": "slope_deg", "payload": "payload_kg", "load_torque": LOAD}
         return (
             *(column for name, column in names.items() if name in self.values),
@@ -133,12 +133,12 @@ class ProfileTable:
         )
 
     def demanded(self, segment: np.ndarray, elapsed: np.ndarray, per_speed: float) -> np.ndarray:
-        """Demanded ground speed [m/s], also from a demanded motor speed, NaN without a demand.
+        """Demanded ground speed [m/s], computed from a demanded motor speed if necessary. NaN without a demand.
 
         Args:
-            segment: number of the segment in one cycle, from 0.
-            elapsed: since it began [s]. Both of one shape.
-            per_speed: motor speed over ground speed [rad/m].
+            segment: index of the segment in one cycle, from 0.
+            elapsed: time since the segment began [s], shape as `segment`.
+            per_speed: ratio of motor speed to ground speed [rad/m].
         """
         before, after = self.demand[segment], self.demand[segment + 1]
         share = elapsed / np.diff(self.time)[segment] if self.linear else 0.0
@@ -146,11 +146,11 @@ class ProfileTable:
         value = (before + (after - before) * share) / np.where(mode == MODES[MOTOR_SPEED], per_speed, 1.0)
         return np.where(np.isin(mode, CONTROLLED), value, np.nan)
 
-    def check_source(self, battery: bool) -> None:
-        """Reject a profile that contradicts the supply of the run.
+    def check_supply(self, battery: bool) -> None:
+        """Rejects a profile that contradicts the supply of the run.
 
         Raises:
-            BadConfiguration: it states a voltage, and the battery feeds the motors.
+            BadConfiguration: the profile states a voltage, but the battery feeds the motors.
         """
         if battery and PAIRS[1][0] in self.values:
             raise BadConfiguration(
@@ -163,14 +163,14 @@ class ProfileTable:
             )
 
     def profile(self, robot: Robot, conditions: Conditions) -> Profile:
-        """The profile that a simulation takes, for a batch of runs.
+        """Profile in the form that simulations take, for a batch of runs.
 
         Args:
             robot: robot that follows it.
             conditions: conditions of shape (runs,), configurations as indices.
 
         Returns:
-            Fields of shape (rows,). Where surfaces are stated, `adhesion` of shape (runs, rows).
+            Fields of shape (rows,). If it states surfaces, `adhesion` has the shape (runs, rows).
         """
         made = profile(
             self.time,
@@ -194,28 +194,28 @@ class ProfileTable:
 
 
 def read_profile(source: str | Path) -> ProfileTable:
-    """Returns a packaged profile, by its name, or the profile of a file in any format of a table.
+    """Packaged profile with a name, or profile from a file in any table format.
 
     Raises:
-        BadData: no such file. Fewer than two rows. An unknown, misspelt or repeated column or unit. A time that does
-            not increase. A cell that is no number, not finite or out of range. An empty cell of a required column.
-            Two demands in a row or none. An unknown mode, surface or setting. The message has file, row (counted
-            from 1 below the header), column, value and the allowed values.
+        BadData: there is no such file, it has fewer than two rows, a column or unit is unknown, misspelt or repeated,
+            time does not increase, a cell is no number, not finite or out of range, a required cell is empty, a row
+            has two demands or none, or a mode, surface or setting is unknown. The message has file, row (counted from
+            1 below the header), column, value and allowed values.
     """
     if str(source) in PACKAGED:
         file = resources.files("calibration") / "data" / "profiles" / f"{source}.csv"
-        return _of_text(file.read_bytes(), str(source))
+        return _profile_of_text(file.read_bytes(), str(source))
     path, within = opening.split_source(str(source))
     if not path.exists():
         raise BadData(f"{source}: no such file and no packaged profile; {allowed_words(str(source), PACKAGED)}")
     table = reading.read_whole_table(path, within)
     if table is None:
-        return _of_text(input_files.csv_bytes(path, path.name or str(source)), path.name)
+        return _profile_of_text(input_files.csv_bytes(path, path.name or str(source)), path.name)
     rows = [list(table.header), *map(list, zip(*map(column_texts, table.values), strict=True))]
     return _parsed(table.name, _header_settings(table.name, []), rows, table.digest, table.notes)
 
 
-def _of_text(content: bytes, name: str) -> ProfileTable:
+def _profile_of_text(content: bytes, name: str) -> ProfileTable:
     text, encoded = delimited.decode_text(name, content)
     lines = [line.strip() for line in text.splitlines() if line.strip()]
     above = next((k for k, line in enumerate(lines) if not line.startswith("#")), len(lines))
@@ -238,7 +238,9 @@ def _parsed(name: str, settings: Json, rows: list[list[str]], digest: str, notes
                 f"{name} row {k}: got {count_noun(len(row), 'cell')}; "
                 f"the header has {count_noun(len(header), 'column')}"
             )
-    cells = _Cells(name, columns, {c: [row[j] for row in body] for j, c in enumerate(header)}, settings["linear"])
+    cells = _CellReader(
+        name, columns, {c: [row[j] for row in body] for j, c in enumerate(header)}, settings["linear"]
+    )
     time = _time(cells)
     if why := sides_error(list(cells.columns), cells.has(MODES[SPEED]), cells.called):
         raise BadData(f"{name}: {why}")
@@ -254,7 +256,9 @@ def _parsed(name: str, settings: Json, rows: list[list[str]], digest: str, notes
 
 
 def _header_settings(name: str, comments: list[str]) -> Json:
-    """Settings in the comment lines at the top: `cycles = 40`, `between_rows = "linear"`. Other lines are remarks."""
+    """Settings in the comment lines at the top, such as `cycles = 40` or `between_rows = "linear"`. Other lines are
+    comments.
+    """
     stated: Json = {}
     for line in comments:
         text = line.lstrip("#").strip()
@@ -287,10 +291,10 @@ def _header_settings(name: str, comments: list[str]) -> Json:
 
 
 def _profile_columns(name: str, header: list[str]) -> dict[str, tuple[str, str]]:
-    """Column and unit of each field that the file has.
+    """Column and unit of each field in the file.
 
     Raises:
-        BadData: an unknown column or unit, a field twice, no time.
+        BadData: a column or unit is unknown, a field occurs twice, or time is missing.
     """
     columns_known: dict[str, tuple[str, str]] = {
         column: (field, unit) for field, quantity in QUANTITIES.items() for column, unit in quantity.columns().items()
@@ -309,12 +313,12 @@ def _profile_columns(name: str, header: list[str]) -> dict[str, tuple[str, str]]
             raise BadData(f"{name}: got {both}; expected one of them")
         columns_found[field] = (column, unit)
     if "time" not in columns_found:
-        raise BadData(f"{name}: column time_s is missing; other columns: {', '.join(_standard())}")
+        raise BadData(f"{name}: column time_s is missing; other columns: {', '.join(_standard_columns())}")
     return columns_found
 
 
-def _standard() -> list[str]:
-    """The column of each quantity in its first unit."""
+def _standard_columns() -> list[str]:
+    """Column of each quantity, in its first unit."""
     return [next(iter(quantity.columns())) for quantity in QUANTITIES.values()] + [MODE, SURFACE]
 
 
@@ -326,12 +330,14 @@ def _refuse_column(name: str, column: str) -> NoReturn:
             raise BadData(
                 f"{name}, column {column}: got the unit {unit}; expected one of {', '.join(quantity.columns())}"
             )
-    raise BadData(f"{name}: unknown column {column or '(without a name)'}; {allowed_words(column, _standard(), 3)}")
+    raise BadData(
+        f"{name}: unknown column {column or '(without a name)'}; {allowed_words(column, _standard_columns(), 3)}"
+    )
 
 
 @dataclasses.dataclass(frozen=True)
-class _Cells:
-    """The cells of a file by column, read one by one."""
+class _CellReader:
+    """Cells of a file by column, read one at a time."""
 
     source: str
     columns: dict[str, tuple[str, str]]
@@ -345,7 +351,7 @@ class _Cells:
         return field in self.columns
 
     def called(self, field: str) -> str:
-        """The column of a field, or the first that it could have."""
+        """Column of a field, or the first one that it could have."""
         return self.columns[field][0] if self.has(field) else next(iter(QUANTITIES[field].columns()))
 
     def text(self, field: str, row: int) -> str:
@@ -357,7 +363,7 @@ class _Cells:
         raise BadData(f"{self.source} row {row + 1}, {self.columns[field][0]}: got {got}; expected {allowed}")
 
     def value(self, field: str, row: int) -> float:
-        """A number in the unit of `Profile`."""
+        """Number in a cell, in the unit of `Profile`."""
         quantity, unit = QUANTITIES[field], self.columns[field][1]
         low, high = quantity.limits(unit)
         allowed = f"{low:g} to {high:g}"
@@ -371,7 +377,7 @@ class _Cells:
         return value * quantity.factor if isinstance(quantity, Channel) else value
 
     def held(self, field: str) -> np.ndarray:
-        """A column that every row needs. The last row of a profile whose values are held needs none."""
+        """Numbers of a required column. With held values, the last row may be empty."""
         last = len(self) - 1
         held_values: list[float] = []
         for row in range(len(self)):
@@ -393,18 +399,18 @@ class _Cells:
         return tuple(labels_found)
 
 
-def _time(cells: _Cells) -> np.ndarray:
+def _time(cells: _CellReader) -> np.ndarray:
     time = np.array([cells.value("time", row) for row in range(len(cells))])
     for row in np.flatnonzero(np.diff(time) <= 0)[:1] + 1:
         cells.refuse("time", int(row), f"more than {cells.text('time', int(row) - 1)} of the row before")
     return time
 
 
-def _modes_and_demands(cells: _Cells) -> tuple[Names, Columns]:
-    """Mode of each row, and by field of `Profile` its demand, and the duties, voltages and yaw rates that are stated.
+def _modes_and_demands(cells: _CellReader) -> tuple[Names, Columns]:
+    """Mode of each row, and by field of `Profile` its demand and the stated duties, voltages and yaw rates.
 
-    A cell of a demand column in a row of another mode ends the ramp that leads to this row, where values are linear
-    between rows, else it is a second demand.
+    If values are linear between rows, a demand of another mode ends the ramp that leads to its row. Otherwise it is
+    an error: a second demand.
     """
     modes: list[str] = []
     shares = [field for field in DEMANDS if DEMANDS[field] == MODES[VOLTAGE] and cells.has(field)]
@@ -438,8 +444,8 @@ def _modes_and_demands(cells: _Cells) -> tuple[Names, Columns]:
     return tuple(modes), shares_found
 
 
-def _mode_of_row(cells: _Cells, row: int, before: str, filled: list[str]) -> str:
-    """The mode that a row states, or that its demand means, without either voltage, if no row has a demand."""
+def _mode_of_row(cells: _CellReader, row: int, before: str, filled: list[str]) -> str:
+    """Mode of a row, as stated or as implied by its demand. If no row has a demand, the motors are off."""
     stated = cells.text(MODE, row)
     if stated and stated not in MODES:
         cells.refuse(MODE, row, f"one of these; {allowed_words(stated, MODES)}")
@@ -455,8 +461,8 @@ def _mode_of_row(cells: _Cells, row: int, before: str, filled: list[str]) -> str
     return mode
 
 
-def _check_demands(cells: _Cells, row: int, before: str, mode: str, own: list[str], others: list[str]) -> None:
-    """Reject a row with two demands or a missing one, and a ramp from one kind of demand to another."""
+def _check_demands(cells: _CellReader, row: int, before: str, mode: str, own: list[str], others: list[str]) -> None:
+    """Rejects a row with two demands or none, and a ramp between different kinds of demand."""
     if others:
         where = cells.columns[others[0]][0]
         beside = cells.columns[own[0]][0] if own and not cells.text(MODE, row) else f"mode {mode}"

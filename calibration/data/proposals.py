@@ -1,4 +1,4 @@
-"""Proposed columns for the signals of a file: by their units, then their behaviour, then their names."""
+"""Proposed columns for the signals of a file, chosen by unit, then behaviour, then name."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ POWER = 0.25
 
 
 class Meaning(NamedTuple):
-    """A quantity, and names of signals that show it."""
+    """A quantity, and the usual names of its signals."""
 
     quantity: str
     pattern: re.Pattern[str]
@@ -77,13 +77,13 @@ BY_UNIT = ("supply_voltage", "total_current", "motor_speed", "winding_temperatur
 
 
 @dataclasses.dataclass(frozen=True)
-class Candidate:
+class ColumnCandidate:
     """A signal and the quantity that it may show.
 
     Attributes:
-        column: name of the column with the signal's unit.
-        question: empty, or what a person has to check.
-        factor: factor from the signal's unit, if no column has it.
+        column: name of the column, with the unit of the signal.
+        question: what a person has to check, empty for nothing.
+        factor: factor that converts the unit of the signal, if no column has that unit.
     """
 
     signal: Signal
@@ -102,12 +102,12 @@ class Candidate:
 def propose_columns(
     signals: Sequence[Signal], spelled: set[str], seconds: Callable[[Signal], np.ndarray | None]
 ) -> Iterator[tuple[str, str]]:
-    """Paths of signals that may be columns, each with its line of a table `[columns]`.
+    """Proposes columns for signals: the path of each signal, with its line of a table `[columns]`.
 
     Args:
-        signals: those that change first.
+        signals: signals, those that change first.
         spelled: names that already are columns.
-        seconds: times of a signal [s].
+        seconds: function that returns the times of a signal [s].
     """
     columns = {q.stem or q.name: q.columns() for q in Layout(channels=channels.EVERY).quantities().values()}
     taken = {signal.name.rpartition("_")[0] for signal in signals if signal.name in spelled}
@@ -120,7 +120,7 @@ def propose_columns(
         "min",
         "h",
     }
-    units = [_unit(signal, known_units) for signal in signals]
+    units = [_stated_unit(signal, known_units) for signal in signals]
     count = collections.Counter(units)
     pool = [
         candidate
@@ -130,8 +130,8 @@ def propose_columns(
         and (candidate := _candidate_of_signal(signal, unit, count[unit] == 1, columns)) is not None
     ]
     units_of = dict(zip((signal.path for signal in signals), units, strict=True))
-    groups: dict[str, list[Candidate]] = {}
-    for candidate in _by_power(_by_rate(pool, units_of, columns, seconds)):
+    groups: dict[str, list[ColumnCandidate]] = {}
+    for candidate in _currents_by_duty(_candidates_by_rate(pool, units_of, columns, seconds)):
         groups.setdefault(candidate.quantity, []).append(candidate)
     for quantity, group in groups.items():
         if quantity in taken:
@@ -147,7 +147,7 @@ def propose_columns(
 
 
 def _joint_name(signal: Signal, signals: Sequence[Signal]) -> str:
-    """Name of the joint that an element of a message of joints belongs to, empty if there is none."""
+    """Name of the joint to which an element of a joint message belongs, empty if none."""
     element = re.search(r"\w+(\[\d+\])$", signal.path)
     if element is None:
         return ""
@@ -158,12 +158,13 @@ def _joint_name(signal: Signal, signals: Sequence[Signal]) -> str:
 
 def _candidate_of_signal(
     signal: Signal, unit: str | None, alone: bool, columns: Mapping[str, Mapping[str, str]]
-) -> Candidate | None:
-    """Quantity that a signal may show, None if its unit, its behaviour or its name excludes every one.
+) -> ColumnCandidate | None:
+    """Quantity that a signal may be. None if its unit, behaviour or name excludes all quantities.
 
     Args:
-        unit: unit that it states, a column's. None: it states none. alone: True if no other signal states it.
-        columns: names of the columns of each quantity, and their units.
+        unit: unit of the signal, spelled as in columns. None: it states none.
+        alone: True if no other signal has that unit.
+        columns: column names of each quantity, and their units.
     """
     if signal.refused:
         return None
@@ -179,7 +180,7 @@ def _candidate_of_signal(
     quantity, question = fitting[0], ""
     units = columns[quantity]
     if quantity == "run_id":
-        return Candidate(signal, quantity, quantity)
+        return ColumnCandidate(signal, quantity, quantity)
     values = np.asarray(signal.load(), float)
     values = values[np.isfinite(values)]
     if not _is_reading(values):
@@ -187,15 +188,15 @@ def _candidate_of_signal(
     largest = float(np.abs(values).max())
     if quantity == "duty":
         if unit == "percent" or re.search(r"pct|percent|%", name) or 1.0 < largest <= 100.0:
-            return Candidate(signal, quantity, "duty", "", 0.01)
+            return ColumnCandidate(signal, quantity, "duty", "", 0.01)
         if largest <= 1.0:
-            return Candidate(signal, quantity, "duty")
+            return ColumnCandidate(signal, quantity, "duty")
         whole = next((w for w in WHOLE if largest <= w <= 1.05 * largest), None)
         if whole is None or values.min() > 0.4 * largest:  # the width of a pulse has a large least value
             return None
-        return Candidate(signal, quantity, "duty", f"is {whole} a whole duty?", float(f"{1 / whole:.8g}"))
+        return ColumnCandidate(signal, quantity, "duty", f"is {whole} a whole duty?", float(f"{1 / whole:.8g}"))
     if unit is None and quantity == "motor_speed" and largest < SLOW:
-        return Candidate(signal, "speed", "speed_m_s", f"numbers up to {largest:.3g}: m/s?")
+        return ColumnCandidate(signal, "speed", "speed_m_s", f"numbers up to {largest:.3g}: m/s?")
     if unit is None:
         unit, question = next(iter(units.values())), "unit not stated: check it"
         if largest > {"V": LARGEST_V, "A": LARGEST_A}.get(unit, np.inf):
@@ -205,16 +206,16 @@ def _candidate_of_signal(
     elif "effort" in name:
         question = "effort may be a torque or a current: check it"
     column = next(c for c, u in units.items() if u == unit)
-    return Candidate(signal, quantity, column, question)
+    return ColumnCandidate(signal, quantity, column, question)
 
 
 def _path_words(path: str) -> str:
-    """A path in lower case, with underscores between words that capitals separate."""
+    """Path in lower case, with underscores between words that are separated by capitals."""
     return re.sub(r"(?<=[a-z])(?=[A-Z])", "_", path).casefold()
 
 
-def _unit(signal: Signal, known: set[str]) -> str | None:
-    """Unit that a signal's metadata or its name states, None if it states none."""
+def _stated_unit(signal: Signal, known: set[str]) -> str | None:
+    """Unit stated by the metadata or the name of a signal, None if there is none."""
     if signal.unit:
         return quantities.unit_in_column(signal.unit.strip("[]()"))
     if brackets := re.search(r"[\[(]([^\])]*[^\])\d][^\])]*)[\])]\s*$", signal.path):
@@ -232,14 +233,17 @@ def _is_reading(values: np.ndarray) -> bool:
     return not (len(steps) > 3 and values.min() >= 0 and (steps == steps[0]).all() and float(steps[0]).is_integer())
 
 
-def seconds_of_a_count(signals: Sequence[Signal], count: np.ndarray) -> float:
-    """Seconds between numbers of a clock, from a place and its rate that state their units, NaN without such two.
+def seconds_per_count(signals: Sequence[Signal], count: np.ndarray) -> float:
+    """Seconds per count of a clock, from a position and its rate that state their units. NaN if there are no such
+    signals.
 
     Args:
-        count: numbers of the clock, shape (rows,).
+        count: counts of the clock, shape (rows,).
     """
     known_units = {unit for units in RATES for unit in units[:2] if isinstance(unit, str)}
-    stated = {signal.path: _unit(signal, known_units) for signal in signals if not (signal.refused or signal.words)}
+    stated = {
+        signal.path: _stated_unit(signal, known_units) for signal in signals if not (signal.refused or signal.words)
+    }
     pairs = {(of_place, of_rate): one for of_place, of_rate, one in RATES}
     for place, rate in itertools.permutations([s for s in signals if stated.get(s.path)], 2):
         one = pairs.get((str(stated[place.path]), str(stated[rate.path])))
@@ -250,19 +254,19 @@ def seconds_of_a_count(signals: Sequence[Signal], count: np.ndarray) -> float:
     return math.nan
 
 
-def _by_rate(
-    pool: Sequence[Candidate],
+def _candidates_by_rate(
+    pool: Sequence[ColumnCandidate],
     stated: Mapping[str, str | None],
     columns: Mapping[str, Mapping[str, str]],
     seconds: Callable[[Signal], np.ndarray | None],
-) -> Iterator[Candidate]:
-    """Candidates. A place and its rate have units that agree with each other.
+) -> Iterator[ColumnCandidate]:
+    """Candidates for position and speed, with units that agree with each other.
 
     Args:
         stated: unit of each signal, by its path.
-        columns: as of `_candidate_of_signal`.
+        columns: as in `_candidate_of_signal`.
     """
-    agreed: dict[str, Candidate] = {}
+    agreed: dict[str, ColumnCandidate] = {}
     for place, rate in itertools.product(pool, pool):
         if not _PLACES & {*columns[place.quantity].values()} or not _SPEEDS & {*columns[rate.quantity].values()}:
             continue
@@ -272,7 +276,7 @@ def _by_rate(
         if time is None or len(time) != rate.signal.length or "motor" in rate.signal.path.casefold():
             continue
         stated_rates = [stated[c.signal.path] for c in (place, rate)]
-        units = _units_of_place_and_rate(time, place.signal, rate.signal, stated_rates)
+        units = _units_of_position_and_rate(time, place.signal, rate.signal, stated_rates)
         if not units:
             continue
         *others, words = ["", *(f"{p} and {v.replace('_', '/')}" for p, v in reversed(units[:4]))]
@@ -283,17 +287,17 @@ def _by_rate(
             quantity, other = quantities_of_both[k], (rate, place)[k]
             column = next(c for c, u in columns[quantity].items() if u == units[0][k])
             question = "" if None not in stated_rates else f"by {other.signal.path}, in {words}{either}"
-            agreed[candidate.signal.path] = Candidate(candidate.signal, quantity, column, question)
+            agreed[candidate.signal.path] = ColumnCandidate(candidate.signal, quantity, column, question)
     yield from (agreed.get(c.signal.path, c) for c in pool)
 
 
-def _units_of_place_and_rate(
+def _units_of_position_and_rate(
     time: np.ndarray, place: Signal, rate: Signal, stated: Sequence[str | None]
 ) -> list[tuple[str, str]]:
-    """Units in which a place is the integral of its rate, empty if it is not.
+    """Units in which a position is the integral of its rate, empty if it is not.
 
     Args:
-        time: time of both [s].
+        time: time of both signals [s].
         stated: unit of each, None if it states none.
     """
     turned = np.asarray(rate.load(), float)
@@ -311,7 +315,7 @@ def _units_of_place_and_rate(
 
 
 def _integral_factor(time: np.ndarray, place: np.ndarray, rate: np.ndarray) -> float:
-    """Factor from the integral of a rate to its place, NaN if the place is not that integral."""
+    """Ratio of a position to the integral of a rate, NaN if the position is not that integral."""
     step = np.diff(time)
     sound = np.isfinite(step) & (step > 0) & np.isfinite(np.diff(place)) & np.isfinite(rate[1:] + rate[:-1])
     if sound.sum() < 3:
@@ -326,12 +330,12 @@ def _integral_factor(time: np.ndarray, place: np.ndarray, rate: np.ndarray) -> f
     return factor if rest < INTEGRAL else math.nan
 
 
-def _by_power(pool: Iterable[Candidate]) -> Iterator[Candidate]:
-    """Candidates. Of two currents next to a duty, that of the supply is the motor's times the duty."""
+def _currents_by_duty(pool: Iterable[ColumnCandidate]) -> Iterator[ColumnCandidate]:
+    """Candidates for two currents next to a duty: the supply current is the motor current times the duty."""
     pool = [*pool]
     duty = next((c for c in pool if c.quantity == "duty"), None)
     currents = [c for c in pool if c.quantity in ("total_current", "motor_current")]
-    load: Callable[[Candidate], np.ndarray] = lambda c: np.abs(np.asarray(c.signal.load(), float) * c.factor)  # noqa: E731
+    load: Callable[[ColumnCandidate], np.ndarray] = lambda c: np.abs(np.asarray(c.signal.load(), float) * c.factor)  # noqa: E731
     meant = {id(c): c.quantity for c in currents}
     for supply, motor in itertools.permutations(currents, 2) if duty is not None else ():
         if duty is None or not supply.signal.length == motor.signal.length == duty.signal.length:

@@ -1,4 +1,4 @@
-"""Requirements as TOML files: limits on a robot's performance over an envelope of use, units in the names."""
+"""Requirements as TOML files: limits on a robot's performance over an envelope of use. Names include units."""
 
 from __future__ import annotations
 
@@ -48,10 +48,10 @@ class Envelope:
     """Ranges of the conditions under which a requirement must be met.
 
     Attributes:
-        configuration: configuration of the robot, by name. Empty: its first.
+        configuration: name of the configuration. Empty: the first one of the robot.
         surface: surface of Table 5. battery: on the battery, else on the external supply.
-        payload_kg, slope_deg, state_of_charge, supply_voltage_V: as named.
-        ambient_C: None: the robot's own ambient temperature.
+        payload_kg, slope_deg, state_of_charge, supply_voltage_V: ranges, units as named.
+        ambient_C: ambient temperature [°C]. None: that of the robot.
     """
 
     configuration: str = ""
@@ -65,17 +65,19 @@ class Envelope:
 
     @property
     def charge(self) -> Range:
-        """State of charge, or the voltage of the external supply."""
+        """Range of the state of charge or, with an external supply, of its voltage."""
         return self.state_of_charge if self.battery else (self.supply_voltage_V or (0.0, 0.0))
 
     @property
     def charge_end(self) -> float:
-        """State of charge at the end of the battery's use: the least of its range, 0 if the range is one number."""
+        """State of charge at the end of the battery's use: the lower end of its range. 0 if the range is one
+        number.
+        """
         low, high = self.state_of_charge
         return low if low < high else 0.0
 
     def meets(self, other: Envelope) -> bool:
-        """True if the two have some use in common."""
+        """True if two envelopes have conditions in common."""
         if (self.configuration, self.surface, self.battery) != (other.configuration, other.surface, other.battery):
             return False
         pairs = [(getattr(self, key), getattr(other, key)) for key in RANGES]
@@ -84,16 +86,16 @@ class Envelope:
 
 @dataclasses.dataclass(frozen=True)
 class Requirement:
-    """One requirement.
+    """One requirement: a quantity with a limit.
 
     Attributes:
-        name: one of `QUANTITIES`.
-        limit: limit in the unit of the name, None: as the part is rated.
-        least: true if the quantity has to be at least the limit, false if at most.
+        name: name of the quantity, one of `QUANTITIES`.
+        limit: limit in the unit of the name. None: the rating of the part.
+        least: true if the quantity must be at least the limit, false if at most.
         envelope: conditions under which it has to be met.
-        share: share of the time that the robot drives, for the endurance. 0: it stands.
-        tread_mm: tread of stairs, for their rise.
-        source: where the requirement comes from.
+        share: for endurance, share of the time in which the robot drives. 0: it stands.
+        tread_mm: for the rise of stairs, their tread [mm].
+        source: origin of the requirement.
     """
 
     name: str
@@ -133,10 +135,10 @@ class Requirements:
 
 
 def load_requirements(path: Path | None) -> Requirements:
-    """The requirements of a file, or without one the paper's aims.
+    """Requirements of a file or, without a file, the aims of the paper.
 
     Raises:
-        BadConfiguration: no such file, and what `parse_requirements` raises.
+        BadConfiguration: there is no such file, or as in `parse_requirements`.
     """
     if path is None or str(path) == PAPER:
         packaged = resources.files("calibration") / "data" / "aims" / f"{PAPER}.toml"
@@ -185,12 +187,12 @@ def parse_requirements(text: str, where: str) -> Requirements:
             each += _requirements_of_entry(name, table, envelope, place)
     if not each:
         raise BadConfiguration(f"{where}: contains no requirement; expected one of {', '.join(QUANTITIES)}")
-    _contradictions(each, envelope, where)
+    _check_consistent(each, envelope, where)
     return Requirements(where, envelope, tuple(each), text)
 
 
 def _stem_of_name(name: str) -> str:
-    """A name without its unit."""
+    """Name without its unit."""
     units = ("_m_s", "_mm", "_deg", "_kg", "_min", "_C", "_Nm", "_rpm", "_A", "_Wh", "_V")
     return next((name.removesuffix(u) for u in units if name.endswith(u)), name)
 
@@ -207,7 +209,7 @@ def _unknown_name_error(name: str, known: Iterable[str]) -> str:
     return f"{name}: no such key; {allowed_words(name, known)}"
 
 
-def _range(value: Any, where: str, low: float, high: float, unit: str) -> Range:
+def _parse_range(value: Any, where: str, low: float, high: float, unit: str) -> Range:
     ends = value if isinstance(value, list) else [value, value]
     if len(ends) != 2:
         raise BadConfiguration(f"{where}: got {value}; expected a number or [least, greatest]")
@@ -218,14 +220,14 @@ def _range(value: Any, where: str, low: float, high: float, unit: str) -> Range:
 
 
 def _updated_envelope(base: Envelope, stated: Mapping[str, Any], where: str) -> Envelope:
-    """`base` with the stated values in place of its own."""
+    """Envelope with the stated values in place of those of `base`."""
     envelope: Json = {}
     for key, value in stated.items():
         place = f"{where}.{key}"
         if key not in KEYS:
             raise BadConfiguration(f"{where}, {_unknown_name_error(key, KEYS)}")
         if key in RANGES:
-            envelope[key] = _range(value, place, *RANGES[key])
+            envelope[key] = _parse_range(value, place, *RANGES[key])
         elif key == "battery":
             if not isinstance(value, bool):
                 raise BadConfiguration(f"{place}: got {value!r}; expected true or false")
@@ -252,10 +254,10 @@ def _updated_envelope(base: Envelope, stated: Mapping[str, Any], where: str) -> 
 
 
 def _requirements_of_entry(name: str, value: Any, envelope: Envelope, where: str) -> list[Requirement]:
-    """The one or two requirements (least, most) of one entry."""
+    """Requirements of one entry: at least, at most, or both."""
     quantity = QUANTITIES[name]
     table = dict(value) if isinstance(value, dict) else {"least" if quantity.least else "most": value}
-    limits = {s: _limit(table.pop(s), where, quantity) for s in ("least", "most") if s in table}
+    limits = {s: _parse_limit(table.pop(s), where, quantity) for s in ("least", "most") if s in table}
     source, duty, share = table.pop("source", ""), table.pop("duty", None), table.pop("share", None)
     tread = table.pop(TREAD) if TREAD in table and name == STAIRS else None
     own_keys = {"endurance_min": ("duty", "share"), STAIRS: (TREAD,)}.get(name, ())
@@ -288,14 +290,14 @@ def _requirements_of_entry(name: str, value: Any, envelope: Envelope, where: str
         own_envelope = dataclasses.replace(
             own_envelope, state_of_charge=(own_envelope.charge_end, own_envelope.charge_end)
         )
-    driven = _share(duty, share, where)
+    driven = _parse_share(duty, share, where)
     return [
         Requirement(name, limit, sense == "least", own_envelope, driven, source, depth)
         for sense, limit in limits.items()
     ]
 
 
-def _limit(value: Any, where: str, quantity: Quantity) -> float | None:
+def _parse_limit(value: Any, where: str, quantity: Quantity) -> float | None:
     if value == RATED:
         if quantity.column not in RATINGS:
             raise BadConfiguration(
@@ -306,7 +308,7 @@ def _limit(value: Any, where: str, quantity: Quantity) -> float | None:
     return stated_number(value, where, *limits, quantity.unit)
 
 
-def _share(duty: Any, share: Any, where: str) -> float:
+def _parse_share(duty: Any, share: Any, where: str) -> float:
     if duty is not None and duty not in DUTIES:
         raise BadConfiguration(f"{where}, duty: got {duty!r}; {allowed_words(str(duty), DUTIES)}")
     if share is None:
@@ -321,7 +323,7 @@ def _share(duty: Any, share: Any, where: str) -> float:
 _SAME = {"speed_end_of_charge_m_s": "speed_m_s", "gearbox_speed_rpm": "motor_speed_rpm"}
 
 
-def _contradictions(each: list[Requirement], envelope: Envelope, where: str) -> None:
+def _check_consistent(each: list[Requirement], envelope: Envelope, where: str) -> None:
     for a, b in combinations(each, 2):
         least, most = (a, b) if a.least else (b, a)
         same = _SAME.get(a.name, a.name) == _SAME.get(b.name, b.name)

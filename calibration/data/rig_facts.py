@@ -1,4 +1,4 @@
-"""Facts that follow from a rig's numbers, and doubts about unusual ones."""
+"""Values that follow from a rig's numbers, and doubts about unusual numbers."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from calibration.data import Names, rig_file
 from calibration.data.columns import CURRENT, LOAD, SPEED, SUPPLY
-from calibration.data.courses import applied_drive, changing_columns, course_stretches
+from calibration.data.courses import applied_drive, changing_columns, intervals_by_run
 from calibration.data.input_errors import three_digits
 from calibration.data.robot_file import RobotFile
 from calibration.data.row_checks import time_constant
@@ -31,13 +31,13 @@ FAR, RISING = 100.0, 3
 
 
 @dataclasses.dataclass(frozen=True)
-class Fact:
-    """A value derived from a rig's numbers, for a plausibility check.
+class DerivedFact:
+    """A value that follows from the numbers of a rig, for a plausibility check.
 
     Attributes:
-        what: in words.
-        value: value with its unit.
-        odd: reason to check its numbers again, else empty.
+        what: meaning, in words.
+        value: value with its unit, as text.
+        odd: reason to check the numbers, empty if there is none.
     """
 
     what: str
@@ -45,84 +45,86 @@ class Fact:
     odd: str = ""
 
 
-def derived_facts(robot: Robot) -> list[Fact]:
-    """Returns facts that follow from the numbers of a robot's motor, gearbox and loads."""
-    facts = [*_motor(robot), *_gearbox(robot)]
+def derived_facts(robot: Robot) -> list[DerivedFact]:
+    """Values that follow from the numbers of a robot's motor, gearbox and loads."""
+    facts = [*_motor_facts(robot), *_gearbox_facts(robot)]
     for name, load in robot.configurations.items():
-        facts += _shaft(robot, name, load) if isinstance(load, Shaft) else _vehicle(robot, name)
+        facts += _shaft_facts(robot, name, load) if isinstance(load, Shaft) else _vehicle_facts(robot, name)
     return facts
 
 
-def _outside(value: float, low: float, high: float, why: str) -> str:
-    """`why` if a value is outside the usual range, else empty."""
+def _reason_if_outside(value: float, low: float, high: float, why: str) -> str:
+    """`why`, with the usual range, if a value is outside that range. Otherwise empty."""
     return "" if low <= value <= high else f"{why} (usual: {three_digits(low)} to {three_digits(high)})"
 
 
-def _motor(robot: Robot) -> Iterator[Fact]:
+def _motor_facts(robot: Robot) -> Iterator[DerivedFact]:
     motor = robot.motor
     constant, resistance, inertia = (float(x) for x in (motor.torque_constant, motor.resistance, motor.inertia))
     voltage = motor.voltage_limit
     with_constant, with_resistance = robot.knows(["motor.torque_constant"]), robot.knows(["motor.resistance"])
     if with_constant:
         per_volt = 1 / constant / RPM
-        odd = _outside(per_volt, 5, 20_000, "is torque_constant in N·m/A? 1 mN·m/A is 0.001")
-        yield Fact("no-load speed per volt", f"{three_digits(per_volt)} rpm/V", odd)
+        odd = _reason_if_outside(per_volt, 5, 20_000, "is torque_constant in N·m/A? 1 mN·m/A is 0.001")
+        yield DerivedFact("no-load speed per volt", f"{three_digits(per_volt)} rpm/V", odd)
         idle = float(motor.friction_coulomb) / constant
-        odd = _outside(idle, 0, 10, "is friction_coulomb in N·m? it is torque_constant times the no-load current")
-        yield Fact("current needed to overcome the motor's dry friction", f"{three_digits(idle)} A", odd)
+        odd = _reason_if_outside(
+            idle, 0, 10, "is friction_coulomb in N·m? it is torque_constant times the no-load current"
+        )
+        yield DerivedFact("current needed to overcome the motor's dry friction", f"{three_digits(idle)} A", odd)
     if with_constant and voltage is not None:
         fastest = voltage / constant
         odd = "" if fastest < 2 * motor.speed_limit else ("more than twice motor.speed_limit; check torque_constant")
-        yield Fact(f"no-load speed at {three_digits(voltage)} V", f"{three_digits(fastest / RPM)} rpm", odd)
+        yield DerivedFact(f"no-load speed at {three_digits(voltage)} V", f"{three_digits(fastest / RPM)} rpm", odd)
     if with_resistance and voltage is not None:
         stall = float(motor.current_stall(voltage))
-        odd = _outside(stall, 0.02, 1000, "check motor.resistance")
-        yield Fact(f"stall current at {three_digits(voltage)} V", f"{three_digits(stall)} A", odd)
+        odd = _reason_if_outside(stall, 0.02, 1000, "check motor.resistance")
+        yield DerivedFact(f"stall current at {three_digits(voltage)} V", f"{three_digits(stall)} A", odd)
     if with_constant and with_resistance:
         size = constant**2 / resistance
-        odd = _outside(
+        odd = _reason_if_outside(
             size, 1e-7, 1.0, "torque_constant and resistance are unlikely to belong to one motor; check their units"
         )
-        yield Fact("torque over speed k²/R", f"{three_digits(size * 1e3)} mN·m·s", odd)
+        yield DerivedFact("torque over speed k²/R", f"{three_digits(size * 1e3)} mN·m·s", odd)
         if inertia > 0:
             constant_time = inertia / size
             why = "check motor.inertia (1 g·cm² is 1e-7 kg·m²), torque_constant and resistance"
-            odd = _outside(constant_time, 5e-4, 0.5, why)
-            yield Fact(
+            odd = _reason_if_outside(constant_time, 5e-4, 0.5, why)
+            yield DerivedFact(
                 "mechanical time constant of the motor alone J R/k²", f"{three_digits(constant_time * 1e3)} ms", odd
             )
 
 
-def _gearbox(robot: Robot) -> Iterator[Fact]:
+def _gearbox_facts(robot: Robot) -> Iterator[DerivedFact]:
     ratio, efficiency = float(robot.gearbox.ratio), float(robot.gearbox.efficiency_load)
-    odd = _outside(ratio, 1, 3000, "expected motor turns per output turn")
+    odd = _reason_if_outside(ratio, 1, 3000, "expected motor turns per output turn")
     if ratio >= STAGES and efficiency > EFFICIENCY:
         odd = f"an efficiency of {efficiency:g} is higher than usual for three or more stages (0.5 to {EFFICIENCY:g})"
     if ratio == 1 and efficiency < 0.9:
         odd = f"an efficiency of {efficiency:g} without a gearbox; is the ratio missing?"
-    yield Fact("gearbox", f"{ratio:g} : 1 with efficiency {efficiency:g}", odd)
+    yield DerivedFact("gearbox", f"{ratio:g} : 1 with efficiency {efficiency:g}", odd)
 
 
 def _output_torque_at(robot: Robot, current: float) -> float:
-    """Torque at the output of one drive at a motor current, with its losses [N·m]."""
+    """Output torque of one drive at a motor current, after losses [N·m]."""
     motor, gear = robot.motor, robot.gearbox
     lost = float(motor.friction_coulomb) + float(gear.friction_coulomb)
     return (float(motor.torque_constant) * current - lost) * float(gear.ratio) * float(gear.efficiency_load)
 
 
 def _current_for_torque(robot: Robot, torque: float) -> float:
-    """Motor current needed for a torque at its output, at low speed [A]."""
+    """Motor current for an output torque at low speed [A]."""
     motor, gear = robot.motor, robot.gearbox
     lost = float(motor.friction_coulomb) + float(gear.friction_coulomb)
     return (torque / (float(gear.ratio) * float(gear.efficiency_load)) + lost) / float(motor.torque_constant)
 
 
-def _current_fact(robot: Robot, what: str, torque: float, places: str) -> Iterator[Fact]:
-    """Current needed for a torque, compared with the stall current if a voltage limit is given."""
+def _current_fact(robot: Robot, what: str, torque: float, places: str) -> Iterator[DerivedFact]:
+    """Current for a torque, compared with the stall current if a voltage limit is known."""
     if not robot.knows(["motor.torque_constant"]):
         return
     current, limit = _current_for_torque(robot, torque), robot.motor.voltage_limit
-    odd = _outside(current, 0, 200, f"check {places}, and the gearbox")
+    odd = _reason_if_outside(current, 0, 200, f"check {places}, and the gearbox")
     if limit is not None and robot.knows(["motor.resistance"]):
         stall = float(robot.motor.current_stall(limit))
         if current > stall:
@@ -130,10 +132,10 @@ def _current_fact(robot: Robot, what: str, torque: float, places: str) -> Iterat
                 f"above the stall current {three_digits(stall)} A at {three_digits(limit)} V, so it cannot move; "
                 f"check {places}"
             )
-    yield Fact(what, f"{three_digits(current)} A per motor", odd)
+    yield DerivedFact(what, f"{three_digits(current)} A per motor", odd)
 
 
-def _shaft(robot: Robot, name: str, load: Shaft) -> Iterator[Fact]:
+def _shaft_facts(robot: Robot, name: str, load: Shaft) -> Iterator[DerivedFact]:
     friction, constant, gravity = (float(x) for x in (load.loss_coulomb, load.torque_constant, load.torque_gravity))
     places = f"{name}.loss_coulomb [N·m, at the output]"
     yield from _current_fact(robot, f"{name}: current to turn it slowly", friction + max(constant, 0.0), places)
@@ -143,44 +145,44 @@ def _shaft(robot: Robot, name: str, load: Shaft) -> Iterator[Fact]:
         )
         length = float(load.inertia) * GRAVITY / gravity
         why = f"{name}.inertia and {name}.torque_gravity are unlikely to belong to one arm (m l² and m g l)"
-        yield Fact(
+        yield DerivedFact(
             f"{name}: length of a pendulum with the same period",
             f"{three_digits(length * 1e3)} mm",
-            _outside(length, 0.01, 3.0, why),
+            _reason_if_outside(length, 0.01, 3.0, why),
         )
     if float(load.inertia) > 0 and float(robot.motor.inertia) > 0:
         share = float(load.inertia) / (float(robot.motor.inertia) * float(robot.gearbox.ratio) ** 2)
         why = f"check {name}.inertia and motor.inertia [kg·m²]; 1 g·cm² is 1e-7"
-        yield Fact(
+        yield DerivedFact(
             f"{name}: load inertia over motor inertia, both at the output",
             three_digits(share),
-            _outside(share, 1e-4, 1e4, why),
+            _reason_if_outside(share, 1e-4, 1e4, why),
         )
     if float(load.radius) != 1.0:
         travel = 2 * math.pi * float(load.radius)
-        yield Fact(
+        yield DerivedFact(
             f"{name}: travel per turn",
             f"{three_digits(travel * 1e3)} mm",
-            _outside(travel, 1e-4, 10.0, "check the travel"),
+            _reason_if_outside(travel, 1e-4, 10.0, "check the travel"),
         )
 
 
-def _vehicle(robot: Robot, name: str) -> Iterator[Fact]:
+def _vehicle_facts(robot: Robot, name: str) -> Iterator[DerivedFact]:
     load = robot.configurations[name]
     sides, mass, radius = float(robot.sides), float(load.mass), float(load.radius)
     rolling, static = float(load.ground.rolling_resistance), float(load.ground.friction.static)
-    odd = _outside(mass, 0.05, 2000, f"is {name}.mass in kg?")
-    yield Fact(f"{name}: weight", f"{three_digits(mass)} kg, {three_digits(mass * GRAVITY)} N", odd)
+    odd = _reason_if_outside(mass, 0.05, 2000, f"is {name}.mass in kg?")
+    yield DerivedFact(f"{name}: weight", f"{three_digits(mass)} kg, {three_digits(mass * GRAVITY)} N", odd)
     guide = float(load.track.guide_friction) * float(load.track.guide_share)
     torque = mass * GRAVITY * (rolling + guide) * radius / sides + float(load.track.loss_coulomb)
     places = f"{name}.ground.rolling_resistance and {name}.track.loss_coulomb"
     yield from _current_fact(robot, f"{name}: current to roll slowly on the flat", torque, places)
     grip = math.degrees(math.atan(static))
     odd = "" if static > rolling + guide else "it cannot move on the flat: friction.static is below the resistance"
-    yield Fact(
+    yield DerivedFact(
         f"{name}: steepest slope without sliding",
         f"{grip:.0f}°",
-        odd or _outside(grip, 5, 60, "check friction.static"),
+        odd or _reason_if_outside(grip, 5, 60, "check friction.static"),
     )
     limit = robot.motor.voltage_limit
     if limit is None or not robot.knows(["motor.resistance"]):
@@ -189,22 +191,22 @@ def _vehicle(robot: Robot, name: str) -> Iterator[Fact]:
     climb = pull * sides / (radius * mass * GRAVITY) - rolling - guide
     odd = "" if climb > 0 else "its motors cannot move it; check mass, ratio, torque_constant and resistance"
     angle = "any" if climb >= 1 else f"{math.degrees(math.asin(max(climb, 0.0))):.0f}°"
-    yield Fact(f"{name}: steepest slope that the stall torque holds at {three_digits(limit)} V", angle, odd)
+    yield DerivedFact(f"{name}: steepest slope that the stall torque holds at {three_digits(limit)} V", angle, odd)
     speed = limit / float(robot.motor.torque_constant) / float(robot.gearbox.ratio) * radius
-    odd = _outside(speed, 0.005, 15, f"check {name}.radius, gearbox.ratio and motor.torque_constant")
-    yield Fact(f"{name}: no-load speed at {three_digits(limit)} V", f"{three_digits(speed)} m/s", odd)
+    odd = _reason_if_outside(speed, 0.005, 15, f"check {name}.radius, gearbox.ratio and motor.torque_constant")
+    yield DerivedFact(f"{name}: no-load speed at {three_digits(limit)} V", f"{three_digits(speed)} m/s", odd)
 
 
 def doubtful_time(runs: Runs, robot: Robot) -> str:
-    """Reason to read a log's time as milliseconds, empty without evidence.
+    """Reason to suspect that the time of a log is in milliseconds, empty without evidence.
 
-    At a constant voltage, the speed then changes over far longer than the motors take with their load.
+    At constant voltage, its speed then changes over far longer than motors with their load take.
     """
     if not runs.sampled or robot.rig.imposed != "voltage":
         return ""
     longest = FAR * time_constant(robot)
     moving = [c for c in runs.channels if c.zero_at_rest and c.directed and runs.has(c.column)]
-    for stretch in (s for run in course_stretches(runs) for s in run if len(s.rows) >= 4 * RISING):
+    for stretch in (s for run in intervals_by_run(runs) for s in run if len(s.rows) >= 4 * RISING):
         time = runs["time_s"][stretch.rows]
         for channel in moving:
             readings = runs[channel.column][stretch.rows]
@@ -232,7 +234,7 @@ LEAST, MOST = 0.1, 100.0
 def doubtful_current(runs: Runs, robot: Robot) -> str:
     """Reason to doubt the unit of an imposed current or torque, empty without evidence.
 
-    Such a current is far from the current that turns the loads of the table slowly.
+    The current is far from the one that turns the loads of the table slowly.
     """
     column, present = runs.layout.imposed_column, set(runs["configuration"])
     loads = [x for name, x in robot.configurations.items() if name in present and isinstance(x, Shaft)]
@@ -256,17 +258,17 @@ def doubtful_current(runs: Runs, robot: Robot) -> str:
 LONG = 100.0
 
 
-def _times_between(runs: Runs) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
-    """Name of each run of a log, its rows in the order of time, and the times between these [s]."""
+def _time_steps_of_runs(runs: Runs) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
+    """For each run of a log: its name, its rows in order of time, and the time steps between them [s]."""
     for name in np.unique(runs.run_names) if runs.sampled else ():
         rows = runs.in_order(name)
         yield name, rows, np.diff(runs["time_s"][rows])
 
 
 def gap_sentence(runs: Runs) -> str:
-    """Sentence on the longest time between two rows of a run, if rows may be missing there, empty otherwise."""
+    """Sentence on the longest time step of a log, if rows may be missing there. Otherwise empty."""
     worst, told = 0.0, ""
-    for _, rows, steps in _times_between(runs):
+    for _, rows, steps in _time_steps_of_runs(runs):
         usual = float(np.median(steps)) if len(steps) else 0.0
         long = steps > LONG * usual
         if not (usual > 0 and long.any() and steps.max() > worst):
@@ -287,12 +289,12 @@ UNEVEN, TURNS_BACK, ROWS_OF_CLOCK = 0.1, -0.3, 50
 
 
 def jitter_sentence(runs: Runs) -> str:
-    """Sentence on a clock that jitters about even rows, empty otherwise.
+    """Sentence on a clock that jitters although rows are evenly spaced. Otherwise empty.
 
-    If rows are even and the clock's errors independent, the times between rows correlate with the next by -1/2. If
-    the rows themselves are uneven, these times are independent and correlate by 0.
+    If rows are even and clock errors independent, successive time steps correlate by -1/2. If the rows themselves are
+    uneven, time steps are independent.
     """
-    for name, rows, steps in _times_between(runs):
+    for name, rows, steps in _time_steps_of_runs(runs):
         usual = float(np.median(steps)) if len(steps) > ROWS_OF_CLOCK else 0.0
         off = np.clip(steps - usual, -usual, usual)
         spread = float(np.std(off))
@@ -308,8 +310,8 @@ def jitter_sentence(runs: Runs) -> str:
     return ""
 
 
-def one_level(runs: Runs) -> str:
-    """Sentence on a log without any condition that changes, empty for others."""
+def constant_conditions_sentence(runs: Runs) -> str:
+    """Sentence on a log in which no condition changes, empty for others."""
     conditions = (*changing_columns(runs), *(c for c in runs.layout.sides if runs.has(c)))
     column = runs.layout.imposed_column
     if not (runs.sampled and runs.has(column) and np.isfinite(runs[column]).all()):
@@ -330,10 +332,10 @@ INNER, ROWS_INNER, FITS, REACHES = 0.25, 30, 0.2, 0.8
 
 
 def saturation_sentence(runs: Runs) -> str:
-    """Sentence on a voltage in a log that the driver does not reach, empty without evidence.
+    """Sentence on a command voltage that the driver does not reach, empty without evidence.
 
-    Rows of small voltage give U = R I + k ω by least squares. In rows of a larger voltage, current and speed show one
-    voltage all the time if the driver limits it.
+    Rows at low voltage give U = R I + k ω by least squares. If the driver limits the voltage, rows at higher commands
+    have currents and speeds that correspond to one constant voltage.
     """
     # With a duty, the supply's current is only a share of the motors' current.
     current_columns = [CURRENT, *(() if runs.has("duty") else ("total_current_A",))]
@@ -372,8 +374,8 @@ OTHER_UNIT = 3.0
 def doubtful_speed(runs: Runs, robot: Robot) -> str:
     """Reason to doubt the unit of an imposed voltage or of the speed, empty without evidence.
 
-    The speed is far above that at which the motors' back-EMF equals the voltage. A load keeps it below, so only rows
-    without current or without a brake's torque show a speed that is far too small.
+    The speed is far above the one at which the back-EMF equals the voltage. A load lowers the speed, so a speed that
+    is too small shows only in rows without current or brake torque.
     """
     column = next((c for c in (SPEED, OUTPUT_SPEED) if runs.has(c)), None)
     if robot.rig.imposed != "voltage" or not robot.knows(VOLTAGE) or column is None:
@@ -402,9 +404,9 @@ BEYOND = 3.0
 
 
 def doubtful_torque(runs: Runs, robot: Robot) -> str:
-    """Reason to doubt the unit of a brake's torque, empty without evidence, or if the speed is imposed.
+    """Reason to doubt the unit of a brake torque, empty without evidence or if the speed is imposed.
 
-    Most rows of such a torque are far above the torque that stalls the motors.
+    In most rows the torque is far above the stall torque of the motors.
     """
     of_current = robot.rig.imposed == "motor_current"
     if not runs.has(LOAD) or not (of_current or (robot.rig.imposed == "voltage" and robot.knows(VOLTAGE))):
@@ -442,7 +444,7 @@ def still_sentence(runs: Runs) -> str:
 
 
 def held_sentence(runs: Runs) -> str:
-    """Sentence on readings that repeat the last value while what is imposed changes, empty for others."""
+    """Sentence on readings that repeat their last value while the imposed quantity changes, empty for others."""
     imposed = runs.layout.imposed_column
     if not (runs.sampled and runs.has(imposed)):
         return ""
@@ -464,7 +466,7 @@ def held_sentence(runs: Runs) -> str:
 
 
 def swapped_sentence(runs: Runs) -> str:
-    """Sentence on a speed whose sign swaps within a log, by the power of the drive, empty for others."""
+    """Sentence on a speed whose sign changes within a log although the drive does not, empty for others."""
     imposed = runs.layout.imposed_column
     if not (runs.sampled and runs.has(imposed) and np.nanmin(runs[imposed]) < 0 < np.nanmax(runs[imposed])):
         return ""  # what never changes its sign may lack one, which other checks report
@@ -485,12 +487,12 @@ def swapped_sentence(runs: Runs) -> str:
 
 
 def log_doubts(runs: Runs, robot: Robot) -> Names:
-    """Sentences on a log's times, its levels and limits, and on units that do not fit the robot."""
+    """Sentences on doubts about a log: its times, levels and limits, and units that do not fit the robot."""
     every = (
         gap_sentence(runs),
         jitter_sentence(runs),
         saturation_sentence(runs),
-        one_level(runs),
+        constant_conditions_sentence(runs),
         still_sentence(runs),
         held_sentence(runs),
         swapped_sentence(runs),
@@ -503,13 +505,13 @@ def log_doubts(runs: Runs, robot: Robot) -> Names:
 
 
 @dataclasses.dataclass(frozen=True)
-class Origin:
-    """Origin of a number of a robot.
+class NumberOrigin:
+    """Origin of a parameter value.
 
     Attributes:
         name: name of the parameter, value [unit].
-        sd: as stated, None if the file states none.
-        why: in words.
+        sd: standard deviation, None if the file states none.
+        why: origin, in words.
     """
 
     name: str
@@ -519,8 +521,8 @@ class Origin:
     why: str
 
 
-def number_origins(file: RobotFile) -> list[Origin]:
-    """Returns the origin of each number of a robot. In each part, numbers that no file states come last."""
+def number_origins(file: RobotFile) -> list[NumberOrigin]:
+    """Origin of each number of a robot, part by part. Numbers that no file states come last in their part."""
     robot, stated = file.robot, file.stated
     priors = {name: sd for name, _, sd in robot.rig.priors}
     origins = []
@@ -542,12 +544,12 @@ def number_origins(file: RobotFile) -> list[Origin]:
         elif head == BATTERY and not robot.knows([p.name]):
             why = "not stated: an example value; results on the battery depend on it"
         else:
-            why = _default(p.name, rest if mine else "")
-        origins.append(Origin(p.name, float(p.value), p.spec.unit, priors.get(p.name), why))
+            why = _reason_of_default(p.name, rest if mine else "")
+        origins.append(NumberOrigin(p.name, float(p.value), p.spec.unit, priors.get(p.name), why))
     return origins
 
 
-def _default(name: str, rest: str) -> str:
+def _reason_of_default(name: str, rest: str) -> str:
     if name == "motor.inductance":
         return rig_file.WINDING_WHY
     if name == rig_file.CENTRE:

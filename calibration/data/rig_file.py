@@ -1,4 +1,4 @@
-"""Statements of a robot file on a rig: its loads, the imposed quantity, channels, columns and instruments."""
+"""Entries of a robot file that describe a rig: its loads, imposed quantity, channels, columns and instruments."""
 
 from __future__ import annotations
 
@@ -84,23 +84,24 @@ FOLLOWS = {
 
 
 def linear_to_shaft(table: Json, name: str, where: str, sds: dict[str, float], sides: float) -> None:
-    """Converts the table of a linear unit, and its sds, into the table of the shaft of one of its drives.
+    """Converts the table of a linear unit, and its standard deviations, into the table of a shaft for one of its
+    drives.
 
-    Travel r per radian is lead / 2π or the drum's radius. With n drives, each drive has
+    Travel per radian r is lead / 2π or the radius of the drum. With n drives, each drive has
 
         J = J_0 + m r² / n,  M_0 = F_0 r / n.  K = b r² / n,  M_c = (F_c + m g sin α) r / n.
 
-    The sds are first order for independent inputs. Exact inputs give exact values.
+    The standard deviations are first order for independent inputs. Exact inputs give exact values.
 
     Args:
         table: table of the configuration `name`, without `load`.
-        where: opens the message of an error.
-        sds: stated, by dotted name.
-        sides: drives that move it together.
+        where: beginning of the error message.
+        sds: stated standard deviations, by dotted name.
+        sides: number of drives that move it together.
 
     Raises:
-        BadConfiguration: an unknown key, a value that is no number, no mass, not exactly one travel, or a mass or
-            travel that is not positive.
+        BadConfiguration: a key is unknown, a value is no number, the mass is missing, there is not exactly one
+            travel, or mass or travel is not positive.
     """
     for key in table:
         stated_word(key, LINEAR, f"{where}.{key}", "no such key of a linear unit")
@@ -114,20 +115,21 @@ def linear_to_shaft(table: Json, name: str, where: str, sds: dict[str, float], s
     if "mass_kg" not in values:
         raise BadConfiguration(f"{where}.mass_kg: missing; expected the mass that it moves [kg]")
     table.clear()
-    table.update(_shaft(values, sides))
+    table.update(_shaft_of_linear_unit(values, sides))
     inputs = {key: sds.pop(f"{name}.{key}") for key in values if f"{name}.{key}" in sds}
     exact = {key for key, sd in inputs.items() if sd == 0}
     for result in table:
         moved = {
             key
             for key in values
-            if _shaft({**values, key: 1.01 * values[key] + 1e-6}, sides)[result] != table[result]
+            if _shaft_of_linear_unit({**values, key: 1.01 * values[key] + 1e-6}, sides)[result] != table[result]
         }
         if moved and moved <= exact:
             sds[f"{name}.{result}"] = 0.0
             continue
         steps = [
-            _shaft({**values, key: values[key] + sd}, sides)[result] - table[result] for key, sd in inputs.items()
+            _shaft_of_linear_unit({**values, key: values[key] + sd}, sides)[result] - table[result]
+            for key, sd in inputs.items()
         ]
         sd = math.hypot(*steps)
         if sd > 0:
@@ -142,7 +144,7 @@ def _linear_value(table: Mapping[str, Any], key: str, where: str) -> float:
     return float(value)
 
 
-def _shaft(at: Mapping[str, float], sides: float) -> dict[str, float]:
+def _shaft_of_linear_unit(at: Mapping[str, float], sides: float) -> dict[str, float]:
     travel = (at["lead_mm"] / (2 * math.pi) if "lead_mm" in at else at["drum_radius_mm"]) * 1e-3
     weight = at["mass_kg"] * GRAVITY * math.sin(math.radians(at.get("incline_deg", 0.0)))
     return {
@@ -155,35 +157,37 @@ def _shaft(at: Mapping[str, float], sides: float) -> dict[str, float]:
 
 
 def vehicle_defaults(on_tracks: bool, table: Mapping[str, Any], sides: float) -> dict[str, float]:
-    """Returns default values of a vehicle that starts from nothing.
+    """Default values of a vehicle in a robot file without a base.
 
     Args:
-        table: table that its file states of it.
-        sides: drives that move it together.
+        table: table of the vehicle in the file.
+        sides: number of drives that move it together.
     """
 
-    def stated(*keys: str) -> float:
+    def stated_value(*keys: str) -> float:
         entry: Any = table
         for key in keys:
             entry = entry.get(key) if isinstance(entry, Mapping) else None
         return float(entry) if is_number(entry) else 0.0  # a value that is no number is refused later
 
     defaults = {name: value for name, (value, _) in VEHICLE.items() if not (on_tracks and name in _OF_TRACKS)}
-    wheels = 0.5 * WHEELS * stated("mass") * stated("radius") ** 2 / sides
-    return defaults | {DYNAMIC: DYNAMIC_SHARE * stated(*DYNAMIC.split(".")[:-1], "static"), "inertia": wheels}
+    wheels = 0.5 * WHEELS * stated_value("mass") * stated_value("radius") ** 2 / sides
+    return defaults | {DYNAMIC: DYNAMIC_SHARE * stated_value(*DYNAMIC.split(".")[:-1], "static"), "inertia": wheels}
 
 
 def parse_rig(content: Json, where: str, loads: Sequence[str], *, travels: bool, inherits: bool) -> Rig:
-    """The rig that a file's content states. Takes the `KEYS` out of it.
+    """Rig that a robot file describes. Its keys (`KEYS`) are removed from `content`.
 
     Args:
+        content: content of the file.
+        where: beginning of the error message.
         loads: names of the configurations.
-        travels: true if their travel can be measured.
+        travels: true if the travel of the loads can be measured.
         inherits: true if the robot has a base.
 
     Raises:
-        BadConfiguration: an unknown word, channel or column, a channel that is imposed, or an instrument of a channel
-            that the rig does not have.
+        BadConfiguration: a word, channel or column is unknown, a channel is imposed, or an instrument belongs to a
+            channel that the rig does not have.
     """
     stated = content.pop("imposed", IMPOSED[0])
     imposed = stated_word(
@@ -192,7 +196,7 @@ def parse_rig(content: Json, where: str, loads: Sequence[str], *, travels: bool,
     start = stated_word(content.pop("start", STARTS[0]), STARTS, f"{where}, start")
     between = stated_word(content.pop("between_rows", BETWEEN[0]), BETWEEN, f"{where}, between_rows")
     usual = [name for name in channels.USUAL if travels or name != "speed"]
-    names = _channels(content.pop("channels", [n for n in usual if n != imposed]), f"{where}, channels")
+    names = _parse_channels(content.pop("channels", [n for n in usual if n != imposed]), f"{where}, channels")
     if idle := {imposed, f"{imposed}_left", f"{imposed}_right"} & set(names):
         raise BadConfiguration(
             f"{where}, channels: {min(idle)} is imposed, so it cannot be a reading; remove it, or set imposed = "
@@ -201,16 +205,16 @@ def parse_rig(content: Json, where: str, loads: Sequence[str], *, travels: bool,
     return Rig(
         imposed=imposed,
         channels=names,
-        instruments=_instruments(content.pop("instruments", {}), names, where),
-        columns=_columns(content.pop("columns", {}), where),
+        instruments=_parse_instruments(content.pop("instruments", {}), names, where),
+        columns=_parse_columns(content.pop("columns", {}), where),
         start=start,
         between_rows=between,
-        surfaces=_surfaces(content.pop("surfaces", {}), loads, where),
+        surfaces=_parse_surfaces(content.pop("surfaces", {}), loads, where),
         inherits=inherits,
     )
 
 
-def _channels(stated: Any, where: str) -> Names:
+def _parse_channels(stated: Any, where: str) -> Names:
     every = channels.channel_names(channels.EVERY)
     if not isinstance(stated, list) or not stated or not all(isinstance(name, str) for name in stated):
         raise BadConfiguration(
@@ -223,7 +227,7 @@ def _channels(stated: Any, where: str) -> Names:
     return tuple(name for name in every if name in stated)
 
 
-def _surfaces(stated: Any, loads: Sequence[str], where: str) -> tuple[tuple[str, str], ...]:
+def _parse_surfaces(stated: Any, loads: Sequence[str], where: str) -> tuple[tuple[str, str], ...]:
     here = f"{where}, surfaces"
     if not isinstance(stated, dict):
         raise BadConfiguration(f"{here}: got {stated!r}; expected a table [surfaces]")
@@ -237,7 +241,7 @@ def _surfaces(stated: Any, loads: Sequence[str], where: str) -> tuple[tuple[str,
 FREE = "free"
 
 
-def _instruments(stated: Any, names: Sequence[str], where: str) -> tuple[Instrument, ...]:
+def _parse_instruments(stated: Any, names: Sequence[str], where: str) -> tuple[Instrument, ...]:
     here = f"{where}, instruments"
     if not isinstance(stated, dict):
         raise BadConfiguration(f"{here}: got {stated!r}; expected tables such as [instruments.{names[0]}]")
@@ -265,7 +269,7 @@ def _instruments(stated: Any, names: Sequence[str], where: str) -> tuple[Instrum
     return tuple(instruments)
 
 
-def _columns(stated: Any, where: str) -> tuple[tuple[str, str, float], ...]:
+def _parse_columns(stated: Any, where: str) -> tuple[tuple[str, str, float], ...]:
     here = f"{where}, columns"
     if not isinstance(stated, dict):
         raise BadConfiguration(f"{here}: got {stated!r}; expected a table [columns]")
@@ -288,11 +292,11 @@ def _columns(stated: Any, where: str) -> tuple[tuple[str, str, float], ...]:
     return tuple(entries)
 
 
-def needed_parameters(rig: Rig, values: Iterable[tuple[str, Any]] = ()) -> Names:
-    """Parameters that a robot without a base must have: those of its drive, and of turning if it turns.
+def required_parameters(rig: Rig, values: Iterable[tuple[str, Any]] = ()) -> Names:
+    """Parameters that a robot file without a base must state: those of its drive and, if it turns, of turning.
 
     Args:
-        values: values of its parameters, by dotted name.
+        values: values of the robot's parameters, by dotted name.
     """
     turns = any(name.endswith(WIDTH) and is_number(value) and value > 0 for name, value in values)
     current = {"total_current", "motor_current", "winding_temperature"} & {*rig.channels, rig.imposed}
@@ -311,18 +315,18 @@ def needed_parameters(rig: Rig, values: Iterable[tuple[str, Any]] = ()) -> Names
     return tuple(name for name, wanted in conditions if wanted)
 
 
-def refuse_missing(
+def reject_missing(
     missing: Sequence[str], known: Mapping[str, params.Parameter], where: str, given: Iterable[str] = ()
 ) -> None:
-    """Reject a robot that starts from nothing and does not state all required parameters.
+    """Rejects a robot file without a base that does not state all required parameters.
 
     Args:
-        missing: names of parameters.
-        known: every parameter of the robot.
-        given: names that the file states. One of them may be misspelt.
+        missing: names of the missing parameters.
+        known: names of all parameters of the robot.
+        given: names that the file states, one of which may be misspelt.
 
     Raises:
-        BadConfiguration: one sentence that lists all of them.
+        BadConfiguration: a parameter is missing. One sentence lists all of them.
     """
     if missing:
         each = ", ".join(f"{name} [{known[name].spec.unit}]" for name in missing)
@@ -354,8 +358,8 @@ def with_priors(robot: Robot, sds: Mapping[str, float], where: str) -> Robot:
     return dataclasses.replace(robot, rig=dataclasses.replace(robot.rig, priors=priors))
 
 
-def moved_priors(robot: Robot, values: Mapping[str, float]) -> Robot:
-    """The robot with the stated priors of parameters that are given other values around those, as wide as before."""
+def recentre_priors(robot: Robot, values: Mapping[str, float]) -> Robot:
+    """Robot whose stated priors are centred on new parameter values, with unchanged widths."""
     if not set(values) & {name for name, _, _ in robot.rig.priors}:
         return robot
     priors = tuple((name, float(values.get(name, mean)), sd) for name, mean, sd in robot.rig.priors)
@@ -363,7 +367,7 @@ def moved_priors(robot: Robot, values: Mapping[str, float]) -> Robot:
 
 
 def rig_lines(rig: Rig) -> tuple[list[str], dict[str, list[str]]]:
-    """Lines of a robot file that state a rig: those of its head, then those of each table."""
+    """Lines of a robot file that describe a rig: the first lines, then those of each table."""
     head = [
         f'imposed = "{rig.imposed}"  # what sets the drives, one of {", ".join(IMPOSED)}',
         f"channels = {toml_value(list(rig.channels))}  # what its instruments show",
@@ -393,14 +397,14 @@ def rig_lines(rig: Rig) -> tuple[list[str], dict[str, list[str]]]:
 
 
 def value_text(name: str, value: float, rig: Rig) -> str:
-    """A parameter's value as a file has it, with ± where its prior is stated and it is unchanged since."""
+    """Value of a parameter as written in a file, with ± if its prior is stated and the value is unchanged."""
     for stated, mean, sd in rig.priors:
         if stated == name and mean == value:
             return f'"{value!r} ± {sd!r}"'
     return repr(value)
 
 
-def same_rig(rig: Rig) -> bool:
-    """True if a rig is driven and measured as a robot with a file that states nothing about it."""
+def is_default_rig(rig: Rig) -> bool:
+    """True if a rig is driven and measured like a robot whose file describes no rig."""
     usual = Rig()
     return all(getattr(rig, key) == getattr(usual, key) for key in KEYS)

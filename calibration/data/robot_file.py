@@ -1,4 +1,4 @@
-"""Robots as TOML files: a base robot by name, with added or replaced parameters and effects."""
+"""Robots as TOML files: a base robot by name, with changed or added parameters and effects."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import Any
 import jax.numpy as jnp
 
 from calibration.data import Json, Names, rig_file, stated
-from calibration.data.configuration_tables import loads_from_tables, resolved_likes
+from calibration.data.configuration_tables import loads_from_tables, resolve_likes
 from calibration.data.effect_file import Library
 from calibration.data.input_errors import BadConfiguration, allowed_words, is_number, stated_word
 from calibration.data.input_files import toml_content, toml_text
@@ -90,12 +90,12 @@ class RobotFile:
     """A robot and the origin of its numbers.
 
     Attributes:
-        robot: including changes from elsewhere, such as the command line.
-        source: path of its file, or name of a packaged robot. A packaged robot states no parameters.
-        stated: names of the parameters that the file states. A linear unit's keys become parameters of its shaft.
-        linear: configurations that it states as linear units.
+        robot: the robot, including changes from elsewhere such as the command line.
+        source: path of its file, or name of a packaged robot.
+        stated: names of the parameters in the file. The keys of a linear unit become parameters of its shaft.
+        linear: configurations that the file describes as linear units.
         text: text of the file.
-        remarks: sentences on the robot, for readers of its numbers.
+        remarks: sentences on the robot that readers of its numbers should know.
     """
 
     robot: Robot
@@ -113,12 +113,12 @@ class RobotFile:
 
 @in_double
 def load_robot(name_or_path: str, library: Library = effects.BY_NAME, notes: list[str] | None = None) -> Robot:
-    """A robot by its name or from its file.
+    """Robot with a packaged name, or from a robot file.
 
     Args:
         name_or_path: `nominal`, `sm1`, `sm2`, or a TOML file that `calibrate`, `loop` or `rig new` wrote.
         library: effects by name that the file may use.
-        notes: receives remarks on the file.
+        notes: function that receives remarks on the file.
 
     Raises:
         BadConfiguration: no such name or file, or an invalid value in the file.
@@ -127,20 +127,20 @@ def load_robot(name_or_path: str, library: Library = effects.BY_NAME, notes: lis
 
 
 def read_robot(path: Path, library: Library = effects.BY_NAME, notes: list[str] | None = None) -> Robot:
-    """The robot alone of `parse_robot_file`."""
+    """Robot from a file, as in `parse_robot_file` but without the origin of its numbers."""
     return parse_robot_file(path, library, notes).robot
 
 
 def find_robot_file(
     name_or_path: str, library: Library = effects.BY_NAME, notes: list[str] | None = None
 ) -> RobotFile:
-    """A robot by its name (`nominal`, `sm1`, `sm2`) or from a TOML file, with effects of `library`.
+    """Robot with a packaged name (`nominal`, `sm1`, `sm2`) or from a file, and the origin of its numbers.
 
     Args:
-        notes: receives a sentence for each value that is allowed and unlikely.
+        notes: function that receives a sentence for each value that is allowed but unlikely.
 
     Raises:
-        BadConfiguration: no such name or file, or what `parse_robot_file` raises.
+        BadConfiguration: there is no such name or file, or as in `parse_robot_file`.
     """
     if name_or_path in paper_robots.ROBOTS:
         return RobotFile(paper_robots.ROBOTS[name_or_path](), name_or_path)
@@ -177,7 +177,7 @@ def parse_robot_file(path: Path, library: Library = effects.BY_NAME, notes: list
 
     Raises:
         BadConfiguration: not TOML, an unknown key (with the choices), a value that is no number, not finite, or
-            outside the field's bounds, or what `configured` and `with_effects` raise.
+            outside the field's bounds, or what `configured` and `add_effects` raise.
     """
     text = toml_text(path, path.name)
     content = toml_content(text, path.name)
@@ -191,7 +191,7 @@ def parse_robot_file(path: Path, library: Library = effects.BY_NAME, notes: list
         raise BadConfiguration(f"{path.name}, schema: got {schema}; expected {SCHEMA}")
     base = content.pop("base", "nominal")
     stated_word(base, (*paper_robots.ROBOTS, rig_file.NONE), f"{path.name}, base")
-    robot, sds, linear = _without_parameters(
+    robot, sds, linear = _robot_before_parameters(
         None if base == rig_file.NONE else paper_robots.ROBOTS[base](),
         content,
         path.name,
@@ -207,25 +207,25 @@ def parse_robot_file(path: Path, library: Library = effects.BY_NAME, notes: list
     acting = {name: table.pop("configurations") for name, table in tables.items() if "configurations" in table}
     factors = {name: table.pop(FACTORS) for name, table in tables.items() if FACTORS in table}
     sized = {**effects.OF_TURNS, **effects.OF_CHANNELS, **library}
-    of_size = {name: _of_size(sized, name, value, path.name) for name, value in factors.items()}
-    robot = with_effects(robot, tuple(present), {**library, **of_size}, acting, where=path.name)
+    of_size = {name: _scaled_effect(sized, name, value, path.name) for name, value in factors.items()}
+    robot = add_effects(robot, tuple(present), {**library, **of_size}, acting, where=path.name)
     parameters = dict(_flatten(content))
     robot = rig_file.with_priors(change_robot(robot, parameters, where=path.name, notes=notes), sds, path.name)
     return RobotFile(robot, str(path), frozenset(parameters), linear, text)
 
 
-def _without_parameters(
+def _robot_before_parameters(
     base: Robot | None, content: Json, where: str, examples: Collection[str]
 ) -> tuple[Robot, dict[str, float], frozenset[str]]:
-    """The robot of a file's content before the parameters that it states, the sds stated of those, its linear units.
+    """Robot of a file before its parameters are applied, the standard deviations of those, and its linear units.
 
     Args:
-        base: None starts from nothing.
-        content: the function removes keys other than parameters.
-        examples: names of numbers that are still a template's.
+        base: base robot. None: there is no base.
+        content: content of the file. Keys other than parameters are removed from it.
+        examples: names of numbers that are still those of a template.
     """
     if base is None:
-        resolved_likes(content, where)
+        resolve_likes(content, where)
     tables = {key: value for key, value in content.items() if key not in rig_file.KEYS and isinstance(value, dict)}
     sds = stated.taken_apart(tables, where)
     values = dict(_flatten(tables))
@@ -254,18 +254,18 @@ def _without_parameters(
     for name in given:
         if "." not in name and name not in COUNTS:
             raise BadConfiguration(f"{where}, {name}: no such parameter; {_parameter_choices(name, parameters)}")
-    missing = [name for name in rig_file.needed_parameters(rig, given.items()) if name not in given]
+    missing = [name for name in rig_file.required_parameters(rig, given.items()) if name not in given]
     if not loads.travels and "speed" in rig.channels:
         missing += [f"{name}.radius" for name in loads.by_name if f"{name}.radius" not in given]
-    rig_file.refuse_missing([*missing, *loads.missing], parameters, where, given)
+    rig_file.reject_missing([*missing, *loads.missing], parameters, where, given)
     return robot, sds, loads.linear
 
 
-def _of_size(library: Library, name: str, factors: Any, where: str) -> type[effects.Effect]:
-    """The effect of a name with its priors and limits brought to the rig's size, as its file states.
+def _scaled_effect(library: Library, name: str, factors: Any, where: str) -> type[effects.Effect]:
+    """Effect whose priors and limits are scaled to the rig, as its file states.
 
     Raises:
-        BadConfiguration: not three positive numbers, or an effect without a prior size.
+        BadConfiguration: the scale is not three positive numbers, or the effect has no prior.
     """
     here = f"{where}, effects.{name}.{FACTORS}"
     if name not in library:
@@ -279,21 +279,21 @@ def _of_size(library: Library, name: str, factors: Any, where: str) -> type[effe
     return scaled_effect(library[name], (float(factors[0]), float(factors[1]), float(factors[2])))
 
 
-def with_effects(
+def add_effects(
     robot: Robot,
     names: Sequence[str],
     library: Library = effects.BY_NAME,
     configurations: Mapping[str, Any] | None = None,
     where: str = "effects",
 ) -> Robot:
-    """The robot with these effects of `library`, or curves, present, each with amplitude 0.
+    """Robot with these effects of `library`, or curves, each with amplitude 0.
 
     Args:
-        configurations: by an effect's name, the list of its configurations. Default: as in its class.
-        where: opens the message of an error.
+        configurations: effect → list of the configurations in which it acts. Default: as in its class.
+        where: beginning of the error message.
 
     Raises:
-        BadConfiguration: an effect's configurations are no list of names, or are not in the robot.
+        BadConfiguration: the configurations of an effect are no list of names, or the robot lacks one of them.
     """
     library_with_built_in = {**effects.BESIDE, **library}
     present = []
@@ -310,19 +310,20 @@ def with_effects(
 
 
 def change_robot(robot: Robot, values: Mapping[str, Any], where: str, notes: list[str] | None = None) -> Robot:
-    """The robot with parameters replaced, each checked. `sides`, `battery.cells`, RATINGS, SWITCHES and CHOICES too.
+    """Robot with changed parameters, each of them checked. Also changes `sides`, `battery.cells`, RATINGS, SWITCHES
+    and CHOICES.
 
     Args:
-        values: by dotted name [SI].
-        where: opens the message of an error.
-        notes: as for `find_robot_file`.
+        values: new values by dotted name [SI].
+        where: beginning of the error message.
+        notes: as in `find_robot_file`.
 
     Raises:
         BadConfiguration: for the same reasons as `parse_robot_file`.
     """
     stated = dict(values)
     settings = (*COUNTS, *RATINGS, *SWITCHES, *CHOICES)
-    ratings = {name: _checked_setting(where, name, stated.pop(name)) for name in settings if name in stated}
+    ratings = {name: _check_setting(where, name, stated.pop(name)) for name in settings if name in stated}
     if CURVE & stated.keys() and "battery.capacity" in stated:  # all of one cell, unless stated otherwise
         ratings.setdefault("battery.capacity_curve", stated["battery.capacity"])
     parameters = {p.name: p for p in params.walk_parameters(robot)}
@@ -336,7 +337,7 @@ def change_robot(robot: Robot, values: Mapping[str, Any], where: str, notes: lis
             sentences = [sentence.partition(" allowed: ")[0] for sentence in sentences]
         raise BadConfiguration(f"{where}, {'; also '.join(sentences)}")
     robot = params.replace(robot, {name: jnp.asarray(value, float) for name, value in stated.items()})
-    robot = rig_file.moved_priors(robot, stated)
+    robot = rig_file.recentre_priors(robot, stated)
     robot = dataclasses.replace(robot, sides=ratings.pop("sides", robot.sides))
     for name, value in ratings.items():
         part, _, key = name.partition(".")
@@ -347,11 +348,11 @@ def change_robot(robot: Robot, values: Mapping[str, Any], where: str, notes: lis
     shapes = CURVE | {"battery.capacity_curve"}
     if notes is not None and shapes & values.keys() and (remark := power.curve_remark(robot.battery)):
         notes.append(f"{where}, battery.curvature: {remark}")
-    return _with_states(robot, where)
+    return _add_required_states(robot, where)
 
 
 def _refusal_reason(name: str, value: Any, known: Mapping[str, params.Parameter]) -> str:
-    """Reason why a value of a parameter is refused, empty if it is allowed."""
+    """Reason why a parameter value is rejected, empty if it is allowed."""
     if name not in known:
         return f"no such parameter; {_parameter_choices(name, known)}"
     spec = known[name].spec
@@ -367,8 +368,8 @@ def _refusal_reason(name: str, value: Any, known: Mapping[str, params.Parameter]
     return ""
 
 
-def _with_states(robot: Robot, where: str) -> Robot:
-    """`robot` with the states that its values need: two bodies where a load gives way, a duty that lags."""
+def _add_required_states(robot: Robot, where: str) -> Robot:
+    """Robot with the states that its values require: two bodies for a compliant load, a lagged duty."""
     loose = {name: load for name, load in robot.configurations.items() if load.has_two_bodies}
     for name, load in loose.items():
         if not (float(robot.motor.inertia) > 0 and float(load.inertia) > 0):
@@ -383,8 +384,8 @@ def _with_states(robot: Robot, where: str) -> Robot:
     return dataclasses.replace(robot, rig=dataclasses.replace(robot.rig, loose=bool(loose)), controller=own)
 
 
-def _checked_setting(where: str, name: str, value: Any) -> Any:
-    """A count, a rating, a switch or a choice of a robot's file, checked."""
+def _check_setting(where: str, name: str, value: Any) -> Any:
+    """Checks and returns a count, a rating, a switch or a choice of a robot file."""
     if name in SWITCHES:
         allowed, expected = isinstance(value, bool), f"true or false ({SWITCHES[name]})"
     elif name in CHOICES:
@@ -408,7 +409,7 @@ def _checked_setting(where: str, name: str, value: Any) -> Any:
 
 
 def _parameter_choices(name: str, known: Collection[str]) -> str:
-    """List of parts and parameters to choose from, for the message about an unknown parameter."""
+    """Parts and parameters to choose from, for the message about an unknown parameter."""
     head = name.partition(".")[0]
     heads = list(dict.fromkeys(n.partition(".")[0] for n in known))
     near = difflib.get_close_matches(name, known, n=5, cutoff=0.4)
@@ -447,9 +448,10 @@ def _check_pairs(robot: Robot, where: str) -> None:
 
 
 def write_robot(robot: Robot, path: Path, *, note: str = "") -> None:
-    """Write a robot with everything that it states, with unit, meaning and source. `read_robot` gives it back.
+    """Writes a robot file with everything that the robot states, with unit, meaning and source. `read_robot` restores
+    it.
 
-    Parameters that a robot which starts from nothing does not state are left out.
+    For a robot without a base, parameters that it does not state are left out.
     """
     whole, nothing = robot.rig.inherits, _base_robot(robot)
     pack = not whole and robot.battery.cells == nothing.battery.cells
@@ -459,7 +461,7 @@ def write_robot(robot: Robot, path: Path, *, note: str = "") -> None:
         "gearbox": [],
     }
     head, more = rig_file.rig_lines(robot.rig)
-    if rig_file.same_rig(robot.rig) and whole and robot.has_ground:
+    if rig_file.is_default_rig(robot.rig) and whole and robot.has_ground:
         head, more = [], {}
     for name, load in robot.configurations.items():
         moves = "tracks" if float(load.on_tracks) > 0.5 else "wheels"
@@ -482,7 +484,7 @@ def write_robot(robot: Robot, path: Path, *, note: str = "") -> None:
 
 
 def _lines_of_effect(effect: Effect) -> list[str]:
-    """Keys of an effect's table other than its parameters."""
+    """Lines of an effect's table except its parameters."""
     named = effect.configurations or type(effect)().configurations
     lines = [f"configurations = {toml_value(effect.configurations)}  # in which it acts"] if named else []
     if type(effect).plain is not None:
@@ -491,10 +493,12 @@ def _lines_of_effect(effect: Effect) -> list[str]:
 
 
 def _lines_of_parameters(robot: Robot, nothing: Robot) -> Iterator[tuple[str, str]]:
-    """Table and line of each parameter that a file has to state, or that differs from the robot it starts from."""
+    """Table and line of each parameter that a file must state because it differs from the base robot."""
     whole = robot.rig.inherits
     start = {p.name: float(p.value) for p in params.walk_parameters(nothing)}
-    needed = rig_file.needed_parameters(robot.rig, ((p.name, float(p.value)) for p in params.walk_parameters(robot)))
+    needed = rig_file.required_parameters(
+        robot.rig, ((p.name, float(p.value)) for p in params.walk_parameters(robot))
+    )
     always = (*(f"{name}." for name in robot.configurations), "effects.")
     for parameter in params.walk_parameters(robot):
         table, _, key = parameter.name.rpartition(".")
@@ -515,10 +519,10 @@ def _lines_of_parameters(robot: Robot, nothing: Robot) -> Iterator[tuple[str, st
 
 
 def _lines_of_ratings(robot: Robot, nothing: Robot, stated: set[str]) -> Iterator[tuple[str, str]]:
-    """Table and line of each rating, switch and choice that differs from the robot that a file starts from.
+    """Table and line of each rating, switch and choice that differs from the base robot.
 
     Args:
-        stated: tables that state something already.
+        stated: tables that already have an entry.
     """
     whole = robot.rig.inherits
 
@@ -544,7 +548,7 @@ def _lines_of_ratings(robot: Robot, nothing: Robot, stated: set[str]) -> Iterato
 
 
 def _base_robot(robot: Robot) -> Robot:
-    """Robot that the file of a robot starts from."""
+    """Base robot of a robot's file."""
     if robot.rig.inherits:
         return paper_robots.nominal()
     nothing = paper_robots.blank_robot(robot.configurations)

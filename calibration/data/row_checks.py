@@ -39,13 +39,13 @@ STEPS = 0.5
 
 
 def reading_period(values: np.ndarray) -> float:
-    """Rows of a log between two readings of a slow sensor, 0 for a channel that is read in every row.
+    """Number of rows between two readings of a slow sensor in a log. 0 for a channel that is read in every row.
 
-    A slow sensor changes at even distances of two rows or more, and rarely sooner. An instrument of coarse steps
-    repeats numbers too, but changes by its smallest step, or at any distance.
+    A slow sensor changes at even intervals of two rows or more, and rarely sooner. An instrument with coarse
+    resolution repeats numbers too, but it changes by its smallest step, or at irregular intervals.
 
     Args:
-        values: readings of a channel in one recording, in the order of time, NaN if missing.
+        values: readings of a channel in one recording, in order of time, NaN if missing.
     """
     values = values[np.isfinite(values)]
     changed = np.flatnonzero(np.diff(values) != 0)
@@ -65,14 +65,18 @@ def reading_period(values: np.ndarray) -> float:
     return rows if (off <= np.maximum(1.0, 0.1 * gaps)).mean() >= REGULAR and len(near) >= 0.5 * len(gaps) else 0.0
 
 
-def used_once(values: np.ndarray, time: np.ndarray, run: np.ndarray | None = None) -> tuple[np.ndarray, float]:
-    """Returns a channel's values with one row for each reading of a slow sensor, NaN in the rows that repeat it, and
-    the rows between readings. The unchanged values and 0 if no reading is repeated.
+def drop_repeated_readings(
+    values: np.ndarray, time: np.ndarray, run: np.ndarray | None = None
+) -> tuple[np.ndarray, float]:
+    """Values of a channel in which each reading of a slow sensor occurs once, and the number of rows between
+    readings.
+
+    Rows that repeat a reading are NaN. Without repeated readings, the values are unchanged and the number is 0.
 
     Args:
-        values: NaN for a missing reading, shape (rows,).
+        values: readings, NaN if missing, shape (rows,).
         time: time of the rows.
-        run: name of the recording of each row. None: all are of one.
+        run: name of the recording of each row. None: all rows belong to one recording.
     """
     if (np.diff(values) == 0).sum() < LEAST * len(values):
         return values, 0.0
@@ -109,7 +113,7 @@ STILL = 0.02
 
 
 def complete_columns(name: str, columns: Columns, rows: int, layout: Layout) -> None:
-    """Fills columns that a table may leave out, and refuses values that contradict each other."""
+    """Adds columns that a table may omit, and rejects values that contradict each other."""
     _add_default_columns(name, columns, rows, layout)
     _check_driving(name, columns)
     held = columns.get("held", np.zeros(1)) > 0.5
@@ -122,7 +126,7 @@ def complete_columns(name: str, columns: Columns, rows: int, layout: Layout) -> 
     if "total_mass_kg" in columns:
         total, payload = columns["total_mass_kg"], columns["payload_kg"]
         for row in np.flatnonzero(total <= payload)[:1]:
-            raise BadData(too_light(f"{name} row {row + 1}", total[row], payload[row]))
+            raise BadData(too_light_message(f"{name} row {row + 1}", total[row], payload[row]))
     for channel in layout.channels:
         if channel.column in columns and channel.sd_column in columns:
             lost = np.isfinite(columns[channel.column]) & ~np.isfinite(columns[channel.sd_column])
@@ -133,8 +137,8 @@ def complete_columns(name: str, columns: Columns, rows: int, layout: Layout) -> 
                 )
 
 
-def without_copies(name: str, columns: Columns) -> tuple[np.ndarray, Names]:
-    """Returns False for rows of a log that are the row before once more, shape (rows,), and a sentence on them."""
+def distinct_rows(name: str, columns: Columns) -> tuple[np.ndarray, Names]:
+    """False for each row of a log that repeats the row before it, shape (rows,), and a sentence on such rows."""
     rows = len(next(iter(columns.values()), []))
     kept = np.full(rows, True)
     if not set(TIME) <= set(columns):
@@ -164,7 +168,7 @@ def without_copies(name: str, columns: Columns) -> tuple[np.ndarray, Names]:
 
 
 def _add_default_columns(name: str, columns: Columns, rows: int, layout: Layout) -> None:
-    """Adds columns that a table of a rig may leave out: its only configuration, and conditions with a usual value."""
+    """Adds columns that a table of a rig may omit: its only configuration, and conditions with their usual value."""
     if layout.complete:
         return
     if "configuration" not in columns and layout.configurations:
@@ -214,12 +218,12 @@ def _check_sides(name: str, columns: Columns, layout: Layout) -> None:
         )
 
 
-def without_clamped(name: str, columns: Columns, kept: np.ndarray) -> tuple[Columns, np.ndarray, Names]:
-    """Returns a log without the rows in which a clamp holds the output, a mask of the rows kept, and a note on the
-    others.
+def drop_clamped_rows(name: str, columns: Columns, kept: np.ndarray) -> tuple[Columns, np.ndarray, Names]:
+    """A log without the rows in which a clamp holds the output, a mask of the other rows, and a note on the dropped
+    ones.
 
-    Each segment between two clamped ones becomes a run, because the motors start again. Settled rows keep their
-    runs.
+    Each segment between clamped rows becomes a run, because the motors start again. Runs of settled rows are
+    unchanged.
     """
     note: Names = ()
     if "held" in columns and set(TIME) <= set(columns) and (held := columns.pop("held") > 0.5).any():
@@ -240,16 +244,16 @@ def without_clamped(name: str, columns: Columns, kept: np.ndarray) -> tuple[Colu
     return {c: values[kept] for c, values in columns.items()}, kept, note
 
 
-def too_light(where: str, total: float, payload: float) -> str:
+def too_light_message(where: str, total: float, payload: float) -> str:
     included = f"more than the payload of {payload:g} kg, which it includes"
     return f"{where}, total_mass_kg: got {total:g}; expected {included}"
 
 
-def settled_points(name: str, columns: Columns, layout: Layout, robot: Robot) -> tuple[Columns, Names]:
-    """Returns columns without the time if each row is a settled run, and a note that says so.
+def drop_time_of_settled_rows(name: str, columns: Columns, layout: Layout, robot: Robot) -> tuple[Columns, Names]:
+    """Columns without the time if each row is a settled run, and a note that says so.
 
-    Rows are `CONSTANTS_APART` time constants after one another: of the windings where a clamp holds the output in
-    every row, else of the motors, and then they are points as of `_are_points`.
+    Rows are then at least `CONSTANTS_APART` time constants apart: of the windings if a clamp holds the output in
+    every row, otherwise of the motors, and then `_are_separate_settings` must hold.
     """
     kept, time = dict(columns), columns.get("time_s")
     if time is None or len(time) < 3 or {"mode", *layout.sides} & set(columns):
@@ -258,7 +262,9 @@ def settled_points(name: str, columns: Columns, layout: Layout, robot: Robot) ->
     apart, clamped = float(step[step > 0].min(initial=math.inf)), _is_clamped(columns, layout)
     windings = float(robot.motor.inductance / robot.motor.resistance) if robot.knows(VOLTAGE) else 0.0
     constant = windings if clamped else time_constant(robot)
-    if not math.inf > apart >= CONSTANTS_APART * constant or not (clamped or _are_points(columns, layout, apart)):
+    if not math.inf > apart >= CONSTANTS_APART * constant or not (
+        clamped or _are_separate_settings(columns, layout, apart)
+    ):
         return kept, ()
     for column in (*TIME, "run_id"):
         kept.pop(column, None)
@@ -269,18 +275,17 @@ def settled_points(name: str, columns: Columns, layout: Layout, robot: Robot) ->
 
 
 def _is_clamped(columns: Columns, layout: Layout) -> bool:
-    """True if a clamp holds the output in every row, or an imposed speed of 0 holds it against a torque."""
+    """True if a clamp holds the output in every row, or if an imposed speed of 0 holds it against a torque."""
     if "held" in columns:
         return bool((columns["held"] > 0.5).all())
     speed = columns.get(layout.imposed_column, np.ones(1))
     return layout.imposed == "motor_speed" and LOAD in columns and not speed.any()
 
 
-def _are_points(columns: Columns, layout: Layout, apart: float) -> bool:
-    """True for rows `SECONDS_APART` or more after one another, half of them at another setting than the row before.
+def _are_separate_settings(columns: Columns, layout: Layout, apart: float) -> bool:
+    """True if rows are `SECONDS_APART` or more apart, and half of them are at another setting than the row before.
 
-    Readings follow the setting of their own row as well as that of the row before. They do not if a setting begins at
-    its row.
+    Readings must follow the setting of their own row at least as well as that of the row before.
     """
     present = [c for c in layout.channels if c.column in columns]
     if layout.imposed != "voltage" or SUPPLY not in columns or "held" in columns or apart < SECONDS_APART:
@@ -298,7 +303,7 @@ def _are_points(columns: Columns, layout: Layout, apart: float) -> bool:
 
 
 def _unexplained_squares(readings: np.ndarray, settings: Sequence[np.ndarray]) -> float:
-    """Sum of squares of readings that no linear function of the settings explains."""
+    """Sum of squares of the readings that no linear function of the settings explains."""
     a = np.stack([np.ones(len(readings)), *settings], 1)
     sound = np.isfinite(readings)
     if sound.sum() < 3:
@@ -308,13 +313,13 @@ def _unexplained_squares(readings: np.ndarray, settings: Sequence[np.ndarray]) -
 
 
 def inertia_at_motor(robot: Robot, load: Load) -> float:
-    """Inertia of a motor and of its share of a load that rolls without slip [kg·m²]."""
+    """Inertia of a motor and of its share of a load that rolls without slip, at the motor shaft [kg·m²]."""
     moved = float(load.mass) * float(load.radius) ** 2 / float(robot.sides)
     return float(robot.motor.inertia) + (float(load.inertia) + moved) / float(robot.gearbox.ratio) ** 2
 
 
 def time_constant(robot: Robot) -> float:
-    """Time constant J R/k² of the motors' speed with the slowest load [s]. Infinite if it is unknown."""
+    """Time constant J R/k² of the motor speed with the slowest load [s]. Infinite if unknown."""
     motor, slowest = robot.motor, 0.0
     if not robot.knows(VOLTAGE):
         return math.inf
@@ -326,11 +331,10 @@ def time_constant(robot: Robot) -> float:
 
 
 def driven_rows(name: str, columns: Columns, layout: Layout) -> tuple[Columns, np.ndarray, Names]:
-    """Returns the columns of settled runs in rows where something drives the motors, True for these rows, and a note
-    on the other ones.
+    """Columns of settled runs whose motors are driven, True for these rows, and a note on the other rows.
 
     Raises:
-        BadData: for the same reasons as `_driven_mask`, turns on a slope, or a reading without its sign.
+        BadData: for the same reasons as `_driven_mask`, a turn on a slope, or a reading without its sign.
     """
     driven, note = _driven_mask(name, columns, layout)
     if note:
@@ -353,10 +357,10 @@ def driven_rows(name: str, columns: Columns, layout: Layout) -> tuple[Columns, n
 
 
 def _driven_mask(name: str, columns: Columns, layout: Layout) -> tuple[np.ndarray, str]:
-    """True for rows of settled runs in which something drives the motors. A sentence on the other rows.
+    """True for rows of settled runs whose motors are driven, and a sentence on the other rows.
 
     Raises:
-        BadData: no row is driven, or a speed is read where nothing drives the motors.
+        BadData: no row is driven, or a speed was read in a row where nothing drives the motors.
     """
     sides = [c for c in layout.sides if c in columns]
     column = layout.imposed_column
@@ -395,7 +399,7 @@ def _driven_mask(name: str, columns: Columns, layout: Layout) -> tuple[np.ndarra
 
 
 def _check_signs(name: str, columns: Columns, layout: Layout) -> None:
-    """Rejects readings without a sign in rows that drive the robot backward."""
+    """Rejects unsigned readings in rows that drive the robot backward."""
     column = layout.imposed_column
     imposed, unit = columns[column], column.split("_")[-1]
     if layout.imposed == "voltage":
@@ -416,7 +420,7 @@ def _check_signs(name: str, columns: Columns, layout: Layout) -> None:
         backward = (imposed < 0) & ((columns["slope_deg"] <= 0) | channel.zero_at_rest)
         if not channel.zero_at_rest and (layout.weight or "duty" in columns or driven_on(columns, layout).any()):
             continue  # the load may drive a motor; a bridge that reverses the voltage reverses the supply's current
-        doubt = _largest_doubt(columns, channel)
+        doubt = _sign_tolerance(columns, channel)
         wrong = np.flatnonzero(backward & (readings > (doubt if layout.crosses_zero else 0.0)))
         if _rises_through_zero(imposed, readings, backward):
             wrong = wrong[:0]
@@ -442,7 +446,8 @@ def _check_signs(name: str, columns: Columns, layout: Layout) -> None:
 
 
 def _rises_through_zero(imposed: np.ndarray, readings: np.ndarray, backward: np.ndarray) -> bool:
-    """True if readings of backward rows have signs and an offset: they rise with the imposed value to zero.
+    """True if readings of backward rows are signed with an offset, because they rise with the imposed value towards
+    zero.
 
     A lost sign would mirror the forward readings, which then fall toward zero.
     """
@@ -455,15 +460,15 @@ def _rises_through_zero(imposed: np.ndarray, readings: np.ndarray, backward: np.
     return bool(slope * np.ptp(levels) > 2 * scatter)
 
 
-def _largest_doubt(columns: Columns, channel: Channel) -> np.ndarray | float:
-    """Largest excess of a reading beyond zero by noise: SIGN_SDS of its sd, or a share of the channel's rms."""
+def _sign_tolerance(columns: Columns, channel: Channel) -> np.ndarray | float:
+    """Largest reading of the wrong sign that noise explains: SIGN_SDS of its sd, or a share of the channel's rms."""
     readings = columns[channel.column]
     share = SIGN_SHARE * float(np.sqrt(np.nanmean(readings**2))) if np.isfinite(readings).any() else 0.0
     return np.fmax(share, SIGN_SDS * np.nan_to_num(columns.get(channel.sd_column, np.zeros(len(readings)))))
 
 
 def missing_data_notes(name: str, columns: Columns, layout: Layout) -> Iterator[str]:
-    """Yields notes on missing channels and readings, on copies of rows, and on runs with several rows."""
+    """Notes on missing channels and readings, on copies of rows, and on runs with several rows."""
     for channel in layout.channels:
         if channel.column not in columns:
             if layout.complete:
@@ -502,7 +507,7 @@ def missing_data_notes(name: str, columns: Columns, layout: Layout) -> Iterator[
 
 
 def driven_backward_notes(name: str, columns: Columns, layout: Layout) -> Iterator[str]:
-    """Yields a note on settled rows in which a load torque without a sign drives a shaft that runs backward."""
+    """Note on settled rows in which an unsigned load torque drives a shaft that runs backward."""
     on = np.flatnonzero(driven_on(columns, layout))
     if on.size and not set(TIME) & set(columns) and columns[LOAD].min() >= 0:
         more = f", and so in {on.size} rows" if on.size > 1 else ""

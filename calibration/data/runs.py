@@ -1,7 +1,7 @@
-"""Runs from outside: a table of operating points or samples, from its source to checked columns.
+"""Runs from files or memory: a table of operating points or samples, from its source to checked columns.
 
-A reader gives the columns of its source by name with raw values (`NamedArrays`). `of_arrays` gives each column its
-meaning, checks the values and makes `Runs`. It is the same for every source.
+A reader returns the raw columns of its source by name (`NamedArrays`). For every source, `runs_of_arrays` gives each
+column its meaning, checks the values and returns `Runs`.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from calibration.data import (
     sides,
 )
 from calibration.data.columns import CONDITIONS, DUTY, SUPPLY, TIME, WHEN, Column, Layout
-from calibration.data.computed_columns import without_computed_torques
+from calibration.data.computed_columns import drop_computed_torques
 from calibration.data.input_errors import BadConfiguration, BadData
 from calibration.data.named_arrays import NamedArrays, Raw, column_numbers, column_texts, missing_readings
 from calibration.data.sources import opening, reading
@@ -41,7 +41,7 @@ from mmrjax.model import channels
 from mmrjax.model.quantities import MM, RPM
 from mmrjax.model.robot import NO_BRAKE, Robot
 
-__all__ = ["CONDITIONS", "DUTY", "MM", "RPM", "WHEN", "Runs", "of_arrays", "read_runs", "single_run"]
+__all__ = ["CONDITIONS", "DUTY", "MM", "RPM", "WHEN", "Runs", "read_runs", "runs_of_arrays", "single_run"]
 
 
 #: Tables that come with the package.
@@ -59,28 +59,30 @@ def read_runs(
     battery: bool = False,
     of_turns: bool = False,
 ) -> Runs:
-    """Returns the runs of a packaged table, of a file, or of a table in memory.
+    """Reads runs from a packaged table, a file, or a table in memory.
 
     Args:
         source: `measured`, `simulated_by_paper`, a path, or a table in memory. Files are CSV, Parquet, Feather,
             Arrow, spreadsheets, MATLAB, HDF5, NumPy, JSON, ROS bags, MCAP, ULog, MDF and WPILOG. A path of signals
             may follow `::`. A pattern such as `runs/*.csv` reads files that are a run each. Tables in memory are a
             pandas or polars DataFrame, an Arrow table, an xarray Dataset, a dict of arrays, or a list of records.
-        columns: columns of the source, where its names are not this program's: a packaged preset
-            (`vesc,pole_pairs=7`), a preset's file, or a dict such as `{"motor_speed_rpm": "speed"}`. They win over
-            the robot's file.
-        measured, battery, robot, of_turns: as for `of_arrays`.
+        columns: meaning of the source's columns, if their names are not those of this program: a packaged preset
+            (`vesc,pole_pairs=7`), a preset file, or a dict such as `{"motor_speed_rpm": "speed"}`. It takes
+            precedence over the robot file.
+        measured, battery, robot, of_turns: as in `runs_of_arrays`.
 
     Raises:
         BadData: no such file, a format that is not read, a damaged file, a signal that is missing or of another kind,
-            or as `of_arrays`.
+            or as `runs_of_arrays`.
         BadConfiguration: no such preset, or a preset with a mistake.
     """
     layout, between = Layout.of(robot), "held" if robot is None else robot.rig.between_rows
     preset = None
     if columns is not None:
         preset = (
-            presets_file.of_columns(columns) if isinstance(columns, Mapping) else presets_file.find_preset(columns)
+            presets_file.preset_of_table(columns)
+            if isinstance(columns, Mapping)
+            else presets_file.find_preset(columns)
         )
     if isinstance(source, str | Path) and str(source) in PACKAGED:
         with resources.as_file(resources.files("calibration") / "data" / PACKAGED[str(source)]) as path:
@@ -100,10 +102,10 @@ def read_runs(
             f"{arrays.name}: has no column with a known name, but columns of {name}; add --columns "
             f'{name}{numbers_asked}, in Python columns="{name}{numbers_asked}"'
         )
-    return of_arrays(arrays, measured=measured, battery=battery, robot=robot, of_turns=of_turns, mapped=mapped)
+    return runs_of_arrays(arrays, measured=measured, battery=battery, robot=robot, of_turns=of_turns, mapped=mapped)
 
 
-def of_arrays(
+def runs_of_arrays(
     arrays: NamedArrays,
     *,
     measured: bool = True,
@@ -112,16 +114,16 @@ def of_arrays(
     of_turns: bool = False,
     mapped: Mapped | None = None,
 ) -> Runs:
-    """Returns the runs in named columns of raw values.
+    """Runs from named columns of raw values, with all checks.
 
     Args:
         arrays: columns of the source.
-        measured: True if at least one channel is required, without any, `total_mass_kg` may be missing too.
-        battery: True if the runs are on the on-board battery. The column of the voltage is missing then, or empty.
-        robot: defines the columns that are needed, and the channels. None: the packaged robot, with a channel for
-            each further column of one.
-        of_turns: True to give a table of turns a channel for each of its columns of one side or of the yaw.
-        mapped: columns that have other names in the source, as `Layout.mapped`. None: from the robot's file.
+        measured: True to require at least one channel. False: none is required, nor `total_mass_kg`.
+        battery: True if the runs are on the on-board battery. The voltage column is then missing or empty.
+        robot: robot that defines the required columns and the channels. None: the packaged robot, with every further
+            channel that the table has.
+        of_turns: True to add a channel for each column of one side or of the yaw rate.
+        mapped: columns with other names in the source, as in `Layout.mapped`. None: from the robot file.
 
     Raises:
         BadData: no columns or rows, no channel, a missing, misspelt or repeated column, or a wrong unit. Values that
@@ -141,20 +143,20 @@ def of_arrays(
     meanings = layout.meanings(name, header)
     column_names.check_header(name, header, meanings, measured, battery, layout)
     if measured and not inferred:
-        column_names.check_time(name, header, meanings, layout)
+        column_names.check_has_time(name, header, meanings, layout)
     column_names.check_units(arrays, meanings)
     if not len(arrays):
         raise BadData(f"{name}: a header without rows; expected at least one run")
-    arrays = clock.recorded_rows(arrays, meanings)
+    arrays = clock.drop_empty_rows(arrays, meanings)
     columns, changed = _column_values(arrays, meanings, layout, battery)
     settled: Names = ()
     if measured and robot is not None:
-        columns, settled = row_checks.settled_points(name, columns, layout, robot)
+        columns, settled = row_checks.drop_time_of_settled_rows(name, columns, layout, robot)
     notes = (*arrays.notes, *settled, *sides.of_volts(name, columns, battery))
-    kept, copied = row_checks.without_copies(name, columns)
-    columns, kept, clamped = row_checks.without_clamped(name, columns, kept)
+    kept, copied = row_checks.distinct_rows(name, columns)
+    columns, kept, clamped = row_checks.drop_clamped_rows(name, columns, kept)
     if measured:
-        notes = (*notes, *copied, *clamped, *_without_repeats(name, columns, layout))
+        notes = (*notes, *copied, *clamped, *_drop_repeats(name, columns, layout))
     stated = instruments.infer_instruments(layout.instruments, columns)
     unsigned = sides.unsigned_current_channels(columns, layout) if measured else ()
     unsigned = tuple(i for i in unsigned if i.channel not in {known.channel for known in stated})
@@ -168,7 +170,11 @@ def of_arrays(
         notes = (*notes, *left_out)
     if not any(column in columns for column in WHEN):
         columns["order"] = np.arange(1.0, kept.sum() + 1)
-    extras = {c: _extra(raw)[kept] for c, m, raw in zip(header, meanings, arrays.values, strict=True) if m is None}
+    extras = {
+        c: _values_without_role(raw)[kept]
+        for c, m, raw in zip(header, meanings, arrays.values, strict=True)
+        if m is None
+    }
     notes = (*notes, *capitals, *changed, *(row_checks.missing_data_notes(name, columns, layout) if measured else ()))
     notes = (*notes, *(
         f"{name}: {channels.find_channel(i.channel).column} is positive although its side is driven backward; it "
@@ -179,14 +185,14 @@ def of_arrays(
     runs = Runs(name, columns, tuple(extras), arrays.digest, extras, layout, notes, headings)
     if robot is not None:
         contradictions.check_contradictions(runs, robot)
-        runs = without_computed_torques(without_unread(runs, robot), robot)
+        runs = drop_computed_torques(without_unread(runs, robot), robot)
     return runs
 
 
 def _column_values(
     arrays: NamedArrays, meanings: Sequence[Column | None], layout: Layout, battery: bool
 ) -> tuple[Columns, Names]:
-    """Values of the columns with a meaning, and notes on cells that are read as another value."""
+    """Values of the known columns, and notes on cells that are read as another value."""
     columns: Columns = {}
     bad: list[tuple[int, int, str]] = []
     notes: list[str] = []
@@ -196,14 +202,14 @@ def _column_values(
         if meaning is None:
             continue
         if meaning.column == "configuration":
-            raw, more = _configurations_in_case(arrays.name, column_texts(raw), layout)
+            raw, more = _match_configuration_case(arrays.name, column_texts(raw), layout)
             notes += more
         if meaning.column in TIME:
             runs = column_texts(by_name["run_id"]) if "run_id" in by_name else None
-            raw, more_notes = clock.from_the_first(arrays.name, meaning, raw, runs)
+            raw, more_notes = clock.time_since_start(arrays.name, meaning, raw, runs)
             notes += more_notes
         if battery and meaning.column == SUPPLY and layout.imposed == "voltage":
-            _refuse_stated(arrays, raw)
+            _reject_supply_voltages(arrays, raw)
         elif meaning.column in layout.idle:
             _reject_condition_without_effect(arrays, meaning, raw, layout)
         else:
@@ -221,11 +227,11 @@ def _column_values(
 
 
 def _join_cell_messages(name: str, said: Sequence[str], count: int) -> str:
-    """Combines the messages on refused cells into one, in the order of the rows, each piece of advice once.
+    """One message from the messages on rejected cells, in row order, with each piece of advice once.
 
     Args:
-        said: messages, of which at least the first `LISTED` must be given.
-        count: number of cells.
+        said: messages, at least the first `LISTED`.
+        count: number of rejected cells.
     """
     first, *others = said
     if not others:
@@ -239,13 +245,13 @@ def _join_cell_messages(name: str, said: Sequence[str], count: int) -> str:
     return f"{first}; also {'; '.join(more)}{rest}"
 
 
-def _without_repeats(name: str, columns: Columns, layout: Layout) -> Iterator[str]:
-    """Takes readings that a log repeats out of its columns, with a sentence on each channel."""
+def _drop_repeats(name: str, columns: Columns, layout: Layout) -> Iterator[str]:
+    """Replaces repeated readings of a log by NaN in its columns. Yields a sentence on each channel."""
     if not set(TIME) <= set(columns):
         return
     run = columns.get("run_id")
     for channel in (c for c in layout.channels if c.column in columns and c.column != layout.imposed_column):
-        values, rows = row_checks.used_once(columns[channel.column], columns["time_s"], run)
+        values, rows = row_checks.drop_repeated_readings(columns[channel.column], columns["time_s"], run)
         if rows:
             columns[channel.column] = values
             yield (
@@ -254,8 +260,8 @@ def _without_repeats(name: str, columns: Columns, layout: Layout) -> Iterator[st
             )
 
 
-def _configurations_in_case(name: str, cells: list[str], layout: Layout) -> tuple[list[str], list[str]]:
-    """Names of configurations with the capitals of the robot's names, and notes on changed names."""
+def _match_configuration_case(name: str, cells: list[str], layout: Layout) -> tuple[list[str], list[str]]:
+    """Names of configurations with the capitals of the robot file, and notes on changed names."""
     meant = {c.casefold(): c for c in layout.configurations}
     if len(meant) < len(layout.configurations):  # they differ only in their capitals
         return cells, []
@@ -265,8 +271,8 @@ def _configurations_in_case(name: str, cells: list[str], layout: Layout) -> tupl
     return [odd.get(c, c) for c in cells] if odd else cells, notes
 
 
-def _extra(raw: Raw) -> np.ndarray:
-    """A column without a role: numbers where every cell that has a reading is one, else words."""
+def _values_without_role(raw: Raw) -> np.ndarray:
+    """Values of a column without a role: numbers if every reading is one, otherwise words."""
     if isinstance(raw, np.ndarray):
         return raw
     numbers = column_numbers(raw)
@@ -275,7 +281,7 @@ def _extra(raw: Raw) -> np.ndarray:
 
 
 def _reject_condition_without_effect(arrays: NamedArrays, meaning: Column, raw: Raw, layout: Layout) -> None:
-    """Rejects a condition that does not act on the robot's load, unless it is 0 or not stated."""
+    """Rejects a condition that does not act on the robot's load, unless it is 0 or missing."""
     why = (
         f"{NO_BRAKE}; give slope_deg or payload_kg, or describe the load as a shaft"
         if layout.has_ground
@@ -290,8 +296,8 @@ def _reject_condition_without_effect(arrays: NamedArrays, meaning: Column, raw: 
         raise BadData(f"{arrays.row(row)}, {meaning.shown}: got {column_texts(raw[row : row + 1])[0]}; {why}")
 
 
-def _refuse_stated(arrays: NamedArrays, voltages: Raw) -> None:
-    """Rejects voltages of a supply next to a battery."""
+def _reject_supply_voltages(arrays: NamedArrays, voltages: Raw) -> None:
+    """Rejects supply voltages of runs that are on a battery."""
     if isinstance(voltages, np.ndarray):
         stated = np.flatnonzero(~np.isnan(voltages.astype(float)))[:1].tolist()
     else:
@@ -304,13 +310,14 @@ def _refuse_stated(arrays: NamedArrays, voltages: Raw) -> None:
 
 
 def single_run(cells: Json, layout: Layout | None = None) -> Runs:
-    """Returns one run from options by column name, each checked as a cell of a file. On a battery without a voltage.
+    """One run from command options, by column name, each checked like a cell of a file. On a battery it has no
+    voltage.
 
     Args:
-        layout: of the robot's tables. None: of the packaged one's.
+        layout: layout of the robot's tables. None: of the packaged robot.
 
     Raises:
-        BadConfiguration: an option that is out of range, not finite or an unknown word.
+        BadConfiguration: an option is out of range, not finite, or an unknown word.
     """
     layout = Layout() if layout is None else layout
     rows = layout.quantities()
@@ -325,6 +332,6 @@ def single_run(cells: Json, layout: Layout | None = None) -> Runs:
     if layout.imposed == "voltage":
         columns.setdefault(SUPPLY, np.array([math.nan]))
     if "total_mass_kg" in cells and cells["total_mass_kg"] <= cells["payload_kg"]:
-        raise BadConfiguration(row_checks.too_light("option", cells["total_mass_kg"], cells["payload_kg"]))
+        raise BadConfiguration(row_checks.too_light_message("option", cells["total_mass_kg"], cells["payload_kg"]))
     columns = {c: np.array([cells[c]]) if isinstance(cells.get(c), float) else v for c, v in columns.items()}
     return Runs("the options", columns, layout=layout)

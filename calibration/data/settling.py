@@ -16,7 +16,7 @@ from calibration.data.columns import LOAD, SPEED, TIME
 from calibration.data.contradictions import GAP
 from calibration.data.courses import applied_drive, differs_from_row_before
 from calibration.data.input_errors import BadData
-from calibration.data.instruments import step_of
+from calibration.data.instruments import common_step
 from calibration.data.row_checks import inertia_at_motor
 from calibration.data.runs import Runs
 from mmrjax.errors import count_noun
@@ -413,7 +413,7 @@ def _step_of_instrument(runs: Runs, channel: Channel, shown: np.ndarray) -> floa
     If neither has one, it is the smallest difference of readings that mostly repeat.
     """
     stated = (i.quantum or 0.0 for i in runs.layout.instruments if i.channel == channel.name)
-    if step := step_of(shown) or next(stated, 0.0) / channel.factor:
+    if step := common_step(shown) or next(stated, 0.0) / channel.factor:
         return step
     levels = np.unique(shown[np.isfinite(shown)])
     coarse = 1 < len(levels) < COARSE * np.isfinite(shown).sum()

@@ -13,7 +13,7 @@ from calibration.data.input_errors import BadConfiguration, BadData
 from calibration.data.named_arrays import column_texts
 from calibration.data.sources import reading
 from mmrjax.climbing import terrain
-from mmrjax.climbing.climb_simulation import ON_GROUND, Sequence, roller_clearance
+from mmrjax.climbing.climb_simulation import ON_GROUND, LeverSequence, roller_clearance
 from mmrjax.climbing.terrain import Terrain
 from mmrjax.model.robot import Robot
 
@@ -108,7 +108,7 @@ def read_terrain(path: Path) -> Terrain:
     raise BadData(f"{path.name}: {wrong}{hint}")
 
 
-def read_sequence(path: Path, robot: Robot, begins: tuple[float, float]) -> Sequence:
+def read_sequence(path: Path, robot: Robot, begins: tuple[float, float]) -> LeverSequence:
     """Lever angles over distance or time from a file, or voltages of their motors.
 
     Args:
@@ -137,13 +137,13 @@ def read_sequence(path: Path, robot: Robot, begins: tuple[float, float]) -> Sequ
                         f"{path.name} row {k + 2}, {name}: got {value:g} V; expected -{HIGHEST:g} to {HIGHEST:g} V"
                     )
         front, rear = (jnp.asarray(columns[name]) for name in volts)
-        return Sequence(jnp.asarray(abscissa), front, rear, jnp.asarray(begins), over_time)
+        return LeverSequence(jnp.asarray(abscissa), front, rear, jnp.asarray(begins), over_time)
     for name in angles:
         for k, value in enumerate(columns[name]):
             if why := lever_angle_refusal(robot, value):
                 raise BadData(f"{path.name} row {k + 2}, {name}: {why}")
     front, rear = (jnp.asarray(np.radians(columns[name])) for name in angles)
-    return Sequence(jnp.asarray(abscissa), front, rear, over_time=over_time)
+    return LeverSequence(jnp.asarray(abscissa), front, rear, over_time=over_time)
 
 
 def lever_start_refusal(robot: Robot, angle: float) -> str:

@@ -21,7 +21,7 @@ from calibration.data.effect_file import Library
 from calibration.data.input_errors import BadConfiguration, BadData
 from calibration.data.runs import Runs
 from calibration.data.thinning import used_rows
-from calibration.described import describe, in_words
+from calibration.described import describe, report_in_words
 from calibration.discovery import findings, kept, menu, prediction, preference, scales
 from calibration.discovery.active_set import CandidateSpace, candidate_space
 from calibration.discovery.adequacy import AdequacyTest, Diagnosis
@@ -159,7 +159,7 @@ def discover(
     """
     if not is_double():
         raise BadConfiguration(f"discover: {SINGLE}")
-    tell = in_words(progress)
+    tell = report_in_words(progress)
     ready = prepare_loop(
         runs, robot, noise=noise, stated=stated, library=library, replicates=replicates, seed=seed, prefer=prefer,
         forbidden=forbidden, rows=rows,

@@ -17,7 +17,7 @@ from calibration.data.columns import ROWS
 from calibration.data.input_errors import SEEDS, BadConfiguration, stated_count
 from calibration.data.runs import Runs
 from calibration.data.thinning import used_rows
-from calibration.described import in_words
+from calibration.described import report_in_words
 from calibration.inference import blocks as holdout
 from calibration.inference import (
     checks,
@@ -125,7 +125,7 @@ def calibrate(
         if value is not None:
             stated_count(value, name, low, LARGEST[name])
     solver = solvers.solver_by_name(solver) if isinstance(solver, str) else solver
-    runs, progress = used_rows(runs, robot, rows), in_words(tell)
+    runs, progress = used_rows(runs, robot, rows), report_in_words(tell)
     observe = observers.observer_kind(runs)
     fidelity = model or (OF_HISTORIES if observe.axis else fidelities.NAMES[0])
     effort = observers.facts_of_fidelity(fidelity).effort

@@ -1,4 +1,4 @@
-"""A whole sensitivity study: important inputs at each point, and the most informative next runs."""
+"""A complete sensitivity study: the important inputs at each operating point, and the most informative next runs."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ import numpy as np
 from calibration.data.input_errors import BadConfiguration
 from calibration.inference.fit_notes import Remark, progress_remark
 from calibration.inference.identifiability import Z95
-from calibration.sensitivity.local import Local, correlated_directions, inert_inputs, local_derivatives
-from calibration.sensitivity.methods import Part, morris_screening, sobol_indices
-from calibration.sensitivity.next_runs import Candidates, next_runs
-from calibration.sensitivity.result import METHODS, Input, OutputStudy, SensitivityResult
+from calibration.sensitivity.local import LocalDerivatives, correlated_directions, inert_inputs, local_derivatives
+from calibration.sensitivity.methods import PartialResult, morris_screening, sobol_indices
+from calibration.sensitivity.next_runs import CandidateRuns, choose_next_runs
+from calibration.sensitivity.result import METHODS, InputSummary, OutputStudy, SensitivityResult
 from calibration.sensitivity.study import Study
-from calibration.sensitivity.uncertain_inputs import Inputs
+from calibration.sensitivity.uncertain_inputs import UncertainInputs
 from mmrjax import derived, fidelities
 from mmrjax.model.quantities import Quantity
 
@@ -23,19 +23,19 @@ LEAST = 1_000
 
 
 def analyse_sensitivity(
-    study: Study, method: str, evaluations: int | None = None, seed: int = 0, candidates: Candidates | None = None
+    study: Study, method: str, evaluations: int | None = None, seed: int = 0, candidates: CandidateRuns | None = None
 ) -> SensitivityResult:
-    """Result of a whole study.
+    """Result of a complete sensitivity study.
 
     Args:
         method: one of `METHODS`.
-        evaluations: least number of model evaluations in all. None takes the default.
+        evaluations: smallest total number of model evaluations. None: the default.
         seed: random seed.
-        candidates: possible next runs. None proposes none.
+        candidates: possible next runs. None: no runs are proposed.
 
     Raises:
-        BadConfiguration: an unknown method, a method that needs independent inputs, too few evaluations, inputs
-            that change no output, or no point that can be studied.
+        BadConfiguration: an unknown method, a method that needs independent inputs, too few evaluations, inputs that
+            change no output, or no point that can be studied.
     """
     inputs, model = study.inputs, study.model
     if method not in METHODS:
@@ -52,26 +52,26 @@ def analyse_sensitivity(
     study.tell(progress_remark("points"))
     studies = local_derivatives(study)
     if not any(np.isfinite(x).any() for x in studies.value.values()):
-        raise BadConfiguration(_none_converges(study, studies.statuses))
+        raise BadConfiguration(_no_point_message(study, studies.statuses))
     idle = inert_inputs(study, studies, seed)
     if idle.all():
         raise BadConfiguration(
             "--parameters: the derivative of every output by every input is zero; choose others, or change --outputs"
         )
-    parts: dict[str, Part] = {}
+    parts: dict[str, PartialResult] = {}
     if method != "local":
         study.tell(Remark("sampling", method=method, points=len(study.points)))
         by_method = sobol_indices if method == "sobol" else morris_screening
         parts = by_method(study, ~idle, evaluations, seed)
-    outputs = {o.name: _study_of(o, study, studies, parts.get(o.name)) for o in model.outputs}
+    outputs = {o.name: _study_of_output(o, study, studies, parts.get(o.name)) for o in model.outputs}
     if method != "local" and not any(s.studied.any() for s in outputs.values()):
-        raise BadConfiguration(_none_converges(study, study.statuses()))
-    proposed = None if candidates is None else next_runs(study, studies, candidates)
+        raise BadConfiguration(_no_point_message(study, study.statuses()))
+    proposed = None if candidates is None else choose_next_runs(study, studies, candidates)
     return SensitivityResult(
         method=method,
         model=model.fidelity,
         seed=seed,
-        inputs=_described(inputs, idle),
+        inputs=_describe_inputs(inputs, idle),
         correlated=inputs.is_posterior,
         points=study.points,
         outputs=outputs,
@@ -84,7 +84,7 @@ def analyse_sensitivity(
     )
 
 
-def _described(inputs: Inputs, idle: np.ndarray) -> dict[str, Input]:
+def _describe_inputs(inputs: UncertainInputs, idle: np.ndarray) -> dict[str, InputSummary]:
     slope = inputs.slope[inputs.places]
     uniform = np.arange(len(inputs)) >= len(inputs.parameters)
     sd = np.where(uniform, np.abs(slope).sum(1) / np.sqrt(12), np.sqrt(np.sum(slope**2, 1)))
@@ -104,13 +104,13 @@ def _described(inputs: Inputs, idle: np.ndarray) -> dict[str, Input]:
         kind = "uniform" if uniform[k] else "posterior" if inputs.is_posterior else inputs.parameters.kinds[k]
         axis = inputs.axes[name]
         interval = (float(settings[-1][k]), float(settings[1][k]))
-        described[name] = Input(
+        described[name] = InputSummary(
             axis.unit, axis.meaning, kind, float(settings[0][k]), interval, float(sd[k]), bool(idle[k])
         )
     return described
 
 
-def _study_of(row: Quantity, study: Study, found: Local, part: Part | None) -> OutputStudy:
+def _study_of_output(row: Quantity, study: Study, found: LocalDerivatives, part: PartialResult | None) -> OutputStudy:
     name, points = row.name, len(study.points)
     value, slopes, scores = found.value[name], found.derivative[name], found.by_score[name]
     median = study.inputs.values(study.inputs.centre)[study.inputs.places]
@@ -148,7 +148,7 @@ def _study_of(row: Quantity, study: Study, found: Local, part: Part | None) -> O
     )
 
 
-def _none_converges(study: Study, statuses: dict[str, dict[str, int]]) -> str:
+def _no_point_message(study: Study, statuses: dict[str, dict[str, int]]) -> str:
     listed = "; ".join(f"{s}: " + ", ".join(f"{n} {w}" for w, n in by.items()) for s, by in statuses.items())
     return (
         f"no operating point can be studied, because too many robots do not travel there ({listed}); choose smaller "

@@ -1,4 +1,4 @@
-"""Exact derivatives at the medians of the inputs, effects of single inputs, and inert inputs."""
+"""Exact derivatives at the medians of the inputs, effects of single inputs, and inputs without influence."""
 
 from __future__ import annotations
 
@@ -11,21 +11,21 @@ from scipy.stats import qmc
 from calibration.data import Columns
 from calibration.inference.identifiability import Z95
 from calibration.sensitivity.study import Study, source_words
-from calibration.sensitivity.uncertain_inputs import Inputs
+from calibration.sensitivity.uncertain_inputs import UncertainInputs
 
 #: Number of random robots, and of points, at which derivatives are computed before an input is called inert.
 LOOKS, PLACES = 4, 12
 
 
 @dataclasses.dataclass(frozen=True)
-class Local:
-    """Values and derivatives at the medians of the inputs. Arrays over (points, inputs), NaN without a value.
+class LocalDerivatives:
+    """Outputs and derivatives at the medians of the inputs. Arrays of shape (points, inputs), NaN without a value.
 
     Attributes:
-        value: [SI], shape (points,).
-        derivative: by each input [SI per unit].
-        by_score: by its score [SI].
-        swing: with each single input at the ends of its 95 % interval [SI], shape (2, points, inputs).
+        value: outputs [SI], shape (points,).
+        derivative: derivative with respect to each input [SI per unit].
+        by_score: derivative with respect to each input's score [SI].
+        swing: output with one input at either end of its 95 % interval [SI], shape (2, points, inputs).
     """
 
     value: Columns
@@ -35,8 +35,9 @@ class Local:
     statuses: dict[str, dict[str, int]]
 
 
-def correlated_directions(inputs: Inputs) -> np.ndarray:
-    """Directions in scores along which each input moves by one sd and the others follow by their correlation.
+def correlated_directions(inputs: UncertainInputs) -> np.ndarray:
+    """Directions in the space of scores: in each, one input moves by one sd and the others follow by their
+    correlation.
 
     Each row has length 1. A condition moves along its own score.
     """
@@ -48,8 +49,8 @@ def correlated_directions(inputs: Inputs) -> np.ndarray:
     return whole
 
 
-def local_derivatives(study: Study) -> Local:
-    """Values, exact derivatives and swings at each point."""
+def local_derivatives(study: Study) -> LocalDerivatives:
+    """Outputs, exact derivatives and swings at each operating point."""
     inputs, points = study.inputs, len(study.points)
     d, centre = len(inputs), np.tile(study.inputs.centre, (points, 1))
     values = study.values_at(centre)
@@ -58,7 +59,7 @@ def local_derivatives(study: Study) -> Local:
     derivative, by_score, swing = {}, {}, {}
     for name, moved in by_columns.items():
         finite = np.isfinite(answer.values[name])[:, None]
-        derivative[name] = np.where(finite, _by_inputs(inputs, moved), np.nan)
+        derivative[name] = np.where(finite, _derivatives_by_input(inputs, moved), np.nan)
         by_score[name] = np.where(finite, moved @ inputs.slope, np.nan)
     along = correlated_directions(inputs)
     p = len(inputs.parameters)
@@ -73,12 +74,13 @@ def local_derivatives(study: Study) -> Local:
         ends.append({n: x.reshape(points, d) for n, x in study.model(study.values_at(rows), spread).values.items()})
     for name in by_columns:
         swing[name] = np.stack([end[name] for end in ends])
-    return Local(answer.values, derivative, by_score, swing, _in_words(answer.counts()))
+    return LocalDerivatives(answer.values, derivative, by_score, swing, _in_words(answer.counts()))
 
 
-def _by_inputs(inputs: Inputs, by_columns: np.ndarray) -> np.ndarray:
-    """Derivatives with respect to inputs, shape (points, inputs), from those by column. Tied parameters follow their
-    leader."""
+def _derivatives_by_input(inputs: UncertainInputs, by_columns: np.ndarray) -> np.ndarray:
+    """Derivatives with respect to inputs, shape (points, inputs), from those with respect to columns. Tied parameters
+    are added to their leader.
+    """
     by_inputs = by_columns[:, inputs.places].copy()
     for j, (_, leader, ratio) in enumerate(inputs.parameters.tied):
         by_inputs[:, leader] += ratio * by_columns[:, len(inputs.parameters) + j]
@@ -89,8 +91,8 @@ def _in_words(counts: dict[str, dict[str, int]]) -> dict[str, dict[str, int]]:
     return {source_words(source): by for source, by in counts.items()}
 
 
-def inert_inputs(study: Study, found: Local, seed: int) -> np.ndarray:
-    """True for inputs with exactly zero derivatives of all outputs at all tested points, shape (inputs,)."""
+def inert_inputs(study: Study, found: LocalDerivatives, seed: int) -> np.ndarray:
+    """True for inputs whose derivatives of all outputs are exactly zero at all tested points, shape (inputs,)."""
     streams = np.random.default_rng(seed).spawn(LOOKS)
     unit = np.concatenate([qmc.Sobol(len(study.inputs), scramble=True, rng=rng).random(1) for rng in streams])
     scores = study.inputs.scores(unit)
@@ -103,5 +105,5 @@ def inert_inputs(study: Study, found: Local, seed: int) -> np.ndarray:
     rows = np.repeat(scores, len(points), 0)
     conditions = jax.tree.map(lambda x: np.tile(np.asarray(x)[points], len(scores)), study.conditions)
     for g in study.model.derivatives(study.values_at(rows), conditions).values():
-        moving |= (np.nan_to_num(_by_inputs(study.inputs, g)) != 0).any(0)
+        moving |= (np.nan_to_num(_derivatives_by_input(study.inputs, g)) != 0).any(0)
     return ~moving

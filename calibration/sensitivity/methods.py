@@ -1,4 +1,4 @@
-"""Methods over all operating points of a study. Each gives a part of every output's result."""
+"""Methods of sensitivity analysis over all operating points. Each returns a part of every output's result."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 
 from calibration.inference.identifiability import Z95
 from calibration.sensitivity import morris, sobol
-from calibration.sensitivity.replicates import REPLICATES, Estimate
+from calibration.sensitivity.replicates import REPLICATES, IntervalEstimate
 from calibration.sensitivity.study import Study
 
 #: Largest share of base points without a value for a point to be studied.
@@ -16,28 +16,28 @@ MOST_LOST = 0.5
 
 
 @dataclasses.dataclass(frozen=True)
-class Part:
+class PartialResult:
     """Result of a method for one output, as fields of `OutputStudy`."""
 
-    overall: dict[str, Estimate]
-    at_points: dict[str, Estimate]
+    overall: dict[str, IntervalEstimate]
+    at_points: dict[str, IntervalEstimate]
     share: np.ndarray | None
     sd: np.ndarray | None
-    second: Estimate | None
-    convergence: tuple[tuple[int, Estimate], ...]
+    second: IntervalEstimate | None
+    convergence: tuple[tuple[int, IntervalEstimate], ...]
     lost: np.ndarray
     studied: np.ndarray
 
 
 def _sampled_scores(study: Study, unit: np.ndarray, which: np.ndarray) -> np.ndarray:
-    """Scores of all inputs at points of the unit cube of some of them."""
+    """Scores of all inputs, at points of the unit cube of some inputs. The others are at their medians."""
     whole = np.full((len(unit), len(study.inputs)), 0.5)
     whole[:, which] = unit
     return study.inputs.scores(whole)
 
 
 def group_points(study: Study, moving: np.ndarray) -> dict[tuple[int, ...], list[int]]:
-    """Points grouped by the inputs that act there."""
+    """Groups of operating points at which the same inputs act."""
     groups: dict[tuple[int, ...], list[int]] = {}
     for k in range(len(study.points)):
         which = tuple(i for i in study.acting(k) if moving[i])
@@ -46,23 +46,23 @@ def group_points(study: Study, moving: np.ndarray) -> dict[tuple[int, ...], list
     return groups
 
 
-def _blank(points: int, size: int) -> Estimate:
-    return Estimate(*(np.full((points, size), np.nan) for _ in range(3)))
+def _empty_estimate(points: int, size: int) -> IntervalEstimate:
+    return IntervalEstimate(*(np.full((points, size), np.nan) for _ in range(3)))
 
 
-def _put(into: Estimate, k: int, found: Estimate) -> None:
+def _store_estimate(into: IntervalEstimate, k: int, found: IntervalEstimate) -> None:
     into.value[k], into.low[k], into.high[k] = found.value, found.low, found.high
 
 
-def sobol_indices(study: Study, moving: np.ndarray, evaluations: int, seed: int) -> dict[str, Part]:
-    """First, total and second-order indices at each point, and over all of them."""
+def sobol_indices(study: Study, moving: np.ndarray, evaluations: int, seed: int) -> dict[str, PartialResult]:
+    """First-order, total and second-order Sobol indices at each point and over all points."""
     points, d = len(study.points), len(study.inputs)
     names = [o.name for o in study.model.outputs]
-    terms: dict[str, dict[int, sobol.Terms]] = {name: {} for name in names}
+    terms: dict[str, dict[int, sobol.VarianceTerms]] = {name: {} for name in names}
     lost = {name: np.zeros(points) for name in names}
     spent = {}
     for which, group in group_points(study, moving).items():
-        size = sobol.base_points(evaluations / points, len(which), True)
+        size = sobol.base_point_count(evaluations / points, len(which), True)
         design = sobol.sobol_design(len(which), size, seed)
         scores = _sampled_scores(study, design.points, np.array(which))
         for k, made in study.sample(study.values_at(scores), group):
@@ -75,22 +75,22 @@ def sobol_indices(study: Study, moving: np.ndarray, evaluations: int, seed: int)
                     terms[name][k] = output_terms.widened(which, d)
     answer = {}
     for name in names:
-        first, total, sd = _blank(points, d), _blank(points, d), np.full(points, np.nan)
-        whole: sobol.Terms | None = None
+        first, total, sd = _empty_estimate(points, d), _empty_estimate(points, d), np.full(points, np.nan)
+        whole: sobol.VarianceTerms | None = None
         for k, output_terms in terms[name].items():
             indices = sobol.indices_of_terms(output_terms)
-            _put(first, k, indices.first)
-            _put(total, k, indices.total)
+            _store_estimate(first, k, indices.first)
+            _store_estimate(total, k, indices.total)
             sd[k] = np.sqrt(indices.variance)
             whole = output_terms if whole is None else whole + output_terms
         studied = np.array([k in terms[name] for k in range(points)])
         if whole is None:
-            answer[name] = Part({}, {}, None, None, None, (), lost[name], studied)
+            answer[name] = PartialResult({}, {}, None, None, None, (), lost[name], studied)
             continue
         overall = sobol.indices_of_terms(whole)
         stages = [(r, sobol.indices_of_terms(whole, r).total) for r in sobol.STAGES]
         count = sum(spent[k] for k in terms[name])
-        answer[name] = Part(
+        answer[name] = PartialResult(
             {"first": overall.first, "total": overall.total},
             {"first": first, "total": total},
             np.where(np.isfinite(total.value), np.clip(total.value, 0.0, 1.0), np.nan),
@@ -103,11 +103,11 @@ def sobol_indices(study: Study, moving: np.ndarray, evaluations: int, seed: int)
     return answer
 
 
-def morris_screening(study: Study, moving: np.ndarray, evaluations: int, seed: int) -> dict[str, Part]:
-    """Elementary effects over the 95 % range of each input, at each point."""
+def morris_screening(study: Study, moving: np.ndarray, evaluations: int, seed: int) -> dict[str, PartialResult]:
+    """Elementary effects (Morris) over the 95 % range of each input, at each point."""
     points, d = len(study.points), len(study.inputs)
     names = [o.name for o in study.model.outputs]
-    found: dict[str, dict[int, tuple[morris.Effects, tuple[int, ...]]]] = {name: {} for name in names}
+    found: dict[str, dict[int, tuple[morris.ElementaryEffects, tuple[int, ...]]]] = {name: {} for name in names}
     lost = {name: np.zeros(points) for name in names}
     for which, group in group_points(study, moving).items():
         count = max(int(np.ceil(evaluations / points / (len(which) + 1))), 10)
@@ -126,7 +126,7 @@ def morris_screening(study: Study, moving: np.ndarray, evaluations: int, seed: i
                     found[name][k] = effects, which
     answer = {}
     for name in names:
-        size, mean, spread = _blank(points, d), np.full((points, d), np.nan), np.full((points, d), np.nan)
+        size, mean, spread = _empty_estimate(points, d), np.full((points, d), np.nan), np.full((points, d), np.nan)
         for k, (effects, which) in found[name].items():
             places = list(which)
             for whole, part in (
@@ -140,20 +140,20 @@ def morris_screening(study: Study, moving: np.ndarray, evaluations: int, seed: i
                 whole[k, places] = part  # fmt: skip
         studied = np.array([k in found[name] for k in range(points)])
         if not studied.any():
-            answer[name] = Part({}, {}, None, None, None, (), lost[name], studied)
+            answer[name] = PartialResult({}, {}, None, None, None, (), lost[name], studied)
             continue
         square = size.value**2
         share = square / np.where(square.sum(1, keepdims=True) > 0, square.sum(1, keepdims=True), 1.0)
         rows = np.flatnonzero(studied)
         overall = {
-            "mean_absolute_effect": Estimate(*(x[rows].mean(0) for x in (size.value, size.low, size.high))),
-            "mean_effect": Estimate(*(mean[rows].mean(0),) * 3),
-            "sd_effect": Estimate(*(spread[rows].mean(0),) * 3),
+            "mean_absolute_effect": IntervalEstimate(*(x[rows].mean(0) for x in (size.value, size.low, size.high))),
+            "mean_effect": IntervalEstimate(*(mean[rows].mean(0),) * 3),
+            "sd_effect": IntervalEstimate(*(spread[rows].mean(0),) * 3),
         }
         at_points = {
             "mean_absolute_effect": size,
-            "mean_effect": Estimate(mean, mean, mean),
-            "sd_effect": Estimate(spread, spread, spread),
+            "mean_effect": IntervalEstimate(mean, mean, mean),
+            "sd_effect": IntervalEstimate(spread, spread, spread),
         }
-        answer[name] = Part(overall, at_points, share, None, None, (), lost[name], studied)
+        answer[name] = PartialResult(overall, at_points, share, None, None, (), lost[name], studied)
     return answer

@@ -1,4 +1,4 @@
-"""A robot's outputs as functions of inputs, over many points at once: values and exact derivatives."""
+"""Outputs of a robot as functions of inputs, for many points at once: values and exact derivatives."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from calibration.data import Columns, Names
-from calibration.data.contradictions import cannot_stand
+from calibration.data.contradictions import reason_without_stance
 from calibration.data.input_errors import BadConfiguration, allowed_words
 from mmrjax import derived, fidelities
 from mmrjax.compile.compiling import compiled
@@ -32,12 +32,12 @@ DEFAULT = ("slip", "power_supply", "efficiency_chassis", "steepest_slope")
 
 
 @dataclasses.dataclass(frozen=True)
-class Answer:
-    """Outputs of many points.
+class ModelOutputs:
+    """Outputs at many points.
 
     Attributes:
         values: values of each output [SI], NaN if its run did not converge, shape (points,).
-        statuses: source (a fidelity, or a module of derived outputs) → codes, shape (points,).
+        statuses: source (a fidelity, or a module of derived outputs) → status of each point, shape (points,).
     """
 
     values: Columns
@@ -49,18 +49,18 @@ class Answer:
 
 
 def count_statuses(codes: np.ndarray) -> dict[str, int]:
-    """Status → number, without zeros."""
+    """Number of points with each status, without zeros."""
     each = np.bincount(codes, minlength=len(STATUSES))
     return {STATUSES[k]: int(n) for k, n in enumerate(each) if n}
 
 
 def known_outputs(robot: Robot) -> dict[str, Quantity]:
-    """Every output by name: those of a fidelity, then the derived ones."""
+    """Every output by name: those of a fidelity, then derived ones."""
     return {o.name: o for o in (*table_of_outputs.output_table(robot.channels), *derived.TABLE)}
 
 
 def default_outputs(robot: Robot, turns: bool) -> Names:
-    """Names of the default outputs: every channel, and those defined for the robot's load."""
+    """Names of the outputs that are studied by default: every channel, and those defined for the robot's load."""
     beside: Names = DEFAULT
     if turns:
         apart = {row.name for row in derived.OF_STRAIGHT}
@@ -78,14 +78,14 @@ def default_outputs(robot: Robot, turns: bool) -> Names:
 
 
 def chosen_outputs(words: Names, robot: Robot, turns: bool = False) -> tuple[Quantity, ...]:
-    """Outputs of these names, or the default ones for none. `start` means all outputs of a start.
+    """Outputs with these names, or the default ones if none is given. `start` stands for all outputs of a start.
 
     Args:
-        turns: True if the robot is free to turn, with the instruments for it.
+        turns: True if the robot is free to turn and has instruments for it.
 
     Raises:
-        BadConfiguration: an unknown name, with the choices. An output of a ground or stance that the robot lacks, of
-            turns if it travels straight, or of straight travel if it turns.
+        BadConfiguration: a name is unknown (the message lists the choices), or an output needs a ground or stance
+            that the robot lacks, a turn while it travels straight, or straight travel while it turns.
     """
     outputs, chosen = known_outputs(robot), []
     start = tuple(d.name for d in derived.OF_START)
@@ -111,7 +111,7 @@ def chosen_outputs(words: Names, robot: Robot, turns: bool = False) -> tuple[Qua
                 raise BadConfiguration(
                     f"--outputs {word}: only for straight travel; the varied inputs make the robot turn"
                 )
-            if row in derived.OF_POSTURE and (why := cannot_stand(robot)):
+            if row in derived.OF_POSTURE and (why := reason_without_stance(robot)):
                 raise BadConfiguration(f"--outputs {name}: {why}")
             chosen.append(row)
     return tuple(dict.fromkeys(chosen))
@@ -119,13 +119,13 @@ def chosen_outputs(words: Names, robot: Robot, turns: bool = False) -> tuple[Qua
 
 @dataclasses.dataclass(frozen=True)
 class Model:
-    """Outputs of a robot with some varying parameters and conditions.
+    """Outputs of a robot as functions of some of its parameters and conditions.
 
     Attributes:
-        robot: start of every point.
-        columns: names of the varying parameters and conditions.
-        fidelity, options: fidelity and options of the simulation of outputs that are not derived.
-        outputs: to be computed.
+        robot: robot with the other parameters.
+        columns: names of the parameters and conditions that vary.
+        fidelity, options: fidelity and its options, for outputs that are not derived.
+        outputs: outputs to compute.
     """
 
     robot: Robot
@@ -136,52 +136,56 @@ class Model:
 
     @property
     def sources(self) -> dict[str, tuple[Quantity, ...]]:
-        """Outputs by source: the fidelity's name, or the module of derived ones."""
+        """Outputs by source: the name of the fidelity, or the module of derived outputs."""
         rows_of_source: dict[str, list[Quantity]] = {}
         for output in self.outputs:
             rows_of_source.setdefault(output.group or self.fidelity, []).append(output)
         return {source: tuple(rows) for source, rows in rows_of_source.items()}
 
     def chunk(self, source: str, points: int, differentiated: bool = False) -> int:
-        """Number of points in one call, for a number of all points."""
+        """Number of points in one call."""
         long = source == derived.START or (source in fidelities.TABLE and fidelities.fidelity_facts(source).rollout)
         kind = ("derivatives of runs" if long else "derivatives") if differentiated else "runs" if long else "solves"
         few, many = CHUNKS[kind]
         return few if points <= 4 * few else many
 
-    def __call__(self, values: Float[np.ndarray, "points columns"], conditions: Conditions) -> Answer:
-        """Outputs of many points.
+    def __call__(self, values: Float[np.ndarray, "points columns"], conditions: Conditions) -> ModelOutputs:
+        """Outputs at many points.
 
         Args:
-            values: a row a point, in the order of `columns`.
-            conditions: those that do not vary, of shape () or (points,).
+            values: values of `columns`, one row for each point.
+            conditions: conditions that do not vary, shape () or (points,).
         """
         return self.joined({source: self.of_source(source, values, conditions) for source in self.sources})
 
-    def of_source(self, source: str, values: Float[np.ndarray, "points columns"], conditions: Conditions) -> Answer:
-        """Outputs of one source. See `sources`."""
-        made = self._chunked(self._function(source), self.chunk(source, len(values)), values, conditions)
+    def of_source(
+        self, source: str, values: Float[np.ndarray, "points columns"], conditions: Conditions
+    ) -> ModelOutputs:
+        """Outputs of one source, see `sources`."""
+        made = self._call_in_chunks(self._function(source), self.chunk(source, len(values)), values, conditions)
         codes = made.pop(STATUS).astype(int)
-        return Answer(made, {source: codes})
+        return ModelOutputs(made, {source: codes})
 
-    def joined(self, parts: Mapping[str, Answer]) -> Answer:
+    def joined(self, parts: Mapping[str, ModelOutputs]) -> ModelOutputs:
         """Outputs of all sources, in order."""
         values = {name: x for part in parts.values() for name, x in part.values.items()}
         statuses = {source: codes for part in parts.values() for source, codes in part.statuses.items()}
-        return Answer({o.name: values[o.name] for o in self.outputs}, statuses)
+        return ModelOutputs({o.name: values[o.name] for o in self.outputs}, statuses)
 
     def ignores(self, source: str) -> Names:
-        """Conditions without influence on any output of a source."""
+        """Conditions that influence no output of a source."""
         each = [set(o.ignores) for o in self.sources[source]]
         return tuple(sorted(set.intersection(*each)))
 
     def derivatives(self, values: Float[np.ndarray, "points columns"], conditions: Conditions) -> Columns:
-        """Exact derivatives of each output by each column [SI per unit], shape (points, columns). Zeros for a run
-        without values."""
+        """Exact derivative of each output with respect to each column [SI per unit], shape (points, columns).
+
+        Zeros for a run without values.
+        """
         columns: Columns = {}
         for source in self.sources:
             size = self.chunk(source, len(values), differentiated=True)
-            made = self._chunked(self._function(source, differentiated=True), size, values, conditions)
+            made = self._call_in_chunks(self._function(source, differentiated=True), size, values, conditions)
             made.pop(STATUS)
             columns |= made
         return {o.name: columns[o.name] for o in self.outputs}
@@ -193,10 +197,12 @@ class Model:
         run = _derivatives if differentiated else _values
         return lambda values, conditions: run(variation, source, options, rows, values, conditions)
 
-    def _chunked(
+    def _call_in_chunks(
         self, function: Callable[..., dict[str, Array]], size: int, values: Any, conditions: Conditions
     ) -> Columns:
-        """A function over chunks of one shape. The last is padded by its last point."""
+        """Results of a function that is called with chunks of equal size. The last chunk is padded with its last
+        point.
+        """
         points, values = len(values), np.asarray(values)
         alike = conditions.shape == ()  # the program broadcasts them
         spread = conditions if alike else jax.tree.map(np.asarray, conditions)
@@ -214,7 +220,7 @@ class Model:
 
 
 def _pad_rows(rows: np.ndarray, size: int) -> np.ndarray:
-    """Rows padded by repeats of the last to a given size."""
+    """Rows, padded to a given number by repeating the last one."""
     if len(rows) == size:
         return rows
     return np.concatenate([rows, np.repeat(rows[-1:], size - len(rows), 0)])
@@ -258,7 +264,9 @@ def _derivatives(
     values: Array,
     conditions: Conditions,
 ) -> dict[str, Array]:
-    """Jacobian of all points by one tangent a column, because each point's outputs depend only on its own row."""
+    """Jacobian of all points. One tangent for each column suffices, because outputs of a point depend on its own row
+    only.
+    """
 
     def numbers(values: Array) -> tuple[dict[str, Array], Array]:
         made = _outputs(variation, source, options, names, values, conditions)

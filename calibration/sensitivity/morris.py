@@ -1,4 +1,4 @@
-"""Screening by elementary effects: changes of an output by single inputs (Morris 1991).
+"""Screening by elementary effects: changes of an output when single inputs change (Morris 1991).
 
 μ* is the mean magnitude of the change per whole range of the input (Campolongo et al., Environ. Model. Softw. 22
 (2007)). σ is the variation of the change between places, by nonlinearity or interactions. Trajectories and measures
@@ -12,33 +12,33 @@ import dataclasses
 import numpy as np
 from scipy import stats
 
-from calibration.sensitivity.replicates import LEVEL, Estimate
+from calibration.sensitivity.replicates import LEVEL, IntervalEstimate
 
 #: Levels of the grid of the trajectories.
 LEVELS = 4
 
 
 @dataclasses.dataclass(frozen=True)
-class Effects:
-    """Elementary effects of each input on an output [its unit per range of the input], shape (inputs,) each.
+class ElementaryEffects:
+    """Elementary effects of each input on an output [unit of the output per range of the input], shape (inputs,).
 
     Attributes:
-        mean: μ.
-        size: μ* with its interval.
-        spread: σ.
-        trajectories: number included.
-        lost: number of those with a point without a value of the model.
+        mean: μ, mean of the effects.
+        size: μ*, mean magnitude of the effects, with its interval.
+        spread: σ, standard deviation of the effects.
+        trajectories: number of included trajectories.
+        lost: number of trajectories that were left out because the model has no value at a point.
     """
 
     mean: np.ndarray
-    size: Estimate
+    size: IntervalEstimate
     spread: np.ndarray
     trajectories: int
     lost: int
 
 
 def morris_design(inputs: int, trajectories: int, seed: int) -> np.ndarray:
-    """Points of the unit cube, shape (trajectories · (inputs + 1), inputs)."""
+    """Trajectories in the unit cube, shape (trajectories · (inputs + 1), inputs)."""
     from SALib.sample import morris as sampling
 
     # The sampler draws from NumPy's global generator, whatever its seed argument; its state is restored.
@@ -49,8 +49,8 @@ def morris_design(inputs: int, trajectories: int, seed: int) -> np.ndarray:
         np.random.set_state(state)  # noqa: NPY002
 
 
-def elementary_effects(points: np.ndarray, values: np.ndarray) -> Effects | None:
-    """Elementary effects of an output.
+def elementary_effects(points: np.ndarray, values: np.ndarray) -> ElementaryEffects | None:
+    """Elementary effects of each input on one output.
 
     Args:
         points: points from `morris_design`.
@@ -81,9 +81,9 @@ def elementary_effects(points: np.ndarray, values: np.ndarray) -> Effects | None
     np.put_along_axis(elementary, which, change, 1)
     width = float(stats.t.ppf(0.5 + LEVEL / 2, int(finite.sum()) - 1)) / np.sqrt(finite.sum())
     error = width * np.abs(elementary).std(0, ddof=1)
-    return Effects(
+    return ElementaryEffects(
         np.asarray(analysis["mu"], float),
-        Estimate(size, size - error, size + error),
+        IntervalEstimate(size, size - error, size + error),
         np.asarray(analysis["sigma"], float),
         int(finite.sum()),
         int(count - finite.sum()),

@@ -1,4 +1,4 @@
-"""The most informative ones of a list of runs, for the inputs of a study."""
+"""Choice of the runs from a list that are most informative about the inputs of a study."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ import dataclasses
 
 import numpy as np
 
-from calibration.sensitivity.local import Local
+from calibration.sensitivity.local import LocalDerivatives
 from calibration.sensitivity.model import known_outputs
-from calibration.sensitivity.result import NextRuns, Points
+from calibration.sensitivity.result import NextRuns, OperatingPoints
 from calibration.sensitivity.study import Study
 from mmrjax.model.conditions import Conditions
 
@@ -16,13 +16,14 @@ from mmrjax.model.conditions import Conditions
 
 
 @dataclasses.dataclass(frozen=True)
-class Choice:
+class ChosenRuns:
     """Runs to make next, the most informative first.
 
     Attributes:
-        rows: of the candidates.
-        gain: bits that each adds to those before it, shape (runs,).
-        covariance: covariance of the scores after each run, starting with no run, shape (runs + 1, inputs, inputs).
+        rows: indices of the chosen candidates.
+        gain: information that each run adds to those before it [bit], shape (runs,).
+        covariance: covariance of the scores after each number of runs, from none to all, shape (runs + 1, inputs,
+            inputs).
     """
 
     rows: tuple[int, ...]
@@ -31,10 +32,11 @@ class Choice:
 
 
 def fisher_information(jacobian: np.ndarray, sd: np.ndarray) -> np.ndarray:
-    """Information of each run on the scores, shape (runs, inputs, inputs).
+    """Fisher information of each run about the scores, shape (runs, inputs, inputs).
 
     Args:
-        jacobian: Jacobian of its readings by the scores, shape (runs, channels, inputs), NaN for missing readings.
+        jacobian: derivatives of the readings with respect to the scores, shape (runs, channels, inputs), NaN for
+            missing readings.
         sd: standard deviation of the readings, shape (runs, channels).
     """
     with np.errstate(divide="ignore", invalid="ignore"):  # a share of a reading of zero is no information
@@ -43,11 +45,11 @@ def fisher_information(jacobian: np.ndarray, sd: np.ndarray) -> np.ndarray:
     return np.einsum("rci,rcj->rij", whitened, whitened)
 
 
-def choose_runs(information: np.ndarray, count: int) -> Choice:
-    """Runs that together are most informative, each candidate at most once.
+def choose_runs(information: np.ndarray, count: int) -> ChosenRuns:
+    """Runs that together are most informative. Each candidate is chosen at most once.
 
     Args:
-        information: information of each candidate, from `fisher_information`.
+        information: Fisher information of each candidate, from `fisher_information`.
         count: number of runs.
     """
     candidates, size, _ = information.shape
@@ -61,26 +63,26 @@ def choose_runs(information: np.ndarray, count: int) -> Choice:
         for place in range(count):
             others = chosen[:place] + chosen[place + 1 :]
             best = _best_candidate(information, others)
-            if _value(information, [*others, best]) > _value(information, chosen) + 1e-9:
+            if _log_determinant(information, [*others, best]) > _log_determinant(information, chosen) + 1e-9:
                 chosen = [*others, best]
                 improved = True
     ordered: list[int] = []
     for _ in range(count):  # of the set, the most informative first
         left = [k for k in chosen if k not in ordered]
-        ordered.append(max(left, key=lambda k: _value(information, [*ordered, k])))
-    values = [_value(information, ordered[:k]) for k in range(count + 1)]
+        ordered.append(max(left, key=lambda k: _log_determinant(information, [*ordered, k])))
+    values = [_log_determinant(information, ordered[:k]) for k in range(count + 1)]
     eye = np.eye(size)
     after = [np.linalg.inv(eye + information[ordered[:k]].sum(0)) for k in range(count + 1)]
-    return Choice(tuple(ordered), np.diff(values) / (2 * np.log(2)), np.stack(after))
+    return ChosenRuns(tuple(ordered), np.diff(values) / (2 * np.log(2)), np.stack(after))
 
 
-def _value(information: np.ndarray, rows: list[int]) -> float:
+def _log_determinant(information: np.ndarray, rows: list[int]) -> float:
     total = np.eye(information.shape[1]) + information[rows].sum(0)
     return float(np.linalg.slogdet(total)[1])
 
 
 def _best_candidate(information: np.ndarray, rows: list[int]) -> int:
-    """Candidate outside `rows` that adds most information to them."""
+    """Index of the candidate outside `rows` that adds most information."""
     total = np.eye(information.shape[1]) + information[rows].sum(0)
     value = np.linalg.slogdet(total + information)[1]
     value[rows] = -np.inf
@@ -95,19 +97,19 @@ RUNS = 5
 
 
 @dataclasses.dataclass(frozen=True)
-class Candidates:
+class CandidateRuns:
     """Possible next runs.
 
     Attributes:
-        points, conditions: of them.
-        source: of the list.
-        noise: channel's place → (number, True for a share of the reading), see `calibration.inference.noise`.
-        words: the same for a person.
-        sd: stated by the candidates [SI], NaN if not, shape (candidates, channels).
+        points, conditions: operating points and conditions of the runs.
+        source: origin of the list.
+        noise: index of a channel → (number, True for a share of the reading), see `calibration.inference.noise`.
+        words: the same noise as text.
+        sd: standard deviations stated by the candidates [SI], NaN if not stated, shape (candidates, channels).
         count: number to propose.
     """
 
-    points: Points
+    points: OperatingPoints
     conditions: Conditions
     source: str
     noise: dict[int, tuple[float, bool]]
@@ -116,18 +118,18 @@ class Candidates:
     count: int = RUNS
 
     def deviations(self, reading: np.ndarray) -> np.ndarray:
-        """Sd of readings [SI], shape (candidates, channels)."""
+        """Standard deviation of these readings [SI], shape (candidates, channels)."""
         whole = np.empty_like(reading)
         for k, (size, relative) in self.noise.items():
             whole[:, k] = size * np.abs(reading[:, k]) if relative else size
         return np.where(np.isfinite(self.sd), self.sd, whole)
 
 
-def next_runs(study: Study, found: Local, candidates: Candidates) -> NextRuns | None:
-    """Candidates that together are most informative about the parameters, with readings of every channel.
+def choose_next_runs(study: Study, found: LocalDerivatives, candidates: CandidateRuns) -> NextRuns | None:
+    """Candidates that together are most informative about the parameters, if every channel is read.
 
     Args:
-        found: at the study's own points.
+        found: results at the operating points of the study.
 
     Returns:
         None if no candidate travels, or no parameter is uncertain.

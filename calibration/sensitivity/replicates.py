@@ -21,11 +21,11 @@ LEVEL = 0.95
 
 
 @dataclasses.dataclass(frozen=True)
-class Estimate:
-    """Indices with their intervals.
+class IntervalEstimate:
+    """Estimates with their 95 % intervals.
 
     Attributes:
-        value: shape (...).
+        value: estimates, any shape.
         low, high: ends of the 95 % interval.
     """
 
@@ -33,12 +33,12 @@ class Estimate:
     low: np.ndarray
     high: np.ndarray
 
-    def __getitem__(self, k: Any) -> Estimate:
-        return Estimate(self.value[k], self.low[k], self.high[k])
+    def __getitem__(self, k: Any) -> IntervalEstimate:
+        return IntervalEstimate(self.value[k], self.low[k], self.high[k])
 
 
-def ratio_estimate(numerator: np.ndarray, denominator: np.ndarray) -> Estimate:
-    """Ratio of the means of two quantities over replicates, and its interval.
+def ratio_estimate(numerator: np.ndarray, denominator: np.ndarray) -> IntervalEstimate:
+    """Ratio of the means of two quantities over replicates, with its interval.
 
     Its variance is that of the linearised ratio, e = (numerator - ratio · denominator) / mean denominator (Cochran,
     Sampling Techniques (1977), eq. 6.9). The bias of a ratio decreases with the number of all points, not of a
@@ -56,10 +56,10 @@ def ratio_estimate(numerator: np.ndarray, denominator: np.ndarray) -> Estimate:
     shape = (-1,) + (1,) * (numerator.ndim - 1)
     if not below > 0:
         nothing = np.full(numerator.shape[1:], np.nan)
-        return Estimate(nothing, nothing, nothing)
+        return IntervalEstimate(nothing, nothing, nothing)
     above = np.mean(numerator, 0)
     value = above / below
     error = (numerator - above - value * (denominator - below).reshape(shape)) / below
     sd = np.sqrt(np.sum(error**2, 0) / (count * (count - 1)))
     width = float(stats.t.ppf(0.5 + LEVEL / 2, count - 1)) * sd
-    return Estimate(value, value - width, value + width)
+    return IntervalEstimate(value, value - width, value + width)

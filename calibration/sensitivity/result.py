@@ -1,4 +1,4 @@
-"""Result of a sensitivity study: typed, by name. JSON, tables, terminal and report are made from it."""
+"""Result of a sensitivity study, by name. JSON, tables, terminal output and reports are made from it."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from calibration.data.runs import Runs
 from calibration.data.writing import entries_of, json_value
 from calibration.described import describe, sentences
 from calibration.inference.fit_notes import Remark
-from calibration.sensitivity.replicates import LEVEL, REPLICATES, Estimate
+from calibration.sensitivity.replicates import LEVEL, REPLICATES, IntervalEstimate
 from mmrjax.model.quantities import Quantity
 
 SCHEMA = "mmrjax.sensitivity/1"
@@ -23,12 +23,13 @@ NEGLIGIBLE = 0.01
 
 
 @dataclasses.dataclass(frozen=True)
-class Points:
-    """Operating points, arrays of shape (points,). With a battery their voltage is NaN.
+class OperatingPoints:
+    """Operating points of a study. Arrays of shape (points,). On a battery, the voltage is NaN.
 
     Attributes:
-        motor_speed: imposed [rpm] instead of the voltage, which is 0 then, None if the voltage is imposed.
-        has_ground: True if payload and slope act, else they are 0.
+        motor_speed: imposed motor speed [rpm], None if the voltage is imposed. The voltage is 0 if the speed is
+            imposed.
+        has_ground: True if payload and slope act. Otherwise they are 0.
     """
 
     configuration: np.ndarray
@@ -42,7 +43,7 @@ class Points:
         return len(self.voltage)
 
     @classmethod
-    def of(cls, runs: Runs) -> Points:
+    def of(cls, runs: Runs) -> OperatingPoints:
         """Operating points of a table of runs."""
         layout, nothing = runs.layout, np.zeros(len(runs))
         payload, slope = (runs[c] if c in runs.axes else nothing for c in ("payload_kg", "slope_deg"))
@@ -57,33 +58,33 @@ class Points:
             layout.has_ground,
         )
 
-    def at(self, rows: np.ndarray) -> Points:
-        """Some of the points, by a mask or an index."""
+    def at(self, rows: np.ndarray) -> OperatingPoints:
+        """Some of the points, selected by a mask or an index."""
         speed = None if self.motor_speed is None else self.motor_speed[rows]
         voltage, payload, slope = (x[rows] for x in (self.voltage, self.payload, self.slope_deg))
-        return Points(self.configuration[rows], voltage, payload, slope, speed, self.has_ground)
+        return OperatingPoints(self.configuration[rows], voltage, payload, slope, speed, self.has_ground)
 
     @property
     def imposed(self) -> tuple[str, np.ndarray, str]:
-        """Imposed quantity of the motors: words, values, unit."""
+        """Imposed quantity of the motors: name, values, unit."""
         if self.motor_speed is None:
             return "voltage", self.voltage, "V"
         return "motor speed", self.motor_speed, "rpm"
 
     @property
     def ground(self) -> tuple[tuple[str, np.ndarray, str], ...]:
-        """Conditions of the ground: columns, values, units, empty without a ground."""
+        """Conditions of the ground: column, values and unit of each. Empty without a ground."""
         found = ("payload_kg", self.payload, " kg"), ("slope_deg", self.slope_deg, "°")
         return found if self.has_ground else ()
 
     def label(self, k: int) -> str:
-        """A point in words."""
+        """Name of a point, such as `6T2A, 12 V, 2 kg, 10°`."""
         _, imposed, unit = self.imposed
         supply = "battery" if np.isnan(imposed[k]) else f"{imposed[k]:g} {unit}"
         return ", ".join((f"{self.configuration[k]}, {supply}", *(f"{x[k]:g}{unit}" for _, x, unit in self.ground)))
 
     def columns(self) -> Columns:
-        """Columns as in tables of runs."""
+        """Columns of the points, as in tables of runs."""
         further = (
             {"supply_voltage_V": self.voltage} if self.motor_speed is None else {"motor_speed_rpm": self.motor_speed}
         )
@@ -91,16 +92,16 @@ class Points:
 
 
 @dataclasses.dataclass(frozen=True)
-class Input:
-    """An uncertain input.
+class InputSummary:
+    """An uncertain input of a study.
 
     Attributes:
-        unit, meaning: unit and meaning of its field.
+        unit, meaning: unit and meaning of the input.
         distribution: log-normal, normal, uniform or posterior.
-        median: [unit].
-        interval: interval of 95 % [unit].
-        sd: to first order [unit].
-        inert: True if all computed derivatives of all outputs by it were exactly zero. It is then not sampled.
+        median: median [unit].
+        interval: 95 % interval [unit].
+        sd: standard deviation, to first order [unit].
+        inert: True if the derivatives of all outputs with respect to it were exactly zero. It is then not sampled.
     """
 
     unit: str
@@ -114,24 +115,23 @@ class Input:
 
 @dataclasses.dataclass(frozen=True)
 class OutputStudy:
-    """Results for one output. Arrays over (points, inputs), NaN at points without a value.
+    """Results for one output. Arrays of shape (points, inputs), NaN at points without a value.
 
     Attributes:
-        row: name, unit, label.
+        row: name, unit and label of the output.
         value: value at the medians of the inputs [SI], shape (points,).
-        derivative: by each input [SI per its unit].
+        derivative: derivative with respect to each input [SI per unit of the input].
         elasticity: (x / y) ∂y/∂x [-].
-        swing: output with each single input at the lower and upper end of its 95 % interval [SI], shape
-            (2, points, inputs).
-        sd: standard deviation of the output over all inputs [SI], shape (points,): to first order, or of the sample
-            if there is one.
-        share: share of the variance that involves an input, as the method defines it [-].
-        overall: indices of each input over all points together, name → Estimate of shape (inputs,).
-        at_points: the same at each point, name → Estimate of shape (points, inputs).
-        second: interactions over all points, Estimate of shape (inputs, inputs), None without.
-        convergence: (model evaluations, Estimate of the main index) at stages.
-        lost: share of base points without a value at each point, shape (points,).
-        studied: True for included points.
+        swing: output with one input at the lower or upper end of its 95 % interval [SI], shape (2, points, inputs).
+        sd: standard deviation of the output due to all inputs [SI], shape (points,). From the sample if there is one,
+            otherwise to first order.
+        share: share of the variance that involves an input, as defined by the method [-].
+        overall: indices of each input over all points: name → estimates of shape (inputs,).
+        at_points: indices at each point: name → estimates of shape (points, inputs).
+        second: second-order indices over all points, shape (inputs, inputs). None if not computed.
+        convergence: main index after increasing numbers of model evaluations.
+        lost: share of base points without a value, at each point, shape (points,).
+        studied: True for points that could be studied.
     """
 
     JSON = ("label=row.label", "unit=row.unit_shown", "factor=row.factor", "value", "sd", "share", "studied", "lost")
@@ -142,16 +142,18 @@ class OutputStudy:
     swing: np.ndarray
     sd: np.ndarray
     share: np.ndarray
-    overall: dict[str, Estimate]
-    at_points: dict[str, Estimate]
-    second: Estimate | None
-    convergence: tuple[tuple[int, Estimate], ...]
+    overall: dict[str, IntervalEstimate]
+    at_points: dict[str, IntervalEstimate]
+    second: IntervalEstimate | None
+    convergence: tuple[tuple[int, IntervalEstimate], ...]
     lost: np.ndarray
     studied: np.ndarray
 
     @property
     def overall_share(self) -> np.ndarray:
-        """Share over all points together, shape (inputs,): of the method, else the mean over the points."""
+        """Share of the variance over all points, shape (inputs,): from the method or, if it gives none, the mean over
+        the points.
+        """
         if "total" in self.overall and np.isfinite(self.overall["total"].value).any():
             return np.clip(np.nan_to_num(self.overall["total"].value), 0.0, 1.0)
         finite = np.isfinite(self.share).any(1)
@@ -163,12 +165,12 @@ class OutputStudy:
 
 @dataclasses.dataclass(frozen=True)
 class Interaction:
-    """Interaction of two inputs, in addition to their single effects.
+    """Interaction of two inputs: share of the variance in addition to that of each alone.
 
     Attributes:
         second: second-order index.
-        interval: its 95 % interval.
-        sure: True if it is also above zero with an interval that allows for all tested pairs.
+        interval: 95 % interval of the index.
+        sure: True if the index is above zero even with an interval that allows for all tested pairs.
     """
 
     JSON = ("pair", "second", "second_interval=interval", "sure")
@@ -180,21 +182,23 @@ class Interaction:
 
 @dataclasses.dataclass(frozen=True)
 class NextRuns:
-    """Most informative next runs.
+    """The most informative next runs.
 
     Attributes:
         candidates: number of candidates.
-        source: of their list.
-        points: those chosen, in order.
-        gain: bits that each adds, shape (runs,).
-        noise: channel → sd as a share of the reading [-], and words for a person.
-        sd: standard deviation of each input after so many runs, over that before any, shape (runs + 1, inputs).
-        output_sd: output → its sd, root mean square over the points, after so many runs [SI], shape (runs + 1,).
+        source: origin of the list of candidates.
+        points: chosen runs, in order.
+        gain: information that each adds [bit], shape (runs,).
+        noise: channel → standard deviation relative to the reading [-], and the noise as text.
+        sd: standard deviation of each input after each number of runs, relative to that before any, shape (runs + 1,
+            inputs).
+        output_sd: output → its standard deviation after each number of runs, rms over the points [SI], shape (runs +
+            1,).
     """
 
     candidates: int
     source: str
-    points: Points
+    points: OperatingPoints
     gain: np.ndarray
     noise: str
     sd: np.ndarray
@@ -203,30 +207,30 @@ class NextRuns:
 
 @dataclasses.dataclass(frozen=True)
 class SensitivityResult:
-    """A finished study.
+    """Result of a sensitivity study.
 
     Attributes:
         method: one of `METHODS`.
-        model: fidelity.
+        model: name of the fidelity.
         seed: random seed.
-        inputs: by name, in order.
-        correlated: True for inputs of a posterior.
+        inputs: inputs by name, in order.
+        correlated: True if the inputs come from a posterior, so that they are correlated.
         points: operating points.
-        outputs: by name.
-        statuses: source → status → points, at the medians.
-        sampled: the same over the sample.
-        next_runs: None without a candidate that converges.
+        outputs: results by output name.
+        statuses: source → status → number of points, at the medians.
+        sampled: the same for the sample.
+        next_runs: most informative next runs. None if no candidate converges.
         evaluations: number of model evaluations.
-        seconds: their duration, including compilation.
+        seconds: duration of the evaluations [s], including compilation.
         remarks: notes on the result.
     """
 
     method: str
     model: str
     seed: int
-    inputs: dict[str, Input]
+    inputs: dict[str, InputSummary]
     correlated: bool
-    points: Points
+    points: OperatingPoints
     outputs: dict[str, OutputStudy]
     statuses: dict[str, dict[str, int]]
     sampled: dict[str, dict[str, int]]
@@ -257,7 +261,7 @@ class SensitivityResult:
 
     @property
     def negligible(self) -> Names:
-        """Inputs with less than `NEGLIGIBLE` of the variance of every output at every point."""
+        """Inputs that cause less than `NEGLIGIBLE` of the variance of every output at every point."""
         return tuple(n for n, x in zip(self.names, self.importance(), strict=True) if x < NEGLIGIBLE)
 
     @property
@@ -266,7 +270,7 @@ class SensitivityResult:
         return not any(counts.get("failed") for counts in self.statuses.values())
 
     def leaders(self) -> dict[str, list[tuple[str, float]]]:
-        """Input → label and share [-] of each output that depends on it more than on any other."""
+        """Input → label and share [-] of each output for which it is the most important input."""
         leading: dict[str, list[tuple[str, float]]] = {}
         for study in self.outputs.values():
             share = study.overall_share
@@ -276,7 +280,7 @@ class SensitivityResult:
         return leading
 
     def statement(self) -> str:
-        """What decides these outputs, in one sentence."""
+        """The inputs that matter most, in one sentence."""
         return describe(self)
 
     @property
@@ -285,7 +289,7 @@ class SensitivityResult:
         return sentences(self.remarks)
 
     def to_json(self) -> Json:
-        """Entries of result.json, docs/schemas/sensitivity.schema.json."""
+        """Content of result.json, as described in docs/schemas/sensitivity.schema.json."""
         names = self.names
         return json_value(
             {
@@ -304,14 +308,14 @@ class SensitivityResult:
                 },
                 "convergence": {
                     name: [
-                        {"evaluations": count, "indices": _by_input(names, {"index": estimate})}
+                        {"evaluations": count, "indices": _estimates_by_input(names, {"index": estimate})}
                         for count, estimate in study.convergence
                     ]
                     for name, study in self.outputs.items()
                     if study.convergence
                 },
                 **entries_of(self, "negligible", "statuses", "statuses_sampled=sampled"),
-                "next_runs": None if self.next_runs is None else _next_runs(self.next_runs, names),
+                "next_runs": None if self.next_runs is None else _next_runs_json(self.next_runs, names),
                 **entries_of(self, "evaluations", "seconds", "notes"),
             }
         )
@@ -322,10 +326,12 @@ class SensitivityResult:
                 name: {"derivative": study.derivative[:, k], "elasticity": study.elasticity[:, k]}
                 for k, name in enumerate(self.names)
             }
-        return _by_input(self.names, study.overall)
+        return _estimates_by_input(self.names, study.overall)
 
     def tables(self) -> dict[str, Columns]:
-        """CSV tables by file name: derivatives and swings at each point, indices over all and at each point."""
+        """CSV tables by file name: derivatives and swings at each point, indices over all points and at each
+        point.
+        """
         names = np.array(self.names)
         found: dict[str, list[Columns]] = {"points.csv": [], "indices.csv": []}
         for name, study in self.outputs.items():
@@ -359,7 +365,7 @@ class SensitivityResult:
         }
 
 
-def _by_input(names: Names, estimates: dict[str, Estimate]) -> Json:
+def _estimates_by_input(names: Names, estimates: dict[str, IntervalEstimate]) -> Json:
     return {
         name: {
             key: value
@@ -371,7 +377,7 @@ def _by_input(names: Names, estimates: dict[str, Estimate]) -> Json:
 
 
 def interactions(study: OutputStudy, names: Names) -> list[Interaction]:
-    """Pairs of the relevant inputs of an output, the strongest first."""
+    """Interactions of the relevant inputs of an output, the strongest first."""
     second = study.second
     if second is None:
         return []
@@ -388,7 +394,7 @@ def interactions(study: OutputStudy, names: Names) -> list[Interaction]:
     return sorted(found, key=lambda pair: -pair.second)
 
 
-def _next_runs(runs: NextRuns, names: Names) -> Json:
+def _next_runs_json(runs: NextRuns, names: Names) -> Json:
     columns = runs.points.columns()
     return {
         **entries_of(runs, "candidates", "source", "noise"),

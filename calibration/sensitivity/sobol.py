@@ -1,11 +1,12 @@
-"""Variance-based indices of independent inputs: first, total and second order (Sobol' 1993, Homma and Saltelli 1996).
+"""Variance-based (Sobol) indices of independent inputs: first, total and second order (Sobol' 1993, Homma and
+Saltelli 1996).
 
-S_i = Var(E[y | x_i]) / Var y is the mean share of the variance that is removed if x_i is known. T_i =
-E[Var(y | all but x_i)] / Var y is the share that remains if all but x_i are known. T_i - S_i is due to interactions.
-S_ij is the joint effect of x_i and x_j in addition to their single effects. Designs are SALib's (Saltelli's scheme on
-a scrambled Sobol sequence), and so are the estimators: Saltelli et al., Comput. Phys. Commun. 181 (2010) for first
-order and, after Jansen (1999), for the total. Saltelli, ibid. 145 (2002) for second order, the mean of both orders.
-Intervals are from whole replicates.
+S_i = Var(E[y | x_i]) / Var y is the mean share of the variance that is removed if x_i is known. T_i = E[Var(y | all
+but x_i)] / Var y is the share that remains if all but x_i are known. T_i - S_i is due to interactions. S_ij is the
+joint effect of x_i and x_j in addition to their single effects. Designs are SALib's (Saltelli's scheme on a scrambled
+Sobol sequence), and so are the estimators: Saltelli et al., Comput. Phys. Commun. 181 (2010) for first order and,
+after Jansen (1999), for the total. Saltelli, ibid. 145 (2002) for second order, the mean of both orders. Intervals
+are from whole replicates.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from calibration.sensitivity.replicates import REPLICATES, Estimate, ratio_estimate
+from calibration.sensitivity.replicates import REPLICATES, IntervalEstimate, ratio_estimate
 
 #: Fewest points of a replicate.
 FEWEST = 4
@@ -25,13 +26,13 @@ STAGES = (4, 8, 16, REPLICATES)
 
 
 @dataclasses.dataclass(frozen=True)
-class Design:
-    """Points of the unit cube, by replicates.
+class SobolDesign:
+    """Points of the unit cube for Sobol indices, grouped by replicates.
 
     Attributes:
-        points: shape (replicates · size · blocks, inputs), a block after the other: A, A with the k-th column of B
-            for each k, with `second` B with the k-th column of A for each k, B.
-        size: base points of a replicate, a power of 2.
+        points: points, shape (replicates · size · blocks, inputs). Blocks follow one another: A, then A with the k-th
+            column of B for each k, then (with `second`) B with the k-th column of A for each k, then B.
+        size: number of base points of a replicate, a power of 2.
         second: True for designs with second-order indices.
     """
 
@@ -47,17 +48,17 @@ class Design:
 
     @property
     def blocks(self) -> int:
-        """Evaluations for each base point."""
+        """Number of evaluations for each base point."""
         return (2 * self.inputs if self.second else self.inputs) + 2
 
 
-def base_points(evaluations: float, inputs: int, second: bool, replicates: int = REPLICATES) -> int:
-    """Base points of a replicate for at least so many evaluations in all: the next power of 2."""
+def base_point_count(evaluations: float, inputs: int, second: bool, replicates: int = REPLICATES) -> int:
+    """Number of base points of a replicate that gives at least this many evaluations: the next power of 2."""
     blocks = (2 * inputs if second else inputs) + 2
     return 2 ** max(math.ceil(math.log2(max(evaluations / (replicates * blocks), FEWEST))), 0)
 
 
-def sobol_design(inputs: int, size: int, seed: int, second: bool = True, replicates: int = REPLICATES) -> Design:
+def sobol_design(inputs: int, size: int, seed: int, second: bool = True, replicates: int = REPLICATES) -> SobolDesign:
     """Design of independent replicates, each a Sobol sequence with its own scrambling.
 
     Args:
@@ -73,19 +74,20 @@ def sobol_design(inputs: int, size: int, seed: int, second: bool = True, replica
     }
     generators = np.random.default_rng(seed).spawn(replicates)
     parts = [sampling.sample(problem, size, calc_second_order=second, seed=rng) for rng in generators]
-    return Design(np.concatenate(parts), size, second, replicates)
+    return SobolDesign(np.concatenate(parts), size, second, replicates)
 
 
 @dataclasses.dataclass(frozen=True)
-class Terms:
-    """Parts of the variance of an output, by replicate, whose ratios are the indices [output's unit²].
+class VarianceTerms:
+    """Parts of the variance of an output, for each replicate [unit² of the output]. Their ratios are the indices.
 
     Attributes:
-        variance: shape (replicates,).
-        first, total: shape (replicates, inputs).
-        second: of each pair, closed (with the single effects), shape (replicates, inputs, inputs), None without.
+        variance: total variance, shape (replicates,).
+        first, total: parts for the first-order and total indices, shape (replicates, inputs).
+        second: part of each pair including its single effects, shape (replicates, inputs, inputs). None if not
+            computed.
         rows: number of included base points.
-        lost: number of those with a missing value of the model.
+        lost: number of base points that were left out because the model has no value.
     """
 
     variance: np.ndarray
@@ -95,10 +97,10 @@ class Terms:
     rows: int
     lost: int
 
-    def __add__(self, other: Terms) -> Terms:
-        """Terms of both outputs together, as of a vector (Gamboa et al., Electron. J. Stat. 8 (2014))."""
+    def __add__(self, other: VarianceTerms) -> VarianceTerms:
+        """Terms of both outputs together, as for a vector of outputs (Gamboa et al., Electron. J. Stat. 8 (2014))."""
         second = None if self.second is None or other.second is None else self.second + other.second
-        return Terms(
+        return VarianceTerms(
             self.variance + other.variance,
             self.first + other.first,
             self.total + other.total,
@@ -107,8 +109,8 @@ class Terms:
             self.lost + other.lost,
         )
 
-    def widened(self, places: Sequence[int], inputs: int) -> Terms:
-        """Terms for more inputs, with these at `places` and the others inert."""
+    def widened(self, places: Sequence[int], inputs: int) -> VarianceTerms:
+        """Terms for more inputs: these at `places`, the others without influence."""
 
         first, total = (np.zeros((len(self.variance), inputs)) for _ in range(2))
         first[:, places], total[:, places] = self.first, self.total
@@ -120,18 +122,18 @@ class Terms:
         return dataclasses.replace(self, first=first, total=total, second=second)
 
 
-def sobol_terms(design: Design, values: np.ndarray) -> Terms | None:
-    """Parts of an output's variance.
+def sobol_terms(design: SobolDesign, values: np.ndarray) -> VarianceTerms | None:
+    """Parts of the variance of an output.
 
-    A base point is omitted if the output is not finite in one of its blocks. If that depends on one
-    input only (an adhesion that is too small), the indices are exactly those of that input truncated there, otherwise
-    approximately.
+    A base point is omitted if the output is not finite in one of its blocks. If that depends on a single input (such
+    as too small an adhesion), the indices are exactly those of that input truncated there. Otherwise they are
+    approximate.
 
     Args:
-        values: values of the output at the design's points.
+        values: values of the output at the points of the design.
 
     Returns:
-        None if fewer than two base points of some replicate remain.
+        None if some replicate has fewer than two base points left.
     """
     d = design.inputs
     by = np.reshape(values, (design.replicates, design.size, design.blocks))
@@ -154,7 +156,7 @@ def sobol_terms(design: Design, values: np.ndarray) -> Terms | None:
         alone = np.einsum("rn,rn->r", a, b)[:, None, None]
         closed = weight * (mixed - alone)
         second = (closed + np.swapaxes(closed, 1, 2)) / 2
-    return Terms(
+    return VarianceTerms(
         variance=weight * np.sum(a**2 + b**2, 1) / 2,
         first=weight * np.einsum("rn,rnk->rk", b, ab - a[..., None]),
         total=weight * np.sum((a[..., None] - ab) ** 2, 1) / 2,
@@ -165,23 +167,25 @@ def sobol_terms(design: Design, values: np.ndarray) -> Terms | None:
 
 
 @dataclasses.dataclass(frozen=True)
-class Indices:
-    """Indices of one output, shape (inputs,). `second` has shape (inputs, inputs) or is None. `variance`: [unit²]."""
+class SobolIndices:
+    """Sobol indices of one output, shape (inputs,). `second` has the shape (inputs, inputs) or is None. `variance`:
+    [unit²].
+    """
 
-    first: Estimate
-    total: Estimate
-    second: Estimate | None
+    first: IntervalEstimate
+    total: IntervalEstimate
+    second: IntervalEstimate | None
     variance: float
 
 
-def indices_of_terms(terms: Terms, replicates: int | None = None) -> Indices:
-    """Indices from parts of the variance, or from a first number of replicates."""
+def indices_of_terms(terms: VarianceTerms, replicates: int | None = None) -> SobolIndices:
+    """Sobol indices from the parts of the variance. `replicates`: only this many of the first replicates."""
     kept = slice(replicates)
     variance, first = terms.variance[kept], terms.first[kept]
     second = None
     if terms.second is not None:
         beyond = terms.second[kept] - first[:, :, None] - first[:, None, :]
         second = ratio_estimate(beyond, variance)
-    return Indices(
+    return SobolIndices(
         ratio_estimate(first, variance), ratio_estimate(terms.total[kept], variance), second, float(variance.mean())
     )

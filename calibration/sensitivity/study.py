@@ -1,4 +1,4 @@
-"""Object of a study: one robot, its uncertain inputs, operating points and outputs."""
+"""Subject of a sensitivity study: one robot, its uncertain inputs, operating points and outputs."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ import numpy as np
 
 from calibration.data import Columns
 from calibration.inference.fit_notes import Remark, progress_remark
-from calibration.sensitivity.model import Answer, Model, count_statuses
-from calibration.sensitivity.result import Points
-from calibration.sensitivity.uncertain_inputs import Inputs
+from calibration.sensitivity.model import Model, ModelOutputs, count_statuses
+from calibration.sensitivity.result import OperatingPoints
+from calibration.sensitivity.uncertain_inputs import UncertainInputs
 from mmrjax import fidelities
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.quantities import RPM, Quantity
@@ -27,8 +27,8 @@ SILENCE = 10.0
 
 
 @dataclasses.dataclass(frozen=True)
-class Supply:
-    """Supply of the motors at each point: battery (1) or not (0), charge taken [C], and the adhesion ratio there."""
+class PointSupply:
+    """Supply of the motors at each point: battery (1) or external (0), charge taken [C], and adhesion ratio."""
 
     battery: float = 0.0
     discharge: float = 0.0
@@ -36,20 +36,20 @@ class Supply:
 
 
 class Study:
-    """One robot, its uncertain inputs, operating points and outputs. Methods are functions of a study."""
+    """One robot with its uncertain inputs, operating points and outputs. The methods are functions of a study."""
 
     def __init__(
         self,
         robot: Robot,
-        inputs: Inputs,
-        points: Points,
+        inputs: UncertainInputs,
+        points: OperatingPoints,
         outputs: tuple[Quantity, ...],
         model: str = "steady",
         options: Mapping[str, float] | None = None,
-        supply: Supply | None = None,
+        supply: PointSupply | None = None,
         tell: Tell = lambda note: None,
     ) -> None:
-        supply = Supply() if supply is None else supply
+        supply = PointSupply() if supply is None else supply
         self.robot, self.inputs, self.points, self.tell = robot, inputs, points, tell
         options = fidelities.fidelity_facts(model).resolved() if options is None else options
         self.model = Model(robot, inputs.columns, model, options, outputs)
@@ -69,23 +69,24 @@ class Study:
         self.sampled: Columns = {}
 
     def at(self, k: int) -> Conditions:
-        """Conditions of one point."""
+        """Conditions at one point."""
         return jax.tree.map(lambda x: jnp.asarray(np.asarray(x)[k]), self.conditions)
 
     def acting(self, k: int) -> np.ndarray:
-        """Inputs that act at a point: all except those of other configurations."""
+        """Indices of the inputs that act at a point: all except those of other configurations."""
         return self.inputs.acting(str(self.points.configuration[k]), self.robot.configurations.names)
 
     def values_at(self, scores: np.ndarray) -> np.ndarray:
-        """Columns of the model at scores of all inputs."""
+        """Columns of the model for scores of all inputs."""
         return np.asarray(self.inputs.values(scores))
 
     def sample(self, values: np.ndarray, points: Sequence[int]) -> Iterator[tuple[int, Columns]]:
-        """Outputs at the same values of the model's columns, one point at a time, counted and timed.
+        """Yields the outputs at each point for the same values of the model's columns. Evaluations are counted and
+        timed.
 
-        A source is not computed again if only conditions differ that it ignores.
+        A source is not computed again if conditions differ only in ones that it ignores.
         """
-        kept: dict[tuple[str, tuple[float, ...]], Answer] = {}
+        kept: dict[tuple[str, tuple[float, ...]], ModelOutputs] = {}
         for k in points:
             began = time.perf_counter()
             conditions = self.at(k)
@@ -108,14 +109,14 @@ class Study:
                 self.tell(progress_remark("evaluations", self.evaluations, rate))
             yield k, answer.values
 
-    def _count(self, answer: Answer, rows: int, began: float) -> None:
+    def _count(self, answer: ModelOutputs, rows: int, began: float) -> None:
         self.seconds += time.perf_counter() - began
         self.evaluations += rows
         for source, codes in answer.statuses.items():
             self.sampled[source] = self.sampled.get(source, 0) + np.bincount(codes, minlength=len(STATUSES))
 
     def statuses(self) -> dict[str, dict[str, int]]:
-        """Source → status → number in the sample."""
+        """Source → status → number of evaluations in the sample."""
         return {
             source_words(source): count_statuses(np.repeat(np.arange(len(whole)), whole))
             for source, whole in self.sampled.items()
@@ -123,5 +124,5 @@ class Study:
 
 
 def source_words(source: str) -> str:
-    """Source of outputs in words: the fidelity, or the derived output's module."""
+    """Name of a source of outputs in words: the fidelity, or the module of derived outputs."""
     return source.rpartition(".")[2].replace("_", " ") if "." in source else source

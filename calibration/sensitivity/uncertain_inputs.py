@@ -1,4 +1,4 @@
-"""Uncertain inputs of a study: names, distributions, and values as functions of their scores."""
+"""Uncertain inputs of a study: their names and distributions, and their values as functions of scores."""
 
 from __future__ import annotations
 
@@ -35,14 +35,14 @@ NOTHING = Posterior(
 
 
 @dataclasses.dataclass(frozen=True)
-class Inputs:
-    """Parameters, normal in their coordinates, and conditions, uniform in their ranges.
+class UncertainInputs:
+    """Uncertain inputs: parameters, normal in their coordinates, and conditions, uniform in their ranges.
 
     Attributes:
-        parameters: distribution of the parameters. Independent except for a posterior.
-        low, high: ranges of the conditions, in their units.
-        conditions: their names.
-        axes: facts about each input, by name.
+        parameters: distribution of the parameters. They are independent unless from a posterior.
+        low, high: ranges of the conditions [own units].
+        conditions: names of the conditions.
+        axes: properties of each input, by name.
         is_posterior: True for the correlated parameters of a fit.
     """
 
@@ -63,7 +63,7 @@ class Inputs:
 
     @property
     def columns(self) -> Names:
-        """Columns of a point's values: inputs, and parameters tied to one."""
+        """Columns of a point's values: inputs, and parameters tied to them."""
         return (*self.parameters.names, *self.conditions)
 
     @cached_property
@@ -71,15 +71,15 @@ class Inputs:
         return self.parameters.root
 
     def values(self, scores: Any) -> Any:
-        """Values of `columns` at independent scores: standard normal for parameters, in 0..1 for conditions.
+        """Values of `columns` at independent scores: standard normal for parameters, 0 to 1 for conditions.
 
-        NumPy in, NumPy out, without compilation, else traceable.
+        A NumPy array is computed with NumPy, without compilation. Anything else can be traced by JAX.
 
         Args:
-            scores: shape (..., inputs).
+            scores: scores, shape (..., inputs).
 
         Returns:
-            Shape (..., columns).
+            Values, shape (..., columns).
         """
         p = len(self.parameters)
         theta = self.parameters.at(self.parameters.mean + scores[..., :p] @ self._root.T)
@@ -87,12 +87,12 @@ class Inputs:
         return (np if isinstance(scores, np.ndarray) else jnp).concatenate([theta, stated], -1)
 
     def jacobian(self, scores: Float[np.ndarray, "rows inputs"]) -> Float[np.ndarray, "rows columns inputs"]:
-        """d values / d scores of each row."""
+        """Derivatives of the values with respect to the scores, for each row."""
         return np.asarray(jax.jit(jax.vmap(jax.jacfwd(self.values)))(scores))
 
     @cached_property
     def slope(self) -> Float[np.ndarray, "columns inputs"]:
-        """d values / d scores at the medians."""
+        """Derivatives of the values with respect to the scores, at the medians."""
         return self.jacobian(self.centre[None])[0]
 
     def scores(self, unit: Float[np.ndarray, "... inputs"]) -> Float[np.ndarray, "... inputs"]:
@@ -124,10 +124,10 @@ _OTHERS = ("driver.", "rig.", "motor.resistance_thermal_", "motor.time_constant_
 def default_input_names(
     robot: Robot, configurations: Sequence[str], battery: bool, model: str = "steady", turns: bool = False
 ) -> Names:
-    """Parameters of the robot with a prior of nonzero width, for these configurations and those common to all.
+    """Names of the parameters that have a prior of nonzero width, for these configurations.
 
-    Omitted are the battery's if it does not feed the motors, guides' on wheels, and parameters that the
-    fidelity does not read, in straight travel or in turns.
+    Parameters of an unused battery, guide parameters on wheels, and parameters that the fidelity does not use (in
+    straight travel or in turns) are left out.
     """
     absent = [name for name in robot.configurations if name not in configurations]
     wheels = [name for name in configurations if float(robot.configurations[name].on_tracks) < 0.5]
@@ -147,15 +147,18 @@ def default_input_names(
     )
 
 
-def inputs_from_priors(robot: Robot, words: Sequence[str], ranges: Mapping[str, tuple[float, float]]) -> Inputs:
-    """Inputs from the priors of the parameters' fields, around the robot's values, and from stated ranges.
+def inputs_from_priors(
+    robot: Robot, words: Sequence[str], ranges: Mapping[str, tuple[float, float]]
+) -> UncertainInputs:
+    """Inputs from the priors of parameters, around the values of the robot, and from ranges of conditions.
 
     Args:
-        words: parameters, `motor.*` a group.
+        words: names of parameters. `motor.*` stands for a group.
         ranges: ranges of conditions.
 
     Raises:
-        BadConfiguration: an unknown name, with the choices. One with a prior of zero width, or an invalid range.
+        BadConfiguration: a name is unknown (the message lists the choices), its prior has zero width, or a range is
+            invalid.
     """
     everything = list(priors.parameters_by_name(robot))
     names = list(
@@ -177,14 +180,16 @@ def inputs_from_priors(robot: Robot, words: Sequence[str], ranges: Mapping[str, 
     return _inputs(robot, parameters, ranges, posterior=False)
 
 
-def inputs_from_posterior(robot: Robot, posterior: Posterior, ranges: Mapping[str, tuple[float, float]]) -> Inputs:
+def inputs_from_posterior(
+    robot: Robot, posterior: Posterior, ranges: Mapping[str, tuple[float, float]]
+) -> UncertainInputs:
     """Inputs from the posterior of a calibrated robot, and from stated ranges of conditions."""
     return _inputs(robot, posterior, ranges, posterior=True)
 
 
 def _inputs(
     robot: Robot, parameters: Posterior, ranges: Mapping[str, tuple[float, float]], *, posterior: bool
-) -> Inputs:
+) -> UncertainInputs:
     for name in ranges:
         stated_word(name, [n for n in CONDITIONS if n != "configuration"], f"--vary {name}", "no such condition")
     try:
@@ -199,4 +204,4 @@ def _inputs(
                 f"{axes[name].unit}, the smaller end first"
             )
     ends = np.array(list(ranges.values()), float).reshape(-1, 2)
-    return Inputs(parameters, tuple(ranges), ends[:, 0], ends[:, 1], axes, posterior)
+    return UncertainInputs(parameters, tuple(ranges), ends[:, 0], ends[:, 1], axes, posterior)

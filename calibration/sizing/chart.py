@@ -1,4 +1,4 @@
-"""Chart of a robot's use: over payload and slope, the nearest limit and its margin."""
+"""Chart of where a robot can be used: the nearest limit and its margin, over payload and slope."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from jaxtyping import Array
 from calibration.data.requirements_file import Requirement, Requirements
 from calibration.sizing import sheet
 from mmrjax.compile.compiling import compiled
-from mmrjax.derived.requirements import EnvelopePoint, Ratings, heat_left, ratings, travel_quantities
+from mmrjax.derived.requirements import EnvelopePoint, Ratings, ratings, thermal_margin, travel_quantities
 from mmrjax.model import params
 from mmrjax.model.robot import Robot
 
@@ -32,13 +32,13 @@ POINTS, BEYOND = 33, 1.6
 
 
 @dataclasses.dataclass(frozen=True)
-class Chart:
-    """Nearest limit, shape (slopes, payloads).
+class MarginChart:
+    """Nearest limit at each payload and slope, shape (slopes, payloads).
 
     Attributes:
-        payload, slope: axes [kg], [deg].
-        nearest: index into `LIMITS`.
-        margin: to it, negative beyond it.
+        payload, slope: values of the axes [kg], [deg].
+        nearest: index of the nearest limit in `LIMITS`.
+        margin: margin to that limit, negative beyond it.
     """
 
     payload: np.ndarray
@@ -49,14 +49,14 @@ class Chart:
 
 @compiled
 def _margins(robot: Robot, rated: Ratings, points: EnvelopePoint, speeds: Array, wanted: Array) -> Array:
-    """Margins by limit, shape (points, limits)."""
+    """Margin to each limit, shape (points, limits)."""
 
-    def one(point: EnvelopePoint, wanted: Array) -> Array:
+    def margins_at_point(point: EnvelopePoint, wanted: Array) -> Array:
         state, _ = travel_quantities(robot, point, rated)
         turns = state["motor_speed_rpm"]
         each = [
             state["adhesion"], jnp.clip(state["left"], -1.0, 1.0),
-            heat_left(robot, point, state["current"], rated.temperature),
+            thermal_margin(robot, point, state["current"], rated.temperature),
             1 - turns / speeds[0], 1 - turns / speeds[1], 1 - state["gearbox_Nm"] / rated.torque,
             jnp.minimum(state["cell"] / rated.voltage_cutoff, 1.0),
             jnp.where(wanted > 0, state["speed_m_s"] / jnp.where(wanted > 0, wanted, 1.0) - 1, 1.0),
@@ -65,11 +65,11 @@ def _margins(robot: Robot, rated: Ratings, points: EnvelopePoint, speeds: Array,
         each[1] = jnp.where(each[0] <= each[1], 1.0, each[1])
         return jnp.stack([jnp.asarray(x, float) for x in each])
 
-    return jax.vmap(one)(points, wanted)
+    return jax.vmap(margins_at_point)(points, wanted)
 
 
-def margin_chart(robot: Robot, asked: Requirements, most: tuple[float, float]) -> Chart:
-    """Chart of a robot, at the worse end of charge, in the warmest ambient of the envelope.
+def margin_chart(robot: Robot, asked: Requirements, most: tuple[float, float]) -> MarginChart:
+    """Chart for a robot at the worse end of charge, in the warmest ambient temperature of the envelope.
 
     A required speed applies only within its own payloads and slopes.
 
@@ -100,7 +100,7 @@ def margin_chart(robot: Robot, asked: Requirements, most: tuple[float, float]) -
     assert margins is not None
     margins = np.where(np.isfinite(margins), margins, -1.0)
     shape = (POINTS, POINTS)
-    return Chart(payload, slope, np.argmin(margins, 1).reshape(shape), margins.min(1).reshape(shape))
+    return MarginChart(payload, slope, np.argmin(margins, 1).reshape(shape), margins.min(1).reshape(shape))
 
 
 def chart_extent(asked: Requirements) -> tuple[float, float]:

@@ -1,4 +1,4 @@
-"""A design as numbers, its robot, and its margins to requirements and ratings of parts."""
+"""A design as numbers, the robot that it describes, and its margins to requirements and to ratings of parts."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from jaxtyping import Array, Float
 from calibration.data import Json, Names
 from calibration.data.requirements_file import Envelope, Requirement, Requirements
 from calibration.sizing import sheet
-from calibration.sizing.part_options import Options
+from calibration.sizing.part_options import PartOptions
 from mmrjax.derived.requirements import (
     NODES,
     QUANTITIES,
     EnvelopePoint,
     Ratings,
-    heat_left,
+    thermal_margin,
     travel_quantities,
 )
 from mmrjax.derived.requirements import evaluate_requirement as requirement
@@ -48,12 +48,12 @@ RATED = {
 
 
 class Design(eqx.Module):
-    """Designs in numbers, every field batchable.
+    """One or more designs as numbers. Every field can have a batch axis.
 
     Attributes:
         continuous: logarithms of `CONTINUOUS`.
-        drive, cell: numbers of `Options`, by name.
-        cells: cells in series.
+        drive, cell: numbers of the chosen drive and cell, by name, as in `PartOptions`.
+        cells: number of cells in series.
     """
 
     continuous: Float[Array, "... 3"]
@@ -63,10 +63,10 @@ class Design(eqx.Module):
 
 
 def build_robot(robot: Robot, base_mass: float, configuration: str, design: Design) -> tuple[Robot, Ratings]:
-    """Robot of a design, from an initial robot, with its ratings, traceable.
+    """Robot of a design, derived from an initial robot, and the ratings of its parts. Can be traced by JAX.
 
-    Motors, gearboxes and cells replace the robot's own in its mass. The cell's voltage depends on the used share
-    of its capacity as for the robot's cell. Cells in parallel share the resistance.
+    The masses of motors, gearboxes and cells replace those of the initial robot. The voltage of a cell depends on the
+    used share of its capacity as in the initial robot. Cells in parallel share the resistance.
     """
     ratio, radius, parallel = (jnp.exp(design.continuous[..., k]) for k in range(3))
     d, c = design.drive, design.cell
@@ -87,12 +87,12 @@ def build_robot(robot: Robot, base_mass: float, configuration: str, design: Desi
 
 
 @dataclasses.dataclass(frozen=True)
-class Demand:
-    """One requirement, with its points.
+class SizingDemand:
+    """One requirement with the points at which it is evaluated.
 
     Attributes:
-        requirement: as stated. None: the ratings of the parts. label: words.
-        rows: of its points.
+        requirement: requirement. None: the ratings of the parts.
+        rows: indices of its points.
     """
 
     requirement: Requirement | None
@@ -100,15 +100,15 @@ class Demand:
     rows: tuple[int, ...]
 
 
-class Task(eqx.Module):
+class SizingTask(eqx.Module):
     """Requirements as points and demands. Each point needs one solution of the balances for each design.
 
     Attributes:
-        robot: to be changed, with one cell (see `sheet`).
-        configuration: to be sized.
-        base_mass: base mass of the parts in the robot's mass [kg].
-        points: shape (points,).
-        middle: row of the middle of the envelope, for the energy.
+        robot: initial robot, with one cell (see `sheet`).
+        configuration: index of the configuration to be sized.
+        base_mass: mass of the initial parts in the robot's mass [kg].
+        points: evaluation points, shape (points,).
+        middle: index of the point in the middle of the envelope, at which energy is evaluated.
         demands: demands in order.
     """
 
@@ -117,7 +117,7 @@ class Task(eqx.Module):
     base_mass: float = eqx.field(static=True)
     points: EnvelopePoint
     middle: int = eqx.field(static=True)
-    demands: tuple[Demand, ...] = eqx.field(static=True)
+    demands: tuple[SizingDemand, ...] = eqx.field(static=True)
 
     @property
     def labels(self) -> Names:
@@ -125,11 +125,12 @@ class Task(eqx.Module):
         return tuple(d.label for d in self.demands)
 
 
-def sizing_task(robot: Robot, asked: Requirements, options: Options) -> Task:
-    """Points of requirements: corners of each envelope, each point once.
+def build_sizing_task(robot: Robot, asked: Requirements, options: PartOptions) -> SizingTask:
+    """Evaluation points and demands of requirements. Points are the corners of each envelope, without repeats.
 
-    A required slope or payload is a condition in which the robot has to travel. Ratings of the parts apply to
-    points of lasting travel: the middle of the envelope if no requirement states any.
+    A required slope or payload is a condition in which the robot must travel. Ratings of parts apply at points of
+    continuous
+    travel: those of such requirements or, if there are none, the middle of the envelope.
     """
     name = asked.envelope.configuration or robot.configurations.names[0]
     index: dict[tuple[float, ...], int] = {}
@@ -145,16 +146,18 @@ def sizing_task(robot: Robot, asked: Requirements, options: Options) -> Task:
     demands = []
     for r in asked.each:
         envelope = sheet.envelope_points(robot, r)
-        rows = [tuple(row(p) for p in corner) for corner in _corners(robot, r, envelope)]
-        demands.append(Demand(r, requirement_label(r), tuple(k for corner in dict.fromkeys(rows) for k in corner)))
-    middle = row(_middle(robot, asked.envelope))
+        rows = [tuple(row(p) for p in corner) for corner in _envelope_corners(robot, r, envelope)]
+        demands.append(
+            SizingDemand(r, requirement_label(r), tuple(k for corner in dict.fromkeys(rows) for k in corner))
+        )
+    middle = row(_envelope_middle(robot, asked.envelope))
     travelling = sorted({k for d in demands if d.requirement and d.requirement.name in LASTING for k in d.rows})
-    demands += [Demand(None, words, tuple(travelling) or (middle,)) for words in RATED.values()]
+    demands += [SizingDemand(None, words, tuple(travelling) or (middle,)) for words in RATED.values()]
     points: EnvelopePoint = jax.tree.map(lambda *x: jnp.stack([jnp.asarray(v) for v in x]), *kept)
     one_cell = params.without_weak_types(
         dataclasses.replace(robot, battery=dataclasses.replace(robot.battery, cells=1))
     )
-    return Task(one_cell, name, options.base_mass, points, middle, tuple(demands))
+    return SizingTask(one_cell, name, options.base_mass, points, middle, tuple(demands))
 
 
 def requirement_label(r: Requirement) -> str:
@@ -164,7 +167,7 @@ def requirement_label(r: Requirement) -> str:
     return f"{r.quantity.label}{extra}"
 
 
-def _corners(robot: Robot, r: Requirement, at: EnvelopePoint) -> list[tuple[EnvelopePoint, ...]]:
+def _envelope_corners(robot: Robot, r: Requirement, at: EnvelopePoint) -> list[tuple[EnvelopePoint, ...]]:
     """Points of a requirement, grouped by the corners of its envelope."""
     count = len(np.asarray(at.payload))
     points = [jax.tree.map(lambda x, k=k: x[k], at) for k in range(count)]
@@ -191,7 +194,7 @@ def _corners(robot: Robot, r: Requirement, at: EnvelopePoint) -> list[tuple[Enve
     return [(p,) for p in chosen]
 
 
-def _middle(robot: Robot, e: Envelope) -> EnvelopePoint:
+def _envelope_middle(robot: Robot, e: Envelope) -> EnvelopePoint:
     middle = Requirement("speed_m_s", 0.0, True, dataclasses.replace(
         e, payload_kg=(sum(e.payload_kg) / 2,) * 2, slope_deg=(sum(e.slope_deg) / 2,) * 2,
         state_of_charge=(sum(e.state_of_charge) / 2,) * 2,
@@ -200,8 +203,8 @@ def _middle(robot: Robot, e: Envelope) -> EnvelopePoint:
     return jax.tree.map(lambda x: x[0], sheet.envelope_points(robot, middle))
 
 
-def evaluate_design(asked: Task, design: Design) -> tuple[Array, Array]:
-    """Objectives (as `OBJECTIVES`) and margins (as `Task.labels`) of one design, traceable.
+def evaluate_design(asked: SizingTask, design: Design) -> tuple[Array, Array]:
+    """Objectives (as in `OBJECTIVES`) and margins (as in `SizingTask.labels`) of one design. Can be traced by JAX.
 
     Margins are shares of the required or permitted value. A requirement is met if its margin is not negative.
     """
@@ -209,13 +212,13 @@ def evaluate_design(asked: Task, design: Design) -> tuple[Array, Array]:
     states = jax.vmap(lambda p: travel_quantities(robot, p, ratings)[0])(asked.points)
     mass = jnp.asarray(robot.configurations[asked.configuration].mass)
     energy = states["energy_per_metre_Wh"][asked.middle] / 3600.0
-    margins = [_margin(asked, d, design, robot, ratings, states) for d in asked.demands]
+    margins = [_demand_margin(asked, d, design, robot, ratings, states) for d in asked.demands]
     objectives = jnp.stack([mass, energy, jnp.asarray(design.drive["cost"])])
     return objectives, jnp.stack(margins)
 
 
-def _margin(
-    asked: Task, d: Demand, design: Design, robot: Robot, ratings: Ratings, found: Mapping[str, Array]
+def _demand_margin(
+    asked: SizingTask, d: SizingDemand, design: Design, robot: Robot, ratings: Ratings, found: Mapping[str, Array]
 ) -> Array:
     rows = np.array(d.rows, int)
     states = {key: x[rows] for key, x in found.items()}
@@ -225,7 +228,7 @@ def _margin(
     r = d.requirement
     if r is None:
         most = {
-            "winding": jnp.min(_heat(robot, points, states["current"], design.drive["temperature"])),
+            "winding": jnp.min(_heat_margins(robot, points, states["current"], design.drive["temperature"])),
             "motor_speed": 1 - jnp.max(states["motor_speed_rpm"]) / design.drive["speed_motor"],
             "gearbox_speed": 1 - jnp.max(states["motor_speed_rpm"]) / design.drive["speed_gearbox"],
             "gearbox_torque": 1 - jnp.max(states["gearbox_Nm"]) / design.drive["torque"],
@@ -234,16 +237,16 @@ def _margin(
         }  # fmt: skip
         return most[next(key for key, words in RATED.items() if words == d.label)]
     if r.name == "mass_kg":
-        share = 1 - jnp.asarray(robot.configurations[asked.configuration].mass) / _limit(r)
+        share = 1 - jnp.asarray(robot.configurations[asked.configuration].mass) / _positive_limit(r)
         return -share if r.least else share
     if r.name == "slope_deg":
         return jnp.minimum(travels, above)
     if r.name == "payload_kg":
-        hot = jnp.min(_heat(robot, points, states["current"], jnp.asarray(ratings.temperature)))
+        hot = jnp.min(_heat_margins(robot, points, states["current"], jnp.asarray(ratings.temperature)))
         torque = 1 - jnp.max(states["gearbox_Nm"]) / ratings.torque
         return jnp.min(jnp.stack([travels, above, hot, torque]))
     if r.name == "endurance_min":
-        return _endurance(r, robot, ratings, states)
+        return _endurance_margin(r, robot, ratings, states)
     if r.limit is None:  # the rating of the parts, a demand on every design
         return jnp.minimum(travels, above)
     if r.name not in states:  # a quantity that is not of straight travel
@@ -252,25 +255,25 @@ def _margin(
         value, travels = found_here.value / r.quantity.factor, jnp.min(counts)
     else:
         value = states[r.name] / r.quantity.factor
-    share = jnp.min(value / _limit(r) - 1) if r.least else jnp.min(1 - value / _limit(r))
+    share = jnp.min(value / _positive_limit(r) - 1) if r.least else jnp.min(1 - value / _positive_limit(r))
     if r.name == "winding_C":
-        share = jnp.min(_heat(robot, points, states["current"], jnp.asarray(_limit(r))))
+        share = jnp.min(_heat_margins(robot, points, states["current"], jnp.asarray(_positive_limit(r))))
     return jnp.min(jnp.stack([share, travels, above]))
 
 
-def _limit(r: Requirement) -> float:
+def _positive_limit(r: Requirement) -> float:
     return max(float(r.limit or 0.0), 1e-9)
 
 
-def _heat(robot: Robot, points: EnvelopePoint, current: Array, limit: Array) -> Array:
-    return jax.vmap(lambda p, i: jnp.asarray(heat_left(robot, p, i, limit)))(points, current)
+def _heat_margins(robot: Robot, points: EnvelopePoint, current: Array, limit: Array) -> Array:
+    return jax.vmap(lambda p, i: jnp.asarray(thermal_margin(robot, p, i, limit)))(points, current)
 
 
-def _endurance(r: Requirement, robot: Robot, ratings: Ratings, at: Mapping[str, Array]) -> Array:
-    """Margin of the time until the end of the charge, with the cells above their cut-off."""
+def _endurance_margin(r: Requirement, robot: Robot, ratings: Ratings, at: Mapping[str, Array]) -> Array:
+    """Margin of the time until the charge ends, or until the cells reach their cut-off voltage."""
     battery = robot.battery
     used = battery.capacity * (r.envelope.charge[1] - r.envelope.charge_end)
-    limit = r.quantity.factor * _limit(r)
+    limit = r.quantity.factor * _positive_limit(r)
     if not r.share:
         end = battery.voltage_cell(0.0, battery.capacity * (1 - r.envelope.charge_end)) / ratings.voltage_cutoff - 1
         return jnp.minimum(used / battery.current(0.0) / limit - 1, end)

@@ -1,4 +1,6 @@
-"""Search for a size: parts are enumerated, the other numbers found by gradients from many starts in one batch."""
+"""Search for a design: parts are enumerated, continuous numbers are found by gradients from many starts in one
+batch.
+"""
 
 from __future__ import annotations
 
@@ -20,8 +22,16 @@ from calibration.data.parts import CellSheet
 from calibration.data.requirements_file import Requirements
 from calibration.inference.fit_notes import Remark, progress_remark
 from calibration.sizing import sheet
-from calibration.sizing.design import CONTINUOUS, OBJECTIVES, Design, Task, build_robot, evaluate_design, sizing_task
-from calibration.sizing.part_options import Drive, Options, options_for_robot
+from calibration.sizing.design import (
+    CONTINUOUS,
+    OBJECTIVES,
+    Design,
+    SizingTask,
+    build_robot,
+    build_sizing_task,
+    evaluate_design,
+)
+from calibration.sizing.part_options import DriveOption, PartOptions, options_for_robot
 from mmrjax.compile.compiling import compiled
 from mmrjax.model.robot import Robot
 
@@ -48,15 +58,15 @@ BINDS = 0.01
 
 @dataclasses.dataclass(frozen=True)
 class SizedDesign:
-    """One design.
+    """One design that the search found.
 
     Attributes:
-        drive, cell: sheets.
-        ratio, radius: total ratio and rolling radius [m].
-        in_series, parallel: cells.
-        objectives: by name of `OBJECTIVES`.
-        margins: by label, shares of what is required or permitted.
-        bounds: active bounds of the search.
+        drive, cell: data sheets of drive and cell.
+        ratio, radius: total gear ratio [-] and rolling radius [m].
+        in_series, parallel: number of cells in series and in parallel.
+        objectives: objectives by name.
+        margins: margins by label, relative to the required or permitted value [-].
+        bounds: bounds of the search that limit the design.
         robot: robot of the design.
     """
 
@@ -64,7 +74,7 @@ class SizedDesign:
         "motor=drive.motor.name", "gearbox", "ratio", "radius_m=radius", "cell=cell.name", "cells=in_series",
         "parallel", "objectives", "feasible", "binds", "margins",
     )  # fmt: skip
-    drive: Drive
+    drive: DriveOption
     cell: CellSheet
     ratio: float
     radius: float
@@ -82,34 +92,34 @@ class SizedDesign:
 
     @property
     def binds(self) -> list[str]:
-        """Active or violated limits, the nearest first. Then active bounds of the search."""
+        """Limits that are reached or violated, the nearest first, then bounds of the search that limit the design."""
         order = sorted(self.margins.items(), key=lambda item: item[1])
         return [*(label for label, m in order if m < BINDS), *self.bounds]
 
     @property
     def gearbox(self) -> str:
-        """Family of the gearbox, and its stages."""
+        """Family of the gearbox and number of stages."""
         return f"{self.drive.family}, stages {self.drive.stages}"
 
 
 @dataclasses.dataclass(frozen=True)
-class Sizing:
-    """Result of a search.
+class SizingResult:
+    """Result of a search for designs.
 
     Attributes:
         task, options: task and options of the search.
-        objective: objective that is minimised, of a Pareto front the first.
-        unmeetable: labels that no choice of parts meets, which were dropped.
-        ideal: the best with any ratio and fraction of a cell, None without one.
-        best: the best with a ratio of the sheets and whole cells.
-        alternatives: the next best, with other motors or cells.
-        motors: by motor, its best design, feasible or the nearest to it.
-        front: designs of the Pareto front of two objectives, empty unless requested.
-        starts, evaluated: number of searches, and of all designs.
+        objective: objective that is minimised. For a Pareto front, the first one.
+        unmeetable: labels of requirements that no choice of parts meets. They were dropped.
+        ideal: best design with any gear ratio and fraction of a cell. None if there is none.
+        best: best design with a gear ratio from the data sheets and whole cells.
+        alternatives: next best designs, with other motors or cells.
+        motors: best design for each motor: the best feasible one, or the one nearest to feasible.
+        front: designs on the Pareto front of two objectives. Empty unless requested.
+        starts, evaluated: number of searches, and of evaluated designs.
     """
 
-    task: Task
-    options: Options
+    task: SizingTask
+    options: PartOptions
     objective: str
     unmeetable: Names
     ideal: SizedDesign | None
@@ -122,21 +132,21 @@ class Sizing:
 
 
 @compiled
-def _evaluate_designs(problem: Task, designs: Design) -> tuple[Array, Array]:
-    """Objectives and margins of designs, shapes (designs, objectives), (designs, margins)."""
+def _evaluate_designs(problem: SizingTask, designs: Design) -> tuple[Array, Array]:
+    """Objectives, shape (designs, objectives), and margins, shape (designs, margins)."""
     return jax.vmap(lambda d: evaluate_design(problem, d))(designs)
 
 
 @compiled
 def _descend(
-    problem: Task,
+    problem: SizingTask,
     designs: Design,
     low: Float[Array, "designs 3"],
     high: Float[Array, "designs 3"],
     weights: Float[Array, "designs objectives"],
     kept: Float[Array, " margins"],
 ) -> Float[Array, "designs 3"]:
-    """Ends of searches that start at designs: the best feasible point on the way, or the last point.
+    """Improves designs by gradients. Returns the best feasible point of each search, or else its last point.
 
     The objective is an augmented Lagrangian, f + Σ (max(0, λ - w g)² - λ²) / 2w over the logarithms of the continuous
     numbers. Steps are Adam's, clipped to bounds.
@@ -177,15 +187,15 @@ def _descend(
 
 
 @dataclasses.dataclass(frozen=True)
-class Space:
-    """All enumerated choices, a row each, with the bounds of the continuous numbers.
+class ChoiceSpace:
+    """All enumerated choices of parts, one in each row, with the bounds of the continuous numbers.
 
     Attributes:
-        drive, cell, in_series: of each choice.
-        low, high: logarithms, shape (choices, 3).
+        drive, cell, in_series: index of drive and cell, and number of cells in series, of each choice.
+        low, high: logarithms of the bounds, shape (choices, 3).
     """
 
-    options: Options
+    options: PartOptions
     drive: np.ndarray
     cell: np.ndarray
     in_series: np.ndarray
@@ -203,8 +213,8 @@ class Space:
         )
 
 
-def choice_space(robot: Robot, problem: Task, options: Options) -> Space:
-    """Choices for a robot."""
+def enumerate_choices(robot: Robot, problem: SizingTask, options: PartOptions) -> ChoiceSpace:
+    """All choices of parts for a robot."""
     n_drives, n_cells = len(options.drives), len(options.cells)
     every = list(itertools.product(range(n_drives), range(n_cells), range(CELLS[0], CELLS[1] + 1)))
     drive, cell, series = (np.array(x) for x in zip(*every, strict=True))
@@ -222,11 +232,13 @@ def choice_space(robot: Robot, problem: Task, options: Options) -> Space:
             )
         )
 
-    return Space(options, drive, cell, series, bounds(0, "ratio_least"), bounds(1, "ratio_most"))
+    return ChoiceSpace(options, drive, cell, series, bounds(0, "ratio_least"), bounds(1, "ratio_most"))
 
 
-def evaluate_designs(problem: Task, choice: Space, rows: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Objectives and margins of many designs, in calls of one size."""
+def evaluate_designs(
+    problem: SizingTask, choice: ChoiceSpace, rows: np.ndarray, x: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Objectives and margins of many designs, computed in calls of one size."""
     parts = []
     for first in range(0, len(rows), ROWS):
         some = np.minimum(np.arange(first, first + ROWS), len(rows) - 1)
@@ -246,43 +258,43 @@ def size_robot(
     motors: Names = (),
     seed: int = 0,
     tell: Callable[[Remark], None] = lambda note: None,
-) -> Sizing:
-    """Search ratio, radius, cells and motor of a robot so that it meets requirements.
+) -> SizingResult:
+    """Finds gear ratio, radius, cells and motor with which a robot meets its requirements.
 
     Args:
-        objectives: objectives from `OBJECTIVES`, one to make small, or two for a Pareto front.
-        starts: searches in the batch.
-        motors: names of those to choose from, empty: all.
-        seed: seed of the starts.
+        objectives: objectives to minimise, from `OBJECTIVES`. Two give a Pareto front.
+        starts: number of searches in the batch.
+        motors: names of the motors to choose from, empty for all.
+        seed: random seed of the starts.
         tell: callback for progress.
 
     Raises:
-        BadConfiguration: any raised by `sheet.refuse_impossible`. An unknown objective or motor.
+        BadConfiguration: as in `sheet.reject_impossible`, or an objective or a motor is unknown.
     """
     for name in objectives:
         stated_word(name, OBJECTIVES, "objective")
-    sheet.refuse_impossible(robot, asked)
+    sheet.reject_impossible(robot, asked)
     chosen = options_for_robot(robot, motors)
-    problem = sizing_task(robot, asked, chosen)
-    choice = choice_space(robot, problem, chosen)
+    problem = build_sizing_task(robot, asked, chosen)
+    choice = enumerate_choices(robot, problem, chosen)
     columns = [list(OBJECTIVES).index(name) for name in objectives]
     tell(progress_remark("designs"))
     drawn = _random_designs(problem, choice, "cost" in objectives, np.random.default_rng(seed))
     kept = drawn.g.max(axis=0) >= 0
     unmeetable = tuple(label for label, k in zip(problem.labels, kept, strict=True) if not k)
-    search = _Search(problem, choice, kept, columns)
+    search = _DesignSearch(problem, choice, kept, columns)
     weights = search.weights(starts)
     tell(progress_remark("descents", starts))
-    free = search.descended(drawn, weights)
+    free = search.descend(drawn, weights)
     tell(progress_remark("whole"))
-    real = search.real(drawn, free, weights)
+    real = search.buildable_designs(drawn, free, weights)
     tell(progress_remark("refined", REFINED))
     # The best of these with any ratio and parts of a cell: no search may have begun from their choice of parts.
     top = np.argsort(search.cost(real))[:REFINED]
     free = free + search.refined(real.rows[top], real.x[top], search.first(len(top)), np.ones(3))
     evaluated = len(drawn.rows) + starts * STEPS + search.evaluated
 
-    def found(designs: _Designs, k: int) -> SizedDesign:
+    def found(designs: _EvaluatedDesigns, k: int) -> SizedDesign:
         margins = np.where(kept, designs.g[k], np.nan)
         return _sized_design(robot, problem, choice, designs.rows[k], designs.x[k], designs.f[k], margins)
 
@@ -298,7 +310,7 @@ def size_robot(
     best = [found(real, k) for k in list(different.values())[:8]]
     ideal = int(np.argmin(search.cost(free)))
     front = [found(real, k) for k in _pareto_front(real.f[:, columns], good)] if len(columns) == 2 else []
-    return Sizing(
+    return SizingResult(
         problem, chosen, objectives[0], unmeetable,
         found(free, ideal) if np.all(free.g[ideal][kept] >= 0) else None,
         best[0] if best else None, tuple(best[1:]), by_motor, tuple(front), starts, evaluated,
@@ -306,11 +318,11 @@ def size_robot(
 
 
 @dataclasses.dataclass(frozen=True)
-class _Designs:
+class _EvaluatedDesigns:
     """Designs with their objectives and margins.
 
     Attributes:
-        rows: row numbers of the choice of parts, shape (designs,).
+        rows: index of the choice of parts, shape (designs,).
         x: logarithms of ratio, radius and cells in parallel, shape (designs, 3).
         f, g: objectives and margins, shapes (designs, objectives) and (designs, limits).
     """
@@ -320,15 +332,17 @@ class _Designs:
     f: np.ndarray
     g: np.ndarray
 
-    def __add__(self, other: _Designs) -> _Designs:
-        return _Designs(*(np.concatenate([mine, theirs]) for mine, theirs in zip(self, other, strict=True)))
+    def __add__(self, other: _EvaluatedDesigns) -> _EvaluatedDesigns:
+        return _EvaluatedDesigns(*(np.concatenate([mine, theirs]) for mine, theirs in zip(self, other, strict=True)))
 
     def __iter__(self) -> Iterator[np.ndarray]:
         return iter((self.rows, self.x, self.f, self.g))
 
 
-def _random_designs(problem: Task, choice: Space, costed: bool, rng: np.random.Generator) -> _Designs:
-    """Random designs of every choice of parts: they show which limits can be met, and give the starts.
+def _random_designs(
+    problem: SizingTask, choice: ChoiceSpace, costed: bool, rng: np.random.Generator
+) -> _EvaluatedDesigns:
+    """Random designs for every choice of parts. They show which limits can be met, and serve as starts.
 
     Args:
         costed: True to include only drives with a known price.
@@ -338,35 +352,37 @@ def _random_designs(problem: Task, choice: Space, costed: bool, rng: np.random.G
         rows = rows[np.isfinite(choice.options.drive["cost"][choice.drive[rows]])]
     low, high = choice.low[rows], choice.high[rows]
     x = low + (high - low) * rng.random((len(rows), 3)) ** np.array([1.0, 1.0, 2.0])
-    return _Designs(rows, x, *evaluate_designs(problem, choice, rows, x))
+    return _EvaluatedDesigns(rows, x, *evaluate_designs(problem, choice, rows, x))
 
 
 @dataclasses.dataclass
-class _Search:
-    """Steps of a search.
+class _DesignSearch:
+    """The steps of a search for designs.
 
     Attributes:
-        kept: True for limits that some design meets.
-        columns: columns of the objectives.
-        evaluated: designs so far.
+        kept: True for limits that at least one design meets.
+        columns: indices of the objectives.
+        evaluated: number of designs evaluated so far.
     """
 
-    problem: Task
-    choice: Space
+    problem: SizingTask
+    choice: ChoiceSpace
     kept: np.ndarray
     columns: list[int]
     evaluated: int = 0
 
-    def designs(self, rows: np.ndarray, x: np.ndarray) -> _Designs:
+    def designs(self, rows: np.ndarray, x: np.ndarray) -> _EvaluatedDesigns:
         """Designs with their objectives and margins."""
-        return _Designs(rows, x, *evaluate_designs(self.problem, self.choice, rows, x))
+        return _EvaluatedDesigns(rows, x, *evaluate_designs(self.problem, self.choice, rows, x))
 
     def first(self, count: int) -> np.ndarray:
         """Weights of only the first objective, shape (count, objectives)."""
         return np.tile(np.eye(len(OBJECTIVES))[self.columns[0]], (count, 1))
 
     def weights(self, starts: int) -> np.ndarray:
-        """Weights of the objectives in each start, shape (starts, objectives): along a Pareto front for two."""
+        """Weights of the objectives in each start, shape (starts, objectives). For two objectives they vary along the
+        Pareto front.
+        """
         weights = np.zeros((starts, len(OBJECTIVES)))
         share = np.ones(starts) if len(self.columns) == 1 else np.linspace(0.98, 0.02, starts)
         weights[:, self.columns[0]] += share
@@ -374,22 +390,22 @@ class _Search:
             weights[:, self.columns[1]] += 1 - share
         return weights
 
-    def cost(self, designs: _Designs) -> np.ndarray:
+    def cost(self, designs: _EvaluatedDesigns) -> np.ndarray:
         """Cost by the first objective, shape (designs,)."""
         return _cost(designs.f, designs.g, self.kept, self.first(len(designs.rows)))
 
-    def misses(self, drawn: _Designs) -> np.ndarray:
-        """Violation of the limits that can be met, shape (designs,)."""
+    def misses(self, drawn: _EvaluatedDesigns) -> np.ndarray:
+        """Total violation of the limits that can be met, shape (designs,)."""
         return 5 * np.sum(np.maximum(-drawn.g[:, self.kept], 0.0), axis=1)
 
-    def refined(self, rows: np.ndarray, x: np.ndarray, weights: np.ndarray, free: np.ndarray) -> _Designs:
-        """Designs refined on shrinking boxes around them, see `_refine_designs`."""
+    def refined(self, rows: np.ndarray, x: np.ndarray, weights: np.ndarray, free: np.ndarray) -> _EvaluatedDesigns:
+        """Refines designs in shrinking boxes around them, see `_refine_designs`."""
         x, count = _refine_designs(self.problem, self.choice, rows, x, self.kept, weights, free)
         self.evaluated += count
         return self.designs(rows, x)
 
-    def descended(self, drawn: _Designs, weights: np.ndarray) -> _Designs:
-        """Designs with any ratio and fraction of a cell, by gradients from the best random ones."""
+    def descend(self, drawn: _EvaluatedDesigns, weights: np.ndarray) -> _EvaluatedDesigns:
+        """Designs with any gear ratio and fraction of a cell, found by gradients from the best random designs."""
         choice, misses = self.choice, self.misses(drawn)
         shares = [len(s) for s in np.array_split(np.arange(len(weights)), len(self.columns))]
         picked = [
@@ -406,8 +422,12 @@ class _Search:
         x[best] = self.refined(rows[best], x[best], weights[best], np.ones(3)).x
         return self.designs(rows, x)
 
-    def real(self, drawn: _Designs, free: _Designs, weights: np.ndarray) -> _Designs:
-        """Designs with ratios of the sheets and whole cells: those near `free`, and the best of every choice."""
+    def buildable_designs(
+        self, drawn: _EvaluatedDesigns, free: _EvaluatedDesigns, weights: np.ndarray
+    ) -> _EvaluatedDesigns:
+        """Designs with gear ratios from data sheets and whole cells: those near `free`, and the best of every
+        choice.
+        """
         rows, x, w = _nearest_buildable(self.choice, free.rows, free.x, weights, np.argsort(self.cost(free)))
         misses = self.misses(drawn)
         for c in self.columns:
@@ -421,8 +441,8 @@ class _Search:
         return self.refined(rows, x, w, np.array([0.0, 1.0, 0.0]))
 
 
-def _start_designs(choice: Space, rows: np.ndarray, merit: np.ndarray, count: int) -> np.ndarray:
-    """Best designs as starts: some of each motor, then the best of all, few of one choice."""
+def _start_designs(choice: ChoiceSpace, rows: np.ndarray, merit: np.ndarray, count: int) -> np.ndarray:
+    """Best designs to start from: some for each motor, then the best of all, with few from one choice."""
     order = np.argsort(np.where(np.isfinite(merit), merit, 1e9))
     motor = [choice.options.drives[d].motor.name for d in choice.drive]
     taken: list[int] = []
@@ -442,22 +462,22 @@ def _start_designs(choice: Space, rows: np.ndarray, merit: np.ndarray, count: in
 
 
 def _cost(f: np.ndarray, g: np.ndarray, kept: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Cost of designs: logarithm of the objective. With a violated margin it is above that of any feasible design."""
+    """Cost of designs: logarithm of the objective. With a violated margin it exceeds that of any feasible design."""
     value = np.sum(np.where(weights > 0, weights * np.log(np.where(weights > 0, f, 1.0)), 0.0), axis=1)
     short = np.sum(np.maximum(-g[:, kept], 0.0), axis=1)
     return np.where(np.isfinite(value), value + np.where(short > 0, 100 + short, 0.0), 1e6)
 
 
 def _refine_designs(
-    problem: Task,
-    choice: Space,
+    problem: SizingTask,
+    choice: ChoiceSpace,
     rows: np.ndarray,
     x: np.ndarray,
     kept: np.ndarray,
     weights: np.ndarray,
     free: np.ndarray,
 ) -> tuple[np.ndarray, int]:
-    """Designs refined on shrinking boxes around them, and the number of evaluations.
+    """Refines designs in shrinking boxes around them. Also returns the number of evaluations.
 
     Args:
         free: 1 for continuous numbers that may move.
@@ -476,9 +496,9 @@ def _refine_designs(
 
 
 def _nearest_buildable(
-    choice: Space, rows: np.ndarray, x: np.ndarray, weights: np.ndarray, order: np.ndarray
+    choice: ChoiceSpace, rows: np.ndarray, x: np.ndarray, weights: np.ndarray, order: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Designs near the given ones with ratios of the sheets and whole cells: the two nearest of each."""
+    """Designs near the given ones with gear ratios from data sheets and whole cells: the two nearest of each."""
     made: dict[tuple, tuple] = {}
     for k in order:
         drive = choice.options.drives[choice.drive[rows[k]]]
@@ -494,10 +514,13 @@ def _nearest_buildable(
 
 
 def _best_buildable(
-    problem: Task, choice: Space, rows: np.ndarray, kept: np.ndarray, weights: np.ndarray
+    problem: SizingTask, choice: ChoiceSpace, rows: np.ndarray, kept: np.ndarray, weights: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, int]:
-    """Best designs of choices with every ratio of their sheets, few whole cells in parallel and three radii, and
-    the number of evaluations."""
+    """Best design of each choice of parts, over every gear ratio of its sheets, a few whole cells in parallel and
+    three radii.
+
+    Also returns the number of evaluations.
+    """
     of_row, points = [], []
     for row in rows:
         low, high = choice.low[row, 1], choice.high[row, 1]
@@ -512,7 +535,7 @@ def _best_buildable(
 
 
 def _pareto_front(f: np.ndarray, among: list[int]) -> list[int]:
-    """Pareto front of two objectives, sorted by the first."""
+    """Indices of the designs on the Pareto front of two objectives, sorted by the first."""
     order = sorted(among, key=lambda k: (f[k, 0], f[k, 1]))
     front: list[int] = []
     for k in order:
@@ -522,7 +545,7 @@ def _pareto_front(f: np.ndarray, among: list[int]) -> list[int]:
 
 
 def _sized_design(
-    robot: Robot, problem: Task, choice: Space, row: int, x: np.ndarray, f: np.ndarray, g: np.ndarray
+    robot: Robot, problem: SizingTask, choice: ChoiceSpace, row: int, x: np.ndarray, f: np.ndarray, g: np.ndarray
 ) -> SizedDesign:
     drive, cell = choice.options.drives[choice.drive[row]], choice.options.cells[choice.cell[row]]
     series = int(choice.in_series[row])

@@ -1,8 +1,8 @@
-"""Options of a search: drives (motor and gearbox) and cells, from the packaged sheets, as arrays.
+"""Parts to choose from: drives (motor and gearbox) and cells from the packaged data sheets, as arrays.
 
-Where a sheet lacks a number that the model needs, the paper's robot is scaled (docs/howto/size.md):
-friction of a motor by its no-load torque, efficiency of a gearbox by the sheet's largest, resistance and mass of a
-cell by its capacity, and its own ratings of winding and speeds.
+Where a sheet lacks a number that the model needs, the paper's robot is scaled (docs/howto/size.md): friction of a
+motor by its no-load torque, efficiency of a gearbox by the sheet's largest, resistance and mass of a cell by its
+capacity, and its own ratings of winding and speeds.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ BELT_STAGE = 25 / 12
 FREE = 1e9
 
 
-class Drive(NamedTuple):
-    """A motor with one size of gearbox (a family with so many stages), with a choice of ratios.
+class DriveOption(NamedTuple):
+    """A motor with one size of gearbox (family and number of stages), which has several gear ratios.
 
     Attributes:
-        motor: its sheet.
+        motor: data sheet of the motor.
         family, stages: family and stages of the gearbox.
-        ratios: total ones, ascending.
-        gearbox: any of its sheets.
+        ratios: total gear ratios, ascending.
+        gearbox: one of the data sheets of that gearbox.
     """
 
     motor: MotorSheet
@@ -50,12 +50,12 @@ class Drive(NamedTuple):
 
     @property
     def name(self) -> str:
-        """Name for people."""
+        """Name for the user."""
         return f"{self.motor.name}, {self.family}, {self.stages} stage{'s' if self.stages > 1 else ''}"
 
 
-def drive_options(names: Names = ()) -> tuple[Drive, ...]:
-    """All motors of the sheets (or those named) with all sizes of gearbox that their source combines them with."""
+def drive_options(names: Names = ()) -> tuple[DriveOption, ...]:
+    """All motors (or those named) with all sizes of gearbox with which their source combines them."""
     options = []
     for motor in packaged_motors():
         if names and motor.name not in names:
@@ -67,7 +67,7 @@ def drive_options(names: Names = ()) -> tuple[Drive, ...]:
                     key=lambda g: g.ratio,
                 )
                 ratios = tuple(BELT_STAGE * g.ratio for g in ranked)
-                options.append(Drive(motor, family, int(stages), ratios, ranked[0]))
+                options.append(DriveOption(motor, family, int(stages), ratios, ranked[0]))
     return tuple(options)
 
 
@@ -75,16 +75,16 @@ _LIPO = "lithium-polymer"
 
 
 @dataclasses.dataclass(frozen=True)
-class Options:
-    """Numbers of drives and cells, one row each, by name.
+class PartOptions:
+    """Numbers of drives and cells, one row for each, by name.
 
     Attributes:
-        drives, cells: the sheets.
-        drive, cell: columns, shapes (drives,) and (cells,).
-        base_mass: base mass of the paper's two motors, two gearboxes and cells, which a robot's mass includes [kg].
+        drives, cells: data sheets.
+        drive, cell: columns of numbers, shapes (drives,) and (cells,).
+        base_mass: mass of the paper's two motors, two gearboxes and cells, which is part of the robot's mass [kg].
     """
 
-    drives: tuple[Drive, ...]
+    drives: tuple[DriveOption, ...]
     cells: tuple[CellSheet, ...]
     drive: Columns
     cell: Columns
@@ -95,12 +95,12 @@ def _stated(value: float, otherwise: float) -> float:
     return otherwise if math.isnan(value) else value
 
 
-def options_for_robot(robot: Robot, names: Names = ()) -> Options:
-    """Options for a robot.
+def options_for_robot(robot: Robot, names: Names = ()) -> PartOptions:
+    """Parts to choose from for a robot.
 
     Args:
-        robot: source of friction, efficiencies and cells missing in sheets.
-        names: names of motors, empty: all.
+        robot: robot whose friction, efficiencies and cells replace values that data sheets lack.
+        names: names of motors, empty for all.
     """
     chosen, packs = (
         drive_options(names),
@@ -147,7 +147,7 @@ def options_for_robot(robot: Robot, names: Names = ()) -> Options:
         for c in packs
     ]  # fmt: skip
     base = sides * (paper_motor.mass + paper_gear.mass) + battery.cells * per_charge * float(battery.capacity)
-    return Options(chosen, packs, _columns(rows), _columns(columns), base)
+    return PartOptions(chosen, packs, _columns(rows), _columns(columns), base)
 
 
 def _columns(rows: list[dict[str, float]]) -> Columns:

@@ -1,4 +1,4 @@
-"""Sheet of requirements: each at the worst corner of its envelope, with its margin and changes that would meet it."""
+"""Check of requirements: each at the worst corner of its envelope, with its margin and changes that would meet it."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from calibration.data import Json, Names
-from calibration.data.contradictions import cannot_stand
+from calibration.data.contradictions import reason_without_stance
 from calibration.data.input_errors import BadConfiguration, allowed_words
 from calibration.data.requirements_file import STAIRS, TREAD, Envelope, Requirement, Requirements
 from calibration.inference.fit_notes import Remark, progress_remark
@@ -44,15 +44,16 @@ ROWS, LADDER, DIGITS = 32, 24, 4
 
 
 @dataclasses.dataclass(frozen=True)
-class Change:
-    """A change of a single parameter that meets a requirement.
+class ParameterChange:
+    """A change of a single parameter with which a requirement is met.
 
     Attributes:
-        parameter: by dotted name.
-        before, after: [unit].
-        unit: unit of its field.
-        gradient: derivative of the quantity by the parameter at the worst corner [unit of quantity / unit].
-        breaks: names of requirements that are met now and would be violated.
+        parameter: dotted name of the parameter.
+        before, after: present and changed value [unit].
+        unit: unit of the parameter.
+        gradient: derivative of the quantity with respect to the parameter at the worst corner [unit of the quantity /
+            unit].
+        breaks: names of requirements that are met now and would be missed.
     """
 
     JSON = ("parameter", "from=before", "to=after", "unit", "gradient", "breaks")
@@ -65,16 +66,17 @@ class Change:
 
 
 @dataclasses.dataclass(frozen=True)
-class Outcome:
-    """Result of a requirement for a robot.
+class RequirementOutcome:
+    """Result of checking a requirement.
 
     Attributes:
-        requirement: as stated, with its rating filled in.
-        value: value of the quantity at the worst corner, in the unit of its name, None without a value there.
-        margin: to the limit, negative if it is missed, None without a value.
-        status: status of the worst corner, of `STATUSES`.
+        requirement: the requirement, with its rating filled in.
+        value: value of the quantity at the worst corner [unit of its name]. None if there is none.
+        margin: margin to the limit, negative if missed. None without a value.
+        status: status at the worst corner, one of `STATUSES`.
         at: the worst corner.
-        change: single changes that would meet it, the smallest first, empty if it is met or none does.
+        change: single changes with which it would be met, the smallest first. Empty if it is met, or if there is
+            none.
     """
 
     JSON = (
@@ -86,7 +88,7 @@ class Outcome:
     margin: float | None
     status: str
     at: Json
-    change: tuple[Change, ...] = ()
+    change: tuple[ParameterChange, ...] = ()
 
     @property
     def met(self) -> bool:
@@ -94,11 +96,11 @@ class Outcome:
         return self.margin is not None and self.margin >= 0
 
 
-def with_ratings(robot: Robot, asked: Requirements) -> Requirements:
-    """Requirements with the robot's own ratings for those without a number.
+def fill_in_ratings(robot: Robot, asked: Requirements) -> Requirements:
+    """Requirements in which missing limits are replaced by the robot's own ratings.
 
     Raises:
-        BadConfiguration: the robot states no such rating.
+        BadConfiguration: the robot has no such rating.
     """
     ratings_by_name = {
         "winding_C": robot.motor.temperature_limit, "motor_speed_rpm": robot.motor.speed_limit,
@@ -116,13 +118,12 @@ def with_ratings(robot: Robot, asked: Requirements) -> Requirements:
     return dataclasses.replace(asked, each=tuple(each))
 
 
-def refuse_impossible(robot: Robot, asked: Requirements) -> None:
-    """Reject requirements that cannot be evaluated for a robot of these configurations.
+def reject_impossible(robot: Robot, asked: Requirements) -> None:
+    """Rejects requirements that cannot be evaluated for this robot.
 
     Raises:
-        BadConfiguration: a configuration that the robot does not have. A turn that it cannot make. A posture of a
-            robot without a stated stance. An envelope with a slope that the surface does not hold, whatever drives
-            the robot: tan α above μ_s.
+        BadConfiguration: the robot lacks a configuration, cannot make a turn, or has no stated stance for a posture.
+            Or the surface does not hold a slope of the envelope, whatever drives the robot: tan α above μ_s.
     """
     for r in asked.each:
         e = r.envelope
@@ -133,36 +134,36 @@ def refuse_impossible(robot: Robot, asked: Requirements) -> None:
                 f"{allowed_words(e.configuration, robot.configurations)}"
             )
         turns = r.quantity.group in ("turn", "across")
-        if turns and (why := turn_error(robot, (_configuration(robot, e),))):
+        if turns and (why := turn_error(robot, (_configuration_name(robot, e),))):
             raise BadConfiguration(f"{where}: {why}")
-        if r.quantity.group == "posture" and (why := cannot_stand(robot)):
+        if r.quantity.group == "posture" and (why := reason_without_stance(robot)):
             raise BadConfiguration(f"{where}: {why}")
-        chassis = robot.configurations[_configuration(robot, e)]
+        chassis = robot.configurations[_configuration_name(robot, e)]
         friction = float(chassis.ground.friction.static) * adhesion_ratio(e.surface, float(chassis.on_tracks) > 0.5)
         steepest = math.degrees(math.atan(friction))
         if SLOPE in r.quantity.axes and e.slope_deg[1] > steepest:
             raise BadConfiguration(
                 f"{where}: the envelope's slope_deg goes up to {e.slope_deg[1]:g}; {e.surface} holds "
-                f"{_configuration(robot, e)} up to {steepest:.1f} deg at most (adhesion {friction:.2f}), whatever "
-                "drives it"
+                f"{_configuration_name(robot, e)} up to {steepest:.1f} deg at most (adhesion {friction:.2f}), "
+                "whatever drives it"
             )
 
 
-def _configuration(robot: Robot, envelope: Envelope) -> str:
+def _configuration_name(robot: Robot, envelope: Envelope) -> str:
     return envelope.configuration or robot.configurations.names[0]
 
 
 def envelope_points(robot: Robot, requirement: Requirement) -> EnvelopePoint:
-    """Points of a requirement's envelope: ends of each range and values between, shape (points,).
+    """Points of a requirement's envelope: the ends of each range and values between, shape (points,).
 
-    An axis without influence on the quantity has one value. The number of points depends only on the quantity.
+    A condition without influence on the quantity has one value. The number of points depends only on the quantity.
     """
     e, axes = requirement.envelope, requirement.quantity.axes
     ambient = e.ambient_C or (float(robot.motor.temperature_ambient),) * 2
     ranges = {PAYLOAD: e.payload_kg, SLOPE: e.slope_deg, CHARGE: e.charge, AMBIENT: ambient}
     values = [np.linspace(*ranges[a], VALUES[a]) if a in axes else np.array([ranges[a][-1]]) for a in AXES]
     payload, slope, charge, warm = (x.ravel() for x in np.meshgrid(*values, indexing="ij"))
-    name = _configuration(robot, e)
+    name = _configuration_name(robot, e)
     on_tracks = float(robot.configurations[name].on_tracks) > 0.5
 
     def same(x: float) -> Float[Array, " points"]:
@@ -178,7 +179,7 @@ def envelope_points(robot: Robot, requirement: Requirement) -> EnvelopePoint:
     )  # fmt: skip
 
 
-def _robot_with(robot: Robot, rated: Ratings, names: Names, theta: Array) -> tuple[Robot, Ratings]:
+def _with_parameters(robot: Robot, rated: Ratings, names: Names, theta: Array) -> tuple[Robot, Ratings]:
     """Robot with parameters from a vector, and its ratings, which include `battery.cells`."""
     values = dict(zip(names, theta, strict=True))
     cells = values.pop(CELLS)
@@ -207,7 +208,7 @@ def _robot_without_ratings(robot: Robot) -> Robot:
 
 
 @compiled
-def _quantity_over(
+def _quantity_at_points(
     robot: Robot,
     rated: Ratings,
     names: Names,
@@ -215,10 +216,10 @@ def _quantity_over(
     at: EnvelopePoint,
     name: str,
 ) -> tuple[Array, Array]:
-    """Values and outcomes of a quantity over robots (rows of parameters) and points, shape (rows, points)."""
+    """Values and outcomes of a quantity for robots (rows of parameters) at points, shape (rows, points)."""
 
     def one(theta: Array, point: EnvelopePoint) -> tuple[Array, Array]:
-        changed, changed_ratings = _robot_with(robot, rated, names, theta)
+        changed, changed_ratings = _with_parameters(robot, rated, names, theta)
         quantity = evaluate_requirement(changed, point, changed_ratings, name)
         return quantity.value, quantity.outcome
 
@@ -226,11 +227,13 @@ def _quantity_over(
 
 
 @compiled
-def _gradient(robot: Robot, rated: Ratings, names: Names, theta: Array, at: EnvelopePoint, name: str) -> Array:
-    """Derivative of a quantity at one point by the parameters."""
+def _quantity_gradient(
+    robot: Robot, rated: Ratings, names: Names, theta: Array, at: EnvelopePoint, name: str
+) -> Array:
+    """Derivative of a quantity at one point with respect to the parameters."""
 
     def value(theta: Array) -> Array:
-        changed, changed_ratings = _robot_with(robot, rated, names, theta)
+        changed, changed_ratings = _with_parameters(robot, rated, names, theta)
         return evaluate_requirement(changed, at, changed_ratings, name).value
 
     return jax.grad(value)(theta)
@@ -238,7 +241,7 @@ def _gradient(robot: Robot, rated: Ratings, names: Names, theta: Array, at: Enve
 
 @dataclasses.dataclass(frozen=True)
 class _QuantityOfRobot:
-    """A requirement's quantity over its envelope, as a function of the designer's parameters."""
+    """The quantity of a requirement over its envelope, as a function of the parameters that may change."""
 
     robot: Robot
     requirement: Requirement
@@ -255,13 +258,13 @@ class _QuantityOfRobot:
         for first in range(0, len(rows), ROWS):
             chosen = rows[np.minimum(np.arange(first, first + ROWS), len(rows) - 1)]
             found = jax.device_get(
-                _quantity_over(robot, rated, self.names, jnp.asarray(chosen), at, _computed_name(r))
+                _quantity_at_points(robot, rated, self.names, jnp.asarray(chosen), at, _computed_name(r))
             )
             parts.append([x[: len(rows) - first] for x in found])
         value, outcome = (np.concatenate(x) for x in zip(*parts, strict=True))
         value = value / r.quantity.factor
         counts = (outcome == CONVERGED) & np.isfinite(value)
-        assert r.limit is not None  # see `with_ratings`
+        assert r.limit is not None  # see `fill_in_ratings`
         margin = (value - r.limit) * (1 if r.least else -1)
         return value, outcome, np.where(counts, margin, -np.inf)
 
@@ -271,7 +274,7 @@ class _QuantityOfRobot:
 
 
 def _computed_name(requirement: Requirement) -> str:
-    """Name by which a quantity is computed. The same for several names of one quantity, to share a program."""
+    """Name under which a quantity is computed. Names of the same quantity share a program."""
     return "speed_m_s" if requirement.name == "speed_end_of_charge_m_s" else requirement.name
 
 
@@ -281,21 +284,21 @@ def check_requirements(
     *,
     changes: bool = True,
     tell: Callable[[Remark], None] = lambda note: None,
-) -> tuple[Outcome, ...]:
-    """Compare a robot with requirements.
+) -> tuple[RequirementOutcome, ...]:
+    """Compares a robot with requirements.
 
     Args:
-        changes: True to search for changes that would meet the missed ones.
+        changes: True to search for changes with which missed requirements would be met.
         tell: callback for progress.
 
     Raises:
-        BadConfiguration: see `refuse_impossible` and `with_ratings`.
+        BadConfiguration: see `reject_impossible` and `fill_in_ratings`.
     """
-    refuse_impossible(robot, asked)
-    asked = with_ratings(robot, asked)
+    reject_impossible(robot, asked)
+    asked = fill_in_ratings(robot, asked)
     held = []
     for r in asked.each:
-        configuration = _configuration(robot, r.envelope)
+        configuration = _configuration_name(robot, r.envelope)
         of_levers = OF_LEVERS if r.quantity.group == "posture" else ()
         by_name = {p.name: p for p in params.walk_parameters(robot)}
         names = (*CHANGEABLE, *(f"{configuration}.{n}" for n in OF_CONFIGURATION))
@@ -307,13 +310,13 @@ def check_requirements(
     outcomes = []
     for k, h in enumerate(held, 1):
         tell(progress_remark("requirement", k, len(held), h.requirement.quantity.label))
-        outcomes.append(_outcome(h))
+        outcomes.append(_check_requirement(h))
     if not changes:
         return tuple(outcomes)
     missed, answer = [k for k, o in enumerate(outcomes) if not o.met], list(outcomes)
     for n, k in enumerate(missed, 1):
         tell(progress_remark("changes", n, len(missed), held[k].requirement.quantity.label))
-        answer[k] = _with_changes(held[k], outcomes[k], held, outcomes)
+        answer[k] = _add_changes(held[k], outcomes[k], held, outcomes)
     return tuple(answer)
 
 
@@ -322,7 +325,7 @@ def _present_values(held: _QuantityOfRobot) -> np.ndarray:
     return np.array([held.robot.battery.cells if n == CELLS else value_of_name[n] for n in held.names], float)
 
 
-def _outcome(held: _QuantityOfRobot) -> Outcome:
+def _check_requirement(held: _QuantityOfRobot) -> RequirementOutcome:
     r = held.requirement
     value, outcome, margin = (x[0] for x in held.over(_present_values(held)[None]))
     # A point without a value is worse than any; the largest of those with the same outcome is at its worst corner.
@@ -331,7 +334,7 @@ def _outcome(held: _QuantityOfRobot) -> Outcome:
     counts = np.isfinite(margin[k])
     if not counts and status == STATUSES[CONVERGED]:  # a value beyond all bounds: a temperature that never settles
         status = "unbounded"
-    return Outcome(
+    return RequirementOutcome(
         r,
         float(value[k]) if counts else None,
         float(margin[k]) if counts else None,
@@ -341,7 +344,7 @@ def _outcome(held: _QuantityOfRobot) -> Outcome:
 
 
 def _named_corner(held: _QuantityOfRobot, k: int) -> Json:
-    """A point in the names of a file."""
+    """A point as entries with the names of a requirements file."""
     r, at = held.requirement, held.at
     e = r.envelope
     places = {
@@ -358,16 +361,19 @@ def _named_corner(held: _QuantityOfRobot, k: int) -> Json:
         }
     if r.name == STAIRS:
         corner[TREAD] = r.tread_mm
-    return {"configuration": _configuration(held.robot, e), "surface": e.surface, **corner}
+    return {"configuration": _configuration_name(held.robot, e), "surface": e.surface, **corner}
 
 
-def _with_changes(
-    held: _QuantityOfRobot, outcome: Outcome, every: Sequence[_QuantityOfRobot], now: Sequence[Outcome]
-) -> Outcome:
-    changes = _changes(held, outcome)
+def _add_changes(
+    held: _QuantityOfRobot,
+    outcome: RequirementOutcome,
+    every: Sequence[_QuantityOfRobot],
+    now: Sequence[RequirementOutcome],
+) -> RequirementOutcome:
+    changes = _find_changes(held, outcome)
     if not changes:
         return outcome
-    rows = np.stack([_with_value(held, c.parameter, c.after) for c in changes])
+    rows = np.stack([_row_with_value(held, c.parameter, c.after) for c in changes])
     broken: list[list[str]] = [[] for _ in changes]
     for other, before in zip(every, now, strict=True):
         if other is held or not before.met:
@@ -386,23 +392,23 @@ def _with_changes(
     return dataclasses.replace(outcome, change=tuple(order))
 
 
-def _with_value(held: _QuantityOfRobot, name: str, value: float) -> np.ndarray:
+def _row_with_value(held: _QuantityOfRobot, name: str, value: float) -> np.ndarray:
     row = _present_values(held)
     row[held.names.index(name)] = value
     return row
 
 
-def _changes(held: _QuantityOfRobot, outcome: Outcome) -> list[Change]:
-    """Single changes that meet a requirement.
+def _find_changes(held: _QuantityOfRobot, outcome: RequirementOutcome) -> list[ParameterChange]:
+    """Single changes with which a requirement is met.
 
-    The direction is that of the derivative at the worst corner. The nearest value that meets the requirement at every
-    corner is found on a ladder and by division of its interval. Each stated value is verified.
+    The direction follows from the derivative at the worst corner. The nearest value that meets the requirement at
+    every corner is found by a coarse search and bisection. Each result is verified.
     """
     now, names = _present_values(held), held.names
     worst = int(np.argmin(held.over(now[None])[2][0]))
     point = jax.tree.map(lambda x: x[worst], held.at)
     slopes = np.asarray(
-        _gradient(
+        _quantity_gradient(
             _robot_without_ratings(held.robot),
             ratings(held.robot),
             names,
@@ -431,17 +437,19 @@ def _changes(held: _QuantityOfRobot, outcome: Outcome) -> list[Change]:
         if options:
             after = min(options, key=lambda v: abs(math.log(v / now[k])))
             sense = 1 if held.requirement.least else -1
-            changes.append(Change(name, float(now[k]), after, unit, float(sense * slopes[k])))
+            changes.append(ParameterChange(name, float(now[k]), after, unit, float(sense * slopes[k])))
     return changes
 
 
 def _nearest_value(held: _QuantityOfRobot, name: str, begin: float, end: float) -> float | None:
-    """Value of a parameter nearest to `begin` towards `end` that meets the requirement, None without one."""
+    """Value of a parameter, nearest to `begin` and in the direction of `end`, that meets the requirement. None if
+    there is none.
+    """
     if begin == end:
         return None
 
     def meets(values: np.ndarray) -> np.ndarray:
-        return held.worst(np.stack([_with_value(held, name, v) for v in values])) >= 0
+        return held.worst(np.stack([_row_with_value(held, name, v) for v in values])) >= 0
 
     def steps(a: float, b: float, count: int) -> np.ndarray:
         if name == CELLS:
@@ -464,18 +472,18 @@ def _nearest_value(held: _QuantityOfRobot, name: str, begin: float, end: float) 
         a, b = (a if k == 0 else finer[k - 1]), finer[k]
     # Rounded to few digits, away from `begin`; each rounding is tested.
     for digits in (DIGITS, DIGITS + 2, DIGITS + 4):
-        rounded = _rounded(b, digits, up=end > begin)
+        rounded = _round_outward(b, digits, up=end > begin)
         if min(begin, end) <= rounded <= max(begin, end) and meets(np.array([rounded]))[0]:
             return rounded
     return float(b)
 
 
-def _rounded(value: float, digits: int, up: bool) -> float:
+def _round_outward(value: float, digits: int, up: bool) -> float:
     step = 10.0 ** (math.floor(math.log10(abs(value))) - digits + 1)
     return float(f"{(math.ceil if up else math.floor)(value / step - (1e-9 if up else -1e-9)) * step:.{digits}g}")
 
 
-def count_outcomes(outcomes: Sequence[Outcome]) -> Mapping[str, int]:
-    """Number of met and of missed requirements."""
+def count_outcomes(outcomes: Sequence[RequirementOutcome]) -> Mapping[str, int]:
+    """Number of requirements that are met, and that are missed."""
     met = sum(o.met for o in outcomes)
     return {"met": met, "missed": len(outcomes) - met}

@@ -12,7 +12,7 @@ from calibration.data import Names
 from mmrjax.errors import count_noun
 
 if TYPE_CHECKING:
-    from calibration.sensitivity.result import Points, SensitivityResult
+    from calibration.sensitivity.result import OperatingPoints, SensitivityResult
 
 #: Meaning of each method's result for an input.
 METHODS = {
@@ -77,7 +77,7 @@ def points_studied(found: SensitivityResult) -> str:
     )
 
 
-def _in_words(points: Points, mask: np.ndarray) -> str:
+def _in_words(points: OperatingPoints, mask: np.ndarray) -> str:
     """Points of a mask by the values of one axis, such as `20° and 18 more`."""
     _, imposed, unit = points.imposed
     axes = [(x, u) for _, x, u in points.ground[::-1]] + [(imposed, f" {unit}"), (points.configuration, "")]

@@ -1,1 +1,1 @@
-"""Levers, posture, terrain and static limits, and a robot that climbs."""
+"""Robots with levers: posture, terrain, static limits, and the simulation of a climb."""

@@ -1,4 +1,4 @@
-"""A belt round two pulleys of different radius: position of its points, tilt of its grousers, contact with corners.
+"""A belt around two pulleys of different radius: positions on it, tilt of its grousers, contact with corners.
 
 The frame has its origin on the first pulley's axle and its first axis towards the second pulley. The belt runs
 clockwise: along the lower run to the first pulley, up, along the upper run to the second, down. The coordinate of a
@@ -16,13 +16,13 @@ from jaxtyping import Array, Float
 from mmrjax.model.params import Scalar
 
 
-class Loop(eqx.Module):
+class BeltLoop(eqx.Module):
     """A closed belt with grousers.
 
     Attributes:
         first, second: pitch radii of the pulleys [m], first >= second.
-        distance: distance of their axles [m].
-        grouser_height, grouser_length: grouser height and grouser length over the pitch line, and along it [m].
+        distance: distance between the axles [m].
+        grouser_height, grouser_length: size of a grouser above the pitch line and along it [m].
         grousers: number of grousers.
     """
 
@@ -35,7 +35,7 @@ class Loop(eqx.Module):
 
     @property
     def taper(self) -> Scalar:
-        """Angle between a run and the line of the axles [rad]."""
+        """Angle between a straight run and the line through the axles [rad]."""
         return jnp.arcsin((self.first - self.second) / self.distance)
 
     @property
@@ -45,7 +45,7 @@ class Loop(eqx.Module):
 
     @property
     def marks(self) -> tuple[Scalar, Scalar, Scalar, Scalar]:
-        """Start and end of the first arc, and of the second [m along the path]."""
+        """Start and end of the first arc, and of the second arc [m along the path]."""
         begin = self.run / 2
         end = begin + self.first * (jnp.pi + 2 * self.taper)
         return begin, end, end + self.run, end + self.run + self.second * (jnp.pi - 2 * self.taper)
@@ -61,16 +61,18 @@ class Loop(eqx.Module):
         return self.length / self.grousers
 
     def normal(self, turned: Array) -> Float[Array, "n 2"]:
-        """Outward normal of a belt that has `turned` by this angle since its lower run [rad]."""
+        """Outward normal where the belt has turned by this angle since its lower run [rad]."""
         return jnp.stack([-jnp.sin(turned - self.taper), -jnp.cos(turned - self.taper)], axis=-1)
 
     def turned(self, place: Array) -> Array:
-        """Turning angle of the belt since its lower run [rad], at `place` [m], also beyond an end."""
+        """Angle by which the belt has turned since its lower run [rad], at `place` [m]. Also defined beyond an
+        end.
+        """
         a, b, c, d = self.marks
         return jnp.clip(place - a, 0.0, b - a) / self.first + jnp.clip(place - c, 0.0, d - c) / self.second
 
     def tilt(self, place: Array) -> tuple[Array, Array]:
-        """Tilt [rad] of a grouser on its rigid base, the mean of the path below it, and its derivative [rad/m]."""
+        """Tilt of a grouser on its rigid base [rad], the mean over the path below it, and its derivative [rad/m]."""
         half = self.grouser_length / 2
 
         def integral(s: Array) -> Array:
@@ -84,7 +86,7 @@ class Loop(eqx.Module):
         return mean, (self.turned(place + half) - self.turned(place - half)) / self.grouser_length
 
     def point(self, place: Array) -> Float[Array, "n 2"]:
-        """Points of the pitch line [m] at `place` from 0 to the belt's length."""
+        """Points of the pitch line [m], at positions `place` from 0 to the length of the belt."""
         a, b, c, d = self.marks
         normal = self.normal(self.turned(place))
         first = place < (b + c) / 2
@@ -103,7 +105,9 @@ class Loop(eqx.Module):
         return jnp.mod(jnp.arange(self.grousers) * self.pitch + drawn, self.length)
 
     def project(self, at: Float[Array, "n 2"]) -> tuple[Array, Array]:
-        """Height of points over the pitch line [m], negative within the belt, and the place under them [m]."""
+        """Height of points above the pitch line [m], negative inside the belt, and the position on the path below
+        them [m].
+        """
         a, b, c, _ = self.marks
         sin, cos = jnp.sin(self.taper), jnp.cos(self.taper)
         upper = at[..., 1] > 0
@@ -119,39 +123,41 @@ class Loop(eqx.Module):
         straight = jnp.where(upper, b + along, jnp.mod(a - along, self.length))
         place = jnp.where(
             on_first,
-            a + self.first * self._angle(at),
-            jnp.where(on_second, c + self.second * (self._angle(from_second) - jnp.pi - 2 * self.taper), straight),
+            a + self.first * self._angle_of_normal(at),
+            jnp.where(
+                on_second, c + self.second * (self._angle_of_normal(from_second) - jnp.pi - 2 * self.taper), straight
+            ),
         )
         return height, place
 
-    def _angle(self, arm: Array) -> Array:
-        """Turning angle since the lower run of a belt with its normal along `arm` [rad]."""
+    def _angle_of_normal(self, arm: Array) -> Array:
+        """Angle by which the belt has turned since its lower run where its normal points along `arm` [rad]."""
         return jnp.mod(jnp.arctan2(-arm[..., 0], -arm[..., 1]) + self.taper, 2 * jnp.pi)
 
 
-class Tips(NamedTuple):
-    """Tips of grousers [m], and their displacement per displacement of the belt [-], each (n, 2)."""
+class GrouserTips(NamedTuple):
+    """Tips of grousers [m], and their displacement per displacement of the belt [-], each of shape (n, 2)."""
 
     at: Array
     rate: Array
 
 
-def grouser_tips(loop: Loop, place: Float[Array, " n"]) -> Tips:
-    """Tips of the grousers at `place` [m along the path]. See `belt.tips_on_path` for their rigid bases."""
+def grouser_tips(loop: BeltLoop, place: Float[Array, " n"]) -> GrouserTips:
+    """Tips of the grousers at `place` [m along the path]. Their rigid bases: see `belt.tips_on_path`."""
     tilt, rise = loop.tilt(place)
     normal = loop.normal(tilt)
     height = loop.grouser_height
     run = running_direction(loop.normal(loop.turned(place)))
-    return Tips(loop.point(place) + height * normal, run + height * rise[:, None] * running_direction(normal))
+    return GrouserTips(loop.point(place) + height * normal, run + height * rise[:, None] * running_direction(normal))
 
 
-class Corners(NamedTuple):
-    """Distance of a belt from points.
+class CornerGaps(NamedTuple):
+    """Gaps between a belt and points such as corners of the ground.
 
     Attributes:
-        gap: distance [m].
-        normal: out of the belt, (n, 2).
-        rate: displacement of the belt's material there per displacement of the belt, (n, 2).
+        gap: distance from the belt [m].
+        normal: outward normal of the belt, shape (n, 2).
+        rate: displacement of the belt's material per displacement of the belt, shape (n, 2).
         place: position on the path [m].
     """
 
@@ -161,15 +167,15 @@ class Corners(NamedTuple):
     place: Array
 
 
-def gaps_to_belt(loop: Loop, at: Float[Array, "n 2"]) -> Corners:
-    """Distance of points from the belt between its grousers."""
+def gaps_to_belt(loop: BeltLoop, at: Float[Array, "n 2"]) -> CornerGaps:
+    """Gaps between points and the belt between its grousers."""
     height, place = loop.project(at)
     normal = loop.normal(loop.turned(place))
-    return Corners(height, normal, running_direction(normal), place)
+    return CornerGaps(height, normal, running_direction(normal), place)
 
 
-def gaps_to_grousers(loop: Loop, drawn: Scalar, at: Float[Array, "n 2"]) -> Corners:
-    """Distance of points from the nearest grouser, a rigid tooth with flanks across its base."""
+def gaps_to_grousers(loop: BeltLoop, drawn: Scalar, at: Float[Array, "n 2"]) -> CornerGaps:
+    """Gaps between points and the nearest grouser, a rigid tooth with flanks perpendicular to its base."""
     under = loop.project(at)[1]
     ahead = jnp.mod(under - drawn + loop.pitch / 2, loop.pitch) - loop.pitch / 2
     place = jnp.mod(under - ahead, loop.length)
@@ -182,11 +188,11 @@ def gaps_to_grousers(loop: Loop, drawn: Scalar, at: Float[Array, "n 2"]) -> Corn
     outward = jnp.where((flank > top)[:, None], jnp.sign(u)[:, None] * along, normal)
     run = running_direction(loop.normal(loop.turned(place)))
     rate = run + rise[:, None] * (w[:, None] * along - u[:, None] * normal)
-    return Corners(jnp.maximum(flank, top), outward, rate, place)
+    return CornerGaps(jnp.maximum(flank, top), outward, rate, place)
 
 
 def running_direction(normal: Array) -> Array:
-    """Running direction of the belt at its outward `normal`."""
+    """Direction in which the belt runs where its outward normal is `normal`."""
     return jnp.stack([normal[..., 1], -normal[..., 0]], axis=-1)
 
 

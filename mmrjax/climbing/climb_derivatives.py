@@ -1,4 +1,4 @@
-"""Margins of one climb, including that of its success, and their forward derivatives through its simulation.
+"""Outputs of one climb, such as its margins, and their forward derivatives through the simulation.
 
 The derivatives belong to the computed run, with its contacts opening and closing. They do not include that a
 different robot may meet the edge with another grouser. Slopes over a range of each value, from several runs, include
@@ -24,9 +24,9 @@ from mmrjax.climbing.climb_simulation import (
     SETTLES,
     TURNED_OVER,
     UNFINISHED,
-    Climb,
     ClimbRecord,
-    Sequence,
+    ClimbRuns,
+    LeverSequence,
 )
 from mmrjax.climbing.footing import PITCH
 from mmrjax.climbing.terrain import Terrain
@@ -60,27 +60,27 @@ OUTPUTS: dict[str, tuple[str, str]] = {
 
 
 class ClimbInputs(NamedTuple):
-    """One run, fields without a leading axis."""
+    """Inputs of one climb. Fields have no batch axis."""
 
     robot: Robot
     conditions: Conditions
     terrain: Terrain
-    sequence: Sequence
+    sequence: LeverSequence
 
 
 def smooth_minimum(values: Float[Array, " n"]) -> Scalar:
-    """Smoothed minimum of values, -τ log mean exp(-x / τ) with τ = `SMOOTH`: between the minimum and the mean."""
+    """Smooth minimum of values, -τ log mean exp(-x / τ) with τ = `SMOOTH`. It lies between their minimum and mean."""
     lowest = jax.lax.stop_gradient(jnp.min(values))
     return lowest - SMOOTH * jnp.log(jnp.mean(jnp.exp(-(values - lowest) / SMOOTH)))
 
 
 def crest_sample(terrain: Terrain, record: ClimbRecord, over: bool) -> int | None:
-    """The first sample with the centre of mass past the obstacle, for a robot that gets over, else None."""
+    """First sample whose centre of mass is past the obstacle. None if the robot does not get over it."""
     return int(jnp.argmax(record.centre > terrain.finish)) if over else None
 
 
 def climb_outputs(robot: Robot, terrain: Terrain, record: ClimbRecord, crest: int | None) -> Scalars:
-    """`OUTPUTS` of a run until its verdict, from its record of shape (samples,)."""
+    """`OUTPUTS` of a climb until its verdict, from a record of shape (samples,)."""
     reach = jnp.asarray((record.centre - terrain.finish) / (robot.running_gear.wheelbase / 2))
     # the crest is between two samples
     share = jnp.ones(()) if crest is None else -reach[crest - 1] / (reach[crest] - reach[crest - 1])
@@ -111,17 +111,17 @@ def climb_outputs(robot: Robot, terrain: Terrain, record: ClimbRecord, crest: in
     }
 
 
-class Derivatives(NamedTuple):
-    """Outputs of a climb, by the names of `OUTPUTS`, and their derivatives.
+class ClimbDerivatives(NamedTuple):
+    """Outputs of a climb by name (see `OUTPUTS`), and their derivatives.
 
     Attributes:
-        climb: the run.
-        found: outputs of the run.
+        climb: the simulated climb.
+        found: outputs of the climb.
         by: derivatives of the outputs, of shape (values,). slope, slope_sd: slopes and standard deviations of
         straight lines through `BESIDE` runs along each value, and their standard deviations.
     """
 
-    climb: Climb
+    climb: ClimbRuns
     found: dict[str, float]
     by: dict[str, Float[np.ndarray, " values"]]
     slope: dict[str, Float[np.ndarray, " values"]]
@@ -138,21 +138,23 @@ def climb_derivatives(
     sample: float = climb.SAMPLE,
     part: float = 1.0,
     progress: Callable[[float], None] | None = None,
-) -> Derivatives:
+) -> ClimbDerivatives:
     """Outputs of one climb, their derivatives with respect to `values`, and slopes over `widths` to both sides.
 
-    `given` makes robot, conditions, terrain and sequence from the values. The other arguments are those of
-    `climb_batch`.
+    `given` is a function of the values that returns robot, conditions, terrain and sequence. The other arguments are
+    as in `climb_batch`.
     """
     directions = jnp.eye(len(values))
     parts, samples, steps = climb.divide_run(duration, step, sample, part)
     interval, each = jnp.asarray(step, float), jnp.asarray(steps)
     run, turned = _value_and_derivatives_along(given, values, directions)
-    state, moved = _value_and_derivatives_along(functools.partial(_initial, step=interval), run, turned)
+    state, moved = _value_and_derivatives_along(functools.partial(_initial_state, step=interval), run, turned)
     records: list[Any] = []
     for k in range(parts):
         first = jnp.asarray(k * samples * steps * step)
-        (state, record), (moved, changed) = _part((run, state), (turned, moved), first, interval, each, samples)
+        (state, record), (moved, changed) = _advance_part(
+            (run, state), (turned, moved), first, interval, each, samples
+        )
         records.append(jax.device_get((record, changed)))
         if progress is not None:
             progress((k + 1) / parts / 2)
@@ -162,7 +164,7 @@ def climb_derivatives(
     changed = jax.tree.map(lambda *x: jnp.concatenate(x, axis=1), *[c for _, c in records])
     verdict, ended = int(state[2].verdict), state[2].ended
     last = UNFINISHED if verdict < 0 else verdict, ended, state[2].furthest
-    whole = Climb(*jax.tree.map(lambda x: np.asarray(x)[None], (*last, record)))
+    whole = ClimbRuns(*jax.tree.map(lambda x: np.asarray(x)[None], (*last, record)))
     ran = jax.tree.map(jnp.asarray, whole.run(0))
     count = len(ran.time)
     top = crest_sample(run.terrain, ran, verdict == OVER)
@@ -188,19 +190,19 @@ def climb_derivatives(
         left = off - np.outer(rise, offsets)
         slope[name] = rise / np.asarray(widths)
         sd[name] = np.sqrt(np.sum(left**2, axis=1) / (BESIDE - 2) / square) / np.asarray(widths)
-    return Derivatives(
+    return ClimbDerivatives(
         whole, {n: float(x) for n, x in gradients.items()}, {n: np.asarray(x) for n, x in by.items()}, slope, sd
     )
 
 
-def outputs_of_run(robot: Robot, terrain: Terrain, ended: Climb, k: int) -> Scalars:
+def outputs_of_run(robot: Robot, terrain: Terrain, ended: ClimbRuns, k: int) -> Scalars:
     """`OUTPUTS` of run `k` of a batch."""
     record = jax.tree.map(jnp.asarray, ended.run(k))
     return climb_outputs(robot, terrain, record, crest_sample(terrain, record, bool(ended.verdict[k] == OVER)))
 
 
 def _value_and_derivatives_along(function: Callable[[Any], Any], at: Any, directions: Any) -> tuple[Any, Any]:
-    """A function's value and its derivatives along `directions`, leaves with a leading axis (None: zero)."""
+    """Value of a function and its derivatives along `directions`. Leaves have a first axis (None: zero)."""
     numbers, rest = eqx.partition(at, eqx.is_inexact_array)
     further: list[Any] = []
 
@@ -217,16 +219,18 @@ def _value_and_derivatives_along(function: Callable[[Any], Any], at: Any, direct
     return eqx.combine(values, arrays, further[-1]), changed
 
 
-def _initial(run: ClimbInputs, step: Scalar) -> Any:
-    return climb.begin_climb(climb.climb_system(*run, step))
+def _initial_state(run: ClimbInputs, step: Scalar) -> Any:
+    return climb.begin_climb(climb.build_climb_system(*run, step))
 
 
-def _sampled(at: tuple[ClimbInputs, Any], first: Scalar, step: Scalar, steps: Scalar, samples: int) -> Any:
+def _advance_with_samples(
+    at: tuple[ClimbInputs, Any], first: Scalar, step: Scalar, steps: Scalar, samples: int
+) -> Any:
     run, state = at
-    return climb.advance_samples(climb.climb_system(*run, step), state, first, steps, samples)
+    return climb.advance_samples(climb.build_climb_system(*run, step), state, first, steps, samples)
 
 
 @functools.partial(compiled, options=SELDOM)
-def _part(at: Any, directions: Any, first: Scalar, step: Scalar, steps: Scalar, samples: int) -> Any:
-    along = functools.partial(_sampled, first=first, step=step, steps=steps, samples=samples)
+def _advance_part(at: Any, directions: Any, first: Scalar, step: Scalar, steps: Scalar, samples: int) -> Any:
+    along = functools.partial(_advance_with_samples, first=first, step=step, steps=steps, samples=samples)
     return _value_and_derivatives_along(along, at, directions)

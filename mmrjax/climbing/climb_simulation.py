@@ -1,8 +1,8 @@
-"""Half a robot with levers on a terrain in its plane of travel: its state, one step, and the verdict of a run.
+"""Half a robot with levers on a terrain in its plane of travel: its state, one time step, and the verdict of a run.
 
 The bodies are the chassis with payload, two pulleys and two levers. The belts run rigidly with the pulleys. The
-levers' drives follow a sequence of angles, limited by the levers' rate, or have given voltages. `footing` computes
-the contacts, `balances` the drive of the tracks, `lever_drives` that of the levers.
+levers' drives follow a sequence of angles, limited by the levers' rate, or have given voltages.
+`contacts_with_terrain` computes the contacts, `balances` the drive of the tracks, `lever_drives` that of the levers.
 """
 
 from __future__ import annotations
@@ -19,20 +19,20 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from mmrjax.climbing import footing
-from mmrjax.climbing.footing import COORDINATES, FRONT, PITCH, REAR, SHAFT, Footing, Shape
-from mmrjax.climbing.lever_drives import LeverDrive, Swing, lever_drive, step_levers
+from mmrjax.climbing.footing import COORDINATES, FRONT, PITCH, REAR, SHAFT, ContactShape, Footing
+from mmrjax.climbing.lever_drives import LeverDrive, LeverStep, lever_drive, step_levers
 from mmrjax.climbing.terrain import Terrain
 from mmrjax.compile.compiling import SMALL, compiled
 from mmrjax.model import balances, contact
 from mmrjax.model.chassis import Chassis
 from mmrjax.model.conditions import Conditions
-from mmrjax.model.masses import Masses, without_levers
+from mmrjax.model.masses import HalfRobotMasses, without_levers
 from mmrjax.model.params import Pair, Scalar
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import GRAVITY, Signals, State
 from mmrjax.model.track_friction import Track
 from mmrjax.numerics.linear_equations import factorise, solve_factorised
-from mmrjax.undercarriage.half_robot import contacts_resist, current_after
+from mmrjax.undercarriage.half_robot import contact_damping, current_after
 from mmrjax.undercarriage.running_gear import RunningGear
 
 #: Verdicts of a climb; the last two: its time ended while it was still moving, and numbers that are not finite.
@@ -59,18 +59,19 @@ LED = np.array([FRONT, REAR])
 _ON_BELTS = np.eye(COORDINATES)[LED] + np.eye(COORDINATES)[SHAFT]
 
 
-class Sequence(eqx.Module):
-    """Angles of the levers, or voltages of their motors, over distance or time, linear between knots.
+class LeverSequence(eqx.Module):
+    """Lever angles, or voltages of the lever motors, over distance or time. Linear between knots.
 
     Values beyond the first and last knot are constant.
 
     Attributes:
-        at: knots, of the middle of the wheelbase from the start of the obstacle [m], or times [s].
-        front, rear: angles at the knots, 0 along the wheelbase outward, positive up [rad], or voltages, positive up
-            [V].
-        begins: initial angles of front and rear levers driven by voltages [rad]. None: the sequence states angles.
-        over_time: True if knots are times.
-        supply: highest voltage of the levers' motors [V]. None: that of the supply.
+        at: knots: position of the middle of the wheelbase from the start of the obstacle [m], or time [s].
+        front, rear: values at the knots: angles, 0 along the wheelbase outward, positive up [rad], or voltages,
+            positive up [V].
+        begins: initial angles of front and rear levers that are driven by voltages [rad]. None: the sequence states
+            angles.
+        over_time: True if the knots are times.
+        supply: highest voltage of the lever motors [V]. None: that of the supply.
     """
 
     at: Float[Array, " knots"]
@@ -92,18 +93,19 @@ class Sequence(eqx.Module):
 
 
 def _convert_lever_angles(front: Array, rear: Array) -> Pair:
-    """Converts between ψ of both levers and their angles, see `footing` [rad]."""
+    """Converts both lever angles between ψ (see `contacts_with_terrain`) and the angles of the sequence [rad]."""
     return jnp.stack([front, jnp.pi - rear])
 
 
-def constant_angles(front: Scalar, rear: Scalar) -> Sequence:
-    """Levers that stay at their angles [rad]."""
+def constant_angles(front: Scalar, rear: Scalar) -> LeverSequence:
+    """Sequence in which the levers keep their angles [rad]."""
     one = jnp.zeros(1)
-    return Sequence(one, one + front, one + rear)
+    return LeverSequence(one, one + front, one + rear)
 
 
-class Motion(eqx.Module):
-    """State of half a robot: coordinates, velocities (see `footing`), and three electrical quantities.
+class ClimbMotion(eqx.Module):
+    """State of half a robot: coordinates, velocities (see `contacts_with_terrain`), motor current [A], charge taken
+    [C], and supply current of the lever motors [A].
 
     They are the current of one motor [A], the charge taken from the battery [C], and the current of the levers'
     motors from the supply [A].
@@ -125,26 +127,26 @@ Energy = dict[str, Any]
 
 
 class ClimbRecord(eqx.Module):
-    """An instant or a sample: means over it, and energy since the start of the run.
+    """Recorded quantities of an instant, or their means over a sample. Energies count from the start of the run.
 
     Attributes:
         current: current of one motor [A].
-        total_current: current of all motors, from the supply, I_s of (10) [A].
-        torque: torque of each drive on its pair of levers [N·m], lever_current [A] and lever_voltage [V] of its
-            motor, up.
-        holds: 1 if only its worm holds a pair, without current [-].
-        energy: energy in and lost, by the names of `SOURCES` and `LOSSES`, of the whole robot [J].
-        stored: energy stored in motion, height, contacts and windings of the whole robot [J].
-        body: share of all normal force that the body carries [-].
-        grip: traction of all rolling contacts over the limit of their friction [-].
-        carried: share of the weight that all contacts carry [-].
+        total_current: supply current of all motors, I_s of (10) [A].
+        torque: torque of each lever drive on its pair of levers [N·m], with lever_current [A] and lever_voltage [V]
+            of its motor, positive up.
+        holds: 1 if a pair is held by its worm alone, without current [-].
+        energy: energy taken and lost, by names in `SOURCES` and `LOSSES`, for the whole robot [J].
+        stored: energy stored in motion, height, contacts and windings, for the whole robot [J].
+        body: share of all normal force that acts on the body [-].
+        grip: traction of all rolling contacts relative to the limit of their friction [-].
+        carried: share of the weight that the contacts carry [-].
         centre: x of the centre of mass [m].
-        base: distances of the outermost contacts behind and ahead of it [m]. For a sample the largest,
-            because contacts that open for a few steps still carry the robot.
+        base: distances from the centre of mass to the outermost contacts behind and ahead [m]. For a sample, the
+            largest ones, because contacts that open for a few steps still support the robot.
     """
 
     time: Scalar
-    motion: Motion
+    motion: ClimbMotion
     current: Scalar
     total_current: Scalar
     voltage: Scalar
@@ -163,23 +165,25 @@ class ClimbRecord(eqx.Module):
 
     @property
     def margin(self) -> Scalar:
-        """Distance of gravity's line through the centre of mass from the nearer of the outermost contacts [m].
+        """Distance from the line of gravity through the centre of mass to the nearer of the outermost contacts [m].
 
-        Negative if the line is beyond them, NaN for a robot that falls or bounces.
+        Negative if the line is outside them, NaN for a robot that falls or bounces.
         """
         least = jnp.min(self.base, axis=-1)
         return jnp.where(jnp.isfinite(least) & (self.carried >= CARRIED), least, jnp.nan)
 
 
-class System(eqx.Module):
-    """Constants of one run. Robot and chassis have only the main tracks' losses, the levers' tracks their own."""
+class ClimbSystem(eqx.Module):
+    """Constants of one run. Robot and chassis have the losses of the main tracks only, those of the lever tracks are
+    separate.
+    """
 
     robot: Robot
     conditions: Conditions
     terrain: Terrain
-    sequence: Sequence
-    shape: Shape
-    half: Masses
+    sequence: LeverSequence
+    shape: ContactShape
+    half: HalfRobotMasses
     lever: Float[Array, " 3"]
     chassis: Chassis
     lever_track: Track
@@ -187,15 +191,18 @@ class System(eqx.Module):
     step: Scalar
 
 
-def climb_system(
-    robot: Robot, conditions: Conditions, terrain: Terrain, sequence: Sequence, step: Scalar = STEP
-) -> System:
+def build_climb_system(
+    robot: Robot, conditions: Conditions, terrain: Terrain, sequence: LeverSequence, step: Scalar = STEP
+) -> ClimbSystem:
     """Constants of one run (scalar conditions). The robot may hold tracers."""
     zero = jnp.zeros_like(conditions.voltage)
     mass = balances.begin_signals(robot, conditions, State(zero, zero, zero, zero)).mass
     robot, gear = robot.within(conditions.configuration), robot.running_gear
     chassis = robot.chassis(conditions.configuration)
-    half, shape = without_levers(robot, conditions, mass), footing.contact_shape(chassis, gear, robot.radius_pulley)
+    half, shape = (
+        without_levers(robot, conditions, mass),
+        footing.contact_shape_of_robot(chassis, gear, robot.radius_pulley),
+    )
     none = jnp.zeros_like(chassis.on_tracks)
     lever = jnp.stack([gear.lever_mass, gear.lever_centre, gear.lever_inertia]) * jnp.stack(
         [chassis.on_tracks, jnp.ones(()), chassis.on_tracks]
@@ -211,7 +218,7 @@ def climb_system(
     chassis = dataclasses.replace(chassis, track=main)
     robot = eqx.tree_at(lambda r: r.configurations.chosen, robot, chassis)
     drive = lever_drive(robot)
-    return System(
+    return ClimbSystem(
         robot,
         conditions,
         terrain,
@@ -226,7 +233,9 @@ def climb_system(
     )
 
 
-def mass_matrix_and_bias(run: System, q: Array, v: Array) -> tuple[Float[Array, "6 6"], Float[Array, " 6"], Scalar]:
+def mass_matrix_and_bias(
+    run: ClimbSystem, q: Array, v: Array
+) -> tuple[Float[Array, "6 6"], Float[Array, " 6"], Scalar]:
     """Mass matrix M without rotors, bias c (centrifugal forces and gravity) and potential energy, per side.
 
     M v' + c = Q. Each body's centre of mass moves by its arm about the middle of the wheelbase and, of a lever, about
@@ -269,7 +278,7 @@ def mass_matrix_and_bias(run: System, q: Array, v: Array) -> tuple[Float[Array, 
     return matrix, bias, height
 
 
-class _Pull(eqx.Module):
+class _ContactForces(eqx.Module):
     """Forces of the contacts, in the form that `balances.resolved_signals` expects."""
 
     traction: Scalar
@@ -278,7 +287,7 @@ class _Pull(eqx.Module):
     force: Float[Array, " pairs"]
 
 
-class _Mover(eqx.Module):
+class _LeveredContacts(eqx.Module):
     at: Footing
     v: Array
     radius: Scalar
@@ -289,7 +298,7 @@ class _Mover(eqx.Module):
         """Normal load of one side, of all rolling contacts [N]."""
         return jnp.sum(self.at.force * self.at.rolls)
 
-    def pull(self, chassis: Chassis, signals: Signals) -> _Pull:
+    def pull(self, chassis: Chassis, signals: Signals) -> _ContactForces:
         """Friction of the contacts (25) by Fig. 7, and of the guide (26)."""
         touching = self.at
         force = jnp.asarray(
@@ -301,16 +310,20 @@ class _Mover(eqx.Module):
             + self.levers
             - jnp.sum(force * touching.along[:, SHAFT] + touching.force * touching.off[:, SHAFT])
         )
-        return _Pull(jnp.sum(force), guide, load, force)
+        return _ContactForces(jnp.sum(force), guide, load, force)
 
 
 def _sliding(at: Footing, v: Array, signals: Signals) -> Array:
     return -(at.along @ v) - signals.speed_slip_terms
 
 
-def climb_instant(run: System, motion: Motion, on: Scalar) -> tuple[Signals, Footing, _Pull, Array]:
-    """All signals, contacts, forces and load shares of an instant. `on`: share of their voltage at the motors."""
-    touching = footing.footing(run.shape, run.terrain, motion.q, motion.v)
+def climb_instant(
+    run: ClimbSystem, motion: ClimbMotion, on: Scalar
+) -> tuple[Signals, Footing, _ContactForces, Array]:
+    """All signals, contacts, forces and load shares of an instant. `on`: share of its voltage that each motor
+    receives.
+    """
+    touching = footing.contacts_with_terrain(run.shape, run.terrain, motion.q, motion.v)
     # share of each rolling contact in the load, and the robot's speed along the ground, their load-weighted mean
     bears = touching.force * touching.rolls
     share = bears / jnp.maximum(jnp.sum(bears), 1e-9)
@@ -319,34 +332,35 @@ def climb_instant(run: System, motion: Motion, on: Scalar) -> tuple[Signals, Foo
 
     ratio = run.robot.gearbox.ratio
     state = State(motion.current, ratio * motion.v[SHAFT], speed, motion.discharge)
-    mover = _Mover(
+    mover = _LeveredContacts(
         touching, motion.v, run.shape.main.first, jnp.sum(_lever_loss(run, motion.v[SHAFT] + motion.v[LED]))
     )
     signals, pulled = balances.resolved_signals(run.robot, conditions, state, mover, 2 * run.half.inertia_pulley)
     return signals, touching, pulled, share
 
 
-def _driven(run: System, on: Scalar) -> Conditions:
+def _driven(run: ClimbSystem, on: Scalar) -> Conditions:
     return dataclasses.replace(run.conditions, duty=run.conditions.duty * on)
 
 
-def _lever_loss(run: System, speed: Array) -> Array:
-    """Loss torques of the levers' tracks (24) [N·m] at the speeds of their pulleys on their levers [rad/s]."""
+def _lever_loss(run: ClimbSystem, speed: Array) -> Array:
+    """Loss torques of the lever tracks (24) [N·m], at the speeds of their pulleys relative to the levers [rad/s]."""
     rolls = contact.smooth_sign(run.shape.main.first * speed, run.chassis.speed_still)
     return jnp.asarray(run.lever_track.torque_loss(speed, rolls))
 
 
-def _with_lever_current(run: System, motion: Motion) -> System:
-    """The run with the current of the levers' motors added to the battery's other consumers, I_s of eq. (10)."""
+def _with_lever_current(run: ClimbSystem, motion: ClimbMotion) -> ClimbSystem:
+    """Run in which the current of the lever motors is added to the battery's other consumers, I_s of eq. (10)."""
     battery = run.robot.battery
     battery = dataclasses.replace(battery, current_other=battery.current_other + motion.drawn)
     return dataclasses.replace(run, robot=dataclasses.replace(run.robot, battery=battery))
 
 
-def demanded_lever_rates(run: System, motion: Motion, time: Scalar) -> Pair:
+def demanded_lever_rates(run: ClimbSystem, motion: ClimbMotion, time: Scalar) -> Pair:
     """Demanded angular speeds of the levers after a step [rad/s].
 
-    They lead to the sequence's angles, limited by the levers' rate. Levers at their angle stand.
+    They lead to the angles of the sequence, limited by the largest rate of the levers. At its angle, a lever stands
+    still.
     """
     rate = run.robot.running_gear.levers.rate
     toward = (_convert_lever_angles(*run.sequence.asked(motion.q[0], time)) - motion.q[LED]) / (4 * _SWINGS)
@@ -354,8 +368,10 @@ def demanded_lever_rates(run: System, motion: Motion, time: Scalar) -> Pair:
     return jnp.where((jnp.abs(toward) < _STILL) & (jnp.abs(motion.v[LED]) < _STILL), 0.0, speed)
 
 
-def _drive_action(run: System, motion: Motion, time: Scalar, source: Scalar, free: Array, yields: Array) -> Swing:
-    """Action of the drives on the levers in a step, without it they have the rates `free` afterwards [rad/s]."""
+def _drive_action(
+    run: ClimbSystem, motion: ClimbMotion, time: Scalar, source: Scalar, free: Array, yields: Array
+) -> LeverStep:
+    """Action of the lever drives in a step. Without it, the rates after the step would be `free` [rad/s]."""
     levers, sequence = run.robot.running_gear.levers, run.sequence
     most = jnp.abs(source) if sequence.supply is None else sequence.supply
     high = jnp.stack([most, most])
@@ -373,7 +389,9 @@ def _drive_action(run: System, motion: Motion, time: Scalar, source: Scalar, fre
     return step_levers(run.drive, run.step, motion.v[LED], free, yields, aims, low, high)
 
 
-def advance_climb(run: System, motion: Motion, time: Scalar, energy: Energy) -> tuple[Motion, Energy, ClimbRecord]:
+def advance_climb(
+    run: ClimbSystem, motion: ClimbMotion, time: Scalar, energy: Energy
+) -> tuple[ClimbMotion, Energy, ClimbRecord]:
     """One step, linearly implicit in the forces of contacts and drive, as `half_robot.advance`.
 
     (M + Δt K) Δv = Δt (Q - c). The drives' torques on the levers and the levers' rates are solved together within
@@ -401,7 +419,7 @@ def advance_climb(run: System, motion: Motion, time: Scalar, energy: Energy) -> 
         run.chassis.ground.traction_rise(_sliding(touching, motion.v, signals), touching.force, signals.adhesion), 0
     )
     shaft = _shaft_loss(run, motion, signals, touching)
-    damping = contacts_resist(touching.along, touching.off, pulled.force, touching.force, rises, touching.damped)
+    damping = contact_damping(touching.along, touching.off, pulled.force, touching.force, rises, touching.damped)
     damping = damping.at[SHAFT, SHAFT].add(shaft) + (_ON_BELTS.T * stiffens) @ _ON_BELTS
     whole = matrix.at[SHAFT, SHAFT].add(armature) + step * damping
     # of wheels, with massless levers
@@ -424,7 +442,7 @@ def advance_climb(run: System, motion: Motion, time: Scalar, energy: Energy) -> 
     charge = balances.charge_drawn(robot, run.conditions, signals.total_current)
     current = current_after(robot, _driven(run, on), step, signals)
     drawn = swung.voltage @ swung.current / jnp.maximum(jnp.abs(signals.voltage_source), 1e-9)
-    after = Motion(motion.q + step * v, v, current, motion.discharge + step * charge, drawn)
+    after = ClimbMotion(motion.q + step * v, v, current, motion.discharge + step * charge, drawn)
 
     pair = run.drive
     # (1 / step) is the compiler's form of a division by a constant: a step passed as an argument gives the same bits
@@ -482,15 +500,17 @@ def advance_climb(run: System, motion: Motion, time: Scalar, energy: Energy) -> 
 
 
 def _contact_ends(centre: Scalar, at: Footing) -> Pair:
-    """Distances of the outermost contacts behind and ahead of the centre of mass [m], assuming level ground below."""
+    """Distances from the centre of mass to the outermost contacts behind and ahead [m], measured along level
+    ground.
+    """
     bears, ahead = at.force > 0, at.place - centre
     return jnp.stack([jnp.max(jnp.where(bears, way, -jnp.inf)) for way in (-ahead, ahead)])
 
 
-def _shaft_loss(run: System, motion: Motion, signals: Signals, at: Footing) -> Scalar:
-    """Derivative of the drive's losses with respect to the shaft speed [N·m·s], at least 0. It is large at rest.
+def _shaft_loss(run: ClimbSystem, motion: ClimbMotion, signals: Signals, at: Footing) -> Scalar:
+    """Derivative of the drive's losses with respect to the shaft speed, at least 0 [N·m·s]. It is large at rest.
 
-    Contacts and winding are excluded, because they are resolved.
+    Contacts and winding are excluded because they are resolved in time.
     """
     one = jnp.ones_like(motion.v[SHAFT])
     force = jnp.sum(run.chassis.track.guide_friction * at.guided * at.force) * run.shape.main.first
@@ -505,8 +525,10 @@ def _shaft_loss(run: System, motion: Motion, signals: Signals, at: Footing) -> S
     return jnp.maximum(jax.jvp(loss, (motion.v[SHAFT],), (one,))[1], 0.0)
 
 
-class Progress(eqx.Module):
-    """State of a run's verdict: verdict, its time, furthest position, time of that, and shaft angle since."""
+class VerdictState(eqx.Module):
+    """State from which the verdict follows: verdict, its time, furthest position, the time of that, and the shaft
+    angle since then.
+    """
 
     verdict: Array
     ended: Scalar
@@ -515,8 +537,8 @@ class Progress(eqx.Module):
     belt: Scalar
 
 
-def stand_before_obstacle(run: System, clear: float = 0.1) -> Motion:
-    """At rest on the ground before the obstacle, with its foremost point `clear` [m] from it."""
+def stand_before_obstacle(run: ClimbSystem, clear: float = 0.1) -> ClimbMotion:
+    """Initial motion: at rest on the ground, with the foremost point `clear` [m] before the obstacle."""
     shape = run.shape
     angles = run.sequence.first
     outer = shape.main.first + shape.gear.grouser_height
@@ -529,13 +551,13 @@ def stand_before_obstacle(run: System, clear: float = 0.1) -> Motion:
     place = below + (axle - gap - 2e-5) * normal
     zero = jnp.zeros_like(x)
     q = jnp.stack([place[0], place[1], jnp.arctan2(normal[0], normal[1]), zero, angles[0], angles[1]])
-    return Motion(q, jnp.zeros(COORDINATES), zero, run.conditions.discharge + zero, zero)
+    return ClimbMotion(q, jnp.zeros(COORDINATES), zero, run.conditions.discharge + zero, zero)
 
 
 def _update_verdict(
-    run: System, before: Motion, passed: ClimbRecord, motion: Motion, progress: Progress
-) -> tuple[Motion, Progress]:
-    """Updates the verdict of a run after a sample. A run that has ended keeps its state."""
+    run: ClimbSystem, before: ClimbMotion, passed: ClimbRecord, motion: ClimbMotion, progress: VerdictState
+) -> tuple[ClimbMotion, VerdictState]:
+    """Verdict of a run after one more sample. A run that has ended keeps its state."""
     q, v = motion.q, motion.v
     outer = run.shape.main.first + run.shape.gear.grouser_height
     finite = jnp.all(jnp.isfinite(q)) & jnp.all(jnp.isfinite(v)) & jnp.isfinite(motion.current)
@@ -544,7 +566,7 @@ def _update_verdict(
     gained = q[0] > progress.furthest + GAIN
     swings = jnp.max(jnp.abs(v[LED])) > 0.05
     moved = gained | swings | (passed.time < SETTLES)
-    progress = Progress(
+    progress = VerdictState(
         progress.verdict,
         jnp.where(progress.verdict == _RUNNING, passed.time, progress.ended),
         jnp.where(gained, q[0], progress.furthest),
@@ -566,8 +588,8 @@ def _update_verdict(
     return motion, dataclasses.replace(progress, verdict=verdict)
 
 
-def begin_climb(run: System, motion: Motion | None = None) -> tuple[Motion, Energy, Progress]:
-    """Initial motion (None: at rest before the obstacle), zero energy, and the initial verdict.
+def begin_climb(run: ClimbSystem, motion: ClimbMotion | None = None) -> tuple[ClimbMotion, Energy, VerdictState]:
+    """Initial motion (if None, at rest before the obstacle), zero energy, and the initial verdict.
 
     The verdict is `failed` if the levers would begin below the ground, else the run goes on.
     """
@@ -577,7 +599,7 @@ def begin_climb(run: System, motion: Motion | None = None) -> tuple[Motion, Ener
     motion = stand_before_obstacle(run) if motion is None else motion
     zero = jnp.zeros_like(motion.q[0])
     energy = dict.fromkeys((*SOURCES, *LOSSES), zero)
-    return motion, energy, Progress(jnp.where(buried, FAILED, _RUNNING), zero, motion.q[0], zero, zero)
+    return motion, energy, VerdictState(jnp.where(buried, FAILED, _RUNNING), zero, motion.q[0], zero, zero)
 
 
 def roller_clearance(axle: Scalar, gear: RunningGear, angles: Float[Array, " levers"]) -> Float[Array, " levers"]:
@@ -585,8 +607,12 @@ def roller_clearance(axle: Scalar, gear: RunningGear, angles: Float[Array, " lev
     return axle + gear.lever_length * jnp.sin(angles) - gear.levers.roller
 
 
-def advance_samples(run: System, state: Any, first: Scalar, steps: Scalar, samples: int) -> tuple[Any, ClimbRecord]:
-    """A part of a run with `samples` samples of `steps` steps each, from time `first` [s]: its end and its record."""
+def advance_samples(
+    run: ClimbSystem, state: Any, first: Scalar, steps: Scalar, samples: int
+) -> tuple[Any, ClimbRecord]:
+    """State after a part of a run with `samples` samples of `steps` steps each, from time `first` [s], and its
+    record.
+    """
 
     def sample(state: Any, k: Array) -> tuple[Any, ClimbRecord]:
         motion, energy, progress = state
@@ -608,7 +634,8 @@ def advance_samples(run: System, state: Any, first: Scalar, steps: Scalar, sampl
 
 
 def divide_run(duration: float, step: float, sample: float, part: float) -> tuple[int, int, int]:
-    """Division of a run of a `duration`: parts no longer than `part`, samples per part, steps per sample.
+    """Division of a run of length `duration`: number of parts (no longer than `part`), samples per part, steps per
+    sample.
 
     A sample has a whole number of steps and all parts are equal, so the run may be a few samples longer.
     """
@@ -616,8 +643,8 @@ def divide_run(duration: float, step: float, sample: float, part: float) -> tupl
     return parts, math.ceil(duration / (parts * steps * step) - 1e-9), steps
 
 
-class Climb(eqx.Module):
-    """Runs: verdicts as indices into `NAMES`, their times [s], and records of shape (runs, samples)."""
+class ClimbRuns(eqx.Module):
+    """Simulated climbs: verdicts as indices into `NAMES`, their times [s], and records of shape (runs, samples)."""
 
     verdict: np.ndarray
     ended: np.ndarray
@@ -626,41 +653,50 @@ class Climb(eqx.Module):
 
     @property
     def names(self) -> list[str]:
-        """The verdicts in words."""
+        """Verdicts in words."""
         return [NAMES[k] for k in self.verdict]
 
     @property
-    def during(self) -> np.ndarray:
+    def before_verdict(self) -> np.ndarray:
         """Mask of the samples before a run's verdict, after which its state is constant, shape (runs, samples)."""
         return np.asarray(self.record.time) <= np.asarray(self.ended)[:, None] + 1e-9
 
     def run(self, k: int) -> ClimbRecord:
         """The record of run `k` until its verdict, shape (samples,)."""
-        count = int(np.sum(self.during[k]))
+        count = int(np.sum(self.before_verdict[k]))
         return jax.tree.map(lambda x: x[k, :count], self.record)
 
 
 def _robot_axis(robot: Robot) -> int | None:
-    """Axis of the runs in a robot's parameters, None if all runs have one robot."""
+    """Batch axis in the parameters of a robot, None if all runs have the same robot."""
     return 0 if jnp.ndim(robot.sides) else None
 
 
 @compiled
 def _begin(
-    robot: Robot, conditions: Conditions, terrain: Terrain, sequence: Sequence, step: Scalar, motion: Motion | None
+    robot: Robot,
+    conditions: Conditions,
+    terrain: Terrain,
+    sequence: LeverSequence,
+    step: Scalar,
+    motion: ClimbMotion | None,
 ) -> Any:
-    def one(robot: Robot, conditions: Conditions, terrain: Terrain, sequence: Sequence, motion: Motion | None) -> Any:
-        return begin_climb(climb_system(robot, conditions, terrain, sequence, step), motion)
+    def one(
+        robot: Robot, conditions: Conditions, terrain: Terrain, sequence: LeverSequence, motion: ClimbMotion | None
+    ) -> Any:
+        return begin_climb(build_climb_system(robot, conditions, terrain, sequence, step), motion)
 
     return jax.vmap(one, in_axes=(_robot_axis(robot), 0, 0, 0, 0))(robot, conditions, terrain, sequence, motion)
 
 
 def _part(
-    robot: Robot, conditions: Conditions, terrain: Terrain, sequence: Sequence, state: Any, first: Scalar,
+    robot: Robot, conditions: Conditions, terrain: Terrain, sequence: LeverSequence, state: Any, first: Scalar,
     step: Scalar, steps: Scalar, samples: int,
 ) -> tuple[Any, ClimbRecord]:  # fmt: skip
-    def one(robot: Robot, conditions: Conditions, terrain: Terrain, sequence: Sequence, state: Any) -> Any:
-        return advance_samples(climb_system(robot, conditions, terrain, sequence, step), state, first, steps, samples)
+    def one(robot: Robot, conditions: Conditions, terrain: Terrain, sequence: LeverSequence, state: Any) -> Any:
+        return advance_samples(
+            build_climb_system(robot, conditions, terrain, sequence, step), state, first, steps, samples
+        )
 
     each = (_robot_axis(robot), 0, 0, 0, 0)
     parts: tuple[Any, ClimbRecord] = jax.vmap(one, in_axes=each)(robot, conditions, terrain, sequence, state)
@@ -674,26 +710,27 @@ def climb_batch(
     robot: Robot,
     conditions: Conditions,
     terrain: Terrain,
-    sequence: Sequence,
+    sequence: LeverSequence,
     *,
     duration: float = DURATION,
     step: float = STEP,
     sample: float = SAMPLE,
     part: float = 1.0,
     record: bool = True,
-    start: Motion | None = None,
+    start: ClimbMotion | None = None,
     progress: Callable[[float], None] | None = None,
-) -> Climb:
-    """Climbs over a batch of conditions, terrains and sequences (leading axis of every field), until all have ended.
+) -> ClimbRuns:
+    """Simulates climbs over a batch of conditions, terrains and sequences (first axis of every field) until all have
+    ended.
 
     Args:
-        robot: robot of all runs, or with a leading axis in every parameter too.
+        robot: robot of all runs, or a batch with a first axis in every parameter.
         duration: duration of the longest run [s].
         step, sample: intervals of integration and of the record [s].
-        part: length of run between two checks for the end of all runs [s].
-        record: True to return all samples. False: only the last one.
+        part: simulated time between checks for the end of all runs [s].
+        record: True to return all samples, False to return only the last one.
         start: initial motions. None: at rest before the obstacle.
-        progress: called with the finished share of the time.
+        progress: callback with the finished share of the time.
     """
     parts, samples, steps = divide_run(duration, step, sample, part)
     interval, each = jnp.asarray(step, float), jnp.asarray(steps)  # arrays: one program for all lengths of a step
@@ -711,4 +748,4 @@ def climb_batch(
             break
     verdict = np.where(verdict == _RUNNING, UNFINISHED, verdict)
     joined = jax.tree.map(lambda *x: np.concatenate(x, axis=1), *kept)
-    return Climb(verdict, np.asarray(state[2].ended), np.asarray(state[2].furthest), joined)
+    return ClimbRuns(verdict, np.asarray(state[2].ended), np.asarray(state[2].furthest), joined)

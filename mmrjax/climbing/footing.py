@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from mmrjax.climbing import belt_loop
-from mmrjax.climbing.belt_loop import Loop
+from mmrjax.climbing.belt_loop import BeltLoop
 from mmrjax.climbing.terrain import Terrain
 from mmrjax.model import contact
 from mmrjax.model.chassis import Chassis
@@ -33,19 +33,19 @@ COORDINATES = 6
 PITCH, SHAFT, FRONT, REAR = 2, 3, 4, 5
 
 
-class Shape(eqx.Module):
+class ContactShape(eqx.Module):
     """Parts of half a robot that can touch the ground.
 
     Attributes:
-        main, lever: the belts of one side. Both levers have equal ones.
+        main, lever: belts of one side. Both levers have equal belts.
         gear: the running gear.
-        on_tracks: 1 if levers carry load, 0 if wheels do [-].
+        on_tracks: 1 if tracks carry load, 0 if wheels do [-].
         wheel: radius of the wheels [m].
-        belly: height of the body's underside over the axles [m].
+        belly: height of the underside of the body above the axles [m].
     """
 
-    main: Loop
-    lever: Loop
+    main: BeltLoop
+    lever: BeltLoop
     gear: RunningGear
     on_tracks: Scalar
     wheel: Scalar
@@ -57,44 +57,46 @@ class Shape(eqx.Module):
         return self.gear.wheelbase / 2
 
 
-class Frame(NamedTuple):
-    """Frame of a part: origin in the world [m], angle of its first axis [rad], and the coordinate that turns it."""
+class PartFrame(NamedTuple):
+    """Frame of a part: its origin in the world [m], the angle of its first axis [rad], and the coordinate that turns
+    it.
+    """
 
     origin: Array
     angle: Scalar
     turns: int | None = None
 
     def world(self, at: Array) -> Array:
-        """Points of the part in the world."""
+        """Points of the part, in world coordinates."""
         return self.origin + self.along(at)
 
     def along(self, vector: Array) -> Array:
-        """Directions of the part in the world."""
+        """Directions of the part, in world coordinates."""
         cos, sin = jnp.cos(self.angle), jnp.sin(self.angle)
         a, b = vector[..., 0], vector[..., 1]
         return jnp.stack([a * cos - b * sin, a * sin + b * cos], axis=-1)
 
     def within(self, at: Array) -> Array:
-        """Points of the world in the part."""
+        """World points, in coordinates of the part."""
         return self._replace(origin=jnp.zeros(2), angle=-self.angle).along(at - self.origin)
 
 
 class Footing(eqx.Module):
-    """All pairs that may touch, and their forces at an instant.
+    """All pairs of surfaces that may touch, and their forces at an instant.
 
     Attributes:
         gap: distance [m].
-        gap_rate: rate of the gap [m/s].
-        normal: normal of the robot's contact, out of the ground.
-        off, along: change of the contact's speed off the ground and along it (forward on level ground) per
+        gap_rate: rate of change of the gap [m/s].
+        normal: normal of the contact on the robot, away from the ground.
+        off, along: change of the contact's speed normal to the ground and along it (forward on level ground), per
             velocity of `COORDINATES`.
-        carried: along it with the belts at rest.
+        carried: the change along the ground with the belts held still.
         force: normal force [N].
-        damped: decrease of the force with the gap's rate [N·s/m].
-        elastic: recoverable part of the force [N].
-        energy: stored in it [J].
-        guided: share that passes to the lower guide [-].
-        rolls: 1 but for the body [-].
+        damped: decrease of the force per rate of the gap [N·s/m].
+        elastic: elastic part of the force [N].
+        energy: energy stored in it [J].
+        guided: share of the force that passes to the lower guide [-].
+        rolls: 0 for contacts of the body, otherwise 1 [-].
         place: x of the contact [m].
     """
 
@@ -113,11 +115,11 @@ class Footing(eqx.Module):
     place: PerPair
 
 
-class _Group(NamedTuple):
-    """Pairs of one part.
+class _ContactGroup(NamedTuple):
+    """Contacts of one part.
 
-    Fields: contact points in the world, gaps, normals, displacement of the belt per angle of the pulleys (0 on the
-    body), shares on the guide, and whether they carry load.
+    Fields: contact points in the world, gaps, normals, displacement of the belt per angle of the pulleys (0 for the
+    body), shares on the guide, and whether the contacts carry load.
     """
 
     at: Array
@@ -130,34 +132,38 @@ class _Group(NamedTuple):
     rolls: float = 1.0
 
 
-def part_frames(shape: Shape, q: Sequence[Scalar] | Array) -> tuple[Frame, Frame, Frame]:
-    """Chassis, front and rear lever."""
-    body = Frame(jnp.stack([q[0], q[1]]), -q[PITCH])
+def part_frames(shape: ContactShape, q: Sequence[Scalar] | Array) -> tuple[PartFrame, PartFrame, PartFrame]:
+    """Frames of chassis, front lever and rear lever."""
+    body = PartFrame(jnp.stack([q[0], q[1]]), -q[PITCH])
     levers = [
-        Frame(body.world(jnp.stack([end * shape.half, jnp.zeros_like(shape.half)])), q[k] - q[PITCH], k)
+        PartFrame(body.world(jnp.stack([end * shape.half, jnp.zeros_like(shape.half)])), q[k] - q[PITCH], k)
         for end, k in ((1.0, FRONT), (-1.0, REAR))
     ]
     return body, levers[0], levers[1]
 
 
-def _guided_share(shape: Shape, place: Array) -> Array:
-    """Share of a load on the main belt at `place` that passes to the lower guide [-], as in `belt.tips_on_path`."""
+def _guided_share(shape: ContactShape, place: Array) -> Array:
+    """Share of a load at `place` on the main belt that passes to the lower guide [-], as in `belt.tips_on_path`."""
     run, length = shape.main.run, shape.main.length
     off = jnp.minimum(place, length - place)  # from the middle of the lower run
     return jnp.asarray(contact.cubic_step(run / 2 - off, 0.0, 0.0, shape.gear.guide_gap, 1.0))
 
 
-def _on_belt(shape: Shape, terrain: Terrain, belt: Loop, frame: Frame, drawn: Scalar, bears: Scalar) -> list[_Group]:
-    """Grousers on the ground, and corners of the ground on the belt between grousers and on their flanks."""
+def _belt_contacts(
+    shape: ContactShape, terrain: Terrain, belt: BeltLoop, frame: PartFrame, drawn: Scalar, bears: Scalar
+) -> list[_ContactGroup]:
+    """Contacts of a belt: its grousers on the ground, and corners of the ground on the belt and on flanks of
+    grousers.
+    """
     radius, main = shape.main.first, frame.turns is None
     place = belt.places(drawn)
     tips = belt_loop.grouser_tips(belt, place)
     points = frame.world(tips.at)
     gap, normal = terrain.distance(points)
 
-    def contact_group(at: Array, gap: Array, normal: Array, rate: Array, place: Array) -> _Group:
+    def contact_group(at: Array, gap: Array, normal: Array, rate: Array, place: Array) -> _ContactGroup:
         guided = _guided_share(shape, place) if main else jnp.zeros_like(gap)
-        return _Group(at, gap, normal, radius * rate, frame.turns, guided, bears * jnp.ones_like(gap))
+        return _ContactGroup(at, gap, normal, radius * rate, frame.turns, guided, bears * jnp.ones_like(gap))
 
     groups = [contact_group(points, gap, normal, frame.along(tips.rate), place)]
     corners = terrain.corners
@@ -169,8 +175,8 @@ def _on_belt(shape: Shape, terrain: Terrain, belt: Loop, frame: Frame, drawn: Sc
     return groups
 
 
-def _on_wheels(shape: Shape, terrain: Terrain, body: Frame) -> list[_Group]:
-    """Wheels on edges of the ground and on its corners."""
+def _wheel_contacts(shape: ContactShape, terrain: Terrain, body: PartFrame) -> list[_ContactGroup]:
+    """Contacts of the wheels with edges and corners of the ground."""
     a, b = terrain.points[:-1], terrain.points[1:]
     along = b - a
     length = jnp.sqrt(jnp.maximum(jnp.sum(along**2, axis=1), 1e-30))
@@ -189,7 +195,7 @@ def _on_wheels(shape: Shape, terrain: Terrain, body: Frame) -> list[_Group]:
         touch_points = centre - (shape.wheel + jnp.minimum(gap, 0.0))[:, None] * normal
         none = jnp.zeros_like(gap)
         rate = shape.wheel * belt_loop.running_direction(-normal)
-        groups.append(_Group(touch_points, gap, normal, rate, None, none, none + 1 - shape.on_tracks))
+        groups.append(_ContactGroup(touch_points, gap, normal, rate, None, none, none + 1 - shape.on_tracks))
     return groups
 
 
@@ -197,28 +203,28 @@ def _on_wheels(shape: Shape, terrain: Terrain, body: Frame) -> list[_Group]:
 FAR_OFF = 1e3
 
 
-def _under_body(shape: Shape, terrain: Terrain, body: Frame) -> _Group:
-    """Corners under the body."""
+def _body_contacts(shape: ContactShape, terrain: Terrain, body: PartFrame) -> _ContactGroup:
+    """Contacts of corners of the ground with the body."""
     local = body.within(terrain.corners)
     over = jnp.abs(local[:, 0]) < shape.half
     gap = jnp.where(over & (local[:, 1] < 0), shape.belly - local[:, 1], FAR_OFF) - terrain.nose
     up = body.along(jnp.broadcast_to(jnp.array([0.0, 1.0]), local.shape))
     none = jnp.zeros_like(gap)
-    return _Group(terrain.corners + terrain.nose * up, gap, up, 0 * up, None, none, none + 1, 0.0)
+    return _ContactGroup(terrain.corners + terrain.nose * up, gap, up, 0 * up, None, none, none + 1, 0.0)
 
 
-def footing(shape: Shape, terrain: Terrain, q: Array, v: Array) -> Footing:
-    """Pairs that may touch and their normal forces (27) at coordinates `q`, velocities `v`."""
+def contacts_with_terrain(shape: ContactShape, terrain: Terrain, q: Array, v: Array) -> Footing:
+    """Contacts that may touch and their normal forces (27), at coordinates `q` and velocities `v`."""
     body, front, rear = part_frames(shape, q)
     radius = shape.main.first
     rear_axle = body._replace(origin=rear.origin)  # origin of the main belt's loop
-    groups = _on_belt(shape, terrain, shape.main, rear_axle, radius * q[SHAFT], jnp.ones(()))
+    groups = _belt_contacts(shape, terrain, shape.main, rear_axle, radius * q[SHAFT], jnp.ones(()))
     for lever in (front, rear):
         assert lever.turns is not None
         drawn = radius * (q[SHAFT] + q[lever.turns])
-        groups += _on_belt(shape, terrain, shape.lever, lever, drawn, shape.on_tracks)
-    groups += _on_wheels(shape, terrain, body)
-    groups.append(_under_body(shape, terrain, body))
+        groups += _belt_contacts(shape, terrain, shape.lever, lever, drawn, shape.on_tracks)
+    groups += _wheel_contacts(shape, terrain, body)
+    groups.append(_body_contacts(shape, terrain, body))
 
     points, normal, rate = (jnp.concatenate([getattr(g, name) for g in groups]) for name in ("at", "normal", "rate"))
     gap, guided, bears = (jnp.concatenate([getattr(g, name) for g in groups]) for name in ("gap", "guided", "bears"))
@@ -260,14 +266,14 @@ def footing(shape: Shape, terrain: Terrain, q: Array, v: Array) -> Footing:
 
 
 def _speed_about_axle(direction: Array, arm: Array) -> Array:
-    """Speed along directions of points at `arm` that rotate about an axle nose down, per angular speed [m]."""
+    """Speed along directions of points at `arm` that rotate nose down about an axle, per angular speed [m]."""
     return direction[:, 0] * arm[:, 1] - direction[:, 1] * arm[:, 0]
 
 
-def contact_shape(chassis: Chassis, gear: RunningGear, radius: Scalar) -> Shape:
+def contact_shape_of_robot(chassis: Chassis, gear: RunningGear, radius: Scalar) -> ContactShape:
     """Shapes of one side of a robot, from its parameters."""
-    main = Loop(radius, radius, gear.wheelbase, gear.grouser_height, gear.grouser_length, GROUSERS)
-    lever = Loop(
+    main = BeltLoop(radius, radius, gear.wheelbase, gear.grouser_height, gear.grouser_length, GROUSERS)
+    lever = BeltLoop(
         radius,
         gear.levers.roller - gear.grouser_height,
         gear.lever_length,
@@ -276,4 +282,4 @@ def contact_shape(chassis: Chassis, gear: RunningGear, radius: Scalar) -> Shape:
         GROUSERS_LEVER,
     )
     belly = gear.clearance - (radius + gear.grouser_height)
-    return Shape(main, lever, gear, chassis.on_tracks, chassis.radius, belly)
+    return ContactShape(main, lever, gear, chassis.on_tracks, chassis.radius, belly)

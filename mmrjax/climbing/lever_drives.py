@@ -1,4 +1,4 @@
-"""Drives of the levers, Fig. 5b: interaction of a pair of levers and its motor in one step.
+"""Lever drives, Fig. 5b: motor and gears of a pair of levers in one time step.
 
 Each pair has a motor, a planetary gear and a worm. All quantities refer to the levers' shaft: torques are multiplied
 by the ratio i = i_p i_w of both gears, speeds are divided by it.
@@ -28,23 +28,23 @@ _NONE = 1e-9
 
 
 class LeverDrive(eqx.Module):
-    """The drive of a pair of levers, at their shaft.
+    """Drive of a pair of levers, with all quantities referred to the lever shaft.
 
     With the motor's torque e = i C_m I, its rotor's i² J_d and friction i M_df (14), and T on the levers,
 
         e - i² J_d ω' - i M_df = c T,
 
-    c = 1 / (η_p η_w) if T acts with the motion, c = (2 - 1/η_w) (2 - 1/η_p) if it acts against it. The loss in
-    a mesh is proportional to its force in both directions of power (`Gearbox.efficiency_backward`). A worm with η_w
-    up to 1/2 is self-locking: the motor has to help to lower the load, and drives its planetary gear:
-    c = (2 - 1/η_w) / η_p. At rest e may have any value between the two.
+    c = 1 / (η_p η_w) if T acts with the motion, c = (2 - 1/η_w) (2 - 1/η_p) if it acts against it. The loss in a mesh
+    is proportional to its force in both directions of power (`Gearbox.efficiency_backward`). A worm with η_w up to
+    1/2 is self-locking: the motor has to help to lower the load, and drives its planetary gear: c = (2 - 1/η_w) /
+    η_p. At rest e may have any value between the two.
 
     Attributes:
         constant: i C_m [N·m/A, V·s/rad].
         resistance: resistance of the winding [ohm].
         inertia: i² J_d [kg·m²].
-        dry, viscous: i M_df0 [N·m], i² K_fd [N·m·s].
-        ahead, back: c for T with the motion and against it [-].
+        dry, viscous: Coulomb friction i M_df0 [N·m] and viscous friction i² K_fd [N·m·s].
+        ahead, back: factor c for T with the motion, and against it [-].
         current_limit: current limit of the motor [A].
     """
 
@@ -58,12 +58,14 @@ class LeverDrive(eqx.Module):
     current_limit: Scalar
 
     def against(self, torque: Scalar, direction: float) -> Scalar:
-        """c T [N·m] of a torque on levers that move up (`direction` 1) or down (-1)."""
+        """Torque c T [N·m] that the motor side must supply for a torque T on levers that move up (`direction` 1) or
+        down (-1).
+        """
         return jnp.where(torque * direction > 0, self.ahead, self.back) * torque
 
 
 def lever_drive(robot: Robot) -> LeverDrive:
-    """The drive of a pair of levers of a robot: its motor behind both gears."""
+    """Drive of a pair of levers: the motor with both gears."""
     levers, motor = robot.running_gear.levers, robot.motor
     ratio = levers.worm_ratio * levers.planetary_ratio
     planetary = Gearbox(efficiency_load=levers.planetary_efficiency, mesh_theory=True).efficiency_backward
@@ -80,13 +82,13 @@ def lever_drive(robot: Robot) -> LeverDrive:
     )
 
 
-class Swing(NamedTuple):
-    """Action of both pairs in a step, each (2,).
+class LeverStep(NamedTuple):
+    """Result of a time step of both lever drives, each of shape (2,).
 
     Attributes:
         torque: torque on the levers [N·m].
         rate: angular speed after the step [rad/s]. voltage, current: voltage and current of their motors [V], [A].
-        holds: True if only its worm holds a pair, without current.
+        holds: True if a pair is held by its worm alone, without current.
     """
 
     torque: Array
@@ -105,23 +107,23 @@ def step_levers(
     asked: Pair,
     least: Pair,
     most: Pair,
-) -> Swing:
-    """One step of both pairs: the demanded rates if the voltages permit them, else the rates that these give.
+) -> LeverStep:
+    """One time step of both lever pairs: the demanded rates if the voltages suffice, otherwise the rates that the
+    voltages give.
 
-    The levers' mechanics give ω = free + yields T after the step. The voltage is chosen between `least` and `most`
-    so that ω is the demanded rate. For a lever that has to stand, the smallest voltage that holds it. Each drive's
-    law has straight pieces (`_PIECES`). Of all pairs of pieces the one whose solution is on both is taken, or the
-    one with the smallest deviation.
-    This is exact and has no iterations. A root finder cannot replace it: where a lever stands, its law allows a range
-    of torques and is no function.
+    The levers' mechanics give ω = free + yields T after the step. The voltage is chosen between `least` and `most` so
+    that ω is the demanded rate. For a lever that has to stand, the smallest voltage that holds it. Each drive's law
+    has straight pieces (`_PIECES`). Of all pairs of pieces the one whose solution is on both is taken, or the one
+    with the smallest deviation. This is exact and has no iterations. A root finder cannot replace it: where a lever
+    stands, its law allows a range of torques and is no function.
 
     Args:
-        step: [s].
-        rate: rate before it [rad/s].
-        free: angular speed after the step without torque [rad/s].
-        yields: [rad/(N·m·s)].
-        asked: demanded rates after it [rad/s].
-        least, most: voltages of the motors [V].
+        step: time step [s].
+        rate: angular speed before the step [rad/s].
+        free: angular speed after the step without drive torque [rad/s].
+        yields: change of the angular speed per drive torque [rad/(N·m·s)].
+        asked: demanded angular speeds after the step [rad/s].
+        least, most: limits of the motor voltages [V].
     """
     limits = drive.constant * rate + drive.resistance * drive.current_limit * jnp.array([[-1.0], [1.0]])
     least, most = jnp.maximum(least, limits[0]), jnp.minimum(most, limits[1])
@@ -145,7 +147,7 @@ def step_levers(
     torque = jnp.stack([(d * r - b * s) / size, (a * s - c * r) / size])
     turned = free[:, None, None] + jnp.einsum("ij,jkl->ikl", yields, torque)
 
-    def motor(k: int, ways: tuple[slice | None, ...]) -> tuple[Array, Array, Array, Array]:
+    def candidate_solutions(k: int, ways: tuple[slice | None, ...]) -> tuple[Array, Array, Array, Array]:
         """Distance of each candidate solution from its piece of the law of lever pair `k` (0: on it) [N·m], i C_m I
         of the motor within the voltage limits [N·m], load torque [N·m] and speed [rad/s]."""
         force, speed = torque[k], turned[k]
@@ -164,7 +166,7 @@ def step_levers(
         )
         return jnp.maximum(off, 0.0), jnp.clip(jnp.clip(0.0, low, high), weak, strong), force, speed
 
-    both = motor(0, (slice(None), None)), motor(1, (None, slice(None)))
+    both = candidate_solutions(0, (slice(None), None)), candidate_solutions(1, (None, slice(None)))
     off = jnp.nan_to_num(jnp.maximum(both[0][0], both[1][0]), nan=jnp.inf, posinf=jnp.inf)
     best = jnp.unravel_index(jnp.argmin(off), off.shape)
     chosen, taken = jnp.stack(best), jnp.stack([pair[1][best] for pair in both])
@@ -176,4 +178,4 @@ def step_levers(
         jnp.asarray(follows)[chosen], drive.resistance / drive.constant * taken + drive.constant * after, fixed
     )
     current = (voltage - drive.constant * after) / drive.resistance
-    return Swing(torque, after, voltage, current, stands & (jnp.abs(current) < _NONE))
+    return LeverStep(torque, after, voltage, current, stands & (jnp.abs(current) < _NONE))

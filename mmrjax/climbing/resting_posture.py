@@ -1,4 +1,4 @@
-"""Posture: rest of a robot on its one-sided supports, main belts and the rollers of its levers, on a plane.
+"""Posture of a robot at rest on a plane, on its main belts and the rollers of its levers.
 
 Frame of the robot, its origin the middle of the wheelbase: forward along it, up across it. Seen from the side a robot
 is two axles and two rollers, circles over the grousers, with a belt around each pair: the main one around the axles,
@@ -37,14 +37,15 @@ UPRIGHT = np.pi / 3
 _ROUNDING = 1e-9
 
 
-class Outline(eqx.Module):
-    """A robot seen from the side, in its own frame.
+class SideOutline(eqx.Module):
+    """Side view of a robot, in its own frame.
 
     Attributes:
         forward, up: centres of the circles, in the order of `CIRCLES` [m].
-        radius: radius of the circles as they roll on the ground: wheels, or belts over the grousers [m].
-        belt: radius of the main belt over its grousers [m].
-        tracked: 1 on tracks. On wheels there are no levers: their rollers are on the axles, with radius 0 [-].
+        radius: rolling radius of each circle: wheels, or belts including grousers [m].
+        belt: radius of the main belt including grousers [m].
+        tracked: 1 on tracks, 0 on wheels [-]. On wheels there are no levers: their rollers are on the axles with
+            radius 0.
         centre_forward, centre_up: centre of mass of all parts [m].
     """
 
@@ -56,7 +57,7 @@ class Outline(eqx.Module):
     centre_forward: Scalar
     centre_up: Scalar
 
-    def pitched(self, pitch: Scalar) -> Outline:
+    def with_pitch(self, pitch: Scalar) -> SideOutline:
         """Same outline with its nose raised by `pitch` [rad], about the middle of the wheelbase."""
         forward, up = rotate_to_ground(self.forward, self.up, jnp.asarray(pitch)[..., None])
         at, high = rotate_to_ground(self.centre_forward, self.centre_up, pitch)
@@ -74,16 +75,16 @@ class Outline(eqx.Module):
 
 
 def rotate_to_ground(forward: Scalar, up: Scalar, pitch: Scalar) -> tuple[Array, Array]:
-    """Coordinates of a point of the robot's frame along and above the ground, about mid-wheelbase [m]."""
+    """Coordinates along and above the ground of a point of the robot, relative to the middle of the wheelbase [m]."""
     sine, cosine = jnp.sin(pitch), jnp.cos(pitch)
     return jnp.asarray(forward * cosine - up * sine), jnp.asarray(forward * sine + up * cosine)
 
 
-def posture_masses(robot: Robot, conditions: Conditions, mass: Scalar | None = None) -> masses.Masses:
-    """Masses of half a robot with the levers at the angles of the conditions.
+def posture_masses(robot: Robot, conditions: Conditions, mass: Scalar | None = None) -> masses.HalfRobotMasses:
+    """Masses of half a robot with its levers at the angles of the conditions.
 
     Args:
-        mass: total with payload [kg]. None: as stated.
+        mass: total mass with payload [kg]. None: as stated.
     """
     if mass is None:
         stated = robot.chassis(conditions.configuration).mass + conditions.payload
@@ -91,11 +92,11 @@ def posture_masses(robot: Robot, conditions: Conditions, mass: Scalar | None = N
     return masses.masses_of_parts(robot, conditions, mass)
 
 
-def side_outline(robot: Robot, conditions: Conditions, mass: Scalar | None = None) -> Outline:
-    """Side view of a robot with the levers at the angles of the conditions.
+def side_outline(robot: Robot, conditions: Conditions, mass: Scalar | None = None) -> SideOutline:
+    """Side view of a robot with its levers at the angles of the conditions.
 
     Args:
-        mass: total with payload [kg]. None: as stated.
+        mass: total mass with payload [kg]. None: as stated.
     """
     chassis, gear = robot.chassis(conditions.configuration), robot.running_gear
     tracked = jnp.asarray(chassis.on_tracks)
@@ -110,25 +111,25 @@ def side_outline(robot: Robot, conditions: Conditions, mass: Scalar | None = Non
         jnp.stack(jnp.broadcast_arrays(*(jnp.asarray(x) for x in row)), -1)
         for row in (corners, lie, [roller, axle, axle, roller])
     )
-    return Outline(forward, up, radius, robot.radius_pulley + gear.grouser_height, tracked, ahead, high)
+    return SideOutline(forward, up, radius, robot.radius_pulley + gear.grouser_height, tracked, ahead, high)
 
 
 class Posture(eqx.Module):
     """Posture of a robot at rest on a plane.
 
     Attributes:
-        pitch: nose up [rad].
+        pitch: pitch, nose up [rad].
         height: height of the middle of the wheelbase above the plane [m].
-        rear, front: ends of the contact, ahead of the middle of the wheelbase along the plane [m].
-        line: 1 if a belt carries load all along between them, 0 if only the ends do [-].
-        centre_ahead: centre of mass ahead of the middle of the wheelbase, along the plane [m].
-        centre_height: above the plane [m].
-        load_front: share of the normal load at its front if only both ends carried it. Outside 0..1 the robot
-            tips [-].
-        margin: distance along the plane from the intersection of gravity's line through the centre of mass to the
-            nearer end of the contact. Negative if the robot tips [m].
-        tips_back, tips_forward: tipping slopes, uphill and downhill [rad].
-        inertia: inertia in pitch about the centre of mass [kg·m²].
+        rear, front: ends of the contact, measured along the plane ahead of the middle of the wheelbase [m].
+        line: 1 if a belt carries load over the whole length between them, 0 if only the ends carry load [-].
+        centre_ahead: position of the centre of mass along the plane, ahead of the middle of the wheelbase [m].
+        centre_height: height of the centre of mass above the plane [m].
+        load_front: share of the normal load at the front end, if only the ends carried load. The robot tips outside 0
+            to 1 [-].
+        margin: distance along the plane from the line of gravity through the centre of mass to the nearer end of the
+            contact [m]. Negative if the robot tips.
+        tips_back, tips_forward: slopes at which the robot tips, uphill and downhill [rad].
+        inertia: moment of inertia in pitch about the centre of mass [kg·m²].
     """
 
     pitch: Scalar
@@ -158,14 +159,14 @@ def posture(robot: Robot, conditions: Conditions, mass: Scalar | None = None) ->
         θ = asin((r_j - r_i) / d) - β,
 
     and carry the robot if no other circle is below and gravity's line through the centre of mass passes between them.
-    The slope is that of the conditions, uphill ahead. If no edge holds, the nearest to holding is returned, with
-    a negative `margin`. Postures with a pitch beyond `UPRIGHT` are excluded.
+    The slope is that of the conditions, uphill ahead. If the robot would tip over every pair, the pair that comes
+    nearest is returned, with a negative `margin`. Postures with a pitch beyond `UPRIGHT` are excluded.
 
     Args:
         mass: mass with payload [kg]. None: as stated.
     """
     inertia = robot.sides * posture_masses(robot, conditions, mass).inertia_pitch(robot.running_gear.wheelbase)
-    return rest_outline(side_outline(robot, conditions, mass), conditions.slope, inertia)
+    return rest_on_slope(side_outline(robot, conditions, mass), conditions.slope, inertia)
 
 
 def level_posture(robot: Robot, conditions: Conditions, mass: Scalar | None = None) -> Posture:
@@ -173,8 +174,8 @@ def level_posture(robot: Robot, conditions: Conditions, mass: Scalar | None = No
     return posture(robot, dataclasses.replace(conditions, slope_deg=jnp.zeros_like(conditions.slope_deg)), mass)
 
 
-def rest_outline(side: Outline, slope: Scalar, inertia: Scalar) -> Posture:
-    """The posture of an outline on a slope [rad]. See `posture`."""
+def rest_on_slope(side: SideOutline, slope: Scalar, inertia: Scalar) -> Posture:
+    """Posture of an outline at rest on a slope [rad], see `posture`."""
     tail, nose = EDGES.T
     ahead, rise = side.forward[nose] - side.forward[tail], side.up[nose] - side.up[tail]
     apart = jnp.sqrt(jnp.maximum(ahead**2 + rise**2, 1e-12))
@@ -182,7 +183,7 @@ def rest_outline(side: Outline, slope: Scalar, inertia: Scalar) -> Posture:
     tangent = jnp.abs(ratio) < 1
     pitch = jnp.arcsin(jnp.where(tangent, ratio, 0.0)) - jnp.arctan2(rise, jnp.where(apart > 1e-6, ahead, 1.0))
     pitch = jnp.arctan2(jnp.sin(pitch), jnp.cos(pitch))
-    rotated = side.pitched(pitch)
+    rotated = side.with_pitch(pitch)
     low = rotated.up - rotated.radius  # (edges, circles)
     every = np.arange(len(EDGES))
     gaps = low - low[every, tail][:, None]

@@ -1,4 +1,4 @@
-"""Static limits, from geometry only: the highest step and the widest gap for a robot at given lever angles.
+"""Static limits from geometry alone: the highest step and the widest gap for given lever angles.
 
 They ignore the friction and torque needed to get there. A static limit is therefore an upper bound for a robot that
 climbs slowly with its levers held.
@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from mmrjax.climbing import resting_posture
-from mmrjax.climbing.resting_posture import BELTS, FRONT_ROLLER, REAR_ROLLER, Outline, Posture
+from mmrjax.climbing.resting_posture import BELTS, FRONT_ROLLER, REAR_ROLLER, Posture, SideOutline
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.params import Scalar
 from mmrjax.model.robot import Robot
@@ -28,18 +28,18 @@ _BESIDE = 1e-5
 
 
 class StepLimit(eqx.Module):
-    """The highest step that carries a robot with its centre of mass over the edge.
+    """The highest step on which the robot can rest with its centre of mass above the edge.
 
     Attributes:
         height: height of the step [m].
-        pitch: nose up [rad].
-        side: the robot there, in a frame along the ground with the middle of its wheelbase as origin.
-        base: height of that above the lower ground [m].
+        pitch: pitch of the robot, nose up [rad].
+        side: outline of the robot there, in a frame along the ground whose origin is the middle of the wheelbase.
+        base: height of that origin above the lower ground [m].
     """
 
     height: Scalar
     pitch: Scalar
-    side: Outline
+    side: SideOutline
     base: Scalar
 
 
@@ -47,11 +47,12 @@ class StaticLimits(eqx.Module):
     """Static limits of a robot at its lever angles.
 
     Attributes:
-        step: the highest, driven onto nose first [m].
-        gap: the widest gap that its contact bridges on both sides of its centre of mass [m], 0 if no belt touches.
+        step: highest step, driven onto nose first [m].
+        gap: widest gap that the contact bridges on both sides of the centre of mass [m]. 0 if no belt touches the
+            ground.
         contact: length of the contact on level ground [m].
-        tip_front, tip_rear: tops of the levers' rollers above level ground [m]. On wheels those of the wheels.
-        tips_back, tips_forward, tips_aside: tipping slopes: uphill, downhill, across [rad].
+        tip_front, tip_rear: height of the tops of the lever rollers above level ground [m]. On wheels, of the wheels.
+        tips_back, tips_forward, tips_aside: slopes at which the robot tips: uphill, downhill, sideways [rad].
         length, height: overall, on level ground [m].
     """
 
@@ -67,8 +68,8 @@ class StaticLimits(eqx.Module):
     height: Scalar
 
 
-def lowest_points(side: Outline) -> tuple[Scalar, Scalar]:
-    """Lowest points of a pitched outline behind the line through its centre of mass and ahead of it [m]."""
+def lowest_points(side: SideOutline) -> tuple[Scalar, Scalar]:
+    """Heights of the lowest points of an outline behind its centre of mass and ahead of it [m]."""
     line = side.centre_forward
     # circles: the bottom if it is on that side, else the intersection of the line with the arc
     apart, radius = side.forward - line, side.radius
@@ -93,23 +94,25 @@ def lowest_points(side: Outline) -> tuple[Scalar, Scalar]:
     return jnp.minimum(jnp.min(behind), belt), jnp.minimum(jnp.min(ahead), belt)
 
 
-def step_height_at(side: Outline, pitch: Scalar) -> Scalar:
-    """Height of the step [m] under an outline at a pitch [rad] with its centre of mass over the edge.
+def step_height_at(side: SideOutline, pitch: Scalar) -> Scalar:
+    """Height of the step on which an outline rests at a pitch with its centre of mass above the edge [m].
 
-    The lowest point behind the centre of mass stands on the lower ground, the lowest point ahead of it on the step:
-    H = min over x ≥ x_c of z less min over x ≤ x_c of z. Let only belt and pulley touch, with the tail turning on
-    a circle of radius R, the centre of mass ℓ ahead of its centre and h above the axles,
+    The lowest point behind the centre of mass stands on the lower ground, the lowest point ahead of it on the step: H
+    = min over x ≥ x_c of z less min over x ≤ x_c of z. Let only belt and pulley touch, with the tail turning on a
+    circle of radius R, the centre of mass ℓ ahead of its centre and h above the axles,
 
         H = R (1 - cos θ) + (ℓ - (h + R) tan θ) sin θ.
     """
-    behind, ahead = lowest_points(side.pitched(pitch))
+    behind, ahead = lowest_points(side.with_pitch(pitch))
     return ahead - behind
 
 
 def _pitch_of_highest_step(
     height: Callable[[Scalar], Scalar], count: int, near: int, rounds: int
 ) -> tuple[Scalar, Scalar]:
-    """The pitch of the highest step from `count` pitches, then `rounds` times from `near`, and the spacing [rad]."""
+    """Pitch of the highest step and its resolution [rad], from `count` pitches, refined `rounds` times around
+    `near`.
+    """
     apart = jnp.pi / 2 / (count - 1)
     grid = jnp.linspace(0.0, jnp.pi / 2, count)
     best = grid[jnp.argmax(jax.vmap(height)(grid))]
@@ -119,11 +122,11 @@ def _pitch_of_highest_step(
     return best, apart
 
 
-def find_highest_step(side: Outline, pitch: Scalar | None = None) -> StepLimit:
-    """The maximum of `step_height_at`, nose up, for one outline.
+def find_highest_step(side: SideOutline, pitch: Scalar | None = None) -> StepLimit:
+    """Highest step for one outline: the maximum of `step_height_at` over all pitches with the nose up.
 
-    If two parts of the outline meet at the highest step, its derivatives are those of both, weighted by their
-    slopes s over pitch on the other side: dH = (s_1 dH_2 - s_2 dH_1) / (s_1 - s_2).
+    If two parts of the outline meet at the highest step, its derivatives are those of both, weighted by their slopes
+    s over pitch on the other side: dH = (s_1 dH_2 - s_2 dH_1) / (s_1 - s_2).
 
     Args:
         pitch: pitch of the highest step [rad]. None: it is searched.
@@ -138,33 +141,33 @@ def find_highest_step(side: Outline, pitch: Scalar | None = None) -> StepLimit:
     )
     share = jnp.clip(-rises[1] / jnp.maximum(rises[0] - rises[1], 1e-12), 0.0, 1.0)
     moved = jnp.asarray(jax.vmap(lambda pitch: step_height_at(side, pitch) - step_height_at(still, pitch))(beside))
-    pitched = side.pitched(best)
+    pitched = side.with_pitch(best)
     height = step_height_at(still, best) + share * moved[0] + (1 - share) * moved[1]
     return StepLimit(height, best, pitched, -lowest_points(pitched)[0])
 
 
-def with_levers(conditions: Conditions, front: Scalar, rear: Scalar) -> Conditions:
+def with_lever_angles(conditions: Conditions, front: Scalar, rear: Scalar) -> Conditions:
     """Conditions with the levers at these angles [rad]."""
     front, rear = (jnp.broadcast_to(jnp.degrees(x), conditions.shape) for x in (front, rear))
     return dataclasses.replace(conditions, levers_front_deg=front, levers_rear_deg=rear)
 
 
 def flush_lever_angle(robot: Robot) -> Scalar:
-    """Lever angle for a lower run in line with the main belt [rad], downward."""
+    """Lever angle at which the lower run of a lever is in line with the main belt [rad], positive downward."""
     gear = robot.running_gear
     return -jnp.arcsin((robot.radius_pulley + gear.grouser_height - gear.levers.roller) / gear.lever_length)
 
 
 def best_levers(robot: Robot, conditions: Conditions, pitch: Scalar) -> tuple[Scalar, Scalar]:
-    """The angles of front and rear levers [rad] that give one run's robot its highest step at a pitch θ.
+    """Angles of front and rear levers [rad] with which the robot of one run climbs its highest step at a pitch θ.
 
-    The belt is over the edge, and the tail stands on the rollers of the rear levers. Front levers extend level,
-    which brings their mass furthest over the step: φ_1 = -θ. Rear levers of length L stand at
+    The belt is over the edge, and the tail stands on the rollers of the rear levers. Front levers extend level, which
+    brings their mass furthest over the step: φ_1 = -θ. Rear levers of length L stand at
 
         θ - φ_2 = π/2 + atan2(μ c sin θ, L cos θ).
 
-    They would be upright without their mass, a share μ of the total with its centre c from their axle, which
-    favours a position further ahead. Both angles are limited to the levers' range.
+    They would be upright without their mass, a share μ of the total with its centre c from their axle, which favours
+    a position further ahead. Both angles are limited to the levers' range.
     """
     gear, half = robot.running_gear, resting_posture.posture_masses(robot, conditions)
     moved = gear.lever_mass * gear.lever_centre / (half.chassis + 2 * half.pulley)
@@ -174,17 +177,17 @@ def best_levers(robot: Robot, conditions: Conditions, pitch: Scalar) -> tuple[Sc
 
 
 def best_step(robot: Robot, conditions: Conditions) -> tuple[StepLimit, Scalar, Scalar]:
-    """The highest step of one run in any posture within the levers' range, and the angles of front and rear levers.
+    """Highest step of one run in any posture within the lever range, with the angles of front and rear levers [rad].
 
-    In derivatives the angles [rad] are constants. The step is a limit for any slow sequence of postures if the riser
-    carries no load: when the tail leaves the lower ground, the centre of mass must be over the step, and no posture
-    allows a higher step then. Only the pitch is searched. The levers' angles follow from it (`best_levers`).
+    In derivatives, the angles are treated as constants. The step is a limit for any slow sequence of postures if the
+    riser carries no load: when the tail leaves the lower ground, the centre of mass must be over the step, and no
+    posture allows a higher step then. Only the pitch is searched. The levers' angles follow from it (`best_levers`).
     """
     still, run = jax.lax.stop_gradient((robot, conditions))
 
     def height(pitch: Scalar) -> Scalar:
         return step_height_at(
-            resting_posture.side_outline(still, with_levers(run, *best_levers(still, run, pitch))), pitch
+            resting_posture.side_outline(still, with_lever_angles(run, *best_levers(still, run, pitch))), pitch
         )
 
     best, apart = _pitch_of_highest_step(height, *_POSTURES)
@@ -198,23 +201,23 @@ def best_step(robot: Robot, conditions: Conditions) -> tuple[StepLimit, Scalar, 
         apart = apart / 16
     front, rear = best_levers(still, run, best)
     return (
-        find_highest_step(resting_posture.side_outline(robot, with_levers(conditions, front, rear)), best),
+        find_highest_step(resting_posture.side_outline(robot, with_lever_angles(conditions, front, rear)), best),
         front,
         rear,
     )
 
 
 def stairs_rise(robot: Robot, conditions: Conditions, tread: Scalar, friction: Scalar) -> Scalar:
-    """The highest rise of stairs of this tread [m] that one run's robot stands on without rocking or sliding.
+    """Largest rise of stairs with this tread [m] on which the robot of one run rests without rocking or sliding.
 
-    Its levers are flush with the belt. With friction alone, a belt of friction μ slides at tan α = μ, with
-    tan α = rise / tread. Noses are t / cos α apart. The belt always has one nose behind gravity's line through its
-    centre of mass and one ahead of it if it extends far enough both ways: ℓ - h tan α ≥ t / cos α at the tail, with
-    the centre of mass ℓ ahead of the tail and h above the belt. The result is 0 if even noses without rise are too
-    far apart. Grousers that catch a nose hold more, and a robot that rocks may still climb.
+    Its levers are flush with the belt. With friction alone, a belt of friction μ slides at tan α = μ, with tan α =
+    rise / tread. Noses are t / cos α apart. The belt always has one nose behind gravity's line through its centre of
+    mass and one ahead of it if it extends far enough both ways: ℓ - h tan α ≥ t / cos α at the tail, with the centre
+    of mass ℓ ahead of the tail and h above the belt. The result is 0 if even noses without rise are too far apart.
+    Grousers that catch a nose hold more, and a robot that rocks may still climb.
     """
     angle = flush_lever_angle(robot)
-    rests = resting_posture.level_posture(robot, with_levers(conditions, angle, angle))
+    rests = resting_posture.level_posture(robot, with_lever_angles(conditions, angle, angle))
     tail, nose = rests.centre_ahead - rests.rear, rests.front - rests.centre_ahead
     # ℓ cos α - h sin α = t
     reach = jnp.sqrt(tail**2 + rests.centre_height**2)
@@ -225,9 +228,9 @@ def stairs_rise(robot: Robot, conditions: Conditions, tread: Scalar, friction: S
 
 
 def posture_limits(robot: Robot, conditions: Conditions) -> StaticLimits:
-    """The static limits of a robot, for one run on level ground, with its tipping slopes."""
+    """Static limits of a robot on level ground, for one run, including the slopes at which it tips."""
     side, rests = resting_posture.side_outline(robot, conditions), resting_posture.level_posture(robot, conditions)
-    highest, lies = find_highest_step(side), side.pitched(rests.pitch)
+    highest, lies = find_highest_step(side), side.with_pitch(rests.pitch)
     tops, tracked = lies.up + lies.radius + rests.height, jnp.asarray(side.tracked) > 0.5
     bridged: Scalar = jnp.minimum(rests.front - rests.centre_ahead, rests.centre_ahead - rests.rear)
     width = robot.chassis(conditions.configuration).turning.width
@@ -250,7 +253,7 @@ def _over_levers(robot: Robot, conditions: Conditions, angles: Float[Array, "n 2
     def at(pair: Array) -> tuple[StepLimit, Array]:
         here = dataclasses.replace(conditions, levers_front_deg=pair[0], levers_rear_deg=pair[1])
         side = resting_posture.side_outline(robot, here)
-        return find_highest_step(side), jnp.asarray(resting_posture.rest_outline(side, here.slope, 0.0).margin)
+        return find_highest_step(side), jnp.asarray(resting_posture.rest_on_slope(side, here.slope, 0.0).margin)
 
     return jax.lax.map(at, angles, batch_size=256)
 
@@ -258,7 +261,7 @@ def _over_levers(robot: Robot, conditions: Conditions, angles: Float[Array, "n 2
 def steps_over_lever_angles(
     robot: Robot, conditions: Conditions, front_deg: Float[np.ndarray, " n"], rear_deg: Float[np.ndarray, " m"]
 ) -> tuple[StepLimit, Float[Array, "n m"]]:
-    """The highest step for each pair of lever angles [deg], for one run, and the tipping margin at rest.
+    """Highest step for each pair of lever angles [deg], for one run, and the tipping margin at rest.
 
     The margin is on the slope of the run [m] (see `Posture`). Leaves have shape (n, m, ...).
     """
@@ -268,14 +271,14 @@ def steps_over_lever_angles(
 
 
 @jax.jit
-def postures_of_runs(robot: Robot, conditions: Conditions) -> tuple[Posture, StaticLimits, Outline, StepLimit]:
-    """Posture, limits, outline at rest and highest step of the robot in each run of a batch.
+def postures_of_runs(robot: Robot, conditions: Conditions) -> tuple[Posture, StaticLimits, SideOutline, StepLimit]:
+    """Posture, limits, outline at rest and highest step of the robot, for each run of a batch.
 
-    Leaves have shape (runs, ...).
+    Leaves have the shape (runs, ...).
     """
 
-    def of_one(one: Conditions) -> tuple[Posture, StaticLimits, Outline, StepLimit]:
+    def of_run(one: Conditions) -> tuple[Posture, StaticLimits, SideOutline, StepLimit]:
         side, rests = resting_posture.side_outline(robot, one), resting_posture.posture(robot, one)
-        return rests, posture_limits(robot, one), side.pitched(rests.pitch), find_highest_step(side)
+        return rests, posture_limits(robot, one), side.with_pitch(rests.pitch), find_highest_step(side)
 
-    return jax.vmap(of_one)(conditions)
+    return jax.vmap(of_run)(conditions)

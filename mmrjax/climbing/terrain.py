@@ -1,4 +1,4 @@
-"""Terrain in the plane of travel: a polyline with its signed distance, its normal and its convex corners.
+"""Terrain in the plane of travel: a polyline with its distance from points, its normals and its convex corners.
 
 All terrains are polylines that go forward (x never decreases), with points [m] and the ground on their right, so that
 flat ground has its free side up. The obstacle begins at x = 0. Rounded noses are a level line of the distance to a
@@ -25,7 +25,7 @@ _NOWHERE = (0.0, -1e3)
 
 
 class Terrain(eqx.Module):
-    """A polyline of ground.
+    """Terrain as a polyline.
 
     Attributes:
         points: vertices of the polyline [m]. Repeated vertices count once.
@@ -39,7 +39,7 @@ class Terrain(eqx.Module):
 
     @property
     def corners(self) -> Float[Array, "corners 2"]:
-        """Convex corners, centres of the noses [m]. Concave ones are out of reach."""
+        """Convex corners: centres of their rounded noses [m]. Concave corners cannot be touched."""
         before, middle, after = self.points[:-2], self.points[1:-1], self.points[2:]
         turn = _cross_product(middle - before, after - middle)
         # A repeated vertex has no edge; its next different vertex gives the direction.
@@ -52,7 +52,8 @@ class Terrain(eqx.Module):
         return jnp.any(under & (_cross_product(b - a, at[:, None] - a) < 0), axis=1)
 
     def distance(self, at: Float[Array, "n 2"]) -> tuple[Float[Array, " n"], Float[Array, "n 2"]]:
-        """Distance of points from the ground [m], negative within it, and the ground's normal at the nearest point.
+        """Distance of points from the ground [m], negative below it, and the normal of the ground at the nearest
+        point.
 
         The normal is the gradient of the distance: that of the nearest edge, or away from the nearest corner.
         """
@@ -82,8 +83,10 @@ def _at(values: Array, which: Array) -> Array:
     return jnp.take_along_axis(values, index, axis=1)[:, 0]
 
 
-def _terrain(points: Sequence[tuple[Scalar, Scalar]], finish: Scalar, nose: Scalar = 0.0, size: int = 0) -> Terrain:
-    """Terrain through points [m] between the ground before and the ground after. Padded to `size` points."""
+def _terrain_of_points(
+    points: Sequence[tuple[Scalar, Scalar]], finish: Scalar, nose: Scalar = 0.0, size: int = 0
+) -> Terrain:
+    """Terrain through points [m], with level ground before and after. Padded to `size` points."""
     zero = jnp.zeros(())
     rows = jnp.stack([jnp.stack([x + zero, z + zero]) for x, z in points])
     # Noses: the polyline is deeper by their radius; risers face backward.
@@ -94,31 +97,31 @@ def _terrain(points: Sequence[tuple[Scalar, Scalar]], finish: Scalar, nose: Scal
 
 def flat_ground(size: int = 0) -> Terrain:
     """Level ground."""
-    return _terrain([(-FAR, 0.0), (FAR, 0.0)], 0.0, size=size)
+    return _terrain_of_points([(-FAR, 0.0), (FAR, 0.0)], 0.0, size=size)
 
 
 def single_step(height: Scalar, nose: Scalar = 0.0, size: int = 0) -> Terrain:
     """A step up (or down) by `height` [m], its corner rounded by `nose` [m]."""
-    return _terrain([(-FAR, 0.0), (0.0, 0.0), (0.0, height), (FAR, height)], 0.0, nose, size)
+    return _terrain_of_points([(-FAR, 0.0), (0.0, 0.0), (0.0, height), (FAR, height)], 0.0, nose, size)
 
 
 def stairs(rise: Scalar, tread: Scalar, count: int, nose: Scalar = 0.0, size: int = 0) -> Terrain:
-    """`count` steps of `rise` and `tread` [m], noses rounded by `nose` [m]."""
+    """`count` steps of `rise` and `tread` [m], with noses rounded by `nose` [m]."""
     points: list[tuple[Scalar, Scalar]] = [(-FAR, 0.0)]
     for k in range(count):
         points += [(k * tread, k * rise), (k * tread, (k + 1) * rise)]
     last = (count - 1) * tread
-    return _terrain([*points, (last + FAR, count * rise)], last, nose, size)
+    return _terrain_of_points([*points, (last + FAR, count * rise)], last, nose, size)
 
 
 def gap(width: Scalar, size: int = 0) -> Terrain:
-    """A trench of `width` [m] without a floor in reach."""
+    """A trench of `width` [m] that is too deep for the robot to touch its floor."""
     points = [(-FAR, 0.0), (0.0, 0.0), (0.0, -DEEP), (width, -DEEP), (width, 0.0), (width + FAR, 0.0)]
-    return _terrain(points, width, size=size)
+    return _terrain_of_points(points, width, size=size)
 
 
 def polyline(x: Sequence[float] | np.ndarray, z: Sequence[float] | np.ndarray, size: int = 0) -> Terrain:
-    """Level ground up to the first point (x, z) [m], the polyline, then level ground from its last point on.
+    """Level ground up to the first point (x, z) [m], then the polyline, then level ground from the last point on.
 
     Raises:
         ValueError: fewer than two points, a value that is not finite, decreasing x, or a wall that doubles back.
@@ -143,4 +146,4 @@ def polyline(x: Sequence[float] | np.ndarray, z: Sequence[float] | np.ndarray, s
             f"terrain: z goes from {z[k]:g} back to {z[k + 1]:g} m at x = {x[k]:g} m; expected a wall up or down"
         )
     points = [(x[0] - FAR, z[0]), *zip(x, z, strict=True), (x[-1] + FAR, z[-1])]
-    return _terrain(points, float(x[-1]), size=size)
+    return _terrain_of_points(points, float(x[-1]), size=size)

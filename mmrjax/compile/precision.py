@@ -134,9 +134,9 @@ class Threads(concurrent.futures.ThreadPoolExecutor):
 
     def submit(self, fn: Callable[..., T], /, *args: Any, **named: Any) -> concurrent.futures.Future[T]:
         """Submits a call, to be computed in the precision of this thread."""
-        return super().submit(_within, is_double(), fn, *args, **named)
+        return super().submit(_in_precision, is_double(), fn, *args, **named)
 
 
-def _within(double: bool, function: Callable[..., T], /, *args: Any, **named: Any) -> T:
+def _in_precision(double: bool, function: Callable[..., T], /, *args: Any, **named: Any) -> T:
     with jax.enable_x64(double) if double != is_double() else contextlib.nullcontext():
         return function(*args, **named)

@@ -1,4 +1,4 @@
-"""Programs on disk: compiled functions for arguments of one structure.
+"""Compiled programs on disk, for arguments of one structure.
 
 JAX's own cache is consulted only after tracing and lowering, which is most of the time of a process that compiles
 nothing. Here a program is found by its name, a hash of all inputs of its tracing: the source of our packages, the
@@ -66,7 +66,7 @@ class _ArrayPlaceholder:
 
 
 @dataclasses.dataclass(frozen=True)
-class Program:
+class StoredProgram:
     """One compiled program.
 
     Attributes:
@@ -111,13 +111,15 @@ class Programs:
     def __init__(self, function: Callable[..., Any], options: dict[str, Any] | None = None) -> None:
         """Stores the function and the options of the compiler."""
         self.function, self.options = function, options or {}
-        self._found: dict[Any, Future[Program | None]] = {}
+        self._found: dict[Any, Future[StoredProgram | None]] = {}
 
-    def of(self, arguments: tuple[tuple, dict[str, Any]]) -> Program | None:
+    def of(self, arguments: tuple[tuple, dict[str, Any]]) -> StoredProgram | None:
         """The program for positional and named arguments, None if it may not be stored."""
         return self.of_structure(structure_of(arguments), arguments)
 
-    def of_structure(self, structure: Hashable | None, arguments: tuple[tuple, dict[str, Any]]) -> Program | None:
+    def of_structure(
+        self, structure: Hashable | None, arguments: tuple[tuple, dict[str, Any]]
+    ) -> StoredProgram | None:
         """The program for arguments of known structure (`structure_of`), None if it may not be stored."""
         folder = os.environ.get(VARIABLE, "")
         if structure is None or not folder or not _may_store_programs() or not _folder_is_private(folder):
@@ -144,7 +146,7 @@ class Programs:
             self._found.pop(structure).set_exception(error)
             raise
 
-    def _obtained(self, folder: Path, leaves: list[Any], tree: Any) -> Callable[[], Program | None]:
+    def _obtained(self, folder: Path, leaves: list[Any], tree: Any) -> Callable[[], StoredProgram | None]:
         """Returns a function that gives the program: read from the folder, or traced here, compiled and stored."""
         try:
             name = _program_name(self.function, tree.unflatten([_leaf_structure(x) for x in leaves]))
@@ -158,13 +160,13 @@ class Programs:
             result, compiled = loaded
             executable = _load_executable(folder, compiled, len(arrays), result)
             if executable is not None:
-                return functools.partial(Program, executable, result)
+                return functools.partial(StoredProgram, executable, result)
         result, lowered = self._lowered(leaves, tree)
         text = lowered.as_text()
         compiled = hashlib.sha256(f"{sorted(self.options.items())}{text}".encode()).hexdigest()
         executable = _load_executable(folder, compiled, len(arrays), result)
 
-        def make() -> Program:
+        def make() -> StoredProgram:
             """Compiles in parallel with other threads that trace and compile."""
             program = executable
             if program is None:
@@ -173,13 +175,13 @@ class Programs:
                 # A program that JAX has read from its cache loses functions when it is written again (XLA on a CPU),
                 # and one with callbacks into Python holds addresses of this process.
                 if read or "callback" in text:
-                    return Program(program, result)
+                    return StoredProgram(program, result)
                 with contextlib.suppress(Exception):  # an unwritable program, for any reason, is not stored
                     written = serialize_executable.serialize(program)[0]
                     _write_atomically(_executable(folder, compiled), zlib.compress(written, 1))
             with contextlib.suppress(pickle.PicklingError, AttributeError, TypeError):
                 _write_atomically(place, pickle.dumps((result, compiled)))
-            return Program(program, result)
+            return StoredProgram(program, result)
 
         return make
 
@@ -246,7 +248,7 @@ def _leaf_structure(leaf: Any) -> Any:
     return leaf.shape, str(leaf.dtype), bool(getattr(leaf, "weak_type", False))
 
 
-class _Describer(pickle.Pickler):
+class _ArgumentPickler(pickle.Pickler):
     """Pickles only objects of known packages, equal objects to equal bytes."""
 
     def __init__(self, file: io.BytesIO) -> None:
@@ -284,7 +286,7 @@ def _program_name(function: Callable[..., Any], arguments: Any) -> str:
     if named[0].partition(".")[0] not in OWN or "<" in named[1]:
         raise Unnamed
     file = io.BytesIO()
-    _Describer(file).dump((named, _compile_settings(), arguments))
+    _ArgumentPickler(file).dump((named, _compile_settings(), arguments))
     return hashlib.sha256(source_hash().encode() + file.getvalue()).hexdigest()
 
 
@@ -318,7 +320,7 @@ def _load_executable(folder: Path, name: str, arrays: int, result: Any) -> Calla
     out = sum(isinstance(x, _ArrayPlaceholder) for x in jax.tree.leaves(result))
     try:
         written = zlib.decompress(_executable(folder, name).read_bytes())
-        _linear_algebra()
+        _load_lapack()
         return serialize_executable.deserialize_and_load(
             written, jax.tree.structure(((0,) * arrays, {})), jax.tree.structure([0] * out)
         )
@@ -327,7 +329,7 @@ def _load_executable(folder: Path, name: str, arrays: int, result: Any) -> Calla
 
 
 @functools.cache
-def _linear_algebra() -> None:
+def _load_lapack() -> None:
     """Lets JAX find LAPACK, as it does when it lowers a call of it: programs read from disk call it too."""
     jax.jit(jnp.linalg.cholesky).lower(jax.ShapeDtypeStruct((1, 1), float))
 

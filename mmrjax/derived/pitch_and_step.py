@@ -14,7 +14,7 @@ from mmrjax.model.signals import CONVERGED
 
 @compiled
 def compute(robot: Robot, conditions: Conditions) -> dict[str, Array]:
-    """Pitch and highest steps of one run's robot, from geometry alone.
+    """Pitch and highest steps of the robot of one run, from geometry alone.
 
     Returns:
         `pitch` [rad], `highest_step`, in this posture, and `best_step`, in any [m], `status`: always `converged`.

@@ -1,4 +1,4 @@
-"""Requirements on a robot, as functions of the robot and a point of an envelope of use."""
+"""Quantities of requirements, as functions of the robot and of a point of the envelope of use."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ QUANTITIES: dict[str, Quantity] = {q.column: q for q in TABLE["requirement"]}
 
 
 class Ratings(eqx.Module):
-    """Limits and counts that a robot holds as constants, in a form that can be batched.
+    """Limits and counts that are constants of a robot, in a form that can be batched.
 
     Attributes:
-        cells: cells in series [-].
-        voltage_cutoff: cutoff voltage of a cell [V].
+        cells: number of cells in series [-].
+        voltage_cutoff: cut-off voltage of a cell [V].
         temperature: permissible winding temperature [°C].
         torque: permissible continuous torque of a gearbox [N·m], inf if not stated.
     """
@@ -46,7 +46,7 @@ class Ratings(eqx.Module):
 
 
 def ratings(robot: Robot) -> Ratings:
-    """The ratings of a robot."""
+    """Ratings of a robot."""
     return Ratings(
         jnp.asarray(robot.battery.cells, float),
         jnp.asarray(robot.battery.voltage_cutoff, float),
@@ -56,18 +56,18 @@ def ratings(robot: Robot) -> Ratings:
 
 
 class EnvelopePoint(eqx.Module):
-    """A point of the envelope. Every field differentiable and batchable.
+    """A point of the envelope of use. Every field can be differentiated and batched.
 
     Attributes:
-        configuration: index.
-        battery: 1 on the battery.
-        adhesion, adhesion_lateral: adhesion and lateral adhesion of the surface as a ratio to the robot's own [-].
+        configuration: index of the configuration.
+        battery: 1 on the battery, 0 on an external supply.
+        adhesion, adhesion_lateral: adhesion along and across, relative to the robot's own [-].
         charge: state of charge [-], or voltage of an external supply [V].
-        charge_end: state of charge at the end.
-        share: share of time in motion, for the endurance. 0: standing still [-].
-        slope_deg: [deg].
-        payload: [kg].
-        ambient: [°C].
+        charge_end: state of charge at the end of use [-].
+        share: for endurance, share of time in motion [-]. 0: standing still.
+        slope_deg: slope [deg].
+        payload: payload [kg].
+        ambient: ambient temperature [°C].
         tread: tread of stairs [m].
     """
 
@@ -88,8 +88,8 @@ class QuantityValue(eqx.Module):
     """Value of a quantity at one point.
 
     Attributes:
-        value: value [SI], a number for every outcome, not NaN.
-        outcome: index into `STATUSES`. The value is valid only for `converged`.
+        value: value [SI], finite for every outcome.
+        outcome: index into `STATUSES`. The value is meaningful only for `converged`.
     """
 
     value: Float[Array, "..."]
@@ -97,7 +97,7 @@ class QuantityValue(eqx.Module):
 
 
 def with_cells(robot: Robot, cells: Scalar) -> Robot:
-    """The robot with this number of cells in series, which may be traced. Voltages scale with the number."""
+    """Robot with this number of cells in series, which may be traced. Battery voltages scale with the number."""
     battery = robot.battery
     more = cells / battery.cells
     battery = dataclasses.replace(
@@ -122,7 +122,7 @@ def _robot_and_conditions_at(robot: Robot, point: EnvelopePoint, rated: Ratings)
     )  # fmt: skip
 
 
-def heat_left(robot: Robot, point: EnvelopePoint, current: Scalar, limit: Scalar) -> Scalar:
+def thermal_margin(robot: Robot, point: EnvelopePoint, current: Scalar, limit: Scalar) -> Scalar:
     """Relative thermal margin of a winding for continuous `current` [-]: 0 if it settles at `limit` [°C].
 
     1 - I² R_th R (1 + α (T - 25 °C)) / (T - T_a). `robot` as stated, not as returned by `_robot_and_conditions_at`.
@@ -133,7 +133,7 @@ def heat_left(robot: Robot, point: EnvelopePoint, current: Scalar, limit: Scalar
 
 
 def _cell_margin(rated: Ratings, signals: Signals, point: EnvelopePoint) -> Scalar:
-    """Margin of a cell above its cut-off voltage [V], inf on an external supply."""
+    """Margin of a cell above its cut-off voltage [V], inf with an external supply."""
     return jnp.where(point.battery > 0.5, signals.voltage_source / rated.cells - rated.voltage_cutoff, jnp.inf)
 
 
@@ -167,12 +167,12 @@ def travel_quantities(robot: Robot, point: EnvelopePoint, rated: Ratings) -> tup
     return {name: jnp.asarray(x) for name, x in quantities.items()}, outcome
 
 
-def _travel(robot: Robot, point: EnvelopePoint, rated: Ratings, name: str) -> QuantityValue:
+def _travel_quantity(robot: Robot, point: EnvelopePoint, rated: Ratings, name: str) -> QuantityValue:
     values, outcome = travel_quantities(robot, point, rated)
     return QuantityValue(values[name], outcome)
 
 
-def _slope(robot: Robot, point: EnvelopePoint, rated: Ratings, name: str) -> QuantityValue:
+def _steepest_slope(robot: Robot, point: EnvelopePoint, rated: Ratings, name: str) -> QuantityValue:
     here, conditions = _robot_and_conditions_at(robot, point, rated)
     answer = steepest_slope.compute(here, conditions)
     held = jnp.isfinite(answer["steepest_slope"])
@@ -184,10 +184,10 @@ HALVINGS = 26
 
 
 def _largest_payload(robot: Robot, point: EnvelopePoint, rated: Ratings, name: str) -> QuantityValue:
-    """The largest payload for continuous travel.
+    """Largest payload for continuous travel.
 
-    The robot travels, its winding settles at a permissible temperature, its gearboxes stay within their torque limit
-    (if stated) and its cells above their cut-off.
+    The robot travels, its winding settles below its largest temperature, the gearboxes stay within their torque limit
+    (if stated), and the cells above their cut-off voltage.
     """
     most = CONDITIONS["payload"].range[1]
 
@@ -195,20 +195,20 @@ def _largest_payload(robot: Robot, point: EnvelopePoint, rated: Ratings, name: s
         loaded_point = dataclasses.replace(point, payload=payload)
         here, conditions = _robot_and_conditions_at(robot, loaded_point, rated)
         signals, _, _ = operating_state(here, conditions)
-        hot = heat_left(robot, loaded_point, signals.current, rated.temperature)
+        hot = thermal_margin(robot, loaded_point, signals.current, rated.temperature)
         torque = 1 - jnp.abs(signals.torque_gear) / rated.torque
         each = [steepest_slope.travel_margin(here, signals), hot, torque, _cell_margin(rated, signals, point)]
         return functools.reduce(jnp.minimum, each)
 
-    found, holds = _sign_change(left, robot, jnp.zeros(()), jnp.asarray(most))
+    found, holds = _find_sign_change(left, robot, jnp.zeros(()), jnp.asarray(most))
     here, conditions = _robot_and_conditions_at(robot, dataclasses.replace(point, payload=jnp.zeros(())), rated)
     signals, status, _ = operating_state(here, conditions)
     outcome = jnp.where((status == CONVERGED) & (_cell_margin(rated, signals, point) < 0), CUT_OFF, status)
     return QuantityValue(jnp.where(holds, found, 0.0), outcome)
 
 
-def _sign_change(left, robot: Robot, low: Array, high: Array) -> tuple[Array, Array]:  # type: ignore[no-untyped-def]
-    """Point between low and high where `left` becomes negative, and whether `left` is positive at low.
+def _find_sign_change(left, robot: Robot, low: Array, high: Array) -> tuple[Array, Array]:  # type: ignore[no-untyped-def]
+    """Point between low and high at which `left` becomes negative, and True if `left` is positive at low.
 
     `high` if it does not become negative. Derivatives are implicit, forward and reverse.
     """
@@ -255,7 +255,7 @@ def _endurance(robot: Robot, point: EnvelopePoint, rated: Ratings, name: str) ->
         current = here.battery.current(point.share * motors)
         return current, cell, jnp.where(stands, CONVERGED, status)
 
-    end, begins = _sign_change(lambda robot, c: drawn(robot, c)[1], robot, first, last)
+    end, begins = _find_sign_change(lambda robot, c: drawn(robot, c)[1], robot, first, last)
     nodes, weights = np.polynomial.legendre.leggauss(NODES)
     discharges = first + (end - first) * jnp.asarray((nodes + 1) / 2)
     current, _, status = jax.vmap(lambda c: drawn(robot, c))(discharges)
@@ -266,7 +266,7 @@ def _endurance(robot: Robot, point: EnvelopePoint, rated: Ratings, name: str) ->
     return QuantityValue(time, outcome)
 
 
-def _mass(robot: Robot, point: EnvelopePoint, rated: Ratings, name: str) -> QuantityValue:
+def _mass_quantity(robot: Robot, point: EnvelopePoint, rated: Ratings, name: str) -> QuantityValue:
     mass = jnp.asarray(robot.chassis(point.configuration).mass)
     return QuantityValue(mass, jnp.full(mass.shape, CONVERGED))
 
@@ -309,7 +309,7 @@ def _side_slope(robot: Robot, point: EnvelopePoint, rated: Ratings, name: str) -
     return QuantityValue(jnp.degrees(jnp.arctan(jnp.minimum(slides, tips))), jnp.asarray(CONVERGED))
 
 
-def _posture_limits_of(robot: Robot, point: EnvelopePoint, rated: Ratings, name: str) -> QuantityValue:
+def _posture_quantity(robot: Robot, point: EnvelopePoint, rated: Ratings, name: str) -> QuantityValue:
     """Geometric limits of a robot on level ground, see `static_limits`.
 
     The highest step in any posture of its levers, stairs and gaps with its levers flush, its size with them folded.
@@ -322,23 +322,24 @@ def _posture_limits_of(robot: Robot, point: EnvelopePoint, rated: Ratings, name:
         value = static_limits.stairs_rise(robot, conditions, point.tread, friction)
     else:
         angle = static_limits.flush_lever_angle(robot) if name == "gap_mm" else jnp.pi
-        limits = static_limits.posture_limits(robot, static_limits.with_levers(conditions, angle, angle))
+        limits = static_limits.posture_limits(robot, static_limits.with_lever_angles(conditions, angle, angle))
         value = {"gap_mm": limits.gap, "length_mm": limits.length, "height_mm": limits.height}[name]
     return QuantityValue(jnp.asarray(value), jnp.asarray(CONVERGED))
 
 
 #: Function of each group of quantities: (robot, point, ratings, name) -> Found.
-GROUPS = {"travel": _travel, "slope": _slope, "payload": _largest_payload, "endurance": _endurance, "mass": _mass,
-          "turn": _settled_turn, "across": _side_slope, "posture": _posture_limits_of}  # fmt: skip
+GROUPS = {"travel": _travel_quantity, "slope": _steepest_slope, "payload": _largest_payload, "endurance": _endurance,
+"mass": _mass_quantity,
+          "turn": _settled_turn, "across": _side_slope, "posture": _posture_quantity}  # fmt: skip
 
 
 def evaluate_requirement(robot: Robot, point: EnvelopePoint, rated: Ratings, name: str) -> QuantityValue:
     """Value of one quantity at one point.
 
     Args:
-        robot: its parameters may be tracers.
-        point: scalars.
-        rated: the robot's `ratings`, or others.
-        name: one of `QUANTITIES`.
+        robot: robot. Its parameters may be tracers.
+        point: point of the envelope, scalar fields.
+        rated: ratings of the robot, or others.
+        name: name of the quantity, one of `QUANTITIES`.
     """
     return GROUPS[QUANTITIES[name].group](robot, point, rated, name)

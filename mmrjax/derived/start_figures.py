@@ -1,4 +1,4 @@
-"""The start from standstill: its peak current, duration and electrical energy, and its stages."""
+"""Start from standstill: its peak current, duration, electrical energy and stages."""
 
 from __future__ import annotations
 
@@ -32,15 +32,15 @@ WITHIN, LAST = 0.01, 0.15
 
 @dataclasses.dataclass(frozen=True)
 class StartStages:
-    """The stages of one start. Times since its first sample.
+    """Stages of one start. Times count from its first sample.
 
     Attributes:
-        sense: direction of the shafts at the end, 1 or -1.
+        sense: direction of rotation of the shafts at the end, 1 or -1.
         starting: end of the first stage [s]: the slide has reached its maximum, the shafts have spun up.
         slipping: end of the second stage [s]: the slide stays within V_s from here, `starting` if it never left.
         settled: t' [s]: the speed is within 1 % of its last value, the mean over the last 0.15 s.
         end: end of the run [s].
-        slip: slip of each stage, and over_settling: from 0 to t', by `mean_slip` [-], NaN for a stage of no length.
+        slip: mean slip of each stage [-] (`mean_slip`), NaN for a stage without length.
     """
 
     sense: float
@@ -71,7 +71,9 @@ class StartStages:
 
 
 def _moving_means(time: np.ndarray, values: np.ndarray, period: float) -> np.ndarray:
-    """Means over a `period` about each instant of evenly spaced samples. At the ends, of the nearest whole period."""
+    """Means over a `period` around each instant of evenly spaced samples. At the ends, over the nearest whole
+    period.
+    """
     count = min(round(period / (time[-1] / len(time))) | 1, len(values) | 1) if time[-1] > 0 else 1
     if count < 3 or count > len(values):
         return values
@@ -105,14 +107,15 @@ def stages_of_start(
     speed_static: float,
     way: float = 0.0,
 ) -> StartStages:
-    """The stages of one start, from samples without gaps.
+    """Stages of one start, from samples without gaps.
 
     Args:
-        time: [s].
-        speed, theoretical, sliding: V, r_k ω_k and the contact patch's speed over the ground [m/s].
+        time: times of the samples [s].
+        speed, theoretical, sliding: speed V, theoretical speed r_k ω_k, and speed of the contact patch over the
+            ground [m/s].
         speed_static: V_s of the friction law [m/s].
-        way: distance of the movers between two contacts that cause ripple [m]. Slide and speed are averaged over it
-            at the last speed. 0: no ripple.
+        way: travel between two contacts that cause ripple [m], 0 for none. Speeds are averaged over that distance at
+            the last speed.
     """
     sense = -1.0 if theoretical[-1] < -1e-4 else 1.0
     starting = float(time[int(np.argmax(sense * sliding))])
@@ -131,7 +134,7 @@ def stages_of_start(
 def stages_of_histories(
     robot: Robot, history: History, which: Sequence[int] | np.ndarray
 ) -> list[StartStages | None]:
-    """Stages of each run of a batch from standstill, up to its last number, None for a run without numbers.
+    """Stages of each run of a batch from standstill, up to its last finite sample. None for a run without samples.
 
     Args:
         which: index of each run's configuration in `robot`. Its loads are vehicles.
@@ -151,13 +154,15 @@ def stages_of_histories(
 
 
 def count_finite_samples(values: OverTime) -> int:
-    """Number of samples of a run up to its last finite one."""
+    """Number of samples of a run up to the last finite one."""
     finite = np.flatnonzero(np.isfinite(values))
     return int(finite[-1]) + 1 if finite.size else 0
 
 
 def last_samples(time: OverTime) -> np.ndarray:
-    """Mask of the last 0.15 s, several pitches of the running gear. For a short run, of its last tenth."""
+    """True for the samples of the last 0.15 s, which contain several pitches of the running gear. For a short run, of
+    its last tenth.
+    """
     return np.asarray(time >= time[-1] - min(LAST, 0.1 * float(time[-1])))
 
 
@@ -170,12 +175,12 @@ TOLERANCE = 1e-7
 
 
 def curve_peak(times: Float[Array, " times"], x: Float[Array, " times"], kink: Scalar = np.inf) -> Float[Array, ""]:
-    """Largest value of a sampled curve: the vertex of the parabola through its largest sample and both neighbours.
+    """Largest value of a sampled curve: vertex of the parabola through its largest sample and the two neighbours.
 
     Args:
         times: not decreasing [s].
         x: samples, NaN if the curve has no value.
-        kink: largest value of the parabola. At a limit of the current the curve has a corner.
+        kink: upper limit of the peak. At a current limit, the curve has a corner.
     """
     finite_values = jnp.where(jnp.isfinite(x), x, -jnp.inf)
     k = jnp.clip(jnp.argmax(finite_values), 1, x.shape[0] - 2)
@@ -193,7 +198,8 @@ def curve_peak(times: Float[Array, " times"], x: Float[Array, " times"], kink: S
 def first_crossing(
     times: Float[Array, " times"], x: Float[Array, " times"], rate: Float[Array, " times"], level: Array
 ) -> tuple[Array, Array]:
-    """First crossing of a level by a sampled curve: index of the sample before, and share of the way to the next.
+    """First time at which a sampled curve crosses a level: index of the sample before, and fraction of the way to the
+    next.
 
     Found on the cubic through two samples and their rates, by Newton's method from the straight line.
     """
@@ -216,7 +222,7 @@ def first_crossing(
 
 @compiled
 def compute(robot: Robot, conditions: Conditions) -> dict[str, Array]:
-    """One start from standstill by `drive`, over `TIME_SETTLED`.
+    """Simulates one start from standstill by `drive`, over `TIME_SETTLED`.
 
     Returns:
         `peak_current` of all motors [A], `time_to_speed`, until 95 % of the final speed [s], `energy_start`,

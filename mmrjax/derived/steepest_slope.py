@@ -1,4 +1,4 @@
-"""The steepest slope that a robot climbs without sliding or stalling."""
+"""Steepest slope that a robot climbs without sliding or stalling."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ HALVINGS = 24
 
 
 def slope_margin(robot: Robot, conditions: Conditions, slope_deg: Scalar) -> Float[Array, ""]:
-    """Smaller of the margins of adhesion and speed on a slope [-], see `travel_margin`."""
+    """The smaller of the margins of adhesion and of speed on a slope [-], see `travel_margin`."""
     conditions = dataclasses.replace(conditions, slope_deg=jnp.asarray(slope_deg))
     return travel_margin(robot, operating_state(robot, conditions)[0])
 
 
 def travel_margin(robot: Robot, signals: Signals) -> Float[Array, ""]:
-    """Smaller of two margins [-]: of adhesion, 1 - demand / limit, and of speed, V / (V_s / 10) - 1.
+    """The smaller of two margins [-]: of adhesion, 1 - demand / limit, and of speed, V / (V_s / 10) - 1.
 
-    Positive if `steady` returns `converged`. Continuous through the edge in both cases.
+    Positive if `steady` would converge. Both are continuous beyond their limit.
     """
     rest = robot.chassis(signals.configuration).speed_still
     slowest = jnp.minimum(signals.speed_theoretical, signals.speed)
@@ -41,10 +41,10 @@ def travel_margin(robot: Robot, signals: Signals) -> Float[Array, ""]:
 
 @compiled
 def compute(robot: Robot, conditions: Conditions) -> dict[str, Array]:
-    """Steepest slope that one run's voltage and payload allow. The run's own slope has no influence.
+    """Steepest slope for the voltage and payload of one run. The slope of the run has no influence.
 
-    The root of `slope_margin` between level ground and `STEEPEST`, by bisection. Derivatives are implicit,
-    dα = -(∂margin/∂α)⁻¹ ∂margin/∂θ dθ, forward and reverse.
+    The root of `slope_margin` between level ground and `STEEPEST`, by bisection. Derivatives are implicit, dα =
+    -(∂margin/∂α)⁻¹ ∂margin/∂θ dθ, forward and reverse.
 
     Returns:
         `steepest_slope` [deg], NaN if the robot does not travel on level ground, `STEEPEST`, with zero derivatives,

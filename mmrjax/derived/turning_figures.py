@@ -1,4 +1,4 @@
-"""Figures of a turn: radius, instantaneous centre, effective width, power and temperature of each side."""
+"""Quantities of a turn: radius, instantaneous centre, effective width, power and temperature of each side."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ PLANE = ("speed", "lateral_speed", "yaw_rate")
 
 
 def turning_radius(ahead: Any, aside: Any, rate: Any) -> Array:
-    """Radius of the circle of the centre of mass, positive to the left, inf in straight travel [m].
+    """Radius of the circle on which the centre of mass moves, positive to the left, inf in straight travel [m].
 
     Args:
         ahead, aside: speeds of the centre of mass [m/s].
-        rate: yaw rate [rad/s], arrays of one shape.
+        rate: yaw rate [rad/s]. All arguments have the same shape.
     """
     turns = jnp.abs(rate) > NONE
     along = jnp.sqrt(jnp.maximum(jnp.square(ahead) + jnp.square(aside), 1e-24))  # a root of 0 has no derivative
@@ -39,7 +39,7 @@ def turning_radius(ahead: Any, aside: Any, rate: Any) -> Array:
 
 @compiled
 def compute(robot: Robot, conditions: Conditions) -> dict[str, Array]:
-    """The radius of a settled turn of one run.
+    """Radius of the settled turn of one run.
 
     Returns:
         `turning_radius` [m], NaN if no turn settles. `status` of the turn. Derivatives are implicit.
@@ -62,7 +62,7 @@ def turns_under_equal_commands(robot: Robot, imposed: float) -> Result:
 
 
 def turning_columns(robot: Robot, reading: Mapping[str, Any], radius: np.ndarray) -> dict[str, np.ndarray]:
-    """The columns of settled turns, from the readings of their channels [SI], arrays of one shape.
+    """Table columns of settled turns, from the readings of their channels [SI], all of the same shape.
 
     Args:
         radius: radius of the driving wheels [m].

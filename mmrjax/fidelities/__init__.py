@@ -56,18 +56,19 @@ FEW = 256
 
 
 @dataclasses.dataclass(frozen=True)
-class Facts:
-    """Facts about a fidelity that are known without importing it.
+class FidelityFacts:
+    """Properties of a fidelity that are known without importing it.
 
     Attributes:
         module: module that holds its `FIDELITY`.
         description: one line.
-        chunk: largest number of runs in one call. A pair if it differs on an accelerator.
+        chunk: largest number of runs in one call. A pair if it differs between processors and an accelerator.
         effort: effort of a calibration with it.
         options: its options.
         rollout: True if it integrates over time. Searches with it run one at a time and end sooner.
         histories: True if it can return a run over time.
-        computes: parameters of a configuration that it computes instead of reads, such as `track.guide_share`.
+        computes: parameters of a configuration that it computes and does not use as inputs, such as
+            `track.guide_share`.
         resolves: prefixes of parameter names that only fidelities of this kind read.
         reverse: True if it supports derivatives in reverse mode (`jax.grad`) in addition to forward mode.
         slow: True if a batch takes long enough for a progress bar.
@@ -99,7 +100,7 @@ class Facts:
         return runs if self.rollout else max(runs, FEW)
 
     def resolved(self, **given: float | None) -> dict[str, float]:
-        """Every option by name: the given value, or its default if absent or None.
+        """Every option by name: the given value, or its default if the value is missing or None.
 
         Raises:
             ValueError: an option that this fidelity does not have, or a number out of range.
@@ -121,36 +122,36 @@ class Facts:
         return values
 
 
-def _duration(default: float, most: float) -> Option:
+def _duration_option(default: float, most: float) -> Option:
     return Option("duration", "s", default, most, "length of a run")
 
 
 _STEP = Option("step", "s", 1e-4, 0.01, "integration step")
 
 #: By name, the cheapest first. Read through the module, so that a new line adds a fidelity everywhere.
-TABLE: dict[str, Facts] = {
-    "steady": Facts(
+TABLE: dict[str, FidelityFacts] = {
+    "steady": FidelityFacts(
         "mmrjax.fidelities.steady",
         "the operating point as a root of the balances, with implicit derivatives",
         chunk=(262_144, 4_194_304),
         effort=Effort(starts=64, profiles=True, blocks=True),
     ),
-    "drive": Facts(
+    "drive": FidelityFacts(
         "mmrjax.fidelities.drive",
         "the ODE of drives and chassis, with slip, inductance and battery",
         chunk=(4_096, 65_536),
         effort=Effort(starts=1, profiles=False, blocks=False),
-        options=(_duration(30.0, 86_400.0),),
+        options=(_duration_option(30.0, 86_400.0),),
         rollout=True,
         histories=True,
         reverse=False,
     ),
-    "track": Facts(
+    "track": FidelityFacts(
         "mmrjax.fidelities.track",
         "half a robot as multibody dynamics in MuJoCo MJX, with individual contacts",
         chunk=(512, 16_384),
         effort=Effort(starts=1, profiles=False, blocks=False),
-        options=(_duration(1.5, 3600.0), _STEP),
+        options=(_duration_option(1.5, 3600.0), _STEP),
         rollout=True,
         histories=True,
         computes=("track.guide_share",),
@@ -163,8 +164,8 @@ TABLE: dict[str, Facts] = {
 NAMES: Names = tuple(TABLE)
 
 
-def fidelity_facts(name: str) -> Facts:
-    """Facts about a fidelity that are known without importing it.
+def fidelity_facts(name: str) -> FidelityFacts:
+    """Properties of a fidelity that are known without importing it.
 
     Raises:
         KeyError: no such fidelity. The message lists the valid names.
@@ -179,7 +180,7 @@ OF_TURNS = ".turning."
 
 
 def unread_parameters(name: str, parameters: Iterable[str], turns: bool = False) -> Names:
-    """Parameters among `parameters` (dotted) that a fidelity does not read in straight travel, or in turns."""
+    """Names of those parameters that a fidelity does not use, in straight travel or in turns."""
     of_others = {head for other in TABLE.values() for head in other.resolves} - set(fidelity_facts(name).resolves)
     return tuple(p for p in parameters if p.startswith(tuple(of_others)) or (OF_TURNS in p and not turns))
 

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 from mmrjax import fidelities
 from mmrjax.compile.compiling import compiled
-from mmrjax.fidelities import Facts
+from mmrjax.fidelities import FidelityFacts
 from mmrjax.model import balances, channels
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.params import Scalars
@@ -21,7 +21,7 @@ from mmrjax.model.quantities import VOLTAGE
 from mmrjax.model.rig import Rig
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import Result, Signals
-from mmrjax.undercarriage.side_contacts import Reactions
+from mmrjax.undercarriage.side_contacts import GearReactions
 
 T = TypeVar("T")
 
@@ -35,8 +35,8 @@ class History(eqx.Module):
     Attributes:
         time: time in the clock of tables [s]. The imposed quantity acts the rig's `delay` later than its column
             states.
-        distance: travelled along the slope [m].
-        signals: every signal.
+        distance: distance travelled along the slope [m].
+        signals: all signals.
         reading: readings [SI] by channel, of the channels that change in a history.
         reactions: loads inside the running gear of one side, if the fidelity computes them.
     """
@@ -45,7 +45,7 @@ class History(eqx.Module):
     distance: Float[Array, "runs samples"]
     signals: Signals
     reading: Scalars
-    reactions: Reactions | None = None
+    reactions: GearReactions | None = None
 
     @staticmethod
     def of(
@@ -53,9 +53,9 @@ class History(eqx.Module):
         time: Array,
         distance: Array,
         signals: Signals,
-        reactions: Reactions | None = None,
+        reactions: GearReactions | None = None,
     ) -> History:
-        """A history with its readings, from runs known at `time` since the imposed quantity acts.
+        """Runs over time with their readings. `time` counts from the action of the imposed quantity.
 
         Signals with a further axis of left and right side are averaged over it.
         """
@@ -94,7 +94,7 @@ def in_table_time(rig: Rig, time: Float[Array, "runs samples"], values: T) -> tu
 
 @compiled
 def _channel_readings(robot: Robot, signals: Signals, apart: bool = False) -> Scalars:
-    """Readings of the channels that change in a history. `apart`: from signals of left and right side."""
+    """Readings of the channels that change in a history. `apart`: signals have a left and a right side."""
     every = balances.readings_of_sides(robot, signals) if apart else balances.sensor(robot, signals)
     return {c.name: every[c.name] for c in channels.EVERY if c.over_time}
 
@@ -110,12 +110,13 @@ def _between_for_batch(values: Array, k: Array, share: Array) -> Array:
     return jax.vmap(Rig.between)(values, k, share)
 
 
-class Run(eqx.Module):
-    """A batch of runs.
+class RunBatch(eqx.Module):
+    """A simulated batch of runs.
 
     Attributes:
         result: result of each run, shape (runs,).
-        columns: outputs that only this fidelity has, by column of `runs.csv`, in the column's unit, shape (runs,).
+        columns: outputs that only this fidelity has: column of `runs.csv` → values in the unit of the column, shape
+            (runs,).
         history: the runs over time, if requested.
     """
 
@@ -124,12 +125,12 @@ class Run(eqx.Module):
     history: History | None = None
 
 
-class Simulate(Protocol):
-    """Simulates a batch."""
+class SimulateBatch(Protocol):
+    """Type of a function that simulates a batch."""
 
     def __call__(
         self, robot: Robot, conditions: Conditions, options: Mapping[str, float], progress: Progress | None = None, /
-    ) -> Run:
+    ) -> RunBatch:
         """Simulates a batch in one call.
 
         Args:
@@ -144,11 +145,13 @@ class Simulate(Protocol):
 
 
 @dataclasses.dataclass(frozen=True)
-class Implicit:
-    """Steady travel of one run, straight or turning, in two halves. A fit takes all derivatives from one evaluation.
+class ImplicitSolution:
+    """Steady travel of one run in two parts, straight or turning. This lets a fit take all derivatives from one
+    evaluation.
 
     Attributes:
-        solve: returns the unknowns, shape (unknowns,), and whether they were found. Has no derivatives.
+        solve: function that returns the unknowns, shape (unknowns,), and True if they were found. Without
+            derivatives.
         shown: returns result and signals for given unknowns (differentiable in them and in the robot) and the
             residuals of the equations, shape (unknowns,). A demand above the ground's limit counts as sliding. For a
             fit it is out of reach in any case.
@@ -158,11 +161,13 @@ class Implicit:
     shown: Callable[[Robot, Conditions, Array, Array], tuple[Result, Signals, Array]]
 
 
-def _no_check(robot: Robot, conditions: Conditions, options: Mapping[str, float]) -> None:  # results are pickled
+def _accept_every_run(
+    robot: Robot, conditions: Conditions, options: Mapping[str, float]
+) -> None:  # results are pickled
     """Accepts every run."""
 
 
-def _no_cautions(robot: Robot, conditions: Conditions) -> list[str]:
+def _without_cautions(robot: Robot, conditions: Conditions) -> list[str]:
     return []
 
 
@@ -172,29 +177,29 @@ class Fidelity:
 
     Attributes:
         name: its line in `fidelities.TABLE`.
-        settled: batch of conditions to results. Pure, traceable, with numbers at any status if possible. Calibrations
-            differentiate it (forward).
-        implicit: the same in two halves, None if it is not the root of equations.
+        settled: function from a batch of conditions to results. Pure and traceable, with finite numbers for every
+            status if possible. Calibrations differentiate it in forward mode.
+        implicit: the same in two parts. None if it is not the solution of equations.
         run: results of a batch, as in a sweep.
-        outputs: only the named outputs of a batch [SI], of `outputs.output_table`, and `status`, quicker than `run`.
-            None if it would not be. A fidelity with it has no options.
+        outputs: function that computes only the named outputs of a batch [SI] and `status`, faster than `run`. None
+            if it would not be faster. A fidelity with it has no options.
         columns: names of further columns of its runs (`Run.columns`).
         histories: a batch from standstill over time, None for a fidelity without time.
-        check: raises ValueError before the first simulation if it cannot compute some run of a batch.
+        check: function that raises ValueError before the first simulation if some run of a batch cannot be computed.
         cautions: warnings about the steady readings of a calibrated robot, one sentence each.
     """
 
     name: str
     settled: Callable[[Robot, Conditions], Result]
-    run: Simulate
+    run: SimulateBatch
     outputs: Callable[[Robot, Conditions, tuple[str, ...]], dict[str, Array]] | None = None
-    implicit: Implicit | None = None
-    histories: Simulate | None = None
-    check: Callable[[Robot, Conditions, Mapping[str, float]], None] = _no_check
-    cautions: Callable[[Robot, Conditions], list[str]] = _no_cautions
+    implicit: ImplicitSolution | None = None
+    histories: SimulateBatch | None = None
+    check: Callable[[Robot, Conditions, Mapping[str, float]], None] = _accept_every_run
+    cautions: Callable[[Robot, Conditions], list[str]] = _without_cautions
     columns: tuple[str, ...] = ()
 
     @property
-    def facts(self) -> Facts:
-        """Facts about it that are known without importing it."""
+    def facts(self) -> FidelityFacts:
+        """Properties that are known without importing the fidelity."""
         return fidelities.fidelity_facts(self.name)

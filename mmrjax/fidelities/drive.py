@@ -1,4 +1,4 @@
-"""Fidelity `drive`: the ODE of drives and chassis, with slip, inductance and battery."""
+"""Fidelity `drive`: equations of motion of drives and chassis over time, with slip, inductance and battery."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from mmrjax.compile.compiling import compiled
-from mmrjax.fidelities.base import Fidelity, History, Progress, Run
+from mmrjax.fidelities.base import Fidelity, History, Progress, RunBatch
 from mmrjax.fidelities.rest import HELD, holds, standing_signals, status_moving, voltage_at_rest
 from mmrjax.fidelities.result import result_of_signals, withhold_numbers
 from mmrjax.fidelities.steady import operating_signals
@@ -48,13 +48,13 @@ TIME_INRUSH, SAMPLES_INRUSH = 0.04, 160  # first part of a history [s], and its 
 TIME_RISE, SAMPLES_RISE = 0.002, 40  # first part of the inrush, in which the current rises to its peak
 
 
-class Trajectory(eqx.Module):
-    """A run.
+class DriveTrajectory(eqx.Module):
+    """One run over time.
 
     Attributes:
         time: [s], shape (times,).
-        distance: travelled along the slope. For a robot that turns, from its start [m], shape (times,).
-        signals: every signal at those times. Each field has shape (times,).
+        distance: distance along the slope [m], shape (times,). For a robot that turns, distance from its start.
+        signals: all signals at those times. Each field has the shape (times,).
         result: the state at the end, with the run's status.
     """
 
@@ -85,7 +85,7 @@ moving = compiled(balances.moving_signals)
 
 @compiled
 def drive_rates(robot: Robot, conditions: Conditions, y: Unknowns, way: Scalar | None = None) -> Unknowns:
-    """Rates of the unknowns, in their units [1/s]. `way` as in `balances.moving_signals`, or `HELD`."""
+    """Rates of change of the unknowns, in their units [1/s]. `way` as in `balances.moving_signals`, or `HELD`."""
     held = jnp.asarray(False if way is None else way == HELD)
     state = state_of_unknowns(robot, y)
     signals = moving(robot, conditions, state, None if way is None else jnp.where(held, 0.0, way))
@@ -111,7 +111,7 @@ def drive_rates(robot: Robot, conditions: Conditions, y: Unknowns, way: Scalar |
 
 
 def winding_rate(robot: Robot, conditions: Conditions, y: Unknowns) -> Array:
-    """Rate of the current only, in its unit, without an imposed speed [1/s]."""
+    """Rate of change of the current alone, in its unit [1/s], if the speed is not imposed."""
     state = state_of_unknowns(robot, y)
     signals = balances.driven_signals(robot, conditions, state, None)
     return jnp.asarray(signals.voltage_left / signals.inductance / _UNITS[CURRENT])
@@ -121,9 +121,9 @@ _norm = functools.partial(error_norm, own=len(_UNITS))
 
 
 def drive_start(robot: Robot, conditions: Conditions, rolling: bool = False) -> Unknowns:
-    """Unknowns at rest, or for `rolling` those of the steady fidelity with settled memories of effects.
+    """Unknowns at rest. With `rolling`, those of the steady fidelity, with settled memories of effects.
 
-    At rest too if the steady fidelity has no root.
+    At rest too if the steady fidelity has no solution.
     """
     size = jnp.asarray(drive_units(robot), jnp.result_type(conditions.voltage))
     load = robot.chassis(conditions.configuration)
@@ -164,10 +164,10 @@ def _initial_unknowns(robot: Robot, conditions: Conditions) -> Array:
     turning = begin.motor_speed if conditions.motor_speed is None else conditions.motor_speed
     rolling, none = radius * turning / robot.gearbox.ratio, jnp.zeros(())
     still = State(none, turning, rolling, none, distance=radius * begin.angle)
-    conditions = balances.commanded(robot, conditions, still)
+    conditions = balances.with_controller_duty(robot, conditions, still)
     left = voltage_at_rest(robot, conditions)
     if conditions.motor_current is None:  # an amplifier compensates it
-        share = jnp.abs(balances.duty_given(robot, conditions)) if robot.driver.decay == FAST else 1.0
+        share = jnp.abs(balances.bridge_duty(robot, conditions)) if robot.driver.decay == FAST else 1.0
         left = left - share * robot.motor.voltage_back(turning)
     open_circuit = (conditions.open > 0.5) | (conditions.motor_speed is not None)
     current = jnp.where(open_circuit, 0.0, robot.motor.current_stall(left))
@@ -182,15 +182,16 @@ def drive(
     max_steps: int = 4096,
     *,
     rolling: bool = False,
-) -> Trajectory:
-    """Runs one robot from standstill (or rolling) under constant conditions and returns the given times.
+) -> DriveTrajectory:
+    """Simulates one robot over time under constant conditions, from standstill or rolling, and returns the given
+    times.
 
     Args:
         robot: any robot. Its parameters may be tracers.
-        conditions: one run, scalar fields.
-        times: increasing, from 0 [s]. The last one ends the run.
+        conditions: conditions of one run, scalar fields.
+        times: increasing times, from 0 [s]. The run ends at the last one.
         tolerance: relative and (in units of 10 A, 1000 rad/s, 1 m/s) absolute error of a step.
-        max_steps: integration steps after which a run has `failed`.
+        max_steps: number of integration steps after which a run has `failed`.
         rolling: True to start at the operating point of the steady fidelity, or with the sliding speed at V_s if it
             would slide. Derivatives pass through it. False: from standstill.
 
@@ -216,9 +217,9 @@ def drive(
         static = jax.vmap(lambda y: standing_signals(robot, conditions, state_of_unknowns(robot, y)))(ys)
         signals = jax.tree.map(lambda rest, travel: jnp.where(parked, rest, travel), static, signals)
     end = jax.tree.map(lambda x: x[-1], signals)
-    last = balances.commanded(robot, conditions, state_of_unknowns(robot, ys[-1]))
-    status = _status(robot, last, end, parked, went)
-    return _recorded_part(
+    last = balances.with_controller_duty(robot, conditions, state_of_unknowns(robot, ys[-1]))
+    status = _status_of_run(robot, last, end, parked, went)
+    return _cut_at_empty_battery(
         robot,
         conditions,
         times,
@@ -229,9 +230,9 @@ def drive(
     )
 
 
-def _recorded_part(
+def _cut_at_empty_battery(
     robot: Robot, conditions: Conditions, times: Array, away: Array, signals: Signals, discharge: Scalar, end: Result
-) -> Trajectory:
+) -> DriveTrajectory:
     """The recorded part of a run: it ends with an empty battery, and all later numbers are NaN.
 
     The parabola of the battery alone would continue.
@@ -242,7 +243,7 @@ def _recorded_part(
     )
     valid = (end.status != BATTERY_EMPTY) & (end.status != FAILED)
     answer = withhold_numbers(end, valid, end.status != FAILED)
-    return Trajectory(times, away, signals, answer)
+    return DriveTrajectory(times, away, signals, answer)
 
 
 def _integrate_unknowns(
@@ -257,12 +258,12 @@ def _integrate_unknowns(
     max_steps: int,
     currents: int = 1,
 ) -> tuple[Float[Array, "times unknowns"], Array]:
-    """The unknowns at those times, and whether the integrator reached the last of them.
+    """Unknowns at the given times, and True if the integrator reached the last one.
 
     Args:
-        law: rates of the unknowns.
-        size: norm of their error.
-        moves: 0 for robots at rest, else 1.
+        law: function that returns the rates of the unknowns.
+        size: function that returns the norm of an error of the unknowns.
+        moves: 0 for robots that stay at rest, otherwise 1.
         currents: number of currents, the first of the unknowns.
     """
     import diffrax  # only here: the import takes half a second
@@ -291,7 +292,7 @@ def _integrate_unknowns(
 
 def _drive_turning(
     robot: Robot, conditions: Conditions, times: Array, tolerance: float, max_steps: int, rolling: bool
-) -> Trajectory:
+) -> DriveTrajectory:
     """`drive` for a robot with independently driven sides. Its signals have a last axis of left and right side."""
     y0 = circling.turning_start(robot, conditions, rolling)
     parked = jnp.asarray(False) if rolling else circling.holds(robot, conditions)
@@ -299,16 +300,16 @@ def _drive_turning(
     ys, went = _integrate_unknowns(
         circling.turning_rates, circling.norm, robot, conditions, moves, y0, times, tolerance, max_steps, len(SIDES)
     )
-    motion = jax.vmap(lambda y: circling.motion_of(robot, y))(ys)
+    motion = jax.vmap(lambda y: circling.motion_of_unknowns(robot, y))(ys)
     travel = jax.vmap(lambda m: balances.turning_signals(robot, conditions, m))(motion)
     end = jax.tree.map(lambda x: x[-1], (travel, motion))
-    status = jnp.where(parked, STALLED, circling.status_moving(robot, conditions, *end))
+    status = jnp.where(parked, STALLED, circling.status_after_run(robot, conditions, *end))
     status = jnp.where(went, status, FAILED)
-    away, answer = jnp.hypot(motion.place_x, motion.place_y), circling.result_of(robot, end[0], status)
-    return _recorded_part(robot, conditions, times, away, travel.signals, motion.discharge, answer)
+    away, answer = jnp.hypot(motion.place_x, motion.place_y), circling.result_of_turn(robot, end[0], status)
+    return _cut_at_empty_battery(robot, conditions, times, away, travel.signals, motion.discharge, answer)
 
 
-def _status(robot: Robot, conditions: Conditions, end: Signals, parked: Array, done: Array) -> Array:
+def _status_of_run(robot: Robot, conditions: Conditions, end: Signals, parked: Array, done: Array) -> Array:
     voltage = voltage_at_rest(robot, conditions) if conditions.voltage_follows else end.voltage
     status = status_moving(robot, conditions, end, voltage)
     status = jnp.where(parked, STALLED, status)
@@ -324,20 +325,22 @@ def drive_batch(
     times: Float[Array, " times"],
     tolerance: float = 1e-6,
     max_steps: int = 4096,
-) -> Trajectory:
-    """`drive` over a batch of conditions (leading axis of every field) for one robot, compiled."""
+) -> DriveTrajectory:
+    """`drive` for one robot over a batch of conditions (first axis of every field), compiled."""
     return jax.vmap(lambda c: drive(robot, c, times, tolerance, max_steps))(conditions)
 
 
-def _settled(robot: Robot, conditions: Conditions) -> Result:
+def _settled_results(robot: Robot, conditions: Conditions) -> Result:
     # A table of settled runs does not record their starts. A start from standstill slides first, at μ_d; on a slope
     # between μ_d and μ_s it never grips, although it was measured there. Hence a rolling start, as in `track`.
     times = jnp.asarray([0.0, TIME_SETTLED])
     return jax.vmap(lambda c: drive(robot, c, times, rolling=True).result)(conditions)
 
 
-def _run(robot: Robot, conditions: Conditions, options: Mapping[str, float], progress: Progress | None = None) -> Run:
-    return Run(drive_batch(robot, conditions, jnp.asarray([0.0, options["duration"]])).result)
+def _run_batch(
+    robot: Robot, conditions: Conditions, options: Mapping[str, float], progress: Progress | None = None
+) -> RunBatch:
+    return RunBatch(drive_batch(robot, conditions, jnp.asarray([0.0, options["duration"]])).result)
 
 
 def _history_instants(duration: float) -> np.ndarray:
@@ -347,14 +350,14 @@ def _history_instants(duration: float) -> np.ndarray:
     return np.unique(np.round(np.concatenate([first, early, np.linspace(0.0, duration, SAMPLES)]), 9))
 
 
-def _histories(
+def _run_histories(
     robot: Robot, conditions: Conditions, options: Mapping[str, float], progress: Progress | None = None
-) -> Run:
+) -> RunBatch:
     kept = drive_batch(robot, conditions, jnp.asarray(_history_instants(options["duration"])))
-    return Run(kept.result, history=History.of(robot, kept.time, kept.distance, kept.signals))
+    return RunBatch(kept.result, history=History.of(robot, kept.time, kept.distance, kept.signals))
 
 
-def _from_standstill(robot: Robot, conditions: Conditions) -> list[str]:
+def _standstill_cautions(robot: Robot, conditions: Conditions) -> list[str]:
     run = drive_batch(robot, conditions, jnp.asarray([0.0, TIME_SETTLED]))
     rows = ", ".join(str(k + 1) for k in np.flatnonzero(np.asarray(run.result.status) != CONVERGED))
     if not rows:
@@ -365,4 +368,6 @@ def _from_standstill(robot: Robot, conditions: Conditions) -> list[str]:
     ]
 
 
-FIDELITY = Fidelity("drive", settled=_settled, run=_run, histories=_histories, cautions=_from_standstill)
+FIDELITY = Fidelity(
+    "drive", settled=_settled_results, run=_run_batch, histories=_run_histories, cautions=_standstill_cautions
+)

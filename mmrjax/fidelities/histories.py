@@ -1,12 +1,12 @@
-"""Fidelity `drive` on a given time grid, with cheap derivatives in many directions at once.
+"""Fidelity `drive` on a given time grid, with derivatives in many directions at low cost.
 
 The rates are those of `drive`. The method is implicit with fixed steps: SDIRK2, two stages, order 2, L-stable and
 stiffly accurate (Alexander, Diagonally implicit Runge-Kutta methods for stiff O.D.E.'s, SIAM J. Numer. Anal. 14
-(1977)). Derivatives follow from the implicit function theorem, stage by stage: linear equations with the matrix
-of Newton's method at the solution. A further direction costs one tangent of the rates per stage, instead of a
-rollout. The Rodas4 of `drive` takes two thirds of the time for a run on the same grid. For each direction, however,
-it needs six stages and the derivative of a Jacobian. On a fixed grid no error control shortens its steps at kinks of
-friction (measured in docs/lab/figures.md).
+(1977)). Derivatives follow from the implicit function theorem, stage by stage: linear equations with the matrix of
+Newton's method at the solution. A further direction costs one tangent of the rates per stage, instead of a rollout.
+The Rodas4 of `drive` takes two thirds of the time for a run on the same grid. For each direction, however, it needs
+six stages and the derivative of a Jacobian. On a fixed grid no error control shortens its steps at kinks of friction
+(measured in docs/lab/figures.md).
 
 After a jump of the voltage the current lags by L / R, often much less than a step. SDIRK2 leaves up to a fifth of the
 jump at the end of such a step. The lag of the last jump therefore decays exponentially in every step, and the method
@@ -44,7 +44,7 @@ from mmrjax.model.rig import interpolate
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import Signals
 from mmrjax.numerics.linear_equations import invert, solve
-from mmrjax.numerics.rarely import compute_rarely
+from mmrjax.numerics.rarely import compute_if_needed
 from mmrjax.numerics.rosenbrock import Unknowns
 
 T = TypeVar("T")
@@ -86,11 +86,11 @@ def time_grid(
     """Instants from 0 to the last of `times` [s], including `times` and `changes`.
 
     Args:
-        changes: instants of changes of the motors' input [s].
+        changes: times at which the motors' command changes [s].
         sizes: size of each change relative to a usual one. The first step after a smaller change is longer.
-        longest: longest step, if `STEPS` permit it [s]. An array: for each interval between `times`.
+        longest: longest step, if `STEPS` allows it [s]. An array has a value for each interval between `times`.
         start, change: first step and growth of the steps after the start and after changes.
-        parts: number of equal steps in place of each.
+        parts: number of equal steps into which each step is divided.
     """
     last = float(np.max(times, initial=0.0))
     changes = np.zeros(0) if changes is None else np.asarray(changes, float)
@@ -106,11 +106,11 @@ def time_grid(
     since, first, grows = begins[which], first[which], grows[which]
     knee = np.maximum((longest - first) / grows, 0.0)
 
-    def clock(t: np.ndarray) -> np.ndarray:  # number of steps up to t: ∫ dt / min(longest, first + grows t)
+    def step_count(t: np.ndarray) -> np.ndarray:  # number of steps up to t: ∫ dt / min(longest, first + grows t)
         young = np.log1p(grows * np.minimum(t, knee) / first) / grows
         return young + np.maximum(t - knee, 0.0) / longest
 
-    at, ends, at_knee = clock(times[:-1] - since), clock(times[1:] - since), clock(knee)
+    at, ends, at_knee = step_count(times[:-1] - since), step_count(times[1:] - since), step_count(knee)
     instants = []
     for k in range(len(times) - 1):
         count = max(1, int(np.ceil(ends[k] - at[k] - 1e-9)))
@@ -122,14 +122,14 @@ def time_grid(
     return np.interp(np.arange((len(whole) - 1) * parts + 1) / parts, np.arange(len(whole)), whole)
 
 
-def _in_time(conditions: Conditions) -> tuple[Conditions, Conditions]:
-    """The conditions that change between instants, and the constant ones, each with None in the other fields."""
+def _split_conditions(conditions: Conditions) -> tuple[Conditions, Conditions]:
+    """Conditions that change between instants, and constant ones. Each has None in the other's fields."""
     return eqx.partition(conditions, lambda x: jnp.ndim(x) > 0)
 
 
-def first_instant(robot: Robot, conditions: Conditions) -> tuple[Conditions, Unknowns]:
+def first_conditions_and_state(robot: Robot, conditions: Conditions) -> tuple[Conditions, Unknowns]:
     """Conditions and state of a run at its first instant."""
-    changing, constant = _in_time(conditions)
+    changing, constant = _split_conditions(conditions)
     held = eqx.combine(jax.tree.map(lambda x: x[0], changing), constant)
     return held, drive_start(robot, held)
 
@@ -159,18 +159,18 @@ class LinearisedRun(eqx.Module):
     lags: Float[Array, "steps rates unknowns"]
 
 
-def _current(y: Unknowns) -> Unknowns:
+def _unit_vector_of_current(y: Unknowns) -> Unknowns:
     """Unit vector of the current among the unknowns."""
     return jnp.eye(len(y), dtype=y.dtype)[CURRENT]
 
 
-class Lag(eqx.Module):
-    """Excess of a current after a jump of its voltage. It decays within a step.
+class CurrentLag(eqx.Module):
+    """Difference of a current from its settled value after a voltage jump. It decays within a step.
 
     Attributes:
-        begin, end: lag at the beginning and the end of a step.
+        begin, end: difference at the begin and end of a step.
         decay: rate of the decay [1/s].
-        means: means over the consecutive parts of a step that its stages weigh.
+        means: means over the parts of a step, as its stages need them.
     """
 
     begin: Float[Array, ""]
@@ -180,12 +180,12 @@ class Lag(eqx.Module):
 
 
 class RunStep(eqx.Module):
-    """A step of a run, or all of them, with fields of shape (steps, ...).
+    """One time step of a run, or all of them, with fields of shape (steps, ...).
 
     Attributes:
-        length: [s].
-        since: time from the last jump of the current's input to the start of the step [s].
-        begun: 0 before the first jump of a run from rest, which begins with one, else 1.
+        length: length [s].
+        since: time from the last jump of the current's command to the begin of the step [s].
+        begun: 0 before the first jump of a run that starts from rest, otherwise 1.
         before, now: the changing conditions before that jump and in the step.
         before: None if no lag follows a jump.
     """
@@ -214,14 +214,14 @@ class RunStep(eqx.Module):
         before = eqx.combine(self.before, constant)
         nothing = [x if x is None else self.begun * x for x in (before.duty, before.motor_current)]
         before = eqx.tree_at(lambda c: [c.duty, c.motor_current], before, nothing, is_leaf=lambda x: x is None)
-        states = jnp.stack([y, y, y + MORE * _current(y)])
+        states = jnp.stack([y, y, y + MORE * _unit_vector_of_current(y)])
         each = jax.tree.map(lambda before, now: jnp.stack([before, now, now]), before, now)
         return jax.vmap(rate)(states, each)
 
 
 def run_steps(conditions: Conditions, times: Float[Array, " times"]) -> tuple[RunStep, Conditions]:
-    """Every step of a run, and the conditions that do not change."""
-    changing, constant = _in_time(conditions)
+    """All steps of a run, and the conditions that do not change."""
+    changing, constant = _split_conditions(conditions)
     now = jax.tree.map(lambda x: x[:-1], changing)
     jumped = jnp.zeros(len(times) - 1, bool)
     for x in (getattr(now, name) for name in DRIVING):
@@ -235,53 +235,57 @@ def run_steps(conditions: Conditions, times: Float[Array, " times"]) -> tuple[Ru
     return RunStep(jnp.diff(times), since, begun, before if conditions.motor_speed is None else None, now), constant
 
 
-def _lag(
+def _lag_of_step(
     rate: Float[Array, " rates"],
     step: RunStep,
     current: Scalar,
     limit: Scalar,
     parts: Pair,
     wait: Scalar = 0.0,
-) -> Lag:
+) -> CurrentLag:
     """Lag of a step after the last jump, from the rates at its start: the remainder of its decay.
 
-    `parts` and `wait` as of `_decaying`. None if the driver's limit acts on the `current`, which then follows the
-    limit at once.
+    `parts` and `wait` as of `_decay_over_parts`. None if the driver's limit acts on the `current`, which then follows
+    the limit at once.
     """
     if not len(rate):
-        return _decaying(jnp.zeros(()), jnp.zeros(()), parts, wait)
+        return _decay_over_parts(jnp.zeros(()), jnp.zeros(()), parts, wait)
     slope = (rate[1] - rate[2]) / MORE
     follows = slope > 0  # except when a diode begins to block
     decay = jnp.where(follows, slope, 1.0)
     left = (rate[0] - rate[1]) / decay * jnp.exp(-decay * step.since)
     follows &= jax.lax.stop_gradient(jnp.abs(current - left)) <= limit
-    return _decaying(jnp.where(follows, left, 0.0), decay, parts, wait)
+    return _decay_over_parts(jnp.where(follows, left, 0.0), decay, parts, wait)
 
 
-def _decaying(begin: Array, decay: Array, parts: Pair, wait: Scalar = 0.0) -> Lag:
+def _decay_over_parts(begin: Array, decay: Array, parts: Pair, wait: Scalar = 0.0) -> CurrentLag:
     """Lag in two parts of a step [s], from its value at the start. `wait` lies between them [s]."""
     second = parts[0] + wait
     currents = begin * jnp.exp(-decay * jnp.stack([jnp.zeros(()), second]))
     z = decay * parts
     means = jnp.where(z > 0, -jnp.expm1(-z) / jnp.where(z > 0, z, 1.0), 1.0) * currents
-    return Lag(begin, means, begin * jnp.exp(-decay * (second + parts[1])), decay)
+    return CurrentLag(begin, means, begin * jnp.exp(-decay * (second + parts[1])), decay)
 
 
-def _windings(robot: Robot, constant: Conditions, step: RunStep, y: Unknowns) -> Float[Array, " rates"]:
+def _lag_rates(robot: Robot, constant: Conditions, step: RunStep, y: Unknowns) -> Float[Array, " rates"]:
     """Rates that determine the lag of a step, see `Step.rates_at_start`."""
     return step.rates_at_start(constant, lambda y, held: winding_rate(robot, held, y), y)
 
 
-def _lag_of(robot: Robot, constant: Conditions, step: RunStep, y: Unknowns) -> Lag:
-    return _lag(_windings(robot, constant, step, y), step, y[CURRENT], _limit(robot), step.length * _WEIGHED)
+def _lag_of_robot(robot: Robot, constant: Conditions, step: RunStep, y: Unknowns) -> CurrentLag:
+    return _lag_of_step(
+        _lag_rates(robot, constant, step, y), step, y[CURRENT], _current_limit(robot), step.length * _WEIGHED
+    )
 
 
-def _limit(robot: Robot) -> Scalar:
+def _current_limit(robot: Robot) -> Scalar:
     """The driver's current limit in the unit of the current."""
     return robot.driver.current_limit / drive_units(robot)[CURRENT]
 
 
-def _stage(law: Callable[[Array], Array], known: Array, guess: Array, h: Array, mean: Array, decay: Array) -> Array:
+def _solve_stage(
+    law: Callable[[Array], Array], known: Array, guess: Array, h: Array, mean: Array, decay: Array
+) -> Array:
     """Solves Y = known + γ h f(Y) for the unknowns without the lag. The lag acts by its mean."""
     known = known + _GAMMA * h * decay * mean
 
@@ -311,8 +315,8 @@ class RunStates(eqx.Module):
     Attributes:
         stages: unknowns at both stages of every step, without lags.
         ends: states at the end of each step.
-        sides: direction of a shaft (see `shaft_direction`) at the start and end of a step. They differ if it
-            stops or leaves rest within the step.
+        sides: direction of a shaft (see `shaft_direction`) at the start and end of a step. They differ if it stops or
+            leaves rest within the step.
         before: time in such a step until it stops, or leaves rest [s].
         since: start of the last part of a step [s], later if friction holds the shaft after it stops.
         rest: unknowns at that moment.
@@ -326,7 +330,7 @@ class RunStates(eqx.Module):
     rest: Float[Array, "steps unknowns"]
 
 
-class _Part(eqx.Module):
+class _StepPart(eqx.Module):
     """A step, or its part before or after a shaft stops, or while it waits at rest.
 
     Attributes:
@@ -351,35 +355,35 @@ class _Part(eqx.Module):
 
 
 def solve_states(robot: Robot, conditions: Conditions, times: Float[Array, " times"]) -> RunStates:
-    """Solves one run from standstill.
+    """Solves the equations of one run from standstill.
 
     Friction jumps when a shaft turns through rest. Each step therefore uses the friction of one direction. A step in
-    which the shaft stops is split at that moment (Filippov systems; Leine and Nijmeijer, Dynamics
-    and Bifurcations of Non-Smooth Mechanical Systems, 2004).
+    which the shaft stops is split at that moment (Filippov systems; Leine and Nijmeijer, Dynamics and Bifurcations of
+    Non-Smooth Mechanical Systems, 2004).
 
     Args: as for `history_signals`.
     """
     steps, constant = run_steps(conditions, times)
-    of_first, first_state = first_instant(robot, conditions)
+    of_first, first_state = first_conditions_and_state(robot, conditions)
     # change of the unknowns with motor speed when shafts and robot move as one, in their units
     size, per_speed = drive_units(robot), robot.chassis(of_first.configuration).radius / robot.gearbox.ratio
     along = jnp.zeros(len(size)).at[MOTOR].set(1.0).at[GROUND].set(per_speed * size[MOTOR] / size[GROUND])
 
     def taken(y: Array, step: RunStep) -> tuple[Array, RunStates]:
-        held, lag = step.held(constant), _lag_of(robot, constant, step, y)
+        held, lag = step.held(constant), _lag_of_robot(robot, constant, step, y)
         law = functools.partial(drive_rates, robot, held)
 
-        def turned(part: _Part) -> _Part:
-            mine = _decaying(part.lag, lag.decay, part.length * _WEIGHED)
-            first = part.begin - mine.begin * _current(y)
+        def turned(part: _StepPart) -> _StepPart:
+            mine = _decay_over_parts(part.lag, lag.decay, part.length * _WEIGHED)
+            first = part.begin - mine.begin * _unit_vector_of_current(y)
 
             def stage(given: tuple[Array, Array], mean: Array) -> tuple[tuple[Array, Array], Array]:
                 now = functools.partial(law, way=part.side)
-                stage_result = _stage(now, *given, part.length, mean * _current(y), mine.decay)
+                stage_result = _solve_stage(now, *given, part.length, mean * _unit_vector_of_current(y), mine.decay)
                 return (first + (1 - _GAMMA) / _GAMMA * (stage_result - first), stage_result), stage_result
 
             stages = jax.lax.scan(stage, (first, first), mine.means)[1]
-            end = stages[1] + mine.end * _current(y)
+            end = stages[1] + mine.end * _unit_vector_of_current(y)
             before, after = part.begin[MOTOR], end[MOTOR]
             nears = jnp.where(part.turn == 0, part.side * after < 0, part.turn < TURNS)
             rests, waited, rest = part.turn == TURNS, part.turn == WAITS, end - after * along
@@ -389,10 +393,10 @@ def solve_states(robot: Robot, conditions: Conditions, times: Float[Array, " tim
             by_newton = part.length - after / jnp.where(slows == 0, 1.0, slows)
             to_rest = jnp.clip(jnp.where(part.turn == 0, on_line, by_newton), 0.0, step.length)
             since = part.since + jnp.where(rests | waited, part.length, 0.0)
-            side, then, wait = _side(robot, held, rest, step.length - since)
+            side, then, wait = _shaft_side(robot, held, rest, step.length - since)
             left = jnp.where(rests & (wait > 0), wait, step.length - since)
             after_rest = jnp.where(wait > 0, WAITS, WAITS + 1)
-            return _Part(
+            return _StepPart(
                 jnp.where(nears, part.turn + 1, jnp.where(rests, after_rest, WAITS + 2 - waited)),
                 jnp.where(rests, rest, jnp.where(waited, end, part.begin)),
                 jnp.where(rests | waited, mine.end, part.lag),
@@ -405,9 +409,9 @@ def solve_states(robot: Robot, conditions: Conditions, times: Float[Array, " tim
                 end,
             )
 
-        side, then, wait = _side(robot, held, y, step.length)
+        side, then, wait = _shaft_side(robot, held, y, step.length)
         turn, length, none = jnp.where(wait > 0, WAITS, 0), jnp.where(wait > 0, wait, step.length), jnp.zeros(())
-        whole = _Part(turn, y, lag.begin, none, length, side, then, wait, jnp.stack([y, y]), y)
+        whole = _StepPart(turn, y, lag.begin, none, length, side, then, wait, jnp.stack([y, y]), y)
         last = jax.lax.while_loop(lambda part: part.turn < WAITS + 2, turned, whole)
         sides = jnp.stack([side, last.side])
         return last.end, RunStates(last.stages, last.end, sides, last.before, last.since, last.begin)
@@ -415,7 +419,7 @@ def solve_states(robot: Robot, conditions: Conditions, times: Float[Array, " tim
     return jax.lax.scan(taken, first_state, steps)[1]
 
 
-def _side(robot: Robot, conditions: Conditions, y: Array, length: Array) -> tuple[Array, Array, Array]:
+def _shaft_side(robot: Robot, conditions: Conditions, y: Array, length: Array) -> tuple[Array, Array, Array]:
     """Direction of a shaft in a part of a step, after it has waited, and that time (see `shaft_direction`).
 
     0 if shafts and load stop separately. It waits at most for the part's length [s].
@@ -430,13 +434,13 @@ def _side(robot: Robot, conditions: Conditions, y: Array, length: Array) -> tupl
 def linearise_run(
     robot: Robot, conditions: Conditions, times: Float[Array, " times"], known: RunStates | None = None
 ) -> LinearisedRun:
-    """A run and its equations linearised along it.
+    """A solved run, with its equations linearised along it.
 
     Args: as for `history_signals`, and `known`: its states, if computed.
     """
     run = solve_states(robot, conditions, times) if known is None else known
     steps, constant = run_steps(conditions, times)
-    first_state = first_instant(robot, conditions)[1]
+    first_state = first_conditions_and_state(robot, conditions)[1]
     begins = jnp.concatenate([first_state[None], run.ends[:-1]])
     # A step to rest and the one from it use an approximant of the exponential. For a current that lags by a quarter
     # of such a part, implicit Euler would keep a fifth of the decayed excess.
@@ -451,11 +455,11 @@ def linearise_run(
         begin, end, stages, (rest, wait), sides, spans, passes, step = given
         held = step.held(constant)
         one = jnp.eye(len(end), dtype=end.dtype)
-        current = _current(end)
+        current = _unit_vector_of_current(end)
 
-        by_begin, rate = jax.jacfwd(lambda y: (_windings(robot, constant, step, y),) * 2, has_aux=True)(begin)
+        by_begin, rate = jax.jacfwd(lambda y: (_lag_rates(robot, constant, step, y),) * 2, has_aux=True)(begin)
         parts = jnp.where(passes, spans, step.length * _WEIGHED)
-        lagging = lambda r: (_lag(r, step, begin[CURRENT], _limit(robot), parts, wait),) * 2  # noqa: E731
+        lagging = lambda r: (_lag_of_step(r, step, begin[CURRENT], _current_limit(robot), parts, wait),) * 2  # noqa: E731
         by_rate, lag = jax.jacfwd(lagging, has_aux=True)(rate)
         lags = jnp.stack([lag.begin, lag.begin * jnp.exp(-lag.decay * (spans[0] + wait)), lag.end])
         ends = jnp.stack([begin, rest, end]) - lags[:, None] * current
@@ -465,7 +469,7 @@ def linearise_run(
         weight = jnp.where(passes, one - z / 2 + z @ z / 6, one)  # Padé (0, 3): 1 / (1 - z + z²/2 - z³/6)
         first, second = jax.vmap(invert)(one - z @ weight)
         stops, ways = passes & (sides[0] != HELD), sides.at[1].set(jnp.where(wait > 0, HELD, sides[1]))
-        jump = compute_rarely(stops, _jump, (robot, held, rest, ways), jnp.zeros_like(end))
+        jump = compute_if_needed(stops, _sensitivity_jump, (robot, held, rest, ways), jnp.zeros_like(end))
         # The start of the second stage depends on the first stage and on the change before the step.
         by_first = jnp.where(passes, one + jump[:, None] * one[MOTOR], (1 - _GAMMA) / _GAMMA * one)
         by_before = jnp.where(passes, 0.0, 1 - (1 - _GAMMA) / _GAMMA) * one
@@ -480,12 +484,12 @@ def linearise_run(
         return places, carries + lags.T @ by_begin, gains, lags
 
     each = begins, run.ends, run.stages, rests, run.sides, spans, passes, steps
-    places, carries, gains, lags = _of_steps(jax.lax.map(jax.vmap(linear), _in_blocks(each)), len(h))
+    places, carries, gains, lags = _steps_of_blocks(jax.lax.map(jax.vmap(linear), _arrange_in_blocks(each)), len(h))
     return LinearisedRun(begins, run.ends, places, run.sides, passes, clock, carries, gains, lags)
 
 
 @eqx.filter_custom_jvp
-def _ends(
+def _unknowns_at_ends(
     robot: Robot,
     conditions: Conditions,
     times: Float[Array, " times"],
@@ -495,8 +499,8 @@ def _ends(
     return known.ends
 
 
-@_ends.def_jvp
-def _response(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
+@_unknowns_at_ends.def_jvp
+def _ends_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
     """Tangents with respect to the robot's parameters."""
     (robot, conditions, times, states), moved = primals, tangents[0]
     along = states if isinstance(states, LinearisedRun) else linearise_run(robot, conditions, times, states)
@@ -508,7 +512,7 @@ def _response(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
     def source(_: Array, y: Array, held: Conditions, way: Array) -> Array:
         return change(lambda r: drive_rates(r, held, y, way))
 
-    begin = change(lambda r: first_instant(r, conditions)[1])
+    begin = change(lambda r: first_conditions_and_state(r, conditions)[1])
     return states.ends, run_response(conditions, along, source, lambda t, y, dy, _: dy, begin)
 
 
@@ -519,7 +523,7 @@ def run_response(
     seen: Callable[[Array, Array, Array, Conditions], Array],
     begin: Array,
 ) -> Array:
-    """Response of a run to small changes of its rates.
+    """Response of a run to small changes of its rates of change.
 
     Args:
         conditions: as for `history_signals`.
@@ -552,11 +556,11 @@ def run_response(
         whole = jax.vmap(lambda t, y, dy, changing: seen(t, y, dy, eqx.combine(changing, constant)))
         return last, whole(along.clock[:, 2], along.ends, changes, then)
 
-    each = along, steps, jax.tree.map(lambda x: x[1:], _in_time(conditions)[0])
-    return _of_steps(jax.lax.scan(block, begin, _in_blocks(each))[1], len(along.clock))
+    each = along, steps, jax.tree.map(lambda x: x[1:], _split_conditions(conditions)[0])
+    return _steps_of_blocks(jax.lax.scan(block, begin, _arrange_in_blocks(each))[1], len(along.clock))
 
 
-def _in_blocks(of_steps: T) -> T:
+def _arrange_in_blocks(of_steps: T) -> T:
     """Data of each step, arranged in blocks of steps. The last block is padded with the last step."""
 
     def filled(x: Array) -> Array:
@@ -566,12 +570,12 @@ def _in_blocks(of_steps: T) -> T:
     return jax.tree.map(filled, of_steps)
 
 
-def _of_steps(blocks: T, count: int) -> T:
-    """Inverse of `_in_blocks` for this number of steps."""
+def _steps_of_blocks(blocks: T, count: int) -> T:
+    """Inverse of `_arrange_in_blocks` for this number of steps."""
     return jax.tree.map(lambda x: x.reshape(x.shape[0] * BLOCK, *x.shape[2:])[:count], blocks)
 
 
-def _jump(robot: Robot, conditions: Conditions, y: Unknowns, sides: Pair) -> Unknowns:
+def _sensitivity_jump(robot: Robot, conditions: Conditions, y: Unknowns, sides: Pair) -> Unknowns:
     """Jump of the unknowns' sensitivity at a passage through rest, per motor speed before it: (f⁺ - f⁻) / f⁻.
 
     The moment of rest moves by -1 / f⁻ (Filippov systems; Leine and Nijmeijer 2004, Section 7.3).
@@ -604,25 +608,25 @@ def history_signals(
     friction holds them. For others friction at rest is smooth: gravity makes a resting robot creep, below a tenth of
     V_s.
     """
-    changing, constant = _in_time(conditions)
-    ys, sides = _nodes(robot, conditions, times, known)
+    changing, constant = _split_conditions(conditions)
+    ys, sides = _unknowns_of_run(robot, conditions, times, known)
     each = ys, jnp.append(sides[:, 0], sides[-1, 1]), changing
     if at is not None:
         each = jax.tree.map(lambda x: x[at], each)
-    return jax.vmap(lambda y, way, now: _shown(robot, eqx.combine(now, constant), y, way))(*each)
+    return jax.vmap(lambda y, way, now: _signals_of_instant(robot, eqx.combine(now, constant), y, way))(*each)
 
 
-def _nodes(
+def _unknowns_of_run(
     robot: Robot, conditions: Conditions, times: Float[Array, " times"], known: LinearisedRun | None
 ) -> tuple[Float[Array, "times unknowns"], Float[Array, "steps 2"]]:
     """Unknowns at every instant, and `sides` of every step."""
     still = jax.lax.stop_gradient(robot)
     run = solve_states(still, conditions, times) if known is None else known
-    ends = _ends(robot, conditions, times, run)
-    return jnp.concatenate([first_instant(robot, conditions)[1][None], ends]), run.sides
+    ends = _unknowns_at_ends(robot, conditions, times, run)
+    return jnp.concatenate([first_conditions_and_state(robot, conditions)[1][None], ends]), run.sides
 
 
-def _shown(robot: Robot, conditions: Conditions, y: Array, way: Array) -> Signals:
+def _signals_of_instant(robot: Robot, conditions: Conditions, y: Array, way: Array) -> Signals:
     """Signals of an instant, in static equilibrium if friction holds shafts and load."""
     state = state_of_unknowns(robot, y)
     signals = moving(robot, conditions, state)
@@ -634,11 +638,11 @@ def _shown(robot: Robot, conditions: Conditions, y: Array, way: Array) -> Signal
 
 
 class StepCourse(eqx.Module):
-    """Course of steps of a run between their instants. Signals have fields of shape (steps,).
+    """Course of a run within its steps. Signals have fields of shape (steps,).
 
     Attributes:
-        first: at the beginning.
-        begin, end: ends of the line that the signals follow apart from a decaying lag.
+        first: signals at the begin of the step.
+        begin, end: ends of the straight line that the signals follow, apart from a decaying lag.
         decays: exponent of that decay over the step, shape (steps,).
     """
 
@@ -649,7 +653,7 @@ class StepCourse(eqx.Module):
 
     @staticmethod
     def read(steps: tuple[Array, ...], share: Float[Array, " steps"]) -> Float[Array, "steps ..."]:
-        """Readings at a share of each step.
+        """Readings at a fraction of each step.
 
         Args:
             steps: readings at `first`, `begin` and `end`, shape (steps, ...), and `decays`.
@@ -666,13 +670,13 @@ def course_between_instants(
     known: LinearisedRun | None = None,
     at: Int[Array, " places"] | None = None,
 ) -> StepCourse:
-    """Course of one run between its instants. The run is that of `history_signals`.
+    """Course of one run between its instants, for the run of `history_signals`.
 
     Args: as for `history_signals`, and `at`: steps to return, by the index of the instant at the start of each.
     """
-    ys, sides = _nodes(robot, conditions, times, known)
+    ys, sides = _unknowns_of_run(robot, conditions, times, known)
     steps, constant = run_steps(conditions, times)
-    then = jax.tree.map(lambda x: x[1:], _in_time(conditions)[0])
+    then = jax.tree.map(lambda x: x[1:], _split_conditions(conditions)[0])
     each = ys[:-1], ys[1:], steps, then, sides
     if at is not None:
         each = jax.tree.map(lambda x: x[at], each)
@@ -680,13 +684,13 @@ def course_between_instants(
     def one(y: Array, after: Array, step: RunStep, then: Conditions, sides: Array) -> StepCourse:
         held = step.held(constant)
         if step.before is None:  # the imposed quantity is itself linear
-            first = _shown(robot, held, y, sides[0])
+            first = _signals_of_instant(robot, held, y, sides[0])
             return StepCourse(
-                first, first, _shown(robot, eqx.combine(then, constant), after, sides[1]), jnp.zeros(())
+                first, first, _signals_of_instant(robot, eqx.combine(then, constant), after, sides[1]), jnp.zeros(())
             )
-        lag, current = _lag_of(robot, constant, step, y), _current(y)
+        lag, current = _lag_of_robot(robot, constant, step, y), _unit_vector_of_current(y)
         states = jnp.stack([y, y - lag.begin * current, after - lag.end * current])
-        rows = jax.vmap(lambda *at: jax.tree.map(jnp.asarray, _shown(robot, held, *at)))(
+        rows = jax.vmap(lambda *at: jax.tree.map(jnp.asarray, _signals_of_instant(robot, held, *at)))(
             states, sides[np.array([0, 0, 1])]
         )
         first, begin, end = (jax.tree.map(lambda x, k=k: x[k], rows) for k in range(3))

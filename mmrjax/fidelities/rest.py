@@ -1,4 +1,4 @@
-"""Rest: whether friction holds a standing robot, its current at rest, and the status of a run at its end."""
+"""Robots at rest: whether friction holds them, their current at rest, and the status at the end of a run."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from mmrjax.model.params import Scalar
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import NOT_SETTLED, SLIDES, STALLED, Signals, State
 from mmrjax.numerics import one_sided
-from mmrjax.numerics.rarely import compute_rarely
+from mmrjax.numerics.rarely import compute_if_needed
 
 #: Torque at the driving wheel equivalent to the whole weight of a side [N·m].
 TORQUE = 1.0
@@ -30,7 +30,7 @@ GAIN, STARTS = 1e-3, 1e-2
 HELD = 2.0
 
 
-def smallest(*values: Scalar) -> Array:
+def smallest_of(*values: Scalar) -> Array:
     """The smallest of some numbers, with the derivative of that number.
 
     The derivative of `jnp.minimum` is 0 if XLA computes an argument twice with different rounding, because it
@@ -57,7 +57,7 @@ def travel_direction(robot: Robot, conditions: Conditions) -> Array:
     mass = chassis.mass + conditions.payload if conditions.total_mass is None else conditions.total_mass
     stall = robot.motor.current_stall(voltage_at_rest(robot, conditions))
     if not conditions.voltage_follows:
-        most = robot.driver.current_limit * (1 + jnp.abs(balances.duty_given(robot, conditions)) * (1 / STEEPNESS))
+        most = robot.driver.current_limit * (1 + jnp.abs(balances.bridge_duty(robot, conditions)) * (1 / STEEPNESS))
         stall = one_sided.clip(stall, -most, most)
     stall = robot.motor.torque_electromagnetic(stall)
     weight = chassis.torque_weight(mass * (1 / robot.sides), conditions.slope)
@@ -71,7 +71,7 @@ def voltage_at_rest(robot: Robot, conditions: Conditions) -> Array:
         return jnp.asarray(robot.motor.voltage_back(conditions.motor_speed))
     if conditions.motor_current is not None:  # an amplifier's, see `balances.electrical`
         return jnp.asarray(robot.motor.resistance * conditions.motor_current)
-    return balances.duty_given(robot, conditions) * jnp.where(
+    return balances.bridge_duty(robot, conditions) * jnp.where(
         conditions.open > 0.5, 0.0, _source_at_rest(robot, conditions)
     )
 
@@ -82,14 +82,14 @@ def _source_at_rest(robot: Robot, conditions: Conditions) -> Array:
 
 
 def admitted_current(robot: Robot, conditions: Conditions, wanted: Scalar) -> tuple[Scalar, Scalar]:
-    """Current that limit and diode of the driver admit [A], and the voltage that holds back the rest [V].
+    """Current that limit and diode of the driver allow [A], and the voltage that blocks the rest [V].
 
     See `Driver.admitted`, with the resistance of a motor and its share of the battery's. An amplifier that imposes
     speed or current has neither limit nor diode.
     """
     if conditions.voltage_follows:
         return wanted, jnp.zeros_like(wanted)
-    battery, duty = robot.battery, balances.duty_given(robot, conditions)
+    battery, duty = robot.battery, balances.bridge_duty(robot, conditions)
     behind = robot.sides * battery.cells * battery.resistance * duty * robot.driver.share_drawn(duty)
     resistance = robot.motor.resistance + jnp.where(conditions.battery > 0.5, behind, 0.0)
     resistance, source = jax.lax.stop_gradient((resistance, _source_at_rest(robot, conditions)))
@@ -102,7 +102,7 @@ def without_diode(robot: Robot) -> Robot:
     return dataclasses.replace(robot, driver=dataclasses.replace(robot.driver, returns_current=True))
 
 
-def _carried(robot: Robot, conditions: Conditions, state: State, direction: Scalar) -> Signals:
+def _signals_about_to_turn(robot: Robot, conditions: Conditions, state: State, direction: Scalar) -> Signals:
     """Signals of a standing robot whose shafts turn, or are about to turn, in `direction`.
 
     Traction equals the robot's demand, clipped to the adhesion limit.
@@ -124,8 +124,11 @@ def standing_signals(robot: Robot, conditions: Conditions, state: State) -> Sign
         conditions: voltage or current imposed, no speed.
         state: state with the current that flows at rest.
     """
-    robot, conditions = robot.within(conditions.configuration), balances.commanded(robot, conditions, state)
-    chassis, gear, still = robot.chassis(conditions.configuration), robot.gearbox, _still(state)
+    robot, conditions = (
+        robot.within(conditions.configuration),
+        balances.with_controller_duty(robot, conditions, state),
+    )
+    chassis, gear, still = robot.chassis(conditions.configuration), robot.gearbox, _without_motion(state)
     # About to turn forward and backward: the two limits of friction.
     ends = [balances.settled_signals(robot, conditions, still, way)[0] for way in (1.0, -1.0)]
     ahead, back = ends
@@ -163,7 +166,7 @@ def standing_signals(robot: Robot, conditions: Conditions, state: State) -> Sign
     )
 
 
-def _still(state: State) -> State:
+def _without_motion(state: State) -> State:
     return dataclasses.replace(state, speed_motor=jnp.zeros_like(state.speed), speed=jnp.zeros_like(state.speed))
 
 
@@ -181,8 +184,10 @@ def holds(robot: Robot, conditions: Conditions) -> Array:
 
 
 def _ground_margin(forward: Signals, backward: Signals) -> Scalar:
-    """Adhesion less the pull of gravity beyond rolling resistance [-], negative if a robot slides down."""
-    along = -smallest(-backward.demand, forward.demand)
+    """Adhesion minus the pull of gravity that rolling resistance does not carry [-]. Negative if a robot slides
+    down.
+    """
+    along = -smallest_of(-backward.demand, forward.demand)
     return (forward.adhesion_limit - along) / forward.normal
 
 
@@ -193,15 +198,17 @@ def firmness(robot: Robot, conditions: Conditions, state: State) -> Scalar:
     robot or by sliding its movers under it. Its movers rest if gravity along the slope less rolling resistance is
     below the ground's adhesion.
     """
-    forward, backward = _about_to_turn(robot, conditions, state)
-    shafts = smallest(-forward.torque_net, backward.torque_net) / TORQUE
-    return smallest(shafts, _ground_margin(forward, backward)) if robot.has_ground else shafts
+    forward, backward = _signals_both_ways(robot, conditions, state)
+    shafts = smallest_of(-forward.torque_net, backward.torque_net) / TORQUE
+    return smallest_of(shafts, _ground_margin(forward, backward)) if robot.has_ground else shafts
 
 
-def _about_to_turn(robot: Robot, conditions: Conditions, state: State) -> tuple[Signals, Signals]:
+def _signals_both_ways(robot: Robot, conditions: Conditions, state: State) -> tuple[Signals, Signals]:
     """Signals of resting shafts that are about to turn forward, and backward."""
-    still = _still(state)
-    return _carried(robot, conditions, still, 1.0), _carried(robot, conditions, still, -1.0)
+    still = _without_motion(state)
+    return _signals_about_to_turn(robot, conditions, still, 1.0), _signals_about_to_turn(
+        robot, conditions, still, -1.0
+    )
 
 
 def shaft_direction(robot: Robot, conditions: Conditions, state: State) -> tuple[Array, Array]:
@@ -211,7 +218,7 @@ def shaft_direction(robot: Robot, conditions: Conditions, state: State) -> tuple
     If friction holds them only now, they leave rest when the current, which lags exponentially, exceeds it. An
     imposed speed turns them in any case, 0 if it is 0.
     """
-    conditions = balances.commanded(robot, conditions, state)
+    conditions = balances.with_controller_duty(robot, conditions, state)
     motor_speed, load = jnp.asarray(state.speed_motor), robot.chassis(conditions.configuration)
     slow = jnp.abs(motor_speed) * load.radius / robot.gearbox.ratio < load.speed_still
     at_once = jnp.zeros_like(motor_speed)
@@ -222,10 +229,10 @@ def shaft_direction(robot: Robot, conditions: Conditions, state: State) -> tuple
 
     def leaving(robot: Robot, conditions: Conditions, state: State) -> tuple[Array, Array]:
         settled = dataclasses.replace(state, current=current_at_rest(robot, conditions, state))
-        now, then = (_about_to_turn(robot, conditions, state_there) for state_there in (state, settled))
+        now, then = (_signals_both_ways(robot, conditions, state_there) for state_there in (state, settled))
         turned, later = (1.0 * (ahead.torque_net > 0) - 1.0 * (back.torque_net < 0) for ahead, back in (now, then))
         lacks, exceeds = (jnp.where(later > 0, ahead.torque_net, -back.torque_net) for ahead, back in (now, then))
-        winding = balances.driven_signals(robot, conditions, _still(state), None)
+        winding = balances.driven_signals(robot, conditions, _without_motion(state), None)
         rises, missing = winding.voltage_left / winding.inductance, settled.current - state.current
         waits = (turned == 0) & (later != 0) & (rises * missing > 0)
         share = jnp.where(waits, -lacks / jnp.where(waits, exceeds - lacks, 1.0), 0.0)
@@ -234,11 +241,11 @@ def shaft_direction(robot: Robot, conditions: Conditions, state: State) -> tuple
         stands = state.speed_motor == 0
         return jnp.where(stands, way, jnp.sign(state.speed_motor)), jnp.where(stands & waits, wait, 0.0)
 
-    return compute_rarely(slow, leaving, (robot, conditions, state), (jnp.sign(motor_speed), at_once))
+    return compute_if_needed(slow, leaving, (robot, conditions, state), (jnp.sign(motor_speed), at_once))
 
 
 def slides_in_place(robot: Robot, conditions: Conditions) -> Array:
-    """True if a robot slides, whose demand exceeds the limit of the ground, False if it stands.
+    """True if a robot slides although its demand exceeds the limit of the ground. False if it stands.
 
     It slides down if gravity less rolling resistance exceeds the adhesion. It slides in place if the motors turn the
     movers faster than V_s. Up to V_s the traction of the ground increases with sliding speed.
@@ -252,13 +259,13 @@ def slides_in_place(robot: Robot, conditions: Conditions) -> Array:
         spins = sense * conditions.motor_speed > sense * turning
     else:
         spun = dataclasses.replace(spun, current=current_settled(robot, conditions, spun))
-        spins = sense * _carried(robot, conditions, spun, sense).torque_net > 0
+        spins = sense * _signals_about_to_turn(robot, conditions, spun, sense).torque_net > 0
     forward, backward = (balances.demanded_signals(robot, conditions, still, way + none) for way in (1.0, -1.0))
     return (_ground_margin(forward, backward) < 0) | spins
 
 
 def current_settled(robot: Robot, conditions: Conditions, state: State) -> Scalar:
-    """Current [A] that settles at the motor speed of `state`, by the secant of its voltage balance."""
+    """Current that settles at the motor speed of `state` [A], by the secant method on its voltage balance."""
 
     def left(wanted: Scalar) -> Scalar:
         current, held = admitted_current(robot, conditions, wanted)
@@ -275,7 +282,7 @@ def current_settled(robot: Robot, conditions: Conditions, state: State) -> Scala
 
 def current_at_rest(robot: Robot, conditions: Conditions, state: State) -> Scalar:
     """Current that settles in a standing robot [A]."""
-    return current_settled(robot, conditions, _still(state))
+    return current_settled(robot, conditions, _without_motion(state))
 
 
 def is_at_rest(sense: Array, voltage: Scalar, theoretical: Scalar, speed: Scalar, rest: Scalar) -> Array:

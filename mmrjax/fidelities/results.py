@@ -16,7 +16,7 @@ from mmrjax.compile.precision import computed_outside_trace, on_host
 from mmrjax.compile.programs import has_tracer
 from mmrjax.errors import UsageError, allowed_words, count_noun
 from mmrjax.fidelities import outputs
-from mmrjax.fidelities.base import Fidelity, History, Run
+from mmrjax.fidelities.base import Fidelity, History, RunBatch
 from mmrjax.missions import mission_batch
 from mmrjax.missions.mission import Mission
 from mmrjax.model import channels
@@ -32,8 +32,8 @@ HISTORIES = 1000
 
 
 @dataclasses.dataclass(frozen=True)
-class Pending:
-    """A checked batch that has not been computed.
+class PendingBatch:
+    """A checked batch that is computed when a result is read.
 
     Attributes:
         robot: concrete.
@@ -50,7 +50,7 @@ class Pending:
         """Readings of the robot's instruments by channel, and the status codes as `status`."""
         outputs, names = self.fidelity.outputs, (*channels.channel_names(self.robot.channels), STATUS)
         assert outputs is not None
-        return _in_chunks(self.fidelity, lambda runs: outputs(self.robot, runs, names), self.conditions)
+        return _map_in_chunks(self.fidelity, lambda runs: outputs(self.robot, runs, names), self.conditions)
 
     @computed_outside_trace
     def result(self) -> Result:
@@ -65,8 +65,8 @@ class Pending:
 
 def run_batch(
     fidelity: Fidelity, robot: Robot, conditions: Conditions, options: Mapping[str, float], history: bool
-) -> Run:
-    """Computes a batch of any shape."""
+) -> RunBatch:
+    """Simulates a batch of any shape."""
     runs = math.prod(conditions.shape)
     if history and runs > HISTORIES:
         raise UsageError(f"history: got {runs} runs; at most {HISTORIES} can be kept over time; set history=False")
@@ -74,13 +74,13 @@ def run_batch(
     assert simulate is not None
     if has_tracer((robot, conditions)):
         return reshape_runs(simulate(robot, flatten_conditions(conditions), options), conditions.shape)
-    return _in_chunks(fidelity, lambda runs: simulate(robot, runs, options), conditions)
+    return _map_in_chunks(fidelity, lambda runs: simulate(robot, runs, options), conditions)
 
 
 T = TypeVar("T")
 
 
-def _in_chunks(fidelity: Fidelity, function: Callable[[Conditions], T], conditions: Conditions) -> T:
+def _map_in_chunks(fidelity: Fidelity, function: Callable[[Conditions], T], conditions: Conditions) -> T:
     """Returns the values of a function of conditions of shape (runs,), in the shape of the conditions.
 
     Large batches are split into chunks of one size, which share a compilation. The last chunk ends
@@ -105,21 +105,21 @@ def _in_chunks(fidelity: Fidelity, function: Callable[[Conditions], T], conditio
 
 def flatten_conditions(conditions: Conditions) -> Conditions:
     """Conditions of shape (runs,)."""
-    return conditions if len(conditions.shape) == 1 else _raveled(conditions)
+    return conditions if len(conditions.shape) == 1 else _flattened(conditions)
 
 
 @compiled
-def _raveled(conditions: Conditions) -> Conditions:
+def _flattened(conditions: Conditions) -> Conditions:
     return jax.tree.map(jnp.ravel, conditions)
 
 
 def reshape_runs(tree: T, shape: tuple[int, ...]) -> T:
     """A tree with a leading axis of runs in its leaves, reshaped to the batch's own shape."""
-    return tree if len(shape) == 1 else _reshaped(tree, shape)
+    return tree if len(shape) == 1 else _reshape(tree, shape)
 
 
 @compiled
-def _reshaped(tree: T, shape: tuple[int, ...]) -> T:
+def _reshape(tree: T, shape: tuple[int, ...]) -> T:
     return jax.tree.map(lambda x: jnp.reshape(x, shape + x.shape[1:]), tree)
 
 
@@ -140,11 +140,11 @@ def total_mass(robot: Robot, conditions: Conditions) -> jax.Array:
     if conditions.total_mass is not None:
         return conditions.total_mass
     masses = tuple(chassis.mass for chassis in robot.configurations.members)
-    return _own_mass(masses, conditions.configuration, conditions.payload)
+    return _unstated_mass(masses, conditions.configuration, conditions.payload)
 
 
 @compiled
-def _own_mass(own: tuple[Scalar, ...], configuration: jax.Array | np.ndarray, payload: jax.Array) -> jax.Array:
+def _unstated_mass(own: tuple[Scalar, ...], configuration: jax.Array | np.ndarray, payload: jax.Array) -> jax.Array:
     return jnp.stack([jnp.asarray(mass) for mass in own])[configuration] + payload
 
 
@@ -164,7 +164,7 @@ _WORDS = {"status": ("status", "", 0), "flags": ("flags", "", 0)}
 
 
 class StatusCodes(np.ndarray):
-    """Status codes that can be compared with words of `STATUSES`: `results.status == "converged"`."""
+    """Status codes that can be compared with the words of `STATUSES`: `results.status == "converged"`."""
 
     __hash__ = None  # as for every array
 
@@ -235,7 +235,7 @@ class Results:
             object.__setattr__(self, "result", dataclasses.replace(result, status=coded))
 
     @staticmethod
-    def pending(batch: Pending, configurations: Names, model: str) -> Results:
+    def pending(batch: PendingBatch, configurations: Names, model: str) -> Results:
         """Results that will be computed at first use."""
         results = object.__new__(Results)
         fields = {"conditions": batch.conditions, "further": {}, "history": None, "mission": None, "stated": ()}
@@ -252,7 +252,7 @@ class Results:
         return Results.pending(on_host(batch), self.configurations, self.model)
 
     def _compute(self, name: str) -> None:
-        """Computes the program that holds a name, unless a computed one has it."""
+        """Computes the program that contains a name, unless it is already computed."""
         cache, batch = self.__dict__, self.__dict__.get("_pending")
         if batch is None or name.startswith("_"):
             return

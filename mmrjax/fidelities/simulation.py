@@ -17,12 +17,12 @@ from mmrjax.compile.precision import as_jax_arrays, in_double, in_trace
 from mmrjax.compile.programs import has_tracer
 from mmrjax.errors import UsageError, allowed_words
 from mmrjax.fidelities.base import History
-from mmrjax.fidelities.results import Pending, Results, flatten_conditions, reshape_runs, run_batch, total_mass
+from mmrjax.fidelities.results import PendingBatch, Results, flatten_conditions, reshape_runs, run_batch, total_mass
 from mmrjax.missions import mission_batch
 from mmrjax.missions.mission import Start
 from mmrjax.missions.profile import Profile
 from mmrjax.model import params, power
-from mmrjax.model.conditions import OF_TURNS, Conditions, Named, sides_contradiction
+from mmrjax.model.conditions import OF_TURNS, Conditions, NamedConfigurations, sides_contradiction
 from mmrjax.model.quantities import CONDITIONS
 from mmrjax.model.robot import NO_BRAKE, Robot, turn_error
 from mmrjax.model.signals import CODES
@@ -109,7 +109,7 @@ def simulate(
         robot = as_jax_arrays(robot)
         conditions, profile, start = jax.device_put((conditions, profile, start))
     if profile is not None:
-        return _forward_alone(_missions(robot, conditions, profile, start, history))
+        return _forward_mode_only(_simulate_missions(robot, conditions, profile, start, history))
     robot = robot.showing_turns() if conditions.turns else robot
     fidelity, traced = fidelities.get_fidelity(model), has_tracer((robot, conditions))
     if not traced:
@@ -119,16 +119,16 @@ def simulate(
             raise UsageError(f"model {model}, {error}") from error
     names = robot.configurations.names
     if fidelity.outputs is not None and not traced:
-        return Results.pending(Pending(robot, conditions, fidelity), names, model)
+        return Results.pending(PendingBatch(robot, conditions, fidelity), names, model)
     run = run_batch(fidelity, robot, conditions, stated, history and fidelities.fidelity_facts(model).histories)
     results = Results(
         conditions, total_mass(robot, conditions), run.result, run.columns, run.history, names, model,
         channels=robot.channels,
     )  # fmt: skip
-    return results if fidelities.fidelity_facts(model).reverse else _forward_alone(results)
+    return results if fidelities.fidelity_facts(model).reverse else _forward_mode_only(results)
 
 
-def _forward_alone(results: Results) -> Results:
+def _forward_mode_only(results: Results) -> Results:
     """Same results with a clear error in reverse mode: a loop over adaptive steps does not support it."""
     if not has_tracer(results):
         return results
@@ -173,7 +173,9 @@ def _check_profile(model: str, profile: Any, options: Mapping[str, float | None]
             raise UsageError(f"{name}: got {value!r} with a profile; its last row ends the mission; leave {name} out")
 
 
-def _missions(robot: Robot, conditions: Conditions, profile: Profile, start: Start | None, history: bool) -> Results:
+def _simulate_missions(
+    robot: Robot, conditions: Conditions, profile: Profile, start: Start | None, history: bool
+) -> Results:
     """Runs every member of a batch over the same profile."""
     runs = flatten_conditions(conditions)
     if not has_tracer((robot, runs, profile, start)):
@@ -226,7 +228,7 @@ def check_robot(robot: Robot) -> None:
 def _resolve_conditions(robot: Robot, conditions: Conditions) -> Conditions:
     """Conditions with configuration names replaced by indices, checked against the robot's configurations."""
     names, which = robot.configurations.names, conditions.configuration
-    if isinstance(which, Named):
+    if isinstance(which, NamedConfigurations):
         try:
             return dataclasses.replace(conditions, configuration=which.among(names))
         except KeyError as error:
@@ -290,7 +292,7 @@ def _check_conditions(conditions: Conditions) -> None:
 
 
 def _smallest_and_largest(values: jax.Array | np.ndarray) -> tuple[float, float]:
-    """Least and greatest of some numbers, computed by the library that holds them, NaN if one of them is."""
+    """Smallest and largest number, computed by the library that holds them. NaN if one of them is NaN."""
     on_host = not isinstance(values, jax.Array) or all(device.platform == "cpu" for device in values.devices())
     numbers = np.asarray(values) if on_host else values
     least, most = jax.device_get((numbers.min(), numbers.max()))

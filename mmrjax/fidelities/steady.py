@@ -1,4 +1,4 @@
-"""Fidelity `steady`: the operating point as a root of the balances, with implicit derivatives."""
+"""Fidelity `steady`: the operating point as a solution of the balances, with implicit derivatives."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float
 
 from mmrjax.compile.compiling import SELDOM, compiled
 from mmrjax.fidelities import outputs
-from mmrjax.fidelities.base import Fidelity, Implicit, Progress, Run
+from mmrjax.fidelities.base import Fidelity, ImplicitSolution, Progress, RunBatch
 from mmrjax.fidelities.rest import (
     admitted_current,
     is_at_rest,
@@ -43,7 +43,7 @@ from mmrjax.model.signals import (
 from mmrjax.numerics.linear_equations import Vector
 from mmrjax.numerics.newton import root
 from mmrjax.numerics.one_sided import clip
-from mmrjax.numerics.rarely import compute_rarely
+from mmrjax.numerics.rarely import compute_if_needed
 from mmrjax.numerics.rosenbrock import Unknowns
 from mmrjax.turning import circling
 
@@ -54,7 +54,7 @@ _SPEED, _CURRENT, _SPEED_MOTOR, _VOLTAGE, _TORQUE = 1.0, 10.0, 1000.0, 10.0, 100
 _balanced = compiled(balances.settled_signals)
 
 
-def _settled_at(
+def _signals_and_residuals(
     robot: Robot, conditions: Conditions, unknowns: Vector, sense: Array
 ) -> tuple[State, Signals, Vector]:
     """State and signals at given unknowns, and the residuals of the balances, all 0 at the operating point.
@@ -104,15 +104,15 @@ def _clamped_conditions(conditions: Conditions, third: Scalar) -> tuple[Conditio
 
 
 @compiled
-def _residual(unknowns: Vector, robot: Robot, own: tuple[Conditions, Array]) -> Vector:
+def _residuals(unknowns: Vector, robot: Robot, own: tuple[Conditions, Array]) -> Vector:
     conditions, sense = own
     robot = robot.within(conditions.configuration)
-    return _settled_at(robot, _conditions_are_sound(robot, conditions)[1], unknowns, sense)[2]
+    return _signals_and_residuals(robot, _conditions_are_sound(robot, conditions)[1], unknowns, sense)[2]
 
 
-def _residual_unlimited(unknowns: Vector, robot: Robot, own: tuple[Conditions, Array]) -> Vector:
-    """`_residual` in most runs: linear, without the driver's limit and diode."""
-    return _residual(unknowns, dataclasses.replace(robot, driver=robot.driver.unlimited()), own)
+def _residuals_without_limit(unknowns: Vector, robot: Robot, own: tuple[Conditions, Array]) -> Vector:
+    """`_residuals` in most runs: linear, without the driver's limit and diode."""
+    return _residuals(unknowns, dataclasses.replace(robot, driver=robot.driver.unlimited()), own)
 
 
 def _conditions_are_sound(robot: Robot, conditions: Conditions) -> tuple[Array, Conditions]:
@@ -130,7 +130,7 @@ def _conditions_are_sound(robot: Robot, conditions: Conditions) -> tuple[Array, 
     return sound, dataclasses.replace(conditions, adhesion=jnp.maximum(conditions.adhesion, 1e-9))
 
 
-def _start(robot: Robot, conditions: Conditions) -> Vector:
+def _initial_guess(robot: Robot, conditions: Conditions) -> Vector:
     nominal = voltage_at_rest(robot, conditions)
     speed = nominal * (0.9 / robot.motor.torque_constant)
     if conditions.motor_speed is not None:
@@ -145,21 +145,21 @@ def _start(robot: Robot, conditions: Conditions) -> Vector:
     )
 
 
-def _root_of_balances(robot: Robot, conditions: Conditions, large: bool = True) -> tuple[Vector, Array]:
+def _solve_balances(robot: Robot, conditions: Conditions, large: bool = True) -> tuple[Vector, Array]:
     """The root of the balances, and whether the search converged. Derivatives are implicit.
 
     `large` selects the program for large batches. The other compiles sooner.
     """
     tolerance = float(jnp.finfo(jnp.result_type(conditions.voltage)).eps) ** 0.85
     sound = _conditions_are_sound(robot, conditions)[1]
-    start = jax.lax.stop_gradient(_start(robot, sound))
+    start = jax.lax.stop_gradient(_initial_guess(robot, sound))
     inputs = conditions, travel_direction(robot, sound)
-    linear = _residual_unlimited if large and not robot.effects else None
-    return root(_residual, start, robot, inputs, tolerance, linear, large)
+    linear = _residuals_without_limit if large and not robot.effects else None
+    return root(_residuals, start, robot, inputs, tolerance, linear, large)
 
 
 @compiled
-def _circled(robot: Robot, conditions: Conditions) -> Signals:
+def _turning_signals(robot: Robot, conditions: Conditions) -> Signals:
     return circling.circling_signals(robot, conditions)[0].signals
 
 
@@ -169,10 +169,10 @@ def operating_signals(robot: Robot, conditions: Conditions) -> Signals:
     For a robot that turns, those of each side, on an axis of 2.
     """
     if conditions.turns:
-        return _circled(robot, conditions)
-    unknowns, _ = _root_of_balances(robot, conditions)
+        return _turning_signals(robot, conditions)
+    unknowns, _ = _solve_balances(robot, conditions)
     _, sound = _conditions_are_sound(robot, conditions)
-    return _settled_at(robot, sound, unknowns, travel_direction(robot, sound))[1]
+    return _signals_and_residuals(robot, sound, unknowns, travel_direction(robot, sound))[1]
 
 
 def steady(robot: Robot, conditions: Conditions) -> Result:
@@ -241,11 +241,11 @@ def _slides_in_place(robot: Robot, conditions: Conditions) -> Array:
 
 def operating_state(robot: Robot, conditions: Conditions) -> tuple[Signals, Array, Array]:
     """Every signal of `operating_point`, its status, and whether robot and conditions are sound."""
-    unknowns, solved = _root_of_balances(robot, conditions)
-    return _operating_at(robot, conditions, unknowns, solved)[:3]
+    unknowns, solved = _solve_balances(robot, conditions)
+    return _state_at_unknowns(robot, conditions, unknowns, solved)[:3]
 
 
-def _operating_at(
+def _state_at_unknowns(
     robot: Robot, conditions: Conditions, unknowns: Vector, solved: Array, stands: bool = True
 ) -> tuple[Signals, Array, Array, Vector]:
     """`operating_state` at given unknowns, and the residuals of the balances there.
@@ -257,7 +257,7 @@ def _operating_at(
     robot = robot.within(conditions.configuration)
     sound, conditions = _conditions_are_sound(robot, conditions)
     sense = travel_direction(robot, conditions)
-    state, signals, left = _settled_at(robot, conditions, unknowns, sense)
+    state, signals, left = _signals_and_residuals(robot, conditions, unknowns, sense)
     rest = robot.chassis(conditions.configuration).speed_still
     voltage = voltage_at_rest(robot, conditions)
     still = is_at_rest(sense, voltage, signals.speed_theoretical, signals.speed, rest)
@@ -266,7 +266,7 @@ def _operating_at(
     status = jnp.where(still, STALLED, travel_status(signals.speed, voltage))
     if robot.has_ground:
         beyond = jnp.abs(signals.demand) > signals.adhesion_limit
-        slides = compute_rarely(beyond, _slides_in_place, given, jnp.zeros_like(beyond)) if stands else beyond
+        slides = compute_if_needed(beyond, _slides_in_place, given, jnp.zeros_like(beyond)) if stands else beyond
         status = jnp.where(beyond, jnp.where(slides, SLIDES, STALLED), status)
     if conditions.motor_speed is None:
         stands_still = (status == STALLED) & (jnp.abs(signals.speed_theoretical) < 1e-9)
@@ -290,7 +290,7 @@ def _vmap_axes(tree: Any) -> Any:
 BLOCK = 32_768
 
 
-def _over_points(function: Callable[..., Any], *arguments: Any) -> Any:
+def _map_over_points(function: Callable[..., Any], *arguments: Any) -> Any:
     """`function` of scalars, mapped over the leading axis of all arrays that have one. On a CPU block by block."""
     batched = jax.vmap(function, in_axes=_vmap_axes(arguments))
     leaves, tree = jax.tree.flatten(arguments)
@@ -319,7 +319,7 @@ def steady_batch(robot: Robot, conditions: Conditions) -> Result:
         robot: one robot, or parameters of shape (points,) among its numbers.
         conditions: leading axis of every field.
     """
-    return _over_points(steady, robot, conditions)
+    return _map_over_points(steady, robot, conditions)
 
 
 @compiled
@@ -345,31 +345,31 @@ def steady_outputs(robot: Robot, conditions: Conditions, names: tuple[str, ...])
         answer = steady(robot, conditions)
         return {name: jnp.asarray(getattr(answer, name)) for name in names}
 
-    return _over_points(one, robot, conditions)
+    return _map_over_points(one, robot, conditions)
 
 
-def _settled(robot: Robot, conditions: Conditions) -> Result:
+def _settled_results(robot: Robot, conditions: Conditions) -> Result:
     return jax.vmap(lambda c: operating_point(robot, c)[0])(conditions)
 
 
-def _solve(robot: Robot, conditions: Conditions) -> tuple[Unknowns, Bool[Array, ""]]:
+def _solve_run(robot: Robot, conditions: Conditions) -> tuple[Unknowns, Bool[Array, ""]]:
     if conditions.turns:
         return circling.solve_turn(robot, conditions)
-    unknowns, is_root = _root_of_balances(robot, conditions, large=False)
+    unknowns, is_root = _solve_balances(robot, conditions, large=False)
     return jax.lax.stop_gradient((jnp.stack(unknowns), is_root))
 
 
-def _shown(
+def _results_at_unknowns(
     robot: Robot, conditions: Conditions, unknowns: Unknowns, found: Bool[Array, ""]
 ) -> tuple[Result, Signals, Unknowns]:
     if conditions.turns:
         return circling.turn_results(robot, conditions, unknowns, found)
-    signals, status, _, left = _operating_at(robot, conditions, tuple(unknowns), found, stands=False)
+    signals, status, _, left = _state_at_unknowns(robot, conditions, tuple(unknowns), found, stands=False)
     return result_of_signals(robot.within(conditions.configuration), signals, status), signals, jnp.stack(left)
 
 
 #: `operating_point` in two halves.
-IMPLICIT = Implicit(_solve, _shown)
+IMPLICIT = ImplicitSolution(_solve_run, _results_at_unknowns)
 
 
 #: Numbers of rows that tables are padded to, so that tables of similar size share a program; beyond the last number,
@@ -397,8 +397,10 @@ def _shown_rows(robot: Robot, conditions: Conditions, unknowns: Array, found: Ar
     return jax.vmap(lambda *row: IMPLICIT.shown(robot, *row)[:2])(conditions, unknowns, found)
 
 
-def _run(robot: Robot, conditions: Conditions, options: Mapping[str, float], progress: Progress | None = None) -> Run:
-    return Run(steady_batch(robot, conditions))
+def _run_batch(
+    robot: Robot, conditions: Conditions, options: Mapping[str, float], progress: Progress | None = None
+) -> RunBatch:
+    return RunBatch(steady_batch(robot, conditions))
 
 
 def _check_run(robot: Robot, conditions: Conditions, options: Mapping[str, float]) -> None:
@@ -420,4 +422,6 @@ def _check_run(robot: Robot, conditions: Conditions, options: Mapping[str, float
             )
 
 
-FIDELITY = Fidelity("steady", settled=_settled, implicit=IMPLICIT, run=_run, outputs=steady_outputs, check=_check_run)
+FIDELITY = Fidelity(
+    "steady", settled=_settled_results, implicit=IMPLICIT, run=_run_batch, outputs=steady_outputs, check=_check_run
+)

@@ -52,7 +52,7 @@ def initial_state(robot: Robot, conditions: Conditions | None = None, *, rolling
         UsageError: an argument that `step` refuses too.
     """
     robot, conditions = as_floats((robot, _commanded_conditions(robot, None, conditions)))
-    return drive.state_of_unknowns(robot, _begun(robot, conditions, rolling))
+    return drive.state_of_unknowns(robot, _initial_unknowns(robot, conditions, rolling))
 
 
 def rates(robot: Robot, state: State, command: Command, conditions: Conditions | None = None) -> State:
@@ -99,17 +99,17 @@ def step(robot: Robot, state: State, command: Command, dt: Scalar, conditions: C
 
 
 @compiled
-def _begun(robot: Robot, conditions: Conditions, rolling: bool) -> Unknowns:
+def _initial_unknowns(robot: Robot, conditions: Conditions, rolling: bool) -> Unknowns:
     return drive.drive_start(robot, conditions, rolling)
 
 
 @compiled
 def _unknowns_after_step(robot: Robot, conditions: Conditions, y: Unknowns, dt: Scalar) -> Unknowns:
-    """The unknowns of `drive` after a step. A robot that has stopped is held if friction at rest can hold it."""
+    """Unknowns of `drive` after a step. A robot that has stopped is held if friction can hold it."""
     speeds = np.isin(np.arange(len(y)), (drive.MOTOR, drive.GROUND))
     last = len(y) - robot.loose
     drawn = np.isin(np.arange(len(y)), (drive.CURRENT, _DISCHARGE, *range(last - robot.controller_size, last)))
-    held = holds(robot, balances.commanded(robot, conditions, drive.state_of_unknowns(robot, y)))
+    held = holds(robot, balances.with_controller_duty(robot, conditions, drive.state_of_unknowns(robot, y)))
     stands = held & jnp.all(jnp.where(speeds, y, 0.0) == 0)
     moves = jnp.where(stands, jnp.asarray(drawn, y.dtype), 1.0)
 
@@ -138,9 +138,9 @@ def _commanded_conditions(robot: Robot, command: Command, conditions: Conditions
     if unknown := next((name for name in values if name not in field_names), None):
         raise UsageError(f"command: got {unknown}; {allowed_words(str(unknown), field_names)}")
     for name, value in values.items():
-        if name != "configuration" and _shape(value) is None:
+        if name != "configuration" and _shape_of_numbers(value) is None:
             raise UsageError(f"command, {name}: got {_text_of_value(value)}; expected a number")
-        if shape := _shape(value):
+        if shape := _shape_of_numbers(value):
             raise UsageError(f"command, {name}: got shape {shape}; expected one number, or jax.vmap over several")
     if conditions.turns or not values.keys().isdisjoint(OF_TURNS):
         raise UsageError("conditions: got a command for each side; a step travels straight, use mmrjax.simulate")
@@ -152,7 +152,7 @@ def _commanded_conditions(robot: Robot, command: Command, conditions: Conditions
     return conditions
 
 
-def _shape(value: Any) -> tuple[int, ...] | None:
+def _shape_of_numbers(value: Any) -> tuple[int, ...] | None:
     """Shape of a number or an array of numbers, tracers included. None of anything else."""
     if isinstance(value, jax.Array):
         return value.shape
@@ -171,7 +171,7 @@ def _text_of_value(value: Any) -> str:
 
 def _step_length(dt: Scalar) -> Scalar:
     """The length of a step, checked unless it is a tracer."""
-    if _shape(dt) != () or not (has_tracer(dt) or 0 < float(dt) < math.inf):
+    if _shape_of_numbers(dt) != () or not (has_tracer(dt) or 0 < float(dt) < math.inf):
         raise UsageError(f"dt: got {_text_of_value(dt)}; expected a number of seconds above 0")
     return jnp.asarray(dt, float)
 

@@ -1,4 +1,4 @@
-"""Fidelity `track`: half a robot, or all of one free to turn, as multibody dynamics in MJX with all contacts."""
+"""Fidelity `track`: half a robot, or a whole one free to turn, as multibody dynamics in MJX with all contacts."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 from mmrjax import fidelities
 from mmrjax.compile.compiling import compiled
 from mmrjax.compile.programs import has_tracer
-from mmrjax.fidelities.base import Fidelity, History, Progress, Run
+from mmrjax.fidelities.base import Fidelity, History, Progress, RunBatch
 from mmrjax.fidelities.result import flag_mask, withhold_numbers
 from mmrjax.model import balances, contact, masses
 from mmrjax.model.balances import signals_of
@@ -32,8 +32,8 @@ from mmrjax.model.signals import (
     Signals,
 )
 from mmrjax.undercarriage import both_sides, half_robot
-from mmrjax.undercarriage.half_robot import Changes, Motion, Steady, System, half_robot_system
-from mmrjax.undercarriage.side_contacts import Reactions
+from mmrjax.undercarriage.half_robot import Changes, HalfRobotState, HalfRobotSystem, SteadyAverages, build_system
+from mmrjax.undercarriage.side_contacts import GearReactions
 from mmrjax.undercarriage.stability import check_track_step, largest_step
 
 STEP = fidelities.fidelity_facts("track").resolved()["step"]  # [s]
@@ -47,7 +47,7 @@ TIME_ROLLED = 0.6
 JUMPS, ALOFT = 0.01, 0.01
 
 
-class Record(eqx.Module):
+class SampleRecord(eqx.Module):
     """One sample interval of a run.
 
     Attributes:
@@ -56,22 +56,22 @@ class Record(eqx.Module):
         guided: mean load of the guides over it.
     """
 
-    motions: Motion
+    motions: HalfRobotState
     passed: Signals | balances.Travel
     guided: Float[Array, "samples ..."]
-    reactions: Reactions
+    reactions: GearReactions
 
 
-class Trajectory(eqx.Module):
-    """A run.
+class TrackTrajectory(eqx.Module):
+    """One run over time.
 
     Attributes:
-        time: ends of the sample intervals [s], shape (samples,).
+        time: end of each sample interval [s], shape (samples,).
         q, v: coordinates and velocities at those times (see `undercarriage`), shape (samples, 5). For a robot free to
             turn those of `both_sides`, shape (samples, 10).
         signals: means over each interval. Each field has shape (samples,). For a robot free to turn they and the
             following have a last axis of left and right side: (samples, 2).
-        reactions: loads at those times, of one side.
+        reactions: loads at those times, for one side.
         steady: averages at the end of the run.
         result: the observation from those averages, with the run's status.
     """
@@ -80,13 +80,13 @@ class Trajectory(eqx.Module):
     q: Float[Array, "samples coordinates"]
     v: Float[Array, "samples coordinates"]
     signals: Signals
-    reactions: Reactions
-    steady: Steady
+    reactions: GearReactions
+    steady: SteadyAverages
     result: Result
 
 
 def _period_averages(
-    run: System, time: Array, travelled: Array, sums: tuple[Any, Array]
+    run: HalfRobotSystem, time: Array, travelled: Array, sums: tuple[Any, Array]
 ) -> tuple[Any, Scalar, Array, Changes]:
     """Means of signals (or `Travel`) and guides' load, number of periods, and change and size of three signals."""
     # Weights over the belt's travel that rise over one pitch and fall over another by the cubic step. Each adds up to
@@ -125,14 +125,14 @@ def track(
     step: float = STEP,
     sample: float = SAMPLE,
     rolling: bool = False,
-) -> Trajectory:
-    """Runs one robot under constant conditions, from standstill or rolling.
+) -> TrackTrajectory:
+    """Simulates one robot under constant conditions, from standstill or rolling.
 
     Pure and traceable: differentiable forward and backward, vmappable over every argument's leaves.
 
     Args:
         robot: any robot. Its parameters may be tracers. Its `guide_share` is not used: it is an output.
-        conditions: one run, scalar fields.
+        conditions: conditions of one run, scalar fields.
         duration: duration of the run [s].
         step, sample: intervals of integration and of the record [s].
         rolling: True to start at the steady fidelity's speed, which settles sooner. False: from standstill.
@@ -146,10 +146,10 @@ def track(
         numbers are no longer finite, or the robot has left the ground. `failed` and `tips` withhold the result's
         numbers. Flag `jumps`: the robot has no contact for more than a hundredth of the averaging window.
     """
-    run = half_robot_system(robot, conditions, step)
-    start = _start(run, rolling)
-    end, record = _record(run, start, round(sample / step), round(duration / sample))
-    return _trajectory(run, start, end, record, sample)
+    run = build_system(robot, conditions, step)
+    start = _initial_motion(run, rolling)
+    end, record = _advance_and_record(run, start, round(sample / step), round(duration / sample))
+    return _assemble_trajectory(run, start, end, record, sample)
 
 
 def _moving_system_module(conditions: Conditions) -> ModuleType:
@@ -157,33 +157,39 @@ def _moving_system_module(conditions: Conditions) -> ModuleType:
     return both_sides if conditions.turns else half_robot
 
 
-def _start(run: System, rolling: bool) -> Motion:
+def _initial_motion(run: HalfRobotSystem, rolling: bool) -> HalfRobotState:
     kind = _moving_system_module(run.conditions)
-    start: Motion = kind.roll(run) if rolling else kind.stand(run)
+    start: HalfRobotState = kind.roll(run) if rolling else kind.stand(run)
     return start
 
 
-def _record(run: System, start: Motion, steps: int, samples: int) -> tuple[Motion, Record]:
+def _advance_and_record(
+    run: HalfRobotSystem, start: HalfRobotState, steps: int, samples: int
+) -> tuple[HalfRobotState, SampleRecord]:
     kind = _moving_system_module(run.conditions)
 
-    def small(motion: Motion, _: None) -> tuple[Motion, tuple[Any, Array]]:
+    def small(motion: HalfRobotState, _: None) -> tuple[HalfRobotState, tuple[Any, Array]]:
         after, passed, guided = kind.advance(run, motion)
         return after, (passed, guided)
 
     @jax.checkpoint  # reverse mode keeps one motion per sample and recomputes the steps in between
-    def interval(motion: Motion, _: None) -> tuple[Motion, Record]:
+    def interval(motion: HalfRobotState, _: None) -> tuple[HalfRobotState, SampleRecord]:
         after, every = jax.lax.scan(small, motion, None, length=steps)
         passed, guided = jax.tree.map(lambda x: jnp.mean(x, axis=0), every)
-        return after, Record(after, passed, guided, kind.loads(run, *kind.instant(run, after)[1:]))
+        return after, SampleRecord(after, passed, guided, kind.loads(run, *kind.instant(run, after)[1:]))
 
     return jax.lax.scan(interval, start, None, length=samples)
 
 
-def _trajectory(run: System, start: Motion, end: Motion, record: Record, sample: float) -> Trajectory:
+def _assemble_trajectory(
+    run: HalfRobotSystem, start: HalfRobotState, end: HalfRobotState, record: SampleRecord, sample: float
+) -> TrackTrajectory:
     kind, motions = _moving_system_module(run.conditions), record.motions
     time = sample * jnp.arange(len(motions.q) + 1)
     travelled = run.path.radius * jnp.concatenate([start.q[None, kind.SHAFTS], motions.q[:, kind.SHAFTS]])
-    averages = kind.averaged(functools.partial(_period_averages, run, time), travelled, record.passed, record.guided)
+    averages = kind.steady_averages(
+        functools.partial(_period_averages, run, time), travelled, record.passed, record.guided
+    )
     status = kind.status(run, averages, end)
     valid = (status != FAILED) & (status != TIPS)
     window = time[1:] > time[-1] - WINDOW * (time[-1] - time[0])
@@ -193,7 +199,7 @@ def _trajectory(run: System, start: Motion, end: Motion, record: Record, sample:
     jumps = jnp.sum(aloft) > JUMPS * jnp.sum(window)
     flags = answer.flags | flag_mask({"jumps": jumps})
     answer = withhold_numbers(dataclasses.replace(answer, flags=flags), valid, status != FAILED)
-    return Trajectory(time[1:], motions.q, motions.v, signals, record.reactions, averages, answer)
+    return TrackTrajectory(time[1:], motions.q, motions.v, signals, record.reactions, averages, answer)
 
 
 def check_track_runs(
@@ -240,12 +246,12 @@ def track_batch(
     sample: float = SAMPLE,
     rolling: bool = False,
     progress: Progress | None = None,
-) -> Trajectory:
-    """`track` over a batch of conditions (leading axis of every field) for one robot, compiled once.
+) -> TrackTrajectory:
+    """`track` for one robot over a batch of conditions (first axis of every field), compiled once.
 
     Args:
-        progress: called with the finished share of the runs' time. Between its calls the runs can be
-            interrupted. None: one call of XLA, which cannot be interrupted.
+        progress: called with the finished share of the runs' time. Between its calls the runs can be interrupted.
+            None: one call of XLA, which cannot be interrupted.
 
     Raises:
         ValueError: a run that `check_track_runs` refuses.
@@ -255,89 +261,91 @@ def track_batch(
         # All parts have one length, to share a compilation; the excess of the last one is cut off.
         samples = round(duration / sample)
         length = math.ceil(samples / PARTS)
-        start = motion = _begin(robot, conditions, step, rolling)
+        start = motion = _begin_runs(robot, conditions, step, rolling)
         records = []
         for done in range(0, samples, length):
-            motion, record = jax.block_until_ready(_part(robot, conditions, motion, step, sample, length))
+            motion, record = jax.block_until_ready(_advance_runs(robot, conditions, motion, step, sample, length))
             records.append(record)
             progress(min((done + length) / samples, 1.0))
-        return _end(robot, conditions, start, records, step, sample, samples)
-    return _batch(robot, conditions, duration, step, sample, rolling)
+        return _end_runs(robot, conditions, start, records, step, sample, samples)
+    return _simulate_batch(robot, conditions, duration, step, sample, rolling)
 
 
 @compiled
-def _batch(
+def _simulate_batch(
     robot: Robot,
     conditions: Conditions,
     duration: float,
     step: float,
     sample: float,
     rolling: bool,
-) -> Trajectory:
-    def one(conditions: Conditions) -> Trajectory:
+) -> TrackTrajectory:
+    def one(conditions: Conditions) -> TrackTrajectory:
         return track(robot, conditions, duration=duration, step=step, sample=sample, rolling=rolling)
 
     return jax.vmap(one)(conditions)
 
 
 @compiled
-def _begin(robot: Robot, conditions: Conditions, step: float, rolling: bool) -> Motion:
-    return jax.vmap(lambda one: _start(half_robot_system(robot, one, step), rolling))(conditions)
+def _begin_runs(robot: Robot, conditions: Conditions, step: float, rolling: bool) -> HalfRobotState:
+    return jax.vmap(lambda one: _initial_motion(build_system(robot, one, step), rolling))(conditions)
 
 
 @compiled
-def _part(
-    robot: Robot, conditions: Conditions, motions: Motion, step: float, sample: float, samples: int
-) -> tuple[Motion, Record]:
-    def one(conditions: Conditions, motion: Motion) -> tuple[Motion, Record]:
-        return _record(half_robot_system(robot, conditions, step), motion, round(sample / step), samples)
+def _advance_runs(
+    robot: Robot, conditions: Conditions, motions: HalfRobotState, step: float, sample: float, samples: int
+) -> tuple[HalfRobotState, SampleRecord]:
+    def one(conditions: Conditions, motion: HalfRobotState) -> tuple[HalfRobotState, SampleRecord]:
+        return _advance_and_record(build_system(robot, conditions, step), motion, round(sample / step), samples)
 
     return jax.vmap(one)(conditions, motions)
 
 
 @compiled
-def _end(
+def _end_runs(
     robot: Robot,
     conditions: Conditions,
-    starts: Motion,
-    records: list[Record],
+    starts: HalfRobotState,
+    records: list[SampleRecord],
     step: float,
     sample: float,
     samples: int,
-) -> Trajectory:
-    def one(conditions: Conditions, start: Motion, parts: list[Record]) -> Trajectory:
+) -> TrackTrajectory:
+    def one(conditions: Conditions, start: HalfRobotState, parts: list[SampleRecord]) -> TrackTrajectory:
         record = jax.tree.map(lambda *x: jnp.concatenate(x)[:samples], *parts)
         end = jax.tree.map(lambda x: x[-1], record.motions)
-        return _trajectory(half_robot_system(robot, conditions, step), start, end, record, sample)
+        return _assemble_trajectory(build_system(robot, conditions, step), start, end, record, sample)
 
     return jax.vmap(one)(conditions, starts, records)
 
 
-def _settled(robot: Robot, conditions: Conditions) -> Result:
+def _settled_results(robot: Robot, conditions: Conditions) -> Result:
     return jax.vmap(lambda c: track(robot, c, duration=TIME_ROLLED, rolling=True).result)(conditions)
 
 
-def _run(robot: Robot, conditions: Conditions, options: Mapping[str, float], progress: Progress | None = None) -> Run:
+def _run_batch(
+    robot: Robot, conditions: Conditions, options: Mapping[str, float], progress: Progress | None = None
+) -> RunBatch:
     runs = track_batch(
         robot, conditions, duration=options["duration"], step=options["step"], rolling=True, progress=progress
     )
-    return Run(runs.result, {"guide_share": runs.steady.guide_share})
+    return RunBatch(runs.result, {"guide_share": runs.steady.guide_share})
 
 
-def _histories(
+def _run_histories(
     robot: Robot, conditions: Conditions, options: Mapping[str, float], progress: Progress | None = None
-) -> Run:
+) -> RunBatch:
     runs = track_batch(robot, conditions, duration=options["duration"], step=options["step"], progress=progress)
-    away, reactions = _moving_system_module(conditions).away(runs.q, runs.reactions)
+    away, reactions = _moving_system_module(conditions).distance_and_reactions(runs.q, runs.reactions)
     history = History.of(robot, runs.time, away, runs.signals, reactions)
-    return Run(runs.result, {"guide_share": runs.steady.guide_share}, history)
+    return RunBatch(runs.result, {"guide_share": runs.steady.guide_share}, history)
 
 
 def _check_time_step_and_conditions(robot: Robot, conditions: Conditions, options: Mapping[str, float]) -> None:
     check_track_runs(robot, conditions, duration=options["duration"], step=options["step"])
 
 
-def _too_stiff(robot: Robot, conditions: Conditions) -> list[str]:
+def _stiffness_cautions(robot: Robot, conditions: Conditions) -> list[str]:
     limits = largest_step(robot, conditions)
     rows = ", ".join(str(k + 1) for k in np.flatnonzero(limits < STEP))
     if not rows:
@@ -350,10 +358,10 @@ def _too_stiff(robot: Robot, conditions: Conditions) -> list[str]:
 
 FIDELITY = Fidelity(
     "track",
-    settled=_settled,
-    run=_run,
-    histories=_histories,
+    settled=_settled_results,
+    run=_run_batch,
+    histories=_run_histories,
     check=_check_time_step_and_conditions,
-    cautions=_too_stiff,
+    cautions=_stiffness_cautions,
     columns=("guide_share",),
 )

@@ -15,7 +15,7 @@ from mmrjax import fidelities
 from mmrjax.compile.compiling import compiled
 from mmrjax.errors import UsageError, allowed_words
 from mmrjax.fidelities import outputs as table_of_outputs
-from mmrjax.fidelities.base import Run
+from mmrjax.fidelities.base import RunBatch
 from mmrjax.missions.profile import Profile
 from mmrjax.model import params, quantities
 from mmrjax.model.channels import Channel
@@ -175,7 +175,7 @@ def _evaluate(
         each = jax.tree.map(lambda x: jnp.broadcast_to(x, (points,)), each)
         return steady_outputs(robot, each, (*names, STATUS))
 
-    def simulate(robot: Robot, conditions: Conditions) -> Run:
+    def simulate(robot: Robot, conditions: Conditions) -> RunBatch:
         if profile is not None:
             from mmrjax.missions import mission_batch
 
@@ -185,7 +185,7 @@ def _evaluate(
     if not variation.varies_robot:
         return pick_outputs(simulate(*variation.at(values, conditions)), outputs_of, names)
 
-    def one(values: Array, conditions: Conditions) -> Run:
+    def one(values: Array, conditions: Conditions) -> RunBatch:
         robot, point = variation.at(values, conditions)
         run = simulate(robot, jax.tree.map(lambda x: x[None], point))
         return jax.tree.map(lambda x: x[0], run)
@@ -193,7 +193,7 @@ def _evaluate(
     return pick_outputs(jax.vmap(one)(values, conditions), outputs_of, names)
 
 
-def pick_outputs(run: Run, shown: tuple[Channel, ...], names: Names) -> dict[str, Array]:
+def pick_outputs(run: RunBatch, shown: tuple[Channel, ...], names: Names) -> dict[str, Array]:
     """Outputs of a batch by name, as from `evaluate_points`, of a rig with these channels."""
     rows = table_of_outputs.output_names(shown)
     _known(names, (*rows, *run.columns))

@@ -18,7 +18,7 @@ from jaxtyping import Array, Float, Int
 
 from mmrjax.fidelities.result import flag_mask, withhold_numbers
 from mmrjax.missions import mission_straight, mission_turning
-from mmrjax.missions.mission_steps import EVENTS, FIRST, Carry, MotionLaw, SegmentInputs, integrate_segment
+from mmrjax.missions.mission_steps import EVENTS, FIRST, IntegrationState, MotionLaw, SegmentInputs, integrate_segment
 from mmrjax.missions.profile import BRAKE, COAST, MOTOR_SPEED, SPEED, Profile
 from mmrjax.model import balances, energy
 from mmrjax.model.conditions import Conditions
@@ -51,10 +51,11 @@ class Totals(eqx.Module):
 
     Attributes:
         time: duration [s].
-        of: integrals by the names of the law's `TOTALS`. `drawn` and `returned` belong to the source, the others are
-            sinks.
-        stored: rise of the energy in motion [J].
-        given: net energy of the source [J]: of a battery from its charge at both ends, of a supply as integrated.
+        of: integrals by name, as in the law's `TOTALS`. `drawn` and `returned` are energy of the source, the others
+            are losses.
+        stored: increase of the kinetic energy [J].
+        given: net energy from the source [J]: for a battery from its charge at begin and end, for a supply by
+            integration.
     """
 
     time: Array
@@ -69,20 +70,20 @@ class Totals(eqx.Module):
 
     @property
     def unaccounted(self) -> Scalar:
-        """Energy in, less the sinks and the energy stored [J]: the error of the integration.
+        """Energy taken, minus losses and stored energy [J]: the error of the integration.
 
-        A battery's energy follows only from its charge, so that an error of the charge shows too.
+        The energy of a battery follows from its charge alone, so an error of the charge shows too.
         """
         return self.given - sum(self.of[name] for name in energy.SINKS) - self.stored
 
 
 class Start(eqx.Module):
-    """The state at the start of a mission. By default at rest and at ambient temperature.
+    """State at the start of a mission. By default at rest and at ambient temperature.
 
     Attributes:
-        speed: speed of the robot, its movers rolling [m/s].
+        speed: speed of the robot, with rolling tracks or wheels [m/s].
         current: current of one motor [A].
-        temperature_winding, temperature_housing: [°C], None: ambient.
+        temperature_winding, temperature_housing: temperatures [°C]. None: ambient.
     """
 
     speed: Scalar = 0.0
@@ -91,18 +92,19 @@ class Start(eqx.Module):
     temperature_housing: Scalar | None = None
 
 
-class Course(eqx.Module):
-    """A mission over time: its accepted steps, shape (kept,). Entries after the last step are NaN.
+class MissionCourse(eqx.Module):
+    """A mission over time, at its accepted steps, shape (kept,). Entries after the last step are NaN.
 
     Attributes:
         time: time since the start of the mission [s].
         segment: index of the segment, -1 after the last.
-        event: index into `MARKS` of the event at the end of a step, -1 for none.
-        distance: along the ground, forward less backward [m].
-        path: path in both directions [m].
-        temperature_winding, temperature_housing: [°C]. For a robot that turns, of each side, shape (kept, 2).
+        event: index into `MARKS` of the event at the end of the step, -1 for none.
+        distance: distance along the ground, forward minus backward [m].
+        path: distance in both directions [m].
+        temperature_winding, temperature_housing: temperatures [°C]. For a robot that turns, of each side, shape
+            (kept, 2).
         energy: net energy taken from the source [J].
-        signals: every signal. For a robot that turns, of left and right side, shape (kept, 2).
+        signals: all signals. For a robot that turns, of the left and right side, shape (kept, 2).
     """
 
     time: Float[Array, " kept"]
@@ -117,21 +119,22 @@ class Course(eqx.Module):
 
 
 class Mission(eqx.Module):
-    """A robot's run over a profile.
+    """Result of a mission: a robot's run over a profile.
 
     Attributes:
-        total: total of the mission.
-        segments: totals of each segment in each cycle, fields of shape (cycles, segments).
-        peaks: by the names of the law's `PEAKS` (`cell_low` is the lowest voltage of a cell). Also of the segments.
-        status, flags: status at the end of each segment, and its flags, shape (cycles, segments).
+        total: totals of the whole mission.
+        segments: totals of each segment of each cycle, fields of shape (cycles, segments).
+        peaks: largest values by name, as in the law's `PEAKS` (`cell_low`: lowest voltage of a cell). `segments` has
+            them too.
+        status, flags: status and flags at the end of each segment, shape (cycles, segments).
         result: the end of the mission, with its status and all flags. `converged`: the profile was followed to its
             end. `battery_empty`. `cut_off`: the cells stayed below their cut-off. `stalled`, `slides`, `rolls_back`
             or `tips`: status of the first segment with demanded motion that ends so. `failed`: the integrator gave
             up.
         temperature_winding, temperature_housing: winding temperature and housing temperature of the hottest side at
             the end [°C].
-        discharge: [C].
-        steps: number of steps, and number of rejected ones.
+        discharge: charge taken from the battery [C].
+        steps: number of steps, and of rejected steps.
         course: course over time, if requested.
     """
 
@@ -147,16 +150,18 @@ class Mission(eqx.Module):
     discharge: Scalar
     steps: Int[Array, ""]
     rejected: Int[Array, ""]
-    course: Course | None
+    course: MissionCourse | None
 
 
-def law_of(conditions: Conditions, profile: Profile) -> MotionLaw:
-    """Law of motion: free to turn if profile or conditions drive the sides apart or state a heading."""
+def motion_law(conditions: Conditions, profile: Profile) -> MotionLaw:
+    """Equations of motion of a mission: of a robot that is free to turn, if profile or conditions drive the sides
+    differently or state a heading.
+    """
     return mission_turning if profile.turns or conditions.turns else mission_straight
 
 
 def initial_unknowns(law: MotionLaw, robot: Robot, conditions: Conditions, start: Start) -> Float[Array, " unknowns"]:
-    """The unknowns at the start in SI, with the heading of the conditions, else uphill."""
+    """Unknowns at the start [SI], with the heading of the conditions, uphill by default."""
     ambient, heading = robot.motor.temperature_ambient, conditions.heading_deg
     winding, housing = (ambient if t is None else t for t in (start.temperature_winding, start.temperature_housing))
     shafts = start.speed / robot.chassis(conditions.configuration).radius * robot.gearbox.ratio
@@ -179,7 +184,7 @@ def _segment_status(
     asked: SegmentInputs,
     stands: Array,
 ) -> tuple[Array, Array]:
-    """Status of a segment at its end, and whether the robot has missed the demanded speed."""
+    """Status at the end of a segment, and True if the robot has missed the demanded speed."""
     mode, signals = segment.mode[0], balances.signals_of(found)
     driven = jnp.max(jnp.abs(jnp.asarray(signals.duty * signals.voltage_source)))
     status = jnp.where(stands, STALLED, law.status(robot, asked.conditions, found))
@@ -200,8 +205,8 @@ def _segment_status(
     return status, missed
 
 
-def _early_end_status(c: Carry) -> Array:
-    """Status of a mission that ended before its profile did."""
+def _early_end_status(c: IntegrationState) -> Array:
+    """Status of a mission that ended before its profile."""
     return jnp.where(c.failed, FAILED, jnp.where(c.cut_off, CUT_OFF, BATTERY_EMPTY))
 
 
@@ -215,26 +220,26 @@ def mission(
     most_steps: int = MOST_STEPS,
     keep: int = 0,
 ) -> Mission:
-    """Runs one robot over a profile.
+    """Simulates one robot over a profile.
 
     Args:
         robot: any robot. Its parameters may be tracers.
-        conditions: one run, scalar fields. They supply what the profile does not state.
-        profile: one mission.
-        start: state at its start. None: at rest, at ambient temperature.
-        tolerance: relative, and in `UNITS` absolute, error of a step.
-        most_steps: most steps of one segment. A mission that needs more has `failed`.
-        keep: largest number of accepted steps in the recorded course, 0 for no course.
+        conditions: conditions of one run, scalar fields, where the profile states none.
+        profile: profile of one mission.
+        start: state at the start. None: at rest, at ambient temperature.
+        tolerance: relative error of a step, also absolute in `UNITS`.
+        most_steps: largest number of steps of a segment. A mission that needs more ends as `failed`.
+        keep: largest number of accepted steps to record, 0 for none.
 
     Returns:
         The mission. Derivatives are forward (`jax.jvp`, `jax.jacfwd`), with respect to parameters, conditions, and
         values and times of the profile, through stops and reversals. At a limit that begins to act they are
         one-sided.
     """
-    begin, law = Start() if start is None else start, law_of(conditions, profile)
+    begin, law = Start() if start is None else start, motion_law(conditions, profile)
     nothing = jnp.full(len(law.PEAKS), -jnp.inf, jnp.result_type(conditions.voltage, profile.time))
 
-    def one(carry: Carry, k: Array) -> tuple[Carry, _Segment]:
+    def run_segment(carry: IntegrationState, k: Array) -> tuple[IntegrationState, _SegmentEnd]:
         segment = profile.row(k)
         fresh = carry._replace(peaks=nothing, flags=jnp.asarray(0))
         beginning = law.instant(robot, conditions, segment, carry.y.at[law.CLOCK].set(0.0), carry.stands)[0]
@@ -244,12 +249,14 @@ def mission(
         return carry, ended
 
     order = jnp.tile(jnp.arange(profile.segments), profile.cycles)
-    c, each = jax.lax.scan(one, _at_start(law, robot, conditions, begin, nothing, keep), order)
+    c, each = jax.lax.scan(run_segment, _initial_carry(law, robot, conditions, begin, nothing, keep), order)
     return _assemble_mission(law, robot, conditions, profile, c, each)
 
 
-class _Segment(NamedTuple):
-    """A segment at its end, as in `Totals` and `Mission`, with its last instant and the steps recorded so far."""
+class _SegmentEnd(NamedTuple):
+    """State at the end of a segment: totals, peaks and status as in `Mission`, the last instant and the steps
+    recorded so far.
+    """
 
     time: Array
     q: Array
@@ -263,12 +270,14 @@ class _Segment(NamedTuple):
 
 
 def _charge_taken(law: MotionLaw, y: Array) -> Array:
-    """Charge taken [C]."""
+    """Charge taken from the battery [C]."""
     return y[law.DISCHARGE] * law.UNITS[law.DISCHARGE]
 
 
-def _at_start(law: MotionLaw, robot: Robot, conditions: Conditions, start: Start, peaks: Array, keep: int) -> Carry:
-    """The state at the start of a mission, with room for `keep` steps of its course."""
+def _initial_carry(
+    law: MotionLaw, robot: Robot, conditions: Conditions, start: Start, peaks: Array, keep: int
+) -> IntegrationState:
+    """State at the start of a mission, with space for `keep` recorded steps."""
     dtype, whole, false = peaks.dtype, jnp.asarray(0), jnp.asarray(False)
     y0 = initial_unknowns(law, robot, conditions, start).astype(dtype) / law.units(robot).astype(dtype)
     q0 = jnp.zeros(len(law.TOTALS), dtype)
@@ -276,7 +285,7 @@ def _at_start(law: MotionLaw, robot: Robot, conditions: Conditions, start: Start
     if keep:
         blank = jnp.full((keep, 1), jnp.nan, dtype)
         buffer = (blank * y0, blank * q0, jnp.zeros(keep, bool), jnp.full(keep, -1))
-    return Carry(
+    return IntegrationState(
         y=y0, q=q0, step=jnp.asarray(FIRST, dtype), stands=jnp.asarray(start.speed == 0.0), ended=false,
         below=false, low=jnp.zeros((), dtype), cut_off=false, peaks=peaks,
         flags=whole, events=jnp.full(len(EVENTS), -1.0, dtype), accepted=whole, rejected=whole, failed=false,
@@ -285,9 +294,15 @@ def _at_start(law: MotionLaw, robot: Robot, conditions: Conditions, start: Start
 
 
 def _segment_end(
-    law: MotionLaw, robot: Robot, conditions: Conditions, segment: Profile, before: Carry, c: Carry, beginning: Any
-) -> _Segment:
-    """A segment at its end `c`, from the state `before` it and its first instant."""
+    law: MotionLaw,
+    robot: Robot,
+    conditions: Conditions,
+    segment: Profile,
+    before: IntegrationState,
+    c: IntegrationState,
+    beginning: Any,
+) -> _SegmentEnd:
+    """Data of a segment at its end `c`, given the state `before` it and its first instant."""
     signals, _, _, asked = law.instant(robot, conditions, segment, c.y, c.stands)
     status, missed = _segment_status(law, robot, conditions, segment, signals, asked, c.stands)
     status = jnp.where(c.ended, _early_end_status(c), status)
@@ -299,13 +314,13 @@ def _segment_end(
     given = jnp.where(conditions.battery > 0.5, last - first, drawn - returned)
     ran = ~before.ended
     time, rise, given = (jnp.where(ran, x, 0.0) for x in (c.y[law.CLOCK], rise, given))
-    return _Segment(time, jnp.where(ran, c.q, 0.0), rise, given, c.peaks, status, flags, signals, c.kept)
+    return _SegmentEnd(time, jnp.where(ran, c.q, 0.0), rise, given, c.peaks, status, flags, signals, c.kept)
 
 
 def _assemble_mission(
-    law: MotionLaw, robot: Robot, conditions: Conditions, profile: Profile, c: Carry, ends: _Segment
+    law: MotionLaw, robot: Robot, conditions: Conditions, profile: Profile, c: IntegrationState, ends: _SegmentEnd
 ) -> Mission:
-    """The mission from its last state `c` and the ends of its segments, (cycles · segments, ...)."""
+    """Mission from its last state `c` and the ends of its segments, shape (cycles · segments, ...)."""
     shape = (profile.cycles, profile.segments)
     totals = {n: ends.q[:, i].reshape(shape) for i, n in enumerate(law.TOTALS)}
     each = Totals(ends.time.reshape(shape), totals, ends.rise.reshape(shape), ends.given.reshape(shape))
@@ -324,7 +339,7 @@ def _assemble_mission(
 
     course = None
     if c.buffer is not None:
-        course = _course(law, robot, conditions, profile, c, each, ends.kept)
+        course = _recorded_course(law, robot, conditions, profile, c, each, ends.kept)
     winding, housing = _winding_and_housing_temperatures(law, c.y)
     return Mission(
         total=total, segments=each, peaks=named(c.peaks), segment_peaks=named(ends.peaks.reshape(*shape, -1)),
@@ -341,9 +356,15 @@ def _winding_and_housing_temperatures(law: MotionLaw, y: Array) -> tuple[Array, 
     return winding, housing
 
 
-def _course(
-    law: MotionLaw, robot: Robot, conditions: Conditions, profile: Profile, c: Carry, each: Totals, kept: Array
-) -> Course:
+def _recorded_course(
+    law: MotionLaw,
+    robot: Robot,
+    conditions: Conditions,
+    profile: Profile,
+    c: IntegrationState,
+    each: Totals,
+    kept: Array,
+) -> MissionCourse:
     assert c.buffer is not None
     ys, qs, stood, marks = c.buffer
     index = jnp.arange(len(ys))
@@ -365,7 +386,7 @@ def _course(
     def shown(x: Array) -> Array:
         return jnp.where(within.reshape(-1, *[1] * (x.ndim - 1)), x, jnp.nan)
 
-    return Course(
+    return MissionCourse(
         time=shown(begun + ys[:, law.CLOCK]),
         segment=jnp.where(within, segment, -1),
         event=jnp.where(within, marks, -1),

@@ -1,4 +1,4 @@
-"""Missions of a batch of runs, and their numbers: energy, distance, peaks, heat, charge."""
+"""Missions of a batch of runs, and their results as numbers: energy, distance, peaks, heat, charge."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from jaxtyping import Array
 
 from mmrjax.compile.compiling import compiled
 from mmrjax.compile.programs import has_tracer
-from mmrjax.fidelities.base import Run
+from mmrjax.fidelities.base import RunBatch
 from mmrjax.missions.mission import TOLERANCE, Mission, Start, Totals, mission
 from mmrjax.missions.profile import Profile
 from mmrjax.model.channels import SIDES
@@ -33,7 +33,7 @@ OUTPUTS, OF_TURNS = TABLE["mission"], TABLE["mission of sides"]
 
 
 def mission_columns(turns: bool = False) -> tuple[str, ...]:
-    """Columns of a mission's numbers, in order. `turns`: of a mission with separate sides."""
+    """Columns of a mission's numbers, in order. `turns`: True for a mission with independently driven sides."""
     return tuple(output.column for output in (*OUTPUTS, *(OF_TURNS if turns else ())))
 
 
@@ -44,8 +44,8 @@ USUAL = (
 )  # fmt: skip
 
 
-def _quotient(part: Scalar, whole: Scalar) -> Array:
-    """part / whole, NaN with a finite derivative where `whole` is not above 0."""
+def _safe_ratio(part: Scalar, whole: Scalar) -> Array:
+    """part / whole. NaN with a finite derivative if `whole` is not above 0."""
     positive = whole > 0
     return jnp.where(positive, part / jnp.where(positive, whole, 1.0), jnp.nan)
 
@@ -55,9 +55,9 @@ def _root(x: Scalar) -> Array:
 
 
 def mission_totals(found: Totals, peaks: Mapping[str, Array]) -> dict[str, Array]:
-    """Numbers [SI] by name that follow from totals and peaks of missions or segments, any shape.
+    """Numbers [SI], by name, from the totals and peaks of missions or segments, any shape.
 
-    A segment that was not reached has NaN.
+    NaN for a segment that was not reached.
     """
     by_segment, ran = found.of, found.time > 0
     turned = by_segment["drawn"] + by_segment["returned"] + sum(jnp.abs(by_segment[name]) for name in SINKS)
@@ -68,13 +68,13 @@ def mission_totals(found: Totals, peaks: Mapping[str, Array]) -> dict[str, Array
         "displacement": by_segment["distance"],
         "energy": found.energy,
         "energy_per_metre": jnp.where(
-            still, jnp.nan, _quotient(found.energy, jnp.where(still, 1.0, by_segment["path"]))
+            still, jnp.nan, _safe_ratio(found.energy, jnp.where(still, 1.0, by_segment["path"]))
         ),
         "energy_drawn": by_segment["drawn"],
         "energy_returned": by_segment["returned"],
-        "rms_current": _root(_quotient(by_segment["current_squared"], found.time)),
+        "rms_current": _root(_safe_ratio(by_segment["current_squared"], found.time)),
         "peak_current": peaks["current"],
-        "rms_torque": _root(_quotient(by_segment["torque_squared"], found.time)),
+        "rms_torque": _root(_safe_ratio(by_segment["torque_squared"], found.time)),
         "peak_torque": peaks["torque"],
         "peak_speed": peaks["speed"],
         "peak_motor_speed": peaks["motor_speed"],
@@ -82,7 +82,7 @@ def mission_totals(found: Totals, peaks: Mapping[str, Array]) -> dict[str, Array
         "cell_low": jnp.where(jnp.isfinite(peaks["cell_low"]), peaks["cell_low"], jnp.nan),
         **{f"energy_to_{name}": by_segment[name] for name in SINKS},
         "energy_stored": found.stored,
-        "unaccounted_share": _quotient(found.unaccounted, turned),
+        "unaccounted_share": _safe_ratio(found.unaccounted, turned),
     }
     if "turned" in by_segment:
         numbers |= {name: by_segment[name] for name in ("turned", "place_x", "place_y")} | {
@@ -90,7 +90,7 @@ def mission_totals(found: Totals, peaks: Mapping[str, Array]) -> dict[str, Array
         }
         for side in SIDES:
             numbers |= {
-                f"rms_current_{side}": _root(_quotient(by_segment[f"current_squared_{side}"], found.time)),
+                f"rms_current_{side}": _root(_safe_ratio(by_segment[f"current_squared_{side}"], found.time)),
                 f"peak_current_{side}": peaks[f"current_{side}"],
                 f"winding_peak_{side}": peaks[f"temperature_{side}"],
             }
@@ -98,17 +98,18 @@ def mission_totals(found: Totals, peaks: Mapping[str, Array]) -> dict[str, Array
 
 
 def mission_numbers(robot: Robot, conditions: Conditions, found: Mission) -> dict[str, Array]:
-    """Numbers of missions [SI], by the names of `OUTPUTS`. Any shape, NaN if a number does not apply.
+    """Numbers of missions [SI], by name as in `OUTPUTS`, any shape. NaN if a number does not apply.
 
     State of charge, endurance and range refer to the on-board battery. Endurance is the time from the charge at the
-    start of the mission to empty at the mission's mean current, range the distance in that time. Both are exact if
-    the battery ends within the mission. They ignore that a demanded speed takes more current as the voltage falls.
+    start until the battery is empty, at the mean current of the mission. Range is the distance in that time. Both are
+    exact if the battery becomes empty within the mission. They neglect that a demanded speed takes more current as
+    the voltage falls.
     """
     on_battery, capacity = conditions.battery > 0.5, robot.battery.capacity
     used = found.discharge - conditions.discharge
     time, path = jnp.asarray(found.total.time), jnp.asarray(found.total.of["path"])
     ended = (found.result.status == BATTERY_EMPTY) | (found.result.status == CUT_OFF)
-    times = jnp.where(ended, 1.0, _quotient(capacity - conditions.discharge, used))  # number of missions per charge
+    times = jnp.where(ended, 1.0, _safe_ratio(capacity - conditions.discharge, used))  # number of missions per charge
     return {
         **mission_totals(found.total, found.peaks),
         "state_of_charge": jnp.where(on_battery, 1 - found.discharge / capacity, jnp.nan),
@@ -122,7 +123,8 @@ def mission_numbers(robot: Robot, conditions: Conditions, found: Mission) -> dic
 def cell_below_cutoff(
     robot: Robot, conditions: Conditions, profile: Profile, start: Start | None = None
 ) -> np.ndarray:
-    """Cell voltage at the start of missions on the battery [V] if it is below the cut-off, else NaN, shape (runs,).
+    """Cell voltage at the start of missions on the battery [V] if it is below the cut-off, otherwise NaN, shape
+    (runs,).
 
     Not traceable. The motors draw the current of the start, which is 0 at rest.
     """
@@ -145,18 +147,18 @@ def numbers_by_column(found: Mapping[str, Any]) -> dict[str, Any]:
 def missions_of_runs(
     robot: Robot, conditions: Conditions, profile: Profile, start: Start | None = None, *, history: bool = False
 ) -> Mission:
-    """Missions of a batch of runs, traceable.
+    """Simulates the missions of a batch of runs. Can be traced by JAX.
 
     Args:
         conditions: shape (runs,).
         profile: fields of shape (rows,), or (runs, rows).
-        start: common start of all.
+        start: state at the start of all missions.
         history: True to record the missions over time, see `simulate_in_parts`.
     """
     if not history:
         return simulate_batch(robot, conditions, profile, start, 0)
     if has_tracer((robot, conditions, profile, start)):
-        return simulate_batch(robot, conditions, profile, start, _room(profile))
+        return simulate_batch(robot, conditions, profile, start, _step_capacity(profile))
     parts = list(simulate_in_parts(robot, conditions, profile, start))
     return jax.tree.map(lambda *x: np.concatenate(x), *parts)
 
@@ -164,13 +166,13 @@ def missions_of_runs(
 def simulate_in_parts(
     robot: Robot, conditions: Conditions, profile: Profile, start: Start | None = None
 ) -> Iterator[Mission]:
-    """Missions of a batch of runs with recorded courses, in parts whose steps fit into memory.
+    """Simulates missions with recorded courses, in parts whose steps fit into memory.
 
-    A mission with more steps than fit is simulated again with more room, up to `MOST_KEPT`. The course of a longer
-    mission ends there.
+    A mission with more steps than fit is repeated with more space, up to `MOST_KEPT` steps. The recorded course of a
+    longer mission ends there.
     """
     (runs,) = conditions.shape
-    keep, first = _room(profile), 0
+    keep, first = _step_capacity(profile), 0
     while first < runs:
         size = max(1, min(runs, MOST_KEPT // keep))
         rows = np.minimum(np.arange(first, first + size), runs - 1)  # padding repeats the last run
@@ -179,17 +181,17 @@ def simulate_in_parts(
         part = jax.device_get(simulate_batch(robot, some, followed, start, keep))
         steps = int(np.max(part.steps - part.rejected))
         if steps > keep and keep < MOST_KEPT:
-            keep = min(MOST_KEPT, _power(steps))
+            keep = min(MOST_KEPT, _next_power(steps))
             continue
         yield jax.tree.map(lambda x, count=runs - first: x[:count], part)
         first += size
 
 
-def _room(profile: Profile) -> int:
-    return min(MOST_KEPT, max(LEAST_KEPT, _power(ROOM * profile.segments * profile.cycles)))
+def _step_capacity(profile: Profile) -> int:
+    return min(MOST_KEPT, max(LEAST_KEPT, _next_power(ROOM * profile.segments * profile.cycles)))
 
 
-def _power(count: int) -> int:
+def _next_power(count: int) -> int:
     return 1 << (count - 1).bit_length()
 
 
@@ -202,10 +204,10 @@ def simulate_batch(
     keep: int = 0,
     tolerance: Scalar = TOLERANCE,
 ) -> Mission:
-    """Missions of a batch in one call, compiled. See `missions_of_runs`.
+    """Simulates the missions of a batch in one compiled call, see `missions_of_runs`.
 
     Args:
-        keep: largest number of steps in the recorded courses, 0 for no courses.
+        keep: largest number of steps to record, 0 for none.
     """
     axes = jax.tree.map(lambda x: 0 if x.ndim == 2 else None, profile)
 
@@ -215,7 +217,7 @@ def simulate_batch(
     return jax.vmap(mission_of_run, in_axes=(0, axes))(conditions, profile)
 
 
-def run_missions(robot: Robot, conditions: Conditions, profile: Profile) -> Run:
+def run_missions(robot: Robot, conditions: Conditions, profile: Profile) -> RunBatch:
     """Missions of a batch as runs of a fidelity, with their numbers as columns."""
     missions = missions_of_runs(robot, conditions, profile)
-    return Run(missions.result, numbers_by_column(mission_numbers(robot, conditions, missions)))
+    return RunBatch(missions.result, numbers_by_column(mission_numbers(robot, conditions, missions)))

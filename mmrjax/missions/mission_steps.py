@@ -1,8 +1,8 @@
-"""Steps of a mission, events that they land on, and one segment of the profile.
+"""Steps of a mission: integration over one segment of the profile, with steps that end exactly at events.
 
 The law of motion gives the equations of an instant: `mission_straight` or `mission_turning`. For a start and a stop
-the loop of diffrax with its `Event` takes 1.8 to 2.5 times as long. It takes as many steps of
-the same method, and finds neither peaks nor flags (docs/lab/figures.md).
+the loop of diffrax with its `Event` takes 1.8 to 2.5 times as long. It takes as many steps of the same method, and
+finds neither peaks nor flags (docs/lab/figures.md).
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from mmrjax.fidelities.rest import smallest
+from mmrjax.fidelities.rest import smallest_of
 from mmrjax.fidelities.result import flag_mask
 from mmrjax.missions.profile import Profile
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.params import Scalar, Scalars
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import Signals
-from mmrjax.numerics.rarely import compute_rarely
+from mmrjax.numerics.rarely import compute_if_needed
 from mmrjax.numerics.rosenbrock import error_across_kink, rosenbrock_stages, step_longest
 
 #: The first step of a segment [s], and the shortest.
@@ -49,8 +49,8 @@ FIRMLY = 1e-3
 class SegmentInputs(NamedTuple):
     """Inputs of the robot at an instant.
 
-    The robot with its other consumers. The conditions with the controller's duty. The rate of the controller's
-    integral [rad/s]. The error of the demand [rad/s]. For a robot that turns, duty, rate and error are per side.
+    The robot with its other consumers, the conditions with the duty of the controller, the rate of the controller's
+    integral [rad/s], and the error of the demand [rad/s]. For a robot that turns, duty, rate and error of each side.
     """
 
     robot: Robot
@@ -60,20 +60,20 @@ class SegmentInputs(NamedTuple):
 
 
 class MotionLaw(Protocol):
-    """Law of motion of a robot in a mission: unknowns, equations of an instant, and the quantities read from it.
+    """Equations of motion of a robot in a mission: unknowns, equations at an instant, and quantities read from it.
 
-    `found` is the result of `instant`: signals, and for a robot that turns also its motion.
+    `found` is the result of `instant`: signals and, for a robot that turns, also its motion.
 
     Attributes:
         TOTALS: integrated quantities and their units.
-        PEAKS: largest values of any instant and their units.
+        PEAKS: quantities whose largest values are recorded, and their units.
         CLOCK, DISCHARGE, WINDING, HOUSING: positions among the unknowns of the time in the segment [s], the charge
-            taken [C], and the temperatures [°C], for a robot that turns of both sides.
+            taken [C], and the temperatures [°C]. For a robot that turns, temperatures of both sides.
         CURRENT, MOTOR, GROUND, HEADING: positions of currents, motor speeds, speed and heading.
-        STOPS: positions of unknowns that are 0 at rest.
-        AT_REST: module for standing robots of its kind (`rest`, `turning`).
-        RESULT: returns the result of a run at its end, from robot, instant and status.
-        UNITS: units of the unknowns before the memories of effects.
+        STOPS: positions of the unknowns that are 0 at rest.
+        AT_REST: module for standing robots of this kind (`rest`, `turning`).
+        RESULT: function (robot, instant, status) that returns the result at the end of a run.
+        UNITS: units of the unknowns, except memories of effects.
         LONG: True if an instant takes long to compile.
     """
 
@@ -98,24 +98,27 @@ class MotionLaw(Protocol):
         ...
 
     def state_of(self, robot: Robot, y: Array, stands: Array) -> Any:
-        """The state of the unknowns."""
+        """State that the unknowns describe."""
         ...
 
     def asked_at(
         self, robot: Robot, otherwise: Conditions, segment: Profile, y: Array, stands: Array
     ) -> SegmentInputs:
-        """Inputs of the robot, see `SegmentInputs`."""
+        """Inputs of the robot at an instant."""
         ...
 
     def instant(
         self, robot: Robot, otherwise: Conditions, segment: Profile, y: Array, stands: Array
     ) -> tuple[Any, Array, Array, SegmentInputs]:
-        """Signals of an instant, rates of the unknowns in their units and of the totals [1/s], and the inputs."""
+        """Signals of an instant, rates of the unknowns in their units and of the totals [1/s], and inputs."""
         ...
 
     def slowness(self, asked: SegmentInputs, y: Array, stands: Array) -> tuple[Scalar, Scalar]:
-        """1 - |v| / limit of the shafts and of the sliding speeds of contacts, with the speed at which friction is
-        resolved as limit: 1 at rest, negative above it [-]."""
+        """How far the shafts, and the sliding speeds of the contacts, are below the speed at which friction is
+        resolved [-].
+
+        1 - |v| / limit: 1 at rest, negative above the limit.
+        """
         ...
 
     def supply_current_and_charge(self, asked: SegmentInputs, y: Array, stands: Array) -> tuple[Scalar, Scalar]:
@@ -123,17 +126,17 @@ class MotionLaw(Protocol):
         ...
 
     def stored(self, robot: Robot, found: Any) -> Scalar:
-        """Energy in the motion [J]."""
+        """Kinetic energy [J]."""
         ...
 
     def peaks(self, robot: Robot, found: Any) -> Scalars:
-        """Values of an instant that enter `PEAKS`. Of the cell voltage the negative."""
+        """Values at an instant whose largest values are recorded. The cell voltage is negated."""
         ...
 
     def peaks_within(self, robot: Robot, y: Array, tops: Array) -> Scalars:
         """Peaks of currents and temperatures from the largest unknowns within a step.
 
-        A current counts up to the driver's limit: beyond it only the ends of a step are exact.
+        A current counts only up to the driver's limit. Above it, only the ends of a step are exact.
         """
         ...
 
@@ -146,7 +149,7 @@ class MotionLaw(Protocol):
         ...
 
     def norm(self, error: Array) -> Scalar:
-        """Norm of an error of the unknowns relative to the tolerance [-]."""
+        """Norm of an error of the unknowns, relative to the tolerance [-]."""
         ...
 
     def demanded(self, robot: Robot, otherwise: Conditions, segment: Profile) -> Array:
@@ -154,7 +157,7 @@ class MotionLaw(Protocol):
         ...
 
     def status(self, robot: Robot, conditions: Conditions, found: Any) -> Array:
-        """Status of a robot that friction does not hold, from its last instant."""
+        """Status of a moving robot at its last instant."""
         ...
 
     def at_places(self, signals: Signals, so_far: dict[str, Array]) -> Signals:
@@ -165,24 +168,24 @@ class MotionLaw(Protocol):
 def _holding_margins(
     law: MotionLaw, robot: Robot, otherwise: Conditions, segment: Profile, y: Array, stands: Array
 ) -> tuple[Array, Array]:
-    """Margins of the friction that would hold the robot, now and at the later current.
+    """Margin of the friction that would hold the robot at rest: now, and with the settled current.
 
-    A controller reduces its demand after the error has vanished.
+    A controller lowers its demand once the error has vanished.
     """
     asked = law.asked_at(robot, otherwise, segment, y, stands)
     at_rest = law.asked_at(robot, otherwise, segment, y, jnp.asarray(True))
     current = law.AT_REST.current_at_rest(at_rest.robot, at_rest.conditions, law.state_of(at_rest.robot, y, stands))
     settled = y.at[law.CURRENT].set(current / law.UNITS[0])
     firm = _holding_margin(law, asked, y, stands)
-    return firm, smallest(firm, _holding_margin(law, at_rest, settled, stands))
+    return firm, smallest_of(firm, _holding_margin(law, at_rest, settled, stands))
 
 
 def _holding_margin(law: MotionLaw, asked: SegmentInputs, y: Array, stands: Array) -> Array:
-    """Margin of the friction that would hold the robot [-], see `rest.firmness`."""
+    """Margin of the friction that would hold the robot at rest [-], see `rest.firmness`."""
     return jnp.asarray(law.AT_REST.firmness(asked.robot, asked.conditions, law.state_of(asked.robot, y, stands)))
 
 
-class Carry(NamedTuple):
+class IntegrationState(NamedTuple):
     y: Array
     q: Array
     step: Array
@@ -203,7 +206,7 @@ class Carry(NamedTuple):
 
 
 def _peak_between(before: Array, after: Array, rise: Array, fall: Array) -> Array:
-    """Largest magnitude of a curve between two values, on the cubic with slopes `rise` and `fall` at its ends."""
+    """Largest magnitude of a curve between two values, by a cubic with the slopes `rise` and `fall` at its ends."""
     sign = jnp.sign(after)
     x0, x1, d0, d1 = sign * before, sign * after, sign * rise, sign * fall
     bends = (d0 > 0) & (d1 < 0)
@@ -217,8 +220,8 @@ def _peak_between(before: Array, after: Array, rise: Array, fall: Array) -> Arra
     return jnp.where(bends, jnp.maximum(top, jnp.maximum(x0, x1)), jnp.maximum(x0, x1))
 
 
-def _cell_above(law: MotionLaw, asked: SegmentInputs, y: Array, stands: Array) -> Scalar:
-    """Margin of a cell above its cut-off [V]. Large on an external supply."""
+def _cell_margin(law: MotionLaw, asked: SegmentInputs, y: Array, stands: Array) -> Scalar:
+    """Margin of a cell above its cut-off voltage [V]. Large on an external supply."""
     battery = asked.robot.battery
     cell = battery.voltage_cell(*law.supply_current_and_charge(asked, y, stands))
     return jnp.where(asked.conditions.battery > 0.5, cell - battery.voltage_cutoff, 10.0)
@@ -227,18 +230,18 @@ def _cell_above(law: MotionLaw, asked: SegmentInputs, y: Array, stands: Array) -
 def event_functions(
     law: MotionLaw, robot: Robot, otherwise: Conditions, segment: Profile, y: Array, stands: Array, below: Array
 ) -> Float[Array, " events"]:
-    """Functions that become positive when their event of `EVENTS` has happened [-]."""
+    """Functions that become positive when their event (see `EVENTS`) has happened [-]."""
     asked = law.asked_at(robot, otherwise, segment, y, stands)
     slow, grips = law.slowness(asked, y, stands)
     near = stands | ((slow > -1) & (grips > -1))
 
     none = -jnp.ones_like(slow)
     here = (robot, otherwise, segment, y, stands)
-    firm, stays = compute_rarely(near, functools.partial(_holding_margins, law), here, (none, none))
-    standing = smallest(slow, grips, stays - FIRMLY)
+    firm, stays = compute_if_needed(near, functools.partial(_holding_margins, law), here, (none, none))
+    standing = smallest_of(slow, grips, stays - FIRMLY)
     battery, discharge = asked.robot.battery, law.supply_current_and_charge(asked, y, stands)[1]
     empty = jnp.where(asked.conditions.battery > 0.5, (discharge / battery.capacity - 1) / OF_CHARGE, -1.0)
-    above = _cell_above(law, asked, y, stands)
+    above = _cell_margin(law, asked, y, stands)
     falls, recovers = jnp.where(below, -1.0, -above / OF_CELL), jnp.where(below, (above - RECOVERED) / OF_CELL, -1.0)
     return jnp.stack([jnp.where(stands, -1.0, standing), jnp.where(stands, -firm, -1.0), empty, falls, recovers])
 
@@ -255,13 +258,14 @@ def _move_to_event(
     after: Array,
     h: Array,
 ) -> tuple[Array, Array, Array, Array, Array, Array]:
-    """Moves to the earliest event by a Newton step in time, and applies the change of state.
+    """Moves to the earliest event by a Newton step in time, and applies its change of state.
 
-    The step carries the derivative of the event's moment (implicit function theorem: dt = -dg / (∂g/∂y y')).
+    The step includes the derivative of the event's time (implicit function theorem: dt = -dg / (∂g/∂y y')).
 
     Returns:
-        Unknowns, integrals, whether the robot stands, whether the cells are below their cut-off. The event, and the
-        step in time [s].
+        Unknowns, integrals, True if the robot stands, True if the cells are below their cut-off, the event, and the
+        step
+        in time [s].
     """
     _, dy, dq, _ = law.instant(robot, otherwise, segment, y, stands)
     steep = jax.jvp(lambda y: event_functions(law, robot, otherwise, segment, y, stands, below), (y,), (dy,))[1]
@@ -288,24 +292,24 @@ def integrate_segment(
     robot: Robot,
     otherwise: Conditions,
     segment: Profile,
-    carry: Carry,
+    carry: IntegrationState,
     tolerance: Scalar,
     most: int,
-) -> Carry:
+) -> IntegrationState:
     """Integrates one segment until its end, or until the mission ends."""
     length = (segment.time[1] - segment.time[0]).astype(carry.y.dtype)
     limit = step_longest(robot, otherwise)
-    leg = _SegmentLeg(law, robot, otherwise, segment, tolerance, length, jnp.inf if limit is None else limit)
+    leg = _SegmentIntegrator(law, robot, otherwise, segment, tolerance, length, jnp.inf if limit is None else limit)
     first, nearly = carry.accepted + carry.rejected, length * (1 - 1e-12 if carry.y.dtype == float else 1 - 1e-6)
 
-    def going(c: Carry) -> Array:
+    def is_running(c: IntegrationState) -> Array:
         return (c.y[law.CLOCK] < nearly) & ~c.ended & (c.accepted + c.rejected - first < most)
 
-    def turn(c: Carry) -> Carry:
+    def take_step(c: IntegrationState) -> IntegrationState:
         tried = leg.tried(c)
-        return leg.after(c, tried.h, tried.good, leg.landed(c, tried))
+        return leg.after(c, tried.h, tried.good, leg.shorten_to_event(c, tried))
 
-    c = jax.lax.while_loop(going, turn, leg.begin(carry))
+    c = jax.lax.while_loop(is_running, take_step, leg.begin(carry))
     failed = c.failed | ((c.y[law.CLOCK] < nearly) & ~c.ended)
     return c._replace(failed=failed, ended=c.ended | failed)
 
@@ -316,9 +320,9 @@ class _TriedStep(NamedTuple):
     Attributes:
         y, q: unknowns and integrals at its end.
         h: length of the step [s].
-        last: True if it ends the segment or trips.
-        good: True if its error is small enough.
-        grown: length that its error permits for the next step [s].
+        last: True if it ends the segment, or if the cut-off time of the cells ends with it.
+        good: True if its error is within the tolerance.
+        grown: length of the next step that its error permits [s].
     """
 
     y: Array
@@ -330,16 +334,16 @@ class _TriedStep(NamedTuple):
 
 
 class _StepToEvent(NamedTuple):
-    """A step with the event at its end.
+    """A step that may end early, at an event.
 
     Attributes:
-        y, q, stands, below, low: as in `Carry`, at its end.
-        which: the event, -1 for none.
+        y, q, stands, below, low: as in `IntegrationState`, at its end.
+        which: index of the event, -1 for none.
         cut_off: True if the cells stayed below their cut-off.
         after: event functions at the end of the tried step.
         taken: True if the step is accepted.
         event: True if it ends at an event.
-        step: length of the next one [s].
+        step: length of the next step [s].
     """
 
     y: Array
@@ -355,8 +359,8 @@ class _StepToEvent(NamedTuple):
     step: Array
 
 
-class _SegmentLeg(NamedTuple):
-    """One segment of a mission, with its length and the longest step [s]."""
+class _SegmentIntegrator(NamedTuple):
+    """Integrator of one segment, with its length and the longest step [s]."""
 
     law: MotionLaw
     robot: Robot
@@ -366,15 +370,15 @@ class _SegmentLeg(NamedTuple):
     length: Array
     longest: Array | float
 
-    def begin(self, carry: Carry) -> Carry:
-        """The state at the start of the segment."""
+    def begin(self, carry: IntegrationState) -> IntegrationState:
+        """State at the start of the segment."""
         law, robot, otherwise, segment, *_ = self
         # The inputs of the segment may exceed the friction that held the robot.
         y = carry.y.at[law.CLOCK].set(0.0)
         asked = law.asked_at(robot, otherwise, segment, y, carry.stands)
         stands = carry.stands & (_holding_margin(law, asked, y, carry.stands) >= 0)
         # They may also change the cell voltage across its cut-off.
-        below = jnp.asarray(_cell_above(law, asked, y, stands) < 0)
+        below = jnp.asarray(_cell_margin(law, asked, y, stands) < 0)
         low = jnp.where(below & carry.below, carry.low, 0.0)
         step = jnp.minimum(jnp.asarray(FIRST, y.dtype), self.longest)
         events = event_functions(law, robot, otherwise, segment, y, stands, below)
@@ -385,8 +389,8 @@ class _SegmentLeg(NamedTuple):
         )  # fmt: skip
         return begin._replace(slope=law.instant(robot, otherwise, segment, y, stands)[1])
 
-    def tried(self, c: Carry) -> _TriedStep:
-        """A step of the planned length, limited by the end of the segment and by the cut-off time of the cells."""
+    def tried(self, c: IntegrationState) -> _TriedStep:
+        """A step of the planned length, limited by the end of the segment and the cut-off time of the cells."""
         law, robot, otherwise, segment, *_ = self
 
         def rates(y: Array) -> tuple[Array, Array]:
@@ -407,7 +411,7 @@ class _SegmentLeg(NamedTuple):
         grown = h * jnp.clip(0.9 * jnp.maximum(size, 1e-12) ** -0.25, 0.1, 6.0)
         return _TriedStep(y, q, h, last, size <= 1, grown)
 
-    def landed(self, c: Carry, tried: _TriedStep) -> _StepToEvent:
+    def shorten_to_event(self, c: IntegrationState, tried: _TriedStep) -> _StepToEvent:
         """The step, shortened to its first event if it contains one."""
         law, robot, otherwise, segment, *_ = self
         y, q, h, last, good, grown = tried
@@ -421,7 +425,9 @@ class _SegmentLeg(NamedTuple):
         event = taken & jnp.any(happened)
         here = (robot, otherwise, segment, y, q, c.stands, c.below, after, h)
         none = (y, q, c.stands, c.below, jnp.asarray(-1, jnp.argmin(after).dtype), jnp.zeros_like(h))
-        y, q, stands, below, which, back = compute_rarely(event, functools.partial(_move_to_event, law), here, none)
+        y, q, stands, below, which, back = compute_if_needed(
+            event, functools.partial(_move_to_event, law), here, none
+        )
         y, q = jnp.where(taken, y, c.y), jnp.where(taken, q, c.q)
         stands = jnp.where(taken, stands, c.stands)
         low = jnp.where(below & c.below, c.low + jnp.where(taken, h + back, 0.0), 0.0)
@@ -433,8 +439,8 @@ class _SegmentLeg(NamedTuple):
         step = jnp.clip(jax.lax.stop_gradient(step), SHORTEST, self.longest)
         return _StepToEvent(y, q, stands, below, low, which, cut_off, after, taken, event, step)
 
-    def after(self, c: Carry, h: Array, good: Array, landed: _StepToEvent) -> Carry:
-        """The state after a step of length h [s], with its contributions to peaks, flags and the course."""
+    def after(self, c: IntegrationState, h: Array, good: Array, landed: _StepToEvent) -> IntegrationState:
+        """State after a step of length h [s], with its contributions to peaks, flags and recorded steps."""
         law, robot, otherwise, segment, *_ = self
         y, stands, below, taken, cut_off = landed.y, landed.stands, landed.below, landed.taken, landed.cut_off
         signals, dy, _, _ = law.instant(robot, otherwise, segment, y, stands)
@@ -455,13 +461,13 @@ class _SegmentLeg(NamedTuple):
         ended = c.ended | cut_off | (landed.which == EMPTY) | failed
         now = (robot, otherwise, segment, y, stands, below)
         unchanged = jnp.where(taken, landed.after, c.events)
-        events_now = compute_rarely(landed.event, functools.partial(event_functions, law), now, unchanged)
+        events_now = compute_if_needed(landed.event, functools.partial(event_functions, law), now, unchanged)
         kept, buffer = c.kept, c.buffer
         if buffer is not None:
             slot = jnp.where(taken, kept, buffer[0].shape[0])  # beyond the end: dropped
             row = (y, landed.q, stands, jnp.where(cut_off, MARKS.index("cut_off"), landed.which))
             buffer = tuple(b.at[slot].set(r, mode="drop") for b, r in zip(buffer, row, strict=True))
-        return Carry(
+        return IntegrationState(
             y=y, q=landed.q, step=landed.step, stands=stands, ended=ended, below=below, low=landed.low,
             cut_off=cut_off, peaks=peaks, flags=c.flags | flags,
             events=events_now, accepted=c.accepted + taken, rejected=c.rejected + ~taken, failed=failed,
@@ -470,6 +476,6 @@ class _SegmentLeg(NamedTuple):
 
 
 def _stayed_below(robot: Robot, below: Array, low: Array) -> Array:
-    """True if the cells have been below their cut-off longer than permitted."""
+    """True if the cells have been below their cut-off for longer than permitted."""
     rounding = 8 * jnp.finfo(low.dtype).eps
     return below & (low >= robot.battery.delay_cutoff * (1 - rounding))

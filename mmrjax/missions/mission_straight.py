@@ -1,4 +1,4 @@
-"""A mission in straight travel, with equal sides: its unknowns, inputs, rates and integrals."""
+"""A mission in straight travel with equal sides: its unknowns, inputs, rates and integrals."""
 
 from __future__ import annotations
 
@@ -56,30 +56,30 @@ def state_of(robot: Robot, y: Unknowns, stands: Array) -> State:
 
 
 def with_consumers(robot: Robot, asked: Profile) -> Robot:
-    """The robot with the current of its other consumers at an instant."""
+    """Robot with the current of its other consumers at an instant."""
     if asked.current_other is None:
         return robot
     battery = dataclasses.replace(robot.battery, current_other=asked.current_other)
     return dataclasses.replace(robot, battery=battery)
 
 
-def source(robot: Robot, conditions: Conditions, discharge: Scalar) -> Scalar:
-    """Source voltage that the duty multiplies [V]: for a battery the no-load voltage."""
+def source_voltage(robot: Robot, conditions: Conditions, discharge: Scalar) -> Scalar:
+    """Source voltage, which the duty multiplies [V]. For a battery, the no-load voltage."""
     battery = robot.battery.voltage(0.0, discharge)
     return jnp.where(conditions.battery > 0.5, battery, jnp.abs(conditions.voltage))
 
 
-def driven(
+def controlled_duty(
     robot: Robot, mode: Array, demand: Scalar, conditions: Conditions, state: State, integral: Scalar
 ) -> tuple[Array, Array, Array]:
     """Duty of a motor at an instant, and the state of its controller.
 
     Args:
-        mode: mode of the profile.
-        demand: demand of this side [rad/s or m/s].
+        mode: mode of the profile, index into `MODES`.
+        demand: demanded speed of this side [rad/s or m/s].
         conditions: conditions of this side.
         state: state of this side.
-        integral: integral of its controller [rad].
+        integral: integral of the controller of this side [rad].
 
     Returns:
         The duty [-], the rate of the controller's integral, and the error of the demand [rad/s]. For a ground speed,
@@ -90,7 +90,7 @@ def driven(
     demanded = demand * jnp.where(on_ground, per_speed, 1.0)
     error = demanded - jnp.where(on_ground, state.speed * per_speed, state.speed_motor)
     controlled = (mode == MOTOR_SPEED) | (mode == SPEED)
-    voltage_source = source(robot, conditions, state.discharge)
+    voltage_source = source_voltage(robot, conditions, state.discharge)
     voltage = robot.driver.demand(error, integral, demanded, robot.motor.torque_constant)
     wanted = voltage / jnp.maximum(voltage_source, 1e-3)
     limited = robot.driver.duty_limited(clip(wanted, -1.0, 1.0), state.current)
@@ -104,7 +104,7 @@ def asked_at(robot: Robot, otherwise: Conditions, segment: Profile, y: Array, st
     asked = segment.at(y[CLOCK])
     robot, conditions = with_consumers(robot, asked), asked.conditions(otherwise)
     state, integral = state_of(robot, y, stands), y[INTEGRAL] * UNITS[INTEGRAL]
-    duty, rate, error = driven(robot, asked.mode, asked.demand, conditions, state, integral)
+    duty, rate, error = controlled_duty(robot, asked.mode, asked.demand, conditions, state, integral)
     return SegmentInputs(robot, dataclasses.replace(conditions, duty=duty), rate, error)
 
 
@@ -155,7 +155,7 @@ def slowness(asked: SegmentInputs, y: Array, stands: Array) -> tuple[Scalar, Sca
 
 def supply_current_and_charge(asked: SegmentInputs, y: Array, stands: Array) -> tuple[Scalar, Scalar]:
     robot, state = asked.robot, state_of(asked.robot, y, stands)
-    duty = robot.driver.duty_limited(balances.duty_given(robot, asked.conditions), state.current)
+    duty = robot.driver.duty_limited(balances.bridge_duty(robot, asked.conditions), state.current)
     motors = robot.sides * state.current * robot.driver.share_drawn(duty)
     return motors, state.discharge
 

@@ -1,4 +1,4 @@
-"""A mission of a robot with independently driven sides, counterpart of `mission_straight`.
+"""A mission of a robot with independently driven sides, the counterpart of `mission_straight`.
 
 A demanded speed and yaw rate give the speed of each side, V_s = v - ω y_s, which its own controller follows. Equal
 sides give a mission of straight travel.
@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from mmrjax.compile.compiling import compiled
-from mmrjax.fidelities.rest import smallest
+from mmrjax.fidelities.rest import smallest_of
 from mmrjax.missions import mission_straight
 from mmrjax.missions.mission_steps import SegmentInputs
 from mmrjax.missions.profile import SPEED, VOLTAGE, Profile
@@ -49,7 +49,7 @@ CURRENT, MOTOR, WINDING, HOUSING, INTEGRAL = (slice(2 * k, 2 * k + 2) for k in r
 GROUND, LATERAL, YAW, HEADING, DISCHARGE, CLOCK = range(2 * len(_EACH), len(UNITS))
 
 STOPS = (MOTOR, GROUND, LATERAL, YAW)
-LONG, AT_REST, RESULT = True, circling, circling.result_of
+LONG, AT_REST, RESULT = True, circling, circling.result_of_turn
 
 #: Integrated quantities: name, and unit of a total; of current and torque the mean over both sides.
 OF_SIDES = tuple(f"current_squared_{side}" for side in channels.SIDES)
@@ -66,7 +66,7 @@ PEAKS: dict[str, str] = {
 
 
 class TurningInstant(balances.Travel):
-    """One instant: signals of both sides, and the motion of the robot."""
+    """One instant of a turning robot: signals of both sides, and its motion."""
 
     motion: PlaneMotion
 
@@ -85,7 +85,7 @@ def state_of(robot: Robot, y: Unknowns, stands: Array) -> PlaneMotion:
 
 
 def demanded(robot: Robot, otherwise: Conditions, segment: Profile) -> Array:
-    """Demanded speed of each side for each row [rad/s or m/s], shape (rows, 2)."""
+    """Demanded speed of each side in each row [rad/s or m/s], shape (rows, 2)."""
     demand = jnp.stack([segment.demand, segment.demand], -1)
     if segment.yaw_rate is None:
         return demand
@@ -102,11 +102,13 @@ def asked_at(robot: Robot, otherwise: Conditions, segment: Profile, y: Array, st
     if asked.voltage_left is not None and asked.voltage_right is not None:
         volts = jnp.stack([asked.voltage_left, asked.voltage_right])
         share = (
-            of_sides.polarity * volts / jnp.maximum(mission_straight.source(robot, of_sides, state.discharge), 1e-3)
+            of_sides.polarity
+            * volts
+            / jnp.maximum(mission_straight.source_voltage(robot, of_sides, state.discharge), 1e-3)
         )
         of_sides = dataclasses.replace(of_sides, duty=jnp.where(asked.mode == VOLTAGE, share, of_sides.duty))
     demand = demanded(robot, conditions, asked)
-    law = jax.vmap(functools.partial(mission_straight.driven, robot, asked.mode))
+    law = jax.vmap(functools.partial(mission_straight.controlled_duty, robot, asked.mode))
     duty, rate, error = law(demand, of_sides, state, y[INTEGRAL] * _EACH[-1])
     return SegmentInputs(robot, dataclasses.replace(conditions, duty_left=duty[0], duty_right=duty[1]), rate, error)
 
@@ -169,12 +171,12 @@ def slowness(asked: SegmentInputs, y: Array, stands: Array) -> tuple[Scalar, Sca
     along = jnp.abs(rolling - balances.states_of_sides(robot, conditions, motion).speed)
     across = jnp.abs(motion.speed_lateral) + jnp.abs(motion.yaw_rate) * robot.running_gear.wheelbase / 2
     slow, grips = 1 - jnp.abs(rolling) / load.speed_still, 1 - along / load.speed_grip
-    return smallest(*slow), smallest(*grips, 1 - across / load.speed_grip)
+    return smallest_of(*slow), smallest_of(*grips, 1 - across / load.speed_grip)
 
 
 def supply_current_and_charge(asked: SegmentInputs, y: Array, stands: Array) -> tuple[Scalar, Scalar]:
     robot, motion = asked.robot, state_of(asked.robot, y, stands)
-    duty = robot.driver.duty_limited(balances.duty_given(robot, asked.conditions.of_sides()), motion.current)
+    duty = robot.driver.duty_limited(balances.bridge_duty(robot, asked.conditions.of_sides()), motion.current)
     return robot.sides * sum_of_sides(
         jnp.asarray(motion.current * robot.driver.share_drawn(duty))
     ) / 2, motion.discharge
@@ -188,17 +190,17 @@ def peaks(robot: Robot, found: TurningInstant) -> Scalars:
     each = jax.vmap(lambda s: mission_straight.peaks(robot, s))(found.signals)
     most: Scalars = {name: jnp.max(jnp.asarray(x)) for name, x in each.items()}
     most |= {"current": sum_of_sides(jnp.asarray(each["current"])) / 2, "speed": _ground_speed(found.motion)}
-    return {**most, "yaw_rate": jnp.abs(found.motion.yaw_rate), **_of_sides(robot, each)}
+    return {**most, "yaw_rate": jnp.abs(found.motion.yaw_rate), **_peaks_of_sides(robot, each)}
 
 
 def peaks_within(robot: Robot, y: Array, tops: Array) -> Scalars:
     current = robot.sides * jnp.minimum(_EACH[0] * tops[CURRENT], robot.driver.current_limit)
     temperature = jnp.where(y[WINDING] > 0, _EACH[2] * tops[WINDING], -jnp.inf)
-    either = _of_sides(robot, {"current": current, "temperature": temperature})
+    either = _peaks_of_sides(robot, {"current": current, "temperature": temperature})
     return {"current": sum_of_sides(current) / 2, "temperature": jnp.max(temperature), **either}
 
 
-def _of_sides(robot: Robot, each: dict[str, Any]) -> Scalars:
+def _peaks_of_sides(robot: Robot, each: dict[str, Any]) -> Scalars:
     """Peaks of one motor of each side."""
     current = jnp.asarray(each["current"]) / robot.sides
     both = (("current", current), ("temperature", jnp.asarray(each["temperature"])))
@@ -220,7 +222,7 @@ norm = functools.partial(
 
 
 def status(robot: Robot, conditions: Conditions, found: TurningInstant) -> Array:
-    return circling.status_moving(robot, conditions, found, found.motion)
+    return circling.status_after_run(robot, conditions, found, found.motion)
 
 
 def at_places(signals: Signals, so_far: dict[str, jax.Array]) -> Signals:

@@ -41,24 +41,25 @@ APART = (*PAIRS[0], *PAIRS[1], YAW_RATE)
 
 
 class Profile(eqx.Module):
-    """A mission as rows in time, with a segment between two rows. All numbers differentiable and batchable.
+    """A mission profile: rows in time, with a segment between two rows. All numbers can be differentiated and
+    batched.
 
     Attributes:
-        time: time of the rows, increasing [s], shape (rows,). The last row ends the mission.
-        mode: index into `MODES` of the segment that a row begins, shape (rows,).
-        demand: motor speed [rad/s] or ground speed [m/s] for modes with a demand, else not used, shape (rows,).
+        time: times of the rows, increasing [s], shape (rows,). The mission ends at the last row.
+        mode: mode of the segment that begins at a row, index into `MODES`, shape (rows,).
+        demand: demanded motor speed [rad/s] or ground speed [m/s], shape (rows,). Unused in modes without a demand.
         voltage: voltage of the external supply [V].
-        duty: share of the supply's voltage [-].
-        slope_deg: [deg].
-        payload: [kg].
-        adhesion, adhesion_lateral: as a ratio to the robot's surface, along and across [-].
-        load_torque: torque of a brake on the output of each drive, for a load on a shaft [N·m].
+        duty: share of the supply voltage [-].
+        slope_deg: slope [deg].
+        payload: payload [kg].
+        adhesion, adhesion_lateral: adhesion along and across, relative to that of the robot's surface [-].
+        load_torque: brake torque on the output of each drive, for a load on a shaft [N·m].
         current_other: current of other consumers on the battery [A]. Shape (rows,), or None: as in the conditions
             (for current_other, in the robot). duty_left, duty_right: as `duty`, of each side. voltage_left,
             voltage_right: left and right voltage at the motors of each side [V], as a share of the no-load voltage
             of the source.
-        yaw_rate: demanded together with a ground speed, positive to the left [rad/s]. Stating any of them
-            makes the robot free to turn.
+        yaw_rate: demanded yaw rate together with a ground speed, positive to the left [rad/s]. If any of the last
+            five is stated, the robot is free to turn.
         linear: True if values change linearly between rows, False if they hold until the next row.
         cycles: number of repetitions of the rows.
     """
@@ -89,12 +90,12 @@ class Profile(eqx.Module):
 
     @property
     def stated(self) -> tuple[str, ...]:
-        """Conditions that it states."""
+        """Names of the conditions that it states."""
         return tuple(name for name in CONDITIONS if getattr(self, name) is not None)
 
     @property
     def turns(self) -> bool:
-        """True if it drives the sides apart. The robot is then free to turn."""
+        """True if it drives the sides independently, so that the robot is free to turn."""
         return any(getattr(self, name) is not None for name in APART)
 
     @property
@@ -103,11 +104,11 @@ class Profile(eqx.Module):
         return self.cycles * (self.time[-1] - self.time[0])
 
     def row(self, k: Index) -> Profile:
-        """The rows `k` and `k + 1`: one segment as a separate profile."""
+        """One segment as a separate profile: the rows `k` and `k + 1`."""
         return jax.tree.map(lambda x: jax.lax.dynamic_slice_in_dim(x, k, 2), self)
 
     def at(self, elapsed: Scalar) -> Profile:
-        """Values of a profile of two rows `elapsed` seconds after the first. Its fields are scalars."""
+        """Values of a profile with two rows, `elapsed` seconds after the first. Its fields are scalars."""
         share = elapsed / (self.time[1] - self.time[0]) if self.linear else 0.0
 
         def interpolate(x: Array) -> Array:
@@ -119,7 +120,7 @@ class Profile(eqx.Module):
         return dataclasses.replace(values, **still)
 
     def conditions(self, otherwise: Conditions) -> Conditions:
-        """The conditions of an instant, see `at`. From `otherwise` if the profile does not state them."""
+        """Conditions at an instant (see `at`). Those that the profile does not state are from `otherwise`."""
         stated = {name: getattr(self, name) for name in CONDITIONS if getattr(self, name) is not None}
         if "payload" in stated and otherwise.total_mass is not None:
             stated["total_mass"] = otherwise.total_mass + stated["payload"] - otherwise.payload
@@ -143,11 +144,11 @@ def profile(
     cycles: int = 1,
     **values: Number | None,
 ) -> Profile:
-    """A profile from plain numbers, each one for all rows or one per row.
+    """Profile from plain numbers, each one for all rows or one for each row.
 
     Args:
         time: time of the rows [s].
-        mode: one of `MODES`, one or one per row.
+        mode: one of `MODES`, for all rows or one for each row.
         demand, linear, cycles: see `Profile`.
         values: other fields of the profile, by name.
 
@@ -202,14 +203,14 @@ def profile(
 
 
 def sides_error(stated: Sequence[str], speed: bool, named: Callable[[str], str] = str) -> str | None:
-    """Error message if a profile's fields for the sides contradict each other, else None.
+    """Message if a profile's fields for the sides contradict each other, otherwise None.
 
     They do for one side without the other, two kinds at once, or a yaw rate without a demanded speed.
 
     Args:
-        stated: fields.
+        stated: names of the stated fields.
         speed: True if a ground speed is demanded.
-        named: maps a field to its name in the input.
+        named: function from a field to its name in the input.
     """
     for left, right in (pair for either in PAIRS for pair in (either, either[::-1])):
         if left in stated and right not in stated:

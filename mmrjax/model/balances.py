@@ -1,7 +1,7 @@
 """The balances: the only place where terms are summed, in the order in which an instant is computed.
 
-Each function takes a robot and the `Signals` so far and returns them with its own quantities filled in.
-All three fidelities are compositions of these functions.
+Each function takes a robot and the `Signals` so far and returns them with its own quantities filled in. All three
+fidelities are compositions of these functions.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from mmrjax.model.shaft import Shaft
 from mmrjax.model.signals import GRAVITY, PlaneMotion, Signals, State
 from mmrjax.numerics.one_sided import at_least, clip
 from mmrjax.numerics.trigonometry import cosine, sine
-from mmrjax.turning.two_sides import SIDES, Grip, Stance, grip, sum_of_sides
+from mmrjax.turning.two_sides import SIDES, GroundForces, Stance, ground_forces, sum_of_sides
 
 #: Each balance with its unit and its equation.
 BALANCES = {
@@ -80,7 +80,7 @@ def effects_sum(robot: Robot, signals: Signals, balance: str, channel: str = "")
     return sum(terms) if terms else 0.0
 
 
-def _fill(signals: Signals, **values: Any) -> Signals:
+def _fill_unset(signals: Signals, **values: Any) -> Signals:
     return dataclasses.replace(signals, **values)
 
 
@@ -88,7 +88,7 @@ def _fill(signals: Signals, **values: Any) -> Signals:
 IN_PLANE = ("speed_lateral", "yaw_rate", "heading", "place_x", "place_y")
 
 
-def duty_given(robot: Robot, conditions: Conditions) -> Scalar:
+def bridge_duty(robot: Robot, conditions: Conditions) -> Scalar:
     """Duty that the bridge gives for the demanded one [-], before its current limit, in the same direction."""
     if conditions.voltage_follows or not any(e.balance == "duty" for e in robot.effects):
         return conditions.duty
@@ -103,7 +103,7 @@ def duty_given(robot: Robot, conditions: Conditions) -> Scalar:
     return way * clip(way * (conditions.duty - effects_sum(robot, demanded, "duty")), 0.0, 1.0)
 
 
-def shown_to_controller(robot: Robot, conditions: Conditions, state: State) -> tuple[Scalar, Scalar]:
+def controller_reading(robot: Robot, conditions: Conditions, state: State) -> tuple[Scalar, Scalar]:
     """Reading that a controller compares with its goal, as `Rig.imposed`, and the rate of an angle, else 0 [SI]."""
     if robot.rig.imposed == "goal_current":
         return state.current, jnp.zeros_like(state.current)
@@ -112,8 +112,8 @@ def shown_to_controller(robot: Robot, conditions: Conditions, state: State) -> t
     return (state.distance / radius, speed) if robot.rig.imposed == "goal_angle" else (speed, jnp.zeros_like(speed))
 
 
-def commanded(robot: Robot, conditions: Conditions, state: State) -> Conditions:
-    """Conditions with the duty that a controller demands in a state, in the place of its goal."""
+def with_controller_duty(robot: Robot, conditions: Conditions, state: State) -> Conditions:
+    """Conditions in which the goal is replaced by the duty that the controller demands in a state."""
     if conditions.goal is None or robot.controller is None:
         return conditions
     duty = conditions.duty * (_controller_duty(robot, conditions, state) if state.command is None else state.command)
@@ -123,18 +123,20 @@ def commanded(robot: Robot, conditions: Conditions, state: State) -> Conditions:
 def _controller_duty(robot: Robot, conditions: Conditions, state: State) -> Scalar:
     """Duty that a controller wants [-]."""
     assert robot.controller is not None and conditions.goal is not None
-    shown, speed = shown_to_controller(robot, conditions, state)
+    shown, speed = controller_reading(robot, conditions, state)
     ahead = 0.0 if robot.rig.imposed == "goal_angle" else conditions.goal
     integral = 0.0 if state.integral is None else state.integral
     return robot.controller.duty(conditions.goal - shown, integral, speed, ahead)
 
 
 def controller_rates(robot: Robot, conditions: Conditions, state: State) -> list[Scalar]:
-    """Rates of a controller's states: the error, unless it would drive the duty beyond its limit, and the duty's."""
+    """Rates of change of the controller's states: its integral (the error, or 0 while it would drive the duty beyond
+    its limit), and the lagged duty.
+    """
     if conditions.goal is None or robot.controller is None:
         return [jnp.zeros_like(state.speed)] * robot.controller_size
     duty = _controller_duty(robot, conditions, state)
-    error = conditions.goal - shown_to_controller(robot, conditions, state)[0]
+    error = conditions.goal - controller_reading(robot, conditions, state)[0]
     limited = (jnp.abs(duty) >= robot.controller.limit) & (duty * error > 0)
     integrated = jnp.where(limited | (conditions.open > 0.5), 0.0, error)
     return [integrated] if state.command is None else [integrated, (duty - state.command) / robot.controller.lag]
@@ -146,7 +148,7 @@ def begin_signals(robot: Robot, conditions: Conditions, state: State, direction:
     speed_wheel = state.speed_motor * (1 / robot.gearbox.ratio)
     speed_theoretical = chassis.radius * speed_wheel
     rest = chassis.speed_still
-    duty = robot.driver.duty_limited(duty_given(robot, conditions), state.current, conditions.polarity)
+    duty = robot.driver.duty_limited(bridge_duty(robot, conditions), state.current, conditions.polarity)
     straight = dict.fromkeys(IN_PLANE, jnp.zeros_like(state.speed))
     signals = Signals(
         **straight,
@@ -177,11 +179,11 @@ def begin_signals(robot: Robot, conditions: Conditions, state: State, direction:
         total_current=robot.sides * state.current * robot.driver.share_drawn(duty),
     )
     if isinstance(chassis, Shaft):  # no ground carries it
-        return _fill(signals, mass=jnp.zeros_like(state.speed), normal=jnp.zeros_like(state.speed))
+        return _fill_unset(signals, mass=jnp.zeros_like(state.speed), normal=jnp.zeros_like(state.speed))
     stated = chassis.mass + conditions.payload if conditions.total_mass is None else conditions.total_mass
-    mass = stated + effects_sum(robot, _fill(signals, mass=stated), "mass")
+    mass = stated + effects_sum(robot, _fill_unset(signals, mass=stated), "mass")
     normal = chassis_room.normal_load(mass, conditions.slope, GRAVITY, robot.sides)
-    return _fill(signals, mass=mass, normal=normal)
+    return _fill_unset(signals, mass=mass, normal=normal)
 
 
 def supply(robot: Robot, conditions: Conditions, signals: Signals) -> Signals:
@@ -193,10 +195,10 @@ def supply(robot: Robot, conditions: Conditions, signals: Signals) -> Signals:
     )
     back = robot.motor.voltage_back(signals.speed_motor)
     voltage = robot.driver.voltage(source - effects_sum(robot, signals, "supply"), signals.duty, signals.pause, back)
-    demanded, limited = (conditions.polarity * duty for duty in (duty_given(robot, conditions), signals.duty))
+    demanded, limited = (conditions.polarity * duty for duty in (bridge_duty(robot, conditions), signals.duty))
     conducts = robot.driver.conducts(demanded, limited, signals.current, voltage - back, conditions.open)
     voltage = jnp.where(conducts == 1, voltage, back + conducts * (voltage - back))
-    return _fill(signals, voltage_source=source, voltage=voltage)
+    return _fill_unset(signals, voltage_source=source, voltage=voltage)
 
 
 def power_drawn(robot: Robot, signals: Signals) -> Scalar:
@@ -223,8 +225,8 @@ def electrical(robot: Robot, conditions: Conditions, signals: Signals) -> Signal
     if conditions.voltage_follows:
         asked = signals.current if conditions.motor_current is None else conditions.motor_current
         taken = back + drop + robot.motor.resistance * (asked - signals.current)
-        signals = _fill(signals, voltage=taken, voltage_source=taken)
-    return _fill(
+        signals = _fill_unset(signals, voltage=taken, voltage_source=taken)
+    return _fill_unset(
         signals,
         voltage_back=back,
         voltage_drop=drop,
@@ -238,7 +240,7 @@ def motor(robot: Robot, signals: Signals) -> Signals:
     electromagnetic = robot.motor.torque_electromagnetic(signals.current)
     loss = robot.motor.torque_loss(signals.speed_motor, signals.direction)
     loss = loss + effects_sum(robot, signals, "motor")
-    return _fill(
+    return _fill_unset(
         signals,
         torque_electromagnetic=electromagnetic,
         torque_motor_loss=loss,
@@ -257,11 +259,11 @@ def travel(robot: Robot, chassis: Load, signals: Signals) -> Signals:
     if isinstance(chassis, Shaft):
         demand = opposing_torque(chassis, signals) / chassis.radius
         none = jnp.zeros_like(demand)
-        return _fill(signals, resistance=none, gravity=demand, demand=demand, adhesion_limit=none + jnp.inf)
+        return _fill_unset(signals, resistance=none, gravity=demand, demand=demand, adhesion_limit=none + jnp.inf)
     resistance = chassis.ground.force_resistance(signals.normal, signals.direction_travel)
     resistance = resistance + effects_sum(robot, signals, "ground")
     gravity = ground.force_gravity(signals.mass * (1 / robot.sides), signals.slope, GRAVITY)
-    return _fill(
+    return _fill_unset(
         signals,
         resistance=resistance,
         gravity=gravity,
@@ -273,7 +275,9 @@ def travel(robot: Robot, chassis: Load, signals: Signals) -> Signals:
 def slip(robot: Robot, signals: Signals) -> Signals:
     """Sliding speed of the contact patch over the ground [m/s]."""
     terms = effects_sum(robot, signals, "slip")
-    return _fill(signals, speed_slip_terms=terms, speed_sliding=signals.speed_theoretical - signals.speed - terms)
+    return _fill_unset(
+        signals, speed_slip_terms=terms, speed_sliding=signals.speed_theoretical - signals.speed - terms
+    )
 
 
 def track(robot: Robot, chassis: Load, signals: Signals, guide: Scalar | None = None) -> Signals:
@@ -283,11 +287,11 @@ def track(robot: Robot, chassis: Load, signals: Signals, guide: Scalar | None = 
     """
     if isinstance(chassis, Shaft):
         loss = chassis.torque_loss(signals.speed_wheel, signals.direction) + effects_sum(robot, signals, "track")
-        return _fill(signals, torque_track_loss=loss)
+        return _fill_unset(signals, torque_track_loss=loss)
     loss = chassis.track.torque_loss(signals.speed_wheel, signals.direction)
     guide = chassis.track.force_guide(signals.normal, signals.direction) if guide is None else guide
     loss = loss + guide * chassis.radius + effects_sum(robot, signals, "track")
-    return _fill(signals, torque_track_loss=loss)
+    return _fill_unset(signals, torque_track_loss=loss)
 
 
 #: Least inertia of the parts that turn with a wheel [kg·m²]: a rig's file may state none.
@@ -312,7 +316,7 @@ def gearbox(
     load = signals.torque_track_loss + mover
 
     def at_output(torque: Scalar) -> Signals:
-        carrying = _fill(signals, torque_carried=torque)
+        carrying = _fill_unset(signals, torque_carried=torque)
         return _gearbox_signals(robot, chassis, carrying, load, effects_sum(robot, carrying, "gearbox"))
 
     def surplus(torque: Scalar) -> Scalar:
@@ -323,7 +327,7 @@ def gearbox(
     if settled:
         return output
     if not any(e.balance == "gearbox" for e in robot.effects):
-        return _fill(output, torque_carried=torque - surplus(torque))
+        return _fill_unset(output, torque_carried=torque - surplus(torque))
     for _ in range(TORQUE_STEPS):
         left, rise = jax.jvp(surplus, (torque,), (jnp.ones_like(torque),))
         torque = torque - left / rise
@@ -355,7 +359,7 @@ def _gearbox_signals(robot: Robot, chassis: Load, signals: Signals, load: Scalar
     acceleration = net / inertia
     torque_input = signals.torque_motor - inertia_motor * gear.ratio * acceleration
     torque_gear = gear.ratio * efficiency * (torque_input - idle)
-    return _fill(
+    return _fill_unset(
         signals,
         torque_idle=idle,
         torque_load=load,
@@ -369,7 +373,7 @@ def _gearbox_signals(robot: Robot, chassis: Load, signals: Signals, load: Scalar
     )
 
 
-def _to_slip(robot: Robot, conditions: Conditions, chassis: Load, signals: Signals) -> Signals:
+def _signals_up_to_slip(robot: Robot, conditions: Conditions, chassis: Load, signals: Signals) -> Signals:
     """Applies the balances between kinematics and traction, in their order."""
     signals = electrical(robot, conditions, supply(robot, conditions, signals))
     return slip(robot, travel(robot, chassis, motor(robot, signals)))
@@ -378,7 +382,7 @@ def _to_slip(robot: Robot, conditions: Conditions, chassis: Load, signals: Signa
 def _traction_and_net_force(robot: Robot, signals: Signals, traction: Scalar) -> Signals:
     """Traction [N] and the force left to accelerate the robot, eq. (1)."""
     acceleration = (traction - signals.demand) / (signals.mass / robot.sides)
-    return _fill(signals, traction=traction, acceleration=acceleration)
+    return _fill_unset(signals, traction=traction, acceleration=acceleration)
 
 
 def moving_signals(robot: Robot, conditions: Conditions, state: State, way: Scalar | None = None) -> Signals:
@@ -389,10 +393,10 @@ def moving_signals(robot: Robot, conditions: Conditions, state: State, way: Scal
     Args:
         way: direction of motion that dry friction opposes, ±1 [-]. None or 0: from the speeds, smooth through rest.
     """
-    conditions = commanded(robot, conditions, state)
+    conditions = with_controller_duty(robot, conditions, state)
     if conditions.motor_speed is not None:
         state = dataclasses.replace(state, current=_current_for_acceleration(robot, conditions, state, way))
-    return _moving(robot, conditions, state, way)
+    return _signals_in_motion(robot, conditions, state, way)
 
 
 def rolling_signals(robot: Robot, conditions: Conditions, state: State, way: Scalar | None = None) -> Signals:
@@ -405,21 +409,23 @@ def rolling_signals(robot: Robot, conditions: Conditions, state: State, way: Sca
     chassis = robot.chassis(conditions.configuration)
     if isinstance(chassis, Shaft):
         return moving_signals(robot, conditions, state, way)
-    signals = _to_slip(robot, conditions, chassis, _one_way(begin_signals(robot, conditions, state), way))
-    signals = track(robot, chassis, _fill(signals, traction=signals.demand))
+    signals = _signals_up_to_slip(
+        robot, conditions, chassis, _with_direction(begin_signals(robot, conditions, state), way)
+    )
+    signals = track(robot, chassis, _fill_unset(signals, traction=signals.demand))
     carried = signals.mass * (1 / robot.sides)
     heavy = dataclasses.replace(chassis, inertia=chassis.inertia + carried * chassis.radius**2)
     signals = gearbox(robot, heavy, signals)
     acceleration = chassis.radius * signals.acceleration_wheel
-    return _fill(signals, acceleration=acceleration, traction=signals.demand + carried * acceleration)
+    return _fill_unset(signals, acceleration=acceleration, traction=signals.demand + carried * acceleration)
 
 
-def _one_way(signals: Signals, way: Scalar | None) -> Signals:
+def _with_direction(signals: Signals, way: Scalar | None) -> Signals:
     """Signals with the direction that dry friction opposes, as in `moving_signals`."""
     if way is None:
         return signals
     directions = "direction", "direction_travel"
-    return _fill(signals, **{d: jnp.where(way == 0, getattr(signals, d), way) for d in directions})
+    return _fill_unset(signals, **{d: jnp.where(way == 0, getattr(signals, d), way) for d in directions})
 
 
 #: Newton steps of the current at an imposed speed: torque is linear in it except for effects and the power direction.
@@ -431,25 +437,25 @@ def _current_for_acceleration(robot: Robot, conditions: Conditions, state: State
 
     def at(given: tuple[Robot, Conditions, State], current: Scalar) -> Signals:
         robot, conditions, state = given
-        return _moving(robot, conditions, dataclasses.replace(state, current=current), way)
+        return _signals_in_motion(robot, conditions, dataclasses.replace(state, current=current), way)
 
-    return _current_of(at, (robot, conditions, state))
+    return _solve_current(at, (robot, conditions, state))
 
 
-def _speed_imposed(robot: Robot, conditions: Conditions, chassis: Chassis, signals: Signals) -> Signals:
+def _signals_at_imposed_speed(robot: Robot, conditions: Conditions, chassis: Chassis, signals: Signals) -> Signals:
     """Signals of a side whose motor speed is imposed and whose traction is known."""
 
     def at(given: tuple[Robot, Conditions, Chassis, Signals], current: Scalar) -> Signals:
         robot, conditions, chassis, signals = given
         total = robot.sides * current * signals.share_drawn
-        moved = electrical(robot, conditions, _fill(signals, current=current, total_current=total))
+        moved = electrical(robot, conditions, _fill_unset(signals, current=current, total_current=total))
         return gearbox(robot, chassis, motor(robot, moved))
 
     given = robot, conditions, chassis, signals
-    return at(given, _current_of(at, given))
+    return at(given, _solve_current(at, given))
 
 
-def _current_of(signals: Callable[[Any, Scalar], Signals], given: tuple) -> Scalar:
+def _solve_current(signals: Callable[[Any, Scalar], Signals], given: tuple) -> Scalar:
     """Motor current that gives the imposed acceleration [A].
 
     Args:
@@ -471,22 +477,24 @@ def _current_of(signals: Callable[[Any, Scalar], Signals], given: tuple) -> Scal
     return current
 
 
-def _moving(robot: Robot, conditions: Conditions, state: State, way: Scalar | None) -> Signals:
+def _signals_in_motion(robot: Robot, conditions: Conditions, state: State, way: Scalar | None) -> Signals:
     robot = robot.within(conditions.configuration)
     chassis = robot.chassis(conditions.configuration)
-    signals = _to_slip(robot, conditions, chassis, _one_way(begin_signals(robot, conditions, state), way))
+    signals = _signals_up_to_slip(
+        robot, conditions, chassis, _with_direction(begin_signals(robot, conditions, state), way)
+    )
     if isinstance(chassis, Shaft):
-        signals = _fill(signals, traction=signals.demand)
+        signals = _fill_unset(signals, traction=signals.demand)
         if state.gap is not None:
-            return _two_bodies(robot, chassis, signals, state.gap)
+            return _joint_signals(robot, chassis, signals, state.gap)
         signals = gearbox(robot, chassis, track(robot, chassis, signals))
-        return _fill(signals, acceleration=chassis.radius * signals.acceleration_wheel)
+        return _fill_unset(signals, acceleration=chassis.radius * signals.acceleration_wheel)
     traction = chassis.ground.traction(signals.speed_sliding, signals.normal, signals.adhesion)
     signals = _traction_and_net_force(robot, signals, traction)
     return gearbox(robot, chassis, track(robot, chassis, signals))
 
 
-def _two_bodies(robot: Robot, chassis: Shaft, signals: Signals, gap: Scalar) -> Signals:
+def _joint_signals(robot: Robot, chassis: Shaft, signals: Signals, gap: Scalar) -> Signals:
     """Motor and load as two bodies, between which gear flanks or an elastic joint carry a torque [N·m]."""
     gear = robot.gearbox
     idle = gear.torque_idle(signals.speed_motor, signals.direction)
@@ -494,13 +502,13 @@ def _two_bodies(robot: Robot, chassis: Shaft, signals: Signals, gap: Scalar) -> 
     inertia_added = effects_sum(robot, signals, "inertia")
     inertia_motor = robot.motor.inertia * gear.ratio**2
     mesh = chassis.torque_joint(gap, signals.speed_wheel - signals.speed_output, inertia_motor)
-    signals = _fill(signals, torque_track_loss=loss, torque_carried=mesh)
+    signals = _fill_unset(signals, torque_track_loss=loss, torque_carried=mesh)
     added_loss = effects_sum(robot, signals, "gearbox")
     efficiency = gear.efficiency_flow(mesh, signals.direction)
     drive = signals.torque_motor - idle
     net = gear.ratio * drive - mesh / efficiency - added_loss
     acceleration = net / inertia_motor
-    return _fill(
+    return _fill_unset(
         signals,
         torque_idle=idle,
         torque_load=mesh + added_loss,
@@ -544,8 +552,8 @@ def resolved_signals(
     """
     robot = robot.within(conditions.configuration)
     chassis = dataclasses.replace(robot.chassis(conditions.configuration), inertia=inertia)
-    signals = _fill(begin_signals(robot, conditions, state), normal=mover.normal)
-    signals = _to_slip(robot, conditions, chassis, signals)
+    signals = _fill_unset(begin_signals(robot, conditions, state), normal=mover.normal)
+    signals = _signals_up_to_slip(robot, conditions, chassis, signals)
     pull = mover.pull(chassis, signals)
     return _side_signals(robot, chassis, signals, pull), pull
 
@@ -567,15 +575,15 @@ def resolved_sides(
     robot = robot.within(conditions.configuration)
     chassis = dataclasses.replace(robot.chassis(conditions.configuration), inertia=inertia)
     sides = conditions.of_sides()
-    signals = _fill(_begin_sides(robot, conditions, sides, motion), normal=mover.normal)
-    signals = jax.vmap(lambda c, s: _to_slip(robot, c, chassis, s))(sides, signals)
+    signals = _fill_unset(_begin_sides(robot, conditions, sides, motion), normal=mover.normal)
+    signals = jax.vmap(lambda c, s: _signals_up_to_slip(robot, c, chassis, s))(sides, signals)
     pull = mover.pull(chassis, signals)
     return jax.vmap(lambda s, p: _side_signals(robot, chassis, s, p))(signals, pull), pull
 
 
 def driven_signals(robot: Robot, conditions: Conditions, state: State, direction: Scalar | None) -> Signals:
     """Signals of an instant up to the voltage balance. `direction`: as in `begin_signals`."""
-    robot, conditions = robot.within(conditions.configuration), commanded(robot, conditions, state)
+    robot, conditions = robot.within(conditions.configuration), with_controller_duty(robot, conditions, state)
     return electrical(
         robot, conditions, supply(robot, conditions, begin_signals(robot, conditions, state, direction))
     )
@@ -584,7 +592,7 @@ def driven_signals(robot: Robot, conditions: Conditions, state: State, direction
 def demanded_signals(robot: Robot, conditions: Conditions, state: State, direction: Scalar) -> Signals:
     """Signals of an instant up to the demand on traction and the sliding of the contact."""
     robot = robot.within(conditions.configuration)
-    return _to_slip(
+    return _signals_up_to_slip(
         robot, conditions, robot.chassis(conditions.configuration), begin_signals(robot, conditions, state, direction)
     )
 
@@ -606,7 +614,7 @@ def settled_signals(
     signals = demanded_signals(robot, conditions, state, direction * jnp.ones_like(state.speed_motor))
     # In steady travel nothing changes: the rates that other fidelities compute are zero.
     still = jnp.zeros_like(signals.demand)
-    signals = _fill(signals, traction=signals.demand, acceleration=still)
+    signals = _fill_unset(signals, traction=signals.demand, acceleration=still)
     if isinstance(chassis, Shaft):
         creep = still
     else:
@@ -626,7 +634,7 @@ class Travel(eqx.Module):
     """
 
     signals: Signals
-    grip: Grip
+    grip: GroundForces
     acceleration: Scalar
     acceleration_lateral: Scalar
     acceleration_yaw: Scalar
@@ -672,7 +680,7 @@ def lateral_friction(conditions: Conditions, chassis: Chassis) -> Scalar:
     return lateral if stated is None else lateral * stated / conditions.adhesion
 
 
-def _for_both(x: Scalar) -> Array:
+def _both_sides(x: Scalar) -> Array:
     """The same value for left and right side."""
     return jnp.broadcast_to(x, SIDES.shape)
 
@@ -681,15 +689,15 @@ def _begin_sides(robot: Robot, conditions: Conditions, own: Conditions, motion: 
     """`begin_signals` of left and right side, with motion in the plane. `own` are the conditions of each side."""
     chassis = robot.chassis(conditions.configuration)
     signals = jax.vmap(functools.partial(begin_signals, robot))(own, states_of_sides(robot, conditions, motion))
-    return _fill(
+    return _fill_unset(
         signals,
-        total_current=_for_both(sum_of_sides(jnp.asarray(signals.total_current)) / 2),
+        total_current=_both_sides(sum_of_sides(jnp.asarray(signals.total_current)) / 2),
         side=jnp.sign(SIDES),
-        direction_turn=_for_both(
+        direction_turn=_both_sides(
             contact.smooth_sign(motion.yaw_rate * chassis.turning.width / 2, chassis.speed_still)
         ),
-        slope=_for_both(jnp.arcsin(sine(conditions.slope) * cosine(motion.heading))),
-        **{name: _for_both(getattr(motion, name)) for name in IN_PLANE},
+        slope=_both_sides(jnp.arcsin(sine(conditions.slope) * cosine(motion.heading))),
+        **{name: _both_sides(getattr(motion, name)) for name in IN_PLANE},
     )
 
 
@@ -697,7 +705,7 @@ def lateral_and_yaw_effects(robot: Robot, signals: Signals) -> tuple[Scalar, Sca
     """Sums of the robot's effects in the balances `lateral` [N] and `yaw` [N·m], over both sides."""
 
     def of(balance: str) -> Scalar:
-        each = _for_both(jax.vmap(lambda s: effects_sum(robot, s, balance))(signals))
+        each = _both_sides(jax.vmap(lambda s: effects_sum(robot, s, balance))(signals))
         return robot.sides / 2 * sum_of_sides(each)
 
     return of("lateral"), of("yaw")
@@ -712,24 +720,24 @@ def turning_signals(
     with the load divided equally between the sides.
 
     Args:
-        loads: normal loads of both sides [N], see `turning.grip`.
+        loads: normal loads of both sides [N], see `turning.ground_forces`.
     """
     robot = robot.within(conditions.configuration)
     chassis, sides = robot.chassis(conditions.configuration), conditions.of_sides()
     y = SIDES * chassis.turning.width
     signals = _begin_sides(robot, conditions, sides, motion)
     sine_slope, mass = sine(conditions.slope), jnp.maximum(*jnp.asarray(signals.mass))
-    even = jax.vmap(lambda c, s: _to_slip(robot, c, chassis, s))(sides, signals)
+    even = jax.vmap(lambda c, s: _signals_up_to_slip(robot, c, chassis, s))(sides, signals)
     rolling = chassis.ground.force_resistance(1.0, even.direction_travel)
     units = robot.sides / 2
     stands = stance(robot, conditions, chassis, mass)
     load, sliding = sum_of_sides(units * jnp.asarray(even.normal)), jnp.asarray(even.speed_sliding)
-    held = grip(
+    held = ground_forces(
         stands, chassis.ground.friction, conditions.adhesion, load, sliding, motion.speed_lateral, motion.yaw_rate,
         jnp.asarray(rolling), loads,
     )  # fmt: skip
     own_load = jax.vmap(lambda s: travel(robot, chassis, s))(
-        _fill(even, normal=held.normal / units, moment_lateral=held.moment / units)
+        _fill_unset(even, normal=held.normal / units, moment_lateral=held.moment / units)
     )
     lateral, yaw = lateral_and_yaw_effects(robot, own_load)
     pull = held.ahead - units * own_load.resistance
@@ -737,13 +745,13 @@ def turning_signals(
     across = sum_of_sides(held.aside) + mass * GRAVITY * sine_slope * sine(motion.heading) - lateral
     turn = (sum_of_sides(held.moment - y * pull) - yaw) / chassis.turning.inertia
     acceleration = along / mass + motion.yaw_rate * motion.speed_lateral
-    pulled = _fill(own_load, traction=held.ahead / units, acceleration=acceleration - turn * y)
+    pulled = _fill_unset(own_load, traction=held.ahead / units, acceleration=acceleration - turn * y)
     pulled = jax.vmap(lambda s: track(robot, chassis, s))(pulled)
     if sides.motor_speed is None:
         pulled = jax.vmap(lambda s: gearbox(robot, chassis, s))(pulled)
     else:
-        pulled = jax.vmap(lambda c, s: _speed_imposed(robot, c, chassis, s))(sides, pulled)
-        pulled = _fill(pulled, total_current=_for_both(sum_of_sides(jnp.asarray(pulled.total_current)) / 2))
+        pulled = jax.vmap(lambda c, s: _signals_at_imposed_speed(robot, c, chassis, s))(sides, pulled)
+        pulled = _fill_unset(pulled, total_current=_both_sides(sum_of_sides(jnp.asarray(pulled.total_current)) / 2))
     return Travel(
         pulled,
         held,

@@ -33,7 +33,7 @@ OF_TURNS = (*OF_SIDES, "heading_deg")
 NUMBERS = ("voltage", "slope_deg", "payload", "battery", "discharge", "adhesion", "order", "duty", "open")
 
 
-class Named(eqx.Module):
+class NamedConfigurations(eqx.Module):
     """Configurations by name: a pytree, so that conditions by name pass `jax.jit` and `jax.vmap`.
 
     Attributes:
@@ -45,7 +45,7 @@ class Named(eqx.Module):
     names: tuple[str, ...] = eqx.field(static=True)
 
     @staticmethod
-    def of(words: np.ndarray) -> Named:
+    def of(words: np.ndarray) -> NamedConfigurations:
         """Encodes an array of names."""
         # one name for all runs, as `Conditions` broadcasts it, is looked up once
         once = np.asarray(words[tuple(slice(1) if stride == 0 else slice(None) for stride in words.strides)])
@@ -53,7 +53,7 @@ class Named(eqx.Module):
         while (left := index < 0).any():
             names.append(str(once[left][0]))
             index[once == names[-1]] = len(names) - 1
-        return Named(np.broadcast_to(index, words.shape), tuple(names))
+        return NamedConfigurations(np.broadcast_to(index, words.shape), tuple(names))
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -78,7 +78,7 @@ class Conditions(eqx.Module):
     """The conditions of one run or of a batch. All fields broadcast to one shape.
 
     Attributes:
-        configuration: index of the robot's configuration. Until `resolved` it may be a name (`Named`).
+        configuration: index of the robot's configuration. Until `resolved` it may be a name (`NamedConfigurations`).
         voltage: voltage of the external supply [V]. Not used with `battery`.
         slope_deg: slope angle, positive uphill [deg].
         payload: additional load mass m_c [kg].
@@ -142,7 +142,7 @@ class Conditions(eqx.Module):
 
     def __init__(
         self,
-        configuration: str | int | Sequence[str] | np.ndarray | Array | Named = 0,
+        configuration: str | int | Sequence[str] | np.ndarray | Array | NamedConfigurations = 0,
         voltage: Number = 33.0,
         slope_deg: Number = 0.0,
         payload: Number = 0.0,
@@ -178,10 +178,10 @@ class Conditions(eqx.Module):
         given: dict[str, Any] = locals()
         stated = {name: given[name] for name in CONDITIONS if given[name] is not None or name in NUMBERS}
         which: Any = configuration
-        if not isinstance(configuration, jax.Array | Named):
+        if not isinstance(configuration, jax.Array | NamedConfigurations):
             words = np.asarray(configuration)
-            which = Named.of(words) if words.dtype.kind == "U" else configuration
-        which = which if isinstance(which, Named) else _number_array("configuration", which, int)
+            which = NamedConfigurations.of(words) if words.dtype.kind == "U" else configuration
+        which = which if isinstance(which, NamedConfigurations) else _number_array("configuration", which, int)
         numbers = {name: _number_array(name, x) for name, x in stated.items()}
         shapes = {name: x.shape for name, x in {"configuration": which, **numbers}.items()}
         try:
@@ -252,7 +252,7 @@ class Conditions(eqx.Module):
         Raises:
             KeyError: a name is no configuration of the robot. The message lists the robot's configurations.
         """
-        if not isinstance(self.configuration, Named):
+        if not isinstance(self.configuration, NamedConfigurations):
             return self
         try:
             which = self.configuration.among(robot.configurations.names)

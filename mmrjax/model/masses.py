@@ -16,7 +16,7 @@ from mmrjax.model.robot import Robot
 from mmrjax.undercarriage.running_gear import RunningGear
 
 
-class Masses(eqx.Module):
+class HalfRobotMasses(eqx.Module):
     """Masses and inertias of half a robot [kg, m, kg·m²].
 
     Attributes:
@@ -58,7 +58,7 @@ class Masses(eqx.Module):
         return self.pitching(wheelbase) + 2 * self.inertia_pulley - moved / total
 
 
-class _Part(NamedTuple):
+class _RigidPart(NamedTuple):
     """A rigid part: mass [kg], centre from the middle of the wheelbase [m], inertia in pitch about it [kg·m²]."""
 
     mass: Scalar
@@ -67,23 +67,23 @@ class _Part(NamedTuple):
     inertia: Scalar
 
 
-def _joined_parts(parts: list[_Part]) -> _Part:
+def _joined_parts(parts: list[_RigidPart]) -> _RigidPart:
     """Parts joined rigidly: Σ J + Σ m d² about their common centre (Huygens and Steiner)."""
     mass = sum(p.mass for p in parts)
     forward = sum(p.mass * p.forward for p in parts) / mass
     up = sum(p.mass * p.up for p in parts) / mass
     inertia = sum(p.inertia + p.mass * ((p.forward - forward) ** 2 + (p.up - up) ** 2) for p in parts)
-    return _Part(mass, forward, up, inertia)
+    return _RigidPart(mass, forward, up, inertia)
 
 
-def _belt_part(gear: RunningGear, radius: Scalar) -> _Part:
+def _belt_part(gear: RunningGear, radius: Scalar) -> _RigidPart:
     """A main track round its pulleys. Its inertia is reduced by m r², which is in J_w and turns with the pulleys."""
     base, mass = gear.wheelbase, gear.belt_mass
     straights = 2 * base * (base**2 / 12 + radius**2)
     arcs = 2 * radius * (jnp.pi * base**2 / 4 + 2 * base * radius + jnp.pi * radius**2)
     loop = mass * (straights + arcs) / (2 * base + 2 * jnp.pi * radius)
     nothing = jnp.zeros_like(mass)
-    return _Part(mass, nothing, nothing, loop - mass * radius**2)
+    return _RigidPart(mass, nothing, nothing, loop - mass * radius**2)
 
 
 def lever_angles(gear: RunningGear, conditions: Conditions) -> tuple[Scalar, Scalar]:
@@ -98,36 +98,36 @@ def lever_angles(gear: RunningGear, conditions: Conditions) -> tuple[Scalar, Sca
     )
 
 
-def _lever_parts(gear: RunningGear, tracked: Scalar, front: Scalar, rear: Scalar) -> list[_Part]:
+def _lever_parts(gear: RunningGear, tracked: Scalar, front: Scalar, rear: Scalar) -> list[_RigidPart]:
     """The levers of one side at their angles [rad], see `lever_angles`."""
     mass, inertia, half = gear.lever_mass * tracked, gear.lever_inertia * tracked, gear.wheelbase / 2
     along = gear.lever_centre
     return [
-        _Part(mass, side * (half + along * jnp.cos(angle)), along * jnp.sin(angle), inertia)
+        _RigidPart(mass, side * (half + along * jnp.cos(angle)), along * jnp.sin(angle), inertia)
         for side, angle in ((1.0, front), (-1.0, rear))
     ]
 
 
-def masses_of_parts(robot: Robot, conditions: Conditions, mass: Scalar) -> Masses:
+def masses_of_parts(robot: Robot, conditions: Conditions, mass: Scalar) -> HalfRobotMasses:
     """Masses of half a robot whose total with payload is `mass` [kg], as `balances.begin_signals` gives it.
 
     The body's mass is the rest after pulleys, wheels, tracks, levers and payload. It has its own radius of gyration.
     The moment of inertia is summed over the parts at the lever angles. A robot may state the inertia of the whole
     with folded levers and without payload (`inertia_tracked`, `inertia_wheeled`). The body's is then the difference.
     """
-    fixed, levers, body, pulley, inertia_pulley = _of_robot(robot, conditions, mass)
-    return Masses(*_joined_parts([*fixed, *levers]), body, pulley, inertia_pulley)
+    fixed, levers, body, pulley, inertia_pulley = _parts_of_robot(robot, conditions, mass)
+    return HalfRobotMasses(*_joined_parts([*fixed, *levers]), body, pulley, inertia_pulley)
 
 
-def without_levers(robot: Robot, conditions: Conditions, mass: Scalar) -> Masses:
+def without_levers(robot: Robot, conditions: Conditions, mass: Scalar) -> HalfRobotMasses:
     """Same as `masses_of_parts` without the levers, which rest on their axles."""
-    fixed, _, body, pulley, inertia_pulley = _of_robot(robot, conditions, mass)
-    return Masses(*_joined_parts(fixed), body, pulley, inertia_pulley)
+    fixed, _, body, pulley, inertia_pulley = _parts_of_robot(robot, conditions, mass)
+    return HalfRobotMasses(*_joined_parts(fixed), body, pulley, inertia_pulley)
 
 
-def _of_robot(
+def _parts_of_robot(
     robot: Robot, conditions: Conditions, mass: Scalar
-) -> tuple[list[_Part], list[_Part], Scalar, Scalar, Scalar]:
+) -> tuple[list[_RigidPart], list[_RigidPart], Scalar, Scalar, Scalar]:
     """Parts fixed in the chassis, levers, mass of the body, mass and inertia of the parts that turn on an axle."""
     kind, gear = robot.chassis(conditions.configuration), robot.running_gear
     tracked = kind.on_tracks
@@ -137,11 +137,11 @@ def _of_robot(
     belt = _belt_part(gear, robot.radius_pulley)
     levers = _lever_parts(gear, tracked, *lever_angles(gear, conditions))
     nothing = jnp.zeros_like(belt.mass)
-    payload = _Part(conditions.payload / robot.sides, gear.payload_offset, gear.payload_height, nothing)
+    payload = _RigidPart(conditions.payload / robot.sides, gear.payload_offset, gear.payload_height, nothing)
     weighs = mass / robot.sides - 2 * pulley - belt.mass - sum(p.mass for p in levers) - payload.mass
-    body = _Part(weighs, gear.centre_offset, gear.centre_height, weighs * gear.body_gyration**2)
+    body = _RigidPart(weighs, gear.centre_offset, gear.centre_height, weighs * gear.body_gyration**2)
 
-    pulleys = [_Part(pulley, side * gear.wheelbase / 2, nothing, inertia_pulley) for side in (1.0, -1.0)]
+    pulleys = [_RigidPart(pulley, side * gear.wheelbase / 2, nothing, inertia_pulley) for side in (1.0, -1.0)]
     folded = [
         body._replace(inertia=nothing),
         belt,

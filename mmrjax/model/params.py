@@ -123,15 +123,15 @@ def walk_parameters(component: eqx.Module, prefix: str = "") -> Iterator[Paramet
     """
     rig = getattr(component, "rig", None)
     if rig is None or rig.inherits:
-        yield from _walk(component, prefix)
+        yield from _walk_component(component, prefix)
         return
     stated = {name for name, _, _ in rig.priors}
-    for parameter in _walk(component, prefix):
+    for parameter in _walk_component(component, prefix):
         spec = rig_spec(parameter.spec, parameter.name in stated)
         yield dataclasses.replace(parameter, spec=spec)
 
 
-def _walk(component: eqx.Module, prefix: str) -> Iterator[Parameter]:
+def _walk_component(component: eqx.Module, prefix: str) -> Iterator[Parameter]:
     for field in dataclasses.fields(component):
         value = getattr(component, field.name)
         name = f"{prefix}{field.name}"
@@ -139,13 +139,13 @@ def _walk(component: eqx.Module, prefix: str) -> Iterator[Parameter]:
             yield Parameter(name, value, field.metadata["spec"])
         elif hasattr(value, "items"):
             for key, member in value.items():
-                yield from _walk(member, f"{prefix}{key}.")
+                yield from _walk_component(member, f"{prefix}{key}.")
         elif isinstance(value, eqx.Module):
-            yield from _walk(value, f"{name}.")
+            yield from _walk_component(value, f"{name}.")
         elif isinstance(value, tuple):
             members: list[Any] = [m for m in value if isinstance(m, eqx.Module)]
             for member in members:
-                yield from _walk(member, f"{name}.{member.name}.")
+                yield from _walk_component(member, f"{name}.{member.name}.")
 
 
 def parameter_table(component: eqx.Module) -> str:
@@ -189,7 +189,7 @@ def replace(component: M, values: dict[str, Any]) -> M:
         meant = [similar_words(name, names, 3) for name in unknown]
         hints = [f"{n} (did you mean {', '.join(m)}?)" if m else n for n, m in zip(unknown, meant, strict=True)]
         raise KeyError(f"no such parameter: {', '.join(hints)}")
-    replaced = _replace(component, values, "")
+    replaced = _replace_below(component, values, "")
     rig: Any = getattr(replaced, "rig", None)
     if rig is None or values.keys().isdisjoint(rig.unknown):
         return replaced
@@ -198,22 +198,24 @@ def replace(component: M, values: dict[str, Any]) -> M:
     return dataclasses.replace(replaced, **changes)
 
 
-def _replace(component: Any, values: dict[str, Any], prefix: str) -> Any:
+def _replace_below(component: Any, values: dict[str, Any], prefix: str) -> Any:
     changes: dict[str, Any] = {}
     for field in dataclasses.fields(component):
         value = getattr(component, field.name)
         name = f"{prefix}{field.name}"
         if hasattr(value, "items"):
-            changes[field.name] = type(value)({k: _replace(m, values, f"{prefix}{k}.") for k, m in value.items()})
+            changes[field.name] = type(value)(
+                {k: _replace_below(m, values, f"{prefix}{k}.") for k, m in value.items()}
+            )
             continue
         if not any(key == name or key.startswith(f"{name}.") for key in values):
             continue
         if "spec" in field.metadata:
             changes[field.name] = values[name]
         elif isinstance(value, tuple):
-            changes[field.name] = tuple(_replace(m, values, f"{name}.{m.name}.") for m in value)
+            changes[field.name] = tuple(_replace_below(m, values, f"{name}.{m.name}.") for m in value)
         else:
-            changes[field.name] = _replace(value, values, f"{name}.")
+            changes[field.name] = _replace_below(value, values, f"{name}.")
     return dataclasses.replace(component, **changes) if changes else component
 
 

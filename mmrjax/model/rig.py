@@ -62,7 +62,7 @@ class Instrument:
         return (self.quantum or 0.0) ** 2 / 12
 
 
-class Begin(eqx.Module):
+class RunStart(eqx.Module):
     """Start of a run that does not begin at rest: its shafts turn, and its load rolls with them."""
 
     motor_speed: Scalar = parameter(
@@ -74,20 +74,20 @@ class Begin(eqx.Module):
     )
 
 
-class Begins(eqx.Module):
+class RunStarts(eqx.Module):
     """The beginnings of runs by name, in a fixed order. Conditions hold an index."""
 
     names: Names = eqx.field(static=True)
-    members: tuple[Begin, ...]
+    members: tuple[RunStart, ...]
 
-    def __init__(self, by_name: Mapping[str, Begin]) -> None:
+    def __init__(self, by_name: Mapping[str, RunStart]) -> None:
         self.names, self.members = tuple(by_name), tuple(by_name.values())
 
-    def items(self) -> Iterator[tuple[str, Begin]]:
+    def items(self) -> Iterator[tuple[str, RunStart]]:
         """Names and beginnings, in order."""
         return zip(self.names, self.members, strict=True)
 
-    def of(self, index: Index) -> Begin:
+    def of(self, index: Index) -> RunStart:
         """The beginning with this index, traceable."""
         stacked = jax.tree.map(lambda *x: jnp.stack([jnp.asarray(v, float) for v in x]), *self.members)
         return jax.tree.map(lambda x: x[jnp.asarray(index)], stacked)
@@ -119,7 +119,7 @@ class Rig(eqx.Module):
         0.0, "s", "dead time between a value in the imposed quantity's column and its action", (-10.0, 10.0),
         "stated by the owner of the rig", sd=0.02, scanned=0.0,
     )  # fmt: skip
-    begins: Begins | None = None
+    begins: RunStarts | None = None
     imposed: str = eqx.field(default=IMPOSED[0], static=True)
     channels: Names = eqx.field(default=channels.USUAL, static=True)
     instruments: tuple[Instrument, ...] = eqx.field(default=(), static=True)

@@ -1,4 +1,6 @@
-"""A loop for batches with very different numbers of turns: finished members are replaced by queued ones."""
+"""A loop for batches whose members need very different numbers of turns: finished members are replaced by waiting
+ones.
+"""
 
 from __future__ import annotations
 

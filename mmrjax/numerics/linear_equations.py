@@ -37,17 +37,17 @@ Matrix = Sequence[Sequence[Entry]] | Float[Array, "n n"]
 Factors = list[list[Entry]]
 
 
-def _times(a: Entry, b: Entry) -> Entry:
+def _product(a: Entry, b: Entry) -> Entry:
     return None if a is None or b is None else a * b
 
 
-def _minus(a: Entry, b: Entry) -> Entry:
+def _difference(a: Entry, b: Entry) -> Entry:
     if a is None or b is None:
         return a if b is None else -b
     return a - b
 
 
-def _over(a: Entry, b: Entry) -> Entry:
+def _quotient(a: Entry, b: Entry) -> Entry:
     # A quotient, not a product with a reciprocal: XLA stores a quotient with several uses for the whole batch, but
     # computes a product and its inputs again for each use.
     return None if a is None else a / (jnp.zeros(()) if b is None else b)
@@ -63,9 +63,9 @@ def factorise(matrix: Matrix) -> Factors:
     n = len(rows)
     for k in range(n):
         for i in range(k + 1, n):
-            rows[i][k] = _over(rows[i][k], rows[k][k])
+            rows[i][k] = _quotient(rows[i][k], rows[k][k])
             for j in range(k + 1, n):
-                rows[i][j] = _minus(rows[i][j], _times(rows[i][k], rows[k][j]))
+                rows[i][j] = _difference(rows[i][j], _product(rows[i][k], rows[k][j]))
     return rows
 
 
@@ -74,11 +74,11 @@ def substitute(factors: Factors, vector: Sequence[Entry] | Float[Array, " n"]) -
     n, x = len(factors), list(vector)
     for i in range(n):
         for j in range(i):
-            x[i] = _minus(x[i], _times(factors[i][j], x[j]))
+            x[i] = _difference(x[i], _product(factors[i][j], x[j]))
     for i in reversed(range(n)):
         for j in range(i + 1, n):
-            x[i] = _minus(x[i], _times(factors[i][j], x[j]))
-        x[i] = _over(x[i], factors[i][i])
+            x[i] = _difference(x[i], _product(factors[i][j], x[j]))
+        x[i] = _quotient(x[i], factors[i][i])
     return x
 
 

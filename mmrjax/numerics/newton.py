@@ -22,7 +22,7 @@ from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Bool, Float
 
 from mmrjax.numerics.linear_equations import Entry, Matrix, Vector, factorise, regularise, substitute
-from mmrjax.numerics.rarely import compute_rarely
+from mmrjax.numerics.rarely import compute_if_needed
 
 #: f(y, shared, own): as many scalars as unknowns, so that in a batch each is an array.
 Residual = Callable[[Vector, Any, Any], Vector]
@@ -80,11 +80,11 @@ def _watch_derivative(value: Array, index: int, moved: set[int]) -> Array:
     return watched(value)
 
 
-def _small(value: Vector, tolerance: float) -> Bool[Array, ""]:
+def _is_small(value: Vector, tolerance: float) -> Bool[Array, ""]:
     return functools.reduce(jnp.logical_and, [jnp.abs(x) < tolerance for x in value], jnp.asarray(True))
 
 
-def _solution(factors: list, value: Vector) -> Vector:
+def _solve_step(factors: list, value: Vector) -> Vector:
     return tuple(jnp.zeros(()) if x is None else x for x in substitute(factors, value))
 
 
@@ -93,7 +93,7 @@ def _subtract_step(y: Vector, step: Vector) -> Vector:
     return tuple(jnp.where(jnp.isfinite(b), a - b, a) for a, b in zip(y, step, strict=True))
 
 
-class Turning(eqx.Module):
+class NewtonState(eqx.Module):
     """State of a search.
 
     Full steps between branches of f can alternate without end. After `PATIENCE` turns, the last unknown therefore
@@ -112,24 +112,24 @@ class Turning(eqx.Module):
     low: Array
     high: Array
 
-    def after(self, jacobian: Matrix, value: Vector, atol: float) -> Turning:
+    def after(self, jacobian: Matrix, value: Vector, atol: float) -> NewtonState:
         """The search after one turn, from ∂f/∂y and f at its unknowns."""
         factors = factorise(jacobian)
-        step, here, left = _solution(factors, value), self.y[-1], value[-1]
+        step, here, left = _solve_step(factors, value), self.y[-1], value[-1]
         # Such a small step leaves an error of the order of its square.
-        solved, others, late = _small(step, atol**0.7), _small(value[:-1], atol**0.5), self.turns >= PATIENCE
+        solved, others, late = _is_small(step, atol**0.7), _is_small(value[:-1], atol**0.5), self.turns >= PATIENCE
         low = jnp.where(others & (left < 0), here, self.low)
         high = jnp.where(others & (left > 0), here, self.high)
         then = here - step[-1]
         leaves = late & others & ~solved & jnp.isfinite(high - low) & ((then <= low) | (then >= high))
         share = jnp.where(leaves, (here - 0.5 * (low + high)) / jnp.where(leaves, step[-1], 1.0), 1.0)
-        aside = (*_solution([row[:-1] for row in factors[:-1]], value[:-1]), jnp.zeros_like(here))
+        aside = (*_solve_step([row[:-1] for row in factors[:-1]], value[:-1]), jnp.zeros_like(here))
         alone = late & ~others & ~solved
         taken = tuple(jnp.where(alone, b, jnp.where(leaves, share * a, a)) for a, b in zip(step, aside, strict=True))
-        return Turning(_subtract_step(self.y, taken), solved, self.turns + 1, low, high)
+        return NewtonState(_subtract_step(self.y, taken), solved, self.turns + 1, low, high)
 
 
-class FewUnknowns(optx.AbstractRootFinder[Vector, Vector, Any, Turning]):
+class FewUnknowns(optx.AbstractRootFinder[Vector, Vector, Any, NewtonState]):
     """Newton's method for a few scalars, each determined by the equation of the same index (see `factorise`).
 
     A member is solved after a step whose square is below `atol`.
@@ -154,20 +154,26 @@ class FewUnknowns(optx.AbstractRootFinder[Vector, Vector, Any, Turning]):
         f_struct: Any,
         aux_struct: Any,
         tags: frozenset,
-    ) -> Turning:
+    ) -> NewtonState:
         """Returns the state of a search before its first turn."""
         least = jnp.full_like(y[-1], -jnp.inf)
-        return Turning(y, jnp.asarray(False), jnp.asarray(0), least, -least)
+        return NewtonState(y, jnp.asarray(False), jnp.asarray(0), least, -least)
 
     def step(
-        self, fn: Function, y: Vector, args: tuple[Any, Any], options: dict[str, Any], state: Turning, tags: frozenset
-    ) -> tuple[Vector, Turning, Any]:
+        self,
+        fn: Function,
+        y: Vector,
+        args: tuple[Any, Any],
+        options: dict[str, Any],
+        state: NewtonState,
+        tags: frozenset,
+    ) -> tuple[Vector, NewtonState, Any]:
         """One turn: y - J⁻¹ f."""
         state = state.after(*_linearised(fn, state.y, args, self.apart), self.atol)
         return state.y, state, None
 
     def terminate(
-        self, fn: Function, y: Vector, args: Any, options: dict[str, Any], state: Turning, tags: frozenset
+        self, fn: Function, y: Vector, args: Any, options: dict[str, Any], state: NewtonState, tags: frozenset
     ) -> tuple[Array, optx.RESULTS]:
         """True if f is 0 at the unknowns."""
         return state.solved, optx.RESULTS.successful  # type: ignore[return-value]  # an enumeration of equinox's
@@ -179,7 +185,7 @@ class FewUnknowns(optx.AbstractRootFinder[Vector, Vector, Any, Turning]):
         aux: Any,
         args: Any,
         options: dict[str, Any],
-        state: Turning,
+        state: NewtonState,
         tags: frozenset,
         result: optx.RESULTS,
     ) -> tuple[Vector, Any, dict[str, Any]]:
@@ -227,9 +233,9 @@ def root(
     if linear is None:
         return search(start, shared, own)
     jacobian, value = _linearised(_function(linear), start, (shared, own), apart)
-    y = _subtract_step(start, _solution(factorise(jacobian), value))
-    solved = _small(residual(y, shared, own), tolerance)
-    return compute_rarely(~solved, search, (y, shared, own), (y, solved))
+    y = _subtract_step(start, _solve_step(factorise(jacobian), value))
+    solved = _is_small(residual(y, shared, own), tolerance)
+    return compute_if_needed(~solved, search, (y, shared, own), (y, solved))
 
 
 def _function(residual: Residual) -> Function:

@@ -1,4 +1,4 @@
-"""A branch for rarely needed computations, which a batch skips if no member needs it."""
+"""A branch for rarely needed computations. A batch skips it if no member needs it."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from jaxtyping import Array, Bool
 T = TypeVar("T")
 
 
-def compute_rarely(needed: Bool[Array, ""], function: Callable[..., T], arguments: tuple, otherwise: T) -> T:
-    """`function(*arguments)` if `needed`, else `otherwise`.
+def compute_if_needed(needed: Bool[Array, ""], function: Callable[..., T], arguments: tuple, otherwise: T) -> T:
+    """Result of `function(*arguments)` if `needed`, otherwise `otherwise`.
 
     Similar to `jax.lax.cond`, but `jax.vmap` turns that into computing both branches for every member of a batch.
     This is a loop of at most one turn: a batch runs it if one member needs it.
 
     Args:
-        function: pure.
+        function: pure function.
         arguments: trees of arrays.
-        otherwise: with the shapes and types of the result of `function`.
+        otherwise: alternative, with the shapes and types of the function's result.
     """
 
     def turn(state: tuple[Array, T]) -> tuple[Array, T]:

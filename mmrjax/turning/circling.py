@@ -1,7 +1,6 @@
-"""Robots with independently driven sides: settled turns as roots, and turning over time, from the same equations.
+"""Robots with independently driven sides: settled turns, and turning over time, from the same equations.
 
-The fidelities `steady` and `drive` use both for conditions that distinguish the sides
-(`Conditions.turns`).
+The fidelities `steady` and `drive` use both for conditions that distinguish the sides (`Conditions.turns`).
 """
 
 from __future__ import annotations
@@ -69,19 +68,21 @@ FEW = 32
 SMALL, SMALL_RATE, LONG, TURNS = 1e-9, 1e-7, 10.0, 200
 
 
-def _kept(robot: Robot, size: int) -> tuple[Effect, ...]:
-    """The effects with a memory among `size` unknowns: all that have one, or none. Memories are then settled."""
+def _effects_with_memory(robot: Robot, size: int) -> tuple[Effect, ...]:
+    """Effects whose memory is among `size` unknowns: all that have one, or none. In the latter case memories are
+    settled.
+    """
     return robot.remembering if size > len(_UNITS) else ()
 
 
-def _units(kept: tuple[Effect, ...]) -> Array:
+def _units_of_unknowns(kept: tuple[Effect, ...]) -> Array:
     return jnp.asarray((*_UNITS, *(size for e in kept for size in (e.memory_size or 1.0,) * 2)))
 
 
-def motion_of(robot: Robot, y: Unknowns) -> PlaneMotion:
-    """The motion of a vector of unknowns."""
-    kept = _kept(robot, y.shape[0])
-    y = y * _units(kept).astype(y.dtype)
+def motion_of_unknowns(robot: Robot, y: Unknowns) -> PlaneMotion:
+    """Motion of the robot that the unknowns describe."""
+    kept = _effects_with_memory(robot, y.shape[0])
+    y = y * _units_of_unknowns(kept).astype(y.dtype)
     memory = {e.name: y[len(_UNITS) + 2 * k :][:2] for k, e in enumerate(kept)}
     return PlaneMotion(y[:2], y[2:4], y[4], y[5], y[6], y[7], y[8], y[9], y[10], memory)
 
@@ -91,12 +92,12 @@ _turning = compiled(balances.turning_signals)
 
 @compiled
 def turning_rates(robot: Robot, conditions: Conditions, y: Unknowns) -> Unknowns:
-    """Rates of the unknowns, in their units [1/s], 0 for a motor whose speed is imposed."""
-    return _rates(robot, conditions, y, _turning(robot, conditions, motion_of(robot, y)))
+    """Rates of change of the unknowns, in their units [1/s]. 0 for a motor with imposed speed."""
+    return _rates(robot, conditions, y, _turning(robot, conditions, motion_of_unknowns(robot, y)))
 
 
 def _rates(robot: Robot, conditions: Conditions, y: Array, travel: balances.Travel) -> Array:
-    motion, kept = motion_of(robot, y), _kept(robot, y.shape[0])
+    motion, kept = motion_of_unknowns(robot, y), _effects_with_memory(robot, y.shape[0])
     signals = travel.signals
     free = conditions.of_sides().motor_speed is None
     cos, sin = jnp.cos(motion.heading), jnp.sin(motion.heading)
@@ -113,16 +114,16 @@ def _rates(robot: Robot, conditions: Conditions, y: Array, travel: balances.Trav
     ]
     for effect in kept:
         residuals.extend(jax.vmap(lambda s, effect=effect: effect.rate(robot, s))(signals))
-    return jnp.stack([jnp.asarray(x, y.dtype) for x in residuals]) / _units(kept).astype(y.dtype)
+    return jnp.stack([jnp.asarray(x, y.dtype) for x in residuals]) / _units_of_unknowns(kept).astype(y.dtype)
 
 
 def turning_start(robot: Robot, conditions: Conditions, rolling: bool = False) -> Unknowns:
-    """Unknowns at rest with the heading of the conditions, or for `rolling` in the settled turn if it exists.
+    """Unknowns at rest, with the heading of the conditions. With `rolling`, in the settled turn if there is one.
 
     Motors with an imposed speed turn.
     """
     heading = 0.0 if conditions.heading_deg is None else jnp.radians(conditions.heading_deg)
-    size, sides = _units(robot.remembering), conditions.of_sides()
+    size, sides = _units_of_unknowns(robot.remembering), conditions.of_sides()
     y = jnp.zeros_like(size).at[7].set(heading).at[10].set(conditions.discharge)
     if sides.motor_speed is not None:
         y = y.at[2:4].set(sides.motor_speed)
@@ -141,7 +142,7 @@ def turning_start(robot: Robot, conditions: Conditions, rolling: bool = False) -
 
 
 def _initial_guess(robot: Robot, conditions: Conditions) -> Float[Array, " 11"]:
-    """Motors near their no-load speed, and the turn of a robot of twice the width without slip."""
+    """Motors near their no-load speed, and the turn of a robot with twice the width and no slip."""
     sides, chassis = conditions.of_sides(), robot.chassis(conditions.configuration)
     shafts = 0.9 * jax.vmap(lambda c: voltage_at_rest(robot, c))(sides) / robot.motor.torque_constant
     if sides.motor_speed is not None:
@@ -152,13 +153,13 @@ def _initial_guess(robot: Robot, conditions: Conditions) -> Float[Array, " 11"]:
     return y.at[10].set(conditions.discharge) / jnp.asarray(_UNITS)
 
 
-class _Secant(eqx.Module):
-    """A search for a settled turn by Broyden's method.
+class _BroydenSearch(eqx.Module):
+    """Search for a settled turn by Broyden's method.
 
     Attributes:
-        y: the unknowns that settle, and the loads.
+        y: unknowns that settle, and the loads.
         rates: `_scaled_balance` at y.
-        inverse: inverse of minus its Jacobian, as approximated so far.
+        inverse: approximate inverse of minus its Jacobian.
         looks: number of evaluations of `_scaled_balance`.
         solved: True once the search has converged.
     """
@@ -170,13 +171,13 @@ class _Secant(eqx.Module):
     solved: Array
 
 
-class _Linear(eqx.Module):
-    """`_scaled_balance` linearised at the end of a search.
+class _LinearisedBalance(eqx.Module):
+    """Linearisation of `_scaled_balance` at the end of a search.
 
     Attributes:
         jacobian: Jacobian of `_scaled_balance`.
-        sound: True if that is a turn, and a stable one.
-        known: True once this is computed.
+        sound: True if it is a turn, and a stable one.
+        known: True once it has been computed.
     """
 
     jacobian: Float[Array, "9 9"]
@@ -184,15 +185,15 @@ class _Linear(eqx.Module):
     known: Array
 
 
-class _Search(eqx.Module):
-    """A search for a settled turn along a run.
+class _EulerSearch(eqx.Module):
+    """Search for a settled turn by following a run until it settles.
 
     Attributes:
-        y: the unknowns that settle, and the loads.
+        y: unknowns that settle, and the loads.
         rates: `_scaled_balance` at y.
-        jacobian: derivative of these.
+        jacobian: Jacobian of `_scaled_balance`.
         step: length of the next step [s].
-        turns: steps taken.
+        turns: number of steps.
         solved: True once it has converged.
     """
 
@@ -205,7 +206,7 @@ class _Search(eqx.Module):
 
 
 def _scaled_balance(robot: Robot, conditions: Conditions, y: Settling) -> Settling:
-    """Rates of the unknowns that settle [1/s], and minus the errors of the loads."""
+    """Residuals of a settled turn: rates of the unknowns that settle [1/s], and minus the errors of the loads."""
     return _imbalance_of_sides(robot, conditions, y, _signals_and_motion(robot, conditions, y)[0])
 
 
@@ -216,23 +217,25 @@ def _imbalance_of_sides(robot: Robot, conditions: Conditions, y: Settling, trave
 
 
 def _all_unknowns(conditions: Conditions, y: Settling) -> Float[Array, " 11"]:
-    """All unknowns of a robot that has not left its place."""
+    """All unknowns of a robot, with its position at the start."""
     charge = jnp.zeros(len(_UNITS) - SETTLING).at[-1].set(conditions.discharge / _UNITS[-1])
     return jnp.concatenate([y[:SETTLING], charge])
 
 
-def _turning_round(robot: Robot, conditions: Conditions, y: Settling) -> Float[Array, " 4"]:
-    """Speeds of both sides and of their movers that decide the sign of friction, over its smoothing width [-]."""
+def _speeds_over_width(robot: Robot, conditions: Conditions, y: Settling) -> Float[Array, " 4"]:
+    """Speeds of both sides and of their tracks that decide the sign of friction, relative to its smoothing
+    width [-].
+    """
     chassis = robot.chassis(conditions.configuration)
     _, shafts, ahead, _, yaw = jnp.split(y[:SETTLING] * jnp.asarray(_UNITS[:SETTLING]), [2, 4, 5, 6])
     sides, movers = ahead - yaw * SIDES * chassis.turning.width, shafts * chassis.radius / robot.gearbox.ratio
     return jnp.concatenate([sides, movers]) / chassis.speed_still
 
 
-def _step_share(robot: Robot, conditions: Conditions, y: Array, step: Array) -> Scalar:
-    """Share of a step that changes no unknown by more than `FAR` and does not cross a reversal of friction."""
+def _allowed_step_fraction(robot: Robot, conditions: Conditions, y: Array, step: Array) -> Scalar:
+    """Fraction of a step that changes no unknown by more than `FAR` and reverses no friction."""
     share = jnp.minimum(1.0, FAR / jnp.max(jnp.abs(step[:SETTLING])))
-    now, then = (_turning_round(robot, conditions, state_there) for state_there in (y, y + share * step))
+    now, then = (_speeds_over_width(robot, conditions, state_there) for state_there in (y, y + share * step))
     across = (now * then < 0) & (jnp.minimum(jnp.abs(now), jnp.abs(then)) > 1)
     return share * jnp.min(jnp.where(across, now / jnp.where(across, now - then, 1.0), 1.0))
 
@@ -242,7 +245,7 @@ def _load_units(robot: Robot, conditions: Conditions) -> Pair:
     return jnp.stack([robot.chassis(conditions.configuration).mass * GRAVITY, robot.running_gear.wheelbase])
 
 
-def _loads(robot: Robot, conditions: Conditions, y: Settling) -> Pair:
+def _load_transfer(robot: Robot, conditions: Conditions, y: Settling) -> Pair:
     return y[SETTLING:] * _load_units(robot, conditions)
 
 
@@ -251,67 +254,67 @@ def _is_searched(conditions: Conditions) -> np.ndarray:
     return np.arange(SETTLING + len(SIDES)) >= (0 if conditions.of_sides().motor_speed is None else 4)
 
 
-def _begins(robot: Robot, conditions: Conditions) -> Settling:
+def _search_start(robot: Robot, conditions: Conditions) -> Settling:
     """Initial unknowns of a search. Imposed speeds keep these values."""
     return jnp.concatenate([_initial_guess(robot, conditions)[:SETTLING], jnp.zeros(len(SIDES))])
 
 
-def _secant(held: tuple[Robot, Conditions]) -> _Secant:
-    start = _begins(*held)
-    return _Secant(start, jnp.zeros_like(start), jnp.eye(start.size), jnp.asarray(0), jnp.asarray(False))
+def _begin_broyden(held: tuple[Robot, Conditions]) -> _BroydenSearch:
+    start = _search_start(*held)
+    return _BroydenSearch(start, jnp.zeros_like(start), jnp.eye(start.size), jnp.asarray(0), jnp.asarray(False))
 
 
-def _probe(held: tuple[Robot, Conditions], search: _Secant) -> _Secant:
-    """Evaluates at the start, then along each unknown from there, then along the secants."""
+def _broyden_step(held: tuple[Robot, Conditions], search: _BroydenSearch) -> _BroydenSearch:
+    """Next evaluation: at the start, then along each unknown from there, then along the secants."""
     size = search.y.size
     aside = search.looks <= size
     step = (search.inverse * search.rates).sum(-1)
-    taken = step * _step_share(*held, search.y, step)
+    taken = step * _allowed_step_fraction(*held, search.y, step)
     taken = jnp.where(aside, ALONG * (np.arange(size) == search.looks - 1), taken)
     residual = _scaled_balance(*held, search.y + taken)
-    residual = jnp.where(_is_searched(held[1]), residual, _begins(*held) - search.y - taken)
+    residual = jnp.where(_is_searched(held[1]), residual, _search_start(*held) - search.y - taken)
     gone = search.inverse @ (search.rates - residual)
     row = taken @ search.inverse
     change = jnp.outer(taken - gone, row) / (taken @ gone)
     inverse = jnp.where((search.looks > 0) & jnp.all(jnp.isfinite(change)), search.inverse + change, search.inverse)
     y = jnp.where(aside, search.y, search.y + taken)
     rates = jnp.where(aside & (search.looks > 0), search.rates, residual)
-    return _Secant(y, rates, inverse, search.looks + 1, ~aside & (jnp.max(jnp.abs(step)) < NEAR))
+    return _BroydenSearch(y, rates, inverse, search.looks + 1, ~aside & (jnp.max(jnp.abs(step)) < NEAR))
 
 
 def _jacobian_at_rest(conditions: Conditions) -> Float[np.ndarray, "9 9"]:
-    """The Jacobian where nothing moves."""
+    """Jacobian of `_scaled_balance` with nothing in motion."""
     return -np.eye(len(_is_searched(conditions)))
 
 
 def _jacobian_and_value(robot: Robot, conditions: Conditions, y: Array) -> tuple[Array, Array]:
-    """The Jacobian of `_scaled_balance`, and its value. Imposed unknowns have no equation."""
+    """Jacobian of `_scaled_balance`, and its value. Imposed unknowns have no equation."""
     slope, residual = jax.jacfwd(lambda y: (_scaled_balance(robot, conditions, y),) * 2, has_aux=True)(y)
     return jnp.where(_is_searched(conditions)[:, None], slope, _jacobian_at_rest(conditions)), residual
 
 
-def _unknown(held: tuple[Robot, Conditions, Array, Array]) -> _Linear:
-    return _Linear(jnp.asarray(_jacobian_at_rest(held[1])), jnp.asarray(False), jnp.asarray(False))
+def _no_linearisation(held: tuple[Robot, Conditions, Array, Array]) -> _LinearisedBalance:
+    return _LinearisedBalance(jnp.asarray(_jacobian_at_rest(held[1])), jnp.asarray(False), jnp.asarray(False))
 
 
-def _linear(held: tuple[Robot, Conditions, Array, Array], _: _Linear) -> _Linear:
+def _linearise_balance(held: tuple[Robot, Conditions, Array, Array], _: _LinearisedBalance) -> _LinearisedBalance:
     y, solved = held[2:]
     slope, residual = _jacobian_and_value(*held[:2], y)
     inverted, determinant = inverse(-slope)
     close = jnp.max(jnp.abs(inverted @ residual)) < CLOSE
-    return _Linear(slope, solved & close & (determinant > 0), jnp.asarray(True))
+    return _LinearisedBalance(slope, solved & close & (determinant > 0), jnp.asarray(True))
 
 
-def _follow(held: tuple[Robot, Conditions, Array, _Linear]) -> _Search:
+def _begin_euler(held: tuple[Robot, Conditions, Array, _LinearisedBalance]) -> _EulerSearch:
     """State before the first step, which has length 0 and only evaluates."""
     y, unknowns = held[2:]
-    y = jnp.where(unknowns.sound, y, _begins(*held[:2]))
+    y = jnp.where(unknowns.sound, y, _search_start(*held[:2]))
     slope = jnp.where(unknowns.sound, unknowns.jacobian, _jacobian_at_rest(held[1]))
-    return _Search(y, jnp.zeros_like(y), slope, jnp.asarray(FIRST), jnp.asarray(0), unknowns.sound)
+    return _EulerSearch(y, jnp.zeros_like(y), slope, jnp.asarray(FIRST), jnp.asarray(0), unknowns.sound)
 
 
-def _euler_step(held: tuple[Robot, Conditions, Array, _Linear], search: _Search) -> _Search:
-    """One step of implicit Euler along the run, taken back where the rates grow or an unknown goes too far."""
+def _euler_step(held: tuple[Robot, Conditions, Array, _LinearisedBalance], search: _EulerSearch) -> _EulerSearch:
+    """One implicit Euler step along the run. It is rejected if the rates grow or an unknown changes too much."""
     slow = np.diag(np.arange(search.y.size) < SETTLING)
     step = inverse(jnp.asarray(slow) / search.step - search.jacobian)[0] @ search.rates
     largest, next_y = jnp.max(jnp.abs(step)), search.y + step
@@ -325,11 +328,11 @@ def _euler_step(held: tuple[Robot, Conditions, Array, _Linear], search: _Search)
         for old, new in ((search.y, next_y), (search.rates, residual), (search.jacobian, slope))
     )
     length = jnp.clip(search.step * jnp.where(worse, SHORTER, LONGER), SHORTEST, LONGEST)
-    return _Search(y, residual, slope, length, search.turns + 1, ended)
+    return _EulerSearch(y, residual, slope, length, search.turns + 1, ended)
 
 
 def _find_settled_unknowns(robot: Robot, conditions: Conditions) -> tuple[Settling, Bool[Array, ""]]:
-    """The unknowns of a settled turn on level ground, see `_Search`, and whether it was found.
+    """The unknowns of a settled turn on level ground, see `_EulerSearch`, and whether it was found.
 
     Broyden's method, which first evaluates along each unknown, finds most. If it does not converge, or converges to
     an unstable turn, implicit Euler with growing steps follows a run until it settles. Only its shortest steps may
@@ -339,10 +342,12 @@ def _find_settled_unknowns(robot: Robot, conditions: Conditions) -> tuple[Settli
     each member ends on its own (`lanes`), while a search by `optimistix.root_find` lasts as long as its slowest.
     """
     held = robot, conditions
-    first = lanes.loop_until(_secant, _probe, lambda s: (s.looks >= SOON) | s.solved, held, lambda s: (s.y, s.solved))
-    solution = lanes.loop_until(_unknown, _linear, lambda s: s.known, (*held, *first))
+    first = lanes.loop_until(
+        _begin_broyden, _broyden_step, lambda s: (s.looks >= SOON) | s.solved, held, lambda s: (s.y, s.solved)
+    )
+    solution = lanes.loop_until(_no_linearisation, _linearise_balance, lambda s: s.known, (*held, *first))
     end = lanes.loop_until(
-        _follow, _euler_step, lambda s: (s.turns >= TURNS) | s.solved, (*held, first[0], solution), most=FEW
+        _begin_euler, _euler_step, lambda s: (s.turns >= TURNS) | s.solved, (*held, first[0], solution), most=FEW
     )
     sound = end.solved & jnp.all(jnp.isfinite(end.jacobian))
     slope = jnp.where(sound, end.jacobian, jnp.asarray(_jacobian_at_rest(conditions)))
@@ -350,21 +355,21 @@ def _find_settled_unknowns(robot: Robot, conditions: Conditions) -> tuple[Settli
 
 
 def _signals_and_motion(robot: Robot, conditions: Conditions, y: Settling) -> tuple[balances.Travel, PlaneMotion]:
-    """Signals of both sides and motion at the unknowns of a search.
+    """Signals of both sides, and motion, at the unknowns of a search.
 
-    Their currents are those that the duties alone would drive, see `rest.admitted_current`.
+    Currents are those that the duties alone would cause, see `rest.admitted_current`.
     """
-    motion = motion_of(robot, _all_unknowns(conditions, y))
+    motion = motion_of_unknowns(robot, _all_unknowns(conditions, y))
     current, held = jax.vmap(lambda c, x: rest.admitted_current(robot, c, x))(conditions.of_sides(), motion.current)
     motion = dataclasses.replace(motion, current=current)
-    travel = _turning(rest.without_diode(robot), conditions, motion, _loads(robot, conditions, y))
+    travel = _turning(rest.without_diode(robot), conditions, motion, _load_transfer(robot, conditions, y))
     signals = travel.signals
     signals = dataclasses.replace(signals, voltage=signals.voltage - held, voltage_left=signals.voltage_left - held)
     return dataclasses.replace(travel, signals=signals), motion
 
 
 def solve_turn(robot: Robot, conditions: Conditions) -> tuple[Settling, Bool[Array, ""]]:
-    """The unknowns of a settled turn, and whether they were found, see `Implicit.solve`."""
+    """Unknowns of a settled turn, and True if it was found, see `Implicit.solve`."""
     return jax.lax.stop_gradient(_find_settled_unknowns(*jax.lax.stop_gradient((robot, conditions))))
 
 
@@ -373,17 +378,17 @@ def turn_results(
 ) -> tuple[Result, Signals, Settling]:
     """Result, signals of both sides and residuals of the balances at given unknowns, see `Implicit.shown`."""
     travel, motion = _signals_and_motion(robot, conditions, unknowns)
-    stays = unknowns - jax.lax.stop_gradient(_begins(robot, conditions))
+    stays = unknowns - jax.lax.stop_gradient(_search_start(robot, conditions))
     left = jnp.where(_is_searched(conditions), _imbalance_of_sides(robot, conditions, unknowns, travel), stays)
-    status = _status(robot, conditions, travel, motion, found)
-    return result_of(robot, travel, status), travel.signals, left
+    status = _turn_status(robot, conditions, travel, motion, found)
+    return result_of_turn(robot, travel, status), travel.signals, left
 
 
 def circling_signals(robot: Robot, conditions: Conditions) -> tuple[balances.Travel, PlaneMotion, Array]:
-    """Signals of a settled turn on level ground, and its status. With numbers at any status.
+    """Signals of a settled turn on level ground, motion, and status. All numbers are finite for every status.
 
     Args:
-        conditions: one run, scalar fields, on level ground.
+        conditions: conditions of one run, scalar fields, on level ground.
 
     Returns:
         Signals of both sides, motion of the robot, and one of these statuses. `converged`. `stalled`: neither shafts
@@ -393,23 +398,25 @@ def circling_signals(robot: Robot, conditions: Conditions) -> tuple[balances.Tra
     """
     unknowns, solved = _find_settled_unknowns(robot, conditions)
     travel, motion = _signals_and_motion(robot, conditions, unknowns)
-    return travel, motion, _status(robot, conditions, travel, motion, solved)
+    return travel, motion, _turn_status(robot, conditions, travel, motion, solved)
 
 
-def _status(
+def _turn_status(
     robot: Robot, conditions: Conditions, travel: balances.Travel, motion: PlaneMotion, found: Array
 ) -> Array:
-    """Status of a settled turn, found or not."""
-    status = status_keeping(robot, conditions, travel, motion)
+    """Status of a settled turn, whether it was found or not."""
+    status = status_of_steady_motion(robot, conditions, travel, motion)
     return jnp.where(found | (status == BATTERY_EMPTY), status, NOT_SETTLED)
 
 
 def _motion_size(chassis: Chassis, ahead: Scalar, aside: Scalar, yaw: Scalar) -> Array:
-    """Size of a motion in the plane, or of its change, at the sides [m/s], [m/s²]."""
+    """Magnitude of a motion in the plane, or of its rate of change, at the sides [m/s], [m/s²]."""
     return jnp.abs(ahead) + jnp.abs(aside) + jnp.abs(yaw) * chassis.turning.width / 2
 
 
-def status_keeping(robot: Robot, conditions: Conditions, travel: balances.Travel, motion: PlaneMotion) -> Array:
+def status_of_steady_motion(
+    robot: Robot, conditions: Conditions, travel: balances.Travel, motion: PlaneMotion
+) -> Array:
     """Status of a robot in steady motion."""
     chassis = robot.chassis(conditions.configuration)
     shafts = jnp.max(jnp.abs(travel.signals.speed_theoretical))
@@ -420,27 +427,28 @@ def status_keeping(robot: Robot, conditions: Conditions, travel: balances.Travel
     return jnp.where(empty, BATTERY_EMPTY, status)
 
 
-def status_moving(robot: Robot, conditions: Conditions, travel: balances.Travel, motion: PlaneMotion) -> Array:
-    """Status at the end of a run over time: `not_settled` while its motion in its own frame changes.
+def status_after_run(robot: Robot, conditions: Conditions, travel: balances.Travel, motion: PlaneMotion) -> Array:
+    """Status at the end of a run over time: `not_settled` if the motion still changes, otherwise as
+    `status_of_steady_motion`.
 
-    Otherwise that of `status_keeping`.
+    Otherwise that of `status_of_steady_motion`.
     """
     chassis = robot.chassis(conditions.configuration)
     size = _motion_size(chassis, motion.speed, motion.speed_lateral, motion.yaw_rate)
     change = _motion_size(chassis, travel.acceleration, travel.acceleration_lateral, travel.acceleration_yaw)
-    status = status_keeping(robot, conditions, travel, motion)
+    status = status_of_steady_motion(robot, conditions, travel, motion)
     return jnp.where((change * TIME > SHARE * size) & (status == CONVERGED), NOT_SETTLED, status)
 
 
 def changing_at_rest(y: Unknowns) -> Unknowns:
-    """1 for the unknowns that change while friction holds a robot (currents and charge), else 0."""
+    """1 for the unknowns that change while friction holds the robot (currents and charge), otherwise 0."""
     return jnp.zeros_like(y).at[jnp.asarray([0, 1, 10])].set(1.0)
 
 
 norm = functools.partial(error_norm_of_sides, whole=slice(4, len(_UNITS)), own=OF_STRAIGHT)
 
 
-def _of_sides(robot: Robot, conditions: Conditions, motion: PlaneMotion) -> tuple[Conditions, State]:
+def _sides_at_rest(robot: Robot, conditions: Conditions, motion: PlaneMotion) -> tuple[Conditions, State]:
     """Conditions of each side, with the slope along its heading, and its state."""
     sides = conditions.of_sides()
     along = jnp.degrees(jnp.arcsin(jnp.sin(sides.slope) * jnp.cos(motion.heading)))
@@ -452,7 +460,7 @@ def _of_sides(robot: Robot, conditions: Conditions, motion: PlaneMotion) -> tupl
 
 def current_at_rest(robot: Robot, conditions: Conditions, motion: PlaneMotion) -> Pair:
     """Currents that settle in a standing robot [A]."""
-    sides, state = _of_sides(robot, conditions, motion)
+    sides, state = _sides_at_rest(robot, conditions, motion)
     return jnp.asarray(jax.vmap(lambda c, s: rest.current_at_rest(robot, c, s))(sides, state))
 
 
@@ -461,31 +469,31 @@ def firmness(robot: Robot, conditions: Conditions, motion: PlaneMotion) -> Scala
 
     Each side against its motors and its share of gravity, the ground against all of gravity.
     """
-    own, state = _of_sides(robot, conditions, motion)
+    own, state = _sides_at_rest(robot, conditions, motion)
     sides = jnp.asarray(jax.vmap(lambda c, s: rest.firmness(robot, c, s))(own, state))
     chassis = robot.chassis(conditions.configuration)
     level = chassis.ground.friction.static * conditions.adhesion * balances.lateral_friction(conditions, chassis)
     aside = jnp.abs(jnp.tan(conditions.slope) * jnp.sin(motion.heading))
-    return rest.smallest(sides[0], sides[1], jnp.where(aside > 0, level - aside, jnp.inf))
+    return rest.smallest_of(sides[0], sides[1], jnp.where(aside > 0, level - aside, jnp.inf))
 
 
 def holds(robot: Robot, conditions: Conditions) -> Array:
-    """True if friction at rest holds a standing robot, at the currents a millisecond after the start."""
-    motion = motion_of(robot, turning_start(robot, conditions))
+    """True if friction holds a standing robot at the currents one millisecond after the start."""
+    motion = motion_of_unknowns(robot, turning_start(robot, conditions))
     settled = dataclasses.replace(motion, current=current_at_rest(robot, conditions, motion))
     return jnp.asarray(jax.lax.stop_gradient(firmness(robot, conditions, settled)) >= 0)
 
 
 def has_tipped(robot: Robot, travel: balances.Travel) -> Array:
-    """True if no load is left on a side, or all of it is at an end of the contact."""
+    """True if no load is left on one side, or if all load is at an end of the contact."""
     load = jnp.sum(travel.grip.normal)
     return (jnp.abs(travel.grip.moved) >= load / 2) | (
         jnp.abs(travel.grip.centre) >= robot.running_gear.wheelbase / 2
     )
 
 
-def result_of(robot: Robot, travel: balances.Travel, status: Array) -> Result:
-    """Readings, powers and warnings of an instant: means over both sides, and the worse of them."""
+def result_of_turn(robot: Robot, travel: balances.Travel, status: Array) -> Result:
+    """Result of an instant: readings, powers and warnings, as means over both sides or for the worse side."""
     signals = travel.signals
     each = jax.vmap(lambda s: result_of_signals(robot, s, status))(signals)
     mean = jax.tree.map(lambda x: jnp.mean(x, axis=0), each)
@@ -507,7 +515,9 @@ def result_of(robot: Robot, travel: balances.Travel, status: Array) -> Result:
 
 
 def operating_point(robot: Robot, conditions: Conditions) -> tuple[Result, Array]:
-    """A settled turn, see `circling_signals`, and whether its conditions are sound. With numbers at any status."""
+    """A settled turn, see `circling_signals`, and True if its conditions are valid. All numbers are finite for every
+    status.
+    """
     sound = jnp.asarray(True)
     for number in jax.tree.leaves(conditions):
         sound &= jnp.isfinite(number)
@@ -515,10 +525,10 @@ def operating_point(robot: Robot, conditions: Conditions) -> tuple[Result, Array
     travel, _, status = circling_signals(robot, conditions)
     # On a slope the heading changes continuously.
     status = jnp.where(conditions.slope_deg == 0, status, NOT_SETTLED)
-    return result_of(robot, travel, jnp.where(sound, status, FAILED)), sound
+    return result_of_turn(robot, travel, jnp.where(sound, status, FAILED)), sound
 
 
 def steady(robot: Robot, conditions: Conditions) -> Result:
-    """`steady` for a robot that turns: see `circling_signals`, NaN if it has no settled turn."""
+    """Result of `steady` for a robot that turns, see `circling_signals`. NaN if there is no settled turn."""
     point, sound = operating_point(robot, conditions)
     return withhold_numbers(point, (point.status == CONVERGED) | (point.status == STALLED), sound)

@@ -1,4 +1,4 @@
-"""Two sides: loads and sliding of a robot with independently driven sides on the ground.
+"""Loads, sliding and ground forces of a robot with independently driven sides.
 
 Frame of the robot, its origin the centre of mass: x ahead, y to the left, yaw positive to the left. Sides are in the
 order left, right (leading axis 2), their contact lines at y = ±B/2. A contact at (x, y_s) slides over the ground by
@@ -23,7 +23,7 @@ from jaxtyping import Array, Float
 
 from mmrjax.model.contact import Friction
 from mmrjax.model.params import Pair, Scalar, parameter
-from mmrjax.numerics.rarely import compute_rarely
+from mmrjax.numerics.rarely import compute_if_needed
 
 #: Position of a side's contact line from the middle of the robot, in shares of B [-]: left, right.
 SIDES = np.array([0.5, -0.5])
@@ -37,10 +37,10 @@ STILL = 1e-16
 LOAD_STEPS = 3
 
 
-def _nodes(count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Gauss-Legendre nodes on -1..1 and their weights, and the weights of two wheels at the ends.
+def _quadrature_nodes(count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Gauss-Legendre nodes on -1 to 1 with their weights, and the weights of two wheels at the ends.
 
-    The wheels use the first and the last node.
+    The wheels use the first and last node.
     """
     place, weight = np.polynomial.legendre.leggauss(count)
     ends = np.zeros(count)
@@ -49,15 +49,15 @@ def _nodes(count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def sum_of_sides(sides: Float[Array, "2 ..."]) -> Array:
-    """Sum over both sides, as two numbers: XLA makes a call of every reduction, even a short one."""
+    """Sum over both sides, written as two numbers because XLA compiles every reduction to a call."""
     return sides[0] + sides[1]
 
 
 class Turning(eqx.Module):
-    """Parameters of a robot with two sides that matter only in turns.
+    """Parameters that matter only if the two sides are driven independently.
 
     Attributes:
-        nodes: nodes of a track's contact, see `Stance`.
+        nodes: number of nodes along a track's contact, see `Stance`.
     """
 
     width: Scalar = parameter(
@@ -80,18 +80,18 @@ class Turning(eqx.Module):
 
 
 class Stance(eqx.Module):
-    """Position of a robot on its contacts.
+    """Position of a robot on its contacts, and parameters of these.
 
     Attributes:
-        length: length of the contact, or the wheelbase [m].
-        width: B [m].
+        length: length of the contact, or wheelbase [m].
+        width: distance between the tracks, B [m].
         height: height of the centre of mass above the ground [m].
-        ahead: distance of it from the middle of the contact [m].
-        on_tracks: 1 on tracks, whose contact is a line, 0 on wheels, with contacts only at its ends [-].
-        lateral: λ on this ground [-].
-        rule: a [-].
-        nodes: nodes of a track's contact, even. The width of a turn on the spot under dry friction has an error of
-            3e-5 with 16 nodes and 1e-8 with 32.
+        ahead: position of the centre of mass ahead of the middle of the contact [m].
+        on_tracks: 1 on tracks, whose contact is a line, 0 on wheels, whose contacts are at its ends [-].
+        lateral: ratio λ of lateral to longitudinal friction on this ground [-].
+        rule: exponent a of the friction law [-].
+        nodes: number of nodes along a track's contact, even. The width of a turn on the spot under dry friction has
+            an error of 3e-5 with 16 nodes and 1e-8 with 32.
     """
 
     length: Scalar
@@ -104,17 +104,17 @@ class Stance(eqx.Module):
     nodes: int = eqx.field(default=16, static=True)
 
 
-class Grip(eqx.Module):
+class GroundForces(eqx.Module):
     """Forces of the ground on each side, shape (2,): left, right.
 
     Attributes:
-        normal: load of a side [N].
-        ahead, aside: forces along x and y [N].
+        normal: normal load of each side [N].
+        ahead, aside: longitudinal and lateral force [N].
         moment: moment of the lateral forces about the centre of mass, positive to the left [N·m].
-        across: power that lateral sliding turns into heat [W].
-        moved: load transferred from the left side to the right one [N].
-        centre: centre of pressure, ahead of the middle of the contact [m].
-        lacking: excess of both over the values that these forces give: 0, except during a search for them [N, m].
+        across: power lost by lateral sliding [W].
+        moved: load transferred from the left to the right side [N].
+        centre: centre of pressure ahead of the middle of the contact [m].
+        lacking: residual of these two: what the forces give minus the values used [N, m]. 0 except during a search.
     """
 
     normal: Pair
@@ -128,7 +128,8 @@ class Grip(eqx.Module):
 
 
 def loaded_part(stance: Stance, centre: Scalar) -> tuple[Scalar, Scalar, Scalar]:
-    """Centre and half length of the loaded part of a contact, from its own middle [m], and its relative excess load.
+    """Centre and half length of the loaded part of a contact, measured from the middle of the contact [m], and its
+    relative excess load.
 
     The excess is that of the pressure at its front end over the mean [-]. Tracks: p = (N/L)(1 + 12 x_p x / L²). From
     |x_p| = L/6 on it is a triangle of length 3 (L/2 - |x_p|), up to the lift-off of the contact (middle third rule).
@@ -140,12 +141,12 @@ def loaded_part(stance: Stance, centre: Scalar) -> tuple[Scalar, Scalar, Scalar]
     return jnp.sign(centre) * (length - borne) / 2, borne / 2, tilt
 
 
-class Law(eqx.Module):
-    """Data of a contact's law that all nodes share.
+class ContactLaw(eqx.Module):
+    """Parameters of the friction law that all nodes of a contact share.
 
     Attributes:
-        friction: along.
-        ratio: λ^(2a-2), the weight of lateral over longitudinal sliding in a direction [-].
+        friction: longitudinal friction.
+        ratio: weight of lateral relative to longitudinal sliding in the direction of the force, λ^(2a-2) [-].
         on_tracks, nodes: see `Stance`.
     """
 
@@ -156,12 +157,12 @@ class Law(eqx.Module):
 
     def places(self) -> Array:
         """Nodes on -1..1."""
-        line = _nodes(self.nodes)[0]
+        line = _quadrature_nodes(self.nodes)[0]
         return jnp.where(self.on_tracks > 0.5, line, np.sign(line))
 
     def over(self, x: Scalar, most: int) -> Float[Array, "2 powers"]:
-        """Σ w zᵏ x over the nodes z with their weights w, for k from 0 to `most`."""
-        line, share, ends = _nodes(self.nodes)
+        """Sums Σ w zᵏ x over the nodes z with their weights w, for k from 0 to `most`."""
+        line, share, ends = _quadrature_nodes(self.nodes)
         powers = np.arange(most + 1)
         of_line = share[:, None] * line[:, None] ** powers
         of_ends = ends[:, None] * np.sign(line)[:, None] ** powers
@@ -169,12 +170,12 @@ class Law(eqx.Module):
         return jnp.where(self.on_tracks > 0.5, both[..., : most + 1], both[..., most + 1 :])
 
     def per_speed(self, along: Scalar, across: Scalar) -> Scalar:
-        """Longitudinal force over load and sliding speed [s/m], at the squares of the sliding speeds [m²/s²]."""
+        """Longitudinal force per load and sliding speed [s/m], given the squares of the sliding speeds [m²/s²]."""
         square, weighed = along + across, along + self.ratio * across
         return jnp.sqrt((square + STILL) / (weighed + STILL)) * self.friction.per_speed(square)
 
     def per_speed_rise(self, along: Scalar, across: Scalar) -> tuple[Scalar, Scalar]:
-        """Derivatives of `per_speed` with respect to those squares [s³/m³]."""
+        """Derivatives of `force_per_sliding_speed` with respect to the squares of the sliding speeds [s³/m³]."""
         square, weighed = along + across, along + self.ratio * across
         turned, held = jnp.sqrt((square + STILL) / (weighed + STILL)), self.friction.per_speed(square)
         slower = turned * self.friction.per_speed_rise(square)
@@ -185,9 +186,9 @@ class Law(eqx.Module):
         )
 
     def rises(self, along: Scalar, across: Scalar) -> tuple[tuple[Scalar, Scalar], tuple[Scalar, Scalar]]:
-        """Derivatives of forces over load, `per_speed` times the sliding speeds, with respect to those [s/m].
+        """Derivatives of the forces per load with respect to the sliding speeds [s/m].
 
-        For a force that falls with all of the sliding, the derivative is set to 0.
+        If the total force falls with sliding, the derivative is set to 0.
         """
         square, other, both = along**2, across**2, along * across
         held, (by_along, by_across) = self.per_speed(square, other), self.per_speed_rise(square, other)
@@ -198,15 +199,16 @@ class Law(eqx.Module):
 
 
 @eqx.filter_custom_jvp
-def law_moments(law: Law, sliding: Pair, middle: Scalar, end: Scalar) -> Float[Array, "2 4"]:
-    """Moments of order 0 to 3 of `Law.per_speed` over a uniformly loaded contact, of each side [s/m].
+def law_moments(law: ContactLaw, sliding: Pair, middle: Scalar, end: Scalar) -> Float[Array, "2 4"]:
+    """Moments of order 0 to 3 of the force per sliding speed over a uniformly loaded contact, for each side [s/m].
 
-    They are taken about its middle and in units of half its length.
+    They are taken about its middle, in units of half its length.
 
     Args:
-        sliding: longitudinal, of each side [m/s].
-        middle: lateral, at the middle of the contact [m/s].
-        end: its increase to the front end [m/s].
+        law: friction law of the contact.
+        sliding: longitudinal sliding speed of each side [m/s].
+        middle: lateral sliding speed at the middle of the contact [m/s].
+        end: increase of the lateral speed from the middle to the front end [m/s].
     """
     across = middle + end * law.places()
     return law.over(law.per_speed(sliding[:, None] ** 2, across**2), 3)
@@ -235,8 +237,8 @@ def _moments_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
     return moments, change
 
 
-class _Given(NamedTuple):
-    """Arguments of `grip`."""
+class _GroundForceInputs(NamedTuple):
+    """Arguments of `ground_forces`."""
 
     stance: Stance
     friction: Friction
@@ -248,7 +250,7 @@ class _Given(NamedTuple):
     resistance: Array
 
 
-def grip(
+def ground_forces(
     stance: Stance,
     friction: Friction,
     adhesion: Scalar,
@@ -258,8 +260,8 @@ def grip(
     yaw_rate: Scalar,
     resistance: Pair,
     loads: Pair | None = None,
-) -> Grip:
-    """Forces and loads of both sides, which depend on each other.
+) -> GroundForces:
+    """Ground forces and loads of both sides, which depend on each other.
 
     The load moves to the outer side, T = h ΣF_y / B, and to the rear, N x_p = N x_c - h (ΣF_x - ΣR). The load of a
     side is never negative.
@@ -267,71 +269,73 @@ def grip(
     Args:
         stance: stance of the robot.
         friction: friction of the ground.
-        adhesion: the surface's ratio [-].
-        load: normal to the ground, of both sides [N].
-        sliding: u_x of each side [m/s].
-        lateral_speed: v_y [m/s].
-        yaw_rate: ω [rad/s].
-        resistance: rolling resistance over the normal load, with its sign, of each side [-].
-        loads: T [N] and x_p [m] if a larger search has them among its unknowns. None: found here.
+        adhesion: adhesion relative to the robot's surface [-].
+        load: load of both sides, normal to the ground [N].
+        sliding: longitudinal sliding speed u_x of each side [m/s].
+        lateral_speed: lateral speed v_y [m/s].
+        yaw_rate: yaw rate ω [rad/s].
+        resistance: rolling resistance relative to the normal load, with sign, for each side [-].
+        loads: load transfer T [N] and centre of pressure x_p [m], if they are unknowns of a larger search. None: they
+            are solved here.
     """
-    given = _Given(stance, friction, adhesion, load, sliding, lateral_speed, yaw_rate, resistance)
+    given = _GroundForceInputs(stance, friction, adhesion, load, sliding, lateral_speed, yaw_rate, resistance)
     if loads is not None:
-        return _at_loads(loads, None, given)
+        return _forces_at_loads(loads, None, given)
     held = jax.lax.stop_gradient(given)
-    at, rise = _transferred_load(held)
-    forces = _at_loads(at, None, given)
+    at, rise = _solve_loads(held)
+    forces = _forces_at_loads(at, None, given)
     # Only the last step carries derivatives, the implicit ones; it is so small that linear terms suffice.
-    change = _step(forces.lacking, rise.lacking)
+    change = _load_step(forces.lacking, rise.lacking)
     return jax.tree.map(lambda x, slope: x - slope @ change, forces, rise)
 
 
-def _step(lacking: Pair, slope: Float[Array, "2 2"]) -> Pair:
-    """Newton step of the loads, to be subtracted."""
+def _load_step(lacking: Pair, slope: Float[Array, "2 2"]) -> Pair:
+    """Newton step of load transfer and centre of pressure, to be subtracted."""
     (a, b), (c, d) = slope
     first, second = lacking
     return jnp.stack([d * first - b * second, a * second - c * first]) / (a * d - b * c)
 
 
-def _transferred_load(given: _Given) -> tuple[Pair, Grip]:
-    """The transferred load [N] and the centre of pressure [m], and the derivatives of `Grip` with respect to them.
+def _solve_loads(given: _GroundForceInputs) -> tuple[Pair, GroundForces]:
+    """Load transfer [N] and centre of pressure [m], and the derivatives of `GroundForces` with respect to them.
 
-    None of these carry derivatives. While the whole contact is loaded, the moments of its law do not depend on them.
+    The results carry no derivatives. While the whole contact is loaded, the moments of its law do not depend on the
+    loads.
     """
     stance, load = given.stance, given.load
 
-    def steps(loads: Array, given: _Given, even: Array | None) -> tuple[Array, Grip]:
+    def steps(loads: Array, given: _GroundForceInputs, even: Array | None) -> tuple[Array, GroundForces]:
         def step(_: int, loads: Array) -> Array:
             def lacking(x: Array) -> tuple[Array, Array]:
-                return (_at_loads(x, even, given).lacking,) * 2
+                return (_forces_at_loads(x, even, given).lacking,) * 2
 
             slope, left = jax.jacfwd(lacking, has_aux=True)(loads)
-            return loads - _step(left, slope)
+            return loads - _load_step(left, slope)
 
         loads_found = jax.lax.fori_loop(0, LOAD_STEPS, step, loads, unroll=even is not None)
-        return loads_found, jax.jacfwd(lambda x: _at_loads(x, even, given))(loads_found)
+        return loads_found, jax.jacfwd(lambda x: _forces_at_loads(x, even, given))(loads_found)
 
     nothing = load * given.sliding[0]
     begun = jnp.stack([jnp.zeros_like(nothing), stance.ahead * jnp.ones_like(nothing)])
     even = law_moments(*_moment_arguments(begun[1], given))
     found = steps(begun, given, even)
     lifts = (stance.on_tracks > 0.5) & (jnp.maximum(jnp.abs(begun[1]), jnp.abs(found[0][1])) > stance.length / 6)
-    return compute_rarely(lifts, lambda at, given: steps(at, given, None), (begun, given), found)
+    return compute_if_needed(lifts, lambda at, given: steps(at, given, None), (begun, given), found)
 
 
-def _moment_arguments(centre: Scalar, given: _Given) -> tuple[Law, Array, Scalar, Scalar]:
-    """Arguments of `law_moments` for this centre of pressure."""
+def _moment_arguments(centre: Scalar, given: _GroundForceInputs) -> tuple[ContactLaw, Array, Scalar, Scalar]:
+    """Arguments of `law_moments` for a centre of pressure."""
     stance, yaw = given.stance, given.yaw_rate
     place, half, _ = loaded_part(stance, centre)
-    law = Law(given.friction, stance.lateral ** (2 * stance.rule - 2), stance.on_tracks, stance.nodes)
+    law = ContactLaw(given.friction, stance.lateral ** (2 * stance.rule - 2), stance.on_tracks, stance.nodes)
     return law, given.sliding, -given.lateral_speed - yaw * (place - stance.ahead), -yaw * half
 
 
-def _at_loads(loads: Array, even: Array | None, given: _Given) -> Grip:
-    """Forces of the ground for a given load transfer and centre of pressure.
+def _forces_at_loads(loads: Array, even: Array | None, given: _GroundForceInputs) -> GroundForces:
+    """Ground forces for a given load transfer and centre of pressure.
 
-    The lateral speed of a contact is linear along it, and so is its load. Its forces and moments are therefore
-    sums of four moments of the law over a uniform load. `even` are these, if known.
+    The lateral speed is linear along a contact, and so is its load. Forces and moments are therefore sums of four
+    moments of the law over a uniform load. `even`: these moments, if known.
     """
     (moved, centre), stance, adhesion, load = loads, given.stance, given.adhesion, given.load
     normal = jnp.maximum(load / 2 - 2 * SIDES * moved, 0.0)
@@ -347,7 +351,7 @@ def _at_loads(loads: Array, even: Array | None, given: _Given) -> Grip:
     outward = stance.height * sum_of_sides(aside) / stance.width
     # A vertical ground carries no normal load.
     behind = stance.height * sum_of_sides(ahead - given.resistance * normal) / jnp.maximum(load, 1e-9)
-    return Grip(
+    return GroundForces(
         normal=normal,
         ahead=ahead,
         aside=aside,

@@ -1,8 +1,8 @@
-"""The main track of one side: its path around two pulleys, its elastic runs, its tooth mesh.
+"""Main track of one side: its path around two pulleys, its elastic runs and its tooth mesh.
 
 The belt is not a chain of bodies: it runs on its path. The coordinate of a point is its distance along the path,
-counted from the end of the front pulley, in the direction of
-forward running: lower run (backwards), rear pulley (up), upper run (forwards), front pulley (down).
+counted from the end of the front pulley, in the direction of forward running: lower run (backwards), rear pulley
+(up), upper run (forwards), front pulley (down).
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ Numbers = Float[Array, " n"]
 POLYGON = (1 - math.cos(math.pi / TEETH_PULLEY)) / 2
 
 
-class Path(eqx.Module):
-    """The belt's closed path in the frame of the chassis (origin midway between the axles).
+class BeltPath(eqx.Module):
+    """Closed path of the belt in the frame of the chassis, whose origin is midway between the axles.
 
     Attributes:
         radius: pitch radius of the pulleys [m].
@@ -40,37 +40,39 @@ class Path(eqx.Module):
 
     @property
     def length(self) -> Scalar:
-        """Length of the path 2 L_b + 2 π r [m], 840 mm on the paper's robot."""
+        """Length of the path, 2 L_b + 2 π r [m]. 840 mm for the paper's robot."""
         return 2 * self.gear.wheelbase + 2 * jnp.pi * self.radius
 
     @property
     def pitch(self) -> Scalar:
-        """Pitch of the grousers S_g [m], 35 mm on the paper's robot."""
+        """Pitch of the grousers S_g [m]. 35 mm for the paper's robot."""
         return self.length / GROUSERS
 
     def weight(self, place: Numbers) -> Numbers:
-        """Share of the rear pulley's motion in a belt point's: 0 on the front pulley, 1 on the rear one.
+        """Share of the rear pulley in the motion of a belt point: 0 at the front pulley, 1 at the rear one.
 
-        A run stretches uniformly between them, so the share is linear. A force on the point loads the
-        pulleys in the same shares (virtual work), which is exact for a uniform elastic run.
+        A straight run stretches uniformly, so the share is linear along it. By virtual work, a force on the point
+        loads the pulleys in the same shares. This is exact for a uniform elastic run.
         """
         run, arc = self.gear.wheelbase, jnp.pi * self.radius
         return jnp.clip(place / run, 0.0, 1.0) - jnp.clip((place - run - arc) / run, 0.0, 1.0)
 
     def place(self, front: Scalar, rear: Scalar) -> tuple[Float[Array, " 24"], Float[Array, " 24"]]:
-        """Positions of the grousers [m along the path] at pulley angles [rad], and their `weight`."""
+        """Positions of the grousers [m along the path] for pulley angles [rad], and the share of the rear pulley in
+        their motion.
+        """
         at_front = jnp.mod(jnp.arange(GROUSERS) * self.pitch + self.radius * front, self.length)
         weight = self.weight(at_front)
         return jnp.mod(at_front + self.radius * weight * (rear - front), self.length), weight
 
 
-class Tips(eqx.Module):
-    """Tips of grousers in the frame of the chassis, each field of shape (grousers,).
+class PathTips(eqx.Module):
+    """Tips of the grousers in the frame of the chassis, each field of shape (grousers,).
 
     Attributes:
-        forward, up: position [m].
+        forward, up: coordinates [m].
         rate_forward, rate_up: displacement per displacement of the belt [-].
-        guided: share of a load on the grouser that passes to the lower guide, the rest to a pulley [-].
+        guided: share of a load on the grouser that passes to the lower guide [-]. The rest passes to a pulley.
         compliance: compliance of the free belt between pulley and guide at unit tension [m], see `tips_on_path`.
     """
 
@@ -82,7 +84,7 @@ class Tips(eqx.Module):
     compliance: Numbers
 
 
-def tips_on_path(path: Path, place: Numbers) -> Tips:
+def tips_on_path(path: BeltPath, place: Numbers) -> PathTips:
     """Tips of the grousers at `place` [m along the path].
 
     A grouser sits on a rigid base and turns with the mean direction of the path under that base. Its
@@ -105,7 +107,7 @@ def tips_on_path(path: Path, place: Numbers) -> Tips:
     rise_rate = gear.guide_recess * 6 * u * (1 - u) / gear.guide_gap
     straight = jnp.where(x > 0, -x, jnp.where(turned < jnp.pi, 0.0, x + arc))
     height = gear.grouser_height
-    return Tips(
+    return PathTips(
         forward=side * (run / 2 + straight + radius * sine(turned) + height * sine(tilt)),
         up=-radius * cosine(turned) - height * cosine(tilt) + rise,
         rate_forward=-cosine(turned) + height * cosine(tilt) * tilt_rate,
@@ -115,13 +117,13 @@ def tips_on_path(path: Path, place: Numbers) -> Tips:
     )
 
 
-class Runs(eqx.Module):
-    """Tension of the two straight runs and the torque they put on the pulleys.
+class BeltRuns(eqx.Module):
+    """Tensions of the two straight runs, and their torques on the pulleys.
 
     Attributes:
-        upper, lower: total tension, mean over the run [N].
+        upper, lower: total tension, averaged over the run [N].
         centrifugal: part that accelerates the belt's own mass round the pulleys, P_ct = m v² / length [N].
-        torque_front, torque_rear: front torque and rear torque on the pulleys, in the direction of running [N·m].
+        torque_front, torque_rear: torques on front and rear pulley, in the direction of running [N·m].
     """
 
     upper: Scalar
@@ -141,7 +143,7 @@ def belt_travel(radius: Scalar, angle: Scalar) -> tuple[Scalar, Scalar]:
     return radius * (angle + POLYGON * sine(phase) / TEETH_PULLEY), radius * (1 + POLYGON * cosine(phase))
 
 
-def belt_runs(path: Path, angles: Sequence[Scalar], rates: Sequence[Scalar]) -> Runs:
+def belt_runs(path: BeltPath, angles: Sequence[Scalar], rates: Sequence[Scalar]) -> BeltRuns:
     """Tensions from the angles [rad] and rates [rad/s] of front and rear pulley, relative to the chassis.
 
     P = max(0, P_0 ± k Δs ± b Δṡ), with Δs the belt drawn by the front pulley less that of the rear one: the
@@ -156,7 +158,7 @@ def belt_runs(path: Path, angles: Sequence[Scalar], rates: Sequence[Scalar]) -> 
     upper = jnp.maximum(gear.pretension + pull, 0.0)
     lower = jnp.maximum(gear.pretension - pull, 0.0)
     speed = path.radius * (rates[0] + rates[1]) / 2
-    return Runs(
+    return BeltRuns(
         upper=upper,
         lower=lower,
         centrifugal=gear.belt_mass / path.length * speed**2,
@@ -166,9 +168,9 @@ def belt_runs(path: Path, angles: Sequence[Scalar], rates: Sequence[Scalar]) -> 
 
 
 def tension_along(
-    path: Path, tension: Runs, place: Numbers, force: Numbers, stations: Float[Array, " s"]
+    path: BeltPath, tension: BeltRuns, place: Numbers, force: Numbers, stations: Float[Array, " s"]
 ) -> Float[Array, " s"]:
-    """Tension [N] at `stations` [m along the path] under forces [N] on the belt against its running.
+    """Tension [N] at `stations` [m along the path], with forces [N] on the belt against its running direction.
 
     A force F at x of the lower run leaves P - F (1 - x/L) ahead of it and P + F x/L behind. On the arcs the tension
     changes uniformly along the engaged teeth, from that of one run to that of the other.

@@ -1,11 +1,11 @@
-"""A robot free to turn, in motion: its state, all its forces at an instant, one step, and the start of a run.
+"""A whole robot free to turn, in motion: its state, all its forces at an instant, one time step, and its start.
 
 Coordinates q: place x uphill and y to the left [m], height z of the middle of the wheelbase over the ground [m], yaw,
 pitch (nose down) and roll (left side up) [rad], then the angles of driving and driven pulley of the left and of the
 right side [rad], relative to the chassis. Velocities v are their rates. MJX computes chassis and pulleys (`mjcf`).
 Each side is the half robot's belt, contacts and drive (`undercarriage`, `balances.resolved_sides`) at its own height
-z + y_s roll and speed v_x - ω y_s. `turning.Law` at each contact replaces the straight-travel law of Fig. 7. Roll is
-small.
+z + y_s roll and speed v_x - ω y_s. `turning.ContactLaw` at each contact replaces the straight-travel law of Fig. 7.
+Roll is small.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ from mmrjax.model.signals import CONVERGED, NOT_SETTLED, PlaneMotion, Result, Si
 from mmrjax.numerics.linear_equations import factorise, solve_factorised
 from mmrjax.numerics.trigonometry import cosine, sine
 from mmrjax.turning import circling
-from mmrjax.turning.two_sides import SIDES, Grip, Law
+from mmrjax.turning.two_sides import SIDES, ContactLaw, GroundForces
 from mmrjax.undercarriage import half_robot, side_contacts
-from mmrjax.undercarriage.belt import Path
-from mmrjax.undercarriage.half_robot import Average, Motion, Steady, System
+from mmrjax.undercarriage.belt import BeltPath
+from mmrjax.undercarriage.half_robot import Average, HalfRobotState, HalfRobotSystem, SteadyAverages
 from mmrjax.undercarriage.mjcf import mjx
-from mmrjax.undercarriage.side_contacts import Pull, Reactions, Touch
+from mmrjax.undercarriage.side_contacts import ContactPull, ContactState, GearReactions
 
 #: Coordinates of the robot, or their velocities or forces.
 Coordinates = Float[Array, " 10"]
@@ -48,13 +48,13 @@ COORDINATES = 10
 OF_SIDE = np.array([[*range(6), *pulleys] for pulleys in PULLEYS])
 
 
-class _Sides(eqx.Module):
-    """The contacts of both sides, a leading axis of 2, in the form that `balances.resolved_sides` expects."""
+class _ContactsOfSides(eqx.Module):
+    """Contacts of both sides, first axis left and right, in the form that `balances.resolved_sides` expects."""
 
-    path: Path
-    law: Law
+    path: BeltPath
+    law: ContactLaw
     lateral: Scalar
-    at: Touch
+    at: ContactState
     aside: Float[Array, "2 contacts"]  # velocity of each contact to the left [m/s]
     height: Pair
 
@@ -62,8 +62,8 @@ class _Sides(eqx.Module):
     def normal(self) -> Pair:
         return jnp.sum(self.at.force, axis=-1)
 
-    def pull(self, chassis: Chassis, signals: Signals) -> Pull:
-        def side(signals: Signals, at: Touch, aside: Array, height: Scalar) -> Pull:
+    def pull(self, chassis: Chassis, signals: Signals) -> ContactPull:
+        def side(signals: Signals, at: ContactState, aside: Array, height: Scalar) -> ContactPull:
             along = side_contacts.sliding_speeds(signals, at)
             held = signals.adhesion * at.force * self.law.per_speed(along**2, aside**2)
             pulled = side_contacts.contact_forces(self.path, chassis, signals, at, height, held * along)
@@ -72,18 +72,18 @@ class _Sides(eqx.Module):
         return jax.vmap(side)(signals, self.at, self.aside, self.height)
 
 
-def _width(run: System) -> Scalar:
+def _width(run: HalfRobotSystem) -> Scalar:
     return run.chassis.turning.width
 
 
-def _mid_wheelbase_speeds(run: System, v: Coordinates, yaw: Scalar) -> tuple[Scalar, Scalar]:
-    """Speeds of the middle of the wheelbase in the frame of the robot, ahead and to the left [m/s]."""
+def _mid_wheelbase_speeds(run: HalfRobotSystem, v: Coordinates, yaw: Scalar) -> tuple[Scalar, Scalar]:
+    """Speeds of the middle of the wheelbase, ahead and to the left, in the frame of the robot [m/s]."""
     cos, sin = cosine(yaw), sine(yaw)
     return cos * v[X] + sin * v[Y], cos * v[Y] - sin * v[X]
 
 
-def plane_motion(run: System, motion: Motion) -> PlaneMotion:
-    """The motion in the form of the other fidelities: speeds of the centre of mass, the robot level."""
+def plane_motion(run: HalfRobotSystem, motion: HalfRobotState) -> PlaneMotion:
+    """Motion in the form of the other fidelities: speeds of the centre of mass of a level robot."""
     q, v = motion.q, motion.v
     speed, lateral = _mid_wheelbase_speeds(run, v, q[YAW])
     forward, up = run.half.centre
@@ -101,7 +101,7 @@ def plane_motion(run: System, motion: Motion) -> PlaneMotion:
     )
 
 
-def _contacts(run: System, motion: Motion) -> _Sides:
+def _contacts_of_sides(run: HalfRobotSystem, motion: HalfRobotState) -> _ContactsOfSides:
     q, v = motion.q, motion.v
     speed, lateral = _mid_wheelbase_speeds(run, v, q[YAW])
     y = SIDES * _width(run)
@@ -109,48 +109,54 @@ def _contacts(run: System, motion: Motion) -> _Sides:
     nothing = jnp.zeros_like(y)
     of_q = jnp.stack([nothing, heights, q[PITCH] + nothing, *q[PULLEYS].T], axis=1)
     of_v = jnp.stack([speed - v[YAW] * y, rises, v[PITCH] + nothing, *v[PULLEYS].T], axis=1)
-    touching = jax.vmap(lambda q, v: side_contacts.contact_state(run.path, run.chassis, q, v))(of_q, of_v)
+    touching = jax.vmap(lambda q, v: side_contacts.compute_contacts(run.path, run.chassis, q, v))(of_q, of_v)
     own, ratio = run.chassis.turning, balances.lateral_friction(run.conditions, run.chassis)
-    law = Law(run.chassis.ground.friction, ratio ** (2 * own.rule - 2), run.chassis.on_tracks, own.nodes)
+    law = ContactLaw(run.chassis.ground.friction, ratio ** (2 * own.rule - 2), run.chassis.on_tracks, own.nodes)
     aside = lateral + v[YAW] * touching.lever_x - v[ROLL] * touching.lever_z
-    return _Sides(run.path, law, ratio**own.rule, touching, aside, heights)
+    return _ContactsOfSides(run.path, law, ratio**own.rule, touching, aside, heights)
 
 
-def _resolved(run: System, motion: PlaneMotion, sides: _Sides) -> tuple[Signals, Pull]:
+def _resolve_signals(
+    run: HalfRobotSystem, motion: PlaneMotion, sides: _ContactsOfSides
+) -> tuple[Signals, ContactPull]:
     return balances.resolved_sides(run.robot, run.conditions, motion, sides, run.half.inertia_pulley)
 
 
-def instant(run: System, motion: Motion) -> tuple[Signals, Touch, Pull]:
-    """All signals, contacts and forces of an instant, a leading axis of left and right side."""
-    sides = _contacts(run, motion)
-    signals, pulled = _resolved(run, plane_motion(run, motion), sides)
+def instant(run: HalfRobotSystem, motion: HalfRobotState) -> tuple[Signals, ContactState, ContactPull]:
+    """All signals, contacts and forces of an instant. The first axis is the side: left, right."""
+    sides = _contacts_of_sides(run, motion)
+    signals, pulled = _resolve_signals(run, plane_motion(run, motion), sides)
     return signals, sides.at, pulled
 
 
-def _losses(run: System, motion: PlaneMotion, sides: _Sides) -> Float[Array, "2 2"]:
-    """See `half_robot._losses`: with respect to the speed of each side, and to that of its driving shaft."""
+def _loss_derivatives(run: HalfRobotSystem, motion: PlaneMotion, sides: _ContactsOfSides) -> Float[Array, "2 2"]:
+    """Derivatives of resistance and losses as in `half_robot`, with respect to the speed of each side and of its
+    driving shaft.
+    """
 
     def along(change: Scalar) -> Array:
-        signals, pulled = _resolved(run, dataclasses.replace(motion, speed=motion.speed + change), sides)
+        signals, pulled = _resolve_signals(run, dataclasses.replace(motion, speed=motion.speed + change), sides)
         return jnp.sum(pulled.force, axis=-1) - signals.resistance
 
     def shaft(change: Scalar) -> Array:
         faster = motion.speed_motor + run.robot.gearbox.ratio * change
-        return jnp.asarray(_resolved(run, dataclasses.replace(motion, speed_motor=faster), sides)[0].torque_net)
+        return jnp.asarray(
+            _resolve_signals(run, dataclasses.replace(motion, speed_motor=faster), sides)[0].torque_net
+        )
 
     zero, one = jnp.zeros_like(motion.speed), jnp.ones_like(motion.speed)
     return jnp.stack([jnp.maximum(-jax.jvp(f, (zero,), (one,))[1], 0.0) for f in (along, shaft)])
 
 
-class _Levers(eqx.Module):
-    """Motion of each contact of a side along the robot, to its left and off the ground, per velocity of `OF_SIDE`."""
+class _ContactLevers(eqx.Module):
+    """Motion of each contact along the robot, to its left and off the ground, per velocity of `OF_SIDE`."""
 
     along: Float[Array, "2 contacts 8"]
     across: Float[Array, "2 contacts 8"]
     off: Float[Array, "2 contacts 8"]
 
 
-def _levers(run: System, motion: Motion, at: Touch) -> _Levers:
+def _contact_levers(run: HalfRobotSystem, motion: HalfRobotState, at: ContactState) -> _ContactLevers:
     cos, sin = cosine(motion.q[YAW]), sine(motion.q[YAW])
     one, y = jnp.ones_like(at.gap), (SIDES * _width(run))[:, None]
     none = jnp.zeros_like(one)
@@ -159,10 +165,12 @@ def _levers(run: System, motion: Motion, at: Touch) -> _Levers:
     along: list[Any] = [cos * one, sin * one, none, -y * one, z, none, at.rate_x * front, at.rate_x * rear]
     across: list[Any] = [-sin * one, cos * one, none, x, none, -z, none, none]
     off: list[Any] = [none, none, one, none, -x, y * one, at.rate_z * front, at.rate_z * rear]
-    return _Levers(*(jnp.stack(rows, axis=-1) for rows in (along, across, off)))
+    return _ContactLevers(*(jnp.stack(rows, axis=-1) for rows in (along, across, off)))
 
 
-def generalized(run: System, motion: Motion, signals: Signals, at: Touch, pulled: Pull) -> Coordinates:
+def generalized_forces(
+    run: HalfRobotSystem, motion: HalfRobotState, signals: Signals, at: ContactState, pulled: ContactPull
+) -> Coordinates:
     """Generalized forces on q [N, N·m]."""
     cos, sin = cosine(motion.q[YAW]), sine(motion.q[YAW])
     y, several = SIDES * _width(run), run.robot.sides / 2
@@ -178,22 +186,22 @@ def generalized(run: System, motion: Motion, signals: Signals, at: Touch, pulled
     return jnp.stack([*body, several * jnp.sum(moment), tilt, *pulleys])
 
 
-def _with_lateral_moment(run: System, signals: Signals, at: Touch, pulled: Pull) -> Signals:
-    """The signals with the moment of the lateral forces about the centre of mass."""
+def _with_lateral_moment(run: HalfRobotSystem, signals: Signals, at: ContactState, pulled: ContactPull) -> Signals:
+    """Signals with the moment of the lateral forces about the centre of mass."""
     assert pulled.aside is not None
     moment = jnp.sum(pulled.aside * (at.lever_x - run.half.centre[0]), axis=-1)
     return dataclasses.replace(signals, moment_lateral=moment)
 
 
-def resistance(
-    run: System, motion: Motion, signals: Signals, sides: _Sides, pulled: Pull
-) -> tuple[Float[Array, "10 10"], _Levers, Array]:
-    """Damping matrix K of the forces on v, see `half_robot.resistance`, with friction in both directions.
+def damping_matrix(
+    run: HalfRobotSystem, motion: HalfRobotState, signals: Signals, sides: _ContactsOfSides, pulled: ContactPull
+) -> tuple[Float[Array, "10 10"], _ContactLevers, Array]:
+    """Damping matrix K of the forces on v, see `half_robot.damping_matrix`, with friction in both directions.
 
     Also returns the levers, and the rise of each contact's forces with its sliding [N·s/m], shape (2, 2, 2,
     contacts).
     """
-    levers, touching = _levers(run, motion, sides.at), sides.at
+    levers, touching = _contact_levers(run, motion, sides.at), sides.at
     assert pulled.aside is not None
     sliding = jax.vmap(side_contacts.sliding_speeds)(signals, touching)
     weight = jnp.asarray(signals.adhesion)[:, None] * touching.force
@@ -209,7 +217,7 @@ def resistance(
         for k, f in enumerate((pulled.force, pulled.aside))
     ]
     each = jnp.einsum("sci,scj->sij", moves, jnp.concatenate([*pushes, falls], axis=1))
-    losses = _losses(run, plane_motion(run, motion), sides)
+    losses = _loss_derivatives(run, plane_motion(run, motion), sides)
     # Rolling resistance acts at each side, along the robot.
     cos, sin = cosine(motion.q[YAW]), sine(motion.q[YAW])
     total = jnp.zeros((COORDINATES, COORDINATES), motion.v.dtype)
@@ -221,8 +229,12 @@ def resistance(
     return run.robot.sides / 2 * total, levers, rises
 
 
-def dynamics(run: System, motion: Motion, armature: Pair) -> tuple[Float[Array, "10 10"], Coordinates]:
-    """Mass matrix and bias of MJX. The mass matrix includes the rotors' `armature` at the driving shafts [kg·m²]."""
+def mass_matrix_and_bias(
+    run: HalfRobotSystem, motion: HalfRobotState, armature: Pair
+) -> tuple[Float[Array, "10 10"], Coordinates]:
+    """Mass matrix and bias force of MJX. The mass matrix includes the rotors' `armature` at the driving shafts
+    [kg·m²].
+    """
     model = run.model.replace(dof_armature=jnp.zeros(COORDINATES).at[SHAFTS].set(armature))
     data = run.data.replace(qpos=motion.q, qvel=motion.v)
     data = mjx.com_pos(model, mjx.kinematics(model, data))
@@ -230,72 +242,78 @@ def dynamics(run: System, motion: Motion, armature: Pair) -> tuple[Float[Array, 
     return mjx.full_m(model, data), data.qfrc_bias
 
 
-class _Forces(eqx.Module):
-    """Data of a step at an instant: mass matrix M, damping K, and `push`, Δt (Q - c)."""
+class _StepForces(eqx.Module):
+    """Quantities of a time step: mass matrix M, damping K, and impulse `push`, Δt (Q - c)."""
 
-    sides: _Sides
+    sides: _ContactsOfSides
     signals: Signals
-    pulled: Pull
-    levers: _Levers
+    pulled: ContactPull
+    levers: _ContactLevers
     rises: Array
     mass: Float[Array, "10 10"]
     damping: Float[Array, "10 10"]
     push: Coordinates
 
 
-def _forces(run: System, motion: Motion, stored: bool = False) -> _Forces:
-    """Forces of an instant, unless `stored`, XLA computes derivatives of contacts and signals again at each use."""
+def _step_forces(run: HalfRobotSystem, motion: HalfRobotState, stored: bool = False) -> _StepForces:
+    """Forces of an instant. Without `stored`, XLA would compute derivatives of contacts and signals again at each
+    use.
+    """
 
     def found(x: Any) -> Any:
         return jax.lax.optimization_barrier(x) if stored else x
 
-    sides = found(_contacts(run, motion))
-    signals, pulled = found(_resolved(run, plane_motion(run, motion), sides))
-    damping, levers, rises = resistance(run, motion, signals, sides, pulled)
-    mass, bias = dynamics(run, motion, jnp.asarray(run.robot.sides / 2 * half_robot.armature_inertia(run, signals)))
-    push = run.step * (generalized(run, motion, signals, sides.at, pulled) - bias)
-    return _Forces(sides, signals, pulled, levers, rises, mass, damping, push)
+    sides = found(_contacts_of_sides(run, motion))
+    signals, pulled = found(_resolve_signals(run, plane_motion(run, motion), sides))
+    damping, levers, rises = damping_matrix(run, motion, signals, sides, pulled)
+    mass, bias = mass_matrix_and_bias(
+        run, motion, jnp.asarray(run.robot.sides / 2 * half_robot.armature_inertia(run, signals))
+    )
+    push = run.step * (generalized_forces(run, motion, signals, sides.at, pulled) - bias)
+    return _StepForces(sides, signals, pulled, levers, rises, mass, damping, push)
 
 
-def _solver(run: System, found: _Forces) -> Callable[[Coordinates], Coordinates]:
+def _solver(run: HalfRobotSystem, found: _StepForces) -> Callable[[Coordinates], Coordinates]:
     factors = factorise(found.mass + run.step * found.damping)
     return functools.partial(solve_factorised, factors)
 
 
 @eqx.filter_custom_jvp
-def advance(run: System, motion: Motion) -> tuple[Motion, balances.Travel, Pair]:
+def advance(run: HalfRobotSystem, motion: HalfRobotState) -> tuple[HalfRobotState, balances.Travel, Pair]:
     """One step, see `half_robot.advance`: (M + Δt K) Δv = Δt (Q - c).
 
     Returns:
         The motion after it. All signals of the instant before it, with forces and accelerations of the step. The load
         on each lower guide before it [N].
     """
-    forces = _forces(run, motion)
-    return _moved(run, motion, forces, _solver(run, forces)(forces.push))
+    forces = _step_forces(run, motion)
+    return _state_after_step(run, motion, forces, _solver(run, forces)(forces.push))
 
 
 @advance.def_jvp
-def _differentiated(primals: tuple[System, Motion], tangents: tuple[Any, Any]) -> tuple[Any, Any]:
+def _differentiated(primals: tuple[HalfRobotSystem, HalfRobotState], tangents: tuple[Any, Any]) -> tuple[Any, Any]:
     """See `half_robot.advance`. K enters only by its product with Δv."""
-    found = _forces(*primals)
+    found = _step_forces(*primals)
     solve = _solver(primals[0], found)
     gained = solve(found.push)
 
-    def held(run: System, motion: Motion) -> tuple[Array, _Forces]:
-        forces = _forces(run, motion, stored=True)
+    def held(run: HalfRobotSystem, motion: HalfRobotState) -> tuple[Array, _StepForces]:
+        forces = _step_forces(run, motion, stored=True)
         fallen = _damping_product(run, motion, forces, gained)
         return forces.push - forces.mass @ gained - run.step * fallen, forces
 
     _, (left, changed) = eqx.filter_jvp(held, primals, tangents)
-    return eqx.filter_jvp(_moved, (*primals, found, gained), (*tangents, changed, solve(left)))
+    return eqx.filter_jvp(_state_after_step, (*primals, found, gained), (*tangents, changed, solve(left)))
 
 
-def _damping_product(run: System, motion: Motion, found: _Forces, gained: Coordinates) -> Coordinates:
-    """The product K Δv, see `resistance`, without forming K."""
+def _damping_product(
+    run: HalfRobotSystem, motion: HalfRobotState, found: _StepForces, gained: Coordinates
+) -> Coordinates:
+    """Product K Δv without forming K, see `damping_matrix`."""
     touching, pulled, levers = found.sides.at, found.pulled, found.levers
     assert pulled.aside is not None
-    after = forces_after(touching, pulled, levers, found.rises, gained)
-    losses, shafts = _losses(run, plane_motion(run, motion), found.sides)
+    after = contact_forces_after_step(touching, pulled, levers, found.rises, gained)
+    losses, shafts = _loss_derivatives(run, plane_motion(run, motion), found.sides)
     cos, sin, y = cosine(motion.q[YAW]), sine(motion.q[YAW]), SIDES * _width(run)
     ahead, turn = cos * gained[X] + sin * gained[Y], gained[YAW]
     rolls = losses * (ahead - y * turn)
@@ -311,24 +329,26 @@ def _damping_product(run: System, motion: Motion, found: _Forces, gained: Coordi
     return run.robot.sides / 2 * gained_forces
 
 
-def _moved(run: System, motion: Motion, found: _Forces, gained: Coordinates) -> tuple[Motion, balances.Travel, Pair]:
+def _state_after_step(
+    run: HalfRobotSystem, motion: HalfRobotState, found: _StepForces, gained: Coordinates
+) -> tuple[HalfRobotState, balances.Travel, Pair]:
     v = motion.v + gained
 
     def later(own: Conditions, signals: Signals, memory: Mapping[str, Scalar]) -> Any:
         of_side = dataclasses.replace(run, conditions=own), dataclasses.replace(motion, memory=memory)
-        return half_robot.state_after(*of_side, signals)
+        return half_robot.other_states_after_step(*of_side, signals)
 
     each = jax.vmap(later)(run.conditions.of_sides(), found.signals, motion.memory)
-    after = Motion(motion.q + run.step * v, v, each.current, each.discharge[0], each.memory)
+    after = HalfRobotState(motion.q + run.step * v, v, each.current, each.discharge[0], each.memory)
     return after, _signals_after_step(run, motion, found, gained), found.pulled.guided
 
 
-def forces_after(
-    at: Touch, pulled: Pull, levers: _Levers, rises: Array, gained: Coordinates
+def contact_forces_after_step(
+    at: ContactState, pulled: ContactPull, levers: _ContactLevers, rises: Array, gained: Coordinates
 ) -> tuple[Array, Array, Array]:
-    """Forces of the contacts ahead, to the left and off the ground [N] during a step that gains Δv.
+    """Forces of the contacts ahead, to the left and off the ground [N] in a step that changes the velocities by Δv.
 
-    Each has shape (2, contacts).
+    Each has the shape (2, contacts).
     """
     of_side = gained[OF_SIDE]
     along, across, off = (jnp.einsum("sci,si->sc", x, of_side) for x in (levers.along, levers.across, levers.off))
@@ -341,10 +361,12 @@ def forces_after(
     return ahead, aside, at.force - down
 
 
-def _signals_after_step(run: System, motion: Motion, found: _Forces, gained: Coordinates) -> balances.Travel:
-    """All signals of a step, with its forces at its end to first order."""
+def _signals_after_step(
+    run: HalfRobotSystem, motion: HalfRobotState, found: _StepForces, gained: Coordinates
+) -> balances.Travel:
+    """All signals of a step, with its forces at the end of the step to first order."""
     sides, signals, touching, several = found.sides, found.signals, found.sides.at, run.robot.sides / 2
-    ahead, aside, normal = forces_after(touching, found.pulled, found.levers, found.rises, gained)
+    ahead, aside, normal = contact_forces_after_step(touching, found.pulled, found.levers, found.rises, gained)
     forward = run.half.centre[0]
     arm = touching.lever_x - forward
     load, moment = jnp.sum(normal, axis=-1), jnp.sum(aside * arm, axis=-1)
@@ -356,7 +378,7 @@ def _signals_after_step(run: System, motion: Motion, found: _Forces, gained: Coo
     y = SIDES * _width(run)
     acceleration = ahead_gained + motion.v[YAW] * lateral
     signals = dataclasses.replace(signals, acceleration=acceleration - turn * y)
-    grip = Grip(
+    grip = GroundForces(
         normal=several * load,
         ahead=several * jnp.sum(ahead, axis=-1),
         aside=several * jnp.sum(aside, axis=-1),
@@ -369,7 +391,7 @@ def _signals_after_step(run: System, motion: Motion, found: _Forces, gained: Coo
     return balances.Travel(signals, grip, acceleration, aside_gained - motion.v[YAW] * speed + forward * turn, turn)
 
 
-def stand(run: System) -> Motion:
+def stand(run: HalfRobotSystem) -> HalfRobotState:
     """At rest on the ground, with the heading of the conditions. See `half_robot.stand`, on the slope along it.
 
     Load transfer to the lower side is not included yet.
@@ -384,13 +406,13 @@ def stand(run: System) -> Motion:
         .set(jnp.stack([half.q[1], half.q[2], heading + jnp.zeros_like(half.q[1])]))
     )
     memory = {name: jnp.stack([x, x]) for name, x in half.memory.items()}
-    return Motion(q, jnp.zeros_like(q), jnp.zeros(len(SIDES), q.dtype), half.discharge, memory)
+    return HalfRobotState(q, jnp.zeros_like(q), jnp.zeros(len(SIDES), q.dtype), half.discharge, memory)
 
 
-def roll(run: System) -> Motion:
+def roll(run: HalfRobotSystem) -> HalfRobotState:
     """In the settled turn of the steady fidelity, at rest if it has none."""
     begins = stand(run)
-    rolls = circling.motion_of(run.robot, circling.turning_start(run.robot, run.conditions, rolling=True))
+    rolls = circling.motion_of_unknowns(run.robot, circling.turning_start(run.robot, run.conditions, rolling=True))
     cos, sin = cosine(rolls.heading), sine(rolls.heading)
     lateral = rolls.speed_lateral - run.half.centre[0] * rolls.yaw_rate
     shafts = rolls.speed_motor / run.robot.gearbox.ratio
@@ -399,40 +421,40 @@ def roll(run: System) -> Motion:
     return dataclasses.replace(begins, v=v, current=rolls.current, memory=rolls.memory)
 
 
-def loads(run: System, at: Touch, pulled: Pull) -> Reactions:
+def loads(run: HalfRobotSystem, at: ContactState, pulled: ContactPull) -> GearReactions:
     """See `half_robot.loads`, for each side."""
     return jax.vmap(lambda at, pulled: half_robot.loads(run, at, pulled))(at, pulled)
 
 
-def away(q: Array, reactions: Reactions) -> tuple[Array, Reactions | None]:
-    """See `half_robot.away`: distance from the start. A history has no loads of both sides."""
+def distance_and_reactions(q: Array, reactions: GearReactions) -> tuple[Array, GearReactions | None]:
+    """See `half_robot.distance_and_reactions`: distance from the start. A history has no loads of both sides."""
     return jnp.hypot(q[..., X], q[..., Y]), None
 
 
-def averaged(average: Average, travelled: Array, passed: balances.Travel, guided: Array) -> Steady:
-    """See `half_robot.averaged`. Quantities of the whole robot are averaged over the periods of both sides."""
+def steady_averages(average: Average, travelled: Array, passed: balances.Travel, guided: Array) -> SteadyAverages:
+    """See `half_robot.steady_averages`. Quantities of the whole robot are averaged over the periods of both sides."""
     both = jax.tree.map(lambda x: jnp.broadcast_to(x.reshape(*x.shape[:1], -1), (*x.shape[:1], 2)), passed)
     means, load, periods, changes = jax.vmap(average, in_axes=1)(jnp.abs(travelled), (both, guided))
     travel = jax.tree.map(lambda x, like: x if like.ndim > 1 else jnp.mean(x), means, passed)
     share = jnp.sum(load) / jnp.maximum(jnp.sum(travel.signals.normal), 1e-9)
     # A side that hardly moves counts as settled if its changes are small compared with the other side's.
     larger = [(change, jnp.max(size)) for change, size in changes]
-    return Steady(travel.signals, share, periods, jnp.max(half_robot.relative_changes(larger)), travel)
+    return SteadyAverages(travel.signals, share, periods, jnp.max(half_robot.relative_changes(larger)), travel)
 
 
-def status(run: System, averages: Steady, end: Motion) -> Array:
+def status(run: HalfRobotSystem, averages: SteadyAverages, end: HalfRobotState) -> Array:
     """See `half_robot.status`."""
     travel, signals = averages.travel, jax.tree.map(jnp.mean, averages.signals)
     assert travel is not None
     over = {name: getattr(signals, name) for name in ("speed", "speed_lateral", "yaw_rate")}
     keeps = dataclasses.replace(plane_motion(run, end), **over)
-    status = circling.status_keeping(run.robot, run.conditions, travel, keeps)
+    status = circling.status_of_steady_motion(run.robot, run.conditions, travel, keeps)
     status = jnp.where((averages.change > half_robot.SETTLED) & (status == CONVERGED), NOT_SETTLED, status)
     tilt = jnp.maximum(jnp.abs(end.q[PITCH]), jnp.abs(end.q[ROLL]))
     return half_robot.status_unless_lost(run, status, end, end.q[HEIGHT], tilt, signals.total_current)
 
 
-def result_of(run: System, averages: Steady, status: Array) -> Result:
+def result_of(run: HalfRobotSystem, averages: SteadyAverages, status: Array) -> Result:
     """See `half_robot.result_of`."""
     assert averages.travel is not None
-    return circling.result_of(run.robot, averages.travel, status)
+    return circling.result_of_turn(run.robot, averages.travel, status)

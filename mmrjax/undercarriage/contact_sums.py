@@ -1,7 +1,7 @@
 """Sums over all contacts of one side, and their exact derivatives, one column for each input.
 
-A step of the track model needs a dozen sums over its contacts. Their derivatives are computed once per input and
-not once per parameter of a derivative. Each tangent then costs only a small product.
+A step of the track model needs a dozen sums over its contacts. Their derivatives are computed once per input and not
+once per parameter of a derivative. Each tangent then costs only a small product.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from mmrjax.model.chassis import Chassis
 from mmrjax.model.params import Scalar
 from mmrjax.model.signals import Signals
 from mmrjax.numerics.trigonometry import cosine, sine
-from mmrjax.undercarriage.belt import Path, belt_runs, tips_on_path
+from mmrjax.undercarriage.belt import BeltPath, belt_runs, tips_on_path
 from mmrjax.undercarriage.side_contacts import (
     WHEEL,
-    Touch,
+    ContactState,
     bearing_contacts,
-    contact_state,
+    compute_contacts,
     join_contacts,
     tension_free,
 )
@@ -50,12 +50,12 @@ FRICTION = ("static", "dynamic", "speed_static", "speed_dynamic")
 CHASSIS = ("radius", "on_tracks")
 #: Coordinates and velocities (see `undercarriage`) except the travel, which has no influence.
 MOTION = ("z", "pitch", "front", "rear", "v_x", "v_z", "v_pitch", "v_front", "v_rear")
-#: Of each contact: F, R, F~ and R~ [N] (see `Sums`) and the rise of F with sliding [N·s/m].
+#: Of each contact: F, R, F~ and R~ [N] (see `ContactSums`) and the rise of F with sliding [N·s/m].
 Forces = tuple[Array, ...]
 
 
-class Sums(eqx.Module):
-    """Sums over the contacts of one side, for a given change of velocity Δv of a step.
+class ContactSums(eqx.Module):
+    """Sums over the contacts of one side, for a given change of velocity Δv in a time step.
 
     A contact's traction is F, its normal force R. The damping of the step (`half_robot.resistance`, without the
     drive's part) reduces them by F~ and R~. They act on the pulleys with their levers, front and rear.
@@ -83,10 +83,10 @@ class Sums(eqx.Module):
     rise_front: Scalar
 
 
-ROWS = tuple(f.name for f in dataclasses.fields(Sums))
+ROWS = tuple(f.name for f in dataclasses.fields(ContactSums))
 
 
-def contact_inputs(path: Path, chassis: Chassis, adhesion: Any) -> dict[str, Any]:
+def contact_inputs(path: BeltPath, chassis: Chassis, adhesion: Any) -> dict[str, Any]:
     """Inputs of the contacts other than the motion, by name. Tangents have the same form (None: constant)."""
     gear, friction = path.gear, chassis.ground.friction
     return {
@@ -98,19 +98,21 @@ def contact_inputs(path: Path, chassis: Chassis, adhesion: Any) -> dict[str, Any
     }
 
 
-def _with(path: Path, chassis: Chassis, values: Mapping[str, Any]) -> tuple[Path, Chassis]:
+def _with(path: BeltPath, chassis: Chassis, values: Mapping[str, Any]) -> tuple[BeltPath, Chassis]:
     gear = dataclasses.replace(path.gear, **{name: values[name] for name in GEAR})
     ground = chassis.ground
     friction = dataclasses.replace(ground.friction, **{name: values[f"friction_{name}"] for name in FRICTION})
     ground = dataclasses.replace(ground, friction=friction)
     changed = {name: values[f"chassis_{name}"] for name in CHASSIS}
-    return Path(values["pulley"], gear), dataclasses.replace(chassis, ground=ground, **changed)
+    return BeltPath(values["pulley"], gear), dataclasses.replace(chassis, ground=ground, **changed)
 
 
-def contact_shares(
-    path: Path, chassis: Chassis, at: Touch, slip: Scalar, adhesion: Scalar, gained: Float[Array, " 5"]
+def contributions_of_contacts(
+    path: BeltPath, chassis: Chassis, at: ContactState, slip: Scalar, adhesion: Scalar, gained: Float[Array, " 5"]
 ) -> Float[Array, "sums contacts"]:
-    """Contribution of each contact to the `Sums`. `slip` shifts all sliding speeds [m/s], `gained` is Δv."""
+    """Contribution of each contact to the `ContactSums`. `slip` is added to all sliding speeds [m/s]. `gained`
+    is Δv.
+    """
     sliding = -at.speed_x - slip
     ground = chassis.ground
     coefficient = ground.traction(sliding, 1.0, adhesion)
@@ -141,45 +143,45 @@ def contact_shares(
     )
 
 
-class Linearized(eqx.Module):
-    """The sums and their derivatives with respect to motion, slip and selected inputs.
+class LinearizedSums(eqx.Module):
+    """Sums over contacts and their derivatives with respect to motion, slip and selected inputs.
 
     Attributes:
         values: the sums.
-        slopes: their derivatives, a row for each of `names`.
-        at: values of the inputs of the rows.
+        slopes: derivatives of the sums, one row for each of `names`.
+        at: values of these inputs at which the sums are linearised.
     """
 
-    values: Sums
+    values: ContactSums
     slopes: Float[Array, "names sums"]
     at: Mapping[str, Scalar]
     names: tuple[str, ...] = eqx.field(static=True)
 
-    def near(self, now: Mapping[str, Any]) -> Sums:
-        """The sums for inputs `now` to first order. Inputs that it leaves out keep their values."""
+    def near(self, now: Mapping[str, Any]) -> ContactSums:
+        """Sums for inputs `now`, to first order. Missing inputs keep their values."""
         moved = [now[name] - self.at[name] if name in now else jnp.zeros(()) for name in self.names]
         return jax.tree.map(jnp.add, self.values, _sums(jnp.stack(moved) @ self.slopes))
 
-    def slope(self, name: str) -> Sums:
+    def slope(self, name: str) -> ContactSums:
         """Derivatives of the sums with respect to one of `names`."""
         return _sums(self.slopes[self.names.index(name)])
 
 
-def _sums(row: Float[Array, " sums"]) -> Sums:
-    return Sums(*(row[k] for k in range(len(ROWS))))
+def _sums(row: Float[Array, " sums"]) -> ContactSums:
+    return ContactSums(*(row[k] for k in range(len(ROWS))))
 
 
 def linearize(
-    path: Path,
+    path: BeltPath,
     chassis: Chassis,
     given: Mapping[str, Any],
     gained: Float[Array, " 5"],
     constants: tuple[str, ...] = (),
-) -> Linearized:
+) -> LinearizedSums:
     """Sums and their derivatives.
 
     Derivatives with respect to motion and slip are written out. The others are by forward differentiation of
-    `contact_shares`, one input at a time.
+    `contributions_of_contacts`, one input at a time.
 
     Args:
         path, chassis: path and chassis of the run.
@@ -191,33 +193,33 @@ def linearize(
     def each(values: Mapping[str, Any]) -> Float[Array, "sums contacts"]:
         path_now, chassis_now = _with(path, chassis, values)
         z, pitch, front, rear, *v = (values[name] for name in MOTION)
-        touching = contact_state(path_now, chassis_now, (0.0, z, pitch, front, rear), v)
-        return contact_shares(path_now, chassis_now, touching, values["slip"], values["adhesion"], gained)
+        touching = compute_contacts(path_now, chassis_now, (0.0, z, pitch, front, rear), v)
+        return contributions_of_contacts(path_now, chassis_now, touching, values["slip"], values["adhesion"], gained)
 
     def along(name: str) -> Float[Array, "sums contacts"]:
         value = jnp.asarray(given[name])
         return jax.jvp(lambda x: each({**given, name: x}), (value,), (jnp.ones_like(value),))[1]
 
-    values, slopes = _by_motion(path, chassis, given, gained)
+    values, slopes = _sums_and_motion_derivatives(path, chassis, given, gained)
     if constants:
         others = jnp.stack([along(name) for name in constants])
         slopes = jnp.concatenate([slopes, others @ jnp.ones(others.shape[-1])])
     # Slip shifts the sliding of every contact like the robot's own speed.
     slopes = jnp.concatenate([slopes, slopes[None, MOTION.index("v_x")]])
     names = (*MOTION, *constants, "slip")
-    return Linearized(_sums(values), slopes, {name: given[name] for name in names}, names)
+    return LinearizedSums(_sums(values), slopes, {name: given[name] for name in names}, names)
 
 
 def _sum_of_products(*products: tuple[Any, ...]) -> Any:
-    """Sum of products. Those with a factor None are left out, which XLA would not do with zeros."""
+    """Sum of products. Products with a factor None are left out. XLA would compute products with zeros."""
     terms = [math.prod(factors[1:], start=factors[0]) for factors in products if all(f is not None for f in factors)]
     return sum(terms[1:], start=terms[0]) if terms else None
 
 
-class _Law(eqx.Module):
-    """Derivatives of the forces of a contact with respect to its own motion, for constant Δv of the step."""
+class _ContactDerivatives(eqx.Module):
+    """Derivatives of the forces of a contact with respect to its own motion, at constant Δv."""
 
-    at: Touch
+    at: ContactState
     by_depth: Array  # of R [N/m]
     damped_by_depth: Array  # of D, the damping by the gap's rate [N·s/m²]
     share: Array  # relative decrease of both with the belt's compliance [N/m]
@@ -242,7 +244,7 @@ class _Law(eqx.Module):
         off: Any = None,
         compliance: Any = None,
     ) -> Forces:
-        """Change of `forces` with gap, gap rate, sliding speed, the step's velocity changes and belt compliance.
+        """Changes of `forces` due to gap, gap rate, sliding speed, velocity changes of the step, and belt compliance.
 
         None: no change.
         """
@@ -263,7 +265,9 @@ class _Law(eqx.Module):
         return tuple(jnp.zeros_like(touching.force) if a is None else a for a in moved_sums)
 
 
-def _law(path: Path, chassis: Chassis, at: Touch, given: Mapping[str, Any], gained: Array) -> _Law:
+def _contact_derivatives(
+    path: BeltPath, chassis: Chassis, at: ContactState, given: Mapping[str, Any], gained: Array
+) -> _ContactDerivatives:
     gear, friction = path.gear, chassis.ground.friction
     depth = jnp.maximum(-at.gap, 1e-9)
     stiff = gear.contact_stiffness * depth ** (gear.contact_exponent - 1)
@@ -275,7 +279,7 @@ def _law(path: Path, chassis: Chassis, at: Touch, given: Mapping[str, Any], gain
     sliding = -at.speed_x - given["slip"]
     rise, bend = jax.jvp(friction.rise, (sliding,), (jnp.ones_like(sliding),))
     drawn = path.radius * ((1 - at.weight) * gained[3] + at.weight * gained[4])
-    return _Law(
+    return _ContactDerivatives(
         at=at,
         by_depth=bears * (gear.contact_exponent * stiff - deepens * at.gap_rate) - softens * at.force,
         damped_by_depth=bears * deepens - softens * at.damped,
@@ -288,19 +292,19 @@ def _law(path: Path, chassis: Chassis, at: Touch, given: Mapping[str, Any], gain
     )
 
 
-class _Levers(eqx.Module):
-    """Levers of forces along the ground and off it in the sums, each of shape (levers, contacts)."""
+class _SumLevers(eqx.Module):
+    """Levers of the forces along and normal to the ground in the sums, each of shape (levers, contacts)."""
 
     level: Array
     steep: Array
 
     @classmethod
-    def of(cls, unit: Any, x: Array, z: Array, front: tuple[Array, ...], rear: tuple[Array, ...]) -> _Levers:
+    def of(cls, unit: Any, x: Array, z: Array, front: tuple[Array, ...], rear: tuple[Array, ...]) -> _SumLevers:
         """From the levers of the pitch [m], and on each pulley those of F, R [m] and of friction on the guide [m]."""
         return cls(jnp.stack([unit, z, front[0], rear[0]]), jnp.stack([unit, x, *front[1:], *rear[1:]]))
 
 
-def _weighted_sums(forces: Sequence[Forces], levers: Sequence[_Levers]) -> Float[Array, "forces levers sums"]:
+def _weighted_sums(forces: Sequence[Forces], levers: Sequence[_SumLevers]) -> Float[Array, "forces levers sums"]:
     """Sums over all contacts for every combination of forces and levers."""
     level, steep = jnp.stack([a.level for a in levers]), jnp.stack([a.steep for a in levers])
     pulls = jnp.stack([jnp.stack([row[0], row[2], row[4]]) for row in forces])
@@ -310,7 +314,7 @@ def _weighted_sums(forces: Sequence[Forces], levers: Sequence[_Levers]) -> Float
     pull, fallen, rise = (pulls[:, k] for k in range(3))
     force, down = (bears[:, k] for k in range(2))
     left, held = pull - fallen, force - down
-    sums = Sums(
+    sums = ContactSums(
         traction=pull[..., 0],
         normal=force[..., 0],
         moment=left[..., 1] - held[..., 1],
@@ -327,18 +331,18 @@ def _weighted_sums(forces: Sequence[Forces], levers: Sequence[_Levers]) -> Float
     return jnp.stack([getattr(sums, name) for name in ROWS], axis=-1)
 
 
-def _by_motion(
-    path: Path, chassis: Chassis, given: Mapping[str, Any], gained: Array
+def _sums_and_motion_derivatives(
+    path: BeltPath, chassis: Chassis, given: Mapping[str, Any], gained: Array
 ) -> tuple[Float[Array, " sums"], Float[Array, "motion sums"]]:
-    """The sums, and their derivatives with respect to `MOTION`.
+    """Sums over contacts, and their derivatives with respect to `MOTION`.
 
     Each contact is moved along ten directions: its height, the pitch, the position of the belt as each pulley turns,
     five velocities and the deflection of the belt. Changes of its forces are weighted with the levers of the sums,
     and changes of the levers with its forces.
     """
     height, pitch, front, rear, *v = (given[name] for name in MOTION)
-    touching = contact_state(path, chassis, (0.0, height, pitch, front, rear), v)
-    law = _law(path, chassis, touching, given, gained)
+    touching = compute_contacts(path, chassis, (0.0, height, pitch, front, rear), v)
+    law = _contact_derivatives(path, chassis, touching, given, gained)
     x, z, rate_x, rate_z, guided, one = (
         touching.lever_x,
         touching.lever_z,
@@ -361,10 +365,10 @@ def _by_motion(
             compliance=compliance,
         )
 
-    def levers(dx: Array, dz: Array, ahead: Array, rise: Array, share: Array) -> _Levers:
+    def levers(dx: Array, dz: Array, ahead: Array, rise: Array, share: Array) -> _SumLevers:
         """Change of the levers with contact points and their rates."""
         rates = (ahead, rise, share)
-        return _Levers.of(
+        return _SumLevers.of(
             jnp.zeros_like(x), dx, dz, tuple(a * on_front for a in rates), tuple(a * on_rear for a in rates)
         )
 
@@ -404,11 +408,11 @@ def _by_motion(
         law.moved(compliance=-touching.compliance / taut),
     ]
     forces, rates = law.forces(), (rate_x, rate_z, guided)
-    here = _Levers.of(one, x, z, tuple(a * on_front for a in rates), tuple(a * on_rear for a in rates))
+    here = _SumLevers.of(one, x, z, tuple(a * on_front for a in rates), tuple(a * on_rear for a in rates))
     rows = _weighted_sums([*changes, forces], [here])[:, 0]
     over_belt = levers(*belt, tip.guided)
     shift = tuple(path.radius * a * shared for a in rates)
-    by_share = _Levers.of(jnp.zeros_like(x), 0 * x, 0 * x, tuple(-a for a in shift), shift)
+    by_share = _SumLevers.of(jnp.zeros_like(x), 0 * x, 0 * x, tuple(-a for a in shift), shift)
     moved = [
         levers(*pitched, jnp.zeros_like(x)),
         jax.tree.map(lambda a, b: a * by_front + b, over_belt, by_share),
@@ -422,7 +426,7 @@ def _by_motion(
 
 
 class ContactForces(eqx.Module):
-    """Forces of the contacts at an instant, from their sums. See `undercarriage.Pull`."""
+    """Forces of the contacts at an instant, from their sums, see `side_contacts.Pull`."""
 
     traction: Scalar
     moment: Scalar
@@ -432,15 +436,15 @@ class ContactForces(eqx.Module):
     load: Scalar
 
 
-class Mover(eqx.Module):
-    """The contacts in the form that `balances.resolved_signals` expects, from their sums near an instant.
+class SummedContacts(eqx.Module):
+    """Contacts in the form that `balances.resolved_signals` expects, from their sums near an instant.
 
-    The forces also depend on `speed_slip_terms`: traction and load to second order, so that the first derivatives
-    of their change with it are exact as well.
+    The forces also depend on `speed_slip_terms`: traction and load to second order, so that the first derivatives of
+    their change with it are exact as well.
     """
 
-    linearized: Linearized
-    sums: Sums
+    linearized: LinearizedSums
+    sums: ContactSums
     radius: Scalar
     torque_front: Scalar
 
@@ -449,8 +453,8 @@ class Mover(eqx.Module):
         """Normal load of one side [N]."""
         return self.sums.normal
 
-    def shifted(self, slip: Scalar) -> Sums:
-        """The sums with the sliding speeds shifted by `slip` [m/s]."""
+    def shifted(self, slip: Scalar) -> ContactSums:
+        """Sums with `slip` added to the sliding speeds [m/s]."""
         by, was = self.linearized.slope("slip"), self.linearized.values
         moved = slip - self.linearized.at["slip"]
         sums = jax.tree.map(lambda a, b: a + b * moved, self.sums, by)

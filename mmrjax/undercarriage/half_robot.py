@@ -1,7 +1,7 @@
-"""Half a robot in motion: its state, all its forces at an instant, one step, and the start of a run.
+"""Half a robot in motion: its state, all its forces at an instant, one time step, and its start.
 
-MJX computes chassis and pulleys (5 degrees of freedom, `mjcf`). Grousers or wheels, guides and belt
-(`undercarriage`, `belt`) and the drive (`balances`) enter as generalized forces.
+MJX computes chassis and pulleys (5 degrees of freedom, `mjcf`). Grousers or wheels, guides and belt (`undercarriage`,
+`belt`) and the drive (`balances`) enter as generalized forces.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from mmrjax.fidelities.steady import steady
 from mmrjax.model import balances
 from mmrjax.model.chassis import Chassis, inertia_reduced
 from mmrjax.model.conditions import Conditions
-from mmrjax.model.masses import Masses, masses_of_parts
+from mmrjax.model.masses import HalfRobotMasses, masses_of_parts
 from mmrjax.model.params import Scalar
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import (
@@ -40,10 +40,10 @@ from mmrjax.model.signals import (
 from mmrjax.numerics.linear_equations import Factors, Vector, factorise, solve_factorised
 from mmrjax.numerics.newton import root
 from mmrjax.undercarriage import contact_sums, mjcf, side_contacts
-from mmrjax.undercarriage.belt import Path, belt_runs
-from mmrjax.undercarriage.contact_sums import Linearized
+from mmrjax.undercarriage.belt import BeltPath, belt_runs
+from mmrjax.undercarriage.contact_sums import LinearizedSums
 from mmrjax.undercarriage.mjcf import mjx
-from mmrjax.undercarriage.side_contacts import Pull, Reactions, Touch
+from mmrjax.undercarriage.side_contacts import ContactPull, ContactState, GearReactions
 
 #: Coordinates of half a robot, or their velocities or forces.
 Coordinates = Float[Array, " 5"]
@@ -62,14 +62,14 @@ Changes = Sequence[tuple[Scalar, Scalar]]
 Average = Callable[[Array, tuple[Any, Array]], tuple[Any, Array, Array, Changes]]
 
 
-class Motion(eqx.Module):
-    """State of half a robot, which a step advances.
+class HalfRobotState(eqx.Module):
+    """State of half a robot, which a time step advances.
 
     Attributes:
         q, v: coordinates and velocities, see `undercarriage`.
         current: current of one motor [A].
         discharge: charge taken from the battery [C].
-        memory: memory of each effect that has one, by effect name.
+        memory: memory of each effect that has one, by name.
     """
 
     q: Coordinates
@@ -79,18 +79,18 @@ class Motion(eqx.Module):
     memory: Mapping[str, Scalar] = eqx.field(default_factory=dict)
 
 
-class Steady(eqx.Module):
-    """Averages over the last whole number of grouser periods of a run.
+class SteadyAverages(eqx.Module):
+    """Averages over the last whole grouser periods of a run.
 
-    For a robot that turns they have a leading axis of left and right side, with separate periods for each.
+    For a robot that turns, their first axis is the side, with a separate period for each.
 
     Attributes:
-        signals: means.
-        guide_share: share of the ground's normal reaction on the lower guides [-]: an output here, a
+        signals: mean signals.
+        guide_share: share of the normal reaction of the ground on the lower guides [-]. It is an output here and a
             parameter in the other fidelities.
-        periods: number of grouser periods averaged [-]. 0: the plain window, for a belt that barely moved.
-        change: largest relative change of current, motor speed and speed between the window's halves [-].
-        travel: means of `balances.Travel`, for a robot that turns.
+        periods: number of grouser periods that were averaged [-]. 0: a fixed window, because the belt hardly moved.
+        change: largest relative change of current, motor speed and speed between the two halves of the window [-].
+        travel: for a robot that turns, means of `balances.Travel`.
     """
 
     signals: Signals
@@ -100,91 +100,94 @@ class Steady(eqx.Module):
     travel: balances.Travel | None = None
 
 
-class System(eqx.Module):
-    """One run's constants, which `instant` and `advance` need in addition to the motion.
+class HalfRobotSystem(eqx.Module):
+    """Constants of one run that `instant` and `advance` need.
 
     Attributes:
-        chassis: chassis of the run's configuration.
-        model, data: MJX model with this member's constants, and data of the same structure.
+        chassis: chassis of the configuration of the run.
+        model, data: MJX model with the constants of this member, and MJX data of the same structure.
         step: interval of integration [s].
     """
 
     robot: Robot
     conditions: Conditions
-    path: Path
-    half: Masses
+    path: BeltPath
+    half: HalfRobotMasses
     chassis: Chassis
     model: Any
     data: Any
     step: Scalar
 
 
-def half_robot_system(robot: Robot, conditions: Conditions, step: Scalar) -> System:
-    """Constants of one run (scalar fields), of half a robot or of a whole one. The robot may hold tracers."""
+def build_system(robot: Robot, conditions: Conditions, step: Scalar) -> HalfRobotSystem:
+    """Constants of one run (scalar fields), for half a robot or a whole one. The robot may hold tracers."""
     zero = jnp.zeros_like(conditions.voltage)
     mass = balances.begin_signals(robot, conditions, State(zero, zero, zero, zero)).mass
     half = masses_of_parts(robot, conditions, mass)
     model, data = mjcf.model_template(conditions.turns)
     model = mjcf.member_model(model, mjcf.robot_bodies(robot, half, conditions), conditions.slope, step)
-    path, chassis = Path(robot.radius_pulley, robot.running_gear), robot.chassis(conditions.configuration)
-    return System(robot, conditions, path, half, chassis, model, data, jnp.asarray(step, float))
+    path, chassis = BeltPath(robot.radius_pulley, robot.running_gear), robot.chassis(conditions.configuration)
+    return HalfRobotSystem(robot, conditions, path, half, chassis, model, data, jnp.asarray(step, float))
 
 
-class _Mover(eqx.Module):
-    path: Path
-    at: Touch
+class _SideContacts(eqx.Module):
+    path: BeltPath
+    at: ContactState
     height: Scalar
 
     @property
     def normal(self) -> Scalar:
         return self.at.normal
 
-    def pull(self, chassis: Chassis, signals: Signals) -> Pull:
+    def pull(self, chassis: Chassis, signals: Signals) -> ContactPull:
         return side_contacts.contact_forces(self.path, chassis, signals, self.at, self.height)
 
 
-def instant(run: System, motion: Motion) -> tuple[Signals, Touch, Pull]:
+def instant(run: HalfRobotSystem, motion: HalfRobotState) -> tuple[Signals, ContactState, ContactPull]:
     """All signals, contacts and forces of an instant."""
-    touching = side_contacts.contact_state(run.path, run.chassis, motion.q, motion.v)
-    signals, pulled = _resolved(run, motion, _Mover(run.path, touching, motion.q[1]), motion.v[0], motion.v[3])
+    touching = side_contacts.compute_contacts(run.path, run.chassis, motion.q, motion.v)
+    signals, pulled = _resolve_signals(
+        run, motion, _SideContacts(run.path, touching, motion.q[1]), motion.v[0], motion.v[3]
+    )
     return signals, touching, pulled
 
 
-def _resolved(
-    run: System, motion: Motion, mover: balances.Mover, speed: Scalar, speed_shaft: Scalar
+def _resolve_signals(
+    run: HalfRobotSystem, motion: HalfRobotState, mover: balances.Mover, speed: Scalar, speed_shaft: Scalar
 ) -> tuple[Signals, Any]:
-    """Signals and forces of the given contacts, for a speed of the robot [m/s] and of the driving shaft [rad/s]."""
+    """Signals and forces of these contacts at a speed of the robot [m/s] and of the driving shaft [rad/s]."""
     ratio = run.robot.gearbox.ratio
     state = State(motion.current, ratio * speed_shaft, speed, motion.discharge, motion.memory)
     return balances.resolved_signals(run.robot, run.conditions, state, mover, run.half.inertia_pulley)
 
 
-def _losses(run: System, motion: Motion, mover: balances.Mover) -> tuple[Scalar, Scalar]:
-    """Derivatives of the ground's resistance with respect to the robot's speed and of the drive's losses.
-
-    [N·s/m], and with respect to the speed of the driving shaft [N·m·s]. Negative ones are set to 0.
+def _loss_derivatives(run: HalfRobotSystem, motion: HalfRobotState, mover: balances.Mover) -> tuple[Scalar, Scalar]:
+    """Derivative of the ground's resistance with respect to the robot's speed [N·s/m], and of the drive's losses with
+    respect to the speed of the driving shaft [N·m·s]. Negative ones are set to 0.
     """
 
     def forward(speed: Scalar) -> Scalar:
-        signals, pulled = _resolved(run, motion, mover, speed, motion.v[3])
+        signals, pulled = _resolve_signals(run, motion, mover, speed, motion.v[3])
         return pulled.traction - signals.resistance
 
     def shaft(speed: Scalar) -> Scalar:
-        return jnp.asarray(_resolved(run, motion, mover, motion.v[0], speed)[0].torque_net)
+        return jnp.asarray(_resolve_signals(run, motion, mover, motion.v[0], speed)[0].torque_net)
 
     one = jnp.ones_like(motion.v[0])
     fall_x, fall_shaft = (jax.jvp(f, (motion.v[k],), (one,))[1] for f, k in ((forward, 0), (shaft, 3)))
     return jnp.maximum(-fall_x, 0.0), jnp.maximum(-fall_shaft, 0.0)
 
 
-def generalized(run: System, signals: Signals, pulled: Pull) -> tuple[Coordinates, Coordinates]:
-    """Generalized forces on q [N, N·m], and the armature's inertia seen at each joint [kg·m²], eq. (31)."""
+def generalized_forces(
+    run: HalfRobotSystem, signals: Signals, pulled: ContactPull
+) -> tuple[Coordinates, Coordinates]:
+    """Generalized forces on q [N, N·m], and inertia of the armature at each joint [kg·m²], eq. (31)."""
     force = jnp.insert(pulled.generalized, 3, signals.torque_net)
     return force, jnp.zeros_like(force).at[3].set(armature_inertia(run, signals))
 
 
-def armature_inertia(run: System, signals: Signals) -> Scalar:
-    """The armature's inertia seen at the driving shaft [kg·m²], eq. (31)."""
+def armature_inertia(run: HalfRobotSystem, signals: Signals) -> Scalar:
+    """Inertia of the armature at the driving shaft [kg·m²], eq. (31)."""
     motor, ratio = run.robot.motor.inertia, run.robot.gearbox.ratio
     return inertia_reduced(motor, ratio, signals.efficiency_load, signals.inertia_added)
 
@@ -207,7 +210,9 @@ def current_after(robot: Robot, conditions: Conditions, step: Scalar, signals: S
     return signals.current + step / signals.inductance * voltage * jnp.expm1(z) / z
 
 
-def resistance(run: System, motion: Motion, signals: Signals, at: Touch, pulled: Pull) -> Float[Array, "5 5"]:
+def damping_matrix(
+    run: HalfRobotSystem, motion: HalfRobotState, signals: Signals, at: ContactState, pulled: ContactPull
+) -> Float[Array, "5 5"]:
     """Damping matrix K of a step: decrease of the forces on v with v.
 
     Friction rises with sliding and is proportional to the normal force, which falls with the rate of the gap:
@@ -215,48 +220,52 @@ def resistance(run: System, motion: Motion, signals: Signals, at: Touch, pulled:
     v. Friction that falls with sliding, beyond V_s, is an instability of the robot and not of the step. It is left
     out. The drive's losses and the resistance of the ground rise steeply from rest and are on K's diagonal.
     """
-    losses = _losses(run, motion, _Mover(run.path, at, motion.q[1]))
-    rises = jnp.maximum(side_contacts.friction_rise(run.chassis, signals, at), 0.0)
+    losses = _loss_derivatives(run, motion, _SideContacts(run.path, at, motion.q[1]))
+    rises = jnp.maximum(side_contacts.friction_derivative(run.chassis, signals, at), 0.0)
     front, rear = run.path.radius * (1 - at.weight), run.path.radius * at.weight
     one, none = jnp.ones_like(rises), jnp.zeros_like(rises)
     along = jnp.stack([one, none, at.lever_z, at.rate_x * front, at.rate_x * rear], axis=1)
     off = jnp.stack([none, one, -at.lever_x, at.rate_z * front, at.rate_z * rear], axis=1)
     none = jnp.zeros_like(losses[0])
     diagonal = jnp.diag(jnp.stack([losses[0], none, none, losses[1], none]))
-    return contacts_resist(along, off, pulled.force, at.force, rises, at.damped) + diagonal
+    return contact_damping(along, off, pulled.force, at.force, rises, at.damped) + diagonal
 
 
-def contacts_resist(
+def contact_damping(
     along: Float[Array, "contacts n"], off: Float[Array, "contacts n"], pulled: Array, force: Array, rises: Array,
     damped: Array,
 ) -> Float[Array, "n n"]:  # fmt: skip
-    """K of the contacts, see `resistance`.
+    """Damping matrix of the contacts, see `damping_matrix`.
 
-    They move `along` the ground and `off` it with v, under friction `pulled` [N] and normal `force` [N].
+    `along` and `off`: their speeds along and normal to the ground per v. `pulled`: friction force [N]. `force`:
+    normal force [N]. `rises`: derivative of friction with sliding speed. `damped`: decrease of the normal force per
+    rate of the gap.
     """
     pushes = (pulled / jnp.maximum(force, 1e-9))[:, None] * along + off
     return (along.T * rises) @ along + (pushes.T * damped) @ off
 
 
-def _explicit(run: System, motion: Motion, signals: Signals, pulled: Pull) -> tuple[Coordinates, Float[Array, "5 5"]]:
+def _explicit_step(
+    run: HalfRobotSystem, motion: HalfRobotState, signals: Signals, pulled: ContactPull
+) -> tuple[Coordinates, Float[Array, "5 5"]]:
     """Velocities after one explicit step, and the mass matrix."""
-    force, armature = generalized(run, signals, pulled)
+    force, armature = generalized_forces(run, signals, pulled)
     data = run.data.replace(qpos=motion.q, qvel=motion.v, qfrc_applied=force)
     model = run.model.replace(dof_armature=armature)
     data = mjx.step(model, data)
     return data.qvel, mjx.full_m(model, data)
 
 
-def mass_matrix(run: System, motion: Motion) -> Float[Array, "5 5"]:
+def mass_matrix(run: HalfRobotSystem, motion: HalfRobotState) -> Float[Array, "5 5"]:
     """Mass matrix M on v, including the rotors' armature [kg, kg·m, kg·m²]."""
     signals, _, pulled = instant(run, motion)
-    return _explicit(run, motion, signals, pulled)[1]
+    return _explicit_step(run, motion, signals, pulled)[1]
 
 
-class _Step(eqx.Module):
-    """A step as computed, with the data of its derivatives: K, factors of M + Δt K, and Δv."""
+class _StepFactors(eqx.Module):
+    """A computed time step, with the quantities of its derivatives: K, factors of M + Δt K, and Δv."""
 
-    after: Motion
+    after: HalfRobotState
     signals: Signals
     guided: Scalar
     damping: Float[Array, "5 5"]
@@ -265,14 +274,16 @@ class _Step(eqx.Module):
     slip: Scalar
 
 
-def _step(run: System, motion: Motion) -> _Step:
+def _implicit_step(run: HalfRobotSystem, motion: HalfRobotState) -> _StepFactors:
     signals, touching, pulled = instant(run, motion)
-    pushed, mass = _explicit(run, motion, signals, pulled)
-    damping = resistance(run, motion, signals, touching, pulled)
+    pushed, mass = _explicit_step(run, motion, signals, pulled)
+    damping = damping_matrix(run, motion, signals, touching, pulled)
     factors = factorise(mass + run.step * damping)
     gained = solve_factorised(factors, mass @ (pushed - motion.v))
-    after, over = _moved(motion, run.step, state_after(run, motion, signals), damping @ gained, gained, signals)
-    return _Step(after, over, pulled.guided, damping, factors, gained, jnp.asarray(signals.speed_slip_terms))
+    after, over = _state_after_motion(
+        motion, run.step, other_states_after_step(run, motion, signals), damping @ gained, gained, signals
+    )
+    return _StepFactors(after, over, pulled.guided, damping, factors, gained, jnp.asarray(signals.speed_slip_terms))
 
 
 class _StateAfterStep(eqx.Module):
@@ -283,8 +294,8 @@ class _StateAfterStep(eqx.Module):
     memory: Mapping[str, Scalar]
 
 
-def state_after(run: System, motion: Motion, signals: Signals) -> _StateAfterStep:
-    """Currents, charge and memories after one step."""
+def other_states_after_step(run: HalfRobotSystem, motion: HalfRobotState, signals: Signals) -> _StateAfterStep:
+    """Currents, charge and memories after one time step."""
     charge = balances.charge_drawn(run.robot, run.conditions, signals.total_current)
     memory = {
         effect.name: motion.memory[effect.name] + run.step * effect.rate(run.robot, signals)
@@ -295,17 +306,17 @@ def state_after(run: System, motion: Motion, signals: Signals) -> _StateAfterSte
     )
 
 
-def _moved(
-    motion: Motion, step: Scalar, later: _StateAfterStep, fallen: Array, gained: Array, signals: Signals
-) -> tuple[Motion, Signals]:
+def _state_after_motion(
+    motion: HalfRobotState, step: Scalar, later: _StateAfterStep, fallen: Array, gained: Array, signals: Signals
+) -> tuple[HalfRobotState, Signals]:
     v = motion.v + gained
-    after = Motion(motion.q + step * v, v, later.current, later.discharge, later.memory)
+    after = HalfRobotState(motion.q + step * v, v, later.current, later.discharge, later.memory)
     traction, normal = signals.traction - fallen[0], signals.normal - fallen[1]
     return after, dataclasses.replace(signals, traction=traction, normal=normal, acceleration=gained[0] / step)
 
 
 @eqx.filter_custom_jvp
-def advance(run: System, motion: Motion) -> tuple[Motion, Signals, Scalar]:
+def advance(run: HalfRobotSystem, motion: HalfRobotState) -> tuple[HalfRobotState, Signals, Scalar]:
     """One step of MJX (semi-implicit Euler) and of the winding.
 
     Forces of the contacts are those at the end of the step as far as they depend on v, to first order: (M + Δt K) Δv
@@ -313,23 +324,23 @@ def advance(run: System, motion: Motion) -> tuple[Motion, Signals, Scalar]:
     Within V_s the time constant of a contact is m V_s / (μ_s R_z), microseconds for a small V_s.
 
     Derivatives are those of the step as computed, written once. With Δv constant, the residual of
-    Δt τ - Δt c - (M + Δt K) Δv = 0 is differentiated (τ: forces of `generalized`, c: MJX's bias). The same factors
-    solve for the change of Δv.
+    Δt τ - Δt c - (M + Δt K) Δv = 0 is differentiated (τ: forces of `generalized_forces`, c: MJX's bias). The same
+    factors solve for the change of Δv.
 
     Returns:
         The motion after it. The signals before it, with traction, normal load and acceleration of the step. The
         load on the lower guide before it [N].
     """
-    step = _step(run, motion)
+    step = _implicit_step(run, motion)
     return step.after, step.signals, step.guided
 
 
 @advance.def_jvp
 def _differentiated(
-    primals: tuple[System, Motion], tangents: tuple[Any, Any]
-) -> tuple[tuple[Motion, Signals, Scalar], tuple[Motion, Signals, Scalar]]:
+    primals: tuple[HalfRobotSystem, HalfRobotState], tangents: tuple[Any, Any]
+) -> tuple[tuple[HalfRobotState, Signals, Scalar], tuple[HalfRobotState, Signals, Scalar]]:
     run, motion = primals
-    step = _step(run, motion)
+    step = _implicit_step(run, motion)
     # The model's constants follow from the rest of the run.
     run, d_run = (dataclasses.replace(x, model=None, data=None) for x in (run, tangents[0]))
     d_motion = tangents[1]
@@ -339,7 +350,7 @@ def _differentiated(
     given = _contact_inputs(run, motion) | {"slip": step.slip}
     linearized = contact_sums.linearize(run.path, run.chassis, given, step.gained, differentiated)
 
-    def held(run: System, motion: Motion) -> tuple[Array, Array, _StateAfterStep, Signals, Scalar]:
+    def held(run: HalfRobotSystem, motion: HalfRobotState) -> tuple[Array, Array, _StateAfterStep, Signals, Scalar]:
         return _step_residual(run, motion, step.gained, linearized)
 
     (left, fallen, later, signals, _), d_held = eqx.filter_jvp(held, (run, motion), (d_run, d_motion))
@@ -349,33 +360,33 @@ def _differentiated(
     through = step.damping[:2] @ d_gained
     d_fallen = through if d_fallen is None else d_fallen + through
     _, (d_after, d_over) = eqx.filter_jvp(
-        _moved,
+        _state_after_motion,
         (motion, run.step, later, fallen, step.gained, signals),
         (d_motion, d_run.step, d_later, d_fallen, d_gained, d_signals),
     )
     return (step.after, step.signals, step.guided), (d_after, d_over, d_guided)
 
 
-def _contact_inputs(run: System, motion: Motion) -> dict[str, Scalar]:
+def _contact_inputs(run: HalfRobotSystem, motion: HalfRobotState) -> dict[str, Scalar]:
     """Inputs of the contacts, by name."""
     moving = dict(zip(contact_sums.MOTION, (*motion.q[1:], *motion.v), strict=True))
     return moving | contact_sums.contact_inputs(run.path, run.chassis, run.conditions.adhesion)
 
 
 def _step_residual(
-    run: System, motion: Motion, gained: Coordinates, linearized: Linearized
+    run: HalfRobotSystem, motion: HalfRobotState, gained: Coordinates, linearized: LinearizedSums
 ) -> tuple[Array, Array, _StateAfterStep, Signals, Scalar]:
-    """Residual of a step with constant Δv, K Δv of x and z, and the remaining results of the step.
+    """Residual of a time step at constant Δv, K Δv of x and z, and the other results of the step.
 
     The residual is Δt τ - Δt c - (M + Δt K) Δv, see `advance`.
     """
     q, v = motion.q, motion.v
     belt = belt_runs(run.path, (q[3], q[4]), (v[3], v[4]))
     sums = linearized.near(_contact_inputs(run, motion))
-    mover = contact_sums.Mover(linearized, sums, run.path.radius, belt.torque_front)
-    signals, drawn = _resolved(run, motion, mover, v[0], v[3])
+    mover = contact_sums.SummedContacts(linearized, sums, run.path.radius, belt.torque_front)
+    signals, drawn = _resolve_signals(run, motion, mover, v[0], v[3])
     sums = mover.shifted(signals.speed_slip_terms)
-    losses = [loss * gained[k] for k, loss in zip((0, 3), _losses(run, motion, mover), strict=True)]
+    losses = [loss * gained[k] for k, loss in zip((0, 3), _loss_derivatives(run, motion, mover), strict=True)]
     force = jnp.stack(
         [
             drawn.traction - signals.resistance - sums.fallen_x - losses[0],
@@ -388,28 +399,28 @@ def _step_residual(
     gear, spins = run.path.gear, armature_inertia(run, signals)
     spent = mjcf.step_impulse(run.half, gear.wheelbase, run.conditions, q[2], v[2], spins, gained, run.step)
     fallen = jnp.stack([sums.fallen_x + losses[0], sums.fallen_z])
-    return run.step * force - spent, fallen, state_after(run, motion, signals), signals, drawn.guided
+    return run.step * force - spent, fallen, other_states_after_step(run, motion, signals), signals, drawn.guided
 
 
-def tipping_margin(run: System) -> Scalar:
-    """Distance of the line of gravity inside the outermost contacts on the ground [m]. Negative: the robot tips."""
+def tipping_margin(run: HalfRobotSystem) -> Scalar:
+    """Distance of the line of gravity inside the outermost contacts [m]. Negative: the robot tips."""
     forward, up, _ = centre_of_mass(run)
     meets = forward - jnp.tan(run.conditions.slope) * (up + axle_height(run))
     return run.path.gear.wheelbase / 2 - jnp.abs(meets)
 
 
-def centre_of_mass(run: System) -> tuple[Scalar, Scalar, Scalar]:
+def centre_of_mass(run: HalfRobotSystem) -> tuple[Scalar, Scalar, Scalar]:
     """Centre of mass ahead of and above the middle of the wheelbase [m], and the mass of half a robot [kg]."""
     return *run.half.centre, run.half.chassis + 2 * run.half.pulley
 
 
-def axle_height(run: System) -> Scalar:
+def axle_height(run: HalfRobotSystem) -> Scalar:
     """Height of the axles over the ground with the contacts just touching [m]."""
     tracked = run.path.radius + run.path.gear.grouser_height
     return jnp.where(run.chassis.on_tracks > 0.5, tracked, run.chassis.radius)
 
 
-def stand(run: System, turned: Scalar = 0.0) -> Motion:
+def stand(run: HalfRobotSystem, turned: Scalar = 0.0) -> HalfRobotState:
     """At rest on the ground, with its weight on the contacts: a root in height and pitch.
 
     The search starts with every contact that could carry load touching, because from there it does not overshoot.
@@ -431,7 +442,9 @@ def stand(run: System, turned: Scalar = 0.0) -> Motion:
 
     def unbalanced(y: Vector, _: None, given: tuple[Any, ...]) -> Vector:
         path, chassis, turned, weight, forward, up, axle, cos, sin = given
-        touching = side_contacts.contact_state(path, chassis, placed(turned, axle - y[0], y[1]), jnp.zeros_like(rest))
+        touching = side_contacts.compute_contacts(
+            path, chassis, placed(turned, axle - y[0], y[1]), jnp.zeros_like(rest)
+        )
         moment = weight * (cos * (forward + y[1] * up) - sin * (up + axle)) - jnp.sum(
             touching.force * touching.lever_x
         )
@@ -443,10 +456,10 @@ def stand(run: System, turned: Scalar = 0.0) -> Motion:
     stands = tipping_margin(run) > 0
     q = placed(turned, axle - jnp.where(stands, sunk, 0.0), jnp.where(stands, pitch, 0.0))
     memory = {effect.name: jnp.zeros_like(axle) for effect in run.robot.remembering}
-    return Motion(q, rest, jnp.zeros_like(axle), run.conditions.discharge * jnp.ones_like(axle), memory)
+    return HalfRobotState(q, rest, jnp.zeros_like(axle), run.conditions.discharge * jnp.ones_like(axle), memory)
 
 
-def roll(run: System) -> Motion:
+def roll(run: HalfRobotSystem) -> HalfRobotState:
     """Rolling on its contacts at the speed of the steady fidelity, or at the no-load speed if it has none.
 
     Derivatives pass through it, so that the derivatives of a short run include its start.
@@ -467,28 +480,30 @@ def roll(run: System) -> Motion:
     return dataclasses.replace(start, memory=memory)
 
 
-def loads(run: System, at: Touch, pulled: Pull) -> Reactions:
+def loads(run: HalfRobotSystem, at: ContactState, pulled: ContactPull) -> GearReactions:
     """Loads inside the running gear at an instant."""
     return side_contacts.inner_loads(run.path, at, pulled)
 
 
-def away(q: Array, reactions: Reactions) -> tuple[Array, Reactions | None]:
+def distance_and_reactions(q: Array, reactions: GearReactions) -> tuple[Array, GearReactions | None]:
     """Distance that a robot has travelled [m], and the loads inside its running gear."""
     return q[..., 0], reactions
 
 
-def averaged(average: Average, travelled: Array, passed: Any, guided: Array) -> Steady:
+def steady_averages(average: Average, travelled: Array, passed: Any, guided: Array) -> SteadyAverages:
     """Averages at the end of a run, from its record."""
     signals, load, periods, changes = average(travelled, (passed, guided))
-    return Steady(signals, load / jnp.maximum(signals.normal, 1e-9), periods, jnp.max(relative_changes(changes)))
+    return SteadyAverages(
+        signals, load / jnp.maximum(signals.normal, 1e-9), periods, jnp.max(relative_changes(changes))
+    )
 
 
 def relative_changes(changes: Changes) -> Array:
-    """Changes over their sizes [-]."""
+    """Changes relative to the sizes of the quantities [-]."""
     return jnp.stack([change / jnp.maximum(size, 1e-3) for change, size in changes])
 
 
-def status(run: System, averages: Steady, end: Motion) -> Array:
+def status(run: HalfRobotSystem, averages: SteadyAverages, end: HalfRobotState) -> Array:
     """Status of a run from its averages and its last motion."""
     robot, conditions, signals = run.robot, run.conditions, averages.signals
     status = jnp.where(averages.change > SETTLED, NOT_SETTLED, travel_status(signals.speed, signals.voltage))
@@ -506,13 +521,20 @@ def status(run: System, averages: Steady, end: Motion) -> Array:
     return status_unless_lost(run, status, end, end.q[1], jnp.abs(end.q[2]), signals.total_current)
 
 
-def status_unless_lost(run: System, status: Array, end: Motion, height: Array, tilt: Array, current: Scalar) -> Array:
-    """The status of a run, or `tips` or `failed` if it has left the ground, sunk through it or turned over.
+def status_unless_lost(
+    run: HalfRobotSystem, status: Array, end: HalfRobotState, height: Array, tilt: Array, current: Scalar
+) -> Array:
+    """Status of a run, replaced by `tips` or `failed` if the robot has left the ground, sunk into it or turned over.
 
     The numbers of such a run are not valid.
 
     Args:
-        end: its last motion, with the `height` of the middle of the wheelbase [m] and its `tilt`, 0 or more [rad].
+        run: the run.
+        status: status otherwise.
+        end: its last motion.
+        height: height of the middle of the wheelbase [m].
+        tilt: tilt of the robot, at least 0 [rad].
+        current: current of the motors [A].
     """
     level = axle_height(run)
     finite = jnp.all(jnp.isfinite(end.q)) & jnp.all(jnp.isfinite(end.v)) & jnp.isfinite(current)
@@ -522,6 +544,6 @@ def status_unless_lost(run: System, status: Array, end: Motion, height: Array, t
     return jnp.where(finite & (grounded | (status == TIPS)), status, FAILED)
 
 
-def result_of(run: System, averages: Steady, status: Array) -> Result:
+def result_of(run: HalfRobotSystem, averages: SteadyAverages, status: Array) -> Result:
     """Result of a run with this status."""
     return result_of_signals(run.robot, averages.signals, status)

@@ -1,7 +1,7 @@
-"""Half a robot, or a whole one free to turn, as MJCF for MuJoCo, and as an MJX model with mass constants per member.
+"""Half a robot, or a whole one free to turn, as MJCF for MuJoCo and as an MJX model with masses for each member.
 
-MJX computes only the multibody dynamics: contacts and constraints are switched off, and every force of the
-running gear enters as a generalized force. The same text loads in C MuJoCo and its viewer.
+MJX computes only the multibody dynamics: contacts and constraints are switched off, and every force of the running
+gear enters as a generalized force. The same text loads in C MuJoCo and its viewer.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 
 from mmrjax.model import channels
 from mmrjax.model.conditions import Conditions
-from mmrjax.model.masses import Masses, masses_of_parts
+from mmrjax.model.masses import HalfRobotMasses, masses_of_parts
 from mmrjax.model.params import Scalar
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import GRAVITY
@@ -40,15 +40,15 @@ _JOINTS = {
 }  # fmt: skip
 
 
-class Bodies(NamedTuple):
+class ModelBodies(NamedTuple):
     """Bodies in the order of the model: chassis, then driving and driven pulley of each side.
 
     Attributes:
         names: names of the bodies.
-        mass: [kg].
-        inertia: about its own centre by x, y, z [kg·m²].
-        centre: centre in its own frame [m].
-        place: position of its frame in that of the chassis, whose origin is the middle of the wheelbase [m].
+        mass: masses [kg].
+        inertia: moments of inertia about the own centre, for x, y, z [kg·m²].
+        centre: centres of mass, each in the frame of its body [m].
+        place: origins of the frames in the frame of the chassis, whose origin is the middle of the wheelbase [m].
     """
 
     names: tuple[str, ...]
@@ -58,8 +58,8 @@ class Bodies(NamedTuple):
     place: Float[Array, "bodies 3"]
 
 
-def robot_bodies(robot: Robot, half: Masses, conditions: Conditions) -> Bodies:
-    """The bodies of half a robot, or of a whole robot free to turn (`Conditions.turns`).
+def robot_bodies(robot: Robot, half: HalfRobotMasses, conditions: Conditions) -> ModelBodies:
+    """Bodies of half a robot, or of a whole robot that is free to turn (`Conditions.turns`).
 
     In the plane of travel only the moments about y count, and the others are set equal. The moment of yaw is
     `turning.inertia` of all parts about their centre, without payload as in the other fidelities. The moment of roll
@@ -89,7 +89,7 @@ def robot_bodies(robot: Robot, half: Masses, conditions: Conditions) -> Bodies:
         rows = [jnp.stack([jnp.maximum(roll, yaw - pitch), pitch, yaw])] + [jnp.stack([spins] * 3)] * 4
         inertia = jnp.stack(rows)
     half_sizes = jnp.stack([half.forward, zero, half.up])
-    return Bodies(
+    return ModelBodies(
         ("chassis", *names),
         jnp.stack(mass),
         inertia,
@@ -105,8 +105,8 @@ def mjcf_text(robot: Robot, conditions: Conditions, mass: float, step: float = 1
     side.
 
     Args:
-        mass: total [kg].
-        step: [s].
+        mass: total mass [kg].
+        step: time step [s].
     """
     gear = robot.running_gear
     parts = robot_bodies(robot, masses_of_parts(robot, conditions, jnp.asarray(mass)), conditions)
@@ -130,8 +130,8 @@ def mjcf_text(robot: Robot, conditions: Conditions, mass: float, step: float = 1
         discs = "".join(f'{disc} pos="0 {y} 0"/>\n        ' for y in middles)
         across = 0.019 if conditions.turns else 0.141
         pulleys += f"""
-      <body name="{name}" pos="{_row(parts.place[k])}">
-        <inertial pos="0 0 0" mass="{float(parts.mass[k]):.17g}" diaginertia="{_row(parts.inertia[k])}"/>
+      <body name="{name}" pos="{_numbers_text(parts.place[k])}">
+        <inertial pos="0 0 0" mass="{float(parts.mass[k]):.17g}" diaginertia="{_numbers_text(parts.inertia[k])}"/>
         <joint name="{name}" type="hinge" axis="0 1 0"/>
         {discs}<geom type="box" size="{outer:.9g} {across} 0.003" rgba=".8 .8 .2 1"/>
       </body>"""
@@ -154,8 +154,8 @@ def mjcf_text(robot: Robot, conditions: Conditions, mass: float, step: float = 1
     <light pos="0 -2 3" dir="0 .5 -1" directional="true"/>
     <geom name="ground" type="plane" size="20 2 .1" rgba=".8 .78 .72 1"/>
     <body name="chassis" pos="0 0 0">
-      <inertial pos="{_row(parts.centre[0])}" mass="{float(parts.mass[0]):.17g}"
-        diaginertia="{_row(parts.inertia[0])}"/>
+      <inertial pos="{_numbers_text(parts.centre[0])}" mass="{float(parts.mass[0]):.17g}"
+        diaginertia="{_numbers_text(parts.inertia[0])}"/>
       {joints}<geom type="box" size="{base / 2:.9g} 0.104 0.038" pos="0 0 {0.043 - 0.038:.9g}" rgba=".3 .5 .7 1"/>
       {belts}{levers}{pulleys}
     </body>
@@ -165,12 +165,12 @@ def mjcf_text(robot: Robot, conditions: Conditions, mass: float, step: float = 1
 """
 
 
-def _row(numbers: Array) -> str:
+def _numbers_text(numbers: Array) -> str:
     return " ".join(f"{float(x):.17g}" for x in numbers)
 
 
 def step_impulse(
-    half: Masses,
+    half: HalfRobotMasses,
     wheelbase: Scalar,
     conditions: Conditions,
     pitch: Scalar,
@@ -185,12 +185,12 @@ def step_impulse(
     them too, but the derivatives of its general tree cost many times as much. No other force depends on v here.
 
     Args:
-        half, wheelbase: masses and distance of the pulleys.
-        conditions: conditions for the slope.
+        half, wheelbase: masses of half a robot, and distance between its pulleys.
+        conditions: conditions, for their slope.
         pitch: pitch of the chassis [rad].
         rate: pitch rate [rad/s].
-        rotating: the armature's inertia at its joint [kg·m²].
-        gained: Δv.
+        rotating: inertia of the armature at its joint [kg·m²].
+        gained: change of the velocities Δv.
         step: Δt [s].
     """
     cos, sin = cosine(pitch), sine(pitch)
@@ -227,7 +227,7 @@ def model_template(turns: bool = False) -> tuple[Any, Any]:
     return _template(jnp.result_type(float) == jnp.float64, turns)
 
 
-def member_model(model: Any, parts: Bodies, slope: Scalar, step: Scalar) -> Any:
+def member_model(model: Any, parts: ModelBodies, slope: Scalar, step: Scalar) -> Any:
     """The MJX `model` with this member's bodies, gravity and time step.
 
     Every constant that the smooth dynamics read and that depends on mass is set here (mujoco issue 1607).

@@ -1,4 +1,4 @@
-"""Natural frequencies of half a robot on its contacts: bounce, pitch, and oscillations of the drive."""
+"""Natural vibrations of half a robot on its contacts: bounce, pitch, and oscillations of the drive."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from mmrjax.compile.compiling import compiled
 from mmrjax.model import params
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.robot import Robot
-from mmrjax.undercarriage.half_robot import half_robot_system, mass_matrix, roll, stand
+from mmrjax.undercarriage.half_robot import build_system, mass_matrix, roll, stand
 from mmrjax.undercarriage.stability import PROBE, step_derivative
 
 POSITIONS = 12  # of the belt within a pitch of the grousers
@@ -30,12 +30,12 @@ class Mode(NamedTuple):
     """A natural vibration, over the positions of the belt within a pitch.
 
     Attributes:
-        name: one of `NAMES`, by the kinetic energy in its eigenvector.
-        frequency: damped natural frequency, mean over the positions that have the mode [Hz].
+        name: one of `NAMES`, chosen by the kinetic energy in its eigenvector.
+        frequency: damped natural frequency, averaged over the positions that have the mode [Hz].
         low, high: range of the frequency over the positions [Hz].
-        natural: undamped, |λ| / 2π, mean [Hz].
-        damping: ratio ζ = -Re λ / |λ|, mean [-]. Negative: it is unstable.
-        share: share of the kinetic energy in the coordinate of its name, mean [-].
+        natural: undamped natural frequency |λ| / 2π, averaged [Hz].
+        damping: damping ratio ζ = -Re λ / |λ|, averaged [-]. Negative: unstable.
+        share: share of its kinetic energy in the coordinate of its name, averaged [-].
         positions: share of the positions that have the mode [-].
     """
 
@@ -55,9 +55,9 @@ class Mode(NamedTuple):
 
     @property
     def resonant(self) -> bool:
-        """True if it amplifies at a frequency that changes by less than an octave with the belt's position.
+        """True if it amplifies and its frequency changes by less than an octave with the position of the belt.
 
-        An octave always contains some harmonic, so a peak there would confirm nothing.
+        Some harmonic always lies within an octave, so a peak there would confirm nothing.
         """
         return self.amplifies and self.high < 2 * self.low
 
@@ -79,16 +79,16 @@ def modes(robot: Robot, conditions: Conditions, positions: int = POSITIONS) -> l
         robot, conditions: a batch of runs.
         positions: positions of the belt, evenly over a pitch of the grousers.
     """
-    rates, masses = jax.device_get(_linearised(params.without_weak_types(robot), conditions, positions))
+    rates, masses = jax.device_get(_linearised_steps(params.without_weak_types(robot), conditions, positions))
     return [_run_modes(rate, mass) for rate, mass in zip(rates, masses, strict=True)]
 
 
 @compiled
-def _linearised(
+def _linearised_steps(
     robot: Robot, conditions: Conditions, positions: int
 ) -> tuple[Float[Array, "runs positions 11 11"], Float[Array, "runs positions 5 5"]]:
     def one(conditions: Conditions) -> tuple[Array, Array]:
-        run = half_robot_system(robot, conditions, PROBE)
+        run = build_system(robot, conditions, PROBE)
         rolling = roll(run)
 
         def at(turned: Array) -> tuple[Array, Array]:

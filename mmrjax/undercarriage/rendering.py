@@ -11,13 +11,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from mmrjax.fidelities.track import Trajectory
+from mmrjax.fidelities.track import TrackTrajectory
 from mmrjax.model import params
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.paper_tables import BODY_HEIGHT
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import GRAVITY
-from mmrjax.undercarriage.belt import Path, tips_on_path
+from mmrjax.undercarriage.belt import BeltPath, tips_on_path
 from mmrjax.undercarriage.running_gear import GROUSERS, TEETH_BELT
 from mmrjax.undercarriage.side_contacts import lever_tips
 
@@ -30,8 +30,8 @@ _INK, _BODY, _BELT, _GROUND = "#1f2933", "#5b8db8", "#2f3437", "#b8a98f"
 _NORMAL, _TRACTION, _RESISTANCE, _GUIDE, _WEIGHT = "#d1495b", "#2e933c", "#b07d12", "#7048a8", "#1f2933"
 
 
-class Scene(NamedTuple):
-    """Data for the pictures of one run, as plain arrays.
+class RunScene(NamedTuple):
+    """Data for pictures of one run, as plain arrays.
 
     Attributes:
         slope: [rad].
@@ -52,7 +52,7 @@ class Scene(NamedTuple):
     wheeled: bool
     axle: float
     wheel: float
-    path: Path
+    path: BeltPath
     levers: list[tuple[float, float]]
     time: Float[np.ndarray, " n"]
     q: Float[np.ndarray, "n 5"]
@@ -69,11 +69,11 @@ class Scene(NamedTuple):
 
     def sheet(self, k: int) -> Any:
         """Figure of sample `k`."""
-        return figure(self, k)
+        return figure_of_sample(self, k)
 
 
-class View(Protocol):
-    """A run that can be drawn: times of its samples [s], and a figure of each."""
+class RunView(Protocol):
+    """Data of a run that can be drawn: times of its samples [s], and a figure of each sample."""
 
     @property
     def time(self) -> np.ndarray:
@@ -85,8 +85,8 @@ class View(Protocol):
         ...
 
 
-def check_finite(run: Trajectory) -> None:
-    """Raises for a run that cannot be drawn.
+def check_finite(run: TrackTrajectory) -> None:
+    """Rejects a run that cannot be drawn.
 
     Raises:
         ValueError: it holds numbers that are not finite (a failed member).
@@ -95,8 +95,8 @@ def check_finite(run: Trajectory) -> None:
         raise ValueError("run: its coordinates are not finite and cannot be drawn; expected a run that ended")
 
 
-def scene(robot: Robot, conditions: Conditions, run: Trajectory) -> Scene:
-    """Collects the data of one run (scalar conditions, one member of a batch) for drawing.
+def scene_of_run(robot: Robot, conditions: Conditions, run: TrackTrajectory) -> RunScene:
+    """Collects the data of one run for drawing (scalar conditions, one member of a batch).
 
     Raises:
         ValueError: the run holds numbers that are not finite (a failed member).
@@ -104,10 +104,10 @@ def scene(robot: Robot, conditions: Conditions, run: Trajectory) -> Scene:
     gear = robot.running_gear
     check_finite(run)
     chassis = robot.chassis(conditions.configuration)
-    path, wheeled = Path(robot.radius_pulley, gear), bool(chassis.on_tracks < 0.5)
+    path, wheeled = BeltPath(robot.radius_pulley, gear), bool(chassis.on_tracks < 0.5)
     levers = [] if wheeled else lever_tips(gear, conditions)
     signals, reactions = run.signals, run.reactions
-    return Scene(
+    return RunScene(
         slope=float(conditions.slope),
         name=robot.configurations.names[int(conditions.configuration)],
         wheeled=wheeled,
@@ -130,19 +130,19 @@ def scene(robot: Robot, conditions: Conditions, run: Trajectory) -> Scene:
     )
 
 
-def _turn(points: Any, angle: float, about: tuple[float, float] = (0.0, 0.0)) -> np.ndarray:
+def _rotate(points: Any, angle: float, about: tuple[float, float] = (0.0, 0.0)) -> np.ndarray:
     cos, sin = np.cos(angle), np.sin(angle)
     return np.asarray(points) @ np.array([[cos, sin], [-sin, cos]]) + np.asarray(about)
 
 
-def belt_outline(path: Path, height: float, places: np.ndarray) -> np.ndarray:
+def belt_outline(path: BeltPath, height: float, places: np.ndarray) -> np.ndarray:
     """Points of the belt (height 0) or of grouser tips in the chassis frame [m], at positions on its path."""
     gear = params.replace(path.gear, {"grouser_height": jnp.asarray(height)})
-    tips = tips_on_path(Path(path.radius, gear), jnp.asarray(places))
+    tips = tips_on_path(BeltPath(path.radius, gear), jnp.asarray(places))
     return np.stack([np.asarray(tips.forward), np.asarray(tips.up)], axis=1)
 
 
-def draw(axes: Any, view: Scene, k: int) -> None:
+def draw_sample(axes: Any, view: RunScene, k: int) -> None:
     """Draws sample `k` of a scene into Matplotlib `axes`, uphill to the right."""
     from matplotlib.collections import LineCollection
     from matplotlib.patches import Circle, Polygon
@@ -151,10 +151,10 @@ def draw(axes: Any, view: Scene, k: int) -> None:
     axle_x, height = q[0], q[1]
 
     def world(points: Any) -> np.ndarray:  # chassis frame -> slope -> page
-        return _turn(_turn(points, -q[2], (0.0, height)), view.slope)
+        return _rotate(_rotate(points, -q[2], (0.0, height)), view.slope)
 
     def ground(points: Any) -> np.ndarray:
-        return _turn(points, view.slope)
+        return _rotate(points, view.slope)
 
     strip = ground([(-0.6, 0.0), (0.6, 0.0), (0.6, -0.2), (-0.6, -0.2)])
     axes.add_patch(Polygon(strip, color=_GROUND, alpha=0.45, lw=0))
@@ -175,7 +175,7 @@ def draw(axes: Any, view: Scene, k: int) -> None:
     axes.plot(*belt.T, color=_BELT, lw=2.2, zorder=3)
     if view.wheeled:
         for x, phi in ((view.axle, q[3]), (-view.axle, q[4])):
-            _disc(axes, Circle, world, x, view.wheel, phi, "#9aa5ad")
+            _draw_disc(axes, Circle, world, x, view.wheel, phi, "#9aa5ad")
     else:
         base = world(belt_outline(view.path, 0.0, view.place[k]))
         tip = world(belt_outline(view.path, float(view.path.gear.grouser_height), view.place[k]))
@@ -184,11 +184,11 @@ def draw(axes: Any, view: Scene, k: int) -> None:
     root, inner = (world(belt_outline(view.path, h, teeth[:TEETH_BELT])) for h in (0.0, -0.0022))
     axes.add_collection(LineCollection(list(np.stack([root, inner], axis=1)), colors=_BELT, lw=0.9, zorder=3))
     for x, phi in ((view.axle, q[3]), (-view.axle, q[4])):
-        _disc(axes, Circle, world, x, radius - 0.003, phi, "#d9dee2")
-    _forces(axes, view, k, world, ground)
+        _draw_disc(axes, Circle, world, x, radius - 0.003, phi, "#d9dee2")
+    _draw_forces(axes, view, k, world, ground)
 
 
-def _disc(axes: Any, circle: Any, world: Any, x: float, radius: float, angle: float, colour: str) -> None:
+def _draw_disc(axes: Any, circle: Any, world: Any, x: float, radius: float, angle: float, colour: str) -> None:
     centre = world([(x, 0.0)])[0]
     axes.add_patch(circle(centre, radius, facecolor=colour, edgecolor=_INK, lw=1, zorder=4))
     for turn in (0.0, np.pi / 2):  # spokes turn clockwise when it rolls uphill to the right
@@ -196,7 +196,7 @@ def _disc(axes: Any, circle: Any, world: Any, x: float, radius: float, angle: fl
         axes.plot(*world(np.array([arm, -arm]) + np.array([x, 0.0])).T, color=_INK, lw=0.8, zorder=4)
 
 
-def _forces(axes: Any, view: Scene, k: int, world: Any, ground: Any) -> None:
+def _draw_forces(axes: Any, view: RunScene, k: int, world: Any, ground: Any) -> None:
     def arrow(start: Any, along: Any, colour: str) -> None:
         tail, head = ground([start])[0], ground([np.asarray(start) + np.asarray(along) * FORCE])[0]
         if np.hypot(*(head - tail)) > 2e-3:
@@ -211,12 +211,12 @@ def _forces(axes: Any, view: Scene, k: int, world: Any, ground: Any) -> None:
         tip = belt_outline(view.path, float(view.path.gear.grouser_height), view.place[k])
         for j in range(GROUSERS):
             force = view.normal[k, j]
-            x = _turn([tip[j]], -q[2])[0, 0]
+            x = _rotate([tip[j]], -q[2])[0, 0]
             arrow((x, -force * FORCE), (0.0, force), _NORMAL)
         arrow((-view.axle / 2, 0.012), (0.0, view.guided[k].sum()), _GUIDE)
     arrow((0.0, -0.012), (view.traction[k], 0.0), _TRACTION)
     arrow((0.0, -0.024), (-view.resistance[k], 0.0), _RESISTANCE)
-    down = _turn([(0.0, -view.weight)], -view.slope)[0]
+    down = _rotate([(0.0, -view.weight)], -view.slope)[0]
     arrow((0.0, q[1]), down, _WEIGHT)
 
 
@@ -229,14 +229,14 @@ _LEGEND = (
 )
 
 
-def figure(view: Scene, k: int) -> Any:
+def figure_of_sample(view: RunScene, k: int) -> Any:
     """Figure of sample `k`: the robot above, current and speeds of the whole run below."""
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
 
     sheet = Figure(figsize=(9.6, 7.2), dpi=100, layout="constrained")
     upper, current, speed = sheet.subplots(3, 1, gridspec_kw=dict(height_ratios=[4.6, 1, 1]))
-    draw(upper, view, k)
+    draw_sample(upper, view, k)
     span, rise = 0.31, 0.31 * np.sin(abs(view.slope))
     upper.set(xlim=(-span, span), ylim=(-0.15 - rise * 0.55, 0.16 + rise * 0.55), aspect="equal")
     upper.axis("off")
@@ -265,7 +265,7 @@ def figure(view: Scene, k: int) -> Any:
     return sheet
 
 
-def _pixels(sheet: Any) -> np.ndarray:
+def _figure_pixels(sheet: Any) -> np.ndarray:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     canvas = FigureCanvasAgg(sheet)
@@ -276,11 +276,12 @@ def _pixels(sheet: Any) -> np.ndarray:
 def frame_times(
     file: File, begin: float, end: float | None, slow: float, length: float, rate: int = RATE
 ) -> Float[np.ndarray, " frames"]:
-    """Times [s] that `render` draws for a run of `length` [s]. Called before a run, it finds errors early.
+    """Times [s] of the pictures that `render` draws of a run of `length` [s]. Called before a run, it reports errors
+    early.
 
     Raises:
-        ValueError: the suffix is not one of `FORMATS`, no time of the run is between `begin` and `end`, the film
-            has more than `FRAMES` pictures.
+        ValueError: the suffix is not one of `FORMATS`, no time of the run is between `begin` and `end`, the film has
+            more than `FRAMES` pictures.
     """
     if file.suffix not in FORMATS:
         raise ValueError(f"file: got {file.name}; expected a name that ends in {', '.join(FORMATS)}")
@@ -300,12 +301,17 @@ def frame_times(
 
 
 def render(
-    view: View, file: str | File, begin: float = 0.0, end: float | None = None, slow: float = 10.0, rate: int = RATE
+    view: RunView,
+    file: str | File,
+    begin: float = 0.0,
+    end: float | None = None,
+    slow: float = 10.0,
+    rate: int = RATE,
 ) -> File:
     """Writes a picture (.png, at time `begin`) or a film (.gif, .mp4) of a scene.
 
     Args:
-        view: view from `scene`, of this module or of `render_above`.
+        view: view from `scene_of_run`, of this module or of `rendering_from_above`.
         file: its suffix decides the format.
         begin, end: part of the run to film [s]. None: to its end.
         slow: slow-motion factor. A pitch lasts 36 ms at 1 m/s.
@@ -325,17 +331,17 @@ def render(
     return file
 
 
-def _write_frames(view: View, file: File, frames: list[int], rate: int) -> None:
+def _write_frames(view: RunView, file: File, frames: list[int], rate: int) -> None:
     if file.suffix == ".png":
         view.sheet(frames[0]).savefig(file)
         return
     if file.suffix == ".gif":
         from PIL import Image
 
-        images = [Image.fromarray(_pixels(view.sheet(k))).quantize(256) for k in frames]
+        images = [Image.fromarray(_figure_pixels(view.sheet(k))).quantize(256) for k in frames]
         images[0].save(file, save_all=True, append_images=images[1:], duration=round(1000 / rate), loop=0)
         return
-    pictures = (_pixels(view.sheet(k)) for k in frames)
+    pictures = (_figure_pixels(view.sheet(k)) for k in frames)
     first = next(pictures)
     import imageio_ffmpeg
 

@@ -7,13 +7,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from mmrjax.fidelities.track import Trajectory
+from mmrjax.fidelities.track import TrackTrajectory
 from mmrjax.model import channels
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.robot import Robot
 from mmrjax.turning.two_sides import SIDES
 from mmrjax.undercarriage import both_sides
-from mmrjax.undercarriage.belt import Path
+from mmrjax.undercarriage.belt import BeltPath
 from mmrjax.undercarriage.rendering import belt_outline, check_finite
 
 #: Length of an arrow per sliding speed [s], and number of arrows per track.
@@ -27,8 +27,8 @@ _INK, _BODY, _PATH, _SLIDES = "#1f2933", "#5b8db8", "#8fa3b0", "#d1495b"
 _SIDES = ("#0072b2", "#d55e00")
 
 
-class Above(NamedTuple):
-    """Data for the pictures of one run, as plain arrays. A side axis of 2 is left, right.
+class TopViewScene(NamedTuple):
+    """Data for pictures of one run from above, as plain arrays. The side axis is left, right.
 
     Attributes:
         name: name of the configuration.
@@ -55,18 +55,18 @@ class Above(NamedTuple):
 
     def sheet(self, k: int) -> Any:
         """Figure of sample `k`."""
-        return figure(self, k)
+        return figure_of_sample(self, k)
 
 
-def scene(robot: Robot, conditions: Conditions, run: Trajectory) -> Above:
-    """Collects the data of one run (scalar conditions, one member of a batch) for drawing.
+def scene_of_run(robot: Robot, conditions: Conditions, run: TrackTrajectory) -> TopViewScene:
+    """Collects the data of one run for drawing (scalar conditions, one member of a batch).
 
     Raises:
         ValueError: the run holds numbers that are not finite (a failed member).
     """
     check_finite(run)
     gear, chassis = robot.running_gear, robot.chassis(conditions.configuration)
-    path, length = Path(robot.radius_pulley, gear), float(gear.wheelbase)
+    path, length = BeltPath(robot.radius_pulley, gear), float(gear.wheelbase)
     place = np.asarray(run.reactions.place)
     if chassis.on_tracks > 0.5:
         load = np.asarray(run.reactions.grouser)
@@ -75,7 +75,7 @@ def scene(robot: Robot, conditions: Conditions, run: Trajectory) -> Above:
         load = np.asarray(run.reactions.support)
         along = np.broadcast_to(np.array([0.5, -0.5]) * length, load.shape)
     v = np.asarray(run.v)
-    return Above(
+    return TopViewScene(
         name=robot.configurations.names[int(conditions.configuration)],
         slope=float(conditions.slope),
         length=length,
@@ -90,7 +90,7 @@ def scene(robot: Robot, conditions: Conditions, run: Trajectory) -> Above:
     )
 
 
-def draw(axes: Any, view: Above, k: int) -> None:
+def draw_sample(axes: Any, view: TopViewScene, k: int) -> None:
     """Draws sample `k` of a scene into Matplotlib `axes`, uphill to the top and left to the left."""
     from matplotlib.patches import Polygon
 
@@ -126,14 +126,14 @@ def draw(axes: Any, view: Above, k: int) -> None:
                 axes.annotate("", head, tail, arrowprops={"arrowstyle": "-|>", "color": _SLIDES, "lw": 1.3}, zorder=6)
 
 
-def figure(view: Above, k: int) -> Any:
+def figure_of_sample(view: TopViewScene, k: int) -> Any:
     """Figure of sample `k`: the robot from above, currents and yaw rate of the whole run below."""
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
 
     sheet = Figure(figsize=(7.2, 8.4), dpi=100, layout="constrained")
     upper, current, rate = sheet.subplots(3, 1, gridspec_kw={"height_ratios": [5.2, 1, 1]})
-    draw(upper, view, k)
+    draw_sample(upper, view, k)
     x, y, turned = view.q[k, 0], view.q[k, 1], np.degrees(view.q[k, both_sides.YAW])
     upper.set(xlim=(-y - AROUND, -y + AROUND), ylim=(x - AROUND, x + AROUND), aspect="equal")
     upper.set_xlabel("to the right of the start, m")

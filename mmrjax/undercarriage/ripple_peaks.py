@@ -1,4 +1,4 @@
-"""Ripple of the running gear, its peaks over speed, and natural frequencies that a harmonic meets there.
+"""Ripple caused by the running gear, its peaks over speed, and the natural frequencies that explain them.
 
 Computed from finished runs, in NumPy, member by member, not differentiable.
 """
@@ -13,10 +13,10 @@ import numpy as np
 from jaxtyping import Float
 from scipy.signal import find_peaks, peak_widths
 
-from mmrjax.fidelities.track import Trajectory
+from mmrjax.fidelities.track import TrackTrajectory
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import CONVERGED, NOT_SETTLED
-from mmrjax.undercarriage.belt import Path
+from mmrjax.undercarriage.belt import BeltPath
 from mmrjax.undercarriage.modes import Mode
 from mmrjax.undercarriage.running_gear import TEETH_PULLEY
 
@@ -24,11 +24,11 @@ Series = Float[np.ndarray, " samples"]
 
 
 class Ripple(NamedTuple):
-    """Fluctuation of a signal about its mean.
+    """Periodic fluctuation of a signal about its mean.
 
     Attributes:
-        mean: [the signal's unit].
-        amplitude: half of peak to peak over the mean [-].
+        mean: mean [unit of the signal].
+        amplitude: half of the peak-to-peak value, relative to the mean [-].
         period: period of repetition [s]. NaN: no repetition within half the record.
     """
 
@@ -37,7 +37,7 @@ class Ripple(NamedTuple):
     period: float
 
 
-def ripple(time: Series, values: Series) -> Ripple:
+def measure_ripple(time: Series, values: Series) -> Ripple:
     """Ripple of evenly sampled `values`, with a linear drift removed.
 
     Two events per pitch (a grouser lands in front, another lifts at the rear) make a harmonic the strongest
@@ -55,20 +55,20 @@ def ripple(time: Series, values: Series) -> Ripple:
     period = float("nan")
     good = peaks[agreement[peaks] >= 0.9 * agreement[peaks].max(initial=0.0)]
     if len(good):
-        first = _vertex(agreement, good[0])
+        first = _parabola_vertex(agreement, good[0])
         count = np.round(good / first)
         near = np.abs(good / first - count) < 0.2
         last = good[near][-1]
-        period = float(_vertex(agreement, last) / np.round(last / first) * (time[1] - time[0]))
+        period = float(_parabola_vertex(agreement, last) / np.round(last / first) * (time[1] - time[0]))
     return Ripple(float(values.mean()), float(np.ptp(rest) / 2 / abs(values.mean())), period)
 
 
 class Fluctuation(NamedTuple):
-    """Variation of a signal about its mean, and its strongest frequency.
+    """Fluctuation of a signal about its mean, and its strongest frequency.
 
     Attributes:
-        mean: [the signal's unit].
-        deviation: standard deviation over the mean [-].
+        mean: mean [unit of the signal].
+        deviation: standard deviation, relative to the mean [-].
         frequency: frequency of the strongest line of its spectrum [Hz]. NaN: it is constant.
     """
 
@@ -77,7 +77,7 @@ class Fluctuation(NamedTuple):
     frequency: float
 
 
-def fluctuation(time: Series, values: Series) -> Fluctuation:
+def measure_fluctuation(time: Series, values: Series) -> Fluctuation:
     """Fluctuation of evenly sampled `values`, with a linear drift removed and a Hann window for the spectrum."""
     time, values = np.asarray(time, float), np.asarray(values, float)
     mean = float(values.mean())
@@ -90,10 +90,10 @@ def fluctuation(time: Series, values: Series) -> Fluctuation:
     size = 1 << (8 * len(rest) - 1).bit_length()  # zero padding, for a fine grid of frequencies
     power = np.abs(np.fft.rfft(rest * np.hanning(len(rest)), size)) ** 2
     best = int(np.argmax(power[1:-1])) + 1
-    return Fluctuation(mean, deviation, float(_vertex(power, best) / (size * (time[1] - time[0]))))
+    return Fluctuation(mean, deviation, float(_parabola_vertex(power, best) / (size * (time[1] - time[0]))))
 
 
-def _vertex(values: Series, k: int) -> float:
+def _parabola_vertex(values: Series, k: int) -> float:
     below, here, above = values[k - 1 : k + 2]
     return float(k + (below - above) / (2 * (below - 2 * here + above)))
 
@@ -106,7 +106,8 @@ def period_pitch(pitch: float, speed_wheel: float, radius: float) -> float:
 def touchdowns(
     time: Series, grouser: Float[np.ndarray, "samples 24"], place: Float[np.ndarray, "samples 24"]
 ) -> Series:
-    """Times at which a grouser touches down, in order [s]. `place` distinguishes the front arc from the rear one.
+    """Times at which a grouser touches down, in order [s]. Its position `place` tells the front arc from the rear
+    one.
 
     A grouser that lifts and returns in the middle of the run does not count: its place has to be in the second half
     of the path, or just at the start of it.
@@ -118,8 +119,10 @@ def touchdowns(
     return np.sort(np.asarray(time)[1:][np.nonzero(lands & front)[0]])
 
 
-class Signal(NamedTuple):
-    """A signal with ripple: the signal's field, words for it, its display unit and the SI value of one such unit."""
+class RippleSignal(NamedTuple):
+    """A signal whose ripple is studied: its field, its name in words, its display unit, and the SI value of that
+    unit.
+    """
 
     field: str
     label: str
@@ -129,10 +132,10 @@ class Signal(NamedTuple):
 
 #: By name.
 SIGNALS = {
-    "reaction": Signal("normal", "ground reaction", "N", 1.0),
-    "current": Signal("total_current", "current", "A", 1.0),
-    "speed": Signal("speed", "speed", "mm_s", 1e-3),
-    "motor_speed": Signal("speed_motor", "motor speed", "rpm", 2 * np.pi / 60),
+    "reaction": RippleSignal("normal", "ground reaction", "N", 1.0),
+    "current": RippleSignal("total_current", "current", "A", 1.0),
+    "speed": RippleSignal("speed", "speed", "mm_s", 1e-3),
+    "motor_speed": RippleSignal("speed_motor", "motor speed", "rpm", 2 * np.pi / 60),
 }
 TAIL = 0.5  # share of a run, at its end, that is evaluated
 PERIODS = 3  # fewest pitches in it for a valid ripple
@@ -143,13 +146,13 @@ MOVES = 0.03  # relative change of a mode with payload that its peaks have to fo
 _SAME = 0.2  # of an order: largest distance of the strongest line from a whole order
 
 
-class Passing(NamedTuple):
-    """Parts of the running gear that pass the chassis at a pitch.
+class PassingParts(NamedTuple):
+    """Parts of the running gear that pass the chassis at a regular distance and excite vibrations.
 
     Attributes:
-        name: grousers or teeth.
-        pitch: pitch of the belt [m].
-        travel: travel of the robot from one to the next, without slip [m].
+        name: `grousers` or `teeth`.
+        pitch: distance between two of them along the belt [m].
+        travel: travel of the robot between two of them, without slip [m].
     """
 
     name: str
@@ -157,26 +160,29 @@ class Passing(NamedTuple):
     travel: float
 
 
-def passing_parts(robot: Robot, configuration: int) -> Passing:
-    """Excitation of a configuration: the grousers S_g on tracks. On wheels the tooth mesh S_t."""
+def passing_parts(robot: Robot, configuration: int) -> PassingParts:
+    """Parts that excite vibrations in a configuration: grousers with pitch S_g on tracks, teeth with S_t on
+    wheels.
+    """
     chassis, radius = robot.configurations.members[configuration], float(robot.radius_pulley)
     if float(chassis.on_tracks) > 0.5:
-        pitch = float(Path(robot.radius_pulley, robot.running_gear).pitch)
-        return Passing("grousers", pitch, pitch)
+        pitch = float(BeltPath(robot.radius_pulley, robot.running_gear).pitch)
+        return PassingParts("grousers", pitch, pitch)
     pitch = 2 * np.pi * radius / TEETH_PULLEY
-    return Passing("teeth", pitch, pitch * float(chassis.radius) / radius)
+    return PassingParts("teeth", pitch, pitch * float(chassis.radius) / radius)
 
 
 @dataclasses.dataclass(frozen=True)
 class Vibrations:
-    """Ripple in each run of a batch, NaN if it is not `read`.
+    """Ripple in each run of a batch, NaN where it could not be evaluated (`read`).
 
     Attributes:
         status: codes into `STATUSES`.
-        read: True if the ripple is valid: the robot travels and at least `PERIODS` pitches passed.
-        speed: mean [m/s].
-        passing: frequency of grousers or teeth [Hz].
-        mean, deviation, frequency: mean, deviation and frequency of each of `SIGNALS`, see `Fluctuation`.
+        read: True if the ripple is valid: the robot travels, and at least `PERIODS` pitches have passed.
+        speed: mean speed [m/s].
+        passing: passing frequency of grousers or teeth [Hz].
+        mean, deviation, frequency: mean, relative deviation and strongest frequency of each of `SIGNALS`, see
+            `Fluctuation`.
     """
 
     status: np.ndarray
@@ -193,18 +199,20 @@ class Vibrations:
         return self.read & (self.status == CONVERGED)
 
 
-def vibrations_of_runs(robot: Robot, runs: Trajectory, pitch: float) -> Vibrations:
+def vibrations_of_runs(robot: Robot, runs: TrackTrajectory, pitch: float) -> Vibrations:
     """Ripple at the end of each run of a batch.
 
     Args:
-        runs: fields have shape (runs, samples, ...).
+        runs: simulated runs, fields of shape (runs, samples, ...).
         pitch: pitch of the passing parts [m].
     """
     time, status = np.asarray(runs.time[0]), np.asarray(runs.result.status)
     tail = time > time[-1] - TAIL * (time[-1] - time[0])
     tail_time = time[tail]
     vibrations = {
-        name: np.array([fluctuation(tail_time, x) for x in np.asarray(getattr(runs.signals, signal.field))[:, tail]])
+        name: np.array(
+            [measure_fluctuation(tail_time, x) for x in np.asarray(getattr(runs.signals, signal.field))[:, tail]]
+        )
         for name, signal in SIGNALS.items()
     }
     rates = np.asarray(runs.signals.speed_wheel)[:, tail].mean(axis=1) * float(robot.radius_pulley) / pitch
@@ -217,19 +225,19 @@ def vibrations_of_runs(robot: Robot, runs: Trajectory, pitch: float) -> Vibratio
     return Vibrations(status, read, mean["speed"], np.where(read, rates, np.nan), mean, deviation, frequency)
 
 
-class Peak(NamedTuple):
+class RipplePeak(NamedTuple):
     """A peak of ripple over speed at one payload.
 
     Attributes:
-        signal: one of `SIGNALS`.
-        payload: [kg].
+        signal: signal, one of `SIGNALS`.
+        payload: payload [kg].
         speed, low, high: speed, lower limit and upper limit at the maximum, and limits of the range above 70 % of its
             rise [m/s].
-        ripple: the highest, standard deviation over mean [-].
-        rise: rise of the ripple over the higher of its two valleys [-].
-        order: strongest multiple of the passing frequency. 0: not a whole one.
+        ripple: largest ripple: standard deviation relative to the mean [-].
+        rise: rise of the ripple above the higher of the two valleys next to it [-].
+        order: strongest multiple of the passing frequency. 0: not a whole multiple.
         frequency: frequency of the strongest line [Hz].
-        mode: natural vibration at that frequency, which confirms the crossing. Empty: no such mode.
+        mode: natural vibration at that frequency, which explains the peak. Empty: there is none.
     """
 
     signal: str
@@ -252,15 +260,15 @@ def peaks_over_speed(
     deviation: Float[np.ndarray, " runs"],
     frequency: Float[np.ndarray, " runs"],
     modes: Sequence[Mode],
-) -> list[Peak]:
+) -> list[RipplePeak]:
     """Peaks of ripple over speed at one payload, each with its mode.
 
     A crossing of a harmonic and a natural frequency counts if ripple peaks there and its strongest line is that
     harmonic and within the mode's band. Neither is inferred from the other.
 
     Args:
-        speed, passing, deviation, frequency: of the valid runs, in the order of `speed`.
-        modes: modes at this payload.
+        speed, passing, deviation, frequency: values of the valid runs, in order of speed.
+        modes: natural vibrations at this payload.
     """
     if len(speed) < 3:
         return []
@@ -279,18 +287,20 @@ def peaks_over_speed(
         order = whole if whole and abs(ratio - whole) < _SAME else 0
         near = [m for m in modes if order and m.resonant and m.band[0] <= frequency[top] <= m.band[1]]
         mode = min(near, key=lambda m: abs(m.frequency - frequency[top])).name if near else ""
-        answer.append(Peak(signal, payload, peak_speed, low, high, height, rise, order, float(frequency[top]), mode))
+        answer.append(
+            RipplePeak(signal, payload, peak_speed, low, high, height, rise, order, float(frequency[top]), mode)
+        )
     return answer
 
 
-def confirm_peaks(found: Sequence[Peak], modes: Mapping[float, Sequence[Mode]]) -> list[Peak]:
-    """The peaks, without their mode if they do not follow it over the payloads.
+def drop_unconfirmed_modes(found: Sequence[RipplePeak], modes: Mapping[float, Sequence[Mode]]) -> list[RipplePeak]:
+    """Peaks in which a mode is removed if the peak does not follow it over the payloads.
 
     If a mode's frequency changes with payload by more than `MOVES`, the lines of the peaks of one order have to
     change in the same direction. A peak that moves against it only crosses its band.
 
     Args:
-        modes: by payload [kg].
+        modes: natural vibrations by payload [kg].
     """
     answer = list(found)
     for key in dict.fromkeys((p.mode, p.order, p.signal) for p in found if p.mode):
@@ -304,13 +314,13 @@ def confirm_peaks(found: Sequence[Peak], modes: Mapping[float, Sequence[Mode]]) 
     return answer
 
 
-class Crossing(NamedTuple):
-    """A crossing of a harmonic of the passing frequency with a natural frequency.
+class ModeCrossing(NamedTuple):
+    """A speed at which a harmonic of the passing frequency equals a natural frequency.
 
     Attributes:
         mode, order, payload: mode, order and payload of the crossing [kg].
         speed: speed at the mode's mean frequency [m/s].
-        signals: signals with a ripple peak there. Empty: the crossing does not show.
+        signals: signals with a ripple peak there. Empty: the crossing has no visible effect.
     """
 
     mode: str
@@ -321,8 +331,8 @@ class Crossing(NamedTuple):
 
 
 def find_crossings(
-    modes: Sequence[Mode], payload: float, travel: float, slowest: float, fastest: float, found: Sequence[Peak]
-) -> list[Crossing]:
+    modes: Sequence[Mode], payload: float, travel: float, slowest: float, fastest: float, found: Sequence[RipplePeak]
+) -> list[ModeCrossing]:
     """Crossings at one payload between two speeds [m/s], and the ripple peaks that confirm them.
 
     Args:
@@ -335,7 +345,7 @@ def find_crossings(
         first = max(int(np.ceil(mode.frequency * travel / fastest)), 1)
         for order in range(first, int(mode.frequency * travel / slowest) + 1):
             shows = tuple(p.signal for p in found if (p.payload, p.mode, p.order) == (payload, mode.name, order))
-            answer.append(Crossing(mode.name, order, payload, mode.frequency * travel / order, shows))
+            answer.append(ModeCrossing(mode.name, order, payload, mode.frequency * travel / order, shows))
     return answer
 
 
@@ -343,13 +353,13 @@ class Resonance(NamedTuple):
     """Peaks of one mode, order and signal over the payloads.
 
     Attributes:
-        mode: natural vibration that confirms them. Empty: no such mode.
-        speeds: least and greatest speed of the peaks [m/s].
-        avoid: least and greatest speed of their widths [m/s].
-        frequencies: least and greatest of their lines [Hz].
+        mode: natural vibration that explains the peaks. Empty: there is none.
+        speeds: lowest and highest speed of the peaks [m/s].
+        avoid: range of speeds to avoid, from the widths of the peaks [m/s].
+        frequencies: lowest and highest frequency of the peaks [Hz].
         payloads: payloads of its peaks [kg].
-        ripple: the largest [-].
-        rise: the largest over its surroundings [-].
+        ripple: largest ripple [-].
+        rise: largest rise above the surroundings [-].
     """
 
     mode: str
@@ -363,8 +373,10 @@ class Resonance(NamedTuple):
     rise: float
 
 
-def group_resonances(found: Sequence[Peak]) -> list[Resonance]:
-    """Peaks by mode, order and signal: signals in the order of `SIGNALS`, their largest ripple first."""
+def group_resonances(found: Sequence[RipplePeak]) -> list[Resonance]:
+    """Peaks grouped by mode, order and signal. Signals are in the order of `SIGNALS`, and those with the largest
+    ripple come first.
+    """
     keys = dict.fromkeys((p.mode, p.order, p.signal) for p in found)
     answer = []
     for key in keys:
@@ -381,6 +393,6 @@ def group_resonances(found: Sequence[Peak]) -> list[Resonance]:
 
 
 def strongest_resonances(found: Sequence[Resonance]) -> list[Resonance]:
-    """Resonances to avoid: for each signal, all with at least half of its largest rise, to 1 %."""
+    """Resonances to avoid: for each signal, all whose rise is at least half of the largest (to 1 %)."""
     largest = {s: max((r.rise for r in found if r.signal == s), default=0.0) for s in SIGNALS}
     return [r for r in found if r.rise >= largest[r.signal] / 2 and r.ripple >= MATTERS]

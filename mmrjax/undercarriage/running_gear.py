@@ -15,7 +15,7 @@ _UNSTATED = "not stated in the paper"
 
 
 class Levers(eqx.Module):
-    """Roller at the tip of a lever, and drive of a pair: motor, planetary gear, worm (Fig. A1: 11-14).
+    """Roller at the tip of a lever, and drive of a pair of levers: motor, planetary gear, worm (Fig. A1: 11-14).
 
     Length, mass, centre and inertia of a lever belong to the running gear, as does its angle if a run states none.
     Angles here: 0 along the wheelbase outward, positive up, π folded.
@@ -67,7 +67,7 @@ class Levers(eqx.Module):
     )  # fmt: skip
 
     def tracks(self, side: Track) -> tuple[Track, Track]:
-        """Tracks of a side split into the main one and that of one lever."""
+        """Main track of a side, and track of one lever, with their parts of the losses."""
 
         def share(coulomb: Scalar, viscous: Scalar) -> Track:
             return dataclasses.replace(

@@ -1,11 +1,11 @@
 """Contacts of one side with the ground and the guides, and their generalized forces on the chassis.
 
-Coordinates q of half a robot in its plane of travel: travel x [m] uphill, height z [m] of the middle of the
-wheelbase (axle line) over the ground, pitch θ [rad] nose down, angles φ_1, φ_2 [rad] of driving (front) and
-driven pulley, relative to the chassis. Velocities v are their rates. A wheel of 4W2T sits on its pulley's shaft.
+Coordinates q of half a robot in its plane of travel: travel x [m] uphill, height z [m] of the middle of the wheelbase
+(axle line) over the ground, pitch θ [rad] nose down, angles φ_1, φ_2 [rad] of driving (front) and driven pulley,
+relative to the chassis. Velocities v are their rates. A wheel of 4W2T sits on its pulley's shaft.
 
-Contact pairs of one side: 24 grousers with the ground, 168 teeth with each of two guides (720 in all for
-6T2A), 2 wheels with the ground for 4W2T.
+Contact pairs of one side: 24 grousers with the ground, 168 teeth with each of two guides (720 in all for 6T2A), 2
+wheels with the ground for 4W2T.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from mmrjax.model.masses import lever_angles
 from mmrjax.model.params import Scalar
 from mmrjax.model.signals import GRAVITY, Signals
 from mmrjax.numerics.trigonometry import cosine, sine
-from mmrjax.undercarriage.belt import Path, Runs, belt_runs, tension_along, tips_on_path
+from mmrjax.undercarriage.belt import BeltPath, BeltRuns, belt_runs, tension_along, tips_on_path
 from mmrjax.undercarriage.running_gear import GROUSERS, TEETH_BELT, WHEELS, RunningGear
 
 #: A number of each contact.
@@ -37,8 +37,8 @@ WHEEL = np.arange(CONTACTS) >= GROUSERS
 _END = np.where(WHEEL, np.where(np.arange(CONTACTS) == GROUSERS, 1.0, -1.0), 0.0)  # of the wheelbase: front, rear
 
 
-class Touch(eqx.Module):
-    """Position, motion and load of the contacts at an instant, grousers first.
+class ContactState(eqx.Module):
+    """Position, motion and load of the contacts of one side at an instant. Grousers come first.
     Attributes:
         lever_x, lever_z: contact point from the middle of the wheelbase [m].
         rate_x, rate_z: velocity of the contact per belt speed [-].
@@ -65,7 +65,7 @@ class Touch(eqx.Module):
     damped: PerContact
     guided: PerContact
     place: Float[Array, " 24"]
-    belt: Runs
+    belt: BeltRuns
 
     @property
     def normal(self) -> Scalar:
@@ -74,21 +74,25 @@ class Touch(eqx.Module):
 
 
 def join_contacts(grousers: Float[Array, " 24"], wheels: Array | np.ndarray | float = 0.0) -> PerContact:
-    """One array of grousers and wheels, padded and masked: XLA vectorises this but not a concatenation."""
+    """Contacts of grousers and wheels in one array, padded and masked. XLA vectorises this better than a
+    concatenation.
+    """
     return jnp.where(WHEEL, wheels, jnp.pad(grousers, (0, WHEELS)))
 
 
 def bearing_contacts(chassis: Chassis) -> PerContact:
-    """1 for contacts that carry load in this configuration, else 0 [-]."""
+    """1 for contacts that carry load in this configuration, otherwise 0 [-]."""
     return jnp.where(WHEEL, 1 - chassis.on_tracks, chassis.on_tracks)
 
 
-def tension_free(path: Path, belt: Runs) -> Scalar:
-    """Tension of the free part of the lower run, P - P_ct [N], kept above slack."""
+def tension_free(path: BeltPath, belt: BeltRuns) -> Scalar:
+    """Tension of the free part of the lower run, P - P_ct [N], kept above that of a slack belt."""
     return jnp.maximum(belt.lower - belt.centrifugal, 0.01 * path.gear.pretension)
 
 
-def contact_state(path: Path, chassis: Chassis, q: Sequence[Scalar] | Array, v: Sequence[Scalar] | Array) -> Touch:
+def compute_contacts(
+    path: BeltPath, chassis: Chassis, q: Sequence[Scalar] | Array, v: Sequence[Scalar] | Array
+) -> ContactState:
     """Contact points and normal forces (27)-(29) at coordinates `q`, velocities `v`.
 
     The free belt between pulley and guide deflects under the grouser as a string of tension P - P_ct. The force falls
@@ -125,7 +129,7 @@ def contact_state(path: Path, chassis: Chassis, q: Sequence[Scalar] | Array, v: 
     bears = bearing_contacts(chassis)
     stiffness, damping = gear.contact_stiffness * yields, gear.contact_damping * yields
     force = force_contact(gap, gap_rate, 0.0, stiffness, gear.contact_exponent, damping, gear.contact_depth)
-    return Touch(
+    return ContactState(
         lever_x=x,
         lever_z=z,
         rate_x=rate_x,
@@ -143,16 +147,16 @@ def contact_state(path: Path, chassis: Chassis, q: Sequence[Scalar] | Array, v: 
     )
 
 
-class Pull(eqx.Module):
+class ContactPull(eqx.Module):
     """Forces of the contacts at an instant.
 
     Attributes:
         force: traction of each contact, uphill on the robot [N].
         guide: friction of the teeth on the lower guide F'_t, against forward running [N], eq. (26).
         guided: load on the lower guide [N].
-        load: load of the belt, the ground and the guides on the driving shaft [N·m].
-        generalized: forces on (x, z, θ, φ_2) [N, N, N·m, N·m]. The shaft's own torque is the gearbox's.
-        aside: lateral force of each contact, to the left on a robot free to turn [N]. None: straight travel.
+        load: torque of belt, ground and guides on the driving shaft [N·m].
+        generalized: generalized forces on (x, z, θ, φ_2) [N, N, N·m, N·m], without the torque of the gearbox.
+        aside: lateral force of each contact, to the left, for a robot free to turn [N]. None: straight travel.
     """
 
     force: PerContact
@@ -168,31 +172,31 @@ class Pull(eqx.Module):
         return jnp.sum(self.force)
 
 
-def sliding_speeds(signals: Signals, at: Touch) -> PerContact:
-    """Backward sliding speed of each contact over the ground [m/s], `speed_slip_terms` shifts it."""
+def sliding_speeds(signals: Signals, at: ContactState) -> PerContact:
+    """Backward sliding speed of each contact over the ground [m/s]. `speed_slip_terms` is added to it."""
     return -at.speed_x - signals.speed_slip_terms
 
 
-def friction_rise(chassis: Chassis, signals: Signals, at: Touch) -> PerContact:
+def friction_derivative(chassis: Chassis, signals: Signals, at: ContactState) -> PerContact:
     """Derivative of the traction of each contact with respect to its sliding speed [N·s/m]."""
     return jnp.asarray(chassis.ground.traction_rise(sliding_speeds(signals, at), at.force, signals.adhesion))
 
 
 def contact_forces(
-    path: Path, chassis: Chassis, signals: Signals, at: Touch, height: Scalar, force: Array | None = None
-) -> Pull:
+    path: BeltPath, chassis: Chassis, signals: Signals, at: ContactState, height: Scalar, force: Array | None = None
+) -> ContactPull:
     """Friction of the contacts (25) by Fig. 7, of the guide (26), and all generalized forces.
 
-    The motion resistance (5) acts on the chassis at the ground. Friction of the upper guide is part of the
-    loss (24), which was measured with the tracks lifted.
+    The motion resistance (5) acts on the chassis at the ground. Friction of the upper guide is part of the loss (24),
+    which was measured with the tracks lifted.
 
     Args:
         path: the belt's path.
         chassis: friction and guide coefficients.
-        signals: those up to `balances.slip`. `speed_slip_terms` shifts the sliding of every contact.
-        at: the contacts.
-        height: height of the axle line over the ground [m].
-        force: traction of each contact if contacts slide laterally too [N]. None: by Fig. 7.
+        signals: signals up to `balances.slip`. `speed_slip_terms` is added to the sliding of every contact.
+        at: state of the contacts.
+        height: height of the axles above the ground [m].
+        force: traction of each contact, if contacts slide laterally too [N]. None: by Fig. 7.
     """
     if force is None:
         force = jnp.asarray(chassis.ground.traction(sliding_speeds(signals, at), at.force, signals.adhesion))
@@ -203,20 +207,22 @@ def contact_forces(
     rear = path.radius * jnp.sum(along * at.weight) + at.belt.torque_rear
     forward = jnp.sum(force) - signals.resistance
     moment = jnp.sum(force * at.lever_z - at.force * at.lever_x) + signals.resistance * height
-    return Pull(force, guide, jnp.sum(at.guided * at.force), -front, jnp.stack([forward, at.normal, moment, rear]))
+    return ContactPull(
+        force, guide, jnp.sum(at.guided * at.force), -front, jnp.stack([forward, at.normal, moment, rear])
+    )
 
 
-class Reactions(eqx.Module):
-    """Loads inside one side's running gear at an instant.
+class GearReactions(eqx.Module):
+    """Loads inside the running gear of one side at an instant.
 
     Attributes:
         grouser: normal reaction of the ground on each grouser R_z [N].
         guided: part of it that passes to the lower guide [N].
-        support: on front and rear pulley (6T2A) or wheel (4W2T) [N].
-        place: position of the grousers on the belt's path [m].
+        support: load on front and rear pulley (6T2A) or wheel (4W2T) [N].
+        place: positions of the grousers on the path of the belt [m].
         tension: tension of the belt at as many positions as grousers, from half a pitch after the path's start on
             [N].
-        centrifugal: P_ct of it [N].
+        centrifugal: centrifugal part P_ct of the tension [N].
     """
 
     grouser: Float[Array, "... 24"]
@@ -231,7 +237,7 @@ class Reactions(eqx.Module):
         """Load on the lower guide [N]."""
         return jnp.sum(self.guided, axis=-1)
 
-    def teeth(self, path: Path) -> tuple[Float[Array, "... 168"], Float[Array, "... 168"]]:
+    def teeth(self, path: BeltPath) -> tuple[Float[Array, "... 168"], Float[Array, "... 168"]]:
         """Load R_g of the lower and of the upper guide on each tooth [N].
 
         A grouser's load on the lower guide spreads evenly over the teeth of its pitch. The upper guide
@@ -245,13 +251,13 @@ class Reactions(eqx.Module):
         return lower, jnp.where(over, path.gear.belt_mass * GRAVITY / TEETH_BELT, 0.0)
 
 
-def inner_loads(path: Path, at: Touch, pulled: Pull) -> Reactions:
+def inner_loads(path: BeltPath, at: ContactState, pulled: ContactPull) -> GearReactions:
     """Loads on guides, pulleys and belt at an instant."""
     guided = at.guided * at.force
     to_support = at.force - guided
     ahead = at.lever_x > 0
     against = (-pulled.force * at.rate_x + pulled.guide)[:GROUSERS]
-    return Reactions(
+    return GearReactions(
         grouser=at.force[:GROUSERS],
         guided=guided[:GROUSERS],
         support=jnp.stack([jnp.sum(jnp.where(ahead, to_support, 0.0)), jnp.sum(jnp.where(ahead, 0.0, to_support))]),

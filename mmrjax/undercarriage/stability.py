@@ -16,7 +16,7 @@ from mmrjax.model.params import Scalar
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import State
 from mmrjax.undercarriage import mjcf
-from mmrjax.undercarriage.half_robot import Motion, System, advance, half_robot_system, roll, stand
+from mmrjax.undercarriage.half_robot import HalfRobotState, HalfRobotSystem, advance, build_system, roll, stand
 from mmrjax.undercarriage.side_contacts import lever_tips
 
 SAFETY = 0.75  # of the linear limit: ripple loads the contacts more than standing does
@@ -24,11 +24,11 @@ LEAST = 0.01  # [m/s], least V_s for the linear limit
 PROBE = 1e-6  # [s], step for computing rates
 
 
-def step_derivative(run: System, at: Motion) -> Float[Array, "11 11"]:
+def step_derivative(run: HalfRobotSystem, at: HalfRobotState) -> Float[Array, "11 11"]:
     """Derivative of (q, v, current) after one step with respect to (q, v, current), of one run."""
 
     def after(y: Float[Array, " 11"]) -> Float[Array, " 11"]:
-        moved, _, _ = advance(run, Motion(y[:5], y[5:10], y[10], at.discharge, at.memory))
+        moved, _, _ = advance(run, HalfRobotState(y[:5], y[5:10], y[10], at.discharge, at.memory))
         return jnp.concatenate([moved.q, moved.v, jnp.asarray(moved.current)[None]])
 
     return jax.jacfwd(after)(jnp.concatenate([at.q, at.v, jnp.asarray(at.current)[None]]))
@@ -41,11 +41,9 @@ def _step_derivatives(
     """Derivatives of (q, v, current) after one step with respect to (q, v, current), standing and rolling."""
 
     def one(conditions: Conditions, steps: Float[Array, " starts"]) -> Float[Array, "starts 11 11"]:
-        run = half_robot_system(robot, conditions, PROBE)
+        run = build_system(robot, conditions, PROBE)
         starts = jax.tree.map(lambda *at: jnp.stack(at), stand(run), roll(run))
-        return jax.vmap(lambda at, step: step_derivative(half_robot_system(robot, conditions, step), at))(
-            starts, steps
-        )
+        return jax.vmap(lambda at, step: step_derivative(build_system(robot, conditions, step), at))(starts, steps)
 
     return jax.vmap(one)(conditions, steps)
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from calibration.data import requirements_file
 from calibration.data.input_errors import BadConfiguration
-from calibration.described import in_words
+from calibration.described import report_in_words
 from calibration.sizing import sheet
 from mmrjax.derived.requirements import OF_HEAT
 from mmrjax.model.quantities import CHARGE, HEAT
@@ -27,7 +27,7 @@ from sweeps.store import RunFolder, finish_run_folder, open_folder, print_report
 
 
 def execute(config: configuration.Check, beside: configuration.FolderPart) -> int:
-    """Compare a robot with requirements and write a run folder. Returns the exit code.
+    """Compares a robot with requirements and writes a run folder. Returns the exit code.
 
     The code is 0 whether or not requirements are missed, and 3 if the solver failed at a worst corner.
     """
@@ -35,7 +35,7 @@ def execute(config: configuration.Check, beside: configuration.FolderPart) -> in
     file = load_robot(config)
     robot = file.robot
     imposed.check_on_ground(robot, "check")
-    sheet.refuse_impossible(robot, demands)
+    sheet.reject_impossible(robot, demands)
     _check_charge(robot, demands)
     lacking = robot.unknown(HEAT)
     for r in demands.each:
@@ -46,11 +46,11 @@ def execute(config: configuration.Check, beside: configuration.FolderPart) -> in
             )
     with open_folder("check", config, robot, beside) as folder:
         with step_reporter(print_message, "reading the requirements") as heard:
-            outcomes = sheet.check_requirements(robot, demands, changes=config.changes, tell=in_words(heard))
+            outcomes = sheet.check_requirements(robot, demands, changes=config.changes, tell=report_in_words(heard))
             result = CheckResult(demands, robot, outcomes, posture_words.of_requirements(robot, outcomes))
-        _write(folder, config, result)
+        _write_folder(folder, config, result)
         document = print_report(
-            check_report.check_document(result, capabilities.shown_name(file), config.changes), file
+            check_report.check_document(result, capabilities.displayed_name(file), config.changes), file
         )
         manifest = {"seed": None, **sheet.count_outcomes(result.outcomes)}
         solved = words.every_run_solved(Counter(o.status for o in result.outcomes))
@@ -60,7 +60,7 @@ def execute(config: configuration.Check, beside: configuration.FolderPart) -> in
 
 
 def _check_charge(robot: Robot, asked: requirements_file.Requirements) -> None:
-    """Raise if a requirement needs a battery that the robot's file does not state."""
+    """Rejects a requirement that needs a battery if the robot file states none."""
     for r in asked.each:
         depends = CHARGE in r.quantity.axes or r.quantity.group == "endurance"
         if depends and r.envelope.battery and not capabilities.has_battery(robot):
@@ -70,7 +70,7 @@ def _check_charge(robot: Robot, asked: requirements_file.Requirements) -> None:
             )
 
 
-def _write(folder: RunFolder, config: configuration.Check, found: CheckResult) -> None:
+def _write_folder(folder: RunFolder, config: configuration.Check, found: CheckResult) -> None:
     folder.write_text("requirements.toml", found.asked.text)
     # Outcomes as a table, one row for each requirement
     nan = float("nan")

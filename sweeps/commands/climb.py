@@ -1,4 +1,4 @@
-"""The command `climb`: a robot over an obstacle, or the largest obstacle that it gets over."""
+"""The command `climb`: a robot over an obstacle, or the largest obstacle that it can climb."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ import numpy as np
 from jaxtyping import Array
 
 from calibration.data import terrains
-from calibration.data.contradictions import without_levers
+from calibration.data.contradictions import reason_without_levers
 from calibration.data.input_errors import BadConfiguration
 from mmrjax.climbing import climb_simulation, terrain
-from mmrjax.climbing.climb_derivatives import ClimbInputs, Derivatives, climb_derivatives
-from mmrjax.climbing.climb_simulation import Climb, Sequence, climb_batch
+from mmrjax.climbing.climb_derivatives import ClimbDerivatives, ClimbInputs, climb_derivatives
+from mmrjax.climbing.climb_simulation import ClimbRuns, LeverSequence, climb_batch
 from mmrjax.climbing.terrain import Terrain
 from mmrjax.errors import similar_words
 from mmrjax.fidelities.variation import Variation
@@ -41,7 +41,7 @@ WIDTHS, WIDTH = {"payload": 0.2, "levers_front_deg": 1.0, "levers_rear_deg": 1.0
 
 
 def execute(config: configuration.Climb, beside: configuration.FolderPart) -> int:
-    """Simulate a climb and write a run folder. Returns the exit code.
+    """Simulates a climb and writes a run folder. Returns the exit code.
 
     0 done, whatever the verdict. 3 numbers went wrong.
     """
@@ -58,12 +58,12 @@ def execute(config: configuration.Climb, beside: configuration.FolderPart) -> in
         update={"configuration": name, "supply_voltage_V": None if config.battery else voltage}
     )
     sequence = _lever_sequence(config, robot, name)
-    _, words = _terrain(config, 0.1)
+    _, words = _obstacle_terrain(config, 0.1)
     conditions = Conditions(
         name, voltage, payload=config.payload_kg, battery=config.battery, discharge=3.6 * config.discharge_mAh,
         adhesion=adhesion_ratio(config.surface, bool(np.asarray(robot.configurations[name].on_tracks) > 0.5)),
     ).resolved(robot)  # fmt: skip
-    along = _along(config, robot, conditions, sequence)
+    along = _derivative_variables(config, robot, conditions, sequence)
     with open_folder("climb", config, robot, beside) as folder:
         climbed = _climb_of_configuration(config, robot, name, words, conditions, sequence, along)
         folder.write_table("history.csv", climbed.table)
@@ -93,13 +93,13 @@ def _climb_of_configuration(
     name: str,
     words: str,
     conditions: Conditions,
-    sequence: Sequence,
+    sequence: LeverSequence,
     along: Along | None,
 ) -> ClimbResult:
     """The climb of a configuration: over one obstacle, a search for the largest one, or with derivatives."""
 
-    def run(sizes: np.ndarray) -> tuple[Terrain, Climb]:
-        every = [_terrain(config, float(size) / 1000)[0] for size in sizes]
+    def run(sizes: np.ndarray) -> tuple[Terrain, ClimbRuns]:
+        every = [_obstacle_terrain(config, float(size) / 1000)[0] for size in sizes]
         grounds = jax.tree.map(lambda *x: jnp.stack(x), *every)
         alike = [jax.tree.map(lambda x: jnp.stack([jnp.asarray(x)] * len(sizes)), c) for c in (conditions, sequence)]
         with progress_bar(1, quiet=False) as advance:
@@ -118,7 +118,7 @@ def _climb_of_configuration(
 
     chosen, largest = 0, None
     tried: tuple[tuple[float, str], ...] = ()
-    derivatives: Derivatives | None = None
+    derivatives: ClimbDerivatives | None = None
     if config.find is not None:
         grounds, ended, chosen, tried, largest = _search_largest(config.find, run)
     elif along is None:
@@ -139,8 +139,10 @@ def _climb_of_configuration(
     )  # fmt: skip
 
 
-def _along(config: configuration.Climb, robot: Robot, conditions: Conditions, sequence: Sequence) -> Along | None:
-    """Variables of the derivatives. None: no derivatives.
+def _derivative_variables(
+    config: configuration.Climb, robot: Robot, conditions: Conditions, sequence: LeverSequence
+) -> Along | None:
+    """Variables with respect to which derivatives are computed. None: no derivatives.
 
     Raises:
         BadConfiguration: an unknown name, or one without effect on this climb.
@@ -154,7 +156,7 @@ def _along(config: configuration.Climb, robot: Robot, conditions: Conditions, se
     kind = next((k for k, size in sizes.items() if size is not None), None)
     levers = {"levers_front_deg": "front", "levers_rear_deg": "rear"}
     variables = ["adhesion", "payload", "discharge" if config.battery else "voltage"]
-    moved = sequence.begins is None and not without_levers(robot, config.configuration or "")
+    moved = sequence.begins is None and not reason_without_levers(robot, config.configuration or "")
     variables += [*(levers if moved else ()), *([SIZE] if kind is not None else [])]
     for k, name in enumerate(names):
         if name in names[:k]:
@@ -185,7 +187,9 @@ def _along(config: configuration.Climb, robot: Robot, conditions: Conditions, se
             for name, end in levers.items()
             if name in value_of
         }
-        ground = _terrain(searched, value_of[SIZE] / 1000) if SIZE in value_of else _terrain(config, 0.1)
+        ground = (
+            _obstacle_terrain(searched, value_of[SIZE] / 1000) if SIZE in value_of else _obstacle_terrain(config, 0.1)
+        )
         return ClimbInputs(changed_robot, run, ground[0], dataclasses.replace(sequence, **moved))
 
     values = [usual[name] for name in names]
@@ -194,14 +198,17 @@ def _along(config: configuration.Climb, robot: Robot, conditions: Conditions, se
 
 
 def _search_largest(
-    what: str, run: Callable[[np.ndarray], tuple[Terrain, Climb]]
-) -> tuple[Terrain, Climb, int, tuple[tuple[float, str], ...], float | None]:
-    """The largest size that is got over [mm]: rounds of sizes side by side, between the largest that was got over
-    below all that were not and the next. The run of the largest, or of the smallest tried, is shown."""
+    what: str, run: Callable[[np.ndarray], tuple[Terrain, ClimbRuns]]
+) -> tuple[Terrain, ClimbRuns, int, tuple[tuple[float, str], ...], float | None]:
+    """Largest size of an obstacle that is climbed [mm], by rounds of sizes in parallel.
+
+    Each round divides the interval between the largest size below which all were climbed, and the next one. The run
+    of the largest climbed size, or of the smallest tried, is reported.
+    """
     low, high = SOUGHT[what]
     sizes = np.linspace(low, high, ROUND)
     tried: dict[float, str] = {}
-    kept: tuple[Terrain, Climb, int] | None = None
+    kept: tuple[Terrain, ClimbRuns, int] | None = None
     while True:
         grounds, ended = run(sizes)
         tried |= {float(s): v for s, v in zip(sizes, ended.names, strict=True)}
@@ -217,8 +224,8 @@ def _search_largest(
         sizes = np.unique(np.round(inner, 1))
 
 
-def _terrain(config: configuration.Climb, size: Scalar) -> tuple[Terrain, str]:
-    """The obstacle (for a search, of this `size` [m]) and its description."""
+def _obstacle_terrain(config: configuration.Climb, size: Scalar) -> tuple[Terrain, str]:
+    """Obstacle (in a search, of this `size` [m]) and its description."""
     nose = config.nose_mm / 1000
     if config.terrain is not None:
         return terrains.read_terrain(config.terrain), f"the terrain of {config.terrain.name}"
@@ -241,7 +248,7 @@ def _terrain(config: configuration.Climb, size: Scalar) -> tuple[Terrain, str]:
     ), "a step" if config.step_mm is None else f"a step of {config.step_mm:g} mm"
 
 
-def _lever_sequence(config: configuration.Climb, robot: Robot, name: str) -> Sequence:
+def _lever_sequence(config: configuration.Climb, robot: Robot, name: str) -> LeverSequence:
     """Returns the motion of the levers.
 
     Raises:
@@ -252,7 +259,7 @@ def _lever_sequence(config: configuration.Climb, robot: Robot, name: str) -> Seq
     gear = robot.running_gear
     tracked = bool(np.asarray(robot.configurations[name].on_tracks) > 0.5)
     if not tracked and stated != (None, None, None):
-        raise BadConfiguration(f"--levers-front, --levers-rear, --sequence: {without_levers(robot, name)}")
+        raise BadConfiguration(f"--levers-front, --levers-rear, --sequence: {reason_without_levers(robot, name)}")
     folded_angles = (
         float(np.degrees(np.asarray(gear.lever_front))),
         180 - float(np.degrees(np.asarray(gear.lever_rear))),

@@ -20,7 +20,7 @@ from mmrjax import fidelities
 from mmrjax.model.channels import Channel
 from sweeps import capabilities
 from sweeps import config as configuration
-from sweeps.inputs import beside_robot, fit_of, load_robot, read_runs
+from sweeps.inputs import load_robot, posterior_beside_robot, read_runs, recorded_fit
 from sweeps.points import run, uncertainty
 from sweeps.report import comparison_report
 from sweeps.report.comparison_report import Comparison, add_second_robot, compare_readings
@@ -31,7 +31,9 @@ HISTORIES, OVER = "drive", {"time_s": "time [s]"}
 
 
 def execute(config: configuration.Compare, beside: configuration.ComparedRuns) -> int:
-    """Simulate the runs of a table, compare them with its readings, write a run folder. Returns the exit code."""
+    """Simulates the runs of a table, compares them with its readings, and writes a run folder. Returns the exit
+    code.
+    """
     file = load_robot(config)
     stated = runs = read_runs(
         beside.data, file.robot, columns=config.columns, measured=True, series=True, of_turns=True
@@ -40,12 +42,12 @@ def execute(config: configuration.Compare, beside: configuration.ComparedRuns) -
         file = dataclasses.replace(file, robot=file.robot.showing_turns(runs.layout.measured_columns), remarks=())
     second = _second_robot(config, file)
     if runs.sampled:
-        return _over_time(config, file, second, runs, beside)
+        return _compare_histories(config, file, second, runs, beside)
     robot = instruments.with_inferred_instruments(file.robot, runs)
     if beside.own_mass:
         runs = dataclasses.replace(runs, columns={k: v for k, v in runs.columns.items() if k != "total_mass_kg"})
     remarks = sentences(check_ranges(runs, robot))
-    posterior = None if config.posterior is None else beside_robot(file)
+    posterior = None if config.posterior is None else posterior_beside_robot(file)
     with open_folder("compare", config, robot, beside, runs) as folder:
         table = run.evaluate_runs(robot, runs, config, folder)
         comparison, summary = compare_readings(stated, table, robot)
@@ -66,20 +68,21 @@ def execute(config: configuration.Compare, beside: configuration.ComparedRuns) -
             }
         folder.write_table("comparison.csv", comparison)
         result = Comparison(
-            comparison, summary, stated.channels, Path(runs.source).name, config.model, capabilities.shown_name(file),
-            fit_of(file, runs), notes=(*notes, *of_draws), against=_name_of(config, file, second),
+            comparison, summary, stated.channels, Path(runs.source).name, config.model,
+            capabilities.displayed_name(file),
+            recorded_fit(file, runs), notes=(*notes, *of_draws), against=_second_name(config, file, second),
         )  # fmt: skip
         return _write_result(folder, config, dataclasses.replace(file, robot=robot), runs, table, result, notes)
 
 
-def _over_time(
+def _compare_histories(
     config: configuration.Compare,
     file: RobotFile,
     second: RobotFile | None,
     runs: records.Runs,
     beside: configuration.ComparedRuns,
 ) -> int:
-    """Comparison with time histories, each simulated from its beginning as in fits."""
+    """Compares time histories, each simulated from its start as in fits."""
     options = {"--own-mass": beside.own_mass, "--posterior": config.posterior, "--duration": config.duration_s}
     for option in (name for name, stated in options.items() if stated):
         raise BadConfiguration(
@@ -104,8 +107,8 @@ def _over_time(
             *sentences((*error_after_steps(runs, off), *ready.checked, *ready.begins, *ready.weighed)),
         )
         result = Comparison(
-            comparison, summary, runs.channels, Path(runs.source).name, HISTORIES, capabilities.shown_name(file),
-            fit_of(file, runs), OVER, notes, _name_of(config, file, second),
+            comparison, summary, runs.channels, Path(runs.source).name, HISTORIES, capabilities.displayed_name(file),
+            recorded_fit(file, runs), OVER, notes, _second_name(config, file, second),
         )  # fmt: skip
         return _write_result(folder, config, dataclasses.replace(file, robot=ready.robot), runs, table, result, notes)
 
@@ -141,12 +144,12 @@ def _second_robot(config: configuration.Compare, file: RobotFile) -> RobotFile |
     return second
 
 
-def _name_of(config: configuration.Compare, file: RobotFile, second: RobotFile | None) -> str:
-    """Name of the second robot, with its folder if both files have the same name, "" for none."""
+def _second_name(config: configuration.Compare, file: RobotFile, second: RobotFile | None) -> str:
+    """Name of the second robot, with its folder if both files have the same name. "" if there is none."""
     if second is None:
         return ""
-    name = capabilities.shown_name(second)
-    return str(config.against) if name == capabilities.shown_name(file) else name
+    name = capabilities.displayed_name(second)
+    return str(config.against) if name == capabilities.displayed_name(file) else name
 
 
 def missing_readings_notes(table: Columns, channels: Sequence[Channel]) -> list[str]:

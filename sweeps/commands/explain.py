@@ -1,4 +1,4 @@
-"""The command `explain`: what a name means, read from the code that it is a name of."""
+"""The command `explain`: meaning of a name, from the code that defines it."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ def explainable_names(library: Library) -> dict[str, list[str]]:
     }
 
 
-def _effect(name: str, library: Library) -> Iterator[Line]:
+def _effect_lines(name: str, library: Library) -> Iterator[Line]:
     effect = library.get(name)
     if effect is None:
         return
@@ -102,13 +102,13 @@ def _effect(name: str, library: Library) -> Iterator[Line]:
     for p in params.walk_parameters(example):
         if p.spec.amplitude:
             yield "typical size", f"{p.spec.prior_sd(0.0):g} {p.spec.unit} ({p.spec.meaning}; {p.spec.source})"
-            yield "bounds", _bounds(p.spec)
+            yield "bounds", _bounds_text(p.spec)
         else:
             yield f"  {p.name}", f"{float(p.value):g} {p.spec.unit}: {p.spec.meaning}"
     if declarations := ", ".join(experiment_words.effect_declarations(effect)):
         yield "properties", declarations
-    yield "in data", f"{effect.family()}{_histories(effect)}"
-    for line in _changes(example):
+    yield "in data", f"{effect.family()}{_histories_sentence(effect)}"
+    for line in _change_sentences(example):
         yield "", line
     for k, test in enumerate(experiment_words.effect_tests(effect)):
         yield "" if k else "on a bench", test
@@ -117,13 +117,13 @@ def _effect(name: str, library: Library) -> Iterator[Line]:
     yield "in a file", f"[effects.{name}] amplitude = ..."
 
 
-def _histories(effect: type[Effect]) -> str:
+def _histories_sentence(effect: type[Effect]) -> str:
     if effect.transient:
         return "; visible only in time histories, not in settled runs"
     return f"; settled runs cannot distinguish it from {effect.settles_to}" if effect.settles_to else ""
 
 
-def _changes(effect: Effect) -> Iterator[str]:
+def _change_sentences(effect: Effect) -> Iterator[str]:
     """Sentences on the change of settled travel by a typical size of an effect, in percent of the readings.
 
     Empty if settled travel does not show the effect or the runs have no operating point.
@@ -153,7 +153,7 @@ def _changes(effect: Effect) -> Iterator[str]:
             yield f"change for one typical size, for {name} at 24 V, 5°, 3 kg: {changes}"
 
 
-def _status(name: str, library: Library) -> Iterator[Line]:
+def _status_lines(name: str, library: Library) -> Iterator[Line]:
     if name in words.STATUSES:
         about = words.STATUSES[name]
         yield "means", about.meaning
@@ -163,8 +163,8 @@ def _status(name: str, library: Library) -> Iterator[Line]:
         yield "in files", "column status of runs.csv, counts in result.json"
 
 
-def _meaning(meanings: Mapping[str, str], where: str = "") -> Explain:
-    """Explanation of names from a table of meanings. `where` describes in which files they occur."""
+def _explain_by_table(meanings: Mapping[str, str], where: str = "") -> Explain:
+    """Function that explains names by a table of meanings. `where`: files in which they occur."""
 
     def about(name: str, library: Library) -> Iterator[Line]:
         if name in meanings:
@@ -175,7 +175,7 @@ def _meaning(meanings: Mapping[str, str], where: str = "") -> Explain:
     return about
 
 
-def _channel(name: str, library: Library) -> Iterator[Line]:
+def _channel_lines(name: str, library: Library) -> Iterator[Line]:
     c = next((c for c in channels.EVERY if name in (c.name, c.column, c.sd_column)), None)
     if c is None:
         return
@@ -193,7 +193,7 @@ def _channel(name: str, library: Library) -> Iterator[Line]:
             yield "" if k else "on a bench", test
 
 
-def _condition(name: str, library: Library) -> Iterator[Line]:
+def _condition_lines(name: str, library: Library) -> Iterator[Line]:
     if label := next((label for label in quantities.LABELS if label.name == name), None):
         yield "is", label.label
         yield "column", label.column
@@ -209,23 +209,23 @@ def _condition(name: str, library: Library) -> Iterator[Line]:
         yield "from Python", f"mm.Conditions({c.field}=...)"
 
 
-def _output(name: str, library: Library) -> Iterator[Line]:
+def _output_lines(name: str, library: Library) -> Iterator[Line]:
     for o in (o for o in EVERY_OUTPUT if name in (o.name, o.column)):
         yield "is", f"{o.label} [{o.unit_shown}]"
-        if (meaning := _attribute(Result, o.name)) and o in outputs.FURTHER:
+        if (meaning := _attribute_description(Result, o.name)) and o in outputs.FURTHER:
             yield "equation", meaning
         where = "missions (--profile)" if o in (*mission_batch.OUTPUTS, *mission_batch.OF_TURNS) else "every run"
         yield "column", f"{o.column}, of {'--outputs' if o in derived.TABLE else where}"
 
 
-def _attribute(kind: type, name: str) -> str:
+def _attribute_description(kind: type, name: str) -> str:
     """Description of an attribute, from the docstring of its class."""
     text = " ".join((inspect.getdoc(kind) or "").partition("Attributes:")[2].split())
     match = re.search(rf"(?:^|[.\]] |, |; )(?:\w+, )*{name}(?:, \w+)*: (.*?)(?=\.? [a-z_]+(?:, [a-z_]+)*: |$)", text)
     return "" if match is None else match[1].rstrip(".")
 
 
-def _parameter(name: str, library: Library) -> Iterator[Line]:
+def _parameter_lines(name: str, library: Library) -> Iterator[Line]:
     robot = paper_robots.nominal()
     parameter = next((p for p in params.walk_parameters(robot) if p.name == name), None)
     if parameter is None:
@@ -233,8 +233,8 @@ def _parameter(name: str, library: Library) -> Iterator[Line]:
     spec = parameter.spec
     yield "means", f"{spec.meaning} [{spec.unit}]"
     yield "nominal", f"{float(parameter.value):g} {spec.unit}; {spec.source}"
-    yield "prior", _prior(parameter)
-    yield "bounds", _bounds(spec)
+    yield "prior", _prior_text(parameter)
+    yield "bounds", _bounds_text(spec)
     first = name.partition(".")[0]
     part: Any = dict(robot.configurations.items()).get(first, robot)
     for step in name.split(".")[:-1]:
@@ -251,30 +251,32 @@ def _parameter(name: str, library: Library) -> Iterator[Line]:
     )
 
 
-def _prior(p: Parameter) -> str:
+def _prior_text(p: Parameter) -> str:
     sd = p.spec.prior_sd(float(p.value))
     return f"standard deviation {sd:.3g} {p.spec.unit}" + (
         f" ({100 * p.spec.relative_sd:g} %)" if p.spec.relative_sd else ""
     )
 
 
-def _bounds(spec: Spec) -> str:
+def _bounds_text(spec: Spec) -> str:
     low, high = spec.bounds
     return f"{low:g} to {high:g} {spec.unit}"
 
 
 #: What explains a name, by kind.
 EXPLAINED: dict[str, Explain] = {
-    "effect": _effect,
-    "status": _status,
-    "verdict of the loop": _meaning(words.LOOP_VERDICTS, "verdict of result.json of mmrjax loop"),
-    "verdict of a climb": _meaning(
+    "effect": _effect_lines,
+    "status": _status_lines,
+    "verdict of the loop": _explain_by_table(words.LOOP_VERDICTS, "verdict of result.json of mmrjax loop"),
+    "verdict of a climb": _explain_by_table(
         {name: meaning for name, (_, meaning) in VERDICTS.items()}, "verdict of result.json of mmrjax climb"
     ),
-    "flag": _meaning(words.FLAGS, "column flags of runs.csv, counts in result.json; a run may have several"),
-    "channel": _channel,
-    "output": _output,
-    "parameter": _parameter,
-    "condition": _condition,
-    "word of the reports": _meaning({k: v for k, v in words.GLOSSARY.items() if k not in words.LOOP_VERDICTS}),
+    "flag": _explain_by_table(words.FLAGS, "column flags of runs.csv, counts in result.json; a run may have several"),
+    "channel": _channel_lines,
+    "output": _output_lines,
+    "parameter": _parameter_lines,
+    "condition": _condition_lines,
+    "word of the reports": _explain_by_table(
+        {k: v for k, v in words.GLOSSARY.items() if k not in words.LOOP_VERDICTS}
+    ),
 }

@@ -1,4 +1,6 @@
-"""The command `export`: a drive in the format of another simulator, with what the format loses."""
+"""The command `export`: a drive in the format of another simulator, with a report of what the format cannot
+represent.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`calibrate --feedforward`: constants kS, kV, kA of a log, as users of WPILib state them."""
+"""`calibrate --feedforward`: feedforward constants kS, kV, kA of a log, as in WPILib."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def execute(config: configuration.Calibrate, beside: configuration.FittedRuns) -
 
 
 def drive_log(runs: Runs, unit: str | None = None, as_logged: bool = False) -> DriveLog:
-    """Readings of a log in a unit of position. None: the unit of its first pair of channels.
+    """Readings of a log, with positions in a given unit. None: the unit of the first pair of channels.
 
     Args:
         as_logged: True for a log of SysId, which is in units of its own. `unit` is their name.

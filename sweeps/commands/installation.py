@@ -23,9 +23,9 @@ def check_installation() -> int:
         "packages": lambda: ", ".join(f"{name} {importlib.metadata.version(name)}" for name in ("mmrjax", *PACKAGES)),
         "devices": lambda: ", ".join(map(str, jax.devices())),
         "compilation cache": compilation_cache.describe_cache,
-        "a solved run": _run,
-        "derivatives": _derivative,
-        "writing here": _folder,
+        "a solved run": _check_run,
+        "derivatives": _check_derivative,
+        "writing here": _check_folder,
     }
     healthy = True
     for k, (name, check) in enumerate(checks.items(), 1):
@@ -38,7 +38,7 @@ def check_installation() -> int:
     return 0 if healthy else 1
 
 
-def _run() -> str:
+def _check_run() -> str:
     """Check against a known answer: on level ground, a drive without losses turns at U / C_E and draws no current."""
     import jax.numpy as jnp
 
@@ -58,7 +58,7 @@ def _run() -> str:
     return f"no-load speed {motor_speed:.3f} rad/s = 24 V / C_E ({time.perf_counter() - start:.1f} s with compiling)"
 
 
-def _derivative() -> str:
+def _check_derivative() -> str:
     import jax
 
     from mmrjax.fidelities.steady import steady
@@ -77,7 +77,7 @@ def _derivative() -> str:
     return f"d(current)/d(motor friction) = {exact:.4f} A/(N·m), as by central difference"
 
 
-def _folder() -> str:
+def _check_folder() -> str:
     with tempfile.NamedTemporaryFile(dir=".") as file:
         file.write(b"mmrjax")
     return "the working folder can be written"

@@ -1,4 +1,4 @@
-"""The command `loop`: from a table of runs to what the model lacks, and a robot that has it."""
+"""The command `loop`: finds the effects that the model of a robot lacks, from a table of runs."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ import numpy as np
 import mmrjax as mm
 from calibration.data import Columns, effect_file, robot_file
 from calibration.data.runs import Runs
-from calibration.described import in_words
+from calibration.described import report_in_words
 from calibration.discovery import findings
 from calibration.discovery.discover import discover
 from calibration.discovery.kept import REFIT_FILE, OutOfTime
@@ -53,21 +53,23 @@ def execute(config: configuration.Loop, beside: configuration.LoopBeside) -> int
     if config.model is not None:
         from sweeps.commands import loop_joints
 
-        return loop_joints.run_joints(config, beside, _timed_loop)
+        return loop_joints.run_joints(config, beside, _run_with_time_limit)
     robot = load_robot(config).robot
-    return _timed_loop(
+    return _run_with_time_limit(
         config, beside, robot, read_runs(beside.data, robot, columns=config.columns, measured=True, series=True)
     )
 
 
-def _timed_loop(config: configuration.Loop, beside: configuration.LoopBeside, robot: Robot, runs: Runs) -> int:
+def _run_with_time_limit(
+    config: configuration.Loop, beside: configuration.LoopBeside, robot: Robot, runs: Runs
+) -> int:
     try:
-        return _loop(config, beside, robot, runs)
+        return _run_loop(config, beside, robot, runs)
     except OutOfTime:
         return SOLVER_FAILED
 
 
-def _loop(config: configuration.Loop, beside: configuration.LoopBeside, robot: Robot, runs: Runs) -> int:
+def _run_loop(config: configuration.Loop, beside: configuration.LoopBeside, robot: Robot, runs: Runs) -> int:
     began, within = time.monotonic(), beside.seconds
     stated = priors.parse_priors(config.prior)
     if config.resolve:
@@ -103,7 +105,7 @@ def _loop(config: configuration.Loop, beside: configuration.LoopBeside, robot: R
             return result
 
         try:
-            with _alarm(left(), lambda: "verdict" not in stages):
+            with _time_limit(left(), lambda: "verdict" not in stages):
                 verdict = discover(
                     runs, robot, rows=config.rows, noise=config.noise or None, stated=stated,
                     library=effect_file.effect_library(config.effects), replicates=replicates, seed=config.seed,
@@ -111,11 +113,11 @@ def _loop(config: configuration.Loop, beside: configuration.LoopBeside, robot: R
                 )  # fmt: skip
         except KeyboardInterrupt as ended:
             if isinstance(ended, OutOfTime):
-                _say_out_of_time(within, begun=bool(stages))
-            _say_kept(stages, folder, config.robot)
+                _report_out_of_time(within, begun=bool(stages))
+            _report_stored_stages(stages, folder, config.robot)
             raise
         if config.resolve:
-            verdict = _resolved(verdict, config, beside.members, progress)
+            verdict = _add_track_model_test(verdict, config, beside.members, progress)
         document = loop_report.loop_document(verdict, config.robot, changes_by_effect(verdict))
         page = print_report(document, brief=not beside.verbose)
         if config.resolve and verdict.resolved is None:
@@ -127,28 +129,30 @@ def _loop(config: configuration.Loop, beside: configuration.LoopBeside, robot: R
         return finish_run_folder(folder, config, manifest, solved=verdict.converged, page=page, runs=verdict.runs)
 
 
-def _resolved(
+def _add_track_model_test(
     found: DiscoveryResult, config: configuration.Loop, members: Path | None, progress: Callable[[str], None]
 ) -> DiscoveryResult:
-    """The result, with the track model's test added: does a different running gear explain the misfit?"""
+    """Result with the test of the track model added: does a different running gear explain the misfit?"""
     resolved = fit_track_model(
         found, noise=config.noise or None, population=config.population, generations=config.generations,
-        members=members, seed=config.seed, tell=in_words(progress),
+        members=members, seed=config.seed, tell=report_in_words(progress),
     )  # fmt: skip
     return dataclasses.replace(found, resolved=resolved)
 
 
-def _say_out_of_time(within: float, begun: bool) -> None:
-    """Report that the time budget [s] ended before a verdict. `begun`: at least one stage has finished."""
+def _report_out_of_time(within: float, begun: bool) -> None:
+    """Reports that the time budget [s] ended before a verdict. `begun`: True if at least one stage has finished."""
     more = max(5, math.ceil(within / 30))  # twice as much
     first = "" if begun else f", and no fit of the base model; allow more time, such as --within {more}min"
     print_message(f"no verdict within {within:g} s{first}")
 
 
 @contextlib.contextmanager
-def _alarm(seconds: float, wanted: Callable[[], bool]) -> Iterator[None]:
-    """Raise `OutOfTime` within once so much time has passed, in the middle of a step too where the platform can,
-    while it is `wanted`. It is repeated every second, because a called function may suppress it.
+def _time_limit(seconds: float, wanted: Callable[[], bool]) -> Iterator[None]:
+    """Context manager that raises `OutOfTime` in its block after this many seconds, as long as `wanted` is true.
+
+    On platforms that allow it, it also interrupts a running step. It repeats every second, because a called function
+    may suppress the exception.
     """
     if not hasattr(signal, "SIGALRM"):
         yield
@@ -178,8 +182,8 @@ def _show_ranking(found: EffectRanking, folder: RunFolder, timed: Callable[[str]
     folder.write_json(store.SCREENING_FILE, content)
 
 
-def _say_kept(stages: Mapping[str, Any], folder: RunFolder, robot_name: str) -> None:
-    """Print which stages are stored. Without a verdict, write the robot of the base fit if it is known."""
+def _report_stored_stages(stages: Mapping[str, Any], folder: RunFolder, robot_name: str) -> None:
+    """Reports which stages are stored. Without a verdict, writes the robot of the base fit if it is known."""
     if not stages:
         return
     kept = [name for name in stages if folder.keeps(name)]
@@ -212,7 +216,7 @@ def _say_kept(stages: Mapping[str, Any], folder: RunFolder, robot_name: str) -> 
 
 
 def changes_by_effect(found: DiscoveryResult) -> dict[str, Change]:
-    """Change of settled runs by each effect, empty for histories and for effects that the written robot lacks."""
+    """Change of settled runs by each effect. Empty for histories, and for effects that the written robot lacks."""
     added = [e.name for e in found.effects if e.name in {x.name for x in found.robot.effects}]
     if not isinstance(found.detail, EquationErrors) or not added:
         return {}

@@ -154,7 +154,7 @@ def runs_of_joints(log: NamedArrays, chain: Chain, robots: Mapping[str, Robot]) 
         robots: robot of each joint, by the joint's name.
 
     Raises:
-        BadData: as `smoothed_log` and `records.of_arrays`.
+        BadData: as `smoothed_log` and `records.runs_of_arrays`.
     """
     motion = smoothed_log(log, chain)
     torques, cubic = (chain.torques(x) for x in (motion, smoothed_log(log, chain, 3)))
@@ -172,7 +172,7 @@ def runs_of_joints(log: NamedArrays, chain: Chain, robots: Mapping[str, Robot]) 
         if CURRENT in kept and SD not in kept:
             columns[SD] = np.hypot(doubt[:, k] / per_ampere, noise_of(column_numbers(kept[CURRENT])))
         arrays = NamedArrays(f"{log.name}, joint {name}", tuple(columns), tuple(columns.values()), digest=log.digest)
-        runs[name] = records.of_arrays(arrays, robot=robot)
+        runs[name] = records.runs_of_arrays(arrays, robot=robot)
     return runs
 
 

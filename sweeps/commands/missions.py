@@ -1,4 +1,4 @@
-"""The command `simulate` over a profile: every run follows one mission. Its numbers, segments, course as tables."""
+"""The command `simulate` with a profile: every run follows one mission. Results, segments and courses are tables."""
 
 from __future__ import annotations
 
@@ -77,14 +77,14 @@ def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> 
             f"{source.source}, speed_mm_s: the robot's load is a shaft, so there is no travelling speed; give "
             "motor_speed_rpm or duty"
         )
-    source.check_source(config.battery)
+    source.check_supply(config.battery)
     for column in source.stated:
         if column in beside.stated:
             raise BadConfiguration(
                 f"{OPTIONS[column]}: got it in addition to {source.source}, which contains {column}; keep one of "
                 "the two"
             )
-    _check_charge(robot, config)
+    _check_battery_charge(robot, config)
     runs = given_runs(robot, beside, config, source.stated)
     for column in source.stated:
         if beside.runs is not None and runs.has(column):
@@ -97,8 +97,8 @@ def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> 
     _check_cutoff(robot, runs, source, config)
     with open_folder("simulate", config, robot, beside, runs) as folder:
         ended = run_missions(robot, runs, source, config)
-        folder.write_table("segments.csv", capabilities.without_idle(robot, ended.segments))
-        folder.write_table("history.csv", capabilities.without_idle(robot, ended.course))
+        folder.write_table("segments.csv", capabilities.drop_inapplicable_columns(robot, ended.segments))
+        folder.write_table("history.csv", capabilities.drop_inapplicable_columns(robot, ended.course))
         if not ended.whole:
             print_message(
                 "history.csv ends before the mission, because the mission took more steps than can be saved"
@@ -125,7 +125,9 @@ def _check_turning(robot: Robot, runs: records.Runs, source: ProfileTable) -> No
         )
 
 
-def _commanded(robot: Robot, runs: records.Runs, source: ProfileTable, config: configuration.Simulate) -> Conditions:
+def _conditions_of_runs(
+    robot: Robot, runs: records.Runs, source: ProfileTable, config: configuration.Simulate
+) -> Conditions:
     """Conditions of the runs. For robots that turn, they include the lateral adhesion of a given surface."""
     conditions = run.conditions_of_runs(robot, runs, config)
     if not source.turns or not runs.has(profiles.SURFACE) or source.surface is not None:
@@ -136,7 +138,7 @@ def _commanded(robot: Robot, runs: records.Runs, source: ProfileTable, config: c
     return dataclasses.replace(conditions, adhesion_lateral=jax.numpy.asarray(lateral))
 
 
-def _check_charge(robot: Robot, config: configuration.Simulate) -> None:
+def _check_battery_charge(robot: Robot, config: configuration.Simulate) -> None:
     capacity = float(robot.battery.capacity) / COULOMB_PER_MAH
     if config.battery and config.discharge_mAh >= capacity:
         raise BadConfiguration(
@@ -146,7 +148,7 @@ def _check_charge(robot: Robot, config: configuration.Simulate) -> None:
 
 
 def _check_cutoff(robot: Robot, runs: records.Runs, source: ProfileTable, config: configuration.Simulate) -> None:
-    """Reject missions that begin with cells below their cut-off voltage."""
+    """Rejects missions that would start with cells below their cut-off voltage."""
     if not config.battery:
         return
     conditions = run.conditions_of_runs(robot, runs, config)
@@ -160,8 +162,8 @@ def _check_cutoff(robot: Robot, runs: records.Runs, source: ProfileTable, config
 
 
 def run_missions(robot: Robot, runs: records.Runs, source: ProfileTable, config: configuration.Simulate) -> Missions:
-    """Runs over a profile."""
-    conditions = _commanded(robot, runs, source, config)
+    """Simulates runs over a profile."""
+    conditions = _conditions_of_runs(robot, runs, source, config)
     profile = source.profile(robot, conditions)
     names = run.run_names(runs)
     rows = max(LEAST_ROWS, min(MOST_ROWS, ALL_ROWS // len(runs)))
@@ -190,16 +192,24 @@ def run_missions(robot: Robot, runs: records.Runs, source: ProfileTable, config:
             whole &= bool((batch.steps - batch.rejected <= batch.course.time.shape[-1]).all())
             done += count
             advance(count)
-    about = _conditions(robot, runs, source, config)
-    return Missions({**about, **_stacked(tables)}, _stacked(segments), _stacked(courses), source, whole)
+    about = _condition_columns(robot, runs, source, config)
+    return Missions(
+        {**about, **_concatenate_tables(tables)},
+        _concatenate_tables(segments),
+        _concatenate_tables(courses),
+        source,
+        whole,
+    )
 
 
-def _stacked(tables: list[Columns]) -> Columns:
+def _concatenate_tables(tables: list[Columns]) -> Columns:
     """Concatenated tables with the same columns."""
     return {key: np.concatenate([table[key] for table in tables]) for key in tables[0]}
 
 
-def _conditions(robot: Robot, runs: records.Runs, source: ProfileTable, config: configuration.Simulate) -> Columns:
+def _condition_columns(
+    robot: Robot, runs: records.Runs, source: ProfileTable, config: configuration.Simulate
+) -> Columns:
     """Conditions of the runs, empty where the profile states them or the battery sets them."""
     nothing = np.full(len(runs), np.nan)
     unknown = {*source.stated, *(["supply_voltage_V"] if config.battery else [])}
@@ -213,7 +223,7 @@ def _conditions(robot: Robot, runs: records.Runs, source: ProfileTable, config: 
 def _segment_rows(
     robot: Robot, conditions: Conditions, source: ProfileTable, found: Mission, names: np.ndarray
 ) -> Columns:
-    """A row for each segment of each cycle of each run, up to where the run has ended."""
+    """Table with a row for each segment of each cycle of each run, up to the end of the run."""
     numbers = mission_batch.numbers_by_column(
         jax.device_get(mission_batch.mission_totals(found.segments, found.segment_peaks))
     )
@@ -221,8 +231,10 @@ def _segment_rows(
     time = np.asarray(found.segments.time).reshape(runs, -1)
     begun = np.cumsum(time, 1) - time
     count = cycles * segments
-    last = np.stack([np.searchsorted(_segment_of(found, k), np.arange(count), side="right") - 1 for k in range(runs)])
-    whole = np.stack([_segment_of(found, k)[np.maximum(last[k], 0)] == np.arange(count) for k in range(runs)])
+    last = np.stack(
+        [np.searchsorted(_segment_of_steps(found, k), np.arange(count), side="right") - 1 for k in range(runs)]
+    )
+    whole = np.stack([_segment_of_steps(found, k)[np.maximum(last[k], 0)] == np.arange(count) for k in range(runs)])
     assert found.course is not None  # it was asked for
     discharge = np.asarray(found.course.signals.discharge).reshape(*found.course.time.shape, -1)[..., 0]
     discharge = np.take_along_axis(discharge, np.maximum(last, 0), 1)
@@ -251,21 +263,23 @@ def _segment_rows(
     return {column: rows[column][reached] for column in (*order, "status", "flags")}
 
 
-def _segment_of(found: Mission, k: int) -> np.ndarray:
+def _segment_of_steps(found: Mission, k: int) -> np.ndarray:
     """Segment of each stored step of a run. Steps after the last one get an index beyond the last segment."""
     assert found.course is not None  # it was asked for
     segment = np.asarray(found.course.segment[k])
     return np.where(segment < 0, np.iinfo(segment.dtype).max, segment)
 
 
-def rows_to_keep(segment: np.ndarray, current: np.ndarray, most: int, marked: np.ndarray | None = None) -> np.ndarray:
-    """Rows of a course to keep, in order: the peak of current of each segment, marked rows, evenly spread ones.
+def select_course_rows(
+    segment: np.ndarray, current: np.ndarray, most: int, marked: np.ndarray | None = None
+) -> np.ndarray:
+    """Rows of a course to keep, in order: the current peak of each segment, marked rows, and evenly spaced ones.
 
     Args:
-        segment: number of the segment of each row, not decreasing.
+        segment: index of the segment of each row, not decreasing.
         current: current of each row.
-        most: rows to keep at most.
-        marked: rows to keep, of many the last ones.
+        most: largest number of rows to keep.
+        marked: rows to keep. If there are too many, the last ones.
     """
     if len(segment) <= most:
         return np.arange(len(segment))
@@ -283,13 +297,13 @@ def rows_to_keep(segment: np.ndarray, current: np.ndarray, most: int, marked: np
 def _course_rows(
     robot: Robot, conditions: Conditions, source: ProfileTable, found: Mission, k: int, name: str, most: int
 ) -> Columns:
-    """Rows of history.csv of one run."""
+    """Rows of history.csv for one run."""
     course = jax.tree.map(lambda x: np.asarray(x[k]), found.course)
     filled = course.segment >= 0
     signals = course.signals
     marked = course.event[filled] >= _LASTING
     largest = np.abs(signals.current).reshape(len(filled), -1).max(1)  # of either side
-    picked = np.flatnonzero(filled)[rows_to_keep(course.segment[filled], largest[filled], most, marked)]
+    picked = np.flatnonzero(filled)[select_course_rows(course.segment[filled], largest[filled], most, marked)]
     course = jax.tree.map(lambda x: x[picked], course)
     signals, of_sides = course.signals, {}
     winding, housing = course.temperature_winding, course.temperature_housing

@@ -1,4 +1,4 @@
-"""The command `render`: a picture or a film of a run whose running gear is resolved."""
+"""The command `render`: a picture or a film of a run of the track model."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ def execute(config: configuration.Render, picture: configuration.Picture) -> int
     if picture.climb is not None:
         if config != configuration.Render() or picture.stated:
             raise BadConfiguration("--climb: not allowed with options of a run of the track model; give one of them")
-        _check_free(picture)
+        _check_output_file(picture)
         climb = Seen.read(picture.climb)
         from sweeps.pages import climb_figures
 
-        _write_whole(file, lambda aside: climb_figures.render_climb(climb, aside, begin, end, slow))
+        _write_completely(file, lambda aside: climb_figures.render_climb(climb, aside, begin, end, slow))
         print_output(str(file))
         return DONE
     still, given = file.suffix == ".png", picture.stated
@@ -47,7 +47,7 @@ def execute(config: configuration.Render, picture: configuration.Picture) -> int
         rendering.frame_times(file, begin, end, slow, options["duration"])
     except ValueError as error:
         raise BadConfiguration(f"render: {error}") from error
-    _check_free(picture)
+    _check_output_file(picture)
     robot = load_robot(config).robot
     imposed.check_on_ground(robot, "render")
     if config.turns:
@@ -64,17 +64,17 @@ def execute(config: configuration.Render, picture: configuration.Picture) -> int
     trajectory, conditions = jax.tree.map(lambda x: x[0], (trajectory, conditions))
 
     def draw(aside: Path) -> None:
-        view = (rendering_from_above if config.turns else rendering).scene(robot, conditions, trajectory)
+        view = (rendering_from_above if config.turns else rendering).scene_of_run(robot, conditions, trajectory)
         rendering.render(view, aside, begin, end, slow)
 
-    _write_whole(file, draw)
+    _write_completely(file, draw)
     status = STATUSES[int(trajectory.result.status)]
     print_output(f"{status}: {words.STATUSES[status].why}")
     print_output(str(file))
     return SOLVER_FAILED if status == "failed" else DONE
 
 
-def _check_free(picture: configuration.Picture) -> None:
+def _check_output_file(picture: configuration.Picture) -> None:
     file = picture.file
     if file.exists() and not picture.force:
         raise BadConfiguration(f"FILE: {file} exists already; choose another name (--force replaces it)")
@@ -82,7 +82,7 @@ def _check_free(picture: configuration.Picture) -> None:
         raise BadConfiguration(f"FILE: {file.parent} is not a folder; choose another path")
 
 
-def _write_whole(file: Path, draw: Callable[[Path], Any]) -> None:
+def _write_completely(file: Path, draw: Callable[[Path], Any]) -> None:
     """Write a picture or film completely or not at all."""
     with replacing(file) as aside, progress_bar(1, quiet=False, doing="drawing") as advance:
         try:

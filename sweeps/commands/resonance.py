@@ -1,4 +1,4 @@
-"""The command `resonance`: ripple over speed and payload, and which speeds to avoid."""
+"""The command `resonance`: ripple over speed and payload, and the speeds to avoid."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from mmrjax.model.signals import STATUSES
 from mmrjax.undercarriage.modes import Mode, modes
 from mmrjax.undercarriage.ripple_peaks import (
     SIGNALS,
-    Passing,
-    Peak,
-    confirm_peaks,
+    PassingParts,
+    RipplePeak,
+    drop_unconfirmed_modes,
     find_crossings,
     passing_parts,
     peaks_over_speed,
@@ -82,7 +82,7 @@ def execute(config: configuration.Resonance, beside: configuration.FolderPart) -
         columns = _ripple_columns(folder, robot, conditions, config, what)
         table = {**run.condition_table(robot, runs), "table8": of_table8, **columns}
         result = _modes_and_peaks(config, robot, what, table)
-        _write(folder, config, result)
+        _write_folder(folder, config, result)
         document = print_report(resonance_report.resonance_document(result, file), file)
         manifest, solved = {"seed": None, "statuses": result.statuses}, words.every_run_solved(result.statuses)
         return finish_run_folder(
@@ -97,7 +97,9 @@ def execute(config: configuration.Resonance, beside: configuration.FolderPart) -
         )
 
 
-def _grid(config: configuration.Resonance, voltages: tuple[float, ...], payloads: tuple[float, ...]) -> GridPart:
+def _speed_grid(
+    config: configuration.Resonance, voltages: tuple[float, ...], payloads: tuple[float, ...]
+) -> GridPart:
     assert config.configuration is not None
     return GridPart(
         configurations=(config.configuration,),
@@ -111,7 +113,7 @@ def _grid(config: configuration.Resonance, voltages: tuple[float, ...], payloads
 def _grid_and_table_8(config: configuration.Resonance, robot: Robot) -> tuple[Runs, np.ndarray]:
     """Points of the grid and the missing points of Table 8, and the rows that belong to Table 8."""
     parts = [
-        grid_conditions(_grid(config, v, p), robot)
+        grid_conditions(_speed_grid(config, v, p), robot)
         for v, p in ((config.voltages_V, config.payloads_kg), (VOLTAGES_V, PAYLOADS_KG))
     ]
     pairs = [list(zip(part["supply_voltage_V"], part["payload_kg"], strict=True)) for part in parts]
@@ -124,7 +126,7 @@ def _grid_and_table_8(config: configuration.Resonance, robot: Robot) -> tuple[Ru
 
 
 def _ripple_columns(
-    folder: RunFolder, robot: Robot, conditions: Conditions, config: configuration.Resonance, what: Passing
+    folder: RunFolder, robot: Robot, conditions: Conditions, config: configuration.Resonance, what: PassingParts
 ) -> Columns:
     """Ripple columns, computed in chunks. Chunks stored by an interrupted run are not simulated again."""
     total, parts = conditions.shape[0], []
@@ -139,7 +141,7 @@ def _ripple_columns(
                 chosen = jax.tree.map(lambda x, rows=rows: x[rows], conditions)
                 options = {key: config.options[key] for key in ("duration", "step")}
                 ended = track_batch(robot, chosen, rolling=True, progress=counter, **options)
-                part = {key: x[:count] for key, x in _columns(robot, ended, what).items()}
+                part = {key: x[:count] for key, x in _ripple_of_batch(robot, ended, what).items()}
                 folder.keep_chunk(name, part)
                 counter(1.0)
             else:
@@ -148,7 +150,7 @@ def _ripple_columns(
     return {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
 
 
-def _columns(robot: Robot, ended: Any, what: Passing) -> Columns:
+def _ripple_of_batch(robot: Robot, ended: Any, what: PassingParts) -> Columns:
     """Ripple of a batch of runs, in the units of the table."""
     vibrations = vibrations_of_runs(robot, ended, what.pitch)
     status = np.array(STATUSES)[vibrations.status]
@@ -166,14 +168,16 @@ def _columns(robot: Robot, ended: Any, what: Passing) -> Columns:
     return columns
 
 
-def _modes_and_peaks(config: configuration.Resonance, robot: Robot, what: Passing, table: Columns) -> ResonanceResult:
+def _modes_and_peaks(
+    config: configuration.Resonance, robot: Robot, what: PassingParts, table: Columns
+) -> ResonanceResult:
     """Natural frequencies at the middle voltage, and peaks and crossings at each payload."""
     assert config.configuration is not None
     payloads, middle = config.payloads_kg, config.voltages_V[len(config.voltages_V) // 2]
-    middle_runs = _grid(config, (middle,), payloads)
+    middle_runs = _speed_grid(config, (middle,), payloads)
     linear = modes(robot, run.conditions_of_runs(robot, grid_conditions(middle_runs, robot), config))
     by_payload = dict(zip(payloads, linear, strict=True))
-    tops: list[Peak] = []
+    tops: list[RipplePeak] = []
     ends: dict[float, tuple[float, float]] = {}
     for payload, peaks in by_payload.items():
         gridded = (table["payload_kg"] == payload) & np.isin(table["supply_voltage_V"], config.voltages_V)
@@ -192,20 +196,20 @@ def _modes_and_peaks(config: configuration.Resonance, robot: Robot, what: Passin
         ]  # fmt: skip
         tops += here
         ends[payload] = float(speed[0]), float(speed[-1])
-    tops = confirm_peaks(tops, by_payload)
+    tops = drop_unconfirmed_modes(tops, by_payload)
     meets = [c for p, peaks in ends.items() for c in find_crossings(by_payload[p], p, what.travel, *peaks, tops)]
     return ResonanceResult(
         config.configuration, config.slope_deg, config.surface, what, robot, table, by_payload, tops, meets
     )
 
 
-def _write(folder: RunFolder, config: configuration.Resonance, found: ResonanceResult) -> None:
+def _write_folder(folder: RunFolder, config: configuration.Resonance, found: ResonanceResult) -> None:
     folder.write_table("points.csv", found.table)
     folder.write_table(
         "modes.csv",
         _tuple_columns([{"payload_kg": p, **m._asdict()} for p, modes in found.modes.items() for m in modes], Mode),
     )
-    folder.write_table("peaks.csv", _tuple_columns([p._asdict() for p in found.peaks], Peak))
+    folder.write_table("peaks.csv", _tuple_columns([p._asdict() for p in found.peaks], RipplePeak))
     folder.write_json("result.json", found.to_json())
 
 

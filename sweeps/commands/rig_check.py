@@ -1,4 +1,6 @@
-"""The command `rig check`: what a rig's file says, whether its numbers make sense, what data can tell of it."""
+"""The command `rig check`: how a rig file is interpreted, whether its numbers are plausible, and what data can
+determine.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +14,7 @@ import numpy as np
 from calibration.data import Json, Names, rig_facts, settling
 from calibration.data.columns import IMPOSED, SUPPLY, Layout
 from calibration.data.input_errors import BadConfiguration
-from calibration.data.rig_facts import Fact, Origin
+from calibration.data.rig_facts import DerivedFact, NumberOrigin
 from calibration.data.rig_file import FREE
 from calibration.data.runs import Runs
 from calibration.data.stated import EXAMPLE, EXAMPLE_SHARE, is_example
@@ -44,20 +46,20 @@ class RigCheck:
 
     Attributes:
         file: file that was read.
-        robot: of it.
-        examples: its lines that still hold an example's number.
+        robot: robot of the file.
+        examples: lines of the file that still have a number of the template.
         origins: origins of its numbers.
-        facts: facts that follow from them.
+        facts: values that follow from its numbers.
         runs: runs of the table, None without one.
-        foresight: what it can determine.
-        doubts: doubts of a log over time, a sentence each: signs that are wrong, time or current in another unit.
+        foresight: parameters that the table can determine.
+        doubts: sentences on doubts about a log: wrong signs, time or current in another unit.
     """
 
     file: str
     robot: Robot
     examples: tuple[int, ...]
-    origins: tuple[Origin, ...]
-    facts: tuple[Fact, ...]
+    origins: tuple[NumberOrigin, ...]
+    facts: tuple[DerivedFact, ...]
     runs: Runs | None = None
     foresight: InformationForecast | None = None
     doubts: Names = ()
@@ -68,7 +70,7 @@ class RigCheck:
         count = int(robot.sides)
         motors = "One motor drives" if count == 1 else f"{count} motors with the same command drive"
         gear = f"{'its' if count == 1 else 'their'} gearbox {float(robot.gearbox.ratio):g} : 1"
-        loads = "; ".join(f"{name}: {_load(load)}" for name, load in robot.configurations.items())
+        loads = "; ".join(f"{name}: {_load_words(load)}" for name, load in robot.configurations.items())
         imposed = "the voltage (times the duty in histories)"
         words = {"motor_speed": "the motors' speed", "motor_current": "the current of each motor"}
         words |= {goal: f"the goal of a controller ({goal.removeprefix('goal_')})" for goal in GOALS}
@@ -107,7 +109,9 @@ class RigCheck:
             )
         notes += [f"{fact.what} {fact.value}: {fact.odd}" for fact in self.facts if fact.odd]
         loose = [
-            _program(self.robot, o) for o in self.origins if o.why.startswith("the file") and o.sd is None and o.value
+            _default_origin(self.robot, o)
+            for o in self.origins
+            if o.why.startswith("the file") and o.sd is None and o.value
         ]
         if loose and not self.robot.rig.inherits:
             notes.append(f"no ± is given, so the default ± is used: {', '.join(loose)}")
@@ -137,7 +141,7 @@ class RigCheck:
                     "signed": instrument.signed,
                     "quantum": None if instrument.quantum is None else instrument.quantum / channel.factor,
                     "unit": channel.unit,
-                    "sd": usual if self.foresight is None else _source_of_sd(self.foresight.noise[k], channel),
+                    "sd": usual if self.foresight is None else _noise_source_words(self.foresight.noise[k], channel),
                 }
             )
         return rows
@@ -148,7 +152,7 @@ class RigCheck:
             return []
         rows, theirs = [], self.runs.headings
         for name, values in self.runs.columns.items():
-            if name not in theirs and self._means_nothing(name):
+            if name not in theirs and self._does_not_apply(name):
                 continue
             number = np.issubdtype(values.dtype, np.number)
             finite = values[np.isfinite(values)] if number else values
@@ -157,7 +161,7 @@ class RigCheck:
                 {
                     "column": name,
                     "theirs": theirs.get(name, ""),
-                    "use": _use(name, self.robot) if name in theirs else "not in the table",
+                    "use": _use_of_column(name, self.robot) if name in theirs else "not in the table",
                     "values": len(kinds),
                     "least": float(finite.min()) if number and len(finite) else None,
                     "greatest": float(finite.max()) if number and len(finite) else None,
@@ -166,7 +170,7 @@ class RigCheck:
             )
         return rows
 
-    def _means_nothing(self, column: str) -> bool:
+    def _does_not_apply(self, column: str) -> bool:
         """True if a column missing from the table does not apply to this rig: ground, or another kind of drive."""
         idle = Layout.of(self.robot).idle
         return column in idle or (column == SUPPLY and self.robot.rig.imposed != "voltage")
@@ -243,7 +247,7 @@ class RigCheck:
         }
 
 
-def _source_of_sd(word: str, channel: Channel) -> str:
+def _noise_source_words(word: str, channel: Channel) -> str:
     """Origin of the sd of a channel, in words."""
     every = {
         "columns": "of the table", "series": "estimated from the scatter of readings along series of rows",
@@ -252,13 +256,13 @@ def _source_of_sd(word: str, channel: Channel) -> str:
     return every.get(word, word)
 
 
-def _program(robot: Robot, origin: Origin) -> str:
-    """A number without ±, with the default prior width that a fit gives it."""
+def _default_origin(robot: Robot, origin: NumberOrigin) -> str:
+    """Line on a number without ±, with the default prior width that a fit uses."""
     sd = float(priors.parameter_coordinates(robot, (origin.name,)).prior_sd[0])
     return f"{origin.name} (±{100 * sd / abs(origin.value):.2g} %)"
 
 
-def _load(load: Any) -> str:
+def _load_words(load: Any) -> str:
     if not isinstance(load, Shaft):
         on = "tracks" if float(load.on_tracks) > 0.5 else "wheels"
         return f"a vehicle of {float(load.mass):g} kg on {on}"
@@ -270,7 +274,7 @@ def _load(load: Any) -> str:
     return ", ".join(words)
 
 
-def _use(column: str, robot: Robot) -> str:
+def _use_of_column(column: str, robot: Robot) -> str:
     if column == IMPOSED[robot.rig.imposed][0]:
         return "imposed"
     for channel in channels.EVERY:

@@ -1,4 +1,4 @@
-"""Numbers of a driven joint of a model of MuJoCo, the way back from `export --to mujoco`."""
+"""Numbers of a driven joint of a MuJoCo model, the reverse of `export --to mujoco`."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from calibration.data.input_files import VALUE, check_memory, file_bytes, first_
 from calibration.data.named_arrays import cell_number
 from mmrjax.errors import list_some
 from sweeps.commands.rig_joint import Found, JointNumbers, hanging_torque_and_angle, is_round
-from sweeps.commands.rig_template import Stated
+from sweeps.commands.rig_template import StatedNumber
 from sweeps.export import mujoco
 
 #: Largest model that is read [bytes].
@@ -38,22 +38,22 @@ LEVEL, EQUAL = 0.1, 0.01
 
 
 def read_mujoco_hinge(source: Path, joint: str | None) -> JointNumbers:
-    """Returns the numbers of a hinge, defaults resolved by MuJoCo's compiler.
+    """Numbers of a hinge. Defaults are resolved by MuJoCo's compiler.
 
     With a `<dcmotor>` on the hinge, its winding and effects are those of the motor.
 
     Args:
         source: the model.
-        joint: by name, None: the only driven one.
+        joint: name of the joint. None: the only driven one.
 
     Raises:
         BadConfiguration: a model that MuJoCo refuses, or a joint that it does not have or that is no hinge.
     """
-    return _Model(mujoco.mujoco_module(), read_mujoco_model(source), source.name).numbers(joint)
+    return _MujocoModel(mujoco.mujoco_module(), read_mujoco_model(source), source.name).numbers(joint)
 
 
 def read_mujoco_model(source: Path) -> Any:
-    """Returns the model of a file, compiled by MuJoCo.
+    """Model of a file, compiled by MuJoCo.
 
     Raises:
         BadConfiguration: a model that MuJoCo refuses.
@@ -125,7 +125,7 @@ def _check_attributes(element: Element, file: Path, folder: Path, inside: Sequen
     return int(size) if tag in COPIES else 1
 
 
-class _Model:
+class _MujocoModel:
     def __init__(self, library: Any, model: Any, file: str) -> None:
         self.library, self.model, self.file = library, model, file
         self.data = library.MjData(model)
@@ -172,7 +172,7 @@ class _Model:
             raise BadConfiguration(f"{self.file}, {named}: no mass turns with it; expected an inertia")
         actuator = self.actuators.get(joint)
         gear = 1.0 if actuator is None else abs(float(model.actuator_gear[actuator, 0]))
-        drive: dict[str, Stated] = {}
+        drive: dict[str, StatedNumber] = {}
         if actuator is not None and self.is_motor[actuator]:
             drive = _dc_motor(model, actuator, dof, gear, self.file)
         stated = lambda value, what: (float(value), f"{named}, {what}") if value else None  # noqa: E731
@@ -244,14 +244,14 @@ class _Model:
         return len(equal), f"equal wheels: {', '.join(equal)}"
 
 
-def _dc_motor(model: Any, actuator: int, dof: int, ratio: float, file: str) -> dict[str, Stated]:
+def _dc_motor(model: Any, actuator: int, dof: int, ratio: float, file: str) -> dict[str, StatedNumber]:
     """Numbers of a `<dcmotor>` by dotted name. Losses of its bristles act at the joint."""
     every = (model.actuator_gainprm, model.actuator_dynprm, model.actuator_biasprm)
     gain, dynamic, bias = (x[actuator] for x in every)
     resistance, constant = float(gain[0]), float(gain[1])
     effects = _effects(dynamic, bias, ratio)
     friction = float(model.dof_frictionloss[dof]) + (float(bias[3]) * ratio if float(dynamic[5]) > 0 else 0.0)
-    number = lambda value, unit, what, width="": Stated(float(value), unit, f"{file}, {what}", width)  # noqa: E731
+    number = lambda value, unit, what, width="": StatedNumber(float(value), unit, f"{file}, {what}", width)  # noqa: E731
     numbers = {
         "motor.resistance": number(resistance, "ohm", "<dcmotor> resistance", "10 %"),
         "motor.torque_constant": number(constant, "N·m/A", "<dcmotor> motorconst", "10 %"),

@@ -7,7 +7,7 @@ import re
 from collections.abc import Mapping
 
 from calibration.data.input_errors import BadConfiguration, parse_number, three_digits
-from sweeps.commands.rig_template import Stated
+from sweeps.commands.rig_template import StatedNumber
 
 _GRAVITY, _POUND_FORCE, _INCH = 9.80665, 4.4482216, 0.0254
 #: Units of torque: as read, without dots and capitals, and in N·m.
@@ -32,15 +32,15 @@ LARGEST = 0.1
 WIDTH_RESISTANCE, WIDTH_CONSTANT = 5.0, 3.0
 
 
-def _units(text: str) -> str:
+def _unit_list(text: str) -> str:
     return re.sub(r"[\s·.*-]", "", text).casefold()
 
 
-def _number(name: str, text: str) -> float:
+def _parse_quantity(name: str, text: str) -> float:
     units = NUMBERS[name]
     expected = f"expected a positive number with a unit: {', '.join(units)}"
     split = re.fullmatch(r"\s*([-+\d.][\d.]*(?:[eE][-+]?\d+)?)\s*(.*?)\s*", text)
-    factor = None if split is None else {_units(u): f for u, f in units.items()}.get(_units(split[2]))
+    factor = None if split is None else {_unit_list(u): f for u, f in units.items()}.get(_unit_list(split[2]))
     try:
         value = parse_number(split[1]) if split is not None and factor is not None else math.nan
     except ValueError:
@@ -50,7 +50,7 @@ def _number(name: str, text: str) -> float:
     return value * factor
 
 
-def read_data_sheet(stated: Mapping[str, str]) -> dict[str, Stated]:
+def read_data_sheet(stated: Mapping[str, str]) -> dict[str, StatedNumber]:
     """Returns resistance, torque constant and friction of a motor as lines of a rig's file.
 
     U = R I_s at stall. U = R I_0 + k ω_0 and friction k I_0 at no load. M_s = k (I_s - I_0) at the stalled shaft.
@@ -67,35 +67,35 @@ def read_data_sheet(stated: Mapping[str, str]) -> dict[str, Stated]:
         raise BadConfiguration(
             f"--from-sheet: no motor data; expected --no-load-current and at least three of {others}"
         )
-    sheet = {name: _number(name, text) for name, text in stated.items()}
-    drop = _current(sheet)
+    sheet = {name: _parse_quantity(name, text) for name, text in stated.items()}
+    drop = _stall_minus_no_load_current(sheet)
     voltage, speed, idle, torque, stall, stated_resistance = map(sheet.get, NUMBERS)
     assert idle is not None
-    resistances = [(stated_resistance, "resistance"), (_ratio(voltage, stall), "voltage / stall current")]
+    resistances = [(stated_resistance, "resistance"), (_ratio_or_none(voltage, stall), "voltage / stall current")]
     if stated_resistance is None and stall is None:
-        resistances.append((_ratio(voltage, idle + drop), "voltage and power at no load"))
+        resistances.append((_ratio_or_none(voltage, idle + drop), "voltage and power at no load"))
     if voltage is None and stated_resistance is None and speed is not None and torque is not None:
         resistances.append((torque * speed / drop**2, "stall torque, no-load speed and stall current"))
     given = [(value, source) for value, source in resistances if value is not None]
     resistance = given[0][0]
     back = resistance * drop if voltage is None else voltage - resistance * idle
     constants = [
-        (_ratio(back, speed), "voltage / no-load speed"),
-        (_ratio(torque, drop), "stall torque / stall current"),
+        (_ratio_or_none(back, speed), "voltage / no-load speed"),
+        (_ratio_or_none(torque, drop), "stall torque / stall current"),
     ]
     stated_constants = [(value, source) for value, source in constants if value is not None]
-    _refuse_contradictions((given, "resistance", "ohm"), (stated_constants, "torque constant", "N·m/A"))
+    _reject_contradictions((given, "resistance", "ohm"), (stated_constants, "torque constant", "N·m/A"))
     constant = stated_constants[0][0]
 
-    def line(value: float, unit: str, source: str, width: float) -> Stated:
-        return Stated(float(f"{value:.4g}"), unit, f"data sheet, {source}", f"{width:.2g} %")
+    def line(value: float, unit: str, source: str, width: float) -> StatedNumber:
+        return StatedNumber(float(f"{value:.4g}"), unit, f"data sheet, {source}", f"{width:.2g} %")
 
-    spread = [100 * _difference(pairs) for pairs in (given, stated_constants)]
+    spread = [100 * _largest_difference(pairs) for pairs in (given, stated_constants)]
     return {
         "motor.resistance": line(resistance, "ohm", given[0][1], max(WIDTH_RESISTANCE, spread[0])),
         "motor.torque_constant": line(constant, "N·m/A", stated_constants[0][1], max(WIDTH_CONSTANT, spread[1])),
         "motor.friction_coulomb": line(constant * idle, "N·m", "torque constant × no-load current", 30.0),
-        "motor.friction_viscous": Stated(
+        "motor.friction_viscous": StatedNumber(
             0.0,
             "N·m·s",
             "the no-load current does not separate Coulomb and viscous friction; ± as if half of it were viscous",
@@ -104,11 +104,11 @@ def read_data_sheet(stated: Mapping[str, str]) -> dict[str, Stated]:
     }
 
 
-def _ratio(one: float | None, other: float | None) -> float | None:
+def _ratio_or_none(one: float | None, other: float | None) -> float | None:
     return None if one is None or other is None else one / other
 
 
-def _current(sheet: Mapping[str, float]) -> float:
+def _stall_minus_no_load_current(sheet: Mapping[str, float]) -> float:
     """Stall current less no-load current [A].
 
     Raises:
@@ -120,7 +120,7 @@ def _current(sheet: Mapping[str, float]) -> float:
     missing = [name for name in NUMBERS if name not in sheet]
     if speed is None and torque is None:
         raise BadConfiguration("--no-load-speed and --stall-torque: both missing; the torque constant needs one")
-    totals = [x for x in (stall, _ratio(voltage, resistance)) if x is not None]
+    totals = [x for x in (stall, _ratio_or_none(voltage, resistance)) if x is not None]
     if totals and min(totals) <= idle:
         raise BadConfiguration(f"--no-load-current: got {three_digits(idle)} A, but the stall current is "
                                f"{three_digits(min(totals))} A; expected less")  # fmt: skip
@@ -141,17 +141,17 @@ def _current(sheet: Mapping[str, float]) -> float:
     )
 
 
-def _difference(pairs: list[tuple[float, str]]) -> float:
+def _largest_difference(pairs: list[tuple[float, str]]) -> float:
     values = [value for value, _ in pairs]
     return max(values) / min(values) - 1
 
 
-def _refuse_contradictions(*groups: tuple[list[tuple[float, str]], str, str]) -> None:
+def _reject_contradictions(*groups: tuple[list[tuple[float, str]], str, str]) -> None:
     faults = [
         f"{name} is {' and '.join(f'{three_digits(value)} {unit} ({source})' for value, source in pairs)}, "
-        f"{100 * _difference(pairs):.0f} % apart"
+        f"{100 * _largest_difference(pairs):.0f} % apart"
         for pairs, name, unit in groups
-        if _difference(pairs) > LARGEST
+        if _largest_difference(pairs) > LARGEST
     ]
     if faults:
         raise BadConfiguration(

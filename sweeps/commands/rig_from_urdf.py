@@ -42,11 +42,11 @@ def read_urdf_joint(root: Element, file: str, joint: str | None) -> JointNumbers
         BadConfiguration: an unknown joint, a joint that does not turn, a loop of links, a number that is wrong or
             negative, or no inertia.
     """
-    robot = _Urdf(root, file)
+    robot = _UrdfRobot(root, file)
     return robot.numbers(robot.chosen(joint))
 
 
-class _Urdf:
+class _UrdfRobot:
     def __init__(self, root: Element, file: str) -> None:
         self.root, self.file = root, file
         if any("xacro}" in element.tag for element in root.iter()):

@@ -1,4 +1,4 @@
-"""Numbers at one driven joint of a model, and the lines of a rig's file that follow from them."""
+"""Numbers of one driven joint of a model, and the lines of a rig file that follow from them."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from calibration.data.input_errors import BadConfiguration, allowed_words
-from sweeps.commands.rig_template import Stated
+from sweeps.commands.rig_template import StatedNumber
 
 #: A number and the element of the model that states it.
 Found = tuple[float, str]
@@ -32,20 +32,20 @@ WIDTHS = {
 
 @dataclasses.dataclass(frozen=True)
 class JointNumbers:
-    """Numbers of a joint and of what it moves [SI], None where the model has none.
+    """Numbers of a joint and of what it moves [SI]. None where the model has none.
 
     Attributes:
-        file, joint: names.
+        file, joint: names of the file and the joint.
         rolls: True if the joint turns a wheel of a body that is free to move.
         mass: mass of the whole model.
-        sides: joints that are equal, as a wheel on the other side.
-        inertia: inertia of what turns with the joint, about its axis, without `armature`.
+        sides: number of equal joints, such as the wheel on the other side.
+        inertia: moment of inertia about the joint's axis of everything that turns with it, without `armature`.
         radius: radius of the wheel.
-        ratio: turns of the motor for one of the joint.
+        ratio: turns of the motor per turn of the joint.
         friction, damping, armature: friction, damping and armature at the joint.
-        weight: largest torque of gravity.
+        weight: largest torque of gravity [N·m].
         angle: angle of the load at rest under gravity.
-        drive: numbers of the motor by dotted name. They replace what follows from the others.
+        drive: numbers of the motor by dotted name. They take precedence over what follows from the others.
     """
 
     file: str
@@ -61,7 +61,7 @@ class JointNumbers:
     armature: Found | None = None
     weight: Found | None = None
     angle: Found | None = None
-    drive: Mapping[str, Stated] = dataclasses.field(default_factory=dict)
+    drive: Mapping[str, StatedNumber] = dataclasses.field(default_factory=dict)
 
     def kind(self, stated: str | None) -> str:
         """The kind of rig: `stated`, or else the kind that fits the joint's load.
@@ -76,13 +76,15 @@ class JointNumbers:
                                    f"{allowed_words(stated, TURNING)}")  # fmt: skip
         return stated
 
-    def numbers(self, kind: str) -> dict[str, Stated]:
+    def numbers(self, kind: str) -> dict[str, StatedNumber]:
         """Numbers for the file of a rig of this kind, by dotted name."""
-        by_name: dict[str, Stated] = {}
+        by_name: dict[str, StatedNumber] = {}
 
         def put(name: str, unit: str, key: str, number: Found | None, source: str = "") -> None:
             if number is not None:
-                by_name[name] = Stated(number[0], unit, f"{self.file}, {number[1]}{source}", WIDTHS.get(key, ""))
+                by_name[name] = StatedNumber(
+                    number[0], unit, f"{self.file}, {number[1]}{source}", WIDTHS.get(key, "")
+                )
 
         moving = kind in VEHICLES
         losses = "load.track" if moving else "load"
@@ -93,7 +95,7 @@ class JointNumbers:
             put("load.torque_gravity", "N·m", "weight", self.weight)
             put("load.angle_zero", "rad", "angle", self.angle)
         if self.sides is not None:
-            by_name["sides"] = Stated(int(self.sides[0]), "-", f"{self.file}, {self.sides[1]}")
+            by_name["sides"] = StatedNumber(int(self.sides[0]), "-", f"{self.file}, {self.sides[1]}")
         put(f"{losses}.loss_coulomb", "N·m", "friction", self.friction)
         put(f"{losses}.loss_viscous", "N·m·s", "damping", self.damping)
         put("gearbox.ratio", "-", "ratio", self.ratio)
@@ -103,12 +105,12 @@ class JointNumbers:
             put("motor.inertia", "kg·m^2", "armature", rotor, " / ratio²")
         elif self.armature is not None:
             inertia = (inertia[0] + self.armature[0], f"{inertia[1]}, and armature")
-            by_name["motor.inertia"] = Stated(0.0, "kg·m^2", "no ratio found, so the load inertia includes it")
+            by_name["motor.inertia"] = StatedNumber(0.0, "kg·m^2", "no ratio found, so the load inertia includes it")
         put("load.inertia", "kg·m^2", "inertia", inertia)
         return by_name | {name.replace("load.loss", f"{losses}.loss"): number for name, number in self.drive.items()}
 
 
-def free_unstated_losses(kind: str, numbers: Mapping[str, Stated]) -> dict[str, Stated]:
+def free_unstated_losses(kind: str, numbers: Mapping[str, StatedNumber]) -> dict[str, StatedNumber]:
     """Numbers of a rig of a kind, with losses of the joint free that its model lacks or leaves at the default 0.
 
     Each may take `UNSTATED` of the stall torque k n U / R, that with the speed at no-load speed U / (k n). Without
@@ -130,7 +132,7 @@ def free_unstated_losses(kind: str, numbers: Mapping[str, Stated]) -> dict[str, 
         if name in freed and freed[name].value != 0:
             continue
         if width > 0:
-            freed[name] = Stated(0.0, unit, reason, f"{width:.2g}")
+            freed[name] = StatedNumber(0.0, unit, reason, f"{width:.2g}")
         elif name in freed:
             held = f'{freed[name].source}; a value of 0 stays fixed, "0.0 ± 0.01" is fitted'
             freed[name] = dataclasses.replace(freed[name], source=held)

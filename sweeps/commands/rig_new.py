@@ -1,4 +1,4 @@
-"""The command `rig new`: a rig's file to fill in, with where each number comes from."""
+"""The command `rig new`: writes a rig file to fill in, with the source of each number."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from calibration.data.input_files import file_bytes
 from calibration.data.stated import EXAMPLE, example_numbers
 from calibration.data.writing import write_text
 from sweeps.commands.rig_joint import JointNumbers, free_unstated_losses
-from sweeps.commands.rig_template import KINDS, Stated, fill_rig_template, rig_template
+from sweeps.commands.rig_template import KINDS, StatedNumber, fill_rig_template, rig_template
 from sweeps.console import print_output
 
 #: Kind of rig if neither an option nor a model states one.
@@ -21,8 +21,8 @@ USUAL = "bench"
 LARGEST = 2**26
 
 
-def joint_of(source: Path, joint: str | None) -> JointNumbers:
-    """Returns the numbers of a driven joint of a URDF or of a model of MuJoCo, by the first element of the file.
+def joint_numbers(source: Path, joint: str | None) -> JointNumbers:
+    """Numbers of a driven joint of a URDF or MuJoCo model. The first element of the file decides which it is.
 
     Args:
         joint: by name, None: the only driven one.
@@ -58,12 +58,12 @@ def new_rig_text(kind: str | None, source: Path | None, joint: str | None, sheet
         sheet: numbers by name.
 
     Raises:
-        BadConfiguration: for the same reasons as `joint_of` and `rig_from_sheet.read_data_sheet`.
+        BadConfiguration: for the same reasons as `joint_numbers` and `rig_from_sheet.read_data_sheet`.
     """
-    numbers: dict[str, Stated] = {}
+    numbers: dict[str, StatedNumber] = {}
     origins = []
     if source is not None:
-        joint_model = joint_of(source, joint)
+        joint_model = joint_numbers(source, joint)
         kind = joint_model.kind(kind)
         numbers |= joint_model.numbers(kind)
         origins.append(f"joint {joint_model.joint} of {joint_model.file}")

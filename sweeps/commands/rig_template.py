@@ -25,13 +25,13 @@ LOAD = "load"
 
 
 @dataclasses.dataclass(frozen=True)
-class Stated:
-    """A number for a line of a rig's file.
+class StatedNumber:
+    """A number for a line of a rig file.
 
     Attributes:
         value: value in `unit`.
-        source: file and element.
-        width: text after ±, empty: none.
+        source: file and element from which it was read.
+        width: text after ±, empty if there is none.
     """
 
     value: float
@@ -52,7 +52,7 @@ def rig_template(kind: str) -> str:
     return resources.files("calibration.data").joinpath("rigs", f"{kind}.toml").read_text(encoding="utf-8")
 
 
-def fill_rig_template(kind: str, numbers: Mapping[str, Stated], heading: str) -> str:
+def fill_rig_template(kind: str, numbers: Mapping[str, StatedNumber], heading: str) -> str:
     """Returns the file of a kind with numbers in their lines.
 
     A number whose line the template lacks is added at the end of its table.
@@ -66,7 +66,7 @@ def fill_rig_template(kind: str, numbers: Mapping[str, Stated], heading: str) ->
     load = lines[load_line - 1].strip("[]")
     for name, number in numbers.items():
         table, _, key = re.sub(rf"^{LOAD}\.", f"{load}.", name).rpartition(".")
-        _put(lines, table, key, f"{key} = {number.text}  # [{number.unit}] {_one_line(number.source)}")
+        _put_line(lines, table, key, f"{key} = {number.text}  # [{number.unit}] {_one_line(number.source)}")
     return "\n".join([f"# {_one_line(heading)}", *lines]) + "\n"
 
 
@@ -75,7 +75,7 @@ def _one_line(text: str) -> str:
     return "".join(letter if letter.isprintable() else " " for letter in text)
 
 
-def _put(lines: list[str], table: str, key: str, line: str) -> None:
+def _put_line(lines: list[str], table: str, key: str, line: str) -> None:
     if table and f"[{table}]" not in lines:
         lines += ["", f"[{table}]"]
     start = lines.index(f"[{table}]") + 1 if table else 0

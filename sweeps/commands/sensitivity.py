@@ -1,4 +1,4 @@
-"""The command `sensitivity`: which parameters matter where, and which runs would tell more of them."""
+"""The command `sensitivity`: the influence of each parameter on the outputs, and the most informative next runs."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from calibration.data.columns import Layout
 from calibration.data.input_errors import BadConfiguration
 from calibration.data.robot_file import RobotFile
 from calibration.data.runs import Runs
-from calibration.described import in_words
+from calibration.described import report_in_words
 from calibration.inference import noise
 from calibration.sensitivity import uncertain_inputs
 from calibration.sensitivity.analyse import analyse_sensitivity
 from calibration.sensitivity.model import chosen_outputs
-from calibration.sensitivity.next_runs import Candidates
-from calibration.sensitivity.result import METHODS, Points
-from calibration.sensitivity.study import Study, Supply
-from calibration.sensitivity.uncertain_inputs import Inputs
+from calibration.sensitivity.next_runs import CandidateRuns
+from calibration.sensitivity.result import METHODS, OperatingPoints
+from calibration.sensitivity.study import PointSupply, Study
+from calibration.sensitivity.uncertain_inputs import UncertainInputs
 from mmrjax.model.conditions import OF_TURNS
 from mmrjax.model.paper_tables import PAYLOADS_KG, SLOPES_DEG, VOLTAGES_V
 from mmrjax.model.power import COULOMB_PER_MAH
@@ -28,7 +28,7 @@ from mmrjax.model.robot import Robot
 from sweeps import config as configuration
 from sweeps.config import GridPart
 from sweeps.console import print_message
-from sweeps.inputs import beside_robot, load_robot, read_runs
+from sweeps.inputs import load_robot, posterior_beside_robot, read_runs
 from sweeps.points import axes as axes_room
 from sweeps.points import grid as grid_room
 from sweeps.points import imposed
@@ -67,14 +67,23 @@ def execute(config: configuration.Sensitivity, beside: configuration.FolderPart)
     robot = showing_turns(file.robot, freed)
     outputs = chosen_outputs(config.outputs, robot, bool(freed))
     runs = _operating_points(config, robot, ranges)
-    inputs = _inputs(config, file, runs, ranges)
-    candidates = _candidates(config, robot, runs, bool(freed))
+    inputs = _uncertain_inputs(config, file, runs, ranges)
+    candidates = _candidate_runs(config, robot, runs, bool(freed))
     conditions = runs.conditions(robot)
     turned: Json = {name: np.full(len(runs), np.mean(ranges[name])) for name in freed}
     check_runs_bearable(robot, dataclasses.replace(conditions, **turned), config)
-    supply = Supply(float(config.battery), config.discharge_mAh * COULOMB_PER_MAH, np.asarray(conditions.adhesion))
+    supply = PointSupply(
+        float(config.battery), config.discharge_mAh * COULOMB_PER_MAH, np.asarray(conditions.adhesion)
+    )
     study = Study(
-        robot, inputs, Points.of(runs), outputs, config.model, config.options, supply, in_words(print_message)
+        robot,
+        inputs,
+        OperatingPoints.of(runs),
+        outputs,
+        config.model,
+        config.options,
+        supply,
+        report_in_words(print_message),
     )
     with open_folder("sensitivity", config, robot, beside, runs) as folder:
         result = analyse_sensitivity(study, config.method, config.evaluations, config.seed, candidates)
@@ -96,7 +105,7 @@ def execute(config: configuration.Sensitivity, beside: configuration.FolderPart)
 
 
 def _varied_ranges(vary: Names) -> dict[str, tuple[float, float]]:
-    """`name=low:high` of every varied condition."""
+    """Range of every varied condition, from options `name=low:high`."""
     ranges: dict[str, tuple[float, float]] = {}
     for text in vary:
         name, _, ends = text.partition("=")
@@ -130,7 +139,8 @@ def _operating_points(
         imposed.check_acting(robot, ground, shaft)
         if name in grid_room.AXIS and name != layout.imposed:
             raise BadConfiguration(
-                f"--vary {name}: the robot's file imposes the {words_of(layout.imposed)}; vary it instead"
+                f"--vary {name}: the robot's file imposes the "
+                f"{imposed_quantity_words(layout.imposed)}; vary it instead"
             )
     if config.battery and "voltage" in ranges:
         raise BadConfiguration(
@@ -157,14 +167,14 @@ def _operating_points(
     )
 
 
-def words_of(name: str) -> str:
+def imposed_quantity_words(name: str) -> str:
     """Words for the imposed quantity."""
     return name.replace("_", " ")
 
 
-def _inputs(
+def _uncertain_inputs(
     config: configuration.Sensitivity, file: RobotFile, runs: Runs, ranges: dict[str, tuple[float, float]]
-) -> Inputs:
+) -> UncertainInputs:
     robot, present = file.robot, tuple(dict.fromkeys(map(str, runs["configuration"])))
     if config.posterior:
         if config.parameters:
@@ -172,14 +182,14 @@ def _inputs(
                 "--posterior: cannot be combined with --parameters, since both choose the "
                 "uncertain inputs; give one of them"
             )
-        return uncertain_inputs.inputs_from_posterior(robot, beside_robot(file), ranges)
+        return uncertain_inputs.inputs_from_posterior(robot, posterior_beside_robot(file), ranges)
     names = config.parameters or uncertain_inputs.default_input_names(
         robot, present, config.battery, config.model, not {*OF_TURNS}.isdisjoint(ranges)
     )
     return uncertain_inputs.inputs_from_priors(robot, names, ranges)
 
 
-def _candidates(config: configuration.Sensitivity, robot: Robot, points: Runs, turns: bool) -> Candidates:
+def _candidate_runs(config: configuration.Sensitivity, robot: Robot, points: Runs, turns: bool) -> CandidateRuns:
     """Candidate runs: a table, or Table 8 in every configuration. For a rig or for turns, the operating points."""
     if config.candidates:
         runs = read_runs(config.candidates, robot, columns=config.columns, measured=False)
@@ -193,6 +203,12 @@ def _candidates(config: configuration.Sensitivity, robot: Robot, points: Runs, t
     stated = noise.parse_noise(usual, robot.channels)
     if config.noise:
         stated |= noise.parse_noise(config.noise, robot.channels)
-    return Candidates(
-        Points.of(runs), runs.conditions(robot), source, stated, config.noise or usual, runs.deviations(), config.runs
+    return CandidateRuns(
+        OperatingPoints.of(runs),
+        runs.conditions(robot),
+        source,
+        stated,
+        config.noise or usual,
+        runs.deviations(),
+        config.runs,
     )

@@ -35,7 +35,7 @@ def execute(config: configuration.Settle, beside: configuration.SettledLog) -> i
     few = settle_words.too_few(settled, SettledRuns.fewest, loop)
     with open_folder("settle", config, robot, beside, runs) as folder:
         folder.write_table("settled.csv", settled.table())
-        folder.write_table("stretches.csv", stretches_table(settled))
+        folder.write_table("stretches.csv", segments_table(settled))
         folder.write_json("result.json", to_json(settled, few))
         turned = sentences(ranges.remarks_on_signs(settled.settled_runs(), robot))
         document = print_report(settle_report.settle_document(settled, few, turned))
@@ -50,7 +50,7 @@ def execute(config: configuration.Settle, beside: configuration.SettledLog) -> i
         )
 
 
-def stretches_table(found: Settled) -> Columns:
+def segments_table(found: Settled) -> Columns:
     """Table with a row for each segment of a log: position, reason if it was left out, means, their sds and
     changes."""
     every = found.stretches

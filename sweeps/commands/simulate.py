@@ -1,4 +1,4 @@
-"""The command `simulate`: a few given runs, with their histories where the fidelity has them."""
+"""The command `simulate`: a few given runs, over time if the fidelity allows it."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from mmrjax import fidelities
 from mmrjax.compile.compiling import SELDOM, compiled
 from mmrjax.derived.start_figures import curve_peak, stages_of_histories
 from mmrjax.fidelities import outputs
-from mmrjax.fidelities.base import History, Run
+from mmrjax.fidelities.base import History, RunBatch
 from mmrjax.fidelities.result import result_of_signals
 from mmrjax.model import channels, ground, quantities
 from mmrjax.model.motor import Motor
@@ -28,7 +28,7 @@ from mmrjax.model.signals import BATTERY_EMPTY, STATUSES
 from sweeps import capabilities
 from sweeps import config as configuration
 from sweeps.console import progress_bar
-from sweeps.inputs import beside_robot, given_runs, load_robot
+from sweeps.inputs import given_runs, load_robot, posterior_beside_robot
 from sweeps.pages import words
 from sweeps.points import run, scale, uncertainty
 from sweeps.points.job import showing_turns
@@ -68,7 +68,7 @@ def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> 
         raise BadConfiguration(
             f"--runs: got {len(runs)} runs; --model {config.model} saves at most {_HISTORIES} histories"
         )
-    posterior = None if config.posterior is None else beside_robot(file)
+    posterior = None if config.posterior is None else posterior_beside_robot(file)
     with open_folder("simulate", config, robot, beside, runs) as folder:
         shows_turns = showing_turns(robot, runs.axes)
         table, histories = _simulate_table(folder, shows_turns, runs, config)
@@ -103,8 +103,8 @@ def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> 
 
 def _simulate_table(
     folder: RunFolder, robot: Robot, runs: records.Runs, config: configuration.Simulate
-) -> tuple[Columns, Run | None]:
-    """The table of the runs. Where the fidelity keeps them over time these are written, and returned too."""
+) -> tuple[Columns, RunBatch | None]:
+    """Table of the runs. If the fidelity simulates them over time, the histories are written and returned too."""
     fidelity = fidelities.get_fidelity(config.model)
     if fidelity.histories is None:
         return run.evaluate_runs(robot, runs, config, folder), None
@@ -115,7 +115,9 @@ def _simulate_table(
         batch = jax.device_get(fidelity.histories(robot, conditions, config.options, counter))
         counter(1.0)
     assert batch.history is not None  # the fidelity was asked for it
-    folder.write_table("history.csv", capabilities.without_idle(robot, history_table(robot, batch.history, runs)))
+    folder.write_table(
+        "history.csv", capabilities.drop_inapplicable_columns(robot, history_table(robot, batch.history, runs))
+    )
     if batch.history.reactions is not None:
         # Loads inside one side's running gear over time [N], a row a sample
         loads = batch.history.reactions
@@ -132,14 +134,14 @@ def _simulate_table(
             values = getattr(loads, name)
             table |= {f"{name}_{k + 1:02d}_N": values[..., k].ravel() for k in range(values.shape[-1])}
         folder.write_table("reactions.csv", table)
-    return {**run.condition_table(robot, runs), **over_time(robot, batch)}, batch
+    return {**run.condition_table(robot, runs), **end_columns_of_histories(robot, batch)}, batch
 
 
-def over_time(robot: Robot, batch: Run) -> Columns:
-    """The columns of how runs that were kept over time ended, with what they came to.
+def end_columns_of_histories(robot: Robot, batch: RunBatch) -> Columns:
+    """Columns with the end of each run over time.
 
-    Of a run whose battery went empty they are those of its last instant before, and `time_end_s` is when: the charge
-    left then over the current that took it.
+    If the battery became empty, they describe the last instant before. `time_end_s` is then the time at which the
+    charge ran out at the last current.
     """
     history, status = batch.history, np.asarray(batch.result.status)
     assert history is not None  # the fidelity was asked for it
@@ -150,7 +152,9 @@ def over_time(robot: Robot, batch: Run) -> Columns:
     rows = np.arange(len(last))
     motors = float(robot.sides) * np.asarray(history.signals.current)
     limit = float(robot.sides) * float(robot.driver.current_limit)
-    columns[PEAK] = np.maximum(_peaks(jnp.asarray(time), jnp.asarray(np.abs(motors)), jnp.asarray(limit)), 0.0)
+    columns[PEAK] = np.maximum(
+        _peaks_of_runs(jnp.asarray(time), jnp.asarray(np.abs(motors)), jnp.asarray(limit)), 0.0
+    )
     columns["displacement_m"], columns["time_end_s"] = np.array(history.distance)[rows, last], time[rows, last]
     empty = (status == BATTERY_EMPTY) & ~finite[rows, -1]
     if empty.any():
@@ -175,19 +179,19 @@ def permissible_durations(robot: Robot, table: Columns) -> np.ndarray:
     has_current = np.isfinite(current)
     filled = np.zeros(len(current) + -len(current) % PAD)
     filled[: len(current)] = np.where(has_current, current, 0.0)
-    time = _permissible(robot.motor, jnp.asarray(filled))
+    time = _permissible_time(robot.motor, jnp.asarray(filled))
     return np.where(has_current, np.asarray(time)[: len(current)], np.nan)
 
 
 @functools.partial(compiled, options=SELDOM)
-def _peaks(
+def _peaks_of_runs(
     time: Float[Array, "runs samples"], values: Float[Array, "runs samples"], kink: Array
 ) -> Float[Array, " runs"]:
     return jax.vmap(curve_peak, in_axes=(0, 0, None))(time, values, kink)
 
 
 @functools.partial(compiled, options=SELDOM)
-def _permissible(motor: Motor, currents: Float[Array, " runs"]) -> Scalar:
+def _permissible_time(motor: Motor, currents: Float[Array, " runs"]) -> Scalar:
     return jax.vmap(motor.time_permissible)(currents)
 
 
@@ -244,7 +248,7 @@ def run_remarks(robot: Robot, table: Columns) -> list[str]:
 
 
 def history_table(robot: Robot, history: History, runs: records.Runs) -> Columns:
-    """Time histories of a batch as one table, a row a sample. The columns that series are read with."""
+    """Time histories of a batch as one table with a row for each sample."""
     signals = history.signals
     of_rig = {*robot.rig.channels, *(OF_VEHICLE if robot.has_ground else OF_SHAFT)}
     shown_channels = [c for c in channels.EVERY if c.over_time and c.name in of_rig]

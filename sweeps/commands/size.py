@@ -9,9 +9,9 @@ from pathlib import Path
 from calibration.data import requirements_file, robot_file
 from calibration.data.input_errors import BadConfiguration, allowed_words, stated_word
 from calibration.data.parts import packaged_motors
-from calibration.described import in_words
+from calibration.described import report_in_words
 from calibration.sizing import sheet
-from calibration.sizing.chart import Chart, chart_extent, margin_chart
+from calibration.sizing.chart import MarginChart, chart_extent, margin_chart
 from calibration.sizing.design import OBJECTIVES
 from calibration.sizing.design_search import size_robot as search
 from sweeps import capabilities
@@ -44,35 +44,36 @@ def execute(config: configuration.Size, beside: configuration.FolderPart) -> int
     motor_names = [m.name for m in packaged_motors()]
     for name in config.motors:
         stated_word(name, motor_names, "--motors")
-    sheet.refuse_impossible(robot, requirements)
+    sheet.reject_impossible(robot, requirements)
     with open_folder("size", config, robot, beside) as folder:
         with step_reporter(print_message, "drawing designs") as heard:
             sizing = search(
                 robot, requirements, objectives, starts=config.starts, motors=config.motors, seed=config.seed,
-                tell=in_words(heard),
+                tell=report_in_words(heard),
             )  # fmt: skip
             best = robot if sizing.best is None else sizing.best.robot
             outcomes = (
                 ()
                 if sizing.best is None
-                else sheet.check_requirements(best, requirements, changes=False, tell=in_words(heard))
+                else sheet.check_requirements(best, requirements, changes=False, tell=report_in_words(heard))
             )
-            charts: tuple[Chart, ...] = ()
+            charts: tuple[MarginChart, ...] = ()
             if config.report:
                 heard("charts of limits")
                 robots = (robot,) if sizing.best is None else (best, robot)
                 charts = tuple(margin_chart(r, requirements, chart_extent(requirements)) for r in robots)
         result = SizeResult(requirements, robot, sizing, objectives, outcomes, charts)
-        _write(folder, config, result)
+        _write_folder(folder, config, result)
         document = print_report(
-            size_report.size_document(result, capabilities.shown_name(file)), dataclasses.replace(file, robot=best)
+            size_report.size_document(result, capabilities.displayed_name(file)),
+            dataclasses.replace(file, robot=best),
         )
         manifest = {"seed": config.seed, "feasible": sizing.best is not None}
         solved = words.every_run_solved(Counter(o.status for o in outcomes))
         return finish_run_folder(folder, config, manifest, solved=solved, page=document)
 
 
-def _write(folder: RunFolder, config: configuration.Size, found: SizeResult) -> None:
+def _write_folder(folder: RunFolder, config: configuration.Size, found: SizeResult) -> None:
     best = found.sizing.best
     folder.write_text("requirements.toml", found.asked.text)
     note = f"the robot that was changed, {config.robot}: no design meets the requirements"

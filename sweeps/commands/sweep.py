@@ -1,4 +1,4 @@
-"""The command `sweep`: a grid or a plan of any number of points, into a table of runs or a Zarr store."""
+"""The command `sweep`: simulates the points of a grid or a plan into a table of runs or a Zarr store."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ from sweeps import config_campaign
 from sweeps.config import Sweep
 from sweeps.config_campaign import Campaign, StoreOptions
 from sweeps.console import print_message, print_output, progress_bar
-from sweeps.inputs import beside_robot, load_robot
+from sweeps.inputs import load_robot, posterior_beside_robot
 from sweeps.pages import words
 from sweeps.points import axes, grid, run, scale, uncertainty
-from sweeps.points.job import laid_out, prepare_job, showing_turns
+from sweeps.points.job import prepare_job, showing_turns, store_layout
 from sweeps.points.sampled_design import Blocks
 from sweeps.points.tasks import task_of
 from sweeps.points.zarr_store import STORE, Done, Identity, Layout, SweepStore, job_identity
@@ -52,7 +52,7 @@ def execute(config: Campaign | Sweep, options: StoreOptions) -> int:
     """
     file = load_robot(config)
     if not isinstance(config, Sweep):
-        return _into_store(config, file, options)
+        return _sweep_into_store(config, file, options)
     notes: list[str] = []
     resolved = grid.resolve_grid(config, file.robot, config.battery, notes)
     count = math.prod(map(len, grid.grid_axes(resolved, file.robot, config.battery).values()))
@@ -63,15 +63,15 @@ def execute(config: Campaign | Sweep, options: StoreOptions) -> int:
     for note in notes:
         print_message(note)
     if small:
-        return _into_table(resolved, file, options)
+        return _sweep_into_table(resolved, file, options)
     of_grid = resolved.model_copy(update={"configurations": config.configurations})
-    return _into_store(config_campaign.of_grid(of_grid), file, options)
+    return _sweep_into_store(config_campaign.campaign_of_grid(of_grid), file, options)
 
 
-def _into_table(config: Sweep, file: RobotFile, options: StoreOptions) -> int:
+def _sweep_into_table(config: Sweep, file: RobotFile, options: StoreOptions) -> int:
     robot = file.robot
     runs = grid.grid_conditions(config, robot, config.battery)
-    posterior = None if config.posterior is None else beside_robot(file)
+    posterior = None if config.posterior is None else posterior_beside_robot(file)
     with open_folder("sweep", config, robot, options) as folder:
         table = run.evaluate_runs(robot, runs, config, folder)
         notes: list[str] = []
@@ -84,7 +84,7 @@ def _into_table(config: Sweep, file: RobotFile, options: StoreOptions) -> int:
         return run.write_run_folder(folder, config, result, document)
 
 
-def _into_store(config: Campaign, file: RobotFile, options: StoreOptions) -> int:
+def _sweep_into_store(config: Campaign, file: RobotFile, options: StoreOptions) -> int:
     robot, where = file.robot, options.where
     plan = axes.plan_design(config, robot, where)
     robot = showing_turns(robot, {*plan.axes, *plan.conditions})
@@ -100,7 +100,7 @@ def _into_store(config: Campaign, file: RobotFile, options: StoreOptions) -> int
         chunk = config.chunk or scale.default_chunk(task, None if pool is None else device)
         config = config.model_copy(update={"chunk": chunk, "outputs": wanted})
         job = prepare_job(config, robot, plan, where)
-        layout = laid_out(config, job)
+        layout = store_layout(config, job)
         path = options.out or default_path("sweep")
         if options.dry_run:
             dry_run(job, layout, path)
@@ -109,7 +109,7 @@ def _into_store(config: Campaign, file: RobotFile, options: StoreOptions) -> int
         files += [config.profile] if config.profile is not None and config.profile not in profiles.PACKAGED else []
         same = job_identity(config, robot, files, device)
         if not any((folder / IDENTITY).is_file() for folder in (path, path.with_name(f"{path.name}.partial"))):
-            _refuse_without_space(layout.size, 1.0, path)  # a sweep that goes on needs less
+            _reject_without_space(layout.size, 1.0, path)  # a sweep that goes on needs less
         store = SweepStore(path, same, layout, force=options.force)
         try:
             if not store.finished:
@@ -130,7 +130,7 @@ def _into_store(config: Campaign, file: RobotFile, options: StoreOptions) -> int
 
 
 def dry_run(job: scale.Job, layout: Layout, path: Path) -> None:
-    """Report the points, chunks and bytes of a sweep, and its expected time. Nothing is written."""
+    """Reports points, chunks, bytes and expected time of a sweep. Nothing is written."""
     compiled = scale.Compiled(job)
     blocks, slow = job.blocks, job.task.slow
     if slow and blocks.points > PROBED:
@@ -144,40 +144,40 @@ def dry_run(job: scale.Job, layout: Layout, path: Path) -> None:
     each = min(spent[1:]) / compiled.size
     design = job.plan.design
     dimensions = " x ".join(f"{n} {name}" for n, name in zip(design.shape, design.dimensions, strict=True))
-    free = _free(path)
+    free = _free_bytes(path)
     rows = {
         "points": f"{design.points:,} ({dimensions})",
         "chunks": f"{len(blocks):,} of {blocks.points:,} points on {compiled.mesh.size} x {scale.device_kind()}",
-        "store": f"{bytes_text(layout.size)} (uncompressed); free {bytes_text(free)} in {_existing(path)}",
+        "store": f"{bytes_text(layout.size)} (uncompressed); free {bytes_text(free)} in {_existing_parent(path)}",
         "time": f"about {duration_text(each * blocks.points * len(blocks))} once compiled, {1 / each:,.0f} points/s "
         f"(timed here on {compiled.size:,} points); compiling {duration_text(max(spent[0] - spent[1], 0.0))}",
     }
     print_table(Table("dry-run", (Column("a sweep of"), Column("")), list(rows.items())))
-    _refuse_without_space(layout.size, 1.0, path)
+    _reject_without_space(layout.size, 1.0, path)
 
 
-def _existing(path: Path) -> Path:
+def _existing_parent(path: Path) -> Path:
     path = path.absolute().parent
     while not path.exists():
         path = path.parent
     return path
 
 
-def _free(path: Path) -> int:
-    return shutil.disk_usage(_existing(path)).free
+def _free_bytes(path: Path) -> int:
+    return shutil.disk_usage(_existing_parent(path)).free
 
 
-def _refuse_without_space(size: int, share: float, path: Path) -> None:
+def _reject_without_space(size: int, share: float, path: Path) -> None:
     """Reject a sweep whose results would not fit on the disk.
 
     Args:
         size: size of the whole store [bytes].
         share: share of it that is still to be written.
     """
-    needed, free = math.ceil(size * share) + MARGIN, _free(path)
+    needed, free = math.ceil(size * share) + MARGIN, _free_bytes(path)
     if needed > free:
         raise BadConfiguration(
-            f"--out: the results would take {bytes_text(needed)} (uncompressed); {_existing(path)} has "
+            f"--out: the results would take {bytes_text(needed)} (uncompressed); {_existing_parent(path)} has "
             f"{bytes_text(free)} "
             'free; choose another disk, fewer points or outputs, or storage = "float32"'
         )
@@ -204,7 +204,7 @@ def duration_text(seconds: float) -> str:
 
 
 def chunks_of_shard(share: tuple[int, int], chunks: int) -> range:
-    """Chunks of the k-th of n shares."""
+    """Chunks of share k of n."""
     k, n = share
     return range((k - 1) * chunks // n, k * chunks // n)
 
@@ -220,7 +220,7 @@ def simulate_chunks(store: SweepStore, job: scale.Job, options: StoreOptions, po
     done = store.done()
     own_chunks = chunks_of_shard(options.share, len(job.blocks))
     left = [k for k in own_chunks if k not in done]
-    _refuse_without_space(store.layout.size, len(left) / len(job.blocks), store.path)
+    _reject_without_space(store.layout.size, len(left) / len(job.blocks), store.path)
     if not left:
         return
     total = sum(job.blocks.count(k) for k in own_chunks)
@@ -252,7 +252,7 @@ class DiskFull(InputError):
 def finish_sweep(
     store: SweepStore, config: Campaign, file: RobotFile, job: scale.Job, same: Identity, options: StoreOptions
 ) -> int:
-    """Write the files of a complete sweep and move it into place. Report the progress of an incomplete one."""
+    """Writes the files of a complete sweep and moves it into place, or reports the progress of an incomplete one."""
     left = False
     if not store.finished:
         with store.last() as left:

@@ -1,4 +1,4 @@
-"""The command `simulate` of one run whose sides are driven apart: how it turns, what each motor takes, its path."""
+"""The command `simulate` for one run with different commands for the two sides: its turn, motor currents and path."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from calibration.data.table import Runs
 from mmrjax import fidelities
 from mmrjax.derived import turning_figures
 from mmrjax.fidelities import outputs
-from mmrjax.fidelities.base import History, Run
+from mmrjax.fidelities.base import History, RunBatch
 from mmrjax.fidelities.rest import voltage_at_rest
 from mmrjax.model import channels, quantities
 from mmrjax.model.channels import Channel
@@ -56,19 +56,19 @@ def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> 
     with open_folder("simulate", config, robot, beside, runs) as folder:
         conditions = run.conditions_of_runs(robot, runs, config)
         run.check_runs_bearable(robot, conditions, config)
-        readings = _channels(robot, settled)
+        readings = _displayed_channels(robot, settled)
         stages = 2 + config.demands
         if config.demands:
             with report_stage(1, stages, "duties of the demanded turn"):
-                conditions, runs = _demanded(robot, conditions, runs, config)
+                conditions, runs = _run_for_demand(robot, conditions, runs, config)
         if settled:
             with report_stage(stages - 1, stages, "settled turns over the duties of the inner side"):
-                batch, swept = _with_others(robot, conditions)
+                batch, swept = _turns_to_compare(robot, conditions)
             turns = {
                 **{name: np.asarray(getattr(swept, name)) for name in SIDES},
-                **_columns(robot, readings, swept, batch),
+                **_turn_table(robot, readings, swept, batch),
             }
-            folder.write_table("turns.csv", capabilities.without_idle(robot, turns))
+            folder.write_table("turns.csv", capabilities.drop_inapplicable_columns(robot, turns))
             first, history = jax.tree.map(lambda x: x[:1], batch), None
         else:
             fidelity = fidelities.get_fidelity(config.model)
@@ -85,7 +85,7 @@ def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> 
             assert history is not None
             folder.write_table("history.csv", history_table(history, readings))
         columns = {name: np.asarray(values) for name, values in first.columns.items()}
-        table = {**run.condition_table(robot, runs), **_columns(robot, readings, conditions, first), **columns}
+        table = {**run.condition_table(robot, runs), **_turn_table(robot, readings, conditions, first), **columns}
         turn = {name: _number(table[name][0]) for name in (q.column for q in quantities.TABLE["turn"])}
         with report_stage(stages, stages, "posture"):
             stands = posture_words.posture_of_runs(robot, runs, conditions)
@@ -104,11 +104,13 @@ def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> 
 WIDER, LOADED, NEAR, TRIED = 2.0, (0.1, 0.05, 0.2, 0.4), 1e-7, 100
 
 
-def _demanded(robot: Robot, asked: Conditions, runs: Runs, config: configuration.Simulate) -> tuple[Conditions, Runs]:
-    """The run with those duties whose settled turn has the demanded speed and yaw rate.
+def _run_for_demand(
+    robot: Robot, asked: Conditions, runs: Runs, config: configuration.Simulate
+) -> tuple[Conditions, Runs]:
+    """The run whose duties give the demanded speed and yaw rate in a settled turn.
 
     Raises:
-        BadConfiguration: no duties have it, or they ask more than the supply has.
+        BadConfiguration: no duties give it, or they need more voltage than the supply has.
     """
     chassis = robot.configurations[str(runs.configurations_named(robot)[0])]
     width = float(chassis.turning.width)
@@ -123,7 +125,7 @@ def _demanded(robot: Robot, asked: Conditions, runs: Runs, config: configuration
         return dataclasses.replace(asked, voltage=voltage, duty_left=left, duty_right=right)
 
     def off(volts: np.ndarray) -> np.ndarray:
-        reading = _with_others(robot, driven(volts))[0].result.reading
+        reading = _turns_to_compare(robot, driven(volts))[0].result.reading
         speed, turn = (np.asarray(reading[name])[0] for name in ("speed", "yaw_rate"))
         return np.array([speed, 0.5 * width * turn]) - wanted
 
@@ -132,7 +134,7 @@ def _demanded(robot: Robot, asked: Conditions, runs: Runs, config: configuration
         faster, from straight travel to the spot."""
         faster = np.abs(belts) == np.abs(belts).max()
         faster &= np.cumsum(faster) == 1  # of two, on the spot
-        reading = _with_others(robot, driven(np.where(faster, np.sign(belts) * supply, 0.0)))[0].result.reading
+        reading = _turns_to_compare(robot, driven(np.where(faster, np.sign(belts) * supply, 0.0)))[0].result.reading
         return np.asarray(reading["speed"])[1:], np.asarray(reading["yaw_rate"])[1:]
 
     alike = dataclasses.replace(asked, duty_left=None, duty_right=None)
@@ -162,7 +164,7 @@ def _demanded(robot: Robot, asked: Conditions, runs: Runs, config: configuration
 
 
 def _end_of_run(history: History | None) -> dict[str, float] | None:
-    """Time, distance from the start and angle turned by at the end of a run over time."""
+    """Time, distance from the start and angle turned at the end of a run over time."""
     if history is None:
         return None
     yaw = np.asarray(history.reading["yaw"])[0]
@@ -201,14 +203,14 @@ def turn_columns(config: configuration.TurnPart, given: Json) -> Json:
     return columns | {SUPPLY: float(source), **dict(zip(SIDES, map(float, duties), strict=True))}
 
 
-def _channels(robot: Robot, settled: bool) -> tuple[Channel, ...]:
+def _displayed_channels(robot: Robot, settled: bool) -> tuple[Channel, ...]:
     """Channels shown for a turn."""
     every = channels.channels_named((*robot.rig.channels, *SHOWN))
     return tuple(c for c in every if c.settled or not settled)
 
 
-def _with_others(robot: Robot, asked: Conditions) -> tuple[Run, Conditions]:
-    """The requested settled turn and turns at other duties of the slower side, in one batch."""
+def _turns_to_compare(robot: Robot, asked: Conditions) -> tuple[RunBatch, Conditions]:
+    """The requested settled turn, and turns at other duties of the slower side, in one batch."""
     left, right = (float(np.asarray(getattr(asked, name))[0]) for name in SIDES)
     outer, shares = max(left, right, key=abs), len(SHARES)
     others = outer * SHARES
@@ -221,7 +223,7 @@ def _with_others(robot: Robot, asked: Conditions) -> tuple[Run, Conditions]:
     return jax.device_get(fidelities.get_fidelity(fidelities.NAMES[0]).run(robot, rows, {})), rows
 
 
-def _columns(robot: Robot, shown: tuple[Channel, ...], conditions: Conditions, batch: Run) -> Columns:
+def _turn_table(robot: Robot, shown: tuple[Channel, ...], conditions: Conditions, batch: RunBatch) -> Columns:
     radii = np.array([float(c.radius) for c in robot.configurations.members])
     reading = batch.result.reading
     return {
@@ -231,7 +233,7 @@ def _columns(robot: Robot, shown: tuple[Channel, ...], conditions: Conditions, b
 
 
 def history_table(history: History, shown: tuple[Channel, ...]) -> Columns:
-    """A turn over time, a row a sample."""
+    """A turn over time as a table, with a row for each sample."""
     read = {c.column: np.ravel(history.reading[c.name]) / c.factor for c in shown if c.over_time}
     return {"time_s": np.ravel(history.time), **read, "displacement_m": np.ravel(history.distance)}
 

@@ -1,4 +1,4 @@
-"""Refit of a format's parameters to the native model, the fate of each effect, and the errors of an export."""
+"""Comparison of an exported drive with the native model: refit of its parameters, fate of each effect, and errors."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ import optimistix as optx
 from calibration.data import Names
 from calibration.inference import solvers
 from calibration.inference.simulation_errors import share_of_measured
-from sweeps.export.joint import Joint, channels_of
-from sweeps.export.situation import AtJoint, Situation
+from sweeps.export.joint import DriveJoint, channels_of
+from sweeps.export.situation import ComparisonRuns, JointResult
 
 #: Share of an effect's change of current and speed below which the format does not hold it.
 LITTLE = 0.1
@@ -47,14 +47,14 @@ class FormatLaw(Protocol):
 
 
 @dataclasses.dataclass(frozen=True)
-class Fate:
-    """Fate of an effect, or of a term of the base, in a format.
+class EffectFate:
+    """How a format represents an effect, or a term of the base.
 
     Attributes:
         name: name of the effect or term.
         verdict: `HELD`, `APPROXIMATED` or `DROPPED`.
-        how: in words.
-        kept: share of its change of current and speed that the exported drive shows [-], NaN where it has none.
+        how: explanation in words.
+        kept: share of its change of current and speed that the exported drive reproduces [-]. NaN if it has none.
     """
 
     name: str
@@ -64,7 +64,7 @@ class Fate:
 
 
 @dataclasses.dataclass(frozen=True)
-class Errors:
+class ModelErrors:
     """Error of one model against the reference of each channel, rms over rms [%], by the name of the channel."""
 
     label: str
@@ -72,7 +72,7 @@ class Errors:
 
 
 @dataclasses.dataclass(frozen=True)
-class Comparison:
+class ExportComparison:
     """An exported drive compared with the native model.
 
     Attributes:
@@ -85,14 +85,14 @@ class Comparison:
         exported: at the joint.
     """
 
-    situation: Situation
+    situation: ComparisonRuns
     translated: Mapping[str, float]
     refitted: Mapping[str, float]
-    fates: tuple[Fate, ...]
-    errors: tuple[Errors, ...]
+    fates: tuple[EffectFate, ...]
+    errors: tuple[ModelErrors, ...]
     reference: str
     readings: np.ndarray
-    exported: AtJoint
+    exported: JointResult
 
     def of(self, label: str) -> Mapping[str, float]:
         """Errors of a model [%] by channel."""
@@ -104,12 +104,12 @@ NATIVE, EXPORTED, TRANSLATED, WITHOUT = "native", "exported", "exported, not ref
 
 
 def compare_format(
-    situation: Situation,
-    law_of: Callable[[Joint, Mapping[str, float]], FormatLaw],
-    fates: Sequence[Fate],
+    situation: ComparisonRuns,
+    law_of: Callable[[DriveJoint, Mapping[str, float]], FormatLaw],
+    fates: Sequence[EffectFate],
     held: Mapping[str, str],
     approximated: Callable[[str], str],
-) -> Comparison:
+) -> ExportComparison:
     """Compares a format with the native model over runs.
 
     Args:
@@ -131,7 +131,7 @@ def compare_format(
         how = held.get(effect.name) or approximated(effect.balance)
         if not np.isfinite(kept) and effect.name not in held:
             verdict, how = DROPPED, "it has no effect on these runs, and the format has no term for it"
-        fates_found.append(Fate(effect.name, verdict, how, kept))
+        fates_found.append(EffectFate(effect.name, verdict, how, kept))
     exported = _law_at(law, theta, situation)
     models = {NATIVE: situation.native, EXPORTED: situation.readings(exported)}
     if law.names:
@@ -141,24 +141,24 @@ def compare_format(
         bare = refit_parameters(plain, situation, situation.without(names))
         models[WITHOUT] = situation.readings(_law_at(plain, bare, situation))
     reference = situation.measured if situation.is_measured else situation.native
-    return Comparison(
+    return ExportComparison(
         situation, dict(zip(law.names, map(float, law.start), strict=True)),
         dict(zip(law.names, map(float, theta), strict=True)), tuple(fates_found),
-        tuple(Errors(label, channel_errors(joint, readings, reference)) for label, readings in models.items()),
+        tuple(ModelErrors(label, channel_errors(joint, readings, reference)) for label, readings in models.items()),
         "the measured readings" if situation.is_measured else "the native model",
         models[EXPORTED], exported,
     )  # fmt: skip
 
 
-def channel_errors(joint: Joint, shown: np.ndarray, reference: np.ndarray) -> dict[str, float]:
+def channel_errors(joint: DriveJoint, shown: np.ndarray, reference: np.ndarray) -> dict[str, float]:
     """Rms of the difference over the rms of the reference [%], by channel that has readings."""
     shares = share_of_measured(shown, reference)
     return {c.name: 100 * float(s) for c, s in zip(channels_of(joint), shares, strict=True) if np.isfinite(s)}
 
 
-def _law_at(law: FormatLaw, theta: Any, situation: Situation) -> AtJoint:
+def _law_at(law: FormatLaw, theta: Any, situation: ComparisonRuns) -> JointResult:
     current, speed = evaluate_law(law, jnp.asarray(theta), situation.command, situation.load, situation.way)
-    return AtJoint(np.asarray(current), np.asarray(speed))
+    return JointResult(np.asarray(current), np.asarray(speed))
 
 
 @eqx.filter_jit
@@ -167,7 +167,7 @@ def evaluate_law(law: FormatLaw, theta: Any, command: Any, load: Any, way: Any) 
     return law(theta, *map(jnp.asarray, (command, load, way)))
 
 
-def refit_parameters(law: FormatLaw, situation: Situation, native: AtJoint) -> np.ndarray:
+def refit_parameters(law: FormatLaw, situation: ComparisonRuns, native: JointResult) -> np.ndarray:
     """Least-squares fit of a format's parameters to the native model's currents and speeds.
 
     Residuals are relative to each quantity's rms. Parameters stay positive: each is the square of an unknown. No
@@ -200,22 +200,27 @@ def _refitted(law: FormatLaw, least: Any, command: Any, load: Any, way: Any, cur
     return jnp.where(exact, law.start, (scale * jnp.where(better, solution.value, start)) ** 2)
 
 
-def share_kept(law: FormatLaw, bare: FormatLaw, situation: Situation, native: AtJoint, native_bare: AtJoint) -> float:
+def share_kept(
+    law: FormatLaw, bare: FormatLaw, situation: ComparisonRuns, native: JointResult, native_bare: JointResult
+) -> float:
     """Fraction of an effect's change of current and speed that a refitted format reproduces [-], at most 1.
 
     1 less the rms of what the change of the format's error by the effect is, over that of the change itself. NaN
     where the effect changes nothing.
     """
     left = [
-        _stacked(exact) - _stacked(_law_at(model, refit_parameters(model, situation, exact), situation))
+        _scaled_residuals(exact)
+        - _scaled_residuals(_law_at(model, refit_parameters(model, situation, exact), situation))
         for model, exact in ((law, native), (bare, native_bare))
     ]
-    change = (_stacked(native) - _stacked(native_bare)) / (sizes := np.sqrt(np.mean(_stacked(native) ** 2, 0)))
+    change = (_scaled_residuals(native) - _scaled_residuals(native_bare)) / (
+        sizes := np.sqrt(np.mean(_scaled_residuals(native) ** 2, 0))
+    )
     size = float(np.sqrt(np.mean(change**2)))
     if size < 1e-9:
         return float("nan")
     return 1 - float(np.sqrt(np.mean(((left[0] - left[1]) / sizes) ** 2))) / size
 
 
-def _stacked(found: AtJoint) -> np.ndarray:
+def _scaled_residuals(found: JointResult) -> np.ndarray:
     return np.stack([found.current, found.speed], -1)

@@ -1,4 +1,4 @@
-"""Scalar functions of JAX as expressions, and expressions as source text of NumPy's dialects.
+"""Scalar JAX functions as expressions, and expressions as source text for NumPy-like libraries.
 
 A function is traced once (`jax.make_jaxpr`) and its equations are evaluated on symbols in place of numbers. So the
 text of a law follows from the code of the model, and a user's own effect needs no second definition.
@@ -40,7 +40,7 @@ _FOLDED: dict[str, Callable[..., Any]] = {
 
 
 class Symbol:
-    """A node of an expression: a number, a name, or an operation on other nodes. Equal nodes are one object.
+    """A node of an expression: a number, a name, or an operation on other nodes. Equal nodes are the same object.
 
     Attributes:
         op: `const`, `name`, or an operation.
@@ -67,30 +67,34 @@ class Symbol:
 
 
 def constant_symbol(value: Any) -> Symbol:
-    """Returns the symbol of a number or a truth value."""
+    """Symbol of a number or a truth value."""
     return Symbol.of("const", (), bool(value) if isinstance(value, bool | np.bool_) else float(value))
 
 
-def _is(x: Symbol, value: float) -> bool:
+def _is_constant(x: Symbol, value: float) -> bool:
     return x.is_const and x.value == value and not isinstance(x.value, bool)
 
 
 def apply_operation(op: str, *args: Symbol) -> Symbol:
-    """Returns the symbol of an operation, simplified where an operand is 0, 1 or all are numbers."""
+    """Symbol of an operation, simplified if an operand is 0 or 1, or if all are numbers."""
     if all(a.is_const for a in args):
         try:
             return constant_symbol(_FOLDED[op](*(a.value for a in args)))
         except (ArithmeticError, ValueError):
             return Symbol.of(op, args)
-    if (op == "add" and _is(args[0], 0)) or (op == "mul" and _is(args[0], 1)):
+    if (op == "add" and _is_constant(args[0], 0)) or (op == "mul" and _is_constant(args[0], 1)):
         return args[1]
-    if (op in ("add", "sub") and _is(args[1], 0)) or (op in ("mul", "div", "pow") and _is(args[1], 1)):
+    if (op in ("add", "sub") and _is_constant(args[1], 0)) or (
+        op in ("mul", "div", "pow") and _is_constant(args[1], 1)
+    ):
         return args[0]
-    if (op == "mul" and (_is(args[0], 0) or _is(args[1], 0))) or (op == "div" and _is(args[0], 0)):
+    if (op == "mul" and (_is_constant(args[0], 0) or _is_constant(args[1], 0))) or (
+        op == "div" and _is_constant(args[0], 0)
+    ):
         return constant_symbol(0.0)
-    if (op == "sub" and _is(args[0], 0)) or (op == "mul" and _is(args[0], -1)):
+    if (op == "sub" and _is_constant(args[0], 0)) or (op == "mul" and _is_constant(args[0], -1)):
         return apply_operation("neg", args[1])
-    if op == "mul" and _is(args[1], -1):
+    if op == "mul" and _is_constant(args[1], -1):
         return apply_operation("neg", args[0])
     if op == "neg" and args[0].op == "neg":
         return args[0].args[0]
@@ -114,7 +118,7 @@ def choice_symbol(condition: Symbol, yes: Symbol, no: Symbol) -> Symbol:
     return yes if yes is no else Symbol.of("where", (condition, yes, no))
 
 
-def _each(function: Callable[..., Symbol], *arrays: np.ndarray) -> np.ndarray:
+def _map_elements(function: Callable[..., Symbol], *arrays: np.ndarray) -> np.ndarray:
     arrays = np.broadcast_arrays(*arrays)
     results = np.empty(arrays[0].shape, object)
     for k in np.ndindex(results.shape):
@@ -138,7 +142,7 @@ def _logistic(x: Symbol) -> Symbol:
     )
 
 
-def _converted(x: Symbol, kind: Any) -> Symbol:
+def _convert_kind(x: Symbol, kind: Any) -> Symbol:
     if x.op in _LOGICAL and np.issubdtype(kind, np.number):
         return choice_symbol(x, constant_symbol(1.0), constant_symbol(0.0))
     if x.is_const:
@@ -154,11 +158,11 @@ def _dot(a: np.ndarray, b: np.ndarray, dimensions: Any) -> np.ndarray:
     products = np.empty(a.shape[:-1] + b.shape[:-1], object)
     for i in np.ndindex(a.shape[:-1]):
         for j in np.ndindex(b.shape[:-1]):
-            products[i + j] = _total([apply_operation("mul", x, y) for x, y in zip(a[i], b[j], strict=True)])
+            products[i + j] = _sum_of_symbols([apply_operation("mul", x, y) for x, y in zip(a[i], b[j], strict=True)])
     return products
 
 
-def _total(terms: Sequence[Symbol]) -> Symbol:
+def _sum_of_symbols(terms: Sequence[Symbol]) -> Symbol:
     total = constant_symbol(0.0)
     for term in terms:
         total = apply_operation("add", total, term)
@@ -185,7 +189,11 @@ def _shape_primitive(name: str, x: list[np.ndarray], p: Json) -> np.ndarray:
             shape[axis] = size
         return np.broadcast_to(x[0].reshape(shape), p["shape"])
     if name in ("reshape", "squeeze", "expand_dims"):
-        return x[0].reshape(p["new_sizes"]) if name == "reshape" else x[0].reshape(_kept(name, x[0].shape, p))
+        return (
+            x[0].reshape(p["new_sizes"])
+            if name == "reshape"
+            else x[0].reshape(_axes_that_remain(name, x[0].shape, p))
+        )
     if name == "stack":
         return np.stack(x, p["axis"])
     if name == "transpose":
@@ -198,7 +206,7 @@ def _shape_primitive(name: str, x: list[np.ndarray], p: Json) -> np.ndarray:
     raise NotImplementedError(name)
 
 
-def _kept(name: str, shape: tuple[int, ...], p: Json) -> tuple[int, ...]:
+def _axes_that_remain(name: str, shape: tuple[int, ...], p: Json) -> tuple[int, ...]:
     if name == "squeeze":
         return tuple(n for k, n in enumerate(shape) if k not in p["dimensions"])
     sizes = list(shape)
@@ -207,61 +215,65 @@ def _kept(name: str, shape: tuple[int, ...], p: Json) -> tuple[int, ...]:
     return tuple(sizes)
 
 
-def _evaluated(jaxpr: Any, consts: Sequence[Any], arguments: Sequence[np.ndarray]) -> list[np.ndarray]:
+def _evaluate_jaxpr(jaxpr: Any, consts: Sequence[Any], arguments: Sequence[np.ndarray]) -> list[np.ndarray]:
     """Symbols of the outputs of a jaxpr, as arrays of objects."""
     values: dict[Any, np.ndarray] = {}
 
     def read(atom: Any) -> np.ndarray:
-        return _numbers(atom.val) if hasattr(atom, "val") else values[atom]
+        return _constant_array(atom.val) if hasattr(atom, "val") else values[atom]
 
-    values.update(zip(jaxpr.constvars, map(_numbers, consts), strict=True))
+    values.update(zip(jaxpr.constvars, map(_constant_array, consts), strict=True))
     values.update(zip(jaxpr.invars, arguments, strict=True))
     for eqn in jaxpr.eqns:
         x, name, p = [read(v) for v in eqn.invars], eqn.primitive.name, eqn.params
         inner = next((p[key] for key in ("jaxpr", "call_jaxpr", "fun_jaxpr") if key in p), None)
         if name in _SIMPLE:
-            results = [_each(lambda *a, op=_SIMPLE[name]: apply_operation(op, *a), *x)]
+            results = [_map_elements(lambda *a, op=_SIMPLE[name]: apply_operation(op, *a), *x)]
         elif name in _SAME:
             results = list(x)
         elif name == "integer_pow":
-            results = [_each(lambda a, n=p["y"]: _power(a, n), x[0])]
+            results = [_map_elements(lambda a, n=p["y"]: _power(a, n), x[0])]
         elif name == "square":
-            results = [_each(lambda a: _power(a, 2), x[0])]
+            results = [_map_elements(lambda a: _power(a, 2), x[0])]
         elif name == "rsqrt":
             results = [
-                _each(lambda a: apply_operation("div", constant_symbol(1.0), apply_operation("sqrt", a)), x[0])
+                _map_elements(
+                    lambda a: apply_operation("div", constant_symbol(1.0), apply_operation("sqrt", a)), x[0]
+                )
             ]
         elif name == "logistic":
-            results = [_each(_logistic, x[0])]
+            results = [_map_elements(_logistic, x[0])]
         elif name == "select_n" and len(x) == 3:
             results = [
-                _each(
+                _map_elements(
                     lambda c, no, yes: choice_symbol((constant_symbol(bool(c.value)) if c.is_const else c), yes, no),
                     *x,
                 )
             ]
         elif name == "clamp":
-            results = [_each(lambda low, a, high: apply_operation("min", apply_operation("max", a, low), high), *x)]
+            results = [
+                _map_elements(lambda low, a, high: apply_operation("min", apply_operation("max", a, low), high), *x)
+            ]
         elif name == "convert_element_type":
-            results = [_each(lambda a, kind=p["new_dtype"]: _converted(a, kind), x[0])]
+            results = [_map_elements(lambda a, kind=p["new_dtype"]: _convert_kind(a, kind), x[0])]
         elif name == "iota":
-            results = [_numbers(np.indices(p["shape"], float)[p["dimension"]])]
+            results = [_constant_array(np.indices(p["shape"], float)[p["dimension"]])]
         elif name == "reduce_sum":
             rest = np.moveaxis(x[0], p["axes"], range(len(p["axes"])))
             flat = rest.reshape(-1, *rest.shape[len(p["axes"]) :])
-            results = [_each(lambda *terms: _total(terms), *flat)]
+            results = [_map_elements(lambda *terms: _sum_of_symbols(terms), *flat)]
         elif name == "dot_general":
             results = [_dot(x[0], x[1], p["dimension_numbers"])]
         elif inner is not None:
             closed = hasattr(inner, "consts")
-            results = _evaluated(inner.jaxpr if closed else inner, inner.consts if closed else (), x)
+            results = _evaluate_jaxpr(inner.jaxpr if closed else inner, inner.consts if closed else (), x)
         else:
             results = [_shape_primitive(name, x, p)]
         values.update(zip(eqn.outvars, results, strict=True))
     return [read(v) for v in jaxpr.outvars]
 
 
-def _numbers(value: Any) -> np.ndarray:
+def _constant_array(value: Any) -> np.ndarray:
     value = np.asarray(value)
     symbols = np.empty(value.shape, object)
     for k in np.ndindex(value.shape):
@@ -286,7 +298,7 @@ def trace_function(function: Callable[..., Any], names: Sequence[str], what: str
         cell[()] = Symbol.of("name", (), name)
         arguments.append(cell)
     try:
-        (result,) = _evaluated(closed.jaxpr, closed.consts, arguments)
+        (result,) = _evaluate_jaxpr(closed.jaxpr, closed.consts, arguments)
     except NotImplementedError as error:
         raise BadConfiguration(
             f"{what}: its equation uses {error or 'an operation'} of JAX, which cannot be written as a formula; "
@@ -296,7 +308,7 @@ def trace_function(function: Callable[..., Any], names: Sequence[str], what: str
     return symbol
 
 
-def names_of(*symbols: Symbol) -> list[str]:
+def names_in(*symbols: Symbol) -> list[str]:
     """Names that expressions depend on, in the order of their first use."""
     names: dict[str, None] = {}
     visited: set[int] = set()

@@ -1,4 +1,4 @@
-"""A drive as tables: voltage, current, losses and efficiency over speed and torque of the joint, as CSV and C."""
+"""A drive as tables of voltage, current, losses and efficiency over speed and torque of the joint, in CSV and C."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from calibration.data.writing import table_text
 from mmrjax import __version__
 from mmrjax.errors import printable
 from sweeps.export import jax_actuator, mujoco
-from sweeps.export.comparison import APPROXIMATED, DROPPED, HELD, Fate
-from sweeps.export.joint import Joint
-from sweeps.export.law_source import Constant, jax_source, module_from_source
-from sweeps.export.situation import Situation
+from sweeps.export.comparison import APPROXIMATED, DROPPED, HELD, EffectFate
+from sweeps.export.joint import DriveJoint
+from sweeps.export.law_source import LawConstant, jax_source, module_from_source
+from sweeps.export.situation import ComparisonRuns
 
 #: Points of an axis on either side of rest; how far beyond the runs the axes reach.
 POINTS, BEYOND = 20, 1.2
@@ -32,12 +32,12 @@ COLUMNS = {
 }  # fmt: skip
 
 
-class Map(eqx.Module):
-    """Steady states over a grid.
+class SteadyMap(eqx.Module):
+    """Steady states of a drive over a grid of speed and torque.
 
     Attributes:
-        speed, torque: axes [rad/s], [N·m].
-        values: by name of the quantity, shape (speeds, torques).
+        speed, torque: values of the axes [rad/s], [N·m].
+        values: quantity → values, shape (speeds, torques).
     """
 
     speed: np.ndarray
@@ -46,7 +46,7 @@ class Map(eqx.Module):
 
     @property
     def efficiency(self) -> np.ndarray:
-        """Power given over power taken [-], of a joint that drives. Its inverse for a driven joint."""
+        """Output power over input power [-]. For a driven joint, the inverse."""
         out, taken = np.outer(self.speed, self.torque), self.values["power"]
         share = np.where(out > 0, out / np.where(taken > 0, taken, np.inf), taken / np.where(out < 0, out, -np.inf))
         return np.clip(share, 0.0, 1.0)
@@ -60,8 +60,10 @@ def symmetric_axis(largest: float) -> np.ndarray:
     return np.concatenate([-half[::-1], -near, [0.0], near, half])
 
 
-def steady_state_map(module: ModuleType, params: Json, speed: np.ndarray, torque: np.ndarray, guess: float) -> Map:
-    """Steady states at each speed [rad/s] and torque [N·m] of the joint. `guess`: resistance, of the first step."""
+def steady_state_map(
+    module: ModuleType, params: Json, speed: np.ndarray, torque: np.ndarray, guess: float
+) -> SteadyMap:
+    """Steady states at each speed [rad/s] and torque [N·m] of the joint. `guess`: resistance for the first step."""
     speeds, torques = (jnp.asarray(x.ravel()) for x in np.meshgrid(speed, torque, indexing="ij"))
     params = {name: jnp.asarray(value, float) for name, value in params.items()}
 
@@ -80,7 +82,7 @@ def steady_state_map(module: ModuleType, params: Json, speed: np.ndarray, torque
         return jax_actuator.settled_actuator(module, params, voltage, speeds)[1] | {"left": lacking(voltage)}
 
     solution = {name: np.asarray(x).reshape(len(speed), len(torque)) for name, x in solved(params).items()}
-    return Map(speed, torque, {name: solution[name] for name in COLUMNS})
+    return SteadyMap(speed, torque, {name: solution[name] for name in COLUMNS})
 
 
 class TableLaw(eqx.Module):
@@ -111,8 +113,10 @@ class TableLaw(eqx.Module):
         return jax.scipy.ndimage.map_coordinates(values, places, order=1, mode="nearest")
 
 
-def map_of(situation: Situation, constants: Sequence[Constant], amplitudes: Mapping[str, float] | None = None) -> Map:
-    """The tables of a drive, over the range of the runs and slightly beyond."""
+def map_of_drive(
+    situation: ComparisonRuns, constants: Sequence[LawConstant], amplitudes: Mapping[str, float] | None = None
+) -> SteadyMap:
+    """Steady states of a drive, over the range of the runs and slightly beyond."""
     module = module_from_source(jax_source(situation.joint, constants))
     params = jax_actuator.steady_params(situation.joint, constants, amplitudes or {})
     reach = float(np.max(np.abs(situation.inside.speed))) * BEYOND
@@ -122,18 +126,18 @@ def map_of(situation: Situation, constants: Sequence[Constant], amplitudes: Mapp
     )
 
 
-def law_of(situation: Situation, constants: Sequence[Constant]) -> Any:
-    """Returns the function from a joint and amplitudes to the law of its tables."""
+def table_law_function(situation: ComparisonRuns, constants: Sequence[LawConstant]) -> Any:
+    """Function of a joint and amplitudes that returns the law of its tables."""
 
-    def law(joint: Joint, amplitudes: Mapping[str, float]) -> TableLaw:
-        table = map_of(situation, constants, amplitudes)
+    def law(joint: DriveJoint, amplitudes: Mapping[str, float]) -> TableLaw:
+        table = map_of_drive(situation, constants, amplitudes)
         voltage, current = (jnp.asarray(table.values[name]) for name in ("voltage", "current"))
         return TableLaw(jnp.asarray(table.speed), jnp.asarray(table.torque), voltage, current)
 
     return law
 
 
-def fates_in_tables(joint: Joint, constants: Sequence[Constant]) -> list[Fate]:
+def fates_in_tables(joint: DriveJoint, constants: Sequence[LawConstant]) -> list[EffectFate]:
     """Fates of the base's terms, and of effects outside the joint."""
     fates = [
         f
@@ -145,27 +149,29 @@ def fates_in_tables(joint: Joint, constants: Sequence[Constant]) -> list[Fate]:
     for fate in fates:
         if fate.name == "friction from the joint's surroundings":
             values = ", ".join(f"{n.removeprefix('surroundings.')} = {means[n]:.4g}" for n in joint.surroundings())
-            changed.append(Fate(fate.name, APPROXIMATED, f"their mean over the runs: {values}"))
+            changed.append(EffectFate(fate.name, APPROXIMATED, f"their mean over the runs: {values}"))
         elif fate.name == mujoco.PLAY:
             play, twist = float(joint.load.backlash), float(joint.load.twist(1.0))
             how = f"tables have no state, so  {play:.3g} rad of play and {twist:.3g} rad/(N·m) of twist are ignored"
-            changed.append(Fate(fate.name, DROPPED, how))
+            changed.append(EffectFate(fate.name, DROPPED, how))
         elif fate.name == mujoco.CONTROLLER:
-            changed.append(Fate(fate.name, DROPPED, "the tables give the voltage that it would produce"))
+            changed.append(EffectFate(fate.name, DROPPED, "the tables give the voltage that it would produce"))
         else:
-            changed.append(Fate(fate.name, fate.verdict, fate.how.replace("functions of the law", "the tables")))
+            changed.append(
+                EffectFate(fate.name, fate.verdict, fate.how.replace("functions of the law", "the tables"))
+            )
     how = "not in the tables: add armature · acceleration to the torque"
-    lines = Fate("steady states", HELD, "linear interpolation between points")
-    return [*changed, Fate("rotor inertia", APPROXIMATED, how), lines]
+    lines = EffectFate("steady states", HELD, "linear interpolation between points")
+    return [*changed, EffectFate("rotor inertia", APPROXIMATED, how), lines]
 
 
-def effects_in_tables(joint: Joint) -> dict[str, str]:
+def effects_in_tables(joint: DriveJoint) -> dict[str, str]:
     """Words for each effect inside the joint. Effects with a memory keep their settled value."""
     settled = "its settled value, since a table has no state"
     return {e.name: settled if e.memory_size is not None else "the tables" for e in joint.inside}
 
 
-def table_files(joint: Joint, found: Map, notes: Sequence[str]) -> dict[str, str | bytes]:
+def table_files(joint: DriveJoint, found: SteadyMap, notes: Sequence[str]) -> dict[str, str | bytes]:
     """The tables as CSV and as a C header that reads them."""
     grid = np.meshgrid(found.speed, found.torque, indexing="ij")
     columns = {"joint_speed_rad_s": grid[0].ravel(), "joint_torque_Nm": grid[1].ravel()}
@@ -174,11 +180,11 @@ def table_files(joint: Joint, found: Map, notes: Sequence[str]) -> dict[str, str
     return {"feed_forward.csv": table_text(columns), "feed_forward.h": c_header(joint, found, notes)}
 
 
-def _array(values: np.ndarray) -> str:
+def _c_array(values: np.ndarray) -> str:
     return ", ".join(f"{x:.7g}f" if "." in f"{x:.7g}" or "e" in f"{x:.7g}" else f"{x:.7g}.0f" for x in values)
 
 
-def c_header(joint: Joint, found: Map, notes: Sequence[str]) -> str:
+def c_header(joint: DriveJoint, found: SteadyMap, notes: Sequence[str]) -> str:
     """Text of a C header: axes, tables, and a function that reads each of them."""
     name = joint.name
     guard = f"{name}_FEED_FORWARD_H".upper()
@@ -186,7 +192,7 @@ def c_header(joint: Joint, found: Map, notes: Sequence[str]) -> str:
     tables = {"voltage": found.values["voltage"], "current": found.values["current"], "efficiency": found.efficiency}
     arrays = "\n".join(
         f"static const float {name}_{key}{shape} = {{\n"
-        + ",\n".join(f"  {{{_array(row)}}}" for row in values)
+        + ",\n".join(f"  {{{_c_array(row)}}}" for row in values)
         + "\n};\n"
         for key, values in tables.items()
     )
@@ -209,8 +215,8 @@ def c_header(joint: Joint, found: Map, notes: Sequence[str]) -> str:
 #ifndef {guard}
 #define {guard}
 
-static const float {name}_speed[{len(found.speed)}] = {{{_array(found.speed)}}};
-static const float {name}_torque[{len(found.torque)}] = {{{_array(found.torque)}}};
+static const float {name}_speed[{len(found.speed)}] = {{{_c_array(found.speed)}}};
+static const float {name}_torque[{len(found.torque)}] = {{{_c_array(found.torque)}}};
 
 {arrays}
 static inline int {name}_place(const float *axis, int points, float x, float *share) {{

@@ -19,10 +19,10 @@ from mmrjax.errors import count_noun
 from mmrjax.fidelities.drive import drive_batch
 from mmrjax.model.conditions import Conditions
 from sweeps.export import comparison, feed_forward, jax_actuator, law_source, mujoco, onnx, randomization
-from sweeps.export.comparison import Comparison, Fate
-from sweeps.export.joint import Joint, joint_of_robot
-from sweeps.export.law_source import Constant, constants_of, posterior_of
-from sweeps.export.situation import AtJoint, Situation, situation_of_joint
+from sweeps.export.comparison import EffectFate, ExportComparison
+from sweeps.export.joint import DriveJoint, joint_of_robot
+from sweeps.export.law_source import LawConstant, law_constants, posterior_next_to
+from sweeps.export.situation import ComparisonRuns, JointResult, situation_of_joint
 
 #: Names of formats and their uses.
 FORMATS = {
@@ -54,11 +54,11 @@ class Export:
     """
 
     format: str
-    joint: Joint
-    constants: tuple[Constant, ...]
+    joint: DriveJoint
+    constants: tuple[LawConstant, ...]
     posterior: Posterior | None
     files: Mapping[str, str | bytes]
-    comparison: Comparison
+    comparison: ExportComparison
     checks: Mapping[str, float]
 
 
@@ -93,18 +93,19 @@ def export_format(
     if to in ("mujoco", "randomization"):
         mujoco.mujoco_module()
     drive = joint_of_robot(file, configuration)
-    posterior = posterior_of(drive) if posterior is None else posterior
+    posterior = posterior_next_to(drive) if posterior is None else posterior
     runs = situation_of_joint(drive.steady, data)
-    constants = constants_of(drive, runs.signals, posterior)
+    constants = law_constants(drive, runs.signals, posterior)
     make = {
-        "mujoco": _mujoco, "randomization": _mujoco, "table": _table, "jax": _actuator, "onnx": _actuator,
-        "mjlab": _actuator,
+        "mujoco": _export_mujoco, "randomization": _export_mujoco, "table": _export_tables,
+        "jax": _export_actuator, "onnx": _export_actuator,
+        "mjlab": _export_actuator,
     }[to]  # fmt: skip
     begun = Export(to, drive, constants, posterior, {}, None, {})  # type: ignore[arg-type]  # filled in below
     return make(begun, runs, at, draws, seed)
 
 
-def notes_of(runs: Situation) -> list[str]:
+def notes_of(runs: ComparisonRuns) -> list[str]:
     """Sentences for the head of every file."""
     command = runs.command
     return [
@@ -114,11 +115,15 @@ def notes_of(runs: Situation) -> list[str]:
     ]
 
 
-def _mujoco(begun: Export, runs: Situation, at: str, draws: int, seed: int) -> Export:
+def _export_mujoco(begun: Export, runs: ComparisonRuns, at: str, draws: int, seed: int) -> Export:
     drive = begun.joint
     normal = float(np.mean(np.asarray(runs.signals.normal)))
     compared = comparison.compare_format(
-        runs, mujoco.law_of(normal), mujoco.fates_in_mujoco(drive, normal), mujoco.TERMS, mujoco.approximated_terms
+        runs,
+        mujoco.mujoco_law_function(normal),
+        mujoco.fates_in_mujoco(drive, normal),
+        mujoco.TERMS,
+        mujoco.approximated_terms,
     )
     motor, name = mujoco.mjcf_motor(drive, compared.refitted), f"{drive.name}_drive"
     about = mujoco.attribute_notes(drive, begun.constants, compared.translated, compared.refitted)
@@ -127,7 +132,7 @@ def _mujoco(begun: Export, runs: Situation, at: str, draws: int, seed: int) -> E
     middle = (float(np.mean(runs.command)), float(np.mean(runs.load)))
     follows = drive.robot.rig.imposed == "goal_angle"
 
-    def texts_of(drive: Joint) -> dict[str, str]:
+    def texts_of(drive: DriveJoint) -> dict[str, str]:
         return {
             "drive.xml": mujoco.mjcf_fragment(drive, motor, about, notes_of(runs), name, at, volts),
             "scene.xml": mujoco.mjcf_scene(
@@ -136,7 +141,7 @@ def _mujoco(begun: Export, runs: Situation, at: str, draws: int, seed: int) -> E
         }
 
     texts = texts_of(drive)
-    checks = _in_mujoco(texts_of(drive.steady), motor, runs, compared)
+    checks = _check_in_mujoco(texts_of(drive.steady), motor, runs, compared)
     if follows or (drive.loose and drive.controller is None):
         checks |= _start_difference(drive, texts, GOAL if follows else volts, motor.ratio if follows else 1.0)
     files: Mapping[str, str | bytes] = texts
@@ -148,12 +153,14 @@ def _mujoco(begun: Export, runs: Situation, at: str, draws: int, seed: int) -> E
     return dataclasses.replace(begun, files=files, comparison=compared, checks=checks)
 
 
-def _in_mujoco(texts: Mapping[str, str], motor: mujoco.Motor, runs: Situation, found: Comparison) -> dict[str, float]:
+def _check_in_mujoco(
+    texts: Mapping[str, str], motor: mujoco.MjcfMotor, runs: ComparisonRuns, found: ExportComparison
+) -> dict[str, float]:
     """Largest differences of MuJoCo C from the format's law, and errors of both on the same runs [%]."""
     rows = np.unique(np.linspace(0, len(runs.command) - 1, min(CHECKED, len(runs.command))).astype(int))
     got = mujoco.settle_in_mujoco(texts, motor, runs, found.exported, rows.tolist())
-    law = AtJoint(found.exported.current[rows], found.exported.speed[rows])
-    native = AtJoint(runs.inside.current[rows], runs.inside.speed[rows])
+    law = JointResult(found.exported.current[rows], found.exported.speed[rows])
+    native = JointResult(runs.inside.current[rows], runs.inside.speed[rows])
 
     def apart(a: np.ndarray, b: np.ndarray) -> float:
         return 100 * float(np.sqrt(np.mean((a - b) ** 2)) / np.sqrt(np.mean(b**2)))
@@ -167,7 +174,7 @@ def _in_mujoco(texts: Mapping[str, str], motor: mujoco.Motor, runs: Situation, f
     }
 
 
-def _start_difference(drive: Joint, texts: Mapping[str, str], command: float, ratio: float) -> dict[str, float]:
+def _start_difference(drive: DriveJoint, texts: Mapping[str, str], command: float, ratio: float) -> dict[str, float]:
     """Difference of MuJoCo C from the native model over the start of a constant goal [rad] or voltage [V] at rest."""
     times = np.linspace(0.0, START, 26)
     own = drive.controller
@@ -179,9 +186,9 @@ def _start_difference(drive: Joint, texts: Mapping[str, str], command: float, ra
     return {f"angle over {START:g} s from rest, MuJoCo C against native [%]": share}
 
 
-def _actuator(begun: Export, runs: Situation, at: str, draws: int, seed: int) -> Export:
+def _export_actuator(begun: Export, runs: ComparisonRuns, at: str, draws: int, seed: int) -> Export:
     drive, constants, notes = begun.joint, begun.constants, notes_of(runs)
-    law, held = jax_actuator.law_of(runs, constants), jax_actuator.effects_in_actuator(drive)
+    law, held = jax_actuator.actuator_law_function(runs, constants), jax_actuator.effects_in_actuator(drive)
     checks: dict[str, float] = {}
     if begun.format == "jax":
         files = jax_actuator.jax_files(drive, constants, notes)
@@ -199,10 +206,10 @@ def _actuator(begun: Export, runs: Situation, at: str, draws: int, seed: int) ->
     return dataclasses.replace(begun, files=files, comparison=compared, checks=checks)
 
 
-def _table(begun: Export, runs: Situation, at: str, draws: int, seed: int) -> Export:
+def _export_tables(begun: Export, runs: ComparisonRuns, at: str, draws: int, seed: int) -> Export:
     drive, constants = begun.joint, begun.constants
-    law, held = feed_forward.law_of(runs, constants), feed_forward.effects_in_tables(drive)
-    fates: list[Fate] = feed_forward.fates_in_tables(drive, constants)
+    law, held = feed_forward.table_law_function(runs, constants), feed_forward.effects_in_tables(drive)
+    fates: list[EffectFate] = feed_forward.fates_in_tables(drive, constants)
     compared = comparison.compare_format(runs, law, fates, held, mujoco.approximated_terms)
-    files = feed_forward.table_files(drive, feed_forward.map_of(runs, constants), notes_of(runs))
+    files = feed_forward.table_files(drive, feed_forward.map_of_drive(runs, constants), notes_of(runs))
     return dataclasses.replace(begun, files=files, comparison=compared)

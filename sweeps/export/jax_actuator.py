@@ -13,11 +13,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from calibration.data import Json, Names
-from sweeps.export.comparison import DROPPED, HELD, Fate
-from sweeps.export.joint import Joint, memory_grows
-from sweeps.export.law_source import Constant, constant_values, jax_source, module_from_source
+from sweeps.export.comparison import DROPPED, HELD, EffectFate
+from sweeps.export.joint import DriveJoint, memory_grows
+from sweeps.export.law_source import LawConstant, constant_values, jax_source, module_from_source
 from sweeps.export.mujoco import CONTROLLER, PLAY, fates_outside_joint
-from sweeps.export.situation import Situation
+from sweeps.export.situation import ComparisonRuns
 
 #: Steps of a run to its steady state, and their length [s]: of an implicit step so long, Newton's method is left.
 SETTLING, LONG = 10, 1e9
@@ -30,7 +30,7 @@ PLACES = "jax_traceback_in_locations_limit"
 
 
 class ActuatorLaw(eqx.Module):
-    """The generated actuator in steady travel, without a refit. Attributes: as of `comparison.FormatLaw`.
+    """The generated actuator in steady travel, without a refit. Its attributes are those of `comparison.FormatLaw`.
 
     params: parameters of the actuator, of shape (runs,) where they differ.
     guess: speed of the joint near the solution [rad/s].
@@ -68,7 +68,7 @@ def settled_actuator(module: ModuleType, params: Json, command: Any, speed: Any)
     return torque, info
 
 
-def steady_params(joint: Joint, constants: Sequence[Constant], amplitudes: Mapping[str, float]) -> Json:
+def steady_params(joint: DriveJoint, constants: Sequence[LawConstant], amplitudes: Mapping[str, float]) -> Json:
     """Parameters of the actuator in steady travel: without what repeats with an angle, whose mean is 0."""
     params = dict(constant_values(constants))
     waves = {p.name: 0.0 for p in joint.parts if memory_grows(p)}
@@ -78,11 +78,11 @@ def steady_params(joint: Joint, constants: Sequence[Constant], amplitudes: Mappi
     return params
 
 
-def law_of(situation: Situation, constants: Sequence[Constant]) -> Any:
-    """Returns the function from a joint and amplitudes to the law of its actuator in these runs."""
+def actuator_law_function(situation: ComparisonRuns, constants: Sequence[LawConstant]) -> Any:
+    """Function of a joint and amplitudes that returns the law of its actuator in these runs."""
     module = module_from_source(jax_source(situation.joint, constants))
 
-    def law(joint: Joint, amplitudes: Mapping[str, float]) -> ActuatorLaw:
+    def law(joint: DriveJoint, amplitudes: Mapping[str, float]) -> ActuatorLaw:
         params = steady_params(joint, constants, amplitudes)
         for name in joint.surroundings():
             value = np.asarray(getattr(situation.signals, name.removeprefix("surroundings.")), float)
@@ -93,34 +93,36 @@ def law_of(situation: Situation, constants: Sequence[Constant]) -> Any:
     return law
 
 
-def fates_in_actuator(joint: Joint) -> list[Fate]:
+def fates_in_actuator(joint: DriveJoint) -> list[EffectFate]:
     """Fates of the base's terms, and of effects outside the joint."""
     robot = joint.robot
     fates = [
-        Fate("motor, winding and gearbox", HELD, "functions of the law"),
-        Fate("rotor inertia", HELD, "`armature(params)`, to be set as the joint's own armature"),
+        EffectFate("motor, winding and gearbox", HELD, "functions of the law"),
+        EffectFate("rotor inertia", HELD, "`armature(params)`, to be set as the joint's own armature"),
     ]
     if joint.surroundings():
         names = ", ".join(joint.surroundings())
-        fates.append(Fate("friction from the joint's surroundings", HELD, f"parameters {names}, free to change"))
+        fates.append(
+            EffectFate("friction from the joint's surroundings", HELD, f"parameters {names}, free to change")
+        )
     if robot.has_ground:
         how = "the simulator's own contact with the ground"
-        fates.append(Fate("ground: slip and rolling resistance", DROPPED, how))
+        fates.append(EffectFate("ground: slip and rolling resistance", DROPPED, how))
     if joint.loose:
-        fates.append(Fate(PLAY, HELD, "states of the law: gap, and speed of the motor's side"))
+        fates.append(EffectFate(PLAY, HELD, "states of the law: gap, and speed of the motor's side"))
     if joint.controller is not None:
-        fates.append(Fate(CONTROLLER, HELD, "functions of the law; the command is its goal"))
+        fates.append(EffectFate(CONTROLLER, HELD, "functions of the law; the command is its goal"))
     if joint.limit is not None:
-        fates.append(Fate("current limit of the driver", HELD, "a bound of the current"))
+        fates.append(EffectFate("current limit of the driver", HELD, "a bound of the current"))
     return [*fates, *fates_outside_joint(joint)]
 
 
-def effects_in_actuator(joint: Joint) -> dict[str, str]:
+def effects_in_actuator(joint: DriveJoint) -> dict[str, str]:
     """Words for each effect inside the joint. The law has all of them."""
     return {e.name: "a function of the law" for e in joint.inside}
 
 
-def jax_files(joint: Joint, constants: Sequence[Constant], notes: Sequence[str]) -> dict[str, str | bytes]:
+def jax_files(joint: DriveJoint, constants: Sequence[LawConstant], notes: Sequence[str]) -> dict[str, str | bytes]:
     """The actuator's source, and its program as `jax.export` serialises it."""
     source = jax_source(joint, constants, notes)
     return {"actuator.py": source, "actuator.jaxexport": serialise_actuator(module_from_source(source))}
@@ -133,7 +135,7 @@ def serialise_actuator(module: ModuleType) -> bytes:
     """
     from jax import export
 
-    with jax.enable_x64(False), _without_places():
+    with jax.enable_x64(False), _without_source_paths():
         (many,) = export.symbolic_shape("n")
         single, each = jax.ShapeDtypeStruct((), jnp.float32), jax.ShapeDtypeStruct((many,), jnp.float32)
         params = dict.fromkeys(module.PARAMS, single)
@@ -145,7 +147,7 @@ def serialise_actuator(module: ModuleType) -> bytes:
 
 
 @contextlib.contextmanager
-def _without_places() -> Iterator[None]:
+def _without_source_paths() -> Iterator[None]:
     """Context in which lowered programs have no paths of source files: equal programs have equal bytes."""
     kept = getattr(jax.config, PLACES)
     jax.config.update(PLACES, 0)

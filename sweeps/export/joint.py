@@ -1,4 +1,4 @@
-"""A robot's drive as the actuator of one joint, its driving wheel or shaft: parts of the law as expressions."""
+"""A robot's drive as the actuator of one joint, its driving wheel or shaft. Parts of its law are expressions."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from mmrjax.model.channels import EVERY
 from mmrjax.model.controller import Controller
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import Signals
-from sweeps.export.expressions import ZERO, Symbol, names_of, trace_function
+from sweeps.export.expressions import ZERO, Symbol, names_in, trace_function
 
 #: Balances that a joint has; what enters another one belongs to what the joint moves, or to an instrument.
 INSIDE = ("supply", "electrical", "inductance", "motor", "gearbox", "track", "inertia")
@@ -68,7 +68,7 @@ class Part:
 
 
 @dataclasses.dataclass(frozen=True)
-class Joint:
+class DriveJoint:
     """A drive as the actuator of a joint.
 
     Attributes:
@@ -142,7 +142,7 @@ class Joint:
         return ("current", *memories, *self.controller_states, *motor_side, *(("speed",) * self.accelerates))
 
     @property
-    def steady(self) -> Joint:
+    def steady(self) -> DriveJoint:
         """The same joint in steady travel under a voltage, without the controller and with a rigid gearbox."""
 
         def driven(robot: Robot) -> Robot:
@@ -159,14 +159,14 @@ class Joint:
         """Parts of a balance, in order."""
         return tuple(p for p in self.parts if p.balance == balance)
 
-    def with_robot(self, robot: Robot) -> Joint:
+    def with_robot(self, robot: Robot) -> DriveJoint:
         """The same joint of a robot with other numbers. Its parts are expressions of names and stay."""
         return dataclasses.replace(self, robot=robot, inside=robot.effects)
 
     def parameters(self) -> dict[str, params.Parameter]:
         """Parameters that the law depends on, by dotted name."""
         by_name = {p.name: p for p in params.walk_parameters(self.robot)}
-        used = [n for part in self.parts for n in names_of(*_symbols(part))]
+        used = [n for part in self.parts for n in names_in(*_symbols_of_part(part))]
         further = ["gearbox.ratio", "motor.inertia", "gearbox.efficiency_load"]
         further += ["driver.current_limit"] * (self.limit is not None)
         further += [f"{self.configuration}.inertia"] * (self.accelerates or self.loose)
@@ -176,15 +176,15 @@ class Joint:
 
     def surroundings(self) -> Names:
         """Signals of the joint's surroundings that the law depends on, such as the normal load."""
-        used = [n for part in self.parts for n in names_of(*_symbols(part)) if n.startswith("surroundings.")]
+        used = [n for part in self.parts for n in names_in(*_symbols_of_part(part)) if n.startswith("surroundings.")]
         return tuple(dict.fromkeys(used))
 
 
-def _symbols(part: Part) -> list[Symbol]:
+def _symbols_of_part(part: Part) -> list[Symbol]:
     return [part.value, part.slope, part.rate_slope, *([] if part.rate is None else [part.rate])]
 
 
-def joint_of_robot(file: RobotFile, configuration: str | None = None) -> Joint:
+def joint_of_robot(file: RobotFile, configuration: str | None = None) -> DriveJoint:
     """Returns the drive of a robot as the actuator of one joint.
 
     Args:
@@ -221,24 +221,24 @@ def joint_of_robot(file: RobotFile, configuration: str | None = None) -> Joint:
         raise BadConfiguration(f"{file.name}: {', '.join(lacking)} is missing; the drive law needs it; add it")
     members: Any = {name: robot.configurations[name]}
     one = dataclasses.replace(robot, configurations=members)
-    acting = tuple(e for e in robot.effects if _acts(one, e))
+    acting = tuple(e for e in robot.effects if _effect_acts(one, e))
     idle = tuple(e.name for e in robot.effects if e not in acting)
     inside = tuple(e for e in acting if e.balance in INSIDE and not e.needs_battery and e.balance not in robot.lacks)
     outside = tuple(e for e in acting if e not in inside)
     one = dataclasses.replace(one, effects=inside)
-    joint = Joint(file, name, one, inside, outside, idle, ())
-    return dataclasses.replace(joint, parts=tuple(_parts(joint)))
+    joint = DriveJoint(file, name, one, inside, outside, idle, ())
+    return dataclasses.replace(joint, parts=tuple(_trace_parts(joint)))
 
 
-def _acts(robot: Robot, effect: Effect) -> bool:
+def _effect_acts(robot: Robot, effect: Effect) -> bool:
     on_tracks = jnp.asarray(robot.configurations.members[0].on_tracks)
     return effect.acts_everywhere or bool(effect.acts(robot, Signals(configuration=0, on_tracks=on_tracks)))
 
 
-class _Tracer:
+class _ExpressionTracer:
     """Traces functions of a robot and its signals into expressions of their names."""
 
-    def __init__(self, joint: Joint) -> None:
+    def __init__(self, joint: DriveJoint) -> None:
         self.joint, self.at_wheel = joint, True
         self.parameters = [p.name for p in params.walk_parameters(joint.robot)]
         self.memories = [e.name for e in joint.robot.remembering]
@@ -295,9 +295,9 @@ class _Tracer:
         return robot, Signals(**around)
 
 
-def _parts(joint: Joint) -> Iterator[Part]:
+def _trace_parts(joint: DriveJoint) -> Iterator[Part]:
     """Equations of the base, then those of the effects, each in the order of its balance."""
-    trace = _Tracer(joint)
+    trace = _ExpressionTracer(joint)
     bare = lambda robot: dataclasses.replace(robot, effects=())  # noqa: E731
 
     rest = float(joint.load.speed_still) / float(joint.load.radius)
@@ -330,7 +330,7 @@ def _parts(joint: Joint) -> Iterator[Part]:
          lambda r, s: balances.track(bare(r), r.chassis(0), s).torque_track_loss),
     )  # fmt: skip
     for name, balance, unit, equation, meaning, by, function in base:
-        yield _part(trace, name, balance, unit, equation, meaning, by, function)
+        yield _trace_part(trace, name, balance, unit, equation, meaning, by, function)
     variable = {"supply": "current", "electrical": "current", "gearbox": "load", "track": "pull"}
     for effect in joint.inside:
         alone = lambda r, e=effect: tuple(x for x in r.effects if x.name == e.name)  # noqa: E731
@@ -340,18 +340,18 @@ def _parts(joint: Joint) -> Iterator[Part]:
         rate = None
         if effect.memory_size is not None:
             rate = lambda r, s, alone=alone: alone(r)[0].rate(r, s)  # noqa: E731
-        yield _part(
+        yield _trace_part(
             trace, effect.name, effect.balance, balances.BALANCES[effect.balance][0], *effect_docstring(effect),
             variable.get(effect.balance, ""), value, rate, effect.name,
         )  # fmt: skip
 
 
-def _part(
-    trace: _Tracer, name: str, balance: str, unit: str, equation: str, meaning: str, by: str,
+def _trace_part(
+    trace: _ExpressionTracer, name: str, balance: str, unit: str, equation: str, meaning: str, by: str,
     function: Callable[[Robot, Signals], Any], rate: Callable[[Robot, Signals], Any] | None = None, effect: str = "",
 ) -> Part:  # fmt: skip
     value = trace(function, name, balance)
-    depends = by in names_of(value)
+    depends = by in names_in(value)
     part = Part(name, balance, unit, equation, meaning, value, by if depends else "", effect=effect)
     if depends:
         part = dataclasses.replace(part, slope=trace(function, name, balance, by))
@@ -385,7 +385,7 @@ def mean_surroundings(signals: Signals, names: Sequence[str]) -> dict[str, float
     return means
 
 
-def channels_of(joint: Joint) -> tuple[Any, ...]:
+def channels_of(joint: DriveJoint) -> tuple[Any, ...]:
     """Channels of the robot's instruments that settled runs show, in the order of their table.
 
     A rig without any, such as a servo whose angle alone is read, is compared by current and speed of the motor.

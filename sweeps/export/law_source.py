@@ -23,15 +23,15 @@ from mmrjax.model.balances import TORQUE_STEPS
 from mmrjax.model.params import Parameter
 from mmrjax.model.shaft import FLANK_DAMPING, FLANK_STIFFNESS
 from mmrjax.model.signals import Signals
-from sweeps.export.expressions import JAX, TORCH, Dialect, Symbol, lines_of, names_of
-from sweeps.export.joint import VARIABLES, Joint, Part, mean_surroundings
+from sweeps.export.expressions import JAX, TORCH, Dialect, Symbol, lines_of, names_in
+from sweeps.export.joint import VARIABLES, DriveJoint, Part, mean_surroundings
 
 #: Draws of the posterior by which intervals are found, and the shares of them below their ends.
 DRAWS, ENDS = 4000, (0.025, 0.975)
 OF_POSTERIOR, OF_PRIOR = "95 % interval", "from the prior (± two sds): no posterior available"
 
 
-def posterior_of(joint: Joint) -> Posterior | None:
+def posterior_next_to(joint: DriveJoint) -> Posterior | None:
     """Returns the posterior next to the robot's file, None if there is no such file.
 
     Raises:
@@ -46,20 +46,20 @@ def posterior_of(joint: Joint) -> Posterior | None:
     return posterior
 
 
-def constants_of(joint: Joint, signals: Signals, posterior: Posterior | None) -> tuple[Constant, ...]:
-    """Returns the numbers of the law: parameters of the robot, and means of the joint's surroundings over runs.
+def law_constants(joint: DriveJoint, signals: Signals, posterior: Posterior | None) -> tuple[LawConstant, ...]:
+    """Numbers of the law: parameters of the robot, and means of the joint's surroundings over the runs.
 
     Args:
         signals: signals of the runs.
     """
-    ends = _intervals(posterior)
+    ends = _parameter_intervals(posterior)
     constants = []
     for name, parameter in joint.parameters().items():
-        low, high, kind = _interval(joint, name, parameter, ends, posterior is not None)
+        low, high, kind = _interval_of(joint, name, parameter, ends, posterior is not None)
         spec = parameter.spec
         source = f"fitted; prior: {spec.source}" if kind == OF_POSTERIOR else spec.source
         value = float(parameter.value)
-        constants.append(Constant(name, value, spec.unit, spec.meaning, source, low, high, kind))
+        constants.append(LawConstant(name, value, spec.unit, spec.meaning, source, low, high, kind))
     for name, mean in mean_surroundings(signals, joint.surroundings()).items():
         word = name.removeprefix("surroundings.")
         condition = quantities.CONDITIONS.get(word)
@@ -67,22 +67,22 @@ def constants_of(joint: Joint, signals: Signals, posterior: Posterior | None) ->
         meaning = {"normal": "normal load of one side"}.get(
             word, condition.label if condition else word.replace("_", " ")
         )
-        constants.append(Constant(name, mean, unit, meaning, "mean over the compared runs"))
+        constants.append(LawConstant(name, mean, unit, meaning, "mean over the compared runs"))
     if joint.controller is not None:
         volts = joint.controller.supply_voltage
-        constants.append(Constant(SUPPLY, volts, "V", "supply of the driver", "given by the user of the actuator"))
+        constants.append(LawConstant(SUPPLY, volts, "V", "supply of the driver", "given by the user of the actuator"))
     return tuple(constants)
 
 
-def _intervals(posterior: Posterior | None) -> dict[str, tuple[float, float]]:
+def _parameter_intervals(posterior: Posterior | None) -> dict[str, tuple[float, float]]:
     if posterior is None:
         return {}
     quantiles = np.quantile(posterior.draw(DRAWS, 0), ENDS, axis=0)
     return {name: (float(a), float(b)) for name, a, b in zip(posterior.names, *quantiles, strict=True)}
 
 
-def _interval(
-    joint: Joint, name: str, parameter: Parameter, ends: dict[str, tuple[float, float]], fitted: bool
+def _interval_of(
+    joint: DriveJoint, name: str, parameter: Parameter, ends: dict[str, tuple[float, float]], fitted: bool
 ) -> tuple[float | None, float | None, str]:
     if name in ends:
         return *ends[name], OF_POSTERIOR
@@ -102,7 +102,7 @@ _ARGUMENTS = (*VARIABLES, "load", "pull")
 
 
 @dataclasses.dataclass(frozen=True)
-class Constant:
+class LawConstant:
     """A number of the law.
 
     Attributes:
@@ -129,7 +129,7 @@ class Constant:
 
 
 @dataclasses.dataclass(frozen=True)
-class _Library:
+class _ArrayLibrary:
     """Names that differ between array libraries."""
 
     dialect: Dialect
@@ -138,17 +138,17 @@ class _Library:
     clipped: Callable[[str, str], str]
 
 
-_JAX = _Library(
+_JAX = _ArrayLibrary(
     JAX, "import jax.numpy as jnp", lambda x: f"jnp.maximum({x}, 0.0)", lambda x, b: f"jnp.clip({x}, -{b}, {b})"
 )
-_TORCH = _Library(
+_TORCH = _ArrayLibrary(
     TORCH, "import torch", lambda x: f"torch.clamp({x}, min=0.0)", lambda x, b: f"torch.clamp({x}, -{b}, {b})"
 )
 
 
 def function_arguments(symbol: Symbol) -> list[str]:
     """Arguments of the function of an expression, in addition to its parameters."""
-    used = names_of(symbol)
+    used = names_in(symbol)
     used_arguments = [n for n in _ARGUMENTS if n in used]
     return [*used_arguments, "memory"] if any(n.startswith("memory.") for n in used) else used_arguments
 
@@ -163,18 +163,18 @@ def _docstring(text: str) -> str:
     return '"""' + printable(text).replace("\\", "\\\\").replace('"', '\\"') + '"""'
 
 
-def _function(name: str, symbol: Symbol, document: str, dialect: Dialect) -> str:
+def _function_text(name: str, symbol: Symbol, document: str, dialect: Dialect) -> str:
     def spelled(word: str) -> str:
         if word in _ARGUMENTS:
             return word
         return "memory" if word.startswith("memory.") else f"p[{quoted(word)}]"
 
     head = f"def {name}({', '.join(['p', *function_arguments(symbol)])}):"
-    body = textwrap.indent(_wrapped(document), "    ")
+    body = textwrap.indent(_wrap_docstring(document), "    ")
     return "\n".join([head, body, *lines_of(symbol, dialect, spelled)])
 
 
-def _wrapped(document: str) -> str:
+def _wrap_docstring(document: str) -> str:
     lines = textwrap.wrap(document, 108)
     short = len(lines) == 1 and len(document) < 104
     return _docstring(document if short else "\n".join(lines) + "\n")
@@ -189,31 +189,33 @@ def call_text(part: Part, suffix: str = "", memory: str | None = None) -> str:
     return f"{part.name}{suffix}({', '.join(given)})"
 
 
-def _sum(parts: Sequence[Part], suffix: str = "", memory: Mapping[str, str] | None = None) -> str:
+def _sum_text(parts: Sequence[Part], suffix: str = "", memory: Mapping[str, str] | None = None) -> str:
     memory = memory or {}
     terms = [call_text(p, suffix, memory.get(p.name)) for p in parts if suffix != "_slope" or p.by]
     return " + ".join(terms) or "0.0"
 
 
-def functions_text(joint: Joint, dialect: Dialect) -> str:
+def functions_text(joint: DriveJoint, dialect: Dialect) -> str:
     """Text of the functions of all parts, with their derivatives and rates."""
     texts = []
     for part in joint.parts:
         unit = "" if part.unit == "-" else f" [{part.unit}]"
         meaning = part.meaning if part.meaning.endswith(".") else f"{part.meaning}." if part.meaning else ""
         document = f"{part.equation.rstrip('.')}{unit}. {meaning}".strip()
-        texts.append(_function(part.name, part.value, document, dialect))
+        texts.append(_function_text(part.name, part.value, document, dialect))
         if part.by:
             what = f"Derivative of `{part.name}` with respect to `{part.by}`."
-            texts.append(_function(f"{part.name}_slope", part.slope, what, dialect))
+            texts.append(_function_text(f"{part.name}_slope", part.slope, what, dialect))
         if part.rate is not None:
-            texts.append(_function(f"{part.name}_rate", part.rate, f"Rate of the memory of `{part.name}`.", dialect))
+            texts.append(
+                _function_text(f"{part.name}_rate", part.rate, f"Rate of the memory of `{part.name}`.", dialect)
+            )
             what = f"Derivative of `{part.name}_rate` with respect to the memory of `{part.name}`."
-            texts.append(_function(f"{part.name}_rate_slope", part.rate_slope, what, dialect))
+            texts.append(_function_text(f"{part.name}_rate_slope", part.rate_slope, what, dialect))
     return "\n\n\n".join(texts)
 
 
-def step_lines(joint: Joint, library: _Library) -> list[str]:
+def step_lines(joint: DriveJoint, library: _ArrayLibrary) -> list[str]:
     """Lines of one step of the law, from `state`, `command`, `joint_position`, `joint_velocity` and `dt`."""
     circuit = joint.of("supply") + joint.of("electrical")
     gear, track = joint.of("gearbox"), joint.of("track")
@@ -229,9 +231,9 @@ def step_lines(joint: Joint, library: _Library) -> list[str]:
         f"way = {call_text(joint.of('way')[0])}",
         "# Current of the winding: L dI/dt = U - E - U_R - ..., one implicit Euler step, linear in the current.",
         'current = state["current"]',
-        f"left = voltage - {call_text(joint.of('back')[0])} - ({_sum(circuit)})",
-        f"slope = {library.positive(_sum(circuit, '_slope'))}",
-        f"current = current + dt * left / ({_sum(joint.of('inductance'))} + dt * slope)",
+        f"left = voltage - {call_text(joint.of('back')[0])} - ({_sum_text(circuit)})",
+        f"slope = {library.positive(_sum_text(circuit, '_slope'))}",
+        f"current = current + dt * left / ({_sum_text(joint.of('inductance'))} + dt * slope)",
     ]
     if joint.limit is not None:
         lines.append(
@@ -248,20 +250,20 @@ def step_lines(joint: Joint, library: _Library) -> list[str]:
         if all(a not in ("load", "pull") for a in function_arguments(p.rate or p.value))
     ]
     lines += [
-        f"lost = {_sum(circuit, '', later)}",
+        f"lost = {_sum_text(circuit, '', later)}",
         "# Torques from the winding to the wheel.",
         f"made = {call_text(joint.of('torque')[0])}",
         *(() if joint.loose else inertia),
-        f"at_shaft = made - ({_sum(joint.of('motor'), '', later)}){rotor}",
+        f"at_shaft = made - ({_sum_text(joint.of('motor'), '', later)}){rotor}",
         f"load = at_shaft - {call_text(joint.of('idle')[0])}",
     ]
     if joint.loose:
-        lines += [*_play_lines(joint, library, _sum(gear, "", later)), *inertia]
+        lines += [*_joint_torque_lines(joint, library, _sum_text(gear, "", later)), *inertia]
     else:
         lines.append(f'through = p["gearbox.ratio"] * {call_text(joint.of("efficiency")[0])} * load')
-        lines += _solved("load", "through", gear, later)
+        lines += _fixed_point_lines("load", "through", gear, later)
     lines += [
-        *_solved("pull", f"load{wheel}", track, later),
+        *_fixed_point_lines("pull", f"load{wheel}", track, later),
         'info = {"current": current, "voltage": voltage, "motor_speed": motor_speed, "power": voltage * current,',
         f'        "lost_winding": lost * current, "lost_motor": (made - at_shaft{rotor}) * motor_speed,',
         f'        "lost_gearbox": {"at_shaft * motor_speed - load * wheel_speed" if rigid else "lost_gearbox"},',
@@ -271,7 +273,7 @@ def step_lines(joint: Joint, library: _Library) -> list[str]:
     return lines
 
 
-def _controller_code(joint: Joint, library: _Library) -> list[str]:
+def _controller_code(joint: DriveJoint, library: _ArrayLibrary) -> list[str]:
     """Lines of the controller: the voltage for a goal, and the states after the step."""
     imposed, own, prefix = joint.robot.rig.imposed, joint.controller, library.dialect.prefix
     assert own is not None
@@ -300,7 +302,7 @@ def _controller_code(joint: Joint, library: _Library) -> list[str]:
     ]
 
 
-def _play_lines(joint: Joint, library: _Library, lost: str) -> list[str]:
+def _joint_torque_lines(joint: DriveJoint, library: _ArrayLibrary, lost: str) -> list[str]:
     """Lines of the torque between motor and load (`Shaft.torque_joint`), one implicit Euler step of the motor's side.
 
     Args:
@@ -354,7 +356,7 @@ def _play_lines(joint: Joint, library: _Library, lost: str) -> list[str]:
     ]
 
 
-def _inertia_lines(joint: Joint) -> list[str]:
+def _inertia_lines(joint: DriveJoint) -> list[str]:
     """Lines for the torques that accelerate rotor and wheel: the joint has their inertia, losses by torque do not.
 
     As in the model, the gearbox transmits what is left after the rotor, and its sign is the direction of power.
@@ -375,33 +377,33 @@ TURNING = 'p["motor.inertia"] * p["gearbox.ratio"] ** 2'
 ARMATURE = f'{TURNING} * 0.5 * (p["gearbox.efficiency_load"] + 1.0 / p["gearbox.efficiency_load"])'
 
 
-def _solved(name: str, given: str, parts: Sequence[Part], later: Mapping[str, str]) -> list[str]:
+def _fixed_point_lines(name: str, given: str, parts: Sequence[Part], later: Mapping[str, str]) -> list[str]:
     """Lines that find x with x + losses(x) = given."""
     if not any(p.by for p in parts):
-        return [f"{name} = {given} - ({_sum(parts, '', later)})" if parts else f"{name} = {given}"]
-    left = f"({name} + {_sum(parts, '', later)} - ({given}))"
+        return [f"{name} = {given} - ({_sum_text(parts, '', later)})" if parts else f"{name} = {given}"]
+    left = f"({name} + {_sum_text(parts, '', later)} - ({given}))"
     return [
         f"{name} = {given}",
         f"for _ in range({TORQUE_STEPS}):  # a loss that depends on the torque itself",
-        f"    {name} = {name} - {left} / (1.0 + {_sum(parts, '_slope', later)})",
+        f"    {name} = {name} - {left} / (1.0 + {_sum_text(parts, '_slope', later)})",
     ]
 
 
-def constants_text(constants: Sequence[Constant], name: str = "PARAMS") -> str:
+def constants_text(constants: Sequence[LawConstant], name: str = "PARAMS") -> str:
     """Text of the table of the law's numbers, each with its unit, meaning, interval and source."""
     lines = [f"{name} = {{"]
     for c in constants:
-        lines += [f"    # {text}" for text in textwrap.wrap(printable(_about(c)), 106)]
+        lines += [f"    # {text}" for text in textwrap.wrap(printable(_constant_comment(c)), 106)]
         lines.append(f"    {quoted(c.name)}: {c.value!r},")
     return "\n".join([*lines, "}"])
 
 
-def _about(c: Constant) -> str:
+def _constant_comment(c: LawConstant) -> str:
     interval = f"; {c.interval}" if c.interval else ""
     return f"{c.meaning} [{c.unit}]{interval}; {c.source}"
 
 
-def _header(joint: Joint, what: str, notes: Sequence[str]) -> str:
+def _module_header(joint: DriveJoint, what: str, notes: Sequence[str]) -> str:
     head = f"{what} of {joint.file.name}, {joint.configuration}. Written by mmrjax {__version__}."
     body = "\n\n".join("\n".join(textwrap.wrap(n, 108)) for n in notes)
     return _docstring(f"{head}\n\n{body}\n") + "\n"
@@ -423,19 +425,21 @@ _DOCUMENT = '''"""One step of the drive: torque at the joint, state after the st
     """'''
 
 
-def jax_source(joint: Joint, constants: Sequence[Constant], notes: Sequence[str] = ()) -> str:
+def jax_source(joint: DriveJoint, constants: Sequence[LawConstant], notes: Sequence[str] = ()) -> str:
     """Source of the law in JAX."""
-    return _source(joint, constants, _JAX, "Actuator", notes)
+    return _module_text(joint, constants, _JAX, "Actuator", notes)
 
 
 def torch_source(
-    joint: Joint, constants: Sequence[Constant], notes: Sequence[str] = (), imports: str = _TORCH.imports
+    joint: DriveJoint, constants: Sequence[LawConstant], notes: Sequence[str] = (), imports: str = _TORCH.imports
 ) -> str:
     """Source of the law in PyTorch."""
-    return _source(joint, constants, dataclasses.replace(_TORCH, imports=imports), "Actuator", notes)
+    return _module_text(joint, constants, dataclasses.replace(_TORCH, imports=imports), "Actuator", notes)
 
 
-def _source(joint: Joint, constants: Sequence[Constant], library: _Library, what: str, notes: Sequence[str]) -> str:
+def _module_text(
+    joint: DriveJoint, constants: Sequence[LawConstant], library: _ArrayLibrary, what: str, notes: Sequence[str]
+) -> str:
     states = ", ".join(f'"{n}": zero' for n in joint.states)
     moving = (
         "" if not joint.accelerates else ", and the joint's speed one step before [rad/s]: set it if the joint moves"
@@ -455,7 +459,7 @@ def _source(joint: Joint, constants: Sequence[Constant], library: _Library, what
     zero = "jnp.zeros(shape)" if library.dialect is JAX else "torch.zeros(shape, device=device)"
     given = "shape=()" if library.dialect is JAX else "shape=(), device=None"
     return (
-        f"{_header(joint, what, notes)}\n{library.imports}\n\n{constants_text(constants)}\n\n\n"
+        f"{_module_header(joint, what, notes)}\n{library.imports}\n\n{constants_text(constants)}\n\n\n"
         f"{functions_text(joint, library.dialect)}\n\n\n"
         f"def armature(params):\n"
         f'    """{own}, for the joint\'s own armature [kg·m²]."""\n'
@@ -506,7 +510,7 @@ def _states_a_law(tree: ast.Module) -> bool:
     )
 
 
-def constant_values(constants: Sequence[Constant]) -> Json:
+def constant_values(constants: Sequence[LawConstant]) -> Json:
     """Values of constants by name."""
     return {c.name: c.value for c in constants}
 
@@ -576,6 +580,6 @@ class DriveActuatorCfg(ActuatorCfg):
 '''
 
 
-def mjlab_files(joint: Joint, constants: Sequence[Constant], notes: Sequence[str]) -> dict[str, str | bytes]:
+def mjlab_files(joint: DriveJoint, constants: Sequence[LawConstant], notes: Sequence[str]) -> dict[str, str | bytes]:
     """The source of the law in PyTorch with the classes of mjlab."""
     return {"mjlab_actuator.py": torch_source(joint, constants, notes, imports=_IMPORTS) + _CLASSES}

@@ -20,10 +20,10 @@ from mmrjax import __version__
 from mmrjax.errors import printable
 from mmrjax.model.chassis import inertia_reduced
 from mmrjax.model.shaft import FLANK_DAMPING, FLANK_STIFFNESS
-from sweeps.export.comparison import APPROXIMATED, DROPPED, HELD, Fate
-from sweeps.export.joint import Joint
-from sweeps.export.law_source import Constant
-from sweeps.export.situation import AtJoint, Situation
+from sweeps.export.comparison import APPROXIMATED, DROPPED, HELD, EffectFate
+from sweeps.export.joint import DriveJoint
+from sweeps.export.law_source import LawConstant
+from sweeps.export.situation import ComparisonRuns, JointResult
 
 #: First version that has `<dcmotor>`.
 FIRST = (3, 7, 0)
@@ -90,7 +90,7 @@ class MujocoLaw(eqx.Module):
         return given[SHARE] * current, speed
 
 
-def _effect_numbers(joint: Joint, amplitudes: Mapping[str, float]) -> dict[str, dict[str, float]]:
+def _effect_numbers(joint: DriveJoint, amplitudes: Mapping[str, float]) -> dict[str, dict[str, float]]:
     """Parameters of each effect inside, by its name, with some amplitudes replaced."""
     numbers: dict[str, dict[str, float]] = {}
     for effect in joint.inside:
@@ -103,16 +103,16 @@ def _effect_numbers(joint: Joint, amplitudes: Mapping[str, float]) -> dict[str, 
     return numbers
 
 
-def law_of(normal: float) -> Any:
+def mujoco_law_function(normal: float) -> Any:
     """Returns the function from a joint and amplitudes to its law, at a normal load of one side [N]."""
 
-    def law(joint: Joint, amplitudes: Mapping[str, float]) -> MujocoLaw:
+    def law(joint: DriveJoint, amplitudes: Mapping[str, float]) -> MujocoLaw:
         return translate_law(joint, normal, amplitudes)
 
     return law
 
 
-def translate_law(joint: Joint, normal: float, amplitudes: Mapping[str, float] | None = None) -> MujocoLaw:
+def translate_law(joint: DriveJoint, normal: float, amplitudes: Mapping[str, float] | None = None) -> MujocoLaw:
     """Law of the format with the native law's parameters, for a motor that drives.
 
     Losses in proportion to the load take a share 1 - η of the torque. `<dcmotor>` has one motor constant for torque
@@ -145,7 +145,7 @@ def translate_law(joint: Joint, normal: float, amplitudes: Mapping[str, float] |
     return MujocoLaw(tuple(names), *(jnp.asarray(x, float) for x in numbers))
 
 
-def stribeck_friction(joint: Joint, known: Mapping[str, Mapping[str, float]]) -> tuple[float, float] | None:
+def stribeck_friction(joint: DriveJoint, known: Mapping[str, Mapping[str, float]]) -> tuple[float, float] | None:
     """Excess of friction at a crawl [N·m] and its fading speed [rad/s], at the joint, None without such effects."""
     gear = joint.robot.gearbox
     ratio, share = float(gear.ratio), float(gear.efficiency_load)
@@ -163,42 +163,42 @@ def stribeck_friction(joint: Joint, known: Mapping[str, Mapping[str, float]]) ->
     return sum(a for a, _ in bristles), max(v for _, v in bristles)
 
 
-def fates_in_mujoco(joint: Joint, normal: float) -> list[Fate]:
+def fates_in_mujoco(joint: DriveJoint, normal: float) -> list[EffectFate]:
     """Fates of the base's terms, and of effects outside the joint."""
     robot, load = joint.robot, joint.load
     gear = robot.gearbox
     fates = [
-        Fate("winding and back-EMF", HELD, "resistance, motorconst, inductance"),
-        Fate("friction of motor and gearbox", HELD, "frictionloss and damping of the joint"),
-        Fate("rotor inertia", HELD, "armature of the joint, for a motor that drives"),
+        EffectFate("winding and back-EMF", HELD, "resistance, motorconst, inductance"),
+        EffectFate("friction of motor and gearbox", HELD, "frictionloss and damping of the joint"),
+        EffectFate("rotor inertia", HELD, "armature of the joint, for a motor that drives"),
     ]
     if float(gear.efficiency_load) != 1:
         fates.append(
-            Fate(
+            EffectFate(
                 "gearbox losses proportional to the load", APPROXIMATED,
                 "resistance / η and current = act / η: exact while power flows to the load; while it flows back "
                 "(gravity, a heavy load that stops), the joint is braked less than in reality",
             )
         )  # fmt: skip
     if robot.has_ground:
-        fates.append(Fate("internal losses of tracks", HELD, "frictionloss and damping of the joint"))
+        fates.append(EffectFate("internal losses of tracks", HELD, "frictionloss and damping of the joint"))
         if float(load.track.guide_friction * load.track.guide_share) > 0:
             how = f"frictionloss at the mean normal load of these runs, {normal:.4g} N a side"
-            fates.append(Fate("friction of track guides", APPROXIMATED, how))
+            fates.append(EffectFate("friction of track guides", APPROXIMATED, how))
         fates.append(
-            Fate("ground: slip and rolling resistance", DROPPED, "the simulator's own contact with the ground")
+            EffectFate("ground: slip and rolling resistance", DROPPED, "the simulator's own contact with the ground")
         )
     if joint.loose:
         how = "a joint for the motor's side, and a tendon between both with a range or a stiffness"
-        fates.append(Fate(PLAY, HELD, how))
+        fates.append(EffectFate(PLAY, HELD, how))
     if own := joint.controller:
         fates.append(_controller_fate(joint, float(own.lag), float(own.ki)))
     if joint.limit is not None:
-        fates.append(Fate("current limit of the driver", HELD, "forcerange"))
+        fates.append(EffectFate("current limit of the driver", HELD, "forcerange"))
     return [*fates, *fates_outside_joint(joint)]
 
 
-def _controller_fate(joint: Joint, lag: float, ki: float) -> Fate:
+def _controller_fate(joint: DriveJoint, lag: float, ki: float) -> EffectFate:
     """Fate of a controller in `<dcmotor>`, whose own follows the motor's angle, at once, with a limited integral."""
     imposed = joint.robot.rig.imposed
     if imposed != "goal_angle":
@@ -206,14 +206,14 @@ def _controller_fate(joint: Joint, lag: float, ki: float) -> Fate:
             f"<dcmotor> has no {imposed.replace('_', ' ')} control with these gains: take them from LAW.md and "
             "command voltages"
         )
-        return Fate(CONTROLLER, DROPPED, how)
+        return EffectFate(CONTROLLER, DROPPED, how)
     lost = [f"its lag of {lag:g} s is dropped"] * (lag > 0)
     lost += ["its integral stops at a fixed value, not when the duty reaches its limit"] * (ki > 0)
     lost += ["it measures the angle on the motor's side of the backlash"] * joint.loose
-    return Fate(CONTROLLER, APPROXIMATED if lost else HELD, "; ".join(["gains and limit of voltage", *lost]))
+    return EffectFate(CONTROLLER, APPROXIMATED if lost else HELD, "; ".join(["gains and limit of voltage", *lost]))
 
 
-def fates_outside_joint(joint: Joint) -> list[Fate]:
+def fates_outside_joint(joint: DriveJoint) -> list[EffectFate]:
     """Fates of effects that are not part of a joint."""
     where = {
         "sensor": "an instrument error, not part of the drive",
@@ -221,7 +221,7 @@ def fates_outside_joint(joint: Joint) -> list[Fate]:
         "mass": "the mass of the robot; set it in the simulator's model",
     }
     other = "a property of the ground, which the simulator's contact model must provide"
-    return [Fate(e.name, DROPPED, where.get(e.balance, other)) for e in joint.outside]
+    return [EffectFate(e.name, DROPPED, where.get(e.balance, other)) for e in joint.outside]
 
 
 def approximated_terms(balance: str) -> str:
@@ -230,7 +230,7 @@ def approximated_terms(balance: str) -> str:
 
 
 @dataclasses.dataclass(frozen=True)
-class Motor:
+class MjcfMotor:
     """Numbers of the MJCF.
 
     Attributes:
@@ -257,7 +257,7 @@ class Motor:
         return self.values[FRICTION] - (self.lugre[2] * self.ratio if self.lugre else 0.0)
 
 
-def mjcf_motor(joint: Joint, values: Mapping[str, float]) -> Motor:
+def mjcf_motor(joint: DriveJoint, values: Mapping[str, float]) -> MjcfMotor:
     """Numbers of the MJCF for refitted parameters."""
     robot, numbers = joint.robot, _effect_numbers(joint, {})
     gear, share = robot.gearbox, float(robot.gearbox.efficiency_load)
@@ -286,10 +286,10 @@ def mjcf_motor(joint: Joint, values: Mapping[str, float]) -> Motor:
     )
     limit = None if joint.limit is None else values[CONSTANT] * joint.limit / values[SHARE]
     added = number("rotating_inertia")
-    return Motor(values, ratio, inductance, inertia + added, added, thermal, lugre, cogging, limit)
+    return MjcfMotor(values, ratio, inductance, inertia + added, added, thermal, lugre, cogging, limit)
 
 
-def _controller(joint: Joint, found: Motor) -> tuple[float, ...]:
+def _controller_gains(joint: DriveJoint, found: MjcfMotor) -> tuple[float, ...]:
     """Gains of the controller of `<dcmotor>`: kp, ki, kd of a torque, -, limits of integral and voltage.
 
     It wants U = (R/K) (kp e + ki ∫ e dt - kd ω_m) + K ω_m, of the motor's angle. Empty: it gets a voltage.
@@ -304,7 +304,7 @@ def _controller(joint: Joint, found: Motor) -> tuple[float, ...]:
     return kp * torque, ki * torque, (kd + constant) * torque, 0.0, most, volts * found.ratio * float(own.limit)
 
 
-def _backlash_body(joint: Joint, found: Motor, name: str, at: str) -> str:
+def _backlash_body(joint: DriveJoint, found: MjcfMotor, name: str, at: str) -> str:
     """Text of the motor's side as a body of its own, and of the tendon between its joint and the load's."""
     load, motor = joint.load, found.armature - found.added
     rate = 1 / motor + 1 / (float(load.inertia) + found.added)
@@ -314,11 +314,14 @@ def _backlash_body(joint: Joint, found: Motor, name: str, at: str) -> str:
         square, damper = FLANK_STIFFNESS, FLANK_DAMPING
     if load.backlash > 0:
         half = 0.5 * float(load.backlash)
-        limits = f'limited="true" range="{_digits(-half, half)}" solreflimit="{_digits(-square, -damper)}" '
-        limits += f'solimplimit="{_digits(IMPEDANCE, IMPEDANCE)} 1 0.5 1"'
+        limits = (
+            f'limited="true" range="{_numbers_text(-half, half)}" solreflimit="{_numbers_text(-square, -damper)}" '
+        )
+        limits += f'solimplimit="{_numbers_text(IMPEDANCE, IMPEDANCE)} 1 0.5 1"'
     else:
         limits = (
-            f'stiffness="{_digits(float(load.stiffness))}" damping="{_digits(float(load.damping))}" springlength="0"'
+            f'stiffness="{_numbers_text(float(load.stiffness))}" damping="{_numbers_text(float(load.damping))}" '
+            'springlength="0"'
         )
     return (
         f'  <worldbody>\n    <body name="{at}_rotor">\n      <joint name="{at}_rotor" class="{name}_rotor" '
@@ -329,7 +332,7 @@ def _backlash_body(joint: Joint, found: Motor, name: str, at: str) -> str:
     )
 
 
-def _digits(*numbers: float) -> str:
+def _numbers_text(*numbers: float) -> str:
     return " ".join(f"{x:.9g}" for x in numbers)
 
 
@@ -337,14 +340,20 @@ def _digits(*numbers: float) -> str:
 VIEWER = "python -c \"import mujoco.viewer as v; v.launch_from_path('scene.xml')\""
 
 
-def _comment(lines: Sequence[str], indent: str) -> str:
+def _comment_lines(lines: Sequence[str], indent: str) -> str:
     """Lines as XML comments. Names in them come from users, so nothing in them can end the comment."""
     text = [re.sub("-(?=-)", "- ", t) for line in lines for t in textwrap.wrap(printable(line), 104 - len(indent))]
     return "".join(f"{indent}<!-- {t} -->\n" for t in text)
 
 
 def mjcf_fragment(
-    joint: Joint, found: Motor, about: Mapping[str, str], notes: Sequence[str], name: str, at: str, volts: float
+    joint: DriveJoint,
+    found: MjcfMotor,
+    about: Mapping[str, str],
+    notes: Sequence[str],
+    name: str,
+    at: str,
+    volts: float,
 ) -> str:
     """Text of the fragment that a model includes.
 
@@ -361,13 +370,16 @@ def mjcf_fragment(
         "motorconst": (v[CONSTANT],), "resistance": (v[RESISTANCE],), "inductance": (found.inductance,),
         "thermal": found.thermal, "lugre": found.lugre, "cogging": found.cogging,
     }  # fmt: skip
-    limits = f' ctrllimited="false" ctrlrange="{_digits(-volts, volts)}"'
-    if gains := _controller(joint, found):
-        limits = f' input="pos" controller="{_digits(*gains)}"'
-    limits += "" if found.limit is None else f' forcelimited="true" forcerange="{_digits(-found.limit, found.limit)}"'
-    written = "".join(f' {key}="{_digits(*x)}"' for key, x in attributes.items() if x)
+    limits = f' ctrllimited="false" ctrlrange="{_numbers_text(-volts, volts)}"'
+    if gains := _controller_gains(joint, found):
+        limits = f' input="pos" controller="{_numbers_text(*gains)}"'
+    limits += (
+        "" if found.limit is None else f' forcelimited="true" forcerange="{_numbers_text(-found.limit, found.limit)}"'
+    )
+    written = "".join(f' {key}="{_numbers_text(*x)}"' for key, x in attributes.items() if x)
     head = [
-        f"Drive of {joint.file.name}, {joint.configuration}. Written by mmrjax {__version__}; MuJoCo {_version()} "
+        f"Drive of {joint.file.name}, {joint.configuration}. Written by mmrjax {__version__}; "
+        f"MuJoCo {_version_text()} "
         f"or later.",
         f'In the model: <include file="drive.xml"/> before <worldbody>, and class="{name}" on the joint "{at}".',
         f"Command: goal angle of the motor [rad], {found.ratio:.6g} times that of the joint; MuJoCo 3.17 or later."
@@ -389,28 +401,28 @@ def mjcf_fragment(
         sides = [("", own, at), ("_rotor", [a - b for a, b in zip(numbers, own, strict=True)], f"{at}_rotor")]
     return (
         "<mujocoinclude>\n"
-        + _comment(head, "  ")
+        + _comment_lines(head, "  ")
         + "  <default>\n"
-        + _comment([f"{k}: {about[k]}" for k in ("frictionloss", "damping", "armature")], "    ")
+        + _comment_lines([f"{k}: {about[k]}" for k in ("frictionloss", "damping", "armature")], "    ")
         + "".join(
-            f'    <default class="{name}{side}">\n      <joint frictionloss="{_digits(dry)}" '
-            f'damping="{_digits(viscous)}" armature="{_digits(inertia)}"/>\n    </default>\n'
+            f'    <default class="{name}{side}">\n      <joint frictionloss="{_numbers_text(dry)}" '
+            f'damping="{_numbers_text(viscous)}" armature="{_numbers_text(inertia)}"/>\n    </default>\n'
             for side, (dry, viscous, inertia), _ in sides
         )
         + "  </default>\n"
         + (_backlash_body(joint, found, name, at) if joint.loose else "")
         + "  <actuator>\n"
-        + _comment(about_motor, "    ")
-        + f'    <dcmotor name="{name}" joint="{sides[-1][2]}" gear="{_digits(found.ratio)}"{written}{limits}/>\n'
-        + "  </actuator>\n</mujocoinclude>\n"
+        + _comment_lines(about_motor, "    ")
+        + f'    <dcmotor name="{name}" joint="{sides[-1][2]}" gear="{_numbers_text(found.ratio)}"'
+        f"{written}{limits}/>\n" + "  </actuator>\n</mujocoinclude>\n"
     )
 
 
-def _version() -> str:
+def _version_text() -> str:
     return ".".join(map(str, FIRST[:2]))
 
 
-def mjcf_scene(joint: Joint, mass: float, name: str, at: str, command: float, load: float) -> str:
+def mjcf_scene(joint: DriveJoint, mass: float, name: str, at: str, command: float, load: float) -> str:
     """Text of a model of one joint that runs: what the drive moves as a body that turns with it.
 
     A vehicle rolls without sliding, so one side's share of its mass acts at the wheel as m r². The actuator
@@ -429,10 +441,10 @@ def mjcf_scene(joint: Joint, mass: float, name: str, at: str, command: float, lo
     else:
         inertia, weight, angle = float(moved.inertia), float(moved.torque_gravity), float(moved.angle_zero)
         head, arm = "The rig's shaft", 0.05
-    body = _body(inertia, weight, angle)
+    body = _body_text(inertia, weight, angle)
     return (
         "<mujoco>\n"
-        + _comment([f"{head}. Key frame run turns it. Viewer:", VIEWER], "  ")
+        + _comment_lines([f"{head}. Key frame run turns it. Viewer:", VIEWER], "  ")
         + '  <include file="drive.xml"/>\n'
         '  <compiler angle="radian"/>\n'
         '  <option timestep="' + ("0.0005" if joint.loose else "0.001") + '" integrator="implicitfast"/>\n'
@@ -443,14 +455,17 @@ def mjcf_scene(joint: Joint, mass: float, name: str, at: str, command: float, lo
         '    <body name="output">\n'
         f'      <joint name="{at}" class="{name}" type="hinge" axis="0 1 0"/>\n'
         f"{body}"
-        f'      <geom type="cylinder" size="{_digits(arm)} 0.015" euler="1.5707963 0 0" rgba="0.2 0.4 0.7 1" '
+        f'      <geom type="cylinder" size="{_numbers_text(arm)} 0.015" euler="1.5707963 0 0" rgba="0.2 0.4 0.7 1" '
         'contype="0" conaffinity="0" mass="0"/>\n'
-        f'      <geom type="capsule" size="0.004" fromto="0 -0.02 0 {_digits(arm)} -0.02 0" rgba="0.8 0.3 0.1 1" '
+        f'      <geom type="capsule" size="0.004" fromto="0 -0.02 0 {_numbers_text(arm)} -0.02 0" '
+        'rgba="0.8 0.3 0.1 1" '
         'contype="0" conaffinity="0" mass="0"/>\n'
         "    </body>\n"
         "  </worldbody>\n"
         "  <actuator>\n"
-        + _comment(["Torque that acts against forward rotation [N·m]: slope, rolling resistance, a brake."], "    ")
+        + _comment_lines(
+            ["Torque that acts against forward rotation [N·m]: slope, rolling resistance, a brake."], "    "
+        )
         + f'    <motor name="load" joint="{at}" gear="-1"/>\n'
         "  </actuator>\n"
         "  <sensor>\n"
@@ -458,26 +473,29 @@ def mjcf_scene(joint: Joint, mass: float, name: str, at: str, command: float, lo
         f'    <actuatorfrc name="motor_torque" actuator="{name}"/>\n'
         "  </sensor>\n"
         "  <keyframe>\n"
-        f'    <key name="run" ctrl="{_digits(command, load)}"/>\n'
+        f'    <key name="run" ctrl="{_numbers_text(command, load)}"/>\n'
         "  </keyframe>\n"
         "</mujoco>\n"
     )
 
 
-def _body(inertia: float, weight: float, angle: float) -> str:
+def _body_text(inertia: float, weight: float, angle: float) -> str:
     """Inertia of the body about its joint [kg·m²], its centre of mass where an arm hangs at `angle` [rad]."""
     if weight <= 0:
-        return f'      <inertial pos="0 0 0" mass="1" diaginertia="{_digits(inertia, inertia, inertia)}"/>\n'
+        return f'      <inertial pos="0 0 0" mass="1" diaginertia="{_numbers_text(inertia, inertia, inertia)}"/>\n'
     gravity = 9.81  # MuJoCo's default
     arm = inertia * gravity / (2 * weight)  # half of the inertia is that of the mass on its arm
     mass = weight / (gravity * arm)
     rest = inertia - mass * arm**2
-    place = _digits(arm * math.sin(angle), 0.0, -arm * math.cos(angle))
-    return f'      <inertial pos="{place}" mass="{_digits(mass)}" diaginertia="{_digits(rest, rest, rest)}"/>\n'
+    place = _numbers_text(arm * math.sin(angle), 0.0, -arm * math.cos(angle))
+    return (
+        f'      <inertial pos="{place}" mass="{_numbers_text(mass)}" '
+        f'diaginertia="{_numbers_text(rest, rest, rest)}"/>\n'
+    )
 
 
 def attribute_notes(
-    joint: Joint, constants: Sequence[Constant], translated: Mapping[str, float], values: Mapping[str, float]
+    joint: DriveJoint, constants: Sequence[LawConstant], translated: Mapping[str, float], values: Mapping[str, float]
 ) -> dict[str, str]:
     """Origin of each attribute in words, with intervals of the parameters from which it is computed."""
     by_name = {c.name: c for c in constants}
@@ -524,7 +542,8 @@ def mujoco_module() -> Any:
         raise BadConfiguration("--to mujoco: mujoco is not installed; pip install mujoco") from error
     if tuple(int(x) for x in found.__version__.split(".")[:3]) < FIRST:
         raise BadConfiguration(
-            f"--to mujoco: got MuJoCo {found.__version__}, which has no <dcmotor>; expected {_version()} or later: "
+            f"--to mujoco: got MuJoCo {found.__version__}, which has no <dcmotor>; "
+            f"expected {_version_text()} or later: "
             "pip install -U mujoco"
         )
     found.set_mju_user_warning(lambda text: None)  # else MuJoCo writes a file in the working folder
@@ -553,8 +572,8 @@ def angles_in_mujoco(
 
 
 def settle_in_mujoco(
-    files: Mapping[str, str], found: Motor, at: Situation, expected: AtJoint, rows: Sequence[int]
-) -> AtJoint:
+    files: Mapping[str, str], found: MjcfMotor, at: ComparisonRuns, expected: JointResult, rows: Sequence[int]
+) -> JointResult:
     """Current and speed of some runs, settled in MuJoCo C by the scene.
 
     Args:
@@ -585,4 +604,4 @@ def settle_in_mujoco(
             mujoco.mj_step(model, data)
         current[k] = found.values[SHARE] * data.act[-1]
         speed[k] = data.qvel[-1]
-    return AtJoint(current, speed)
+    return JointResult(current, speed)

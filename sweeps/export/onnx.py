@@ -12,8 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from calibration.data.input_errors import BadConfiguration
-from sweeps.export.joint import Joint
-from sweeps.export.law_source import Constant, jax_source, module_from_source
+from sweeps.export.joint import DriveJoint
+from sweeps.export.law_source import LawConstant, jax_source, module_from_source
 
 #: Version of the operators, which onnxruntime has had since 1.14.
 OPSET = 18
@@ -22,7 +22,7 @@ STATES, SEED = 10_000, 0
 EXTRA = 'pip install "mmrjax[export]"'
 
 
-def _library(name: str) -> Any:
+def _import_library(name: str) -> Any:
     try:
         return __import__(name)
     except ImportError as error:
@@ -30,14 +30,14 @@ def _library(name: str) -> Any:
 
 
 @contextlib.contextmanager
-def _single() -> Iterator[None]:
+def _single_precision() -> Iterator[None]:
     """Context of single precision, without JAX's warnings about doubles that become single."""
     with jax.enable_x64(False), warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Explicitly requested dtype", UserWarning)
         yield
 
 
-def step_of(joint: Joint, constants: Sequence[Constant]) -> tuple[Any, list[str], list[str]]:
+def step_function(joint: DriveJoint, constants: Sequence[LawConstant]) -> tuple[Any, list[str], list[str]]:
     """Returns the step as a function of arrays, and the names of its inputs and outputs.
 
     Inputs are the state, the command, position and velocity of the joint, each of shape (joints,), and the step's
@@ -57,16 +57,16 @@ def step_of(joint: Joint, constants: Sequence[Constant]) -> tuple[Any, list[str]
     return step, inputs, ["torque", *(f"next_{s}" for s in states), "power"]
 
 
-def onnx_files(joint: Joint, constants: Sequence[Constant]) -> dict[str, str | bytes]:
+def onnx_files(joint: DriveJoint, constants: Sequence[LawConstant]) -> dict[str, str | bytes]:
     """The model as a file, checked by ONNX.
 
     Raises:
         BadConfiguration: the libraries are not installed.
     """
-    jax2onnx, onnx = _library("jax2onnx"), _library("onnx")
-    step, inputs, outputs = step_of(joint, constants)
+    jax2onnx, onnx = _import_library("jax2onnx"), _import_library("onnx")
+    step, inputs, outputs = step_function(joint, constants)
     shapes: list[tuple[int | str, ...]] = [("joints",)] * (len(inputs) - 1) + [(1,)]
-    with _single():
+    with _single_precision():
         model = jax2onnx.to_onnx(
             step, shapes, model_name=joint.name, opset=OPSET, input_names=inputs, output_names=outputs
         )
@@ -74,12 +74,12 @@ def onnx_files(joint: Joint, constants: Sequence[Constant]) -> dict[str, str | b
     return {"actuator.onnx": model.SerializeToString()}
 
 
-def difference_from_jax(joint: Joint, constants: Sequence[Constant], model: bytes) -> float:
+def difference_from_jax(joint: DriveJoint, constants: Sequence[LawConstant], model: bytes) -> float:
     """Largest difference of the model's outputs from JAX's over random states, relative to each output's rms."""
-    runtime = _library("onnxruntime")
-    step, inputs, _ = step_of(joint, constants)
+    runtime = _import_library("onnxruntime")
+    step, inputs, _ = step_function(joint, constants)
     given = random_states(joint, len(inputs))
-    with _single():
+    with _single_precision():
         expected = [np.asarray(x) for x in jax.jit(step)(*given)]
     session = runtime.InferenceSession(model, providers=["CPUExecutionProvider"])
     outputs = session.run(None, dict(zip(inputs, given, strict=True)))
@@ -87,7 +87,7 @@ def difference_from_jax(joint: Joint, constants: Sequence[Constant], model: byte
     return max(float(np.max(np.abs(a - b))) / s for a, b, s in zip(outputs, expected, sizes, strict=True))
 
 
-def random_states(joint: Joint, inputs: int) -> list[np.ndarray]:
+def random_states(joint: DriveJoint, inputs: int) -> list[np.ndarray]:
     """Random inputs of the step: currents, memories, voltages and speeds in both directions."""
     rng = np.random.default_rng(SEED)
     motor, ratio = joint.robot.motor, float(joint.robot.gearbox.ratio)

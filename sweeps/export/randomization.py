@@ -14,17 +14,17 @@ from calibration.data.input_errors import BadConfiguration
 from calibration.data.posterior_file import FILE, Posterior
 from mmrjax.model import params
 from sweeps.export import mujoco
-from sweeps.export.joint import Joint
-from sweeps.export.law_source import Constant
+from sweeps.export.joint import DriveJoint
+from sweeps.export.law_source import LawConstant
 
 #: Limits of draws: as many as environments that are trained at the same time.
 MOST = 1_000_000
 
 
 def draw_parameters(
-    joint: Joint,
+    joint: DriveJoint,
     posterior: Posterior | None,
-    constants: Sequence[Constant],
+    constants: Sequence[LawConstant],
     refitted: Mapping[str, float],
     normal: float,
     draws: int,

@@ -1,4 +1,4 @@
-"""Runs for the comparison of an exported drive with the native model, and the native model's results in them."""
+"""Runs in which an exported drive is compared with the native model, and the native model's results."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from mmrjax.model.paper_tables import SLOPES_DEG
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import Signals, is_done
 from sweeps.config import GridPart
-from sweeps.export.joint import Joint, channels_of
+from sweeps.export.joint import DriveJoint, channels_of
 from sweeps.inputs import read_runs
 from sweeps.points import imposed
 from sweeps.points.grid import grid_conditions
@@ -30,8 +30,8 @@ LOADS = (0.0, 1 / 6, 1 / 3, 1 / 2)
 
 
 @dataclasses.dataclass(frozen=True)
-class AtJoint:
-    """Current and speed of a drive in each run, by one model, arrays of shape (runs,).
+class JointResult:
+    """Motor current and joint speed of a drive in each run, computed by one model. Arrays of shape (runs,).
 
     Attributes:
         current: current of one motor [A].
@@ -43,8 +43,8 @@ class AtJoint:
 
 
 @dataclasses.dataclass(frozen=True)
-class Situation:
-    """Runs of one configuration, and the native model in them.
+class ComparisonRuns:
+    """Runs of one configuration, and the results of the native model.
 
     Attributes:
         joint: the drive.
@@ -59,7 +59,7 @@ class Situation:
         load: torque that the joint has to give at the wheel [N·m].
     """
 
-    joint: Joint
+    joint: DriveJoint
     source: str
     runs: Runs
     conditions: Conditions
@@ -71,10 +71,10 @@ class Situation:
     load: np.ndarray
 
     @property
-    def inside(self) -> AtJoint:
+    def inside(self) -> JointResult:
         """The joint's own model."""
         ratio = float(self.joint.robot.gearbox.ratio)
-        return AtJoint(np.asarray(self.signals.current), np.asarray(self.signals.speed_motor) / ratio)
+        return JointResult(np.asarray(self.signals.current), np.asarray(self.signals.speed_motor) / ratio)
 
     @property
     def way(self) -> np.ndarray:
@@ -86,13 +86,13 @@ class Situation:
         """True if there are readings to compare with."""
         return bool(np.isfinite(self.measured).any())
 
-    def without(self, names: Names) -> AtJoint:
+    def without(self, names: Names) -> JointResult:
         """The joint's own model with amplitudes of some of its effects at 0."""
-        _, signals = _solved(_with_absent_effects(self.joint, names), self.conditions)
+        _, signals = _solve_runs(_with_absent_effects(self.joint, names), self.conditions)
         ratio = float(self.joint.robot.gearbox.ratio)
-        return AtJoint(np.asarray(signals.current)[self.kept], np.asarray(signals.speed_motor)[self.kept] / ratio)
+        return JointResult(np.asarray(signals.current)[self.kept], np.asarray(signals.speed_motor)[self.kept] / ratio)
 
-    def readings(self, found: AtJoint) -> np.ndarray:
+    def readings(self, found: JointResult) -> np.ndarray:
         """Readings of the instruments for an exported drive [SI], shape (runs, channels).
 
         The wheel or shaft is read at its rim: what slips on the ground is the simulator's.
@@ -115,7 +115,7 @@ class Situation:
         return np.stack([np.asarray(sensor_readings[c.name]) for c in channels_of(self.joint)], -1)
 
 
-def _with_absent_effects(joint: Joint, names: Names = ()) -> Robot:
+def _with_absent_effects(joint: DriveJoint, names: Names = ()) -> Robot:
     """The whole robot with amplitudes at 0: of effects outside the joint, and of others by name.
 
     It keeps these effects, so that all models of a comparison are one compiled program.
@@ -124,13 +124,13 @@ def _with_absent_effects(joint: Joint, names: Names = ()) -> Robot:
     return params.replace(joint.file.robot, {f"effects.{n}.amplitude": jnp.zeros(()) for n in (*outside, *names)})
 
 
-def _solved(robot: Robot, conditions: Conditions) -> tuple[np.ndarray, Signals]:
+def _solve_runs(robot: Robot, conditions: Conditions) -> tuple[np.ndarray, Signals]:
     """Mask of the runs that end in the commanded direction, and the signals of all runs."""
     result, signals = results_of_rows(robot, conditions)
     return np.asarray(is_done(result.status)), signals
 
 
-def situation_of_joint(joint: Joint, data: Runs | str | None) -> Situation:
+def situation_of_joint(joint: DriveJoint, data: Runs | str | None) -> ComparisonRuns:
     """Returns the runs of a table in the joint's configuration, or of a grid where there is no table.
 
     Raises:
@@ -150,8 +150,8 @@ def situation_of_joint(joint: Joint, data: Runs | str | None) -> Situation:
         runs = _runs_of_joint(data, joint)
         source = runs.source
     conditions = runs.conditions(robot)
-    moves, whole = _solved(robot, conditions)
-    turns, signals = _solved(_with_absent_effects(joint), conditions) if joint.outside else (moves, whole)
+    moves, whole = _solve_runs(robot, conditions)
+    turns, signals = _solve_runs(_with_absent_effects(joint), conditions) if joint.outside else (moves, whole)
     channels = channels_of(joint)
     sensor_readings = jax.vmap(lambda s: balances.sensor(robot, s))(whole)
     native = np.stack([np.asarray(sensor_readings[c.name]) for c in channels], -1)
@@ -163,14 +163,16 @@ def situation_of_joint(joint: Joint, data: Runs | str | None) -> Situation:
     radius = float(joint.load.radius)
     given = (signals.voltage_source, signals.duty, signals.pause, signals.voltage_back)
     command = robot.driver.voltage(*map(jnp.asarray, given))
-    measured = _measured(chosen, channels) if data is not None else np.full((len(chosen), len(channels)), np.nan)
-    return Situation(
+    measured = (
+        _measured_readings(chosen, channels) if data is not None else np.full((len(chosen), len(channels)), np.nan)
+    )
+    return ComparisonRuns(
         joint, source, chosen, conditions, kept, signals, native[kept], measured, np.asarray(command),
         radius * np.asarray(signals.demand),
     )  # fmt: skip
 
 
-def export_grid(joint: Joint) -> Runs:
+def export_grid(joint: DriveJoint) -> Runs:
     """Operating points in both directions, with loads that oppose the motion.
 
     Voltages are Table 8's or thirds of the motor's limit. A vehicle climbs the slopes of Table 8. A shaft carries
@@ -191,7 +193,7 @@ def export_grid(joint: Joint) -> Runs:
     return dataclasses.replace(runs, columns=both)
 
 
-def stall_torque(joint: Joint, voltage: np.ndarray) -> np.ndarray:
+def stall_torque(joint: DriveJoint, voltage: np.ndarray) -> np.ndarray:
     """Load torque at which a shaft's motor stalls [N·m], without effects and within the limits of driver and
     gearbox."""
     motor, gear, load = joint.robot.motor, joint.robot.gearbox, joint.load
@@ -201,12 +203,12 @@ def stall_torque(joint: Joint, voltage: np.ndarray) -> np.ndarray:
     return np.clip(given, 0.0, np.inf if gear.torque_limit is None else gear.torque_limit)
 
 
-def _measured(runs: Runs, channels: tuple[Any, ...]) -> np.ndarray:
+def _measured_readings(runs: Runs, channels: tuple[Any, ...]) -> np.ndarray:
     by_name = {c.name: runs.measured()[:, k] for k, c in enumerate(runs.channels)}
     return np.stack([by_name.get(c.name, np.full(len(runs), np.nan)) for c in channels], -1)
 
 
-def _runs_of_joint(data: Runs | str, joint: Joint) -> Runs:
+def _runs_of_joint(data: Runs | str, joint: DriveJoint) -> Runs:
     """Runs of a table in the joint's configuration. For a log, its settled segments."""
     robot = joint.file.robot
     runs = read_runs(data, robot, measured=True, series=True) if isinstance(data, str) else data.of(robot)

@@ -21,7 +21,7 @@ SHOWN, ACROSS, WIDE = 6, 3, 0.5
 
 
 def draw_clusters(found: Sequence[ResidualCluster]) -> Figure:
-    """Residuals of each finding over its column, one dot per row. Bars are means of a level."""
+    """Residuals that depend on a column: one dot for each row, bars for the means of levels."""
     found = found[:SHOWN]
     across = min(ACROSS, len(found))
     rows = -(-len(found) // across)
@@ -71,7 +71,7 @@ def draw_parameter_intervals(found: CalibrationResult) -> Figure:
 
 
 def draw_profile_likelihoods(found: CalibrationResult) -> Figure:
-    """Profile likelihood of each parameter: rise of the objective over its value, with the 95 % level."""
+    """Profile likelihood of each parameter, with the 95 % level."""
     profiled = [(name, p, p.profile) for name, p in found.parameters.items() if p.profile is not None]
     rows = -(-len(profiled) // 4)
     fig, grid = new_figure(rows, 4, 2.1 * rows, sharey=True)
@@ -148,7 +148,7 @@ def draw_correlated_pairs(found: CalibrationResult) -> Figure:
     return fig
 
 
-def before_after(found: CalibrationResult) -> Figure:
+def draw_errors_before_after(found: CalibrationResult) -> Figure:
     """rms errors by channel: before, fitted, and with each kind of block held out."""
     lines = {"before": found.errors_before, "fitted": found.errors_after}
     lines |= {f"held out: {blocks.kind_in_words(k, ' + ')}": found.held_out[k].errors for k in found.held_out_alike}

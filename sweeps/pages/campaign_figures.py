@@ -22,8 +22,8 @@ from sweeps.pages.figure_style import (
     PURPLE,
     SKY,
     VERMILION,
+    add_corner_note,
     colour_bar,
-    corner_note,
     new_figure,
 )
 from sweeps.pages.words import short_name
@@ -37,19 +37,21 @@ LEAST, EACH = 6, 5
 ENDINGS = (GREEN, VERMILION, ORANGE, SKY, PURPLE, FAINT, INK)
 
 
-class Varied(NamedTuple):
-    """Values of a name at the points drawn, its label with the unit, and words of the values where they have some."""
+class VariedQuantity(NamedTuple):
+    """A quantity that varies: its values at the drawn points, its label with unit, and words for the values if it has
+    any.
+    """
 
     values: np.ndarray
     label: str
     words: Names = ()
 
 
-def varied_names(values: np.ndarray, layout: Layout) -> dict[str, Varied]:
+def varied_names(values: np.ndarray, layout: Layout) -> dict[str, VariedQuantity]:
     """Varied names of a store with their values at some points, shape (points, names)."""
     units = {n: layout.coordinates[n].get("units", "").removeprefix("1") for n in layout.design.names}
     return {
-        n: Varied(values[:, k], f"{n} [{units[n]}]" if units[n] else n, layout.labels.get(n, ()))
+        n: VariedQuantity(values[:, k], f"{n} [{units[n]}]" if units[n] else n, layout.labels.get(n, ()))
         for k, n in enumerate(layout.design.names)
     }
 
@@ -59,7 +61,7 @@ def draw_output(output: np.ndarray, label: str, values: np.ndarray, layout: Layo
     return draw_output_spread(output, label, varied_names(values, layout))
 
 
-def draw_output_spread(output: np.ndarray, label: str, varied: Mapping[str, Varied]) -> Figure:
+def draw_output_spread(output: np.ndarray, label: str, varied: Mapping[str, VariedQuantity]) -> Figure:
     """Histogram of an output, its median over the two names that it follows most, and over both together.
 
     Args:
@@ -78,12 +80,12 @@ def draw_output_spread(output: np.ndarray, label: str, varied: Mapping[str, Vari
         axes.fill_between(middles, quantiles[:, 0], quantiles[:, 2], color=BLUE, alpha=0.2, linewidth=0)
         axes.plot(middles, quantiles[:, 1], color=BLUE)
         shares = variance_share(values, output)
-        if shares > by_chance(values):
-            corner_note(axes, f"{100 * shares:.0f} % of the variance")
+        if shares > variance_share_by_chance(values):
+            add_corner_note(axes, f"{100 * shares:.0f} % of the variance")
         axes.set(xlabel=varied[name].label, ylabel=label, title=f"over {short_name(name)}")
-        _ticks(axes.xaxis, varied[name])
+        _set_ticks(axes.xaxis, varied[name])
     if len(names) == 2:
-        _map(fig, others[2], varied[names[0]], varied[names[1]], output, label)
+        _draw_map(fig, others[2], varied[names[0]], varied[names[1]], output, label)
     return fig
 
 
@@ -103,7 +105,7 @@ def draw_verdicts(codes: np.ndarray, names: Sequence[str], values: np.ndarray, l
     return draw_grid_statuses(codes[at_first], names, varied[first], varied[SIZE])
 
 
-def draw_grid_statuses(codes: np.ndarray, names: Sequence[str], across: Varied, up: Varied) -> Figure:
+def draw_grid_statuses(codes: np.ndarray, names: Sequence[str], across: VariedQuantity, up: VariedQuantity) -> Figure:
     """Status of the points of a grid over two of its axes.
 
     Args:
@@ -149,8 +151,8 @@ def variance_share(values: np.ndarray, output: np.ndarray) -> float:
     return float(np.sum(count * (mean - output.mean()) ** 2) / len(output) / total) if total > 0 else 0.0
 
 
-def by_chance(values: np.ndarray) -> float:
-    """Share of the variance that lies between the bins of a name without effect in one of 100 samples at most [-].
+def variance_share_by_chance(values: np.ndarray) -> float:
+    """Share of the variance between the bins of a quantity without effect that is exceeded in 1 of 100 samples [-].
 
     Of normal outputs the share is then a beta variable, 0 for a single bin, 1 where every value has a bin of its own.
     """
@@ -158,16 +160,16 @@ def by_chance(values: np.ndarray) -> float:
     return float(scipy.stats.beta.ppf(0.99, between / 2, within / 2)) if within and between else float(within == 0)
 
 
-def _ticks(axis: Axis, varied: Varied) -> None:
+def _set_ticks(axis: Axis, varied: VariedQuantity) -> None:
     if varied.words:
         axis.set_ticks(range(len(varied.words)), labels=list(varied.words))
 
 
-def _map(
+def _draw_map(
     fig: Figure,
     axes: Axes,
-    one: Varied,
-    other: Varied,
+    one: VariedQuantity,
+    other: VariedQuantity,
     output: np.ndarray,
     label: str,
 ) -> None:
@@ -181,6 +183,6 @@ def _map(
     mesh = axes.pcolormesh(across, along, cells, shading="nearest", cmap="viridis", rasterized=True)
     colour_bar(fig, mesh, axes, label=f"median {label}")
     axes.set(xlabel=one.label, ylabel=other.label, title="over both")
-    _ticks(axes.xaxis, one)
-    _ticks(axes.yaxis, other)
+    _set_ticks(axes.xaxis, one)
+    _set_ticks(axes.yaxis, other)
     axes.grid(False)

@@ -40,11 +40,11 @@ SHOWN, RATE, SLOW = 6, 12, 2.0
 NEAR = (0.03, 0.09)
 
 
-def _outlines(found: Drawable, q: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+def _belt_outlines(found: Drawable, q: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
     """Closed outlines of the belts, and tips of their grousers, in the world [m]."""
     robot = found.robot
     chassis = robot.configurations[found.configuration]
-    shape = footing.contact_shape(chassis, robot.running_gear, robot.radius_pulley)
+    shape = footing.contact_shape_of_robot(chassis, robot.running_gear, robot.radius_pulley)
     body, front, rear = footing.part_frames(shape, jnp.asarray(q))
     belts = [(shape.main, body._replace(origin=rear.origin), q[SHAFT])]
     if np.asarray(chassis.on_tracks) > 0.5:
@@ -61,7 +61,7 @@ def _outlines(found: Drawable, q: np.ndarray) -> list[tuple[np.ndarray, np.ndarr
     return outlines
 
 
-def _ground(axes: Any, found: Drawable, begin: float, end: float) -> None:
+def _draw_ground(axes: Any, found: Drawable, begin: float, end: float) -> None:
     points = np.asarray(found.terrain.points) + np.array([-1.0, 1.0]) * float(found.terrain.nose)
     points = points[(points[:, 0] > begin - 200) & (points[:, 0] < end + 200)]
     bottom = points[:, 1].min() - 0.08 if points[:, 1].min() > -1 else -0.25
@@ -70,11 +70,11 @@ def _ground(axes: Any, found: Drawable, begin: float, end: float) -> None:
     axes.plot(*points.T, color=INK, lw=1.2)
 
 
-def _draw(axes: Any, found: Drawable, q: np.ndarray, colour: str = BLUE) -> None:
-    outlines = _outlines(found, q)
+def _draw_robot(axes: Any, found: Drawable, q: np.ndarray, colour: str = BLUE) -> None:
+    outlines = _belt_outlines(found, q)
     cos, sin = np.cos(-q[PITCH]), np.sin(-q[PITCH])
     chassis = found.robot.configurations[found.configuration]
-    shape = footing.contact_shape(chassis, found.robot.running_gear, found.robot.radius_pulley)
+    shape = footing.contact_shape_of_robot(chassis, found.robot.running_gear, found.robot.radius_pulley)
     half, under = float(shape.half), float(shape.belly)
     top = under + BODY_HEIGHT
     box = np.array([(-half, under), (half, under), (half + 0.01, top), (-half - 0.01, top)])
@@ -110,8 +110,8 @@ def draw_silhouettes(found: ClimbResult) -> Figure:
     q = footing_coordinates(found.table)
     fig, axes = new_figure(-(-len(instants) // 3), 3, 2.7 * -(-len(instants) // 3))
     for n, (ax, (name, k)) in enumerate(zip(axes.ravel(), instants, strict=False), 1):
-        _ground(ax, found, q[k, 0] - 0.5, q[k, 0] + 0.5)
-        _draw(ax, found, q[k])
+        _draw_ground(ax, found, q[k, 0] - 0.5, q[k, 0] + 0.5)
+        _draw_robot(ax, found, q[k])
         ax.set(xlim=(q[k, 0] - 0.48, q[k, 0] + 0.48), ylim=(q[k, 1] - 0.38, q[k, 1] + 0.38), aspect="equal")
         ax.set_title(f"{n}: {found.table['time_s'][k]:.2f} s, {name}", fontsize=9)
         ax.axis("off")
@@ -172,7 +172,7 @@ def draw_size_search(found: ClimbResult) -> Figure:
     return fig
 
 
-class Film(NamedTuple):
+class ClimbFilm(NamedTuple):
     """A climb as `mmrjax.undercarriage.rendering` draws it."""
 
     found: Drawable
@@ -189,8 +189,8 @@ class Film(NamedTuple):
         with figure_settings():
             sheet = Figure(figsize=(7.2, 4.6), dpi=80, layout="constrained")
             ax = sheet.subplots()
-            _ground(ax, found, q[k, 0] - 0.7, q[k, 0] + 0.7)
-            _draw(ax, found, q[k])
+            _draw_ground(ax, found, q[k, 0] - 0.7, q[k, 0] + 0.7)
+            _draw_robot(ax, found, q[k])
             ax.set(xlim=(q[k, 0] - 0.6, q[k, 0] + 0.6), ylim=(low, high), aspect="equal")
             time, current = (found.table[name][k] for name in IN_TITLE)
             ax.set_title(f"{found.obstacle}, {time:.2f} s, motors {current:.1f} A")
@@ -203,7 +203,7 @@ def render_climb(
 ) -> Path:
     """The run as a film (.gif, .mp4), or a picture (.png) at the instant `begin`, by default that of the largest
     pitch."""
-    view = Film(found)
+    view = ClimbFilm(found)
     if begin is None:
         begin = float(view.time[np.argmax(np.abs(found.table["pitch_deg"]))]) if file.suffix == ".png" else 0.0
     return rendering.render(view, file, begin, end, SLOW if slow is None else slow, RATE)

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from calibration.data import Columns
 from mmrjax.model.channels import Channel
-from sweeps.export.comparison import Comparison
+from sweeps.export.comparison import ExportComparison
 from sweeps.export.joint import channels_of
 from sweeps.pages.figure_style import (
     BLUE,
@@ -19,14 +19,14 @@ from sweeps.pages.figure_style import (
     INK,
     LOOKS,
     VERMILION,
+    add_corner_note,
     axis_label,
     configuration_looks,
-    corner_note,
     new_figure,
 )
 
 
-def draw_export_readings(compared: Comparison) -> Figure:
+def draw_export_readings(compared: ExportComparison) -> Figure:
     """Readings of the exported drive over those of the reference, a panel for each channel."""
     situation = compared.situation
     channel_places = [
@@ -68,20 +68,20 @@ def draw_parity(table: Columns, channels: Sequence[Channel], band: bool = True) 
         for kind, (colour, marker) in look.items():
             pick = both & (table["configuration"] == kind)
             if pick.any():
-                _dots(axes, measured[pick], simulated[pick], marker, color=colour, label=kind)
+                _draw_dots(axes, measured[pick], simulated[pick], marker, color=colour, label=kind)
         axes.set(xlabel=f"measured {axis_label(channel)}", ylabel=f"simulated {axis_label(channel)}")
         axes.set_xlim(*span)
         axes.set_ylim(*span)
         if not both.any():
-            corner_note(axes, "no row has both numbers")
+            add_corner_note(axes, "no row has both numbers")
     if grid[0, 0].get_legend_handles_labels()[0] and len(look) <= LOOKS:
         grid[0, 0].legend(loc="lower right")
     if band:
-        corner_note(grid[0, 0], "band: ±5 %")
+        add_corner_note(grid[0, 0], "band: ±5 %")
     return fig
 
 
-def errors_over(
+def draw_errors_over_conditions(
     table: Columns,
     channels: Sequence[Channel],
     in_units: bool = False,
@@ -124,7 +124,7 @@ def errors_over(
                 pick = (table["configuration"] == kind) & np.isfinite(error)
                 if pick.any():
                     moved = table[condition][pick] + side * shift
-                    _dots(axes, moved, error[pick], marker, color=colour, label=kind)
+                    _draw_dots(axes, moved, error[pick], marker, color=colour, label=kind)
             if row[0] is grid[-1, 0]:
                 axes.set_xlabel(words)
                 if levels.size <= 8:
@@ -137,6 +137,6 @@ def errors_over(
     return fig
 
 
-def _dots(axes: Axes, x: np.ndarray, y: np.ndarray, marker: str, **look: Any) -> None:
+def _draw_dots(axes: Axes, x: np.ndarray, y: np.ndarray, marker: str, **look: Any) -> None:
     """Readings of a configuration as dots, rasterised if there are many."""
     axes.plot(x, y, marker, ms=5, mec="white", mew=0.5, rasterized=len(x) > 500, **look)

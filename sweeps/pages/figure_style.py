@@ -171,7 +171,7 @@ def fit_for_phones(fig: Figure) -> Figure:
                 text.set_text("\n".join(textwrap.wrap(title, LETTERS - 12)))  # `set_title` would reset its pad
         names = [tick.get_text() for tick in axes.get_yticklabels()]
         if _has_names(axes.yaxis) and max(map(len, names), default=0) > NAMES:
-            axes.set_yticks(axes.get_yticks(), [_broken_name(name) for name in names])
+            axes.set_yticks(axes.get_yticks(), [_break_name(name) for name in names])
     legends: Any = fig.findobj(lambda artist: isinstance(artist, Legend))
     for legend in legends:
         if legend.axes is not None and legend.get_bbox_to_anchor().x0 > legend.axes.bbox.x1:
@@ -181,7 +181,7 @@ def fit_for_phones(fig: Figure) -> Figure:
     return fig
 
 
-def _broken_name(name: str) -> str:
+def _break_name(name: str) -> str:
     """A name in lines of at most `NAMES` letters if it can be broken at spaces, dots and underlines."""
     lines = [""]
     for part in re.findall(r"[^ ._\n]*[ ._\n]*", name):  # panels that share an axis break its names again
@@ -222,10 +222,10 @@ def figure_as_svg(fig: Figure) -> str:
         engine.execute(fig)
         if least == LEAST_NARROW:
             for _ in range(LAYOUTS):
-                if not _wrap(fig) | _give_names_room(fig):
+                if not _wrap_texts(fig) | _make_room_for_names(fig):
                     break
                 engine.execute(fig)
-        _clear_texts(fig, move=least == LEAST_NARROW)
+        _separate_texts(fig, move=least == LEAST_NARROW)
         fig.set_layout_engine(None)  # or savefig draws everything once more to lay it out
     buffer = io.StringIO()
     fig.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
@@ -238,7 +238,7 @@ def figure_as_svg(fig: Figure) -> str:
     return text.replace("<svg ", f'<svg data-axes="{axes}" ', 1)
 
 
-def _wrap(fig: Figure) -> bool:
+def _wrap_texts(fig: Figure) -> bool:
     """Break horizontal texts that reach beyond the figure, True if there is any."""
     width, wrapped = 72 * fig.get_figwidth(), False
     for written in fig.findobj(lambda artist: isinstance(artist, Text) and artist.get_visible()):
@@ -253,7 +253,7 @@ def _wrap(fig: Figure) -> bool:
     return wrapped
 
 
-def _give_names_room(fig: Figure) -> bool:
+def _make_room_for_names(fig: Figure) -> bool:
     """Enlarge the figure to separate names at y axes, and turn names at x axes upright, True if any changed."""
     more, turned = 0.0, False
     for axes in filter(Axes.get_visible, fig.axes):
@@ -276,7 +276,7 @@ def _give_names_room(fig: Figure) -> bool:
     return more > 0.05 or turned
 
 
-def _clear_texts(fig: Figure, move: bool) -> None:
+def _separate_texts(fig: Figure, move: bool) -> None:
     """Separates texts inside axes from other texts: numbers that lie over one are hidden, words are moved.
 
     A map shows all its numbers or none. Without `move` only maps are changed.
@@ -338,7 +338,7 @@ def _axes_position(fig: Figure, axes: Axes) -> Json:
         ("y", axes.yaxis, row, fig.get_supylabel()),
     ):
         labels = (axis.get_label_text(), *(other.get_label_text() for other in beside), whole)
-        both[name] = {**_axis_ends(axis), "label": next(filter(None, labels), "").split("\n")[0]}
+        both[name] = {**_axis_range(axis), "label": next(filter(None, labels), "").split("\n")[0]}
     return {"box": [round(v, 1) for v in place], **both}
 
 
@@ -347,7 +347,7 @@ def _has_names(axis: Axis) -> bool:
     return not isinstance(axis.get_major_formatter(), ScalarFormatter | LogFormatter | NullFormatter)
 
 
-def _axis_ends(axis: Axis) -> Json:
+def _axis_range(axis: Axis) -> Json:
     """Ends of an axis, whether it is logarithmic, and the names of its ticks if they have names."""
     ends = [float(f"{end:.6g}") for end in axis.get_view_interval()]
     axis_facts: Json = {"ends": ends, "log": axis.get_scale() == "log"}
@@ -358,7 +358,7 @@ def _axis_ends(axis: Axis) -> Json:
     return axis_facts
 
 
-def label_end(axes: Axes, x: np.ndarray, y: np.ndarray, words: str, colour: str, **keywords: Any) -> None:
+def label_line_end(axes: Axes, x: np.ndarray, y: np.ndarray, words: str, colour: str, **keywords: Any) -> None:
     """Write `words` at the last finite point of a line, in the line's colour."""
     finite = np.nonzero(np.isfinite(y))[0]
     if finite.size:
@@ -376,7 +376,7 @@ def label_end(axes: Axes, x: np.ndarray, y: np.ndarray, words: str, colour: str,
         )
 
 
-def corner_note(axes: Axes, words: str, x: float = 0.02, y: float = 0.97, **keywords: Any) -> None:
+def add_corner_note(axes: Axes, words: str, x: float = 0.02, y: float = 0.97, **keywords: Any) -> None:
     """A remark in a corner of the axes (axes fractions)."""
     keywords = {"fontsize": 8.5, "color": INK, "va": "top", "ha": "left", **keywords}
     axes.text(x, y, words, transform=axes.transAxes, **keywords)

@@ -20,9 +20,9 @@ from sweeps.pages.figure_style import (
     GREEN,
     INK,
     ORANGE,
+    add_corner_note,
     configuration_looks,
-    corner_note,
-    label_end,
+    label_line_end,
     new_figure,
 )
 
@@ -31,8 +31,8 @@ SHOWN = 0.15  # and drawn [s]
 
 
 @dataclasses.dataclass(frozen=True)
-class Gear:
-    """One run of the track model.
+class GearRun:
+    """One run of the track model, with its loads.
 
     Attributes:
         name: heading.
@@ -72,14 +72,14 @@ class Gear:
         return ripple_peaks.period_pitch(PITCH_GROUSER if self.on_tracks else PITCH_TOOTH, speed, self.radius)
 
 
-def members_with_gear(
+def gear_runs(
     robot: Robot,
     history: Any,
     status: np.ndarray,
     guide_share: np.ndarray,
     which: Sequence[int],
     names: Sequence[str],
-) -> list[Gear]:
+) -> list[GearRun]:
     """Members of a batch of runs whose running gear is resolved.
 
     Args:
@@ -97,15 +97,16 @@ def members_with_gear(
         over_time = (history.time, history.signals, history.reactions)
         time, signals, reactions = jax.tree.map(lambda x, k=k: np.asarray(x[k]), over_time)
         ended, share = STATUSES[int(status[k])], float(guide_share[k])
-        answer.append(Gear(name, on_tracks, ended, float(robot.radius_pulley), time, signals, reactions, share))
+        answer.append(GearRun(name, on_tracks, ended, float(robot.radius_pulley), time, signals, reactions, share))
     return answer
 
 
-def ripple_numbers(gear: Gear) -> Json:
+def ripple_numbers(gear: GearRun) -> Json:
     """Size and frequency of the ripples in a run."""
     tail, signals = gear.tail(TAIL), gear.signals
     line, travel, reaction = (
-        ripple_peaks.ripple(gear.time[tail], x[tail]) for x in (signals.total_current, signals.speed, signals.normal)
+        ripple_peaks.measure_ripple(gear.time[tail], x[tail])
+        for x in (signals.total_current, signals.speed, signals.normal)
     )
     return {
         "configuration": gear.name,
@@ -119,7 +120,7 @@ def ripple_numbers(gear: Gear) -> Json:
     }
 
 
-def current_ripple(shown: list[Gear], title: str = "{}") -> Figure:
+def draw_current_ripple(shown: list[GearRun], title: str = "{}") -> Figure:
     """Total current at the end of each run."""
     fig, grid = new_figure(1, len(shown), 3.0)
     look = configuration_looks(gear.name for gear in shown)
@@ -141,7 +142,7 @@ def current_ripple(shown: list[Gear], title: str = "{}") -> Figure:
     return fig
 
 
-def draw_touchdowns(gear: Gear, title: str = "grousers land (dotted)") -> Figure:
+def draw_touchdowns(gear: GearRun, title: str = "grousers land (dotted)") -> Figure:
     """Current of a run on tracks over time with touchdowns marked, above the load on each grouser."""
     fig, grid = new_figure(2, 1, 5.0, sharex=True)
     last = gear.tail(SHOWN)
@@ -164,7 +165,7 @@ def draw_touchdowns(gear: Gear, title: str = "grousers land (dotted)") -> Figure
     return fig
 
 
-def draw_reactions(shown: list[Gear], title: str = "{}, one side") -> Figure:
+def draw_reactions(shown: list[GearRun], title: str = "{}, one side") -> Figure:
     """Normal reactions of one side: of all grousers and the lower guide on tracks, of both wheels on wheels."""
     fig, grid = new_figure(1, len(shown), 3.2)
     look = configuration_looks(gear.name for gear in shown)
@@ -189,12 +190,12 @@ def draw_reactions(shown: list[Gear], title: str = "{}, one side") -> Figure:
             axes.plot(time, values, color=shade, lw=1.4, alpha=0.9)
             if not gear.on_tracks:
                 apart = {"front wheel": 7, "rear wheel": -7}.get(words, 0)  # they nearly coincide
-                label_end(axes, time, np.asarray(values), words, shade, offset=(5, apart))
+                label_line_end(axes, time, np.asarray(values), words, shade, offset=(5, apart))
             top = max(top, float(np.max(values)))
         axes.set(ylim=(0, 1.25 * top), xlabel="time [ms]", ylabel="normal reaction [N]")
         axes.set_title(title.format(gear.name))
         if gear.on_tracks:
-            corner_note(axes, "orange: load on the lower guide; above it: load on all grousers")
+            add_corner_note(axes, "orange: load on the lower guide; above it: load on all grousers")
         else:
             axes.set_xlim(0, 1.3e3 * SHOWN)
     return fig

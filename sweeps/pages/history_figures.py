@@ -33,9 +33,9 @@ from sweeps.pages.figure_style import (
     INK,
     ORANGE,
     VERMILION,
+    add_corner_note,
     axis_label,
     configuration_looks,
-    corner_note,
     new_figure,
 )
 from sweeps.report.run_tables import UNITS
@@ -49,7 +49,7 @@ SHORTEST = 32
 POINTS = 3000
 
 
-def over_log(found: Settled) -> Figure:
+def draw_settled_log(found: Settled) -> Figure:
     """The imposed quantity and each channel over the log, with settled stretches and their means."""
     runs = found.runs
     rows = np.concatenate([s.rows for s in found.stretches]) if found.stretches else np.zeros(0, int)
@@ -68,7 +68,7 @@ def over_log(found: Settled) -> Figure:
     ]
     fig, grid = new_figure(len(lines), 1, 1.9 * len(lines), sharex=True)
     for axes, (label, values), signal in zip(grid[:, 0], lines, (None, *found.signals), strict=True):
-        axes.plot(*_thin_line(clock[order], values[order]), color=FAINT, lw=0.8)
+        axes.plot(*_decimate_line(clock[order], values[order]), color=FAINT, lw=0.8)
         for s in found.stretches:
             ends = clock[s.rows[0]], clock[s.rows[-1]]
             if s.why:
@@ -81,7 +81,7 @@ def over_log(found: Settled) -> Figure:
     return fig
 
 
-def _thin_line(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _decimate_line(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """A line with fewer points that looks the same: the smallest and largest sample of each group."""
     size = -(-2 * len(x) // POINTS)
     if size <= 2:
@@ -106,8 +106,8 @@ def _largest_magnitude(time: np.ndarray, values: np.ndarray) -> float:
 
 
 @dataclasses.dataclass(frozen=True)
-class Start:
-    """A run from standstill, with numbers up to its last finite sample.
+class StartRun:
+    """A run from standstill, up to its last finite sample.
 
     Attributes:
         name: heading, configuration, status.
@@ -164,9 +164,9 @@ class Start:
         return float(self.current[last].mean()), float(self.speed[last].mean())
 
 
-def members_from_standstill(
+def start_runs(
     robot: Robot, history: Any, status: np.ndarray, which: Sequence[int], names: Sequence[str]
-) -> list[Start]:
+) -> list[StartRun]:
     """Members of a batch of runs from standstill, of any fidelity that has histories.
 
     Args:
@@ -190,12 +190,12 @@ def members_from_standstill(
         kind, ended, scale = robot.configurations.names[int(which[k])], STATUSES[int(status[k])], sense / MM
         times = np.asarray(history.time[k])[upto]
         answer.append(
-            Start(name, kind, ended, times, sense * current[upto], scale * speed, scale * theoretical, found)
+            StartRun(name, kind, ended, times, sense * current[upto], scale * speed, scale * theoretical, found)
         )
     return answer
 
 
-def from_standstill(shown: list[Start], current_title: str = "total current", speed_title: str = "speeds") -> Figure:
+def draw_starts(shown: list[StartRun], current_title: str = "total current", speed_title: str = "speeds") -> Figure:
     """A row for each run: the inrush enlarged, the total current, V and the speed of the shafts, stages shaded.
 
     For a run that ends backward, backward is drawn positive.
@@ -208,7 +208,7 @@ def from_standstill(shown: list[Start], current_title: str = "total current", sp
         current.set_title(current_title + backward)
         speed.set_title(speed_title + backward)
         if not start.time.size:
-            corner_note(zoom, f"no numbers: {words.short_status(start.status)}", color=VERMILION)
+            add_corner_note(zoom, f"no numbers: {words.short_status(start.status)}", color=VERMILION)
             continue
         colour = look[start.configuration][0]
         peak = int(np.argmax(start.current))
@@ -224,13 +224,13 @@ def from_standstill(shown: list[Start], current_title: str = "total current", sp
                 f"peak {start.current[peak]:.3g} A\nat {1e3 * start.time[peak]:.1f} ms", place, xytext=(8, -2),
                 textcoords="offset points", fontsize=8.5, va="top",
             )  # fmt: skip
-        _stages(zoom, start, 1e3)
-        _current(current, start, colour)
-        _speeds(speed, start, colour)
+        _shade_stages(zoom, start, 1e3)
+        _draw_current(current, start, colour)
+        _draw_speeds(speed, start, colour)
     return fig
 
 
-def _current(axes: Axes, start: Start, colour: str) -> None:
+def _draw_current(axes: Axes, start: StartRun, colour: str) -> None:
     last, peak = float(start.time[-1]), float(start.current.max())
     run = start.current[start.time > start.starting]
     run = run[len(run) // 20 :] if len(run) > 20 else start.current
@@ -239,12 +239,15 @@ def _current(axes: Axes, start: Start, colour: str) -> None:
     axes.plot(start.time, np.minimum(start.current, 1.2 * top), color=colour)
     axes.set(xlim=(0, last), ylim=(min(0.0, 1.1 * float(start.current.min())), top if cut else 1.3 * max(peak, 1e-3)))
     axes.set(xlabel="time [s]", ylabel="total current [A]")
-    _stages(axes, start)
+    _shade_stages(axes, start)
     if cut:
-        corner_note(axes, f"peak {peak:.3g} A cut off", x=0.02, y=0.8, color=colour)
+        add_corner_note(axes, f"peak {peak:.3g} A cut off", x=0.02, y=0.8, color=colour)
     during = (start.time > start.starting) & (start.time < start.slipping)
     middle = float(np.median(start.current[during])) if during.any() else 0.0
-    if start.slipping - start.starting > 1.5 * _share(axes, f"{middle:.2f} A") * last and start.gets_under_way:
+    if (
+        start.slipping - start.starting > 1.5 * _text_width_share(axes, f"{middle:.2f} A") * last
+        and start.gets_under_way
+    ):
         label_time = (start.starting + start.slipping) / 2
         axes.annotate(f"{middle:.2f} A", (label_time, middle), xytext=(0, 5), textcoords="offset points", ha="center")
     crest = start.current[last_samples(start.time)].max()
@@ -253,13 +256,13 @@ def _current(axes: Axes, start: Start, colour: str) -> None:
     )
 
 
-def _speeds(axes: Axes, start: Start, colour: str) -> None:
+def _draw_speeds(axes: Axes, start: StartRun, colour: str) -> None:
     last, top = float(start.time[-1]), max(float(start.theoretical.max()), 1.0)
     axes.plot(start.time, start.theoretical, "--", color=INK, lw=1.4)
     axes.plot(start.time, start.speed, color=colour)
     axes.set(xlim=(0, last), ylim=(min(0.0, 1.1 * float(start.speed.min())), 1.38 * top), xlabel="time [s]")
     axes.set_ylabel("speed [mm/s]")
-    _stages(axes, start)
+    _shade_stages(axes, start)
     axes.text(0.02 * last, 1.02 * top, r"$V_{x\,teor}$ (shafts)", fontsize=8.5, va="bottom")
     if 0 < start.settled < last and start.gets_under_way:
         axes.axvline(start.settled, color=FAINT, lw=0.9, ls=":")
@@ -272,10 +275,10 @@ def _speeds(axes: Axes, start: Start, colour: str) -> None:
     place = (6, 6) if beside else (6, -12)
     axes.annotate("$V_x$ (robot)", label_place, xytext=place, textcoords="offset points", color=colour, fontsize=8.5)
     if start.status not in words.SETTLED:
-        corner_note(axes, f"ends: {words.short_status(start.status)}", y=0.15, color=VERMILION)
+        add_corner_note(axes, f"ends: {words.short_status(start.status)}", y=0.15, color=VERMILION)
 
 
-def slip_over_start(shown: list[Start]) -> Figure:
+def draw_slip(shown: list[StartRun]) -> Figure:
     """A row for each run: V_x and V_x_teor until after the start, and the slip (33).
 
     The slip's mean is drawn over each stage and over t'. For a run that ends backward, backward is drawn positive.
@@ -286,7 +289,7 @@ def slip_over_start(shown: list[Start]) -> Figure:
         speeds.set_title(f"{start.name}\nspeeds{', backward positive' if start.sense < 0 else ''}")
         slip.set_title("slip")
         if start.stages is None:
-            corner_note(speeds, f"no numbers: {words.short_status(start.status)}", color=VERMILION)
+            add_corner_note(speeds, f"no numbers: {words.short_status(start.status)}", color=VERMILION)
             continue
         colour = look[start.configuration][0]
         last = float(start.time[-1])
@@ -305,21 +308,21 @@ def slip_over_start(shown: list[Start]) -> Figure:
                 words_of, (t, float(np.interp(t, start.time, curve))), xytext=place, textcoords="offset points",
                 color=colour_of, fontsize=9, ha="center",
             )  # fmt: skip
-        _stages(speeds, start)
+        _shade_stages(speeds, start)
         rolling = np.abs(start.theoretical) > 1e-3 * top
         share = 100 * (1 - start.speed / np.where(rolling, start.theoretical, np.nan))
         slip.plot(start.time, share, color=colour)
         slip.set(xlim=(0, upto), ylim=(min(0.0, *np.clip(share[rolling], -20, 0)) if rolling.any() else 0.0, 125))
         slip.set(xlabel="time [s]", ylabel="slip s [%]")
-        _stages(slip, start)
+        _shade_stages(slip, start)
         if start.gets_under_way:
-            _means(speeds, slip, start, upto)
+            _draw_slip_means(speeds, slip, start, upto)
         if start.status not in words.SETTLED:
-            corner_note(slip, f"ends: {words.short_status(start.status)}", y=0.15, color=VERMILION)
+            add_corner_note(slip, f"ends: {words.short_status(start.status)}", y=0.15, color=VERMILION)
     return fig
 
 
-def _means(speeds: Axes, slip: Axes, start: Start, upto: float) -> None:
+def _draw_slip_means(speeds: Axes, slip: Axes, start: StartRun, upto: float) -> None:
     """Mark t' and draw the mean slip of each stage as a level."""
     assert start.stages is not None
     for axes in (speeds, slip):
@@ -341,7 +344,7 @@ def _means(speeds: Axes, slip: Axes, start: Start, upto: float) -> None:
             )  # fmt: skip
 
 
-def _stages(axes: Axes, start: Start, scale: float = 1.0) -> None:
+def _shade_stages(axes: Axes, start: StartRun, scale: float = 1.0) -> None:
     """Shade the stages behind a plot over time in units of 1/`scale` s and name them at the top."""
     if not start.gets_under_way:
         return
@@ -353,21 +356,21 @@ def _stages(axes: Axes, start: Start, scale: float = 1.0) -> None:
             continue
         axes.axvspan(left, right, color=shade, zorder=0, lw=0)
         width = (right - left) / (right_edge - left_edge)
-        if width > _share(axes, stage):
-            text = f"{stage}\n{name}" if width > _share(axes, name) else stage
+        if width > _text_width_share(axes, stage):
+            text = f"{stage}\n{name}" if width > _text_width_share(axes, name) else stage
             axes.text(
                 (left + right) / 2, 0.985, text, transform=axes.get_xaxis_transform(), ha="center",
                 va="top", fontsize=8.5, fontweight="bold", color=INK,
             )  # fmt: skip
 
 
-def _share(axes: Axes, text: str, size: float = 8.5) -> float:
+def _text_width_share(axes: Axes, text: str, size: float = 8.5) -> float:
     """Approximate fraction of the axes' width that a bold text takes [-]."""
     return 0.72 * size * len(text) / 72 * axes.figure.dpi / axes.bbox.width
 
 
 @dataclasses.dataclass(frozen=True)
-class Course:
+class ShaftRun:
     """A run of a shaft over time, up to its last finite sample.
 
     Attributes:
@@ -391,7 +394,7 @@ class Course:
         return float(values[-1]) if values.size else np.nan
 
 
-def members_as_read(read: Iterable[Channel], history: Any, status: np.ndarray, names: Sequence[str]) -> list[Course]:
+def shaft_runs(read: Iterable[Channel], history: Any, status: np.ndarray, names: Sequence[str]) -> list[ShaftRun]:
     """Members of a batch of runs as their instruments show them.
 
     Args:
@@ -408,11 +411,11 @@ def members_as_read(read: Iterable[Channel], history: Any, status: np.ndarray, n
         finite = np.flatnonzero(np.isfinite(np.stack(list(readings.values()))).all(0))
         upto = slice(0, int(finite[-1]) + 1 if finite.size else 0)
         member_readings = {channel: values[upto] for channel, values in readings.items()}
-        answer.append(Course(name, STATUSES[int(status[k])], np.asarray(history.time[k])[upto], member_readings))
+        answer.append(ShaftRun(name, STATUSES[int(status[k])], np.asarray(history.time[k])[upto], member_readings))
     return answer
 
 
-def over_time(shown: list[Course]) -> Figure:
+def draw_readings_over_time(shown: list[ShaftRun]) -> Figure:
     """A row for each run, a panel for each channel."""
     read = channels.channels_named(shown[0].readings)
     fig, grid = new_figure(len(shown), len(read), 2.6 * len(shown))
@@ -422,7 +425,7 @@ def over_time(shown: list[Course]) -> Figure:
             axes.plot(course.time, course.readings[channel.name], color=BLUE)
             axes.set(xlabel="time [s]", ylabel=axis_label(channel))
         if course.status not in words.SETTLED:
-            corner_note(row[0], f"ends: {words.short_status(course.status)}", color=VERMILION)
+            add_corner_note(row[0], f"ends: {words.short_status(course.status)}", color=VERMILION)
     return fig
 
 
@@ -476,7 +479,7 @@ def draw_frequency_response(runs: Runs, read: Sequence[Channel], simulated: Mapp
             if len(r) >= SHORTEST
         ]
         if not series:
-            corner_note(gain, "no run is long enough")
+            add_corner_note(gain, "no run is long enough")
             continue
         frequency, response, coherence = frequency_response(series)
         looks = zip(response, coherence, ("measured", *simulated.values()), (INK, BLUE, ORANGE), strict=False)

@@ -28,9 +28,9 @@ from sweeps.pages.figure_style import (
     INK,
     ORANGE,
     SKY,
+    add_corner_note,
     colour_bar,
     configuration_looks,
-    corner_note,
     is_narrow,
     new_figure,
     outer_legend,
@@ -71,7 +71,7 @@ CONDITION_WORDS = {
 ABREAST = 110
 
 
-def before_after(table: Columns, channels: Sequence[Channel], verdict: str) -> Figure:
+def draw_residuals_before_after(table: Columns, channels: Sequence[Channel], verdict: str) -> Figure:
     """Residual of every reading in sigmas, before and after. Runs grouped by configuration and voltage."""
     own_column = imposed_column(table)
     beside = [c for c in ("payload_kg", "slope_deg", "load_torque_Nm") if c in table]
@@ -116,12 +116,12 @@ def before_after(table: Columns, channels: Sequence[Channel], verdict: str) -> F
 RUNS_SHOWN, AVERAGED = 8, 5
 
 
-def _range(x: np.ndarray) -> str:
+def _range_text(x: np.ndarray) -> str:
     low, high = np.min(x), np.max(x)
     return f"{low:g}" if low == high else f"{low:g} to {high:g}"
 
 
-def over_time(runs: Runs, table: Columns, channels: Sequence[Channel], verdict: str) -> Figure:
+def draw_residuals_over_time(runs: Runs, table: Columns, channels: Sequence[Channel], verdict: str) -> Figure:
     """Residual of every history over time in sigmas, before and after. One column a run, samples as dots and their
     running mean as a line. The `table` is of the rows of `runs`."""
     names = list(dict.fromkeys(runs.run_names.tolist()))[:RUNS_SHOWN]
@@ -145,9 +145,9 @@ def over_time(runs: Runs, table: Columns, channels: Sequence[Channel], verdict: 
                 axes.set_ylabel(f"{channel.label} [σ]")
         first = run_rows[0]
         grid[0, column].set_title(
-            f"{name}\n{table['configuration'][first]} {_range(table[imposed_column(table)][run_rows])} "
+            f"{name}\n{table['configuration'][first]} {_range_text(table[imposed_column(table)][run_rows])} "
             f"{UNITS[imposed_column(table)]}"
-            + (f" {_range(table['slope_deg'][run_rows])}°" if "slope_deg" in table else ""), fontsize=8,
+            + (f" {_range_text(table['slope_deg'][run_rows])}°" if "slope_deg" in table else ""), fontsize=8,
         )  # fmt: skip
         grid[-1, column].set_xlabel("time [s]")
     words = "blue: the fitted model" if verdict == "none" else "orange: before, blue: after"
@@ -155,7 +155,7 @@ def over_time(runs: Runs, table: Columns, channels: Sequence[Channel], verdict: 
     return fig
 
 
-def time_statistics(detail: TimeStatistics, channels: Sequence[Channel], verdict: str) -> Figure:
+def draw_time_statistics(detail: TimeStatistics, channels: Sequence[Channel], verdict: str) -> Figure:
     """Statistics that need histories: autocorrelation of the residual, waves in shaft angle, drift in time."""
     sides = [("before", detail.before, ORANGE), ("after", detail.after, BLUE)]
     sides = sides if verdict != "none" else sides[1:]
@@ -290,7 +290,7 @@ def draw_bootstrap_statistics(before: Evidence) -> Figure:
         axes.axvline(kind.found, color=BLUE, lw=2)
         axes.set_xlabel(text)
         axes.set_yticks([])
-    corner_note(grid[0, 0], "grey: bootstrap\norange: threshold\nblue: these data", x=0.62)
+    add_corner_note(grid[0, 0], "grey: bootstrap\norange: threshold\nblue: these data", x=0.62)
     return fig
 
 
@@ -357,7 +357,7 @@ def conditions_and_readings(table: Columns) -> Columns:
     return columns
 
 
-def depends_on(table: Columns, change: np.ndarray, driver: str = "") -> tuple[np.ndarray, str]:
+def driving_variable(table: Columns, change: np.ndarray, driver: str = "") -> tuple[np.ndarray, str]:
     """Abscissa of an effect and its label: the condition or reading that makes the change of a reading smoothest.
 
     Args:
@@ -385,7 +385,7 @@ def draw_effect_laws(found: DiscoveryResult, table: Columns, changes: Mapping[st
         c = change.channel
         effect = BY_NAME.get(name)
         moved = np.where(used, change.with_it - change.without, np.nan)
-        x, label = depends_on(table, moved, "" if effect is None else effect.driver)
+        x, label = driving_variable(table, moved, "" if effect is None else effect.driver)
         k = [x.name for x in found.channels].index(c.name)
         size = next(e.parameters["amplitude"] for e in found.effects if e.name == name)
         measured, before, law = (
@@ -427,7 +427,7 @@ def closed_equations(table: Columns) -> list[str]:
     return balances or ["track"]
 
 
-def _over(table: Columns, column: str, label: str, side: str = "") -> tuple[np.ndarray, str]:
+def _defect_variable(table: Columns, column: str, label: str, side: str = "") -> tuple[np.ndarray, str]:
     """Variable over which a defect is drawn, with its label, for one side if each side has its own.
 
     The imposed quantity replaces a variable that the table lacks or that does not vary.
@@ -461,7 +461,7 @@ def draw_defects(table: Columns, verdict: str, crosses_zero: bool = False) -> Fi
                 names, configuration_looks(map(", ".join, names)).values(), strict=True
             ):
                 of_configuration = table["configuration"] == name
-                x, label = _over(table, column, of_what, side)
+                x, label = _defect_variable(table, column, of_what, side)
                 y = by_side[side][of_configuration] * (1e3 if balance == "slip" else 1.0)
                 axes.plot(
                     x[of_configuration], y, marker, ms=4.5, color=colour, label=f"{name}, {side}".removesuffix(", ")
@@ -475,7 +475,7 @@ def draw_defects(table: Columns, verdict: str, crosses_zero: bool = False) -> Fi
     return fig
 
 
-def look_alikes(found: DiscoveryResult) -> Figure:
+def draw_similar_effects(found: DiscoveryResult) -> Figure:
     """|cos| between what the base leaves of two effects' signatures, for the effects that score highest."""
     names = [s.name for s in found.scores if s.score > 0][:ALIKE]
     cosine = found.cosine[: len(names), : len(names)]
@@ -494,7 +494,7 @@ def look_alikes(found: DiscoveryResult) -> Figure:
     return fig
 
 
-def base_shift(found: DiscoveryResult) -> Figure:
+def draw_parameter_shifts(found: DiscoveryResult) -> Figure:
     """Each base parameter in prior sds, before and after the effects were added."""
     shift = found.base_shift
     fig, grid = new_figure(1, 1, 1.0 + 0.27 * len(shift))

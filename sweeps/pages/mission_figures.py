@@ -19,7 +19,7 @@ from sweeps.pages.figure_style import (
     PURPLE,
     SKY,
     VERMILION,
-    corner_note,
+    add_corner_note,
     legend_columns,
     new_figure,
 )
@@ -54,10 +54,10 @@ def draw_mission_course(rows: Columns, cycle: float | None, limit: float, linear
         time = shown_rows["time_s"] / size
         first = column == 0
         axes[0].set_title(f"{title}: speed" + (" and slope" if np.any(rows.get("slope_deg", 0.0)) else ""))
-        _speed(axes[0], time, shown_rows, linear, legend=first)
+        _draw_speed(axes[0], time, shown_rows, linear, legend=first)
         sizes = ", sizes of both sides" if "duty_left" in rows else ""
         axes[1].set_title(f"current of all motors, and duty{sizes}" if first else "current, and duty")
-        _current(axes[1], time, shown_rows, sides, legend=first)
+        _draw_current(axes[1], time, shown_rows, sides, legend=first)
         unlimited = limit >= UNLIMITED or "housing_temperature_C" not in rows
         beyond = (
             ""
@@ -65,13 +65,13 @@ def draw_mission_course(rows: Columns, cycle: float | None, limit: float, linear
             else f", the winding's limit of {limit:.0f} °C beyond the scale"
         )
         axes[2].set_title("temperatures" + (beyond if first else ""))
-        _temperatures(axes[2], time, shown_rows, limit, legend=first)
-        _source(axes[3], time, shown_rows)
+        _draw_temperatures(axes[2], time, shown_rows, limit, legend=first)
+        _draw_source(axes[3], time, shown_rows)
         axes[3].set(xlabel=f"time [{unit}]", xlim=(0, span / size))
     return fig
 
 
-def of_sides(rows: Columns) -> Figure:
+def draw_sides(rows: Columns) -> Figure:
     """Current and duty of either side, and the yaw rate, over time.
 
     Args:
@@ -102,7 +102,7 @@ def _right_axes(axes: Axes, label: str, colour: str) -> Axes:
     return other
 
 
-def _legend(axes: Axes, *others: Axes) -> None:
+def _draw_legend(axes: Axes, *others: Axes) -> None:
     handles = [h for a in (axes, *others) for h in a.get_legend_handles_labels()[0]]
     labels = [str(h.get_label()) for h in handles]
     axes.legend(handles, labels, loc="upper center", ncols=legend_columns(labels), fontsize=8)
@@ -114,7 +114,9 @@ def _legend(axes: Axes, *others: Axes) -> None:
 TURNS, PARTS = 300, 200
 
 
-def _curve(axes: Axes, time: np.ndarray, values: np.ndarray, colour: str, label: str, width: float = 1.0) -> None:
+def _draw_curve(
+    axes: Axes, time: np.ndarray, values: np.ndarray, colour: str, label: str, width: float = 1.0
+) -> None:
     """A curve over time, or from least to greatest in each part of the time if many cycles would fill the panel."""
     if np.count_nonzero(np.diff(np.sign(np.diff(values)))) <= TURNS:
         axes.plot(time, values, color=colour, lw=width, label=label)
@@ -125,18 +127,18 @@ def _curve(axes: Axes, time: np.ndarray, values: np.ndarray, colour: str, label:
     axes.fill_between(middle, least, greatest, color=colour, alpha=0.35, lw=0.6, label=f"{label}, range")
 
 
-def _speed(axes: Axes, time: np.ndarray, rows: Columns, linear: bool, legend: bool) -> None:
+def _draw_speed(axes: Axes, time: np.ndarray, rows: Columns, linear: bool, legend: bool) -> None:
     turning = "demanded_motor_speed_rpm" in rows  # a shaft's
     speed = rows["motor_speed_rpm"] if turning else rows.get("speed_mm_s", rows["theoretical_speed_mm_s"])
-    _curve(axes, time, speed, BLUE, "speed", 1.4)
+    _draw_curve(axes, time, speed, BLUE, "speed", 1.4)
     demanded = rows["demanded_motor_speed_rpm" if turning else "demanded_speed_mm_s"]
     if np.isfinite(demanded).any() and np.count_nonzero(np.diff(np.sign(np.diff(demanded)))) <= TURNS:
         axes.plot(time, demanded, color=INK, lw=0.9, ls=(0, (4, 2)), label="demanded")
     axes.set_ylabel("motor speed [rpm]" if turning else "speed [mm/s]")
     if turning or not np.any(rows["slope_deg"]):
-        corner_note(axes, "" if turning else "level ground", x=0.98, y=0.04, va="bottom", ha="right", color=FAINT)
+        add_corner_note(axes, "" if turning else "level ground", x=0.98, y=0.04, va="bottom", ha="right", color=FAINT)
         if legend:
-            _legend(axes)
+            _draw_legend(axes)
         return
     slope = _right_axes(axes, "slope [°]", GREEN)
     slope.plot(
@@ -145,25 +147,25 @@ def _speed(axes: Axes, time: np.ndarray, rows: Columns, linear: bool, legend: bo
     most = max(1.0, 1.3 * float(np.max(np.abs(rows["slope_deg"]))))
     slope.set_ylim(-most, most)
     if legend:
-        _legend(axes, slope)
+        _draw_legend(axes, slope)
 
 
-def _current(axes: Axes, time: np.ndarray, rows: Columns, sides: float, legend: bool) -> None:
-    current, driven = (of_motors(rows, *name) for name in (("motor_current", "_A"), ("duty", "")))
+def _draw_current(axes: Axes, time: np.ndarray, rows: Columns, sides: float, legend: bool) -> None:
+    current, driven = (mean_of_motors(rows, *name) for name in (("motor_current", "_A"), ("duty", "")))
     current = sides * current
-    _curve(axes, time, current, VERMILION, "current")
+    _draw_curve(axes, time, current, VERMILION, "current")
     top = int(np.argmax(np.abs(current)))
     axes.plot(time[top], current[top], marker="o", ms=4, color=INK, ls="none", label=f"peak {current[top]:.2f} A")
     axes.set_ylabel("current [A]")
     duty = _right_axes(axes, "duty [%]", PURPLE)
-    _curve(duty, time, 100 * driven, PURPLE, "duty", 0.9)
+    _draw_curve(duty, time, 100 * driven, PURPLE, "duty", 0.9)
     low = -110 if (driven < 0).any() else 0
     duty.set_ylim(low, 110)
     if legend:
-        _legend(axes, duty)
+        _draw_legend(axes, duty)
 
 
-def of_motors(rows: Columns, name: str, unit: str) -> np.ndarray:
+def mean_of_motors(rows: Columns, name: str, unit: str) -> np.ndarray:
     """Of a motor on average. Of motors of two sides, which cancel one another on the spot, of their sizes."""
     of_sides = [np.abs(rows[f"{name}_{side}{unit}"]) for side in SIDES if f"{name}_{side}{unit}" in rows]
     return np.asarray(np.mean(of_sides, axis=0) if of_sides else rows[f"{name}{unit}"])
@@ -174,9 +176,9 @@ def _limit_is_near(rows: Columns, limit: float) -> bool:
     return "housing_temperature_C" in rows and bool(np.max(rows["winding_temperature_C"]) > 0.6 * limit)
 
 
-def _temperatures(axes: Axes, time: np.ndarray, rows: Columns, limit: float, legend: bool) -> None:
+def _draw_temperatures(axes: Axes, time: np.ndarray, rows: Columns, limit: float, legend: bool) -> None:
     if "housing_temperature_C" not in rows:
-        corner_note(axes, "not computed: the robot's file lacks\nthe thermal resistance of the windings")
+        add_corner_note(axes, "not computed: the robot's file lacks\nthe thermal resistance of the windings")
         axes.set_yticks([])
         return
     axes.plot(time, rows["winding_temperature_C"], color=VERMILION, lw=1.4, label="winding")
@@ -189,10 +191,10 @@ def _temperatures(axes: Axes, time: np.ndarray, rows: Columns, limit: float, leg
         axes.set_ylim(bottom - 0.5, top + max(1.0, 0.3 * (top - bottom)))
     axes.set_ylabel("temperature [°C]")
     if legend:
-        _legend(axes)
+        _draw_legend(axes)
 
 
-def _source(axes: Axes, time: np.ndarray, rows: Columns) -> None:
+def _draw_source(axes: Axes, time: np.ndarray, rows: Columns) -> None:
     charge = rows["state_of_charge"]
     volts = rows["source_voltage_V"]
     if not np.isfinite(charge).any():
@@ -210,7 +212,7 @@ def _source(axes: Axes, time: np.ndarray, rows: Columns) -> None:
     beside.plot(time, volts, color=BLUE, lw=0.8, alpha=0.8)
     for k in np.flatnonzero(rows["event"] == "below_cut_off")[-1:]:
         axes.axvline(time[k], color=VERMILION, lw=1.0, ls="--")
-        corner_note(axes, "broken line: cells fall below their cut-off", x=0.02, y=0.06, va="bottom", color=FAINT)
+        add_corner_note(axes, "broken line: cells fall below their cut-off", x=0.02, y=0.06, va="bottom", color=FAINT)
 
 
 def draw_mission_energy(run: Json, on_battery: bool, on_ground: bool = True) -> Figure:

@@ -34,7 +34,7 @@ from sweeps.report.document import PAGE_ROWS as ROWS
 from sweeps.report.document import SIDE_BY_SIDE, Column, Note, Section, Table, cell_tone
 
 
-class Album:
+class FigureAlbum:
     """Draws figures into `folder/figures` and keeps them for the page."""
 
     def __init__(self, folder: Path) -> None:
@@ -60,9 +60,9 @@ class Album:
                 narrow = figure_as_svg(fit_for_phones(draw()))
         write_text(self.folder / f"{name}.svg", printable(text))
         looks = "scale " * has_colour_scale(figure)
-        picture = _inline(text, name, looks + ("wide" if narrow else "only"))
+        picture = _inline_svg(text, name, looks + ("wide" if narrow else "only"))
         self.pictures[name] = Markup(
-            picture + (_inline(narrow, f"{name}-narrow", looks + "narrow") if narrow else "")
+            picture + (_inline_svg(narrow, f"{name}-narrow", looks + "narrow") if narrow else "")
         )
 
     def add_overlay(self, name: str, overlay: TimeOverlay) -> None:
@@ -74,7 +74,7 @@ class Album:
         )
 
 
-def _inline(svg: str, name: str, looks: str) -> str:
+def _inline_svg(svg: str, name: str, looks: str) -> str:
     """An SVG document as an element of a page, with the classes `looks`. Ids that are referred to are its own."""
     element = re.sub(r' xmlns(?::\w+)?="[^"]*"', "", svg[svg.index("<svg") :])
     element = element.replace("<svg ", f'<svg class="{looks}" ', 1)
@@ -92,12 +92,12 @@ def robot_section(file: RobotFile) -> Json:
 
     remarks = [Note(". ".join(file.remarks), "warn", "robot-warning")] if file.remarks else []
     return {
-        "robot": capabilities.shown_name(file), "about_robot": _section(file, ROBOTS["nominal"]()),
+        "robot": capabilities.displayed_name(file), "about_robot": _parameter_section(file, ROBOTS["nominal"]()),
         "warnings": (*run_tables.curve_warning(file.robot), *remarks),
     }  # fmt: skip
 
 
-def _section(file: RobotFile, nominal: Robot) -> Section:
+def _parameter_section(file: RobotFile, nominal: Robot) -> Section:
     """Parameters of a rig, or those in which a robot differs from the nominal one."""
     end = (Column("unit"), Column("meaning"))
     first, value = Column("parameter"), "{:.6g}"
@@ -116,7 +116,7 @@ def _section(file: RobotFile, nominal: Robot) -> Section:
     )
 
 
-def render_page(folder: Path, album: Album, **known: Any) -> Path:
+def render_page(folder: Path, album: FigureAlbum, **known: Any) -> Path:
     """Write `report.html` from the album's pictures and the values of `document.html.j2`.
 
     Adds the parts of every page: contents after the answer, files of the folder (`files`: unusual meanings), tables
@@ -140,7 +140,7 @@ def render_page(folder: Path, album: Album, **known: Any) -> Path:
     template = environment.get_template("document.html.j2")
     page = template.render(pictures=album.pictures, overlays=album.overlays, **known)
     page = page.replace("<table", '<div class="scroll" tabindex="0"><table').replace("</table>", "</table></div>")
-    page = _with_contents(page)
+    page = _add_contents(page)
     path = Path(folder) / "report.html"
     write_text(path, printable(page))
     return path
@@ -159,7 +159,7 @@ def _files_of_folder(folder: Path, meanings: dict[str, str]) -> dict[str, str]:
 _HEADING = re.compile(r"<h2(?: id=\"([^\"]+)\")?>(.*?)</h2>", re.S)
 
 
-def _with_contents(page: str) -> str:
+def _add_contents(page: str) -> str:
     """A page with links to its headings before the first of them."""
     links = []
 

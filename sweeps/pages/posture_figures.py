@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Polygon
 from scipy.spatial import ConvexHull
 
-from mmrjax.climbing.resting_posture import BELTS, FRONT_AXLE, REAR_AXLE, Outline
+from mmrjax.climbing.resting_posture import BELTS, FRONT_AXLE, REAR_AXLE, SideOutline
 from mmrjax.model.quantities import MM
 from sweeps.pages.figure_style import BLUE, FAINT, GREEN, INK, ORANGE, VERMILION, colour_bar, is_narrow, new_figure
 from sweeps.report.check_report import (
@@ -67,7 +67,7 @@ _ROUND = np.linspace(0.0, 2 * np.pi, 181)
 _CIRCLE = np.stack([np.cos(_ROUND), np.sin(_ROUND)], 1)
 
 
-def belt_outline(side: Outline, belt: tuple[int, int]) -> np.ndarray:
+def belt_outline(side: SideOutline, belt: tuple[int, int]) -> np.ndarray:
     """Corners of the belt around a pair of circles, over its grousers [m]."""
     wide = [float(side.belt) if k in (REAR_AXLE, FRONT_AXLE) else float(side.radius[k]) for k in belt]
     outline = [np.array([float(side.forward[k]), float(side.up[k])]) for k in belt]
@@ -107,7 +107,7 @@ def draw_silhouette(axes: Axes, shown: Drawn, title: str) -> None:
 ASKED = {"step_mm": "On its highest step", "gap_mm": "Flush over a gap", "length_mm": "Folded"}
 
 
-def asked_about(drawn: Mapping[str, tuple[Drawn, float, float]]) -> Figure:
+def draw_required_postures(drawn: Mapping[str, tuple[Drawn, float, float]]) -> Figure:
     """Side views of the robot, one for each geometric requirement, in the posture that it refers to."""
     fig, grid = new_figure(1, max(len(drawn), 2), 3.6)
     for axes, (name, (shown, front, rear)) in zip(grid[0], drawn.items(), strict=False):
@@ -118,7 +118,7 @@ def asked_about(drawn: Mapping[str, tuple[Drawn, float, float]]) -> Figure:
     return fig
 
 
-def rest_and_step(found: Postures) -> Figure:
+def draw_rest_and_step(found: Postures) -> Figure:
     """The first run at rest on its slope, and where its centre of mass is over the edge of its highest step."""
     fig, grid = new_figure(1, 2, 3.6)
     pitch, contact, step = (found.table[c][0] for c in ("pitch_deg", "contact_mm", "highest_step_mm"))

@@ -35,14 +35,14 @@ _OTHERS = (GREEN, PURPLE, SKY)
 _UNREAD = {"slides": ">", "failed": "x", "tips": "^", "stalled": "_", "too_slow": "|", "battery_empty": "+"}
 
 
-def resonance_map(found: ResonanceResult) -> Figure:
+def draw_resonance_map(found: ResonanceResult) -> Figure:
     """Natural frequencies and harmonics of the passing frequency. Below them, ripple at every speed and payload."""
     rows = len(found.modes)
     heights = [4.4, *(0.5 + 0.2 * rows for _ in MAPS)]
     fig, grid = new_figure(4, 1, sum(heights) + 0.6, sharex=True, height_ratios=heights)
     draw_campbell_diagram(grid[0, 0], found)
     for axes, name in zip(grid[1:, 0], MAPS, strict=True):
-        ripple_map(axes, found, name)
+        draw_ripple_map(axes, found, name)
     grid[-1, 0].set_xlabel("speed of the robot [mm/s]")
     fastest = np.nanmax(found.table["speed_mean_mm_s"])
     grid[0, 0].set_xlim(0, 1.06 * fastest)
@@ -74,7 +74,7 @@ def draw_campbell_diagram(axes: Axes, found: ResonanceResult) -> None:
             textcoords="offset points", color=FAINT, fontsize=8.5, va="center" if inside else "top",
             bbox=None if inside else dict(boxstyle="round,pad=0.1", fc="white", ec="none"),
         )  # fmt: skip
-    _bands(axes, found)
+    _draw_mode_bands(axes, found)
     for name, (colour, marker) in _MARKS.items():
         ripple = table[f"{name}_ripple_percent"][found.read]
         axes.scatter(
@@ -106,7 +106,7 @@ def draw_campbell_diagram(axes: Axes, found: ResonanceResult) -> None:
     )  # fmt: skip
 
 
-def _bands(axes: Axes, found: ResonanceResult) -> None:
+def _draw_mode_bands(axes: Axes, found: ResonanceResult) -> None:
     """A band for each mode, from the least to the greatest frequency over payloads and positions of the belt."""
     others = iter(_OTHERS * 3)
     names = dict.fromkeys(m.name for modes in found.modes.values() for m in modes if m.resonant)
@@ -127,7 +127,7 @@ def _bands(axes: Axes, found: ResonanceResult) -> None:
         )  # fmt: skip
 
 
-def ripple_map(axes: Axes, found: ResonanceResult, name: str) -> None:
+def draw_ripple_map(axes: Axes, found: ResonanceResult, name: str) -> None:
     """Ripple of one signal over speed, one row per payload. Bars mark peaks to avoid."""
     table, payloads = found.table, list(found.modes)
     ripple = table[f"{name}_ripple_percent"]

@@ -6,10 +6,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from calibration.sensitivity.replicates import Estimate
+from calibration.sensitivity.replicates import IntervalEstimate
 from calibration.sensitivity.result import NEGLIGIBLE, NextRuns, OutputStudy, SensitivityResult
 from mmrjax.errors import count_noun
-from sweeps.pages.figure_style import BLUE, GREEN, INK, ORANGE, VERMILION, corner_note, legend_columns, new_figure
+from sweeps.pages.figure_style import BLUE, GREEN, INK, ORANGE, VERMILION, add_corner_note, legend_columns, new_figure
 from sweeps.pages.words import short_name
 
 #: Inputs that a figure shows at most, and operating points of a tornado.
@@ -31,14 +31,14 @@ def draw_input_shares(found: SensitivityResult) -> Figure:
     rows = rows or [int(np.argmax(shares.max(1)))]
     fig, axes = new_figure(1, 1, 0.9 + 0.29 * len(rows))
     ax: Axes = axes[0, 0]
-    _cells(ax, shares[rows], 12)
+    _draw_heat_map(ax, shares[rows], 12)
     ax.set_yticks(range(len(rows)), [short_name(found.names[k]) for k in rows])
     ax.set_xticks(range(shares.shape[1]), [s.row.label for s in found.outputs.values()], rotation=18, ha="left")
     ax.xaxis.tick_top()
     return fig
 
 
-def _cells(ax: Axes, shares: np.ndarray, labelled: int) -> None:
+def _draw_heat_map(ax: Axes, shares: np.ndarray, labelled: int) -> None:
     """A heat map of shares, each cell with its percent where there are few columns."""
     ax.grid(False)
     hidden = np.ma.masked_invalid(np.where(shares < NEGLIGIBLE, 0.0, shares))
@@ -84,7 +84,7 @@ def draw_tornado(study: OutputStudy, found: SensitivityResult) -> Figure:
                     beside = np.nanmax([value[n], *swing[:, n, i]])
                     ax.text(beside, -place, " × does not travel", va="center", fontsize=7.5, color=colour)
         ax.axvline(value[n], color=INK, linewidth=0.9)
-        ax.set_title(_split(found.points.label(where[n])), fontsize=8.5)
+        ax.set_title(_split_label(found.points.label(where[n])), fontsize=8.5)
         ax.tick_params(axis="x", labelsize=8)
         ax.locator_params(axis="x", nbins=3, steps=[1, 2, 5, 10])  # of few digits, so that they do not touch
         ax.grid(axis="y", visible=False)
@@ -93,7 +93,7 @@ def draw_tornado(study: OutputStudy, found: SensitivityResult) -> Figure:
     return fig
 
 
-def _split(label: str) -> str:
+def _split_label(label: str) -> str:
     first, *rest = label.split(", ")
     return f"{first}\n{', '.join(rest)}"
 
@@ -104,8 +104,8 @@ def draw_indices(study: OutputStudy, found: SensitivityResult) -> Figure:
     top = leading_inputs(share)
     fig, axes = new_figure(1, 2, 1.0 + 0.3 * max(len(top), 3), width_ratios=(1.0, 1.7))
     left, right = axes[0]
-    _bars(left, study, found, top)
-    _over_points(right, study, found, top)
+    _draw_index_bars(left, study, found, top)
+    _draw_shares_over_points(right, study, found, top)
     return fig
 
 
@@ -116,8 +116,8 @@ _WORDS = {
 }  # fmt: skip
 
 
-def _bars(ax: Axes, study: OutputStudy, found: SensitivityResult, top: np.ndarray) -> None:
-    estimates: dict[str, Estimate | None] = {key: e for key, e in study.overall.items() if key in _WORDS}
+def _draw_index_bars(ax: Axes, study: OutputStudy, found: SensitivityResult, top: np.ndarray) -> None:
+    estimates: dict[str, IntervalEstimate | None] = {key: e for key, e in study.overall.items() if key in _WORDS}
     estimates = estimates or {"": None}
     height = 0.8 / len(estimates)
     for j, (key, estimate) in enumerate(estimates.items()):
@@ -146,12 +146,12 @@ def _bars(ax: Axes, study: OutputStudy, found: SensitivityResult, top: np.ndarra
     ax.legend(loc="lower left", bbox_to_anchor=(-0.02, 1.0), ncols=columns, fontsize=7.5)  # beside no bar
 
 
-def _over_points(ax: Axes, study: OutputStudy, found: SensitivityResult, top: np.ndarray) -> None:
+def _draw_shares_over_points(ax: Axes, study: OutputStudy, found: SensitivityResult, top: np.ndarray) -> None:
     points = found.points
     names = np.array(list(map(str, points.configuration)))
     kinds = {name: k for k, name in enumerate(dict.fromkeys(names))}
     order = np.lexsort((points.payload, points.imposed[1], points.slope_deg, np.array([kinds[n] for n in names])))
-    _cells(ax, study.share[order][:, top].T, 24)
+    _draw_heat_map(ax, study.share[order][:, top].T, 24)
     ax.set_yticks([])
     ticks, labels = [], []
     word, own_values, unit = points.imposed
@@ -171,12 +171,14 @@ def _over_points(ax: Axes, study: OutputStudy, found: SensitivityResult, top: np
         ax.text(point_rows.mean(), -0.62, kind, ha="center", va="bottom", fontsize=9, fontweight="bold")
     ax.set_xticks(ticks, labels, fontsize=8.5)
     other = ((word, own_values, unit), ("payload", points.payload, "kg"))
-    inner = [f"{word} {_range(x)} {unit}" for word, x, unit in other if x is not levels and np.unique(x).size > 1]
+    inner = [
+        f"{word} {_range_text(x)} {unit}" for word, x, unit in other if x is not levels and np.unique(x).size > 1
+    ]
     within = f"; within each {' and '.join(inner)}" if inner else ""
     ax.set_xlabel(f"{along}{within}; grey: no index there", fontsize=8.5)
 
 
-def _range(values: np.ndarray) -> str:
+def _range_text(values: np.ndarray) -> str:
     return f"{values.min():g}-{values.max():g}"
 
 
@@ -212,7 +214,7 @@ def draw_convergence(found: SensitivityResult) -> Figure:
     return fig
 
 
-def next_runs(runs: NextRuns, found: SensitivityResult) -> Figure:
+def draw_next_runs(runs: NextRuns, found: SensitivityResult) -> Figure:
     """Remaining share of each input's sd after each proposed run."""
     left = runs.sd[-1]
     moving = [k for k in np.argsort(left, kind="stable") if left[k] < 0.99][:10]
@@ -229,5 +231,5 @@ def next_runs(runs: NextRuns, found: SensitivityResult) -> Figure:
     )
     ax.grid(axis="y", visible=False)
     if not moving:
-        corner_note(ax, "these runs give no information on these inputs")
+        add_corner_note(ax, "these runs give no information on these inputs")
     return fig

@@ -7,7 +7,7 @@ from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch, Rectangle
 
-from calibration.sizing.chart import LIMITS, Chart
+from calibration.sizing.chart import LIMITS, MarginChart
 from calibration.sizing.design import OBJECTIVES
 from sweeps.pages.figure_style import BLUE, GREEN, INK, ORANGE, PURPLE, SKY, VERMILION, legend_columns, new_figure
 from sweeps.report.size_report import SizeResult
@@ -15,7 +15,7 @@ from sweeps.report.size_report import SizeResult
 _COLOURS = dict(zip(LIMITS, (BLUE, "#555555", VERMILION, PURPLE, ORANGE, "#8c564b", SKY, GREEN), strict=True))
 
 
-def draw_nearest_limits(found: SizeResult, charts: dict[str, Chart]) -> Figure:
+def draw_nearest_limits(found: SizeResult, charts: dict[str, MarginChart]) -> Figure:
     """One panel per robot. The colour shows which limit is nearest, the line where it is reached."""
     fig, axes = new_figure(1, len(charts), 4.6, sharex=True, sharey=True)
     e = found.asked.envelope

@@ -14,7 +14,7 @@ from matplotlib.ticker import MaxNLocator
 from calibration.data import Columns, Json
 from mmrjax.model.channels import Channel
 from sweeps.pages import words
-from sweeps.pages.figure_style import FAINT, INK, axis_label, colour_bar, corner_note, new_figure
+from sweeps.pages.figure_style import FAINT, INK, add_corner_note, axis_label, colour_bar, new_figure
 from sweeps.report.run_tables import UNITS, imposed_column, reading_text
 
 _PANELS = 3  # voltages drawn of a configuration
@@ -60,7 +60,7 @@ def draw_sweep(runs: Columns, channel: Channel) -> Figure:
     kinds = list(dict.fromkeys(map(str, runs["configuration"])))
     volts = panels_by_imposed(runs[imposed_column(runs)], imposed_column(runs))
     if not (on_ground(runs) and np.unique(runs["slope_deg"]).size > 1 and np.unique(runs["payload_kg"]).size > 1):
-        return _lines(runs, channel, kinds)
+        return _draw_lines(runs, channel, kinds)
     readings = runs[channel.column][runs_with_number(runs, channel)]
     low, high = (float(readings.min()), float(readings.max())) if readings.size else (0.0, 1.0)
     norm = colors.Normalize(low, high if high > low else low + 1.0)
@@ -69,7 +69,7 @@ def draw_sweep(runs: Columns, channel: Channel) -> Figure:
     fig, grid = new_figure(len(kinds), len(volts), max(2.0, tall) * len(kinds) + 0.5)
     for row, kind in zip(grid, kinds, strict=True):
         for axes, (volt, mask) in zip(row, volts, strict=True):
-            _map(axes, runs, np.nonzero((runs["configuration"] == kind) & mask)[0], channel, norm)
+            _draw_map(axes, runs, np.nonzero((runs["configuration"] == kind) & mask)[0], channel, norm)
             axes.set_title(f"{kind}, {volt}")
             axes.set(xlabel="slope [°]", ylabel="payload [kg]")
     from matplotlib.cm import ScalarMappable
@@ -79,15 +79,15 @@ def draw_sweep(runs: Columns, channel: Channel) -> Figure:
     return fig
 
 
-def _map(axes: Axes, runs: Columns, index: np.ndarray, channel: Channel, norm: Any) -> None:
+def _draw_map(axes: Axes, runs: Columns, index: np.ndarray, channel: Channel, norm: Any) -> None:
     axes.grid(False)
     if not index.size:
-        corner_note(axes, "no runs")
+        add_corner_note(axes, "no runs")
         return
     slopes, at_slope = np.unique(runs["slope_deg"][index], return_inverse=True)
     payloads, at_payload = np.unique(runs["payload_kg"][index], return_inverse=True)
     if slopes.size * payloads.size > 4 * index.size:  # scattered, no grid
-        _scatter(axes, runs, index, channel, norm)
+        _draw_scatter(axes, runs, index, channel, norm)
         return
     cell, has_number = at_payload * slopes.size + at_slope, runs_with_number(runs, channel)[index]
     image = np.full((payloads.size, slopes.size), np.nan)
@@ -104,11 +104,11 @@ def _map(axes: Axes, runs: Columns, index: np.ndarray, channel: Channel, norm: A
             shade = colormaps["viridis"](norm(image[j, i]))
             ink = "white" if 0.299 * shade[0] + 0.587 * shade[1] + 0.114 * shade[2] < 0.52 else INK
             axes.text(i, j, reading_text(image[j, i], channel), color=ink, fontsize=7.5, **_INSIDE)
-    for i, j, wide, tall in _blocks(set(missing), joined=not labelled):
+    for i, j, wide, tall in _cover_cells(set(missing), joined=not labelled):
         axes.add_patch(Rectangle((i - 0.5, j - 0.5), wide, tall, fc="#f4f4f4", ec="#b5b5b5", hatch="////", lw=0.4))
-    _say_missing(axes, missing, labelled)
-    _ticks(axes.set_xticks, slopes)
-    _ticks(axes.set_yticks, payloads)
+    _name_missing_cells(axes, missing, labelled)
+    _set_ticks(axes.set_xticks, slopes)
+    _set_ticks(axes.set_yticks, payloads)
 
 
 def _medians(cell: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -119,7 +119,7 @@ def _medians(cell: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarr
     return cells, 0.5 * (ranked[begin + (count - 1) // 2] + ranked[begin + count // 2])
 
 
-def _blocks(cells: set[tuple[int, int]], joined: bool) -> list[tuple[int, int, int, int]]:
+def _cover_cells(cells: set[tuple[int, int]], joined: bool) -> list[tuple[int, int, int, int]]:
     """Rectangles (i, j, width, height) that cover the cells. Joined where they touch, or one a cell."""
     if not joined:
         return [(i, j, 1, 1) for i, j in sorted(cells)]
@@ -138,7 +138,7 @@ def _blocks(cells: set[tuple[int, int]], joined: bool) -> list[tuple[int, int, i
     return blocks
 
 
-def _say_missing(axes: Axes, missing: dict[tuple[int, int], str], each: bool) -> None:
+def _name_missing_cells(axes: Axes, missing: dict[tuple[int, int], str], each: bool) -> None:
     box = {"fc": "white", "ec": "none", "pad": 0.6, "alpha": 0.85}
     if each:
         for (i, j), status in missing.items():
@@ -152,7 +152,7 @@ def _say_missing(axes: Axes, missing: dict[tuple[int, int], str], each: bool) ->
         axes.text(i, j, words.short_status(str(status)), ha=side, va="center", fontsize=8.5, bbox=box)
 
 
-def _ticks(setter: Any, levels: np.ndarray) -> None:
+def _set_ticks(setter: Any, levels: np.ndarray) -> None:
     """Every level, or round numbers between the first and the last where there are many."""
     if levels.size <= 8:
         setter(range(levels.size), [f"{v:.3g}" for v in levels])
@@ -163,7 +163,7 @@ def _ticks(setter: Any, levels: np.ndarray) -> None:
     setter(np.interp(values, levels, np.arange(levels.size)), [f"{v:g}" for v in values])
 
 
-def _scatter(axes: Axes, runs: Columns, index: np.ndarray, channel: Channel, norm: Any) -> None:
+def _draw_scatter(axes: Axes, runs: Columns, index: np.ndarray, channel: Channel, norm: Any) -> None:
     values = runs[channel.column][index]
     settles = runs_with_number(runs, channel)[index]
     x, y = runs["slope_deg"][index], runs["payload_kg"][index]
@@ -175,7 +175,7 @@ def _scatter(axes: Axes, runs: Columns, index: np.ndarray, channel: Channel, nor
         axes.legend(loc="upper right", fontsize=7.5, frameon=True, markerscale=1.5)
 
 
-def _lines(runs: Columns, channel: Channel, kinds: list[str]) -> Figure:
+def _draw_lines(runs: Columns, channel: Channel, kinds: list[str]) -> Figure:
     column, settles = channel.column, runs_with_number(runs, channel)
     over = own_column = imposed_column(runs)
     if on_ground(runs):

@@ -21,7 +21,7 @@ ARC = 20.0
 BEND = 0.05
 
 
-def _outline(axes: Axes, robot: Robot, row: Json, x: float, y: float, yaw: float, color: str) -> None:
+def _draw_outline(axes: Axes, robot: Robot, row: Json, x: float, y: float, yaw: float, color: str) -> None:
     """The robot from above: its contact lines, a bar between them and an arrow pointing ahead."""
     length = float(robot.running_gear.wheelbase)
     width = float(robot.configurations[str(row["configuration"])].turning.width)
@@ -34,7 +34,7 @@ def _outline(axes: Axes, robot: Robot, row: Json, x: float, y: float, yaw: float
     axes.annotate("", (-tip[1], tip[0]), (-y, x), arrowprops={"arrowstyle": "-|>", "color": color})
 
 
-def _plan(axes: Axes) -> None:
+def _set_plan_axes(axes: Axes) -> None:
     axes.set_aspect("equal", adjustable="datalim")
     axes.set_xlabel("to the right of the start [m]", color=INK)
     axes.set_ylabel("uphill of the start, or ahead of it [m]", color=INK)
@@ -64,8 +64,8 @@ def draw_turn_circle(robot: Robot, row: Json) -> Figure:
     else:
         x, y = velocity[0] * times, velocity[1] * times
     axes.plot(-y, x, color=BLUE)
-    _outline(axes, robot, row, 0.0, 0.0, 0.0, INK)
-    _plan(axes)
+    _draw_outline(axes, robot, row, 0.0, 0.0, 0.0, INK)
+    _set_plan_axes(axes)
     return fig
 
 
@@ -97,8 +97,8 @@ def draw_path(robot: Robot, row: Json, x: np.ndarray, y: np.ndarray, yaw: np.nda
     ahead, aside = path_arcs(x, y, yaw)
     axes.plot(-aside, ahead, color=BLUE)
     for k, color in ((0, FAINT), (len(x) // 2, FAINT), (len(x) - 1, INK)):
-        _outline(axes, robot, row, x[k], y[k], yaw[k], color)
-    _plan(axes)
+        _draw_outline(axes, robot, row, x[k], y[k], yaw[k], color)
+    _set_plan_axes(axes)
     return fig
 
 
@@ -126,7 +126,7 @@ def draw_turn_course(history: History) -> Figure:
     return fig
 
 
-def over_yaw_rate(turns: Columns, row: Json) -> Figure:
+def draw_yaw_rates(turns: Columns, row: Json) -> Figure:
     """Currents of both sides and power over the yaw rate of settled turns. The requested turn is marked."""
     fig, grid = new_figure(1, 2, 3.4)
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 
-class Status(NamedTuple):
+class StatusWords(NamedTuple):
     """Words for the end of a run: `short` in figures, `why` in one line, `meaning` for the reader of a report."""
 
     short: str
@@ -16,42 +16,46 @@ class Status(NamedTuple):
 
 #: Phrases for a status that means something else in one model, by both names.
 VERDICTS = {("climb", "converged"): "came to a verdict"}
-STATUSES: dict[str, Status] = {
-    "converged": Status("settled", "steady travel", "found a steady operating point"),
-    "stalled": Status(
+STATUSES: dict[str, StatusWords] = {
+    "converged": StatusWords("settled", "steady travel", "found a steady operating point"),
+    "stalled": StatusWords(
         "stands",
         "held by friction, or the motors cannot turn the load",
         "the robot does not move: static friction holds it, or the motors cannot turn the load and draw "
         "their stall current",
     ),
-    "slides": Status(
+    "slides": StatusWords(
         "slides",
         "traction demand above the adhesion limit",
         "slope and rolling resistance demand more traction than adhesion gives (demand above μ_s N), so the "
         "movers "
         "spin and the robot does not climb",
     ),
-    "not_settled": Status(
+    "not_settled": StatusWords(
         "not settled",
         "still accelerating at the end of the run (try a longer --duration), or a turn without a steady state "
         "(use --model drive to simulate it over time)",
         "still accelerating at the end of the simulated time, or a turn for which no steady state was found, "
         "for example because friction falls with sliding speed",
     ),
-    "battery_empty": Status("battery empty", "the battery is empty", "the battery's capacity is used up"),
-    "failed": Status("failed", "the solver gave up", "the solver found no solution; please report the conditions"),
-    "tips": Status(
+    "battery_empty": StatusWords("battery empty", "the battery is empty", "the battery's capacity is used up"),
+    "failed": StatusWords(
+        "failed", "the solver gave up", "the solver found no solution; please report the conditions"
+    ),
+    "tips": StatusWords(
         "tips over",
         "the robot turns over: its line of gravity passes outside the contacts, or its own motion throws it over",
         "the robot turns over: its line of gravity passes outside the contacts, or its own motion throws it over",
     ),
-    "reverses": Status("reverses", "steady travel backward", "found a steady operating point, travelling backward"),
-    "rolls_back": Status(
+    "reverses": StatusWords(
+        "reverses", "steady travel backward", "found a steady operating point, travelling backward"
+    ),
+    "rolls_back": StatusWords(
         "rolls back",
         "gravity drives the robot, against its motors or with no voltage",
         "gravity drives the robot, against its motors or with no voltage: it travels downhill steadily",
     ),
-    "cut_off": Status(
+    "cut_off": StatusWords(
         "cut off",
         "a cell is below its cut-off voltage, so the battery switches off",
         "the cells stayed below their cut-off voltage for longer than permitted, with charge left",
@@ -233,7 +237,7 @@ def status_meaning(status: str) -> str:
 _PAPERS_NAMES = {"nominal": "nominal (PM)", "sm1": "SM-1", "sm2": "SM-2"}
 
 
-def words_shown(name: str) -> str:
+def displayed_robot_name(name: str) -> str:
     """A robot's name as a page shows it."""
     return _PAPERS_NAMES.get(name, name)
 

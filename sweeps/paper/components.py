@@ -16,11 +16,11 @@ from sweeps.pages.figure_style import (
     ORANGE,
     PURPLE,
     VERMILION,
-    corner_note,
-    label_end,
+    add_corner_note,
+    label_line_end,
     new_figure,
 )
-from sweeps.pages.words import words_shown
+from sweeps.pages.words import displayed_robot_name
 from sweeps.paper import data
 
 CONFIGURATION = {TRACKED: BLUE, WHEELED: VERMILION}
@@ -32,7 +32,7 @@ SHEET_NO_LOAD = (8810.0, 0.165)
 _GEAR_SPEEDS = {"15 V": 5000.0, "33 V": 11_500.0}  # motor speeds of the measured rows, about
 
 
-def gearbox_efficiency(robots: dict[str, Robot], rows: data.Rows | None) -> Figure:
+def draw_gearbox_efficiency(robots: dict[str, Robot], rows: data.PaperRows | None) -> Figure:
     """Fig. 5a: efficiency over output torque. The first robot at two speeds, the others where they differ."""
     fig, grid = new_figure(1, 1, 3.9)
     axes = grid[0, 0]
@@ -45,7 +45,7 @@ def gearbox_efficiency(robots: dict[str, Robot], rows: data.Rows | None) -> Figu
         torque, efficiency = data.gear_efficiency(robot, speed, inputs)
         axes.plot(torque, efficiency, line, color=colour)
         place = int(np.searchsorted(torque, 0.18 * top))
-        words = f"{words_shown(name)}, {speed:,.0f} rpm (about {volts})"
+        words = f"{displayed_robot_name(name)}, {speed:,.0f} rpm (about {volts})"
         offset = (-4, 6) if volts == "15 V" else (8, -14)
         ha = "right" if volts == "15 V" else "left"
         if volts == "15 V":
@@ -92,7 +92,7 @@ def gearbox_efficiency(robots: dict[str, Robot], rows: data.Rows | None) -> Figu
     return fig
 
 
-def _gear_torque(robot: Robot, rows: data.Rows) -> np.ndarray:
+def _gear_torque(robot: Robot, rows: data.PaperRows) -> np.ndarray:
     table = rows.raised
     wheels = table["theoretical_speed_mm_s"] * data.MM
     radius = np.array([float(robot.configurations[str(c)].radius) for c in _kind(rows)])
@@ -100,16 +100,16 @@ def _gear_torque(robot: Robot, rows: data.Rows) -> np.ndarray:
         return table["power_gear_W"] / robot.sides / (wheels / radius)
 
 
-def _kind(rows: data.Rows) -> np.ndarray:
+def _kind(rows: data.PaperRows) -> np.ndarray:
     return rows.conditions["configuration"]
 
 
-def _largest_gear_torque(robot: Robot, rows: data.Rows) -> float:
+def _largest_gear_torque(robot: Robot, rows: data.PaperRows) -> float:
     torque = _gear_torque(robot, rows)
     return float(np.nanmax(torque)) if np.isfinite(torque).any() else 2.0
 
 
-def _mark_rows(axes: Axes, robot: Robot, rows: data.Rows) -> None:
+def _mark_rows(axes: Axes, robot: Robot, rows: data.PaperRows) -> None:
     torque = _gear_torque(robot, rows)
     with np.errstate(divide="ignore", invalid="ignore"):
         efficiency = rows.raised["power_gear_W"] / rows.raised["power_motor_W"]
@@ -140,7 +140,7 @@ def draw_battery(robots: dict[str, Robot]) -> Figure:
         voltage = data.cell_voltage(robot, current, share * capacity)
         left.plot(current, voltage, line, color=colour)
         words = {0.0: "full", 0.5: "half discharged", 1.0: "at capacity"}[share]
-        label_end(left, current, voltage, words, colour)
+        label_line_end(left, current, voltage, words, colour)
     constant = [m for m in ("sm1", "sm2") if m in robots]
     if constant:
         flat = data.cell_voltage(robots[constant[0]], current, 0.0)
@@ -176,7 +176,7 @@ def draw_battery(robots: dict[str, Robot]) -> Figure:
     return fig
 
 
-def motor_friction(robots: dict[str, Robot]) -> Figure:
+def draw_motor_friction(robots: dict[str, Robot]) -> Figure:
     """Fig. 11: motor friction torque over speed, with the maker's no-load point."""
     fig, grid = new_figure(1, 1, 3.4)
     axes = grid[0, 0]
@@ -189,8 +189,8 @@ def motor_friction(robots: dict[str, Robot]) -> Figure:
         drawn_curves.add(torque.tobytes())
         colour = MODEL.get(name, PURPLE)
         axes.plot(speed, torque, color=colour)
-        words = "SM-1, SM-2 (constant)" if name in ("sm1", "sm2") else words_shown(name)
-        label_end(axes, speed, torque, words, colour)
+        words = "SM-1, SM-2 (constant)" if name in ("sm1", "sm2") else displayed_robot_name(name)
+        label_line_end(axes, speed, torque, words, colour)
     first = next(iter(robots.values()))
     rpm, current = SHEET_NO_LOAD
     sheet = 1e3 * current * float(first.motor.torque_constant)
@@ -210,7 +210,7 @@ def motor_friction(robots: dict[str, Robot]) -> Figure:
     return fig
 
 
-def idle_track(robots: dict[str, Robot]) -> Figure:
+def draw_idle_track(robots: dict[str, Robot]) -> Figure:
     """Fig. 18: current of one motor that turns a lifted side, over pulley speed, and R² of a line through it."""
     fig, grid = new_figure(1, 1, 3.6)
     axes = grid[0, 0]
@@ -224,13 +224,13 @@ def idle_track(robots: dict[str, Robot]) -> Figure:
         colour = CONFIGURATION.get(kind, PURPLE)
         axes.plot(speed[::4], current[::4], "o", color=colour, ms=4)
         axes.plot(speed, line, color=colour)
-        label_end(axes, speed, line, f"{words}\nline: R² = {certainty:.4f}", colour)
+        label_line_end(axes, speed, line, f"{words}\nline: R² = {certainty:.4f}", colour)
         for other in ("sm1", "sm2"):
             if other in robots and other != name and kind == TRACKED:
                 flat = data.idle_current(robots[other], kind, speed)
                 axes.plot(speed, flat, color=MODEL[other], lw=1.4)
-                label_end(axes, speed, flat, f"{words_shown(other)}, three tracks", MODEL[other])
+                label_line_end(axes, speed, flat, f"{displayed_robot_name(other)}, three tracks", MODEL[other])
     axes.set(xlabel="pulley speed [rad/s]", ylabel="current of one motor [A]", xlim=(0, 26))
     axes.set_ylim(bottom=0)
-    corner_note(axes, f"dots: {words_shown(name)}; lines: straight fits")
+    add_corner_note(axes, f"dots: {displayed_robot_name(name)}; lines: straight fits")
     return fig

@@ -18,7 +18,7 @@ from mmrjax.model.paper_tables import CONFIGURATIONS, SURFACES, TRACKED, adhesio
 from mmrjax.model.quantities import MM, RPM
 from mmrjax.model.robot import Robot
 from sweeps.pages import history_figures
-from sweeps.pages.history_figures import Start
+from sweeps.pages.history_figures import StartRun
 
 _CHUNK = 256  # one compiled shape for every question that the report asks of `steady`
 #: Surface of Table 5 that stands for "adhesion raised": the first on which all 20 measured rows climb.
@@ -78,7 +78,7 @@ def stack_channels(table: Columns) -> np.ndarray:
 
 
 @dataclasses.dataclass(frozen=True)
-class Rows:
+class PaperRows:
     """Rows of Tables A1 and A2 with a configuration of the robot, and the robot's result for each.
 
     Attributes:
@@ -103,7 +103,7 @@ class Rows:
         return np.array([self.ratio[c] for c in self.conditions["configuration"]])
 
 
-def simulate_measured_rows(robot: Robot) -> Rows | None:
+def simulate_measured_rows(robot: Robot) -> PaperRows | None:
     """Simulate the measured rows with `robot`: as it is, with adhesion raised, and with its own mass.
 
     None where the robot has none of their configurations.
@@ -131,10 +131,12 @@ def simulate_measured_rows(robot: Robot) -> Rows | None:
     adhesion = np.array([ratio[c] for c in kind])
     raised = operating_points(robot, batch_conditions(robot, total_mass=mass, adhesion=adhesion, **request))
     weighed = operating_points(robot, batch_conditions(robot, adhesion=adhesion, **request))
-    return Rows(table, stack_channels(table.columns), stack_channels(paper.columns), plain, raised, weighed, ratio)
+    return PaperRows(
+        table, stack_channels(table.columns), stack_channels(paper.columns), plain, raised, weighed, ratio
+    )
 
 
-def raised_words(robot: Robot, ratio: dict[str, float]) -> str:
+def raised_adhesion_words(robot: Robot, ratio: dict[str, float]) -> str:
     """The raised coefficients in words, with their source."""
     surface = SURFACES[RAISED_SURFACE]
     parts = []
@@ -223,7 +225,7 @@ def fit_line(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, float]:
 # --- runs ---------------------------------------------------------------------------------------------
 
 
-def simulate_starts(robot: Robot, voltage: float = 33.0, seconds: float = 1.5) -> list[Start]:
+def simulate_starts(robot: Robot, voltage: float = 33.0, seconds: float = 1.5) -> list[StartRun]:
     """From standstill on the flat with `drive`, each of the paper's configurations."""
     from mmrjax.fidelities.drive import drive_batch
 
@@ -234,7 +236,7 @@ def simulate_starts(robot: Robot, voltage: float = 33.0, seconds: float = 1.5) -
     return starts_of(robot, History(run.time, run.distance, run.signals, {}), run.result.status)
 
 
-def starts_of(robot: Robot, history: Any, status: Any) -> list[Start]:
+def starts_of(robot: Robot, history: Any, status: Any) -> list[StartRun]:
     """Runs of the paper's configurations from standstill, of any fidelity that has histories.
 
     Args:
@@ -242,9 +244,7 @@ def starts_of(robot: Robot, history: Any, status: Any) -> list[Start]:
         status: codes of how runs ended.
     """
     names = shown_configurations(robot)
-    return history_figures.members_from_standstill(
-        robot, history, status, [robot.configurations.index(c) for c in names], names
-    )
+    return history_figures.start_runs(robot, history, status, [robot.configurations.index(c) for c in names], names)
 
 
 def current_over_slope(robot: Robot, ratio: dict[str, float], slopes: np.ndarray) -> dict[tuple[str, int], Any]:
@@ -265,7 +265,7 @@ def current_over_slope(robot: Robot, ratio: dict[str, float], slopes: np.ndarray
     return {(c, mode): (current[2 * k], current[2 * k + 1]) for k, (c, mode, _) in enumerate(asked[::2])}
 
 
-def rows_of_mode(rows: Rows, kind: str, mode: int) -> np.ndarray:
+def rows_of_mode(rows: PaperRows, kind: str, mode: int) -> np.ndarray:
     """Mask of the measured rows of a configuration in a loading mode."""
     table, (voltage, payload) = rows.conditions, MODES[mode]
     return np.asarray(
@@ -273,7 +273,7 @@ def rows_of_mode(rows: Rows, kind: str, mode: int) -> np.ndarray:
     )
 
 
-def slope_certainty(rows: Rows) -> list[tuple[Any, ...]]:
+def slope_certainty(rows: PaperRows) -> list[tuple[Any, ...]]:
     """R² (A1) of the current over slope, of each configuration and loading mode with measured rows.
 
     Returns:
@@ -297,7 +297,7 @@ def slope_certainty(rows: Rows) -> list[tuple[Any, ...]]:
     return found
 
 
-def supply_errors(robot: Robot, ratio: float, rows_of: Rows, battery: bool) -> dict[int, np.ndarray]:
+def supply_errors(robot: Robot, ratio: float, rows_of: PaperRows, battery: bool) -> dict[int, np.ndarray]:
     """Errors (35) over the five slopes of 6T2A in modes 1 and 2 of Fig. 29: mode → shape (5, 3).
 
     On battery there is mode 2 alone: a full battery of 8 cells gives about the 33 V of the bench.
@@ -403,7 +403,7 @@ def energy_use(robot: Robot, ratio: dict[str, float]) -> EnergyUse:
     return EnergyUse(labels, power, points["power_supply_W"], points["status"])
 
 
-def paper_rows_table(rows: Rows) -> Columns:
+def paper_rows_table(rows: PaperRows) -> Columns:
     """The paper's rows side by side: measured, the paper's simulation, and the robot three ways."""
     conditions = rows.conditions
     columns = {key: conditions[key] for key in ("configuration", *runs.CONDITIONS)}
@@ -415,7 +415,7 @@ def paper_rows_table(rows: Rows) -> Columns:
     return columns | {"status": rows.plain["status"]}
 
 
-def bench_error_summary(rows: Rows) -> dict[str, Json]:
+def bench_error_summary(rows: PaperRows) -> dict[str, Json]:
     """Errors (35) of every channel against the bench: of the robot three ways, and of the paper's simulation."""
     ways = {
         name: channel_percent_errors(getattr(rows, name), rows.measured) for name in ("plain", "raised", "weighed")

@@ -52,7 +52,7 @@ def gear_blocks(robot: Robot) -> Iterator[Block]:
     run, names = simulate_gear_runs(robot), data.shown_configurations(robot)
     which = [robot.configurations.index(c) for c in names]
     status, share = np.asarray(run.result.status), np.asarray(run.steady.guide_share)
-    gears = gear_figures.members_with_gear(robot, run, status, share, which, names)
+    gears = gear_figures.gear_runs(robot, run, status, share, which, names)
     yield catalogue.note("paper.gear")
     if not all(gear.rolls for gear in gears):
         ended = ", ".join(f"{g.name}: {words.short_status(g.status)}" for g in gears)
@@ -75,7 +75,7 @@ def gear_blocks(robot: Robot) -> Iterator[Block]:
 # --- the report -----------------------------------------------------------------------------------
 
 
-def paper_document(file: RobotFile, gear: bool) -> tuple[Document, data.Rows | None]:
+def paper_document(file: RobotFile, gear: bool) -> tuple[Document, data.PaperRows | None]:
     """The report on a robot, next to the nominal robots.
 
     Args:
@@ -85,13 +85,13 @@ def paper_document(file: RobotFile, gear: bool) -> tuple[Document, data.Rows | N
     Returns:
         The report, and the robot's results for the paper's rows, None without one of their configurations.
     """
-    robot, name = file.robot, capabilities.shown_name(file)
-    name = file.name if name == words.words_shown(file.name) else name
+    robot, name = file.robot, capabilities.displayed_name(file)
+    name = file.name if name == words.displayed_robot_name(file.name) else name
     robots = {name: robot} | {n: make() for n, make in ROBOTS.items() if n != name}
     every = {n: data.simulate_measured_rows(member) for n, member in robots.items()}
     rows = {n: of_robot for n, of_robot in every.items() if of_robot is not None}
     own_rows = rows.get(name)
-    blocks: list[Block] = [catalogue.note("paper.lead", capabilities.shown_name(file))]
+    blocks: list[Block] = [catalogue.note("paper.lead", capabilities.displayed_name(file))]
     answer = catalogue.text("paper.alone")
     if own_rows is not None:
         errors = variant_errors(_variants(name, rows), own_rows)
@@ -102,7 +102,7 @@ def paper_document(file: RobotFile, gear: bool) -> tuple[Document, data.Rows | N
         if own_rows is not None:
             yield _against_the_bench(robots, rows, name)
         nominal = rows["nominal"]
-        raised = data.raised_words(ROBOTS["nominal"](), nominal.ratio)
+        raised = data.raised_adhesion_words(ROBOTS["nominal"](), nominal.ratio)
         row_blocks = (
             catalogue.note("paper.row-by-row", raised),
             _paper_rows_table(nominal),
@@ -128,11 +128,11 @@ def paper_document(file: RobotFile, gear: bool) -> tuple[Document, data.Rows | N
         )
         yield Section("Components", figures, "components")
 
-    title = f"The paper's figures and tables: {capabilities.shown_name(file)}"
+    title = f"The paper's figures and tables: {capabilities.displayed_name(file)}"
     return Document(title, answer, tuple(blocks), page_sections=sections), own_rows
 
 
-def variant_errors(variants: Columns, rows: data.Rows) -> list[Json]:
+def variant_errors(variants: Columns, rows: data.PaperRows) -> list[Json]:
     """Rms and worst error (35) of each variant (errors of shape (rows, channels)), all rows and by group."""
     kind = rows.conditions["configuration"]
     answer = []
@@ -173,7 +173,7 @@ def _error_table(errors: list[Json]) -> Block:
     return catalogue.table("paper.errors", rows, *heads)
 
 
-def _sliding(robot: Robot, rows: data.Rows) -> Iterator[Block]:
+def _sliding(robot: Robot, rows: data.PaperRows) -> Iterator[Block]:
     """Note on the rows that have no operating point on the robot's own adhesion, if there are any."""
     slides, table = rows.plain["status"] != "converged", rows.conditions
     each = [
@@ -182,11 +182,11 @@ def _sliding(robot: Robot, rows: data.Rows) -> Iterator[Block]:
         for k in np.flatnonzero(slides)
     ]
     if each:
-        raised = data.raised_words(robot, rows.ratio)
+        raised = data.raised_adhesion_words(robot, rows.ratio)
         yield catalogue.note("paper.sliding", len(each), len(table), ", ".join(each), raised)
 
 
-def _against_the_bench(robots: dict[str, Robot], rows: dict[str, data.Rows], name: str) -> Section:
+def _against_the_bench(robots: dict[str, Robot], rows: dict[str, data.PaperRows], name: str) -> Section:
     own_rows = rows[name]
     certainty = data.slope_certainty(own_rows)
     table = [(*row[:3], f"{row[3]:.3f} ({row[4]})", *row[5:]) for row in certainty]
@@ -207,7 +207,7 @@ def implied_resistance(robot: Robot, table: runs.Runs) -> np.ndarray:
     return robot.sides * (table["supply_voltage_V"] - back) / current
 
 
-def _paper_rows_table(rows: data.Rows) -> Block:
+def _paper_rows_table(rows: data.PaperRows) -> Block:
     """The 20 rows: bench, the paper's simulation, three variants of the nominal robot, and letters for the reasons
     of differences. Wheeled rows appear a second time with the robot's own mass.
     """
@@ -236,7 +236,7 @@ def _paper_rows_table(rows: data.Rows) -> Block:
     return catalogue.table("paper.rowtable", by_row, *heads)
 
 
-def row_reasons(nominal: Robot, rows: data.Rows) -> Iterator[list[str]]:
+def row_reasons(nominal: Robot, rows: data.PaperRows) -> Iterator[list[str]]:
     """Letters of `paper.reasons` in the catalogue, for each row of the nominal robot."""
     table = rows.conditions
     raised, weighed = (data.stack_channels(t) for t in (rows.raised, rows.weighed))
@@ -264,9 +264,9 @@ def row_reasons(nominal: Robot, rows: data.Rows) -> Iterator[list[str]]:
         yield [letter for letter, does in holds.items() if does]
 
 
-def _variants(name: str, rows: dict[str, data.Rows]) -> Columns:
+def _variants(name: str, rows: dict[str, data.PaperRows]) -> Columns:
     """Errors of the rows under the names that the table of errors shows."""
-    own_rows, shown = rows[name], words.words_shown(name)
+    own_rows, shown = rows[name], words.displayed_robot_name(name)
     error = data.channel_percent_errors
     answer = {
         f"{shown}: own adhesion, mass as printed": error(own_rows.plain, own_rows.measured),

@@ -20,21 +20,21 @@ from sweeps.pages.figure_style import (
     PURPLE,
     SKY,
     VERMILION,
+    add_corner_note,
     axis_label,
-    corner_note,
-    label_end,
+    label_line_end,
     legend_columns,
     new_figure,
     outer_legend,
 )
-from sweeps.pages.words import words_shown
+from sweeps.pages.words import displayed_robot_name
 from sweeps.paper import data
 from sweeps.paper.components import CONFIGURATION, MODEL
 
 _MODES = {1: (BLUE, "o"), 2: (SKY, "v"), 3: (GREEN, "^"), 4: (VERMILION, "s")}
 
 
-def current_over_slope(robot: Robot, rows: data.Rows, certainty: Sequence[Sequence[Any]]) -> Figure:
+def current_over_slope(robot: Robot, rows: data.PaperRows, certainty: Sequence[Sequence[Any]]) -> Figure:
     """Fig. 28: total current over slope in four loading modes, with the measured points and R² (A1).
 
     Args:
@@ -52,7 +52,7 @@ def current_over_slope(robot: Robot, rows: data.Rows, certainty: Sequence[Sequen
             stop = np.nonzero(np.isfinite(own))[0]
             if stop.size and stop[-1] < len(slopes) - 1:
                 axes.plot(slopes[stop[-1]], own[stop[-1]], "x", color=colour, ms=7, mew=2)
-            label_end(axes, slopes, raised, f"{mode}", colour, fontweight="bold", offset=(5 + 9 * (mode % 2), 0))
+            label_line_end(axes, slopes, raised, f"{mode}", colour, fontweight="bold", offset=(5 + 9 * (mode % 2), 0))
             pick = data.rows_of_mode(rows, kind, mode)
             if pick.any():
                 table = rows.conditions["slope_deg"][pick]
@@ -64,7 +64,7 @@ def current_over_slope(robot: Robot, rows: data.Rows, certainty: Sequence[Sequen
             for name, mode, straight, *_, weighed in certainty
             if name == kind
         ]
-        corner_note(axes, "markers: measured\n" + "\n".join(texts), fontsize=8.5)
+        add_corner_note(axes, "markers: measured\n" + "\n".join(texts), fontsize=8.5)
     grid[0, 0].set_ylim(0, 1.2 * grid[0, 0].dataLim.y1 if np.isfinite(grid[0, 0].dataLim.y1) else 1.0)
     grid[0, 0].set_ylabel("total current [A]")
     modes = "     ".join(f"{m}: {u:g} V, {p:g} kg" for m, (u, p) in data.MODES.items())
@@ -75,7 +75,7 @@ def current_over_slope(robot: Robot, rows: data.Rows, certainty: Sequence[Sequen
     return fig
 
 
-def model_errors(robots: dict[str, Robot], rows: dict[str, data.Rows]) -> Figure:
+def model_errors(robots: dict[str, Robot], rows: dict[str, data.PaperRows]) -> Figure:
     """Fig. 29: errors (35) in current and speed over slope, 6T2A, modes 1 and 2, adhesion raised."""
     fig, grid = new_figure(2, 2, 6.2, sharex=True)
     slopes = np.array([0.0, 5.0, 10.0, 15.0, 20.0])
@@ -91,7 +91,9 @@ def model_errors(robots: dict[str, Robot], rows: dict[str, data.Rows]) -> Figure
                     axes.plot(slopes, error[:, channel], ":" if battery else "-", color=colour, marker="o", ms=4)
     from matplotlib.lines import Line2D
 
-    handles = [Line2D([], [], color=MODEL.get(n, PURPLE), marker="o", ms=4, label=words_shown(n)) for n in robots]
+    handles = [
+        Line2D([], [], color=MODEL.get(n, PURPLE), marker="o", ms=4, label=displayed_robot_name(n)) for n in robots
+    ]
     handles.append(Line2D([], [], color=INK, ls=":", marker="o", ms=4, label="on a full battery (mode 2)"))
     paper = simulation_errors.relative_error(next(iter(rows.values())).paper, next(iter(rows.values())).measured)
     table = next(iter(rows.values())).conditions
@@ -113,7 +115,7 @@ def model_errors(robots: dict[str, Robot], rows: dict[str, data.Rows]) -> Figure
         grid[row, 0].set_ylabel(label)
     grid[0, 0].set_title("mode 1: 15 V, 0 kg")
     grid[0, 1].set_title("mode 2: 33 V, 8 kg")
-    corner_note(
+    add_corner_note(
         grid[0, 0], "shaded: ±7 %, the paper's claim", x=0.02, y=0.04, va="bottom", fontsize=8, color="#447744"
     )
     for axes in grid[1]:
@@ -173,7 +175,7 @@ def draw_energy(used: data.EnergyUse) -> Figure:
     return fig
 
 
-def row_parity(rows: data.Rows, name: str) -> Figure:
+def row_parity(rows: data.PaperRows, name: str) -> Figure:
     """Simulated over measured for the rows, every channel, adhesion raised, both masses for 4W2T."""
     channels_shown = data.channels_of_paper()
     fig, grid = new_figure(1, len(channels_shown), 3.7)
@@ -215,6 +217,6 @@ def row_parity(rows: data.Rows, name: str) -> Figure:
         axes.set_xlim(*span)
         axes.set_ylim(*span)
         axes.locator_params(nbins=5)
-    corner_note(grid[0, 0], f"{words_shown(name)}; band ±5 %", fontsize=8.5)
+    add_corner_note(grid[0, 0], f"{displayed_robot_name(name)}; band ±5 %", fontsize=8.5)
     outer_legend(grid[0, 0], "lower center")
     return fig

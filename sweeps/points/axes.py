@@ -14,7 +14,7 @@ from jaxtyping import Float
 from calibration.data import Json, Names
 from calibration.data.columns import IMPOSED as OF_IMPOSED
 from calibration.data.columns import LEVERS
-from calibration.data.contradictions import without_levers
+from calibration.data.contradictions import reason_without_levers
 from calibration.data.input_errors import BadConfiguration, allowed_words, stated_count, stated_number, stated_word
 from mmrjax.fidelities import variation
 from mmrjax.fidelities.variation import Axis
@@ -25,7 +25,7 @@ from mmrjax.model.robot import Robot
 from sweeps.config_campaign import Campaign
 from sweeps.options import parse_axis
 from sweeps.points import imposed
-from sweeps.points.sampled_design import DESIGNS, ROW, Design, Drawn, Joint, Samples, in_blocks
+from sweeps.points.sampled_design import DESIGNS, ROW, Design, DrawnSamples, JointDistribution, Samples, in_blocks
 from sweeps.points.tasks import task_of
 
 CONFIGURATION, SURFACE = "configuration", "surface"
@@ -41,7 +41,7 @@ Quantile = Callable[[np.ndarray], np.ndarray]
 
 
 @dataclasses.dataclass(frozen=True)
-class Plan:
+class SweepPlan:
     """Points of a sweep and their constant conditions.
 
     Attributes:
@@ -62,9 +62,9 @@ class Plan:
     rows: Conditions | None = None
 
     @staticmethod
-    def of_rows(rows: Conditions, samples: Drawn | None = None) -> Plan:
+    def of_rows(rows: Conditions, samples: DrawnSamples | None = None) -> SweepPlan:
         """The runs of a table, of shape (runs,), each combined with every sample."""
-        return Plan(Design({ROW: np.arange(rows.shape[0], dtype=float)}, samples), {}, {}, rows=rows)
+        return SweepPlan(Design({ROW: np.arange(rows.shape[0], dtype=float)}, samples), {}, {}, rows=rows)
 
     def varied(self, robot: Robot) -> variation.Variation:
         """The robot and the varied parameters and conditions, without the axes that belong to a task."""
@@ -79,7 +79,7 @@ class Plan:
         return Conditions(which, **{k: v for k, v in self.conditions.items() if k != CONFIGURATION})
 
 
-def plan_design(config: Campaign, robot: Robot, where: str) -> Plan:
+def plan_design(config: Campaign, robot: Robot, where: str) -> SweepPlan:
     """The design of a configuration, checked.
 
     Args:
@@ -92,12 +92,15 @@ def plan_design(config: Campaign, robot: Robot, where: str) -> Plan:
     data: list[str] = []
     task = task_of(config, robot)
     extra = task.axes
-    axes = {name: _axis(name, stated, robot, f"{where}, axes.{name}", extra) for name, stated in config.axes.items()}
-    samples = _samples(config.samples, robot, f"{where}, samples", data)
+    axes = {
+        name: _axis_values(name, stated, robot, f"{where}, axes.{name}", extra)
+        for name, stated in config.axes.items()
+    }
+    samples = _sampled_design(config.samples, robot, f"{where}, samples", data)
     if not axes and samples is None:
         raise BadConfiguration(f"{where}: no [axes] or [samples]; specify at least one quantity to vary")
     design = Design(axes, samples)
-    fixed, surface = _fixed(config.conditions, robot, f"{where}, conditions")
+    fixed, surface = _fixed_conditions(config.conditions, robot, f"{where}, conditions")
     fixed |= task.further({**{name: np.array([value]) for name, value in fixed.items()}, **axes}, robot, where)
     for k, name in enumerate(design.names):
         if name in fixed or name in design.names[:k]:
@@ -113,7 +116,7 @@ def plan_design(config: Campaign, robot: Robot, where: str) -> Plan:
     imposed.check_turning(robot, {*fixed, *design.names}, simulated, where)
     if levers := sorted({*fixed, *design.names} & {*LEVERS}):
         for name in simulated:
-            if why := without_levers(robot, name):
+            if why := reason_without_levers(robot, name):
                 raise BadConfiguration(f"{where}, {levers[0]}: {why}")
     own_axis = AXIS[robot.rig.imposed]
     if not robot.rig.inherits and own_axis not in {*fixed, *design.names} and fixed.get("battery", 0.0) <= 0.5:
@@ -125,7 +128,7 @@ def plan_design(config: Campaign, robot: Robot, where: str) -> Plan:
         )
     if design.points > MOST:
         raise BadConfiguration(f"{where}: got {design.points:.3g} points; expected at most {MOST:.3g}")
-    plan = Plan(design, dict(extra), fixed, surface, tuple(data))
+    plan = SweepPlan(design, dict(extra), fixed, surface, tuple(data))
     varied = {**extra, **plan.varied(robot).axes}
     return dataclasses.replace(plan, axes={name: varied[name] for name in design.names})
 
@@ -157,7 +160,7 @@ def adhesion_ratios(robot: Robot, surface: str) -> tuple[float, ...]:
     return tuple(adhesion_ratio(surface, float(c.on_tracks) > 0.5) for c in robot.configurations.members)
 
 
-def _known(name: str, robot: Robot, where: str) -> Axis:
+def _known_axis(name: str, robot: Robot, where: str) -> Axis:
     names = variation.variable_names(robot)
     if name not in names:
         raise BadConfiguration(
@@ -171,7 +174,7 @@ def _axis_value(name: str, value: Any, where: str) -> float:
     return float(value) if name == "battery" and isinstance(value, bool) else stated_number(value, where)
 
 
-def _within(values: Float[np.ndarray, " n"], axis: Axis, where: str) -> None:
+def _check_within(values: Float[np.ndarray, " n"], axis: Axis, where: str) -> None:
     low, high = axis.bounds
     for value in values:
         if not low <= value <= high:
@@ -191,15 +194,15 @@ def _configuration(name: Any, robot: Robot, where: str) -> float:
 # --- grids ------------------------------------------------------------------------------------------------------
 
 
-def _axis(name: str, stated: Any, robot: Robot, where: str, extra: Mapping[str, Axis]) -> np.ndarray:
-    axis = extra[name] if name in extra else _known(name, robot, where)
+def _axis_values(name: str, stated: Any, robot: Robot, where: str, extra: Mapping[str, Axis]) -> np.ndarray:
+    axis = extra[name] if name in extra else _known_axis(name, robot, where)
     if name == CONFIGURATION:
         names = (
             list(robot.configurations.names) if stated == "all" else stated if isinstance(stated, list) else [stated]
         )
         values = np.array([_configuration(n, robot, where) for n in names])
     elif isinstance(stated, dict):
-        values = _range(stated, where)
+        values = _range_values(stated, where)
     elif isinstance(stated, str):
         values = np.array(parse_axis(where, stated))
     else:
@@ -210,15 +213,15 @@ def _axis(name: str, stated: Any, robot: Robot, where: str, extra: Mapping[str, 
         raise BadConfiguration(f"{where}: got {len(values)} values; expected at most {LONGEST} (except in [samples])")
     if len(np.unique(values)) < len(values):
         raise BadConfiguration(f"{where}: got a value twice; expected different values")
-    _within(values, axis, where)
+    _check_within(values, axis, where)
     return values
 
 
 _RANGE = ("start", "stop", "number", "scale")
 
 
-def _range(stated: Json, where: str) -> np.ndarray:
-    _keys(stated, _RANGE, ("start", "stop", "number"), where)
+def _range_values(stated: Json, where: str) -> np.ndarray:
+    _check_keys(stated, _RANGE, ("start", "stop", "number"), where)
     start, stop = (stated_number(stated[k], f"{where}.{k}") for k in ("start", "stop"))
     number = stated_count(stated["number"], f"{where}.number", 1, LONGEST)
     scale = stated.get("scale", "linear")
@@ -234,7 +237,7 @@ def _range(stated: Json, where: str) -> np.ndarray:
     return np.linspace(start, stop, number) if scale == "linear" else np.geomspace(start, stop, number)
 
 
-def _keys(stated: Json, allowed: Names, needed: Names, where: str) -> None:
+def _check_keys(stated: Json, allowed: Names, needed: Names, where: str) -> None:
     for key in stated:
         stated_word(key, allowed, f"{where}.{key}", "no such key")
     for key in needed:
@@ -245,7 +248,7 @@ def _keys(stated: Json, allowed: Names, needed: Names, where: str) -> None:
 # --- fixed conditions -------------------------------------------------------------------------------------------
 
 
-def _fixed(stated: Json, robot: Robot, where: str) -> tuple[dict[str, float], str | None]:
+def _fixed_conditions(stated: Json, robot: Robot, where: str) -> tuple[dict[str, float], str | None]:
     allowed = (*variation.CONDITIONS, SURFACE)
     fixed: dict[str, float] = {}
     surface = None
@@ -260,7 +263,7 @@ def _fixed(stated: Json, robot: Robot, where: str) -> tuple[dict[str, float], st
             fixed[name] = _configuration(value, robot, place)
         else:
             fixed[name] = _axis_value(name, value, place)
-            _within(np.array([fixed[name]]), _known(name, robot, place), place)
+            _check_within(np.array([fixed[name]]), _known_axis(name, robot, place), place)
     return fixed, surface
 
 
@@ -269,10 +272,10 @@ def _fixed(stated: Json, robot: Robot, where: str) -> tuple[dict[str, float], st
 _SAMPLES = ("design", "number", "seed", "over", "posterior")
 
 
-def _samples(stated: Json, robot: Robot, where: str, data: list[str]) -> Samples | None:
+def _sampled_design(stated: Json, robot: Robot, where: str, data: list[str]) -> Samples | None:
     if not stated:
         return None
-    _keys(stated, _SAMPLES, ("design", "number"), where)
+    _check_keys(stated, _SAMPLES, ("design", "number"), where)
     design = stated["design"]
     if not isinstance(design, str) or design not in DESIGNS:
         raise BadConfiguration(f"{where}.design: got {design!r}; {allowed_words(str(design), DESIGNS)}")
@@ -294,7 +297,7 @@ def _samples(stated: Json, robot: Robot, where: str, data: list[str]) -> Samples
     return Samples(design, number, seed, marginals, joint)
 
 
-def _posterior(stated: Any, robot: Robot, where: str, data: list[str]) -> Joint:
+def _posterior(stated: Any, robot: Robot, where: str, data: list[str]) -> JointDistribution:
     from calibration.data import posterior_file
 
     if not isinstance(stated, str):
@@ -320,7 +323,7 @@ DISTRIBUTIONS: dict[str, Names] = {
 
 def _quantile(name: str, stated: Any, robot: Robot, where: str) -> Quantile:
     """The quantile function of a distribution, cut off at the bounds of what is sampled."""
-    axis = _known(name, robot, where)
+    axis = _known_axis(name, robot, where)
     if name == CONFIGURATION:
         raise BadConfiguration(f"{where}: cannot be sampled; put it under axes or conditions")
     table = {"distribution": stated} if isinstance(stated, str) else stated
@@ -328,7 +331,7 @@ def _quantile(name: str, stated: Any, robot: Robot, where: str) -> Quantile:
     if not isinstance(kind, str) or kind not in DISTRIBUTIONS:
         raise BadConfiguration(f"{where}.distribution: got {kind!r}; {allowed_words(str(kind), DISTRIBUTIONS)}")
     needed = DISTRIBUTIONS[kind]
-    _keys(table, ("distribution", *needed), needed, where)
+    _check_keys(table, ("distribution", *needed), needed, where)
     numbers = {key: stated_number(table[key], f"{where}.{key}") for key in needed}
     ordered = [numbers[key] for key in ("low", "mode", "high") if key in numbers]
     if ordered != sorted(ordered) or (ordered and ordered[0] == ordered[-1]):
@@ -337,13 +340,13 @@ def _quantile(name: str, stated: Any, robot: Robot, where: str) -> Quantile:
     for key in ("sd", "sd_log"):
         if numbers.get(key, 1.0) <= 0:
             raise BadConfiguration(f"{where}.{key}: got {numbers[key]:g}; expected more than 0")
-    _within(np.array([v for k, v in numbers.items() if not k.startswith("sd")]), axis, where)
+    _check_within(np.array([v for k, v in numbers.items() if not k.startswith("sd")]), axis, where)
     if kind == "prior":
         if not axis.prior_sd or axis.value is None:
             others = ", ".join(k for k in DISTRIBUTIONS if k != kind)
             raise BadConfiguration(f"{where}: {name} has no prior; expected one of {others}")
         return _prior(name, robot)
-    return _cut(kind, numbers, axis.bounds, where)
+    return _truncate(kind, numbers, axis.bounds, where)
 
 
 def _prior(name: str, robot: Robot) -> Quantile:
@@ -360,7 +363,7 @@ def _prior(name: str, robot: Robot) -> Quantile:
     return quantile
 
 
-def _cut(kind: str, numbers: dict[str, float], bounds: tuple[float, float], where: str) -> Quantile:
+def _truncate(kind: str, numbers: dict[str, float], bounds: tuple[float, float], where: str) -> Quantile:
     from scipy import special
 
     if kind in ("uniform", "loguniform"):

@@ -19,8 +19,8 @@ from mmrjax.climbing.climb_simulation import (
     NAMES,
     OVER,
     UNFINISHED,
-    Climb,
-    Sequence,
+    ClimbRuns,
+    LeverSequence,
     climb_batch,
     constant_angles,
 )
@@ -152,9 +152,9 @@ def compute_climbs(
             robot,
             base,
         )
-    sequence = _sequences(obstacle, robot, conditions_there, points)
+    sequence = _lever_sequences(obstacle, robot, conditions_there, points)
 
-    def run(sizes: np.ndarray, told: Callable[[float], None]) -> Climb:
+    def run(sizes: np.ndarray, told: Callable[[float], None]) -> ClimbRuns:
         # Terrains of sizes [mm]
         nose, tread = obstacle.nose_mm / 1000, obstacle.tread_mm / 1000
         make = {
@@ -175,7 +175,7 @@ def compute_climbs(
     return {**results, VERDICT: verdict.astype(np.uint8), STATUS: status.astype(np.uint8)}
 
 
-def _sequences(obstacle: Obstacle, robot: Robot, conditions: Conditions, points: int) -> Sequence:
+def _lever_sequences(obstacle: Obstacle, robot: Robot, conditions: Conditions, points: int) -> LeverSequence:
     each = 0 if jnp.ndim(robot.sides) else None
     angles = jax.vmap(lambda r, c: masses.lever_angles(r.running_gear, c), in_axes=(each, 0))(robot, conditions)
     front, rear = (jnp.broadcast_to(x, (points,)) for x in angles)
@@ -190,9 +190,9 @@ def _sequences(obstacle: Obstacle, robot: Robot, conditions: Conditions, points:
     return dataclasses.replace(sequences, supply=jnp.full(points, obstacle.levers_voltage_V))
 
 
-def _until_verdict(found: Climb) -> Columns:
+def _until_verdict(found: ClimbRuns) -> Columns:
     """Numbers of runs until their verdicts."""
-    r, during = found.record, found.during
+    r, during = found.record, found.before_verdict
 
     def most(values: Any) -> np.ndarray:
         return np.max(np.where(during, np.nan_to_num(np.asarray(values)), -np.inf), axis=1)
@@ -211,7 +211,9 @@ def _until_verdict(found: Climb) -> Columns:
     }
 
 
-def _search_all(obstacle: Obstacle, points: int, run: Callable[..., Climb], told: Callable[[float], None]) -> Columns:
+def _search_all(
+    obstacle: Obstacle, points: int, run: Callable[..., ClimbRuns], told: Callable[[float], None]
+) -> Columns:
     """Largest sizes that are climbed, by simultaneous bisection for all points, and the result for the next larger
     size."""
     low, high = SOUGHT[obstacle.kind]
@@ -223,7 +225,7 @@ def _search_all(obstacle: Obstacle, points: int, run: Callable[..., Climb], told
         np.full(points, low),
     )
     for k in range(rounds):
-        ended = run(sizes, functools.partial(_share, told, k, rounds)).verdict
+        ended = run(sizes, functools.partial(_report_share, told, k, rounds)).verdict
         gone = ended == OVER
         over, beyond = np.where(gone, sizes, over), np.where(gone, beyond, sizes)
         verdict = np.where(gone, verdict, ended)
@@ -231,5 +233,5 @@ def _search_all(obstacle: Obstacle, points: int, run: Callable[..., Climb], told
     return {VERDICT: verdict, LARGEST: over}
 
 
-def _share(told: Callable[[float], None], k: int, rounds: int, share: float) -> None:
+def _report_share(told: Callable[[float], None], k: int, rounds: int, share: float) -> None:
     told((k + share) / rounds)

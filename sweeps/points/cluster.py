@@ -63,7 +63,7 @@ class Pool:
 
         from sweeps.points.scale import Piece
 
-        work, left = _packed(job), iter(chunks)
+        work, left = _pack_job(job), iter(chunks)
         name = hashlib.sha256(work).hexdigest()[:16]
         expected = {**program_identity(), "device": {"device": self.device}}
         tried: dict[int, int] = {}
@@ -154,7 +154,7 @@ class Pool:
                     self.client.wait_for_workers(1, timeout=WORKER)
 
 
-def _packed(job: Job) -> bytes:
+def _pack_job(job: Job) -> bytes:
     """A job as bytes. It includes the source of the user's own effects, so workers need no user files."""
     import cloudpickle
 
@@ -179,7 +179,7 @@ def connect_workers(address: str) -> Pool:
     """
     if importlib.util.find_spec("distributed") is None:
         raise BadConfiguration("--scheduler: needs dask; install mmrjax[cluster]")
-    client = _client(address)
+    client = _connect_client(address)
     try:
         try:
             client.wait_for_workers(1, timeout=ANSWER)
@@ -204,7 +204,7 @@ def connect_workers(address: str) -> Pool:
         raise
 
 
-def _client(address: str) -> Any:
+def _connect_client(address: str) -> Any:
     """A client of the scheduler at an address, in `ANSWER` seconds or not at all.
 
     dask limits the wait for a connection but not for messages over it, so this waits in a thread.

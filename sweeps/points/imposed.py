@@ -25,7 +25,7 @@ SHARES = (1 / 3, 2 / 3, 1.0)
 
 
 @dataclasses.dataclass(frozen=True)
-class Said:
+class ImposedWords:
     """Description of an imposed quantity: words, unit, the parameter that limits it, and example options for one run
     and for a grid."""
 
@@ -37,9 +37,9 @@ class Said:
 
 
 SAID = {
-    "voltage": Said("voltage", "V", "voltage_limit", "12", "6,12,24"),
-    "motor_speed": Said("motors' speed", "rpm", "speed_limit", "3000", "1000,2000"),
-    "motor_current": Said("motors' current", "A", "current_limit", "2", "0.5,1,2"),
+    "voltage": ImposedWords("voltage", "V", "voltage_limit", "12", "6,12,24"),
+    "motor_speed": ImposedWords("motors' speed", "rpm", "speed_limit", "3000", "1000,2000"),
+    "motor_current": ImposedWords("motors' current", "A", "current_limit", "2", "0.5,1,2"),
 }
 
 
@@ -69,7 +69,7 @@ def imposed_default(robot: Robot, option: str) -> float:
         return VOLTAGE
     most = imposed_limit(robot)
     if most is None:
-        raise BadConfiguration(_missing(robot, option, SAID[robot.rig.imposed].one))
+        raise BadConfiguration(_missing_limit_message(robot, option, SAID[robot.rig.imposed].one))
     return most if robot.rig.imposed == "voltage" else _digits(most)
 
 
@@ -94,24 +94,27 @@ def imposed_levels(robot: Robot, option: str, notes: list[str] | None = None) ->
         return VOLTAGES_V
     most = imposed_limit(robot)
     if most is None:
-        raise BadConfiguration(_missing(robot, option, SAID[robot.rig.imposed].several))
+        raise BadConfiguration(_missing_limit_message(robot, option, SAID[robot.rig.imposed].several))
     levels = tuple(_digits(share * most) for share in SHARES)
     if notes is not None:
         level_text = ",".join(f"{v:g}" for v in levels)
-        notes.append(f"{option}: not given; thirds of the {_of(robot)} in the robot's file are used: {level_text}")
+        notes.append(
+            f"{option}: not given; thirds of the {_robot_phrase(robot)} in the robot's file are used: {level_text}"
+        )
     return levels
 
 
-def _of(robot: Robot) -> str:
+def _robot_phrase(robot: Robot) -> str:
     return SAID[robot.rig.imposed].limit
 
 
-def _missing(robot: Robot, option: str, example: str) -> str:
+def _missing_limit_message(robot: Robot, option: str, example: str) -> str:
     unit = SAID[robot.rig.imposed].unit
     if robot.rig.imposed == "motor_current":  # which no file limits
         return f"{option}: not given; give it [{unit}], such as {option} {example}"
     return (
-        f"{option}: not given, and the robot's file has no motor.{_of(robot)}; give it [{unit}], such as {option} "
+        f"{option}: not given, and the robot's file has no motor.{_robot_phrase(robot)}; "
+        f"give it [{unit}], such as {option} "
         f"{example}"
     )
 

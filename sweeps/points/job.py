@@ -35,7 +35,7 @@ def showing_turns(robot: Robot, conditions: Collection[str]) -> Robot:
     return robot if set(OF_TURNS).isdisjoint(conditions) else robot.showing_turns()
 
 
-def prepare_job(config: Campaign, robot: Robot, plan: axes.Plan, where: str) -> scale.Job:
+def prepare_job(config: Campaign, robot: Robot, plan: axes.SweepPlan, where: str) -> scale.Job:
     """The job of a resolved configuration.
 
     Raises:
@@ -64,7 +64,7 @@ def prepare_job(config: Campaign, robot: Robot, plan: axes.Plan, where: str) -> 
     return scale.Job(robot, task, plan, config.outputs, config.storage, blocks, profile)
 
 
-def _profile(name: str, robot: Robot, plan: axes.Plan, where: str) -> Profile:
+def _profile(name: str, robot: Robot, plan: axes.SweepPlan, where: str) -> Profile:
     """The profile that every point follows.
 
     Raises:
@@ -90,11 +90,11 @@ def _profile(name: str, robot: Robot, plan: axes.Plan, where: str) -> Profile:
                 f"{where}, {field}: got it in addition to {source.source}, which contains it; keep one of the two"
             )
     on_battery = plan.conditions.get("battery", 0.0) or "battery" in plan.design.names
-    source.check_source(bool(on_battery))
+    source.check_supply(bool(on_battery))
     return source.profile(robot, plan.fixed())
 
 
-def _check_with_fidelity(variation: Variation, task: Task, plan: axes.Plan) -> None:
+def _check_with_fidelity(variation: Variation, task: Task, plan: axes.SweepPlan) -> None:
     """Lets the fidelity check points spread over the design, including its corners.
 
     Raises:
@@ -115,16 +115,18 @@ def _check_with_fidelity(variation: Variation, task: Task, plan: axes.Plan) -> N
             raise BadConfiguration(f"--model {task.model}: at {place}: {error}") from error
 
 
-def laid_out(config: Campaign, job: scale.Job) -> Layout:
+def store_layout(config: Campaign, job: scale.Job) -> Layout:
     """Arrays of the store of a job, with units and long names."""
     variables = [
-        Variable(name, scale.KINDS.get(name, config.storage), _in_store(job.task.attributes[name]))
+        Variable(name, scale.KINDS.get(name, config.storage), _store_attributes(job.task.attributes[name]))
         for name in job.outputs
     ]
     meanings = {"flag_values": [*range(len(STATUSES)), ABSENT], "flag_meanings": " ".join((*STATUSES, "absent"))}
     variables.append(Variable(STATUS, scale.KINDS[STATUS], {"long_name": "status of the run", **meanings}))
     planned = job.plan.axes
-    coordinates = {n: _in_store({"units": axis.unit, "long_name": axis.meaning}) for n, axis in planned.items()}
+    coordinates = {
+        n: _store_attributes({"units": axis.unit, "long_name": axis.meaning}) for n, axis in planned.items()
+    }
     for name in {axes.CONFIGURATION} & set(coordinates):
         del coordinates[name]["units"]
     labels = {axes.CONFIGURATION: job.robot.configurations.names}
@@ -132,6 +134,6 @@ def laid_out(config: Campaign, job: scale.Job) -> Layout:
     return Layout(job.plan.design, job.blocks, tuple(variables), coordinates, labels, about, config.compression)
 
 
-def _in_store(about: Json) -> Json:
+def _store_attributes(about: Json) -> Json:
     """Attributes in the form of a store, with the unit 1 for a quantity without unit."""
     return {**about, "units": "1"} if about.get("units") in ("-", "") else about

@@ -17,7 +17,7 @@ from calibration.inference.problem import Observation
 from mmrjax import fidelities
 from mmrjax.compile.compiling import compiled
 from mmrjax.fidelities import outputs
-from mmrjax.fidelities.base import Run
+from mmrjax.fidelities.base import RunBatch
 from mmrjax.fidelities.variation import FLAGS as FLAGS_CODE
 from mmrjax.fidelities.variation import STATUS
 from mmrjax.model import params
@@ -31,8 +31,8 @@ from sweeps.config import FidelityPart, Part, SupplyPart
 from sweeps.console import progress_bar as bar
 from sweeps.pages import words
 from sweeps.points import scale
-from sweeps.points.axes import Plan
-from sweeps.points.sampled_design import Blocks, Drawn
+from sweeps.points.axes import SweepPlan
+from sweeps.points.sampled_design import Blocks, DrawnSamples
 from sweeps.points.scale import Job
 from sweeps.points.tasks import run_task
 from sweeps.store import Page, RunFolder, finish_run_folder
@@ -45,15 +45,15 @@ PARTS = 4
 
 @dataclasses.dataclass(frozen=True)
 class SimulationResult:
-    """Result of a simulating command. All its files are written from it.
+    """Result of a command that simulates. All its files are written from it.
 
     Attributes:
         command: command that simulated.
         model: fidelity.
         robot: robot that was simulated.
-        runs: what was simulated.
-        table: their conditions and outcomes, a column each as in `runs.csv`.
-        further: what the command adds to `result.json`.
+        runs: runs that were simulated.
+        table: conditions and results, by column as in `runs.csv`.
+        further: further entries of `result.json`.
     """
 
     command: str
@@ -85,7 +85,7 @@ class SimulationResult:
         }
 
 
-def ending_columns(robot: Robot, batch: Run) -> Columns:
+def ending_columns(robot: Robot, batch: RunBatch) -> Columns:
     """Columns with the results at the end of a batch of runs, including those specific to the fidelity."""
     result, further = jax.device_get((batch.result, batch.columns))
     return outputs.output_columns(result, robot.channels, further)
@@ -140,7 +140,7 @@ def compute_chunks(
     return {column: np.concatenate([part.pop(column) for part in every]) for column in tuple(every[0])}
 
 
-def job_of(robot: Robot, runs: Runs, config: FidelityPart, samples: Drawn | None = None) -> Job:
+def job_of(robot: Robot, runs: Runs, config: FidelityPart, samples: DrawnSamples | None = None) -> Job:
     """Job for every output of the runs of a table, each combined with every sample if there are samples.
 
     Raises:
@@ -148,7 +148,7 @@ def job_of(robot: Robot, runs: Runs, config: FidelityPart, samples: Drawn | None
     """
     rows = conditions_of_runs(robot, runs, config)
     check_runs_bearable(robot, rows, config)
-    plan = Plan.of_rows(jax.tree.map(np.asarray, rows), samples)
+    plan = SweepPlan.of_rows(jax.tree.map(np.asarray, rows), samples)
     wanted = (*outputs.output_names(robot.channels), FLAGS_CODE, *fidelities.get_fidelity(config.model).columns)
     task = run_task(config.model, config.options, robot)
     chunk = getattr(config, "chunk", None) or scale.default_chunk(task)
@@ -198,14 +198,14 @@ def simulate_histories(robot: Robot, runs: Runs, model: str | None) -> Table:
         BadConfiguration: a fidelity that cannot follow them.
     """
     histories = jax.device_get(
-        _observed(observers.Histories.of(runs, robot, model, PARTS), params.without_weak_types(robot))
+        _observe(observers.Histories.of(runs, robot, model, PARTS), params.without_weak_types(robot))
     )
     columns = {c.column: histories.reading[:, k] / c.factor for k, c in enumerate(robot.channels)}
     return {**condition_table(robot, runs), **columns, **outputs.status_words(histories.status, histories.flags)}
 
 
 @compiled
-def _observed(observe: observers.Observer, robot: Robot) -> Observation:
+def _observe(observe: observers.Observer, robot: Robot) -> Observation:
     return observe(robot)
 
 
@@ -237,7 +237,7 @@ def write_run_folder(
         config: its configuration, with the robot's name.
         page: its page.
     """
-    folder.write_table("runs.csv", capabilities.without_idle(result.robot, result.table))
+    folder.write_table("runs.csv", capabilities.drop_inapplicable_columns(result.robot, result.table))
     folder.write_json("result.json", result.to_json())
     manifest = {"seed": None, "statuses": result.statuses}
     return finish_run_folder(

@@ -25,8 +25,8 @@ SAMPLE = "sample"
 ROW = "run"
 
 
-class Joint(Protocol):
-    """Several names that are sampled together, from as many independent normal scores as it has coordinates."""
+class JointDistribution(Protocol):
+    """Several quantities that are sampled together, from as many independent normal scores as it has coordinates."""
 
     @property
     def names(self) -> Names:
@@ -66,7 +66,7 @@ class Samples:
     number: int
     seed: int
     marginals: dict[str, Callable[[np.ndarray], np.ndarray]]
-    joint: Joint | None = None
+    joint: JointDistribution | None = None
 
     @property
     def names(self) -> Names:
@@ -96,7 +96,7 @@ class Samples:
 
 
 @dataclasses.dataclass(frozen=True)
-class Drawn:
+class DrawnSamples:
     """Sampled points that are already available.
 
     Attributes:
@@ -142,7 +142,7 @@ class Design:
     """
 
     axes: Columns
-    samples: Samples | Drawn | None = None
+    samples: Samples | DrawnSamples | None = None
 
     @property
     def names(self) -> Names:

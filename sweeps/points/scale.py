@@ -32,7 +32,7 @@ from mmrjax.fidelities.variation import FLAGS, STATUS, Variation, evaluate_point
 from mmrjax.missions.profile import Profile
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.robot import Robot
-from sweeps.points.axes import Plan, adhesion_ratios
+from sweeps.points.axes import SweepPlan, adhesion_ratios
 from sweeps.points.climbs import VERDICT
 from sweeps.points.sampled_design import ROW, Blocks
 from sweeps.points.tasks import Task
@@ -62,7 +62,7 @@ class Job:
 
     robot: Robot
     task: Task
-    plan: Plan
+    plan: SweepPlan
     outputs: Names
     storage: str
     blocks: Blocks

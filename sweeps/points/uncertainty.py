@@ -18,7 +18,7 @@ from mmrjax.model.signals import DONE
 from sweeps.config import FidelityPart
 from sweeps.console import progress_bar
 from sweeps.points import run
-from sweeps.points.sampled_design import Drawn
+from sweeps.points.sampled_design import DrawnSamples
 from sweeps.store import RunFolder
 
 #: What is added to the column of an output: standard deviation, ends of the 95 % interval.
@@ -60,7 +60,7 @@ def simulate_draws(
     Returns:
         For every output's column its sd and the ends of its 95 % interval, NaN where fewer than two draws converge.
     """
-    samples = Drawn(tuple(posterior.names), posterior.draw(draws, SEED).T)
+    samples = DrawnSamples(tuple(posterior.names), posterior.draw(draws, SEED).T)
     job = run.job_of(robot, runs, config, samples)
     slow = fidelities.fidelity_facts(config.model).slow or draws * len(runs) > 100_000
 

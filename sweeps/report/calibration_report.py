@@ -40,7 +40,7 @@ def calibration_document(found: CalibrationResult, robot_name: str) -> Document:
     table = found.rows()
     kinds = {"": "measured", "after_": "fitted"}
     return Document(
-        f"Calibration of {words.words_shown(Path(robot_name).name)} to {Path(found.source).name}",
+        f"Calibration of {words.displayed_robot_name(Path(robot_name).name)} to {Path(found.source).name}",
         answer,
         (
             Note(f"{found.adequacy.statement}.", "lead", "adequate", terminal=True),

@@ -12,7 +12,7 @@ from calibration.data import Json
 from calibration.data.input_errors import three_digits
 from calibration.data.requirements_file import Requirements
 from calibration.sizing import sheet
-from calibration.sizing.sheet import Change, Outcome
+from calibration.sizing.sheet import ParameterChange, RequirementOutcome
 from mmrjax.model.paper_tables import COULOMB_PER_MAH
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import NOT_SETTLED, STATUSES
@@ -38,11 +38,11 @@ class CheckResult:
 
     asked: Requirements
     robot: Robot
-    outcomes: tuple[Outcome, ...]
+    outcomes: tuple[RequirementOutcome, ...]
     drawn: Mapping[str, tuple[Drawn, float, float]] = dataclasses.field(default_factory=dict)
 
     @property
-    def missed(self) -> list[Outcome]:
+    def missed(self) -> list[RequirementOutcome]:
         """Outcomes of the missed requirements."""
         return [o for o in self.outcomes if not o.met]
 
@@ -68,12 +68,12 @@ class CheckResult:
         }
 
 
-def _margin_share(outcome: Outcome) -> float:
+def _margin_share(outcome: RequirementOutcome) -> float:
     """Margin as a share of the limit [-]. The least for a requirement without a value."""
     return -math.inf if outcome.margin is None else outcome.margin / max(abs(requirement_limit(outcome)), 1e-12)
 
 
-def requirement_label(outcome: Outcome) -> str:
+def requirement_label(outcome: RequirementOutcome) -> str:
     """Name of a requirement, with its duty."""
     point = outcome.at
     duty = ""
@@ -82,20 +82,20 @@ def requirement_label(outcome: Outcome) -> str:
     return f"{outcome.requirement.quantity.label}{duty}"
 
 
-def requirement_limit(outcome: Outcome) -> float:
+def requirement_limit(outcome: RequirementOutcome) -> float:
     """Required value, or the rating of the part."""
     limit = outcome.requirement.limit
     assert limit is not None
     return limit
 
 
-def required_value_text(outcome: Outcome) -> str:
+def required_value_text(outcome: RequirementOutcome) -> str:
     """Required value with its sense and unit, as in `≥ 0.9 m/s`."""
     r = outcome.requirement
     return f"{'≥' if r.least else '≤'} {three_digits(requirement_limit(outcome))} {r.quantity.unit}"
 
 
-def reached_value_text(outcome: Outcome) -> str:
+def reached_value_text(outcome: RequirementOutcome) -> str:
     """Value with its unit, or the reason for having none."""
     quantity = outcome.requirement.quantity
     if outcome.value is not None:
@@ -104,7 +104,7 @@ def reached_value_text(outcome: Outcome) -> str:
     return words.NO_TURN if no_turn else words.reason_without_value(outcome.status)
 
 
-def shortfall_text(outcome: Outcome) -> str:
+def shortfall_text(outcome: RequirementOutcome) -> str:
     """Value and its limit."""
     if outcome.value is None or outcome.margin is None:
         return f"({reached_value_text(outcome)})"
@@ -117,7 +117,7 @@ _PLACES = {
 }  # fmt: skip
 
 
-def worst_corner_text(outcome: Outcome) -> str:
+def worst_corner_text(outcome: RequirementOutcome) -> str:
     """The worst corner in words."""
     parts = []
     for key, form in _PLACES.items():
@@ -146,7 +146,7 @@ def check_document(found: CheckResult, robot_name: str, changes: bool = True) ->
     return Document("Requirements", found.statement(), blocks, tuple(sections))
 
 
-def requirements_sheet(outcomes: Sequence[Outcome], terminal: bool = True) -> Table:
+def requirements_sheet(outcomes: Sequence[RequirementOutcome], terminal: bool = True) -> Table:
     """Requirements with required and reached values, margins and worst corners."""
     rows = [
         (
@@ -186,11 +186,11 @@ def _changes(found: CheckResult) -> tuple[Note | Table, ...]:
     )  # fmt: skip
 
 
-def _change(c: Change) -> tuple[object, ...]:
+def _change(c: ParameterChange) -> tuple[object, ...]:
     breaks = ", ".join(c.breaks) or "nothing more"
     unit = f"C ({c.after / COULOMB_PER_MAH:.0f} mAh)" if c.unit == "C" else c.unit
     return f"`{c.parameter}`", c.before, c.after, unit, 100 * (c.after / c.before - 1), breaks
 
 
-def _margin(o: Outcome) -> str | None:
+def _margin(o: RequirementOutcome) -> str | None:
     return None if o.margin is None else f"{'+' if o.margin >= 0 else '−'}{three_digits(abs(o.margin))}"

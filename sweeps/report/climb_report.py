@@ -17,8 +17,8 @@ from jaxtyping import Array
 from calibration.data import Columns, Json, Names, robot_file
 from calibration.data.input_errors import BadConfiguration
 from calibration.data.robot_file import RobotFile
-from mmrjax.climbing.climb_derivatives import OUTPUTS, ClimbInputs, Derivatives, outputs_of_run
-from mmrjax.climbing.climb_simulation import LOSSES, NAMES, OVER, SOURCES, Climb
+from mmrjax.climbing.climb_derivatives import OUTPUTS, ClimbDerivatives, ClimbInputs, outputs_of_run
+from mmrjax.climbing.climb_simulation import LOSSES, NAMES, OVER, SOURCES, ClimbRuns
 from mmrjax.climbing.footing import FRONT, PITCH, REAR, SHAFT
 from mmrjax.climbing.terrain import Terrain
 from mmrjax.model.robot import Robot
@@ -122,12 +122,12 @@ class ClimbResult:
     configuration: str
     obstacle: str
     terrain: Terrain
-    climb: Climb
+    climb: ClimbRuns
     tried: tuple[tuple[float, str], ...] = ()
     largest: float | None = None
     sought: str = ""
     along: Along | None = None
-    derivatives: Derivatives | None = None
+    derivatives: ClimbDerivatives | None = None
 
     @property
     def verdict(self) -> str:

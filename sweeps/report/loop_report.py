@@ -45,7 +45,7 @@ def loop_document(found: DiscoveryResult, robot_name: str, changes: Mapping[str,
     moved, added = list(moved_parameters(found)), list(_effect_findings(found, changes))
     rise = loop_words.rising_errors_sentence(found.held_out_worse, found.predicted)
     return Document(
-        f"Is the {words.words_shown(Path(robot_name).name)} model complete?",
+        f"Is the {words.displayed_robot_name(Path(robot_name).name)} model complete?",
         found.statement,
         (
             *remarks(moved, "moved"),

@@ -87,7 +87,7 @@ _NO_RETURN = "No energy returned to the source"
 def missions_document(file: RobotFile, found: Missions) -> Document:
     """The report of finished missions. In detail the first run."""
     table, source = found.table, found.source
-    shown_columns = capabilities.without_idle(file.robot, table)
+    shown_columns = capabilities.drop_inapplicable_columns(file.robot, table)
     first, names = {key: value[0] for key, value in table.items()}, _names(table)
     answer = mission_answer({key: value[0] for key, value in shown_columns.items()}, file.robot.has_ground)
     fed = "battery" if np.isfinite(first["state_of_charge"]) else "supply"
@@ -122,7 +122,9 @@ def _sections(robot: Robot, found: Missions, first: Json, answer: str) -> Iterab
     """The first run over time, from above, its energy and its segments."""
     source, name, limit = found.source, found.segments["run_id"][0], float(robot.motor.temperature_limit)
     run_rows = found.course["run_id"] == name
-    rows = {key: value[run_rows] for key, value in capabilities.without_idle(robot, found.course).items()}
+    rows = {
+        key: value[run_rows] for key, value in capabilities.drop_inapplicable_columns(robot, found.course).items()
+    }
     cycle = float(source.time[-1] - source.time[0]) if source.cycles > 1 else None
     course = catalogue.figure(
         "mission.course", rows, cycle, limit, source.linear, float(robot.sides), words=(len(rows["time_s"]),),
@@ -153,7 +155,8 @@ def _sections(robot: Robot, found: Missions, first: Json, answer: str) -> Iterab
     )  # fmt: skip
     yield Section("Where the energy goes", (energy,), "energy-section")
     yield Section(
-        "Segments", (_segments(found, name, capabilities.idle_columns(robot)), catalogue.note("mission.settles")),
+        "Segments",
+        (_segments(found, name, capabilities.inapplicable_columns(robot)), catalogue.note("mission.settles")),
         "segments-section",
     )  # fmt: skip
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from calibration.data import Json
 from calibration.data.robot_file import RobotFile
-from sweeps.pages.page import Album, render_page, robot_section
+from sweeps.pages.page import FigureAlbum, render_page, robot_section
 from sweeps.report.document import Document, Figure
 
 
@@ -17,7 +17,7 @@ def write_report_page(folder: Path, document: Document, file: RobotFile | None =
     Args:
         file: file of the robot that the page is about: its parameters are the last section.
     """
-    album = Album(folder)
+    album = FigureAlbum(folder)
     document = dataclasses.replace(document, sections=(*document.page_sections(), *document.sections))
     for block in document.every_block:
         if isinstance(block, Figure):

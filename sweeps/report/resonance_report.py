@@ -20,10 +20,10 @@ from mmrjax.undercarriage.ripple_peaks import (
     PERIODS,
     SIGNALS,
     TAIL,
-    Crossing,
-    Passing,
-    Peak,
+    ModeCrossing,
+    PassingParts,
     Resonance,
+    RipplePeak,
     group_resonances,
     strongest_resonances,
 )
@@ -54,12 +54,12 @@ class ResonanceResult:
     configuration: str
     slope_deg: float
     surface: str
-    passing: Passing
+    passing: PassingParts
     robot: Robot
     table: Columns
     modes: dict[float, list[Mode]]
-    peaks: list[Peak]
-    crossings: list[Crossing]
+    peaks: list[RipplePeak]
+    crossings: list[ModeCrossing]
 
     @property
     def resonances(self) -> list[Resonance]:
@@ -67,7 +67,7 @@ class ResonanceResult:
         return group_resonances(self.peaks)
 
     @property
-    def strong(self) -> list[Peak]:
+    def strong(self) -> list[RipplePeak]:
         """Peaks of the strongest resonances."""
         kinds = {(r.mode, r.order, r.signal) for r in strongest_resonances(self.resonances)}
         return [p for p in self.peaks if (p.mode, p.order, p.signal) in kinds]

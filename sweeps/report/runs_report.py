@@ -11,7 +11,7 @@ import numpy as np
 
 from calibration.data import Columns, Json
 from calibration.data.robot_file import RobotFile
-from mmrjax.fidelities.base import Run
+from mmrjax.fidelities.base import RunBatch
 from mmrjax.model.channels import Channel
 from mmrjax.model.quantities import MM, RPM, VOLTAGE
 from mmrjax.model.robot import Robot
@@ -38,7 +38,7 @@ def runs_document(
     file: RobotFile,
     model: str,
     runs: Columns,
-    histories: Run | None = None,
+    histories: RunBatch | None = None,
     stands: Postures | None = None,
     notes: Sequence[str] = (),
 ) -> Document:
@@ -54,7 +54,7 @@ def runs_document(
     single, first = len(names) == 1, {key: value[0] for key, value in runs.items()}
     used = limits_used(robot, first) if single else []
     endings = run_tables.endings_table(Counter(map(str, runs["status"])))
-    table = capabilities.without_idle(robot, runs)
+    table = capabilities.drop_inapplicable_columns(robot, runs)
     shown_columns = (imposed_column(table), *_CONDITIONS, *(c.column for c in robot.channels), *_FURTHER)
     if not np.nan_to_num(table.get("voltage_cell_V", 0.0)).any():
         table.pop("voltage_cell_V", None)
@@ -128,7 +128,7 @@ def conditions_in_words(table: Columns, row: int) -> str:
     return ", ".join(parts)
 
 
-def _histories(robot: Robot, runs: Columns, names: list[str], histories: Run) -> Iterable[Section]:
+def _histories(robot: Robot, runs: Columns, names: list[str], histories: RunBatch) -> Iterable[Section]:
     """Runs over time: as instruments show them, or from standstill on a ground, with what the running gear does."""
     from sweeps.pages import gear_figures, history_figures
 
@@ -138,7 +138,7 @@ def _histories(robot: Robot, runs: Columns, names: list[str], histories: Run) ->
     cut = (catalogue.note("runs.cut", HISTORIES, len(names)),) * (len(names) > HISTORIES)
     if not robot.has_ground:
         if any(c.over_time for c in robot.channels):
-            members = history_figures.members_as_read(robot.channels, history, status, names[:HISTORIES])
+            members = history_figures.shaft_runs(robot.channels, history, status, names[:HISTORIES])
             names_of = [c.name for c in robot.channels]
             ends = [
                 (s.name, words.short_status(s.status), *(read(n) for n in names_of for read in (s.largest, s.last)))
@@ -148,7 +148,7 @@ def _histories(robot: Robot, runs: Columns, names: list[str], histories: Run) ->
             table = catalogue.table("runs.courses-table", ends, *(column for _, column in read_heads))
             yield Section("Over time", (*cut, catalogue.figure("runs.courses", members), table), "history-section")
         return
-    starts = history_figures.members_from_standstill(robot, history, status, which, names[:HISTORIES])
+    starts = history_figures.start_runs(robot, history, status, which, names[:HISTORIES])
     averaged = ""
     if history.reactions is not None:
         averaged = catalogue.text("runs.averaged", 1e3 * float(history.time[0, 1] - history.time[0, 0]))
@@ -158,7 +158,7 @@ def _histories(robot: Robot, runs: Columns, names: list[str], histories: Run) ->
     if history.reactions is None:
         return
     share = np.asarray(histories.columns["guide_share"])
-    gears = gear_figures.members_with_gear(robot, history, status, share, which, names[:GEARS])
+    gears = gear_figures.gear_runs(robot, history, status, share, which, names[:GEARS])
     # A ripple is of steady travel: the contacts have stopped sliding before the part that is looked at.
     ripples = [g for g, s in zip(gears, starts, strict=False) if s.gets_under_way and g.settled_since(s.slipping)]
     if ripples:
@@ -231,7 +231,7 @@ def _drive_chart(robot: Robot, runs: Columns) -> Iterable[Block]:
 
 def limits_used(robot: Robot, run: Json) -> list[Json]:
     """Use of each limit by a run. The inrush current has no share of a limit that is not stated."""
-    idle = capabilities.idle_columns(robot)
+    idle = capabilities.inapplicable_columns(robot)
     radius = float(robot.configurations[str(run["configuration"])].radius)
     shaft = float(run["theoretical_speed_mm_s"]) * MM / radius * float(robot.gearbox.ratio) / RPM
     turning = abs(shaft) > 1e-9

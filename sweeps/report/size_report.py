@@ -10,10 +10,10 @@ import numpy as np
 
 from calibration.data import Json, Names, writing
 from calibration.data.requirements_file import Requirements
-from calibration.sizing.chart import LIMITS, Chart
+from calibration.sizing.chart import LIMITS, MarginChart
 from calibration.sizing.design import OBJECTIVES
-from calibration.sizing.design_search import SizedDesign, Sizing
-from calibration.sizing.sheet import Outcome
+from calibration.sizing.design_search import SizedDesign, SizingResult
+from calibration.sizing.sheet import RequirementOutcome
 from mmrjax.errors import count_noun
 from mmrjax.model.robot import Robot
 from sweeps.report import catalogue
@@ -36,10 +36,10 @@ class SizeResult:
 
     asked: Requirements
     robot: Robot
-    sizing: Sizing
+    sizing: SizingResult
     objectives: Names
-    outcomes: tuple[Outcome, ...]
-    charts: tuple[Chart, ...] = ()
+    outcomes: tuple[RequirementOutcome, ...]
+    charts: tuple[MarginChart, ...] = ()
 
     def statement(self) -> str:
         """The answer: the best design and its binding limits, or the nearest one and its misses."""
@@ -172,7 +172,7 @@ def _limits(found: SizeResult, robot_name: str) -> tuple[Figure, ...]:
     return (catalogue.figure("size.limits", found, charts, finding=alternative),)
 
 
-def _share_within_limits(c: Chart) -> str:
+def _share_within_limits(c: MarginChart) -> str:
     """The share of a chart within all limits, and the limit that is most often nearest."""
     (most, _), *_ = Counter(c.nearest.ravel().tolist()).most_common(1)
     within = f"{100 * np.mean(c.margin >= 0):.0f} % of payloads up to {c.payload[-1]:.3g} kg and slopes up to "

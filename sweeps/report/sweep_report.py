@@ -20,7 +20,7 @@ from sweeps.report.run_tables import imposed_column, quantity_column
 
 def sweep_document(file: RobotFile, model: str, runs: Columns, notes: Sequence[str] = ()) -> Document:
     """The report of a finished sweep of any grid."""
-    shown_runs = capabilities.without_idle(file.robot, runs)
+    shown_runs = capabilities.drop_inapplicable_columns(file.robot, runs)
     statuses = Counter(map(str, runs["status"]))
     statuses_known = [*words.STATUSES, *(statuses.keys() - words.STATUSES.keys())]
     over = {s: int(((runs["status"] == s) & (runs["flags"] != "")).sum()) for s in statuses_known}

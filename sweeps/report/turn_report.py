@@ -71,7 +71,7 @@ def turn_document(
 
 def sides_table(robot: Robot, row: Columns) -> Table:
     """What the left and the right side do, without rows if no motion is known."""
-    idle, yaw_known = capabilities.idle_columns(robot), math.isfinite(float(row["yaw_rate_rad_s"]))
+    idle, yaw_known = capabilities.inapplicable_columns(robot), math.isfinite(float(row["yaw_rate_rad_s"]))
     rows = []
     for label, column, form in _ROWS if yaw_known else ():
         values = [float(row[column.format(side)]) for side in SIDES]

@@ -16,7 +16,7 @@ from calibration.inference.observers.turns import SettledTurns
 from calibration.inference.priors import Coordinates
 from calibration.inference.problem import Problem, data_from_readings
 from mmrjax import fidelities
-from mmrjax.fidelities import Facts
+from mmrjax.fidelities import FidelityFacts
 from mmrjax.model import params
 from mmrjax.model.robot import Robot
 
@@ -33,7 +33,7 @@ def observer_kind(runs: Runs) -> type[Observer]:
     return next(k for k in KINDS if k.accepts_table(runs))
 
 
-def facts_of_fidelity(model: str) -> Facts:
+def facts_of_fidelity(model: str) -> FidelityFacts:
     """Properties of a fidelity, by its name.
 
     Raises:

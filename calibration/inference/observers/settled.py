@@ -40,7 +40,7 @@ from mmrjax import fidelities
 from mmrjax.compile.compiling import SELDOM, compiled
 from mmrjax.effects import Effect
 from mmrjax.effects.curve import WAYS, direction_signal
-from mmrjax.fidelities.base import Implicit
+from mmrjax.fidelities.base import ImplicitSolution
 from mmrjax.fidelities.rest import travel_direction
 from mmrjax.fidelities.steady import SIZES, operating_signals
 from mmrjax.model import balances, channels
@@ -231,7 +231,7 @@ class SettledRuns(Observer):
         return Observation(reading, jnp.asarray(result.adhesion_used), result.status, jnp.asarray(result.flags))
 
     @property
-    def _implicit(self) -> Implicit | None:
+    def _implicit(self) -> ImplicitSolution | None:
         return fidelities.get_fidelity(self.fidelity).implicit
 
     def solve(self, robot: Robot) -> tuple[Array, Array] | None:

@@ -24,12 +24,12 @@ from jaxtyping import Array, Float, Int
 from calibration.data import Columns, Names
 from calibration.data.columns import SUPPLY
 from calibration.data.courses import (
-    Stretch,
+    ConstantInterval,
     applied_drive,
     changing_columns,
-    course_stretches,
     differs_from_row_before,
     divide_run,
+    intervals_by_run,
 )
 from calibration.data.input_errors import BadConfiguration, BadData
 from calibration.data.runs import Runs
@@ -82,7 +82,7 @@ from mmrjax.fidelities.histories import (
     RunStep,
     StepCourse,
     course_between_instants,
-    first_instant,
+    first_conditions_and_state,
     history_signals,
     linearise_run,
     run_response,
@@ -93,7 +93,7 @@ from mmrjax.model import balances, channels
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.params import Scalar
 from mmrjax.model.quantities import GOALS
-from mmrjax.model.rig import Begin, Begins, Rig
+from mmrjax.model.rig import Rig, RunStart, RunStarts
 from mmrjax.model.robot import Robot
 from mmrjax.model.signals import CONVERGED, FAILED, Signals, State
 from mmrjax.numerics.linear_equations import solve
@@ -405,7 +405,7 @@ class Histories(Observer):
         time, measured = runs["time_s"], runs.measured()
         each = [
             max((s for s in run if s.driven or s.whole), key=lambda s: s.lasts, default=run[0])
-            for run in course_stretches(runs)
+            for run in intervals_by_run(runs)
         ]
         each = [s for s in each if s.driven and (s.whole or s.lasts >= LASTING)]
         if steady:
@@ -506,7 +506,7 @@ class Histories(Observer):
         """True if some conditions change within a run."""
         return any(x.ndim > 1 for x in jax.tree.leaves(self.conditions))
 
-    def stretches(self) -> list[list[Stretch]]:
+    def stretches(self) -> list[list[ConstantInterval]]:
         """Intervals of constant conditions in each run."""
         rows_of, time, of_rows = np.asarray(self.rows_of), np.asarray(self.time), self.of_rows
         volts = np.where(of_rows.open > 0.5, 0.0, of_rows.voltage * of_rows.duty)
@@ -923,7 +923,7 @@ def measure_initial_states(robot: Robot, runs: Runs, noise: Noise) -> Robot:
     if robot.rig.start == "rest" or not runs.sampled:
         return robot
     measured = runs.measured()
-    begins, stated = dict[str, Begin](), []
+    begins, stated = dict[str, RunStart](), []
     rows = runs.configurations(robot)
     for name in np.unique(runs.run_names):
         run_rows = runs.in_order(name)
@@ -943,10 +943,10 @@ def measure_initial_states(robot: Robot, runs: Runs, noise: Noise) -> Robot:
                 value, sd = _value_at_zero(runs["time_s"][finite] - runs["time_s"][run_rows[0]], measured[finite, k])
                 least = float(np.median(noise.sd[finite, k]))
                 state[field] = factor * value, abs(factor) * max(sd, least)
-        begins[key] = Begin(**{field: value for field, (value, _) in state.items()})
+        begins[key] = RunStart(**{field: value for field, (value, _) in state.items()})
         stated += [(f"rig.{key}.{field}", value, sd) for field, (value, sd) in state.items()]
     priors = (*robot.rig.priors, *stated) if robot.rig.start == "free" else robot.rig.priors
-    return dataclasses.replace(robot, rig=dataclasses.replace(robot.rig, begins=Begins(begins), priors=priors))
+    return dataclasses.replace(robot, rig=dataclasses.replace(robot.rig, begins=RunStarts(begins), priors=priors))
 
 
 def _value_at_zero(time: np.ndarray, shown: np.ndarray) -> tuple[float, float]:
@@ -981,7 +981,7 @@ def _check_signs(runs: Runs) -> None:
     unsigned = np.nanmin(measured, 0, initial=0.0) >= -RESTING * size
     unsigned &= [runs.turns_round(c) for c in runs.channels]
     unit = runs.layout.imposed_column.rpartition("_")[2]
-    for run in course_stretches(runs):
+    for run in intervals_by_run(runs):
         for s in (s for s in run if volts[s.rows[0]] < 0 and s.lasts >= LASTING):
             rows = s.after(time, 0.5)
             for k in np.flatnonzero(unsigned):
@@ -1345,8 +1345,8 @@ class _ProbedRobot(NamedTuple):
             shows = jnp.concatenate([jnp.zeros((len(by_state), size * len(clock))), self.at_sensor * term], 1)
             return by_state @ dy + both(at_once, t, term) + shows
 
-        first, begins = first_instant(robot, conditions)
-        by_probes = jax.jacfwd(lambda a: first_instant(self.at(a), conditions)[1])(none)
+        first, begins = first_conditions_and_state(robot, conditions)
+        by_probes = jax.jacfwd(lambda a: first_conditions_and_state(self.at(a), conditions)[1])(none)
         begun = by_probes[:, self.entering] * (self.enters * terms(clock[0], begins, first))
         unmoved = jnp.concatenate([jnp.zeros((len(begins), size * len(clock))), begun], 1)
         changed = run_response(conditions, along, source, seen, unmoved)
@@ -1423,7 +1423,7 @@ def _memory_along_run(
         last = stage(memory + ahead * (first - memory), span, state_there.places[1], state_there.sides[1])
         return last, jnp.stack([first, last])
 
-    begin = first_instant(robot, conditions)[1]
+    begin = first_conditions_and_state(robot, conditions)[1]
     angle = state_of_unknowns(robot, begin).distance / robot.chassis(conditions.configuration).radius
     begun = jnp.concatenate(
         [

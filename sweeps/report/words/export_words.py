@@ -11,9 +11,9 @@ from mmrjax import __version__
 from mmrjax.errors import count_noun, printable
 from mmrjax.model import channels
 from mmrjax.model.shaft import MESH_DAMPING, MESH_FREQUENCY
-from sweeps.export.comparison import APPROXIMATED, DROPPED, EXPORTED, HELD, NATIVE, Fate
+from sweeps.export.comparison import APPROXIMATED, DROPPED, EXPORTED, HELD, NATIVE, EffectFate
 from sweeps.export.formats import FORMATS, Export
-from sweeps.export.joint import INSIDE, Joint
+from sweeps.export.joint import INSIDE, DriveJoint
 from sweeps.export.law_source import jax_source, module_from_source
 
 #: Use of a file of each format, as a paragraph of LAW.md.
@@ -81,7 +81,7 @@ def export_statement(found: Export) -> str:
     )
 
 
-def share_kept(fate: Fate) -> str:
+def share_kept(fate: EffectFate) -> str:
     """Share of an effect that is kept, in percent, empty where none was computed."""
     return f"{100 * fate.kept:.0f} %" if np.isfinite(fate.kept) else ""
 
@@ -187,7 +187,7 @@ def law_equations(found: Export) -> list[str]:
     return lines
 
 
-def _further_equations(joint: Joint) -> list[str]:
+def _further_equations(joint: DriveJoint) -> list[str]:
     """Equations of a controller, and of a load that turns apart from the motor."""
     lines = []
     if joint.controller is not None:

@@ -11,9 +11,9 @@ import numpy as np
 from calibration.data import Columns
 from calibration.data.columns import LEVERS
 from calibration.data.table import Runs
-from calibration.sizing.sheet import Outcome
+from calibration.sizing.sheet import RequirementOutcome
 from mmrjax.climbing import resting_posture, static_limits
-from mmrjax.climbing.resting_posture import Outline
+from mmrjax.climbing.resting_posture import SideOutline
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.masses import lever_angles
 from mmrjax.model.quantities import MM
@@ -35,7 +35,7 @@ class Drawn:
         slope: [rad].
     """
 
-    side: Outline
+    side: SideOutline
     base: float
     step: float
     slope: float = 0.0
@@ -118,7 +118,7 @@ def posture_of_runs(robot: Robot, runs: Runs, conditions: Conditions) -> Posture
     )
 
 
-def of_requirements(robot: Robot, outcomes: Sequence[Outcome]) -> dict[str, tuple[Drawn, float, float]]:
+def of_requirements(robot: Robot, outcomes: Sequence[RequirementOutcome]) -> dict[str, tuple[Drawn, float, float]]:
     """A robot as requirements of its geometry ask about it, by their names: drawn, and angles of its levers [deg].
 
     The best posture on a step, levers flush with the belt over a gap, folded for its size.
@@ -136,9 +136,9 @@ def of_requirements(robot: Robot, outcomes: Sequence[Outcome]) -> dict[str, tupl
             drawn = _on_step(step)
         else:
             front = rear = float(static_limits.flush_lever_angle(robot)) if name == "gap_mm" else np.pi
-            stands = static_limits.with_levers(conditions, front, rear)
+            stands = static_limits.with_lever_angles(conditions, front, rear)
             rests, side = resting_posture.level_posture(robot, stands), resting_posture.side_outline(robot, stands)
-            drawn = Drawn(jax.device_get(side.pitched(rests.pitch)), float(rests.height), 0.0)
+            drawn = Drawn(jax.device_get(side.with_pitch(rests.pitch)), float(rests.height), 0.0)
         found[name] = drawn, float(np.degrees(front)), float(np.degrees(rear))
     return found
 
