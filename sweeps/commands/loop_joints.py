@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 import warnings
@@ -14,11 +15,15 @@ from scipy.ndimage import uniform_filter1d
 
 from calibration.data import Names, delimited
 from calibration.data import runs as records
-from calibration.data.columns import CURRENT, LOAD, SPEED
+from calibration.data.column_names import check_units
+from calibration.data.columns import LOAD, SPEED, Column, Layout
 from calibration.data.input_errors import BadConfiguration, BadData, allowed_words
-from calibration.data.named_arrays import NamedArrays, Raw, column_numbers, column_texts
+from calibration.data.named_arrays import NamedArrays, column_numbers, column_texts
 from calibration.data.runs import Runs
 from calibration.data.sources import reading
+from calibration.inference.observers import observer_kind
+from calibration.inference.series_noise import estimate_noise
+from mmrjax.model import channels
 from mmrjax.model.quantities import RPM
 from mmrjax.model.robot import Robot
 from sweeps import config as configuration
@@ -30,8 +35,7 @@ from sweeps.inputs import load_robot
 from sweeps.report import catalogue
 from sweeps.report.document import Document
 
-#: Columns of a joint's angle, and their units [rad].
-ANGLES = {"output_angle_deg": math.pi / 180, "output_angle_rad": 1.0}
+ANGLE = channels.find_channel("output_angle")
 #: Stands for the name of a joint in the name of its robot's file.
 JOINT = "{joint}"
 #: Column of the current's sd, and rows over which that of the torque is averaged.
@@ -89,8 +93,11 @@ class Chain:
         return needed
 
 
-def noise_of(readings: np.ndarray) -> float:
-    """Standard deviation of the noise of a slow signal, by its sixth differences."""
+def noise_of_angle(readings: np.ndarray) -> float:
+    """Standard deviation of the noise of an angle, by its sixth differences.
+
+    Second differences, as in `estimate_noise`, contain 0.1 mrad of the curvature of a log of 200 Hz.
+    """
     return float(np.nanmedian(np.abs(np.diff(readings, 6)))) / QUANTILE
 
 
@@ -100,7 +107,7 @@ def smoothed_motion(time: np.ndarray, angle: np.ndarray, times: np.ndarray, degr
     It has the fewest knots with which readings are off by their noise, at least that of the display's step if most
     readings repeat others. At a jump of the torque, knots crowd, so that the acceleration jumps within a few samples.
     """
-    noise, steps = noise_of(angle), np.diff(np.unique(np.round(angle, 9)))
+    noise, steps = noise_of_angle(angle), np.diff(np.unique(np.round(angle, 9)))
     if 0 < len(steps) < len(angle) / 2:
         noise = max(noise, steps.min() / math.sqrt(12))
     with warnings.catch_warnings():
@@ -109,34 +116,47 @@ def smoothed_motion(time: np.ndarray, angle: np.ndarray, times: np.ndarray, degr
     return np.stack([curve(times), curve.derivative(1)(times), curve.derivative(2)(times)])
 
 
+def columns_of_joint(log: NamedArrays, joint: str, joints: Names) -> NamedArrays:
+    """Columns of a log that are a joint's, without its name, and those of no joint."""
+    others = tuple(f"{name}." for name in joints if name != joint)
+    kept = [k for k, column in enumerate(log.header) if not column.startswith(others)]
+    return dataclasses.replace(
+        log,
+        name=f"{log.name}, joint {joint}",
+        header=tuple(log.header[k].removeprefix(f"{joint}.") for k in kept),
+        values=tuple(log.values[k] for k in kept),
+        units=tuple(log.units[k] for k in kept if log.units),
+    )
+
+
 def smoothed_log(log: NamedArrays, chain: Chain, degree: int = 5) -> np.ndarray:
     """Motion of all joints at each row of a log, shape (3, rows, joints), by splines of a degree.
 
     Raises:
-        BadData: the log has no `time_s`, lacks the angle of a joint, or has too few readings of it in a run.
+        BadData: the log has no `time_s`, lacks the angle of a joint, or has too few readings of it in a run. As
+            `check_units`.
     """
-    columns = dict(zip(log.header, log.values, strict=True))
-
-    def numbers(*names: str) -> tuple[str, np.ndarray]:
-        column = next((c for c in names if c in columns), None)
-        if column is None:
+    motion = np.empty((3, len(log), len(chain.names)))
+    for k, name in enumerate(chain.names):
+        joint = columns_of_joint(log, name, chain.names)
+        columns, units = dict(zip(joint.header, joint.values, strict=True)), ANGLE.columns()
+        column = next((c for c in units if c in columns), None)
+        if column is None or "time_s" not in columns:
+            lacking = "time_s" if column else " or ".join(f"{name}.{c}" for c in units)
             raise BadData(
-                f"{log.name}: has no column {' or '.join(names)}; expected time_s and the angle of each joint of the "
+                f"{log.name}: has no column {lacking}; expected time_s and the angle of each joint of the "
                 "model, because every joint's torque depends on the whole motion"
             )
-        return column, column_numbers(columns[column])
-
-    time, motion = numbers("time_s")[1], np.empty((3, len(log), len(chain.names)))
-    runs = np.array(column_texts(columns["run_id"]) if "run_id" in columns else [""] * len(log))
-    for k, name in enumerate(chain.names):
-        column, angle = numbers(*(f"{name}.{c}" for c in ANGLES))
-        angle = ANGLES[column.removeprefix(f"{name}.")] * angle
+        check_units(joint, [Column(ANGLE, c, units[c]) if c in units else None for c in joint.header])
+        time = column_numbers(columns["time_s"])
+        angle = math.radians(ANGLE.units[units[column]]) * column_numbers(columns[column])
+        runs = np.array(column_texts(columns["run_id"]) if "run_id" in columns else [""] * len(log))
         for run in np.unique(runs):
             rows = np.flatnonzero(runs == run)
             seen = rows[np.isfinite(angle[rows])]
             if len(seen) < FEWEST or not (np.diff(time[seen]) > 0).all():
                 raise BadData(
-                    f"{log.name}, {column}: has {len(seen)} readings in run {run or 1}; expected at least "
+                    f"{log.name}, {name}.{column}: has {len(seen)} readings in run {run or 1}; expected at least "
                     f"{FEWEST} with increasing time_s"
                 )
             motion[:, rows, k] = smoothed_motion(time[seen], angle[seen], time[rows], degree)
@@ -162,17 +182,22 @@ def runs_of_joints(log: NamedArrays, chain: Chain, robots: Mapping[str, Robot]) 
     runs = {}
     for name, robot in robots.items():
         k, (load,) = chain.names.index(name), robot.configurations.members
-        named = {h.removeprefix(f"{name}."): v for h, v in zip(log.header, log.values, strict=True)}
-        kept = {h: v for h, v in named.items() if not h.startswith(tuple(f"{n}." for n in chain.names))}
+        joint = columns_of_joint(log, name, chain.names)
         angle, speed, acceleration = motion[:, :, k]
-        stated = float(load.inertia) * acceleration + np.asarray(load.torque_load(angle))
+        known_torque = float(load.inertia) * acceleration + np.asarray(load.torque_load(angle))
         ratio = float(robot.gearbox.ratio)
         per_ampere = ratio * float(robot.gearbox.efficiency_load * robot.motor.torque_constant)
-        columns: dict[str, Raw] = {**kept, LOAD: torques[:, k] - stated, SPEED: speed * ratio / RPM}
-        if CURRENT in kept and SD not in kept:
-            columns[SD] = np.hypot(doubt[:, k] / per_ampere, noise_of(column_numbers(kept[CURRENT])))
-        arrays = NamedArrays(f"{log.name}, joint {name}", tuple(columns), tuple(columns.values()), digest=log.digest)
-        runs[name] = records.of_arrays(arrays, robot=robot)
+        columns = {LOAD: torques[:, k] - known_torque, SPEED: speed * ratio / RPM}
+        meanings = Layout.of(robot).meanings(joint.name, list(joint.header))
+        states_sd = any(m is not None and m.column == SD for m in meanings)
+        if not states_sd:
+            columns[SD] = np.maximum(doubt[:, k] / per_ampere, np.finfo(float).tiny)
+        table = records.of_arrays(joint.with_columns(columns), robot=robot)
+        (noise,) = estimate_noise(table, sizes := observer_kind(table).sizes(table))
+        if not states_sd and noise is not None:
+            sds = np.hypot(table[SD], noise.sd(sizes[:, 0]))
+            table = dataclasses.replace(table, columns={**table.columns, SD: sds})
+        runs[name] = table
     return runs
 
 
