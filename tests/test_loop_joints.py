@@ -109,7 +109,7 @@ def test_load_of_a_joint_is_that_torque_less_what_its_file_states(tmp_path):
         write(tmp_path, rows, noise)
         robot = read_rig(tmp_path, RIG + "torque_gravity = 0.3\nangle_zero = 0.2\n")
         chain, log = loop_joints.Chain(tmp_path / "arm.xml"), read_csv_columns(tmp_path / "log.csv", "log.csv")
-        runs = loop_joints.runs_of_joints(log, chain, {"elbow": robot})["elbow"]
+        runs = loop_joints.runs_of_joints(log, chain, {"elbow": robot})["elbow"].whole
         needed = chain.torques(motion)[:, 1]
         expected = needed - 0.05 * acceleration - 0.3 * np.sin(angle - 0.2)
         errors.append(np.abs(runs["load_torque_Nm"] - expected)[inner].max() / np.abs(needed).max())
