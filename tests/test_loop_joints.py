@@ -8,6 +8,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from calibration.data.delimited import read_csv_columns
+from calibration.data.input_errors import BadData
 from sweeps import store
 from sweeps.commands import loop_joints
 from tests.commands import ends, read_json, read_rig
@@ -108,12 +109,43 @@ def test_load_of_a_joint_is_that_torque_less_what_its_file_states(tmp_path):
         write(tmp_path, rows, noise)
         robot = read_rig(tmp_path, RIG + "torque_gravity = 0.3\nangle_zero = 0.2\n")
         chain, log = loop_joints.Chain(tmp_path / "arm.xml"), read_csv_columns(tmp_path / "log.csv", "log.csv")
-        runs = loop_joints.runs_of_joints(log, chain, {"elbow": robot})["elbow"]
+        runs = loop_joints.runs_of_joints(log, chain, {"elbow": robot})["elbow"].whole
         needed = chain.torques(motion)[:, 1]
         expected = needed - 0.05 * acceleration - 0.3 * np.sin(angle - 0.2)
         errors.append(np.abs(runs["load_torque_Nm"] - expected)[inner].max() / np.abs(needed).max())
         assert_allclose(runs["motor_speed_rpm"][inner], 50 * 30 / np.pi * speed[inner], atol=3)
     assert errors[0] < 1e-6 and 1e-4 < errors[1] < 0.02
+
+
+def test_units_of_a_log_reach_each_joint(tmp_path):
+    """In names of columns and in a row below them. The sd of a current is that of its noise, in any unit."""
+    rng, time = np.random.default_rng(2), np.arange(0, 2, 0.005)
+    smooth = np.column_stack([np.sin(2 * time), np.cos(3 * time)])
+    rows = np.column_stack(
+        [time, np.full((len(time), 2), 5.0), smooth + 0.01 * rng.standard_normal(smooth.shape), smooth]
+    )
+    write(tmp_path, rows)
+    header, *lines = (tmp_path / "log.csv").read_text().splitlines()
+    robots, chain = {"elbow": read_rig(tmp_path, RIG)}, loop_joints.Chain(tmp_path / "arm.xml")
+
+    def runs(units, header=header, lines=lines):
+        (tmp_path / "log.csv").write_text("\n".join([header, units, *lines]))
+        return loop_joints.runs_of_joints(read_csv_columns(tmp_path / "log.csv", "log.csv"), chain, robots)["elbow"]
+
+    table = runs("s,V,V,A,A,deg,deg")
+    assert any("contains units" in note for note in table.notes)
+    assert_allclose(np.median(table["motor_current_sd_A"]), 0.01, rtol=0.1)
+    milli = [
+        ",".join(x if k != 4 else f"{1e3 * float(x):.9g}" for k, x in enumerate(line.split(","))) for line in lines
+    ]
+    other = runs("s,V,V,A,mA,deg,deg", header.replace("elbow.motor_current_A", "elbow.motor_current_mA"), milli)
+    assert_allclose(other["motor_current_sd_A"], table["motor_current_sd_A"], rtol=1e-6)
+    for wrong, name in (
+        ("s,V,V,A,mA,deg,deg", "motor_current_A states mA"),
+        ("s,V,V,A,A,rad,deg", "output_angle_deg states rad"),
+    ):
+        with pytest.raises(BadData, match=f"{name} in the row of units"):
+            runs(wrong)
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -53,6 +54,16 @@ class NamedArrays:
         index = np.flatnonzero(kept)
         values = tuple(v[index] if isinstance(v, np.ndarray) else [v[k] for k in index] for v in self.values)
         return dataclasses.replace(self, values=values, notes=(*self.notes, f"{self.name}: {note}"))
+
+    def with_columns(self, columns: Mapping[str, np.ndarray]) -> NamedArrays:
+        """Copy with columns of numbers in addition to its own, or in place of those with the same name."""
+        kept = [k for k, column in enumerate(self.header) if column not in columns]
+        return dataclasses.replace(
+            self,
+            header=(*(self.header[k] for k in kept), *columns),
+            values=(*(self.values[k] for k in kept), *columns.values()),
+            units=(*(self.units[k] for k in kept), *[""] * len(columns)) if self.units else (),
+        )
 
     def row(self, index: int) -> str:
         """Label of a row in messages, by its index from 0."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 import warnings
@@ -10,15 +11,20 @@ from pathlib import Path
 
 import numpy as np
 from scipy.interpolate import UnivariateSpline
-from scipy.ndimage import uniform_filter1d
+from scipy.ndimage import maximum_filter1d
 
 from calibration.data import Names, delimited
 from calibration.data import runs as records
-from calibration.data.columns import CURRENT, LOAD, SPEED
+from calibration.data.column_names import check_units
+from calibration.data.columns import CURRENT, LOAD, SPEED, Column
 from calibration.data.input_errors import BadConfiguration, BadData, allowed_words
-from calibration.data.named_arrays import NamedArrays, Raw, column_numbers, column_texts
+from calibration.data.named_arrays import NamedArrays, column_numbers, column_texts
 from calibration.data.runs import Runs
 from calibration.data.sources import reading
+from calibration.data.thinning import thin_rows
+from calibration.inference.observers import observer_kind
+from calibration.inference.series_noise import estimate_noise
+from mmrjax.model import channels
 from mmrjax.model.quantities import RPM
 from mmrjax.model.robot import Robot
 from sweeps import config as configuration
@@ -30,12 +36,15 @@ from sweeps.inputs import load_robot
 from sweeps.report import catalogue
 from sweeps.report.document import Document
 
-#: Columns of a joint's angle, and their units [rad].
-ANGLES = {"output_angle_deg": math.pi / 180, "output_angle_rad": 1.0}
+ANGLE = channels.find_channel("output_angle")
 #: Stands for the name of a joint in the name of its robot's file.
 JOINT = "{joint}"
-#: Column of the current's sd, and rows over which that of the torque is averaged.
+#: Column of the current's sd, and rows within which the motion is as uncertain as in its worst row.
 SD, NEAR = "motor_current_sd_A", 21
+#: Smallest speed whose direction is certain, in errors of the speed.
+CERTAIN = 2.0
+#: Columns of the error of the torque [A] and of the smallest certain speed [rpm], while a joint's table is made.
+DOUBTS = ("error of torque", "least speed")
 #: Fewest readings of a run whose motion is smoothed.
 FEWEST = 12
 #: Median of the magnitude of sixth differences of white noise [sd].
@@ -89,66 +98,88 @@ class Chain:
         return needed
 
 
-def noise_of(readings: np.ndarray) -> float:
-    """Standard deviation of the noise of a slow signal, by its sixth differences."""
+def noise_of_angle(readings: np.ndarray) -> float:
+    """Standard deviation of the noise of an angle, by its sixth differences.
+
+    Second differences, as in `estimate_noise`, contain 0.1 mrad of the curvature of a log of 200 Hz.
+    """
     return float(np.nanmedian(np.abs(np.diff(readings, 6)))) / QUANTILE
 
 
-def smoothed_motion(time: np.ndarray, angle: np.ndarray, times: np.ndarray, degree: int) -> np.ndarray:
-    """Angle [rad], speed and acceleration at `times`, shape (3, times), by a spline that leaves the noise alone.
+def smoothed_motion(time: np.ndarray, angle: np.ndarray, times: np.ndarray, degree: int) -> tuple[np.ndarray, int]:
+    """Angle [rad], speed and acceleration at `times`, shape (3, times), by a spline that leaves the noise alone, and
+    the number of its knots.
 
     It has the fewest knots with which readings are off by their noise, at least that of the display's step if most
     readings repeat others. At a jump of the torque, knots crowd, so that the acceleration jumps within a few samples.
     """
-    noise, steps = noise_of(angle), np.diff(np.unique(np.round(angle, 9)))
+    noise, steps = noise_of_angle(angle), np.diff(np.unique(np.round(angle, 9)))
     if 0 < len(steps) < len(angle) / 2:
         noise = max(noise, steps.min() / math.sqrt(12))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # that more knots would be needed, for readings without noise
         curve = UnivariateSpline(time, angle, k=degree, s=len(time) * noise**2)
-    return np.stack([curve(times), curve.derivative(1)(times), curve.derivative(2)(times)])
+    motion = np.stack([curve(times), curve.derivative(1)(times), curve.derivative(2)(times)])
+    return motion, len(curve.get_knots())
 
 
-def smoothed_log(log: NamedArrays, chain: Chain, degree: int = 5) -> np.ndarray:
-    """Motion of all joints at each row of a log, shape (3, rows, joints), by splines of a degree.
+def columns_of_joint(log: NamedArrays, joint: str, joints: Names) -> NamedArrays:
+    """Columns of a log that are a joint's, without its name, and those of no joint."""
+    others = tuple(f"{name}." for name in joints if name != joint)
+    kept = [k for k, column in enumerate(log.header) if not column.startswith(others)]
+    return dataclasses.replace(
+        log,
+        name=f"{log.name}, joint {joint}",
+        header=tuple(log.header[k].removeprefix(f"{joint}.") for k in kept),
+        values=tuple(log.values[k] for k in kept),
+        units=tuple(log.units[k] for k in kept if log.units),
+    )
+
+
+def smoothed_log(log: NamedArrays, chain: Chain, degree: int = 5) -> tuple[np.ndarray, int]:
+    """Motion of all joints at each row of a log, shape (3, rows, joints), by splines of a degree, and the largest
+    number of knots of a joint.
 
     Raises:
-        BadData: the log has no `time_s`, lacks the angle of a joint, or has too few readings of it in a run.
+        BadData: the log has no `time_s`, lacks the angle of a joint, or has too few readings of it in a run. As
+            `check_units`.
     """
-    columns = dict(zip(log.header, log.values, strict=True))
-
-    def numbers(*names: str) -> tuple[str, np.ndarray]:
-        column = next((c for c in names if c in columns), None)
-        if column is None:
+    motion, knots = np.empty((3, len(log), len(chain.names))), np.zeros(len(chain.names), int)
+    for k, name in enumerate(chain.names):
+        joint = columns_of_joint(log, name, chain.names)
+        columns, units = dict(zip(joint.header, joint.values, strict=True)), ANGLE.columns()
+        column = next((c for c in units if c in columns), None)
+        if column is None or "time_s" not in columns:
+            lacking = "time_s" if column else " or ".join(f"{name}.{c}" for c in units)
             raise BadData(
-                f"{log.name}: has no column {' or '.join(names)}; expected time_s and the angle of each joint of the "
+                f"{log.name}: has no column {lacking}; expected time_s and the angle of each joint of the "
                 "model, because every joint's torque depends on the whole motion"
             )
-        return column, column_numbers(columns[column])
-
-    time, motion = numbers("time_s")[1], np.empty((3, len(log), len(chain.names)))
-    runs = np.array(column_texts(columns["run_id"]) if "run_id" in columns else [""] * len(log))
-    for k, name in enumerate(chain.names):
-        column, angle = numbers(*(f"{name}.{c}" for c in ANGLES))
-        angle = ANGLES[column.removeprefix(f"{name}.")] * angle
+        check_units(joint, [Column(ANGLE, c, units[c]) if c in units else None for c in joint.header])
+        time = column_numbers(columns["time_s"])
+        angle = math.radians(ANGLE.units[units[column]]) * column_numbers(columns[column])
+        runs = np.array(column_texts(columns["run_id"]) if "run_id" in columns else [""] * len(log))
         for run in np.unique(runs):
             rows = np.flatnonzero(runs == run)
             seen = rows[np.isfinite(angle[rows])]
             if len(seen) < FEWEST or not (np.diff(time[seen]) > 0).all():
                 raise BadData(
-                    f"{log.name}, {column}: has {len(seen)} readings in run {run or 1}; expected at least "
+                    f"{log.name}, {name}.{column}: has {len(seen)} readings in run {run or 1}; expected at least "
                     f"{FEWEST} with increasing time_s"
                 )
-            motion[:, rows, k] = smoothed_motion(time[seen], angle[seen], time[rows], degree)
-    return motion
+            motion[:, rows, k], more = smoothed_motion(time[seen], angle[seen], time[rows], degree)
+            knots[k] += more
+    return motion, int(knots.max())
 
 
 def runs_of_joints(log: NamedArrays, chain: Chain, robots: Mapping[str, Robot]) -> dict[str, Runs]:
     """Runs of each joint, with the torque of the rest of the model as the torque of its load.
 
     It is what the model needs less the inertia and the weight that the joint's file states. The motor speed is
-    that of the smoothed motion. Its torque is less exact where the torque jumps, by about its difference from that of
-    cubic splines. Unless the log states the current's sd, it has twice this share, as neighbouring rows err alike.
+    that of the smoothed motion. Both err most where the torque jumps, by about their difference from those of cubic
+    splines, alike in the rows between two knots. This error of the torque is part of the current's sd, unless the log
+    states it. If it exceeds the current's noise, one row for each knot is used. Readings are left out where the
+    direction of the speed is uncertain, because the friction of a wrong direction would count as an error.
 
     Args:
         robots: robot of each joint, by the joint's name.
@@ -156,23 +187,37 @@ def runs_of_joints(log: NamedArrays, chain: Chain, robots: Mapping[str, Robot]) 
     Raises:
         BadData: as `smoothed_log` and `records.runs_of_arrays`.
     """
-    motion = smoothed_log(log, chain)
-    torques, cubic = (chain.torques(x) for x in (motion, smoothed_log(log, chain, 3)))
-    doubt = 2 * np.sqrt(uniform_filter1d((torques - cubic) ** 2, NEAR, axis=0))
+    (motion, knots), (cubic, _) = (smoothed_log(log, chain, degree) for degree in (5, 3))
+    torques, cubic_torques = chain.torques(motion), chain.torques(cubic)
+    doubts = [maximum_filter1d(np.abs(x), NEAR, axis=0) for x in (torques - cubic_torques, motion[1] - cubic[1])]
     runs = {}
     for name, robot in robots.items():
         k, (load,) = chain.names.index(name), robot.configurations.members
-        named = {h.removeprefix(f"{name}."): v for h, v in zip(log.header, log.values, strict=True)}
-        kept = {h: v for h, v in named.items() if not h.startswith(tuple(f"{n}." for n in chain.names))}
+        joint = columns_of_joint(log, name, chain.names)
         angle, speed, acceleration = motion[:, :, k]
-        stated = float(load.inertia) * acceleration + np.asarray(load.torque_load(angle))
+        known_torque = float(load.inertia) * acceleration + np.asarray(load.torque_load(angle))
         ratio = float(robot.gearbox.ratio)
         per_ampere = ratio * float(robot.gearbox.efficiency_load * robot.motor.torque_constant)
-        columns: dict[str, Raw] = {**kept, LOAD: torques[:, k] - stated, SPEED: speed * ratio / RPM}
-        if CURRENT in kept and SD not in kept:
-            columns[SD] = np.hypot(doubt[:, k] / per_ampere, noise_of(column_numbers(kept[CURRENT])))
-        arrays = NamedArrays(f"{log.name}, joint {name}", tuple(columns), tuple(columns.values()), digest=log.digest)
-        runs[name] = records.runs_of_arrays(arrays, robot=robot)
+        columns = {
+            LOAD: torques[:, k] - known_torque,
+            SPEED: speed * ratio / RPM,
+            **{DOUBTS[0]: doubts[0][:, k] / per_ampere, DOUBTS[1]: CERTAIN * doubts[1][:, k] * ratio / RPM},
+        }
+        table = records.runs_of_arrays(joint.with_columns(columns), robot=robot)
+        doubt, least = (table.extras[c] for c in DOUBTS)
+        (noise,) = estimate_noise(table, sizes := observer_kind(table).sizes(table))
+        noise_sd = np.zeros(len(table)) if noise is None else noise.sd(sizes[:, 0])
+        certain = np.abs(table[SPEED]) > least
+        columns = {SD: np.hypot(doubt, noise_sd), **table.columns, CURRENT: np.where(certain, table[CURRENT], np.nan)}
+        note = f"{joint.name}: {np.sum(~certain)} of {len(table)} readings of the current are left out, because the "
+        table = dataclasses.replace(
+            table,
+            columns=columns,
+            unknown=tuple(c for c in table.unknown if c not in DOUBTS),
+            extras={c: x for c, x in table.extras.items() if c not in DOUBTS},
+            notes=(*table.notes, f"{note}direction of the speed is uncertain"),
+        )
+        runs[name] = thin_rows(table, knots) if np.median(doubt) > np.median(noise_sd) else table
     return runs
 
 
