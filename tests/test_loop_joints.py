@@ -148,6 +148,20 @@ def test_units_of_a_log_reach_each_joint(tmp_path):
             runs(wrong)
 
 
+def test_current_is_left_out_where_the_direction_of_the_smoothed_speed_is_uncertain(tmp_path):
+    """A reading of friction with the wrong sign looks like a missing effect."""
+    rows = arm(2.0)
+    write(tmp_path, rows, 3e-4)
+    robots, chain = {"elbow": read_rig(tmp_path, RIG)}, loop_joints.Chain(tmp_path / "arm.xml")
+    log = read_csv_columns(tmp_path / "log.csv", "log.csv")
+    table = loop_joints.runs_of_joints(log, chain, robots)["elbow"]
+    true_speed = np.interp(table["time_s"], rows[:, 0], rows[:, 8])
+    wrong = np.sign(table["motor_speed_rpm"]) != np.sign(true_speed)
+    kept = np.isfinite(table["motor_current_A"])
+    assert np.sum(wrong) > 5 and np.sum(wrong & kept) <= 0.2 * np.sum(wrong) and np.mean(kept) > 0.5
+    assert any("direction of the speed is uncertain" in note for note in table.notes)
+
+
 @pytest.mark.parametrize(
     ("old", "new", "joints", "message"),
     [
