@@ -120,7 +120,7 @@ def statuses() -> str:
         "Files of a run folder": {name: _sentence(meaning) for name, meaning in words.FILES.items()},
     }
     opening = (
-        "Every run has one status and any number of flags; `runs.csv` has a column for each. A run that stalls or "
+        "Every run has one status and any number of flags. They are in the columns `status` and `flags` of `runs.csv`. A run that stalls or "
         "slides is an answer, with [exit code](exit-codes.md) 0."
     )
     tables = [f"## {heading}\n\n" + _table(("name", "meaning"), _named(rows)) for heading, rows in parts.items()]

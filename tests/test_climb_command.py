@@ -98,7 +98,7 @@ FILES = {
     ),
     "metres": (
         "x_mm,z_mm\n0,0\n0.3,0.12\n",
-        r"is 0\.3 mm large; expected at least 1 mm; is the file in metres\? Name",
+        r"is 0\.3 mm large; expected at least 1 mm; is the file in metres\? Then name",
     ),
     "too large in millimetres": ("x_mm,z_mm\n0,0\n3e6,120\n", r"is 3000 m large; expected at most 50 m$"),
     "a wall that goes back": (

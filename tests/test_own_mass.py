@@ -16,7 +16,7 @@ from calibration.data.input_errors import BadConfiguration, BadData
 from calibration.discovery import discover, findings
 from calibration.discovery.candidates import Candidate, fill_slots
 from calibration.inference.calibration import calibrate
-from calibration.inference.linearization import shape_at, shape_of, shape_scales
+from calibration.inference.linearization import shape_of, shape_parameter_at, shape_scales
 from calibration.inference.observers import SettledRuns
 from calibration.inference.optimizers import observe_robot
 from mmrjax.effects import ALL, BY_NAME, UNNAMED
@@ -123,7 +123,7 @@ def test_robot_that_the_loop_writes_is_the_one_that_it_fitted(name, fits):
 def test_shape_that_a_fit_reaches_is_one_that_a_file_may_state(effect):
     shape = shape_of(effect())
     z = np.linspace(-6.0, 6.0, 61)
-    value = np.asarray(shape_at(shape_scales(shape), jnp.asarray(z)))
+    value = np.asarray(shape_parameter_at(shape_scales(shape), jnp.asarray(z)))
     low, high = shape.spec.bounds
     assert low <= value.min() and value.max() <= high
     if shape.name == "phase":

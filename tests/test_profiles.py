@@ -33,7 +33,7 @@ def read(tmp_path):
 def test_packaged_profile_is_read_by_its_name_and_makes_a_profile(name):
     table = profiles.read_profile(name)
     made = table.profile(paper_robots.nominal(), Conditions(configuration=np.array([0, 1])))
-    assert (made.segments, made.cycles, made.linear) == (table.segments, table.cycles, table.linear)
+    assert (made.segment_count, made.cycles, made.linear) == (table.segment_count, table.cycles, table.linear)
     assert float(made.duration) == pytest.approx(table.duration)
     assert tuple(MODES[k] for k in made.mode) == table.modes
 

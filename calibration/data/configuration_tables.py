@@ -1,4 +1,4 @@
-"""Configurations from the tables of a robot file: their names, and the values from which each starts."""
+"""Configurations from the tables of a robot file, with their names and starting values."""
 
 from __future__ import annotations
 

@@ -109,7 +109,7 @@ class ProfileTable:
         return Start(**self.begins) if self.begins else None
 
     @property
-    def segments(self) -> int:
+    def segment_count(self) -> int:
         """Number of segments of one cycle."""
         return len(self.time) - 1
 

@@ -17,8 +17,8 @@ from calibration.data.effect_file import Library
 from calibration.inference.linearization import (
     ScoredEffect,
     amplitude_of,
-    shape_at,
     shape_of,
+    shape_parameter_at,
     shape_scales,
     with_shape_grid,
 )
@@ -89,7 +89,7 @@ def _scaled_parts(space: ActiveSet, z: Array) -> tuple[Array, tuple[Array, ...],
     base, amplitude, shape = space.parts(z)
     held_vector = space.held()
     amplitudes = space.sd * (amplitude @ held_vector)
-    shapes = shape_at(space.scales, shape @ held_vector)
+    shapes = shape_parameter_at(space.scales, shape @ held_vector)
     return base, params.split_numbers(amplitudes), params.split_numbers(shapes)
 
 

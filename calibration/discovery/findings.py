@@ -47,8 +47,8 @@ from calibration.inference.identifiability import held_by_prior
 from calibration.inference.linearization import (
     amplitude_of,
     amplitude_unit,
-    shape_at,
     shape_of,
+    shape_parameter_at,
     shape_scales,
 )
 from calibration.inference.problem import Observation, Problem
@@ -123,7 +123,7 @@ def _effect_parameters(
     return values
 
 
-_shaped = jax.jit(jax.value_and_grad(shape_at, argnums=1))
+_shaped = jax.jit(jax.value_and_grad(shape_parameter_at, argnums=1))
 
 
 def _class_member(space: CandidateSpace, best: Candidate, found: Classes, slot: int, name: str) -> ClassMember:

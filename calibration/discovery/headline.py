@@ -1,4 +1,4 @@
-"""The main claim of a result: the most detailed one that holds at every noise level tried."""
+"""The main claim of a result. It holds for every noise level of the run."""
 
 from __future__ import annotations
 

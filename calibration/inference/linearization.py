@@ -64,7 +64,7 @@ def shape_scales(shape: Parameter | None) -> tuple[float, float, float, float, f
     """Scales (value, spread, sd, low, high) of a shape parameter. At coordinate z it is value · exp(spread · z) + sd
     · z.
 
-    A phase is shifted (sd), other parameters are multiplied (spread). `shape_at` applies the bounds.
+    A phase is shifted (sd), other parameters are multiplied (spread). `shape_parameter_at` applies the bounds.
     """
     if shape is None:
         return 1.0, 0.0, 0.0, -math.inf, math.inf
@@ -74,7 +74,7 @@ def shape_scales(shape: Parameter | None) -> tuple[float, float, float, float, f
     return float(shape.value), math.sqrt(math.log1p((shape.spec.relative_sd or 0.0) ** 2)), 0.0, low, high
 
 
-def shape_at(scales: Scales, z: Array) -> Array:
+def shape_parameter_at(scales: Scales, z: Array) -> Array:
     """Shape parameter at coordinate z, within the bounds of its field. `scales` is from `shape_scales`.
 
     A phase is wrapped by whole turns. Other parameters are clipped.
@@ -126,10 +126,10 @@ def with_shape_grid(effect: Effect, grid: Sequence[float] = GRID) -> ScoredEffec
         return ScoredEffect(unit, "", (0.0,), jnp.zeros(0))
     grid = TURN if _is_phase(shape) else grid
     scales = [np.asarray(x) for x in shape_scales(shape)]
-    return ScoredEffect(unit, shape.name, tuple(grid), _shape_at(tuple(scales), np.asarray(grid)))
+    return ScoredEffect(unit, shape.name, tuple(grid), _shape_parameter_at(tuple(scales), np.asarray(grid)))
 
 
-_shape_at: Callable[..., Array] = compiled(shape_at)
+_shape_parameter_at: Callable[..., Array] = compiled(shape_parameter_at)
 
 
 def with_shape_of_robot(robot: Robot, scored: ScoredEffect) -> ScoredEffect:

@@ -1,4 +1,4 @@
-"""Check of the stated sds: the factor by which residuals without structure exceed them."""
+"""Check of the stated sds against the scatter of residuals without structure."""
 
 from __future__ import annotations
 

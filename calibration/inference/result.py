@@ -178,7 +178,7 @@ class BlockErrors:
 
     Attributes:
         errors: errors of its rows.
-        unreachable_rows: numbers of the rows that the fit without it does not reach, counted from 1.
+        unreachable_rows: numbers of the block's rows without a prediction, counted from 1.
         converged: True if the fit without it converged.
     """
 

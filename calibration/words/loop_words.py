@@ -233,7 +233,7 @@ def _level(variable: str, x: float) -> str:
 
 
 def brief_verdict(said: loop_notes.VerdictSummary) -> str:
-    """A verdict, and the effects in the model by their leaders."""
+    """Verdict, families of a mechanism, and the first name of each effect, marked established or tentative."""
     phrases = []
     if said.verdict == "mechanism" and said.mechanism is not None:
         phrases.append(" or ".join(said.mechanism.families))

@@ -63,7 +63,7 @@ def step_sentence(name: str, about: tuple[object, ...]) -> str:
 
 
 def expected_time(text: str, seconds: float) -> float | None:
-    """Time that a loop is expected to take yet, by what the stages before took [s], None where that is not known.
+    """Expected remaining time of a loop [s], from the time of its earlier stages. None if it is unknown.
 
     Args:
         text: line of a stage that begins.

@@ -494,16 +494,16 @@ def advance_climb(
         grip=jnp.sum(jnp.abs(pulled.force) * touching.rolls) / jnp.maximum(held, 1e-9),
         carried=total / (GRAVITY * matrix[0, 0]),
         centre=centre,
-        base=_contact_ends(centre, touching),
+        base=_distances_to_outermost_contacts(centre, touching),
     )
     return after, spent, passed
 
 
-def _contact_ends(centre: Scalar, at: Footing) -> Pair:
+def _distances_to_outermost_contacts(centre_of_mass: Scalar, at: Footing) -> Pair:
     """Distances from the centre of mass to the outermost contacts behind and ahead [m], measured along level
     ground.
     """
-    bears, ahead = at.force > 0, at.place - centre
+    bears, ahead = at.force > 0, at.place - centre_of_mass
     return jnp.stack([jnp.max(jnp.where(bears, way, -jnp.inf)) for way in (-ahead, ahead)])
 
 

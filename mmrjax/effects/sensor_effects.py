@@ -85,7 +85,7 @@ class EncoderScale(SensorEffect):
 class SpeedGain(SensorEffect):
     """ΔV = a V in the reading.
 
-    The measured distance over which the robot is timed is wrong.
+    The distance of the timed travel was measured wrongly.
 
     Source: speed as distance over time (Section 4 of the paper): the relative errors of both add.
     """

@@ -257,7 +257,7 @@ class DirectionalViscous(TrackEffect):
     needs_reverse = True
 
     amplitude: Scalar = amplitude(
-        "N·m·s", "viscous loss forward beyond the mean of both directions", (-0.05, 0.05),
+        "N·m·s", "viscous loss in forward rotation minus the mean of both directions", (-0.05, 0.05),
         "a third of the viscous loss of Table 3", sd=5e-3,
     )  # fmt: skip
 

@@ -248,7 +248,7 @@ def mission(
         carry = c._replace(peaks=jnp.maximum(carry.peaks, c.peaks), flags=carry.flags | ended.flags)
         return carry, ended
 
-    order = jnp.tile(jnp.arange(profile.segments), profile.cycles)
+    order = jnp.tile(jnp.arange(profile.segment_count), profile.cycles)
     c, each = jax.lax.scan(run_segment, _initial_carry(law, robot, conditions, begin, nothing, keep), order)
     return _assemble_mission(law, robot, conditions, profile, c, each)
 
@@ -321,7 +321,7 @@ def _assemble_mission(
     law: MotionLaw, robot: Robot, conditions: Conditions, profile: Profile, c: IntegrationState, ends: _SegmentEnd
 ) -> Mission:
     """Mission from its last state `c` and the ends of its segments, shape (cycles · segments, ...)."""
-    shape = (profile.cycles, profile.segments)
+    shape = (profile.cycles, profile.segment_count)
     totals = {n: ends.q[:, i].reshape(shape) for i, n in enumerate(law.TOTALS)}
     each = Totals(ends.time.reshape(shape), totals, ends.rise.reshape(shape), ends.given.reshape(shape))
     total, status = jax.tree.map(jnp.sum, each), ends.status
@@ -378,7 +378,9 @@ def _recorded_course(
     }
 
     def signals(y: Array, stands: Array, k: Array) -> Signals:
-        return balances.signals_of(law.instant(robot, conditions, profile.row(k % profile.segments), y, stands)[0])
+        return balances.signals_of(
+            law.instant(robot, conditions, profile.row(k % profile.segment_count), y, stands)[0]
+        )
 
     every = law.at_places(jax.vmap(signals)(ys, stood, segment), so_far)
     winding, housing = _winding_and_housing_temperatures(law, ys)

@@ -188,7 +188,7 @@ def simulate_in_parts(
 
 
 def _step_capacity(profile: Profile) -> int:
-    return min(MOST_KEPT, max(LEAST_KEPT, _next_power(ROOM * profile.segments * profile.cycles)))
+    return min(MOST_KEPT, max(LEAST_KEPT, _next_power(ROOM * profile.segment_count * profile.cycles)))
 
 
 def _next_power(count: int) -> int:

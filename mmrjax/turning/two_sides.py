@@ -61,7 +61,7 @@ class Turning(eqx.Module):
     """
 
     width: Scalar = parameter(
-        0.243, "m", "distance B of the contact lines of left and right side", (0.0, 5.0),
+        0.243, "m", "distance B between the contact lines of the left and right sides", (0.0, 5.0),
         f"middle of {BETWEEN:g} and {OVER:g} m, the widths between and over the tracks (Table 6: B_b, B_T)", sd=0.012,
     )  # fmt: skip
     lateral: Scalar = parameter(

@@ -393,6 +393,7 @@ def group_resonances(found: Sequence[RipplePeak]) -> list[Resonance]:
 
 
 def strongest_resonances(found: Sequence[Resonance]) -> list[Resonance]:
-    """Resonances to avoid: for each signal, all whose rise is at least half of the largest (to 1 %)."""
+    """Resonances to avoid: for each signal, all whose ripple is at least 1 % and whose rise is at least half of the
+    largest."""
     largest = {s: max((r.rise for r in found if r.signal == s), default=0.0) for s in SIGNALS}
     return [r for r in found if r.rise >= largest[r.signal] / 2 and r.ripple >= MATTERS]

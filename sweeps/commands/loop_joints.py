@@ -149,8 +149,9 @@ def smoothed_log(log: NamedArrays, chain: Chain, degree: int = 5) -> tuple[np.nd
         joint = columns_of_joint(log, name, chain.names)
         columns, units = dict(zip(joint.header, joint.values, strict=True)), ANGLE.columns()
         column = next((c for c in units if c in columns), None)
-        if column is None or "time_s" not in columns:
-            lacking = "time_s" if column else " or ".join(f"{name}.{c}" for c in units)
+        needed = {" or ".join(f"{name}.{c}" for c in units): column, "time_s": columns.get("time_s")}
+        lacking = next((names for names, kept in needed.items() if kept is None), None)
+        if column is None or lacking is not None:
             raise BadData(
                 f"{log.name}: has no column {lacking}; expected time_s and the angle of each joint of the "
                 "model, because every joint's torque depends on the whole motion"

@@ -317,7 +317,7 @@ def _course_rows(
         reading = balances.sensor(robot, signals)
     # What the profile demands acts this much later than its rows say, and all that is written beside it with it.
     late = float(robot.rig.delay)
-    segment = course.segment % source.segments
+    segment = course.segment % source.segment_count
     length = np.asarray(found.segments.time[k]).ravel()
     elapsed = course.time - (np.cumsum(length) - length)[course.segment]
     which = int(np.asarray(conditions.configuration)[k])
@@ -352,7 +352,7 @@ def _course_rows(
         "housing_temperature_C": housing,
         "energy_Wh": course.energy / quantities.SIZES["Wh"],
         "state_of_charge": left if battery else np.full(len(picked), np.nan),
-        "cycle": course.segment // source.segments + 1,
+        "cycle": course.segment // source.segment_count + 1,
         "segment": segment + 1,
         **of_sides,
         "event": np.array([*MARKS, ""])[course.event],

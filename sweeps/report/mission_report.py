@@ -50,7 +50,7 @@ class Missions:
         each = [self._one(k) for k in range(len(self.table["status"]))]
         about = {
             "name": self.source.source, "sha256": self.source.digest, "duration_s": self.source.duration,
-            "segments": self.source.segments, "cycles": self.source.cycles,
+            "segments": self.source.segment_count, "cycles": self.source.cycles,
             "between_rows": profiles.BETWEEN[self.source.linear],
         }  # fmt: skip
         return {"profile": about, **(each[0] if len(each) == 1 else {"missions": each})}
@@ -94,7 +94,7 @@ def missions_document(file: RobotFile, found: Missions) -> Document:
     cycles, each = (f", {source.cycles} cycles", " each") if source.cycles > 1 else ("", "")
     between = "linear" if source.linear else "held"
     lead = (
-        f"Profile **{source.source}**: {source.duration:g} s{cycles}, {count_noun(source.segments, 'segment')}"
+        f"Profile **{source.source}**: {source.duration:g} s{cycles}, {count_noun(source.segment_count, 'segment')}"
         f"{each}, values {between} between rows; fed by its {fed}."
     )
     detail = f"In detail the first of {len(names)} runs: **{names[0]}**." if len(names) > 1 else ""
@@ -232,7 +232,7 @@ def _segments(found: Missions, name: str, idle: set[str]) -> Table:
     totals = [c for c in shown_columns if c != "rms_current_A"] if many else []
     rows = {key: value[found.segments["run_id"] == name] for key, value in found.segments.items()}
     whole, answer = float(np.sum(rows["energy_Wh"])), []
-    for k in range(min(source.segments, SEGMENTS)):
+    for k in range(min(source.segment_count, SEGMENTS)):
         segment_rows = {key: value[rows["segment"] == k + 1] for key, value in rows.items()}
         if not len(segment_rows["status"]):
             continue

@@ -151,7 +151,7 @@ def find_signal(signals: Sequence[Signal], name: str, where: str) -> Signal:
 
 
 def suggested_paths(name: str, paths: Sequence[str]) -> str:
-    """Paths that a message offers for an unknown name: near ones, else the first."""
+    """Hint for an unknown name: up to three similar paths, otherwise the first `LISTED` paths."""
     close = similar_words(name, paths, 3)
     if close:
         return f"did you mean {', '.join(close)}?"
