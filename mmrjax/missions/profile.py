@@ -84,7 +84,7 @@ class Profile(eqx.Module):
     cycles: int = eqx.field(default=1, static=True)
 
     @property
-    def segments(self) -> int:
+    def segment_count(self) -> int:
         """Number of segments of one cycle."""
         return self.time.shape[-1] - 1
 

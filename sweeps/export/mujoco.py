@@ -515,7 +515,7 @@ def attribute_notes(
     return {
         "gear": f"ratio motor to joint [-]; {made_of('gearbox.ratio')}",
         "motorconst": f"[N·m/A] = [V·s/rad]; {made_of('motor.torque_constant')}{fitted(CONSTANT)}",
-        "resistance": "[ohm], winding resistance plus resistances in series with it, divided by the gearbox's efficiency; "
+        "resistance": "[ohm], resistance of winding and leads, divided by the gearbox's efficiency; "
         + made_of("motor.resistance", "gearbox.efficiency_load", *effects("series_resistance", "supply_sag"))
         + fitted(RESISTANCE),
         "inductance": f"[H], likewise; {made_of('motor.inductance', *effects('armature_inductance'))}",
