@@ -121,7 +121,7 @@ def statuses() -> str:
     }
     opening = (
         "Every run has one status and any number of flags. They are in the columns `status` and `flags` of `runs.csv`. A run that stalls or "
-        "slides is an answer, with [exit code](exit-codes.md) 0."
+        "slides is a valid result, with [exit code](exit-codes.md) 0."
     )
     tables = [f"## {heading}\n\n" + _table(("name", "meaning"), _named(rows)) for heading, rows in parts.items()]
     return "\n\n".join(["# Statuses, flags, verdicts and files", opening, MADE, *tables]) + "\n"

@@ -237,11 +237,11 @@ class Folder:
             (self.results() / name).write_bytes(content)
 
     def write_json(self, name: str, content: Json) -> None:
-        """Write a JSON file. What is not finite becomes null."""
+        """Write a JSON file. Numbers that are not finite become null."""
         writing.write_json(self.results() / name, content)
 
     def write_table(self, name: str, columns: Columns) -> None:
-        """Write a table as CSV, and as Parquet too where asked. What is not finite is an empty cell."""
+        """Write a table as CSV, and as Parquet too where asked. Numbers that are not finite become empty cells."""
         writing.write_table(self.results() / name, columns, self.tables)
 
     def finish(self, manifest: Json, runs: Runs | None = None) -> Path:

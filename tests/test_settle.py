@@ -576,9 +576,7 @@ def test_a_log_with_few_settled_runs_is_given_to_the_loop_itself(tmp_path):
     )
     every = [settling.Stretch("", np.arange(9), 0.0, 1.0, 6.0, why) for why in settling.REASONS]
     told = {row[0]: row[-1] for row in words.left_out(every, few=True)}
-    assert {told[words.WHY[why][0]] for why in words.OF_LEVELS} == {
-        "nothing: a fit to the log as it is uses these samples"
-    }
+    assert {told[words.WHY[why][0]] for why in words.OF_LEVELS} == {"nothing: a fit to the log uses these samples"}
     assert told[words.WHY["stuck"][0]] == words.WHY["stuck"][1]
 
 

@@ -130,7 +130,7 @@ def test_scheduler_without_workers_is_refused(tmp_path, monkeypatch):
     alone = Cluster(tmp_path / "cluster", 0)
     monkeypatch.setattr(cluster, "ANSWER", 3.0)
     try:
-        with pytest.raises(BadConfiguration, match=r"has no workers; start one for each device, as dask worker tcp"):
+        with pytest.raises(BadConfiguration, match=r"has no workers; start one for each device: `dask worker tcp"):
             connect_when_up(alone.address)
     finally:
         alone.close()

@@ -90,7 +90,9 @@ def test_mp4_is_written(scenes, tmp_path):
 def test_what_cannot_be_written_is_refused(scenes, tmp_path, name, begin, message):
     with pytest.raises(ValueError, match=message):
         render(scenes(0), tmp_path / name, begin=begin)
-    with pytest.raises(ValueError, match=r"end: got 0.02 s for robot.png, a picture at time begin; remove it"):
+    with pytest.raises(
+        ValueError, match=r"end: got 0.02 s for robot.png; a PNG shows only the time `begin`; leave `end` out"
+    ):
         render(scenes(0), tmp_path / "robot.png", end=0.02)
 
 

@@ -67,7 +67,7 @@ def drop_computed_torques(runs: Runs, robot: Robot) -> Runs:
 
 
 def _load_for_current(runs: Runs, robot: Robot, channel: str, current: np.ndarray) -> np.ndarray:
-    """Load torque in each row at which the robot draws the measured current [N·m].
+    """Load torque in each row that makes the robot draw the measured current [N·m].
 
     Raises:
         BadData: no load gives this current in a row.

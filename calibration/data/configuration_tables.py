@@ -259,7 +259,7 @@ def _blank_chassis(pattern: Chassis, on_tracks: float, table: Mapping[str, Any],
 
 
 def _parameter_defaults(component: eqx.Module, prefix: str = "") -> Iterator[tuple[str, float | None]]:
-    """Default of every parameter of a component, None if there is none."""
+    """Default of every parameter of a component, or None."""
     for field in dataclasses.fields(component):
         value = getattr(component, field.name)
         if "spec" in field.metadata:

@@ -36,7 +36,7 @@ class SignalFacts:
         refused: reason why it cannot be read.
         rate: sampling rate [Hz], NaN without a clock.
         gaps: number of steps longer than `GAP` usual ones, NaN without a clock.
-        least, greatest: smallest and largest number, NaN if there is none.
+        least, greatest: smallest and largest number, or NaN.
         missing: number of samples without a number.
         words: some of its words, if its samples are words.
         clock: name of its clock.

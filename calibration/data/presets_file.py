@@ -47,7 +47,7 @@ class PresetColumn:
 
     Attributes:
         mine: name of the column in this program.
-        theirs: possible names in the file, `*` for any text. The first one that the file has is read.
+        theirs: possible names in the file, `*` for any text. The first name in the file is used.
         factor: factor from its unit to the unit of `mine`.
         note: its meaning, for a note to the user.
         needs: column of this program without which it does not describe what drives the motor. Empty: none.
@@ -86,7 +86,7 @@ class Preset:
         """Columns of a source in the form of `Layout.mapped`, and notes on their meaning.
 
         Args:
-            found: function that returns the source column with a name, None if there is none.
+            found: function that returns the source column with a name, or None.
             has_readings: function that returns False for an empty source column.
         """
         mapped, notes = [], []

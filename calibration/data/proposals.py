@@ -215,7 +215,7 @@ def _path_words(path: str) -> str:
 
 
 def _stated_unit(signal: Signal, known: set[str]) -> str | None:
-    """Unit stated by the metadata or the name of a signal, None if there is none."""
+    """Unit stated by the metadata or the name of a signal, or None."""
     if signal.unit:
         return quantities.unit_in_column(signal.unit.strip("[]()"))
     if brackets := re.search(r"[\[(]([^\])]*[^\])\d][^\])]*)[\])]\s*$", signal.path):

@@ -37,7 +37,7 @@ class DerivedFact:
     Attributes:
         what: meaning, in words.
         value: value with its unit, as text.
-        odd: reason to check the numbers, empty if there is none.
+        odd: reason to check the numbers, or empty.
     """
 
     what: str

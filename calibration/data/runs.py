@@ -99,7 +99,7 @@ def read_runs(
     if not known and (name := presets_file.recognise_preset(arrays.header)):
         numbers_asked = "".join(f",{key}=..." for key in presets_file.numbers_to_state(name))
         raise BadData(
-            f"{arrays.name}: has no column with a known name, but columns of {name}; add --columns "
+            f"{arrays.name}: has no column with a known name, but its columns match the preset {name}; add --columns "
             f'{name}{numbers_asked}, in Python columns="{name}{numbers_asked}"'
         )
     return runs_of_arrays(arrays, measured=measured, battery=battery, robot=robot, of_turns=of_turns, mapped=mapped)

@@ -347,7 +347,7 @@ def prepare_loop(
 
 @dataclasses.dataclass(frozen=True)
 class VerdictNoise:
-    """Noise on which a verdict is based.
+    """Noise behind a verdict.
 
     Attributes:
         noise: noise of the readings.
@@ -368,7 +368,7 @@ class LoopStages:
         verdict: `none`, `named`, `class`, `mechanism`, `place` or `undescribed`.
         screened: base fit without outliers.
         left: diagnosis of the base fit.
-        sds: noise on which the verdict is based.
+        sds: noise behind the verdict.
         searched: result of the search for effects.
         alike: alternatives to the effects found, if effects are named.
         where: location of the discrepancy, or of the rest that the effects leave.
@@ -848,7 +848,7 @@ def verdict_at_noise(factor: float, traced: LoopStages, numbers: np.ndarray) -> 
 
 
 def verdict_summary(traced: LoopStages, numbers: np.ndarray) -> VerdictSummary:
-    """Data from which the statement of a verdict is written. `numbers`: row numbers as used in messages."""
+    """Data of the statement of a verdict. `numbers`: row numbers as used in messages."""
     space, alike = traced.screened.base.space, traced.alike
     support = None if traced.standing is None else traced.standing.with_row_numbers(numbers)
     best = None if traced.searched is None else traced.searched.best

@@ -190,7 +190,7 @@ class Discrepancy:
         balance, variable, unit: place and variable of the discrepancy, and the unit of the balance.
         effect: name of the curve among the effects of `robot`, the fitted robot with the curve.
         defect: error of the balance in each row, at the fit without the curve. None if single rows do not show it.
-        grid: values of the variable at which the curve is given [SI].
+        grid: values of the variable for the curve [SI].
         curve, sd: there [unit], shape (points,). The 95 % band is ±1.96 sd. The band includes the uncertainty of the
             base, so it is wide if base parameters can replace the curve.
         chi2: twice the objective without and with the curve [σ²], priors included.

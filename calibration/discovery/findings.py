@@ -244,7 +244,7 @@ def parameter_shifts(
     """Every base parameter before and after effects were added, in its unit and in prior sds.
 
     Args:
-        before, after: coordinates of both fits. Those of the base are first.
+        before, after: coordinates of both fits. Coordinates of the base come first.
         sd: standard deviation of `after`.
     """
     coordinates, p = space.coordinates.base, space.free
@@ -309,7 +309,7 @@ def rank_effects_by_weak_form(space: CandidateSpace, known: WeakFormScreening, s
 
 
 def _rank_effects(space: CandidateSpace, scores: ScoreTable, settings: Settings) -> tuple[RankedEffect, ...]:
-    """Effects sorted by score. Those that would supply power are last."""
+    """Effects sorted by score. Effects that would supply power come last."""
     listed = []
     for s in effect_scores(space, scores, settings):
         effect = space.library[s.name]

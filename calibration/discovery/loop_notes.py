@@ -344,7 +344,7 @@ class RuledOut:
         name: name of the effect.
         why: `power` (a balance would supply power), `size`, or `edge` (within an sd of the largest plausible size).
         size: amplitude relative to the largest plausible one [-].
-        check: stated values on which the size depends.
+        check: stated values that the size depends on.
     """
 
     name: str

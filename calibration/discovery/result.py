@@ -243,7 +243,7 @@ class EffectRanking:
         missing: True if an effect is missing.
         p_value: family-wise p-value of the test for a missing effect.
         chance: critical score of the strongest effect [σ²].
-        effects: effects by score, strongest first. Those that would supply power are last.
+        effects: effects by score, strongest first. Effects that would supply power come last.
         windows: number of equations in weak form. 0 if the ranking uses the sensitivities of the base fit.
         parameters: base parameters fitted together with the first effect, with their sds [SI].
     """

@@ -104,7 +104,9 @@ def unexplained_torque_notes(runs: Runs) -> tuple[Remark, ...]:
 
 
 def _unexplained_torque(torque: np.ndarray, speed: np.ndarray, way: np.ndarray) -> float:
-    """Sum of squared residuals of a torque after fitting the best load. `speed`: magnitudes. `way`: directions."""
+    """Sum of squared residuals of a torque after fitting a load M_0 sign ω + K ω + M_c with M_0, K ≥ 0.
+
+    `speed`: magnitudes of ω. `way`: its signs."""
     w, ones = speed / max(float(speed.max()), 1e-12), np.ones(len(speed))
     return float(nnls(np.stack([way, way * w, ones, -ones], 1), torque)[1] ** 2)
 

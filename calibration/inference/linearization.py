@@ -225,7 +225,7 @@ class Linearization(eqx.Module):
 
     @property
     def points(self) -> int:
-        """Number of points at which a balance may have an error."""
+        """Number of points where a balance may have an error."""
         return self.rows
 
     def at_points(self, rows: np.ndarray) -> np.ndarray:

@@ -243,7 +243,7 @@ class ChiSquare:
 
 @dataclasses.dataclass(frozen=True)
 class CalibrationResult:
-    """Result of `calibrate`, from which all files and figures are made.
+    """Result of `calibrate`, the source of all files and figures.
 
     Attributes:
         robot: calibrated robot.
@@ -267,7 +267,7 @@ class CalibrationResult:
         searched: population of the search by generations before them, None without one.
         chi_square: χ² of the finite readings.
         adequacy: tests of whether the residuals are consistent with noise.
-        residual_clusters: columns without a role on which residuals depend.
+        residual_clusters: columns without a role that the residuals depend on.
         identifiability: linear analysis at the optimum.
         posterior: posterior of the free parameters.
         remarks: remarks to read before the result is used.
@@ -360,7 +360,7 @@ class CalibrationResult:
 
     @property
     def main_blocks(self) -> HeldOutErrors | None:
-        """Hold-out errors of the most informative kind of block, None if there is none."""
+        """Hold-out errors of the most informative kind of block, or None."""
         return next(iter(self.held_out.values()), None)
 
     @property

@@ -56,7 +56,7 @@ class MissingStates(StrEnum):
 
 
 class StatePlan(eqx.Module):
-    """Channels from which the states of the equations are taken.
+    """Channels that give the states of the equations.
 
     Attributes:
         current: index of the current channel, -1 if the current follows from an imposed quantity.
@@ -92,7 +92,7 @@ def state_plan(problem: Problem) -> StatePlan | None:
 
 
 def state_plan_or_reason(problem: Problem) -> StatePlan | MissingStates:
-    """State plan of a log, or the reason why there is none."""
+    """State plan of a log, or the reason why it has no plan."""
     robot, counts = problem.base, np.asarray(problem.data.weight).sum(0) > 0
     channels_read = {k: c for k, c in enumerate(problem.channels) if counts[k]}
     if robot.rig.turns:
@@ -269,7 +269,7 @@ def windows_of_run(time: np.ndarray, piece: np.ndarray, length: float) -> list[t
 
 
 def correlation_time(time: np.ndarray, speed: np.ndarray, noise: float) -> float:
-    """Correlation time of a speed: lag at which its mean squared change equals its variance [s]. 0 if shorter than a
+    """Correlation time of a speed: lag where its mean squared change equals its variance [s]. 0 if shorter than a
     time step.
 
     Args:
@@ -502,7 +502,7 @@ def _exact_weights(weights: np.ndarray, share: np.ndarray, length: float) -> np.
 
 
 def _jump_times(observe: Any, run: int) -> np.ndarray:
-    """Times at which the imposed quantities of a run jump [s]."""
+    """Times of the jumps of a run's imposed quantities [s]."""
     conditions, times = observe.conditions, np.asarray(observe.times[run])
     jumps = np.zeros(len(times) - 1, bool)
     imposed = "voltage", "motor_current", "duty", "open", "load_torque", "slope_deg", "payload", "total_mass"

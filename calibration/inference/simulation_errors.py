@@ -45,7 +45,7 @@ def share_of_measured(simulated: np.ndarray, measured: np.ndarray) -> np.ndarray
 
 
 def root_mean_square(errors: np.ndarray) -> float:
-    """Root mean square of the finite errors, NaN if there are none."""
+    """Root mean square of the finite errors, or NaN."""
     finite = errors[np.isfinite(errors)]
     return float(np.sqrt(np.mean(finite**2))) if finite.size else float("nan")
 

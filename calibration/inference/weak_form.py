@@ -369,7 +369,7 @@ def memory_by_point(
 
 @dataclasses.dataclass(frozen=True)
 class FittedDelay:
-    """Delay at which the equations of a log fit best.
+    """Delay that fits the equations of a log best.
 
     Attributes:
         value: time by which the imposed quantity acts later than its column states [s]. Negative if earlier.
@@ -541,7 +541,9 @@ def fit_weak_form(problem: Problem, effects: tuple[ScoredEffect, ...] = ()) -> W
         return np.concatenate([solve_triangular(x, window_errors(plan, w, given), lower=True) for x, w in each])
 
     def of(z: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
-        """Residuals and their derivatives, with the covariance and the states without noise at z."""
+        """Function of the parameters that returns residuals and their derivatives.
+
+        The covariance and the noise-free states (`with_smooth_states`) are computed once, at z."""
         smooth = with_smooth_states(problem, plan, rows, jnp.asarray(z))
         terms_there = terms(smooth, z)
         read, none = terms(rows, z), np.zeros(equations)

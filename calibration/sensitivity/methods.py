@@ -37,7 +37,7 @@ def _sampled_scores(study: Study, unit: np.ndarray, which: np.ndarray) -> np.nda
 
 
 def group_points(study: Study, moving: np.ndarray) -> dict[tuple[int, ...], list[int]]:
-    """Groups of operating points at which the same inputs act."""
+    """Groups of operating points with the same inputs."""
     groups: dict[tuple[int, ...], list[int]] = {}
     for k in range(len(study.points)):
         which = tuple(i for i in study.acting(k) if moving[i])

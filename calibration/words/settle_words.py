@@ -49,7 +49,7 @@ def left_out(stretches: Iterable[Stretch], few: bool = False) -> list[tuple[str,
         mine = [s for s in every if s.why == why]
         longest = max(mine, key=lambda s: len(s.rows))
         rows = f"{longest.rows[0] + 1}-{longest.rows[-1] + 1}"
-        cure = "nothing: a fit to the log as it is uses these samples" if few and why in OF_LEVELS else WHY[why][1]
+        cure = "nothing: a fit to the log uses these samples" if few and why in OF_LEVELS else WHY[why][1]
         causes.append((left_out_reason(longest), len(mine), sum(len(s.rows) for s in mine), rows, cure))
     return causes
 

@@ -65,7 +65,7 @@ class BeltLoop(eqx.Module):
         return jnp.stack([-jnp.sin(turned - self.taper), -jnp.cos(turned - self.taper)], axis=-1)
 
     def turned(self, place: Array) -> Array:
-        """Angle by which the belt has turned since its lower run [rad], at `place` [m]. Also defined beyond an
+        """Turning angle of the belt since its lower run [rad], at `place` [m]. Also defined beyond an
         end.
         """
         a, b, c, d = self.marks
@@ -131,7 +131,7 @@ class BeltLoop(eqx.Module):
         return height, place
 
     def _angle_of_normal(self, arm: Array) -> Array:
-        """Angle by which the belt has turned since its lower run where its normal points along `arm` [rad]."""
+        """Turning angle of the belt since its lower run where its normal points along `arm` [rad]."""
         return jnp.mod(jnp.arctan2(-arm[..., 0], -arm[..., 1]) + self.taper, 2 * jnp.pi)
 
 

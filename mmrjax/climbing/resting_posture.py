@@ -128,7 +128,7 @@ class Posture(eqx.Module):
             to 1 [-].
         margin: distance along the plane from the line of gravity through the centre of mass to the nearer end of the
             contact [m]. Negative if the robot tips.
-        tips_back, tips_forward: slopes at which the robot tips, uphill and downhill [rad].
+        tips_back, tips_forward: slopes that tip the robot, uphill and downhill [rad].
         inertia: moment of inertia in pitch about the centre of mass [kg·m²].
     """
 

@@ -52,7 +52,7 @@ class StaticLimits(eqx.Module):
             ground.
         contact: length of the contact on level ground [m].
         tip_front, tip_rear: height of the tops of the lever rollers above level ground [m]. On wheels, of the wheels.
-        tips_back, tips_forward, tips_aside: slopes at which the robot tips: uphill, downhill, sideways [rad].
+        tips_back, tips_forward, tips_aside: slopes that tip the robot: uphill, downhill, sideways [rad].
         length, height: overall, on level ground [m].
     """
 

@@ -84,7 +84,7 @@ class DutySaturation(DutyEffect):
         "-", "share of the duty above D_s that is lost", (-1.0, 1.0), "1 if the voltage stops rising at D_s", sd=0.5
     )
     duty_full: Scalar = parameter(
-        0.8, "-", "duty D_s at which the limit begins", (0.3, 0.99), "end points of speed controllers: 0.8 to 1",
+        0.8, "-", "duty D_s where the limit begins", (0.3, 0.99), "end points of speed controllers: 0.8 to 1",
         relative_sd=0.2,
     )  # fmt: skip
 

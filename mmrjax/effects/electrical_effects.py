@@ -17,7 +17,7 @@ class ElectricalEffect(Effect):
 
 
 class SeriesResistance(ElectricalEffect):
-    """ΔU = a I_d: Ohm's law for the resistance in series with one motor that its data sheet leaves out.
+    """ΔU = a I_d: Ohm's law for a resistance in series with one motor, not included in the motor's data sheet.
 
     Leads, ammeter and brush contacts in series with each motor.
 

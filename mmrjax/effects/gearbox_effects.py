@@ -49,9 +49,8 @@ class GearQuadraticLoss(GearboxEffect):
 
     Gear loss that grows faster than the load.
 
-    Source: second-order term of the load-dependent mesh loss, whose friction grows with tooth load
-    (Ohlendorf, Verlustleistung und Erwärmung von Stirnrädern, 1958: μ as the power 0.2 of the load) and
-    whose planets tilt.
+    Source: second-order term of the load-dependent mesh loss. The coefficient of friction grows with the tooth load
+    (Ohlendorf, Verlustleistung und Erwärmung von Stirnrädern, 1958: μ ∝ load^0.2), and the planets tilt under load.
     """
 
     driver = "load"

@@ -86,7 +86,7 @@ def time_grid(
     """Instants from 0 to the last of `times` [s], including `times` and `changes`.
 
     Args:
-        changes: times at which the motors' command changes [s].
+        changes: times of changes of the motors' command [s].
         sizes: size of each change relative to a usual one. The first step after a smaller change is longer.
         longest: longest step, if `STEPS` allows it [s]. An array has a value for each interval between `times`.
         start, change: first step and growth of the steps after the start and after changes.

@@ -126,7 +126,7 @@ def cell_below_cutoff(
     """Cell voltage at the start of missions on the battery [V] if it is below the cut-off, otherwise NaN, shape
     (runs,).
 
-    Not traceable. The motors draw the current of the start, which is 0 at rest.
+    Not traceable. The motor current is `start.current`, or 0 if no start is given.
     """
     battery, first = robot.battery, jax.tree.map(lambda x: x[..., 0], profile)
     other = battery.current_other if first.current_other is None else first.current_other

@@ -460,7 +460,7 @@ def _solve_current(signals: Callable[[Any, Scalar], Signals], given: tuple) -> S
 
     Args:
         signals: function of `given` and a current [A].
-        given: robot, conditions and further inputs. Derivatives with respect to it are those of the last step only.
+        given: robot, conditions and further inputs. Only the last Newton step is differentiated with respect to them.
     """
 
     def lacking(given: tuple, current: Scalar) -> Scalar:

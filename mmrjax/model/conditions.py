@@ -86,7 +86,7 @@ class Conditions(eqx.Module):
         discharge: charge C_b already taken from the battery [C].
         adhesion: adhesion of this surface, as a ratio to that of the surface the robot's friction is stated for [-].
         total_mass: weighed mass of robot and payload [kg]. None: the robot's own mass plus the payload.
-        order: place in the sequence of runs. What drifts from run to run depends on it [-].
+        order: place in the sequence of runs. Drifts from run to run depend on it [-].
         duty: share of the supply voltage that the driver applies to the motors, negative backward [-]. None: 1.
         open: 1 if the motors' circuit is open, so that they coast, -1 if the driver shorts it, so that they brake at
             any duty.

@@ -180,7 +180,7 @@ class Condition(Quantity):
     """A quantity that is set from outside before a run starts.
 
     Attributes:
-        field: field of `Conditions`, by default its name, empty if there is none.
+        field: field of `Conditions`, by default its name, or empty.
         heading: heading of its column on pages, empty if no page shows it.
         shown: format of a number there.
         in_tables: True if a table of runs may state it, under its own column.
@@ -576,7 +576,7 @@ TABLE: dict[str, tuple[Quantity, ...]] = {
     "history": (
         Quantity("winding_temperature", "°C", "winding, at that time", rests_on=WARMING),
         Quantity("housing_temperature", "°C", "housing, at that time", rests_on=WARMING),
-        Quantity("permissible_time", "s", "time for which a current may flow from ambient", rests_on=WARMING),
+        Quantity("permissible_time", "s", "time this current may flow, from ambient temperature on", rests_on=WARMING),
     ),
     "turn": (
         Quantity(

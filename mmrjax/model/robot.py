@@ -159,7 +159,8 @@ class Robot(eqx.Module):
         return self.motor.current_continuous if self.knows(HEAT) else jnp.inf
 
     def heating(self, power: Scalar, winding: Scalar, housing: Scalar) -> tuple[Scalar, Scalar]:
-        """Rates of the temperatures of winding and housing [K/s], as in `Motor.heating`, 0 if unknown."""
+        """Rates of the temperatures of winding and housing [K/s], as in `Motor.heating`. They are 0 if the motor's
+        thermal data are unknown."""
         rates = self.motor.heating(power, winding, housing)
         return rates if self.knows(WARMING) else (jnp.zeros_like(rates[0]), jnp.zeros_like(rates[1]))
 

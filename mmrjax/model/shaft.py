@@ -91,7 +91,7 @@ class Shaft(eqx.Module):
         return bool(self.backlash > 0) or bool(self.stiffness > 0)
 
     def frequency(self, inertia_motor: Scalar) -> Scalar:
-        """Angular frequency at which motor and load swing against each other across an elastic joint [rad/s].
+        """Angular frequency of motor and load that swing against each other across an elastic joint [rad/s].
 
         √(k (1/J_m + 1/J)) with the inertia J_m of the motor side at the output [kg·m²]. 0 without a stiffness.
         """

@@ -149,7 +149,7 @@ class LinearizedSums(eqx.Module):
     Attributes:
         values: the sums.
         slopes: derivatives of the sums, one row for each of `names`.
-        at: values of these inputs at which the sums are linearised.
+        at: values of these inputs for the linearization of the sums.
     """
 
     values: ContactSums

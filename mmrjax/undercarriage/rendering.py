@@ -286,7 +286,7 @@ def frame_times(
     if file.suffix not in FORMATS:
         raise ValueError(f"file: got {file.name}; expected a name that ends in {', '.join(FORMATS)}")
     if file.suffix == ".png" and end is not None:
-        raise ValueError(f"end: got {end:g} s for {file.name}, a picture at time begin; remove it")
+        raise ValueError(f"end: got {end:g} s for {file.name}; a PNG shows only the time `begin`; leave `end` out")
     film, last = file.suffix != ".png", length if end is None else end
     until = min(last, length)
     if not 0 <= begin <= length or (film and not begin < until):

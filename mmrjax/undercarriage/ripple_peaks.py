@@ -106,7 +106,7 @@ def period_pitch(pitch: float, speed_wheel: float, radius: float) -> float:
 def touchdowns(
     time: Series, grouser: Float[np.ndarray, "samples 24"], place: Float[np.ndarray, "samples 24"]
 ) -> Series:
-    """Times at which a grouser touches down, in order [s]. Its position `place` tells the front arc from the rear
+    """Touchdown times of a grouser, in order [s]. Its position `place` tells the front arc from the rear
     one.
 
     A grouser that lifts and returns in the middle of the run does not count: its place has to be in the second half

@@ -30,8 +30,8 @@ class StatedNumber:
 
     Attributes:
         value: value in `unit`.
-        source: file and element from which it was read.
-        width: text after ±, empty if there is none.
+        source: its file and element.
+        width: text after ±, or empty.
     """
 
     value: float

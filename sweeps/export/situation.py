@@ -194,7 +194,7 @@ def export_grid(joint: DriveJoint) -> Runs:
 
 
 def stall_torque(joint: DriveJoint, voltage: np.ndarray) -> np.ndarray:
-    """Load torque at which a shaft's motor stalls [N·m], without effects and within the limits of driver and
+    """Load torque that stalls a shaft's motor [N·m], without effects and within the limits of driver and
     gearbox."""
     motor, gear, load = joint.robot.motor, joint.robot.gearbox, joint.load
     current = np.minimum(voltage / float(motor.resistance), float(joint.robot.driver.current_limit))

@@ -121,7 +121,7 @@ def ripple_numbers(gear: GearRun) -> Json:
 
 
 def draw_current_ripple(shown: list[GearRun], title: str = "{}") -> Figure:
-    """Total current at the end of each run."""
+    """Total current over the last `SHOWN` seconds of each run, with the period expected from eq. (34)."""
     fig, grid = new_figure(1, len(shown), 3.0)
     look = configuration_looks(gear.name for gear in shown)
     for axes, gear in zip(grid[0], shown, strict=True):

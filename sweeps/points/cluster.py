@@ -185,8 +185,8 @@ def connect_workers(address: str) -> Pool:
             client.wait_for_workers(1, timeout=ANSWER)
         except TimeoutError:
             raise BadConfiguration(
-                f"--scheduler: {address} has no workers; start one for each device, as dask worker {address} "
-                "--nthreads 1"
+                f"--scheduler: {address} has no workers; start one for each device: `dask worker {address} "
+                "--nthreads 1`"
             ) from None
         here, kinds = program_identity(), set()
         for worker, (host, device) in client.run(introduce_worker).items():

@@ -28,7 +28,7 @@ COLUMNS = {c.field: (c.column, 1.0) for c in quantities.SET if c.in_tables and c
 def export_runs(kind: str, folder: Path, layout: Layout) -> Path:
     """Write `runs.csv` or `runs.parquet` into a finished run folder. Returns its path.
 
-    A row a point, in the order of the points. What is not finite is empty.
+    A row a point, in the order of the points. Numbers that are not finite become empty cells.
     """
     path = folder / f"runs.{kind}"
     aside = path.with_name(path.name + ".writing")

@@ -33,7 +33,7 @@ def text(name: str, *words: Any) -> str:
 
 
 def figure(name: str, *drawn: Any, finding: str = "", words: Sequence[Any] = (), more: str = "") -> Figure:
-    """A figure of the catalogue. What draws it is imported when it is drawn, as matplotlib costs half a second.
+    """A figure of the catalogue. Its drawing function is imported late, because matplotlib costs half a second.
 
     Args:
         name: name in the catalogue, `report.name`.

@@ -217,7 +217,7 @@ def _advice(found: DiscoveryResult) -> Table:
 
 
 def _effects_in_words(found: DiscoveryResult) -> Iterable[Block]:
-    """What was found, effects and a discrepancy without a name."""
+    """Effects that were found, and a discrepancy without a name."""
     rows = []
     for e in found.to_json()["effects"]:
         effect = next((x for x in found.effects if x.name == e["name"]), None)

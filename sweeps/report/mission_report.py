@@ -218,7 +218,7 @@ def _exceeded_limits(found: Missions) -> Iterable[str]:
 
 
 def _charge_left(table: Columns) -> Iterable[str]:
-    """Charge at which missions were cut off, if any was."""
+    """Cut-off charge of missions, if any was."""
     left = 100 * table["state_of_charge"][table["status"] == "cut_off"]
     if len(left):
         span = f"{left.min():.1f}" if len(left) == 1 else f"{left.min():.1f} to {left.max():.1f}"

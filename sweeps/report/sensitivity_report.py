@@ -153,7 +153,7 @@ def _two_digits(sd: float) -> str:
 
 
 def _ranges(found: SensitivityResult) -> str:
-    """Values of the operating points at which any output was studied."""
+    """Values of the operating points with a studied output."""
     p = found.points.at(np.any([o.studied for o in found.outputs.values()], axis=0))
     parts = [", ".join(dict.fromkeys(map(str, p.configuration)))]
     _, own_values, symbol = p.imposed

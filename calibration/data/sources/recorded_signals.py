@@ -179,11 +179,12 @@ def of_arrays(
 ) -> tuple[Signal, ...]:
     """Signals of named arrays. Each column of an array of two dimensions is a separate signal, `name[0]`.
 
-    Arrays of one group that are equally long share its time stamps: the array there whose name is a clock's. A group
-    without one, or a recording in which every array is equally long, is a table.
+    An array takes its time stamps from the clock of equal length in its group, or else from the only other clock of
+    that length. A clock is an array that is named like one (`unit_of_clock`). Arrays without a clock form a table, as
+    do all arrays if they are equally long.
 
     Args:
-        source: name of it, for messages.
+        source: name of the recording, for messages.
         arrays: by path: shape, kind of numbers, and a function that returns the array.
         units: units that the recording states, by path.
 

@@ -324,7 +324,7 @@ class Observer(eqx.Module):
         return ()
 
     def number_of_scan_points(self, problem: Problem, k: int) -> int:
-        """Number of values at which a coordinate is scanned, a multiple of `scans.CLOSER`."""
+        """Number of scanned values of a coordinate, a multiple of `scans.CLOSER`."""
         raise NotImplementedError
 
     def scan(self, problem: Problem, z: Array, data: Data, k: int, values: Array) -> tuple[Array, Array]:

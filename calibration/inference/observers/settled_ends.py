@@ -210,7 +210,7 @@ def _spread_over_surfaces(problem: Problem, draws: np.ndarray) -> np.ndarray:
 
 
 def _coordinate_of_value(problem: Problem, k: int, value: float) -> float:
-    """Coordinate at which a parameter has this value [SI]."""
+    """Coordinate where a parameter has this value [SI]."""
     c = problem.coordinates
     location, spread, scale = (np.asarray(x)[k] for x in (c.location, c.spread, c.scale))
     return float(((np.log(value) if scale else value) - location) / spread)

@@ -1028,7 +1028,7 @@ def _changes_still(speeds: np.ndarray, half: np.ndarray, quarter: np.ndarray) ->
 
 
 def _drive_changes(runs: Runs, rows: np.ndarray, share: float = 0.0) -> np.ndarray:
-    """True for rows of a run at which its command changes. For the supply of motors, only changes above a share of
+    """True for rows of a run where its command changes. For the supply of motors, only changes above a share of
     the largest value count.
     """
     supplied = (runs.layout.imposed_column, SUPPLY, "duty")
