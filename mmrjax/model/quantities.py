@@ -576,7 +576,7 @@ TABLE: dict[str, tuple[Quantity, ...]] = {
     "history": (
         Quantity("winding_temperature", "°C", "winding, at that time", rests_on=WARMING),
         Quantity("housing_temperature", "°C", "housing, at that time", rests_on=WARMING),
-        Quantity("permissible_time", "s", "time this current may flow, from ambient temperature on", rests_on=WARMING),
+        Quantity("permissible_time", "s", "time this current may flow, from ambient temperature", rests_on=WARMING),
     ),
     "turn": (
         Quantity(
