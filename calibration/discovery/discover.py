@@ -347,7 +347,7 @@ def prepare_loop(
 
 @dataclasses.dataclass(frozen=True)
 class VerdictNoise:
-    """Noise on which a verdict is based.
+    """Noise that a verdict assumes.
 
     Attributes:
         noise: noise of the readings.
@@ -368,7 +368,7 @@ class LoopStages:
         verdict: `none`, `named`, `class`, `mechanism`, `place` or `undescribed`.
         screened: base fit without outliers.
         left: diagnosis of the base fit.
-        sds: noise on which the verdict is based.
+        sds: noise that the verdict assumes.
         searched: result of the search for effects.
         alike: alternatives to the effects found, if effects are named.
         where: location of the discrepancy, or of the rest that the effects leave.

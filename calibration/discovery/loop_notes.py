@@ -318,11 +318,10 @@ class Headline:
     """Claims that hold at every noise level tried.
 
     Attributes:
-        level: verdict on which all noise levels agree. `open` if the noise level decides whether an effect is
-            missing.
+        level: verdict that all noise levels share. `open` if the noise level decides whether an effect is missing.
         claims: laws, mechanisms or places, each with its alternatives.
         factors: noise levels tried, as factors on the noise.
-        shared: for each mechanism or place, the number of its first members on which all noise levels agree. At some
+        shared: for each mechanism or place, the number of its first members that all noise levels share. At some
             noise levels, the others cannot be separated from these.
         families: equation and driving variable of each law, in words.
         values: stated values that may be wrong instead of it.
@@ -344,7 +343,7 @@ class RuledOut:
         name: name of the effect.
         why: `power` (a balance would supply power), `size`, or `edge` (within an sd of the largest plausible size).
         size: amplitude relative to the largest plausible one [-].
-        check: stated values on which the size depends.
+        check: stated values that affect the size.
     """
 
     name: str

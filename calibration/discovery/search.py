@@ -111,7 +111,7 @@ def search_effects(
 def _fit_to_rank_at(
     space: CandidateSpace, base: Candidate, left: Diagnosis, bases: Bases, settings: Settings
 ) -> tuple[Candidate, Diagnosis]:
-    """Fit at which the effects are ranked, and its diagnosis.
+    """Fit for the ranking of the effects, and its diagnosis.
 
     It is the base fit, unless that is `UNLIKELY` far from its prior and its sensitivities mislead. Then it is the set
     that the log's equations rank first, simulated from the coordinates of the equations.

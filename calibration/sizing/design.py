@@ -88,7 +88,7 @@ def build_robot(robot: Robot, base_mass: float, configuration: str, design: Desi
 
 @dataclasses.dataclass(frozen=True)
 class SizingDemand:
-    """One requirement with the points at which it is evaluated.
+    """One requirement with the points of its evaluation.
 
     Attributes:
         requirement: requirement. None: the ratings of the parts.

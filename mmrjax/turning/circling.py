@@ -357,7 +357,7 @@ def _find_settled_unknowns(robot: Robot, conditions: Conditions) -> tuple[Settli
 def _signals_and_motion(robot: Robot, conditions: Conditions, y: Settling) -> tuple[balances.Travel, PlaneMotion]:
     """Signals of both sides, and motion, at the unknowns of a search.
 
-    Currents are those that the duties alone would cause, see `rest.admitted_current`.
+    Currents are as the duties alone would cause them, see `rest.admitted_current`.
     """
     motion = motion_of_unknowns(robot, _all_unknowns(conditions, y))
     current, held = jax.vmap(lambda c, x: rest.admitted_current(robot, c, x))(conditions.of_sides(), motion.current)
