@@ -191,8 +191,8 @@ def one_run(robot: Robot, cells: Json, battery: bool = False, elsewhere: Collect
         elsewhere: columns that a profile states.
 
     Raises:
-        BadConfiguration: a value out of range, an unknown configuration, a voltage together with the battery, a
-            condition that does not act on the robot, or nothing imposed and no limit in its file.
+        BadConfiguration: a value out of range, an unknown configuration, or a voltage together with the battery. Also
+            a condition that does not act on the robot, or nothing imposed and no limit in its file.
     """
     if battery and cells.get("supply_voltage_V") is not None:
         raise BadConfiguration(

@@ -1,8 +1,8 @@
 """Results of stages in files: JSON of values, of names of our own classes and of places of arrays, and their bytes.
 
-A file is an archive as `np.savez` writes it, whose checksum covers both. Reading one runs no code that it brings: it
+A file is an archive as `np.savez` writes it, whose checksum covers both. Reading one runs no code that it brings. It
 can name only dataclasses of `mmrjax` and `calibration`, effects that the user has loaded, and the functions of
-`FUNCTIONS`, and sets fields without calling a constructor.
+`FUNCTIONS`. It sets fields without calling a constructor.
 """
 
 from __future__ import annotations

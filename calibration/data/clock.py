@@ -102,8 +102,8 @@ _WITH_POINTS = re.compile(r"(\d\d)\.(\d\d)\.(\d{4})(?=[ T])")
 def drop_empty_rows(arrays: NamedArrays, meanings: Sequence[Column | None]) -> NamedArrays:
     """The columns without empty rows, and a note with the number of these rows.
 
-    A row is empty if all of its cells are missing, or if it is at the end of a log whose clock has returned to 0:
-    such a logger writes all of its memory.
+    A row is empty if all of its cells are missing, or if it is at the end of a log whose clock has returned to 0.
+    Such a logger writes all of its memory.
     """
     empty = np.arange(len(arrays))
     for raw in arrays.values:

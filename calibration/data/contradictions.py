@@ -35,8 +35,9 @@ def check_contradictions(runs: Runs, robot: Robot) -> None:
     """Rejects a table that contradicts itself or its robot.
 
     Raises:
-        BadData: a vehicle has no mass, a robot turns that cannot turn, its sides are exchanged, the stated voltage
-            cannot turn the motors at the imposed speed, an angle wraps or changes its unit, or time goes back.
+        BadData: a vehicle has no mass, a robot turns that cannot turn, or its sides are exchanged. Also if the stated
+            voltage cannot turn the motors at the imposed speed, an angle wraps or changes its unit, or time goes
+            back.
     """
     _check_mass(runs, robot)
     if runs.turns and (why := turn_error(robot, sorted({str(n) for n in runs.configurations_named(robot)}))):

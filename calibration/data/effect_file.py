@@ -222,7 +222,7 @@ def _check_effect(path: Path, effect: type[Effect]) -> None:
 
 @functools.cache
 def _test_points(balance: str, channel: str, configuration: int) -> tuple[Signals, Signals, Signals]:
-    """Signals of the nominal robot on its battery, at which the terms of effects are tested.
+    """Signals of the nominal robot on its battery, for the test of the terms of effects.
 
     Returns:
         Signals that a term of the left side may read while the robot climbs and turns left, all signals at that

@@ -198,9 +198,9 @@ def read_profile(source: str | Path) -> ProfileTable:
 
     Raises:
         BadData: there is no such file, it has fewer than two rows, a column or unit is unknown, misspelt or repeated,
-            time does not increase, a cell is no number, not finite or out of range, a required cell is empty, a row
-            has two demands or none, or a mode, surface or setting is unknown. The message has file, row (counted from
-            1 below the header), column, value and allowed values.
+            or time does not increase. Also if a cell is no number, not finite or out of range, or a required cell is
+            empty. Also if a row has two demands or none, or a mode, surface or setting is unknown. The message has
+            file, row (counted from 1 below the header), column, value and allowed values.
     """
     if str(source) in PACKAGED:
         file = resources.files("calibration") / "data" / "profiles" / f"{source}.csv"

@@ -50,8 +50,8 @@ def remaining_errors(
 ) -> tuple[MissedChannel, ...]:
     """Hold-out errors of the missed channels after effects were added.
 
-    None if the effects do not describe the runs either: more than `UNDESCRIBED` of a channel's rms remains, less than
-    `REMOVED` of the refit's error has gone, or the noise itself is estimated to be that large.
+    None if the effects do not describe the runs either. This is so if more than `UNDESCRIBED` of a channel's rms
+    remains, less than `REMOVED` of the refit's error has gone, or the noise itself is estimated to be that large.
 
     Args:
         missed: channels from `missed_channels`.

@@ -2,13 +2,12 @@
 
 Alternatives are hypotheses that explain the same table equally well. Each predicts every reading y of the menu
 with the covariance S = diag(sd²) + J C Jᵀ. The first term is the variance of the instruments. The second is, to first
-order, the covariance of the fitted coordinates, with C = (JᵀJ)⁻¹ over readings and priors of the table (Chaloner
-and Verdinelli, Bayesian experimental design, Statistical Science 10 (1995)). The separation of two alternatives
-A, B is √(dᵀ S⁻¹ d), d = y_A - y_B. It takes the S with the smaller result (Hunter and Reiner, Designs for
-discriminating between two rival models, Technometrics 7 (1965)). If one of them is true, the χ² of the other is
-larger by σ² ± 2σ, where σ is their separation. So the probability that the false one is refuted is
-Φ((σ² - refuted) / 2σ). The proposal is expected to separate most of all pairs. If one experiment is not enough, two
-are proposed.
+order, the covariance of the fitted coordinates. C = (JᵀJ)⁻¹ is over readings and priors of the table (Chaloner and
+Verdinelli, Bayesian experimental design, Statistical Science 10 (1995)). The separation of two alternatives A, B is
+√(dᵀ S⁻¹ d), d = y_A - y_B. It takes the S with the smaller result (Hunter and Reiner, Designs for discriminating
+between two rival models, Technometrics 7 (1965)). If one of them is true, the χ² of the other is larger by σ² ± 2σ,
+where σ is their separation. So the probability that the false one is refuted is Φ((σ² - refuted) / 2σ). The proposal
+is expected to separate most of all pairs. If one experiment is not enough, two are proposed.
 """
 
 from __future__ import annotations
@@ -360,8 +359,8 @@ SERIES, REPEATS = 15, 3
 def denser_runs_instruction(place: str, variable: str, within: Reach, by_duty: bool = False) -> Remark:
     """Instruction to measure more levels of the variable of a curve, within reach of the table.
 
-    Its values: `low` and `high`, the range of the voltages, `top`, the highest voltage of the table [V], `slope`
-    [deg] and `payload` [kg], the largest ones, and `steps` of voltage, slope and payload.
+    Its values: `low` and `high`, the range of the voltages, and `top`, the highest voltage of the table [V]. `slope`
+    [deg] and `payload` [kg] are the largest ones. `steps` are those of voltage, slope and payload.
     """
     volts = within.voltages
     low, high = (volts[0], volts[-1]) if volts[-1] > volts[0] else (menu.round_significant(0.5 * volts[0]), volts[0])

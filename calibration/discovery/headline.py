@@ -10,7 +10,7 @@ from calibration.discovery.settings import WITHOUT_NAME
 
 
 def headline(said: VerdictSummary, others: Sequence[tuple[float, VerdictSummary]] = ()) -> Headline:
-    """The most detailed claims on which the verdicts at all noise levels agree.
+    """The most detailed claims that the verdicts at all noise levels share.
 
     Args:
         others: factor on the noise, and verdict, of each other noise level.
@@ -66,8 +66,8 @@ def _shared_claims(
 ) -> tuple[tuple[Names, ...], tuple[int, ...]]:
     """Claims of the first verdict that every other verdict shares at least in part.
 
-    Members on which all verdicts agree come first, then those that some noise levels cannot separate from them. A
-    claim that is part of another is omitted. The second result is the number of agreed members of each claim.
+    Members that all verdicts share come first, then those that some noise levels cannot separate from them. A claim
+    that is part of another is omitted. The second result is the number of agreed members of each claim.
     """
     counts: dict[Names, int] = {}
     for claim in claims[0]:

@@ -318,11 +318,10 @@ class Headline:
     """Claims that hold at every noise level tried.
 
     Attributes:
-        level: verdict on which all noise levels agree. `open` if the noise level decides whether an effect is
-            missing.
+        level: verdict that all noise levels share. `open` if the noise level decides whether an effect is missing.
         claims: laws, mechanisms or places, each with its alternatives.
         factors: noise levels tried, as factors on the noise.
-        shared: for each mechanism or place, the number of its first members on which all noise levels agree. At some
+        shared: for each mechanism or place, the number of its first members that all noise levels share. At some
             noise levels, the others cannot be separated from these.
         families: equation and driving variable of each law, in words.
         values: stated values that may be wrong instead of it.

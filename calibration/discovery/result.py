@@ -132,7 +132,7 @@ class UnnamedDiscrepancy(DiscrepancyLocation):
         score: decrease of χ² by the curve [σ²].
         score_free_in_each_run: score of a wave with its own phase in each run. None for other curves.
         at: values of the variable [SI]. value, sd: value and standard deviation of the curve there [unit]. over,
-        defect, defect_sd: for each row the fitted variable [SI] and the defect of the balance [unit]: the curve
+        defect, defect_sd: for each row the fitted variable [SI] and the defect of the balance [unit]. It is the curve
         there plus the row's residual, along the travel, None if single rows do not show it.
         proposal: proposed formula.
     """

@@ -1,10 +1,11 @@
 """Scale of the library's priors: they are stated for the nominal robot and are scaled to the size of a rig.
 
 A loss of 0.7 mN·m is a fifth of the friction of a motor of 60 W and negligible in one of 1 kW. The share of a term in
-its balance carries over from rig to rig. So the prior sd of an amplitude is scaled: a term of one sd has the same
-share of its balance at the rig's operating points as on the nominal robot over Table 8. A shape parameter that is a
-speed or a current is scaled with those of the rig. The limits of an amplitude hold up to the motors' rated values.
-Otherwise a saturation visible at a tenth of the rated current would leave no torque constant at the rated one.
+its balance carries over from rig to rig. So the prior sd of an amplitude is scaled. A term of one sd then has the
+same share of its balance at the rig's operating points as on the nominal robot over Table 8. A shape parameter that
+is a speed or a current is scaled with those of the rig. The limits of an amplitude hold up to the motors' rated
+values. Otherwise a saturation visible at a tenth of the rated current would leave no torque constant at the rated
+one.
 """
 
 from __future__ import annotations

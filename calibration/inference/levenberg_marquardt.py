@@ -1,8 +1,8 @@
 """Least-squares solver for optimistix in which some residuals are one-sided: they count only while they are positive.
 
 The objective is ½ Σ r² over the two-sided residuals and the positive one-sided ones. The solver is
-Levenberg-Marquardt, built from optimistix's parts: a descent that determines which one-sided residuals are positive
-at the end of its step, a trust region that predicts with them, and Anderson's mixing between the two. The
+Levenberg-Marquardt, built from optimistix's parts. Its descent determines which one-sided residuals are positive at
+the end of its step. A trust region predicts with them, and Anderson's mixing acts between the two. The
 Levenberg-Marquardt method of optimistix needs the same residuals clipped at 0. Near the edge of a clipped residual
 its linearisation predicts a gain that does not exist, and it then follows the edge in steps of 1e-4.
 """

@@ -190,8 +190,8 @@ class Linearization(eqx.Module):
         magnitudes: channels whose readings have no sign.
         probed: balances whose errors are known.
 
-    A defect of a balance has a value at each point: one for each row, or for a robot with independently driven sides
-    one for each row and side, with the left side of all rows first.
+    A defect of a balance has a value at each point, which is a row. For a robot with independently driven sides it is
+    a row and side, with the left side of all rows first.
     """
 
     probed: ClassVar[Names] = PROBED

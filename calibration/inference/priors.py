@@ -94,9 +94,9 @@ class Coordinates(eqx.Module):
 
     A parameter is a scale if its field states a relative sd and it cannot be negative: its prior is log-normal with
     the nominal value as median. Every other one is normal. The clip is the identity inside the bounds (to e^-20 an sd
-    away), has slope ½ on a bound, and is never flat: an amplitude with prior mean zero, or a share with its nominal
-    value on its bound, starts with a live gradient. Beyond a bound, a parameter is held by its prior, which is on z
-    and acts everywhere.
+    away), has slope ½ on a bound, and is never flat. So an amplitude with prior mean zero, or a share with its
+    nominal value on its bound, starts with a live gradient. Beyond a bound, a parameter is held by its prior, which
+    is on z and acts everywhere.
 
     Attributes:
         location, spread, low, high: location, spread, lower limit and upper limit in units of θ, or of log θ for a
@@ -463,8 +463,8 @@ def parameter_coordinates(
         any_surface: True to use the priors of `SURFACE` for ground friction without a stated prior.
 
     Raises:
-        BadConfiguration: a stated prior belongs to an unknown or fixed parameter, a mean is out of bounds, or the
-            prior of a free parameter has zero width (value 0 with a relative sd, or stated as exact).
+        BadConfiguration: a stated prior belongs to an unknown or fixed parameter, or a mean is out of bounds. Also if
+            the prior of a free parameter has zero width (value 0 with a relative sd, or stated as exact).
     """
     stated = stated or {}
     fields = parameters_by_name(robot)

@@ -2,11 +2,11 @@
 
 A column that the model does not read may still explain which rows differ: which wheel idles, who measured, which
 battery was in. For each channel a variance ratio (Seber and Lee, Linear Regression Analysis (2003), 4.3) compares the
-residuals over the levels of each such column: over all rows, within the levels of each label of the conditions, and
-with opposite signs in the two directions of travel. Columns of many numbers enter by their ranks. Free parameters,
-labels and smooth curves over the conditions are first projected out on both sides. The significance is family-wise
-over all columns, channels and tests. It is limited by Bonferroni and by the strongest test of permuted residuals
-(Freedman and Lane 1983), so that neither few rows nor outliers cause a finding.
+residuals over the levels of each such column. It does so over all rows, within the levels of each label of the
+conditions, and with opposite signs in the two directions of travel. Columns of many numbers enter by their ranks.
+Free parameters, labels and smooth curves over the conditions are first projected out on both sides. The significance
+is family-wise over all columns, channels and tests. It is limited by Bonferroni and by the strongest test of permuted
+residuals (Freedman and Lane 1983), so that neither few rows nor outliers cause a finding.
 """
 
 from __future__ import annotations
@@ -113,7 +113,7 @@ class ResidualCluster:
 
 
 def find_residual_clusters(fit: Residuals, seed: int = 0) -> tuple[ResidualCluster, ...]:
-    """Columns without a role on which the residuals of a fit depend, the most significant first.
+    """Columns without a role that affect the residuals of a fit, the most significant first.
 
     Args:
         fit: residuals of the fit. For histories, the mean of each run is tested.

@@ -183,7 +183,7 @@ class ImposedCourse:
     """Imposed quantities over time as integrals, so that each interval has a mean at any delay.
 
     Attributes:
-        time: times at which they change, for all runs one after the other [s].
+        time: times of their changes, for all runs one after the other [s].
         values: values from each of these times on, by field of `Conditions`.
         integrals: integrals up to each of these times, by field of `Conditions`.
         cell: begin and end of the interval of each point, on the same time axis.
@@ -307,8 +307,7 @@ def local_slopes(time: np.ndarray, values: np.ndarray, piece: np.ndarray, count:
 
 
 def slope_rows(time: np.ndarray, angle: np.ndarray, sd: float) -> tuple[int, float]:
-    """Number of rows over which the slope of an angle is little affected by noise, and the standard deviation of that
-    slope.
+    """Number of rows that give the slope of an angle with little noise, and the standard deviation of that slope.
 
     The noise of the slope is then `STEEP` of its size.
     """

@@ -9,11 +9,12 @@ follows from the sds of the readings and the steps of their instruments, and wei
 Dukic, Bull. Math. Biol. 85 (2023) 110). No window contains a jump of an imposed quantity, a gap, or rest.
 
 Readings are regressors too, and their noise biases the parameters. So derivatives are those of simulated states
-(`with_smooth_states`), as instruments. Largest bias of a parameter over 100 logs of each kind, in posterior sds: a
-motor with voltage, current and speed, a carriage with force and speed, an angle alone, also with coarse instruments.
-An independent NumPy regression with exact states as instruments has 0.21 (standard error 0.1), and 91 to 99 % of its
-intervals hold. An iterated covariance has 0.97 (82 %), on the motor with its log-determinant as much as without. With
-windows of sin⁴, the covariance used before has 0.90 (72 %), and one that changes within the fit 0.29 (56 %).
+(`with_smooth_states`), as instruments. The next figures are the largest bias of a parameter over 100 logs of each
+kind, in posterior sds. The kinds are a motor with voltage, current and speed, a carriage with force and speed, and an
+angle alone, also with coarse instruments. An independent NumPy regression with exact states as instruments has 0.21
+(standard error 0.1), and 91 to 99 % of its intervals hold. An iterated covariance has 0.97 (82 %), on the motor with
+its log-determinant as much as without. With windows of sin⁴, the covariance used before has 0.90 (72 %), and one that
+changes within the fit 0.29 (56 %).
 """
 
 from __future__ import annotations
@@ -372,7 +373,7 @@ class FittedDelay:
     """Delay that fits the equations of a log best.
 
     Attributes:
-        value: time by which the imposed quantity acts later than its column states [s]. Negative if earlier.
+        value: delay of the imposed quantity after the time that its column states [s]. Negative if earlier.
         limit: largest delay that was tried [s].
         ended: True if the best delay is at that limit.
     """

@@ -84,8 +84,8 @@ def chosen_outputs(words: Names, robot: Robot, turns: bool = False) -> tuple[Qua
         turns: True if the robot is free to turn and has instruments for it.
 
     Raises:
-        BadConfiguration: a name is unknown (the message lists the choices), or an output needs a ground or stance
-            that the robot lacks, a turn while it travels straight, or straight travel while it turns.
+        BadConfiguration: a name is unknown (the message lists the choices). Also if an output needs a ground or
+            stance that the robot lacks, a turn while it travels straight, or straight travel while it turns.
     """
     outputs, chosen = known_outputs(robot), []
     start = tuple(d.name for d in derived.OF_START)

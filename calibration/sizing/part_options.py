@@ -1,8 +1,8 @@
 """Parts to choose from: drives (motor and gearbox) and cells from the packaged data sheets, as arrays.
 
-Where a sheet lacks a number that the model needs, the paper's robot is scaled (docs/howto/size.md): friction of a
-motor by its no-load torque, efficiency of a gearbox by the sheet's largest, resistance and mass of a cell by its
-capacity, and its own ratings of winding and speeds.
+If a sheet lacks a number that the model needs, the paper's robot is scaled (docs/howto/size.md). Friction of a motor
+is scaled by its no-load torque, efficiency of a gearbox by the sheet's largest, and resistance and mass of a cell by
+its capacity. For winding and speeds, the robot's own ratings apply.
 """
 
 from __future__ import annotations

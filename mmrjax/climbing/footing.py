@@ -1,9 +1,9 @@
 """Contacts of half a robot with a terrain: grousers and wheels on the ground, and corners of the ground on belts.
 
-Coordinates q of half a robot with levers: x, z [m] of the middle of the wheelbase, pitch θ [rad] nose down, angle φ
-[rad] of the pulleys relative to the chassis (belts are rigid here: all pulleys have one angle), angles ψ_1, ψ_2 [rad]
-of front and rear lever from the chassis' forward axis, positive upward. Velocities v are their rates. A lever's belt
-runs on its lever at r (φ̇ + ψ̇).
+Coordinates q of half a robot with levers: x, z [m] of the middle of the wheelbase, pitch θ [rad] nose down, and three
+angles. φ [rad] is the angle of the pulleys relative to the chassis (belts are rigid here: all pulleys have one
+angle). ψ_1, ψ_2 [rad] are those of front and rear lever from the chassis' forward axis, positive upward. Velocities v
+are their rates. A lever's belt runs on its lever at r (φ̇ + ψ̇).
 """
 
 from __future__ import annotations

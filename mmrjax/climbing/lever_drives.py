@@ -148,8 +148,8 @@ def step_levers(
     turned = free[:, None, None] + jnp.einsum("ij,jkl->ikl", yields, torque)
 
     def candidate_solutions(k: int, ways: tuple[slice | None, ...]) -> tuple[Array, Array, Array, Array]:
-        """Distance of each candidate solution from its piece of the law of lever pair `k` (0: on it) [N·m], i C_m I
-        of the motor within the voltage limits [N·m], load torque [N·m] and speed [rad/s]."""
+        """Distance of each candidate solution from its piece of the law of lever pair `k` (0: on it) [N·m]. Then i
+        C_m I of the motor within the voltage limits [N·m], load torque [N·m] and speed [rad/s]."""
         force, speed = torque[k], turned[k]
         turning = kept * (speed - rate[k]) + drive.viscous * speed
         up, down = drive.against(force, 1.0) + drive.dry + turning, drive.against(force, -1.0) - drive.dry + turning

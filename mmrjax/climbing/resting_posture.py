@@ -1,11 +1,11 @@
 """Posture of a robot at rest on a plane, on its main belts and the rollers of its levers.
 
 Frame of the robot, its origin the middle of the wheelbase: forward along it, up across it. Seen from the side a robot
-is two axles and two rollers, circles over the grousers, with a belt around each pair: the main one around the axles,
-a lever's between its axle and its roller. It rests on the lower hull of the circles, on an edge between two of them,
-which gives height, pitch and loads in closed form. All are smooth in angles, lengths and masses while the same two
-circles carry the load. If another circle takes over, pitch and height are continuous, but their derivatives and the
-contact jump.
+is two axles and two rollers, circles over the grousers, with a belt around each pair. The main belt is around the
+axles, a lever's between its axle and its roller. It rests on the lower hull of the circles, on an edge between two of
+them, which gives height, pitch and loads in closed form. All are smooth in angles, lengths and masses while the same
+two circles carry the load. If another circle takes over, pitch and height are continuous, but their derivatives and
+the contact jump.
 """
 
 from __future__ import annotations

@@ -97,9 +97,9 @@ def lowest_points(side: SideOutline) -> tuple[Scalar, Scalar]:
 def step_height_at(side: SideOutline, pitch: Scalar) -> Scalar:
     """Height of the step on which an outline rests at a pitch with its centre of mass above the edge [m].
 
-    The lowest point behind the centre of mass stands on the lower ground, the lowest point ahead of it on the step: H
-    = min over x ≥ x_c of z less min over x ≤ x_c of z. Let only belt and pulley touch, with the tail turning on a
-    circle of radius R, the centre of mass ℓ ahead of its centre and h above the axles,
+    The lowest point behind the centre of mass stands on the lower ground, the lowest point ahead of it on the step.
+    So H = min over x ≥ x_c of z less min over x ≤ x_c of z. Let only belt and pulley touch, with the tail turning on
+    a circle of radius R, the centre of mass ℓ ahead of its centre and h above the axles,
 
         H = R (1 - cos θ) + (ℓ - (h + R) tan θ) sin θ.
     """
@@ -125,8 +125,8 @@ def _pitch_of_highest_step(
 def find_highest_step(side: SideOutline, pitch: Scalar | None = None) -> StepLimit:
     """Highest step for one outline: the maximum of `step_height_at` over all pitches with the nose up.
 
-    If two parts of the outline meet at the highest step, its derivatives are those of both, weighted by their slopes
-    s over pitch on the other side: dH = (s_1 dH_2 - s_2 dH_1) / (s_1 - s_2).
+    If two parts of the outline meet at the highest step, its derivatives are those of both. The weight of each is the
+    slope s over pitch of the other: dH = (s_1 dH_2 - s_2 dH_1) / (s_1 - s_2).
 
     Args:
         pitch: pitch of the highest step [rad]. None: it is searched.
@@ -180,7 +180,7 @@ def best_step(robot: Robot, conditions: Conditions) -> tuple[StepLimit, Scalar, 
     """Highest step of one run in any posture within the lever range, with the angles of front and rear levers [rad].
 
     In derivatives, the angles are treated as constants. The step is a limit for any slow sequence of postures if the
-    riser carries no load: when the tail leaves the lower ground, the centre of mass must be over the step, and no
+    riser carries no load. When the tail leaves the lower ground, the centre of mass must be over the step, and no
     posture allows a higher step then. Only the pitch is searched. The levers' angles follow from it (`best_levers`).
     """
     still, run = jax.lax.stop_gradient((robot, conditions))
@@ -212,9 +212,9 @@ def stairs_rise(robot: Robot, conditions: Conditions, tread: Scalar, friction: S
 
     Its levers are flush with the belt. With friction alone, a belt of friction μ slides at tan α = μ, with tan α =
     rise / tread. Noses are t / cos α apart. The belt always has one nose behind gravity's line through its centre of
-    mass and one ahead of it if it extends far enough both ways: ℓ - h tan α ≥ t / cos α at the tail, with the centre
-    of mass ℓ ahead of the tail and h above the belt. The result is 0 if even noses without rise are too far apart.
-    Grousers that catch a nose hold more, and a robot that rocks may still climb.
+    mass and one ahead of it if it extends far enough both ways. At the tail this is ℓ - h tan α ≥ t / cos α, with the
+    centre of mass ℓ ahead of the tail and h above the belt. The result is 0 if even noses without rise are too far
+    apart. Grousers that catch a nose hold more, and a robot that rocks may still climb.
     """
     angle = flush_lever_angle(robot)
     rests = resting_posture.level_posture(robot, with_lever_angles(conditions, angle, angle))

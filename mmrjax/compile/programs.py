@@ -1,13 +1,13 @@
 """Compiled programs on disk, for arguments of one structure.
 
 JAX's own cache is consulted only after tracing and lowering, which is most of the time of a process that compiles
-nothing. Here a program is found by its name, a hash of all inputs of its tracing: the source of our packages, the
-versions of the libraries, JAX's settings, and the arguments with shapes in place of arrays. Arguments that cannot be
-named (a class of a user's own file, an array of keys) are compiled as usual. A program is native code: it is read
-only from a folder that nobody but the user can change (`mmrjax.compile.private`).
+nothing. Here a program is found by its name, a hash of all inputs of its tracing. These are the source of our
+packages, the versions of the libraries, JAX's settings, and the arguments with shapes in place of arrays. Arguments
+that cannot be named (a class of a user's own file, an array of keys) are compiled as usual. A program is native code:
+it is read only from a folder that nobody but the user can change (`mmrjax.compile.private`).
 
-In addition to JAX's cache this saves processor time of warm commands (docs/lab/figures.md, 2026-11-28): 27 % of
-`simulate` (7.6 → 5.6 s), 23 % of a `sweep` and 45 % of `loop measured` (68 → 37 s). `jax.export` saves no more: it
+In addition to JAX's cache this saves processor time of warm commands (docs/lab/figures.md, 2026-11-28). It saves 27 %
+of `simulate` (7.6 → 5.6 s), 23 % of a `sweep` and 45 % of `loop measured` (68 → 37 s). `jax.export` saves no more: it
 needs the same names.
 """
 

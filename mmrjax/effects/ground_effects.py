@@ -71,8 +71,8 @@ class WeightTransfer(GroundEffect):
     The slope loads the rear of the tracks, and uneven pressure costs more.
 
     Source: load transfer (h/L) tan α of the weight (Wong 2008, ch. 1). Resistance that is convex in the
-    local pressure gains the square of an antisymmetric transfer (Bekker 1956: compaction as a power of the
-    pressure above 1), so the first-order part cancels and a ~ f (h/L)².
+    local pressure gains the square of an antisymmetric transfer (Bekker 1956: compaction as a power of the pressure
+    above 1). So the first-order part cancels and a ~ f (h/L)².
     """
 
     driver = "slope"

@@ -214,8 +214,8 @@ class StribeckExponent(TrackEffect):
     Friction of bearings and seals that leaves mixed lubrication faster or more slowly than exponentially.
 
     Source: Armstrong-Hélouvry, Dupont and Canudas de Wit, A survey of models, analysis tools and compensation
-    methods for the control of machines with friction, Automatica 30 (1994) 1083: the exponential of Bo and Pavelescu
-    with δ of 1/2 to 1, of Tustin with 1 (`stribeck_track`), Armstrong's Gaussian with 2. |ω_k| / ω_s is smoothed
+    methods for the control of machines with friction, Automatica 30 (1994) 1083. δ is 1/2 to 1 in the exponential of
+    Bo and Pavelescu, 1 in that of Tustin (`stribeck_track`) and 2 in Armstrong's Gaussian. |ω_k| / ω_s is smoothed
     within a thousandth, as the sign is: for δ below 1 the power has no derivative at rest.
     """
 

@@ -10,8 +10,8 @@ six stages and the derivative of a Jacobian. On a fixed grid no error control sh
 
 After a jump of the voltage the current lags by L / R, often much less than a step. SDIRK2 leaves up to a fifth of the
 jump at the end of such a step. The lag of the last jump therefore decays exponentially in every step, and the method
-solves for the rest (an integrating factor; Lawson, Generalized Runge-Kutta processes for stable systems with large
-Lipschitz constants, SIAM J. Numer. Anal. 4 (1967)).
+solves for the rest. This is an integrating factor (Lawson, Generalized Runge-Kutta processes for stable systems with
+large Lipschitz constants, SIAM J. Numer. Anal. 4 (1967)).
 """
 
 from __future__ import annotations

@@ -310,8 +310,8 @@ def status_moving(robot: Robot, conditions: Conditions, end: Signals, voltage: S
         voltage: voltage of the driver at that instant [V].
 
     Returns:
-        `not_settled` if the speed changes, or if the robot gains speed with movers sliding beyond V_s, `slides` if it
-        then loses speed or stands, `stalled` if it creeps, else the status of steady travel.
+        `not_settled` if the speed changes, or if the robot gains speed with movers sliding beyond V_s. `slides` if it
+        then loses speed or stands. `stalled` if it creeps. Else the status of steady travel.
     """
     settling = jnp.abs(end.acceleration) * TIME > SHARE * jnp.abs(end.speed)
     status = jnp.where(settling, NOT_SETTLED, travel_status(end.speed, voltage))

@@ -60,9 +60,9 @@ def _signals_and_residuals(
     """State and signals at given unknowns, and the residuals of the balances, all 0 at the operating point.
 
     The unknowns are speed, current and motor speed, in the order of elimination of the balances. For any robot the
-    slip determines the speed and the voltage the current. The torque then gives the motor speed. The current is the
-    one that the duty alone would drive, see `Driver.admitted`. Where a clamp holds the output, the third unknown is
-    the torque that the clamp carries, in place of the motor speed.
+    slip determines the speed and the voltage the current. The torque then gives the motor speed. The current is as
+    the duty alone would drive it, see `Driver.admitted`. If a clamp holds the output, the third unknown is the torque
+    that the clamp carries, in place of the motor speed.
     """
     speed, wanted, third = unknowns
     conditions, speed_motor = _clamped_conditions(conditions, third)
@@ -188,11 +188,11 @@ def steady(robot: Robot, conditions: Conditions) -> Result:
         Scalars. The status is one of these. `converged`. `reverses`: steady travel backward due to a negative
         voltage. `rolls_back`: gravity drives the robot against its motors, or backward without voltage. `stalled`:
         shafts or robot are slower than a tenth of V_s, where static friction is not resolved, and neither motors nor
-        gravity
-        can turn the shafts: stall current, shaft speed 0, and the robot creeps at the sliding speed of the friction
-        law. `slides`: the demand is above the adhesion limit. `battery_empty`. `failed`. The last three have NaN in
-        every number but `mass` and `adhesion_used`, which are NaN too if the conditions are not finite or the mass
-        is not positive. A member without numbers has zero derivatives and does not affect the others.
+        gravity can turn the shafts. The current is that of stall, the shaft speed 0, and the robot creeps at the
+        sliding speed of the friction law. `slides`: the demand is above the adhesion limit. `battery_empty`.
+        `failed`. The last three have NaN in every number but `mass` and `adhesion_used`, which are NaN too if the
+        conditions are not finite or the mass is not positive. A member without numbers has zero derivatives and does
+        not affect the others.
     """
     if conditions.turns:
         return circling.steady(robot, conditions)
@@ -222,8 +222,8 @@ def steady(robot: Robot, conditions: Conditions) -> Result:
 def operating_point(robot: Robot, conditions: Conditions) -> tuple[Result, Array]:
     """`steady` with numbers at any status, for a fit that needs a way back.
 
-    If the robot `slides` they are those of the balances with the contact held at V_s: current and motor
-    speed as if the ground held, the robot V_s slower than r_k ω_k, and no derivative of the speed in μ_s.
+    If the robot `slides` they are those of the balances with the contact held at V_s. Current and motor speed are as
+    if the ground held, the robot is V_s slower than r_k ω_k, and its speed has no derivative in μ_s.
 
     Returns:
         The result, and whether robot and conditions are sound (see `_conditions_are_sound`).

@@ -74,8 +74,8 @@ def step(robot: Robot, state: State, command: Command, dt: Scalar, conditions: C
     """Returns the state `dt` later under a constant command.
 
     The step is split into eight parts of growing length, each by Rodas4, an L-stable method (Hairer and Wanner,
-    Solving Ordinary Differential Equations II, 1996, Section IV.7). At a `dt` of 10 ms, compared with steps of 0.1
-    ms, the speed of the paper's robot is within 4 mm/s, also during starts and stops, and its position within 0.1 mm
+    Solving Ordinary Differential Equations II, 1996, Section IV.7). At a `dt` of 10 ms, the speed of the paper's
+    robot is within 4 mm/s of that with steps of 0.1 ms, also during starts and stops. Its position is within 0.1 mm
     (tests/test_stepping.py). A robot that has stopped stays at rest as long as friction can hold it.
 
     Args:
@@ -90,8 +90,8 @@ def step(robot: Robot, state: State, command: Command, dt: Scalar, conditions: C
 
     Raises:
         UsageError: conditions of several runs, conditions that impose the motors' speed or drive the sides
-            independently, a value out of range or NaN, a configuration that the robot lacks, a command that is no
-            number or names no condition, a state of another robot, a `dt` that is not above 0. Tracers pass.
+            independently, a value out of range or NaN, a configuration that the robot lacks. Also a command that is
+            no number or names no condition, a state of another robot, a `dt` that is not above 0. Tracers pass.
     """
     robot, conditions = as_floats((robot, _commanded_conditions(robot, command, conditions)))
     y = _unknowns_of_state(robot, state)

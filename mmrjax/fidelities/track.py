@@ -209,7 +209,7 @@ def check_track_runs(
 
     Raises:
         ValueError: `sample` is not a whole number of steps or `duration` of samples, a lever reaches below the
-            ground, the step is above the largest stable one, which the message states, a load without ground, an
+            ground, the step is above the largest stable one, which the message states. Also a load without ground, an
             imposed motor speed, movers without inertia, parts with more mass or inertia than the robot.
     """
     if not robot.has_ground:

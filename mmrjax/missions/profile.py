@@ -153,7 +153,7 @@ def profile(
         values: other fields of the profile, by name.
 
     Raises:
-        UsageError: fewer than two rows, a time that does not increase, an unknown mode or field, a length that
+        UsageError: fewer than two rows, a time that does not increase, an unknown mode or field. Also a length that
             differs from that of `time`, a value that is not finite, a duty beyond -1..1, cycles below 1.
     """
     rows = np.asarray(time, float)

@@ -305,8 +305,9 @@ def gearbox(
 ) -> Signals:
     """Torques at both shafts and the acceleration of the driving wheel, the armature taking its share.
 
-    Effects of the gearbox depend on the torque B + J_w ω̇_k that it transmits to its output, J_w being what turns with
-    the output and B the load without their own loss. That torque depends on their loss, so Newton's method finds it.
+    Effects of the gearbox depend on the torque B + J_w ω̇_k that it transmits to its output. J_w is the inertia that
+    turns with the output, and B the load without their own loss. That torque depends on their loss, so Newton's
+    method finds it.
 
     Args:
         mover: the mover's torque on the shaft in addition to the track losses [N·m]. None: the traction.

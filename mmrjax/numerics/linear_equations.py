@@ -7,7 +7,7 @@ They are here instead of lineax for two reasons, measured in one run (two cores,
 * LAPACK divides its batch among the threads that run the program, and one of these waits for the others. Programs in
   parallel threads can each hold a thread and wait for ever. Four threads that solved batches of 512 to 2048 systems
   by lineax's `LU`, `QR` or `Cholesky` came to a standstill within seconds, in four runs of four. Fits run in parallel
-  threads. So the loops for many unknowns stay too, although lineax is faster there: `LU` takes 0.6, 0.8 and 0.5 times
+  threads. So the loops for many unknowns stay too, although lineax is faster there. `LU` takes 0.6, 0.8 and 0.5 times
   the time of `solve` at n = 9, 12 and 20, and `Cholesky` 0.4, 0.4 and 0.2 times.
 
 * `factorise`, `substitute`, `solve_factorised`, `regularise`: each number is an array of the batch, without pivoting.

@@ -21,8 +21,8 @@ _D = (
 class RodasInterpolation(diffrax.LocalLinearInterpolation):
     """The method's own dense output, of order 3: y0 (1 - s) + s (y1 + (1 - s) (c2 + s c3)).
 
-    A Hermite cubic would not work: its slopes are right-hand sides, in which a stiff component multiplies
-    the error of its value, so that it oscillates between the ends of a long step.
+    A Hermite cubic would not work. Its slopes are right-hand sides, and there a stiff component multiplies the error
+    of its value. So the cubic oscillates between the ends of a long step.
     """
 
     c2: Any

@@ -1,8 +1,8 @@
 """Main track of one side: its path around two pulleys, its elastic runs and its tooth mesh.
 
 The belt is not a chain of bodies: it runs on its path. The coordinate of a point is its distance along the path,
-counted from the end of the front pulley, in the direction of forward running: lower run (backwards), rear pulley
-(up), upper run (forwards), front pulley (down).
+counted from the end of the front pulley, in the direction of forward running. The order is lower run (backwards),
+rear pulley (up), upper run (forwards), front pulley (down).
 """
 
 from __future__ import annotations
@@ -146,8 +146,8 @@ def belt_travel(radius: Scalar, angle: Scalar) -> tuple[Scalar, Scalar]:
 def belt_runs(path: BeltPath, angles: Sequence[Scalar], rates: Sequence[Scalar]) -> BeltRuns:
     """Tensions from the angles [rad] and rates [rad/s] of front and rear pulley, relative to the chassis.
 
-    P = max(0, P_0 ± k Δs ± b Δṡ), with Δs the belt drawn by the front pulley less that of the rear one: the
-    upper run pulls, the lower one slackens. The teeth transmit, so P_0 only keeps the runs from going slack.
+    P = max(0, P_0 ± k Δs ± b Δṡ), with Δs the belt drawn by the front pulley less that of the rear one. The upper run
+    pulls, the lower one slackens. The teeth transmit, so P_0 only keeps the runs from going slack.
     """
     gear = path.gear
     drawn_front, lever_front = belt_travel(path.radius, angles[0])

@@ -1,11 +1,11 @@
 """A whole robot free to turn, in motion: its state, all its forces at an instant, one time step, and its start.
 
-Coordinates q: place x uphill and y to the left [m], height z of the middle of the wheelbase over the ground [m], yaw,
-pitch (nose down) and roll (left side up) [rad], then the angles of driving and driven pulley of the left and of the
-right side [rad], relative to the chassis. Velocities v are their rates. MJX computes chassis and pulleys (`mjcf`).
-Each side is the half robot's belt, contacts and drive (`undercarriage`, `balances.resolved_sides`) at its own height
-z + y_s roll and speed v_x - ω y_s. `turning.ContactLaw` at each contact replaces the straight-travel law of Fig. 7.
-Roll is small.
+Coordinates q begin with place x uphill and y to the left [m], and height z of the middle of the wheelbase over the
+ground [m]. Then come yaw, pitch (nose down) and roll (left side up) [rad]. The last are the angles of driving and
+driven pulley of the left and of the right side [rad], relative to the chassis. Velocities v are their rates. MJX
+computes chassis and pulleys (`mjcf`). Each side is the half robot's belt, contacts and drive (`undercarriage`,
+`balances.resolved_sides`) at its own height z + y_s roll and speed v_x - ω y_s. `turning.ContactLaw` at each contact
+replaces the straight-travel law of Fig. 7. Roll is small.
 """
 
 from __future__ import annotations

@@ -88,7 +88,8 @@ class SteadyAverages(eqx.Module):
         signals: mean signals.
         guide_share: share of the normal reaction of the ground on the lower guides [-]. It is an output here and a
             parameter in the other fidelities.
-        periods: number of grouser periods that were averaged [-]. 0: a fixed window, because the belt hardly moved.
+        periods: number of grouser periods that were averaged [-]. 0: a fixed window, because the belt moved too
+            little.
         change: largest relative change of current, motor speed and speed between the two halves of the window [-].
         travel: for a robot that turns, means of `balances.Travel`.
     """
@@ -319,8 +320,8 @@ def _state_after_motion(
 def advance(run: HalfRobotSystem, motion: HalfRobotState) -> tuple[HalfRobotState, Signals, Scalar]:
     """One step of MJX (semi-implicit Euler) and of the winding.
 
-    Forces of the contacts are those at the end of the step as far as they depend on v, to first order: (M + Δt K) Δv
-    = Δt M a with MJX's mass matrix M and acceleration a (linearly implicit Euler; Hairer and Wanner 1996, IV.7).
+    Forces of the contacts are those at the end of the step as far as they depend on v, to first order. So (M + Δt K)
+    Δv = Δt M a with MJX's mass matrix M and acceleration a (linearly implicit Euler; Hairer and Wanner 1996, IV.7).
     Within V_s the time constant of a contact is m V_s / (μ_s R_z), microseconds for a small V_s.
 
     Derivatives are those of the step as computed, written once. With Δv constant, the residual of

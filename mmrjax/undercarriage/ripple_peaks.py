@@ -109,7 +109,7 @@ def touchdowns(
     """Touchdown times of a grouser, in order [s]. Its position `place` tells the front arc from the rear
     one.
 
-    A grouser that lifts and returns in the middle of the run does not count: its place has to be in the second half
+    A grouser that lifts and returns in the middle of the run does not count. Its place has to be in the second half
     of the path, or just at the start of it.
     """
     bears = np.asarray(grouser) > 0
@@ -315,7 +315,7 @@ def drop_unconfirmed_modes(found: Sequence[RipplePeak], modes: Mapping[float, Se
 
 
 class ModeCrossing(NamedTuple):
-    """A speed at which a harmonic of the passing frequency equals a natural frequency.
+    """Speed that makes a harmonic of the passing frequency equal to a natural frequency.
 
     Attributes:
         mode, order, payload: mode, order and payload of the crossing [kg].

@@ -1,8 +1,9 @@
 """Contacts of one side with the ground and the guides, and their generalized forces on the chassis.
 
 Coordinates q of half a robot in its plane of travel: travel x [m] uphill, height z [m] of the middle of the wheelbase
-(axle line) over the ground, pitch θ [rad] nose down, angles φ_1, φ_2 [rad] of driving (front) and driven pulley,
-relative to the chassis. Velocities v are their rates. A wheel of 4W2T sits on its pulley's shaft.
+(axle line) over the ground, and three angles. Pitch θ [rad] is nose down. φ_1, φ_2 [rad] are the angles of driving
+(front) and driven pulley, relative to the chassis. Velocities v are their rates. A wheel of 4W2T sits on its pulley's
+shaft.
 
 Contact pairs of one side: 24 grousers with the ground, 168 teeth with each of two guides (720 in all for 6T2A), 2
 wheels with the ground for 4W2T.

@@ -277,8 +277,8 @@ def slope_certainty(rows: PaperRows) -> list[tuple[Any, ...]]:
     """R² (A1) of the current over slope, of each configuration and loading mode with measured rows.
 
     Returns:
-        Configuration, mode, R² of a straight line through the points, of the robot on its own adhesion, the number
-        of rows that settle on it, and R² with the adhesion raised and with the robot's own mass.
+        Configuration, mode, and R² of a straight line through the points and of the robot on its own adhesion. Then
+        the number of rows that settle on it, and R² with the adhesion raised and with the robot's own mass.
     """
     found = []
     for kind in rows.ratio:
