@@ -131,7 +131,7 @@ FIRST_HOUR = """mmrjax simulates a small robot's drive and compares it with meas
 
   mmrjax simulate --configuration 6T2A --voltage 24 --slope 10    one run of the packaged robot
   mmrjax inspect log.csv                                          what a data file contains
-  mmrjax loop measured --out found what the model lacks, from the packaged runs
+  mmrjax loop measured --out found                                what the model lacks, from the packaged runs
 
 mmrjax --help lists all commands."""
 

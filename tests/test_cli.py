@@ -466,7 +466,9 @@ def test_help_lists_commands_under_four_headings_with_one_line_each():
 
 def test_mmrjax_alone_prints_commands_that_exist(mmrjax):
     code, out, _ = mmrjax()
-    names = [line.split()[1] for line in out.splitlines() if line.startswith("  mmrjax ")]
+    lines = [line for line in out.splitlines() if line.startswith("  mmrjax ")]
+    assert len({len(line.rstrip()) - len(re.split("  +", line.strip())[1]) for line in lines}) == 1  # one column
+    names = [line.split()[1] for line in lines]
     assert code == 0 and len(names) == 3 and {*names} <= {*typer.main.get_command(cli.app).commands}
 
 
