@@ -114,10 +114,9 @@ class MotionLaw(Protocol):
         ...
 
     def slowness(self, asked: SegmentInputs, y: Array, stands: Array) -> tuple[Scalar, Scalar]:
-        """How far the shafts, and the sliding speeds of the contacts, are below the speed at which friction is
-        resolved [-].
+        """Slowness of the shafts and of the sliding contacts [-]: 1 - |v| / limit.
 
-        1 - |v| / limit: 1 at rest, negative above the limit.
+        The limit is the speed that resolves friction. Slowness is 1 at rest, and negative above the limit.
         """
         ...
 

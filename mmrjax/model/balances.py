@@ -320,15 +320,17 @@ def gearbox(
         carrying = _fill_unset(signals, torque_carried=torque)
         return _gearbox_signals(robot, chassis, carrying, load, effects_sum(robot, carrying, "gearbox"))
 
+    def transmitted(output: Signals) -> Scalar:
+        return load + (chassis.inertia + output.inertia_added) * output.acceleration_wheel
+
     def surplus(torque: Scalar) -> Scalar:
-        signals = at_output(torque)
-        return torque - load - (chassis.inertia + signals.inertia_added) * signals.acceleration_wheel
+        return torque - transmitted(at_output(torque))
 
     torque, output = load, at_output(load)
     if settled:
         return output
     if not any(e.balance == "gearbox" for e in robot.effects):
-        return _fill_unset(output, torque_carried=torque - surplus(torque))
+        return _fill_unset(output, torque_carried=transmitted(output))
     for _ in range(TORQUE_STEPS):
         left, rise = jax.jvp(surplus, (torque,), (jnp.ones_like(torque),))
         torque = torque - left / rise

@@ -1,7 +1,7 @@
 """Newton's method for a few unknowns over a large batch, with derivatives by the implicit function theorem.
 
 `FewUnknowns` is a root finder of optimistix, called through `optimistix.root_find`. For 65 536 points of `steady` on
-two cores it takes 29 ms of processor time, and a loop of our own took 27 ms (medians of four turns of ten calls,
+two cores it takes 29 ms of processor time. A loop of our own took 27 ms (medians of four turns of ten calls,
 alternating in one run, 2026-11-28). optimistix's `Newton` takes 3.1 times as long, because it factorises by batched
 calls of LAPACK. The derivative is written here. A program with optimistix's derivative (`ImplicitAdjoint`) contains a
 host callback, through lineax, and JAX's cache never stores such a program. With `elimination` as lineax's solver it

@@ -136,28 +136,29 @@ def columns_of_joint(log: NamedArrays, joint: str, joints: Names) -> NamedArrays
     )
 
 
-def smoothed_log(log: NamedArrays, chain: Chain, degree: int = 5) -> tuple[np.ndarray, int]:
-    """Motion of all joints at each row of a log, shape (3, rows, joints), by splines of a degree, and the largest
-    number of knots of a joint.
+def smoothed_log(log: NamedArrays, chain: Chain) -> tuple[np.ndarray, np.ndarray, int]:
+    """Motion of all joints at each row of a log, shape (3, rows, joints), by splines of degree 5 and of degree 3, and
+    the largest number of knots of a joint at degree 5.
 
     Raises:
         BadData: the log has no `time_s`, lacks the angle of a joint, or has too few readings of it in a run. As
             `check_units`.
     """
-    motion, knots = np.empty((3, len(log), len(chain.names))), np.zeros(len(chain.names), int)
+    motion, cubic = np.empty((2, 3, len(log), len(chain.names)))
+    knots = np.zeros(len(chain.names), int)
     for k, name in enumerate(chain.names):
         joint = columns_of_joint(log, name, chain.names)
         columns, units = dict(zip(joint.header, joint.values, strict=True)), ANGLE.columns()
         column = next((c for c in units if c in columns), None)
-        needed = {" or ".join(f"{name}.{c}" for c in units): column, "time_s": columns.get("time_s")}
-        lacking = next((names for names, kept in needed.items() if kept is None), None)
-        if column is None or lacking is not None:
+        clock = columns.get("time_s")
+        if column is None or clock is None:
+            lacking = "time_s" if column else " or ".join(f"{name}.{c}" for c in units)
             raise BadData(
                 f"{log.name}: has no column {lacking}; expected time_s and the angle of each joint of the "
                 "model, because every joint's torque depends on the whole motion"
             )
         check_units(joint, [Column(ANGLE, c, units[c]) if c in units else None for c in joint.header])
-        time = column_numbers(columns["time_s"])
+        time = column_numbers(clock)
         angle = math.radians(ANGLE.units[units[column]]) * column_numbers(columns[column])
         runs = np.array(column_texts(columns["run_id"]) if "run_id" in columns else [""] * len(log))
         for run in np.unique(runs):
@@ -168,9 +169,11 @@ def smoothed_log(log: NamedArrays, chain: Chain, degree: int = 5) -> tuple[np.nd
                     f"{log.name}, {name}.{column}: has {len(seen)} readings in run {run or 1}; expected at least "
                     f"{FEWEST} with increasing time_s"
                 )
-            motion[:, rows, k], more = smoothed_motion(time[seen], angle[seen], time[rows], degree)
+            readings = time[seen], angle[seen], time[rows]
+            motion[:, rows, k], more = smoothed_motion(*readings, degree=5)
+            cubic[:, rows, k], _ = smoothed_motion(*readings, degree=3)
             knots[k] += more
-    return motion, int(knots.max())
+    return motion, cubic, int(knots.max())
 
 
 def runs_of_joints(log: NamedArrays, chain: Chain, robots: Mapping[str, Robot]) -> dict[str, Runs]:
@@ -188,7 +191,7 @@ def runs_of_joints(log: NamedArrays, chain: Chain, robots: Mapping[str, Robot]) 
     Raises:
         BadData: as `smoothed_log` and `records.runs_of_arrays`.
     """
-    (motion, knots), (cubic, _) = (smoothed_log(log, chain, degree) for degree in (5, 3))
+    motion, cubic, knots = smoothed_log(log, chain)
     torques, cubic_torques = chain.torques(motion), chain.torques(cubic)
     doubts = [maximum_filter1d(np.abs(x), NEAR, axis=0) for x in (torques - cubic_torques, motion[1] - cubic[1])]
     runs = {}

@@ -51,7 +51,6 @@ FINER = (1.0, 0.25)
 STEPS, STEPS_BLUNT = 40, 20
 #: Sd of a blunt instrument, over its channel's root mean square [-].
 BLUNT = 0.03
-
 #: Draws of the prior in addition to the settled ends, and number of fits with blunt instruments: without a regression
 #: or over several configurations, and beside the regression of one.
 MANY, FEW = (96, 8), (4, 2)
