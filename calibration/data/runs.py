@@ -154,9 +154,9 @@ def runs_of_arrays(
         columns, settled = row_checks.drop_time_of_settled_rows(name, columns, layout, robot)
     notes = (*arrays.notes, *settled, *sides.of_volts(name, columns, battery))
     kept, copied = row_checks.distinct_rows(name, columns)
-    columns, kept, clamped = row_checks.drop_clamped_rows(name, columns, kept)
+    columns = {c: values[kept] for c, values in columns.items() if c != "held" or values.any()}
     if measured:
-        notes = (*notes, *copied, *clamped, *_drop_repeats(name, columns, layout))
+        notes = (*notes, *copied, *_drop_repeats(name, columns, layout))
     stated = instruments.infer_instruments(layout.instruments, columns)
     unsigned = sides.unsigned_current_channels(columns, layout) if measured else ()
     unsigned = tuple(i for i in unsigned if i.channel not in {known.channel for known in stated})
