@@ -138,8 +138,8 @@ class Layout:
         weight = any(float(x) != 0 for load in loads for x in (load.torque_constant, load.torque_gravity))
         names = robot.configurations.names
         supply = 0.0 if robot.controller is None else robot.controller.supply_voltage
-        stated = rig.imposed, robot.has_ground, weight, rig.inherits, names, rig.instruments, rig.columns
-        return cls(*stated, robot.channels, supply)
+        choices = rig.imposed, robot.has_ground, weight, rig.inherits, names, rig.instruments, rig.columns
+        return cls(*choices, robot.channels, supply)
 
     @property
     def table8(self) -> bool:
@@ -200,8 +200,8 @@ class Layout:
         read = (SUPPLY, *self.measured_columns, *self.deviation_columns)
         labels = [word for word in WORDS if word != "mode" or self.imposed in ("voltage", *GOALS)]
         set_ = [c.column for c in quantities.SET if c.in_tables and self.imposed in (c.imposed or IMPOSED)]
-        every = ("configuration", *self.axes, *read, *labels, "time_s", *self.sides, *set_)
-        return tuple(dict.fromkeys(c for c in every if c not in self.idle))
+        column_names = ("configuration", *self.axes, *read, *labels, "time_s", *self.sides, *set_)
+        return tuple(dict.fromkeys(c for c in column_names if c not in self.idle))
 
     def required(self, *, measured: bool, battery: bool) -> Names:
         """Columns that a table must have, in addition to channels."""
@@ -263,8 +263,12 @@ class Layout:
     @functools.cached_property
     def _by_name(self) -> Mapping[str, Column]:
         """Every name of a column, in any unit, with its quantity."""
-        held = self.quantities().values()
-        return {name: Column(quantity, name, unit) for quantity in held for name, unit in quantity.columns().items()}
+        quantities_by_name = self.quantities().values()
+        return {
+            name: Column(quantity, name, unit)
+            for quantity in quantities_by_name
+            for name, unit in quantity.columns().items()
+        }
 
     def spellings(self) -> Names:
         """Every possible name of a known column, in any unit."""

@@ -204,13 +204,13 @@ def _proposed_columns(signals: Sequence[Signal]) -> Iterator[tuple[str, str]]:
         elapsed = None if clock.words else np.asarray(clock.load(), float) * UNITS[unit]
         line = f'time_{unit} = "{clock.path}"'
         if named is None and elapsed is not None:
-            each = proposals.seconds_per_count(rest, np.asarray(clock.load(), float))
-            question = f"compared with a position, it counts {1 / each:.3g} per second"
-            if math.isnan(each):
-                each, question = UNITS[unit], "unit of the counts? give the seconds per count"
-            each = float(f"{each:.3g}")
-            elapsed = np.asarray(clock.load(), float) * each
-            line = f'time_s = {{column = "{clock.path}", factor = {each:g}}}  # {question}'
+            seconds_per_unit = proposals.seconds_per_count(rest, np.asarray(clock.load(), float))
+            question = f"compared with a position, it counts {1 / seconds_per_unit:.3g} per second"
+            if math.isnan(seconds_per_unit):
+                seconds_per_unit, question = UNITS[unit], "unit of the counts? give the seconds per count"
+            seconds_per_unit = float(f"{seconds_per_unit:.3g}")
+            elapsed = np.asarray(clock.load(), float) * seconds_per_unit
+            line = f'time_s = {{column = "{clock.path}", factor = {seconds_per_unit:g}}}  # {question}'
         elif not _unit_of_time(clock.name) and elapsed is not None and unit != "s":
             step = np.diff(elapsed)
             usual = float(np.median(step[step > 0])) if (step > 0).any() else np.nan

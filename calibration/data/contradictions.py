@@ -77,18 +77,18 @@ def misplaced_levers(runs: Runs, robot: Robot) -> tuple[int, str, str] | None:
 
     The reason is a configuration without levers, or an angle beyond their range.
     """
-    stated = [name for name in LEVERS if runs.has(name)]
-    if not stated:
+    lever_columns = [name for name in LEVERS if runs.has(name)]
+    if not lever_columns:
         return None
     if why := reason_without_stance(robot):
-        return 0, stated[0], why
+        return 0, lever_columns[0], why
     on_tracks = np.array([float(c.on_tracks) > 0.5 for c in robot.configurations.members])[runs.configurations(robot)]
     if not on_tracks.all():
         row = int(np.argmin(on_tracks))
-        return row, stated[0], reason_without_levers(robot, runs["configuration"][row])
+        return row, lever_columns[0], reason_without_levers(robot, runs["configuration"][row])
     levers = robot.running_gear.levers
     low, high = (float(np.degrees(x)) for x in (levers.angle_least, levers.angle_most))
-    for name in stated:
+    for name in lever_columns:
         beyond = (runs[name] < low - 1e-9) | (runs[name] > high + 1e-9)
         if beyond.any():
             row = int(np.argmax(beyond))

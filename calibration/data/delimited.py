@@ -136,8 +136,8 @@ def row_of_units(header: Sequence[str], first: Sequence[str]) -> Names:
     known_units = {
         unit for quantity in (*quantities.SET, *channels.EVERY) for unit in quantity.columns().values()
     } - {""}
-    stated = any(unit in known_units for column, unit in zip(header, units, strict=True) if column not in WORDS)
-    return units if stated else ()
+    has_units = any(unit in known_units for column, unit in zip(header, units, strict=True) if column not in WORDS)
+    return units if has_units else ()
 
 
 def decode_text(name: str, content: bytes) -> tuple[str, Names]:

@@ -197,18 +197,18 @@ def toml_content(text: str, where: str | Path, kind: type[InputError] = BadConfi
     except RecursionError as error:
         raise kind(f"{where}: tables or lists are nested too deep; expected at most {DEEPEST} levels") from error
     keys = 0
-    left: list[tuple[Json | list[Any], int]] = [(content, 1)]
-    while left:
-        value, depth = left.pop()
+    pending: list[tuple[Json | list[Any], int]] = [(content, 1)]
+    while pending:
+        value, depth = pending.pop()
         if depth > DEEPEST:
             raise kind(f"{where}: tables or lists are nested too deep; expected at most {DEEPEST} levels")
         inner = value.values() if isinstance(value, dict) else value
         keys += len(value) if isinstance(value, dict) else 0
         if keys > KEYS:
             raise kind(f"{where}: has more than {count_noun(KEYS, 'key')}; is it the right file?")
-        for each in inner:
-            if isinstance(each, dict | list):
-                left.append((each, depth + 1))
-            elif isinstance(each, int) and not -WHOLE <= each < WHOLE:
+        for item in inner:
+            if isinstance(item, dict | list):
+                pending.append((item, depth + 1))
+            elif isinstance(item, int) and not -WHOLE <= item < WHOLE:
                 raise kind(f"{where}: got a whole number beyond 64 bits; expected numbers of at most 18 digits")
     return content

@@ -93,19 +93,19 @@ def mass_notes(robot: Robot, runs: Runs) -> list[str]:
         robot: robot as given, before `with_table_mass`.
     """
     notes = []
-    for name, stated in stated_masses(robot, runs).items():
+    for name, file_mass in stated_masses(robot, runs).items():
         mass = float(robot.configurations[name].mass)
-        if stated.varies:
-            why = "; does total_mass_kg leave the payload out?" if stated.unladen else ""
+        if file_mass.varies:
+            why = "; does total_mass_kg leave the payload out?" if file_mass.unladen else ""
             notes.append(
-                f"{name}: total_mass_kg minus payload_kg varies from {stated.low:.4g} to {stated.high:.4g} kg. The "
-                f"fit used the mass of each row; robot.toml contains the median, {stated.median:.4g} kg, and does "
-                f"not reproduce the fit in rows of another mass{why}"
+                f"{name}: total_mass_kg minus payload_kg varies from {file_mass.low:.4g} to {file_mass.high:.4g} kg. "
+                f"The fit used the mass of each row; robot.toml contains the median, {file_mass.median:.4g} kg, and "
+                f"does not reproduce the fit in rows of another mass{why}"
             )
-        elif abs(stated.median - mass) > ROUNDING:
+        elif abs(file_mass.median - mass) > ROUNDING:
             notes.append(
-                f"{name}: the table states {stated.median:.6g} kg without payload, the robot's file {mass:.6g} kg; "
-                f"{stated.median:.6g} kg is used, and written to robot.toml"
+                f"{name}: the table states {file_mass.median:.6g} kg without payload, the robot's file {mass:.6g} "
+                f"kg; {file_mass.median:.6g} kg is used, and written to robot.toml"
             )
     of_table5 = np.zeros(len(runs), bool)
     if runs.has("surface"):

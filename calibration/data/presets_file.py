@@ -149,24 +149,24 @@ def find_preset(stated: str | Path) -> Preset:
         BadConfiguration: there is no such preset or file, a number is missing or unknown, or as in `parse_preset`.
     """
     name, *others = str(stated).split(SEPARATOR)
-    given: dict[str, float] = {}
-    for each in others:
-        key, equals, text = (part.strip() for part in each.partition("="))
+    number_values: dict[str, float] = {}
+    for preset in others:
+        key, equals, text = (part.strip() for part in preset.partition("="))
         try:
-            given[key] = stated_number(parse_number(text), f"--columns {name}, {key}")
+            number_values[key] = stated_number(parse_number(text), f"--columns {name}, {key}")
         except ValueError as error:
             got = f"{key}{equals}{text}"
             raise BadConfiguration(
                 f"--columns {name}: got {got}; expected a name and a number, such as pole_pairs=7"
             ) from error
     if name in PACKAGED:
-        return parse_preset(_packaged_text(name), name, given)
+        return parse_preset(_packaged_text(name), name, number_values)
     path = Path(name)
     if not path.exists():
         raise BadConfiguration(
             f"--columns: got {name}; no such file and no packaged preset; {allowed_words(name, PACKAGED)}"
         )
-    return parse_preset(input_files.toml_text(path, path.name), path.name, given)
+    return parse_preset(input_files.toml_text(path, path.name), path.name, number_values)
 
 
 def recognise_preset(names: Sequence[str]) -> str:
@@ -192,7 +192,7 @@ def _matches_any(theirs: str, names: set[str]) -> bool:
 def numbers_to_state(name: str) -> Names:
     """Names of the numbers that the user must give for a packaged preset."""
     numbers = input_files.toml_content(_packaged_text(name), name).get("ask", {})
-    return tuple(key for key, stated in numbers.items() if isinstance(stated, str) or "usual" not in stated)
+    return tuple(key for key, number in numbers.items() if isinstance(number, str) or "usual" not in number)
 
 
 def _packaged_text(name: str) -> str:
@@ -243,11 +243,11 @@ def _preset_numbers(asked: Any, where: str, given: Mapping[str, float]) -> dict[
             listed = allowed_words(key, asked) if asked else "it defines no numbers under [ask]"
             raise BadConfiguration(f"--columns {where}: got {key}; {listed}")
     numbers: dict[str, float] = {}
-    for key, stated in asked.items():
-        table = {"about": stated} if isinstance(stated, str) else stated
+    for key, number in asked.items():
+        table = {"about": number} if isinstance(number, str) else number
         if not isinstance(table, dict) or {*table} - {*KEYS_OF_NUMBER} or not isinstance(table.get("about"), str):
             raise BadConfiguration(
-                f'{where}, ask.{key}: got {stated!r}; expected a description such as "number of the motor, from 0", '
+                f'{where}, ask.{key}: got {number!r}; expected a description such as "number of the motor, from 0", '
                 f'or {{about = "DESCRIPTION", usual = 1.0}}'
             )
         if key not in given and "usual" not in table:
@@ -267,8 +267,8 @@ def _parse_column(mine: str, theirs: Any, where: str, numbers: Mapping[str, floa
     table = theirs if isinstance(theirs, dict) else {"column": theirs}
     for key in table:
         stated_word(key, KEYS_OF_COLUMN, where, f"got the key {key}")
-    stated = table.get("column")
-    names = _list_of_texts([stated] if isinstance(stated, str) else stated, f"{where}.column", form)
+    column = table.get("column")
+    names = _list_of_texts([column] if isinstance(column, str) else column, f"{where}.column", form)
     factor = stated_number(table.get("factor", 1.0), f"{where}.factor")
     for key in ("per", "times"):
         if key in table:
@@ -306,7 +306,7 @@ def _fill_in_numbers(name: str, where: str, numbers: Mapping[str, float]) -> str
 
 
 def _list_of_texts(stated: Any, where: str, form: str = "expected a list of names") -> Names:
-    if not isinstance(stated, list) or not all(isinstance(each, str) and each for each in stated):
+    if not isinstance(stated, list) or not all(isinstance(text, str) and text for text in stated):
         raise BadConfiguration(f"{where}: got {stated!r}; {form}")
     return tuple(stated)
 

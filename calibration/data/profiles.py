@@ -259,7 +259,7 @@ def _header_settings(name: str, comments: list[str]) -> Json:
     """Settings in the comment lines at the top, such as `cycles = 40` or `between_rows = "linear"`. Other lines are
     comments.
     """
-    stated: Json = {}
+    header_settings: Json = {}
     for line in comments:
         text = line.lstrip("#").strip()
         if not re.match(r"[\w-]+\s*=", text):
@@ -271,17 +271,17 @@ def _header_settings(name: str, comments: list[str]) -> Json:
         for key, value in settings.items():
             if key not in SETTINGS:
                 raise BadData(f"{name}: got the setting {key}; {allowed_words(key, SETTINGS)}")
-            if key in stated:
+            if key in header_settings:
                 raise BadData(f"{name}: {key} is set twice; expected once")
-            stated[key] = value
-    cycles, between = stated.get("cycles", 1), stated.get("between_rows", BETWEEN[0])
+            header_settings[key] = value
+    cycles, between = header_settings.get("cycles", 1), header_settings.get("between_rows", BETWEEN[0])
     if isinstance(cycles, bool) or not isinstance(cycles, int) or cycles < 1:
         raise BadData(f"{name}, cycles: got {cycles!r}; expected a whole number from 1")
     if between not in BETWEEN:
         raise BadData(f"{name}, between_rows: got {between!r}; expected held or linear")
     begins = {}
     for key, (field, least, greatest, one) in STARTS.items():
-        value = stated.get(key)
+        value = header_settings.get(key)
         if value is None:
             continue
         if not is_number(value) or not least <= value <= greatest:
@@ -432,25 +432,25 @@ def _modes_and_demands(cells: _CellReader) -> tuple[Names, Columns]:
                 shares_found[name][row] = full[name] if mode == MODES[VOLTAGE] else shares_found[name][row - 1]
         for field in (*(f for f in ends if f not in demands), *demands):
             shares_found["demand" if field in CONTROLLED else field][row] = cells.value(field, row)
-        speed, stated = MODES[SPEED], bool(cells.text(YAW_RATE, row))
-        if stated and mode != speed and not (cells.linear and before == speed):
+        speed, has_yaw_rate = MODES[SPEED], bool(cells.text(YAW_RATE, row))
+        if has_yaw_rate and mode != speed and not (cells.linear and before == speed):
             cells.refuse(
                 YAW_RATE, row, f"an empty cell: a yaw rate needs a demanded speed, but this row has mode {mode}"
             )
-        if cells.has(YAW_RATE) and not stated and mode == speed and (cells.linear or row < len(cells) - 1):
+        if cells.has(YAW_RATE) and not has_yaw_rate and mode == speed and (cells.linear or row < len(cells) - 1):
             cells.refuse(YAW_RATE, row, "the demanded yaw rate, 0 for straight travel")
-        if stated:
+        if has_yaw_rate:
             shares_found[YAW_RATE][row] = cells.value(YAW_RATE, row)
     return tuple(modes), shares_found
 
 
 def _mode_of_row(cells: _CellReader, row: int, before: str, filled: list[str]) -> str:
     """Mode of a row, as stated or as implied by its demand. If no row has a demand, the motors are off."""
-    stated = cells.text(MODE, row)
-    if stated and stated not in MODES:
-        cells.refuse(MODE, row, f"one of these; {allowed_words(stated, MODES)}")
+    mode_text = cells.text(MODE, row)
+    if mode_text and mode_text not in MODES:
+        cells.refuse(MODE, row, f"one of these; {allowed_words(mode_text, MODES)}")
     columns = [cells.columns[field][0] for field in DEMANDS if cells.has(field)]
-    mode = stated or (DEMANDS[filled[0]] if filled else "" if columns else MODES[VOLTAGE])
+    mode = mode_text or (DEMANDS[filled[0]] if filled else "" if columns else MODES[VOLTAGE])
     if not mode and row == len(cells) - 1:
         mode = before
     if not mode:

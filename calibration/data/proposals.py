@@ -95,8 +95,8 @@ class ColumnCandidate:
     def line(self, question: str) -> str:
         """Line of a table `[columns]`."""
         name = f'"{self.signal.path}"'
-        stated = name if self.factor == 1.0 else f"{{column = {name}, factor = {self.factor:g}}}"
-        return f"{self.column} = {stated}{f'  # {question}' if question else ''}"
+        value_text = name if self.factor == 1.0 else f"{{column = {name}, factor = {self.factor:g}}}"
+        return f"{self.column} = {value_text}{f'  # {question}' if question else ''}"
 
 
 def propose_columns(
@@ -241,12 +241,12 @@ def seconds_per_count(signals: Sequence[Signal], count: np.ndarray) -> float:
         count: counts of the clock, shape (rows,).
     """
     known_units = {unit for units in RATES for unit in units[:2] if isinstance(unit, str)}
-    stated = {
+    seconds_by_unit = {
         signal.path: _stated_unit(signal, known_units) for signal in signals if not (signal.refused or signal.words)
     }
     pairs = {(of_place, of_rate): one for of_place, of_rate, one in RATES}
-    for place, rate in itertools.permutations([s for s in signals if stated.get(s.path)], 2):
-        one = pairs.get((str(stated[place.path]), str(stated[rate.path])))
+    for place, rate in itertools.permutations([s for s in signals if seconds_by_unit.get(s.path)], 2):
+        one = pairs.get((str(seconds_by_unit[place.path]), str(seconds_by_unit[rate.path])))
         if one is not None and place.length == rate.length == len(count):
             factor = _integral_factor(count, np.asarray(place.load(), float), np.asarray(rate.load(), float))
             if math.isfinite(factor) and factor > 0:
@@ -321,12 +321,12 @@ def _integral_factor(time: np.ndarray, place: np.ndarray, rate: np.ndarray) -> f
     if sound.sum() < 3:
         return math.nan
     sound &= step <= 5 * np.median(step[sound])
-    moved = np.cumsum(np.where(sound, np.diff(place), 0.0))
+    distance = np.cumsum(np.where(sound, np.diff(place), 0.0))
     turned = np.cumsum(np.where(sound, 0.5 * (rate[1:] + rate[:-1]) * step, 0.0))
     if not np.any(turned):
         return math.nan
-    factor = float(moved @ turned / (turned @ turned))
-    rest = np.abs(moved - factor * turned).max() / max(float(np.abs(moved).max()), 1e-300)
+    factor = float(distance @ turned / (turned @ turned))
+    rest = np.abs(distance - factor * turned).max() / max(float(np.abs(distance).max()), 1e-300)
     return factor if rest < INTEGRAL else math.nan
 
 

@@ -344,24 +344,24 @@ def saturation_sentence(runs: Runs) -> str:
         return ""
     if any(runs.layout.magnitude(c.name) for c in runs.channels if c.column in (current, speed)):
         return ""
-    given, readings = applied_drive(runs), np.stack([runs[current], runs[speed]], 1)
+    drive, readings = applied_drive(runs), np.stack([runs[current], runs[speed]], 1)
     read = np.isfinite(readings).all(1)
-    inner = read & (given != 0) & (np.abs(given) <= INNER * float(np.max(np.abs(given))))
+    inner = read & (drive != 0) & (np.abs(drive) <= INNER * float(np.max(np.abs(drive))))
     if inner.sum() < ROWS_INNER:
         return ""
-    seen = readings @ np.linalg.lstsq(readings[inner], given[inner], rcond=None)[0]
-    if np.std(seen[inner] - given[inner]) > FITS * np.std(given[inner]):
+    seen = readings @ np.linalg.lstsq(readings[inner], drive[inner], rcond=None)[0]
+    if np.std(seen[inner] - drive[inner]) > FITS * np.std(drive[inner]):
         return ""
-    top = read & (np.abs(given) >= np.quantile(np.abs(given[read]), 0.9))
+    top = read & (np.abs(drive) >= np.quantile(np.abs(drive[read]), 0.9))
     limit = float(np.median(np.abs(seen[top])))
-    beyond = read & (np.abs(given) > limit / REACHES)
+    beyond = read & (np.abs(drive) > limit / REACHES)
     # If the voltage that they show still rises, the reason is another one.
     if beyond.sum() < ROWS_INNER or np.std(np.abs(seen[beyond])) > FITS * limit:
         return ""
     row = int(np.flatnonzero(beyond)[0])
     column = "duty" if runs.has("duty") else runs.headings.get(SUPPLY, SUPPLY)
     return (
-        f"{runs.source} row {row + 1}, {column}: commands {three_digits(given[row])} V, but current and speed "
+        f"{runs.source} row {row + 1}, {column}: commands {three_digits(drive[row])} V, but current and speed "
         f"show {three_digits(limit)} V at most, as in {100 * np.mean(beyond):.2g} % of the log; the driver limits "
         f"the voltage. Give the voltage that it applies, or limit the column to {three_digits(limit)} V"
     )
@@ -488,7 +488,7 @@ def swapped_sentence(runs: Runs) -> str:
 
 def log_doubts(runs: Runs, robot: Robot) -> Names:
     """Sentences on doubts about a log: its times, levels and limits, and units that do not fit the robot."""
-    every = (
+    doubts = (
         gap_sentence(runs),
         jitter_sentence(runs),
         saturation_sentence(runs),
@@ -501,7 +501,7 @@ def log_doubts(runs: Runs, robot: Robot) -> Names:
         doubtful_torque(runs, robot),
         doubtful_speed(runs, robot),
     )
-    return tuple(filter(None, every))
+    return tuple(filter(None, doubts))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -523,21 +523,21 @@ class NumberOrigin:
 
 def number_origins(file: RobotFile) -> list[NumberOrigin]:
     """Origin of each number of a robot, part by part. Numbers that no file states come last in their part."""
-    robot, stated = file.robot, file.stated
+    robot, names_in_file = file.robot, file.stated
     priors = {name: sd for name, _, sd in robot.rig.priors}
     origins = []
     for p in params.walk_parameters(robot):
         head, _, rest = p.name.partition(".")
         mine = head in robot.configurations
-        is_shown = p.name in stated or mine or p.name.startswith(("motor.friction", "gearbox."))
-        is_shown |= p.name == rig_file.CENTRE and rig_file.WHEELBASE in stated
-        is_shown |= head == BATTERY and any(name.startswith(f"{BATTERY}.") for name in stated)
+        is_shown = p.name in names_in_file or mine or p.name.startswith(("motor.friction", "gearbox."))
+        is_shown |= p.name == rig_file.CENTRE and rig_file.WHEELBASE in names_in_file
+        is_shown |= head == BATTERY and any(name.startswith(f"{BATTERY}.") for name in names_in_file)
         assumed = not robot.rig.inherits and (
-            p.name == "motor.inertia" or (p.name == "motor.inductance" and "motor.resistance" in stated)
+            p.name == "motor.inertia" or (p.name == "motor.inductance" and "motor.resistance" in names_in_file)
         )
         if not is_shown and not assumed:
             continue
-        if p.name in stated:
+        if p.name in names_in_file:
             why = "the file, from mass and travel of the linear unit" if head in file.linear else "the file"
         elif robot.rig.inherits:
             why = "its base"

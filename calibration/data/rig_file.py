@@ -119,12 +119,12 @@ def linear_to_shaft(table: Json, name: str, where: str, sds: dict[str, float], s
     inputs = {key: sds.pop(f"{name}.{key}") for key in values if f"{name}.{key}" in sds}
     exact = {key for key, sd in inputs.items() if sd == 0}
     for result in table:
-        moved = {
+        shaft_values = {
             key
             for key in values
             if _shaft_of_linear_unit({**values, key: 1.01 * values[key] + 1e-6}, sides)[result] != table[result]
         }
-        if moved and moved <= exact:
+        if shaft_values and shaft_values <= exact:
             sds[f"{name}.{result}"] = 0.0
             continue
         steps = [
@@ -189,9 +189,11 @@ def parse_rig(content: Json, where: str, loads: Sequence[str], *, travels: bool,
         BadConfiguration: a word, channel or column is unknown, a channel is imposed, or an instrument belongs to a
             channel that the rig does not have.
     """
-    stated = content.pop("imposed", IMPOSED[0])
+    imposed_name = content.pop("imposed", IMPOSED[0])
     imposed = stated_word(
-        SHORT.get(stated, stated) if isinstance(stated, str) else stated, IMPOSED, f"{where}, imposed"
+        SHORT.get(imposed_name, imposed_name) if isinstance(imposed_name, str) else imposed_name,
+        IMPOSED,
+        f"{where}, imposed",
     )
     start = stated_word(content.pop("start", STARTS[0]), STARTS, f"{where}, start")
     between = stated_word(content.pop("between_rows", BETWEEN[0]), BETWEEN, f"{where}, between_rows")
@@ -215,16 +217,16 @@ def parse_rig(content: Json, where: str, loads: Sequence[str], *, travels: bool,
 
 
 def _parse_channels(stated: Any, where: str) -> Names:
-    every = channels.channel_names(channels.EVERY)
+    channel_names = channels.channel_names(channels.EVERY)
     if not isinstance(stated, list) or not stated or not all(isinstance(name, str) for name in stated):
         raise BadConfiguration(
-            f"{where}: got {stated!r}; expected a list of channels, at least one of {', '.join(every)}"
+            f"{where}: got {stated!r}; expected a list of channels, at least one of {', '.join(channel_names)}"
         )
     for name in stated:
-        stated_word(name, every, where)
+        stated_word(name, channel_names, where)
         if stated.count(name) > 1:
             raise BadConfiguration(f"{where}: {name} is repeated; expected each channel once")
-    return tuple(name for name in every if name in stated)
+    return tuple(name for name in channel_names if name in stated)
 
 
 def _parse_surfaces(stated: Any, loads: Sequence[str], where: str) -> tuple[tuple[str, str], ...]:
@@ -329,13 +331,14 @@ def reject_missing(
         BadConfiguration: a parameter is missing. One sentence lists all of them.
     """
     if missing:
-        each = ", ".join(f"{name} [{known[name].spec.unit}]" for name in missing)
+        names_with_units = ", ".join(f"{name} [{known[name].spec.unit}]" for name in missing)
         verb = "is" if len(missing) == 1 else "are"
         strange = [name for name in given if name not in known]
         near = [(x, name) for name in missing for x in difflib.get_close_matches(name, strange, 1, 0.85)]
         misspelt = "".join(f"; is {x} meant to be {name}?" for x, name in near)
         raise BadConfiguration(
-            f'{where}: {each} {verb} missing; a robot with base = "none" needs every parameter (mmrjax rig new '
+            f'{where}: {names_with_units} {verb} missing; a robot with base = "none" needs every parameter (mmrjax '
+            "rig new "
             f"writes a file with all of them){misspelt}"
         )
 
@@ -398,8 +401,8 @@ def rig_lines(rig: Rig) -> tuple[list[str], dict[str, list[str]]]:
 
 def value_text(name: str, value: float, rig: Rig) -> str:
     """Value of a parameter as written in a file, with ± if its prior is stated and the value is unchanged."""
-    for stated, mean, sd in rig.priors:
-        if stated == name and mean == value:
+    for prior_name, mean, sd in rig.priors:
+        if prior_name == name and mean == value:
             return f'"{value!r} ± {sd!r}"'
     return repr(value)
 

@@ -246,18 +246,18 @@ def _robot_before_parameters(
     robot = paper_robots.blank_robot(Configurations(loads.by_name), rig=rig)
     robot = dataclasses.replace(robot, controller=controller)
     robot = params.replace(robot, {name: jnp.asarray(value) for name, (value, _) in rig_file.DEFAULTS.items()})
-    given = dict(_flatten(content))
+    file_values = dict(_flatten(content))
     parameters = {p.name: p for p in params.walk_parameters(robot)}
-    resistance = given.get("motor.resistance")
+    resistance = file_values.get("motor.resistance")
     if isinstance(resistance, int | float):
         robot = params.replace(robot, {"motor.inductance": params.as_float(rig_file.WINDING * resistance)})
-    for name in given:
+    for name in file_values:
         if "." not in name and name not in COUNTS:
             raise BadConfiguration(f"{where}, {name}: no such parameter; {_parameter_choices(name, parameters)}")
-    missing = [name for name in rig_file.required_parameters(rig, given.items()) if name not in given]
+    missing = [name for name in rig_file.required_parameters(rig, file_values.items()) if name not in file_values]
     if not loads.travels and "speed" in rig.channels:
-        missing += [f"{name}.radius" for name in loads.by_name if f"{name}.radius" not in given]
-    rig_file.reject_missing([*missing, *loads.missing], parameters, where, given)
+        missing += [f"{name}.radius" for name in loads.by_name if f"{name}.radius" not in file_values]
+    rig_file.reject_missing([*missing, *loads.missing], parameters, where, file_values)
     return robot, sds, loads.linear
 
 
@@ -321,14 +321,14 @@ def change_robot(robot: Robot, values: Mapping[str, Any], where: str, notes: lis
     Raises:
         BadConfiguration: for the same reasons as `parse_robot_file`.
     """
-    stated = dict(values)
+    new_values = dict(values)
     settings = (*COUNTS, *RATINGS, *SWITCHES, *CHOICES)
-    ratings = {name: _check_setting(where, name, stated.pop(name)) for name in settings if name in stated}
-    if CURVE & stated.keys() and "battery.capacity" in stated:  # all of one cell, unless stated otherwise
-        ratings.setdefault("battery.capacity_curve", stated["battery.capacity"])
+    ratings = {name: _check_setting(where, name, new_values.pop(name)) for name in settings if name in new_values}
+    if CURVE & new_values.keys() and "battery.capacity" in new_values:  # all of one cell, unless stated otherwise
+        ratings.setdefault("battery.capacity_curve", new_values["battery.capacity"])
     parameters = {p.name: p for p in params.walk_parameters(robot)}
     refused: dict[str, list[str]] = {}
-    for name, value in stated.items():
+    for name, value in new_values.items():
         if why := _refusal_reason(name, value, parameters):
             refused.setdefault(why, []).append(name)
     if refused:
@@ -336,8 +336,8 @@ def change_robot(robot: Robot, values: Mapping[str, Any], where: str, notes: lis
         if len(sentences) > 1:  # one message has room for all of them without the allowed names
             sentences = [sentence.partition(" allowed: ")[0] for sentence in sentences]
         raise BadConfiguration(f"{where}, {'; also '.join(sentences)}")
-    robot = params.replace(robot, {name: jnp.asarray(value, float) for name, value in stated.items()})
-    robot = rig_file.recentre_priors(robot, stated)
+    robot = params.replace(robot, {name: jnp.asarray(value, float) for name, value in new_values.items()})
+    robot = rig_file.recentre_priors(robot, new_values)
     robot = dataclasses.replace(robot, sides=ratings.pop("sides", robot.sides))
     for name, value in ratings.items():
         part, _, key = name.partition(".")
@@ -374,9 +374,9 @@ def _add_required_states(robot: Robot, where: str) -> Robot:
     for name, load in loose.items():
         if not (float(robot.motor.inertia) > 0 and float(load.inertia) > 0):
             key, unit = ("backlash", "rad") if load.backlash > 0 else ("stiffness", "N·m/rad")
-            stated = f"{where}, {name}.{key}: got {float(getattr(load, key)):g} {unit}"
+            problem_text = f"{where}, {name}.{key}: got {float(getattr(load, key)):g} {unit}"
             raise BadConfiguration(
-                f"{stated}; motor and load can then move relative to each other, so motor.inertia and "
+                f"{problem_text}; motor and load can then move relative to each other, so motor.inertia and "
                 f"{name}.inertia must be above 0"
             )
     own = robot.controller

@@ -153,25 +153,25 @@ def runs_of_arrays(
     if measured and robot is not None:
         columns, settled = row_checks.drop_time_of_settled_rows(name, columns, layout, robot)
     notes = (*arrays.notes, *settled, *sides.of_volts(name, columns, battery))
-    kept, copied = row_checks.distinct_rows(name, columns)
-    columns, kept, clamped = row_checks.drop_clamped_rows(name, columns, kept)
+    is_kept, copied = row_checks.distinct_rows(name, columns)
+    columns, is_kept, clamped = row_checks.drop_clamped_rows(name, columns, is_kept)
     if measured:
         notes = (*notes, *copied, *clamped, *_drop_repeats(name, columns, layout))
-    stated = instruments.infer_instruments(layout.instruments, columns)
+    table_instruments = instruments.infer_instruments(layout.instruments, columns)
     unsigned = sides.unsigned_current_channels(columns, layout) if measured else ()
-    unsigned = tuple(i for i in unsigned if i.channel not in {known.channel for known in stated})
-    layout = dataclasses.replace(layout, instruments=(*stated, *unsigned))
-    row_checks.complete_columns(name, columns, int(kept.sum()), layout)
+    unsigned = tuple(i for i in unsigned if i.channel not in {known.channel for known in table_instruments})
+    layout = dataclasses.replace(layout, instruments=(*table_instruments, *unsigned))
+    row_checks.complete_columns(name, columns, int(is_kept.sum()), layout)
     if battery and layout.imposed == "voltage":
-        columns[SUPPLY] = np.full(int(kept.sum()), np.nan)
+        columns[SUPPLY] = np.full(int(is_kept.sum()), np.nan)
     elif measured and not set(TIME) <= set(columns):  # a history may stop, and go on forwards against its motors
         columns, driven, left_out = row_checks.driven_rows(name, columns, layout)
-        kept[kept] = driven
+        is_kept[is_kept] = driven
         notes = (*notes, *left_out)
     if not any(column in columns for column in WHEN):
-        columns["order"] = np.arange(1.0, kept.sum() + 1)
+        columns["order"] = np.arange(1.0, is_kept.sum() + 1)
     extras = {
-        c: _values_without_role(raw)[kept]
+        c: _values_without_role(raw)[is_kept]
         for c, m, raw in zip(header, meanings, arrays.values, strict=True)
         if m is None
     }
@@ -299,10 +299,10 @@ def _reject_condition_without_effect(arrays: NamedArrays, meaning: Column, raw: 
 def _reject_supply_voltages(arrays: NamedArrays, voltages: Raw) -> None:
     """Rejects supply voltages of runs that are on a battery."""
     if isinstance(voltages, np.ndarray):
-        stated = np.flatnonzero(~np.isnan(voltages.astype(float)))[:1].tolist()
+        filled_rows = np.flatnonzero(~np.isnan(voltages.astype(float)))[:1].tolist()
     else:
-        stated = [row for row, cell in enumerate(voltages) if cell][:1]
-    for row in stated:
+        filled_rows = [row for row, cell in enumerate(voltages) if cell][:1]
+    for row in filled_rows:
         raise BadData(
             f"{arrays.row(row)}, supply_voltage_V: got {column_texts(voltages[row : row + 1])[0]} together with "
             "--battery, whose charge sets the voltage; leave the cell empty or remove the column"

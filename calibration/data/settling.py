@@ -174,7 +174,7 @@ class Settled:
 
     def table(self) -> Columns:
         """The settled runs, a column each as tables of runs have them."""
-        kept = self.kept
+        stretches = self.kept
         columns: Columns = {}
         means = dict(self.runs.columns) | {k: v for k, v in self.runs.extras.items() if v.dtype.kind == "f"}
         read = {c.column for s in self.signals for c in (s.channel,)} | {"time_s", "order", "run_id"}
@@ -183,17 +183,17 @@ class Settled:
             if name in read or name == "mode" or (name == SPEED and self.runs.turns):
                 continue
             if column.dtype.kind == "f":
-                columns[name] = np.array([_digits(_plain(column[s.rows])) for s in kept])
+                columns[name] = np.array([_digits(_plain(column[s.rows])) for s in stretches])
             else:
-                columns[name] = np.array([str(column[s.rows[0]]) for s in kept])
+                columns[name] = np.array([str(column[s.rows[0]]) for s in stretches])
         for signal in self.signals:
             name = signal.channel.name
-            if not any(math.isfinite(s.mean[name]) for s in kept):
+            if not any(math.isfinite(s.mean[name]) for s in stretches):
                 continue
-            columns[signal.channel.column] = np.array([_digits(s.mean[name]) for s in kept])
-            columns[signal.channel.sd_column] = np.array([_digits(s.sd[name], 3) for s in kept])
-        columns["run_id"] = np.array([f"{s.run or 'log'} {s.begin:.6g}-{s.end:.6g} s" for s in kept])
-        columns["order"] = np.arange(1.0, len(kept) + 1)
+            columns[signal.channel.column] = np.array([_digits(s.mean[name]) for s in stretches])
+            columns[signal.channel.sd_column] = np.array([_digits(s.sd[name], 3) for s in stretches])
+        columns["run_id"] = np.array([f"{s.run or 'log'} {s.begin:.6g}-{s.end:.6g} s" for s in stretches])
+        columns["order"] = np.arange(1.0, len(stretches) + 1)
         return columns
 
 
@@ -266,15 +266,15 @@ def _divide_log(runs: Runs, shortest: float | None, drift: float, inertia: Mappi
         raise BadData(
             f"{runs.source}: column time_s is missing, so each row is already a settled run; use it with loop"
         )
-    each = _in_order(runs)
-    step = float(np.median(np.concatenate([np.diff(runs["time_s"][rows]) for rows in each])))
+    rows_by_run = _in_order(runs)
+    step = float(np.median(np.concatenate([np.diff(runs["time_s"][rows]) for rows in rows_by_run])))
     shortest = max(LEAST, 20 * step) if shortest is None else shortest
     half = max(1, round(shortest / 6 / step))
     drives = applied_drive(runs)
     gaps: list[int] = []
     levels: list[np.ndarray] = []
     divided_by = (*(runs.of_sides if runs.turns else (drives,)), *([runs[LOAD]] if runs.has(LOAD) else []))
-    for rows in each:
+    for rows in rows_by_run:
         far = np.flatnonzero(np.diff(runs["time_s"][rows]) > GAP * step)
         gaps += [int(rows[k]) for k in far]
         for part in np.split(rows, far + 1):
@@ -282,10 +282,10 @@ def _divide_log(runs: Runs, shortest: float | None, drift: float, inertia: Mappi
             for driver in divided_by:
                 found_in = [x for level in found_in for x in _levels_of(runs, driver, level, shortest, drift, step)]
             levels += found_in
-    signals = _settled_signals_of_log(runs, each, levels, half, drift)
+    signals = _settled_signals_of_log(runs, rows_by_run, levels, half, drift)
     for signal in signals:
         _check_alive(runs, signal)
-    stuck = {s.channel.name: _stuck_rows(s, each) for s in signals}
+    stuck = {s.channel.name: _stuck_rows(s, rows_by_run) for s in signals}
     stretches = [
         _settled_end(runs, signals, drives, level, shortest, drift, step, stuck, inertia or {}) for level in levels
     ]
@@ -305,8 +305,8 @@ def settled_channels(robot: Robot) -> tuple[Channel, ...]:
 def _in_order(runs: Runs) -> list[np.ndarray]:
     """Rows of each run, whose time increases from row to row."""
     run, time = runs.run_names, runs["time_s"]
-    each = [np.flatnonzero(run == name) for name in dict.fromkeys(run.tolist())]
-    for rows in each:
+    rows_by_run = [np.flatnonzero(run == name) for name in dict.fromkeys(run.tolist())]
+    for rows in rows_by_run:
         steps = np.diff(time[rows])
         if (steps <= 0).any():
             k = int(np.argmax(steps <= 0))
@@ -321,12 +321,12 @@ def _in_order(runs: Runs) -> list[np.ndarray]:
                 "s; give each "
                 "recording its own run_id, or sort the rows"
             )
-    if max(map(len, each)) < FEWEST:
+    if max(map(len, rows_by_run)) < FEWEST:
         raise BadData(
-            f"{runs.source}: {count_noun(max(map(len, each)), 'sample')} in its longest run; at least {FEWEST} are "
-            "needed"
+            f"{runs.source}: {count_noun(max(map(len, rows_by_run)), 'sample')} in its longest run; at least "
+            f"{FEWEST} are needed"
         )
-    return each
+    return rows_by_run
 
 
 def _settled_signals_of_log(
@@ -412,8 +412,8 @@ def _step_of_instrument(runs: Runs, channel: Channel, shown: np.ndarray) -> floa
 
     If neither has one, it is the smallest difference of readings that mostly repeat.
     """
-    stated = (i.quantum or 0.0 for i in runs.layout.instruments if i.channel == channel.name)
-    if step := common_step(shown) or next(stated, 0.0) / channel.factor:
+    quanta = (i.quantum or 0.0 for i in runs.layout.instruments if i.channel == channel.name)
+    if step := common_step(shown) or next(quanta, 0.0) / channel.factor:
         return step
     levels = np.unique(shown[np.isfinite(shown)])
     coarse = 1 < len(levels) < COARSE * np.isfinite(shown).sum()
@@ -442,9 +442,9 @@ def _check_alive(runs: Runs, signal: Signal) -> None:
 
 def _stuck_rows(signal: Signal, each: list[np.ndarray]) -> np.ndarray:
     """Rows in which a channel repeats one number for longer than its noise allows: saturated, or frozen."""
-    held = np.zeros(len(signal.shown), bool)
+    is_stuck = np.zeros(len(signal.shown), bool)
     if len(signal.angle):
-        return held
+        return is_stuck
     for rows in each:
         readings = signal.shown[rows]
         same = np.diff(readings) == 0
@@ -456,8 +456,8 @@ def _stuck_rows(signal: Signal, each: list[np.ndarray]) -> np.ndarray:
         edges = np.flatnonzero(np.diff(np.concatenate([[0], same.astype(int), [0]])))
         for low, high in edges.reshape(-1, 2):
             if high - low >= STUCK and readings[low] != 0:
-                held[rows[low : high + 1]] = True
-    return held
+                is_stuck[rows[low : high + 1]] = True
+    return is_stuck
 
 
 # --- levels and stretches -------------------------------------------------------------------------------
@@ -536,10 +536,10 @@ def _settled_end(
     """The settled end of a level, or the reason why it has none."""
     time = runs["time_s"]
     begin, end, imposed = float(time[rows[0]]), float(time[rows[-1]]), float(np.mean(drives[rows]))
-    left = Stretch(str(runs.run_names[rows[0]]), rows, begin, end, imposed)
+    unsettled_stretch = Stretch(str(runs.run_names[rows[0]]), rows, begin, end, imposed)
 
     def out(why: str, channel: str = "", size: float = 0.0) -> Stretch:
-        return dataclasses.replace(left, why=why, channel=channel, size=size)
+        return dataclasses.replace(unsettled_stretch, why=why, channel=channel, size=size)
 
     if runs.has("mode") and str(runs["mode"][rows[0]]) != "voltage":
         return out("undriven")
@@ -567,16 +567,16 @@ def _settled_end(
     lasts = float(time[stretch.rows[-1]] - time[stretch.rows[0]])
     if acting is not None and (accelerates := _acceleration_reason(acting, seen, lasts, imposed, drift)) is not None:
         return out(*accelerates)
-    every = {s.channel.name: seen.get(s.channel.name, (math.nan,) * 3) for s in signals}
+    values_by_channel = {s.channel.name: seen.get(s.channel.name, (math.nan,) * 3) for s in signals}
     # A change continues after the end, a lag's tail by about as much again, and all channels with it.
-    further = {s.channel.name: left_over * _scale_of(s, every[s.channel.name][0]) for s in signals}
+    further = {s.channel.name: left_over * _scale_of(s, values_by_channel[s.channel.name][0]) for s in signals}
     return dataclasses.replace(
-        left,
+        unsettled_stretch,
         rows=stretch.rows,
         begin=float(time[stretch.rows[0]]),
-        mean={name: mean for name, (mean, _, _) in every.items()},
-        sd={name: math.hypot(sd, further[name]) for name, (_, sd, _) in every.items()},
-        drift={name: change for name, (_, _, change) in every.items()},
+        mean={name: mean for name, (mean, _, _) in values_by_channel.items()},
+        sd={name: math.hypot(sd, further[name]) for name, (_, sd, _) in values_by_channel.items()},
+        drift={name: change for name, (_, _, change) in values_by_channel.items()},
         glitches={name: count for name, count in stretch.glitches.items() if count},
     )
 
@@ -903,18 +903,18 @@ def _nothing_settled_message(found: Settled, loop: str) -> str:
     rows = f"rows {longest.rows[0] + 1} to {longest.rows[-1] + 1}"
     if why in ("changes", "short"):
         step = longest.lasts / max(len(longest.rows) - 1, 1)
-        held, asked = f"{longest.lasts:.3g} s", f"{found.shortest:.3g} s"
+        longest_text, asked = f"{longest.lasts:.3g} s", f"{found.shortest:.3g} s"
         cure = "hold each level longer or set a smaller --shortest"
         if len(longest.rows) < FEWEST or found.shortest > longest.lasts >= LEAST:  # too few samples
             needed = max(FEWEST, round(found.shortest / step) if step > 0 else FEWEST)
-            held, asked = count_noun(len(longest.rows), "sample"), f"{needed}"
+            longest_text, asked = count_noun(len(longest.rows), "sample"), f"{needed}"
             cure = (
                 "log faster, hold each level longer (for --shortest and at least "
                 f"{FEWEST} samples), or remove time_s if each row is a settled run already"
             )
         return (
-            f"{source}: no settled segment: the longest level has {held} ({rows}); expected at least {asked}; "
-            f"{direct}{cure}"
+            f"{source}: no settled segment: the longest level has {longest_text} ({rows}); expected at least "
+            f"{asked}; {direct}{cure}"
         )
     if why in ("settling", "accelerates"):
         return (
@@ -923,10 +923,10 @@ def _nothing_settled_message(found: Settled, loop: str) -> str:
             "level longer or set a larger --drift"
         )
     if why == "unread":
-        each = " and ".join(f"{s.channel.column} in {100 * s.filled:.2g} %" for s in found.signals)
+        filled_shares = " and ".join(f"{s.channel.column} in {100 * s.filled:.2g} %" for s in found.signals)
         return (
-            f"{source}: no settled segment: no channel has enough readings ({each} of the rows); each level needs at "
-            f"least {FEWEST}; {direct}log them more often"
+            f"{source}: no settled segment: no channel has enough readings ({filled_shares} of the rows); each level "
+            f"needs at least {FEWEST}; {direct}log them more often"
         )
     imposed = found.runs.layout.imposed_column
     others = {

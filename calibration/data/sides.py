@@ -42,23 +42,24 @@ def of_volts(name: str, columns: Columns, battery: bool) -> Names:
         BadData: a battery feeds the motors, one side's voltage is missing, the table also states shares, or a voltage
             is higher than the supply's.
     """
-    stated = [c for c in VOLTS if c in columns]
-    if not stated:
+    voltage_columns = [c for c in VOLTS if c in columns]
+    if not voltage_columns:
         return ()
     if battery:
         raise BadData(
-            f"{name}: column {stated[0]} together with --battery, whose voltage falls; give {' and '.join(SIDES)} "
-            "instead"
+            f"{name}: column {voltage_columns[0]} together with --battery, whose voltage falls; give "
+            f"{' and '.join(SIDES)} instead"
         )
     if twin := next((c for c in (*SIDES, *DUTY) if c in columns), None):
         raise BadData(
-            f"{name}: column {twin} in addition to {stated[0]}, which already gives the command of both sides; "
-            "keep one"
+            f"{name}: column {twin} in addition to {voltage_columns[0]}, which already gives the command of both "
+            "sides; keep one"
         )
-    if len(stated) == 1:
-        (other,) = {*VOLTS} - {*stated}
+    if len(voltage_columns) == 1:
+        (other,) = {*VOLTS} - {*voltage_columns}
         raise BadData(
-            f"{name}: column {other} is missing although {stated[0]} is present; give the command of both sides"
+            f"{name}: column {other} is missing although {voltage_columns[0]} is present; give the command of both "
+            "sides"
         )
     volts = np.stack([columns.pop(c) for c in VOLTS])
     supply, parts = supply_and_shares(volts, columns.get(SUPPLY))

@@ -257,14 +257,14 @@ class LoopInput:
         """
         ranked = list[EffectRanking]()
         with contextlib.ExitStack() as others:
-            given = dataclasses.replace(self, others=others if ahead else None, later=[])
-            screened, sds = self.keep("base", functools.partial(_fit_base_and_noise, given, ranked))
-            screened, left, searched = _search_until_clean(given, screened, sds, ranked)
+            base_input = dataclasses.replace(self, others=others if ahead else None, later=[])
+            screened, sds = self.keep("base", functools.partial(_fit_base_and_noise, base_input, ranked))
+            screened, diagnosis, searched = _search_until_clean(base_input, screened, sds, ranked)
             if searched is None:
-                missed = missed_channels(screened.base.space, self.runs, sds.noise, left.linear)
+                missed = missed_channels(screened.base.space, self.runs, sds.noise, diagnosis.linear)
                 word = "undescribed" if missed or self.shows_unmodelled_backlash else "none"
-                return LoopStages(word, screened, left, sds, missed=missed, unused=unused_inputs(self.runs))
-            return _reach_verdict(given, screened, left, sds, searched)
+                return LoopStages(word, screened, diagnosis, sds, missed=missed, unused=unused_inputs(self.runs))
+            return _reach_verdict(base_input, screened, diagnosis, sds, searched)
 
     @functools.cached_property
     def shows_unmodelled_backlash(self) -> bool:
@@ -419,7 +419,9 @@ class LoopStages:
     def families(self) -> Names:
         """Families of the members of each established class, or of the location of a discrepancy without a name."""
         if self.alike is not None and self.verdict not in WITHOUT_NAME:
-            return tuple(f for each, name in zip(self.alike.families, self._named, strict=True) if name for f in each)
+            return tuple(
+                f for members, name in zip(self.alike.families, self._named, strict=True) if name for f in members
+            )
         if self.verdict == "mechanism" and self.mechanism is not None:
             return self.mechanism.families
         return () if self.where is None else (self.where.family,)
@@ -515,15 +517,17 @@ def _search_until_clean(
     settings, keep, progress = given.settings, given.keep, given.progress
     for k in range(SCREENINGS):
         progress(progress_remark("bootstrap", settings.replicates))
-        screened, left = keep(f"bootstrap {k}", functools.partial(_test_base, given, sds, screened))
+        screened, diagnosis = keep(f"bootstrap {k}", functools.partial(_test_base, given, sds, screened))
         if k == 0 and not ranked:
-            keep("ranking", functools.partial(findings.rank_library, screened.base.space, left, settings))
-        if given.shows_unmodelled_backlash or (not left.test.rejected and screened.cluster is None):
-            return screened, left, None  # effects of the library would only stand in for a backlash
+            keep("ranking", functools.partial(findings.rank_library, screened.base.space, diagnosis, settings))
+        if given.shows_unmodelled_backlash or (not diagnosis.test.rejected and screened.cluster is None):
+            return screened, diagnosis, None  # effects of the library would only stand in for a backlash
         progress(progress_remark("effects"))
-        screened, left, searched = keep(f"search {k}", functools.partial(_search_effects, given, screened, left))
+        screened, diagnosis, searched = keep(
+            f"search {k}", functools.partial(_search_effects, given, screened, diagnosis)
+        )
         after = searched.diagnosis
-        if after is None and (confirmed := _confirm_gains(screened, left, searched)) is not None:
+        if after is None and (confirmed := _confirm_gains(screened, diagnosis, searched)) is not None:
             return screened, confirmed, None
         if after is None or not after.test.rejected_with_margin or screened.base.space.near:
             break
@@ -534,7 +538,7 @@ def _search_until_clean(
             break
         progress(progress_remark("alone"))
         screened = more
-    return screened, left, searched
+    return screened, diagnosis, searched
 
 
 def _confirm_gains(screened: Screening, left: Diagnosis, searched: SearchResult) -> Diagnosis | None:
@@ -761,8 +765,8 @@ def has_partial_duty(runs: Runs) -> bool:
 
 def goes_both_ways(runs: Runs) -> bool:
     """True if there are forward and backward runs, according to a measured speed or the command."""
-    moved = [c.column for c in channels.EVERY if c.zero_at_rest and c.directed]
-    columns = [runs[name] for name in (*moved, runs.layout.imposed_column, "duty") if runs.has(name)]
+    motion_columns = [c.column for c in channels.EVERY if c.zero_at_rest and c.directed]
+    columns = [runs[name] for name in (*motion_columns, runs.layout.imposed_column, "duty") if runs.has(name)]
     finite_columns = [x[np.isfinite(x)] for x in columns]
     return any(min(x.max(), -x.min()) > EITHER_WAY * np.abs(x).max() for x in finite_columns if x.size)
 
@@ -897,7 +901,12 @@ def missing_effects(space: CandidateSpace, alike: Classes, support: NameSupport 
 def assemble_result(given: LoopInput, traced: LoopStages) -> DiscoveryResult:
     """Result of the loop. Computes the hold-out errors and the next experiment."""
     runs, numbers, settings, progress = given.runs, given.numbers, given.settings, given.progress
-    screened, left, noise, nameless = traced.screened, traced.left, traced.sds.noise, traced.verdict in WITHOUT_NAME
+    screened, diagnosis, noise, nameless = (
+        traced.screened,
+        traced.left,
+        traced.sds.noise,
+        traced.verdict in WITHOUT_NAME,
+    )
     space, base, best, ends = screened.base.space, screened.base.candidate, traced.best, traced.ends
     observe, included = space.bare.observe, space.included[: len(runs)]
     # The fit of the result: with the named effects, or with the curve if no name is given.
@@ -928,7 +937,7 @@ def assemble_result(given: LoopInput, traced: LoopStages) -> DiscoveryResult:
     if written and curve is not None:
         robot, converged, posterior = curve.robot, curve.converged, posterior_of_curve(space, best.active, curve)
     else:
-        fit, of_fit = (best, traced.ends) if written else (base, left)
+        fit, of_fit = (best, traced.ends) if written else (base, diagnosis)
         robot, converged = findings.proposed_robot(space, fit), fit.converged
         posterior = posterior_of_fit(space, fit.active, fit.z, of_fit.linear)
     progress(progress_remark("next"))
@@ -944,11 +953,11 @@ def assemble_result(given: LoopInput, traced: LoopStages) -> DiscoveryResult:
     found: tuple[FoundEffect, ...] = ()
     concealed: tuple[HiddenEffect, ...] = ()
     if traced.alike is not None:
-        found = findings.found_effects(space, base, best, traced.alike, left.test, settings)
+        found = findings.found_effects(space, base, best, traced.alike, diagnosis.test, settings)
         if not nameless:
             ask = observe.menu and not observe.long
-            concealed = find_hidden_effects(space, best, traced.alike, left, traced.ends, settings, ask=ask)
-    listed = findings.effect_scores(space, left.scores, settings)
+            concealed = find_hidden_effects(space, best, traced.alike, diagnosis, traced.ends, settings, ask=ask)
+    listed = findings.effect_scores(space, diagnosis.scores, settings)
     library_places = space.library.indices([s.name for s in listed])
     summary, kind = verdict_summary(traced, numbers), type(observe)
     result = DiscoveryResult(
@@ -968,10 +977,10 @@ def assemble_result(given: LoopInput, traced: LoopStages) -> DiscoveryResult:
         effects=found,
         unnamed=None
         if beside is None or traced.where is None
-        else findings.unnamed_discrepancy(beside, traced.where, left.test.p_value, len(runs)),
+        else findings.unnamed_discrepancy(beside, traced.where, diagnosis.test.p_value, len(runs)),
         remains=None if nameless or traced.alike is None else traced.where,
         next_experiment=_next_experiment(space, traced, settings),
-        cannot_see=findings.invisible_effects(space, left.scores, settings),
+        cannot_see=findings.invisible_effects(space, diagnosis.scores, settings),
         needs_histories=tuple(sorted(name for name, e in given.library.items() if e.transient and not kind.shows(e))),
         needs_reverse=tuple(
             sorted(name for name, e in given.library.items() if e.needs_reverse and not goes_both_ways(runs))
@@ -982,14 +991,14 @@ def assemble_result(given: LoopInput, traced: LoopStages) -> DiscoveryResult:
         support=summary.support,
         cluster=screened.cluster,
         residual_clusters=find_residual_clusters(remaining, settings.seed),
-        before=findings.evidence_of_test(left.test, adequate=not left.test.rejected),
+        before=findings.evidence_of_test(diagnosis.test, adequate=not diagnosis.test.rejected),
         after=findings.evidence_of_test(ends.test, adequate=not ends.test.rejected_with_margin),
         chi2=(2 * base.cost, 2 * cost),
         readings=int(np.sum(space.weight > 0)),
         base_shift=findings.parameter_shifts(space, base.z, z, sd),
         scores=listed,
-        cosine=signature_cosines(space, left.scores)[np.ix_(library_places, library_places)],
-        detail=observe.detail(screened.bases, included, left, ends),
+        cosine=signature_cosines(space, diagnosis.scores)[np.ix_(library_places, library_places)],
+        detail=observe.detail(screened.bases, included, diagnosis, ends),
         readings_of_rows=seen,
         errors_as_stated=error(seen.as_stated),
         errors=errors_on_common_rows(seen.before, seen.after, error),
@@ -999,7 +1008,7 @@ def assemble_result(given: LoopInput, traced: LoopStages) -> DiscoveryResult:
         alternatives_held_out=compared,
         noise=_noise_by_channel(runs, noise, kind),
         settings=settings,
-        replicates=len(left.test.null.single),
+        replicates=len(diagnosis.test.null.single),
     )
     # A temporary change is not uniform.
     of_noise = noise_remarks_before_verdict(traced.sds, remaining) if traced.sds.factors or not traced.events else ()
@@ -1021,16 +1030,16 @@ def worse_than_stated(seen: ReadingsOfRows, noise: Noise, included: np.ndarray) 
         rows = included & np.isfinite(seen.measured[:, k] + seen.as_stated[:, k] + seen.before[:, k])
         if noise.source[k] not in noise_room.UNSTATED or not rows.any():
             continue
-        stated, refit, size, sd = (
+        file_misfit, refit, size, sd = (
             float(np.sqrt(np.mean(x[rows, k] ** 2)))
             for x in (seen.as_stated - seen.measured, seen.before - seen.measured, seen.measured, noise.sd)
         )
-        if refit > WORSE * stated and refit - stated > sd:
+        if refit > WORSE * file_misfit and refit - file_misfit > sd:
             worse_channels.append(
                 Remark(
                     "refit_worse",
                     channel=channel.name,
-                    stated=stated / size,
+                    stated=file_misfit / size,
                     refit=refit / size,
                     word=noise_room.UNSTATED[noise.source[k]],
                 )

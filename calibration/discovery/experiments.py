@@ -224,10 +224,12 @@ def _predict_alternatives(
         def readings(x: Array) -> tuple[Any, predicted.MenuPrediction]:
             return predicted.predict_readings(robot(x[: wide.size]), batch, unknowns + x[wide.size :], solved)
 
-        (acts, every, left), found = jax.jacfwd(readings, has_aux=True)(
+        (acts, all_readings, left), found = jax.jacfwd(readings, has_aux=True)(
             jnp.concatenate([wide, jnp.zeros(unknowns.shape[1])])
         )
-        slopes = predicted.arrange_readings(batch, [a[:, : wide.size] for a in acts], implicit_slopes(every, left))
+        slopes = predicted.arrange_readings(
+            batch, [a[:, : wide.size] for a in acts], implicit_slopes(all_readings, left)
+        )
         half = jnp.concatenate([solve_lower(informed.T @ informed, slopes[:, : z.size].T).T, slopes[:, z.size :]], 1)
         exists = found.exists & jnp.all(jnp.isfinite(half), 1) & jnp.isfinite(found.value)
         return dataclasses.replace(found, exists=exists), half
@@ -264,12 +266,15 @@ def predict_menu(space: CandidateSpace, candidates: Mapping[str, Candidate], set
         )
     )
     predictions, half = jax.tree.map(lambda x: np.asarray(x)[: len(names)], (predictions, half))
-    experiments, kept = _possible_experiments(all_experiments, predictions, within, settings)
+    experiments, possible_predictions = _possible_experiments(all_experiments, predictions, within, settings)
     medians = np.median(np.asarray(space.equipped.data.sd), 0)
     sd = predicted.reading_sds(experiments, dict(zip(shown_channels, medians, strict=True)))
-    value, half = np.nan_to_num(predictions.value[:, kept]), np.nan_to_num(half[:, kept])
+    value, half = (
+        np.nan_to_num(predictions.value[:, possible_predictions]),
+        np.nan_to_num(half[:, possible_predictions]),
+    )
     return PredictedReadings(
-        tuple(names), experiments, value, half, sd, np.all(predictions.exists, 0)[kept], settings
+        tuple(names), experiments, value, half, sd, np.all(predictions.exists, 0)[possible_predictions], settings
     )
 
 
@@ -285,7 +290,7 @@ def _possible_experiments(
     runs = [e for e in experiments if isinstance(e, menu.ProposedRuns)]
     ends = dict(zip((r.name for r in runs), np.cumsum([len(r.voltage) for r in runs]).tolist(), strict=True))
     possible_experiments: list[menu.Experiment] = []
-    kept: list[np.ndarray] = []
+    possible_predictions: list[np.ndarray] = []
     for e in experiments:
         rows = np.ones(predicted.reading_count(e), bool)
         if isinstance(e, menu.ProposedRuns):
@@ -300,8 +305,8 @@ def _possible_experiments(
             rows = np.zeros(len(rows), bool)
         if rows.any():
             possible_experiments.append(e)
-        kept.append(rows)
-    return tuple(possible_experiments), np.concatenate(kept)
+        possible_predictions.append(rows)
+    return tuple(possible_experiments), np.concatenate(possible_predictions)
 
 
 # --- the choice -------------------------------------------------------------------------------------

@@ -303,8 +303,8 @@ def rank_effects_by_weak_form(space: CandidateSpace, known: WeakFormScreening, s
     chance = float(np.quantile(known.null, 1 - settings.family_wise_error, method="higher")) ** 2
     listed = _rank_effects(space, known.scores, settings)
     fit = next((c for c in known.alone if c.plausible), known.base)
-    moved = {} if fit is None else parameter_shifts(space, fit.z, fit.z, fit.sd)
-    parameters = {name: (shift.after, shift.sd_after) for name, shift in moved.items()}
+    shifts = {} if fit is None else parameter_shifts(space, fit.z, fit.z, fit.sd)
+    parameters = {name: (shift.after, shift.sd_after) for name, shift in shifts.items()}
     return EffectRanking(p <= settings.family_wise_error, p, chance, listed, known.windows, parameters)
 
 
@@ -326,10 +326,10 @@ def _plausible_amplitude_and_score(
 ) -> tuple[float, float]:
     """Best amplitude within plausible limits [prior sds], and the decrease of χ² that it explains [σ²]."""
     m = space.library.best_instance(effect.name, np.asarray(scores.single))
-    wanted, left = float(scores.amplitude[m]), float(scores.left[m])
+    wanted, score = float(scores.amplitude[m]), float(scores.left[m])
     low = max(-settings.plausible, amplitude_of(effect).spec.bounds[0] / amplitude_unit(effect))
     amplitude = min(max(wanted, low), settings.plausible)
-    return amplitude, float(scores.single[m] ** 2 - ((wanted - amplitude) * left) ** 2)
+    return amplitude, float(scores.single[m] ** 2 - ((wanted - amplitude) * score) ** 2)
 
 
 def invisible_effects(space: CandidateSpace, scores: ScoreTable, settings: Settings) -> Names:
@@ -391,14 +391,17 @@ def readings_of_rows(
     def held_out_reading(fitted: FittedProblem, masks: list[np.ndarray]) -> np.ndarray:
         return predict_unseen(fitted.problem, fitted.z, masks, fitted.active).reading
 
-    held, labels = {}, {}
+    values, labels = {}, {}
     for kind, by in kinds.items():
         masks = list(by.values())
         first = held_out_reading(before, masks) if known_before is None else known_before[kind]
         later = first
         if after is not None:
             later = held_out_reading(after, masks) if known_after is None else known_after[kind]
-        held[kind], labels[kind] = (first, later), tuple(by)
-    stated, fitted = fitted_reading(dataclasses.replace(before, z=np.zeros_like(before.z))), fitted_reading(before)
+        values[kind], labels[kind] = (first, later), tuple(by)
+    stated_readings, fitted = (
+        fitted_reading(dataclasses.replace(before, z=np.zeros_like(before.z))),
+        fitted_reading(before),
+    )
     later = fitted if after is None else fitted_reading(after)
-    return ReadingsOfRows(runs.measured(), sd[:rows], stated, fitted, later, held, labels)
+    return ReadingsOfRows(runs.measured(), sd[:rows], stated_readings, fitted, later, values, labels)

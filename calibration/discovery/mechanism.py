@@ -327,10 +327,10 @@ def _changed_readings(space: CandidateSpace, runs: Runs, before: np.ndarray, aft
     """
     rows = len(runs)
     sd, counts = np.asarray(space.bare.data.sd)[:rows], space.weight[:rows] > 0
-    moved = np.where(counts, np.abs(after[:rows] - before[:rows]) / sd, 0.0)
-    moved = np.nan_to_num(moved)
-    most = np.max(np.sqrt(np.sum(moved**2, 0) / np.maximum(counts.sum(0), 1)))
-    return np.asarray(counts & (moved >= CHANGED * most))
+    reading_changes = np.where(counts, np.abs(after[:rows] - before[:rows]) / sd, 0.0)
+    reading_changes = np.nan_to_num(reading_changes)
+    most = np.max(np.sqrt(np.sum(reading_changes**2, 0) / np.maximum(counts.sum(0), 1)))
+    return np.asarray(counts & (reading_changes >= CHANGED * most))
 
 
 # --- hold-out blocks ------------------------------------------------------------------------------------

@@ -234,10 +234,13 @@ def spaced_settings(least: float, most: float, count: int) -> tuple[float, ...]:
 def _mass_difference(robot: Robot, at: Array) -> Array:
     """Mass of the loaded robot minus the mass that its file states."""
     still = State(*(jnp.zeros(()),) * 4)
-    stated = without_effects_of(robot, "mass")
+    plain_robot = without_effects_of(robot, "mass")
     loads = [Conditions(configuration=k.astype(int), payload=m) for k, m in at]
     return jnp.stack(
-        [balances.begin_signals(robot, c, still).mass - balances.begin_signals(stated, c, still).mass for c in loads]
+        [
+            balances.begin_signals(robot, c, still).mass - balances.begin_signals(plain_robot, c, still).mass
+            for c in loads
+        ]
     )
 
 
@@ -313,14 +316,14 @@ def _combined_runs(
     torques: Sequence[float] = (0.0,),
 ) -> ProposedRuns:
     """Runs at every combination of slopes, voltages and brake torques."""
-    each = list(itertools.product(dict.fromkeys(slopes), dict.fromkeys(voltages), dict.fromkeys(torques)))
-    slope, voltage, torque = (tuple(x) for x in zip(*each, strict=True))
-    stated = (at.configuration,) if at is not None else ()
+    combinations = list(itertools.product(dict.fromkeys(slopes), dict.fromkeys(voltages), dict.fromkeys(torques)))
+    slope, voltage, torque = (tuple(x) for x in zip(*combinations, strict=True))
+    fixed = (at.configuration,) if at is not None else ()
     return ProposedRuns(
-        ", ".join((name, *stated)), (*(kinds or (name,)), *stated), doing, setup, voltage, slope,
-        (payload,) * len(each),
+        ", ".join((name, *fixed)), (*(kinds or (name,)), *fixed), doing, setup, voltage, slope,
+        (payload,) * len(combinations),
         tuple(c for c in (read or reach.measured) if c in reach.measured), 0 if at is None else at.index, sides,
-        brake, math.inf if at is None else at.steepest, steepest, where=", ".join(stated), motors=reach.motors,
+        brake, math.inf if at is None else at.steepest, steepest, where=", ".join(fixed), motors=reach.motors,
         torque=torque if reach.torques else (),
     )  # fmt: skip
 

@@ -77,11 +77,11 @@ def batch_experiments(experiments: Sequence[Experiment], shown: Names) -> Experi
     runs = [e for e in experiments if isinstance(e, ProposedRuns)]
     set_up = list(dict.fromkeys((r.setup, r.sides) for r in runs))
     several = [(r, len(r.voltage)) for r in runs]
-    each = [jax.tree.map(lambda x: np.atleast_1d(np.asarray(x)), _conditions_of_runs(r)) for r in runs]
+    run_conditions = [jax.tree.map(lambda x: np.atleast_1d(np.asarray(x)), _conditions_of_runs(r)) for r in runs]
     return ExperimentBatch(
         acts=tuple(a.reading for a in acts),
         at=tuple(jnp.asarray(a.at, float) for a in acts),
-        conditions=jax.tree.map(lambda *x: jnp.asarray(np.concatenate(x)), *each),
+        conditions=jax.tree.map(lambda *x: jnp.asarray(np.concatenate(x)), *run_conditions),
         brake=jnp.asarray(np.concatenate([np.full(n, r.brake) for r, n in several])),
         set_up=tuple(set_up),
         which=tuple(k for r, n in several for k in [set_up.index((r.setup, r.sides))] * n),
@@ -110,10 +110,10 @@ def map_over_runs(function: Callable[..., T], robot: Robot, experiments: Experim
     """
     conditions = experiments.conditions
     mass = jax.vmap(lambda k: robot.chassis(k).mass)(conditions.configuration) + conditions.payload
-    stated = jnp.asarray(conditions.total_mass)
-    conditions = dataclasses.replace(conditions, total_mass=jnp.where(jnp.isnan(stated), mass, stated))
+    total_mass = jnp.asarray(conditions.total_mass)
+    conditions = dataclasses.replace(conditions, total_mass=jnp.where(jnp.isnan(total_mass), mass, total_mass))
     braked = jnp.max(experiments.brake, initial=0.0)
-    each = [
+    batch_axes = [
         dataclasses.replace(setup(robot, braked), sides=robot.sides if sides is None else sides)
         for setup, sides in experiments.set_up
     ]
@@ -123,9 +123,9 @@ def map_over_runs(function: Callable[..., T], robot: Robot, experiments: Experim
         return all(v is x[0] for v in x)
 
     robots = jax.tree.map(
-        lambda *x: x[0] if all_identical(*x) else jnp.stack([jnp.asarray(v) for v in x])[which], *each
+        lambda *x: x[0] if all_identical(*x) else jnp.stack([jnp.asarray(v) for v in x])[which], *batch_axes
     )
-    axes = jax.tree.map(lambda *x: None if all_identical(*x) else 0, *each)
+    axes = jax.tree.map(lambda *x: None if all_identical(*x) else 0, *batch_axes)
     return jax.vmap(function, in_axes=(axes, 0, *[0] * len(own)))(robots, conditions, *own)
 
 
@@ -138,7 +138,7 @@ def predict_readings(
     the residuals of the equations there, shape (runs, unknowns), and all predictions.
     """
     acts = tuple(act(robot, at) for act, at in zip(experiments.acts, experiments.at, strict=True))
-    result, _, left = map_over_runs(IMPLICIT.shown, robot, experiments, unknowns, found)
+    result, _, residual = map_over_runs(IMPLICIT.shown, robot, experiments, unknowns, found)
     all_readings = jnp.stack([result.reading[c] for c in channels.channel_names(robot.channels)], -1)
     is_held = np.array([experiments.set_up[k][0] is menu.locked for k in experiments.which])
     does = jnp.where(jnp.asarray(is_held), result.status == STALLED, is_done(result.status))
@@ -150,7 +150,7 @@ def predict_readings(
         arrange_readings(experiments, acts, all_readings), exists, does, jnp.asarray(result.adhesion_used),
         jnp.asarray(result.winding_settled), speed,
     )  # fmt: skip
-    return (acts, all_readings, left), predicted_readings
+    return (acts, all_readings, residual), predicted_readings
 
 
 def arrange_readings(

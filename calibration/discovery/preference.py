@@ -153,8 +153,8 @@ def _classes_with_leader(
     members = dict(zip(best.effects, alike.members, strict=True))
     (new,), (old,) = leader.key - best.key, best.key - leader.key
     members[new] = (new, *(n for n in members.pop(old) if n != new))
-    stated = dict(zip(best.effects, alike.stated, strict=True))
-    stated[new] = stated.pop(old)
+    stated_by_effect = dict(zip(best.effects, alike.stated, strict=True))
+    stated_by_effect[new] = stated_by_effect.pop(old)
     keys = {best.key, *(c.key for c in alike.ladder)}
     missing_fits = [
         tuple(other if n == name else n for n in leader.active)
@@ -165,7 +165,7 @@ def _classes_with_leader(
     fitted = fit_candidates(space, [(w, start_of_fit(space, leader, w, settings)) for w in missing], settings)
     return Classes(
         tuple(members[name] for name in leader.effects),
-        tuple(stated[name] for name in leader.effects),
+        tuple(stated_by_effect[name] for name in leader.effects),
         tuple(
             tuple(dict.fromkeys((*families_of_members(space, members[name]), *others)))
             for name, others in zip(leader.effects, alike.families, strict=True)

@@ -261,8 +261,11 @@ def fit_by_regression(
     Args:
         wanted: (active effects, other fit, its diagnosis).
     """
-    regressions = {id(left): LinearisedFits(space, at, left.linear, left.scores, settings) for _, at, left in wanted}
-    return [regressions[id(left)](active) for active, _, left in wanted]
+    regressions = {
+        id(diagnosis): LinearisedFits(space, at, diagnosis.linear, diagnosis.scores, settings)
+        for _, at, diagnosis in wanted
+    }
+    return [regressions[id(diagnosis)](active) for active, _, diagnosis in wanted]
 
 
 def include_likely_effects(

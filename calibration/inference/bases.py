@@ -391,11 +391,11 @@ def order_collinearity(
     smooth = [VARIABLES["slope"]] * (VARIABLES["slope"] in conditions) if few else conditions
     level = cell.ravel() if few else which.ravel()
     spans = [scale_to_unit_range(np.asarray(columns[c], float), weight)[counts] for c in smooth]
-    each = [legendre.legvander(span, DEGREE)[:, 1:] for span in spans]
+    polynomials = [legendre.legvander(span, DEGREE)[:, 1:] for span in spans]
     for span in spans:  # a sorted table's order is the rank
         rank = np.searchsorted(np.sort(span), span, "left") + np.searchsorted(np.sort(span), span, "right")
-        each.append(rank[:, None] / (2 * len(x)))
-    terms = np.concatenate([np.zeros((len(x), 1)), *each], 1)
+        polynomials.append(rank[:, None] / (2 * len(x)))
+    terms = np.concatenate([np.zeros((len(x), 1)), *polynomials], 1)
     # Without the means of each level: a matrix with a column for each level would be rows times rows.
     count = np.bincount(level)
     inner, terms_left = (v - (_level_sums(level, v) / count[:, None])[level] for v in (terms, x[:, None]))
@@ -454,8 +454,8 @@ def wave_families(
     possible = sum(1 for _, belted in ORDERS.values() if np.any(on_tracks) or not belted)
     bases += bases[:1] * (possible - len(bases))
     words += words[:1] * (possible - len(words))
-    every = [(b, w) for b in balances_of(robot) for w in words]
-    return (Basis.of(np.stack(bases * len(balances_of(robot))), every),)
+    balance_waves = [(b, w) for b in balances_of(robot) for w in words]
+    return (Basis.of(np.stack(bases * len(balances_of(robot))), balance_waves),)
 
 
 def family_names(bases: Bases) -> tuple[tuple[str, str], ...]:

@@ -167,8 +167,8 @@ def _free_names(
     present = _configurations_present(runs, robot)
     default = priors.default_names(present, robot, computed=computes, turns=runs.turns)
     owned = priors.names_to_fit(robot, present, () if observe.axis else priors.OVER_TIME)
-    held = {*default, *fidelities.unread_parameters(fidelity, owned, runs.turns)}
-    default = (*default, *(n for n in owned if n not in held and not n.endswith(computes)))
+    fixed_names = {*default, *fidelities.unread_parameters(fidelity, owned, runs.turns)}
+    default = (*default, *(n for n in owned if n not in fixed_names and not n.endswith(computes)))
     if priors.DELAY in observe.free()[0] and priors.DELAY in robot.rig.stated - robot.rig.exact:
         default = (*default, priors.DELAY)
     names = priors.choose_free_names(robot, default, *words)
@@ -291,11 +291,11 @@ def _search(
     solver: optimizers.Solver | None,
 ) -> tuple[MultistartResult, np.ndarray | None]:
     """Searches for the optimum. Also returns the optimum of `steady` if the searches started there."""
-    rng, every = np.random.default_rng(seed), None
+    rng, all_members = np.random.default_rng(seed), None
     if runs.log is not None:
         sd = np.broadcast_to(np.median(known.sd, 0), runs.log.measured().shape)
-        every = observers.pose_problem(runs.log, base, posed.coordinates, sd)
-    points = posed.observe.starts(posed, rng, starts, every)
+        all_members = observers.pose_problem(runs.log, base, posed.coordinates, sd)
+    points = posed.observe.starts(posed, rng, starts, all_members)
     if not posed.observe.long:
         return multistart.search_from_starts(posed, known, points, solver), None
     if not posed.observe.starts_from_steady:
@@ -400,7 +400,9 @@ def _calibration_result(
     profile = None
     if setting.profiles:
         profile = identifiability.profile_likelihoods(posed, jnp.asarray(z), float(found.best.cost), about)
-    held = holdout.hold_out_by_kind(posed, z, {kind: holdout.blocks_of_kind(runs, kind) for kind in setting.kinds})
+    errors_by_kind = holdout.hold_out_by_kind(
+        posed, z, {kind: holdout.blocks_of_kind(runs, kind) for kind in setting.kinds}
+    )
     measured, sd, converged = runs.measured(), np.asarray(posed.data.sd), bool(found.best.converged)
     finite = np.isfinite(measured) & np.isfinite(seen)
     whitened = np.where(finite, (seen - measured) / sd, 0.0)
@@ -419,7 +421,7 @@ def _calibration_result(
         axis=observe.axis,
         errors_before=estimates.errors_by_channel(runs.channels, seen_before, measured, sd),
         errors_after=estimates.errors_by_channel(runs.channels, seen, measured, sd),
-        held_out={kind: estimates.hold_out_errors(posed, h, measured, sd) for kind, h in held.items()},
+        held_out={kind: estimates.hold_out_errors(posed, h, measured, sd) for kind, h in errors_by_kind.items()},
         conditions=estimates.condition_columns(observe, runs),
         readings=estimates.readings_by_channel(runs.channels, measured, sd, seen_before, seen),
         status_before=np.array(STATUSES)[status_before],

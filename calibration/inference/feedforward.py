@@ -167,14 +167,14 @@ def fit_feedforward(log: DriveLog, mechanism: str = "simple", tolerances: Tolera
         most = None if log.current is None else float(np.nanmax(np.abs(log.current)))
         limited = Remark("feedforward_limit", level=level, current=most)
         remarks.append(limited if bend < 0 else Remark("feedforward_skid", level=level))
-    kept = _select_windows(windows, windows["demand"] < level) if level else windows
-    values, covariance, _ = _fit_constants(kept, mechanism)
+    fitted_windows = _select_windows(windows, windows["demand"] < level) if level else windows
+    values, covariance, _ = _fit_constants(fitted_windows, mechanism)
     sds = np.sqrt(np.diag(covariance))
     names = ("kS", "kV", "kA", "kG")[: len(values)]
     constants = {name: float(x) for name, x in zip(names, values, strict=True)}
     spread = {name: float(x) for name, x in zip(names, sds, strict=True)}
     if mechanism == "simple":
-        remarks += _direction_remarks(kept)
+        remarks += _direction_remarks(fitted_windows)
     remarks += _battery_remarks(log)
     if missing:
         remarks.append(Remark("feedforward_missing", tests=missing))
@@ -190,12 +190,12 @@ def fit_feedforward(log: DriveLog, mechanism: str = "simple", tolerances: Tolera
         remarks.append(Remark("feedforward_gains_delayed", delay=asked.delay, slow=gains["velocity_kP"],
                               prompt=prompt["velocity_kP"]))  # fmt: skip
     figures = {
-        "run": kept["run"],
-        "voltage_V": kept["u"] / kept["T"],
-        "velocity": kept["x"] / kept["T"],
-        "acceleration": kept["dv"] / kept["T"],
-        "direction": kept["s"] / kept["T"],
-        "quasistatic": kept["quasistatic"],
+        "run": fitted_windows["run"],
+        "voltage_V": fitted_windows["u"] / fitted_windows["T"],
+        "velocity": fitted_windows["x"] / fitted_windows["T"],
+        "acceleration": fitted_windows["dv"] / fitted_windows["T"],
+        "direction": fitted_windows["s"] / fitted_windows["T"],
+        "quasistatic": fitted_windows["quasistatic"],
     }
     return Feedforward(
         mechanism, log.unit, constants, spread, gains, asked, delay, lag, missing, figures, tuple(remarks)
@@ -216,8 +216,8 @@ def feedback_gains(kV: float, kA: float, tolerances: Tolerances) -> dict[str, fl
 
 def _lqr_gains(a: np.ndarray, b: np.ndarray, tolerated: list[float], t: Tolerances) -> list[float]:
     n = len(a)
-    held = scipy.linalg.expm(np.block([[a, b], [np.zeros((1, n + 1))]]) * t.period)
-    a, b = held[:n, :n], held[:n, n:]
+    discrete_system = scipy.linalg.expm(np.block([[a, b], [np.zeros((1, n + 1))]]) * t.period)
+    a, b = discrete_system[:n, :n], discrete_system[:n, n:]
     cost, effort = np.diag(1 / np.square(tolerated)), np.array([[1 / t.effort**2]])
     p = scipy.linalg.solve_discrete_are(a, b, cost, effort)
     k = np.linalg.solve(effort + b.T @ p @ b, b.T @ p @ a)

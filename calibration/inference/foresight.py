@@ -113,12 +113,17 @@ def predict_identifiability(
     )
     data = dataclasses.replace(posed.data, weight=posed.data.weight * jnp.asarray(reached, float)[:, None])
     about = identifiability.analyse_identifiability(posed, z, data)
-    held = identifiability.held_by_prior(about.sd)
+    is_prior_bound = identifiability.held_by_prior(about.sd)
     fields = priors.parameters_by_name(robot)
     width = coordinates.prior_sd
     estimates = tuple(
         ParameterInformation(
-            n, fields[n].spec.unit, float(fields[n].value), float(width[k]), float(about.sd[k]), bool(held[k])
+            n,
+            fields[n].spec.unit,
+            float(fields[n].value),
+            float(width[k]),
+            float(about.sd[k]),
+            bool(is_prior_bound[k]),
         )
         for k, n in enumerate(names)
     )

@@ -197,8 +197,8 @@ def profile_likelihoods(
     pinned = centre[:, None] + about.sd[:, None] * steps  # (parameters, points)
     along = about.covariance / np.diag(about.covariance)[:, None]  # row k: how all move with k
     starts = centre + along[:, None, :] * (pinned - centre[:, None])[..., None]
-    held = np.broadcast_to(np.eye(size, dtype=bool)[:, None, :], starts.shape)
-    pins = Pin(jnp.asarray(held.reshape(-1, size)), jnp.asarray(starts.reshape(-1, size)))
+    pinned_names = np.broadcast_to(np.eye(size, dtype=bool)[:, None, :], starts.shape)
+    pins = Pin(jnp.asarray(pinned_names.reshape(-1, size)), jnp.asarray(starts.reshape(-1, size)))
     profiles = _profiles(problem, data, pins.at, pins)
     rise = 2 * (np.asarray(profiles.cost).reshape(pinned.shape) - cost)
     root = np.sign(steps) * np.sqrt(np.maximum(rise, 0.0))

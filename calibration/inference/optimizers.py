@@ -104,8 +104,8 @@ def penalty_slice(data: Data) -> slice:
 
 def informative_residuals(data: Data) -> np.ndarray:
     """Indices of the residuals of readings and priors, without the adhesion penalties."""
-    held = penalty_slice(data)
-    return np.r_[: held.start, held.stop : held.stop + data.centre.size]
+    penalties = penalty_slice(data)
+    return np.r_[: penalties.start, penalties.stop : penalties.stop + data.centre.size]
 
 
 #: Least-squares solvers and minimisers of optimistix.
@@ -136,9 +136,9 @@ def residual_function(problem: Problem, data: Data, pin: Pin) -> Function:
 
 def _least_squares_solver(data: Data, long: bool) -> OneSidedLevenbergMarquardt:
     """Solver for fits to such data. `long`: True for rollouts."""
-    held, tolerance = penalty_slice(data), TOLERANCE_LONG if long else TOLERANCE
+    penalties, tolerance = penalty_slice(data), TOLERANCE_LONG if long else TOLERANCE
     return OneSidedLevenbergMarquardt(
-        tolerance, tolerance, held.start, held.stop, near=0.0 if long else NEAR, rough=long
+        tolerance, tolerance, penalties.start, penalties.stop, near=0.0 if long else NEAR, rough=long
     )
 
 
@@ -153,8 +153,8 @@ def _optimum_at(
     sd = jnp.linalg.norm(half, axis=0)
     ahead = r + slope @ one_sided_step(r, slope, held_rows, 0.0)
     decrement = half_squares(r, held_rows) - half_squares(ahead, held_rows)
-    held = jnp.where(pin.held, pin.at - data.centre, 0.0)
-    cost = half_squares(r, held_rows) + 0.5 * jnp.sum(held**2)
+    pinned_offset = jnp.where(pin.held, pin.at - data.centre, 0.0)
+    cost = half_squares(r, held_rows) + 0.5 * jnp.sum(pinned_offset**2)
     return Optimum(
         pin.apply(z),
         sd,

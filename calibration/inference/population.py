@@ -326,12 +326,12 @@ def local_regression(
     apart = z - found.z[at]
     near = np.argsort(np.einsum("ij,jk,ik->i", apart, spread, apart), kind="stable")[:number]
     scale = np.asarray(posed.data.weight / posed.data.sd)
-    moved = np.where(scale > 0, (reading[near] - found.reading[at]) * scale, 0.0).reshape(number, -1)
+    reading_changes = np.where(scale > 0, (reading[near] - found.reading[at]) * scale, 0.0).reshape(number, -1)
     design = np.column_stack([np.ones(number), apart[near]])
     # A ridge of one prior sd: parameters that the members do not determine get slope zero.
     ridge = np.diag([0.0, *np.full(z.shape[1], 1e-3 * number * np.var(apart[near]) + 1e-12)])
-    slope = np.linalg.solve(design.T @ design + ridge, design.T @ moved)
-    unexplained = moved - design @ slope
+    slope = np.linalg.solve(design.T @ design + ridge, design.T @ reading_changes)
+    unexplained = reading_changes - design @ slope
     return slope[1:].T, float(np.sqrt(np.mean(unexplained**2)))
 
 

@@ -147,14 +147,14 @@ class Problem(eqx.Module):
         size, (rows, count) = x.size, data.measured.shape
 
         def shown(x: Array) -> tuple[tuple[Array, Array], tuple[Array, Observation, Signals]]:
-            observation, signals, left = self.observe.shown(robot(x[:size]), unknowns + x[size:], was_found)
+            observation, signals, residual = self.observe.shown(robot(x[:size]), unknowns + x[size:], was_found)
             r = self.signed(observation, data)
-            return (r, left), (r, observation, signals)
+            return (r, residual), (r, observation, signals)
 
         wide = jnp.concatenate([x, jnp.zeros(unknowns.shape[1])])
-        (slope, left), (r, observed, signals) = jax.jacfwd(shown, has_aux=True)(wide)
+        (slope, residual_slope), (r, observed, signals) = jax.jacfwd(shown, has_aux=True)(wide)
         by_row = slope[: rows * count].reshape(rows, count, -1)
-        by_row = implicit_slopes(jnp.concatenate([by_row, slope[rows * count :, None]], 1), left)
+        by_row = implicit_slopes(jnp.concatenate([by_row, slope[rows * count :, None]], 1), residual_slope)
         return r, jnp.concatenate([by_row[:, :count].reshape(-1, size), by_row[:, count]]), observed, signals
 
     def excess(self, seen: Observation, data: Data) -> Float[Array, " rows"]:

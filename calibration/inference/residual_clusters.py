@@ -129,10 +129,10 @@ def find_residual_clusters(fit: Residuals, seed: int = 0) -> tuple[ResidualClust
         if (seen := _tests_of_channel(residuals, k, columns)) is not None
     ]
     count = sum(len(tested.tests) for _, tested in channel_tests)
-    every = [
+    clusters = [
         (count * float(p[0]), k, test) for k, seen in channel_tests for test, p in seen.p_values(seen.left[:, None])
     ]
-    significant = [one for one in every if one[0] < LEVEL]
+    significant = [one for one in clusters if one[0] < LEVEL]
     if not significant:
         return ()
     strongest = _permuted_p_values(channel_tests, seed)
@@ -226,11 +226,11 @@ def _units_by_run(fit: Residuals) -> _ResidualUnits:
     def total(x: np.ndarray) -> np.ndarray:
         return np.einsum("sr,sc...->rc...", member.astype(float), np.nan_to_num(x))
 
-    each = [member[:, r] for r in range(len(first))]
-    one = {c: v[first] for c, v in fit.runs.extras.items() if all(len(np.unique(v[m])) == 1 for m in each)}
+    members_by_run = [member[:, r] for r in range(len(first))]
+    one = {c: v[first] for c, v in fit.runs.extras.items() if all(len(np.unique(v[m])) == 1 for m in members_by_run)}
     # A condition that changes within a run enters as its mean.
     columns = {
-        c: np.array([v[m].mean() for m in each]) if v.dtype.kind == "f" else v[first]
+        c: np.array([v[m].mean() for m in members_by_run]) if v.dtype.kind == "f" else v[first]
         for c, v in fit.runs.columns.items()
     }
     mean = np.maximum(counts, 1.0)

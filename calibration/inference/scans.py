@@ -156,8 +156,8 @@ def search_lower_minima(
         found: optimum of a search, and the observation there.
         search: function that searches from a start.
     """
-    every = scanned_coordinates(problem)
-    if not every:
+    coordinates = scanned_coordinates(problem)
+    if not coordinates:
         return found
 
     def objective(z: np.ndarray) -> float:
@@ -166,7 +166,7 @@ def search_lower_minima(
 
     for _ in range(AGAIN):
         cost_here, z = float(found[0].cost), np.asarray(found[0].z)
-        looked = {k: scan_coordinate(problem, z, data, k) for k in every}
+        looked = {k: scan_coordinate(problem, z, data, k) for k in coordinates}
         lower = found
         for k, scan in looked.items():
             for j in [j for j in scan.local_minima() if scan.cost[j] < cost_here - WORTH][:TRIED]:
@@ -176,7 +176,7 @@ def search_lower_minima(
         if not float(lower[0].cost) < cost_here - WORTH:
             break
         found = lower
-        over = " or ".join(problem.coordinates.names[k] for k in every)
+        over = " or ".join(problem.coordinates.names[k] for k in coordinates)
         tell(progress_remark("basin", over, float(found[0].cost)))
     else:
         return dataclasses.replace(found[0], converged=jnp.asarray(False)), found[1]

@@ -83,8 +83,10 @@ def estimate_noise(runs: Runs, sizes: Float[np.ndarray, "rows channels"]) -> tup
     measured = runs.measured()
     noises: list[SeriesNoise | None] = []
     for k, channel in enumerate(runs.channels):
-        each = [_noise_of_channel(channel, measured[:, k], sizes[:, k], runs[a], a, s) for a, s in by_axis.items()]
-        enough = [e for e in each if e is not None and e.freedom >= FEWEST]
+        channel_noises = [
+            _noise_of_channel(channel, measured[:, k], sizes[:, k], runs[a], a, s) for a, s in by_axis.items()
+        ]
+        enough = [e for e in channel_noises if e is not None and e.freedom >= FEWEST]
         first = next((e for e in enough if e.axis == FIRST), None)
         noises.append(first or max(enough, key=lambda e: e.freedom, default=None))
     return tuple(noises)

@@ -260,11 +260,13 @@ def windows_of_run(time: np.ndarray, piece: np.ndarray, length: float) -> list[t
             continue
         times = time[begin:end]
         duration = times[-1] - times[0]
-        each = min(length, duration)
-        for first in times[0] + np.linspace(0.0, duration - each, int((duration - each) / (APART * each)) + 1):
-            low, high = np.searchsorted(times, (first - 1e-9, first + each + 1e-9))
+        window_length = min(length, duration)
+        for first in times[0] + np.linspace(
+            0.0, duration - window_length, int((duration - window_length) / (APART * window_length)) + 1
+        ):
+            low, high = np.searchsorted(times, (first - 1e-9, first + window_length + 1e-9))
             if high - low >= FEWEST - 1:
-                windows.append((np.arange(begin + low, begin + high), (times[low:high] - first) / each))
+                windows.append((np.arange(begin + low, begin + high), (times[low:high] - first) / window_length))
     return windows
 
 
@@ -402,7 +404,7 @@ class _LogArrays:
             if (x := getattr(self.of_rows, name)) is not None and np.ptp(np.asarray(x)) > 0
         }
         linear = self.problem.base.rig.between_rows == "linear"
-        knots, moved = list[np.ndarray](), list[np.ndarray]()
+        knots, drive_changes = list[np.ndarray](), list[np.ndarray]()
         values, integrals = ({name: list[np.ndarray]() for name in changing} for _ in range(2))
         for rows, cell in zip(self.every, cells, strict=True):
             period = float(self.time[rows[-1]] - self.time[rows[0]]) + 1.0
@@ -415,9 +417,9 @@ class _LogArrays:
                 integrals[name].append(np.r_[0.0, np.cumsum(np.diff(time) * mean)])
                 values[name].append(padded)
             knots.append(time + begin)
-            moved.append(cell + begin)
-        held, summed = ({n: np.concatenate(x) for n, x in each.items()} for each in (values, integrals))
-        return ImposedCourse(np.concatenate(knots), held, summed, np.concatenate(moved))
+            drive_changes.append(cell + begin)
+        means, summed = ({n: np.concatenate(x) for n, x in each.items()} for each in (values, integrals))
+        return ImposedCourse(np.concatenate(knots), means, summed, np.concatenate(drive_changes))
 
 
 def points_and_windows(

@@ -421,13 +421,13 @@ def fit_delay(problem: Problem, plan: StatePlan) -> FittedDelay:
     jumps, because jumps show a delay best. If several delays fit equally well, as with a periodic input, the shortest
     is returned.
     """
-    stated = float(np.max(np.asarray(problem.base.rig.delay)))
+    file_delay = float(np.max(np.asarray(problem.base.rig.delay)))
     if DELAY not in problem.coordinates.names:
-        return FittedDelay(stated, 0.0, False)
+        return FittedDelay(file_delay, 0.0, False)
     rows, course, cut = points_and_windows(problem, plan, across=True)
     time, since = np.asarray(rows.time), np.asarray(rows.since)
     if not (cut and rows.drift):
-        return FittedDelay(stated, 0.0, False)
+        return FittedDelay(file_delay, 0.0, False)
     step = float(np.median(since[since > 0]))
     apart = -(-sum(len(w.rows) for w in cut) // PROFILED)
     cut = [w.part(np.arange(0, len(w.rows), apart)) for w in cut]
@@ -455,8 +455,8 @@ def fit_delay(problem: Problem, plan: StatePlan) -> FittedDelay:
         costs, ends = [], []
         for delay in delays:
             means = course.at(float(delay))[0]
-            moved = {n: (means[n] - prompt[n])[:, None, None] for n in change}
-            f, y = (fixed[k] + sum(moved[n] * change[n][k] for n in change) for k in range(2))
+            mean_changes = {n: (means[n] - prompt[n])[:, None, None] for n in change}
+            f, y = (fixed[k] + sum(mean_changes[n] * change[n][k] for n in change) for k in range(2))
             all_integrals = np.concatenate([_integrate_terms(plan, w, f, y) for w in cut], 1)[
                 acts
             ]  # (equations, windows, 1 + z)
@@ -538,8 +538,8 @@ def fit_weak_form(problem: Problem, effects: tuple[ScoredEffect, ...] = ()) -> W
         )  # one program for all of them
 
     def whole(factors: list[np.ndarray], given: EquationTerms) -> np.ndarray:
-        each = zip(factors, cut, strict=True)
-        return np.concatenate([solve_triangular(x, window_errors(plan, w, given), lower=True) for x, w in each])
+        windows = zip(factors, cut, strict=True)
+        return np.concatenate([solve_triangular(x, window_errors(plan, w, given), lower=True) for x, w in windows])
 
     def of(z: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
         """Function of the parameters that returns residuals and their derivatives.
@@ -549,7 +549,7 @@ def fit_weak_form(problem: Problem, effects: tuple[ScoredEffect, ...] = ()) -> W
         terms_there = terms(smooth, z)
         read, none = terms(rows, z), np.zeros(equations)
         plain = [_covariance_factor(plan, w, sd, terms_there, none) for w in cut]
-        each = [
+        whitened_windows = [
             (
                 window_errors(plan, w, read)[:, 0],
                 np.sum(x**2, 1),
@@ -557,7 +557,9 @@ def fit_weak_form(problem: Problem, effects: tuple[ScoredEffect, ...] = ()) -> W
             )
             for w, x in zip(cut, plain, strict=True)
         ]
-        by_equation = (np.concatenate([x.reshape(equations, -1).T for x in part]) for part in zip(*each, strict=True))
+        by_equation = (
+            np.concatenate([x.reshape(equations, -1).T for x in part]) for part in zip(*whitened_windows, strict=True)
+        )
         unknown = disturbance_intensities(*by_equation)
         factors = [_covariance_factor(plan, w, sd, terms_there, unknown) for w in cut]
         offset = whole(factors, read)[:, 0] - whole(factors, terms_there)[:, 0]
@@ -598,9 +600,9 @@ def window_errors(plan: StatePlan, w: RunWindows, terms: EquationTerms) -> np.nd
     """Errors of the equations in a run's windows, with their derivatives and signatures, shape (windows, 1 +
     coordinates + instances).
     """
-    given = (terms.f[..., None], terms.y[..., None]), terms.by_z, terms.by_effects
-    each = np.concatenate([_integrate_terms(plan, w, np.asarray(f), np.asarray(y)) for f, y in given], 2)
-    return each.reshape(-1, each.shape[2])
+    term_arrays = (terms.f[..., None], terms.y[..., None]), terms.by_z, terms.by_effects
+    integrals = np.concatenate([_integrate_terms(plan, w, np.asarray(f), np.asarray(y)) for f, y in term_arrays], 2)
+    return integrals.reshape(-1, integrals.shape[2])
 
 
 def _integrate_terms(plan: StatePlan, w: RunWindows, f: np.ndarray, y: np.ndarray) -> np.ndarray:

@@ -120,9 +120,9 @@ def _study_of_output(row: Quantity, study: Study, found: LocalDerivatives, part:
     # A condition's score is uniform in 0..1, of variance 1/12.
     weight = np.where(np.arange(len(study.inputs)) < len(study.inputs.parameters), 1.0, 1 / 12)
     along = correlated_directions(study.inputs)
-    moved = (scores @ along.T) ** 2 * weight if study.inputs.is_posterior else scores**2 * weight
+    squared_changes = (scores @ along.T) ** 2 * weight if study.inputs.is_posterior else scores**2 * weight
     variance = np.sum(scores**2 * weight, 1)
-    linear = moved / np.where(variance > 0, variance, 1.0)[:, None]
+    linear = squared_changes / np.where(variance > 0, variance, 1.0)[:, None]
     finite = np.isfinite(value)
     share = np.where(finite[:, None], linear, np.nan)
     sd = np.where(finite, np.sqrt(variance), np.nan)

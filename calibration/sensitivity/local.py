@@ -57,10 +57,10 @@ def local_derivatives(study: Study) -> LocalDerivatives:
     answer = study.model(values, study.conditions)
     by_columns = study.model.derivatives(values, study.conditions)
     derivative, by_score, swing = {}, {}, {}
-    for name, moved in by_columns.items():
+    for name, derivatives in by_columns.items():
         finite = np.isfinite(answer.values[name])[:, None]
-        derivative[name] = np.where(finite, _derivatives_by_input(inputs, moved), np.nan)
-        by_score[name] = np.where(finite, moved @ inputs.slope, np.nan)
+        derivative[name] = np.where(finite, _derivatives_by_input(inputs, derivatives), np.nan)
+        by_score[name] = np.where(finite, derivatives @ inputs.slope, np.nan)
     along = correlated_directions(inputs)
     p = len(inputs.parameters)
     ends = []

@@ -50,8 +50,8 @@ class ModelOutputs:
 
 def count_statuses(codes: np.ndarray) -> dict[str, int]:
     """Number of points with each status, without zeros."""
-    each = np.bincount(codes, minlength=len(STATUSES))
-    return {STATUSES[k]: int(n) for k, n in enumerate(each) if n}
+    counts = np.bincount(codes, minlength=len(STATUSES))
+    return {STATUSES[k]: int(n) for k, n in enumerate(counts) if n}
 
 
 def known_outputs(robot: Robot) -> dict[str, Quantity]:
@@ -174,8 +174,8 @@ class Model:
 
     def ignores(self, source: str) -> Names:
         """Conditions that influence no output of a source."""
-        each = [set(o.ignores) for o in self.sources[source]]
-        return tuple(sorted(set.intersection(*each)))
+        ignored_by_output = [set(o.ignores) for o in self.sources[source]]
+        return tuple(sorted(set.intersection(*ignored_by_output)))
 
     def derivatives(self, values: Float[np.ndarray, "points columns"], conditions: Conditions) -> Columns:
         """Exact derivative of each output with respect to each column [SI per unit], shape (points, columns).
@@ -274,8 +274,10 @@ def _derivatives(
         return made, status
 
     def along(direction: Array) -> tuple[dict[str, Array], Array]:
-        _, moved, status = jax.jvp(numbers, (values,), (jnp.broadcast_to(direction, values.shape),), has_aux=True)
-        return moved, status
+        _, derivative, status = jax.jvp(
+            numbers, (values,), (jnp.broadcast_to(direction, values.shape),), has_aux=True
+        )
+        return derivative, status
 
-    moved, status = jax.vmap(along, out_axes=(-1, None))(jnp.eye(values.shape[1], dtype=values.dtype))
-    return {**moved, STATUS: status}
+    derivatives, status = jax.vmap(along, out_axes=(-1, None))(jnp.eye(values.shape[1], dtype=values.dtype))
+    return {**derivatives, STATUS: status}

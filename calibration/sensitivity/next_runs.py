@@ -68,8 +68,8 @@ def choose_runs(information: np.ndarray, count: int) -> ChosenRuns:
                 improved = True
     ordered: list[int] = []
     for _ in range(count):  # of the set, the most informative first
-        left = [k for k in chosen if k not in ordered]
-        ordered.append(max(left, key=lambda k: _log_determinant(information, [*ordered, k])))
+        unordered = [k for k in chosen if k not in ordered]
+        ordered.append(max(unordered, key=lambda k: _log_determinant(information, [*ordered, k])))
     values = [_log_determinant(information, ordered[:k]) for k in range(count + 1)]
     eye = np.eye(size)
     after = [np.linalg.inv(eye + information[ordered[:k]].sum(0)) for k in range(count + 1)]
@@ -147,13 +147,13 @@ def choose_next_runs(study: Study, found: LocalDerivatives, candidates: Candidat
     # range.
     first = len(study.inputs.columns) - len(study.inputs.conditions)
     for j, name in enumerate(study.inputs.conditions):
-        stated = getattr(conditions, name)
-        if stated is not None:
-            values[:, first + j] = np.asarray(stated)
+        condition_value = getattr(conditions, name)
+        if condition_value is not None:
+            values[:, first + j] = np.asarray(condition_value)
     answer = model(values, conditions)
-    moved = model.derivatives(values, conditions)
+    derivatives = model.derivatives(values, conditions)
     inner = study.inputs.slope[:, :p]
-    jacobian = np.stack([moved[o.name] @ inner for o in shown], 1)
+    jacobian = np.stack([derivatives[o.name] @ inner for o in shown], 1)
     reading = np.stack([answer.values[o.name] for o in shown], 1)
     finite = np.isfinite(reading).all(1)
     if not finite.any():

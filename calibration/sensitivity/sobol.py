@@ -180,12 +180,15 @@ class SobolIndices:
 
 def indices_of_terms(terms: VarianceTerms, replicates: int | None = None) -> SobolIndices:
     """Sobol indices from the parts of the variance. `replicates`: only this many of the first replicates."""
-    kept = slice(replicates)
-    variance, first = terms.variance[kept], terms.first[kept]
+    replicate_slice = slice(replicates)
+    variance, first = terms.variance[replicate_slice], terms.first[replicate_slice]
     second = None
     if terms.second is not None:
-        beyond = terms.second[kept] - first[:, :, None] - first[:, None, :]
+        beyond = terms.second[replicate_slice] - first[:, :, None] - first[:, None, :]
         second = ratio_estimate(beyond, variance)
     return SobolIndices(
-        ratio_estimate(first, variance), ratio_estimate(terms.total[kept], variance), second, float(variance.mean())
+        ratio_estimate(first, variance),
+        ratio_estimate(terms.total[replicate_slice], variance),
+        second,
+        float(variance.mean()),
     )

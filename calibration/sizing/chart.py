@@ -54,7 +54,7 @@ def _margins(robot: Robot, rated: Ratings, points: EnvelopePoint, speeds: Array,
     def margins_at_point(point: EnvelopePoint, wanted: Array) -> Array:
         state, _ = travel_quantities(robot, point, rated)
         turns = state["motor_speed_rpm"]
-        each = [
+        margins = [
             state["adhesion"], jnp.clip(state["left"], -1.0, 1.0),
             thermal_margin(robot, point, state["current"], rated.temperature),
             1 - turns / speeds[0], 1 - turns / speeds[1], 1 - state["gearbox_Nm"] / rated.torque,
@@ -62,8 +62,8 @@ def _margins(robot: Robot, rated: Ratings, points: EnvelopePoint, speeds: Array,
             jnp.where(wanted > 0, state["speed_m_s"] / jnp.where(wanted > 0, wanted, 1.0) - 1, 1.0),
         ]  # fmt: skip
         # At the limit of adhesion both margins are zero; it is assigned to adhesion.
-        each[1] = jnp.where(each[0] <= each[1], 1.0, each[1])
-        return jnp.stack([jnp.asarray(x, float) for x in each])
+        margins[1] = jnp.where(margins[0] <= margins[1], 1.0, margins[1])
+        return jnp.stack([jnp.asarray(x, float) for x in margins])
 
     return jax.vmap(margins_at_point)(points, wanted)
 
@@ -95,8 +95,8 @@ def margin_chart(robot: Robot, asked: Requirements, most: tuple[float, float]) -
         points = dataclasses.replace(
             points, payload=jnp.asarray(p), slope_deg=jnp.asarray(s), charge=jnp.full(len(p), charge)
         )
-        left = np.asarray(_margins(robot, ratings(robot), points, permitted, jnp.asarray(wanted)))
-        margins = left if margins is None else np.minimum(margins, left)
+        margin_grid = np.asarray(_margins(robot, ratings(robot), points, permitted, jnp.asarray(wanted)))
+        margins = margin_grid if margins is None else np.minimum(margins, margin_grid)
     assert margins is not None
     margins = np.where(np.isfinite(margins), margins, -1.0)
     shape = (POINTS, POINTS)

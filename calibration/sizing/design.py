@@ -134,13 +134,13 @@ def build_sizing_task(robot: Robot, asked: Requirements, options: PartOptions) -
     """
     name = asked.envelope.configuration or robot.configurations.names[0]
     index: dict[tuple[float, ...], int] = {}
-    kept: list[EnvelopePoint] = []
+    envelope_points: list[EnvelopePoint] = []
 
     def row(point: EnvelopePoint) -> int:
         key = tuple(float(np.asarray(x)) for x in jax.tree.leaves(point))
         if key not in index:
-            index[key] = len(kept)
-            kept.append(point)
+            index[key] = len(envelope_points)
+            envelope_points.append(point)
         return index[key]
 
     demands = []
@@ -153,7 +153,7 @@ def build_sizing_task(robot: Robot, asked: Requirements, options: PartOptions) -
     middle = row(_envelope_middle(robot, asked.envelope))
     travelling = sorted({k for d in demands if d.requirement and d.requirement.name in LASTING for k in d.rows})
     demands += [SizingDemand(None, words, tuple(travelling) or (middle,)) for words in RATED.values()]
-    points: EnvelopePoint = jax.tree.map(lambda *x: jnp.stack([jnp.asarray(v) for v in x]), *kept)
+    points: EnvelopePoint = jax.tree.map(lambda *x: jnp.stack([jnp.asarray(v) for v in x]), *envelope_points)
     one_cell = params.without_weak_types(
         dataclasses.replace(robot, battery=dataclasses.replace(robot.battery, cells=1))
     )

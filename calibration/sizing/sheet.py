@@ -106,16 +106,16 @@ def fill_in_ratings(robot: Robot, asked: Requirements) -> Requirements:
         "winding_C": robot.motor.temperature_limit, "motor_speed_rpm": robot.motor.speed_limit,
         "gearbox_speed_rpm": robot.gearbox.speed_limit, "gearbox_Nm": robot.gearbox.torque_limit,
     }  # fmt: skip
-    each = []
+    filled_ratings = []
     for r in asked.each:
         limit = r.limit
         if limit is None:
-            stated = ratings_by_name[r.name]
-            if stated is None:
+            rating = ratings_by_name[r.name]
+            if rating is None:
                 raise BadConfiguration(f"{asked.source}, {r.name}: the robot states no rating; state a number")
-            limit = stated / r.quantity.factor
-        each.append(dataclasses.replace(r, limit=limit))
-    return dataclasses.replace(asked, each=tuple(each))
+            limit = rating / r.quantity.factor
+        filled_ratings.append(dataclasses.replace(r, limit=limit))
+    return dataclasses.replace(asked, each=tuple(filled_ratings))
 
 
 def reject_impossible(robot: Robot, asked: Requirements) -> None:
@@ -296,27 +296,27 @@ def check_requirements(
     """
     reject_impossible(robot, asked)
     asked = fill_in_ratings(robot, asked)
-    held = []
+    checked_requirements = []
     for r in asked.each:
         configuration = _configuration_name(robot, r.envelope)
         of_levers = OF_LEVERS if r.quantity.group == "posture" else ()
         by_name = {p.name: p for p in params.walk_parameters(robot)}
         names = (*CHANGEABLE, *(f"{configuration}.{n}" for n in OF_CONFIGURATION))
-        held.append(
+        checked_requirements.append(
             _QuantityOfRobot(
                 robot, r, (*{name: by_name[name] for name in names if name in by_name}, *of_levers, CELLS)
             )
         )
     outcomes = []
-    for k, h in enumerate(held, 1):
-        tell(progress_remark("requirement", k, len(held), h.requirement.quantity.label))
+    for k, h in enumerate(checked_requirements, 1):
+        tell(progress_remark("requirement", k, len(checked_requirements), h.requirement.quantity.label))
         outcomes.append(_check_requirement(h))
     if not changes:
         return tuple(outcomes)
     missed, answer = [k for k, o in enumerate(outcomes) if not o.met], list(outcomes)
     for n, k in enumerate(missed, 1):
-        tell(progress_remark("changes", n, len(missed), held[k].requirement.quantity.label))
-        answer[k] = _add_changes(held[k], outcomes[k], held, outcomes)
+        tell(progress_remark("changes", n, len(missed), checked_requirements[k].requirement.quantity.label))
+        answer[k] = _add_changes(checked_requirements[k], outcomes[k], checked_requirements, outcomes)
     return tuple(answer)
 
 

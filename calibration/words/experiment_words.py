@@ -87,11 +87,13 @@ def experiment_sentences(e: menu.Experiment) -> str:
 def _act(act: menu.CalibrationAct) -> str:
     if act.name == "weigh":
         configurations, payload = {k for k, _ in act.at}, max(m for _, m in act.at)
-        each = {1: "", 2: "in both configurations, "}.get(len(configurations), "in each configuration, ")
+        configuration_words = {1: "", 2: "in both configurations, "}.get(
+            len(configurations), "in each configuration, "
+        )
         laden = f"unladen and with the payload of {payload:g} kg, " if payload > 0 else "unladen, "
         return (
-            f"Weigh the robot {each}{laden}on scales accurate to 20 g, and compare the readings with the total mass "
-            "in the robot file"
+            f"Weigh the robot {configuration_words}{laden}on scales accurate to 20 g, and compare the readings with "
+            "the total mass in the robot file"
         )
     (kind,) = act.kinds
     if act.channel:

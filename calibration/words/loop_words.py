@@ -88,8 +88,10 @@ def _verdict(said: loop_notes.VerdictSummary) -> str:
         return text
     names = [_effect_and_rivals(one) for one in said.missing if one.established]
     in_model = _tentative([one for one in said.missing if not one.established], said.support)
-    left = "" if where is None else f" An unexplained error remains in the {bases.place_in_words(where.place)}."
-    return f"Missing: {'; '.join(names)} ({_evidence(said)}).{in_model}{left}"
+    place_sentence = (
+        "" if where is None else f" An unexplained error remains in the {bases.place_in_words(where.place)}."
+    )
+    return f"Missing: {'; '.join(names)} ({_evidence(said)}).{in_model}{place_sentence}"
 
 
 def _evidence(said: loop_notes.VerdictSummary) -> str:
@@ -129,9 +131,9 @@ def loop_answer(found: loop_notes.Headline) -> str:
 
 def _law(names: Sequence[str], families: Sequence[str], values: Sequence[loop_notes.AlternativeValue]) -> str:
     """`a loss torque that changes with speed (churning or windage; these data cannot tell which)`."""
-    each = [*map(freed_value, values), *in_order_of_parts(names)]
-    which = "; these data cannot tell which" if len(each) + len(families) > 2 else ""
-    return f"{' or '.join(map(with_article, families))} ({' or '.join(each)}{which})"
+    terms = [*map(freed_value, values), *in_order_of_parts(names)]
+    which = "; these data cannot tell which" if len(terms) + len(families) > 2 else ""
+    return f"{' or '.join(map(with_article, families))} ({' or '.join(terms)}{which})"
 
 
 def in_order_of_parts(names: Iterable[str]) -> list[str]:
@@ -152,7 +154,7 @@ def _are_missing(nouns: Sequence[str]) -> str:
 
 def _undescribed(said: loop_notes.VerdictSummary) -> str:
     """Sentence on a model that does not describe the runs: the misfit and the checks."""
-    each = [
+    place_words = [
         f"{channels.find_channel(m.channel).label} by {100 * m.error:.0f} % of its measured rms"
         + (f" (its noise is estimated as {100 * m.noise:.0f} %)" if m.noise > m.error else "")
         for m in said.missed
@@ -160,12 +162,12 @@ def _undescribed(said: loop_notes.VerdictSummary) -> str:
     check = [f"columns that vary and are not used ({', '.join(said.unused)})"] * bool(said.unused)
     check += [f"parameters far from their priors ({', '.join(said.far)})"] * bool(said.far)
     check += ["units, signs and sides of the columns"]
-    if not each:
+    if not place_words:
         return (
             "This model does not describe these runs: it lacks backlash. No effect is named until backlash is added."
         )
     return (
-        f"This model does not describe these runs: refitted, it misses {', '.join(each)}. No effect is named. "
+        f"This model does not describe these runs: refitted, it misses {', '.join(place_words)}. No effect is named. "
         f"Check first: {'; '.join(check)}."
     )
 
@@ -248,11 +250,11 @@ def at_other_noise(found: Sequence[NoiseVerdict]) -> str:
     same: dict[str, list[str]] = {}
     for one in found:
         same.setdefault(brief_verdict(one.summary), []).append(f"{one.factor:g}")
-    each = [
+    answers = [
         f"with {' and with '.join(factors)} times the noise the verdict is {words}" for words, factors in same.items()
     ]
     near = " (after a few steps from the fits with the stated noise)" if any(one.near for one in found) else ""
-    return "; ".join(each) + near
+    return "; ".join(answers) + near
 
 
 def _effect_and_rivals(one: loop_notes.MissingEffect) -> str:
@@ -271,13 +273,13 @@ def _tentative(those: Sequence[loop_notes.MissingEffect], support: loop_notes.Na
     """Effects that are in the model without a name of their own, each with what speaks against it."""
     if not those:
         return ""
-    each = [
+    effect_words = [
         f"{_effect_and_rivals(one)}, which {effect_doubts(one.test)}"
         if effect_doubts(one.test)
         else f"{_effect_and_rivals(one)} ({support_reasons(support)})"
         for one in those
     ]
-    return f" Tentative, kept in the model because it improves predictions: {'; '.join(each)}."
+    return f" Tentative, kept in the model because it improves predictions: {'; '.join(effect_words)}."
 
 
 def verdict_line(stages: LoopStages) -> str:
@@ -426,13 +428,13 @@ def brief_answer(found: DiscoveryResult, moved: Sequence[str], next_step: str) -
         f"{e.name} {effect_amplitude(e)}" + " (tentative)" * (not is_established(found, e)) for e in found.effects
     ]
     changes = f"Moved: {'; '.join(moved)}. " * bool(moved) + f"Added: {', '.join(added)}." * bool(added)
-    stated, fitted = found.errors_as_stated, found.errors[0 if found.refit_alone else 1]
+    stated_errors, fitted = found.errors_as_stated, found.errors[0 if found.refit_alone else 1]
     errors = [
-        f"{channels.find_channel(c).label} {percent_text(stated[c])} → {percent_text(e)} %"
+        f"{channels.find_channel(c).label} {percent_text(stated_errors[c])} → {percent_text(e)} %"
         for c, e in fitted.items()
         if e["rows"]
     ]
-    reached, total = max((int(e["rows"]) for e in stated.values()), default=0), len(found.runs)
+    reached, total = max((int(e["rows"]) for e in stated_errors.values()), default=0), len(found.runs)
     aside = f", {len(found.outliers)} set aside as outliers" * bool(found.outliers)
     few = f" (with the robot file as given, only {reached} rows can be simulated)" * (reached < total)
     rows = f"{int(found.included.sum())} of {total} rows are used{aside}{few}"
@@ -649,12 +651,12 @@ def hidden_effects_sentence(found: DiscoveryResult) -> str:
     """Sentence on effects that the findings could hide, and on runs that would show them, empty for none."""
     if not found.hidden:
         return ""
-    each = [
+    effect_words = [
         f"{h.name} up to {h.amplitude:.2g} {h.unit}".rstrip(" -")
         + (f" ({h.experiment} would show it)" if h.experiment else "")
         for h in found.hidden
     ]
-    return f"These data could hide, in addition: {', '.join(each)}."
+    return f"These data could hide, in addition: {', '.join(effect_words)}."
 
 
 def moved_parameter(name: str, value: float, stated: float, unit: str, shift: float) -> str:
@@ -744,8 +746,8 @@ def track_model_answer(found: TrackModelResult) -> str:
             f"Track model, {track_model_question(found.asked)}: no running gear within its priors was found that "
             f"explains this error ({slip}, χ² falls by {found.fall:.0f}, p = {found.p:.2g}{why}){on}"
         )
-    held = len(found.constants) - len(found.known_from_rows)
-    undetermined = f"not determined by these rows: {held} of {len(found.constants)} constants"
+    constants_count = len(found.constants) - len(found.known_from_rows)
+    undetermined = f"not determined by these rows: {constants_count} of {len(found.constants)} constants"
     return (
         f"Track model, {track_model_question(found.asked)}: a running gear within its priors explains this error "
         f"({slip}, χ² falls by {found.fall:.0f}, p = {found.p:.2g}): {gear}; {undetermined}{on}"
@@ -819,8 +821,10 @@ def leader_choice(
         FIT: "the fit to all rows",
         loop_notes.DRAW: f"the fit to all rows, since held-out errors differ by less than {told:.0%}",
     }
-    each = ", ".join(f"{n} {x:.2f} σ" for n, x in zip(names, rms_sigma, strict=True))
-    sentence = f"{names[leader]} is listed first in its class because of {criteria[by]}; held-out errors: {each}"
+    error_words = ", ".join(f"{n} {x:.2f} σ" for n, x in zip(names, rms_sigma, strict=True))
+    sentence = (
+        f"{names[leader]} is listed first in its class because of {criteria[by]}; held-out errors: {error_words}"
+    )
     if prefer == HELD_OUT and leader != closest:
         sentence += f"; the fit to all rows prefers {names[closest]}, by Δχ² {rise_chi2:.1f}"
     if leader != best:

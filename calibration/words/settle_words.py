@@ -44,9 +44,9 @@ def left_out(stretches: Iterable[Stretch], few: bool = False) -> list[tuple[str,
         few: the log itself is to be fitted, as it has too few settled runs.
     """
     causes = []
-    every = [s for s in stretches if s.why]
-    for why in dict.fromkeys(s.why for s in every):
-        mine = [s for s in every if s.why == why]
+    omitted = [s for s in stretches if s.why]
+    for why in dict.fromkeys(s.why for s in omitted):
+        mine = [s for s in omitted if s.why == why]
         longest = max(mine, key=lambda s: len(s.rows))
         rows = f"{longest.rows[0] + 1}-{longest.rows[-1] + 1}"
         cure = "nothing: a fit to the log uses these samples" if few and why in OF_LEVELS else WHY[why][1]
@@ -56,11 +56,11 @@ def left_out(stretches: Iterable[Stretch], few: bool = False) -> list[tuple[str,
 
 def settle_statement(found: Settled) -> str:
     """Number of settled runs of a log, and its samples."""
-    kept, rows = found.kept, sum(len(s.rows) for s in found.kept)
-    back = sum(s.imposed < 0 for s in kept)
-    ways = f", {len(kept) - back} forward and {back} backward" if back else ""
+    stretches, rows = found.kept, sum(len(s.rows) for s in found.kept)
+    back = sum(s.imposed < 0 for s in stretches)
+    ways = f", {len(stretches) - back} forward and {back} backward" if back else ""
     return (
-        f"{count_noun(len(kept), 'settled run')}{ways}, from {rows} of {len(found.runs)} samples (each at least "
+        f"{count_noun(len(stretches), 'settled run')}{ways}, from {rows} of {len(found.runs)} samples (each at least "
         f"{found.shortest:.3g} s long, with means steady to {100 * found.drift:g} %)."
     )
 

@@ -117,9 +117,9 @@ def _runs(names: Names, one: str, several: str) -> str:
 
 def inherited_priors(part: str, changed: tuple[tuple[str, float, float], ...], kept: Names) -> str:
     """A part that is not the nominal robot's while friction of it is."""
-    each = ", ".join(f"{name} {mine:g} instead of {nominal:g}" for name, mine, nominal in changed)
+    changes = ", ".join(f"{name} {mine:g} instead of {nominal:g}" for name, mine, nominal in changed)
     return (
-        f"{part} differs from that of the nominal robot ({each}), but the prior of its {', '.join(kept)} is still "
+        f"{part} differs from that of the nominal robot ({changes}), but the prior of its {', '.join(kept)} is still "
         "the nominal robot's; set your values in the robot's file or with --prior"
     )
 

@@ -146,14 +146,14 @@ def climb_derivatives(
     """
     directions = jnp.eye(len(values))
     parts, samples, steps = climb.divide_run(duration, step, sample, part)
-    interval, each = jnp.asarray(step, float), jnp.asarray(steps)
+    interval, step_numbers = jnp.asarray(step, float), jnp.asarray(steps)
     run, turned = _value_and_derivatives_along(given, values, directions)
-    state, moved = _value_and_derivatives_along(functools.partial(_initial_state, step=interval), run, turned)
+    state, state_change = _value_and_derivatives_along(functools.partial(_initial_state, step=interval), run, turned)
     records: list[Any] = []
     for k in range(parts):
         first = jnp.asarray(k * samples * steps * step)
-        (state, record), (moved, changed) = _advance_part(
-            (run, state), (turned, moved), first, interval, each, samples
+        (state, record), (state_change, changed) = _advance_part(
+            (run, state), (turned, state_change), first, interval, step_numbers, samples
         )
         records.append(jax.device_get((record, changed)))
         if progress is not None:
@@ -187,9 +187,9 @@ def climb_derivatives(
         y = np.array([float(other[name]) for other in others]).reshape(-1, BESIDE)
         square, off = np.sum(offsets**2), y - y.mean(axis=1, keepdims=True)
         rise = off @ offsets / square
-        left = off - np.outer(rise, offsets)
+        unexplained_rise = off - np.outer(rise, offsets)
         slope[name] = rise / np.asarray(widths)
-        sd[name] = np.sqrt(np.sum(left**2, axis=1) / (BESIDE - 2) / square) / np.asarray(widths)
+        sd[name] = np.sqrt(np.sum(unexplained_rise**2, axis=1) / (BESIDE - 2) / square) / np.asarray(widths)
     return ClimbDerivatives(
         whole, {n: float(x) for n, x in gradients.items()}, {n: np.asarray(x) for n, x in by.items()}, slope, sd
     )

@@ -426,16 +426,16 @@ def advance_climb(
     whole = whole.at[LED, LED].add(1 - run.chassis.on_tracks)
     pushed = step * (force - bias)
     factors = factorise(whole[:4, :4])
-    moved, *coupled = (solve_factorised(factors, x) for x in (pushed[:4], whole[:4, 4], whole[:4, 5]))
+    acceleration, *coupled = (solve_factorised(factors, x) for x in (pushed[:4], whole[:4, 4], whole[:4, 5]))
     coupling = jnp.stack(coupled, axis=1)
-    left = whole[4:, 4:] - whole[4:, :4] @ coupling
-    inverse = jnp.array([[left[1, 1], -left[0, 1]], [-left[1, 0], left[0, 0]]]) / (
-        left[0, 0] * left[1, 1] - left[0, 1] * left[1, 0]
-    )
-    alone = motion.v[LED] + inverse @ (pushed[4:] - whole[4:, :4] @ moved)
+    coupled_matrix = whole[4:, 4:] - whole[4:, :4] @ coupling
+    inverse = jnp.array(
+        [[coupled_matrix[1, 1], -coupled_matrix[0, 1]], [-coupled_matrix[1, 0], coupled_matrix[0, 0]]]
+    ) / (coupled_matrix[0, 0] * coupled_matrix[1, 1] - coupled_matrix[0, 1] * coupled_matrix[1, 0])
+    alone = motion.v[LED] + inverse @ (pushed[4:] - whole[4:, :4] @ acceleration)
     swung = _drive_action(run, motion, time, signals.voltage_source, alone, step * inverse / robot.sides)
     led = swung.rate - motion.v[LED]
-    gained = jnp.concatenate([moved - coupling @ led, led])
+    gained = jnp.concatenate([acceleration - coupling @ led, led])
     v = motion.v + gained
     middle = motion.v + gained / 2
 
@@ -475,7 +475,7 @@ def advance_climb(
     stored = kinetic / 2 + signals.inductance * motion.current**2 / 2 + height + jnp.sum(touching.energy)
     up = jnp.array([1.0, -1.0])  # for a rear lever, upward is decreasing ψ
     total = jnp.sum(touching.force)
-    held = run.chassis.ground.force_adhesion(jnp.sum(touching.force * touching.rolls), signals.adhesion)
+    adhesion_force = run.chassis.ground.force_adhesion(jnp.sum(touching.force * touching.rolls), signals.adhesion)
     centre = motion.q[0] - matrix[1, PITCH] / matrix[0, 0]
     passed = ClimbRecord(
         time=time,
@@ -491,7 +491,7 @@ def advance_climb(
         stored=robot.sides * stored + pair.inertia * motion.v[LED] @ motion.v[LED] / 2,
         normal=total,
         body=jnp.sum(touching.force * (1 - touching.rolls)) / jnp.maximum(total, 1e-9),
-        grip=jnp.sum(jnp.abs(pulled.force) * touching.rolls) / jnp.maximum(held, 1e-9),
+        grip=jnp.sum(jnp.abs(pulled.force) * touching.rolls) / jnp.maximum(adhesion_force, 1e-9),
         carried=total / (GRAVITY * matrix[0, 0]),
         centre=centre,
         base=_distances_to_outermost_contacts(centre, touching),
@@ -565,13 +565,13 @@ def _update_verdict(
     rear = q[0] - run.shape.half * jnp.cos(q[PITCH])
     gained = q[0] > progress.furthest + GAIN
     swings = jnp.max(jnp.abs(v[LED])) > 0.05
-    moved = gained | swings | (passed.time < SETTLES)
+    has_progressed = gained | swings | (passed.time < SETTLES)
     progress = VerdictState(
         progress.verdict,
         jnp.where(progress.verdict == _RUNNING, passed.time, progress.ended),
         jnp.where(gained, q[0], progress.furthest),
-        jnp.where(moved, passed.time, progress.since),
-        jnp.where(moved, q[SHAFT], progress.belt),
+        jnp.where(has_progressed, passed.time, progress.since),
+        jnp.where(has_progressed, q[SHAFT], progress.belt),
     )
     waits = passed.time - progress.since
     stuck = waits > PATIENCE
@@ -627,8 +627,8 @@ def advance_samples(
         after, spent, passed = jax.lax.fori_loop(0, steps, small, (motion, energy, nothing))
         ended = progress.verdict != _RUNNING
         after, progress = _update_verdict(run, motion, passed, after, progress)
-        kept = jax.tree.map(lambda new, old: jnp.where(ended, old, new), spent, energy)
-        return (after, kept, progress), passed
+        energy_recorded = jax.tree.map(lambda new, old: jnp.where(ended, old, new), spent, energy)
+        return (after, energy_recorded, progress), passed
 
     return jax.lax.scan(sample, state, jnp.arange(samples))
 
@@ -698,8 +698,8 @@ def _part(
             build_climb_system(robot, conditions, terrain, sequence, step), state, first, steps, samples
         )
 
-    each = (_robot_axis(robot), 0, 0, 0, 0)
-    parts: tuple[Any, ClimbRecord] = jax.vmap(one, in_axes=each)(robot, conditions, terrain, sequence, state)
+    in_axes = (_robot_axis(robot), 0, 0, 0, 0)
+    parts: tuple[Any, ClimbRecord] = jax.vmap(one, in_axes=in_axes)(robot, conditions, terrain, sequence, state)
     return parts
 
 
@@ -733,19 +733,22 @@ def climb_batch(
         progress: callback with the finished share of the time.
     """
     parts, samples, steps = divide_run(duration, step, sample, part)
-    interval, each = jnp.asarray(step, float), jnp.asarray(steps)  # arrays: one program for all lengths of a step
+    interval, step_numbers = (
+        jnp.asarray(step, float),
+        jnp.asarray(steps),
+    )  # arrays: one program for all lengths of a step
     state = _begin(robot, conditions, terrain, sequence, interval, start)
-    kept: list[ClimbRecord] = []
+    records: list[ClimbRecord] = []
     for k in range(parts):
         first = jnp.asarray(k * samples * steps * step)
-        state, passed = _compiled(robot, conditions, terrain, sequence, state, first, interval, each, samples)
+        state, passed = _compiled(robot, conditions, terrain, sequence, state, first, interval, step_numbers, samples)
         verdict = np.asarray(state[2].verdict)
         last = passed if record else jax.tree.map(lambda x: x[:, -1:], passed)
-        kept = [*(kept if record else []), jax.device_get(last)]
+        records = [*(records if record else []), jax.device_get(last)]
         if progress is not None:
             progress((k + 1) / parts)
         if np.all(verdict != _RUNNING):
             break
     verdict = np.where(verdict == _RUNNING, UNFINISHED, verdict)
-    joined = jax.tree.map(lambda *x: np.concatenate(x, axis=1), *kept)
+    joined = jax.tree.map(lambda *x: np.concatenate(x, axis=1), *records)
     return ClimbRuns(verdict, np.asarray(state[2].ended), np.asarray(state[2].furthest), joined)

@@ -127,8 +127,8 @@ def step_levers(
     """
     limits = drive.constant * rate + drive.resistance * drive.current_limit * jnp.array([[-1.0], [1.0]])
     least, most = jnp.maximum(least, limits[0]), jnp.minimum(most, limits[1])
-    kept = drive.inertia * (1 / step)
-    stiff = kept + drive.constant**2 / drive.resistance + drive.viscous
+    inertia_rate = drive.inertia * (1 / step)
+    stiff = inertia_rate + drive.constant**2 / drive.resistance + drive.viscous
 
     end, way, sign = _PIECES.T
     moves, follows = way != 0, end == 0
@@ -136,7 +136,7 @@ def step_levers(
     # α T + β ω = γ on a piece, (pairs, pieces)
     alpha = jnp.where(moves, jnp.where(sign * way > 0, drive.ahead, drive.back), 0.0) + 0 * pushed
     beta = jnp.where(moves, stiff, 1.0) + 0 * pushed
-    gamma = jnp.where(moves, pushed + kept * rate[:, None] - way * drive.dry, follows * asked[:, None])
+    gamma = jnp.where(moves, pushed + inertia_rate * rate[:, None] - way * drive.dry, follows * asked[:, None])
 
     (a, b), (c, d) = beta[:, None] * yields[:, :, None]
     a, d = (a + alpha[0])[:, None], (d + alpha[1])[None]
@@ -151,7 +151,7 @@ def step_levers(
         """Distance of each candidate solution from its piece of the law of lever pair `k` (0: on it) [N·m]. Then i
         C_m I of the motor within the voltage limits [N·m], load torque [N·m] and speed [rad/s]."""
         force, speed = torque[k], turned[k]
-        turning = kept * (speed - rate[k]) + drive.viscous * speed
+        turning = inertia_rate * (speed - rate[k]) + drive.viscous * speed
         up, down = drive.against(force, 1.0) + drive.dry + turning, drive.against(force, -1.0) - drive.dry + turning
         low, high = jnp.where(asked[k] > 0, up, down), jnp.where(asked[k] < 0, down, up)
         weak, strong = (drive.constant / drive.resistance * (x[k] - drive.constant * speed) for x in (least, most))

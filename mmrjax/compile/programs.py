@@ -190,8 +190,8 @@ class Programs:
         returned: list[Any] = []
 
         def flat(*arrays: Any) -> list[Any]:
-            given = iter(arrays)
-            args, named = tree.unflatten([next(given) if eqx.is_array(x) else x for x in leaves])
+            array_iterator = iter(arrays)
+            args, named = tree.unflatten([next(array_iterator) if eqx.is_array(x) else x for x in leaves])
             out, shape = jax.tree.flatten(self.function(*args, **named))
             returned.append(jax.tree.unflatten(shape, [_ArrayPlaceholder() if eqx.is_array(x) else x for x in out]))
             return _arrays(out)

@@ -175,8 +175,8 @@ def _travel_quantity(robot: Robot, point: EnvelopePoint, rated: Ratings, name: s
 def _steepest_slope(robot: Robot, point: EnvelopePoint, rated: Ratings, name: str) -> QuantityValue:
     here, conditions = _robot_and_conditions_at(robot, point, rated)
     answer = steepest_slope.compute(here, conditions)
-    held = jnp.isfinite(answer["steepest_slope"])
-    return QuantityValue(jnp.where(held, answer["steepest_slope"], 0.0), answer["status"])
+    is_reachable = jnp.isfinite(answer["steepest_slope"])
+    return QuantityValue(jnp.where(is_reachable, answer["steepest_slope"], 0.0), answer["status"])
 
 
 #: Halvings of a bracket; a Newton step removes the remaining error.
@@ -197,8 +197,8 @@ def _largest_payload(robot: Robot, point: EnvelopePoint, rated: Ratings, name: s
         signals, _, _ = operating_state(here, conditions)
         hot = thermal_margin(robot, loaded_point, signals.current, rated.temperature)
         torque = 1 - jnp.abs(signals.torque_gear) / rated.torque
-        each = [steepest_slope.travel_margin(here, signals), hot, torque, _cell_margin(rated, signals, point)]
-        return functools.reduce(jnp.minimum, each)
+        margins = [steepest_slope.travel_margin(here, signals), hot, torque, _cell_margin(rated, signals, point)]
+        return functools.reduce(jnp.minimum, margins)
 
     found, holds = _find_sign_change(left, robot, jnp.zeros(()), jnp.asarray(most))
     here, conditions = _robot_and_conditions_at(robot, dataclasses.replace(point, payload=jnp.zeros(())), rated)

@@ -62,9 +62,9 @@ class StartStages:
         def number(x: float) -> float | None:
             return float(x) if np.isfinite(x) else None
 
-        each = zip(NAMES, self.bounds[:-1], self.bounds[1:], self.slip, strict=True)
+        stages = zip(NAMES, self.bounds[:-1], self.bounds[1:], self.slip, strict=True)
         return {
-            "stages": [{"stage": n, "from_s": a, "until_s": b, "slip": number(s)} for n, a, b, s in each],
+            "stages": [{"stage": n, "from_s": a, "until_s": b, "slip": number(s)} for n, a, b, s in stages],
             "acceleration_time_s": self.settled,
             "slip_over_acceleration": number(self.over_settling),
         }
@@ -126,9 +126,9 @@ def stages_of_start(
     late = np.flatnonzero(np.abs(even - last) > WITHIN * abs(last))
     settled = float(time[min(int(late[-1]) + 1, len(time) - 1)]) if late.size else 0.0
     bounds = (0.0, starting, max(slipping, starting), float(time[-1]))
-    each = [mean_slip(time, speed, theoretical, a, b) for a, b in itertools.pairwise(bounds)]
+    slips = [mean_slip(time, speed, theoretical, a, b) for a, b in itertools.pairwise(bounds)]
     over = mean_slip(time, speed, theoretical, 0.0, settled)
-    return StartStages(sense, bounds[1], bounds[2], settled, bounds[3], (each[0], each[1], each[2]), over)
+    return StartStages(sense, bounds[1], bounds[2], settled, bounds[3], (slips[0], slips[1], slips[2]), over)
 
 
 def stages_of_histories(

@@ -33,8 +33,8 @@ def turning_radius(ahead: Any, aside: Any, rate: Any) -> Array:
     """
     turns = jnp.abs(rate) > NONE
     along = jnp.sqrt(jnp.maximum(jnp.square(ahead) + jnp.square(aside), 1e-24))  # a root of 0 has no derivative
-    left = jnp.where(jnp.asarray(ahead) * rate < 0, -1.0, 1.0)
-    return jnp.where(turns, left * along / jnp.where(turns, jnp.abs(rate), 1.0), jnp.inf)
+    turn_sign = jnp.where(jnp.asarray(ahead) * rate < 0, -1.0, 1.0)
+    return jnp.where(turns, turn_sign * along / jnp.where(turns, jnp.abs(rate), 1.0), jnp.inf)
 
 
 @compiled

@@ -116,9 +116,9 @@ class Effect(eqx.Module):
         if "name" not in vars(cls):
             cls.name = re.sub(r"(?<!^)(?=[A-Z])", "_", cls.__name__).lower()
         # Stated next to the class attributes, it is the default of the field.
-        if isinstance(stated := vars(cls).get("configurations"), tuple):
+        if isinstance(configurations := vars(cls).get("configurations"), tuple):
             cls.__annotations__ = {**inspect.get_annotations(cls), "configurations": Names}
-            cls.configurations = eqx.field(default=stated, static=True, kw_only=True)
+            cls.configurations = eqx.field(default=configurations, static=True, kw_only=True)
 
     def for_equations(self) -> Effect:
         """Same effect as a class of the library, without its own priors."""

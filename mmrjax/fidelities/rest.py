@@ -93,8 +93,8 @@ def admitted_current(robot: Robot, conditions: Conditions, wanted: Scalar) -> tu
     behind = robot.sides * battery.cells * battery.resistance * duty * robot.driver.share_drawn(duty)
     resistance = robot.motor.resistance + jnp.where(conditions.battery > 0.5, behind, 0.0)
     resistance, source = jax.lax.stop_gradient((resistance, _source_at_rest(robot, conditions)))
-    current, held = robot.driver.admitted(wanted, conditions.polarity * duty, jnp.abs(source) / resistance)
-    return current, resistance * held
+    current, is_limited = robot.driver.admitted(wanted, conditions.polarity * duty, jnp.abs(source) / resistance)
+    return current, resistance * is_limited
 
 
 def without_diode(robot: Robot) -> Robot:
@@ -133,7 +133,7 @@ def standing_signals(robot: Robot, conditions: Conditions, state: State) -> Sign
     ends = [balances.settled_signals(robot, conditions, still, way)[0] for way in (1.0, -1.0)]
     ahead, back = ends
     # Least and greatest torque through the gearbox, and least and greatest friction of the track.
-    given = [
+    inputs = [
         gear.torque_output(end.torque_motor - end.torque_idle, end.direction)
         - (end.torque_load - end.torque_track_loss - chassis.radius * end.traction)
         for end in ends
@@ -141,10 +141,10 @@ def standing_signals(robot: Robot, conditions: Conditions, state: State) -> Sign
     lost = [end.torque_track_loss for end in (back, ahead)]
     traction = ahead.gravity
     if robot.has_ground:
-        least_, most = ((given[k] - lost[1 - k]) / chassis.radius for k in range(2))
+        least_, most = ((inputs[k] - lost[1 - k]) / chassis.radius for k in range(2))
         traction = one_sided.clip(one_sided.clip(traction, least_, most), -ahead.adhesion_limit, ahead.adhesion_limit)
     carried = chassis.radius * traction
-    torque = one_sided.clip(0.0, jnp.maximum(carried + lost[0], given[0]), jnp.minimum(carried + lost[1], given[1]))
+    torque = one_sided.clip(0.0, jnp.maximum(carried + lost[0], inputs[0]), jnp.minimum(carried + lost[1], inputs[1]))
     none = jnp.zeros_like(carried)
     return dataclasses.replace(
         ahead,
@@ -268,10 +268,10 @@ def current_settled(robot: Robot, conditions: Conditions, state: State) -> Scala
     """Current that settles at the motor speed of `state` [A], by the secant method on its voltage balance."""
 
     def left(wanted: Scalar) -> Scalar:
-        current, held = admitted_current(robot, conditions, wanted)
+        current, is_limited = admitted_current(robot, conditions, wanted)
         here = dataclasses.replace(state, current=current)
         none = jnp.zeros_like(state.speed)
-        return balances.driven_signals(without_diode(robot), conditions, here, none).voltage_left - held
+        return balances.driven_signals(without_diode(robot), conditions, here, none).voltage_left - is_limited
 
     guess = robot.motor.current_stall(left(jnp.zeros_like(state.current)))
     first, second = left(0.5 * guess), left(guess)

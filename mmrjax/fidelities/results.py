@@ -96,10 +96,10 @@ def _map_in_chunks(fidelity: Fidelity, function: Callable[[Conditions], T], cond
         return jax.device_put(
             jax.tree.map(lambda x: np.asarray(x)[:runs].reshape((*conditions.shape, *x.shape[1:])), part)
         )
-    every = flatten_conditions(conditions)
+    flat_conditions = flatten_conditions(conditions)
     if runs <= size:
-        return reshape_runs(function(every), conditions.shape)
-    parts = [function(_chunk_of_runs(every, np.asarray(first), size)) for first in range(0, runs, size)]
+        return reshape_runs(function(flat_conditions), conditions.shape)
+    parts = [function(_chunk_of_runs(flat_conditions, np.asarray(first), size)) for first in range(0, runs, size)]
     return reshape_runs(_join_chunks(parts, runs), conditions.shape)
 
 
@@ -373,8 +373,8 @@ class Results:
             width = max(map(len, column))
             cells.append([c.ljust(width) if words else c.rjust(width) for c in column])
         lines = ["  ".join(line).rstrip() for line in zip(*cells, strict=True)]
-        left = len(content["status"]) - rows
-        return "\n".join([*lines, f"... and {left} more"] if left > 0 else lines)
+        padding = len(content["status"]) - rows
+        return "\n".join([*lines, f"... and {padding} more"] if padding > 0 else lines)
 
     def __str__(self) -> str:
         return self.table()

@@ -174,8 +174,8 @@ def _advance_and_record(
 
     @jax.checkpoint  # reverse mode keeps one motion per sample and recomputes the steps in between
     def interval(motion: HalfRobotState, _: None) -> tuple[HalfRobotState, SampleRecord]:
-        after, every = jax.lax.scan(small, motion, None, length=steps)
-        passed, guided = jax.tree.map(lambda x: jnp.mean(x, axis=0), every)
+        after, records = jax.lax.scan(small, motion, None, length=steps)
+        passed, guided = jax.tree.map(lambda x: jnp.mean(x, axis=0), records)
         return after, SampleRecord(after, passed, guided, kind.loads(run, *kind.instant(run, after)[1:]))
 
     return jax.lax.scan(interval, start, None, length=samples)

@@ -249,8 +249,8 @@ def mission(
         return carry, ended
 
     order = jnp.tile(jnp.arange(profile.segment_count), profile.cycles)
-    c, each = jax.lax.scan(run_segment, _initial_carry(law, robot, conditions, begin, nothing, keep), order)
-    return _assemble_mission(law, robot, conditions, profile, c, each)
+    c, segment_ends = jax.lax.scan(run_segment, _initial_carry(law, robot, conditions, begin, nothing, keep), order)
+    return _assemble_mission(law, robot, conditions, profile, c, segment_ends)
 
 
 class _SegmentEnd(NamedTuple):
@@ -311,10 +311,10 @@ def _segment_end(
     rise = law.stored(robot, signals) - law.stored(robot, beginning)
     drawn, returned = (c.q[list(law.TOTALS).index(name)] for name in ("drawn", "returned"))
     first, last = (robot.battery.energy(_charge_taken(law, x.y)) for x in (before, c))
-    given = jnp.where(conditions.battery > 0.5, last - first, drawn - returned)
+    energy_supplied = jnp.where(conditions.battery > 0.5, last - first, drawn - returned)
     ran = ~before.ended
-    time, rise, given = (jnp.where(ran, x, 0.0) for x in (c.y[law.CLOCK], rise, given))
-    return _SegmentEnd(time, jnp.where(ran, c.q, 0.0), rise, given, c.peaks, status, flags, signals, c.kept)
+    time, rise, energy_supplied = (jnp.where(ran, x, 0.0) for x in (c.y[law.CLOCK], rise, energy_supplied))
+    return _SegmentEnd(time, jnp.where(ran, c.q, 0.0), rise, energy_supplied, c.peaks, status, flags, signals, c.kept)
 
 
 def _assemble_mission(
@@ -323,8 +323,8 @@ def _assemble_mission(
     """Mission from its last state `c` and the ends of its segments, shape (cycles · segments, ...)."""
     shape = (profile.cycles, profile.segment_count)
     totals = {n: ends.q[:, i].reshape(shape) for i, n in enumerate(law.TOTALS)}
-    each = Totals(ends.time.reshape(shape), totals, ends.rise.reshape(shape), ends.given.reshape(shape))
-    total, status = jax.tree.map(jnp.sum, each), ends.status
+    by_segment = Totals(ends.time.reshape(shape), totals, ends.rise.reshape(shape), ends.given.reshape(shape))
+    total, status = jax.tree.map(jnp.sum, by_segment), ends.status
     bad = (status == STALLED) | (status == SLIDES) | (status == ROLLS_BACK) | (status == TIPS)
     first = jnp.argmax(bad)
     outcome = jnp.where(jnp.any(bad), status[first], CONVERGED)
@@ -339,10 +339,10 @@ def _assemble_mission(
 
     course = None
     if c.buffer is not None:
-        course = _recorded_course(law, robot, conditions, profile, c, each, ends.kept)
+        course = _recorded_course(law, robot, conditions, profile, c, by_segment, ends.kept)
     winding, housing = _winding_and_housing_temperatures(law, c.y)
     return Mission(
-        total=total, segments=each, peaks=named(c.peaks), segment_peaks=named(ends.peaks.reshape(*shape, -1)),
+        total=total, segments=by_segment, peaks=named(c.peaks), segment_peaks=named(ends.peaks.reshape(*shape, -1)),
         status=status.reshape(shape), flags=ends.flags.reshape(shape), result=answer,
         temperature_winding=jnp.max(winding), temperature_housing=jnp.max(housing), discharge=_charge_taken(law, c.y),
         steps=c.accepted + c.rejected, rejected=c.rejected,
@@ -382,7 +382,7 @@ def _recorded_course(
             law.instant(robot, conditions, profile.row(k % profile.segment_count), y, stands)[0]
         )
 
-    every = law.at_places(jax.vmap(signals)(ys, stood, segment), so_far)
+    course_signals = law.at_places(jax.vmap(signals)(ys, stood, segment), so_far)
     winding, housing = _winding_and_housing_temperatures(law, ys)
 
     def shown(x: Array) -> Array:
@@ -397,5 +397,5 @@ def _recorded_course(
         energy=shown(so_far["drawn"] - so_far["returned"]),
         temperature_winding=shown(winding),
         temperature_housing=shown(housing),
-        signals=jax.tree.map(shown, every),
+        signals=jax.tree.map(shown, course_signals),
     )

@@ -277,9 +277,9 @@ def _move_to_event(
     rest = y
     for k in law.STOPS:
         rest = rest.at[k].set(0.0)
-    moved, parked = (law.instant(robot, otherwise, segment, x, stands)[0] for x in (y, rest))
+    state_at_event, parked = (law.instant(robot, otherwise, segment, x, stands)[0] for x in (y, rest))
     halts = which == STANDS
-    lost = jnp.where(halts, law.stored(robot, moved) - law.stored(robot, parked), 0.0)
+    lost = jnp.where(halts, law.stored(robot, state_at_event) - law.stored(robot, parked), 0.0)
     q = q.at[list(law.TOTALS).index("sliding")].add(lost)
     stands = (stands | halts) & (which != BREAKS_AWAY)
     below = (below | (which == FALLS)) & (which != RECOVERS)
@@ -398,9 +398,9 @@ class _SegmentIntegrator(NamedTuple):
 
         to_end = self.length - c.y[law.CLOCK]
         to_trip = jnp.where(c.below, robot.battery.delay_cutoff - c.low, jnp.inf)
-        left, trips = jnp.minimum(to_end, to_trip), to_trip < to_end
-        last = c.step >= left * (1 - 1e-9)
-        h = jnp.where(last, left, jax.lax.stop_gradient(c.step))
+        step_left, trips = jnp.minimum(to_end, to_trip), to_trip < to_end
+        last = c.step >= step_left * (1 - 1e-9)
+        h = jnp.where(last, step_left, jax.lax.stop_gradient(c.step))
         y, q, u, _ = rosenbrock_stages(rates, c.y, c.q, h, looped=law.LONG)
         y = y.at[law.CLOCK].set(jnp.where(last & ~trips, self.length, y[law.CLOCK]))
         scale = self.tolerance * (1 + jnp.maximum(jnp.abs(c.y), jnp.abs(y)))
@@ -448,9 +448,10 @@ class _SegmentIntegrator(NamedTuple):
         tops = _peak_between(c.y, y, h * c.slope, h * dy)
         within = law.peaks_within(robot, y, tops)
         highest = jnp.stack([jnp.where(taken, within.get(name, -jnp.inf), -jnp.inf) for name in law.PEAKS])
-        each = law.peaks(robot, signals)
+        signal_peaks = law.peaks(robot, signals)
         peaks = jnp.maximum(
-            jnp.maximum(c.peaks, jnp.stack([jnp.asarray(each[name]) * jnp.ones(()) for name in law.PEAKS])), highest
+            jnp.maximum(c.peaks, jnp.stack([jnp.asarray(signal_peaks[name]) * jnp.ones(()) for name in law.PEAKS])),
+            highest,
         )
         hot = taken & (within["temperature"] > robot.motor.temperature_limit)
         over = law.exceeded(robot, signals)
@@ -461,16 +462,16 @@ class _SegmentIntegrator(NamedTuple):
         now = (robot, otherwise, segment, y, stands, below)
         unchanged = jnp.where(taken, landed.after, c.events)
         events_now = compute_if_needed(landed.event, functools.partial(event_functions, law), now, unchanged)
-        kept, buffer = c.kept, c.buffer
+        buffer_count, buffer = c.kept, c.buffer
         if buffer is not None:
-            slot = jnp.where(taken, kept, buffer[0].shape[0])  # beyond the end: dropped
+            slot = jnp.where(taken, buffer_count, buffer[0].shape[0])  # beyond the end: dropped
             row = (y, landed.q, stands, jnp.where(cut_off, MARKS.index("cut_off"), landed.which))
             buffer = tuple(b.at[slot].set(r, mode="drop") for b, r in zip(buffer, row, strict=True))
         return IntegrationState(
             y=y, q=landed.q, step=landed.step, stands=stands, ended=ended, below=below, low=landed.low,
             cut_off=cut_off, peaks=peaks, flags=c.flags | flags,
             events=events_now, accepted=c.accepted + taken, rejected=c.rejected + ~taken, failed=failed,
-            kept=kept + taken, buffer=buffer, slope=dy,
+            kept=buffer_count + taken, buffer=buffer, slope=dy,
         )  # fmt: skip
 
 

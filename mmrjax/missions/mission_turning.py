@@ -187,10 +187,13 @@ def stored(robot: Robot, found: TurningInstant) -> Scalar:
 
 
 def peaks(robot: Robot, found: TurningInstant) -> Scalars:
-    each = jax.vmap(lambda s: mission_straight.peaks(robot, s))(found.signals)
-    most: Scalars = {name: jnp.max(jnp.asarray(x)) for name, x in each.items()}
-    most |= {"current": sum_of_sides(jnp.asarray(each["current"])) / 2, "speed": _ground_speed(found.motion)}
-    return {**most, "yaw_rate": jnp.abs(found.motion.yaw_rate), **_peaks_of_sides(robot, each)}
+    peaks_of_sides = jax.vmap(lambda s: mission_straight.peaks(robot, s))(found.signals)
+    most: Scalars = {name: jnp.max(jnp.asarray(x)) for name, x in peaks_of_sides.items()}
+    most |= {
+        "current": sum_of_sides(jnp.asarray(peaks_of_sides["current"])) / 2,
+        "speed": _ground_speed(found.motion),
+    }
+    return {**most, "yaw_rate": jnp.abs(found.motion.yaw_rate), **_peaks_of_sides(robot, peaks_of_sides)}
 
 
 def peaks_within(robot: Robot, y: Array, tops: Array) -> Scalars:
@@ -208,8 +211,8 @@ def _peaks_of_sides(robot: Robot, each: dict[str, Any]) -> Scalars:
 
 
 def exceeded(robot: Robot, found: TurningInstant) -> Scalars:
-    each = jax.vmap(lambda s: mission_straight.exceeded(robot, s))(found.signals)
-    return {name: jnp.any(x) for name, x in each.items()}
+    exceeded_by_side = jax.vmap(lambda s: mission_straight.exceeded(robot, s))(found.signals)
+    return {name: jnp.any(x) for name, x in exceeded_by_side.items()}
 
 
 def limited(robot: Robot, y: Array) -> Array:

@@ -177,9 +177,9 @@ class ContactLaw(eqx.Module):
     def per_speed_rise(self, along: Scalar, across: Scalar) -> tuple[Scalar, Scalar]:
         """Derivatives of `force_per_sliding_speed` with respect to the squares of the sliding speeds [s³/m³]."""
         square, weighed = along + across, along + self.ratio * across
-        turned, held = jnp.sqrt((square + STILL) / (weighed + STILL)), self.friction.per_speed(square)
+        turned, friction_per_speed = jnp.sqrt((square + STILL) / (weighed + STILL)), self.friction.per_speed(square)
         slower = turned * self.friction.per_speed_rise(square)
-        share = held * turned / 2
+        share = friction_per_speed * turned / 2
         return (
             slower + share * (1 / (square + STILL) - 1 / (weighed + STILL)),
             slower + share * (1 / (square + STILL) - self.ratio / (weighed + STILL)),
@@ -191,11 +191,14 @@ class ContactLaw(eqx.Module):
         If the total force falls with sliding, the derivative is set to 0.
         """
         square, other, both = along**2, across**2, along * across
-        held, (by_along, by_across) = self.per_speed(square, other), self.per_speed_rise(square, other)
-        grows = held + 2 * (square * by_along + other * by_across)
+        friction_per_speed, (by_along, by_across) = self.per_speed(square, other), self.per_speed_rise(square, other)
+        grows = friction_per_speed + 2 * (square * by_along + other * by_across)
         stays = jnp.maximum(-grows, 0.0) / (square + other + STILL)
         first, second = 2 * by_along + stays, 2 * by_across + stays
-        return (held + square * first, both * second), (both * first, held + other * second)
+        return (friction_per_speed + square * first, both * second), (
+            both * first,
+            friction_per_speed + other * second,
+        )
 
 
 @eqx.filter_custom_jvp
@@ -278,12 +281,12 @@ def ground_forces(
         loads: load transfer T [N] and centre of pressure x_p [m], if they are unknowns of a larger search. None: they
             are solved here.
     """
-    given = _GroundForceInputs(stance, friction, adhesion, load, sliding, lateral_speed, yaw_rate, resistance)
+    inputs = _GroundForceInputs(stance, friction, adhesion, load, sliding, lateral_speed, yaw_rate, resistance)
     if loads is not None:
-        return _forces_at_loads(loads, None, given)
-    held = jax.lax.stop_gradient(given)
-    at, rise = _solve_loads(held)
-    forces = _forces_at_loads(at, None, given)
+        return _forces_at_loads(loads, None, inputs)
+    detached_inputs = jax.lax.stop_gradient(inputs)
+    at, rise = _solve_loads(detached_inputs)
+    forces = _forces_at_loads(at, None, inputs)
     # Only the last step carries derivatives, the implicit ones; it is so small that linear terms suffice.
     change = _load_step(forces.lacking, rise.lacking)
     return jax.tree.map(lambda x, slope: x - slope @ change, forces, rise)
@@ -309,8 +312,8 @@ def _solve_loads(given: _GroundForceInputs) -> tuple[Pair, GroundForces]:
             def lacking(x: Array) -> tuple[Array, Array]:
                 return (_forces_at_loads(x, even, given).lacking,) * 2
 
-            slope, left = jax.jacfwd(lacking, has_aux=True)(loads)
-            return loads - _load_step(left, slope)
+            slope, residual = jax.jacfwd(lacking, has_aux=True)(loads)
+            return loads - _load_step(residual, slope)
 
         loads_found = jax.lax.fori_loop(0, LOAD_STEPS, step, loads, unroll=even is not None)
         return loads_found, jax.jacfwd(lambda x: _forces_at_loads(x, even, given))(loads_found)
@@ -337,17 +340,17 @@ def _forces_at_loads(loads: Array, even: Array | None, given: _GroundForceInputs
     The lateral speed is linear along a contact, and so is its load. Forces and moments are therefore sums of four
     moments of the law over a uniform load. `even`: these moments, if known.
     """
-    (moved, centre), stance, adhesion, load = loads, given.stance, given.adhesion, given.load
-    normal = jnp.maximum(load / 2 - 2 * SIDES * moved, 0.0)
+    (moments, centre), stance, adhesion, load = loads, given.stance, given.adhesion, given.load
+    normal = jnp.maximum(load / 2 - 2 * SIDES * moments, 0.0)
     place, half, tilt = loaded_part(stance, centre)
     arm = place - stance.ahead
     law, sliding, middle, end = _moment_arguments(centre, given)
     even = law_moments(law, sliding, middle, end) if even is None else even
     zeroth, first, second = (even[:, k] + tilt * even[:, k + 1] for k in range(3))
-    held, across = adhesion * normal, adhesion * normal * stance.lateral**stance.rule
+    friction_limit, across = adhesion * normal, adhesion * normal * stance.lateral**stance.rule
     aside = across * (middle * zeroth + end * first)
     turned = across * (middle * first + end * second)
-    ahead = held * zeroth * sliding
+    ahead = friction_limit * zeroth * sliding
     outward = stance.height * sum_of_sides(aside) / stance.width
     # A vertical ground carries no normal load.
     behind = stance.height * sum_of_sides(ahead - given.resistance * normal) / jnp.maximum(load, 1e-9)
@@ -357,7 +360,7 @@ def _forces_at_loads(loads: Array, even: Array | None, given: _GroundForceInputs
         aside=aside,
         moment=arm * aside + half * turned,
         across=middle * aside + end * turned,
-        moved=moved,
+        moved=moments,
         centre=centre,
         lacking=loads - jnp.stack([outward, stance.ahead - behind]),
     )

@@ -126,13 +126,13 @@ def smoothed_motion(time: np.ndarray, angle: np.ndarray, times: np.ndarray, degr
 def columns_of_joint(log: NamedArrays, joint: str, joints: Names) -> NamedArrays:
     """Columns of a log that are a joint's, without its name, and those of no joint."""
     others = tuple(f"{name}." for name in joints if name != joint)
-    kept = [k for k, column in enumerate(log.header) if not column.startswith(others)]
+    joint_columns = [k for k, column in enumerate(log.header) if not column.startswith(others)]
     return dataclasses.replace(
         log,
         name=f"{log.name}, joint {joint}",
-        header=tuple(log.header[k].removeprefix(f"{joint}.") for k in kept),
-        values=tuple(log.values[k] for k in kept),
-        units=tuple(log.units[k] for k in kept if log.units),
+        header=tuple(log.header[k].removeprefix(f"{joint}.") for k in joint_columns),
+        values=tuple(log.values[k] for k in joint_columns),
+        units=tuple(log.units[k] for k in joint_columns if log.units),
     )
 
 
@@ -280,11 +280,11 @@ def run_joints(
     code, rows = 0, []
     for name, (one, robot) in robots.items():
         place, table = folder / name, runs[name]
-        kept = not beside.force and store.is_finished(place, store.run_identity("loop", one, robot, table))
-        print_message(f"joint {name}{f': finished in {place}, kept' if kept else ''}")
+        is_finished = not beside.force and store.is_finished(place, store.run_identity("loop", one, robot, table))
+        print_message(f"joint {name}{f': finished in {place}, kept' if is_finished else ''}")
         for note in table.notes:
             print_message(note)
-        if not kept:
+        if not is_finished:
             code = max(code, loop(one, beside.model_copy(update={"out": place}), robot, table))
         rows.append(_row(name, place))
     answer = " ".join(f"{name}: {answer}" for name, answer, *_ in rows)

@@ -323,7 +323,7 @@ def _course_rows(
     which = int(np.asarray(conditions.configuration)[k])
     per_speed = float(robot.gearbox.ratio) / float(robot.configurations.members[which].radius)
     battery = float(np.asarray(conditions.battery)[k]) > 0.5
-    left = 1 - signals.discharge / float(robot.battery.capacity)
+    state_of_charge = 1 - signals.discharge / float(robot.battery.capacity)
     demanded = source.demanded(segment, elapsed, per_speed)
     of_shaft = {}
     if not robot.has_ground:
@@ -351,7 +351,7 @@ def _course_rows(
         "winding_temperature_C": winding if source.turns else np.asarray(reading["winding_temperature"]),
         "housing_temperature_C": housing,
         "energy_Wh": course.energy / quantities.SIZES["Wh"],
-        "state_of_charge": left if battery else np.full(len(picked), np.nan),
+        "state_of_charge": state_of_charge if battery else np.full(len(picked), np.nan),
         "cycle": course.segment // source.segment_count + 1,
         "segment": segment + 1,
         **of_sides,

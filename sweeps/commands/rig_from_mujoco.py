@@ -74,9 +74,9 @@ def check_mujoco_model(source: Path) -> None:
         BadConfiguration: numbers that are not finite, too many copies, elements or cells, or a file that is a pipe or
             a device.
     """
-    left, roots = [source], dict[Path, Element]()
-    while left:
-        file = left.pop().resolve()
+    pending, roots = [source], dict[Path, Element]()
+    while pending:
+        file = pending.pop().resolve()
         text = file_bytes(file, file, BadConfiguration, LARGEST)
         try:
             roots[file] = ElementTree.fromstring(text)
@@ -84,7 +84,7 @@ def check_mujoco_model(source: Path) -> None:
             raise BadConfiguration(f"{file}: not a readable XML file ({error}); expected MuJoCo's XML") from error
         named = [element.get("file", "") for tag in NESTED for element in roots[file].iter(tag)]
         inner = {(base / name).resolve() for name in named if name for base in (source.parent, file.parent)}
-        left += [each for each in inner if each.exists() and each not in roots]
+        pending += [path for path in inner if path.exists() and path not in roots]
     compilers = [element for root in roots.values() for element in root.iter("compiler")]
     folders = [element.get(key, "") for element in compilers for key in FOLDERS]
     count = 0
@@ -175,7 +175,7 @@ class _MujocoModel:
         drive: dict[str, StatedNumber] = {}
         if actuator is not None and self.is_motor[actuator]:
             drive = _dc_motor(model, actuator, dof, gear, self.file)
-        stated = lambda value, what: (float(value), f"{named}, {what}") if value else None  # noqa: E731
+        value_and_source = lambda value, what: (float(value), f"{named}, {what}") if value else None  # noqa: E731
         root = model.body_rootid[model.jnt_bodyid[joint]]
         free = any(
             model.jnt_type[k] == int(library.mjtJoint.mjJNT_FREE) and model.jnt_bodyid[k] == root
@@ -190,9 +190,9 @@ class _MujocoModel:
             sides=self._sides(joint, radius) if rolls else None, radius=radius,
             inertia=(inertia, f"{named}, inertia that turns with it, without armature"),
             ratio=(gear, f"{named}, gear of its actuator") if gear > 1 or drive else None,
-            friction=stated(model.dof_frictionloss[dof], "frictionloss"),
-            damping=stated(np.ravel(model.dof_damping[dof])[0], "damping"),
-            armature=stated(armature, "armature"),
+            friction=value_and_source(model.dof_frictionloss[dof], "frictionloss"),
+            damping=value_and_source(np.ravel(model.dof_damping[dof])[0], "damping"),
+            armature=value_and_source(armature, "armature"),
             weight=None if weight is None else (weight[0], f"{named}, largest torque from its weight"),
             angle=None if weight is None else (weight[1], f"{named}, hanging position"),
             drive=drive,
@@ -246,8 +246,8 @@ class _MujocoModel:
 
 def _dc_motor(model: Any, actuator: int, dof: int, ratio: float, file: str) -> dict[str, StatedNumber]:
     """Numbers of a `<dcmotor>` by dotted name. Losses of its bristles act at the joint."""
-    every = (model.actuator_gainprm, model.actuator_dynprm, model.actuator_biasprm)
-    gain, dynamic, bias = (x[actuator] for x in every)
+    parameter_rows = (model.actuator_gainprm, model.actuator_dynprm, model.actuator_biasprm)
+    gain, dynamic, bias = (x[actuator] for x in parameter_rows)
     resistance, constant = float(gain[0]), float(gain[1])
     effects = _effects(dynamic, bias, ratio)
     friction = float(model.dof_frictionloss[dof]) + (float(bias[3]) * ratio if float(dynamic[5]) > 0 else 0.0)

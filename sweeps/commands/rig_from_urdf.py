@@ -110,12 +110,16 @@ class _UrdfRobot:
         element, link = self.joints[joint], self._link(self.joints[joint], "child", joint)
         axis = self._axis(joint)
         to_root, root_link = self._to_root(joint)
-        moved = list(self._moved(link))
+        moved_links = list(self._moved(link))
         inertia, moment, count = 0.0, np.zeros(3), 0
-        for name, pose in moved:
+        for name, pose in moved_links:
             mass, about, first = self._inertial(name, pose, axis)
             inertia, moment, count = inertia + about, moment + first, count + (mass > 0)
-        named = f"link {link}" if len(moved) == 1 else (f"link {link} and the {len(moved) - 1} links that it carries")
+        named = (
+            f"link {link}"
+            if len(moved_links) == 1
+            else (f"link {link} and the {len(moved_links) - 1} links that it carries")
+        )
         if count == 0:
             raise BadConfiguration(f"{self.file}, {named}: no <inertial>; expected its <mass> and <inertia>")
         if inertia < LEAST_INERTIA:
@@ -153,13 +157,13 @@ class _UrdfRobot:
 
     def _moved(self, link: str, rigid: bool = False) -> Iterator[tuple[str, Pose]]:
         """Links that turn with a link, or are fixed to it, and their poses in its frame, other joints at zero."""
-        left: list[tuple[str, Pose]] = [(link, (np.eye(3), np.zeros(3)))]
+        pending: list[tuple[str, Pose]] = [(link, (np.eye(3), np.zeros(3)))]
         met: set[str] = set()
-        while left:
-            name, pose = left.pop()
+        while pending:
+            name, pose = pending.pop()
             self._once(name, met)
             yield name, pose
-            left += [
+            pending += [
                 (
                     self._link(self.joints[j], "child", j),
                     _compose(pose, self._origin(self.joints[j], f"joint {j}")),
@@ -189,9 +193,11 @@ class _UrdfRobot:
 
     def _mass(self) -> Found | None:
         masses = [self._link_mass(name) for name in self.links]
-        stated = [m for m in masses if m]
-        lacking = f", {len(masses) - len(stated)} more links have none" if len(stated) < len(masses) else ""
-        return (math.fsum(stated), f"sum of <mass> of {len(stated)} links{lacking}") if stated else None
+        link_masses = [m for m in masses if m]
+        lacking = f", {len(masses) - len(link_masses)} more links have none" if len(link_masses) < len(masses) else ""
+        return (
+            (math.fsum(link_masses), f"sum of <mass> of {len(link_masses)} links{lacking}") if link_masses else None
+        )
 
     def _link_mass(self, link: str) -> float:
         element = self.links[link].find("inertial/mass")
@@ -251,8 +257,8 @@ class _UrdfRobot:
 
     def _driven(self, joint: str) -> bool:
         commanded = any(
-            each.get("name") == joint and each.find("command_interface") is not None
-            for each in self.root.iterfind("ros2_control/joint")
+            ros_joint.get("name") == joint and ros_joint.find("command_interface") is not None
+            for ros_joint in self.root.iterfind("ros2_control/joint")
         )
         return commanded or any(True for _ in self._transmissions(joint))
 
@@ -263,11 +269,11 @@ class _UrdfRobot:
             of_joint = [j for j in element.findall("joint") if j.get("name") == joint]
             owners = of_joint if shared else [element, *of_joint, *element.findall("actuator")]
             texts = [(owner.findtext(tag), tag) for owner in owners for tag in REDUCTIONS]
-            stated = [(text, tag) for text, tag in texts if text is not None]
-            if not stated:
+            ratio_texts = [(text, tag) for text, tag in texts if text is not None]
+            if not ratio_texts:
                 continue
-            name = f"transmission {element.get('name', '')}, <{stated[0][1]}>".replace(" ,", ",")
-            ratio = math.prod(abs(self._parsed(text, name, "")) for text, _ in stated)
+            name = f"transmission {element.get('name', '')}, <{ratio_texts[0][1]}>".replace(" ,", ",")
+            ratio = math.prod(abs(self._parsed(text, name, "")) for text, _ in ratio_texts)
             if not ratio >= 1:
                 raise BadConfiguration(f"{self.file}, {name}: got {ratio:g}; expected motor turns per joint turn, "
                                        "1 or more")  # fmt: skip

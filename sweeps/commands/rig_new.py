@@ -103,8 +103,8 @@ def write_new_rig(
     if joint is not None and source is None:
         raise BadConfiguration(f"--joint: got {joint} without --from; expected a model that has this joint")
     if kind is not None and kind not in KINDS:
-        each = "; ".join(f"{name}: {what}" for name, what in KINDS.items())
-        raise BadConfiguration(f"--kind: got {kind}; {allowed_words(kind, KINDS)} ({each})")
+        kinds = "; ".join(f"{name}: {what}" for name, what in KINDS.items())
+        raise BadConfiguration(f"--kind: got {kind}; {allowed_words(kind, KINDS)} ({kinds})")
     if file.exists() and (file.is_dir() or not force):
         what = (
             "a folder; give a file, such as my-rig.toml" if file.is_dir() else ("already exists; --force replaces it")

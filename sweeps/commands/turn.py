@@ -48,10 +48,10 @@ def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> 
         raise BadConfiguration("--runs: got a file in addition to --left, --right or --heading; either put "
                                "duty_left and duty_right columns in the file, or omit --runs and describe one "
                                "run with options")  # fmt: skip
-    file, given = load_robot(config), beside.stated
+    file, beside_columns = load_robot(config), beside.stated
     robot = file.robot
-    check_can_turn(robot, given.get("configuration") or robot.configurations.names[0])
-    runs = one_run(robot, {**given, **turn_columns(config, given)}, config.battery)
+    check_can_turn(robot, beside_columns.get("configuration") or robot.configurations.names[0])
+    runs = one_run(robot, {**beside_columns, **turn_columns(config, beside_columns)}, config.battery)
     settled = config.model == fidelities.NAMES[0]
     with open_folder("simulate", config, robot, beside, runs) as folder:
         conditions = run.conditions_of_runs(robot, runs, config)
@@ -205,8 +205,8 @@ def turn_columns(config: configuration.TurnPart, given: Json) -> Json:
 
 def _displayed_channels(robot: Robot, settled: bool) -> tuple[Channel, ...]:
     """Channels shown for a turn."""
-    every = channels.channels_named((*robot.rig.channels, *SHOWN))
-    return tuple(c for c in every if c.settled or not settled)
+    channels_to_show = channels.channels_named((*robot.rig.channels, *SHOWN))
+    return tuple(c for c in channels_to_show if c.settled or not settled)
 
 
 def _turns_to_compare(robot: Robot, asked: Conditions) -> tuple[RunBatch, Conditions]:

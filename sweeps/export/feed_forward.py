@@ -73,8 +73,8 @@ def steady_state_map(
             return jax_actuator.settled_actuator(module, params, voltage, speeds)[0] - torques
 
         def again(voltage: Any, _: None) -> tuple[Any, None]:
-            left, rise = jax.jvp(lacking, (voltage,), (jnp.ones_like(voltage),))
-            return voltage - left / jnp.where(rise > 1e-12, rise, 1e-12), None
+            residual, rise = jax.jvp(lacking, (voltage,), (jnp.ones_like(voltage),))
+            return voltage - residual / jnp.where(rise > 1e-12, rise, 1e-12), None
 
         constant, ratio = params["motor.torque_constant"], params["gearbox.ratio"]
         start = constant * ratio * speeds + guess * torques / (constant * ratio)

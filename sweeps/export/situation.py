@@ -155,19 +155,19 @@ def situation_of_joint(joint: DriveJoint, data: Runs | str | None) -> Comparison
     channels = channels_of(joint)
     sensor_readings = jax.vmap(lambda s: balances.sensor(robot, s))(whole)
     native = np.stack([np.asarray(sensor_readings[c.name]) for c in channels], -1)
-    kept = moves & turns & np.asarray(np.abs(signals.speed_motor) > 0) & (np.asarray(conditions.open) < 0.5)
-    if not kept.any():
+    is_moving = moves & turns & np.asarray(np.abs(signals.speed_motor) > 0) & (np.asarray(conditions.open) < 0.5)
+    if not is_moving.any():
         raise BadData(f"{source}: the model settles in none of these runs, so no comparison is possible")
-    signals = jax.tree.map(lambda x: x[kept] if np.shape(x) else x, signals)
-    chosen = runs.where(kept)
+    signals = jax.tree.map(lambda x: x[is_moving] if np.shape(x) else x, signals)
+    chosen = runs.where(is_moving)
     radius = float(joint.load.radius)
-    given = (signals.voltage_source, signals.duty, signals.pause, signals.voltage_back)
-    command = robot.driver.voltage(*map(jnp.asarray, given))
+    drive_signals = (signals.voltage_source, signals.duty, signals.pause, signals.voltage_back)
+    command = robot.driver.voltage(*map(jnp.asarray, drive_signals))
     measured = (
         _measured_readings(chosen, channels) if data is not None else np.full((len(chosen), len(channels)), np.nan)
     )
     return ComparisonRuns(
-        joint, source, chosen, conditions, kept, signals, native[kept], measured, np.asarray(command),
+        joint, source, chosen, conditions, is_moving, signals, native[is_moving], measured, np.asarray(command),
         radius * np.asarray(signals.demand),
     )  # fmt: skip
 
@@ -199,8 +199,8 @@ def stall_torque(joint: DriveJoint, voltage: np.ndarray) -> np.ndarray:
     motor, gear, load = joint.robot.motor, joint.robot.gearbox, joint.load
     current = np.minimum(voltage / float(motor.resistance), float(joint.robot.driver.current_limit))
     torque = float(motor.torque_constant) * current - float(motor.friction_coulomb + gear.friction_coulomb)
-    given = float(gear.ratio * gear.efficiency_load) * torque - float(load.loss_coulomb)
-    return np.clip(given, 0.0, np.inf if gear.torque_limit is None else gear.torque_limit)
+    output_torque = float(gear.ratio * gear.efficiency_load) * torque - float(load.loss_coulomb)
+    return np.clip(output_torque, 0.0, np.inf if gear.torque_limit is None else gear.torque_limit)
 
 
 def _measured_readings(runs: Runs, channels: tuple[Any, ...]) -> np.ndarray:

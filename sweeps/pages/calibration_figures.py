@@ -125,8 +125,8 @@ def draw_correlated_pairs(found: CalibrationResult) -> Figure:
     posterior = found.posterior
     sd = np.sqrt(np.diag(posterior.covariance))
     correlation = np.abs(posterior.covariance / np.outer(sd, sd))
-    every = [(i, j) for i in range(len(posterior)) for j in range(i)]
-    chosen = sorted(every, key=lambda pair: -np.nan_to_num(correlation[pair]))[:PAIRED]
+    pairs = [(i, j) for i in range(len(posterior)) for j in range(i)]
+    chosen = sorted(pairs, key=lambda pair: -np.nan_to_num(correlation[pair]))[:PAIRED]
     fig, grid = new_figure(-(-len(chosen) // 3), min(3, len(chosen)), 2.9 * -(-len(chosen) // 3))
     turn = np.linspace(0, 2 * np.pi, 120)
     circle = np.stack([np.cos(turn), np.sin(turn)], 1)

@@ -36,12 +36,14 @@ def draw_export_readings(compared: ExportComparison) -> Figure:
     fig, grid = new_figure(1, max(len(channel_places), 1), 3.4)
     for axes, (k, channel) in zip(grid[0], channel_places, strict=False):
         size = 1 / channel.factor
-        given = reference[:, k] * size
-        ends = np.nanmin(given), np.nanmax(given)
+        reference_readings = reference[:, k] * size
+        ends = np.nanmin(reference_readings), np.nanmax(reference_readings)
         axes.plot(ends, ends, color=FAINT, lw=1)
         if situation.is_measured:
-            axes.plot(given, situation.native[:, k] * size, "o", color=BLUE, ms=5, mfc="none", label="native")
-        axes.plot(given, compared.readings[:, k] * size, ".", color=VERMILION, ms=5, label="exported")
+            axes.plot(
+                reference_readings, situation.native[:, k] * size, "o", color=BLUE, ms=5, mfc="none", label="native"
+            )
+        axes.plot(reference_readings, compared.readings[:, k] * size, ".", color=VERMILION, ms=5, label="exported")
         axes.set_xlabel(f"{compared.reference}: {channel.label} [{channel.unit}]", color=INK)
         axes.set_ylabel(f"{channel.label} [{channel.unit}]", color=INK)
         axes.legend(loc="upper left", frameon=False)
@@ -94,11 +96,13 @@ def draw_errors_over_conditions(
         in_units: errors in the unit of the channel instead, with a band of two sds where they are known. Over those
             conditions that vary.
     """
-    every = {
+    errors_by_condition = {
         "slope_deg": "slope [°]", "supply_voltage_V": "supply voltage [V]", "motor_speed_rpm": "motor speed [rpm]",
         "motor_current_A": "motor current [A]", "payload_kg": "payload [kg]",
     }  # fmt: skip
-    conditions = {c: words for c, words in every.items() if c in table and f"simulated_{c}" not in table}
+    conditions = {
+        c: words for c, words in errors_by_condition.items() if c in table and f"simulated_{c}" not in table
+    }
     if in_units:
         conditions |= beside or {}
         varied = {c: words for c, words in conditions.items() if np.unique(table[c]).size > 1}
@@ -123,8 +127,8 @@ def draw_errors_over_conditions(
             for side, (kind, (colour, marker)) in zip(sides, look.items(), strict=True):
                 pick = (table["configuration"] == kind) & np.isfinite(error)
                 if pick.any():
-                    moved = table[condition][pick] + side * shift
-                    _draw_dots(axes, moved, error[pick], marker, color=colour, label=kind)
+                    shifted = table[condition][pick] + side * shift
+                    _draw_dots(axes, shifted, error[pick], marker, color=colour, label=kind)
             if row[0] is grid[-1, 0]:
                 axes.set_xlabel(words)
                 if levels.size <= 8:

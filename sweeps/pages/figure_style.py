@@ -281,8 +281,8 @@ def _separate_texts(fig: Figure, move: bool) -> None:
 
     A map shows all its numbers or none. Without `move` only maps are changed.
     """
-    every: Any = fig.findobj(lambda a: isinstance(a, Text) and a.get_visible() and a.get_text().strip() != "")
-    boxes = {text: Text.get_window_extent(text) for text in every if text.get_rotation() == 0}
+    texts: Any = fig.findobj(lambda a: isinstance(a, Text) and a.get_visible() and a.get_text().strip() != "")
+    boxes = {text: Text.get_window_extent(text) for text in texts if text.get_rotation() == 0}
 
     def is_free(text: Text, box: Bbox) -> bool:
         return not any(
@@ -303,13 +303,13 @@ def _separate_texts(fig: Figure, move: bool) -> None:
             continue
         aside = max(panel.x0 + 2 - box.x0, 0.0)
         for lines, along in itertools.product(sorted(range(-12, 13), key=abs), dict.fromkeys((0.0, aside))):
-            moved = box.translated(along, lines * line)
-            if panel.y0 < moved.y0 and moved.y1 < panel.y1 and is_free(text, moved):
+            shifted_box = box.translated(along, lines * line)
+            if panel.y0 < shifted_box.y0 and shifted_box.y1 < panel.y1 and is_free(text, shifted_box):
                 if isinstance(text, Annotation) and isinstance(text.anncoords, str):
                     text.xyann = tuple(np.add(text.xyann, (along, lines * line)))
                 else:
                     text.set_transform(text.get_transform() + Affine2D().translate(along, lines * line))
-                boxes[text] = moved
+                boxes[text] = shifted_box
                 break
 
 

@@ -350,10 +350,13 @@ def conditions_and_readings(table: Columns) -> Columns:
     columns = {f"{label} [{unit}]": table[c] for c, (label, unit) in labels.items() if c in table}
     values, words = imposed_axis(table)
     columns |= {words: values}
-    for label, left in list(columns.items()):
+    for label, column in list(columns.items()):
         if (right := columns.get(label.replace(", left", ", right"))) is not None and ", left" in label:
             both = label.replace(", left", "")
-            columns |= {f"mean of both sides: {both}": (left + right) / 2, f"left minus right: {both}": left - right}
+            columns |= {
+                f"mean of both sides: {both}": (column + right) / 2,
+                f"left minus right: {both}": column - right,
+            }
     return columns
 
 
@@ -365,8 +368,8 @@ def driving_variable(table: Columns, change: np.ndarray, driver: str = "") -> tu
         driver: driver of the effect; variables with that word are preferred.
     """
     use = np.isfinite(change)
-    every = {k: np.asarray(v, float) for k, v in conditions_and_readings(table).items()}
-    whole = {k: v for k, v in every.items() if np.isfinite(v[use]).all()}
+    columns = {k: np.asarray(v, float) for k, v in conditions_and_readings(table).items()}
+    whole = {k: v for k, v in columns.items() if np.isfinite(v[use]).all()}
     whole = {k: v for k, v in whole.items() if driver in k.split() and np.ptp(v[use]) > 0} or whole
     label = min(whole, key=lambda k: roughness(whole[k][use], change[use]))
     return whole[label], label
@@ -384,8 +387,8 @@ def draw_effect_laws(found: DiscoveryResult, table: Columns, changes: Mapping[st
     for axes, (name, change) in zip(grid[0], changes.items(), strict=True):
         c = change.channel
         effect = BY_NAME.get(name)
-        moved = np.where(used, change.with_it - change.without, np.nan)
-        x, label = driving_variable(table, moved, "" if effect is None else effect.driver)
+        effect_size = np.where(used, change.with_it - change.without, np.nan)
+        x, label = driving_variable(table, effect_size, "" if effect is None else effect.driver)
         k = [x.name for x in found.channels].index(c.name)
         size = next(e.parameters["amplitude"] for e in found.effects if e.name == name)
         measured, before, law = (

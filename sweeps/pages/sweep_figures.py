@@ -124,16 +124,16 @@ def _cover_cells(cells: set[tuple[int, int]], joined: bool) -> list[tuple[int, i
     if not joined:
         return [(i, j, 1, 1) for i, j in sorted(cells)]
     blocks = []
-    left = set(cells)
-    while left:
-        i, j = min(left)
+    uncovered = set(cells)
+    while uncovered:
+        i, j = min(uncovered)
         tall = 1
-        while (i, j + tall) in left:
+        while (i, j + tall) in uncovered:
             tall += 1
         wide = 1
-        while all((i + wide, j + k) in left for k in range(tall)):
+        while all((i + wide, j + k) in uncovered for k in range(tall)):
             wide += 1
-        left -= {(i + p, j + q) for p in range(wide) for q in range(tall)}
+        uncovered -= {(i + p, j + q) for p in range(wide) for q in range(tall)}
         blocks.append((i, j, wide, tall))
     return blocks
 

@@ -25,10 +25,10 @@ def _draw_outline(axes: Axes, robot: Robot, row: Json, x: float, y: float, yaw: 
     """The robot from above: its contact lines, a bar between them and an arrow pointing ahead."""
     length = float(robot.running_gear.wheelbase)
     width = float(robot.configurations[str(row["configuration"])].turning.width)
-    ahead, left = np.array([np.cos(yaw), np.sin(yaw)]), np.array([-np.sin(yaw), np.cos(yaw)])
+    ahead, sideways = np.array([np.cos(yaw), np.sin(yaw)]), np.array([-np.sin(yaw), np.cos(yaw)])
     middle = np.array([x, y])
     for side in (0.5, -0.5):
-        ends = [middle + side * width * left + s * length * ahead for s in (0.5, -0.5)]
+        ends = [middle + side * width * sideways + s * length * ahead for s in (0.5, -0.5)]
         axes.plot([-e[1] for e in ends], [e[0] for e in ends], color=color, lw=3.5, solid_capstyle="round")
     tip = middle + 0.5 * length * ahead
     axes.annotate("", (-tip[1], tip[0]), (-y, x), arrowprops={"arrowstyle": "-|>", "color": color})

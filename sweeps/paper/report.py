@@ -88,8 +88,8 @@ def paper_document(file: RobotFile, gear: bool) -> tuple[Document, data.PaperRow
     robot, name = file.robot, capabilities.displayed_name(file)
     name = file.name if name == words.displayed_robot_name(file.name) else name
     robots = {name: robot} | {n: make() for n, make in ROBOTS.items() if n != name}
-    every = {n: data.simulate_measured_rows(member) for n, member in robots.items()}
-    rows = {n: of_robot for n, of_robot in every.items() if of_robot is not None}
+    runs_by_robot = {n: data.simulate_measured_rows(member) for n, member in robots.items()}
+    rows = {n: of_robot for n, of_robot in runs_by_robot.items() if of_robot is not None}
     own_rows = rows.get(name)
     blocks: list[Block] = [catalogue.note("paper.lead", capabilities.displayed_name(file))]
     answer = catalogue.text("paper.alone")
@@ -176,14 +176,14 @@ def _error_table(errors: list[Json]) -> Block:
 def _sliding(robot: Robot, rows: data.PaperRows) -> Iterator[Block]:
     """Note on the rows that have no operating point on the robot's own adhesion, if there are any."""
     slides, table = rows.plain["status"] != "converged", rows.conditions
-    each = [
+    sentences = [
         f"{table['configuration'][k]} {table['supply_voltage_V'][k]:.0f} V {table['slope_deg'][k]:.0f}° "
         f"{words.short_status(str(rows.plain['status'][k]))}"
         for k in np.flatnonzero(slides)
     ]
-    if each:
+    if sentences:
         raised = data.raised_adhesion_words(robot, rows.ratio)
-        yield catalogue.note("paper.sliding", len(each), len(table), ", ".join(each), raised)
+        yield catalogue.note("paper.sliding", len(sentences), len(table), ", ".join(sentences), raised)
 
 
 def _against_the_bench(robots: dict[str, Robot], rows: dict[str, data.PaperRows], name: str) -> Section:

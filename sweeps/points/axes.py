@@ -93,8 +93,8 @@ def plan_design(config: Campaign, robot: Robot, where: str) -> SweepPlan:
     task = task_of(config, robot)
     extra = task.axes
     axes = {
-        name: _axis_values(name, stated, robot, f"{where}, axes.{name}", extra)
-        for name, stated in config.axes.items()
+        name: _axis_values(name, axis_text, robot, f"{where}, axes.{name}", extra)
+        for name, axis_text in config.axes.items()
     }
     samples = _sampled_design(config.samples, robot, f"{where}, samples", data)
     if not axes and samples is None:

@@ -176,8 +176,8 @@ def compute_climbs(
 
 
 def _lever_sequences(obstacle: Obstacle, robot: Robot, conditions: Conditions, points: int) -> LeverSequence:
-    each = 0 if jnp.ndim(robot.sides) else None
-    angles = jax.vmap(lambda r, c: masses.lever_angles(r.running_gear, c), in_axes=(each, 0))(robot, conditions)
+    batch_axis = 0 if jnp.ndim(robot.sides) else None
+    angles = jax.vmap(lambda r, c: masses.lever_angles(r.running_gear, c), in_axes=(batch_axis, 0))(robot, conditions)
     front, rear = (jnp.broadcast_to(x, (points,)) for x in angles)
     sequences = jax.vmap(constant_angles)(front, rear)
     if obstacle.sequence is not None:

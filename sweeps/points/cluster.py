@@ -63,7 +63,7 @@ class Pool:
 
         from sweeps.points.scale import Piece
 
-        work, left = _pack_job(job), iter(chunks)
+        work, chunks_left = _pack_job(job), iter(chunks)
         name = hashlib.sha256(work).hexdigest()[:16]
         expected = {**program_identity(), "device": {"device": self.device}}
         tried: dict[int, int] = {}
@@ -79,7 +79,7 @@ class Pool:
         def fill() -> None:
             """Submit enough work for the present workers. Some may have joined later."""
             room = max(self._workers(), 1) * (1 + AHEAD) - len(numbers)
-            for chunk in itertools.islice(left, max(room, 0)):
+            for chunk in itertools.islice(chunks_left, max(room, 0)):
                 under_way.add(submit(chunk))
 
         under_way = as_completed(loop=self.client.loop)

@@ -126,7 +126,7 @@ def compute_chunks(
     chunks = range(len(job.blocks))
     files = [f"{name}-{k:06d}" for k in chunks]
     stored = {} if folder is None else {k: part for k in chunks if (part := folder.chunk(files[k])) is not None}
-    left, times = [k for k in chunks if k not in stored], scale.Times()
+    chunks_left, times = [k for k in chunks if k not in stored], scale.Times()
     advance(sum(map(job.blocks.count, stored)))
 
     def keep(chunk: int, arrays: Table, _: Any) -> None:
@@ -134,10 +134,12 @@ def compute_chunks(
         if folder is not None:
             folder.keep_chunk(files[chunk], stored[chunk])
 
-    if left:
-        scale.write_chunks(keep, job, scale.produce_chunks(scale.Compiled(job), left, times, advance), advance, times)
-    every = [stored.pop(k) for k in chunks]
-    return {column: np.concatenate([part.pop(column) for part in every]) for column in tuple(every[0])}
+    if chunks_left:
+        scale.write_chunks(
+            keep, job, scale.produce_chunks(scale.Compiled(job), chunks_left, times, advance), advance, times
+        )
+    results = [stored.pop(k) for k in chunks]
+    return {column: np.concatenate([part.pop(column) for part in results]) for column in tuple(results[0])}
 
 
 def job_of(robot: Robot, runs: Runs, config: FidelityPart, samples: DrawnSamples | None = None) -> Job:

@@ -296,17 +296,17 @@ def keyed_permutation(key: int, number: int, points: UInt64[np.ndarray, " points
     answer = np.array(points)
     for first in range(0, len(answer), CACHED):
         block = answer[first : first + CACHED]
-        left, scratch = np.arange(len(block)), np.empty((2, len(block)), np.uint64)
-        while len(left):
-            high, low = np.divmod(block[left], np.uint64(b))
-            x, y = scratch[:, : len(left)]
+        unplaced, scratch = np.arange(len(block)), np.empty((2, len(block)), np.uint64)
+        while len(unplaced):
+            high, low = np.divmod(block[unplaced], np.uint64(b))
+            x, y = scratch[:, : len(unplaced)]
             for k in range(0, ROUNDS, 2):
                 _add_modulo(high, _mix_words(low, keys[k], x, y), np.uint64(a), y)
                 _add_modulo(low, _mix_words(high, keys[k + 1], x, y), np.uint64(b), y)
             high *= np.uint64(b)
             high += low
-            block[left] = high
-            left = left[high >= number]
+            block[unplaced] = high
+            unplaced = unplaced[high >= number]
     return answer
 
 

@@ -103,10 +103,10 @@ class Compiled:
         devices = jax.local_devices() if devices is None else devices
         self.mesh = Mesh(np.array(devices), (POINTS,))
         # Every device has the same number of points; the last ones stand for the chunk's last point again.
-        each = -(-job.blocks.points // len(devices))
-        each = each if job.task.run is not None else fidelities.fidelity_facts(job.task.model).filled(each)
-        each = each if each < SHARED else -(-each // SHARED) * SHARED
-        self.size = each * len(devices)
+        share = -(-job.blocks.points // len(devices))
+        share = share if job.task.run is not None else fidelities.fidelity_facts(job.task.model).filled(share)
+        share = share if share < SHARED else -(-share // SHARED) * SHARED
+        self.size = share * len(devices)
         everywhere = NamedSharding(self.mesh, PartitionSpec())
         tree = (job.plan.varied(job.robot), job.plan.fixed())
         arrays, rest = eqx.partition(tree, eqx.is_array)
@@ -219,7 +219,7 @@ def _split_among(mesh: Mesh) -> Callable[..., dict[str, Array]]:
         variation: Variation, conditions: Conditions, values: Array, asked: _AskedOutputs, profile: Profile | None
     ) -> dict[str, Array]:
         arrays, rest = eqx.partition((variation, profile), eqx.is_array)
-        each = PartitionSpec(POINTS) if conditions.shape else PartitionSpec()
+        sharding = PartitionSpec(POINTS) if conditions.shape else PartitionSpec()
 
         def part(arrays: Any, conditions: Conditions, values: Array) -> dict[str, Array]:
             variation, profile = eqx.combine(arrays, rest)
@@ -227,9 +227,12 @@ def _split_among(mesh: Mesh) -> Callable[..., dict[str, Array]]:
 
         # Each device searches its own roots and steps its own runs: none waits for another inside a loop.
         split = jax.shard_map(
-            part, mesh=mesh, in_specs=(PartitionSpec(), each, PartitionSpec(POINTS)), out_specs=PartitionSpec(POINTS),
+            part,
+            mesh=mesh,
+            in_specs=(PartitionSpec(), sharding, PartitionSpec(POINTS)),
+            out_specs=PartitionSpec(POINTS),
             check_vma=False,
-        )  # fmt: skip
+        )
         return split(arrays, conditions, values)
 
     return program

@@ -186,8 +186,8 @@ class Layout:
         """Bytes of the store on a disk, uncompressed: blocks of its files and folders, metadata and journal."""
         counts, points = self.blocks.counts, self.blocks.points
         folders = sum(math.prod(counts[:k]) for k in range(len(counts)))
-        each = sum(_on_disk(np.dtype(v.dtype).itemsize * points) for v in self.variables) * len(self.blocks)
-        outputs = each + BLOCK * folders * len(self.variables)
+        point_bytes = sum(_on_disk(np.dtype(v.dtype).itemsize * points) for v in self.variables) * len(self.blocks)
+        outputs = point_bytes + BLOCK * folders * len(self.variables)
         names = () if self.design.samples is None else self.design.samples.names
         sample_size = len(names) * counts[-1] * _on_disk(8 * self.blocks.size[-1])
         axes = sum(_on_disk(8 * len(values)) for values in self.design.axes.values())

@@ -118,12 +118,12 @@ def sample_points(store: Path, layout: Layout) -> tuple[np.ndarray, Columns]:
     group: Any = zarr.open_group(store, mode="r")
     rng, blocks = np.random.default_rng(0), layout.blocks
     chunks = np.sort(rng.permutation(len(blocks))[:CHUNKS])
-    each = -(-THINNED // len(chunks))
+    points_per_chunk = -(-THINNED // len(chunks))
     values: list[np.ndarray] = []
     values_by_name: dict[str, list[np.ndarray]] = {v.name: [] for v in layout.variables}
     for chunk in map(int, chunks):
         box, count = blocks.box(chunk), blocks.count(chunk)
-        rows = np.sort(rng.permutation(count)[:each]) if count > each else np.arange(count)
+        rows = np.sort(rng.permutation(count)[:points_per_chunk]) if count > points_per_chunk else np.arange(count)
         values.append(layout.design.block(box)[rows])
         for variable in layout.variables:
             values_by_name[variable.name].append(group[variable.name][box].ravel()[rows])

@@ -182,12 +182,12 @@ def _over_time(found: Comparison) -> tuple[Section, ...]:
 
 def comparison_answer(found: Comparison) -> str:
     """The rms errors with their rows, the worst reading, and if this robot was fitted to these rows."""
-    every, total = found.summary["all"], len(found.table["status"])
-    each = [(c, every[c.name]) for c in found.channels if every[c.name]["rows"]]
-    if not each:
+    error_summary, total = found.summary["all"], len(found.table["status"])
+    channel_errors = [(c, error_summary[c.name]) for c in found.channels if error_summary[c.name]["rows"]]
+    if not channel_errors:
         return "No row has both a simulated and a measured value."
-    errors = ", ".join(f"{e['rms_percent']:.1f} % {c.label}" for c, e in each)
-    rows, worst = max(e["rows"] for _, e in each), max(e["max_percent"] for _, e in each)
+    errors = ", ".join(f"{e['rms_percent']:.1f} % {c.label}" for c, e in channel_errors)
+    rows, worst = max(e["rows"] for _, e in channel_errors), max(e["max_percent"] for _, e in channel_errors)
     what = f"{rows} of {total} rows" if rows < total else count_noun(total, "row")
     if found.over is not None:
         what = f"{_log_duration(found):.3g} s of log"

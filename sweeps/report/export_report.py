@@ -17,8 +17,8 @@ def export_document(found: Export) -> Document:
     """The report of an exported drive."""
     compared = found.comparison
     used = words.USE[found.format].format(name=found.joint.name, at="drive", armature=words.rotor_inertia(found))
-    kept = [(f.name, Cell(f.verdict, TONES[f.verdict]), 100 * f.kept, f.how) for f in compared.fates]
-    fates = catalogue.table("export.fates", kept)
+    fate_rows = [(f.name, Cell(f.verdict, TONES[f.verdict]), 100 * f.kept, f.how) for f in compared.fates]
+    fates = catalogue.table("export.fates", fate_rows)
     readings = catalogue.figure("export.readings", compared, finding=words.export_statement(found))
     sections = [
         Section("What the format represents", (fates, catalogue.note("export.kept")), "holds"),

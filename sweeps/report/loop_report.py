@@ -42,13 +42,13 @@ def loop_document(found: DiscoveryResult, robot_name: str, changes: Mapping[str,
         changes: changes of settled runs by each effect.
     """
     missing, table = found.verdict not in ("none", "undescribed"), rows_of(found)
-    moved, added = list(moved_parameters(found)), list(_effect_findings(found, changes))
+    shifts, added = list(moved_parameters(found)), list(_effect_findings(found, changes))
     rise = loop_words.rising_errors_sentence(found.held_out_worse, found.predicted)
     return Document(
         f"Is the {words.displayed_robot_name(Path(robot_name).name)} model complete?",
         found.statement,
         (
-            *remarks(moved, "moved"),
+            *remarks(shifts, "moved"),
             *_first_figure(found, table, changes),
             _summary(found),
             *([Note(rise, name="worse", terminal=True)] if rise else []),
@@ -57,7 +57,7 @@ def loop_document(found: DiscoveryResult, robot_name: str, changes: Mapping[str,
             *run_tables.curve_warning(found.robot),
         ),
         tuple(_sections(found, table, changes, missing)),
-        brief=loop_words.brief_answer(found, moved, _next_step(found, "")),
+        brief=loop_words.brief_answer(found, shifts, _next_step(found, "")),
     )
 
 
@@ -119,8 +119,8 @@ def moved_parameters(found: DiscoveryResult) -> Iterable[str]:
     }
     for name, (value, shift) in sorted(by_name.items(), key=lambda item: -abs(item[1][1])):
         if abs(shift) >= MOVED:
-            stated = found.base_shift[name]
-            yield loop_words.moved_parameter(name, value, stated.prior, stated.unit, shift)
+            base_shift = found.base_shift[name]
+            yield loop_words.moved_parameter(name, value, base_shift.prior, base_shift.unit, shift)
 
 
 def _arrow_cell(text: str, change: float) -> Cell:
@@ -141,15 +141,19 @@ def _summary(found: DiscoveryResult) -> Table:
     if not found.refit_alone:
         lines.append(("with the effects found", found.errors[1], unseen[1]))
     rows = []
-    for what, seen, held in lines:
+    for what, seen, held_out_error in lines:
         cells = []
         for c, e in seen.items():
-            other = f" ({loop_words.percent_text(held[c])} %)" if c in held and held[c]["rows"] else ""
+            other = (
+                f" ({loop_words.percent_text(held_out_error[c])} %)"
+                if c in held_out_error and held_out_error[c]["rows"]
+                else ""
+            )
             last, rows_before = before.get(c, (e["rms_percent"], e["rows"]))
             change = e["rms_percent"] - last if rows_before == e["rows"] else 0.0
             cells.append(_arrow_cell(f"{loop_words.percent_text(e)} %{other}", change) if e["rows"] else Cell("-"))
         before = {c: (float(e["rms_percent"]), int(e["rows"])) for c, e in seen.items()}
-        reached, also = (max((int(e["rows"]) for e in by.values()), default=0) for by in (seen, held))
+        reached, also = (max((int(e["rows"]) for e in by.values()), default=0) for by in (seen, held_out_error))
         rows.append((what, *cells, f"{reached}/{total}" + (f" ({also}/{total})" if also else "")))
     held_out = f", seen and (unseen, by {blocks.kind_in_words(kind)})" if kind else ""
     heads = f"rms error{held_out}", *(f"{c.label} |" for c in found.channels)
@@ -246,8 +250,8 @@ def _certainty(found: DiscoveryResult, missing: bool) -> Table:
     chi = f"{chi_before:.0f} → {chi_after:.0f}" if missing else f"{chi_before:.0f}"
     priors = f"{before:.0f} → {after:.0f}" if missing else f"{before:.0f}"
     adequate, level = bool(found.after.adequate), found.headline.level
-    left, set_aside = len(found.unusable), len(found.outliers)
-    aside = f"{left} without a result of the fitted model, {set_aside} set aside as outliers"
+    unusable_count, set_aside = len(found.unusable), len(found.outliers)
+    aside = f"{unusable_count} without a result of the fitted model, {set_aside} set aside as outliers"
     p = loop_words.p_value(found.before.p_value)
     rows = [
         (
@@ -260,7 +264,7 @@ def _certainty(found: DiscoveryResult, missing: bool) -> Table:
         ),
         (
             f"{int(found.included.sum())} of {len(found.runs)} {_rows_are(found)}",
-            aside if left or set_aside else "all used",
+            aside if unusable_count or set_aside else "all used",
         ),
     ]  # fmt: skip
     if missing and found.gain is not None:
@@ -413,7 +417,7 @@ def _candidates(found: DiscoveryResult) -> Iterable[Block]:
         )
         for h in found.hidden
     ]  # fmt: skip
-    held = [
+    candidate_rows = [
         (
             f"**{', '.join(a.effects)}**" if a.leads else ", ".join(a.effects), a.rise_chi2, a.rms_sigma,
             *a.by_kind.values(), a.lost,
@@ -421,12 +425,14 @@ def _candidates(found: DiscoveryResult) -> Iterable[Block]:
         for a in found.alternatives_held_out
     ]  # fmt: skip
     kinds = (
-        [] if not held else [f"by {blocks.kind_in_words(k)} | .2f" for k in found.alternatives_held_out[0].by_kind]
+        []
+        if not candidate_rows
+        else [f"by {blocks.kind_in_words(k)} | .2f" for k in found.alternatives_held_out[0].by_kind]
     )
     tables: dict[str, tuple[str, Sequence[Any], Sequence[str], Names]] = {
         "alternatives": ("alternatives", several, (), (curves if found.verdict in WITHOUT_NAME else "",)),
         "hidden": ("hidden", hidden, (), ()),
-        "held": ("alternatives_held_out", held, kinds, ()),
+        "held": ("alternatives_held_out", candidate_rows, kinds, ()),
         "implausible": ("implausible", sizes, (), ()),
     }
     for above, (name, rows, more, values) in tables.items():

@@ -47,13 +47,13 @@ class Missions:
 
     def to_json(self) -> Json:
         """Content of `result.json`: for one run its numbers by name, for several a list of them."""
-        each = [self._one(k) for k in range(len(self.table["status"]))]
+        missions = [self._one(k) for k in range(len(self.table["status"]))]
         about = {
             "name": self.source.source, "sha256": self.source.digest, "duration_s": self.source.duration,
             "segments": self.source.segment_count, "cycles": self.source.cycles,
             "between_rows": profiles.BETWEEN[self.source.linear],
         }  # fmt: skip
-        return {"profile": about, **(each[0] if len(each) == 1 else {"missions": each})}
+        return {"profile": about, **(missions[0] if len(missions) == 1 else {"missions": missions})}
 
     def _one(self, row: int) -> Json:
         to = {name: f"energy_to_{name}_Wh" for name in SINKS}
@@ -91,11 +91,11 @@ def missions_document(file: RobotFile, found: Missions) -> Document:
     first, names = {key: value[0] for key, value in table.items()}, _names(table)
     answer = mission_answer({key: value[0] for key, value in shown_columns.items()}, file.robot.has_ground)
     fed = "battery" if np.isfinite(first["state_of_charge"]) else "supply"
-    cycles, each = (f", {source.cycles} cycles", " each") if source.cycles > 1 else ("", "")
+    cycles, per_cycle = (f", {source.cycles} cycles", " each") if source.cycles > 1 else ("", "")
     between = "linear" if source.linear else "held"
     lead = (
         f"Profile **{source.source}**: {source.duration:g} s{cycles}, {count_noun(source.segment_count, 'segment')}"
-        f"{each}, values {between} between rows; fed by its {fed}."
+        f"{per_cycle}, values {between} between rows; fed by its {fed}."
     )
     detail = f"In detail the first of {len(names)} runs: **{names[0]}**." if len(names) > 1 else ""
     runs = run_tables.quantity_table(
@@ -219,9 +219,13 @@ def _exceeded_limits(found: Missions) -> Iterable[str]:
 
 def _charge_left(table: Columns) -> Iterable[str]:
     """Cut-off charge of missions, if any was."""
-    left = 100 * table["state_of_charge"][table["status"] == "cut_off"]
-    if len(left):
-        span = f"{left.min():.1f}" if len(left) == 1 else f"{left.min():.1f} to {left.max():.1f}"
+    charge_left = 100 * table["state_of_charge"][table["status"] == "cut_off"]
+    if len(charge_left):
+        span = (
+            f"{charge_left.min():.1f}"
+            if len(charge_left) == 1
+            else f"{charge_left.min():.1f} to {charge_left.max():.1f}"
+        )
         yield f"cut off: ended with {span} % of the charge left"
 
 

@@ -187,10 +187,15 @@ class ResonanceResult:
 
     def _spread(self) -> list[tuple[str, float, float]]:
         """Modes that amplify but change by an octave with the position of the belt, with their range [Hz]."""
-        every = [m for modes in self.modes.values() for m in modes if m.amplifies and not m.resonant]
-        names = dict.fromkeys(m.name for m in every)
+        amplifying_modes = [m for modes in self.modes.values() for m in modes if m.amplifies and not m.resonant]
+        names = dict.fromkeys(m.name for m in amplifying_modes)
         return [
-            (n, min(m.low for m in every if m.name == n), max(m.high for m in every if m.name == n)) for n in names
+            (
+                n,
+                min(m.low for m in amplifying_modes if m.name == n),
+                max(m.high for m in amplifying_modes if m.name == n),
+            )
+            for n in names
         ]
 
     def _table8(self) -> str:

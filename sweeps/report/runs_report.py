@@ -265,7 +265,7 @@ def limits_used(robot: Robot, run: Json) -> list[Json]:
 def inrush_limit(robot: Robot, on_battery: bool) -> float | None:
     """Largest current of the driver, or of the battery less other consumers, for all motors [A]. None: not stated."""
     most, battery = float(robot.driver.current_limit), robot.battery
-    stated = [float(robot.sides) * most] if most < float(type(robot.driver)().current_limit) else []
+    limits = [float(robot.sides) * most] if most < float(type(robot.driver)().current_limit) else []
     if on_battery and battery.current_limit is not None:
-        stated.append(battery.current_limit - float(battery.current_other))
-    return min(stated, default=None)
+        limits.append(battery.current_limit - float(battery.current_other))
+    return min(limits, default=None)

@@ -39,15 +39,18 @@ def print_table(table: Table) -> None:
         print_output(f"{len(rows):,} rows: see {table.file}")
         return
     printed = rich.table.Table(title=table.title or None, title_justify="left", box=None, pad_edge=False)
-    kept = [k for k, column in enumerate(turned.columns) if column.terminal]
-    for k in kept:
+    terminal_columns = [k for k, column in enumerate(turned.columns) if column.terminal]
+    for k in terminal_columns:
         column, number = turned.columns[k], bool(turned.columns[k].form)
         short = number or max(len(plain_text(column.text(row[k]))) for row in rows) <= SHORT
         justify: Literal["right", "left"] = "right" if number else "left"
         printed.add_column(plain_text(column.full_title), justify=justify, no_wrap=short, overflow="fold")
     for row in rows:
         printed.add_row(
-            *(Text(plain_text(turned.columns[k].text(row[k])), TONES.get(cell_tone(row[k]), "")) for k in kept)
+            *(
+                Text(plain_text(turned.columns[k].text(row[k])), TONES.get(cell_tone(row[k]), ""))
+                for k in terminal_columns
+            )
         )
     print_output(printed)
     if table.sideways and len(table.rows) > SIDE_BY_SIDE:

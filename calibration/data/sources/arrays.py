@@ -120,10 +120,10 @@ def _structure_fields(path: str, value: np.ndarray) -> list[tuple[str, np.ndarra
     if value.dtype.names is None:
         return [(path, value)]
     fields: list[tuple[str, np.ndarray]] = []
-    for k, each in enumerate(np.ravel(value)):
+    for k, element in enumerate(np.ravel(value)):
         place = path if value.size == 1 else f"{path}[{k}]"
         for field in value.dtype.names:
-            fields += _structure_fields(f"{place}.{field}", np.asarray(each[field]))
+            fields += _structure_fields(f"{place}.{field}", np.asarray(element[field]))
     return fields
 
 
@@ -189,8 +189,8 @@ def _add_group(
         dtype = np.dtype(f"U{item.dtype.itemsize}") if words or char else item.dtype
         shape = item.shape[::-1] if matlab else item.shape
         arrays[here] = (shape, dtype, _dataset(path, here, words, char, matlab))
-        stated = next((item.attrs[key] for key in ("unit", "units", "Unit", "Units") if key in item.attrs), "")
-        units[here] = stated.decode("utf-8", "replace") if isinstance(stated, bytes) else str(stated)
+        unit = next((item.attrs[key] for key in ("unit", "units", "Unit", "Units") if key in item.attrs), "")
+        units[here] = unit.decode("utf-8", "replace") if isinstance(unit, bytes) else str(unit)
 
 
 def _dataset(path: Path, at: str, words: bool, char: bool, matlab: bool) -> Load:

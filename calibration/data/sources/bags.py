@@ -160,10 +160,10 @@ def _values(message: Any, at: str) -> Iterator[tuple[str, Any]]:
         elif isinstance(value, list | tuple | np.ndarray):
             if len(value) > ELEMENTS:
                 continue
-            for k, each in enumerate(value):
-                if hasattr(each, "__dataclass_fields__"):
-                    yield from _values(each, f"{here}[{k}]")
+            for k, element in enumerate(value):
+                if hasattr(element, "__dataclass_fields__"):
+                    yield from _values(element, f"{here}[{k}]")
                 else:
-                    yield f"{here}[{k}]", each
+                    yield f"{here}[{k}]", element
         else:
             yield here, value

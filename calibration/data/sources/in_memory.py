@@ -69,7 +69,7 @@ def of_object(source: Any) -> tuple[str, tuple[Signal, ...]]:
         )
     if isinstance(source, Mapping):
         return "the dict", json_records.of_content(source, "the dict")
-    if isinstance(source, list | tuple) and source and all(isinstance(each, Mapping) for each in source):
+    if isinstance(source, list | tuple) and source and all(isinstance(item, Mapping) for item in source):
         return "the records", json_records.of_content(list(source), "the records")
     raise BadData(f"the source: got {_called(source)}; expected {EXPECTED}")
 

@@ -121,16 +121,16 @@ def on_one_grid(
     for key, time in times.items():
         _check(name, clocks[key].name, time)
     measured = {id(s.clock) for column, s in chosen.items() if is_measured(column)}
-    stated = [key for key, clock in clocks.items() if grid and clock.name == grid]
-    pool = stated or sorted(measured or times, key=lambda key: _step(times[key]))
+    grid_clocks = [key for key, clock in clocks.items() if grid and clock.name == grid]
+    pool = grid_clocks or sorted(measured or times, key=lambda key: _step(times[key]))
     main = pool[0]
     rows = times[main]
-    held = {column for column in chosen if is_held(column)}
-    starts = [times[id(chosen[column].clock)][0] for column in held]
+    step_columns = {column for column in chosen if is_held(column)}
+    starts = [times[id(chosen[column].clock)][0] for column in step_columns]
     alike = SAME * min(_step(rows), 1.0)
-    kept = rows >= max(starts, default=-np.inf) - alike
+    is_covered = rows >= max(starts, default=-np.inf) - alike
     for key, time in times.items():
-        if time[-1] < rows[kept][0] if kept.any() else True:
+        if time[-1] < rows[is_covered][0] if is_covered.any() else True:
             raise BadData(
                 f"{name}: {clocks[key].name} ends at {time[-1]:g} s, before {clocks[main].name} and every command "
                 "have begun; expected signals that overlap in time"
@@ -141,10 +141,10 @@ def on_one_grid(
         own, key, sorted_by = signal.load(), same[id(signal.clock)], order[id(signal.clock)]
         own = own if sorted_by is None else own[sorted_by]
         if key == same[main]:
-            values[column] = own[kept]
+            values[column] = own[is_covered]
             continue
-        on = rows[kept]
-        if column in held or own.dtype.kind not in "biuf":
+        on = rows[is_covered]
+        if column in step_columns or own.dtype.kind not in "biuf":
             values[column] = own[np.maximum(np.searchsorted(times[key], on + alike, side="right") - 1, 0)]
             brought.setdefault("held", []).append(column)
         else:
@@ -156,13 +156,13 @@ def on_one_grid(
             "held": "held from sample to sample",
             "interpolated": "interpolated linearly between samples, each used once",
         }
-        each = "; ".join(f"{', '.join(columns)} {how[kind]}" for kind, columns in brought.items())
+        kind_sentences = "; ".join(f"{', '.join(columns)} {how[kind]}" for kind, columns in brought.items())
         notes.append(
             f"{name}: signals have different clocks; rows are taken at the samples of {clocks[main].name} "
-            f"({_rate(rows)}): {each}"
+            f"({_rate(rows)}): {kind_sentences}"
         )
-    if not kept.all():
-        notes.append(f"{name}: {np.count_nonzero(~kept)} rows before the first command are left out")
+    if not is_covered.all():
+        notes.append(f"{name}: {np.count_nonzero(~is_covered)} rows before the first command are left out")
     for key, clock in clocks.items():
         unit, period = read[key].unit, read[key].period
         if key in late:
@@ -173,7 +173,7 @@ def on_one_grid(
             notes.append(f"{name}: {clock.name} wraps at {period:.10g}; counted on from there")
         if not clock.unit and unit not in ("", "s"):
             notes.append(f"{name}: {clock.name} has no unit; its numbers are read as {unit} ({_rate(times[key])})")
-    on = rows[kept]
+    on = rows[is_covered]
     return on - on[0], values, tuple(notes)
 
 

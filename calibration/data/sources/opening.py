@@ -171,8 +171,8 @@ def open_signals(path: Path, within: str, name: str, form: Format) -> Source:
     signals = tuple(form.signals(path, name))
     if not signals:
         raise BadData(f"{name}: is {form.kind} without signals; expected at least one column or array")
-    held = sum(file.stat().st_size for file in _files_of_folder(path))
-    source = checked_source(name, form.kind, signals, held, source_digest(path))
+    byte_count = sum(file.stat().st_size for file in _files_of_folder(path))
+    source = checked_source(name, form.kind, signals, byte_count, source_digest(path))
     return source.below(within) if within else source
 
 

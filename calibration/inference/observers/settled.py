@@ -75,8 +75,8 @@ class SettledLinearization(Linearization):
 
     def columns(self, balance: Scalar | int, shapes: Array | np.ndarray) -> Float[Array, "readings terms"]:
         of_sides = shapes.reshape(-1, self.rows, shapes.shape[1])
-        moved = self.of_sides(balance)[:, :, :, None] * of_sides[:, :, None, :]
-        return moved.sum(0).reshape(-1, shapes.shape[1])
+        changes = self.of_sides(balance)[:, :, :, None] * of_sides[:, :, None, :]
+        return changes.sum(0).reshape(-1, shapes.shape[1])
 
     def of_sides(self, balance: Scalar | int) -> Float[Array, "sides rows channels"]:
         """Change of the readings by a defect of a balance on each side. Identical sides are one."""
@@ -241,8 +241,8 @@ class SettledRuns(Observer):
     def shown(self, robot: Robot, unknowns: Array, found: Array) -> tuple[Observation, Signals, Array]:
         assert self._implicit is not None
         one = functools.partial(self._implicit.shown, robot)
-        result, signals, left = jax.vmap(one)(self.conditions, unknowns, found)
-        return self._simulated_readings(robot, result), signals, left
+        result, signals, residual = jax.vmap(one)(self.conditions, unknowns, found)
+        return self._simulated_readings(robot, result), signals, residual
 
     def operating_points(self, robot: Robot) -> Signals | None:
         if self.long or self.conditions.turns:
@@ -293,21 +293,21 @@ class SettledRuns(Observer):
         defects = jacobian[: rows * count, size:].reshape(rows, count, len(probes), -1).transpose(2, 3, 0, 1)
         if signals is None:
             signals = jax.vmap(lambda c: operating_signals(robot, c))(self.conditions)
-        each = jax.tree.map(lambda x: x.reshape(-1), signals)
+        flat_signals = jax.tree.map(lambda x: x.reshape(-1), signals)
         scale = data.weight / data.sd
 
         def signature(effect: Effect) -> Array:
             alone = dataclasses.replace(robot, effects=(effect,))
-            term = jax.vmap(lambda s: balances.effects_sum(alone, s, effect.balance, effect.channel))(each)
-            term = jnp.broadcast_to(term, each.speed.shape).reshape(rows, -1)
+            term = jax.vmap(lambda s: balances.effects_sum(alone, s, effect.balance, effect.channel))(flat_signals)
+            term = jnp.broadcast_to(term, flat_signals.speed.shape).reshape(rows, -1)
             if effect.balance == "sensor":
                 term = term @ side_shares(effect.channel, term.shape[1])
-                moved = term[:, None] * (jnp.arange(count) == shown.index(effect.channel)) * scale
+                change = term[:, None] * (jnp.arange(count) == shown.index(effect.channel)) * scale
             elif effect.balance in kind.probed:
-                moved = (term.T[:, :, None] * defects[kind.probed.index(effect.balance)]).sum(0)
+                change = (term.T[:, :, None] * defects[kind.probed.index(effect.balance)]).sum(0)
             else:
-                moved = jnp.zeros((rows, count))
-            return moved.ravel()
+                change = jnp.zeros((rows, count))
+            return change.ravel()
 
         signatures = jnp.concatenate([e.each(signature) for e in effects]).T
         defects = defects.reshape(len(probes), *self.shape_sides, rows, count)

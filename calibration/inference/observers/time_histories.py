@@ -180,8 +180,8 @@ class HistoriesLinearization(Linearization):
     angle: Float[Array, " rows"]
 
     def columns(self, balance: Scalar | int, shapes: Array | np.ndarray) -> Float[Array, "readings terms"]:
-        moved = jnp.einsum("rksc,rkt->rsct", self.defects[balance], shapes[self.knots])
-        return _to_rows(moved, self.rows_of, self.rows).reshape(-1, shapes.shape[1])
+        changes = jnp.einsum("rksc,rkt->rsct", self.defects[balance], shapes[self.knots])
+        return _to_rows(changes, self.rows_of, self.rows).reshape(-1, shapes.shape[1])
 
     def places(self) -> np.ndarray:
         return np.unique(np.asarray(self.knots))
@@ -274,23 +274,27 @@ class Histories(Observer):
         whole, exact = runs.whole, robot.rig.imposed == "motor_speed"
         linear = robot.rig.between_rows == "linear"
         names, run = np.unique(runs.run_names, return_inverse=True)
-        mine, every = ([table.in_order(name) for name in names] for table in (runs, whole))
-        given = [runs["time_s"][m] for m in mine]
+        mine, rows_of_whole = ([table.in_order(name) for name in names] for table in (runs, whole))
+        run_times = [runs["time_s"][m] for m in mine]
         # Rows of the log without a reading here are kept if the imposed quantity changes there.
         smooth = runs.log is not None and robot.rig.imposed == "motor_current" and not linear
         noted = [
             np.isin(whole["time_s"][rows], t) | exact | linear | _drive_changes(whole, rows, SMALL if smooth else 0.0)
-            for rows, t in zip(every, given, strict=True)
+            for rows, t in zip(rows_of_whole, run_times, strict=True)
         ]
         longest_steps = _longest_steps(runs, robot)
         if smooth:
-            noted = [n | _begins_new_step(whole["time_s"][rows], n) for n, rows in zip(noted, every, strict=True)]
-            whole = _average_imposed_current(whole, every, noted)
+            noted = [
+                n | _begins_new_step(whole["time_s"][rows], n) for n, rows in zip(noted, rows_of_whole, strict=True)
+            ]
+            whole = _average_imposed_current(whole, rows_of_whole, noted)
         steps = [np.minimum.reduceat(h, np.flatnonzero(n)[:-1]) for h, n in zip(longest_steps, noted, strict=True)]
         change = LOOSE if robot.loose else CHANGE
         grids = [
             time_grid(whole["time_s"][rows[n]], *c, h, START if robot.has_ground else change, change, parts)
-            for rows, n, c, h in zip(every, noted, _drive_jumps(whole, every, robot.rig), steps, strict=True)
+            for rows, n, c, h in zip(
+                rows_of_whole, noted, _drive_jumps(whole, rows_of_whole, robot.rig), steps, strict=True
+            )
         ]
         # The last instant begins a step too, of length zero.
         longest, samples = _common_length(max(map(len, grids)) + 1), max(map(len, mine))
@@ -300,7 +304,7 @@ class Histories(Observer):
         most = min(samples, KNOTS, max(8, int(KNOT_STEPS / times.size)))
         knots = np.stack([_choose_knots(m, most) for m in mine])
         conditions = _conditions_over_time(
-            whole.conditions(robot), every, whole["time_s"], times, ON_LINES if linear else ()
+            whole.conditions(robot), rows_of_whole, whole["time_s"], times, ON_LINES if linear else ()
         )
         if robot.rig.begins is not None:
             order = [robot.rig.begins.names.index(initial_state_name(str(n))) for n in names]
@@ -403,22 +407,22 @@ class Histories(Observer):
         In a run with changing conditions, the longest interval of forward drive counts, if it is long enough.
         """
         time, measured = runs["time_s"], runs.measured()
-        each = [
+        stretches = [
             max((s for s in run if s.driven or s.whole), key=lambda s: s.lasts, default=run[0])
             for run in intervals_by_run(runs)
         ]
-        each = [s for s in each if s.driven and (s.whole or s.lasts >= LASTING)]
+        stretches = [s for s in stretches if s.driven and (s.whole or s.lasts >= LASTING)]
         if steady:
             speeds = measured[:, [c.zero_at_rest and c.directed for c in runs.channels]]
-            each = [s for s in each if not _changes_still(speeds, s.after(time, 0.5), s.after(time, 0.75))]
+            stretches = [s for s in stretches if not _changes_still(speeds, s.after(time, 0.5), s.after(time, 0.75))]
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", RuntimeWarning)  # a channel without readings
-            settled_readings = [np.nanmedian(measured[s.after(time, 0.5)], 0) for s in each]
-        first = np.array([s.rows[0] for s in each], int)
+            settled_readings = [np.nanmedian(measured[s.after(time, 0.5)], 0) for s in stretches]
+        first = np.array([s.rows[0] for s in stretches], int)
         return (
             runs.where(first),
             np.reshape(settled_readings, (-1, measured.shape[1])),
-            np.array([s.lasts for s in each]),
+            np.array([s.lasts for s in stretches]),
         )
 
     @classmethod
@@ -454,14 +458,14 @@ class Histories(Observer):
         the values of its term. Its memory follows from the run too. Between two instants, its change of a reading is
         linear.
         """
-        every = _ProbedRobot.of(robot, probes, effects)
+        probed = _ProbedRobot.of(robot, probes, effects)
         clock = self.times[jnp.arange(len(self.times))[:, None], self.instant[self.knots]]
         rows = jnp.where(self.rows_of < 0, 0, self.rows_of)
         followed_signals = self.with_simulated_runs(robot).known
         assert followed_signals is not None
         # One run at a time: each has a wide array, by its knots.
-        given = self.conditions, clock, self.instant[rows], followed_signals, self.times, self.time[rows]
-        knots, by_effects = jax.lax.map(lambda of_run: every.changes(*of_run, delayed=self.delayed), given)
+        inputs = self.conditions, clock, self.instant[rows], followed_signals, self.times, self.time[rows]
+        knots, by_effects = jax.lax.map(lambda of_run: probed.changes(*of_run, delayed=self.delayed), inputs)
         return jnp.moveaxis(knots, 0, 1), by_effects
 
     def with_simulated_runs(self, robot: Robot) -> Histories:
@@ -498,8 +502,8 @@ class Histories(Observer):
     def of_rows(self) -> Any:
         """Conditions of each row as NumPy arrays, shape (rows,)."""
         run, instant = np.asarray(self.run), np.asarray(self.instant)
-        held = jax.tree.map(np.asarray, self.conditions)
-        return jax.tree.map(lambda x: x[run] if x.ndim == 1 else x[run, instant], held)
+        conditions = jax.tree.map(np.asarray, self.conditions)
+        return jax.tree.map(lambda x: x[run] if x.ndim == 1 else x[run, instant], conditions)
 
     @property
     def varying(self) -> bool:
@@ -530,9 +534,9 @@ class Histories(Observer):
             which = np.stack([rows.configuration, levels, rows.slope_deg, rows.payload, braked], 1)
             cases = np.unique(which[levels != 0], axis=0, return_index=True)[1]
             cases = np.flatnonzero(levels != 0)[cases] if len(cases) else np.arange(1)
-            held = {} if rows.motor_speed is None else {"motor_acceleration": np.zeros_like(levels)}
-            held |= {} if rows.load_torque is None else {"load_torque": braked}
-            steady = dataclasses.replace(rows, **{driven_channel: levels}, **held)
+            imposed_values = {} if rows.motor_speed is None else {"motor_acceleration": np.zeros_like(levels)}
+            imposed_values |= {} if rows.load_torque is None else {"load_torque": braked}
+            steady = dataclasses.replace(rows, **{driven_channel: levels}, **imposed_values)
             return _conditions_of_rows(steady, cases)
         applied = np.where(rows.open > 0.5, 0.0, rows.voltage * rows.duty)
         some = np.flatnonzero(applied != 0) if (applied != 0).any() else np.arange(1)
@@ -923,7 +927,7 @@ def measure_initial_states(robot: Robot, runs: Runs, noise: Noise) -> Robot:
     if robot.rig.start == "rest" or not runs.sampled:
         return robot
     measured = runs.measured()
-    begins, stated = dict[str, RunStart](), []
+    begins, state_priors = dict[str, RunStart](), []
     rows = runs.configurations(robot)
     for name in np.unique(runs.run_names):
         run_rows = runs.in_order(name)
@@ -944,8 +948,8 @@ def measure_initial_states(robot: Robot, runs: Runs, noise: Noise) -> Robot:
                 least = float(np.median(noise.sd[finite, k]))
                 state[field] = factor * value, abs(factor) * max(sd, least)
         begins[key] = RunStart(**{field: value for field, (value, _) in state.items()})
-        stated += [(f"rig.{key}.{field}", value, sd) for field, (value, sd) in state.items()]
-    priors = (*robot.rig.priors, *stated) if robot.rig.start == "free" else robot.rig.priors
+        state_priors += [(f"rig.{key}.{field}", value, sd) for field, (value, sd) in state.items()]
+    priors = (*robot.rig.priors, *state_priors) if robot.rig.start == "free" else robot.rig.priors
     return dataclasses.replace(robot, rig=dataclasses.replace(robot.rig, begins=RunStarts(begins), priors=priors))
 
 
@@ -1078,8 +1082,11 @@ def _longest_steps(runs: Runs, robot: Robot) -> list[np.ndarray]:
     Without such readings it may be anywhere.
     """
     whole, rig, exact = runs.whole, robot.rig, robot.rig.imposed == "motor_speed"
-    moved = [k for k, c in enumerate(runs.channels) if c.zero_at_rest and (c.directed or not c.settled)]
-    measured, rates = whole.measured()[:, moved], [k for k, at in enumerate(moved) if not runs.channels[at].settled]
+    motion_channels = [k for k, c in enumerate(runs.channels) if c.zero_at_rest and (c.directed or not c.settled)]
+    measured, rates = (
+        whole.measured()[:, motion_channels],
+        [k for k, at in enumerate(motion_channels) if not runs.channels[at].settled],
+    )
     driven = None if exact else applied_drive(whole)
     early, found = DELAYED * np.max(np.asarray(rig.delay)) + EARLIER.get(rig.imposed, 0.0), []
     turned = robot.motor.inertia * robot.gearbox.ratio**2
@@ -1162,11 +1169,11 @@ def _scan_delays(problem: Problem, z: Array, data: Data, scanned: Array, values:
     def shown(z: Array) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
         robot = problem.robot(z)
         of_run = lambda c, t, k: _readings_within_steps(robot, course_between_instants(robot, c, t, k))  # noqa: E731
-        *every, decays = jax.vmap(of_run)(observe.conditions, observe.times, observe.known)
-        return tuple(every), (*every, decays)
+        *measured, decays = jax.vmap(of_run)(observe.conditions, observe.times, observe.known)
+        return tuple(measured), (*measured, decays)
 
-    slopes, (*every, decays) = jax.jacfwd(shown, has_aux=True)(z)
-    both = [jnp.concatenate([x[..., None], slope], -1) for x, slope in zip(every, slopes, strict=True)]
+    slopes, (*all_measured, decays) = jax.jacfwd(shown, has_aux=True)(z)
+    both = [jnp.concatenate([x[..., None], slope], -1) for x, slope in zip(all_measured, slopes, strict=True)]
 
     def one(value: Array) -> tuple[Array, Array]:
         coordinates = jnp.where(scanned, value, z)
@@ -1280,16 +1287,16 @@ class _ProbedRobot(NamedTuple):
         """Robot with these probes and further ones for the balances that the effects enter."""
         others = dict.fromkeys(e.effect.balance for e in effects if e.effect.balance != "sensor")
         entered = tuple(balance_probe(b) for b in others if b not in {p.balance for p in probes})
-        every, size = (*probes, *entered), len(probes)
+        rows_of_whole, size = (*probes, *entered), len(probes)
         effects = tuple(with_shape_of_robot(robot, e) for e in effects)
-        counts, places = np.array([len(e.at) for e in effects], int), [p.balance for p in every]
+        counts, places = np.array([len(e.at) for e in effects], int), [p.balance for p in rows_of_whole]
         entering = np.array([places.index(b) if (b := e.effect.balance) in places else 0 for e in effects], int)
         entering = np.repeat(entering, counts)
         enters = np.repeat([1.0 * (e.effect.balance in places) for e in effects], counts)
         shown_channels = channels.channel_names(robot.channels)
         at_sensor = np.array([[e.effect.channel == c for e in effects] for c in shown_channels], float)
         at_sensor = np.repeat(at_sensor, counts, 1) if effects else np.zeros((len(shown_channels), 0))
-        return cls(robot, every, size, effects, entering, enters, at_sensor)
+        return cls(robot, rows_of_whole, size, effects, entering, enters, at_sensor)
 
     def at(self, amplitude: Array) -> Robot:
         """Robot with the probes at amplitudes [units of their balances], shape (probes,)."""
@@ -1410,10 +1417,10 @@ def _memory_along_run(
 
     def after(memory: Array, step: tuple[LinearisedRun, RunStep]) -> tuple[Array, Array]:
         state_there, taken = step
-        held, spans, passes = taken.held(constant), jnp.diff(state_there.clock), state_there.passes
+        conditions, spans, passes = taken.held(constant), jnp.diff(state_there.clock), state_there.passes
 
         def stage(memory: Array, span: Array, y: Array, way: Array) -> Array:
-            law = lambda m: memory_rates(y, held, way, m)  # noqa: E731
+            law = lambda m: memory_rates(y, conditions, way, m)  # noqa: E731
             speed, slope = jax.jvp(law, (memory,), (jnp.ones_like(memory),))
             return memory + span * speed / (1 - span * slope)
 
