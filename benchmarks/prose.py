@@ -27,7 +27,8 @@ HABITS = re.compile(
 )
 #: Locals that say how a value was come by, and not what it is.
 EMPTY_NAMES = frozenset([
-    "found", "at", "own", "shown", "known", "said", "each", "every", "stated", "held", "moved", "left", "kept", "given",
+    "found", "at", "own", "shown", "known", "said",
+    "each", "every", "stated", "held", "moved", "left", "kept", "given",
 ])  # fmt: skip
 #: Largest figures. They only fall.
 CEILINGS = {
