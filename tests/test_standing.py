@@ -333,9 +333,8 @@ def test_name_stands_by_its_score_its_curves_and_its_rows(root, without, evidenc
     assert dataclasses.replace(test, varies=9.0, spread=0.31).established is False
     # of a library of three effects chance reaches less than in a dozen looks at the amplitude
     assert dataclasses.replace(test, varies=3.4, by_chance=3.5).established == test.established
-    # the other runs of a log test one effect that is chosen already
-    of_runs = [dataclasses.replace(test, what="run", root_without=x).rests_on for x in (2.5, 2.7)]
-    assert of_runs == [10 if root >= 3.3 else None, None]
+    of_runs = dataclasses.replace(test, what="run")  # of histories: chance alone
+    assert of_runs.rests_on == (10 if without < 3.3 <= root else None)
     renumbered = NameSupport(True, tests=(test,)).with_row_numbers(np.arange(1, 21) * 2)
     assert renumbered.rests_on("a") == (None if rests_on is None else 20) and renumbered.rests_on("b") is None
 

@@ -27,12 +27,9 @@ class PlacedCurve(NamedTuple):
 #: Advantage in evidence of a smooth curve of an effect's own equation that refutes its name [σ²]
 #: (docs/lab/findings.md, "Why the constants are what they are").
 BETTER = 5.0
-#: Least share of its root that an effect keeps without any one row of a table, which may have a wrong reading.
-KEPT = 1 / math.sqrt(3)
-#: Least root of an effect without any one run of a log: two-sided 1 % for one effect that was chosen in advance [σ].
-#: The other runs do not choose it again. With the critical value of the whole library instead, four logs of twenty
-#: with 5 σ were not established (docs/lab/findings.md).
-CHOSEN = 2.58
+#: Least share of its root that an effect keeps without any one run. A row of a table may have a wrong reading; a run
+#: of a history has hundreds of samples, so that only significance is tested.
+KEPT = {"row": 1 / math.sqrt(3), "run": 0.0}
 #: Zero error of an instrument over the rms of its readings, below which it is not established without a stated noise:
 #: sds that grow with the readings, or that are too small, leave such an offset.
 SMALL_OFFSET = 0.05
@@ -99,8 +96,7 @@ class NameTest:
         """
         if self.root < self.needed:
             return None
-        least = max(self.needed, KEPT * self.root) if self.what == "row" else CHOSEN
-        return self.row if self.root_without < least else None
+        return self.row if self.root_without < max(self.needed, KEPT[self.what] * self.root) else None
 
     @property
     def fails(self) -> Names:
