@@ -29,6 +29,8 @@ HABITS = re.compile(
 EMPTY_NAMES = frozenset([
     "found", "at", "own", "shown", "known", "said",
     "each", "every", "stated", "held", "moved", "left", "kept", "given",
+    "which", "what", "by", "where", "over", "whole", "mine", "theirs", "here", "chosen", "lost", "turned", "ended",
+    "begun", "wanted", "taken", "asked", "named", "listed", "used", "seen",
 ])  # fmt: skip
 #: Largest figures. They only fall.
 CEILINGS = {

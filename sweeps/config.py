@@ -965,17 +965,17 @@ def _error_sentence(kind: type[Part], error: ValidationError, file: Path | None,
         return message if file is None else f"{file.name}: {message}"
     key = str(first["loc"][0])
     place = ".".join(str(part) for part in first["loc"])
-    where = f"{file.name}, {place}" if file is not None and key not in given else called(key)
+    option_place = f"{file.name}, {place}" if file is not None and key not in given else called(key)
     if first["type"] == "extra_forbidden":
-        return f"{where}: no such key; {allowed_words(key, kind.model_fields)}"
-    wanted = first["msg"][0].lower() + first["msg"][1:]
+        return f"{option_place}: no such key; {allowed_words(key, kind.model_fields)}"
+    expectation = first["msg"][0].lower() + first["msg"][1:]
     fact = schema_facts(kind).get(key, {})
     limits = {**fact.get("items", {}), **fact}
     if first["type"] == "literal_error":
-        wanted = f"expected {first['ctx']['expected']}"
+        expectation = f"expected {first['ctx']['expected']}"
     if {"minimum", "maximum"} <= limits.keys() and {"ge", "le"} & first.get("ctx", {}).keys():
-        wanted = f"expected {limits['minimum']:.10g} to {limits['maximum']:.10g}"
-    return f"{where}: got {first['input']!r}; {wanted}"
+        expectation = f"expected {limits['minimum']:.10g} to {limits['maximum']:.10g}"
+    return f"{option_place}: got {first['input']!r}; {expectation}"
 
 
 def as_toml(config: Part) -> str:

@@ -191,9 +191,9 @@ class Folder:
         Before the results are written these are all but `PARTS`. Later the lock's file lists them.
         """
         foreign = {p.name for p in self.partial.iterdir()} - PARTS
-        listed = _json(self.partial / LOCK).get(FOREIGN)
+        foreign_names = _json(self.partial / LOCK).get(FOREIGN)
         chunk_files = (self.partial / CHUNKS).glob("*")
-        return (foreign & set(map(str, listed)) if isinstance(listed, list) else foreign) | {
+        return (foreign & set(map(str, foreign_names)) if isinstance(foreign_names, list) else foreign) | {
             f"{CHUNKS}/{p.name}" for p in chunk_files if p.suffix not in KEPT
         }
 
@@ -263,7 +263,7 @@ class Folder:
         import jax
         import jax.numpy as jnp
 
-        whole = {
+        new_manifest = {
             **{
                 "schema": MANIFEST,
                 "program": f"mmrjax {__version__}",
@@ -278,7 +278,7 @@ class Folder:
             "hashes": hashes,
             "contents": sorted(names),
         }
-        self.write_json("manifest.json", whole)
+        self.write_json("manifest.json", new_manifest)
         return self.move_into_place()
 
     def move_into_place(self) -> Path:

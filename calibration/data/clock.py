@@ -42,9 +42,9 @@ def unwrap_counter(count: np.ndarray, run: np.ndarray) -> tuple[np.ndarray, floa
     usual = float(np.median(step[step > 0]))
     for period in PERIODS:
         across = step[back] + period
-        whole = period < 2**15 or not (count % 1).any()
+        is_counter = period < 2**15 or not (count % 1).any()
         if (
-            whole
+            is_counter
             and count.min() >= 0
             and count.max() < period
             and (np.abs(across) <= LACKING * usual).all()
@@ -120,10 +120,10 @@ def drop_empty_rows(arrays: NamedArrays, meanings: Sequence[Column | None]) -> N
     if clock is None or "run_id" in column_names or not len(arrays):
         return arrays
     count = column_numbers(clock)
-    used = np.flatnonzero(count != 0)
-    if not len(used) or used[-1] == len(count) - 1 or not np.nanmax(count) > 0:
+    filled_rows = np.flatnonzero(count != 0)
+    if not len(filled_rows) or filled_rows[-1] == len(count) - 1 or not np.nanmax(count) > 0:
         return arrays
-    is_kept = np.arange(len(count)) <= used[-1]
+    is_kept = np.arange(len(count)) <= filled_rows[-1]
     note = f"{count_noun(int((~is_kept).sum()), 'row')} at the end left out, because the clock restarts at 0 there"
     return arrays.rows(is_kept, note)
 
@@ -181,11 +181,11 @@ def time_since_start(name: str, meaning: Column, raw: Raw, runs: Sequence[str] |
             *notes,
             f"{name}: {meaning.shown} is a time of day; time is counted from the first row of each run",
         )
-    which = run[np.flatnonzero(first[run])[0]]
-    where = f"{first[which] / factor:g}{f' in run {names[which]}' if names[which] else ''}"
+    run_index = run[np.flatnonzero(first[run])[0]]
+    time_words = f"{first[run_index] / factor:g}{f' in run {names[run_index]}' if names[run_index] else ''}"
     return passed, (
         *notes,
-        f"{name}: {meaning.shown} begins at {where}; time is counted from the first row of a run. If the run "
+        f"{name}: {meaning.shown} begins at {time_words}; time is counted from the first row of a run. If the run "
         "began earlier, add a row without readings at that time",
     )
 
@@ -211,10 +211,10 @@ def _unwrap_clock(name: str, meaning: Column, count: np.ndarray, run: np.ndarray
 def _add_days_after_midnight(clock: np.ndarray, cells: Sequence[str], run: np.ndarray) -> None:
     """Adds a day [s] to times without a date after they fall back by more than half a day within their run."""
     last: dict[int, float] = {}
-    for k, (x, which) in enumerate(zip(clock.tolist(), run.tolist(), strict=True)):
-        if _is_time_without_date(cells[k]) and which in last:
-            clock[k] = x = x + _DAY * max(math.floor((last[which] - x) / _DAY + 0.5), 0)
-        last[which] = x
+    for k, (x, run_index) in enumerate(zip(clock.tolist(), run.tolist(), strict=True)):
+        if _is_time_without_date(cells[k]) and run_index in last:
+            clock[k] = x = x + _DAY * max(math.floor((last[run_index] - x) / _DAY + 0.5), 0)
+        last[run_index] = x
 
 
 def _is_time_without_date(cell: str) -> bool:

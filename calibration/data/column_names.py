@@ -93,24 +93,24 @@ def _hint_about_cell(meaning: Column, cell: str, units: bool, readings: Names) -
     """Guess at what a rejected cell means, ending in a semicolon. Empty without a guess."""
     if cell.lower() in NOTHING:
         return "leave the cell empty if there is no reading; " if meaning.column in readings else ""
-    quantity, mine = meaning.quantity, meaning.unit
+    quantity, column_unit = meaning.quantity, meaning.unit
     if not units or meaning.factor != 1.0:
         return ""
-    named = {unit: column for column, unit in quantity.columns().items()}
+    columns_by_unit = {unit: column for column, unit in quantity.columns().items()}
     try:
         value = parse_number(cell)
     except ValueError:
         match = _WITH_UNIT.fullmatch(cell)
-        return "" if match is None else _unit_hint(match[1], match[2], mine, named)
-    far = abs(value) > FAR * max(map(abs, quantity.limits(mine)))
+        return "" if match is None else _unit_hint(match[1], match[2], column_unit, columns_by_unit)
+    far = abs(value) > FAR * max(map(abs, quantity.limits(column_unit)))
     if far and meaning.column in DUTY:
         return (
             "is the command scaled differently? divide it by its maximum, in a log with "
             "[columns] duty = {column, factor}; "
         )
-    for unit, column in named.items():
+    for unit, column in columns_by_unit.items():
         low, high = quantity.limits(unit)
-        if far and unit != mine and low <= value <= high:
+        if far and unit != column_unit and low <= value <= high:
             return f"is it in {unit or 'shares of 1'}? then name the column {column}; "
     return ""
 
@@ -141,15 +141,17 @@ def match_column_names(
     Raises:
         BadData: a name occurs twice.
     """
-    named, notes = _match_case(name, header, layout, inferred)
-    repeated = sorted({c for c in named if named.count(c) > 1})
+    matched_names, notes = _match_case(name, header, layout, inferred)
+    repeated = sorted({c for c in matched_names if matched_names.count(c) > 1})
     if repeated:
-        raise BadData(f"{name}: column {repeated[0]} is present {named.count(repeated[0])} times; expected once")
+        raise BadData(
+            f"{name}: column {repeated[0]} is present {matched_names.count(repeated[0])} times; expected once"
+        )
     if inferred:
-        layout = _with_channels(name, named, layout, channels.EVERY)
-    if of_turns and {*layout.sides, *VOLTS, *HEADING} & {m.column for m in layout.meanings(name, named) if m}:
-        layout = _with_channels(name, named, layout, channels.OF_TURNS)
-    return named, layout, tuple(notes)
+        layout = _with_channels(name, matched_names, layout, channels.EVERY)
+    if of_turns and {*layout.sides, *VOLTS, *HEADING} & {m.column for m in layout.meanings(name, matched_names) if m}:
+        layout = _with_channels(name, matched_names, layout, channels.OF_TURNS)
+    return matched_names, layout, tuple(notes)
 
 
 def _match_case(name: str, header: Sequence[str], layout: Layout, inferred: bool) -> tuple[list[str], Names]:
@@ -244,9 +246,9 @@ def _advice_on_unknown_columns(strange: list[str], column: str) -> str:
         return ""
     unit = column.rpartition("_")[2]
     guess = next((c for c in strange if re.search(rf"\b{unit}\b", c)), "...")
-    listed = ", ".join(strange[:NAMED]) + (", ..." if len(strange) > NAMED else "")
+    names_text = ", ".join(strange[:NAMED]) + (", ..." if len(strange) > NAMED else "")
     return (
-        f"; other columns: {listed}; if one of them has these values, name it in the robot's file, with the "
+        f"; other columns: {names_text}; if one of them has these values, name it in the robot's file, with the "
         f'factor for its unit: [columns] {column} = {{column = "{guess}", factor = 1.0}} (mmrjax inspect '
         "proposes such lines)"
     )
@@ -296,16 +298,16 @@ def check_units(arrays: NamedArrays, meanings: Sequence[Column | None]) -> None:
     for stated_below, meaning in zip(below, meanings, strict=True):
         if meaning is None or abs(meaning.factor) != 1.0:
             continue
-        named = {unit: column for column, unit in meaning.quantity.columns().items()}
-        for unit_text, where in (
-            (quantities.unit_at_end(meaning.shown, named), "in its name"),
+        columns_by_unit = {unit: column for column, unit in meaning.quantity.columns().items()}
+        for unit_text, place_words in (
+            (quantities.unit_at_end(meaning.shown, columns_by_unit), "in its name"),
             (stated_below, f"in {arrays.units_from}"),
         ):
             if unit_text and unit_text != meaning.unit:
-                mapped = meaning.shown not in (meaning.column, named[meaning.unit])
-                remedy = f'state [columns] {named[unit_text]} = "{meaning.shown}" in the robot\'s file'
+                mapped = meaning.shown not in (meaning.column, columns_by_unit[meaning.unit])
+                remedy = f'state [columns] {columns_by_unit[unit_text]} = "{meaning.shown}" in the robot\'s file'
                 raise BadData(
-                    f"{arrays.name}: column {meaning.shown} states {unit_text} {where}, and is read in "
+                    f"{arrays.name}: column {meaning.shown} states {unit_text} {place_words}, and is read in "
                     f"{meaning.unit or 'shares of 1'}; "
-                    f"{remedy if mapped else f'name it {named[unit_text]}'}, or correct the unit"
+                    f"{remedy if mapped else f'name it {columns_by_unit[unit_text]}'}, or correct the unit"
                 )

@@ -228,14 +228,16 @@ class Layout:
             BadData: two columns hold the same quantity.
         """
         by_name = self._by_name
-        theirs = {column: (mine, factor) for mine, column, factor in self.mapped if column in header}
-        taken = {_standard_name(by_name, mine) for mine, _ in theirs.values()}
+        mapped_columns = {
+            column: (own_column, factor) for own_column, column, factor in self.mapped if column in header
+        }
+        taken = {_standard_name(by_name, own_column) for own_column, _ in mapped_columns.values()}
         meanings_found: list[Column | None] = []
         for column in header:
-            if column in theirs:
-                mine, factor = theirs[column]
-                meant = by_name.get(mine)
-                if meant is None and mine in {
+            if column in mapped_columns:
+                own_column, factor = mapped_columns[column]
+                meant = by_name.get(own_column)
+                if meant is None and own_column in {
                     name
                     for channel in channels.EVERY
                     for q in _reading_and_deviation(channel)
@@ -245,8 +247,8 @@ class Layout:
                     continue
                 if meant is None:
                     raise BadData(
-                        f"{source}: the robot's file reads {mine} from column {column}; mmrjax has no column "
-                        f"{mine} (known: {', '.join(self.known())})"
+                        f"{source}: the robot's file reads {own_column} from column {column}; mmrjax has no column "
+                        f"{own_column} (known: {', '.join(self.known())})"
                     )
                 meanings_found.append(dataclasses.replace(meant, shown=column, factor=factor))
             else:
@@ -282,8 +284,10 @@ class Layout:
         Args:
             stated: columns that the table already has, which are left out.
         """
-        none = {*stated, *self.idle, *self.deviation_columns, *WHEN, *WORDS, "held"}
-        lacking = {column: quantity for column, quantity in self.quantities().items() if column not in none}
+        ignored_columns = {*stated, *self.idle, *self.deviation_columns, *WHEN, *WORDS, "held"}
+        lacking = {
+            column: quantity for column, quantity in self.quantities().items() if column not in ignored_columns
+        }
         spelled = {s: (column, unit) for column, q in lacking.items() for s, unit in q.columns().items()}
         unit = quantities.unit_at_end(name, {unit for _, unit in spelled.values()})
         pool = [s for s, (column, own) in spelled.items() if own == unit or (unit is None and s == column)]
@@ -295,10 +299,10 @@ class Layout:
 
     def expected(self, column: str) -> str:
         """Name of the column, with the name in the source if the robot file states one."""
-        theirs = next(
+        mapped_column = next(
             (their for mine, their, _ in self.mapped if _standard_name(self._by_name, mine) == column), None
         )
-        return column if theirs is None else f"{column} (in the robot's file: {theirs})"
+        return column if mapped_column is None else f"{column} (in the robot's file: {mapped_column})"
 
 
 def _standard_name(by_name: Mapping[str, Column], name: str) -> str:

@@ -151,10 +151,10 @@ def _check_time_order(runs: Runs) -> None:
     """
     time, run = runs["time_s"], runs.run_names
     for name in np.unique(run):
-        mine = np.flatnonzero(run == name)
-        back = np.flatnonzero(np.diff(time[mine]) < 0)
-        if 0 < back.size <= max(SELDOM * len(mine), 1):
-            row, was, now = mine[back[0] + 1] + 1, time[mine[back[0]]], time[mine[back[0] + 1]]
+        run_rows = np.flatnonzero(run == name)
+        back = np.flatnonzero(np.diff(time[run_rows]) < 0)
+        if 0 < back.size <= max(SELDOM * len(run_rows), 1):
+            row, was, now = run_rows[back[0] + 1] + 1, time[run_rows[back[0]]], time[run_rows[back[0] + 1]]
             raise BadData(
                 f"{runs.source} row {row}, time_s: goes back from {was:g} to {now:g} s; "
                 "give each recording its own run_id, or sort the rows"
@@ -170,9 +170,9 @@ def _median_of_neighbours(step: np.ndarray) -> np.ndarray:
 def _check_angle(runs: Runs) -> None:
     angle = runs["output_angle_deg"]
     for name in np.unique(runs.run_names):
-        mine = runs.in_order(name)
-        mine = mine[np.isfinite(angle[mine])]
-        step = np.diff(angle[mine])
+        run_rows = runs.in_order(name)
+        run_rows = run_rows[np.isfinite(angle[run_rows])]
+        step = np.diff(angle[run_rows])
         if step.size < 2:
             continue
         usual = np.maximum(np.median(np.abs(step)), _median_of_neighbours(np.abs(step)))
@@ -180,7 +180,7 @@ def _check_angle(runs: Runs) -> None:
             (np.abs(step) > TURN) & (np.abs(step) < 2 * TURN + UNUSUAL * usual) & (np.abs(step) > UNUSUAL * usual)
         )
         if jumps.size:
-            row, passed = int(mine[jumps[0] + 1]), np.diff(runs["time_s"][mine])
+            row, passed = int(run_rows[jumps[0] + 1]), np.diff(runs["time_s"][run_rows])
             gap = passed[jumps[0]]
             why = "like an angle that wraps; expected an angle that keeps counting beyond one turn"
             if gap > GAP * np.median(passed):
@@ -191,12 +191,12 @@ def _check_angle(runs: Runs) -> None:
                 f"deg from the sample before, {why}"
             )
         with np.errstate(divide="ignore", invalid="ignore"):
-            times = np.abs(angle[mine][1:] / angle[mine][:-1])
+            times = np.abs(angle[run_rows][1:] / angle[run_rows][:-1])
         other = np.abs(np.abs(np.log(np.where(times > 0, times, 1.0))) / np.log(RADIAN) - 1) < ALIKE / np.log(RADIAN)
         mixed = np.flatnonzero(other & (np.abs(step) > UNUSUAL * np.maximum(usual, 1.0)))
         if mixed.size:
-            row, k = int(mine[mixed[0] + 1]), mixed[0]
-            was, now = (f"{float(f'{x:.4g}'):g}" for x in angle[mine][k : k + 2])
+            row, k = int(run_rows[mixed[0] + 1]), mixed[0]
+            was, now = (f"{float(f'{x:.4g}'):g}" for x in angle[run_rows][k : k + 2])
             raise BadData(
                 f"{runs.source} row {row + 1}, output_angle_deg: goes from {was} to {now} between two samples, as "
                 "if degrees and radians are mixed; write all rows in one unit"

@@ -58,12 +58,12 @@ def readable_signals(
         settled: True for steady forward travel (`balances.settled_signals`), False for motion
             (`balances.moving_signals`).
     """
-    seen: list[Signals] = []
-    watched = dataclasses.replace(robot, effects=(_effect_that_records_signals(balance, channel, seen),))
+    signals_read: list[Signals] = []
+    watched = dataclasses.replace(robot, effects=(_effect_that_records_signals(balance, channel, signals_read),))
     order = balances.settled_signals if settled else balances.moving_signals
     signals = order(watched, conditions, state)
     balances.sensor(watched, signals[0] if isinstance(signals, tuple) else signals)
-    return seen[0]
+    return signals_read[0]
 
 
 #: Effects by their name in robot files and on the command line.
@@ -169,10 +169,10 @@ def _where(path: Path, effect: type[Effect]) -> str:
 
 
 def _check_effect(path: Path, effect: type[Effect]) -> None:
-    where = _where(path, effect)
+    effect_place = _where(path, effect)
 
     def refuse(what: str) -> BadConfiguration:
-        return BadConfiguration(f"{where}{what}")
+        return BadConfiguration(f"{effect_place}{what}")
 
     for attribute, kind in _STATED.items():
         value = getattr(effect, attribute, None)

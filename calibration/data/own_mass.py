@@ -52,7 +52,7 @@ def stated_masses(robot: Robot, runs: Runs) -> dict[str, StatedMass]:
     """
     if not runs.has("total_mass_kg"):
         return {}
-    which = runs.configurations(robot)
+    configuration_index = runs.configurations(robot)
     own_masses = runs["total_mass_kg"] - runs["payload_kg"]
     low, high = next(
         p for p in params.walk_parameters(robot.configurations.members[0]) if p.name == "mass"
@@ -66,10 +66,10 @@ def stated_masses(robot: Robot, runs: Runs) -> dict[str, StatedMass]:
             f"{runs['payload_kg'][row]:g} kg; expected {low:g} to {high:g} kg without the payload"
         )
     masses = {}
-    for index in np.unique(which):
-        mine = which == index
-        m = own_masses[mine]
-        constant = bool(np.ptp(runs["total_mass_kg"][mine]) <= ROUNDING)
+    for index in np.unique(configuration_index):
+        is_own_row = configuration_index == index
+        m = own_masses[is_own_row]
+        constant = bool(np.ptp(runs["total_mass_kg"][is_own_row]) <= ROUNDING)
         median = round(float(np.median(m)), 6)
         masses[robot.configurations.names[index]] = StatedMass(median, float(m.min()), float(m.max()), constant)
     return masses

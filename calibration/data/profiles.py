@@ -183,11 +183,13 @@ class ProfileTable:
         if self.surface is None:
             return made
         tracks = np.array([float(c.on_tracks) > 0.5 for c in robot.configurations.members])
-        which = tracks[np.asarray(conditions.configuration)].astype(int)
+        is_tracked = tracks[np.asarray(conditions.configuration)].astype(int)
 
         def ratio_by_surface(ratio: Callable[[str, bool], float]) -> Array:
             assert self.surface is not None
-            return jnp.asarray(np.array([[ratio(s, kind) for s in self.surface] for kind in (False, True)])[which])
+            return jnp.asarray(
+                np.array([[ratio(s, kind) for s in self.surface] for kind in (False, True)])[is_tracked]
+            )
 
         lateral = ratio_by_surface(lateral_ratio) if self.turns else None
         return dataclasses.replace(made, adhesion=ratio_by_surface(adhesion_ratio), adhesion_lateral=lateral)
@@ -280,13 +282,13 @@ def _header_settings(name: str, comments: list[str]) -> Json:
     if between not in BETWEEN:
         raise BadData(f"{name}, between_rows: got {between!r}; expected held or linear")
     begins = {}
-    for key, (field, least, greatest, one) in STARTS.items():
+    for key, (field, least, greatest, unit_size) in STARTS.items():
         value = header_settings.get(key)
         if value is None:
             continue
         if not is_number(value) or not least <= value <= greatest:
             raise BadData(f"{name}, {key}: got {value!r}; expected a number, {least:g} to {greatest:g}")
-        begins[field] = one * value
+        begins[field] = unit_size * value
     return {"cycles": cycles, "linear": between == "linear", "begins": begins}
 
 
@@ -309,8 +311,8 @@ def _profile_columns(name: str, header: list[str]) -> dict[str, tuple[str, str]]
             _refuse_column(name, column)
         if field in columns_found:
             first = columns_found[field][0]
-            both = f"column {column} twice" if column == first else f"columns {first} and {column}"
-            raise BadData(f"{name}: got {both}; expected one of them")
+            column_words = f"column {column} twice" if column == first else f"columns {first} and {column}"
+            raise BadData(f"{name}: got {column_words}; expected one of them")
         columns_found[field] = (column, unit)
     if "time" not in columns_found:
         raise BadData(f"{name}: column time_s is missing; other columns: {', '.join(_standard_columns())}")
@@ -464,10 +466,10 @@ def _mode_of_row(cells: _CellReader, row: int, before: str, filled: list[str]) -
 def _check_demands(cells: _CellReader, row: int, before: str, mode: str, own: list[str], others: list[str]) -> None:
     """Rejects a row with two demands or none, and a ramp between different kinds of demand."""
     if others:
-        where = cells.columns[others[0]][0]
+        cell_place = cells.columns[others[0]][0]
         beside = cells.columns[own[0]][0] if own and not cells.text(MODE, row) else f"mode {mode}"
         raise BadData(
-            f"{cells.source} row {row + 1}, {where}: got {cells.text(others[0], row)} in addition to {beside}; "
+            f"{cells.source} row {row + 1}, {cell_place}: got {cells.text(others[0], row)} in addition to {beside}; "
             "expected one demand per row"
         )
     pair = next((pair for pair in PAIRS if cells.has(pair[0])), ())

@@ -108,15 +108,15 @@ def _gearbox_facts(robot: Robot) -> Iterator[DerivedFact]:
 def _output_torque_at(robot: Robot, current: float) -> float:
     """Output torque of one drive at a motor current, after losses [N·m]."""
     motor, gear = robot.motor, robot.gearbox
-    lost = float(motor.friction_coulomb) + float(gear.friction_coulomb)
-    return (float(motor.torque_constant) * current - lost) * float(gear.ratio) * float(gear.efficiency_load)
+    friction = float(motor.friction_coulomb) + float(gear.friction_coulomb)
+    return (float(motor.torque_constant) * current - friction) * float(gear.ratio) * float(gear.efficiency_load)
 
 
 def _current_for_torque(robot: Robot, torque: float) -> float:
     """Motor current for an output torque at low speed [A]."""
     motor, gear = robot.motor, robot.gearbox
-    lost = float(motor.friction_coulomb) + float(gear.friction_coulomb)
-    return (torque / (float(gear.ratio) * float(gear.efficiency_load)) + lost) / float(motor.torque_constant)
+    friction = float(motor.friction_coulomb) + float(gear.friction_coulomb)
+    return (torque / (float(gear.ratio) * float(gear.efficiency_load)) + friction) / float(motor.torque_constant)
 
 
 def _current_fact(robot: Robot, what: str, torque: float, places: str) -> Iterator[DerivedFact]:
@@ -246,11 +246,11 @@ def doubtful_current(runs: Runs, robot: Robot) -> str:
     largest = float(np.nanmax(np.abs(runs[column][turning]), initial=0.0))
     if needed == 0 or not turning.any() or LEAST < largest / needed < MOST:
         return ""
-    theirs = runs.headings.get(column, column)
+    heading = runs.headings.get(column, column)
     return (
-        f"{runs.source}, {theirs}: up to {three_digits(largest)} A, although by the file's numbers the load turns "
+        f"{runs.source}, {heading}: up to {three_digits(largest)} A, although by the file's numbers the load turns "
         f"slowly at {three_digits(needed)} A; is it in another unit (mA, mN·m)? then state [columns] {column} = "
-        f'{{column = "{theirs}", factor = ...}}'
+        f'{{column = "{heading}", factor = ...}}'
     )
 
 
@@ -349,14 +349,14 @@ def saturation_sentence(runs: Runs) -> str:
     inner = read & (drive != 0) & (np.abs(drive) <= INNER * float(np.max(np.abs(drive))))
     if inner.sum() < ROWS_INNER:
         return ""
-    seen = readings @ np.linalg.lstsq(readings[inner], drive[inner], rcond=None)[0]
-    if np.std(seen[inner] - drive[inner]) > FITS * np.std(drive[inner]):
+    predicted = readings @ np.linalg.lstsq(readings[inner], drive[inner], rcond=None)[0]
+    if np.std(predicted[inner] - drive[inner]) > FITS * np.std(drive[inner]):
         return ""
     top = read & (np.abs(drive) >= np.quantile(np.abs(drive[read]), 0.9))
-    limit = float(np.median(np.abs(seen[top])))
+    limit = float(np.median(np.abs(predicted[top])))
     beyond = read & (np.abs(drive) > limit / REACHES)
     # If the voltage that they show still rises, the reason is another one.
-    if beyond.sum() < ROWS_INNER or np.std(np.abs(seen[beyond])) > FITS * limit:
+    if beyond.sum() < ROWS_INNER or np.std(np.abs(predicted[beyond])) > FITS * limit:
         return ""
     row = int(np.flatnonzero(beyond)[0])
     column = "duty" if runs.has("duty") else runs.headings.get(SUPPLY, SUPPLY)
@@ -391,10 +391,10 @@ def doubtful_speed(runs: Runs, robot: Robot) -> str:
     if share < OTHER_UNIT and (braked or robot.has_ground or share > 1 / OTHER_UNIT / 100):
         return ""
     row = int(np.flatnonzero(is_shown)[0])
-    theirs, supply = (runs.headings.get(c, c) for c in (column, SUPPLY))
+    heading, supply = (runs.headings.get(c, c) for c in (column, SUPPLY))
     return (
-        f"{runs.source} row {row + 1}, {theirs}: got {three_digits(abs(read[row]))} rpm, but with the file's "
-        f"torque constant the motors reach at most {three_digits(reached[row])} rpm; check the units of {theirs} "
+        f"{runs.source} row {row + 1}, {heading}: got {three_digits(abs(read[row]))} rpm, but with the file's "
+        f"torque constant the motors reach at most {three_digits(reached[row])} rpm; check the units of {heading} "
         f"and {supply}, and motor.torque_constant"
     )
 
@@ -412,16 +412,16 @@ def doubtful_torque(runs: Runs, robot: Robot) -> str:
     if not runs.has(LOAD) or not (of_current or (robot.rig.imposed == "voltage" and robot.knows(VOLTAGE))):
         return ""
     current = np.abs(applied_drive(runs)) / (1.0 if of_current else float(robot.motor.resistance))
-    lost, made = (_output_torque_at(robot, x) for x in (0.0, 1.0))  # it rises with the current on a line
-    stall = np.maximum(lost + (made - lost) * current, 0.0)
+    torque_at_zero, made = (_output_torque_at(robot, x) for x in (0.0, 1.0))  # it rises with the current on a line
+    stall = np.maximum(torque_at_zero + (made - torque_at_zero) * current, 0.0)
     braked = (runs[LOAD] != 0) & (current > 0)
     beyond = braked & (np.abs(runs[LOAD]) > BEYOND * stall)
     if not braked.any() or beyond.sum() <= braked.sum() / 2:
         return ""
-    row, theirs = int(np.flatnonzero(beyond)[0]), runs.headings.get(LOAD, LOAD)
+    row, heading = int(np.flatnonzero(beyond)[0]), runs.headings.get(LOAD, LOAD)
     return (
-        f"{runs.source} row {row + 1}, {theirs}: got {three_digits(runs[LOAD][row])} N·m, but the motors stall at "
-        f'{three_digits(stall[row])} N·m; is it in mN·m? then state [columns] load_torque_mNm = "{theirs}"'
+        f"{runs.source} row {row + 1}, {heading}: got {three_digits(runs[LOAD][row])} N·m, but the motors stall at "
+        f'{three_digits(stall[row])} N·m; is it in mN·m? then state [columns] load_torque_mNm = "{heading}"'
     )
 
 
@@ -528,8 +528,10 @@ def number_origins(file: RobotFile) -> list[NumberOrigin]:
     origins = []
     for p in params.walk_parameters(robot):
         head, _, rest = p.name.partition(".")
-        mine = head in robot.configurations
-        is_shown = p.name in names_in_file or mine or p.name.startswith(("motor.friction", "gearbox."))
+        is_own_configuration = head in robot.configurations
+        is_shown = (
+            p.name in names_in_file or is_own_configuration or p.name.startswith(("motor.friction", "gearbox."))
+        )
         is_shown |= p.name == rig_file.CENTRE and rig_file.WHEELBASE in names_in_file
         is_shown |= head == BATTERY and any(name.startswith(f"{BATTERY}.") for name in names_in_file)
         assumed = not robot.rig.inherits and (
@@ -544,7 +546,7 @@ def number_origins(file: RobotFile) -> list[NumberOrigin]:
         elif head == BATTERY and not robot.knows([p.name]):
             why = "not stated: an example value; results on the battery depend on it"
         else:
-            why = _reason_of_default(p.name, rest if mine else "")
+            why = _reason_of_default(p.name, rest if is_own_configuration else "")
         origins.append(NumberOrigin(p.name, float(p.value), p.spec.unit, priors.get(p.name), why))
     return origins
 

@@ -91,13 +91,13 @@ def drop_repeated_readings(
     rows_apart = float(np.median(true_periods))
     first_readings = np.full(len(values), np.nan)
     for rows in recordings:
-        shown = rows[np.isfinite(values[rows])]
-        begins = np.flatnonzero(np.concatenate([[True], np.diff(values[shown]) != 0]))[: len(shown)]
-        lengths = np.diff(np.append(begins, len(shown)))
+        finite_rows = rows[np.isfinite(values[rows])]
+        begins = np.flatnonzero(np.concatenate([[True], np.diff(values[finite_rows]) != 0]))[: len(finite_rows)]
+        lengths = np.diff(np.append(begins, len(finite_rows)))
         times = np.maximum(np.floor(lengths / rows_apart + 0.5), 1).astype(int)  # a reading may be the same again
         first = np.repeat(begins, times)
         again = np.arange(len(first)) - np.repeat(np.cumsum(times) - times, times)
-        nearest = shown[np.minimum(first + np.round(again * rows_apart).astype(int), len(shown) - 1)]
+        nearest = finite_rows[np.minimum(first + np.round(again * rows_apart).astype(int), len(finite_rows) - 1)]
         first_readings[nearest] = values[nearest]
     return first_readings, rows_apart
 
@@ -129,10 +129,10 @@ def complete_columns(name: str, columns: Columns, rows: int, layout: Layout) -> 
             raise BadData(too_light_message(f"{name} row {row + 1}", total[row], payload[row]))
     for channel in layout.channels:
         if channel.column in columns and channel.sd_column in columns:
-            lost = np.isfinite(columns[channel.column]) & ~np.isfinite(columns[channel.sd_column])
-            if lost.any():
+            lacks_sd = np.isfinite(columns[channel.column]) & ~np.isfinite(columns[channel.sd_column])
+            if lacks_sd.any():
                 raise BadData(
-                    f"{name} row {int(np.flatnonzero(lost)[0]) + 1}, {channel.sd_column}: got an empty cell next "
+                    f"{name} row {int(np.flatnonzero(lacks_sd)[0]) + 1}, {channel.sd_column}: got an empty cell next "
                     f"to a reading; expected its sd, more than 0 {channel.unit}"
                 )
 
@@ -153,7 +153,7 @@ def distinct_rows(name: str, columns: Columns) -> tuple[np.ndarray, Names]:
             same |= np.isnan(now) & np.isnan(before)
         again = again[same]
     is_distinct[again] = False
-    which = (
+    row_words = (
         f"row {again[0] + 1} is"
         if again.size == 1
         else f"{again.size} rows, the first row {again[0] + 1}, are"
@@ -161,7 +161,7 @@ def distinct_rows(name: str, columns: Columns) -> tuple[np.ndarray, Names]:
         else ""
     )
     note = (
-        f"{name}: {which} a repetition of the row before, with the same time. Repetitions are left out and not "
+        f"{name}: {row_words} a repetition of the row before, with the same time. Repetitions are left out and not "
         "counted in row numbers"
     )
     return is_distinct, (note,) if again.size else ()
@@ -393,9 +393,9 @@ def _driven_mask(name: str, columns: Columns, layout: Layout) -> tuple[np.ndarra
             f"{name}: {zero} is 0 in every row, so nothing drives the motors; expected rows with a "
             f"command{clamp * (layout.imposed == 'motor_speed' and not layout.has_ground)}"
         )
-    which = f"row {idle[0] + 1} is" if idle.size == 1 else f"{idle.size} rows, the first row {idle[0] + 1}, are"
+    row_words = f"row {idle[0] + 1} is" if idle.size == 1 else f"{idle.size} rows, the first row {idle[0] + 1}, are"
     return size != 0, (
-        f"{name}: {which} left out, since nothing drives the motors ({zero or column} is 0); row numbers do not "
+        f"{name}: {row_words} left out, since nothing drives the motors ({zero or column} is 0); row numbers do not "
         "count them"
     )
 
@@ -500,10 +500,10 @@ def missing_data_notes(name: str, columns: Columns, layout: Layout) -> Iterator[
         if several.any():
             run = runs[np.argmax(several)]
             rows = (np.flatnonzero(columns["run_id"] == run) + 1).tolist()
-            which = f"{', '.join(map(str, rows[:5]))}{' and more' if len(rows) > 5 else ''}"
+            row_words = f"{', '.join(map(str, rows[:5]))}{' and more' if len(rows) > 5 else ''}"
             others = f", and so {several.sum() - 1} more" if several.sum() > 1 else ""
             yield (
-                f"{name}: run_id {run} is in rows {which}{others}; without {', '.join(TIME)} every row is a "
+                f"{name}: run_id {run} is in rows {row_words}{others}; without {', '.join(TIME)} every row is a "
                 "separate run"
             )
 

@@ -90,13 +90,13 @@ def read_runs(
     else:
         if isinstance(source, str) and not source:
             raise BadData(f"the source: got an empty path; expected {EXPECTED}")
-        named = isinstance(source, str | Path) and not opening.files_of_group(str(source))
-        if named and not opening.split_source(str(source))[0].exists():
+        is_plain_file = isinstance(source, str | Path) and not opening.files_of_group(str(source))
+        if is_plain_file and not opening.split_source(str(source))[0].exists():
             raise BadData(f"{source}: no such file and no packaged table; packaged: {', '.join(PACKAGED)}")
         reading_found = reading.read_columns(source, layout, preset, between)
         arrays, mapped = reading_found.arrays, reading_found.mapped
-    known = preset is not None or any(layout.meanings(arrays.name, list(dict.fromkeys(arrays.header))))
-    if not known and (name := presets_file.recognise_preset(arrays.header)):
+    has_known_columns = preset is not None or any(layout.meanings(arrays.name, list(dict.fromkeys(arrays.header))))
+    if not has_known_columns and (name := presets_file.recognise_preset(arrays.header)):
         numbers_asked = "".join(f",{key}=..." for key in presets_file.numbers_to_state(name))
         raise BadData(
             f"{arrays.name}: has no column with a known name, but its columns match the preset {name}; add --columns "
@@ -236,11 +236,11 @@ def _join_cell_messages(name: str, said: Sequence[str], count: int) -> str:
     first, *others = said
     if not others:
         return first
-    more, seen = list[str](), {first.partition(";")[2]}
+    more, repeats = list[str](), {first.partition(";")[2]}
     for sentence in others[: LISTED - 1]:
-        what, _, cure = sentence.removeprefix(f"{name} ").partition(";")
-        more.append(what if cure in seen else f"{what};{cure}")
-        seen.add(cure)
+        cell_message, _, cure = sentence.removeprefix(f"{name} ").partition(";")
+        more.append(cell_message if cure in repeats else f"{cell_message};{cure}")
+        repeats.add(cure)
     rest = f"; and {count - LISTED} more" if count > LISTED else ""
     return f"{first}; also {'; '.join(more)}{rest}"
 
@@ -276,8 +276,8 @@ def _values_without_role(raw: Raw) -> np.ndarray:
     if isinstance(raw, np.ndarray):
         return raw
     numbers = column_numbers(raw)
-    lost = np.flatnonzero(np.isnan(numbers))
-    return numbers if missing_readings(raw, lost).all() else np.array(raw)
+    missing_rows = np.flatnonzero(np.isnan(numbers))
+    return numbers if missing_readings(raw, missing_rows).all() else np.array(raw)
 
 
 def _reject_condition_without_effect(arrays: NamedArrays, meaning: Column, raw: Raw, layout: Layout) -> None:

@@ -83,17 +83,17 @@ def check_turns(runs: Runs) -> None:
         BadData: readings of a side that follow the drive of the other side, or a yaw rate that contradicts both.
     """
     left, right = runs.of_sides
-    for what in ("motor_speed", "motor_current"):
-        pair = [channels.find_channel(f"{what}_{side}") for side in channels.SIDES]
+    for quantity in ("motor_speed", "motor_current"):
+        pair = [channels.find_channel(f"{quantity}_{side}") for side in channels.SIDES]
         if not all(c in runs.channels and runs.has(c.column) for c in pair):
             continue
-        one, other = (runs[c.column] for c in pair)
+        left_value, right_value = (runs[c.column] for c in pair)
         drive = right - left
         if any(runs.layout.magnitude(c.name) for c in pair):
-            one, other, drive = np.abs(one), np.abs(other), np.abs(right) - np.abs(left)
+            left_value, right_value, drive = np.abs(left_value), np.abs(right_value), np.abs(right) - np.abs(left)
         columns = f"{pair[0].column} and {pair[1].column}"
         _refuse_against(
-            runs, columns, (one, other), other - one, drive,
+            runs, columns, (left_value, right_value), right_value - left_value, drive,
             "the larger value on the side that is driven faster; the left and right columns of one quantity are "
             "exchanged",
         )  # fmt: skip

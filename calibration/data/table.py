@@ -110,14 +110,14 @@ class Runs:
         """
         if self.channels == robot.channels:
             return self
-        mine = {column for c in robot.channels for column in (c.column, c.sd_column)}
-        if lost := [column for column in self.unknown if column in mine]:
+        own_columns = {column for c in robot.channels for column in (c.column, c.sd_column)}
+        if lost_columns := [column for column in self.unknown if column in own_columns]:
             raise BadData(
-                f"{self.source}, {lost[0]}: this channel of the robot was left out when the table was read; read "
-                "the table with robot=, set to this robot"
+                f"{self.source}, {lost_columns[0]}: this channel of the robot was left out when the table was read; "
+                "read the table with robot=, set to this robot"
             )
-        mine |= {self.layout.imposed_column, IMPOSED[robot.rig.imposed][0], *self.layout.sides}
-        others = {column for c in channels.EVERY for column in (c.column, c.sd_column)} - mine
+        own_columns |= {self.layout.imposed_column, IMPOSED[robot.rig.imposed][0], *self.layout.sides}
+        others = {column for c in channels.EVERY for column in (c.column, c.sd_column)} - own_columns
         remaining_columns = {name: values for name, values in self.columns.items() if name in others}
         return dataclasses.replace(
             self,
@@ -205,14 +205,14 @@ class Runs:
         """Returns a note on each channel with missing readings."""
         notes = []
         for k, channel in enumerate(self.channels):
-            lost = np.flatnonzero(np.isnan(self.measured()[:, k]))
-            if not self.has(channel.column) or lost.size == len(self):
+            missing_rows = np.flatnonzero(np.isnan(self.measured()[:, k]))
+            if not self.has(channel.column) or missing_rows.size == len(self):
                 notes.append(
                     f"{channel.column}: no readings; parameters that only this channel determines are not fitted"
                 )
-            elif lost.size:
-                rows = rows_text(lost.tolist(), 8)
-                notes.append(f"{channel.column}: {lost.size} of {len(self)} readings are missing ({rows})")
+            elif missing_rows.size:
+                rows = rows_text(missing_rows.tolist(), 8)
+                notes.append(f"{channel.column}: {missing_rows.size} of {len(self)} readings are missing ({rows})")
         return notes
 
     def configurations(self, robot: Robot) -> np.ndarray:
@@ -224,7 +224,7 @@ class Runs:
         Raises:
             InputError: a configuration that the robot does not have. The message lists its configurations.
         """
-        which = np.empty(len(self), int)
+        configuration_index = np.empty(len(self), int)
         names = self.configurations_named(robot)
         for name in np.unique(names):
             rows = names == name
@@ -234,8 +234,8 @@ class Runs:
                     f"{self.source} row {first}, configuration: got {name}; expected one of these; "
                     f"{allowed_words(str(name), robot.configurations)}"
                 )
-            which[rows] = robot.configurations.index(str(name))
-        return which
+            configuration_index[rows] = robot.configurations.index(str(name))
+        return configuration_index
 
     def configurations_named(self, robot: Robot) -> np.ndarray:
         """Names of `configurations`. A configuration that the robot does not have keeps the table's name."""
@@ -262,11 +262,13 @@ class Runs:
         """
         from mmrjax.model.conditions import Conditions
 
-        which = self.configurations(robot)
+        configuration_index = self.configurations(robot)
         is_undriven = self["mode"] != DRIVEN[0] if self.has("mode") else np.zeros(len(self), bool)
         adhesion, lateral = np.ones(len(self)), np.ones(len(self))
         if self.has("surface"):
-            on_tracks = np.array([float(c.on_tracks) > 0.5 for c in robot.configurations.members])[which]
+            on_tracks = np.array([float(c.on_tracks) > 0.5 for c in robot.configurations.members])[
+                configuration_index
+            ]
             scaled = surface_labels.rows_of_scaled_adhesion(robot, self["configuration"], self["surface"])
             adhesion[scaled] = [
                 adhesion_ratio(s, t) for s, t in zip(self["surface"][scaled], on_tracks[scaled], strict=True)
@@ -295,7 +297,7 @@ class Runs:
                 if self.has(name):
                     set_values[f"{robot.rig.imposed}_{side}"] = self[name] * factor
         return Conditions(
-            which,
+            configuration_index,
             battery=battery,
             discharge=discharge,
             adhesion=adhesion,

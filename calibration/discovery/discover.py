@@ -331,10 +331,10 @@ def prepare_loop(
             raise BadData(describe(note))
     at_first = (*ready.foreign, *ready.doubted, *remarks_with_codes(ready.checked, "lost_motion"))
     notes_so_far: Notes = (*notes, *ready.checked, *ready.begins, *ready.weighed, *ready.foreign, *ready.doubted)
-    turned = scales.output_rotation(distinct, ready.robot)
+    output_turn = scales.output_rotation(distinct, ready.robot)
     channel_effects = {name: e for name, e in effects.OF_CHANNELS.items() if e.channel in ready.robot.rig.channels}
     library = {**library, **kind.library, **channel_effects}
-    library = scales.scale_library(ready.robot, distinct.conditions(ready.robot), library, turned)
+    library = scales.scale_library(ready.robot, distinct.conditions(ready.robot), library, output_turn)
     settings = dataclasses.replace(
         settings_for(kind, replicates, seed, prefer),
         forbidden=tuple(forbidden),
@@ -470,8 +470,8 @@ class LoopStages:
 
 def _fit_base_and_noise(given: LoopInput, ranked: list[EffectRanking]) -> tuple[Screening, VerdictNoise]:
     """Fits the base. If its residuals have no structure but exceed the noise by one factor, rescales the noise."""
-    known, noise = given.known, given.noise
-    screened = given.screen(noise, None if known is None else known.screened.base, ranked)
+    known_stages, noise = given.known, given.noise
+    screened = given.screen(noise, None if known_stages is None else known_stages.screened.base, ranked)
     base, free = screened.base, screened.base.space.free
     residuals = _residual_tests(base.space, given.runs, screened.diagnosed[0], base.reading, base.candidate.z[:free])
     factors = {} if screened.cluster is not None else common_factors(residuals)
@@ -487,8 +487,12 @@ def _test_base(given: LoopInput, sds: VerdictNoise, screened: Screening) -> tupl
     """Tests the base fit by bootstrap. The returned fit also has a program for the sets of effects to be
     simulated.
     """
-    known, weight = given.known, screened.base.space.weight
-    null = None if known is None or np.any(known.screened.base.space.weight != weight) else known.left.test.null
+    known_stages, weight = given.known, screened.base.space.weight
+    null = (
+        None
+        if known_stages is None or np.any(known_stages.screened.base.space.weight != weight)
+        else known_stages.left.test.null
+    )
     base, (linear, scores, _) = screened.base, screened.diagnosed
     space = include_likely_effects(base.space, base.candidate, linear, scores, given.settings)
     screened = dataclasses.replace(screened, base=dataclasses.replace(base, space=space))
@@ -565,7 +569,7 @@ def _reach_verdict(
     runs, settings, progress = given.runs, given.settings, given.progress
     base, space, bases = screened.base.candidate, screened.base.space, screened.bases
     beside, predicted = BaseCurve(space, base, left, bases), Predicted()
-    where = dataclasses.replace(beside.where, by_duty=varied_by_duty(runs))
+    location = dataclasses.replace(beside.where, by_duty=varied_by_duty(runs))
     model, searched, stood = choose_effects(runs, screened, left, searched, settings, progress, beside, predicted)
     stages = functools.partial(LoopStages, beside=beside, predicted=predicted)
     leaves: tuple[MissedChannel, ...] = ()
@@ -586,17 +590,17 @@ def _reach_verdict(
         progress(progress_remark("mechanism"))
         ladder = [c for c in (*searched.ladder, *([] if model is None else model[:1]))]
         mechanism = find_mechanism(space, runs, base, left, ladder, bases, beside, predicted, settings)
-        mechanism = mechanism and _with_ammeter_alternatives(space, mechanism, left.linear, bases, where, settings)
+        mechanism = mechanism and _with_ammeter_alternatives(space, mechanism, left.linear, bases, location, settings)
         level = "place" if mechanism is None or mechanism.fails else "mechanism"
     if model is None:
-        return stages(level, screened, left, sds, searched, where=where, standing=stood, mechanism=mechanism)
+        return stages(level, screened, left, sds, searched, where=location, standing=stood, mechanism=mechanism)
 
     searched = dataclasses.replace(searched, best=model[0], diagnosis=model[1])
     best, after = model
     progress(progress_remark("alike", best.effects))
     alike = find_classes(space, base, best, searched.ladder, left, after, settings)
     if not any(established_names):
-        return stages(level, screened, left, sds, searched, alike, where, standing=stood, mechanism=mechanism)
+        return stages(level, screened, left, sds, searched, alike, location, standing=stood, mechanism=mechanism)
     compared: tuple[HeldOutAlternative, ...] = ()
     if settings.prefer == HELD_OUT:
         progress(progress_remark("held out"))
@@ -659,7 +663,7 @@ def choose_effects(
         return None, searched, judge_names(space, base, searched, left, bases, settings)
     adequate = not after.test.rejected_with_margin
     kinds = blocks_room.predictable_blocks(runs, space.bare)
-    blocks = [mask for by in kinds.values() for mask in by.values()]
+    blocks = [mask for blocks_by_name in kinds.values() for mask in blocks_by_name.values()]
     support_of = functools.partial(
         judge_names, space, base, searched, left, bases, settings, blocks=blocks, beside=beside
     )
@@ -924,13 +928,13 @@ def assemble_result(given: LoopInput, traced: LoopStages) -> DiscoveryResult:
     progress(progress_remark("errors"))
     predictions = [traced.predicted.get(prediction.candidate_key(c)) for c in (base, best)]
     kinds = blocks_room.predictable_blocks(runs, space.bare)
-    seen = findings.readings_of_rows(
+    row_readings = findings.readings_of_rows(
         runs, noise.sd, kinds, before, after, predictions[0], None if best is base else predictions[1]
     )
     compared = traced.held_out
     if traced.alike is not None and not nameless and not compared and not observe.long:
         compared = preference.compare_alternatives(space, runs, best, traced.alike)
-    gains = _hold_out_gains(space, runs, traced, seen)
+    gains = _hold_out_gains(space, runs, traced, row_readings)
     gain = gains[-1][1] if gains and after is not None else None
     # What is written never predicts worse than the refit. A curve, which claims no cause, has to predict better.
     written = gain is None or (gain.mean > gain.se if best is base else gain.mean >= -prediction.WORSE)
@@ -941,11 +945,11 @@ def assemble_result(given: LoopInput, traced: LoopStages) -> DiscoveryResult:
         robot, converged = findings.proposed_robot(space, fit), fit.converged
         posterior = posterior_of_fit(space, fit.active, fit.z, of_fit.linear)
     progress(progress_remark("next"))
-    remaining = _residual_tests(space, runs, ends.linear, seen.after, z)
+    remaining = _residual_tests(space, runs, ends.linear, row_readings.after, z)
 
     def error(simulated: np.ndarray) -> Errors:
         simulated = np.where(included[:, None], simulated, np.nan)
-        return channel_errors(space.bare.channels, simulated, seen.measured, seen.sd)
+        return channel_errors(space.bare.channels, simulated, row_readings.measured, row_readings.sd)
 
     ladder = () if traced.searched is None else traced.searched.ladder
     ladder = ladder if traced.alike is None else traced.alike.ladder
@@ -957,8 +961,8 @@ def assemble_result(given: LoopInput, traced: LoopStages) -> DiscoveryResult:
         if not nameless:
             ask = observe.menu and not observe.long
             concealed = find_hidden_effects(space, best, traced.alike, diagnosis, traced.ends, settings, ask=ask)
-    listed = findings.effect_scores(space, diagnosis.scores, settings)
-    library_places = space.library.indices([s.name for s in listed])
+    scores = findings.effect_scores(space, diagnosis.scores, settings)
+    library_places = space.library.indices([s.name for s in scores])
     summary, kind = verdict_summary(traced, numbers), type(observe)
     result = DiscoveryResult(
         verdict=traced.verdict,
@@ -996,15 +1000,17 @@ def assemble_result(given: LoopInput, traced: LoopStages) -> DiscoveryResult:
         chi2=(2 * base.cost, 2 * cost),
         readings=int(np.sum(space.weight > 0)),
         base_shift=findings.parameter_shifts(space, base.z, z, sd),
-        scores=listed,
+        scores=scores,
         cosine=signature_cosines(space, diagnosis.scores)[np.ix_(library_places, library_places)],
         detail=observe.detail(screened.bases, included, diagnosis, ends),
-        readings_of_rows=seen,
-        errors_as_stated=error(seen.as_stated),
-        errors=errors_on_common_rows(seen.before, seen.after, error),
-        errors_held_out={k: errors_on_common_rows(*both, error) for k, both in seen.held_out.items()},
+        readings_of_rows=row_readings,
+        errors_as_stated=error(row_readings.as_stated),
+        errors=errors_on_common_rows(row_readings.before, row_readings.after, error),
+        errors_held_out={
+            k: errors_on_common_rows(*error_pair, error) for k, error_pair in row_readings.held_out.items()
+        },
         held_out_unpredictable=blocks_room.unpredictable_kinds(runs, space.bare),
-        held_out_worse=preference.worse_predictions(seen.held_out, error),
+        held_out_worse=preference.worse_predictions(row_readings.held_out, error),
         alternatives_held_out=compared,
         noise=_noise_by_channel(runs, noise, kind),
         settings=settings,
@@ -1013,7 +1019,7 @@ def assemble_result(given: LoopInput, traced: LoopStages) -> DiscoveryResult:
     # A temporary change is not uniform.
     of_noise = noise_remarks_before_verdict(traced.sds, remaining) if traced.sds.factors or not traced.events else ()
     return dataclasses.replace(
-        result, remarks=(*of_noise, *worse_than_stated(seen, noise, included), *loop_remarks(result))
+        result, remarks=(*of_noise, *worse_than_stated(row_readings, noise, included), *loop_remarks(result))
     )
 
 
@@ -1156,9 +1162,9 @@ def loop_remarks(found: DiscoveryResult) -> Notes:
     if not found.written and found.gain is not None:
         remarks.append(Remark("unwritten", curve=not found.effects, gain=found.gain.mean, se=found.gain.se))
     remarks += preference.leader_remarks(found.alternatives_held_out, found.settings.prefer)
-    settled, asked = found.replicates, found.settings.replicates
-    if settled < 0.9 * asked:
-        remarks.append(Remark("lost_replicates", settled=settled, asked=asked))
+    settled, replicates_asked = found.replicates, found.settings.replicates
+    if settled < 0.9 * replicates_asked:
+        remarks.append(Remark("lost_replicates", settled=settled, asked=replicates_asked))
     if 1 / (1 + settled) > min(found.settings.shares.values()):
         remarks.append(Remark("too_few_replicates", settled=settled))
     return tuple(remarks)

@@ -407,9 +407,14 @@ def experiment_menu(reach: Reach) -> tuple[Experiment, ...]:
     `possible_runs`.
     """
     if reach.imposed != "voltage" or not reach.has_ground:
-        runs: tuple[ProposedRuns, ...] = tuple(r for used in reach.used for r in _shaft_runs(reach, used))
+        runs: tuple[ProposedRuns, ...] = tuple(
+            r for used_conditions in reach.used for r in _shaft_runs(reach, used_conditions)
+        )
     else:
-        runs = (*_motor_runs(reach), *(r for used in reach.used for r in _travel_runs(reach, used)))
+        runs = (
+            *_motor_runs(reach),
+            *(r for used_conditions in reach.used for r in _travel_runs(reach, used_conditions)),
+        )
     return (*calibration_acts(reach), *(r for r in runs if r.channels))
 
 
@@ -424,13 +429,13 @@ def _shaft_runs(reach: Reach, used: UsedConditions) -> tuple[ProposedRuns, ...]:
     top = round_significant(1.3 * high) if 1.3 * high < allowed else floor_significant(max(allowed, high))
     between = 0.5 * (sizes[0] + high) if top > high else 0.5 * (low + high)
     others = tuple(sorted({round_significant(low), round_significant(between), top}))
-    both = any(x < 0 for x in levels) and any(x > 0 for x in levels)
+    has_both_signs = any(x < 0 for x in levels) and any(x > 0 for x in levels)
     torques = other_torques(reach.torques)
     way = -1.0 if levels[-1] > 0 else 1.0  # also of a brake, which acts against the rotation
     experiments = [
         _combined_runs(reach, others_of[reach.imposed], "run", kinds=("other voltages",), at=used,
               voltages=others),
-        *([] if both else [
+        *([] if has_both_signs else [
             _combined_runs(reach, "reverse", "other way", at=used, voltages=[way * x for x in (sizes[0], sizes[-1])],
                   torques=[0.0, *(way * x for x in torques[1:2])])
         ]),

@@ -117,13 +117,13 @@ def map_over_runs(function: Callable[..., T], robot: Robot, experiments: Experim
         dataclasses.replace(setup(robot, braked), sides=robot.sides if sides is None else sides)
         for setup, sides in experiments.set_up
     ]
-    which = np.asarray(experiments.which)
+    run_index = np.asarray(experiments.which)
 
     def all_identical(*x: Any) -> bool:  # in all setups
         return all(v is x[0] for v in x)
 
     robots = jax.tree.map(
-        lambda *x: x[0] if all_identical(*x) else jnp.stack([jnp.asarray(v) for v in x])[which], *batch_axes
+        lambda *x: x[0] if all_identical(*x) else jnp.stack([jnp.asarray(v) for v in x])[run_index], *batch_axes
     )
     axes = jax.tree.map(lambda *x: None if all_identical(*x) else 0, *batch_axes)
     return jax.vmap(function, in_axes=(axes, 0, *[0] * len(own)))(robots, conditions, *own)
@@ -137,7 +137,7 @@ def predict_readings(
     Returns the readings of each calibration, the readings of each run at the given unknowns, shape (runs, channels),
     the residuals of the equations there, shape (runs, unknowns), and all predictions.
     """
-    acts = tuple(act(robot, at) for act, at in zip(experiments.acts, experiments.at, strict=True))
+    acts = tuple(act(robot, arguments) for act, arguments in zip(experiments.acts, experiments.at, strict=True))
     result, _, residual = map_over_runs(IMPLICIT.shown, robot, experiments, unknowns, found)
     all_readings = jnp.stack([result.reading[c] for c in channels.channel_names(robot.channels)], -1)
     is_held = np.array([experiments.set_up[k][0] is menu.locked for k in experiments.which])
@@ -190,10 +190,10 @@ def reading_sds(experiments: Sequence[Experiment], of_channels: Mapping[str, flo
     """
     sds = [np.zeros(0)]
     for e in experiments:
-        one = (
+        one_sd = (
             [of_channels[e.channel] if e.sd is None else e.sd] * len(e.at)
             if isinstance(e, CalibrationAct)
             else np.tile([of_channels[c] for c in e.channels], len(e.voltage))
         )
-        sds.append(np.asarray(one, float) / math.sqrt(e.repeats))
+        sds.append(np.asarray(one_sd, float) / math.sqrt(e.repeats))
     return np.concatenate(sds)

@@ -75,8 +75,13 @@ def compare_alternatives(
         reading = predict_unseen(problem, z, masks, active).reading
         return np.where(counts, (reading - measured) / sd, np.nan)
 
-    errors = [{kind: residuals_in_sds(c, list(by.values())) for kind, by in kinds.items()} for c in alternatives]
-    held_out = {kind: counts & np.any(list(by.values()), 0)[:, None] for kind, by in kinds.items()}
+    errors = [
+        {kind: residuals_in_sds(c, list(blocks_by_name.values())) for kind, blocks_by_name in kinds.items()}
+        for c in alternatives
+    ]
+    held_out = {
+        kind: counts & np.any(list(blocks_by_name.values()), 0)[:, None] for kind, blocks_by_name in kinds.items()
+    }
     common = {kind: np.all([np.isfinite(e[kind]) for e in errors], 0) for kind in kinds}
 
     def rms(e: Columns, blocks: Sequence[str]) -> float:

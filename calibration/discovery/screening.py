@@ -189,9 +189,9 @@ def _first_to_simulate(space: CandidateSpace, order: Sequence[Candidate]) -> lis
     if not sound:
         return list(order[:1])
     of_others = [c for c in sound if families(c) != families(sound[0])]
-    chosen = [sound[0], *of_others[:1], *sound[1:]]
-    chosen = list({c.active: c for c in chosen}.values())[:CONFIRMED]
-    return [*chosen, *(c for c in order[:1] if not c.plausible)]
+    candidates = [sound[0], *of_others[:1], *sound[1:]]
+    candidates = list({c.active: c for c in candidates}.values())[:CONFIRMED]
+    return [*candidates, *(c for c in order[:1] if not c.plausible)]
 
 
 @dataclasses.dataclass(frozen=True)

@@ -276,7 +276,7 @@ class OneSidedLevenbergMarquardt(optx.AbstractLeastSquaresSolver[Z, Array, Any, 
         alike = jnp.all(linearised.positive == before.positive)
         accepted &= first | alike | ~state.mixed
         region = _select(state.mixed & ~accepted, state.region, region)
-        ended = self._is_small(state.ahead, state_after_step, linearised, before) & accepted
+        has_converged = self._is_small(state.ahead, state_after_step, linearised, before) & accepted
 
         corrected = state.slope
         if self.rough:
@@ -294,8 +294,8 @@ class OneSidedLevenbergMarquardt(optx.AbstractLeastSquaresSolver[Z, Array, Any, 
         mixed = accepted & alike & (state.steps > 1) & (jnp.max(jnp.abs(stride)) < self.near)
         ahead = y + jnp.where(mixed, mixed_step(stride, state_after_step, stride - state.stride), stride)
         rejected = jnp.where(accepted, 0, state.rejected + 1)
-        over = ended | (rejected >= PATIENCE)
-        new = SearchState(best, slope, aux, stride, ahead, mixed, region, state.steps + 1, rejected, over)
+        is_over = has_converged | (rejected >= PATIENCE)
+        new = SearchState(best, slope, aux, stride, ahead, mixed, region, state.steps + 1, rejected, is_over)
         return y, new, aux
 
     def _is_small(self, y: Z, moved: Z, found: SolverLinearisation, before: SolverLinearisation) -> Array:

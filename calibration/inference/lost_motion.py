@@ -45,15 +45,19 @@ def lost_motion_notes(runs: Runs, robot: Robot) -> list[Remark]:
     reversals = int(np.sum(np.abs(reversed_)))
     if reversals < REVERSALS or len(motion) < 2 * REVERSALS:
         return []
-    sets = [[integral]] if turning else [[integral, taken, faster, driven] for taken in clipped]
+    sets = [[integral]] if turning else [[integral, regressor, faster, driven] for regressor in clipped]
     _, width, sd, explained = min(_fit_lost_angle(motion, reversed_, np.stack(x, 1)) for x in sets)
-    lost, stiffness, load = width > SURE * sd and explained > EXPLAINED, 0.0, robot.configurations.members[0]
+    is_lost, stiffness, load = (
+        width > SURE * sd and explained > EXPLAINED,
+        0.0,
+        robot.configurations.members[0],
+    )
     radius = float(load.radius) if channel.name == "position" else 1.0
     if turning:
         _, late, sd, explained = _fit_lost_angle(curved, bent, np.stack([integral, faster, reversed_], 1))
         if late > SURE * sd and explained > EXPLAINED:
             stiffness, width = float(load.inertia) * radius / late, late * np.sqrt(np.mean(bent**2))
-    if not (lost or stiffness):
+    if not (is_lost or stiffness):
         return []
     return [
         Remark(

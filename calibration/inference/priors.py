@@ -363,14 +363,14 @@ def choose_free_names(
             nothing is left to fit.
     """
     everything = list(parameters_by_name(robot))
-    chosen: list[str] = []
+    free_names: list[str] = []
     for word in free:
-        chosen += default if word == "default" else expand_name(word, everything, "--free")
+        free_names += default if word == "default" else expand_name(word, everything, "--free")
     fixed = [n for word in fix for n in expand_name(word, everything, "--fix")]
-    both = [word for word in free if word in fix]
-    if both:
-        raise BadConfiguration(f"--free and --fix both name {both[0]}; name it once")
-    names = [n for n in dict.fromkeys(chosen if free else default) if n not in fixed]
+    conflicting = [word for word in free if word in fix]
+    if conflicting:
+        raise BadConfiguration(f"--free and --fix both name {conflicting[0]}; name it once")
+    names = [n for n in dict.fromkeys(free_names if free else default) if n not in fixed]
     if not names and not fix:
         raise BadConfiguration(
             "no parameter to fit: every loss in the robot's file is zero or exact, so it is fixed, and no value "

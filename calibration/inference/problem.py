@@ -159,8 +159,8 @@ class Problem(eqx.Module):
 
     def excess(self, seen: Observation, data: Data) -> Float[Array, " rows"]:
         """Used adhesion above the margin, in units of the penalty, shape (rows,). Negative within the margin."""
-        over = (seen.adhesion_used - (1 - MARGIN)) * jnp.max(data.weight, 1) / data.stiffness
-        return jnp.where(jnp.isfinite(over), over, 0.0)
+        adhesion_excess = (seen.adhesion_used - (1 - MARGIN)) * jnp.max(data.weight, 1) / data.stiffness
+        return jnp.where(jnp.isfinite(adhesion_excess), adhesion_excess, 0.0)
 
     def robot(self, z: Float[Array, " parameters"]) -> Robot:
         """Robot at coordinates z."""

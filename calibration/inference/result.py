@@ -369,7 +369,10 @@ class CalibrationResult:
         fits = {"before": self.errors_before, "after": self.errors_after}
         if self.main_blocks is not None:
             fits["held_out"] = self.main_blocks.errors
-        return {fit: {name: e.rms for name, e in by.items() if e.rows} for fit, by in fits.items()}
+        return {
+            fit: {name: e.rms for name, e in errors_by_channel.items() if e.rows}
+            for fit, errors_by_channel in fits.items()
+        }
 
     def to_json(self) -> Json:
         """Content of result.json, as described in docs/schemas/calibrate.schema.json."""

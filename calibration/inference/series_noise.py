@@ -138,8 +138,8 @@ def _noise_of_channel(
     that of the mixture by 2.2. Instruments of motors at rest show 0 without noise, so such readings do not count.
     """
     measured = np.where(channel.zero_at_rest & (measured == 0), np.nan, measured)
-    weights, used = _differences_from_neighbours(measured, x, series)
-    if not used:
+    weights, rows_used = _differences_from_neighbours(measured, x, series)
+    if not rows_used:
         return None
     difference = weights @ np.nan_to_num(measured)
     least = float(display_step(measured, channel) / np.sqrt(12))
@@ -157,7 +157,7 @@ def _noise_of_channel(
     likely, size, freedom = np.array(forms).T
     probability = np.exp(likely - likely.max()) / np.exp(likely - likely.max()).sum()
     floor, *share = (np.sqrt(probability) * size * (probability > NEGLIGIBLE)).tolist()
-    return SeriesNoise(channel, floor, sum(share, 0.0), float(probability @ freedom), axis, used, least)
+    return SeriesNoise(channel, floor, sum(share, 0.0), float(probability @ freedom), axis, rows_used, least)
 
 
 def _differences_from_neighbours(
@@ -168,7 +168,7 @@ def _differences_from_neighbours(
 
     The weights have the shape (differences, rows). Only series with at least one difference are counted.
     """
-    differences, used = [], 0
+    differences, rows_used = [], 0
     for rows in series:
         rows = rows[np.isfinite(measured[rows])]
         rows = rows[np.argsort(x[rows], kind="stable")]
@@ -179,8 +179,10 @@ def _differences_from_neighbours(
         weights = np.concatenate([-share, np.ones(len(middle)), share - 1.0])
         second_differences = k, np.concatenate([before, middle, after])
         differences.append(sparse.csr_array((weights, second_differences), (len(middle), len(measured))))
-        used += bool(len(middle))
-    return sparse.csr_array(sparse.vstack(differences)) if differences else sparse.csr_array((0, len(measured))), used
+        rows_used += bool(len(middle))
+    return sparse.csr_array(sparse.vstack(differences)) if differences else sparse.csr_array(
+        (0, len(measured))
+    ), rows_used
 
 
 def _sound_differences(unit: np.ndarray, limit: float) -> tuple[np.ndarray, float]:

@@ -298,12 +298,12 @@ def local_slopes(time: np.ndarray, values: np.ndarray, piece: np.ndarray, count:
             continue
         low = np.clip(np.arange(begin, end) - wide // 2, begin, end - wide)
         for part in np.array_split(np.arange(end - begin), 1 + (end - begin) * wide // 1_000_000):
-            near, here = low[part][:, None] + np.arange(wide), (begin + part)[:, None]
-            away = time[near] - time[here]
+            near, row_index = low[part][:, None] + np.arange(wide), (begin + part)[:, None]
+            away = time[near] - time[row_index]
             scale = np.abs(away).max()
             powers = (away / scale)[:, :, None] ** np.arange(4)
             normal = np.einsum("nwi,nwj->nij", powers, powers)
-            rise = np.einsum("nwi,nw->ni", powers, values[near] - values[here])
+            rise = np.einsum("nwi,nw->ni", powers, values[near] - values[row_index])
             out[begin + part] = np.linalg.solve(normal, rise[..., None])[:, 1, 0] / scale
     return out
 
@@ -459,9 +459,9 @@ def points_and_windows(
     piece = np.where(usable, np.cumsum(np.r_[False, (np.diff(apart) != 0) | (np.diff(way) != 0)]), -1)
     if plan.angle:
         rate = local_slopes(time, readings[:, plan.motion], piece, wide)
-    turned = np.cumsum(np.where(since > 0, 0.5 * (speed + np.roll(speed, 1)) * since, 0.0))
+    turned_angle = np.cumsum(np.where(since > 0, 0.5 * (speed + np.roll(speed, 1)) * since, 0.0))
     none = np.zeros(len(run))
-    arrays = readings, sd, rate, way, turned - turned[count[:-1]][run], since, time, joined["row"]
+    arrays = readings, sd, rate, way, turned_angle - turned_angle[count[:-1]][run], since, time, joined["row"]
     late = none + delay, none + log.step, drift
     windows = [
         _weight_windows(r, time, windows_of_run(time, np.where(run == r, piece, -1), length))

@@ -87,7 +87,7 @@ def chosen_outputs(words: Names, robot: Robot, turns: bool = False) -> tuple[Qua
         BadConfiguration: a name is unknown (the message lists the choices). Also if an output needs a ground or
             stance that the robot lacks, a turn while it travels straight, or straight travel while it turns.
     """
-    outputs, chosen = known_outputs(robot), []
+    outputs, outputs_chosen = known_outputs(robot), []
     start = tuple(d.name for d in derived.OF_START)
     of_turns = {*(o.name for o in derived.OF_TURNS), *(c.name for c in channels.OF_TURNS if c.settled)}
     for word in words or default_outputs(robot, turns):
@@ -113,8 +113,8 @@ def chosen_outputs(words: Names, robot: Robot, turns: bool = False) -> tuple[Qua
                 )
             if row in derived.OF_POSTURE and (why := reason_without_stance(robot)):
                 raise BadConfiguration(f"--outputs {name}: {why}")
-            chosen.append(row)
-    return tuple(dict.fromkeys(chosen))
+            outputs_chosen.append(row)
+    return tuple(dict.fromkeys(outputs_chosen))
 
 
 @dataclasses.dataclass(frozen=True)

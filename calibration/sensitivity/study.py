@@ -118,8 +118,8 @@ class Study:
     def statuses(self) -> dict[str, dict[str, int]]:
         """Source → status → number of evaluations in the sample."""
         return {
-            source_words(source): count_statuses(np.repeat(np.arange(len(whole)), whole))
-            for source, whole in self.sampled.items()
+            source_words(source): count_statuses(np.repeat(np.arange(len(source_outputs)), source_outputs))
+            for source, source_outputs in self.sampled.items()
         }
 
 

@@ -82,11 +82,11 @@ def margin_chart(robot: Robot, asked: Requirements, most: tuple[float, float]) -
     first = jax.tree.map(lambda x: np.asarray(x)[-1], base)
     s, p = (x.ravel() for x in np.meshgrid(slope, payload, indexing="ij"))
     speeds = [r for r in asked.each if r.quantity.group == "travel" and r.name.startswith("speed") and r.least]
-    wanted = np.zeros(len(p))
+    power_needed = np.zeros(len(p))
     for r in speeds:
         v = r.envelope
         inside = (p >= v.payload_kg[0]) & (p <= v.payload_kg[1]) & (s >= v.slope_deg[0]) & (s <= v.slope_deg[1])
-        wanted = np.where(inside, np.maximum(wanted, r.limit or 0.0), wanted)
+        power_needed = np.where(inside, np.maximum(power_needed, r.limit or 0.0), power_needed)
     robot = params.without_weak_types(robot)
     permitted = jnp.asarray([robot.motor.speed_limit, robot.gearbox.speed_limit])
     margins = None
@@ -95,7 +95,7 @@ def margin_chart(robot: Robot, asked: Requirements, most: tuple[float, float]) -
         points = dataclasses.replace(
             points, payload=jnp.asarray(p), slope_deg=jnp.asarray(s), charge=jnp.full(len(p), charge)
         )
-        margin_grid = np.asarray(_margins(robot, ratings(robot), points, permitted, jnp.asarray(wanted)))
+        margin_grid = np.asarray(_margins(robot, ratings(robot), points, permitted, jnp.asarray(power_needed)))
         margins = margin_grid if margins is None else np.minimum(margins, margin_grid)
     assert margins is not None
     margins = np.where(np.isfinite(margins), margins, -1.0)

@@ -274,9 +274,9 @@ def size_robot(
     for name in objectives:
         stated_word(name, OBJECTIVES, "objective")
     sheet.reject_impossible(robot, asked)
-    chosen = options_for_robot(robot, motors)
-    problem = build_sizing_task(robot, asked, chosen)
-    choice = enumerate_choices(robot, problem, chosen)
+    part_options = options_for_robot(robot, motors)
+    problem = build_sizing_task(robot, asked, part_options)
+    choice = enumerate_choices(robot, problem, part_options)
     columns = [list(OBJECTIVES).index(name) for name in objectives]
     tell(progress_remark("designs"))
     drawn = _random_designs(problem, choice, "cost" in objectives, np.random.default_rng(seed))
@@ -300,7 +300,7 @@ def size_robot(
 
     everything, by_motor = free + real, dict[str, SizedDesign]()
     for k in np.argsort(search.cost(everything)):
-        name = chosen.drives[choice.drive[everything.rows[k]]].motor.name
+        name = part_options.drives[choice.drive[everything.rows[k]]].motor.name
         if name not in by_motor:  # building a robot takes time, and there are a thousand designs
             by_motor[name] = found(everything, int(k))
     good = [k for k in range(len(real.rows)) if np.all(real.g[k][is_feasible] >= 0)]
@@ -311,7 +311,7 @@ def size_robot(
     ideal = int(np.argmin(search.cost(free)))
     front = [found(real, k) for k in _pareto_front(real.f[:, columns], good)] if len(columns) == 2 else []
     return SizingResult(
-        problem, chosen, objectives[0], unmeetable,
+        problem, part_options, objectives[0], unmeetable,
         found(free, ideal) if np.all(free.g[ideal][is_feasible] >= 0) else None,
         best[0] if best else None, tuple(best[1:]), by_motor, tuple(front), starts, evaluated,
     )  # fmt: skip
@@ -445,20 +445,20 @@ def _start_designs(choice: ChoiceSpace, rows: np.ndarray, merit: np.ndarray, cou
     """Best designs to start from: some for each motor, then the best of all, with few from one choice."""
     order = np.argsort(np.where(np.isfinite(merit), merit, 1e9))
     motor = [choice.options.drives[d].motor.name for d in choice.drive]
-    taken: list[int] = []
+    start_indices: list[int] = []
     of_motor: dict[str, int] = {}
     of_choice: dict[int, int] = {}
     for least in (True, False):
         for k in order:
             c = int(rows[k])
             name = motor[c]
-            if len(taken) == count or (least and of_motor.get(name, 0) >= OF_MOTOR):
+            if len(start_indices) == count or (least and of_motor.get(name, 0) >= OF_MOTOR):
                 continue
-            if of_choice.get(c, 0) >= OF_CHOICE or k in taken[: len(taken) if not least else 0]:
+            if of_choice.get(c, 0) >= OF_CHOICE or k in start_indices[: len(start_indices) if not least else 0]:
                 continue
-            taken.append(int(k))
+            start_indices.append(int(k))
             of_motor[name], of_choice[c] = of_motor.get(name, 0) + 1, of_choice.get(c, 0) + 1
-    return np.resize(np.array(taken), count)
+    return np.resize(np.array(start_indices), count)
 
 
 def _cost(f: np.ndarray, g: np.ndarray, kept: np.ndarray, weights: np.ndarray) -> np.ndarray:
@@ -509,8 +509,8 @@ def _nearest_buildable(
         ):
             key = (int(rows[k]), ratio, p)
             made.setdefault(key, (rows[k], [math.log(ratio), x[k, 1], math.log(p)], weights[k]))
-    chosen, points, w = zip(*made.values(), strict=True)
-    return np.array(chosen), np.array(points), np.array(w)
+    choices, points, w = zip(*made.values(), strict=True)
+    return np.array(choices), np.array(points), np.array(w)
 
 
 def _best_buildable(

@@ -80,15 +80,15 @@ def only_together(pairs: tuple[fit_notes.DependentPair, ...]) -> str:
 
 def of_rows(rows: tuple[int, ...], what: str, share: float = 0.0) -> str:
     """Rows with a property, and its consequence."""
-    listed = f"rows {', '.join(map(str, rows))}"
+    row_words = f"rows {', '.join(map(str, rows))}"
     if what == "limited":
         return (
-            f"{listed} are within {share:.0%} of the adhesion limit. They give a lower bound for static friction, "
+            f"{row_words} are within {share:.0%} of the adhesion limit. They give a lower bound for static friction, "
             "which does not explain all of their slip"
         )
     if what == "jumps":
-        return f"{listed}: the calibrated robot's running gear jumps off the ground at times"
-    return f"{listed}: {what} with the calibrated robot"
+        return f"{row_words}: the calibrated robot's running gear jumps off the ground at times"
+    return f"{row_words}: {what} with the calibrated robot"
 
 
 def search_agreement(starts: int, agree: int, elsewhere: int, more: float, open: int) -> str:
@@ -129,16 +129,16 @@ def search_generations(members: int, generations: int, settled: bool) -> str:
 
 def lost_rows(members: dict[str, int]) -> str:
     """Members with a row that is lost."""
-    lost = ", ".join(f"{members[status]} {how}" for status, how in LOST_AS.items() if status in members)
-    return f"members that fail in at least one row: {lost}; they rank below the others"
+    row_outcomes = ", ".join(f"{members[status]} {how}" for status, how in LOST_AS.items() if status in members)
+    return f"members that fail in at least one row: {row_outcomes}; they rank below the others"
 
 
 def members_jump(members: int, best: tuple[int, ...]) -> str:
     """Members whose running gear jumps."""
-    where = f"rows {', '.join(map(str, best))}" if best else "none"
+    row_words = f"rows {', '.join(map(str, best))}" if best else "none"
     return (
         f"{members} members jump in at least one row: the weight passes between guides and pulleys so hard that "
-        f"they leave the ground at times; the best member does so in {where}"
+        f"they leave the ground at times; the best member does so in {row_words}"
     )
 
 
@@ -227,18 +227,20 @@ def calibration_answer(found: CalibrationResult) -> str:
     channel_errors, rows = list[tuple[str, str]](), dict[str, int]()
     for c in found.channels:
         r = found.readings[c.name]
-        both = np.isfinite(r.measured) & np.isfinite(r.before) & np.isfinite(r.after)
-        if both.any():
-            size = root_mean_square(r.measured[both])
-            before, after = (100 * root_mean_square((x - r.measured)[both]) / size for x in (r.before, r.after))
-            rows[c.label] = int(both.sum())
+        is_compared = np.isfinite(r.measured) & np.isfinite(r.before) & np.isfinite(r.after)
+        if is_compared.any():
+            size = root_mean_square(r.measured[is_compared])
+            before, after = (
+                100 * root_mean_square((x - r.measured)[is_compared]) / size for x in (r.before, r.after)
+            )
+            rows[c.label] = int(is_compared.sum())
             channel_errors.append((c.label, f"{c.label} {before:.1f} → {after:.1f} %"))
     if not channel_errors:
         return f"{_VERDICTS[found.adequacy.adequate]}; the model reaches no row both before and after the fit."
     same = len(set(rows.values())) == 1
     errors = ", ".join(text + ("" if same else f" ({rows[label]} rows)") for label, text in channel_errors)
-    where = f"the same {count_noun(max(rows.values()), 'row')}" if same else "the same rows"
-    return f"{_VERDICTS[found.adequacy.adequate]}; rms error before → after on {where}: {errors}."
+    row_words = f"the same {count_noun(max(rows.values()), 'row')}" if same else "the same rows"
+    return f"{_VERDICTS[found.adequacy.adequate]}; rms error before → after on {row_words}: {errors}."
 
 
 #: Levels of a cluster that are listed, the farthest from nothing.
@@ -247,14 +249,14 @@ LISTED = 6
 
 def residual_cluster(c: ResidualCluster) -> str:
     """Residuals that go with a column without a role."""
-    what = f"residuals of {channels.find_channel(c.channel).label}"
+    subject = f"residuals of {channels.find_channel(c.channel).label}"
     within = f" within {c.within}" if c.within else ""
     signs = ", with opposite signs in the two directions of travel" if c.reversing else ""
     p = f"p = {c.p:.1g}"
     role = "a column without a role" + (f" (as well by {', '.join(c.alike)})" if c.alike else "")
     if c.correlation is not None:
         return (
-            f"{what} are correlated with {c.column}{within}{signs} (rank correlation {c.correlation:+.2f}; {p}), "
+            f"{subject} are correlated with {c.column}{within}{signs} (rank correlation {c.correlation:+.2f}; {p}), "
             f"{role}: find what changes with it"
         )
     if c.coarser:
@@ -265,7 +267,7 @@ def residual_cluster(c: ResidualCluster) -> str:
     level_words = ", ".join(f"{m.name}: {m.mean:+.2g} {c.unit}" for m in mean_levels)
     more = ", ..." if len(mean_levels) < len(c.levels) else ""
     return (
-        f"{what} differ between the levels of {c.column}{within}{signs} (simulated minus measured, by level: "
+        f"{subject} differ between the levels of {c.column}{within}{signs} (simulated minus measured, by level: "
         f"{level_words}{more}; {p}), {role}: give each level its own configuration, or find what differs between them"
     )
 

@@ -272,8 +272,8 @@ def mass_matrix_and_bias(
         height = height + mass * down @ (body.origin + place)
     turning = [(half.inertia, {PITCH: 1.0}), (2 * half.inertia_pulley, {PITCH: 1.0, SHAFT: 1.0})]
     turning += [(run.lever[2], {PITCH: 1.0, k: -1.0}) for k in (FRONT, REAR)]
-    for about, by in turning:
-        row = jnp.zeros(COORDINATES).at[np.array(list(by))].set(jnp.array(list(by.values())))
+    for about, shares in turning:
+        row = jnp.zeros(COORDINATES).at[np.array(list(shares))].set(jnp.array(list(shares.values())))
         matrix = matrix + about * jnp.outer(row, row)
     return matrix, bias, height
 
@@ -411,9 +411,9 @@ def advance_climb(
     force = pulled.force @ touching.along + touching.force @ touching.off - resisted
     force = force.at[SHAFT].set(signals.torque_net - resisted[SHAFT])
     belts = motion.v[SHAFT] + motion.v[LED]
-    lost, stiffens = jax.jvp(lambda speed: _lever_loss(run, speed), (belts,), (jnp.ones_like(belts),))
+    lever_loss, stiffens = jax.jvp(lambda speed: _lever_loss(run, speed), (belts,), (jnp.ones_like(belts),))
     stiffens = jnp.maximum(stiffens, 0.0)
-    force = force.at[LED].add(-lost)
+    force = force.at[LED].add(-lever_loss)
 
     rises = jnp.maximum(
         run.chassis.ground.traction_rise(_sliding(touching, motion.v, signals), touching.force, signals.adhesion), 0
@@ -421,18 +421,20 @@ def advance_climb(
     shaft = _shaft_loss(run, motion, signals, touching)
     damping = contact_damping(touching.along, touching.off, pulled.force, touching.force, rises, touching.damped)
     damping = damping.at[SHAFT, SHAFT].add(shaft) + (_ON_BELTS.T * stiffens) @ _ON_BELTS
-    whole = matrix.at[SHAFT, SHAFT].add(armature) + step * damping
+    full_matrix = matrix.at[SHAFT, SHAFT].add(armature) + step * damping
     # of wheels, with massless levers
-    whole = whole.at[LED, LED].add(1 - run.chassis.on_tracks)
+    full_matrix = full_matrix.at[LED, LED].add(1 - run.chassis.on_tracks)
     pushed = step * (force - bias)
-    factors = factorise(whole[:4, :4])
-    acceleration, *coupled = (solve_factorised(factors, x) for x in (pushed[:4], whole[:4, 4], whole[:4, 5]))
+    factors = factorise(full_matrix[:4, :4])
+    acceleration, *coupled = (
+        solve_factorised(factors, x) for x in (pushed[:4], full_matrix[:4, 4], full_matrix[:4, 5])
+    )
     coupling = jnp.stack(coupled, axis=1)
-    coupled_matrix = whole[4:, 4:] - whole[4:, :4] @ coupling
+    coupled_matrix = full_matrix[4:, 4:] - full_matrix[4:, :4] @ coupling
     inverse = jnp.array(
         [[coupled_matrix[1, 1], -coupled_matrix[0, 1]], [-coupled_matrix[1, 0], coupled_matrix[0, 0]]]
     ) / (coupled_matrix[0, 0] * coupled_matrix[1, 1] - coupled_matrix[0, 1] * coupled_matrix[1, 0])
-    alone = motion.v[LED] + inverse @ (pushed[4:] - whole[4:, :4] @ acceleration)
+    alone = motion.v[LED] + inverse @ (pushed[4:] - full_matrix[4:, :4] @ acceleration)
     swung = _drive_action(run, motion, time, signals.voltage_source, alone, step * inverse / robot.sides)
     led = swung.rate - motion.v[LED]
     gained = jnp.concatenate([acceleration - coupling @ led, led])
@@ -463,7 +465,7 @@ def advance_climb(
         signals.torque_motor_loss * motor,
         (signals.torque_idle + (1 - signals.efficiency_load) * mesh) * motor + imbalance * middle[SHAFT],
         (signals.torque_track_loss + shaft * gained[SHAFT]) * middle[SHAFT]
-        + (lost + stiffens * (_ON_BELTS @ gained)) @ (_ON_BELTS @ middle),
+        + (lever_loss + stiffens * (_ON_BELTS @ gained)) @ (_ON_BELTS @ middle),
         -friction @ (touching.along @ middle),
         -(normal - touching.elastic) @ (touching.off @ middle),
         resisted @ middle,
@@ -582,9 +584,9 @@ def _update_verdict(
     verdict = jnp.where(rear > run.terrain.finish + outer, OVER, verdict)
     verdict = jnp.where(jnp.abs(q[PITCH]) > TURNED_OVER, TIPS, verdict)
     verdict = jnp.where(finite, verdict, FAILED)
-    ended = progress.verdict != _RUNNING
-    verdict = jnp.where(ended, progress.verdict, verdict)
-    motion = jax.tree.map(lambda new, old: jnp.where(finite & ~ended, new, old), motion, before)
+    has_ended = progress.verdict != _RUNNING
+    verdict = jnp.where(has_ended, progress.verdict, verdict)
+    motion = jax.tree.map(lambda new, old: jnp.where(finite & ~has_ended, new, old), motion, before)
     return motion, dataclasses.replace(progress, verdict=verdict)
 
 
@@ -625,9 +627,9 @@ def advance_samples(
         nothing = jax.eval_shape(lambda: advance_climb(run, motion, first, energy)[2])
         nothing = jax.tree.map(lambda x: jnp.full(x.shape, -jnp.inf, x.dtype), nothing)
         after, spent, passed = jax.lax.fori_loop(0, steps, small, (motion, energy, nothing))
-        ended = progress.verdict != _RUNNING
+        has_ended = progress.verdict != _RUNNING
         after, progress = _update_verdict(run, motion, passed, after, progress)
-        energy_recorded = jax.tree.map(lambda new, old: jnp.where(ended, old, new), spent, energy)
+        energy_recorded = jax.tree.map(lambda new, old: jnp.where(has_ended, old, new), spent, energy)
         return (after, energy_recorded, progress), passed
 
     return jax.lax.scan(sample, state, jnp.arange(samples))

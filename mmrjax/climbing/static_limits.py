@@ -253,9 +253,11 @@ def posture_limits(robot: Robot, conditions: Conditions) -> StaticLimits:
 @jax.jit
 def _over_levers(robot: Robot, conditions: Conditions, angles: Float[Array, "n 2"]) -> tuple[StepLimit, Array]:
     def at(pair: Array) -> tuple[StepLimit, Array]:
-        here = dataclasses.replace(conditions, levers_front_deg=pair[0], levers_rear_deg=pair[1])
-        side = resting_posture.side_outline(robot, here)
-        return find_highest_step(side), jnp.asarray(resting_posture.rest_on_slope(side, here.slope, 0.0).margin)
+        conditions_there = dataclasses.replace(conditions, levers_front_deg=pair[0], levers_rear_deg=pair[1])
+        side = resting_posture.side_outline(robot, conditions_there)
+        return find_highest_step(side), jnp.asarray(
+            resting_posture.rest_on_slope(side, conditions_there.slope, 0.0).margin
+        )
 
     return jax.lax.map(at, angles, batch_size=256)
 

@@ -55,10 +55,10 @@ def turns_under_equal_commands(robot: Robot, imposed: float) -> Result:
     Args:
         imposed: voltage [V], or motor speed [rad/s] if its rig imposes that.
     """
-    both = OF_SIDES[-2:] if robot.rig.imposed == "motor_speed" else OF_SIDES[:2]
-    alike = dict.fromkeys(both, imposed if robot.rig.imposed == "motor_speed" else 1.0)
-    asked = Conditions([*robot.configurations], voltage=abs(imposed), **alike).resolved(robot)
-    return jax.device_get(steady_batch(robot, asked))
+    side_commands = OF_SIDES[-2:] if robot.rig.imposed == "motor_speed" else OF_SIDES[:2]
+    alike = dict.fromkeys(side_commands, imposed if robot.rig.imposed == "motor_speed" else 1.0)
+    equal_commands = Conditions([*robot.configurations], voltage=abs(imposed), **alike).resolved(robot)
+    return jax.device_get(steady_batch(robot, equal_commands))
 
 
 def turning_columns(robot: Robot, reading: Mapping[str, Any], radius: np.ndarray) -> dict[str, np.ndarray]:

@@ -102,8 +102,8 @@ def time_grid(
     longest = np.maximum(longest, last / STEPS) if np.size(longest) else LONGEST  # one row has no interval
     longest = np.broadcast_to(longest, max(len(requested_times) - 1, 1))
     longest = longest[np.clip(np.searchsorted(requested_times, times[:-1], side="right") - 1, 0, len(longest) - 1)]
-    which = np.searchsorted(begins, times[:-1], side="right") - 1  # the last change before each instant
-    since, first, grows = begins[which], first[which], grows[which]
+    interval_index = np.searchsorted(begins, times[:-1], side="right") - 1  # the last change before each instant
+    since, first, grows = begins[interval_index], first[interval_index], grows[interval_index]
     knee = np.maximum((longest - first) / grows, 0.0)
 
     def step_count(t: np.ndarray) -> np.ndarray:  # number of steps up to t: ∫ dt / min(longest, first + grows t)
@@ -114,12 +114,14 @@ def time_grid(
     instants = []
     for k in range(len(times) - 1):
         count = max(1, int(np.ceil(ends[k] - at[k] - 1e-9)))
-        wanted = np.linspace(at[k], ends[k], count, endpoint=False)
-        young = first[k] / grows[k] * np.expm1(grows[k] * np.minimum(wanted, at_knee[k]))
-        instants.append(since[k] + young + np.maximum(wanted - at_knee[k], 0.0) * longest[k])
+        even_places = np.linspace(at[k], ends[k], count, endpoint=False)
+        young = first[k] / grows[k] * np.expm1(grows[k] * np.minimum(even_places, at_knee[k]))
+        instants.append(since[k] + young + np.maximum(even_places - at_knee[k], 0.0) * longest[k])
         instants[-1][0] = times[k]
-    whole = np.concatenate([*instants, times[-1:]])
-    return np.interp(np.arange((len(whole) - 1) * parts + 1) / parts, np.arange(len(whole)), whole)
+    all_instants = np.concatenate([*instants, times[-1:]])
+    return np.interp(
+        np.arange((len(all_instants) - 1) * parts + 1) / parts, np.arange(len(all_instants)), all_instants
+    )
 
 
 def _split_conditions(conditions: Conditions) -> tuple[Conditions, Conditions]:
@@ -230,9 +232,11 @@ def run_steps(conditions: Conditions, times: Float[Array, " times"]) -> tuple[Ru
     jump = jax.lax.cummax(jnp.where(jumped, jnp.arange(len(jumped)), 0))
     before = jax.tree.map(lambda x: x[jnp.maximum(jump - 1, 0)], now)
     rests = conditions.begin is None
-    begun = jnp.where((jump == 0) & rests, 0.0, 1.0).astype(times.dtype)
+    is_moving = jnp.where((jump == 0) & rests, 0.0, 1.0).astype(times.dtype)
     since = times[:-1] - times[jump]
-    return RunStep(jnp.diff(times), since, begun, before if conditions.motor_speed is None else None, now), constant
+    return RunStep(
+        jnp.diff(times), since, is_moving, before if conditions.motor_speed is None else None, now
+    ), constant
 
 
 def _lag_of_step(
@@ -298,9 +302,13 @@ def _solve_stage(
         step = solve(matrix, value)
         # Over a kink of the friction law full steps can alternate without end.
         tried = y - jnp.array([0.1, 0.4, 1.0], y.dtype)[:, None] * step
-        over = jnp.max(jnp.abs(jax.vmap(left)(tried)), 1)
-        best = jnp.where(over[0] < over[1], tried[0], tried[1])
-        return count + 1, jnp.where(over[2] <= jnp.min(over), tried[2], best), jnp.min(over)
+        residual_size = jnp.max(jnp.abs(jax.vmap(left)(tried)), 1)
+        best = jnp.where(residual_size[0] < residual_size[1], tried[0], tried[1])
+        return (
+            count + 1,
+            jnp.where(residual_size[2] <= jnp.min(residual_size), tried[2], best),
+            jnp.min(residual_size),
+        )
 
     def going(state: tuple[Array, Array, Array]) -> Array:
         return (state[0] < NEWTON) & (state[2] > SOLVED)
@@ -374,21 +382,23 @@ def solve_states(robot: Robot, conditions: Conditions, times: Float[Array, " tim
         law = functools.partial(drive_rates, robot, conditions)
 
         def turned(part: _StepPart) -> _StepPart:
-            mine = _decay_over_parts(part.lag, lag.decay, part.length * _WEIGHED)
-            first = part.begin - mine.begin * _unit_vector_of_current(y)
+            member_decay = _decay_over_parts(part.lag, lag.decay, part.length * _WEIGHED)
+            first = part.begin - member_decay.begin * _unit_vector_of_current(y)
 
             def stage(given: tuple[Array, Array], mean: Array) -> tuple[tuple[Array, Array], Array]:
                 now = functools.partial(law, way=part.side)
-                stage_result = _solve_stage(now, *given, part.length, mean * _unit_vector_of_current(y), mine.decay)
+                stage_result = _solve_stage(
+                    now, *given, part.length, mean * _unit_vector_of_current(y), member_decay.decay
+                )
                 return (first + (1 - _GAMMA) / _GAMMA * (stage_result - first), stage_result), stage_result
 
-            stages = jax.lax.scan(stage, (first, first), mine.means)[1]
-            end = stages[1] + mine.end * _unit_vector_of_current(y)
+            stages = jax.lax.scan(stage, (first, first), member_decay.means)[1]
+            end = stages[1] + member_decay.end * _unit_vector_of_current(y)
             before, after = part.begin[MOTOR], end[MOTOR]
             nears = jnp.where(part.turn == 0, part.side * after < 0, part.turn < TURNS)
             rests, waited, rest = part.turn == TURNS, part.turn == WAITS, end - after * along
-            lost = before - after  # 0 in a part of no length, of a step that begins at rest
-            on_line = part.length * before / jnp.where(lost == 0, 1.0, lost)
+            transient_drop = before - after  # 0 in a part of no length, of a step that begins at rest
+            on_line = part.length * before / jnp.where(transient_drop == 0, 1.0, transient_drop)
             slows = law(end, way=part.side)[MOTOR]
             by_newton = part.length - after / jnp.where(slows == 0, 1.0, slows)
             to_rest = jnp.clip(jnp.where(part.turn == 0, on_line, by_newton), 0.0, step.length)
@@ -399,7 +409,7 @@ def solve_states(robot: Robot, conditions: Conditions, times: Float[Array, " tim
             return _StepPart(
                 jnp.where(nears, part.turn + 1, jnp.where(rests, after_rest, WAITS + 2 - waited)),
                 jnp.where(rests, rest, jnp.where(waited, end, part.begin)),
-                jnp.where(rests | waited, mine.end, part.lag),
+                jnp.where(rests | waited, member_decay.end, part.lag),
                 since,
                 jnp.where(nears, to_rest, step_left),
                 jnp.where(rests, side, jnp.where(waited, part.then, part.side)),
@@ -411,8 +421,8 @@ def solve_states(robot: Robot, conditions: Conditions, times: Float[Array, " tim
 
         side, then, wait = _shaft_side(robot, conditions, y, step.length)
         turn, length, none = jnp.where(wait > 0, WAITS, 0), jnp.where(wait > 0, wait, step.length), jnp.zeros(())
-        whole = _StepPart(turn, y, lag.begin, none, length, side, then, wait, jnp.stack([y, y]), y)
-        last = jax.lax.while_loop(lambda part: part.turn < WAITS + 2, turned, whole)
+        whole_step = _StepPart(turn, y, lag.begin, none, length, side, then, wait, jnp.stack([y, y]), y)
+        last = jax.lax.while_loop(lambda part: part.turn < WAITS + 2, turned, whole_step)
         sides = jnp.stack([side, last.side])
         return last.end, RunStates(last.stages, last.end, sides, last.before, last.since, last.begin)
 
@@ -542,8 +552,10 @@ def run_response(
     def added(along: LinearisedRun, step: RunStep) -> Array:
         """Contribution of the sources of a step, at its end."""
         conditions = step.held(constant)
-        both = jax.vmap(lambda t, y, way: source(t, y, conditions, way))(along.clock[1:], along.places, along.sides)
-        tangents = jnp.tensordot(along.gains, both, ((0, 2), (0, 1)))
+        source_terms = jax.vmap(lambda t, y, way: source(t, y, conditions, way))(
+            along.clock[1:], along.places, along.sides
+        )
+        tangents = jnp.tensordot(along.gains, source_terms, ((0, 2), (0, 1)))
         at_start = lambda y, held: source(along.clock[0], y, held, along.sides[0])[CURRENT]  # noqa: E731
         of_lag = step.rates_at_start(constant, at_start, along.begins)
         return tangents + jnp.tensordot(along.lags, of_lag, ((0,), (0,)))

@@ -138,13 +138,15 @@ def standing_signals(robot: Robot, conditions: Conditions, state: State) -> Sign
         - (end.torque_load - end.torque_track_loss - chassis.radius * end.traction)
         for end in ends
     ]
-    lost = [end.torque_track_loss for end in (back, ahead)]
+    track_losses = [end.torque_track_loss for end in (back, ahead)]
     traction = ahead.gravity
     if robot.has_ground:
-        least_, most = ((inputs[k] - lost[1 - k]) / chassis.radius for k in range(2))
+        least_, most = ((inputs[k] - track_losses[1 - k]) / chassis.radius for k in range(2))
         traction = one_sided.clip(one_sided.clip(traction, least_, most), -ahead.adhesion_limit, ahead.adhesion_limit)
     carried = chassis.radius * traction
-    torque = one_sided.clip(0.0, jnp.maximum(carried + lost[0], inputs[0]), jnp.minimum(carried + lost[1], inputs[1]))
+    torque = one_sided.clip(
+        0.0, jnp.maximum(carried + track_losses[0], inputs[0]), jnp.minimum(carried + track_losses[1], inputs[1])
+    )
     none = jnp.zeros_like(carried)
     return dataclasses.replace(
         ahead,
@@ -230,14 +232,16 @@ def shaft_direction(robot: Robot, conditions: Conditions, state: State) -> tuple
     def leaving(robot: Robot, conditions: Conditions, state: State) -> tuple[Array, Array]:
         settled = dataclasses.replace(state, current=current_at_rest(robot, conditions, state))
         now, then = (_signals_both_ways(robot, conditions, state_there) for state_there in (state, settled))
-        turned, later = (1.0 * (ahead.torque_net > 0) - 1.0 * (back.torque_net < 0) for ahead, back in (now, then))
+        leaving_sense, later = (
+            1.0 * (ahead.torque_net > 0) - 1.0 * (back.torque_net < 0) for ahead, back in (now, then)
+        )
         lacks, exceeds = (jnp.where(later > 0, ahead.torque_net, -back.torque_net) for ahead, back in (now, then))
         winding = balances.driven_signals(robot, conditions, _without_motion(state), None)
         rises, missing = winding.voltage_left / winding.inductance, settled.current - state.current
-        waits = (turned == 0) & (later != 0) & (rises * missing > 0)
+        waits = (leaving_sense == 0) & (later != 0) & (rises * missing > 0)
         share = jnp.where(waits, -lacks / jnp.where(waits, exceeds - lacks, 1.0), 0.0)
         wait = -jnp.log1p(-share) * missing / jnp.where(waits, rises, 1.0)
-        way = jnp.where(turned != 0, turned, jnp.where(later != 0, later, HELD))
+        way = jnp.where(leaving_sense != 0, leaving_sense, jnp.where(later != 0, later, HELD))
         stands = state.speed_motor == 0
         return jnp.where(stands, way, jnp.sign(state.speed_motor)), jnp.where(stands & waits, wait, 0.0)
 
@@ -269,15 +273,15 @@ def current_settled(robot: Robot, conditions: Conditions, state: State) -> Scala
 
     def left(wanted: Scalar) -> Scalar:
         current, is_limited = admitted_current(robot, conditions, wanted)
-        here = dataclasses.replace(state, current=current)
+        state_there = dataclasses.replace(state, current=current)
         none = jnp.zeros_like(state.speed)
-        return balances.driven_signals(without_diode(robot), conditions, here, none).voltage_left - is_limited
+        return balances.driven_signals(without_diode(robot), conditions, state_there, none).voltage_left - is_limited
 
     guess = robot.motor.current_stall(left(jnp.zeros_like(state.current)))
     first, second = left(0.5 * guess), left(guess)
     slope = (second - first) / jnp.where(guess == 0, 1.0, 0.5 * guess)
-    wanted = guess - jnp.where(guess == 0, 0.0, second / jnp.where(guess == 0, 1.0, slope))
-    return admitted_current(robot, conditions, wanted)[0]
+    newton_guess = guess - jnp.where(guess == 0, 0.0, second / jnp.where(guess == 0, 1.0, slope))
+    return admitted_current(robot, conditions, newton_guess)[0]
 
 
 def current_at_rest(robot: Robot, conditions: Conditions, state: State) -> Scalar:

@@ -135,8 +135,8 @@ def _forward_mode_only(results: Results) -> Results:
     if not has_tracer(results):
         return results
     kind = results.model if results.mission is None else f"{results.model} over a profile"
-    named: Results = eqxi.nondifferentiable_backward(results, msg=f"{kind}: {FORWARD_ALONE}")
-    return named
+    guarded: Results = eqxi.nondifferentiable_backward(results, msg=f"{kind}: {FORWARD_ALONE}")
+    return guarded
 
 
 def _check_battery(robot: Robot, conditions: Conditions) -> None:
@@ -229,17 +229,21 @@ def check_robot(robot: Robot) -> None:
 
 def _resolve_conditions(robot: Robot, conditions: Conditions) -> Conditions:
     """Conditions with configuration names replaced by indices, checked against the robot's configurations."""
-    names, which = robot.configurations.names, conditions.configuration
-    if isinstance(which, NamedConfigurations):
+    names, configuration = robot.configurations.names, conditions.configuration
+    if isinstance(configuration, NamedConfigurations):
         try:
-            return dataclasses.replace(conditions, configuration=which.among(names))
+            return dataclasses.replace(conditions, configuration=configuration.among(names))
         except KeyError as error:
             raise UsageError(f"configuration: got {error.args[0]}; {allowed_words(error.args[0], names)}") from error
-    if not has_tracer(which) and which.size and not _all_within(_smallest_and_largest(which), 0, len(names) - 1):
-        wrong = _first_outside(which, 0, len(names) - 1)
+    if (
+        not has_tracer(configuration)
+        and configuration.size
+        and not _all_within(_smallest_and_largest(configuration), 0, len(names) - 1)
+    ):
+        wrong = _first_outside(configuration, 0, len(names) - 1)
         assert wrong is not None
-        listed = ", ".join(f"{k} ({name})" for k, name in enumerate(names))
-        raise UsageError(f"configuration{wrong[0]}: got {wrong[1]:g}; expected one of {listed}")
+        numbered_names = ", ".join(f"{k} ({name})" for k, name in enumerate(names))
+        raise UsageError(f"configuration{wrong[0]}: got {wrong[1]:g}; expected one of {numbered_names}")
     return conditions
 
 

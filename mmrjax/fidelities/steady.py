@@ -64,9 +64,9 @@ def _signals_and_residuals(
     the duty alone would drive it, see `Driver.admitted`. If a clamp holds the output, the third unknown is the torque
     that the clamp carries, in place of the motor speed.
     """
-    speed, wanted, third = unknowns
+    speed, scaled_current, third = unknowns
     conditions, speed_motor = _clamped_conditions(conditions, third)
-    current, is_limited = admitted_current(robot, conditions, _CURRENT * wanted)
+    current, is_limited = admitted_current(robot, conditions, _CURRENT * scaled_current)
     state = State(current, _SPEED_MOTOR * speed_motor, _SPEED * speed, conditions.discharge)
     signals, creep = _balanced(without_diode(robot), conditions, state, sense)
     # Moving with balanced torques, or at rest with too little torque: speed >= 0 and torque <= 0 in the direction of

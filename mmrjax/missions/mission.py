@@ -190,8 +190,8 @@ def _segment_status(
     status = jnp.where(stands, STALLED, law.status(robot, asked.conditions, found))
     slow = [jnp.max(jnp.abs(jnp.asarray(x))) < 1.0 for x in (signals.direction, signals.direction_travel)]
     rests = stands | (slow[0] & slow[1])
-    wanted = (mode != BRAKE) & (mode != COAST) & (driven > 1e-6)
-    status = jnp.where(~wanted & (status == STALLED), CONVERGED, status)  # it stands as demanded
+    wants_motion = (mode != BRAKE) & (mode != COAST) & (driven > 1e-6)
+    status = jnp.where(~wants_motion & (status == STALLED), CONVERGED, status)  # it stands as demanded
     controlled = (mode == MOTOR_SPEED) | (mode == SPEED)
     per_speed = robot.gearbox.ratio / robot.chassis(otherwise.configuration).radius
     demanded = law.demanded(robot, otherwise, segment)
@@ -244,9 +244,9 @@ def mission(
         fresh = carry._replace(peaks=nothing, flags=jnp.asarray(0))
         beginning = law.instant(robot, conditions, segment, carry.y.at[law.CLOCK].set(0.0), carry.stands)[0]
         c = integrate_segment(law, robot, conditions, segment, fresh, tolerance, most_steps)
-        ended = _segment_end(law, robot, conditions, segment, carry, c, beginning)
-        carry = c._replace(peaks=jnp.maximum(carry.peaks, c.peaks), flags=carry.flags | ended.flags)
-        return carry, ended
+        segment_end = _segment_end(law, robot, conditions, segment, carry, c, beginning)
+        carry = c._replace(peaks=jnp.maximum(carry.peaks, c.peaks), flags=carry.flags | segment_end.flags)
+        return carry, segment_end
 
     order = jnp.tile(jnp.arange(profile.segment_count), profile.cycles)
     c, segment_ends = jax.lax.scan(run_segment, _initial_carry(law, robot, conditions, begin, nothing, keep), order)
@@ -278,7 +278,7 @@ def _initial_carry(
     law: MotionLaw, robot: Robot, conditions: Conditions, start: Start, peaks: Array, keep: int
 ) -> IntegrationState:
     """State at the start of a mission, with space for `keep` recorded steps."""
-    dtype, whole, false = peaks.dtype, jnp.asarray(0), jnp.asarray(False)
+    dtype, zero, false = peaks.dtype, jnp.asarray(0), jnp.asarray(False)
     y0 = initial_unknowns(law, robot, conditions, start).astype(dtype) / law.units(robot).astype(dtype)
     q0 = jnp.zeros(len(law.TOTALS), dtype)
     buffer = None
@@ -288,8 +288,8 @@ def _initial_carry(
     return IntegrationState(
         y=y0, q=q0, step=jnp.asarray(FIRST, dtype), stands=jnp.asarray(start.speed == 0.0), ended=false,
         below=false, low=jnp.zeros((), dtype), cut_off=false, peaks=peaks,
-        flags=whole, events=jnp.full(len(EVENTS), -1.0, dtype), accepted=whole, rejected=whole, failed=false,
-        kept=whole, buffer=buffer, slope=jnp.zeros_like(y0),
+        flags=zero, events=jnp.full(len(EVENTS), -1.0, dtype), accepted=zero, rejected=zero, failed=false,
+        kept=zero, buffer=buffer, slope=jnp.zeros_like(y0),
     )  # fmt: skip
 
 
@@ -303,8 +303,8 @@ def _segment_end(
     beginning: Any,
 ) -> _SegmentEnd:
     """Data of a segment at its end `c`, given the state `before` it and its first instant."""
-    signals, _, _, asked = law.instant(robot, conditions, segment, c.y, c.stands)
-    status, missed = _segment_status(law, robot, conditions, segment, signals, asked, c.stands)
+    signals, _, _, demand = law.instant(robot, conditions, segment, c.y, c.stands)
+    status, missed = _segment_status(law, robot, conditions, segment, signals, demand, c.stands)
     status = jnp.where(c.ended, _early_end_status(c), status)
     slips = law.exceeded(robot, signals)["slips"] & ~c.stands
     flags = c.flags | flag_mask({"demand_missed": missed & ~c.ended, "slips": slips})
@@ -371,7 +371,7 @@ def _recorded_course(
     # Segment of each recorded step: the first one with a larger step count.
     segment = jnp.minimum(jnp.searchsorted(kept, index, side="right"), len(kept) - 1)
     within = index < kept[-1]
-    begun = jnp.concatenate([jnp.zeros(1), jnp.cumsum(each.time.ravel())])[segment]
+    begin_times = jnp.concatenate([jnp.zeros(1), jnp.cumsum(each.time.ravel())])[segment]
     so_far = {
         name: jnp.concatenate([jnp.zeros(1), jnp.cumsum(each.of[name].ravel())])[segment] + qs[:, i]
         for i, name in enumerate(law.TOTALS)
@@ -389,7 +389,7 @@ def _recorded_course(
         return jnp.where(within.reshape(-1, *[1] * (x.ndim - 1)), x, jnp.nan)
 
     return MissionCourse(
-        time=shown(begun + ys[:, law.CLOCK]),
+        time=shown(begin_times + ys[:, law.CLOCK]),
         segment=jnp.where(within, segment, -1),
         event=jnp.where(within, marks, -1),
         distance=shown(so_far["distance"]),

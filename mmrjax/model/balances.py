@@ -223,9 +223,9 @@ def electrical(robot: Robot, conditions: Conditions, signals: Signals) -> Signal
         robot, signals, "electrical"
     )
     if conditions.voltage_follows:
-        asked = signals.current if conditions.motor_current is None else conditions.motor_current
-        taken = back + drop + robot.motor.resistance * (asked - signals.current)
-        signals = _fill_unset(signals, voltage=taken, voltage_source=taken)
+        current_imposed = signals.current if conditions.motor_current is None else conditions.motor_current
+        voltage_needed = back + drop + robot.motor.resistance * (current_imposed - signals.current)
+        signals = _fill_unset(signals, voltage=voltage_needed, voltage_source=voltage_needed)
     return _fill_unset(
         signals,
         voltage_back=back,
@@ -468,8 +468,8 @@ def _solve_current(signals: Callable[[Any, Scalar], Signals], given: tuple) -> S
 
     def lacking(given: tuple, current: Scalar) -> Scalar:
         robot, conditions, *_ = given
-        asked = 0.0 if conditions.motor_acceleration is None else conditions.motor_acceleration
-        return signals(given, current).acceleration_wheel * robot.gearbox.ratio - asked
+        acceleration_imposed = 0.0 if conditions.motor_acceleration is None else conditions.motor_acceleration
+        return signals(given, current).acceleration_wheel * robot.gearbox.ratio - acceleration_imposed
 
     fixed = jax.tree.map(lambda x: jax.lax.stop_gradient(x) if isinstance(x, jax.Array) else x, given)
     current = jnp.zeros_like(jnp.asarray(fixed[1].motor_speed))

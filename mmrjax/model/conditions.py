@@ -179,19 +179,23 @@ class Conditions(eqx.Module):
         condition_values = {
             name: arguments[name] for name in CONDITIONS if arguments[name] is not None or name in NUMBERS
         }
-        which: Any = configuration
+        configurations: Any = configuration
         if not isinstance(configuration, jax.Array | NamedConfigurations):
             words = np.asarray(configuration)
-            which = NamedConfigurations.of(words) if words.dtype.kind == "U" else configuration
-        which = which if isinstance(which, NamedConfigurations) else _number_array("configuration", which, int)
+            configurations = NamedConfigurations.of(words) if words.dtype.kind == "U" else configuration
+        configurations = (
+            configurations
+            if isinstance(configurations, NamedConfigurations)
+            else _number_array("configuration", configurations, int)
+        )
         numbers = {name: _number_array(name, x) for name, x in condition_values.items()}
-        shapes = {name: x.shape for name, x in {"configuration": which, **numbers}.items()}
+        shapes = {name: x.shape for name, x in {"configuration": configurations, **numbers}.items()}
         try:
             shape = np.broadcast_shapes(*shapes.values())
         except ValueError:
-            listed = ", ".join(f"{name} {s}" for name, s in shapes.items() if s)
-            raise ValueError(f"Conditions: shapes do not broadcast to one another: {listed}") from None
-        self.configuration = jax.tree.map(lambda x: _broadcast_array(x, shape), which)
+            shape_words = ", ".join(f"{name} {s}" for name, s in shapes.items() if s)
+            raise ValueError(f"Conditions: shapes do not broadcast to one another: {shape_words}") from None
+        self.configuration = jax.tree.map(lambda x: _broadcast_array(x, shape), configurations)
         self.begin = None if begin is None else _broadcast_array(_number_array("begin", begin, int), shape)
         # an equal number for all runs is stored once: most fields of a large batch are 0 or 1
         shared: dict[float, Array] = {}
@@ -257,11 +261,11 @@ class Conditions(eqx.Module):
         if not isinstance(self.configuration, NamedConfigurations):
             return self
         try:
-            which = self.configuration.among(robot.configurations.names)
+            configuration = self.configuration.among(robot.configurations.names)
         except KeyError as error:
             robot.configurations.index(error.args[0])  # raises a KeyError that lists the valid names
             raise
-        return dataclasses.replace(self, configuration=which)
+        return dataclasses.replace(self, configuration=configuration)
 
 
 def sides_contradiction(stated: Collection[str]) -> str:
@@ -290,8 +294,8 @@ def _number_array(name: str, x: Any, kind: type = float) -> Any:
     number = np.asarray(x)
     if np.ma.is_masked(x):
         raise UsageError(f"Conditions: {name}: got masked numbers; expected numbers, or rows without the masked ones")
-    whole = kind is float or number.dtype.kind in "biu" or (number.dtype.kind == "f" and not (number % 1).any())
-    if number.dtype.kind not in ("biuf" if name in SWITCHES else "iuf") or not whole:
+    is_integer = kind is float or number.dtype.kind in "biu" or (number.dtype.kind == "f" and not (number % 1).any())
+    if number.dtype.kind not in ("biuf" if name in SWITCHES else "iuf") or not is_integer:
         expected = "numbers" if kind is float else "whole numbers" + ", or names" * (name == "configuration")
         raise UsageError(f"Conditions: {name}: got {x!r}; expected {expected}")
     return number.astype(kind)

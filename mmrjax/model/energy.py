@@ -67,8 +67,8 @@ def sink_powers_turning(robot: Robot, conditions: Conditions, travel: Travel) ->
     across = jnp.mean(jnp.asarray(signals.speed_lateral)) * sine(jnp.mean(jnp.asarray(signals.heading)))
     means["sliding"] = means["sliding"] + jnp.sum(travel.grip.across)
     for balance, rate in (("lateral", signals.speed_lateral), ("yaw", signals.yaw_rate)):
-        taken = jax.vmap(lambda s, balance=balance: effects_sum(robot, s, balance) * jnp.ones(()))(signals)
-        means["sliding"] = means["sliding"] + robot.sides / 2 * jnp.sum(taken * jnp.asarray(rate))
+        effect_terms = jax.vmap(lambda s, balance=balance: effects_sum(robot, s, balance) * jnp.ones(()))(signals)
+        means["sliding"] = means["sliding"] + robot.sides / 2 * jnp.sum(effect_terms * jnp.asarray(rate))
     means["lift"] = means["lift"] - weight * across
     return means
 

@@ -173,11 +173,11 @@ def check_parts(robot: Robot) -> None:
                 f"{name}.mass: got {np.min(np.asarray(chassis.mass)):.3g} kg; expected more than {parts:.3g} kg, "
                 "the mass of its pulleys, wheels, tracks and levers (running_gear.pulley_mass and others)"
             )
-        whole = "inertia_tracked" if chassis.on_tracks > 0.5 else "inertia_wheeled"
-        declared_total = np.asarray(getattr(robot.running_gear, whole))
+        total_field = "inertia_tracked" if chassis.on_tracks > 0.5 else "inertia_wheeled"
+        declared_total = np.asarray(getattr(robot.running_gear, total_field))
         least = np.asarray(robot.sides * half.inertia_pitch(gear.wheelbase))
         if np.any((declared_total > 0) & (declared_total <= least)):
             raise ValueError(
-                f"running_gear.{whole}: got {np.min(declared_total):.3g} kg·m^2; expected 0, or more than "
+                f"running_gear.{total_field}: got {np.min(declared_total):.3g} kg·m^2; expected 0, or more than "
                 f"{np.max(least):.3g} kg·m^2, the inertia of the parts of {name} without the body's own"
             )

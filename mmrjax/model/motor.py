@@ -154,9 +154,9 @@ class Motor(eqx.Module):
 
         still = rates(jnp.zeros(2))
         matrix = jax.jacfwd(rates)(jnp.zeros(2))
-        whole = jnp.block([[matrix, still[:, None]], [jnp.zeros((1, 3))]])
+        augmented_matrix = jnp.block([[matrix, still[:, None]], [jnp.zeros((1, 3))]])
         begin = jnp.stack([jnp.asarray(x, float) + zero for x in (winding, housing, 1.0)])
-        end = jax.scipy.linalg.expm(whole * time) @ begin
+        end = jax.scipy.linalg.expm(augmented_matrix * time) @ begin
         return end[0], end[1]
 
     def time_permissible(

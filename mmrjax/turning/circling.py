@@ -271,15 +271,15 @@ def _broyden_step(held: tuple[Robot, Conditions], search: _BroydenSearch) -> _Br
     size = search.y.size
     aside = search.looks <= size
     step = (search.inverse * search.rates).sum(-1)
-    taken = step * _allowed_step_fraction(*held, search.y, step)
-    taken = jnp.where(aside, ALONG * (np.arange(size) == search.looks - 1), taken)
-    residual = _scaled_balance(*held, search.y + taken)
-    residual = jnp.where(_is_searched(held[1]), residual, _search_start(*held) - search.y - taken)
+    damped_step = step * _allowed_step_fraction(*held, search.y, step)
+    damped_step = jnp.where(aside, ALONG * (np.arange(size) == search.looks - 1), damped_step)
+    residual = _scaled_balance(*held, search.y + damped_step)
+    residual = jnp.where(_is_searched(held[1]), residual, _search_start(*held) - search.y - damped_step)
     gone = search.inverse @ (search.rates - residual)
-    row = taken @ search.inverse
-    change = jnp.outer(taken - gone, row) / (taken @ gone)
+    row = damped_step @ search.inverse
+    change = jnp.outer(damped_step - gone, row) / (damped_step @ gone)
     inverse = jnp.where((search.looks > 0) & jnp.all(jnp.isfinite(change)), search.inverse + change, search.inverse)
-    y = jnp.where(aside, search.y, search.y + taken)
+    y = jnp.where(aside, search.y, search.y + damped_step)
     rates = jnp.where(aside & (search.looks > 0), search.rates, residual)
     return _BroydenSearch(y, rates, inverse, search.looks + 1, ~aside & (jnp.max(jnp.abs(step)) < NEAR))
 
@@ -324,13 +324,13 @@ def _euler_step(held: tuple[Robot, Conditions, Array, _LinearisedBalance], searc
     before, after = jnp.linalg.norm(search.rates), jnp.linalg.norm(residual)
     worse = (~(after <= WORSE * before + SMALL) | (largest > FAR)) & (search.turns > 0)
     worse &= search.step > SHORTEST
-    ended = ~worse & (largest < SMALL) & ((search.step > LONG) | (after < SMALL_RATE))
+    has_settled = ~worse & (largest < SMALL) & ((search.step > LONG) | (after < SMALL_RATE))
     y, residual, slope = (
         jnp.where(worse, old, new)
         for old, new in ((search.y, next_y), (search.rates, residual), (search.jacobian, slope))
     )
     length = jnp.clip(search.step * jnp.where(worse, SHORTER, LONGER), SHORTEST, LONGEST)
-    return _EulerSearch(y, residual, slope, length, search.turns + 1, ended)
+    return _EulerSearch(y, residual, slope, length, search.turns + 1, has_settled)
 
 
 def _find_settled_unknowns(robot: Robot, conditions: Conditions) -> tuple[Settling, Bool[Array, ""]]:

@@ -166,8 +166,8 @@ class ContactLaw(eqx.Module):
         powers = np.arange(most + 1)
         of_line = share[:, None] * line[:, None] ** powers
         of_ends = ends[:, None] * np.sign(line)[:, None] ** powers
-        both = jnp.asarray(x) @ np.concatenate([of_line, of_ends], axis=1)
-        return jnp.where(self.on_tracks > 0.5, both[..., : most + 1], both[..., most + 1 :])
+        line_and_ends = jnp.asarray(x) @ np.concatenate([of_line, of_ends], axis=1)
+        return jnp.where(self.on_tracks > 0.5, line_and_ends[..., : most + 1], line_and_ends[..., most + 1 :])
 
     def per_speed(self, along: Scalar, across: Scalar) -> Scalar:
         """Longitudinal force per load and sliding speed [s/m], given the squares of the sliding speeds [m²/s²]."""
@@ -177,9 +177,12 @@ class ContactLaw(eqx.Module):
     def per_speed_rise(self, along: Scalar, across: Scalar) -> tuple[Scalar, Scalar]:
         """Derivatives of `force_per_sliding_speed` with respect to the squares of the sliding speeds [s³/m³]."""
         square, weighed = along + across, along + self.ratio * across
-        turned, friction_per_speed = jnp.sqrt((square + STILL) / (weighed + STILL)), self.friction.per_speed(square)
-        slower = turned * self.friction.per_speed_rise(square)
-        share = friction_per_speed * turned / 2
+        direction_gain, friction_per_speed = (
+            jnp.sqrt((square + STILL) / (weighed + STILL)),
+            self.friction.per_speed(square),
+        )
+        slower = direction_gain * self.friction.per_speed_rise(square)
+        share = friction_per_speed * direction_gain / 2
         return (
             slower + share * (1 / (square + STILL) - 1 / (weighed + STILL)),
             slower + share * (1 / (square + STILL) - self.ratio / (weighed + STILL)),
@@ -190,13 +193,13 @@ class ContactLaw(eqx.Module):
 
         If the total force falls with sliding, the derivative is set to 0.
         """
-        square, other, both = along**2, across**2, along * across
+        square, other, speed_product = along**2, across**2, along * across
         friction_per_speed, (by_along, by_across) = self.per_speed(square, other), self.per_speed_rise(square, other)
         grows = friction_per_speed + 2 * (square * by_along + other * by_across)
         stays = jnp.maximum(-grows, 0.0) / (square + other + STILL)
         first, second = 2 * by_along + stays, 2 * by_across + stays
-        return (friction_per_speed + square * first, both * second), (
-            both * first,
+        return (friction_per_speed + square * first, speed_product * second), (
+            speed_product * first,
             friction_per_speed + other * second,
         )
 
@@ -319,11 +322,13 @@ def _solve_loads(given: _GroundForceInputs) -> tuple[Pair, GroundForces]:
         return loads_found, jax.jacfwd(lambda x: _forces_at_loads(x, even, given))(loads_found)
 
     nothing = load * given.sliding[0]
-    begun = jnp.stack([jnp.zeros_like(nothing), stance.ahead * jnp.ones_like(nothing)])
-    even = law_moments(*_moment_arguments(begun[1], given))
-    found = steps(begun, given, even)
-    lifts = (stance.on_tracks > 0.5) & (jnp.maximum(jnp.abs(begun[1]), jnp.abs(found[0][1])) > stance.length / 6)
-    return compute_if_needed(lifts, lambda at, given: steps(at, given, None), (begun, given), found)
+    first_loads = jnp.stack([jnp.zeros_like(nothing), stance.ahead * jnp.ones_like(nothing)])
+    even = law_moments(*_moment_arguments(first_loads[1], given))
+    solution = steps(first_loads, given, even)
+    lifts = (stance.on_tracks > 0.5) & (
+        jnp.maximum(jnp.abs(first_loads[1]), jnp.abs(solution[0][1])) > stance.length / 6
+    )
+    return compute_if_needed(lifts, lambda at, given: steps(at, given, None), (first_loads, given), solution)
 
 
 def _moment_arguments(centre: Scalar, given: _GroundForceInputs) -> tuple[ContactLaw, Array, Scalar, Scalar]:
@@ -349,7 +354,7 @@ def _forces_at_loads(loads: Array, even: Array | None, given: _GroundForceInputs
     zeroth, first, second = (even[:, k] + tilt * even[:, k + 1] for k in range(3))
     friction_limit, across = adhesion * normal, adhesion * normal * stance.lateral**stance.rule
     aside = across * (middle * zeroth + end * first)
-    turned = across * (middle * first + end * second)
+    turning_force = across * (middle * first + end * second)
     ahead = friction_limit * zeroth * sliding
     outward = stance.height * sum_of_sides(aside) / stance.width
     # A vertical ground carries no normal load.
@@ -358,8 +363,8 @@ def _forces_at_loads(loads: Array, even: Array | None, given: _GroundForceInputs
         normal=normal,
         ahead=ahead,
         aside=aside,
-        moment=arm * aside + half * turned,
-        across=middle * aside + end * turned,
+        moment=arm * aside + half * turning_force,
+        across=middle * aside + end * turning_force,
         moved=moments,
         centre=centre,
         lacking=loads - jnp.stack([outward, stance.ahead - behind]),

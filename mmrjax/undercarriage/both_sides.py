@@ -435,8 +435,8 @@ def distance_and_reactions(q: Array, reactions: GearReactions) -> tuple[Array, G
 
 def steady_averages(average: Average, travelled: Array, passed: balances.Travel, guided: Array) -> SteadyAverages:
     """See `half_robot.steady_averages`. Quantities of the whole robot are averaged over the periods of both sides."""
-    both = jax.tree.map(lambda x: jnp.broadcast_to(x.reshape(*x.shape[:1], -1), (*x.shape[:1], 2)), passed)
-    means, load, periods, changes = jax.vmap(average, in_axes=1)(jnp.abs(travelled), (both, guided))
+    side_averages = jax.tree.map(lambda x: jnp.broadcast_to(x.reshape(*x.shape[:1], -1), (*x.shape[:1], 2)), passed)
+    means, load, periods, changes = jax.vmap(average, in_axes=1)(jnp.abs(travelled), (side_averages, guided))
     travel = jax.tree.map(lambda x, like: x if like.ndim > 1 else jnp.mean(x), means, passed)
     share = jnp.sum(load) / jnp.maximum(jnp.sum(travel.signals.normal), 1e-9)
     # A side that hardly moves counts as settled if its changes are small compared with the other side's.
@@ -448,8 +448,8 @@ def status(run: HalfRobotSystem, averages: SteadyAverages, end: HalfRobotState) 
     """See `half_robot.status`."""
     travel, signals = averages.travel, jax.tree.map(jnp.mean, averages.signals)
     assert travel is not None
-    over = {name: getattr(signals, name) for name in ("speed", "speed_lateral", "yaw_rate")}
-    keeps = dataclasses.replace(plane_motion(run, end), **over)
+    limits = {name: getattr(signals, name) for name in ("speed", "speed_lateral", "yaw_rate")}
+    keeps = dataclasses.replace(plane_motion(run, end), **limits)
     status = circling.status_of_steady_motion(run.robot, run.conditions, travel, keeps)
     status = jnp.where((averages.change > half_robot.SETTLED) & (status == CONVERGED), NOT_SETTLED, status)
     tilt = jnp.maximum(jnp.abs(end.q[PITCH]), jnp.abs(end.q[ROLL]))

@@ -252,16 +252,16 @@ class _ContactDerivatives(eqx.Module):
         yields = None if compliance is None else -self.share * compliance
         force = _sum_of_products((self.by_depth, sinks), (-touching.damped, gap_rate), (touching.force, yields))
         damped = _sum_of_products((self.damped_by_depth, sinks), (touching.damped, yields))
-        turned = _sum_of_products((self.bend * touching.force, slide), (self.rise, force))
+        angle_derivative = _sum_of_products((self.bend * touching.force, slide), (self.rise, force))
         down = _sum_of_products((damped, self.off), (touching.damped, off))
         fallen = _sum_of_products(
-            (jnp.where(self.rise > 0, self.along, 0.0), turned),
+            (jnp.where(self.rise > 0, self.along, 0.0), angle_derivative),
             (jnp.maximum(self.rise, 0.0) * touching.force, along),
             (self.rise * touching.damped * self.off, slide),
             (self.coefficient, down),
         )
         pulled = _sum_of_products((self.rise * touching.force, slide), (self.coefficient, force))
-        moved_sums = (pulled, force, fallen, down, turned)
+        moved_sums = (pulled, force, fallen, down, angle_derivative)
         return tuple(jnp.zeros_like(touching.force) if a is None else a for a in moved_sums)
 
 
@@ -393,8 +393,10 @@ def _sums_and_motion_derivatives(
     pulleys = (front, rear, v[3], v[4])
     taut = free(pulleys)
     drawn_belt = turned(*belt, tip.compliance / taut)
-    over, gains = (path.radius * (a[4] - a[3]) for a in (v, gained))
-    handed = law.moved(gap_rate=rate_z * over, slide=-rate_x * over, along=rate_x * gains, off=rate_z * gains)
+    belt_slip, gains = (path.radius * (a[4] - a[3]) for a in (v, gained))
+    handed = law.moved(
+        gap_rate=rate_z * belt_slip, slide=-rate_x * belt_slip, along=rate_x * gains, off=rate_z * gains
+    )
     changes = [
         law.moved(gap=one),
         turned(*pitched),
@@ -408,8 +410,8 @@ def _sums_and_motion_derivatives(
         law.moved(compliance=-touching.compliance / taut),
     ]
     forces, rates = law.forces(), (rate_x, rate_z, guided)
-    here = _SumLevers.of(one, x, z, tuple(a * on_front for a in rates), tuple(a * on_rear for a in rates))
-    rows = _weighted_sums([*changes, forces], [here])[:, 0]
+    sum_levers = _SumLevers.of(one, x, z, tuple(a * on_front for a in rates), tuple(a * on_rear for a in rates))
+    rows = _weighted_sums([*changes, forces], [sum_levers])[:, 0]
     over_belt = levers(*belt, tip.guided)
     shift = tuple(path.radius * a * shared for a in rates)
     by_share = _SumLevers.of(jnp.zeros_like(x), 0 * x, 0 * x, tuple(-a for a in shift), shift)
@@ -420,8 +422,10 @@ def _sums_and_motion_derivatives(
     ]
     slopes = rows[: len(MOTION)].at[1:4].add(_weighted_sums([forces], derivatives)[0])
     for k, name in enumerate(("front", "rear", "v_front", "v_rear")):
-        by = jax.jvp(lambda a, k=k: free((*pulleys[:k], a, *pulleys[k + 1 :])), (pulleys[k],), (unit,))[1]
-        slopes = slopes.at[MOTION.index(name)].add(by * rows[-2])
+        pulley_derivative = jax.jvp(
+            lambda a, k=k: free((*pulleys[:k], a, *pulleys[k + 1 :])), (pulleys[k],), (unit,)
+        )[1]
+        slopes = slopes.at[MOTION.index(name)].add(pulley_derivative * rows[-2])
     return rows[-1], slopes
 
 
@@ -455,14 +459,14 @@ class SummedContacts(eqx.Module):
 
     def shifted(self, slip: Scalar) -> ContactSums:
         """Sums with `slip` added to the sliding speeds [m/s]."""
-        by, was = self.linearized.slope("slip"), self.linearized.values
+        slip_derivative, was = self.linearized.slope("slip"), self.linearized.values
         slip_change = slip - self.linearized.at["slip"]
-        sums = jax.tree.map(lambda a, b: a + b * slip_change, self.sums, by)
+        sums = jax.tree.map(lambda a, b: a + b * slip_change, self.sums, slip_derivative)
         rise, rise_front = self.sums.rise - was.rise, self.sums.rise_front - was.rise_front
         return dataclasses.replace(
             sums,
-            traction=sums.traction - (rise + by.rise * slip_change / 2) * slip_change,
-            front=sums.front - (rise_front + by.rise_front * slip_change / 2) * slip_change,
+            traction=sums.traction - (rise + slip_derivative.rise * slip_change / 2) * slip_change,
+            front=sums.front - (rise_front + slip_derivative.rise_front * slip_change / 2) * slip_change,
         )
 
     def pull(self, chassis: Chassis, signals: Signals) -> ContactForces:

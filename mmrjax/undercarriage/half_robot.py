@@ -281,10 +281,12 @@ def _implicit_step(run: HalfRobotSystem, motion: HalfRobotState) -> _StepFactors
     damping = damping_matrix(run, motion, signals, touching, pulled)
     factors = factorise(mass + run.step * damping)
     gained = solve_factorised(factors, mass @ (pushed - motion.v))
-    after, over = _state_after_motion(
+    after, is_over = _state_after_motion(
         motion, run.step, other_states_after_step(run, motion, signals), damping @ gained, gained, signals
     )
-    return _StepFactors(after, over, pulled.guided, damping, factors, gained, jnp.asarray(signals.speed_slip_terms))
+    return _StepFactors(
+        after, is_over, pulled.guided, damping, factors, gained, jnp.asarray(signals.speed_slip_terms)
+    )
 
 
 class _StateAfterStep(eqx.Module):
@@ -442,9 +444,9 @@ def stand(run: HalfRobotSystem, turned: Scalar = 0.0) -> HalfRobotState:
         return jnp.zeros_like(rest).at[3:5].set(turned).at[1].set(height).at[2].set(pitch)
 
     def unbalanced(y: Vector, _: None, given: tuple[Any, ...]) -> Vector:
-        path, chassis, turned, weight, forward, up, axle, cos, sin = given
+        path, chassis, pulley_angle, weight, forward, up, axle, cos, sin = given
         touching = side_contacts.compute_contacts(
-            path, chassis, placed(turned, axle - y[0], y[1]), jnp.zeros_like(rest)
+            path, chassis, placed(pulley_angle, axle - y[0], y[1]), jnp.zeros_like(rest)
         )
         moment = weight * (cos * (forward + y[1] * up) - sin * (up + axle)) - jnp.sum(
             touching.force * touching.lever_x
@@ -541,8 +543,8 @@ def status_unless_lost(
     """
     level = axle_height(run)
     finite = jnp.all(jnp.isfinite(end.q)) & jnp.all(jnp.isfinite(end.v)) & jnp.isfinite(current)
-    turned = (tilt > OVER) & (tilt < 2 * jnp.pi)
-    status = jnp.where(turned & (jnp.abs(height) < HIGH * level), TIPS, status)
+    is_overturned = (tilt > OVER) & (tilt < 2 * jnp.pi)
+    status = jnp.where(is_overturned & (jnp.abs(height) < HIGH * level), TIPS, status)
     grounded = (jnp.abs(height - level) < 0.5 * level) & (tilt < OVER)
     return jnp.where(finite & (grounded | (status == TIPS)), status, FAILED)
 

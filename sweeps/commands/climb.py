@@ -104,7 +104,7 @@ def _climb_of_configuration(
         alike = [jax.tree.map(lambda x: jnp.stack([jnp.asarray(x)] * len(sizes)), c) for c in (conditions, sequence)]
         with progress_bar(1, quiet=False) as advance:
             counter = scale.share_counter(advance, 1)
-            ended = climb_batch(
+            climb_runs = climb_batch(
                 robot,
                 alike[0],
                 grounds,
@@ -114,26 +114,26 @@ def _climb_of_configuration(
                 progress=counter,
             )
             counter(1.0)
-        return grounds, ended
+        return grounds, climb_runs
 
-    chosen, largest = 0, None
+    shown_index, largest = 0, None
     tried: tuple[tuple[float, str], ...] = ()
     derivatives: ClimbDerivatives | None = None
     if config.find is not None:
-        grounds, ended, chosen, tried, largest = _search_largest(config.find, run)
+        grounds, all_climbs, shown_index, tried, largest = _search_largest(config.find, run)
     elif along is None:
-        grounds, ended = run(np.array([np.nan]))
+        grounds, all_climbs = run(np.array([np.nan]))
     else:
         with progress_bar(1, quiet=False) as advance:
             derivatives = climb_derivatives(
                 along.given, along.values, along.widths, duration=config.duration_s, step=config.time_step_s,
                 progress=scale.share_counter(advance, 1),
             )  # fmt: skip
-        ended = derivatives.climb
+        all_climbs = derivatives.climb
         grounds = jax.tree.map(lambda x: x[None], along.given(along.values).terrain)
-    one = jax.tree.map(lambda x: x[chosen : chosen + 1], ended)
+    one = jax.tree.map(lambda x: x[shown_index : shown_index + 1], all_climbs)
     return ClimbResult(
-        robot, name, words, jax.tree.map(lambda x: x[chosen], grounds), one, tried, largest,
+        robot, name, words, jax.tree.map(lambda x: x[shown_index], grounds), one, tried, largest,
         {"step": "step", "stairs": "rise of such stairs", "gap": "gap", None: ""}[config.find],
         along, derivatives,
     )  # fmt: skip
@@ -210,13 +210,13 @@ def _search_largest(
     tried: dict[float, str] = {}
     largest_climbed: tuple[Terrain, ClimbRuns, int] | None = None
     while True:
-        grounds, ended = run(sizes)
-        tried |= {float(s): v for s, v in zip(sizes, ended.names, strict=True)}
+        grounds, climb_runs = run(sizes)
+        tried |= {float(s): v for s, v in zip(sizes, climb_runs.names, strict=True)}
         order = sorted(tried)
-        over = [s for s in order if tried[s] == "over" and all(tried[t] == "over" for t in order if t < s)]
-        best = max(over, default=None)
+        climbed_sizes = [s for s in order if tried[s] == "over" and all(tried[t] == "over" for t in order if t < s)]
+        best = max(climbed_sizes, default=None)
         if largest_climbed is None or best in sizes:
-            largest_climbed = grounds, ended, int(np.flatnonzero(sizes == best)[0]) if best in sizes else 0
+            largest_climbed = grounds, climb_runs, int(np.flatnonzero(sizes == best)[0]) if best in sizes else 0
         beyond = [s for s in order if best is None or s > best]
         if best is None or not beyond or min(beyond) - best <= NEAR:
             return *largest_climbed, tuple((s, tried[s]) for s in order), best

@@ -154,10 +154,10 @@ def _second_name(config: configuration.Compare, file: RobotFile, second: RobotFi
 
 def missing_readings_notes(table: Columns, channels: Sequence[Channel]) -> list[str]:
     """Sentences on channels with missing readings."""
-    lost = {c.column: int(np.isnan(table[c.column]).sum()) for c in channels}
+    missing_counts = {c.column: int(np.isnan(table[c.column]).sum()) for c in channels}
     rows = len(table["status"])
     return [
         f"{column}: {'all' if count == rows else f'{count} of {rows}'} readings are missing and are ignored"
-        for column, count in lost.items()
+        for column, count in missing_counts.items()
         if count
     ]

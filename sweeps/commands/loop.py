@@ -82,9 +82,9 @@ def _run_loop(config: configuration.Loop, beside: configuration.LoopBeside, robo
         return max(within - (time.monotonic() - began), 0.0)
 
     def timed(text: str) -> None:
-        used = time.monotonic() - began
-        more = expected_time(text, used)
-        print_message(f"{used:4.0f} s  {text}{'' if more is None else f' (about {more:.0f} s more)'}")
+        elapsed = time.monotonic() - began
+        more = expected_time(text, elapsed)
+        print_message(f"{elapsed:4.0f} s  {text}{'' if more is None else f' (about {more:.0f} s more)'}")
 
     with (
         open_folder("loop", config, robot, beside, runs) as folder,

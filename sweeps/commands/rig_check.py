@@ -129,7 +129,7 @@ class RigCheck:
 
     def channels(self) -> list[Json]:
         """Name, column in the file, sign convention, resolution [unit] and source of the sd of each channel."""
-        theirs = {name: column for name, column, _ in self.robot.rig.columns}
+        columns_by_channel = {name: column for name, column, _ in self.robot.rig.columns}
         rig, rows = (self if self.foresight is None else self.foresight).robot.rig, []
         for k, channel in enumerate(self.robot.channels):
             instrument = rig.instrument(channel.name)
@@ -137,7 +137,7 @@ class RigCheck:
             rows.append(
                 {
                     "channel": channel.name,
-                    "column": theirs.get(channel.column, channel.column),
+                    "column": columns_by_channel.get(channel.column, channel.column),
                     "signed": instrument.signed,
                     "quantum": None if instrument.quantum is None else instrument.quantum / channel.factor,
                     "unit": channel.unit,
@@ -150,9 +150,9 @@ class RigCheck:
         """Use and range of each column of the table."""
         if self.runs is None:
             return []
-        rows, theirs = [], self.runs.headings
+        rows, headings = [], self.runs.headings
         for name, values in self.runs.columns.items():
-            if name not in theirs and self._does_not_apply(name):
+            if name not in headings and self._does_not_apply(name):
                 continue
             number = np.issubdtype(values.dtype, np.number)
             finite = values[np.isfinite(values)] if number else values
@@ -160,8 +160,8 @@ class RigCheck:
             rows.append(
                 {
                     "column": name,
-                    "theirs": theirs.get(name, ""),
-                    "use": _use_of_column(name, self.robot) if name in theirs else "not in the table",
+                    "theirs": headings.get(name, ""),
+                    "use": _use_of_column(name, self.robot) if name in headings else "not in the table",
                     "values": len(kinds),
                     "least": float(finite.min()) if number and len(finite) else None,
                     "greatest": float(finite.max()) if number and len(finite) else None,
@@ -354,7 +354,7 @@ def check_document(found: RigCheck) -> Document:
 
 
 def _data_blocks(found: RigCheck, runs: Runs, seen: InformationForecast) -> tuple[Block, ...]:
-    used = [
+    channel_names = [
         (
             c["column"] if c["theirs"] in ("", c["column"]) else f"{c['column']}, yours {c['theirs']}",
             c["use"], c["values"], *(("", "") if c["words"] else (c["least"], c["greatest"])),
@@ -394,7 +394,7 @@ def _data_blocks(found: RigCheck, runs: Runs, seen: InformationForecast) -> tupl
     )
     return (
         Table(
-            "columns", columns("column", "used as", "values |", "from | .5g", "to | .5g", "words"), used,
+            "columns", columns("column", "used as", "values |", "from | .5g", "to | .5g", "words"), channel_names,
             f"{runs.source}: {count_noun(len(runs), 'row')}",
         ),
         *remarks(notes_of_data),

@@ -67,8 +67,8 @@ class _UrdfRobot:
         for element in self.root.findall(tag):
             name = element.get("name", "")
             if not name or name in elements:
-                what = f"two are called {name}" if name else "one has no name"
-                raise BadConfiguration(f"{self.file}, <{tag}>: {what}; expected different names")
+                problem_words = f"two are called {name}" if name else "one has no name"
+                raise BadConfiguration(f"{self.file}, <{tag}>: {problem_words}; expected different names")
             elements[name] = element
         if not elements:
             raise BadConfiguration(f"{self.file}: has no <{tag}>; expected a robot with links and joints")
@@ -152,8 +152,8 @@ class _UrdfRobot:
     def _origin(self, owner: Element, where: str) -> Pose:
         element = owner.find("origin")
         roll, pitch, yaw = self._vector(element, "rpy", f"{where}, <origin>", (0.0, 0.0, 0.0))
-        turned = _rotation_about(2, yaw) @ _rotation_about(1, pitch) @ _rotation_about(0, roll)
-        return turned, self._vector(element, "xyz", f"{where}, <origin>", (0.0, 0.0, 0.0))
+        rotation = _rotation_about(2, yaw) @ _rotation_about(1, pitch) @ _rotation_about(0, roll)
+        return rotation, self._vector(element, "xyz", f"{where}, <origin>", (0.0, 0.0, 0.0))
 
     def _moved(self, link: str, rigid: bool = False) -> Iterator[tuple[str, Pose]]:
         """Links that turn with a link, or are fixed to it, and their poses in its frame, other joints at zero."""
@@ -209,13 +209,13 @@ class _UrdfRobot:
         if inertial is None:
             return 0.0, 0.0, np.zeros(3)
         mass = self._link_mass(link)
-        turned, centre = _compose(pose, self._origin(inertial, f"link {link}"))
+        rotation, centre = _compose(pose, self._origin(inertial, f"link {link}"))
         entries = inertial.find("inertia")
-        where = f"link {link}, <inertia>"
-        xx, yy, zz = (self._number(entries, f"i{a}{a}", where, "kg·m²", 0.0) for a in "xyz")
-        xy, xz, yz = (self._number(entries, f"i{a}", where, "kg·m²", None) for a in ("xy", "xz", "yz"))
+        place_words = f"link {link}, <inertia>"
+        xx, yy, zz = (self._number(entries, f"i{a}{a}", place_words, "kg·m²", 0.0) for a in "xyz")
+        xy, xz, yz = (self._number(entries, f"i{a}", place_words, "kg·m²", None) for a in ("xy", "xz", "yz"))
         tensor = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-        own_axis = turned.T @ axis
+        own_axis = rotation.T @ axis
         lever = np.cross(axis, centre)
         return mass, float(own_axis @ tensor @ own_axis + mass * lever @ lever), mass * centre
 
@@ -227,13 +227,13 @@ class _UrdfRobot:
             radii: list[Found] = []
             for name, pose in self._moved(link, rigid=True):
                 for shape in self.links[name].findall(tag):
-                    turned, centre = _compose(pose, self._origin(shape, f"link {name}, <{tag}>"))
-                    for kind, along in (("cylinder", turned[:, 2]), ("sphere", None)):
-                        where = f"link {name}, <{tag}> <{kind}>"
+                    rotation, centre = _compose(pose, self._origin(shape, f"link {name}, <{tag}>"))
+                    for kind, along in (("cylinder", rotation[:, 2]), ("sphere", None)):
+                        place_words = f"link {name}, <{tag}> <{kind}>"
                         element = shape.find(f"geometry/{kind}")
-                        radius = self._number(element, "radius", where, "m", 0.0)
+                        radius = self._number(element, "radius", place_words, "m", 0.0)
                         if radius > 0 and is_round(centre, axis, radius, along):
-                            radii.append((radius, where))
+                            radii.append((radius, place_words))
             if radii:
                 return max(radii)
         return None
@@ -282,15 +282,15 @@ class _UrdfRobot:
 
     def _dynamics(self, joint: Element, key: str) -> Found | None:
         unit = {"friction": "N·m"}.get(key, "N·m·s")
-        where = f"joint {joint.get('name')}, <dynamics {key}>"
-        value = self._number(joint.find("dynamics"), key, where, unit, 0.0)
-        return (value, where) if value else None
+        place_words = f"joint {joint.get('name')}, <dynamics {key}>"
+        value = self._number(joint.find("dynamics"), key, place_words, unit, 0.0)
+        return (value, place_words) if value else None
 
     def _armature(self, joint: str) -> Found | None:
         """Inertia of the rotor at the joint: an attribute `armature` of its dynamics."""
-        where = f"joint {joint}, <dynamics armature>"
-        value = self._number(self.joints[joint].find("dynamics"), "armature", where, "kg·m²", 0.0)
-        return (value, where) if value else None
+        place_words = f"joint {joint}, <dynamics armature>"
+        value = self._number(self.joints[joint].find("dynamics"), "armature", place_words, "kg·m²", 0.0)
+        return (value, place_words) if value else None
 
     # --- cells
 
@@ -327,11 +327,11 @@ class _UrdfRobot:
 def _rotation_about(axis: int, angle: float) -> np.ndarray:
     """Rotation about a coordinate axis, shape (3, 3)."""
     one, other = (axis + 1) % 3, (axis + 2) % 3
-    turned = np.eye(3)
-    turned[one, one] = turned[other, other] = math.cos(angle)
-    turned[other, one] = math.sin(angle)
-    turned[one, other] = -math.sin(angle)
-    return turned
+    rotation = np.eye(3)
+    rotation[one, one] = rotation[other, other] = math.cos(angle)
+    rotation[other, one] = math.sin(angle)
+    rotation[one, other] = -math.sin(angle)
+    return rotation
 
 
 def _compose(outer: Pose, inner: Pose) -> Pose:

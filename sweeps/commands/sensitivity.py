@@ -70,8 +70,8 @@ def execute(config: configuration.Sensitivity, beside: configuration.FolderPart)
     inputs = _uncertain_inputs(config, file, runs, ranges)
     candidates = _candidate_runs(config, robot, runs, bool(freed))
     conditions = runs.conditions(robot)
-    turned: Json = {name: np.full(len(runs), np.mean(ranges[name])) for name in freed}
-    check_runs_bearable(robot, dataclasses.replace(conditions, **turned), config)
+    turn_columns: Json = {name: np.full(len(runs), np.mean(ranges[name])) for name in freed}
+    check_runs_bearable(robot, dataclasses.replace(conditions, **turn_columns), config)
     supply = PointSupply(
         float(config.battery), config.discharge_mAh * COULOMB_PER_MAH, np.asarray(conditions.adhesion)
     )

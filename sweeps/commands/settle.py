@@ -22,8 +22,8 @@ def execute(config: configuration.Settle, beside: configuration.SettledLog) -> i
     """Find the settled runs of a log and write a run folder with their table. Returns the exit code, 0."""
     robot = load_robot(config).robot
     runs = read_runs(beside.data, robot, columns=config.columns, measured=True, series=True)
-    named = [] if config.columns is None else ["--columns", config.columns]
-    loop = shlex.join(["mmrjax", "loop", beside.data, "--robot", config.robot, *named])
+    column_options = [] if config.columns is None else ["--columns", config.columns]
+    loop = shlex.join(["mmrjax", "loop", beside.data, "--robot", config.robot, *column_options])
     settled = settling.settle_log(
         runs,
         shortest=config.shortest_s,
@@ -37,8 +37,8 @@ def execute(config: configuration.Settle, beside: configuration.SettledLog) -> i
         folder.write_table("settled.csv", settled.table())
         folder.write_table("stretches.csv", segments_table(settled))
         folder.write_json("result.json", to_json(settled, few))
-        turned = sentences(ranges.remarks_on_signs(settled.settled_runs(), robot))
-        document = print_report(settle_report.settle_document(settled, few, turned))
+        sign_sentences = sentences(ranges.remarks_on_signs(settled.settled_runs(), robot))
+        document = print_report(settle_report.settle_document(settled, few, sign_sentences))
         return finish_run_folder(
             folder,
             config,

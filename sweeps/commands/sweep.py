@@ -85,8 +85,8 @@ def _sweep_into_table(config: Sweep, file: RobotFile, options: StoreOptions) -> 
 
 
 def _sweep_into_store(config: Campaign, file: RobotFile, options: StoreOptions) -> int:
-    robot, where = file.robot, options.where
-    plan = axes.plan_design(config, robot, where)
+    robot, place = file.robot, options.where
+    plan = axes.plan_design(config, robot, place)
     robot = showing_turns(robot, {*plan.axes, *plan.conditions})
     pool = None
     if options.scheduler is not None and not options.dry_run:
@@ -96,10 +96,10 @@ def _sweep_into_store(config: Campaign, file: RobotFile, options: StoreOptions) 
     try:
         device = scale.device_kind() if pool is None else pool.device
         task = task_of(config, robot)
-        wanted = options.outputs or config.outputs or task.usual
+        output_names = options.outputs or config.outputs or task.usual
         chunk = config.chunk or scale.default_chunk(task, None if pool is None else device)
-        config = config.model_copy(update={"chunk": chunk, "outputs": wanted})
-        job = prepare_job(config, robot, plan, where)
+        config = config.model_copy(update={"chunk": chunk, "outputs": output_names})
+        job = prepare_job(config, robot, plan, place)
         layout = store_layout(config, job)
         path = options.out or default_path("sweep")
         if options.dry_run:

@@ -47,8 +47,12 @@ class SteadyMap(eqx.Module):
     @property
     def efficiency(self) -> np.ndarray:
         """Output power over input power [-]. For a driven joint, the inverse."""
-        out, taken = np.outer(self.speed, self.torque), self.values["power"]
-        share = np.where(out > 0, out / np.where(taken > 0, taken, np.inf), taken / np.where(out < 0, out, -np.inf))
+        out, input_power = np.outer(self.speed, self.torque), self.values["power"]
+        share = np.where(
+            out > 0,
+            out / np.where(input_power > 0, input_power, np.inf),
+            input_power / np.where(out < 0, out, -np.inf),
+        )
         return np.clip(share, 0.0, 1.0)
 
 

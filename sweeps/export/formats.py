@@ -101,8 +101,8 @@ def export_format(
         "jax": _export_actuator, "onnx": _export_actuator,
         "mjlab": _export_actuator,
     }[to]  # fmt: skip
-    begun = Export(to, drive, constants, posterior, {}, None, {})  # type: ignore[arg-type]  # filled in below
-    return make(begun, runs, at, draws, seed)
+    empty_export = Export(to, drive, constants, posterior, {}, None, {})  # type: ignore[arg-type]  # filled in below
+    return make(empty_export, runs, at, draws, seed)
 
 
 def notes_of(runs: ComparisonRuns) -> list[str]:

@@ -148,9 +148,9 @@ _TORCH = _ArrayLibrary(
 
 def function_arguments(symbol: Symbol) -> list[str]:
     """Arguments of the function of an expression, in addition to its parameters."""
-    used = names_in(symbol)
-    used_arguments = [n for n in _ARGUMENTS if n in used]
-    return [*used_arguments, "memory"] if any(n.startswith("memory.") for n in used) else used_arguments
+    symbol_names = names_in(symbol)
+    used_arguments = [n for n in _ARGUMENTS if n in symbol_names]
+    return [*used_arguments, "memory"] if any(n.startswith("memory.") for n in symbol_names) else used_arguments
 
 
 def quoted(word: str) -> str:
@@ -204,14 +204,14 @@ def functions_text(joint: DriveJoint, dialect: Dialect) -> str:
         document = f"{part.equation.rstrip('.')}{unit}. {meaning}".strip()
         texts.append(_function_text(part.name, part.value, document, dialect))
         if part.by:
-            what = f"Derivative of `{part.name}` with respect to `{part.by}`."
-            texts.append(_function_text(f"{part.name}_slope", part.slope, what, dialect))
+            docstring = f"Derivative of `{part.name}` with respect to `{part.by}`."
+            texts.append(_function_text(f"{part.name}_slope", part.slope, docstring, dialect))
         if part.rate is not None:
             texts.append(
                 _function_text(f"{part.name}_rate", part.rate, f"Rate of the memory of `{part.name}`.", dialect)
             )
-            what = f"Derivative of `{part.name}_rate` with respect to the memory of `{part.name}`."
-            texts.append(_function_text(f"{part.name}_rate_slope", part.rate_slope, what, dialect))
+            docstring = f"Derivative of `{part.name}_rate` with respect to the memory of `{part.name}`."
+            texts.append(_function_text(f"{part.name}_rate_slope", part.rate_slope, docstring, dialect))
     return "\n\n\n".join(texts)
 
 

@@ -207,21 +207,23 @@ def _controller_fate(joint: DriveJoint, lag: float, ki: float) -> EffectFate:
             "command voltages"
         )
         return EffectFate(CONTROLLER, DROPPED, how)
-    lost = [f"its lag of {lag:g} s is dropped"] * (lag > 0)
-    lost += ["its integral stops at a fixed value, not when the duty reaches its limit"] * (ki > 0)
-    lost += ["it measures the angle on the motor's side of the backlash"] * joint.loose
-    return EffectFate(CONTROLLER, APPROXIMATED if lost else HELD, "; ".join(["gains and limit of voltage", *lost]))
+    limitations = [f"its lag of {lag:g} s is dropped"] * (lag > 0)
+    limitations += ["its integral stops at a fixed value, not when the duty reaches its limit"] * (ki > 0)
+    limitations += ["it measures the angle on the motor's side of the backlash"] * joint.loose
+    return EffectFate(
+        CONTROLLER, APPROXIMATED if limitations else HELD, "; ".join(["gains and limit of voltage", *limitations])
+    )
 
 
 def fates_outside_joint(joint: DriveJoint) -> list[EffectFate]:
     """Fates of effects that are not part of a joint."""
-    where = {
+    place_by_effect = {
         "sensor": "an instrument error, not part of the drive",
         "supply": "the battery; the command is a voltage, so reduce it accordingly",
         "mass": "the mass of the robot; set it in the simulator's model",
     }
     other = "a property of the ground, which the simulator's contact model must provide"
-    return [EffectFate(e.name, DROPPED, where.get(e.balance, other)) for e in joint.outside]
+    return [EffectFate(e.name, DROPPED, place_by_effect.get(e.balance, other)) for e in joint.outside]
 
 
 def approximated_terms(balance: str) -> str:

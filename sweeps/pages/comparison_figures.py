@@ -60,21 +60,23 @@ def draw_parity(table: Columns, channels: Sequence[Channel], band: bool = True) 
     look = configuration_looks(table["configuration"])
     for axes, channel in zip(grid[0], channels, strict=True):
         measured, simulated = table[channel.column], table[f"simulated_{channel.column}"]
-        both = np.isfinite(measured) & np.isfinite(simulated)
-        ends = np.concatenate([measured[both], simulated[both]]) if both.any() else np.array([0.0, 1.0])
+        is_paired = np.isfinite(measured) & np.isfinite(simulated)
+        ends = (
+            np.concatenate([measured[is_paired], simulated[is_paired]]) if is_paired.any() else np.array([0.0, 1.0])
+        )
         low, high = min(0.0, float(ends.min())), max(0.0, float(ends.max()))
         span = np.array([low - 0.05 * (high - low) * (low < 0), high + 0.05 * (high - low)])
         if band:
             axes.fill_between(span, span * 0.95, span * 1.05, color="#eef3ee", lw=0)
         axes.plot(span, span, color="#666666", lw=0.9)
         for kind, (colour, marker) in look.items():
-            pick = both & (table["configuration"] == kind)
+            pick = is_paired & (table["configuration"] == kind)
             if pick.any():
                 _draw_dots(axes, measured[pick], simulated[pick], marker, color=colour, label=kind)
         axes.set(xlabel=f"measured {axis_label(channel)}", ylabel=f"simulated {axis_label(channel)}")
         axes.set_xlim(*span)
         axes.set_ylim(*span)
-        if not both.any():
+        if not is_paired.any():
             add_corner_note(axes, "no row has both numbers")
     if grid[0, 0].get_legend_handles_labels()[0] and len(look) <= LOOKS:
         grid[0, 0].legend(loc="lower right")

@@ -187,10 +187,10 @@ def start_runs(
             np.asarray(x[k])[upto] for x in (history.signals.speed, history.signals.speed_theoretical)
         )
         sense = 1.0 if found is None else found.sense
-        kind, ended, scale = robot.configurations.names[int(which[k])], STATUSES[int(status[k])], sense / MM
+        kind, status_word, scale = robot.configurations.names[int(which[k])], STATUSES[int(status[k])], sense / MM
         times = np.asarray(history.time[k])[upto]
         answer.append(
-            StartRun(name, kind, ended, times, sense * current[upto], scale * speed, scale * theoretical, found)
+            StartRun(name, kind, status_word, times, sense * current[upto], scale * speed, scale * theoretical, found)
         )
     return answer
 

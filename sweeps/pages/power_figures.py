@@ -137,19 +137,21 @@ def operating_points(robot: Robot, runs: Columns) -> Columns:
 def draw_chart_of_corners(robot: Robot, corners: Sequence[Json]) -> Figure:
     """The chart of motor and gear with operating points at corners of an envelope, on the robot's own ground."""
     keys = ("configuration", "payload_kg", "slope_deg", "state_of_charge", "supply_voltage_V")
-    whole = (corner for corner in corners if not any(isinstance(corner.get(key), list | tuple) for key in keys))
-    cells = dict.fromkeys(tuple(corner.get(key) for key in keys) for corner in whole)
+    single_corners = (
+        corner for corner in corners if not any(isinstance(corner.get(key), list | tuple) for key in keys)
+    )
+    cells = dict.fromkeys(tuple(corner.get(key) for key in keys) for corner in single_corners)
     rows = [cell for cell in cells if None not in cell[:3]]
     full = float(robot.battery.voltage_no_load(0.0))
     if not rows:
         return draw_drive_chart(robot, [full], dict.fromkeys(("torque_Nm", "motor_rpm", "motor_A"), np.zeros(0)))
     names, payload, slope, charge, volts = zip(*rows, strict=True)
     on_battery = np.array([v is None for v in volts])
-    used = float(robot.battery.capacity) * (1 - np.array([1.0 if c is None else max(c, 1e-9) for c in charge]))
+    charge_used = float(robot.battery.capacity) * (1 - np.array([1.0 if c is None else max(c, 1e-9) for c in charge]))
     supply = np.array([full if v is None else v for v in volts], float)
     conditions = Conditions(
         list(names), supply, slope_deg=np.array(slope, float), payload=np.array(payload, float),
-        battery=on_battery.astype(float), discharge=np.where(on_battery, used, 0.0),
+        battery=on_battery.astype(float), discharge=np.where(on_battery, charge_used, 0.0),
     )  # fmt: skip
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # a cut-off that rarely acts

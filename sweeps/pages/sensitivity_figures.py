@@ -60,21 +60,21 @@ def draw_tornado(study: OutputStudy, found: SensitivityResult) -> Figure:
     points = found.points
     kinds = list(dict.fromkeys(map(str, points.configuration)))
     panel_rows = max(PANELS // len(kinds), 1)
-    chosen: list[int] = []
+    shown_points: list[int] = []
     for kind in kinds:
         point_rows = np.flatnonzero((points.configuration == kind) & np.isfinite(study.value) & study.studied)
         order = point_rows[
             np.lexsort((points.payload[point_rows], points.slope_deg[point_rows], points.imposed[1][point_rows]))
         ]
         if order.size:
-            chosen += [int(order[k]) for k in np.unique(np.linspace(0, order.size - 1, panel_rows).astype(int))]
-    where = chosen[:PANELS]
+            shown_points += [int(order[k]) for k in np.unique(np.linspace(0, order.size - 1, panel_rows).astype(int))]
+    panel_points = shown_points[:PANELS]
     unit, factor = study.row.unit_shown, study.row.factor
-    swing, value = study.swing[:, where] / factor, study.value[where] / factor
+    swing, value = study.swing[:, panel_points] / factor, study.value[panel_points] / factor
     reach = np.nanmax(np.abs(swing - value[:, None]), 0, initial=0.0, where=np.isfinite(swing))
     relative = (reach / np.maximum(reach.max(1, keepdims=True), 1e-300)).sum(0)
     top = [i for i in np.argsort(-relative, kind="stable")[:TALLEST] if relative[i] > 0.03]
-    fig, axes = new_figure(1, max(len(where), 1), 0.9 + 0.26 * len(top), sharey=True)
+    fig, axes = new_figure(1, max(len(panel_points), 1), 0.9 + 0.26 * len(top), sharey=True)
     for n, ax in enumerate(axes[0]):
         for place, i in enumerate(top):
             for end, colour in ((swing[0, n, i], VERMILION), (swing[1, n, i], BLUE)):
@@ -84,7 +84,7 @@ def draw_tornado(study: OutputStudy, found: SensitivityResult) -> Figure:
                     beside = np.nanmax([value[n], *swing[:, n, i]])
                     ax.text(beside, -place, " × does not travel", va="center", fontsize=7.5, color=colour)
         ax.axvline(value[n], color=INK, linewidth=0.9)
-        ax.set_title(_split_label(found.points.label(where[n])), fontsize=8.5)
+        ax.set_title(_split_label(found.points.label(panel_points[n])), fontsize=8.5)
         ax.tick_params(axis="x", labelsize=8)
         ax.locator_params(axis="x", nbins=3, steps=[1, 2, 5, 10])  # of few digits, so that they do not touch
         ax.grid(axis="y", visible=False)

@@ -188,9 +188,9 @@ def connect_workers(address: str) -> Pool:
                 f"--scheduler: {address} has no workers; start one for each device: `dask worker {address} "
                 "--nthreads 1`"
             ) from None
-        here, kinds = program_identity(), set()
+        own_identity, kinds = program_identity(), set()
         for worker, (host, device) in client.run(introduce_worker).items():
-            differ = identity_differences(here, host)
+            differ = identity_differences(own_identity, host)
             if differ:
                 raise BadConfiguration(f"--scheduler: {worker} runs different software; it differs in {differ}")
             kinds.add(device)

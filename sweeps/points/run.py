@@ -151,11 +151,11 @@ def job_of(robot: Robot, runs: Runs, config: FidelityPart, samples: DrawnSamples
     rows = conditions_of_runs(robot, runs, config)
     check_runs_bearable(robot, rows, config)
     plan = SweepPlan.of_rows(jax.tree.map(np.asarray, rows), samples)
-    wanted = (*outputs.output_names(robot.channels), FLAGS_CODE, *fidelities.get_fidelity(config.model).columns)
+    output_names = (*outputs.output_names(robot.channels), FLAGS_CODE, *fidelities.get_fidelity(config.model).columns)
     task = run_task(config.model, config.options, robot)
     chunk = getattr(config, "chunk", None) or scale.default_chunk(task)
     blocks = Blocks.of(plan.design.shape, chunk)
-    return Job(robot, task, plan, wanted, "float64", blocks)
+    return Job(robot, task, plan, output_names, "float64", blocks)
 
 
 def evaluate_runs(

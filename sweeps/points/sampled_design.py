@@ -87,8 +87,8 @@ class Samples:
 
         joint = 0 if self.joint is None else len(self.joint)
         begin = first - first % TOGETHER
-        whole = first + count + -(first + count) % TOGETHER - begin
-        unit = DESIGNS[self.design](self.seed, self.number, len(self.marginals) + joint, begin, whole)
+        padded_count = first + count + -(first + count) % TOGETHER - begin
+        unit = DESIGNS[self.design](self.seed, self.number, len(self.marginals) + joint, begin, padded_count)
         rows = [quantile(u) for quantile, u in zip(self.marginals.values(), unit, strict=False)]
         if self.joint is not None:
             rows.extend(in_blocks(self.joint.values, ndtri(unit[len(self.marginals) :]).T).T)

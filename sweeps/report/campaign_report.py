@@ -35,10 +35,10 @@ def campaign_document(file: RobotFile, layout: Layout, result: Json, store: Path
     """
     counts, model, total = result["statuses"], result["model"], result["points"]
     reached = sum(counts.get(s, 0) for s in words.SETTLED)
-    what = words.VERDICTS.get((model, "converged"), "have an operating point")
+    verdict_words = words.VERDICTS.get((model, "converged"), "have an operating point")
     return Document(
         f"Sweep of {count_noun(total, 'point')}",
-        f"{count_noun(total, 'point')}: {reached:,} {what}.",
+        f"{count_noun(total, 'point')}: {reached:,} {verdict_words}.",
         (
             run_tables.lead_note(file, model, f"All points are in `{STORE}`."),
             run_tables.endings_table(counts, "points", model),

@@ -59,7 +59,7 @@ def noise_sentence(noise: Mapping[str, tuple[float | None, str]], shown: Iterabl
 
 def rms_table(rms: Mapping[str, Mapping[str, float]], shown: Sequence[Channel]) -> Table:
     """rms errors in the units of their channels, by fit."""
-    rows = [(FITS[fit], *(by.get(c.name) for c in shown)) for fit, by in rms.items()]
+    rows = [(FITS[fit], *(rms_by_channel.get(c.name) for c in shown)) for fit, rms_by_channel in rms.items()]
     return catalogue.table("fit.rms", rows, *(f"{c.label} [{c.unit}] | .3g" for c in shown))
 
 

@@ -102,7 +102,7 @@ def missions_document(file: RobotFile, found: Missions) -> Document:
         "runs", shown_columns, _RUNS, first=[(Column("run"), names)], file="runs.csv", sideways=True
     )
     endings = run_tables.endings_table(Counter(map(str, table["status"])))
-    whole = len(names) == 1 and first["status"] == "converged"
+    is_complete = len(names) == 1 and first["status"] == "converged"
     return Document(
         f"Mission {source.source}" + ("" if len(names) > 1 else f" of {names[0]}"),
         answer,
@@ -111,7 +111,7 @@ def missions_document(file: RobotFile, found: Missions) -> Document:
             Note(lead, terminal=True),
             *remarks(_exceeded_limits(found), "flags"),
             runs,
-            *([] if whole else [endings]),
+            *([] if is_complete else [endings]),
             *remarks(_charge_left(table)),
         ),
         page_sections=lambda: _sections(file.robot, found, first, answer),
@@ -197,12 +197,12 @@ def mission_limits(robot: Robot, run: Json) -> list[Json]:
          "{:.2f} A"),
         ("rms torque, one gearbox", run["rms_torque_Nm"], gearbox.torque_limit or np.nan, "{:.2f} N·m"),
     ]  # fmt: skip
-    used = run_tables.use_of_limits(limits, float(motor.temperature_ambient))
+    limit_use = run_tables.use_of_limits(limits, float(motor.temperature_ambient))
     low, cutoff = float(run["cell_low_V"]), float(robot.battery.voltage_cutoff)
     if np.isfinite(low):
         line = {"words": "lowest cell (not below)", "value": f"{low:.2f} V", "limit": f"{cutoff:.2f} V"}
-        used.append(line | {"percent": 100 * cutoff / low})
-    return used
+        limit_use.append(line | {"percent": 100 * cutoff / low})
+    return limit_use
 
 
 def _exceeded_limits(found: Missions) -> Iterable[str]:
@@ -235,7 +235,7 @@ def _segments(found: Missions, name: str, idle: set[str]) -> Table:
     shown_columns = [c for c in _OF_SEGMENTS if c not in idle]
     totals = [c for c in shown_columns if c != "rms_current_A"] if many else []
     rows = {key: value[found.segments["run_id"] == name] for key, value in found.segments.items()}
-    whole, answer = float(np.sum(rows["energy_Wh"])), []
+    total_energy, answer = float(np.sum(rows["energy_Wh"])), []
     for k in range(min(source.segment_count, SEGMENTS)):
         segment_rows = {key: value[rows["segment"] == k + 1] for key, value in rows.items()}
         if not len(segment_rows["status"]):
@@ -246,7 +246,11 @@ def _segments(found: Missions, name: str, idle: set[str]) -> Table:
         sums = [
             np.sum(segment_rows[c]) if c in ("energy_Wh", "distance_m") else np.max(segment_rows[c]) for c in totals
         ]
-        shares = [100 * float(np.sum(segment_rows["energy_Wh"])) / whole if whole > 0 else None] if many else []
+        shares = (
+            [100 * float(np.sum(segment_rows["energy_Wh"])) / total_energy if total_energy > 0 else None]
+            if many
+            else []
+        )
         answer.append(
             (
                 f"{k + 1}: {begin:g} to {end:g} s", source.modes[k].replace("_", " "), _demand_in_words(found, k),

@@ -176,11 +176,11 @@ def _leaves(record: Mapping[str, Any], at: str, name: str, depth: int) -> Iterab
     if depth > DEEPEST:
         raise BadData(f"{name}, {at}: is nested too deeply; expected at most {DEEPEST} levels")
     for key, value in record.items():
-        here = f"{at}.{key}" if at else str(key)
+        key_path = f"{at}.{key}" if at else str(key)
         if isinstance(value, Mapping):
-            yield from _leaves(value, here, name, depth + 1)
+            yield from _leaves(value, key_path, name, depth + 1)
         else:
-            yield here, value
+            yield key_path, value
 
 
 def _array(values: Sequence[Any]) -> np.ndarray:

@@ -26,9 +26,9 @@ def of_mdf(path: Path, name: str) -> tuple[Signal, ...]:
             for j, channel in enumerate(group.channels):
                 if j == master:
                     continue
-                at = channel.name if count[channel.name] == 1 else f"{title}/{channel.name}"
+                channel_path = channel.name if count[channel.name] == 1 else f"{title}/{channel.name}"
                 unit = file.get_channel_unit(group=k, index=j) or ""
-                signals.append(Signal(at, rows, _column(path, k, j), unit, clock))
+                signals.append(Signal(channel_path, rows, _column(path, k, j), unit, clock))
     clocks = {id(s.clock) for s in signals}
     if len(clocks) == 1 and signals and signals[0].clock is not None:  # a table
         time = signals[0].clock

@@ -49,18 +49,21 @@ def clock_seconds(clock: Clock) -> Elapsed:
         BadData: a time stamp that is missing or infinite.
     """
     raw = np.asarray(clock.load())
-    if (lost := np.flatnonzero(~np.isfinite(raw))).size:
-        raise BadData(f"{clock.name}: got {raw[lost[0]]} at sample {lost[0] + 1}; expected a time in every sample")
+    if (missing_rows := np.flatnonzero(~np.isfinite(raw))).size:
+        raise BadData(
+            f"{clock.name}: got {raw[missing_rows[0]]} at sample {missing_rows[0] + 1}; expected a time in every "
+            "sample"
+        )
     if raw.dtype.kind in "Mm":
-        whole = raw.astype("datetime64[ns]" if raw.dtype.kind == "M" else "timedelta64[ns]").astype(np.int64)
-        return Elapsed((whole - whole[:1]) * 1e-9, float(whole[0]) * 1e-9, "")
+        ticks = raw.astype("datetime64[ns]" if raw.dtype.kind == "M" else "timedelta64[ns]").astype(np.int64)
+        return Elapsed((ticks - ticks[:1]) * 1e-9, float(ticks[0]) * 1e-9, "")
     if raw.dtype.kind in "iu":
         raw = raw.astype(np.int64)
     unit, period = clock.unit or guessed_unit(raw), 0.0
     if (np.diff(raw) < 0).any():
         raw, period = unwrap_counter(raw.astype(float), np.zeros(len(raw), int))
-    one = UNITS[unit]
-    return Elapsed((raw - raw[:1]) * one, float(raw[0]) * one, unit, period)
+    seconds_per_unit = UNITS[unit]
+    return Elapsed((raw - raw[:1]) * seconds_per_unit, float(raw[0]) * seconds_per_unit, unit, period)
 
 
 def guessed_unit(raw: np.ndarray) -> str:
@@ -138,17 +141,17 @@ def on_one_grid(
     values: Columns = {}
     brought: dict[str, list[str]] = {}
     for column, signal in chosen.items():
-        own, key, sorted_by = signal.load(), same[id(signal.clock)], order[id(signal.clock)]
-        own = own if sorted_by is None else own[sorted_by]
+        signal_values, key, sorted_by = signal.load(), same[id(signal.clock)], order[id(signal.clock)]
+        signal_values = signal_values if sorted_by is None else signal_values[sorted_by]
         if key == same[main]:
-            values[column] = own[is_covered]
+            values[column] = signal_values[is_covered]
             continue
         on = rows[is_covered]
-        if column in step_columns or own.dtype.kind not in "biuf":
-            values[column] = own[np.maximum(np.searchsorted(times[key], on + alike, side="right") - 1, 0)]
+        if column in step_columns or signal_values.dtype.kind not in "biuf":
+            values[column] = signal_values[np.maximum(np.searchsorted(times[key], on + alike, side="right") - 1, 0)]
             brought.setdefault("held", []).append(column)
         else:
-            values[column] = used_once(on, times[key], own)
+            values[column] = used_once(on, times[key], signal_values)
             brought.setdefault("interpolated", []).append(column)
     notes = []
     if brought:

@@ -139,9 +139,9 @@ def starts_from_settled_ends(
     rms = np.sqrt(np.sum(np.asarray(data.weight > 0) * np.asarray(data.measured) ** 2, 0) / count)
     blunt = dataclasses.replace(problem, data=dataclasses.replace(data, sd=jnp.hypot(data.sd, BLUNT * rms)))
     optima = search(blunt, _recombine_points(blunt, points)[:searches], STEPS_BLUNT)
-    ended = np.asarray(optima.z)[np.argsort(np.asarray(optima.cost))]
-    best = _recombine_points(blunt, ended)[:1]
-    return _distinct_points(np.concatenate([best, _with_peaked_friction(problem, best[0]), ended]))
+    sorted_optima = np.asarray(optima.z)[np.argsort(np.asarray(optima.cost))]
+    best = _recombine_points(blunt, sorted_optima)[:1]
+    return _distinct_points(np.concatenate([best, _with_peaked_friction(problem, best[0]), sorted_optima]))
 
 
 def _with_peaked_friction(problem: Problem, z: np.ndarray) -> np.ndarray:
@@ -182,11 +182,11 @@ def _recombine_points(problem: Problem, points: np.ndarray) -> np.ndarray:
     """
     by_run = _misfit_of_runs(problem, points)
     mixed = np.tile(points[int(np.argmin(by_run.sum(1)))], (len(points), 1))
-    which = np.asarray(problem.observe.conditions.configuration)
+    configuration = np.asarray(problem.observe.conditions.configuration)
     for k, name in enumerate(problem.base.configurations):
         columns = [j for j, n in enumerate(problem.coordinates.names) if n.startswith(f"{name}.")]
-        if columns and (which == k).any():
-            order = np.argsort(by_run[:, which == k].sum(1), kind="stable")
+        if columns and (configuration == k).any():
+            order = np.argsort(by_run[:, configuration == k].sum(1), kind="stable")
             mixed[:, columns] = points[order][:, columns]
     return mixed
 

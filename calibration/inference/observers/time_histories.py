@@ -271,40 +271,44 @@ class Histories(Observer):
                 f"{runs.source}: time histories of a robot that turns can be simulated but not fitted; make a "
                 f"table of its settled turns: mmrjax settle {runs.source} --robot FILE"
             )
-        whole, exact = runs.whole, robot.rig.imposed == "motor_speed"
+        whole_log, exact = runs.whole, robot.rig.imposed == "motor_speed"
         linear = robot.rig.between_rows == "linear"
         names, run = np.unique(runs.run_names, return_inverse=True)
-        mine, rows_of_whole = ([table.in_order(name) for name in names] for table in (runs, whole))
-        run_times = [runs["time_s"][m] for m in mine]
+        own_rows, rows_of_whole = ([table.in_order(name) for name in names] for table in (runs, whole_log))
+        run_times = [runs["time_s"][m] for m in own_rows]
         # Rows of the log without a reading here are kept if the imposed quantity changes there.
         smooth = runs.log is not None and robot.rig.imposed == "motor_current" and not linear
         noted = [
-            np.isin(whole["time_s"][rows], t) | exact | linear | _drive_changes(whole, rows, SMALL if smooth else 0.0)
+            np.isin(whole_log["time_s"][rows], t)
+            | exact
+            | linear
+            | _drive_changes(whole_log, rows, SMALL if smooth else 0.0)
             for rows, t in zip(rows_of_whole, run_times, strict=True)
         ]
         longest_steps = _longest_steps(runs, robot)
         if smooth:
             noted = [
-                n | _begins_new_step(whole["time_s"][rows], n) for n, rows in zip(noted, rows_of_whole, strict=True)
+                n | _begins_new_step(whole_log["time_s"][rows], n)
+                for n, rows in zip(noted, rows_of_whole, strict=True)
             ]
-            whole = _average_imposed_current(whole, rows_of_whole, noted)
+            whole_log = _average_imposed_current(whole_log, rows_of_whole, noted)
         steps = [np.minimum.reduceat(h, np.flatnonzero(n)[:-1]) for h, n in zip(longest_steps, noted, strict=True)]
         change = LOOSE if robot.loose else CHANGE
         grids = [
-            time_grid(whole["time_s"][rows[n]], *c, h, START if robot.has_ground else change, change, parts)
+            time_grid(whole_log["time_s"][rows[n]], *c, h, START if robot.has_ground else change, change, parts)
             for rows, n, c, h in zip(
-                rows_of_whole, noted, _drive_jumps(whole, rows_of_whole, robot.rig), steps, strict=True
+                rows_of_whole, noted, _drive_jumps(whole_log, rows_of_whole, robot.rig), steps, strict=True
             )
         ]
         # The last instant begins a step too, of length zero.
-        longest, samples = _common_length(max(map(len, grids)) + 1), max(map(len, mine))
+        longest, samples = _common_length(max(map(len, grids)) + 1), max(map(len, own_rows))
         times = np.stack([np.concatenate([g, np.repeat(g[-1], longest - len(g))]) for g in grids])
         instant = np.array([np.searchsorted(grids[r], t) for r, t in zip(run, runs["time_s"], strict=True)])
-        rows = np.stack([np.concatenate([m, np.full(samples - len(m), -1)]) for m in mine])
+        rows = np.stack([np.concatenate([m, np.full(samples - len(m), -1)]) for m in own_rows])
         most = min(samples, KNOTS, max(8, int(KNOT_STEPS / times.size)))
-        knots = np.stack([_choose_knots(m, most) for m in mine])
+        knots = np.stack([_choose_knots(m, most) for m in own_rows])
         conditions = _conditions_over_time(
-            whole.conditions(robot), rows_of_whole, whole["time_s"], times, ON_LINES if linear else ()
+            whole_log.conditions(robot), rows_of_whole, whole_log["time_s"], times, ON_LINES if linear else ()
         )
         if robot.rig.begins is not None:
             order = [robot.rig.begins.names.index(initial_state_name(str(n))) for n in names]
@@ -494,8 +498,8 @@ class Histories(Observer):
     def angle(self, whole: Signals) -> Float[Array, " rows"]:
         """Angle of the driving shaft in each row since the start of its run [rad]."""
         speed = jnp.asarray(whole.speed_wheel)
-        turned = 0.5 * (speed[:, 1:] + speed[:, :-1]) * jnp.diff(self.times)
-        angle = jnp.concatenate([jnp.zeros((len(turned), 1)), jnp.cumsum(turned, 1)], 1)
+        angle_steps = 0.5 * (speed[:, 1:] + speed[:, :-1]) * jnp.diff(self.times)
+        angle = jnp.concatenate([jnp.zeros((len(angle_steps), 1)), jnp.cumsum(angle_steps, 1)], 1)
         return angle[self.run, self.instant]
 
     @property
@@ -531,8 +535,8 @@ class Histories(Observer):
         if rows.voltage_follows:
             driven_channel = "motor_current" if rows.motor_speed is None else "motor_speed"
             levels = _merge_levels(getattr(rows, driven_channel))
-            which = np.stack([rows.configuration, levels, rows.slope_deg, rows.payload, braked], 1)
-            cases = np.unique(which[levels != 0], axis=0, return_index=True)[1]
+            drive_key = np.stack([rows.configuration, levels, rows.slope_deg, rows.payload, braked], 1)
+            cases = np.unique(drive_key[levels != 0], axis=0, return_index=True)[1]
             cases = np.flatnonzero(levels != 0)[cases] if len(cases) else np.arange(1)
             imposed_values = {} if rows.motor_speed is None else {"motor_acceleration": np.zeros_like(levels)}
             imposed_values |= {} if rows.load_torque is None else {"load_torque": braked}
@@ -542,7 +546,7 @@ class Histories(Observer):
         some = np.flatnonzero(applied != 0) if (applied != 0).any() else np.arange(1)
         way = np.where(applied < 0, -1.0, 1.0)
         braked = way * braked
-        turned = dataclasses.replace(
+        turned_rows = dataclasses.replace(
             rows,
             voltage=_merge_levels(np.abs(applied)),
             slope_deg=_merge_levels(way * rows.slope_deg),
@@ -551,9 +555,11 @@ class Histories(Observer):
             duty=np.ones_like(rows.duty),
             open=np.zeros_like(rows.open),
         )
-        which = np.stack([turned.configuration, turned.voltage, turned.slope_deg, turned.payload, braked], 1)[some]
-        cases = some[np.unique(which, axis=0, return_index=True)[1]]
-        return _conditions_of_rows(turned, cases)
+        drive_key = np.stack(
+            [turned_rows.configuration, turned_rows.voltage, turned_rows.slope_deg, turned_rows.payload, braked], 1
+        )[some]
+        cases = some[np.unique(drive_key, axis=0, return_index=True)[1]]
+        return _conditions_of_rows(turned_rows, cases)
 
     def late(self, every: tuple[Array, ...], rig: Rig) -> Float[Array, "rows ..."]:
         """Values within steps at the time of each row minus the delay of the rig.
@@ -615,8 +621,8 @@ class Histories(Observer):
         first, second = rows[:, :-1].ravel(), rows[:, 1:].ravel()
         within = (first >= 0) & (second >= 0)
         for k in range(residual.shape[1]):
-            both = within & counts[first, k] & counts[second, k]
-            apart = np.abs(residual[second[both], k] - residual[first[both], k])
+            is_compared = within & counts[first, k] & counts[second, k]
+            apart = np.abs(residual[second[is_compared], k] - residual[first[is_compared], k])
             usual = apart[apart <= JUMP * np.median(apart)] if len(apart) else np.zeros(1)
             total += counts[:, k].sum() * max(1.0, float(np.mean(usual**2)) / 2)
         return float(total)
@@ -630,9 +636,9 @@ class Histories(Observer):
         are computed along its runs.
         """
         problem = dataclasses.replace(problem, data=data)
-        which = getattr(problem.coordinates, "active", None)
+        active_set = getattr(problem.coordinates, "active", None)
         twice = lambda x: jnp.stack([jnp.asarray(x)] * TOGETHER)  # noqa: E731
-        members = twice(z), twice(data.weight), None if which is None else twice(which)
+        members = twice(z), twice(data.weight), None if active_set is None else twice(active_set)
         r, jacobian, _, simulated = jax.tree.map(lambda x: x[0], _evaluate(problem, *members))
         residual, jacobian = zero_inactive_residuals(r, jacobian, penalty_slice(data))
         robot, observe = problem.robot(jnp.asarray(z)), dataclasses.replace(self, known=simulated)
@@ -654,9 +660,9 @@ class Histories(Observer):
 
     def at_fit(self, problem: Problem, z: Numbers) -> Histories:
         """Observer with its runs as simulated at coordinates z, by the program of the searches."""
-        which = getattr(problem.coordinates, "active", None)
+        active_set = getattr(problem.coordinates, "active", None)
         twice = lambda x: np.stack([np.asarray(x)] * TOGETHER)  # noqa: E731
-        members = twice(z), twice(problem.data.weight), None if which is None else twice(which)
+        members = twice(z), twice(problem.data.weight), None if active_set is None else twice(active_set)
         simulated = _evaluate(problem, *members)[3]
         return dataclasses.replace(self, known=jax.tree.map(lambda x: x[0], simulated))
 
@@ -761,29 +767,31 @@ class Histories(Observer):
             return optima
 
         def result_of_member(every: tuple[Optimum, Observation], k: int) -> tuple[Optimum, Observation]:
-            best, seen = jax.tree.map(lambda leaf: leaf[k], every)
-            return dataclasses.replace(best, z=best.z[:size], sd=best.sd[:size]), seen
+            best, observation = jax.tree.map(lambda leaf: leaf[k], every)
+            return dataclasses.replace(best, z=best.z[:size], sd=best.sd[:size]), observation
 
         def search_again(z: np.ndarray) -> tuple[Optimum, Observation]:
             return result_of_member(searched(np.pad(z, (0, np.shape(starts)[1] - size))[None], slice(k, k + 1)), 0)
 
         scan_data = dataclasses.replace(bare.data, weight=weights[k])
-        best, seen = scans.search_lower_minima(
+        best, seen_observation = scans.search_lower_minima(
             bare, result_of_member(optima, k), scan_data, search_again, lambda _: None
         )
         optimum = jax.tree.map(lambda leaf: jnp.asarray(leaf[k]), optima[0])
         best = dataclasses.replace(best, z=optimum.z.at[:size].set(best.z), sd=optimum.sd.at[:size].set(best.sd))
-        return jax.tree.map(lambda every, mine: jnp.asarray(every).at[k].set(mine), optima, (best, seen))
+        return jax.tree.map(lambda every, mine: jnp.asarray(every).at[k].set(mine), optima, (best, seen_observation))
 
     def observation_at(self, problem: Problem, z: Numbers, active: Numbers | None = None) -> Observation:
         return self.at(problem, z, active)[2]
 
     def at(self, problem: Problem, z: Numbers, active: Numbers | None = None) -> tuple[Numbers, Numbers, Observation]:
         """Residuals, Jacobian and observation, see `Observer.at`, by the program of the searches."""
-        which = None if active is None else np.asarray(active)[None]
-        evaluate = _parallel_evaluator(problem, np.asarray(problem.data.weight)[None], which)
-        r, jacobian, seen = jax.tree.map(lambda x: x[0], evaluate(np.asarray(z)[None], np.zeros(1, int)))
-        return *zero_inactive_residuals(jnp.asarray(r), jnp.asarray(jacobian), penalty_slice(problem.data)), seen
+        active_sets = None if active is None else np.asarray(active)[None]
+        evaluate = _parallel_evaluator(problem, np.asarray(problem.data.weight)[None], active_sets)
+        r, jacobian, observation = jax.tree.map(lambda x: x[0], evaluate(np.asarray(z)[None], np.zeros(1, int)))
+        return *zero_inactive_residuals(
+            jnp.asarray(r), jnp.asarray(jacobian), penalty_slice(problem.data)
+        ), observation
 
     def bases(self, columns: Columns, included: np.ndarray, robot: Robot) -> Bases:
         """Bases of curves and windows as for settled runs, also over time, and waves over the angle of a shaft.
@@ -795,8 +803,8 @@ class Histories(Observer):
         if (rows.duty != 1).any():
             at_motors = np.where(rows.open > 0.5, electromotive, rows.voltage * rows.duty)
             columns = {**columns, "supply_voltage_V": at_motors}
-        which = self.conditions.configuration
-        on_tracks = np.broadcast_to(jax.vmap(robot.chassis)(which).on_tracks > 0.5, np.shape(which))
+        configuration = self.conditions.configuration
+        on_tracks = np.broadcast_to(jax.vmap(robot.chassis)(configuration).on_tracks > 0.5, np.shape(configuration))
         waves = bases_room.wave_families(
             on_tracks[self.run], angle, np.asarray(self.rows_of), np.asarray(self.knots), robot
         )
@@ -1014,8 +1022,8 @@ def _choose_knots(rows: np.ndarray, most: int) -> np.ndarray:
     """At most `most` rows of a run, evenly spaced, including its first and last. The last one is repeated as
     padding.
     """
-    chosen = rows[np.unique(np.round(np.linspace(0, len(rows) - 1, most)).astype(int))]
-    return np.concatenate([chosen, np.repeat(chosen[-1], most - len(chosen))])
+    knot_rows = rows[np.unique(np.round(np.linspace(0, len(rows) - 1, most)).astype(int))]
+    return np.concatenate([knot_rows, np.repeat(knot_rows[-1], most - len(knot_rows))])
 
 
 def _changes_still(speeds: np.ndarray, half: np.ndarray, quarter: np.ndarray) -> bool:
@@ -1081,26 +1089,28 @@ def _longest_steps(runs: Runs, robot: Robot) -> list[np.ndarray]:
     passage is where the measured speeds, or the rates of measured angles and positions, are low or change their sign.
     Without such readings it may be anywhere.
     """
-    whole, rig, exact = runs.whole, robot.rig, robot.rig.imposed == "motor_speed"
+    whole_log, rig, exact = runs.whole, robot.rig, robot.rig.imposed == "motor_speed"
     motion_channels = [k for k, c in enumerate(runs.channels) if c.zero_at_rest and (c.directed or not c.settled)]
     measured, rates = (
-        whole.measured()[:, motion_channels],
+        whole_log.measured()[:, motion_channels],
         [k for k, at in enumerate(motion_channels) if not runs.channels[at].settled],
     )
-    driven = None if exact else applied_drive(whole)
+    driven = None if exact else applied_drive(whole_log)
     early, found = DELAYED * np.max(np.asarray(rig.delay)) + EARLIER.get(rig.imposed, 0.0), []
-    turned = robot.motor.inertia * robot.gearbox.ratio**2
-    elastic = max(float(load.frequency(turned)) for _, load in robot.configurations.items()) if robot.loose else 0.0
+    output_inertia = robot.motor.inertia * robot.gearbox.ratio**2
+    elastic = (
+        max(float(load.frequency(output_inertia)) for _, load in robot.configurations.items()) if robot.loose else 0.0
+    )
     for name in np.unique(runs.run_names):
-        rows = whole.in_order(name)
-        time = whole["time_s"][rows]
+        rows = whole_log.in_order(name)
+        time = whole_log["time_s"][rows]
         apart, wait = np.diff(time), _usual_interval(np.diff(runs["time_s"][runs.in_order(name)]))
         both_ways = driven is not None and driven[rows].min() < 0 < driven[rows].max()
         longest = np.full(len(apart), (FAST if both_ways else 1) * LONGEST)
         if driven is None:
             longest[:] = min(SLOWLY * LONGEST, wait / COARSELY)
         elif runs.log is not None:
-            begins = np.where(_drive_changes(whole, rows, SMALL), np.arange(len(rows)), 0)
+            begins = np.where(_drive_changes(whole_log, rows, SMALL), np.arange(len(rows)), 0)
             since = time - time[np.maximum.accumulate(begins)]
             longest = np.maximum(longest, np.minimum(LATER * since[:-1], wait / BETWEEN))
         if both_ways and not robot.moves_as_one:
@@ -1173,11 +1183,13 @@ def _scan_delays(problem: Problem, z: Array, data: Data, scanned: Array, values:
         return tuple(measured), (*measured, decays)
 
     slopes, (*all_measured, decays) = jax.jacfwd(shown, has_aux=True)(z)
-    both = [jnp.concatenate([x[..., None], slope], -1) for x, slope in zip(all_measured, slopes, strict=True)]
+    values_and_slopes = [
+        jnp.concatenate([x[..., None], slope], -1) for x, slope in zip(all_measured, slopes, strict=True)
+    ]
 
     def one(value: Array) -> tuple[Array, Array]:
         coordinates = jnp.where(scanned, value, z)
-        late = observe.late((*both, decays), problem.robot(coordinates).rig)
+        late = observe.late((*values_and_slopes, decays), problem.robot(coordinates).rig)
         error = data.weight * (late[..., 0] - data.measured) / data.sd
         finite = jnp.all(jnp.isfinite(late), -1)
         error = jnp.where(finite, error, MISSING * data.weight)
@@ -1354,8 +1366,8 @@ class _ProbedRobot(NamedTuple):
 
         first, begins = first_conditions_and_state(robot, conditions)
         by_probes = jax.jacfwd(lambda a: first_conditions_and_state(self.at(a), conditions)[1])(none)
-        begun = by_probes[:, self.entering] * (self.enters * terms(clock[0], begins, first))
-        unmoved = jnp.concatenate([jnp.zeros((len(begins), size * len(clock))), begun], 1)
+        begin_changes = by_probes[:, self.entering] * (self.enters * terms(clock[0], begins, first))
+        unmoved = jnp.concatenate([jnp.zeros((len(begins), size * len(clock))), begin_changes], 1)
         changed = run_response(conditions, along, source, seen, unmoved)
         state_changes = jnp.concatenate([seen(clock[0], begins, unmoved, first)[None], changed])
         knots = state_changes[instants, :, : size * len(clock)].reshape(len(instants), -1, size, len(clock))
@@ -1416,8 +1428,8 @@ def _memory_along_run(
     steps, constant = run_steps(conditions, times)
 
     def after(memory: Array, step: tuple[LinearisedRun, RunStep]) -> tuple[Array, Array]:
-        state_there, taken = step
-        conditions, spans, passes = taken.held(constant), jnp.diff(state_there.clock), state_there.passes
+        state_there, run_step = step
+        conditions, spans, passes = run_step.held(constant), jnp.diff(state_there.clock), state_there.passes
 
         def stage(memory: Array, span: Array, y: Array, way: Array) -> Array:
             law = lambda m: memory_rates(y, conditions, way, m)  # noqa: E731
@@ -1432,7 +1444,7 @@ def _memory_along_run(
 
     begin = first_conditions_and_state(robot, conditions)[1]
     angle = state_of_unknowns(robot, begin).distance / robot.chassis(conditions.configuration).radius
-    begun = jnp.concatenate(
+    memory_at_begin = jnp.concatenate(
         [
             map_over_shapes(
                 e, lambda effect, _: jnp.asarray(effect.initial(robot, angle), float), jnp.zeros(len(e.at))
@@ -1440,8 +1452,8 @@ def _memory_along_run(
             for e in with_memory
         ]
     )
-    stages = jax.lax.scan(after, begun, (along, steps))[1]
-    nodes = jnp.concatenate([begun[None], stages.reshape(-1, len(begun))])
+    stages = jax.lax.scan(after, memory_at_begin, (along, steps))[1]
+    nodes = jnp.concatenate([memory_at_begin[None], stages.reshape(-1, len(memory_at_begin))])
     clock = jnp.append(along.clock[0, 0], along.clock[:, 1:].ravel())
 
     def at_time(t: Array) -> list[Array]:
