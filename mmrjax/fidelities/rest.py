@@ -93,8 +93,8 @@ def admitted_current(robot: Robot, conditions: Conditions, wanted: Scalar) -> tu
     behind = robot.sides * battery.cells * battery.resistance * duty * robot.driver.share_drawn(duty)
     resistance = robot.motor.resistance + jnp.where(conditions.battery > 0.5, behind, 0.0)
     resistance, source = jax.lax.stop_gradient((resistance, _source_at_rest(robot, conditions)))
-    current, held = robot.driver.admitted(wanted, conditions.polarity * duty, jnp.abs(source) / resistance)
-    return current, resistance * held
+    current, is_limited = robot.driver.admitted(wanted, conditions.polarity * duty, jnp.abs(source) / resistance)
+    return current, resistance * is_limited
 
 
 def without_diode(robot: Robot) -> Robot:
@@ -134,22 +134,21 @@ def standing_signals(robot: Robot, conditions: Conditions, state: State) -> Sign
     ends = [balances.settled_signals(robot, conditions, still, way)[0] for way in (1.0, -1.0)]
     ahead, back = ends
     # Least and greatest torque through the gearbox, and least and greatest friction of the track.
-    given = [
+    inputs = [
         gear.torque_output(end.torque_motor - end.torque_idle, end.direction)
         - (end.torque_load - end.torque_track_loss - chassis.radius * end.traction)
         for end in ends
     ]
-    lost = [end.torque_track_loss for end in (back, ahead)]
+    track_losses = [end.torque_track_loss for end in (back, ahead)]
     traction = ahead.gravity
     if robot.has_ground:
-        least_, most = ((given[k] - lost[1 - k]) / chassis.radius for k in range(2))
+        least_, most = ((inputs[k] - track_losses[1 - k]) / chassis.radius for k in range(2))
         traction = one_sided.clip(one_sided.clip(traction, least_, most), -ahead.adhesion_limit, ahead.adhesion_limit)
     carried = chassis.radius * traction
-    ends_of_load = (carried + lost[0], carried + lost[1])
+    loads = [carried + lost for lost in track_losses]
     if conditions.held is not None:
-        clamped = conditions.held > 0.5
-        ends_of_load = jnp.where(clamped, given[0], ends_of_load[0]), jnp.where(clamped, given[1], ends_of_load[1])
-    torque = one_sided.clip(0.0, jnp.maximum(ends_of_load[0], given[0]), jnp.minimum(ends_of_load[1], given[1]))
+        loads = [jnp.where(conditions.held > 0.5, *both) for both in zip(inputs, loads, strict=True)]
+    torque = one_sided.clip(0.0, jnp.maximum(loads[0], inputs[0]), jnp.minimum(loads[1], inputs[1]))
     none = jnp.zeros_like(carried)
     return dataclasses.replace(
         ahead,
@@ -235,14 +234,16 @@ def shaft_direction(robot: Robot, conditions: Conditions, state: State) -> tuple
     def leaving(robot: Robot, conditions: Conditions, state: State) -> tuple[Array, Array]:
         settled = dataclasses.replace(state, current=current_at_rest(robot, conditions, state))
         now, then = (_signals_both_ways(robot, conditions, state_there) for state_there in (state, settled))
-        turned, later = (1.0 * (ahead.torque_net > 0) - 1.0 * (back.torque_net < 0) for ahead, back in (now, then))
+        leaving_sense, later = (
+            1.0 * (ahead.torque_net > 0) - 1.0 * (back.torque_net < 0) for ahead, back in (now, then)
+        )
         lacks, exceeds = (jnp.where(later > 0, ahead.torque_net, -back.torque_net) for ahead, back in (now, then))
         winding = balances.driven_signals(robot, conditions, _without_motion(state), None)
         rises, missing = winding.voltage_left / winding.inductance, settled.current - state.current
-        waits = (turned == 0) & (later != 0) & (rises * missing > 0)
+        waits = (leaving_sense == 0) & (later != 0) & (rises * missing > 0)
         share = jnp.where(waits, -lacks / jnp.where(waits, exceeds - lacks, 1.0), 0.0)
         wait = -jnp.log1p(-share) * missing / jnp.where(waits, rises, 1.0)
-        way = jnp.where(turned != 0, turned, jnp.where(later != 0, later, HELD))
+        way = jnp.where(leaving_sense != 0, leaving_sense, jnp.where(later != 0, later, HELD))
         stands = state.speed_motor == 0
         return jnp.where(stands, way, jnp.sign(state.speed_motor)), jnp.where(stands & waits, wait, 0.0)
 
@@ -275,16 +276,16 @@ def current_settled(robot: Robot, conditions: Conditions, state: State) -> Scala
     """Current that settles at the motor speed of `state` [A], by the secant method on its voltage balance."""
 
     def left(wanted: Scalar) -> Scalar:
-        current, held = admitted_current(robot, conditions, wanted)
-        here = dataclasses.replace(state, current=current)
+        current, is_limited = admitted_current(robot, conditions, wanted)
+        state_there = dataclasses.replace(state, current=current)
         none = jnp.zeros_like(state.speed)
-        return balances.driven_signals(without_diode(robot), conditions, here, none).voltage_left - held
+        return balances.driven_signals(without_diode(robot), conditions, state_there, none).voltage_left - is_limited
 
     guess = robot.motor.current_stall(left(jnp.zeros_like(state.current)))
     first, second = left(0.5 * guess), left(guess)
     slope = (second - first) / jnp.where(guess == 0, 1.0, 0.5 * guess)
-    wanted = guess - jnp.where(guess == 0, 0.0, second / jnp.where(guess == 0, 1.0, slope))
-    return admitted_current(robot, conditions, wanted)[0]
+    newton_guess = guess - jnp.where(guess == 0, 0.0, second / jnp.where(guess == 0, 1.0, slope))
+    return admitted_current(robot, conditions, newton_guess)[0]
 
 
 def current_at_rest(robot: Robot, conditions: Conditions, state: State) -> Scalar:
