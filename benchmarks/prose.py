@@ -26,7 +26,12 @@ HABITS = re.compile(
     r"|\b(alike|by itself|hardly|now and then)\b"
 )
 #: Locals that say how a value was come by, and not what it is.
-EMPTY_NAMES = frozenset(["found", "at", "own", "shown", "known", "said"])
+EMPTY_NAMES = frozenset([
+    "found", "at", "own", "shown", "known", "said",
+    "each", "every", "stated", "held", "moved", "left", "kept", "given",
+    "which", "what", "by", "where", "over", "whole", "mine", "theirs", "here", "chosen", "lost", "turned", "ended",
+    "begun", "wanted", "taken", "asked", "named", "listed", "used", "seen",
+])  # fmt: skip
 #: Largest figures. They only fall.
 CEILINGS = {
     "docs": 1.2, "help": 2.1, "templates": 1.9, "strings": 1.1, "semicolons": 0.5,

@@ -30,8 +30,8 @@ def describe(found: Any, part: str = "", *about: str) -> str:
     if isinstance(found, tables.Remark) and not part:
         sentence = tables.NOTES[found.code]
         if isinstance(sentence, str):
-            listed = {name: ", ".join(x) if isinstance(x, tuple) else x for name, x in found.values.items()}
-            return sentence.format(**listed)
+            values_text = {name: ", ".join(x) if isinstance(x, tuple) else x for name, x in found.values.items()}
+            return sentence.format(**values_text)
         return sentence(**found.values)
     sentence = tables.PARTS.get((type(found), part)) if part else tables.RESULTS.get(type(found))
     if sentence is None:

@@ -81,7 +81,9 @@ def similar_words(word: str, allowed: Iterable[str], most: int = 1) -> list[str]
     Words that contain it come first, in their order (`current` is a part of `total_current`).
     """
     folded = {a.casefold(): a for a in allowed}
-    wanted = word.casefold()
-    parts = [f for f in folded if wanted in re.split(r"[._ -]", f)]
-    close = difflib.get_close_matches(wanted, folded, max(most, 1))
-    return [folded[f] for f in dict.fromkeys([*([wanted] if wanted in folded else []), *parts, *close])][:most]
+    plain_word = word.casefold()
+    parts = [f for f in folded if plain_word in re.split(r"[._ -]", f)]
+    close = difflib.get_close_matches(plain_word, folded, max(most, 1))
+    return [folded[f] for f in dict.fromkeys([*([plain_word] if plain_word in folded else []), *parts, *close])][
+        :most
+    ]

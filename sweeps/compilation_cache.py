@@ -34,11 +34,11 @@ def cache_location(path: Path | None = None) -> Path | None:
         path: folder to hold caches. None takes it from the environment.
     """
     if path is None:
-        stated = os.environ.get(VARIABLE, "").strip()
-        if stated.lower() in OFF:
+        folder_text = os.environ.get(VARIABLE, "").strip()
+        if folder_text.lower() in OFF:
             return None
-        if stated:
-            path = Path(stated)
+        if folder_text:
+            path = Path(folder_text)
         else:
             base = Path(os.environ.get("XDG_CACHE_HOME", ""))
             path = (base if base.is_absolute() else Path("~/.cache")) / "mmrjax"

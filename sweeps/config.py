@@ -444,11 +444,12 @@ class TurnPart(Part):
             if (getattr(self, left) is None) != (getattr(self, right) is None):
                 one, other = (left, right) if getattr(self, right) is None else (right, left)
                 raise PydanticCustomError("idle", f"`{one}` needs `{other}`; give both")
-        stated = [one for one, _ in pairs if getattr(self, one) is not None]
-        if len(stated) > 1:
+        side_options = [one for one, _ in pairs if getattr(self, one) is not None]
+        if len(side_options) > 1:
             raise PydanticCustomError(
                 "idle",
-                f"`{stated[0]}` cannot be combined with `{stated[1]}`; give voltages, duties, or speed and yaw rate",
+                f"`{side_options[0]}` cannot be combined with `{side_options[1]}`; give voltages, duties, or speed "
+                "and yaw rate",
             )
         return self
 
@@ -517,8 +518,8 @@ class Simulate(RobotPart, DataPart, ProfilePart, SupplyPart, TurnPart, Posterior
         if self.turns:
             beside = [name for name in ("profile", "posterior") if getattr(self, name) is not None]
             if beside:
-                stated = next(name for name in TurnPart.model_fields if getattr(self, name) is not None)
-                raise PydanticCustomError("idle", f"`{stated}` cannot be combined with `{beside[0]}`")
+                option = next(name for name in TurnPart.model_fields if getattr(self, name) is not None)
+                raise PydanticCustomError("idle", f"`{option}` cannot be combined with `{beside[0]}`")
             self.refuse_volts(self.battery)
         if self.profile is not None and self.posterior is not None:
             raise PydanticCustomError("idle", "`posterior` cannot be combined with `profile`")
@@ -634,17 +635,21 @@ class Climb(RobotPart, SupplyPart, OutputPart):
 
     @model_validator(mode="after")
     def _one_obstacle(self) -> Self:
-        given = [name for name in ("step_mm", "stairs", "gap_mm", "terrain") if getattr(self, name) is not None]
-        if len(given) > 1:
-            raise PydanticCustomError("idle", f"`{given[0]}` and `{given[1]}` are both given; keep one obstacle")
-        if not given and self.find is None:
+        obstacle_options = [
+            name for name in ("step_mm", "stairs", "gap_mm", "terrain") if getattr(self, name) is not None
+        ]
+        if len(obstacle_options) > 1:
+            raise PydanticCustomError(
+                "idle", f"`{obstacle_options[0]}` and `{obstacle_options[1]}` are both given; keep one obstacle"
+            )
+        if not obstacle_options and self.find is None:
             raise PydanticCustomError(
                 "idle", "no obstacle is given; give `step_mm`, `stairs`, `gap_mm` or `terrain`, or `find`"
             )
         if self.find == "stairs" and self.stairs is None:
             raise PydanticCustomError("idle", "`find` stairs needs `stairs`, which sets tread and count")
-        if self.find is not None and given and not given[0].startswith(self.find):
-            raise PydanticCustomError("idle", f"`find` {self.find} cannot be combined with `{given[0]}`")
+        if self.find is not None and obstacle_options and not obstacle_options[0].startswith(self.find):
+            raise PydanticCustomError("idle", f"`find` {self.find} cannot be combined with `{obstacle_options[0]}`")
         if self.nose_mm and (self.gap_mm is not None or self.terrain is not None or self.find == "gap"):
             raise PydanticCustomError("idle", "`nose_mm` has an effect only with steps and stairs")
         if self.battery and self.supply_voltage_V is not None:
@@ -906,8 +911,8 @@ def resolve_further_options(kind: type[C], file: Path | None, options: Json, tru
         BadConfiguration: for the same reasons as `resolve_configuration`.
     """
     table = {} if file is None else read_toml(file).get("solver", {})
-    stated = {key: table[key] for key in fields_with(kind, "solver") if key in table}
-    return _check_values(kind, file, stated, options, trust)
+    solver_options = {key: table[key] for key in fields_with(kind, "solver") if key in table}
+    return _check_values(kind, file, solver_options, options, trust)
 
 
 def resolve_configuration(
@@ -930,22 +935,22 @@ def resolve_configuration(
 
 
 def _check_values(kind: type[C], file: Path | None, values: Json, options: Json, trust: bool) -> C:
-    given = {k: v for k, v in options.items() if v is not None}
+    option_values = {k: v for k, v in options.items() if v is not None}
     for name in fields_with(kind, "executes"):
-        if file is not None and values.get(name) and name not in given and not trust:
+        if file is not None and values.get(name) and name not in option_values and not trust:
             option = options_of_fields(kind)[name]
             raise BadConfiguration(
                 f"{file.name}, {name}: would run code, which a file may not request; give {option} on the command "
                 "line, or --trust if you trust the author of the file"
             )
-    if "set" in given:
-        stated = values.get("set", {})
+    if "set" in option_values:
+        set_values = values.get("set", {})
         # A file whose table is none is refused below, whatever the options say.
-        given["set"] = {**stated, **given["set"]} if isinstance(stated, dict) else stated
+        option_values["set"] = {**set_values, **option_values["set"]} if isinstance(set_values, dict) else set_values
     try:
-        return kind.model_validate({**values, **given})
+        return kind.model_validate({**values, **option_values})
     except ValidationError as error:
-        raise BadConfiguration(_error_sentence(kind, error, file, given)) from None
+        raise BadConfiguration(_error_sentence(kind, error, file, option_values)) from None
 
 
 def _error_sentence(kind: type[Part], error: ValidationError, file: Path | None, given: Json) -> str:
@@ -960,17 +965,17 @@ def _error_sentence(kind: type[Part], error: ValidationError, file: Path | None,
         return message if file is None else f"{file.name}: {message}"
     key = str(first["loc"][0])
     place = ".".join(str(part) for part in first["loc"])
-    where = f"{file.name}, {place}" if file is not None and key not in given else called(key)
+    option_place = f"{file.name}, {place}" if file is not None and key not in given else called(key)
     if first["type"] == "extra_forbidden":
-        return f"{where}: no such key; {allowed_words(key, kind.model_fields)}"
-    wanted = first["msg"][0].lower() + first["msg"][1:]
+        return f"{option_place}: no such key; {allowed_words(key, kind.model_fields)}"
+    expectation = first["msg"][0].lower() + first["msg"][1:]
     fact = schema_facts(kind).get(key, {})
     limits = {**fact.get("items", {}), **fact}
     if first["type"] == "literal_error":
-        wanted = f"expected {first['ctx']['expected']}"
+        expectation = f"expected {first['ctx']['expected']}"
     if {"minimum", "maximum"} <= limits.keys() and {"ge", "le"} & first.get("ctx", {}).keys():
-        wanted = f"expected {limits['minimum']:.10g} to {limits['maximum']:.10g}"
-    return f"{where}: got {first['input']!r}; {wanted}"
+        expectation = f"expected {limits['minimum']:.10g} to {limits['maximum']:.10g}"
+    return f"{option_place}: got {first['input']!r}; {expectation}"
 
 
 def as_toml(config: Part) -> str:

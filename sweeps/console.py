@@ -143,7 +143,7 @@ def step_reporter(
     from calibration.words.step_words import still_running_sentence
 
     compiled, state = 0, [(doing, time.monotonic(), 0)]
-    spoke, over = threading.Event(), threading.Event()
+    spoke, is_over = threading.Event(), threading.Event()
 
     def count(event: str, duration_secs: float, **_: Any) -> None:
         nonlocal compiled
@@ -155,10 +155,10 @@ def step_reporter(
         tell(text)
 
     def beat() -> None:
-        while not over.is_set():
+        while not is_over.is_set():
             heard = spoke.wait(silence)
             spoke.clear()
-            if not heard and not over.is_set():
+            if not heard and not is_over.is_set():
                 text, since, before = state[0]
                 again(still_running_sentence(text, time.monotonic() - since, compiled - before))
 
@@ -168,7 +168,7 @@ def step_reporter(
     try:
         yield say_it
     finally:
-        over.set()
+        is_over.set()
         spoke.set()
         thread.join()
 

@@ -199,26 +199,26 @@ def one_run(robot: Robot, cells: Json, battery: bool = False, elsewhere: Collect
             f"--voltage: got {cells['supply_voltage_V']:g} with --battery, whose charge sets the voltage; "
             "give one of them"
         )
-    stated = cells.get("configuration")
-    name = robot.configurations.names[0] if stated is None else stated
+    configuration = cells.get("configuration")
+    name = robot.configurations.names[0] if configuration is None else configuration
     check_configurations(robot, (name,), "--configuration")
-    given = {key: value for key, value in cells.items() if value is not None}
+    cell_values = {key: value for key, value in cells.items() if value is not None}
     layout = Layout.of(robot)
     column = layout.imposed_column
-    for other in (c for c, _ in IMPOSED.values() if c != column and c in given):
+    for other in (c for c, _ in IMPOSED.values() if c != column and c in cell_values):
         raise BadConfiguration(imposed.option_refusal(robot, OPTIONS[other], OPTIONS[column]))
-    idle = [OPTIONS[key] for key in given if key in layout.idle]
+    idle = [OPTIONS[key] for key in cell_values if key in layout.idle]
     imposed.check_acting(robot, idle, idle)
     if battery:
         imposed.check_battery(robot)
-    elif column not in given:
+    elif column not in cell_values:
         rest = 0.0 if column in elsewhere else None
-        given[column] = imposed.imposed_default(robot, OPTIONS[column]) if rest is None else rest
+        cell_values[column] = imposed.imposed_default(robot, OPTIONS[column]) if rest is None else rest
     if robot.has_ground:
         bench = {"surface": BENCH} if robot.rig.scales_adhesion else {}
-        given = {**bench, "payload_kg": 0.0, "slope_deg": 0.0, **given}
-        check_surface(robot, (name,), given.get("surface"), "--surface")
-    run = records.single_run({**given, "configuration": name}, layout)
+        cell_values = {**bench, "payload_kg": 0.0, "slope_deg": 0.0, **cell_values}
+        check_surface(robot, (name,), cell_values.get("surface"), "--surface")
+    run = records.single_run({**cell_values, "configuration": name}, layout)
     if misplaced := misplaced_levers(run, robot):
         _, column, why = misplaced
         raise BadConfiguration(f"{OPTIONS[column]}: {why}")

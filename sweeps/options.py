@@ -38,9 +38,9 @@ def schema_facts(kind: type[BaseModel]) -> dict[str, Json]:
     ]
     facts = {}
     for name in dict.fromkeys(n for n in own_metadata if n in schema):
-        stated = schema[name]
-        given: Json = next((a for a in stated.get("anyOf", ()) if a.get("type") != "null"), {})
-        facts[name] = {**given, **stated}
+        option_schema = schema[name]
+        value_schema: Json = next((a for a in option_schema.get("anyOf", ()) if a.get("type") != "null"), {})
+        facts[name] = {**value_schema, **option_schema}
     return facts
 
 

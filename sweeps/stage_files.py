@@ -120,8 +120,8 @@ class _Writer:
         if isinstance(x, types.FunctionType) and x.__module__ in FUNCTIONS:
             return ["function", x.__module__, x.__qualname__]
         if dataclasses.is_dataclass(x):
-            held = {name: self.encoded(value) for name, value in vars(x).items() if _holds(type(x), name)}
-            return ["instance", *_named_class(type(x)), held]
+            fields = {name: self.encoded(value) for name, value in vars(x).items() if _holds(type(x), name)}
+            return ["instance", *_named_class(type(x)), fields]
         if isinstance(x, tuple) and hasattr(x, "_fields"):
             return ["named", *_named_class(type(x)), [self.encoded(item) for item in x]]
         raise Unwritable(f"{type(x).__module__}.{type(x).__qualname__}")
@@ -216,9 +216,9 @@ class _Reader:
 
 def _holds(kind: type, name: str) -> bool:
     """True if instances of a dataclass hold a value by that name: a field, or what they compute once and keep."""
-    kept = inspect.getattr_static(kind, name, None)
+    attribute = inspect.getattr_static(kind, name, None)
     fields: dict[str, Any] = getattr(kind, "__dataclass_fields__", {})
-    return name in fields or isinstance(kept, functools.cached_property)
+    return name in fields or isinstance(attribute, functools.cached_property)
 
 
 def _named_class(kind: type) -> tuple[str, str, list[float] | None]:

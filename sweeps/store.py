@@ -137,10 +137,10 @@ class Folder:
             hint = "it is a file"
         elif not force:
             hint = "--force replaces a run folder"
-        elif (left := listed_names(self.path)) is None:
+        elif (file_names := listed_names(self.path)) is None:
             hint = "it is not a run folder, so --force does not replace it"
         else:
-            foreign = sorted({p.name for p in self.path.iterdir()} - {*left, *self.further})
+            foreign = sorted({p.name for p in self.path.iterdir()} - {*file_names, *self.further})
             if not foreign:
                 return
             hint = f"--force would delete {foreign[0]}, which its command did not write"
@@ -191,10 +191,10 @@ class Folder:
         Before the results are written these are all but `PARTS`. Later the lock's file lists them.
         """
         foreign = {p.name for p in self.partial.iterdir()} - PARTS
-        listed = _json(self.partial / LOCK).get(FOREIGN)
-        kept = (self.partial / CHUNKS).glob("*")
-        return (foreign & set(map(str, listed)) if isinstance(listed, list) else foreign) | {
-            f"{CHUNKS}/{p.name}" for p in kept if p.suffix not in KEPT
+        foreign_names = _json(self.partial / LOCK).get(FOREIGN)
+        chunk_files = (self.partial / CHUNKS).glob("*")
+        return (foreign & set(map(str, foreign_names)) if isinstance(foreign_names, list) else foreign) | {
+            f"{CHUNKS}/{p.name}" for p in chunk_files if p.suffix not in KEPT
         }
 
     def _begin_results(self) -> None:
@@ -263,7 +263,7 @@ class Folder:
         import jax
         import jax.numpy as jnp
 
-        whole = {
+        new_manifest = {
             **{
                 "schema": MANIFEST,
                 "program": f"mmrjax {__version__}",
@@ -278,7 +278,7 @@ class Folder:
             "hashes": hashes,
             "contents": sorted(names),
         }
-        self.write_json("manifest.json", whole)
+        self.write_json("manifest.json", new_manifest)
         return self.move_into_place()
 
     def move_into_place(self) -> Path:
@@ -492,8 +492,8 @@ class RunFolder(Folder):
         file = self._of_stage(name)
         if file.is_file():
             try:
-                kept: T = stage_files.read_stage(file)
-                return kept
+                stored_result: T = stage_files.read_stage(file)
+                return stored_result
             except stage_files.Unreadable:
                 print_message(f"{file}: damaged; computed again")
         result = make()

@@ -42,9 +42,9 @@ def unwrap_counter(count: np.ndarray, run: np.ndarray) -> tuple[np.ndarray, floa
     usual = float(np.median(step[step > 0]))
     for period in PERIODS:
         across = step[back] + period
-        whole = period < 2**15 or not (count % 1).any()
+        is_counter = period < 2**15 or not (count % 1).any()
         if (
-            whole
+            is_counter
             and count.min() >= 0
             and count.max() < period
             and (np.abs(across) <= LACKING * usual).all()
@@ -81,12 +81,12 @@ def spread_shared_stamps(time: np.ndarray, run: np.ndarray) -> tuple[np.ndarray,
     step = np.append(step, np.nan)
     step[np.append(np.diff(recording) != 0, True)] = np.nan
     usual = float(np.nanmedian(step)) if np.isfinite(step).any() else np.nan
-    each = float(np.median(rows))
+    rows_per_stamp = float(np.median(rows))
     inner = rows[1:-1] if len(rows) > 4 else rows
-    if not np.isfinite(usual) or (np.abs(inner - each) > 1).mean() > ODD:
+    if not np.isfinite(usual) or (np.abs(inner - rows_per_stamp) > 1).mean() > ODD:
         return time, 0.0
     apart = np.where(np.isfinite(step), step, usual) / rows
-    apart = np.minimum(apart, usual / np.maximum(each, 1.0) * 1.5)
+    apart = np.minimum(apart, usual / np.maximum(rows_per_stamp, 1.0) * 1.5)
     index = np.arange(len(time)) - np.repeat(begins, rows)
     return np.repeat(stamps, rows) + index * np.repeat(apart, rows), float(rows.mean())
 
@@ -109,22 +109,23 @@ def drop_empty_rows(arrays: NamedArrays, meanings: Sequence[Column | None]) -> N
     for raw in arrays.values:
         empty = empty[missing_readings(raw, empty)]
     if len(arrays) > len(empty) > 0:
-        kept = np.ones(len(arrays), bool)
-        kept[empty] = False
+        is_kept = np.ones(len(arrays), bool)
+        is_kept[empty] = False
         arrays = arrays.rows(
-            kept, f"{count_noun(len(empty), 'row')} without any reading left out; row numbers count only the others"
+            is_kept,
+            f"{count_noun(len(empty), 'row')} without any reading left out; row numbers count only the others",
         )
-    stated = [None if m is None else m.column for m in meanings]
-    clock = next((raw for c, raw in zip(stated, arrays.values, strict=True) if c in TIME), None)
-    if clock is None or "run_id" in stated or not len(arrays):
+    column_names = [None if m is None else m.column for m in meanings]
+    clock = next((raw for c, raw in zip(column_names, arrays.values, strict=True) if c in TIME), None)
+    if clock is None or "run_id" in column_names or not len(arrays):
         return arrays
     count = column_numbers(clock)
-    used = np.flatnonzero(count != 0)
-    if not len(used) or used[-1] == len(count) - 1 or not np.nanmax(count) > 0:
+    filled_rows = np.flatnonzero(count != 0)
+    if not len(filled_rows) or filled_rows[-1] == len(count) - 1 or not np.nanmax(count) > 0:
         return arrays
-    kept = np.arange(len(count)) <= used[-1]
-    note = f"{count_noun(int((~kept).sum()), 'row')} at the end left out, because the clock restarts at 0 there"
-    return arrays.rows(kept, note)
+    is_kept = np.arange(len(count)) <= filled_rows[-1]
+    note = f"{count_noun(int((~is_kept).sum()), 'row')} at the end left out, because the clock restarts at 0 there"
+    return arrays.rows(is_kept, note)
 
 
 def time_since_start(name: str, meaning: Column, raw: Raw, runs: Sequence[str] | None) -> tuple[Raw, Names]:
@@ -180,11 +181,11 @@ def time_since_start(name: str, meaning: Column, raw: Raw, runs: Sequence[str] |
             *notes,
             f"{name}: {meaning.shown} is a time of day; time is counted from the first row of each run",
         )
-    which = run[np.flatnonzero(first[run])[0]]
-    where = f"{first[which] / factor:g}{f' in run {names[which]}' if names[which] else ''}"
+    run_index = run[np.flatnonzero(first[run])[0]]
+    time_words = f"{first[run_index] / factor:g}{f' in run {names[run_index]}' if names[run_index] else ''}"
     return passed, (
         *notes,
-        f"{name}: {meaning.shown} begins at {where}; time is counted from the first row of a run. If the run "
+        f"{name}: {meaning.shown} begins at {time_words}; time is counted from the first row of a run. If the run "
         "began earlier, add a row without readings at that time",
     )
 
@@ -210,10 +211,10 @@ def _unwrap_clock(name: str, meaning: Column, count: np.ndarray, run: np.ndarray
 def _add_days_after_midnight(clock: np.ndarray, cells: Sequence[str], run: np.ndarray) -> None:
     """Adds a day [s] to times without a date after they fall back by more than half a day within their run."""
     last: dict[int, float] = {}
-    for k, (x, which) in enumerate(zip(clock.tolist(), run.tolist(), strict=True)):
-        if _is_time_without_date(cells[k]) and which in last:
-            clock[k] = x = x + _DAY * max(math.floor((last[which] - x) / _DAY + 0.5), 0)
-        last[which] = x
+    for k, (x, run_index) in enumerate(zip(clock.tolist(), run.tolist(), strict=True)):
+        if _is_time_without_date(cells[k]) and run_index in last:
+            clock[k] = x = x + _DAY * max(math.floor((last[run_index] - x) / _DAY + 0.5), 0)
+        last[run_index] = x
 
 
 def _is_time_without_date(cell: str) -> bool:

@@ -93,24 +93,24 @@ def _hint_about_cell(meaning: Column, cell: str, units: bool, readings: Names) -
     """Guess at what a rejected cell means, ending in a semicolon. Empty without a guess."""
     if cell.lower() in NOTHING:
         return "leave the cell empty if there is no reading; " if meaning.column in readings else ""
-    quantity, mine = meaning.quantity, meaning.unit
+    quantity, column_unit = meaning.quantity, meaning.unit
     if not units or meaning.factor != 1.0:
         return ""
-    named = {unit: column for column, unit in quantity.columns().items()}
+    columns_by_unit = {unit: column for column, unit in quantity.columns().items()}
     try:
         value = parse_number(cell)
     except ValueError:
         match = _WITH_UNIT.fullmatch(cell)
-        return "" if match is None else _unit_hint(match[1], match[2], mine, named)
-    far = abs(value) > FAR * max(map(abs, quantity.limits(mine)))
+        return "" if match is None else _unit_hint(match[1], match[2], column_unit, columns_by_unit)
+    far = abs(value) > FAR * max(map(abs, quantity.limits(column_unit)))
     if far and meaning.column in DUTY:
         return (
             "is the command scaled differently? divide it by its maximum, in a log with "
             "[columns] duty = {column, factor}; "
         )
-    for unit, column in named.items():
+    for unit, column in columns_by_unit.items():
         low, high = quantity.limits(unit)
-        if far and unit != mine and low <= value <= high:
+        if far and unit != column_unit and low <= value <= high:
             return f"is it in {unit or 'shares of 1'}? then name the column {column}; "
     return ""
 
@@ -141,15 +141,17 @@ def match_column_names(
     Raises:
         BadData: a name occurs twice.
     """
-    named, notes = _match_case(name, header, layout, inferred)
-    repeated = sorted({c for c in named if named.count(c) > 1})
+    matched_names, notes = _match_case(name, header, layout, inferred)
+    repeated = sorted({c for c in matched_names if matched_names.count(c) > 1})
     if repeated:
-        raise BadData(f"{name}: column {repeated[0]} is present {named.count(repeated[0])} times; expected once")
+        raise BadData(
+            f"{name}: column {repeated[0]} is present {matched_names.count(repeated[0])} times; expected once"
+        )
     if inferred:
-        layout = _with_channels(name, named, layout, channels.EVERY)
-    if of_turns and {*layout.sides, *VOLTS, *HEADING} & {m.column for m in layout.meanings(name, named) if m}:
-        layout = _with_channels(name, named, layout, channels.OF_TURNS)
-    return named, layout, tuple(notes)
+        layout = _with_channels(name, matched_names, layout, channels.EVERY)
+    if of_turns and {*layout.sides, *VOLTS, *HEADING} & {m.column for m in layout.meanings(name, matched_names) if m}:
+        layout = _with_channels(name, matched_names, layout, channels.OF_TURNS)
+    return matched_names, layout, tuple(notes)
 
 
 def _match_case(name: str, header: Sequence[str], layout: Layout, inferred: bool) -> tuple[list[str], Names]:
@@ -172,29 +174,33 @@ def _match_case(name: str, header: Sequence[str], layout: Layout, inferred: bool
 def _with_channels(name: str, header: list[str], layout: Layout, more: Sequence[Channel]) -> Layout:
     """Layout with each channel of `more` for which the file has a column."""
     meanings = dataclasses.replace(layout, channels=channels.EVERY).meanings(name, header)
-    stated = {m.column for m in meanings if m is not None}
-    with_channels = tuple(c for c in channels.EVERY if c in layout.channels or (c in more and c.column in stated))
+    mapped_columns = {m.column for m in meanings if m is not None}
+    with_channels = tuple(
+        c for c in channels.EVERY if c in layout.channels or (c in more and c.column in mapped_columns)
+    )
     return dataclasses.replace(layout, channels=with_channels)
 
 
 def check_header(
     name: str, header: list[str], meanings: list[Column | None], measured: bool, battery: bool, layout: Layout
 ) -> None:
-    stated = {m.column for m in meanings if m is not None}
+    mapped_columns = {m.column for m in meanings if m is not None}
     strange = [c for c, m in zip(header, meanings, strict=True) if m is None]
     if not layout.complete:  # other channels' columns are not misspelt
         strange = [c for c in strange if c not in {x for k in channels.EVERY for x in (k.column, k.sd_column)}]
-    _check_names_of_sides(name, strange, stated, layout)
+    _check_names_of_sides(name, strange, mapped_columns, layout)
     required = layout.required(measured=measured, battery=battery)
-    if layout.imposed_column == SPEED and stated & set(layout.sides):  # the sides' speeds are imposed
+    if layout.imposed_column == SPEED and mapped_columns & set(layout.sides):  # the sides' speeds are imposed
         required = tuple(c for c in required if c != SPEED)
-        if SPEED in stated:
+        if SPEED in mapped_columns:
             raise BadData(f"{name}: column {SPEED} in addition to {', '.join(layout.sides)}; keep one of them")
-    if stated & set(VOLTS):  # the supply's voltage is the larger one
+    if mapped_columns & set(VOLTS):  # the supply's voltage is the larger one
         required = tuple(c for c in required if c != SUPPLY)
-    if not layout.complete and "surface" in stated:  # it gives the configuration too, if all surfaces are of one
+    if (
+        not layout.complete and "surface" in mapped_columns
+    ):  # it gives the configuration too, if all surfaces are of one
         required = tuple(c for c in required if c != "configuration")
-    for column in (c for c in (*required, *layout.measured_columns) if c not in stated):
+    for column in (c for c in (*required, *layout.measured_columns) if c not in mapped_columns):
         close = difflib.get_close_matches(column, strange, 1, 0.6)
         if column in required or (close and layout.complete):
             got = f"; is {close[0]} meant?" if close else ""
@@ -207,7 +213,7 @@ def check_header(
                 f"{name}: column {layout.expected(column)} is missing{got} (required: {', '.join(required)})"
                 + ("" if close else _advice_on_unknown_columns(strange, column))
             )
-    if measured and not any(c in stated for c in layout.measured_columns):
+    if measured and not any(c in mapped_columns for c in layout.measured_columns):
         expected = ", ".join(layout.measured_columns)
         other = _advice_on_unknown_columns(strange, layout.measured_columns[0])
         turning = {c.column: c.name for c in channels.OF_TURNS}
@@ -216,16 +222,16 @@ def check_header(
             other = f"; {', '.join(of_turns)}: set channels = [{names}] in the robot's file"
         raise BadData(f"{name}: no column with readings; expected at least one of {expected}{other}")
     for column in strange:
-        close = difflib.get_close_matches(column, [c for c in layout.known() if c not in stated], 1, 0.85)
+        close = difflib.get_close_matches(column, [c for c in layout.known() if c not in mapped_columns], 1, 0.85)
         if close:
             raise BadData(f"{name}: unknown column {column}; did you mean {close[0]}? rename or remove it")
 
 
 def check_has_time(name: str, header: list[str], meanings: list[Column | None], layout: Layout) -> None:
     """Rejects readings of a log without a time column."""
-    stated = {m.column: m.shown for m in meanings if m is not None}
-    over_time = [stated[c.column] for c in layout.channels if c.column in stated and not c.settled]
-    if over_time and stated.keys().isdisjoint(TIME):
+    shown_names = {m.column: m.shown for m in meanings if m is not None}
+    over_time = [shown_names[c.column] for c in layout.channels if c.column in shown_names and not c.settled]
+    if over_time and shown_names.keys().isdisjoint(TIME):
         strange = [c for c, m in zip(header, meanings, strict=True) if m is None]
         raise BadData(
             f"{name}: column {layout.expected('time_s')} is missing, and {over_time[0]} can be used only in a "
@@ -240,9 +246,9 @@ def _advice_on_unknown_columns(strange: list[str], column: str) -> str:
         return ""
     unit = column.rpartition("_")[2]
     guess = next((c for c in strange if re.search(rf"\b{unit}\b", c)), "...")
-    listed = ", ".join(strange[:NAMED]) + (", ..." if len(strange) > NAMED else "")
+    names_text = ", ".join(strange[:NAMED]) + (", ..." if len(strange) > NAMED else "")
     return (
-        f"; other columns: {listed}; if one of them has these values, name it in the robot's file, with the "
+        f"; other columns: {names_text}; if one of them has these values, name it in the robot's file, with the "
         f'factor for its unit: [columns] {column} = {{column = "{guess}", factor = 1.0}} (mmrjax inspect '
         "proposes such lines)"
     )
@@ -292,16 +298,16 @@ def check_units(arrays: NamedArrays, meanings: Sequence[Column | None]) -> None:
     for stated_below, meaning in zip(below, meanings, strict=True):
         if meaning is None or abs(meaning.factor) != 1.0:
             continue
-        named = {unit: column for column, unit in meaning.quantity.columns().items()}
-        for stated, where in (
-            (quantities.unit_at_end(meaning.shown, named), "in its name"),
+        columns_by_unit = {unit: column for column, unit in meaning.quantity.columns().items()}
+        for unit_text, place_words in (
+            (quantities.unit_at_end(meaning.shown, columns_by_unit), "in its name"),
             (stated_below, f"in {arrays.units_from}"),
         ):
-            if stated and stated != meaning.unit:
-                mapped = meaning.shown not in (meaning.column, named[meaning.unit])
-                remedy = f'state [columns] {named[stated]} = "{meaning.shown}" in the robot\'s file'
+            if unit_text and unit_text != meaning.unit:
+                mapped = meaning.shown not in (meaning.column, columns_by_unit[meaning.unit])
+                remedy = f'state [columns] {columns_by_unit[unit_text]} = "{meaning.shown}" in the robot\'s file'
                 raise BadData(
-                    f"{arrays.name}: column {meaning.shown} states {stated} {where}, and is read in "
+                    f"{arrays.name}: column {meaning.shown} states {unit_text} {place_words}, and is read in "
                     f"{meaning.unit or 'shares of 1'}; "
-                    f"{remedy if mapped else f'name it {named[stated]}'}, or correct the unit"
+                    f"{remedy if mapped else f'name it {columns_by_unit[unit_text]}'}, or correct the unit"
                 )

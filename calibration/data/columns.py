@@ -138,8 +138,8 @@ class Layout:
         weight = any(float(x) != 0 for load in loads for x in (load.torque_constant, load.torque_gravity))
         names = robot.configurations.names
         supply = 0.0 if robot.controller is None else robot.controller.supply_voltage
-        stated = rig.imposed, robot.has_ground, weight, rig.inherits, names, rig.instruments, rig.columns
-        return cls(*stated, robot.channels, supply)
+        choices = rig.imposed, robot.has_ground, weight, rig.inherits, names, rig.instruments, rig.columns
+        return cls(*choices, robot.channels, supply)
 
     @property
     def table8(self) -> bool:
@@ -200,8 +200,8 @@ class Layout:
         read = (SUPPLY, *self.measured_columns, *self.deviation_columns)
         labels = [word for word in WORDS if word != "mode" or self.imposed in ("voltage", *GOALS)]
         set_ = [c.column for c in quantities.SET if c.in_tables and self.imposed in (c.imposed or IMPOSED)]
-        every = ("configuration", *self.axes, *read, *labels, "time_s", *self.sides, *set_)
-        return tuple(dict.fromkeys(c for c in every if c not in self.idle))
+        column_names = ("configuration", *self.axes, *read, *labels, "time_s", *self.sides, *set_)
+        return tuple(dict.fromkeys(c for c in column_names if c not in self.idle))
 
     def required(self, *, measured: bool, battery: bool) -> Names:
         """Columns that a table must have, in addition to channels."""
@@ -228,14 +228,16 @@ class Layout:
             BadData: two columns hold the same quantity.
         """
         by_name = self._by_name
-        theirs = {column: (mine, factor) for mine, column, factor in self.mapped if column in header}
-        taken = {_standard_name(by_name, mine) for mine, _ in theirs.values()}
+        mapped_columns = {
+            column: (own_column, factor) for own_column, column, factor in self.mapped if column in header
+        }
+        taken = {_standard_name(by_name, own_column) for own_column, _ in mapped_columns.values()}
         meanings_found: list[Column | None] = []
         for column in header:
-            if column in theirs:
-                mine, factor = theirs[column]
-                meant = by_name.get(mine)
-                if meant is None and mine in {
+            if column in mapped_columns:
+                own_column, factor = mapped_columns[column]
+                meant = by_name.get(own_column)
+                if meant is None and own_column in {
                     name
                     for channel in channels.EVERY
                     for q in _reading_and_deviation(channel)
@@ -245,8 +247,8 @@ class Layout:
                     continue
                 if meant is None:
                     raise BadData(
-                        f"{source}: the robot's file reads {mine} from column {column}; mmrjax has no column "
-                        f"{mine} (known: {', '.join(self.known())})"
+                        f"{source}: the robot's file reads {own_column} from column {column}; mmrjax has no column "
+                        f"{own_column} (known: {', '.join(self.known())})"
                     )
                 meanings_found.append(dataclasses.replace(meant, shown=column, factor=factor))
             else:
@@ -263,8 +265,12 @@ class Layout:
     @functools.cached_property
     def _by_name(self) -> Mapping[str, Column]:
         """Every name of a column, in any unit, with its quantity."""
-        held = self.quantities().values()
-        return {name: Column(quantity, name, unit) for quantity in held for name, unit in quantity.columns().items()}
+        quantities_by_name = self.quantities().values()
+        return {
+            name: Column(quantity, name, unit)
+            for quantity in quantities_by_name
+            for name, unit in quantity.columns().items()
+        }
 
     def spellings(self) -> Names:
         """Every possible name of a known column, in any unit."""
@@ -278,8 +284,10 @@ class Layout:
         Args:
             stated: columns that the table already has, which are left out.
         """
-        none = {*stated, *self.idle, *self.deviation_columns, *WHEN, *WORDS, "held"}
-        lacking = {column: quantity for column, quantity in self.quantities().items() if column not in none}
+        ignored_columns = {*stated, *self.idle, *self.deviation_columns, *WHEN, *WORDS, "held"}
+        lacking = {
+            column: quantity for column, quantity in self.quantities().items() if column not in ignored_columns
+        }
         spelled = {s: (column, unit) for column, q in lacking.items() for s, unit in q.columns().items()}
         unit = quantities.unit_at_end(name, {unit for _, unit in spelled.values()})
         pool = [s for s, (column, own) in spelled.items() if own == unit or (unit is None and s == column)]
@@ -291,10 +299,10 @@ class Layout:
 
     def expected(self, column: str) -> str:
         """Name of the column, with the name in the source if the robot file states one."""
-        theirs = next(
+        mapped_column = next(
             (their for mine, their, _ in self.mapped if _standard_name(self._by_name, mine) == column), None
         )
-        return column if theirs is None else f"{column} (in the robot's file: {theirs})"
+        return column if mapped_column is None else f"{column} (in the robot's file: {mapped_column})"
 
 
 def _standard_name(by_name: Mapping[str, Column], name: str) -> str:

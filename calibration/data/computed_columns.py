@@ -94,8 +94,8 @@ def _load_for_current(runs: Runs, robot: Robot, channel: str, current: np.ndarra
 
 def line_through(x: np.ndarray, y: np.ndarray) -> tuple[float, float] | None:
     """Intercept and slope of a line through all points, to within their digits. None if there is no such line."""
-    both = np.isfinite(x) & np.isfinite(y)
-    x, y = x[both], y[both]
+    is_paired = np.isfinite(x) & np.isfinite(y)
+    x, y = x[is_paired], y[is_paired]
     if len(x) < ROWS or min(len(np.unique(x)), len(np.unique(y))) < LEVELS:
         return None
     slope, intercept = np.polyfit(x - x.mean(), y, 1)

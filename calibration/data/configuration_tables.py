@@ -95,22 +95,23 @@ def loads_from_tables(base: Robot | None, content: Json, sds: dict[str, float], 
     missing: list[str] = []
     linear: set[str] = set()
     for name in names:
-        table, here = content.get(name, {}), f"{where}, {name}"
+        table, table_place = content.get(name, {}), f"{where}, {name}"
         if not isinstance(table, dict):
-            raise BadConfiguration(f"{here}: got {table!r}; expected a table [{name}]")
-        kind = _load_kind(table, here)
+            raise BadConfiguration(f"{table_place}: got {table!r}; expected a table [{name}]")
+        kind = _load_kind(table, table_place)
         if kind == "linear":
-            rig_file.linear_to_shaft(table, name, here, sds, _number_of_drives(content, base))
+            rig_file.linear_to_shaft(table, name, table_place, sds, _number_of_drives(content, base))
             linear.add(name)
         if kind in ("linear", "shaft"):
             by_name[name], lacking = _blank_shaft(table)
         elif base is None:
-            by_name[name], lacking = _blank_vehicle(table, here, _number_of_drives(content, base))
+            by_name[name], lacking = _blank_vehicle(table, table_place, _number_of_drives(content, base))
         else:
-            by_name[name], lacking = _chassis_of_base(base, name, table, here), []
+            by_name[name], lacking = _chassis_of_base(base, name, table, table_place), []
         if lacking and base is not None:
             raise BadConfiguration(
-                f"{here}: without a base, the load must be described completely; {_list_in_words(lacking)} missing"
+                f"{table_place}: without a base, the load must be described completely; {_list_in_words(lacking)} "
+                "missing"
             )
         missing += [f"{name}.{key}" for key in lacking]
     shafts = [name for name, load in by_name.items() if isinstance(load, Shaft)]
@@ -140,10 +141,10 @@ def resolve_likes(content: Json, where: str) -> None:
 
 def _merge_tables(below: Mapping[str, Any], above: Mapping[str, Any]) -> Json:
     """Two tables merged into one. Entries of `above` take precedence."""
-    both = {
+    merged = {
         key: value for key, value in below.items() if isinstance(value, dict) and isinstance(above.get(key), dict)
     }
-    return {**below, **above, **{key: _merge_tables(value, above[key]) for key, value in both.items()}}
+    return {**below, **above, **{key: _merge_tables(value, above[key]) for key, value in merged.items()}}
 
 
 def _load_kind(table: Json, where: str) -> str:

@@ -88,8 +88,10 @@ def inspect_source(source: str | Path | Any) -> FileContents:
     contents_found = _source(source)
     times: dict[int, tuple[np.ndarray, str] | str] = {}
     clocks = {id(s.clock) for s in contents_found.signals if s.clock is not None}
-    named = (s for s in contents_found.signals if not (s.words or s.refused) and _unit_of_time(s.name) is not None)
-    table = None if clocks else next(named, None)  # the signal of a table that is its time
+    clock_signals = (
+        s for s in contents_found.signals if not (s.words or s.refused) and _unit_of_time(s.name) is not None
+    )
+    table = None if clocks else next(clock_signals, None)  # the signal of a table that is its time
     clock = None if table is None else Clock(table.path, table.load, _unit_of_time(table.name) or "")
     facts = tuple(
         _facts(signal, signal.clock or (None if signal is table else clock), times)
@@ -195,22 +197,22 @@ def _proposed_columns(signals: Sequence[Signal]) -> Iterator[tuple[str, str]]:
     """Paths of signals that may be columns, each with its line of a table `[columns]`: the time, then the others."""
     spelled = set(Layout(channels=channels.EVERY).spellings())
     row_signals = [s for s in signals if s.clock is None and not s.refused]
-    named = next((s for s in row_signals if _unit_of_time(s.name) is not None), None)
-    clock = named or next((s for s in row_signals if _is_rising_count(s)), None)
+    time_signal = next((s for s in row_signals if _unit_of_time(s.name) is not None), None)
+    clock = time_signal or next((s for s in row_signals if _is_rising_count(s)), None)
     rest = [s for s in signals if _unit_of_time(s.name) is None and s is not clock]
     elapsed = None
     if clock is not None:
         unit = _unit_of_time(clock.name) or ("s" if clock.words else one_clock.guessed_unit(clock.load()))
         elapsed = None if clock.words else np.asarray(clock.load(), float) * UNITS[unit]
         line = f'time_{unit} = "{clock.path}"'
-        if named is None and elapsed is not None:
-            each = proposals.seconds_per_count(rest, np.asarray(clock.load(), float))
-            question = f"compared with a position, it counts {1 / each:.3g} per second"
-            if math.isnan(each):
-                each, question = UNITS[unit], "unit of the counts? give the seconds per count"
-            each = float(f"{each:.3g}")
-            elapsed = np.asarray(clock.load(), float) * each
-            line = f'time_s = {{column = "{clock.path}", factor = {each:g}}}  # {question}'
+        if time_signal is None and elapsed is not None:
+            seconds_per_unit = proposals.seconds_per_count(rest, np.asarray(clock.load(), float))
+            question = f"compared with a position, it counts {1 / seconds_per_unit:.3g} per second"
+            if math.isnan(seconds_per_unit):
+                seconds_per_unit, question = UNITS[unit], "unit of the counts? give the seconds per count"
+            seconds_per_unit = float(f"{seconds_per_unit:.3g}")
+            elapsed = np.asarray(clock.load(), float) * seconds_per_unit
+            line = f'time_s = {{column = "{clock.path}", factor = {seconds_per_unit:g}}}  # {question}'
         elif not _unit_of_time(clock.name) and elapsed is not None and unit != "s":
             step = np.diff(elapsed)
             usual = float(np.median(step[step > 0])) if (step > 0).any() else np.nan

@@ -77,18 +77,18 @@ def misplaced_levers(runs: Runs, robot: Robot) -> tuple[int, str, str] | None:
 
     The reason is a configuration without levers, or an angle beyond their range.
     """
-    stated = [name for name in LEVERS if runs.has(name)]
-    if not stated:
+    lever_columns = [name for name in LEVERS if runs.has(name)]
+    if not lever_columns:
         return None
     if why := reason_without_stance(robot):
-        return 0, stated[0], why
+        return 0, lever_columns[0], why
     on_tracks = np.array([float(c.on_tracks) > 0.5 for c in robot.configurations.members])[runs.configurations(robot)]
     if not on_tracks.all():
         row = int(np.argmin(on_tracks))
-        return row, stated[0], reason_without_levers(robot, runs["configuration"][row])
+        return row, lever_columns[0], reason_without_levers(robot, runs["configuration"][row])
     levers = robot.running_gear.levers
     low, high = (float(np.degrees(x)) for x in (levers.angle_least, levers.angle_most))
-    for name in stated:
+    for name in lever_columns:
         beyond = (runs[name] < low - 1e-9) | (runs[name] > high + 1e-9)
         if beyond.any():
             row = int(np.argmax(beyond))
@@ -151,10 +151,10 @@ def _check_time_order(runs: Runs) -> None:
     """
     time, run = runs["time_s"], runs.run_names
     for name in np.unique(run):
-        mine = np.flatnonzero(run == name)
-        back = np.flatnonzero(np.diff(time[mine]) < 0)
-        if 0 < back.size <= max(SELDOM * len(mine), 1):
-            row, was, now = mine[back[0] + 1] + 1, time[mine[back[0]]], time[mine[back[0] + 1]]
+        run_rows = np.flatnonzero(run == name)
+        back = np.flatnonzero(np.diff(time[run_rows]) < 0)
+        if 0 < back.size <= max(SELDOM * len(run_rows), 1):
+            row, was, now = run_rows[back[0] + 1] + 1, time[run_rows[back[0]]], time[run_rows[back[0] + 1]]
             raise BadData(
                 f"{runs.source} row {row}, time_s: goes back from {was:g} to {now:g} s; "
                 "give each recording its own run_id, or sort the rows"
@@ -170,9 +170,9 @@ def _median_of_neighbours(step: np.ndarray) -> np.ndarray:
 def _check_angle(runs: Runs) -> None:
     angle = runs["output_angle_deg"]
     for name in np.unique(runs.run_names):
-        mine = runs.in_order(name)
-        mine = mine[np.isfinite(angle[mine])]
-        step = np.diff(angle[mine])
+        run_rows = runs.in_order(name)
+        run_rows = run_rows[np.isfinite(angle[run_rows])]
+        step = np.diff(angle[run_rows])
         if step.size < 2:
             continue
         usual = np.maximum(np.median(np.abs(step)), _median_of_neighbours(np.abs(step)))
@@ -180,7 +180,7 @@ def _check_angle(runs: Runs) -> None:
             (np.abs(step) > TURN) & (np.abs(step) < 2 * TURN + UNUSUAL * usual) & (np.abs(step) > UNUSUAL * usual)
         )
         if jumps.size:
-            row, passed = int(mine[jumps[0] + 1]), np.diff(runs["time_s"][mine])
+            row, passed = int(run_rows[jumps[0] + 1]), np.diff(runs["time_s"][run_rows])
             gap = passed[jumps[0]]
             why = "like an angle that wraps; expected an angle that keeps counting beyond one turn"
             if gap > GAP * np.median(passed):
@@ -191,12 +191,12 @@ def _check_angle(runs: Runs) -> None:
                 f"deg from the sample before, {why}"
             )
         with np.errstate(divide="ignore", invalid="ignore"):
-            times = np.abs(angle[mine][1:] / angle[mine][:-1])
+            times = np.abs(angle[run_rows][1:] / angle[run_rows][:-1])
         other = np.abs(np.abs(np.log(np.where(times > 0, times, 1.0))) / np.log(RADIAN) - 1) < ALIKE / np.log(RADIAN)
         mixed = np.flatnonzero(other & (np.abs(step) > UNUSUAL * np.maximum(usual, 1.0)))
         if mixed.size:
-            row, k = int(mine[mixed[0] + 1]), mixed[0]
-            was, now = (f"{float(f'{x:.4g}'):g}" for x in angle[mine][k : k + 2])
+            row, k = int(run_rows[mixed[0] + 1]), mixed[0]
+            was, now = (f"{float(f'{x:.4g}'):g}" for x in angle[run_rows][k : k + 2])
             raise BadData(
                 f"{runs.source} row {row + 1}, output_angle_deg: goes from {was} to {now} between two samples, as "
                 "if degrees and radians are mixed; write all rows in one unit"

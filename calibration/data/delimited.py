@@ -136,8 +136,8 @@ def row_of_units(header: Sequence[str], first: Sequence[str]) -> Names:
     known_units = {
         unit for quantity in (*quantities.SET, *channels.EVERY) for unit in quantity.columns().values()
     } - {""}
-    stated = any(unit in known_units for column, unit in zip(header, units, strict=True) if column not in WORDS)
-    return units if stated else ()
+    has_units = any(unit in known_units for column, unit in zip(header, units, strict=True) if column not in WORDS)
+    return units if has_units else ()
 
 
 def decode_text(name: str, content: bytes) -> tuple[str, Names]:
@@ -205,15 +205,15 @@ def split_cells(name: str, lines: Sequence[str]) -> tuple[list[list[str]], Names
             f"more than {csv.field_size_limit():,} characters"
         ) from error
     rows = [row for row in rows if any(row)]
-    named = max((j + 1 for j, cell in enumerate(rows[0]) if cell), default=0) if rows else 0
-    if not any(any(row[named:]) for row in rows):  # separators at the ends of lines
-        rows = [row[:named] for row in rows]
+    header_width = max((j + 1 for j, cell in enumerate(rows[0]) if cell), default=0) if rows else 0
+    if not any(any(row[header_width:]) for row in rows):  # separators at the ends of lines
+        rows = [row[:header_width] for row in rows]
     if mark == ",":
         return rows, ()
     note = f"{name}: columns are separated by {SEPARATORS[mark]}"
     comma: dict[int, list[str]] = {}
     point: dict[int, list[str]] = {}
-    whole: set[int] = set()
+    integer_columns: set[int] = set()
     for row in rows[1:]:
         for j, cell in enumerate(row):
             if _COMMA.fullmatch(cell):
@@ -222,17 +222,17 @@ def split_cells(name: str, lines: Sequence[str]) -> tuple[list[list[str]], Names
             elif _POINT.fullmatch(cell):
                 point.setdefault(j, []).append(cell)
             elif _BELOW.fullmatch(cell):
-                whole.add(j)
-    wanted = "expected either decimal commas or decimal points in a column, and no thousands separators"
+                integer_columns.add(j)
+    expectation = "expected either decimal commas or decimal points in a column, and no thousands separators"
     for j in comma.keys() & point.keys():
-        raise BadData(f"{name}, {_column(rows, j)}: got {comma[j][0]} and {point[j][0]}; {wanted}")
+        raise BadData(f"{name}, {_column(rows, j)}: got {comma[j][0]} and {point[j][0]}; {expectation}")
     for marked, other in ((point, comma), (comma, point)):
         for j, written in marked.items():
-            if (other or j in whole) and all(map(_THOUSANDS.fullmatch, written)):
+            if (other or j in integer_columns) and all(map(_THOUSANDS.fullmatch, written)):
                 beside = ", ".join(f"{cells[0]} in {_column(rows, k)}" for k, cells in list(other.items())[:1])
                 raise BadData(
                     f"{name}, {_column(rows, j)}: got {written[0]} next to "
-                    f"{beside or 'whole numbers below a thousand'}; {wanted}"
+                    f"{beside or 'whole numbers below a thousand'}; {expectation}"
                 )
     return rows, (f"{note}, and numbers have decimal commas; read accordingly" if comma else f"{note}; read so",)
 

@@ -58,12 +58,12 @@ def readable_signals(
         settled: True for steady forward travel (`balances.settled_signals`), False for motion
             (`balances.moving_signals`).
     """
-    seen: list[Signals] = []
-    watched = dataclasses.replace(robot, effects=(_effect_that_records_signals(balance, channel, seen),))
+    signals_read: list[Signals] = []
+    watched = dataclasses.replace(robot, effects=(_effect_that_records_signals(balance, channel, signals_read),))
     order = balances.settled_signals if settled else balances.moving_signals
     signals = order(watched, conditions, state)
     balances.sensor(watched, signals[0] if isinstance(signals, tuple) else signals)
-    return seen[0]
+    return signals_read[0]
 
 
 #: Effects by their name in robot files and on the command line.
@@ -169,10 +169,10 @@ def _where(path: Path, effect: type[Effect]) -> str:
 
 
 def _check_effect(path: Path, effect: type[Effect]) -> None:
-    where = _where(path, effect)
+    effect_place = _where(path, effect)
 
     def refuse(what: str) -> BadConfiguration:
-        return BadConfiguration(f"{where}{what}")
+        return BadConfiguration(f"{effect_place}{what}")
 
     for attribute, kind in _STATED.items():
         value = getattr(effect, attribute, None)
@@ -200,9 +200,9 @@ def _check_effect(path: Path, effect: type[Effect]) -> None:
         default = effect()
     except (Exception, SystemExit) as error:
         raise refuse(f": cannot be created without arguments ({error}); give every field a default") from error
-    acting, stated = default.configurations, effect.configurations
-    if acting != stated or not isinstance(acting, tuple) or not all(isinstance(c, str) for c in acting):
-        raise refuse(f', configurations: got {stated!r}; expected a tuple of names such as ("4W2T",)')
+    acting, configurations = default.configurations, effect.configurations
+    if acting != configurations or not isinstance(acting, tuple) or not all(isinstance(c, str) for c in acting):
+        raise refuse(f', configurations: got {configurations!r}; expected a tuple of names such as ("4W2T",)')
     declared = {p.name: p for p in params.walk_parameters(default)}
     amplitudes = [name for name, p in declared.items() if p.spec.amplitude]
     if amplitudes != ["amplitude"]:
@@ -236,9 +236,9 @@ def _test_points(balance: str, channel: str, configuration: int) -> tuple[Signal
     rest = State(zero, zero, zero, zero)
     # Sums for the turn are computed after both sides' slip and resistance.
     before = "slip" if balance in ROUND else balance
-    climbs, every = readable_signals(robot, run, climbing, before, channel), moving_signals(robot, run, climbing)
+    climbs, points = readable_signals(robot, run, climbing, before, channel), moving_signals(robot, run, climbing)
     still = readable_signals(robot, run, rest, before, channel)
-    return dataclasses.replace(climbs, **TURN), dataclasses.replace(every, **TURN), still
+    return dataclasses.replace(climbs, **TURN), dataclasses.replace(points, **TURN), still
 
 
 def _check_term(refuse: Callable[[str], BadConfiguration], effect: type[Effect], size: float) -> None:
@@ -252,20 +252,20 @@ def _check_term(refuse: Callable[[str], BadConfiguration], effect: type[Effect],
         return jnp.asarray(effects_sum(with_it, signals, effect.balance, effect.channel), float)
 
     for configuration in range(len(robot.configurations)):
-        known, every, rest = (
+        known, points, rest = (
             dataclasses.replace(s, memory=memory) for s in _test_points(effect.balance, effect.channel, configuration)
         )
         mirrored = dataclasses.replace(known, **{name: -value for name, value in TURN.items()})
         external = dataclasses.replace(known, battery=jnp.zeros(()))
         try:
             none, once, twice = (term(jnp.asarray(k * size), known) for k in (0.0, 1.0, 2.0))
-            late, fed = (term(jnp.asarray(size), s) for s in (every, external))
+            late, fed = (term(jnp.asarray(size), s) for s in (points, external))
             other = term(jnp.asarray(size), mirrored) * (-1 if effect.balance in ROUND else 1)
             slope = jax.grad(lambda a, s=known: jnp.sum(term(a, s)))(jnp.asarray(0.0))
             at_rest = eqx.filter_grad(lambda s: jnp.sum(term(jnp.asarray(size), s)))(rest)
-            kept = []
+            memory_rates = []
             if effect.memory_size is not None:
-                kept = [effect().rate(robot, every), effect().settled(robot, known)]
+                memory_rates = [effect().rate(robot, points), effect().settled(robot, known)]
         except (Exception, SystemExit) as error:
             raise refuse(f": its term cannot be computed ({type(error).__name__}: {error})") from error
         if once.shape != ():
@@ -281,7 +281,7 @@ def _check_term(refuse: Callable[[str], BadConfiguration], effect: type[Effect],
             raise refuse(
                 ": its term is not linear in its amplitude; expected amplitude times a function of the other signals"
             )
-        if not all(math.isfinite(float(jnp.sum(x))) for x in kept):
+        if not all(math.isfinite(float(jnp.sum(x))) for x in memory_rates):
             raise refuse(": the rate or settled value of its memory is not finite")
         if not all(jnp.isfinite(x).all() for x in jax.tree.leaves(at_rest)):
             raise refuse(": derivatives of its term are not finite at rest, where drive and track start")

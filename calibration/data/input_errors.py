@@ -52,8 +52,8 @@ def rows_text(rows: Sequence[int], most: int, rest: str = ", ...") -> str:
 
     `rest` replaces the rows after the first `most`. `{}` in it is replaced by their number.
     """
-    listed = ", ".join(str(k + 1) for k in rows[:most]) + rest.format(len(rows) - most) * (len(rows) > most)
-    return f"row{'s' * (len(rows) > 1)} {listed}"
+    row_numbers = ", ".join(str(k + 1) for k in rows[:most]) + rest.format(len(rows) - most) * (len(rows) > most)
+    return f"row{'s' * (len(rows) > 1)} {row_numbers}"
 
 
 def three_digits(value: float) -> str:

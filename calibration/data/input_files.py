@@ -75,8 +75,8 @@ def _opened(path: Path, where: str | Path, kind: type[InputError], largest: floa
     try:
         status = path.stat()
         if not stat.S_ISREG(status.st_mode):
-            what = next((word for is_kind, word in _KINDS.items() if is_kind(status.st_mode)), "a device")
-            raise kind(f"{where}: is {what}; expected a file")
+            file_kind = next((word for is_kind, word in _KINDS.items() if is_kind(status.st_mode)), "a device")
+            raise kind(f"{where}: is {file_kind}; expected a file")
         if status.st_size > largest:
             raise kind(f"{where}: has {status.st_size / 1e6:,.0f} MB; expected at most {largest / 1e6:,.0f} MB")
         if math.isfinite(largest):
@@ -139,8 +139,8 @@ def available_memory() -> float:
             import resource
 
             limit = resource.getrlimit(resource.RLIMIT_AS)[0]
-            used = int(Path("/proc/self/statm").read_text("ascii").split()[0]) * os.sysconf("SC_PAGE_SIZE")
-            free = free if limit == resource.RLIM_INFINITY else min(free, float(limit - used))
+            pages_bytes = int(Path("/proc/self/statm").read_text("ascii").split()[0]) * os.sysconf("SC_PAGE_SIZE")
+            free = free if limit == resource.RLIM_INFINITY else min(free, float(limit - pages_bytes))
         return free
     except (ValueError, OSError, AttributeError):
         return math.inf
@@ -153,11 +153,11 @@ def csv_bytes(path: Path, where: str | Path) -> bytes:
         BadData: for the same reasons as `file_bytes`, or the file has another format, which the message names.
     """
     content = file_bytes(path, where)
-    what = next((word for begin, word in BINARY.items() if content.startswith(begin)), None)
-    what = what or next((word for begin, word in TEXTS.items() if begin.match(content)), None)
-    if what is not None:
+    format_name = next((word for begin, word in BINARY.items() if content.startswith(begin)), None)
+    format_name = format_name or next((word for begin, word in TEXTS.items() if begin.match(content)), None)
+    if format_name is not None:
         raise BadData(
-            f"{where}: is {what}; expected CSV (a header line with the columns' names, then one line for each "
+            f"{where}: is {format_name}; expected CSV (a header line with the columns' names, then one line for each "
             "row), Parquet, or another format of docs/howto/formats.md; export it as CSV, from Python with "
             "pandas.DataFrame(...).to_csv(..., index=False)"
         )
@@ -197,18 +197,18 @@ def toml_content(text: str, where: str | Path, kind: type[InputError] = BadConfi
     except RecursionError as error:
         raise kind(f"{where}: tables or lists are nested too deep; expected at most {DEEPEST} levels") from error
     keys = 0
-    left: list[tuple[Json | list[Any], int]] = [(content, 1)]
-    while left:
-        value, depth = left.pop()
+    pending: list[tuple[Json | list[Any], int]] = [(content, 1)]
+    while pending:
+        value, depth = pending.pop()
         if depth > DEEPEST:
             raise kind(f"{where}: tables or lists are nested too deep; expected at most {DEEPEST} levels")
         inner = value.values() if isinstance(value, dict) else value
         keys += len(value) if isinstance(value, dict) else 0
         if keys > KEYS:
             raise kind(f"{where}: has more than {count_noun(KEYS, 'key')}; is it the right file?")
-        for each in inner:
-            if isinstance(each, dict | list):
-                left.append((each, depth + 1))
-            elif isinstance(each, int) and not -WHOLE <= each < WHOLE:
+        for item in inner:
+            if isinstance(item, dict | list):
+                pending.append((item, depth + 1))
+            elif isinstance(item, int) and not -WHOLE <= item < WHOLE:
                 raise kind(f"{where}: got a whole number beyond 64 bits; expected numbers of at most 18 digits")
     return content

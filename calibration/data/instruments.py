@@ -90,10 +90,10 @@ def infer_instruments(instruments: tuple[Instrument, ...], columns: Columns) -> 
 
 def with_inferred_instruments(robot: Robot, runs: Runs) -> Robot:
     """Robot with the instruments that its table shows."""
-    mine = robot.rig.instruments
-    all_instruments = runs.layout.instruments if any(i.free for i in mine) else mine
-    named = {i.channel for i in all_instruments}
-    all_instruments = (*all_instruments, *(i for i in runs.layout.instruments if i.channel not in named))
-    if all_instruments == mine:
+    rig_instruments = robot.rig.instruments
+    all_instruments = runs.layout.instruments if any(i.free for i in rig_instruments) else rig_instruments
+    channel_names = {i.channel for i in all_instruments}
+    all_instruments = (*all_instruments, *(i for i in runs.layout.instruments if i.channel not in channel_names))
+    if all_instruments == rig_instruments:
         return robot
     return dataclasses.replace(robot, rig=dataclasses.replace(robot.rig, instruments=all_instruments))

@@ -57,12 +57,12 @@ class NamedArrays:
 
     def with_columns(self, columns: Mapping[str, np.ndarray]) -> NamedArrays:
         """Copy with columns of numbers in addition to its own, or in place of those with the same name."""
-        kept = [k for k, column in enumerate(self.header) if column not in columns]
+        columns_left = [k for k, column in enumerate(self.header) if column not in columns]
         return dataclasses.replace(
             self,
-            header=(*(self.header[k] for k in kept), *columns),
-            values=(*(self.values[k] for k in kept), *columns.values()),
-            units=(*(self.units[k] for k in kept), *[""] * len(columns)) if self.units else (),
+            header=(*(self.header[k] for k in columns_left), *columns),
+            values=(*(self.values[k] for k in columns_left), *columns.values()),
+            units=(*(self.units[k] for k in columns_left), *[""] * len(columns)) if self.units else (),
         )
 
     def row(self, index: int) -> str:

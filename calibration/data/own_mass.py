@@ -52,7 +52,7 @@ def stated_masses(robot: Robot, runs: Runs) -> dict[str, StatedMass]:
     """
     if not runs.has("total_mass_kg"):
         return {}
-    which = runs.configurations(robot)
+    configuration_index = runs.configurations(robot)
     own_masses = runs["total_mass_kg"] - runs["payload_kg"]
     low, high = next(
         p for p in params.walk_parameters(robot.configurations.members[0]) if p.name == "mass"
@@ -66,10 +66,10 @@ def stated_masses(robot: Robot, runs: Runs) -> dict[str, StatedMass]:
             f"{runs['payload_kg'][row]:g} kg; expected {low:g} to {high:g} kg without the payload"
         )
     masses = {}
-    for index in np.unique(which):
-        mine = which == index
-        m = own_masses[mine]
-        constant = bool(np.ptp(runs["total_mass_kg"][mine]) <= ROUNDING)
+    for index in np.unique(configuration_index):
+        is_own_row = configuration_index == index
+        m = own_masses[is_own_row]
+        constant = bool(np.ptp(runs["total_mass_kg"][is_own_row]) <= ROUNDING)
         median = round(float(np.median(m)), 6)
         masses[robot.configurations.names[index]] = StatedMass(median, float(m.min()), float(m.max()), constant)
     return masses
@@ -93,19 +93,19 @@ def mass_notes(robot: Robot, runs: Runs) -> list[str]:
         robot: robot as given, before `with_table_mass`.
     """
     notes = []
-    for name, stated in stated_masses(robot, runs).items():
+    for name, file_mass in stated_masses(robot, runs).items():
         mass = float(robot.configurations[name].mass)
-        if stated.varies:
-            why = "; does total_mass_kg leave the payload out?" if stated.unladen else ""
+        if file_mass.varies:
+            why = "; does total_mass_kg leave the payload out?" if file_mass.unladen else ""
             notes.append(
-                f"{name}: total_mass_kg minus payload_kg varies from {stated.low:.4g} to {stated.high:.4g} kg. The "
-                f"fit used the mass of each row; robot.toml contains the median, {stated.median:.4g} kg, and does "
-                f"not reproduce the fit in rows of another mass{why}"
+                f"{name}: total_mass_kg minus payload_kg varies from {file_mass.low:.4g} to {file_mass.high:.4g} kg. "
+                f"The fit used the mass of each row; robot.toml contains the median, {file_mass.median:.4g} kg, and "
+                f"does not reproduce the fit in rows of another mass{why}"
             )
-        elif abs(stated.median - mass) > ROUNDING:
+        elif abs(file_mass.median - mass) > ROUNDING:
             notes.append(
-                f"{name}: the table states {stated.median:.6g} kg without payload, the robot's file {mass:.6g} kg; "
-                f"{stated.median:.6g} kg is used, and written to robot.toml"
+                f"{name}: the table states {file_mass.median:.6g} kg without payload, the robot's file {mass:.6g} "
+                f"kg; {file_mass.median:.6g} kg is used, and written to robot.toml"
             )
     of_table5 = np.zeros(len(runs), bool)
     if runs.has("surface"):

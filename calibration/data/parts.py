@@ -186,15 +186,16 @@ def _read_sheets(kind: type[Sheet], file: str) -> Iterator[Sheet]:
         BadData: the columns differ from the fields of the sheet, or a cell is not a number.
     """
     fields = dataclasses.fields(kind)
-    wanted = [f.metadata["column"] for f in fields]
+    column_names = [f.metadata["column"] for f in fields]
     table = resources.files("calibration") / "data" / "parts" / file
     reader = csv.DictReader(io.StringIO(table.read_text("utf-8")), strict=True)
-    if list(reader.fieldnames or ()) != wanted:
-        raise BadData(f"{file}: got the columns {reader.fieldnames}; expected {wanted}")
+    if list(reader.fieldnames or ()) != column_names:
+        raise BadData(f"{file}: got the columns {reader.fieldnames}; expected {column_names}")
     for row in reader:
         if None in row or None in row.values():
             raise BadData(
-                f"{file} row {reader.line_num}: the number of cells differs from the number of columns, {len(wanted)}"
+                f"{file} row {reader.line_num}: the number of cells differs from the number of columns, "
+                f"{len(column_names)}"
             )
         yield kind(
             **{f.name: _parse_cell(row[f.metadata["column"]], f"{file} row {reader.line_num}", f) for f in fields}

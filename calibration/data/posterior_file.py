@@ -122,9 +122,9 @@ class Posterior:
                     f"{allowed_words(name, alike or values)}"
                 )
         with np.errstate(invalid="ignore"):  # of a file with NaN, refused below
-            at = self.at(np.asarray(self.mean))
+            robot_at_mean = self.at(np.asarray(self.mean))
         sd = np.asarray(self.sd)
-        for name, value, width in zip(self.names, at, sd, strict=True):
+        for name, value, width in zip(self.names, robot_at_mean, sd, strict=True):
             if not abs(values[name] - value) <= APART * width + 1e-6 * abs(value):  # also where one is NaN
                 raise BadData(
                     f"{where}: {name} is {values[name]:.6g} in the robot; expected {value:.6g}, the centre of its "

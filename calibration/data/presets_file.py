@@ -104,7 +104,7 @@ class Preset:
 
     def column_of(self, name: str) -> PresetColumn:
         """Preset column that is read from a source column. An empty one if none is."""
-        read = (c for c in self.columns if any(_matches_any(theirs, {name}) for theirs in c.theirs))
+        read = (c for c in self.columns if any(_matches_any(pattern, {name}) for pattern in c.theirs))
         return next(read, PresetColumn("", ()))
 
     def check_needed(self, mapped: Iterable[tuple[str, str, float]], imposed: str, name: str) -> None:
@@ -118,15 +118,15 @@ class Preset:
         Raises:
             BadData: the other column is missing.
         """
-        present = {mine: theirs for mine, theirs, _ in mapped}
+        present = {own_column: pattern for own_column, pattern, _ in mapped}
         by_name = {column.mine: column for column in self.columns}
-        for mine in present:
-            if mine == imposed and (needs := by_name[mine].needs) and needs not in present:
-                wanted = " or ".join(by_name[needs].theirs)
+        for own_column in present:
+            if own_column == imposed and (needs := by_name[own_column].needs) and needs not in present:
+                missing_words = " or ".join(by_name[needs].theirs)
                 raise BadData(
-                    f"{name}: has no {wanted}; --columns {self.name} needs it for {needs}, because "
-                    f"{present[mine]} by itself does not give the motor voltage; record {wanted}, or set imposed "
-                    "to the speed or the current in the rig's file"
+                    f"{name}: has no {missing_words}; --columns {self.name} needs it for {needs}, because "
+                    f"{present[own_column]} by itself does not give the motor voltage; record {missing_words}, or "
+                    "set imposed to the speed or the current in the rig's file"
                 )
 
 
@@ -149,24 +149,24 @@ def find_preset(stated: str | Path) -> Preset:
         BadConfiguration: there is no such preset or file, a number is missing or unknown, or as in `parse_preset`.
     """
     name, *others = str(stated).split(SEPARATOR)
-    given: dict[str, float] = {}
-    for each in others:
-        key, equals, text = (part.strip() for part in each.partition("="))
+    number_values: dict[str, float] = {}
+    for preset in others:
+        key, equals, text = (part.strip() for part in preset.partition("="))
         try:
-            given[key] = stated_number(parse_number(text), f"--columns {name}, {key}")
+            number_values[key] = stated_number(parse_number(text), f"--columns {name}, {key}")
         except ValueError as error:
             got = f"{key}{equals}{text}"
             raise BadConfiguration(
                 f"--columns {name}: got {got}; expected a name and a number, such as pole_pairs=7"
             ) from error
     if name in PACKAGED:
-        return parse_preset(_packaged_text(name), name, given)
+        return parse_preset(_packaged_text(name), name, number_values)
     path = Path(name)
     if not path.exists():
         raise BadConfiguration(
             f"--columns: got {name}; no such file and no packaged preset; {allowed_words(name, PACKAGED)}"
         )
-    return parse_preset(input_files.toml_text(path, path.name), path.name, given)
+    return parse_preset(input_files.toml_text(path, path.name), path.name, number_values)
 
 
 def recognise_preset(names: Sequence[str]) -> str:
@@ -179,7 +179,7 @@ def recognise_preset(names: Sequence[str]) -> str:
     ends = {*names, *(re.split(r"[/.]", name)[-1] for name in names)}
     for name in PACKAGED:
         preset = find_preset(SEPARATOR.join([name, *(f"{key}=1" for key in numbers_to_state(name))]))
-        count = sum(any(_matches_any(theirs, ends) for theirs in column.theirs) for column in preset.columns)
+        count = sum(any(_matches_any(pattern, ends) for pattern in column.theirs) for column in preset.columns)
         if count > most:
             best, most = name, count
     return best
@@ -192,7 +192,7 @@ def _matches_any(theirs: str, names: set[str]) -> bool:
 def numbers_to_state(name: str) -> Names:
     """Names of the numbers that the user must give for a packaged preset."""
     numbers = input_files.toml_content(_packaged_text(name), name).get("ask", {})
-    return tuple(key for key, stated in numbers.items() if isinstance(stated, str) or "usual" not in stated)
+    return tuple(key for key, number in numbers.items() if isinstance(number, str) or "usual" not in number)
 
 
 def _packaged_text(name: str) -> str:
@@ -224,13 +224,13 @@ def _parsed(content: Mapping[str, Any], where: str, given: Mapping[str, float]) 
         )
     layout = Layout(channels=channels.EVERY)
     spellings, entries = layout.spellings(), []
-    for mine, theirs in columns.items():
-        if mine not in spellings:
-            listed = allowed_words(mine, spellings, shown=layout.known())
+    for own_column, patterns in columns.items():
+        if own_column not in spellings:
+            names_text = allowed_words(own_column, spellings, shown=layout.known())
             raise BadConfiguration(
-                f"{where}, columns.{mine}: no such column of a table; {listed}; other units are allowed too"
+                f"{where}, columns.{own_column}: no such column of a table; {names_text}; other units are allowed too"
             )
-        entries.append(_parse_column(mine, theirs, f"{where}, columns.{mine}", numbers))
+        entries.append(_parse_column(own_column, patterns, f"{where}, columns.{own_column}", numbers))
     return Preset(where, tuple(entries), header)
 
 
@@ -240,14 +240,14 @@ def _preset_numbers(asked: Any, where: str, given: Mapping[str, float]) -> dict[
         raise BadConfiguration(f"{where}, ask: got {asked!r}; expected a table")
     for key in given:
         if key not in asked:
-            listed = allowed_words(key, asked) if asked else "it defines no numbers under [ask]"
-            raise BadConfiguration(f"--columns {where}: got {key}; {listed}")
+            names_text = allowed_words(key, asked) if asked else "it defines no numbers under [ask]"
+            raise BadConfiguration(f"--columns {where}: got {key}; {names_text}")
     numbers: dict[str, float] = {}
-    for key, stated in asked.items():
-        table = {"about": stated} if isinstance(stated, str) else stated
+    for key, number in asked.items():
+        table = {"about": number} if isinstance(number, str) else number
         if not isinstance(table, dict) or {*table} - {*KEYS_OF_NUMBER} or not isinstance(table.get("about"), str):
             raise BadConfiguration(
-                f'{where}, ask.{key}: got {stated!r}; expected a description such as "number of the motor, from 0", '
+                f'{where}, ask.{key}: got {number!r}; expected a description such as "number of the motor, from 0", '
                 f'or {{about = "DESCRIPTION", usual = 1.0}}'
             )
         if key not in given and "usual" not in table:
@@ -267,8 +267,8 @@ def _parse_column(mine: str, theirs: Any, where: str, numbers: Mapping[str, floa
     table = theirs if isinstance(theirs, dict) else {"column": theirs}
     for key in table:
         stated_word(key, KEYS_OF_COLUMN, where, f"got the key {key}")
-    stated = table.get("column")
-    names = _list_of_texts([stated] if isinstance(stated, str) else stated, f"{where}.column", form)
+    column = table.get("column")
+    names = _list_of_texts([column] if isinstance(column, str) else column, f"{where}.column", form)
     factor = stated_number(table.get("factor", 1.0), f"{where}.factor")
     for key in ("per", "times"):
         if key in table:
@@ -296,17 +296,17 @@ def _parse_column(mine: str, theirs: Any, where: str, numbers: Mapping[str, floa
 def _fill_in_numbers(name: str, where: str, numbers: Mapping[str, float]) -> str:
     """Name of a column, with numbers in place of the names in braces."""
     try:
-        named = [field for _, field, _, _ in string.Formatter().parse(name) if field is not None]
+        field_names = [field for _, field, _, _ in string.Formatter().parse(name) if field is not None]
     except ValueError:
         return name
-    for field in named:
+    for field in field_names:
         if field in numbers:
             name = name.replace(f"{{{field}}}", f"{numbers[field]:g}")
     return name
 
 
 def _list_of_texts(stated: Any, where: str, form: str = "expected a list of names") -> Names:
-    if not isinstance(stated, list) or not all(isinstance(each, str) and each for each in stated):
+    if not isinstance(stated, list) or not all(isinstance(text, str) and text for text in stated):
         raise BadConfiguration(f"{where}: got {stated!r}; {form}")
     return tuple(stated)
 
@@ -316,8 +316,8 @@ def merge_columns(
 ) -> tuple[tuple[str, str, float], ...]:
     """Columns of two tables. `first` takes precedence if both have a column, or read the same source column."""
     first = tuple(first)
-    taken = {_name_without_unit(mine) for mine, _, _ in first} | {theirs for _, theirs, _ in first}
-    return (*first, *(c for c in others if _name_without_unit(c[0]) not in taken and c[1] not in taken))
+    used_names = {_name_without_unit(own_column) for own_column, _, _ in first} | {theirs for _, theirs, _ in first}
+    return (*first, *(c for c in others if _name_without_unit(c[0]) not in used_names and c[1] not in used_names))
 
 
 def _name_without_unit(mine: str) -> str:

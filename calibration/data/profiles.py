@@ -183,11 +183,13 @@ class ProfileTable:
         if self.surface is None:
             return made
         tracks = np.array([float(c.on_tracks) > 0.5 for c in robot.configurations.members])
-        which = tracks[np.asarray(conditions.configuration)].astype(int)
+        is_tracked = tracks[np.asarray(conditions.configuration)].astype(int)
 
         def ratio_by_surface(ratio: Callable[[str, bool], float]) -> Array:
             assert self.surface is not None
-            return jnp.asarray(np.array([[ratio(s, kind) for s in self.surface] for kind in (False, True)])[which])
+            return jnp.asarray(
+                np.array([[ratio(s, kind) for s in self.surface] for kind in (False, True)])[is_tracked]
+            )
 
         lateral = ratio_by_surface(lateral_ratio) if self.turns else None
         return dataclasses.replace(made, adhesion=ratio_by_surface(adhesion_ratio), adhesion_lateral=lateral)
@@ -259,7 +261,7 @@ def _header_settings(name: str, comments: list[str]) -> Json:
     """Settings in the comment lines at the top, such as `cycles = 40` or `between_rows = "linear"`. Other lines are
     comments.
     """
-    stated: Json = {}
+    header_settings: Json = {}
     for line in comments:
         text = line.lstrip("#").strip()
         if not re.match(r"[\w-]+\s*=", text):
@@ -271,22 +273,22 @@ def _header_settings(name: str, comments: list[str]) -> Json:
         for key, value in settings.items():
             if key not in SETTINGS:
                 raise BadData(f"{name}: got the setting {key}; {allowed_words(key, SETTINGS)}")
-            if key in stated:
+            if key in header_settings:
                 raise BadData(f"{name}: {key} is set twice; expected once")
-            stated[key] = value
-    cycles, between = stated.get("cycles", 1), stated.get("between_rows", BETWEEN[0])
+            header_settings[key] = value
+    cycles, between = header_settings.get("cycles", 1), header_settings.get("between_rows", BETWEEN[0])
     if isinstance(cycles, bool) or not isinstance(cycles, int) or cycles < 1:
         raise BadData(f"{name}, cycles: got {cycles!r}; expected a whole number from 1")
     if between not in BETWEEN:
         raise BadData(f"{name}, between_rows: got {between!r}; expected held or linear")
     begins = {}
-    for key, (field, least, greatest, one) in STARTS.items():
-        value = stated.get(key)
+    for key, (field, least, greatest, unit_size) in STARTS.items():
+        value = header_settings.get(key)
         if value is None:
             continue
         if not is_number(value) or not least <= value <= greatest:
             raise BadData(f"{name}, {key}: got {value!r}; expected a number, {least:g} to {greatest:g}")
-        begins[field] = one * value
+        begins[field] = unit_size * value
     return {"cycles": cycles, "linear": between == "linear", "begins": begins}
 
 
@@ -309,8 +311,8 @@ def _profile_columns(name: str, header: list[str]) -> dict[str, tuple[str, str]]
             _refuse_column(name, column)
         if field in columns_found:
             first = columns_found[field][0]
-            both = f"column {column} twice" if column == first else f"columns {first} and {column}"
-            raise BadData(f"{name}: got {both}; expected one of them")
+            column_words = f"column {column} twice" if column == first else f"columns {first} and {column}"
+            raise BadData(f"{name}: got {column_words}; expected one of them")
         columns_found[field] = (column, unit)
     if "time" not in columns_found:
         raise BadData(f"{name}: column time_s is missing; other columns: {', '.join(_standard_columns())}")
@@ -432,25 +434,25 @@ def _modes_and_demands(cells: _CellReader) -> tuple[Names, Columns]:
                 shares_found[name][row] = full[name] if mode == MODES[VOLTAGE] else shares_found[name][row - 1]
         for field in (*(f for f in ends if f not in demands), *demands):
             shares_found["demand" if field in CONTROLLED else field][row] = cells.value(field, row)
-        speed, stated = MODES[SPEED], bool(cells.text(YAW_RATE, row))
-        if stated and mode != speed and not (cells.linear and before == speed):
+        speed, has_yaw_rate = MODES[SPEED], bool(cells.text(YAW_RATE, row))
+        if has_yaw_rate and mode != speed and not (cells.linear and before == speed):
             cells.refuse(
                 YAW_RATE, row, f"an empty cell: a yaw rate needs a demanded speed, but this row has mode {mode}"
             )
-        if cells.has(YAW_RATE) and not stated and mode == speed and (cells.linear or row < len(cells) - 1):
+        if cells.has(YAW_RATE) and not has_yaw_rate and mode == speed and (cells.linear or row < len(cells) - 1):
             cells.refuse(YAW_RATE, row, "the demanded yaw rate, 0 for straight travel")
-        if stated:
+        if has_yaw_rate:
             shares_found[YAW_RATE][row] = cells.value(YAW_RATE, row)
     return tuple(modes), shares_found
 
 
 def _mode_of_row(cells: _CellReader, row: int, before: str, filled: list[str]) -> str:
     """Mode of a row, as stated or as implied by its demand. If no row has a demand, the motors are off."""
-    stated = cells.text(MODE, row)
-    if stated and stated not in MODES:
-        cells.refuse(MODE, row, f"one of these; {allowed_words(stated, MODES)}")
+    mode_text = cells.text(MODE, row)
+    if mode_text and mode_text not in MODES:
+        cells.refuse(MODE, row, f"one of these; {allowed_words(mode_text, MODES)}")
     columns = [cells.columns[field][0] for field in DEMANDS if cells.has(field)]
-    mode = stated or (DEMANDS[filled[0]] if filled else "" if columns else MODES[VOLTAGE])
+    mode = mode_text or (DEMANDS[filled[0]] if filled else "" if columns else MODES[VOLTAGE])
     if not mode and row == len(cells) - 1:
         mode = before
     if not mode:
@@ -464,10 +466,10 @@ def _mode_of_row(cells: _CellReader, row: int, before: str, filled: list[str]) -
 def _check_demands(cells: _CellReader, row: int, before: str, mode: str, own: list[str], others: list[str]) -> None:
     """Rejects a row with two demands or none, and a ramp between different kinds of demand."""
     if others:
-        where = cells.columns[others[0]][0]
+        cell_place = cells.columns[others[0]][0]
         beside = cells.columns[own[0]][0] if own and not cells.text(MODE, row) else f"mode {mode}"
         raise BadData(
-            f"{cells.source} row {row + 1}, {where}: got {cells.text(others[0], row)} in addition to {beside}; "
+            f"{cells.source} row {row + 1}, {cell_place}: got {cells.text(others[0], row)} in addition to {beside}; "
             "expected one demand per row"
         )
     pair = next((pair for pair in PAIRS if cells.has(pair[0])), ())

@@ -95,8 +95,8 @@ class ColumnCandidate:
     def line(self, question: str) -> str:
         """Line of a table `[columns]`."""
         name = f'"{self.signal.path}"'
-        stated = name if self.factor == 1.0 else f"{{column = {name}, factor = {self.factor:g}}}"
-        return f"{self.column} = {stated}{f'  # {question}' if question else ''}"
+        value_text = name if self.factor == 1.0 else f"{{column = {name}, factor = {self.factor:g}}}"
+        return f"{self.column} = {value_text}{f'  # {question}' if question else ''}"
 
 
 def propose_columns(
@@ -110,7 +110,7 @@ def propose_columns(
         seconds: function that returns the times of a signal [s].
     """
     columns = {q.stem or q.name: q.columns() for q in Layout(channels=channels.EVERY).quantities().values()}
-    taken = {signal.name.rpartition("_")[0] for signal in signals if signal.name in spelled}
+    spelled_stems = {signal.name.rpartition("_")[0] for signal in signals if signal.name in spelled}
     known_units = {unit for units in columns.values() for unit in units.values()} - {
         "",
         "s",
@@ -134,7 +134,7 @@ def propose_columns(
     for candidate in _currents_by_duty(_candidates_by_rate(pool, units_of, columns, seconds)):
         groups.setdefault(candidate.quantity, []).append(candidate)
     for quantity, group in groups.items():
-        if quantity in taken:
+        if quantity in spelled_stems:
             continue
         best, *others = sorted(group, key=lambda c: (c.signal.clock is None, bool(c.question)))
         question = best.question
@@ -191,10 +191,12 @@ def _candidate_of_signal(
             return ColumnCandidate(signal, quantity, "duty", "", 0.01)
         if largest <= 1.0:
             return ColumnCandidate(signal, quantity, "duty")
-        whole = next((w for w in WHOLE if largest <= w <= 1.05 * largest), None)
-        if whole is None or values.min() > 0.4 * largest:  # the width of a pulse has a large least value
+        full_scale = next((w for w in WHOLE if largest <= w <= 1.05 * largest), None)
+        if full_scale is None or values.min() > 0.4 * largest:  # the width of a pulse has a large least value
             return None
-        return ColumnCandidate(signal, quantity, "duty", f"is {whole} a whole duty?", float(f"{1 / whole:.8g}"))
+        return ColumnCandidate(
+            signal, quantity, "duty", f"is {full_scale} a whole duty?", float(f"{1 / full_scale:.8g}")
+        )
     if unit is None and quantity == "motor_speed" and largest < SLOW:
         return ColumnCandidate(signal, "speed", "speed_m_s", f"numbers up to {largest:.3g}: m/s?")
     if unit is None:
@@ -241,16 +243,16 @@ def seconds_per_count(signals: Sequence[Signal], count: np.ndarray) -> float:
         count: counts of the clock, shape (rows,).
     """
     known_units = {unit for units in RATES for unit in units[:2] if isinstance(unit, str)}
-    stated = {
+    seconds_by_unit = {
         signal.path: _stated_unit(signal, known_units) for signal in signals if not (signal.refused or signal.words)
     }
-    pairs = {(of_place, of_rate): one for of_place, of_rate, one in RATES}
-    for place, rate in itertools.permutations([s for s in signals if stated.get(s.path)], 2):
-        one = pairs.get((str(stated[place.path]), str(stated[rate.path])))
-        if one is not None and place.length == rate.length == len(count):
+    pairs = {(of_place, of_rate): seconds for of_place, of_rate, seconds in RATES}
+    for place, rate in itertools.permutations([s for s in signals if seconds_by_unit.get(s.path)], 2):
+        seconds = pairs.get((str(seconds_by_unit[place.path]), str(seconds_by_unit[rate.path])))
+        if seconds is not None and place.length == rate.length == len(count):
             factor = _integral_factor(count, np.asarray(place.load(), float), np.asarray(rate.load(), float))
             if math.isfinite(factor) and factor > 0:
-                return factor / one
+                return factor / seconds
     return math.nan
 
 
@@ -300,14 +302,14 @@ def _units_of_position_and_rate(
         time: time of both signals [s].
         stated: unit of each, None if it states none.
     """
-    turned = np.asarray(rate.load(), float)
-    factor = _integral_factor(time, np.asarray(place.load(), float), turned)
+    rate_values = np.asarray(rate.load(), float)
+    factor = _integral_factor(time, np.asarray(place.load(), float), rate_values)
     turns = re.search(r"angle|theta|omega|rpm", _path_words(f"{place.path} {rate.path}"))
-    no_length = not any(stated) and (bool(turns) or float(np.nanmax(np.abs(turned))) > LARGEST_M_S)
+    no_length = not any(stated) and (bool(turns) or float(np.nanmax(np.abs(rate_values))) > LARGEST_M_S)
     return [
         (of_place, of_rate)
-        for of_place, of_rate, one in RATES
-        if abs(factor / one - 1) < SAME_RATE
+        for of_place, of_rate, seconds in RATES
+        if abs(factor / seconds - 1) < SAME_RATE
         and stated[0] in (None, of_place)
         and stated[1] in (None, of_rate)
         and not (no_length and of_place in ("m", "mm"))
@@ -321,12 +323,12 @@ def _integral_factor(time: np.ndarray, place: np.ndarray, rate: np.ndarray) -> f
     if sound.sum() < 3:
         return math.nan
     sound &= step <= 5 * np.median(step[sound])
-    moved = np.cumsum(np.where(sound, np.diff(place), 0.0))
-    turned = np.cumsum(np.where(sound, 0.5 * (rate[1:] + rate[:-1]) * step, 0.0))
-    if not np.any(turned):
+    distance = np.cumsum(np.where(sound, np.diff(place), 0.0))
+    integral = np.cumsum(np.where(sound, 0.5 * (rate[1:] + rate[:-1]) * step, 0.0))
+    if not np.any(integral):
         return math.nan
-    factor = float(moved @ turned / (turned @ turned))
-    rest = np.abs(moved - factor * turned).max() / max(float(np.abs(moved).max()), 1e-300)
+    factor = float(distance @ integral / (integral @ integral))
+    rest = np.abs(distance - factor * integral).max() / max(float(np.abs(distance).max()), 1e-300)
     return factor if rest < INTEGRAL else math.nan
 
 

@@ -169,11 +169,11 @@ def parse_requirements(text: str, where: str) -> Requirements:
     schema = content.pop("schema", SCHEMA)
     if schema != SCHEMA:
         raise BadConfiguration(f"{where}, schema: got {schema!r}; expected {SCHEMA}")
-    stated = content.pop("envelope", {})
-    if not isinstance(stated, dict):
-        raise BadConfiguration(f"{where}, envelope: got {stated!r}; expected a table of {', '.join(KEYS)}")
-    envelope = _updated_envelope(Envelope(), stated, f"{where}, envelope")
-    each: list[Requirement] = []
+    envelope_table = content.pop("envelope", {})
+    if not isinstance(envelope_table, dict):
+        raise BadConfiguration(f"{where}, envelope: got {envelope_table!r}; expected a table of {', '.join(KEYS)}")
+    envelope = _updated_envelope(Envelope(), envelope_table, f"{where}, envelope")
+    requirements: list[Requirement] = []
     for name, value in content.items():
         if name not in QUANTITIES:
             raise BadConfiguration(f"{where}, {_unknown_name_error(name, (*QUANTITIES, 'envelope'))}")
@@ -184,11 +184,11 @@ def parse_requirements(text: str, where: str) -> Requirements:
             )
         for k, table in enumerate(tables):
             place = f"{where}, {name}" + (f" {k + 1}" if len(tables) > 1 else "")
-            each += _requirements_of_entry(name, table, envelope, place)
-    if not each:
+            requirements += _requirements_of_entry(name, table, envelope, place)
+    if not requirements:
         raise BadConfiguration(f"{where}: contains no requirement; expected one of {', '.join(QUANTITIES)}")
-    _check_consistent(each, envelope, where)
-    return Requirements(where, envelope, tuple(each), text)
+    _check_consistent(requirements, envelope, where)
+    return Requirements(where, envelope, tuple(requirements), text)
 
 
 def _stem_of_name(name: str) -> str:

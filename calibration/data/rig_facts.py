@@ -108,15 +108,15 @@ def _gearbox_facts(robot: Robot) -> Iterator[DerivedFact]:
 def _output_torque_at(robot: Robot, current: float) -> float:
     """Output torque of one drive at a motor current, after losses [N·m]."""
     motor, gear = robot.motor, robot.gearbox
-    lost = float(motor.friction_coulomb) + float(gear.friction_coulomb)
-    return (float(motor.torque_constant) * current - lost) * float(gear.ratio) * float(gear.efficiency_load)
+    friction = float(motor.friction_coulomb) + float(gear.friction_coulomb)
+    return (float(motor.torque_constant) * current - friction) * float(gear.ratio) * float(gear.efficiency_load)
 
 
 def _current_for_torque(robot: Robot, torque: float) -> float:
     """Motor current for an output torque at low speed [A]."""
     motor, gear = robot.motor, robot.gearbox
-    lost = float(motor.friction_coulomb) + float(gear.friction_coulomb)
-    return (torque / (float(gear.ratio) * float(gear.efficiency_load)) + lost) / float(motor.torque_constant)
+    friction = float(motor.friction_coulomb) + float(gear.friction_coulomb)
+    return (torque / (float(gear.ratio) * float(gear.efficiency_load)) + friction) / float(motor.torque_constant)
 
 
 def _current_fact(robot: Robot, what: str, torque: float, places: str) -> Iterator[DerivedFact]:
@@ -246,11 +246,11 @@ def doubtful_current(runs: Runs, robot: Robot) -> str:
     largest = float(np.nanmax(np.abs(runs[column][turning]), initial=0.0))
     if needed == 0 or not turning.any() or LEAST < largest / needed < MOST:
         return ""
-    theirs = runs.headings.get(column, column)
+    heading = runs.headings.get(column, column)
     return (
-        f"{runs.source}, {theirs}: up to {three_digits(largest)} A, although by the file's numbers the load turns "
+        f"{runs.source}, {heading}: up to {three_digits(largest)} A, although by the file's numbers the load turns "
         f"slowly at {three_digits(needed)} A; is it in another unit (mA, mN·m)? then state [columns] {column} = "
-        f'{{column = "{theirs}", factor = ...}}'
+        f'{{column = "{heading}", factor = ...}}'
     )
 
 
@@ -344,24 +344,24 @@ def saturation_sentence(runs: Runs) -> str:
         return ""
     if any(runs.layout.magnitude(c.name) for c in runs.channels if c.column in (current, speed)):
         return ""
-    given, readings = applied_drive(runs), np.stack([runs[current], runs[speed]], 1)
+    drive, readings = applied_drive(runs), np.stack([runs[current], runs[speed]], 1)
     read = np.isfinite(readings).all(1)
-    inner = read & (given != 0) & (np.abs(given) <= INNER * float(np.max(np.abs(given))))
+    inner = read & (drive != 0) & (np.abs(drive) <= INNER * float(np.max(np.abs(drive))))
     if inner.sum() < ROWS_INNER:
         return ""
-    seen = readings @ np.linalg.lstsq(readings[inner], given[inner], rcond=None)[0]
-    if np.std(seen[inner] - given[inner]) > FITS * np.std(given[inner]):
+    predicted = readings @ np.linalg.lstsq(readings[inner], drive[inner], rcond=None)[0]
+    if np.std(predicted[inner] - drive[inner]) > FITS * np.std(drive[inner]):
         return ""
-    top = read & (np.abs(given) >= np.quantile(np.abs(given[read]), 0.9))
-    limit = float(np.median(np.abs(seen[top])))
-    beyond = read & (np.abs(given) > limit / REACHES)
+    top = read & (np.abs(drive) >= np.quantile(np.abs(drive[read]), 0.9))
+    limit = float(np.median(np.abs(predicted[top])))
+    beyond = read & (np.abs(drive) > limit / REACHES)
     # If the voltage that they show still rises, the reason is another one.
-    if beyond.sum() < ROWS_INNER or np.std(np.abs(seen[beyond])) > FITS * limit:
+    if beyond.sum() < ROWS_INNER or np.std(np.abs(predicted[beyond])) > FITS * limit:
         return ""
     row = int(np.flatnonzero(beyond)[0])
     column = "duty" if runs.has("duty") else runs.headings.get(SUPPLY, SUPPLY)
     return (
-        f"{runs.source} row {row + 1}, {column}: commands {three_digits(given[row])} V, but current and speed "
+        f"{runs.source} row {row + 1}, {column}: commands {three_digits(drive[row])} V, but current and speed "
         f"show {three_digits(limit)} V at most, as in {100 * np.mean(beyond):.2g} % of the log; the driver limits "
         f"the voltage. Give the voltage that it applies, or limit the column to {three_digits(limit)} V"
     )
@@ -391,10 +391,10 @@ def doubtful_speed(runs: Runs, robot: Robot) -> str:
     if share < OTHER_UNIT and (braked or robot.has_ground or share > 1 / OTHER_UNIT / 100):
         return ""
     row = int(np.flatnonzero(is_shown)[0])
-    theirs, supply = (runs.headings.get(c, c) for c in (column, SUPPLY))
+    heading, supply = (runs.headings.get(c, c) for c in (column, SUPPLY))
     return (
-        f"{runs.source} row {row + 1}, {theirs}: got {three_digits(abs(read[row]))} rpm, but with the file's "
-        f"torque constant the motors reach at most {three_digits(reached[row])} rpm; check the units of {theirs} "
+        f"{runs.source} row {row + 1}, {heading}: got {three_digits(abs(read[row]))} rpm, but with the file's "
+        f"torque constant the motors reach at most {three_digits(reached[row])} rpm; check the units of {heading} "
         f"and {supply}, and motor.torque_constant"
     )
 
@@ -412,16 +412,16 @@ def doubtful_torque(runs: Runs, robot: Robot) -> str:
     if not runs.has(LOAD) or not (of_current or (robot.rig.imposed == "voltage" and robot.knows(VOLTAGE))):
         return ""
     current = np.abs(applied_drive(runs)) / (1.0 if of_current else float(robot.motor.resistance))
-    lost, made = (_output_torque_at(robot, x) for x in (0.0, 1.0))  # it rises with the current on a line
-    stall = np.maximum(lost + (made - lost) * current, 0.0)
+    torque_at_zero, made = (_output_torque_at(robot, x) for x in (0.0, 1.0))  # it rises with the current on a line
+    stall = np.maximum(torque_at_zero + (made - torque_at_zero) * current, 0.0)
     braked = (runs[LOAD] != 0) & (current > 0)
     beyond = braked & (np.abs(runs[LOAD]) > BEYOND * stall)
     if not braked.any() or beyond.sum() <= braked.sum() / 2:
         return ""
-    row, theirs = int(np.flatnonzero(beyond)[0]), runs.headings.get(LOAD, LOAD)
+    row, heading = int(np.flatnonzero(beyond)[0]), runs.headings.get(LOAD, LOAD)
     return (
-        f"{runs.source} row {row + 1}, {theirs}: got {three_digits(runs[LOAD][row])} N·m, but the motors stall at "
-        f'{three_digits(stall[row])} N·m; is it in mN·m? then state [columns] load_torque_mNm = "{theirs}"'
+        f"{runs.source} row {row + 1}, {heading}: got {three_digits(runs[LOAD][row])} N·m, but the motors stall at "
+        f'{three_digits(stall[row])} N·m; is it in mN·m? then state [columns] load_torque_mNm = "{heading}"'
     )
 
 
@@ -488,7 +488,7 @@ def swapped_sentence(runs: Runs) -> str:
 
 def log_doubts(runs: Runs, robot: Robot) -> Names:
     """Sentences on doubts about a log: its times, levels and limits, and units that do not fit the robot."""
-    every = (
+    doubts = (
         gap_sentence(runs),
         jitter_sentence(runs),
         saturation_sentence(runs),
@@ -501,7 +501,7 @@ def log_doubts(runs: Runs, robot: Robot) -> Names:
         doubtful_torque(runs, robot),
         doubtful_speed(runs, robot),
     )
-    return tuple(filter(None, every))
+    return tuple(filter(None, doubts))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -523,28 +523,30 @@ class NumberOrigin:
 
 def number_origins(file: RobotFile) -> list[NumberOrigin]:
     """Origin of each number of a robot, part by part. Numbers that no file states come last in their part."""
-    robot, stated = file.robot, file.stated
+    robot, names_in_file = file.robot, file.stated
     priors = {name: sd for name, _, sd in robot.rig.priors}
     origins = []
     for p in params.walk_parameters(robot):
         head, _, rest = p.name.partition(".")
-        mine = head in robot.configurations
-        is_shown = p.name in stated or mine or p.name.startswith(("motor.friction", "gearbox."))
-        is_shown |= p.name == rig_file.CENTRE and rig_file.WHEELBASE in stated
-        is_shown |= head == BATTERY and any(name.startswith(f"{BATTERY}.") for name in stated)
+        is_own_configuration = head in robot.configurations
+        is_shown = (
+            p.name in names_in_file or is_own_configuration or p.name.startswith(("motor.friction", "gearbox."))
+        )
+        is_shown |= p.name == rig_file.CENTRE and rig_file.WHEELBASE in names_in_file
+        is_shown |= head == BATTERY and any(name.startswith(f"{BATTERY}.") for name in names_in_file)
         assumed = not robot.rig.inherits and (
-            p.name == "motor.inertia" or (p.name == "motor.inductance" and "motor.resistance" in stated)
+            p.name == "motor.inertia" or (p.name == "motor.inductance" and "motor.resistance" in names_in_file)
         )
         if not is_shown and not assumed:
             continue
-        if p.name in stated:
+        if p.name in names_in_file:
             why = "the file, from mass and travel of the linear unit" if head in file.linear else "the file"
         elif robot.rig.inherits:
             why = "its base"
         elif head == BATTERY and not robot.knows([p.name]):
             why = "not stated: an example value; results on the battery depend on it"
         else:
-            why = _reason_of_default(p.name, rest if mine else "")
+            why = _reason_of_default(p.name, rest if is_own_configuration else "")
         origins.append(NumberOrigin(p.name, float(p.value), p.spec.unit, priors.get(p.name), why))
     return origins
 

@@ -119,12 +119,12 @@ def linear_to_shaft(table: Json, name: str, where: str, sds: dict[str, float], s
     inputs = {key: sds.pop(f"{name}.{key}") for key in values if f"{name}.{key}" in sds}
     exact = {key for key, sd in inputs.items() if sd == 0}
     for result in table:
-        moved = {
+        shaft_values = {
             key
             for key in values
             if _shaft_of_linear_unit({**values, key: 1.01 * values[key] + 1e-6}, sides)[result] != table[result]
         }
-        if moved and moved <= exact:
+        if shaft_values and shaft_values <= exact:
             sds[f"{name}.{result}"] = 0.0
             continue
         steps = [
@@ -189,9 +189,11 @@ def parse_rig(content: Json, where: str, loads: Sequence[str], *, travels: bool,
         BadConfiguration: a word, channel or column is unknown, a channel is imposed, or an instrument belongs to a
             channel that the rig does not have.
     """
-    stated = content.pop("imposed", IMPOSED[0])
+    imposed_name = content.pop("imposed", IMPOSED[0])
     imposed = stated_word(
-        SHORT.get(stated, stated) if isinstance(stated, str) else stated, IMPOSED, f"{where}, imposed"
+        SHORT.get(imposed_name, imposed_name) if isinstance(imposed_name, str) else imposed_name,
+        IMPOSED,
+        f"{where}, imposed",
     )
     start = stated_word(content.pop("start", STARTS[0]), STARTS, f"{where}, start")
     between = stated_word(content.pop("between_rows", BETWEEN[0]), BETWEEN, f"{where}, between_rows")
@@ -215,25 +217,25 @@ def parse_rig(content: Json, where: str, loads: Sequence[str], *, travels: bool,
 
 
 def _parse_channels(stated: Any, where: str) -> Names:
-    every = channels.channel_names(channels.EVERY)
+    channel_names = channels.channel_names(channels.EVERY)
     if not isinstance(stated, list) or not stated or not all(isinstance(name, str) for name in stated):
         raise BadConfiguration(
-            f"{where}: got {stated!r}; expected a list of channels, at least one of {', '.join(every)}"
+            f"{where}: got {stated!r}; expected a list of channels, at least one of {', '.join(channel_names)}"
         )
     for name in stated:
-        stated_word(name, every, where)
+        stated_word(name, channel_names, where)
         if stated.count(name) > 1:
             raise BadConfiguration(f"{where}: {name} is repeated; expected each channel once")
-    return tuple(name for name in every if name in stated)
+    return tuple(name for name in channel_names if name in stated)
 
 
 def _parse_surfaces(stated: Any, loads: Sequence[str], where: str) -> tuple[tuple[str, str], ...]:
-    here = f"{where}, surfaces"
+    table_place = f"{where}, surfaces"
     if not isinstance(stated, dict):
-        raise BadConfiguration(f"{here}: got {stated!r}; expected a table [surfaces]")
+        raise BadConfiguration(f"{table_place}: got {stated!r}; expected a table [surfaces]")
     for name, other in stated.items():
         for word in (name, other):
-            stated_word(word, loads, f"{here}.{name}")
+            stated_word(word, loads, f"{table_place}.{name}")
     return tuple(stated.items())
 
 
@@ -242,26 +244,26 @@ FREE = "free"
 
 
 def _parse_instruments(stated: Any, names: Sequence[str], where: str) -> tuple[Instrument, ...]:
-    here = f"{where}, instruments"
+    table_place = f"{where}, instruments"
     if not isinstance(stated, dict):
-        raise BadConfiguration(f"{here}: got {stated!r}; expected tables such as [instruments.{names[0]}]")
+        raise BadConfiguration(f"{table_place}: got {stated!r}; expected tables such as [instruments.{names[0]}]")
     instruments = []
     for name, table in stated.items():
-        stated_word(name, names, f"{here}.{name}", "the rig has no such channel")
+        stated_word(name, names, f"{table_place}.{name}", "the rig has no such channel")
         if not isinstance(table, dict):
-            raise BadConfiguration(f"{here}.{name}: got {table!r}; expected a table [instruments.{name}]")
+            raise BadConfiguration(f"{table_place}.{name}: got {table!r}; expected a table [instruments.{name}]")
         for key in table:
-            stated_word(key, ("signed", "quantum"), f"{here}.{name}.{key}", "no such key")
+            stated_word(key, ("signed", "quantum"), f"{table_place}.{name}.{key}", "no such key")
         signed, quantum = table.get("signed", True), table.get("quantum", 0.0)
         channel = channels.find_channel(name)
         if not isinstance(signed, bool) and signed != FREE:
             raise BadConfiguration(
-                f"{here}.{name}.signed: got {signed!r}; expected true, false (shows only the magnitude), or {FREE!r} "
-                "(decided from the table)"
+                f"{table_place}.{name}.signed: got {signed!r}; expected true, false (shows only the magnitude), or "
+                f"{FREE!r} (decided from the table)"
             )
         if quantum != FREE and not (is_number(quantum) and 0 <= quantum < math.inf):
             raise BadConfiguration(
-                f"{here}.{name}.quantum: got {quantum!r}; expected the resolution of its readings, 0 or more "
+                f"{table_place}.{name}.quantum: got {quantum!r}; expected the resolution of its readings, 0 or more "
                 f"{channel.unit}, or {FREE!r} (decided from the table)"
             )
         step = None if quantum == FREE else float(quantum) * channel.factor
@@ -270,25 +272,29 @@ def _parse_instruments(stated: Any, names: Sequence[str], where: str) -> tuple[I
 
 
 def _parse_columns(stated: Any, where: str) -> tuple[tuple[str, str, float], ...]:
-    here = f"{where}, columns"
+    table_place = f"{where}, columns"
     if not isinstance(stated, dict):
-        raise BadConfiguration(f"{here}: got {stated!r}; expected a table [columns]")
+        raise BadConfiguration(f"{table_place}: got {stated!r}; expected a table [columns]")
     layout, entries = Layout(channels=channels.EVERY), []
     spellings = layout.spellings()
-    for mine, theirs in stated.items():
-        if mine not in spellings:
-            listed = allowed_words(mine, spellings, shown=layout.known())
-            raise BadConfiguration(f"{here}.{mine}: no such column of a table; {listed}; also in other units")
-        table = {"column": theirs} if isinstance(theirs, str) else theirs
+    for own_column, logger_column in stated.items():
+        if own_column not in spellings:
+            names_text = allowed_words(own_column, spellings, shown=layout.known())
+            raise BadConfiguration(
+                f"{table_place}.{own_column}: no such column of a table; {names_text}; also in other units"
+            )
+        table = {"column": logger_column} if isinstance(logger_column, str) else logger_column
         if not isinstance(table, dict) or not isinstance(table.get("column"), str) or {*table} - {"column", "factor"}:
             raise BadConfiguration(
-                f'{here}.{mine}: got {theirs!r}; expected {mine} = "LOGGER COLUMN", or '
-                f'{mine} = {{column = "LOGGER COLUMN", factor = 0.001}}'
+                f'{table_place}.{own_column}: got {logger_column!r}; expected {own_column} = "LOGGER COLUMN", or '
+                f'{own_column} = {{column = "LOGGER COLUMN", factor = 0.001}}'
             )
         factor = table.get("factor", 1.0)
         if not is_number(factor) or not math.isfinite(factor) or not factor:
-            raise BadConfiguration(f"{here}.{mine}.factor: got {factor!r}; expected a number that is not 0")
-        entries.append((mine, table["column"], float(factor)))
+            raise BadConfiguration(
+                f"{table_place}.{own_column}.factor: got {factor!r}; expected a number that is not 0"
+            )
+        entries.append((own_column, table["column"], float(factor)))
     return tuple(entries)
 
 
@@ -312,7 +318,7 @@ def required_parameters(rig: Rig, values: Iterable[tuple[str, Any]] = ()) -> Nam
         ("motor.resistance_thermal_housing", hot),
         (WHEELBASE, turns),
     )
-    return tuple(name for name, wanted in conditions if wanted)
+    return tuple(name for name, is_needed in conditions if is_needed)
 
 
 def reject_missing(
@@ -329,13 +335,14 @@ def reject_missing(
         BadConfiguration: a parameter is missing. One sentence lists all of them.
     """
     if missing:
-        each = ", ".join(f"{name} [{known[name].spec.unit}]" for name in missing)
+        names_with_units = ", ".join(f"{name} [{known[name].spec.unit}]" for name in missing)
         verb = "is" if len(missing) == 1 else "are"
         strange = [name for name in given if name not in known]
         near = [(x, name) for name in missing for x in difflib.get_close_matches(name, strange, 1, 0.85)]
         misspelt = "".join(f"; is {x} meant to be {name}?" for x, name in near)
         raise BadConfiguration(
-            f'{where}: {each} {verb} missing; a robot with base = "none" needs every parameter (mmrjax rig new '
+            f'{where}: {names_with_units} {verb} missing; a robot with base = "none" needs every parameter (mmrjax '
+            "rig new "
             f"writes a file with all of them){misspelt}"
         )
 
@@ -377,10 +384,10 @@ def rig_lines(rig: Rig) -> tuple[list[str], dict[str, list[str]]]:
     tables: dict[str, list[str]] = {}
     if rig.columns:
         tables["columns"] = [
-            f"{mine} = {toml_value(theirs)}"
+            f"{own_column} = {toml_value(logger_column)}"
             if factor == 1
-            else f"{mine} = {{column = {toml_value(theirs)}, factor = {factor!r}}}"
-            for mine, theirs, factor in rig.columns
+            else f"{own_column} = {{column = {toml_value(logger_column)}, factor = {factor!r}}}"
+            for own_column, logger_column, factor in rig.columns
         ]
     if rig.surfaces:
         tables["surfaces"] = ["# these differ only in their ground"]
@@ -398,8 +405,8 @@ def rig_lines(rig: Rig) -> tuple[list[str], dict[str, list[str]]]:
 
 def value_text(name: str, value: float, rig: Rig) -> str:
     """Value of a parameter as written in a file, with ± if its prior is stated and the value is unchanged."""
-    for stated, mean, sd in rig.priors:
-        if stated == name and mean == value:
+    for prior_name, mean, sd in rig.priors:
+        if prior_name == name and mean == value:
             return f'"{value!r} ± {sd!r}"'
     return repr(value)
 

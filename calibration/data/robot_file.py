@@ -246,18 +246,18 @@ def _robot_before_parameters(
     robot = paper_robots.blank_robot(Configurations(loads.by_name), rig=rig)
     robot = dataclasses.replace(robot, controller=controller)
     robot = params.replace(robot, {name: jnp.asarray(value) for name, (value, _) in rig_file.DEFAULTS.items()})
-    given = dict(_flatten(content))
+    file_values = dict(_flatten(content))
     parameters = {p.name: p for p in params.walk_parameters(robot)}
-    resistance = given.get("motor.resistance")
+    resistance = file_values.get("motor.resistance")
     if isinstance(resistance, int | float):
         robot = params.replace(robot, {"motor.inductance": params.as_float(rig_file.WINDING * resistance)})
-    for name in given:
+    for name in file_values:
         if "." not in name and name not in COUNTS:
             raise BadConfiguration(f"{where}, {name}: no such parameter; {_parameter_choices(name, parameters)}")
-    missing = [name for name in rig_file.required_parameters(rig, given.items()) if name not in given]
+    missing = [name for name in rig_file.required_parameters(rig, file_values.items()) if name not in file_values]
     if not loads.travels and "speed" in rig.channels:
-        missing += [f"{name}.radius" for name in loads.by_name if f"{name}.radius" not in given]
-    rig_file.reject_missing([*missing, *loads.missing], parameters, where, given)
+        missing += [f"{name}.radius" for name in loads.by_name if f"{name}.radius" not in file_values]
+    rig_file.reject_missing([*missing, *loads.missing], parameters, where, file_values)
     return robot, sds, loads.linear
 
 
@@ -267,13 +267,13 @@ def _scaled_effect(library: Library, name: str, factors: Any, where: str) -> typ
     Raises:
         BadConfiguration: the scale is not three positive numbers, or the effect has no prior.
     """
-    here = f"{where}, effects.{name}.{FACTORS}"
+    table_place = f"{where}, effects.{name}.{FACTORS}"
     if name not in library:
-        raise BadConfiguration(f"{here}: a curve or wave has no prior for its size; remove the key")
+        raise BadConfiguration(f"{table_place}: a curve or wave has no prior for its size; remove the key")
     three = isinstance(factors, list) and len(factors) == 3
     if not three or not all(is_number(x) and 0 < x < math.inf for x in factors):
         raise BadConfiguration(
-            f"{here}: got {factors!r}; expected three factors above 0 on the library's values: [sd of the "
+            f"{table_place}: got {factors!r}; expected three factors above 0 on the library's values: [sd of the "
             "amplitude, shape, limits of the amplitude]"
         )
     return scaled_effect(library[name], (float(factors[0]), float(factors[1]), float(factors[2])))
@@ -300,11 +300,13 @@ def add_effects(
     for name in names:
         effect = library_with_built_in[name]()
         acting = (configurations or {}).get(name, effect.configurations)
-        here = f"{where}, effects.{name}.configurations"
+        list_place = f"{where}, effects.{name}.configurations"
         if not isinstance(acting, list | tuple) or not all(isinstance(c, str) for c in acting):
-            raise BadConfiguration(f"{here}: got {acting!r}; expected a list of {', '.join(robot.configurations)}")
+            raise BadConfiguration(
+                f"{list_place}: got {acting!r}; expected a list of {', '.join(robot.configurations)}"
+            )
         for c in acting:
-            stated_word(c, robot.configurations, here)
+            stated_word(c, robot.configurations, list_place)
         present.append(dataclasses.replace(effect, configurations=tuple(acting)))
     return dataclasses.replace(robot, effects=tuple(present))
 
@@ -321,14 +323,14 @@ def change_robot(robot: Robot, values: Mapping[str, Any], where: str, notes: lis
     Raises:
         BadConfiguration: for the same reasons as `parse_robot_file`.
     """
-    stated = dict(values)
+    new_values = dict(values)
     settings = (*COUNTS, *RATINGS, *SWITCHES, *CHOICES)
-    ratings = {name: _check_setting(where, name, stated.pop(name)) for name in settings if name in stated}
-    if CURVE & stated.keys() and "battery.capacity" in stated:  # all of one cell, unless stated otherwise
-        ratings.setdefault("battery.capacity_curve", stated["battery.capacity"])
+    ratings = {name: _check_setting(where, name, new_values.pop(name)) for name in settings if name in new_values}
+    if CURVE & new_values.keys() and "battery.capacity" in new_values:  # all of one cell, unless stated otherwise
+        ratings.setdefault("battery.capacity_curve", new_values["battery.capacity"])
     parameters = {p.name: p for p in params.walk_parameters(robot)}
     refused: dict[str, list[str]] = {}
-    for name, value in stated.items():
+    for name, value in new_values.items():
         if why := _refusal_reason(name, value, parameters):
             refused.setdefault(why, []).append(name)
     if refused:
@@ -336,8 +338,8 @@ def change_robot(robot: Robot, values: Mapping[str, Any], where: str, notes: lis
         if len(sentences) > 1:  # one message has room for all of them without the allowed names
             sentences = [sentence.partition(" allowed: ")[0] for sentence in sentences]
         raise BadConfiguration(f"{where}, {'; also '.join(sentences)}")
-    robot = params.replace(robot, {name: jnp.asarray(value, float) for name, value in stated.items()})
-    robot = rig_file.recentre_priors(robot, stated)
+    robot = params.replace(robot, {name: jnp.asarray(value, float) for name, value in new_values.items()})
+    robot = rig_file.recentre_priors(robot, new_values)
     robot = dataclasses.replace(robot, sides=ratings.pop("sides", robot.sides))
     for name, value in ratings.items():
         part, _, key = name.partition(".")
@@ -374,14 +376,14 @@ def _add_required_states(robot: Robot, where: str) -> Robot:
     for name, load in loose.items():
         if not (float(robot.motor.inertia) > 0 and float(load.inertia) > 0):
             key, unit = ("backlash", "rad") if load.backlash > 0 else ("stiffness", "N·m/rad")
-            stated = f"{where}, {name}.{key}: got {float(getattr(load, key)):g} {unit}"
+            problem_text = f"{where}, {name}.{key}: got {float(getattr(load, key)):g} {unit}"
             raise BadConfiguration(
-                f"{stated}; motor and load can then move relative to each other, so motor.inertia and "
+                f"{problem_text}; motor and load can then move relative to each other, so motor.inertia and "
                 f"{name}.inertia must be above 0"
             )
-    own = robot.controller
-    own = None if own is None else dataclasses.replace(own, lags=float(own.lag) > 0)
-    return dataclasses.replace(robot, rig=dataclasses.replace(robot.rig, loose=bool(loose)), controller=own)
+    controller = robot.controller
+    controller = None if controller is None else dataclasses.replace(controller, lags=float(controller.lag) > 0)
+    return dataclasses.replace(robot, rig=dataclasses.replace(robot.rig, loose=bool(loose)), controller=controller)
 
 
 def _check_setting(where: str, name: str, value: Any) -> Any:
@@ -389,18 +391,18 @@ def _check_setting(where: str, name: str, value: Any) -> Any:
     if name in SWITCHES:
         allowed, expected = isinstance(value, bool), f"true or false ({SWITCHES[name]})"
     elif name in CHOICES:
-        words, what = CHOICES[name]
-        allowed, expected = value in words, f"{' or '.join(words)} ({what})"
+        words, meaning = CHOICES[name]
+        allowed, expected = value in words, f"{' or '.join(words)} ({meaning})"
     elif name in COUNTS:
-        low, high, what = COUNTS[name]
+        low, high, meaning = COUNTS[name]
         allowed = is_number(value) and value == value // 1 and low <= value <= high
-        value, expected = int(value) if allowed else value, f"a whole number, {low} to {high} {what}"
+        value, expected = int(value) if allowed else value, f"a whole number, {low} to {high} {meaning}"
     else:
-        least, most, unit, what = RATINGS[name]
+        least, most, unit, meaning = RATINGS[name]
         allowed = is_number(value) and least <= value <= most
         value, expected = (
             float(value) if is_number(value) else value,
-            f"a number, {least:g} to {most:g} {unit} ({what})",
+            f"a number, {least:g} to {most:g} {unit} ({meaning})",
         )
     if not allowed:
         got = f"{value:g}" if name in RATINGS and is_number(value) else repr(value)
@@ -453,15 +455,15 @@ def write_robot(robot: Robot, path: Path, *, note: str = "") -> None:
 
     For a robot without a base, parameters that it does not state are left out.
     """
-    whole, nothing = robot.rig.inherits, _base_robot(robot)
-    pack = not whole and robot.battery.cells == nothing.battery.cells
+    inherits, nothing = robot.rig.inherits, _base_robot(robot)
+    pack = not inherits and robot.battery.cells == nothing.battery.cells
     tables: dict[str, list[str]] = {
         "battery": [] if pack else [f"cells = {robot.battery.cells}  # in series"],
         "motor": [],
         "gearbox": [],
     }
     head, more = rig_file.rig_lines(robot.rig)
-    if rig_file.is_default_rig(robot.rig) and whole and robot.has_ground:
+    if rig_file.is_default_rig(robot.rig) and inherits and robot.has_ground:
         head, more = [], {}
     for name, load in robot.configurations.items():
         moves = "tracks" if float(load.on_tracks) > 0.5 else "wheels"
@@ -473,11 +475,11 @@ def write_robot(robot: Robot, path: Path, *, note: str = "") -> None:
     for title, line in _lines_of_ratings(robot, nothing, {name for name, lines in tables.items() if lines}):
         tables.setdefault(title, []).append(line)
     lines = [f"# {printable(line)}" for line in note.splitlines()]
-    lines += [f'schema = "{SCHEMA}"', f'base = "{"nominal" if whole else rig_file.NONE}"']
+    lines += [f'schema = "{SCHEMA}"', f'base = "{"nominal" if inherits else rig_file.NONE}"']
     lines += [f"sides = {int(robot.sides)}  # motors with the same command", *head]
     lines.append(f"configurations = {toml_value(list(robot.configurations))}")
     for title, table in {**tables, **more}.items():
-        if not (whole or table or title in robot.configurations):
+        if not (inherits or table or title in robot.configurations):
             continue
         lines += ["", f"[{title}]", *table]
     write_text(path, "\n".join(lines) + "\n")
@@ -485,8 +487,8 @@ def write_robot(robot: Robot, path: Path, *, note: str = "") -> None:
 
 def _lines_of_effect(effect: Effect) -> list[str]:
     """Lines of an effect's table except its parameters."""
-    named = effect.configurations or type(effect)().configurations
-    lines = [f"configurations = {toml_value(effect.configurations)}  # in which it acts"] if named else []
+    configurations = effect.configurations or type(effect)().configurations
+    lines = [f"configurations = {toml_value(effect.configurations)}  # in which it acts"] if configurations else []
     if type(effect).plain is not None:
         lines.append(f"{FACTORS} = {list(type(effect).factors)}  # sd, shape, limits: times the library's")
     return lines
@@ -494,7 +496,7 @@ def _lines_of_effect(effect: Effect) -> list[str]:
 
 def _lines_of_parameters(robot: Robot, nothing: Robot) -> Iterator[tuple[str, str]]:
     """Table and line of each parameter that a file must state because it differs from the base robot."""
-    whole = robot.rig.inherits
+    inherits = robot.rig.inherits
     start = {p.name: float(p.value) for p in params.walk_parameters(nothing)}
     needed = rig_file.required_parameters(
         robot.rig, ((p.name, float(p.value)) for p in params.walk_parameters(robot))
@@ -508,14 +510,14 @@ def _lines_of_parameters(robot: Robot, nothing: Robot) -> Iterator[tuple[str, st
         was = start.get(parameter.name, 0.0 if table.startswith("effects.") else None)
         same = value == was and not parameter.name.startswith(always) and parameter.name not in needed
         same &= parameter.name not in nothing.rig.unknown or parameter.name in robot.rig.unknown
-        same &= whole or parameter.name not in robot.rig.stated
-        if same and (not whole or table == "rig"):
+        same &= inherits or parameter.name not in robot.rig.stated
+        if same and (not inherits or table == "rig"):
             continue
         origin = f"; nominal {was:g}: {spec.source}" if was is not None and value != was else ""
         origin = f"; {spec.source}" if value == was else origin
         text = rig_file.value_text(parameter.name, value, robot.rig)
         line = f"{key} = {text}  # [{spec.unit}] {spec.meaning}"
-        yield table, f"{line}{origin}" if whole else line
+        yield table, f"{line}{origin}" if inherits else line
 
 
 def _lines_of_ratings(robot: Robot, nothing: Robot, stated: set[str]) -> Iterator[tuple[str, str]]:
@@ -524,27 +526,27 @@ def _lines_of_ratings(robot: Robot, nothing: Robot, stated: set[str]) -> Iterato
     Args:
         stated: tables that already have an entry.
     """
-    whole = robot.rig.inherits
+    inherits = robot.rig.inherits
 
     def value(owner: Robot, name: str) -> Any:
         part, _, key = name.partition(".")
         return getattr(getattr(owner, part), key, None)
 
-    for name, (_, _, unit, what) in RATINGS.items():
+    for name, (_, _, unit, meaning) in RATINGS.items():
         part, _, key = name.partition(".")
         rating = value(robot, name)
         beside = key == "capacity_curve" and part in stated  # else it would follow from the capacity
-        if rating is not None and (whole or beside or rating != value(nothing, name)):
+        if rating is not None and (inherits or beside or rating != value(nothing, name)):
             stated = stated | {part}
-            yield part, f"{key} = {rating!r}  # [{unit}] {what if whole else what.partition(';')[0]}"
-    for name, what in SWITCHES.items():
+            yield part, f"{key} = {rating!r}  # [{unit}] {meaning if inherits else meaning.partition(';')[0]}"
+    for name, meaning in SWITCHES.items():
         part, _, key = name.partition(".")
-        if whole or value(robot, name) != value(nothing, name):
-            yield part, f"{key} = {str(value(robot, name)).lower()}  # {what}"
-    for name, (_, what) in CHOICES.items():
+        if inherits or value(robot, name) != value(nothing, name):
+            yield part, f"{key} = {str(value(robot, name)).lower()}  # {meaning}"
+    for name, (_, meaning) in CHOICES.items():
         part, _, key = name.partition(".")
         if value(robot, name) != value(nothing, name):
-            yield part, f"{key} = {toml_value(value(robot, name))}  # {what}"
+            yield part, f"{key} = {toml_value(value(robot, name))}  # {meaning}"
 
 
 def _base_robot(robot: Robot) -> Robot:

@@ -89,17 +89,17 @@ def drop_repeated_readings(
     if not true_periods or min(true_periods) < ALIKE * max(true_periods) or of_period < 0.5 * len(values):
         return values, 0.0
     rows_apart = float(np.median(true_periods))
-    kept = np.full(len(values), np.nan)
+    first_readings = np.full(len(values), np.nan)
     for rows in recordings:
-        shown = rows[np.isfinite(values[rows])]
-        begins = np.flatnonzero(np.concatenate([[True], np.diff(values[shown]) != 0]))[: len(shown)]
-        lengths = np.diff(np.append(begins, len(shown)))
+        finite_rows = rows[np.isfinite(values[rows])]
+        begins = np.flatnonzero(np.concatenate([[True], np.diff(values[finite_rows]) != 0]))[: len(finite_rows)]
+        lengths = np.diff(np.append(begins, len(finite_rows)))
         times = np.maximum(np.floor(lengths / rows_apart + 0.5), 1).astype(int)  # a reading may be the same again
         first = np.repeat(begins, times)
         again = np.arange(len(first)) - np.repeat(np.cumsum(times) - times, times)
-        nearest = shown[np.minimum(first + np.round(again * rows_apart).astype(int), len(shown) - 1)]
-        kept[nearest] = values[nearest]
-    return kept, rows_apart
+        nearest = finite_rows[np.minimum(first + np.round(again * rows_apart).astype(int), len(finite_rows) - 1)]
+        first_readings[nearest] = values[nearest]
+    return first_readings, rows_apart
 
 
 #: Excess of a reading beyond zero by its noise, in stated sds, and as a share of the channel's rms.
@@ -116,8 +116,8 @@ def complete_columns(name: str, columns: Columns, rows: int, layout: Layout) -> 
     """Adds columns that a table may omit, and rejects values that contradict each other."""
     _add_default_columns(name, columns, rows, layout)
     _check_driving(name, columns)
-    held = columns.get("held", np.zeros(1)) > 0.5
-    for row in np.flatnonzero(held & (columns.get(LOAD, 0.0) != 0))[:1]:
+    is_clamped = columns.get("held", np.zeros(1)) > 0.5
+    for row in np.flatnonzero(is_clamped & (columns.get(LOAD, 0.0) != 0))[:1]:
         raise BadData(
             f"{name} row {row + 1}, {LOAD}: got {columns[LOAD][row]:g} although held is 1; expected 0, since the "
             "torque at a clamp is a reading: rename its column to output_torque"
@@ -129,10 +129,10 @@ def complete_columns(name: str, columns: Columns, rows: int, layout: Layout) -> 
             raise BadData(too_light_message(f"{name} row {row + 1}", total[row], payload[row]))
     for channel in layout.channels:
         if channel.column in columns and channel.sd_column in columns:
-            lost = np.isfinite(columns[channel.column]) & ~np.isfinite(columns[channel.sd_column])
-            if lost.any():
+            lacks_sd = np.isfinite(columns[channel.column]) & ~np.isfinite(columns[channel.sd_column])
+            if lacks_sd.any():
                 raise BadData(
-                    f"{name} row {int(np.flatnonzero(lost)[0]) + 1}, {channel.sd_column}: got an empty cell next "
+                    f"{name} row {int(np.flatnonzero(lacks_sd)[0]) + 1}, {channel.sd_column}: got an empty cell next "
                     f"to a reading; expected its sd, more than 0 {channel.unit}"
                 )
 
@@ -140,20 +140,20 @@ def complete_columns(name: str, columns: Columns, rows: int, layout: Layout) -> 
 def distinct_rows(name: str, columns: Columns) -> tuple[np.ndarray, Names]:
     """False for each row of a log that repeats the row before it, shape (rows,), and a sentence on such rows."""
     rows = len(next(iter(columns.values()), []))
-    kept = np.full(rows, True)
+    is_distinct = np.full(rows, True)
     if not set(TIME) <= set(columns):
-        return kept, ()
+        return is_distinct, ()
     again = np.flatnonzero(np.diff(columns["time_s"]) == 0) + 1
     for values in columns.values():
         if not again.size:
-            return kept, ()
+            return is_distinct, ()
         now, before = values[again], values[again - 1]
         same = now == before
         if values.dtype.kind == "f":
             same |= np.isnan(now) & np.isnan(before)
         again = again[same]
-    kept[again] = False
-    which = (
+    is_distinct[again] = False
+    row_words = (
         f"row {again[0] + 1} is"
         if again.size == 1
         else f"{again.size} rows, the first row {again[0] + 1}, are"
@@ -161,10 +161,10 @@ def distinct_rows(name: str, columns: Columns) -> tuple[np.ndarray, Names]:
         else ""
     )
     note = (
-        f"{name}: {which} a repetition of the row before, with the same time. Repetitions are left out and not "
+        f"{name}: {row_words} a repetition of the row before, with the same time. Repetitions are left out and not "
         "counted in row numbers"
     )
-    return kept, (note,) if again.size else ()
+    return is_distinct, (note,) if again.size else ()
 
 
 def _add_default_columns(name: str, columns: Columns, rows: int, layout: Layout) -> None:
@@ -204,44 +204,18 @@ def _check_driving(name: str, columns: Columns) -> None:
 
 
 def _check_sides(name: str, columns: Columns, layout: Layout) -> None:
-    stated = [c for c in layout.sides if c in columns]
-    if len(stated) == 1:
-        (other,) = set(layout.sides) - set(stated)
+    side_columns = [c for c in layout.sides if c in columns]
+    if len(side_columns) == 1:
+        (other,) = set(layout.sides) - set(side_columns)
         raise BadData(
-            f"{name}: column {other} is missing although {stated[0]} is present; give the command of both sides"
+            f"{name}: column {other} is missing although {side_columns[0]} is present; give the command of both sides"
         )
-    if stated and set(columns) & {"duty", "mode"}:
+    if side_columns and set(columns) & {"duty", "mode"}:
         beside = min(set(columns) & {"duty", "mode"})
         raise BadData(
-            f"{name}: column {beside} in addition to {stated[0]}, which already gives the command of both sides; "
-            "keep one"
+            f"{name}: column {beside} in addition to {side_columns[0]}, which already gives the command of both "
+            "sides; keep one"
         )
-
-
-def drop_clamped_rows(name: str, columns: Columns, kept: np.ndarray) -> tuple[Columns, np.ndarray, Names]:
-    """A log without the rows in which a clamp holds the output, a mask of the other rows, and a note on the dropped
-    ones.
-
-    Each segment between clamped rows becomes a run, because the motors start again. Runs of settled rows are
-    unchanged.
-    """
-    note: Names = ()
-    if "held" in columns and set(TIME) <= set(columns) and (held := columns.pop("held") > 0.5).any():
-        if held.all():
-            raise BadData(
-                f"{name}: held is 1 in every row, and the rows are too close in time to be settled; log one row "
-                "for each settled state, or also rows in which the output is not clamped"
-            )
-        runs = columns.get("run_id", np.zeros(len(held), str))
-        stretch = np.cumsum(np.append(0, np.diff(held.astype(int)) < 0)).astype(str)
-        columns["run_id"] = np.char.add(runs, np.char.add(np.where(runs == "", "stretch ", ", stretch "), stretch))
-        kept &= ~held
-        left_out = f"{name}: a clamp holds the output in {held.sum()} of {len(held)} rows of a log; they are left out"
-        note = (
-            f"{left_out}, and each segment between them becomes a run. To use them as settled rows, put them "
-            "in a separate file",
-        )
-    return {c: values[kept] for c, values in columns.items()}, kept, note
 
 
 def too_light_message(where: str, total: float, payload: float) -> str:
@@ -255,9 +229,9 @@ def drop_time_of_settled_rows(name: str, columns: Columns, layout: Layout, robot
     Rows are then at least `CONSTANTS_APART` time constants apart: of the windings if a clamp holds the output in
     every row, otherwise of the motors, and then `_are_separate_settings` must hold.
     """
-    kept, time = dict(columns), columns.get("time_s")
+    columns_left, time = dict(columns), columns.get("time_s")
     if time is None or len(time) < 3 or {"mode", *layout.sides} & set(columns):
-        return kept, ()
+        return columns_left, ()
     step = np.diff(time)
     apart, clamped = float(step[step > 0].min(initial=math.inf)), _is_clamped(columns, layout)
     windings = float(robot.motor.inductance / robot.motor.resistance) if robot.knows(VOLTAGE) else 0.0
@@ -265,13 +239,13 @@ def drop_time_of_settled_rows(name: str, columns: Columns, layout: Layout, robot
     if not math.inf > apart >= CONSTANTS_APART * constant or not (
         clamped or _are_separate_settings(columns, layout, apart)
     ):
-        return kept, ()
+        return columns_left, ()
     for column in (*TIME, "run_id"):
-        kept.pop(column, None)
+        columns_left.pop(column, None)
     note = f"rows are {three_digits(apart)} s or more apart, mostly at different settings"
     settle = f", and the motors settle in about {three_digits(CONSTANTS_APART * constant)} s" if constant > 0 else ""
     why = "the output is held in every row" if clamped else f"{note}{settle}"
-    return kept, (f"{name}: {why}, so each row is read as a settled run and its time is ignored",)
+    return columns_left, (f"{name}: {why}, so each row is read as a settled run and its time is ignored",)
 
 
 def _is_clamped(columns: Columns, layout: Layout) -> bool:
@@ -314,8 +288,8 @@ def _unexplained_squares(readings: np.ndarray, settings: Sequence[np.ndarray]) -
 
 def inertia_at_motor(robot: Robot, load: Load) -> float:
     """Inertia of a motor and of its share of a load that rolls without slip, at the motor shaft [kg·m²]."""
-    moved = float(load.mass) * float(load.radius) ** 2 / float(robot.sides)
-    return float(robot.motor.inertia) + (float(load.inertia) + moved) / float(robot.gearbox.ratio) ** 2
+    load_inertia = float(load.mass) * float(load.radius) ** 2 / float(robot.sides)
+    return float(robot.motor.inertia) + (float(load.inertia) + load_inertia) / float(robot.gearbox.ratio) ** 2
 
 
 def time_constant(robot: Robot) -> float:
@@ -372,8 +346,8 @@ def _driven_mask(name: str, columns: Columns, layout: Layout) -> tuple[np.ndarra
     idle = np.flatnonzero(size == 0)
     if not idle.size:
         return size != 0, ""
-    stated = (column, *sides, *(["duty"] if "duty" in columns else []))
-    zero = " and ".join(c for c in stated if not columns[c][idle].any())
+    drive_columns = (column, *sides, *(["duty"] if "duty" in columns else []))
+    zero = " and ".join(c for c in drive_columns if not columns[c][idle].any())
     for channel in (c for c in layout.channels if c.zero_at_rest and c.column in columns):
         readings = np.nan_to_num(columns[channel.column])
         moving = idle[np.abs(readings[idle]) > STILL * np.max(np.abs(readings))]
@@ -391,9 +365,9 @@ def _driven_mask(name: str, columns: Columns, layout: Layout) -> tuple[np.ndarra
             f"{name}: {zero} is 0 in every row, so nothing drives the motors; expected rows with a "
             f"command{clamp * (layout.imposed == 'motor_speed' and not layout.has_ground)}"
         )
-    which = f"row {idle[0] + 1} is" if idle.size == 1 else f"{idle.size} rows, the first row {idle[0] + 1}, are"
+    row_words = f"row {idle[0] + 1} is" if idle.size == 1 else f"{idle.size} rows, the first row {idle[0] + 1}, are"
     return size != 0, (
-        f"{name}: {which} left out, since nothing drives the motors ({zero or column} is 0); row numbers do not "
+        f"{name}: {row_words} left out, since nothing drives the motors ({zero or column} is 0); row numbers do not "
         "count them"
     )
 
@@ -498,10 +472,10 @@ def missing_data_notes(name: str, columns: Columns, layout: Layout) -> Iterator[
         if several.any():
             run = runs[np.argmax(several)]
             rows = (np.flatnonzero(columns["run_id"] == run) + 1).tolist()
-            which = f"{', '.join(map(str, rows[:5]))}{' and more' if len(rows) > 5 else ''}"
+            row_words = f"{', '.join(map(str, rows[:5]))}{' and more' if len(rows) > 5 else ''}"
             others = f", and so {several.sum() - 1} more" if several.sum() > 1 else ""
             yield (
-                f"{name}: run_id {run} is in rows {which}{others}; without {', '.join(TIME)} every row is a "
+                f"{name}: run_id {run} is in rows {row_words}{others}; without {', '.join(TIME)} every row is a "
                 "separate run"
             )
 

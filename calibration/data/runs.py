@@ -90,13 +90,13 @@ def read_runs(
     else:
         if isinstance(source, str) and not source:
             raise BadData(f"the source: got an empty path; expected {EXPECTED}")
-        named = isinstance(source, str | Path) and not opening.files_of_group(str(source))
-        if named and not opening.split_source(str(source))[0].exists():
+        is_plain_file = isinstance(source, str | Path) and not opening.files_of_group(str(source))
+        if is_plain_file and not opening.split_source(str(source))[0].exists():
             raise BadData(f"{source}: no such file and no packaged table; packaged: {', '.join(PACKAGED)}")
         reading_found = reading.read_columns(source, layout, preset, between)
         arrays, mapped = reading_found.arrays, reading_found.mapped
-    known = preset is not None or any(layout.meanings(arrays.name, list(dict.fromkeys(arrays.header))))
-    if not known and (name := presets_file.recognise_preset(arrays.header)):
+    has_known_columns = preset is not None or any(layout.meanings(arrays.name, list(dict.fromkeys(arrays.header))))
+    if not has_known_columns and (name := presets_file.recognise_preset(arrays.header)):
         numbers_asked = "".join(f",{key}=..." for key in presets_file.numbers_to_state(name))
         raise BadData(
             f"{arrays.name}: has no column with a known name, but its columns match the preset {name}; add --columns "
@@ -153,25 +153,25 @@ def runs_of_arrays(
     if measured and robot is not None:
         columns, settled = row_checks.drop_time_of_settled_rows(name, columns, layout, robot)
     notes = (*arrays.notes, *settled, *sides.of_volts(name, columns, battery))
-    kept, copied = row_checks.distinct_rows(name, columns)
-    columns, kept, clamped = row_checks.drop_clamped_rows(name, columns, kept)
+    is_kept, copied = row_checks.distinct_rows(name, columns)
+    columns = {c: values[is_kept] for c, values in columns.items() if c != "held" or values.any()}
     if measured:
-        notes = (*notes, *copied, *clamped, *_drop_repeats(name, columns, layout))
-    stated = instruments.infer_instruments(layout.instruments, columns)
+        notes = (*notes, *copied, *_drop_repeats(name, columns, layout))
+    table_instruments = instruments.infer_instruments(layout.instruments, columns)
     unsigned = sides.unsigned_current_channels(columns, layout) if measured else ()
-    unsigned = tuple(i for i in unsigned if i.channel not in {known.channel for known in stated})
-    layout = dataclasses.replace(layout, instruments=(*stated, *unsigned))
-    row_checks.complete_columns(name, columns, int(kept.sum()), layout)
+    unsigned = tuple(i for i in unsigned if i.channel not in {known.channel for known in table_instruments})
+    layout = dataclasses.replace(layout, instruments=(*table_instruments, *unsigned))
+    row_checks.complete_columns(name, columns, int(is_kept.sum()), layout)
     if battery and layout.imposed == "voltage":
-        columns[SUPPLY] = np.full(int(kept.sum()), np.nan)
+        columns[SUPPLY] = np.full(int(is_kept.sum()), np.nan)
     elif measured and not set(TIME) <= set(columns):  # a history may stop, and go on forwards against its motors
         columns, driven, left_out = row_checks.driven_rows(name, columns, layout)
-        kept[kept] = driven
+        is_kept[is_kept] = driven
         notes = (*notes, *left_out)
     if not any(column in columns for column in WHEN):
-        columns["order"] = np.arange(1.0, kept.sum() + 1)
+        columns["order"] = np.arange(1.0, is_kept.sum() + 1)
     extras = {
-        c: _values_without_role(raw)[kept]
+        c: _values_without_role(raw)[is_kept]
         for c, m, raw in zip(header, meanings, arrays.values, strict=True)
         if m is None
     }
@@ -236,11 +236,11 @@ def _join_cell_messages(name: str, said: Sequence[str], count: int) -> str:
     first, *others = said
     if not others:
         return first
-    more, seen = list[str](), {first.partition(";")[2]}
+    more, repeats = list[str](), {first.partition(";")[2]}
     for sentence in others[: LISTED - 1]:
-        what, _, cure = sentence.removeprefix(f"{name} ").partition(";")
-        more.append(what if cure in seen else f"{what};{cure}")
-        seen.add(cure)
+        cell_message, _, cure = sentence.removeprefix(f"{name} ").partition(";")
+        more.append(cell_message if cure in repeats else f"{cell_message};{cure}")
+        repeats.add(cure)
     rest = f"; and {count - LISTED} more" if count > LISTED else ""
     return f"{first}; also {'; '.join(more)}{rest}"
 
@@ -276,8 +276,8 @@ def _values_without_role(raw: Raw) -> np.ndarray:
     if isinstance(raw, np.ndarray):
         return raw
     numbers = column_numbers(raw)
-    lost = np.flatnonzero(np.isnan(numbers))
-    return numbers if missing_readings(raw, lost).all() else np.array(raw)
+    missing_rows = np.flatnonzero(np.isnan(numbers))
+    return numbers if missing_readings(raw, missing_rows).all() else np.array(raw)
 
 
 def _reject_condition_without_effect(arrays: NamedArrays, meaning: Column, raw: Raw, layout: Layout) -> None:
@@ -299,10 +299,10 @@ def _reject_condition_without_effect(arrays: NamedArrays, meaning: Column, raw: 
 def _reject_supply_voltages(arrays: NamedArrays, voltages: Raw) -> None:
     """Rejects supply voltages of runs that are on a battery."""
     if isinstance(voltages, np.ndarray):
-        stated = np.flatnonzero(~np.isnan(voltages.astype(float)))[:1].tolist()
+        filled_rows = np.flatnonzero(~np.isnan(voltages.astype(float)))[:1].tolist()
     else:
-        stated = [row for row, cell in enumerate(voltages) if cell][:1]
-    for row in stated:
+        filled_rows = [row for row, cell in enumerate(voltages) if cell][:1]
+    for row in filled_rows:
         raise BadData(
             f"{arrays.row(row)}, supply_voltage_V: got {column_texts(voltages[row : row + 1])[0]} together with "
             "--battery, whose charge sets the voltage; leave the cell empty or remove the column"

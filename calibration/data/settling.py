@@ -174,7 +174,7 @@ class Settled:
 
     def table(self) -> Columns:
         """The settled runs, a column each as tables of runs have them."""
-        kept = self.kept
+        stretches = self.kept
         columns: Columns = {}
         means = dict(self.runs.columns) | {k: v for k, v in self.runs.extras.items() if v.dtype.kind == "f"}
         read = {c.column for s in self.signals for c in (s.channel,)} | {"time_s", "order", "run_id"}
@@ -183,17 +183,17 @@ class Settled:
             if name in read or name == "mode" or (name == SPEED and self.runs.turns):
                 continue
             if column.dtype.kind == "f":
-                columns[name] = np.array([_digits(_plain(column[s.rows])) for s in kept])
+                columns[name] = np.array([_digits(_plain(column[s.rows])) for s in stretches])
             else:
-                columns[name] = np.array([str(column[s.rows[0]]) for s in kept])
+                columns[name] = np.array([str(column[s.rows[0]]) for s in stretches])
         for signal in self.signals:
             name = signal.channel.name
-            if not any(math.isfinite(s.mean[name]) for s in kept):
+            if not any(math.isfinite(s.mean[name]) for s in stretches):
                 continue
-            columns[signal.channel.column] = np.array([_digits(s.mean[name]) for s in kept])
-            columns[signal.channel.sd_column] = np.array([_digits(s.sd[name], 3) for s in kept])
-        columns["run_id"] = np.array([f"{s.run or 'log'} {s.begin:.6g}-{s.end:.6g} s" for s in kept])
-        columns["order"] = np.arange(1.0, len(kept) + 1)
+            columns[signal.channel.column] = np.array([_digits(s.mean[name]) for s in stretches])
+            columns[signal.channel.sd_column] = np.array([_digits(s.sd[name], 3) for s in stretches])
+        columns["run_id"] = np.array([f"{s.run or 'log'} {s.begin:.6g}-{s.end:.6g} s" for s in stretches])
+        columns["order"] = np.arange(1.0, len(stretches) + 1)
         return columns
 
 
@@ -266,15 +266,15 @@ def _divide_log(runs: Runs, shortest: float | None, drift: float, inertia: Mappi
         raise BadData(
             f"{runs.source}: column time_s is missing, so each row is already a settled run; use it with loop"
         )
-    each = _in_order(runs)
-    step = float(np.median(np.concatenate([np.diff(runs["time_s"][rows]) for rows in each])))
+    rows_by_run = _in_order(runs)
+    step = float(np.median(np.concatenate([np.diff(runs["time_s"][rows]) for rows in rows_by_run])))
     shortest = max(LEAST, 20 * step) if shortest is None else shortest
     half = max(1, round(shortest / 6 / step))
     drives = applied_drive(runs)
     gaps: list[int] = []
     levels: list[np.ndarray] = []
     divided_by = (*(runs.of_sides if runs.turns else (drives,)), *([runs[LOAD]] if runs.has(LOAD) else []))
-    for rows in each:
+    for rows in rows_by_run:
         far = np.flatnonzero(np.diff(runs["time_s"][rows]) > GAP * step)
         gaps += [int(rows[k]) for k in far]
         for part in np.split(rows, far + 1):
@@ -282,10 +282,10 @@ def _divide_log(runs: Runs, shortest: float | None, drift: float, inertia: Mappi
             for driver in divided_by:
                 found_in = [x for level in found_in for x in _levels_of(runs, driver, level, shortest, drift, step)]
             levels += found_in
-    signals = _settled_signals_of_log(runs, each, levels, half, drift)
+    signals = _settled_signals_of_log(runs, rows_by_run, levels, half, drift)
     for signal in signals:
         _check_alive(runs, signal)
-    stuck = {s.channel.name: _stuck_rows(s, each) for s in signals}
+    stuck = {s.channel.name: _stuck_rows(s, rows_by_run) for s in signals}
     stretches = [
         _settled_end(runs, signals, drives, level, shortest, drift, step, stuck, inertia or {}) for level in levels
     ]
@@ -305,8 +305,8 @@ def settled_channels(robot: Robot) -> tuple[Channel, ...]:
 def _in_order(runs: Runs) -> list[np.ndarray]:
     """Rows of each run, whose time increases from row to row."""
     run, time = runs.run_names, runs["time_s"]
-    each = [np.flatnonzero(run == name) for name in dict.fromkeys(run.tolist())]
-    for rows in each:
+    rows_by_run = [np.flatnonzero(run == name) for name in dict.fromkeys(run.tolist())]
+    for rows in rows_by_run:
         steps = np.diff(time[rows])
         if (steps <= 0).any():
             k = int(np.argmax(steps <= 0))
@@ -321,12 +321,12 @@ def _in_order(runs: Runs) -> list[np.ndarray]:
                 "s; give each "
                 "recording its own run_id, or sort the rows"
             )
-    if max(map(len, each)) < FEWEST:
+    if max(map(len, rows_by_run)) < FEWEST:
         raise BadData(
-            f"{runs.source}: {count_noun(max(map(len, each)), 'sample')} in its longest run; at least {FEWEST} are "
-            "needed"
+            f"{runs.source}: {count_noun(max(map(len, rows_by_run)), 'sample')} in its longest run; at least "
+            f"{FEWEST} are needed"
         )
-    return each
+    return rows_by_run
 
 
 def _settled_signals_of_log(
@@ -345,14 +345,16 @@ def _settled_signals_of_log(
     have = {s.channel.name for s in signals}
     for angle, rate, factor in RATES:
         if angle in runs.layout.measured_columns and runs.has(angle) and rate not in have:
-            whole = np.full(len(runs), np.nan)
+            smoothed_values = np.full(len(runs), np.nan)
             readings = np.full(len(runs), np.nan)
             read = next(c for c in runs.channels if c.column == angle)
             off = find_glitches(runs[angle], levels, width, _step_of_instrument(runs, read, runs[angle]), None)
             for rows in each:
-                whole[rows] = np.where(off[rows], np.nan, runs[angle][rows] * factor)
-                readings[rows] = _recent_rate(runs["time_s"][rows], whole[rows], half)
-            signals.append(Signal(channels.find_channel(rate), readings, whole, 0.0, _reading_size(readings), off))
+                smoothed_values[rows] = np.where(off[rows], np.nan, runs[angle][rows] * factor)
+                readings[rows] = _recent_rate(runs["time_s"][rows], smoothed_values[rows], half)
+            signals.append(
+                Signal(channels.find_channel(rate), readings, smoothed_values, 0.0, _reading_size(readings), off)
+            )
     if not signals:
         raise BadData(f"{runs.source}: no channel has readings that can be used for settled runs")
     return tuple(signals)
@@ -412,8 +414,8 @@ def _step_of_instrument(runs: Runs, channel: Channel, shown: np.ndarray) -> floa
 
     If neither has one, it is the smallest difference of readings that mostly repeat.
     """
-    stated = (i.quantum or 0.0 for i in runs.layout.instruments if i.channel == channel.name)
-    if step := common_step(shown) or next(stated, 0.0) / channel.factor:
+    quanta = (i.quantum or 0.0 for i in runs.layout.instruments if i.channel == channel.name)
+    if step := common_step(shown) or next(quanta, 0.0) / channel.factor:
         return step
     levels = np.unique(shown[np.isfinite(shown)])
     coarse = 1 < len(levels) < COARSE * np.isfinite(shown).sum()
@@ -442,9 +444,9 @@ def _check_alive(runs: Runs, signal: Signal) -> None:
 
 def _stuck_rows(signal: Signal, each: list[np.ndarray]) -> np.ndarray:
     """Rows in which a channel repeats one number for longer than its noise allows: saturated, or frozen."""
-    held = np.zeros(len(signal.shown), bool)
+    is_stuck = np.zeros(len(signal.shown), bool)
     if len(signal.angle):
-        return held
+        return is_stuck
     for rows in each:
         readings = signal.shown[rows]
         same = np.diff(readings) == 0
@@ -456,8 +458,8 @@ def _stuck_rows(signal: Signal, each: list[np.ndarray]) -> np.ndarray:
         edges = np.flatnonzero(np.diff(np.concatenate([[0], same.astype(int), [0]])))
         for low, high in edges.reshape(-1, 2):
             if high - low >= STUCK and readings[low] != 0:
-                held[rows[low : high + 1]] = True
-    return held
+                is_stuck[rows[low : high + 1]] = True
+    return is_stuck
 
 
 # --- levels and stretches -------------------------------------------------------------------------------
@@ -536,10 +538,10 @@ def _settled_end(
     """The settled end of a level, or the reason why it has none."""
     time = runs["time_s"]
     begin, end, imposed = float(time[rows[0]]), float(time[rows[-1]]), float(np.mean(drives[rows]))
-    left = Stretch(str(runs.run_names[rows[0]]), rows, begin, end, imposed)
+    unsettled_stretch = Stretch(str(runs.run_names[rows[0]]), rows, begin, end, imposed)
 
     def out(why: str, channel: str = "", size: float = 0.0) -> Stretch:
-        return dataclasses.replace(left, why=why, channel=channel, size=size)
+        return dataclasses.replace(unsettled_stretch, why=why, channel=channel, size=size)
 
     if runs.has("mode") and str(runs["mode"][rows[0]]) != "voltage":
         return out("undriven")
@@ -554,29 +556,34 @@ def _settled_end(
     unsettled, left_over = _unsettled(signals, rows, stretch, drift)
     if unsettled is not None:
         return out(*unsettled)
-    seen = {name: x for name, x in stretch.seen.items() if math.isfinite(x[0])}
-    if not seen:
+    finite_means = {name: x for name, x in stretch.seen.items() if math.isfinite(x[0])}
+    if not finite_means:
         return out("unread")
     moving = [
-        s for s in signals if s.channel.zero_at_rest and s.channel.name in seen and s.channel.name not in OF_YAW
+        s
+        for s in signals
+        if s.channel.zero_at_rest and s.channel.name in finite_means and s.channel.name not in OF_YAW
     ]
-    ends = [(s, *seen[s.channel.name][:2]) for s in moving]
+    ends = [(s, *finite_means[s.channel.name][:2]) for s in moving]
     if bool(ends) and all(abs(mean) < max(STILL * s.largest, SDS * sd) for s, mean, sd in ends):
         return out("rest")
     acting = inertia.get(str(runs["configuration"][rows[0]]))
     lasts = float(time[stretch.rows[-1]] - time[stretch.rows[0]])
-    if acting is not None and (accelerates := _acceleration_reason(acting, seen, lasts, imposed, drift)) is not None:
+    if (
+        acting is not None
+        and (accelerates := _acceleration_reason(acting, finite_means, lasts, imposed, drift)) is not None
+    ):
         return out(*accelerates)
-    every = {s.channel.name: seen.get(s.channel.name, (math.nan,) * 3) for s in signals}
+    values_by_channel = {s.channel.name: finite_means.get(s.channel.name, (math.nan,) * 3) for s in signals}
     # A change continues after the end, a lag's tail by about as much again, and all channels with it.
-    further = {s.channel.name: left_over * _scale_of(s, every[s.channel.name][0]) for s in signals}
+    further = {s.channel.name: left_over * _scale_of(s, values_by_channel[s.channel.name][0]) for s in signals}
     return dataclasses.replace(
-        left,
+        unsettled_stretch,
         rows=stretch.rows,
         begin=float(time[stretch.rows[0]]),
-        mean={name: mean for name, (mean, _, _) in every.items()},
-        sd={name: math.hypot(sd, further[name]) for name, (_, sd, _) in every.items()},
-        drift={name: change for name, (_, _, change) in every.items()},
+        mean={name: mean for name, (mean, _, _) in values_by_channel.items()},
+        sd={name: math.hypot(sd, further[name]) for name, (_, sd, _) in values_by_channel.items()},
+        drift={name: change for name, (_, _, change) in values_by_channel.items()},
         glitches={name: count for name, count in stretch.glitches.items() if count},
     )
 
@@ -589,14 +596,17 @@ def _best_end(signals: tuple[Signal, ...], time: np.ndarray, rows: np.ndarray, s
     last = max(len(parts) - 3, first)
     ends: list[tuple[float, _End]] = []
     for k in sorted({first, *np.linspace(first, last, TRIES).astype(int).tolist()}):
-        taken = rows[parts[k][0] :]
-        seen = {s.channel.name: _segment_mean(s, time[taken], taken) for s in signals}
-        left_over = max(_certain_change(s, *seen[s.channel.name]) for s in signals)
+        end_rows = rows[parts[k][0] :]
+        end_means = {s.channel.name: _segment_mean(s, time[end_rows], end_rows) for s in signals}
+        left_over = max(_certain_change(s, *end_means[s.channel.name]) for s in signals)
         sds = [
-            sd / _scale_of(s, mean) for s in signals for mean, sd, _ in (seen[s.channel.name],) if math.isfinite(mean)
+            sd / _scale_of(s, mean)
+            for s in signals
+            for mean, sd, _ in (end_means[s.channel.name],)
+            if math.isfinite(mean)
         ]
-        glitches = {s.channel.name: int(s.glitches[taken].sum()) for s in signals}
-        ends.append((math.hypot(max(sds, default=0.0), left_over), _End(taken, seen, left_over, glitches)))
+        glitches = {s.channel.name: int(s.glitches[end_rows].sum()) for s in signals}
+        ends.append((math.hypot(max(sds, default=0.0), left_over), _End(end_rows, end_means, left_over, glitches)))
         if left_over <= SLIGHT * drift:
             break
     return min(ends, key=lambda end: end[0])[1]
@@ -633,8 +643,8 @@ def _acceleration_reason(
         return None
     a_second = acting.per_rate / lasts
     _, sd, change = seen[acting.speed]
-    whole = max(abs(seen[acting.current][0] if acting.current else imposed), acting.least)
-    share, noise = abs(a_second * change) / whole, OF_CHANGE * abs(a_second * sd) / whole
+    full_scale = max(abs(seen[acting.current][0] if acting.current else imposed), acting.least)
+    share, noise = abs(a_second * change) / full_scale, OF_CHANGE * abs(a_second * sd) / full_scale
     return ("accelerates", acting.speed, share) if share > drift + SDS * noise else None
 
 
@@ -663,12 +673,12 @@ def _to_come(signal: Signal, rows: np.ndarray, mean: float) -> float:
     first, before, last = np.diff([float(np.mean(q)) for q in quarters]).tolist()
     place = np.arange(len(quarters[3]))  # the last quarter alone: in those before, a lag's decay is no noise
     rest = quarters[3] - np.polyval(np.polyfit(place, quarters[3], 1), place)
-    seen = SDS * math.sqrt(2 * _correlation_time(rest) / len(rest)) * float(np.std(rest))
-    earlier, later = (before, last) if abs(last) >= seen else (first, before)
-    if abs(later) < seen or earlier * later <= 0:
+    standard_error = SDS * math.sqrt(2 * _correlation_time(rest) / len(rest)) * float(np.std(rest))
+    earlier, later = (before, last) if abs(last) >= standard_error else (first, before)
+    if abs(later) < standard_error or earlier * later <= 0:
         return 0.0
     fades = min(later / earlier, 0.9)
-    last = abs(last) if abs(last) >= seen else min(abs(later) * fades, seen)
+    last = abs(last) if abs(last) >= standard_error else min(abs(later) * fades, standard_error)
     return last * fades / (1 - fades) / _scale_of(signal, mean)
 
 
@@ -683,13 +693,13 @@ def _level_parts(time: np.ndarray, shortest: float) -> list[tuple[int, int]]:
     size = max(shortest / 3, float(time[-1] - time[0]) / 300)
     part = ((time[-1] - time) / size).astype(int)  # counted from the end, so that the last parts are whole
     edges = [0, *(np.flatnonzero(np.diff(part)) + 1).tolist(), len(time)]
-    whole: list[tuple[int, int]] = []
+    level_parts: list[tuple[int, int]] = []
     for low, high in reversed(list(pairwise(edges))):
-        if whole and whole[-1][1] - whole[-1][0] < PART:
-            whole[-1] = (low, whole[-1][1])
+        if level_parts and level_parts[-1][1] - level_parts[-1][0] < PART:
+            level_parts[-1] = (low, level_parts[-1][1])
         else:
-            whole.append((low, high))
-    return whole[::-1]
+            level_parts.append((low, high))
+    return level_parts[::-1]
 
 
 def _first_steady(signals: tuple[Signal, ...], rows: np.ndarray, parts: list[tuple[int, int]], drift: float) -> int:
@@ -776,14 +786,14 @@ def _scatter_of(runs: Runs, found: list[Stretch], signals: tuple[Signal, ...], l
     repeats."""
     alike = [c for c in EXACT if runs.has(c)]
     groups: list[list[Stretch]] = []
-    where: tuple[object, ...] = ()
+    previous_key: tuple[object, ...] = ()
     for s in sorted((s for s in found if not s.why), key=lambda s: (_brake_levels(runs, s), s.imposed)):
-        here = (_brake_levels(runs, s), *(runs[c][s.rows[0]] for c in alike))
-        if groups and here == where and abs(s.imposed - groups[-1][0].imposed) <= 0.2 * FINE * largest:
+        row_key = (_brake_levels(runs, s), *(runs[c][s.rows[0]] for c in alike))
+        if groups and row_key == previous_key and abs(s.imposed - groups[-1][0].imposed) <= 0.2 * FINE * largest:
             groups[-1].append(s)
         else:
             groups.append([s])
-        where = here
+        previous_key = row_key
     scatter = {}
     for signal in signals:
         name = signal.channel.name
@@ -839,17 +849,17 @@ def _check_signs(found: Settled) -> None:
         clear = [s for s in found.kept if abs(s.mean[channel.name]) > least[id(s)]]
         back, ahead = ([s for s in clear if way * s.imposed > 0] for way in (-1, 1))
         wrong = [s for s in ahead if s.mean[channel.name] < 0]
-        turned = bool(wrong) and len(wrong) == len(ahead)
-        if back and all(s.mean[channel.name] > 0 for s in back) and not turned:
+        is_reversed = bool(wrong) and len(wrong) == len(ahead)
+        if back and all(s.mean[channel.name] > 0 for s in back) and not is_reversed:
             raise BadData(
                 f"{_place_text(found, back[0], channel)}; expected readings with their signs, negative backward; or "
                 f"set [instruments.{channel.name}] signed = false in the rig's file, if it shows only the "
                 "magnitude"
             )
-        if (turned or (wrong and channel.zero_at_rest)) and not runs.pulled:
+        if (is_reversed or (wrong and channel.zero_at_rest)) and not runs.pulled:
             cure = (
                 f"state [columns] {channel.column} = {{column = ..., factor = -1}} in the rig's file"
-                if turned
+                if is_reversed
                 else f"give {'duty' if runs.has('duty') else layout.imposed_column} the sign of its direction"
             )
             raise BadData(
@@ -903,18 +913,18 @@ def _nothing_settled_message(found: Settled, loop: str) -> str:
     rows = f"rows {longest.rows[0] + 1} to {longest.rows[-1] + 1}"
     if why in ("changes", "short"):
         step = longest.lasts / max(len(longest.rows) - 1, 1)
-        held, asked = f"{longest.lasts:.3g} s", f"{found.shortest:.3g} s"
+        longest_text, least_text = f"{longest.lasts:.3g} s", f"{found.shortest:.3g} s"
         cure = "hold each level longer or set a smaller --shortest"
         if len(longest.rows) < FEWEST or found.shortest > longest.lasts >= LEAST:  # too few samples
             needed = max(FEWEST, round(found.shortest / step) if step > 0 else FEWEST)
-            held, asked = count_noun(len(longest.rows), "sample"), f"{needed}"
+            longest_text, least_text = count_noun(len(longest.rows), "sample"), f"{needed}"
             cure = (
                 "log faster, hold each level longer (for --shortest and at least "
                 f"{FEWEST} samples), or remove time_s if each row is a settled run already"
             )
         return (
-            f"{source}: no settled segment: the longest level has {held} ({rows}); expected at least {asked}; "
-            f"{direct}{cure}"
+            f"{source}: no settled segment: the longest level has {longest_text} ({rows}); expected at least "
+            f"{least_text}; {direct}{cure}"
         )
     if why in ("settling", "accelerates"):
         return (
@@ -923,10 +933,10 @@ def _nothing_settled_message(found: Settled, loop: str) -> str:
             "level longer or set a larger --drift"
         )
     if why == "unread":
-        each = " and ".join(f"{s.channel.column} in {100 * s.filled:.2g} %" for s in found.signals)
+        filled_shares = " and ".join(f"{s.channel.column} in {100 * s.filled:.2g} %" for s in found.signals)
         return (
-            f"{source}: no settled segment: no channel has enough readings ({each} of the rows); each level needs at "
-            f"least {FEWEST}; {direct}log them more often"
+            f"{source}: no settled segment: no channel has enough readings ({filled_shares} of the rows); each level "
+            f"needs at least {FEWEST}; {direct}log them more often"
         )
     imposed = found.runs.layout.imposed_column
     others = {

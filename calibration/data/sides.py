@@ -42,23 +42,24 @@ def of_volts(name: str, columns: Columns, battery: bool) -> Names:
         BadData: a battery feeds the motors, one side's voltage is missing, the table also states shares, or a voltage
             is higher than the supply's.
     """
-    stated = [c for c in VOLTS if c in columns]
-    if not stated:
+    voltage_columns = [c for c in VOLTS if c in columns]
+    if not voltage_columns:
         return ()
     if battery:
         raise BadData(
-            f"{name}: column {stated[0]} together with --battery, whose voltage falls; give {' and '.join(SIDES)} "
-            "instead"
+            f"{name}: column {voltage_columns[0]} together with --battery, whose voltage falls; give "
+            f"{' and '.join(SIDES)} instead"
         )
     if twin := next((c for c in (*SIDES, *DUTY) if c in columns), None):
         raise BadData(
-            f"{name}: column {twin} in addition to {stated[0]}, which already gives the command of both sides; "
-            "keep one"
+            f"{name}: column {twin} in addition to {voltage_columns[0]}, which already gives the command of both "
+            "sides; keep one"
         )
-    if len(stated) == 1:
-        (other,) = {*VOLTS} - {*stated}
+    if len(voltage_columns) == 1:
+        (other,) = {*VOLTS} - {*voltage_columns}
         raise BadData(
-            f"{name}: column {other} is missing although {stated[0]} is present; give the command of both sides"
+            f"{name}: column {other} is missing although {voltage_columns[0]} is present; give the command of both "
+            "sides"
         )
     volts = np.stack([columns.pop(c) for c in VOLTS])
     supply, parts = supply_and_shares(volts, columns.get(SUPPLY))
@@ -82,17 +83,17 @@ def check_turns(runs: Runs) -> None:
         BadData: readings of a side that follow the drive of the other side, or a yaw rate that contradicts both.
     """
     left, right = runs.of_sides
-    for what in ("motor_speed", "motor_current"):
-        pair = [channels.find_channel(f"{what}_{side}") for side in channels.SIDES]
+    for quantity in ("motor_speed", "motor_current"):
+        pair = [channels.find_channel(f"{quantity}_{side}") for side in channels.SIDES]
         if not all(c in runs.channels and runs.has(c.column) for c in pair):
             continue
-        one, other = (runs[c.column] for c in pair)
+        left_value, right_value = (runs[c.column] for c in pair)
         drive = right - left
         if any(runs.layout.magnitude(c.name) for c in pair):
-            one, other, drive = np.abs(one), np.abs(other), np.abs(right) - np.abs(left)
+            left_value, right_value, drive = np.abs(left_value), np.abs(right_value), np.abs(right) - np.abs(left)
         columns = f"{pair[0].column} and {pair[1].column}"
         _refuse_against(
-            runs, columns, (one, other), other - one, drive,
+            runs, columns, (left_value, right_value), right_value - left_value, drive,
             "the larger value on the side that is driven faster; the left and right columns of one quantity are "
             "exchanged",
         )  # fmt: skip

@@ -63,16 +63,16 @@ def with_surface_configurations(robot: Robot, runs: Runs) -> Robot:
     labelled = SURFACES if robot.rig.scales_adhesion else ()
     leaders: dict[str, str] = {}
     for configuration in dict.fromkeys(c for c, _ in pairs):
-        mine = [label for c, label in pairs if c == configuration]
-        own_names = [x for x in mine if x not in labelled or configuration_on_surface(configuration, x) in members]
+        labels = [label for c, label in pairs if c == configuration]
+        own_names = [x for x in labels if x not in labelled or configuration_on_surface(configuration, x) in members]
         present = [
             configuration_on_surface(configuration, x)
             for x in own_names
             if configuration_on_surface(configuration, x) in members
         ]
-        if not own_names or (len(mine) == 1 and not present) or (configuration not in members and not present):
+        if not own_names or (len(labels) == 1 and not present) or (configuration not in members and not present):
             continue
-        stays = configuration in members and len(own_names) < len(mine)
+        stays = configuration in members and len(own_names) < len(labels)
         pattern = members[configuration] if configuration in members else members[present[0]]
         names = list(dict.fromkeys(configuration_on_surface(configuration, x) for x in own_names))
         if configuration in members and not stays:  # in its place
@@ -120,10 +120,10 @@ def names_of_surfaces(names: Iterable[str], robot: Robot, runs: Runs) -> list[st
         if not gone:
             names_found.append(name)
             continue
-        mine = runs["surface"][runs["configuration"] == configuration]
+        surface_names = runs["surface"][runs["configuration"] == configuration]
         on = [
             n
-            for n in dict.fromkeys(configuration_on_surface(configuration, s) for s in mine)
+            for n in dict.fromkeys(configuration_on_surface(configuration, s) for s in surface_names)
             if n in robot.configurations
         ]
         names_found += [f"{n}.{rest}" for n in (on if rest.startswith((GROUND, "*")) else on[:1])]

@@ -44,9 +44,9 @@ def drive_of_sides(columns: Columns, layout: Layout) -> np.ndarray:
         columns: columns of a table that turns.
     """
     alike = np.ones(len(next(iter(columns.values()))))
-    each = np.stack([columns.get(name, columns.get("duty", alike)) for name in layout.sides])
+    side_drives = np.stack([columns.get(name, columns.get("duty", alike)) for name in layout.sides])
     supply = columns.get(SUPPLY, alike) if layout.imposed == "voltage" else alike
-    return each * np.where(np.isnan(supply), 1.0, supply)
+    return side_drives * np.where(np.isnan(supply), 1.0, supply)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -110,20 +110,20 @@ class Runs:
         """
         if self.channels == robot.channels:
             return self
-        mine = {column for c in robot.channels for column in (c.column, c.sd_column)}
-        if lost := [column for column in self.unknown if column in mine]:
+        own_columns = {column for c in robot.channels for column in (c.column, c.sd_column)}
+        if lost_columns := [column for column in self.unknown if column in own_columns]:
             raise BadData(
-                f"{self.source}, {lost[0]}: this channel of the robot was left out when the table was read; read "
-                "the table with robot=, set to this robot"
+                f"{self.source}, {lost_columns[0]}: this channel of the robot was left out when the table was read; "
+                "read the table with robot=, set to this robot"
             )
-        mine |= {self.layout.imposed_column, IMPOSED[robot.rig.imposed][0], *self.layout.sides}
-        others = {column for c in channels.EVERY for column in (c.column, c.sd_column)} - mine
-        left = {name: values for name, values in self.columns.items() if name in others}
+        own_columns |= {self.layout.imposed_column, IMPOSED[robot.rig.imposed][0], *self.layout.sides}
+        others = {column for c in channels.EVERY for column in (c.column, c.sd_column)} - own_columns
+        remaining_columns = {name: values for name, values in self.columns.items() if name in others}
         return dataclasses.replace(
             self,
-            columns={name: values for name, values in self.columns.items() if name not in left},
-            unknown=(*self.unknown, *left),
-            extras={**self.extras, **left},
+            columns={name: values for name, values in self.columns.items() if name not in remaining_columns},
+            unknown=(*self.unknown, *remaining_columns),
+            extras={**self.extras, **remaining_columns},
             layout=dataclasses.replace(self.layout, channels=robot.channels),
         )
 
@@ -133,8 +133,8 @@ class Runs:
         duty = () if self.sampled else DUTY
         usual = (*CONDITIONS, *DUTY, *WHEN)
         others = (c.column for c in quantities.SET if c.in_tables and c.field and c.column not in usual)
-        every = (*self.layout.axes, *duty, *self.layout.sides, *HEADING, *LEVERS, *others)
-        return tuple(dict.fromkeys(c for c in every if self.has(c)))
+        axis_names = (*self.layout.axes, *duty, *self.layout.sides, *HEADING, *LEVERS, *others)
+        return tuple(dict.fromkeys(c for c in axis_names if self.has(c)))
 
     @property
     def pulled(self) -> bool:
@@ -205,14 +205,14 @@ class Runs:
         """Returns a note on each channel with missing readings."""
         notes = []
         for k, channel in enumerate(self.channels):
-            lost = np.flatnonzero(np.isnan(self.measured()[:, k]))
-            if not self.has(channel.column) or lost.size == len(self):
+            missing_rows = np.flatnonzero(np.isnan(self.measured()[:, k]))
+            if not self.has(channel.column) or missing_rows.size == len(self):
                 notes.append(
                     f"{channel.column}: no readings; parameters that only this channel determines are not fitted"
                 )
-            elif lost.size:
-                rows = rows_text(lost.tolist(), 8)
-                notes.append(f"{channel.column}: {lost.size} of {len(self)} readings are missing ({rows})")
+            elif missing_rows.size:
+                rows = rows_text(missing_rows.tolist(), 8)
+                notes.append(f"{channel.column}: {missing_rows.size} of {len(self)} readings are missing ({rows})")
         return notes
 
     def configurations(self, robot: Robot) -> np.ndarray:
@@ -224,7 +224,7 @@ class Runs:
         Raises:
             InputError: a configuration that the robot does not have. The message lists its configurations.
         """
-        which = np.empty(len(self), int)
+        configuration_index = np.empty(len(self), int)
         names = self.configurations_named(robot)
         for name in np.unique(names):
             rows = names == name
@@ -234,15 +234,15 @@ class Runs:
                     f"{self.source} row {first}, configuration: got {name}; expected one of these; "
                     f"{allowed_words(str(name), robot.configurations)}"
                 )
-            which[rows] = robot.configurations.index(str(name))
-        return which
+            configuration_index[rows] = robot.configurations.index(str(name))
+        return configuration_index
 
     def configurations_named(self, robot: Robot) -> np.ndarray:
         """Names of `configurations`. A configuration that the robot does not have keeps the table's name."""
-        stated = self["configuration"]
+        configurations = self["configuration"]
         if not self.has("surface"):
-            return stated
-        pairs = list(zip(stated.tolist(), self["surface"].tolist(), strict=True))
+            return configurations
+        pairs = list(zip(configurations.tolist(), self["surface"].tolist(), strict=True))
         on = {pair: surface_labels.configuration_on_surface(*pair) for pair in set(pairs)}
         return np.array([on[p] if on[p] in robot.configurations else p[0] for p in pairs])
 
@@ -262,11 +262,13 @@ class Runs:
         """
         from mmrjax.model.conditions import Conditions
 
-        which = self.configurations(robot)
-        held = self["mode"] != DRIVEN[0] if self.has("mode") else np.zeros(len(self), bool)
+        configuration_index = self.configurations(robot)
+        is_undriven = self["mode"] != DRIVEN[0] if self.has("mode") else np.zeros(len(self), bool)
         adhesion, lateral = np.ones(len(self)), np.ones(len(self))
         if self.has("surface"):
-            on_tracks = np.array([float(c.on_tracks) > 0.5 for c in robot.configurations.members])[which]
+            on_tracks = np.array([float(c.on_tracks) > 0.5 for c in robot.configurations.members])[
+                configuration_index
+            ]
             scaled = surface_labels.rows_of_scaled_adhesion(robot, self["configuration"], self["surface"])
             adhesion[scaled] = [
                 adhesion_ratio(s, t) for s, t in zip(self["surface"][scaled], on_tracks[scaled], strict=True)
@@ -281,23 +283,25 @@ class Runs:
                 f"{self.source}: no {column}, which is the imposed quantity in the robot's file; the "
                 "table must contain it"
             )
-        stated = {c.field: self[c.column] for c in quantities.SET if c.in_tables and c.field and self.has(c.column)}
-        stated["duty"] = np.where(held, 0.0, stated.get("duty", 1.0))
+        set_values = {
+            c.field: self[c.column] for c in quantities.SET if c.in_tables and c.field and self.has(c.column)
+        }
+        set_values["duty"] = np.where(is_undriven, 0.0, set_values.get("duty", 1.0))
         follows = imposed and not robot.rig.follows_goal
-        stated["voltage"] = np.zeros(len(self)) if battery or follows else self[SUPPLY]
+        set_values["voltage"] = np.zeros(len(self)) if battery or follows else self[SUPPLY]
         if robot.rig.follows_goal:
-            stated["goal"] = self[column] * factor
+            set_values["goal"] = self[column] * factor
         elif imposed:
-            stated[robot.rig.imposed] = self[column] * factor
+            set_values[robot.rig.imposed] = self[column] * factor
             for side, name in zip(channels.SIDES, self.layout.sides, strict=False):
                 if self.has(name):
-                    stated[f"{robot.rig.imposed}_{side}"] = self[name] * factor
+                    set_values[f"{robot.rig.imposed}_{side}"] = self[name] * factor
         return Conditions(
-            which,
+            configuration_index,
             battery=battery,
             discharge=discharge,
             adhesion=adhesion,
             adhesion_lateral=lateral if self.turns else None,
             open=[CIRCUITS[mode] for mode in self["mode"]] if self.has("mode") else 0.0,
-            **stated,
+            **set_values,
         )

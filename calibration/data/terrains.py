@@ -61,10 +61,10 @@ def _read_columns(path: Path, option: str, wanted: Rows[Rows[str]]) -> tuple[Col
         either = ", or ".join(" and ".join(names) for names in wanted)
         raise BadData(f"{path.name}: got columns {', '.join(header) or 'none'}; expected {either}")
     for others in wanted:
-        if both := [name for name in others if name in header and name not in names]:
+        if conflicting := [name for name in others if name in header and name not in names]:
             ours = ", ".join(name for name in names if name not in others)
             raise BadData(
-                f"{path.name}: got columns {', '.join(both)} and {ours}; expected one kind, remove the other"
+                f"{path.name}: got columns {', '.join(conflicting)} and {ours}; expected one kind, remove the other"
             )
     columns: dict[str, list[float]] = {name: [] for name in names}
     for k, row in enumerate(rows[1:], 2):
@@ -120,8 +120,8 @@ def read_sequence(path: Path, robot: Robot, begins: tuple[float, float]) -> Leve
             voltage beyond `HIGHEST`.
     """
     angles, volts = ("front_deg", "rear_deg"), ("front_V", "rear_V")
-    wanted = [(abscissa, *both) for both in (angles, volts) for abscissa in ("x_mm", "time_s")]
-    columns, names = _read_columns(path, "--sequence", wanted)
+    column_sets = [(abscissa, *both) for both in (angles, volts) for abscissa in ("x_mm", "time_s")]
+    columns, names = _read_columns(path, "--sequence", column_sets)
     abscissa = columns[names[0]] * (1e-3 if names[0] == "x_mm" else 1.0)
     if (falls := np.flatnonzero(np.diff(abscissa) <= 0)).size:
         raise BadData(

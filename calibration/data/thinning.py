@@ -55,15 +55,15 @@ def thin_rows(runs: Runs, most: int = ROWS) -> Runs:
         )
     if len(runs) <= most:
         return runs
-    apart, kept = -(-len(runs) // most), []
+    apart, kept_rows = -(-len(runs) // most), []
     read = np.isfinite(runs.measured())
     if runs.sampled:
         ordered = list(runs.rows_by_run().values())
     else:
         ordered = [np.lexsort([runs[column] for column in reversed(("configuration", *runs.axes))])]
     for rows in ordered:
-        kept.append(rows[_evenly_spaced_rows(read[rows], apart)])
-    return dataclasses.replace(runs.where(np.sort(np.concatenate(kept))), log=runs.whole)
+        kept_rows.append(rows[_evenly_spaced_rows(read[rows], apart)])
+    return dataclasses.replace(runs.where(np.sort(np.concatenate(kept_rows))), log=runs.whole)
 
 
 def _evenly_spaced_rows(read: np.ndarray, apart: int) -> np.ndarray:
@@ -72,9 +72,9 @@ def _evenly_spaced_rows(read: np.ndarray, apart: int) -> np.ndarray:
     Args:
         read: true if a row has a reading, shape (rows, channels).
     """
-    kept = list(range(min(FIRST, len(read))))
-    count = read[kept].sum(0)
+    kept_rows = list(range(min(FIRST, len(read))))
+    count = read[kept_rows].sum(0)
     for begin in range(apart, len(read) - 1, apart):
-        kept.append(begin + int(np.argmax(read[begin : begin + apart] @ (1.0 / (1.0 + count)))))
-        count = count + read[kept[-1]]
-    return np.array(sorted({*kept, len(read) - 1}))
+        kept_rows.append(begin + int(np.argmax(read[begin : begin + apart] @ (1.0 / (1.0 + count)))))
+        count = count + read[kept_rows[-1]]
+    return np.array(sorted({*kept_rows, len(read) - 1}))

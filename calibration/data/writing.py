@@ -241,8 +241,8 @@ def _is_number(text: str) -> bool:
 def entries_of(value: Any, *listed: str) -> Json:
     """Entries of an object, listed as `key` or `key=attribute.of.attribute`. Methods are called."""
     pairs = (entry.partition("=") for entry in listed)
-    found = {key: operator.attrgetter(attribute or key)(value) for key, _, attribute in pairs}
-    return {key: x() if inspect.ismethod(x) else x for key, x in found.items()}
+    entries = {key: operator.attrgetter(attribute or key)(value) for key, _, attribute in pairs}
+    return {key: x() if inspect.ismethod(x) else x for key, x in entries.items()}
 
 
 def json_value(value: Any) -> Any:
@@ -251,13 +251,13 @@ def json_value(value: Any) -> Any:
     An object becomes the entries that its class lists in `JSON`, see `entries_of`. Without such a list it becomes its
     `to_json()`, or the fields of its dataclass.
     """
-    listed = getattr(value, "JSON", None)
-    if listed is None and hasattr(value, "to_json"):
+    json_fields = getattr(value, "JSON", None)
+    if json_fields is None and hasattr(value, "to_json"):
         return json_value(value.to_json())
-    if listed is None and dataclasses.is_dataclass(value):
-        listed = [field.name for field in dataclasses.fields(value)]
-    if listed is not None:
-        return json_value(entries_of(value, *listed))
+    if json_fields is None and dataclasses.is_dataclass(value):
+        json_fields = [field.name for field in dataclasses.fields(value)]
+    if json_fields is not None:
+        return json_value(entries_of(value, *json_fields))
     if isinstance(value, Mapping):
         return {key: json_value(v) for key, v in value.items()}
     if isinstance(value, list | tuple):

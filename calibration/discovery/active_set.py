@@ -207,22 +207,22 @@ class CandidateSpace:
         if not self.bare.observe.long:
             return self.equipped, [self.library.indices(names) for names in sets]
         effects_to_place = {*self.room, *(n for names in sets for n in names if n)} or {*self.library.names[:1]}
-        chosen = [k for k, n in enumerate(self.library.names) if n in effects_to_place]
-        names, all_coordinates = tuple(self.library.names[k] for k in chosen), self.coordinates
-        value, spread, sd, low, high = (x[np.asarray(chosen)] for x in all_coordinates.scales)
+        library_indices = [k for k, n in enumerate(self.library.names) if n in effects_to_place]
+        names, all_coordinates = tuple(self.library.names[k] for k in library_indices), self.coordinates
+        value, spread, sd, low, high = (x[np.asarray(library_indices)] for x in all_coordinates.scales)
         coordinates = dataclasses.replace(
             all_coordinates,
-            sd=all_coordinates.sd[np.asarray(chosen)],
+            sd=all_coordinates.sd[np.asarray(library_indices)],
             scales=(value, spread, sd, low, high),
             names=names,
-            shapes=tuple(all_coordinates.shapes[k] for k in chosen),
+            shapes=tuple(all_coordinates.shapes[k] for k in library_indices),
         )
         robot = self.equipped.base
         effect_names = {e.name for e in self.bare.base.effects} | effects_to_place
         robot = dataclasses.replace(robot, effects=tuple(e for e in robot.effects if e.name in effect_names))
         index = {n: k for k, n in enumerate(names)} | {"": -1}
         problem = dataclasses.replace(self.equipped, base=robot, coordinates=coordinates)
-        return problem, [tuple(index[n] for n in each) for each in sets]
+        return problem, [tuple(index[n] for n in name_set) for name_set in sets]
 
     def fit_of(self, active: Sequence[str], z: np.ndarray) -> tuple[Problem, np.ndarray, tuple[int, ...] | None]:
         """Problem, coordinates and indices of the effects for one fit.

@@ -61,8 +61,8 @@ class AdequacyTest:
         """
         promised = float(self.found.single) ** 2
         pair = self.found.pair - max(promised - gain, 0.0)
-        found = dataclasses.replace(self.found, single=np.sqrt(min(promised, gain)), pair=pair)
-        return dataclasses.replace(self, found=found)
+        bounded = dataclasses.replace(self.found, single=np.sqrt(min(promised, gain)), pair=pair)
+        return dataclasses.replace(self, found=bounded)
 
     @property
     def p_value(self) -> float:

@@ -204,16 +204,16 @@ def fit_base(space: CandidateSpace, settings: Settings, where: str, near: Candid
     Raises:
         BadData: too few rows remain.
     """
-    lost = _beyond_adhesion(space)
-    unusable = tuple(map(int, np.flatnonzero(lost)))
-    space = space.without(lost) if unusable else space
+    unusable_rows = _beyond_adhesion(space)
+    unusable = tuple(map(int, np.flatnonzero(unusable_rows)))
+    space = space.without(unusable_rows) if unusable else space
     while True:
         optima, observations = _best_starts(space, settings, near)
         # The first of those that end in one place, because rounding decides which of them is the lowest.
         cost = np.where(np.isfinite(optima.cost), optima.cost, np.inf)
         k = int(np.argmax(cost <= np.min(cost) + ALIKE))
-        lost = space.bare.observe.unreachable(np.asarray(observations.status[k])) & space.included
-        if not lost.any():
+        unusable_rows = space.bare.observe.unreachable(np.asarray(observations.status[k])) & space.included
+        if not unusable_rows.any():
             slots = np.zeros(2 * settings.slots)
             best = jax.tree.map(lambda x: x[k], optima)  # noqa: B023
             z, sd = np.concatenate([best.z[: space.free], slots]), np.concatenate([best.sd[: space.free], slots + 1])
@@ -224,8 +224,8 @@ def fit_base(space: CandidateSpace, settings: Settings, where: str, near: Candid
                 space,
                 unusable,
             )
-        unusable = tuple(sorted({*unusable, *map(int, np.flatnonzero(lost))}))
-        space = space.without(lost)
+        unusable = tuple(sorted({*unusable, *map(int, np.flatnonzero(unusable_rows))}))
+        space = space.without(unusable_rows)
         if space.included.sum() < FEWEST:
             rows = ", ".join(str(r + 1) for r in unusable[:12])
             raise BadData(f"{where}: too few rows for a search, since the model has no result in rows {rows}")
@@ -266,19 +266,19 @@ def _best_starts(space: CandidateSpace, settings: Settings, near: Candidate | No
 
     def search(starts: np.ndarray) -> tuple[Optimum, Observation]:
         weights = np.repeat(space.weight[None], len(starts), 0)
-        problem, which = bare, None
+        problem, active_sets = bare, None
         if space.room:
             problem, (empty,) = space.problem_for_sets([empty_slots(settings)])
             starts = np.pad(starts, ((0, 0), (0, 2 * settings.slots)))
-            which = np.repeat(np.asarray(empty)[None], len(starts), 0)
-        search_inputs = jnp.asarray(starts), jnp.asarray(weights), which
+            active_sets = np.repeat(np.asarray(empty)[None], len(starts), 0)
+        search_inputs = jnp.asarray(starts), jnp.asarray(weights), active_sets
         return jax.device_get(observe.search(problem, *search_inputs, rivals=rivals, most=most, scanned=bare))
 
-    found = search(starts)
-    if regression and len(starts) == 1 and not np.all(found[0].converged):
+    optima = search(starts)
+    if regression and len(starts) == 1 and not np.all(optima[0].converged):
         from_mean = search(scans.place_at_minimum(bare, np.zeros((1, space.free))))
-        found = jax.tree.map(lambda *x: np.concatenate(x), found, from_mean)
-    return found
+        optima = jax.tree.map(lambda *x: np.concatenate(x), optima, from_mean)
+    return optima
 
 
 Proposal = tuple[Names, np.ndarray]
@@ -301,8 +301,8 @@ def fit_candidates(space: CandidateSpace, proposals: Sequence[Proposal], setting
             problem, starts, [space.weight] * len(positions), [active[k] for k in positions], most
         )
         for j, k in enumerate(positions):
-            one = jax.tree.map(lambda x: x[j], optima)  # noqa: B023
-            candidates[k] = candidate_of_fit(space, proposals[k][0], one, settings)
+            optimum = jax.tree.map(lambda x: x[j], optima)  # noqa: B023
+            candidates[k] = candidate_of_fit(space, proposals[k][0], optimum, settings)
     return [candidates[k] for k in range(len(proposals))]
 
 
@@ -319,8 +319,10 @@ def fit_in_addition(
         wanted: (active effects, previous fit, scores of its residuals). The active effects include those of the
             previous fit.
     """
-    fits = fit_candidates(space, [(w, start_of_fit(space, at, w, settings, by)) for w, at, by in wanted], settings)
-    stuck = [k for k, (_, at, _) in enumerate(wanted) if not fits[k].cost <= at.cost + STUCK]
+    fits = fit_candidates(
+        space, [(w, start_of_fit(space, base_fit, w, settings, scores)) for w, base_fit, scores in wanted], settings
+    )
+    stuck = [k for k, (_, base_fit, _) in enumerate(wanted) if not fits[k].cost <= base_fit.cost + STUCK]
     restarts = [(k, start_of_fit(space, wanted[k][1], wanted[k][0], settings)) for k in stuck]
     for k in sorted(range(len(fits)), key=lambda k: fits[k].cost)[:1]:
         restarts.append((k, np.where(np.arange(len(fits[k].z)) < space.free, 0.0, fits[k].z)))

@@ -203,7 +203,7 @@ def find_classes(
     wanted_fits = [(w, start_of_fit(space, best, w, settings, left.scores)) for w in new]
     fitted += fit_candidates(space, wanted_fits, settings)
     simulated |= {c.key: c for c in fitted if c.simulated}
-    members, stated, ammeter = [], [], []
+    members, stated_shifts, ammeter = [], [], []
     jacobian, residual = map(np.asarray, (after.linear.jacobian, after.linear.residual))
     for slot, (name, gain) in enumerate(zip(best.effects, gains, strict=True)):
         same = [name]
@@ -223,12 +223,12 @@ def find_classes(
         ammeter.append(ammeter_families(space, *rest, column, family, settings))
         linear = left.linear if len(best.effects) == 1 else None
         shifts = find_prior_shifts(space, fewer[slot], SURE * gain, settings, linear)
-        stated.append(tuple(s for s in shifts if 2 * (s.fit.cost - best.cost) <= within[settings.form]))
+        stated_shifts.append(tuple(s for s in shifts if 2 * (s.fit.cost - best.cost) <= within[settings.form]))
     by_regression = [c for c in (*ladder, *fitted) if not c.simulated and c.key not in simulated]
     latest = {c.key: c for c in by_regression} | {k: c for k, c in simulated.items() if not c.simulated}
     all_fits = (*latest.values(), *(c for c in (*ladder, *fitted) if c.simulated))
     families = ((*families_of_members(space, same), *also) for same, also in zip(members, ammeter, strict=True))
-    return Classes(tuple(members), tuple(stated), tuple(tuple(dict.fromkeys(f)) for f in families), all_fits)
+    return Classes(tuple(members), tuple(stated_shifts), tuple(tuple(dict.fromkeys(f)) for f in families), all_fits)
 
 
 def families_of_members(space: CandidateSpace, members: Sequence[str]) -> Names:

@@ -257,14 +257,14 @@ class LoopInput:
         """
         ranked = list[EffectRanking]()
         with contextlib.ExitStack() as others:
-            given = dataclasses.replace(self, others=others if ahead else None, later=[])
-            screened, sds = self.keep("base", functools.partial(_fit_base_and_noise, given, ranked))
-            screened, left, searched = _search_until_clean(given, screened, sds, ranked)
+            base_input = dataclasses.replace(self, others=others if ahead else None, later=[])
+            screened, sds = self.keep("base", functools.partial(_fit_base_and_noise, base_input, ranked))
+            screened, diagnosis, searched = _search_until_clean(base_input, screened, sds, ranked)
             if searched is None:
-                missed = missed_channels(screened.base.space, self.runs, sds.noise, left.linear)
+                missed = missed_channels(screened.base.space, self.runs, sds.noise, diagnosis.linear)
                 word = "undescribed" if missed or self.shows_unmodelled_backlash else "none"
-                return LoopStages(word, screened, left, sds, missed=missed, unused=unused_inputs(self.runs))
-            return _reach_verdict(given, screened, left, sds, searched)
+                return LoopStages(word, screened, diagnosis, sds, missed=missed, unused=unused_inputs(self.runs))
+            return _reach_verdict(base_input, screened, diagnosis, sds, searched)
 
     @functools.cached_property
     def shows_unmodelled_backlash(self) -> bool:
@@ -331,10 +331,10 @@ def prepare_loop(
             raise BadData(describe(note))
     at_first = (*ready.foreign, *ready.doubted, *remarks_with_codes(ready.checked, "lost_motion"))
     notes_so_far: Notes = (*notes, *ready.checked, *ready.begins, *ready.weighed, *ready.foreign, *ready.doubted)
-    turned = scales.output_rotation(distinct, ready.robot)
+    output_turn = scales.output_rotation(distinct, ready.robot)
     channel_effects = {name: e for name, e in effects.OF_CHANNELS.items() if e.channel in ready.robot.rig.channels}
     library = {**library, **kind.library, **channel_effects}
-    library = scales.scale_library(ready.robot, distinct.conditions(ready.robot), library, turned)
+    library = scales.scale_library(ready.robot, distinct.conditions(ready.robot), library, output_turn)
     settings = dataclasses.replace(
         settings_for(kind, replicates, seed, prefer),
         forbidden=tuple(forbidden),
@@ -419,7 +419,9 @@ class LoopStages:
     def families(self) -> Names:
         """Families of the members of each established class, or of the location of a discrepancy without a name."""
         if self.alike is not None and self.verdict not in WITHOUT_NAME:
-            return tuple(f for each, name in zip(self.alike.families, self._named, strict=True) if name for f in each)
+            return tuple(
+                f for members, name in zip(self.alike.families, self._named, strict=True) if name for f in members
+            )
         if self.verdict == "mechanism" and self.mechanism is not None:
             return self.mechanism.families
         return () if self.where is None else (self.where.family,)
@@ -468,8 +470,8 @@ class LoopStages:
 
 def _fit_base_and_noise(given: LoopInput, ranked: list[EffectRanking]) -> tuple[Screening, VerdictNoise]:
     """Fits the base. If its residuals have no structure but exceed the noise by one factor, rescales the noise."""
-    known, noise = given.known, given.noise
-    screened = given.screen(noise, None if known is None else known.screened.base, ranked)
+    known_stages, noise = given.known, given.noise
+    screened = given.screen(noise, None if known_stages is None else known_stages.screened.base, ranked)
     base, free = screened.base, screened.base.space.free
     residuals = _residual_tests(base.space, given.runs, screened.diagnosed[0], base.reading, base.candidate.z[:free])
     factors = {} if screened.cluster is not None else common_factors(residuals)
@@ -485,8 +487,12 @@ def _test_base(given: LoopInput, sds: VerdictNoise, screened: Screening) -> tupl
     """Tests the base fit by bootstrap. The returned fit also has a program for the sets of effects to be
     simulated.
     """
-    known, weight = given.known, screened.base.space.weight
-    null = None if known is None or np.any(known.screened.base.space.weight != weight) else known.left.test.null
+    known_stages, weight = given.known, screened.base.space.weight
+    null = (
+        None
+        if known_stages is None or np.any(known_stages.screened.base.space.weight != weight)
+        else known_stages.left.test.null
+    )
     base, (linear, scores, _) = screened.base, screened.diagnosed
     space = include_likely_effects(base.space, base.candidate, linear, scores, given.settings)
     screened = dataclasses.replace(screened, base=dataclasses.replace(base, space=space))
@@ -515,15 +521,17 @@ def _search_until_clean(
     settings, keep, progress = given.settings, given.keep, given.progress
     for k in range(SCREENINGS):
         progress(progress_remark("bootstrap", settings.replicates))
-        screened, left = keep(f"bootstrap {k}", functools.partial(_test_base, given, sds, screened))
+        screened, diagnosis = keep(f"bootstrap {k}", functools.partial(_test_base, given, sds, screened))
         if k == 0 and not ranked:
-            keep("ranking", functools.partial(findings.rank_library, screened.base.space, left, settings))
-        if given.shows_unmodelled_backlash or (not left.test.rejected and screened.cluster is None):
-            return screened, left, None  # effects of the library would only stand in for a backlash
+            keep("ranking", functools.partial(findings.rank_library, screened.base.space, diagnosis, settings))
+        if given.shows_unmodelled_backlash or (not diagnosis.test.rejected and screened.cluster is None):
+            return screened, diagnosis, None  # effects of the library would only stand in for a backlash
         progress(progress_remark("effects"))
-        screened, left, searched = keep(f"search {k}", functools.partial(_search_effects, given, screened, left))
+        screened, diagnosis, searched = keep(
+            f"search {k}", functools.partial(_search_effects, given, screened, diagnosis)
+        )
         after = searched.diagnosis
-        if after is None and (confirmed := _confirm_gains(screened, left, searched)) is not None:
+        if after is None and (confirmed := _confirm_gains(screened, diagnosis, searched)) is not None:
             return screened, confirmed, None
         if after is None or not after.test.rejected_with_margin or screened.base.space.near:
             break
@@ -534,7 +542,7 @@ def _search_until_clean(
             break
         progress(progress_remark("alone"))
         screened = more
-    return screened, left, searched
+    return screened, diagnosis, searched
 
 
 def _confirm_gains(screened: Screening, left: Diagnosis, searched: SearchResult) -> Diagnosis | None:
@@ -561,7 +569,7 @@ def _reach_verdict(
     runs, settings, progress = given.runs, given.settings, given.progress
     base, space, bases = screened.base.candidate, screened.base.space, screened.bases
     beside, predicted = BaseCurve(space, base, left, bases), Predicted()
-    where = dataclasses.replace(beside.where, by_duty=varied_by_duty(runs))
+    location = dataclasses.replace(beside.where, by_duty=varied_by_duty(runs))
     model, searched, stood = choose_effects(runs, screened, left, searched, settings, progress, beside, predicted)
     stages = functools.partial(LoopStages, beside=beside, predicted=predicted)
     leaves: tuple[MissedChannel, ...] = ()
@@ -582,17 +590,17 @@ def _reach_verdict(
         progress(progress_remark("mechanism"))
         ladder = [c for c in (*searched.ladder, *([] if model is None else model[:1]))]
         mechanism = find_mechanism(space, runs, base, left, ladder, bases, beside, predicted, settings)
-        mechanism = mechanism and _with_ammeter_alternatives(space, mechanism, left.linear, bases, where, settings)
+        mechanism = mechanism and _with_ammeter_alternatives(space, mechanism, left.linear, bases, location, settings)
         level = "place" if mechanism is None or mechanism.fails else "mechanism"
     if model is None:
-        return stages(level, screened, left, sds, searched, where=where, standing=stood, mechanism=mechanism)
+        return stages(level, screened, left, sds, searched, where=location, standing=stood, mechanism=mechanism)
 
     searched = dataclasses.replace(searched, best=model[0], diagnosis=model[1])
     best, after = model
     progress(progress_remark("alike", best.effects))
     alike = find_classes(space, base, best, searched.ladder, left, after, settings)
     if not any(established_names):
-        return stages(level, screened, left, sds, searched, alike, where, standing=stood, mechanism=mechanism)
+        return stages(level, screened, left, sds, searched, alike, location, standing=stood, mechanism=mechanism)
     compared: tuple[HeldOutAlternative, ...] = ()
     if settings.prefer == HELD_OUT:
         progress(progress_remark("held out"))
@@ -655,7 +663,7 @@ def choose_effects(
         return None, searched, judge_names(space, base, searched, left, bases, settings)
     adequate = not after.test.rejected_with_margin
     kinds = blocks_room.predictable_blocks(runs, space.bare)
-    blocks = [mask for by in kinds.values() for mask in by.values()]
+    blocks = [mask for blocks_by_name in kinds.values() for mask in blocks_by_name.values()]
     support_of = functools.partial(
         judge_names, space, base, searched, left, bases, settings, blocks=blocks, beside=beside
     )
@@ -761,8 +769,8 @@ def has_partial_duty(runs: Runs) -> bool:
 
 def goes_both_ways(runs: Runs) -> bool:
     """True if there are forward and backward runs, according to a measured speed or the command."""
-    moved = [c.column for c in channels.EVERY if c.zero_at_rest and c.directed]
-    columns = [runs[name] for name in (*moved, runs.layout.imposed_column, "duty") if runs.has(name)]
+    motion_columns = [c.column for c in channels.EVERY if c.zero_at_rest and c.directed]
+    columns = [runs[name] for name in (*motion_columns, runs.layout.imposed_column, "duty") if runs.has(name)]
     finite_columns = [x[np.isfinite(x)] for x in columns]
     return any(min(x.max(), -x.min()) > EITHER_WAY * np.abs(x).max() for x in finite_columns if x.size)
 
@@ -897,7 +905,12 @@ def missing_effects(space: CandidateSpace, alike: Classes, support: NameSupport 
 def assemble_result(given: LoopInput, traced: LoopStages) -> DiscoveryResult:
     """Result of the loop. Computes the hold-out errors and the next experiment."""
     runs, numbers, settings, progress = given.runs, given.numbers, given.settings, given.progress
-    screened, left, noise, nameless = traced.screened, traced.left, traced.sds.noise, traced.verdict in WITHOUT_NAME
+    screened, diagnosis, noise, nameless = (
+        traced.screened,
+        traced.left,
+        traced.sds.noise,
+        traced.verdict in WITHOUT_NAME,
+    )
     space, base, best, ends = screened.base.space, screened.base.candidate, traced.best, traced.ends
     observe, included = space.bare.observe, space.included[: len(runs)]
     # The fit of the result: with the named effects, or with the curve if no name is given.
@@ -915,28 +928,28 @@ def assemble_result(given: LoopInput, traced: LoopStages) -> DiscoveryResult:
     progress(progress_remark("errors"))
     predictions = [traced.predicted.get(prediction.candidate_key(c)) for c in (base, best)]
     kinds = blocks_room.predictable_blocks(runs, space.bare)
-    seen = findings.readings_of_rows(
+    row_readings = findings.readings_of_rows(
         runs, noise.sd, kinds, before, after, predictions[0], None if best is base else predictions[1]
     )
     compared = traced.held_out
     if traced.alike is not None and not nameless and not compared and not observe.long:
         compared = preference.compare_alternatives(space, runs, best, traced.alike)
-    gains = _hold_out_gains(space, runs, traced, seen)
+    gains = _hold_out_gains(space, runs, traced, row_readings)
     gain = gains[-1][1] if gains and after is not None else None
     # What is written never predicts worse than the refit. A curve, which claims no cause, has to predict better.
     written = gain is None or (gain.mean > gain.se if best is base else gain.mean >= -prediction.WORSE)
     if written and curve is not None:
         robot, converged, posterior = curve.robot, curve.converged, posterior_of_curve(space, best.active, curve)
     else:
-        fit, of_fit = (best, traced.ends) if written else (base, left)
+        fit, of_fit = (best, traced.ends) if written else (base, diagnosis)
         robot, converged = findings.proposed_robot(space, fit), fit.converged
         posterior = posterior_of_fit(space, fit.active, fit.z, of_fit.linear)
     progress(progress_remark("next"))
-    remaining = _residual_tests(space, runs, ends.linear, seen.after, z)
+    remaining = _residual_tests(space, runs, ends.linear, row_readings.after, z)
 
     def error(simulated: np.ndarray) -> Errors:
         simulated = np.where(included[:, None], simulated, np.nan)
-        return channel_errors(space.bare.channels, simulated, seen.measured, seen.sd)
+        return channel_errors(space.bare.channels, simulated, row_readings.measured, row_readings.sd)
 
     ladder = () if traced.searched is None else traced.searched.ladder
     ladder = ladder if traced.alike is None else traced.alike.ladder
@@ -944,12 +957,12 @@ def assemble_result(given: LoopInput, traced: LoopStages) -> DiscoveryResult:
     found: tuple[FoundEffect, ...] = ()
     concealed: tuple[HiddenEffect, ...] = ()
     if traced.alike is not None:
-        found = findings.found_effects(space, base, best, traced.alike, left.test, settings)
+        found = findings.found_effects(space, base, best, traced.alike, diagnosis.test, settings)
         if not nameless:
             ask = observe.menu and not observe.long
-            concealed = find_hidden_effects(space, best, traced.alike, left, traced.ends, settings, ask=ask)
-    listed = findings.effect_scores(space, left.scores, settings)
-    library_places = space.library.indices([s.name for s in listed])
+            concealed = find_hidden_effects(space, best, traced.alike, diagnosis, traced.ends, settings, ask=ask)
+    scores = findings.effect_scores(space, diagnosis.scores, settings)
+    library_places = space.library.indices([s.name for s in scores])
     summary, kind = verdict_summary(traced, numbers), type(observe)
     result = DiscoveryResult(
         verdict=traced.verdict,
@@ -968,10 +981,10 @@ def assemble_result(given: LoopInput, traced: LoopStages) -> DiscoveryResult:
         effects=found,
         unnamed=None
         if beside is None or traced.where is None
-        else findings.unnamed_discrepancy(beside, traced.where, left.test.p_value, len(runs)),
+        else findings.unnamed_discrepancy(beside, traced.where, diagnosis.test.p_value, len(runs)),
         remains=None if nameless or traced.alike is None else traced.where,
         next_experiment=_next_experiment(space, traced, settings),
-        cannot_see=findings.invisible_effects(space, left.scores, settings),
+        cannot_see=findings.invisible_effects(space, diagnosis.scores, settings),
         needs_histories=tuple(sorted(name for name, e in given.library.items() if e.transient and not kind.shows(e))),
         needs_reverse=tuple(
             sorted(name for name, e in given.library.items() if e.needs_reverse and not goes_both_ways(runs))
@@ -982,29 +995,31 @@ def assemble_result(given: LoopInput, traced: LoopStages) -> DiscoveryResult:
         support=summary.support,
         cluster=screened.cluster,
         residual_clusters=find_residual_clusters(remaining, settings.seed),
-        before=findings.evidence_of_test(left.test, adequate=not left.test.rejected),
+        before=findings.evidence_of_test(diagnosis.test, adequate=not diagnosis.test.rejected),
         after=findings.evidence_of_test(ends.test, adequate=not ends.test.rejected_with_margin),
         chi2=(2 * base.cost, 2 * cost),
         readings=int(np.sum(space.weight > 0)),
         base_shift=findings.parameter_shifts(space, base.z, z, sd),
-        scores=listed,
-        cosine=signature_cosines(space, left.scores)[np.ix_(library_places, library_places)],
-        detail=observe.detail(screened.bases, included, left, ends),
-        readings_of_rows=seen,
-        errors_as_stated=error(seen.as_stated),
-        errors=errors_on_common_rows(seen.before, seen.after, error),
-        errors_held_out={k: errors_on_common_rows(*both, error) for k, both in seen.held_out.items()},
+        scores=scores,
+        cosine=signature_cosines(space, diagnosis.scores)[np.ix_(library_places, library_places)],
+        detail=observe.detail(screened.bases, included, diagnosis, ends),
+        readings_of_rows=row_readings,
+        errors_as_stated=error(row_readings.as_stated),
+        errors=errors_on_common_rows(row_readings.before, row_readings.after, error),
+        errors_held_out={
+            k: errors_on_common_rows(*error_pair, error) for k, error_pair in row_readings.held_out.items()
+        },
         held_out_unpredictable=blocks_room.unpredictable_kinds(runs, space.bare),
-        held_out_worse=preference.worse_predictions(seen.held_out, error),
+        held_out_worse=preference.worse_predictions(row_readings.held_out, error),
         alternatives_held_out=compared,
         noise=_noise_by_channel(runs, noise, kind),
         settings=settings,
-        replicates=len(left.test.null.single),
+        replicates=len(diagnosis.test.null.single),
     )
     # A temporary change is not uniform.
     of_noise = noise_remarks_before_verdict(traced.sds, remaining) if traced.sds.factors or not traced.events else ()
     return dataclasses.replace(
-        result, remarks=(*of_noise, *worse_than_stated(seen, noise, included), *loop_remarks(result))
+        result, remarks=(*of_noise, *worse_than_stated(row_readings, noise, included), *loop_remarks(result))
     )
 
 
@@ -1021,16 +1036,16 @@ def worse_than_stated(seen: ReadingsOfRows, noise: Noise, included: np.ndarray) 
         rows = included & np.isfinite(seen.measured[:, k] + seen.as_stated[:, k] + seen.before[:, k])
         if noise.source[k] not in noise_room.UNSTATED or not rows.any():
             continue
-        stated, refit, size, sd = (
+        file_misfit, refit, size, sd = (
             float(np.sqrt(np.mean(x[rows, k] ** 2)))
             for x in (seen.as_stated - seen.measured, seen.before - seen.measured, seen.measured, noise.sd)
         )
-        if refit > WORSE * stated and refit - stated > sd:
+        if refit > WORSE * file_misfit and refit - file_misfit > sd:
             worse_channels.append(
                 Remark(
                     "refit_worse",
                     channel=channel.name,
-                    stated=stated / size,
+                    stated=file_misfit / size,
                     refit=refit / size,
                     word=noise_room.UNSTATED[noise.source[k]],
                 )
@@ -1147,9 +1162,9 @@ def loop_remarks(found: DiscoveryResult) -> Notes:
     if not found.written and found.gain is not None:
         remarks.append(Remark("unwritten", curve=not found.effects, gain=found.gain.mean, se=found.gain.se))
     remarks += preference.leader_remarks(found.alternatives_held_out, found.settings.prefer)
-    settled, asked = found.replicates, found.settings.replicates
-    if settled < 0.9 * asked:
-        remarks.append(Remark("lost_replicates", settled=settled, asked=asked))
+    settled, replicates_asked = found.replicates, found.settings.replicates
+    if settled < 0.9 * replicates_asked:
+        remarks.append(Remark("lost_replicates", settled=settled, asked=replicates_asked))
     if 1 / (1 + settled) > min(found.settings.shares.values()):
         remarks.append(Remark("too_few_replicates", settled=settled))
     return tuple(remarks)

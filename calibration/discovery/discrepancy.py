@@ -75,10 +75,10 @@ def locate_discrepancy(left: Diagnosis, bases: Bases, included: np.ndarray) -> D
     lacks = [j for j in same_kind if not bases_room.is_channel_place(names[j][0]) and deviate[j] > deviate[k] - ALIKE]
     k = max(lacks, key=lambda j: deviate[j]) if lacks else k
     place = names[k][0]
-    over = [j for j in same_kind if names[j][0] == place and names[j][1] != bases_room.CONDITIONS]
-    j = k if for_a_while else max(over, key=lambda j: deviate[j])
+    place_columns = [j for j in same_kind if names[j][0] == place and names[j][1] != bases_room.CONDITIONS]
+    j = k if for_a_while else max(place_columns, key=lambda j: deviate[j])
     if names[j][1] in bases_room.VARIABLES:
-        smoothly = [i for i in over if bases_room.window_from_name(names[i][1]) is None]
+        smoothly = [i for i in place_columns if bases_room.window_from_name(names[i][1]) is None]
         evidence = {i: fit_smooth_curve(left.linear, *names[i], included).evidence for i in smoothly}
         j = max(smoothly, key=lambda i: evidence[i] - INDIRECT * (names[i][1] == "voltage"))
     places = dict.fromkeys(names[i][0] for i in same_kind)

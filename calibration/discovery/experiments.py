@@ -74,8 +74,8 @@ class PredictedReadings:
 
     def apart(self, a: int, b: int, *experiments: str) -> float:
         """Expected separation of two alternatives if all of these experiments are carried out [σ]."""
-        where = predicted.reading_spans(self.experiments)
-        spans = [where[e] for e in experiments]
+        run_spans = predicted.reading_spans(self.experiments)
+        spans = [run_spans[e] for e in experiments]
         columns = np.concatenate([np.flatnonzero(self.exists[k]) + k.start for k in spans])
         d = self.value[a, columns] - self.value[b, columns]
         squares = [d @ np.linalg.solve(_covariance(self.half[x, columns], self.sd[columns]), d) for x in (a, b)]
@@ -224,13 +224,15 @@ def _predict_alternatives(
         def readings(x: Array) -> tuple[Any, predicted.MenuPrediction]:
             return predicted.predict_readings(robot(x[: wide.size]), batch, unknowns + x[wide.size :], solved)
 
-        (acts, every, left), found = jax.jacfwd(readings, has_aux=True)(
+        (acts, all_readings, left), roots = jax.jacfwd(readings, has_aux=True)(
             jnp.concatenate([wide, jnp.zeros(unknowns.shape[1])])
         )
-        slopes = predicted.arrange_readings(batch, [a[:, : wide.size] for a in acts], implicit_slopes(every, left))
+        slopes = predicted.arrange_readings(
+            batch, [a[:, : wide.size] for a in acts], implicit_slopes(all_readings, left)
+        )
         half = jnp.concatenate([solve_lower(informed.T @ informed, slopes[:, : z.size].T).T, slopes[:, z.size :]], 1)
-        exists = found.exists & jnp.all(jnp.isfinite(half), 1) & jnp.isfinite(found.value)
-        return dataclasses.replace(found, exists=exists), half
+        exists = roots.exists & jnp.all(jnp.isfinite(half), 1) & jnp.isfinite(roots.value)
+        return dataclasses.replace(roots, exists=exists), half
 
     return jax.vmap(predict_alternative)(which, z, informed)
 
@@ -252,8 +254,8 @@ def predict_menu(space: CandidateSpace, candidates: Mapping[str, Candidate], set
     z = jnp.asarray(np.stack([c.z for c in alternatives]))
     informed = jnp.stack(
         [
-            equipped.observe.at(equipped, c.z, mine)[1][informative_residuals(equipped.data)]
-            for c, mine in zip(alternatives, indices, strict=True)
+            equipped.observe.at(equipped, c.z, index_of_set)[1][informative_residuals(equipped.data)]
+            for c, index_of_set in zip(alternatives, indices, strict=True)
         ]
     )
     within = reach_of_space(space, space.bare.robot(jnp.asarray(alternatives[0].z[: space.free])))
@@ -264,12 +266,15 @@ def predict_menu(space: CandidateSpace, candidates: Mapping[str, Candidate], set
         )
     )
     predictions, half = jax.tree.map(lambda x: np.asarray(x)[: len(names)], (predictions, half))
-    experiments, kept = _possible_experiments(all_experiments, predictions, within, settings)
+    experiments, possible_predictions = _possible_experiments(all_experiments, predictions, within, settings)
     medians = np.median(np.asarray(space.equipped.data.sd), 0)
     sd = predicted.reading_sds(experiments, dict(zip(shown_channels, medians, strict=True)))
-    value, half = np.nan_to_num(predictions.value[:, kept]), np.nan_to_num(half[:, kept])
+    value, half = (
+        np.nan_to_num(predictions.value[:, possible_predictions]),
+        np.nan_to_num(half[:, possible_predictions]),
+    )
     return PredictedReadings(
-        tuple(names), experiments, value, half, sd, np.all(predictions.exists, 0)[kept], settings
+        tuple(names), experiments, value, half, sd, np.all(predictions.exists, 0)[possible_predictions], settings
     )
 
 
@@ -285,7 +290,7 @@ def _possible_experiments(
     runs = [e for e in experiments if isinstance(e, menu.ProposedRuns)]
     ends = dict(zip((r.name for r in runs), np.cumsum([len(r.voltage) for r in runs]).tolist(), strict=True))
     possible_experiments: list[menu.Experiment] = []
-    kept: list[np.ndarray] = []
+    possible_predictions: list[np.ndarray] = []
     for e in experiments:
         rows = np.ones(predicted.reading_count(e), bool)
         if isinstance(e, menu.ProposedRuns):
@@ -300,8 +305,8 @@ def _possible_experiments(
             rows = np.zeros(len(rows), bool)
         if rows.any():
             possible_experiments.append(e)
-        kept.append(rows)
-    return tuple(possible_experiments), np.concatenate(kept)
+        possible_predictions.append(rows)
+    return tuple(possible_experiments), np.concatenate(possible_predictions)
 
 
 # --- the choice -------------------------------------------------------------------------------------
@@ -346,9 +351,9 @@ def choose_experiment(seen: PredictedReadings) -> Proposal:
             (NONE,), Remark("nothing_tells", names=seen.names, sigma=seen.settings.worth), (), 0.0, False, table
         )
     by_name = {e.name: e for e in seen.experiments}
-    what = Remark("carry_out", experiments=tuple(by_name[name] for name in plan.experiments))
+    instruction = Remark("carry_out", experiments=tuple(by_name[name] for name in plan.experiments))
     return Proposal(
-        plan.experiments, what, plan.separates, min(plan.told), plan.smallest >= seen.settings.apart, table
+        plan.experiments, instruction, plan.separates, min(plan.told), plan.smallest >= seen.settings.apart, table
     )
 
 
@@ -368,7 +373,8 @@ def denser_runs_instruction(place: str, variable: str, within: Reach, by_duty: b
     payload = max(u.payloads[-1] for u in within.used)
     step, angle, mass = (menu.step_of_settings(x, SERIES - 1) for x in (high - low, slope, payload))
     low, high, slope, payload = (
-        menu.last_setting(x, by) for x, by in ((low, step), (high, step), (slope, angle), (payload, mass))
+        menu.last_setting(x, step_size)
+        for x, step_size in ((low, step), (high, step), (slope, angle), (payload, mass))
     )
     low = low or step
     return Remark(

@@ -78,11 +78,11 @@ def found_effects(
     others = [base] if len(best.effects) == 1 else refit_without_each(space, best, settings, found.ladder)
     gains = [2 * (c.cost - best.cost) for c in others]
     null, excess = np.asarray(test.null.single), excess_misfit(space, base)
-    listed = []
+    effects = []
     for slot, members in enumerate(found.members):
         effect = space.library[members[0]]
         words, source = equation_and_source(effect)
-        listed.append(
+        effects.append(
             FoundEffect(
                 name=effect.name,
                 members={name: _class_member(space, best, found, slot, name) for name in members},
@@ -98,7 +98,7 @@ def found_effects(
                 share=share_of_excess(excess, float(gains[slot])),
             )
         )
-    return tuple(listed)
+    return tuple(effects)
 
 
 def _effect_parameters(
@@ -146,29 +146,29 @@ def unnamed_discrepancy(
     beside: BaseCurve, where: DiscrepancyLocation, p_value: float, rows: int
 ) -> UnnamedDiscrepancy:
     """Result entry of a discrepancy without a name. The curve and the errors of rows come from the same fit."""
-    found, linear, lacks = beside.curve, beside.diagnosis.linear, None
+    curve, linear, lacks = beside.curve, beside.diagnosis.linear, None
     happens = bases.window_from_name(where.variable)
-    x, way = linear.curve_variable(found.balance, where.variable if happens is None else happens.axis)
-    if found.defect is not None:
-        lacks = balance_error_by_row(linear, found.balance)
+    x, way = linear.curve_variable(curve.balance, where.variable if happens is None else happens.axis)
+    if curve.defect is not None:
+        lacks = balance_error_by_row(linear, curve.balance)
         turn = 2 * np.pi if where.variable in bases.ORDERS else None
-        lacks = BalanceError(np.interp(x, found.grid, found.curve, period=turn) + way * lacks.value, lacks.sd)
+        lacks = BalanceError(np.interp(x, curve.grid, curve.curve, period=turn) + way * lacks.value, lacks.sd)
     return UnnamedDiscrepancy(
         **dataclasses.asdict(where),
-        unit=found.unit,
+        unit=curve.unit,
         families=(where.family,),
         window=None if happens is None else dataclasses.asdict(happens),
-        effect=found.effect,
+        effect=curve.effect,
         p_value=p_value,
-        score=float(found.chi2[0] - found.chi2[1]),
+        score=float(curve.chi2[0] - curve.chi2[1]),
         score_free_in_each_run=where.explained if where.variable in bases.ORDERS else None,
-        at=found.grid,
-        value=found.curve,
-        sd=found.sd,
+        at=curve.grid,
+        value=curve.curve,
+        sd=curve.sd,
         over=None if lacks is None else x[:rows],
         defect=None if lacks is None else lacks.value[:rows],
         defect_sd=None if lacks is None else lacks.sd[:rows],
-        proposal=found.proposal,
+        proposal=curve.proposal,
     )
 
 
@@ -274,11 +274,11 @@ def effect_scores(space: CandidateSpace, scores: ScoreTable, settings: Settings)
     """Score of each effect at its best shape and a plausible amplitude, strongest first. Equal scores are sorted by
     name.
     """
-    listed = []
+    score_list = []
     for effect in space.library.effects:
         amplitude, explained = _plausible_amplitude_and_score(space, effect, scores, settings)
         m = space.library.best_instance(effect.name, np.asarray(scores.single))
-        listed.append(
+        score_list.append(
             EffectScore(
                 name=effect.name,
                 balance=effect.balance,
@@ -287,38 +287,38 @@ def effect_scores(space: CandidateSpace, scores: ScoreTable, settings: Settings)
                 sigmas_per_prior_sd=float(scores.left[m]),
             )
         )
-    return tuple(sorted(listed, key=lambda s: (-round(s.score, 9), s.name)))
+    return tuple(sorted(score_list, key=lambda s: (-round(s.score, 9), s.name)))
 
 
 def rank_library(space: CandidateSpace, left: Diagnosis, settings: Settings) -> EffectRanking:
     """Ranking of the library by the share of the base's misfit that each effect alone would explain."""
     test = left.test
-    listed = _rank_effects(space, left.scores, settings)
-    return EffectRanking(test.rejected, test.p_value, test.threshold("single") ** 2, listed)
+    ranking = _rank_effects(space, left.scores, settings)
+    return EffectRanking(test.rejected, test.p_value, test.threshold("single") ** 2, ranking)
 
 
 def rank_effects_by_weak_form(space: CandidateSpace, known: WeakFormScreening, settings: Settings) -> EffectRanking:
     """Ranking of the effects by the equations of a log in weak form, before any simulation."""
     p = single_p_value(float(np.max(known.scores.single**2)), known.null)
     chance = float(np.quantile(known.null, 1 - settings.family_wise_error, method="higher")) ** 2
-    listed = _rank_effects(space, known.scores, settings)
+    ranking = _rank_effects(space, known.scores, settings)
     fit = next((c for c in known.alone if c.plausible), known.base)
-    moved = {} if fit is None else parameter_shifts(space, fit.z, fit.z, fit.sd)
-    parameters = {name: (shift.after, shift.sd_after) for name, shift in moved.items()}
-    return EffectRanking(p <= settings.family_wise_error, p, chance, listed, known.windows, parameters)
+    shifts = {} if fit is None else parameter_shifts(space, fit.z, fit.z, fit.sd)
+    parameters = {name: (shift.after, shift.sd_after) for name, shift in shifts.items()}
+    return EffectRanking(p <= settings.family_wise_error, p, chance, ranking, known.windows, parameters)
 
 
 def _rank_effects(space: CandidateSpace, scores: ScoreTable, settings: Settings) -> tuple[RankedEffect, ...]:
     """Effects sorted by score. Effects that would supply power come last."""
-    listed = []
+    ranking = []
     for s in effect_scores(space, scores, settings):
         effect = space.library[s.name]
         sd = amplitude_unit(effect) / max(s.sigmas_per_prior_sd, 1e-300)
         unit = amplitude_of(effect).spec.unit
         # as in `candidates.supplying_effects`
         supplies = space.bare.observe.long and effect.dissipative and s.amplitude < 0
-        listed.append(RankedEffect(s.name, effect.family(), unit, s.score, s.amplitude, sd, supplies))
-    return tuple(sorted(listed, key=lambda e: e.supplies))
+        ranking.append(RankedEffect(s.name, effect.family(), unit, s.score, s.amplitude, sd, supplies))
+    return tuple(sorted(ranking, key=lambda e: e.supplies))
 
 
 def _plausible_amplitude_and_score(
@@ -326,10 +326,10 @@ def _plausible_amplitude_and_score(
 ) -> tuple[float, float]:
     """Best amplitude within plausible limits [prior sds], and the decrease of χ² that it explains [σ²]."""
     m = space.library.best_instance(effect.name, np.asarray(scores.single))
-    wanted, left = float(scores.amplitude[m]), float(scores.left[m])
+    amplitude_wanted, score = float(scores.amplitude[m]), float(scores.left[m])
     low = max(-settings.plausible, amplitude_of(effect).spec.bounds[0] / amplitude_unit(effect))
-    amplitude = min(max(wanted, low), settings.plausible)
-    return amplitude, float(scores.single[m] ** 2 - ((wanted - amplitude) * left) ** 2)
+    amplitude = min(max(amplitude_wanted, low), settings.plausible)
+    return amplitude, float(scores.single[m] ** 2 - ((amplitude_wanted - amplitude) * score) ** 2)
 
 
 def invisible_effects(space: CandidateSpace, scores: ScoreTable, settings: Settings) -> Names:
@@ -385,20 +385,23 @@ def readings_of_rows(
 
     def fitted_reading(fitted: FittedProblem) -> np.ndarray:
         observation = fitted.observation()
-        lost = fitted.problem.observe.unreachable(np.asarray(observation.status))[:rows, None]
-        return np.where(lost, np.nan, np.asarray(observation.reading)[:rows])
+        unreachable = fitted.problem.observe.unreachable(np.asarray(observation.status))[:rows, None]
+        return np.where(unreachable, np.nan, np.asarray(observation.reading)[:rows])
 
     def held_out_reading(fitted: FittedProblem, masks: list[np.ndarray]) -> np.ndarray:
         return predict_unseen(fitted.problem, fitted.z, masks, fitted.active).reading
 
-    held, labels = {}, {}
-    for kind, by in kinds.items():
-        masks = list(by.values())
+    values, labels = {}, {}
+    for kind, blocks_by_name in kinds.items():
+        masks = list(blocks_by_name.values())
         first = held_out_reading(before, masks) if known_before is None else known_before[kind]
         later = first
         if after is not None:
             later = held_out_reading(after, masks) if known_after is None else known_after[kind]
-        held[kind], labels[kind] = (first, later), tuple(by)
-    stated, fitted = fitted_reading(dataclasses.replace(before, z=np.zeros_like(before.z))), fitted_reading(before)
+        values[kind], labels[kind] = (first, later), tuple(blocks_by_name)
+    stated_readings, fitted = (
+        fitted_reading(dataclasses.replace(before, z=np.zeros_like(before.z))),
+        fitted_reading(before),
+    )
     later = fitted if after is None else fitted_reading(after)
-    return ReadingsOfRows(runs.measured(), sd[:rows], stated, fitted, later, held, labels)
+    return ReadingsOfRows(runs.measured(), sd[:rows], stated_readings, fitted, later, values, labels)

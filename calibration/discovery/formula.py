@@ -90,8 +90,8 @@ class Monomial:
         return tuple(self.ratios[k].of for k, _ in self.factors)
 
     def __str__(self) -> str:
-        over = ((self.ratios[k], p) for k, p in self.factors)
-        return " ".join(f"({r.symbol}/{r.value})" + (f"^{p:g}" if p != 1 else "") for r, p in over)
+        ratio_powers = ((self.ratios[k], p) for k, p in self.factors)
+        return " ".join(f"({r.symbol}/{r.value})" + (f"^{p:g}" if p != 1 else "") for r, p in ratio_powers)
 
 
 def monomial_dictionary(ratios: np.ndarray, kinds: tuple[Ratio, ...] = RATIOS) -> dict[Monomial, np.ndarray]:

@@ -15,26 +15,26 @@ def headline(said: VerdictSummary, others: Sequence[tuple[float, VerdictSummary]
     Args:
         others: factor on the noise, and verdict, of each other noise level.
     """
-    every = [said, *(summary for _, summary in others)]
+    sentences = [said, *(summary for _, summary in others)]
     factors = tuple(sorted([1.0, *(factor for factor, _ in others)]))
-    if len({_verdict_without_claim(s) for s in every}) > 1:
+    if len({_verdict_without_claim(s) for s in sentences}) > 1:
         return Headline("open", (), factors)
     if _verdict_without_claim(said):
         return Headline(said.verdict, (), factors)
-    laws, _ = _shared_claims([[m.names for m in s.missing if m.established] for s in every])
+    laws, _ = _shared_claims([[m.names for m in s.missing if m.established] for s in sentences])
     if laws:
         alone = all(len(names) == 1 for names in laws) and not any(
-            m.values or len(m.families) > len(m.names) for s in every for m in s.missing
+            m.values or len(m.families) > len(m.names) for s in sentences for m in s.missing
         )
         effects_of_laws = [
             next(m for m in said.missing if m.established and set(m.names) & set(names)) for names in laws
         ]
         families, values = tuple(m.families for m in effects_of_laws), tuple(m.values for m in effects_of_laws)
         return Headline("named" if alone else "class", laws, factors, (), families, values)
-    mechanisms, shared = _shared_claims([_claimed_families(s) for s in every])
+    mechanisms, shared = _shared_claims([_claimed_families(s) for s in sentences])
     if mechanisms:
         return Headline("mechanism", mechanisms, factors, shared)
-    places, shared = _shared_claims([_claimed_equations(s) for s in every])
+    places, shared = _shared_claims([_claimed_equations(s) for s in sentences])
     return Headline("place", places, factors, shared)
 
 
@@ -73,9 +73,9 @@ def _shared_claims(
     for claim in claims[0]:
         alike = [[other for other in those if set(other) & set(claim)] for those in claims[1:]]
         if all(alike):
-            every = dict.fromkeys([*claim, *(n for those in alike for other in those for n in other)])
+            effect_names = dict.fromkeys([*claim, *(n for those in alike for other in those for n in other)])
             shared = [n for n in claim if all(any(n in o for o in those) for those in alike)]
-            ordered_names = (*shared, *(n for n in every if n not in shared))
+            ordered_names = (*shared, *(n for n in effect_names if n not in shared))
             if not any(set(ordered_names) <= set(other) for other in counts):
                 counts[ordered_names] = len(shared)
     largest_claims = {c: n for c, n in counts.items() if not any(set(c) < set(other) for other in counts)}

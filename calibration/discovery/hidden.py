@@ -107,8 +107,8 @@ def _add_experiment(
     k = space.free + slot
     move = what.amplitude / amplitude_unit(space.library[what.name]) / settings.width - joint.z[k]
     z = joint.z + covariance[:, k] / covariance[k, k] * move
-    moved = dataclasses.replace(joint, z=z, cost=joint.cost + 0.5 * move**2 / covariance[k, k])
-    predicted_menu = experiments.predict_menu(space, {"without": best, "with": moved}, settings)
+    shifted_fit = dataclasses.replace(joint, z=z, cost=joint.cost + 0.5 * move**2 / covariance[k, k])
+    predicted_menu = experiments.predict_menu(space, {"without": best, "with": shifted_fit}, settings)
     if not predicted_menu.experiments:
         return what
     first = experiments.rank_experiments(predicted_menu)[0]

@@ -71,9 +71,9 @@ class DiscrepancyLocation:
         """Equation and driving variable, in the words of `Effect.family`."""
         happens = bases.window_from_name(self.variable)
         variable = self.variable if happens is None else happens.axis
-        what = bases.place_in_words(self.place) if self.channel else EQUATION[self.balance]
+        subject = bases.place_in_words(self.place) if self.channel else EQUATION[self.balance]
         drivers = {name: v.driver for name, v in EVERY_VARIABLE.items() if v.driver}
         drivers |= {"current": "load" if self.balance in OF_LOAD else "current"}
         drivers |= {"payload": "load", "slope": "demand" if self.balance == "slip" else "slope"}
         drivers |= {"voltage": "duty"} if self.by_duty else {}
-        return f"{what} that changes with {drivers.get(variable, variable)}"
+        return f"{subject} that changes with {drivers.get(variable, variable)}"

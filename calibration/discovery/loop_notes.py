@@ -175,11 +175,11 @@ class NameSupport:
         Args:
             numbers: number of each row.
         """
-        named = (
+        numbered = (
             t if t.row is None or t.what == "run" else dataclasses.replace(t, row=int(numbers[t.row - 1]))
             for t in self.tests
         )
-        return dataclasses.replace(self, tests=tuple(named))
+        return dataclasses.replace(self, tests=tuple(numbered))
 
 
 class AlternativeValue(NamedTuple):

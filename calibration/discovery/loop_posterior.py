@@ -88,14 +88,14 @@ def _coordinate_groups(
         shape = shape_of(effect)
         if shape is None:
             continue
-        value, spread, turned, low, high = shape_scales(shape)
+        value, spread, angle_sd, low, high = shape_scales(shape)
         log = spread > 0
         of_shape = _clipped_parameters((f"effects.{name}.{shape.name}",), [shape.spec], np.zeros(1))
         bounds = (math.log(low) if low > 0 else -math.inf, math.log(high)) if log else (-math.inf, math.inf)
         parts.append(
             dataclasses.replace(
                 of_shape, mean=z[p + slots + slot, None], location=np.array([math.log(value) if log else value]),
-                spread=np.array([spread if log else turned]), low=np.array([bounds[0]]), high=np.array([bounds[1]]),
+                spread=np.array([spread if log else angle_sd]), low=np.array([bounds[0]]), high=np.array([bounds[1]]),
                 kinds=(LOG if log else ANGLE,),
             )
         )  # fmt: skip

@@ -62,27 +62,41 @@ def find_mechanism(
         predicted: hold-out predictions of fits that are already known.
     """
     ladder = simulate_leading_families(space, base, ladder, settings)
-    best, own = _best_by_family(space, ladder), _families_of_location(beside.where)
+    best, location_families = _best_by_family(space, ladder), _families_of_location(beside.where)
     if space.bare.observe.long:  # fits of curves take long
         by_curve = beside.where.explained - OF_CURVE
     else:
         by_curve = beside.curve.chi2[0] - beside.curve.chi2[1] - OF_CURVE
     pairs = _explained_by_family(space, base, ladder, best)
     by_effects = {family: pair.explained for family, pair in pairs.items()}
-    explained = by_effects | {own[0]: max(by_curve, by_effects.get(own[0], 0.0))}
+    explained = by_effects | {location_families[0]: max(by_curve, by_effects.get(location_families[0], 0.0))}
     most = max(explained.values())
     within = max(settings.same, settings.form**2 * most)
     alike = sorted((f for f in explained if explained[f] >= most - within), key=lambda f: -explained[f])
     # Families that the curve cannot separate from its own may predict better by an effect.
-    over = [f for f in own if f not in alike and explained[alike[0]] == by_curve]
-    by_name = [f for f in (*alike, *over) if f in best and (space.bare.observe.long or by_effects[f] >= HALF * most)]
-    blocks = [mask for by in blocks_room.predictable_blocks(runs, space.bare).values() for mask in by.values()]
+    other_families = [f for f in location_families if f not in alike and explained[alike[0]] == by_curve]
+    by_name = [
+        f
+        for f in (*alike, *other_families)
+        if f in best and (space.bare.observe.long or by_effects[f] >= HALF * most)
+    ]
+    blocks = [
+        mask
+        for blocks_by_name in blocks_room.predictable_blocks(runs, space.bare).values()
+        for mask in blocks_by_name.values()
+    ]
     mechanisms: list[Mechanism] = []
     excess = excess_misfit(space, base)
-    curve = () if space.bare.observe.long or own[0] in by_name or own[0] not in alike else own[:1]
+    curve = (
+        ()
+        if space.bare.observe.long or location_families[0] in by_name or location_families[0] not in alike
+        else location_families[:1]
+    )
     for leader in (*by_name[:1], *curve, *by_name[1:]):
         refuted = leader in by_name and _refuted_by_curve(space, base, best[leader], left, bases, settings)
-        others = [*alike, *own] if refuted else alike if leader in by_name else [*alike, *over]
+        others = (
+            [*alike, *location_families] if refuted else alike if leader in by_name else [*alike, *other_families]
+        )
         families = (leader, *(f for f in others if f != leader))
         families = tuple(dict.fromkeys((*families, *_same_driver_elsewhere(leader, beside.where))))
         if leader in by_name:
@@ -195,9 +209,9 @@ def _same_driver_elsewhere(family: str, where: DiscrepancyLocation) -> Names:
     """Families with the same driving variable in the other equations that the data cannot separate."""
     places = [p for p in where.alike if not bases_room.is_channel_place(p)]  # instruments are excluded
     equations = [dataclasses.replace(where, place=p).family.partition(" that ") for p in places]
-    what, joint, driver = family.partition(" that ")
+    subject, joint, driver = family.partition(" that ")
     alike = dict.fromkeys(equation for equation, *_ in equations)
-    return tuple(f"{other}{joint}{driver}" for other in alike) if what in alike else ()
+    return tuple(f"{other}{joint}{driver}" for other in alike) if subject in alike else ()
 
 
 def _refuted_by_curve(
@@ -258,11 +272,15 @@ def _hold_out_gain_of_curve(
     """
     curve, kinds = beside.curve, blocks_room.predictable_blocks(runs, space.bare)
     predictions = {
-        kind: predict_unseen(curve.problem, curve.z, list(by.values())).reading for kind, by in kinds.items()
+        kind: predict_unseen(curve.problem, curve.z, list(blocks_by_name.values())).reading
+        for kind, blocks_by_name in kinds.items()
     }
     changed = _changed_readings(space, runs, _simulated_reading(space, base), curve.reading)
     score = _hold_out_score(space, runs, predictions)
-    in_seen_range = {kind: _within_seen_range(space, beside, list(by.values())) for kind, by in kinds.items()}
+    in_seen_range = {
+        kind: _within_seen_range(space, beside, list(blocks_by_name.values()))
+        for kind, blocks_by_name in kinds.items()
+    }
     inside = {kind: np.where(in_seen_range[kind][:, None], x, np.nan) for kind, x in score.by_kind.items()}
     score = dataclasses.replace(score, by_kind=inside)
     return _gain_over_changed(score, cached_hold_out_score(space, runs, base, predicted), changed)
@@ -275,11 +293,11 @@ def _within_seen_range(space: CandidateSpace, beside: BaseCurve, masks: Sequence
     Args:
         masks: mask of the rows of each block.
     """
-    where, linear, rows = beside.where, beside.left.linear, len(masks[0])
+    location, linear, rows = beside.where, beside.left.linear, len(masks[0])
     in_range = np.ones(rows, bool)
-    if where.variable not in bases_room.VARIABLES:
+    if location.variable not in bases_room.VARIABLES:
         return in_range
-    x = np.asarray(linear.curve_variable(where.place, where.variable)[0], float)
+    x = np.asarray(linear.curve_variable(location.place, location.variable)[0], float)
     if len(x) != len(space.included):  # turns, with different sides
         return in_range
     for mask in masks:
@@ -327,10 +345,10 @@ def _changed_readings(space: CandidateSpace, runs: Runs, before: np.ndarray, aft
     """
     rows = len(runs)
     sd, counts = np.asarray(space.bare.data.sd)[:rows], space.weight[:rows] > 0
-    moved = np.where(counts, np.abs(after[:rows] - before[:rows]) / sd, 0.0)
-    moved = np.nan_to_num(moved)
-    most = np.max(np.sqrt(np.sum(moved**2, 0) / np.maximum(counts.sum(0), 1)))
-    return np.asarray(counts & (moved >= CHANGED * most))
+    reading_changes = np.where(counts, np.abs(after[:rows] - before[:rows]) / sd, 0.0)
+    reading_changes = np.nan_to_num(reading_changes)
+    most = np.max(np.sqrt(np.sum(reading_changes**2, 0) / np.maximum(counts.sum(0), 1)))
+    return np.asarray(counts & (reading_changes >= CHANGED * most))
 
 
 # --- hold-out blocks ------------------------------------------------------------------------------------

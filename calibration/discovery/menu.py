@@ -234,10 +234,13 @@ def spaced_settings(least: float, most: float, count: int) -> tuple[float, ...]:
 def _mass_difference(robot: Robot, at: Array) -> Array:
     """Mass of the loaded robot minus the mass that its file states."""
     still = State(*(jnp.zeros(()),) * 4)
-    stated = without_effects_of(robot, "mass")
+    plain_robot = without_effects_of(robot, "mass")
     loads = [Conditions(configuration=k.astype(int), payload=m) for k, m in at]
     return jnp.stack(
-        [balances.begin_signals(robot, c, still).mass - balances.begin_signals(stated, c, still).mass for c in loads]
+        [
+            balances.begin_signals(robot, c, still).mass - balances.begin_signals(plain_robot, c, still).mass
+            for c in loads
+        ]
     )
 
 
@@ -313,14 +316,14 @@ def _combined_runs(
     torques: Sequence[float] = (0.0,),
 ) -> ProposedRuns:
     """Runs at every combination of slopes, voltages and brake torques."""
-    each = list(itertools.product(dict.fromkeys(slopes), dict.fromkeys(voltages), dict.fromkeys(torques)))
-    slope, voltage, torque = (tuple(x) for x in zip(*each, strict=True))
-    stated = (at.configuration,) if at is not None else ()
+    combinations = list(itertools.product(dict.fromkeys(slopes), dict.fromkeys(voltages), dict.fromkeys(torques)))
+    slope, voltage, torque = (tuple(x) for x in zip(*combinations, strict=True))
+    fixed = (at.configuration,) if at is not None else ()
     return ProposedRuns(
-        ", ".join((name, *stated)), (*(kinds or (name,)), *stated), doing, setup, voltage, slope,
-        (payload,) * len(each),
+        ", ".join((name, *fixed)), (*(kinds or (name,)), *fixed), doing, setup, voltage, slope,
+        (payload,) * len(combinations),
         tuple(c for c in (read or reach.measured) if c in reach.measured), 0 if at is None else at.index, sides,
-        brake, math.inf if at is None else at.steepest, steepest, where=", ".join(stated), motors=reach.motors,
+        brake, math.inf if at is None else at.steepest, steepest, where=", ".join(fixed), motors=reach.motors,
         torque=torque if reach.torques else (),
     )  # fmt: skip
 
@@ -404,9 +407,14 @@ def experiment_menu(reach: Reach) -> tuple[Experiment, ...]:
     `possible_runs`.
     """
     if reach.imposed != "voltage" or not reach.has_ground:
-        runs: tuple[ProposedRuns, ...] = tuple(r for used in reach.used for r in _shaft_runs(reach, used))
+        runs: tuple[ProposedRuns, ...] = tuple(
+            r for used_conditions in reach.used for r in _shaft_runs(reach, used_conditions)
+        )
     else:
-        runs = (*_motor_runs(reach), *(r for used in reach.used for r in _travel_runs(reach, used)))
+        runs = (
+            *_motor_runs(reach),
+            *(r for used_conditions in reach.used for r in _travel_runs(reach, used_conditions)),
+        )
     return (*calibration_acts(reach), *(r for r in runs if r.channels))
 
 
@@ -421,13 +429,13 @@ def _shaft_runs(reach: Reach, used: UsedConditions) -> tuple[ProposedRuns, ...]:
     top = round_significant(1.3 * high) if 1.3 * high < allowed else floor_significant(max(allowed, high))
     between = 0.5 * (sizes[0] + high) if top > high else 0.5 * (low + high)
     others = tuple(sorted({round_significant(low), round_significant(between), top}))
-    both = any(x < 0 for x in levels) and any(x > 0 for x in levels)
+    has_both_signs = any(x < 0 for x in levels) and any(x > 0 for x in levels)
     torques = other_torques(reach.torques)
     way = -1.0 if levels[-1] > 0 else 1.0  # also of a brake, which acts against the rotation
     experiments = [
         _combined_runs(reach, others_of[reach.imposed], "run", kinds=("other voltages",), at=used,
               voltages=others),
-        *([] if both else [
+        *([] if has_both_signs else [
             _combined_runs(reach, "reverse", "other way", at=used, voltages=[way * x for x in (sizes[0], sizes[-1])],
                   torques=[0.0, *(way * x for x in torques[1:2])])
         ]),

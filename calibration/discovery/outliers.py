@@ -211,8 +211,8 @@ def screen_outliers(base: BaseFit, bases_at: Callable[[BaseFit], Bases], runs: R
         bases_at: function that returns the bases of curves at a fit of the base.
         runs: the runs.
     """
-    where = runs.source
-    screened = _exclude_outliers(base, bases_at, settings, where)
+    source = runs.source
+    screened = _exclude_outliers(base, bases_at, settings, source)
     cluster_rows = np.zeros(len(base.space.included), bool)
     cluster_rows[list(screened.outliers)] = True
     together = _common_property(screened, cluster_rows, runs, settings)
@@ -237,9 +237,9 @@ def _common_property(found: Screening, outliers: np.ndarray, runs: Runs, setting
     """Property that the outliers share."""
     rows = len(runs)
     axes = {a: runs[c] for a, c in (("time", "time_s"), ("order", "order")) if runs.has(c)}
-    turned = found.diagnosed[0].turned()
-    if turned is not None:
-        axes["angle of the driving shaft"] = turned[:rows] % (2 * np.pi)
+    turned_rows = found.diagnosed[0].turned()
+    if turned_rows is not None:
+        axes["angle of the driving shaft"] = turned_rows[:rows] % (2 * np.pi)
     levels = {c: runs[c] for c in LEVELS if runs.has(c)}
     included = found.base.space.included
     return find_cluster(outliers[:rows], included[:rows], axes, levels, settings.outlier_error, settings.seed)

@@ -77,11 +77,11 @@ def batch_experiments(experiments: Sequence[Experiment], shown: Names) -> Experi
     runs = [e for e in experiments if isinstance(e, ProposedRuns)]
     set_up = list(dict.fromkeys((r.setup, r.sides) for r in runs))
     several = [(r, len(r.voltage)) for r in runs]
-    each = [jax.tree.map(lambda x: np.atleast_1d(np.asarray(x)), _conditions_of_runs(r)) for r in runs]
+    run_conditions = [jax.tree.map(lambda x: np.atleast_1d(np.asarray(x)), _conditions_of_runs(r)) for r in runs]
     return ExperimentBatch(
         acts=tuple(a.reading for a in acts),
         at=tuple(jnp.asarray(a.at, float) for a in acts),
-        conditions=jax.tree.map(lambda *x: jnp.asarray(np.concatenate(x)), *each),
+        conditions=jax.tree.map(lambda *x: jnp.asarray(np.concatenate(x)), *run_conditions),
         brake=jnp.asarray(np.concatenate([np.full(n, r.brake) for r, n in several])),
         set_up=tuple(set_up),
         which=tuple(k for r, n in several for k in [set_up.index((r.setup, r.sides))] * n),
@@ -110,22 +110,22 @@ def map_over_runs(function: Callable[..., T], robot: Robot, experiments: Experim
     """
     conditions = experiments.conditions
     mass = jax.vmap(lambda k: robot.chassis(k).mass)(conditions.configuration) + conditions.payload
-    stated = jnp.asarray(conditions.total_mass)
-    conditions = dataclasses.replace(conditions, total_mass=jnp.where(jnp.isnan(stated), mass, stated))
+    total_mass = jnp.asarray(conditions.total_mass)
+    conditions = dataclasses.replace(conditions, total_mass=jnp.where(jnp.isnan(total_mass), mass, total_mass))
     braked = jnp.max(experiments.brake, initial=0.0)
-    each = [
+    batch_axes = [
         dataclasses.replace(setup(robot, braked), sides=robot.sides if sides is None else sides)
         for setup, sides in experiments.set_up
     ]
-    which = np.asarray(experiments.which)
+    run_index = np.asarray(experiments.which)
 
     def all_identical(*x: Any) -> bool:  # in all setups
         return all(v is x[0] for v in x)
 
     robots = jax.tree.map(
-        lambda *x: x[0] if all_identical(*x) else jnp.stack([jnp.asarray(v) for v in x])[which], *each
+        lambda *x: x[0] if all_identical(*x) else jnp.stack([jnp.asarray(v) for v in x])[run_index], *batch_axes
     )
-    axes = jax.tree.map(lambda *x: None if all_identical(*x) else 0, *each)
+    axes = jax.tree.map(lambda *x: None if all_identical(*x) else 0, *batch_axes)
     return jax.vmap(function, in_axes=(axes, 0, *[0] * len(own)))(robots, conditions, *own)
 
 
@@ -137,8 +137,8 @@ def predict_readings(
     Returns the readings of each calibration, the readings of each run at the given unknowns, shape (runs, channels),
     the residuals of the equations there, shape (runs, unknowns), and all predictions.
     """
-    acts = tuple(act(robot, at) for act, at in zip(experiments.acts, experiments.at, strict=True))
-    result, _, left = map_over_runs(IMPLICIT.shown, robot, experiments, unknowns, found)
+    acts = tuple(act(robot, arguments) for act, arguments in zip(experiments.acts, experiments.at, strict=True))
+    result, _, residual = map_over_runs(IMPLICIT.shown, robot, experiments, unknowns, found)
     all_readings = jnp.stack([result.reading[c] for c in channels.channel_names(robot.channels)], -1)
     is_held = np.array([experiments.set_up[k][0] is menu.locked for k in experiments.which])
     does = jnp.where(jnp.asarray(is_held), result.status == STALLED, is_done(result.status))
@@ -150,7 +150,7 @@ def predict_readings(
         arrange_readings(experiments, acts, all_readings), exists, does, jnp.asarray(result.adhesion_used),
         jnp.asarray(result.winding_settled), speed,
     )  # fmt: skip
-    return (acts, all_readings, left), predicted_readings
+    return (acts, all_readings, residual), predicted_readings
 
 
 def arrange_readings(
@@ -190,10 +190,10 @@ def reading_sds(experiments: Sequence[Experiment], of_channels: Mapping[str, flo
     """
     sds = [np.zeros(0)]
     for e in experiments:
-        one = (
+        one_sd = (
             [of_channels[e.channel] if e.sd is None else e.sd] * len(e.at)
             if isinstance(e, CalibrationAct)
             else np.tile([of_channels[c] for c in e.channels], len(e.voltage))
         )
-        sds.append(np.asarray(one, float) / math.sqrt(e.repeats))
+        sds.append(np.asarray(one_sd, float) / math.sqrt(e.repeats))
     return np.concatenate(sds)

@@ -70,9 +70,9 @@ class HeldOutScore:
         mean = float(np.nansum(gains) / total)
         # Errors by row, and by block of each kind, because readings of a block share the rows that were left out.
         off = np.nansum(gains, (0, 2)) - mean * counts
-        several = [by for by in self.blocks.values() if len(np.unique(by[by >= 0])) >= fewest]
+        several = [block for block in self.blocks.values() if len(np.unique(block[block >= 0])) >= fewest]
         groups = [np.arange(len(rows)), *several]
-        return Gain(mean, max(_clustered_standard_error(off[rows], by[rows]) for by in groups) / total)
+        return Gain(mean, max(_clustered_standard_error(off[rows], block[rows]) for block in groups) / total)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -90,9 +90,9 @@ class Gain:
 
 def _clustered_standard_error(off: np.ndarray, groups: np.ndarray) -> float:
     """Standard error of a sum whose terms are correlated within groups."""
-    _, which = np.unique(groups, return_inverse=True)
-    count = which.max() + 1
-    sums = np.bincount(which, off)
+    _, cluster_index = np.unique(groups, return_inverse=True)
+    count = cluster_index.max() + 1
+    sums = np.bincount(cluster_index, off)
     return float(np.sqrt(np.sum(sums**2) * count / (count - 1))) if count > 1 else 0.0
 
 
@@ -112,9 +112,9 @@ def score_readings(
     """
     by_kind, blocks = {}, {}
     norm = math.lgamma((FREEDOM + 1) / 2) - math.lgamma(FREEDOM / 2) - 0.5 * math.log(FREEDOM * math.pi)
-    for kind, by in kinds.items():
+    for kind, blocks_by_name in kinds.items():
         block = np.full(len(measured), -1)
-        for k, mask in enumerate(by.values()):
+        for k, mask in enumerate(blocks_by_name.values()):
             block[mask] = k
         off = (reading[kind] - measured) / sd
         off = np.where(np.isfinite(off), off, UNREACHED)
@@ -138,7 +138,10 @@ def score_candidate(space: CandidateSpace, runs: Runs, candidate: Candidate) -> 
     data, rows, kinds = space.equipped.data, len(runs), blocks_room.predictable_blocks(runs, space.bare)
     measured, sd, counts = (np.asarray(x)[:rows] for x in (data.measured, data.sd, space.weight > 0))
     problem, z, active = space.fit_of(candidate.active, candidate.z)
-    reading = {kind: predict_unseen(problem, z, list(by.values()), active).reading for kind, by in kinds.items()}
+    reading = {
+        kind: predict_unseen(problem, z, list(blocks_by_name.values()), active).reading
+        for kind, blocks_by_name in kinds.items()
+    }
     return score_readings(reading, measured, sd, counts, kinds)
 
 

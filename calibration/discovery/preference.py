@@ -75,8 +75,13 @@ def compare_alternatives(
         reading = predict_unseen(problem, z, masks, active).reading
         return np.where(counts, (reading - measured) / sd, np.nan)
 
-    errors = [{kind: residuals_in_sds(c, list(by.values())) for kind, by in kinds.items()} for c in alternatives]
-    held_out = {kind: counts & np.any(list(by.values()), 0)[:, None] for kind, by in kinds.items()}
+    errors = [
+        {kind: residuals_in_sds(c, list(blocks_by_name.values())) for kind, blocks_by_name in kinds.items()}
+        for c in alternatives
+    ]
+    held_out = {
+        kind: counts & np.any(list(blocks_by_name.values()), 0)[:, None] for kind, blocks_by_name in kinds.items()
+    }
     common = {kind: np.all([np.isfinite(e[kind]) for e in errors], 0) for kind in kinds}
 
     def rms(e: Columns, blocks: Sequence[str]) -> float:
@@ -153,8 +158,8 @@ def _classes_with_leader(
     members = dict(zip(best.effects, alike.members, strict=True))
     (new,), (old,) = leader.key - best.key, best.key - leader.key
     members[new] = (new, *(n for n in members.pop(old) if n != new))
-    stated = dict(zip(best.effects, alike.stated, strict=True))
-    stated[new] = stated.pop(old)
+    stated_by_effect = dict(zip(best.effects, alike.stated, strict=True))
+    stated_by_effect[new] = stated_by_effect.pop(old)
     keys = {best.key, *(c.key for c in alike.ladder)}
     missing_fits = [
         tuple(other if n == name else n for n in leader.active)
@@ -165,7 +170,7 @@ def _classes_with_leader(
     fitted = fit_candidates(space, [(w, start_of_fit(space, leader, w, settings)) for w in missing], settings)
     return Classes(
         tuple(members[name] for name in leader.effects),
-        tuple(stated[name] for name in leader.effects),
+        tuple(stated_by_effect[name] for name in leader.effects),
         tuple(
             tuple(dict.fromkeys((*families_of_members(space, members[name]), *others)))
             for name, others in zip(leader.effects, alike.families, strict=True)

@@ -111,19 +111,19 @@ def reach_of_table(robot: Robot, conditions: Conditions, measured: Names) -> Rea
         conditions: conditions of the table's runs, shape (runs,).
         measured: names of the measured channels.
     """
-    which, volts, slope, payload = (
+    configuration_index, volts, slope, payload = (
         np.asarray(x)
         for x in (conditions.configuration, conditions.voltage, conditions.slope_deg, conditions.payload)
     )
     masses = np.asarray([float(c.mass) for c in robot.configurations.members])
     total_mass = conditions.total_mass
-    mass = masses[which] + payload if total_mass is None else np.asarray(total_mass)
-    used = tuple(
+    mass = masses[configuration_index] + payload if total_mass is None else np.asarray(total_mass)
+    settings = tuple(
         UsedConditions(
             name, k, _levels(volts[rows]), _levels(slope[rows]), _levels(payload[rows]), float(mass[rows].max())
         )
         for k, name in enumerate(robot.configurations)
-        if (rows := which == k).any()
+        if (rows := configuration_index == k).any()
     )
     motor, highest = robot.motor, float(volts.max())
     constant, resistance = float(motor.torque_constant), float(motor.resistance)
@@ -139,7 +139,7 @@ def reach_of_table(robot: Robot, conditions: Conditions, measured: Names) -> Rea
     free_speed = max(motor.speed_limit, motor_speed)
     geared = max(min(motor.speed_limit, robot.gearbox.speed_limit), motor_speed)
     return Reach(
-        used, measured, voltage, min(voltage, constant * geared), min(voltage, constant * free_speed), current,
+        settings, measured, voltage, min(voltage, constant * geared), min(voltage, constant * free_speed), current,
         motor_speed, speed, geared, free_speed, motors, resistance, constant, motor.temperature_limit,
         robot.rig.imposed,
         _levels(np.asarray(getattr(conditions, robot.rig.imposed))) if conditions.voltage_follows else (),

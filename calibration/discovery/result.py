@@ -522,8 +522,8 @@ class DiscoveryResult:
         """The answer in a sentence or two. It begins with backlash or compliance that no effect of the library
         explains.
         """
-        lost = (f"{note}." for note in sentences(remarks_with_codes(self.remarks, "lost_motion")))
-        return " ".join((*lost, describe(self.headline)))
+        lost_motion_sentences = (f"{note}." for note in sentences(remarks_with_codes(self.remarks, "lost_motion")))
+        return " ".join((*lost_motion_sentences, describe(self.headline)))
 
     @property
     def verdict_statement(self) -> str:
@@ -592,7 +592,10 @@ class DiscoveryResult:
         fits = dict(zip(("before", "after"), self.errors, strict=True))
         main = next(iter(self.errors_held_out.values()), ())
         fits |= dict(zip(("held_out_before", "held_out_after"), main, strict=False))
-        return {fit: {name: e["rms"] for name, e in by.items() if e["rows"]} for fit, by in fits.items()}
+        return {
+            fit: {name: e["rms"] for name, e in errors_by_channel.items() if e["rows"]}
+            for fit, errors_by_channel in fits.items()
+        }
 
     @property
     def held_by_prior(self) -> Names:

@@ -98,13 +98,15 @@ def scale_library(robot: Robot, conditions: Conditions, library: Library, turned
     if robot.rig.inherits:
         return library
     signals = _operating_signals(robot, _steady_conditions(robot, conditions))
-    nominal, theirs = _nominal_signals()
+    nominal, effect_signals = _nominal_signals()
     sized = {}
     for name, kind in library.items():
         if not effect_applies(kind, robot):
             continue
         sized[name] = _scale_effect(
-            kind, (robot, _signals_at_angle(signals, kind, turned)), (nominal, _signals_at_angle(theirs, kind))
+            kind,
+            (robot, _signals_at_angle(signals, kind, turned)),
+            (nominal, _signals_at_angle(effect_signals, kind)),
         )
     return sized
 
@@ -172,8 +174,8 @@ def _nominal_signals() -> tuple[Robot, Signals]:
     axes = np.meshgrid(
         paper_robots.VOLTAGES_V, paper_robots.SLOPES_DEG, paper_robots.PAYLOADS_KG, (0, 1), indexing="ij"
     )
-    volts, slopes, payloads, which = (a.ravel() for a in axes)
-    return robot, _operating_signals(robot, Conditions(which.astype(int), volts, slopes, payloads))
+    volts, slopes, payloads, configuration_index = (a.ravel() for a in axes)
+    return robot, _operating_signals(robot, Conditions(configuration_index.astype(int), volts, slopes, payloads))
 
 
 def _rms_size(x: object) -> float:
@@ -206,8 +208,8 @@ def _scale_effect(kind: type[Effect], mine: tuple[Robot, Signals], theirs: tuple
     if kind.balance == "sensor":
         share = min(share, _unit_share(grown, mine[0], _scale_to_rated_load(*mine)) / LEAST_SHOWN)
     if amplitude.spec.unit == BALANCES[kind.balance][0]:  # by its own size, even if operating points show none
-        whole = WHOLE[kind.balance]
-        factor = _size_ratio(_rms_size(whole(*mine)), _rms_size(whole(*theirs)))
+        full_scale = WHOLE[kind.balance]
+        factor = _size_ratio(_rms_size(full_scale(*mine)), _rms_size(full_scale(*theirs)))
     elif amplitude.spec.unit != "-":
         factor = _size_ratio(_unit_share(effect, *theirs), share)
     slips = kind.balance == "slip" and amplitude.spec.unit == "-"
@@ -242,14 +244,14 @@ def _scale_to_rated_load(robot: Robot, signals: Signals) -> Signals:
 
 def _unit_share(effect: Effect, robot: Robot, signals: Signals) -> float:
     """Share of the balance that the effect's term has at amplitude one [1/unit of the amplitude]."""
-    one = params.replace(effect, {amplitude_of(effect).name: jnp.asarray(1.0)})
-    robot_with_effect = dataclasses.replace(robot, effects=(one,))
+    unit_effect = params.replace(effect, {amplitude_of(effect).name: jnp.asarray(1.0)})
+    robot_with_effect = dataclasses.replace(robot, effects=(unit_effect,))
 
     def share(s: Signals) -> tuple[jax.Array, jax.Array]:
         reading = next((c.read(robot, s) for c in channels.EVERY if c.name == effect.channel), None)
-        whole = WHOLE[effect.balance](robot, s) if reading is None else reading
+        full_scale = WHOLE[effect.balance](robot, s) if reading is None else reading
         return jnp.asarray(effects_sum(robot_with_effect, s, effect.balance, effect.channel), float), jnp.asarray(
-            whole, float
+            full_scale, float
         )
 
     term, total = jax.vmap(share)(signals)

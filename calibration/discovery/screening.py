@@ -189,9 +189,9 @@ def _first_to_simulate(space: CandidateSpace, order: Sequence[Candidate]) -> lis
     if not sound:
         return list(order[:1])
     of_others = [c for c in sound if families(c) != families(sound[0])]
-    chosen = [sound[0], *of_others[:1], *sound[1:]]
-    chosen = list({c.active: c for c in chosen}.values())[:CONFIRMED]
-    return [*chosen, *(c for c in order[:1] if not c.plausible)]
+    candidates = [sound[0], *of_others[:1], *sound[1:]]
+    candidates = list({c.active: c for c in candidates}.values())[:CONFIRMED]
+    return [*candidates, *(c for c in order[:1] if not c.plausible)]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -261,8 +261,11 @@ def fit_by_regression(
     Args:
         wanted: (active effects, other fit, its diagnosis).
     """
-    regressions = {id(left): LinearisedFits(space, at, left.linear, left.scores, settings) for _, at, left in wanted}
-    return [regressions[id(left)](active) for active, _, left in wanted]
+    regressions = {
+        id(diagnosis): LinearisedFits(space, at, diagnosis.linear, diagnosis.scores, settings)
+        for _, at, diagnosis in wanted
+    }
+    return [regressions[id(diagnosis)](active) for active, _, diagnosis in wanted]
 
 
 def include_likely_effects(

@@ -78,8 +78,8 @@ def search_effects(
     names = _rank_by_score(space, left.scores)
     if not space.bare.observe.long:
         names = names[: _batch_size(space)]
-    at, by = _fit_to_rank_at(space, base, left, bases, settings)
-    rounds = [_fit_sets(space, [(fill_slots([name], settings), at, by) for name in names], settings)]
+    at, rankings = _fit_to_rank_at(space, base, left, bases, settings)
+    rounds = [_fit_sets(space, [(fill_slots([name], settings), at, rankings) for name in names], settings)]
     space = space.with_room(rounds[0].room)
     ladder = list(rounds[0].candidates)
     null = np.asarray(left.test.null.single)
@@ -94,7 +94,7 @@ def search_effects(
         ):
             break
         progress(progress_remark("more effects", best.effects))
-        rounds.append(_extend_set(space, best, diagnosis, at, by, settings))
+        rounds.append(_extend_set(space, best, diagnosis, at, rankings, settings))
         more, space = list(rounds[-1].candidates), space.with_room(rounds[-1].room)
         best = _accept_if_better(_best_plausible(more), ladder, settings)
         ladder += more
@@ -174,7 +174,11 @@ def _fit_sets(
 ) -> ScreenedSets:
     """Fits sets of effects, each in addition to another fit. For long runs they are first screened by regression."""
     if not space.bare.observe.long:
-        return ScreenedSets(tuple(fit_in_addition(space, [(w, at, by.scores) for w, at, by in wanted], settings)))
+        return ScreenedSets(
+            tuple(
+                fit_in_addition(space, [(w, base_fit, ranking.scores) for w, base_fit, ranking in wanted], settings)
+            )
+        )
     return confirm_by_simulation(space, fit_by_regression(space, wanted, settings), settings)
 
 
@@ -195,10 +199,10 @@ def _extend_set(
     sources = {fill_slots([*best.effects, name], settings): (best, left_by_best) for name in names}
     if len(best.effects) == 1 and not at.effects:
         for pair in _best_pairs(space, left.scores):
-            one, swapped = fill_slots(pair, settings), fill_slots(pair[::-1], settings)
-            if one not in sources and swapped not in sources:
-                sources[one] = (at, left)
-    return _fit_sets(space, [(w, at, by) for w, (at, by) in sources.items()], settings)
+            pair_set, swapped = fill_slots(pair, settings), fill_slots(pair[::-1], settings)
+            if pair_set not in sources and swapped not in sources:
+                sources[pair_set] = (at, left)
+    return _fit_sets(space, [(w, at, ranking) for w, (at, ranking) in sources.items()], settings)
 
 
 def _best_pairs(space: CandidateSpace, scores: ScoreTable) -> list[tuple[str, str]]:

@@ -172,10 +172,10 @@ def fit_smooth_surface(
         counts: True for included rows, shape (rows,).
     """
     weight = linear.at_points(counts).astype(float)
-    each, ways = zip(*(linear.curve_variable(balance, v) for v in variables), strict=True)
+    bases, ways = zip(*(linear.curve_variable(balance, v) for v in variables), strict=True)
     sides = [
         legendre.legvander(scale_to_unit_range(x, weight), PRODUCT - 1) * np.exp(-FALL * np.arange(PRODUCT))
-        for x in each
+        for x in bases
     ]
     shapes = ways[0][:, None] * (sides[0][:, :, None] * sides[1][:, None, :]).reshape(linear.points, -1)
     columns = place_signature(linear, balance, shapes)

@@ -144,12 +144,12 @@ def _compare_with_curves(
     curves = _curve_evidence(space, linear, bases, crowded)
     if not curves:
         return NameSupport(True)
-    curve, over = max(curves)
+    curve, best_place = max(curves)
     # Curves are linear at the base, so names get the better of their fit and of their linear gain there.
     fall = max(2 * (base.cost - best.cost), _linear_explanation(space, best, linear, settings))
     names = fall - cost_of_names(space, best, settings)
     if curve - 2 * math.log(len(curves)) > names + settings.preferred:
-        return NameSupport(False, "better curve", best.effects, (over,))
+        return NameSupport(False, "better curve", best.effects, (best_place,))
     return NameSupport(True)
 
 
@@ -163,7 +163,7 @@ def _curve_evidence(
     known_curves = [
         v
         for v in (*bases_room.VARIABLES, *bases_room.ORDERS)
-        if any(v == over for _, over in offered) and _variable_varies(linear, v, included)
+        if any(v == variables for _, variables in offered) and _variable_varies(linear, v, included)
     ]
     curves = []
     for place, variable in offered:
@@ -173,8 +173,8 @@ def _curve_evidence(
     project = Projection(linear)
     for place in sorted(crowded):
         for pair in itertools.combinations([v for v in VARIABLES if v in known_curves], 2):
-            over = fit_smooth_surface(linear, place, pair, included, project)
-            curves.append((over.evidence, PlacedCurve(place, pair)))
+            variables = fit_smooth_surface(linear, place, pair, included, project)
+            curves.append((variables.evidence, PlacedCurve(place, pair)))
     return curves
 
 
@@ -192,12 +192,14 @@ def _linear_explanation(space: CandidateSpace, best: Candidate, linear: Lineariz
     [σ²].
     """
     p, s = space.free, settings.slots
-    chosen = []
+    chosen_places = []
     for slot, name in enumerate(best.active):
         if name:
             instances = np.flatnonzero(space.library.of == space.library.names.index(name))
-            chosen.append(int(instances[np.argmin(np.abs(space.library.at[instances] - best.z[p + s + slot]))]))
-    a, b = Projection(linear)(np.asarray(linear.signatures)[:, chosen])
+            chosen_places.append(
+                int(instances[np.argmin(np.abs(space.library.at[instances] - best.z[p + s + slot]))])
+            )
+    a, b = Projection(linear)(np.asarray(linear.signatures)[:, chosen_places])
     return float(b @ np.linalg.lstsq(a, b, rcond=1e-9)[0])
 
 
@@ -223,13 +225,13 @@ def _compare_with_single_curve(
         )
         if not AdequacyTest(statistics, left.test.null, settings).rejected_with_margin:
             return NameSupport(False, "curve alone", curves=(_curve_of_variable(*names[k]),))
-    where = beside.where
-    if equation_of_place(where.place) in {_equation_of_effect(space, e) for e in best.effects}:
+    location = beside.where
+    if equation_of_place(location.place) in {_equation_of_effect(space, e) for e in best.effects}:
         # A strong curve distorts the base fit, and names then absorb its residuals in the same equation.
         # If the result is highly significant, no closer look is compiled.
         adequate = not left.test.exceeds_margin("chi2", beside.curve.chi2[1])
         if adequate and not beside.diagnosis.test.rejected_with_margin:
-            return NameSupport(False, "curve alone", curves=(_curve_of_variable(where.place, where.variable),))
+            return NameSupport(False, "curve alone", curves=(_curve_of_variable(location.place, location.variable),))
     return NameSupport(True)
 
 
@@ -255,14 +257,14 @@ def _add_curves(
     """
     places = [n[0] for n in bases_room.family_names(bases)]
     barred = np.isin([equation_of_place(p) for p in places], list(without))
-    chosen, columns = list[int](), np.zeros((linear.readings, 0))
+    chosen_curves, columns = list[int](), np.zeros((linear.readings, 0))
     deviate, test = np.array(seen.scores.curve), seen.test
-    while test.rejected_with_margin and len(chosen) < most:
-        chosen.append(int(np.argmax(np.where(barred, -np.inf, deviate))))
-        columns = np.concatenate([columns, family_columns(linear, bases, chosen[-1])], 1)
-        statistics, deviate = statistics_with_columns(linear, bases, columns, [places[k] for k in chosen])
+    while test.rejected_with_margin and len(chosen_curves) < most:
+        chosen_curves.append(int(np.argmax(np.where(barred, -np.inf, deviate))))
+        columns = np.concatenate([columns, family_columns(linear, bases, chosen_curves[-1])], 1)
+        statistics, deviate = statistics_with_columns(linear, bases, columns, [places[k] for k in chosen_curves])
         test = AdequacyTest(statistics, seen.test.null, settings)
-    return chosen, test
+    return chosen_curves, test
 
 
 def judge_each_name(
@@ -298,18 +300,19 @@ def judge_each_name(
     without_effect = refit_without_each(space, best, settings, searched.ladder)
     fits = {c.active: c for c in (*without_effect, *(c for e, c in fewer.items() if e in best.effects))}
     linearizations = {
-        at: diagnose_candidate(space, c, bases, after.test.null, settings).linear for at, c in fits.items()
+        name_set: diagnose_candidate(space, c, bases, after.test.null, settings).linear
+        for name_set, c in fits.items()
     }
     for effect, without in zip(best.effects, without_effect, strict=True):
         equation = _equation_of_effect(space, effect)
         linear = linearizations[without.active]
-        chosen, _ = _add_curves(after.linear, after, bases, {equation}, CURVES, settings)
-        beside = _augment_with_curves(space, linear, bases, chosen, effect)
+        chosen_curves, _ = _add_curves(after.linear, after, bases, {equation}, CURVES, settings)
+        beside = _augment_with_curves(space, linear, bases, chosen_curves, effect)
         promised = _largest_root(np.asarray(linear.jacobian), np.asarray(linear.residual), beside[2]) ** 2
         judged, signatures = beside, linear.signatures
         if promised < PROMISED * 2 * (without.cost - best.cost):
             judged = _restore_effect(
-                space, best, effect, _augment_with_curves(space, after.linear, bases, chosen, effect)
+                space, best, effect, _augment_with_curves(space, after.linear, bases, chosen_curves, effect)
             )
             signatures = after.linear.signatures
         run, root_without = _most_influential_run(space, linear.runs(), *beside, differ=space.bare.observe.long)
@@ -320,7 +323,7 @@ def judge_each_name(
                 effect,
                 _largest_root(*beside),
                 after.test.threshold("single"),
-                tuple(_curve_of_variable(*names[k]) for k in chosen),
+                tuple(_curve_of_variable(*names[k]) for k in chosen_curves),
                 evidence_over_curves(
                     space, full_fit, other_fit, (effect,), linearizations[other_fit.active], bases, settings
                 ),

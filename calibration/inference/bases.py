@@ -385,17 +385,17 @@ def order_collinearity(
     conditions = (*(axes_of(None) if axes is None else axes), *(["duty"] if "duty" in columns else []))
     others = [c for c in conditions if c != VARIABLES["slope"]]
     values = np.stack([configuration, *(np.asarray(columns[c], float)[counts] for c in others)], 1)
-    _, which = np.unique(np.c_[configuration, np.sign(values[:, 1:])], axis=0, return_inverse=True)
+    _, group_index = np.unique(np.c_[configuration, np.sign(values[:, 1:])], axis=0, return_inverse=True)
     _, cell = np.unique(values, axis=0, return_inverse=True)
     few = cell.max() + 1 <= FEW_CELLS * len(x)
     smooth = [VARIABLES["slope"]] * (VARIABLES["slope"] in conditions) if few else conditions
-    level = cell.ravel() if few else which.ravel()
+    level = cell.ravel() if few else group_index.ravel()
     spans = [scale_to_unit_range(np.asarray(columns[c], float), weight)[counts] for c in smooth]
-    each = [legendre.legvander(span, DEGREE)[:, 1:] for span in spans]
+    polynomials = [legendre.legvander(span, DEGREE)[:, 1:] for span in spans]
     for span in spans:  # a sorted table's order is the rank
         rank = np.searchsorted(np.sort(span), span, "left") + np.searchsorted(np.sort(span), span, "right")
-        each.append(rank[:, None] / (2 * len(x)))
-    terms = np.concatenate([np.zeros((len(x), 1)), *each], 1)
+        polynomials.append(rank[:, None] / (2 * len(x)))
+    terms = np.concatenate([np.zeros((len(x), 1)), *polynomials], 1)
     # Without the means of each level: a matrix with a column for each level would be rows times rows.
     count = np.bincount(level)
     inner, terms_left = (v - (_level_sums(level, v) / count[:, None])[level] for v in (terms, x[:, None]))
@@ -437,13 +437,13 @@ def wave_families(
             rows_of_wave = row[row >= 0]
             if len(rows_of_wave) < 8 or (belted and not on_tracks[rows_of_wave[0]]):
                 continue
-            turned = order * angle[rows_of_wave]
+            phase = order * angle[rows_of_wave]
             step = np.abs(np.diff(order * angle[knots[k]]))
             if not step.any() or np.median(step[step > 0]) > RESOLVED:
                 continue
-            shape = np.stack([np.cos(turned), np.sin(turned)], 1)
+            shape = np.stack([np.cos(phase), np.sin(phase)], 1)
             pieces[rows_of_wave, :2] = shape
-            if np.ptp(turned) >= 4 * np.pi:
+            if np.ptp(phase) >= 4 * np.pi:
                 wave[rows_of_wave, 2 * k : 2 * k + 2] = shape
         if pieces.any():
             bases.append(wave if wave.any() else pieces)
@@ -454,8 +454,8 @@ def wave_families(
     possible = sum(1 for _, belted in ORDERS.values() if np.any(on_tracks) or not belted)
     bases += bases[:1] * (possible - len(bases))
     words += words[:1] * (possible - len(words))
-    every = [(b, w) for b in balances_of(robot) for w in words]
-    return (Basis.of(np.stack(bases * len(balances_of(robot))), every),)
+    balance_waves = [(b, w) for b in balances_of(robot) for w in words]
+    return (Basis.of(np.stack(bases * len(balances_of(robot))), balance_waves),)
 
 
 def family_names(bases: Bases) -> tuple[tuple[str, str], ...]:

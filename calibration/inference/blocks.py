@@ -33,8 +33,8 @@ TURN, PART = "turn", "part"
 
 def kind_in_words(by: str, joint: str = " and ") -> str:
     """Name of a kind of block in words. `joint` is put between two conditions."""
-    for one in ("motor_speed", "load_torque"):
-        by = by.replace(one, one.replace("_", " "))
+    for quantity in ("motor_speed", "load_torque"):
+        by = by.replace(quantity, quantity.replace("_", " "))
     return by.replace("_", joint)
 
 
@@ -72,7 +72,11 @@ def blocks_by_sharpness(runs: Runs) -> Columns:
     share = np.round(slow / np.maximum(fast, 1e-12) * np.sign(np.prod(runs.of_sides, 0)), 6)
     part = np.searchsorted(np.sort(share), share) * PARTS // len(share)
     rows = [part == k for k in np.unique(part)]
-    return {f"{share[mine].min():.2g} to {share[mine].max():.2g}": mine for mine in rows} if len(rows) > 1 else {}
+    return (
+        {f"{share[block_rows].min():.2g} to {share[block_rows].max():.2g}": block_rows for block_rows in rows}
+        if len(rows) > 1
+        else {}
+    )
 
 
 def parts_over_time(runs: Runs) -> Columns:
@@ -123,12 +127,12 @@ def distinct_held_out_blocks(runs: Runs, kinds: Sequence[str]) -> dict[str, Colu
     blocks: dict[str, Columns] = {}
     divided = []
     for kind in kinds:
-        by = blocks_of_kind(runs, kind)
-        parts = {m.tobytes() for m in by.values()}
+        blocks_by_name = blocks_of_kind(runs, kind)
+        parts = {m.tobytes() for m in blocks_by_name.values()}
         if parts not in divided:
             divided.append(parts)
-            blocks[kind] = by
-    return {kind: by for kind, by in blocks.items() if by}
+            blocks[kind] = blocks_by_name
+    return {kind: blocks_by_name for kind, blocks_by_name in blocks.items() if blocks_by_name}
 
 
 def predictable_blocks(runs: Runs, problem: Problem) -> dict[str, Columns]:
@@ -143,10 +147,12 @@ def predictable_blocks(runs: Runs, problem: Problem) -> dict[str, Columns]:
         informs[k].add(_configuration_of_parameter(follower, names))
     owned = [np.isin(names, list(owners)) for owners in informs if "" not in owners]
     kinds = {
-        kind: {label: m for label, m in by.items() if not any(m[block_rows].all() for block_rows in owned)}
-        for kind, by in distinct_held_out_blocks(runs, problem.observe.blocks).items()
+        kind: {
+            label: m for label, m in blocks_by_name.items() if not any(m[block_rows].all() for block_rows in owned)
+        }
+        for kind, blocks_by_name in distinct_held_out_blocks(runs, problem.observe.blocks).items()
     }
-    return {kind: by for kind, by in kinds.items() if by}
+    return {kind: blocks_by_name for kind, blocks_by_name in kinds.items() if blocks_by_name}
 
 
 def unpredictable_kinds(runs: Runs, problem: Problem) -> Names:
@@ -155,7 +161,9 @@ def unpredictable_kinds(runs: Runs, problem: Problem) -> Names:
         distinct_held_out_blocks(runs, problem.observe.blocks),
         predictable_blocks(runs, problem),
     )
-    return tuple(kind for kind, by in all_blocks.items() if len(predictable.get(kind, {})) < len(by))
+    return tuple(
+        kind for kind, blocks_by_name in all_blocks.items() if len(predictable.get(kind, {})) < len(blocks_by_name)
+    )
 
 
 def _configuration_of_parameter(parameter: str, configurations: np.ndarray) -> str:
@@ -195,11 +203,18 @@ def hold_out_by_kind(problem: Problem, start: np.ndarray, masks: dict[str, Colum
     """
     answers = {}
     fits: dict[tuple[bytes, ...], refits.HeldOutFits] = {}  # shared by kinds that divide the rows in the same way
-    for kind, by in masks.items():
-        if by:
-            parts = tuple(m.tobytes() for m in by.values())
-            held_out = fits[parts] = fits.get(parts) or refits.hold_out_blocks(problem, start, list(by.values()))
+    for kind, blocks_by_name in masks.items():
+        if blocks_by_name:
+            parts = tuple(m.tobytes() for m in blocks_by_name.values())
+            held_out = fits[parts] = fits.get(parts) or refits.hold_out_blocks(
+                problem, start, list(blocks_by_name.values())
+            )
             answers[kind] = HeldOutReadings(
-                tuple(by), held_out.block, held_out.reading, held_out.status, held_out.z, held_out.converged
+                tuple(blocks_by_name),
+                held_out.block,
+                held_out.reading,
+                held_out.status,
+                held_out.z,
+                held_out.converged,
             )
     return answers

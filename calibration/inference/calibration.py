@@ -167,8 +167,8 @@ def _free_names(
     present = _configurations_present(runs, robot)
     default = priors.default_names(present, robot, computed=computes, turns=runs.turns)
     owned = priors.names_to_fit(robot, present, () if observe.axis else priors.OVER_TIME)
-    held = {*default, *fidelities.unread_parameters(fidelity, owned, runs.turns)}
-    default = (*default, *(n for n in owned if n not in held and not n.endswith(computes)))
+    fixed_names = {*default, *fidelities.unread_parameters(fidelity, owned, runs.turns)}
+    default = (*default, *(n for n in owned if n not in fixed_names and not n.endswith(computes)))
     if priors.DELAY in observe.free()[0] and priors.DELAY in robot.rig.stated - robot.rig.exact:
         default = (*default, priors.DELAY)
     names = priors.choose_free_names(robot, default, *words)
@@ -291,11 +291,11 @@ def _search(
     solver: optimizers.Solver | None,
 ) -> tuple[MultistartResult, np.ndarray | None]:
     """Searches for the optimum. Also returns the optimum of `steady` if the searches started there."""
-    rng, every = np.random.default_rng(seed), None
+    rng, all_members = np.random.default_rng(seed), None
     if runs.log is not None:
         sd = np.broadcast_to(np.median(known.sd, 0), runs.log.measured().shape)
-        every = observers.pose_problem(runs.log, base, posed.coordinates, sd)
-    points = posed.observe.starts(posed, rng, starts, every)
+        all_members = observers.pose_problem(runs.log, base, posed.coordinates, sd)
+    points = posed.observe.starts(posed, rng, starts, all_members)
     if not posed.observe.long:
         return multistart.search_from_starts(posed, known, points, solver), None
     if not posed.observe.starts_from_steady:
@@ -327,8 +327,8 @@ def _search(
     )  # fmt: skip
     best_member = int(everyone.order[0])
     if not np.isfinite(everyone.cost[best_member]):
-        ended = population.PopulationSearch(everyone, best_member, (), None, np.nan).outcomes()
-        endings = ", ".join(f"{count} {word.replace('_', ' ')}" for word, count in ended.items())
+        search_result = population.PopulationSearch(everyone, best_member, (), None, np.nan).outcomes()
+        endings = ", ".join(f"{count} {word.replace('_', ' ')}" for word, count in search_result.items())
         raise BadConfiguration(
             f"--population: none of {len(everyone.z)} members can be run in every row (members with a row that ended "
             f"in: {endings or 'none'}); begin from another robot, or free fewer parameters"
@@ -364,10 +364,10 @@ def _calibration_result(
     robot = posed.robot(jnp.asarray(z))
     after, before = optimizers.observe_at(posed, jnp.asarray(z)), optimizers.observe_robot(posed, posed.base)
     status, status_before = np.asarray(after.status), np.asarray(before.status)
-    lost = multistart.unreachable_rows(posed, status)
-    if lost.any():
-        raise checks.infeasible_error(runs, robot, status, lost, ready.names)
-    seen, seen_before = (
+    unreachable_rows = multistart.unreachable_rows(posed, status)
+    if unreachable_rows.any():
+        raise checks.infeasible_error(runs, robot, status, unreachable_rows, ready.names)
+    seen_after, seen_before = (
         np.where(posed.observe.unreachable(codes)[:, None], np.nan, np.asarray(x.reading))
         for codes, x in ((status, after), (status_before, before))
     )
@@ -391,8 +391,8 @@ def _calibration_result(
     ]
     elsewhere = scans.count_outside(scanned, found.starts.z, found.starts.converged)
     if elsewhere:
-        over = tuple(names[k] for k in scanned)
-        notes.append(Remark("elsewhere", searches=elsewhere, total=len(found.starts.cost), names=over))
+        scanned_names = tuple(names[k] for k in scanned)
+        notes.append(Remark("elsewhere", searches=elsewhere, total=len(found.starts.cost), names=scanned_names))
     if not np.isfinite(about.covariance).all():
         notes.append(Remark("no_covariance"))
     if jumps := row_numbers(np.asarray(after.flags) >> FLAGS.index("jumps") & 1):
@@ -400,11 +400,13 @@ def _calibration_result(
     profile = None
     if setting.profiles:
         profile = identifiability.profile_likelihoods(posed, jnp.asarray(z), float(found.best.cost), about)
-    held = holdout.hold_out_by_kind(posed, z, {kind: holdout.blocks_of_kind(runs, kind) for kind in setting.kinds})
+    errors_by_kind = holdout.hold_out_by_kind(
+        posed, z, {kind: holdout.blocks_of_kind(runs, kind) for kind in setting.kinds}
+    )
     measured, sd, converged = runs.measured(), np.asarray(posed.data.sd), bool(found.best.converged)
-    finite = np.isfinite(measured) & np.isfinite(seen)
-    whitened = np.where(finite, (seen - measured) / sd, 0.0)
-    residuals = lack_of_fit.Residuals(observe, runs, seen, whitened, finite, about.jacobian, z)
+    finite = np.isfinite(measured) & np.isfinite(seen_after)
+    whitened = np.where(finite, (seen_after - measured) / sd, 0.0)
+    residuals = lack_of_fit.Residuals(observe, runs, seen_after, whitened, finite, about.jacobian, z)
     notes += [] if noise.estimated.any() else noise_remarks(residuals)
     sources = {name: "product" for name in setting.of_product} | {name: "stated" for name in ready.stated}
     result = CalibrationResult(
@@ -418,10 +420,10 @@ def _calibration_result(
         noise=estimates.channel_noise(posed, noise, found.shares, measured),
         axis=observe.axis,
         errors_before=estimates.errors_by_channel(runs.channels, seen_before, measured, sd),
-        errors_after=estimates.errors_by_channel(runs.channels, seen, measured, sd),
-        held_out={kind: estimates.hold_out_errors(posed, h, measured, sd) for kind, h in held.items()},
+        errors_after=estimates.errors_by_channel(runs.channels, seen_after, measured, sd),
+        held_out={kind: estimates.hold_out_errors(posed, h, measured, sd) for kind, h in errors_by_kind.items()},
         conditions=estimates.condition_columns(observe, runs),
-        readings=estimates.readings_by_channel(runs.channels, measured, sd, seen_before, seen),
+        readings=estimates.readings_by_channel(runs.channels, measured, sd, seen_before, seen_after),
         status_before=np.array(STATUSES)[status_before],
         status=np.array(STATUSES)[status],
         adhesion_used=np.asarray(after.adhesion_used),
@@ -429,7 +431,7 @@ def _calibration_result(
         converged=converged and not elsewhere,
         starts=found.starts,
         searched=searched,
-        chi_square=estimates.chi_square(seen, measured, sd, about, noise),
+        chi_square=estimates.chi_square(seen_after, measured, sd, about, noise),
         adequacy=lack_of_fit.judge_adequacy(
             residuals, seen_before, sd, estimated=noise.estimated, converged=converged
         ),
@@ -438,7 +440,7 @@ def _calibration_result(
         posterior=posterior_of_coordinates(posed.coordinates, z, about.covariance),
         remarks=(
             *notes,
-            *(() if priors.DELAY in ready.names else error_after_steps(runs, seen - measured)),
+            *(() if priors.DELAY in ready.names else error_after_steps(runs, seen_after - measured)),
             *(Remark("unmeasured", name=n) for n, s in zip(ready.names, about.sensitivity, strict=True) if s < 1e-6),
         ),
     )

@@ -37,8 +37,12 @@ class EquationErrors(Detail):
         return {"series": None}
 
     def columns(self) -> Columns:
-        both = (("before", self.before), ("after", self.after))
-        return {f"defect_{when}_{balance}": values for when, by in both for balance, values in by.items()}
+        defects_by_fit = (("before", self.before), ("after", self.after))
+        return {
+            f"defect_{when}_{balance}": values
+            for when, defects_by_balance in defects_by_fit
+            for balance, values in defects_by_balance.items()
+        }
 
 
 @dataclasses.dataclass(frozen=True)

@@ -148,19 +148,22 @@ def hold_out_errors(
     posed: Problem, held: holdout.HeldOutReadings, measured: np.ndarray, sd: np.ndarray
 ) -> HeldOutErrors:
     """Hold-out errors of all rows together and of each block."""
-    percent, lost = sized_error(held.reading, measured), posed.observe.unreachable(held.status)
+    percent, unreachable = sized_error(held.reading, measured), posed.observe.unreachable(held.status)
     blocks = {}
     for k, label in enumerate(held.labels):
         inside = held.block == k
         alone = [np.where(inside[:, None], x, np.nan) for x in (held.reading, percent)]
         blocks[label] = BlockErrors(
             _channel_errors(posed.channels, alone[0], measured, sd, alone[1]),
-            _row_numbers(inside & lost),
+            _row_numbers(inside & unreachable),
             bool(held.converged[k]),
         )
     reading = dict(zip(channels.channel_names(posed.channels), held.reading.T, strict=True))
     return HeldOutErrors(
-        _channel_errors(posed.channels, held.reading, measured, sd, percent), _row_numbers(lost), blocks, reading
+        _channel_errors(posed.channels, held.reading, measured, sd, percent),
+        _row_numbers(unreachable),
+        blocks,
+        reading,
     )
 
 

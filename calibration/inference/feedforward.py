@@ -167,14 +167,14 @@ def fit_feedforward(log: DriveLog, mechanism: str = "simple", tolerances: Tolera
         most = None if log.current is None else float(np.nanmax(np.abs(log.current)))
         limited = Remark("feedforward_limit", level=level, current=most)
         remarks.append(limited if bend < 0 else Remark("feedforward_skid", level=level))
-    kept = _select_windows(windows, windows["demand"] < level) if level else windows
-    values, covariance, _ = _fit_constants(kept, mechanism)
+    fitted_windows = _select_windows(windows, windows["demand"] < level) if level else windows
+    values, covariance, _ = _fit_constants(fitted_windows, mechanism)
     sds = np.sqrt(np.diag(covariance))
     names = ("kS", "kV", "kA", "kG")[: len(values)]
     constants = {name: float(x) for name, x in zip(names, values, strict=True)}
     spread = {name: float(x) for name, x in zip(names, sds, strict=True)}
     if mechanism == "simple":
-        remarks += _direction_remarks(kept)
+        remarks += _direction_remarks(fitted_windows)
     remarks += _battery_remarks(log)
     if missing:
         remarks.append(Remark("feedforward_missing", tests=missing))
@@ -182,23 +182,29 @@ def fit_feedforward(log: DriveLog, mechanism: str = "simple", tolerances: Tolera
     if not determined:
         slow = [t for t in missing if t.startswith("dynamic")]
         remarks.append(Remark("feedforward_no_kA", share=spread["kA"] * Z95 / abs(constants["kA"]), missing=slow))
-    asked = tolerances or Tolerances()
-    asked = dataclasses.replace(asked, delay=delay + lag) if asked.delay is None else asked
-    gains = feedback_gains(constants["kV"], constants["kA"], asked) if determined and constants["kV"] > 0 else {}
-    if gains and asked.delay:
-        prompt = feedback_gains(constants["kV"], constants["kA"], dataclasses.replace(asked, delay=0.0))
-        remarks.append(Remark("feedforward_gains_delayed", delay=asked.delay, slow=gains["velocity_kP"],
+    tolerances_used = tolerances or Tolerances()
+    tolerances_used = (
+        dataclasses.replace(tolerances_used, delay=delay + lag) if tolerances_used.delay is None else tolerances_used
+    )
+    gains = (
+        feedback_gains(constants["kV"], constants["kA"], tolerances_used)
+        if determined and constants["kV"] > 0
+        else {}
+    )
+    if gains and tolerances_used.delay:
+        prompt = feedback_gains(constants["kV"], constants["kA"], dataclasses.replace(tolerances_used, delay=0.0))
+        remarks.append(Remark("feedforward_gains_delayed", delay=tolerances_used.delay, slow=gains["velocity_kP"],
                               prompt=prompt["velocity_kP"]))  # fmt: skip
     figures = {
-        "run": kept["run"],
-        "voltage_V": kept["u"] / kept["T"],
-        "velocity": kept["x"] / kept["T"],
-        "acceleration": kept["dv"] / kept["T"],
-        "direction": kept["s"] / kept["T"],
-        "quasistatic": kept["quasistatic"],
+        "run": fitted_windows["run"],
+        "voltage_V": fitted_windows["u"] / fitted_windows["T"],
+        "velocity": fitted_windows["x"] / fitted_windows["T"],
+        "acceleration": fitted_windows["dv"] / fitted_windows["T"],
+        "direction": fitted_windows["s"] / fitted_windows["T"],
+        "quasistatic": fitted_windows["quasistatic"],
     }
     return Feedforward(
-        mechanism, log.unit, constants, spread, gains, asked, delay, lag, missing, figures, tuple(remarks)
+        mechanism, log.unit, constants, spread, gains, tolerances_used, delay, lag, missing, figures, tuple(remarks)
     )  # fmt: skip
 
 
@@ -216,8 +222,8 @@ def feedback_gains(kV: float, kA: float, tolerances: Tolerances) -> dict[str, fl
 
 def _lqr_gains(a: np.ndarray, b: np.ndarray, tolerated: list[float], t: Tolerances) -> list[float]:
     n = len(a)
-    held = scipy.linalg.expm(np.block([[a, b], [np.zeros((1, n + 1))]]) * t.period)
-    a, b = held[:n, :n], held[:n, n:]
+    discrete_system = scipy.linalg.expm(np.block([[a, b], [np.zeros((1, n + 1))]]) * t.period)
+    a, b = discrete_system[:n, :n], discrete_system[:n, n:]
     cost, effort = np.diag(1 / np.square(tolerated)), np.array([[1 / t.effort**2]])
     p = scipy.linalg.solve_discrete_are(a, b, cost, effort)
     k = np.linalg.solve(effort + b.T @ p @ b, b.T @ p @ a)
@@ -229,15 +235,15 @@ def missing_tests(log: DriveLog) -> Names:
     """SysId tests that a log lacks. Empty if the voltage is neither a ramp nor a step."""
     present = set()
     for name in dict.fromkeys(log.run.tolist()):
-        named = next((t for t, old in TESTS.items() if t in name or old in name), None)
+        test_name = next((t for t, old in TESTS.items() if t in name or old in name), None)
         u = _driven_voltages(log.voltage[log.run == name])
-        if named is None and len(u) > WINDOWS:
+        if test_name is None and len(u) > WINDOWS:
             rises = np.mean(np.diff(np.abs(u)) >= 0) > 0.95
             kind = "dynamic" if not _is_ramp(u) else "quasistatic" if rises else ""
             if not kind or not (np.all(u > 0) or np.all(u < 0)):
                 return ()
-            named = f"{kind}-{'forward' if u[0] > 0 else 'reverse'}"
-        present.add(named)
+            test_name = f"{kind}-{'forward' if u[0] > 0 else 'reverse'}"
+        present.add(test_name)
     return tuple(t for t in TESTS if t not in present)
 
 
@@ -296,11 +302,11 @@ def _motion_windows(log: DriveLog, delay: float) -> Columns:
     count = max(FEWEST, round(WINDOW / step))
     for rows in _rows_of_runs(log):
         t, u, v = log.time[rows], log.voltage[rows], speeds[rows]
-        whole = np.r_[0, np.cumsum(u[:-1] * np.diff(t))]
+        voltage_integral = np.r_[0, np.cumsum(u[:-1] * np.diff(t))]
         path = np.r_[0, np.cumsum((v[1:] + v[:-1]) / 2 * np.diff(t))] if log.position is None else log.position[rows]
         instants = t - delay
         rests = not abs(v[0]) >= least  # a test begins without voltage
-        driven = np.interp(instants, t, whole) + np.minimum(instants - t[0], 0) * (0.0 if rests else u[0])
+        driven = np.interp(instants, t, voltage_integral) + np.minimum(instants - t[0], 0) * (0.0 if rests else u[0])
         driven += np.maximum(instants - t[-1], 0) * u[-1]
         place = np.zeros(len(t)) if log.position is None else log.position[rows] * UNITS[log.unit]
         ramp = _is_ramp(_driven_voltages(u))
@@ -372,8 +378,8 @@ def _fit_constants(w: Columns, mechanism: str) -> tuple[np.ndarray, np.ndarray, 
         kG = np.hypot(c, s)
         names = [*names, kG]
         jacobian = [*jacobian, (c * size[3] + s * size[4]) / kG - np.eye(len(solved))[0] * kG / b]
-    by = np.array(jacobian)
-    return np.array(names), by @ spread @ by.T, float(rest @ rest)
+    derivatives = np.array(jacobian)
+    return np.array(names), derivatives @ spread @ derivatives.T, float(rest @ rest)
 
 
 def _fit_delay_and_slope_change(log: DriveLog, mechanism: str) -> tuple[float, Columns, float, float]:
@@ -410,14 +416,14 @@ def _slope_change(w: Columns, mechanism: str) -> tuple[float, float, float]:
     values, _, plain = _fit_constants(w, mechanism)
     level, bend, cost, material = 0.0, 0.0, np.inf, False
     for _ in range(3):
-        asked = (w["u"] - values[0] * w["s"] - values[1] * w["x"]) / w["T"]
-        w["demand"] = np.abs(asked)
+        demanded_slope = (w["u"] - values[0] * w["s"] - values[1] * w["x"]) / w["T"]
+        w["demand"] = np.abs(demanded_slope)
         trials = []
         for share in np.linspace(0.15, 0.9, 16):
             limit = share * w["demand"].max()
             above = w["demand"] > limit
             if above.sum() >= 3 and (~above).sum() >= WINDOWS:
-                hinge = np.sign(asked) * np.maximum(w["demand"] - limit, 0) * w["T"]
+                hinge = np.sign(demanded_slope) * np.maximum(w["demand"] - limit, 0) * w["T"]
                 matrix = np.column_stack([_regression_matrix(w, mechanism), hinge])
                 slope = np.linalg.lstsq(matrix, w["dv"], rcond=None)[0]
                 trials.append((float(np.sum((w["dv"] - matrix @ slope) ** 2)), float(limit), slope))

@@ -113,12 +113,17 @@ def predict_identifiability(
     )
     data = dataclasses.replace(posed.data, weight=posed.data.weight * jnp.asarray(reached, float)[:, None])
     about = identifiability.analyse_identifiability(posed, z, data)
-    held = identifiability.held_by_prior(about.sd)
+    is_prior_bound = identifiability.held_by_prior(about.sd)
     fields = priors.parameters_by_name(robot)
     width = coordinates.prior_sd
     estimates = tuple(
         ParameterInformation(
-            n, fields[n].spec.unit, float(fields[n].value), float(width[k]), float(about.sd[k]), bool(held[k])
+            n,
+            fields[n].spec.unit,
+            float(fields[n].value),
+            float(width[k]),
+            float(about.sd[k]),
+            bool(is_prior_bound[k]),
         )
         for k, n in enumerate(names)
     )
@@ -145,7 +150,7 @@ def _separating_columns(
 
     Each sample is assumed to have such a reading, and its sensitivity is simulated.
     """
-    own, rig = posed.base.channels, posed.base.rig
+    channels, rig = posed.base.channels, posed.base.rig
     wide = dataclasses.replace(posed.base, rig=dataclasses.replace(rig, channels=(*rig.channels, *MORE)))
     columns = {**{c.column: np.zeros(len(runs)) for c in wide.channels}, **runs.columns}
     layout = dataclasses.replace(runs.layout, channels=wide.channels)
@@ -157,11 +162,11 @@ def _separating_columns(
     covariances = {}
     for k, channel in enumerate(wide.channels):
         size = channel.sd_share * np.sqrt(np.mean(shown[:, k] ** 2))
-        if channel not in own and size > 0:
+        if channel not in channels and size > 0:
             rows = np.concatenate([about.jacobian, slopes[:, k] / size, np.eye(len(about.sd))])
             covariances[channel.column] = np.linalg.inv(rows.T @ rows)
-    for one, other, _ in alike:
-        pair = [about.names.index(one), about.names.index(other)]
+    for first_name, other, _ in alike:
+        pair = [about.names.index(first_name), about.names.index(other)]
         yield tuple(column for column, c in covariances.items() if _are_separable(c[np.ix_(pair, pair)]))
 
 

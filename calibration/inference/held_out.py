@@ -31,8 +31,8 @@ def fit_from_each_start(
         Optimum of each search and the model's observation there. The leading axis is the starts.
     """
     z, weight = (np.stack([np.asarray(x) for x in xs]) for xs in (starts, weights))
-    which = None if active is None else np.stack([np.asarray(x) for x in active])
-    return jax.device_get(problem.observe.search(problem, z, weight, which, most=most))
+    active_sets = None if active is None else np.stack([np.asarray(x) for x in active])
+    return jax.device_get(problem.observe.search(problem, z, weight, active_sets, most=most))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -68,15 +68,15 @@ def hold_out_blocks(
     """
     rows, weight = len(masks[0]), np.asarray(problem.data.weight)
     out = [np.concatenate([m, np.zeros(len(weight) - rows, bool)]) for m in masks]
-    which = None if active is None else [active] * len(masks)
+    active_sets = None if active is None else [active] * len(masks)
     optima, observations = fit_from_each_start(
-        problem, [start] * len(masks), [weight * ~m[:, None] for m in out], which
+        problem, [start] * len(masks), [weight * ~m[:, None] for m in out], active_sets
     )
     reading, status = np.full((rows, weight.shape[1]), np.nan), np.full(rows, -1)
     block = np.full(rows, -1)
     for k, mask in enumerate(masks):
-        lost = problem.observe.unreachable(np.asarray(observations.status[k]))[:rows, None]
-        reading[mask] = np.where(lost, np.nan, observations.reading[k][:rows])[mask]
+        unreachable = problem.observe.unreachable(np.asarray(observations.status[k]))[:rows, None]
+        reading[mask] = np.where(unreachable, np.nan, observations.reading[k][:rows])[mask]
         status[mask], block[mask] = observations.status[k][:rows][mask], k
     return HeldOutFits(reading, status, block, np.asarray(optima.z), np.asarray(optima.converged))
 
@@ -103,7 +103,7 @@ def predict_unseen(
     slopes = jacobian[:size].reshape(*scale.shape, -1)
     with np.errstate(invalid="ignore", divide="ignore"):
         per_unit = np.where(scale[..., None] > 0, slopes / scale[..., None], 0.0)
-    lost = problem.observe.unreachable(np.asarray(observation.status))
+    unreachable = problem.observe.unreachable(np.asarray(observation.status))
     reading, status = np.full((rows, count), np.nan), np.full(rows, -1)
     block, z = np.full(rows, -1), np.tile(start_values, (len(out), 1))
     promised = -np.linalg.solve(jacobian.T @ jacobian, jacobian.T @ residual)
@@ -115,6 +115,6 @@ def predict_unseen(
         step = -np.linalg.solve(j.T @ j, j.T @ residual[kept_residuals]) - promised
         z[k] += step
         held_rows = mask[:rows]
-        reading[held_rows] = np.where(lost[:, None], np.nan, read + per_unit @ step)[:rows][held_rows]
+        reading[held_rows] = np.where(unreachable[:, None], np.nan, read + per_unit @ step)[:rows][held_rows]
         status[held_rows], block[held_rows] = np.asarray(observation.status)[:rows][held_rows], k
     return HeldOutFits(reading, status, block, z, np.ones(len(out), bool))

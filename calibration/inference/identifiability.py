@@ -197,8 +197,8 @@ def profile_likelihoods(
     pinned = centre[:, None] + about.sd[:, None] * steps  # (parameters, points)
     along = about.covariance / np.diag(about.covariance)[:, None]  # row k: how all move with k
     starts = centre + along[:, None, :] * (pinned - centre[:, None])[..., None]
-    held = np.broadcast_to(np.eye(size, dtype=bool)[:, None, :], starts.shape)
-    pins = Pin(jnp.asarray(held.reshape(-1, size)), jnp.asarray(starts.reshape(-1, size)))
+    pinned_names = np.broadcast_to(np.eye(size, dtype=bool)[:, None, :], starts.shape)
+    pins = Pin(jnp.asarray(pinned_names.reshape(-1, size)), jnp.asarray(starts.reshape(-1, size)))
     profiles = _profiles(problem, data, pins.at, pins)
     rise = 2 * (np.asarray(profiles.cost).reshape(pinned.shape) - cost)
     root = np.sign(steps) * np.sqrt(np.maximum(rise, 0.0))
@@ -260,15 +260,15 @@ def determined_together(posterior: Posterior, held: Collection[str] = ()) -> tup
     spread = posterior.spread * sd  # of the parameter, or of its logarithm
     groups = []
     for i, j in zip(*np.triu_indices(len(sd), 1), strict=True):
-        one, other = posterior.coordinates[i], posterior.coordinates[j]
+        first_name, other = posterior.coordinates[i], posterior.coordinates[j]
         correlation = float(posterior.covariance[i, j] / max(sd[i] * sd[j], 1e-300))
-        if not abs(correlation) > TOGETHER or (one in held and other in held):
+        if not abs(correlation) > TOGETHER or (first_name in held and other in held):
             continue
         size = spread * np.where(log, value[: len(sd)], 1.0)
         weight = -np.sign(correlation) * abs(size[i] / size[j])
         even = log[i] and log[j] and 1 / EVEN < spread[i] / spread[j] < EVEN
         form = "linear" if not even else "ratio" if correlation > 0 else "product"
-        groups.append(DependentPair(one, other, correlation, form, float(weight)))
+        groups.append(DependentPair(first_name, other, correlation, form, float(weight)))
     return tuple(sorted(groups, key=lambda pair: -abs(pair.correlation)))
 
 

@@ -171,12 +171,12 @@ def judge_adequacy(
     """
     misses = fit.misses(as_stated, ~estimated)
     adequacy = adequacy_of_residuals(fit, known=not estimated.any())
-    both = fit.counts & np.isfinite(as_stated)
-    before = np.sum(((as_stated - fit.runs.measured()) / sd) ** 2, where=both)
+    is_compared = fit.counts & np.isfinite(as_stated)
+    before = np.sum(((as_stated - fit.runs.measured()) / sd) ** 2, where=is_compared)
     obstacle = (
         "undescribed" if any(m.large for m in misses)
         else "not converged" if not converged
-        else "worse" if np.sum(fit.whitened**2, where=both) > before + WORSE
+        else "worse" if np.sum(fit.whitened**2, where=is_compared) > before + WORSE
         else ""
     )  # fmt: skip
     adequate = adequacy.adequate if not obstacle else None if obstacle == "not converged" else False
@@ -249,7 +249,7 @@ def _curve_columns(fit: Residuals) -> dict[AdequacyFinding, np.ndarray]:
         for k, c in enumerate(fit.runs.channels)
         if counts[:, k].any()
     }
-    which = runs["configuration"]
+    configuration = runs["configuration"]
     families = {}
     for k, channel in enumerate(fit.runs.channels):
         rows = counts[:, k]
@@ -258,7 +258,7 @@ def _curve_columns(fit: Residuals) -> dict[AdequacyFinding, np.ndarray]:
                 continue
             scaled = 2 * (x - x[rows].min()) / np.ptp(x[rows]) - 1
             curve = legendre.legvander(np.nan_to_num(scaled), min(terms, len(np.unique(x[rows])) - 1))
-            own_curves = [curve * ((which == c) & rows)[:, None] for c in np.unique(which)]
+            own_curves = [curve * ((configuration == c) & rows)[:, None] for c in np.unique(configuration)]
             columns = np.zeros((*counts.shape, sum(o.shape[1] for o in own_curves)))
             columns[:, k] = np.concatenate(own_curves, 1)
             families[AdequacyFinding(channel.name, "follow", name)] = columns.reshape(counts.size, -1)
@@ -276,11 +276,11 @@ def _autocorrelation_test(fit: Residuals) -> tuple[float, AdequacyFinding] | Non
     tests = []
     for k, channel in enumerate(fit.runs.channels):
         e, ok = residual[order, k], counts[order, k]
-        both = follows & ok[1:] & ok[:-1]
+        is_consecutive = follows & ok[1:] & ok[:-1]
         power = float(np.sum(e[ok] ** 2))
-        if both.sum() >= 20 and power > 0:
-            r = float(np.sum(e[1:][both] * e[:-1][both])) / power
-            tests.append((float(ndtr(-r * np.sqrt(both.sum()))), AdequacyFinding(channel.name, "remember")))
+        if is_consecutive.sum() >= 20 and power > 0:
+            r = float(np.sum(e[1:][is_consecutive] * e[:-1][is_consecutive])) / power
+            tests.append((float(ndtr(-r * np.sqrt(is_consecutive.sum()))), AdequacyFinding(channel.name, "remember")))
     if not tests:
         return None
     p, finding = min(tests)
@@ -298,13 +298,13 @@ def _replicate_test(fit: Residuals) -> tuple[float, AdequacyFinding] | None:
     past = course_of_each_row(runs).tolist()  # replicates share their past too
     for row, key in enumerate(zip(past, *(runs[c].astype(str).tolist() for c in columns), strict=True)):
         groups.setdefault(key, []).append(row)
-    pure, own = 0.0, 0
+    pure, degrees = 0.0, 0
     for rows in (g for g in groups.values() if len(g) > 1):
         for k in range(counts.shape[1]):
             e = residual[rows, k][counts[rows, k]]
             pure += float(np.sum((e - e.mean()) ** 2)) if len(e) > 1 else 0.0
-            own += max(len(e) - 1, 0)
-    if own < REPLICATES or freedom - own < 1 or pure <= 0:
+            degrees += max(len(e) - 1, 0)
+    if degrees < REPLICATES or freedom - degrees < 1 or pure <= 0:
         return None
-    quotient = max(chi2 - pure, 0.0) / (freedom - own) / (pure / own)
-    return float(fdtrc(freedom - own, own, quotient)), AdequacyFinding(what="repeats")
+    quotient = max(chi2 - pure, 0.0) / (freedom - degrees) / (pure / degrees)
+    return float(fdtrc(freedom - degrees, degrees, quotient)), AdequacyFinding(what="repeats")

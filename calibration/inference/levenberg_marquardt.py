@@ -267,7 +267,7 @@ class OneSidedLevenbergMarquardt(optx.AbstractLeastSquaresSolver[Z, Array, Any, 
         one.
         """
         linearised, aux = self._linearised(fn, state.ahead, args)
-        moved, first, before = (
+        state_after_step, first, before = (
             state.ahead - y,
             state.steps == 0,
             dataclasses.replace(state.found, jacobian=state.slope),
@@ -276,15 +276,15 @@ class OneSidedLevenbergMarquardt(optx.AbstractLeastSquaresSolver[Z, Array, Any, 
         alike = jnp.all(linearised.positive == before.positive)
         accepted &= first | alike | ~state.mixed
         region = _select(state.mixed & ~accepted, state.region, region)
-        ended = self._is_small(state.ahead, moved, linearised, before) & accepted
+        has_converged = self._is_small(state.ahead, state_after_step, linearised, before) & accepted
 
         corrected = state.slope
         if self.rough:
             least = jnp.finfo(y.dtype).tiny
-            along, length = corrected @ moved, jnp.maximum(moved @ moved, least)
+            along, length = corrected @ state_after_step, jnp.maximum(state_after_step @ state_after_step, least)
             missed = linearised.residual - before.residual - along
             near = (state.steps > 0) & (linearised.as_min() < TELLING * before.as_min())
-            corrected = jnp.where(near, corrected + jnp.outer(missed, moved) / length, corrected)
+            corrected = jnp.where(near, corrected + jnp.outer(missed, state_after_step) / length, corrected)
             half = jnp.minimum(region.step_size, length / jnp.maximum(along @ along, least))
             region = _select(accepted | state.mixed, region, dataclasses.replace(region, step_size=half))
         slope = jnp.where(accepted, linearised.jacobian, corrected)
@@ -292,10 +292,10 @@ class OneSidedLevenbergMarquardt(optx.AbstractLeastSquaresSolver[Z, Array, Any, 
         ahead_of = dataclasses.replace(best, jacobian=slope)
         stride, _ = self.descent.step(region.step_size, self.descent.query(y, ahead_of, ahead_of))
         mixed = accepted & alike & (state.steps > 1) & (jnp.max(jnp.abs(stride)) < self.near)
-        ahead = y + jnp.where(mixed, mixed_step(stride, moved, stride - state.stride), stride)
+        ahead = y + jnp.where(mixed, mixed_step(stride, state_after_step, stride - state.stride), stride)
         rejected = jnp.where(accepted, 0, state.rejected + 1)
-        over = ended | (rejected >= PATIENCE)
-        new = SearchState(best, slope, aux, stride, ahead, mixed, region, state.steps + 1, rejected, over)
+        is_over = has_converged | (rejected >= PATIENCE)
+        new = SearchState(best, slope, aux, stride, ahead, mixed, region, state.steps + 1, rejected, is_over)
         return y, new, aux
 
     def _is_small(self, y: Z, moved: Z, found: SolverLinearisation, before: SolverLinearisation) -> Array:

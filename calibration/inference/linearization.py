@@ -80,9 +80,9 @@ def shape_parameter_at(scales: Scales, z: Array) -> Array:
     A phase is wrapped by whole turns. Other parameters are clipped.
     """
     value, spread, sd, low, high = scales
-    moved = value * jnp.exp(spread * z) + sd * z
-    turned = jnp.remainder(moved + jnp.pi, 2 * jnp.pi) - jnp.pi
-    return jnp.where(jnp.asarray(sd) > 0, turned, clip(moved, low, high))
+    shape_value = value * jnp.exp(spread * z) + sd * z
+    wrapped_angle = jnp.remainder(shape_value + jnp.pi, 2 * jnp.pi) - jnp.pi
+    return jnp.where(jnp.asarray(sd) > 0, wrapped_angle, clip(shape_value, low, high))
 
 
 #: Coordinates on the prior of a shape parameter at which the library is scored, in its sds.

@@ -39,21 +39,25 @@ def lost_motion_notes(runs: Runs, robot: Robot) -> list[Remark]:
         _changes_between_contacts(runs["time_s"][rows], measured_values[rows, placed[0]], drive[rows])
         for rows in map(runs.in_order, np.unique(runs.run_names))
     ]
-    moved, integral, clipped, faster, driven, reversed_, bent, curved = (
+    motion, integral, clipped, faster, driven, reversed_, bent, curved = (
         np.concatenate(x, -1) for x in zip(*changes, strict=True)
     )
     reversals = int(np.sum(np.abs(reversed_)))
-    if reversals < REVERSALS or len(moved) < 2 * REVERSALS:
+    if reversals < REVERSALS or len(motion) < 2 * REVERSALS:
         return []
-    sets = [[integral]] if turning else [[integral, taken, faster, driven] for taken in clipped]
-    _, width, sd, explained = min(_fit_lost_angle(moved, reversed_, np.stack(x, 1)) for x in sets)
-    lost, stiffness, load = width > SURE * sd and explained > EXPLAINED, 0.0, robot.configurations.members[0]
+    sets = [[integral]] if turning else [[integral, regressor, faster, driven] for regressor in clipped]
+    _, width, sd, explained = min(_fit_lost_angle(motion, reversed_, np.stack(x, 1)) for x in sets)
+    is_lost, stiffness, load = (
+        width > SURE * sd and explained > EXPLAINED,
+        0.0,
+        robot.configurations.members[0],
+    )
     radius = float(load.radius) if channel.name == "position" else 1.0
     if turning:
         _, late, sd, explained = _fit_lost_angle(curved, bent, np.stack([integral, faster, reversed_], 1))
         if late > SURE * sd and explained > EXPLAINED:
             stiffness, width = float(load.inertia) * radius / late, late * np.sqrt(np.mean(bent**2))
-    if not (lost or stiffness):
+    if not (is_lost or stiffness):
         return []
     return [
         Remark(
@@ -97,8 +101,8 @@ def _changes_between_contacts(time: np.ndarray, angle: np.ndarray, drive: np.nda
     integral = lambda x: np.append(0.0, np.cumsum((x[1:] + x[:-1]) / 2 * np.diff(time)))  # noqa: E731
     levels = np.maximum(np.quantile(np.abs(drive), FRICTIONS), 1e-9 * np.max(np.abs(drive), initial=1e-300))
     clipped = np.array([integral(np.clip(drive / level, -1, 1)) for level in levels])
-    every = smooth, integral(drive), clipped, speed, drive, way / 2, bend, smooth - bend * square.mean(1) / 2
-    return tuple(np.diff(x[..., points]) for x in every)
+    regressors = smooth, integral(drive), clipped, speed, drive, way / 2, bend, smooth - bend * square.mean(1) / 2
+    return tuple(np.diff(x[..., points]) for x in regressors)
 
 
 def _fit_lost_angle(

@@ -111,11 +111,11 @@ def search_from_starts(
     Args:
         solver: solver of optimistix. None: the solver of this package.
     """
-    by = functools.partial(optimizers.search_starts, solver=solver)
+    search_function = functools.partial(optimizers.search_starts, solver=solver)
     z = points[0]
     shares = initial_noise_shares(noise)
     for _ in range(ROUNDS):
-        posed, optima, feasible = _search_until_feasible(posed, np.concatenate([points, z[None]]), by)
+        posed, optima, feasible = _search_until_feasible(posed, np.concatenate([points, z[None]]), search_function)
         best = _pick_member(optima, int(np.nanargmin(optima.cost)))
         z = np.asarray(best.z)
         new = _reestimate_shares(posed, noise, z, shares)
@@ -147,10 +147,10 @@ def search_one_by_one(
         tell: callback for progress after every step.
         solver: solver of optimistix. None: the solver of this package.
     """
-    begun = time.perf_counter()
+    start_time = time.perf_counter()
 
     def elapsed_minutes() -> float:
-        return (time.perf_counter() - begun) / 60
+        return (time.perf_counter() - start_time) / 60
 
     def step(posed: Problem, points: np.ndarray, data: Data) -> tuple[optimizers.Optimum, np.ndarray, np.ndarray]:
         def one(z: np.ndarray) -> tuple[optimizers.Optimum, Observation, Observation]:
@@ -215,8 +215,8 @@ def starts_from_posterior(easy: Problem, z: np.ndarray, rng: np.random.Generator
         return easy.observation(z).status, steepness(easy.robot(z)) > 1.001 * steepness(easy.base)
 
     status, steep = jax.jit(jax.vmap(status_and_steepness))(jnp.asarray(draws))
-    lost = unreachable_rows(easy, status).sum(1) + np.asarray(steep).sum(1)
-    return draws[np.argsort(lost, kind="stable")[:count]]
+    unreachable_count = unreachable_rows(easy, status).sum(1) + np.asarray(steep).sum(1)
+    return draws[np.argsort(unreachable_count, kind="stable")[:count]]
 
 
 def optimum_of_population(
@@ -242,8 +242,10 @@ def optimum_of_population(
     best = optimizers.optimum_at_point(np.concatenate([searched.slope, rows, np.eye(len(z))]), error, z, posed.data)
     settled = np.array([searched.found.settled])
     best = dataclasses.replace(best, converged=jnp.asarray(searched.found.settled))
-    ended = StartOutcomes(np.array([float(best.cost)]), settled, sum(g.failed for g in searched.found.generations))
-    return MultistartResult(posed, best, ended, shares, searched)
+    start_outcomes = StartOutcomes(
+        np.array([float(best.cost)]), settled, sum(g.failed for g in searched.found.generations)
+    )
+    return MultistartResult(posed, best, start_outcomes, shares, searched)
 
 
 def reestimate_noise_at(posed: Problem, noise: Noise, searched: Population, at: int) -> tuple[Problem, np.ndarray]:

@@ -82,13 +82,13 @@ def parse_noise(text: str, shown: tuple[Channel, ...]) -> dict[int, tuple[float,
     """
     words = {c.word: k for k, c in enumerate(shown)}
     channel_of_word = words | {c.name: k for k, c in enumerate(shown)}
-    stated: dict[int, tuple[float, bool]] = {}
+    channel_sizes: dict[int, tuple[float, bool]] = {}
     for part in text.split(","):
         name, _, value = part.strip().partition("=")
         if name not in channel_of_word:
             raise BadConfiguration(f"--noise {part.strip()}: no such channel; {allowed_words(name, words)}")
         k = channel_of_word[name]
-        if k in stated:
+        if k in channel_sizes:
             raise BadConfiguration(f"--noise {part.strip()}: {name} is given twice; expected each channel once")
         channel = shown[k]
         match = re.fullmatch(r"\s*([-+0-9.eE]+)\s*(%|[^\d\s.]+)\s*", value)
@@ -103,8 +103,8 @@ def parse_noise(text: str, shown: tuple[Channel, ...]) -> dict[int, tuple[float,
         if match is None or not size > 0 or math.isinf(size) or match[2] not in ("%", *sizes):
             raise BadConfiguration(f"--noise {part.strip()}: {form}")
         relative = match[2] == "%"
-        stated[k] = (size / 100 if relative else size * sizes[match[2]], relative)
-    return stated
+        channel_sizes[k] = (size / 100 if relative else size * sizes[match[2]], relative)
+    return channel_sizes
 
 
 def noise_from_table(runs: Runs, sizes: np.ndarray, stated: str | None = None) -> Noise:
@@ -143,9 +143,9 @@ def noise_from_table(runs: Runs, sizes: np.ndarray, stated: str | None = None) -
         sd[:, k] = np.where(finite, size * sizes[:, k] if relative else size, 1.0)
         source.append("stated" if k in shares else "estimated")
     quantum = np.array([runs.layout.variance(name) for name in channels.channel_names(runs.channels)])
-    given = np.array([s in ("columns", "stated") for s in source])  # an estimate already includes it
-    if (given & (quantum > 0)).any():
-        sd = np.where(given & np.isfinite(measured), np.sqrt(sd**2 + quantum), sd)
+    includes_estimate = np.array([s in ("columns", "stated") for s in source])  # an estimate already includes it
+    if (includes_estimate & (quantum > 0)).any():
+        sd = np.where(includes_estimate & np.isfinite(measured), np.sqrt(sd**2 + quantum), sd)
     return Noise(runs.channels, sd, np.array([s == "estimated" for s in source]), tuple(source))
 
 
@@ -166,13 +166,13 @@ def infer_noise(runs: Runs, sizes: np.ndarray, stated: str | None = None) -> Noi
     Raises:
         BadConfiguration, BadData: for the same reasons as `noise_from_table`.
     """
-    given = noise_from_table(runs, sizes, stated)
-    if not given.estimated.any():
-        return given
-    sd, words, series = given.sd.copy(), list(given.source), []
+    table_noise = noise_from_table(runs, sizes, stated)
+    if not table_noise.estimated.any():
+        return table_noise
+    sd, words, series = table_noise.sd.copy(), list(table_noise.source), []
     guess = noise_from_table(runs, sizes, default_noise(runs.channels))
     from_series = series_noise.estimate_noise(runs, sizes)
-    for k in np.flatnonzero(given.estimated):
+    for k in np.flatnonzero(table_noise.estimated):
         estimate = from_series[k]
         if estimate is None:
             sd[:, k], words[k] = guess.sd[:, k], "assumed"

@@ -104,8 +104,8 @@ def penalty_slice(data: Data) -> slice:
 
 def informative_residuals(data: Data) -> np.ndarray:
     """Indices of the residuals of readings and priors, without the adhesion penalties."""
-    held = penalty_slice(data)
-    return np.r_[: held.start, held.stop : held.stop + data.centre.size]
+    penalties = penalty_slice(data)
+    return np.r_[: penalties.start, penalties.stop : penalties.stop + data.centre.size]
 
 
 #: Least-squares solvers and minimisers of optimistix.
@@ -136,9 +136,9 @@ def residual_function(problem: Problem, data: Data, pin: Pin) -> Function:
 
 def _least_squares_solver(data: Data, long: bool) -> OneSidedLevenbergMarquardt:
     """Solver for fits to such data. `long`: True for rollouts."""
-    held, tolerance = penalty_slice(data), TOLERANCE_LONG if long else TOLERANCE
+    penalties, tolerance = penalty_slice(data), TOLERANCE_LONG if long else TOLERANCE
     return OneSidedLevenbergMarquardt(
-        tolerance, tolerance, held.start, held.stop, near=0.0 if long else NEAR, rough=long
+        tolerance, tolerance, penalties.start, penalties.stop, near=0.0 if long else NEAR, rough=long
     )
 
 
@@ -153,8 +153,8 @@ def _optimum_at(
     sd = jnp.linalg.norm(half, axis=0)
     ahead = r + slope @ one_sided_step(r, slope, held_rows, 0.0)
     decrement = half_squares(r, held_rows) - half_squares(ahead, held_rows)
-    held = jnp.where(pin.held, pin.at - data.centre, 0.0)
-    cost = half_squares(r, held_rows) + 0.5 * jnp.sum(held**2)
+    pinned_offset = jnp.where(pin.held, pin.at - data.centre, 0.0)
+    cost = half_squares(r, held_rows) + 0.5 * jnp.sum(pinned_offset**2)
     return Optimum(
         pin.apply(z),
         sd,
@@ -218,8 +218,8 @@ def _advance_search(problem: Problem, at: Progress, data: Data, max_steps: int |
     )
     y, state = _solver_step(solver, function, at)
     done, _ = solver.terminate(function, y, None, {}, state, frozenset())
-    over = done | (state.steps >= max_steps) | ~jnp.all(jnp.isfinite(y))
-    return y, dataclasses.replace(state, over=over)
+    is_over = done | (state.steps >= max_steps) | ~jnp.all(jnp.isfinite(y))
+    return y, dataclasses.replace(state, over=is_over)
 
 
 def _optimum_of_progress(at: Progress, data: Data, pin: Pin) -> Optimum:
@@ -285,8 +285,8 @@ def _start_fresh_searches(problem: Problem, members: SearchMember, fresh: Number
     """States of parallel searches after the `fresh` ones were reset to their starts."""
 
     def begin(member: SearchMember, fresh: Array, at: Progress) -> Progress:
-        begun = _begin_search(problem, member.start, member.problem(problem).data)
-        return jax.tree.map(lambda new, old: jnp.where(fresh, new, old), begun, at)
+        search_begin = _begin_search(problem, member.start, member.problem(problem).data)
+        return jax.tree.map(lambda new, old: jnp.where(fresh, new, old), search_begin, at)
 
     return jax.vmap(begin)(members, fresh, at)
 
@@ -301,8 +301,8 @@ def _continue_searches(
     pin = no_pin(members.start.shape[-1])
 
     def advance(member: SearchMember, at: Progress) -> Progress:
-        here = member.problem(problem)
-        new = _advance_search(here, at, here.data, max_steps)
+        member_problem = member.problem(problem)
+        new = _advance_search(member_problem, at, member_problem.data, max_steps)
         return jax.tree.map(lambda new, old: jnp.where(at[1].over, old, new), new, at)
 
     at = _start_fresh_searches(problem, members, fresh, at)
@@ -331,10 +331,10 @@ def _step_unfinished(
     pin = no_pin(members.start.shape[-1])
 
     def advance(member: SearchMember, at: Progress, roots: tuple[Array, Array]) -> tuple[Progress, Optimum]:
-        here = dataclasses.replace(member.problem(problem), roots=roots)
-        new = _advance_search(here, at, here.data, max_steps)
+        member_problem = dataclasses.replace(member.problem(problem), roots=roots)
+        new = _advance_search(member_problem, at, member_problem.data, max_steps)
         new = jax.tree.map(lambda new, old: jnp.where(at[1].over, old, new), new, at)
-        return new, _optimum_of_progress(new, here.data, pin)
+        return new, _optimum_of_progress(new, member_problem.data, pin)
 
     return jax.vmap(advance)(members, at, roots)
 
@@ -467,8 +467,10 @@ def _search_with_states(
     if cores > 1:  # compiles the program once, by a call that takes no step
         go_on(problem, first, np.zeros(places, bool), idle, np.asarray(0), most)
     with Threads(cores) as pool:
-        ended = {k: result for part in pool.map(search_on_core, range(cores)) for k, result in part.items()}
-    return jax.tree.map(lambda *x: np.stack(x), *(ended[k] for k in range(count)))
+        results_by_member = {
+            k: result for part in pool.map(search_on_core, range(cores)) for k, result in part.items()
+        }
+    return jax.tree.map(lambda *x: np.stack(x), *(results_by_member[k] for k in range(count)))
 
 
 def linearise(problem: Problem, z: Z, data: Data) -> tuple[Array, Array, Observation]:
@@ -490,8 +492,8 @@ def _linearise_by_search_program(problem: Problem, z: Z, data: Data) -> tuple[Ar
         one_member[3],
         None if active is None else np.asarray(active)[None],
     )
-    _, ended = _search_with_states(problem, members, 1, problem.observe.places(problem))
-    state = jax.tree.map(lambda x: jnp.asarray(x[0]), ended)
+    _, final_states = _search_with_states(problem, members, 1, problem.observe.places(problem))
+    state = jax.tree.map(lambda x: jnp.asarray(x[0]), final_states)
     return state.found.residual, state.found.jacobian, state.aux
 
 
@@ -643,28 +645,28 @@ def search_rollouts(
             trail[:, fresh] = np.nan
             aux = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), optima[2])
             begin = functools.partial(_initial_progress, solver, size=optima[0].shape[1], aux=aux)
-            begun = jax.device_get(jax.vmap(begin)(jnp.asarray(ahead)))
+            first_states = jax.device_get(jax.vmap(begin)(jnp.asarray(ahead)))
             put = lambda old, new: _with_values(old, fresh, new[fresh])  # noqa: B023, E731
-            progress = begun if progress is None else jax.tree.map(put, progress, begun)
+            progress = first_states if progress is None else jax.tree.map(put, progress, first_states)
         assert progress is not None  # the first searches are fresh
         progress, ends = jax.device_get(_step_searches(progress, optima, data, weights[assigned.member]))
         state = progress[1]
         ahead, observation = state.ahead, state.aux
         small = 0.1 * (DECREMENT + DECREMENT_SHARE * ends.cost)
-        over = state.over | (state.steps >= max_steps) | (ends.decrement < small)
-        over = over | (trail[0] - ends.cost < SAME + STALLED * ends.cost)
+        is_over = state.over | (state.steps >= max_steps) | (ends.decrement < small)
+        is_over = is_over | (trail[0] - ends.cost < SAME + STALLED * ends.cost)
         cost[assigned.holds[going]] = ends.cost[going]
         if within < np.inf:
-            done = np.r_[[*assigned.ended], assigned.holds[over & assigned.taken]].astype(int)
+            done = np.r_[[*assigned.ended], assigned.holds[is_over & assigned.taken]].astype(int)
             lowest = np.min(cost[done], initial=np.inf)
-            lower = assigned.taken & ~over & (ends.cost < lowest - SAME)
+            lower = assigned.taken & ~is_over & (ends.cost < lowest - SAME)
             agree = within <= SAME and np.sum(cost[done] < lowest + SAME) >= AGREE and not lower.any()
             so_far = min(lowest, np.min(ends.cost[assigned.taken]))
             with np.errstate(invalid="ignore"):  # NaN of runs that cannot be simulated yet
                 hope = HOPELESS * np.fmin(ends.decrement, trail[LATELY] - ends.cost)
-            over = over | (ends.cost - hope > so_far + within) | agree
+            is_over = is_over | (ends.cost - hope > so_far + within) | agree
         trail = np.concatenate([trail[1:], ends.cost[None]])
-        assigned.leave(over, (ends, observation))
+        assigned.leave(is_over, (ends, observation))
     return jax.tree.map(lambda *x: np.stack(x), *(assigned.ended[k] for k in range(len(starts))))
 
 
@@ -696,8 +698,10 @@ def search_starts(
     members = SearchMember(np.asarray(starts), *tables)
     problem = dataclasses.replace(problem, data=data)
     # A search of one step evaluates its start.
-    begun, ended = (search_refilling(problem, members, steps, problem.observe.places(problem)) for steps in (1, 100))
-    return ended[0], begun[1].status, ended[1].status
+    first_results, final_results = (
+        search_refilling(problem, members, steps, problem.observe.places(problem)) for steps in (1, 100)
+    )
+    return final_results[0], first_results[1].status, final_results[1].status
 
 
 @compiled

@@ -276,7 +276,7 @@ def run_evolution(
     """
     from cmaes import CMA
 
-    begun = time.perf_counter()
+    start_time = time.perf_counter()
     search = CMA(np.asarray(centre, float), 1.0, population_size=size, seed=seed, cov=np.array(covariance, float))
     z = np.empty((0, len(centre))) if beside is None else np.asarray(beside, float)
     rows, cost, progress = None, np.empty(0), list[Generation]()
@@ -285,7 +285,7 @@ def run_evolution(
         points = sample if number > 1 or not len(z) else np.concatenate([z, sample])
 
         def advance(done: int) -> None:
-            minutes = (time.perf_counter() - begun) / 60
+            minutes = (time.perf_counter() - start_time) / 60
             tell(progress_remark("members", number, done, len(points), minutes))  # noqa: B023
 
         now = members.run(points, advance)
@@ -326,12 +326,12 @@ def local_regression(
     apart = z - found.z[at]
     near = np.argsort(np.einsum("ij,jk,ik->i", apart, spread, apart), kind="stable")[:number]
     scale = np.asarray(posed.data.weight / posed.data.sd)
-    moved = np.where(scale > 0, (reading[near] - found.reading[at]) * scale, 0.0).reshape(number, -1)
+    reading_changes = np.where(scale > 0, (reading[near] - found.reading[at]) * scale, 0.0).reshape(number, -1)
     design = np.column_stack([np.ones(number), apart[near]])
     # A ridge of one prior sd: parameters that the members do not determine get slope zero.
     ridge = np.diag([0.0, *np.full(z.shape[1], 1e-3 * number * np.var(apart[near]) + 1e-12)])
-    slope = np.linalg.solve(design.T @ design + ridge, design.T @ moved)
-    unexplained = moved - design @ slope
+    slope = np.linalg.solve(design.T @ design + ridge, design.T @ reading_changes)
+    unexplained = reading_changes - design @ slope
     return slope[1:].T, float(np.sqrt(np.mean(unexplained**2)))
 
 
@@ -390,9 +390,9 @@ class PopulationSearch:
     def outcomes(self) -> dict[str, int]:
         """Number of members with at least one row of each status or flag. Zeros are omitted."""
         status, flags = self.found.status, self.found.flags
-        ended = {word: int((status == k).any(1).sum()) for k, word in enumerate(STATUSES) if k}
-        ended["jumps"] = int(self._jumps(flags).any(1).sum())
-        return {word: count for word, count in ended.items() if count}
+        status_counts = {word: int((status == k).any(1).sum()) for k, word in enumerate(STATUSES) if k}
+        status_counts["jumps"] = int(self._jumps(flags).any(1).sum())
+        return {word: count for word, count in status_counts.items() if count}
 
     @staticmethod
     def _jumps(flags: np.ndarray) -> np.ndarray:
@@ -417,12 +417,12 @@ class PopulationSearch:
                 settled=self.found.settled,
             )
         ]
-        ended = self.outcomes()
-        lost = {status: ended[status] for status in LOST_AS if status in ended}
-        notes += [Remark("lost_rows", members=lost)] * bool(lost)
-        if "jumps" in ended:
+        status_counts = self.outcomes()
+        lost_counts = {status: status_counts[status] for status in LOST_AS if status in status_counts}
+        notes += [Remark("lost_rows", members=lost_counts)] * bool(lost_counts)
+        if "jumps" in status_counts:
             rows = np.flatnonzero(self._jumps(self.found.flags[self.at]))
-            notes.append(Remark("members_jump", members=ended["jumps"], best=tuple(int(k) + 1 for k in rows)))
+            notes.append(Remark("members_jump", members=status_counts["jumps"], best=tuple(int(k) + 1 for k in rows)))
         notes += [Remark("ended_at_edge", edge=self.edge)] * bool(self.edge)
         notes += [Remark("read_from_members", names=self.apart, left=self.left)] * bool(self.apart)
         return notes

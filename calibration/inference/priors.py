@@ -198,9 +198,9 @@ def _uncertain_names(robot: Robot, names: Iterable[str]) -> Names:
     log may be late without the knowledge of its author.
     """
     fields, exact = parameters_by_name(robot), robot.rig.exact
-    stated = robot.rig.stated if robot.rig.inherits else {*robot.rig.stated, DELAY}
+    file_names = robot.rig.stated if robot.rig.inherits else {*robot.rig.stated, DELAY}
     own_names = (n for n in names if n in fields and n not in exact)
-    return tuple(n for n in own_names if float(fields[n].value) != 0.0 or n in stated)
+    return tuple(n for n in own_names if float(fields[n].value) != 0.0 or n in file_names)
 
 
 def names_to_fit(robot: Robot, configurations: Iterable[str], idle: Names = ()) -> Names:
@@ -246,8 +246,8 @@ def initial_state_names(robot: Robot) -> Names:
     """Names of the initial speeds and angles of histories, if the rig leaves them free."""
     if robot.rig.begins is None or robot.rig.start != "free":
         return ()
-    every = (f"rig.{run}.{field}" for run in robot.rig.begins.names for field in ("motor_speed", "angle"))
-    return tuple(name for name in every if name in robot.rig.stated)
+    state_names = (f"rig.{run}.{field}" for run in robot.rig.begins.names for field in ("motor_speed", "angle"))
+    return tuple(name for name in state_names if name in robot.rig.stated)
 
 
 #: Freed by the loop in addition to friction: values from benches and makers, with their tolerances.
@@ -288,8 +288,8 @@ def loop_parameter_names(
     ]
     names = [n for n in names if _leading_parameter(robot, n) is None]
     decided = (*(f".{n}" for n in (*SHAFT, *OF_TURNS)), ".radius")  # above, by what the channels show
-    stated = names_to_fit(robot, present, idle)
-    owned = (n for n in stated if not n.endswith(decided) and ".track." not in n and f".{GROUND}" not in n)
+    fitted_names = names_to_fit(robot, present, idle)
+    owned = (n for n in fitted_names if not n.endswith(decided) and ".track." not in n and f".{GROUND}" not in n)
     return tuple(
         dict.fromkeys(
             [
@@ -363,14 +363,14 @@ def choose_free_names(
             nothing is left to fit.
     """
     everything = list(parameters_by_name(robot))
-    chosen: list[str] = []
+    free_names: list[str] = []
     for word in free:
-        chosen += default if word == "default" else expand_name(word, everything, "--free")
+        free_names += default if word == "default" else expand_name(word, everything, "--free")
     fixed = [n for word in fix for n in expand_name(word, everything, "--fix")]
-    both = [word for word in free if word in fix]
-    if both:
-        raise BadConfiguration(f"--free and --fix both name {both[0]}; name it once")
-    names = [n for n in dict.fromkeys(chosen if free else default) if n not in fixed]
+    conflicting = [word for word in free if word in fix]
+    if conflicting:
+        raise BadConfiguration(f"--free and --fix both name {conflicting[0]}; name it once")
+    names = [n for n in dict.fromkeys(free_names if free else default) if n not in fixed]
     if not names and not fix:
         raise BadConfiguration(
             "no parameter to fit: every loss in the robot's file is zero or exact, so it is fixed, and no value "
@@ -422,8 +422,8 @@ def parse_prior(text: str) -> tuple[str, float, float]:
         raise BadConfiguration(f"--prior {text}: {form}")
     try:
         mean = float(match["value"])
-        stated = match["sd"].strip()
-        sd = abs(mean) * float(stated[:-1]) / 100 if stated.endswith("%") else float(stated)
+        sd_text = match["sd"].strip()
+        sd = abs(mean) * float(sd_text[:-1]) / 100 if sd_text.endswith("%") else float(sd_text)
     except ValueError:
         raise BadConfiguration(f"--prior {text}: {form}") from None
     if not (math.isfinite(mean) and math.isfinite(sd) and sd > 0):
@@ -437,13 +437,13 @@ def parse_priors(texts: Sequence[str]) -> Priors:
     Raises:
         BadConfiguration: for the same reasons as `parse_prior`, or if a name is given twice.
     """
-    stated: dict[str, tuple[float, float]] = {}
+    priors: dict[str, tuple[float, float]] = {}
     for text in texts:
         name, mean, sd = parse_prior(text)
-        if name in stated:
+        if name in priors:
             raise BadConfiguration(f"--prior {name}: given twice; expected once")
-        stated[name] = (mean, sd)
-    return stated
+        priors[name] = (mean, sd)
+    return priors
 
 
 def parameter_coordinates(

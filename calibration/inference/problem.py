@@ -147,20 +147,20 @@ class Problem(eqx.Module):
         size, (rows, count) = x.size, data.measured.shape
 
         def shown(x: Array) -> tuple[tuple[Array, Array], tuple[Array, Observation, Signals]]:
-            observation, signals, left = self.observe.shown(robot(x[:size]), unknowns + x[size:], was_found)
+            observation, signals, residual = self.observe.shown(robot(x[:size]), unknowns + x[size:], was_found)
             r = self.signed(observation, data)
-            return (r, left), (r, observation, signals)
+            return (r, residual), (r, observation, signals)
 
         wide = jnp.concatenate([x, jnp.zeros(unknowns.shape[1])])
-        (slope, left), (r, observed, signals) = jax.jacfwd(shown, has_aux=True)(wide)
+        (slope, residual_slope), (r, observed, signals) = jax.jacfwd(shown, has_aux=True)(wide)
         by_row = slope[: rows * count].reshape(rows, count, -1)
-        by_row = implicit_slopes(jnp.concatenate([by_row, slope[rows * count :, None]], 1), left)
+        by_row = implicit_slopes(jnp.concatenate([by_row, slope[rows * count :, None]], 1), residual_slope)
         return r, jnp.concatenate([by_row[:, :count].reshape(-1, size), by_row[:, count]]), observed, signals
 
     def excess(self, seen: Observation, data: Data) -> Float[Array, " rows"]:
         """Used adhesion above the margin, in units of the penalty, shape (rows,). Negative within the margin."""
-        over = (seen.adhesion_used - (1 - MARGIN)) * jnp.max(data.weight, 1) / data.stiffness
-        return jnp.where(jnp.isfinite(over), over, 0.0)
+        adhesion_excess = (seen.adhesion_used - (1 - MARGIN)) * jnp.max(data.weight, 1) / data.stiffness
+        return jnp.where(jnp.isfinite(adhesion_excess), adhesion_excess, 0.0)
 
     def robot(self, z: Float[Array, " parameters"]) -> Robot:
         """Robot at coordinates z."""

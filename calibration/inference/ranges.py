@@ -132,17 +132,17 @@ def _sign_remarks_of_readings(runs: Runs, measured: np.ndarray, possible: np.nda
     for k, channel in enumerate(runs.channels if runs.layout.weight else ()):
         if not channel.directed or runs.layout.magnitude(channel.name):
             continue
-        off, turned = (_smallest_rms(sign * measured[:, k] - possible[:, :, k]) for sign in (1.0, -1.0))
-        if turned * NEARER < off:
-            theirs = runs.headings.get(channel.column, channel.column)
+        off, reversed_rms = (_smallest_rms(sign * measured[:, k] - possible[:, :, k]) for sign in (1.0, -1.0))
+        if reversed_rms * NEARER < off:
+            heading = runs.headings.get(channel.column, channel.column)
             remarks.append(
                 Remark(
                     "turned",
                     source=runs.source,
                     column=channel.column,
-                    theirs=theirs,
+                    theirs=heading,
                     off=off / channel.factor,
-                    turned=turned / channel.factor,
+                    turned=reversed_rms / channel.factor,
                 )
             )
     return remarks if len(remarks) == 1 else []  # with several, the file's values may be wrong instead
@@ -201,8 +201,8 @@ def _check_gear(runs: Runs, measured: np.ndarray, robot: Robot) -> None:
     """Rejects a gear ratio if its inverse is the ratio of motor and output speeds."""
     readings = dict(zip(channels.channel_names(robot.channels), measured.T, strict=True))
     conditions = runs.conditions(robot)
-    which = np.asarray(conditions.configuration)
-    radius = np.asarray([float(c.radius) for c in robot.configurations.members])[which]
+    configuration = np.asarray(conditions.configuration)
+    radius = np.asarray([float(c.radius) for c in robot.configurations.members])[configuration]
     output = readings.get("output_speed", readings["speed"] / radius if "speed" in readings else None)
     motor = readings.get("motor_speed", conditions.motor_speed)
     if motor is None:  # approximately its speed without load

@@ -64,8 +64,8 @@ def _status_remarks(found: CalibrationResult) -> Iterator[Remark]:
 
 def _parameter_remarks(found: CalibrationResult) -> Iterator[Remark]:
     far = {name for name, p in found.parameters.items() if abs(p.shift) > FAR}  # these get a remark of their own
-    if held := tuple(name for name in found.undetermined if name not in far):
-        yield Remark("held_by_prior", names=held)
+    if near_prior := tuple(name for name in found.undetermined if name not in far):
+        yield Remark("held_by_prior", names=near_prior)
     if pairs := found.together:
         yield Remark("only_together", pairs=pairs)
     for name, p in found.parameters.items():
@@ -91,14 +91,14 @@ def _limit_remarks(found: CalibrationResult) -> Iterator[Remark]:
 
 
 def _block_remarks(found: CalibrationResult) -> Iterator[Remark]:
-    for kind, held in found.held_out.items():
-        if held.unreachable_rows:
-            yield Remark("no_prediction", kind=kind, rows=len(held.unreachable_rows), total=len(found))
+    for kind, block_errors in found.held_out.items():
+        if block_errors.unreachable_rows:
+            yield Remark("no_prediction", kind=kind, rows=len(block_errors.unreachable_rows), total=len(found))
     for kind, others in found.held_out_alike.items():
         if others:
             yield Remark("same_predictions", kind=kind, others=others)
-    for kind, held in found.held_out.items():
-        if not all(block.converged for block in held.blocks.values()):
+    for kind, block_errors in found.held_out.items():
+        if not all(block.converged for block in block_errors.blocks.values()):
             yield Remark("block_not_converged", kind=kind)
 
 

@@ -124,15 +124,17 @@ def find_residual_clusters(fit: Residuals, seed: int = 0) -> tuple[ResidualClust
     if not columns:
         return ()
     channel_tests = [
-        (k, seen)
+        (k, tests)
         for k in range(fit.counts.shape[1])
-        if (seen := _tests_of_channel(residuals, k, columns)) is not None
+        if (tests := _tests_of_channel(residuals, k, columns)) is not None
     ]
     count = sum(len(tested.tests) for _, tested in channel_tests)
-    every = [
-        (count * float(p[0]), k, test) for k, seen in channel_tests for test, p in seen.p_values(seen.left[:, None])
+    clusters = [
+        (count * float(p[0]), k, test)
+        for k, tests in channel_tests
+        for test, p in tests.p_values(tests.left[:, None])
     ]
-    significant = [one for one in every if one[0] < LEVEL]
+    significant = [one for one in clusters if one[0] < LEVEL]
     if not significant:
         return ()
     strongest = _permuted_p_values(channel_tests, seed)
@@ -140,19 +142,21 @@ def find_residual_clusters(fit: Residuals, seed: int = 0) -> tuple[ResidualClust
     answer: list[ResidualCluster] = []
     for k, tested in channel_tests:
         chances = [
-            (p, test, floor * (1 + int(np.sum(strongest <= p / count)))) for p, seen, test in significant if seen == k
+            (p, test, floor * (1 + int(np.sum(strongest <= p / count))))
+            for p, tests, test in significant
+            if tests == k
         ]
-        mine = sorted(((p if c <= floor else max(p, c)), test) for p, test, c in chances if c <= LEVEL)
-        taken: list[tuple[float, _Comparison, list[str]]] = []
-        for p, test in _coarse_first(mine, columns):
-            if any(test.column in (t.column, *names) for _, t, names in taken):
+        own_chances = sorted(((p if c <= floor else max(p, c)), test) for p, test, c in chances if c <= LEVEL)
+        comparisons: list[tuple[float, _Comparison, list[str]]] = []
+        for p, test in _coarse_first(own_chances, columns):
+            if any(test.column in (t.column, *names) for _, t, names in comparisons):
                 continue
-            explains = next((t for t in taken if tested.beside(test, t[1]) * count >= LEVEL), None)
+            explains = next((t for t in comparisons if tested.beside(test, t[1]) * count >= LEVEL), None)
             if explains is None:
-                taken.append((p, test, []))
+                comparisons.append((p, test, []))
             else:
                 explains[2].append(test.column)
-        answer += [_report_cluster(residuals, k, test, p, tuple(names)) for p, test, names in taken]
+        answer += [_report_cluster(residuals, k, test, p, tuple(names)) for p, test, names in comparisons]
     return tuple(sorted(answer, key=lambda c: c.p))
 
 
@@ -226,16 +230,18 @@ def _units_by_run(fit: Residuals) -> _ResidualUnits:
     def total(x: np.ndarray) -> np.ndarray:
         return np.einsum("sr,sc...->rc...", member.astype(float), np.nan_to_num(x))
 
-    each = [member[:, r] for r in range(len(first))]
-    one = {c: v[first] for c, v in fit.runs.extras.items() if all(len(np.unique(v[m])) == 1 for m in each)}
+    members_by_run = [member[:, r] for r in range(len(first))]
+    columns_by_run = {
+        c: v[first] for c, v in fit.runs.extras.items() if all(len(np.unique(v[m])) == 1 for m in members_by_run)
+    }
     # A condition that changes within a run enters as its mean.
     columns = {
-        c: np.array([v[m].mean() for m in each]) if v.dtype.kind == "f" else v[first]
+        c: np.array([v[m].mean() for m in members_by_run]) if v.dtype.kind == "f" else v[first]
         for c, v in fit.runs.columns.items()
     }
     mean = np.maximum(counts, 1.0)
     return _ResidualUnits(
-        runs=dataclasses.replace(fit.runs, columns=columns, extras=one),
+        runs=dataclasses.replace(fit.runs, columns=columns, extras=columns_by_run),
         counts=counts > 0,
         whitened=total(rows.whitened) / weight,
         jacobian=total(rows.jacobian) / weight[..., None],
@@ -411,23 +417,25 @@ def _tests_of_channel(whole: _ResidualUnits, k: int, columns: Columns) -> _Chann
         return x + directions @ ((by - 1)[:, None] * (directions.T @ x))
 
     travel = np.sign(whole.simulated[counts, k])
-    both = min(np.sum(travel > 0), np.sum(travel < 0)) >= 2
-    smooth = _condition_columns(runs, whole.simulated[counts], travel if both else None)
-    taken = _orthonormal_basis(np.concatenate([directions[:, ~open_], _unit_columns(scaled(smooth, forth))], 1))
+    has_both_directions = min(np.sum(travel > 0), np.sum(travel < 0)) >= 2
+    smooth = _condition_columns(runs, whole.simulated[counts], travel if has_both_directions else None)
+    explained_basis = _orthonormal_basis(
+        np.concatenate([directions[:, ~open_], _unit_columns(scaled(smooth, forth))], 1)
+    )
     whitened = scaled(whole.whitened[counts, k][:, None], back)[:, 0]
-    projected = whitened - taken @ (taken.T @ whitened)
-    freedom = len(projected) - taken.shape[1]
+    projected = whitened - explained_basis @ (explained_basis.T @ whitened)
+    freedom = len(projected) - explained_basis.shape[1]
     tests = []
     for name, cells in columns.items():
         for within in ("", *_condition_labels(runs)):
-            for reversing in (False, True)[: 1 + both]:
+            for reversing in (False, True)[: 1 + has_both_directions]:
                 shape = _comparison_columns(cells[counts], runs[within] if within else None)
                 basis = scaled(shape * travel[:, None] if reversing else shape, forth)
                 basis = _orthonormal_basis(_unit_columns(basis))
-                basis = _orthonormal_basis(basis - taken @ (taken.T @ basis), OWN)
+                basis = _orthonormal_basis(basis - explained_basis @ (explained_basis.T @ basis), OWN)
                 if basis.shape[1] and freedom - basis.shape[1] >= LEAST:
                     tests.append(_Comparison(name, within, reversing, basis))
-    return _ChannelTests(projected, freedom, taken, tuple(tests)) if tests else None
+    return _ChannelTests(projected, freedom, explained_basis, tuple(tests)) if tests else None
 
 
 def _unit_columns(columns: np.ndarray) -> np.ndarray:
@@ -460,8 +468,8 @@ def _comparison_columns(cells: np.ndarray, within: np.ndarray | None) -> np.ndar
             [np.where(cell == c, _centred_ranks(np.where(cell == c, cells, np.nan)), 0.0) for c in np.unique(cell)], 1
         )
     words = _column_as_words(cells)
-    both = [(words == w) & (cell == c) for w in np.unique(words) for c in np.unique(cell)]
-    return np.stack([b for b in both if b.any()], 1).astype(float)
+    cell_masks = [(words == w) & (cell == c) for w in np.unique(words) for c in np.unique(cell)]
+    return np.stack([b for b in cell_masks if b.any()], 1).astype(float)
 
 
 def _condition_columns(runs: Runs, simulated: np.ndarray, travel: np.ndarray | None) -> np.ndarray:

@@ -347,8 +347,8 @@ class CalibrationResult:
         sd).
         """
         groups: dict[str, Names] = {}
-        for kind, held in self.held_out.items():
-            like = next((k for k in groups if self._same(self.held_out[k], held)), None)
+        for kind, block_errors in self.held_out.items():
+            like = next((k for k in groups if self._same(self.held_out[k], block_errors)), None)
             groups |= {kind: ()} if like is None else {like: (*groups[like], kind)}
         return groups
 
@@ -369,7 +369,10 @@ class CalibrationResult:
         fits = {"before": self.errors_before, "after": self.errors_after}
         if self.main_blocks is not None:
             fits["held_out"] = self.main_blocks.errors
-        return {fit: {name: e.rms for name, e in by.items() if e.rows} for fit, by in fits.items()}
+        return {
+            fit: {name: e.rms for name, e in errors_by_channel.items() if e.rows}
+            for fit, errors_by_channel in fits.items()
+        }
 
     def to_json(self) -> Json:
         """Content of result.json, as described in docs/schemas/calibrate.schema.json."""
@@ -451,8 +454,8 @@ class CalibrationResult:
 
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
-        held = [describe(Remark("held_by_prior", names=self.undetermined))] if self.undetermined else []
-        note = "\n".join([describe(self, "header", robot_name), *held])
+        notes = [describe(Remark("held_by_prior", names=self.undetermined))] if self.undetermined else []
+        note = "\n".join([describe(self, "header", robot_name), *notes])
         robot_file.write_robot(self.robot, folder / "robot.toml", note=note)
         writing.write_json(folder / "result.json", self.to_json())
         writing.write_table(folder / "rows.csv", self.rows(), tables)

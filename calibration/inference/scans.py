@@ -59,8 +59,10 @@ class Scan:
         """Coordinate between point k (inside) and the next one at which the rise is 3.84, or the end point."""
         if not 0 <= k + side < len(self.at):
             return float(self.at[k])
-        one, two = (np.sqrt(max(2 * (self.cost[j] - self.cost.min()), 0.0)) for j in (k, k + side))
-        return float(self.at[k] + (self.at[k + side] - self.at[k]) * (Z95 - one) / max(two - one, 1e-12))
+        inner_root, outer_root = (np.sqrt(max(2 * (self.cost[j] - self.cost.min()), 0.0)) for j in (k, k + side))
+        return float(
+            self.at[k] + (self.at[k + side] - self.at[k]) * (Z95 - inner_root) / max(outer_root - inner_root, 1e-12)
+        )
 
     def open(self) -> tuple[bool, bool]:
         """True for each end of the interval that may lie beyond the scanned range."""
@@ -156,8 +158,8 @@ def search_lower_minima(
         found: optimum of a search, and the observation there.
         search: function that searches from a start.
     """
-    every = scanned_coordinates(problem)
-    if not every:
+    coordinates = scanned_coordinates(problem)
+    if not coordinates:
         return found
 
     def objective(z: np.ndarray) -> float:
@@ -166,7 +168,7 @@ def search_lower_minima(
 
     for _ in range(AGAIN):
         cost_here, z = float(found[0].cost), np.asarray(found[0].z)
-        looked = {k: scan_coordinate(problem, z, data, k) for k in every}
+        looked = {k: scan_coordinate(problem, z, data, k) for k in coordinates}
         lower = found
         for k, scan in looked.items():
             for j in [j for j in scan.local_minima() if scan.cost[j] < cost_here - WORTH][:TRIED]:
@@ -176,8 +178,8 @@ def search_lower_minima(
         if not float(lower[0].cost) < cost_here - WORTH:
             break
         found = lower
-        over = " or ".join(problem.coordinates.names[k] for k in every)
-        tell(progress_remark("basin", over, float(found[0].cost)))
+        scanned_names = " or ".join(problem.coordinates.names[k] for k in coordinates)
+        tell(progress_remark("basin", scanned_names, float(found[0].cost)))
     else:
         return dataclasses.replace(found[0], converged=jnp.asarray(False)), found[1]
     # A kink has a slope on either side, so an optimum there is a point with no lower point nearby.

@@ -83,8 +83,10 @@ def estimate_noise(runs: Runs, sizes: Float[np.ndarray, "rows channels"]) -> tup
     measured = runs.measured()
     noises: list[SeriesNoise | None] = []
     for k, channel in enumerate(runs.channels):
-        each = [_noise_of_channel(channel, measured[:, k], sizes[:, k], runs[a], a, s) for a, s in by_axis.items()]
-        enough = [e for e in each if e is not None and e.freedom >= FEWEST]
+        channel_noises = [
+            _noise_of_channel(channel, measured[:, k], sizes[:, k], runs[a], a, s) for a, s in by_axis.items()
+        ]
+        enough = [e for e in channel_noises if e is not None and e.freedom >= FEWEST]
         first = next((e for e in enough if e.axis == FIRST), None)
         noises.append(first or max(enough, key=lambda e: e.freedom, default=None))
     return tuple(noises)
@@ -136,8 +138,8 @@ def _noise_of_channel(
     that of the mixture by 2.2. Instruments of motors at rest show 0 without noise, so such readings do not count.
     """
     measured = np.where(channel.zero_at_rest & (measured == 0), np.nan, measured)
-    weights, used = _differences_from_neighbours(measured, x, series)
-    if not used:
+    weights, rows_used = _differences_from_neighbours(measured, x, series)
+    if not rows_used:
         return None
     difference = weights @ np.nan_to_num(measured)
     least = float(display_step(measured, channel) / np.sqrt(12))
@@ -155,7 +157,7 @@ def _noise_of_channel(
     likely, size, freedom = np.array(forms).T
     probability = np.exp(likely - likely.max()) / np.exp(likely - likely.max()).sum()
     floor, *share = (np.sqrt(probability) * size * (probability > NEGLIGIBLE)).tolist()
-    return SeriesNoise(channel, floor, sum(share, 0.0), float(probability @ freedom), axis, used, least)
+    return SeriesNoise(channel, floor, sum(share, 0.0), float(probability @ freedom), axis, rows_used, least)
 
 
 def _differences_from_neighbours(
@@ -166,7 +168,7 @@ def _differences_from_neighbours(
 
     The weights have the shape (differences, rows). Only series with at least one difference are counted.
     """
-    differences, used = [], 0
+    differences, rows_used = [], 0
     for rows in series:
         rows = rows[np.isfinite(measured[rows])]
         rows = rows[np.argsort(x[rows], kind="stable")]
@@ -177,8 +179,10 @@ def _differences_from_neighbours(
         weights = np.concatenate([-share, np.ones(len(middle)), share - 1.0])
         second_differences = k, np.concatenate([before, middle, after])
         differences.append(sparse.csr_array((weights, second_differences), (len(middle), len(measured))))
-        used += bool(len(middle))
-    return sparse.csr_array(sparse.vstack(differences)) if differences else sparse.csr_array((0, len(measured))), used
+        rows_used += bool(len(middle))
+    return sparse.csr_array(sparse.vstack(differences)) if differences else sparse.csr_array(
+        (0, len(measured))
+    ), rows_used
 
 
 def _sound_differences(unit: np.ndarray, limit: float) -> tuple[np.ndarray, float]:

@@ -260,11 +260,13 @@ def windows_of_run(time: np.ndarray, piece: np.ndarray, length: float) -> list[t
             continue
         times = time[begin:end]
         duration = times[-1] - times[0]
-        each = min(length, duration)
-        for first in times[0] + np.linspace(0.0, duration - each, int((duration - each) / (APART * each)) + 1):
-            low, high = np.searchsorted(times, (first - 1e-9, first + each + 1e-9))
+        window_length = min(length, duration)
+        for first in times[0] + np.linspace(
+            0.0, duration - window_length, int((duration - window_length) / (APART * window_length)) + 1
+        ):
+            low, high = np.searchsorted(times, (first - 1e-9, first + window_length + 1e-9))
             if high - low >= FEWEST - 1:
-                windows.append((np.arange(begin + low, begin + high), (times[low:high] - first) / each))
+                windows.append((np.arange(begin + low, begin + high), (times[low:high] - first) / window_length))
     return windows
 
 
@@ -296,12 +298,12 @@ def local_slopes(time: np.ndarray, values: np.ndarray, piece: np.ndarray, count:
             continue
         low = np.clip(np.arange(begin, end) - wide // 2, begin, end - wide)
         for part in np.array_split(np.arange(end - begin), 1 + (end - begin) * wide // 1_000_000):
-            near, here = low[part][:, None] + np.arange(wide), (begin + part)[:, None]
-            away = time[near] - time[here]
+            near, row_index = low[part][:, None] + np.arange(wide), (begin + part)[:, None]
+            away = time[near] - time[row_index]
             scale = np.abs(away).max()
             powers = (away / scale)[:, :, None] ** np.arange(4)
             normal = np.einsum("nwi,nwj->nij", powers, powers)
-            rise = np.einsum("nwi,nw->ni", powers, values[near] - values[here])
+            rise = np.einsum("nwi,nw->ni", powers, values[near] - values[row_index])
             out[begin + part] = np.linalg.solve(normal, rise[..., None])[:, 1, 0] / scale
     return out
 
@@ -402,7 +404,7 @@ class _LogArrays:
             if (x := getattr(self.of_rows, name)) is not None and np.ptp(np.asarray(x)) > 0
         }
         linear = self.problem.base.rig.between_rows == "linear"
-        knots, moved = list[np.ndarray](), list[np.ndarray]()
+        knots, drive_changes = list[np.ndarray](), list[np.ndarray]()
         values, integrals = ({name: list[np.ndarray]() for name in changing} for _ in range(2))
         for rows, cell in zip(self.every, cells, strict=True):
             period = float(self.time[rows[-1]] - self.time[rows[0]]) + 1.0
@@ -415,9 +417,9 @@ class _LogArrays:
                 integrals[name].append(np.r_[0.0, np.cumsum(np.diff(time) * mean)])
                 values[name].append(padded)
             knots.append(time + begin)
-            moved.append(cell + begin)
-        held, summed = ({n: np.concatenate(x) for n, x in each.items()} for each in (values, integrals))
-        return ImposedCourse(np.concatenate(knots), held, summed, np.concatenate(moved))
+            drive_changes.append(cell + begin)
+        means, summed = ({n: np.concatenate(x) for n, x in each.items()} for each in (values, integrals))
+        return ImposedCourse(np.concatenate(knots), means, summed, np.concatenate(drive_changes))
 
 
 def points_and_windows(
@@ -457,9 +459,9 @@ def points_and_windows(
     piece = np.where(usable, np.cumsum(np.r_[False, (np.diff(apart) != 0) | (np.diff(way) != 0)]), -1)
     if plan.angle:
         rate = local_slopes(time, readings[:, plan.motion], piece, wide)
-    turned = np.cumsum(np.where(since > 0, 0.5 * (speed + np.roll(speed, 1)) * since, 0.0))
+    turned_angle = np.cumsum(np.where(since > 0, 0.5 * (speed + np.roll(speed, 1)) * since, 0.0))
     none = np.zeros(len(run))
-    arrays = readings, sd, rate, way, turned - turned[count[:-1]][run], since, time, joined["row"]
+    arrays = readings, sd, rate, way, turned_angle - turned_angle[count[:-1]][run], since, time, joined["row"]
     late = none + delay, none + log.step, drift
     windows = [
         _weight_windows(r, time, windows_of_run(time, np.where(run == r, piece, -1), length))

@@ -24,9 +24,9 @@ def sized_error(simulated: np.ndarray, measured: np.ndarray) -> np.ndarray:
     Args:
         simulated, measured: CV and EV, shape (rows, ...).
     """
-    both = np.isfinite(simulated) & np.isfinite(measured)
+    is_compared = np.isfinite(simulated) & np.isfinite(measured)
     with np.errstate(divide="ignore", invalid="ignore"):  # NaN for a channel without readings
-        size = np.sqrt(np.sum(np.square(measured), 0, where=both) / both.sum(0))
+        size = np.sqrt(np.sum(np.square(measured), 0, where=is_compared) / is_compared.sum(0))
         return np.asarray(100.0 * (simulated - measured) / size)
 
 
@@ -38,8 +38,8 @@ def share_of_measured(simulated: np.ndarray, measured: np.ndarray) -> np.ndarray
         simulated, measured: shape (rows, channels), or shapes that broadcast to it.
     """
     simulated, measured = np.broadcast_arrays(simulated, measured)
-    both = np.isfinite(simulated) & np.isfinite(measured)
-    off, size = (np.sqrt(np.sum(np.square(x), 0, where=both)) for x in (simulated - measured, measured))
+    is_compared = np.isfinite(simulated) & np.isfinite(measured)
+    off, size = (np.sqrt(np.sum(np.square(x), 0, where=is_compared)) for x in (simulated - measured, measured))
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.asarray(off / size)
 
@@ -67,8 +67,8 @@ def r_squared(measured: np.ndarray, approximated: np.ndarray) -> float:
 
     NaN if the measured values do not vary, or if fewer than two rows have both.
     """
-    both = np.isfinite(measured) & np.isfinite(approximated)
-    y, approximation = measured[both], approximated[both]
+    is_compared = np.isfinite(measured) & np.isfinite(approximated)
+    y, approximation = measured[is_compared], approximated[is_compared]
     if y.size < 2:
         return float("nan")
     spread = float(np.sum(y**2) - np.sum(y) ** 2 / y.size)

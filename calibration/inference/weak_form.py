@@ -229,8 +229,8 @@ def equation_terms(
     if plan.others:
         if robot.has_ground:
             creep = chassis.ground.speed_creep(signals.traction, signals.normal, signals.adhesion)
-            lost = balances.effects_sum(robot, signals, "slip")
-            signals = dataclasses.replace(signals, speed=signals.speed_theoretical - creep - lost)
+            slip_effects = balances.effects_sum(robot, signals, "slip")
+            signals = dataclasses.replace(signals, speed=signals.speed_theoretical - creep - slip_effects)
         says = balances.sensor(robot, signals)
         f += [says[names[k]] - shown[k] for k in plan.others]
         y += [none] * len(plan.others)
@@ -311,7 +311,7 @@ def _terms_with_derivatives(
     # negative reading, or like a defect of that equation if the reading follows from the states.
     counts = np.array([len(e.at) for e in effects], int)
     enters = [entering.index(b) if (b := e.effect.balance) in entering else -1 for e in effects]
-    which = np.repeat(np.array([size + k if k >= 0 else -1 for k in enters], int), counts)
+    parameter_index = np.repeat(np.array([size + k if k >= 0 else -1 for k in enters], int), counts)
     channel_of_row = np.repeat(
         np.array([names.index(c) if (c := e.effect.channel) in names else 0 for e in effects], int), counts
     )
@@ -321,7 +321,7 @@ def _terms_with_derivatives(
         change = -slope[:, :, size + len(probes) :][:, :, channel_of_row]
         for k, channel in enumerate(plan.others):
             change = change.at[:, first + k].set(jnp.asarray(1.0 * (channel_of_row == channel)) * direct)
-        by_term = jnp.where(which >= 0, slope[:, :, np.maximum(which, 0)], change)
+        by_term = jnp.where(parameter_index >= 0, slope[:, :, np.maximum(parameter_index, 0)], change)
         return by_term * entered[:, None]
 
     def both(part: Callable[[Array, bool], Array]) -> tuple[Array, Array]:
@@ -397,8 +397,10 @@ def _terms_by_coordinates(problem: Problem, plan: StatePlan, rows: LogPoints, z:
 
     def one(row: LogPoints) -> Array:
         def of(z: Array) -> tuple[Array, Array]:
-            both = jnp.stack(equation_terms(plan, problem.coordinates.robot(problem.base, z), row, row.shown)[:2])
-            return both, both
+            state_terms = jnp.stack(
+                equation_terms(plan, problem.coordinates.robot(problem.base, z), row, row.shown)[:2]
+            )
+            return state_terms, state_terms
 
         slope, value = jax.jacfwd(of, has_aux=True)(z)
         return jnp.concatenate([value[..., None], slope], -1)
@@ -421,13 +423,13 @@ def fit_delay(problem: Problem, plan: StatePlan) -> FittedDelay:
     jumps, because jumps show a delay best. If several delays fit equally well, as with a periodic input, the shortest
     is returned.
     """
-    stated = float(np.max(np.asarray(problem.base.rig.delay)))
+    file_delay = float(np.max(np.asarray(problem.base.rig.delay)))
     if DELAY not in problem.coordinates.names:
-        return FittedDelay(stated, 0.0, False)
+        return FittedDelay(file_delay, 0.0, False)
     rows, course, cut = points_and_windows(problem, plan, across=True)
     time, since = np.asarray(rows.time), np.asarray(rows.since)
     if not (cut and rows.drift):
-        return FittedDelay(stated, 0.0, False)
+        return FittedDelay(file_delay, 0.0, False)
     step = float(np.median(since[since > 0]))
     apart = -(-sum(len(w.rows) for w in cut) // PROFILED)
     cut = [w.part(np.arange(0, len(w.rows), apart)) for w in cut]
@@ -455,8 +457,8 @@ def fit_delay(problem: Problem, plan: StatePlan) -> FittedDelay:
         costs, ends = [], []
         for delay in delays:
             means = course.at(float(delay))[0]
-            moved = {n: (means[n] - prompt[n])[:, None, None] for n in change}
-            f, y = (fixed[k] + sum(moved[n] * change[n][k] for n in change) for k in range(2))
+            mean_changes = {n: (means[n] - prompt[n])[:, None, None] for n in change}
+            f, y = (fixed[k] + sum(mean_changes[n] * change[n][k] for n in change) for k in range(2))
             all_integrals = np.concatenate([_integrate_terms(plan, w, f, y) for w in cut], 1)[
                 acts
             ]  # (equations, windows, 1 + z)
@@ -538,8 +540,8 @@ def fit_weak_form(problem: Problem, effects: tuple[ScoredEffect, ...] = ()) -> W
         )  # one program for all of them
 
     def whole(factors: list[np.ndarray], given: EquationTerms) -> np.ndarray:
-        each = zip(factors, cut, strict=True)
-        return np.concatenate([solve_triangular(x, window_errors(plan, w, given), lower=True) for x, w in each])
+        windows = zip(factors, cut, strict=True)
+        return np.concatenate([solve_triangular(x, window_errors(plan, w, given), lower=True) for x, w in windows])
 
     def of(z: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
         """Function of the parameters that returns residuals and their derivatives.
@@ -549,7 +551,7 @@ def fit_weak_form(problem: Problem, effects: tuple[ScoredEffect, ...] = ()) -> W
         terms_there = terms(smooth, z)
         read, none = terms(rows, z), np.zeros(equations)
         plain = [_covariance_factor(plan, w, sd, terms_there, none) for w in cut]
-        each = [
+        whitened_windows = [
             (
                 window_errors(plan, w, read)[:, 0],
                 np.sum(x**2, 1),
@@ -557,7 +559,9 @@ def fit_weak_form(problem: Problem, effects: tuple[ScoredEffect, ...] = ()) -> W
             )
             for w, x in zip(cut, plain, strict=True)
         ]
-        by_equation = (np.concatenate([x.reshape(equations, -1).T for x in part]) for part in zip(*each, strict=True))
+        by_equation = (
+            np.concatenate([x.reshape(equations, -1).T for x in part]) for part in zip(*whitened_windows, strict=True)
+        )
         unknown = disturbance_intensities(*by_equation)
         factors = [_covariance_factor(plan, w, sd, terms_there, unknown) for w in cut]
         offset = whole(factors, read)[:, 0] - whole(factors, terms_there)[:, 0]
@@ -585,22 +589,24 @@ def fit_weak_form(problem: Problem, effects: tuple[ScoredEffect, ...] = ()) -> W
                 max_nfev=STEPS, xtol=SMALL, ftol=SMALL,
             )  # fmt: skip
             step = (regression.x - z) * min(1.0, FAR / max(float(np.abs(regression.x - z).max()), 1e-300))
-            z, both = z + step, terms_at_fit(z + step)
-            if np.abs(both[:, 1 : size + 1] @ step).max() < SETTLED:
+            z, terms_after_step = z + step, terms_at_fit(z + step)
+            if np.abs(terms_after_step[:, 1 : size + 1] @ step).max() < SETTLED:
                 break
     except (np.linalg.LinAlgError, ValueError):  # non-finite numbers
         return None
-    count = len(both) - size
-    return WeakFormFit(z, both[:, 0], both[:, 1 : size + 1], both[:count, size + 1 :], count)
+    count = len(terms_after_step) - size
+    return WeakFormFit(
+        z, terms_after_step[:, 0], terms_after_step[:, 1 : size + 1], terms_after_step[:count, size + 1 :], count
+    )
 
 
 def window_errors(plan: StatePlan, w: RunWindows, terms: EquationTerms) -> np.ndarray:
     """Errors of the equations in a run's windows, with their derivatives and signatures, shape (windows, 1 +
     coordinates + instances).
     """
-    given = (terms.f[..., None], terms.y[..., None]), terms.by_z, terms.by_effects
-    each = np.concatenate([_integrate_terms(plan, w, np.asarray(f), np.asarray(y)) for f, y in given], 2)
-    return each.reshape(-1, each.shape[2])
+    term_arrays = (terms.f[..., None], terms.y[..., None]), terms.by_z, terms.by_effects
+    integrals = np.concatenate([_integrate_terms(plan, w, np.asarray(f), np.asarray(y)) for f, y in term_arrays], 2)
+    return integrals.reshape(-1, integrals.shape[2])
 
 
 def _integrate_terms(plan: StatePlan, w: RunWindows, f: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -623,10 +629,10 @@ def _covariance_factor(
     explain (`disturbance_intensities`).
     """
     equations, (points, channels) = terms.f.shape[1], sd.shape
-    by, also = terms.by_reading
+    reading_factors, also = terms.by_reading
     noise = []
     for k, slope in enumerate(_derivative_weights(plan, w, equations)):
-        changed = w.weight[..., None] * by[w.rows, k] + slope[..., None] * also[w.rows, k]
+        changed = w.weight[..., None] * reading_factors[w.rows, k] + slope[..., None] * also[w.rows, k]
         own_equations = np.zeros((*w.rows.shape, equations))
         own_equations[..., k] = unknown[k] * w.weight / np.sqrt(w.steps)
         noise.append(np.concatenate([changed * sd[w.rows], own_equations], -1))

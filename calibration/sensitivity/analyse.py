@@ -120,9 +120,9 @@ def _study_of_output(row: Quantity, study: Study, found: LocalDerivatives, part:
     # A condition's score is uniform in 0..1, of variance 1/12.
     weight = np.where(np.arange(len(study.inputs)) < len(study.inputs.parameters), 1.0, 1 / 12)
     along = correlated_directions(study.inputs)
-    moved = (scores @ along.T) ** 2 * weight if study.inputs.is_posterior else scores**2 * weight
+    squared_changes = (scores @ along.T) ** 2 * weight if study.inputs.is_posterior else scores**2 * weight
     variance = np.sum(scores**2 * weight, 1)
-    linear = moved / np.where(variance > 0, variance, 1.0)[:, None]
+    linear = squared_changes / np.where(variance > 0, variance, 1.0)[:, None]
     finite = np.isfinite(value)
     share = np.where(finite[:, None], linear, np.nan)
     sd = np.where(finite, np.sqrt(variance), np.nan)
@@ -149,10 +149,10 @@ def _study_of_output(row: Quantity, study: Study, found: LocalDerivatives, part:
 
 
 def _no_point_message(study: Study, statuses: dict[str, dict[str, int]]) -> str:
-    listed = "; ".join(f"{s}: " + ", ".join(f"{n} {w}" for w, n in by.items()) for s, by in statuses.items())
+    status_words = "; ".join(f"{s}: " + ", ".join(f"{n} {w}" for w, n in by.items()) for s, by in statuses.items())
     return (
-        f"no operating point can be studied, because too many robots do not travel there ({listed}); choose smaller "
-        "--slopes, another --voltages, or reduce the uncertainty of the adhesion with --set or by calibrating"
+        f"no operating point can be studied, because too many robots do not travel there ({status_words}); choose "
+        "smaller --slopes, another --voltages, or reduce the uncertainty of the adhesion with --set or by calibrating"
     )
 
 

@@ -42,11 +42,11 @@ def correlated_directions(inputs: UncertainInputs) -> np.ndarray:
     Each row has length 1. A condition moves along its own score.
     """
     p = len(inputs.parameters)
-    whole = np.eye(len(inputs))
+    identity = np.eye(len(inputs))
     root = inputs.parameters.root
     length = np.linalg.norm(root, axis=1, keepdims=True)
-    whole[:p, :p] = root / np.where(length > 0, length, 1.0)
-    return whole
+    identity[:p, :p] = root / np.where(length > 0, length, 1.0)
+    return identity
 
 
 def local_derivatives(study: Study) -> LocalDerivatives:
@@ -57,10 +57,10 @@ def local_derivatives(study: Study) -> LocalDerivatives:
     answer = study.model(values, study.conditions)
     by_columns = study.model.derivatives(values, study.conditions)
     derivative, by_score, swing = {}, {}, {}
-    for name, moved in by_columns.items():
+    for name, derivatives in by_columns.items():
         finite = np.isfinite(answer.values[name])[:, None]
-        derivative[name] = np.where(finite, _derivatives_by_input(inputs, moved), np.nan)
-        by_score[name] = np.where(finite, moved @ inputs.slope, np.nan)
+        derivative[name] = np.where(finite, _derivatives_by_input(inputs, derivatives), np.nan)
+        by_score[name] = np.where(finite, derivatives @ inputs.slope, np.nan)
     along = correlated_directions(inputs)
     p = len(inputs.parameters)
     ends = []
@@ -88,7 +88,7 @@ def _derivatives_by_input(inputs: UncertainInputs, by_columns: np.ndarray) -> np
 
 
 def _in_words(counts: dict[str, dict[str, int]]) -> dict[str, dict[str, int]]:
-    return {source_words(source): by for source, by in counts.items()}
+    return {source_words(source): counts_by_status for source, counts_by_status in counts.items()}
 
 
 def inert_inputs(study: Study, found: LocalDerivatives, seed: int) -> np.ndarray:

@@ -31,18 +31,18 @@ class PartialResult:
 
 def _sampled_scores(study: Study, unit: np.ndarray, which: np.ndarray) -> np.ndarray:
     """Scores of all inputs, at points of the unit cube of some inputs. The others are at their medians."""
-    whole = np.full((len(unit), len(study.inputs)), 0.5)
-    whole[:, which] = unit
-    return study.inputs.scores(whole)
+    unit_scores = np.full((len(unit), len(study.inputs)), 0.5)
+    unit_scores[:, which] = unit
+    return study.inputs.scores(unit_scores)
 
 
 def group_points(study: Study, moving: np.ndarray) -> dict[tuple[int, ...], list[int]]:
     """Groups of operating points with the same inputs."""
     groups: dict[tuple[int, ...], list[int]] = {}
     for k in range(len(study.points)):
-        which = tuple(i for i in study.acting(k) if moving[i])
-        if which:
-            groups.setdefault(which, []).append(k)
+        acting_inputs = tuple(i for i in study.acting(k) if moving[i])
+        if acting_inputs:
+            groups.setdefault(acting_inputs, []).append(k)
     return groups
 
 
@@ -59,36 +59,36 @@ def sobol_indices(study: Study, moving: np.ndarray, evaluations: int, seed: int)
     points, d = len(study.points), len(study.inputs)
     names = [o.name for o in study.model.outputs]
     terms: dict[str, dict[int, sobol.VarianceTerms]] = {name: {} for name in names}
-    lost = {name: np.zeros(points) for name in names}
+    lost_counts = {name: np.zeros(points) for name in names}
     spent = {}
-    for which, group in group_points(study, moving).items():
-        size = sobol.base_point_count(evaluations / points, len(which), True)
-        design = sobol.sobol_design(len(which), size, seed)
-        scores = _sampled_scores(study, design.points, np.array(which))
+    for input_set, group in group_points(study, moving).items():
+        size = sobol.base_point_count(evaluations / points, len(input_set), True)
+        design = sobol.sobol_design(len(input_set), size, seed)
+        scores = _sampled_scores(study, design.points, np.array(input_set))
         for k, made in study.sample(study.values_at(scores), group):
             spent[k] = len(design.points)
             for name in names:
                 output_terms = sobol.sobol_terms(design, made[name])
                 rows = design.size * design.replicates
-                lost[name][k] = 1.0 if output_terms is None else output_terms.lost / rows
-                if output_terms is not None and lost[name][k] <= MOST_LOST:
-                    terms[name][k] = output_terms.widened(which, d)
+                lost_counts[name][k] = 1.0 if output_terms is None else output_terms.lost / rows
+                if output_terms is not None and lost_counts[name][k] <= MOST_LOST:
+                    terms[name][k] = output_terms.widened(input_set, d)
     answer = {}
     for name in names:
         first, total, sd = _empty_estimate(points, d), _empty_estimate(points, d), np.full(points, np.nan)
-        whole: sobol.VarianceTerms | None = None
+        total_terms: sobol.VarianceTerms | None = None
         for k, output_terms in terms[name].items():
             indices = sobol.indices_of_terms(output_terms)
             _store_estimate(first, k, indices.first)
             _store_estimate(total, k, indices.total)
             sd[k] = np.sqrt(indices.variance)
-            whole = output_terms if whole is None else whole + output_terms
+            total_terms = output_terms if total_terms is None else total_terms + output_terms
         studied = np.array([k in terms[name] for k in range(points)])
-        if whole is None:
-            answer[name] = PartialResult({}, {}, None, None, None, (), lost[name], studied)
+        if total_terms is None:
+            answer[name] = PartialResult({}, {}, None, None, None, (), lost_counts[name], studied)
             continue
-        overall = sobol.indices_of_terms(whole)
-        stages = [(r, sobol.indices_of_terms(whole, r).total) for r in sobol.STAGES]
+        overall = sobol.indices_of_terms(total_terms)
+        stages = [(r, sobol.indices_of_terms(total_terms, r).total) for r in sobol.STAGES]
         count = sum(spent[k] for k in terms[name])
         answer[name] = PartialResult(
             {"first": overall.first, "total": overall.total},
@@ -97,7 +97,7 @@ def sobol_indices(study: Study, moving: np.ndarray, evaluations: int, seed: int)
             sd,
             overall.second,
             tuple((count * r // REPLICATES, e) for r, e in stages),
-            lost[name],
+            lost_counts[name],
             studied,
         )
     return answer
@@ -108,27 +108,27 @@ def morris_screening(study: Study, moving: np.ndarray, evaluations: int, seed: i
     points, d = len(study.points), len(study.inputs)
     names = [o.name for o in study.model.outputs]
     found: dict[str, dict[int, tuple[morris.ElementaryEffects, tuple[int, ...]]]] = {name: {} for name in names}
-    lost = {name: np.zeros(points) for name in names}
-    for which, group in group_points(study, moving).items():
-        count = max(int(np.ceil(evaluations / points / (len(which) + 1))), 10)
-        unit = morris.morris_design(len(which), count, seed)
-        scores = np.array(_sampled_scores(study, 0.025 + 0.95 * unit, np.array(which)))
+    lost_counts = {name: np.zeros(points) for name in names}
+    for input_set, group in group_points(study, moving).items():
+        count = max(int(np.ceil(evaluations / points / (len(input_set) + 1))), 10)
+        unit = morris.morris_design(len(input_set), count, seed)
+        scores = np.array(_sampled_scores(study, 0.025 + 0.95 * unit, np.array(input_set)))
         # Trajectories have equal steps in the scores, between the ends of the 95 % interval.
         normal = np.arange(d) < len(study.inputs.parameters)
-        for j, i in enumerate(which):
+        for j, i in enumerate(input_set):
             if normal[i]:
                 scores[:, i] = Z95 * (2 * unit[:, j] - 1)
         for k, made in study.sample(study.values_at(scores), group):
             for name in names:
                 effects = morris.elementary_effects(unit, made[name])
-                lost[name][k] = 1.0 if effects is None else effects.lost / count
-                if effects is not None and lost[name][k] <= MOST_LOST:
-                    found[name][k] = effects, which
+                lost_counts[name][k] = 1.0 if effects is None else effects.lost / count
+                if effects is not None and lost_counts[name][k] <= MOST_LOST:
+                    found[name][k] = effects, input_set
     answer = {}
     for name in names:
         size, mean, spread = _empty_estimate(points, d), np.full((points, d), np.nan), np.full((points, d), np.nan)
-        for k, (effects, which) in found[name].items():
-            places = list(which)
+        for k, (effects, input_set) in found[name].items():
+            places = list(input_set)
             for whole, part in (
                 (size.value, effects.size.value),
                 (size.low, effects.size.low),
@@ -140,7 +140,7 @@ def morris_screening(study: Study, moving: np.ndarray, evaluations: int, seed: i
                 whole[k, places] = part  # fmt: skip
         studied = np.array([k in found[name] for k in range(points)])
         if not studied.any():
-            answer[name] = PartialResult({}, {}, None, None, None, (), lost[name], studied)
+            answer[name] = PartialResult({}, {}, None, None, None, (), lost_counts[name], studied)
             continue
         square = size.value**2
         share = square / np.where(square.sum(1, keepdims=True) > 0, square.sum(1, keepdims=True), 1.0)
@@ -155,5 +155,5 @@ def morris_screening(study: Study, moving: np.ndarray, evaluations: int, seed: i
             "mean_effect": IntervalEstimate(mean, mean, mean),
             "sd_effect": IntervalEstimate(spread, spread, spread),
         }
-        answer[name] = PartialResult(overall, at_points, share, None, None, (), lost[name], studied)
+        answer[name] = PartialResult(overall, at_points, share, None, None, (), lost_counts[name], studied)
     return answer

@@ -50,8 +50,8 @@ class ModelOutputs:
 
 def count_statuses(codes: np.ndarray) -> dict[str, int]:
     """Number of points with each status, without zeros."""
-    each = np.bincount(codes, minlength=len(STATUSES))
-    return {STATUSES[k]: int(n) for k, n in enumerate(each) if n}
+    counts = np.bincount(codes, minlength=len(STATUSES))
+    return {STATUSES[k]: int(n) for k, n in enumerate(counts) if n}
 
 
 def known_outputs(robot: Robot) -> dict[str, Quantity]:
@@ -87,7 +87,7 @@ def chosen_outputs(words: Names, robot: Robot, turns: bool = False) -> tuple[Qua
         BadConfiguration: a name is unknown (the message lists the choices). Also if an output needs a ground or
             stance that the robot lacks, a turn while it travels straight, or straight travel while it turns.
     """
-    outputs, chosen = known_outputs(robot), []
+    outputs, outputs_chosen = known_outputs(robot), []
     start = tuple(d.name for d in derived.OF_START)
     of_turns = {*(o.name for o in derived.OF_TURNS), *(c.name for c in channels.OF_TURNS if c.settled)}
     for word in words or default_outputs(robot, turns):
@@ -113,8 +113,8 @@ def chosen_outputs(words: Names, robot: Robot, turns: bool = False) -> tuple[Qua
                 )
             if row in derived.OF_POSTURE and (why := reason_without_stance(robot)):
                 raise BadConfiguration(f"--outputs {name}: {why}")
-            chosen.append(row)
-    return tuple(dict.fromkeys(chosen))
+            outputs_chosen.append(row)
+    return tuple(dict.fromkeys(outputs_chosen))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -174,8 +174,8 @@ class Model:
 
     def ignores(self, source: str) -> Names:
         """Conditions that influence no output of a source."""
-        each = [set(o.ignores) for o in self.sources[source]]
-        return tuple(sorted(set.intersection(*each)))
+        ignored_by_output = [set(o.ignores) for o in self.sources[source]]
+        return tuple(sorted(set.intersection(*ignored_by_output)))
 
     def derivatives(self, values: Float[np.ndarray, "points columns"], conditions: Conditions) -> Columns:
         """Exact derivative of each output with respect to each column [SI per unit], shape (points, columns).
@@ -274,8 +274,10 @@ def _derivatives(
         return made, status
 
     def along(direction: Array) -> tuple[dict[str, Array], Array]:
-        _, moved, status = jax.jvp(numbers, (values,), (jnp.broadcast_to(direction, values.shape),), has_aux=True)
-        return moved, status
+        _, derivative, status = jax.jvp(
+            numbers, (values,), (jnp.broadcast_to(direction, values.shape),), has_aux=True
+        )
+        return derivative, status
 
-    moved, status = jax.vmap(along, out_axes=(-1, None))(jnp.eye(values.shape[1], dtype=values.dtype))
-    return {**moved, STATUS: status}
+    derivatives, status = jax.vmap(along, out_axes=(-1, None))(jnp.eye(values.shape[1], dtype=values.dtype))
+    return {**derivatives, STATUS: status}

@@ -62,23 +62,27 @@ def elementary_effects(points: np.ndarray, values: np.ndarray) -> ElementaryEffe
     from SALib.analyze.morris import analyze
 
     count, steps = len(points) // (points.shape[1] + 1), points.shape[1] + 1
-    by = values.reshape(count, steps)
-    finite = np.isfinite(by).all(1)
-    kept = np.repeat(finite, steps)
+    values_by_path = values.reshape(count, steps)
+    finite = np.isfinite(values_by_path).all(1)
+    finite_points = np.repeat(finite, steps)
     if finite.sum() < 2:
         return None
     state = np.random.get_state()  # noqa: NPY002
     try:
-        analysis = analyze(_problem(points.shape[1]), points[kept], values[kept], num_levels=LEVELS, seed=0)
+        analysis = analyze(
+            _problem(points.shape[1]), points[finite_points], values[finite_points], num_levels=LEVELS, seed=0
+        )
     finally:
         np.random.set_state(state)  # noqa: NPY002
     size = np.asarray(analysis["mu_star"], float)
     # change of the output per change of the moved input, shape (trajectories, inputs)
-    moved = np.diff(points[kept].reshape(-1, steps, points.shape[1]), axis=1)
-    which = np.abs(moved).argmax(-1)
-    change = np.diff(by[finite], axis=1) / np.take_along_axis(moved, which[..., None], -1)[..., 0]
+    steps_taken = np.diff(points[finite_points].reshape(-1, steps, points.shape[1]), axis=1)
+    moved_input = np.abs(steps_taken).argmax(-1)
+    change = (
+        np.diff(values_by_path[finite], axis=1) / np.take_along_axis(steps_taken, moved_input[..., None], -1)[..., 0]
+    )
     elementary = np.zeros_like(change)
-    np.put_along_axis(elementary, which, change, 1)
+    np.put_along_axis(elementary, moved_input, change, 1)
     width = float(stats.t.ppf(0.5 + LEVEL / 2, int(finite.sum()) - 1)) / np.sqrt(finite.sum())
     error = width * np.abs(elementary).std(0, ddof=1)
     return ElementaryEffects(

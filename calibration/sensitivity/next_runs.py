@@ -54,22 +54,22 @@ def choose_runs(information: np.ndarray, count: int) -> ChosenRuns:
     """
     candidates, size, _ = information.shape
     count = min(count, candidates)
-    chosen: list[int] = []
+    run_indices: list[int] = []
     for _ in range(count):
-        chosen.append(_best_candidate(information, chosen))
+        run_indices.append(_best_candidate(information, run_indices))
     improved = True
     while improved:
         improved = False
         for place in range(count):
-            others = chosen[:place] + chosen[place + 1 :]
+            others = run_indices[:place] + run_indices[place + 1 :]
             best = _best_candidate(information, others)
-            if _log_determinant(information, [*others, best]) > _log_determinant(information, chosen) + 1e-9:
-                chosen = [*others, best]
+            if _log_determinant(information, [*others, best]) > _log_determinant(information, run_indices) + 1e-9:
+                run_indices = [*others, best]
                 improved = True
     ordered: list[int] = []
     for _ in range(count):  # of the set, the most informative first
-        left = [k for k in chosen if k not in ordered]
-        ordered.append(max(left, key=lambda k: _log_determinant(information, [*ordered, k])))
+        unordered = [k for k in run_indices if k not in ordered]
+        ordered.append(max(unordered, key=lambda k: _log_determinant(information, [*ordered, k])))
     values = [_log_determinant(information, ordered[:k]) for k in range(count + 1)]
     eye = np.eye(size)
     after = [np.linalg.inv(eye + information[ordered[:k]].sum(0)) for k in range(count + 1)]
@@ -119,10 +119,10 @@ class CandidateRuns:
 
     def deviations(self, reading: np.ndarray) -> np.ndarray:
         """Standard deviation of these readings [SI], shape (candidates, channels)."""
-        whole = np.empty_like(reading)
+        all_deviations = np.empty_like(reading)
         for k, (size, relative) in self.noise.items():
-            whole[:, k] = size * np.abs(reading[:, k]) if relative else size
-        return np.where(np.isfinite(self.sd), self.sd, whole)
+            all_deviations[:, k] = size * np.abs(reading[:, k]) if relative else size
+        return np.where(np.isfinite(self.sd), self.sd, all_deviations)
 
 
 def choose_next_runs(study: Study, found: LocalDerivatives, candidates: CandidateRuns) -> NextRuns | None:
@@ -147,13 +147,13 @@ def choose_next_runs(study: Study, found: LocalDerivatives, candidates: Candidat
     # range.
     first = len(study.inputs.columns) - len(study.inputs.conditions)
     for j, name in enumerate(study.inputs.conditions):
-        stated = getattr(conditions, name)
-        if stated is not None:
-            values[:, first + j] = np.asarray(stated)
+        condition_value = getattr(conditions, name)
+        if condition_value is not None:
+            values[:, first + j] = np.asarray(condition_value)
     answer = model(values, conditions)
-    moved = model.derivatives(values, conditions)
+    derivatives = model.derivatives(values, conditions)
     inner = study.inputs.slope[:, :p]
-    jacobian = np.stack([moved[o.name] @ inner for o in shown], 1)
+    jacobian = np.stack([derivatives[o.name] @ inner for o in shown], 1)
     reading = np.stack([answer.values[o.name] for o in shown], 1)
     finite = np.isfinite(reading).all(1)
     if not finite.any():
@@ -168,8 +168,14 @@ def choose_next_runs(study: Study, found: LocalDerivatives, candidates: Candidat
         g = g[np.isfinite(g).all(1)][:, :p]
         variance = np.einsum("pi,kij,pj->kp", g, choice.covariance, g)
         outputs[name] = np.sqrt(variance.mean(1)) if len(g) else np.full(len(choice.covariance), np.nan)
-    whole = np.where(after[0] > 0, after[0], 1.0)
-    chosen = points.at(picked)
+    safe_variance = np.where(after[0] > 0, after[0], 1.0)
+    next_points = points.at(picked)
     return NextRuns(
-        int(finite.sum()), candidates.source, chosen, choice.gain, candidates.words, after / whole, outputs
+        int(finite.sum()),
+        candidates.source,
+        next_points,
+        choice.gain,
+        candidates.words,
+        after / safe_variance,
+        outputs,
     )

@@ -48,13 +48,13 @@ class OperatingPoints:
         layout, nothing = runs.layout, np.zeros(len(runs))
         payload, slope = (runs[c] if c in runs.axes else nothing for c in ("payload_kg", "slope_deg"))
         imposed = runs[layout.imposed_column]
-        turned = layout.imposed == "motor_speed"
+        imposes_speed = layout.imposed == "motor_speed"
         return cls(
             runs["configuration"],
-            nothing if turned else imposed,
+            nothing if imposes_speed else imposed,
             payload,
             slope,
-            imposed if turned else None,
+            imposed if imposes_speed else None,
             layout.has_ground,
         )
 
@@ -74,8 +74,8 @@ class OperatingPoints:
     @property
     def ground(self) -> tuple[tuple[str, np.ndarray, str], ...]:
         """Conditions of the ground: column, values and unit of each. Empty without a ground."""
-        found = ("payload_kg", self.payload, " kg"), ("slope_deg", self.slope_deg, "°")
-        return found if self.has_ground else ()
+        quantities = ("payload_kg", self.payload, " kg"), ("slope_deg", self.slope_deg, "°")
+        return quantities if self.has_ground else ()
 
     def label(self, k: int) -> str:
         """Name of a point, such as `6T2A, 12 V, 2 kg, 10°`."""
@@ -333,14 +333,14 @@ class SensitivityResult:
         point.
         """
         names = np.array(self.names)
-        found: dict[str, list[Columns]] = {"points.csv": [], "indices.csv": []}
+        tables_by_file: dict[str, list[Columns]] = {"points.csv": [], "indices.csv": []}
         for name, study in self.outputs.items():
             points, size = study.derivative.shape
-            where = {key: np.repeat(x, size) for key, x in self.points.columns().items()}
+            point_columns = {key: np.repeat(x, size) for key, x in self.points.columns().items()}
             table = {
                 "output": np.full(points * size, name),
                 "unit": np.full(points * size, study.row.unit_shown),
-                **where,
+                **point_columns,
                 "input": np.tile(names, points),
                 "value": np.repeat(study.value, size) / study.row.factor,
                 "derivative": study.derivative.ravel() / study.row.factor,
@@ -352,15 +352,15 @@ class SensitivityResult:
             for key, estimate in study.at_points.items():
                 table |= {key: estimate.value.ravel()}
                 table |= {f"{key}_low": estimate.low.ravel(), f"{key}_high": estimate.high.ravel()}
-            found["points.csv"].append(table)
+            tables_by_file["points.csv"].append(table)
             if study.overall:
                 overall = {"output": np.full(size, name), "input": names}
                 for key, estimate in study.overall.items():
                     overall |= {key: estimate.value, f"{key}_low": estimate.low, f"{key}_high": estimate.high}
-                found["indices.csv"].append(overall)
+                tables_by_file["indices.csv"].append(overall)
         return {
             file: {key: np.concatenate([t[key] for t in tables]) for key in tables[0]}
-            for file, tables in found.items()
+            for file, tables in tables_by_file.items()
             if tables
         }
 
@@ -385,13 +385,13 @@ def interactions(study: OutputStudy, names: Names) -> list[Interaction]:
     pairs = [(int(i), int(j)) for n, i in enumerate(part) for j in part[n + 1 :]]
     wider = 1.0
     if pairs:  # so that in 95 of 100 studies no pair is called sure by chance (Bonferroni)
-        one, all_ = (stats.t.ppf(1 - (1 - LEVEL) / 2 / n, REPLICATES - 1) for n in (1, len(pairs)))
-        wider = float(all_ / one)
-    found = []
+        single_quantile, all_ = (stats.t.ppf(1 - (1 - LEVEL) / 2 / n, REPLICATES - 1) for n in (1, len(pairs)))
+        wider = float(all_ / single_quantile)
+    pairs_found = []
     for i, j in pairs:
         value, low, high = float(second.value[i, j]), float(second.low[i, j]), float(second.high[i, j])
-        found.append(Interaction((names[i], names[j]), value, (low, high), value - wider * (value - low) > 0))
-    return sorted(found, key=lambda pair: -pair.second)
+        pairs_found.append(Interaction((names[i], names[j]), value, (low, high), value - wider * (value - low) > 0))
+    return sorted(pairs_found, key=lambda pair: -pair.second)
 
 
 def _next_runs_json(runs: NextRuns, names: Names) -> Json:

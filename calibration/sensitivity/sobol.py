@@ -136,21 +136,21 @@ def sobol_terms(design: SobolDesign, values: np.ndarray) -> VarianceTerms | None
         None if some replicate has fewer than two base points left.
     """
     d = design.inputs
-    by = np.reshape(values, (design.replicates, design.size, design.blocks))
-    finite = np.asarray(np.isfinite(by).all(-1))
+    values_by_block = np.reshape(values, (design.replicates, design.size, design.blocks))
+    finite = np.asarray(np.isfinite(values_by_block).all(-1))
     count = finite.sum(1)
     if count.min() < 2:
         return None
-    by = np.where(finite[..., None], by, 0.0)
-    a, b = by[..., 0], by[..., -1]
+    values_by_block = np.where(finite[..., None], values_by_block, 0.0)
+    a, b = values_by_block[..., 0], values_by_block[..., -1]
     centre = (a + b)[finite].mean() / 2
-    by = np.where(finite[..., None], by - centre, 0.0)
-    a, b, ab = by[..., 0], by[..., -1], by[..., 1 : d + 1]
+    values_by_block = np.where(finite[..., None], values_by_block - centre, 0.0)
+    a, b, ab = values_by_block[..., 0], values_by_block[..., -1], values_by_block[..., 1 : d + 1]
     # A replicate with more rows has a larger weight: sums over the mean number of rows, not means of each.
     weight = 1.0 / count.mean()
     second = None
     if design.second:
-        ba = by[..., d + 1 : 2 * d + 1]
+        ba = values_by_block[..., d + 1 : 2 * d + 1]
         # Var E[y | x_j, x_k]: common to B with A's x_j and A with B's x_k, in both orders.
         mixed = np.einsum("rnj,rnk->rjk", ba, ab)
         alone = np.einsum("rn,rn->r", a, b)[:, None, None]
@@ -180,12 +180,15 @@ class SobolIndices:
 
 def indices_of_terms(terms: VarianceTerms, replicates: int | None = None) -> SobolIndices:
     """Sobol indices from the parts of the variance. `replicates`: only this many of the first replicates."""
-    kept = slice(replicates)
-    variance, first = terms.variance[kept], terms.first[kept]
+    replicate_slice = slice(replicates)
+    variance, first = terms.variance[replicate_slice], terms.first[replicate_slice]
     second = None
     if terms.second is not None:
-        beyond = terms.second[kept] - first[:, :, None] - first[:, None, :]
+        beyond = terms.second[replicate_slice] - first[:, :, None] - first[:, None, :]
         second = ratio_estimate(beyond, variance)
     return SobolIndices(
-        ratio_estimate(first, variance), ratio_estimate(terms.total[kept], variance), second, float(variance.mean())
+        ratio_estimate(first, variance),
+        ratio_estimate(terms.total[replicate_slice], variance),
+        second,
+        float(variance.mean()),
     )

@@ -86,7 +86,7 @@ class Study:
 
         A source is not computed again if conditions differ only in ones that it ignores.
         """
-        kept: dict[tuple[str, tuple[float, ...]], ModelOutputs] = {}
+        sampled: dict[tuple[str, tuple[float, ...]], ModelOutputs] = {}
         for k in points:
             began = time.perf_counter()
             conditions = self.at(k)
@@ -95,12 +95,12 @@ class Study:
                 ignored = self.model.ignores(source)
                 fields = {f.name: getattr(conditions, f.name) for f in dataclasses.fields(conditions)}
                 mark = tuple(float(x) for name, x in fields.items() if x is not None and name not in ignored)
-                if (source, mark) not in kept:
+                if (source, mark) not in sampled:
                     if not ignored:  # so no other point can reuse it
                         parts[source] = self.model.of_source(source, values, conditions)
                         continue
-                    kept[source, mark] = self.model.of_source(source, values, conditions)
-                parts[source] = kept[source, mark]
+                    sampled[source, mark] = self.model.of_source(source, values, conditions)
+                parts[source] = sampled[source, mark]
             answer = self.model.joined(parts)
             self._count(answer, len(values), began)
             if time.perf_counter() - self.told > SILENCE:
@@ -118,8 +118,8 @@ class Study:
     def statuses(self) -> dict[str, dict[str, int]]:
         """Source → status → number of evaluations in the sample."""
         return {
-            source_words(source): count_statuses(np.repeat(np.arange(len(whole)), whole))
-            for source, whole in self.sampled.items()
+            source_words(source): count_statuses(np.repeat(np.arange(len(source_outputs)), source_outputs))
+            for source, source_outputs in self.sampled.items()
         }
 
 

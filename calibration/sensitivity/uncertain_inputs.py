@@ -83,8 +83,8 @@ class UncertainInputs:
         """
         p = len(self.parameters)
         theta = self.parameters.at(self.parameters.mean + scores[..., :p] @ self._root.T)
-        stated = self.low + (self.high - self.low) * scores[..., p:]
-        return (np if isinstance(scores, np.ndarray) else jnp).concatenate([theta, stated], -1)
+        uniform_values = self.low + (self.high - self.low) * scores[..., p:]
+        return (np if isinstance(scores, np.ndarray) else jnp).concatenate([theta, uniform_values], -1)
 
     def jacobian(self, scores: Float[np.ndarray, "rows inputs"]) -> Float[np.ndarray, "rows columns inputs"]:
         """Derivatives of the values with respect to the scores, for each row."""
@@ -136,8 +136,8 @@ def default_input_names(
     by_name = priors.parameters_by_name(robot)
     left_out = {*guides, *fidelities.unread_parameters(model, by_name, turns), *robot.rig.exact}
     if not robot.rig.inherits:  # parameters of another robot are not its own
-        stated = {name for name, _, _ in robot.rig.priors}
-        left_out |= {name for name in by_name if name.startswith(_OTHERS) and name not in stated} | {
+        prior_names = {name for name, _, _ in robot.rig.priors}
+        left_out |= {name for name in by_name if name.startswith(_OTHERS) and name not in prior_names} | {
             *robot.rig.unknown
         }
     return tuple(

@@ -54,7 +54,7 @@ def _margins(robot: Robot, rated: Ratings, points: EnvelopePoint, speeds: Array,
     def margins_at_point(point: EnvelopePoint, wanted: Array) -> Array:
         state, _ = travel_quantities(robot, point, rated)
         turns = state["motor_speed_rpm"]
-        each = [
+        margins = [
             state["adhesion"], jnp.clip(state["left"], -1.0, 1.0),
             thermal_margin(robot, point, state["current"], rated.temperature),
             1 - turns / speeds[0], 1 - turns / speeds[1], 1 - state["gearbox_Nm"] / rated.torque,
@@ -62,8 +62,8 @@ def _margins(robot: Robot, rated: Ratings, points: EnvelopePoint, speeds: Array,
             jnp.where(wanted > 0, state["speed_m_s"] / jnp.where(wanted > 0, wanted, 1.0) - 1, 1.0),
         ]  # fmt: skip
         # At the limit of adhesion both margins are zero; it is assigned to adhesion.
-        each[1] = jnp.where(each[0] <= each[1], 1.0, each[1])
-        return jnp.stack([jnp.asarray(x, float) for x in each])
+        margins[1] = jnp.where(margins[0] <= margins[1], 1.0, margins[1])
+        return jnp.stack([jnp.asarray(x, float) for x in margins])
 
     return jax.vmap(margins_at_point)(points, wanted)
 
@@ -82,11 +82,11 @@ def margin_chart(robot: Robot, asked: Requirements, most: tuple[float, float]) -
     first = jax.tree.map(lambda x: np.asarray(x)[-1], base)
     s, p = (x.ravel() for x in np.meshgrid(slope, payload, indexing="ij"))
     speeds = [r for r in asked.each if r.quantity.group == "travel" and r.name.startswith("speed") and r.least]
-    wanted = np.zeros(len(p))
+    power_needed = np.zeros(len(p))
     for r in speeds:
         v = r.envelope
         inside = (p >= v.payload_kg[0]) & (p <= v.payload_kg[1]) & (s >= v.slope_deg[0]) & (s <= v.slope_deg[1])
-        wanted = np.where(inside, np.maximum(wanted, r.limit or 0.0), wanted)
+        power_needed = np.where(inside, np.maximum(power_needed, r.limit or 0.0), power_needed)
     robot = params.without_weak_types(robot)
     permitted = jnp.asarray([robot.motor.speed_limit, robot.gearbox.speed_limit])
     margins = None
@@ -95,8 +95,8 @@ def margin_chart(robot: Robot, asked: Requirements, most: tuple[float, float]) -
         points = dataclasses.replace(
             points, payload=jnp.asarray(p), slope_deg=jnp.asarray(s), charge=jnp.full(len(p), charge)
         )
-        left = np.asarray(_margins(robot, ratings(robot), points, permitted, jnp.asarray(wanted)))
-        margins = left if margins is None else np.minimum(margins, left)
+        margin_grid = np.asarray(_margins(robot, ratings(robot), points, permitted, jnp.asarray(power_needed)))
+        margins = margin_grid if margins is None else np.minimum(margins, margin_grid)
     assert margins is not None
     margins = np.where(np.isfinite(margins), margins, -1.0)
     shape = (POINTS, POINTS)

@@ -134,13 +134,13 @@ def build_sizing_task(robot: Robot, asked: Requirements, options: PartOptions) -
     """
     name = asked.envelope.configuration or robot.configurations.names[0]
     index: dict[tuple[float, ...], int] = {}
-    kept: list[EnvelopePoint] = []
+    envelope_points: list[EnvelopePoint] = []
 
     def row(point: EnvelopePoint) -> int:
         key = tuple(float(np.asarray(x)) for x in jax.tree.leaves(point))
         if key not in index:
-            index[key] = len(kept)
-            kept.append(point)
+            index[key] = len(envelope_points)
+            envelope_points.append(point)
         return index[key]
 
     demands = []
@@ -153,7 +153,7 @@ def build_sizing_task(robot: Robot, asked: Requirements, options: PartOptions) -
     middle = row(_envelope_middle(robot, asked.envelope))
     travelling = sorted({k for d in demands if d.requirement and d.requirement.name in LASTING for k in d.rows})
     demands += [SizingDemand(None, words, tuple(travelling) or (middle,)) for words in RATED.values()]
-    points: EnvelopePoint = jax.tree.map(lambda *x: jnp.stack([jnp.asarray(v) for v in x]), *kept)
+    points: EnvelopePoint = jax.tree.map(lambda *x: jnp.stack([jnp.asarray(v) for v in x]), *envelope_points)
     one_cell = params.without_weak_types(
         dataclasses.replace(robot, battery=dataclasses.replace(robot.battery, cells=1))
     )
@@ -175,7 +175,7 @@ def _envelope_corners(robot: Robot, r: Requirement, at: EnvelopePoint) -> list[t
         return [(points[0],)]
     low, high = r.envelope.charge
     ends = {SLOPE: r.envelope.slope_deg, CHARGE: (low, high)}
-    chosen = [
+    corners = [
         p
         for p in points
         if (SLOPE not in r.quantity.axes or float(p.slope_deg) in ends[SLOPE])
@@ -183,15 +183,15 @@ def _envelope_corners(robot: Robot, r: Requirement, at: EnvelopePoint) -> list[t
         and float(p.payload) in r.envelope.payload_kg
     ]
     if r.name == "slope_deg":
-        return [(dataclasses.replace(p, slope_deg=jnp.asarray(float(r.limit or 0.0))),) for p in chosen]
+        return [(dataclasses.replace(p, slope_deg=jnp.asarray(float(r.limit or 0.0))),) for p in corners]
     if r.name == "payload_kg":
-        return [(dataclasses.replace(p, payload=jnp.asarray(float(r.limit or 0.0))),) for p in chosen]
+        return [(dataclasses.replace(p, payload=jnp.asarray(float(r.limit or 0.0))),) for p in corners]
     if r.name == "endurance_min":
         # The nodes of the integral and the end of the charge.
         nodes = (np.polynomial.legendre.leggauss(NODES)[0] + 1) / 2
         charges = [*(high + (r.envelope.charge_end - high) * nodes), r.envelope.charge_end]
-        return [tuple(dataclasses.replace(p, charge=jnp.asarray(float(c))) for c in charges) for p in chosen]
-    return [(p,) for p in chosen]
+        return [tuple(dataclasses.replace(p, charge=jnp.asarray(float(c))) for c in charges) for p in corners]
+    return [(p,) for p in corners]
 
 
 def _envelope_middle(robot: Robot, e: Envelope) -> EnvelopePoint:
@@ -272,14 +272,14 @@ def _heat_margins(robot: Robot, points: EnvelopePoint, current: Array, limit: Ar
 def _endurance_margin(r: Requirement, robot: Robot, ratings: Ratings, at: Mapping[str, Array]) -> Array:
     """Margin of the time until the charge ends, or until the cells reach their cut-off voltage."""
     battery = robot.battery
-    used = battery.capacity * (r.envelope.charge[1] - r.envelope.charge_end)
+    capacity_used = battery.capacity * (r.envelope.charge[1] - r.envelope.charge_end)
     limit = r.quantity.factor * _positive_limit(r)
     if not r.share:
         end = battery.voltage_cell(0.0, battery.capacity * (1 - r.envelope.charge_end)) / ratings.voltage_cutoff - 1
-        return jnp.minimum(used / battery.current(0.0) / limit - 1, end)
+        return jnp.minimum(capacity_used / battery.current(0.0) / limit - 1, end)
     weights = jnp.asarray(np.polynomial.legendre.leggauss(NODES)[1] / 2)
     motors = (at["battery"] - battery.current_other) * r.share
     current = jnp.asarray(battery.current(motors)).reshape(-1, NODES + 1)
-    time = used * jnp.sum(weights / current[:, :NODES], axis=1)
+    time = capacity_used * jnp.sum(weights / current[:, :NODES], axis=1)
     travels, above = jnp.min(jnp.minimum(at["left"], 1.0)), jnp.min(at["cell"] / ratings.voltage_cutoff)
     return jnp.min(jnp.stack([jnp.min(time) / limit - 1, travels, above]))

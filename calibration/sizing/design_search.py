@@ -216,8 +216,8 @@ class ChoiceSpace:
 def enumerate_choices(robot: Robot, problem: SizingTask, options: PartOptions) -> ChoiceSpace:
     """All choices of parts for a robot."""
     n_drives, n_cells = len(options.drives), len(options.cells)
-    every = list(itertools.product(range(n_drives), range(n_cells), range(CELLS[0], CELLS[1] + 1)))
-    drive, cell, series = (np.array(x) for x in zip(*every, strict=True))
+    choices = list(itertools.product(range(n_drives), range(n_cells), range(CELLS[0], CELLS[1] + 1)))
+    drive, cell, series = (np.array(x) for x in zip(*choices, strict=True))
     radius = float(robot.configurations[problem.configuration].radius)
 
     def bounds(k: int, ratio: str) -> np.ndarray:
@@ -274,15 +274,15 @@ def size_robot(
     for name in objectives:
         stated_word(name, OBJECTIVES, "objective")
     sheet.reject_impossible(robot, asked)
-    chosen = options_for_robot(robot, motors)
-    problem = build_sizing_task(robot, asked, chosen)
-    choice = enumerate_choices(robot, problem, chosen)
+    part_options = options_for_robot(robot, motors)
+    problem = build_sizing_task(robot, asked, part_options)
+    choice = enumerate_choices(robot, problem, part_options)
     columns = [list(OBJECTIVES).index(name) for name in objectives]
     tell(progress_remark("designs"))
     drawn = _random_designs(problem, choice, "cost" in objectives, np.random.default_rng(seed))
-    kept = drawn.g.max(axis=0) >= 0
-    unmeetable = tuple(label for label, k in zip(problem.labels, kept, strict=True) if not k)
-    search = _DesignSearch(problem, choice, kept, columns)
+    is_feasible = drawn.g.max(axis=0) >= 0
+    unmeetable = tuple(label for label, k in zip(problem.labels, is_feasible, strict=True) if not k)
+    search = _DesignSearch(problem, choice, is_feasible, columns)
     weights = search.weights(starts)
     tell(progress_remark("descents", starts))
     free = search.descend(drawn, weights)
@@ -295,15 +295,15 @@ def size_robot(
     evaluated = len(drawn.rows) + starts * STEPS + search.evaluated
 
     def found(designs: _EvaluatedDesigns, k: int) -> SizedDesign:
-        margins = np.where(kept, designs.g[k], np.nan)
+        margins = np.where(is_feasible, designs.g[k], np.nan)
         return _sized_design(robot, problem, choice, designs.rows[k], designs.x[k], designs.f[k], margins)
 
     everything, by_motor = free + real, dict[str, SizedDesign]()
     for k in np.argsort(search.cost(everything)):
-        name = chosen.drives[choice.drive[everything.rows[k]]].motor.name
+        name = part_options.drives[choice.drive[everything.rows[k]]].motor.name
         if name not in by_motor:  # building a robot takes time, and there are a thousand designs
             by_motor[name] = found(everything, int(k))
-    good = [k for k in range(len(real.rows)) if np.all(real.g[k][kept] >= 0)]
+    good = [k for k in range(len(real.rows)) if np.all(real.g[k][is_feasible] >= 0)]
     different: dict[tuple[int, int], int] = {}
     for k in (int(k) for k in np.argsort(search.cost(real)) if k in set(good)):
         different.setdefault((int(choice.drive[real.rows[k]]), int(choice.cell[real.rows[k]])), k)
@@ -311,8 +311,8 @@ def size_robot(
     ideal = int(np.argmin(search.cost(free)))
     front = [found(real, k) for k in _pareto_front(real.f[:, columns], good)] if len(columns) == 2 else []
     return SizingResult(
-        problem, chosen, objectives[0], unmeetable,
-        found(free, ideal) if np.all(free.g[ideal][kept] >= 0) else None,
+        problem, part_options, objectives[0], unmeetable,
+        found(free, ideal) if np.all(free.g[ideal][is_feasible] >= 0) else None,
         best[0] if best else None, tuple(best[1:]), by_motor, tuple(front), starts, evaluated,
     )  # fmt: skip
 
@@ -445,20 +445,20 @@ def _start_designs(choice: ChoiceSpace, rows: np.ndarray, merit: np.ndarray, cou
     """Best designs to start from: some for each motor, then the best of all, with few from one choice."""
     order = np.argsort(np.where(np.isfinite(merit), merit, 1e9))
     motor = [choice.options.drives[d].motor.name for d in choice.drive]
-    taken: list[int] = []
+    start_indices: list[int] = []
     of_motor: dict[str, int] = {}
     of_choice: dict[int, int] = {}
     for least in (True, False):
         for k in order:
             c = int(rows[k])
             name = motor[c]
-            if len(taken) == count or (least and of_motor.get(name, 0) >= OF_MOTOR):
+            if len(start_indices) == count or (least and of_motor.get(name, 0) >= OF_MOTOR):
                 continue
-            if of_choice.get(c, 0) >= OF_CHOICE or k in taken[: len(taken) if not least else 0]:
+            if of_choice.get(c, 0) >= OF_CHOICE or k in start_indices[: len(start_indices) if not least else 0]:
                 continue
-            taken.append(int(k))
+            start_indices.append(int(k))
             of_motor[name], of_choice[c] = of_motor.get(name, 0) + 1, of_choice.get(c, 0) + 1
-    return np.resize(np.array(taken), count)
+    return np.resize(np.array(start_indices), count)
 
 
 def _cost(f: np.ndarray, g: np.ndarray, kept: np.ndarray, weights: np.ndarray) -> np.ndarray:
@@ -509,8 +509,8 @@ def _nearest_buildable(
         ):
             key = (int(rows[k]), ratio, p)
             made.setdefault(key, (rows[k], [math.log(ratio), x[k, 1], math.log(p)], weights[k]))
-    chosen, points, w = zip(*made.values(), strict=True)
-    return np.array(chosen), np.array(points), np.array(w)
+    choices, points, w = zip(*made.values(), strict=True)
+    return np.array(choices), np.array(points), np.array(w)
 
 
 def _best_buildable(
@@ -528,10 +528,10 @@ def _best_buildable(
         for ratio, p, share in itertools.product(ratios, range(1, MOST_WHOLE + 1), (0.4, 0.7, 1.0)):
             of_row.append(row)
             points.append([math.log(ratio), low + share * (high - low), math.log(p)])
-    every, x = np.array(of_row), np.array(points)
-    f, g = evaluate_designs(problem, choice, every, x)
-    best = np.argsort(_cost(f, g, kept, np.tile(weights, (len(every), 1))))[:KEPT_WHOLE]
-    return every[best], x[best], len(every)
+    choice_rows, x = np.array(of_row), np.array(points)
+    f, g = evaluate_designs(problem, choice, choice_rows, x)
+    best = np.argsort(_cost(f, g, kept, np.tile(weights, (len(choice_rows), 1))))[:KEPT_WHOLE]
+    return choice_rows[best], x[best], len(choice_rows)
 
 
 def _pareto_front(f: np.ndarray, among: list[int]) -> list[int]:

@@ -102,7 +102,7 @@ def options_for_robot(robot: Robot, names: Names = ()) -> PartOptions:
         robot: robot whose friction, efficiencies and cells replace values that data sheets lack.
         names: names of motors, empty for all.
     """
-    chosen, packs = (
+    motor_options, packs = (
         drive_options(names),
         tuple(c for c in packaged_cells() if c.cells == 1 and (c.name == CELL or not math.isnan(c.voltage_cut_off))),
     )
@@ -112,7 +112,7 @@ def options_for_robot(robot: Robot, names: Names = ()) -> PartOptions:
     sides, battery = float(robot.sides), robot.battery
     idle = paper_motor.torque_constant * paper_motor.current_no_load
     rows = []
-    for d in chosen:
+    for d in motor_options:
         m, g = d.motor, d.gearbox
         share = m.torque_constant * m.current_no_load / idle
         rows.append(
@@ -147,7 +147,7 @@ def options_for_robot(robot: Robot, names: Names = ()) -> PartOptions:
         for c in packs
     ]  # fmt: skip
     base = sides * (paper_motor.mass + paper_gear.mass) + battery.cells * per_charge * float(battery.capacity)
-    return PartOptions(chosen, packs, _columns(rows), _columns(columns), base)
+    return PartOptions(motor_options, packs, _columns(rows), _columns(columns), base)
 
 
 def _columns(rows: list[dict[str, float]]) -> Columns:

@@ -106,16 +106,16 @@ def fill_in_ratings(robot: Robot, asked: Requirements) -> Requirements:
         "winding_C": robot.motor.temperature_limit, "motor_speed_rpm": robot.motor.speed_limit,
         "gearbox_speed_rpm": robot.gearbox.speed_limit, "gearbox_Nm": robot.gearbox.torque_limit,
     }  # fmt: skip
-    each = []
+    filled_ratings = []
     for r in asked.each:
         limit = r.limit
         if limit is None:
-            stated = ratings_by_name[r.name]
-            if stated is None:
+            rating = ratings_by_name[r.name]
+            if rating is None:
                 raise BadConfiguration(f"{asked.source}, {r.name}: the robot states no rating; state a number")
-            limit = stated / r.quantity.factor
-        each.append(dataclasses.replace(r, limit=limit))
-    return dataclasses.replace(asked, each=tuple(each))
+            limit = rating / r.quantity.factor
+        filled_ratings.append(dataclasses.replace(r, limit=limit))
+    return dataclasses.replace(asked, each=tuple(filled_ratings))
 
 
 def reject_impossible(robot: Robot, asked: Requirements) -> None:
@@ -127,23 +127,23 @@ def reject_impossible(robot: Robot, asked: Requirements) -> None:
     """
     for r in asked.each:
         e = r.envelope
-        where = f"{asked.source}, {r.name}"
+        requirement_place = f"{asked.source}, {r.name}"
         if e.configuration and e.configuration not in robot.configurations:
             raise BadConfiguration(
-                f"{where}: the robot has no configuration {e.configuration}; "
+                f"{requirement_place}: the robot has no configuration {e.configuration}; "
                 f"{allowed_words(e.configuration, robot.configurations)}"
             )
         turns = r.quantity.group in ("turn", "across")
         if turns and (why := turn_error(robot, (_configuration_name(robot, e),))):
-            raise BadConfiguration(f"{where}: {why}")
+            raise BadConfiguration(f"{requirement_place}: {why}")
         if r.quantity.group == "posture" and (why := reason_without_stance(robot)):
-            raise BadConfiguration(f"{where}: {why}")
+            raise BadConfiguration(f"{requirement_place}: {why}")
         chassis = robot.configurations[_configuration_name(robot, e)]
         friction = float(chassis.ground.friction.static) * adhesion_ratio(e.surface, float(chassis.on_tracks) > 0.5)
         steepest = math.degrees(math.atan(friction))
         if SLOPE in r.quantity.axes and e.slope_deg[1] > steepest:
             raise BadConfiguration(
-                f"{where}: the envelope's slope_deg goes up to {e.slope_deg[1]:g}; {e.surface} holds "
+                f"{requirement_place}: the envelope's slope_deg goes up to {e.slope_deg[1]:g}; {e.surface} holds "
                 f"{_configuration_name(robot, e)} up to {steepest:.1f} deg at most (adhesion {friction:.2f}), "
                 "whatever drives it"
             )
@@ -256,9 +256,9 @@ class _QuantityOfRobot:
         r, at, parts = self.requirement, self.at, []
         robot, rated = _robot_without_ratings(self.robot), ratings(self.robot)
         for first in range(0, len(rows), ROWS):
-            chosen = rows[np.minimum(np.arange(first, first + ROWS), len(rows) - 1)]
+            chunk_rows = rows[np.minimum(np.arange(first, first + ROWS), len(rows) - 1)]
             found = jax.device_get(
-                _quantity_at_points(robot, rated, self.names, jnp.asarray(chosen), at, _computed_name(r))
+                _quantity_at_points(robot, rated, self.names, jnp.asarray(chunk_rows), at, _computed_name(r))
             )
             parts.append([x[: len(rows) - first] for x in found])
         value, outcome = (np.concatenate(x) for x in zip(*parts, strict=True))
@@ -296,27 +296,27 @@ def check_requirements(
     """
     reject_impossible(robot, asked)
     asked = fill_in_ratings(robot, asked)
-    held = []
+    checked_requirements = []
     for r in asked.each:
         configuration = _configuration_name(robot, r.envelope)
         of_levers = OF_LEVERS if r.quantity.group == "posture" else ()
         by_name = {p.name: p for p in params.walk_parameters(robot)}
         names = (*CHANGEABLE, *(f"{configuration}.{n}" for n in OF_CONFIGURATION))
-        held.append(
+        checked_requirements.append(
             _QuantityOfRobot(
                 robot, r, (*{name: by_name[name] for name in names if name in by_name}, *of_levers, CELLS)
             )
         )
     outcomes = []
-    for k, h in enumerate(held, 1):
-        tell(progress_remark("requirement", k, len(held), h.requirement.quantity.label))
+    for k, h in enumerate(checked_requirements, 1):
+        tell(progress_remark("requirement", k, len(checked_requirements), h.requirement.quantity.label))
         outcomes.append(_check_requirement(h))
     if not changes:
         return tuple(outcomes)
     missed, answer = [k for k, o in enumerate(outcomes) if not o.met], list(outcomes)
     for n, k in enumerate(missed, 1):
-        tell(progress_remark("changes", n, len(missed), held[k].requirement.quantity.label))
-        answer[k] = _add_changes(held[k], outcomes[k], held, outcomes)
+        tell(progress_remark("changes", n, len(missed), checked_requirements[k].requirement.quantity.label))
+        answer[k] = _add_changes(checked_requirements[k], outcomes[k], checked_requirements, outcomes)
     return tuple(answer)
 
 
@@ -453,8 +453,8 @@ def _nearest_value(held: _QuantityOfRobot, name: str, begin: float, end: float) 
 
     def steps(a: float, b: float, count: int) -> np.ndarray:
         if name == CELLS:
-            whole = np.arange(round(min(a, b)), round(max(a, b)) + 1, dtype=float)
-            return (whole if a < b else whole[::-1])[1:]
+            integer_steps = np.arange(round(min(a, b)), round(max(a, b)) + 1, dtype=float)
+            return (integer_steps if a < b else integer_steps[::-1])[1:]
         return np.geomspace(a, b, count + 1)[1:]
 
     ladder = steps(begin, end, LADDER)

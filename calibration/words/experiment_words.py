@@ -87,11 +87,13 @@ def experiment_sentences(e: menu.Experiment) -> str:
 def _act(act: menu.CalibrationAct) -> str:
     if act.name == "weigh":
         configurations, payload = {k for k, _ in act.at}, max(m for _, m in act.at)
-        each = {1: "", 2: "in both configurations, "}.get(len(configurations), "in each configuration, ")
+        configuration_words = {1: "", 2: "in both configurations, "}.get(
+            len(configurations), "in each configuration, "
+        )
         laden = f"unladen and with the payload of {payload:g} kg, " if payload > 0 else "unladen, "
         return (
-            f"Weigh the robot {each}{laden}on scales accurate to 20 g, and compare the readings with the total mass "
-            "in the robot file"
+            f"Weigh the robot {configuration_words}{laden}on scales accurate to 20 g, and compare the readings with "
+            "the total mass in the robot file"
         )
     (kind,) = act.kinds
     if act.channel:
@@ -101,13 +103,13 @@ def _act(act: menu.CalibrationAct) -> str:
 
 def _run(run: menu.ProposedRuns) -> str:
     level = (run.imposed != "voltage" or bool(run.torque)) and not any(run.slope)
-    where = "" if run.setup in menu.WEIGHTLESS or level else f" {join_slopes(run.slope)}"
+    slope_words = "" if run.setup in menu.WEIGHTLESS or level else f" {join_slopes(run.slope)}"
     read = join_words([channels.find_channel(c).label for c in run.channels])
     turning = [menu.round_significant(v / RPM) for v in run.voltage]
     unit = {"voltage": "V", "motor_current": "A per motor"}.get(run.imposed)
-    at = join_amounts(turning, "rpm at the motor") if unit is None else join_amounts(run.voltage, unit)
+    levels = join_amounts(turning, "rpm at the motor") if unit is None else join_amounts(run.voltage, unit)
     against = f" against a brake of {join_torques(run.torque)}" if any(run.torque) else ""
-    text = f"{_doing(run)}{where} at {at}{against}; read {read}"
+    text = f"{_doing(run)}{slope_words} at {levels}{against}; read {read}"
     return f"{text}. Watch {'; '.join(map(describe, run.watch))}" if run.watch else text
 
 
@@ -192,8 +194,10 @@ def _steps(what: SimpleNamespace, first: str = "") -> str:
 def _up_to(most: float, runs: int, unit: str = "", first: str = "") -> str:
     """` from crawl to 12 V in steps of 1 V`: levels that a person can set."""
     step = menu.step_of_settings(most, runs)
-    last, by = (f"{x:g} {unit}".rstrip() for x in (menu.last_setting(most, step), step))
-    return f" from a {first} to {last} in steps of {by}" if first else f" up to {last} in steps of {by}"
+    last, step_words = (f"{x:g} {unit}".rstrip() for x in (menu.last_setting(most, step), step))
+    return (
+        f" from a {first} to {last} in steps of {step_words}" if first else f" up to {last} in steps of {step_words}"
+    )
 
 
 def _advice_by_variable(what: SimpleNamespace) -> dict[str, str]:
@@ -231,18 +235,18 @@ def _of_level(what: SimpleNamespace) -> dict[str, str]:
     level = "Repeat on the level, unladen," if within.has_ground else "Repeat"
     of_speed = within.imposed == "motor_speed"
     most = max(within.levels, default=within.motor_speed if of_speed else within.current)
-    one, levels = ("motor speed", (most / RPM, "rpm")) if of_speed else ("motor current", (most, "A"))
-    turning = f"with the {one}{_up_to(levels[0], what.runs, levels[1])}"
+    name, levels = ("motor speed", (most / RPM, "rpm")) if of_speed else ("motor current", (most, "A"))
+    turning = f"with the {name}{_up_to(levels[0], what.runs, levels[1])}"
     words = {
         "speed_motor": f"{level} {turning}",
         "speed": f"{level} {turning}, which also varies the travelling speed",
-        "slope": f"Repeat at one {one} and payload with the slope from 0 to {what.slope:g} deg, and downhill",
-        "payload": f"Repeat at one {one} and slope with the payload from 0 to {what.payload:g} kg",
-        "time": f"Repeat at one {one} for ten minutes from a cold start, and again at once while everything is warm",
+        "slope": f"Repeat at one {name} and payload with the slope from 0 to {what.slope:g} deg, and downhill",
+        "payload": f"Repeat at one {name} and slope with the payload from 0 to {what.payload:g} kg",
+        "time": f"Repeat at one {name} for ten minutes from a cold start, and again at once while everything is warm",
     }
     if not within.has_ground:
         words["current"] = (
-            f"{level} at one {one} with {_brake(what)}" if any(within.torques) else words["speed_motor"]
+            f"{level} at one {name} with {_brake(what)}" if any(within.torques) else words["speed_motor"]
         )
     return words
 
@@ -368,5 +372,5 @@ def effect_tests(effect: type[Effect]) -> Iterator[str]:
                 shafts="the motor shafts",
             )
             yield f"{text[0].upper()}{text[1:].rstrip(',')}, at several voltages"
-    what = VARY.get(effect.driver, f"the {effect.driver}")  # one's own may go with anything
-    yield f"Vary {what}" + ("; from rest, over time" if effect.transient or effect.settles_to else "")
+    variation = VARY.get(effect.driver, f"the {effect.driver}")  # one's own may go with anything
+    yield f"Vary {variation}" + ("; from rest, over time" if effect.transient or effect.settles_to else "")

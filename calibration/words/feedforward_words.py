@@ -10,8 +10,8 @@ from calibration.inference.feedforward import WRONG_UNITS, Feedforward, constant
 def feedforward_statement(found: Feedforward) -> str:
     """Each constant with ± (95 %) and unit."""
     units = constant_units(found.unit)
-    listed = (f"{n} = {x:.4g} ± {1.96 * found.sds[n]:.2g} {units[n]}" for n, x in found.constants.items())
-    return ", ".join(listed) + "."
+    constants_words = (f"{n} = {x:.4g} ± {1.96 * found.sds[n]:.2g} {units[n]}" for n, x in found.constants.items())
+    return ", ".join(constants_words) + "."
 
 
 def _limit(level: float, current: float | None) -> str:

@@ -51,10 +51,10 @@ def noise_off(channel: str, factor: float, source: str) -> str:
 
 def estimated_noise(percent: tuple[tuple[str, float], ...]) -> str:
     """Channels whose noise was estimated."""
-    each = ", ".join(f"{channel.replace('_', ' ')} {share:.1f} %" for channel, share in percent)
+    share_words = ", ".join(f"{channel.replace('_', ' ')} {share:.1f} %" for channel, share in percent)
     return (
-        f"no noise was stated for {each}. It is estimated from the misfit, so it includes model error and cannot "
-        "be used to test the model"
+        f"no noise was stated for {share_words}. It is estimated from the misfit, so it includes model error and "
+        "cannot be used to test the model"
     )
 
 
@@ -74,21 +74,21 @@ def is_determined_answer(found: fit_notes.Determination) -> str:
 
 def only_together(pairs: tuple[fit_notes.DependentPair, ...]) -> str:
     """Parameters that are not determined separately, with what is."""
-    each = [f"{determined_combination(p)} (correlation {p.correlation:+.3f})" for p in pairs]
-    return f"determined only together: {', '.join(each)}"
+    pair_words = [f"{determined_combination(p)} (correlation {p.correlation:+.3f})" for p in pairs]
+    return f"determined only together: {', '.join(pair_words)}"
 
 
 def of_rows(rows: tuple[int, ...], what: str, share: float = 0.0) -> str:
     """Rows with a property, and its consequence."""
-    listed = f"rows {', '.join(map(str, rows))}"
+    row_words = f"rows {', '.join(map(str, rows))}"
     if what == "limited":
         return (
-            f"{listed} are within {share:.0%} of the adhesion limit. They give a lower bound for static friction, "
+            f"{row_words} are within {share:.0%} of the adhesion limit. They give a lower bound for static friction, "
             "which does not explain all of their slip"
         )
     if what == "jumps":
-        return f"{listed}: the calibrated robot's running gear jumps off the ground at times"
-    return f"{listed}: {what} with the calibrated robot"
+        return f"{row_words}: the calibrated robot's running gear jumps off the ground at times"
+    return f"{row_words}: {what} with the calibrated robot"
 
 
 def search_agreement(starts: int, agree: int, elsewhere: int, more: float, open: int) -> str:
@@ -129,16 +129,16 @@ def search_generations(members: int, generations: int, settled: bool) -> str:
 
 def lost_rows(members: dict[str, int]) -> str:
     """Members with a row that is lost."""
-    lost = ", ".join(f"{members[status]} {how}" for status, how in LOST_AS.items() if status in members)
-    return f"members that fail in at least one row: {lost}; they rank below the others"
+    row_outcomes = ", ".join(f"{members[status]} {how}" for status, how in LOST_AS.items() if status in members)
+    return f"members that fail in at least one row: {row_outcomes}; they rank below the others"
 
 
 def members_jump(members: int, best: tuple[int, ...]) -> str:
     """Members whose running gear jumps."""
-    where = f"rows {', '.join(map(str, best))}" if best else "none"
+    row_words = f"rows {', '.join(map(str, best))}" if best else "none"
     return (
         f"{members} members jump in at least one row: the weight passes between guides and pulleys so hard that "
-        f"they leave the ground at times; the best member does so in {where}"
+        f"they leave the ground at times; the best member does so in {row_words}"
     )
 
 
@@ -175,12 +175,12 @@ OBSTACLES = {
 
 def _misses(those: Sequence[RelativeError]) -> str:
     """`total current 74 % of its measured rms (32 % with the file as given)`."""
-    each = [
+    miss_words = [
         f"{channels.find_channel(m.channel).label} {_percent(m.fitted)} of its measured rms ({_percent(m.as_stated)} "
         "with the file as given)"
         for m in those
     ]
-    return ", ".join(each)
+    return ", ".join(miss_words)
 
 
 def _percent(share: float) -> str:
@@ -224,21 +224,23 @@ _VERDICTS: dict[bool | None, str] = {
 
 def calibration_answer(found: CalibrationResult) -> str:
     """Answer of a calibration: adequate or not, and rms errors before and after over the rows that have both."""
-    each, rows = list[tuple[str, str]](), dict[str, int]()
+    channel_errors, rows = list[tuple[str, str]](), dict[str, int]()
     for c in found.channels:
         r = found.readings[c.name]
-        both = np.isfinite(r.measured) & np.isfinite(r.before) & np.isfinite(r.after)
-        if both.any():
-            size = root_mean_square(r.measured[both])
-            before, after = (100 * root_mean_square((x - r.measured)[both]) / size for x in (r.before, r.after))
-            rows[c.label] = int(both.sum())
-            each.append((c.label, f"{c.label} {before:.1f} → {after:.1f} %"))
-    if not each:
+        is_compared = np.isfinite(r.measured) & np.isfinite(r.before) & np.isfinite(r.after)
+        if is_compared.any():
+            size = root_mean_square(r.measured[is_compared])
+            before, after = (
+                100 * root_mean_square((x - r.measured)[is_compared]) / size for x in (r.before, r.after)
+            )
+            rows[c.label] = int(is_compared.sum())
+            channel_errors.append((c.label, f"{c.label} {before:.1f} → {after:.1f} %"))
+    if not channel_errors:
         return f"{_VERDICTS[found.adequacy.adequate]}; the model reaches no row both before and after the fit."
     same = len(set(rows.values())) == 1
-    errors = ", ".join(text + ("" if same else f" ({rows[label]} rows)") for label, text in each)
-    where = f"the same {count_noun(max(rows.values()), 'row')}" if same else "the same rows"
-    return f"{_VERDICTS[found.adequacy.adequate]}; rms error before → after on {where}: {errors}."
+    errors = ", ".join(text + ("" if same else f" ({rows[label]} rows)") for label, text in channel_errors)
+    row_words = f"the same {count_noun(max(rows.values()), 'row')}" if same else "the same rows"
+    return f"{_VERDICTS[found.adequacy.adequate]}; rms error before → after on {row_words}: {errors}."
 
 
 #: Levels of a cluster that are listed, the farthest from nothing.
@@ -247,26 +249,26 @@ LISTED = 6
 
 def residual_cluster(c: ResidualCluster) -> str:
     """Residuals that go with a column without a role."""
-    what = f"residuals of {channels.find_channel(c.channel).label}"
+    subject = f"residuals of {channels.find_channel(c.channel).label}"
     within = f" within {c.within}" if c.within else ""
     signs = ", with opposite signs in the two directions of travel" if c.reversing else ""
     p = f"p = {c.p:.1g}"
     role = "a column without a role" + (f" (as well by {', '.join(c.alike)})" if c.alike else "")
     if c.correlation is not None:
         return (
-            f"{what} are correlated with {c.column}{within}{signs} (rank correlation {c.correlation:+.2f}; {p}), "
+            f"{subject} are correlated with {c.column}{within}{signs} (rank correlation {c.correlation:+.2f}; {p}), "
             f"{role}: find what changes with it"
         )
     if c.coarser:
         shares = ", ".join(f"{name} alone {share:.0%} of it" for name, share in c.coarser)
         role += f" ({shares})"
     ordered = sorted(c.levels, key=lambda m: -abs(m.mean))[:LISTED]
-    kept = [m for m in c.levels if m in ordered]
-    each = ", ".join(f"{m.name}: {m.mean:+.2g} {c.unit}" for m in kept)
-    more = ", ..." if len(kept) < len(c.levels) else ""
+    mean_levels = [m for m in c.levels if m in ordered]
+    level_words = ", ".join(f"{m.name}: {m.mean:+.2g} {c.unit}" for m in mean_levels)
+    more = ", ..." if len(mean_levels) < len(c.levels) else ""
     return (
-        f"{what} differ between the levels of {c.column}{within}{signs} (simulated minus measured, by level: "
-        f"{each}{more}; {p}), {role}: give each level its own configuration, or find what differs between them"
+        f"{subject} differ between the levels of {c.column}{within}{signs} (simulated minus measured, by level: "
+        f"{level_words}{more}; {p}), {role}: give each level its own configuration, or find what differs between them"
     )
 
 

@@ -65,19 +65,19 @@ def verdict_sentences(said: loop_notes.VerdictSummary) -> str:
 
 
 def _verdict(said: loop_notes.VerdictSummary) -> str:
-    where = said.where
+    location = said.where
     if said.verdict == "undescribed":
         return _undescribed(said)
     if said.verdict == "none":
         return f"Nothing is missing: the residuals are consistent with noise (family-wise p = {said.p:.2g})."
-    if said.verdict in WITHOUT_NAME and where is not None:
+    if said.verdict in WITHOUT_NAME and location is not None:
         mechanism = said.mechanism
         if said.verdict == "mechanism" and mechanism is not None:
-            within = _window_words(where) if where.family in mechanism.families else ""
+            within = _window_words(location) if location.family in mechanism.families else ""
             text = f"Missing: {_mechanism(mechanism, within)} ({_evidence(said)}). "
             text += "No law of the library is established."
         else:
-            text = _without_name(where, _evidence(said), "is established" if said.missing else "explains it")
+            text = _without_name(location, _evidence(said), "is established" if said.missing else "explains it")
             text += f" No mechanism is established: {no_mechanism(mechanism)}." if mechanism is not None else ""
         if said.missing:
             text += _tentative(said.missing, said.support)
@@ -88,8 +88,10 @@ def _verdict(said: loop_notes.VerdictSummary) -> str:
         return text
     names = [_effect_and_rivals(one) for one in said.missing if one.established]
     in_model = _tentative([one for one in said.missing if not one.established], said.support)
-    left = "" if where is None else f" An unexplained error remains in the {bases.place_in_words(where.place)}."
-    return f"Missing: {'; '.join(names)} ({_evidence(said)}).{in_model}{left}"
+    place_sentence = (
+        "" if location is None else f" An unexplained error remains in the {bases.place_in_words(location.place)}."
+    )
+    return f"Missing: {'; '.join(names)} ({_evidence(said)}).{in_model}{place_sentence}"
 
 
 def _evidence(said: loop_notes.VerdictSummary) -> str:
@@ -129,9 +131,9 @@ def loop_answer(found: loop_notes.Headline) -> str:
 
 def _law(names: Sequence[str], families: Sequence[str], values: Sequence[loop_notes.AlternativeValue]) -> str:
     """`a loss torque that changes with speed (churning or windage; these data cannot tell which)`."""
-    each = [*map(freed_value, values), *in_order_of_parts(names)]
-    which = "; these data cannot tell which" if len(each) + len(families) > 2 else ""
-    return f"{' or '.join(map(with_article, families))} ({' or '.join(each)}{which})"
+    terms = [*map(freed_value, values), *in_order_of_parts(names)]
+    ambiguity = "; these data cannot tell which" if len(terms) + len(families) > 2 else ""
+    return f"{' or '.join(map(with_article, families))} ({' or '.join(terms)}{ambiguity})"
 
 
 def in_order_of_parts(names: Iterable[str]) -> list[str]:
@@ -152,7 +154,7 @@ def _are_missing(nouns: Sequence[str]) -> str:
 
 def _undescribed(said: loop_notes.VerdictSummary) -> str:
     """Sentence on a model that does not describe the runs: the misfit and the checks."""
-    each = [
+    place_words = [
         f"{channels.find_channel(m.channel).label} by {100 * m.error:.0f} % of its measured rms"
         + (f" (its noise is estimated as {100 * m.noise:.0f} %)" if m.noise > m.error else "")
         for m in said.missed
@@ -160,12 +162,12 @@ def _undescribed(said: loop_notes.VerdictSummary) -> str:
     check = [f"columns that vary and are not used ({', '.join(said.unused)})"] * bool(said.unused)
     check += [f"parameters far from their priors ({', '.join(said.far)})"] * bool(said.far)
     check += ["units, signs and sides of the columns"]
-    if not each:
+    if not place_words:
         return (
             "This model does not describe these runs: it lacks backlash. No effect is named until backlash is added."
         )
     return (
-        f"This model does not describe these runs: refitted, it misses {', '.join(each)}. No effect is named. "
+        f"This model does not describe these runs: refitted, it misses {', '.join(place_words)}. No effect is named. "
         f"Check first: {'; '.join(check)}."
     )
 
@@ -218,8 +220,8 @@ def proposed_formula(d: UnnamedDiscrepancy) -> str:
     """The formula of a curve, or its course where no single term explains it."""
     if d.proposal.expression:
         return f"{d.proposal.expression} ({d.proposal.mark})"
-    what = curve_course(d)
-    return f"The curve {what}; {NO_FORMULA}" if what else NO_FORMULA
+    course = curve_course(d)
+    return f"The curve {course}; {NO_FORMULA}" if course else NO_FORMULA
 
 
 #: Units in which people set the variables of a curve, and their SI values.
@@ -248,11 +250,11 @@ def at_other_noise(found: Sequence[NoiseVerdict]) -> str:
     same: dict[str, list[str]] = {}
     for one in found:
         same.setdefault(brief_verdict(one.summary), []).append(f"{one.factor:g}")
-    each = [
+    answers = [
         f"with {' and with '.join(factors)} times the noise the verdict is {words}" for words, factors in same.items()
     ]
     near = " (after a few steps from the fits with the stated noise)" if any(one.near for one in found) else ""
-    return "; ".join(each) + near
+    return "; ".join(answers) + near
 
 
 def _effect_and_rivals(one: loop_notes.MissingEffect) -> str:
@@ -262,22 +264,22 @@ def _effect_and_rivals(one: loop_notes.MissingEffect) -> str:
         return one.names[0]
     family = f"{one.families[0]}, " if len(one.families) == 1 else ""
     names = ", ".join(in_order_of_parts(one.names))
-    listed = names if len(one.names) == 1 else f"one of {names}"
+    names_words = names if len(one.names) == 1 else f"one of {names}"
     values = [freed_value(v) for v in one.values]
-    return f"{family}{', or '.join([listed, *values, *readings])} (these data cannot tell which)"
+    return f"{family}{', or '.join([names_words, *values, *readings])} (these data cannot tell which)"
 
 
 def _tentative(those: Sequence[loop_notes.MissingEffect], support: loop_notes.NameSupport | None) -> str:
     """Effects that are in the model without a name of their own, each with what speaks against it."""
     if not those:
         return ""
-    each = [
+    effect_words = [
         f"{_effect_and_rivals(one)}, which {effect_doubts(one.test)}"
         if effect_doubts(one.test)
         else f"{_effect_and_rivals(one)} ({support_reasons(support)})"
         for one in those
     ]
-    return f" Tentative, kept in the model because it improves predictions: {'; '.join(each)}."
+    return f" Tentative, kept in the model because it improves predictions: {'; '.join(effect_words)}."
 
 
 def verdict_line(stages: LoopStages) -> str:
@@ -290,12 +292,13 @@ def verdict_line(stages: LoopStages) -> str:
 
 def ranking_lines(found: EffectRanking, most: int = 5, brief: bool = False) -> list[str]:
     """Lines of the ranking by regression: whether an effect is missing, and the strongest, `brief` by name alone."""
-    by = f"by regression on {found.windows} windows of the log" if found.windows else "by regression"
+    method_words = f"by regression on {found.windows} windows of the log" if found.windows else "by regression"
     if not found.missing:
         return [
-            f"{by}, not yet confirmed: no effect of the library exceeds chance (family-wise p = {found.p_value:.2g})"
+            f"{method_words}, not yet confirmed: no effect of the library exceeds chance (family-wise p = "
+            f"{found.p_value:.2g})"
         ]
-    first = f"{by}, not yet confirmed: something is missing (family-wise p {p_value(found.p_value)})"
+    first = f"{method_words}, not yet confirmed: something is missing (family-wise p {p_value(found.p_value)})"
     beyond = [e for e in found.effects if e.score > found.chance and not e.supplies][:most]
     if not beyond:
         return [f"{first}; no effect explains more than chance would"]
@@ -339,10 +342,10 @@ def so_far(effects: Sequence[str], families: Sequence[str]) -> str:
 def _without_name(where: DiscrepancyLocation, evidence: str, no_effect: str) -> str:
     others = [bases.place_in_words(p).removesuffix(" balance") for p in where.alike if p != where.place]
     also = f" (or {', '.join(others)}, which these data do not distinguish)" if others else ""
-    what = f": {where.family}" if where.variable in bases.VARIABLES else ""
+    family_words = f": {where.family}" if where.variable in bases.VARIABLES else ""
     return (
-        f"Something is missing in the {bases.place_in_words(where.place)}{also}, {_shown(where)}{what}; no effect of "
-        f"the library {no_effect} ({evidence})."
+        f"Something is missing in the {bases.place_in_words(where.place)}{also}, {_shown(where)}{family_words}; no "
+        f"effect of the library {no_effect} ({evidence})."
     )
 
 
@@ -391,8 +394,8 @@ def p_value(p: float) -> str:
 
 def cluster_sentence(c: OutlierCluster) -> str:
     """Sentence on the common level of outlying rows."""
-    where = f"at {c.axis} {c.level}" if c.level else f"at {c.axis} {c.low:.3g} to {c.high:.3g}"
-    return f"{c.inside} of {c.of} outlying rows cluster {where} (p = {c.p:.1g})"
+    place_words = f"at {c.axis} {c.level}" if c.level else f"at {c.axis} {c.low:.3g} to {c.high:.3g}"
+    return f"{c.inside} of {c.of} outlying rows cluster {place_words} (p = {c.p:.1g})"
 
 
 # --- the first screen -----------------------------------------------------------------------------------
@@ -409,8 +412,8 @@ def how_sure(found: DiscoveryResult, effect: FoundEffect) -> str:
     if is_established(found, effect):
         evidence = "" if test is None else f": {test.root:.1f} σ (chance: {test.needed:.1f})"
         if test is not None and test.shows_form:
-            over = test.over.replace("_", " ")
-            evidence += f"; its size varies by ±{100 * test.spread:.0f} % over {over}"
+            variable = test.over.replace("_", " ")
+            evidence += f"; its size varies by ±{100 * test.spread:.0f} % over {variable}"
         return f"established{evidence}"
     return f"tentative: it improves predictions, but {effect_doubts(test)}" if effect_doubts(test) else "tentative"
 
@@ -426,13 +429,13 @@ def brief_answer(found: DiscoveryResult, moved: Sequence[str], next_step: str) -
         f"{e.name} {effect_amplitude(e)}" + " (tentative)" * (not is_established(found, e)) for e in found.effects
     ]
     changes = f"Moved: {'; '.join(moved)}. " * bool(moved) + f"Added: {', '.join(added)}." * bool(added)
-    stated, fitted = found.errors_as_stated, found.errors[0 if found.refit_alone else 1]
+    stated_errors, fitted = found.errors_as_stated, found.errors[0 if found.refit_alone else 1]
     errors = [
-        f"{channels.find_channel(c).label} {percent_text(stated[c])} → {percent_text(e)} %"
+        f"{channels.find_channel(c).label} {percent_text(stated_errors[c])} → {percent_text(e)} %"
         for c, e in fitted.items()
         if e["rows"]
     ]
-    reached, total = max((int(e["rows"]) for e in stated.values()), default=0), len(found.runs)
+    reached, total = max((int(e["rows"]) for e in stated_errors.values()), default=0), len(found.runs)
     aside = f", {len(found.outliers)} set aside as outliers" * bool(found.outliers)
     few = f" (with the robot file as given, only {reached} rows can be simulated)" * (reached < total)
     rows = f"{int(found.included.sum())} of {total} rows are used{aside}{few}"
@@ -455,8 +458,8 @@ def use_it(found: DiscoveryResult) -> list[str]:
     """Errors of the written robot on fitted and on held-out rows, by kind of block."""
     when = 1 if found.written else 0
     lines = [f"Within these conditions: {_rms(found.errors[when], len(found.runs))}."] * bool(found.errors[when])
-    for kind, both in found.errors_held_out.items():
-        lines.append(f"Another {blocks.kind_in_words(kind)}: {_rms(both[when], len(found.runs))}.")
+    for kind, error_pair in found.errors_held_out.items():
+        lines.append(f"Another {blocks.kind_in_words(kind)}: {_rms(error_pair[when], len(found.runs))}.")
     return lines
 
 
@@ -472,16 +475,16 @@ def _rms(errors: Errors, total: int) -> str:
 
 def largest_share(found: DiscoveryResult) -> str:
     """The reading that weighs most in what is left, empty where none stands out."""
-    seen, runs = found.readings_of_rows, found.runs
-    after = seen.after if found.written else seen.before
-    squares = np.where(found.included[:, None], ((after - seen.measured) / seen.sd) ** 2, np.nan)
+    readings, runs = found.readings_of_rows, found.runs
+    after = readings.after if found.written else readings.before
+    squares = np.where(found.included[:, None], ((after - readings.measured) / readings.sd) ** 2, np.nan)
     total = float(np.nansum(squares))
     if not total > 0 or (share := 100 * float(np.nanmax(squares)) / total) < SHARE:
         return ""
     row, k = np.unravel_index(int(np.nanargmax(squares)), squares.shape)
     columns = {c: runs[c][row] for c in ("configuration", *runs.axes) if runs.has(c)}
-    where, label = _conditions(columns), found.channels[k].label
-    return f"Row {found.numbers[row]} ({where}): its {label} causes {share:.0f} % of the remaining misfit"
+    place_words, label = _conditions(columns), found.channels[k].label
+    return f"Row {found.numbers[row]} ({place_words}): its {label} causes {share:.0f} % of the remaining misfit"
 
 
 def _conditions(columns: Mapping[str, str | float]) -> str:
@@ -539,8 +542,8 @@ def naming_reasons(found: DiscoveryResult) -> str:
     reasons, lacks = support_reasons(found.support), found.unnamed
     if lacks is None or not found.after.adequate or (found.support is not None and found.support.curves):
         return reasons
-    over = loop_notes.PlacedCurve(lacks.place, (lacks.variable,))
-    return "; ".join([REASONS["curve alone"].format(curves=_curve(over)), *[reasons] * bool(reasons)])
+    placed_curve = loop_notes.PlacedCurve(lacks.place, (lacks.variable,))
+    return "; ".join([REASONS["curve alone"].format(curves=_curve(placed_curve)), *[reasons] * bool(reasons)])
 
 
 def _score_words(test: loop_notes.NameTest) -> str:
@@ -569,8 +572,11 @@ def effect_doubts(test: loop_notes.NameTest | None) -> str:
     """Reasons against an effect, empty for none."""
     if test is None or not test.fails:
         return ""
-    over = ", ".join(_place_over(c.place, *c.variables) for c in test.curves)
-    doubts = {"beside": over and f" next to smooth curves ({over})", "larger": " and ".join(test.larger)}
+    curve_words = ", ".join(_place_over(c.place, *c.variables) for c in test.curves)
+    doubts = {
+        "beside": curve_words and f" next to smooth curves ({curve_words})",
+        "larger": " and ".join(test.larger),
+    }
     doubts |= {"over_variable": test.over.replace("_", " ")}
     doubts["spread"] = f" by ±{100 * test.spread:.0f} %" if math.isfinite(test.spread) else ""
     *first, last = [DOUBTS[d][1].format(test, **doubts, again=100 * test.again) for d in test.fails]
@@ -633,9 +639,9 @@ def ruled_out(found: DiscoveryResult) -> str:
     if not candidates or found.verdict in ("none", "undescribed"):
         return ""
     first = min(candidates, key=lambda a: (len(a.effects), a.rise_chi2))
-    what = "the curve" if found.verdict in WITHOUT_NAME else "what is proposed"
+    subject = "the curve" if found.verdict in WITHOUT_NAME else "what is proposed"
     more = first.rise_chi2 < -found.settings.same
-    gain = f"{misfit_text(-first.rise_chi2)} σ² more than {what}" if more else f"as much as {what}"
+    gain = f"{misfit_text(-first.rise_chi2)} σ² more than {subject}" if more else f"as much as {subject}"
     are = "are" if len(first.effects) > 1 else "is"
     return (
         f"{' and '.join(first.effects)} would explain {gain}, but {are} ruled out only by size or sign: {first.why}."
@@ -649,12 +655,12 @@ def hidden_effects_sentence(found: DiscoveryResult) -> str:
     """Sentence on effects that the findings could hide, and on runs that would show them, empty for none."""
     if not found.hidden:
         return ""
-    each = [
+    effect_words = [
         f"{h.name} up to {h.amplitude:.2g} {h.unit}".rstrip(" -")
         + (f" ({h.experiment} would show it)" if h.experiment else "")
         for h in found.hidden
     ]
-    return f"These data could hide, in addition: {', '.join(each)}."
+    return f"These data could hide, in addition: {', '.join(effect_words)}."
 
 
 def moved_parameter(name: str, value: float, stated: float, unit: str, shift: float) -> str:
@@ -700,10 +706,12 @@ def rising_errors_sentence(found: Sequence[WorseChannel], predicted: Mapping[str
     """
     parts = []
     for kind, (before, after) in predicted.items():
-        mine = [w for w in found if w.kind == kind]
-        changes = [f"{channels.find_channel(w.channel).label} {_two_numbers(w.before, w.after)} %" for w in mine]
-        if mine:
-            changes[-1] += f" (same {min(w.rows for w in mine)} rows)"
+        own_windows = [w for w in found if w.kind == kind]
+        changes = [
+            f"{channels.find_channel(w.channel).label} {_two_numbers(w.before, w.after)} %" for w in own_windows
+        ]
+        if own_windows:
+            changes[-1] += f" (same {min(w.rows for w in own_windows)} rows)"
         if before > after:
             changes.append(f"{count_noun(before - after, 'row')} can no longer be predicted")
         if changes:
@@ -744,8 +752,8 @@ def track_model_answer(found: TrackModelResult) -> str:
             f"Track model, {track_model_question(found.asked)}: no running gear within its priors was found that "
             f"explains this error ({slip}, χ² falls by {found.fall:.0f}, p = {found.p:.2g}{why}){on}"
         )
-    held = len(found.constants) - len(found.known_from_rows)
-    undetermined = f"not determined by these rows: {held} of {len(found.constants)} constants"
+    constants_count = len(found.constants) - len(found.known_from_rows)
+    undetermined = f"not determined by these rows: {constants_count} of {len(found.constants)} constants"
     return (
         f"Track model, {track_model_question(found.asked)}: a running gear within its priors explains this error "
         f"({slip}, χ² falls by {found.fall:.0f}, p = {found.p:.2g}): {gear}; {undetermined}{on}"
@@ -819,13 +827,19 @@ def leader_choice(
         FIT: "the fit to all rows",
         loop_notes.DRAW: f"the fit to all rows, since held-out errors differ by less than {told:.0%}",
     }
-    each = ", ".join(f"{n} {x:.2f} σ" for n, x in zip(names, rms_sigma, strict=True))
-    sentence = f"{names[leader]} is listed first in its class because of {criteria[by]}; held-out errors: {each}"
+    error_words = ", ".join(f"{n} {x:.2f} σ" for n, x in zip(names, rms_sigma, strict=True))
+    sentence = (
+        f"{names[leader]} is listed first in its class because of {criteria[by]}; held-out errors: {error_words}"
+    )
     if prefer == HELD_OUT and leader != closest:
         sentence += f"; the fit to all rows prefers {names[closest]}, by Δχ² {rise_chi2:.1f}"
     if leader != best:
-        asked = prefer == HELD_OUT
-        why = "is not as adequate" if asked else (f"would come first with --prefer {HELD_OUT}, where it is adequate")
+        prefers_held_out = prefer == HELD_OUT
+        why = (
+            "is not as adequate"
+            if prefers_held_out
+            else (f"would come first with --prefer {HELD_OUT}, where it is adequate")
+        )
         sentence += f"; {names[best]} {why}"
     return sentence
 
@@ -837,8 +851,8 @@ def rests_on(
     beside: tuple[float, ...] = (),
 ) -> str:
     """Sentence on an effect that depends on one run."""
-    where = _conditions(conditions)
-    run = f"{test.what} {test.rests_on}{f' ({where})' * bool(where)}"
+    place_words = _conditions(conditions)
+    run = f"{test.what} {test.rests_on}{f' ({place_words})' * bool(place_words)}"
     others = (
         f"run it at {axis} {' and '.join(f'{x:g}' for x in beside)} too"
         if beside
@@ -852,10 +866,10 @@ def rests_on(
 
 def unwritten_reason(curve: bool, gain: float, se: float) -> str:
     """Reason why identified effects are not in the written robot."""
-    what = "the curve" if curve else "what was found"
+    subject = "the curve" if curve else "what was found"
     how = "no better than" if curve and gain > 0 else "worse than"
     return (
-        f"{what} predicts held-out runs {how} the refit (log likelihood {gain:+.2f} ± {se:.2f} per reading), so "
+        f"{subject} predicts held-out runs {how} the refit (log likelihood {gain:+.2f} ± {se:.2f} per reading), so "
         "robot.toml contains the refit"
     )
 

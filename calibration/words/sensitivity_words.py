@@ -34,8 +34,8 @@ def input_in_words(found: SensitivityResult, name: str) -> str:
     if name.startswith("effects.") or not found.inputs[name].meaning:
         return name
     words = re.split(r"[,;:] | \(", found.inputs[name].meaning)[0]
-    where = name.partition(".")[0]
-    return f"{words} ({where})" if where in set(map(str, found.points.configuration)) else words
+    part = name.partition(".")[0]
+    return f"{words} ({part})" if part in set(map(str, found.points.configuration)) else words
 
 
 def sensitivity_statement(found: SensitivityResult) -> str:
@@ -44,13 +44,13 @@ def sensitivity_statement(found: SensitivityResult) -> str:
     if not leaders:
         return "No input changes any of these outputs."
     verb, measure, note = _CAUSES.get(found.method, ("causes", "variance", ""))
-    listed = "; ".join(
+    input_words = "; ".join(
         f"{input_in_words(found, name)} {verb} {100 * outputs[0][1]:.0f} % of the {measure} of {outputs[0][0]}"
         + "".join(f", {100 * share:.0f} % of {label}" for label, share in outputs[1:])
         for name, outputs in sorted(leaders.items(), key=lambda item: -len(item[1]))
     )
-    where, idle = points_studied(found), len(found.negligible)
-    return f"{where}: {listed}{note}. " + (
+    points_words, idle = points_studied(found), len(found.negligible)
+    return f"{points_words}: {input_words}{note}. " + (
         f"{idle} of {len(found.inputs)} inputs do not matter." if idle else "Every input matters somewhere."
     )
 
@@ -70,8 +70,8 @@ def points_studied(found: SensitivityResult) -> str:
     if len(parts) > 1:
         return f"At {fewest} to {total} of {total} operating points, by output (others are left out, because {why})"
     (studied,) = parts.values()
-    whole = [o.row.label for o in found.outputs.values() if o.studied.all()]
-    rest = f"; all {total} for {', '.join(whole)}" if whole else ""
+    labels = [o.row.label for o in found.outputs.values() if o.studied.all()]
+    rest = f"; all {total} for {', '.join(labels)}" if labels else ""
     return (
         f"At {fewest} of {total} operating points ({_in_words(found.points, ~studied)} left out, because {why}{rest})"
     )
@@ -83,10 +83,10 @@ def _in_words(points: OperatingPoints, mask: np.ndarray) -> str:
     axes = [(x, u) for _, x, u in points.ground[::-1]] + [(imposed, f" {unit}"), (points.configuration, "")]
     most, words = 0, ""
     for x, symbol in axes:
-        whole = np.setdiff1d(x[mask], x[~mask])
-        covered = int(np.isin(x, whole).sum())
+        values_inside = np.setdiff1d(x[mask], x[~mask])
+        covered = int(np.isin(x, values_inside).sum())
         if covered > most:
-            most, words = covered, f"{', '.join(f'{v:g}' if symbol else str(v) for v in whole)}{symbol}"
+            most, words = covered, f"{', '.join(f'{v:g}' if symbol else str(v) for v in values_inside)}{symbol}"
     others = int(mask.sum()) - most
     return " and ".join([words] * bool(words) + [f"{others} more" if words else str(others)] * bool(others))
 

@@ -33,8 +33,8 @@ WHY = {
 
 def left_out_reason(stretch: Stretch) -> str:
     """Reason why a stretch is left out: `total_current still changes at the end of its level (6.1 %)`."""
-    what = f"{stretch.channel} {WHY[stretch.why][0]}" if stretch.channel else WHY[stretch.why][0]
-    return what + (f" ({100 * stretch.size:.2g} %)" if stretch.size else "")
+    reason = f"{stretch.channel} {WHY[stretch.why][0]}" if stretch.channel else WHY[stretch.why][0]
+    return reason + (f" ({100 * stretch.size:.2g} %)" if stretch.size else "")
 
 
 def left_out(stretches: Iterable[Stretch], few: bool = False) -> list[tuple[str, int, int, str, str]]:
@@ -44,23 +44,31 @@ def left_out(stretches: Iterable[Stretch], few: bool = False) -> list[tuple[str,
         few: the log itself is to be fitted, as it has too few settled runs.
     """
     causes = []
-    every = [s for s in stretches if s.why]
-    for why in dict.fromkeys(s.why for s in every):
-        mine = [s for s in every if s.why == why]
-        longest = max(mine, key=lambda s: len(s.rows))
+    omitted = [s for s in stretches if s.why]
+    for why in dict.fromkeys(s.why for s in omitted):
+        stretches_of_reason = [s for s in omitted if s.why == why]
+        longest = max(stretches_of_reason, key=lambda s: len(s.rows))
         rows = f"{longest.rows[0] + 1}-{longest.rows[-1] + 1}"
         cure = "nothing: a fit to the log uses these samples" if few and why in OF_LEVELS else WHY[why][1]
-        causes.append((left_out_reason(longest), len(mine), sum(len(s.rows) for s in mine), rows, cure))
+        causes.append(
+            (
+                left_out_reason(longest),
+                len(stretches_of_reason),
+                sum(len(s.rows) for s in stretches_of_reason),
+                rows,
+                cure,
+            )
+        )
     return causes
 
 
 def settle_statement(found: Settled) -> str:
     """Number of settled runs of a log, and its samples."""
-    kept, rows = found.kept, sum(len(s.rows) for s in found.kept)
-    back = sum(s.imposed < 0 for s in kept)
-    ways = f", {len(kept) - back} forward and {back} backward" if back else ""
+    stretches, rows = found.kept, sum(len(s.rows) for s in found.kept)
+    back = sum(s.imposed < 0 for s in stretches)
+    ways = f", {len(stretches) - back} forward and {back} backward" if back else ""
     return (
-        f"{count_noun(len(kept), 'settled run')}{ways}, from {rows} of {len(found.runs)} samples (each at least "
+        f"{count_noun(len(stretches), 'settled run')}{ways}, from {rows} of {len(found.runs)} samples (each at least "
         f"{found.shortest:.3g} s long, with means steady to {100 * found.drift:g} %)."
     )
 
@@ -98,14 +106,14 @@ def glitch_sentences(found: Settled) -> list[str]:
     """Sentences on the readings that means leave out because they are far from the others, one for each channel."""
     sentences = []
     for channel in (s.channel for s in found.signals):
-        mine = [s for s in found.kept if channel.name in s.glitches]
-        if mine:
-            counts = [s.glitches[channel.name] for s in mine]
-            worst = mine[counts.index(max(counts))]
+        glitch_stretches = [s for s in found.kept if channel.name in s.glitches]
+        if glitch_stretches:
+            counts = [s.glitches[channel.name] for s in glitch_stretches]
+            worst = glitch_stretches[counts.index(max(counts))]
             sentences.append(
                 f"{channel.column}: {count_noun(sum(counts), 'reading')} in "
-                f"{count_noun(len(mine), 'settled run')} left out of the mean, because they are far from the "
-                f"readings next to them; most are in rows {worst.rows[0] + 1} to {worst.rows[-1] + 1} "
+                f"{count_noun(len(glitch_stretches), 'settled run')} left out of the mean, because they are far from "
+                f"the readings next to them; most are in rows {worst.rows[0] + 1} to {worst.rows[-1] + 1} "
                 f"({100 * max(counts) / len(worst.rows):.2g} %); check the instrument, or log a mean if it "
                 "delivers pulses"
             )

@@ -70,8 +70,8 @@ def expected_time(text: str, seconds: float) -> float | None:
         seconds: seconds since the loop began.
     """
     stage, _, rest = text.partition(f" of {OF}, ")
-    over = OVER.get(int(stage)) if rest and stage.isdigit() else None
-    return None if over is None else seconds * (1 - over) / over
+    share_done = OVER.get(int(stage)) if rest and stage.isdigit() else None
+    return None if share_done is None else seconds * (1 - share_done) / share_done
 
 
 def still_running_sentence(doing: str, seconds: float, compiled: int) -> str:

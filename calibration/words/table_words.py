@@ -31,9 +31,9 @@ ALIKE = {
 
 def would_measure(name: str) -> str:
     """Runs or instrument that would measure a parameter that these data do not."""
-    for key, what in WOULD_MEASURE.items():
+    for key, meaning in WOULD_MEASURE.items():
         if name.startswith(key) or name.endswith(key):
-            return what
+            return meaning
     return "runs under conditions in which it has an effect"
 
 
@@ -117,9 +117,9 @@ def _runs(names: Names, one: str, several: str) -> str:
 
 def inherited_priors(part: str, changed: tuple[tuple[str, float, float], ...], kept: Names) -> str:
     """A part that is not the nominal robot's while friction of it is."""
-    each = ", ".join(f"{name} {mine:g} instead of {nominal:g}" for name, mine, nominal in changed)
+    changes = ", ".join(f"{name} {own_value:g} instead of {nominal:g}" for name, own_value, nominal in changed)
     return (
-        f"{part} differs from that of the nominal robot ({each}), but the prior of its {', '.join(kept)} is still "
+        f"{part} differs from that of the nominal robot ({changes}), but the prior of its {', '.join(kept)} is still "
         "the nominal robot's; set your values in the robot's file or with --prior"
     )
 
@@ -127,11 +127,11 @@ def inherited_priors(part: str, changed: tuple[tuple[str, float, float], ...], k
 def off_by(column: str, unit: str, factor: float, units: Names, others: Names, imposed: str) -> str:
     """Readings that no robot like this one shows."""
     off, size = (factor, "large") if factor > 1 else (1 / factor, "small")
-    what = f"{column}: readings are about {float(f'{off:.2g}'):g} times too {size} for this robot"
+    subject = f"{column}: readings are about {float(f'{off:.2g}'):g} times too {size} for this robot"
     alike = f"; the same factor in {' and '.join(others)}: check {imposed} and the robot's file" if others else ""
     if units:
-        return f"{what}; are they in {' or '.join(units)}? expected {unit}{alike}"
-    return f"{what}{alike}" if others else f"{what}; check the unit, {unit}, and the robot's file"
+        return f"{subject}; are they in {' or '.join(units)}? expected {unit}{alike}"
+    return f"{subject}{alike}" if others else f"{subject}; check the unit, {unit}, and the robot's file"
 
 
 #: Code of a remark → a sentence with its values, or a function that makes one.

@@ -146,14 +146,16 @@ def climb_derivatives(
     """
     directions = jnp.eye(len(values))
     parts, samples, steps = climb.divide_run(duration, step, sample, part)
-    interval, each = jnp.asarray(step, float), jnp.asarray(steps)
-    run, turned = _value_and_derivatives_along(given, values, directions)
-    state, moved = _value_and_derivatives_along(functools.partial(_initial_state, step=interval), run, turned)
+    interval, step_numbers = jnp.asarray(step, float), jnp.asarray(steps)
+    run, rotated_run = _value_and_derivatives_along(given, values, directions)
+    state, state_change = _value_and_derivatives_along(
+        functools.partial(_initial_state, step=interval), run, rotated_run
+    )
     records: list[Any] = []
     for k in range(parts):
         first = jnp.asarray(k * samples * steps * step)
-        (state, record), (moved, changed) = _advance_part(
-            (run, state), (turned, moved), first, interval, each, samples
+        (state, record), (state_change, changed) = _advance_part(
+            (run, state), (rotated_run, state_change), first, interval, step_numbers, samples
         )
         records.append(jax.device_get((record, changed)))
         if progress is not None:
@@ -162,16 +164,16 @@ def climb_derivatives(
             break
     record = jax.tree.map(lambda *x: jnp.concatenate(x), *[r for r, _ in records])
     changed = jax.tree.map(lambda *x: jnp.concatenate(x, axis=1), *[c for _, c in records])
-    verdict, ended = int(state[2].verdict), state[2].ended
-    last = UNFINISHED if verdict < 0 else verdict, ended, state[2].furthest
-    whole = ClimbRuns(*jax.tree.map(lambda x: np.asarray(x)[None], (*last, record)))
-    ran = jax.tree.map(jnp.asarray, whole.run(0))
+    verdict, has_ended = int(state[2].verdict), state[2].ended
+    last = UNFINISHED if verdict < 0 else verdict, has_ended, state[2].furthest
+    all_runs = ClimbRuns(*jax.tree.map(lambda x: np.asarray(x)[None], (*last, record)))
+    ran = jax.tree.map(jnp.asarray, all_runs.run(0))
     count = len(ran.time)
     top = crest_sample(run.terrain, ran, verdict == OVER)
-    gradients, by = _value_and_derivatives_along(
+    gradients, derivatives_by = _value_and_derivatives_along(
         lambda run_of: climb_outputs(run_of[0].robot, run_of[0].terrain, run_of[1], top),
         (run, ran),
-        (turned, jax.tree.map(lambda x: x[:, :count], changed)),
+        (rotated_run, jax.tree.map(lambda x: x[:, :count], changed)),
     )
     offsets = np.linspace(-1, 1, BESIDE)
     beside = jnp.concatenate([values + np.outer(offsets, unit * widths) for unit in directions])
@@ -187,11 +189,15 @@ def climb_derivatives(
         y = np.array([float(other[name]) for other in others]).reshape(-1, BESIDE)
         square, off = np.sum(offsets**2), y - y.mean(axis=1, keepdims=True)
         rise = off @ offsets / square
-        left = off - np.outer(rise, offsets)
+        unexplained_rise = off - np.outer(rise, offsets)
         slope[name] = rise / np.asarray(widths)
-        sd[name] = np.sqrt(np.sum(left**2, axis=1) / (BESIDE - 2) / square) / np.asarray(widths)
+        sd[name] = np.sqrt(np.sum(unexplained_rise**2, axis=1) / (BESIDE - 2) / square) / np.asarray(widths)
     return ClimbDerivatives(
-        whole, {n: float(x) for n, x in gradients.items()}, {n: np.asarray(x) for n, x in by.items()}, slope, sd
+        all_runs,
+        {n: float(x) for n, x in gradients.items()},
+        {n: np.asarray(x) for n, x in derivatives_by.items()},
+        slope,
+        sd,
     )
 
 

@@ -272,8 +272,8 @@ def mass_matrix_and_bias(
         height = height + mass * down @ (body.origin + place)
     turning = [(half.inertia, {PITCH: 1.0}), (2 * half.inertia_pulley, {PITCH: 1.0, SHAFT: 1.0})]
     turning += [(run.lever[2], {PITCH: 1.0, k: -1.0}) for k in (FRONT, REAR)]
-    for about, by in turning:
-        row = jnp.zeros(COORDINATES).at[np.array(list(by))].set(jnp.array(list(by.values())))
+    for about, shares in turning:
+        row = jnp.zeros(COORDINATES).at[np.array(list(shares))].set(jnp.array(list(shares.values())))
         matrix = matrix + about * jnp.outer(row, row)
     return matrix, bias, height
 
@@ -411,9 +411,9 @@ def advance_climb(
     force = pulled.force @ touching.along + touching.force @ touching.off - resisted
     force = force.at[SHAFT].set(signals.torque_net - resisted[SHAFT])
     belts = motion.v[SHAFT] + motion.v[LED]
-    lost, stiffens = jax.jvp(lambda speed: _lever_loss(run, speed), (belts,), (jnp.ones_like(belts),))
+    lever_loss, stiffens = jax.jvp(lambda speed: _lever_loss(run, speed), (belts,), (jnp.ones_like(belts),))
     stiffens = jnp.maximum(stiffens, 0.0)
-    force = force.at[LED].add(-lost)
+    force = force.at[LED].add(-lever_loss)
 
     rises = jnp.maximum(
         run.chassis.ground.traction_rise(_sliding(touching, motion.v, signals), touching.force, signals.adhesion), 0
@@ -421,21 +421,23 @@ def advance_climb(
     shaft = _shaft_loss(run, motion, signals, touching)
     damping = contact_damping(touching.along, touching.off, pulled.force, touching.force, rises, touching.damped)
     damping = damping.at[SHAFT, SHAFT].add(shaft) + (_ON_BELTS.T * stiffens) @ _ON_BELTS
-    whole = matrix.at[SHAFT, SHAFT].add(armature) + step * damping
+    full_matrix = matrix.at[SHAFT, SHAFT].add(armature) + step * damping
     # of wheels, with massless levers
-    whole = whole.at[LED, LED].add(1 - run.chassis.on_tracks)
+    full_matrix = full_matrix.at[LED, LED].add(1 - run.chassis.on_tracks)
     pushed = step * (force - bias)
-    factors = factorise(whole[:4, :4])
-    moved, *coupled = (solve_factorised(factors, x) for x in (pushed[:4], whole[:4, 4], whole[:4, 5]))
-    coupling = jnp.stack(coupled, axis=1)
-    left = whole[4:, 4:] - whole[4:, :4] @ coupling
-    inverse = jnp.array([[left[1, 1], -left[0, 1]], [-left[1, 0], left[0, 0]]]) / (
-        left[0, 0] * left[1, 1] - left[0, 1] * left[1, 0]
+    factors = factorise(full_matrix[:4, :4])
+    acceleration, *coupled = (
+        solve_factorised(factors, x) for x in (pushed[:4], full_matrix[:4, 4], full_matrix[:4, 5])
     )
-    alone = motion.v[LED] + inverse @ (pushed[4:] - whole[4:, :4] @ moved)
+    coupling = jnp.stack(coupled, axis=1)
+    coupled_matrix = full_matrix[4:, 4:] - full_matrix[4:, :4] @ coupling
+    inverse = jnp.array(
+        [[coupled_matrix[1, 1], -coupled_matrix[0, 1]], [-coupled_matrix[1, 0], coupled_matrix[0, 0]]]
+    ) / (coupled_matrix[0, 0] * coupled_matrix[1, 1] - coupled_matrix[0, 1] * coupled_matrix[1, 0])
+    alone = motion.v[LED] + inverse @ (pushed[4:] - full_matrix[4:, :4] @ acceleration)
     swung = _drive_action(run, motion, time, signals.voltage_source, alone, step * inverse / robot.sides)
     led = swung.rate - motion.v[LED]
-    gained = jnp.concatenate([moved - coupling @ led, led])
+    gained = jnp.concatenate([acceleration - coupling @ led, led])
     v = motion.v + gained
     middle = motion.v + gained / 2
 
@@ -463,7 +465,7 @@ def advance_climb(
         signals.torque_motor_loss * motor,
         (signals.torque_idle + (1 - signals.efficiency_load) * mesh) * motor + imbalance * middle[SHAFT],
         (signals.torque_track_loss + shaft * gained[SHAFT]) * middle[SHAFT]
-        + (lost + stiffens * (_ON_BELTS @ gained)) @ (_ON_BELTS @ middle),
+        + (lever_loss + stiffens * (_ON_BELTS @ gained)) @ (_ON_BELTS @ middle),
         -friction @ (touching.along @ middle),
         -(normal - touching.elastic) @ (touching.off @ middle),
         resisted @ middle,
@@ -475,7 +477,7 @@ def advance_climb(
     stored = kinetic / 2 + signals.inductance * motion.current**2 / 2 + height + jnp.sum(touching.energy)
     up = jnp.array([1.0, -1.0])  # for a rear lever, upward is decreasing ψ
     total = jnp.sum(touching.force)
-    held = run.chassis.ground.force_adhesion(jnp.sum(touching.force * touching.rolls), signals.adhesion)
+    adhesion_force = run.chassis.ground.force_adhesion(jnp.sum(touching.force * touching.rolls), signals.adhesion)
     centre = motion.q[0] - matrix[1, PITCH] / matrix[0, 0]
     passed = ClimbRecord(
         time=time,
@@ -491,7 +493,7 @@ def advance_climb(
         stored=robot.sides * stored + pair.inertia * motion.v[LED] @ motion.v[LED] / 2,
         normal=total,
         body=jnp.sum(touching.force * (1 - touching.rolls)) / jnp.maximum(total, 1e-9),
-        grip=jnp.sum(jnp.abs(pulled.force) * touching.rolls) / jnp.maximum(held, 1e-9),
+        grip=jnp.sum(jnp.abs(pulled.force) * touching.rolls) / jnp.maximum(adhesion_force, 1e-9),
         carried=total / (GRAVITY * matrix[0, 0]),
         centre=centre,
         base=_distances_to_outermost_contacts(centre, touching),
@@ -565,13 +567,13 @@ def _update_verdict(
     rear = q[0] - run.shape.half * jnp.cos(q[PITCH])
     gained = q[0] > progress.furthest + GAIN
     swings = jnp.max(jnp.abs(v[LED])) > 0.05
-    moved = gained | swings | (passed.time < SETTLES)
+    has_progressed = gained | swings | (passed.time < SETTLES)
     progress = VerdictState(
         progress.verdict,
         jnp.where(progress.verdict == _RUNNING, passed.time, progress.ended),
         jnp.where(gained, q[0], progress.furthest),
-        jnp.where(moved, passed.time, progress.since),
-        jnp.where(moved, q[SHAFT], progress.belt),
+        jnp.where(has_progressed, passed.time, progress.since),
+        jnp.where(has_progressed, q[SHAFT], progress.belt),
     )
     waits = passed.time - progress.since
     stuck = waits > PATIENCE
@@ -582,9 +584,9 @@ def _update_verdict(
     verdict = jnp.where(rear > run.terrain.finish + outer, OVER, verdict)
     verdict = jnp.where(jnp.abs(q[PITCH]) > TURNED_OVER, TIPS, verdict)
     verdict = jnp.where(finite, verdict, FAILED)
-    ended = progress.verdict != _RUNNING
-    verdict = jnp.where(ended, progress.verdict, verdict)
-    motion = jax.tree.map(lambda new, old: jnp.where(finite & ~ended, new, old), motion, before)
+    has_ended = progress.verdict != _RUNNING
+    verdict = jnp.where(has_ended, progress.verdict, verdict)
+    motion = jax.tree.map(lambda new, old: jnp.where(finite & ~has_ended, new, old), motion, before)
     return motion, dataclasses.replace(progress, verdict=verdict)
 
 
@@ -625,10 +627,10 @@ def advance_samples(
         nothing = jax.eval_shape(lambda: advance_climb(run, motion, first, energy)[2])
         nothing = jax.tree.map(lambda x: jnp.full(x.shape, -jnp.inf, x.dtype), nothing)
         after, spent, passed = jax.lax.fori_loop(0, steps, small, (motion, energy, nothing))
-        ended = progress.verdict != _RUNNING
+        has_ended = progress.verdict != _RUNNING
         after, progress = _update_verdict(run, motion, passed, after, progress)
-        kept = jax.tree.map(lambda new, old: jnp.where(ended, old, new), spent, energy)
-        return (after, kept, progress), passed
+        energy_recorded = jax.tree.map(lambda new, old: jnp.where(has_ended, old, new), spent, energy)
+        return (after, energy_recorded, progress), passed
 
     return jax.lax.scan(sample, state, jnp.arange(samples))
 
@@ -698,8 +700,8 @@ def _part(
             build_climb_system(robot, conditions, terrain, sequence, step), state, first, steps, samples
         )
 
-    each = (_robot_axis(robot), 0, 0, 0, 0)
-    parts: tuple[Any, ClimbRecord] = jax.vmap(one, in_axes=each)(robot, conditions, terrain, sequence, state)
+    in_axes = (_robot_axis(robot), 0, 0, 0, 0)
+    parts: tuple[Any, ClimbRecord] = jax.vmap(one, in_axes=in_axes)(robot, conditions, terrain, sequence, state)
     return parts
 
 
@@ -733,19 +735,22 @@ def climb_batch(
         progress: callback with the finished share of the time.
     """
     parts, samples, steps = divide_run(duration, step, sample, part)
-    interval, each = jnp.asarray(step, float), jnp.asarray(steps)  # arrays: one program for all lengths of a step
+    interval, step_numbers = (
+        jnp.asarray(step, float),
+        jnp.asarray(steps),
+    )  # arrays: one program for all lengths of a step
     state = _begin(robot, conditions, terrain, sequence, interval, start)
-    kept: list[ClimbRecord] = []
+    records: list[ClimbRecord] = []
     for k in range(parts):
         first = jnp.asarray(k * samples * steps * step)
-        state, passed = _compiled(robot, conditions, terrain, sequence, state, first, interval, each, samples)
+        state, passed = _compiled(robot, conditions, terrain, sequence, state, first, interval, step_numbers, samples)
         verdict = np.asarray(state[2].verdict)
         last = passed if record else jax.tree.map(lambda x: x[:, -1:], passed)
-        kept = [*(kept if record else []), jax.device_get(last)]
+        records = [*(records if record else []), jax.device_get(last)]
         if progress is not None:
             progress((k + 1) / parts)
         if np.all(verdict != _RUNNING):
             break
     verdict = np.where(verdict == _RUNNING, UNFINISHED, verdict)
-    joined = jax.tree.map(lambda *x: np.concatenate(x, axis=1), *kept)
+    joined = jax.tree.map(lambda *x: np.concatenate(x, axis=1), *records)
     return ClimbRuns(verdict, np.asarray(state[2].ended), np.asarray(state[2].furthest), joined)

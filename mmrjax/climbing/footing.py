@@ -206,8 +206,8 @@ FAR_OFF = 1e3
 def _body_contacts(shape: ContactShape, terrain: Terrain, body: PartFrame) -> _ContactGroup:
     """Contacts of corners of the ground with the body."""
     local = body.within(terrain.corners)
-    over = jnp.abs(local[:, 0]) < shape.half
-    gap = jnp.where(over & (local[:, 1] < 0), shape.belly - local[:, 1], FAR_OFF) - terrain.nose
+    is_over = jnp.abs(local[:, 0]) < shape.half
+    gap = jnp.where(is_over & (local[:, 1] < 0), shape.belly - local[:, 1], FAR_OFF) - terrain.nose
     up = body.along(jnp.broadcast_to(jnp.array([0.0, 1.0]), local.shape))
     none = jnp.zeros_like(gap)
     return _ContactGroup(terrain.corners + terrain.nose * up, gap, up, 0 * up, None, none, none + 1, 0.0)
@@ -237,9 +237,9 @@ def contacts_with_terrain(shape: ContactShape, terrain: Terrain, q: Array, v: Ar
         levers, with_belt = [], []
         for lever in (front, rear):
             on = np.concatenate([np.full(len(g.gap), g.turns == lever.turns) for g in groups])
-            turned = jnp.where(on, -_speed_about_axle(direction, points - lever.origin), 0.0)
-            levers.append(turned)
-            with_belt.append(turned + jnp.where(on, belt, 0.0))
+            turning_speed = jnp.where(on, -_speed_about_axle(direction, points - lever.origin), 0.0)
+            levers.append(turning_speed)
+            with_belt.append(turning_speed + jnp.where(on, belt, 0.0))
         carried.append(jnp.stack([*columns, 0 * belt, *levers], axis=1))
         own_loads.append(jnp.stack([*columns, belt, *with_belt], axis=1))
     off, gear = own_loads[0], shape.gear

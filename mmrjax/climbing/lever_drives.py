@@ -127,8 +127,8 @@ def step_levers(
     """
     limits = drive.constant * rate + drive.resistance * drive.current_limit * jnp.array([[-1.0], [1.0]])
     least, most = jnp.maximum(least, limits[0]), jnp.minimum(most, limits[1])
-    kept = drive.inertia * (1 / step)
-    stiff = kept + drive.constant**2 / drive.resistance + drive.viscous
+    inertia_rate = drive.inertia * (1 / step)
+    stiff = inertia_rate + drive.constant**2 / drive.resistance + drive.viscous
 
     end, way, sign = _PIECES.T
     moves, follows = way != 0, end == 0
@@ -136,7 +136,7 @@ def step_levers(
     # α T + β ω = γ on a piece, (pairs, pieces)
     alpha = jnp.where(moves, jnp.where(sign * way > 0, drive.ahead, drive.back), 0.0) + 0 * pushed
     beta = jnp.where(moves, stiff, 1.0) + 0 * pushed
-    gamma = jnp.where(moves, pushed + kept * rate[:, None] - way * drive.dry, follows * asked[:, None])
+    gamma = jnp.where(moves, pushed + inertia_rate * rate[:, None] - way * drive.dry, follows * asked[:, None])
 
     (a, b), (c, d) = beta[:, None] * yields[:, :, None]
     a, d = (a + alpha[0])[:, None], (d + alpha[1])[None]
@@ -145,13 +145,13 @@ def step_levers(
     r, s = r[:, None], s[None]
     size = a * d - b * c
     torque = jnp.stack([(d * r - b * s) / size, (a * s - c * r) / size])
-    turned = free[:, None, None] + jnp.einsum("ij,jkl->ikl", yields, torque)
+    lever_rates = free[:, None, None] + jnp.einsum("ij,jkl->ikl", yields, torque)
 
     def candidate_solutions(k: int, ways: tuple[slice | None, ...]) -> tuple[Array, Array, Array, Array]:
         """Distance of each candidate solution from its piece of the law of lever pair `k` (0: on it) [N·m]. Then i
         C_m I of the motor within the voltage limits [N·m], load torque [N·m] and speed [rad/s]."""
-        force, speed = torque[k], turned[k]
-        turning = kept * (speed - rate[k]) + drive.viscous * speed
+        force, speed = torque[k], lever_rates[k]
+        turning = inertia_rate * (speed - rate[k]) + drive.viscous * speed
         up, down = drive.against(force, 1.0) + drive.dry + turning, drive.against(force, -1.0) - drive.dry + turning
         low, high = jnp.where(asked[k] > 0, up, down), jnp.where(asked[k] < 0, down, up)
         weak, strong = (drive.constant / drive.resistance * (x[k] - drive.constant * speed) for x in (least, most))
@@ -166,16 +166,18 @@ def step_levers(
         )
         return jnp.maximum(off, 0.0), jnp.clip(jnp.clip(0.0, low, high), weak, strong), force, speed
 
-    both = candidate_solutions(0, (slice(None), None)), candidate_solutions(1, (None, slice(None)))
-    off = jnp.nan_to_num(jnp.maximum(both[0][0], both[1][0]), nan=jnp.inf, posinf=jnp.inf)
+    candidates = candidate_solutions(0, (slice(None), None)), candidate_solutions(1, (None, slice(None)))
+    off = jnp.nan_to_num(jnp.maximum(candidates[0][0], candidates[1][0]), nan=jnp.inf, posinf=jnp.inf)
     best = jnp.unravel_index(jnp.argmin(off), off.shape)
-    chosen, taken = jnp.stack(best), jnp.stack([pair[1][best] for pair in both])
-    torque, after = torque[:, *best], turned[:, *best]
-    fixed = jnp.where(jnp.asarray(end)[chosen] > 0, most, least)
-    stands = jnp.where(jnp.asarray(follows)[chosen], asked == 0, ~jnp.asarray(moves)[chosen])
+    best_pair, motor_torques = jnp.stack(best), jnp.stack([pair[1][best] for pair in candidates])
+    torque, after = torque[:, *best], lever_rates[:, *best]
+    fixed = jnp.where(jnp.asarray(end)[best_pair] > 0, most, least)
+    stands = jnp.where(jnp.asarray(follows)[best_pair], asked == 0, ~jnp.asarray(moves)[best_pair])
     after = jnp.where(stands, 0.0, after)
     voltage = jnp.where(
-        jnp.asarray(follows)[chosen], drive.resistance / drive.constant * taken + drive.constant * after, fixed
+        jnp.asarray(follows)[best_pair],
+        drive.resistance / drive.constant * motor_torques + drive.constant * after,
+        fixed,
     )
     current = (voltage - drive.constant * after) / drive.resistance
     return LeverStep(torque, after, voltage, current, stands & (jnp.abs(current) < _NONE))

@@ -87,8 +87,8 @@ def posture_masses(robot: Robot, conditions: Conditions, mass: Scalar | None = N
         mass: total mass with payload [kg]. None: as stated.
     """
     if mass is None:
-        stated = robot.chassis(conditions.configuration).mass + conditions.payload
-        mass = stated if conditions.total_mass is None else conditions.total_mass
+        total_mass = robot.chassis(conditions.configuration).mass + conditions.payload
+        mass = total_mass if conditions.total_mass is None else conditions.total_mass
     return masses.masses_of_parts(robot, conditions, mass)
 
 
@@ -185,10 +185,10 @@ def rest_on_slope(side: SideOutline, slope: Scalar, inertia: Scalar) -> Posture:
     pitch = jnp.arctan2(jnp.sin(pitch), jnp.cos(pitch))
     rotated = side.with_pitch(pitch)
     low = rotated.up - rotated.radius  # (edges, circles)
-    every = np.arange(len(EDGES))
-    gaps = low - low[every, tail][:, None]
-    rear, front = rotated.forward[every, tail], rotated.forward[every, nose]
-    high = jnp.asarray(rotated.centre_up) - low[every, tail]
+    edge_numbers = np.arange(len(EDGES))
+    gaps = low - low[edge_numbers, tail][:, None]
+    rear, front = rotated.forward[edge_numbers, tail], rotated.forward[edge_numbers, nose]
+    high = jnp.asarray(rotated.centre_up) - low[edge_numbers, tail]
     centre = jnp.asarray(rotated.centre_forward)
     foot = centre - high * jnp.tan(slope)
     margin = jnp.minimum(foot - rear, front - foot)

@@ -140,9 +140,11 @@ def find_highest_step(side: SideOutline, pitch: Scalar | None = None) -> StepLim
         beside
     )
     share = jnp.clip(-rises[1] / jnp.maximum(rises[0] - rises[1], 1e-12), 0.0, 1.0)
-    moved = jnp.asarray(jax.vmap(lambda pitch: step_height_at(side, pitch) - step_height_at(still, pitch))(beside))
+    height_change = jnp.asarray(
+        jax.vmap(lambda pitch: step_height_at(side, pitch) - step_height_at(still, pitch))(beside)
+    )
     pitched = side.with_pitch(best)
-    height = step_height_at(still, best) + share * moved[0] + (1 - share) * moved[1]
+    height = step_height_at(still, best) + share * height_change[0] + (1 - share) * height_change[1]
     return StepLimit(height, best, pitched, -lowest_points(pitched)[0])
 
 
@@ -170,8 +172,8 @@ def best_levers(robot: Robot, conditions: Conditions, pitch: Scalar) -> tuple[Sc
     a position further ahead. Both angles are limited to the levers' range.
     """
     gear, half = robot.running_gear, resting_posture.posture_masses(robot, conditions)
-    moved = gear.lever_mass * gear.lever_centre / (half.chassis + 2 * half.pulley)
-    rear = pitch - jnp.pi / 2 - jnp.arctan2(moved * jnp.sin(pitch), gear.lever_length * jnp.cos(pitch))
+    lever_moment_share = gear.lever_mass * gear.lever_centre / (half.chassis + 2 * half.pulley)
+    rear = pitch - jnp.pi / 2 - jnp.arctan2(lever_moment_share * jnp.sin(pitch), gear.lever_length * jnp.cos(pitch))
     least, most = gear.levers.angle_least, gear.levers.angle_most
     return jnp.clip(-pitch, least, most), jnp.clip(rear, least, most)
 
@@ -251,9 +253,11 @@ def posture_limits(robot: Robot, conditions: Conditions) -> StaticLimits:
 @jax.jit
 def _over_levers(robot: Robot, conditions: Conditions, angles: Float[Array, "n 2"]) -> tuple[StepLimit, Array]:
     def at(pair: Array) -> tuple[StepLimit, Array]:
-        here = dataclasses.replace(conditions, levers_front_deg=pair[0], levers_rear_deg=pair[1])
-        side = resting_posture.side_outline(robot, here)
-        return find_highest_step(side), jnp.asarray(resting_posture.rest_on_slope(side, here.slope, 0.0).margin)
+        conditions_there = dataclasses.replace(conditions, levers_front_deg=pair[0], levers_rear_deg=pair[1])
+        side = resting_posture.side_outline(robot, conditions_there)
+        return find_highest_step(side), jnp.asarray(
+            resting_posture.rest_on_slope(side, conditions_there.slope, 0.0).margin
+        )
 
     return jax.lax.map(at, angles, batch_size=256)
 

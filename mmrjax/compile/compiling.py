@@ -50,13 +50,13 @@ def compiled(function: Callable[P, T], *, options: dict[str, Any] | None = None)
     Args:
         options: options of XLA for programs that are stored: `SMALL`, `SELDOM` or None for the defaults.
     """
-    inner, kept, traced = eqx.filter_jit(function), Programs(function, options), set[Hashable]()
+    inner, programs, traced = eqx.filter_jit(function), Programs(function, options), set[Hashable]()
 
     @functools.wraps(function)
     def call(*args: P.args, **named: P.kwargs) -> T:
         arguments = for_equations((args, named))
         structure = structure_of(arguments)
-        program = kept.of_structure(structure, arguments)
+        program = programs.of_structure(structure, arguments)
         if program is not None:
             return program(arguments)
         if structure is not None and structure in traced:

@@ -63,9 +63,9 @@ def in_double(function: Callable[P, T]) -> Callable[P, T]:
         if is_double() or in_trace(args, named):
             return function(*args, **named)
         with jax.enable_x64(True):
-            given: Any = [_in_double_precision(x) for x in args]
+            double_args: Any = [_in_double_precision(x) for x in args]
             by_name: Any = {name: _in_double_precision(x) for name, x in named.items()}
-            return on_host(function(*given, **by_name))
+            return on_host(function(*double_args, **by_name))
 
     return call
 

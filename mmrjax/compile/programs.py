@@ -190,9 +190,9 @@ class Programs:
         returned: list[Any] = []
 
         def flat(*arrays: Any) -> list[Any]:
-            given = iter(arrays)
-            args, named = tree.unflatten([next(given) if eqx.is_array(x) else x for x in leaves])
-            out, shape = jax.tree.flatten(self.function(*args, **named))
+            array_iterator = iter(arrays)
+            args, keywords = tree.unflatten([next(array_iterator) if eqx.is_array(x) else x for x in leaves])
+            out, shape = jax.tree.flatten(self.function(*args, **keywords))
             returned.append(jax.tree.unflatten(shape, [_ArrayPlaceholder() if eqx.is_array(x) else x for x in out]))
             return _arrays(out)
 
@@ -282,19 +282,19 @@ def _program_name(function: Callable[..., Any], arguments: Any) -> str:
     Raises:
         Unnamed: an object belongs to an unknown package.
     """
-    named = function.__module__, function.__qualname__
-    if named[0].partition(".")[0] not in OWN or "<" in named[1]:
+    qualified_name = function.__module__, function.__qualname__
+    if qualified_name[0].partition(".")[0] not in OWN or "<" in qualified_name[1]:
         raise Unnamed
     file = io.BytesIO()
-    _ArgumentPickler(file).dump((named, _compile_settings(), arguments))
+    _ArgumentPickler(file).dump((qualified_name, _compile_settings(), arguments))
     return hashlib.sha256(source_hash().encode() + file.getvalue()).hexdigest()
 
 
 def _compile_settings() -> tuple[tuple[str, str], ...]:
     """JAX's settings and environment variables that change compilation."""
-    chosen = {k: str(v) for k, v in jax.config.values.items() if not k.startswith(_ASIDE)}
-    chosen |= {k: v for k, v in os.environ.items() if k.startswith(_HEEDED)}
-    return tuple(sorted(chosen.items()))
+    settings = {k: str(v) for k, v in jax.config.values.items() if not k.startswith(_ASIDE)}
+    settings |= {k: v for k, v in os.environ.items() if k.startswith(_HEEDED)}
+    return tuple(sorted(settings.items()))
 
 
 @functools.cache
@@ -337,10 +337,10 @@ def _load_lapack() -> None:
 @contextlib.contextmanager
 def _read_from_cache() -> Iterator[list[str]]:
     """Yields a list that is filled if JAX reads a program from its own cache in this thread meanwhile."""
-    mine, read = threading.get_ident(), list[str]()
+    thread_id, read = threading.get_ident(), list[str]()
 
     def listen(event: str, **_: Any) -> None:
-        if event.endswith("/cache_hits") and threading.get_ident() == mine:
+        if event.endswith("/cache_hits") and threading.get_ident() == thread_id:
             read.append(event)
 
     jax.monitoring.register_event_listener(listen)

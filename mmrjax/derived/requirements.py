@@ -143,8 +143,8 @@ def travel_quantities(robot: Robot, point: EnvelopePoint, rated: Ratings) -> tup
     Further entries are the `current` of one motor and of the `battery` [A] and three margins: `left` of traction and
     speed, `adhesion` alone [-], and `cell`, above the cut-off voltage [V].
     """
-    here, conditions = _robot_and_conditions_at(robot, point, rated)
-    signals, status, _ = operating_state(here, conditions)
+    robot_there, conditions = _robot_and_conditions_at(robot, point, rated)
+    signals, status, _ = operating_state(robot_there, conditions)
     outcome = jnp.where((status == CONVERGED) & (_cell_margin(rated, signals, point) < 0), CUT_OFF, status)
     warm = dataclasses.replace(robot.motor, temperature_ambient=point.ambient)  # its resistance as stated
     moving = jnp.where(jnp.abs(signals.speed) > 1e-6, signals.speed, 1e-6)
@@ -157,11 +157,11 @@ def travel_quantities(robot: Robot, point: EnvelopePoint, rated: Ratings) -> tup
         "gearbox_speed_rpm": turns,
         "motor_speed_rpm": turns,
         "current_A": signals.total_current,
-        "energy_per_metre_Wh": energy.source_power(here, conditions, signals) / moving,
+        "energy_per_metre_Wh": energy.source_power(robot_there, conditions, signals) / moving,
         "current": signals.current,
-        "battery": here.battery.current(signals.total_current),
+        "battery": robot_there.battery.current(signals.total_current),
         "adhesion": 1 - signals.demand / signals.adhesion_limit,
-        "left": steepest_slope.travel_margin(here, signals),
+        "left": steepest_slope.travel_margin(robot_there, signals),
         "cell": _cell_margin(rated, signals, point),
     }
     return {name: jnp.asarray(x) for name, x in quantities.items()}, outcome
@@ -173,10 +173,10 @@ def _travel_quantity(robot: Robot, point: EnvelopePoint, rated: Ratings, name: s
 
 
 def _steepest_slope(robot: Robot, point: EnvelopePoint, rated: Ratings, name: str) -> QuantityValue:
-    here, conditions = _robot_and_conditions_at(robot, point, rated)
-    answer = steepest_slope.compute(here, conditions)
-    held = jnp.isfinite(answer["steepest_slope"])
-    return QuantityValue(jnp.where(held, answer["steepest_slope"], 0.0), answer["status"])
+    robot_there, conditions = _robot_and_conditions_at(robot, point, rated)
+    answer = steepest_slope.compute(robot_there, conditions)
+    is_reachable = jnp.isfinite(answer["steepest_slope"])
+    return QuantityValue(jnp.where(is_reachable, answer["steepest_slope"], 0.0), answer["status"])
 
 
 #: Halvings of a bracket; a Newton step removes the remaining error.
@@ -193,16 +193,23 @@ def _largest_payload(robot: Robot, point: EnvelopePoint, rated: Ratings, name: s
 
     def left(robot: Robot, payload: Scalar) -> Scalar:
         loaded_point = dataclasses.replace(point, payload=payload)
-        here, conditions = _robot_and_conditions_at(robot, loaded_point, rated)
-        signals, _, _ = operating_state(here, conditions)
+        robot_there, conditions = _robot_and_conditions_at(robot, loaded_point, rated)
+        signals, _, _ = operating_state(robot_there, conditions)
         hot = thermal_margin(robot, loaded_point, signals.current, rated.temperature)
         torque = 1 - jnp.abs(signals.torque_gear) / rated.torque
-        each = [steepest_slope.travel_margin(here, signals), hot, torque, _cell_margin(rated, signals, point)]
-        return functools.reduce(jnp.minimum, each)
+        margins = [
+            steepest_slope.travel_margin(robot_there, signals),
+            hot,
+            torque,
+            _cell_margin(rated, signals, point),
+        ]
+        return functools.reduce(jnp.minimum, margins)
 
     found, holds = _find_sign_change(left, robot, jnp.zeros(()), jnp.asarray(most))
-    here, conditions = _robot_and_conditions_at(robot, dataclasses.replace(point, payload=jnp.zeros(())), rated)
-    signals, status, _ = operating_state(here, conditions)
+    unladen_robot, conditions = _robot_and_conditions_at(
+        robot, dataclasses.replace(point, payload=jnp.zeros(())), rated
+    )
+    signals, status, _ = operating_state(unladen_robot, conditions)
     outcome = jnp.where((status == CONVERGED) & (_cell_margin(rated, signals, point) < 0), CUT_OFF, status)
     return QuantityValue(jnp.where(holds, found, 0.0), outcome)
 
@@ -246,13 +253,13 @@ def _endurance(robot: Robot, point: EnvelopePoint, rated: Ratings, name: str) ->
 
     def drawn(robot: Robot, discharge: Scalar) -> tuple[Scalar, Scalar, Array]:
         """Mean battery current [A], margin above the cut-off [V], status."""
-        here, conditions = _robot_and_conditions_at(robot, point, rated)
+        robot_there, conditions = _robot_and_conditions_at(robot, point, rated)
         conditions = dataclasses.replace(conditions, discharge=jnp.asarray(discharge))
-        signals, status, _ = operating_state(here, conditions)
+        signals, status, _ = operating_state(robot_there, conditions)
         stands = point.share <= 0
         motors = jnp.where(stands, 0.0, signals.total_current)
-        cell = here.battery.voltage(motors, discharge) / rated.cells - rated.voltage_cutoff
-        current = here.battery.current(point.share * motors)
+        cell = robot_there.battery.voltage(motors, discharge) / rated.cells - rated.voltage_cutoff
+        current = robot_there.battery.current(point.share * motors)
         return current, cell, jnp.where(stands, CONVERGED, status)
 
     end, begins = _find_sign_change(lambda robot, c: drawn(robot, c)[1], robot, first, last)
@@ -277,12 +284,12 @@ DUTY_LEFT = {"turn_in_place_rad_s": -1.0, "turning_radius_mm": 0.0}
 
 def _settled_turn(robot: Robot, point: EnvelopePoint, rated: Ratings, name: str) -> QuantityValue:
     """A settled turn on level ground at full voltage: on the spot with opposite sides, or around a braked side."""
-    here, conditions = _robot_and_conditions_at(robot, point, rated)
+    robot_there, conditions = _robot_and_conditions_at(robot, point, rated)
     conditions = dataclasses.replace(
         conditions, slope_deg=jnp.zeros(()), adhesion_lateral=jnp.asarray(point.adhesion_lateral),
         duty_left=jnp.asarray(DUTY_LEFT[name]), duty_right=jnp.asarray(1.0),
     )  # fmt: skip
-    signals, motion, status = circling_signals(here, conditions)
+    signals, motion, status = circling_signals(robot_there, conditions)
     low = jnp.any(jnp.asarray(_cell_margin(rated, signals.signals, point)) < 0)
     turns = jnp.where(jnp.abs(motion.yaw_rate) > 1e-6, motion.yaw_rate, 1e-6)
     rolls = motion.speed**2 + motion.speed_lateral**2
@@ -297,14 +304,14 @@ def _side_slope(robot: Robot, point: EnvelopePoint, rated: Ratings, name: str) -
     Rolling resistance takes a share f/φ_x of the friction ellipse: tan α = φ_y √(1 - (f/φ_x)²). It tips at
     tan α = B / (2 h). For a rigid robot whose load does not shift.
     """
-    here, conditions = _robot_and_conditions_at(robot, point, rated)
+    robot_there, conditions = _robot_and_conditions_at(robot, point, rated)
     conditions = dataclasses.replace(conditions, adhesion_lateral=jnp.asarray(point.adhesion_lateral))
-    chassis = here.chassis(conditions.configuration)
-    stands = balances.stance(here, conditions, chassis, chassis.mass + point.payload)
+    chassis = robot_there.chassis(conditions.configuration)
+    stands = balances.stance(robot_there, conditions, chassis, chassis.mass + point.payload)
     friction = chassis.ground.friction.static * point.adhesion
-    taken = jnp.minimum(chassis.ground.rolling_resistance / friction, 1.0)
+    rolling_share = jnp.minimum(chassis.ground.rolling_resistance / friction, 1.0)
     # A root of 0 has no derivative.
-    slides = friction * stands.lateral * jnp.sqrt(jnp.maximum(1 - taken**2, 1e-12))
+    slides = friction * stands.lateral * jnp.sqrt(jnp.maximum(1 - rolling_share**2, 1e-12))
     tips = stands.width / (2 * stands.height)
     return QuantityValue(jnp.degrees(jnp.arctan(jnp.minimum(slides, tips))), jnp.asarray(CONVERGED))
 

@@ -62,9 +62,9 @@ class StartStages:
         def number(x: float) -> float | None:
             return float(x) if np.isfinite(x) else None
 
-        each = zip(NAMES, self.bounds[:-1], self.bounds[1:], self.slip, strict=True)
+        stages = zip(NAMES, self.bounds[:-1], self.bounds[1:], self.slip, strict=True)
         return {
-            "stages": [{"stage": n, "from_s": a, "until_s": b, "slip": number(s)} for n, a, b, s in each],
+            "stages": [{"stage": n, "from_s": a, "until_s": b, "slip": number(s)} for n, a, b, s in stages],
             "acceleration_time_s": self.settled,
             "slip_over_acceleration": number(self.over_settling),
         }
@@ -126,9 +126,9 @@ def stages_of_start(
     late = np.flatnonzero(np.abs(even - last) > WITHIN * abs(last))
     settled = float(time[min(int(late[-1]) + 1, len(time) - 1)]) if late.size else 0.0
     bounds = (0.0, starting, max(slipping, starting), float(time[-1]))
-    each = [mean_slip(time, speed, theoretical, a, b) for a, b in itertools.pairwise(bounds)]
-    over = mean_slip(time, speed, theoretical, 0.0, settled)
-    return StartStages(sense, bounds[1], bounds[2], settled, bounds[3], (each[0], each[1], each[2]), over)
+    slips = [mean_slip(time, speed, theoretical, a, b) for a, b in itertools.pairwise(bounds)]
+    mean_of_start = mean_slip(time, speed, theoretical, 0.0, settled)
+    return StartStages(sense, bounds[1], bounds[2], settled, bounds[3], (slips[0], slips[1], slips[2]), mean_of_start)
 
 
 def stages_of_histories(
@@ -237,14 +237,14 @@ def compute(robot: Robot, conditions: Conditions) -> dict[str, Array]:
     power = jnp.asarray(signals.voltage) * current
     k, share = first_crossing(times, speed, rate, SHARE * speed[-1])
     width = jnp.diff(times)
-    whole = jnp.concatenate([jnp.zeros(1), jnp.cumsum(width * (power[1:] + power[:-1]) / 2)])
-    here = power[k] + share * (power[k + 1] - power[k])
+    energy_so_far = jnp.concatenate([jnp.zeros(1), jnp.cumsum(width * (power[1:] + power[:-1]) / 2)])
+    power_at_instant = power[k] + share * (power[k + 1] - power[k])
     columns = {
         "peak_current": curve_peak(
             times, jnp.asarray(robot.sides * signals.current), robot.sides * robot.driver.current_limit
         ),
         "time_to_speed": times[k] + share * width[k],
-        "energy_start": whole[k] + share * width[k] * (power[k] + here) / 2,
+        "energy_start": energy_so_far[k] + share * width[k] * (power[k] + power_at_instant) / 2,
     }
     converged = run.result.status == CONVERGED
     return {**{name: jnp.where(converged, x, jnp.nan) for name, x in columns.items()}, "status": run.result.status}

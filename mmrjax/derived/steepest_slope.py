@@ -65,7 +65,7 @@ def compute(robot: Robot, conditions: Conditions) -> dict[str, Array]:
     slope = jax.lax.stop_gradient(
         jax.jvp(lambda a: slope_margin(still_robot, still, a), (root,), (jnp.ones_like(root),))[1]
     )
-    held = root - slope_margin(robot, conditions, root) / slope
+    steepest = root - slope_margin(robot, conditions, root) / slope
     holds_all = slope_margin(still_robot, still, jnp.full_like(root, STEEPEST)) > 0
-    held = jnp.where(holds_all, STEEPEST, jnp.clip(held, 0.0, STEEPEST))
-    return {"steepest_slope": jnp.where(flat.status == CONVERGED, held, jnp.nan), "status": flat.status}
+    steepest = jnp.where(holds_all, STEEPEST, jnp.clip(steepest, 0.0, STEEPEST))
+    return {"steepest_slope": jnp.where(flat.status == CONVERGED, steepest, jnp.nan), "status": flat.status}

@@ -33,8 +33,8 @@ def turning_radius(ahead: Any, aside: Any, rate: Any) -> Array:
     """
     turns = jnp.abs(rate) > NONE
     along = jnp.sqrt(jnp.maximum(jnp.square(ahead) + jnp.square(aside), 1e-24))  # a root of 0 has no derivative
-    left = jnp.where(jnp.asarray(ahead) * rate < 0, -1.0, 1.0)
-    return jnp.where(turns, left * along / jnp.where(turns, jnp.abs(rate), 1.0), jnp.inf)
+    turn_sign = jnp.where(jnp.asarray(ahead) * rate < 0, -1.0, 1.0)
+    return jnp.where(turns, turn_sign * along / jnp.where(turns, jnp.abs(rate), 1.0), jnp.inf)
 
 
 @compiled
@@ -55,10 +55,10 @@ def turns_under_equal_commands(robot: Robot, imposed: float) -> Result:
     Args:
         imposed: voltage [V], or motor speed [rad/s] if its rig imposes that.
     """
-    both = OF_SIDES[-2:] if robot.rig.imposed == "motor_speed" else OF_SIDES[:2]
-    alike = dict.fromkeys(both, imposed if robot.rig.imposed == "motor_speed" else 1.0)
-    asked = Conditions([*robot.configurations], voltage=abs(imposed), **alike).resolved(robot)
-    return jax.device_get(steady_batch(robot, asked))
+    side_commands = OF_SIDES[-2:] if robot.rig.imposed == "motor_speed" else OF_SIDES[:2]
+    alike = dict.fromkeys(side_commands, imposed if robot.rig.imposed == "motor_speed" else 1.0)
+    equal_commands = Conditions([*robot.configurations], voltage=abs(imposed), **alike).resolved(robot)
+    return jax.device_get(steady_batch(robot, equal_commands))
 
 
 def turning_columns(robot: Robot, reading: Mapping[str, Any], radius: np.ndarray) -> dict[str, np.ndarray]:

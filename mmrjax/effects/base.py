@@ -116,9 +116,9 @@ class Effect(eqx.Module):
         if "name" not in vars(cls):
             cls.name = re.sub(r"(?<!^)(?=[A-Z])", "_", cls.__name__).lower()
         # Stated next to the class attributes, it is the default of the field.
-        if isinstance(stated := vars(cls).get("configurations"), tuple):
+        if isinstance(configurations := vars(cls).get("configurations"), tuple):
             cls.__annotations__ = {**inspect.get_annotations(cls), "configurations": Names}
-            cls.configurations = eqx.field(default=stated, static=True, kw_only=True)
+            cls.configurations = eqx.field(default=configurations, static=True, kw_only=True)
 
     def for_equations(self) -> Effect:
         """Same effect as a class of the library, without its own priors."""
@@ -129,8 +129,12 @@ class Effect(eqx.Module):
     @classmethod
     def family(cls) -> str:
         """Equation and driver in words: `loss torque that changes with speed`."""
-        what = f"reading of {cls.channel}".replace("_", " ") if cls.channel else EQUATION[cls.balance]
-        return f"{what} that changes with {cls.driver}" if cls.driver else f"{what} that is the same share everywhere"
+        subject = f"reading of {cls.channel}".replace("_", " ") if cls.channel else EQUATION[cls.balance]
+        return (
+            f"{subject} that changes with {cls.driver}"
+            if cls.driver
+            else f"{subject} that is the same share everywhere"
+        )
 
     @property
     def unlike(self) -> bool:
@@ -145,8 +149,13 @@ class Effect(eqx.Module):
     def acts(self, robot: Robot, signals: Signals) -> Scalar:
         """1 in configurations that it acts on, else 0 [-]: the named ones, else those with its `movers`."""
         if self.configurations:
-            named = {robot.configurations.index(n) for n in self.configurations if n in robot.configurations}
-            return sum((jnp.where(signals.configuration == k, 1.0, 0.0) for k in sorted(named)), jnp.zeros(()))
+            configuration_indices = {
+                robot.configurations.index(n) for n in self.configurations if n in robot.configurations
+            }
+            return sum(
+                (jnp.where(signals.configuration == k, 1.0, 0.0) for k in sorted(configuration_indices)),
+                jnp.zeros(()),
+            )
         return signals.on_tracks if self.movers == "tracks" else 1 - signals.on_tracks
 
     @abc.abstractmethod

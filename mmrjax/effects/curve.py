@@ -187,9 +187,9 @@ def _size(unit: str, size: float) -> Scalar:
 
 def _curve_docstring(place: str, over: str) -> str:
     """Docstring of a curve: its equation with its units, and its source."""
-    where = f"the readings of `{place}`" if place in READINGS else f"the balance `{place}`"
+    place_words = f"the readings of `{place}`" if place in READINGS else f"the balance `{place}`"
     unit, unit_x = PLACES[place][0], EVERY_VARIABLE[over].unit
-    return f"""Δ = a y(x) along the travel in {where} [{unit}], x = {over} [{unit_x}].
+    return f"""Δ = a y(x) along the travel in {place_words} [{unit}], x = {over} [{unit_x}].
 
     y is smooth through six ordinates equally spaced from `low` to `high`, and levels out beyond.
 

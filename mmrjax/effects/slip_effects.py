@@ -77,8 +77,8 @@ class NonlinearSlip(SlipEffect):
     )
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:
-        used = jnp.clip(signals.demand / signals.adhesion_limit, -2.0, 2.0)
-        return self.amplitude * used**3 * signals.speed_theoretical * signals.direction
+        adhesion_used = jnp.clip(signals.demand / signals.adhesion_limit, -2.0, 2.0)
+        return self.amplitude * adhesion_used**3 * signals.speed_theoretical * signals.direction
 
 
 class SpeedSlip(SlipEffect):
@@ -174,6 +174,6 @@ class VibrationSlip(SlipEffect):
     )  # fmt: skip
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:
-        used = signals.demand / signals.adhesion_limit
+        adhesion_used = signals.demand / signals.adhesion_limit
         faster = jnp.hypot(signals.speed_theoretical / self.speed_reference, SLOWEST) ** self.exponent
-        return self.amplitude * faster * used / jnp.hypot(1 - jnp.abs(used), ROUNDED)
+        return self.amplitude * faster * adhesion_used / jnp.hypot(1 - jnp.abs(adhesion_used), ROUNDED)

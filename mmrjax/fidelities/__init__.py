@@ -110,8 +110,10 @@ class FidelityFacts:
             if value is None:
                 continue
             if name not in values:
-                listed = ", ".join(values) or "none"
-                raise ValueError(f"{name}: got {value!r}; this fidelity has no such option; its options: {listed}")
+                option_names = ", ".join(values) or "none"
+                raise ValueError(
+                    f"{name}: got {value!r}; this fidelity has no such option; its options: {option_names}"
+                )
             values[name] = float(value)
         for option in self.options:
             value = values[option.name]

@@ -95,8 +95,8 @@ def in_table_time(rig: Rig, time: Float[Array, "runs samples"], values: T) -> tu
 @compiled
 def _channel_readings(robot: Robot, signals: Signals, apart: bool = False) -> Scalars:
     """Readings of the channels that change in a history. `apart`: signals have a left and a right side."""
-    every = balances.readings_of_sides(robot, signals) if apart else balances.sensor(robot, signals)
-    return {c.name: every[c.name] for c in channels.EVERY if c.over_time}
+    readings = balances.readings_of_sides(robot, signals) if apart else balances.sensor(robot, signals)
+    return {c.name: readings[c.name] for c in channels.EVERY if c.over_time}
 
 
 @compiled

@@ -86,12 +86,12 @@ moving = compiled(balances.moving_signals)
 @compiled
 def drive_rates(robot: Robot, conditions: Conditions, y: Unknowns, way: Scalar | None = None) -> Unknowns:
     """Rates of change of the unknowns, in their units [1/s]. `way` as in `balances.moving_signals`, or `HELD`."""
-    held = jnp.asarray(False if way is None else way == HELD)
+    is_standing = jnp.asarray(False if way is None else way == HELD)
     state = state_of_unknowns(robot, y)
-    signals = moving(robot, conditions, state, None if way is None else jnp.where(held, 0.0, way))
+    signals = moving(robot, conditions, state, None if way is None else jnp.where(is_standing, 0.0, way))
     winding = signals.voltage_left / signals.inductance
     shaft, moves = (
-        jnp.where(held, 0.0, x)
+        jnp.where(is_standing, 0.0, x)
         for x in (signals.acceleration_wheel * robot.gearbox.ratio, jnp.asarray(signals.acceleration))
     )
     if conditions.motor_speed is not None:  # the current follows from torque, the shaft from the imposed speed
@@ -165,12 +165,12 @@ def _initial_unknowns(robot: Robot, conditions: Conditions) -> Array:
     rolling, none = radius * turning / robot.gearbox.ratio, jnp.zeros(())
     still = State(none, turning, rolling, none, distance=radius * begin.angle)
     conditions = balances.with_controller_duty(robot, conditions, still)
-    left = voltage_at_rest(robot, conditions)
+    voltage_left = voltage_at_rest(robot, conditions)
     if conditions.motor_current is None:  # an amplifier compensates it
         share = jnp.abs(balances.bridge_duty(robot, conditions)) if robot.driver.decay == FAST else 1.0
-        left = left - share * robot.motor.voltage_back(turning)
+        voltage_left = voltage_left - share * robot.motor.voltage_back(turning)
     open_circuit = (conditions.open > 0.5) | (conditions.motor_speed is not None)
-    current = jnp.where(open_circuit, 0.0, robot.motor.current_stall(left))
+    current = jnp.where(open_circuit, 0.0, robot.motor.current_stall(voltage_left))
     return jnp.stack([jnp.asarray(x, float) for x in (current, turning, rolling, radius * begin.angle)])
 
 
@@ -353,8 +353,10 @@ def _history_instants(duration: float) -> np.ndarray:
 def _run_histories(
     robot: Robot, conditions: Conditions, options: Mapping[str, float], progress: Progress | None = None
 ) -> RunBatch:
-    kept = drive_batch(robot, conditions, jnp.asarray(_history_instants(options["duration"])))
-    return RunBatch(kept.result, history=History.of(robot, kept.time, kept.distance, kept.signals))
+    histories = drive_batch(robot, conditions, jnp.asarray(_history_instants(options["duration"])))
+    return RunBatch(
+        histories.result, history=History.of(robot, histories.time, histories.distance, histories.signals)
+    )
 
 
 def _standstill_cautions(robot: Robot, conditions: Conditions) -> list[str]:

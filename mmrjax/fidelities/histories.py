@@ -98,12 +98,12 @@ def time_grid(
     inside = (changes > 0) & (changes < last)
     begins, first = np.append(0.0, changes[inside]), np.append(start[0], change[0] / sizes[inside])
     grows = np.append(start[1], np.full(inside.sum(), change[1]))
-    given, times = times, np.unique(np.concatenate([begins, np.asarray(times, float)]))
+    requested_times, times = times, np.unique(np.concatenate([begins, np.asarray(times, float)]))
     longest = np.maximum(longest, last / STEPS) if np.size(longest) else LONGEST  # one row has no interval
-    longest = np.broadcast_to(longest, max(len(given) - 1, 1))
-    longest = longest[np.clip(np.searchsorted(given, times[:-1], side="right") - 1, 0, len(longest) - 1)]
-    which = np.searchsorted(begins, times[:-1], side="right") - 1  # the last change before each instant
-    since, first, grows = begins[which], first[which], grows[which]
+    longest = np.broadcast_to(longest, max(len(requested_times) - 1, 1))
+    longest = longest[np.clip(np.searchsorted(requested_times, times[:-1], side="right") - 1, 0, len(longest) - 1)]
+    interval_index = np.searchsorted(begins, times[:-1], side="right") - 1  # the last change before each instant
+    since, first, grows = begins[interval_index], first[interval_index], grows[interval_index]
     knee = np.maximum((longest - first) / grows, 0.0)
 
     def step_count(t: np.ndarray) -> np.ndarray:  # number of steps up to t: ∫ dt / min(longest, first + grows t)
@@ -114,12 +114,14 @@ def time_grid(
     instants = []
     for k in range(len(times) - 1):
         count = max(1, int(np.ceil(ends[k] - at[k] - 1e-9)))
-        wanted = np.linspace(at[k], ends[k], count, endpoint=False)
-        young = first[k] / grows[k] * np.expm1(grows[k] * np.minimum(wanted, at_knee[k]))
-        instants.append(since[k] + young + np.maximum(wanted - at_knee[k], 0.0) * longest[k])
+        even_places = np.linspace(at[k], ends[k], count, endpoint=False)
+        young = first[k] / grows[k] * np.expm1(grows[k] * np.minimum(even_places, at_knee[k]))
+        instants.append(since[k] + young + np.maximum(even_places - at_knee[k], 0.0) * longest[k])
         instants[-1][0] = times[k]
-    whole = np.concatenate([*instants, times[-1:]])
-    return np.interp(np.arange((len(whole) - 1) * parts + 1) / parts, np.arange(len(whole)), whole)
+    all_instants = np.concatenate([*instants, times[-1:]])
+    return np.interp(
+        np.arange((len(all_instants) - 1) * parts + 1) / parts, np.arange(len(all_instants)), all_instants
+    )
 
 
 def _split_conditions(conditions: Conditions) -> tuple[Conditions, Conditions]:
@@ -130,8 +132,8 @@ def _split_conditions(conditions: Conditions) -> tuple[Conditions, Conditions]:
 def first_conditions_and_state(robot: Robot, conditions: Conditions) -> tuple[Conditions, Unknowns]:
     """Conditions and state of a run at its first instant."""
     changing, constant = _split_conditions(conditions)
-    held = eqx.combine(jax.tree.map(lambda x: x[0], changing), constant)
-    return held, drive_start(robot, held)
+    first_conditions = eqx.combine(jax.tree.map(lambda x: x[0], changing), constant)
+    return first_conditions, drive_start(robot, first_conditions)
 
 
 class LinearisedRun(eqx.Module):
@@ -157,6 +159,13 @@ class LinearisedRun(eqx.Module):
     carries: Float[Array, "steps unknowns unknowns"]
     gains: Float[Array, "steps 2 unknowns unknowns"]
     lags: Float[Array, "steps rates unknowns"]
+
+
+def _stopped_by_clamp(conditions: Conditions, y: Array) -> Array:
+    """Unknowns, or their derivatives by row, without motion if a clamp holds the output."""
+    if conditions.held is None:
+        return y
+    return jnp.where(conditions.held > 0.5, y.at[np.array([MOTOR, GROUND])].set(0.0), y)
 
 
 def _unit_vector_of_current(y: Unknowns) -> Unknowns:
@@ -215,8 +224,8 @@ class RunStep(eqx.Module):
         nothing = [x if x is None else self.begun * x for x in (before.duty, before.motor_current)]
         before = eqx.tree_at(lambda c: [c.duty, c.motor_current], before, nothing, is_leaf=lambda x: x is None)
         states = jnp.stack([y, y, y + MORE * _unit_vector_of_current(y)])
-        each = jax.tree.map(lambda before, now: jnp.stack([before, now, now]), before, now)
-        return jax.vmap(rate)(states, each)
+        stacked = jax.tree.map(lambda before, now: jnp.stack([before, now, now]), before, now)
+        return jax.vmap(rate)(states, stacked)
 
 
 def run_steps(conditions: Conditions, times: Float[Array, " times"]) -> tuple[RunStep, Conditions]:
@@ -230,9 +239,11 @@ def run_steps(conditions: Conditions, times: Float[Array, " times"]) -> tuple[Ru
     jump = jax.lax.cummax(jnp.where(jumped, jnp.arange(len(jumped)), 0))
     before = jax.tree.map(lambda x: x[jnp.maximum(jump - 1, 0)], now)
     rests = conditions.begin is None
-    begun = jnp.where((jump == 0) & rests, 0.0, 1.0).astype(times.dtype)
+    is_moving = jnp.where((jump == 0) & rests, 0.0, 1.0).astype(times.dtype)
     since = times[:-1] - times[jump]
-    return RunStep(jnp.diff(times), since, begun, before if conditions.motor_speed is None else None, now), constant
+    return RunStep(
+        jnp.diff(times), since, is_moving, before if conditions.motor_speed is None else None, now
+    ), constant
 
 
 def _lag_of_step(
@@ -253,9 +264,9 @@ def _lag_of_step(
     slope = (rate[1] - rate[2]) / MORE
     follows = slope > 0  # except when a diode begins to block
     decay = jnp.where(follows, slope, 1.0)
-    left = (rate[0] - rate[1]) / decay * jnp.exp(-decay * step.since)
-    follows &= jax.lax.stop_gradient(jnp.abs(current - left)) <= limit
-    return _decay_over_parts(jnp.where(follows, left, 0.0), decay, parts, wait)
+    transient = (rate[0] - rate[1]) / decay * jnp.exp(-decay * step.since)
+    follows &= jax.lax.stop_gradient(jnp.abs(current - transient)) <= limit
+    return _decay_over_parts(jnp.where(follows, transient, 0.0), decay, parts, wait)
 
 
 def _decay_over_parts(begin: Array, decay: Array, parts: Pair, wait: Scalar = 0.0) -> CurrentLag:
@@ -298,9 +309,13 @@ def _solve_stage(
         step = solve(matrix, value)
         # Over a kink of the friction law full steps can alternate without end.
         tried = y - jnp.array([0.1, 0.4, 1.0], y.dtype)[:, None] * step
-        over = jnp.max(jnp.abs(jax.vmap(left)(tried)), 1)
-        best = jnp.where(over[0] < over[1], tried[0], tried[1])
-        return count + 1, jnp.where(over[2] <= jnp.min(over), tried[2], best), jnp.min(over)
+        residual_size = jnp.max(jnp.abs(jax.vmap(left)(tried)), 1)
+        best = jnp.where(residual_size[0] < residual_size[1], tried[0], tried[1])
+        return (
+            count + 1,
+            jnp.where(residual_size[2] <= jnp.min(residual_size), tried[2], best),
+            jnp.min(residual_size),
+        )
 
     def going(state: tuple[Array, Array, Array]) -> Array:
         return (state[0] < NEWTON) & (state[2] > SOLVED)
@@ -370,38 +385,41 @@ def solve_states(robot: Robot, conditions: Conditions, times: Float[Array, " tim
     along = jnp.zeros(len(size)).at[MOTOR].set(1.0).at[GROUND].set(per_speed * size[MOTOR] / size[GROUND])
 
     def taken(y: Array, step: RunStep) -> tuple[Array, RunStates]:
-        held, lag = step.held(constant), _lag_of_robot(robot, constant, step, y)
-        law = functools.partial(drive_rates, robot, held)
+        conditions, y = step.held(constant), _stopped_by_clamp(step.held(constant), y)
+        lag = _lag_of_robot(robot, constant, step, y)
+        law = functools.partial(drive_rates, robot, conditions)
 
         def turned(part: _StepPart) -> _StepPart:
-            mine = _decay_over_parts(part.lag, lag.decay, part.length * _WEIGHED)
-            first = part.begin - mine.begin * _unit_vector_of_current(y)
+            member_decay = _decay_over_parts(part.lag, lag.decay, part.length * _WEIGHED)
+            first = part.begin - member_decay.begin * _unit_vector_of_current(y)
 
             def stage(given: tuple[Array, Array], mean: Array) -> tuple[tuple[Array, Array], Array]:
                 now = functools.partial(law, way=part.side)
-                stage_result = _solve_stage(now, *given, part.length, mean * _unit_vector_of_current(y), mine.decay)
+                stage_result = _solve_stage(
+                    now, *given, part.length, mean * _unit_vector_of_current(y), member_decay.decay
+                )
                 return (first + (1 - _GAMMA) / _GAMMA * (stage_result - first), stage_result), stage_result
 
-            stages = jax.lax.scan(stage, (first, first), mine.means)[1]
-            end = stages[1] + mine.end * _unit_vector_of_current(y)
+            stages = jax.lax.scan(stage, (first, first), member_decay.means)[1]
+            end = stages[1] + member_decay.end * _unit_vector_of_current(y)
             before, after = part.begin[MOTOR], end[MOTOR]
             nears = jnp.where(part.turn == 0, part.side * after < 0, part.turn < TURNS)
             rests, waited, rest = part.turn == TURNS, part.turn == WAITS, end - after * along
-            lost = before - after  # 0 in a part of no length, of a step that begins at rest
-            on_line = part.length * before / jnp.where(lost == 0, 1.0, lost)
+            transient_drop = before - after  # 0 in a part of no length, of a step that begins at rest
+            on_line = part.length * before / jnp.where(transient_drop == 0, 1.0, transient_drop)
             slows = law(end, way=part.side)[MOTOR]
             by_newton = part.length - after / jnp.where(slows == 0, 1.0, slows)
             to_rest = jnp.clip(jnp.where(part.turn == 0, on_line, by_newton), 0.0, step.length)
             since = part.since + jnp.where(rests | waited, part.length, 0.0)
-            side, then, wait = _shaft_side(robot, held, rest, step.length - since)
-            left = jnp.where(rests & (wait > 0), wait, step.length - since)
+            side, then, wait = _shaft_side(robot, conditions, rest, step.length - since)
+            step_left = jnp.where(rests & (wait > 0), wait, step.length - since)
             after_rest = jnp.where(wait > 0, WAITS, WAITS + 1)
             return _StepPart(
                 jnp.where(nears, part.turn + 1, jnp.where(rests, after_rest, WAITS + 2 - waited)),
                 jnp.where(rests, rest, jnp.where(waited, end, part.begin)),
-                jnp.where(rests | waited, mine.end, part.lag),
+                jnp.where(rests | waited, member_decay.end, part.lag),
                 since,
-                jnp.where(nears, to_rest, left),
+                jnp.where(nears, to_rest, step_left),
                 jnp.where(rests, side, jnp.where(waited, part.then, part.side)),
                 jnp.where(rests, then, part.then),
                 jnp.where(rests, part.length, part.before),
@@ -409,10 +427,10 @@ def solve_states(robot: Robot, conditions: Conditions, times: Float[Array, " tim
                 end,
             )
 
-        side, then, wait = _shaft_side(robot, held, y, step.length)
+        side, then, wait = _shaft_side(robot, conditions, y, step.length)
         turn, length, none = jnp.where(wait > 0, WAITS, 0), jnp.where(wait > 0, wait, step.length), jnp.zeros(())
-        whole = _StepPart(turn, y, lag.begin, none, length, side, then, wait, jnp.stack([y, y]), y)
-        last = jax.lax.while_loop(lambda part: part.turn < WAITS + 2, turned, whole)
+        whole_step = _StepPart(turn, y, lag.begin, none, length, side, then, wait, jnp.stack([y, y]), y)
+        last = jax.lax.while_loop(lambda part: part.turn < WAITS + 2, turned, whole_step)
         sides = jnp.stack([side, last.side])
         return last.end, RunStates(last.stages, last.end, sides, last.before, last.since, last.begin)
 
@@ -442,6 +460,7 @@ def linearise_run(
     steps, constant = run_steps(conditions, times)
     first_state = first_conditions_and_state(robot, conditions)[1]
     begins = jnp.concatenate([first_state[None], run.ends[:-1]])
+    begins = jax.vmap(lambda step, y: _stopped_by_clamp(step.held(constant), y))(steps, begins)
     # A step to rest and the one from it use an approximant of the exponential. For a current that lags by a quarter
     # of such a part, implicit Euler would keep a fifth of the decayed excess.
     passes = (run.sides[:, 0] != run.sides[:, 1]) | (run.since > 0)
@@ -453,7 +472,7 @@ def linearise_run(
 
     def linear(given: tuple) -> tuple[Array, Array, Array, Array]:
         begin, end, stages, (rest, wait), sides, spans, passes, step = given
-        held = step.held(constant)
+        conditions = step.held(constant)
         one = jnp.eye(len(end), dtype=end.dtype)
         current = _unit_vector_of_current(end)
 
@@ -464,27 +483,29 @@ def linearise_run(
         lags = jnp.stack([lag.begin, lag.begin * jnp.exp(-lag.decay * (spans[0] + wait)), lag.end])
         ends = jnp.stack([begin, rest, end]) - lags[:, None] * current
         places = jnp.where(passes, (ends[1:] + ends[:-1]) / 2, stages) + lag.means[:, None] * current
-        slopes = jax.vmap(jax.jacfwd(lambda y, way: drive_rates(robot, held, y, way)))(places, sides)
+        slopes = jax.vmap(jax.jacfwd(lambda y, way: drive_rates(robot, conditions, y, way)))(places, sides)
         z = spans[:, None, None] * slopes
         weight = jnp.where(passes, one - z / 2 + z @ z / 6, one)  # Padé (0, 3): 1 / (1 - z + z²/2 - z³/6)
         first, second = jax.vmap(invert)(one - z @ weight)
         stops, ways = passes & (sides[0] != HELD), sides.at[1].set(jnp.where(wait > 0, HELD, sides[1]))
-        jump = compute_if_needed(stops, _sensitivity_jump, (robot, held, rest, ways), jnp.zeros_like(end))
+        jump = compute_if_needed(stops, _sensitivity_jump, (robot, conditions, rest, ways), jnp.zeros_like(end))
         # The start of the second stage depends on the first stage and on the change before the step.
         by_first = jnp.where(passes, one + jump[:, None] * one[MOTOR], (1 - _GAMMA) / _GAMMA * one)
         by_before = jnp.where(passes, 0.0, 1 - (1 - _GAMMA) / _GAMMA) * one
-        kept = by_first @ first
-        carries = second @ (kept + by_before)
-        gains = jnp.stack([spans[0] * second @ kept, spans[1] * second]) @ weight
+        carried_first = by_first @ first
+        carries = second @ (carried_first + by_before)
+        gains = jnp.stack([spans[0] * second @ carried_first, spans[1] * second]) @ weight
         # The lag reduces the current at a step's start and acts on both stages; its remainder is added at the end.
         by_means = jnp.einsum("sij,sj->si", gains, slopes[:, :, CURRENT] + lag.decay * current)
         by_decay = lag.means @ gains[:, :, CURRENT]
         lags = jnp.outer(by_rate.begin, -carries[:, CURRENT]) + by_rate.means.T @ by_means
         lags = lags + jnp.outer(by_rate.end, current) + jnp.outer(by_rate.decay, by_decay)
-        return places, carries + lags.T @ by_begin, gains, lags
+        return places, _stopped_by_clamp(conditions, (carries + lags.T @ by_begin).T).T, gains, lags
 
-    each = begins, run.ends, run.stages, rests, run.sides, spans, passes, steps
-    places, carries, gains, lags = _steps_of_blocks(jax.lax.map(jax.vmap(linear), _arrange_in_blocks(each)), len(h))
+    scan_inputs = begins, run.ends, run.stages, rests, run.sides, spans, passes, steps
+    places, carries, gains, lags = _steps_of_blocks(
+        jax.lax.map(jax.vmap(linear), _arrange_in_blocks(scan_inputs)), len(h)
+    )
     return LinearisedRun(begins, run.ends, places, run.sides, passes, clock, carries, gains, lags)
 
 
@@ -502,11 +523,11 @@ def _unknowns_at_ends(
 @_unknowns_at_ends.def_jvp
 def _ends_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
     """Tangents with respect to the robot's parameters."""
-    (robot, conditions, times, states), moved = primals, tangents[0]
+    (robot, conditions, times, states), input_tangents = primals, tangents[0]
     along = states if isinstance(states, LinearisedRun) else linearise_run(robot, conditions, times, states)
 
     def change(law: Callable[[Robot], Array]) -> Array:
-        value, moves = eqx.filter_jvp(law, (robot,), (moved,))
+        value, moves = eqx.filter_jvp(law, (robot,), (input_tangents,))
         return jnp.zeros_like(value) if moves is None else moves
 
     def source(_: Array, y: Array, held: Conditions, way: Array) -> Array:
@@ -539,9 +560,11 @@ def run_response(
 
     def added(along: LinearisedRun, step: RunStep) -> Array:
         """Contribution of the sources of a step, at its end."""
-        held = step.held(constant)
-        both = jax.vmap(lambda t, y, way: source(t, y, held, way))(along.clock[1:], along.places, along.sides)
-        tangents = jnp.tensordot(along.gains, both, ((0, 2), (0, 1)))
+        conditions = step.held(constant)
+        source_terms = jax.vmap(lambda t, y, way: source(t, y, conditions, way))(
+            along.clock[1:], along.places, along.sides
+        )
+        tangents = jnp.tensordot(along.gains, source_terms, ((0, 2), (0, 1)))
         at_start = lambda y, held: source(along.clock[0], y, held, along.sides[0])[CURRENT]  # noqa: E731
         of_lag = step.rates_at_start(constant, at_start, along.begins)
         return tangents + jnp.tensordot(along.lags, of_lag, ((0,), (0,)))
@@ -556,8 +579,8 @@ def run_response(
         whole = jax.vmap(lambda t, y, dy, changing: seen(t, y, dy, eqx.combine(changing, constant)))
         return last, whole(along.clock[:, 2], along.ends, changes, then)
 
-    each = along, steps, jax.tree.map(lambda x: x[1:], _split_conditions(conditions)[0])
-    return _steps_of_blocks(jax.lax.scan(block, begin, _arrange_in_blocks(each))[1], len(along.clock))
+    scan_inputs = along, steps, jax.tree.map(lambda x: x[1:], _split_conditions(conditions)[0])
+    return _steps_of_blocks(jax.lax.scan(block, begin, _arrange_in_blocks(scan_inputs))[1], len(along.clock))
 
 
 def _arrange_in_blocks(of_steps: T) -> T:
@@ -610,10 +633,10 @@ def history_signals(
     """
     changing, constant = _split_conditions(conditions)
     ys, sides = _unknowns_of_run(robot, conditions, times, known)
-    each = ys, jnp.append(sides[:, 0], sides[-1, 1]), changing
+    states = ys, jnp.append(sides[:, 0], sides[-1, 1]), changing
     if at is not None:
-        each = jax.tree.map(lambda x: x[at], each)
-    return jax.vmap(lambda y, way, now: _signals_of_instant(robot, eqx.combine(now, constant), y, way))(*each)
+        states = jax.tree.map(lambda x: x[at], states)
+    return jax.vmap(lambda y, way, now: signals_of_instant(robot, eqx.combine(now, constant), y, way))(*states)
 
 
 def _unknowns_of_run(
@@ -626,15 +649,17 @@ def _unknowns_of_run(
     return jnp.concatenate([first_conditions_and_state(robot, conditions)[1][None], ends]), run.sides
 
 
-def _signals_of_instant(robot: Robot, conditions: Conditions, y: Array, way: Array) -> Signals:
-    """Signals of an instant, in static equilibrium if friction holds shafts and load."""
+def signals_of_instant(robot: Robot, conditions: Conditions, y: Array, way: Array) -> Signals:
+    """Signals of an instant, in static equilibrium if friction or a clamp holds shafts and load.
+
+    At the instant at which a clamp stops them, the signals before it.
+    """
     state = state_of_unknowns(robot, y)
     signals = moving(robot, conditions, state)
     if not robot.moves_as_one or conditions.motor_speed is not None:
         return signals
-    return jax.tree.map(
-        lambda a, b: jnp.where(way == HELD, a, b), standing_signals(robot, conditions, state), signals
-    )
+    stands = (way == HELD) & (y[MOTOR] == 0)
+    return jax.tree.map(lambda a, b: jnp.where(stands, a, b), standing_signals(robot, conditions, state), signals)
 
 
 class StepCourse(eqx.Module):
@@ -659,8 +684,8 @@ class StepCourse(eqx.Module):
             steps: readings at `first`, `begin` and `end`, shape (steps, ...), and `decays`.
         """
         first, begin, end, decays = steps
-        left = jnp.reshape(jnp.exp(-decays * share), (*share.shape, *[1] * (first.ndim - share.ndim)))
-        return interpolate(begin, end, share) + left * (first - begin)
+        decay_factor = jnp.reshape(jnp.exp(-decays * share), (*share.shape, *[1] * (first.ndim - share.ndim)))
+        return interpolate(begin, end, share) + decay_factor * (first - begin)
 
 
 def course_between_instants(
@@ -677,23 +702,24 @@ def course_between_instants(
     ys, sides = _unknowns_of_run(robot, conditions, times, known)
     steps, constant = run_steps(conditions, times)
     then = jax.tree.map(lambda x: x[1:], _split_conditions(conditions)[0])
-    each = ys[:-1], ys[1:], steps, then, sides
+    course_inputs = ys[:-1], ys[1:], steps, then, sides
     if at is not None:
-        each = jax.tree.map(lambda x: x[at], each)
+        course_inputs = jax.tree.map(lambda x: x[at], course_inputs)
 
     def one(y: Array, after: Array, step: RunStep, then: Conditions, sides: Array) -> StepCourse:
-        held = step.held(constant)
+        conditions = step.held(constant)
         if step.before is None:  # the imposed quantity is itself linear
-            first = _signals_of_instant(robot, held, y, sides[0])
+            first = signals_of_instant(robot, conditions, y, sides[0])
             return StepCourse(
-                first, first, _signals_of_instant(robot, eqx.combine(then, constant), after, sides[1]), jnp.zeros(())
+                first, first, signals_of_instant(robot, eqx.combine(then, constant), after, sides[1]), jnp.zeros(())
             )
-        lag, current = _lag_of_robot(robot, constant, step, y), _unit_vector_of_current(y)
-        states = jnp.stack([y, y - lag.begin * current, after - lag.end * current])
-        rows = jax.vmap(lambda *at: jax.tree.map(jnp.asarray, _signals_of_instant(robot, held, *at)))(
+        stopped, current = _stopped_by_clamp(conditions, y), _unit_vector_of_current(y)
+        lag = _lag_of_robot(robot, constant, step, stopped)
+        states = jnp.stack([y, stopped - lag.begin * current, after - lag.end * current])
+        rows = jax.vmap(lambda *at: jax.tree.map(jnp.asarray, signals_of_instant(robot, conditions, *at)))(
             states, sides[np.array([0, 0, 1])]
         )
         first, begin, end = (jax.tree.map(lambda x, k=k: x[k], rows) for k in range(3))
         return StepCourse(first, begin, end, lag.decay * step.length)
 
-    return jax.vmap(one)(*each)
+    return jax.vmap(one)(*course_inputs)

@@ -93,8 +93,8 @@ def admitted_current(robot: Robot, conditions: Conditions, wanted: Scalar) -> tu
     behind = robot.sides * battery.cells * battery.resistance * duty * robot.driver.share_drawn(duty)
     resistance = robot.motor.resistance + jnp.where(conditions.battery > 0.5, behind, 0.0)
     resistance, source = jax.lax.stop_gradient((resistance, _source_at_rest(robot, conditions)))
-    current, held = robot.driver.admitted(wanted, conditions.polarity * duty, jnp.abs(source) / resistance)
-    return current, resistance * held
+    current, is_limited = robot.driver.admitted(wanted, conditions.polarity * duty, jnp.abs(source) / resistance)
+    return current, resistance * is_limited
 
 
 def without_diode(robot: Robot) -> Robot:
@@ -118,7 +118,8 @@ def standing_signals(robot: Robot, conditions: Conditions, state: State) -> Sign
 
     The loads alone do not determine static friction. Traction is the pull of gravity along the slope. Rolling
     resistance takes the part that neither shafts nor adhesion hold. The output torque is the smallest that keeps
-    both motor side and track side at rest: friction acts as near as possible to the load it balances.
+    both motor side and track side at rest: friction acts as near as possible to the load it balances. A clamp of the
+    output carries what the friction of motor and gearbox does not hold.
 
     Args:
         conditions: voltage or current imposed, no speed.
@@ -133,18 +134,21 @@ def standing_signals(robot: Robot, conditions: Conditions, state: State) -> Sign
     ends = [balances.settled_signals(robot, conditions, still, way)[0] for way in (1.0, -1.0)]
     ahead, back = ends
     # Least and greatest torque through the gearbox, and least and greatest friction of the track.
-    given = [
+    inputs = [
         gear.torque_output(end.torque_motor - end.torque_idle, end.direction)
         - (end.torque_load - end.torque_track_loss - chassis.radius * end.traction)
         for end in ends
     ]
-    lost = [end.torque_track_loss for end in (back, ahead)]
+    track_losses = [end.torque_track_loss for end in (back, ahead)]
     traction = ahead.gravity
     if robot.has_ground:
-        least_, most = ((given[k] - lost[1 - k]) / chassis.radius for k in range(2))
+        least_, most = ((inputs[k] - track_losses[1 - k]) / chassis.radius for k in range(2))
         traction = one_sided.clip(one_sided.clip(traction, least_, most), -ahead.adhesion_limit, ahead.adhesion_limit)
     carried = chassis.radius * traction
-    torque = one_sided.clip(0.0, jnp.maximum(carried + lost[0], given[0]), jnp.minimum(carried + lost[1], given[1]))
+    loads = [carried + lost for lost in track_losses]
+    if conditions.held is not None:
+        loads = [jnp.where(conditions.held > 0.5, *both) for both in zip(inputs, loads, strict=True)]
+    torque = one_sided.clip(0.0, jnp.maximum(loads[0], inputs[0]), jnp.minimum(loads[1], inputs[1]))
     none = jnp.zeros_like(carried)
     return dataclasses.replace(
         ahead,
@@ -215,8 +219,8 @@ def shaft_direction(robot: Robot, conditions: Conditions, state: State) -> tuple
     """Direction in which shafts and a load that move as one turn, or leave rest, ±1 [-], and time until then [s].
 
     `HELD` if they rest and friction holds them by the test of `firmness`, both now and at the later current at rest.
-    If friction holds them only now, they leave rest when the current, which lags exponentially, exceeds it. An
-    imposed speed turns them in any case, 0 if it is 0.
+    If friction holds them only now, they leave rest when the current, which lags exponentially, exceeds it. A clamp
+    holds them in any case. An imposed speed turns them in any case, 0 if it is 0.
     """
     conditions = balances.with_controller_duty(robot, conditions, state)
     motor_speed, load = jnp.asarray(state.speed_motor), robot.chassis(conditions.configuration)
@@ -230,18 +234,22 @@ def shaft_direction(robot: Robot, conditions: Conditions, state: State) -> tuple
     def leaving(robot: Robot, conditions: Conditions, state: State) -> tuple[Array, Array]:
         settled = dataclasses.replace(state, current=current_at_rest(robot, conditions, state))
         now, then = (_signals_both_ways(robot, conditions, state_there) for state_there in (state, settled))
-        turned, later = (1.0 * (ahead.torque_net > 0) - 1.0 * (back.torque_net < 0) for ahead, back in (now, then))
+        leaving_sense, later = (
+            1.0 * (ahead.torque_net > 0) - 1.0 * (back.torque_net < 0) for ahead, back in (now, then)
+        )
         lacks, exceeds = (jnp.where(later > 0, ahead.torque_net, -back.torque_net) for ahead, back in (now, then))
         winding = balances.driven_signals(robot, conditions, _without_motion(state), None)
         rises, missing = winding.voltage_left / winding.inductance, settled.current - state.current
-        waits = (turned == 0) & (later != 0) & (rises * missing > 0)
+        waits = (leaving_sense == 0) & (later != 0) & (rises * missing > 0)
         share = jnp.where(waits, -lacks / jnp.where(waits, exceeds - lacks, 1.0), 0.0)
         wait = -jnp.log1p(-share) * missing / jnp.where(waits, rises, 1.0)
-        way = jnp.where(turned != 0, turned, jnp.where(later != 0, later, HELD))
+        way = jnp.where(leaving_sense != 0, leaving_sense, jnp.where(later != 0, later, HELD))
         stands = state.speed_motor == 0
         return jnp.where(stands, way, jnp.sign(state.speed_motor)), jnp.where(stands & waits, wait, 0.0)
 
-    return compute_if_needed(slow, leaving, (robot, conditions, state), (jnp.sign(motor_speed), at_once))
+    way, wait = compute_if_needed(slow, leaving, (robot, conditions, state), (jnp.sign(motor_speed), at_once))
+    clamped = jnp.asarray(0.0 if conditions.held is None else conditions.held) > 0.5
+    return jnp.where(clamped, HELD, way), jnp.where(clamped, 0.0, wait)
 
 
 def slides_in_place(robot: Robot, conditions: Conditions) -> Array:
@@ -268,16 +276,16 @@ def current_settled(robot: Robot, conditions: Conditions, state: State) -> Scala
     """Current that settles at the motor speed of `state` [A], by the secant method on its voltage balance."""
 
     def left(wanted: Scalar) -> Scalar:
-        current, held = admitted_current(robot, conditions, wanted)
-        here = dataclasses.replace(state, current=current)
+        current, is_limited = admitted_current(robot, conditions, wanted)
+        state_there = dataclasses.replace(state, current=current)
         none = jnp.zeros_like(state.speed)
-        return balances.driven_signals(without_diode(robot), conditions, here, none).voltage_left - held
+        return balances.driven_signals(without_diode(robot), conditions, state_there, none).voltage_left - is_limited
 
     guess = robot.motor.current_stall(left(jnp.zeros_like(state.current)))
     first, second = left(0.5 * guess), left(guess)
     slope = (second - first) / jnp.where(guess == 0, 1.0, 0.5 * guess)
-    wanted = guess - jnp.where(guess == 0, 0.0, second / jnp.where(guess == 0, 1.0, slope))
-    return admitted_current(robot, conditions, wanted)[0]
+    newton_guess = guess - jnp.where(guess == 0, 0.0, second / jnp.where(guess == 0, 1.0, slope))
+    return admitted_current(robot, conditions, newton_guess)[0]
 
 
 def current_at_rest(robot: Robot, conditions: Conditions, state: State) -> Scalar:

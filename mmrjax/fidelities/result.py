@@ -95,8 +95,8 @@ def flag_mask(over: Mapping[str, Scalar]) -> Array:
 def travel_status(speed: Scalar, voltage: Scalar) -> Array:
     """Status of steady travel at `speed` under a motor `voltage`: driven by the motors or by gravity."""
     backward = jnp.asarray(speed) < 0
-    asked = jnp.where(backward, jnp.asarray(voltage) < 0, jnp.asarray(voltage) >= 0)
-    return jnp.where(asked, jnp.where(backward, REVERSES, CONVERGED), ROLLS_BACK)
+    has_asked_sign = jnp.where(backward, jnp.asarray(voltage) < 0, jnp.asarray(voltage) >= 0)
+    return jnp.where(has_asked_sign, jnp.where(backward, REVERSES, CONVERGED), ROLLS_BACK)
 
 
 def is_not_forward(status: Array) -> Array:

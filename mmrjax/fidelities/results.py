@@ -96,10 +96,10 @@ def _map_in_chunks(fidelity: Fidelity, function: Callable[[Conditions], T], cond
         return jax.device_put(
             jax.tree.map(lambda x: np.asarray(x)[:runs].reshape((*conditions.shape, *x.shape[1:])), part)
         )
-    every = flatten_conditions(conditions)
+    flat_conditions = flatten_conditions(conditions)
     if runs <= size:
-        return reshape_runs(function(every), conditions.shape)
-    parts = [function(_chunk_of_runs(every, np.asarray(first), size)) for first in range(0, runs, size)]
+        return reshape_runs(function(flat_conditions), conditions.shape)
+    parts = [function(_chunk_of_runs(flat_conditions, np.asarray(first), size)) for first in range(0, runs, size)]
     return reshape_runs(_join_chunks(parts, runs), conditions.shape)
 
 
@@ -184,12 +184,12 @@ def _status_codes(words: Any) -> Any:
     Raises:
         UsageError: an unknown word.
     """
-    asked = np.asarray(words)
-    if asked.dtype.kind != "U":
+    status_words = np.asarray(words)
+    if status_words.dtype.kind != "U":
         return words
-    if unknown := sorted(set(asked.ravel().tolist()) - set(STATUSES)):
+    if unknown := sorted(set(status_words.ravel().tolist()) - set(STATUSES)):
         raise UsageError(f"status: got {unknown[0]}; {allowed_words(unknown[0], STATUSES)}")
-    return np.array([STATUSES.index(word) for word in asked.ravel().tolist()], int).reshape(asked.shape)
+    return np.array([STATUSES.index(word) for word in status_words.ravel().tolist()], int).reshape(status_words.shape)
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
@@ -263,11 +263,11 @@ class Results:
             cache["_shown"] = {**columns, STATUS: _comparable_codes(columns[STATUS])}
             cache.update(cache["_shown"])
         elif "result" not in cache:
-            whole = batch.result()
+            batch_result = batch.result()
             columns = cache.get("_shown", {})
-            reading = {k: columns.get(k, x) for k, x in whole.reading.items()}
-            status = columns.get(STATUS, _comparable_codes(whole.status))
-            cache["result"] = dataclasses.replace(whole, reading=reading, status=status)
+            reading = {k: columns.get(k, x) for k, x in batch_result.reading.items()}
+            status = columns.get(STATUS, _comparable_codes(batch_result.status))
+            cache["result"] = dataclasses.replace(batch_result, reading=reading, status=status)
 
     def __getattr__(self, name: str) -> Any:
         self._compute(name)
@@ -373,8 +373,8 @@ class Results:
             width = max(map(len, column))
             cells.append([c.ljust(width) if words else c.rjust(width) for c in column])
         lines = ["  ".join(line).rstrip() for line in zip(*cells, strict=True)]
-        left = len(content["status"]) - rows
-        return "\n".join([*lines, f"... and {left} more"] if left > 0 else lines)
+        padding = len(content["status"]) - rows
+        return "\n".join([*lines, f"... and {padding} more"] if padding > 0 else lines)
 
     def __str__(self) -> str:
         return self.table()

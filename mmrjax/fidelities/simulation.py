@@ -85,7 +85,7 @@ def simulate(
     if profile is not None or start is not None:
         _check_profile(model, profile, {"duration": duration, "step": step, **options})
     try:
-        stated = fidelities.fidelity_facts(model).resolved(duration=duration, step=step, **options)
+        resolved_options = fidelities.fidelity_facts(model).resolved(duration=duration, step=step, **options)
     except ValueError as error:
         raise UsageError(f"model {model}, {error}") from error
     check_robot(robot)
@@ -114,13 +114,15 @@ def simulate(
     fidelity, traced = fidelities.get_fidelity(model), has_tracer((robot, conditions))
     if not traced:
         try:
-            fidelity.check(robot, flatten_conditions(conditions), stated)
+            fidelity.check(robot, flatten_conditions(conditions), resolved_options)
         except ValueError as error:
             raise UsageError(f"model {model}, {error}") from error
     names = robot.configurations.names
     if fidelity.outputs is not None and not traced:
         return Results.pending(PendingBatch(robot, conditions, fidelity), names, model)
-    run = run_batch(fidelity, robot, conditions, stated, history and fidelities.fidelity_facts(model).histories)
+    run = run_batch(
+        fidelity, robot, conditions, resolved_options, history and fidelities.fidelity_facts(model).histories
+    )
     results = Results(
         conditions, total_mass(robot, conditions), run.result, run.columns, run.history, names, model,
         channels=robot.channels,
@@ -133,8 +135,8 @@ def _forward_mode_only(results: Results) -> Results:
     if not has_tracer(results):
         return results
     kind = results.model if results.mission is None else f"{results.model} over a profile"
-    named: Results = eqxi.nondifferentiable_backward(results, msg=f"{kind}: {FORWARD_ALONE}")
-    return named
+    guarded: Results = eqxi.nondifferentiable_backward(results, msg=f"{kind}: {FORWARD_ALONE}")
+    return guarded
 
 
 def _check_battery(robot: Robot, conditions: Conditions) -> None:
@@ -227,17 +229,21 @@ def check_robot(robot: Robot) -> None:
 
 def _resolve_conditions(robot: Robot, conditions: Conditions) -> Conditions:
     """Conditions with configuration names replaced by indices, checked against the robot's configurations."""
-    names, which = robot.configurations.names, conditions.configuration
-    if isinstance(which, NamedConfigurations):
+    names, configuration = robot.configurations.names, conditions.configuration
+    if isinstance(configuration, NamedConfigurations):
         try:
-            return dataclasses.replace(conditions, configuration=which.among(names))
+            return dataclasses.replace(conditions, configuration=configuration.among(names))
         except KeyError as error:
             raise UsageError(f"configuration: got {error.args[0]}; {allowed_words(error.args[0], names)}") from error
-    if not has_tracer(which) and which.size and not _all_within(_smallest_and_largest(which), 0, len(names) - 1):
-        wrong = _first_outside(which, 0, len(names) - 1)
+    if (
+        not has_tracer(configuration)
+        and configuration.size
+        and not _all_within(_smallest_and_largest(configuration), 0, len(names) - 1)
+    ):
+        wrong = _first_outside(configuration, 0, len(names) - 1)
         assert wrong is not None
-        listed = ", ".join(f"{k} ({name})" for k, name in enumerate(names))
-        raise UsageError(f"configuration{wrong[0]}: got {wrong[1]:g}; expected one of {listed}")
+        numbered_names = ", ".join(f"{k} ({name})" for k, name in enumerate(names))
+        raise UsageError(f"configuration{wrong[0]}: got {wrong[1]:g}; expected one of {numbered_names}")
     return conditions
 
 
@@ -280,14 +286,14 @@ def _check_conditions(conditions: Conditions) -> None:
             raise UsageError(
                 f"{field.name}{wrong[0]}: got {wrong[1]:.6g}; expected {low:g} to {high:g} {unit}".rstrip()
             )
-    stated, payload = conditions.total_mass, conditions.payload
-    if stated is None or has_tracer((stated, payload)):
+    declared_mass, payload = conditions.total_mass, conditions.payload
+    if declared_mass is None or has_tracer((declared_mass, payload)):
         return
-    bare = np.asarray(stated) - np.asarray(payload)
+    bare = np.asarray(declared_mass) - np.asarray(payload)
     wrong = _first_outside(bare, np.nextafter(0.0, 1.0), math.inf)
     if wrong is not None:
         place = np.unravel_index(int(np.argmax(~(bare > 0))), bare.shape)
-        mass, load = float(np.asarray(stated)[place]), float(np.asarray(payload)[place])
+        mass, load = float(np.asarray(declared_mass)[place]), float(np.asarray(payload)[place])
         raise UsageError(f"total_mass{wrong[0]}: got {mass:g} kg; expected more than the payload, {load:g} kg")
 
 

@@ -64,16 +64,16 @@ def _signals_and_residuals(
     the duty alone would drive it, see `Driver.admitted`. If a clamp holds the output, the third unknown is the torque
     that the clamp carries, in place of the motor speed.
     """
-    speed, wanted, third = unknowns
+    speed, scaled_current, third = unknowns
     conditions, speed_motor = _clamped_conditions(conditions, third)
-    current, held = admitted_current(robot, conditions, _CURRENT * wanted)
+    current, is_limited = admitted_current(robot, conditions, _CURRENT * scaled_current)
     state = State(current, _SPEED_MOTOR * speed_motor, _SPEED * speed, conditions.discharge)
     signals, creep = _balanced(without_diode(robot), conditions, state, sense)
     # Moving with balanced torques, or at rest with too little torque: speed >= 0 and torque <= 0 in the direction of
     # travel, and one of them is 0.
     lacking, moving = -sense * signals.torque_net / _TORQUE, sense * third
     torque = sense * jnp.where(moving < lacking, moving, lacking)
-    slip, voltage = signals.speed_sliding - creep, (signals.voltage_left - held) / _VOLTAGE
+    slip, voltage = signals.speed_sliding - creep, (signals.voltage_left - is_limited) / _VOLTAGE
     if conditions.motor_speed is not None:  # the torque determines the current; the motor speed is given
         speed_error = speed_motor - conditions.motor_speed / _SPEED_MOTOR
         return (
@@ -98,9 +98,9 @@ def _clamped_conditions(conditions: Conditions, third: Scalar) -> tuple[Conditio
     """Conditions with the clamp's torque as the load, and the motor speed in the unit of its unknown."""
     if conditions.held is None:
         return conditions, third
-    held, load = _is_held(conditions), 0.0 if conditions.load_torque is None else conditions.load_torque
-    carried = dataclasses.replace(conditions, load_torque=jnp.where(held, _TORQUE * third, load))
-    return carried, jnp.where(held, 0.0, third)
+    is_clamped, load = _is_held(conditions), 0.0 if conditions.load_torque is None else conditions.load_torque
+    carried = dataclasses.replace(conditions, load_torque=jnp.where(is_clamped, _TORQUE * third, load))
+    return carried, jnp.where(is_clamped, 0.0, third)
 
 
 @compiled
@@ -120,8 +120,8 @@ def _conditions_are_sound(robot: Robot, conditions: Conditions) -> tuple[Array, 
 
     A NaN in the residual would reach the derivatives of the whole batch, as 0 * NaN.
     """
-    stated = conditions.total_mass
-    mass = robot.chassis(conditions.configuration).mass + conditions.payload if stated is None else stated
+    total_mass = conditions.total_mass
+    mass = robot.chassis(conditions.configuration).mass + conditions.payload if total_mass is None else total_mass
     sound = jnp.asarray("mass" in robot.lacks) | (jnp.asarray(mass) > 0)
     for number in jax.tree.leaves(conditions):
         sound &= jnp.isfinite(number)
@@ -253,11 +253,11 @@ def _state_at_unknowns(
     Args:
         stands: True to test whether a run beyond the limit of adhesion slides or stands. False: it `slides`.
     """
-    given = jax.lax.stop_gradient((robot, conditions))  # nothing is stored for a loop that rarely runs
+    detached = jax.lax.stop_gradient((robot, conditions))  # nothing is stored for a loop that rarely runs
     robot = robot.within(conditions.configuration)
     sound, conditions = _conditions_are_sound(robot, conditions)
     sense = travel_direction(robot, conditions)
-    state, signals, left = _signals_and_residuals(robot, conditions, unknowns, sense)
+    state, signals, residual = _signals_and_residuals(robot, conditions, unknowns, sense)
     rest = robot.chassis(conditions.configuration).speed_still
     voltage = voltage_at_rest(robot, conditions)
     still = is_at_rest(sense, voltage, signals.speed_theoretical, signals.speed, rest)
@@ -266,7 +266,7 @@ def _state_at_unknowns(
     status = jnp.where(still, STALLED, travel_status(signals.speed, voltage))
     if robot.has_ground:
         beyond = jnp.abs(signals.demand) > signals.adhesion_limit
-        slides = compute_if_needed(beyond, _slides_in_place, given, jnp.zeros_like(beyond)) if stands else beyond
+        slides = compute_if_needed(beyond, _slides_in_place, detached, jnp.zeros_like(beyond)) if stands else beyond
         status = jnp.where(beyond, jnp.where(slides, SLIDES, STALLED), status)
     if conditions.motor_speed is None:
         stands_still = (status == STALLED) & (jnp.abs(signals.speed_theoretical) < 1e-9)
@@ -278,7 +278,7 @@ def _state_at_unknowns(
     empty = (conditions.battery > 0.5) & robot.battery.empty(conditions.discharge)
     status = jnp.where(empty, BATTERY_EMPTY, status)
     status = jnp.where(sound, status, FAILED)
-    return signals, status, sound, left
+    return signals, status, sound, residual
 
 
 def _vmap_axes(tree: Any) -> Any:
@@ -364,8 +364,8 @@ def _results_at_unknowns(
 ) -> tuple[Result, Signals, Unknowns]:
     if conditions.turns:
         return circling.turn_results(robot, conditions, unknowns, found)
-    signals, status, _, left = _state_at_unknowns(robot, conditions, tuple(unknowns), found, stands=False)
-    return result_of_signals(robot.within(conditions.configuration), signals, status), signals, jnp.stack(left)
+    signals, status, _, residual = _state_at_unknowns(robot, conditions, tuple(unknowns), found, stands=False)
+    return result_of_signals(robot.within(conditions.configuration), signals, status), signals, jnp.stack(residual)
 
 
 #: `operating_point` in two halves.

@@ -109,8 +109,8 @@ def _unknowns_after_step(robot: Robot, conditions: Conditions, y: Unknowns, dt: 
     speeds = np.isin(np.arange(len(y)), (drive.MOTOR, drive.GROUND))
     last = len(y) - robot.loose
     drawn = np.isin(np.arange(len(y)), (drive.CURRENT, _DISCHARGE, *range(last - robot.controller_size, last)))
-    held = holds(robot, balances.with_controller_duty(robot, conditions, drive.state_of_unknowns(robot, y)))
-    stands = held & jnp.all(jnp.where(speeds, y, 0.0) == 0)
+    is_standing = holds(robot, balances.with_controller_duty(robot, conditions, drive.state_of_unknowns(robot, y)))
+    stands = is_standing & jnp.all(jnp.where(speeds, y, 0.0) == 0)
     moves = jnp.where(stands, jnp.asarray(drawn, y.dtype), 1.0)
 
     def rate(y: Array) -> tuple[Array, Array]:
@@ -120,7 +120,7 @@ def _unknowns_after_step(robot: Robot, conditions: Conditions, y: Unknowns, dt: 
         return rosenbrock_stages(rate, y, y[:0], share * dt, looped=True)[0], None
 
     after = jax.lax.scan(part, y, jnp.asarray(PARTS, y.dtype))[0]
-    rests = held & jnp.all(jnp.where(speeds, y * after, 0.0) <= 0)
+    rests = is_standing & jnp.all(jnp.where(speeds, y * after, 0.0) <= 0)
     return jnp.where(rests & speeds, 0.0, after)
 
 

@@ -109,9 +109,9 @@ def _period_averages(
     early = plain * (jnp.cumsum(plain) <= jnp.sum(plain) / 2)
     means, guided = mean(periods, 0.0, plain)
     halves = mean(periods, periods - half, early)[0], mean(half, 0.0, plain - early)[0]
-    earlier, later, whole = (signals_of(x) for x in (*halves, means))
+    earlier, later, period_signals = (signals_of(x) for x in (*halves, means))
     changes = [
-        (jnp.abs(getattr(later, f) - getattr(earlier, f)), jnp.abs(getattr(whole, f)))
+        (jnp.abs(getattr(later, f) - getattr(earlier, f)), jnp.abs(getattr(period_signals, f)))
         for f in ("total_current", "speed_motor", "speed")
     ]
     return means, guided, periods.astype(int), changes
@@ -174,8 +174,8 @@ def _advance_and_record(
 
     @jax.checkpoint  # reverse mode keeps one motion per sample and recomputes the steps in between
     def interval(motion: HalfRobotState, _: None) -> tuple[HalfRobotState, SampleRecord]:
-        after, every = jax.lax.scan(small, motion, None, length=steps)
-        passed, guided = jax.tree.map(lambda x: jnp.mean(x, axis=0), every)
+        after, records = jax.lax.scan(small, motion, None, length=steps)
+        passed, guided = jax.tree.map(lambda x: jnp.mean(x, axis=0), records)
         return after, SampleRecord(after, passed, guided, kind.loads(run, *kind.instant(run, after)[1:]))
 
     return jax.lax.scan(interval, start, None, length=samples)
@@ -215,9 +215,9 @@ def check_track_runs(
     if not robot.has_ground:
         raise ValueError("the robot's load is a shaft, which has no running gear; use steady or drive")
     if robot.rig.imposed != "voltage":
-        what = robot.rig.imposed.removeprefix("motor_")
+        quantity = robot.rig.imposed.removeprefix("motor_")
         raise ValueError(
-            f"the motors' {what} is imposed, but this model drives them by their voltage; use steady or drive"
+            f"the motors' {quantity} is imposed, but this model drives them by their voltage; use steady or drive"
         )
     if conditions.motor_speed is not None or (conditions.turns and conditions.of_sides().motor_speed is not None):
         raise ValueError("motor_speed: got an imposed speed; this model drives the motors by their voltage")

@@ -84,8 +84,8 @@ class Variation(eqx.Module):
     @property
     def axes(self) -> dict[str, Axis]:
         """Properties of each name that varies, in order."""
-        every = {p.name: p for p in params.walk_parameters(self.robot)}
-        return {name: self._axis(name, every.get(name)) for name in self.names}
+        parameters = {p.name: p for p in params.walk_parameters(self.robot)}
+        return {name: self._axis(name, parameters.get(name)) for name in self.names}
 
     def _axis(self, name: str, parameter: params.Parameter | None) -> Axis:
         if parameter is not None:
@@ -109,12 +109,12 @@ class Variation(eqx.Module):
             values: values in the order of `names`, in the axes' units. `configuration` is an index, rounded.
             conditions: values of the other conditions, names of configurations resolved.
         """
-        given: dict[str, Any] = {name: values[..., k] for k, name in enumerate(self.names)}
-        stated = {name: given.pop(name) for name in self.names if name in CONDITIONS}
-        if "configuration" in stated:
-            stated["configuration"] = jnp.round(stated["configuration"]).astype(int)
-        robot = params.replace(self.robot, given) if given else self.robot
-        return robot, dataclasses.replace(conditions, **stated)
+        values_by_name: dict[str, Any] = {name: values[..., k] for k, name in enumerate(self.names)}
+        condition_values = {name: values_by_name.pop(name) for name in self.names if name in CONDITIONS}
+        if "configuration" in condition_values:
+            condition_values["configuration"] = jnp.round(condition_values["configuration"]).astype(int)
+        robot = params.replace(self.robot, values_by_name) if values_by_name else self.robot
+        return robot, dataclasses.replace(conditions, **condition_values)
 
 
 def variable_names(robot: Robot) -> Names:
@@ -171,9 +171,9 @@ def _evaluate(
         from mmrjax.fidelities.steady import steady_outputs
 
         _known(names, table_of_outputs.output_names(outputs_of))
-        robot, each = variation.at(values, conditions)
-        each = jax.tree.map(lambda x: jnp.broadcast_to(x, (points,)), each)
-        return steady_outputs(robot, each, (*names, STATUS))
+        robot, point_conditions = variation.at(values, conditions)
+        point_conditions = jax.tree.map(lambda x: jnp.broadcast_to(x, (points,)), point_conditions)
+        return steady_outputs(robot, point_conditions, (*names, STATUS))
 
     def simulate(robot: Robot, conditions: Conditions) -> RunBatch:
         if profile is not None:

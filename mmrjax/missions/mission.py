@@ -190,8 +190,8 @@ def _segment_status(
     status = jnp.where(stands, STALLED, law.status(robot, asked.conditions, found))
     slow = [jnp.max(jnp.abs(jnp.asarray(x))) < 1.0 for x in (signals.direction, signals.direction_travel)]
     rests = stands | (slow[0] & slow[1])
-    wanted = (mode != BRAKE) & (mode != COAST) & (driven > 1e-6)
-    status = jnp.where(~wanted & (status == STALLED), CONVERGED, status)  # it stands as demanded
+    wants_motion = (mode != BRAKE) & (mode != COAST) & (driven > 1e-6)
+    status = jnp.where(~wants_motion & (status == STALLED), CONVERGED, status)  # it stands as demanded
     controlled = (mode == MOTOR_SPEED) | (mode == SPEED)
     per_speed = robot.gearbox.ratio / robot.chassis(otherwise.configuration).radius
     demanded = law.demanded(robot, otherwise, segment)
@@ -244,13 +244,13 @@ def mission(
         fresh = carry._replace(peaks=nothing, flags=jnp.asarray(0))
         beginning = law.instant(robot, conditions, segment, carry.y.at[law.CLOCK].set(0.0), carry.stands)[0]
         c = integrate_segment(law, robot, conditions, segment, fresh, tolerance, most_steps)
-        ended = _segment_end(law, robot, conditions, segment, carry, c, beginning)
-        carry = c._replace(peaks=jnp.maximum(carry.peaks, c.peaks), flags=carry.flags | ended.flags)
-        return carry, ended
+        segment_end = _segment_end(law, robot, conditions, segment, carry, c, beginning)
+        carry = c._replace(peaks=jnp.maximum(carry.peaks, c.peaks), flags=carry.flags | segment_end.flags)
+        return carry, segment_end
 
     order = jnp.tile(jnp.arange(profile.segment_count), profile.cycles)
-    c, each = jax.lax.scan(run_segment, _initial_carry(law, robot, conditions, begin, nothing, keep), order)
-    return _assemble_mission(law, robot, conditions, profile, c, each)
+    c, segment_ends = jax.lax.scan(run_segment, _initial_carry(law, robot, conditions, begin, nothing, keep), order)
+    return _assemble_mission(law, robot, conditions, profile, c, segment_ends)
 
 
 class _SegmentEnd(NamedTuple):
@@ -278,7 +278,7 @@ def _initial_carry(
     law: MotionLaw, robot: Robot, conditions: Conditions, start: Start, peaks: Array, keep: int
 ) -> IntegrationState:
     """State at the start of a mission, with space for `keep` recorded steps."""
-    dtype, whole, false = peaks.dtype, jnp.asarray(0), jnp.asarray(False)
+    dtype, zero, false = peaks.dtype, jnp.asarray(0), jnp.asarray(False)
     y0 = initial_unknowns(law, robot, conditions, start).astype(dtype) / law.units(robot).astype(dtype)
     q0 = jnp.zeros(len(law.TOTALS), dtype)
     buffer = None
@@ -288,8 +288,8 @@ def _initial_carry(
     return IntegrationState(
         y=y0, q=q0, step=jnp.asarray(FIRST, dtype), stands=jnp.asarray(start.speed == 0.0), ended=false,
         below=false, low=jnp.zeros((), dtype), cut_off=false, peaks=peaks,
-        flags=whole, events=jnp.full(len(EVENTS), -1.0, dtype), accepted=whole, rejected=whole, failed=false,
-        kept=whole, buffer=buffer, slope=jnp.zeros_like(y0),
+        flags=zero, events=jnp.full(len(EVENTS), -1.0, dtype), accepted=zero, rejected=zero, failed=false,
+        kept=zero, buffer=buffer, slope=jnp.zeros_like(y0),
     )  # fmt: skip
 
 
@@ -303,18 +303,18 @@ def _segment_end(
     beginning: Any,
 ) -> _SegmentEnd:
     """Data of a segment at its end `c`, given the state `before` it and its first instant."""
-    signals, _, _, asked = law.instant(robot, conditions, segment, c.y, c.stands)
-    status, missed = _segment_status(law, robot, conditions, segment, signals, asked, c.stands)
+    signals, _, _, demand = law.instant(robot, conditions, segment, c.y, c.stands)
+    status, missed = _segment_status(law, robot, conditions, segment, signals, demand, c.stands)
     status = jnp.where(c.ended, _early_end_status(c), status)
     slips = law.exceeded(robot, signals)["slips"] & ~c.stands
     flags = c.flags | flag_mask({"demand_missed": missed & ~c.ended, "slips": slips})
     rise = law.stored(robot, signals) - law.stored(robot, beginning)
     drawn, returned = (c.q[list(law.TOTALS).index(name)] for name in ("drawn", "returned"))
     first, last = (robot.battery.energy(_charge_taken(law, x.y)) for x in (before, c))
-    given = jnp.where(conditions.battery > 0.5, last - first, drawn - returned)
+    energy_supplied = jnp.where(conditions.battery > 0.5, last - first, drawn - returned)
     ran = ~before.ended
-    time, rise, given = (jnp.where(ran, x, 0.0) for x in (c.y[law.CLOCK], rise, given))
-    return _SegmentEnd(time, jnp.where(ran, c.q, 0.0), rise, given, c.peaks, status, flags, signals, c.kept)
+    time, rise, energy_supplied = (jnp.where(ran, x, 0.0) for x in (c.y[law.CLOCK], rise, energy_supplied))
+    return _SegmentEnd(time, jnp.where(ran, c.q, 0.0), rise, energy_supplied, c.peaks, status, flags, signals, c.kept)
 
 
 def _assemble_mission(
@@ -323,8 +323,8 @@ def _assemble_mission(
     """Mission from its last state `c` and the ends of its segments, shape (cycles · segments, ...)."""
     shape = (profile.cycles, profile.segment_count)
     totals = {n: ends.q[:, i].reshape(shape) for i, n in enumerate(law.TOTALS)}
-    each = Totals(ends.time.reshape(shape), totals, ends.rise.reshape(shape), ends.given.reshape(shape))
-    total, status = jax.tree.map(jnp.sum, each), ends.status
+    by_segment = Totals(ends.time.reshape(shape), totals, ends.rise.reshape(shape), ends.given.reshape(shape))
+    total, status = jax.tree.map(jnp.sum, by_segment), ends.status
     bad = (status == STALLED) | (status == SLIDES) | (status == ROLLS_BACK) | (status == TIPS)
     first = jnp.argmax(bad)
     outcome = jnp.where(jnp.any(bad), status[first], CONVERGED)
@@ -339,10 +339,10 @@ def _assemble_mission(
 
     course = None
     if c.buffer is not None:
-        course = _recorded_course(law, robot, conditions, profile, c, each, ends.kept)
+        course = _recorded_course(law, robot, conditions, profile, c, by_segment, ends.kept)
     winding, housing = _winding_and_housing_temperatures(law, c.y)
     return Mission(
-        total=total, segments=each, peaks=named(c.peaks), segment_peaks=named(ends.peaks.reshape(*shape, -1)),
+        total=total, segments=by_segment, peaks=named(c.peaks), segment_peaks=named(ends.peaks.reshape(*shape, -1)),
         status=status.reshape(shape), flags=ends.flags.reshape(shape), result=answer,
         temperature_winding=jnp.max(winding), temperature_housing=jnp.max(housing), discharge=_charge_taken(law, c.y),
         steps=c.accepted + c.rejected, rejected=c.rejected,
@@ -371,7 +371,7 @@ def _recorded_course(
     # Segment of each recorded step: the first one with a larger step count.
     segment = jnp.minimum(jnp.searchsorted(kept, index, side="right"), len(kept) - 1)
     within = index < kept[-1]
-    begun = jnp.concatenate([jnp.zeros(1), jnp.cumsum(each.time.ravel())])[segment]
+    begin_times = jnp.concatenate([jnp.zeros(1), jnp.cumsum(each.time.ravel())])[segment]
     so_far = {
         name: jnp.concatenate([jnp.zeros(1), jnp.cumsum(each.of[name].ravel())])[segment] + qs[:, i]
         for i, name in enumerate(law.TOTALS)
@@ -382,14 +382,14 @@ def _recorded_course(
             law.instant(robot, conditions, profile.row(k % profile.segment_count), y, stands)[0]
         )
 
-    every = law.at_places(jax.vmap(signals)(ys, stood, segment), so_far)
+    course_signals = law.at_places(jax.vmap(signals)(ys, stood, segment), so_far)
     winding, housing = _winding_and_housing_temperatures(law, ys)
 
     def shown(x: Array) -> Array:
         return jnp.where(within.reshape(-1, *[1] * (x.ndim - 1)), x, jnp.nan)
 
     return MissionCourse(
-        time=shown(begun + ys[:, law.CLOCK]),
+        time=shown(begin_times + ys[:, law.CLOCK]),
         segment=jnp.where(within, segment, -1),
         event=jnp.where(within, marks, -1),
         distance=shown(so_far["distance"]),
@@ -397,5 +397,5 @@ def _recorded_course(
         energy=shown(so_far["drawn"] - so_far["returned"]),
         temperature_winding=shown(winding),
         temperature_housing=shown(housing),
-        signals=jax.tree.map(shown, every),
+        signals=jax.tree.map(shown, course_signals),
     )

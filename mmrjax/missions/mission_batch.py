@@ -60,7 +60,7 @@ def mission_totals(found: Totals, peaks: Mapping[str, Array]) -> dict[str, Array
     NaN for a segment that was not reached.
     """
     by_segment, ran = found.of, found.time > 0
-    turned = by_segment["drawn"] + by_segment["returned"] + sum(jnp.abs(by_segment[name]) for name in SINKS)
+    converted_energy = by_segment["drawn"] + by_segment["returned"] + sum(jnp.abs(by_segment[name]) for name in SINKS)
     still = by_segment["path"] <= 1e-6  # m
     numbers = {
         "duration": found.time,
@@ -82,7 +82,7 @@ def mission_totals(found: Totals, peaks: Mapping[str, Array]) -> dict[str, Array
         "cell_low": jnp.where(jnp.isfinite(peaks["cell_low"]), peaks["cell_low"], jnp.nan),
         **{f"energy_to_{name}": by_segment[name] for name in SINKS},
         "energy_stored": found.stored,
-        "unaccounted_share": _safe_ratio(found.unaccounted, turned),
+        "unaccounted_share": _safe_ratio(found.unaccounted, converted_energy),
     }
     if "turned" in by_segment:
         numbers |= {name: by_segment[name] for name in ("turned", "place_x", "place_y")} | {
@@ -106,10 +106,12 @@ def mission_numbers(robot: Robot, conditions: Conditions, found: Mission) -> dic
     the voltage falls.
     """
     on_battery, capacity = conditions.battery > 0.5, robot.battery.capacity
-    used = found.discharge - conditions.discharge
+    charge_used = found.discharge - conditions.discharge
     time, path = jnp.asarray(found.total.time), jnp.asarray(found.total.of["path"])
-    ended = (found.result.status == BATTERY_EMPTY) | (found.result.status == CUT_OFF)
-    times = jnp.where(ended, 1.0, _safe_ratio(capacity - conditions.discharge, used))  # number of missions per charge
+    is_empty = (found.result.status == BATTERY_EMPTY) | (found.result.status == CUT_OFF)
+    times = jnp.where(
+        is_empty, 1.0, _safe_ratio(capacity - conditions.discharge, charge_used)
+    )  # number of missions per charge
     return {
         **mission_totals(found.total, found.peaks),
         "state_of_charge": jnp.where(on_battery, 1 - found.discharge / capacity, jnp.nan),

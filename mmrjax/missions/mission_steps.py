@@ -171,11 +171,11 @@ def _holding_margins(
 
     A controller lowers its demand once the error has vanished.
     """
-    asked = law.asked_at(robot, otherwise, segment, y, stands)
+    demand = law.asked_at(robot, otherwise, segment, y, stands)
     at_rest = law.asked_at(robot, otherwise, segment, y, jnp.asarray(True))
     current = law.AT_REST.current_at_rest(at_rest.robot, at_rest.conditions, law.state_of(at_rest.robot, y, stands))
     settled = y.at[law.CURRENT].set(current / law.UNITS[0])
-    firm = _holding_margin(law, asked, y, stands)
+    firm = _holding_margin(law, demand, y, stands)
     return firm, smallest_of(firm, _holding_margin(law, at_rest, settled, stands))
 
 
@@ -230,17 +230,17 @@ def event_functions(
     law: MotionLaw, robot: Robot, otherwise: Conditions, segment: Profile, y: Array, stands: Array, below: Array
 ) -> Float[Array, " events"]:
     """Functions that become positive when their event (see `EVENTS`) has happened [-]."""
-    asked = law.asked_at(robot, otherwise, segment, y, stands)
-    slow, grips = law.slowness(asked, y, stands)
+    demand = law.asked_at(robot, otherwise, segment, y, stands)
+    slow, grips = law.slowness(demand, y, stands)
     near = stands | ((slow > -1) & (grips > -1))
 
     none = -jnp.ones_like(slow)
-    here = (robot, otherwise, segment, y, stands)
-    firm, stays = compute_if_needed(near, functools.partial(_holding_margins, law), here, (none, none))
+    law_inputs = (robot, otherwise, segment, y, stands)
+    firm, stays = compute_if_needed(near, functools.partial(_holding_margins, law), law_inputs, (none, none))
     standing = smallest_of(slow, grips, stays - FIRMLY)
-    battery, discharge = asked.robot.battery, law.supply_current_and_charge(asked, y, stands)[1]
-    empty = jnp.where(asked.conditions.battery > 0.5, (discharge / battery.capacity - 1) / OF_CHARGE, -1.0)
-    above = _cell_margin(law, asked, y, stands)
+    battery, discharge = demand.robot.battery, law.supply_current_and_charge(demand, y, stands)[1]
+    empty = jnp.where(demand.conditions.battery > 0.5, (discharge / battery.capacity - 1) / OF_CHARGE, -1.0)
+    above = _cell_margin(law, demand, y, stands)
     falls, recovers = jnp.where(below, -1.0, -above / OF_CELL), jnp.where(below, (above - RECOVERED) / OF_CELL, -1.0)
     return jnp.stack([jnp.where(stands, -1.0, standing), jnp.where(stands, -firm, -1.0), empty, falls, recovers])
 
@@ -270,20 +270,20 @@ def _move_to_event(
     steep = jax.jvp(lambda y: event_functions(law, robot, otherwise, segment, y, stands, below), (y,), (dy,))[1]
     back = jnp.where(steep > 1e-9, -after / jnp.where(steep > 1e-9, steep, 1.0), 0.0)
     back = jnp.where(jnp.abs(back) < h, back, 0.0)
-    which = jnp.argmin(jnp.where(after > 0, back, jnp.inf))
-    back = back[which]
+    event_index = jnp.argmin(jnp.where(after > 0, back, jnp.inf))
+    back = back[event_index]
     y, q = y + back * dy, q + back * dq
     # At a stop, the remaining kinetic energy is dissipated by the sliding contacts.
     rest = y
     for k in law.STOPS:
         rest = rest.at[k].set(0.0)
-    moved, parked = (law.instant(robot, otherwise, segment, x, stands)[0] for x in (y, rest))
-    halts = which == STANDS
-    lost = jnp.where(halts, law.stored(robot, moved) - law.stored(robot, parked), 0.0)
-    q = q.at[list(law.TOTALS).index("sliding")].add(lost)
-    stands = (stands | halts) & (which != BREAKS_AWAY)
-    below = (below | (which == FALLS)) & (which != RECOVERS)
-    return jnp.where(halts, rest, y), q, stands, below, which, back
+    state_at_event, parked = (law.instant(robot, otherwise, segment, x, stands)[0] for x in (y, rest))
+    halts = event_index == STANDS
+    stored_energy_lost = jnp.where(halts, law.stored(robot, state_at_event) - law.stored(robot, parked), 0.0)
+    q = q.at[list(law.TOTALS).index("sliding")].add(stored_energy_lost)
+    stands = (stands | halts) & (event_index != BREAKS_AWAY)
+    below = (below | (event_index == FALLS)) & (event_index != RECOVERS)
+    return jnp.where(halts, rest, y), q, stands, below, event_index, back
 
 
 def integrate_segment(
@@ -374,10 +374,10 @@ class _SegmentIntegrator(NamedTuple):
         law, robot, otherwise, segment, *_ = self
         # The inputs of the segment may exceed the friction that held the robot.
         y = carry.y.at[law.CLOCK].set(0.0)
-        asked = law.asked_at(robot, otherwise, segment, y, carry.stands)
-        stands = carry.stands & (_holding_margin(law, asked, y, carry.stands) >= 0)
+        demand = law.asked_at(robot, otherwise, segment, y, carry.stands)
+        stands = carry.stands & (_holding_margin(law, demand, y, carry.stands) >= 0)
         # They may also change the cell voltage across its cut-off.
-        below = jnp.asarray(_cell_margin(law, asked, y, stands) < 0)
+        below = jnp.asarray(_cell_margin(law, demand, y, stands) < 0)
         low = jnp.where(below & carry.below, carry.low, 0.0)
         step = jnp.minimum(jnp.asarray(FIRST, y.dtype), self.longest)
         events = event_functions(law, robot, otherwise, segment, y, stands, below)
@@ -398,9 +398,9 @@ class _SegmentIntegrator(NamedTuple):
 
         to_end = self.length - c.y[law.CLOCK]
         to_trip = jnp.where(c.below, robot.battery.delay_cutoff - c.low, jnp.inf)
-        left, trips = jnp.minimum(to_end, to_trip), to_trip < to_end
-        last = c.step >= left * (1 - 1e-9)
-        h = jnp.where(last, left, jax.lax.stop_gradient(c.step))
+        step_left, trips = jnp.minimum(to_end, to_trip), to_trip < to_end
+        last = c.step >= step_left * (1 - 1e-9)
+        h = jnp.where(last, step_left, jax.lax.stop_gradient(c.step))
         y, q, u, _ = rosenbrock_stages(rates, c.y, c.q, h, looped=law.LONG)
         y = y.at[law.CLOCK].set(jnp.where(last & ~trips, self.length, y[law.CLOCK]))
         scale = self.tolerance * (1 + jnp.maximum(jnp.abs(c.y), jnp.abs(y)))
@@ -420,57 +420,58 @@ class _SegmentIntegrator(NamedTuple):
         # The next step is to end slightly beyond it.
         share = jnp.where(between, (c.events - EVENT / 2) / jnp.where(between, c.events - after, 1.0), 1.0)
         far = jnp.any(between & (after > EVENT)) & (h > NEAR)
-        taken = good & ~far
-        event = taken & jnp.any(happened)
-        here = (robot, otherwise, segment, y, q, c.stands, c.below, after, h)
+        is_accepted = good & ~far
+        event = is_accepted & jnp.any(happened)
+        event_inputs = (robot, otherwise, segment, y, q, c.stands, c.below, after, h)
         none = (y, q, c.stands, c.below, jnp.asarray(-1, jnp.argmin(after).dtype), jnp.zeros_like(h))
-        y, q, stands, below, which, back = compute_if_needed(
-            event, functools.partial(_move_to_event, law), here, none
+        y, q, stands, below, event_index, back = compute_if_needed(
+            event, functools.partial(_move_to_event, law), event_inputs, none
         )
-        y, q = jnp.where(taken, y, c.y), jnp.where(taken, q, c.q)
-        stands = jnp.where(taken, stands, c.stands)
-        low = jnp.where(below & c.below, c.low + jnp.where(taken, h + back, 0.0), 0.0)
-        cut_off = taken & _stayed_below(robot, below, low)
+        y, q = jnp.where(is_accepted, y, c.y), jnp.where(is_accepted, q, c.q)
+        stands = jnp.where(is_accepted, stands, c.stands)
+        low = jnp.where(below & c.below, c.low + jnp.where(is_accepted, h + back, 0.0), 0.0)
+        cut_off = is_accepted & _stayed_below(robot, below, low)
         # After a step shortened by the segment's end or an event, the length before it.
-        step = jnp.where(taken, jnp.where(last, jnp.maximum(grown, c.step), grown), grown)
+        step = jnp.where(is_accepted, jnp.where(last, jnp.maximum(grown, c.step), grown), grown)
         step = jnp.where(good & far, h * jnp.clip(jnp.min(share), 0.02, 0.99), step)
         step = jnp.where(event, FIRST, step)
         step = jnp.clip(jax.lax.stop_gradient(step), SHORTEST, self.longest)
-        return _StepToEvent(y, q, stands, below, low, which, cut_off, after, taken, event, step)
+        return _StepToEvent(y, q, stands, below, low, event_index, cut_off, after, is_accepted, event, step)
 
     def after(self, c: IntegrationState, h: Array, good: Array, landed: _StepToEvent) -> IntegrationState:
         """State after a step of length h [s], with its contributions to peaks, flags and recorded steps."""
         law, robot, otherwise, segment, *_ = self
-        y, stands, below, taken, cut_off = landed.y, landed.stands, landed.below, landed.taken, landed.cut_off
+        y, stands, below, is_accepted, cut_off = landed.y, landed.stands, landed.below, landed.taken, landed.cut_off
         signals, dy, _, _ = law.instant(robot, otherwise, segment, y, stands)
         # Current and heat may peak within the step. Speeds are different: at the end of a long step their slopes
         # belong to the stiff part of the solution, and a cubic would oscillate.
         tops = _peak_between(c.y, y, h * c.slope, h * dy)
         within = law.peaks_within(robot, y, tops)
-        highest = jnp.stack([jnp.where(taken, within.get(name, -jnp.inf), -jnp.inf) for name in law.PEAKS])
-        each = law.peaks(robot, signals)
+        highest = jnp.stack([jnp.where(is_accepted, within.get(name, -jnp.inf), -jnp.inf) for name in law.PEAKS])
+        signal_peaks = law.peaks(robot, signals)
         peaks = jnp.maximum(
-            jnp.maximum(c.peaks, jnp.stack([jnp.asarray(each[name]) * jnp.ones(()) for name in law.PEAKS])), highest
+            jnp.maximum(c.peaks, jnp.stack([jnp.asarray(signal_peaks[name]) * jnp.ones(()) for name in law.PEAKS])),
+            highest,
         )
-        hot = taken & (within["temperature"] > robot.motor.temperature_limit)
-        over = law.exceeded(robot, signals)
-        over.pop("slips")  # every start slips for an instant; for a segment, slip counts at its end
-        flags = flag_mask({**over, "cut_off": cut_off}) | flag_mask({"too_hot": hot})
+        hot = is_accepted & (within["temperature"] > robot.motor.temperature_limit)
+        exceedance = law.exceeded(robot, signals)
+        exceedance.pop("slips")  # every start slips for an instant; for a segment, slip counts at its end
+        flags = flag_mask({**exceedance, "cut_off": cut_off}) | flag_mask({"too_hot": hot})
         failed = c.failed | (~good & (h <= SHORTEST))
-        ended = c.ended | cut_off | (landed.which == EMPTY) | failed
+        has_ended = c.ended | cut_off | (landed.which == EMPTY) | failed
         now = (robot, otherwise, segment, y, stands, below)
-        unchanged = jnp.where(taken, landed.after, c.events)
+        unchanged = jnp.where(is_accepted, landed.after, c.events)
         events_now = compute_if_needed(landed.event, functools.partial(event_functions, law), now, unchanged)
-        kept, buffer = c.kept, c.buffer
+        buffer_count, buffer = c.kept, c.buffer
         if buffer is not None:
-            slot = jnp.where(taken, kept, buffer[0].shape[0])  # beyond the end: dropped
+            slot = jnp.where(is_accepted, buffer_count, buffer[0].shape[0])  # beyond the end: dropped
             row = (y, landed.q, stands, jnp.where(cut_off, MARKS.index("cut_off"), landed.which))
             buffer = tuple(b.at[slot].set(r, mode="drop") for b, r in zip(buffer, row, strict=True))
         return IntegrationState(
-            y=y, q=landed.q, step=landed.step, stands=stands, ended=ended, below=below, low=landed.low,
+            y=y, q=landed.q, step=landed.step, stands=stands, ended=has_ended, below=below, low=landed.low,
             cut_off=cut_off, peaks=peaks, flags=c.flags | flags,
-            events=events_now, accepted=c.accepted + taken, rejected=c.rejected + ~taken, failed=failed,
-            kept=kept + taken, buffer=buffer, slope=dy,
+            events=events_now, accepted=c.accepted + is_accepted, rejected=c.rejected + ~is_accepted, failed=failed,
+            kept=buffer_count + is_accepted, buffer=buffer, slope=dy,
         )  # fmt: skip
 
 

@@ -92,19 +92,19 @@ def controlled_duty(
     controlled = (mode == MOTOR_SPEED) | (mode == SPEED)
     voltage_source = source_voltage(robot, conditions, state.discharge)
     voltage = robot.driver.demand(error, integral, demanded, robot.motor.torque_constant)
-    wanted = voltage / jnp.maximum(voltage_source, 1e-3)
-    limited = robot.driver.duty_limited(clip(wanted, -1.0, 1.0), state.current)
+    duty_wanted = voltage / jnp.maximum(voltage_source, 1e-3)
+    limited = robot.driver.duty_limited(clip(duty_wanted, -1.0, 1.0), state.current)
     # Anti-windup: the part of the demand beyond the limits is taken off the integral.
-    excess = (wanted - limited) * voltage_source / (robot.driver.gain * robot.motor.torque_constant + 1e-12)
-    duty = clip(jnp.where(controlled, conditions.polarity * wanted, conditions.duty), -1.0, 1.0)
+    excess = (duty_wanted - limited) * voltage_source / (robot.driver.gain * robot.motor.torque_constant + 1e-12)
+    duty = clip(jnp.where(controlled, conditions.polarity * duty_wanted, conditions.duty), -1.0, 1.0)
     return duty, jnp.where(controlled, error - excess, 0.0), jnp.where(controlled, error, 0.0)
 
 
 def asked_at(robot: Robot, otherwise: Conditions, segment: Profile, y: Array, stands: Array) -> SegmentInputs:
-    asked = segment.at(y[CLOCK])
-    robot, conditions = with_consumers(robot, asked), asked.conditions(otherwise)
+    demand = segment.at(y[CLOCK])
+    robot, conditions = with_consumers(robot, demand), demand.conditions(otherwise)
     state, integral = state_of(robot, y, stands), y[INTEGRAL] * UNITS[INTEGRAL]
-    duty, rate, error = controlled_duty(robot, asked.mode, asked.demand, conditions, state, integral)
+    duty, rate, error = controlled_duty(robot, demand.mode, demand.demand, conditions, state, integral)
     return SegmentInputs(robot, dataclasses.replace(conditions, duty=duty), rate, error)
 
 
@@ -113,9 +113,9 @@ def instant(
     robot: Robot, otherwise: Conditions, segment: Profile, y: Array, stands: Array
 ) -> tuple[Signals, Array, Array, SegmentInputs]:
     """Signals of an instant, rates of the unknowns in their units, and of the totals [1/s]."""
-    asked = asked_at(robot, otherwise, segment, y, stands)
+    demand = asked_at(robot, otherwise, segment, y, stands)
     state = state_of(robot, y, stands)
-    signals = balances.moving_signals(asked.robot, asked.conditions, state)
+    signals = balances.moving_signals(demand.robot, demand.conditions, state)
     winding, housing = (y[k] * UNITS[k] for k in (WINDING, HOUSING))
     copper = robot.motor.voltage_winding(signals.current, winding) * signals.current
     copper = copper * robot.driver.ripple(signals.duty)
@@ -125,15 +125,15 @@ def instant(
         signals.voltage_left / signals.inductance,
         still * signals.acceleration_wheel * robot.gearbox.ratio,
         still * signals.acceleration,
-        balances.charge_drawn(asked.robot, asked.conditions, signals.total_current),
+        balances.charge_drawn(demand.robot, demand.conditions, signals.total_current),
         *heating,
-        asked.integral_rate,
+        demand.integral_rate,
         1.0,
         *(effect.rate(robot, signals) for effect in robot.remembering),
     ]
-    power = energy.source_power(asked.robot, asked.conditions, signals)
+    power = energy.source_power(demand.robot, demand.conditions, signals)
     current, torque = robot.sides * signals.current, signals.torque_gear
-    goes = energy.sink_powers(asked.robot, asked.conditions, signals)
+    goes = energy.sink_powers(demand.robot, demand.conditions, signals)
     totals = [
         signals.speed, jnp.abs(signals.speed), jnp.maximum(power, 0.0), jnp.maximum(-power, 0.0), current**2,
         torque**2, *goes.values(),
@@ -143,7 +143,7 @@ def instant(
         signals,
         jnp.stack([jnp.asarray(r, dtype) for r in rates]) / units(robot).astype(dtype),
         jnp.stack([jnp.asarray(x, dtype) for x in totals]),
-        asked,
+        demand,
     )
 
 

@@ -95,20 +95,20 @@ def demanded(robot: Robot, otherwise: Conditions, segment: Profile) -> Array:
 
 
 def asked_at(robot: Robot, otherwise: Conditions, segment: Profile, y: Array, stands: Array) -> SegmentInputs:
-    asked = segment.at(y[CLOCK])
-    robot, conditions = mission_straight.with_consumers(robot, asked), asked.conditions(otherwise)
+    segment_demand = segment.at(y[CLOCK])
+    robot, conditions = mission_straight.with_consumers(robot, segment_demand), segment_demand.conditions(otherwise)
     motion, of_sides = state_of(robot, y, stands), conditions.of_sides()
     state = balances.states_of_sides(robot, conditions, motion)
-    if asked.voltage_left is not None and asked.voltage_right is not None:
-        volts = jnp.stack([asked.voltage_left, asked.voltage_right])
+    if segment_demand.voltage_left is not None and segment_demand.voltage_right is not None:
+        volts = jnp.stack([segment_demand.voltage_left, segment_demand.voltage_right])
         share = (
             of_sides.polarity
             * volts
             / jnp.maximum(mission_straight.source_voltage(robot, of_sides, state.discharge), 1e-3)
         )
-        of_sides = dataclasses.replace(of_sides, duty=jnp.where(asked.mode == VOLTAGE, share, of_sides.duty))
-    demand = demanded(robot, conditions, asked)
-    law = jax.vmap(functools.partial(mission_straight.controlled_duty, robot, asked.mode))
+        of_sides = dataclasses.replace(of_sides, duty=jnp.where(segment_demand.mode == VOLTAGE, share, of_sides.duty))
+    demand = demanded(robot, conditions, segment_demand)
+    law = jax.vmap(functools.partial(mission_straight.controlled_duty, robot, segment_demand.mode))
     duty, rate, error = law(demand, of_sides, state, y[INTEGRAL] * _EACH[-1])
     return SegmentInputs(robot, dataclasses.replace(conditions, duty_left=duty[0], duty_right=duty[1]), rate, error)
 
@@ -118,9 +118,9 @@ def instant(
     robot: Robot, otherwise: Conditions, segment: Profile, y: Array, stands: Array
 ) -> tuple[TurningInstant, Array, Array, SegmentInputs]:
     """Signals and motion, rates of the unknowns in their units and of the totals [1/s], and inputs of an instant."""
-    asked = asked_at(robot, otherwise, segment, y, stands)
+    demand = asked_at(robot, otherwise, segment, y, stands)
     motion = state_of(robot, y, stands)
-    travel = balances.turning_signals(asked.robot, asked.conditions, motion)
+    travel = balances.turning_signals(demand.robot, demand.conditions, motion)
     signals = travel.signals
     winding, housing = (y[k] * _EACH[2] for k in (WINDING, HOUSING))
     copper = robot.motor.voltage_winding(signals.current, winding) * signals.current
@@ -130,18 +130,18 @@ def instant(
         signals.voltage_left / signals.inductance,
         still * signals.acceleration_wheel * robot.gearbox.ratio,
         *robot.heating(copper, winding, housing),
-        asked.integral_rate,
+        demand.integral_rate,
         still * travel.acceleration,
         still * travel.acceleration_lateral,
         still * travel.acceleration_yaw,
         motion.yaw_rate,
-        balances.charge_drawn(asked.robot, asked.conditions, jnp.asarray(signals.total_current)[0]),
+        balances.charge_drawn(demand.robot, demand.conditions, jnp.asarray(signals.total_current)[0]),
         1.0,
         *(jax.vmap(lambda s, effect=effect: effect.rate(robot, s))(signals) for effect in robot.remembering),
     ]
-    power = jnp.mean(jnp.asarray(energy.source_power(asked.robot, asked.conditions, signals)))
+    power = jnp.mean(jnp.asarray(energy.source_power(demand.robot, demand.conditions, signals)))
     current, torque = (jnp.asarray(x) ** 2 for x in (signals.current, signals.torque_gear))
-    goes = energy.sink_powers_turning(asked.robot, asked.conditions, travel)
+    goes = energy.sink_powers_turning(demand.robot, demand.conditions, travel)
     cos, sin = jnp.cos(motion.heading), jnp.sin(motion.heading)
     totals = [
         motion.speed, _ground_speed(motion), jnp.maximum(power, 0.0), jnp.maximum(-power, 0.0),
@@ -154,7 +154,7 @@ def instant(
         TurningInstant(**vars(travel), motion=motion),
         jnp.concatenate([jnp.atleast_1d(jnp.asarray(r, y.dtype)) for r in rates]) / units(robot).astype(y.dtype),
         jnp.stack([jnp.asarray(x, y.dtype) for x in totals]),
-        asked,
+        demand,
     )
 
 
@@ -187,10 +187,13 @@ def stored(robot: Robot, found: TurningInstant) -> Scalar:
 
 
 def peaks(robot: Robot, found: TurningInstant) -> Scalars:
-    each = jax.vmap(lambda s: mission_straight.peaks(robot, s))(found.signals)
-    most: Scalars = {name: jnp.max(jnp.asarray(x)) for name, x in each.items()}
-    most |= {"current": sum_of_sides(jnp.asarray(each["current"])) / 2, "speed": _ground_speed(found.motion)}
-    return {**most, "yaw_rate": jnp.abs(found.motion.yaw_rate), **_peaks_of_sides(robot, each)}
+    peaks_of_sides = jax.vmap(lambda s: mission_straight.peaks(robot, s))(found.signals)
+    most: Scalars = {name: jnp.max(jnp.asarray(x)) for name, x in peaks_of_sides.items()}
+    most |= {
+        "current": sum_of_sides(jnp.asarray(peaks_of_sides["current"])) / 2,
+        "speed": _ground_speed(found.motion),
+    }
+    return {**most, "yaw_rate": jnp.abs(found.motion.yaw_rate), **_peaks_of_sides(robot, peaks_of_sides)}
 
 
 def peaks_within(robot: Robot, y: Array, tops: Array) -> Scalars:
@@ -203,13 +206,13 @@ def peaks_within(robot: Robot, y: Array, tops: Array) -> Scalars:
 def _peaks_of_sides(robot: Robot, each: dict[str, Any]) -> Scalars:
     """Peaks of one motor of each side."""
     current = jnp.asarray(each["current"]) / robot.sides
-    both = (("current", current), ("temperature", jnp.asarray(each["temperature"])))
-    return {f"{name}_{side}": x[k] for name, x in both for k, side in enumerate(channels.SIDES)}
+    signed_quantities = (("current", current), ("temperature", jnp.asarray(each["temperature"])))
+    return {f"{name}_{side}": x[k] for name, x in signed_quantities for k, side in enumerate(channels.SIDES)}
 
 
 def exceeded(robot: Robot, found: TurningInstant) -> Scalars:
-    each = jax.vmap(lambda s: mission_straight.exceeded(robot, s))(found.signals)
-    return {name: jnp.any(x) for name, x in each.items()}
+    exceeded_by_side = jax.vmap(lambda s: mission_straight.exceeded(robot, s))(found.signals)
+    return {name: jnp.any(x) for name, x in exceeded_by_side.items()}
 
 
 def limited(robot: Robot, y: Array) -> Array:

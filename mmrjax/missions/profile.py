@@ -121,15 +121,15 @@ class Profile(eqx.Module):
 
     def conditions(self, otherwise: Conditions) -> Conditions:
         """Conditions at an instant (see `at`). Those that the profile does not state are from `otherwise`."""
-        stated = {name: getattr(self, name) for name in CONDITIONS if getattr(self, name) is not None}
-        if "payload" in stated and otherwise.total_mass is not None:
-            stated["total_mass"] = otherwise.total_mass + stated["payload"] - otherwise.payload
-        held = (self.mode == BRAKE) | (self.mode == COAST)
+        condition_values = {name: getattr(self, name) for name in CONDITIONS if getattr(self, name) is not None}
+        if "payload" in condition_values and otherwise.total_mass is not None:
+            condition_values["total_mass"] = otherwise.total_mass + condition_values["payload"] - otherwise.payload
+        is_undriven = (self.mode == BRAKE) | (self.mode == COAST)
         for name in ("duty", "duty_left", "duty_right"):
-            duty = stated.get(name, getattr(otherwise, name))
-            stated[name] = None if duty is None else jnp.where(held, 0.0, duty)
+            duty = condition_values.get(name, getattr(otherwise, name))
+            condition_values[name] = None if duty is None else jnp.where(is_undriven, 0.0, duty)
         opened = jnp.where(self.mode == COAST, 1.0, jnp.where(self.mode == BRAKE, -1.0, otherwise.open))
-        return dataclasses.replace(otherwise, **stated, open=opened)
+        return dataclasses.replace(otherwise, **condition_values, open=opened)
 
 
 Index = Int[Array, ""] | int
@@ -177,11 +177,11 @@ def profile(
     unknown = sorted(set(values) - set(allowed))
     if unknown:
         raise UsageError(f"profile: no field {unknown[0]}; expected one of {', '.join(allowed)}")
-    given: dict[str, Any] = {"demand": demand, **{name: v for name, v in values.items() if v is not None}}
-    if why := sides_error(list(given), MODES[SPEED] in modes):
+    columns: dict[str, Any] = {"demand": demand, **{name: v for name, v in values.items() if v is not None}}
+    if why := sides_error(list(columns), MODES[SPEED] in modes):
         raise UsageError(f"profile: {why}")
     arrays = {}
-    for name, value in given.items():
+    for name, value in columns.items():
         x = np.asarray(value, float)
         if x.ndim > 1 or (x.ndim == 1 and len(x) != len(rows)):
             raise UsageError(

@@ -180,8 +180,8 @@ def begin_signals(robot: Robot, conditions: Conditions, state: State, direction:
     )
     if isinstance(chassis, Shaft):  # no ground carries it
         return _fill_unset(signals, mass=jnp.zeros_like(state.speed), normal=jnp.zeros_like(state.speed))
-    stated = chassis.mass + conditions.payload if conditions.total_mass is None else conditions.total_mass
-    mass = stated + effects_sum(robot, _fill_unset(signals, mass=stated), "mass")
+    total_mass = chassis.mass + conditions.payload if conditions.total_mass is None else conditions.total_mass
+    mass = total_mass + effects_sum(robot, _fill_unset(signals, mass=total_mass), "mass")
     normal = chassis_room.normal_load(mass, conditions.slope, GRAVITY, robot.sides)
     return _fill_unset(signals, mass=mass, normal=normal)
 
@@ -223,9 +223,9 @@ def electrical(robot: Robot, conditions: Conditions, signals: Signals) -> Signal
         robot, signals, "electrical"
     )
     if conditions.voltage_follows:
-        asked = signals.current if conditions.motor_current is None else conditions.motor_current
-        taken = back + drop + robot.motor.resistance * (asked - signals.current)
-        signals = _fill_unset(signals, voltage=taken, voltage_source=taken)
+        current_imposed = signals.current if conditions.motor_current is None else conditions.motor_current
+        voltage_needed = back + drop + robot.motor.resistance * (current_imposed - signals.current)
+        signals = _fill_unset(signals, voltage=voltage_needed, voltage_source=voltage_needed)
     return _fill_unset(
         signals,
         voltage_back=back,
@@ -332,8 +332,8 @@ def gearbox(
     if not any(e.balance == "gearbox" for e in robot.effects):
         return _fill_unset(output, torque_carried=transmitted(output))
     for _ in range(TORQUE_STEPS):
-        left, rise = jax.jvp(surplus, (torque,), (jnp.ones_like(torque),))
-        torque = torque - left / rise
+        residual, rise = jax.jvp(surplus, (torque,), (jnp.ones_like(torque),))
+        torque = torque - residual / rise
     return at_output(torque)
 
 
@@ -451,11 +451,11 @@ def _signals_at_imposed_speed(robot: Robot, conditions: Conditions, chassis: Cha
     def at(given: tuple[Robot, Conditions, Chassis, Signals], current: Scalar) -> Signals:
         robot, conditions, chassis, signals = given
         total = robot.sides * current * signals.share_drawn
-        moved = electrical(robot, conditions, _fill_unset(signals, current=current, total_current=total))
-        return gearbox(robot, chassis, motor(robot, moved))
+        signals_at_current = electrical(robot, conditions, _fill_unset(signals, current=current, total_current=total))
+        return gearbox(robot, chassis, motor(robot, signals_at_current))
 
-    given = robot, conditions, chassis, signals
-    return at(given, _solve_current(at, given))
+    inputs = robot, conditions, chassis, signals
+    return at(inputs, _solve_current(at, inputs))
 
 
 def _solve_current(signals: Callable[[Any, Scalar], Signals], given: tuple) -> Scalar:
@@ -468,15 +468,15 @@ def _solve_current(signals: Callable[[Any, Scalar], Signals], given: tuple) -> S
 
     def lacking(given: tuple, current: Scalar) -> Scalar:
         robot, conditions, *_ = given
-        asked = 0.0 if conditions.motor_acceleration is None else conditions.motor_acceleration
-        return signals(given, current).acceleration_wheel * robot.gearbox.ratio - asked
+        acceleration_imposed = 0.0 if conditions.motor_acceleration is None else conditions.motor_acceleration
+        return signals(given, current).acceleration_wheel * robot.gearbox.ratio - acceleration_imposed
 
     fixed = jax.tree.map(lambda x: jax.lax.stop_gradient(x) if isinstance(x, jax.Array) else x, given)
     current = jnp.zeros_like(jnp.asarray(fixed[1].motor_speed))
     for step in range(CURRENT_STEPS):
-        left, rise = jax.jvp(lambda x: lacking(fixed, x), (current,), (jnp.ones_like(current),))
-        left = lacking(given, current) if step == CURRENT_STEPS - 1 else left
-        current = current - left / rise
+        residual, rise = jax.jvp(lambda x: lacking(fixed, x), (current,), (jnp.ones_like(current),))
+        residual = lacking(given, current) if step == CURRENT_STEPS - 1 else residual
+        current = current - residual / rise
     return current
 
 
@@ -679,8 +679,8 @@ def states_of_sides(robot: Robot, conditions: Conditions, motion: PlaneMotion) -
 def lateral_friction(conditions: Conditions, chassis: Chassis) -> Scalar:
     """Lateral friction over longitudinal on this ground, λ [-]."""
     lateral = chassis.turning.lateral
-    stated = conditions.adhesion_lateral
-    return lateral if stated is None else lateral * stated / conditions.adhesion
+    adhesion_lateral = conditions.adhesion_lateral
+    return lateral if adhesion_lateral is None else lateral * adhesion_lateral / conditions.adhesion
 
 
 def _both_sides(x: Scalar) -> Array:
@@ -708,8 +708,8 @@ def lateral_and_yaw_effects(robot: Robot, signals: Signals) -> tuple[Scalar, Sca
     """Sums of the robot's effects in the balances `lateral` [N] and `yaw` [N·m], over both sides."""
 
     def of(balance: str) -> Scalar:
-        each = _both_sides(jax.vmap(lambda s: effects_sum(robot, s, balance))(signals))
-        return robot.sides / 2 * sum_of_sides(each)
+        effect_sums = _both_sides(jax.vmap(lambda s: effects_sum(robot, s, balance))(signals))
+        return robot.sides / 2 * sum_of_sides(effect_sums)
 
     return of("lateral"), of("yaw")
 
@@ -735,20 +735,20 @@ def turning_signals(
     units = robot.sides / 2
     stands = stance(robot, conditions, chassis, mass)
     load, sliding = sum_of_sides(units * jnp.asarray(even.normal)), jnp.asarray(even.speed_sliding)
-    held = ground_forces(
+    contact_forces = ground_forces(
         stands, chassis.ground.friction, conditions.adhesion, load, sliding, motion.speed_lateral, motion.yaw_rate,
         jnp.asarray(rolling), loads,
     )  # fmt: skip
     own_load = jax.vmap(lambda s: travel(robot, chassis, s))(
-        _fill_unset(even, normal=held.normal / units, moment_lateral=held.moment / units)
+        _fill_unset(even, normal=contact_forces.normal / units, moment_lateral=contact_forces.moment / units)
     )
     lateral, yaw = lateral_and_yaw_effects(robot, own_load)
-    pull = held.ahead - units * own_load.resistance
+    pull = contact_forces.ahead - units * own_load.resistance
     along = sum_of_sides(pull) - mass * GRAVITY * sine_slope * cosine(motion.heading)
-    across = sum_of_sides(held.aside) + mass * GRAVITY * sine_slope * sine(motion.heading) - lateral
-    turn = (sum_of_sides(held.moment - y * pull) - yaw) / chassis.turning.inertia
+    across = sum_of_sides(contact_forces.aside) + mass * GRAVITY * sine_slope * sine(motion.heading) - lateral
+    turn = (sum_of_sides(contact_forces.moment - y * pull) - yaw) / chassis.turning.inertia
     acceleration = along / mass + motion.yaw_rate * motion.speed_lateral
-    pulled = _fill_unset(own_load, traction=held.ahead / units, acceleration=acceleration - turn * y)
+    pulled = _fill_unset(own_load, traction=contact_forces.ahead / units, acceleration=acceleration - turn * y)
     pulled = jax.vmap(lambda s: track(robot, chassis, s))(pulled)
     if sides.motor_speed is None:
         pulled = jax.vmap(lambda s: gearbox(robot, chassis, s))(pulled)
@@ -757,7 +757,7 @@ def turning_signals(
         pulled = _fill_unset(pulled, total_current=_both_sides(sum_of_sides(jnp.asarray(pulled.total_current)) / 2))
     return Travel(
         pulled,
-        held,
+        contact_forces,
         acceleration,
         across / mass - motion.yaw_rate * motion.speed,
         turn,

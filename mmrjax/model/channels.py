@@ -25,10 +25,10 @@ def channels_named(names: Iterable[str]) -> tuple[Channel, ...]:
     Raises:
         KeyError: no such channel.
     """
-    wanted = set(names)
-    if unknown := wanted - {c.name for c in EVERY}:
+    wanted_names = set(names)
+    if unknown := wanted_names - {c.name for c in EVERY}:
         raise KeyError(f"no channel {min(unknown)}; there are {', '.join(c.name for c in EVERY)}")
-    return tuple(c for c in EVERY if c.name in wanted)
+    return tuple(c for c in EVERY if c.name in wanted_names)
 
 
 def usual_channels() -> tuple[Channel, ...]:

@@ -50,8 +50,8 @@ class NamedConfigurations(eqx.Module):
         # one name for all runs, as `Conditions` broadcasts it, is looked up once
         once = np.asarray(words[tuple(slice(1) if stride == 0 else slice(None) for stride in words.strides)])
         index, names = np.full(once.shape, -1, np.int32), list[str]()
-        while (left := index < 0).any():
-            names.append(str(once[left][0]))
+        while (unmatched := index < 0).any():
+            names.append(str(once[unmatched][0]))
             index[once == names[-1]] = len(names) - 1
         return NamedConfigurations(np.broadcast_to(index, words.shape), tuple(names))
 
@@ -175,26 +175,32 @@ class Conditions(eqx.Module):
         if not isinstance(duty, np.ndarray | jax.Array | None) and None not in (duty_left, duty_right):
             raise UsageError(sides_contradiction(("duty", *OF_SIDES[:2])))
         duty = 1.0 if duty is None else duty
-        given: dict[str, Any] = locals()
-        stated = {name: given[name] for name in CONDITIONS if given[name] is not None or name in NUMBERS}
-        which: Any = configuration
+        arguments: dict[str, Any] = locals()
+        condition_values = {
+            name: arguments[name] for name in CONDITIONS if arguments[name] is not None or name in NUMBERS
+        }
+        configurations: Any = configuration
         if not isinstance(configuration, jax.Array | NamedConfigurations):
             words = np.asarray(configuration)
-            which = NamedConfigurations.of(words) if words.dtype.kind == "U" else configuration
-        which = which if isinstance(which, NamedConfigurations) else _number_array("configuration", which, int)
-        numbers = {name: _number_array(name, x) for name, x in stated.items()}
-        shapes = {name: x.shape for name, x in {"configuration": which, **numbers}.items()}
+            configurations = NamedConfigurations.of(words) if words.dtype.kind == "U" else configuration
+        configurations = (
+            configurations
+            if isinstance(configurations, NamedConfigurations)
+            else _number_array("configuration", configurations, int)
+        )
+        numbers = {name: _number_array(name, x) for name, x in condition_values.items()}
+        shapes = {name: x.shape for name, x in {"configuration": configurations, **numbers}.items()}
         try:
             shape = np.broadcast_shapes(*shapes.values())
         except ValueError:
-            listed = ", ".join(f"{name} {s}" for name, s in shapes.items() if s)
-            raise ValueError(f"Conditions: shapes do not broadcast to one another: {listed}") from None
-        self.configuration = jax.tree.map(lambda x: _broadcast_array(x, shape), which)
+            shape_words = ", ".join(f"{name} {s}" for name, s in shapes.items() if s)
+            raise ValueError(f"Conditions: shapes do not broadcast to one another: {shape_words}") from None
+        self.configuration = jax.tree.map(lambda x: _broadcast_array(x, shape), configurations)
         self.begin = None if begin is None else _broadcast_array(_number_array("begin", begin, int), shape)
         # an equal number for all runs is stored once: most fields of a large batch are 0 or 1
         shared: dict[float, Array] = {}
         for name in CONDITIONS:
-            if isinstance(value := stated.get(name), float):
+            if isinstance(value := condition_values.get(name), float):
                 if value not in shared:
                     shared[value] = _broadcast_array(numbers[name], shape)
                 setattr(self, name, shared[value])
@@ -235,9 +241,9 @@ class Conditions(eqx.Module):
         """Conditions of left and right side, with a leading axis of 2."""
 
         def side(name: str) -> Conditions:
-            stated = {key: getattr(self, f"{key}_{name}") for key in ("duty", "open", "motor_speed")}
+            side_values = {key: getattr(self, f"{key}_{name}") for key in ("duty", "open", "motor_speed")}
             fields: dict[str, Any] = dict.fromkeys(OF_SIDES)
-            return dataclasses.replace(self, **fields | {k: x for k, x in stated.items() if x is not None})
+            return dataclasses.replace(self, **fields | {k: x for k, x in side_values.items() if x is not None})
 
         return jax.tree.map(lambda left, right: jnp.stack([left, right]), side("left"), side("right"))
 
@@ -255,11 +261,11 @@ class Conditions(eqx.Module):
         if not isinstance(self.configuration, NamedConfigurations):
             return self
         try:
-            which = self.configuration.among(robot.configurations.names)
+            configuration = self.configuration.among(robot.configurations.names)
         except KeyError as error:
             robot.configurations.index(error.args[0])  # raises a KeyError that lists the valid names
             raise
-        return dataclasses.replace(self, configuration=which)
+        return dataclasses.replace(self, configuration=configuration)
 
 
 def sides_contradiction(stated: Collection[str]) -> str:
@@ -285,14 +291,14 @@ def _number_array(name: str, x: Any, kind: type = float) -> Any:
     """
     if isinstance(x, jax.Array):
         return jnp.asarray(x, kind)
-    stated = np.asarray(x)
+    number = np.asarray(x)
     if np.ma.is_masked(x):
         raise UsageError(f"Conditions: {name}: got masked numbers; expected numbers, or rows without the masked ones")
-    whole = kind is float or stated.dtype.kind in "biu" or (stated.dtype.kind == "f" and not (stated % 1).any())
-    if stated.dtype.kind not in ("biuf" if name in SWITCHES else "iuf") or not whole:
+    is_integer = kind is float or number.dtype.kind in "biu" or (number.dtype.kind == "f" and not (number % 1).any())
+    if number.dtype.kind not in ("biuf" if name in SWITCHES else "iuf") or not is_integer:
         expected = "numbers" if kind is float else "whole numbers" + ", or names" * (name == "configuration")
         raise UsageError(f"Conditions: {name}: got {x!r}; expected {expected}")
-    return stated.astype(kind)
+    return number.astype(kind)
 
 
 def _broadcast_array(x: Any, shape: tuple[int, ...]) -> Any:

@@ -56,5 +56,5 @@ class Controller(eqx.Module):
             speed: dx/dt of an angle [rad/s], else 0.
             goal: g of a speed or a current, else 0.
         """
-        wanted = self.kp * error + self.ki * integral - self.kd * speed + self.feed_forward * goal
-        return clip(wanted, -self.limit, self.limit)
+        demanded_voltage = self.kp * error + self.ki * integral - self.kd * speed + self.feed_forward * goal
+        return clip(demanded_voltage, -self.limit, self.limit)

@@ -85,8 +85,8 @@ class Driver(eqx.Module):
         """
         if self.current_limit is None:
             return duty
-        over = at_least(0.0, jnp.abs(current) * (1 / self.current_limit) - 1)
-        return clip(duty - polarity * jnp.sign(current) * STEEPNESS * over, -1.0, 1.0)
+        excess = at_least(0.0, jnp.abs(current) * (1 / self.current_limit) - 1)
+        return clip(duty - polarity * jnp.sign(current) * STEEPNESS * excess, -1.0, 1.0)
 
     def limits(self, current: Scalar) -> Scalar:
         """True if the limit acts at a motor `current` [A]."""
@@ -132,10 +132,10 @@ class Driver(eqx.Module):
             return wanted, jnp.zeros_like(wanted)
         way, limit = jnp.where(wanted < 0, -1.0, 1.0), self.current_limit
         along = way * duty
-        over, step = at_least(jnp.abs(wanted) - limit, 0.0), limit / STEEPNESS
-        taken = at_most(over / (most + step), 1 + along if self.returns_current else at_least(along, 0.0))
-        beyond = over - taken * (most + step)
-        current = at_most(jnp.abs(wanted), limit) + taken * step
+        excess, step = at_least(jnp.abs(wanted) - limit, 0.0), limit / STEEPNESS
+        reduction = at_most(excess / (most + step), 1 + along if self.returns_current else at_least(along, 0.0))
+        beyond = excess - reduction * (most + step)
+        current = at_most(jnp.abs(wanted), limit) + reduction * step
         if self.returns_current:
             return way * (current + beyond), jnp.zeros_like(beyond)
         current = jnp.where(along < 0, 0.0, way * current)

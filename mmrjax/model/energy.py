@@ -61,14 +61,14 @@ def stored_energy(robot: Robot, signals: Signals) -> Scalar:
 def sink_powers_turning(robot: Robot, conditions: Conditions, travel: Travel) -> Scalars:
     """Same as `sink_powers` for a robot that turns: sliding is Σ F·u over all contacts, lift follows its heading."""
     signals = travel.signals
-    each = jax.vmap(lambda c, s: sink_powers(robot, c, s))(conditions.of_sides(), signals)
-    means: Scalars = {name: jnp.mean(jnp.asarray(power)) for name, power in each.items()}
+    powers_of_sides = jax.vmap(lambda c, s: sink_powers(robot, c, s))(conditions.of_sides(), signals)
+    means: Scalars = {name: jnp.mean(jnp.asarray(power)) for name, power in powers_of_sides.items()}
     weight = jnp.mean(jnp.asarray(signals.mass)) * GRAVITY * sine(conditions.slope)
     across = jnp.mean(jnp.asarray(signals.speed_lateral)) * sine(jnp.mean(jnp.asarray(signals.heading)))
     means["sliding"] = means["sliding"] + jnp.sum(travel.grip.across)
     for balance, rate in (("lateral", signals.speed_lateral), ("yaw", signals.yaw_rate)):
-        taken = jax.vmap(lambda s, balance=balance: effects_sum(robot, s, balance) * jnp.ones(()))(signals)
-        means["sliding"] = means["sliding"] + robot.sides / 2 * jnp.sum(taken * jnp.asarray(rate))
+        effect_terms = jax.vmap(lambda s, balance=balance: effects_sum(robot, s, balance) * jnp.ones(()))(signals)
+        means["sliding"] = means["sliding"] + robot.sides / 2 * jnp.sum(effect_terms * jnp.asarray(rate))
     means["lift"] = means["lift"] - weight * across
     return means
 

@@ -54,8 +54,8 @@ class HalfRobotMasses(eqx.Module):
 
     def inertia_pitch(self, wheelbase: Scalar) -> Scalar:
         """Moment of inertia in pitch of half a robot about its centre [kg·m²]."""
-        total, moved = self.chassis + 2 * self.pulley, self.chassis**2 * (self.forward**2 + self.up**2)
-        return self.pitching(wheelbase) + 2 * self.inertia_pulley - moved / total
+        total, moment = self.chassis + 2 * self.pulley, self.chassis**2 * (self.forward**2 + self.up**2)
+        return self.pitching(wheelbase) + 2 * self.inertia_pulley - moment / total
 
 
 class _RigidPart(NamedTuple):
@@ -148,9 +148,9 @@ def _parts_of_robot(
         *_lever_parts(gear, tracked, jnp.pi, jnp.pi),
         *pulleys,
     ]
-    stated = jnp.where(wheeled > 0.5, gear.inertia_wheeled, gear.inertia_tracked) / robot.sides
-    left = stated - _joined_parts(folded).inertia
-    body = body._replace(inertia=jnp.where(left > 0, left, body.inertia))
+    inertia = jnp.where(wheeled > 0.5, gear.inertia_wheeled, gear.inertia_tracked) / robot.sides
+    inertia_left = inertia - _joined_parts(folded).inertia
+    body = body._replace(inertia=jnp.where(inertia_left > 0, inertia_left, body.inertia))
 
     return [body, belt, payload], levers, body.mass, pulley, inertia_pulley
 
@@ -173,11 +173,11 @@ def check_parts(robot: Robot) -> None:
                 f"{name}.mass: got {np.min(np.asarray(chassis.mass)):.3g} kg; expected more than {parts:.3g} kg, "
                 "the mass of its pulleys, wheels, tracks and levers (running_gear.pulley_mass and others)"
             )
-        whole = "inertia_tracked" if chassis.on_tracks > 0.5 else "inertia_wheeled"
-        stated = np.asarray(getattr(robot.running_gear, whole))
+        total_field = "inertia_tracked" if chassis.on_tracks > 0.5 else "inertia_wheeled"
+        declared_total = np.asarray(getattr(robot.running_gear, total_field))
         least = np.asarray(robot.sides * half.inertia_pitch(gear.wheelbase))
-        if np.any((stated > 0) & (stated <= least)):
+        if np.any((declared_total > 0) & (declared_total <= least)):
             raise ValueError(
-                f"running_gear.{whole}: got {np.min(stated):.3g} kg·m^2; expected 0, or more than "
+                f"running_gear.{total_field}: got {np.min(declared_total):.3g} kg·m^2; expected 0, or more than "
                 f"{np.max(least):.3g} kg·m^2, the inertia of the parts of {name} without the body's own"
             )

@@ -109,10 +109,10 @@ class Motor(eqx.Module):
         T = T_a + R_th R I² (1 + α (T - 25 °C)). It is inf from R_th R I² α = 1 on.
         """
         rise = self.resistance_thermal * self.resistance * current**2
-        left = 1 - self.temperature_coefficient * rise
-        finite = left > 0
+        heating_left = 1 - self.temperature_coefficient * rise
+        finite = heating_left > 0
         ratio = self.resistance_ratio(self.temperature_ambient)
-        settled = self.temperature_ambient + rise * ratio / jnp.where(finite, left, 1.0)
+        settled = self.temperature_ambient + rise * ratio / jnp.where(finite, heating_left, 1.0)
         return jnp.where(finite, settled, jnp.inf)
 
     @property
@@ -154,9 +154,9 @@ class Motor(eqx.Module):
 
         still = rates(jnp.zeros(2))
         matrix = jax.jacfwd(rates)(jnp.zeros(2))
-        whole = jnp.block([[matrix, still[:, None]], [jnp.zeros((1, 3))]])
+        augmented_matrix = jnp.block([[matrix, still[:, None]], [jnp.zeros((1, 3))]])
         begin = jnp.stack([jnp.asarray(x, float) + zero for x in (winding, housing, 1.0)])
-        end = jax.scipy.linalg.expm(whole * time) @ begin
+        end = jax.scipy.linalg.expm(augmented_matrix * time) @ begin
         return end[0], end[1]
 
     def time_permissible(
@@ -176,12 +176,12 @@ class Motor(eqx.Module):
             return jnp.where(jnp.isfinite(reached), reached, jnp.inf)
 
         bounds = {"lower": math.log(_SHORT), "upper": math.log(_LONG)}
-        held = jax.lax.stop_gradient((self, current, begin))
+        inputs = jax.lax.stop_gradient((self, current, begin))
         solution: optx.Solution = optx.root_find(
             lambda log_time, held: excess(jnp.exp(log_time), held),
             optx.Bisection(rtol=0.0, atol=0.0, flip=False),  # type: ignore[call-arg]  # its norm is no field
             jnp.asarray(sum(bounds.values()) / 2),
-            held,
+            inputs,
             options=bounds,
             max_steps=60,
             throw=False,
@@ -192,5 +192,5 @@ class Motor(eqx.Module):
         rise = self.heating(self.voltage_winding(current, hot) * current, hot, around)[0]
         rises = jnp.isfinite(hot) & (rise > 0)
         seconds = seconds - jnp.where(rises, (hot - limit) / jnp.where(rises, rise, 1.0), 0.0)
-        ever = (self.temperature_settled(current) > limit) & (excess(jnp.asarray(_LONG), held) > 0)
+        ever = (self.temperature_settled(current) > limit) & (excess(jnp.asarray(_LONG), inputs) > 0)
         return jnp.where(jnp.asarray(begin[0]) >= limit, 0.0, jnp.where(ever, seconds, jnp.inf))

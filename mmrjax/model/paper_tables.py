@@ -48,11 +48,11 @@ BENCH = "lacquered_wood"
 
 def adhesion_ratio(surface: str, on_tracks: bool) -> float:
     """Adhesion of `surface` over that of the bench [-], Table 5. Valid for friction stated on the bench's surface."""
-    here, bench = SURFACES[surface], SURFACES[BENCH]
-    return here.tracked_x / bench.tracked_x if on_tracks else here.wheeled_x / bench.wheeled_x
+    ground, bench = SURFACES[surface], SURFACES[BENCH]
+    return ground.tracked_x / bench.tracked_x if on_tracks else ground.wheeled_x / bench.wheeled_x
 
 
 def lateral_ratio(surface: str, on_tracks: bool) -> float:
     """Lateral adhesion of `surface` over that of the bench [-], Table 5."""
-    here, bench = SURFACES[surface], SURFACES[BENCH]
-    return here.tracked_y / bench.tracked_y if on_tracks else here.wheeled_y / bench.wheeled_y
+    ground, bench = SURFACES[surface], SURFACES[BENCH]
+    return ground.tracked_y / bench.tracked_y if on_tracks else ground.wheeled_y / bench.wheeled_y

@@ -125,9 +125,9 @@ def walk_parameters(component: eqx.Module, prefix: str = "") -> Iterator[Paramet
     if rig is None or rig.inherits:
         yield from _walk_component(component, prefix)
         return
-    stated = {name for name, _, _ in rig.priors}
+    prior_names = {name for name, _, _ in rig.priors}
     for parameter in _walk_component(component, prefix):
-        spec = rig_spec(parameter.spec, parameter.name in stated)
+        spec = rig_spec(parameter.spec, parameter.name in prior_names)
         yield dataclasses.replace(parameter, spec=spec)
 
 

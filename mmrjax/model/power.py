@@ -58,8 +58,8 @@ class Battery(eqx.Module):
 
     def voltage_no_load(self, discharge: Scalar) -> Scalar:
         """No-load voltage of one cell [V] after `discharge` [C], eq. (13)."""
-        taken = self._on_curve(discharge)
-        return self.curvature * taken**2 + self.slope * taken + self.voltage_full
+        curve_value = self._on_curve(discharge)
+        return self.curvature * curve_value**2 + self.slope * curve_value + self.voltage_full
 
     def _on_curve(self, discharge: Scalar) -> Scalar:
         """Charge q [C] that discharges a cell of capacity C_n by the same share."""
@@ -71,8 +71,8 @@ class Battery(eqx.Module):
 
     def energy(self, discharge: Scalar) -> Scalar:
         """Energy given by the whole battery at no-load voltage [J] after `discharge` [C]: integral of eq. (13)."""
-        taken = self._on_curve(discharge)
-        per_charge = (self.curvature / 3 * taken + self.slope / 2) * taken + self.voltage_full
+        curve_value = self._on_curve(discharge)
+        per_charge = (self.curvature / 3 * curve_value + self.slope / 2) * curve_value + self.voltage_full
         return self.cells * per_charge * discharge
 
     def current(self, total_current: Scalar) -> Scalar:

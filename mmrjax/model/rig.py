@@ -152,10 +152,10 @@ class Rig(eqx.Module):
             times: times since the imposed quantity acts [s], increasing.
             at: instants of the tables' clock [s], any shape.
         """
-        wanted = at - self.delay
-        k = jnp.clip(jnp.searchsorted(times, wanted, side="right") - 1, 0, times.shape[0] - 2)
+        instant = at - self.delay
+        k = jnp.clip(jnp.searchsorted(times, instant, side="right") - 1, 0, times.shape[0] - 2)
         gap = times[k + 1] - times[k]
-        return k, jnp.clip(jnp.where(gap > 0, (wanted - times[k]) / jnp.where(gap > 0, gap, 1.0), 0.0), 0.0, 1.0)
+        return k, jnp.clip(jnp.where(gap > 0, (instant - times[k]) / jnp.where(gap > 0, gap, 1.0), 0.0), 0.0, 1.0)
 
     @staticmethod
     def between(values: Array, k: Array, share: Array) -> Array:

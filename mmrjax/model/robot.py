@@ -188,20 +188,20 @@ class Robot(eqx.Module):
         """The load of the configuration with this index, traceable and batchable."""
         if self.configurations.chosen is not None:
             return self.configurations.chosen
-        chosen, *others = self.configurations.members
+        selected, *others = self.configurations.members
         for k, other in enumerate(others, 1):
-            here = jnp.asarray(configuration == k)
-            chosen = jax.tree.map(lambda a, b: jnp.where(here, b, a), chosen, other)  # noqa: B023
-        return chosen
+            is_selected = jnp.asarray(configuration == k)
+            selected = jax.tree.map(lambda a, b: jnp.where(is_selected, b, a), selected, other)  # noqa: B023
+        return selected
 
     def within(self, configuration: Index) -> Robot:
         """Same robot in the configuration with this index. Its load is selected once, here, for all equations."""
         if self.configurations.chosen is not None:
             return self
-        chosen = eqx.tree_at(
+        copied_robot = eqx.tree_at(
             lambda c: c.chosen, self.configurations, self.chassis(configuration), is_leaf=lambda x: x is None
         )
-        return dataclasses.replace(self, configurations=chosen)
+        return dataclasses.replace(self, configurations=copied_robot)
 
     @property
     def radius_pulley(self) -> Scalar:

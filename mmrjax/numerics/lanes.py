@@ -35,8 +35,10 @@ class _MemberLoop(NamedTuple):
 
     def alone(self, numbers: Any) -> Any:
         """Returns the end of one member."""
-        turned = jax.lax.while_loop(lambda s: ~self.ended(s), lambda s: self.turn(numbers, s), self.begun(numbers))
-        return self.kept(turned)
+        final_state = jax.lax.while_loop(
+            lambda s: ~self.ended(s), lambda s: self.turn(numbers, s), self.begun(numbers)
+        )
+        return self.kept(final_state)
 
     def refilled(self, numbers: Any, batched: Any, size: int) -> Any:
         """Returns the end of each of `size` members. A queued member replaces a finished one.
@@ -57,10 +59,10 @@ class _MemberLoop(NamedTuple):
 
         begin = jax.vmap(self.begun, in_axes=(axes,))
         go = jax.vmap(self.turn, in_axes=(axes, 0))
-        over = jax.vmap(self.ended)
+        is_finished = jax.vmap(self.ended)
 
         begins = begin(numbers)
-        idle = over(begins)
+        idle = is_finished(begins)
         order, size_busy = jnp.argsort(idle), size - jnp.sum(idle)
 
         def member_of(place: Array) -> Array:
@@ -72,8 +74,8 @@ class _MemberLoop(NamedTuple):
         def step(carry: tuple) -> tuple:
             results, place, following, state = carry
             member = member_of(place)
-            state = chosen(over(state), state, go(at(member), state))
-            free = over(state) & (place < size_busy)
+            state = chosen(is_finished(state), state, go(at(member), state))
+            free = is_finished(state) & (place < size_busy)
             results = jax.tree.map(
                 lambda all_, x: all_.at[jnp.where(free, member, size)].set(x, mode="drop"),
                 results,
@@ -135,10 +137,10 @@ def loop_until(
                     return jnp.repeat(x, size, axis=0)
                 return x.reshape(outer * size, *x.shape[2:]) if inner else x
 
-            whole = jax.tree.map(member, numbers, batched, of_outer)
+            member_inputs = jax.tree.map(member, numbers, batched, of_outer)
             either = jax.tree.map(lambda inner, out: inner or out, batched, of_outer)
             flattened = jax.tree.map(
-                lambda x: x.reshape(outer, size, *x.shape[1:]), many(whole, either, outer * size)
+                lambda x: x.reshape(outer, size, *x.shape[1:]), many(member_inputs, either, outer * size)
             )
             return flattened, jax.tree.map(lambda _: True, flattened)
 

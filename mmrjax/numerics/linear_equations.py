@@ -127,8 +127,8 @@ def solve(matrix: Float[Array, "n n"], b: Float[Array, "n ..."]) -> Float[Array,
 
     def turn(k: Array, rest: Array) -> Array:
         pivot = jnp.argmax(jnp.where(index < k, -1.0, jnp.abs(rest[:, k])))
-        chosen = (index == pivot) @ rest
-        row = chosen / chosen[k]
+        pivot_row = (index == pivot) @ rest
+        row = pivot_row / pivot_row[k]
         exchanged = jnp.where((index == pivot)[:, None], rest[k], rest)
         column = jnp.where(index == k, 0.0, exchanged[:, k])
         return jnp.where((index == k)[:, None], row, exchanged - column[:, None] * row)

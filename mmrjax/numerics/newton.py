@@ -53,14 +53,14 @@ def _linearised(fn: Function, y: Vector, args: Any, apart: bool) -> tuple[Matrix
     columns: list[list[Entry]] = []
     value = y
     for k in range(len(y)):
-        moved: set[int] = set()
+        moved_inputs: set[int] = set()
 
-        def along(x: Array, k: int = k, moved: set[int] = moved) -> Vector:
+        def along(x: Array, k: int = k, moved: set[int] = moved_inputs) -> Vector:
             values = fn((*y[:k], x, *y[k + 1 :]), args)[0]
             return tuple(_watch_derivative(v, i, moved) for i, v in enumerate(values))
 
         value, column = jax.jvp(along, (y[k],), (jnp.ones_like(y[k]),))
-        columns.append([x if i in moved else None for i, x in enumerate(column)])
+        columns.append([x if i in moved_inputs else None for i, x in enumerate(column)])
     return list(zip(*columns, strict=True)), value
 
 
@@ -115,18 +115,20 @@ class NewtonState(eqx.Module):
     def after(self, jacobian: Matrix, value: Vector, atol: float) -> NewtonState:
         """The search after one turn, from ∂f/∂y and f at its unknowns."""
         factors = factorise(jacobian)
-        step, here, left = _solve_step(factors, value), self.y[-1], value[-1]
+        step, unknowns, residual = _solve_step(factors, value), self.y[-1], value[-1]
         # Such a small step leaves an error of the order of its square.
         solved, others, late = _is_small(step, atol**0.7), _is_small(value[:-1], atol**0.5), self.turns >= PATIENCE
-        low = jnp.where(others & (left < 0), here, self.low)
-        high = jnp.where(others & (left > 0), here, self.high)
-        then = here - step[-1]
+        low = jnp.where(others & (residual < 0), unknowns, self.low)
+        high = jnp.where(others & (residual > 0), unknowns, self.high)
+        then = unknowns - step[-1]
         leaves = late & others & ~solved & jnp.isfinite(high - low) & ((then <= low) | (then >= high))
-        share = jnp.where(leaves, (here - 0.5 * (low + high)) / jnp.where(leaves, step[-1], 1.0), 1.0)
-        aside = (*_solve_step([row[:-1] for row in factors[:-1]], value[:-1]), jnp.zeros_like(here))
+        share = jnp.where(leaves, (unknowns - 0.5 * (low + high)) / jnp.where(leaves, step[-1], 1.0), 1.0)
+        aside = (*_solve_step([row[:-1] for row in factors[:-1]], value[:-1]), jnp.zeros_like(unknowns))
         alone = late & ~others & ~solved
-        taken = tuple(jnp.where(alone, b, jnp.where(leaves, share * a, a)) for a, b in zip(step, aside, strict=True))
-        return NewtonState(_subtract_step(self.y, taken), solved, self.turns + 1, low, high)
+        damped_step = tuple(
+            jnp.where(alone, b, jnp.where(leaves, share * a, a)) for a, b in zip(step, aside, strict=True)
+        )
+        return NewtonState(_subtract_step(self.y, damped_step), solved, self.turns + 1, low, high)
 
 
 class FewUnknowns(optx.AbstractRootFinder[Vector, Vector, Any, NewtonState]):
@@ -246,11 +248,11 @@ def _function(residual: Residual) -> Function:
 def _implicit(primals: tuple, tangents: tuple) -> tuple[tuple[Vector, Array], tuple[Any, None]]:
     residual, start, shared, inputs, tolerance, linear, apart = primals
     y, solved = root(residual, start, shared, inputs, tolerance, linear, apart)
-    moved = eqx.filter_jvp(lambda *given: residual(y, *given), (shared, inputs), tangents[2:4])[1]
-    if moved is None or all(m is None for m in moved):
+    input_change = eqx.filter_jvp(lambda *given: residual(y, *given), (shared, inputs), tangents[2:4])[1]
+    if input_change is None or all(m is None for m in input_change):
         return (y, solved), (tuple(jnp.zeros_like(x) for x in y), None)
     factors, own_factors = regularise(factorise(_linearised(_function(residual), y, (shared, inputs), apart)[0]))
-    step = substitute(factors, moved)
+    step = substitute(factors, input_change)
     change = tuple(
         jnp.zeros_like(a) if b is None else jnp.where(own_factors, -b, 0.0) for a, b in zip(y, step, strict=True)
     )
@@ -271,7 +273,7 @@ def implicit_slopes(slope: Float[Array, "rows outputs x_and_y"], left: Float[Arr
     size = left.shape[2] - n
     factors, regular = regularise(factorise([[left[:, i, size + j, None] for j in range(n)] for i in range(n)]))
     by_x = slope[:, :, :size]
-    for k, moved in enumerate(substitute(factors, [left[:, i, :size] for i in range(n)])):
-        assert moved is not None
-        by_x = by_x - slope[:, :, size + k, None] * jnp.where(regular, moved, 0.0)[:, None, :]
+    for k, column in enumerate(substitute(factors, [left[:, i, :size] for i in range(n)])):
+        assert column is not None
+        by_x = by_x - slope[:, :, size + k, None] * jnp.where(regular, column, 0.0)[:, None, :]
     return by_x

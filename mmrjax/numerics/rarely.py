@@ -26,8 +26,8 @@ def compute_if_needed(needed: Bool[Array, ""], function: Callable[..., T], argum
 
     def turn(state: tuple[Array, T]) -> tuple[Array, T]:
         # Tied to the loop's state; otherwise the compiler would move the computation out of the loop.
-        _, here = jax.lax.optimization_barrier((state[0], arguments))
-        like = jax.tree.map(lambda x, y: jnp.asarray(x, y.dtype), function(*here), otherwise)
+        _, ordered_arguments = jax.lax.optimization_barrier((state[0], arguments))
+        like = jax.tree.map(lambda x, y: jnp.asarray(x, y.dtype), function(*ordered_arguments), otherwise)
         return jnp.zeros_like(state[0]), like
 
     return jax.lax.while_loop(lambda state: state[0], turn, (needed, otherwise))[1]

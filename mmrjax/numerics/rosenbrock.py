@@ -136,7 +136,7 @@ def _loop_over_stages(
         now = inverted @ (f + (c @ u) / h)
         return u.at[k + 1].set(now), v.at[k + 1].set(h * _GAMMA * (g + (c @ v) / h + jacobian_q @ now))
 
-    begun = [jnp.zeros((6, *x.shape), x.dtype).at[0].set(x) for x in (first, first_q)]
-    u, v = jax.lax.fori_loop(0, 5, stage, (begun[0], begun[1]))
+    stage_arrays = [jnp.zeros((6, *x.shape), x.dtype).at[0].set(x) for x in (first, first_q)]
+    u, v = jax.lax.fori_loop(0, 5, stage, (stage_arrays[0], stage_arrays[1]))
     last = jnp.asarray(reach)[4].at[5].set(1.0)
     return y0 + last @ u, q0 + last @ v, u, v

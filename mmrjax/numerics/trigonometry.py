@@ -47,16 +47,16 @@ def _half_turns(angle: Array) -> tuple[Array, Array]:
 @jax.jit
 def sine(angle: Float[Array, "..."]) -> Float[Array, "..."]:
     """sin of an angle within ±1e5 [rad], accurate to 3e-16."""
-    sign, left = _half_turns(jnp.asarray(angle))
-    return left * _polynomial(left * left, _SINE) / sign
+    sign, angle_left = _half_turns(jnp.asarray(angle))
+    return angle_left * _polynomial(angle_left * angle_left, _SINE) / sign
 
 
 @jax.custom_jvp
 @jax.jit
 def cosine(angle: Float[Array, "..."]) -> Float[Array, "..."]:
     """cos of an angle within ±1e5 [rad], accurate to 3e-16."""
-    sign, left = _half_turns(jnp.asarray(angle))
-    return _polynomial(left * left, _COSINE) / sign
+    sign, angle_left = _half_turns(jnp.asarray(angle))
+    return _polynomial(angle_left * angle_left, _COSINE) / sign
 
 
 @jax.custom_jvp

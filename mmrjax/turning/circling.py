@@ -81,9 +81,9 @@ def _units_of_unknowns(kept: tuple[Effect, ...]) -> Array:
 
 def motion_of_unknowns(robot: Robot, y: Unknowns) -> PlaneMotion:
     """Motion of the robot that the unknowns describe."""
-    kept = _effects_with_memory(robot, y.shape[0])
-    y = y * _units_of_unknowns(kept).astype(y.dtype)
-    memory = {e.name: y[len(_UNITS) + 2 * k :][:2] for k, e in enumerate(kept)}
+    memory_effects = _effects_with_memory(robot, y.shape[0])
+    y = y * _units_of_unknowns(memory_effects).astype(y.dtype)
+    memory = {e.name: y[len(_UNITS) + 2 * k :][:2] for k, e in enumerate(memory_effects)}
     return PlaneMotion(y[:2], y[2:4], y[4], y[5], y[6], y[7], y[8], y[9], y[10], memory)
 
 
@@ -97,7 +97,7 @@ def turning_rates(robot: Robot, conditions: Conditions, y: Unknowns) -> Unknowns
 
 
 def _rates(robot: Robot, conditions: Conditions, y: Array, travel: balances.Travel) -> Array:
-    motion, kept = motion_of_unknowns(robot, y), _effects_with_memory(robot, y.shape[0])
+    motion, memory_effects = motion_of_unknowns(robot, y), _effects_with_memory(robot, y.shape[0])
     signals = travel.signals
     free = conditions.of_sides().motor_speed is None
     cos, sin = jnp.cos(motion.heading), jnp.sin(motion.heading)
@@ -112,9 +112,11 @@ def _rates(robot: Robot, conditions: Conditions, y: Array, travel: balances.Trav
         motion.speed * sin + motion.speed_lateral * cos,
         balances.charge_drawn(robot, conditions, jnp.asarray(signals.total_current)[0]),
     ]
-    for effect in kept:
+    for effect in memory_effects:
         residuals.extend(jax.vmap(lambda s, effect=effect: effect.rate(robot, s))(signals))
-    return jnp.stack([jnp.asarray(x, y.dtype) for x in residuals]) / _units_of_unknowns(kept).astype(y.dtype)
+    return jnp.stack([jnp.asarray(x, y.dtype) for x in residuals]) / _units_of_unknowns(memory_effects).astype(
+        y.dtype
+    )
 
 
 def turning_start(robot: Robot, conditions: Conditions, rolling: bool = False) -> Unknowns:
@@ -269,15 +271,15 @@ def _broyden_step(held: tuple[Robot, Conditions], search: _BroydenSearch) -> _Br
     size = search.y.size
     aside = search.looks <= size
     step = (search.inverse * search.rates).sum(-1)
-    taken = step * _allowed_step_fraction(*held, search.y, step)
-    taken = jnp.where(aside, ALONG * (np.arange(size) == search.looks - 1), taken)
-    residual = _scaled_balance(*held, search.y + taken)
-    residual = jnp.where(_is_searched(held[1]), residual, _search_start(*held) - search.y - taken)
+    damped_step = step * _allowed_step_fraction(*held, search.y, step)
+    damped_step = jnp.where(aside, ALONG * (np.arange(size) == search.looks - 1), damped_step)
+    residual = _scaled_balance(*held, search.y + damped_step)
+    residual = jnp.where(_is_searched(held[1]), residual, _search_start(*held) - search.y - damped_step)
     gone = search.inverse @ (search.rates - residual)
-    row = taken @ search.inverse
-    change = jnp.outer(taken - gone, row) / (taken @ gone)
+    row = damped_step @ search.inverse
+    change = jnp.outer(damped_step - gone, row) / (damped_step @ gone)
     inverse = jnp.where((search.looks > 0) & jnp.all(jnp.isfinite(change)), search.inverse + change, search.inverse)
-    y = jnp.where(aside, search.y, search.y + taken)
+    y = jnp.where(aside, search.y, search.y + damped_step)
     rates = jnp.where(aside & (search.looks > 0), search.rates, residual)
     return _BroydenSearch(y, rates, inverse, search.looks + 1, ~aside & (jnp.max(jnp.abs(step)) < NEAR))
 
@@ -322,13 +324,13 @@ def _euler_step(held: tuple[Robot, Conditions, Array, _LinearisedBalance], searc
     before, after = jnp.linalg.norm(search.rates), jnp.linalg.norm(residual)
     worse = (~(after <= WORSE * before + SMALL) | (largest > FAR)) & (search.turns > 0)
     worse &= search.step > SHORTEST
-    ended = ~worse & (largest < SMALL) & ((search.step > LONG) | (after < SMALL_RATE))
+    has_settled = ~worse & (largest < SMALL) & ((search.step > LONG) | (after < SMALL_RATE))
     y, residual, slope = (
         jnp.where(worse, old, new)
         for old, new in ((search.y, next_y), (search.rates, residual), (search.jacobian, slope))
     )
     length = jnp.clip(search.step * jnp.where(worse, SHORTER, LONGER), SHORTEST, LONGEST)
-    return _EulerSearch(y, residual, slope, length, search.turns + 1, ended)
+    return _EulerSearch(y, residual, slope, length, search.turns + 1, has_settled)
 
 
 def _find_settled_unknowns(robot: Robot, conditions: Conditions) -> tuple[Settling, Bool[Array, ""]]:
@@ -341,13 +343,13 @@ def _find_settled_unknowns(robot: Robot, conditions: Conditions) -> tuple[Settli
     Of 128 turns at random duties this finds all, and optimistix's `Newton` from the same start finds 83. In batches
     each member ends on its own (`lanes`), while a search by `optimistix.root_find` lasts as long as its slowest.
     """
-    held = robot, conditions
+    inputs = robot, conditions
     first = lanes.loop_until(
-        _begin_broyden, _broyden_step, lambda s: (s.looks >= SOON) | s.solved, held, lambda s: (s.y, s.solved)
+        _begin_broyden, _broyden_step, lambda s: (s.looks >= SOON) | s.solved, inputs, lambda s: (s.y, s.solved)
     )
-    solution = lanes.loop_until(_no_linearisation, _linearise_balance, lambda s: s.known, (*held, *first))
+    solution = lanes.loop_until(_no_linearisation, _linearise_balance, lambda s: s.known, (*inputs, *first))
     end = lanes.loop_until(
-        _begin_euler, _euler_step, lambda s: (s.turns >= TURNS) | s.solved, (*held, first[0], solution), most=FEW
+        _begin_euler, _euler_step, lambda s: (s.turns >= TURNS) | s.solved, (*inputs, first[0], solution), most=FEW
     )
     sound = end.solved & jnp.all(jnp.isfinite(end.jacobian))
     slope = jnp.where(sound, end.jacobian, jnp.asarray(_jacobian_at_rest(conditions)))
@@ -360,11 +362,15 @@ def _signals_and_motion(robot: Robot, conditions: Conditions, y: Settling) -> tu
     The duties alone would cause these currents, see `rest.admitted_current`.
     """
     motion = motion_of_unknowns(robot, _all_unknowns(conditions, y))
-    current, held = jax.vmap(lambda c, x: rest.admitted_current(robot, c, x))(conditions.of_sides(), motion.current)
+    current, is_limited = jax.vmap(lambda c, x: rest.admitted_current(robot, c, x))(
+        conditions.of_sides(), motion.current
+    )
     motion = dataclasses.replace(motion, current=current)
     travel = _turning(rest.without_diode(robot), conditions, motion, _load_transfer(robot, conditions, y))
     signals = travel.signals
-    signals = dataclasses.replace(signals, voltage=signals.voltage - held, voltage_left=signals.voltage_left - held)
+    signals = dataclasses.replace(
+        signals, voltage=signals.voltage - is_limited, voltage_left=signals.voltage_left - is_limited
+    )
     return dataclasses.replace(travel, signals=signals), motion
 
 
@@ -379,9 +385,9 @@ def turn_results(
     """Result, signals of both sides and residuals of the balances at given unknowns, see `Implicit.shown`."""
     travel, motion = _signals_and_motion(robot, conditions, unknowns)
     stays = unknowns - jax.lax.stop_gradient(_search_start(robot, conditions))
-    left = jnp.where(_is_searched(conditions), _imbalance_of_sides(robot, conditions, unknowns, travel), stays)
+    imbalance = jnp.where(_is_searched(conditions), _imbalance_of_sides(robot, conditions, unknowns, travel), stays)
     status = _turn_status(robot, conditions, travel, motion, found)
-    return result_of_turn(robot, travel, status), travel.signals, left
+    return result_of_turn(robot, travel, status), travel.signals, imbalance
 
 
 def circling_signals(robot: Robot, conditions: Conditions) -> tuple[balances.Travel, PlaneMotion, Array]:
@@ -495,9 +501,9 @@ def has_tipped(robot: Robot, travel: balances.Travel) -> Array:
 def result_of_turn(robot: Robot, travel: balances.Travel, status: Array) -> Result:
     """Result of an instant: readings, powers and warnings, as means over both sides or for the worse side."""
     signals = travel.signals
-    each = jax.vmap(lambda s: result_of_signals(robot, s, status))(signals)
-    mean = jax.tree.map(lambda x: jnp.mean(x, axis=0), each)
-    flags = each.flags[0] | each.flags[1]
+    side_results = jax.vmap(lambda s: result_of_signals(robot, s, status))(signals)
+    mean = jax.tree.map(lambda x: jnp.mean(x, axis=0), side_results)
+    flags = side_results.flags[0] | side_results.flags[1]
     limit = robot.sides / 2 * signals.adhesion_limit
     result = dataclasses.replace(
         mean,
@@ -507,7 +513,7 @@ def result_of_turn(robot: Robot, travel: balances.Travel, status: Array) -> Resu
         efficiency_motor=power_ratio(mean.power_motor, mean.power_supply),
         efficiency_gear=power_ratio(mean.power_gear, mean.power_motor),
         efficiency_chassis=power_ratio(mean.power_ground, mean.power_gear),
-        winding_settled=jnp.max(each.winding_settled),
+        winding_settled=jnp.max(side_results.winding_settled),
         status=status,
         flags=flags,
     )

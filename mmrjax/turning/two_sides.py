@@ -166,8 +166,8 @@ class ContactLaw(eqx.Module):
         powers = np.arange(most + 1)
         of_line = share[:, None] * line[:, None] ** powers
         of_ends = ends[:, None] * np.sign(line)[:, None] ** powers
-        both = jnp.asarray(x) @ np.concatenate([of_line, of_ends], axis=1)
-        return jnp.where(self.on_tracks > 0.5, both[..., : most + 1], both[..., most + 1 :])
+        line_and_ends = jnp.asarray(x) @ np.concatenate([of_line, of_ends], axis=1)
+        return jnp.where(self.on_tracks > 0.5, line_and_ends[..., : most + 1], line_and_ends[..., most + 1 :])
 
     def per_speed(self, along: Scalar, across: Scalar) -> Scalar:
         """Longitudinal force per load and sliding speed [s/m], given the squares of the sliding speeds [m²/s²]."""
@@ -177,9 +177,12 @@ class ContactLaw(eqx.Module):
     def per_speed_rise(self, along: Scalar, across: Scalar) -> tuple[Scalar, Scalar]:
         """Derivatives of `force_per_sliding_speed` with respect to the squares of the sliding speeds [s³/m³]."""
         square, weighed = along + across, along + self.ratio * across
-        turned, held = jnp.sqrt((square + STILL) / (weighed + STILL)), self.friction.per_speed(square)
-        slower = turned * self.friction.per_speed_rise(square)
-        share = held * turned / 2
+        direction_gain, friction_per_speed = (
+            jnp.sqrt((square + STILL) / (weighed + STILL)),
+            self.friction.per_speed(square),
+        )
+        slower = direction_gain * self.friction.per_speed_rise(square)
+        share = friction_per_speed * direction_gain / 2
         return (
             slower + share * (1 / (square + STILL) - 1 / (weighed + STILL)),
             slower + share * (1 / (square + STILL) - self.ratio / (weighed + STILL)),
@@ -190,12 +193,15 @@ class ContactLaw(eqx.Module):
 
         If the total force falls with sliding, the derivative is set to 0.
         """
-        square, other, both = along**2, across**2, along * across
-        held, (by_along, by_across) = self.per_speed(square, other), self.per_speed_rise(square, other)
-        grows = held + 2 * (square * by_along + other * by_across)
+        square, other, speed_product = along**2, across**2, along * across
+        friction_per_speed, (by_along, by_across) = self.per_speed(square, other), self.per_speed_rise(square, other)
+        grows = friction_per_speed + 2 * (square * by_along + other * by_across)
         stays = jnp.maximum(-grows, 0.0) / (square + other + STILL)
         first, second = 2 * by_along + stays, 2 * by_across + stays
-        return (held + square * first, both * second), (both * first, held + other * second)
+        return (friction_per_speed + square * first, speed_product * second), (
+            speed_product * first,
+            friction_per_speed + other * second,
+        )
 
 
 @eqx.filter_custom_jvp
@@ -278,12 +284,12 @@ def ground_forces(
         loads: load transfer T [N] and centre of pressure x_p [m], if they are unknowns of a larger search. None: they
             are solved here.
     """
-    given = _GroundForceInputs(stance, friction, adhesion, load, sliding, lateral_speed, yaw_rate, resistance)
+    inputs = _GroundForceInputs(stance, friction, adhesion, load, sliding, lateral_speed, yaw_rate, resistance)
     if loads is not None:
-        return _forces_at_loads(loads, None, given)
-    held = jax.lax.stop_gradient(given)
-    at, rise = _solve_loads(held)
-    forces = _forces_at_loads(at, None, given)
+        return _forces_at_loads(loads, None, inputs)
+    detached_inputs = jax.lax.stop_gradient(inputs)
+    at, rise = _solve_loads(detached_inputs)
+    forces = _forces_at_loads(at, None, inputs)
     # Only the last step carries derivatives, the implicit ones; it is so small that linear terms suffice.
     change = _load_step(forces.lacking, rise.lacking)
     return jax.tree.map(lambda x, slope: x - slope @ change, forces, rise)
@@ -309,18 +315,20 @@ def _solve_loads(given: _GroundForceInputs) -> tuple[Pair, GroundForces]:
             def lacking(x: Array) -> tuple[Array, Array]:
                 return (_forces_at_loads(x, even, given).lacking,) * 2
 
-            slope, left = jax.jacfwd(lacking, has_aux=True)(loads)
-            return loads - _load_step(left, slope)
+            slope, residual = jax.jacfwd(lacking, has_aux=True)(loads)
+            return loads - _load_step(residual, slope)
 
         loads_found = jax.lax.fori_loop(0, LOAD_STEPS, step, loads, unroll=even is not None)
         return loads_found, jax.jacfwd(lambda x: _forces_at_loads(x, even, given))(loads_found)
 
     nothing = load * given.sliding[0]
-    begun = jnp.stack([jnp.zeros_like(nothing), stance.ahead * jnp.ones_like(nothing)])
-    even = law_moments(*_moment_arguments(begun[1], given))
-    found = steps(begun, given, even)
-    lifts = (stance.on_tracks > 0.5) & (jnp.maximum(jnp.abs(begun[1]), jnp.abs(found[0][1])) > stance.length / 6)
-    return compute_if_needed(lifts, lambda at, given: steps(at, given, None), (begun, given), found)
+    first_loads = jnp.stack([jnp.zeros_like(nothing), stance.ahead * jnp.ones_like(nothing)])
+    even = law_moments(*_moment_arguments(first_loads[1], given))
+    solution = steps(first_loads, given, even)
+    lifts = (stance.on_tracks > 0.5) & (
+        jnp.maximum(jnp.abs(first_loads[1]), jnp.abs(solution[0][1])) > stance.length / 6
+    )
+    return compute_if_needed(lifts, lambda at, given: steps(at, given, None), (first_loads, given), solution)
 
 
 def _moment_arguments(centre: Scalar, given: _GroundForceInputs) -> tuple[ContactLaw, Array, Scalar, Scalar]:
@@ -337,17 +345,17 @@ def _forces_at_loads(loads: Array, even: Array | None, given: _GroundForceInputs
     The lateral speed is linear along a contact, and so is its load. Forces and moments are therefore sums of four
     moments of the law over a uniform load. `even`: these moments, if known.
     """
-    (moved, centre), stance, adhesion, load = loads, given.stance, given.adhesion, given.load
-    normal = jnp.maximum(load / 2 - 2 * SIDES * moved, 0.0)
+    (moments, centre), stance, adhesion, load = loads, given.stance, given.adhesion, given.load
+    normal = jnp.maximum(load / 2 - 2 * SIDES * moments, 0.0)
     place, half, tilt = loaded_part(stance, centre)
     arm = place - stance.ahead
     law, sliding, middle, end = _moment_arguments(centre, given)
     even = law_moments(law, sliding, middle, end) if even is None else even
     zeroth, first, second = (even[:, k] + tilt * even[:, k + 1] for k in range(3))
-    held, across = adhesion * normal, adhesion * normal * stance.lateral**stance.rule
+    friction_limit, across = adhesion * normal, adhesion * normal * stance.lateral**stance.rule
     aside = across * (middle * zeroth + end * first)
-    turned = across * (middle * first + end * second)
-    ahead = held * zeroth * sliding
+    turning_force = across * (middle * first + end * second)
+    ahead = friction_limit * zeroth * sliding
     outward = stance.height * sum_of_sides(aside) / stance.width
     # A vertical ground carries no normal load.
     behind = stance.height * sum_of_sides(ahead - given.resistance * normal) / jnp.maximum(load, 1e-9)
@@ -355,9 +363,9 @@ def _forces_at_loads(loads: Array, even: Array | None, given: _GroundForceInputs
         normal=normal,
         ahead=ahead,
         aside=aside,
-        moment=arm * aside + half * turned,
-        across=middle * aside + end * turned,
-        moved=moved,
+        moment=arm * aside + half * turning_force,
+        across=middle * aside + end * turning_force,
+        moved=moments,
         centre=centre,
         lacking=loads - jnp.stack([outward, stance.ahead - behind]),
     )

@@ -98,20 +98,20 @@ def tips_on_path(path: BeltPath, place: Numbers) -> PathTips:
     ahead = (place < run / 2) | (place > run + arc + run / 2)
     side = jnp.where(ahead, 1.0, -1.0)
     x = jnp.where(ahead, jnp.where(place < run / 2, place, place - path.length), run - place)
-    turned = jnp.clip(-x / radius, 0.0, jnp.pi)  # on the arc, from its bottom
+    arc_angle = jnp.clip(-x / radius, 0.0, jnp.pi)  # on the arc, from its bottom
     share = jnp.clip((base / 2 - x) / base, 0.0, 1.0)  # of the base on the arc
     tilt = jnp.minimum(jnp.where(x < -base / 2, -x / radius, share**2 * base / (2 * radius)), jnp.pi)
     tilt_rate = -jnp.where(tilt < jnp.pi, share, 0.0) / radius
     rise = gear.guide_recess * cubic_step(x, 0.0, 0.0, gear.guide_gap, 1.0)
     u = jnp.clip(x / gear.guide_gap, 0.0, 1.0)
     rise_rate = gear.guide_recess * 6 * u * (1 - u) / gear.guide_gap
-    straight = jnp.where(x > 0, -x, jnp.where(turned < jnp.pi, 0.0, x + arc))
+    straight = jnp.where(x > 0, -x, jnp.where(arc_angle < jnp.pi, 0.0, x + arc))
     height = gear.grouser_height
     return PathTips(
-        forward=side * (run / 2 + straight + radius * sine(turned) + height * sine(tilt)),
-        up=-radius * cosine(turned) - height * cosine(tilt) + rise,
-        rate_forward=-cosine(turned) + height * cosine(tilt) * tilt_rate,
-        rate_up=side * (-sine(turned) + height * sine(tilt) * tilt_rate + rise_rate),
+        forward=side * (run / 2 + straight + radius * sine(arc_angle) + height * sine(tilt)),
+        up=-radius * cosine(arc_angle) - height * cosine(tilt) + rise,
+        rate_forward=-cosine(arc_angle) + height * cosine(tilt) * tilt_rate,
+        rate_up=side * (-sine(arc_angle) + height * sine(tilt) * tilt_rate + rise_rate),
         guided=jnp.where(x > 0, cubic_step(x, 0.0, 0.0, gear.guide_gap, 1.0), 0.0),
         compliance=u * (1 - u) * gear.guide_gap,
     )

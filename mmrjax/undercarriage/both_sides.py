@@ -65,9 +65,9 @@ class _ContactsOfSides(eqx.Module):
     def pull(self, chassis: Chassis, signals: Signals) -> ContactPull:
         def side(signals: Signals, at: ContactState, aside: Array, height: Scalar) -> ContactPull:
             along = side_contacts.sliding_speeds(signals, at)
-            held = signals.adhesion * at.force * self.law.per_speed(along**2, aside**2)
-            pulled = side_contacts.contact_forces(self.path, chassis, signals, at, height, held * along)
-            return dataclasses.replace(pulled, aside=-self.lateral * held * aside)
+            friction_force = signals.adhesion * at.force * self.law.per_speed(along**2, aside**2)
+            pulled = side_contacts.contact_forces(self.path, chassis, signals, at, height, friction_force * along)
+            return dataclasses.replace(pulled, aside=-self.lateral * friction_force * aside)
 
         return jax.vmap(side)(signals, self.at, self.aside, self.height)
 
@@ -216,14 +216,14 @@ def damping_matrix(
         + (f / least)[..., None] * falls
         for k, f in enumerate((pulled.force, pulled.aside))
     ]
-    each = jnp.einsum("sci,scj->sij", moves, jnp.concatenate([*pushes, falls], axis=1))
+    side_matrices = jnp.einsum("sci,scj->sij", moves, jnp.concatenate([*pushes, falls], axis=1))
     losses = _loss_derivatives(run, plane_motion(run, motion), sides)
     # Rolling resistance acts at each side, along the robot.
     cos, sin = cosine(motion.q[YAW]), sine(motion.q[YAW])
     total = jnp.zeros((COORDINATES, COORDINATES), motion.v.dtype)
     for k, y in enumerate(SIDES):
         way = jnp.zeros(8).at[jnp.asarray([X, Y, YAW])].set(jnp.stack([cos, sin, -y * _width(run)]))
-        of_side = each[k] + losses[0, k] * jnp.outer(way, way)
+        of_side = side_matrices[k] + losses[0, k] * jnp.outer(way, way)
         of_side = of_side.at[6, 6].add(losses[1, k])
         total = total.at[np.ix_(OF_SIDE[k], OF_SIDE[k])].add(of_side)
     return run.robot.sides / 2 * total, levers, rises
@@ -302,8 +302,8 @@ def _differentiated(primals: tuple[HalfRobotSystem, HalfRobotState], tangents: t
         fallen = _damping_product(run, motion, forces, gained)
         return forces.push - forces.mass @ gained - run.step * fallen, forces
 
-    _, (left, changed) = eqx.filter_jvp(held, primals, tangents)
-    return eqx.filter_jvp(_state_after_step, (*primals, found, gained), (*tangents, changed, solve(left)))
+    _, (force_residual, changed) = eqx.filter_jvp(held, primals, tangents)
+    return eqx.filter_jvp(_state_after_step, (*primals, found, gained), (*tangents, changed, solve(force_residual)))
 
 
 def _damping_product(
@@ -324,8 +324,8 @@ def _damping_product(
     for lever, now, then in zip(
         (levers.along, levers.across, levers.off), (pulled.force, pulled.aside, touching.force), after, strict=True
     ):
-        each = jnp.einsum("sci,sc->si", lever, now - then)
-        gained_forces = gained_forces.at[OF_SIDE[0]].add(each[0]).at[OF_SIDE[1]].add(each[1])
+        side_products = jnp.einsum("sci,sc->si", lever, now - then)
+        gained_forces = gained_forces.at[OF_SIDE[0]].add(side_products[0]).at[OF_SIDE[1]].add(side_products[1])
     return run.robot.sides / 2 * gained_forces
 
 
@@ -338,8 +338,10 @@ def _state_after_step(
         of_side = dataclasses.replace(run, conditions=own), dataclasses.replace(motion, memory=memory)
         return half_robot.other_states_after_step(*of_side, signals)
 
-    each = jax.vmap(later)(run.conditions.of_sides(), found.signals, motion.memory)
-    after = HalfRobotState(motion.q + run.step * v, v, each.current, each.discharge[0], each.memory)
+    side_memories = jax.vmap(later)(run.conditions.of_sides(), found.signals, motion.memory)
+    after = HalfRobotState(
+        motion.q + run.step * v, v, side_memories.current, side_memories.discharge[0], side_memories.memory
+    )
     return after, _signals_after_step(run, motion, found, gained), found.pulled.guided
 
 
@@ -396,8 +398,8 @@ def stand(run: HalfRobotSystem) -> HalfRobotState:
 
     Load transfer to the lower side is not included yet.
     """
-    stated = run.conditions.heading_deg
-    heading = jnp.zeros(()) if stated is None else jnp.radians(stated)
+    heading_deg = run.conditions.heading_deg
+    heading = jnp.zeros(()) if heading_deg is None else jnp.radians(heading_deg)
     along = jnp.degrees(jnp.arcsin(sine(run.conditions.slope) * cosine(heading)))
     half = half_robot.stand(dataclasses.replace(run, conditions=dataclasses.replace(run.conditions, slope_deg=along)))
     q = (
@@ -433,8 +435,8 @@ def distance_and_reactions(q: Array, reactions: GearReactions) -> tuple[Array, G
 
 def steady_averages(average: Average, travelled: Array, passed: balances.Travel, guided: Array) -> SteadyAverages:
     """See `half_robot.steady_averages`. Quantities of the whole robot are averaged over the periods of both sides."""
-    both = jax.tree.map(lambda x: jnp.broadcast_to(x.reshape(*x.shape[:1], -1), (*x.shape[:1], 2)), passed)
-    means, load, periods, changes = jax.vmap(average, in_axes=1)(jnp.abs(travelled), (both, guided))
+    side_averages = jax.tree.map(lambda x: jnp.broadcast_to(x.reshape(*x.shape[:1], -1), (*x.shape[:1], 2)), passed)
+    means, load, periods, changes = jax.vmap(average, in_axes=1)(jnp.abs(travelled), (side_averages, guided))
     travel = jax.tree.map(lambda x, like: x if like.ndim > 1 else jnp.mean(x), means, passed)
     share = jnp.sum(load) / jnp.maximum(jnp.sum(travel.signals.normal), 1e-9)
     # A side that hardly moves counts as settled if its changes are small compared with the other side's.
@@ -446,8 +448,8 @@ def status(run: HalfRobotSystem, averages: SteadyAverages, end: HalfRobotState) 
     """See `half_robot.status`."""
     travel, signals = averages.travel, jax.tree.map(jnp.mean, averages.signals)
     assert travel is not None
-    over = {name: getattr(signals, name) for name in ("speed", "speed_lateral", "yaw_rate")}
-    keeps = dataclasses.replace(plane_motion(run, end), **over)
+    limits = {name: getattr(signals, name) for name in ("speed", "speed_lateral", "yaw_rate")}
+    keeps = dataclasses.replace(plane_motion(run, end), **limits)
     status = circling.status_of_steady_motion(run.robot, run.conditions, travel, keeps)
     status = jnp.where((averages.change > half_robot.SETTLED) & (status == CONVERGED), NOT_SETTLED, status)
     tilt = jnp.maximum(jnp.abs(end.q[PITCH]), jnp.abs(end.q[ROLL]))

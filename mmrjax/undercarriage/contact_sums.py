@@ -123,14 +123,14 @@ def contributions_of_contacts(
     along = gained[0] + gained[2] * at.lever_z + at.rate_x * drawn
     off = at.damped * (gained[1] - gained[2] * at.lever_x + at.rate_z * drawn)
     fallen = jnp.maximum(rise, 0.0) * along + jnp.where(at.force > 0, coefficient, 0.0) * off
-    left, bears = traction - fallen, at.force - off
+    net_traction, bears = traction - fallen, at.force - off
     guided = at.guided * at.force
     return jnp.stack(
         [
             traction,
             at.force,
-            left * at.lever_z - bears * at.lever_x,
-            (left * at.rate_x + bears * at.rate_z) * rear,
+            net_traction * at.lever_z - bears * at.lever_x,
+            (net_traction * at.rate_x + bears * at.rate_z) * rear,
             (traction * at.rate_x + at.force * at.rate_z) * front,
             guided * front,
             guided * rear,
@@ -159,8 +159,8 @@ class LinearizedSums(eqx.Module):
 
     def near(self, now: Mapping[str, Any]) -> ContactSums:
         """Sums for inputs `now`, to first order. Missing inputs keep their values."""
-        moved = [now[name] - self.at[name] if name in now else jnp.zeros(()) for name in self.names]
-        return jax.tree.map(jnp.add, self.values, _sums(jnp.stack(moved) @ self.slopes))
+        differences = [now[name] - self.at[name] if name in now else jnp.zeros(()) for name in self.names]
+        return jax.tree.map(jnp.add, self.values, _sums(jnp.stack(differences) @ self.slopes))
 
     def slope(self, name: str) -> ContactSums:
         """Derivatives of the sums with respect to one of `names`."""
@@ -252,16 +252,16 @@ class _ContactDerivatives(eqx.Module):
         yields = None if compliance is None else -self.share * compliance
         force = _sum_of_products((self.by_depth, sinks), (-touching.damped, gap_rate), (touching.force, yields))
         damped = _sum_of_products((self.damped_by_depth, sinks), (touching.damped, yields))
-        turned = _sum_of_products((self.bend * touching.force, slide), (self.rise, force))
+        angle_derivative = _sum_of_products((self.bend * touching.force, slide), (self.rise, force))
         down = _sum_of_products((damped, self.off), (touching.damped, off))
         fallen = _sum_of_products(
-            (jnp.where(self.rise > 0, self.along, 0.0), turned),
+            (jnp.where(self.rise > 0, self.along, 0.0), angle_derivative),
             (jnp.maximum(self.rise, 0.0) * touching.force, along),
             (self.rise * touching.damped * self.off, slide),
             (self.coefficient, down),
         )
         pulled = _sum_of_products((self.rise * touching.force, slide), (self.coefficient, force))
-        moved_sums = (pulled, force, fallen, down, turned)
+        moved_sums = (pulled, force, fallen, down, angle_derivative)
         return tuple(jnp.zeros_like(touching.force) if a is None else a for a in moved_sums)
 
 
@@ -313,12 +313,12 @@ def _weighted_sums(forces: Sequence[Forces], levers: Sequence[_SumLevers]) -> Fl
     pulls, bears = jnp.tensordot(pulls, level, ((2,), (2,))), jnp.tensordot(bears, steep, ((2,), (2,)))
     pull, fallen, rise = (pulls[:, k] for k in range(3))
     force, down = (bears[:, k] for k in range(2))
-    left, held = pull - fallen, force - down
+    net_pull, net_force = pull - fallen, force - down
     sums = ContactSums(
         traction=pull[..., 0],
         normal=force[..., 0],
-        moment=left[..., 1] - held[..., 1],
-        rear=left[..., 3] + held[..., 4],
+        moment=net_pull[..., 1] - net_force[..., 1],
+        rear=net_pull[..., 3] + net_force[..., 4],
         front=pull[..., 2] + force[..., 2],
         guide_front=force[..., 3],
         guide_rear=force[..., 5],
@@ -393,8 +393,10 @@ def _sums_and_motion_derivatives(
     pulleys = (front, rear, v[3], v[4])
     taut = free(pulleys)
     drawn_belt = turned(*belt, tip.compliance / taut)
-    over, gains = (path.radius * (a[4] - a[3]) for a in (v, gained))
-    handed = law.moved(gap_rate=rate_z * over, slide=-rate_x * over, along=rate_x * gains, off=rate_z * gains)
+    belt_slip, gains = (path.radius * (a[4] - a[3]) for a in (v, gained))
+    handed = law.moved(
+        gap_rate=rate_z * belt_slip, slide=-rate_x * belt_slip, along=rate_x * gains, off=rate_z * gains
+    )
     changes = [
         law.moved(gap=one),
         turned(*pitched),
@@ -408,20 +410,22 @@ def _sums_and_motion_derivatives(
         law.moved(compliance=-touching.compliance / taut),
     ]
     forces, rates = law.forces(), (rate_x, rate_z, guided)
-    here = _SumLevers.of(one, x, z, tuple(a * on_front for a in rates), tuple(a * on_rear for a in rates))
-    rows = _weighted_sums([*changes, forces], [here])[:, 0]
+    sum_levers = _SumLevers.of(one, x, z, tuple(a * on_front for a in rates), tuple(a * on_rear for a in rates))
+    rows = _weighted_sums([*changes, forces], [sum_levers])[:, 0]
     over_belt = levers(*belt, tip.guided)
     shift = tuple(path.radius * a * shared for a in rates)
     by_share = _SumLevers.of(jnp.zeros_like(x), 0 * x, 0 * x, tuple(-a for a in shift), shift)
-    moved = [
+    derivatives = [
         levers(*pitched, jnp.zeros_like(x)),
         jax.tree.map(lambda a, b: a * by_front + b, over_belt, by_share),
         jax.tree.map(lambda a: a * by_rear, over_belt),
     ]
-    slopes = rows[: len(MOTION)].at[1:4].add(_weighted_sums([forces], moved)[0])
+    slopes = rows[: len(MOTION)].at[1:4].add(_weighted_sums([forces], derivatives)[0])
     for k, name in enumerate(("front", "rear", "v_front", "v_rear")):
-        by = jax.jvp(lambda a, k=k: free((*pulleys[:k], a, *pulleys[k + 1 :])), (pulleys[k],), (unit,))[1]
-        slopes = slopes.at[MOTION.index(name)].add(by * rows[-2])
+        pulley_derivative = jax.jvp(
+            lambda a, k=k: free((*pulleys[:k], a, *pulleys[k + 1 :])), (pulleys[k],), (unit,)
+        )[1]
+        slopes = slopes.at[MOTION.index(name)].add(pulley_derivative * rows[-2])
     return rows[-1], slopes
 
 
@@ -455,14 +459,14 @@ class SummedContacts(eqx.Module):
 
     def shifted(self, slip: Scalar) -> ContactSums:
         """Sums with `slip` added to the sliding speeds [m/s]."""
-        by, was = self.linearized.slope("slip"), self.linearized.values
-        moved = slip - self.linearized.at["slip"]
-        sums = jax.tree.map(lambda a, b: a + b * moved, self.sums, by)
+        slip_derivative, was = self.linearized.slope("slip"), self.linearized.values
+        slip_change = slip - self.linearized.at["slip"]
+        sums = jax.tree.map(lambda a, b: a + b * slip_change, self.sums, slip_derivative)
         rise, rise_front = self.sums.rise - was.rise, self.sums.rise_front - was.rise_front
         return dataclasses.replace(
             sums,
-            traction=sums.traction - (rise + by.rise * moved / 2) * moved,
-            front=sums.front - (rise_front + by.rise_front * moved / 2) * moved,
+            traction=sums.traction - (rise + slip_derivative.rise * slip_change / 2) * slip_change,
+            front=sums.front - (rise_front + slip_derivative.rise_front * slip_change / 2) * slip_change,
         )
 
     def pull(self, chassis: Chassis, signals: Signals) -> ContactForces:

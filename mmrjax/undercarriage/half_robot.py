@@ -281,10 +281,12 @@ def _implicit_step(run: HalfRobotSystem, motion: HalfRobotState) -> _StepFactors
     damping = damping_matrix(run, motion, signals, touching, pulled)
     factors = factorise(mass + run.step * damping)
     gained = solve_factorised(factors, mass @ (pushed - motion.v))
-    after, over = _state_after_motion(
+    after, is_over = _state_after_motion(
         motion, run.step, other_states_after_step(run, motion, signals), damping @ gained, gained, signals
     )
-    return _StepFactors(after, over, pulled.guided, damping, factors, gained, jnp.asarray(signals.speed_slip_terms))
+    return _StepFactors(
+        after, is_over, pulled.guided, damping, factors, gained, jnp.asarray(signals.speed_slip_terms)
+    )
 
 
 class _StateAfterStep(eqx.Module):
@@ -348,16 +350,16 @@ def _differentiated(
     # the contacts' sums with derivatives with respect to the motion and to the `changed` inputs
     constants = contact_sums.contact_inputs(d_run.path, d_run.chassis, d_run.conditions.adhesion)
     differentiated = tuple(name for name, change in constants.items() if change is not None)
-    given = _contact_inputs(run, motion) | {"slip": step.slip}
-    linearized = contact_sums.linearize(run.path, run.chassis, given, step.gained, differentiated)
+    contact_inputs = _contact_inputs(run, motion) | {"slip": step.slip}
+    linearized = contact_sums.linearize(run.path, run.chassis, contact_inputs, step.gained, differentiated)
 
     def held(run: HalfRobotSystem, motion: HalfRobotState) -> tuple[Array, Array, _StateAfterStep, Signals, Scalar]:
         return _step_residual(run, motion, step.gained, linearized)
 
-    (left, fallen, later, signals, _), d_held = eqx.filter_jvp(held, (run, motion), (d_run, d_motion))
+    (residual, fallen, later, signals, _), d_held = eqx.filter_jvp(held, (run, motion), (d_run, d_motion))
     d_left, d_fallen, d_later, d_signals, d_guided = d_held
     # None: the differentiated quantity does not enter.
-    d_gained = jnp.zeros_like(left) if d_left is None else solve_factorised(step.factors, d_left)
+    d_gained = jnp.zeros_like(residual) if d_left is None else solve_factorised(step.factors, d_left)
     through = step.damping[:2] @ d_gained
     d_fallen = through if d_fallen is None else d_fallen + through
     _, (d_after, d_over) = eqx.filter_jvp(
@@ -442,9 +444,9 @@ def stand(run: HalfRobotSystem, turned: Scalar = 0.0) -> HalfRobotState:
         return jnp.zeros_like(rest).at[3:5].set(turned).at[1].set(height).at[2].set(pitch)
 
     def unbalanced(y: Vector, _: None, given: tuple[Any, ...]) -> Vector:
-        path, chassis, turned, weight, forward, up, axle, cos, sin = given
+        path, chassis, pulley_angle, weight, forward, up, axle, cos, sin = given
         touching = side_contacts.compute_contacts(
-            path, chassis, placed(turned, axle - y[0], y[1]), jnp.zeros_like(rest)
+            path, chassis, placed(pulley_angle, axle - y[0], y[1]), jnp.zeros_like(rest)
         )
         moment = weight * (cos * (forward + y[1] * up) - sin * (up + axle)) - jnp.sum(
             touching.force * touching.lever_x
@@ -452,8 +454,10 @@ def stand(run: HalfRobotSystem, turned: Scalar = 0.0) -> HalfRobotState:
         return (touching.normal - weight * cos) / weight, moment / weight
 
     recess = jnp.maximum(run.path.gear.guide_recess, 0.0) * run.chassis.on_tracks
-    given = run.path, run.chassis, turned, weight, forward, up, axle, cos, sin
-    (sunk, pitch), _ = root(unbalanced, (2e-4 + recess, jnp.zeros_like(recess)), None, given, SUNK, None, False)
+    contact_geometry = run.path, run.chassis, turned, weight, forward, up, axle, cos, sin
+    (sunk, pitch), _ = root(
+        unbalanced, (2e-4 + recess, jnp.zeros_like(recess)), None, contact_geometry, SUNK, None, False
+    )
     stands = tipping_margin(run) > 0
     q = placed(turned, axle - jnp.where(stands, sunk, 0.0), jnp.where(stands, pitch, 0.0))
     memory = {effect.name: jnp.zeros_like(axle) for effect in run.robot.remembering}
@@ -539,8 +543,8 @@ def status_unless_lost(
     """
     level = axle_height(run)
     finite = jnp.all(jnp.isfinite(end.q)) & jnp.all(jnp.isfinite(end.v)) & jnp.isfinite(current)
-    turned = (tilt > OVER) & (tilt < 2 * jnp.pi)
-    status = jnp.where(turned & (jnp.abs(height) < HIGH * level), TIPS, status)
+    is_overturned = (tilt > OVER) & (tilt < 2 * jnp.pi)
+    status = jnp.where(is_overturned & (jnp.abs(height) < HIGH * level), TIPS, status)
     grounded = (jnp.abs(height - level) < 0.5 * level) & (tilt < OVER)
     return jnp.where(finite & (grounded | (status == TIPS)), status, FAILED)
 

@@ -290,8 +290,8 @@ def frame_times(
     film, last = file.suffix != ".png", length if end is None else end
     until = min(last, length)
     if not 0 <= begin <= length or (film and not begin < until):
-        given = f"begin, end: got {begin:g} to {last:g} s" if film else f"begin: got {begin:g} s"
-        raise ValueError(f"{given}; expected times within the run, 0 to {length:g} s")
+        received = f"begin, end: got {begin:g} to {last:g} s" if film else f"begin: got {begin:g} s"
+        raise ValueError(f"{received}; expected times within the run, 0 to {length:g} s")
     if not film:
         return np.asarray([begin])
     pictures = (until - begin) * rate * slow

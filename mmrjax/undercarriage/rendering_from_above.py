@@ -134,13 +134,14 @@ def figure_of_sample(view: TopViewScene, k: int) -> Any:
     sheet = Figure(figsize=(7.2, 8.4), dpi=100, layout="constrained")
     upper, current, rate = sheet.subplots(3, 1, gridspec_kw={"height_ratios": [5.2, 1, 1]})
     draw_sample(upper, view, k)
-    x, y, turned = view.q[k, 0], view.q[k, 1], np.degrees(view.q[k, both_sides.YAW])
+    x, y, heading_deg = view.q[k, 0], view.q[k, 1], np.degrees(view.q[k, both_sides.YAW])
     upper.set(xlim=(-y - AROUND, -y + AROUND), ylim=(x - AROUND, x + AROUND), aspect="equal")
     upper.set_xlabel("to the right of the start, m")
     upper.set_ylabel("uphill, or ahead of the start, m")
     upper.grid(alpha=0.25)
     upper.set_title(
-        f"{view.name}, slope {np.degrees(view.slope):.0f}°, t = {view.time[k]:.3f} s, yaw {turned:.0f}°", fontsize=11
+        f"{view.name}, slope {np.degrees(view.slope):.0f}°, t = {view.time[k]:.3f} s, yaw {heading_deg:.0f}°",
+        fontsize=11,
     )
     handles = [
         Line2D([], [], color=c, lw=4, label=f"{name} side, contacts under load")

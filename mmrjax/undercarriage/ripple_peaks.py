@@ -94,8 +94,8 @@ def measure_fluctuation(time: Series, values: Series) -> Fluctuation:
 
 
 def _parabola_vertex(values: Series, k: int) -> float:
-    below, here, above = values[k - 1 : k + 2]
-    return float(k + (below - above) / (2 * (below - 2 * here + above)))
+    below, middle, above = values[k - 1 : k + 2]
+    return float(k + (below - above) / (2 * (below - 2 * middle + above)))
 
 
 def period_pitch(pitch: float, speed_wheel: float, radius: float) -> float:
@@ -283,8 +283,8 @@ def peaks_over_speed(
         ratio = frequency[top] / passing[top]
         bend, slope, _ = np.polyfit(speed[top - 1 : top + 2] - speed[top], deviation[top - 1 : top + 2], 2)
         peak_speed = float(np.clip(speed[top] - slope / (2 * bend), low, high))
-        whole = round(float(ratio)) if np.isfinite(ratio) else 0
-        order = whole if whole and abs(ratio - whole) < _SAME else 0
+        nearest_ratio = round(float(ratio)) if np.isfinite(ratio) else 0
+        order = nearest_ratio if nearest_ratio and abs(ratio - nearest_ratio) < _SAME else 0
         near = [m for m in modes if order and m.resonant and m.band[0] <= frequency[top] <= m.band[1]]
         mode = min(near, key=lambda m: abs(m.frequency - frequency[top])).name if near else ""
         answer.append(

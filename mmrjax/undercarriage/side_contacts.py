@@ -107,11 +107,11 @@ def compute_contacts(
     gear = path.gear
     belt = belt_runs(path, (q[3], q[4]), (v[3], v[4]))
     place, weight = path.place(q[3], q[4])
-    where = tips_on_path(path, place)
+    tip_places = tips_on_path(path, place)
     pitch = q[2]
     cos, sin = cosine(pitch), sine(pitch)
-    forward, up = join_contacts(where.forward, path.gear.wheelbase / 2 * _END), join_contacts(where.up)
-    ahead, rise = join_contacts(where.rate_forward), join_contacts(where.rate_up)
+    forward, up = join_contacts(tip_places.forward, path.gear.wheelbase / 2 * _END), join_contacts(tip_places.up)
+    ahead, rise = join_contacts(tip_places.rate_forward), join_contacts(tip_places.rate_up)
     # The lowest point of a wheel is below its axle at any pitch of the robot.
     below = jnp.where(WHEEL, chassis.radius, 0.0)
     x, z, rate_x, rate_z, weight = (
@@ -124,7 +124,7 @@ def compute_contacts(
     speed = path.radius * ((1 - weight) * v[3] + weight * v[4])
     gap = q[1] + z
     gap_rate = v[1] - v[2] * x + rate_z * speed
-    compliance = join_contacts(where.compliance / tension_free(path, belt))
+    compliance = join_contacts(tip_places.compliance / tension_free(path, belt))
     depth = jnp.maximum(-gap, 1e-9)
     yields = 1 / (1 + compliance * gear.contact_stiffness * depth ** (gear.contact_exponent - 1))
     bears = bearing_contacts(chassis)
@@ -142,7 +142,7 @@ def compute_contacts(
         compliance=compliance,
         force=jnp.asarray(force * bears),
         damped=damping_contact(force, gap, 0.0, damping, gear.contact_depth) * bears,
-        guided=join_contacts(where.guided),
+        guided=join_contacts(tip_places.guided),
         place=place,
         belt=belt,
     )
@@ -248,8 +248,8 @@ class GearReactions(eqx.Module):
         across = (jnp.arange(TEETH_GROUSER) - TEETH_GROUSER // 2) * path.pitch / TEETH_GROUSER
         place = jnp.mod(self.place[..., None] + across, path.length).reshape(lower.shape)
         begins = path.gear.wheelbase + jnp.pi * path.radius
-        over = (place > begins) & (place < begins + path.gear.wheelbase)
-        return lower, jnp.where(over, path.gear.belt_mass * GRAVITY / TEETH_BELT, 0.0)
+        is_engaged = (place > begins) & (place < begins + path.gear.wheelbase)
+        return lower, jnp.where(is_engaged, path.gear.belt_mass * GRAVITY / TEETH_BELT, 0.0)
 
 
 def inner_loads(path: BeltPath, at: ContactState, pulled: ContactPull) -> GearReactions:

@@ -28,8 +28,8 @@ def step_derivative(run: HalfRobotSystem, at: HalfRobotState) -> Float[Array, "1
     """Derivative of (q, v, current) after one step with respect to (q, v, current), of one run."""
 
     def after(y: Float[Array, " 11"]) -> Float[Array, " 11"]:
-        moved, _, _ = advance(run, HalfRobotState(y[:5], y[5:10], y[10], at.discharge, at.memory))
-        return jnp.concatenate([moved.q, moved.v, jnp.asarray(moved.current)[None]])
+        next_state, _, _ = advance(run, HalfRobotState(y[:5], y[5:10], y[10], at.discharge, at.memory))
+        return jnp.concatenate([next_state.q, next_state.v, jnp.asarray(next_state.current)[None]])
 
     return jax.jacfwd(after)(jnp.concatenate([at.q, at.v, jnp.asarray(at.current)[None]]))
 
@@ -110,9 +110,11 @@ def check_track_step(robot: Robot, conditions: Conditions, step: float, sample: 
         tip = float(np.min(tips))
         if tracked.any() and tip < -height:
             of_run = f"levers_{name.removeprefix('lever_')}_deg"
-            stated = getattr(conditions, of_run)
-            stands = np.degrees(float(getattr(gear, name))) if stated is None else np.ravel(stated)[np.argmin(tips)]
-            name = name if stated is None else of_run
+            run_value = getattr(conditions, of_run)
+            stands = (
+                np.degrees(float(getattr(gear, name))) if run_value is None else np.ravel(run_value)[np.argmin(tips)]
+            )
+            name = name if run_value is None else of_run
             raise ValueError(
                 f"{name}: got {stands:.0f} deg, its tip {1e3 * (-tip - height):.0f} mm below the "
                 "ground; expected a posture on the main tracks, with both tips above the ground"

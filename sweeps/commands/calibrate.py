@@ -22,13 +22,13 @@ def execute(config: configuration.Calibrate, beside: configuration.FittedRuns) -
         return feedforward_fit.execute(config, beside)
     robot = load_robot(config).robot
     runs = read_runs(beside.data, robot, columns=config.columns, measured=True, series=True)
-    stated = priors.parse_priors(config.prior)
+    prior_options = priors.parse_priors(config.prior)
     with (
         open_folder("calibrate", config, robot, beside, runs) as folder,
         step_reporter(print_message, "fitting") as heard,
     ):
         result = run(
-            runs, robot, rows=config.rows, free=config.free, fix=config.fix, stated=stated,
+            runs, robot, rows=config.rows, free=config.free, fix=config.fix, stated=prior_options,
             noise=config.noise or None, model=config.model, starts=config.starts, population=config.population,
             generations=config.generations, members=beside.members, seed=config.seed,
             profiles=config.profiles, blocks=config.hold_out, solver=config.solver, tell=heard,

@@ -99,12 +99,12 @@ def _climb_of_configuration(
     """The climb of a configuration: over one obstacle, a search for the largest one, or with derivatives."""
 
     def run(sizes: np.ndarray) -> tuple[Terrain, ClimbRuns]:
-        every = [_obstacle_terrain(config, float(size) / 1000)[0] for size in sizes]
-        grounds = jax.tree.map(lambda *x: jnp.stack(x), *every)
+        all_terrains = [_obstacle_terrain(config, float(size) / 1000)[0] for size in sizes]
+        grounds = jax.tree.map(lambda *x: jnp.stack(x), *all_terrains)
         alike = [jax.tree.map(lambda x: jnp.stack([jnp.asarray(x)] * len(sizes)), c) for c in (conditions, sequence)]
         with progress_bar(1, quiet=False) as advance:
             counter = scale.share_counter(advance, 1)
-            ended = climb_batch(
+            climb_runs = climb_batch(
                 robot,
                 alike[0],
                 grounds,
@@ -114,26 +114,26 @@ def _climb_of_configuration(
                 progress=counter,
             )
             counter(1.0)
-        return grounds, ended
+        return grounds, climb_runs
 
-    chosen, largest = 0, None
+    shown_index, largest = 0, None
     tried: tuple[tuple[float, str], ...] = ()
     derivatives: ClimbDerivatives | None = None
     if config.find is not None:
-        grounds, ended, chosen, tried, largest = _search_largest(config.find, run)
+        grounds, all_climbs, shown_index, tried, largest = _search_largest(config.find, run)
     elif along is None:
-        grounds, ended = run(np.array([np.nan]))
+        grounds, all_climbs = run(np.array([np.nan]))
     else:
         with progress_bar(1, quiet=False) as advance:
             derivatives = climb_derivatives(
                 along.given, along.values, along.widths, duration=config.duration_s, step=config.time_step_s,
                 progress=scale.share_counter(advance, 1),
             )  # fmt: skip
-        ended = derivatives.climb
+        all_climbs = derivatives.climb
         grounds = jax.tree.map(lambda x: x[None], along.given(along.values).terrain)
-    one = jax.tree.map(lambda x: x[chosen : chosen + 1], ended)
+    one = jax.tree.map(lambda x: x[shown_index : shown_index + 1], all_climbs)
     return ClimbResult(
-        robot, name, words, jax.tree.map(lambda x: x[chosen], grounds), one, tried, largest,
+        robot, name, words, jax.tree.map(lambda x: x[shown_index], grounds), one, tried, largest,
         {"step": "step", "stairs": "rise of such stairs", "gap": "gap", None: ""}[config.find],
         along, derivatives,
     )  # fmt: skip
@@ -156,13 +156,13 @@ def _derivative_variables(
     kind = next((k for k, size in sizes.items() if size is not None), None)
     levers = {"levers_front_deg": "front", "levers_rear_deg": "rear"}
     variables = ["adhesion", "payload", "discharge" if config.battery else "voltage"]
-    moved = sequence.begins is None and not reason_without_levers(robot, config.configuration or "")
-    variables += [*(levers if moved else ()), *([SIZE] if kind is not None else [])]
+    levers_move = sequence.begins is None and not reason_without_levers(robot, config.configuration or "")
+    variables += [*(levers if levers_move else ()), *([SIZE] if kind is not None else [])]
     for k, name in enumerate(names):
         if name in names[:k]:
             raise BadConfiguration(f"--derivatives: got {name} twice; expected each once")
-        if name not in variables and name not in (every := [p.name for p in params.walk_parameters(robot)]):
-            meant = " or ".join(similar_words(name, (*variables, *every), 2))
+        if name not in variables and name not in (parameter_names := [p.name for p in params.walk_parameters(robot)]):
+            meant = " or ".join(similar_words(name, (*variables, *parameter_names), 2))
             raise BadConfiguration(
                 f"--derivatives: got {name}; expected {', '.join(variables)} or a parameter of the robot"
                 + (f"; did you mean {meant}?" if meant else "")
@@ -182,7 +182,7 @@ def _derivative_variables(
         changed_robot, run = variation.at(
             jnp.stack([value_of[name] for name in of_run] or [jnp.zeros(())]), conditions
         )
-        moved = {
+        levers_move = {
             end: getattr(sequence, end) + jnp.radians(value_of[name] - usual[name])
             for name, end in levers.items()
             if name in value_of
@@ -190,7 +190,7 @@ def _derivative_variables(
         ground = (
             _obstacle_terrain(searched, value_of[SIZE] / 1000) if SIZE in value_of else _obstacle_terrain(config, 0.1)
         )
-        return ClimbInputs(changed_robot, run, ground[0], dataclasses.replace(sequence, **moved))
+        return ClimbInputs(changed_robot, run, ground[0], dataclasses.replace(sequence, **levers_move))
 
     values = [usual[name] for name in names]
     widths = [WIDTHS.get(name, WIDTH * abs(value) or 1.0) for name, value in zip(names, values, strict=True)]
@@ -208,18 +208,18 @@ def _search_largest(
     low, high = SOUGHT[what]
     sizes = np.linspace(low, high, ROUND)
     tried: dict[float, str] = {}
-    kept: tuple[Terrain, ClimbRuns, int] | None = None
+    largest_climbed: tuple[Terrain, ClimbRuns, int] | None = None
     while True:
-        grounds, ended = run(sizes)
-        tried |= {float(s): v for s, v in zip(sizes, ended.names, strict=True)}
+        grounds, climb_runs = run(sizes)
+        tried |= {float(s): v for s, v in zip(sizes, climb_runs.names, strict=True)}
         order = sorted(tried)
-        over = [s for s in order if tried[s] == "over" and all(tried[t] == "over" for t in order if t < s)]
-        best = max(over, default=None)
-        if kept is None or best in sizes:
-            kept = grounds, ended, int(np.flatnonzero(sizes == best)[0]) if best in sizes else 0
+        climbed_sizes = [s for s in order if tried[s] == "over" and all(tried[t] == "over" for t in order if t < s)]
+        best = max(climbed_sizes, default=None)
+        if largest_climbed is None or best in sizes:
+            largest_climbed = grounds, climb_runs, int(np.flatnonzero(sizes == best)[0]) if best in sizes else 0
         beyond = [s for s in order if best is None or s > best]
         if best is None or not beyond or min(beyond) - best <= NEAR:
-            return *kept, tuple((s, tried[s]) for s in order), best
+            return *largest_climbed, tuple((s, tried[s]) for s in order), best
         inner = np.linspace(best, min(beyond), ROUND + 2)[1:-1]
         sizes = np.unique(np.round(inner, 1))
 
@@ -255,26 +255,28 @@ def _lever_sequence(config: configuration.Climb, robot: Robot, name: str) -> Lev
         BadConfiguration: a configuration without levers, an angle beyond their range, a lever that begins below the
             ground.
     """
-    stated = config.sequence, config.levers_front_deg, config.levers_rear_deg
+    lever_options = config.sequence, config.levers_front_deg, config.levers_rear_deg
     gear = robot.running_gear
     tracked = bool(np.asarray(robot.configurations[name].on_tracks) > 0.5)
-    if not tracked and stated != (None, None, None):
+    if not tracked and lever_options != (None, None, None):
         raise BadConfiguration(f"--levers-front, --levers-rear, --sequence: {reason_without_levers(robot, name)}")
     folded_angles = (
         float(np.degrees(np.asarray(gear.lever_front))),
         180 - float(np.degrees(np.asarray(gear.lever_rear))),
     )
     angles = []
-    for option, given, usual in zip(("--levers-front", "--levers-rear"), stated[1:], folded_angles, strict=True):
-        angle = usual if given is None else given
-        if given is not None and (why := terrains.lever_angle_refusal(robot, angle)):
+    for option, option_value, usual in zip(
+        ("--levers-front", "--levers-rear"), lever_options[1:], folded_angles, strict=True
+    ):
+        angle = usual if option_value is None else option_value
+        if option_value is not None and (why := terrains.lever_angle_refusal(robot, angle)):
             raise BadConfiguration(f"{option}: {why}")
         angles.append(float(np.radians(angle)))
     if config.sequence is None:
         sequence = climb_simulation.constant_angles(*angles)
     else:
         sequence = terrains.read_sequence(config.sequence, robot, (angles[0], angles[1]))
-        if sequence.begins is None and stated[1:] != (None, None):
+        if sequence.begins is None and lever_options[1:] != (None, None):
             raise BadConfiguration(
                 f"--levers-front, --levers-rear: {config.sequence.name} already gives all angles; give these "
                 "options only with a sequence of voltages (front_V, rear_V)"

@@ -35,7 +35,7 @@ def execute(config: configuration.Compare, beside: configuration.ComparedRuns) -
     code.
     """
     file = load_robot(config)
-    stated = runs = read_runs(
+    measured_runs = runs = read_runs(
         beside.data, file.robot, columns=config.columns, measured=True, series=True, of_turns=True
     )
     if runs.turns:
@@ -50,13 +50,13 @@ def execute(config: configuration.Compare, beside: configuration.ComparedRuns) -
     posterior = None if config.posterior is None else posterior_beside_robot(file)
     with open_folder("compare", config, robot, beside, runs) as folder:
         table = run.evaluate_runs(robot, runs, config, folder)
-        comparison, summary = compare_readings(stated, table, robot)
+        comparison, summary = compare_readings(measured_runs, table, robot)
         if second is not None:
             other = instruments.with_inferred_instruments(second.robot, runs)
             comparison = add_second_robot(
-                comparison, stated.channels, run.evaluate_runs(other, runs, config, folder=None)
+                comparison, measured_runs.channels, run.evaluate_runs(other, runs, config, folder=None)
             )
-        notes = (*missing_readings_notes(comparison, stated.channels), *remarks)
+        notes = (*missing_readings_notes(comparison, measured_runs.channels), *remarks)
         of_draws: list[str] = []
         if posterior is not None and config.posterior is not None:
             spread = uncertainty.simulate_draws(robot, posterior, runs, config, config.posterior, folder)
@@ -68,7 +68,7 @@ def execute(config: configuration.Compare, beside: configuration.ComparedRuns) -
             }
         folder.write_table("comparison.csv", comparison)
         result = Comparison(
-            comparison, summary, stated.channels, Path(runs.source).name, config.model,
+            comparison, summary, measured_runs.channels, Path(runs.source).name, config.model,
             capabilities.displayed_name(file),
             recorded_fit(file, runs), notes=(*notes, *of_draws), against=_second_name(config, file, second),
         )  # fmt: skip
@@ -84,7 +84,7 @@ def _compare_histories(
 ) -> int:
     """Compares time histories, each simulated from its start as in fits."""
     options = {"--own-mass": beside.own_mass, "--posterior": config.posterior, "--duration": config.duration_s}
-    for option in (name for name, stated in options.items() if stated):
+    for option in (name for name, is_given in options.items() if is_given):
         raise BadConfiguration(
             f"{option}: {Path(runs.source).name} contains time histories, which are simulated sample by sample "
             "with their own masses and times; remove this option"
@@ -154,10 +154,10 @@ def _second_name(config: configuration.Compare, file: RobotFile, second: RobotFi
 
 def missing_readings_notes(table: Columns, channels: Sequence[Channel]) -> list[str]:
     """Sentences on channels with missing readings."""
-    lost = {c.column: int(np.isnan(table[c.column]).sum()) for c in channels}
+    missing_counts = {c.column: int(np.isnan(table[c.column]).sum()) for c in channels}
     rows = len(table["status"])
     return [
         f"{column}: {'all' if count == rows else f'{count} of {rows}'} readings are missing and are ignored"
-        for column, count in lost.items()
+        for column, count in missing_counts.items()
         if count
     ]

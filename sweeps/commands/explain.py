@@ -214,8 +214,10 @@ def _output_lines(name: str, library: Library) -> Iterator[Line]:
         yield "is", f"{o.label} [{o.unit_shown}]"
         if (meaning := _attribute_description(Result, o.name)) and o in outputs.FURTHER:
             yield "equation", meaning
-        where = "missions (--profile)" if o in (*mission_batch.OUTPUTS, *mission_batch.OF_TURNS) else "every run"
-        yield "column", f"{o.column}, of {'--outputs' if o in derived.TABLE else where}"
+        source_words = (
+            "missions (--profile)" if o in (*mission_batch.OUTPUTS, *mission_batch.OF_TURNS) else "every run"
+        )
+        yield "column", f"{o.column}, of {'--outputs' if o in derived.TABLE else source_words}"
 
 
 def _attribute_description(kind: type, name: str) -> str:

@@ -27,7 +27,7 @@ ROTOR = "motor_speed_rpm", ""
 
 def execute(config: configuration.Calibrate, beside: configuration.FittedRuns) -> int:
     """Fit the constants, print them and write a run folder. Returns the exit code, 0."""
-    if stated := config.robot != "nominal":
+    if has_robot := config.robot != "nominal":
         robot = load_robot(config).robot
     else:
         with resources.as_file(resources.files("calibration.data") / "rigs" / "feedforward.toml") as path:
@@ -46,7 +46,7 @@ def execute(config: configuration.Calibrate, beside: configuration.FittedRuns) -
         folder.write_json("feedforward.json", found.to_json())
         folder.write_table("windows.csv", found.windows)
         shown = print_report(feedforward_report.feedforward_document(found))
-        note = "the rig of this log" if stated else "a rig that reads this log"
+        note = "the rig of this log" if has_robot else "a rig that reads this log"
         return finish_run_folder(folder, config, {"seed": None}, robot=robot, note=note, page=shown, runs=runs)
 
 

@@ -71,7 +71,7 @@ def _run_with_time_limit(
 
 def _run_loop(config: configuration.Loop, beside: configuration.LoopBeside, robot: Robot, runs: Runs) -> int:
     began, within = time.monotonic(), beside.seconds
-    stated = priors.parse_priors(config.prior)
+    prior_options = priors.parse_priors(config.prior)
     if config.resolve:
         check_resolvable(runs, beside.members)
     replicates = max(config.replicates, fewest_replicates(observers.observer_kind(runs)))
@@ -82,9 +82,9 @@ def _run_loop(config: configuration.Loop, beside: configuration.LoopBeside, robo
         return max(within - (time.monotonic() - began), 0.0)
 
     def timed(text: str) -> None:
-        used = time.monotonic() - began
-        more = expected_time(text, used)
-        print_message(f"{used:4.0f} s  {text}{'' if more is None else f' (about {more:.0f} s more)'}")
+        elapsed = time.monotonic() - began
+        more = expected_time(text, elapsed)
+        print_message(f"{elapsed:4.0f} s  {text}{'' if more is None else f' (about {more:.0f} s more)'}")
 
     with (
         open_folder("loop", config, robot, beside, runs) as folder,
@@ -107,7 +107,7 @@ def _run_loop(config: configuration.Loop, beside: configuration.LoopBeside, robo
         try:
             with _time_limit(left(), lambda: "verdict" not in stages):
                 verdict = discover(
-                    runs, robot, rows=config.rows, noise=config.noise or None, stated=stated,
+                    runs, robot, rows=config.rows, noise=config.noise or None, stated=prior_options,
                     library=effect_file.effect_library(config.effects), replicates=replicates, seed=config.seed,
                     prefer=config.prefer, forbidden=config.forbid, progress=progress, keep=keep, left=left,
                 )  # fmt: skip
@@ -186,11 +186,11 @@ def _report_stored_stages(stages: Mapping[str, Any], folder: RunFolder, robot_na
     """Reports which stages are stored. Without a verdict, writes the robot of the base fit if it is known."""
     if not stages:
         return
-    kept = [name for name in stages if folder.keeps(name)]
-    if not kept:
+    stored_stages = [name for name in stages if folder.keeps(name)]
+    if not stored_stages:
         print_message(f"{', '.join(stages)} could not be saved; the same command starts from the beginning")
         return
-    print_message(f"kept: {', '.join(kept)}; to continue, run the same command with --out {folder.path}")
+    print_message(f"kept: {', '.join(stored_stages)}; to continue, run the same command with --out {folder.path}")
     if "verdict" in stages:
         traced = stages["verdict"]
         print_message(f"{loop_words.verdict_line(traced)}; held-out errors and other noise levels are still missing")
@@ -229,12 +229,12 @@ def changes_by_effect(found: DiscoveryResult) -> dict[str, Change]:
     with_it, most, measured = simulated(found.robot), {}, found.readings_of_rows.measured
     for name in added:
         without = simulated(params.replace(found.robot, {f"effects.{name}.amplitude": params.as_float(0.0)}))
-        moved = []
+        changes = []
         for k, c in enumerate(found.channels):
             a, b = without[c.name], with_it[c.name]
             size = root_mean_square(measured[found.included, k])
             if np.isfinite(size) and size > 0:
-                moved.append(Change(c, 100 * root_mean_square((b - a)[found.included]) / size, a, b))
-        if moved:
-            most[name] = max(moved, key=lambda change: change.rms)
+                changes.append(Change(c, 100 * root_mean_square((b - a)[found.included]) / size, a, b))
+        if changes:
+            most[name] = max(changes, key=lambda change: change.rms)
     return most

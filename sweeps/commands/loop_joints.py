@@ -76,8 +76,8 @@ class Chain:
                     f"--model: {source.name}, joint {name} has several actuators; expected one drive per joint"
                 )
         if model.neq or not names:
-            what = "closed loops (<equality>)" if names else "no joint"
-            raise BadConfiguration(f"--model: {source.name} has {what}; expected a chain or tree of hinges")
+            problem_words = "closed loops (<equality>)" if names else "no joint"
+            raise BadConfiguration(f"--model: {source.name} has {problem_words}; expected a chain or tree of hinges")
         self.names: Names = tuple(names)
         self.driven: Names = tuple(names[k] for k in sorted(driven))
         for values in (model.dof_damping, model.dof_frictionloss, model.dof_armature):
@@ -127,13 +127,13 @@ def smoothed_motion(time: np.ndarray, angle: np.ndarray, times: np.ndarray, degr
 def columns_of_joint(log: NamedArrays, joint: str, joints: Names) -> NamedArrays:
     """Columns of a log that are a joint's, without its name, and those of no joint."""
     others = tuple(f"{name}." for name in joints if name != joint)
-    kept = [k for k, column in enumerate(log.header) if not column.startswith(others)]
+    joint_columns = [k for k, column in enumerate(log.header) if not column.startswith(others)]
     return dataclasses.replace(
         log,
         name=f"{log.name}, joint {joint}",
-        header=tuple(log.header[k].removeprefix(f"{joint}.") for k in kept),
-        values=tuple(log.values[k] for k in kept),
-        units=tuple(log.units[k] for k in kept if log.units),
+        header=tuple(log.header[k].removeprefix(f"{joint}.") for k in joint_columns),
+        values=tuple(log.values[k] for k in joint_columns),
+        units=tuple(log.units[k] for k in joint_columns if log.units),
     )
 
 
@@ -164,13 +164,13 @@ def smoothed_log(log: NamedArrays, chain: Chain) -> tuple[np.ndarray, np.ndarray
         runs = np.array(column_texts(columns["run_id"]) if "run_id" in columns else [""] * len(log))
         for run in np.unique(runs):
             rows = np.flatnonzero(runs == run)
-            seen = rows[np.isfinite(angle[rows])]
-            if len(seen) < FEWEST or not (np.diff(time[seen]) > 0).all():
+            finite_rows = rows[np.isfinite(angle[rows])]
+            if len(finite_rows) < FEWEST or not (np.diff(time[finite_rows]) > 0).all():
                 raise BadData(
-                    f"{log.name}, {name}.{column}: has {len(seen)} readings in run {run or 1}; expected at least "
-                    f"{FEWEST} with increasing time_s"
+                    f"{log.name}, {name}.{column}: has {len(finite_rows)} readings in run {run or 1}; expected at "
+                    f"least {FEWEST} with increasing time_s"
                 )
-            readings = time[seen], angle[seen], time[rows]
+            readings = time[finite_rows], angle[finite_rows], time[rows]
             motion[:, rows, k], more = smoothed_motion(*readings, degree=5)
             cubic[:, rows, k], _ = smoothed_motion(*readings, degree=3)
             knots[k] += more
@@ -241,8 +241,8 @@ def robot_of_joint(config: configuration.Loop, joint: str) -> tuple[configuratio
     Raises:
         BadConfiguration: no such file, or no rig of one shaft whose motor speed is imposed and current read.
     """
-    named = f"{JOINT}.toml" if config.robot == "nominal" else config.robot
-    one = config.model_copy(update={"robot": named.replace(JOINT, joint), "joints": (joint,)})
+    robot_name = f"{JOINT}.toml" if config.robot == "nominal" else config.robot
+    one = config.model_copy(update={"robot": robot_name.replace(JOINT, joint), "joints": (joint,)})
     robot = load_robot(one).robot
     rig, shaft = robot.rig, not robot.has_ground and len(robot.configurations.members) == 1
     if not shaft or (rig.imposed, rig.channels) != ("motor_speed", ("motor_current",)):
@@ -274,14 +274,14 @@ def run_joints(
     """
     assert config.model is not None
     chain, data = Chain(config.model), Path(beside.data)
-    wanted = chain.driven if config.joints == ("all",) else config.joints
-    unknown = next((name for name in wanted if name not in chain.names), "" if wanted else "all")
+    joint_names = chain.driven if config.joints == ("all",) else config.joints
+    unknown = next((name for name in joint_names if name not in chain.names), "" if joint_names else "all")
     if unknown:
         raise BadConfiguration(
             f"--joints: got {unknown}; {config.model.name} has no such driven joint; "
             f"{allowed_words(unknown, chain.names)}"
         )
-    robots = {name: robot_of_joint(config, name) for name in wanted}
+    robots = {name: robot_of_joint(config, name) for name in joint_names}
     if not data.is_file():
         raise BadData(f"{data}: no such file; expected a log of the joints of {config.model.name}")
     log = reading.read_whole_table(data) or delimited.read_csv_columns(data, data.name)
@@ -290,11 +290,11 @@ def run_joints(
     code, rows = 0, []
     for name, (one, robot) in robots.items():
         place, table = folder / name, runs[name]
-        kept = not beside.force and store.is_finished(place, store.run_identity("loop", one, robot, table))
-        print_message(f"joint {name}{f': finished in {place}, kept' if kept else ''}")
+        is_finished = not beside.force and store.is_finished(place, store.run_identity("loop", one, robot, table))
+        print_message(f"joint {name}{f': finished in {place}, kept' if is_finished else ''}")
         for note in table.notes:
             print_message(note)
-        if not kept:
+        if not is_finished:
             code = max(code, loop(one, beside.model_copy(update={"out": place}), robot, table))
         rows.append(_row(name, place))
     answer = " ".join(f"{name}: {answer}" for name, answer, *_ in rows)
@@ -311,7 +311,7 @@ def _row(joint: str, place: Path) -> tuple[str, str, str, str]:
         answer = json.loads(ranked.read_text(encoding="utf-8"))["answer"] if ranked.is_file() else ""
         return joint, f"no verdict in time; the same command continues; {answer}.", "", ""
     result: Mapping = json.loads((place / "result.json").read_text(encoding="utf-8"))
-    held_out = (result["errors"][which]["held_out"] for which in ("before", "after"))
+    held_out = (result["errors"][fit]["held_out"] for fit in ("before", "after"))
     percent = [next(iter(x.values()))["rms_percent"] if x else None for x in held_out]  # of the current
     errors = "" if None in percent else " → ".join(f"{x:.3g}" for x in percent)
     return joint, result["statement"], errors, f"{joint}/report.html"

@@ -48,9 +48,9 @@ def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> 
     file = load_robot(config)
     robot = file.robot
     if robot.rig.imposed != "voltage":
-        what = imposed.SAID[robot.rig.imposed].words
+        imposed_words = imposed.SAID[robot.rig.imposed].words
         raise BadConfiguration(
-            f"--profile: the {what} is imposed on this robot, but a profile imposes the motor voltage; "
+            f"--profile: the {imposed_words} is imposed on this robot, but a profile imposes the motor voltage; "
             'simulate a table of runs, or set imposed = "voltage" in the robot\'s file'
         )
     if robot.loose:
@@ -96,16 +96,20 @@ def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> 
     _check_turning(robot, runs, source)
     _check_cutoff(robot, runs, source, config)
     with open_folder("simulate", config, robot, beside, runs) as folder:
-        ended = run_missions(robot, runs, source, config)
-        folder.write_table("segments.csv", capabilities.drop_inapplicable_columns(robot, ended.segments))
-        folder.write_table("history.csv", capabilities.drop_inapplicable_columns(robot, ended.course))
-        if not ended.whole:
+        mission_batch_result = run_missions(robot, runs, source, config)
+        folder.write_table(
+            "segments.csv", capabilities.drop_inapplicable_columns(robot, mission_batch_result.segments)
+        )
+        folder.write_table("history.csv", capabilities.drop_inapplicable_columns(robot, mission_batch_result.course))
+        if not mission_batch_result.whole:
             print_message(
                 "history.csv ends before the mission, because the mission took more steps than can be saved"
             )
-        result = run.SimulationResult("simulate", config.model, robot, runs, ended.table, ended.to_json())
+        result = run.SimulationResult(
+            "simulate", config.model, robot, runs, mission_batch_result.table, mission_batch_result.to_json()
+        )
         return run.write_run_folder(
-            folder, config, result, print_report(mission_report.missions_document(file, ended), file)
+            folder, config, result, print_report(mission_report.missions_document(file, mission_batch_result), file)
         )
 
 
@@ -170,7 +174,7 @@ def run_missions(robot: Robot, runs: records.Runs, source: ProfileTable, config:
     tables: list[Columns] = []
     segments: list[Columns] = []
     courses: list[Columns] = []
-    done, whole = 0, True
+    done, is_complete = 0, True
     with progress_bar(len(runs), quiet=False) as advance:
         for batch in mission_batch.simulate_in_parts(robot, conditions, profile, source.start):
             count = len(batch.steps)
@@ -189,7 +193,7 @@ def run_missions(robot: Robot, runs: records.Runs, source: ProfileTable, config:
                 for k in range(count)
             ]
             assert batch.course is not None  # it was asked for
-            whole &= bool((batch.steps - batch.rejected <= batch.course.time.shape[-1]).all())
+            is_complete &= bool((batch.steps - batch.rejected <= batch.course.time.shape[-1]).all())
             done += count
             advance(count)
     about = _condition_columns(robot, runs, source, config)
@@ -198,7 +202,7 @@ def run_missions(robot: Robot, runs: records.Runs, source: ProfileTable, config:
         _concatenate_tables(segments),
         _concatenate_tables(courses),
         source,
-        whole,
+        is_complete,
     )
 
 
@@ -229,23 +233,25 @@ def _segment_rows(
     )
     (runs, cycles, segments) = found.status.shape
     time = np.asarray(found.segments.time).reshape(runs, -1)
-    begun = np.cumsum(time, 1) - time
+    begin_times = np.cumsum(time, 1) - time
     count = cycles * segments
     last = np.stack(
         [np.searchsorted(_segment_of_steps(found, k), np.arange(count), side="right") - 1 for k in range(runs)]
     )
-    whole = np.stack([_segment_of_steps(found, k)[np.maximum(last[k], 0)] == np.arange(count) for k in range(runs)])
+    is_whole_segment = np.stack(
+        [_segment_of_steps(found, k)[np.maximum(last[k], 0)] == np.arange(count) for k in range(runs)]
+    )
     assert found.course is not None  # it was asked for
     discharge = np.asarray(found.course.signals.discharge).reshape(*found.course.time.shape, -1)[..., 0]
     discharge = np.take_along_axis(discharge, np.maximum(last, 0), 1)
     on_battery = np.asarray(conditions.battery)[:, None] > 0.5
-    charge = np.where(on_battery & whole, 1 - discharge / float(robot.battery.capacity), np.nan)
+    charge = np.where(on_battery & is_whole_segment, 1 - discharge / float(robot.battery.capacity), np.nan)
     segment = np.tile(np.arange(segments), cycles)
     rows = {
         "run_id": np.repeat(names, count),
         "cycle": np.tile(np.repeat(np.arange(1, cycles + 1), segments), runs),
         "segment": np.tile(segment + 1, runs),
-        "time_s": begun.ravel(),
+        "time_s": begin_times.ravel(),
         "mode": np.tile(np.array(source.modes)[segment], runs),
         **{column: np.asarray(numbers[column]).ravel() for column in numbers},
         "state_of_charge": charge.ravel(),
@@ -320,10 +326,10 @@ def _course_rows(
     segment = course.segment % source.segment_count
     length = np.asarray(found.segments.time[k]).ravel()
     elapsed = course.time - (np.cumsum(length) - length)[course.segment]
-    which = int(np.asarray(conditions.configuration)[k])
-    per_speed = float(robot.gearbox.ratio) / float(robot.configurations.members[which].radius)
+    configuration_index = int(np.asarray(conditions.configuration)[k])
+    per_speed = float(robot.gearbox.ratio) / float(robot.configurations.members[configuration_index].radius)
     battery = float(np.asarray(conditions.battery)[k]) > 0.5
-    left = 1 - signals.discharge / float(robot.battery.capacity)
+    state_of_charge = 1 - signals.discharge / float(robot.battery.capacity)
     demanded = source.demanded(segment, elapsed, per_speed)
     of_shaft = {}
     if not robot.has_ground:
@@ -351,7 +357,7 @@ def _course_rows(
         "winding_temperature_C": winding if source.turns else np.asarray(reading["winding_temperature"]),
         "housing_temperature_C": housing,
         "energy_Wh": course.energy / quantities.SIZES["Wh"],
-        "state_of_charge": left if battery else np.full(len(picked), np.nan),
+        "state_of_charge": state_of_charge if battery else np.full(len(picked), np.nan),
         "cycle": course.segment // source.segment_count + 1,
         "segment": segment + 1,
         **of_sides,

@@ -38,7 +38,7 @@ def execute(config: configuration.Render, picture: configuration.Picture) -> int
         _write_completely(file, lambda aside: climb_figures.render_climb(climb, aside, begin, end, slow))
         print_output(str(file))
         return DONE
-    still, given = file.suffix == ".png", picture.stated
+    still, columns = file.suffix == ".png", picture.stated
     slow = 20.0 if slow is None else slow
     begin = (0.8 if still else 0.0) if begin is None else begin
     end = begin + 0.1 if end is None and not still else end
@@ -51,9 +51,9 @@ def execute(config: configuration.Render, picture: configuration.Picture) -> int
     robot = load_robot(config).robot
     imposed.check_on_ground(robot, "render")
     if config.turns:
-        turn.check_can_turn(robot, given.get("configuration") or robot.configurations.names[0])
-        given = {**given, **turn.turn_columns(config, given)}
-    conditions = run.conditions_of_runs(robot, one_run(robot, given, config.battery), config)
+        turn.check_can_turn(robot, columns.get("configuration") or robot.configurations.names[0])
+        columns = {**columns, **turn.turn_columns(config, columns)}
+    conditions = run.conditions_of_runs(robot, one_run(robot, columns, config.battery), config)
     run.check_runs_bearable(robot, conditions, config)
     with progress_bar(1, quiet=False) as advance:
         counter = scale.share_counter(advance, 1)

@@ -78,10 +78,10 @@ def execute(config: configuration.Resonance, beside: configuration.FolderPart) -
     conditions = run.conditions_of_runs(robot, runs, config)
     run.check_runs_bearable(robot, conditions, config)
     with open_folder("resonance", config, robot, beside, runs) as folder:
-        what = passing_parts(robot, robot.configurations.names.index(name))
-        columns = _ripple_columns(folder, robot, conditions, config, what)
+        parts_words = passing_parts(robot, robot.configurations.names.index(name))
+        columns = _ripple_columns(folder, robot, conditions, config, parts_words)
         table = {**run.condition_table(robot, runs), "table8": of_table8, **columns}
-        result = _modes_and_peaks(config, robot, what, table)
+        result = _modes_and_peaks(config, robot, parts_words, table)
         _write_folder(folder, config, result)
         document = print_report(resonance_report.resonance_document(result, file), file)
         manifest, solved = {"seed": None, "statuses": result.statuses}, words.every_run_solved(result.statuses)
@@ -138,10 +138,10 @@ def _ripple_columns(
             part = folder.chunk(name)
             if part is None:
                 counter = scale.share_counter(advance, count)
-                chosen = jax.tree.map(lambda x, rows=rows: x[rows], conditions)
+                rows_conditions = jax.tree.map(lambda x, rows=rows: x[rows], conditions)
                 options = {key: config.options[key] for key in ("duration", "step")}
-                ended = track_batch(robot, chosen, rolling=True, progress=counter, **options)
-                part = {key: x[:count] for key, x in _ripple_of_batch(robot, ended, what).items()}
+                track_runs = track_batch(robot, rows_conditions, rolling=True, progress=counter, **options)
+                part = {key: x[:count] for key, x in _ripple_of_batch(robot, track_runs, what).items()}
                 folder.keep_chunk(name, part)
                 counter(1.0)
             else:
@@ -186,7 +186,7 @@ def _modes_and_peaks(
         if not len(rows):
             continue
         speed = table["speed_mean_mm_s"][rows] * MM
-        here = [
+        peaks_here = [
             peak
             for name in SIGNALS
             for peak in peaks_over_speed(
@@ -194,7 +194,7 @@ def _modes_and_peaks(
                 table[f"{name}_frequency_Hz"][rows], peaks,
             )
         ]  # fmt: skip
-        tops += here
+        tops += peaks_here
         ends[payload] = float(speed[0]), float(speed[-1])
     tops = drop_unconfirmed_modes(tops, by_payload)
     meets = [c for p, peaks in ends.items() for c in find_crossings(by_payload[p], p, what.travel, *peaks, tops)]

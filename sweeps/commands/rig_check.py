@@ -129,7 +129,7 @@ class RigCheck:
 
     def channels(self) -> list[Json]:
         """Name, column in the file, sign convention, resolution [unit] and source of the sd of each channel."""
-        theirs = {name: column for name, column, _ in self.robot.rig.columns}
+        columns_by_channel = {name: column for name, column, _ in self.robot.rig.columns}
         rig, rows = (self if self.foresight is None else self.foresight).robot.rig, []
         for k, channel in enumerate(self.robot.channels):
             instrument = rig.instrument(channel.name)
@@ -137,7 +137,7 @@ class RigCheck:
             rows.append(
                 {
                     "channel": channel.name,
-                    "column": theirs.get(channel.column, channel.column),
+                    "column": columns_by_channel.get(channel.column, channel.column),
                     "signed": instrument.signed,
                     "quantum": None if instrument.quantum is None else instrument.quantum / channel.factor,
                     "unit": channel.unit,
@@ -150,9 +150,9 @@ class RigCheck:
         """Use and range of each column of the table."""
         if self.runs is None:
             return []
-        rows, theirs = [], self.runs.headings
+        rows, headings = [], self.runs.headings
         for name, values in self.runs.columns.items():
-            if name not in theirs and self._does_not_apply(name):
+            if name not in headings and self._does_not_apply(name):
                 continue
             number = np.issubdtype(values.dtype, np.number)
             finite = values[np.isfinite(values)] if number else values
@@ -160,8 +160,8 @@ class RigCheck:
             rows.append(
                 {
                     "column": name,
-                    "theirs": theirs.get(name, ""),
-                    "use": _use_of_column(name, self.robot) if name in theirs else "not in the table",
+                    "theirs": headings.get(name, ""),
+                    "use": _use_of_column(name, self.robot) if name in headings else "not in the table",
                     "values": len(kinds),
                     "least": float(finite.min()) if number and len(finite) else None,
                     "greatest": float(finite.max()) if number and len(finite) else None,
@@ -179,13 +179,14 @@ class RigCheck:
         """Reason why each unused column is not used."""
         if self.runs is None:
             return []
-        every = {c.column: c.name for c in channels.EVERY}
+        names_by_column = {c.column: c.name for c in channels.EVERY}
         notes = [
-            f"{name}: not one of the rig's channels; to use it, add {every[name]} to channels in the rig's file"
+            f"{name}: not one of the rig's channels; to use it, add {names_by_column[name]} to channels in the rig's "
+            "file"
             for name in self.runs.unknown
-            if name in every
+            if name in names_by_column
         ]
-        others = [name for name in self.runs.unknown if name not in every]
+        others = [name for name in self.runs.unknown if name not in names_by_column]
         without = (
             f"{', '.join(others)}: without a role, so residuals are tested for differences between their values; "
             "if one has a role, name it under "
@@ -198,14 +199,14 @@ class RigCheck:
         if self.foresight is None:
             return "No data given: add a table to see which parameters it can determine."
         pairs = self.foresight.together
-        held = undetermined_names([p.name for p in self.foresight.parameters if p.held], pairs)
+        prior_bound = undetermined_names([p.name for p in self.foresight.parameters if p.held], pairs)
         traded = {name for pair in pairs for name in (pair.one, pair.other)}
         determined = [p.name for p in self.foresight.parameters if not p.held and p.name not in traded]
         determined += [fit_words.determined_combination(p) for p in pairs]
         parts = [
             f"These data determine {', '.join(determined)}" if determined else "These data determine no parameter"
         ]
-        parts += [f"{', '.join(held)} are not determined by these runs"] * bool(held)
+        parts += [f"{', '.join(prior_bound)} are not determined by these runs"] * bool(prior_bound)
         return "; ".join(parts) + "."
 
     def determined(self, parameter: ParameterInformation) -> str:
@@ -249,11 +250,11 @@ class RigCheck:
 
 def _noise_source_words(word: str, channel: Channel) -> str:
     """Origin of the sd of a channel, in words."""
-    every = {
+    words_by_source = {
         "columns": "of the table", "series": "estimated from the scatter of readings along series of rows",
         "assumed": f"assumed, {100 * channel.sd_share:g} %, as {channel.sd_column} is no column",
     }  # fmt: skip
-    return every.get(word, word)
+    return words_by_source.get(word, word)
 
 
 def _default_origin(robot: Robot, origin: NumberOrigin) -> str:
@@ -353,7 +354,7 @@ def check_document(found: RigCheck) -> Document:
 
 
 def _data_blocks(found: RigCheck, runs: Runs, seen: InformationForecast) -> tuple[Block, ...]:
-    used = [
+    channel_names = [
         (
             c["column"] if c["theirs"] in ("", c["column"]) else f"{c['column']}, yours {c['theirs']}",
             c["use"], c["values"], *(("", "") if c["words"] else (c["least"], c["greatest"])),
@@ -366,8 +367,13 @@ def _data_blocks(found: RigCheck, runs: Runs, seen: InformationForecast) -> tupl
         notes_of_data.insert(
             0, f"loop and calibrate use {len(seen.status)} of these rows, evenly spaced in time (--rows)"
         )
-    held = runs.has("held") or (runs.layout.imposed == "motor_speed" and not runs[runs.layout.imposed_column].any())
-    settled = {*words.SETTLED, *(["stalled"] if held else [])}  # a shaft that is held stands still, as it should
+    has_clamped_rows = runs.has("held") or (
+        runs.layout.imposed == "motor_speed" and not runs[runs.layout.imposed_column].any()
+    )
+    settled = {
+        *words.SETTLED,
+        *(["stalled"] if has_clamped_rows else []),
+    }  # a shaft that is held stands still, as it should
     others = [
         f"{count_noun(count, 'row')}: {name}" for name, count in Counter(seen.status).items() if name not in settled
     ]
@@ -388,7 +394,7 @@ def _data_blocks(found: RigCheck, runs: Runs, seen: InformationForecast) -> tupl
     )
     return (
         Table(
-            "columns", columns("column", "used as", "values |", "from | .5g", "to | .5g", "words"), used,
+            "columns", columns("column", "used as", "values |", "from | .5g", "to | .5g", "words"), channel_names,
             f"{runs.source}: {count_noun(len(runs), 'row')}",
         ),
         *remarks(notes_of_data),

@@ -74,17 +74,17 @@ def check_mujoco_model(source: Path) -> None:
         BadConfiguration: numbers that are not finite, too many copies, elements or cells, or a file that is a pipe or
             a device.
     """
-    left, roots = [source], dict[Path, Element]()
-    while left:
-        file = left.pop().resolve()
+    pending, roots = [source], dict[Path, Element]()
+    while pending:
+        file = pending.pop().resolve()
         text = file_bytes(file, file, BadConfiguration, LARGEST)
         try:
             roots[file] = ElementTree.fromstring(text)
         except (ElementTree.ParseError, ValueError, LookupError) as error:
             raise BadConfiguration(f"{file}: not a readable XML file ({error}); expected MuJoCo's XML") from error
-        named = [element.get("file", "") for tag in NESTED for element in roots[file].iter(tag)]
-        inner = {(base / name).resolve() for name in named if name for base in (source.parent, file.parent)}
-        left += [each for each in inner if each.exists() and each not in roots]
+        file_names = [element.get("file", "") for tag in NESTED for element in roots[file].iter(tag)]
+        inner = {(base / name).resolve() for name in file_names if name for base in (source.parent, file.parent)}
+        pending += [path for path in inner if path.exists() and path not in roots]
     compilers = [element for root in roots.values() for element in root.iter("compiler")]
     folders = [element.get(key, "") for element in compilers for key in FOLDERS]
     count = 0
@@ -106,14 +106,14 @@ def _check_attributes(element: Element, file: Path, folder: Path, inside: Sequen
         folder: folder of the model.
         inside: folders in it that may hold files.
     """
-    tag, where, sizes = element.tag, f"{file}, <{element.tag}>", [1.0]
+    tag, place_words, sizes = element.tag, f"{file}, <{element.tag}>", [1.0]
     for key, text in element.attrib.items():
         words = [] if key in NAMES else text.casefold().split()
         numbers = [x for x in map(cell_number, words) if math.isfinite(x)]
         if "nan" in (word.lstrip("+-") for word in words):
-            raise BadConfiguration(f"{where} {key}: got {text}; expected numbers")
+            raise BadConfiguration(f"{place_words} {key}: got {text}; expected numbers")
         if tag == "size" and key.startswith(("nuser", "nkey")) and max(numbers, default=0) > MOST_COPIES:
-            raise BadConfiguration(f"{where} {key}: got {text}; expected at most {MOST_COPIES:,}")
+            raise BadConfiguration(f"{place_words} {key}: got {text}; expected at most {MOST_COPIES:,}")
         if key in SIZES.get(tag, ()):
             sizes.append(math.prod(max(x, 1.0) for x in numbers))
         for base in inside if key.startswith("file") else ():
@@ -121,7 +121,7 @@ def _check_attributes(element: Element, file: Path, folder: Path, inside: Sequen
                 first_bytes(path, path, BadConfiguration, 1)
     size = math.prod(sizes)
     if size > (most := MOST_COPIES if tag in COPIES else MOST_CELLS):
-        raise BadConfiguration(f"{where}: got a size of {size:,.0f}; expected at most {most:,}")
+        raise BadConfiguration(f"{place_words}: got a size of {size:,.0f}; expected at most {most:,}")
     return int(size) if tag in COPIES else 1
 
 
@@ -164,18 +164,18 @@ class _MujocoModel:
 
     def numbers(self, name: str | None) -> JointNumbers:
         joint = self._chosen(name)
-        model, library, named = self.model, self.library, f"joint {self.joints[joint]}"
+        model, library, joint_words = self.model, self.library, f"joint {self.joints[joint]}"
         dof = model.jnt_dofadr[joint]
         armature = float(model.dof_armature[dof])
         inertia, weight = self._load(joint, dof, armature)
         if not 0 < inertia < math.inf:
-            raise BadConfiguration(f"{self.file}, {named}: no mass turns with it; expected an inertia")
+            raise BadConfiguration(f"{self.file}, {joint_words}: no mass turns with it; expected an inertia")
         actuator = self.actuators.get(joint)
         gear = 1.0 if actuator is None else abs(float(model.actuator_gear[actuator, 0]))
         drive: dict[str, StatedNumber] = {}
         if actuator is not None and self.is_motor[actuator]:
             drive = _dc_motor(model, actuator, dof, gear, self.file)
-        stated = lambda value, what: (float(value), f"{named}, {what}") if value else None  # noqa: E731
+        value_and_source = lambda value, what: (float(value), f"{joint_words}, {what}") if value else None  # noqa: E731
         root = model.body_rootid[model.jnt_bodyid[joint]]
         free = any(
             model.jnt_type[k] == int(library.mjtJoint.mjJNT_FREE) and model.jnt_bodyid[k] == root
@@ -188,13 +188,13 @@ class _MujocoModel:
             self.file, self.joints[joint], rolls,
             mass=(float(model.body_subtreemass[root]), "mass of its body tree"),
             sides=self._sides(joint, radius) if rolls else None, radius=radius,
-            inertia=(inertia, f"{named}, inertia that turns with it, without armature"),
-            ratio=(gear, f"{named}, gear of its actuator") if gear > 1 or drive else None,
-            friction=stated(model.dof_frictionloss[dof], "frictionloss"),
-            damping=stated(np.ravel(model.dof_damping[dof])[0], "damping"),
-            armature=stated(armature, "armature"),
-            weight=None if weight is None else (weight[0], f"{named}, largest torque from its weight"),
-            angle=None if weight is None else (weight[1], f"{named}, hanging position"),
+            inertia=(inertia, f"{joint_words}, inertia that turns with it, without armature"),
+            ratio=(gear, f"{joint_words}, gear of its actuator") if gear > 1 or drive else None,
+            friction=value_and_source(model.dof_frictionloss[dof], "frictionloss"),
+            damping=value_and_source(np.ravel(model.dof_damping[dof])[0], "damping"),
+            armature=value_and_source(armature, "armature"),
+            weight=None if weight is None else (weight[0], f"{joint_words}, largest torque from its weight"),
+            angle=None if weight is None else (weight[1], f"{joint_words}, hanging position"),
             drive=drive,
         )  # fmt: skip
 
@@ -225,9 +225,9 @@ class _MujocoModel:
             radius, centre = float(model.geom_size[k, 0]), data.geom_xpos[k] - data.xanchor[joint]
             if is_round(centre, data.xaxis[joint], radius, along):
                 shape = "sphere" if along is None else "cylinder"
-                named = self._name(self.library.mjtObj.mjOBJ_GEOM, k)
+                geom_name = self._name(self.library.mjtObj.mjOBJ_GEOM, k)
                 collides = bool(model.geom_contype[k] or model.geom_conaffinity[k])
-                radii.append((collides, radius, " ".join(filter(None, ("geom", named, f"({shape})")))))
+                radii.append((collides, radius, " ".join(filter(None, ("geom", geom_name, f"({shape})")))))
         return max(radii)[1:] if radii else None
 
     def _sides(self, joint: int, radius: Found | None) -> Found | None:
@@ -246,8 +246,8 @@ class _MujocoModel:
 
 def _dc_motor(model: Any, actuator: int, dof: int, ratio: float, file: str) -> dict[str, StatedNumber]:
     """Numbers of a `<dcmotor>` by dotted name. Losses of its bristles act at the joint."""
-    every = (model.actuator_gainprm, model.actuator_dynprm, model.actuator_biasprm)
-    gain, dynamic, bias = (x[actuator] for x in every)
+    parameter_rows = (model.actuator_gainprm, model.actuator_dynprm, model.actuator_biasprm)
+    gain, dynamic, bias = (x[actuator] for x in parameter_rows)
     resistance, constant = float(gain[0]), float(gain[1])
     effects = _effects(dynamic, bias, ratio)
     friction = float(model.dof_frictionloss[dof]) + (float(bias[3]) * ratio if float(dynamic[5]) > 0 else 0.0)

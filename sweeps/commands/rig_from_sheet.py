@@ -76,23 +76,23 @@ def read_data_sheet(stated: Mapping[str, str]) -> dict[str, StatedNumber]:
         resistances.append((_ratio_or_none(voltage, idle + drop), "voltage and power at no load"))
     if voltage is None and stated_resistance is None and speed is not None and torque is not None:
         resistances.append((torque * speed / drop**2, "stall torque, no-load speed and stall current"))
-    given = [(value, source) for value, source in resistances if value is not None]
-    resistance = given[0][0]
+    known_resistances = [(value, source) for value, source in resistances if value is not None]
+    resistance = known_resistances[0][0]
     back = resistance * drop if voltage is None else voltage - resistance * idle
     constants = [
         (_ratio_or_none(back, speed), "voltage / no-load speed"),
         (_ratio_or_none(torque, drop), "stall torque / stall current"),
     ]
     stated_constants = [(value, source) for value, source in constants if value is not None]
-    _reject_contradictions((given, "resistance", "ohm"), (stated_constants, "torque constant", "N·m/A"))
+    _reject_contradictions((known_resistances, "resistance", "ohm"), (stated_constants, "torque constant", "N·m/A"))
     constant = stated_constants[0][0]
 
     def line(value: float, unit: str, source: str, width: float) -> StatedNumber:
         return StatedNumber(float(f"{value:.4g}"), unit, f"data sheet, {source}", f"{width:.2g} %")
 
-    spread = [100 * _largest_difference(pairs) for pairs in (given, stated_constants)]
+    spread = [100 * _largest_difference(pairs) for pairs in (known_resistances, stated_constants)]
     return {
-        "motor.resistance": line(resistance, "ohm", given[0][1], max(WIDTH_RESISTANCE, spread[0])),
+        "motor.resistance": line(resistance, "ohm", known_resistances[0][1], max(WIDTH_RESISTANCE, spread[0])),
         "motor.torque_constant": line(constant, "N·m/A", stated_constants[0][1], max(WIDTH_CONSTANT, spread[1])),
         "motor.friction_coulomb": line(constant * idle, "N·m", "torque constant × no-load current", 30.0),
         "motor.friction_viscous": StatedNumber(

@@ -67,8 +67,8 @@ class _UrdfRobot:
         for element in self.root.findall(tag):
             name = element.get("name", "")
             if not name or name in elements:
-                what = f"two are called {name}" if name else "one has no name"
-                raise BadConfiguration(f"{self.file}, <{tag}>: {what}; expected different names")
+                problem_words = f"two are called {name}" if name else "one has no name"
+                raise BadConfiguration(f"{self.file}, <{tag}>: {problem_words}; expected different names")
             elements[name] = element
         if not elements:
             raise BadConfiguration(f"{self.file}: has no <{tag}>; expected a robot with links and joints")
@@ -110,12 +110,16 @@ class _UrdfRobot:
         element, link = self.joints[joint], self._link(self.joints[joint], "child", joint)
         axis = self._axis(joint)
         to_root, root_link = self._to_root(joint)
-        moved = list(self._moved(link))
+        moved_links = list(self._moved(link))
         inertia, moment, count = 0.0, np.zeros(3), 0
-        for name, pose in moved:
+        for name, pose in moved_links:
             mass, about, first = self._inertial(name, pose, axis)
             inertia, moment, count = inertia + about, moment + first, count + (mass > 0)
-        named = f"link {link}" if len(moved) == 1 else (f"link {link} and the {len(moved) - 1} links that it carries")
+        named = (
+            f"link {link}"
+            if len(moved_links) == 1
+            else (f"link {link} and the {len(moved_links) - 1} links that it carries")
+        )
         if count == 0:
             raise BadConfiguration(f"{self.file}, {named}: no <inertial>; expected its <mass> and <inertia>")
         if inertia < LEAST_INERTIA:
@@ -148,18 +152,18 @@ class _UrdfRobot:
     def _origin(self, owner: Element, where: str) -> Pose:
         element = owner.find("origin")
         roll, pitch, yaw = self._vector(element, "rpy", f"{where}, <origin>", (0.0, 0.0, 0.0))
-        turned = _rotation_about(2, yaw) @ _rotation_about(1, pitch) @ _rotation_about(0, roll)
-        return turned, self._vector(element, "xyz", f"{where}, <origin>", (0.0, 0.0, 0.0))
+        rotation = _rotation_about(2, yaw) @ _rotation_about(1, pitch) @ _rotation_about(0, roll)
+        return rotation, self._vector(element, "xyz", f"{where}, <origin>", (0.0, 0.0, 0.0))
 
     def _moved(self, link: str, rigid: bool = False) -> Iterator[tuple[str, Pose]]:
         """Links that turn with a link, or are fixed to it, and their poses in its frame, other joints at zero."""
-        left: list[tuple[str, Pose]] = [(link, (np.eye(3), np.zeros(3)))]
+        pending: list[tuple[str, Pose]] = [(link, (np.eye(3), np.zeros(3)))]
         met: set[str] = set()
-        while left:
-            name, pose = left.pop()
+        while pending:
+            name, pose = pending.pop()
             self._once(name, met)
             yield name, pose
-            left += [
+            pending += [
                 (
                     self._link(self.joints[j], "child", j),
                     _compose(pose, self._origin(self.joints[j], f"joint {j}")),
@@ -189,9 +193,11 @@ class _UrdfRobot:
 
     def _mass(self) -> Found | None:
         masses = [self._link_mass(name) for name in self.links]
-        stated = [m for m in masses if m]
-        lacking = f", {len(masses) - len(stated)} more links have none" if len(stated) < len(masses) else ""
-        return (math.fsum(stated), f"sum of <mass> of {len(stated)} links{lacking}") if stated else None
+        link_masses = [m for m in masses if m]
+        lacking = f", {len(masses) - len(link_masses)} more links have none" if len(link_masses) < len(masses) else ""
+        return (
+            (math.fsum(link_masses), f"sum of <mass> of {len(link_masses)} links{lacking}") if link_masses else None
+        )
 
     def _link_mass(self, link: str) -> float:
         element = self.links[link].find("inertial/mass")
@@ -203,13 +209,13 @@ class _UrdfRobot:
         if inertial is None:
             return 0.0, 0.0, np.zeros(3)
         mass = self._link_mass(link)
-        turned, centre = _compose(pose, self._origin(inertial, f"link {link}"))
+        rotation, centre = _compose(pose, self._origin(inertial, f"link {link}"))
         entries = inertial.find("inertia")
-        where = f"link {link}, <inertia>"
-        xx, yy, zz = (self._number(entries, f"i{a}{a}", where, "kg·m²", 0.0) for a in "xyz")
-        xy, xz, yz = (self._number(entries, f"i{a}", where, "kg·m²", None) for a in ("xy", "xz", "yz"))
+        place_words = f"link {link}, <inertia>"
+        xx, yy, zz = (self._number(entries, f"i{a}{a}", place_words, "kg·m²", 0.0) for a in "xyz")
+        xy, xz, yz = (self._number(entries, f"i{a}", place_words, "kg·m²", None) for a in ("xy", "xz", "yz"))
         tensor = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-        own_axis = turned.T @ axis
+        own_axis = rotation.T @ axis
         lever = np.cross(axis, centre)
         return mass, float(own_axis @ tensor @ own_axis + mass * lever @ lever), mass * centre
 
@@ -221,13 +227,13 @@ class _UrdfRobot:
             radii: list[Found] = []
             for name, pose in self._moved(link, rigid=True):
                 for shape in self.links[name].findall(tag):
-                    turned, centre = _compose(pose, self._origin(shape, f"link {name}, <{tag}>"))
-                    for kind, along in (("cylinder", turned[:, 2]), ("sphere", None)):
-                        where = f"link {name}, <{tag}> <{kind}>"
+                    rotation, centre = _compose(pose, self._origin(shape, f"link {name}, <{tag}>"))
+                    for kind, along in (("cylinder", rotation[:, 2]), ("sphere", None)):
+                        place_words = f"link {name}, <{tag}> <{kind}>"
                         element = shape.find(f"geometry/{kind}")
-                        radius = self._number(element, "radius", where, "m", 0.0)
+                        radius = self._number(element, "radius", place_words, "m", 0.0)
                         if radius > 0 and is_round(centre, axis, radius, along):
-                            radii.append((radius, where))
+                            radii.append((radius, place_words))
             if radii:
                 return max(radii)
         return None
@@ -251,8 +257,8 @@ class _UrdfRobot:
 
     def _driven(self, joint: str) -> bool:
         commanded = any(
-            each.get("name") == joint and each.find("command_interface") is not None
-            for each in self.root.iterfind("ros2_control/joint")
+            ros_joint.get("name") == joint and ros_joint.find("command_interface") is not None
+            for ros_joint in self.root.iterfind("ros2_control/joint")
         )
         return commanded or any(True for _ in self._transmissions(joint))
 
@@ -263,11 +269,11 @@ class _UrdfRobot:
             of_joint = [j for j in element.findall("joint") if j.get("name") == joint]
             owners = of_joint if shared else [element, *of_joint, *element.findall("actuator")]
             texts = [(owner.findtext(tag), tag) for owner in owners for tag in REDUCTIONS]
-            stated = [(text, tag) for text, tag in texts if text is not None]
-            if not stated:
+            ratio_texts = [(text, tag) for text, tag in texts if text is not None]
+            if not ratio_texts:
                 continue
-            name = f"transmission {element.get('name', '')}, <{stated[0][1]}>".replace(" ,", ",")
-            ratio = math.prod(abs(self._parsed(text, name, "")) for text, _ in stated)
+            name = f"transmission {element.get('name', '')}, <{ratio_texts[0][1]}>".replace(" ,", ",")
+            ratio = math.prod(abs(self._parsed(text, name, "")) for text, _ in ratio_texts)
             if not ratio >= 1:
                 raise BadConfiguration(f"{self.file}, {name}: got {ratio:g}; expected motor turns per joint turn, "
                                        "1 or more")  # fmt: skip
@@ -276,15 +282,15 @@ class _UrdfRobot:
 
     def _dynamics(self, joint: Element, key: str) -> Found | None:
         unit = {"friction": "N·m"}.get(key, "N·m·s")
-        where = f"joint {joint.get('name')}, <dynamics {key}>"
-        value = self._number(joint.find("dynamics"), key, where, unit, 0.0)
-        return (value, where) if value else None
+        place_words = f"joint {joint.get('name')}, <dynamics {key}>"
+        value = self._number(joint.find("dynamics"), key, place_words, unit, 0.0)
+        return (value, place_words) if value else None
 
     def _armature(self, joint: str) -> Found | None:
         """Inertia of the rotor at the joint: an attribute `armature` of its dynamics."""
-        where = f"joint {joint}, <dynamics armature>"
-        value = self._number(self.joints[joint].find("dynamics"), "armature", where, "kg·m²", 0.0)
-        return (value, where) if value else None
+        place_words = f"joint {joint}, <dynamics armature>"
+        value = self._number(self.joints[joint].find("dynamics"), "armature", place_words, "kg·m²", 0.0)
+        return (value, place_words) if value else None
 
     # --- cells
 
@@ -321,11 +327,11 @@ class _UrdfRobot:
 def _rotation_about(axis: int, angle: float) -> np.ndarray:
     """Rotation about a coordinate axis, shape (3, 3)."""
     one, other = (axis + 1) % 3, (axis + 2) % 3
-    turned = np.eye(3)
-    turned[one, one] = turned[other, other] = math.cos(angle)
-    turned[other, one] = math.sin(angle)
-    turned[one, other] = -math.sin(angle)
-    return turned
+    rotation = np.eye(3)
+    rotation[one, one] = rotation[other, other] = math.cos(angle)
+    rotation[other, one] = math.sin(angle)
+    rotation[one, other] = -math.sin(angle)
+    return rotation
 
 
 def _compose(outer: Pose, inner: Pose) -> Pose:

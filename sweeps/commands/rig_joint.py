@@ -134,8 +134,8 @@ def free_unstated_losses(kind: str, numbers: Mapping[str, StatedNumber]) -> dict
         if width > 0:
             freed[name] = StatedNumber(0.0, unit, reason, f"{width:.2g}")
         elif name in freed:
-            held = f'{freed[name].source}; a value of 0 stays fixed, "0.0 ± 0.01" is fitted'
-            freed[name] = dataclasses.replace(freed[name], source=held)
+            source = f'{freed[name].source}; a value of 0 stays fixed, "0.0 ± 0.01" is fitted'
+            freed[name] = dataclasses.replace(freed[name], source=source)
     return freed
 
 

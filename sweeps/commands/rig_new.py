@@ -103,25 +103,25 @@ def write_new_rig(
     if joint is not None and source is None:
         raise BadConfiguration(f"--joint: got {joint} without --from; expected a model that has this joint")
     if kind is not None and kind not in KINDS:
-        each = "; ".join(f"{name}: {what}" for name, what in KINDS.items())
-        raise BadConfiguration(f"--kind: got {kind}; {allowed_words(kind, KINDS)} ({each})")
+        kinds = "; ".join(f"{name}: {instruction}" for name, instruction in KINDS.items())
+        raise BadConfiguration(f"--kind: got {kind}; {allowed_words(kind, KINDS)} ({kinds})")
     if file.exists() and (file.is_dir() or not force):
-        what = (
+        instruction = (
             "a folder; give a file, such as my-rig.toml" if file.is_dir() else ("already exists; --force replaces it")
         )
-        raise BadConfiguration(f"{file}: {what}")
+        raise BadConfiguration(f"{file}: {instruction}")
     if not file.parent.is_dir():
         raise BadConfiguration(f"{file}: the folder {file.parent} does not exist; create it first")
     written = new_rig_text(kind, source, joint, sheet)
     if source is None and sheet is None:
-        what = f'{KINDS[kind or USUAL]}. Replace the numbers marked "{EXAMPLE}" with your own, then'
+        instruction = f'{KINDS[kind or USUAL]}. Replace the numbers marked "{EXAMPLE}" with your own, then'
     else:
         lacking = ", ".join(f"{name} {unit}".rstrip() for name, unit in example_numbers(written).items())
-        what = written.removeprefix("# ").partition("; a comment")[0]
-        what += f"; not found, so fill in: {lacking}. Then" if lacking else ". Next"
+        instruction = written.removeprefix("# ").partition("; a comment")[0]
+        instruction += f"; not found, so fill in: {lacking}. Then" if lacking else ". Next"
     try:
         write_text(file, written)
     except OSError as error:
         raise BadConfiguration(f"{file}: cannot be written ({error.strerror}); choose another path") from error
-    print_output(f"{file}: {what}: mmrjax rig check {file} [DATA.csv]")
+    print_output(f"{file}: {instruction}: mmrjax rig check {file} [DATA.csv]")
     return 0

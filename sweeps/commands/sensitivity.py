@@ -70,8 +70,8 @@ def execute(config: configuration.Sensitivity, beside: configuration.FolderPart)
     inputs = _uncertain_inputs(config, file, runs, ranges)
     candidates = _candidate_runs(config, robot, runs, bool(freed))
     conditions = runs.conditions(robot)
-    turned: Json = {name: np.full(len(runs), np.mean(ranges[name])) for name in freed}
-    check_runs_bearable(robot, dataclasses.replace(conditions, **turned), config)
+    turn_columns: Json = {name: np.full(len(runs), np.mean(ranges[name])) for name in freed}
+    check_runs_bearable(robot, dataclasses.replace(conditions, **turn_columns), config)
     supply = PointSupply(
         float(config.battery), config.discharge_mAh * COULOMB_PER_MAH, np.asarray(conditions.adhesion)
     )
@@ -153,17 +153,17 @@ def _operating_points(
                 raise BadConfiguration(f"--vary {name}: --{option} sets it too; give one of them")
             axes[AXES[name]] = ((low + high) / 2 / (RPM if name == "motor_speed" else 1.0),)
     try:
-        stated = GridPart(configurations=config.configurations, surface=config.surface, **axes)
+        grid = GridPart(configurations=config.configurations, surface=config.surface, **axes)
     except ValueError:
         raise BadConfiguration(f"--vary: got {', '.join(config.vary)}; a range exceeds the limits of a run") from None
     notes: list[str] = []
-    stated = grid_room.resolve_grid(stated, robot, config.battery, notes)
+    grid = grid_room.resolve_grid(grid, robot, config.battery, notes)
     for note in notes:
         print_message(note)
-    names = grid_configurations(stated, robot)
+    names = grid_configurations(grid, robot)
     imposed.check_turning(robot, ranges, names, "--vary")
     return grid_conditions(
-        stated.model_copy(update={"configurations": tuple(dict.fromkeys(names))}), robot, config.battery
+        grid.model_copy(update={"configurations": tuple(dict.fromkeys(names))}), robot, config.battery
     )
 
 
@@ -200,14 +200,14 @@ def _candidate_runs(config: configuration.Sensitivity, robot: Robot, points: Run
         runs = grid_conditions(GridPart(surface=config.surface), robot)
         source = "Table 8"
     usual = noise.default_noise(robot.channels)
-    stated = noise.parse_noise(usual, robot.channels)
+    noise_sizes = noise.parse_noise(usual, robot.channels)
     if config.noise:
-        stated |= noise.parse_noise(config.noise, robot.channels)
+        noise_sizes |= noise.parse_noise(config.noise, robot.channels)
     return CandidateRuns(
         OperatingPoints.of(runs),
         runs.conditions(robot),
         source,
-        stated,
+        noise_sizes,
         config.noise or usual,
         runs.deviations(),
         config.runs,

@@ -22,8 +22,8 @@ def execute(config: configuration.Settle, beside: configuration.SettledLog) -> i
     """Find the settled runs of a log and write a run folder with their table. Returns the exit code, 0."""
     robot = load_robot(config).robot
     runs = read_runs(beside.data, robot, columns=config.columns, measured=True, series=True)
-    named = [] if config.columns is None else ["--columns", config.columns]
-    loop = shlex.join(["mmrjax", "loop", beside.data, "--robot", config.robot, *named])
+    column_options = [] if config.columns is None else ["--columns", config.columns]
+    loop = shlex.join(["mmrjax", "loop", beside.data, "--robot", config.robot, *column_options])
     settled = settling.settle_log(
         runs,
         shortest=config.shortest_s,
@@ -37,8 +37,8 @@ def execute(config: configuration.Settle, beside: configuration.SettledLog) -> i
         folder.write_table("settled.csv", settled.table())
         folder.write_table("stretches.csv", segments_table(settled))
         folder.write_json("result.json", to_json(settled, few))
-        turned = sentences(ranges.remarks_on_signs(settled.settled_runs(), robot))
-        document = print_report(settle_report.settle_document(settled, few, turned))
+        sign_sentences = sentences(ranges.remarks_on_signs(settled.settled_runs(), robot))
+        document = print_report(settle_report.settle_document(settled, few, sign_sentences))
         return finish_run_folder(
             folder,
             config,
@@ -53,15 +53,15 @@ def execute(config: configuration.Settle, beside: configuration.SettledLog) -> i
 def segments_table(found: Settled) -> Columns:
     """Table with a row for each segment of a log: position, reason if it was left out, means, their sds and
     changes."""
-    every = found.stretches
+    stretches = found.stretches
     table: Columns = {
-        "run_id": np.array([s.run for s in every]),
-        "from_s": np.array([s.begin for s in every]),
-        "until_s": np.array([s.end for s in every]),
-        "first_row": np.array([s.rows[0] + 1 for s in every]),
-        "last_row": np.array([s.rows[-1] + 1 for s in every]),
-        "imposed": np.array([s.imposed for s in every]),
-        "left_out": np.array([settle_words.left_out_reason(s) if s.why else "" for s in every]),
+        "run_id": np.array([s.run for s in stretches]),
+        "from_s": np.array([s.begin for s in stretches]),
+        "until_s": np.array([s.end for s in stretches]),
+        "first_row": np.array([s.rows[0] + 1 for s in stretches]),
+        "last_row": np.array([s.rows[-1] + 1 for s in stretches]),
+        "imposed": np.array([s.imposed for s in stretches]),
+        "left_out": np.array([settle_words.left_out_reason(s) if s.why else "" for s in stretches]),
     }
     for signal in found.signals:
         channel = signal.channel
@@ -71,13 +71,13 @@ def segments_table(found: Settled) -> Columns:
             channel.sd_column.replace("_sd_", "_change_"): "drift",
         }
         for column, field in fields.items():
-            table[column] = np.array([getattr(s, field).get(channel.name, np.nan) for s in every])
+            table[column] = np.array([getattr(s, field).get(channel.name, np.nan) for s in stretches])
     return table
 
 
 def to_json(found: Settled, few: str = "") -> Json:
     """`result.json`. `few` is the sentence of `words.too_few`."""
-    left = settle_words.left_out(found.stretches, bool(few))
+    omitted = settle_words.left_out(found.stretches, bool(few))
     return {
         "schema": "mmrjax.settle/1",
         "statement": settle_words.settle_statement(found),
@@ -90,6 +90,6 @@ def to_json(found: Settled, few: str = "") -> Json:
         "glitches": {
             s.channel.name: sum(k.glitches.get(s.channel.name, 0) for k in found.kept) for s in found.signals
         },
-        "left_out": [dict(zip(("why", "stretches", "samples", "rows", "do"), row, strict=True)) for row in left],
+        "left_out": [dict(zip(("why", "stretches", "samples", "rows", "do"), row, strict=True)) for row in omitted],
         "notes": [*filter(None, [few]), *settle_words.settle_remarks(found)],
     }

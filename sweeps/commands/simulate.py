@@ -166,10 +166,12 @@ def end_columns_of_histories(robot: Robot, batch: RunBatch) -> Columns:
             columns[name] = np.where(empty & finite.any(-1), values, columns[name])
         after = time[rows, np.minimum(last + 1, finite.shape[-1] - 1)] - time[rows, last]
         draws = np.asarray(robot.battery.current(signals.total_current))
-        left = (float(robot.battery.capacity) - signals.discharge) / np.where(draws > 0, draws, np.nan)
-        left = np.where(empty & finite.any(-1), np.clip(np.nan_to_num(left), 0.0, after), 0.0)
-        columns["time_end_s"] = columns["time_end_s"] + left
-        columns["displacement_m"] = np.nan_to_num(columns["displacement_m"] + left * np.nan_to_num(signals.speed))
+        time_left = (float(robot.battery.capacity) - signals.discharge) / np.where(draws > 0, draws, np.nan)
+        time_left = np.where(empty & finite.any(-1), np.clip(np.nan_to_num(time_left), 0.0, after), 0.0)
+        columns["time_end_s"] = columns["time_end_s"] + time_left
+        columns["displacement_m"] = np.nan_to_num(
+            columns["displacement_m"] + time_left * np.nan_to_num(signals.speed)
+        )
     return columns
 
 

@@ -37,8 +37,8 @@ def execute(config: configuration.Size, beside: configuration.FolderPart) -> int
     objectives = config.pareto or (config.objective,)
     for name in objectives:
         if name not in OBJECTIVES:
-            where = "--pareto" if config.pareto else "--objective"
-            raise BadConfiguration(f"{where}: got {name}; {allowed_words(name, OBJECTIVES)}")
+            option = "--pareto" if config.pareto else "--objective"
+            raise BadConfiguration(f"{option}: got {name}; {allowed_words(name, OBJECTIVES)}")
     if config.pareto and len(set(config.pareto)) != 2:
         raise BadConfiguration(f"--pareto: got {', '.join(config.pareto)}; expected two different objectives")
     motor_names = [m.name for m in packaged_motors()]

@@ -85,8 +85,8 @@ def _sweep_into_table(config: Sweep, file: RobotFile, options: StoreOptions) -> 
 
 
 def _sweep_into_store(config: Campaign, file: RobotFile, options: StoreOptions) -> int:
-    robot, where = file.robot, options.where
-    plan = axes.plan_design(config, robot, where)
+    robot, place = file.robot, options.where
+    plan = axes.plan_design(config, robot, place)
     robot = showing_turns(robot, {*plan.axes, *plan.conditions})
     pool = None
     if options.scheduler is not None and not options.dry_run:
@@ -96,10 +96,10 @@ def _sweep_into_store(config: Campaign, file: RobotFile, options: StoreOptions) 
     try:
         device = scale.device_kind() if pool is None else pool.device
         task = task_of(config, robot)
-        wanted = options.outputs or config.outputs or task.usual
+        output_names = options.outputs or config.outputs or task.usual
         chunk = config.chunk or scale.default_chunk(task, None if pool is None else device)
-        config = config.model_copy(update={"chunk": chunk, "outputs": wanted})
-        job = prepare_job(config, robot, plan, where)
+        config = config.model_copy(update={"chunk": chunk, "outputs": output_names})
+        job = prepare_job(config, robot, plan, place)
         layout = store_layout(config, job)
         path = options.out or default_path("sweep")
         if options.dry_run:
@@ -141,7 +141,7 @@ def dry_run(job: scale.Job, layout: Layout, path: Path) -> None:
         start = time.perf_counter()
         scale.fetch_values(compiled(compiled.points(0)), 1)
         spent.append(time.perf_counter() - start)
-    each = min(spent[1:]) / compiled.size
+    seconds = min(spent[1:]) / compiled.size
     design = job.plan.design
     dimensions = " x ".join(f"{n} {name}" for n, name in zip(design.shape, design.dimensions, strict=True))
     free = _free_bytes(path)
@@ -149,8 +149,9 @@ def dry_run(job: scale.Job, layout: Layout, path: Path) -> None:
         "points": f"{design.points:,} ({dimensions})",
         "chunks": f"{len(blocks):,} of {blocks.points:,} points on {compiled.mesh.size} x {scale.device_kind()}",
         "store": f"{bytes_text(layout.size)} (uncompressed); free {bytes_text(free)} in {_existing_parent(path)}",
-        "time": f"about {duration_text(each * blocks.points * len(blocks))} once compiled, {1 / each:,.0f} points/s "
-        f"(timed here on {compiled.size:,} points); compiling {duration_text(max(spent[0] - spent[1], 0.0))}",
+        "time": f"about {duration_text(seconds * blocks.points * len(blocks))} once compiled, "
+        f"{1 / seconds:,.0f} points/s (timed here on {compiled.size:,} points); compiling "
+        f"{duration_text(max(spent[0] - spent[1], 0.0))}",
     }
     print_table(Table("dry-run", (Column("a sweep of"), Column("")), list(rows.items())))
     _reject_without_space(layout.size, 1.0, path)
@@ -219,21 +220,21 @@ def simulate_chunks(store: SweepStore, job: scale.Job, options: StoreOptions, po
     store.begin(options.share)
     done = store.done()
     own_chunks = chunks_of_shard(options.share, len(job.blocks))
-    left = [k for k in own_chunks if k not in done]
-    _reject_without_space(store.layout.size, len(left) / len(job.blocks), store.path)
-    if not left:
+    chunks_left = [k for k in own_chunks if k not in done]
+    _reject_without_space(store.layout.size, len(chunks_left) / len(job.blocks), store.path)
+    if not chunks_left:
         return
     total = sum(job.blocks.count(k) for k in own_chunks)
-    before = total - sum(job.blocks.count(k) for k in left)
+    before = total - sum(job.blocks.count(k) for k in chunks_left)
     if before:
         print_message(f"{store.partial}: resumes after {before:,} of {total:,} points")
     times = scale.Times()
     try:
         with progress_bar(total, quiet=False, done=before, rate=True) as advance:
             if pool is not None:
-                chunks = pool.produce(job, left)
+                chunks = pool.produce(job, chunks_left)
             else:
-                chunks = scale.produce_chunks(scale.Compiled(job), left, times, advance)
+                chunks = scale.produce_chunks(scale.Compiled(job), chunks_left, times, advance)
             scale.write_chunks(store.write, job, chunks, advance, times)
     except OSError as error:
         if error.errno not in (errno.ENOSPC, errno.EDQUOT):
@@ -253,10 +254,10 @@ def finish_sweep(
     store: SweepStore, config: Campaign, file: RobotFile, job: scale.Job, same: Identity, options: StoreOptions
 ) -> int:
     """Writes the files of a complete sweep and moves it into place, or reports the progress of an incomplete one."""
-    left = False
+    is_complete = False
     if not store.finished:
-        with store.last() as left:
-            if left:
+        with store.last() as is_complete:
+            if is_complete:
                 # Write all files of a run folder except the store, then move the store into place
                 summary = sweep_summary(store.layout, job, store.done().values())
                 store.write_json("result.json", summary)
@@ -285,7 +286,7 @@ def finish_sweep(
         for kind in options.export:
             print_message(str(export.export_runs(kind, store.path, store.layout)))
     counts = points_by_status(done.values())
-    if not left:
+    if not is_complete:
         print_table(endings_table(counts, "points", job.task.model))
         print_output(str(store.path))
     return DONE if words.every_run_solved(counts) else SOLVER_FAILED

@@ -48,10 +48,10 @@ def execute(config: configuration.Simulate, beside: configuration.GivenRuns) -> 
         raise BadConfiguration("--runs: got a file in addition to --left, --right or --heading; either put "
                                "duty_left and duty_right columns in the file, or omit --runs and describe one "
                                "run with options")  # fmt: skip
-    file, given = load_robot(config), beside.stated
+    file, beside_columns = load_robot(config), beside.stated
     robot = file.robot
-    check_can_turn(robot, given.get("configuration") or robot.configurations.names[0])
-    runs = one_run(robot, {**given, **turn_columns(config, given)}, config.battery)
+    check_can_turn(robot, beside_columns.get("configuration") or robot.configurations.names[0])
+    runs = one_run(robot, {**beside_columns, **turn_columns(config, beside_columns)}, config.battery)
     settled = config.model == fidelities.NAMES[0]
     with open_folder("simulate", config, robot, beside, runs) as folder:
         conditions = run.conditions_of_runs(robot, runs, config)
@@ -115,7 +115,7 @@ def _run_for_demand(
     chassis = robot.configurations[str(runs.configurations_named(robot)[0])]
     width = float(chassis.turning.width)
     assert config.speed_m_s is not None and config.yaw_rate_rad_s is not None  # one comes with the other
-    wanted = np.array([config.speed_m_s, 0.5 * width * config.yaw_rate_rad_s])  # of the turn [m/s]
+    speeds_wanted = np.array([config.speed_m_s, 0.5 * width * config.yaw_rate_rad_s])  # of the turn [m/s]
 
     def driven(volts: np.ndarray) -> Conditions:
         """Voltage of an external supply. A battery sets its own."""
@@ -127,7 +127,7 @@ def _run_for_demand(
     def off(volts: np.ndarray) -> np.ndarray:
         reading = _turns_to_compare(robot, driven(volts))[0].result.reading
         speed, turn = (np.asarray(reading[name])[0] for name in ("speed", "yaw_rate"))
-        return np.array([speed, 0.5 * width * turn]) - wanted
+        return np.array([speed, 0.5 * width * turn]) - speeds_wanted
 
     def at_full_voltage() -> tuple[np.ndarray, np.ndarray]:
         """Speeds and yaw rates of settled turns with all of the supply's voltage on the side that is to be the
@@ -139,11 +139,11 @@ def _run_for_demand(
 
     alike = dataclasses.replace(asked, duty_left=None, duty_right=None)
     supply = float(np.ravel(jax.vmap(lambda c: voltage_at_rest(robot, c))(alike))[0])
-    belts = wanted[0] + WIDER * wanted[1] * np.array([-1.0, 1.0])
+    belts = speeds_wanted[0] + WIDER * speeds_wanted[1] * np.array([-1.0, 1.0])
     turning = belts / float(chassis.radius) * float(robot.gearbox.ratio) * float(robot.motor.torque_constant)
     for share in LOADED:
-        begun = turning + share * np.abs(turning).max() * np.sign(belts)
-        found = scipy.optimize.root(off, begun, options={"maxfev": TRIED})
+        first_guess = turning + share * np.abs(turning).max() * np.sign(belts)
+        found = scipy.optimize.root(off, first_guess, options={"maxfev": TRIED})
         volts = found.x
         if np.abs(found.fun).max() < NEAR:  # not NaN
             break
@@ -205,8 +205,8 @@ def turn_columns(config: configuration.TurnPart, given: Json) -> Json:
 
 def _displayed_channels(robot: Robot, settled: bool) -> tuple[Channel, ...]:
     """Channels shown for a turn."""
-    every = channels.channels_named((*robot.rig.channels, *SHOWN))
-    return tuple(c for c in every if c.settled or not settled)
+    channels_to_show = channels.channels_named((*robot.rig.channels, *SHOWN))
+    return tuple(c for c in channels_to_show if c.settled or not settled)
 
 
 def _turns_to_compare(robot: Robot, asked: Conditions) -> tuple[RunBatch, Conditions]:

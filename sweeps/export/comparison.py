@@ -126,12 +126,12 @@ def compare_format(
     fates_found = list(fates)
     for effect in joint.inside:
         without_effect = situation.without((effect.name,))
-        kept = share_kept(law, law_of(joint, {effect.name: 0.0}), situation, inside, without_effect)
-        verdict = HELD if effect.name in held else DROPPED if kept < LITTLE else APPROXIMATED
+        share = share_kept(law, law_of(joint, {effect.name: 0.0}), situation, inside, without_effect)
+        verdict = HELD if effect.name in held else DROPPED if share < LITTLE else APPROXIMATED
         how = held.get(effect.name) or approximated(effect.balance)
-        if not np.isfinite(kept) and effect.name not in held:
+        if not np.isfinite(share) and effect.name not in held:
             verdict, how = DROPPED, "it has no effect on these runs, and the format has no term for it"
-        fates_found.append(EffectFate(effect.name, verdict, how, kept))
+        fates_found.append(EffectFate(effect.name, verdict, how, share))
     exported = _law_at(law, theta, situation)
     models = {NATIVE: situation.native, EXPORTED: situation.readings(exported)}
     if law.names:
@@ -175,9 +175,9 @@ def refit_parameters(law: FormatLaw, situation: ComparisonRuns, native: JointRes
     """
     if not law.names:
         return np.zeros(0)
-    given = (situation.command, situation.load, situation.way, native.current, native.speed)
+    inputs = (situation.command, situation.load, situation.way, native.current, native.speed)
     least = 1e-3 * float(np.max(np.abs(situation.load))) + 1e-9
-    return np.asarray(_refitted(law, jnp.asarray(least), *map(jnp.asarray, given)))
+    return np.asarray(_refitted(law, jnp.asarray(least), *map(jnp.asarray, inputs)))
 
 
 @eqx.filter_jit
@@ -208,7 +208,7 @@ def share_kept(
     1 less the rms of what the change of the format's error by the effect is, over that of the change itself. NaN
     where the effect changes nothing.
     """
-    left = [
+    errors = [
         _scaled_residuals(exact)
         - _scaled_residuals(_law_at(model, refit_parameters(model, situation, exact), situation))
         for model, exact in ((law, native), (bare, native_bare))
@@ -219,7 +219,7 @@ def share_kept(
     size = float(np.sqrt(np.mean(change**2)))
     if size < 1e-9:
         return float("nan")
-    return 1 - float(np.sqrt(np.mean(((left[0] - left[1]) / sizes) ** 2))) / size
+    return 1 - float(np.sqrt(np.mean(((errors[0] - errors[1]) / sizes) ** 2))) / size
 
 
 def _scaled_residuals(found: JointResult) -> np.ndarray:

@@ -55,8 +55,8 @@ def export(
     exported = dataclasses.replace(exported, files=texts)
     if out is not None:
         folder = Path(out)
-        if taken := next((folder / name for name in texts if (folder / name).exists()), None):
-            raise BadConfiguration(f"out: {taken} exists already; choose another folder, or remove it")
+        if existing_file := next((folder / name for name in texts if (folder / name).exists()), None):
+            raise BadConfiguration(f"out: {existing_file} exists already; choose another folder, or remove it")
         folder.mkdir(parents=True, exist_ok=True)
         for name, content in texts.items():
             with naming_file(folder / name):

@@ -411,8 +411,8 @@ def _operation_text(x: Symbol, text: Callable[..., str], dialect: Dialect) -> tu
     if x.op in _INFIX:
         own_rank, sign = _INFIX[x.op]
         tighter = x.op in ("sub", "div") or own_rank <= 3
-        left = text(x.args[0], own_rank + 1 if x.op == "pow" or own_rank <= 3 else own_rank)
+        left_text = text(x.args[0], own_rank + 1 if x.op == "pow" or own_rank <= 3 else own_rank)
         if x.op == "pow" and x.args[1].is_const and float(x.args[1].value).is_integer():
-            return own_rank, f"{left} ** {int(x.args[1].value)}"
-        return own_rank, f"{left} {sign} {text(x.args[1], own_rank + 1 if tighter else own_rank)}"
+            return own_rank, f"{left_text} ** {int(x.args[1].value)}"
+        return own_rank, f"{left_text} {sign} {text(x.args[1], own_rank + 1 if tighter else own_rank)}"
     return 9, dialect.call(x.op, [text(a) for a in x.args], [a.is_const for a in x.args])

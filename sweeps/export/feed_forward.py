@@ -47,8 +47,12 @@ class SteadyMap(eqx.Module):
     @property
     def efficiency(self) -> np.ndarray:
         """Output power over input power [-]. For a driven joint, the inverse."""
-        out, taken = np.outer(self.speed, self.torque), self.values["power"]
-        share = np.where(out > 0, out / np.where(taken > 0, taken, np.inf), taken / np.where(out < 0, out, -np.inf))
+        out, input_power = np.outer(self.speed, self.torque), self.values["power"]
+        share = np.where(
+            out > 0,
+            out / np.where(input_power > 0, input_power, np.inf),
+            input_power / np.where(out < 0, out, -np.inf),
+        )
         return np.clip(share, 0.0, 1.0)
 
 
@@ -73,8 +77,8 @@ def steady_state_map(
             return jax_actuator.settled_actuator(module, params, voltage, speeds)[0] - torques
 
         def again(voltage: Any, _: None) -> tuple[Any, None]:
-            left, rise = jax.jvp(lacking, (voltage,), (jnp.ones_like(voltage),))
-            return voltage - left / jnp.where(rise > 1e-12, rise, 1e-12), None
+            residual, rise = jax.jvp(lacking, (voltage,), (jnp.ones_like(voltage),))
+            return voltage - residual / jnp.where(rise > 1e-12, rise, 1e-12), None
 
         constant, ratio = params["motor.torque_constant"], params["gearbox.ratio"]
         start = constant * ratio * speeds + guess * torques / (constant * ratio)

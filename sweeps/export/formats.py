@@ -101,8 +101,8 @@ def export_format(
         "jax": _export_actuator, "onnx": _export_actuator,
         "mjlab": _export_actuator,
     }[to]  # fmt: skip
-    begun = Export(to, drive, constants, posterior, {}, None, {})  # type: ignore[arg-type]  # filled in below
-    return make(begun, runs, at, draws, seed)
+    empty_export = Export(to, drive, constants, posterior, {}, None, {})  # type: ignore[arg-type]  # filled in below
+    return make(empty_export, runs, at, draws, seed)
 
 
 def notes_of(runs: ComparisonRuns) -> list[str]:
@@ -178,8 +178,10 @@ def _start_difference(drive: DriveJoint, texts: Mapping[str, str], command: floa
     """Difference of MuJoCo C from the native model over the start of a constant goal [rad] or voltage [V] at rest."""
     times = np.linspace(0.0, START, 26)
     own = drive.controller
-    given = Conditions(voltage=command) if own is None else Conditions(voltage=own.supply_voltage, goal=command)
-    run = drive_batch(drive.robot, jax.tree.map(lambda x: jnp.asarray(x, float)[None], given), jnp.asarray(times))
+    conditions = Conditions(voltage=command) if own is None else Conditions(voltage=own.supply_voltage, goal=command)
+    run = drive_batch(
+        drive.robot, jax.tree.map(lambda x: jnp.asarray(x, float)[None], conditions), jnp.asarray(times)
+    )
     native = np.asarray(run.signals.angle)[0]
     got = mujoco.angles_in_mujoco(texts, command * ratio, times)
     share = 100 * float(np.sqrt(np.mean((got - native) ** 2)) / np.sqrt(np.mean(native**2)))
@@ -188,7 +190,7 @@ def _start_difference(drive: DriveJoint, texts: Mapping[str, str], command: floa
 
 def _export_actuator(begun: Export, runs: ComparisonRuns, at: str, draws: int, seed: int) -> Export:
     drive, constants, notes = begun.joint, begun.constants, notes_of(runs)
-    law, held = jax_actuator.actuator_law_function(runs, constants), jax_actuator.effects_in_actuator(drive)
+    law, effect_names = jax_actuator.actuator_law_function(runs, constants), jax_actuator.effects_in_actuator(drive)
     checks: dict[str, float] = {}
     if begun.format == "jax":
         files = jax_actuator.jax_files(drive, constants, notes)
@@ -201,15 +203,15 @@ def _export_actuator(begun: Export, runs: ComparisonRuns, at: str, draws: int, s
             drive, constants, model
         )
     compared = comparison.compare_format(
-        runs, law, jax_actuator.fates_in_actuator(drive), held, mujoco.approximated_terms
+        runs, law, jax_actuator.fates_in_actuator(drive), effect_names, mujoco.approximated_terms
     )
     return dataclasses.replace(begun, files=files, comparison=compared, checks=checks)
 
 
 def _export_tables(begun: Export, runs: ComparisonRuns, at: str, draws: int, seed: int) -> Export:
     drive, constants = begun.joint, begun.constants
-    law, held = feed_forward.table_law_function(runs, constants), feed_forward.effects_in_tables(drive)
+    law, effect_names = feed_forward.table_law_function(runs, constants), feed_forward.effects_in_tables(drive)
     fates: list[EffectFate] = feed_forward.fates_in_tables(drive, constants)
-    compared = comparison.compare_format(runs, law, fates, held, mujoco.approximated_terms)
+    compared = comparison.compare_format(runs, law, fates, effect_names, mujoco.approximated_terms)
     files = feed_forward.table_files(drive, feed_forward.map_of_drive(runs, constants), notes_of(runs))
     return dataclasses.replace(begun, files=files, comparison=compared)

@@ -47,8 +47,8 @@ class ActuatorLaw(eqx.Module):
             return settled_actuator(self.module, self.params, command, speed)[0] - load
 
         def nearer(speed: Any, _: None) -> tuple[Any, None]:
-            left, rise = jax.jvp(torque, (speed,), (jnp.ones_like(speed),))
-            stride = jnp.where(rise != 0, -left / jnp.where(rise != 0, rise, 1.0), 0.0)
+            residual, rise = jax.jvp(torque, (speed,), (jnp.ones_like(speed),))
+            stride = jnp.where(rise != 0, -residual / jnp.where(rise != 0, rise, 1.0), 0.0)
             # Never across rest, where friction turns round.
             return jnp.where(way * (speed + stride) > 0, speed + stride, 0.5 * speed), None
 
@@ -137,11 +137,11 @@ def serialise_actuator(module: ModuleType) -> bytes:
 
     with jax.enable_x64(False), _without_source_paths():
         (many,) = export.symbolic_shape("n")
-        single, each = jax.ShapeDtypeStruct((), jnp.float32), jax.ShapeDtypeStruct((many,), jnp.float32)
+        single, batch_shape = jax.ShapeDtypeStruct((), jnp.float32), jax.ShapeDtypeStruct((many,), jnp.float32)
         params = dict.fromkeys(module.PARAMS, single)
-        state = dict.fromkeys(module.initial_state(), each)
+        state = dict.fromkeys(module.initial_state(), batch_shape)
         exported = export.export(jax.jit(module.actuator), platforms=PLATFORMS)(
-            params, state, each, each, each, single
+            params, state, batch_shape, batch_shape, batch_shape, single
         )
         return bytes(exported.serialize(vjp_order=1))
 
@@ -149,9 +149,9 @@ def serialise_actuator(module: ModuleType) -> bytes:
 @contextlib.contextmanager
 def _without_source_paths() -> Iterator[None]:
     """Context in which lowered programs have no paths of source files: equal programs have equal bytes."""
-    kept = getattr(jax.config, PLACES)
+    previous_setting = getattr(jax.config, PLACES)
     jax.config.update(PLACES, 0)
     try:
         yield
     finally:
-        jax.config.update(PLACES, kept)
+        jax.config.update(PLACES, previous_setting)

@@ -166,18 +166,20 @@ class DriveJoint:
     def parameters(self) -> dict[str, params.Parameter]:
         """Parameters that the law depends on, by dotted name."""
         by_name = {p.name: p for p in params.walk_parameters(self.robot)}
-        used = [n for part in self.parts for n in names_in(*_symbols_of_part(part))]
+        symbol_names = [n for part in self.parts for n in names_in(*_symbols_of_part(part))]
         further = ["gearbox.ratio", "motor.inertia", "gearbox.efficiency_load"]
         further += ["driver.current_limit"] * (self.limit is not None)
         further += [f"{self.configuration}.inertia"] * (self.accelerates or self.loose)
         further += [f"{self.configuration}.{n}" for n in ("backlash", "stiffness", "damping")] * self.loose
         further += [n for n in by_name if n.startswith("controller.")]
-        return {n: by_name[n] for n in dict.fromkeys((*further, *used)) if n in by_name}
+        return {n: by_name[n] for n in dict.fromkeys((*further, *symbol_names)) if n in by_name}
 
     def surroundings(self) -> Names:
         """Signals of the joint's surroundings that the law depends on, such as the normal load."""
-        used = [n for part in self.parts for n in names_in(*_symbols_of_part(part)) if n.startswith("surroundings.")]
-        return tuple(dict.fromkeys(used))
+        symbol_names = [
+            n for part in self.parts for n in names_in(*_symbols_of_part(part)) if n.startswith("surroundings.")
+        ]
+        return tuple(dict.fromkeys(symbol_names))
 
 
 def _symbols_of_part(part: Part) -> list[Symbol]:
@@ -212,10 +214,10 @@ def joint_of_robot(file: RobotFile, configuration: str | None = None) -> DriveJo
             "to voltage; add it [V]"
         )
     if robot.rig.imposed != "voltage" and robot.controller is None:
-        what = robot.rig.imposed.replace("_", " ")
+        imposed_words = robot.rig.imposed.replace("_", " ")
         raise BadConfiguration(
             f"{file.name}, [rig] imposed: got {robot.rig.imposed}; expected voltage or a goal, the command of an "
-            f"exported drive. With an imposed {what}, the runs contain no information on the winding"
+            f"exported drive. With an imposed {imposed_words}, the runs contain no information on the winding"
         )
     if lacking := [n for n in ("motor.resistance", "motor.torque_constant") if n in robot.rig.unknown]:
         raise BadConfiguration(f"{file.name}: {', '.join(lacking)} is missing; the drive law needs it; add it")
@@ -242,8 +244,8 @@ class _ExpressionTracer:
         self.joint, self.at_wheel = joint, True
         self.parameters = [p.name for p in params.walk_parameters(joint.robot)]
         self.memories = [e.name for e in joint.robot.remembering]
-        taken = {*VARIABLES.values(), "memory", "temperature", "load_torque"}
-        self.around = [f.name for f in dataclasses.fields(Signals) if f.name not in taken]
+        reserved_names = {*VARIABLES.values(), "memory", "temperature", "load_torque"}
+        self.around = [f.name for f in dataclasses.fields(Signals) if f.name not in reserved_names]
         self.names = [
             *self.parameters,
             *VARIABLES,
@@ -329,8 +331,8 @@ def _trace_parts(joint: DriveJoint) -> Iterator[Part]:
          "friction between the gearbox and the wheel's rim, at the wheel", "pull",
          lambda r, s: balances.track(bare(r), r.chassis(0), s).torque_track_loss),
     )  # fmt: skip
-    for name, balance, unit, equation, meaning, by, function in base:
-        yield _trace_part(trace, name, balance, unit, equation, meaning, by, function)
+    for name, balance, unit, equation, meaning, derivative_variable, function in base:
+        yield _trace_part(trace, name, balance, unit, equation, meaning, derivative_variable, function)
     variable = {"supply": "current", "electrical": "current", "gearbox": "load", "track": "pull"}
     for effect in joint.inside:
         alone = lambda r, e=effect: tuple(x for x in r.effects if x.name == e.name)  # noqa: E731

@@ -86,9 +86,9 @@ def _interval_of(
 ) -> tuple[float | None, float | None, str]:
     if name in ends:
         return *ends[name], OF_POSTERIOR
-    stated = {n: (mean, sd) for n, mean, sd in joint.file.robot.rig.priors}
+    priors = {n: (mean, sd) for n, mean, sd in joint.file.robot.rig.priors}
     value = float(parameter.value)
-    sd = stated[name][1] if name in stated else parameter.spec.prior_sd(value)
+    sd = priors[name][1] if name in priors else parameter.spec.prior_sd(value)
     if not sd:
         return None, None, ""
     kind = "from the prior (± two sds): not fitted" if fitted else OF_PRIOR
@@ -148,9 +148,9 @@ _TORCH = _ArrayLibrary(
 
 def function_arguments(symbol: Symbol) -> list[str]:
     """Arguments of the function of an expression, in addition to its parameters."""
-    used = names_in(symbol)
-    used_arguments = [n for n in _ARGUMENTS if n in used]
-    return [*used_arguments, "memory"] if any(n.startswith("memory.") for n in used) else used_arguments
+    symbol_names = names_in(symbol)
+    used_arguments = [n for n in _ARGUMENTS if n in symbol_names]
+    return [*used_arguments, "memory"] if any(n.startswith("memory.") for n in symbol_names) else used_arguments
 
 
 def quoted(word: str) -> str:
@@ -184,9 +184,9 @@ def call_text(part: Part, suffix: str = "", memory: str | None = None) -> str:
     """Text of the call of a part's function."""
     symbol = {"": part.value, "_slope": part.slope, "_rate": part.rate, "_rate_slope": part.rate_slope}[suffix]
     assert symbol is not None
-    given = ["p", *(("state" + f'["{part.name}"]' if memory is None else memory) if a == "memory" else a
+    arguments = ["p", *(("state" + f'["{part.name}"]' if memory is None else memory) if a == "memory" else a
                     for a in function_arguments(symbol))]  # fmt: skip
-    return f"{part.name}{suffix}({', '.join(given)})"
+    return f"{part.name}{suffix}({', '.join(arguments)})"
 
 
 def _sum_text(parts: Sequence[Part], suffix: str = "", memory: Mapping[str, str] | None = None) -> str:
@@ -204,14 +204,14 @@ def functions_text(joint: DriveJoint, dialect: Dialect) -> str:
         document = f"{part.equation.rstrip('.')}{unit}. {meaning}".strip()
         texts.append(_function_text(part.name, part.value, document, dialect))
         if part.by:
-            what = f"Derivative of `{part.name}` with respect to `{part.by}`."
-            texts.append(_function_text(f"{part.name}_slope", part.slope, what, dialect))
+            docstring = f"Derivative of `{part.name}` with respect to `{part.by}`."
+            texts.append(_function_text(f"{part.name}_slope", part.slope, docstring, dialect))
         if part.rate is not None:
             texts.append(
                 _function_text(f"{part.name}_rate", part.rate, f"Rate of the memory of `{part.name}`.", dialect)
             )
-            what = f"Derivative of `{part.name}_rate` with respect to the memory of `{part.name}`."
-            texts.append(_function_text(f"{part.name}_rate_slope", part.rate_slope, what, dialect))
+            docstring = f"Derivative of `{part.name}_rate` with respect to the memory of `{part.name}`."
+            texts.append(_function_text(f"{part.name}_rate_slope", part.rate_slope, docstring, dialect))
     return "\n\n\n".join(texts)
 
 
@@ -381,11 +381,11 @@ def _fixed_point_lines(name: str, given: str, parts: Sequence[Part], later: Mapp
     """Lines that find x with x + losses(x) = given."""
     if not any(p.by for p in parts):
         return [f"{name} = {given} - ({_sum_text(parts, '', later)})" if parts else f"{name} = {given}"]
-    left = f"({name} + {_sum_text(parts, '', later)} - ({given}))"
+    residual_text = f"({name} + {_sum_text(parts, '', later)} - ({given}))"
     return [
         f"{name} = {given}",
         f"for _ in range({TORQUE_STEPS}):  # a loss that depends on the torque itself",
-        f"    {name} = {name} - {left} / (1.0 + {_sum_text(parts, '_slope', later)})",
+        f"    {name} = {name} - {residual_text} / (1.0 + {_sum_text(parts, '_slope', later)})",
     ]
 
 
@@ -457,7 +457,7 @@ def _module_text(
     added = "".join(f" + {call_text(p)}" for p in joint.of("inertia"))
     body = textwrap.indent("\n".join(step_lines(joint, library)), "    ")
     zero = "jnp.zeros(shape)" if library.dialect is JAX else "torch.zeros(shape, device=device)"
-    given = "shape=()" if library.dialect is JAX else "shape=(), device=None"
+    shape_arguments = "shape=()" if library.dialect is JAX else "shape=(), device=None"
     return (
         f"{_module_header(joint, what, notes)}\n{library.imports}\n\n{constants_text(constants)}\n\n\n"
         f"{functions_text(joint, library.dialect)}\n\n\n"
@@ -465,7 +465,7 @@ def _module_text(
         f'    """{own}, for the joint\'s own armature [kg·m²]."""\n'
         f"    p = params\n"
         f"    return {rotor}{added}\n\n\n"
-        f"def initial_state({given}):\n"
+        f"def initial_state({shape_arguments}):\n"
         f'    """State at rest: current [A], memories of effects{moving}."""\n'
         f"    zero = {zero}\n"
         f"    return {{{states}}}\n\n\n"

@@ -74,20 +74,20 @@ class MujocoLaw(eqx.Module):
     coefficient: jax.Array
 
     def __call__(self, theta: Any, command: Any, load: Any, way: Any) -> tuple[Any, Any]:
-        given = dict(zip(self.names, theta, strict=True))
-        resistance, turns = given[RESISTANCE], self.ratio * given[CONSTANT]
+        values_by_name = dict(zip(self.names, theta, strict=True))
+        resistance, turns = values_by_name[RESISTANCE], self.ratio * values_by_name[CONSTANT]
         hot, excess = jnp.ones_like(command), jnp.zeros_like(command)
         current, speed = jnp.zeros_like(command), jnp.zeros_like(command)
-        for _ in range(STEPS if EXCESS in given or HEAT in given else 1):
-            carried = load + way * (given[FRICTION] + excess)
+        for _ in range(STEPS if EXCESS in values_by_name or HEAT in values_by_name else 1):
+            carried = load + way * (values_by_name[FRICTION] + excess)
             drop = hot * resistance / turns
-            speed = (command - drop * carried) / (turns + drop * given[DAMPING])
-            current = (carried + given[DAMPING] * speed) / turns
-            if HEAT in given:
-                hot = 1 + self.coefficient * given[HEAT] * hot * resistance * current**2
-            if EXCESS in given:
-                excess = given[EXCESS] * jnp.exp(-((speed / given[FADE]) ** 2))
-        return given[SHARE] * current, speed
+            speed = (command - drop * carried) / (turns + drop * values_by_name[DAMPING])
+            current = (carried + values_by_name[DAMPING] * speed) / turns
+            if HEAT in values_by_name:
+                hot = 1 + self.coefficient * values_by_name[HEAT] * hot * resistance * current**2
+            if EXCESS in values_by_name:
+                excess = values_by_name[EXCESS] * jnp.exp(-((speed / values_by_name[FADE]) ** 2))
+        return values_by_name[SHARE] * current, speed
 
 
 def _effect_numbers(joint: DriveJoint, amplitudes: Mapping[str, float]) -> dict[str, dict[str, float]]:
@@ -207,21 +207,23 @@ def _controller_fate(joint: DriveJoint, lag: float, ki: float) -> EffectFate:
             "command voltages"
         )
         return EffectFate(CONTROLLER, DROPPED, how)
-    lost = [f"its lag of {lag:g} s is dropped"] * (lag > 0)
-    lost += ["its integral stops at a fixed value, not when the duty reaches its limit"] * (ki > 0)
-    lost += ["it measures the angle on the motor's side of the backlash"] * joint.loose
-    return EffectFate(CONTROLLER, APPROXIMATED if lost else HELD, "; ".join(["gains and limit of voltage", *lost]))
+    limitations = [f"its lag of {lag:g} s is dropped"] * (lag > 0)
+    limitations += ["its integral stops at a fixed value, not when the duty reaches its limit"] * (ki > 0)
+    limitations += ["it measures the angle on the motor's side of the backlash"] * joint.loose
+    return EffectFate(
+        CONTROLLER, APPROXIMATED if limitations else HELD, "; ".join(["gains and limit of voltage", *limitations])
+    )
 
 
 def fates_outside_joint(joint: DriveJoint) -> list[EffectFate]:
     """Fates of effects that are not part of a joint."""
-    where = {
+    place_by_effect = {
         "sensor": "an instrument error, not part of the drive",
         "supply": "the battery; the command is a voltage, so reduce it accordingly",
         "mass": "the mass of the robot; set it in the simulator's model",
     }
     other = "a property of the ground, which the simulator's contact model must provide"
-    return [EffectFate(e.name, DROPPED, where.get(e.balance, other)) for e in joint.outside]
+    return [EffectFate(e.name, DROPPED, place_by_effect.get(e.balance, other)) for e in joint.outside]
 
 
 def approximated_terms(balance: str) -> str:
@@ -432,14 +434,18 @@ def mjcf_scene(joint: DriveJoint, mass: float, name: str, at: str, command: floa
         mass: mass of the vehicle [kg].
         command, load: command and load of the key frame `run` [V or rad], [N·m].
     """
-    moved = joint.load
+    moved_load = joint.load
     if joint.robot.has_ground:
-        radius = float(moved.radius)
-        inertia = float(moved.inertia) + mass / float(joint.robot.sides) * radius**2
+        radius = float(moved_load.radius)
+        inertia = float(moved_load.inertia) + mass / float(joint.robot.sides) * radius**2
         head = f"One side of the robot: its wheel, carrying 1/{float(joint.robot.sides):g} of {mass:.4g} kg"
         weight, arm, angle = 0.0, radius, 0.0
     else:
-        inertia, weight, angle = float(moved.inertia), float(moved.torque_gravity), float(moved.angle_zero)
+        inertia, weight, angle = (
+            float(moved_load.inertia),
+            float(moved_load.torque_gravity),
+            float(moved_load.angle_zero),
+        )
         head, arm = "The rig's shaft", 0.05
     body = _body_text(inertia, weight, angle)
     return (

@@ -78,11 +78,11 @@ def difference_from_jax(joint: DriveJoint, constants: Sequence[LawConstant], mod
     """Largest difference of the model's outputs from JAX's over random states, relative to each output's rms."""
     runtime = _import_library("onnxruntime")
     step, inputs, _ = step_function(joint, constants)
-    given = random_states(joint, len(inputs))
+    states = random_states(joint, len(inputs))
     with _single_precision():
-        expected = [np.asarray(x) for x in jax.jit(step)(*given)]
+        expected = [np.asarray(x) for x in jax.jit(step)(*states)]
     session = runtime.InferenceSession(model, providers=["CPUExecutionProvider"])
-    outputs = session.run(None, dict(zip(inputs, given, strict=True)))
+    outputs = session.run(None, dict(zip(inputs, states, strict=True)))
     sizes = [float(np.sqrt(np.mean(np.square(x)))) or 1.0 for x in expected]
     return max(float(np.max(np.abs(a - b))) / s for a, b, s in zip(outputs, expected, sizes, strict=True))
 
@@ -95,5 +95,5 @@ def random_states(joint: DriveJoint, inputs: int) -> list[np.ndarray]:
     fastest = volts / float(motor.torque_constant) / ratio
     scales = [2.0, *(1.0 for _ in joint.states[1:]), volts, 3.0, fastest]
     assert len(scales) == inputs - 1
-    given = [(s * rng.uniform(-1, 1, STATES)).astype(np.float32) for s in scales]
-    return [*given, np.full(1, 1e-3, np.float32)]
+    states = [(s * rng.uniform(-1, 1, STATES)).astype(np.float32) for s in scales]
+    return [*states, np.full(1, 1e-3, np.float32)]

@@ -150,24 +150,26 @@ def situation_of_joint(joint: DriveJoint, data: Runs | str | None) -> Comparison
         runs = _runs_of_joint(data, joint)
         source = runs.source
     conditions = runs.conditions(robot)
-    moves, whole = _solve_runs(robot, conditions)
-    turns, signals = _solve_runs(_with_absent_effects(joint), conditions) if joint.outside else (moves, whole)
+    moves, solution = _solve_runs(robot, conditions)
+    turns, signals = _solve_runs(_with_absent_effects(joint), conditions) if joint.outside else (moves, solution)
     channels = channels_of(joint)
-    sensor_readings = jax.vmap(lambda s: balances.sensor(robot, s))(whole)
+    sensor_readings = jax.vmap(lambda s: balances.sensor(robot, s))(solution)
     native = np.stack([np.asarray(sensor_readings[c.name]) for c in channels], -1)
-    kept = moves & turns & np.asarray(np.abs(signals.speed_motor) > 0) & (np.asarray(conditions.open) < 0.5)
-    if not kept.any():
+    is_moving = moves & turns & np.asarray(np.abs(signals.speed_motor) > 0) & (np.asarray(conditions.open) < 0.5)
+    if not is_moving.any():
         raise BadData(f"{source}: the model settles in none of these runs, so no comparison is possible")
-    signals = jax.tree.map(lambda x: x[kept] if np.shape(x) else x, signals)
-    chosen = runs.where(kept)
+    signals = jax.tree.map(lambda x: x[is_moving] if np.shape(x) else x, signals)
+    moving_runs = runs.where(is_moving)
     radius = float(joint.load.radius)
-    given = (signals.voltage_source, signals.duty, signals.pause, signals.voltage_back)
-    command = robot.driver.voltage(*map(jnp.asarray, given))
+    drive_signals = (signals.voltage_source, signals.duty, signals.pause, signals.voltage_back)
+    command = robot.driver.voltage(*map(jnp.asarray, drive_signals))
     measured = (
-        _measured_readings(chosen, channels) if data is not None else np.full((len(chosen), len(channels)), np.nan)
+        _measured_readings(moving_runs, channels)
+        if data is not None
+        else np.full((len(moving_runs), len(channels)), np.nan)
     )
     return ComparisonRuns(
-        joint, source, chosen, conditions, kept, signals, native[kept], measured, np.asarray(command),
+        joint, source, moving_runs, conditions, is_moving, signals, native[is_moving], measured, np.asarray(command),
         radius * np.asarray(signals.demand),
     )  # fmt: skip
 
@@ -188,9 +190,11 @@ def export_grid(joint: DriveJoint) -> Runs:
         shares = np.tile(LOADS, len(runs))
         columns = {name: np.repeat(values, len(LOADS)) for name, values in columns.items()}
         columns[LOAD] = shares * stall_torque(joint, columns[volts])
-    turned = {name: -values for name, values in columns.items() if name in (volts, LOAD, "slope_deg")}
-    both = {name: np.concatenate([values, turned.get(name, values)]) for name, values in columns.items()}
-    return dataclasses.replace(runs, columns=both)
+    reversed_columns = {name: -values for name, values in columns.items() if name in (volts, LOAD, "slope_deg")}
+    all_columns = {
+        name: np.concatenate([values, reversed_columns.get(name, values)]) for name, values in columns.items()
+    }
+    return dataclasses.replace(runs, columns=all_columns)
 
 
 def stall_torque(joint: DriveJoint, voltage: np.ndarray) -> np.ndarray:
@@ -199,8 +203,8 @@ def stall_torque(joint: DriveJoint, voltage: np.ndarray) -> np.ndarray:
     motor, gear, load = joint.robot.motor, joint.robot.gearbox, joint.load
     current = np.minimum(voltage / float(motor.resistance), float(joint.robot.driver.current_limit))
     torque = float(motor.torque_constant) * current - float(motor.friction_coulomb + gear.friction_coulomb)
-    given = float(gear.ratio * gear.efficiency_load) * torque - float(load.loss_coulomb)
-    return np.clip(given, 0.0, np.inf if gear.torque_limit is None else gear.torque_limit)
+    output_torque = float(gear.ratio * gear.efficiency_load) * torque - float(load.loss_coulomb)
+    return np.clip(output_torque, 0.0, np.inf if gear.torque_limit is None else gear.torque_limit)
 
 
 def _measured_readings(runs: Runs, channels: tuple[Any, ...]) -> np.ndarray:
@@ -227,7 +231,7 @@ def _runs_of_joint(data: Runs | str, joint: DriveJoint) -> Runs:
 
         numbers = settling.acceleration_currents(robot), settling.rolling_readings(robot)
         runs = settling.settle_log(runs, inertia=numbers[0], rolling=numbers[1]).settled_runs()
-    here = runs.configurations_named(robot) == joint.configuration
-    if not here.any():
+    is_joint_configuration = runs.configurations_named(robot) == joint.configuration
+    if not is_joint_configuration.any():
         raise BadData(f"{runs.source}: no run of {joint.configuration}; expected runs in the exported configuration")
-    return runs.where(here)
+    return runs.where(is_joint_configuration)

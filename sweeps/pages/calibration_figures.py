@@ -36,8 +36,8 @@ def draw_clusters(found: Sequence[ResidualCluster]) -> Figure:
                 side = np.linspace(-0.5, 0.5, len(y)) if len(y) > 1 else np.zeros(1)
                 axes.plot(place + WIDE * side, y, "o", ms=3, color=BLUE, alpha=0.7)
                 axes.plot(place + WIDE * np.array([-0.6, 0.6]), [y.mean()] * 2, color=INK, lw=2)
-            turned = 30 if len(one.levels) > ACROSS else 0
-            axes.set_xticks(range(len(one.levels)), [m.name for m in one.levels], rotation=turned, fontsize=8)
+            label_angle = 30 if len(one.levels) > ACROSS else 0
+            axes.set_xticks(range(len(one.levels)), [m.name for m in one.levels], rotation=label_angle, fontsize=8)
         else:
             axes.plot(one.at, one.residual, "o", ms=3, color=BLUE, alpha=0.7)
         axes.set(xlabel=one.column, ylabel=f"{channels.find_channel(one.channel).label} [{one.unit}]")
@@ -125,14 +125,14 @@ def draw_correlated_pairs(found: CalibrationResult) -> Figure:
     posterior = found.posterior
     sd = np.sqrt(np.diag(posterior.covariance))
     correlation = np.abs(posterior.covariance / np.outer(sd, sd))
-    every = [(i, j) for i in range(len(posterior)) for j in range(i)]
-    chosen = sorted(every, key=lambda pair: -np.nan_to_num(correlation[pair]))[:PAIRED]
-    fig, grid = new_figure(-(-len(chosen) // 3), min(3, len(chosen)), 2.9 * -(-len(chosen) // 3))
+    pairs = [(i, j) for i in range(len(posterior)) for j in range(i)]
+    shown_pairs = sorted(pairs, key=lambda pair: -np.nan_to_num(correlation[pair]))[:PAIRED]
+    fig, grid = new_figure(-(-len(shown_pairs) // 3), min(3, len(shown_pairs)), 2.9 * -(-len(shown_pairs) // 3))
     turn = np.linspace(0, 2 * np.pi, 120)
     circle = np.stack([np.cos(turn), np.sin(turn)], 1)
-    for axes in grid.ravel()[len(chosen) :]:
+    for axes in grid.ravel()[len(shown_pairs) :]:
         axes.set_axis_off()
-    for axes, (i, j) in zip(grid.ravel(), chosen, strict=False):
+    for axes, (i, j) in zip(grid.ravel(), shown_pairs, strict=False):
         pair = [j, i]
         root = np.linalg.cholesky(posterior.covariance[np.ix_(pair, pair)] + 1e-18 * np.eye(2))
         for radius, shade in zip(RADII, (1.0, 0.45), strict=True):
@@ -155,8 +155,8 @@ def draw_errors_before_after(found: CalibrationResult) -> Figure:
     fig, grid = new_figure(1, len(found.channels), 1.1 + 0.36 * len(lines), sharey=True)
     for axes, channel in zip(grid[0], found.channels, strict=True):
         most = int(np.isfinite(found.readings[channel.name].measured).sum())
-        for row, (words, by) in enumerate(lines.items()):
-            errors = by[channel.name]
+        for row, (words, errors_by_channel) in enumerate(lines.items()):
+            errors = errors_by_channel[channel.name]
             colour = FAINT if words == "before" else BLUE if words == "fitted" else ORANGE
             if errors.rows:
                 axes.barh(row, errors.rms_percent, color=colour, height=0.62)

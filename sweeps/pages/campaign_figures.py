@@ -75,8 +75,8 @@ def draw_output_spread(output: np.ndarray, label: str, varied: Mapping[str, Vari
     histogram.set(xlabel=label, ylabel="points", title="how often")
     for axes, name in zip(others, names, strict=False):
         values = varied[name].values
-        which, middles = bin_values(values)
-        quantiles = np.array([np.quantile(output[which == k], (0.05, 0.5, 0.95)) for k in range(len(middles))])
+        bin_index, middles = bin_values(values)
+        quantiles = np.array([np.quantile(output[bin_index == k], (0.05, 0.5, 0.95)) for k in range(len(middles))])
         axes.fill_between(middles, quantiles[:, 0], quantiles[:, 2], color=BLUE, alpha=0.2, linewidth=0)
         axes.plot(middles, quantiles[:, 1], color=BLUE)
         shares = variance_share(values, output)
@@ -144,9 +144,9 @@ def bin_values(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def variance_share(values: np.ndarray, output: np.ndarray) -> float:
     """Share of an output's variance that lies between the bins of a name: its first-order index, roughly."""
-    which, middles = bin_values(values)
-    count = np.bincount(which, minlength=len(middles))
-    mean = np.bincount(which, output, minlength=len(middles)) / np.maximum(count, 1)
+    bin_index, middles = bin_values(values)
+    count = np.bincount(bin_index, minlength=len(middles))
+    mean = np.bincount(bin_index, output, minlength=len(middles)) / np.maximum(count, 1)
     total = float(np.var(output))
     return float(np.sum(count * (mean - output.mean()) ** 2) / len(output) / total) if total > 0 else 0.0
 
@@ -156,7 +156,7 @@ def variance_share_by_chance(values: np.ndarray) -> float:
 
     Of normal outputs the share is then a beta variable, 0 for a single bin, 1 where every value has a bin of its own.
     """
-    within, between = len(values) - (used := len(np.unique(bin_values(values)[0]))), used - 1
+    within, between = len(values) - (bin_count := len(np.unique(bin_values(values)[0]))), bin_count - 1
     return float(scipy.stats.beta.ppf(0.99, between / 2, within / 2)) if within and between else float(within == 0)
 
 

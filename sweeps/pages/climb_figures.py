@@ -50,9 +50,9 @@ def _belt_outlines(found: Drawable, q: np.ndarray) -> list[tuple[np.ndarray, np.
     if np.asarray(chassis.on_tracks) > 0.5:
         belts += [(shape.lever, lever, q[SHAFT] + q[lever.turns]) for lever in (front, rear)]
     outlines = []
-    for belt, frame, turned in belts:
+    for belt, frame, belt_angle in belts:
         path = frame.world(belt.point(jnp.linspace(0.0, belt.length, 120)[:-1]))
-        tips = frame.world(belt_loop.grouser_tips(belt, belt.places(belt.first * turned)).at)
+        tips = frame.world(belt_loop.grouser_tips(belt, belt.places(belt.first * belt_angle)).at)
         outlines.append((np.asarray(path), np.asarray(tips)))
     if np.asarray(chassis.on_tracks) < 0.5:
         round_ = np.linspace(0, 2 * np.pi, 60)
@@ -98,10 +98,10 @@ def decisive_instants(found: Drawable) -> list[tuple[str, int]]:
         "half way": int(np.argmin(np.abs(t["x_mm"] - (t["x_mm"][0] + t["x_mm"].max()) / 2))),
         "end": len(t["time_s"]) - 1,
     }
-    named: dict[int, str] = {}
+    names_by_instant: dict[int, str] = {}
     for name, k in picked.items():
-        named[k] = f"{named[k]}, {name}" if k in named else name
-    return [(named[k], k) for k in sorted(named)][:SHOWN]
+        names_by_instant[k] = f"{names_by_instant[k]}, {name}" if k in names_by_instant else name
+    return [(names_by_instant[k], k) for k in sorted(names_by_instant)][:SHOWN]
 
 
 def draw_silhouettes(found: ClimbResult) -> Figure:

@@ -36,12 +36,14 @@ def draw_export_readings(compared: ExportComparison) -> Figure:
     fig, grid = new_figure(1, max(len(channel_places), 1), 3.4)
     for axes, (k, channel) in zip(grid[0], channel_places, strict=False):
         size = 1 / channel.factor
-        given = reference[:, k] * size
-        ends = np.nanmin(given), np.nanmax(given)
+        reference_readings = reference[:, k] * size
+        ends = np.nanmin(reference_readings), np.nanmax(reference_readings)
         axes.plot(ends, ends, color=FAINT, lw=1)
         if situation.is_measured:
-            axes.plot(given, situation.native[:, k] * size, "o", color=BLUE, ms=5, mfc="none", label="native")
-        axes.plot(given, compared.readings[:, k] * size, ".", color=VERMILION, ms=5, label="exported")
+            axes.plot(
+                reference_readings, situation.native[:, k] * size, "o", color=BLUE, ms=5, mfc="none", label="native"
+            )
+        axes.plot(reference_readings, compared.readings[:, k] * size, ".", color=VERMILION, ms=5, label="exported")
         axes.set_xlabel(f"{compared.reference}: {channel.label} [{channel.unit}]", color=INK)
         axes.set_ylabel(f"{channel.label} [{channel.unit}]", color=INK)
         axes.legend(loc="upper left", frameon=False)
@@ -58,21 +60,23 @@ def draw_parity(table: Columns, channels: Sequence[Channel], band: bool = True) 
     look = configuration_looks(table["configuration"])
     for axes, channel in zip(grid[0], channels, strict=True):
         measured, simulated = table[channel.column], table[f"simulated_{channel.column}"]
-        both = np.isfinite(measured) & np.isfinite(simulated)
-        ends = np.concatenate([measured[both], simulated[both]]) if both.any() else np.array([0.0, 1.0])
+        is_paired = np.isfinite(measured) & np.isfinite(simulated)
+        ends = (
+            np.concatenate([measured[is_paired], simulated[is_paired]]) if is_paired.any() else np.array([0.0, 1.0])
+        )
         low, high = min(0.0, float(ends.min())), max(0.0, float(ends.max()))
         span = np.array([low - 0.05 * (high - low) * (low < 0), high + 0.05 * (high - low)])
         if band:
             axes.fill_between(span, span * 0.95, span * 1.05, color="#eef3ee", lw=0)
         axes.plot(span, span, color="#666666", lw=0.9)
         for kind, (colour, marker) in look.items():
-            pick = both & (table["configuration"] == kind)
+            pick = is_paired & (table["configuration"] == kind)
             if pick.any():
                 _draw_dots(axes, measured[pick], simulated[pick], marker, color=colour, label=kind)
         axes.set(xlabel=f"measured {axis_label(channel)}", ylabel=f"simulated {axis_label(channel)}")
         axes.set_xlim(*span)
         axes.set_ylim(*span)
-        if not both.any():
+        if not is_paired.any():
             add_corner_note(axes, "no row has both numbers")
     if grid[0, 0].get_legend_handles_labels()[0] and len(look) <= LOOKS:
         grid[0, 0].legend(loc="lower right")
@@ -94,11 +98,13 @@ def draw_errors_over_conditions(
         in_units: errors in the unit of the channel instead, with a band of two sds where they are known. Over those
             conditions that vary.
     """
-    every = {
+    errors_by_condition = {
         "slope_deg": "slope [°]", "supply_voltage_V": "supply voltage [V]", "motor_speed_rpm": "motor speed [rpm]",
         "motor_current_A": "motor current [A]", "payload_kg": "payload [kg]",
     }  # fmt: skip
-    conditions = {c: words for c, words in every.items() if c in table and f"simulated_{c}" not in table}
+    conditions = {
+        c: words for c, words in errors_by_condition.items() if c in table and f"simulated_{c}" not in table
+    }
     if in_units:
         conditions |= beside or {}
         varied = {c: words for c, words in conditions.items() if np.unique(table[c]).size > 1}
@@ -123,8 +129,8 @@ def draw_errors_over_conditions(
             for side, (kind, (colour, marker)) in zip(sides, look.items(), strict=True):
                 pick = (table["configuration"] == kind) & np.isfinite(error)
                 if pick.any():
-                    moved = table[condition][pick] + side * shift
-                    _draw_dots(axes, moved, error[pick], marker, color=colour, label=kind)
+                    shifted = table[condition][pick] + side * shift
+                    _draw_dots(axes, shifted, error[pick], marker, color=colour, label=kind)
             if row[0] is grid[-1, 0]:
                 axes.set_xlabel(words)
                 if levels.size <= 8:

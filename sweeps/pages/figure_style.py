@@ -138,8 +138,8 @@ def legend_columns(labels: Iterable[str], most: int = 99) -> int:
 def outer_legend(axes: Axes, place: str) -> None:
     """Legend of axes at a place outside of all panels, such as `upper center`."""
     handles, labels = axes.get_legend_handles_labels()
-    where: Any = f"outside {place}"
-    axes.figure.legend(handles, labels, loc=where, ncols=legend_columns(labels))
+    placement: Any = f"outside {place}"
+    axes.figure.legend(handles, labels, loc=placement, ncols=legend_columns(labels))
 
 
 def can_stack(fig: Figure) -> bool:
@@ -255,7 +255,7 @@ def _wrap_texts(fig: Figure) -> bool:
 
 def _make_room_for_names(fig: Figure) -> bool:
     """Enlarge the figure to separate names at y axes, and turn names at x axes upright, True if any changed."""
-    more, turned = 0.0, False
+    more, has_rotated = 0.0, False
     for axes in filter(Axes.get_visible, fig.axes):
         for axis, low, high in ((axes.xaxis, "x0", "x1"), (axes.yaxis, "y0", "y1")):
             names = [t for t in axis.get_ticklabels() if t.get_text() and t.get_visible()]
@@ -270,10 +270,10 @@ def _make_room_for_names(fig: Figure) -> bool:
                 axis.set_tick_params(rotation=90)
                 for name in names:
                     name.set_horizontalalignment("center")
-                turned = True
+                has_rotated = True
     if more > 0.05:
         fig.set_figheight(fig.get_figheight() + min(more, TALLER))
-    return more > 0.05 or turned
+    return more > 0.05 or has_rotated
 
 
 def _separate_texts(fig: Figure, move: bool) -> None:
@@ -281,8 +281,8 @@ def _separate_texts(fig: Figure, move: bool) -> None:
 
     A map shows all its numbers or none. Without `move` only maps are changed.
     """
-    every: Any = fig.findobj(lambda a: isinstance(a, Text) and a.get_visible() and a.get_text().strip() != "")
-    boxes = {text: Text.get_window_extent(text) for text in every if text.get_rotation() == 0}
+    texts: Any = fig.findobj(lambda a: isinstance(a, Text) and a.get_visible() and a.get_text().strip() != "")
+    boxes = {text: Text.get_window_extent(text) for text in texts if text.get_rotation() == 0}
 
     def is_free(text: Text, box: Bbox) -> bool:
         return not any(
@@ -293,8 +293,8 @@ def _separate_texts(fig: Figure, move: bool) -> None:
 
     inside: list[Any] = [text for axes in fig.axes for text in axes.texts if text in boxes]
     crowded = {text.axes for text in inside if text.axes.images and not is_free(text, boxes[text])}
-    chosen = inside if move else [text for text in inside if text.axes in crowded and _is_number(text)]
-    for text in sorted(chosen, key=lambda text: not _is_number(text)):
+    movable = inside if move else [text for text in inside if text.axes in crowded and _is_number(text)]
+    for text in sorted(movable, key=lambda text: not _is_number(text)):
         box, panel, line = boxes[text], text.axes.bbox, text.get_fontsize() / 2
         if _is_number(text) and (text.axes in crowded or not is_free(text, box)):
             text.set_visible(False)
@@ -303,13 +303,13 @@ def _separate_texts(fig: Figure, move: bool) -> None:
             continue
         aside = max(panel.x0 + 2 - box.x0, 0.0)
         for lines, along in itertools.product(sorted(range(-12, 13), key=abs), dict.fromkeys((0.0, aside))):
-            moved = box.translated(along, lines * line)
-            if panel.y0 < moved.y0 and moved.y1 < panel.y1 and is_free(text, moved):
+            shifted_box = box.translated(along, lines * line)
+            if panel.y0 < shifted_box.y0 and shifted_box.y1 < panel.y1 and is_free(text, shifted_box):
                 if isinstance(text, Annotation) and isinstance(text.anncoords, str):
                     text.xyann = tuple(np.add(text.xyann, (along, lines * line)))
                 else:
                     text.set_transform(text.get_transform() + Affine2D().translate(along, lines * line))
-                boxes[text] = moved
+                boxes[text] = shifted_box
                 break
 
 
@@ -332,14 +332,14 @@ def _axes_position(fig: Figure, axes: Axes) -> Json:
     # an inner axis has its label at the edge of its row or column, or of the figure
     column = [a.xaxis for a in fig.axes if a.get_position().x0 == axes.get_position().x0]
     row = [a.yaxis for a in fig.axes if a.get_position().y0 == axes.get_position().y0]
-    both = {}
+    positions = {}
     for name, axis, beside, whole in (
         ("x", axes.xaxis, column, fig.get_supxlabel()),
         ("y", axes.yaxis, row, fig.get_supylabel()),
     ):
         labels = (axis.get_label_text(), *(other.get_label_text() for other in beside), whole)
-        both[name] = {**_axis_range(axis), "label": next(filter(None, labels), "").split("\n")[0]}
-    return {"box": [round(v, 1) for v in place], **both}
+        positions[name] = {**_axis_range(axis), "label": next(filter(None, labels), "").split("\n")[0]}
+    return {"box": [round(v, 1) for v in place], **positions}
 
 
 def _has_names(axis: Axis) -> bool:

@@ -96,8 +96,10 @@ def gear_runs(
         on_tracks = float(robot.configurations.members[int(which[k])].on_tracks) > 0.5
         over_time = (history.time, history.signals, history.reactions)
         time, signals, reactions = jax.tree.map(lambda x, k=k: np.asarray(x[k]), over_time)
-        ended, share = STATUSES[int(status[k])], float(guide_share[k])
-        answer.append(GearRun(name, on_tracks, ended, float(robot.radius_pulley), time, signals, reactions, share))
+        status_word, share = STATUSES[int(status[k])], float(guide_share[k])
+        answer.append(
+            GearRun(name, on_tracks, status_word, float(robot.radius_pulley), time, signals, reactions, share)
+        )
     return answer
 
 

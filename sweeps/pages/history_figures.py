@@ -53,14 +53,14 @@ def draw_settled_log(found: Settled) -> Figure:
     """The imposed quantity and each channel over the log, with settled stretches and their means."""
     runs = found.runs
     rows = np.concatenate([s.rows for s in found.stretches]) if found.stretches else np.zeros(0, int)
-    every = np.unique(np.concatenate([rows, np.arange(len(runs))]))
+    rows_drawn = np.unique(np.concatenate([rows, np.arange(len(runs))]))
     clock, begin = np.zeros(len(runs)), 0.0
     run = runs.run_names
     for name in dict.fromkeys(run.tolist()):  # recordings one after the other
         run_rows = np.flatnonzero(run == name)
         clock[run_rows] = begin + runs["time_s"][run_rows] - runs["time_s"][run_rows[0]]
         begin = float(clock[run_rows[-1]])
-    order = every[np.argsort(clock[every], kind="stable")]
+    order = rows_drawn[np.argsort(clock[rows_drawn], kind="stable")]
     lines = [("{}\n[{}]".format(*IMPOSED[runs.layout.imposed]), applied_drive(runs))]
     lines += [
         (f"{s.channel.label}\n[{s.channel.unit}]", s.shown if len(s.angle) else runs[s.channel.column])
@@ -187,10 +187,10 @@ def start_runs(
             np.asarray(x[k])[upto] for x in (history.signals.speed, history.signals.speed_theoretical)
         )
         sense = 1.0 if found is None else found.sense
-        kind, ended, scale = robot.configurations.names[int(which[k])], STATUSES[int(status[k])], sense / MM
+        kind, status_word, scale = robot.configurations.names[int(which[k])], STATUSES[int(status[k])], sense / MM
         times = np.asarray(history.time[k])[upto]
         answer.append(
-            StartRun(name, kind, ended, times, sense * current[upto], scale * speed, scale * theoretical, found)
+            StartRun(name, kind, status_word, times, sense * current[upto], scale * speed, scale * theoretical, found)
         )
     return answer
 
@@ -450,9 +450,9 @@ def frequency_response(
     spectra: Any = 0.0
     for time, drive, readings in runs:
         even = time[0] + apart * np.arange(int(np.ptp(time) / apart) + 1)
-        held = drive[np.searchsorted(time, even + 1e-3 * apart, side="right") - 1]
-        series = np.stack([held, *(np.interp(even, time, reading) for reading in readings)])
-        frequency, cross = signal.csd(held, series, 1 / apart, nperseg=length)
+        resampled_drive = drive[np.searchsorted(time, even + 1e-3 * apart, side="right") - 1]
+        series = np.stack([resampled_drive, *(np.interp(even, time, reading) for reading in readings)])
+        frequency, cross = signal.csd(resampled_drive, series, 1 / apart, nperseg=length)
         _, power = signal.welch(series, 1 / apart, nperseg=length)
         spectra = spectra + len(even) * np.stack([cross, power + 0j])
     cross, power = spectra[0, 1:, 1:], spectra[1, :, 1:].real

@@ -79,9 +79,12 @@ def draw_residuals_before_after(table: Columns, channels: Sequence[Channel], ver
     fig, grid = new_figure(len(channels), 1, 1.8 * len(channels), sharex=True)
     levels = np.unique(table[own_column]).size
     few = levels <= 8 or own_column == "supply_voltage_V"  # else a group by configuration alone
-    named = not few or np.unique(table["configuration"]).size > 1
+    names_configurations = not few or np.unique(table["configuration"]).size > 1
     groups = [
-        ", ".join([str(table["configuration"][k])] * named + [f"{table[own_column][k]:g} {UNITS[own_column]}"] * few)
+        ", ".join(
+            [str(table["configuration"][k])] * names_configurations
+            + [f"{table[own_column][k]:g} {UNITS[own_column]}"] * few
+        )
         for k in order
     ]
     edges = [i for i in range(1, len(groups)) if groups[i] != groups[i - 1]]
@@ -254,12 +257,12 @@ def draw_power(found: DiscoveryResult) -> Figure:
 def draw_effect_scores(found: DiscoveryResult) -> Figure:
     """Score of every effect at the base fit, with the threshold that noise alone passes in few tables."""
     rungs = found.scores[:RUNGS]
-    named = {e.name for e in found.effects}
-    alike = {n for e in found.effects for n in e.members} - named
+    effect_names = {e.name for e in found.effects}
+    alike = {n for e in found.effects for n in e.members} - effect_names
     fig, grid = new_figure(1, 1, 1.1 + 0.24 * len(rungs))
     axes = grid[0, 0]
     root = [np.sqrt(r.score) for r in rungs]
-    colours = [BLUE if r.name in named else SKY if r.name in alike else "#c9c9c9" for r in rungs]
+    colours = [BLUE if r.name in effect_names else SKY if r.name in alike else "#c9c9c9" for r in rungs]
     axes.barh(range(len(rungs)), root, color=colours, height=0.72)
     level = found.before.kinds["single"].threshold
     axes.axvline(level, color=ORANGE, lw=1.6)
@@ -350,10 +353,13 @@ def conditions_and_readings(table: Columns) -> Columns:
     columns = {f"{label} [{unit}]": table[c] for c, (label, unit) in labels.items() if c in table}
     values, words = imposed_axis(table)
     columns |= {words: values}
-    for label, left in list(columns.items()):
+    for label, column in list(columns.items()):
         if (right := columns.get(label.replace(", left", ", right"))) is not None and ", left" in label:
-            both = label.replace(", left", "")
-            columns |= {f"mean of both sides: {both}": (left + right) / 2, f"left minus right: {both}": left - right}
+            side_label = label.replace(", left", "")
+            columns |= {
+                f"mean of both sides: {side_label}": (column + right) / 2,
+                f"left minus right: {side_label}": column - right,
+            }
     return columns
 
 
@@ -365,11 +371,13 @@ def driving_variable(table: Columns, change: np.ndarray, driver: str = "") -> tu
         driver: driver of the effect; variables with that word are preferred.
     """
     use = np.isfinite(change)
-    every = {k: np.asarray(v, float) for k, v in conditions_and_readings(table).items()}
-    whole = {k: v for k, v in every.items() if np.isfinite(v[use]).all()}
-    whole = {k: v for k, v in whole.items() if driver in k.split() and np.ptp(v[use]) > 0} or whole
-    label = min(whole, key=lambda k: roughness(whole[k][use], change[use]))
-    return whole[label], label
+    columns = {k: np.asarray(v, float) for k, v in conditions_and_readings(table).items()}
+    finite_columns = {k: v for k, v in columns.items() if np.isfinite(v[use]).all()}
+    finite_columns = {
+        k: v for k, v in finite_columns.items() if driver in k.split() and np.ptp(v[use]) > 0
+    } or finite_columns
+    label = min(finite_columns, key=lambda k: roughness(finite_columns[k][use], change[use]))
+    return finite_columns[label], label
 
 
 def draw_effect_laws(found: DiscoveryResult, table: Columns, changes: Mapping[str, Change]) -> Figure:
@@ -379,20 +387,20 @@ def draw_effect_laws(found: DiscoveryResult, table: Columns, changes: Mapping[st
     amplitude. Backward runs have hollow dots and a separate line.
     """
     fig, grid = new_figure(1, len(changes), 3.4)
-    readings, used = found.readings_of_rows, found.included
-    backward = (table[imposed_column(table)] < 0)[used]
+    readings, is_included = found.readings_of_rows, found.included
+    backward = (table[imposed_column(table)] < 0)[is_included]
     for axes, (name, change) in zip(grid[0], changes.items(), strict=True):
         c = change.channel
         effect = BY_NAME.get(name)
-        moved = np.where(used, change.with_it - change.without, np.nan)
-        x, label = driving_variable(table, moved, "" if effect is None else effect.driver)
+        effect_size = np.where(is_included, change.with_it - change.without, np.nan)
+        x, label = driving_variable(table, effect_size, "" if effect is None else effect.driver)
         k = [x.name for x in found.channels].index(c.name)
         size = next(e.parameters["amplitude"] for e in found.effects if e.name == name)
         measured, before, law = (
-            (values - change.without)[used] / c.factor
+            (values - change.without)[is_included] / c.factor
             for values in (readings.measured[:, k], readings.before[:, k], change.with_it)
         )
-        x, sd = x[used], readings.sd[used, k] / c.factor
+        x, sd = x[is_included], readings.sd[is_included, k] / c.factor
         band = 1.96 * abs(size.sd / size.value * law)
         axes.axhline(0, color=FAINT, lw=0.8)
         for way, fill, words in ((~backward, ORANGE, "measured, ±2 sd"), (backward, "white", "backward")):

@@ -78,8 +78,8 @@ def _inline_svg(svg: str, name: str, looks: str) -> str:
     """An SVG document as an element of a page, with the classes `looks`. Ids that are referred to are its own."""
     element = re.sub(r' xmlns(?::\w+)?="[^"]*"', "", svg[svg.index("<svg") :])
     element = element.replace("<svg ", f'<svg class="{looks}" ', 1)
-    wanted = set(re.findall(r'(?:href="|url\()#([^")]+)', element))
-    element = re.sub(r' id="([^"]+)"', lambda m: f' id="{name}-{m[1]}"' if m[1] in wanted else "", element)
+    used_ids = set(re.findall(r'(?:href="|url\()#([^")]+)', element))
+    element = re.sub(r' id="([^"]+)"', lambda m: f' id="{name}-{m[1]}"' if m[1] in used_ids else "", element)
     return re.sub(r'((?:href="|url\()#)(?=[^")]+)', rf"\g<1>{name}-", element)
 
 

@@ -98,8 +98,8 @@ def draw_silhouette(axes: Axes, shown: Drawn, title: str) -> None:
     mass = page(np.array([[side.centre_forward, side.centre_up]]))[0]
     axes.plot(*mass, "o", color=VERMILION, ms=6)
     axes.plot([mass[0]] * 2, [mass[1], mass[1] - (float(side.centre_up) - high) / MM], color=VERMILION, lw=1, ls="--")
-    every = np.concatenate([page(belt_outline(side, belt)) for belt in colours])
-    (left, low), (right, high) = every.min(0) - 40, every.max(0) + 40
+    outline_points = np.concatenate([page(belt_outline(side, belt)) for belt in colours])
+    (left, low), (right, high) = outline_points.min(0) - 40, outline_points.max(0) + 40
     axes.set(title=title, aspect="equal", xlim=(left, right), ylim=(low, high), xlabel="mm", ylabel="mm")
 
 

@@ -50,8 +50,10 @@ def power_sources(runs: Columns) -> tuple[np.ndarray, np.ndarray]:
 
 def drawable_runs(runs: Columns) -> np.ndarray:
     """Mask of runs with numbers and without negative losses."""
-    parts, given = np.stack(list(power_by_item(runs).values())), sum(power_sources(runs))
-    return np.isfinite(parts).all(0) & (parts >= -1e-6 * np.maximum(given, 1.0)).all(0) & (given > 0)
+    parts, supplied_power = np.stack(list(power_by_item(runs).values())), sum(power_sources(runs))
+    return (
+        np.isfinite(parts).all(0) & (parts >= -1e-6 * np.maximum(supplied_power, 1.0)).all(0) & (supplied_power > 0)
+    )
 
 
 #: Words of an item where the load is a shaft, which takes all that the gearboxes pass on.
@@ -65,21 +67,28 @@ def draw_power_chain(runs: Columns, names: list[str], has_ground: bool = True) -
     labels = {} if has_ground else ON_SHAFT
     supply, slope = power_sources(runs)
     total = supply + slope
-    left = np.zeros(len(names))
+    bar_starts = np.zeros(len(names))
     place = np.arange(len(names), dtype=float)
     for item, colour in ITEMS.items():
         value = np.maximum(parts[item], 0.0)
         if value.max() > 1e-6:
             axes.barh(
-                place, value, left=left, height=0.7, color=colour, label=labels.get(item, item), ec="white", lw=0.6
+                place,
+                value,
+                left=bar_starts,
+                height=0.7,
+                color=colour,
+                label=labels.get(item, item),
+                ec="white",
+                lw=0.6,
             )
-        for y, x, width in zip(place, left, value, strict=True):
+        for y, x, width in zip(place, bar_starts, value, strict=True):
             if width >= 0.04 * total.max():
                 ink = "white" if colour in _DARK else "black"
                 axes.text(x + width / 2, y, f"{width:.1f}", ha="center", va="center", fontsize=8, color=ink)
-        left = left + value
-    for y, watts, given, falls in zip(place, total, supply, slope, strict=True):
-        text = f"{given:.1f} W" + (f" + {falls:.1f} W from the slope" if falls > 1e-6 else "")
+        bar_starts = bar_starts + value
+    for y, watts, supplied_power, falls in zip(place, total, supply, slope, strict=True):
+        text = f"{supplied_power:.1f} W" + (f" + {falls:.1f} W from the slope" if falls > 1e-6 else "")
         axes.text(watts, y, f"  {text}", va="center", fontsize=8.5)
     axes.set_yticks(place, names, fontsize=8.5)
     axes.invert_yaxis()
@@ -128,19 +137,21 @@ def operating_points(robot: Robot, runs: Columns) -> Columns:
 def draw_chart_of_corners(robot: Robot, corners: Sequence[Json]) -> Figure:
     """The chart of motor and gear with operating points at corners of an envelope, on the robot's own ground."""
     keys = ("configuration", "payload_kg", "slope_deg", "state_of_charge", "supply_voltage_V")
-    whole = (corner for corner in corners if not any(isinstance(corner.get(key), list | tuple) for key in keys))
-    cells = dict.fromkeys(tuple(corner.get(key) for key in keys) for corner in whole)
+    single_corners = (
+        corner for corner in corners if not any(isinstance(corner.get(key), list | tuple) for key in keys)
+    )
+    cells = dict.fromkeys(tuple(corner.get(key) for key in keys) for corner in single_corners)
     rows = [cell for cell in cells if None not in cell[:3]]
     full = float(robot.battery.voltage_no_load(0.0))
     if not rows:
         return draw_drive_chart(robot, [full], dict.fromkeys(("torque_Nm", "motor_rpm", "motor_A"), np.zeros(0)))
     names, payload, slope, charge, volts = zip(*rows, strict=True)
     on_battery = np.array([v is None for v in volts])
-    used = float(robot.battery.capacity) * (1 - np.array([1.0 if c is None else max(c, 1e-9) for c in charge]))
+    charge_used = float(robot.battery.capacity) * (1 - np.array([1.0 if c is None else max(c, 1e-9) for c in charge]))
     supply = np.array([full if v is None else v for v in volts], float)
     conditions = Conditions(
         list(names), supply, slope_deg=np.array(slope, float), payload=np.array(payload, float),
-        battery=on_battery.astype(float), discharge=np.where(on_battery, used, 0.0),
+        battery=on_battery.astype(float), discharge=np.where(on_battery, charge_used, 0.0),
     )  # fmt: skip
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # a cut-off that rarely acts

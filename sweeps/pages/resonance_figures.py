@@ -59,11 +59,11 @@ def _largest_frequency(found: ResonanceResult) -> float:
 
 def draw_campbell_diagram(axes: Axes, found: ResonanceResult) -> None:
     """Lines n × V / S, bands of natural frequencies, and the strongest line of each run, larger for more ripple."""
-    table, what, top = found.table, found.passing, _largest_frequency(found)
+    table, parts, top = found.table, found.passing, _largest_frequency(found)
     fastest = float(np.nanmax(table["speed_mean_mm_s"]))
     place = np.inf
     for order in range(1, ORDERS + 1):
-        at_end = order * fastest * MM / what.travel
+        at_end = order * fastest * MM / parts.travel
         axes.plot([0, fastest], [0, at_end], color=FAINT, lw=0.8, zorder=1)
         inside, last = at_end <= top, place
         place = fastest if inside else fastest * 0.985 * top / at_end
@@ -96,7 +96,7 @@ def draw_campbell_diagram(axes: Axes, found: ResonanceResult) -> None:
             fontsize=8.5, color=INK,
         )  # fmt: skip
     axes.set(ylim=(0, top), ylabel="frequency [Hz]")
-    heading = f"{found.configuration}: {what.name} pass every {what.travel / MM:.4g} mm of travel; dotted: Table 8"
+    heading = f"{found.configuration}: {parts.name} pass every {parts.travel / MM:.4g} mm of travel; dotted: Table 8"
     axes.set_title(heading, pad=18)
     labels = axes.get_legend_handles_labels()[1]
     axes.legend(

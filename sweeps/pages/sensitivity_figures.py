@@ -20,8 +20,8 @@ _MAP = "Blues"
 def leading_inputs(share: np.ndarray, most: int = SHOWN) -> np.ndarray:
     """Indices of the inputs with the largest shares. Negligible inputs are left out unless all are negligible."""
     order = np.argsort(-share, kind="stable")
-    kept = [k for k in order[:most] if share[k] >= NEGLIGIBLE]
-    return np.array(kept or order[:1], int)
+    leading = [k for k in order[:most] if share[k] >= NEGLIGIBLE]
+    return np.array(leading or order[:1], int)
 
 
 def draw_input_shares(found: SensitivityResult) -> Figure:
@@ -59,22 +59,22 @@ def draw_tornado(study: OutputStudy, found: SensitivityResult) -> Figure:
     # Operating points of a tornado: of each configuration the gentlest and the hardest that it runs, or between
     points = found.points
     kinds = list(dict.fromkeys(map(str, points.configuration)))
-    each = max(PANELS // len(kinds), 1)
-    chosen: list[int] = []
+    panel_rows = max(PANELS // len(kinds), 1)
+    shown_points: list[int] = []
     for kind in kinds:
         point_rows = np.flatnonzero((points.configuration == kind) & np.isfinite(study.value) & study.studied)
         order = point_rows[
             np.lexsort((points.payload[point_rows], points.slope_deg[point_rows], points.imposed[1][point_rows]))
         ]
         if order.size:
-            chosen += [int(order[k]) for k in np.unique(np.linspace(0, order.size - 1, each).astype(int))]
-    where = chosen[:PANELS]
+            shown_points += [int(order[k]) for k in np.unique(np.linspace(0, order.size - 1, panel_rows).astype(int))]
+    panel_points = shown_points[:PANELS]
     unit, factor = study.row.unit_shown, study.row.factor
-    swing, value = study.swing[:, where] / factor, study.value[where] / factor
+    swing, value = study.swing[:, panel_points] / factor, study.value[panel_points] / factor
     reach = np.nanmax(np.abs(swing - value[:, None]), 0, initial=0.0, where=np.isfinite(swing))
     relative = (reach / np.maximum(reach.max(1, keepdims=True), 1e-300)).sum(0)
     top = [i for i in np.argsort(-relative, kind="stable")[:TALLEST] if relative[i] > 0.03]
-    fig, axes = new_figure(1, max(len(where), 1), 0.9 + 0.26 * len(top), sharey=True)
+    fig, axes = new_figure(1, max(len(panel_points), 1), 0.9 + 0.26 * len(top), sharey=True)
     for n, ax in enumerate(axes[0]):
         for place, i in enumerate(top):
             for end, colour in ((swing[0, n, i], VERMILION), (swing[1, n, i], BLUE)):
@@ -84,7 +84,7 @@ def draw_tornado(study: OutputStudy, found: SensitivityResult) -> Figure:
                     beside = np.nanmax([value[n], *swing[:, n, i]])
                     ax.text(beside, -place, " × does not travel", va="center", fontsize=7.5, color=colour)
         ax.axvline(value[n], color=INK, linewidth=0.9)
-        ax.set_title(_split_label(found.points.label(where[n])), fontsize=8.5)
+        ax.set_title(_split_label(found.points.label(panel_points[n])), fontsize=8.5)
         ax.tick_params(axis="x", labelsize=8)
         ax.locator_params(axis="x", nbins=3, steps=[1, 2, 5, 10])  # of few digits, so that they do not touch
         ax.grid(axis="y", visible=False)
@@ -216,14 +216,14 @@ def draw_convergence(found: SensitivityResult) -> Figure:
 
 def draw_next_runs(runs: NextRuns, found: SensitivityResult) -> Figure:
     """Remaining share of each input's sd after each proposed run."""
-    left = runs.sd[-1]
-    moving = [k for k in np.argsort(left, kind="stable") if left[k] < 0.99][:10]
+    remaining_sd = runs.sd[-1]
+    moving = [k for k in np.argsort(remaining_sd, kind="stable") if remaining_sd[k] < 0.99][:10]
     fig, axes = new_figure(1, 1, 0.8 + 0.28 * max(len(moving), 2))
     ax = axes[0, 0]
     for place, k in enumerate(moving):
         ax.barh(-place, 1.0, color="#e9ecef", height=0.66)
-        ax.barh(-place, left[k], color=BLUE, height=0.66)
-        ax.text(left[k] + 0.01, -place, f"{100 * left[k]:.0f} %", va="center", fontsize=8.5)
+        ax.barh(-place, remaining_sd[k], color=BLUE, height=0.66)
+        ax.text(remaining_sd[k] + 0.01, -place, f"{100 * remaining_sd[k]:.0f} %", va="center", fontsize=8.5)
     ax.set_yticks([-p for p in range(len(moving))], [short_name(found.names[k]) for k in moving])
     ax.set_xlim(0, 1.02)
     ax.set_xlabel(

@@ -124,16 +124,16 @@ def _cover_cells(cells: set[tuple[int, int]], joined: bool) -> list[tuple[int, i
     if not joined:
         return [(i, j, 1, 1) for i, j in sorted(cells)]
     blocks = []
-    left = set(cells)
-    while left:
-        i, j = min(left)
+    uncovered = set(cells)
+    while uncovered:
+        i, j = min(uncovered)
         tall = 1
-        while (i, j + tall) in left:
+        while (i, j + tall) in uncovered:
             tall += 1
         wide = 1
-        while all((i + wide, j + k) in left for k in range(tall)):
+        while all((i + wide, j + k) in uncovered for k in range(tall)):
             wide += 1
-        left -= {(i + p, j + q) for p in range(wide) for q in range(tall)}
+        uncovered -= {(i + p, j + q) for p in range(wide) for q in range(tall)}
         blocks.append((i, j, wide, tall))
     return blocks
 
@@ -177,26 +177,26 @@ def _draw_scatter(axes: Axes, runs: Columns, index: np.ndarray, channel: Channel
 
 def _draw_lines(runs: Columns, channel: Channel, kinds: list[str]) -> Figure:
     column, settles = channel.column, runs_with_number(runs, channel)
-    over = own_column = imposed_column(runs)
+    variable = own_column = imposed_column(runs)
     if on_ground(runs):
-        over = "payload_kg" if np.unique(runs["payload_kg"]).size > 1 else "slope_deg"
-        if np.unique(runs[over]).size == 1 and np.unique(runs[own_column]).size > 1:
-            over = own_column
+        variable = "payload_kg" if np.unique(runs["payload_kg"]).size > 1 else "slope_deg"
+        if np.unique(runs[variable]).size == 1 and np.unique(runs[own_column]).size > 1:
+            variable = own_column
     label = {
         "payload_kg": "payload [kg]", "slope_deg": "slope [°]", "supply_voltage_V": "supply voltage [V]",
         "motor_speed_rpm": "motor speed [rpm]",
-    }[over]  # fmt: skip
+    }[variable]  # fmt: skip
     fig, grid = new_figure(1, len(kinds), 3.2, sharey=True)
     for axes, kind in zip(grid[0], kinds, strict=True):
         of_kind = runs["configuration"] == kind
-        volts = [("", of_kind)] if over == own_column else panels_by_imposed(runs[own_column], own_column)
+        volts = [("", of_kind)] if variable == own_column else panels_by_imposed(runs[own_column], own_column)
         for k, (volt, mask) in enumerate(volts):
             pick = np.nonzero(of_kind & mask)[0]
-            pick = pick[np.argsort(runs[over][pick], kind="stable")]
+            pick = pick[np.argsort(runs[variable][pick], kind="stable")]
             shade = colormaps["viridis"](0.15 + 0.7 * k / max(1, len(volts) - 1))
             line = np.where(settles[pick], runs[column][pick], np.nan)
             axes.plot(
-                runs[over][pick],
+                runs[variable][pick],
                 line,
                 "o-" if pick.size <= 60 else "-",
                 ms=4,
@@ -207,7 +207,7 @@ def _draw_lines(runs: Columns, channel: Channel, kinds: list[str]) -> Figure:
             for status in np.unique(runs["status"][gone]):
                 rows_of_status = gone[runs["status"][gone] == status]
                 axes.plot(
-                    runs[over][rows_of_status],
+                    runs[variable][rows_of_status],
                     np.full(rows_of_status.size, 0.03 + 0.05 * k),
                     "x",
                     color=shade,
@@ -218,7 +218,7 @@ def _draw_lines(runs: Columns, channel: Channel, kinds: list[str]) -> Figure:
                 )
                 axes.annotate(
                     words.short_status(str(status)),
-                    (runs[over][rows_of_status[0]], 0.03 + 0.05 * k),
+                    (runs[variable][rows_of_status[0]], 0.03 + 0.05 * k),
                     xycoords=axes.get_xaxis_transform(),
                     xytext=(6, 4),
                     textcoords="offset points",

@@ -111,13 +111,13 @@ class TimeOverlay:
         groups = max(1, most // (2 * len(self.channels)))
         if len(rows) <= most:
             return rows
-        kept = {0, len(rows) - 1}
+        kept_rows = {0, len(rows) - 1}
         for part in np.array_split(np.arange(len(rows)), groups):
             for channel in self.channels:
                 readings = self.table[channel.column][rows[part]]
                 if np.isfinite(readings).any():
-                    kept |= {int(part[np.nanargmin(readings)]), int(part[np.nanargmax(readings)])}
-        return rows[np.array(sorted(kept))]
+                    kept_rows |= {int(part[np.nanargmin(readings)]), int(part[np.nanargmax(readings)])}
+        return rows[np.array(sorted(kept_rows))]
 
 
 def _numbers(values: np.ndarray) -> list[float | None]:

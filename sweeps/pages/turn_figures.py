@@ -25,10 +25,10 @@ def _draw_outline(axes: Axes, robot: Robot, row: Json, x: float, y: float, yaw: 
     """The robot from above: its contact lines, a bar between them and an arrow pointing ahead."""
     length = float(robot.running_gear.wheelbase)
     width = float(robot.configurations[str(row["configuration"])].turning.width)
-    ahead, left = np.array([np.cos(yaw), np.sin(yaw)]), np.array([-np.sin(yaw), np.cos(yaw)])
+    ahead, sideways = np.array([np.cos(yaw), np.sin(yaw)]), np.array([-np.sin(yaw), np.cos(yaw)])
     middle = np.array([x, y])
     for side in (0.5, -0.5):
-        ends = [middle + side * width * left + s * length * ahead for s in (0.5, -0.5)]
+        ends = [middle + side * width * sideways + s * length * ahead for s in (0.5, -0.5)]
         axes.plot([-e[1] for e in ends], [e[0] for e in ends], color=color, lw=3.5, solid_capstyle="round")
     tip = middle + 0.5 * length * ahead
     axes.annotate("", (-tip[1], tip[0]), (-y, x), arrowprops={"arrowstyle": "-|>", "color": color})
@@ -57,10 +57,10 @@ def draw_turn_circle(robot: Robot, row: Json) -> Figure:
         axes.annotate("centre of rotation", (-center[1], center[0]), xytext=(8, 6), textcoords="offset points",
                       color=INK, fontsize=9)  # fmt: skip
     times = np.linspace(0.0, time if np.isfinite(time) else 0.0, 200)
-    turned = rate * times
+    yaw_angles = rate * times
     if abs(rate) > 1e-9:
-        x = (velocity[0] * np.sin(turned) - velocity[1] * (1 - np.cos(turned))) / rate
-        y = (velocity[0] * (1 - np.cos(turned)) + velocity[1] * np.sin(turned)) / rate
+        x = (velocity[0] * np.sin(yaw_angles) - velocity[1] * (1 - np.cos(yaw_angles))) / rate
+        y = (velocity[0] * (1 - np.cos(yaw_angles)) + velocity[1] * np.sin(yaw_angles)) / rate
     else:
         x, y = velocity[0] * times, velocity[1] * times
     axes.plot(-y, x, color=BLUE)
@@ -78,14 +78,14 @@ def path_arcs(
         x, y: places [m].
         yaw: there, counted on over a turn [rad], shape (rows,).
     """
-    place, turned = x + 1j * y, np.diff(yaw)
-    pieces = np.ceil(np.abs(turned) / BEND).clip(1, 100).astype(int)
+    place, yaw_changes = x + 1j * y, np.diff(yaw)
+    pieces = np.ceil(np.abs(yaw_changes) / BEND).clip(1, 100).astype(int)
     k = np.repeat(np.arange(len(pieces)), pieces)
     share = (np.arange(len(k)) - np.repeat(np.cumsum(pieces) - pieces, pieces)) / pieces[k]
-    bent = np.where(pieces[k] > 1, turned[k], BEND)  # else share is 0 and any will do
+    bent = np.where(pieces[k] > 1, yaw_changes[k], BEND)  # else share is 0 and any will do
     between = place[k] + np.diff(place)[k] * np.expm1(1j * share * bent) / np.expm1(1j * bent)
-    whole = np.append(between, place[-1])
-    return whole.real, whole.imag
+    path_points = np.append(between, place[-1])
+    return path_points.real, path_points.imag
 
 
 def draw_path(robot: Robot, row: Json, x: np.ndarray, y: np.ndarray, yaw: np.ndarray) -> Figure:

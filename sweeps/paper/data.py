@@ -126,8 +126,8 @@ def simulate_measured_rows(robot: Robot) -> PaperRows | None:
     ratio = {}
     for c in paper_configurations(robot):
         largest = float(np.max(np.abs(plain["adhesion_used"][kind == c])))
-        listed = adhesion_ratio(RAISED_SURFACE, c == TRACKED)
-        ratio[c] = max(listed, RAISED_MARGIN * largest) if largest > 1 else 1.0
+        surface_ratio = adhesion_ratio(RAISED_SURFACE, c == TRACKED)
+        ratio[c] = max(surface_ratio, RAISED_MARGIN * largest) if largest > 1 else 1.0
     adhesion = np.array([ratio[c] for c in kind])
     raised = operating_points(robot, batch_conditions(robot, total_mass=mass, adhesion=adhesion, **request))
     weighed = operating_points(robot, batch_conditions(robot, adhesion=adhesion, **request))
@@ -145,8 +145,8 @@ def raised_adhesion_words(robot: Robot, ratio: dict[str, float]) -> str:
         if raised == 1.0:
             parts.append(f"{c} unchanged at {own_friction:.2f}")
             continue
-        listed = surface.tracked_x if c == TRACKED else surface.wheeled_x
-        table = " (Table 5, smooth concrete floor)" if abs(own_friction * raised - listed) < 1e-6 else ""
+        table_value = surface.tracked_x if c == TRACKED else surface.wheeled_x
+        table = " (Table 5, smooth concrete floor)" if abs(own_friction * raised - table_value) < 1e-6 else ""
         parts.append(f"{c} from {own_friction:.2f} to {own_friction * raised:.2f}{table}")
     return "; ".join(parts)
 
@@ -249,20 +249,20 @@ def starts_of(robot: Robot, history: Any, status: Any) -> list[StartRun]:
 
 def current_over_slope(robot: Robot, ratio: dict[str, float], slopes: np.ndarray) -> dict[tuple[str, int], Any]:
     """Current [A] over slope for the loading modes: (configuration, mode) → (own adhesion, raised)."""
-    asked = [(c, mode, r) for c in ratio for mode in MODES for r in (1.0, ratio[c])]
+    cases = [(c, mode, r) for c in ratio for mode in MODES for r in (1.0, ratio[c])]
     kind, voltage, payload, adhesion = (
-        np.repeat(np.array(v), len(slopes)) for v in zip(*((c, *MODES[mode], r) for c, mode, r in asked), strict=True)
+        np.repeat(np.array(v), len(slopes)) for v in zip(*((c, *MODES[mode], r) for c, mode, r in cases), strict=True)
     )
     conditions = batch_conditions(
         robot,
         kind,
         voltage=voltage.astype(float),
         payload=payload.astype(float),
-        slope_deg=np.tile(slopes, len(asked)),
+        slope_deg=np.tile(slopes, len(cases)),
         adhesion=adhesion.astype(float),
     )
-    current = operating_points(robot, conditions)["total_current_A"].reshape(len(asked), len(slopes))
-    return {(c, mode): (current[2 * k], current[2 * k + 1]) for k, (c, mode, _) in enumerate(asked[::2])}
+    current = operating_points(robot, conditions)["total_current_A"].reshape(len(cases), len(slopes))
+    return {(c, mode): (current[2 * k], current[2 * k + 1]) for k, (c, mode, _) in enumerate(cases[::2])}
 
 
 def rows_of_mode(rows: PaperRows, kind: str, mode: int) -> np.ndarray:
@@ -385,8 +385,8 @@ def energy_use(robot: Robot, ratio: dict[str, float]) -> EnergyUse:
     Args:
         ratio: factor by which adhesion is raised where the robot would slide, by configuration.
     """
-    asked = [(c, u, p, s) for c in ratio for u, p in ((15.0, 0.0), (33.0, 8.0)) for s in (0.0, 10.0, 20.0)]
-    kind, voltage, payload, slope = (np.array(v) for v in zip(*asked, strict=True))
+    cases = [(c, u, p, s) for c in ratio for u, p in ((15.0, 0.0), (33.0, 8.0)) for s in (0.0, 10.0, 20.0)]
+    kind, voltage, payload, slope = (np.array(v) for v in zip(*cases, strict=True))
 
     def at(adhesion: np.ndarray) -> tuple[Columns, Columns]:
         conditions = batch_conditions(
@@ -394,11 +394,11 @@ def energy_use(robot: Robot, ratio: dict[str, float]) -> EnergyUse:
         )
         return energy_split(robot, conditions)
 
-    slides = at(np.ones(len(asked)))[0]["status"] == "slides"
+    slides = at(np.ones(len(cases)))[0]["status"] == "slides"
     points, power = at(np.where(slides, [ratio[k] for k in kind], 1.0))
     labels = [
         f"{c}  {u:.0f} V  {p:.0f} kg  {s:.0f}°" + " *" * bool(slid)
-        for (c, u, p, s), slid in zip(asked, slides, strict=True)
+        for (c, u, p, s), slid in zip(cases, slides, strict=True)
     ]
     return EnergyUse(labels, power, points["power_supply_W"], points["status"])
 

@@ -50,13 +50,13 @@ def simulate_gear_runs(robot: Robot) -> Any:
 def gear_blocks(robot: Robot) -> Iterator[Block]:
     """Figures and the table of ripple. If a run does not get under way, the statuses of all and no figures."""
     run, names = simulate_gear_runs(robot), data.shown_configurations(robot)
-    which = [robot.configurations.index(c) for c in names]
+    configuration_indices = [robot.configurations.index(c) for c in names]
     status, share = np.asarray(run.result.status), np.asarray(run.steady.guide_share)
-    gears = gear_figures.gear_runs(robot, run, status, share, which, names)
+    gears = gear_figures.gear_runs(robot, run, status, share, configuration_indices, names)
     yield catalogue.note("paper.gear")
     if not all(gear.rolls for gear in gears):
-        ended = ", ".join(f"{g.name}: {words.short_status(g.status)}" for g in gears)
-        yield catalogue.note("paper.gear-left-out", ended)
+        status_words = ", ".join(f"{g.name}: {words.short_status(g.status)}" for g in gears)
+        yield catalogue.note("paper.gear-left-out", status_words)
         return
     starts = data.starts_of(robot, run, run.result.status)
     yield catalogue.figure("paper.track_fig23_24_from_standstill", starts, data.FIG_23, data.FIG_24)
@@ -88,8 +88,8 @@ def paper_document(file: RobotFile, gear: bool) -> tuple[Document, data.PaperRow
     robot, name = file.robot, capabilities.displayed_name(file)
     name = file.name if name == words.displayed_robot_name(file.name) else name
     robots = {name: robot} | {n: make() for n, make in ROBOTS.items() if n != name}
-    every = {n: data.simulate_measured_rows(member) for n, member in robots.items()}
-    rows = {n: of_robot for n, of_robot in every.items() if of_robot is not None}
+    runs_by_robot = {n: data.simulate_measured_rows(member) for n, member in robots.items()}
+    rows = {n: of_robot for n, of_robot in runs_by_robot.items() if of_robot is not None}
     own_rows = rows.get(name)
     blocks: list[Block] = [catalogue.note("paper.lead", capabilities.displayed_name(file))]
     answer = catalogue.text("paper.alone")
@@ -115,10 +115,10 @@ def paper_document(file: RobotFile, gear: bool) -> tuple[Document, data.PaperRow
         if gear:
             yield Section("Inside the running gear", tuple(gear_blocks(robot)), "gear")
         ratio = dict.fromkeys(data.shown_configurations(robot), 1.0) if own_rows is None else own_rows.ratio
-        used = data.energy_use(robot, ratio)
-        yield Section("Where the energy goes", (catalogue.figure("paper.energy_split", used),), "energy")
-        watts = np.stack([used.total, *(used.power[item] for item in data.SPLIT)], 1)
-        watt_rows = [(label, *row) for label, row in zip(used.labels, watts, strict=True)]
+        energy_rows = data.energy_use(robot, ratio)
+        yield Section("Where the energy goes", (catalogue.figure("paper.energy_split", energy_rows),), "energy")
+        watts = np.stack([energy_rows.total, *(energy_rows.power[item] for item in data.SPLIT)], 1)
+        watt_rows = [(label, *row) for label, row in zip(energy_rows.labels, watts, strict=True)]
         columns = (Column(item, form="{:.1f}") for item in data.SPLIT)
         yield Section("", (catalogue.table("paper.watts", watt_rows, *columns),), folded="The same in watts")
         figures = (
@@ -150,14 +150,14 @@ def error_answer(every: list[Json]) -> str:
     """Sentence on the rms errors (35) over all rows, from `variant_errors`: the robot's and the paper's."""
     own, _, raised, *_, paper = (e for e in every if e["group"] == "all")
     labels = [c.label for c in data.channels_of_paper()]
-    mine, theirs = (
+    own_error, paper_error = (
         ", ".join(f"{c['rms_percent']:.1f} % {label}" for c, label in zip(e["cells"], labels, strict=True))
         for e in (raised, paper)
     )
     few = f", with adhesion raised ({own['rows']} rows settle without that)" if own["rows"] < own["of"] else ""
     return (
-        f"rms error against {raised['rows']} of {raised['of']} measured rows: {mine}{few}. "
-        f"The paper's own simulation: {theirs}."
+        f"rms error against {raised['rows']} of {raised['of']} measured rows: {own_error}{few}. "
+        f"The paper's own simulation: {paper_error}."
     )
 
 
@@ -176,14 +176,14 @@ def _error_table(errors: list[Json]) -> Block:
 def _sliding(robot: Robot, rows: data.PaperRows) -> Iterator[Block]:
     """Note on the rows that have no operating point on the robot's own adhesion, if there are any."""
     slides, table = rows.plain["status"] != "converged", rows.conditions
-    each = [
+    sentences = [
         f"{table['configuration'][k]} {table['supply_voltage_V'][k]:.0f} V {table['slope_deg'][k]:.0f}° "
         f"{words.short_status(str(rows.plain['status'][k]))}"
         for k in np.flatnonzero(slides)
     ]
-    if each:
+    if sentences:
         raised = data.raised_adhesion_words(robot, rows.ratio)
-        yield catalogue.note("paper.sliding", len(each), len(table), ", ".join(each), raised)
+        yield catalogue.note("paper.sliding", len(sentences), len(table), ", ".join(sentences), raised)
 
 
 def _against_the_bench(robots: dict[str, Robot], rows: dict[str, data.PaperRows], name: str) -> Section:

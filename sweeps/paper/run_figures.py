@@ -142,14 +142,16 @@ def draw_energy(used: data.EnergyUse) -> Figure:
     fig, grid = new_figure(1, 1, 5.2)
     axes = grid[0, 0]
     height = [float(k) + 0.6 * (k // 3) for k in range(len(used.labels))]
-    left = np.zeros(len(used.labels))
+    bar_starts = np.zeros(len(used.labels))
     for item in (*data.SPLIT, "other"):
         share = 100 * used.power[item] / used.total
         share = np.where(np.isfinite(share), share, 0.0)
         if np.abs(share).max() < 0.05:  # not to be seen, and in no legend
             continue
-        axes.barh(height, share, left=left, height=0.82, color=_SPLIT_COLOURS[item], label=item, ec="white", lw=0.6)
-        for y, x, width in zip(height, left, share, strict=True):
+        axes.barh(
+            height, share, left=bar_starts, height=0.82, color=_SPLIT_COLOURS[item], label=item, ec="white", lw=0.6
+        )
+        for y, x, width in zip(height, bar_starts, share, strict=True):
             if width >= 4:
                 dark = item in ("winding", "track and guides", "slip", "gearbox", "lift")
                 axes.text(
@@ -161,7 +163,7 @@ def draw_energy(used: data.EnergyUse) -> Figure:
                     fontsize=8,
                     color="white" if dark else INK,
                 )
-        left = left + share
+        bar_starts = bar_starts + share
     for y, total, status in zip(height, used.total, used.status, strict=True):
         alive = np.isfinite(total)
         text = f"{total:.0f} W" if alive else words.short_status(str(status))
@@ -181,7 +183,7 @@ def row_parity(rows: data.PaperRows, name: str) -> Figure:
     fig, grid = new_figure(1, len(channels_shown), 3.7)
     kind = rows.conditions["configuration"]
     raised, weighed = data.stack_channels(rows.raised), data.stack_channels(rows.weighed)
-    moved = (kind == WHEELED) & (np.abs(rows.raised["total_mass_kg"] - rows.weighed["total_mass_kg"]) > 0.05)
+    has_other_mass = (kind == WHEELED) & (np.abs(rows.raised["total_mass_kg"] - rows.weighed["total_mass_kg"]) > 0.05)
     slides = rows.plain["status"] == "slides"
     for k, (axes, channel) in enumerate(zip(grid[0], channels_shown, strict=True)):
         measured = rows.measured[:, k]
@@ -203,10 +205,10 @@ def row_parity(rows: data.PaperRows, name: str) -> Figure:
                     ls="",
                     label=label if pick.any() else None,
                 )
-        if moved.any():
+        if has_other_mass.any():
             axes.plot(
-                measured[moved],
-                weighed[moved, k],
+                measured[has_other_mass],
+                weighed[has_other_mass, k],
                 "+",
                 color=INK,
                 ms=8,

@@ -75,8 +75,8 @@ class SweepPlan:
         """The conditions that do not vary, of shape ()."""
         from mmrjax.model.conditions import Conditions
 
-        which = int(self.conditions.get(CONFIGURATION, 0))
-        return Conditions(which, **{k: v for k, v in self.conditions.items() if k != CONFIGURATION})
+        configuration_index = int(self.conditions.get(CONFIGURATION, 0))
+        return Conditions(configuration_index, **{k: v for k, v in self.conditions.items() if k != CONFIGURATION})
 
 
 def plan_design(config: Campaign, robot: Robot, where: str) -> SweepPlan:
@@ -93,8 +93,8 @@ def plan_design(config: Campaign, robot: Robot, where: str) -> SweepPlan:
     task = task_of(config, robot)
     extra = task.axes
     axes = {
-        name: _axis_values(name, stated, robot, f"{where}, axes.{name}", extra)
-        for name, stated in config.axes.items()
+        name: _axis_values(name, axis_text, robot, f"{where}, axes.{name}", extra)
+        for name, axis_text in config.axes.items()
     }
     samples = _sampled_design(config.samples, robot, f"{where}, samples", data)
     if not axes and samples is None:
@@ -111,8 +111,8 @@ def plan_design(config: Campaign, robot: Robot, where: str) -> SweepPlan:
             "or battery"
         )
     _check_acting_conditions({*fixed, *design.names}, robot, where, surface)
-    which = np.atleast_1d(axes.get(CONFIGURATION, fixed.get(CONFIGURATION, 0.0)))
-    simulated = [robot.configurations.names[int(k)] for k in which]
+    configuration_indices = np.atleast_1d(axes.get(CONFIGURATION, fixed.get(CONFIGURATION, 0.0)))
+    simulated = [robot.configurations.names[int(k)] for k in configuration_indices]
     imposed.check_turning(robot, {*fixed, *design.names}, simulated, where)
     if levers := sorted({*fixed, *design.names} & {*LEVERS}):
         for name in simulated:
@@ -283,10 +283,10 @@ def _sampled_design(stated: Json, robot: Robot, where: str, data: list[str]) -> 
     seed = stated.get("seed", 0)
     if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed < 2**32:
         raise BadConfiguration(f"{where}.seed: got {seed!r}; expected a whole number from 0 to {2**32 - 1}")
-    over = stated.get("over", {})
-    if not isinstance(over, dict):
-        raise BadConfiguration(f"{where}.over: got {over!r}; expected a table of names and distributions")
-    marginals = {name: _quantile(name, d, robot, f"{where}.over.{name}") for name, d in over.items()}
+    overrides = stated.get("over", {})
+    if not isinstance(overrides, dict):
+        raise BadConfiguration(f"{where}.over: got {overrides!r}; expected a table of names and distributions")
+    marginals = {name: _quantile(name, d, robot, f"{where}.over.{name}") for name, d in overrides.items()}
     joint = None
     if "posterior" in stated:
         joint = _posterior(stated["posterior"], robot, f"{where}.posterior", data)

@@ -176,8 +176,8 @@ def compute_climbs(
 
 
 def _lever_sequences(obstacle: Obstacle, robot: Robot, conditions: Conditions, points: int) -> LeverSequence:
-    each = 0 if jnp.ndim(robot.sides) else None
-    angles = jax.vmap(lambda r, c: masses.lever_angles(r.running_gear, c), in_axes=(each, 0))(robot, conditions)
+    batch_axis = 0 if jnp.ndim(robot.sides) else None
+    angles = jax.vmap(lambda r, c: masses.lever_angles(r.running_gear, c), in_axes=(batch_axis, 0))(robot, conditions)
     front, rear = (jnp.broadcast_to(x, (points,)) for x in angles)
     sequences = jax.vmap(constant_angles)(front, rear)
     if obstacle.sequence is not None:
@@ -218,19 +218,19 @@ def _search_all(
     size."""
     low, high = SOUGHT[obstacle.kind]
     rounds = 1 + int(np.ceil(np.log2((high - low) / NEAR)))
-    over, beyond, verdict, sizes = (
+    climbed, beyond, verdict, sizes = (
         np.zeros(points),
         np.full(points, high),
         np.full(points, OVER),
         np.full(points, low),
     )
     for k in range(rounds):
-        ended = run(sizes, functools.partial(_report_share, told, k, rounds)).verdict
-        gone = ended == OVER
-        over, beyond = np.where(gone, sizes, over), np.where(gone, beyond, sizes)
-        verdict = np.where(gone, verdict, ended)
-        sizes = (np.maximum(over, low) + beyond) / 2
-    return {VERDICT: verdict, LARGEST: over}
+        verdicts = run(sizes, functools.partial(_report_share, told, k, rounds)).verdict
+        gone = verdicts == OVER
+        climbed, beyond = np.where(gone, sizes, climbed), np.where(gone, beyond, sizes)
+        verdict = np.where(gone, verdict, verdicts)
+        sizes = (np.maximum(climbed, low) + beyond) / 2
+    return {VERDICT: verdict, LARGEST: climbed}
 
 
 def _report_share(told: Callable[[float], None], k: int, rounds: int, share: float) -> None:

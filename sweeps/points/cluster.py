@@ -63,7 +63,7 @@ class Pool:
 
         from sweeps.points.scale import Piece
 
-        work, left = _pack_job(job), iter(chunks)
+        work, chunks_left = _pack_job(job), iter(chunks)
         name = hashlib.sha256(work).hexdigest()[:16]
         expected = {**program_identity(), "device": {"device": self.device}}
         tried: dict[int, int] = {}
@@ -79,7 +79,7 @@ class Pool:
         def fill() -> None:
             """Submit enough work for the present workers. Some may have joined later."""
             room = max(self._workers(), 1) * (1 + AHEAD) - len(numbers)
-            for chunk in itertools.islice(left, max(room, 0)):
+            for chunk in itertools.islice(chunks_left, max(room, 0)):
                 under_way.add(submit(chunk))
 
         under_way = as_completed(loop=self.client.loop)
@@ -188,9 +188,9 @@ def connect_workers(address: str) -> Pool:
                 f"--scheduler: {address} has no workers; start one for each device: `dask worker {address} "
                 "--nthreads 1`"
             ) from None
-        here, kinds = program_identity(), set()
+        own_identity, kinds = program_identity(), set()
         for worker, (host, device) in client.run(introduce_worker).items():
-            differ = identity_differences(here, host)
+            differ = identity_differences(own_identity, host)
             if differ:
                 raise BadConfiguration(f"--scheduler: {worker} runs different software; it differs in {differ}")
             kinds.add(device)

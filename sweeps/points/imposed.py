@@ -148,8 +148,10 @@ def check_battery(robot: Robot) -> None:
         BadConfiguration: its speed is imposed, or its file states no battery.
     """
     if robot.rig.imposed != "voltage":
-        what = SAID[robot.rig.imposed].words
-        raise BadConfiguration(f"--battery: the {what} is imposed on this robot, whatever the supply; remove it")
+        imposed_words = SAID[robot.rig.imposed].words
+        raise BadConfiguration(
+            f"--battery: the {imposed_words} is imposed on this robot, whatever the supply; remove it"
+        )
     if not capabilities.has_battery(robot):
         raise BadConfiguration("--battery: the robot's file has no battery; add [battery], or give --voltage")
 

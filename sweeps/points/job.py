@@ -45,9 +45,9 @@ def prepare_job(config: Campaign, robot: Robot, plan: axes.SweepPlan, where: str
     repeated = [name for k, name in enumerate(config.outputs) if name in config.outputs[:k]]
     if repeated:
         raise BadConfiguration(f"{where}, outputs: got {repeated[0]} twice; expected each once")
-    taken = [name for name in config.outputs if name in plan.design.names]
-    if taken:
-        raise BadConfiguration(f"{where}, outputs: got {taken[0]}, which is varied; expected outputs of a run")
+    name_clashes = [name for name in config.outputs if name in plan.design.names]
+    if name_clashes:
+        raise BadConfiguration(f"{where}, outputs: got {name_clashes[0]}, which is varied; expected outputs of a run")
     task = task_of(config, robot, profile is not None and profile.turns)
     if unknown := [name for name in config.outputs if name not in task.attributes]:
         raise BadConfiguration(f"{where}, outputs: got {unknown[0]}; {allowed_words(unknown[0], task.attributes, 3)}")

@@ -126,7 +126,7 @@ def compute_chunks(
     chunks = range(len(job.blocks))
     files = [f"{name}-{k:06d}" for k in chunks]
     stored = {} if folder is None else {k: part for k in chunks if (part := folder.chunk(files[k])) is not None}
-    left, times = [k for k in chunks if k not in stored], scale.Times()
+    chunks_left, times = [k for k in chunks if k not in stored], scale.Times()
     advance(sum(map(job.blocks.count, stored)))
 
     def keep(chunk: int, arrays: Table, _: Any) -> None:
@@ -134,10 +134,12 @@ def compute_chunks(
         if folder is not None:
             folder.keep_chunk(files[chunk], stored[chunk])
 
-    if left:
-        scale.write_chunks(keep, job, scale.produce_chunks(scale.Compiled(job), left, times, advance), advance, times)
-    every = [stored.pop(k) for k in chunks]
-    return {column: np.concatenate([part.pop(column) for part in every]) for column in tuple(every[0])}
+    if chunks_left:
+        scale.write_chunks(
+            keep, job, scale.produce_chunks(scale.Compiled(job), chunks_left, times, advance), advance, times
+        )
+    results = [stored.pop(k) for k in chunks]
+    return {column: np.concatenate([part.pop(column) for part in results]) for column in tuple(results[0])}
 
 
 def job_of(robot: Robot, runs: Runs, config: FidelityPart, samples: DrawnSamples | None = None) -> Job:
@@ -149,11 +151,11 @@ def job_of(robot: Robot, runs: Runs, config: FidelityPart, samples: DrawnSamples
     rows = conditions_of_runs(robot, runs, config)
     check_runs_bearable(robot, rows, config)
     plan = SweepPlan.of_rows(jax.tree.map(np.asarray, rows), samples)
-    wanted = (*outputs.output_names(robot.channels), FLAGS_CODE, *fidelities.get_fidelity(config.model).columns)
+    output_names = (*outputs.output_names(robot.channels), FLAGS_CODE, *fidelities.get_fidelity(config.model).columns)
     task = run_task(config.model, config.options, robot)
     chunk = getattr(config, "chunk", None) or scale.default_chunk(task)
     blocks = Blocks.of(plan.design.shape, chunk)
-    return Job(robot, task, plan, wanted, "float64", blocks)
+    return Job(robot, task, plan, output_names, "float64", blocks)
 
 
 def evaluate_runs(

@@ -87,8 +87,8 @@ class Samples:
 
         joint = 0 if self.joint is None else len(self.joint)
         begin = first - first % TOGETHER
-        whole = first + count + -(first + count) % TOGETHER - begin
-        unit = DESIGNS[self.design](self.seed, self.number, len(self.marginals) + joint, begin, whole)
+        padded_count = first + count + -(first + count) % TOGETHER - begin
+        unit = DESIGNS[self.design](self.seed, self.number, len(self.marginals) + joint, begin, padded_count)
         rows = [quantile(u) for quantile, u in zip(self.marginals.values(), unit, strict=False)]
         if self.joint is not None:
             rows.extend(in_blocks(self.joint.values, ndtri(unit[len(self.marginals) :]).T).T)
@@ -296,17 +296,17 @@ def keyed_permutation(key: int, number: int, points: UInt64[np.ndarray, " points
     answer = np.array(points)
     for first in range(0, len(answer), CACHED):
         block = answer[first : first + CACHED]
-        left, scratch = np.arange(len(block)), np.empty((2, len(block)), np.uint64)
-        while len(left):
-            high, low = np.divmod(block[left], np.uint64(b))
-            x, y = scratch[:, : len(left)]
+        unplaced, scratch = np.arange(len(block)), np.empty((2, len(block)), np.uint64)
+        while len(unplaced):
+            high, low = np.divmod(block[unplaced], np.uint64(b))
+            x, y = scratch[:, : len(unplaced)]
             for k in range(0, ROUNDS, 2):
                 _add_modulo(high, _mix_words(low, keys[k], x, y), np.uint64(a), y)
                 _add_modulo(low, _mix_words(high, keys[k + 1], x, y), np.uint64(b), y)
             high *= np.uint64(b)
             high += low
-            block[left] = high
-            left = left[high >= number]
+            block[unplaced] = high
+            unplaced = unplaced[high >= number]
     return answer
 
 

@@ -103,10 +103,10 @@ class Compiled:
         devices = jax.local_devices() if devices is None else devices
         self.mesh = Mesh(np.array(devices), (POINTS,))
         # Every device has the same number of points; the last ones stand for the chunk's last point again.
-        each = -(-job.blocks.points // len(devices))
-        each = each if job.task.run is not None else fidelities.fidelity_facts(job.task.model).filled(each)
-        each = each if each < SHARED else -(-each // SHARED) * SHARED
-        self.size = each * len(devices)
+        share = -(-job.blocks.points // len(devices))
+        share = share if job.task.run is not None else fidelities.fidelity_facts(job.task.model).filled(share)
+        share = share if share < SHARED else -(-share // SHARED) * SHARED
+        self.size = share * len(devices)
         everywhere = NamedSharding(self.mesh, PartitionSpec())
         tree = (job.plan.varied(job.robot), job.plan.fixed())
         arrays, rest = eqx.partition(tree, eqx.is_array)
@@ -119,8 +119,8 @@ class Compiled:
             job.storage, surface,
         )  # fmt: skip
         # What takes long in one call is run in parts, between which it says how far it is and can be interrupted.
-        whole = len(devices) > 1 or self._variation.varies_robot
-        self.in_parts = job.task.slow and (job.task.run is not None or not whole)
+        is_split = len(devices) > 1 or self._variation.varies_robot
+        self.in_parts = job.task.slow and (job.task.run is not None or not is_split)
         self._program = _one_device_kept if len(devices) == 1 else eqx.filter_jit(_split_among(self.mesh))
 
     def points(self, chunk: int) -> Float[np.ndarray, "points names"]:
@@ -140,8 +140,8 @@ class Compiled:
         """
         conditions, rows = self._fixed, self.job.plan.rows
         if rows is not None:
-            which, values = values[:, 0].astype(int), values[:, 1:]
-            conditions = jax.tree.map(lambda x: jax.device_put(np.asarray(x)[which], self._split), rows)
+            configuration_index, values = values[:, 0].astype(int), values[:, 1:]
+            conditions = jax.tree.map(lambda x: jax.device_put(np.asarray(x)[configuration_index], self._split), rows)
         names = [name for name in self.job.plan.design.names if name != ROW]
         own_places = [k for k, name in enumerate(names) if name in self.job.task.axes]
         placed = jax.device_put(np.delete(values, own_places, axis=1) if own_places else values, self._split)
@@ -208,8 +208,8 @@ _one_device_kept = compiled(_one_device)
 def _stored(found: Mapping[str, Array], asked: _AskedOutputs) -> dict[str, Array]:
     """Outputs in the units of tables and in the stored type. Those in `KINDS` keep their own type."""
     stored = {n: (found[n] / factor).astype(asked.storage) for n, factor in asked.factors if n not in KINDS}
-    named = (*(n for n, _ in asked.factors if n in KINDS), STATUS)
-    return {**stored, **{n: found[n].astype(KINDS[n]) for n in named}}
+    unconverted_names = (*(n for n, _ in asked.factors if n in KINDS), STATUS)
+    return {**stored, **{n: found[n].astype(KINDS[n]) for n in unconverted_names}}
 
 
 def _split_among(mesh: Mesh) -> Callable[..., dict[str, Array]]:
@@ -219,7 +219,7 @@ def _split_among(mesh: Mesh) -> Callable[..., dict[str, Array]]:
         variation: Variation, conditions: Conditions, values: Array, asked: _AskedOutputs, profile: Profile | None
     ) -> dict[str, Array]:
         arrays, rest = eqx.partition((variation, profile), eqx.is_array)
-        each = PartitionSpec(POINTS) if conditions.shape else PartitionSpec()
+        sharding = PartitionSpec(POINTS) if conditions.shape else PartitionSpec()
 
         def part(arrays: Any, conditions: Conditions, values: Array) -> dict[str, Array]:
             variation, profile = eqx.combine(arrays, rest)
@@ -227,9 +227,12 @@ def _split_among(mesh: Mesh) -> Callable[..., dict[str, Array]]:
 
         # Each device searches its own roots and steps its own runs: none waits for another inside a loop.
         split = jax.shard_map(
-            part, mesh=mesh, in_specs=(PartitionSpec(), each, PartitionSpec(POINTS)), out_specs=PartitionSpec(POINTS),
+            part,
+            mesh=mesh,
+            in_specs=(PartitionSpec(), sharding, PartitionSpec(POINTS)),
+            out_specs=PartitionSpec(POINTS),
             check_vma=False,
-        )  # fmt: skip
+        )
         return split(arrays, conditions, values)
 
     return program
@@ -334,21 +337,21 @@ def write_chunks(keep: Keep, job: Job, chunks: Produced, advance: Advance, times
     """
     waiting: queue.Queue[Piece | None] = queue.Queue(WAITING)
     stop, failures = threading.Event(), list[BaseException]()
-    begun = time.perf_counter()
+    start_time = time.perf_counter()
 
     def write(piece: Piece) -> None:
-        whole = all(x.is_ready() for x in piece.arrays.values() if isinstance(x, jax.Array))  # type: ignore[attr-defined]
-        if stop.is_set() and not whole:
+        is_ready = all(x.is_ready() for x in piece.arrays.values() if isinstance(x, jax.Array))  # type: ignore[attr-defined]
+        if stop.is_set() and not is_ready:
             return
         start = time.perf_counter()
         jax.block_until_ready(list(piece.arrays.values()))
         computed = time.perf_counter()
         count = job.blocks.count(piece.chunk)
-        here = fetch_values(piece.arrays, count)
+        host_values = fetch_values(piece.arrays, count)
         transferred = time.perf_counter()
-        if stop.is_set() and not whole:  # interrupted while it was computed
+        if stop.is_set() and not is_ready:  # interrupted while it was computed
             return
-        keep(piece.chunk, here, drawn_samples(job, piece))
+        keep(piece.chunk, host_values, drawn_samples(job, piece))
         times.compute += computed - start
         times.transfer += transferred - computed
         times.write += time.perf_counter() - transferred
@@ -379,6 +382,6 @@ def write_chunks(keep: Keep, job: Job, chunks: Produced, advance: Advance, times
         writer.join(LAST)  # what is computed is written, what is still being computed is not waited for
         raise
     finally:
-        times.total += time.perf_counter() - begun
+        times.total += time.perf_counter() - start_time
     if failures:
         raise failures[0]

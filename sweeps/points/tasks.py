@@ -78,8 +78,8 @@ def run_task(
     if profiled:
         from mmrjax.missions import mission_batch  # which imports an integrator
 
-        every = (*mission_batch.OUTPUTS, *(mission_batch.OF_TURNS if turns else ()))
-        rows, usual = {r.column: (r.unit, r.label) for r in every}, mission_batch.USUAL
+        output_names = (*mission_batch.OUTPUTS, *(mission_batch.OF_TURNS if turns else ()))
+        rows, usual = {r.column: (r.unit, r.label) for r in output_names}, mission_batch.USUAL
     flags = {"flag_masks": [1 << k for k in range(len(LIMITS))], "flag_meanings": " ".join(LIMITS)}
     attributes: Attributes = {n: {"units": unit, "long_name": label} for n, (unit, label) in rows.items()}
     attributes[FLAGS] = {"long_name": "limits exceeded", **flags}

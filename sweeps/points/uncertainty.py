@@ -69,12 +69,12 @@ def simulate_draws(
         counts = np.isin(by_name[STATUS], DONE) & np.isfinite(by_name[robot.channels[0].name])
         return _summary({o.column: by_name[o.name] for o in outputs.output_table(robot.channels)}, counts)
 
-    whole = job.blocks.size[-1] == draws  # of a run all draws are in one chunk, which is kept in short
+    draws_fit_chunk = job.blocks.size[-1] == draws  # of a run all draws are in one chunk, which is kept in short
     with progress_bar(draws, quiet=not slow, doing="draws") as advance:
         chunks = run.compute_chunks(
-            job, folder, "draws", lambda points: advance(points / len(runs)), summary if whole else dict
+            job, folder, "draws", lambda points: advance(points / len(runs)), summary if draws_fit_chunk else dict
         )
-    return Intervals(chunks if whole else summary(chunks), draws, robot.channels)
+    return Intervals(chunks if draws_fit_chunk else summary(chunks), draws, robot.channels)
 
 
 def _summary(columns: Columns, counts: np.ndarray) -> Columns:
@@ -103,19 +103,19 @@ def interval_ranges(table: Columns, found: Intervals) -> list[str]:
         least, most = rows[np.argmin(value[rows])], rows[np.argmax(value[rows])]
         ends = [with_sd(value[k], sd[k], c.resolution) for k in dict.fromkeys((int(least), int(most)))]
         ranges.append(f"{c.label}: {' to '.join(ends)} {c.unit}")
-    first_remark, *lost = interval_remarks(found, "the table")
-    return [*[first_remark] * bool(ranges), *ranges, *lost]
+    first_remark, *more_remarks = interval_remarks(found, "the table")
+    return [*[first_remark] * bool(ranges), *ranges, *more_remarks]
 
 
 def interval_remarks(found: Intervals, place: str = "runs.csv") -> list[str]:
     """Number of robots that were drawn, and how many of them do not converge at how many runs, if some do not."""
-    lost = found.columns[SHARE] < 1
+    is_incomplete = found.columns[SHARE] < 1
     remarks = [f"± one sd over {found.draws} robots drawn from the posterior; 95 % intervals are in {place}"]
-    if lost.any():
+    if is_incomplete.any():
         share = 100 * (1 - found.columns[SHARE].min())
         remarks.append(
-            f"in {int(lost.sum())} of {len(lost)} runs, some draws do not converge (up to {share:.0f} %); "
-            "intervals use the others"
+            f"in {int(is_incomplete.sum())} of {len(is_incomplete)} runs, some draws do not converge (up to "
+            f"{share:.0f} %); intervals use the others"
         )
     return remarks
 

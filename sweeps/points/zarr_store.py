@@ -186,8 +186,8 @@ class Layout:
         """Bytes of the store on a disk, uncompressed: blocks of its files and folders, metadata and journal."""
         counts, points = self.blocks.counts, self.blocks.points
         folders = sum(math.prod(counts[:k]) for k in range(len(counts)))
-        each = sum(_on_disk(np.dtype(v.dtype).itemsize * points) for v in self.variables) * len(self.blocks)
-        outputs = each + BLOCK * folders * len(self.variables)
+        point_bytes = sum(_on_disk(np.dtype(v.dtype).itemsize * points) for v in self.variables) * len(self.blocks)
+        outputs = point_bytes + BLOCK * folders * len(self.variables)
         names = () if self.design.samples is None else self.design.samples.names
         sample_size = len(names) * counts[-1] * _on_disk(8 * self.blocks.size[-1])
         axes = sum(_on_disk(8 * len(values)) for values in self.design.axes.values())
@@ -358,8 +358,8 @@ class SweepStore(Folder):
         """Files of metadata and axes that are not as `create_store` writes them, with what they should hold."""
         with tempfile.TemporaryDirectory() as place:
             create_store(Path(place) / STORE, self.layout)
-            whole = {p.relative_to(place): p.read_bytes() for p in Path(place).rglob("*") if p.is_file()}
-        contents = {folder / name: content for name, content in whole.items()}
+            file_contents = {p.relative_to(place): p.read_bytes() for p in Path(place).rglob("*") if p.is_file()}
+        contents = {folder / name: content for name, content in file_contents.items()}
         return {p: content for p, content in contents.items() if not p.is_file() or p.read_bytes() != content}
 
     def _mend_layout(self) -> None:
@@ -377,8 +377,8 @@ class SweepStore(Folder):
         """
         damaged = next(iter(self._altered(self.path)), None)
         if damaged is None and len(self.done()) < len(self.layout.blocks):
-            lost = min(set(range(len(self.layout.blocks))) - set(self._sound))
-            records = self._records().get(lost, [])
+            damaged_chunk = min(set(range(len(self.layout.blocks))) - set(self._sound))
+            records = self._records().get(damaged_chunk, [])
             damaged = self._wrong_file(records[-1]) if records else self.path / JOURNAL
         if damaged is not None:
             raise BadData(f"--out: {damaged} is damaged; choose another path, or use --force to repeat the sweep")

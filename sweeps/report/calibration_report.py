@@ -83,10 +83,10 @@ def _errors(found: CalibrationResult) -> Table:
     lines |= {f"after, held out by {blocks.kind_in_words(k)}": found.held_out[k].errors for k in found.held_out_alike}
     rows = [
         (
-            which, f"{max(e.rows for e in by.values())}/{len(found)}",
+            fit, f"{max(e.rows for e in by.values())}/{len(found)}",
             *(e.rms_percent if e.rows else None for e in by.values()),
         )
-        for which, by in lines.items()
+        for fit, by in lines.items()
     ]  # fmt: skip
     title = f"rms of simulated - measured [% of {OF_SIZE}]"
     return catalogue.table("calibration.errors", rows, *(f"{c.label} | .1f" for c in found.channels), title=title)

@@ -35,10 +35,10 @@ def campaign_document(file: RobotFile, layout: Layout, result: Json, store: Path
     """
     counts, model, total = result["statuses"], result["model"], result["points"]
     reached = sum(counts.get(s, 0) for s in words.SETTLED)
-    what = words.VERDICTS.get((model, "converged"), "have an operating point")
+    verdict_words = words.VERDICTS.get((model, "converged"), "have an operating point")
     return Document(
         f"Sweep of {count_noun(total, 'point')}",
-        f"{count_noun(total, 'point')}: {reached:,} {what}.",
+        f"{count_noun(total, 'point')}: {reached:,} {verdict_words}.",
         (
             run_tables.lead_note(file, model, f"All points are in `{STORE}`."),
             run_tables.endings_table(counts, "points", model),
@@ -118,12 +118,12 @@ def sample_points(store: Path, layout: Layout) -> tuple[np.ndarray, Columns]:
     group: Any = zarr.open_group(store, mode="r")
     rng, blocks = np.random.default_rng(0), layout.blocks
     chunks = np.sort(rng.permutation(len(blocks))[:CHUNKS])
-    each = -(-THINNED // len(chunks))
+    points_per_chunk = -(-THINNED // len(chunks))
     values: list[np.ndarray] = []
     values_by_name: dict[str, list[np.ndarray]] = {v.name: [] for v in layout.variables}
     for chunk in map(int, chunks):
         box, count = blocks.box(chunk), blocks.count(chunk)
-        rows = np.sort(rng.permutation(count)[:each]) if count > each else np.arange(count)
+        rows = np.sort(rng.permutation(count)[:points_per_chunk]) if count > points_per_chunk else np.arange(count)
         values.append(layout.design.block(box)[rows])
         for variable in layout.variables:
             values_by_name[variable.name].append(group[variable.name][box].ravel()[rows])

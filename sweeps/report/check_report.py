@@ -52,10 +52,10 @@ class CheckResult:
         if not missed:
             return f"All {number} requirements are met." if number > 1 else "The requirement is met."
         verb = "is" if len(missed) == 1 else "are"
-        listed = "; ".join(f"{requirement_label(o)} {shortfall_text(o)}" for o in missed[:NAMED])
+        shortfalls = "; ".join(f"{requirement_label(o)} {shortfall_text(o)}" for o in missed[:NAMED])
         more = f"; and {len(missed) - NAMED} more" if len(missed) > NAMED else ""
         worst = ":" if len(missed) <= NAMED else ". Worst:"
-        return f"{len(missed)} of {number} requirements {verb} missed{worst} {listed}{more}."
+        return f"{len(missed)} of {number} requirements {verb} missed{worst} {shortfalls}{more}."
 
     def to_json(self) -> Json:
         """`result.json`."""
@@ -178,11 +178,11 @@ def _changes(found: CheckResult) -> tuple[Note | Table, ...]:
     hopeless = [f"{requirement_label(o)} {required_value_text(o)}" for o in found.missed if not o.change]
     more = f", {len(rows) - len(brief)} more in result.json" if len(rows) > len(brief) else ""
     title = f"changes of a single parameter that would meet them{more}"
-    none = f"No change of a single parameter within its bounds meets {', '.join(hopeless)}."
+    hopeless_sentence = f"No change of a single parameter within its bounds meets {', '.join(hopeless)}."
     return (
         catalogue.note("check.changes"),
         catalogue.table("check.change", rows, title=title, brief=brief),
-        *([Note(none, terminal=True)] if hopeless else []),
+        *([Note(hopeless_sentence, terminal=True)] if hopeless else []),
     )  # fmt: skip
 
 

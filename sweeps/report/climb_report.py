@@ -45,8 +45,8 @@ FILMED = ("time_s", "traction_current_A")
 def footing_coordinates(table: Columns) -> np.ndarray:
     """Coordinates of `mmrjax.climbing.footing` at every sample of a history, (samples, 6)."""
     x, z, pitch, shaft, front, rear = (table[name] for name in COORDINATES)
-    turned = np.radians([-pitch, shaft, front, 180 - rear])
-    return np.stack([x / 1000, z / 1000, *turned], axis=1)
+    angles = np.radians([-pitch, shaft, front, 180 - rear])
+    return np.stack([x / 1000, z / 1000, *angles], axis=1)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -188,8 +188,8 @@ class ClimbResult:
         along, derivatives = self.along, self.derivatives
         if along is None or derivatives is None:
             return None
-        by = ("by", "by_unit", "by_value", "by_width")
-        names = ("output", "unit", "value", *by, "derivative", "slope", "slope_sd")
+        variable_keys = ("by", "by_unit", "by_value", "by_width")
+        names = ("output", "unit", "value", *variable_keys, "derivative", "slope", "slope_sd")
         found_by = {
             name: (derivatives.by[name], derivatives.slope[name], derivatives.slope_sd[name]) for name in OUTPUTS
         }
@@ -305,5 +305,5 @@ def _derivatives(found: ClimbResult, along: Along) -> Table:
         )
         for n in names
     ]  # fmt: skip
-    by = (f"by {n} = {v:.4g} {u}, over ±{w:.2g} |".replace(" ,", ",") for n, u, v, w in along.rows)
-    return catalogue.table("climb.slopes-table", rows, *by, brief=[names.index(n) for n in SHOWN])
+    variable_rows = (f"by {n} = {v:.4g} {u}, over ±{w:.2g} |".replace(" ,", ",") for n, u, v, w in along.rows)
+    return catalogue.table("climb.slopes-table", rows, *variable_rows, brief=[names.index(n) for n in SHOWN])

@@ -57,10 +57,12 @@ class Comparison:
         """For each channel the rows with a number of both robots, and their rms errors [% of the measured rms]."""
         answer = {}
         for channel in self.channels:
-            both = np.stack([self.table[prefix + channel.column] for prefix in ("simulated_", "against_")], 1)
+            readings_of_both = np.stack(
+                [self.table[prefix + channel.column] for prefix in ("simulated_", "against_")], 1
+            )
             measured = self.table[channel.column]
-            rows = np.isfinite(both).all(1) & np.isfinite(measured)
-            first, second = 100 * residual.share_of_measured(both[rows], measured[rows, None])
+            rows = np.isfinite(readings_of_both).all(1) & np.isfinite(measured)
+            first, second = 100 * residual.share_of_measured(readings_of_both[rows], measured[rows, None])
             answer[channel.name] = int(rows.sum()), float(first), float(second)
         return answer
 
@@ -182,35 +184,37 @@ def _over_time(found: Comparison) -> tuple[Section, ...]:
 
 def comparison_answer(found: Comparison) -> str:
     """The rms errors with their rows, the worst reading, and if this robot was fitted to these rows."""
-    every, total = found.summary["all"], len(found.table["status"])
-    each = [(c, every[c.name]) for c in found.channels if every[c.name]["rows"]]
-    if not each:
+    error_summary, total = found.summary["all"], len(found.table["status"])
+    channel_errors = [(c, error_summary[c.name]) for c in found.channels if error_summary[c.name]["rows"]]
+    if not channel_errors:
         return "No row has both a simulated and a measured value."
-    errors = ", ".join(f"{e['rms_percent']:.1f} % {c.label}" for c, e in each)
-    rows, worst = max(e["rows"] for _, e in each), max(e["max_percent"] for _, e in each)
-    what = f"{rows} of {total} rows" if rows < total else count_noun(total, "row")
+    errors = ", ".join(f"{e['rms_percent']:.1f} % {c.label}" for c, e in channel_errors)
+    rows, worst = max(e["rows"] for _, e in channel_errors), max(e["max_percent"] for _, e in channel_errors)
+    extent_words = f"{rows} of {total} rows" if rows < total else count_noun(total, "row")
     if found.over is not None:
-        what = f"{_log_duration(found):.3g} s of log"
-    sentence = f"{what}: rms error {errors} (worst reading {worst:.1f} %). {_FITS[found.fit]}".rstrip()
+        extent_words = f"{_log_duration(found):.3g} s of log"
+    sentence = f"{extent_words}: rms error {errors} (worst reading {worst:.1f} %). {_FITS[found.fit]}".rstrip()
     return sentence if not found.against else f"{sentence} {_second_robot(found)}"
 
 
 def _second_robot(found: Comparison) -> str:
     """Errors of both robots on the rows that both reach."""
-    both = found.rms_of_both
-    shared = max(rows for rows, _, _ in both.values())
+    rms_pair = found.rms_of_both
+    shared = max(rows for rows, _, _ in rms_pair.values())
     if not shared:
         return f"No row has values for both this robot and {found.against}."
     parts = [
-        f"{c.label} {both[c.name][1]:.1f} and {both[c.name][2]:.1f} %" for c in found.channels if both[c.name][0]
+        f"{c.label} {rms_pair[c.name][1]:.1f} and {rms_pair[c.name][2]:.1f} %"
+        for c in found.channels
+        if rms_pair[c.name][0]
     ]
     return f"This robot and {found.against} on the same {count_noun(shared, 'row')}: {', '.join(parts)}."
 
 
 def _both_robots(found: Comparison) -> Table:
-    both = (f"rms error, {name} [%] | .1f" for name in (found.robot_name, found.against))
+    error_columns = (f"rms error, {name} [%] | .1f" for name in (found.robot_name, found.against))
     rows = [(c.label, *found.rms_of_both[c.name]) for c in found.channels]
-    return catalogue.table("comparison.robots", rows, *both)
+    return catalogue.table("comparison.robots", rows, *error_columns)
 
 
 def _log_duration(found: Comparison) -> float:
@@ -259,9 +263,9 @@ def _strongest_trend(found: Comparison) -> str:
     for c in found.channels:
         error = found.table[f"error_{c.name}_percent"]
         for column, heading in headings.items():
-            both = np.isfinite(error) & np.isfinite(found.table[column])
-            x, y = found.table[column][both], error[both]
-            if both.sum() > 2 and np.ptp(x) > 0 and np.ptp(y) > 0 and abs(r := np.corrcoef(x, y)[0, 1]) > size:
+            is_paired = np.isfinite(error) & np.isfinite(found.table[column])
+            x, y = found.table[column][is_paired], error[is_paired]
+            if is_paired.sum() > 2 and np.ptp(x) > 0 and np.ptp(y) > 0 and abs(r := np.corrcoef(x, y)[0, 1]) > size:
                 best = f"The error of {c.label} changes most with {heading} (correlation {r:+.2f}, n = {len(x)})"
                 size = abs(r)
     return best

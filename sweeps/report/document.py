@@ -142,11 +142,11 @@ class Table:
         first, *others = self.columns
         rows = self.rows[:SIDE_BY_SIDE]
         heads = (Column(""), *(Column(first.text(row[0]), form="{}") for row in rows))
-        turned = [
+        turned_rows = [
             (column.title, *(Cell(column.text(row[k]), cell_tone(row[k])) for row in rows))
             for k, column in enumerate(others, 1)
         ]
-        return dataclasses.replace(self, columns=heads, rows=turned, sideways=False)
+        return dataclasses.replace(self, columns=heads, rows=turned_rows, sideways=False)
 
     @property
     def groups(self) -> list[tuple[str, int]]:

@@ -16,9 +16,9 @@ TONES = {HELD: "good", APPROXIMATED: "fair", DROPPED: "bad"}
 def export_document(found: Export) -> Document:
     """The report of an exported drive."""
     compared = found.comparison
-    used = words.USE[found.format].format(name=found.joint.name, at="drive", armature=words.rotor_inertia(found))
-    kept = [(f.name, Cell(f.verdict, TONES[f.verdict]), 100 * f.kept, f.how) for f in compared.fates]
-    fates = catalogue.table("export.fates", kept)
+    usage = words.USE[found.format].format(name=found.joint.name, at="drive", armature=words.rotor_inertia(found))
+    fate_rows = [(f.name, Cell(f.verdict, TONES[f.verdict]), 100 * f.kept, f.how) for f in compared.fates]
+    fates = catalogue.table("export.fates", fate_rows)
     readings = catalogue.figure("export.readings", compared, finding=words.export_statement(found))
     sections = [
         Section("What the format represents", (fates, catalogue.note("export.kept")), "holds"),
@@ -46,7 +46,7 @@ def export_document(found: Export) -> Document:
     return Document(
         f"{found.joint.file.name} for {found.format}",
         words.export_statement(found),
-        (Note(used, "lead"), *remarks(words.export_remarks(found))),
+        (Note(usage, "lead"), *remarks(words.export_remarks(found))),
         (*sections, _constants(found), Section("Conditions in the data, and what was not tested", conditions)),
     )
 

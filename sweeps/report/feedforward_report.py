@@ -14,13 +14,13 @@ def feedforward_document(found: Feedforward) -> Document:
     units, t = constant_units(found.unit), found.tolerances
     constants = [(n, x, interval_95(x, found.sds[n])[1] - x, units[n]) for n, x in found.constants.items()]
     gains = [(*name.split("_"), x, units[name.split("_")[1]]) for name, x in found.gains.items()]
-    asked = (
+    option_rows = (
         f"Gains for tolerances of {t.position:g} {found.unit}, {t.velocity:g} {found.unit}/s and {t.effort:g} V, a "
         f"period of {1000 * t.period:g} ms and a measurement delay of {1000 * (t.delay or 0):.3g} ms."
     )
     blocks: list[Block] = [catalogue.table("feedforward.constants", constants), *remarks(sentences(found.remarks))]
     if gains:
-        blocks += [catalogue.table("feedforward.gains", gains), *remarks((asked,), "asked")]
+        blocks += [catalogue.table("feedforward.gains", gains), *remarks((option_rows,), "asked")]
     figures = tuple(catalogue.figure(f"feedforward.{name}", found) for name in ("quasistatic", "dynamic"))
     return Document(
         f"Feedforward of {'an' if found.mechanism[0] in 'ae' else 'a'} {found.mechanism} mechanism",

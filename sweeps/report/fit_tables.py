@@ -59,7 +59,7 @@ def noise_sentence(noise: Mapping[str, tuple[float | None, str]], shown: Iterabl
 
 def rms_table(rms: Mapping[str, Mapping[str, float]], shown: Sequence[Channel]) -> Table:
     """rms errors in the units of their channels, by fit."""
-    rows = [(FITS[fit], *(by.get(c.name) for c in shown)) for fit, by in rms.items()]
+    rows = [(FITS[fit], *(rms_by_channel.get(c.name) for c in shown)) for fit, rms_by_channel in rms.items()]
     return catalogue.table("fit.rms", rows, *(f"{c.label} [{c.unit}] | .3g" for c in shown))
 
 
@@ -88,12 +88,12 @@ def fits_of_runs(table: Columns, shown: Sequence[Channel], lines: Mapping[str, s
 def range_of_fits(fits: Table, shown: Sequence[Channel]) -> str:
     """Sentence on the fits of `fits_of_runs`: range over the runs of each channel, of the first simulated line."""
     first = [row[2:] for row in fits.rows if row[1] == fits.rows[0][1]]
-    each = []
+    ranges = []
     for channel, values in zip(shown, np.array(first, float).T, strict=True):
         if np.isfinite(values).any():
             ends = dict.fromkeys(f"{end(values):.1f}" for end in (np.nanmin, np.nanmax))
-            each.append(f"{channel.label} {' to '.join(ends)} %")
-    return f" Fit of each run (100 %: exact, 0 %: no better than its mean): {', '.join(each)}."
+            ranges.append(f"{channel.label} {' to '.join(ends)} %")
+    return f" Fit of each run (100 %: exact, 0 %: no better than its mean): {', '.join(ranges)}."
 
 
 def clusters_section(clusters: Sequence[ResidualCluster]) -> tuple[Section, ...]:

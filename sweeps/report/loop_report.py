@@ -42,13 +42,13 @@ def loop_document(found: DiscoveryResult, robot_name: str, changes: Mapping[str,
         changes: changes of settled runs by each effect.
     """
     missing, table = found.verdict not in ("none", "undescribed"), rows_of(found)
-    moved, added = list(moved_parameters(found)), list(_effect_findings(found, changes))
+    shifts, added = list(moved_parameters(found)), list(_effect_findings(found, changes))
     rise = loop_words.rising_errors_sentence(found.held_out_worse, found.predicted)
     return Document(
         f"Is the {words.displayed_robot_name(Path(robot_name).name)} model complete?",
         found.statement,
         (
-            *remarks(moved, "moved"),
+            *remarks(shifts, "moved"),
             *_first_figure(found, table, changes),
             _summary(found),
             *([Note(rise, name="worse", terminal=True)] if rise else []),
@@ -57,7 +57,7 @@ def loop_document(found: DiscoveryResult, robot_name: str, changes: Mapping[str,
             *run_tables.curve_warning(found.robot),
         ),
         tuple(_sections(found, table, changes, missing)),
-        brief=loop_words.brief_answer(found, moved, _next_step(found, "")),
+        brief=loop_words.brief_answer(found, shifts, _next_step(found, "")),
     )
 
 
@@ -119,8 +119,8 @@ def moved_parameters(found: DiscoveryResult) -> Iterable[str]:
     }
     for name, (value, shift) in sorted(by_name.items(), key=lambda item: -abs(item[1][1])):
         if abs(shift) >= MOVED:
-            stated = found.base_shift[name]
-            yield loop_words.moved_parameter(name, value, stated.prior, stated.unit, shift)
+            base_shift = found.base_shift[name]
+            yield loop_words.moved_parameter(name, value, base_shift.prior, base_shift.unit, shift)
 
 
 def _arrow_cell(text: str, change: float) -> Cell:
@@ -141,16 +141,23 @@ def _summary(found: DiscoveryResult) -> Table:
     if not found.refit_alone:
         lines.append(("with the effects found", found.errors[1], unseen[1]))
     rows = []
-    for what, seen, held in lines:
+    for row_label, seen_error, held_out_error in lines:
         cells = []
-        for c, e in seen.items():
-            other = f" ({loop_words.percent_text(held[c])} %)" if c in held and held[c]["rows"] else ""
+        for c, e in seen_error.items():
+            other = (
+                f" ({loop_words.percent_text(held_out_error[c])} %)"
+                if c in held_out_error and held_out_error[c]["rows"]
+                else ""
+            )
             last, rows_before = before.get(c, (e["rms_percent"], e["rows"]))
             change = e["rms_percent"] - last if rows_before == e["rows"] else 0.0
             cells.append(_arrow_cell(f"{loop_words.percent_text(e)} %{other}", change) if e["rows"] else Cell("-"))
-        before = {c: (float(e["rms_percent"]), int(e["rows"])) for c, e in seen.items()}
-        reached, also = (max((int(e["rows"]) for e in by.values()), default=0) for by in (seen, held))
-        rows.append((what, *cells, f"{reached}/{total}" + (f" ({also}/{total})" if also else "")))
+        before = {c: (float(e["rms_percent"]), int(e["rows"])) for c, e in seen_error.items()}
+        reached, also = (
+            max((int(e["rows"]) for e in errors_by_channel.values()), default=0)
+            for errors_by_channel in (seen_error, held_out_error)
+        )
+        rows.append((row_label, *cells, f"{reached}/{total}" + (f" ({also}/{total})" if also else "")))
     held_out = f", seen and (unseen, by {blocks.kind_in_words(kind)})" if kind else ""
     heads = f"rms error{held_out}", *(f"{c.label} |" for c in found.channels)
     return catalogue.table("loop.summary", rows, *heads, f"{_rows_are(found)} reached |")
@@ -159,21 +166,21 @@ def _summary(found: DiscoveryResult) -> Table:
 def held_out_table(found: DiscoveryResult) -> Table:
     """Errors of the refit and with what was found, by kind of block held out, with the rows that each reaches."""
     total, many, rows = len(found.runs), not found.refit_alone, list[tuple[Any, ...]]()
-    for kind, both in {"": found.errors, **found.errors_held_out}.items():
+    for kind, error_pair in {"": found.errors, **found.errors_held_out}.items():
         worse = {w.channel for w in found.held_out_worse if w.kind == kind}
         cells = []
-        for c in both[0]:
-            texts = [loop_words.percent_text(e[c]) for e in both[: 1 + many]]
-            change = both[1][c]["rms_percent"] - both[0][c]["rms_percent"] if many else 0.0
+        for c in error_pair[0]:
+            texts = [loop_words.percent_text(e[c]) for e in error_pair[: 1 + many]]
+            change = error_pair[1][c]["rms_percent"] - error_pair[0][c]["rms_percent"] if many else 0.0
             change_shown = np.inf if c in worse else change if not kind or change < 0 else 0.0
             cells.append(_arrow_cell(" → ".join(texts), change_shown))
-        reached = max(int(e["rows"]) for e in both[0].values())
-        what = f"unseen: another {blocks.kind_in_words(kind)}" if kind else "seen by the fit"
-        rows.append((what, *cells, f"{reached} of {total}"))
+        reached = max(int(e["rows"]) for e in error_pair[0].values())
+        row_label = f"unseen: another {blocks.kind_in_words(kind)}" if kind else "seen by the fit"
+        rows.append((row_label, *cells, f"{reached} of {total}"))
     for kind in found.held_out_unpredictable:
         if kind not in found.errors_held_out:
-            what = f"unseen: another {blocks.kind_in_words(kind)}"
-            rows.append((what, *["-"] * len(found.channels), "not predictable from the others"))
+            row_label = f"unseen: another {blocks.kind_in_words(kind)}"
+            rows.append((row_label, *["-"] * len(found.channels), "not predictable from the others"))
     return catalogue.table("loop.errors", rows, *(f"{c.label} |" for c in found.channels))
 
 
@@ -221,15 +228,15 @@ def _effects_in_words(found: DiscoveryResult) -> Iterable[Block]:
     rows = []
     for e in found.to_json()["effects"]:
         effect = next((x for x in found.effects if x.name == e["name"]), None)
-        over = f"not in the library; plotted over {str(e.get('variable')).replace('_', ' ')}"
+        plot_words = f"not in the library; plotted over {str(e.get('variable')).replace('_', ' ')}"
         lowers, kinds = loop_words.misfit_text(e["score"]), ", or ".join(e["families"])
         if effect is None:
             alike = ", ".join(b for b in e["balances_alike"] if b != e["balance"])
-            rows.append((e["name"], kinds, e["balance"], over, "-", lowers, e["p_value"], "a curve", alike))
+            rows.append((e["name"], kinds, e["balance"], plot_words, "-", lowers, e["p_value"], "a curve", alike))
             continue
         rows.append(
             (
-                loop_words.effect_called(found, effect), kinds, e["balance"], e["equation"] or over,
+                loop_words.effect_called(found, effect), kinds, e["balance"], e["equation"] or plot_words,
                 loop_words.effect_amplitude(effect), f"{lowers} ({100 * e['share']:.0f} %)", e["p_value"],
                 loop_words.tentative_reason(found, effect) or e["standing"],
                 loop_words.indistinguishable_effects(found, effect) or "nothing else of plausible size",
@@ -246,8 +253,8 @@ def _certainty(found: DiscoveryResult, missing: bool) -> Table:
     chi = f"{chi_before:.0f} → {chi_after:.0f}" if missing else f"{chi_before:.0f}"
     priors = f"{before:.0f} → {after:.0f}" if missing else f"{before:.0f}"
     adequate, level = bool(found.after.adequate), found.headline.level
-    left, set_aside = len(found.unusable), len(found.outliers)
-    aside = f"{left} without a result of the fitted model, {set_aside} set aside as outliers"
+    unusable_count, set_aside = len(found.unusable), len(found.outliers)
+    aside = f"{unusable_count} without a result of the fitted model, {set_aside} set aside as outliers"
     p = loop_words.p_value(found.before.p_value)
     rows = [
         (
@@ -260,7 +267,7 @@ def _certainty(found: DiscoveryResult, missing: bool) -> Table:
         ),
         (
             f"{int(found.included.sum())} of {len(found.runs)} {_rows_are(found)}",
-            aside if left or set_aside else "all used",
+            aside if unusable_count or set_aside else "all used",
         ),
     ]  # fmt: skip
     if missing and found.gain is not None:
@@ -318,16 +325,20 @@ def _sections(
     looked_for = Section("Effects that were tested", tuple(_looked_for(found)))
     yield Section("Measured and simulated, run by run", tuple(_run_by_run(found, table, changes)))
     yield from [] if missing else [looked_for]
-    where = "Where the missing term acts" if missing else "What each equation lacks"
-    yield Section(where, tuple(_blocks_of_missing_terms(found, table, changes)))
+    heading = "Where the missing term acts" if missing else "What each equation lacks"
+    yield Section(heading, tuple(_blocks_of_missing_terms(found, table, changes)))
     yield from fit_tables.clusters_section(found.residual_clusters)
     errors = catalogue.figure("loop.errors-figure", found, words=(OF_SIZE,))
-    fits = {when: by for when, by in found.rms.items() if not (found.refit_alone and "after" in when)}
+    fits = {
+        when: rms_by_channel
+        for when, rms_by_channel in found.rms.items()
+        if not (found.refit_alone and "after" in when)
+    }
     sized = Layout.of(found.robot).crosses_zero
     in_units = [fit_tables.rms_table(fits, found.channels)] if sized else []
-    seen: list[Block] = [errors, held_out_table(found), catalogue.note("loop.fitted_again"), *in_units]
-    seen += [catalogue.figure("loop.gains", found)] if len(found.gains) > 1 else []
-    yield Section("Errors on runs used in the fit, and on held-out runs", tuple(seen))
+    error_blocks: list[Block] = [errors, held_out_table(found), catalogue.note("loop.fitted_again"), *in_units]
+    error_blocks += [catalogue.figure("loop.gains", found)] if len(found.gains) > 1 else []
+    yield Section("Errors on runs used in the fit, and on held-out runs", tuple(error_blocks))
     yield from _certainty_sections(found, missing)
     yield Section("Candidates", tuple(_candidates(found)))
     hidden = catalogue.figure("loop.null", found.before), catalogue.figure("loop.look_alikes", found)
@@ -413,7 +424,7 @@ def _candidates(found: DiscoveryResult) -> Iterable[Block]:
         )
         for h in found.hidden
     ]  # fmt: skip
-    held = [
+    candidate_rows = [
         (
             f"**{', '.join(a.effects)}**" if a.leads else ", ".join(a.effects), a.rise_chi2, a.rms_sigma,
             *a.by_kind.values(), a.lost,
@@ -421,12 +432,14 @@ def _candidates(found: DiscoveryResult) -> Iterable[Block]:
         for a in found.alternatives_held_out
     ]  # fmt: skip
     kinds = (
-        [] if not held else [f"by {blocks.kind_in_words(k)} | .2f" for k in found.alternatives_held_out[0].by_kind]
+        []
+        if not candidate_rows
+        else [f"by {blocks.kind_in_words(k)} | .2f" for k in found.alternatives_held_out[0].by_kind]
     )
     tables: dict[str, tuple[str, Sequence[Any], Sequence[str], Names]] = {
         "alternatives": ("alternatives", several, (), (curves if found.verdict in WITHOUT_NAME else "",)),
         "hidden": ("hidden", hidden, (), ()),
-        "held": ("alternatives_held_out", held, kinds, ()),
+        "held": ("alternatives_held_out", candidate_rows, kinds, ()),
         "implausible": ("implausible", sizes, (), ()),
     }
     for above, (name, rows, more, values) in tables.items():
@@ -442,14 +455,14 @@ def _named(values: Mapping[str, float]) -> str:
 def _looked_for(found: DiscoveryResult) -> Iterable[Block]:
     yield catalogue.figure("loop.power", found)
     yield catalogue.note("loop.seen-above")
-    level, listed = found.before.kinds["single"].threshold, []
+    level, rows = found.before.kinds["single"].threshold, []
     for s in found.scores:
         if s.name in BY_NAME and s.sigmas_per_prior_sd > 0:
             spec = next(p.spec for p in params.walk_parameters(BY_NAME[s.name]()) if p.spec.amplitude)
             times = level / s.sigmas_per_prior_sd
             size = f"{times * spec.prior_sd(0.0):.2g} {spec.unit}"
-            listed.append((f"`{s.name}`", BY_NAME[s.name].family(), size, times))
-    yield catalogue.table("loop.would_be_seen", sorted(listed, key=lambda row: row[-1]))
+            rows.append((f"`{s.name}`", BY_NAME[s.name].family(), size, times))
+    yield catalogue.table("loop.would_be_seen", sorted(rows, key=lambda row: row[-1]))
     unseen = {
         "cannot_see": found.cannot_see, "needs_series": found.needs_histories, "needs_reverse": found.needs_reverse
     }  # fmt: skip

@@ -47,13 +47,13 @@ class Missions:
 
     def to_json(self) -> Json:
         """Content of `result.json`: for one run its numbers by name, for several a list of them."""
-        each = [self._one(k) for k in range(len(self.table["status"]))]
+        missions = [self._one(k) for k in range(len(self.table["status"]))]
         about = {
             "name": self.source.source, "sha256": self.source.digest, "duration_s": self.source.duration,
             "segments": self.source.segment_count, "cycles": self.source.cycles,
             "between_rows": profiles.BETWEEN[self.source.linear],
         }  # fmt: skip
-        return {"profile": about, **(each[0] if len(each) == 1 else {"missions": each})}
+        return {"profile": about, **(missions[0] if len(missions) == 1 else {"missions": missions})}
 
     def _one(self, row: int) -> Json:
         to = {name: f"energy_to_{name}_Wh" for name in SINKS}
@@ -91,18 +91,18 @@ def missions_document(file: RobotFile, found: Missions) -> Document:
     first, names = {key: value[0] for key, value in table.items()}, _names(table)
     answer = mission_answer({key: value[0] for key, value in shown_columns.items()}, file.robot.has_ground)
     fed = "battery" if np.isfinite(first["state_of_charge"]) else "supply"
-    cycles, each = (f", {source.cycles} cycles", " each") if source.cycles > 1 else ("", "")
+    cycles, per_cycle = (f", {source.cycles} cycles", " each") if source.cycles > 1 else ("", "")
     between = "linear" if source.linear else "held"
     lead = (
         f"Profile **{source.source}**: {source.duration:g} s{cycles}, {count_noun(source.segment_count, 'segment')}"
-        f"{each}, values {between} between rows; fed by its {fed}."
+        f"{per_cycle}, values {between} between rows; fed by its {fed}."
     )
     detail = f"In detail the first of {len(names)} runs: **{names[0]}**." if len(names) > 1 else ""
     runs = run_tables.quantity_table(
         "runs", shown_columns, _RUNS, first=[(Column("run"), names)], file="runs.csv", sideways=True
     )
     endings = run_tables.endings_table(Counter(map(str, table["status"])))
-    whole = len(names) == 1 and first["status"] == "converged"
+    is_complete = len(names) == 1 and first["status"] == "converged"
     return Document(
         f"Mission {source.source}" + ("" if len(names) > 1 else f" of {names[0]}"),
         answer,
@@ -111,7 +111,7 @@ def missions_document(file: RobotFile, found: Missions) -> Document:
             Note(lead, terminal=True),
             *remarks(_exceeded_limits(found), "flags"),
             runs,
-            *([] if whole else [endings]),
+            *([] if is_complete else [endings]),
             *remarks(_charge_left(table)),
         ),
         page_sections=lambda: _sections(file.robot, found, first, answer),
@@ -197,12 +197,12 @@ def mission_limits(robot: Robot, run: Json) -> list[Json]:
          "{:.2f} A"),
         ("rms torque, one gearbox", run["rms_torque_Nm"], gearbox.torque_limit or np.nan, "{:.2f} N·m"),
     ]  # fmt: skip
-    used = run_tables.use_of_limits(limits, float(motor.temperature_ambient))
+    limit_use = run_tables.use_of_limits(limits, float(motor.temperature_ambient))
     low, cutoff = float(run["cell_low_V"]), float(robot.battery.voltage_cutoff)
     if np.isfinite(low):
         line = {"words": "lowest cell (not below)", "value": f"{low:.2f} V", "limit": f"{cutoff:.2f} V"}
-        used.append(line | {"percent": 100 * cutoff / low})
-    return used
+        limit_use.append(line | {"percent": 100 * cutoff / low})
+    return limit_use
 
 
 def _exceeded_limits(found: Missions) -> Iterable[str]:
@@ -219,9 +219,13 @@ def _exceeded_limits(found: Missions) -> Iterable[str]:
 
 def _charge_left(table: Columns) -> Iterable[str]:
     """Cut-off charge of missions, if any was."""
-    left = 100 * table["state_of_charge"][table["status"] == "cut_off"]
-    if len(left):
-        span = f"{left.min():.1f}" if len(left) == 1 else f"{left.min():.1f} to {left.max():.1f}"
+    charge_left = 100 * table["state_of_charge"][table["status"] == "cut_off"]
+    if len(charge_left):
+        span = (
+            f"{charge_left.min():.1f}"
+            if len(charge_left) == 1
+            else f"{charge_left.min():.1f} to {charge_left.max():.1f}"
+        )
         yield f"cut off: ended with {span} % of the charge left"
 
 
@@ -231,7 +235,7 @@ def _segments(found: Missions, name: str, idle: set[str]) -> Table:
     shown_columns = [c for c in _OF_SEGMENTS if c not in idle]
     totals = [c for c in shown_columns if c != "rms_current_A"] if many else []
     rows = {key: value[found.segments["run_id"] == name] for key, value in found.segments.items()}
-    whole, answer = float(np.sum(rows["energy_Wh"])), []
+    total_energy, answer = float(np.sum(rows["energy_Wh"])), []
     for k in range(min(source.segment_count, SEGMENTS)):
         segment_rows = {key: value[rows["segment"] == k + 1] for key, value in rows.items()}
         if not len(segment_rows["status"]):
@@ -242,7 +246,11 @@ def _segments(found: Missions, name: str, idle: set[str]) -> Table:
         sums = [
             np.sum(segment_rows[c]) if c in ("energy_Wh", "distance_m") else np.max(segment_rows[c]) for c in totals
         ]
-        shares = [100 * float(np.sum(segment_rows["energy_Wh"])) / whole if whole > 0 else None] if many else []
+        shares = (
+            [100 * float(np.sum(segment_rows["energy_Wh"])) / total_energy if total_energy > 0 else None]
+            if many
+            else []
+        )
         answer.append(
             (
                 f"{k + 1}: {begin:g} to {end:g} s", source.modes[k].replace("_", " "), _demand_in_words(found, k),

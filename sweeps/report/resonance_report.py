@@ -145,10 +145,10 @@ class ResonanceResult:
         if not np.isfinite(low):
             return [f"No run of {self.configuration} travels, so there is no ripple (status gives the reason)."]
         parts = []
-        named, bare = ([r for r in self.avoid if bool(r[2][0].mode) is has] for has in (True, False))
-        if named:
+        mode_resonances, bare = ([r for r in self.avoid if bool(r[2][0].mode) is has] for has in (True, False))
+        if mode_resonances:
             loads = "" if len(self.modes) == 1 else "at least at one payload: "
-            parts.append(f"Avoid {loads}{_ranges_in_words(named, self.passing.name)}.")
+            parts.append(f"Avoid {loads}{_ranges_in_words(mode_resonances, self.passing.name)}.")
         elif not bare:
             largest = ", ".join(f"{s.label} {ripple_percent(self._largest(n))}" for n, s in SIGNALS.items())
             parts.append(
@@ -156,7 +156,7 @@ class ResonanceResult:
                 f"natural frequency (largest ripple: {largest})."
             )
         if bare:
-            also = "Ripple also peaks" if named else "Ripple peaks"
+            also = "Ripple also peaks" if mode_resonances else "Ripple peaks"
             parts.append(
                 f"{also}, without a natural frequency nearby, at {_ranges_in_words(bare, self.passing.name)}."
             )
@@ -187,10 +187,15 @@ class ResonanceResult:
 
     def _spread(self) -> list[tuple[str, float, float]]:
         """Modes that amplify but change by an octave with the position of the belt, with their range [Hz]."""
-        every = [m for modes in self.modes.values() for m in modes if m.amplifies and not m.resonant]
-        names = dict.fromkeys(m.name for m in every)
+        amplifying_modes = [m for modes in self.modes.values() for m in modes if m.amplifies and not m.resonant]
+        names = dict.fromkeys(m.name for m in amplifying_modes)
         return [
-            (n, min(m.low for m in every if m.name == n), max(m.high for m in every if m.name == n)) for n in names
+            (
+                n,
+                min(m.low for m in amplifying_modes if m.name == n),
+                max(m.high for m in amplifying_modes if m.name == n),
+            )
+            for n in names
         ]
 
     def _table8(self) -> str:
@@ -312,7 +317,7 @@ def resonance_document(found: ResonanceResult, file: RobotFile) -> Document:
     values = passing.name, 1000 * passing.travel
     figure = catalogue.figure("resonance.map", found, finding=found.statement(), words=values)
     endings = run_tables.endings_table(found.statuses, meanings={SLOW: _FEW.format(PERIODS, passing.name)})
-    peaks, ended = _peaks(found), catalogue.note("resonance.ended", 100 * TAIL)
+    peaks, end_note = _peaks(found), catalogue.note("resonance.ended", 100 * TAIL)
     folded = count_noun(len(peaks.rows), "peak") if len(peaks.rows) > UNFOLDED else ""
     rows = []
     for payload, modes in found.modes.items():
@@ -341,7 +346,7 @@ def resonance_document(found: ResonanceResult, file: RobotFile) -> Document:
             ),
             Section("", (peaks,), folded=folded),
             Section("Operating points of Table 8", (_points(found),), "table8"),
-            Section("How the runs ended", (ended, endings), "ended"),
+            Section("How the runs ended", (end_note, endings), "ended"),
         ),
     )
 

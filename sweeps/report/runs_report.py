@@ -52,14 +52,14 @@ def runs_document(
     """
     robot, names = file.robot, run_headings(runs)
     single, first = len(names) == 1, {key: value[0] for key, value in runs.items()}
-    used = limits_used(robot, first) if single else []
+    limit_use = limits_used(robot, first) if single else []
     endings = run_tables.endings_table(Counter(map(str, runs["status"])))
     table = capabilities.drop_inapplicable_columns(robot, runs)
     shown_columns = (imposed_column(table), *_CONDITIONS, *(c.column for c in robot.channels), *_FURTHER)
     if not np.nan_to_num(table.get("voltage_cell_V", 0.0)).any():
         table.pop("voltage_cell_V", None)
     blocks: list[Block] = [run_tables.lead_note(file, model, "From standstill." if histories is not None else "")]
-    blocks += [run_tables.limits_table(used, "this run"), catalogue.note("run.warming")] if used else []
+    blocks += [run_tables.limits_table(limit_use, "this run"), catalogue.note("run.warming")] if limit_use else []
     shown_table = run_tables.quantity_table(
         "runs", table, shown_columns, first=[(Column("run"), names)], file="runs.csv", wide=len(names) > SIDE_BY_SIDE,
         sideways=True,
@@ -77,7 +77,7 @@ def runs_document(
         yield Section("Where the power goes", (*_power_chain(robot, runs, names), *chart), "chain")
 
     title = f"Run of {names[0]}" if single else f"{len(names)} runs"
-    return Document(title, runs_answer(runs, robot.channels, used), tuple(blocks), (of_runs,), sections)
+    return Document(title, runs_answer(runs, robot.channels, limit_use), tuple(blocks), (of_runs,), sections)
 
 
 def runs_answer(runs: Columns, channels: Sequence[Channel], used: Sequence[Json]) -> str:
@@ -88,9 +88,9 @@ def runs_answer(runs: Columns, channels: Sequence[Channel], used: Sequence[Json]
     """
     settled = np.isin(runs["status"], words.SETTLED)
     if len(settled) > 1:
-        over = int((settled & (runs["flags"] != "")).sum())
-        beyond = f"{over} of them {'exceeds' if over == 1 else 'exceed'} a limit"
-        rest = f"; {beyond if over else 'all within every limit'}" if settled.any() else ""
+        flagged_count = int((settled & (runs["flags"] != "")).sum())
+        beyond = f"{flagged_count} of them {'exceeds' if flagged_count == 1 else 'exceed'} a limit"
+        rest = f"; {beyond if flagged_count else 'all within every limit'}" if settled.any() else ""
         return f"{settled.sum()} of {len(settled)} runs have an operating point{rest}."
     if not settled[0]:
         return f"No operating point: {words.status_meaning(str(runs['status'][0]))}."
@@ -132,7 +132,7 @@ def _histories(robot: Robot, runs: Columns, names: list[str], histories: RunBatc
     """Runs over time: as instruments show them, or from standstill on a ground, with what the running gear does."""
     from sweeps.pages import gear_figures, history_figures
 
-    which = [robot.configurations.index(str(c)) for c in runs["configuration"]]
+    configuration_indices = [robot.configurations.index(str(c)) for c in runs["configuration"]]
     history, status = histories.history, np.asarray(histories.result.status)
     assert history is not None  # the fidelity was asked for it
     cut = (catalogue.note("runs.cut", HISTORIES, len(names)),) * (len(names) > HISTORIES)
@@ -148,7 +148,7 @@ def _histories(robot: Robot, runs: Columns, names: list[str], histories: RunBatc
             table = catalogue.table("runs.courses-table", ends, *(column for _, column in read_heads))
             yield Section("Over time", (*cut, catalogue.figure("runs.courses", members), table), "history-section")
         return
-    starts = history_figures.start_runs(robot, history, status, which, names[:HISTORIES])
+    starts = history_figures.start_runs(robot, history, status, configuration_indices, names[:HISTORIES])
     averaged = ""
     if history.reactions is not None:
         averaged = catalogue.text("runs.averaged", 1e3 * float(history.time[0, 1] - history.time[0, 0]))
@@ -158,7 +158,7 @@ def _histories(robot: Robot, runs: Columns, names: list[str], histories: RunBatc
     if history.reactions is None:
         return
     share = np.asarray(histories.columns["guide_share"])
-    gears = gear_figures.gear_runs(robot, history, status, share, which, names[:GEARS])
+    gears = gear_figures.gear_runs(robot, history, status, share, configuration_indices, names[:GEARS])
     # A ripple is of steady travel: the contacts have stopped sliding before the part that is looked at.
     ripples = [g for g, s in zip(gears, starts, strict=False) if s.gets_under_way and g.settled_since(s.slipping)]
     if ripples:
@@ -206,9 +206,9 @@ def _power_chain(robot: Robot, runs: Columns, names: Sequence[str]) -> Iterable[
 
     chain = np.flatnonzero(power_figures.drawable_runs(runs) & np.isin(runs["status"], words.SETTLED))[:CHAINS]
     if not chain.size:
-        none = "No run ends in steady travel." if robot.has_ground else "No run ends turning steadily."
+        no_run_sentence = "No run ends in steady travel." if robot.has_ground else "No run ends turning steadily."
         unknown = [] if robot.knows(VOLTAGE) else capabilities.unknown_numbers_sentence(robot)
-        yield Note(f"{'. '.join(unknown).capitalize()}." if unknown else none)
+        yield Note(f"{'. '.join(unknown).capitalize()}." if unknown else no_run_sentence)
         return
     if len(chain) < len(names):
         yield catalogue.note("runs.chains", len(chain), len(names), CHAINS)
@@ -222,10 +222,10 @@ def _drive_chart(robot: Robot, runs: Columns) -> Iterable[Block]:
     from sweeps.pages import power_figures
 
     supply = runs.get("supply_voltage_V", np.full(len(runs["status"]), np.nan))
-    used = np.isin(runs["status"], words.SETTLED) & (supply > 0) & (runs["theoretical_speed_mm_s"] > 0)
-    if used.any() and robot.knows(VOLTAGE) and np.isfinite(runs["total_current_A"][used]).all():
-        points = power_figures.operating_points(robot, {key: value[used] for key, value in runs.items()})
-        voltages = np.unique(supply[used])[-3:].tolist()
+    is_drawn = np.isin(runs["status"], words.SETTLED) & (supply > 0) & (runs["theoretical_speed_mm_s"] > 0)
+    if is_drawn.any() and robot.knows(VOLTAGE) and np.isfinite(runs["total_current_A"][is_drawn]).all():
+        points = power_figures.operating_points(robot, {key: value[is_drawn] for key, value in runs.items()})
+        voltages = np.unique(supply[is_drawn])[-3:].tolist()
         yield catalogue.figure("run.drive_chart", robot, voltages, points)
 
 
@@ -265,7 +265,7 @@ def limits_used(robot: Robot, run: Json) -> list[Json]:
 def inrush_limit(robot: Robot, on_battery: bool) -> float | None:
     """Largest current of the driver, or of the battery less other consumers, for all motors [A]. None: not stated."""
     most, battery = float(robot.driver.current_limit), robot.battery
-    stated = [float(robot.sides) * most] if most < float(type(robot.driver)().current_limit) else []
+    limits = [float(robot.sides) * most] if most < float(type(robot.driver)().current_limit) else []
     if on_battery and battery.current_limit is not None:
-        stated.append(battery.current_limit - float(battery.current_other))
-    return min(stated, default=None)
+        limits.append(battery.current_limit - float(battery.current_other))
+    return min(limits, default=None)

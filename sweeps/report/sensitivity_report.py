@@ -136,14 +136,14 @@ def _next_runs(found: SensitivityResult, n: NextRuns) -> Iterable[Block]:
     ]
     yield catalogue.table("sensitivity.next-runs", rows, imposed, *ground)
     yield catalogue.figure("sensitivity.next_runs", n, found)
-    left = []
+    runs_left = []
     for name, sds in n.output_sd.items():
         row = found.outputs[name].row
         if np.isfinite(sds).all() and sds[0] > 0:
             unit = "" if row.unit_shown == "-" else f" {row.unit_shown}"
             ends = sds[0] / row.factor, sds[-1] / row.factor
-            left.append((row.label, *(f"±{_two_digits(sd)}{unit}" for sd in ends), 100 * ends[1] / ends[0]))
-    yield catalogue.table("sensitivity.left", left)
+            runs_left.append((row.label, *(f"±{_two_digits(sd)}{unit}" for sd in ends), 100 * ends[1] / ends[0]))
+    yield catalogue.table("sensitivity.left", runs_left)
     yield catalogue.note("sensitivity.first-order")
 
 

@@ -27,11 +27,11 @@ def settle_document(found: Settled, few: str = "", notes: Names = ()) -> Documen
     next_step = Note("Next: `mmrjax loop settled.csv` with the same `--robot`.", "lead")
     next_step = Note(few, "lead", "few", terminal=True) if few else next_step
     all_remarks = (*words.settle_remarks(found), *notes)
-    left = words.left_out(found.stretches, bool(few))
+    omitted = words.left_out(found.stretches, bool(few))
     log = catalogue.figure("settle.log", found, finding=words.settle_statement(found))
     sections = [Section("Over the log", (log,))]
-    if left:
-        sections.append(Section("Left out", (catalogue.table("settle.left", left),)))
+    if omitted:
+        sections.append(Section("Left out", (catalogue.table("settle.left", omitted),)))
     levels = Note(words.levels_and_samples(found), "key")
     settled = Section("Settled runs", (_settled(found), levels, catalogue.note("settle.sds")))
     return Document(

@@ -115,9 +115,9 @@ _DESIGNS = "The best design, and the best designs with other parts, with the mak
 
 def size_document(found: SizeResult, robot_name: str) -> Document:
     """The report of a sizing that started from a robot of that name."""
-    s, wanted = found.sizing, ", ".join(OBJECTIVES[name][1] for name in found.objectives)
+    s, objective_words = found.sizing, ", ".join(OBJECTIVES[name][1] for name in found.objectives)
     lead = (
-        f"Requirements: **{found.asked.source}**. Starting from: **{robot_name}**. Minimised: **{wanted}**. "
+        f"Requirements: **{found.asked.source}**. Starting from: **{robot_name}**. Minimised: **{objective_words}**. "
         f"{s.starts} searches evaluated {s.evaluated:,} designs."
     )
     best = () if s.best is None else (s.best, *s.alternatives)

@@ -23,8 +23,10 @@ def sweep_document(file: RobotFile, model: str, runs: Columns, notes: Sequence[s
     shown_runs = capabilities.drop_inapplicable_columns(file.robot, runs)
     statuses = Counter(map(str, runs["status"]))
     statuses_known = [*words.STATUSES, *(statuses.keys() - words.STATUSES.keys())]
-    over = {s: int(((runs["status"] == s) & (runs["flags"] != "")).sum()) for s in statuses_known}
-    where = {s: "" if s in words.SETTLED else _ranges_of_runs(runs, runs["status"] == s) for s in statuses_known}
+    flagged_by_status = {s: int(((runs["status"] == s) & (runs["flags"] != "")).sum()) for s in statuses_known}
+    ranges_by_status = {
+        s: "" if s in words.SETTLED else _ranges_of_runs(runs, runs["status"] == s) for s in statuses_known
+    }
     maps = []
     for c in file.robot.channels:
         labels = c.label.capitalize(), c.unit
@@ -37,7 +39,9 @@ def sweep_document(file: RobotFile, model: str, runs: Columns, notes: Sequence[s
         sweep_answer(runs),
         (
             run_tables.lead_note(file, model, f"Varied: {axes}."),
-            run_tables.endings_table({s: statuses[s] for s in statuses_known}, beyond_a_limit=over, where=where),
+            run_tables.endings_table(
+                {s: statuses[s] for s in statuses_known}, beyond_a_limit=flagged_by_status, where=ranges_by_status
+            ),
             _limits(runs),
             _extremes(shown_runs, extremes),
             *remarks(notes),
@@ -50,27 +54,27 @@ def sweep_answer(runs: Columns) -> str:
     """One sentence: runs that have an operating point, and how many of them stay within every limit."""
     total = len(runs["status"])
     settled = np.isin(runs["status"], words.SETTLED)
-    over = settled & (runs["flags"] != "")
+    is_flagged = settled & (runs["flags"] != "")
     verb = "has" if 1 in (total, settled.sum()) else "have"
     first = f"{settled.sum()} of {count_noun(total, 'run')} {verb} an operating point"
-    if not over.any():
+    if not is_flagged.any():
         return f"{first}; all within every limit." if settled.any() else f"{first}."
-    raised = Counter(flag for flags in runs["flags"][over] for flag in str(flags).split(";"))
+    raised = Counter(flag for flags in runs["flags"][is_flagged] for flag in str(flags).split(";"))
     most, times = raised.most_common(1)[0]
     return (
-        f"{first}; {over.sum()} of them {'exceeds' if over.sum() == 1 else 'exceed'} a limit, most often: "
-        f"{words.FLAGS.get(most, most)} ({count_noun(times, 'run')})."
+        f"{first}; {is_flagged.sum()} of them {'exceeds' if is_flagged.sum() == 1 else 'exceed'} a limit, most "
+        f"often: {words.FLAGS.get(most, most)} ({count_noun(times, 'run')})."
     )
 
 
 def _limits(runs: Columns) -> Table:
     """Limits that some runs exceed, with the number of runs and their places."""
-    kinds, which = np.unique(runs["flags"], return_inverse=True)
+    kinds, flag_index = np.unique(runs["flags"], return_inverse=True)
     rows = []
     for flag, meaning in words.FLAGS.items():
-        over = np.array([flag in str(f).split(";") for f in kinds])[which]
-        if over.any():
-            rows.append((f"{meaning} (`{flag}`)", int(over.sum()), _ranges_of_runs(runs, over)))
+        is_flagged = np.array([flag in str(f).split(";") for f in kinds])[flag_index]
+        if is_flagged.any():
+            rows.append((f"{meaning} (`{flag}`)", int(is_flagged.sum()), _ranges_of_runs(runs, is_flagged)))
     return catalogue.table("sweep.limits", rows)
 
 

@@ -34,10 +34,10 @@ def of_npz(path: Path, name: str) -> tuple[Signal, ...]:
     archive = zipfile.ZipFile(path)  # stays open with its directory until no signal needs it
     input_files.check_declared(name, len(archive.namelist()))
     for member in archive.namelist():
-        where = PurePosixPath(member.replace("\\", "/"))
-        if where.is_absolute() or ".." in where.parts:
+        member_path = PurePosixPath(member.replace("\\", "/"))
+        if member_path.is_absolute() or ".." in member_path.parts:
             raise BadData(f"{name}, {member}: is a path that points outside the archive; expected names of arrays")
-        if where.suffix != ".npy":
+        if member_path.suffix != ".npy":
             continue
         array = member.removesuffix(".npy")
         if array in arrays:
@@ -120,10 +120,10 @@ def _structure_fields(path: str, value: np.ndarray) -> list[tuple[str, np.ndarra
     if value.dtype.names is None:
         return [(path, value)]
     fields: list[tuple[str, np.ndarray]] = []
-    for k, each in enumerate(np.ravel(value)):
+    for k, element in enumerate(np.ravel(value)):
         place = path if value.size == 1 else f"{path}[{k}]"
         for field in value.dtype.names:
-            fields += _structure_fields(f"{place}.{field}", np.asarray(each[field]))
+            fields += _structure_fields(f"{place}.{field}", np.asarray(element[field]))
     return fields
 
 
@@ -174,23 +174,23 @@ def _add_group(
     for key in group:
         if not _inside(group, key, name):
             continue
-        item, here = group[key], f"{at}/{key}"
+        item, item_path = group[key], f"{at}/{key}"
         if isinstance(item, h5py.Group):
-            _add_group(item, here, name, arrays, units, path, matlab, h5py, seen)
+            _add_group(item, item_path, name, arrays, units, path, matlab, h5py, seen)
             continue
         if not isinstance(item, h5py.Dataset) or item.shape is None:
             continue
         if item.external or item.is_virtual:
             raise BadData(
-                f"{name}, {here}: its values are in another file; expected data in this file; copy them into it"
+                f"{name}, {item_path}: its values are in another file; expected data in this file; copy them into it"
             )
         words = h5py.check_string_dtype(item.dtype) is not None
         char = matlab and item.attrs.get("MATLAB_class") == b"char"
         dtype = np.dtype(f"U{item.dtype.itemsize}") if words or char else item.dtype
         shape = item.shape[::-1] if matlab else item.shape
-        arrays[here] = (shape, dtype, _dataset(path, here, words, char, matlab))
-        stated = next((item.attrs[key] for key in ("unit", "units", "Unit", "Units") if key in item.attrs), "")
-        units[here] = stated.decode("utf-8", "replace") if isinstance(stated, bytes) else str(stated)
+        arrays[item_path] = (shape, dtype, _dataset(path, item_path, words, char, matlab))
+        unit = next((item.attrs[key] for key in ("unit", "units", "Unit", "Units") if key in item.attrs), "")
+        units[item_path] = unit.decode("utf-8", "replace") if isinstance(unit, bytes) else str(unit)
 
 
 def _dataset(path: Path, at: str, words: bool, char: bool, matlab: bool) -> Load:

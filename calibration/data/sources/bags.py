@@ -119,20 +119,20 @@ def _topic_values(path: Path, topic: str) -> Columns:
     with _opened(path) as reader:
         connections = [c for c in reader.connections if c.topic == topic]
         names: list[str] | None = None
-        for connection, at, raw in reader.messages(connections=connections):
+        for connection, instant, raw in reader.messages(connections=connections):
             message = reader.deserialize(raw, connection.msgtype)
             values = dict(_values(message, ""))
             if names is None:
                 names = list(values)
             if len(values) != len(names):
-                where = next((n for n in (*names, *values) if (n in values) != (n in names)), "")
+                odd_name = next((n for n in (*names, *values) if (n in values) != (n in names)), "")
                 longer = len(values) > len(names)
                 raise BadData(
-                    f"{path.name}, {topic}.{where}: message {len(rows) + 1} has {'more' if longer else 'fewer'} "
+                    f"{path.name}, {topic}.{odd_name}: message {len(rows) + 1} has {'more' if longer else 'fewer'} "
                     "elements than the first; expected arrays of one length in every message"
                 )
             rows.append(tuple(values[n] for n in names if n in values))
-            recorded.append(at)
+            recorded.append(instant)
     columns = {n: np.array(column) for n, column in zip(names or [], zip(*rows, strict=True), strict=True)}
     stamps = columns.pop(_STAMP, None)
     received = np.array(recorded, np.int64)
@@ -152,18 +152,18 @@ def _values(message: Any, at: str) -> Iterator[tuple[str, Any]]:
         if field.startswith("__"):
             continue
         value = getattr(message, field)
-        here = f"{at}.{field}" if at else field
+        field_path = f"{at}.{field}" if at else field
         if hasattr(value, "sec") and hasattr(value, "nanosec"):
-            yield here, value.sec * 1_000_000_000 + value.nanosec
+            yield field_path, value.sec * 1_000_000_000 + value.nanosec
         elif hasattr(value, "__dataclass_fields__"):
-            yield from _values(value, here)
+            yield from _values(value, field_path)
         elif isinstance(value, list | tuple | np.ndarray):
             if len(value) > ELEMENTS:
                 continue
-            for k, each in enumerate(value):
-                if hasattr(each, "__dataclass_fields__"):
-                    yield from _values(each, f"{here}[{k}]")
+            for k, element in enumerate(value):
+                if hasattr(element, "__dataclass_fields__"):
+                    yield from _values(element, f"{field_path}[{k}]")
                 else:
-                    yield f"{here}[{k}]", each
+                    yield f"{field_path}[{k}]", element
         else:
-            yield here, value
+            yield field_path, value

@@ -101,8 +101,8 @@ def _signals(field: Any, rows: int, load: Load, read: Callable[[list[str]], Any]
 def _signal(field: Any, rows: int, load: Load) -> Signal:
     import pyarrow.types as kinds
 
-    kind, stated = field.type, field.metadata or {}
-    unit = next((stated[key].decode("utf-8", "replace") for key in _UNITS if key in stated), "")
+    kind, metadata = field.type, field.metadata or {}
+    unit = next((metadata[key].decode("utf-8", "replace") for key in _UNITS if key in metadata), "")
     if kinds.is_dictionary(kind):
         kind = kind.value_type
     words = kinds.is_string(kind) or kinds.is_large_string(kind) or kinds.is_string_view(kind)

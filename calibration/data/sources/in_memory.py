@@ -37,8 +37,8 @@ def of_object(source: Any) -> tuple[str, tuple[Signal, ...]]:
         signals = []
         for level in range(source.index.nlevels):
             index = source.index.get_level_values(level)
-            named = index.name is not None or index.dtype.kind in "mM"
-            if named:
+            has_named_index = index.name is not None or index.dtype.kind in "mM"
+            if has_named_index:
                 signals.append(_of_series(str(index.name or "time"), index, len(source)))
         signals += [
             _of_series(
@@ -69,7 +69,7 @@ def of_object(source: Any) -> tuple[str, tuple[Signal, ...]]:
         )
     if isinstance(source, Mapping):
         return "the dict", json_records.of_content(source, "the dict")
-    if isinstance(source, list | tuple) and source and all(isinstance(each, Mapping) for each in source):
+    if isinstance(source, list | tuple) and source and all(isinstance(item, Mapping) for item in source):
         return "the records", json_records.of_content(list(source), "the records")
     raise BadData(f"the source: got {_called(source)}; expected {EXPECTED}")
 
@@ -88,7 +88,7 @@ def _of_series(name: str, series: Any, rows: int) -> Signal:
         return Signal(name, rows, lambda: np.asarray(series.to_numpy(dtype=f"{kind}8[ns]")))
     words = str(dtype) in ("str", "string", "category") or str(dtype).startswith("string")
     if kind == "O" and not words:
-        kinds = {type(value) for value, lost in zip(series, series.isna(), strict=True) if not lost}
+        kinds = {type(value) for value, is_missing in zip(series, series.isna(), strict=True) if not is_missing}
         if kinds and kinds <= {str}:
             words = True
         elif kinds and not kinds <= {int, float, bool, np.float64, np.int64}:
@@ -99,7 +99,9 @@ def _of_series(name: str, series: Any, rows: int) -> Signal:
 
 
 def _words(series: Any) -> Load:
-    return lambda: np.array(["" if lost else str(value) for value, lost in zip(series, series.isna(), strict=True)])
+    return lambda: np.array(
+        ["" if is_missing else str(value) for value, is_missing in zip(series, series.isna(), strict=True)]
+    )
 
 
 def _of_xarray(dataset: Any) -> tuple[Signal, ...]:

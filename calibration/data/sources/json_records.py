@@ -96,7 +96,7 @@ def _collect(value: Any, at: str, arrays: Columns, name: str, depth: int) -> Non
             _collect(inner, f"{at}.{key}" if at else str(key), arrays, name, depth + 1)
         _add_time(value, at, arrays)
     elif isinstance(value, Sequence) and not isinstance(value, str | bytes):
-        if value and all(isinstance(each, Mapping) for each in value):
+        if value and all(isinstance(item, Mapping) for item in value):
             _columns_of_records(value, at, arrays, name)
         elif value:
             arrays[at or "values"] = _array(value)
@@ -156,14 +156,15 @@ def _columns_of_episodes(records: Sequence[Mapping[str, Any]]) -> Columns | None
     A text that differs in every record names the runs, else their number does.
     """
     lists = [{key: v for key, v in record.items() if isinstance(v, list) and v} for record in records]
-    lengths = [{len(v) for v in each.values()} for each in lists]
-    flat = all(not isinstance(x, list | Mapping) for each in lists for v in each.values() for x in v[:1])
+    lengths = [{len(v) for v in episode.values()} for episode in lists]
+    flat = all(not isinstance(x, list | Mapping) for episode in lists for v in episode.values() for x in v[:1])
     if not flat or any(
-        len(n) != 1 or max(n) < 2 or each.keys() != lists[0].keys() for n, each in zip(lengths, lists, strict=True)
+        len(n) != 1 or max(n) < 2 or episode.keys() != lists[0].keys()
+        for n, episode in zip(lengths, lists, strict=True)
     ):
         return None
     rows = [n.pop() for n in lengths]
-    columns = {key: _array([x for each in lists for x in each[key]]) for key in lists[0]}
+    columns = {key: _array([x for episode in lists for x in episode[key]]) for key in lists[0]}
     single = [key for key in records[0] if all(isinstance(r.get(key), str | int | float) for r in records)]
     texts = {key: [str(record[key]) for record in records] for key in single if isinstance(records[0][key], str)}
     names = next((v for v in texts.values() if len({*v}) == len(v)), [str(k) for k in range(1, len(records) + 1)])
@@ -175,11 +176,11 @@ def _leaves(record: Mapping[str, Any], at: str, name: str, depth: int) -> Iterab
     if depth > DEEPEST:
         raise BadData(f"{name}, {at}: is nested too deeply; expected at most {DEEPEST} levels")
     for key, value in record.items():
-        here = f"{at}.{key}" if at else str(key)
+        key_path = f"{at}.{key}" if at else str(key)
         if isinstance(value, Mapping):
-            yield from _leaves(value, here, name, depth + 1)
+            yield from _leaves(value, key_path, name, depth + 1)
         else:
-            yield here, value
+            yield key_path, value
 
 
 def _array(values: Sequence[Any]) -> np.ndarray:

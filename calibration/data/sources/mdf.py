@@ -26,9 +26,9 @@ def of_mdf(path: Path, name: str) -> tuple[Signal, ...]:
             for j, channel in enumerate(group.channels):
                 if j == master:
                     continue
-                at = channel.name if count[channel.name] == 1 else f"{title}/{channel.name}"
+                channel_path = channel.name if count[channel.name] == 1 else f"{title}/{channel.name}"
                 unit = file.get_channel_unit(group=k, index=j) or ""
-                signals.append(Signal(at, rows, _column(path, k, j), unit, clock))
+                signals.append(Signal(channel_path, rows, _column(path, k, j), unit, clock))
     clocks = {id(s.clock) for s in signals}
     if len(clocks) == 1 and signals and signals[0].clock is not None:  # a table
         time = signals[0].clock
@@ -58,10 +58,10 @@ def _close_half_made(error: BaseException) -> None:
     """Marks the object of a file that could not be opened as closed. Closing it would print an error on stderr."""
     frame = error.__traceback__
     while frame is not None:
-        for held in frame.tb_frame.f_locals.values():
-            if type(held).__module__.startswith("asammdf.") and hasattr(held, "_closed"):
-                held._closed = True
-                if (temporary := getattr(held, "_tempfile", None)) is not None:
+        for local_value in frame.tb_frame.f_locals.values():
+            if type(local_value).__module__.startswith("asammdf.") and hasattr(local_value, "_closed"):
+                local_value._closed = True
+                if (temporary := getattr(local_value, "_tempfile", None)) is not None:
                     temporary.close()
         frame = frame.tb_next
 

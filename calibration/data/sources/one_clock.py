@@ -49,18 +49,21 @@ def clock_seconds(clock: Clock) -> Elapsed:
         BadData: a time stamp that is missing or infinite.
     """
     raw = np.asarray(clock.load())
-    if (lost := np.flatnonzero(~np.isfinite(raw))).size:
-        raise BadData(f"{clock.name}: got {raw[lost[0]]} at sample {lost[0] + 1}; expected a time in every sample")
+    if (missing_rows := np.flatnonzero(~np.isfinite(raw))).size:
+        raise BadData(
+            f"{clock.name}: got {raw[missing_rows[0]]} at sample {missing_rows[0] + 1}; expected a time in every "
+            "sample"
+        )
     if raw.dtype.kind in "Mm":
-        whole = raw.astype("datetime64[ns]" if raw.dtype.kind == "M" else "timedelta64[ns]").astype(np.int64)
-        return Elapsed((whole - whole[:1]) * 1e-9, float(whole[0]) * 1e-9, "")
+        ticks = raw.astype("datetime64[ns]" if raw.dtype.kind == "M" else "timedelta64[ns]").astype(np.int64)
+        return Elapsed((ticks - ticks[:1]) * 1e-9, float(ticks[0]) * 1e-9, "")
     if raw.dtype.kind in "iu":
         raw = raw.astype(np.int64)
     unit, period = clock.unit or guessed_unit(raw), 0.0
     if (np.diff(raw) < 0).any():
         raw, period = unwrap_counter(raw.astype(float), np.zeros(len(raw), int))
-    one = UNITS[unit]
-    return Elapsed((raw - raw[:1]) * one, float(raw[0]) * one, unit, period)
+    seconds_per_unit = UNITS[unit]
+    return Elapsed((raw - raw[:1]) * seconds_per_unit, float(raw[0]) * seconds_per_unit, unit, period)
 
 
 def guessed_unit(raw: np.ndarray) -> str:
@@ -121,16 +124,16 @@ def on_one_grid(
     for key, time in times.items():
         _check(name, clocks[key].name, time)
     measured = {id(s.clock) for column, s in chosen.items() if is_measured(column)}
-    stated = [key for key, clock in clocks.items() if grid and clock.name == grid]
-    pool = stated or sorted(measured or times, key=lambda key: _step(times[key]))
+    grid_clocks = [key for key, clock in clocks.items() if grid and clock.name == grid]
+    pool = grid_clocks or sorted(measured or times, key=lambda key: _step(times[key]))
     main = pool[0]
     rows = times[main]
-    held = {column for column in chosen if is_held(column)}
-    starts = [times[id(chosen[column].clock)][0] for column in held]
+    step_columns = {column for column in chosen if is_held(column)}
+    starts = [times[id(chosen[column].clock)][0] for column in step_columns]
     alike = SAME * min(_step(rows), 1.0)
-    kept = rows >= max(starts, default=-np.inf) - alike
+    is_covered = rows >= max(starts, default=-np.inf) - alike
     for key, time in times.items():
-        if time[-1] < rows[kept][0] if kept.any() else True:
+        if time[-1] < rows[is_covered][0] if is_covered.any() else True:
             raise BadData(
                 f"{name}: {clocks[key].name} ends at {time[-1]:g} s, before {clocks[main].name} and every command "
                 "have begun; expected signals that overlap in time"
@@ -138,17 +141,17 @@ def on_one_grid(
     values: Columns = {}
     brought: dict[str, list[str]] = {}
     for column, signal in chosen.items():
-        own, key, sorted_by = signal.load(), same[id(signal.clock)], order[id(signal.clock)]
-        own = own if sorted_by is None else own[sorted_by]
+        signal_values, key, sorted_by = signal.load(), same[id(signal.clock)], order[id(signal.clock)]
+        signal_values = signal_values if sorted_by is None else signal_values[sorted_by]
         if key == same[main]:
-            values[column] = own[kept]
+            values[column] = signal_values[is_covered]
             continue
-        on = rows[kept]
-        if column in held or own.dtype.kind not in "biuf":
-            values[column] = own[np.maximum(np.searchsorted(times[key], on + alike, side="right") - 1, 0)]
+        on = rows[is_covered]
+        if column in step_columns or signal_values.dtype.kind not in "biuf":
+            values[column] = signal_values[np.maximum(np.searchsorted(times[key], on + alike, side="right") - 1, 0)]
             brought.setdefault("held", []).append(column)
         else:
-            values[column] = used_once(on, times[key], own)
+            values[column] = used_once(on, times[key], signal_values)
             brought.setdefault("interpolated", []).append(column)
     notes = []
     if brought:
@@ -156,13 +159,13 @@ def on_one_grid(
             "held": "held from sample to sample",
             "interpolated": "interpolated linearly between samples, each used once",
         }
-        each = "; ".join(f"{', '.join(columns)} {how[kind]}" for kind, columns in brought.items())
+        kind_sentences = "; ".join(f"{', '.join(columns)} {how[kind]}" for kind, columns in brought.items())
         notes.append(
             f"{name}: signals have different clocks; rows are taken at the samples of {clocks[main].name} "
-            f"({_rate(rows)}): {each}"
+            f"({_rate(rows)}): {kind_sentences}"
         )
-    if not kept.all():
-        notes.append(f"{name}: {np.count_nonzero(~kept)} rows before the first command are left out")
+    if not is_covered.all():
+        notes.append(f"{name}: {np.count_nonzero(~is_covered)} rows before the first command are left out")
     for key, clock in clocks.items():
         unit, period = read[key].unit, read[key].period
         if key in late:
@@ -173,7 +176,7 @@ def on_one_grid(
             notes.append(f"{name}: {clock.name} wraps at {period:.10g}; counted on from there")
         if not clock.unit and unit not in ("", "s"):
             notes.append(f"{name}: {clock.name} has no unit; its numbers are read as {unit} ({_rate(times[key])})")
-    on = rows[kept]
+    on = rows[is_covered]
     return on - on[0], values, tuple(notes)
 
 

@@ -130,9 +130,9 @@ def format_of(path: Path, name: str) -> Format | None:
                 f"recording, as {path / parts[0]}"
             )
     begin = input_files.first_bytes(path, name)
-    for magic, found in BEGINNINGS.items():
+    for magic, format_name in BEGINNINGS.items():
         if begin.startswith(magic):
-            return found
+            return format_name
     if begin.startswith(b"PK\x03\x04") and (kind := _kind_of_zip(path)) is not None:
         return kind
     if any(text.match(begin) for text, word in input_files.TEXTS.items() if word == "JSON"):
@@ -171,8 +171,8 @@ def open_signals(path: Path, within: str, name: str, form: Format) -> Source:
     signals = tuple(form.signals(path, name))
     if not signals:
         raise BadData(f"{name}: is {form.kind} without signals; expected at least one column or array")
-    held = sum(file.stat().st_size for file in _files_of_folder(path))
-    source = checked_source(name, form.kind, signals, held, source_digest(path))
+    byte_count = sum(file.stat().st_size for file in _files_of_folder(path))
+    source = checked_source(name, form.kind, signals, byte_count, source_digest(path))
     return source.below(within) if within else source
 
 
@@ -212,12 +212,12 @@ def _guarded_signals(signals: Sequence[Signal], name: str, kind: str) -> tuple[S
     their values. Shared clocks stay shared."""
 
     def guarded(load: Load, path: str, signal: Signal, refused: str = "") -> Load:
-        where = f"{name}, {path}"
+        signal_place = f"{name}, {path}"
 
         def read() -> np.ndarray:
             if refused:
-                raise BadData(f"{where}: {refused}")
-            input_files.check_memory(where, signal.size or input_files.VALUE * signal.length)
+                raise BadData(f"{signal_place}: {refused}")
+            input_files.check_memory(signal_place, signal.size or input_files.VALUE * signal.length)
             try:
                 values = load()
                 why = refused_type(values.dtype)
@@ -225,10 +225,10 @@ def _guarded_signals(signals: Sequence[Signal], name: str, kind: str) -> tuple[S
             except InputError:
                 raise
             except Exception as error:  # each library has errors of its own
-                raise unreadable_file(where, kind, error) from error
+                raise unreadable_file(signal_place, kind, error) from error
             if why or len(values) != signal.length:
                 why = why or f"has {len(values)} of the {signal.length} values that it declares; it may be damaged"
-                raise BadData(f"{where}: {why}")
+                raise BadData(f"{signal_place}: {why}")
             return values
 
         return read

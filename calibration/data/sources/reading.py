@@ -152,7 +152,7 @@ def _of_table(arrays: NamedArrays, layout: Layout, columns: Preset | None) -> Re
         return any(cell not in ("", "0") for cell in by_name[name])
 
     mapped, notes = columns.mapped(lambda name: name if name in by_name else None, has_readings)
-    if arrays.header and not any(theirs in by_name for _, theirs, _ in mapped):
+    if arrays.header and not any(pattern in by_name for _, pattern, _ in mapped):
         raise _none_of(arrays.name, columns, arrays.header)
     columns.check_needed(mapped, layout.imposed_column, arrays.name)
     notes = (*arrays.notes, *notes, *weakened_field_notes(columns, by_name))
@@ -171,24 +171,24 @@ def weakened_field_notes(preset: Preset, values: Mapping[str, Raw]) -> Names:
     """
     notes = []
     for column in preset.columns:
-        theirs = next((name for name in column.theirs if name in values), None)
-        if theirs is not None and column.across in values:
-            q, d = (np.sqrt(np.nanmean(column_numbers(values[c]) ** 2)) for c in (theirs, column.across))
+        column_name = next((name for name in column.theirs if name in values), None)
+        if column_name is not None and column.across in values:
+            q, d = (np.sqrt(np.nanmean(column_numbers(values[c]) ** 2)) for c in (column_name, column.across))
             if d > WEAKENED * q:
                 notes.append(
-                    f"{preset.name}: {column.across} is {d / q:.0%} of {theirs}. The motor runs with field "
+                    f"{preset.name}: {column.across} is {d / q:.0%} of {column_name}. The motor runs with field "
                     "weakening there, which a DC motor model does not cover; leave those rows out"
                 )
     return tuple(notes)
 
 
 def _none_of(name: str, columns: Preset, header: Sequence[str]) -> BadData:
-    wanted = ", ".join(column.theirs[0] for column in columns.columns[:6]) + (
+    pattern_words = ", ".join(column.theirs[0] for column in columns.columns[:6]) + (
         ", ..." if len(columns.columns) > 6 else ""
     )
     has = ", ".join(header[:8]) + (", ..." if len(header) > 8 else "")
     return BadData(
-        f"{name}: has none of the columns of {columns.name} ({wanted}), but {has}; correct the names, "
+        f"{name}: has none of the columns of {columns.name} ({pattern_words}), but {has}; correct the names, "
         "or choose another preset"
     )
 
@@ -202,33 +202,36 @@ def _of_signals(source: Source, layout: Layout, columns: Preset | None, between:
         return matches[0].path if "*" in name and len(matches) == 1 else name if matches else None
 
     mapped, notes = ((), ()) if columns is None else columns.mapped(found)
-    if columns is not None and not any(found(theirs) for _, theirs, _ in mapped):
+    if columns is not None and not any(found(pattern) for _, pattern, _ in mapped):
         raise _none_of(source.name, columns, [s.path for s in signals])
     if columns is not None:
         columns.check_needed(mapped, layout.imposed_column, source.name)
     mapped = presets_file.merge_columns(mapped, layout.mapped)
-    chosen, clock, missing = _chosen_signals(source, mapped, layout)
-    for column, signal in chosen.items():
+    signals_by_column, clock, missing = _chosen_signals(source, mapped, layout)
+    for column, signal in signals_by_column.items():
         if signal.refused:
             raise BadData(
                 f"{source.name}, {signal.path}: {signal.refused}"
                 + ("" if column == signal.path else f" (read as {column})")
             )
-    timed = [s for s in chosen.values() if s.clock is not None]
-    extras = _extra_columns(source, chosen, timed)
-    size = input_files.VALUE * sum(s.length for s in (*chosen.values(), *extras.values()))
+    timed = [s for s in signals_by_column.values() if s.clock is not None]
+    extras = _extra_columns(source, signals_by_column, timed)
+    size = input_files.VALUE * sum(s.length for s in (*signals_by_column.values(), *extras.values()))
     input_files.check_memory(source.name, size)
     if columns is not None:
-        chosen = {name: _decoded_signal(columns.column_of(name), signal) for name, signal in chosen.items()}
+        signals_by_column = {
+            name: _decoded_signal(columns.column_of(name), signal) for name, signal in signals_by_column.items()
+        }
     if timed:
-        values, more = _on_a_grid(source, chosen, layout, between, clock, mapped)
+        values, more = _on_a_grid(source, signals_by_column, layout, between, clock, mapped)
     else:
-        values, more = _in_rows(source, chosen), ()
+        values, more = _in_rows(source, signals_by_column), ()
         values |= _in_rows(source, extras, len(next(iter(values.values()), [])))
     if columns is not None:
         notes = (*notes, *weakened_field_notes(columns, values))
     units = tuple(
-        quantities.unit_in_column(next((s.unit for c, s in chosen.items() if c == name), "")) for name in values
+        quantities.unit_in_column(next((s.unit for c, s in signals_by_column.items() if c == name), ""))
+        for name in values
     )
     arrays = NamedArrays(
         source.name,
@@ -247,26 +250,26 @@ def _chosen_signals(source: Source, mapped: Mapped, layout: Layout) -> tuple[dic
 
     A signal has a column if a table of columns names it, or if the last part of its path is a column's name.
     """
-    chosen: dict[str, Signal] = {}
+    signals_by_column: dict[str, Signal] = {}
     clock, missing = "", []
     clocks = {s.clock.name for s in source.signals if s.clock is not None}
-    for mine, theirs, _ in mapped:
-        meant = {s.path for s in matching_signals(source.signals, theirs)}
-        if theirs in clocks or (meant and meant <= clocks):  # several: each signal has its own
-            clock = theirs if theirs in clocks else meant.pop() if len(meant) == 1 else ""
+    for own_column, pattern, _ in mapped:
+        meant = {s.path for s in matching_signals(source.signals, pattern)}
+        if pattern in clocks or (meant and meant <= clocks):  # several: each signal has its own
+            clock = pattern if pattern in clocks else meant.pop() if len(meant) == 1 else ""
         elif meant:
-            chosen[theirs] = find_signal(source.signals, theirs, source.name)
+            signals_by_column[pattern] = find_signal(source.signals, pattern, source.name)
         else:
-            near = suggested_paths(theirs, [s.path for s in source.signals])
-            missing.append(f"{source.name}: no signal {theirs}, from which {mine} is read; {near}")
+            near = suggested_paths(pattern, [s.path for s in source.signals])
+            missing.append(f"{source.name}: no signal {pattern}, from which {own_column} is read; {near}")
     spellings = dataclasses.replace(layout, channels=channels.EVERY, mapped=()).spellings()
     spelled = {name.casefold() for name in spellings}
-    taken = {id(signal) for signal in chosen.values()}
+    used_signals = {id(signal) for signal in signals_by_column.values()}
     for signal in source.signals:
         vague = signal.clock is not None and signal.name in (*WORDS, *WHEN)  # a topic's mode is something else
-        if signal.name.casefold() in spelled and id(signal) not in taken and not vague:
-            chosen.setdefault(signal.name, signal)
-    return chosen, clock, tuple(missing)
+        if signal.name.casefold() in spelled and id(signal) not in used_signals and not vague:
+            signals_by_column.setdefault(signal.name, signal)
+    return signals_by_column, clock, tuple(missing)
 
 
 def _decode_raw_numbers(column: PresetColumn, raw: Raw) -> Raw:
@@ -287,10 +290,10 @@ def _decoded_signal(column: PresetColumn, signal: Signal) -> Signal:
 
 def _extra_columns(source: Source, chosen: Mapping[str, Signal], own: Sequence[Signal]) -> dict[str, Signal]:
     """Further columns of a table, as long as the chosen ones, if there are few values."""
-    taken = {id(signal) for signal in chosen.values()}
+    used_signals = {id(signal) for signal in chosen.values()}
     longest = max((s.length for s in source.signals), default=0)
     lengths = {s.length for s in chosen.values() if s.length > 1} or {longest}
-    others = [s for s in source.signals if id(s) not in taken and not s.refused and s.length in lengths]
+    others = [s for s in source.signals if id(s) not in used_signals and not s.refused and s.length in lengths]
     if own or sum(s.length for s in others) > EXTRA_VALUES:
         return {}
     return {s.path: s for s in others}
@@ -350,9 +353,9 @@ def _raw_values(values: np.ndarray) -> Raw:
     if values.dtype.kind in "US":
         return [str(value).strip() for value in values.tolist()]
     if values.dtype.kind == "M":  # dates are read as text; the clock counts from the first
-        whole, lost = values.astype("datetime64[ns]").astype(np.int64), np.isnat(values)
-        first = whole[~lost].min() if not lost.all() else 0
-        return np.where(lost, np.nan, (whole - first) * 1e-9)
+        ticks, is_missing = values.astype("datetime64[ns]").astype(np.int64), np.isnat(values)
+        first = ticks[~is_missing].min() if not is_missing.all() else 0
+        return np.where(is_missing, np.nan, (ticks - first) * 1e-9)
     if values.dtype.kind == "m":
         return np.where(np.isnat(values), np.nan, values.astype("timedelta64[ns]").astype(np.int64) * 1e-9)
     return values

@@ -129,8 +129,8 @@ def matching_signals(signals: Iterable[Signal], name: str) -> list[Signal]:
         return [s for s in pool if fnmatch.fnmatchcase(s.path, name)]
     if exact := [s for s in pool if s.path == name]:
         return exact
-    wanted = path_parts(name)
-    return [s for s in pool if path_parts(s.path)[-len(wanted) :] == wanted]
+    name_parts = path_parts(name)
+    return [s for s in pool if path_parts(s.path)[-len(name_parts) :] == name_parts]
 
 
 def find_signal(signals: Sequence[Signal], name: str, where: str) -> Signal:
@@ -143,9 +143,9 @@ def find_signal(signals: Sequence[Signal], name: str, where: str) -> Signal:
     if len(matches) == 1:
         return matches[0]
     if matches:
-        listed = ", ".join(s.path for s in matches[:8])
+        paths_text = ", ".join(s.path for s in matches[:8])
         raise BadData(
-            f"{where}, {name}: got a name of {len(matches)} signals, {listed}; expected the path of one of them"
+            f"{where}, {name}: got a name of {len(matches)} signals, {paths_text}; expected the path of one of them"
         )
     raise BadData(f"{where}, {name}: no such signal; {suggested_paths(name, [s.path for s in signals])}")
 
@@ -286,8 +286,10 @@ class Source:
         Raises:
             BadData: there are none.
         """
-        wanted = path_parts(prefix)
-        inside = tuple(s for s in self.signals if path_parts(s.path)[: len(wanted)] == wanted or s.path == prefix)
+        prefix_parts = path_parts(prefix)
+        inside = tuple(
+            s for s in self.signals if path_parts(s.path)[: len(prefix_parts)] == prefix_parts or s.path == prefix
+        )
         if not inside:
             groups = dict.fromkeys(parent_path(s.path).rstrip("/.") or s.path for s in self.signals)
             raise BadData(f"{self.name}::{prefix}: no such signal; {suggested_paths(prefix, list(groups))}")

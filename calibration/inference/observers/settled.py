@@ -75,8 +75,8 @@ class SettledLinearization(Linearization):
 
     def columns(self, balance: Scalar | int, shapes: Array | np.ndarray) -> Float[Array, "readings terms"]:
         of_sides = shapes.reshape(-1, self.rows, shapes.shape[1])
-        moved = self.of_sides(balance)[:, :, :, None] * of_sides[:, :, None, :]
-        return moved.sum(0).reshape(-1, shapes.shape[1])
+        changes = self.of_sides(balance)[:, :, :, None] * of_sides[:, :, None, :]
+        return changes.sum(0).reshape(-1, shapes.shape[1])
 
     def of_sides(self, balance: Scalar | int) -> Float[Array, "sides rows channels"]:
         """Change of the readings by a defect of a balance on each side. Identical sides are one."""
@@ -126,18 +126,18 @@ class SettledRuns(Observer):
 
     @classmethod
     def of(cls, runs: Runs, robot: Robot, fidelity: str | None = None) -> SettledRuns:
-        chosen = fidelities.get_fidelity(fidelity or "steady")
+        fidelity_facts = fidelities.get_fidelity(fidelity or "steady")
         conditions = runs.conditions(robot)
-        if conditions.held is not None and chosen.name != "steady":
+        if conditions.held is not None and fidelity_facts.name != "steady":
             raise BadConfiguration(
-                f"{runs.source}, held: got model {chosen.name}; expected steady, which has a clamp"
+                f"{runs.source}, held: got model {fidelity_facts.name}; expected steady, which has a clamp"
             )
-        if not chosen.facts.rollout:
+        if not fidelity_facts.facts.rollout:
             try:
-                chosen.check(robot, conditions, chosen.facts.resolved())
+                fidelity_facts.check(robot, conditions, fidelity_facts.facts.resolved())
             except ValueError as error:
                 raise BadConfiguration(f"{runs.source}, settled runs: {error}") from error
-        return cls(conditions, chosen.name)
+        return cls(conditions, fidelity_facts.name)
 
     @classmethod
     def sizes(cls, runs: Runs) -> np.ndarray:
@@ -240,9 +240,9 @@ class SettledRuns(Observer):
 
     def shown(self, robot: Robot, unknowns: Array, found: Array) -> tuple[Observation, Signals, Array]:
         assert self._implicit is not None
-        one = functools.partial(self._implicit.shown, robot)
-        result, signals, left = jax.vmap(one)(self.conditions, unknowns, found)
-        return self._simulated_readings(robot, result), signals, left
+        shown_run = functools.partial(self._implicit.shown, robot)
+        result, signals, residual = jax.vmap(shown_run)(self.conditions, unknowns, found)
+        return self._simulated_readings(robot, result), signals, residual
 
     def operating_points(self, robot: Robot) -> Signals | None:
         if self.long or self.conditions.turns:
@@ -276,7 +276,7 @@ class SettledRuns(Observer):
         """
         kind = self.linearization
         probes = tuple(balance_probe(b) for b in kind.probed)
-        robot, size, shown = problem.robot(z), z.size, channels.channel_names(problem.channels)
+        robot, size, channel_names = problem.robot(z), z.size, channels.channel_names(problem.channels)
 
         def probed(x: Array) -> Robot:
             delta = x[size:].reshape(len(probes), *self.shape_sides)
@@ -293,26 +293,26 @@ class SettledRuns(Observer):
         defects = jacobian[: rows * count, size:].reshape(rows, count, len(probes), -1).transpose(2, 3, 0, 1)
         if signals is None:
             signals = jax.vmap(lambda c: operating_signals(robot, c))(self.conditions)
-        each = jax.tree.map(lambda x: x.reshape(-1), signals)
+        flat_signals = jax.tree.map(lambda x: x.reshape(-1), signals)
         scale = data.weight / data.sd
 
         def signature(effect: Effect) -> Array:
             alone = dataclasses.replace(robot, effects=(effect,))
-            term = jax.vmap(lambda s: balances.effects_sum(alone, s, effect.balance, effect.channel))(each)
-            term = jnp.broadcast_to(term, each.speed.shape).reshape(rows, -1)
+            term = jax.vmap(lambda s: balances.effects_sum(alone, s, effect.balance, effect.channel))(flat_signals)
+            term = jnp.broadcast_to(term, flat_signals.speed.shape).reshape(rows, -1)
             if effect.balance == "sensor":
                 term = term @ side_shares(effect.channel, term.shape[1])
-                moved = term[:, None] * (jnp.arange(count) == shown.index(effect.channel)) * scale
+                change = term[:, None] * (jnp.arange(count) == channel_names.index(effect.channel)) * scale
             elif effect.balance in kind.probed:
-                moved = (term.T[:, :, None] * defects[kind.probed.index(effect.balance)]).sum(0)
+                change = (term.T[:, :, None] * defects[kind.probed.index(effect.balance)]).sum(0)
             else:
-                moved = jnp.zeros((rows, count))
-            return moved.ravel()
+                change = jnp.zeros((rows, count))
+            return change.ravel()
 
         signatures = jnp.concatenate([e.each(signature) for e in effects]).T
         defects = defects.reshape(len(probes), *self.shape_sides, rows, count)
         return kind(
-            residual, jacobian[:, :size], finite_or_zero(signatures), defects, scale, signals, channels=shown,
+            residual, jacobian[:, :size], finite_or_zero(signatures), defects, scale, signals, channels=channel_names,
             magnitudes=robot.rig.magnitudes,
         )  # fmt: skip
 
@@ -357,8 +357,8 @@ class SettledRuns(Observer):
     ) -> tuple[Optimum, Observation]:
         data, count = problem.data, len(starts)
         measured, centre = (np.repeat(np.asarray(x)[None], count, 0) for x in (data.measured, data.centre))
-        own = np.asarray(starts), np.asarray(weights), measured, centre
-        members = SearchMember(*own, active=None if active is None else np.asarray(active))
+        search_inputs = np.asarray(starts), np.asarray(weights), measured, centre
+        members = SearchMember(*search_inputs, active=None if active is None else np.asarray(active))
         steps = self.policy.steps if most is None else most
         return search_refilling(problem, members, steps, self.places(problem))
 
@@ -435,8 +435,8 @@ def _row_defects(linear: Linearization, included: np.ndarray) -> Columns:
     k = [*EQUATIONS].index("track")
     size[k] = max(size[k], LOST * made * turning / max(output, 1e-12))
     slopes = (slopes * size[:, None, None, None]).reshape(-1, *slopes.shape[2:]).transpose(1, 2, 0)
-    both = slopes @ slopes.transpose(0, 2, 1) + np.eye(slopes.shape[1])
-    shares = -slopes.transpose(0, 2, 1) @ np.linalg.solve(both, np.asarray(linear.by_row())[rows, :, None])
+    gram_matrix = slopes @ slopes.transpose(0, 2, 1) + np.eye(slopes.shape[1])
+    shares = -slopes.transpose(0, 2, 1) @ np.linalg.solve(gram_matrix, np.asarray(linear.by_row())[rows, :, None])
     defects = np.full((len(EQUATIONS) * sides, len(included)), np.nan)
     defects[:, rows] = np.repeat(size, sides)[:, None] * shares[:, :, 0].T
     names = [f"{b}_{side}" for b in EQUATIONS for side in channels.SIDES] if sides > 1 else EQUATIONS

@@ -86,8 +86,8 @@ def settled_ends_of_runs(problem: Problem) -> SettledEnds:
     data = problem.data
     measured, sd, weight = (np.asarray(x) for x in (data.measured, data.sd, data.weight))
     time = np.asarray(observe.time)
-    every = [s for run in observe.stretches() for s in run]
-    ends = [s for s in every if s.whole or (s.driven and len(s.after(time, 1 - END)) >= FEWEST)] or every[:1]
+    stretches = [s for run in observe.stretches() for s in run]
+    ends = [s for s in stretches if s.whole or (s.driven and len(s.after(time, 1 - END)) >= FEWEST)] or stretches[:1]
     mean, error, shown = (np.full((len(ends), measured.shape[1]), np.nan) for _ in range(3))
     for k, stretch in enumerate(ends):
         end = stretch.after(time, 1 - END) if stretch.driven else stretch.rows[:0]
@@ -139,9 +139,9 @@ def starts_from_settled_ends(
     rms = np.sqrt(np.sum(np.asarray(data.weight > 0) * np.asarray(data.measured) ** 2, 0) / count)
     blunt = dataclasses.replace(problem, data=dataclasses.replace(data, sd=jnp.hypot(data.sd, BLUNT * rms)))
     optima = search(blunt, _recombine_points(blunt, points)[:searches], STEPS_BLUNT)
-    ended = np.asarray(optima.z)[np.argsort(np.asarray(optima.cost))]
-    best = _recombine_points(blunt, ended)[:1]
-    return _distinct_points(np.concatenate([best, _with_peaked_friction(problem, best[0]), ended]))
+    sorted_optima = np.asarray(optima.z)[np.argsort(np.asarray(optima.cost))]
+    best = _recombine_points(blunt, sorted_optima)[:1]
+    return _distinct_points(np.concatenate([best, _with_peaked_friction(problem, best[0]), sorted_optima]))
 
 
 def _with_peaked_friction(problem: Problem, z: np.ndarray) -> np.ndarray:
@@ -150,7 +150,7 @@ def _with_peaked_friction(problem: Problem, z: np.ndarray) -> np.ndarray:
 
     μ_s, V_s and V_d have their nominal ratios to μ_d and to each other, in one configuration or in all.
     """
-    c, out, every = problem.coordinates, [], z.copy()
+    c, out, parameters = problem.coordinates, [], z.copy()
     value, nominal = np.asarray(c.value(z)), np.asarray(c.value(np.zeros(len(c))))
     for name in problem.base.configurations:
         names = [f"{name}.{x}" for x in (*GRIP, *SLIDING)]
@@ -162,8 +162,8 @@ def _with_peaked_friction(problem: Problem, z: np.ndarray) -> np.ndarray:
         new |= {k: new[creep] * nominal[k] / nominal[creep] for k in sliding}
         out.append(z.copy())
         for k, x in new.items():
-            out[-1][k] = every[k] = _coordinate_of_value(problem, k, x)
-    return np.stack([*out, every])
+            out[-1][k] = parameters[k] = _coordinate_of_value(problem, k, x)
+    return np.stack([*out, parameters])
 
 
 def _distinct_points(points: np.ndarray) -> np.ndarray:
@@ -182,11 +182,11 @@ def _recombine_points(problem: Problem, points: np.ndarray) -> np.ndarray:
     """
     by_run = _misfit_of_runs(problem, points)
     mixed = np.tile(points[int(np.argmin(by_run.sum(1)))], (len(points), 1))
-    which = np.asarray(problem.observe.conditions.configuration)
+    configuration = np.asarray(problem.observe.conditions.configuration)
     for k, name in enumerate(problem.base.configurations):
         columns = [j for j, n in enumerate(problem.coordinates.names) if n.startswith(f"{name}.")]
-        if columns and (which == k).any():
-            order = np.argsort(by_run[:, which == k].sum(1), kind="stable")
+        if columns and (configuration == k).any():
+            order = np.argsort(by_run[:, configuration == k].sum(1), kind="stable")
             mixed[:, columns] = points[order][:, columns]
     return mixed
 
@@ -224,10 +224,10 @@ def _fit_settled_ends(problem: Problem) -> Float[np.ndarray, "starts parameters"
     observe = SettledRuns(ends.conditions, "steady")
     ends_problem = Problem(problem.base, problem.coordinates, observe, data_from_readings(mean, ends.sd, len(names)))
     pinned = np.stack([_with_adhesion(problem, np.zeros(len(names)), a) for a in ADHESIONS])
-    held = np.zeros(pinned.shape, bool)
-    held[:, statics] = True
-    fitted = jax.device_get(_fit_pinned(ends_problem, jnp.asarray(pinned), jnp.asarray(held)))
-    free = jax.device_get(_fit_pinned(ends_problem, jnp.asarray(fitted.z), jnp.zeros(held.shape, bool)))
+    is_pinned = np.zeros(pinned.shape, bool)
+    is_pinned[:, statics] = True
+    fitted = jax.device_get(_fit_pinned(ends_problem, jnp.asarray(pinned), jnp.asarray(is_pinned)))
+    free = jax.device_get(_fit_pinned(ends_problem, jnp.asarray(fitted.z), jnp.zeros(is_pinned.shape, bool)))
     best = free.z[int(np.argmin(np.where(np.isfinite(free.cost), free.cost, np.inf)))]
     finite_points = [z for z in (best, *fitted.z) if np.all(np.isfinite(z))]
     return np.stack([_with_friction_slope(problem, z, share) for z in finite_points for share in FINER])
@@ -292,8 +292,8 @@ def _misfit_of_runs(problem: Problem, points: np.ndarray) -> np.ndarray:
     parts = filled.reshape(-1, TOGETHER, points.shape[1])
     first = _reading_misfits(problem, jnp.asarray(parts[0]))  # compiles the program
     with Threads(CORES) as cores:
-        each = [first, *cores.map(lambda part: _reading_misfits(problem, jnp.asarray(part)), parts[1:])]
-    by_row = np.sum(np.concatenate([np.asarray(x) for x in each])[: len(points)] ** 2, 2)
+        misfits = [first, *cores.map(lambda part: _reading_misfits(problem, jnp.asarray(part)), parts[1:])]
+    by_row = np.sum(np.concatenate([np.asarray(x) for x in misfits])[: len(points)] ** 2, 2)
     by_run = np.zeros((len(points), len(observe.rows_of)))
     np.add.at(by_run.T, np.asarray(observe.run), by_row.T)
     return np.where(np.isfinite(by_run), by_run, np.inf)

@@ -87,8 +87,10 @@ from mmrjax.fidelities.histories import (
     linearise_run,
     run_response,
     run_steps,
+    signals_of_instant,
     time_grid,
 )
+from mmrjax.fidelities.rest import HELD
 from mmrjax.model import balances, channels
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.params import Scalar
@@ -114,7 +116,7 @@ JUMP = 7.0
 #: Fields of `Conditions` that may change within a run.
 CHANGING = (
     "voltage", "motor_current", "slope_deg", "payload", "adhesion", "total_mass", "duty", "open", "load_torque",
-    "goal",
+    "goal", "held",
 )  # fmt: skip
 #: Imposed quantities among these, and the torque of a brake, which is measured.
 ON_LINES = ("voltage", "motor_current", "duty", "load_torque", "goal")
@@ -180,8 +182,8 @@ class HistoriesLinearization(Linearization):
     angle: Float[Array, " rows"]
 
     def columns(self, balance: Scalar | int, shapes: Array | np.ndarray) -> Float[Array, "readings terms"]:
-        moved = jnp.einsum("rksc,rkt->rsct", self.defects[balance], shapes[self.knots])
-        return _to_rows(moved, self.rows_of, self.rows).reshape(-1, shapes.shape[1])
+        changes = jnp.einsum("rksc,rkt->rsct", self.defects[balance], shapes[self.knots])
+        return _to_rows(changes, self.rows_of, self.rows).reshape(-1, shapes.shape[1])
 
     def places(self) -> np.ndarray:
         return np.unique(np.asarray(self.knots))
@@ -271,36 +273,49 @@ class Histories(Observer):
                 f"{runs.source}: time histories of a robot that turns can be simulated but not fitted; make a "
                 f"table of its settled turns: mmrjax settle {runs.source} --robot FILE"
             )
-        whole, exact = runs.whole, robot.rig.imposed == "motor_speed"
+        if runs.has("held") and robot.loose:
+            raise BadConfiguration(
+                f"{runs.source}, held: got a clamp in a log of a load with backlash or an elastic joint; leave these "
+                "rows out, or remove backlash and stiffness from the robot's file"
+            )
+        whole_log, exact = runs.whole, robot.rig.imposed == "motor_speed"
         linear = robot.rig.between_rows == "linear"
         names, run = np.unique(runs.run_names, return_inverse=True)
-        mine, every = ([table.in_order(name) for name in names] for table in (runs, whole))
-        given = [runs["time_s"][m] for m in mine]
+        own_rows, rows_of_whole = ([table.in_order(name) for name in names] for table in (runs, whole_log))
+        run_times = [runs["time_s"][m] for m in own_rows]
         # Rows of the log without a reading here are kept if the imposed quantity changes there.
         smooth = runs.log is not None and robot.rig.imposed == "motor_current" and not linear
         noted = [
-            np.isin(whole["time_s"][rows], t) | exact | linear | _drive_changes(whole, rows, SMALL if smooth else 0.0)
-            for rows, t in zip(every, given, strict=True)
+            np.isin(whole_log["time_s"][rows], t)
+            | exact
+            | linear
+            | _drive_changes(whole_log, rows, SMALL if smooth else 0.0)
+            for rows, t in zip(rows_of_whole, run_times, strict=True)
         ]
         longest_steps = _longest_steps(runs, robot)
         if smooth:
-            noted = [n | _begins_new_step(whole["time_s"][rows], n) for n, rows in zip(noted, every, strict=True)]
-            whole = _average_imposed_current(whole, every, noted)
+            noted = [
+                n | _begins_new_step(whole_log["time_s"][rows], n)
+                for n, rows in zip(noted, rows_of_whole, strict=True)
+            ]
+            whole_log = _average_imposed_current(whole_log, rows_of_whole, noted)
         steps = [np.minimum.reduceat(h, np.flatnonzero(n)[:-1]) for h, n in zip(longest_steps, noted, strict=True)]
         change = LOOSE if robot.loose else CHANGE
         grids = [
-            time_grid(whole["time_s"][rows[n]], *c, h, START if robot.has_ground else change, change, parts)
-            for rows, n, c, h in zip(every, noted, _drive_jumps(whole, every, robot.rig), steps, strict=True)
+            time_grid(whole_log["time_s"][rows[n]], *c, h, START if robot.has_ground else change, change, parts)
+            for rows, n, c, h in zip(
+                rows_of_whole, noted, _drive_jumps(whole_log, rows_of_whole, robot.rig), steps, strict=True
+            )
         ]
         # The last instant begins a step too, of length zero.
-        longest, samples = _common_length(max(map(len, grids)) + 1), max(map(len, mine))
+        longest, samples = _common_length(max(map(len, grids)) + 1), max(map(len, own_rows))
         times = np.stack([np.concatenate([g, np.repeat(g[-1], longest - len(g))]) for g in grids])
         instant = np.array([np.searchsorted(grids[r], t) for r, t in zip(run, runs["time_s"], strict=True)])
-        rows = np.stack([np.concatenate([m, np.full(samples - len(m), -1)]) for m in mine])
+        rows = np.stack([np.concatenate([m, np.full(samples - len(m), -1)]) for m in own_rows])
         most = min(samples, KNOTS, max(8, int(KNOT_STEPS / times.size)))
-        knots = np.stack([_choose_knots(m, most) for m in mine])
+        knots = np.stack([_choose_knots(m, most) for m in own_rows])
         conditions = _conditions_over_time(
-            whole.conditions(robot), every, whole["time_s"], times, ON_LINES if linear else ()
+            whole_log.conditions(robot), rows_of_whole, whole_log["time_s"], times, ON_LINES if linear else ()
         )
         if robot.rig.begins is not None:
             order = [robot.rig.begins.names.index(initial_state_name(str(n))) for n in names]
@@ -403,22 +418,22 @@ class Histories(Observer):
         In a run with changing conditions, the longest interval of forward drive counts, if it is long enough.
         """
         time, measured = runs["time_s"], runs.measured()
-        each = [
+        stretches = [
             max((s for s in run if s.driven or s.whole), key=lambda s: s.lasts, default=run[0])
             for run in intervals_by_run(runs)
         ]
-        each = [s for s in each if s.driven and (s.whole or s.lasts >= LASTING)]
+        stretches = [s for s in stretches if s.driven and (s.whole or s.lasts >= LASTING)]
         if steady:
             speeds = measured[:, [c.zero_at_rest and c.directed for c in runs.channels]]
-            each = [s for s in each if not _changes_still(speeds, s.after(time, 0.5), s.after(time, 0.75))]
+            stretches = [s for s in stretches if not _changes_still(speeds, s.after(time, 0.5), s.after(time, 0.75))]
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", RuntimeWarning)  # a channel without readings
-            settled_readings = [np.nanmedian(measured[s.after(time, 0.5)], 0) for s in each]
-        first = np.array([s.rows[0] for s in each], int)
+            settled_readings = [np.nanmedian(measured[s.after(time, 0.5)], 0) for s in stretches]
+        first = np.array([s.rows[0] for s in stretches], int)
         return (
             runs.where(first),
             np.reshape(settled_readings, (-1, measured.shape[1])),
-            np.array([s.lasts for s in each]),
+            np.array([s.lasts for s in stretches]),
         )
 
     @classmethod
@@ -454,14 +469,14 @@ class Histories(Observer):
         the values of its term. Its memory follows from the run too. Between two instants, its change of a reading is
         linear.
         """
-        every = _ProbedRobot.of(robot, probes, effects)
+        probed = _ProbedRobot.of(robot, probes, effects)
         clock = self.times[jnp.arange(len(self.times))[:, None], self.instant[self.knots]]
         rows = jnp.where(self.rows_of < 0, 0, self.rows_of)
         followed_signals = self.with_simulated_runs(robot).known
         assert followed_signals is not None
         # One run at a time: each has a wide array, by its knots.
-        given = self.conditions, clock, self.instant[rows], followed_signals, self.times, self.time[rows]
-        knots, by_effects = jax.lax.map(lambda of_run: every.changes(*of_run, delayed=self.delayed), given)
+        inputs = self.conditions, clock, self.instant[rows], followed_signals, self.times, self.time[rows]
+        knots, by_effects = jax.lax.map(lambda of_run: probed.changes(*of_run, delayed=self.delayed), inputs)
         return jnp.moveaxis(knots, 0, 1), by_effects
 
     def with_simulated_runs(self, robot: Robot) -> Histories:
@@ -490,16 +505,16 @@ class Histories(Observer):
     def angle(self, whole: Signals) -> Float[Array, " rows"]:
         """Angle of the driving shaft in each row since the start of its run [rad]."""
         speed = jnp.asarray(whole.speed_wheel)
-        turned = 0.5 * (speed[:, 1:] + speed[:, :-1]) * jnp.diff(self.times)
-        angle = jnp.concatenate([jnp.zeros((len(turned), 1)), jnp.cumsum(turned, 1)], 1)
+        angle_steps = 0.5 * (speed[:, 1:] + speed[:, :-1]) * jnp.diff(self.times)
+        angle = jnp.concatenate([jnp.zeros((len(angle_steps), 1)), jnp.cumsum(angle_steps, 1)], 1)
         return angle[self.run, self.instant]
 
     @property
     def of_rows(self) -> Any:
         """Conditions of each row as NumPy arrays, shape (rows,)."""
         run, instant = np.asarray(self.run), np.asarray(self.instant)
-        held = jax.tree.map(np.asarray, self.conditions)
-        return jax.tree.map(lambda x: x[run] if x.ndim == 1 else x[run, instant], held)
+        conditions = jax.tree.map(np.asarray, self.conditions)
+        return jax.tree.map(lambda x: x[run] if x.ndim == 1 else x[run, instant], conditions)
 
     @property
     def varying(self) -> bool:
@@ -523,22 +538,26 @@ class Histories(Observer):
         if not self.varying:
             return self.conditions
         rows = self.of_rows
+        if rows.held is not None:  # a clamp, not the drive, determines the motion
+            free, drives = rows.held < 0.5, ("voltage", "motor_current")
+            turned_by = {n: np.where(free, x, 0.0) for n in drives if (x := getattr(rows, n)) is not None}
+            rows = dataclasses.replace(rows, held=None, **turned_by)
         braked = np.zeros(len(rows.voltage)) if rows.load_torque is None else _merge_levels(rows.load_torque)
         if rows.voltage_follows:
             driven_channel = "motor_current" if rows.motor_speed is None else "motor_speed"
             levels = _merge_levels(getattr(rows, driven_channel))
-            which = np.stack([rows.configuration, levels, rows.slope_deg, rows.payload, braked], 1)
-            cases = np.unique(which[levels != 0], axis=0, return_index=True)[1]
+            drive_key = np.stack([rows.configuration, levels, rows.slope_deg, rows.payload, braked], 1)
+            cases = np.unique(drive_key[levels != 0], axis=0, return_index=True)[1]
             cases = np.flatnonzero(levels != 0)[cases] if len(cases) else np.arange(1)
-            held = {} if rows.motor_speed is None else {"motor_acceleration": np.zeros_like(levels)}
-            held |= {} if rows.load_torque is None else {"load_torque": braked}
-            steady = dataclasses.replace(rows, **{driven_channel: levels}, **held)
+            imposed_values = {} if rows.motor_speed is None else {"motor_acceleration": np.zeros_like(levels)}
+            imposed_values |= {} if rows.load_torque is None else {"load_torque": braked}
+            steady = dataclasses.replace(rows, **{driven_channel: levels}, **imposed_values)
             return _conditions_of_rows(steady, cases)
         applied = np.where(rows.open > 0.5, 0.0, rows.voltage * rows.duty)
         some = np.flatnonzero(applied != 0) if (applied != 0).any() else np.arange(1)
         way = np.where(applied < 0, -1.0, 1.0)
         braked = way * braked
-        turned = dataclasses.replace(
+        turned_rows = dataclasses.replace(
             rows,
             voltage=_merge_levels(np.abs(applied)),
             slope_deg=_merge_levels(way * rows.slope_deg),
@@ -547,9 +566,11 @@ class Histories(Observer):
             duty=np.ones_like(rows.duty),
             open=np.zeros_like(rows.open),
         )
-        which = np.stack([turned.configuration, turned.voltage, turned.slope_deg, turned.payload, braked], 1)[some]
-        cases = some[np.unique(which, axis=0, return_index=True)[1]]
-        return _conditions_of_rows(turned, cases)
+        drive_key = np.stack(
+            [turned_rows.configuration, turned_rows.voltage, turned_rows.slope_deg, turned_rows.payload, braked], 1
+        )[some]
+        cases = some[np.unique(drive_key, axis=0, return_index=True)[1]]
+        return _conditions_of_rows(turned_rows, cases)
 
     def late(self, every: tuple[Array, ...], rig: Rig) -> Float[Array, "rows ..."]:
         """Values within steps at the time of each row minus the delay of the rig.
@@ -611,8 +632,8 @@ class Histories(Observer):
         first, second = rows[:, :-1].ravel(), rows[:, 1:].ravel()
         within = (first >= 0) & (second >= 0)
         for k in range(residual.shape[1]):
-            both = within & counts[first, k] & counts[second, k]
-            apart = np.abs(residual[second[both], k] - residual[first[both], k])
+            is_compared = within & counts[first, k] & counts[second, k]
+            apart = np.abs(residual[second[is_compared], k] - residual[first[is_compared], k])
             usual = apart[apart <= JUMP * np.median(apart)] if len(apart) else np.zeros(1)
             total += counts[:, k].sum() * max(1.0, float(np.mean(usual**2)) / 2)
         return float(total)
@@ -626,9 +647,9 @@ class Histories(Observer):
         are computed along its runs.
         """
         problem = dataclasses.replace(problem, data=data)
-        which = getattr(problem.coordinates, "active", None)
+        active_set = getattr(problem.coordinates, "active", None)
         twice = lambda x: jnp.stack([jnp.asarray(x)] * TOGETHER)  # noqa: E731
-        members = twice(z), twice(data.weight), None if which is None else twice(which)
+        members = twice(z), twice(data.weight), None if active_set is None else twice(active_set)
         r, jacobian, _, simulated = jax.tree.map(lambda x: x[0], _evaluate(problem, *members))
         residual, jacobian = zero_inactive_residuals(r, jacobian, penalty_slice(data))
         robot, observe = problem.robot(jnp.asarray(z)), dataclasses.replace(self, known=simulated)
@@ -650,9 +671,9 @@ class Histories(Observer):
 
     def at_fit(self, problem: Problem, z: Numbers) -> Histories:
         """Observer with its runs as simulated at coordinates z, by the program of the searches."""
-        which = getattr(problem.coordinates, "active", None)
+        active_set = getattr(problem.coordinates, "active", None)
         twice = lambda x: np.stack([np.asarray(x)] * TOGETHER)  # noqa: E731
-        members = twice(z), twice(problem.data.weight), None if which is None else twice(which)
+        members = twice(z), twice(problem.data.weight), None if active_set is None else twice(active_set)
         simulated = _evaluate(problem, *members)[3]
         return dataclasses.replace(self, known=jax.tree.map(lambda x: x[0], simulated))
 
@@ -757,29 +778,31 @@ class Histories(Observer):
             return optima
 
         def result_of_member(every: tuple[Optimum, Observation], k: int) -> tuple[Optimum, Observation]:
-            best, seen = jax.tree.map(lambda leaf: leaf[k], every)
-            return dataclasses.replace(best, z=best.z[:size], sd=best.sd[:size]), seen
+            best, observation = jax.tree.map(lambda leaf: leaf[k], every)
+            return dataclasses.replace(best, z=best.z[:size], sd=best.sd[:size]), observation
 
         def search_again(z: np.ndarray) -> tuple[Optimum, Observation]:
             return result_of_member(searched(np.pad(z, (0, np.shape(starts)[1] - size))[None], slice(k, k + 1)), 0)
 
         scan_data = dataclasses.replace(bare.data, weight=weights[k])
-        best, seen = scans.search_lower_minima(
+        best, seen_observation = scans.search_lower_minima(
             bare, result_of_member(optima, k), scan_data, search_again, lambda _: None
         )
         optimum = jax.tree.map(lambda leaf: jnp.asarray(leaf[k]), optima[0])
         best = dataclasses.replace(best, z=optimum.z.at[:size].set(best.z), sd=optimum.sd.at[:size].set(best.sd))
-        return jax.tree.map(lambda every, mine: jnp.asarray(every).at[k].set(mine), optima, (best, seen))
+        return jax.tree.map(lambda every, mine: jnp.asarray(every).at[k].set(mine), optima, (best, seen_observation))
 
     def observation_at(self, problem: Problem, z: Numbers, active: Numbers | None = None) -> Observation:
         return self.at(problem, z, active)[2]
 
     def at(self, problem: Problem, z: Numbers, active: Numbers | None = None) -> tuple[Numbers, Numbers, Observation]:
         """Residuals, Jacobian and observation, see `Observer.at`, by the program of the searches."""
-        which = None if active is None else np.asarray(active)[None]
-        evaluate = _parallel_evaluator(problem, np.asarray(problem.data.weight)[None], which)
-        r, jacobian, seen = jax.tree.map(lambda x: x[0], evaluate(np.asarray(z)[None], np.zeros(1, int)))
-        return *zero_inactive_residuals(jnp.asarray(r), jnp.asarray(jacobian), penalty_slice(problem.data)), seen
+        active_sets = None if active is None else np.asarray(active)[None]
+        evaluate = _parallel_evaluator(problem, np.asarray(problem.data.weight)[None], active_sets)
+        r, jacobian, observation = jax.tree.map(lambda x: x[0], evaluate(np.asarray(z)[None], np.zeros(1, int)))
+        return *zero_inactive_residuals(
+            jnp.asarray(r), jnp.asarray(jacobian), penalty_slice(problem.data)
+        ), observation
 
     def bases(self, columns: Columns, included: np.ndarray, robot: Robot) -> Bases:
         """Bases of curves and windows as for settled runs, also over time, and waves over the angle of a shaft.
@@ -791,8 +814,8 @@ class Histories(Observer):
         if (rows.duty != 1).any():
             at_motors = np.where(rows.open > 0.5, electromotive, rows.voltage * rows.duty)
             columns = {**columns, "supply_voltage_V": at_motors}
-        which = self.conditions.configuration
-        on_tracks = np.broadcast_to(jax.vmap(robot.chassis)(which).on_tracks > 0.5, np.shape(which))
+        configuration = self.conditions.configuration
+        on_tracks = np.broadcast_to(jax.vmap(robot.chassis)(configuration).on_tracks > 0.5, np.shape(configuration))
         waves = bases_room.wave_families(
             on_tracks[self.run], angle, np.asarray(self.rows_of), np.asarray(self.knots), robot
         )
@@ -841,10 +864,11 @@ def _drive_jumps(runs: Runs, each: list[np.ndarray], rig: Rig) -> list[tuple[np.
     jumps_known = (
         rig.imposed != "motor_speed" and rig.between_rows == "held" and np.isfinite(driven).all() and driven.any()
     )
-    coasts = runs["mode"] == "coast" if runs.has("mode") else np.zeros(len(runs), bool)
+    switches = [runs[column] == word for column, word in (("mode", "coast"), ("held", 1.0)) if runs.has(column)]
     driven, jumps = driven if jumps_known else np.zeros(len(runs)), []
     for rows in each:
-        sizes = np.maximum(_relative_jumps(driven[rows]), coasts[rows][1:] != coasts[rows][:-1])
+        switched = (x[rows][1:] != x[rows][:-1] for x in switches)
+        sizes = functools.reduce(np.maximum, switched, _relative_jumps(driven[rows]))
         jumps.append((time[rows[1:]][sizes > 0], sizes[sizes > 0]))
     return jumps
 
@@ -923,7 +947,7 @@ def measure_initial_states(robot: Robot, runs: Runs, noise: Noise) -> Robot:
     if robot.rig.start == "rest" or not runs.sampled:
         return robot
     measured = runs.measured()
-    begins, stated = dict[str, RunStart](), []
+    begins, state_priors = dict[str, RunStart](), []
     rows = runs.configurations(robot)
     for name in np.unique(runs.run_names):
         run_rows = runs.in_order(name)
@@ -944,8 +968,8 @@ def measure_initial_states(robot: Robot, runs: Runs, noise: Noise) -> Robot:
                 least = float(np.median(noise.sd[finite, k]))
                 state[field] = factor * value, abs(factor) * max(sd, least)
         begins[key] = RunStart(**{field: value for field, (value, _) in state.items()})
-        stated += [(f"rig.{key}.{field}", value, sd) for field, (value, sd) in state.items()]
-    priors = (*robot.rig.priors, *stated) if robot.rig.start == "free" else robot.rig.priors
+        state_priors += [(f"rig.{key}.{field}", value, sd) for field, (value, sd) in state.items()]
+    priors = (*robot.rig.priors, *state_priors) if robot.rig.start == "free" else robot.rig.priors
     return dataclasses.replace(robot, rig=dataclasses.replace(robot.rig, begins=RunStarts(begins), priors=priors))
 
 
@@ -1010,8 +1034,8 @@ def _choose_knots(rows: np.ndarray, most: int) -> np.ndarray:
     """At most `most` rows of a run, evenly spaced, including its first and last. The last one is repeated as
     padding.
     """
-    chosen = rows[np.unique(np.round(np.linspace(0, len(rows) - 1, most)).astype(int))]
-    return np.concatenate([chosen, np.repeat(chosen[-1], most - len(chosen))])
+    knot_rows = rows[np.unique(np.round(np.linspace(0, len(rows) - 1, most)).astype(int))]
+    return np.concatenate([knot_rows, np.repeat(knot_rows[-1], most - len(knot_rows))])
 
 
 def _changes_still(speeds: np.ndarray, half: np.ndarray, quarter: np.ndarray) -> bool:
@@ -1077,23 +1101,28 @@ def _longest_steps(runs: Runs, robot: Robot) -> list[np.ndarray]:
     passage is where the measured speeds, or the rates of measured angles and positions, are low or change their sign.
     Without such readings it may be anywhere.
     """
-    whole, rig, exact = runs.whole, robot.rig, robot.rig.imposed == "motor_speed"
-    moved = [k for k, c in enumerate(runs.channels) if c.zero_at_rest and (c.directed or not c.settled)]
-    measured, rates = whole.measured()[:, moved], [k for k, at in enumerate(moved) if not runs.channels[at].settled]
-    driven = None if exact else applied_drive(whole)
+    whole_log, rig, exact = runs.whole, robot.rig, robot.rig.imposed == "motor_speed"
+    motion_channels = [k for k, c in enumerate(runs.channels) if c.zero_at_rest and (c.directed or not c.settled)]
+    measured, rates = (
+        whole_log.measured()[:, motion_channels],
+        [k for k, at in enumerate(motion_channels) if not runs.channels[at].settled],
+    )
+    driven = None if exact else applied_drive(whole_log)
     early, found = DELAYED * np.max(np.asarray(rig.delay)) + EARLIER.get(rig.imposed, 0.0), []
-    turned = robot.motor.inertia * robot.gearbox.ratio**2
-    elastic = max(float(load.frequency(turned)) for _, load in robot.configurations.items()) if robot.loose else 0.0
+    output_inertia = robot.motor.inertia * robot.gearbox.ratio**2
+    elastic = (
+        max(float(load.frequency(output_inertia)) for _, load in robot.configurations.items()) if robot.loose else 0.0
+    )
     for name in np.unique(runs.run_names):
-        rows = whole.in_order(name)
-        time = whole["time_s"][rows]
+        rows = whole_log.in_order(name)
+        time = whole_log["time_s"][rows]
         apart, wait = np.diff(time), _usual_interval(np.diff(runs["time_s"][runs.in_order(name)]))
         both_ways = driven is not None and driven[rows].min() < 0 < driven[rows].max()
         longest = np.full(len(apart), (FAST if both_ways else 1) * LONGEST)
         if driven is None:
             longest[:] = min(SLOWLY * LONGEST, wait / COARSELY)
         elif runs.log is not None:
-            begins = np.where(_drive_changes(whole, rows, SMALL), np.arange(len(rows)), 0)
+            begins = np.where(_drive_changes(whole_log, rows, SMALL), np.arange(len(rows)), 0)
             since = time - time[np.maximum.accumulate(begins)]
             longest = np.maximum(longest, np.minimum(LATER * since[:-1], wait / BETWEEN))
         if both_ways and not robot.moves_as_one:
@@ -1162,15 +1191,17 @@ def _scan_delays(problem: Problem, z: Array, data: Data, scanned: Array, values:
     def shown(z: Array) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
         robot = problem.robot(z)
         of_run = lambda c, t, k: _readings_within_steps(robot, course_between_instants(robot, c, t, k))  # noqa: E731
-        *every, decays = jax.vmap(of_run)(observe.conditions, observe.times, observe.known)
-        return tuple(every), (*every, decays)
+        *measured, decays = jax.vmap(of_run)(observe.conditions, observe.times, observe.known)
+        return tuple(measured), (*measured, decays)
 
-    slopes, (*every, decays) = jax.jacfwd(shown, has_aux=True)(z)
-    both = [jnp.concatenate([x[..., None], slope], -1) for x, slope in zip(every, slopes, strict=True)]
+    slopes, (*all_measured, decays) = jax.jacfwd(shown, has_aux=True)(z)
+    values_and_slopes = [
+        jnp.concatenate([x[..., None], slope], -1) for x, slope in zip(all_measured, slopes, strict=True)
+    ]
 
     def one(value: Array) -> tuple[Array, Array]:
         coordinates = jnp.where(scanned, value, z)
-        late = observe.late((*both, decays), problem.robot(coordinates).rig)
+        late = observe.late((*values_and_slopes, decays), problem.robot(coordinates).rig)
         error = data.weight * (late[..., 0] - data.measured) / data.sd
         finite = jnp.all(jnp.isfinite(late), -1)
         error = jnp.where(finite, error, MISSING * data.weight)
@@ -1280,16 +1311,16 @@ class _ProbedRobot(NamedTuple):
         """Robot with these probes and further ones for the balances that the effects enter."""
         others = dict.fromkeys(e.effect.balance for e in effects if e.effect.balance != "sensor")
         entered = tuple(balance_probe(b) for b in others if b not in {p.balance for p in probes})
-        every, size = (*probes, *entered), len(probes)
+        rows_of_whole, size = (*probes, *entered), len(probes)
         effects = tuple(with_shape_of_robot(robot, e) for e in effects)
-        counts, places = np.array([len(e.at) for e in effects], int), [p.balance for p in every]
+        counts, places = np.array([len(e.at) for e in effects], int), [p.balance for p in rows_of_whole]
         entering = np.array([places.index(b) if (b := e.effect.balance) in places else 0 for e in effects], int)
         entering = np.repeat(entering, counts)
         enters = np.repeat([1.0 * (e.effect.balance in places) for e in effects], counts)
         shown_channels = channels.channel_names(robot.channels)
         at_sensor = np.array([[e.effect.channel == c for e in effects] for c in shown_channels], float)
         at_sensor = np.repeat(at_sensor, counts, 1) if effects else np.zeros((len(shown_channels), 0))
-        return cls(robot, every, size, effects, entering, enters, at_sensor)
+        return cls(robot, rows_of_whole, size, effects, entering, enters, at_sensor)
 
     def at(self, amplitude: Array) -> Robot:
         """Robot with the probes at amplitudes [units of their balances], shape (probes,)."""
@@ -1338,6 +1369,8 @@ class _ProbedRobot(NamedTuple):
             """Changes through the state, and immediate ones: with an imposed speed, current follows from torque."""
 
             def reading(y: Array, amplitude: Array) -> Array:
+                if held.held is not None:
+                    return _reading(robot, signals_of_instant(self.at(amplitude), held, y, HELD * held.held))
                 return _reading(robot, moving(self.at(amplitude), held, state_of_unknowns(robot, y)))
 
             by_state, at_once = jax.jacfwd(reading, (0, 1))(y, none)
@@ -1347,8 +1380,8 @@ class _ProbedRobot(NamedTuple):
 
         first, begins = first_conditions_and_state(robot, conditions)
         by_probes = jax.jacfwd(lambda a: first_conditions_and_state(self.at(a), conditions)[1])(none)
-        begun = by_probes[:, self.entering] * (self.enters * terms(clock[0], begins, first))
-        unmoved = jnp.concatenate([jnp.zeros((len(begins), size * len(clock))), begun], 1)
+        begin_changes = by_probes[:, self.entering] * (self.enters * terms(clock[0], begins, first))
+        unmoved = jnp.concatenate([jnp.zeros((len(begins), size * len(clock))), begin_changes], 1)
         changed = run_response(conditions, along, source, seen, unmoved)
         state_changes = jnp.concatenate([seen(clock[0], begins, unmoved, first)[None], changed])
         knots = state_changes[instants, :, : size * len(clock)].reshape(len(instants), -1, size, len(clock))
@@ -1409,11 +1442,11 @@ def _memory_along_run(
     steps, constant = run_steps(conditions, times)
 
     def after(memory: Array, step: tuple[LinearisedRun, RunStep]) -> tuple[Array, Array]:
-        state_there, taken = step
-        held, spans, passes = taken.held(constant), jnp.diff(state_there.clock), state_there.passes
+        state_there, run_step = step
+        conditions, spans, passes = run_step.held(constant), jnp.diff(state_there.clock), state_there.passes
 
         def stage(memory: Array, span: Array, y: Array, way: Array) -> Array:
-            law = lambda m: memory_rates(y, held, way, m)  # noqa: E731
+            law = lambda m: memory_rates(y, conditions, way, m)  # noqa: E731
             speed, slope = jax.jvp(law, (memory,), (jnp.ones_like(memory),))
             return memory + span * speed / (1 - span * slope)
 
@@ -1425,7 +1458,7 @@ def _memory_along_run(
 
     begin = first_conditions_and_state(robot, conditions)[1]
     angle = state_of_unknowns(robot, begin).distance / robot.chassis(conditions.configuration).radius
-    begun = jnp.concatenate(
+    memory_at_begin = jnp.concatenate(
         [
             map_over_shapes(
                 e, lambda effect, _: jnp.asarray(effect.initial(robot, angle), float), jnp.zeros(len(e.at))
@@ -1433,8 +1466,8 @@ def _memory_along_run(
             for e in with_memory
         ]
     )
-    stages = jax.lax.scan(after, begun, (along, steps))[1]
-    nodes = jnp.concatenate([begun[None], stages.reshape(-1, len(begun))])
+    stages = jax.lax.scan(after, memory_at_begin, (along, steps))[1]
+    nodes = jnp.concatenate([memory_at_begin[None], stages.reshape(-1, len(memory_at_begin))])
     clock = jnp.append(along.clock[0, 0], along.clock[:, 1:].ravel())
 
     def at_time(t: Array) -> list[Array]:

@@ -65,8 +65,8 @@ class TurnLinearization(SettledLinearization):
 
     def shown(self, channel: Scalar | int, shapes: Array | np.ndarray) -> Float[Array, "readings terms"]:
         of_sides = shapes.reshape(-1, self.rows, shapes.shape[1])
-        each = np.stack([side_shares(name, len(of_sides)) for name in self.channels])
-        return super().shown(channel, jnp.tensordot(jnp.asarray(each)[channel], of_sides, 1))
+        shares = np.stack([side_shares(name, len(of_sides)) for name in self.channels])
+        return super().shown(channel, jnp.tensordot(jnp.asarray(shares)[channel], of_sides, 1))
 
 
 class SettledTurns(SettledRuns):

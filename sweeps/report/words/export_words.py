@@ -102,9 +102,9 @@ def export_remarks(found: Export) -> list[str]:
         said.append(
             "the refit used no measurements: these are hold-out errors if the robot was not fitted to these runs"
         )
-    lost = [f.name for f in compared.fates if f.verdict == DROPPED]
-    if lost:
-        said.append(f"dropped: {', '.join(lost)}")
+    dropped_names = [f.name for f in compared.fates if f.verdict == DROPPED]
+    if dropped_names:
+        said.append(f"dropped: {', '.join(dropped_names)}")
     if drive.idle:
         said.append(f"{', '.join(drive.idle)}: not exported, since it has no effect in {drive.configuration}")
     if found.posterior is None and drive.file.source.endswith(".toml"):
@@ -153,10 +153,10 @@ def rotor_inertia(found: Export) -> float:
 def law_equations(found: Export) -> list[str]:
     """The law's equations in words, in the order in which they are computed, with the symbols of the constants."""
     robot = found.joint.robot
-    where = {"supply": "winding", "electrical": "winding", "inductance": "winding", "motor": "motor",
+    sections = {"supply": "winding", "electrical": "winding", "inductance": "winding", "motor": "motor",
              "gearbox": "gearbox", "track": "output", "inertia": "armature"}  # fmt: skip
-    places = {where[p.balance] for p in found.joint.parts if p.effect and p.balance in INSIDE}
-    less = {place: f" - {place} effects" if place in places else "" for place in where.values()}
+    places = {sections[p.balance] for p in found.joint.parts if p.effect and p.balance in INSIDE}
+    less = {place: f" - {place} effects" if place in places else "" for place in sections.values()}
     dry, viscous = ("M_t0", "K_ft") if robot.has_ground else ("M_0", "K")
     rotor = "" if found.joint.loose else " - J_d i_r dω/dt"
     backward = "2 - 1/η_rm, at least 0.02" if robot.gearbox.mesh_theory else "η_rm"
@@ -175,7 +175,7 @@ def law_equations(found: Export) -> list[str]:
     for part in found.joint.parts:
         if part.effect and part.balance in INSIDE:
             lines.append(
-                f"`{part.name}`, in {where[part.balance]}: {part.equation} [{part.unit}] {part.meaning}".rstrip()
+                f"`{part.name}`, in {sections[part.balance]}: {part.equation} [{part.unit}] {part.meaning}".rstrip()
             )
     lines += _further_equations(found.joint)
     if found.format == "mujoco":

@@ -185,11 +185,15 @@ def posture_sentences(found: Postures) -> str:
 
 def tipping_remarks(found: Postures) -> list[str]:
     """Remarks on runs that would tip over, which the numbers of straight travel do not show."""
-    over = np.flatnonzero(found.table["margin_mm"] < 0)
-    if not over.size:
+    tipping_runs = np.flatnonzero(found.table["margin_mm"] < 0)
+    if not tipping_runs.size:
         return []
-    which = "the run" if len(found.table["margin_mm"]) == 1 else "runs " + ", ".join(str(k + 1) for k in over[:ROWS])
+    run_words = (
+        "the run"
+        if len(found.table["margin_mm"]) == 1
+        else "runs " + ", ".join(str(k + 1) for k in tipping_runs[:ROWS])
+    )
     return [
-        f"posture: {which} would tip over on that slope; currents and speeds are for a robot that is held "
+        f"posture: {run_words} would tip over on that slope; currents and speeds are for a robot that is held "
         "upright on it"
     ]

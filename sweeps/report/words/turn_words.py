@@ -37,11 +37,11 @@ def by_itself(robot: Robot, found: Result, value: float) -> str:
         robot.rig.imposed == "motor_speed"
     ) else ("V", "--left and --right, or duty_left and duty_right")  # fmt: skip
     rates, speeds = (np.asarray(found.reading[channel]) for channel in ("yaw_rate", "speed"))
-    each = zip(robot.configurations, rates, speeds, np.asarray(found.status), strict=True)
+    rates_by_configuration = zip(robot.configurations, rates, speeds, np.asarray(found.status), strict=True)
     told = [
         f"{name} {words.STATUSES[STATUSES[int(status)]].short}" if not math.isfinite(rate)
         else f"{name} by {abs(rate):.3g} rad/s to the {SIDES[int(rate < 0)]} at {speed:.3g} m/s ahead"
-        for name, rate, speed, status in each
+        for name, rate, speed, status in rates_by_configuration
         if not abs(rate) < NONE
     ]  # fmt: skip
     alike = f"driven alike, {value:g} {imposed} on level ground"
