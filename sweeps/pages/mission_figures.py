@@ -110,21 +110,23 @@ def _draw_legend(axes: Axes, *others: Axes) -> None:
     axes.set_ylim(low, high + 0.22 * (high - low))  # room for it
 
 
-#: Turns of a curve's slope above which it is drawn as its envelope, and number of parts of the time then.
-TURNS, PARTS = 300, 200
+#: Turns of a curve's slope above which it is drawn as its envelope, and number of parts of the time then: long ones,
+#: so that the envelope has no gaps.
+TURNS, PARTS = 300, 40
 
 
 def _draw_curve(
     axes: Axes, time: np.ndarray, values: np.ndarray, colour: str, label: str, width: float = 1.0
 ) -> None:
-    """A curve over time, or from least to greatest in each part of the time if many cycles would fill the panel."""
+    """A curve over time, or its range and mean in each part of the time if many cycles would fill the panel."""
     if np.count_nonzero(np.diff(np.sign(np.diff(values)))) <= TURNS:
         axes.plot(time, values, color=colour, lw=width, label=label)
         return
     parts = np.array_split(np.arange(len(time)), PARTS)
-    middle = [time[rows].mean() for rows in parts]
+    middle, mean = ([part.mean() for part in np.split(x, [p[0] for p in parts[1:]])] for x in (time, values))
     least, greatest = ([end(values[rows]) for rows in parts] for end in (np.min, np.max))
-    axes.fill_between(middle, least, greatest, color=colour, alpha=0.35, lw=0.6, label=f"{label}, range")
+    axes.fill_between(middle, least, greatest, color=colour, alpha=0.12, lw=0, label=f"{label}, range")
+    axes.plot(middle, mean, color=colour, lw=width, label=f"{label}, mean")
 
 
 def _draw_speed(axes: Axes, time: np.ndarray, rows: Columns, linear: bool, legend: bool) -> None:

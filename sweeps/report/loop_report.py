@@ -10,6 +10,7 @@ import numpy as np
 
 from calibration.data import Columns, Names
 from calibration.data.columns import Layout
+from calibration.data.table import Runs
 from calibration.described import describe
 from calibration.discovery.result import DiscoveryResult
 from calibration.discovery.settings import WITHOUT_NAME
@@ -358,7 +359,10 @@ def _run_by_run(found: DiscoveryResult, table: Columns, changes: Mapping[str, Ch
     if isinstance(detail, TimeStatistics):
         some = f", of the first 8 of {detail.runs} runs" if detail.runs > 8 else ""
         yield catalogue.figure("loop.over_time", found.runs, table, found.channels, verdict, words=(some,))
-        yield fit_tables.fits_of_runs(table, found.channels, _simulated_lines(found))
+        lines = _simulated_lines(found)
+        yield fit_tables.fits_of_runs(table, found.channels, lines)
+        runs = Runs(found.runs.source, table, layout=Layout.of(found.robot))
+        yield from fit_tables.frequency_response(runs, found.channels, lines)
     elif changes or found.unnamed is not None:  # else it is the first figure
         yield catalogue.figure("loop.before_after", table, found.channels, verdict, words=("",))
 
