@@ -267,7 +267,7 @@ def draw_effect_scores(found: DiscoveryResult) -> Figure:
     level = found.before.kinds["single"].threshold
     axes.axvline(level, color=ORANGE, lw=1.6)
     axes.text(level, -0.6, f" threshold {level:.1f}", color=ORANGE, fontsize=8.5, va="bottom")
-    axes.set_yticks(range(len(rungs)), [f"{r.name}  ({r.balance})" for r in rungs])
+    axes.set_yticks(range(len(rungs)), [f"{r.name}  ({place_in_words(r.balance)})" for r in rungs])
     axes.set_ylim(len(rungs) - 0.4, -1.8)
     axes.grid(axis="y", visible=False)
     axes.set(xlabel="score: misfit that the effect alone explains, limited to a plausible size [σ]")

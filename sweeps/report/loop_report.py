@@ -15,6 +15,7 @@ from calibration.described import describe
 from calibration.discovery.result import DiscoveryResult
 from calibration.discovery.settings import WITHOUT_NAME
 from calibration.inference import blocks
+from calibration.inference.bases import place_in_words
 from calibration.inference.details import TimeStatistics
 from calibration.inference.fit_notes import Determination, remarks_with_codes
 from calibration.inference.simulation_errors import OF_SIZE
@@ -231,13 +232,14 @@ def _effects_in_words(found: DiscoveryResult) -> Iterable[Block]:
         effect = next((x for x in found.effects if x.name == e["name"]), None)
         plot_words = f"not in the library; plotted over {str(e.get('variable')).replace('_', ' ')}"
         lowers, kinds = loop_words.misfit_text(e["score"]), ", or ".join(e["families"])
+        place = place_in_words(e["balance"])
         if effect is None:
-            alike = ", ".join(b for b in e["balances_alike"] if b != e["balance"])
-            rows.append((e["name"], kinds, e["balance"], plot_words, "-", lowers, e["p_value"], "a curve", alike))
+            alike = ", ".join(place_in_words(b) for b in e["balances_alike"] if b != e["balance"])
+            rows.append((e["name"], kinds, place, plot_words, "-", lowers, e["p_value"], "a curve", alike))
             continue
         rows.append(
             (
-                loop_words.effect_called(found, effect), kinds, e["balance"], e["equation"] or plot_words,
+                loop_words.effect_called(found, effect), kinds, place, e["equation"] or plot_words,
                 loop_words.effect_amplitude(effect), f"{lowers} ({100 * e['share']:.0f} %)", e["p_value"],
                 loop_words.tentative_reason(found, effect) or e["standing"],
                 loop_words.indistinguishable_effects(found, effect) or "nothing else of plausible size",
@@ -310,7 +312,6 @@ def _certainty_sections(found: DiscoveryResult, missing: bool) -> Iterable[Secti
         *([Note(loop_words.cluster_sentence(found.cluster), name="cluster")] if found.cluster else []),
         *(Note(text, name=name, terminal=True) for name, text in reasons.items() if text),
         *remarks(also, "also"),
-        *([catalogue.note("loop.of-a-shaft")] if not found.robot.has_ground and found.effects else []),
         *_effects_in_words(found),
         _certainty(found, missing),
     ]
