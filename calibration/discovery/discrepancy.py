@@ -44,6 +44,8 @@ STARTS = 8
 POINTS = 61
 #: Extra evidence required of a curve over the supply's voltage, which acts only through currents and speeds [σ²].
 INDIRECT = 6.0
+#: Balances of torques and slip.
+MECHANICAL = ("track", "ground", "slip")
 #: Largest number of instants among which the ends of a window are chosen.
 #: Most instants between which the ends of a window are looked for.
 INSTANTS = 200
@@ -82,7 +84,9 @@ def locate_discrepancy(left: Diagnosis, bases: Bases, included: np.ndarray) -> D
     if names[j][1] in bases_room.VARIABLES:
         smoothly = [i for i in place_columns if bases_room.window_from_name(names[i][1]) is None]
         evidence = {i: fit_smooth_curve(left.linear, *names[i], included).evidence for i in smoothly}
-        j = max(smoothly, key=lambda i: evidence[i] - INDIRECT * (names[i][1] == "voltage"))
+        # A voltage acts on torques and slip only through currents and speeds, so it may be listed but never leads.
+        direct = [i for i in smoothly if names[i][1] != "voltage"] if place in MECHANICAL else smoothly
+        j = max(direct or smoothly, key=lambda i: evidence[i] - INDIRECT * (names[i][1] == "voltage"))
     places = dict.fromkeys(names[i][0] for i in same_kind)
     best = {b: max(deviate[i] for i in same_kind if names[i][0] == b) for b in places}
     variable, strength = names[j][1], float(explained[j])
