@@ -200,7 +200,7 @@ def test_free_stretches_of_a_log_are_runs(tmp_path):
     assert runs.sampled and len(runs) == 10 and (runs["motor_speed_rpm"] == 99).all() and not runs.has("held")
     assert_allclose(runs["time_s"], time[clamp == 0])
     assert runs.run_names.tolist() == ["stretch 1"] * 5 + ["stretch 2"] * 5
-    assert any("holds the output in 10 of 20 rows of a log; they are left out" in n for n in runs.notes)
+    assert any("holds the output in 10 of 20 rows of a log. They are left out" in n for n in runs.notes)
     named = records.read_runs({**log, "held": clamp, "run_id": np.repeat(["a", "b"], 10)}, robot=robot)
     assert named.run_names.tolist() == ["a, stretch 1"] * 5 + ["b, stretch 2"] * 5
     free = records.read_runs({**log, "held": 0 * clamp}, robot=robot)

@@ -28,7 +28,11 @@ class SeriesResistance(ElectricalEffect):
     dissipative = True
 
     amplitude: Scalar = amplitude(
-        "ohm", "resistance in series with each motor", (-0.5, 5.0), "bench leads and meters: tenths of an ohm", sd=0.5
+        "ohm",
+        "resistance in series with each motor",
+        (-0.5, 5.0),
+        "leads and meters of a bench: tenths of an ohm",
+        sd=0.5,
     )
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:
@@ -78,7 +82,7 @@ class WindingHeating(ElectricalEffect):
 
     amplitude: Scalar = amplitude(
         "-", "share of the settled temperature rise that the run reaches", (-0.5, 3.0),
-        "0 cold, 1 settled; above 1 for a closed housing", sd=1.0,
+        "0 cold, 1 settled, above 1 for a closed housing", sd=1.0,
     )  # fmt: skip
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:
@@ -95,8 +99,9 @@ class ThermalDrift(ElectricalEffect):
 
     The winding warms up while the run lasts.
 
-    Source: IEC 60028 for α. The maker's sheet of RE30 310007 for τ and R_wh. The housing, with 593 s, keeps its
-    temperature during a run. In steady travel this effect looks like `winding_heating`.
+    Source: IEC 60028 for α. The maker's sheet of RE30 310007 for τ and R_wh. The housing's
+    time constant is 593 s, so its temperature is taken as constant during a run.
+    In steady travel this effect looks like `winding_heating`.
     The memory is T [K]. Without a memory the settled value is used. If the winding's temperature is followed
     (missions), its resistance follows that, and the effect adds 0.
     """
@@ -109,7 +114,7 @@ class ThermalDrift(ElectricalEffect):
 
     amplitude: Scalar = amplitude(
         "-", "share of the data sheet's temperature rise", (-1.0, 10.0),
-        "1 by the data sheet; more in still air between printed walls", sd=1.0,
+        "1 in the data sheet, more in still air between printed walls", sd=1.0,
     )  # fmt: skip
     time_constant: Scalar = parameter(
         16.3, "s", "thermal time constant of the winding τ", (1.0, 600.0), "maker's sheet of RE30 310007",

@@ -365,7 +365,7 @@ def _standstill_cautions(robot: Robot, conditions: Conditions) -> list[str]:
     if not rows:
         return []
     return [
-        f"rows {rows}: computed from a rolling start; from standstill the calibrated robot does not settle there "
+        f"rows {rows}: computed from a rolling start. From standstill, the calibrated robot does not settle there "
         f"within {TIME_SETTLED:g} s, because it starts by sliding at μ_d"
     ]
 
