@@ -12,7 +12,7 @@ from calibration.data import rig_facts
 from calibration.data import runs as records
 from calibration.data.input_errors import BadConfiguration, BadData
 from calibration.discovery import scales
-from calibration.inference.observers import SettledRuns
+from calibration.inference.observers import Histories, SettledRuns
 from mmrjax import effects
 from mmrjax.errors import UsageError
 from mmrjax.fidelities.steady import steady_batch
@@ -175,15 +175,13 @@ def test_rows_of_a_clamp_in_tables(tmp_path):
 
 
 def test_a_log_of_a_clamp_is_read_as_settled_rows(tmp_path):
-    """Windings settle within a millisecond. Rows that follow sooner are no settled runs."""
+    """Windings settle within a millisecond."""
     rows = {"output_torque_Nm": table()["output_torque_Nm"], "motor_voltage_V": table()["motor_voltage_V"]}
     held = rig(tmp_path, "motor_current", '"motor_voltage", "output_torque"')
     log = records.read_runs(table(time_s=0.02 * np.arange(16.0)), robot=held)
     assert not log.sampled and any("held in every row, so each row is read as a settled run" in n for n in log.notes)
     same = records.read_runs(table(), robot=held)
     assert all((log[c] == same[c]).all() for c in ("motor_current_A", "held", *rows))
-    with pytest.raises(BadData, match="held is 1 in every row, and the rows are too close in time to be settled"):
-        records.read_runs(table(time_s=1e-4 * np.arange(16.0)), robot=held)
     speed = rig(tmp_path, "motor_speed", '"motor_current", "motor_voltage"')
     columns = {c: v for c, v in table(held=False).items() if c != "output_torque_Nm"}
     columns |= {"motor_speed_rpm": np.zeros(16), "load_torque_Nm": rows["output_torque_Nm"]}
@@ -191,20 +189,64 @@ def test_a_log_of_a_clamp_is_read_as_settled_rows(tmp_path):
     assert not log.sampled and len(log) == 16
 
 
-def test_free_stretches_of_a_log_are_runs(tmp_path):
-    """Clamped, free, clamped, free: two runs without the clamp's rows. Such a log was refused."""
-    robot, clamp = rig(tmp_path, "voltage", '"motor_current", "motor_speed"'), np.repeat([1.0, 0.0, 1.0, 0.0], 5)
-    time, volts = 0.01 * np.arange(20), np.linspace(1.0, 3.0, 20)
-    log = {"time_s": time, "supply_voltage_V": volts, "motor_current_A": volts, "motor_speed_rpm": 99 * (1 - clamp)}
-    runs = records.read_runs({**log, "held": clamp}, robot=robot)
-    assert runs.sampled and len(runs) == 10 and (runs["motor_speed_rpm"] == 99).all() and not runs.has("held")
-    assert_allclose(runs["time_s"], time[clamp == 0])
-    assert runs.run_names.tolist() == ["stretch 1"] * 5 + ["stretch 2"] * 5
-    assert any("holds the output in 10 of 20 rows of a log. They are left out" in n for n in runs.notes)
-    named = records.read_runs({**log, "held": clamp, "run_id": np.repeat(["a", "b"], 10)}, robot=robot)
-    assert named.run_names.tolist() == ["a, stretch 1"] * 5 + ["b, stretch 2"] * 5
-    free = records.read_runs({**log, "held": 0 * clamp}, robot=robot)
-    assert free.run_names.tolist() == [""] * 20 and not free.has("held")
+def test_a_clamp_holds_a_part_of_a_log(tmp_path):
+    """A clamp stops a turning shaft, holds it at two voltages and frees it. Such rows were left out.
+
+    Held rows give R and k alone. The first row of the clamp is from before it, as after each change.
+    """
+    time = 0.02 * np.arange(20)
+    held = 1.0 * ((time > 0.1 - 1e-9) & (time < 0.3 - 1e-9))
+    volts = np.where(time < 0.2 - 1e-9, 3.0, -6.0)
+    log = {"time_s": time, "supply_voltage_V": volts, "held": held, "run_id": np.full(20, "one")}
+    robot = rig(tmp_path, "voltage", '"motor_current", "motor_speed", "output_torque"')
+    robot = params.replace(robot, {"motor.inertia": 4e-4, "motor.inductance": 2e-4})
+    names = ("motor_current_A", "motor_speed_rpm", "output_torque_Nm")
+    runs = records.read_runs({**log, **dict.fromkeys(names, np.ones(20))}, robot=robot)
+    assert runs.sampled and len(runs) == 20 and runs["held"].sum() == held.sum() == 10
+    observe = Histories.of(runs, robot)
+
+    def read(x):
+        return observe(params.replace(robot, {"motor.resistance": x[0], "motor.torque_constant": x[1]})).reading
+
+    at = jnp.array([0.3, 0.1])
+    both = jax.jit(jax.jacfwd(lambda x: (read(x),) * 2, has_aux=True))
+    slopes, readings = jax.device_get(both(at))
+    speed, current, torque = readings.T
+    rests, step = np.r_[6:16], [10]  # the row of a change shows the state before it
+    expected = np.where(np.arange(20) <= 10, 3.0, -6.0) / 0.3
+    assert speed[5] > 25 and not speed[rests].any() and speed[19] < -25
+    assert_allclose(current[rests], expected[rests], rtol=1e-6)
+    load = 5 * np.sign(expected) * (0.1 * np.abs(expected) - 0.02)
+    held_rows = np.setdiff1d(np.r_[6:15], step)
+    assert_allclose(torque[held_rows], load[held_rows], rtol=1e-6)
+    assert_allclose(slopes[held_rows, 1, 0], -expected[held_rows] / 0.3, rtol=1e-6)
+    assert_allclose(slopes[held_rows, 2, 1], 5 * expected[held_rows], rtol=1e-6)
+    assert not slopes[rests, 0].any()
+    ends = [np.asarray(both(at + np.array([d, 0.0]))[1]) for d in (1e-6, -1e-6)]
+    assert_allclose(slopes[..., 0], (ends[0] - ends[1]) / 2e-6, rtol=1e-4, atol=1e-3)
+    free = records.read_runs({**log, "held": 0 * held, **dict.fromkeys(names, np.ones(20))}, robot=robot)
+    assert not free.has("held")
+
+
+def test_a_log_of_a_locked_rotor_shows_its_inductance(tmp_path):
+    """Rows closer than the rise of the current are a history: i = u / R (1 - exp(-t R / L))."""
+    robot = params.replace(rig(tmp_path, "voltage", '"motor_current"'), {"motor.inductance": 3e-3})
+    time = 1e-3 * np.arange(30)
+    log = {"time_s": time, "supply_voltage_V": np.full(30, 3.0), "motor_current_A": np.ones(30), "held": np.ones(30)}
+    runs = records.read_runs(log, robot=robot)
+    assert runs.sampled
+    observe = Histories.of(runs, robot)
+    current = np.asarray(jax.jit(lambda robot: observe(robot).reading)(robot))[:, 0]
+    assert_allclose(current, 10 * -np.expm1(-time * 0.3 / 3e-3), atol=1e-3)
+
+
+def test_a_clamp_in_a_log_of_an_elastic_joint_is_refused(tmp_path):
+    text = RIG_HELD.format(imposed="voltage", channels='"motor_current"') + 'stiffness = "50 ± 5"\n'
+    robot = read_rig(tmp_path, text.replace("[gearbox]", "inertia = 4e-4\n[gearbox]"))
+    log = {"time_s": 1e-3 * np.arange(9), "supply_voltage_V": np.ones(9), "motor_current_A": np.ones(9)}
+    runs = records.read_runs({**log, "held": np.r_[np.zeros(4), np.ones(5)]}, robot=robot)
+    with pytest.raises(BadConfiguration, match="a clamp in a log of a load with backlash or an elastic joint"):
+        Histories.of(runs, robot)
 
 
 def test_check_does_not_call_a_held_shaft_stalled(tmp_path, capsys):

@@ -12,7 +12,7 @@ from calibration.data.columns import LOAD, SUPPLY
 from calibration.data.runs import Runs
 
 #: Columns whose values may change from sample to sample of a run. A stated mass may change as the payload does.
-CHANGING = ("supply_voltage_V", "slope_deg", "payload_kg", "total_mass_kg", LOAD, "surface", "duty", "mode")
+CHANGING = ("supply_voltage_V", "slope_deg", "payload_kg", "total_mass_kg", LOAD, "surface", "duty", "mode", "held")
 
 
 @dataclasses.dataclass(frozen=True)

@@ -218,34 +218,6 @@ def _check_sides(name: str, columns: Columns, layout: Layout) -> None:
         )
 
 
-def drop_clamped_rows(name: str, columns: Columns, kept: np.ndarray) -> tuple[Columns, np.ndarray, Names]:
-    """A log without the rows in which a clamp holds the output, a mask of the other rows, and a note on the dropped
-    ones.
-
-    Each segment between clamped rows becomes a run, because the motors start again. Runs of settled rows are
-    unchanged.
-    """
-    note: Names = ()
-    if "held" in columns and set(TIME) <= set(columns) and (clamped := columns.pop("held") > 0.5).any():
-        if clamped.all():
-            raise BadData(
-                f"{name}: held is 1 in every row, and the rows are too close in time to be settled; log one row "
-                "for each settled state, or also rows in which the output is not clamped"
-            )
-        runs = columns.get("run_id", np.zeros(len(clamped), str))
-        stretch = np.cumsum(np.append(0, np.diff(clamped.astype(int)) < 0)).astype(str)
-        columns["run_id"] = np.char.add(runs, np.char.add(np.where(runs == "", "stretch ", ", stretch "), stretch))
-        kept &= ~clamped
-        left_out = (
-            f"{name}: a clamp holds the output in {clamped.sum()} of {len(clamped)} rows of a log. They are left out"
-        )
-        note = (
-            f"{left_out}, and each segment between them becomes a run. To use them as settled rows, put them "
-            "in a separate file",
-        )
-    return {c: values[kept] for c, values in columns.items()}, kept, note
-
-
 def too_light_message(where: str, total: float, payload: float) -> str:
     included = f"more than the payload of {payload:g} kg, which it includes"
     return f"{where}, total_mass_kg: got {total:g}; expected {included}"

@@ -154,9 +154,9 @@ def runs_of_arrays(
         columns, settled = row_checks.drop_time_of_settled_rows(name, columns, layout, robot)
     notes = (*arrays.notes, *settled, *sides.of_volts(name, columns, battery))
     is_kept, copied = row_checks.distinct_rows(name, columns)
-    columns, is_kept, clamped = row_checks.drop_clamped_rows(name, columns, is_kept)
+    columns = {c: values[is_kept] for c, values in columns.items() if c != "held" or values.any()}
     if measured:
-        notes = (*notes, *copied, *clamped, *_drop_repeats(name, columns, layout))
+        notes = (*notes, *copied, *_drop_repeats(name, columns, layout))
     table_instruments = instruments.infer_instruments(layout.instruments, columns)
     unsigned = sides.unsigned_current_channels(columns, layout) if measured else ()
     unsigned = tuple(i for i in unsigned if i.channel not in {known.channel for known in table_instruments})

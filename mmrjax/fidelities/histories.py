@@ -161,6 +161,13 @@ class LinearisedRun(eqx.Module):
     lags: Float[Array, "steps rates unknowns"]
 
 
+def _stopped_by_clamp(conditions: Conditions, y: Array) -> Array:
+    """Unknowns, or their derivatives by row, without motion if a clamp holds the output."""
+    if conditions.held is None:
+        return y
+    return jnp.where(conditions.held > 0.5, y.at[np.array([MOTOR, GROUND])].set(0.0), y)
+
+
 def _unit_vector_of_current(y: Unknowns) -> Unknowns:
     """Unit vector of the current among the unknowns."""
     return jnp.eye(len(y), dtype=y.dtype)[CURRENT]
@@ -378,7 +385,8 @@ def solve_states(robot: Robot, conditions: Conditions, times: Float[Array, " tim
     along = jnp.zeros(len(size)).at[MOTOR].set(1.0).at[GROUND].set(per_speed * size[MOTOR] / size[GROUND])
 
     def taken(y: Array, step: RunStep) -> tuple[Array, RunStates]:
-        conditions, lag = step.held(constant), _lag_of_robot(robot, constant, step, y)
+        conditions, y = step.held(constant), _stopped_by_clamp(step.held(constant), y)
+        lag = _lag_of_robot(robot, constant, step, y)
         law = functools.partial(drive_rates, robot, conditions)
 
         def turned(part: _StepPart) -> _StepPart:
@@ -452,6 +460,7 @@ def linearise_run(
     steps, constant = run_steps(conditions, times)
     first_state = first_conditions_and_state(robot, conditions)[1]
     begins = jnp.concatenate([first_state[None], run.ends[:-1]])
+    begins = jax.vmap(lambda step, y: _stopped_by_clamp(step.held(constant), y))(steps, begins)
     # A step to rest and the one from it use an approximant of the exponential. For a current that lags by a quarter
     # of such a part, implicit Euler would keep a fifth of the decayed excess.
     passes = (run.sides[:, 0] != run.sides[:, 1]) | (run.since > 0)
@@ -491,7 +500,7 @@ def linearise_run(
         by_decay = lag.means @ gains[:, :, CURRENT]
         lags = jnp.outer(by_rate.begin, -carries[:, CURRENT]) + by_rate.means.T @ by_means
         lags = lags + jnp.outer(by_rate.end, current) + jnp.outer(by_rate.decay, by_decay)
-        return places, carries + lags.T @ by_begin, gains, lags
+        return places, _stopped_by_clamp(conditions, (carries + lags.T @ by_begin).T).T, gains, lags
 
     scan_inputs = begins, run.ends, run.stages, rests, run.sides, spans, passes, steps
     places, carries, gains, lags = _steps_of_blocks(
@@ -627,7 +636,7 @@ def history_signals(
     states = ys, jnp.append(sides[:, 0], sides[-1, 1]), changing
     if at is not None:
         states = jax.tree.map(lambda x: x[at], states)
-    return jax.vmap(lambda y, way, now: _signals_of_instant(robot, eqx.combine(now, constant), y, way))(*states)
+    return jax.vmap(lambda y, way, now: signals_of_instant(robot, eqx.combine(now, constant), y, way))(*states)
 
 
 def _unknowns_of_run(
@@ -640,15 +649,17 @@ def _unknowns_of_run(
     return jnp.concatenate([first_conditions_and_state(robot, conditions)[1][None], ends]), run.sides
 
 
-def _signals_of_instant(robot: Robot, conditions: Conditions, y: Array, way: Array) -> Signals:
-    """Signals of an instant, in static equilibrium if friction holds shafts and load."""
+def signals_of_instant(robot: Robot, conditions: Conditions, y: Array, way: Array) -> Signals:
+    """Signals of an instant, in static equilibrium if friction or a clamp holds shafts and load.
+
+    At the instant at which a clamp stops them, the signals before it.
+    """
     state = state_of_unknowns(robot, y)
     signals = moving(robot, conditions, state)
     if not robot.moves_as_one or conditions.motor_speed is not None:
         return signals
-    return jax.tree.map(
-        lambda a, b: jnp.where(way == HELD, a, b), standing_signals(robot, conditions, state), signals
-    )
+    stands = (way == HELD) & (y[MOTOR] == 0)
+    return jax.tree.map(lambda a, b: jnp.where(stands, a, b), standing_signals(robot, conditions, state), signals)
 
 
 class StepCourse(eqx.Module):
@@ -698,13 +709,14 @@ def course_between_instants(
     def one(y: Array, after: Array, step: RunStep, then: Conditions, sides: Array) -> StepCourse:
         conditions = step.held(constant)
         if step.before is None:  # the imposed quantity is itself linear
-            first = _signals_of_instant(robot, conditions, y, sides[0])
+            first = signals_of_instant(robot, conditions, y, sides[0])
             return StepCourse(
-                first, first, _signals_of_instant(robot, eqx.combine(then, constant), after, sides[1]), jnp.zeros(())
+                first, first, signals_of_instant(robot, eqx.combine(then, constant), after, sides[1]), jnp.zeros(())
             )
-        lag, current = _lag_of_robot(robot, constant, step, y), _unit_vector_of_current(y)
-        states = jnp.stack([y, y - lag.begin * current, after - lag.end * current])
-        rows = jax.vmap(lambda *at: jax.tree.map(jnp.asarray, _signals_of_instant(robot, conditions, *at)))(
+        stopped, current = _stopped_by_clamp(conditions, y), _unit_vector_of_current(y)
+        lag = _lag_of_robot(robot, constant, step, stopped)
+        states = jnp.stack([y, stopped - lag.begin * current, after - lag.end * current])
+        rows = jax.vmap(lambda *at: jax.tree.map(jnp.asarray, signals_of_instant(robot, conditions, *at)))(
             states, sides[np.array([0, 0, 1])]
         )
         first, begin, end = (jax.tree.map(lambda x, k=k: x[k], rows) for k in range(3))

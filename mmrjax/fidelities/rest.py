@@ -118,7 +118,8 @@ def standing_signals(robot: Robot, conditions: Conditions, state: State) -> Sign
 
     The loads alone do not determine static friction. Traction is the pull of gravity along the slope. Rolling
     resistance takes the part that neither shafts nor adhesion hold. The output torque is the smallest that keeps
-    both motor side and track side at rest: friction acts as near as possible to the load it balances.
+    both motor side and track side at rest: friction acts as near as possible to the load it balances. A clamp of the
+    output carries what the friction of motor and gearbox does not hold.
 
     Args:
         conditions: voltage or current imposed, no speed.
@@ -144,9 +145,10 @@ def standing_signals(robot: Robot, conditions: Conditions, state: State) -> Sign
         least_, most = ((inputs[k] - track_losses[1 - k]) / chassis.radius for k in range(2))
         traction = one_sided.clip(one_sided.clip(traction, least_, most), -ahead.adhesion_limit, ahead.adhesion_limit)
     carried = chassis.radius * traction
-    torque = one_sided.clip(
-        0.0, jnp.maximum(carried + track_losses[0], inputs[0]), jnp.minimum(carried + track_losses[1], inputs[1])
-    )
+    loads = [carried + lost for lost in track_losses]
+    if conditions.held is not None:
+        loads = [jnp.where(conditions.held > 0.5, *both) for both in zip(inputs, loads, strict=True)]
+    torque = one_sided.clip(0.0, jnp.maximum(loads[0], inputs[0]), jnp.minimum(loads[1], inputs[1]))
     none = jnp.zeros_like(carried)
     return dataclasses.replace(
         ahead,
@@ -217,8 +219,8 @@ def shaft_direction(robot: Robot, conditions: Conditions, state: State) -> tuple
     """Direction in which shafts and a load that move as one turn, or leave rest, ±1 [-], and time until then [s].
 
     `HELD` if they rest and friction holds them by the test of `firmness`, both now and at the later current at rest.
-    If friction holds them only now, they leave rest when the current, which lags exponentially, exceeds it. An
-    imposed speed turns them in any case, 0 if it is 0.
+    If friction holds them only now, they leave rest when the current, which lags exponentially, exceeds it. A clamp
+    holds them in any case. An imposed speed turns them in any case, 0 if it is 0.
     """
     conditions = balances.with_controller_duty(robot, conditions, state)
     motor_speed, load = jnp.asarray(state.speed_motor), robot.chassis(conditions.configuration)
@@ -245,7 +247,9 @@ def shaft_direction(robot: Robot, conditions: Conditions, state: State) -> tuple
         stands = state.speed_motor == 0
         return jnp.where(stands, way, jnp.sign(state.speed_motor)), jnp.where(stands & waits, wait, 0.0)
 
-    return compute_if_needed(slow, leaving, (robot, conditions, state), (jnp.sign(motor_speed), at_once))
+    way, wait = compute_if_needed(slow, leaving, (robot, conditions, state), (jnp.sign(motor_speed), at_once))
+    clamped = jnp.asarray(0.0 if conditions.held is None else conditions.held) > 0.5
+    return jnp.where(clamped, HELD, way), jnp.where(clamped, 0.0, wait)
 
 
 def slides_in_place(robot: Robot, conditions: Conditions) -> Array:

@@ -87,8 +87,10 @@ from mmrjax.fidelities.histories import (
     linearise_run,
     run_response,
     run_steps,
+    signals_of_instant,
     time_grid,
 )
+from mmrjax.fidelities.rest import HELD
 from mmrjax.model import balances, channels
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.params import Scalar
@@ -114,7 +116,7 @@ JUMP = 7.0
 #: Fields of `Conditions` that may change within a run.
 CHANGING = (
     "voltage", "motor_current", "slope_deg", "payload", "adhesion", "total_mass", "duty", "open", "load_torque",
-    "goal",
+    "goal", "held",
 )  # fmt: skip
 #: Imposed quantities among these, and the torque of a brake, which is measured.
 ON_LINES = ("voltage", "motor_current", "duty", "load_torque", "goal")
@@ -270,6 +272,11 @@ class Histories(Observer):
             raise BadConfiguration(
                 f"{runs.source}: time histories of a robot that turns can be simulated but not fitted; make a "
                 f"table of its settled turns: mmrjax settle {runs.source} --robot FILE"
+            )
+        if runs.has("held") and robot.loose:
+            raise BadConfiguration(
+                f"{runs.source}, held: got a clamp in a log of a load with backlash or an elastic joint; leave these "
+                "rows out, or remove backlash and stiffness from the robot's file"
             )
         whole_log, exact = runs.whole, robot.rig.imposed == "motor_speed"
         linear = robot.rig.between_rows == "linear"
@@ -531,6 +538,10 @@ class Histories(Observer):
         if not self.varying:
             return self.conditions
         rows = self.of_rows
+        if rows.held is not None:  # a clamp, not the drive, determines the motion
+            free, drives = rows.held < 0.5, ("voltage", "motor_current")
+            turned_by = {n: np.where(free, x, 0.0) for n in drives if (x := getattr(rows, n)) is not None}
+            rows = dataclasses.replace(rows, held=None, **turned_by)
         braked = np.zeros(len(rows.voltage)) if rows.load_torque is None else _merge_levels(rows.load_torque)
         if rows.voltage_follows:
             driven_channel = "motor_current" if rows.motor_speed is None else "motor_speed"
@@ -853,10 +864,11 @@ def _drive_jumps(runs: Runs, each: list[np.ndarray], rig: Rig) -> list[tuple[np.
     jumps_known = (
         rig.imposed != "motor_speed" and rig.between_rows == "held" and np.isfinite(driven).all() and driven.any()
     )
-    coasts = runs["mode"] == "coast" if runs.has("mode") else np.zeros(len(runs), bool)
+    switches = [runs[column] == word for column, word in (("mode", "coast"), ("held", 1.0)) if runs.has(column)]
     driven, jumps = driven if jumps_known else np.zeros(len(runs)), []
     for rows in each:
-        sizes = np.maximum(_relative_jumps(driven[rows]), coasts[rows][1:] != coasts[rows][:-1])
+        switched = (x[rows][1:] != x[rows][:-1] for x in switches)
+        sizes = functools.reduce(np.maximum, switched, _relative_jumps(driven[rows]))
         jumps.append((time[rows[1:]][sizes > 0], sizes[sizes > 0]))
     return jumps
 
@@ -1357,6 +1369,8 @@ class _ProbedRobot(NamedTuple):
             """Changes through the state, and immediate ones: with an imposed speed, current follows from torque."""
 
             def reading(y: Array, amplitude: Array) -> Array:
+                if held.held is not None:
+                    return _reading(robot, signals_of_instant(self.at(amplitude), held, y, HELD * held.held))
                 return _reading(robot, moving(self.at(amplitude), held, state_of_unknowns(robot, y)))
 
             by_state, at_once = jax.jacfwd(reading, (0, 1))(y, none)
