@@ -131,7 +131,11 @@ def place_in_words(place: str) -> str:
 
 def variable_in_words(variable: str) -> str:
     """Name of a variable of a curve in words, such as `motor speed`."""
-    return EVERY_VARIABLE[variable].label if variable in EVERY_VARIABLE else variable.replace("_", " ")
+    return (
+        EVERY_VARIABLE[variable].label
+        if "_" in variable and variable in EVERY_VARIABLE
+        else variable.replace("_", " ")
+    )
 
 
 def place_signature(linear: Linearization, place: str, shapes: np.ndarray) -> np.ndarray:

@@ -129,12 +129,10 @@ def off_by(column: str, unit: str, factor: float, units: Names, others: Names, i
     """Readings that no robot like this one shows."""
     off, size = (factor, "large") if factor > 1 else (1 / factor, "small")
     subject = f"{column}: readings are about {float(f'{off:.2g}'):g} times too {size} for this robot"
-    alike = (
-        f". {' and '.join(others)} show the same factor, so check {imposed} and the robot's file" if others else ""
-    )
+    alike = f"; the same factor in {' and '.join(others)}: check {imposed} and the robot's file" if others else ""
     if units:
-        return f"{subject}. Are they in {' or '.join(units)}? Expected {unit}{alike}"
-    return f"{subject}{alike}" if others else f"{subject}. Check the unit, {unit}, and the robot's file"
+        return f"{subject}; are they in {' or '.join(units)}? expected {unit}{alike}"
+    return f"{subject}{alike}" if others else f"{subject}; check the unit, {unit}, and the robot's file"
 
 
 #: Code of a remark → a sentence with its values, or a function that makes one.
@@ -192,6 +190,6 @@ SAID: dict[str, str | Callable[..., str]] = {
     "exact than that",
     "inherited_priors": inherited_priors,
     "off_by": off_by,
-    "slopes_in": "slope_deg: the current rises {rise:.2g} times as fast with the slope as for this robot. Are "
-    "the slopes in {unit}? Expected degrees",
+    "slopes_in": "slope_deg: the current rises {rise:.2g} times as fast with the slope as for this robot; are "
+    "the slopes in {unit}? expected degrees",
 }

@@ -19,7 +19,7 @@ class ElectricalEffect(Effect):
 class SeriesResistance(ElectricalEffect):
     """ΔU = a I_d: Ohm's law for a resistance in series with one motor, not included in the motor's data sheet.
 
-    Leads, ammeter and brush contacts in series with each motor.
+    Leads, an ammeter or brush contacts are in series with each motor.
 
     Source: Fig. 20 of the paper (leads and ammeter of the bench). Ohm (1827).
     """
@@ -141,8 +141,8 @@ class ThermalDrift(ElectricalEffect):
 class CoastDecay(ElectricalEffect):
     """ΔU = -a (1 - |D|) E: during a share a of the pauses between the pulses of a duty D the motors coast.
 
-    A driver in fast decay, whose current ends within each period. The mean torque is proportional to the duty, and
-    the no-load speed does not depend on it.
+    The driver uses fast decay, and its current ends within each period. The mean torque is proportional to the duty,
+    and the no-load speed does not depend on it.
 
     Source: Mohan, Undeland and Robbins, Power Electronics (2003), chapter 7: discontinuous conduction, with pulses
     and pauses long compared with L/R. `driver.Driver` with `decay = "fast"` is a = 1, and also gives the supply

@@ -44,9 +44,7 @@ class Windage(MotorEffect):
 
 
 class StribeckMotor(MotorEffect):
-    """ΔM_df = a exp(-|ω_m| / ω_s) sign ω_m.
-
-    Friction of brushes and bearings that decreases with shaft speed.
+    """ΔM_df = a exp(-|ω_m| / ω_s) sign ω_m. The friction of brushes and bearings decreases with shaft speed.
 
     Source: Tustin, The effects of backlash and of speed-dependent friction on the stability of closed-cycle
     control systems, J. IEE 94 (1947), the exponential law. Armstrong-Hélouvry, Dupont and Canudas de Wit
@@ -72,7 +70,7 @@ class StribeckMotor(MotorEffect):
 class IronLoss(MotorEffect):
     """ΔM_df = a 2x / (1 + x²), x = ω_m / ω_c: the drag of an eddy-current brake.
 
-    Eddy currents in the motor's solid parts, weakened by their own field at high speed.
+    Eddy currents in the motor's solid parts brake it, and their own field weakens them at high speed.
 
     Source: Wouterse, Critical torque and speed of eddy current brake with widely separated soft iron poles,
     IEE Proc. B 138 (1991). Below ω_c the drag is proportional to speed, as eq. (14)'s viscous term. Hysteresis

@@ -84,10 +84,10 @@ class NonlinearSlip(SlipEffect):
 class SpeedSlip(SlipEffect):
     """ΔV = a V_teor |V_teor|: the share of speed lost is proportional to the speed V_teor without slip.
 
-    The share of speed lost to slip grows with speed.
+    Treads lift off the ground between impacts.
 
-    Source: first term of an expansion of the slip in speed. Treads lift off between impacts. The loss
-    is kinematic: on a descent it removes no power.
+    Source: first term of an expansion of the slip in speed. The loss is kinematic, so on a descent it removes no
+        power.
     """
 
     driver = "speed"
