@@ -39,10 +39,10 @@ from sweeps.report.document import Document
 ANGLE = channels.find_channel("output_angle")
 #: Stands for the name of a joint in the name of its robot's file.
 JOINT = "{joint}"
-#: Column of the current's sd, and rows within which the motion is as uncertain as in its worst row.
-SD, NEAR = "motor_current_sd_A", 21
-#: Smallest speed whose direction is certain, in errors of the speed.
-CERTAIN = 2.0
+#: Column of the current's sd.
+SD = "motor_current_sd_A"
+#: Smallest speed whose direction is certain, in errors of the speed, and smallest change that is a jump, in sds.
+CERTAIN, JUMP = 2.0, 6.0
 #: Columns of the error of the torque [A] and of the smallest certain speed [rpm], while a joint's table is made.
 DOUBTS = ("error of torque", "least speed")
 #: Fewest readings of a run whose motion is smoothed.
@@ -107,8 +107,8 @@ def noise_of_angle(readings: np.ndarray) -> float:
 
 
 def smoothed_motion(time: np.ndarray, angle: np.ndarray, times: np.ndarray, degree: int) -> tuple[np.ndarray, int]:
-    """Angle [rad], speed and acceleration at `times`, shape (3, times), by a spline that leaves the noise alone, and
-    the number of its knots.
+    """Angle [rad], speed, acceleration and slope of the line to the next speed at `times`, shape (4, times), by a
+    spline that leaves the noise alone, and the number of its knots.
 
     It has the fewest knots with which readings are off by their noise, at least that of the display's step if most
     readings repeat others. At a jump of the torque, knots crowd, so that the acceleration jumps within a few samples.
@@ -119,8 +119,9 @@ def smoothed_motion(time: np.ndarray, angle: np.ndarray, times: np.ndarray, degr
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # that more knots would be needed, for readings without noise
         curve = UnivariateSpline(time, angle, k=degree, s=len(time) * noise**2)
-    motion = np.stack([curve(times), curve.derivative(1)(times), curve.derivative(2)(times)])
-    return motion, len(curve.get_knots())
+        speed = curve.derivative(1)(times)
+        lines = np.diff(speed) / np.diff(times)
+    return np.stack([curve(times), speed, curve.derivative(2)(times), [*lines, lines[-1]]]), len(curve.get_knots())
 
 
 def columns_of_joint(log: NamedArrays, joint: str, joints: Names) -> NamedArrays:
@@ -137,14 +138,14 @@ def columns_of_joint(log: NamedArrays, joint: str, joints: Names) -> NamedArrays
 
 
 def smoothed_log(log: NamedArrays, chain: Chain) -> tuple[np.ndarray, np.ndarray, int]:
-    """Motion of all joints at each row of a log, shape (3, rows, joints), by splines of degree 5 and of degree 3, and
-    the largest number of knots of a joint at degree 5.
+    """`smoothed_motion` of all joints at each row of a log, shape (4, rows, joints), by splines of degree 5 and of
+    degree 3, and the largest number of knots of a joint at degree 5.
 
     Raises:
         BadData: the log has no `time_s`, lacks the angle of a joint, or has too few readings of it in a run. As
             `check_units`.
     """
-    motion, cubic = np.empty((2, 3, len(log), len(chain.names)))
+    motion, cubic = np.empty((2, 4, len(log), len(chain.names)))
     knots = np.zeros(len(chain.names), int)
     for k, name in enumerate(chain.names):
         joint = columns_of_joint(log, name, chain.names)
@@ -179,11 +180,13 @@ def smoothed_log(log: NamedArrays, chain: Chain) -> tuple[np.ndarray, np.ndarray
 def runs_of_joints(log: NamedArrays, chain: Chain, robots: Mapping[str, Robot]) -> dict[str, Runs]:
     """Runs of each joint, with the torque of the rest of the model as the torque of its load.
 
-    It is what the model needs less the inertia and the weight that the joint's file states. The motor speed is
-    that of the smoothed motion. Both err most where the torque jumps, by about their difference from those of cubic
-    splines, alike in the rows between two knots. This error of the torque is part of the current's sd, unless the log
-    states it. If it exceeds the current's noise, one row for each knot is used. Readings are left out where the
-    direction of the speed is uncertain, because the friction of a wrong direction would count as an error.
+    It is what the model needs less the inertia and the weight that the joint's file states. The simulation moves
+    inertias by the slopes of the lines between speeds, half a row early, so the torque contains the difference. The
+    motor speed is that of the smoothed motion. Both err most where the torque jumps, within two knots by about their
+    difference from those of cubic splines. Within a knot of a jump of the current, the torque errs by up to that
+    jump. This error of the torque is part of the current's sd, unless the log states it. If it exceeds the current's
+    noise, one row for each knot is used. Readings are left out where the direction of the speed is uncertain, because
+    the friction of a wrong direction would count as an error.
 
     Args:
         robots: robot of each joint, by the joint's name.
@@ -192,18 +195,22 @@ def runs_of_joints(log: NamedArrays, chain: Chain, robots: Mapping[str, Robot]) 
         BadData: as `smoothed_log` and `records.runs_of_arrays`.
     """
     motion, cubic, knots = smoothed_log(log, chain)
-    torques, cubic_torques = chain.torques(motion), chain.torques(cubic)
-    doubts = [maximum_filter1d(np.abs(x), NEAR, axis=0) for x in (torques - cubic_torques, motion[1] - cubic[1])]
+    torques, cubic_torques = chain.torques(motion[:3]), chain.torques(cubic[:3])
+    apart = round(len(log) / knots)  # rows from knot to knot
+    doubts = [
+        maximum_filter1d(np.abs(x), 4 * apart + 1, axis=0) for x in (torques - cubic_torques, motion[1] - cubic[1])
+    ]
     runs = {}
     for name, robot in robots.items():
         k, (load,) = chain.names.index(name), robot.configurations.members
         joint = columns_of_joint(log, name, chain.names)
-        angle, speed, acceleration = motion[:, :, k]
-        known_torque = float(load.inertia) * acceleration + np.asarray(load.torque_load(angle))
+        angle, speed, acceleration, lines = motion[:, :, k]
         ratio = float(robot.gearbox.ratio)
         per_ampere = ratio * float(robot.gearbox.efficiency_load * robot.motor.torque_constant)
+        rotor = ratio * per_ampere * float(robot.motor.inertia / robot.motor.torque_constant)
+        inertial = float(load.inertia) * lines + rotor * (lines - acceleration)
         columns = {
-            LOAD: torques[:, k] - known_torque,
+            LOAD: torques[:, k] - inertial - np.asarray(load.torque_load(angle)),
             SPEED: speed * ratio / RPM,
             **{DOUBTS[0]: doubts[0][:, k] / per_ampere, DOUBTS[1]: CERTAIN * doubts[1][:, k] * ratio / RPM},
         }
@@ -211,8 +218,11 @@ def runs_of_joints(log: NamedArrays, chain: Chain, robots: Mapping[str, Robot]) 
         doubt, least = (table.extras[c] for c in DOUBTS)
         (noise,) = estimate_noise(table, sizes := observer_kind(table).sizes(table))
         noise_sd = np.zeros(len(table)) if noise is None else noise.sd(sizes[:, 0])
+        change = np.abs(np.diff(table[CURRENT], prepend=np.nan))
+        jump = np.where(change > JUMP * noise_sd, change, 0.0)
+        spread = np.sqrt(maximum_filter1d(jump, 2 * apart + 1) ** 2 + doubt**2 + noise_sd**2)
         certain = np.abs(table[SPEED]) > least
-        columns = {SD: np.hypot(doubt, noise_sd), **table.columns, CURRENT: np.where(certain, table[CURRENT], np.nan)}
+        columns = {SD: spread, **table.columns, CURRENT: np.where(certain, table[CURRENT], np.nan)}
         note = f"{joint.name}: {np.sum(~certain)} of {len(table)} readings of the current are left out, because the "
         table = dataclasses.replace(
             table,
