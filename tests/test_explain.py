@@ -64,7 +64,9 @@ def test_parameters_and_channels_are_explained_by_their_rows():
     known = {p.name: p for p in params.walk_parameters(paper_robots.nominal())}
     lines = dict(said("parameter", "motor.resistance"))
     spec = known["motor.resistance"].spec
-    assert lines["means"] == f"{spec.meaning} [{spec.unit}]" and lines["nominal"] == f"0.611 ohm; {spec.source}"
+    assert (
+        lines["means"] == f"{spec.meaning} [{spec.unit}]" and lines["nominal"] == f"0.611 ohm. Source: {spec.source}"
+    )
     assert lines["equation"].startswith("U_e = C_E ω + I R") and "5 %" in lines["prior"]
     assert dict(said("parameter", "6T2A.ground.friction.static"))["equation"]
     lines = dict(said("channel", "speed_mm_s"))

@@ -70,7 +70,7 @@ def test_a_current_in_another_unit_is_doubted_with_what_turns_the_load(tmp_path,
     assert bool(said) == doubted
     if doubted:
         assert (
-            f"up to {2 * factor:g} A, although by the file's numbers the load turns slowly at 0.667 A; is it in"
+            f"up to {2 * factor:g} A, although by the file's numbers the load turns slowly at 0.667 A. Is it in"
             in said
         )
 

@@ -181,7 +181,7 @@ def test_a_clock_of_its_own_may_wrap_and_start_at_boot(tmp_path, robot):
     runs = records.read_runs(tmp_path / "log.h5", robot, columns=COLUMNS)
     assert_allclose(runs["time_s"], fast["t"], rtol=0, atol=1e-6)
     assert any("/drive/t wraps at 4294967296" in note for note in runs.notes)
-    assert any("/drive/t has no unit; its numbers are read as us (100 Hz)" in note for note in runs.notes)
+    assert any("/drive/t has no unit. Its numbers are read as us (100 Hz)" in note for note in runs.notes)
     read = np.isfinite(runs["motor_speed_rpm"])
     assert_allclose(runs["motor_speed_rpm"][read], np.interp(fast["t"], slow["t"], slow["rpm"])[read], rtol=1e-6)
 

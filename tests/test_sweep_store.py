@@ -331,7 +331,7 @@ def test_what_is_half_written_is_not_trusted(sweep, whole, monkeypatch, tmp_path
 
 def test_full_disk_in_the_middle_ends_with_2_and_goes_on_later(sweep, whole, monkeypatch, tmp_path):
     heal = stopping(monkeypatch, 25, OSError(errno.ENOSPC, "No space left on device"))
-    ends(sweep("s"), "s.partial: No space left on device after 5 of 12 chunks; free some space")
+    ends(sweep("s"), "s.partial: No space left on device after 5 of 12 chunks. Free some space")
     assert not (tmp_path / "s").exists()
     heal()
     assert sweep("s")[0] == 0
@@ -487,7 +487,7 @@ def test_killed_at_twenty_random_moments_goes_on_to_equal_stores(tmp_path):
 @pytest.mark.slow
 def test_shares_make_the_same_store_in_any_order(sweep, whole, tmp_path):
     for k in (3, 1):
-        ends(sweep("s", "--shard", f"{k}/3"), "chunks of s.partial are finished; the last share", code=0)
+        ends(sweep("s", "--shard", f"{k}/3"), "chunks of s.partial are finished. The last share", code=0)
     assert not (tmp_path / "s").exists()
     _, out, _ = ends(sweep("s", "--shard", "2/3"), code=0)
     assert out.splitlines()[-1] == "s"
@@ -718,7 +718,7 @@ def test_what_is_damaged_of_an_interrupted_sweep_is_computed_again(opened, tmp_p
         written(again, k, speed=WHOLE[k])
     finished(again)
     assert xr.open_zarr(tmp_path / "s" / zarr_store.STORE).speed.values.tolist() == WHOLE
-    assert ("damaged; " in capsys.readouterr().err) == ("identity" not in name and "journal" not in name)
+    assert ("damaged, so" in capsys.readouterr().err) == ("identity" not in name and "journal" not in name)
     last = opened()  # which reads the chunk's second line
     assert last.finished and len(last.done()) == 3
 

@@ -61,7 +61,7 @@ RESULTS: dict[type, Callable[..., str]] = {
 #: The same of parts of results, by name.
 PARTS: dict[tuple[type, str], Callable[..., str]] = {
     (fit_results.CalibrationResult, "header"): lambda found, robot_name: (
-        f"calibrated from {robot_name} with {found.source}; the free parameters: {', '.join(found.parameters)}"
+        f"calibrated from {robot_name} with {found.source}. The free parameters: {', '.join(found.parameters)}"
     ),
     (loop_results.DiscoveryResult, "header"): loop_words.proposed_header,
     (loop_results.DiscoveryResult, "refit header"): loop_words.refit_header,

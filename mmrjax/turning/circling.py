@@ -434,10 +434,8 @@ def status_of_steady_motion(
 
 
 def status_after_run(robot: Robot, conditions: Conditions, travel: balances.Travel, motion: PlaneMotion) -> Array:
-    """Status at the end of a run over time: `not_settled` if the motion still changes, otherwise as
+    """Status at the end of a run over time: `not_settled` if the motion still changes, otherwise that of
     `status_of_steady_motion`.
-
-    Otherwise that of `status_of_steady_motion`.
     """
     chassis = robot.chassis(conditions.configuration)
     size = _motion_size(chassis, motion.speed, motion.speed_lateral, motion.yaw_rate)
@@ -473,7 +471,7 @@ def current_at_rest(robot: Robot, conditions: Conditions, motion: PlaneMotion) -
 def firmness(robot: Robot, conditions: Conditions, motion: PlaneMotion) -> Scalar:
     """Margin of the friction that holds the robot at rest at its heading, negative if it cannot hold it [-].
 
-    Each side against its motors and its share of gravity, the ground against all of gravity.
+    The friction of each side has to hold its motor and its share of gravity. The ground has to hold all of gravity.
     """
     own, state = _sides_at_rest(robot, conditions, motion)
     sides = jnp.asarray(jax.vmap(lambda c, s: rest.firmness(robot, c, s))(own, state))

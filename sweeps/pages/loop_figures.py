@@ -517,7 +517,7 @@ def draw_parameter_shifts(found: DiscoveryResult) -> Figure:
     axes.invert_yaxis()
     axes.grid(axis="y", visible=False)
     axes.set(xlabel="shift from the prior [prior sds]")
-    axes.set_title("orange: before, blue: after; a large shift probably absorbs a missing effect")
+    axes.set_title("orange: before, blue: after. A large shift probably absorbs a missing effect")
     return fig
 
 

@@ -13,7 +13,7 @@ from calibration.data.columns import Layout
 from calibration.described import describe
 from calibration.discovery.result import DiscoveryResult
 from calibration.discovery.settings import WITHOUT_NAME
-from calibration.inference import blocks
+from calibration.inference import bases, blocks
 from calibration.inference.details import TimeStatistics
 from calibration.inference.fit_notes import Determination, remarks_with_codes
 from calibration.inference.simulation_errors import OF_SIZE
@@ -196,7 +196,7 @@ def _next_step(found: DiscoveryResult, more: str) -> str:
 def _advice(found: DiscoveryResult) -> Table:
     after, more = found.next_experiment, ""
     if after is not None and after.separates:
-        more = f" It distinguishes {', '.join(after.separates)}; expected separation {after.expected_sigma:.1f} σ."
+        more = f" It distinguishes {', '.join(after.separates)}. Expected separation: {after.expected_sigma:.1f} σ."
     if after is not None and found.headline.level == "class" and not after.settles:
         more += " Some pairs remain undecided."
     far = [
@@ -228,7 +228,7 @@ def _effects_in_words(found: DiscoveryResult) -> Iterable[Block]:
     rows = []
     for e in found.to_json()["effects"]:
         effect = next((x for x in found.effects if x.name == e["name"]), None)
-        plot_words = f"not in the library; plotted over {str(e.get('variable')).replace('_', ' ')}"
+        plot_words = f"not in the library, plotted over {bases.variable_in_words(str(e.get('variable')))}"
         lowers, kinds = loop_words.misfit_text(e["score"]), ", or ".join(e["families"])
         if effect is None:
             alike = ", ".join(b for b in e["balances_alike"] if b != e["balance"])

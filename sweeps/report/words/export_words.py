@@ -46,9 +46,9 @@ USE = {
         "rotor has {armature:.4g} kg·m² at the joint."
     ),
     "randomization": (
-        '`numpy.load("draws.npz")`: each array has one value per sample; use all values of one sample '
+        '`numpy.load("draws.npz")`: each array has one value per sample. Use all values of one sample '
         "together, since they are correlated. `mujoco/…` are attributes of `drive.xml` as the format mujoco "
-        "writes it; `actuator/…` are keys of `PARAMS`."
+        "writes it. `actuator/…` are keys of `PARAMS`."
     ),
 }
 #: Readings that a controller compares with its goal, their units, and the last term of its duty.
@@ -59,9 +59,9 @@ GOALS = {
 }
 NOT_TESTED = (
     "Voltages, loads and temperatures outside the runs above.",
-    "Fast changes: only settled runs are compared, so inductance and inertia are the given values.",
+    "Fast changes. Only settled runs are compared, so inductance and inertia have the given values.",
 )
-BACKWARD = "Runs in which the load drives the motor: not among the runs above."
+BACKWARD = "Runs in which the load drives the motor, because none is among the runs above."
 
 
 def export_statement(found: Export) -> str:
@@ -97,10 +97,10 @@ def export_remarks(found: Export) -> list[str]:
     compared, drive = found.comparison, found.joint
     said = []
     if not compared.situation.is_measured:
-        said.append("no measurements were given, so the reference is the native model; give runs with --data")
+        said.append("no measurements were given, so the reference is the native model. Give runs with --data")
     else:
         said.append(
-            "the refit used no measurements: these are hold-out errors if the robot was not fitted to these runs"
+            "the refit used no measurements. The errors are hold-out errors if the robot was not fitted to these runs"
         )
     dropped_names = [f.name for f in compared.fates if f.verdict == DROPPED]
     if dropped_names:
@@ -256,7 +256,7 @@ def law_text(found: Export) -> str:
     return f"""# The law of this drive
 A motor with its gearbox on one joint: {origin}. A program, mmrjax {__version__},
 found its numbers from measurements or data sheets, and wrote it as {FORMATS[found.format]}. You need no other file of
-that program. All units are SI; the joint is the driven wheel or output shaft.
+that program. All units are SI. The joint is the driven wheel or output shaft.
 
 ## How to use it
 {USE[found.format].format(**about)}{command_sentence(found)}
