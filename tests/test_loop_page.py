@@ -191,7 +191,7 @@ def test_the_page_opens_with_the_law_and_the_terminal_with_five_lines(shown, cap
     assert "May I use it?" in head and "new law, 95 %" in head
     with figure_settings():
         (axes,) = loop_figures.draw_effect_laws(
-            got.found, loop_report.rows_of(got.found), room.changes_by_effect(got.found)
+            got.found, loop_report.rows_for_figures(got.found), room.changes_by_effect(got.found)
         ).axes
     band = axes.collections[-1].get_paths()[0].get_extents()
     (change,) = room.changes_by_effect(got.found).values()
