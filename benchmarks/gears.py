@@ -2,12 +2,13 @@
 
     python benchmarks/gears.py --data DIR [--out docs/lab/gears.md] [--shelf docs/actuators]
 
-`DIR` holds folders of JSON logs of github.com/Rhoban/bam (Apache-2.0), a servo that swings a mass on an arm:
-`xl330` (commit af226046, bam/data.bak/raw) and `sts3250` (commit d13c0577, data_raw_feetech). The arm's own mass
-is not in these logs. Mass and length give the torque T = m l² α + m g l sin θ at the output. The motor's voltage is
-c U = T + k ω + J α + friction. The columns of friction are the terms of the program's own effects. Coefficients
-follow by least squares with the signs that physics allows, shapes by a grid, both from training logs alone. The
-voltage is predicted, because a loss by torque would contain the torque that it predicts.
+`DIR` holds folders of JSON logs of a servo that swings a mass on an arm. `xl330` is bam/data.bak/raw of
+github.com/Rhoban/bam (Apache-2.0, commit af226046). `sts3215` and `sts3250` are of github.com/kscalelabs/sysid (no
+licence): data/feetech/STS_3215_12V_20250317/raw of commit 6b787370 and data/feetech/STS_3250/raw of d66b22c. The mass
+of the arm is not in these logs. Mass and length give the torque T = m l² α + m g l sin θ at the output. The motor's
+voltage is c U = T + k ω + J α + friction. The columns of friction are the terms of the program's own effects.
+Coefficients follow by least squares with the signs that physics allows, shapes by a grid, both from training logs
+alone. The voltage is predicted, because a loss by torque would contain the torque that it predicts.
 """
 
 from __future__ import annotations
@@ -22,6 +23,8 @@ import numpy as np
 from scipy.optimize import lsq_linear
 from scipy.signal import savgol_filter
 
+#: Angle of a lost reading [rad].
+LOST = -3.14
 #: Window of the smoothed angle [s], and speed above which rows are compared [rad/s].
 SMOOTHED, MOVES = 0.09, 0.1
 #: Laws by their names in the tables: effects besides dry and viscous friction.
@@ -34,6 +37,8 @@ LAWS = {
 }
 #: Shapes that are searched: angle over which bristles yield [rad], and speed at which friction has fallen [rad/s].
 YIELDS, FADES = (0.005, 0.01, 0.02, 0.04), (0.1, 0.3, 1.0)
+#: Title of each record, and the gain at which its logs are repeated [raw number]. 0: they are not.
+RECORDS = {"xl330": ("Dynamixel XL330", 0), "sts3215": ("Feetech STS3215", 16), "sts3250": ("Feetech STS3250", 16)}
 BASE = ("c", "k", "J", "M_0", "K")
 UNITS = {"c": "N·m/V", "k": "N·m·s", "J": "kg·m²", "K": "N·m·s"}
 UNITS |= dict.fromkeys(("M_0", "presliding", "stribeck_exponent"), "N·m")
@@ -61,7 +66,8 @@ class Log:
 def read_log(path: Path) -> Log:
     """A log of bam's pendulum, on an even clock."""
     text = json.loads(path.read_text(encoding="utf-8"))
-    raw = {k: np.array([e[k] for e in text["entries"]], float) for k in text["entries"][0]}
+    entries = [e for e in text["entries"] if e["position"] > LOST]
+    raw = {k: np.array([e[k] for e in entries], float) for k in entries[0]}
     time = np.linspace(raw["timestamp"][0], raw["timestamp"][-1], len(raw["timestamp"]))
     at = {k: np.interp(time, raw["timestamp"], v) for k, v in raw.items() if k != "load"}
     if np.any(raw["load"]):  # an XL330 shows the share of its voltage, of 885, in 16 bits
@@ -79,6 +85,19 @@ def read_log(path: Path) -> Log:
     dry = np.tanh(speed / 0.02)
     base = np.stack([torque, on * speed, turning, dry, speed], 1)
     return Log(base, on * duty * at["input_volts"], torque, speed, time)
+
+
+def selected(paths: list[Path], gain: int) -> list[Path]:
+    """Logs of a record. If they are repeated, the first of each mass, arm and course at one gain, without steps."""
+    if not gain:
+        return paths
+    texts = {path: json.loads(path.read_text(encoding="utf-8")) for path in reversed(paths)}
+    first = {
+        (text["mass"], text["length"], text["trajectory"]): path
+        for path, text in texts.items()
+        if text["kp"] == gain and text["trajectory"] != "brutal"
+    }
+    return sorted(first.values())
 
 
 def columns(log: Log, law: str, yields: float, fade: float) -> np.ndarray:
@@ -279,17 +298,18 @@ TOP = """# Load loss of gears
 
 `<dcmotor>` of MuJoCo has Coulomb, viscous and LuGre friction. google-deepmind/mujoco issue 3528 asks for a loss in
 proportion to the torque. This page compares such losses on public records. `python benchmarks/gears.py --data DIR`
-wrote it from logs of [bam](https://github.com/Rhoban/bam) (Duclusaud, Passault, Padois and Ly 2024, Apache-2.0).
+wrote it from logs of [bam](https://github.com/Rhoban/bam) (Duclusaud, Passault, Padois and Ly 2024, Apache-2.0) and
+[kscalelabs/sysid](https://github.com/kscalelabs/sysid) (no licence).
 
 A law is fitted to all logs of a record but one. It predicts that one's voltage from its motion, in rows above
 0.1 rad/s. The intervals come from drawing whole logs. ± is one standard error over logs. Load loss is
 `gear_load_loss`, by direction with `backdriving_loss`. Bristle is `bristle_load_loss` with
 `bristle_backdriving_loss` and `presliding`. LuGre is `presliding` with `stribeck_exponent`.
 
-These logs have no current. So a share lost while the motor drives looks like a smaller torque constant c, and rows
-that move show only the ratio of both directions: the two directions are not told apart. The arm's mass is not stated.
-The voltage of the XL330 is read. That of the STS3250 is computed from goal, angle and the law that bam states, at
-20 ms. Logs of MX-64 and MX-106 in the same repository have no torque. EMPS has no load. No data are copied here.
+These logs have no current, or one that is renewed each 0.9 s. So a share lost while the motor drives looks like a
+smaller torque constant c, and rows that move show only the ratio of both directions: the two directions are not told
+apart. The arm's mass is not stated. The voltage of the XL330 is read. That of the others is computed from goal, angle
+and the law that bam states. Logs of MX-64 and MX-106 have no torque, and EMPS has no load. No data are copied here.
 """
 
 
@@ -340,14 +360,13 @@ def main() -> None:
     wanted.add_argument("--out", type=Path, default=Path("docs/lab/gears.md"))
     wanted.add_argument("--shelf", type=Path, help="folder of the pages of actuators")
     given = wanted.parse_args()
-    titles = {"xl330": "Dynamixel XL330, 16 logs", "sts3250": "Feetech STS3250, 4 logs"}
     texts = [TOP]
-    for folder, title in titles.items():
-        paths = sorted((given.data / folder).glob("*.json"))
+    for folder, (name, gain) in RECORDS.items():
+        paths = selected(sorted((given.data / folder).glob("*.json")), gain)
         if paths:
-            logs, name = [read_log(p) for p in paths], title.split(",")[0]
+            logs = [read_log(p) for p in paths]
             texts.append(section(name, logs))
-            # The voltage of the other record is computed, and no law predicts it well.
+            # The voltage of the other records is computed, no law predicts it well, and they have no licence.
             if given.shelf is not None and folder == "xl330":
                 given.shelf.mkdir(exist_ok=True)
                 (given.shelf / f"{folder}.md").write_text(shelf_page(name, logs, paths), encoding="utf-8")

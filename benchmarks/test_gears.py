@@ -34,6 +34,7 @@ def write(folder, name, seed, share):
         }
         for t, a, n in zip(time.tolist(), angle.tolist(), raw.tolist(), strict=True)
     ]
+    entries[300]["position"] = -np.pi  # a lost reading
     text = {"mass": MASS, "length": LENGTH, "kp": 100, "trajectory": name, "entries": entries}
     (folder / f"{name}.json").write_text(json.dumps(text))
 

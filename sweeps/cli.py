@@ -30,8 +30,8 @@ app = typer.Typer(
     name="mmrjax", add_completion=False, pretty_exceptions_enable=False,
     rich_markup_mode="rich",
     help="Simulate the drive and running gear of a small robot, and compare the model with measured data.\n\n"
-    "[bold]Exit codes[/bold]: 0 done, whatever the answer; 1 internal error; 2 usage or configuration; 3 done, but a "
-    "solver failed; 4 bad data; 130 interrupted (the same command continues).",
+    "[bold]Exit codes[/bold]: 0 done, whatever the answer. 1 internal error. 2 usage or configuration. 3 done, but a "
+    "solver failed. 4 bad data. 130 interrupted, and the same command continues.",
 )  # fmt: skip
 
 
@@ -41,17 +41,19 @@ _NoCache = Annotated[
 ]
 _Config = Annotated[
     Path | None,
-    typer.Option("--config", help="TOML file with the keys of a config.resolved.toml. Options override it."),
+    typer.Option(
+        "--config", help="TOML file with the keys of a config.resolved.toml. Options on the command line override it."
+    ),
 ]
-_Trust = Annotated[bool, typer.Option("--trust", help="Allow --config to name code to run: effects and a scheduler.")]
+_Trust = Annotated[
+    bool, typer.Option("--trust", help="Allow the file of --config to name code that runs: effects, or a scheduler.")
+]
 _Effects = Annotated[
     list[str] | None, typer.Option("--effects", help="Python file with your own effects. May be repeated.")
 ]
 _Columns = Annotated[
     str | None,
-    typer.Option(
-        "--columns", help="Preset for the column names of the data, or a preset file (docs/howto/formats.md)."
-    ),
+    typer.Option("--columns", help="Preset or preset file for the column names of the data (docs/howto/formats.md)."),
 ]
 
 
@@ -167,11 +169,11 @@ def _root(
 def simulate() -> None:
     """Simulate operating points, a start, a mission or a turn.
 
-    Options describe one operating point, --runs FILE.csv several. With --model drive or track the run starts from
-    standstill. history.csv then holds current and speeds over time. With track, reactions.csv also holds the loads
-    inside the running gear. With --profile the robot follows a mission: segments.csv holds energy (Wh, Wh/m),
-    distance, peaks, temperatures and charge of each segment. With --left and --right the two sides have different
-    voltages, and the robot turns (docs/howto/turn.md).
+    The options describe one operating point, and --runs FILE.csv gives several. With --model drive or track the run
+    starts from standstill. history.csv then holds current and speeds over time. With track, reactions.csv also holds
+    the loads inside the running gear. With --profile the robot follows a mission, and segments.csv holds energy (Wh,
+    Wh/m), distance, peaks, temperatures and charge of each segment. With --left and --right the two sides have
+    different voltages, and the robot turns (docs/howto/turn.md).
     """
 
 
@@ -186,7 +188,7 @@ def simulate() -> None:
 def sweep() -> None:
     """Simulate every combination of a grid in one batch.
 
-    The default grid is the paper's Table 8. An axis is a list, 0,5,10, or a range, first:last:step, such as
+    The default grid is the paper's Table 8. An axis is a list such as 0,5,10, or a range first:last:step such as
     0:20:0.5. Up to 100 000 runs are written to runs.csv. Larger sweeps write a Zarr store. --export csv writes
     runs.csv too. In a CONFIG.toml any parameter or condition can vary, on a grid or by sampling
     (docs/reference/plans.md). An interrupted sweep continues with the same command and the same --out.
@@ -202,7 +204,8 @@ def sweep() -> None:
 def compare() -> None:
     """Simulate measured runs and report the errors.
 
-    Errors are given by row and channel, with rms, worst and R². --against compares two robots on the same rows.
+    Errors are reported for each row and channel, with rms, largest error and R². --against compares two robots on the
+    same rows.
     """
 
 
@@ -215,8 +218,8 @@ def compare() -> None:
 def reproduce() -> None:
     """Reproduce the paper's tables and figures with a robot.
 
-    The bench's rows and Figs. 5a-29 are compared row by row. With --model track the running gear is resolved (Figs.
-    23-27).
+    The rows of the paper's bench and Figs. 5a-29 are compared one by one. --model track adds the loads inside the
+    running gear (Figs. 23-27).
     """
 
 
@@ -229,9 +232,9 @@ def reproduce() -> None:
 def render() -> None:
     """Draw a picture or film of the track model.
 
-    It shows the robot on its slope, its track and the contact forces. The run starts from standstill. With --left
-    and --right the robot turns and is shown from above. --climb draws a climb that has been computed. No display is
-    needed.
+    The picture shows the robot on its slope, its track and the contact forces. The run starts from standstill. With
+    --left and --right the robot turns and is shown from above. --climb draws a climb that was computed before. The
+    command works without a display.
     """
 
 
@@ -246,11 +249,12 @@ def render() -> None:
 def calibrate() -> None:
     """Fit parameters to measured runs, with intervals.
 
-    The search follows gradients through the simulation. By default it frees friction, slip and data-sheet values.
+    The search follows gradients through the simulation. By default it fits friction, slip and data-sheet values.
     Writes result.json and robot.toml, which every command accepts as --robot. Logs are fitted with the drive model,
     settled runs with the steady model unless --model is given. With drive or track the search starts at the optimum
-    of steady, and intervals are linear unless --profiles is given. track takes minutes. If the running gear is free
-    (--model track --free running_gear.guide_recess,...), a population is searched first.
+    of steady, and intervals are linear unless --profiles is given. track takes minutes. If parameters of the running
+    gear are free (--model track --free running_gear.guide_recess,...), a gradient-free search with a population comes
+    first.
     """
 
 
@@ -265,8 +269,9 @@ def calibrate() -> None:
 def settle() -> None:
     """Extract the settled runs of a log as a table.
 
-    The table is input for loop and calibrate. The page reports what was left out and why. Writes settled.csv (means
-    and their sds), stretches.csv (every stretch and what still changes) and report.html.
+    The table is input for loop and calibrate. The page lists the parts of the log that were left out, with reasons.
+    Writes settled.csv (means and their standard deviations), stretches.csv (every stretch, and which channel still
+    changes) and report.html.
     """
 
 
@@ -296,8 +301,8 @@ def loop() -> None:
 def sensitivity() -> None:
     """Rank parameters by influence, and propose the next runs.
 
-    Every method includes local derivatives and elasticities at every operating point. With sobol and morris,
-    conditions that you do not give take only the ends of their usual range, and the slope also its middle. Writes
+    Every method includes local derivatives and elasticities at every operating point. With sobol and morris, each
+    condition that you do not give takes only the two ends of its usual range, and the slope also its middle. Writes
     result.json, report.html, points.csv and indices.csv.
     """
 
@@ -312,10 +317,11 @@ def sensitivity() -> None:
 def resonance() -> None:
     """Find speeds at which the tracks excite the chassis.
 
-    The track model gives the ripple of reaction, current and speed over speed and payload. A Campbell diagram
+    The track model gives the ripple of ground reaction, current and speed over speed and payload. A Campbell diagram
     compares the grouser-passing frequency and its harmonics with the bounce and pitch modes of the robot on its
-    contacts. An axis is 0,5,10 or first:last:step. Writes result.json, report.html, points.csv, modes.csv and
-    peaks.csv. The points of Table 8 are included. Takes about a minute on two cores.
+    contacts. An axis is a list such as 0,5,10, or a range first:last:step. Writes result.json, report.html,
+    points.csv, modes.csv and peaks.csv. The operating points of Table 8 are included. The command takes about a
+    minute on two cores.
     """
 
 
@@ -329,10 +335,10 @@ def resonance() -> None:
 def climb() -> None:
     """Simulate a climb over a step, stairs, a gap or a terrain.
 
-    Reports what stops the robot. The robot starts on level ground and meets the obstacle squarely. Levers keep
-    their angles or follow a --sequence. --find searches the largest obstacle by bisection. Writes result.json,
-    report.html and history.csv with posture, currents of all four drives, tipping margin and energy over time
-    (docs/howto/climb.md).
+    Reports what stops the robot. The robot starts on level ground and meets the obstacle at a right angle. Levers
+    keep their angles or follow a --sequence. --find searches for the largest obstacle by bisection. Writes
+    result.json, report.html and history.csv with posture, currents of all four drives, tipping margin and energy over
+    time (docs/howto/climb.md).
     """
 
 
@@ -341,13 +347,13 @@ def climb() -> None:
     config.FolderPart,
     group=DESIGN,
     example="mmrjax check requirements.toml --robot found/robot.toml --set gearbox.ratio=40",
-    failure=f"{_AT_CORNER}. A missed requirement gives 0; result.json counts them",
+    failure=f"{_AT_CORNER}. If only a requirement is missed, the code is 0",
 )
 def check() -> None:
     """Check a robot against requirements.
 
-    Each requirement passes or fails with a margin, at the worst corner of its envelope. For each missed requirement
-    it reports the change of one parameter that would meet it.
+    Each requirement passes or fails, with the margin at the worst corner of its envelope. For each missed requirement
+    the command reports the change of one parameter that would meet it.
     """
 
 
@@ -361,8 +367,8 @@ def check() -> None:
 def size() -> None:
     """Choose motor, gearbox and cells that meet requirements.
 
-    The search covers makers' motors and gearboxes, ratio, wheel radius and number of cells. Writes the best design
-    as robot.toml, the alternatives, and the requirement that limits each motor.
+    The search covers motors and gearboxes of makers, the ratio, the wheel radius and the number of cells. Writes the
+    best design as robot.toml, the alternatives, and the requirement that limits each motor.
     """
 
 
@@ -377,8 +383,8 @@ def size() -> None:
 def export() -> None:
     """Write the drive for MuJoCo, JAX, ONNX and others.
 
-    A page reports what the format cannot represent. The format's parameters are refitted to this model over the
-    runs of --data. LAW.md documents the law on its own: equations, constants with intervals, conditions covered by
+    A page reports what the format cannot represent. The parameters of the format are refitted to this model over the
+    runs of --data. LAW.md documents the law by itself: equations, constants with intervals, conditions covered by
     the data, and what was not tested.
     """
 
@@ -413,17 +419,24 @@ def new(
     ] = None,
     from_sheet: Annotated[
         bool,
-        typer.Option("--from-sheet", help="Read motor data. The options below imply it.", rich_help_panel=_SHEET),
+        typer.Option(
+            "--from-sheet", help="Read the data of a motor. The options below imply it.", rich_help_panel=_SHEET
+        ),
     ] = False,
     voltage: Annotated[
-        str | None, typer.Option(help="Voltage at which the data below hold: V or mV.", rich_help_panel=_SHEET)
+        str | None, typer.Option(help="Voltage to which the data below refer: V or mV.", rich_help_panel=_SHEET)
     ] = None,
-    no_load_speed: Annotated[str | None, typer.Option(help="rpm, 1/min or rad/s.", rich_help_panel=_SHEET)] = None,
-    no_load_current: Annotated[str | None, typer.Option(help="A or mA; required.", rich_help_panel=_SHEET)] = None,
+    no_load_speed: Annotated[
+        str | None, typer.Option(help="No-load speed: rpm, 1/min or rad/s.", rich_help_panel=_SHEET)
+    ] = None,
+    no_load_current: Annotated[
+        str | None, typer.Option(help="No-load current: A or mA. Required.", rich_help_panel=_SHEET)
+    ] = None,
     stall_torque: Annotated[
-        str | None, typer.Option(help="Nm, mNm, Ncm, kg·cm, g·cm, oz·in or lb·in.", rich_help_panel=_SHEET)
+        str | None,
+        typer.Option(help="Stall torque: Nm, mNm, Ncm, kg·cm, g·cm, oz·in or lb·in.", rich_help_panel=_SHEET),
     ] = None,
-    stall_current: Annotated[str | None, typer.Option(help="A or mA.", rich_help_panel=_SHEET)] = None,
+    stall_current: Annotated[str | None, typer.Option(help="Stall current: A or mA.", rich_help_panel=_SHEET)] = None,
     resistance: Annotated[
         str | None, typer.Option(help="Terminal resistance: ohm or mohm.", rich_help_panel=_SHEET)
     ] = None,
@@ -431,13 +444,13 @@ def new(
 ) -> int:
     """Write a rig's file to fill in.
 
-    Each number has its unit and source. The file is valid as written, with example numbers. Units are SI unless a
-    comment states another.
+    Each number has its unit and source. The file is valid as written, but its numbers are examples. Units are SI
+    unless a comment states another.
 
-    --kind chooses the kind of rig. --from reads a joint: mass, inertia, radius, ratio, friction, damping, armature.
-    --from-sheet reads a motor from four to six numbers with units. Numbers that contradict each other by more than
-    10 % are refused. Both can be combined. Each number gets its source and a wide ±. The command lists what is
-    missing.
+    --kind chooses the kind of rig. --from reads mass, inertia, radius, ratio, friction, damping and armature of a
+    joint from a model. --from-sheet reads a motor from four to six numbers with units, and refuses numbers that
+    contradict each other by more than 10 %. Both can be combined. Each number gets its source and a wide ±. The
+    command lists what is missing.
     """
     from sweeps.commands import rig_new
 
@@ -463,9 +476,9 @@ def rig_check(
 ) -> int:
     """Check a rig's file, and data for it.
 
-    Lists values, their sources and their plausibility. With data it lists each column's use and range, and the
-    parameters that these data determine. A parameter is not determined if its posterior sd is above 0.9 of its
-    prior sd. Nothing is fitted or written. Exit codes: 0 usable, 2 the file is not usable, 4 the data are not
+    Lists the values with their sources and plausibility. With data, it also lists the use and range of each column,
+    and the parameters that these data determine. A parameter is not determined if its posterior sd is above 0.9 of
+    its prior sd. Nothing is fitted or written. Exit codes: 0 usable, 2 the file is not usable, 4 the data are not
     usable.
     """
     _start_jax(no_cache)
@@ -478,7 +491,7 @@ def rig_check(
     "inspect", rich_help_panel=DATA, epilog="Example: mmrjax inspect log.bag; mmrjax inspect log.h5::/run1 --json"
 )
 def inspect_file(
-    file: Annotated[str, typer.Argument(metavar="FILE", help="Data file; ::PATH selects a part of it.")],
+    file: Annotated[str, typer.Argument(metavar="FILE", help="Data file. ::PATH selects a part of it.")],
     json: Annotated[bool, typer.Option("--json", help="Print JSON (mmrjax.inspect/1) instead of text.")] = False,
 ) -> int:
     """List the signals of a data file, and propose column names.

@@ -112,7 +112,7 @@ def _is_unsafe(folder: str) -> bool:
         from sweeps.console import print_message
 
         print_message(
-            f"compiled programs are not cached: {reason}; set {VARIABLE} to a folder of your own, or remove write "
+            f"compiled programs are not cached: {reason}. Set {VARIABLE} to a folder of your own, or remove write "
             "access for others (chmod go-w)"
         )
     return bool(reason)

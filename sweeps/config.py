@@ -76,10 +76,10 @@ class RobotPart(Part):
 
     robot: str = option_field("nominal", "nominal, sm1, sm2, or the TOML file of a robot")
     set: dict[str, bool | float] = option_field(
-        {}, "Change a parameter (SI units); may be repeated: 6T2A.ground.friction.static=0.6"
+        {}, "Change a parameter (SI units). May be repeated: 6T2A.ground.friction.static=0.6"
     )
     effects: Names = option_field(
-        (), "Python file with your own effects; its code is run; may be repeated", verbatim=True, executes=True
+        (), "Python file with your own effects. Its code is run. May be repeated", verbatim=True, executes=True
     )
 
 
@@ -104,14 +104,19 @@ class ComparedRuns(Measured):
     data: str = option_field(
         "measured", "Measured runs in any format, or measured, or simulated_by_paper", argument=True
     )
-    own_mass: bool = option_field(False, "Use the robot's mass plus payload instead of the total mass in the table")
+    own_mass: bool = option_field(
+        False, "Use the robot's own mass plus the payload instead of the total mass in the table"
+    )
 
 
 class SettledLog(FolderPart):
     """Data of `settle`."""
 
     data: str = option_field(
-        ..., "Log over time in any format: time_s, the imposed quantity, channels", argument=True, metavar="LOG"
+        ...,
+        "Log over time in any format, with time_s, the imposed quantity and channels",
+        argument=True,
+        metavar="LOG",
     )
 
 
@@ -213,7 +218,7 @@ class BatchPart(FidelityPart):
 
     chunk: Annotated[int, Field(ge=1, le=1_000_000_000)] | None = option_field(
         None,
-        "Runs per vmapped call",
+        "Number of runs that are simulated together",
         usual=", ".join(f"{name} {facts.at_once(accelerator=False)}" for name, facts in fidelities.TABLE.items())
         + " on processors",
     )
@@ -222,7 +227,7 @@ class BatchPart(FidelityPart):
 class SupplyPart(Part):
     """Supply of the motors."""
 
-    battery: bool = option_field(False, "Supply from the on-board battery")
+    battery: bool = option_field(False, "Supply the robot from its battery")
     discharge_mAh: Annotated[float, Field(ge=0, le=100_000)] = option_field(
         0.0, "Charge already taken from the battery"
     )
@@ -238,7 +243,7 @@ class SupplyPart(Part):
         return self
 
 
-SURFACE = "Surface of Table 5, which scales the adhesion of lacquered_wood; for a rig, one of its own surfaces"
+SURFACE = "Surface of Table 5, which scales the adhesion of lacquered_wood. For a rig, one of its own surfaces"
 
 
 def _values_text(values: Iterable[float]) -> str:
@@ -294,7 +299,7 @@ class OneRun(Part):
 class GivenRuns(OneRun, FolderPart):
     """Runs of `simulate`: one run from options, or those in a file."""
 
-    runs: Path | None = option_field(None, "CSV of runs to simulate instead; condition columns are enough")
+    runs: Path | None = option_field(None, "CSV of runs to simulate instead. Condition columns are enough")
 
     @model_validator(mode="after")
     def _once(self) -> Self:
@@ -311,12 +316,12 @@ class Picture(OneRun):
 
     file: Path = option_field(..., "Output file, ending in .png, .gif or .mp4", argument=True)
     begin: float | None = option_field(
-        None, "Time of the picture, or start of the film (s)", usual="0; for a picture 0.8"
+        None, "Time of the picture or start of the film (s)", usual="0; for a picture 0.8"
     )
     end: float | None = option_field(None, "End of the film (s)", usual="begin + 0.1")
     slow: Annotated[float, Field(ge=0.01)] | None = option_field(None, "Slow-motion factor of a film", usual="20")
     climb: Path | None = option_field(
-        None, "Folder of mmrjax climb to draw instead; by default the whole climb at half speed"
+        None, "Folder of mmrjax climb to draw instead. The default is the whole climb at half speed"
     )
     force: bool = option_field(False, "Replace an existing file")
 
@@ -333,16 +338,18 @@ class AxesPart(Part):
         None, "Configurations of the robot, comma-separated", usual="all configurations"
     )
     voltages_V: Several[Voltage] | None = option_field(
-        None, "Supply voltages (V); for a rig thirds of its voltage_limit", usual=_values_text(VOLTAGES_V)
+        None,
+        "Supply voltages (V). The default for a rig is thirds of its voltage_limit",
+        usual=_values_text(VOLTAGES_V),
     )
     motor_speeds_rpm: Several[MotorSpeed] | None = option_field(
         None, "Motor speeds (rpm), for rigs with imposed motor speed", usual="thirds of speed_limit"
     )
     payloads_kg: Several[Payload] | None = option_field(
-        None, "Additional load masses (kg); for a rig 0", usual=_values_text(PAYLOADS_KG)
+        None, "Additional load masses (kg), 0 for a rig", usual=_values_text(PAYLOADS_KG)
     )
     slopes_deg: Several[Slope] | None = option_field(
-        None, "Slopes (deg), positive uphill; 0 for a rig", usual=_values_text(SLOPES_DEG)
+        None, "Slopes (deg), positive uphill. The default for a rig is 0", usual=_values_text(SLOPES_DEG)
     )
     surface: str | None = option_field(None, SURFACE, usual=f"{BENCH}; for a rig none")
 
@@ -362,16 +369,16 @@ class InferencePart(Part):
     """Prior knowledge and data of a fit."""
 
     prior: Names = option_field(
-        (), "A prior in SI units; may be repeated: 6T2A.ground.friction.static=0.45±0.05", verbatim=True
+        (), "A prior in SI units. May be repeated: 6T2A.ground.friction.static=0.45±0.05", verbatim=True
     )
     noise: str = option_field(
         "",
         "Standard deviations of current, motor_speed and speed in % or in A, rpm, mm/s: current=2%,speed=5mm/s",
-        usual="from the file's columns; else calibrate estimates them; loop estimates them from series of rows "
-        "or over time, and assumes 2, 0.5 and 1 % of settled rows without series",
+        usual="from the file's columns. Otherwise calibrate estimates it from the misfit. The loop estimates it from "
+        "series of rows or over time, and assumes 2, 0.5 and 1 % for settled rows without series",
     )
     rows: Annotated[int, Field(ge=100, le=1_000_000)] = option_field(
-        ROWS, "Largest number of rows used; larger data are thinned evenly, logs in time, tables over conditions"
+        ROWS, "Largest number of rows used. Larger data are thinned evenly, logs in time, tables over conditions"
     )
     seed: Seed = option_field(0, "Random seed")
 
@@ -380,7 +387,7 @@ class MembersPart(Part):
     """Folder in which a population keeps its runs. It changes no number."""
 
     members: Path | None = option_field(
-        None, "File for the runs of the population; the same command resumes from it", solver=True
+        None, "File for the runs of the population. The same command resumes from it", solver=True
     )
 
 
@@ -392,7 +399,7 @@ class LoopBeside(FittedRuns):
     """Options of the loop that change no number."""
 
     within: Annotated[str, Field(pattern=r"^\d+(\.\d+)?(s|min|h)?$")] = option_field(
-        "10min", "Wall-clock limit, such as 90s, 5min or 1h; then the best result so far is reported"
+        "10min", "Wall-clock limit, such as 90s, 5min or 1h. The best result at that time is reported"
     )
     verbose: bool = option_field(False, "Print every table and remark of the page instead of five lines")
 
@@ -406,17 +413,19 @@ class LoopBeside(FittedRuns):
 class TurnPart(Part):
     """Different commands for the two sides of one run. None: the same command."""
 
-    left_V: Voltage | None = option_field(None, "Voltage of the left motor (V); with --right the robot can turn")
+    left_V: Voltage | None = option_field(
+        None, "Voltage of the left motor (V). Together with --right, the robot can turn"
+    )
     right_V: Voltage | None = option_field(None, "Voltage of the right motor (V)")
     duty_left: Duty | None = option_field(
         None, "Duty of the left motor (share of the supply voltage), instead of --left"
     )
     duty_right: Duty | None = option_field(None, "Duty of the right motor (share of the supply voltage)")
     speed_m_s: Annotated[float, number_between(-100, 100)] | None = option_field(
-        None, "Speed of the settled turn (m/s); with --yaw-rate it determines --left and --right"
+        None, "Speed of the settled turn (m/s). Together with --yaw-rate, it determines --left and --right"
     )
     yaw_rate_rad_s: Annotated[float, number_between(-100, 100)] | None = option_field(
-        None, "Yaw rate of the settled turn (rad/s), positive to the left; with --speed"
+        None, "Yaw rate of the settled turn (rad/s), positive to the left. Give it together with --speed"
     )
     heading_deg: Heading | None = option_field(None, "Heading at the start, relative to uphill, positive to the left")
 
@@ -466,7 +475,7 @@ class OutputPart(Part):
     """Files written in addition to the numbers."""
 
     report: bool = option_field(True, "Write report.html")
-    table: Literal["csv", "parquet"] = option_field("csv", "Format of the tables: CSV only, or also Parquet")
+    table: Literal["csv", "parquet"] = option_field("csv", "Format of the tables: CSV only, or Parquet as well")
 
 
 class ProfilePart(FidelityPart):
@@ -474,11 +483,11 @@ class ProfilePart(FidelityPart):
 
     profile: Annotated[str, Field(min_length=1)] | None = option_field(
         None,
-        "A mission over time: a CSV with time_s (s) and any of speed_mm_s, motor_speed_rpm, duty, mode, "
-        "supply_voltage_V, slope_deg, payload_kg, load_torque_Nm, surface, current_other_A; with sides duty_left and "
+        "A mission over time, as a CSV with time_s (s) and any of speed_mm_s, motor_speed_rpm, duty, mode, "
+        "supply_voltage_V, slope_deg, payload_kg, load_torque_Nm, surface, current_other_A. For turns: duty_left and "
         "duty_right, "
-        "voltage_left_V and voltage_right_V, or yaw_rate_rad_s with a speed; or stair, stop_and_go, shuttle, patrol "
-        "(docs/reference/profiles.md)",
+        "voltage_left_V and voltage_right_V, or yaw_rate_rad_s with a speed. Or one of stair, stop_and_go, shuttle, "
+        "patrol (docs/reference/profiles.md)",
     )
 
     @model_validator(mode="before")
@@ -542,7 +551,7 @@ class Compare(RobotPart, DataPart, FidelityPart, PosteriorPart, OutputPart):
     """The runs of a measured table."""
 
     against: str | None = option_field(
-        None, "A second robot, simulated on the same rows", metavar="ROBOT.toml", format="path"
+        None, "Second robot, simulated on the same rows", metavar="ROBOT.toml", format="path"
     )
 
 
@@ -566,12 +575,12 @@ class Resonance(RobotPart, FidelityPart, OutputPart):
 
     model: Literal["track"] = "track"
     duration_s: Duration | None = option_field(
-        None, "Length of a run (s); ripple is evaluated in its second half", usual="1.5", minimum=0.5
+        None, "Length of a run (s). Ripple is evaluated in its second half", usual="1.5", minimum=0.5
     )
     configuration: str | None = option_field(None, "Configuration of the robot", usual="its first")
     voltages_V: Several[Voltage] = option_field(
         tuple(10.0 + k for k in range(31)),
-        "Supply voltages (V), which give the speeds of the map; at least 5",
+        "Supply voltages (V), which give the speeds of the map. Give at least 5",
         usual="10:40:1, that is 31",
         minimum=0,
     )
@@ -606,8 +615,8 @@ class Climb(RobotPart, SupplyPart, OutputPart):
         None, "Angle of the rear levers, with the same convention", usual="from the robot's file"
     )
     sequence: Path | None = option_field(
-        None, "CSV of lever angles: x_mm (middle of the robot from the obstacle) or time_s, front_deg, rear_deg; "
-              "or voltages of the lever motors, front_V, rear_V, starting from the given angles",
+        None, "CSV of lever angles: x_mm (middle of the robot from the obstacle) or time_s, front_deg, rear_deg. "
+              "Or front_V and rear_V, voltages of the lever motors, starting from the given angles",
         format="path",
     )  # fmt: skip
     levers_voltage_V: Annotated[float, positive_number(1e6)] | None = option_field(
@@ -620,7 +629,7 @@ class Climb(RobotPart, SupplyPart, OutputPart):
     )
     find: Literal["step", "stairs", "gap"] | None = option_field(
         None,
-        "Search for the largest obstacle that the robot gets over, instead of one run; for stairs the rise "
+        "Search for the largest obstacle that the robot gets over, instead of one run. For stairs: largest rise "
         "at the tread of --stairs",
     )
     derivatives: Names = option_field(
@@ -673,16 +682,18 @@ class FeedforwardPart(Part):
         None, "Fit kS, kV, kA (kG) of this mechanism instead, and feedback gains (docs/howto/wpilib.md)", usual="no"
     )
     unit: Literal["rotation", "rad", "degree", "m"] | None = option_field(
-        None, "Unit of position for kV and kA, with --feedforward", usual="rotation; for a travel m"
+        None, "Unit of the position in kV and kA, with --feedforward", usual="rotation; for a travel m"
     )
     position_error: Annotated[float, positive_number(1e6)] = option_field(
-        1.0, "Tolerance of the position regulator [unit]"
+        1.0, "Largest acceptable position error, for the gains [unit]"
     )
-    velocity_error: Annotated[float, positive_number(1e6)] = option_field(1.5, "Tolerance of the velocity [unit/s]")
-    effort_V: Annotated[float, positive_number(1e4)] = option_field(7.0, "Voltage that the feedback may use (V)")
+    velocity_error: Annotated[float, positive_number(1e6)] = option_field(
+        1.5, "Largest acceptable velocity error, for the gains [unit/s]"
+    )
+    effort_V: Annotated[float, positive_number(1e4)] = option_field(7.0, "Largest voltage of the feedback (V)")
     period_s: Annotated[float, positive_number(10)] = option_field(0.02, "Period of the controller (s)")
     measurement_delay_s: Annotated[float, number_between(0, 10)] | None = option_field(
-        None, "Delay of the measurement (s)", usual="from the log"
+        None, "Delay of the measured position and velocity (s)", usual="from the log"
     )
 
 
@@ -710,23 +721,23 @@ class Calibrate(RobotPart, DataPart, InferencePart, FeedforwardPart, OutputPart)
         None,
         f"Solver of the searches, of optimistix ({', '.join(solvers.OF_OPTIMISTIX)}) or optax "
         f"({', '.join(solvers.OF_OPTAX)})",
-        usual="our Levenberg-Marquardt",
+        usual="Levenberg-Marquardt of mmrjax",
         solver=True,
     )
     profiles: bool | None = option_field(
         None, "Compute the profile likelihood of each parameter", usual="for steady, except turns"
     )
-    hold_out: bool | None = option_field(None, "Refit without each block in turn", usual="steady only")
+    hold_out: bool | None = option_field(None, "Refit with each block of runs left out in turn", usual="steady only")
 
 
 class Settle(RobotPart, DataPart, OutputPart):
     """Options for extracting settled runs from a log over time."""
 
     shortest_s: Annotated[float, positive_number(3600)] | None = option_field(
-        None, "Shortest segment that counts as settled", usual="0.3, and at least 20 samples"
+        None, "Shortest stretch that counts as settled", usual="0.3, and at least 20 samples"
     )
     drift: Annotated[float, Field(gt=0, le=0.5)] = option_field(
-        0.02, "Largest change of a channel's mean within a segment, as a fraction of the mean"
+        0.02, "Largest change of a channel's mean within a stretch, as a fraction of the mean"
     )
 
 
@@ -744,12 +755,12 @@ class Export(RobotPart, OutputPart):
         "mujoco", "Format (docs/howto/export.md)"
     )
     data: str | None = option_field(
-        None, "Table of runs or log with which the exported drive is compared", usual="a grid without readings"
+        None, "Table of runs, or log, to compare the exported drive with", usual="a grid without readings"
     )
     configuration: str | None = option_field(None, "Configuration of the robot", usual="its first")
     joint: str = option_field("drive", "Name of the joint in the simulator's model, for mujoco")
     draws: Annotated[int, Field(ge=1, le=100_000)] = option_field(
-        1000, "Samples from the posterior, for randomization"
+        1000, "Number of samples from the posterior, for randomization"
     )
     seed: Seed = option_field(0, "Random seed of the samples")
 
@@ -758,20 +769,20 @@ class Loop(RobotPart, DataPart, InferencePart, OutputPart):
     """Options of the closed loop."""
 
     replicates: Annotated[int, Field(ge=250, le=100_000)] = option_field(
-        500, "Number of bootstrap tables; time histories use at least 333", solver=True
+        500, "Number of bootstrap tables. Time histories use at least 333", solver=True
     )
     prefer: Literal["fit", "held-out"] = option_field(
         "fit",
-        "Criterion for the first of several effects that these data cannot distinguish; held-out takes the errors on "
+        "Criterion for the first of several effects that these data cannot distinguish. held-out: the errors on "
         "blocks left out of the fit",
     )
     forbid: Names = option_field(
-        (), "Experiment that you cannot do; may be repeated: stall, lifted, 'one motor', or a configuration"
+        (), "Experiment that you cannot do. May be repeated: stall, lifted, 'one motor', or a configuration"
     )
     resolve: bool = option_field(
         False,
         "Test with the track model whether a different running gear within its priors explains the remaining "
-        "error in slip, track or ground; takes tens of minutes on two cores",
+        "error in slip, track or ground. Takes tens of minutes on two cores",
     )
     population: Annotated[int, Field(ge=4, le=1_000_000)] | None = option_field(
         None, "Members of each generation of the search for --resolve", usual="128", solver=True
@@ -780,10 +791,12 @@ class Loop(RobotPart, DataPart, InferencePart, OutputPart):
         None, "Largest number of generations for --resolve", usual="20", solver=True
     )
     model: Path | None = option_field(
-        None, "MuJoCo model with several joints: runs one loop per joint, with the model's torque as its load"
+        None,
+        "MuJoCo model with several joints. The loop runs for each joint, with the torque that the model computes as "
+        "its load",
     )
     joints: Names = option_field(
-        (), "Joints of --model, comma-separated, or all; log columns are named JOINT.output_angle_deg"
+        (), "Joints of --model, comma-separated, or all. Log columns are named JOINT.output_angle_deg"
     )
 
     @model_validator(mode="after")
@@ -799,7 +812,7 @@ class RequirementsPart(Part):
     requirements: str = option_field(
         "paper",
         "TOML file (docs/reference/requirements.md)",
-        usual="the paper's aims",
+        usual="the aims of the paper",
         metavar="[REQUIREMENTS.toml]",
         format="path",
         argument=True,
@@ -815,10 +828,10 @@ class Check(RequirementsPart, RobotPart, OutputPart):
 class Size(RequirementsPart, RobotPart, OutputPart):
     """A search for a robot that meets requirements."""
 
-    objective: str = option_field("mass", "Quantity to minimise: mass (kg), energy (Wh/m), cost (EUR)")
+    objective: str = option_field("mass", "Quantity to minimise: mass (kg), energy (Wh/m) or cost (EUR)")
     pareto: Names = option_field((), "Two objectives, comma-separated, for a Pareto front instead")
     motors: Names = option_field((), "Motors to choose from, comma-separated", usual="all in the catalogue")
-    starts: Annotated[int, Field(ge=1, le=100_000)] = option_field(256, "Number of searches, in one batch")
+    starts: Annotated[int, Field(ge=1, le=100_000)] = option_field(256, "Number of searches")
     seed: Seed = option_field(0, "Random seed of the starts")
 
 
@@ -835,7 +848,7 @@ class Sensitivity(RobotPart, DataPart, FidelityPart, SupplyPart, AxesPart, Outpu
         (), "Uncertain parameters, comma-separated, or a group such as motor.*", usual="all that have a prior"
     )
     vary: Names = option_field(
-        (), "Also treat an operating condition as uncertain; may be repeated: voltage=22:26, slope_deg=0:5"
+        (), "Also treat an operating condition as uncertain. May be repeated: voltage=22:26, slope_deg=0:5"
     )
     outputs: Names = option_field(
         (),
@@ -855,7 +868,7 @@ class Sensitivity(RobotPart, DataPart, FidelityPart, SupplyPart, AxesPart, Outpu
         format="path",
     )
     runs: Annotated[int, Field(ge=1, le=100)] = option_field(5, "Number of runs to propose")
-    noise: str = option_field("", "Noise (sd) of the readings", usual="current=2%,motor_speed=0.5%,speed=1%")
+    noise: str = option_field("", "Standard deviation of the readings", usual="current=2%,motor_speed=0.5%,speed=1%")
 
     @model_validator(mode="before")
     @classmethod

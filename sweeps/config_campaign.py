@@ -96,9 +96,11 @@ class StoreOptions(FolderPart):
     outputs: Names = option_field(
         (), "Outputs to store for each point, comma-separated", usual="the channels of its instruments"
     )
-    dry_run: bool = option_field(False, "Print points, chunks, bytes and expected time, and write nothing")
+    dry_run: bool = option_field(
+        False, "Print the number of points and chunks, the size and the expected time, and write nothing"
+    )
     export: tuple[Literal["csv", "parquet"], ...] = option_field(
-        (), "Also write the store as csv or parquet; may be repeated"
+        (), "Also write the store as csv or parquet. May be repeated"
     )
     shard: str | None = option_field(
         None, "Simulate the i-th of n shares, such as 3/8, in one process of a job array", solver=True

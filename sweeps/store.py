@@ -430,7 +430,7 @@ class RunFolder(Folder):
                         f"--out: {self.partial} contains interrupted work of another configuration, table or "
                         "version; choose another path, or use --force to start again"
                     )
-                print_message(f"{self.partial}: was made with another configuration; started again")
+                print_message(f"{self.partial}: was made with another configuration, so it is started again")
             self._clear()
             self._lock.truncate(0)
             self._lock.write(lock_text(self._command, self._digest))
@@ -473,7 +473,7 @@ class RunFolder(Folder):
         try:
             return stage_files.read_arrays(file)
         except Exception:  # whatever a damaged file makes the reader raise
-            print_message(f"{file}: damaged; computed again")
+            print_message(f"{file}: damaged, so it is computed again")
             return None
 
     def keep_chunk(self, name: str, columns: Columns) -> None:
@@ -495,7 +495,7 @@ class RunFolder(Folder):
                 stored_result: T = stage_files.read_stage(file)
                 return stored_result
             except stage_files.Unreadable:
-                print_message(f"{file}: damaged; computed again")
+                print_message(f"{file}: damaged, so it is computed again")
         result = make()
         with contextlib.suppress(OSError, stage_files.Unwritable), writing.replacing(file) as aside:
             stage_files.write_stage(aside, result)

@@ -274,7 +274,7 @@ def test_a_column_that_varies_where_no_condition_does_is_named(measured):
     dyno = dataclasses.replace(alike, columns=alike.columns | speeds, extras=extras)
     known = noise.noise_from_table(dyno, SettledRuns.sizes(dyno), "current=2%,motor_speed=1%,speed=1%")
     with pytest.raises(
-        BadData, match=r"; torque_mNm varies between these rows and is not used as a condition: .*; no condition"
+        BadData, match=r". torque_mNm varies between these rows and is not used as a condition. .*; no condition"
     ):
         SettledRuns.check(dyno, known)
 
@@ -347,7 +347,7 @@ def test_drive_reads_settled_rows_rolling_and_agrees_with_steady(measured):
     assert made.adhesion_used[2] > 0.9
     assert all(abs(p.with_steady.apart_in_sd) < 0.01 for p in made.parameters.values())
     jsonschema.validate(made.to_json(), SCHEMA)
-    assert any(note.startswith("rows 3: computed from a rolling start; from standstill") for note in made.notes)
+    assert any(note.startswith("rows 3: computed from a rolling start. From standstill") for note in made.notes)
 
 
 # --- missing readings -----------------------------------------------------------------------------------
@@ -373,7 +373,7 @@ def test_a_table_with_missing_readings_calibrates_and_says_so(found_with_gaps):
     assert made.converged and (made.status == "converged").all()
     assert made.notes[:2] == (
         "total_current_A: 2 of 20 readings are missing (rows 3, 8)",
-        "motor_speed_rpm: no readings; parameters that only this channel determines are not fitted",
+        "motor_speed_rpm: no readings. Parameters that only this channel determines are not fitted",
     )
     assert {c: e.rows for c, e in made.errors_after.items()} == {"total_current": 18, "motor_speed": 0, "speed": 20}
     assert made.noise["motor_speed"].source == "no readings"

@@ -113,7 +113,7 @@ def test_what_to_check_first_is_said_with_the_columns_that_are_not_used():
         VerdictSummary("undescribed", 0.004, None, missed=missed, unused=("brake_Nm",), far=("motor.r",))
     )
     assert said == (
-        "This model does not describe these runs: refitted, it misses total current by 48 % of its measured rms. No "
-        "effect is named. Check first: columns that vary and are not used (brake_Nm); parameters far from their priors "
-        "(motor.r); units, signs and sides of the columns."
+        "This model does not describe these runs: even after the refit, it misses total current by 48 % of its measured "
+        "rms. No effect is named. Check first: columns that vary and are not used (brake_Nm), and parameters far from "
+        "their priors (motor.r), and units, signs and sides of the columns."
     )

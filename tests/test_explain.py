@@ -54,7 +54,7 @@ def test_a_typical_size_is_simulated(robot):
     """0.5 ohm in series take 0.5 V/A · I of 24 V less what drives: the motors slow down by that."""
     changes = list(explain._change_sentences(effects.BY_NAME["series_resistance"]()))
     assert len(changes) == 2 and changes[0].startswith(
-        "change for one typical size, for 6T2A at 24 V, 5°, 3 kg: total current -"
+        "change of the readings at its typical size (6T2A, 24 V, 5°, 3 kg): total current -"
     )
     assert "motor speed -3.3 %" in changes[0]
     assert list(explain._change_sentences(effects.BY_NAME["armature_inductance"]())) == []
@@ -64,7 +64,9 @@ def test_parameters_and_channels_are_explained_by_their_rows():
     known = {p.name: p for p in params.walk_parameters(paper_robots.nominal())}
     lines = dict(said("parameter", "motor.resistance"))
     spec = known["motor.resistance"].spec
-    assert lines["means"] == f"{spec.meaning} [{spec.unit}]" and lines["nominal"] == f"0.611 ohm; {spec.source}"
+    assert (
+        lines["means"] == f"{spec.meaning} [{spec.unit}]" and lines["nominal"] == f"0.611 ohm. Source: {spec.source}"
+    )
     assert lines["equation"].startswith("U_e = C_E ω + I R") and "5 %" in lines["prior"]
     assert dict(said("parameter", "6T2A.ground.friction.static"))["equation"]
     lines = dict(said("channel", "speed_mm_s"))

@@ -59,7 +59,7 @@ def test_it_is_said_with_the_noises_at_which_it_holds():
     weak = loop_words.loop_answer(headline(law("a"), [(0.7, law("a", established=False))]))
     assert weak == "No: a voltage drop is missing at 0.7 and 1 times the noise. No more is established."
     assert loop_words.loop_answer(headline(law("a", "b"))) == (
-        f"No: a {DROP} (a or b; these data cannot tell which) is missing."
+        f"No: a {DROP} (a or b, which these data cannot distinguish) is missing."
     )
 
 
@@ -67,10 +67,10 @@ def test_a_law_that_an_ammeter_imitates_is_stated_with_it():
     both = "loss torque that changes with speed", "reading of total current that changes with speed"
     found = headline(law("windage", families=both))
     assert found.level == "class" and loop_words.loop_answer(found) == (
-        f"No: a {both[0]} or a {both[1]} (windage; these data cannot tell which) is missing."
+        f"No: a {both[0]} or a {both[1]} (windage, which these data cannot distinguish) is missing."
     )
     verdict = loop_words.verdict_sentences(law("windage", families=both))
-    assert verdict.startswith(f"Missing: windage, or a {both[1]} (these data cannot tell which) (")
+    assert verdict.startswith(f"Missing: windage, or a {both[1]} (these data cannot distinguish them) (")
 
 
 def test_what_only_some_noises_cannot_tell_apart_comes_after_what_all_list():

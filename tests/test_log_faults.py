@@ -50,7 +50,7 @@ SPEED, VOLTS, TIME = "motor_speed_rpm", "supply_voltage_V", "time_s"
 
 @pytest.mark.parametrize("column, fault, words", [
     (SPEED, still, "the same in every row, so nothing moves"),
-    (SPEED, held, "empty these cells to use the other rows"),
+    (SPEED, held, "Empty these cells to use the other rows"),
     (SPEED, swapped, "row 377,"),  # of the first run with so much of both signs
     (VOLTS, constant, "12 V in every row"),
     (TIME, jumped, "row 77, time_s: 3.01 s after the row before it"),
@@ -126,7 +126,7 @@ def test_a_delay_is_freed_if_the_error_lies_after_the_steps(robot, tmp_path, mon
     if freed:
         (z,) = found.starts
         assert dict(zip(again[0], z, strict=True)) == dict.fromkeys(first, 1.0) | {"rig.delay": 0.0}
-        assert "rig.delay is therefore fitted" in describe(setting.ready.weighed[-1])
+        assert "The fit therefore includes rig.delay" in describe(setting.ready.weighed[-1])
 
 
 @pytest.mark.parametrize("late", [-0.004, 0.01])
@@ -143,4 +143,4 @@ def test_readings_that_are_late_or_early_are_named_with_their_shift(robot, late)
     off[:, list(runs.layout.measured_columns).index(SPEED)] *= np.pi / 30
     (note,) = error_after_steps(runs, off)
     assert note.code == "shifted" and note.shift == pytest.approx(late, rel=0.1) and note.share > 0.9
-    assert f"ms {'late' if late > 0 else 'early'}: set [rig] delay" in describe(note)
+    assert f"ms {'late' if late > 0 else 'early'}. To fit this delay, set [rig] delay" in describe(note)

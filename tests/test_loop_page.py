@@ -193,7 +193,7 @@ def test_the_page_opens_with_the_law_and_the_terminal_with_five_lines(shown, cap
     assert "May I use it?" in head and "new law, band of 95 %" in head
     with figure_settings():
         (axes,) = loop_figures.draw_effect_laws(
-            got.found, loop_report.rows_of(got.found), room.changes_by_effect(got.found)
+            got.found, loop_report.rows_for_figures(got.found), room.changes_by_effect(got.found)
         ).axes
     band = axes.collections[-1].get_paths()[0].get_extents()
     (change,) = room.changes_by_effect(got.found).values()
@@ -208,7 +208,7 @@ def test_the_page_opens_with_the_law_and_the_terminal_with_five_lines(shown, cap
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) <= 4 and lines[0] == got.found.statement  # the fifth is the path of the folder
     assert [line.partition(":")[0] for line in lines[1:]] == [
-        "Moved",
+        "Changed",
         "rms error, robot file as given → after the loop",
         "Next",
     ]
@@ -328,19 +328,25 @@ def test_what_is_held_by_its_prior_is_said_everywhere(shown, capsys, tmp_path, n
     held = {n for n, p in seen.document["base_shift"].items() if p["held_by_prior"]}
     assert held == {n for n in made.held_by_prior if n in made.base_shift}
     assert all("held_by_prior" in p for e in seen.document["effects"] for p in e["parameters"].values())
-    (note,) = [n for n in made.notes if n.startswith("not determined ")]
+    (note,) = [n for n in made.notes if n.startswith("these runs do not determine ")]
     far = {n for n, p in made.base_shift.items() if abs(p.shift_after) > FAR}
     pairs = {n for pair in made.together for n in (pair.one, pair.other)}
-    assert note.split("): ")[1].split(", ") == [n for n in made.held_by_prior if n not in far | pairs]
+    assert note.removeprefix("these runs do not determine ").split(" (posterior")[0].split(", ") == [
+        n for n in made.held_by_prior if n not in far | pairs
+    ]
     assert " ".join(note.split()) in seen.printed
-    together = " ".join(n for n in made.notes if n.startswith("determined only together"))
-    assert far == {n.split()[0] for n in made.notes if " is implausible, " in n} and all(n in together for n in pairs)
+    together = " ".join(n for n in made.notes if n.startswith("these runs determine only combinations"))
+    assert far == {n.split()[0] for n in made.notes if " has an implausible value, " in n} and all(
+        n in together for n in pairs
+    )
     head, *rows = seen.page.tables["base"]
     said = {row[0]: row[head.index("determined")] for row in rows}
     assert {n for n, answer in said.items() if answer == "no"} == held - pairs
     assert {n for n, answer in said.items() if answer.startswith("only with ")} == pairs & set(said)
     made.save(tmp_path)
-    assert f"prior's): {', '.join(made.held_by_prior)}" in (tmp_path / "robot.toml").read_text("utf-8")
+    assert f"do not determine {', '.join(made.held_by_prior)} (posterior" in (tmp_path / "robot.toml").read_text(
+        "utf-8"
+    )
 
 
 def resolved(found, p, outside=(), settled=True):

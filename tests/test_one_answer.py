@@ -61,8 +61,8 @@ def test_the_answer_states_a_value_that_may_be_wrong_before_the_effect_that_imit
         "class", (("gear_load_loss",),), (1.0,), (), (("loss torque that changes with load",),), ((value,),)
     )
     assert describe(found) == (
-        "No: a loss torque that changes with load (gearbox.efficiency_load is 0.685 or gear_load_loss; "
-        "these data cannot tell which) is missing."
+        "No: a loss torque that changes with load (gearbox.efficiency_load is 0.685 or gear_load_loss, "
+        "which these data cannot distinguish) is missing."
     )
 
 

@@ -16,7 +16,7 @@ from calibration.data.input_errors import BadConfiguration, BadData
 from calibration.discovery import discover, findings
 from calibration.discovery.candidates import Candidate, fill_slots
 from calibration.inference.calibration import calibrate
-from calibration.inference.linearization import shape_of, shape_parameter_at, shape_scales
+from calibration.inference.linearization import free_shape_parameter, shape_parameter_at, shape_scales
 from calibration.inference.observers import SettledRuns
 from calibration.inference.optimizers import observe_robot
 from mmrjax.effects import ALL, BY_NAME, UNNAMED
@@ -119,9 +119,9 @@ def test_robot_that_the_loop_writes_is_the_one_that_it_fitted(name, fits):
     assert_allclose(again, reading, rtol=1e-9)
 
 
-@pytest.mark.parametrize("effect", [e for e in ALL if shape_of(e()) is not None], ids=lambda e: e.name)
+@pytest.mark.parametrize("effect", [e for e in ALL if free_shape_parameter(e()) is not None], ids=lambda e: e.name)
 def test_shape_that_a_fit_reaches_is_one_that_a_file_may_state(effect):
-    shape = shape_of(effect())
+    shape = free_shape_parameter(effect())
     z = np.linspace(-6.0, 6.0, 61)
     value = np.asarray(shape_parameter_at(shape_scales(shape), jnp.asarray(z)))
     low, high = shape.spec.bounds
@@ -179,7 +179,7 @@ def curves(tmp_path_factory):
 def test_mass_of_the_table_is_taken_and_said(robot):
     runs = table({"6T2A": 13.1, "4W2T": 13.1})
     assert own_mass.mass_notes(robot, runs) == [
-        "4W2T: the table states 13.1 kg without payload, the robot's file 11.5 kg; 13.1 kg is used, and written to robot.toml"
+        "4W2T: the table states 13.1 kg without payload, the robot's file 11.5 kg. 13.1 kg is used, and written to robot.toml"
     ]
     taken = own_mass.with_table_mass(robot, runs)
     assert float(taken.configurations["4W2T"].mass) == 13.1 and float(taken.configurations["6T2A"].mass) == 13.1
@@ -198,7 +198,7 @@ def test_a_mass_that_varies_is_said_and_its_median_written(robot):
     runs.columns["total_mass_kg"][:6] += [0.0, 0.0, 0.1, 0.2, 0.3, 0.4]
     (said, _) = own_mass.mass_notes(robot, runs)
     assert said == (
-        "6T2A: total_mass_kg minus payload_kg varies from 14.2 to 14.6 kg. The fit used the mass of each row; "
+        "6T2A: total_mass_kg minus payload_kg varies from 14.2 to 14.6 kg. The fit used the mass of each row. "
         "robot.toml contains the median, 14.35 kg, and does not reproduce the fit in rows of another mass"
     )
     assert float(own_mass.with_table_mass(robot, runs).configurations["6T2A"].mass) == 14.35
@@ -214,7 +214,7 @@ def test_a_total_without_its_payload_is_suspected(robot):
 def test_a_surface_other_than_the_robots_is_said(robot):
     said = own_mass.mass_notes(robot, table({"6T2A": 13.1, "4W2T": 11.5}, surface="asphalt"))
     assert said == [
-        "the table has runs on asphalt: the written friction is for lacquered_wood; simulate with "
+        "the table has runs on asphalt: the written friction is for lacquered_wood. Simulate with "
         "--surface asphalt to use the fitted values"
     ]
     assert own_mass.mass_notes(robot, table({"6T2A": 13.1, "4W2T": 11.5}, surface="lacquered_wood")) == []

@@ -252,7 +252,7 @@ def test_levels_are_thirds_of_the_limit_to_two_digits(tmp_path):
     found = imposed.imposed_levels(robot, "--motor-speeds", notes)
     assert all(0.9 * share * top < level <= share * top for level, share in zip(found, imposed.SHARES, strict=True))
     assert notes == [
-        "--motor-speeds: not given; thirds of the speed_limit in the robot's file are used: 1500,3100,4700"
+        "--motor-speeds: not given. Thirds of the speed_limit in the robot's file are used: 1500,3100,4700"
     ]
 
 

@@ -233,7 +233,7 @@ def test_times_of_day_count_from_the_first_of_each_run(tmp_path, column, cells):
     runs = read(tmp_path, f"run_id,{column},supply_voltage_V,total_current_A\n{rows}", robot)
     assert runs["time_s"] == pytest.approx([0, 0.25, 1.25] * 2, abs=1e-6)
     assert any(
-        f"{column} is a time of day; time is counted from the first row of each run" in note for note in runs.notes
+        f"{column} is a time of day. Time is counted from the first row of each run" in note for note in runs.notes
     )
     usual = read(tmp_path, "time_s,supply_voltage_V,total_current_A\n0,12,0.4\n6,12,0.4\n7,12,0.4\n", robot)
     assert usual["time_s"] == pytest.approx([0, 6, 7]) and usual.notes == ()
@@ -248,12 +248,12 @@ def test_a_run_begins_at_its_first_row_whatever_its_clock_shows(tmp_path):
     runs = read(tmp_path, f"run_id,time_s,supply_voltage_V,total_current_A\n{rows}", bench("voltage"))
     assert runs["time_s"].tolist() == [0.0, 0.0, 0.5, 0.25, 0.0]
     assert any(
-        n.startswith("runs.csv: time_s begins at 3600.25 in run a; time is counted from the first row")
+        n.startswith("runs.csv: time_s begins at 3600.25 in run a. Time is counted from the first row")
         for n in runs.notes
     )
     slow = "time_min,supply_voltage_V,total_current_A\n60,12,0.4\n60.5,12,0.4\n"
     runs = read(tmp_path, slow, bench("voltage"))
-    assert runs["time_s"].tolist() == [0.0, 30.0] and any("time_min begins at 60; time is" in n for n in runs.notes)
+    assert runs["time_s"].tolist() == [0.0, 30.0] and any("time_min begins at 60. Time is" in n for n in runs.notes)
     late = "time_s,supply_voltage_V,total_current_A\n60,12,0.4\n-1,12,0.4\n"
     with pytest.raises(BadData, match=r"row 2, time_s: got -1; expected 0 to 1e\+06"):
         read(tmp_path, late, bench("voltage"))

@@ -102,7 +102,7 @@ def test_interrupted_work_of_another_command_is_left_alone(tmp_path, capsys):
     assert (partial / "chunks" / "base.stage").is_file()
     RunFolder(tmp_path / "x", other, force=True).close()
     assert not (partial / "chunks" / "base.stage").exists()
-    assert "x.partial: was made with another configuration; started again" in capsys.readouterr().err
+    assert "x.partial: was made with another configuration, so it is started again" in capsys.readouterr().err
     RunFolder(tmp_path / "x", SWEEP).close()  # nothing of the loop's is left
     interrupted(tmp_path / "x", SWEEP)
     with RunFolder(tmp_path / "x", LOOP, force=True) as folder:

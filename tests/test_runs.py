@@ -72,7 +72,7 @@ def test_missing_readings_are_nan_and_counted(tmp_path):
     assert_array_equal(np.isnan(runs.measured()), [[False, True, False], [True, True, False]])
     assert runs.missing() == [
         "total_current_A: 1 of 2 readings are missing (row 2)",
-        "motor_speed_rpm: no readings; parameters that only this channel determines are not fitted",
+        "motor_speed_rpm: no readings. Parameters that only this channel determines are not fitted",
     ]
     assert np.isnan(runs.deviations()).all()
 
@@ -335,7 +335,7 @@ def test_copies_of_rows_are_said(tmp_path):
     )
     assert (
         plain.notes == ()
-        and "runs.csv: rows 1 and 3 have the same conditions and readings, and so 1 more; " in copied.notes[0]
+        and "runs.csv: rows 1 and 3 have the same conditions and readings, and so 1 more. " in copied.notes[0]
     )
 
 
@@ -415,9 +415,9 @@ def test_what_a_table_lacks_is_said_before_it_is_used(tmp_path):
     rows[1] = rows[1].replace("2.71", "")
     found = records.read_runs(written(tmp_path, "\n".join([header, *rows])), robot=paper_robots.nominal())
     assert found.notes == (
-        "runs.csv: 1 of 4 cells of total_current_A are empty, the first in row 2; they are ignored",
+        "runs.csv: 1 of 4 cells of total_current_A are empty, the first in row 2. They are ignored",
         "runs.csv: no column motor_speed_rpm, so this channel has no readings",
-        "runs.csv: run_id a is in rows 1, 3; without time_s every row is a separate run",
+        "runs.csv: run_id a is in rows 1, 3. Without time_s every row is a separate run",
     )
 
 

@@ -225,7 +225,7 @@ BAD = {
         ),
         r"motor_speed_rpm: shows -1001 rpm at 6 V; expected the sign of the imposed quantity; give duty the sign",
     ),
-    "nothing imposed": (lambda c: c | {"supply_voltage_V": np.zeros(600)}, r"rows 1 to 600, no settled segment: supply_voltage_V is about zero, so nothing drives the motors; log rows"),
+    "nothing imposed": (lambda c: c | {"supply_voltage_V": np.zeros(600)}, r"rows 1 to 600, no settled segment: supply_voltage_V is about zero, so nothing drives the motors. Log rows"),
     "never settles": (
         lambda c: (
             stairs((12.0,), 600) | {"motor_speed_rpm": 300 + 200 * c["time_s"]}
@@ -348,7 +348,7 @@ def test_time_in_milliseconds_is_doubted_where_a_start_shows_it(tmp_path):
     for unit, doubted in ((1.0, False), (1e3, True)):
         bench(tmp_path, {"time_s": unit * seconds, **start})
         said = rig_facts.doubtful_time(records.read_runs(tmp_path / "log.csv", robot=robot), robot)
-        assert ("is time_s in milliseconds? then name it time_ms" in said) == doubted == bool(said)
+        assert ("Is time_s in milliseconds? Then name it time_ms" in said) == doubted == bool(said)
     drifts = {"time_s": 1e3 * seconds, **start, "motor_speed_rpm": 1000 + 50 * (1 - np.exp(-seconds / step))}
     bench(tmp_path, drifts)
     assert rig_facts.doubtful_time(records.read_runs(tmp_path / "log.csv", robot=robot), robot) == ""
@@ -397,7 +397,7 @@ def test_missing_samples_divide_a_level_and_are_said(tmp_path):
     robot = bench(tmp_path, cut(columns, np.r_[0:300, 400:600]))
     found = settled(tmp_path, robot)
     assert found.gaps == (299,) and len(found.kept) == 2
-    assert words.settle_remarks(found)[0].startswith("samples are missing after row 300; no segment spans such a gap")
+    assert words.settle_remarks(found)[0].startswith("samples are missing after row 300. No segment spans such a gap")
 
 
 def test_days_between_rows_are_a_gap(tmp_path):
@@ -413,8 +413,8 @@ def test_a_saturated_channel_leaves_its_stretch_out(tmp_path):
     found = settled(tmp_path, bench(tmp_path, columns))
     assert [s.why for s in found.stretches] == ["", "", "stuck"] and found.stretches[2].channel == "total_current"
     assert (
-        "total_current shows the same number for a long time: saturated or frozen"
-        in words.left_out(found.stretches)[0]
+        "total_current shows the same number for a long time, so it is saturated or frozen"
+        in words.omitted_stretches(found.stretches)[0]
     )
 
 
@@ -435,7 +435,9 @@ def test_glitches_leave_means_where_they_are_or_a_level_out(tmp_path, case):
     found = settled(tmp_path, bench(tmp_path, columns))
     assert [s.why for s in found.stretches] == ["", "" if count is not None else "glitches", ""]
     if count is None:
-        assert "motor_speed has many readings far from the others (4" in words.left_out(found.stretches)[0][0]
+        assert (
+            "motor_speed has many readings far from the others (4" in words.omitted_stretches(found.stretches)[0][0]
+        )
         return
     middle, clean = found.kept[1], stairs()["motor_speed_rpm"][200:400]
     assert middle.glitches.get("motor_speed", 0) == np.isin(off, middle.rows).sum() >= 0.7 * count
@@ -519,7 +521,7 @@ def test_an_angle_shows_the_speed_of_its_shaft(tmp_path):
     assert speeds == pytest.approx([108.0, 216.0, 324.0], rel=0.01)
     said = words.settle_remarks(found)
     assert (
-        "output_speed_rpm is the rate of output_angle_deg; add output_speed to channels in the rig's file" in said[0]
+        "output_speed_rpm is the rate of output_angle_deg. Add output_speed to channels in the rig's file" in said[0]
     )
     named = bench(tmp_path, columns | {"output_angle_deg": angle}, '"total_current", "output_speed", "output_angle"')
     assert words.settle_remarks(settled(tmp_path, named)) == []
@@ -569,14 +571,14 @@ def test_a_column_without_a_role_may_be_empty_for_a_while(tmp_path):
 
 def test_a_log_with_few_settled_runs_is_given_to_the_loop_itself(tmp_path):
     found, loop = settled(tmp_path, bench(tmp_path, stairs())), "mmrjax loop log.csv"
-    said = words.too_few(found, 6, loop)
+    said = words.sentence_on_few_settled_runs(found, 6, loop)
     assert (
         "run it on the log as it is: mmrjax loop log.csv. With calibrate" in said
-        and words.too_few(found, 3, loop) == ""
+        and words.sentence_on_few_settled_runs(found, 3, loop) == ""
     )
     every = [settling.Stretch("", np.arange(9), 0.0, 1.0, 6.0, why) for why in settling.REASONS]
-    told = {row[0]: row[-1] for row in words.left_out(every, few=True)}
-    assert {told[words.WHY[why][0]] for why in words.OF_LEVELS} == {"nothing: a fit to the log uses these samples"}
+    told = {row[0]: row[-1] for row in words.omitted_stretches(every, few=True)}
+    assert {told[words.WHY[why][0]] for why in words.OF_LEVELS} == {"nothing, as a fit to the log uses these samples"}
     assert told[words.WHY["stuck"][0]] == words.WHY["stuck"][1]
 
 
@@ -632,8 +634,8 @@ def test_a_channel_that_is_read_in_few_rows_has_the_means_of_these_or_none(tmp_p
 @pytest.mark.parametrize(("case", "said"), [
     ("even", ""),
     ("uneven rows", ""),
-    ("missing rows", r"^log\.csv row 401, time_s: 90 s after the row before it, where 0\.01 s is usual; a fit keeps"),
-    ("a clock that jitters", r"^log\.csv rows 1 to 600, time_s: the clock jitters by 0\.00\d+ s around even spacing; .* 0\.01 s apart"),
+    ("missing rows", r"^log\.csv row 401, time_s: 90 s after the row before it, where 0\.01 s is usual. A fit keeps"),
+    ("a clock that jitters", r"^log\.csv rows 1 to 600, time_s: the clock jitters by 0\.00\d+ s around even spacing\. .* 0\.01 s apart"),
 ])  # fmt: skip
 def test_gaps_and_a_clock_that_jitters_are_said_with_rows_and_remedy(tmp_path, case, said):
     rng, columns = np.random.default_rng(12), stairs()
@@ -671,7 +673,7 @@ def test_a_log_in_which_nothing_moves_is_refused_unless_a_shaft_is_locked(tmp_pa
 
 
 @pytest.mark.parametrize(("levels", "said"), [
-    ((12.0,) * 3, r"^log\.csv rows 1 to 600, supply_voltage_V: 12 V in every row; .* Log three levels or more"),
+    ((12.0,) * 3, r"^log\.csv rows 1 to 600, supply_voltage_V: 12 V in every row\. .* Log three levels or more"),
     ((6.0, 12.0), ""),
 ])  # fmt: skip
 def test_a_log_of_one_level_is_said_with_what_it_lacks(tmp_path, levels, said):

@@ -125,6 +125,37 @@ def test_a_wave_is_weighed_as_curves_are_and_said_where_it_is_the_better_one(toy
     assert (where.place, where.variable) == ("track", order)
 
 
+def located(toy, offered, scores, **changes):
+    """Location of a discrepancy on the toy problem among curves with these scores."""
+    scores = SimpleNamespace(curve=np.array(scores), explained=10 * np.array(scores))
+    left = SimpleNamespace(scores=scores, linear=dataclasses.replace(toy.linear, **changes))
+    return locate_discrepancy(left, (SimpleNamespace(names=offered),), toy.counts)
+
+
+def test_a_voltage_leads_no_loss_torque(toy):
+    """It acts there only through current and speed: a friction that steps with the speed was one over the voltage."""
+    known = vars(toy.linear.signals)
+    speed = np.random.default_rng(1).uniform(100, 900, toy.rows)
+    signals = SimpleNamespace(**known | {"voltage": known["speed_motor"], "speed_motor": speed})
+    where = located(toy, (("track", "voltage"), ("track", "speed_motor")), [9.0, 8.5], signals=signals)
+    assert (where.variable, where.variables_alike) == ("speed_motor", ("voltage",))
+    known_defects = np.array(toy.linear.defects)
+    known_defects[PROBED.index("electrical")] = known_defects[PROBED.index("track")]
+    offered = ("electrical", "voltage"), ("electrical", "slope")
+    where = located(toy, offered, [9.0, 5.0], signals=signals, defects=known_defects)
+    assert where.variable == "voltage"
+
+
+def test_balances_are_alike_where_they_change_the_readings_alike(toy):
+    """A loss before the sensor of the torque is an ammeter's error, not a loss of the load, if the speed is imposed."""
+    defects = np.array(toy.linear.defects)
+    defects[PROBED.index("gearbox")] = 1.1 * defects[PROBED.index("track")]
+    defects[PROBED.index("motor")] = [2.0, 0.0, 0.0]
+    offered = ("track", "speed_motor"), ("total_current", "speed_motor")
+    where = located(toy, offered, [9.0, 8.5], defects=defects)
+    assert where.alike == ("track", "gearbox", channels.USUAL[0], "motor")
+
+
 class Turning(SettledLinearization):
     """Rows at which a shaft has turned by `signals.angle`."""
 

@@ -30,7 +30,7 @@ from sweeps.commands import sweep as command
 from sweeps.config_campaign import Campaign
 from sweeps.points import axes, scale, zarr_store
 from sweeps.points.job import prepare_job, store_layout
-from sweeps.points.tasks import task_of
+from sweeps.points.tasks import task_of_configuration
 from sweeps.store import LOCK, MANIFEST, RunFolder
 from tests.commands import ends, read_json
 
@@ -331,7 +331,7 @@ def test_what_is_half_written_is_not_trusted(sweep, whole, monkeypatch, tmp_path
 
 def test_full_disk_in_the_middle_ends_with_2_and_goes_on_later(sweep, whole, monkeypatch, tmp_path):
     heal = stopping(monkeypatch, 25, OSError(errno.ENOSPC, "No space left on device"))
-    ends(sweep("s"), "s.partial: No space left on device after 5 of 12 chunks; free some space")
+    ends(sweep("s"), "s.partial: No space left on device after 5 of 12 chunks. Free some space")
     assert not (tmp_path / "s").exists()
     heal()
     assert sweep("s")[0] == 0
@@ -487,7 +487,7 @@ def test_killed_at_twenty_random_moments_goes_on_to_equal_stores(tmp_path):
 @pytest.mark.slow
 def test_shares_make_the_same_store_in_any_order(sweep, whole, tmp_path):
     for k in (3, 1):
-        ends(sweep("s", "--shard", f"{k}/3"), "chunks of s.partial are finished; the last share", code=0)
+        ends(sweep("s", "--shard", f"{k}/3"), "chunks of s.partial are finished. The last share", code=0)
     assert not (tmp_path / "s").exists()
     _, out, _ = ends(sweep("s", "--shard", "2/3"), code=0)
     assert out.splitlines()[-1] == "s"
@@ -718,7 +718,7 @@ def test_what_is_damaged_of_an_interrupted_sweep_is_computed_again(opened, tmp_p
         written(again, k, speed=WHOLE[k])
     finished(again)
     assert xr.open_zarr(tmp_path / "s" / zarr_store.STORE).speed.values.tolist() == WHOLE
-    assert ("damaged; " in capsys.readouterr().err) == ("identity" not in name and "journal" not in name)
+    assert ("damaged, so" in capsys.readouterr().err) == ("identity" not in name and "journal" not in name)
     last = opened()  # which reads the chunk's second line
     assert last.finished and len(last.done()) == 3
 
@@ -841,7 +841,7 @@ def test_grid_too_large_for_the_disk_is_refused_with_figures(sweep, monkeypatch,
 def laid_out_of(text):
     stated = tomllib.loads(text)
     config, robot = Campaign(**stated), paper_robots.nominal()
-    config = config.model_copy(update={"outputs": task_of(config, robot).usual})
+    config = config.model_copy(update={"outputs": task_of_configuration(config, robot).usual})
     return store_layout(config, prepare_job(config, robot, axes.plan_design(config, robot, "x"), "x"))
 
 

@@ -95,10 +95,10 @@ ROLLS, WIDE = 0.03, 0.5
     ("speed", "rate", "says"),
     [
         (0.3, 3.0, "need 35 V at one motor; the supply has 24 V, which gives about 1.68 rad/s at 0.3 m/s and "
-                   "no more than 2.88 rad/s, on the spot"),
+                   "no more than 2.88 rad/s when turning on the spot"),
         (-0.6, 1.0, "need 28.3 V at one motor; .* about 0.48 rad/s at 0.6 m/s and about 0.47 m/s at 1 rad/s"),
-        (0.0, -9.0, "which gives no more than 2.88 rad/s, on the spot"),
-        (2.0, -0.5, "which gives about 0.595 m/s at 0.5 rad/s and no more than 0.72 m/s, straight"),
+        (0.0, -9.0, "which gives no more than 2.88 rad/s when turning on the spot"),
+        (2.0, -0.5, "which gives about 0.595 m/s at 0.5 rad/s and no more than 0.72 m/s in straight travel"),
     ],
 )  # fmt: skip
 def test_a_turn_beyond_the_supply_is_refused_with_what_it_reaches(monkeypatch, speed, rate, says):
@@ -322,7 +322,7 @@ def test_turns_are_told_as_recorded():
     ]
     text = "\n".join(lines) + "\n"
     assert text == recorded("turns", text)
-    assert not turn_words.is_going(row(**TOLD["no numbers"]))
+    assert not turn_words.has_motion(row(**TOLD["no numbers"]))
 
 
 PLAN = '[conditions]\nconfiguration = "6T2A"\nvoltage = 24\nduty_right = 1\n[axes]\nduty_left = [-1, 1]\n'

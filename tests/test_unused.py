@@ -55,7 +55,7 @@ def test_numbers_that_vary_and_have_no_role_are_said(tmp_path):
     (note,) = unused_notes(runs)
     assert note.columns == (("brake_torque_Nm", "load_torque_Nm"),)
     assert sentences((note,)) == (
-        "runs.csv: brake_torque_Nm varies from row to row and is not used; if brake_torque_Nm is load_torque_Nm, set "
+        "runs.csv: brake_torque_Nm varies from row to row and is not used. If brake_torque_Nm is load_torque_Nm, set "
         '[columns] load_torque_Nm = "brake_torque_Nm" in the robot\'s file',
     )
     assert description.unused_inputs(runs) == ("brake_torque_Nm",)

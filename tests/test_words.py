@@ -400,7 +400,7 @@ OVER = PlacedCurve("slip", ("slope",))
         (NameSupport(False, "larger", ("a", "b")), "a and b would explain more, but only at an implausible size"),
         (
             NameSupport(False, "better curve", ("a",), (PlacedCurve("speed", ("speed_motor", "slope")),)),
-            "a smooth surface in the reading of speed over speed motor and slope explains the data better than a",
+            "a smooth surface in the reading of speed over motor speed and slope explains the data better than a",
         ),
         (
             NameSupport(False, "curve alone", curves=(OVER,)),
@@ -416,14 +416,14 @@ OVER = PlacedCurve("slip", ("slope",))
                     NameTest("c", 5.0, 3.41, (), 9.0, again=0.75, larger=("d", "e"), remains=True),
                 ),
             ),
-            "a explains 1.2 σ next to smooth curves (slip balance over slope); chance alone reaches 3.4; b is a worse "
+            "a explains 1.2 σ next to smooth curves (slip balance over slope), where chance alone reaches 3.4 σ; b is a worse "
             "explanation than a smooth curve in its place and depends on row 10 alone; c is chosen again in only 75 % of the "
             "fits with one block left out, explains less than d and e at an implausible size and leaves an error in "
             "its own equation",
         ),
         (
             NameSupport(False, "none by itself", tests=(NameTest("a", 1.2, 3.41, (), 0.0),)),
-            "a explains 1.2 σ; chance alone reaches 3.4",
+            "a explains 1.2 σ, where chance alone reaches 3.4 σ",
         ),
         (
             NameSupport(
@@ -431,8 +431,8 @@ OVER = PlacedCurve("slip", ("slope",))
                 "beside",
                 tests=(NameTest("a", 6.91, 3.27, (OVER,), 1.0, 11, 5.8), NameTest("b", 5.0, 3.27, (), 0.0)),
             ),
-            "each effect, added to the fit of the others, explains more than chance would: a 6.9 σ (chance 3.3, without row 11 "
-            "5.8), b 5.0 σ (chance 3.3)",
+            "each effect, added to the fit of the others, explains more than chance would: a scores 6.9 σ (chance "
+            "alone reaches 3.3 σ, and 5.8 σ remain without row 11), b scores 5.0 σ (chance alone reaches 3.3 σ)",
         ),
     ],
 )
@@ -464,7 +464,7 @@ def test_verdict_tells_what_is_tentative():
     )
     only = MissingEffect(("b",), (), ("slip",), False)
     said = loop_words.verdict_sentences(VerdictSummary("place", 0.001, place, (only,), support=curve))
-    assert "no effect of the library is established" in said
+    assert "No effect of the library is established" in said
     assert said.endswith(
         "improves predictions: b (a single smooth curve in the slip balance over slope leaves no significant misfit)."
     )
@@ -477,7 +477,7 @@ def test_a_mechanism_is_stated_with_what_it_explains_and_predicts():
     )
     said = loop_words.verdict_sentences(VerdictSummary("mechanism", 0.001, place, mechanism=found))
     assert said.startswith(
-        "Missing: a loss torque that changes with speed or a slip, established as a mechanism: it "
+        "Missing: a loss torque that changes with speed or a slip, established as a mechanism. It "
     )
     assert (
         "explains 99 % of the misfit beyond noise, raises the log likelihood of held-out runs by 0.8 per" in said
@@ -500,7 +500,7 @@ def test_a_mechanism_is_stated_with_its_window_and_why_no_name_stands():
     )  # fmt: skip
     mechanism = Mechanism((here.family,), (), 0.99, 0.8, 0.1, 1.0)
     summary = VerdictSummary("mechanism", 0.001, here, mechanism=mechanism)
-    within = "order, in runs 30 to 44 (as well in runs 31 to 44)"
+    within = "order, in runs 30 to 44 (equally clear in runs 31 to 44)"
     assert loop_words.verdict_sentences(summary).startswith(
         f"Missing: a slip that changes with {within}, established as a mechanism"
     )
@@ -510,7 +510,7 @@ def test_a_mechanism_is_stated_with_its_window_and_why_no_name_stands():
     found = SimpleNamespace(
         verdict="mechanism", summary=summary, effects=(), unnamed=here, support=support, after=SimpleNamespace(adequate=True)
     )  # fmt: skip
-    said = "a single constant in the slip balance in runs 30 to 44 leaves no significant misfit; a explains 1.2 σ; chance alone reaches 3.4"
+    said = "a single constant in the slip balance in runs 30 to 44 leaves no significant misfit; a explains 1.2 σ, where chance alone reaches 3.4 σ"
     assert loop_words.naming_reasons(found) == said
     found.after.adequate = False
     assert loop_words.naming_reasons(found) == loop_words.support_reasons(support)
@@ -542,10 +542,10 @@ def test_verdicts_at_other_noise_are_one_sentence():
     sure, weak = MissingEffect(("a", "c"), (), ("x",)), MissingEffect(("b",), (), ("y",), False)
     assert loop_words.at_other_noise(()) == ""
     assert loop_words.at_other_noise([other(0.7, "class", sure, weak), other(1.4, "class", sure, weak)]) == (
-        "with 0.7 and with 1.4 times the noise the verdict is class: a established, b tentative"
+        "with 0.7 and with 1.4 times the noise, the verdict is class: a established, b tentative"
     )
     assert loop_words.at_other_noise([other(0.5, "place", weak), other(2, "none")]) == (
-        "with 0.5 times the noise the verdict is place: b tentative; with 2 times the noise the verdict is none"
+        "with 0.5 times the noise, the verdict is place: b tentative, and with 2 times the noise, the verdict is none"
     )
 
 
@@ -554,8 +554,8 @@ def test_verdict_lists_what_cannot_be_told_apart():
     one = MissingEffect(("a",), (value,), ("losses",))
     two = MissingEffect(("b", "c"), (), ("leads", "supply"))
     assert loop_words.verdict_sentences(VerdictSummary("class", 0.0004, None, (one, two))) == (
-        "Missing: losses, a, or motor.resistance is 1.94 ohm (these data cannot tell which); one of b, c (these data "
-        "cannot tell which) (family-wise p ≤ 0.0004)."
+        "Missing: losses, a, or motor.resistance is 1.94 ohm (these data cannot distinguish them) and one of b, c (these "
+        "data cannot distinguish them) (family-wise p ≤ 0.0004)."
     )
     assert loop_words.verdict_sentences(
         VerdictSummary("named", 0.002, None, (MissingEffect(("a",), (), ("x",)),))
@@ -582,7 +582,7 @@ def test_a_formula_without_terms_says_so():
 def test_why_an_effect_is_ruled_out():
     reasons = (RuledOut("a", "power"), RuledOut("b", "size", 2.94, ("x", "y")), RuledOut("c", "edge"))
     assert loop_words.why_ruled_out(reasons) == (
-        "a would supply power instead of losing it; b at 2.9 times its largest plausible size; check x and y; c is within one sd of its "
+        "a would supply power instead of losing it; b would have 2.9 times its largest plausible size, so check x and y; c is within one sd of its "
         "largest plausible size"
     )
 
@@ -595,12 +595,20 @@ def test_names_say_what_would_explain_more_than_they():
         return SimpleNamespace(effects=dict.fromkeys(names, 1.0), rise_chi2=rise, why="too large")
 
     near, better = candidate(-2.0, "a"), candidate(-30.4, "b", "c")
-    assert loop_words.ruled_out(of("named", candidate(6.5, "a"))) == "" == loop_words.ruled_out(of("place"))
-    assert loop_words.ruled_out(of("named", near)).startswith("a would explain as much as what is proposed, but is")
-    assert loop_words.ruled_out(of("class", near, better)) == (
+    assert (
+        loop_words.sentence_on_ruled_out_effects(of("named", candidate(6.5, "a")))
+        == ""
+        == loop_words.sentence_on_ruled_out_effects(of("place"))
+    )
+    assert loop_words.sentence_on_ruled_out_effects(of("named", near)).startswith(
+        "a would explain as much as what is proposed, but is"
+    )
+    assert loop_words.sentence_on_ruled_out_effects(of("class", near, better)) == (
         "b and c would explain 30 σ² more than what is proposed, but are ruled out only by size or sign: too large."
     )
-    assert loop_words.ruled_out(of("place", better, near)).startswith("a would explain as much as the curve, but is")
+    assert loop_words.sentence_on_ruled_out_effects(of("place", better, near)).startswith(
+        "a would explain as much as the curve, but is"
+    )
 
 
 @pytest.mark.parametrize(
@@ -623,7 +631,7 @@ def test_what_is_predicted_worse_is_said_with_its_rows(found, predicted, said):
 @pytest.mark.parametrize(
     ("about", "said"),
     [
-        (("missing", "slip", "speed_motor"), "the error of the slip balance over speed motor"),
+        (("missing", "slip", "speed_motor"), "the error of the slip balance over motor speed"),
         (("found", "", "", ("a", "b")), "a, b, found by the lumped model"),
         (("near", "", "", ("a",)), "a, which explains the readings nearly as well"),
     ],
@@ -641,12 +649,12 @@ def test_what_the_track_model_is_asked_about(about, said):
         (
             Adequacy(False, 812.3, 600.0, 1e-9, AdequacyFinding(what="stated"), True),
             "Not adequate: the residuals exceed the stated noise (χ² 812.3 on 600 degrees of freedom, p < 1e-6), so "
-            "a term is missing and the parameters may absorb its effect; run mmrjax loop to find it",
+            "a term is missing and the parameters may absorb its effect. Run mmrjax loop to find it",
         ),
         (
             Adequacy(False, 60.0, 60.0, 0.0021, AdequacyFinding("motor_speed", "follow", "slope_deg"), False),
-            "Not adequate: the residuals of motor speed depend on slope_deg (p = 0.0021, the noise estimated from them), "
-            "so a term is missing and the parameters may absorb its effect; run mmrjax loop to find it",
+            "Not adequate: the residuals of motor speed depend on slope_deg (p = 0.0021, with the noise estimated from the residuals), "
+            "so a term is missing and the parameters may absorb its effect. Run mmrjax loop to find it",
         ),
         (
             Adequacy(True, 61.0, 60.0, 0.4, AdequacyFinding(what="repeats"), True),
@@ -654,19 +662,19 @@ def test_what_the_track_model_is_asked_about(about, said):
         ),
         (
             Adequacy(True, 50.0, 50.0, 0.4, AdequacyFinding(), False),
-            "Adequate as far as can be tested: the residuals show no structure (p = 0.4); the noise was estimated from "
-            "them, so χ² is no test",
+            "Adequate as far as can be tested: the residuals show no structure (p = 0.4). The noise was estimated from "
+            "them, so χ² cannot test the fit",
         ),
         (
             Adequacy(None, 5.0, 2.5, None, AdequacyFinding(), False),
             "Adequacy cannot be tested: the noise was estimated from the misfit, and 2.5 degrees of freedom are too few "
-            "to show structure; state the noise with --noise",
+            "to show structure. State the noise with --noise",
         ),
     ],
 )
 def test_adequacy_is_said(found, said):
     assert found.statement == said and found.to_json()["statement"] == said
-    assert found.to_json()["shown_by"] == fit_words.shown_by(found.shown_by)
+    assert found.to_json()["shown_by"] == fit_words.adequacy_finding_in_words(found.shown_by)
 
 
 def clustered(levels, **other):
@@ -684,19 +692,19 @@ def clustered(levels, **other):
     [
         (
             clustered({"1": -14.42, "2": 3.6}, alike=("direction_deg",)),
-            "residuals of speed differ between the levels of wheel (simulated minus measured, by level: 1: -14 mm/s, 2: +3.6 mm/s; p = 2e-07), "
-            "a column without a role (as well by direction_deg): give each level its own configuration, or find what "
+            "residuals of speed differ between the levels of wheel (simulated minus measured, by level: 1: -14 mm/s, 2: +3.6 mm/s, p = 2e-07), "
+            "a column without a role (as well by direction_deg). Give each level its own configuration, or find what "
             "differs between them",
         ),
         (
             clustered({"1": -1.0, "2": 1.0}, reversing=True, within="configuration", coarser=(("axle", 0.91),)),
             "residuals of speed differ between the levels of wheel within configuration, with opposite signs in the two directions of travel "
-            "(simulated minus measured, by level: 1: -1 mm/s, 2: +1 mm/s; p = 2e-07), a column without a role (axle alone "
-            "91% of it): give each level its own configuration, or find what differs between them",
+            "(simulated minus measured, by level: 1: -1 mm/s, 2: +1 mm/s, p = 2e-07), a column without a role (axle alone "
+            "91% of it). Give each level its own configuration, or find what differs between them",
         ),
         (
             clustered({}, correlation=-0.456),
-            "residuals of speed are correlated with wheel (rank correlation -0.46; p = 2e-07), a column without a role: find "
+            "residuals of speed are correlated with wheel (rank correlation -0.46, p = 2e-07), a column without a role. Find "
             "what changes with it",
         ),
     ],
@@ -707,7 +715,7 @@ def test_what_residuals_cluster_by_is_said(found, said):
 
 def test_six_levels_that_are_furthest_off_are_listed():
     said = clustered({str(k): k - 5.0 for k in range(1, 10)}).statement
-    assert [int(k) for k in re.findall(r"(\d): [+-]", said)] == [1, 2, 3, 7, 8, 9] and ", ...;" in said
+    assert [int(k) for k in re.findall(r"(\d): [+-]", said)] == [1, 2, 3, 7, 8, 9] and ", ..., p" in said
 
 
 def test_tests_that_are_as_improbable_are_named_in_the_order_of_their_words():
@@ -717,7 +725,7 @@ def test_tests_that_are_as_improbable_are_named_in_the_order_of_their_words():
         AdequacyFinding(c, "follow", v) for c in ("total_current", "speed") for v in ("the fitted speed", "slope_deg")
     ]
     every += [AdequacyFinding(c, "remember") for c in ("motor_speed", "total_current")]
-    assert sorted(every) == sorted(every, key=fit_words.shown_by)
+    assert sorted(every) == sorted(every, key=fit_words.adequacy_finding_in_words)
 
 
 def test_what_would_measure_is_found_by_either_end_of_a_name():

@@ -113,7 +113,7 @@ def drop_empty_rows(arrays: NamedArrays, meanings: Sequence[Column | None]) -> N
         is_kept[empty] = False
         arrays = arrays.rows(
             is_kept,
-            f"{count_noun(len(empty), 'row')} without any reading left out; row numbers count only the others",
+            f"{count_noun(len(empty), 'row')} without any reading left out. Row numbers count only the others",
         )
     column_names = [None if m is None else m.column for m in meanings]
     clock = next((raw for c, raw in zip(column_names, arrays.values, strict=True) if c in TIME), None)
@@ -179,13 +179,13 @@ def time_since_start(name: str, meaning: Column, raw: Raw, runs: Sequence[str] |
     if of_day:
         return passed, (
             *notes,
-            f"{name}: {meaning.shown} is a time of day; time is counted from the first row of each run",
+            f"{name}: {meaning.shown} is a time of day. Time is counted from the first row of each run",
         )
     run_index = run[np.flatnonzero(first[run])[0]]
     time_words = f"{first[run_index] / factor:g}{f' in run {names[run_index]}' if names[run_index] else ''}"
     return passed, (
         *notes,
-        f"{name}: {meaning.shown} begins at {time_words}; time is counted from the first row of a run. If the run "
+        f"{name}: {meaning.shown} begins at {time_words}. Time is counted from the first row of a run. If the run "
         "began earlier, add a row without readings at that time",
     )
 
@@ -199,11 +199,11 @@ def _unwrap_clock(name: str, meaning: Column, count: np.ndarray, run: np.ndarray
     recording = np.zeros(len(count), int) if run is None else run
     count, period = unwrap_counter(count, recording)
     if period:
-        notes.append(f"{name}: {meaning.shown} wraps at {period:.10g}; counted on from there")
+        notes.append(f"{name}: {meaning.shown} wraps at {period:.10g}. The time is counted on from there")
     count, rows = spread_shared_stamps(count, recording)
     if rows:
         notes.append(
-            f"{name}: {meaning.shown} repeats, {rows:.3g} rows per time stamp; rows are spaced evenly between stamps"
+            f"{name}: {meaning.shown} repeats, {rows:.3g} rows per time stamp. Rows are spaced evenly between stamps"
         )
     return count, tuple(notes)
 

@@ -105,7 +105,7 @@ def inspect_source(source: str | Path | Any) -> FileContents:
     preset = presets_file.recognise_preset([s.path for s in contents_found.signals])
     if len(clocks) > 1:
         notes.append(
-            f"{contents_found.name}: signals have {len(clocks)} clocks; rows are taken at the samples of the "
+            f"{contents_found.name}: signals have {len(clocks)} clocks. Rows are taken at the samples of the "
             "densest channel"
         )
     still = {fact.path for fact in facts if fact.least == fact.greatest}
@@ -216,7 +216,7 @@ def _proposed_columns(signals: Sequence[Signal]) -> Iterator[tuple[str, str]]:
         elif not _unit_of_time(clock.name) and elapsed is not None and unit != "s":
             step = np.diff(elapsed)
             usual = float(np.median(step[step > 0])) if (step > 0).any() else np.nan
-            line += f"  # unit not stated: in {unit}, rows are {usual:.3g} s apart; check it"
+            line += f"  # unit not stated: in {unit}, rows are {usual:.3g} s apart. Check it"
         if not (clock.name in spelled and clock.name.startswith("time_")):
             yield clock.path, line
 

@@ -58,7 +58,7 @@ def read_csv_columns(path: Path, name: str) -> NamedArrays:
     units = row_of_units(header, body[0]) if body else ()
     if units:
         body = body[1:]
-        notes = (*notes, f"{name}: the row below the header contains units; row numbers start below it")
+        notes = (*notes, f"{name}: the row below the header contains units. Row numbers start below it")
     for k, row in enumerate(body, 1):
         if len(row) != len(header):
             raise BadData(
@@ -155,7 +155,7 @@ def decode_text(name: str, content: bytes) -> tuple[str, Names]:
         wrong = f"{name}: cannot be read as a text file ({error}); save it as CSV in UTF-8"
     try:
         if not _CONTROLS.search(content):
-            return content.decode("cp1252"), (f"{name}: is not in UTF-8; read as Windows-1252",)
+            return content.decode("cp1252"), (f"{name}: is not in UTF-8, so it is read as Windows-1252",)
     except UnicodeDecodeError:
         pass
     raise BadData(wrong)
@@ -234,7 +234,9 @@ def split_cells(name: str, lines: Sequence[str]) -> tuple[list[list[str]], Names
                     f"{name}, {_column(rows, j)}: got {written[0]} next to "
                     f"{beside or 'whole numbers below a thousand'}; {expectation}"
                 )
-    return rows, (f"{note}, and numbers have decimal commas; read accordingly" if comma else f"{note}; read so",)
+    return rows, (
+        f"{note}, and numbers have decimal commas, which are read as such" if comma else f"{note}; read so",
+    )
 
 
 def _column(rows: list[list[str]], j: int) -> str:

@@ -99,13 +99,13 @@ def mass_notes(robot: Robot, runs: Runs) -> list[str]:
             why = "; does total_mass_kg leave the payload out?" if file_mass.unladen else ""
             notes.append(
                 f"{name}: total_mass_kg minus payload_kg varies from {file_mass.low:.4g} to {file_mass.high:.4g} kg. "
-                f"The fit used the mass of each row; robot.toml contains the median, {file_mass.median:.4g} kg, and "
+                f"The fit used the mass of each row. robot.toml contains the median, {file_mass.median:.4g} kg, and "
                 f"does not reproduce the fit in rows of another mass{why}"
             )
         elif abs(file_mass.median - mass) > ROUNDING:
             notes.append(
                 f"{name}: the table states {file_mass.median:.6g} kg without payload, the robot's file {mass:.6g} "
-                f"kg; {file_mass.median:.6g} kg is used, and written to robot.toml"
+                f"kg. {file_mass.median:.6g} kg is used, and written to robot.toml"
             )
     of_table5 = np.zeros(len(runs), bool)
     if runs.has("surface"):
@@ -113,7 +113,7 @@ def mass_notes(robot: Robot, runs: Runs) -> list[str]:
     others = [s for s in np.unique(runs["surface"][of_table5]) if s != BENCH] if of_table5.any() else []
     if others:
         notes.append(
-            f"the table has runs on {', '.join(others)}: the written friction is for {BENCH}; simulate with "
+            f"the table has runs on {', '.join(others)}: the written friction is for {BENCH}. Simulate with "
             f"--surface {others[0]} to use the fitted values"
         )
     return notes

@@ -74,7 +74,7 @@ def _motor_facts(robot: Robot) -> Iterator[DerivedFact]:
         yield DerivedFact("current needed to overcome the motor's dry friction", f"{three_digits(idle)} A", odd)
     if with_constant and voltage is not None:
         fastest = voltage / constant
-        odd = "" if fastest < 2 * motor.speed_limit else ("more than twice motor.speed_limit; check torque_constant")
+        odd = "" if fastest < 2 * motor.speed_limit else ("more than twice motor.speed_limit. Check torque_constant")
         yield DerivedFact(f"no-load speed at {three_digits(voltage)} V", f"{three_digits(fastest / RPM)} rpm", odd)
     if with_resistance and voltage is not None:
         stall = float(motor.current_stall(voltage))
@@ -83,7 +83,7 @@ def _motor_facts(robot: Robot) -> Iterator[DerivedFact]:
     if with_constant and with_resistance:
         size = constant**2 / resistance
         odd = _reason_if_outside(
-            size, 1e-7, 1.0, "torque_constant and resistance are unlikely to belong to one motor; check their units"
+            size, 1e-7, 1.0, "torque_constant and resistance are unlikely to belong to one motor. Check their units"
         )
         yield DerivedFact("torque over speed k²/R", f"{three_digits(size * 1e3)} mN·m·s", odd)
         if inertia > 0:
@@ -101,7 +101,7 @@ def _gearbox_facts(robot: Robot) -> Iterator[DerivedFact]:
     if ratio >= STAGES and efficiency > EFFICIENCY:
         odd = f"an efficiency of {efficiency:g} is higher than usual for three or more stages (0.5 to {EFFICIENCY:g})"
     if ratio == 1 and efficiency < 0.9:
-        odd = f"an efficiency of {efficiency:g} without a gearbox; is the ratio missing?"
+        odd = f"an efficiency of {efficiency:g} without a gearbox. Is the ratio missing?"
     yield DerivedFact("gearbox", f"{ratio:g} : 1 with efficiency {efficiency:g}", odd)
 
 
@@ -129,8 +129,8 @@ def _current_fact(robot: Robot, what: str, torque: float, places: str) -> Iterat
         stall = float(robot.motor.current_stall(limit))
         if current > stall:
             odd = (
-                f"above the stall current {three_digits(stall)} A at {three_digits(limit)} V, so it cannot move; "
-                f"check {places}"
+                f"above the stall current {three_digits(stall)} A at {three_digits(limit)} V, so it cannot move. "
+                f"Check {places}"
             )
     yield DerivedFact(what, f"{three_digits(current)} A per motor", odd)
 
@@ -189,7 +189,7 @@ def _vehicle_facts(robot: Robot, name: str) -> Iterator[DerivedFact]:
         return
     pull = _output_torque_at(robot, float(robot.motor.current_stall(limit))) - float(load.track.loss_coulomb)
     climb = pull * sides / (radius * mass * GRAVITY) - rolling - guide
-    odd = "" if climb > 0 else "its motors cannot move it; check mass, ratio, torque_constant and resistance"
+    odd = "" if climb > 0 else "its motors cannot move it. Check mass, ratio, torque_constant and resistance"
     angle = "any" if climb >= 1 else f"{math.degrees(math.asin(max(climb, 0.0))):.0f}°"
     yield DerivedFact(f"{name}: steepest slope that the stall torque holds at {three_digits(limit)} V", angle, odd)
     speed = limit / float(robot.motor.torque_constant) / float(robot.gearbox.ratio) * radius
@@ -221,7 +221,7 @@ def doubtful_time(runs: Runs, robot: Robot) -> str:
             return (
                 f"{runs.source} rows {stretch.rows[rises[0]] + 1} to {stretch.rows[rises[-1]] + 1}: "
                 f"{channel.label} changes over {three_digits(lasts)} s at a constant voltage, while these motors "
-                f"need about {three_digits(longest / FAR)} s; is {column} in milliseconds? then name it time_ms, "
+                f"need about {three_digits(longest / FAR)} s. Is {column} in milliseconds? Then name it time_ms, "
                 f'or state [columns] time_ms = "{column}"'
             )
     return ""
@@ -249,7 +249,7 @@ def doubtful_current(runs: Runs, robot: Robot) -> str:
     heading = runs.headings.get(column, column)
     return (
         f"{runs.source}, {heading}: up to {three_digits(largest)} A, although by the file's numbers the load turns "
-        f"slowly at {three_digits(needed)} A; is it in another unit (mA, mN·m)? then state [columns] {column} = "
+        f"slowly at {three_digits(needed)} A. Is it in another unit (mA, mN·m)? Then state [columns] {column} = "
         f'{{column = "{heading}", factor = ...}}'
     )
 
@@ -277,7 +277,7 @@ def gap_sentence(runs: Runs) -> str:
         more = f" (and {count_noun(int(long.sum()) - 1, 'other row')} after a gap)" if long.sum() > 1 else ""
         told = (
             f"{runs.source} row {rows[k + 1] + 1}, time_s: {three_digits(worst)} s after the row before it, where "
-            f"{three_digits(usual)} s is usual{more}; a fit keeps the imposed quantity constant in the gap; if rows "
+            f"{three_digits(usual)} s is usual{more}. A fit keeps the imposed quantity constant in the gap. If rows "
             'are missing, give those after the gap another run_id, with start = "measured" in the rig\'s file'
         )
     return told
@@ -304,7 +304,7 @@ def jitter_sentence(runs: Runs) -> str:
             run = f" of run {name}" if name else ""
             return (
                 f"{runs.source} rows {rows[0] + 1} to {rows[-1] + 1}, time_s: the clock{run} jitters by "
-                f"{three_digits(spread / 2**0.5)} s around even spacing; a fit uses these times unchanged. "
+                f"{three_digits(spread / 2**0.5)} s around even spacing. A fit uses these times unchanged. "
                 f"Replace them by even times, {three_digits(float(np.mean(steps)))} s apart"
             )
     return ""
@@ -320,7 +320,7 @@ def constant_conditions_sentence(runs: Runs) -> str:
         return ""
     return (
         f"{runs.source} rows 1 to {len(runs)}, {runs.headings.get(column, column)}: "
-        f"{three_digits(runs[column][0])} {column.rpartition('_')[2]} in every row; one level gives one steady "
+        f"{three_digits(runs[column][0])} {column.rpartition('_')[2]} in every row. One level gives one steady "
         "current and speed, which cannot separate losses that rise with current from losses that rise with "
         "speed. Log three levels or more, in both directions if the drive reverses"
     )
@@ -362,7 +362,7 @@ def saturation_sentence(runs: Runs) -> str:
     column = "duty" if runs.has("duty") else runs.headings.get(SUPPLY, SUPPLY)
     return (
         f"{runs.source} row {row + 1}, {column}: commands {three_digits(drive[row])} V, but current and speed "
-        f"show {three_digits(limit)} V at most, as in {100 * np.mean(beyond):.2g} % of the log; the driver limits "
+        f"show {three_digits(limit)} V at most, as in {100 * np.mean(beyond):.2g} % of the log. The driver limits "
         f"the voltage. Give the voltage that it applies, or limit the column to {three_digits(limit)} V"
     )
 
@@ -438,7 +438,7 @@ def still_sentence(runs: Runs) -> str:
         return ""
     columns = ", ".join(runs.headings.get(c, c) for c in (runs.channels[k].column for k in moving))
     return (
-        f"{runs.source}, {columns}: the same in every row, so nothing moves; the log determines at most the "
+        f"{runs.source}, {columns}: the same in every row, so nothing moves. The log determines at most the "
         "winding resistance. Log a run in which the shaft turns, or name the column with its speed or angle"
     )
 
@@ -459,7 +459,7 @@ def held_sentence(runs: Runs) -> str:
                     column, last = runs.headings.get(channel.column, channel.column), rows[end - 1] + 1
                     return (
                         f"{runs.source} rows {rows[begin] + 1} to {last}, {column}: the same reading while "
-                        f"{runs.headings.get(imposed, imposed)} changes, as if the last value was repeated; empty "
+                        f"{runs.headings.get(imposed, imposed)} changes, as if the last value was repeated. Empty "
                         "these cells to use the other rows"
                     )
     return ""
@@ -481,7 +481,7 @@ def swapped_sentence(runs: Runs) -> str:
                 column = runs.headings.get(channel.column, channel.column)
                 return (
                     f"{runs.source} row {rows[turn] + 2}, {column}: from here on its sign is reversed relative to "
-                    f"{runs.headings.get(imposed, imposed)}; correct the sign in one of the two parts"
+                    f"{runs.headings.get(imposed, imposed)}. Correct the sign in one of the two parts"
                 )
     return ""
 
@@ -544,7 +544,7 @@ def number_origins(file: RobotFile) -> list[NumberOrigin]:
         elif robot.rig.inherits:
             why = "its base"
         elif head == BATTERY and not robot.knows([p.name]):
-            why = "not stated: an example value; results on the battery depend on it"
+            why = "not stated: an example value. Results on the battery depend on it"
         else:
             why = _reason_of_default(p.name, rest if is_own_configuration else "")
         origins.append(NumberOrigin(p.name, float(p.value), p.spec.unit, priors.get(p.name), why))

@@ -367,7 +367,7 @@ def _driven_mask(name: str, columns: Columns, layout: Layout) -> tuple[np.ndarra
         )
     row_words = f"row {idle[0] + 1} is" if idle.size == 1 else f"{idle.size} rows, the first row {idle[0] + 1}, are"
     return size != 0, (
-        f"{name}: {row_words} left out, since nothing drives the motors ({zero or column} is 0); row numbers do not "
+        f"{name}: {row_words} left out, since nothing drives the motors ({zero or column} is 0). Row numbers do not "
         "count them"
     )
 
@@ -452,7 +452,7 @@ def missing_data_notes(name: str, columns: Columns, layout: Layout) -> Iterator[
         if empty.size:
             count = f"{empty.size} of {len(columns[channel.column])}"
             yield (
-                f"{name}: {count} cells of {channel.column} are empty, the first in row {empty[0] + 1}; they are "
+                f"{name}: {count} cells of {channel.column} are empty, the first in row {empty[0] + 1}. They are "
                 "ignored"
             )
     alike: dict[tuple[Any, ...], list[int]] = {}
@@ -463,8 +463,8 @@ def missing_data_notes(name: str, columns: Columns, layout: Layout) -> Iterator[
     if copied := [rows for rows in alike.values() if len(rows) > 1]:
         others = f", and so {len(copied) - 1} more" if len(copied) > 1 else ""
         yield (
-            f"{name}: rows {' and '.join(map(str, copied[0][:2]))} have the same conditions and readings{others}; "
-            "they count as repeats. Remove copies: they make results look more certain than they are"
+            f"{name}: rows {' and '.join(map(str, copied[0][:2]))} have the same conditions and readings{others}. "
+            "They count as repeats. Remove copies: they make results look more certain than they are"
         )
     if "run_id" in columns and not set(TIME) & set(columns):
         runs, times = np.unique(columns["run_id"], return_counts=True)
@@ -475,7 +475,7 @@ def missing_data_notes(name: str, columns: Columns, layout: Layout) -> Iterator[
             row_words = f"{', '.join(map(str, rows[:5]))}{' and more' if len(rows) > 5 else ''}"
             others = f", and so {several.sum() - 1} more" if several.sum() > 1 else ""
             yield (
-                f"{name}: run_id {run} is in rows {row_words}{others}; without {', '.join(TIME)} every row is a "
+                f"{name}: run_id {run} is in rows {row_words}{others}. Without {', '.join(TIME)} every row is a "
                 "separate run"
             )
 

@@ -152,7 +152,7 @@ def runs_of_arrays(
     settled: Names = ()
     if measured and robot is not None:
         columns, settled = row_checks.drop_time_of_settled_rows(name, columns, layout, robot)
-    notes = (*arrays.notes, *settled, *sides.of_volts(name, columns, battery))
+    notes = (*arrays.notes, *settled, *sides.duties_from_side_voltages(name, columns, battery))
     is_kept, copied = row_checks.distinct_rows(name, columns)
     columns = {c: values[is_kept] for c, values in columns.items() if c != "held" or values.any()}
     if measured:
@@ -177,7 +177,7 @@ def runs_of_arrays(
     }
     notes = (*notes, *capitals, *changed, *(row_checks.missing_data_notes(name, columns, layout) if measured else ()))
     notes = (*notes, *(
-        f"{name}: {channels.find_channel(i.channel).column} is positive although its side is driven backward; it "
+        f"{name}: {channels.find_channel(i.channel).column} is positive although its side is driven backward. It "
         "is assumed to show only the magnitude, so magnitudes are compared" for i in unsigned
     ))  # fmt: skip
     notes = (*notes, *row_checks.driven_backward_notes(name, columns, layout))
@@ -255,7 +255,7 @@ def _drop_repeats(name: str, columns: Columns, layout: Layout) -> Iterator[str]:
         if rows:
             columns[channel.column] = values
             yield (
-                f"{name}: {channel.column} repeats each reading in {rows:.3g} rows, like a slower sensor; each "
+                f"{name}: {channel.column} repeats each reading in {rows:.3g} rows, like a slower sensor. Each "
                 "reading is used once, in its first row"
             )
 
@@ -285,7 +285,7 @@ def _reject_condition_without_effect(arrays: NamedArrays, meaning: Column, raw: 
     why = (
         f"{NO_BRAKE}; give slope_deg or payload_kg, or describe the load as a shaft"
         if layout.has_ground
-        else "the robot's load is a shaft, on which no slope, payload or mass acts; remove the column, or "
+        else "the robot's load is a shaft, on which no slope, payload or mass acts. Remove the column, or "
         "describe the load as a vehicle"
     )
     if isinstance(raw, np.ndarray):

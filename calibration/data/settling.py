@@ -940,14 +940,14 @@ def _nothing_settled_message(found: Settled, loop: str) -> str:
         )
     imposed = found.runs.layout.imposed_column
     others = {
-        "idle": f"{imposed} is about zero, so nothing drives the motors; log rows in which they are driven, or, if "
+        "idle": f"{imposed} is about zero, so nothing drives the motors. Log rows in which they are driven, or, if "
         "another column has the command, name that one under [columns] in the rig file",
-        "rest": "no level shows motion above the noise; use larger commands",
-        "stuck": f"{longest.channel} shows the same number for a long time: saturated or frozen; repair the "
+        "rest": "no level shows motion above the noise. Use larger commands",
+        "stuck": f"{longest.channel} shows the same number for a long time: saturated or frozen. Repair the "
         "instrument or change its range",
-        "glitches": f"{longest.channel} has many readings far from the others; repair the instrument, or log its "
+        "glitches": f"{longest.channel} has many readings far from the others. Repair the instrument, or log its "
         "mean",
-        "undriven": "the driver brakes or coasts in every row; log rows in which it drives the motors",
+        "undriven": "the driver brakes or coasts in every row. Log rows in which it drives the motors",
     }
     return f"{source} {rows}, no settled segment: {others[why]}"
 

@@ -32,7 +32,7 @@ def supply_and_shares(volts: np.ndarray, supply: np.ndarray | None = None) -> tu
     return source, np.divide(volts, source, out=np.zeros_like(volts), where=source != 0)
 
 
-def of_volts(name: str, columns: Columns, battery: bool) -> Names:
+def duties_from_side_voltages(name: str, columns: Columns, battery: bool) -> Names:
     """Replaces the sides' voltages of a table by their shares of the supply's voltage.
 
     Returns:

@@ -208,7 +208,7 @@ class Runs:
             missing_rows = np.flatnonzero(np.isnan(self.measured()[:, k]))
             if not self.has(channel.column) or missing_rows.size == len(self):
                 notes.append(
-                    f"{channel.column}: no readings; parameters that only this channel determines are not fitted"
+                    f"{channel.column}: no readings. Parameters that only this channel determines are not fitted"
                 )
             elif missing_rows.size:
                 rows = rows_text(missing_rows.tolist(), 8)

@@ -35,14 +35,14 @@ def without_unread(runs: Runs, robot: Robot) -> Runs:
         if not_read.any():
             rows = rows_text(np.flatnonzero(not_read).tolist(), *SHOWN)
             notes.append(
-                f"{runs.source}, {channel.column}: 0 in {rows} although the current is that of a turning motor; "
-                "these readings are treated as missing"
+                f"{runs.source}, {channel.column}: 0 in {rows} although the current is that of a turning motor. "
+                "These readings are treated as missing"
             )
     if beyond.any():
         rows = rows_text(np.flatnonzero(beyond).tolist(), *SHOWN)
         notes.append(
             f"{runs.source}, {rows}: the readings no longer change while the command rises, so the supply or the "
-            "driver is at a limit; these rows are set aside"
+            "driver is at a limit. These rows are set aside"
         )
     return dataclasses.replace(runs, columns=columns, notes=tuple(notes))
 

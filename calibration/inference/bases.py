@@ -129,6 +129,15 @@ def place_in_words(place: str) -> str:
     return f"reading of {place}".replace("_", " ") if is_channel_place(place) else f"{words} balance"
 
 
+def variable_in_words(variable: str) -> str:
+    """Name of a variable of a curve in words, such as `motor speed`."""
+    return (
+        EVERY_VARIABLE[variable].label
+        if "_" in variable and variable in EVERY_VARIABLE
+        else variable.replace("_", " ")
+    )
+
+
 def place_signature(linear: Linearization, place: str, shapes: np.ndarray) -> np.ndarray:
     """Change of the readings by errors of one place, for errors of shape (rows, terms). Shape (readings, terms)."""
     if is_channel_place(place):

@@ -151,7 +151,7 @@ def _study_of_output(row: Quantity, study: Study, found: LocalDerivatives, part:
 def _no_point_message(study: Study, statuses: dict[str, dict[str, int]]) -> str:
     status_words = "; ".join(f"{s}: " + ", ".join(f"{n} {w}" for w, n in by.items()) for s, by in statuses.items())
     return (
-        f"no operating point can be studied, because too many robots do not travel there ({status_words}); choose "
+        f"no operating point can be studied, because too many robots do not travel there ({status_words}). Choose "
         "smaller --slopes, another --voltages, or reduce the uncertainty of the adhesion with --set or by calibrating"
     )
 

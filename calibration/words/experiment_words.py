@@ -109,8 +109,8 @@ def _run(run: menu.ProposedRuns) -> str:
     unit = {"voltage": "V", "motor_current": "A per motor"}.get(run.imposed)
     levels = join_amounts(turning, "rpm at the motor") if unit is None else join_amounts(run.voltage, unit)
     against = f" against a brake of {join_torques(run.torque)}" if any(run.torque) else ""
-    text = f"{_doing(run)}{slope_words} at {levels}{against}; read {read}"
-    return f"{text}. Watch {'; '.join(map(describe, run.watch))}" if run.watch else text
+    text = f"{_doing(run)}{slope_words} at {levels}{against}. Read {read}"
+    return ". ".join([text, *(f"Watch {describe(limit)}" for limit in run.watch)])
 
 
 def _doing(run: menu.ProposedRuns) -> str:
@@ -132,8 +132,8 @@ def heated_winding(temperature: float, allowed: float | None) -> str:
         allowed: permitted temperature, None if unknown [°C].
     """
     settles = math.isfinite(temperature)
-    would = f"would reach {temperature:.0f} °C" if settles else ("would burn out, as its temperature never settles")
-    return f"an energised winding {would}{'' if allowed is None else _temperature_limit(allowed)}"
+    would = f"would reach {temperature:.0f} °C" if settles else "would burn out, as its temperature never settles"
+    return f"a winding that stays energised {would}{'' if allowed is None else _temperature_limit(allowed)}"
 
 
 def _temperature_limit(temperature: float) -> str:
@@ -144,7 +144,7 @@ def _temperature_limit(temperature: float) -> str:
 # --- what is proposed -----------------------------------------------------------------------------------
 
 
-def more_runs(what: SimpleNamespace) -> str:
+def instruction_for_further_runs(what: SimpleNamespace) -> str:
     """More runs along the variable of a discrepancy, from the values of `denser_runs_instruction`."""
     if what.variable in bases.ORDERS:
         three = [f"{menu.round_significant(v):g}" for v in (what.low, 0.5 * (what.low + what.high), what.high)]
@@ -160,7 +160,7 @@ def more_runs(what: SimpleNamespace) -> str:
         by_kind = _of_level(what)
     else:
         by_kind = {} if what.within.has_ground else _of_shaft(what)
-    last = f"Repeat with {what.variable.replace('_', ' ')} in small, equal steps over its whole range"
+    last = f"Repeat, and vary the {bases.variable_in_words(what.variable)} in small, equal steps over its whole range"
     return (_advice_by_variable(what) | by_kind).get(what.variable, last)
 
 
@@ -179,7 +179,7 @@ def _repeat_instruction(happens: bases.Window) -> str:
         )
     return (
         f"Repeat two of the runs, sampled as finely as the instruments allow from {happens.low:.3g} to "
-        f"{happens.high:.3g} s; in one of them, switch nothing during that time"
+        f"{happens.high:.3g} s. In one of them, switch nothing during that time"
     )
 
 
@@ -224,7 +224,7 @@ def _advice_by_variable(what: SimpleNamespace) -> dict[str, str]:
         "speed": "Repeat on the level, unladen, with the travelling speed in equal steps from a crawl to its "
         f"maximum, about {within.speed:.2g} m/s at {high:g} V",
         "time": f"Record one condition for ten minutes from a cold start, at no more than {low:g} V, and repeat "
-        f"it at once while everything is warm; watch the winding's temperature{_temperature_limit(within.hot)}",
+        f"it at once while everything is warm. Watch the winding's temperature{_temperature_limit(within.hot)}",
         "order": "Repeat the table in reverse order, and repeat one condition after every fifth run",
     }
 
@@ -271,30 +271,30 @@ def _of_shaft(what: SimpleNamespace) -> dict[str, str]:
 
 #: Code of an instruction or of what to watch → a sentence with its values, or a function that makes one.
 SAID: dict[str, str | Callable[..., str]] = {
-    "nothing_possible": "Every experiment that the loop can propose is excluded or out of reach",
+    "nothing_possible": "Every experiment that the loop can propose is forbidden or not possible on this bench",
     "no_menu": "The loop can propose experiments for straight travel only, not for {word}",
     "nothing_tells": lambda names, sigma: (
-        f"No experiment that the loop can propose separates {' and '.join(names)} by {sigma:g} sigma"
+        f"No experiment that the loop can propose separates {' and '.join(names)} by {sigma:g} σ"
     ),
-    "too_weak": "A series of runs over {variable} would show the missing term with {sigma:.1f} sigma only",
+    "too_weak": "A series of runs over {variable} would show the missing term with only {sigma:.1f} σ",
     "carry_out": lambda experiments: ". Then: ".join(map(experiment_sentences, experiments)),
     "more_runs": lambda **series: (
-        f"{more_runs(SimpleNamespace(**series))}. Read every channel: the series shows the shape of the term that is "
-        f"missing in the {bases.place_in_words(series['place'])}"
+        f"{instruction_for_further_runs(SimpleNamespace(**series))}. Read every channel. The series shows how the "
+        f"term that is missing in the {bases.place_in_words(series['place'])} depends on this variable"
     ),
     "overspeed": lambda speed, limit, voltage: (
         f"the motor speed: expect about {speed / RPM:.0f} rpm unloaded at {voltage:g} V and do not exceed "
-        f"{limit / RPM:.0f} rpm; raise the voltage slowly"
+        f"{limit / RPM:.0f} rpm. Raise the voltage slowly"
     ),
     "overvoltage": "the supply: {voltage:g} V is above the highest voltage in the table, {used:g} V",
     "held_motor": lambda current, **heat: (
-        f"the heating: {current:.2g} A flow through a stationary, uncooled motor; {heated_winding(**heat)}, so "
-        "switch off within seconds and let it cool between readings"
+        f"the heating: {current:.2g} A flow through a stationary, uncooled motor, and {heated_winding(**heat)}. "
+        "Switch off within seconds and let the motor cool between readings"
     ),
     "braked_motor": lambda **heat: (
-        f"the brake and the winding's temperature: {heated_winding(**heat)}; a few seconds are enough for a reading"
+        f"the brake and the winding's temperature: {heated_winding(**heat)}. A few seconds are enough for a reading"
     ),
-    "hot_motor": lambda **heat: f"the winding's temperature: {heated_winding(**heat)}; keep the runs short",
+    "hot_motor": lambda **heat: f"the winding's temperature: {heated_winding(**heat)}. Keep the runs short",
 }
 
 
@@ -373,4 +373,4 @@ def effect_tests(effect: type[Effect]) -> Iterator[str]:
             )
             yield f"{text[0].upper()}{text[1:].rstrip(',')}, at several voltages"
     variation = VARY.get(effect.driver, f"the {effect.driver}")  # one's own may go with anything
-    yield f"Vary {variation}" + ("; from rest, over time" if effect.transient or effect.settles_to else "")
+    yield f"Vary {variation}" + (", from rest, over time" if effect.transient or effect.settles_to else "")

@@ -45,16 +45,16 @@ def _unit(ratio: float, near: float) -> str:
 def _undetermined(share: float, missing: Sequence[str]) -> str:
     lack = f" ({', '.join(missing)} missing)" if missing else ""
     return (
-        f"kA is not determined: its 95 % interval is ± {100 * share:.0f} %{lack}. No feedback gains are given; "
-        "run dynamic tests with more acceleration and a faster log."
+        f"kA is not determined: its 95 % interval is ± {100 * share:.0f} %{lack}. No feedback gains are given. "
+        "Run dynamic tests with more acceleration and a faster log."
     )
 
 
 SAID: dict[str, str | Callable[..., str]] = {
     "feedforward_sign": "A positive voltage gives a negative velocity: the motor or the encoder is inverted. The "
-    "sign of the voltage is changed here; set the inversion in the robot's code.",
+    "sign of the voltage is changed here. Set the inversion in the robot's code.",
     "feedforward_speed_sign": "Velocity and position have opposite signs. The sign of the velocity is changed "
-    "here; invert one of the two in the robot's code.",
+    "here. Invert one of the two in the robot's code.",
     "feedforward_unit": _unit,
     "feedforward_delay": lambda delay: (
         f"The motion follows the voltage {1000 * delay:.0f} ms late. The constants are fitted with this delay."

@@ -22,10 +22,10 @@ if TYPE_CHECKING:
 
 #: Meaning of a parameter far from its prior, by the kind of result.
 FAR = {
-    "loop": "{} is implausible, {:.1f} prior sds from its prior: it probably absorbs a missing effect",
-    "calibration": "{} lies {:.1f} prior sds from its prior: the prior or the model is wrong",
-    "edge": "{}: its posterior mean lies {:.1f} prior sds from its prior, at the edge of the searched range: "
-    "widen the prior and search again, or question the model",
+    "loop": "{} has an implausible value, {:.1f} prior sds from its prior mean. It probably absorbs a missing effect",
+    "calibration": "{} is {:.1f} prior sds from its prior mean. The prior or the model is wrong",
+    "edge": "{} has a posterior mean {:.1f} prior sds from its prior mean, at the edge of the searched range. "
+    "Widen the prior and search again, or question the model",
 }
 #: Origin of a prior that is neither from a field nor stated.
 PRIORS = {"product": "the prior of its product with the guide share in the other fidelities"}
@@ -36,16 +36,16 @@ LOST_AS = {
 }  # fmt: skip
 
 
-def noise_off(channel: str, factor: float, source: str) -> str:
+def sentence_on_wrong_noise(channel: str, factor: float, source: str) -> str:
     """Ratio of residuals to their sds."""
     if not channel:
         return (
-            f"in every channel and under all conditions, residuals are {factor:.2g} times the {source} noise: "
-            "check the noise"
+            f"in every channel and under all conditions, the residuals are {factor:.2g} times the {source} noise. "
+            "Check the noise"
         )
     return (
-        f"residuals of {channels.find_channel(channel).label} are {factor:.2g} times the {source} noise under all "
-        "conditions: check the noise"
+        f"the residuals of {channels.find_channel(channel).label} are {factor:.2g} times the {source} noise under "
+        "all conditions. Check the noise"
     )
 
 
@@ -53,8 +53,8 @@ def estimated_noise(percent: tuple[tuple[str, float], ...]) -> str:
     """Channels whose noise was estimated."""
     share_words = ", ".join(f"{channel.replace('_', ' ')} {share:.1f} %" for channel, share in percent)
     return (
-        f"no noise was stated for {share_words}. It is estimated from the misfit, so it includes model error and "
-        "cannot be used to test the model"
+        f"no noise was given, so it is estimated from the misfit: {share_words}. These values include model error, "
+        "so they cannot be used to test the model"
     )
 
 
@@ -72,36 +72,36 @@ def is_determined_answer(found: fit_notes.Determination) -> str:
     return "no" if found.held else "yes"
 
 
-def only_together(pairs: tuple[fit_notes.DependentPair, ...]) -> str:
+def sentence_on_combinations(pairs: tuple[fit_notes.DependentPair, ...]) -> str:
     """Parameters that are not determined separately, with what is."""
     pair_words = [f"{determined_combination(p)} (correlation {p.correlation:+.3f})" for p in pairs]
-    return f"determined only together: {', '.join(pair_words)}"
+    return f"these runs determine only combinations of some parameters: {', '.join(pair_words)}"
 
 
-def of_rows(rows: tuple[int, ...], what: str, share: float = 0.0) -> str:
+def sentence_on_rows(rows: tuple[int, ...], what: str, share: float = 0.0) -> str:
     """Rows with a property, and its consequence."""
     row_words = f"rows {', '.join(map(str, rows))}"
     if what == "limited":
         return (
-            f"{row_words} are within {share:.0%} of the adhesion limit. They give a lower bound for static friction, "
-            "which does not explain all of their slip"
+            f"{row_words} are within {share:.0%} of the adhesion limit. They give a lower bound for the static "
+            "friction, but sliding does not explain all of their slip"
         )
     if what == "jumps":
-        return f"{row_words}: the calibrated robot's running gear jumps off the ground at times"
-    return f"{row_words}: {what} with the calibrated robot"
+        return f"{row_words}: the running gear of the calibrated robot leaves the ground at times"
+    return f"{row_words}: the calibrated robot has the status {what}"
 
 
 def search_agreement(starts: int, agree: int, elsewhere: int, more: float, open: int) -> str:
     """Agreement of searches from many starts."""
     if starts == 1:
-        return "one search, which did not converge" if open else "one search"
+        return "one search was made, which did not converge" if open else "one search was made"
     if agree == starts:
-        return f"all {starts} starts end at the same optimum"
+        return f"the searches from all {starts} starts end at the same optimum"
     if open == starts:
-        return f"none of {starts} searches converged; the best result is shown"
-    parts = [f"{agree} of {starts} starts end at the best optimum"]
+        return f"none of {starts} searches converged. The best result is shown"
+    parts = [f"{agree} of {starts} searches end at the best optimum"]
     if elsewhere:
-        parts.append(f"{elsewhere} at other optima (the next best has a cost higher by {more:.3g})")
+        parts.append(f"{elsewhere} at other optima (the objective of the next best is higher by {more:.3g})")
     if open:
         parts.append(f"{open} did not converge")
     return ", ".join(parts)
@@ -109,10 +109,10 @@ def search_agreement(starts: int, agree: int, elsewhere: int, more: float, open:
 
 def unsettled_search(names: Names) -> str:
     """A search that ended before it converged."""
-    determined = f"these data do not determine {', '.join(names)}" if names else "the data determine them all"
+    determined = f"These data do not determine {', '.join(names)}" if names else "These data determine all parameters"
     return (
-        "the search ended before it converged: the parameters are the best that it found, their intervals are "
-        f"unreliable, and {determined}"
+        "the search ended before it converged. The parameters are the best that it found, and their intervals are "
+        f"unreliable. {determined}"
     )
 
 
@@ -121,28 +121,28 @@ def unsettled_search(names: Names) -> str:
 
 def search_generations(members: int, generations: int, settled: bool) -> str:
     """Progress of a search."""
-    end = "the last generation brought no significant gain"
+    end = "The last generation improved the best member no further"
     if not settled:
-        end = "the last generation still brought a gain: continue with more --generations"
-    return f"{count_noun(members, 'member')} in {count_noun(generations, 'generation')}; {end}"
+        end = "The last generation still improved the best member, so continue with more --generations"
+    return f"{count_noun(members, 'member')} in {count_noun(generations, 'generation')}. {end}"
 
 
-def lost_rows(members: dict[str, int]) -> str:
+def sentence_on_failing_members(members: dict[str, int]) -> str:
     """Members with a row that is lost."""
     row_outcomes = ", ".join(f"{members[status]} {how}" for status, how in LOST_AS.items() if status in members)
-    return f"members that fail in at least one row: {row_outcomes}; they rank below the others"
+    return f"some members fail in at least one row: {row_outcomes}. They rank below the others"
 
 
-def members_jump(members: int, best: tuple[int, ...]) -> str:
+def sentence_on_jumping_members(members: int, best: tuple[int, ...]) -> str:
     """Members whose running gear jumps."""
     row_words = f"rows {', '.join(map(str, best))}" if best else "none"
     return (
-        f"{members} members jump in at least one row: the weight passes between guides and pulleys so hard that "
-        f"they leave the ground at times; the best member does so in {row_words}"
+        f"{members} members jump in at least one row: the weight moves between guides and pulleys so abruptly that "
+        f"they leave the ground at times. Rows in which the best member does so: {row_words}"
     )
 
 
-def prior_edge(at: fit_notes.ReachedBound) -> str:
+def distance_from_prior(at: fit_notes.ReachedBound) -> str:
     """Bound of a parameter, or its distance from the middle of its prior."""
     if at.bound:
         return f"at its {at.bound} bound"
@@ -152,7 +152,7 @@ def prior_edge(at: fit_notes.ReachedBound) -> str:
 # --- what residuals show --------------------------------------------------------------------------------
 
 
-def shown_by(test: fit_notes.AdequacyFinding) -> str:
+def adequacy_finding_in_words(test: fit_notes.AdequacyFinding) -> str:
     """Result of the most significant test of residuals."""
     whose = f"the residuals of {channels.find_channel(test.channel).label}" if test.channel else ""
     return {
@@ -168,8 +168,8 @@ def shown_by(test: fit_notes.AdequacyFinding) -> str:
 OBSTACLES = {
     "undescribed": "This model does not describe these runs: {large}. Check units, signs, sides, and columns that "
     "vary and are not used, before you use a parameter",
-    "not converged": "No verdict: the search did not converge, so better parameters exist ({every})",
-    "worse": "Not adequate: the fit is worse than the robot file as given ({every})",
+    "not converged": "No verdict: the search did not converge, so there may be better parameters ({every})",
+    "worse": "Not adequate: the fitted robot has larger errors than the robot file as given ({every})",
 }
 
 
@@ -196,21 +196,21 @@ def adequacy_verdict(found: Adequacy) -> str:
     if found.adequate is None or found.p_value is None:
         return (
             "Adequacy cannot be tested: the noise was estimated from the misfit, and "
-            f"{found.degrees_of_freedom:.4g} degrees of freedom are too few to show structure; state the noise "
+            f"{found.degrees_of_freedom:.4g} degrees of freedom are too few to show structure. State the noise "
             "with --noise"
         )
     p = f"p = {found.p_value:.2g}" if found.p_value > 1e-6 else "p < 1e-6"
     if not found.adequate:
-        why = f"{chi2}, {p}" if found.noise_known else f"{p}, the noise estimated from them"
+        why = f"{chi2}, {p}" if found.noise_known else f"{p}, with the noise estimated from the residuals"
         return (
-            f"Not adequate: {shown_by(found.shown_by)} ({why}), so a term is missing and the parameters may "
-            "absorb its effect; run mmrjax loop to find it"
+            f"Not adequate: {adequacy_finding_in_words(found.shown_by)} ({why}), so a term is missing and the "
+            "parameters may absorb its effect. Run mmrjax loop to find it"
         )
     if found.noise_known:
         return f"Adequate: the residuals are consistent with the stated noise ({chi2}, {p})"
     return (
-        f"Adequate as far as can be tested: the residuals show no structure ({p}); the noise was estimated from "
-        "them, so χ² is no test"
+        f"Adequate as far as can be tested: the residuals show no structure ({p}). The noise was estimated from "
+        "them, so χ² cannot test the fit"
     )
 
 
@@ -236,11 +236,11 @@ def calibration_answer(found: CalibrationResult) -> str:
             rows[c.label] = int(is_compared.sum())
             channel_errors.append((c.label, f"{c.label} {before:.1f} → {after:.1f} %"))
     if not channel_errors:
-        return f"{_VERDICTS[found.adequacy.adequate]}; the model reaches no row both before and after the fit."
+        return f"{_VERDICTS[found.adequacy.adequate]}. No row has a prediction both before and after the fit."
     same = len(set(rows.values())) == 1
     errors = ", ".join(text + ("" if same else f" ({rows[label]} rows)") for label, text in channel_errors)
     row_words = f"the same {count_noun(max(rows.values()), 'row')}" if same else "the same rows"
-    return f"{_VERDICTS[found.adequacy.adequate]}; rms error before → after on {row_words}: {errors}."
+    return f"{_VERDICTS[found.adequacy.adequate]}. The rms error before → after on {row_words}: {errors}."
 
 
 #: Levels of a cluster that are listed, the farthest from nothing.
@@ -256,8 +256,8 @@ def residual_cluster(c: ResidualCluster) -> str:
     role = "a column without a role" + (f" (as well by {', '.join(c.alike)})" if c.alike else "")
     if c.correlation is not None:
         return (
-            f"{subject} are correlated with {c.column}{within}{signs} (rank correlation {c.correlation:+.2f}; {p}), "
-            f"{role}: find what changes with it"
+            f"{subject} are correlated with {c.column}{within}{signs} (rank correlation {c.correlation:+.2f}, {p}), "
+            f"{role}. Find what changes with it"
         )
     if c.coarser:
         shares = ", ".join(f"{name} alone {share:.0%} of it" for name, share in c.coarser)
@@ -268,71 +268,72 @@ def residual_cluster(c: ResidualCluster) -> str:
     more = ", ..." if len(mean_levels) < len(c.levels) else ""
     return (
         f"{subject} differ between the levels of {c.column}{within}{signs} (simulated minus measured, by level: "
-        f"{level_words}{more}; {p}), {role}: give each level its own configuration, or find what differs between them"
+        f"{level_words}{more}, {p}), {role}. Give each level its own configuration, or find what differs between them"
     )
 
 
 #: Code of a remark → a sentence with its values, or a function that makes one.
 SAID: dict[str, str | Callable[..., str]] = {
-    "held_by_prior": f"not determined by these runs (posterior sd above {HELD:g} of the prior's): {{names}}",
-    "only_together": only_together,
+    "held_by_prior": f"these runs do not determine {{names}} (posterior sd above {HELD:g} times the prior sd)",
+    "only_together": sentence_on_combinations,
     "far_from_prior": lambda name, sds, kind: FAR[kind].format(name, sds),
-    "noise_off": noise_off,
-    "not_profiled": "no profiles were computed: intervals are from the linearized model, and too symmetric where "
-    "the model is nonlinear",
-    "no_covariance": "the posterior has no finite covariance: the values can be used, the intervals cannot",
-    "no_grip": "every run slides: static friction, and slip below its limit, are known only from their priors",
+    "noise_off": sentence_on_wrong_noise,
+    "not_profiled": "no profiles were computed, so intervals come from the linearized model. They are too symmetric "
+    "where the model is nonlinear",
+    "no_covariance": "the posterior has no finite covariance. The values can be used, but not the intervals",
+    "no_grip": "every run slides, so static friction and the slip below its limit are known only from their priors",
     "estimated_noise": estimated_noise,
     "beside_steady": "{inside} of {total} parameters agree with the optimum of the steady model within their 95 "
-    "% intervals; the largest difference is {sds:.2f} sd, for {furthest}",
-    "of_rows": of_rows,
+    "% intervals. The largest difference is {sds:.2f} sd ({furthest})",
+    "of_rows": sentence_on_rows,
     "at_bound": "{name} is at its {side} bound",
     "after_steps": lambda channel, share, rows, total: (
         f"{share:.0%} of the squared error of {channels.find_channel(channel).label} lies in the first sample "
-        f"after each step ({rows} of {total} rows; without them the rms error falls to "
-        f"{100 * (1 - share) ** 0.5:.0f} % of its value). The readings may be offset in time from the command; "
-        'set [rig] delay = "0 ± 0.02" [s] (it may be negative), and calibrate fits it'
+        f"after each step of the command ({rows} of {total} rows). Without these rows, the rms error falls to "
+        f"{100 * (1 - share) ** 0.5:.0f} % of its value. The readings may be offset in time from the command. "
+        'To fit the offset, set [rig] delay = "0 ± 0.02" [s] (it may be negative)'
     ),
     "freed_delay": lambda channel, share: (
         f"without a delay, {share:.0%} of the squared error of {channels.find_channel(channel).label} lies in the "
-        "first sample after each step; rig.delay is therefore fitted, unless the file has [rig] delay = '0 ± 0'"
+        "first sample after each step of the command. The fit therefore includes rig.delay. To leave it out, set "
+        "[rig] delay = '0 ± 0'"
     ),
     "shifted": lambda channel, share, shift: (
         f"{share:.0%} of the squared error of {channels.find_channel(channel).label} is explained by readings "
-        f'that are {abs(1e3 * shift):.2g} ms {"late" if shift > 0 else "early"}: set [rig] delay = "{shift:.2g} '
-        f'± {max(abs(shift), 0.005):.2g}" [s], and calibrate fits it'
+        f"that are {abs(1e3 * shift):.2g} ms {'late' if shift > 0 else 'early'}. To fit this delay, set [rig] delay "
+        "= "
+        f'"{shift:.2g} ± {max(abs(shift), 0.005):.2g}" [s]'
     ),
     "product_alone": lambda friction, share, free: (
-        f"the readings depend only on the product {friction} x {share}; its two factors are known only from their "
+        f"the readings depend only on the product {friction} x {share}. Its two factors are known only from their "
         "priors"
         if free
         else f"{share} is fitted with {friction} fixed, because the readings depend only on their product"
     ),
-    "prior_of_product": "{name}: its prior, {mean:.3g} ± {sd:.2g}, is the prior of its product with the guide "
-    "share in the other fidelities; in the track model the guides carry {share:.0%} of the "
-    "weight",
+    "prior_of_product": "{name} has the prior {mean:.3g} ± {sd:.2g}, which the other fidelities use for its product "
+    "with the guide share. In the track model the guides carry {share:.0%} of the weight",
     "no_prediction": lambda kind, rows, total: (
-        f"held out by {blocks.kind_in_words(kind)}: {rows} of {total} rows have no prediction, because the robot "
-        "fitted without them slides in them; the errors exclude these rows"
+        f"blocks by {blocks.kind_in_words(kind)}: {rows} of {total} held-out rows have no prediction, because the "
+        "robot fitted to the other blocks slides in them. The errors exclude these rows"
     ),
     "same_predictions": lambda kind, others: (
-        f"held out by {' or by '.join(blocks.kind_in_words(k) for k in others)}: the same predictions as held out "
-        f"by {blocks.kind_in_words(kind)}, so shown once; these runs do not vary them separately"
+        f"blocks by {' or by '.join(blocks.kind_in_words(k) for k in others)} are the same as blocks by "
+        f"{blocks.kind_in_words(kind)}, because these runs do not vary them separately. Their errors are shown once"
     ),
-    "block_not_converged": "a search with one block of {kind} left out did not converge",
+    "block_not_converged": "the search with one block of {kind} left out did not converge",
     "agreement": search_agreement,
     "unsettled": unsettled_search,
     "elsewhere": "{searches} of {total} searches converged at other values of {names}",
-    "in_pieces": "{name}: its 95 % interval consists of {pieces} parts, with worse values between them; readings "
-    "at more closely spaced conditions would tell the parts apart",
+    "in_pieces": "{name} has a 95 % interval of {pieces} separate parts. Readings at more closely spaced conditions "
+    "would show which part is right",
     "generations": search_generations,
-    "lost_rows": lost_rows,
-    "members_jump": members_jump,
+    "lost_rows": sentence_on_failing_members,
+    "members_jump": sentence_on_jumping_members,
     "ended_at_edge": lambda edge: (
         "the search ended at the edge of the allowed range: its best member has "
-        + ", ".join(f"{name} {prior_edge(at)}" for name, at in edge.items())
+        + ", ".join(f"{name} {distance_from_prior(at)}" for name, at in edge.items())
     ),
-    "read_from_members": "derivatives of the run with respect to {names} disagree with finite differences "
-    "(contacts open and close). The determined parameters therefore come from a regression "
-    "over the members near the best, with residuals of {left:.2g} sd rms",
+    "read_from_members": "derivatives of the run with respect to {names} disagree with finite differences, because "
+    "contacts open and close. The combinations that the data determine therefore come from a regression "
+    "over the members near the best one, with residuals of {left:.2g} sd rms",
 }

@@ -56,10 +56,10 @@ def verdict_sentences(said: loop_notes.VerdictSummary) -> str:
         share = 100 * said.aside / said.of
         text = f"{said.aside} of {said.of} rows ({share:.0f} %) are outliers and are set aside. {text}"
     if said.noise:
-        text = f"{text} But {'; '.join(map(describe, said.noise))}"
+        text = f"{text} But {'. '.join(map(describe, said.noise))}"
     if said.cluster is not None:
         text = (
-            f"{text} {cluster_sentence(said.cluster).capitalize()}: that is a finding, so all of these rows are kept."
+            f"{text} {cluster_sentence(said.cluster).capitalize()}. This is a finding, so all of these rows are kept."
         )
     return text
 
@@ -84,14 +84,14 @@ def _verdict(said: loop_notes.VerdictSummary) -> str:
         elif said.nearest:
             one = len(said.nearest) == 1
             text += f" The nearest {'candidate is' if one else 'candidates are'} {' and '.join(said.nearest)}, but "
-            text += f"{'it is' if one else 'they are'} not supported by the tests."
+            text += f"the tests do not support {'it' if one else 'them'}."
         return text
     names = [_effect_and_rivals(one) for one in said.missing if one.established]
     in_model = _tentative([one for one in said.missing if not one.established], said.support)
     place_sentence = (
-        "" if location is None else f" An unexplained error remains in the {bases.place_in_words(location.place)}."
+        "" if location is None else f" The {bases.place_in_words(location.place)} still has an unexplained error."
     )
-    return f"Missing: {'; '.join(names)} ({_evidence(said)}).{in_model}{place_sentence}"
+    return f"Missing: {' and '.join(names)} ({_evidence(said)}).{in_model}{place_sentence}"
 
 
 def _evidence(said: loop_notes.VerdictSummary) -> str:
@@ -130,9 +130,9 @@ def loop_answer(found: loop_notes.Headline) -> str:
 
 
 def _law(names: Sequence[str], families: Sequence[str], values: Sequence[loop_notes.AlternativeValue]) -> str:
-    """`a loss torque that changes with speed (churning or windage; these data cannot tell which)`."""
+    """`a loss torque that changes with speed (churning or windage, which these data cannot distinguish)`."""
     terms = [*map(freed_value, values), *in_order_of_parts(names)]
-    ambiguity = "; these data cannot tell which" if len(terms) + len(families) > 2 else ""
+    ambiguity = ", which these data cannot distinguish" if len(terms) + len(families) > 2 else ""
     return f"{' or '.join(map(with_article, families))} ({' or '.join(terms)}{ambiguity})"
 
 
@@ -167,15 +167,15 @@ def _undescribed(said: loop_notes.VerdictSummary) -> str:
             "This model does not describe these runs: it lacks backlash. No effect is named until backlash is added."
         )
     return (
-        f"This model does not describe these runs: refitted, it misses {', '.join(place_words)}. No effect is named. "
-        f"Check first: {'; '.join(check)}."
+        f"This model does not describe these runs: even after the refit, it misses {', '.join(place_words)}. No "
+        f"effect is named. Check first: {', and '.join(check)}."
     )
 
 
 def _mechanism(found: loop_notes.Mechanism, within: str) -> str:
     """A mechanism with its evidence."""
     names = " or ".join(map(with_article, found.families))
-    return f"{names}{within}, established as a mechanism: it {mechanism_evidence(found)}"
+    return f"{names}{within}, established as a mechanism. It {mechanism_evidence(found)}"
 
 
 def mechanism_evidence(found: loop_notes.Mechanism) -> str:
@@ -221,7 +221,7 @@ def proposed_formula(d: UnnamedDiscrepancy) -> str:
     if d.proposal.expression:
         return f"{d.proposal.expression} ({d.proposal.mark})"
     course = curve_course(d)
-    return f"The curve {course}; {NO_FORMULA}" if course else NO_FORMULA
+    return f"The curve {course}. {NO_FORMULA}" if course else NO_FORMULA
 
 
 #: Units in which people set the variables of a curve, and their SI values.
@@ -251,10 +251,11 @@ def at_other_noise(found: Sequence[NoiseVerdict]) -> str:
     for one in found:
         same.setdefault(brief_verdict(one.summary), []).append(f"{one.factor:g}")
     answers = [
-        f"with {' and with '.join(factors)} times the noise the verdict is {words}" for words, factors in same.items()
+        f"with {' and with '.join(factors)} times the noise, the verdict is {words}"
+        for words, factors in same.items()
     ]
     near = " (after a few steps from the fits with the stated noise)" if any(one.near for one in found) else ""
-    return "; ".join(answers) + near
+    return ", and ".join(answers) + near
 
 
 def _effect_and_rivals(one: loop_notes.MissingEffect) -> str:
@@ -266,7 +267,7 @@ def _effect_and_rivals(one: loop_notes.MissingEffect) -> str:
     names = ", ".join(in_order_of_parts(one.names))
     names_words = names if len(one.names) == 1 else f"one of {names}"
     values = [freed_value(v) for v in one.values]
-    return f"{family}{', or '.join([names_words, *values, *readings])} (these data cannot tell which)"
+    return f"{family}{', or '.join([names_words, *values, *readings])} (these data cannot distinguish them)"
 
 
 def _tentative(those: Sequence[loop_notes.MissingEffect], support: loop_notes.NameSupport | None) -> str:
@@ -301,15 +302,15 @@ def ranking_lines(found: EffectRanking, most: int = 5, brief: bool = False) -> l
     first = f"{method_words}, not yet confirmed: something is missing (family-wise p {p_value(found.p_value)})"
     beyond = [e for e in found.effects if e.score > found.chance and not e.supplies][:most]
     if not beyond:
-        return [f"{first}; no effect explains more than chance would"]
+        return [f"{first}. No effect explains more than chance would"]
     if brief:
-        return [f"{first}; strongest alone: {', '.join(e.name for e in beyond)}"]
+        return [f"{first}. Strongest alone: {', '.join(e.name for e in beyond)}"]
     lines = [
         f"  {k}. {e.name}, {with_article(e.family)}: lowers the misfit by {three_digits(e.score)} σ², "
         f"amplitude {e.amplitude:.3g} ± {e.sd:.2g} {e.unit}".rstrip(" -")
         for k, e in enumerate(beyond, 1)
     ]
-    return [f"{first}; strongest effects, each added alone:", *lines]
+    return [f"{first}. Strongest effects, each added alone:", *lines]
 
 
 def regression_verdict(found: EffectRanking) -> str:
@@ -320,22 +321,22 @@ def regression_verdict(found: EffectRanking) -> str:
     lacks = f"{families} ({' or '.join(e.name for e in alike)})" if alike else "but no effect explains it"
     lacks = f"something is missing, {lacks}" if found.missing else "no effect of the library exceeds chance"
     numbers = ", ".join(f"{name} {value:.4g} ± {sd:.2g}" for name, (value, sd) in found.parameters.items())
-    numbers = f"; parameters [SI]: {numbers}" if numbers else ""
+    numbers = f". Parameters [SI]: {numbers}" if numbers else ""
     return f"regression only, not confirmed by simulation: {lacks}{numbers}"
 
 
 #: Remark beside a regression that sees nothing, where the simulation does.
 DISAGREES = (
     "simulation disagrees: the refitted model leaves more error than chance would, so something is "
-    "missing; trust the simulation"
+    "missing. Trust the simulation"
 )
 
 
-def so_far(effects: Sequence[str], families: Sequence[str]) -> str:
+def search_progress(effects: Sequence[str], families: Sequence[str]) -> str:
     """Findings of a search before its verdict is known."""
     return (
-        f"so far, confirmed by simulation: {' and '.join(with_article(f) for f in dict.fromkeys(families))} "
-        f"({' and '.join(effects)}); not yet tested further"
+        f"so far, simulation confirms {' and '.join(with_article(f) for f in dict.fromkeys(families))} "
+        f"({' and '.join(effects)}). Further tests are still to come"
     )
 
 
@@ -344,15 +345,20 @@ def _without_name(where: DiscrepancyLocation, evidence: str, no_effect: str) -> 
     also = f" (or {', '.join(others)}, which these data do not distinguish)" if others else ""
     family_words = f": {where.family}" if where.variable in bases.VARIABLES else ""
     return (
-        f"Something is missing in the {bases.place_in_words(where.place)}{also}, {_shown(where)}{family_words}; no "
+        f"Something is missing in the {bases.place_in_words(where.place)}{also}, {_shown(where)}{family_words}. No "
         f"effect of the library {no_effect} ({evidence})."
     )
 
 
 def _shown(where: DiscrepancyLocation) -> str:
     """Variable that shows a discrepancy, and equally significant others."""
-    well = [shown_over(v, where.by_duty).removeprefix("best shown ") for v in where.variables_alike]
-    return shown_over(where.variable, where.by_duty) + (f" (as well {', '.join(well)})" if well else "")
+    well = [
+        variable_showing_discrepancy(v, where.by_duty).removeprefix("clearest when plotted ")
+        for v in where.variables_alike
+    ]
+    return variable_showing_discrepancy(where.variable, where.by_duty) + (
+        f" (equally clear {', '.join(well)})" if well else ""
+    )
 
 
 def _window_words(where: DiscrepancyLocation) -> str:
@@ -360,7 +366,7 @@ def _window_words(where: DiscrepancyLocation) -> str:
     return "" if bases.window_from_name(where.variable) is None else f", {_shown(where)}"
 
 
-def shown_over(variable: str, by_duty: bool = False) -> str:
+def variable_showing_discrepancy(variable: str, by_duty: bool = False) -> str:
     """Variable that shows a discrepancy. `by_duty`: only the duty changed the motors' voltage."""
     variable = "duty" if by_duty and variable == "voltage" else variable
     happens = bases.window_from_name(variable)
@@ -368,7 +374,7 @@ def shown_over(variable: str, by_duty: bool = False) -> str:
         return "different on the two sides"
     if happens is None:
         return (
-            f"clearest when plotted over {variable.replace('_', ' ')}"
+            f"clearest when plotted over {bases.variable_in_words(variable)}"
             if variable != "order"
             else "drifting from run to run"
         )
@@ -406,14 +412,14 @@ def is_established(found: DiscoveryResult, effect: FoundEffect) -> bool:
     return found.support is None or found.support.established(effect.name)
 
 
-def how_sure(found: DiscoveryResult, effect: FoundEffect) -> str:
+def standing_of_effect(found: DiscoveryResult, effect: FoundEffect) -> str:
     """Standing of an effect, with its score and the threshold of chance."""
     test = None if found.support is None else found.support.test_of(effect.name)
     if is_established(found, effect):
-        evidence = "" if test is None else f": {test.root:.1f} σ (chance: {test.needed:.1f})"
+        evidence = "" if test is None else f": {test.root:.1f} σ (chance alone reaches {test.needed:.1f} σ)"
         if test is not None and test.shows_form:
-            variable = test.over.replace("_", " ")
-            evidence += f"; its size varies by ±{100 * test.spread:.0f} % over {variable}"
+            variable = bases.variable_in_words(test.over)
+            evidence += f", and its size varies by ±{100 * test.spread:.0f} % over {variable}"
         return f"established{evidence}"
     return f"tentative: it improves predictions, but {effect_doubts(test)}" if effect_doubts(test) else "tentative"
 
@@ -428,7 +434,7 @@ def brief_answer(found: DiscoveryResult, moved: Sequence[str], next_step: str) -
     added = [
         f"{e.name} {effect_amplitude(e)}" + " (tentative)" * (not is_established(found, e)) for e in found.effects
     ]
-    changes = f"Moved: {'; '.join(moved)}. " * bool(moved) + f"Added: {', '.join(added)}." * bool(added)
+    changes = f"Changed: {', and '.join(moved)}. " * bool(moved) + f"Added: {', '.join(added)}." * bool(added)
     stated_errors, fitted = found.errors_as_stated, found.errors[0 if found.refit_alone else 1]
     errors = [
         f"{channels.find_channel(c).label} {percent_text(stated_errors[c])} → {percent_text(e)} %"
@@ -441,7 +447,7 @@ def brief_answer(found: DiscoveryResult, moved: Sequence[str], next_step: str) -
     rows = f"{int(found.included.sum())} of {total} rows are used{aside}{few}"
     return (
         *filter(None, [changes.rstrip()]),
-        f"rms error, robot file as given → after the loop: {', '.join(errors)}; {rows}.",
+        f"rms error, robot file as given → after the loop: {', '.join(errors)}. {rows}.",
         f"Next: {next_step}",
     )
 
@@ -454,7 +460,7 @@ def percent_text(error: Mapping[str, float | int]) -> str:
     return f"{percent:.1f}" if percent == 0 or percent >= 0.095 else f"{percent:.1g}"
 
 
-def use_it(found: DiscoveryResult) -> list[str]:
+def errors_of_written_robot(found: DiscoveryResult) -> list[str]:
     """Errors of the written robot on fitted and on held-out rows, by kind of block."""
     when = 1 if found.written else 0
     lines = [f"Within these conditions: {_rms(found.errors[when], len(found.runs))}."] * bool(found.errors[when])
@@ -548,13 +554,13 @@ def naming_reasons(found: DiscoveryResult) -> str:
 
 def _score_words(test: loop_notes.NameTest) -> str:
     """Score of an effect, with the threshold of chance and the score without its strongest row."""
-    less = "" if test.row is None else f", without {test.what} {test.row} {test.root_without:.1f}"
-    return f"{test.effect} {test.root:.1f} σ (chance {test.needed:.1f}{less})"
+    less = "" if test.row is None else f", and {test.root_without:.1f} σ remain without {test.what} {test.row}"
+    return f"{test.effect} scores {test.root:.1f} σ (chance alone reaches {test.needed:.1f} σ{less})"
 
 
 #: Evidence against a single effect: short, and in words.
 DOUBTS = {
-    "chance": ("chance", "explains {0.root:.1f} σ{beside}; chance alone reaches {0.needed:.1f}"),
+    "chance": ("chance", "explains {0.root:.1f} σ{beside}, where chance alone reaches {0.needed:.1f} σ"),
     "curve": ("a curve", "is a worse explanation than a smooth curve in its place"),
     "row": ("{0.what} {0.rests_on}", "depends on {0.what} {0.rests_on} alone"),
     "blocks": ("blocks", "is chosen again in only {again:.0f} % of the fits with one block left out"),
@@ -577,7 +583,7 @@ def effect_doubts(test: loop_notes.NameTest | None) -> str:
         "beside": curve_words and f" next to smooth curves ({curve_words})",
         "larger": " and ".join(test.larger),
     }
-    doubts |= {"over_variable": test.over.replace("_", " ")}
+    doubts |= {"over_variable": bases.variable_in_words(test.over)}
     doubts["spread"] = f" by ±{100 * test.spread:.0f} %" if math.isfinite(test.spread) else ""
     *first, last = [DOUBTS[d][1].format(test, **doubts, again=100 * test.again) for d in test.fails]
     return f"{', '.join(first)} and {last}" if first else last
@@ -585,13 +591,13 @@ def effect_doubts(test: loop_notes.NameTest | None) -> str:
 
 def _curve(c: loop_notes.PlacedCurve) -> str:
     if bases.window_from_name(c.variables[0]) is not None:
-        return f"constant in the {bases.place_in_words(c.place)} {shown_over(c.variables[0])}"
+        return f"constant in the {bases.place_in_words(c.place)} {variable_showing_discrepancy(c.variables[0])}"
     return f"smooth {'curve' if len(c.variables) == 1 else 'surface'} in the {_place_over(c.place, *c.variables)}"
 
 
 def _place_over(place: str, *variables: str) -> str:
-    """`slip balance over speed motor and slope`."""
-    return f"{bases.place_in_words(place)} over {' and '.join(v.replace('_', ' ') for v in variables)}"
+    """`slip balance over motor speed and slope`."""
+    return f"{bases.place_in_words(place)} over {' and '.join(map(bases.variable_in_words, variables))}"
 
 
 def support_sentence(found: DiscoveryResult) -> str:
@@ -620,7 +626,7 @@ def tentative_reason(found: DiscoveryResult, effect: FoundEffect) -> str:
 #: Reasons why an effect is not plausible.
 RULED_OUT = {
     "power": "{0.name} would supply power instead of losing it",
-    "size": "{0.name} at {0.size:.2g} times its largest plausible size; check {check}",
+    "size": "{0.name} would have {0.size:.2g} times its largest plausible size, so check {check}",
     "edge": "{0.name} is within one sd of its largest plausible size",
 }
 
@@ -630,7 +636,7 @@ def why_ruled_out(reasons: Sequence[loop_notes.RuledOut]) -> str:
     return "; ".join(RULED_OUT[r.why].format(r, check=" and ".join(r.check)) for r in reasons)
 
 
-def ruled_out(found: DiscoveryResult) -> str:
+def sentence_on_ruled_out_effects(found: DiscoveryResult) -> str:
     """Effects that explain the data at least as well but are ruled out by size or sign, empty for none."""
     candidates, same = found.implausible, found.settings.same
     if found.verdict not in WITHOUT_NAME:
@@ -660,7 +666,7 @@ def hidden_effects_sentence(found: DiscoveryResult) -> str:
         + (f" ({h.experiment} would show it)" if h.experiment else "")
         for h in found.hidden
     ]
-    return f"These data could hide, in addition: {', '.join(effect_words)}."
+    return f"These data could also hide {', '.join(effect_words)}."
 
 
 def moved_parameter(name: str, value: float, stated: float, unit: str, shift: float) -> str:
@@ -716,7 +722,7 @@ def rising_errors_sentence(found: Sequence[WorseChannel], predicted: Mapping[str
             changes.append(f"{count_noun(before - after, 'row')} can no longer be predicted")
         if changes:
             parts.append(f"by {blocks.kind_in_words(kind)} {', '.join(changes)}")
-    return f"Predictions of held-out rows get worse: {'; '.join(parts)}." if parts else ""
+    return f"Predictions of held-out rows get worse: {', and '.join(parts)}." if parts else ""
 
 
 def _two_numbers(before: float, after: float) -> str:
@@ -731,7 +737,7 @@ def _two_numbers(before: float, after: float) -> str:
 def track_model_question(about: loop_notes.TrackModelQuestion) -> str:
     """Question to the track model."""
     return {
-        "missing": f"the error of the {about.balance} balance over {about.variable.replace('_', ' ')}",
+        "missing": f"the error of the {about.balance} balance over {bases.variable_in_words(about.variable)}",
         "found": f"{', '.join(about.effects)}, found by the lumped model",
         "near": f"{', '.join(about.effects)}, which explains the readings nearly as well",
     }[about.why]
@@ -744,26 +750,26 @@ def track_model_answer(found: TrackModelResult) -> str:
         f"{name.removeprefix('running_gear.')} {_estimate(e)}"
         for name, e in found.constants.items() if name.startswith("running_gear.")
     )  # fmt: skip
-    on = "" if found.settled else ("; the search has not converged: continue with --members and more --generations")
+    on = "" if found.settled else (". The search has not converged: continue with --members and more --generations")
     slip = f"rms slip error of the {found.rows} rows on tracks {before:.2g} → {after:.2g} percentage points"
     if not found.gear_explains_discrepancy:
-        why = f"; outside their priors: {', '.join(found.outside)}" if found.outside else ""
+        why = f". Outside their priors: {', '.join(found.outside)}" if found.outside else ""
         return (
             f"Track model, {track_model_question(found.asked)}: no running gear within its priors was found that "
             f"explains this error ({slip}, χ² falls by {found.fall:.0f}, p = {found.p:.2g}{why}){on}"
         )
     constants_count = len(found.constants) - len(found.known_from_rows)
-    undetermined = f"not determined by these rows: {constants_count} of {len(found.constants)} constants"
+    undetermined = f"These rows do not determine {constants_count} of {len(found.constants)} constants"
     return (
         f"Track model, {track_model_question(found.asked)}: a running gear within its priors explains this error "
-        f"({slip}, χ² falls by {found.fall:.0f}, p = {found.p:.2g}): {gear}; {undetermined}{on}"
+        f"({slip}, χ² falls by {found.fall:.0f}, p = {found.p:.2g}): {gear}. {undetermined}{on}"
     )
 
 
 # --- remarks --------------------------------------------------------------------------------------------
 
 
-def in_parts(noise: SeriesNoise) -> str:
+def noise_in_words(noise: SeriesNoise) -> str:
     """An estimated sd: `0.055 A and 1.3 % of the reading`."""
     parts = [
         f"{noise.floor / noise.channel.factor:.2g} {noise.channel.unit}" if noise.floor or not noise.share else "",
@@ -776,12 +782,12 @@ def in_parts(noise: SeriesNoise) -> str:
 
 def noise_from_series(noise: tuple[SeriesNoise, ...]) -> str:
     """Channels whose sds are estimated along series."""
-    parts = [f"{s.channel.label} {in_parts(s)}" for s in noise]
+    parts = [f"{s.channel.label} {noise_in_words(s)}" for s in noise]
     along = dict.fromkeys(f"{s.count} series of {s.axis}" for s in noise)
     freedom = min(s.freedom for s in noise)
     return (
-        f"no sd is stated for {', '.join(s.channel.name for s in noise)}: {', '.join(parts)} are estimated "
-        f"from the scatter along {' and '.join(along)} ({freedom:.1f} degrees of freedom); state yours with --noise"
+        f"the noise of {', '.join(s.channel.name for s in noise)} is not given: {', '.join(parts)} are estimated "
+        f"from the scatter along {' and '.join(along)} ({freedom:.1f} degrees of freedom). Set yours with --noise"
     )
 
 
@@ -792,11 +798,11 @@ def copied_rows(rows: tuple[int, ...]) -> str:
     return f"rows {', '.join(map(str, rows))} are exact copies of earlier ones and count once"
 
 
-def kept_out(rows: tuple[int, ...], why: str) -> str:
+def sentence_on_unused_rows(rows: tuple[int, ...], why: str) -> str:
     """Rows that do not count."""
     reasons = {
         "unusable": "are not used, because the fitted model slides or fails in them",
-        "outliers": "are outliers that no effect explains; they are left out",
+        "outliers": "are outliers that no effect explains. They are left out",
     }
     return f"rows {', '.join(map(str, rows))} {reasons[why]}"
 
@@ -805,8 +811,8 @@ def imposed_delay(delay: float, sd: float) -> str:
     """Delay of the imposed quantity, and the line for the rig's file."""
     when = "later" if delay > 0 else "earlier"
     return (
-        f"the imposed quantity acts {1e3 * abs(delay):.3g} ± {1e3 * sd:.2g} ms {when} than its column says, and "
-        f'the rig file gives no delay; set [rig] delay = "{delay:.3g} ± {sd:.2g}" to start the fit from that value'
+        f"the imposed quantity acts {1e3 * abs(delay):.3g} ± {1e3 * sd:.2g} ms {when} than its column states, and "
+        f'the rig file gives no delay. To start the fit from this delay, set [rig] delay = "{delay:.3g} ± {sd:.2g}"'
     )
 
 
@@ -829,22 +835,22 @@ def leader_choice(
     }
     error_words = ", ".join(f"{n} {x:.2f} σ" for n, x in zip(names, rms_sigma, strict=True))
     sentence = (
-        f"{names[leader]} is listed first in its class because of {criteria[by]}; held-out errors: {error_words}"
+        f"{names[leader]} is listed first in its class because of {criteria[by]}. Held-out errors: {error_words}"
     )
     if prefer == HELD_OUT and leader != closest:
-        sentence += f"; the fit to all rows prefers {names[closest]}, by Δχ² {rise_chi2:.1f}"
+        sentence += f". The fit to all rows prefers {names[closest]}, by Δχ² {rise_chi2:.1f}"
     if leader != best:
         prefers_held_out = prefer == HELD_OUT
         why = (
-            "is not as adequate"
+            "describes the data less adequately"
             if prefers_held_out
             else (f"would come first with --prefer {HELD_OUT}, where it is adequate")
         )
-        sentence += f"; {names[best]} {why}"
+        sentence += f". {names[best]} {why}"
     return sentence
 
 
-def rests_on(
+def sentence_on_single_run(
     test: loop_notes.NameTest,
     conditions: Mapping[str, str | float] = MappingProxyType({}),
     axis: str = "",
@@ -854,13 +860,13 @@ def rests_on(
     place_words = _conditions(conditions)
     run = f"{test.what} {test.rests_on}{f' ({place_words})' * bool(place_words)}"
     others = (
-        f"run it at {axis} {' and '.join(f'{x:g}' for x in beside)} too"
+        f"add runs at {axis} {' and '.join(f'{x:g}' for x in beside)}"
         if beside
-        else "runs at conditions on either side of it"
+        else "add runs at conditions on either side of it"
     )
     return (
         f"{test.effect} depends on {test.what} {test.rests_on} alone ({test.root:.1f} σ with it, "
-        f"{test.root_without:.1f} σ without): repeat {run}, and {others}"
+        f"{test.root_without:.1f} σ without). Repeat {run}, and {others}"
     )
 
 
@@ -876,34 +882,34 @@ def unwritten_reason(curve: bool, gain: float, se: float) -> str:
 
 #: Code of a remark → a sentence with its values, or a function that makes one.
 SAID: dict[str, str | Callable[..., str]] = {
-    "assumed_noise": "no sd is stated for {channels}: {usual} is assumed; state yours with --noise",
+    "assumed_noise": "the noise of {channels} is not given, so {usual} is assumed. Set yours with --noise",
     "noise_from_series": noise_from_series,
     "refit_worse": "{channel}: the refit made its error larger ({stated:.0%} of the measured rms with the robot file "
-    "as given, {refit:.0%} after the refit). The {word} noise gives some of its readings too much weight; state the "
+    "as given, {refit:.0%} after the refit). The {word} noise gives some of its readings too much weight. State the "
     "instrument's noise with --noise",
     "copies": copied_rows,
-    "kept_out": kept_out,
-    "phases_differ": "the phase of the wave differs between runs (it explains {free:.0f} σ² with a free phase in "
-    "each run, {held:.0f} with a common phase), so robot.toml contains the mean phase; start every run "
+    "kept_out": sentence_on_unused_rows,
+    "phases_differ": "the phase of the wave differs between runs, so robot.toml contains the mean phase. The wave "
+    "explains {free:.0f} σ² with a free phase in each run, and {held:.0f} σ² with a common phase. Start every run "
     "with the shaft at a mark",
     "still_lacks": lambda place, variable: (
-        f"not everything is explained: an error in the {bases.place_in_words(place)} that varies with "
-        f"{variable.replace('_', ' ')} remains"
+        f"the {bases.place_in_words(place)} still has an unexplained error, which varies with the "
+        f"{bases.variable_in_words(variable)}"
     ),
     "late": imposed_delay,
     "led": leader_choice,
     "not_predictable": lambda kinds: (
-        f"blocks by {' and by '.join(blocks.kind_in_words(kind) for kind in kinds)} that contain all runs of a "
-        "configuration with its own parameters are neither scored nor tested, because the other runs cannot predict "
-        "them"
+        f"some blocks by {' and by '.join(blocks.kind_in_words(kind) for kind in kinds)} contain all runs of a "
+        "configuration with its own parameters. The other runs cannot predict these blocks, so they are neither "
+        "scored nor tested"
     ),
-    "lost_replicates": "only {settled} of {asked} bootstrap tables could be refitted; the thresholds come from these",
+    "lost_replicates": "only {settled} of {asked} bootstrap tables could be refitted. The thresholds use only these",
     "outstanding": lambda factors, word: (
-        f"out of time: whether the verdict is the same with {' and '.join(f'{f:g}' for f in factors)} times the "
-        f"{word} noise is not known; run the same command without --within"
+        f"the time ended before the verdict was tested with {' and '.join(f'{f:g}' for f in factors)} times the "
+        f"{word} noise. To test it, run the same command without --within"
     ),
-    "too_few_replicates": "{settled} bootstrap tables are too few to use every kind of evidence; use 500 or more "
+    "too_few_replicates": "{settled} bootstrap tables are too few for some kinds of evidence. Use 500 or more "
     "(--replicates)",
-    "rests_on": rests_on,
+    "rests_on": sentence_on_single_run,
     "unwritten": unwritten_reason,
 }

@@ -71,7 +71,7 @@ def points_studied(found: SensitivityResult) -> str:
         return f"At {fewest} to {total} of {total} operating points, by output (others are left out, because {why})"
     (studied,) = parts.values()
     labels = [o.row.label for o in found.outputs.values() if o.studied.all()]
-    rest = f"; all {total} for {', '.join(labels)}" if labels else ""
+    rest = f", but all {total} for {', '.join(labels)}" if labels else ""
     return (
         f"At {fewest} of {total} operating points ({_in_words(found.points, ~studied)} left out, because {why}{rest})"
     )
@@ -105,6 +105,6 @@ SAID: dict[str, str | Callable[..., str]] = {
         f"at {points} operating points up to {100 * share:.1f} % of the sample is left out, since these robots do "
         f"not travel there ({', '.join(outputs)}). The indices describe the others"
     ),
-    "inert": "not sampled, because every output has zero derivative with respect to them: {inputs}",
-    "tied": "scaled with another input, whose share includes theirs: {inputs}",
+    "inert": "these inputs are not sampled, because every output has zero derivative with respect to them: {inputs}",
+    "tied": "these inputs are scaled with another input, whose share includes theirs: {inputs}",
 }

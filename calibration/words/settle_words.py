@@ -16,10 +16,10 @@ WHY = {
     "short": ("the level is held too briefly", "hold it longer, or set a smaller --shortest"),
     "settling": ("still changes at the end of its level", "hold the level longer, or set a larger --drift"),
     "accelerates": ("still accelerates at the end of its level", "hold the level longer, or set a larger --drift"),
-    "idle": ("nothing drives the motors", "nothing: settled runs need a driven motor"),
-    "rest": ("the drive does not move", "nothing: friction holds the drive; a fit to the log uses these samples"),
+    "idle": ("nothing drives the motors", "nothing, as settled runs need a driven motor"),
+    "rest": ("the drive does not move", "nothing, as friction holds the drive. A fit to the log uses these samples"),
     "stuck": (
-        "shows the same number for a long time: saturated or frozen",
+        "shows the same number for a long time, so it is saturated or frozen",
         "repair the instrument or change its range",
     ),
     "glitches": (
@@ -27,7 +27,7 @@ WHY = {
         "repair the instrument, or log its mean if it delivers pulses",
     ),
     "unread": ("no channel has enough readings", "log more readings, or remove the rows without them"),
-    "undriven": ("the driver brakes or coasts", "nothing: a fit to the log uses these samples"),
+    "undriven": ("the driver brakes or coasts", "nothing, as a fit to the log uses these samples"),
 }
 
 
@@ -37,7 +37,7 @@ def left_out_reason(stretch: Stretch) -> str:
     return reason + (f" ({100 * stretch.size:.2g} %)" if stretch.size else "")
 
 
-def left_out(stretches: Iterable[Stretch], few: bool = False) -> list[tuple[str, int, int, str, str]]:
+def omitted_stretches(stretches: Iterable[Stretch], few: bool = False) -> list[tuple[str, int, int, str, str]]:
     """Reasons, each with its stretches, samples, rows of the longest one, and what to do.
 
     Args:
@@ -49,7 +49,7 @@ def left_out(stretches: Iterable[Stretch], few: bool = False) -> list[tuple[str,
         stretches_of_reason = [s for s in omitted if s.why == why]
         longest = max(stretches_of_reason, key=lambda s: len(s.rows))
         rows = f"{longest.rows[0] + 1}-{longest.rows[-1] + 1}"
-        cure = "nothing: a fit to the log uses these samples" if few and why in OF_LEVELS else WHY[why][1]
+        cure = "nothing, as a fit to the log uses these samples" if few and why in OF_LEVELS else WHY[why][1]
         causes.append(
             (
                 left_out_reason(longest),
@@ -82,7 +82,7 @@ def levels_and_samples(found: Settled) -> str:
     )
 
 
-def too_few(found: Settled, fewest: int, loop: str) -> str:
+def sentence_on_few_settled_runs(found: Settled, fewest: int, loop: str) -> str:
     """Sentence for a log with too few settled runs: fit the log itself, empty where it has enough.
 
     Args:
@@ -113,8 +113,8 @@ def glitch_sentences(found: Settled) -> list[str]:
             sentences.append(
                 f"{channel.column}: {count_noun(sum(counts), 'reading')} in "
                 f"{count_noun(len(glitch_stretches), 'settled run')} left out of the mean, because they are far from "
-                f"the readings next to them; most are in rows {worst.rows[0] + 1} to {worst.rows[-1] + 1} "
-                f"({100 * max(counts) / len(worst.rows):.2g} %); check the instrument, or log a mean if it "
+                f"the readings next to them. Most are in rows {worst.rows[0] + 1} to {worst.rows[-1] + 1} "
+                f"({100 * max(counts) / len(worst.rows):.2g} %). Check the instrument, or log a mean if it "
                 "delivers pulses"
             )
     return sentences
@@ -124,19 +124,19 @@ def settle_remarks(found: Settled) -> list[str]:
     """Sentences on what should be looked at."""
     remarks = []
     if found.gaps:
-        remarks.append(f"samples are missing after {rows_text(found.gaps, 5)}; no segment spans such a gap")
+        remarks.append(f"samples are missing after {rows_text(found.gaps, 5)}. No segment spans such a gap")
     remarks += glitch_sentences(found)
     angles = {rate: angle for angle, rate, _ in RATES}
     for channel in (s.channel for s in found.signals):
         if channel not in found.runs.channels:
             remarks.append(
-                f"{channel.column} is the rate of {angles[channel.name]}; add {channel.name} to channels in the "
+                f"{channel.column} is the rate of {angles[channel.name]}. Add {channel.name} to channels in the "
                 "rig's file, or these runs will lack its reading"
             )
     wide = {name: x for name, x in found.scatter.items() if x > 0}
     for signal in (s for s in found.signals if s.channel.name in wide):
         remarks.append(
             f"{signal.channel.column}: repeated levels differ by {wide[signal.channel.name]:.2g} "
-            f"{signal.channel.unit} more than their noise; the sds include this scatter"
+            f"{signal.channel.unit} more than their noise. The standard deviations of the runs include this scatter"
         )
     return remarks

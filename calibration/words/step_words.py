@@ -33,10 +33,10 @@ STEPS = {
     "whole": "3 of 4, catalogue ratios and whole numbers of cells",
     "refined": "4 of 4, the best {} designs, with ratio and number of cells continuous",
     # a calibration
-    "optimum": "optimum found; now {}",
+    "optimum": "optimum found, now {}",
     "steady": "fitting the steady model first, to start from its optimum",
     "delay": "the error lies in the first sample after each step: fitting again with a delay",
-    "derivatives": "population finished; comparing derivatives with finite differences at the best member",
+    "derivatives": "population search finished, comparing derivatives with finite differences at the best member",
     "search": "  step {}: objective {:.4f}, {:.1f} min",
     "round": "round {}: objective {:.4f} after {} steps, {:.1f} min",
     "start": "start {} of {}: objective {:.4f} after {} steps, {:.1f} min",

@@ -17,7 +17,7 @@ WOULD_MEASURE = {
     "motor.temperature_ambient": "runs at several room temperatures with the effect winding_heating present",
     ".friction.dynamic": "a history in which the movers spin faster than V_d (a start on a slippery slope)",
     ".friction.speed_dynamic": "a history in which the movers spin faster than V_s (a start on a slippery slope)",
-    ".guide_share": "the fidelities steady and drive (the track model computes it; fit guide_friction there)",
+    ".guide_share": "the fidelities steady and drive (the track model computes it, so fit guide_friction there)",
     ".mass": "a scale, or runs whose table does not state total_mass_kg",
 }
 #: Losses that data do not distinguish without variation of a condition.
@@ -57,12 +57,12 @@ def differing_repeats(
         many = len(unused) > 1
         name = f'set [columns] {near} = "{unused[0]}"' if near else "name it under [columns]"
         return (
-            f"{reading}; {', '.join(unused)} {'vary' if many else 'varies'} between these rows and "
-            f"{'are' if many else 'is'} not used as a condition: {name}, or, for a load, give each level its own "
-            "configuration"
+            f"{reading}. {', '.join(unused)} {'vary' if many else 'varies'} between these rows and "
+            f"{'are' if many else 'is'} not used as a condition. Therefore {name}, or, for a load, give each level "
+            "its own configuration"
         )
-    wrong = f"{reading}; remove the wrong row"
-    return f"{wrong}, or find what changed between such rows without a column in the table" if more else wrong
+    wrong = f"{reading}. Remove the wrong row"
+    return f"{wrong}, or find what changed between these rows and has no column in the table" if more else wrong
 
 
 def unused_columns(source: str, columns: tuple[tuple[str, str], ...]) -> str:
@@ -72,8 +72,8 @@ def unused_columns(source: str, columns: tuple[tuple[str, str], ...]) -> str:
     sentences_unused = [f"{source}: {', '.join(names)} {vary} from row to row and {are} not used"]
     for name, near in columns:
         if near:
-            sentences_unused.append(f'if {name} is {near}, set [columns] {near} = "{name}" in the robot\'s file')
-    return "; ".join(sentences_unused)
+            sentences_unused.append(f'If {name} is {near}, set [columns] {near} = "{name}" in the robot\'s file')
+    return ". ".join(sentences_unused)
 
 
 def nothing_varies(source: str, rows: int, column: str, unused: Names = ()) -> str:
@@ -83,10 +83,10 @@ def nothing_varies(source: str, rows: int, column: str, unused: Names = ()) -> s
         if len(unused) > 1
         else ("varies", "is", "it", "it is a condition")
     )
-    name = f"{', '.join(unused)} {vary} and {are} not used: name {them} under [columns] if {if_conditions}, or "
+    name = f"{', '.join(unused)} {vary} and {are} not used. Name {them} under [columns] if {if_conditions}, or "
+    record = f"{'r' if unused else 'R'}ecord runs at several values of {column} or at several loads"
     return (
-        f"{source}: these {rows} runs differ only by noise, so they determine nothing; "
-        f"{name * bool(unused)}record runs at several values of {column} or at several loads"
+        f"{source}: these {rows} runs differ only by noise, so they determine nothing. {name * bool(unused)}{record}"
     )
 
 
@@ -97,17 +97,17 @@ def copied_channel(source: str, column: str, other: str, intercept: float, slope
     sentence = f"{source}, {column}: equals {start}{factor:.4g} times {other} in every row, to the last digit"
     if tied:
         return (
-            f"{sentence}; if it is computed rather than measured, remove it, since the noise of {other} counts twice"
+            f"{sentence}. If it is computed rather than measured, remove it: the noise of {other} would count twice"
         )
-    return f"{sentence}, so it is computed, not measured; remove it from channels and table, or measure it"
+    return f"{sentence}, so it is computed, not measured. Measure it, or remove it from the channels and the table"
 
 
-def ends_early(runs: Names, lasts: float, share: float) -> str:
+def sentence_on_short_histories(runs: Names, lasts: float, share: float) -> str:
     """Histories that end before the robot is under way."""
     at_speed = "" if math.isnan(share) else f", at {share:.0%} of the speed of steady travel"
     return (
         f"{_runs(runs, 'ends', 'end')} after {lasts:.2g} s at the latest{at_speed}, before the speed is steady. "
-        "Only priors then determine the resistance to travel; record until the speed is steady"
+        "So the resistance to travel is known only from its priors. Record until the speed is steady"
     )
 
 
@@ -119,12 +119,15 @@ def inherited_priors(part: str, changed: tuple[tuple[str, float, float], ...], k
     """A part that is not the nominal robot's while friction of it is."""
     changes = ", ".join(f"{name} {own_value:g} instead of {nominal:g}" for name, own_value, nominal in changed)
     return (
-        f"{part} differs from that of the nominal robot ({changes}), but the prior of its {', '.join(kept)} is still "
-        "the nominal robot's; set your values in the robot's file or with --prior"
+        f"the {part} differs from that of the nominal robot ({changes}), but {', '.join(kept)} still "
+        f"{'has' if len(kept) == 1 else 'have'} the nominal robot's prior. Set your values in the robot's file or "
+        "with --prior"
     )
 
 
-def off_by(column: str, unit: str, factor: float, units: Names, others: Names, imposed: str) -> str:
+def sentence_on_implausible_readings(
+    column: str, unit: str, factor: float, units: Names, others: Names, imposed: str
+) -> str:
     """Readings that no robot like this one shows."""
     off, size = (factor, "large") if factor > 1 else (1 / factor, "small")
     subject = f"{column}: readings are about {float(f'{off:.2g}'):g} times too {size} for this robot"
@@ -137,7 +140,8 @@ def off_by(column: str, unit: str, factor: float, units: Names, others: Names, i
 #: Code of a remark → a sentence with its values, or a function that makes one.
 SAID: dict[str, str | Callable[..., str]] = {
     "unmeasured": lambda name: (
-        f"{name}: these data do not determine it, so it keeps its prior value. To measure it: {would_measure(name)}"
+        f"{name} keeps its prior value, because these data do not determine it. To measure it, use "
+        f"{would_measure(name)}"
     ),
     "constant": lambda column, value, alike: (
         f"{column} is {value:g} in every row: {ALIKE[alike]}, so only their priors distinguish them"
@@ -147,45 +151,47 @@ SAID: dict[str, str | Callable[..., str]] = {
     "as the {source} noise predicts, so its sd is multiplied by {factor:.2g}. Check the repeats, "
     "or state the noise with --noise",
     "unused": unused_columns,
-    "no_load_gives": "{source}, {theirs}: friction and a constant torque of a load leave {share:.0%} of its "
-    "variance unexplained; if a brake sets this torque, it is a condition: set [columns] load_torque_Nm "
-    '= "{theirs}" in the robot\'s file, and take output_torque out of its channels',
+    "no_load_gives": "{source}, {theirs}: the friction and the constant torque of the load leave {share:.0%} of its "
+    "variance unexplained. If a brake sets this torque, it is a condition. Then set [columns] load_torque_Nm "
+    '= "{theirs}" in the robot\'s file, and remove output_torque from its channels',
     "nothing_varies": nothing_varies,
     "copied": copied_channel,
-    "turned": "{source}, {theirs}: differs by {off:.2g} (rms) from the value that the robot file's numbers give, "
-    "but only by {turned:.2g} with the opposite sign; if the instrument is reversed, set [columns] "
+    "turned": "{source}, {theirs}: differs by {off:.2g} (rms) from the values that follow from the robot file, "
+    "but only by {turned:.2g} with the opposite sign. If the instrument's sign is reversed, set [columns] "
     '{column} = {{column = "{theirs}", factor = -1}}',
-    "stiff_supply": "{column} is {value:g} in every row: treated as a stiff supply; if it was not "
+    "stiff_supply": "{column} is {value:g} in every row, so the supply is treated as stiff. If the voltage was not "
     "measured, remove the column",
     "lost_motion": lambda source, column, reversals, width, unit, angle, stiffness: (
         f"{source}, {column}: "
         + (
-            f"the output lags the motor by {width:.2g} {unit} rms in proportion to its acceleration: a compliant "
-            f'coupling, perhaps with backlash; set damping and stiffness = "{stiffness:.2g} ± 50 %" (N·m/rad'
+            f"the output lags the motor by {width:.2g} {unit} rms in proportion to its acceleration, as with a "
+            "compliant "
+            f'coupling, perhaps with backlash. Set damping and stiffness = "{stiffness:.2g} ± 50 %" (N·m/rad'
             if stiffness
-            else f"at each of {reversals} reversals about {width:.2g} {unit} are lost that friction, inertia and "
-            f'delay do not explain: backlash or a compliant coupling; set backlash = "{angle:.2g} ± 30 %" (rad'
+            else f"at each of {reversals} reversals about {width:.2g} {unit} of motion are lost. Friction, inertia "
+            f'and delay do not explain this, but backlash or a compliant coupling does. Set backlash = "{angle:.2g} '
+            '± 30 %" (rad'
         )
         + " at the output) in the load's table of the robot file"
     ),
-    "ends_early": ends_early,
+    "ends_early": sentence_on_short_histories,
     "never_grips": lambda runs, share: (
-        f"{_runs(runs, 'never grips', 'never grip')}: in the end the robot travels at {share:.0%} of the speed of "
-        "its movers, so these runs do not measure the grip of the ground before it slides"
+        f"{_runs(runs, 'slides', 'slide')} to the end: the robot then travels at {share:.0%} of the speed of its "
+        "tracks or wheels. Such runs do not measure the static friction of the ground"
     ),
     "thinned": "{source}: the fit uses readings of {kept} of {rows} rows, evenly spaced in time, and the imposed "
-    "quantity of all rows; --rows changes the number, and settle uses all rows",
-    "thinned_table": "{source}: {kept} of {rows} rows are used, spread evenly over the conditions; row numbers "
-    "refer to these; --rows changes the number",
+    "quantity of all rows. Change the number with --rows, or use settle, which takes all rows",
+    "thinned_table": "{source}: {kept} of {rows} rows are used, spread evenly over the conditions. Row numbers "
+    "refer to these. Change the number with --rows",
     "coarse_steps": lambda lasts, step: (
-        f"runs of {lasts:.0f} s are simulated in steps of {1e3 * step:.0f} ms, so waves of a shaft with a period "
-        "below about ten steps are not resolved; use shorter runs to look for them"
+        f"runs of {lasts:.0f} s are simulated in steps of {1e3 * step:.0f} ms. Ripple of a shaft with a period below "
+        "about ten steps is not resolved. Use shorter runs to look for it"
     ),
-    "stops_on_slope": "run {runs}: the motors are not driven on a slope. Friction at rest is smoothed in time "
-    "histories, so a robot that should stand still creeps at a few mm/s. Leave out rows at "
-    "rest if their readings are more exact than that",
+    "stops_on_slope": "run {runs}: the motors are not driven on a slope. Time histories smooth the friction at rest, "
+    "so a robot that should stand still creeps at a few mm/s. Leave out rows at rest if their readings are more "
+    "exact than that",
     "inherited_priors": inherited_priors,
-    "off_by": off_by,
+    "off_by": sentence_on_implausible_readings,
     "slopes_in": "slope_deg: the current rises {rise:.2g} times as fast with the slope as for this robot; are "
     "the slopes in {unit}? expected degrees",
 }

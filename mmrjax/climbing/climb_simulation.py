@@ -104,11 +104,8 @@ def constant_angles(front: Scalar, rear: Scalar) -> LeverSequence:
 
 
 class ClimbMotion(eqx.Module):
-    """State of half a robot: coordinates, velocities (see `contacts_with_terrain`), motor current [A], charge taken
-    [C], and supply current of the lever motors [A].
-
-    They are the current of one motor [A], the charge taken from the battery [C], and the current of the levers'
-    motors from the supply [A].
+    """State of half a robot: coordinates, velocities (see `contacts_with_terrain`), current of one motor [A], charge
+    taken from the battery [C], and supply current of the lever motors [A].
     """
 
     q: Float[Array, " 6"]
@@ -320,8 +317,8 @@ def _sliding(at: Footing, v: Array, signals: Signals) -> Array:
 def climb_instant(
     run: ClimbSystem, motion: ClimbMotion, on: Scalar
 ) -> tuple[Signals, Footing, _ContactForces, Array]:
-    """All signals, contacts, forces and load shares of an instant. `on`: share of its voltage that each motor
-    receives.
+    """All signals, contacts, forces and load shares of an instant. `on`: fraction of the voltage that is applied to
+    each motor.
     """
     touching = footing.contacts_with_terrain(run.shape, run.terrain, motion.q, motion.v)
     # share of each rolling contact in the load, and the robot's speed along the ground, their load-weighted mean
@@ -359,8 +356,8 @@ def _with_lever_current(run: ClimbSystem, motion: ClimbMotion) -> ClimbSystem:
 def demanded_lever_rates(run: ClimbSystem, motion: ClimbMotion, time: Scalar) -> Pair:
     """Demanded angular speeds of the levers after a step [rad/s].
 
-    They lead to the angles of the sequence, limited by the largest rate of the levers. At its angle, a lever stands
-    still.
+    They move the levers to the angles of the sequence, at most at the levers' largest rate. A lever that has reached
+    its angle stands still.
     """
     rate = run.robot.running_gear.levers.rate
     toward = (_convert_lever_angles(*run.sequence.asked(motion.q[0], time)) - motion.q[LED]) / (4 * _SWINGS)
@@ -591,9 +588,9 @@ def _update_verdict(
 
 
 def begin_climb(run: ClimbSystem, motion: ClimbMotion | None = None) -> tuple[ClimbMotion, Energy, VerdictState]:
-    """Initial motion (if None, at rest before the obstacle), zero energy, and the initial verdict.
+    """Initial motion (None: at rest before the obstacle), zero energy, and the initial verdict.
 
-    The verdict is `failed` if the levers would begin below the ground, else the run goes on.
+    The verdict is `failed` if the levers would start below the ground. Otherwise the run continues.
     """
     angles, gear = _convert_lever_angles(*run.sequence.first), run.shape.gear
     under = roller_clearance(run.shape.main.first + gear.grouser_height, gear, angles) < -ON_GROUND

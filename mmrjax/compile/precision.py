@@ -24,7 +24,7 @@ from mmrjax.compile.programs import has_tracer
 
 #: Reason for refusing a fit inside a trace in single precision, with the remedy.
 SINGLE = (
-    "called inside a JAX transformation in single precision, which is too coarse for a fit; call it outside of "
+    "called inside a JAX transformation in single precision, which is too coarse for a fit. Call it outside of "
     'jax.jit, or set jax.config.update("jax_enable_x64", True)'
 )
 

@@ -29,7 +29,7 @@ class DutyEffect(Effect):
 class DutyExponent(DutyEffect):
     """ΔD = a D (1 - |D|^(n-1)) / (n - 1): with a = n - 1 the bridge gives |D|^n sign D.
 
-    A driver whose voltage is a power of the command, as a controller with a throttle curve.
+    The driver's voltage is a power of the command, as in a speed controller with a throttle curve.
 
     Source: Gabriel, Meyer and du Plessis, Brushless DC motor characterisation and selection for a fixed wing UAV,
     IEEE Africon (2011), measure voltage over command of speed controllers, which is not a line. Box and Cox, An
@@ -56,7 +56,7 @@ class DutyExponent(DutyEffect):
 class DutyDeadBand(DutyEffect):
     """ΔD = a (1 - |D|) sign D: with a = d / (1 - d) the bridge gives (|D| - d) / (1 - d) sign D, and 0 below d.
 
-    A driver that gives nothing for small commands.
+    The driver gives no voltage for small commands.
 
     Source: dead time and dead band of bridges, Mohan, Undeland and Robbins, Power Electronics (2003), chapter 8
     (blanking time). The sign is smooth within a duty of 0.001.
@@ -74,7 +74,7 @@ class DutyDeadBand(DutyEffect):
 class DutySaturation(DutyEffect):
     """ΔD = a max(|D| - D_s, 0) sign D: with a = 1 the voltage no longer grows above a duty of D_s.
 
-    A driver or a supply that reaches its limit before full command.
+    The driver or the supply reaches its limit before full command.
 
     Source: end points of speed controllers, and supplies in current limit. Åström and Murray, Feedback Systems
     (2008), section 10.4, saturation of actuators. `driver.current_limit` limits the current instead of the voltage.

@@ -19,7 +19,7 @@ class ElectricalEffect(Effect):
 class SeriesResistance(ElectricalEffect):
     """ΔU = a I_d: Ohm's law for a resistance in series with one motor, not included in the motor's data sheet.
 
-    Leads, ammeter and brush contacts in series with each motor.
+    Leads, an ammeter or brush contacts are in series with each motor.
 
     Source: Fig. 20 of the paper (leads and ammeter of the bench). Ohm (1827).
     """
@@ -28,7 +28,11 @@ class SeriesResistance(ElectricalEffect):
     dissipative = True
 
     amplitude: Scalar = amplitude(
-        "ohm", "resistance in series with each motor", (-0.5, 5.0), "bench leads and meters: tenths of an ohm", sd=0.5
+        "ohm",
+        "resistance in series with each motor",
+        (-0.5, 5.0),
+        "leads and meters of a bench: tenths of an ohm",
+        sd=0.5,
     )
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:
@@ -78,7 +82,7 @@ class WindingHeating(ElectricalEffect):
 
     amplitude: Scalar = amplitude(
         "-", "share of the settled temperature rise that the run reaches", (-0.5, 3.0),
-        "0 cold, 1 settled; above 1 for a closed housing", sd=1.0,
+        "0 cold, 1 settled, above 1 for a closed housing", sd=1.0,
     )  # fmt: skip
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:
@@ -95,8 +99,9 @@ class ThermalDrift(ElectricalEffect):
 
     The winding warms up while the run lasts.
 
-    Source: IEC 60028 for α. The maker's sheet of RE30 310007 for τ and R_wh. The housing, with 593 s, keeps its
-    temperature during a run. In steady travel this effect looks like `winding_heating`.
+    Source: IEC 60028 for α. The maker's sheet of RE30 310007 for τ and R_wh. The housing's
+    time constant is 593 s, so its temperature is taken as constant during a run.
+    In steady travel this effect looks like `winding_heating`.
     The memory is T [K]. Without a memory the settled value is used. If the winding's temperature is followed
     (missions), its resistance follows that, and the effect adds 0.
     """
@@ -109,7 +114,7 @@ class ThermalDrift(ElectricalEffect):
 
     amplitude: Scalar = amplitude(
         "-", "share of the data sheet's temperature rise", (-1.0, 10.0),
-        "1 by the data sheet; more in still air between printed walls", sd=1.0,
+        "1 in the data sheet, more in still air between printed walls", sd=1.0,
     )  # fmt: skip
     time_constant: Scalar = parameter(
         16.3, "s", "thermal time constant of the winding τ", (1.0, 600.0), "maker's sheet of RE30 310007",
@@ -136,8 +141,8 @@ class ThermalDrift(ElectricalEffect):
 class CoastDecay(ElectricalEffect):
     """ΔU = -a (1 - |D|) E: during a share a of the pauses between the pulses of a duty D the motors coast.
 
-    A driver in fast decay, whose current ends within each period. The mean torque is proportional to the duty, and
-    the no-load speed does not depend on it.
+    The driver uses fast decay, and its current ends within each period. The mean torque is proportional to the duty,
+    and the no-load speed does not depend on it.
 
     Source: Mohan, Undeland and Robbins, Power Electronics (2003), chapter 7: discontinuous conduction, with pulses
     and pauses long compared with L/R. `driver.Driver` with `decay = "fast"` is a = 1, and also gives the supply

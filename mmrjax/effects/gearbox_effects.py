@@ -47,7 +47,7 @@ class GearLoadLoss(GearboxEffect):
 class GearQuadraticLoss(GearboxEffect):
     """ΔM_r = a M_load²: the square of the torque at the output shaft.
 
-    Gear loss that grows faster than the load.
+    The gear loss grows faster than the load.
 
     Source: second-order term of the load-dependent mesh loss. The coefficient of friction grows with the tooth load
     (Ohlendorf, Verlustleistung und Erwärmung von Stirnrädern, 1958: μ ∝ load^0.2), and the planets tilt under load.
@@ -57,7 +57,7 @@ class GearQuadraticLoss(GearboxEffect):
     dissipative = True
 
     amplitude: Scalar = amplitude(
-        "1/N/m", "loss torque over squared output torque", (-0.05, 0.3), "at 2 N·m 6 % of the load", sd=0.03
+        "1/N/m", "loss torque over squared output torque", (-0.05, 0.3), "6 % of the load at 2 N·m", sd=0.03
     )
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:
@@ -67,7 +67,7 @@ class GearQuadraticLoss(GearboxEffect):
 class StribeckGear(GearboxEffect):
     """ΔM_r = a exp(-|ω_m| / ω_s) sign ω_m at the output shaft.
 
-    Gear friction that falls as the input gains speed.
+    The friction of the gear decreases with the speed of its input.
 
     Source: Tustin (1947), the exponential law. Mixed lubrication of grease-packed planets (Niemann and
     Winter, 2003). With the same ω_s it is `stribeck_motor` times i η_rm.

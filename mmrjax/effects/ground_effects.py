@@ -12,7 +12,7 @@ from mmrjax.model.signals import Signals
 
 
 class GroundEffect(Effect):
-    """Force against the travel, of one side [N]."""
+    """Force against the travel, on one side [N]."""
 
     balance = "ground"
 
@@ -20,7 +20,7 @@ class GroundEffect(Effect):
 class SpeedRolling(GroundEffect):
     """ΔF_f = a N V² against the travel: f(V) = f + a V².
 
-    Rolling resistance that grows with the square of speed.
+    The rolling resistance grows with the square of speed.
 
     Source: Wong, Theory of Ground Vehicles (2008), ch. 1: f = f_0 + f_s V² of rolling tyres. Bekker (1969)
     for light tracks.
@@ -41,7 +41,7 @@ class SpeedRolling(GroundEffect):
 class AdhesiveDrag(GroundEffect):
     """ΔF_f = a (1 + (V / V_p)²)^0.3 against the travel: a rest value that grows as V^0.6, independent of the load.
 
-    Rubber that is peeled off the ground behind the contact.
+    Rubber is peeled off the ground behind the contact.
 
     Source: Roberts and Thomas, The adhesion and friction of smooth rubber surfaces, Wear 33 (1975) 45.
     Maugis and Barquins, J. Phys. D 11 (1978) 1989: energy of peeling w (1 + (V/V_p)^0.6) times the width.
@@ -68,7 +68,7 @@ class AdhesiveDrag(GroundEffect):
 class WeightTransfer(GroundEffect):
     """ΔF_f = a N tan² α against the travel.
 
-    The slope loads the rear of the tracks, and uneven pressure costs more.
+    The slope loads the rear of the tracks, and uneven pressure increases the resistance.
 
     Source: load transfer (h/L) tan α of the weight (Wong 2008, ch. 1). Resistance that is convex in the
     local pressure gains the square of an antisymmetric transfer (Bekker 1956: compaction as a power of the pressure
@@ -90,7 +90,7 @@ class WeightTransfer(GroundEffect):
 class Sinkage(GroundEffect):
     """ΔF_f = a N (M / M_0)^(1/n) against the travel, M_0 the robot without payload.
 
-    Movers that sink deeper under load meet more resistance.
+    Tracks or wheels that sink deeper under load meet more resistance.
 
     Source: Bekker, Theory of Land Locomotion (1956): compaction resistance as the power (n + 1)/n of the
     load with sinkage exponent n. Written as a change of the coefficient of the unladen robot, so that a is a

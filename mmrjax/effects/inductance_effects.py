@@ -13,7 +13,7 @@ from mmrjax.model.signals import Signals
 class ArmatureInductance(Effect):
     """ΔL = a in eq. (15), for one motor.
 
-    Inductance of leads and supply in series with the armature.
+    The inductance of leads and supply is in series with the armature.
 
     Source: eq. (15). Leads have about 1 µH/m, a supply's output choke tens to hundreds of µH. Visible only
     while the current changes within a millisecond.

@@ -13,7 +13,7 @@ from mmrjax.model.signals import Signals
 class RotatingInertia(Effect):
     """ΔJ_w = a in eq. (31), for one side.
 
-    Parts that turn with the driving wheel beyond Table 7.
+    Parts that Table 7 does not list turn with the driving wheel.
 
     Source: Table 7 lists pulleys, wheels and belts. Teeth, grousers, shafts and the belt stage of the drive
     are not included. It has no influence on steady travel.

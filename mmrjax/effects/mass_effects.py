@@ -11,7 +11,7 @@ from mmrjax.model.signals import Signals
 
 
 class MassEffect(Effect):
-    """Mass beyond the stated one [kg]."""
+    """Difference of the true mass from the stated one [kg]."""
 
     balance = "mass"
 
@@ -36,9 +36,9 @@ class MassError(MassEffect):
 
 
 class MassOffset(MassEffect):
-    """M = stated mass + a in the wheeled configuration. In the tracked one M is as stated.
+    """M = stated mass + a in the wheeled configuration, and the stated mass in the tracked one.
 
-    Additional mass of one configuration. `configurations` may name others.
+    One configuration has additional mass. `configurations` may name others.
 
     Source: Table A2 prints 13.1 kg for the wheeled robot, Table 7 states 11.5 kg. Weight, adhesion,
     guide load and inertia all follow from the mass, so it enters only there.

@@ -34,7 +34,7 @@ class Windage(MotorEffect):
     dissipative = True
 
     amplitude: Scalar = amplitude(
-        "N·m·s^2", "torque over squared motor speed", (-1e-9, 1e-8), "at 1200 rad/s 0.7 mN·m, a fifth of eq. (14)",
+        "N·m·s^2", "torque over squared motor speed", (-1e-9, 1e-8), "0.7 mN·m at 1200 rad/s, a fifth of eq. (14)",
         sd=5e-10,
     )  # fmt: skip
 
@@ -46,7 +46,7 @@ class Windage(MotorEffect):
 class StribeckMotor(MotorEffect):
     """ΔM_df = a exp(-|ω_m| / ω_s) sign ω_m.
 
-    Friction of brushes and bearings that decreases with shaft speed.
+    The friction of brushes and bearings decreases with shaft speed.
 
     Source: Tustin, The effects of backlash and of speed-dependent friction on the stability of closed-cycle
     control systems, J. IEE 94 (1947), the exponential law. Armstrong-Hélouvry, Dupont and Canudas de Wit
@@ -57,11 +57,11 @@ class StribeckMotor(MotorEffect):
     dissipative = True
 
     amplitude: Scalar = amplitude(
-        "N·m", "friction torque at rest beyond the dry friction", (-3e-3, 2e-2),
+        "N·m", "friction torque at rest in excess of the dry friction", (-3e-3, 2e-2),
         "half of the dry friction of Table 2", sd=1.5e-3,
     )  # fmt: skip
     speed_fade: Scalar = parameter(
-        300.0, "rad/s", "motor speed ω_s that scales the decay of the excess", (20.0, 3000.0),
+        300.0, "rad/s", "motor speed ω_s over which the excess falls to 1/e", (20.0, 3000.0),
         "sleeve bearings leave mixed lubrication at 1000 to 5000 rpm", relative_sd=0.5,
     )  # fmt: skip
 
@@ -72,7 +72,7 @@ class StribeckMotor(MotorEffect):
 class IronLoss(MotorEffect):
     """ΔM_df = a 2x / (1 + x²), x = ω_m / ω_c: the drag of an eddy-current brake.
 
-    Eddy currents in the motor's solid parts, weakened by their own field at high speed.
+    Eddy currents in the motor's solid parts brake it, and their own field weakens them at high speed.
 
     Source: Wouterse, Critical torque and speed of eddy current brake with widely separated soft iron poles,
     IEE Proc. B 138 (1991). Below ω_c the drag is proportional to speed, as eq. (14)'s viscous term. Hysteresis
@@ -111,7 +111,7 @@ class TorqueConstantSaturation(MotorEffect):
 
     amplitude: Scalar = amplitude(
         "1/A^2", "relative loss of torque constant over squared current", (-0.01, 0.05),
-        "3 % at 3 A; an ironless rotor saturates little", sd=3e-3,
+        "3 % at 3 A, since an ironless rotor saturates little", sd=3e-3,
     )  # fmt: skip
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:
@@ -141,7 +141,7 @@ class Cogging(Periodic, MotorEffect):
     )  # fmt: skip
     rate_fade: Scalar = parameter(
         1000.0, "rad/s", "ripple rate ω_f above which it is faded out", (10.0, 1e5),
-        "a choice of the model, see above", relative_sd=0.1,
+        "a choice of the model, see the source", relative_sd=0.1,
     )  # fmt: skip
 
     def order(self, robot: Robot, configuration: Index) -> Scalar:

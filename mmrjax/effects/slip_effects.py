@@ -21,9 +21,9 @@ class SlipEffect(Effect):
 
 
 class RollingRadius(SlipEffect):
-    """ΔV = -a r_k ω_k: the robot travels (1 + a) r_k per radian, at the same lever arm of the traction.
+    """ΔV = -a r_k ω_k: per radian the robot travels (1 + a) r_k, while the lever arm of the traction stays r_k.
 
-    The distance rolled per turn is not that of the nominal radius.
+    The distance travelled per turn of the wheel differs from that of the nominal radius.
 
     Source: kinematic rolling radius against loaded radius (Wong, Theory of Ground Vehicles, 2008, ch. 1).
     The difference is kinematic and not dissipative: a > 0 reduces the loss in slip.
@@ -39,7 +39,7 @@ class RollingRadius(SlipEffect):
 
 
 class BeltCreep(SlipEffect):
-    """ΔV = a P V_teor: elastic creep, a share of the speed in proportion to the traction.
+    """ΔV = a P V_teor: elastic creep, proportional to the traction P of a side and to the speed V_teor without slip.
 
     The belt stretches under traction and creeps on its pulley.
 
@@ -53,7 +53,7 @@ class BeltCreep(SlipEffect):
 
     amplitude: Scalar = amplitude(
         "1/N", "creep over traction of a side, 1/(E A)", (-1e-3, 1e-2),
-        "E A of 1 to 20 kN for narrow rubber with cord; at 22 N 1 %", sd=5e-4,
+        "E A of 1 to 20 kN for narrow rubber with cord, 1 % of creep at 22 N", sd=5e-4,
     )  # fmt: skip
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:
@@ -61,12 +61,12 @@ class BeltCreep(SlipEffect):
 
 
 class NonlinearSlip(SlipEffect):
-    """ΔV = a V_teor u³, u = demand over the adhesion limit of eq. (6).
+    """ΔV = a V_teor u³, with the speed V_teor without slip and u = demand over the adhesion limit of eq. (6).
 
-    Slip that grows steeply as the adhesion is used up.
+    The slip grows steeply as the demand approaches the adhesion limit.
 
     Source: Janosi and Hanamoto (1961): traction saturates over slip. The cube is the steep part of its
-    inverse. u is limited to 2. The robot slides from 1 on.
+    inverse. u is limited to 2. From u = 1 on, the robot slides.
     """
 
     driver = "demand"
@@ -82,12 +82,12 @@ class NonlinearSlip(SlipEffect):
 
 
 class SpeedSlip(SlipEffect):
-    """ΔV = a V_teor |V_teor|: a share of the speed in proportion to the speed.
+    """ΔV = a V_teor |V_teor|: the share of speed lost is proportional to the speed V_teor without slip.
 
-    Slip that grows with speed.
+    Treads lift off the ground between impacts.
 
-    Source: first term of an expansion of the slip in speed. Treads lift off between impacts. The loss
-    is kinematic: on a descent it removes no power.
+    Source: first term of an expansion of the slip in speed. The loss is kinematic, so on a descent it removes no
+        power.
     """
 
     driver = "speed"
@@ -99,9 +99,9 @@ class SpeedSlip(SlipEffect):
 
 
 class LoadSlip(SlipEffect):
-    """ΔV = a V_teor N: radius r_k (1 - a N).
+    """ΔV = a V_teor N, with the speed V_teor without slip and the load N of a side: the radius becomes r_k (1 - a N).
 
-    Belt and tyre yield under load, so that their rolling radius decreases.
+    Belt and tyre yield under load, which reduces their rolling radius.
 
     Source: effective rolling radius of a loaded tyre (Wong 2008, ch. 1. Pacejka, Tire and Vehicle Dynamics,
     2012, ch. 1). Kinematic, so not dissipative.
@@ -111,7 +111,7 @@ class LoadSlip(SlipEffect):
 
     amplitude: Scalar = amplitude(
         "1/N", "relative loss of rolling radius over load of a side", (-1e-3, 2e-3),
-        "at 100 N 1 %: tread 5 mm thick yields 0.5 mm", sd=1e-4,
+        "1 % at 100 N: a tread 5 mm thick yields by 0.5 mm", sd=1e-4,
     )  # fmt: skip
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:
@@ -123,8 +123,8 @@ class PulleyEccentricity(Periodic, SlipEffect):
 
     The driving pulley or wheel is eccentric.
 
-    Source: order 1 of the driving wheel's angle. Total run-out by ISO 1101. The lever arm of the traction
-    changes by the same share, which is left out: an effect enters only one balance.
+    Source: order 1 of the driving wheel's angle. Total run-out as in ISO 1101. The lever arm of the traction
+    changes by the same share. This is left out, because an effect enters only one balance.
     """
 
     driver = "angle"
@@ -152,7 +152,7 @@ class VibrationSlip(SlipEffect):
     over contacts that oscillate by s (`mmrjax.vibration`), for V_s small compared with s. The slip is proportional to
     s and, because the load leads, to u. s grows as 1 / (1 - u), as the track model shows
     (docs/explanation/vibration.md). It is smoothed at rest and within 0.05 of the limit. Beyond, the robot slides. If
-    the demand pulls forward, the robot runs ahead of its tracks.
+    the demand pulls forward, the robot moves faster than its tracks.
     """
 
     driver = "demand"

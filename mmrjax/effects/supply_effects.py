@@ -17,7 +17,7 @@ class SupplyEffect(Effect):
 class SupplySag(SupplyEffect):
     """ΔU = a I_Σ: Ohm's law for conductors that carry the current of all motors.
 
-    Leads and internal resistance that both motors share.
+    Both motors share leads and the internal resistance of the supply.
 
     Source: Fig. 20 of the paper (supply, leads and ammeter of the bench). Ohm (1827). With equal sides
     (assumption 3) it acts as a `series_resistance` of 2 a: only a run with one motor off

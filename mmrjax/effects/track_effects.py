@@ -14,15 +14,15 @@ from mmrjax.numerics.one_sided import magnitude
 
 
 class TrackEffect(Effect):
-    """Torque lost between the driving shaft and the ground, of one side [N·m]."""
+    """Torque lost between the driving shaft and the ground, on one side [N·m]."""
 
     balance = "track"
 
 
 class Churning(TrackEffect):
-    """ΔM_t = a ω_k |ω_k| at the pulley, for a side's tracks.
+    """ΔM_t = a ω_k |ω_k| at the pulley, for the track of one side.
 
-    Track loss that grows with the square of speed.
+    The loss of the track grows with the square of speed.
 
     Source: the next term after eq. (24). Impact of teeth and grousers transfers a momentum proportional to the
     speed, at a rate proportional to the speed (Merritt, The Evolution of a Tank Transmission, 1946).
@@ -44,7 +44,7 @@ class Churning(TrackEffect):
 class StribeckTrack(TrackEffect):
     """ΔM_t = a exp(-|ω_k| / ω_s) sign ω_k at the pulley, for a side's tracks.
 
-    Friction of belt and pulley bearings that decreases with belt speed.
+    The friction of belt and pulley bearings decreases with belt speed.
 
     Source: Tustin (1947), the exponential law. Armstrong-Hélouvry, Dupont and Canudas de Wit (1994).
     """
@@ -65,9 +65,9 @@ class StribeckTrack(TrackEffect):
 
 
 class TensionFriction(TrackEffect):
-    """ΔM_t = a r_k |P_t|: tension presses the tight side on pulleys and guides.
+    """ΔM_t = a r_k |P_t|: the tension presses the tight side of the belt on pulleys and guides.
 
-    Belt friction that grows with the traction the belt carries.
+    Belt friction grows with the traction that the belt carries.
 
     Source: Euler (1769) and Eytelwein (1808): normal force of a belt round a pulley in proportion to its
     tension. Merritt, The Evolution of a Tank Transmission (1946), track efficiency as a share of the
@@ -186,13 +186,14 @@ class StickSlip(TrackEffect):
 class DirectionalFriction(TrackEffect):
     """ΔM_t = a (sign ω_k)²: a dry loss of M_t0 + a forward and of M_t0 - a backward.
 
-    Dry friction that is larger in one direction of rotation than in the other.
+    Dry friction is larger in one direction of rotation than in the other.
 
     Source: Armstrong-Hélouvry, Control of Machines with Friction (1991), who states the Coulomb friction of a joint
-    separately for each direction. Lip seals, teeth and belts that bear on another flank. The mean of both directions
-    is eq. (24)'s M_t0, half their difference is a. Runs in one direction show their sum, so that it cannot be
-    distinguished from M_t0. A constant torque (`torque_offset`) does not depend on the direction. The effect is
-    dissipative only together with a larger M_t0. Alone it adds power in one direction, so it is not dissipative.
+    separately for each direction. Causes are lip seals, and teeth and belts that bear on another flank. The mean of
+    both directions is eq. (24)'s M_t0, half their difference is a. Runs in one direction show only the sum, so that
+    the effect cannot be distinguished from M_t0. A constant torque (`torque_offset`) does not depend on the
+    direction. The effect is dissipative only together with a larger M_t0. Alone it adds power in one direction, so it
+    is not dissipative.
     """
 
     driver = "direction"
@@ -200,7 +201,8 @@ class DirectionalFriction(TrackEffect):
     needs_reverse = True
 
     amplitude: Scalar = amplitude(
-        "N·m", "loss torque forward beyond the mean of both directions", (-0.5, 0.5), "a seventh of M_t0 of Table 3",
+        "N·m", "loss torque in forward rotation minus the mean of both directions", (-0.5, 0.5), "a seventh of M_t0 "
+        "of Table 3",
         sd=0.05,
     )  # fmt: skip
 
@@ -211,7 +213,7 @@ class DirectionalFriction(TrackEffect):
 class StribeckExponent(TrackEffect):
     """ΔM_t = a exp(-(|ω_k| / ω_s)^δ) sign ω_k at the driven shaft. δ = 2 unless stated.
 
-    Friction of bearings and seals that leaves mixed lubrication faster or more slowly than exponentially.
+    The friction of bearings and seals decreases with speed faster or more slowly than exponentially.
 
     Source: Armstrong-Hélouvry, Dupont and Canudas de Wit, A survey of models, analysis tools and compensation
     methods for the control of machines with friction, Automatica 30 (1994) 1083. δ is 1/2 to 1 in the exponential of
@@ -244,12 +246,12 @@ class StribeckExponent(TrackEffect):
 class DirectionalViscous(TrackEffect):
     """ΔM_t = a |ω_k|: a viscous loss of K + a forward and of K - a backward.
 
-    Friction whose growth with speed is larger in one direction of rotation than in the other.
+    Viscous friction is larger in one direction of rotation than in the other.
 
     Source: Armstrong-Hélouvry, Control of Machines with Friction (1991), who fits viscous friction of a joint
-    separately for each direction. Lip seals, and guides that draw in their lubricant in one direction. It is the part
-    that grows with speed, in addition to `directional_friction`, which is even in the speed too. The mean of both
-    directions is eq. (24)'s viscous loss: runs in one direction show their sum.
+    separately for each direction. Causes are lip seals, and guides that draw in their lubricant in one direction. It
+    is the part that grows with speed, in addition to `directional_friction`, which is even in the speed too. The mean
+    of both directions is eq. (24)'s viscous loss: runs in one direction show their sum.
     """
 
     driver = "direction"
@@ -267,9 +269,9 @@ class DirectionalViscous(TrackEffect):
 
 
 class TorqueOffset(TrackEffect):
-    """ΔM_t = a in both directions of rotation and at rest. At the radius a force a / r_k.
+    """ΔM_t = a in both directions of rotation and at rest, or a force a / r_k at the radius r_k.
 
-    A constant pull in one direction: a cable, a spring, a counterweight, or an offset in a torque command or meter.
+    A cable, a spring or a counterweight pulls in one direction, or a torque command or meter has an offset.
 
     Source: Swevers, Verdonck and De Schutter, Dynamic model identification for industrial robots, IEEE Control
     Systems 27 (2007) 58: an offset in addition to dry and viscous friction of each joint. While a shaft turns it
@@ -315,7 +317,7 @@ class Presliding(Bristle, TrackEffect):
 class AngleFriction(Periodic, TrackEffect):
     """ΔM_t = a sin(θ_k + φ) sign ω_k: dry friction that changes over a turn of the driven shaft.
 
-    A bent shaft, a bearing or a guide that is tight at one place in each turn.
+    A bent shaft, a bearing or a guide is tight at one place in each turn.
 
     Source: Popović and Goldenberg, Modeling of friction using spectral analysis, IEEE Trans. Robotics and Automation
     14 (1998) 114: friction of a joint over its angle, here its first order. If the log measures the angle, φ
@@ -343,7 +345,7 @@ class AngleFriction(Periodic, TrackEffect):
 class PositionFriction(TrackEffect):
     """ΔM_t = a θ sign ω_k, θ' = ω_k: dry friction that grows along the travel.
 
-    Guides or a screw that are tighter towards one end.
+    The guides or the screw are tighter towards one end.
 
     Source: Armstrong-Hélouvry, Control of Machines with Friction (1991), ch. 4: friction of a joint over its
     position, to first order. The memory is θ [rad], counted as in the channel of the angle or position, which
@@ -376,7 +378,7 @@ class PositionFriction(TrackEffect):
 class DirectionalStribeck(TrackEffect):
     """ΔM_t = a exp(-|ω_k| / ω_s) (sign ω_k)²: an excess at low speed of E + a forward and of E - a backward.
 
-    Friction whose decrease with speed is larger in one direction of rotation than in the other.
+    The friction decreases more with speed in one direction of rotation than in the other.
 
     Source: Canudas de Wit, Olsson, Åström and Lischinsky, A new model for control of systems with friction, IEEE
     Trans. Automatic Control 40 (1995): the curve g of the steady friction may differ between the directions. Here the
@@ -390,7 +392,7 @@ class DirectionalStribeck(TrackEffect):
     needs_reverse = True
 
     amplitude: Scalar = amplitude(
-        "N·m", "excess at low speed forward, beyond the mean of both directions", (-0.5, 0.5),
+        "N·m", "excess at low speed in forward rotation minus the mean of both directions", (-0.5, 0.5),
         "half of a common `stribeck_track`", sd=0.05,
     )  # fmt: skip
     speed_fade: Scalar = parameter(

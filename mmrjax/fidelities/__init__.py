@@ -37,8 +37,8 @@ class Option:
 class Effort:
     """Default effort of a calibration.
 
-    A profile costs about twenty refits per parameter, and blocks a dozen: seconds with `steady`, many minutes of
-    rollouts.
+    A profile takes about twenty refits per parameter, and hold-out blocks take about a dozen. This is seconds with
+    `steady`, and many minutes with simulations over time.
 
     Attributes:
         starts: searches from different start points.
@@ -93,9 +93,9 @@ class FidelityFacts:
         return self.chunk if isinstance(self.chunk, int) else self.chunk[accelerator]
 
     def filled(self, runs: int) -> int:
-        """Number of runs that a batch is padded to, so that small batches share a program.
+        """Number of runs to which a batch is padded, so that small batches share a compiled program.
 
-        Computing padded steady runs takes less time than compiling another program.
+        Computing the additional steady runs takes less time than compiling another program.
         """
         return runs if self.rollout else max(runs, FEW)
 

@@ -121,9 +121,8 @@ _norm = functools.partial(error_norm, own=len(_UNITS))
 
 
 def drive_start(robot: Robot, conditions: Conditions, rolling: bool = False) -> Unknowns:
-    """Unknowns at rest. With `rolling`, those of the steady fidelity, with settled memories of effects.
-
-    At rest too if the steady fidelity has no solution.
+    """Unknowns at rest. With `rolling`, the unknowns of steady travel, with settled memories of effects. If there is
+    no steady travel, the unknowns at rest.
     """
     size = jnp.asarray(drive_units(robot), jnp.result_type(conditions.voltage))
     load = robot.chassis(conditions.configuration)
@@ -365,7 +364,7 @@ def _standstill_cautions(robot: Robot, conditions: Conditions) -> list[str]:
     if not rows:
         return []
     return [
-        f"rows {rows}: computed from a rolling start; from standstill the calibrated robot does not settle there "
+        f"rows {rows}: computed from a rolling start. From standstill, the calibrated robot does not settle there "
         f"within {TIME_SETTLED:g} s, because it starts by sliding at μ_d"
     ]
 

@@ -174,7 +174,7 @@ def _unit_vector_of_current(y: Unknowns) -> Unknowns:
 
 
 class CurrentLag(eqx.Module):
-    """Difference of a current from its settled value after a voltage jump. It decays within a step.
+    """Difference of a current from its settled value after a jump of the voltage, which decays within a step.
 
     Attributes:
         begin, end: difference at the begin and end of a step.

@@ -59,7 +59,7 @@ def result_of_signals(robot: Robot, signals: Signals, status: Int[Array, "..."])
 
 
 def mask_unknown(robot: Robot, found: Result) -> Result:
-    """`found` with NaN in numbers that depend on unknown parameters of a robot."""
+    """Copy of `found` in which numbers that depend on unknown parameters of the robot are NaN."""
     unknown = [output.name for output in outputs.FURTHER if not robot.knows(output.rests_on)]
     nan: dict[str, Any] = {name: jnp.full_like(getattr(found, name), jnp.nan) for name in unknown}
     return dataclasses.replace(found, **nan)
@@ -93,7 +93,9 @@ def flag_mask(over: Mapping[str, Scalar]) -> Array:
 
 
 def travel_status(speed: Scalar, voltage: Scalar) -> Array:
-    """Status of steady travel at `speed` under a motor `voltage`: driven by the motors or by gravity."""
+    """Status of steady travel at `speed` under a motor `voltage`, which distinguishes motion driven by the motors
+    from motion driven by gravity.
+    """
     backward = jnp.asarray(speed) < 0
     has_asked_sign = jnp.where(backward, jnp.asarray(voltage) < 0, jnp.asarray(voltage) >= 0)
     return jnp.where(has_asked_sign, jnp.where(backward, REVERSES, CONVERGED), ROLLS_BACK)

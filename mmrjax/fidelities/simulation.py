@@ -31,7 +31,7 @@ from mmrjax.model.signals import CODES
 STRAIGHT = "the robot's sides differ, but the runs state nothing for each side: they travel straight, as if steered"
 #: Error message for reverse mode through a fidelity that does not support it.
 FORWARD_ALONE = (
-    "derivatives are forward (jax.jacfwd, jax.jvp); for jax.grad use model steady, or mmrjax.step for runs over time"
+    "derivatives are forward (jax.jacfwd, jax.jvp). For jax.grad use model steady, or mmrjax.step for runs over time"
 )
 STATUS, _ = CODES
 

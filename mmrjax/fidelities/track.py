@@ -352,7 +352,7 @@ def _stiffness_cautions(robot: Robot, conditions: Conditions) -> list[str]:
         return []
     return [
         f"rows {rows}: the track model's step of {STEP:g} s is above the largest stable one of the calibrated robot, "
-        f"{limits.min():.2g} s; do not trust its readings there: contacts or belt are too stiff"
+        f"{limits.min():.2g} s. Do not trust its readings there: contacts or belt are too stiff"
     ]
 
 

@@ -72,7 +72,7 @@ class Totals(eqx.Module):
     def unaccounted(self) -> Scalar:
         """Energy taken, minus losses and stored energy [J]: the error of the integration.
 
-        The energy of a battery follows from its charge alone, so an error of the charge shows too.
+        The energy of a battery is computed from its charge, so this error also includes errors of the charge.
         """
         return self.given - sum(self.of[name] for name in energy.SINKS) - self.stored
 

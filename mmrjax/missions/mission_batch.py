@@ -102,7 +102,7 @@ def mission_numbers(robot: Robot, conditions: Conditions, found: Mission) -> dic
 
     State of charge, endurance and range refer to the on-board battery. Endurance is the time from the charge at the
     start until the battery is empty, at the mean current of the mission. Range is the distance in that time. Both are
-    exact if the battery becomes empty within the mission. They neglect that a demanded speed takes more current as
+    exact if the battery becomes empty during the mission. They neglect that a demanded speed takes more current as
     the voltage falls.
     """
     on_battery, capacity = conditions.battery > 0.5, robot.battery.capacity

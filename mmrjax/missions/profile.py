@@ -90,7 +90,7 @@ class Profile(eqx.Module):
 
     @property
     def stated(self) -> tuple[str, ...]:
-        """Names of the conditions that it states."""
+        """Names of the conditions that the profile states."""
         return tuple(name for name in CONDITIONS if getattr(self, name) is not None)
 
     @property

@@ -215,8 +215,9 @@ def charge_drawn(robot: Robot, conditions: Conditions, total_current: Scalar) ->
 def electrical(robot: Robot, conditions: Conditions, signals: Signals) -> Signals:
     """Voltage available to change the current [V].
 
-    With an imposed speed, the voltage that the speed needs. With an imposed current, the voltage of an amplifier that
-    brings the current to its set value within the winding's time constant.
+    With an imposed speed, the voltage that this speed needs. With an
+    imposed current, the voltage of an amplifier that brings the current to its set value within the winding's time
+    constant.
     """
     back = robot.motor.voltage_back(signals.speed_motor)
     drop = robot.motor.voltage_winding(signals.current, signals.temperature) + effects_sum(
@@ -670,7 +671,7 @@ def stance(robot: Robot, conditions: Conditions, chassis: Chassis, mass: Scalar)
 
 
 def states_of_sides(robot: Robot, conditions: Conditions, motion: PlaneMotion) -> State:
-    """States of left and right side, a leading axis of 2: each travels at V_s = v_x - ω y_s."""
+    """States of left and right side, with a leading axis of 2. Each side travels at V_s = v_x - ω y_s."""
     speed = motion.speed - motion.yaw_rate * SIDES * robot.chassis(conditions.configuration).turning.width
     none, drawn = jnp.zeros_like(speed), jnp.broadcast_to(motion.discharge, speed.shape)
     return State(motion.current, motion.speed_motor, speed, drawn, motion.memory, motion.temperature, distance=none)

@@ -48,7 +48,7 @@ class Controller(eqx.Module):
     supply_voltage: float = eqx.field(default=0.0, static=True)
 
     def duty(self, error: Scalar, integral: Scalar, speed: Scalar, goal: Scalar) -> Scalar:
-        """Duty [-] within the limit.
+        """Duty that the controller demands [-], within its limit.
 
         Args:
             error: e [rad, rad/s or A].

@@ -16,8 +16,8 @@ class Gearbox(eqx.Module):
     """M_r = i η_rm (M_d - M_rf_idle) with M_rf_idle = M_rf0 sign ω + K_fr ω.
 
     Driven from the output (overhauling), the load loss changes direction: M_r = (i / η_b) (M_d - M_rf_idle) with the
-    efficiency η_b of `efficiency_backward`. The paper leaves it out because its robot never coasts, without it a
-    descent would gain energy.
+    efficiency η_b of `efficiency_backward`. The paper leaves it out because its robot never coasts. Without it, a
+    robot would gain energy on a descent.
 
     Attributes:
         mesh_theory: True: η_b = 2 - 1/η_rm, the theory of the mesh. False: η_b = η_rm.

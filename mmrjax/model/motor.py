@@ -96,7 +96,7 @@ class Motor(eqx.Module):
 
     @property
     def resistance_thermal(self) -> Scalar:
-        """Thermal resistance winding to ambient [K/W]."""
+        """Thermal resistance from the winding to ambient [K/W]."""
         return self.resistance_thermal_winding + self.resistance_thermal_housing
 
     def temperature_cold(self, current: Scalar) -> Scalar:
@@ -106,7 +106,7 @@ class Motor(eqx.Module):
     def temperature_settled(self, current: Scalar) -> Scalar:
         """Winding temperature after long running at `current` [°C], with the rise of its resistance.
 
-        T = T_a + R_th R I² (1 + α (T - 25 °C)). It is inf from R_th R I² α = 1 on.
+        T = T_a + R_th R I² (1 + α (T - 25 °C)). It is inf if R_th R I² α >= 1.
         """
         rise = self.resistance_thermal * self.resistance * current**2
         heating_left = 1 - self.temperature_coefficient * rise

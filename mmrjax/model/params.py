@@ -68,7 +68,7 @@ def parameter(
     """Declares a differentiable scalar of a component. See `Spec` for the arguments.
 
     Args:
-        default: value of a component that does not state it. None: it has to.
+        default: value if the component does not state one. None: the component has to state it.
     """
     if (relative_sd is None) == (sd is None):
         raise ValueError("a parameter states either relative_sd or sd")

@@ -140,7 +140,7 @@ class Quantity:
 
     @functools.cached_property
     def sizes(self) -> dict[str, float]:
-        """SI value of each unit that its column names may state, its own unit first. Slopes cannot be in per cent."""
+        """SI value of each unit that its column names may state, its own unit first. Slopes cannot be in percent."""
         alike: Mapping[str, float] = next((units for units in DIMENSIONS if self.unit in units), {})
         share = {PERCENT: 1e-2} if self.percent and self.unit != "deg" else {}
         return {self.unit: self.factor} | {u: size for u, size in alike.items() if u != self.unit} | share
@@ -177,7 +177,7 @@ class Quantity:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Condition(Quantity):
-    """A quantity that is set from outside before a run starts.
+    """A quantity that the user sets before a run starts.
 
     Attributes:
         field: field of `Conditions`, by default its name, or empty.

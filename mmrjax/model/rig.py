@@ -1,4 +1,4 @@
-"""Rig: the inputs imposed on a robot's drives, and the instruments that measure it."""
+"""Rig: the inputs imposed on a robot's drives, and the instruments that measure the robot."""
 
 from __future__ import annotations
 

@@ -171,7 +171,7 @@ class Robot(eqx.Module):
 
     @property
     def loose(self) -> bool:
-        """True if its load turns apart from the motor, by a backlash or an elastic joint."""
+        """True if its load can turn relative to the motor, because of a backlash or an elastic joint."""
         return self.rig.loose
 
     @property

@@ -56,8 +56,7 @@ def _quotient(a: Entry, b: Entry) -> Entry:
 def factorise(matrix: Matrix) -> Factors:
     """LU factors of a small matrix by Gaussian elimination, unrolled.
 
-    There is no pivoting: the first unknown needs a pivot in the first equation, and so on, as if each equation
-    is listed in the order of the unknown that it determines. Not finite if a pivot vanishes.
+    There is no pivoting, so equation k has to determine unknown k. Not finite if a pivot vanishes.
     """
     rows = [list(row) for row in matrix]
     n = len(rows)

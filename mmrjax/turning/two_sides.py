@@ -80,7 +80,7 @@ class Turning(eqx.Module):
 
 
 class Stance(eqx.Module):
-    """Position of a robot on its contacts, and parameters of these.
+    """Position of a robot on its contacts, and parameters of the contacts.
 
     Attributes:
         length: length of the contact, or wheelbase [m].
@@ -175,7 +175,7 @@ class ContactLaw(eqx.Module):
         return jnp.sqrt((square + STILL) / (weighed + STILL)) * self.friction.per_speed(square)
 
     def per_speed_rise(self, along: Scalar, across: Scalar) -> tuple[Scalar, Scalar]:
-        """Derivatives of `force_per_sliding_speed` with respect to the squares of the sliding speeds [s³/m³]."""
+        """Derivatives of `per_speed` with respect to the squares of the sliding speeds [s³/m³]."""
         square, weighed = along + across, along + self.ratio * across
         direction_gain, friction_per_speed = (
             jnp.sqrt((square + STILL) / (weighed + STILL)),

@@ -101,7 +101,10 @@ def _effect_lines(name: str, library: Library) -> Iterator[Line]:
     example = effect()
     for p in params.walk_parameters(example):
         if p.spec.amplitude:
-            yield "typical size", f"{p.spec.prior_sd(0.0):g} {p.spec.unit} ({p.spec.meaning}; {p.spec.source})"
+            yield (
+                "typical size",
+                f"{p.spec.prior_sd(0.0):g} {p.spec.unit} ({p.spec.meaning}. Source: {p.spec.source})",
+            )
             yield "bounds", _bounds_text(p.spec)
         else:
             yield f"  {p.name}", f"{float(p.value):g} {p.spec.unit}: {p.spec.meaning}"
@@ -119,8 +122,8 @@ def _effect_lines(name: str, library: Library) -> Iterator[Line]:
 
 def _histories_sentence(effect: type[Effect]) -> str:
     if effect.transient:
-        return "; visible only in time histories, not in settled runs"
-    return f"; settled runs cannot distinguish it from {effect.settles_to}" if effect.settles_to else ""
+        return ". It is visible only in time histories, not in settled runs"
+    return f". Settled runs cannot distinguish it from {effect.settles_to}" if effect.settles_to else ""
 
 
 def _change_sentences(effect: Effect) -> Iterator[str]:
@@ -150,7 +153,7 @@ def _change_sentences(effect: Effect) -> Iterator[str]:
                 shares[c.label] = 100 * (after / before - 1)
         if any(abs(x) > 5e-3 for x in shares.values()):
             changes = ", ".join(f"{label} {x:+.2g} %" for label, x in shares.items())
-            yield f"change for one typical size, for {name} at 24 V, 5°, 3 kg: {changes}"
+            yield f"change of the readings at its typical size ({name}, 24 V, 5°, 3 kg): {changes}"
 
 
 def _status_lines(name: str, library: Library) -> Iterator[Line]:
@@ -184,7 +187,7 @@ def _channel_lines(name: str, library: Library) -> Iterator[Line]:
     yield "column", f"{c.column}, its standard deviation {c.sd_column}, {low:g} to {high:g}"
     if c.other_units:
         yield "other units", ", ".join(c.other_units)
-    yield "typical noise", f"{100 * c.sd_share:g} % of the reading, assumed if none is stated"
+    yield "typical noise", f"{100 * c.sd_share:g} % of the reading, which is assumed if you give no noise"
     yield "shows in", " and ".join(["settled runs"] * c.settled + ["histories"] * c.over_time)
     wrong = [e for e in library.values() if e.channel == c.name and e.name not in effects.UNNAMED]
     if wrong:
@@ -234,7 +237,7 @@ def _parameter_lines(name: str, library: Library) -> Iterator[Line]:
         return
     spec = parameter.spec
     yield "means", f"{spec.meaning} [{spec.unit}]"
-    yield "nominal", f"{float(parameter.value):g} {spec.unit}; {spec.source}"
+    yield "nominal", f"{float(parameter.value):g} {spec.unit}. Source: {spec.source}"
     yield "prior", _prior_text(parameter)
     yield "bounds", _bounds_text(spec)
     first = name.partition(".")[0]
@@ -273,7 +276,9 @@ EXPLAINED: dict[str, Explain] = {
     "verdict of a climb": _explain_by_table(
         {name: meaning for name, (_, meaning) in VERDICTS.items()}, "verdict of result.json of mmrjax climb"
     ),
-    "flag": _explain_by_table(words.FLAGS, "column flags of runs.csv, counts in result.json; a run may have several"),
+    "flag": _explain_by_table(
+        words.FLAGS, "column flags of runs.csv, counts in result.json. A run may have several flags"
+    ),
     "channel": _channel_lines,
     "output": _output_lines,
     "parameter": _parameter_lines,

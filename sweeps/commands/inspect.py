@@ -33,7 +33,7 @@ def inspect_file(file: str, as_json: bool) -> int:
         numbers = "".join(f",{key}=..." for key in presets_file.numbers_to_state(source.preset))
         proposals.append(f"Its columns match the preset {source.preset}: add --columns {source.preset}{numbers}")
     if source.proposed:
-        proposals.append("\n".join(["Proposal for the robot's file; check it:", "[columns]", *source.proposed]))
+        proposals.append("\n".join(["Proposal for the robot's file, to be checked:", "[columns]", *source.proposed]))
     answer = f"{source.name}: {source.kind}, {count_noun(len(source.signals), 'signal')}"
     notes = (Note(text, terminal=True) for text in proposals)
     print_document(Document(source.name, answer, (Table("signals", heads, rows), *remarks(said), *notes)))

@@ -101,7 +101,7 @@ def _run_loop(config: configuration.Loop, beside: configuration.LoopBeside, robo
             if name == "ranking":
                 _show_ranking(stages[name], folder, timed, brief=not beside.verbose)
             if name == "verdict":
-                timed(f"{loop_words.verdict_line(stages[name])}; next: held-out errors and other noise levels")
+                timed(f"{loop_words.verdict_line(stages[name])}. Next: held-out errors and other noise levels")
             return result
 
         try:
@@ -188,12 +188,12 @@ def _report_stored_stages(stages: Mapping[str, Any], folder: RunFolder, robot_na
         return
     stored_stages = [name for name in stages if folder.keeps(name)]
     if not stored_stages:
-        print_message(f"{', '.join(stages)} could not be saved; the same command starts from the beginning")
+        print_message(f"{', '.join(stages)} could not be saved. The same command starts from the beginning")
         return
-    print_message(f"kept: {', '.join(stored_stages)}; to continue, run the same command with --out {folder.path}")
+    print_message(f"kept: {', '.join(stored_stages)}. To continue, run the same command with --out {folder.path}")
     if "verdict" in stages:
         traced = stages["verdict"]
-        print_message(f"{loop_words.verdict_line(traced)}; held-out errors and other noise levels are still missing")
+        print_message(f"{loop_words.verdict_line(traced)}. Held-out errors and other noise levels are still missing")
         return
     if "ranking" in stages:
         for line in (*loop_words.ranking_lines(stages["ranking"]), loop_words.regression_verdict(stages["ranking"])):
@@ -204,13 +204,13 @@ def _report_stored_stages(stages: Mapping[str, Any], folder: RunFolder, robot_na
     searches = [search for name, search in stages.items() if name.startswith("search")]
     if searches and (best := searches[-1][2].best) is not None:
         library = searches[-1][0].base.space.library
-        print_message(loop_words.so_far(best.effects, [library[n].family() for n in best.effects]))
+        print_message(loop_words.search_progress(best.effects, [library[n].family() for n in best.effects]))
     if "base" not in stages:
         return
     base = stages["base"][0].base
     robot = findings.proposed_robot(base.space, base.candidate)
     robot_file.write_robot(
-        robot, folder.partial / REFIT_FILE, note=f"{robot_name}, fitted; the loop has no verdict yet"
+        robot, folder.partial / REFIT_FILE, note=f"{robot_name}, fitted. The loop has no verdict yet"
     )
     print_message(f"the best result so far is the refit, {folder.partial / REFIT_FILE}")
 

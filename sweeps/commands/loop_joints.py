@@ -309,7 +309,7 @@ def _row(joint: str, place: Path) -> tuple[str, str, str, str]:
     if not (place / "result.json").is_file():
         ranked = place.with_name(f"{joint}.partial") / store.SCREENING_FILE
         answer = json.loads(ranked.read_text(encoding="utf-8"))["answer"] if ranked.is_file() else ""
-        return joint, f"no verdict in time; the same command continues; {answer}.", "", ""
+        return joint, f"no verdict in time. The same command continues. So far: {answer}.", "", ""
     result: Mapping = json.loads((place / "result.json").read_text(encoding="utf-8"))
     held_out = (result["errors"][fit]["held_out"] for fit in ("before", "after"))
     percent = [next(iter(x.values()))["rms_percent"] if x else None for x in held_out]  # of the current

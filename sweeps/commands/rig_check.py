@@ -96,21 +96,21 @@ class RigCheck:
         notes = []
         if self.robot.rig.inherits:
             notes.append(
-                'values missing in the file come from its base, a packaged robot; base = "none" prevents this'
+                'values missing in the file come from its base, a packaged robot. Set base = "none" to prevent this'
             )
         if self.examples:
             lines = ", ".join(map(str, self.examples))
             count = count_noun(len(self.examples), "line")
             wide = f"a fit widens each ± among them to {100 * EXAMPLE_SHARE:g} %"
-            notes.append(f"{count} with the template's example number ({EXAMPLE}): {lines}; {wide}")
+            notes.append(f"{count} with the template's example number ({EXAMPLE}): {lines}. {wide}")
         if self.unmarked:
             lines = ", ".join(map(str, self.unmarked))
             count = count_noun(len(self.unmarked), "line")
-            notes.append(f"{count} with a number equal to the template's example: {lines}; check that it is yours")
+            notes.append(f"{count} with a number equal to the template's example: {lines}. Check that it is yours")
         notes += self.doubts
         if self.runs is not None and self.runs.has("duty") and self.runs.has("total_current_A"):
             notes.append(
-                "with a duty, total_current is the supply current: duty times the motor current; a sensor in the "
+                "with a duty, total_current is the supply current: duty times the motor current. A sensor in the "
                 "motor leads measures motor_current"
             )
         notes += [f"{fact.what} {fact.value}: {fact.odd}" for fact in self.facts if fact.odd]
@@ -187,15 +187,15 @@ class RigCheck:
             return []
         names_by_column = {c.column: c.name for c in channels.EVERY}
         notes = [
-            f"{name}: not one of the rig's channels; to use it, add {names_by_column[name]} to channels in the rig's "
+            f"{name}: not one of the rig's channels. To use it, add {names_by_column[name]} to channels in the rig's "
             "file"
             for name in self.runs.unknown
             if name in names_by_column
         ]
         others = [name for name in self.runs.unknown if name not in names_by_column]
         without = (
-            f"{', '.join(others)}: without a role, so residuals are tested for differences between their values; "
-            "if one has a role, name it under "
+            f"{', '.join(others)}: without a role, so residuals are tested for differences between their values. "
+            "If one has a role, name it under "
         )
         without += "[columns] in the rig's file"
         return [*notes, *([without] if others else [])]
@@ -385,7 +385,7 @@ def _data_blocks(found: RigCheck, runs: Runs, seen: InformationForecast) -> tupl
     ]
     if others:
         notes_of_data.append(
-            f"with the numbers of the file, some rows have no steady state ({', '.join(others)}); these are not "
+            f"with the numbers of the file, some rows have no steady state ({', '.join(others)}). These are not "
             "counted"
         )
     determined = [

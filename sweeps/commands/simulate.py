@@ -218,7 +218,7 @@ def run_remarks(robot: Robot, table: Columns) -> list[str]:
         if "overvoltage" in flags:
             back = -float(robot.battery.current(table["total_current_A"][k]))
             remarks.append(
-                f"{name}overvoltage: {back:.2f} A flow into the battery, a cell at {cell:.2f} V; the highest "
+                f"{name}overvoltage: {back:.2f} A flow into the battery, a cell at {cell:.2f} V. The highest "
                 f"charging voltage is {robot.battery.voltage_charge:g} V"
             )
         if "cut_off" in flags:
@@ -236,13 +236,13 @@ def run_remarks(robot: Robot, table: Columns) -> list[str]:
             current = float(motor_currents(robot, table)[k])
             remarks.append(
                 f"{name}winding, long running: {words.NONE_SETTLES} at {current:.2f} A per motor, because the "
-                "resistance rises faster than heat is removed; the permissible current is "
+                "resistance rises faster than heat is removed. The permissible current is "
                 f"{float(robot.current_continuous):.2f} A"
             )
         if status == "battery_empty" and "time_end_s" in table:
             when, far = float(table["time_end_s"][k]), float(table["displacement_m"][k])
             remarks.append(
-                f"{name}battery_empty: after {when:.1f} s and {far:.2f} m; values are those just before"
+                f"{name}battery_empty: after {when:.1f} s and {far:.2f} m. Values are those just before"
                 if when > 0
                 else f"{name}battery_empty: empty before the start"
             )

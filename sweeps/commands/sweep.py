@@ -26,7 +26,7 @@ from sweeps.pages import words
 from sweeps.points import axes, grid, run, scale, uncertainty
 from sweeps.points.job import prepare_job, showing_turns, store_layout
 from sweeps.points.sampled_design import Blocks
-from sweeps.points.tasks import task_of
+from sweeps.points.tasks import task_of_configuration
 from sweeps.points.zarr_store import STORE, Done, Identity, Layout, SweepStore, job_identity
 from sweeps.report import campaign_report, sweep_report
 from sweeps.report.document import Column, Table
@@ -58,8 +58,8 @@ def execute(config: Campaign | Sweep, options: StoreOptions) -> int:
     count = math.prod(map(len, grid.grid_axes(resolved, file.robot, config.battery).values()))
     small = not options.of_store and (count <= TABLE or config.posterior is not None)
     if not options.of_store and not small:
-        print_message(f"{count:,} points: too many for runs.csv (limit {TABLE:,}), so results go to {STORE}; "
-             "add --export csv to get a CSV as well")  # fmt: skip
+        print_message(f"{count:,} points: too many for runs.csv (limit {TABLE:,}), so results go to {STORE}. "
+             "Add --export csv to get a CSV as well")  # fmt: skip
     for note in notes:
         print_message(note)
     if small:
@@ -95,7 +95,7 @@ def _sweep_into_store(config: Campaign, file: RobotFile, options: StoreOptions) 
         pool = cluster.connect_workers(options.scheduler)
     try:
         device = scale.device_kind() if pool is None else pool.device
-        task = task_of(config, robot)
+        task = task_of_configuration(config, robot)
         output_names = options.outputs or config.outputs or task.usual
         chunk = config.chunk or scale.default_chunk(task, None if pool is None else device)
         config = config.model_copy(update={"chunk": chunk, "outputs": output_names})
@@ -150,7 +150,7 @@ def dry_run(job: scale.Job, layout: Layout, path: Path) -> None:
         "chunks": f"{len(blocks):,} of {blocks.points:,} points on {compiled.mesh.size} x {scale.device_kind()}",
         "store": f"{bytes_text(layout.size)} (uncompressed); free {bytes_text(free)} in {_existing_parent(path)}",
         "time": f"about {duration_text(seconds * blocks.points * len(blocks))} once compiled, "
-        f"{1 / seconds:,.0f} points/s (timed here on {compiled.size:,} points); compiling "
+        f"{1 / seconds:,.0f} points/s (timed here on {compiled.size:,} points). Compiling "
         f"{duration_text(max(spent[0] - spent[1], 0.0))}",
     }
     print_table(Table("dry-run", (Column("a sweep of"), Column("")), list(rows.items())))
@@ -241,7 +241,7 @@ def simulate_chunks(store: SweepStore, job: scale.Job, options: StoreOptions, po
             raise
         written = len(store.done())
         raise DiskFull(
-            f"{store.partial}: {error.strerror} after {written} of {len(job.blocks)} chunks; free some space, and "
+            f"{store.partial}: {error.strerror} after {written} of {len(job.blocks)} chunks. Free some space, and "
             "the same command resumes from there"
         ) from error
 
@@ -277,7 +277,7 @@ def finish_sweep(
                 )
     done = store.done()
     if not store.finished:
-        print_output(f"{len(done)} of {len(job.blocks)} chunks of {store.partial} are finished; the last share, "
+        print_output(f"{len(done)} of {len(job.blocks)} chunks of {store.partial} are finished. The last share, "
                      "or the same command without --shard, completes the sweep")  # fmt: skip
         return DONE
     if options.export:

@@ -111,7 +111,7 @@ def fates_in_actuator(joint: DriveJoint) -> list[EffectFate]:
     if joint.loose:
         fates.append(EffectFate(PLAY, HELD, "states of the law: gap, and speed of the motor's side"))
     if joint.controller is not None:
-        fates.append(EffectFate(CONTROLLER, HELD, "functions of the law; the command is its goal"))
+        fates.append(EffectFate(CONTROLLER, HELD, "functions of the law. The command is its goal"))
     if joint.limit is not None:
         fates.append(EffectFate("current limit of the driver", HELD, "a bound of the current"))
     return [*fates, *fates_outside_joint(joint)]

@@ -176,7 +176,7 @@ def fates_in_mujoco(joint: DriveJoint, normal: float) -> list[EffectFate]:
         fates.append(
             EffectFate(
                 "gearbox losses proportional to the load", APPROXIMATED,
-                "resistance / η and current = act / η: exact while power flows to the load; while it flows back "
+                "resistance / η and current = act / η: exact while power flows to the load. While it flows back "
                 "(gravity, a heavy load that stops), the joint is braked less than in reality",
             )
         )  # fmt: skip
@@ -220,7 +220,7 @@ def fates_outside_joint(joint: DriveJoint) -> list[EffectFate]:
     place_by_effect = {
         "sensor": "an instrument error, not part of the drive",
         "supply": "the battery; the command is a voltage, so reduce it accordingly",
-        "mass": "the mass of the robot; set it in the simulator's model",
+        "mass": "the mass of the robot. Set it in the simulator's model",
     }
     other = "a property of the ground, which the simulator's contact model must provide"
     return [EffectFate(e.name, DROPPED, place_by_effect.get(e.balance, other)) for e in joint.outside]

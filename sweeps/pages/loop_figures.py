@@ -435,7 +435,7 @@ def draw_effect_laws(found: DiscoveryResult, table: Columns, changes: Mapping[st
     return fig
 
 
-def defects_of(table: Columns, when: str, balance: str) -> Columns:
+def defects_by_side(table: Columns, when: str, balance: str) -> Columns:
     """Defects of a balance by side. The side's name is empty if both sides are the same."""
     sides = {side: f"defect_{when}_{balance}{'_' * bool(side)}{side}" for side in ("", *SIDES)}
     return {side: table[column] for side, column in sides.items() if column in table}
@@ -444,7 +444,7 @@ def defects_of(table: Columns, when: str, balance: str) -> Columns:
 def closed_equations(table: Columns) -> list[str]:
     """Equations that the readings close: those with a defect somewhere, at least one."""
     balances = [
-        b for b in DEFECT_WORDS if any(np.nan_to_num(x).any() for x in defects_of(table, "before", b).values())
+        b for b in DEFECT_WORDS if any(np.nan_to_num(x).any() for x in defects_by_side(table, "before", b).values())
     ]
     return balances or ["track"]
 
@@ -476,7 +476,7 @@ def draw_defects(table: Columns, verdict: str, crosses_zero: bool = False) -> Fi
     for row, when in enumerate(whens):
         for axes, (balance, (words, unit, column, of_what)) in zip(grid[row], panels.items(), strict=True):
             balance_words = RIG_WORDS.get(balance, words) if crosses_zero else words
-            by_side = defects_of(table, when, balance)
+            by_side = defects_by_side(table, when, balance)
             names = [(name, side) for name in dict.fromkeys(table["configuration"]) for side in by_side]
             axes.axhline(0, color=FAINT, lw=0.8)
             for (name, side), (colour, marker) in zip(
@@ -531,7 +531,7 @@ def draw_parameter_shifts(found: DiscoveryResult) -> Figure:
     axes.invert_yaxis()
     axes.grid(axis="y", visible=False)
     axes.set(xlabel="shift from the prior [prior sds]")
-    axes.set_title("orange: before, blue: after; a large shift probably absorbs a missing effect")
+    axes.set_title("orange: before, blue: after. A large shift probably absorbs a missing effect")
     return fig
 
 

@@ -46,7 +46,7 @@ VERDICT, LARGEST = "verdict", "largest_mm"
 OUTPUTS: dict[str, tuple[str, str]] = {
     VERDICT: (
         "",
-        "result of the climb; for a search, result for the smallest obstacle that the robot does not get over",
+        "result of the climb. For a search, result for the smallest obstacle that the robot does not get over",
     ),
     LARGEST: ("mm", "largest got over"),
     "time_s": ("s", "time to the verdict"),

@@ -99,7 +99,7 @@ def imposed_levels(robot: Robot, option: str, notes: list[str] | None = None) ->
     if notes is not None:
         level_text = ",".join(f"{v:g}" for v in levels)
         notes.append(
-            f"{option}: not given; thirds of the {_robot_phrase(robot)} in the robot's file are used: {level_text}"
+            f"{option}: not given. Thirds of the {_robot_phrase(robot)} in the robot's file are used: {level_text}"
         )
     return levels
 

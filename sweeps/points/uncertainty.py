@@ -61,7 +61,7 @@ def simulate_draws(
         For every output's column its sd and the ends of its 95 % interval, NaN where fewer than two draws converge.
     """
     samples = DrawnSamples(tuple(posterior.names), posterior.draw(draws, SEED).T)
-    job = run.job_of(robot, runs, config, samples)
+    job = run.job_of_run_table(robot, runs, config, samples)
     slow = fidelities.fidelity_facts(config.model).slow or draws * len(runs) > 100_000
 
     def summary(found: run.Table) -> run.Table:
@@ -110,12 +110,12 @@ def interval_ranges(table: Columns, found: Intervals) -> list[str]:
 def interval_remarks(found: Intervals, place: str = "runs.csv") -> list[str]:
     """Number of robots that were drawn, and how many of them do not converge at how many runs, if some do not."""
     is_incomplete = found.columns[SHARE] < 1
-    remarks = [f"± one sd over {found.draws} robots drawn from the posterior; 95 % intervals are in {place}"]
+    remarks = [f"± one sd over {found.draws} robots drawn from the posterior. 95 % intervals are in {place}"]
     if is_incomplete.any():
         share = 100 * (1 - found.columns[SHARE].min())
         remarks.append(
             f"in {int(is_incomplete.sum())} of {len(is_incomplete)} runs, some draws do not converge (up to "
-            f"{share:.0f} %); intervals use the others"
+            f"{share:.0f} %). Intervals use the others"
         )
     return remarks
 

@@ -365,7 +365,7 @@ class SweepStore(Folder):
     def _mend_layout(self) -> None:
         """Write what is damaged of metadata and axes anew, with a note."""
         for file, content in self._altered(self.partial).items():
-            print_message(f"{file}: damaged; written again")
+            print_message(f"{file}: damaged, so it is written again")
             file.parent.mkdir(parents=True, exist_ok=True)
             write_file(file, content, self._aside)
 
@@ -430,7 +430,7 @@ class SweepStore(Folder):
                 self._sound[chunk] = sound
             elif chunk not in self._damaged and not self.finished:
                 self._damaged.add(chunk)
-                print_message(f"{self._wrong_file(records[-1])}: damaged; computed again")
+                print_message(f"{self._wrong_file(records[-1])}: damaged, so it is computed again")
         return dict(sorted(self._sound.items()))
 
     def _records(self) -> dict[int, list[Done]]:

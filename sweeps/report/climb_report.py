@@ -32,7 +32,7 @@ VERDICTS: dict[str, tuple[str, str]] = {
     "stalls": ("stalls", "the robot and its tracks stop: the motors cannot turn the tracks"),
     "slides": ("slides", "the robot stops while its tracks slip: the ground has too little grip"),
     "hangs": ("hangs", "the robot stops with its body on an edge, or has fallen into a gap"),
-    "unfinished": ("is under way", "the robot was still moving when the time ended; use a longer --duration"),
+    "unfinished": ("is under way", "the robot was still moving when the time ended. Use a longer --duration"),
     "failed": ("failed", "the simulation broke down, or the levers would start below the ground"),
 }
 
@@ -204,7 +204,7 @@ class ClimbResult:
         if self.sought:
             if self.largest is None:
                 smallest = min(size for size, _ in self.tried)
-                return f"It cannot climb any {self.sought} that was tried; the smallest was {smallest:.0f} mm."
+                return f"It cannot climb any {self.sought} that was tried. The smallest was {smallest:.0f} mm."
             beyond = [(s, v) for s, v in self.tried if s > self.largest]
             least = min(beyond, default=None)
             why = "" if least is None else f"; at {least[0]:.0f} mm it {VERDICTS[least[1]][0]}"
@@ -261,10 +261,10 @@ SHOWN = ("margin_success", "crest_time_s", "crest_energy_J", "crest_current_rms_
 
 def climb_document(found: ClimbResult, file: RobotFile) -> Document:
     """The report of a climb."""
-    lead = f"**{found.configuration}**; {found.obstacle}, approached at a right angle."
+    lead = f"**{found.configuration}**, {found.obstacle}, approached at a right angle."
     tried = ", ".join(f"{size:g} mm {VERDICTS[verdict][0]}" for size, verdict in found.tried)
     blocks: tuple[Block, ...] = (
-        run_tables.lead_note(file, more=lead),
+        run_tables.note_on_robot(file, more=lead),
         catalogue.figure("climb.silhouettes", found),
         catalogue.figure("climb.course", found),
     )

@@ -95,7 +95,7 @@ def missions_document(file: RobotFile, found: Missions) -> Document:
     between = "linear" if source.linear else "held"
     lead = (
         f"Profile **{source.source}**: {source.duration:g} s{cycles}, {count_noun(source.segment_count, 'segment')}"
-        f"{per_cycle}, values {between} between rows; fed by its {fed}."
+        f"{per_cycle}, values {between} between rows. Its {fed} supplies it."
     )
     detail = f"In detail the first of {len(names)} runs: **{names[0]}**." if len(names) > 1 else ""
     runs = run_tables.quantity_table(
@@ -107,7 +107,7 @@ def missions_document(file: RobotFile, found: Missions) -> Document:
         f"Mission {source.source}" + ("" if len(names) > 1 else f" of {names[0]}"),
         answer,
         (
-            run_tables.lead_note(file, more=detail),
+            run_tables.note_on_robot(file, more=detail),
             Note(lead, terminal=True),
             *remarks(_exceeded_limits(found), "flags"),
             runs,
@@ -147,7 +147,7 @@ def _sections(robot: Robot, found: Missions, first: Json, answer: str) -> Iterab
         )
     back, on_battery = float(first["energy_returned_Wh"]), bool(np.isfinite(first["state_of_charge"]))
     returned = f"{back:.3g} Wh returned to the source." if back > 1e-6 * first["energy_drawn_Wh"] else (
-        f"{_NO_RETURN}; driven motors first supply the other consumers." if on_battery else f"{_NO_RETURN}."
+        f"{_NO_RETURN}. Driven motors first supply the other consumers." if on_battery else f"{_NO_RETURN}."
     )  # fmt: skip
     source_name = "battery's charge" if on_battery else "supply", returned, abs(first["unaccounted_share"])
     energy = catalogue.figure(

@@ -304,7 +304,7 @@ def span_text(low: float, high: float, unit: float = MM) -> str:
     return ends[0] if ends[0] == ends[1] else f"{ends[0]}-{ends[1]}"
 
 
-_FEW = "travels, but fewer than {} {} passed while ripple was measured; use a longer --duration"
+_FEW = "travels, but fewer than {} {} passed while ripple was measured. Use a longer --duration"
 #: Most peaks that are shown unfolded.
 UNFOLDED = 30
 
@@ -329,7 +329,7 @@ def resonance_document(found: ResonanceResult, file: RobotFile) -> Document:
         "Which speeds to avoid",
         first,
         (
-            run_tables.lead_note(file, "track", lead),
+            run_tables.note_on_robot(file, "track", lead),
             *remarks(others),
             figure if found.read.any() else catalogue.note("resonance.still"),
         ),

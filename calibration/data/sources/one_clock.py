@@ -86,7 +86,7 @@ def guessed_unit(raw: np.ndarray) -> str:
     return next((unit for unit, largest in _STEPS.items() if usual <= largest), "s")
 
 
-def on_one_grid(
+def signals_on_one_grid(
     name: str,
     chosen: Mapping[str, Signal],
     is_held: Callable[[str], bool],
@@ -151,7 +151,7 @@ def on_one_grid(
             values[column] = signal_values[np.maximum(np.searchsorted(times[key], on + alike, side="right") - 1, 0)]
             brought.setdefault("held", []).append(column)
         else:
-            values[column] = used_once(on, times[key], signal_values)
+            values[column] = readings_used_once(on, times[key], signal_values)
             brought.setdefault("interpolated", []).append(column)
     notes = []
     if brought:
@@ -161,7 +161,7 @@ def on_one_grid(
         }
         kind_sentences = "; ".join(f"{', '.join(columns)} {how[kind]}" for kind, columns in brought.items())
         notes.append(
-            f"{name}: signals have different clocks; rows are taken at the samples of {clocks[main].name} "
+            f"{name}: signals have different clocks. Rows are taken at the samples of {clocks[main].name} "
             f"({_rate(rows)}): {kind_sentences}"
         )
     if not is_covered.all():
@@ -170,17 +170,18 @@ def on_one_grid(
         unit, period = read[key].unit, read[key].period
         if key in late:
             notes.append(
-                f"{name}: {count_noun(late[key], 'sample')} of {clock.name} recorded late; sorted by time stamp"
+                f"{name}: {count_noun(late[key], 'sample')} of {clock.name} recorded late. They are sorted by time "
+                "stamp"
             )
         if period:
-            notes.append(f"{name}: {clock.name} wraps at {period:.10g}; counted on from there")
+            notes.append(f"{name}: {clock.name} wraps at {period:.10g}. The time is counted on from there")
         if not clock.unit and unit not in ("", "s"):
-            notes.append(f"{name}: {clock.name} has no unit; its numbers are read as {unit} ({_rate(times[key])})")
+            notes.append(f"{name}: {clock.name} has no unit. Its numbers are read as {unit} ({_rate(times[key])})")
     on = rows[is_covered]
     return on - on[0], values, tuple(notes)
 
 
-def used_once(rows: np.ndarray, time: np.ndarray, values: np.ndarray) -> np.ndarray:
+def readings_used_once(rows: np.ndarray, time: np.ndarray, values: np.ndarray) -> np.ndarray:
     """Readings in the rows nearest to their samples, on the straight line between these, NaN in other rows.
 
     Args:

@@ -139,7 +139,7 @@ def _with_header(arrays: NamedArrays, columns: Preset) -> NamedArrays:
     if len(arrays.header) != len(columns.header) or not np.isfinite(column_numbers(list(arrays.header))).all():
         return arrays
     values = tuple([first, *rest] for first, rest in zip(arrays.header, arrays.values, strict=True))
-    note = f"{arrays.name}: has no header; its columns are read as {', '.join(columns.header)}"
+    note = f"{arrays.name}: has no header. Its columns are read as {', '.join(columns.header)}"
     return dataclasses.replace(arrays, header=columns.header, values=values, notes=(*arrays.notes, note))
 
 
@@ -177,7 +177,7 @@ def weakened_field_notes(preset: Preset, values: Mapping[str, Raw]) -> Names:
             if d > WEAKENED * q:
                 notes.append(
                     f"{preset.name}: {column.across} is {d / q:.0%} of {column_name}. The motor runs with field "
-                    "weakening there, which a DC motor model does not cover; leave those rows out"
+                    "weakening there, which a DC motor model does not cover. Leave those rows out"
                 )
     return tuple(notes)
 
@@ -336,7 +336,7 @@ def _on_a_grid(
 
     if not over_time:
         raise BadData(f"{source.name}: no signal has a column's name; {_how_to_name(source)}")
-    time, values, notes = one_clock.on_one_grid(source.name, over_time, is_held, is_measured, clock)
+    time, values, notes = one_clock.signals_on_one_grid(source.name, over_time, is_held, is_measured, clock)
     return {"time_s": time, **values, **_in_rows(source, others, len(time))}, notes
 
 

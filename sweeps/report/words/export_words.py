@@ -46,9 +46,9 @@ USE = {
         "rotor has {armature:.4g} kg·m² at the joint."
     ),
     "randomization": (
-        '`numpy.load("draws.npz")`: each array has one value per sample; use all values of one sample '
+        '`numpy.load("draws.npz")`: each array has one value per sample. Use all values of one sample '
         "together, since they are correlated. `mujoco/…` are attributes of `drive.xml` as the format mujoco "
-        "writes it; `actuator/…` are keys of `PARAMS`."
+        "writes it. `actuator/…` are keys of `PARAMS`."
     ),
 }
 #: Readings that a controller compares with its goal, their units, and the last term of its duty.
@@ -59,9 +59,9 @@ GOALS = {
 }
 NOT_TESTED = (
     "Voltages, loads and temperatures outside the runs above.",
-    "Fast changes: only settled runs are compared, so inductance and inertia are the given values.",
+    "Fast changes. Only settled runs are compared, so inductance and inertia have the given values.",
 )
-BACKWARD = "Runs in which the load drives the motor: not among the runs above."
+BACKWARD = "Runs in which the load drives the motor, because none is among the runs above."
 
 
 def export_statement(found: Export) -> str:
@@ -97,10 +97,10 @@ def export_remarks(found: Export) -> list[str]:
     compared, drive = found.comparison, found.joint
     said = []
     if not compared.situation.is_measured:
-        said.append("no measurements were given, so the reference is the native model; give runs with --data")
+        said.append("no measurements were given, so the reference is the native model. Give runs with --data")
     else:
         said.append(
-            "the refit used no measurements: these are hold-out errors if the robot was not fitted to these runs"
+            "the refit used no measurements. The errors are hold-out errors if the robot was not fitted to these runs"
         )
     dropped_names = [f.name for f in compared.fates if f.verdict == DROPPED]
     if dropped_names:
@@ -222,7 +222,7 @@ def command_sentence(found: Export) -> str:
     )
 
 
-def markdown(text: str) -> str:
+def escape_markdown(text: str) -> str:
     """A name of a user's in Markdown: it ends no line, cell or code, and begins no HTML."""
     words = " ".join(printable(text).split())
     return words.replace("`", "'").replace("|", "\\|").replace("<", "&lt;")
@@ -234,8 +234,8 @@ def law_text(found: Export) -> str:
     about = {"name": drive.name, "at": "drive", "armature": rotor_inertia(found)}
     verdicts = {HELD: "held by", APPROXIMATED: "approximated by", DROPPED: "dropped:"}
     constants = "\n".join(
-        f"| `{markdown(c.name)}` | {c.value:.6g} | {c.unit} | {c.interval or '–'} | {c.meaning} | "
-        f"{markdown(c.source)} |"
+        f"| `{escape_markdown(c.name)}` | {c.value:.6g} | {c.unit} | {c.interval or '–'} | {c.meaning} | "
+        f"{escape_markdown(c.source)} |"
         for c in found.constants
     )
     refitted = "\n".join(f"| {n} | {compared.translated[n]:.6g} | {v:.6g} |" for n, v in compared.refitted.items())
@@ -252,11 +252,11 @@ def law_text(found: Export) -> str:
     cited = any(re.search(r"\beqs?\.|\bTables? [A\d]", f"{c.meaning} {c.source}") for c in found.constants)
     paper = "\nNumbers of equations and tables are those of the paper that describes this robot.\n" if cited else ""
     bullets = lambda lines: "\n".join(f"* {line}" for line in lines)  # noqa: E731
-    origin = markdown(f"{drive.file.name}, {drive.configuration}")
+    origin = escape_markdown(f"{drive.file.name}, {drive.configuration}")
     return f"""# The law of this drive
 A motor with its gearbox on one joint: {origin}. A program, mmrjax {__version__},
 found its numbers from measurements or data sheets, and wrote it as {FORMATS[found.format]}. You need no other file of
-that program. All units are SI; the joint is the driven wheel or output shaft.
+that program. All units are SI. The joint is the driven wheel or output shaft.
 
 ## How to use it
 {USE[found.format].format(**about)}{command_sentence(found)}
@@ -282,7 +282,7 @@ Percentages compare currents and speeds of settled runs with and without the eff
 {errors}
 
 ## Conditions seen
-{bullets(map(markdown, conditions_seen(found)))}
+{bullets(map(escape_markdown, conditions_seen(found)))}
 
 ## Not tested
 {bullets(not_tested(found))}

@@ -175,10 +175,10 @@ def posture_sentences(found: Postures) -> str:
     """One or two sentences on the posture of the first run and its geometric limits."""
     one, most = {c: values[0] for c, values in found.table.items()}, found.over.step_mm.max()
     return (
-        f"posture: pitch {one['pitch_deg']:z.1f}°, on {one['contact_mm']:.0f} mm, carried by {one['bears']}; tips "
+        f"posture: pitch {one['pitch_deg']:z.1f}°, on {one['contact_mm']:.0f} mm, carried by {one['bears']}. Tips "
         f"on slopes of {one['tips_back_deg']:.1f}° uphill, {one['tips_forward_deg']:.1f}° downhill, "
         f"{one['tips_aside_deg']:.1f}° across. Its geometry allows steps up to {one['highest_step_mm']:.0f} mm "
-        f"and gaps up to {one['widest_gap_mm']:.0f} mm; the highest step in any posture is {most:.0f} mm (front "
+        f"and gaps up to {one['widest_gap_mm']:.0f} mm. The highest step in any posture is {most:.0f} mm (front "
         f"{found.over.front_deg:g}°, rear {found.over.rear_deg:g}°)"
     )
 
@@ -194,6 +194,6 @@ def tipping_remarks(found: Postures) -> list[str]:
         else "runs " + ", ".join(str(k + 1) for k in tipping_runs[:ROWS])
     )
     return [
-        f"posture: {run_words} would tip over on that slope; currents and speeds are for a robot that is held "
+        f"posture: {run_words} would tip over on that slope. Currents and speeds are for a robot that is held "
         "upright on it"
     ]

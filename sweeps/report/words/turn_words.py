@@ -27,7 +27,7 @@ def unlike_sides_note(name: str, effects: Sequence[str], turns: str) -> str:
     return f"{name}: {STRAIGHT} ({', '.join(effects)}); {turns}"
 
 
-def by_itself(robot: Robot, found: Result, value: float) -> str:
+def turn_under_equal_commands(robot: Robot, found: Result, value: float) -> str:
     """Turn of a robot with both sides driven the same, by configuration, in words, empty if it travels straight.
 
     Args:
@@ -40,12 +40,12 @@ def by_itself(robot: Robot, found: Result, value: float) -> str:
     rates_by_configuration = zip(robot.configurations, rates, speeds, np.asarray(found.status), strict=True)
     told = [
         f"{name} {words.STATUSES[STATUSES[int(status)]].short}" if not math.isfinite(rate)
-        else f"{name} by {abs(rate):.3g} rad/s to the {SIDES[int(rate < 0)]} at {speed:.3g} m/s ahead"
+        else f"{name} turns to the {SIDES[int(rate < 0)]} at {abs(rate):.3g} rad/s and {speed:.3g} m/s"
         for name, rate, speed, status in rates_by_configuration
         if not abs(rate) < NONE
     ]  # fmt: skip
-    alike = f"driven alike, {value:g} {imposed} on level ground"
-    return f"{alike}, it turns: {'; '.join(told)} ({states} show it)" if told else ""
+    alike = f"with {value:g} {imposed} on both sides on level ground"
+    return f"{alike}, the robot does not travel straight: {', '.join(told)} ({states} show it)" if told else ""
 
 
 def turn_not_found_reason(speed: float, rate: float, speeds: np.ndarray, rates: np.ndarray) -> str:
@@ -59,20 +59,22 @@ def turn_not_found_reason(speed: float, rate: float, speeds: np.ndarray, rates: 
     """
     known = np.isfinite(speeds) & np.isfinite(rates)
     if not known.any():
-        return "and even with all of the supply no turn settles"
+        return "and no turn settles even at the full supply voltage"
     ahead, round_ = np.abs(speeds[known]), np.abs(rates[known])
     most_rate = np.interp(abs(speed), ahead[::-1], round_[::-1], right=math.nan)
     most_speed = np.interp(abs(rate), round_, ahead, right=math.nan)
     if most_rate >= abs(rate):
-        return "which would be enough; if friction falls with sliding speed, there may be no settled turn"
+        return "which would be enough. If friction falls with sliding speed, there may be no settled turn"
     told = [f"about {most_rate:.3g} rad/s at {abs(speed):g} m/s"] if speed and math.isfinite(most_rate) else []
     told += [f"about {most_speed:.3g} m/s at {abs(rate):g} rad/s"] if math.isfinite(most_speed) else []
-    told += [f"no more than {ahead.max():.3g} m/s, straight"] if not math.isfinite(most_rate) else []
-    told += [f"no more than {round_.max():.3g} rad/s, on the spot"] if not math.isfinite(most_speed) else []
+    told += [f"no more than {ahead.max():.3g} m/s in straight travel"] if not math.isfinite(most_rate) else []
+    told += (
+        [f"no more than {round_.max():.3g} rad/s when turning on the spot"] if not math.isfinite(most_speed) else []
+    )
     return f"which gives {' and '.join(told)}"
 
 
-def is_going(row: Json) -> bool:
+def has_motion(row: Json) -> bool:
     """True if a turn has a motion, settled or not."""
     return math.isfinite(float(row["yaw_rate_rad_s"])) and row["status"] in ("converged", "not_settled")
 
@@ -85,7 +87,7 @@ def turn_answer(row: Json, ended: Mapping[str, float] | None) -> str:
         ended: of a run over time `time_s`, `displacement_m` and `turned_deg` at its end. None: a settled turn.
     """
     status = str(row["status"])
-    if not is_going(row):
+    if not has_motion(row):
         unsettled = ended is None and status == STATUSES[NOT_SETTLED]
         return f"{status}: {words.NO_TURN if unsettled else words.STATUSES[status].why}"
     if ended is None:
@@ -107,7 +109,7 @@ def _way(row: Json) -> str:
 def _now(row: Json) -> str:
     """A motion that still changes."""
     rate, speed = float(row["yaw_rate_rad_s"]), float(row["speed_mm_s"])
-    return f"Not settled: {speed:.0f} mm/s ahead and {abs(rate):.2f} rad/s to the {_way(row)} then."
+    return f"Not settled: it then moves at {speed:.0f} mm/s and turns to the {_way(row)} at {abs(rate):.2f} rad/s."
 
 
 def _moves(row: Json) -> str:
@@ -116,15 +118,15 @@ def _moves(row: Json) -> str:
         return f"Straight at {speed:.0f} mm/s."
     if _sloping(row):
         return (
-            f"There {speed:.0f} mm/s ahead and {abs(rate):.2f} rad/s to the {_way(row)}: on a slope the heading "
-            "keeps changing, so a turn is not a circle."
+            f"At this heading the forward speed is {speed:.0f} mm/s and the yaw rate {abs(rate):.2f} rad/s to the "
+            f"{_way(row)}. On a slope the heading keeps changing, so a turn is not a circle."
         )
     if abs(speed) < SPOT:
         minute = 60 / FULL * abs(rate)
         return f"Turns on the spot to the {_way(row)} at {abs(rate):.2f} rad/s, {minute:.1f} turns a minute."
-    back, ahead = ("backward ", "") if speed < 0 else ("", " ahead")
+    back = "backward " if speed < 0 else ""
     return (
-        f"Turns {back}to the {_way(row)}: a circle of {abs(radius):.0f} mm radius at {abs(speed):.0f} mm/s{ahead} "
+        f"Turns {back}to the {_way(row)} on a circle of {abs(radius):.0f} mm radius, at {abs(speed):.0f} mm/s "
         f"and {abs(rate):.2f} rad/s, one turn in {FULL / abs(rate):.1f} s."
     )
 
