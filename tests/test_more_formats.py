@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from calibration.data import delimited, presets_file, runs
+from calibration.data import contents, delimited, presets_file, runs
 from calibration.data.input_errors import BadData
 from calibration.data.sources import json_records, opening, reading
 from tests.commands import text_file
