@@ -37,7 +37,7 @@ from mmrjax.undercarriage.half_robot import (  # noqa: E402
     instant,
     roll,
 )
-from mmrjax.undercarriage.ripple_peaks import period_pitch, touchdowns  # noqa: E402
+from mmrjax.undercarriage.ripple_peaks import period_pitch, touchdown_times  # noqa: E402
 from mmrjax.undercarriage.running_gear import GROUSERS, TEETH_BELT  # noqa: E402
 
 SET_S = {
@@ -159,7 +159,9 @@ def findings(step: float) -> list[dict[str, Any]]:
             }
         if tracked:
             lands, lifts = passes(time, run["grouser"], period)
-            row["touchdowns a grouser"] = round(len(touchdowns(time, run["grouser"], run["place"])) / len(lands), 2)
+            row["touchdowns a grouser"] = round(
+                len(touchdown_times(time, run["grouser"], run["place"])) / len(lands), 2
+            )
             row["scatter of landings, of a pitch"] = round(float(np.std(phases(lands, lands[0], period))), 3)
             row["lifts after landing, of a pitch"] = round(float(np.mean(phases(lifts, lands[0], period)) % 1), 2)
             for name in ("total_current", "normal"):

@@ -79,7 +79,7 @@ def _unlike_sides_sentence(name: str, robot: Robot) -> Names:
         return (turn_words.unlike_sides_note(name, robot.unlike, f"turning cannot be computed: {why}"),)
     value = imposed.imposed_example(robot)
     turn_rows = turns_under_equal_commands(robot, value * RPM if robot.rig.imposed == "motor_speed" else value)
-    turns = turn_words.by_itself(robot, turn_rows, value)
+    turns = turn_words.turn_under_equal_commands(robot, turn_rows, value)
     return (turn_words.unlike_sides_note(name, robot.unlike, turns),) if turns else ()
 
 

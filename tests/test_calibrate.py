@@ -347,7 +347,7 @@ def test_drive_reads_settled_rows_rolling_and_agrees_with_steady(measured):
     assert made.adhesion_used[2] > 0.9
     assert all(abs(p.with_steady.apart_in_sd) < 0.01 for p in made.parameters.values())
     jsonschema.validate(made.to_json(), SCHEMA)
-    assert any(note.startswith("rows 3: computed from a rolling start; from standstill") for note in made.notes)
+    assert any(note.startswith("rows 3: computed from a rolling start. From standstill") for note in made.notes)
 
 
 # --- missing readings -----------------------------------------------------------------------------------

@@ -106,7 +106,10 @@ def test_what_a_duty_drives_is_known_and_its_effect_looked_for_in_such_alone(sup
     assert ("coast_decay" in names) is below_one
     where = DiscrepancyLocation("electrical", "voltage", ("electrical",), (), 9.0, 9.0, by_duty=alone)
     assert where.family.endswith("duty" if alone else "voltage")
-    assert words.shown_over("voltage", alone) == f"clearest when plotted over {'duty' if alone else 'voltage'}"
+    assert (
+        words.variable_showing_discrepancy("voltage", alone)
+        == f"clearest when plotted over {'duty' if alone else 'voltage'}"
+    )
 
 
 @pytest.mark.nightly

@@ -20,7 +20,7 @@ from calibration.discovery.score_tests import bootstrap_statistics, diagnose_fit
 from calibration.discovery.settings import WITHOUT_NAME
 from calibration.inference import bases, noise
 from calibration.inference.held_out import hold_out_blocks
-from calibration.inference.linearization import PROBED, amplitude_of, shape_of, with_shape_grid
+from calibration.inference.linearization import PROBED, amplitude_of, free_shape_parameter, with_shape_grid
 from calibration.inference.observers import SettledRuns
 from calibration.inference.observers.settled import SettledLinearization
 from calibration.inference.optimizers import observe_at
@@ -241,7 +241,7 @@ def test_signatures_are_derivatives_of_the_readings(clean, looks):
     problem = clean.space.bare
     z = jnp.asarray(clean.base.z[: clean.space.free])
     library = discover.visible_effects(looks.library, problem.base, SettledRuns)
-    names, shapes = [e.name for e in library], [shape_of(e) for e in library]
+    names, shapes = [e.name for e in library], [free_shape_parameter(e) for e in library]
     unit = jnp.asarray([amplitude_of(e).spec.prior_sd(0.0) for e in library])
     instances = tuple(with_shape_grid(e, (-1.5, 0.75)) for e in library)
     robot = dataclasses.replace(problem.robot(z), effects=library)

@@ -20,7 +20,7 @@ from calibration.discovery.score_tests import bootstrap_statistics, diagnose_fit
 from calibration.discovery.settings import WITHOUT_NAME, settings_for
 from calibration.discovery.standing import judge_names
 from calibration.inference import bases, noise
-from calibration.inference.linearization import PROBED, shape_of, with_shape_grid
+from calibration.inference.linearization import PROBED, free_shape_parameter, with_shape_grid
 from calibration.inference.observers import Histories
 from calibration.inference.optimizers import levenberg_marquardt
 from mmrjax.effects import BY_NAME, UNNAMED
@@ -311,7 +311,7 @@ def test_assumed_noise_of_histories_does_not_vanish_at_the_start(runs):
 
 def test_phase_is_a_shape_and_covers_half_a_turn():
     effect = BY_NAME["pulley_eccentricity"]()
-    shape = shape_of(effect)
+    shape = free_shape_parameter(effect)
     assert shape.name == "phase"
     instances = with_shape_grid(effect)
     # sin(ψ + φ) of any φ lies within 18 degrees of the grid, with either sign

@@ -54,7 +54,7 @@ def test_a_typical_size_is_simulated(robot):
     """0.5 ohm in series take 0.5 V/A · I of 24 V less what drives: the motors slow down by that."""
     changes = list(explain._change_sentences(effects.BY_NAME["series_resistance"]()))
     assert len(changes) == 2 and changes[0].startswith(
-        "change for one typical size, for 6T2A at 24 V, 5°, 3 kg: total current -"
+        "change of the readings at its typical size (6T2A, 24 V, 5°, 3 kg): total current -"
     )
     assert "motor speed -3.3 %" in changes[0]
     assert list(explain._change_sentences(effects.BY_NAME["armature_inductance"]())) == []
@@ -107,3 +107,9 @@ def test_near_words_have_the_word_as_a_part_whatever_its_capitals():
         and similar_words("xyzzy", outputs) == []
     )
     assert allowed_words("Motor_Speed", outputs).startswith("did you mean motor_speed? allowed: total_current")
+
+
+@pytest.mark.parametrize("name", ["established", "tentative", "held out", "noise", "voltage_limit"])
+def test_words_of_the_verdict_are_explained(name, mmrjax):
+    code, out, _ = mmrjax("explain", name)
+    assert code == 0 and words.GLOSSARY[name].split(".")[0][:40] in " ".join(out.split())

@@ -101,7 +101,7 @@ def test_models_headers_and_pages_of_an_export_have_names_as_words(drive):
     header = feed_forward.c_header(joint, points, [ALL])
     assert "boom" not in re.sub(r"/\*.*?\*/", "", header, flags=re.S).replace(joint.name, "")
     assert joint.name.isidentifier() and not obeyed(header)
-    words = export_words.markdown(ALL)
+    words = export_words.escape_markdown(ALL)
     assert not obeyed(words) and "<" not in words and "`" not in words and not re.search(r"(?<!\\)\||\n", words)
 
 

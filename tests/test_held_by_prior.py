@@ -114,9 +114,13 @@ def test_calibration_says_it_of_every_parameter_everywhere(case, found, capsys, 
     assert {name for name, p in made.parameters.items() if p.held_by_prior} == held
     document = json.loads(json.dumps(made.to_json()))
     assert {name for name, p in document["parameters"].items() if p["held_by_prior"]} == held
-    notes = [note for note in made.notes if note.startswith("not determined ")]
-    listed = set(notes[0].split("): ")[1].split(", ")) if notes else set()
-    far = {note.split()[0] for note in made.notes if note.endswith("the prior or the model is wrong")}
+    notes = [note for note in made.notes if note.startswith("these runs do not determine ")]
+    listed = (
+        set(notes[0].removeprefix("these runs do not determine ").split(" (posterior")[0].split(", "))
+        if notes
+        else set()
+    )
+    far = {note.split()[0] for note in made.notes if note.endswith("The prior or the model is wrong")}
     assert listed == held - far and len(notes) <= 1
     shown = calibration_report.calibration_document(made, "nominal")
     print_document(shown)

@@ -86,7 +86,7 @@ def test_heating_three_times_too_large_is_unnamed_and_said(hot):
     first = next(a for a in ruled_out if list(a.effects) == ["winding_heating"])
     assert 2.7 < first.sizes["winding_heating"] < 3.3 and abs(first.rise_chi2) < 9
     assert first.why == (
-        f"winding_heating at {first.sizes['winding_heating']:.2g} times its largest plausible size; "
+        f"winding_heating would have {first.sizes['winding_heating']:.2g} times its largest plausible size, so "
         "check motor.resistance_thermal_housing and motor.resistance_thermal_winding"
     )
     assert first.effects["winding_heating"] == pytest.approx(3.0 * LARGEST, rel=0.1)

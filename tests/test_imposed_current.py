@@ -83,12 +83,12 @@ def test_a_loop_and_a_calibration_say_so_before_they_fit(tmp_path, robot, factor
     runs = read_table(tmp_path, "motor_current_A,motor_speed_rpm\n" + "".join(rows), robot, "runs.csv")
     monkeypatch.setattr(checks, "check_ranges", lambda runs, robot: [])  # which refuses it where speeds show it too
     ready = discover.prepare_loop(runs, robot)
-    assert any("is it in another unit" in str(note) for note in ready.at_first) == doubted
+    assert any("Is it in another unit" in str(note) for note in ready.at_first) == doubted
     said = []
     monkeypatch.setattr(observers, "pose_problem", lambda *given: said.append("fit") or 1 / 0)
     with pytest.raises(ZeroDivisionError):
         calibrate(runs, robot, tell=said.append)
-    assert any("is it in another unit" in text for text in said[: said.index("fit")]) == doubted
+    assert any("Is it in another unit" in text for text in said[: said.index("fit")]) == doubted
 
 
 def test_the_file_says_what_is_imposed_and_needs_no_winding(robot, tmp_path):

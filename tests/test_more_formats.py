@@ -173,7 +173,7 @@ def test_last_comment_without_units_is_the_header(tmp_path):
 
 
 def content_signals(content):
-    return {s.path: s for s in json_records.of_content(content, "log.json")}
+    return {s.path: s for s in json_records.signals_of_json_content(content, "log.json")}
 
 
 def test_records_of_lists_are_runs_of_their_own():

@@ -16,7 +16,7 @@ from calibration.data.input_errors import BadConfiguration, BadData
 from calibration.discovery import discover, findings
 from calibration.discovery.candidates import Candidate, fill_slots
 from calibration.inference.calibration import calibrate
-from calibration.inference.linearization import shape_of, shape_parameter_at, shape_scales
+from calibration.inference.linearization import free_shape_parameter, shape_parameter_at, shape_scales
 from calibration.inference.observers import SettledRuns
 from calibration.inference.optimizers import observe_robot
 from mmrjax.effects import ALL, BY_NAME, UNNAMED
@@ -119,9 +119,9 @@ def test_robot_that_the_loop_writes_is_the_one_that_it_fitted(name, fits):
     assert_allclose(again, reading, rtol=1e-9)
 
 
-@pytest.mark.parametrize("effect", [e for e in ALL if shape_of(e()) is not None], ids=lambda e: e.name)
+@pytest.mark.parametrize("effect", [e for e in ALL if free_shape_parameter(e()) is not None], ids=lambda e: e.name)
 def test_shape_that_a_fit_reaches_is_one_that_a_file_may_state(effect):
-    shape = shape_of(effect())
+    shape = free_shape_parameter(effect())
     z = np.linspace(-6.0, 6.0, 61)
     value = np.asarray(shape_parameter_at(shape_scales(shape), jnp.asarray(z)))
     low, high = shape.spec.bounds

@@ -559,7 +559,7 @@ ODD = {
     "nothing geared": (
         "ratio = 16\nefficiency_load = 0.9",
         "ratio = 1\nefficiency_load = 0.5",
-        "is the ratio missing?",
+        "Is the ratio missing?",
     ),
     "stuck": ("loss_coulomb = 0.1", "loss_coulomb = 40.0", "above the stall current 12 A at 12 V, so it cannot move"),
     "rotor in g·cm²": ("[gearbox]", "inertia = 0.02\n[gearbox]", "check motor.inertia (1 g·cm² is 1e-7 kg·m²)"),

@@ -15,7 +15,7 @@ from calibration.data import runs as records
 from calibration.data.input_errors import BadConfiguration
 from calibration.discovery import discover, scales
 from mmrjax import effects
-from mmrjax.effects.scaled import amplitude_of, scaled_effect, shape_of
+from mmrjax.effects.scaled import amplitude_of, free_shape_parameter, scaled_effect
 from mmrjax.model import params
 from mmrjax.model.quantities import RPM
 from sweeps.commands import rig_new
@@ -39,7 +39,7 @@ def with_all(robot, library, share):
     robot = robot_file.add_effects(robot, tuple(library), library)
     values = {}
     for effect in robot.effects:
-        amplitude, shape = amplitude_of(effect), shape_of(effect)
+        amplitude, shape = amplitude_of(effect), free_shape_parameter(effect)
         values[f"effects.{effect.name}.amplitude"] = share * amplitude.spec.bounds[1]
         if shape is not None:
             low, high = shape.spec.bounds

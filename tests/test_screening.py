@@ -301,7 +301,7 @@ def test_a_ranking_answers_with_a_mechanism_at_most_and_with_parameters():
     found = dataclasses.replace(RANKING, parameters={"motor.inertia": (2.5e-4, 1e-6)})
     assert words.regression_verdict(found) == (
         "regression only, not confirmed by simulation: something is missing, a loss torque that changes with speed "
-        "(churning); parameters [SI]: motor.inertia 0.00025 ± 1e-06"
+        "(churning). Parameters [SI]: motor.inertia 0.00025 ± 1e-06"
     )
     assert words.regression_verdict(dataclasses.replace(found, effects=(), parameters={})).endswith(
         "no effect explains it"
@@ -317,7 +317,7 @@ def test_what_is_found_before_the_verdict_is_said_to_be_untested(capsys):
     folder = SimpleNamespace(keeps=lambda name: True, path="found")
     command._report_stored_stages({"ranking": RANKING, "search 0": (base, None, found)}, folder, "rig.toml")
     said = capsys.readouterr().err
-    assert "so far, confirmed by simulation: a loss torque that changes with speed (churning);" in said
+    assert "so far, simulation confirms a loss torque that changes with speed (churning)." in said
     assert said.index("by regression") < said.index("so far")
 
 
@@ -340,7 +340,7 @@ def test_a_budget_that_ends_after_the_screening_leaves_its_ranking(tmp_path, mmr
     monkeypatch.setattr(command, "discover", screened)
     options = ("--robot", "rig.toml", "--no-report", "--out", "found", "--within", "20s")
     code, _, err = mmrjax("loop table.csv", *options)
-    assert code == 3 and "strongest alone: churning\n" in err  # at once
+    assert code == 3 and "Strongest alone: churning\n" in err  # at once
     assert err.count("  1. churning, a loss torque that changes with speed") == 1  # at the end
     assert "no verdict within 20 s\n" in err and "kept: ranking" in err
     assert "regression only, not confirmed by simulation: something is missing, a loss torque that changes" in err

@@ -414,7 +414,7 @@ def test_a_saturated_channel_leaves_its_stretch_out(tmp_path):
     assert [s.why for s in found.stretches] == ["", "", "stuck"] and found.stretches[2].channel == "total_current"
     assert (
         "total_current shows the same number for a long time, so it is saturated or frozen"
-        in words.left_out(found.stretches)[0]
+        in words.omitted_stretches(found.stretches)[0]
     )
 
 
@@ -435,7 +435,9 @@ def test_glitches_leave_means_where_they_are_or_a_level_out(tmp_path, case):
     found = settled(tmp_path, bench(tmp_path, columns))
     assert [s.why for s in found.stretches] == ["", "" if count is not None else "glitches", ""]
     if count is None:
-        assert "motor_speed has many readings far from the others (4" in words.left_out(found.stretches)[0][0]
+        assert (
+            "motor_speed has many readings far from the others (4" in words.omitted_stretches(found.stretches)[0][0]
+        )
         return
     middle, clean = found.kept[1], stairs()["motor_speed_rpm"][200:400]
     assert middle.glitches.get("motor_speed", 0) == np.isin(off, middle.rows).sum() >= 0.7 * count
@@ -569,13 +571,13 @@ def test_a_column_without_a_role_may_be_empty_for_a_while(tmp_path):
 
 def test_a_log_with_few_settled_runs_is_given_to_the_loop_itself(tmp_path):
     found, loop = settled(tmp_path, bench(tmp_path, stairs())), "mmrjax loop log.csv"
-    said = words.too_few(found, 6, loop)
+    said = words.sentence_on_few_settled_runs(found, 6, loop)
     assert (
         "run it on the log as it is: mmrjax loop log.csv. With calibrate" in said
-        and words.too_few(found, 3, loop) == ""
+        and words.sentence_on_few_settled_runs(found, 3, loop) == ""
     )
     every = [settling.Stretch("", np.arange(9), 0.0, 1.0, 6.0, why) for why in settling.REASONS]
-    told = {row[0]: row[-1] for row in words.left_out(every, few=True)}
+    told = {row[0]: row[-1] for row in words.omitted_stretches(every, few=True)}
     assert {told[words.WHY[why][0]] for why in words.OF_LEVELS} == {"nothing, as a fit to the log uses these samples"}
     assert told[words.WHY["stuck"][0]] == words.WHY["stuck"][1]
 

@@ -137,7 +137,9 @@ def test_commands_are_held_and_readings_on_one_clock_stay_as_they_are():
         "command": signal([0.5, 2.5], [7.0, 8.0]),
         "slow": signal([1.25, 3.75], [10.0, 20.0]),
     }
-    time, values, notes = one_clock.on_one_grid("log", chosen, lambda c: c == "command", lambda c: c != "command", "")
+    time, values, notes = one_clock.signals_on_one_grid(
+        "log", chosen, lambda c: c == "command", lambda c: c != "command", ""
+    )
     assert_array_equal(time, np.arange(5.0))  # the row before the first command is left out
     assert_array_equal(values["current"], np.arange(1.0, 6) ** 2)
     assert_array_equal(values["command"], [7, 7, 8, 8, 8])
@@ -147,19 +149,19 @@ def test_commands_are_held_and_readings_on_one_clock_stay_as_they_are():
 
 def test_a_slow_reading_is_on_the_straight_line_in_the_row_nearest_to_its_sample():
     rows, time = np.arange(9.0), np.array([0.9, 4.2, 7.9])
-    found = one_clock.used_once(rows, time, 10 * time)
+    found = one_clock.readings_used_once(rows, time, 10 * time)
     assert_allclose(found, [np.nan, 10, np.nan, np.nan, 40, np.nan, np.nan, np.nan, np.nan])
 
 
 def test_samples_that_are_recorded_late_are_sorted_by_their_stamps():
     time = np.r_[0.0, 1, 2, 4, 3, 5, 6, 7]
     late = Signal("late", 8, lambda: 10 * time, clock=Clock("c", lambda: time, "s"))
-    found, values, notes = one_clock.on_one_grid("log", {"late": late}, lambda c: False, lambda c: True, "")
+    found, values, notes = one_clock.signals_on_one_grid("log", {"late": late}, lambda c: False, lambda c: True, "")
     assert_array_equal(values["late"], 10 * np.arange(8.0))
     assert found.tolist() == list(range(8)) and "1 sample of c recorded late" in notes[0]
     back = Signal("back", 60, lambda: np.zeros(60), clock=Clock("c", lambda: np.tile(np.arange(30.0), 2), "s"))
     with pytest.raises(BadData, match="log, c: goes back from 29 to 0 s at sample 31"):
-        one_clock.on_one_grid("log", {"back": back}, lambda c: False, lambda c: True, "")
+        one_clock.signals_on_one_grid("log", {"back": back}, lambda c: False, lambda c: True, "")
 
 
 @pytest.mark.parametrize(

@@ -140,7 +140,7 @@ def test_a_forged_stage_runs_nothing_and_is_made_again(tmp_path, monkeypatch, ca
         assert folder.stage("base", lambda: "anew") == "anew"
         assert folder.stage("base", lambda: "no more") == "anew"
     assert not (tmp_path / "harmed").exists() and "this" not in sys.modules
-    assert capsys.readouterr().err.count("base.stage: damaged; computed again") == 1
+    assert capsys.readouterr().err.count("base.stage: damaged, so it is computed again") == 1
 
 
 def test_a_damaged_stage_or_chunk_is_made_again_with_a_note(tmp_path, capsys):

@@ -593,7 +593,7 @@ def test_front_door_loads_nothing_heavy():
 
 #: What `calibrate`, `discover` and `foresee` do to a table and a robot inside, from instruments to the base fit.
 INNER = {
-    "with_inferred_instruments", "with_surface_configurations", "of_surfaces", "with_table_mass",
+    "with_inferred_instruments", "with_surface_configurations", "values_of_surface_configurations", "with_table_mass",
     "with_initial_states", "measure_initial_states", "check_start", "infer_noise", "scale_library", "settings_for",
     "remove_copies", "pose", "pose_problem", "build_candidate_space", "fit_base", "trace",
 }  # fmt: skip

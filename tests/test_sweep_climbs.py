@@ -153,7 +153,7 @@ def test_interrupted_map_goes_on_after_its_last_chunk(mmrjax, tmp_path, monkeypa
     (tmp_path / "map.toml").write_text(MAP)
     assert mmrjax("sweep map.toml --out map")[0] == 130
     assert climbed == [[0.0, 0.0]] and (tmp_path / "map.partial").is_dir()
-    ends(mmrjax("sweep map.toml --out map"), "resumes after 2 of 6 points", "came to a verdict", code=0)
+    ends(mmrjax("sweep map.toml --out map"), "resumes after 2 of 6 points", "have a verdict", code=0)
     assert climbed == [[0.0, 0.0], [30.0, 30.0], [60.0, 60.0]]
     store = zarr.open_group(tmp_path / "map" / "results.zarr", mode="r")
     assert store["energy_J"][:].tolist() == [[60, 560 - 60], [90, 530], [120, 560]]

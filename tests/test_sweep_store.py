@@ -30,7 +30,7 @@ from sweeps.commands import sweep as command
 from sweeps.config_campaign import Campaign
 from sweeps.points import axes, scale, zarr_store
 from sweeps.points.job import prepare_job, store_layout
-from sweeps.points.tasks import task_of
+from sweeps.points.tasks import task_of_configuration
 from sweeps.store import LOCK, MANIFEST, RunFolder
 from tests.commands import ends, read_json
 
@@ -841,7 +841,7 @@ def test_grid_too_large_for_the_disk_is_refused_with_figures(sweep, monkeypatch,
 def laid_out_of(text):
     stated = tomllib.loads(text)
     config, robot = Campaign(**stated), paper_robots.nominal()
-    config = config.model_copy(update={"outputs": task_of(config, robot).usual})
+    config = config.model_copy(update={"outputs": task_of_configuration(config, robot).usual})
     return store_layout(config, prepare_job(config, robot, axes.plan_design(config, robot, "x"), "x"))
 
 

@@ -60,7 +60,7 @@ def same(one, other, rtol=0.0):
 
 def test_points_of_a_table_are_its_runs_each_with_every_draw(robot, runs, posterior):
     drawn = DrawnSamples(posterior.names, posterior.draw(DRAWS, 0).T)
-    job = run.job_of(robot, runs, chunked(5), drawn)
+    job = run.job_of_run_table(robot, runs, chunked(5), drawn)
     assert job.plan.design.shape == (4, DRAWS) and job.blocks.size == (1, 4)
     points = job.plan.design.block((slice(1, 3), slice(2, 5)))
     assert_array_equal(points[:, 0], np.repeat([1.0, 2.0], 3))
@@ -148,6 +148,6 @@ def test_what_takes_long_runs_in_parts_and_says_how_far_it_is(robot, runs, monke
 def test_chunks_are_filled_up_to_share_programs(robot, runs):
     """Of settled points those of few too. What runs over time takes longer than its program does to compile."""
     many = dataclasses.replace(runs, columns={k: np.tile(v, 4200) for k, v in runs.columns.items()})
-    sizes = [scale.Compiled(run.job_of(robot, r, chunked(None))).size for r in (runs, many)]
+    sizes = [scale.Compiled(run.job_of_run_table(robot, r, chunked(None))).size for r in (runs, many)]
     assert sizes == [fidelities.FEW, 2 * scale.SHARED]
-    assert scale.Compiled(run.job_of(robot, runs, config.Simulate(model="drive"))).size == 4
+    assert scale.Compiled(run.job_of_run_table(robot, runs, config.Simulate(model="drive"))).size == 4

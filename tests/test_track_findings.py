@@ -11,7 +11,7 @@ from mmrjax.model import params
 from mmrjax.model.conditions import Conditions
 from mmrjax.model.signals import FLAGS, STATUSES
 from mmrjax.undercarriage.belt import BeltPath
-from mmrjax.undercarriage.ripple_peaks import measure_ripple, period_pitch, touchdowns
+from mmrjax.undercarriage.ripple_peaks import measure_ripple, period_pitch, touchdown_times
 
 pytestmark = pytest.mark.slow
 
@@ -137,7 +137,7 @@ def test_current_peaks_when_a_grouser_touches_down(runs, robot, k):
     """Fig. 26, at its 33 V: folded on the pitch, the current peaks within a tenth of a period of a touchdown. It is
     higher yet a third of a period later, since the pitch inertia is that of the folded robot (the paper has one peak)."""
     time = runs.time[k, TAIL]
-    lands = touchdowns(time, runs.reactions.grouser[k, TAIL], runs.reactions.place[k, TAIL])
+    lands = touchdown_times(time, runs.reactions.grouser[k, TAIL], runs.reactions.place[k, TAIL])
     wheel = series(runs, k, "speed_wheel")[TAIL].mean()
     period = period_pitch(0.035, wheel, float(robot.configurations["6T2A"].radius))
     assert_allclose(np.diff(lands), period, rtol=0.04)  # one touchdown a pitch, to a sample

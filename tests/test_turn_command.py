@@ -322,7 +322,7 @@ def test_turns_are_told_as_recorded():
     ]
     text = "\n".join(lines) + "\n"
     assert text == recorded("turns", text)
-    assert not turn_words.is_going(row(**TOLD["no numbers"]))
+    assert not turn_words.has_motion(row(**TOLD["no numbers"]))
 
 
 PLAN = '[conditions]\nconfiguration = "6T2A"\nvoltage = 24\nduty_right = 1\n[axes]\nduty_left = [-1, 1]\n'

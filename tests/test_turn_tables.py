@@ -239,7 +239,7 @@ def test_a_turn_that_nothing_drives_is_left_out_with_a_note(rig, table, row, zer
     header = f"supply_voltage_V,duty_left,duty_right,{SPEEDS}"
     found = table(header, (24, 0, 1, 0, 900), (*row, 0, 0), robot=rig(DRIVEN))
     assert len(found) == 1
-    assert f"turns.csv: row 2 is left out, since nothing drives the motors ({zero} is 0); " in found.notes[0]
+    assert f"turns.csv: row 2 is left out, since nothing drives the motors ({zero} is 0). " in found.notes[0]
 
 
 @pytest.mark.parametrize("of_turns", ["duty_left,duty_right", "heading_deg,duty_left,duty_right", "heading_deg"])

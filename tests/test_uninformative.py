@@ -84,7 +84,7 @@ def test_a_channel_that_is_a_line_of_another_is_refused_by_the_loop(tmp_path, ro
     (found,) = checks.copied_channels(runs, robot)
     assert (found.column, found.tied) == (column, False) and said in describe(found)
     foreseen(shown(runs))
-    with pytest.raises(BadData, match=rf"t\.csv, {column}: equals .* remove it from channels and table"):
+    with pytest.raises(BadData, match=rf"t\.csv, {column}: equals .* remove it from the channels and the table"):
         discover.prepare_loop(runs, robot, replicates=192)
 
 
@@ -136,7 +136,7 @@ def test_readings_that_a_rigid_gear_ties_are_said_and_not_refused(tmp_path, robo
     (found,) = checks.copied_channels(
         records.read_runs(text_file(path, "\n".join([",".join(columns), *rows]) + "\n"), robot=driven), driven
     )
-    assert found.tied and found.slope == pytest.approx(0.05) and "counts twice" in describe(found)
+    assert found.tied and found.slope == pytest.approx(0.05) and "would count twice" in describe(found)
 
 
 @pytest.mark.parametrize(("spread", "varies"), [(0.5, False), (3.0, True)])

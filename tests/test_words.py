@@ -595,12 +595,20 @@ def test_names_say_what_would_explain_more_than_they():
         return SimpleNamespace(effects=dict.fromkeys(names, 1.0), rise_chi2=rise, why="too large")
 
     near, better = candidate(-2.0, "a"), candidate(-30.4, "b", "c")
-    assert loop_words.ruled_out(of("named", candidate(6.5, "a"))) == "" == loop_words.ruled_out(of("place"))
-    assert loop_words.ruled_out(of("named", near)).startswith("a would explain as much as what is proposed, but is")
-    assert loop_words.ruled_out(of("class", near, better)) == (
+    assert (
+        loop_words.sentence_on_ruled_out_effects(of("named", candidate(6.5, "a")))
+        == ""
+        == loop_words.sentence_on_ruled_out_effects(of("place"))
+    )
+    assert loop_words.sentence_on_ruled_out_effects(of("named", near)).startswith(
+        "a would explain as much as what is proposed, but is"
+    )
+    assert loop_words.sentence_on_ruled_out_effects(of("class", near, better)) == (
         "b and c would explain 30 σ² more than what is proposed, but are ruled out only by size or sign: too large."
     )
-    assert loop_words.ruled_out(of("place", better, near)).startswith("a would explain as much as the curve, but is")
+    assert loop_words.sentence_on_ruled_out_effects(of("place", better, near)).startswith(
+        "a would explain as much as the curve, but is"
+    )
 
 
 @pytest.mark.parametrize(
@@ -666,7 +674,7 @@ def test_what_the_track_model_is_asked_about(about, said):
 )
 def test_adequacy_is_said(found, said):
     assert found.statement == said and found.to_json()["statement"] == said
-    assert found.to_json()["shown_by"] == fit_words.shown_by(found.shown_by)
+    assert found.to_json()["shown_by"] == fit_words.adequacy_finding_in_words(found.shown_by)
 
 
 def clustered(levels, **other):
@@ -717,7 +725,7 @@ def test_tests_that_are_as_improbable_are_named_in_the_order_of_their_words():
         AdequacyFinding(c, "follow", v) for c in ("total_current", "speed") for v in ("the fitted speed", "slope_deg")
     ]
     every += [AdequacyFinding(c, "remember") for c in ("motor_speed", "total_current")]
-    assert sorted(every) == sorted(every, key=fit_words.shown_by)
+    assert sorted(every) == sorted(every, key=fit_words.adequacy_finding_in_words)
 
 
 def test_what_would_measure_is_found_by_either_end_of_a_name():

@@ -46,7 +46,7 @@ CIRCUITS = dict(zip(DRIVEN, (0.0, -1.0, 1.0), strict=True))
 DRIVING = ("duty", "mode")
 #: Shares of the supply's voltage that the motors of either side get, of a robot whose sides are driven apart.
 SIDES = {c: BY_COLUMN[c] for c in ("duty_left", "duty_right")}
-#: The same in volts, converted to shares (`sides.of_volts`).
+#: The same in volts, converted to shares (`sides.duties_from_side_voltages`).
 VOLTS = {c: BY_COLUMN[c] for c in ("voltage_left_V", "voltage_right_V")}
 #: The same where speeds are imposed.
 SPEEDS = tuple(channels.find_channel(f"motor_speed_{side}").column for side in channels.SIDES)

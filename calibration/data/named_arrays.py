@@ -19,7 +19,7 @@ MISSING = frozenset({"", "nan", "na", "n/a", "#n/a", "<na>", "none", "null"})
 
 @dataclasses.dataclass(frozen=True)
 class NamedArrays:
-    """Named columns of one source. `runs.of_arrays` checks them and converts them to `Runs`.
+    """Named columns of one source. `runs.runs_of_arrays` checks them and converts them to `Runs`.
 
     Messages count rows from 1. A reader that leaves out rows reports it in `notes`.
 

@@ -227,7 +227,7 @@ def _robot_before_parameters(
     if base is None:
         resolve_likes(content, where)
     tables = {key: value for key, value in content.items() if key not in rig_file.KEYS and isinstance(value, dict)}
-    sds = stated.taken_apart(tables, where)
+    sds = stated.split_values_and_sds(tables, where)
     values = dict(_flatten(tables))
     sds |= {name: stated.example_sd(values[name], sds[name]) for name in sds.keys() & set(examples)}
     loads = loads_from_tables(base, content, sds, where)

@@ -152,7 +152,7 @@ def runs_of_arrays(
     settled: Names = ()
     if measured and robot is not None:
         columns, settled = row_checks.drop_time_of_settled_rows(name, columns, layout, robot)
-    notes = (*arrays.notes, *settled, *sides.of_volts(name, columns, battery))
+    notes = (*arrays.notes, *settled, *sides.duties_from_side_voltages(name, columns, battery))
     is_kept, copied = row_checks.distinct_rows(name, columns)
     columns = {c: values[is_kept] for c, values in columns.items() if c != "held" or values.any()}
     if measured:

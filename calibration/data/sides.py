@@ -32,7 +32,7 @@ def supply_and_shares(volts: np.ndarray, supply: np.ndarray | None = None) -> tu
     return source, np.divide(volts, source, out=np.zeros_like(volts), where=source != 0)
 
 
-def of_volts(name: str, columns: Columns, battery: bool) -> Names:
+def duties_from_side_voltages(name: str, columns: Columns, battery: bool) -> Names:
     """Replaces the sides' voltages of a table by their shares of the supply's voltage.
 
     Returns:
@@ -94,7 +94,7 @@ def check_turns(runs: Runs) -> None:
         columns = f"{pair[0].column} and {pair[1].column}"
         _refuse_against(
             runs, columns, (left_value, right_value), right_value - left_value, drive,
-            "the larger value on the side that is driven faster. The left and right columns of one quantity are "
+            "the larger value on the side that is driven faster; the left and right columns of one quantity are "
             "exchanged",
         )  # fmt: skip
     for yaw in (c.column for c in channels.EVERY if c.sign == TURN and runs.has(c.column)):

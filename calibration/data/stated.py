@@ -50,7 +50,7 @@ def stated_number(text: str, where: str) -> tuple[float, float]:
     return mean, float(f"{size:.12g}")  # a percentage leaves digits of rounding
 
 
-def taken_apart(table: Json, where: str, prefix: str = "") -> dict[str, float]:
+def split_values_and_sds(table: Json, where: str, prefix: str = "") -> dict[str, float]:
     """Replaces each `value ± sd` of a table and its subtables by the value. Returns the sds by dotted name.
 
     Raises:
@@ -60,7 +60,7 @@ def taken_apart(table: Json, where: str, prefix: str = "") -> dict[str, float]:
     for key, value in table.items():
         name = f"{prefix}{key}"
         if isinstance(value, dict):
-            sds |= taken_apart(value, where, f"{name}.")
+            sds |= split_values_and_sds(value, where, f"{name}.")
         elif isinstance(value, str) and re.search(_SIGNS, value) is not None:
             table[key], sds[name] = stated_number(value, f"{where}, {name}")
     return sds
@@ -69,6 +69,12 @@ def taken_apart(table: Json, where: str, prefix: str = "") -> dict[str, float]:
 def is_example(line: str) -> bool:
     """True if a line of a rig's file is marked as an example and has a template's number."""
     return EXAMPLE in line and not line.startswith("#") and _number_of_line(line) in _template_numbers()
+
+
+def has_template_number(line: str) -> bool:
+    """True if a line has the name and number of a template's example, marked or not. 0 and 1 may be anyone's."""
+    number = None if line.startswith("#") else _number_of_line(line)
+    return number is not None and number[1] not in (0.0, 1.0) and number in _template_numbers()
 
 
 def example_numbers(text: str) -> dict[str, str]:

@@ -88,12 +88,14 @@ def with_surface_configurations(robot: Robot, runs: Runs) -> Robot:
         leaders |= {n: first for n in names if n != first}
     rig = dataclasses.replace(robot.rig, surfaces=tuple(leaders.items()))
     with_surfaces = dataclasses.replace(robot, configurations=Configurations(members), rig=rig)
-    priors = of_surfaces({name: (mean, sd) for name, mean, sd in rig.priors}, with_surfaces, runs)
+    priors = values_of_surface_configurations(
+        {name: (mean, sd) for name, mean, sd in rig.priors}, with_surfaces, runs
+    )
     rig = dataclasses.replace(rig, priors=tuple((name, *value) for name, value in priors.items()))
     return dataclasses.replace(with_surfaces, rig=rig)
 
 
-def of_surfaces(stated: Mapping[str, V], robot: Robot, runs: Runs) -> dict[str, V]:
+def values_of_surface_configurations(stated: Mapping[str, V], robot: Robot, runs: Runs) -> dict[str, V]:
     """Values stated by parameter, with replaced configurations renamed to the configurations of their surfaces.
 
     Args:

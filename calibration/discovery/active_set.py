@@ -17,7 +17,7 @@ from calibration.data.effect_file import Library
 from calibration.inference.linearization import (
     ScoredEffect,
     amplitude_of,
-    shape_of,
+    free_shape_parameter,
     shape_parameter_at,
     shape_scales,
     with_shape_grid,
@@ -245,7 +245,7 @@ def candidate_space(
     bare: Problem, effects: Sequence[Effect], library: Library, slots: int, width: float
 ) -> CandidateSpace:
     """Candidate space of a base problem, with slots for effects of a library (number of slots: see `Settings`)."""
-    shapes = [shape_of(e) for e in effects]
+    shapes = [free_shape_parameter(e) for e in effects]
     scales = [shape_scales(s) for s in shapes]
     value, spread, sd, low, high = (jnp.asarray([s[k] for s in scales]) for k in range(5))
     coordinates = ActiveSet(

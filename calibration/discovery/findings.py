@@ -47,7 +47,7 @@ from calibration.inference.identifiability import held_by_prior
 from calibration.inference.linearization import (
     amplitude_of,
     amplitude_unit,
-    shape_of,
+    free_shape_parameter,
     shape_parameter_at,
     shape_scales,
 )
@@ -113,7 +113,7 @@ def _effect_parameters(
             float(best.amplitude[slot] * unit), float(sd), amplitude.spec.unit, bool(held_names[p + slot])
         )
     }
-    shape = shape_of(effect)
+    shape = free_shape_parameter(effect)
     if shape is not None:
         k, scales = p + settings.slots + slot, shape_scales(shape)
         value, slope = _shaped(scales, best.z[k])

@@ -12,7 +12,7 @@ from calibration.data.posterior_file import ANGLE, LOG, NORMAL, Posterior, join_
 from calibration.discovery.active_set import ActiveSet, CandidateSpace
 from calibration.discovery.discrepancy import CurveCoordinates, Discrepancy
 from calibration.inference.identifiability import posterior_of_coordinates
-from calibration.inference.linearization import Linearization, amplitude_of, shape_of, shape_scales
+from calibration.inference.linearization import Linearization, amplitude_of, free_shape_parameter, shape_scales
 from calibration.inference.optimizers import informative_residuals
 from calibration.inference.priors import Coordinates
 from mmrjax.model import params
@@ -85,7 +85,7 @@ def _coordinate_groups(
         )
         parts.append(dataclasses.replace(of_amplitude, mean=z[p + slot, None], spread=np.array([sd])))
         kept_places.append(p + slot)
-        shape = shape_of(effect)
+        shape = free_shape_parameter(effect)
         if shape is None:
             continue
         value, spread, angle_sd, low, high = shape_scales(shape)

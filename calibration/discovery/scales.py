@@ -26,7 +26,7 @@ from calibration.discovery.reach import LOADED, RUNNING
 from mmrjax.compile.compiling import OVER_TIME, compiled
 from mmrjax.compile.precision import Threads, in_double
 from mmrjax.effects import Effect
-from mmrjax.effects.scaled import amplitude_of, scaled_effect, shape_of
+from mmrjax.effects.scaled import amplitude_of, free_shape_parameter, scaled_effect
 from mmrjax.fidelities.steady import operating_signals, results_of_rows
 from mmrjax.model import channels, paper_robots, params
 from mmrjax.model.balances import BALANCES, absent_balances, effects_sum
@@ -194,7 +194,7 @@ def _size_ratio(mine: float, theirs: float) -> float:
 def _scale_effect(kind: type[Effect], mine: tuple[Robot, Signals], theirs: tuple[Robot, Signals]) -> type[Effect]:
     """Effect class with priors scaled from one robot to another."""
     effect = kind()
-    shape, amplitude = shape_of(effect), amplitude_of(effect)
+    shape, amplitude = free_shape_parameter(effect), amplitude_of(effect)
     stretch = 1.0
     if shape is not None:
         with_ = SCALED_WITH.get(shape.spec.unit)

@@ -18,7 +18,7 @@ from mmrjax.compile.compiling import compiled
 from mmrjax.effects import Effect
 from mmrjax.effects.curve import in_travel_frame
 from mmrjax.effects.scaled import amplitude_of as amplitude_of
-from mmrjax.effects.scaled import shape_of as shape_of
+from mmrjax.effects.scaled import free_shape_parameter as free_shape_parameter
 from mmrjax.model import balances, params
 from mmrjax.model.params import Parameter, Scalar, parameter
 from mmrjax.model.robot import Robot
@@ -120,7 +120,7 @@ class ScoredEffect(eqx.Module):
 
 def with_shape_grid(effect: Effect, grid: Sequence[float] = GRID) -> ScoredEffect:
     """Effect with the grid of its shape parameter, clipped at the parameter's bounds."""
-    shape, amplitude = shape_of(effect), amplitude_of(effect)
+    shape, amplitude = free_shape_parameter(effect), amplitude_of(effect)
     unit = params.replace(effect, {amplitude.name: jnp.asarray(amplitude.spec.prior_sd(0.0))})
     if shape is None:
         return ScoredEffect(unit, "", (0.0,), jnp.zeros(0))

@@ -81,7 +81,7 @@ def prepare_input(
         raise BadConfiguration(str(error)) from error
     observe = observers.observer_kind(runs)
     robot = surfaces.with_surface_configurations(instruments.with_inferred_instruments(robot, runs), runs)
-    priors = surfaces.of_surfaces(stated or {}, robot, runs)
+    priors = surfaces.values_of_surface_configurations(stated or {}, robot, runs)
     own_mass.check_priors(priors, robot, runs)
     as_stated, weighed = robot, own_mass.mass_notes(robot, runs)
     robot = own_mass.with_table_mass(robot, runs)

@@ -144,7 +144,7 @@ def _temperature_limit(temperature: float) -> str:
 # --- what is proposed -----------------------------------------------------------------------------------
 
 
-def more_runs(what: SimpleNamespace) -> str:
+def instruction_for_further_runs(what: SimpleNamespace) -> str:
     """More runs along the variable of a discrepancy, from the values of `denser_runs_instruction`."""
     if what.variable in bases.ORDERS:
         three = [f"{menu.round_significant(v):g}" for v in (what.low, 0.5 * (what.low + what.high), what.high)]
@@ -279,8 +279,8 @@ SAID: dict[str, str | Callable[..., str]] = {
     "too_weak": "A series of runs over {variable} would show the missing term with only {sigma:.1f} σ",
     "carry_out": lambda experiments: ". Then: ".join(map(experiment_sentences, experiments)),
     "more_runs": lambda **series: (
-        f"{more_runs(SimpleNamespace(**series))}. Read every channel. The series shows how the term that is missing "
-        f"in the {bases.place_in_words(series['place'])} depends on this variable"
+        f"{instruction_for_further_runs(SimpleNamespace(**series))}. Read every channel. The series shows how the "
+        f"term that is missing in the {bases.place_in_words(series['place'])} depends on this variable"
     ),
     "overspeed": lambda speed, limit, voltage: (
         f"the motor speed: expect about {speed / RPM:.0f} rpm unloaded at {voltage:g} V and do not exceed "

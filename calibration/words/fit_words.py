@@ -36,7 +36,7 @@ LOST_AS = {
 }  # fmt: skip
 
 
-def noise_off(channel: str, factor: float, source: str) -> str:
+def sentence_on_wrong_noise(channel: str, factor: float, source: str) -> str:
     """Ratio of residuals to their sds."""
     if not channel:
         return (
@@ -72,13 +72,13 @@ def is_determined_answer(found: fit_notes.Determination) -> str:
     return "no" if found.held else "yes"
 
 
-def only_together(pairs: tuple[fit_notes.DependentPair, ...]) -> str:
+def sentence_on_combinations(pairs: tuple[fit_notes.DependentPair, ...]) -> str:
     """Parameters that are not determined separately, with what is."""
     pair_words = [f"{determined_combination(p)} (correlation {p.correlation:+.3f})" for p in pairs]
     return f"these runs determine only combinations of some parameters: {', '.join(pair_words)}"
 
 
-def of_rows(rows: tuple[int, ...], what: str, share: float = 0.0) -> str:
+def sentence_on_rows(rows: tuple[int, ...], what: str, share: float = 0.0) -> str:
     """Rows with a property, and its consequence."""
     row_words = f"rows {', '.join(map(str, rows))}"
     if what == "limited":
@@ -127,13 +127,13 @@ def search_generations(members: int, generations: int, settled: bool) -> str:
     return f"{count_noun(members, 'member')} in {count_noun(generations, 'generation')}. {end}"
 
 
-def lost_rows(members: dict[str, int]) -> str:
+def sentence_on_failing_members(members: dict[str, int]) -> str:
     """Members with a row that is lost."""
     row_outcomes = ", ".join(f"{members[status]} {how}" for status, how in LOST_AS.items() if status in members)
     return f"some members fail in at least one row: {row_outcomes}. They rank below the others"
 
 
-def members_jump(members: int, best: tuple[int, ...]) -> str:
+def sentence_on_jumping_members(members: int, best: tuple[int, ...]) -> str:
     """Members whose running gear jumps."""
     row_words = f"rows {', '.join(map(str, best))}" if best else "none"
     return (
@@ -142,7 +142,7 @@ def members_jump(members: int, best: tuple[int, ...]) -> str:
     )
 
 
-def prior_edge(at: fit_notes.ReachedBound) -> str:
+def distance_from_prior(at: fit_notes.ReachedBound) -> str:
     """Bound of a parameter, or its distance from the middle of its prior."""
     if at.bound:
         return f"at its {at.bound} bound"
@@ -152,7 +152,7 @@ def prior_edge(at: fit_notes.ReachedBound) -> str:
 # --- what residuals show --------------------------------------------------------------------------------
 
 
-def shown_by(test: fit_notes.AdequacyFinding) -> str:
+def adequacy_finding_in_words(test: fit_notes.AdequacyFinding) -> str:
     """Result of the most significant test of residuals."""
     whose = f"the residuals of {channels.find_channel(test.channel).label}" if test.channel else ""
     return {
@@ -203,8 +203,8 @@ def adequacy_verdict(found: Adequacy) -> str:
     if not found.adequate:
         why = f"{chi2}, {p}" if found.noise_known else f"{p}, with the noise estimated from the residuals"
         return (
-            f"Not adequate: {shown_by(found.shown_by)} ({why}), so a term is missing and the parameters may "
-            "absorb its effect. Run mmrjax loop to find it"
+            f"Not adequate: {adequacy_finding_in_words(found.shown_by)} ({why}), so a term is missing and the "
+            "parameters may absorb its effect. Run mmrjax loop to find it"
         )
     if found.noise_known:
         return f"Adequate: the residuals are consistent with the stated noise ({chi2}, {p})"
@@ -275,9 +275,9 @@ def residual_cluster(c: ResidualCluster) -> str:
 #: Code of a remark → a sentence with its values, or a function that makes one.
 SAID: dict[str, str | Callable[..., str]] = {
     "held_by_prior": f"these runs do not determine {{names}} (posterior sd above {HELD:g} times the prior sd)",
-    "only_together": only_together,
+    "only_together": sentence_on_combinations,
     "far_from_prior": lambda name, sds, kind: FAR[kind].format(name, sds),
-    "noise_off": noise_off,
+    "noise_off": sentence_on_wrong_noise,
     "not_profiled": "no profiles were computed, so intervals come from the linearized model. They are too symmetric "
     "where the model is nonlinear",
     "no_covariance": "the posterior has no finite covariance. The values can be used, but not the intervals",
@@ -285,7 +285,7 @@ SAID: dict[str, str | Callable[..., str]] = {
     "estimated_noise": estimated_noise,
     "beside_steady": "{inside} of {total} parameters agree with the optimum of the steady model within their 95 "
     "% intervals. The largest difference is {sds:.2f} sd ({furthest})",
-    "of_rows": of_rows,
+    "of_rows": sentence_on_rows,
     "at_bound": "{name} is at its {side} bound",
     "after_steps": lambda channel, share, rows, total: (
         f"{share:.0%} of the squared error of {channels.find_channel(channel).label} lies in the first sample "
@@ -327,11 +327,11 @@ SAID: dict[str, str | Callable[..., str]] = {
     "in_pieces": "{name} has a 95 % interval of {pieces} separate parts. Readings at more closely spaced conditions "
     "would show which part is right",
     "generations": search_generations,
-    "lost_rows": lost_rows,
-    "members_jump": members_jump,
+    "lost_rows": sentence_on_failing_members,
+    "members_jump": sentence_on_jumping_members,
     "ended_at_edge": lambda edge: (
         "the search ended at the edge of the allowed range: its best member has "
-        + ", ".join(f"{name} {prior_edge(at)}" for name, at in edge.items())
+        + ", ".join(f"{name} {distance_from_prior(at)}" for name, at in edge.items())
     ),
     "read_from_members": "derivatives of the run with respect to {names} disagree with finite differences, because "
     "contacts open and close. The combinations that the data determine therefore come from a regression "

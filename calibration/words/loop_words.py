@@ -332,7 +332,7 @@ DISAGREES = (
 )
 
 
-def so_far(effects: Sequence[str], families: Sequence[str]) -> str:
+def search_progress(effects: Sequence[str], families: Sequence[str]) -> str:
     """Findings of a search before its verdict is known."""
     return (
         f"so far, simulation confirms {' and '.join(with_article(f) for f in dict.fromkeys(families))} "
@@ -352,8 +352,13 @@ def _without_name(where: DiscrepancyLocation, evidence: str, no_effect: str) -> 
 
 def _shown(where: DiscrepancyLocation) -> str:
     """Variable that shows a discrepancy, and equally significant others."""
-    well = [shown_over(v, where.by_duty).removeprefix("clearest when plotted ") for v in where.variables_alike]
-    return shown_over(where.variable, where.by_duty) + (f" (equally clear {', '.join(well)})" if well else "")
+    well = [
+        variable_showing_discrepancy(v, where.by_duty).removeprefix("clearest when plotted ")
+        for v in where.variables_alike
+    ]
+    return variable_showing_discrepancy(where.variable, where.by_duty) + (
+        f" (equally clear {', '.join(well)})" if well else ""
+    )
 
 
 def _window_words(where: DiscrepancyLocation) -> str:
@@ -361,7 +366,7 @@ def _window_words(where: DiscrepancyLocation) -> str:
     return "" if bases.window_from_name(where.variable) is None else f", {_shown(where)}"
 
 
-def shown_over(variable: str, by_duty: bool = False) -> str:
+def variable_showing_discrepancy(variable: str, by_duty: bool = False) -> str:
     """Variable that shows a discrepancy. `by_duty`: only the duty changed the motors' voltage."""
     variable = "duty" if by_duty and variable == "voltage" else variable
     happens = bases.window_from_name(variable)
@@ -407,7 +412,7 @@ def is_established(found: DiscoveryResult, effect: FoundEffect) -> bool:
     return found.support is None or found.support.established(effect.name)
 
 
-def how_sure(found: DiscoveryResult, effect: FoundEffect) -> str:
+def standing_of_effect(found: DiscoveryResult, effect: FoundEffect) -> str:
     """Standing of an effect, with its score and the threshold of chance."""
     test = None if found.support is None else found.support.test_of(effect.name)
     if is_established(found, effect):
@@ -455,7 +460,7 @@ def percent_text(error: Mapping[str, float | int]) -> str:
     return f"{percent:.1f}" if percent == 0 or percent >= 0.095 else f"{percent:.1g}"
 
 
-def use_it(found: DiscoveryResult) -> list[str]:
+def errors_of_written_robot(found: DiscoveryResult) -> list[str]:
     """Errors of the written robot on fitted and on held-out rows, by kind of block."""
     when = 1 if found.written else 0
     lines = [f"Within these conditions: {_rms(found.errors[when], len(found.runs))}."] * bool(found.errors[when])
@@ -586,7 +591,7 @@ def effect_doubts(test: loop_notes.NameTest | None) -> str:
 
 def _curve(c: loop_notes.PlacedCurve) -> str:
     if bases.window_from_name(c.variables[0]) is not None:
-        return f"constant in the {bases.place_in_words(c.place)} {shown_over(c.variables[0])}"
+        return f"constant in the {bases.place_in_words(c.place)} {variable_showing_discrepancy(c.variables[0])}"
     return f"smooth {'curve' if len(c.variables) == 1 else 'surface'} in the {_place_over(c.place, *c.variables)}"
 
 
@@ -631,7 +636,7 @@ def why_ruled_out(reasons: Sequence[loop_notes.RuledOut]) -> str:
     return "; ".join(RULED_OUT[r.why].format(r, check=" and ".join(r.check)) for r in reasons)
 
 
-def ruled_out(found: DiscoveryResult) -> str:
+def sentence_on_ruled_out_effects(found: DiscoveryResult) -> str:
     """Effects that explain the data at least as well but are ruled out by size or sign, empty for none."""
     candidates, same = found.implausible, found.settings.same
     if found.verdict not in WITHOUT_NAME:
@@ -764,7 +769,7 @@ def track_model_answer(found: TrackModelResult) -> str:
 # --- remarks --------------------------------------------------------------------------------------------
 
 
-def in_parts(noise: SeriesNoise) -> str:
+def noise_in_words(noise: SeriesNoise) -> str:
     """An estimated sd: `0.055 A and 1.3 % of the reading`."""
     parts = [
         f"{noise.floor / noise.channel.factor:.2g} {noise.channel.unit}" if noise.floor or not noise.share else "",
@@ -777,7 +782,7 @@ def in_parts(noise: SeriesNoise) -> str:
 
 def noise_from_series(noise: tuple[SeriesNoise, ...]) -> str:
     """Channels whose sds are estimated along series."""
-    parts = [f"{s.channel.label} {in_parts(s)}" for s in noise]
+    parts = [f"{s.channel.label} {noise_in_words(s)}" for s in noise]
     along = dict.fromkeys(f"{s.count} series of {s.axis}" for s in noise)
     freedom = min(s.freedom for s in noise)
     return (
@@ -793,7 +798,7 @@ def copied_rows(rows: tuple[int, ...]) -> str:
     return f"rows {', '.join(map(str, rows))} are exact copies of earlier ones and count once"
 
 
-def kept_out(rows: tuple[int, ...], why: str) -> str:
+def sentence_on_unused_rows(rows: tuple[int, ...], why: str) -> str:
     """Rows that do not count."""
     reasons = {
         "unusable": "are not used, because the fitted model slides or fails in them",
@@ -845,7 +850,7 @@ def leader_choice(
     return sentence
 
 
-def rests_on(
+def sentence_on_single_run(
     test: loop_notes.NameTest,
     conditions: Mapping[str, str | float] = MappingProxyType({}),
     axis: str = "",
@@ -883,7 +888,7 @@ SAID: dict[str, str | Callable[..., str]] = {
     "as given, {refit:.0%} after the refit). The {word} noise gives some of its readings too much weight. State the "
     "instrument's noise with --noise",
     "copies": copied_rows,
-    "kept_out": kept_out,
+    "kept_out": sentence_on_unused_rows,
     "phases_differ": "the phase of the wave differs between runs, so robot.toml contains the mean phase. The wave "
     "explains {free:.0f} σ² with a free phase in each run, and {held:.0f} σ² with a common phase. Start every run "
     "with the shaft at a mark",
@@ -905,6 +910,6 @@ SAID: dict[str, str | Callable[..., str]] = {
     ),
     "too_few_replicates": "{settled} bootstrap tables are too few for some kinds of evidence. Use 500 or more "
     "(--replicates)",
-    "rests_on": rests_on,
+    "rests_on": sentence_on_single_run,
     "unwritten": unwritten_reason,
 }

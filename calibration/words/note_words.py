@@ -40,9 +40,9 @@ NOTES: dict[str, str | Callable[..., str]] = {
 RESULTS: dict[type, Callable[..., str]] = {
     Feedforward: feedforward_words.feedforward_statement,
     fit_notes.Determination: fit_words.is_determined_answer,
-    fit_notes.ReachedBound: fit_words.prior_edge,
+    fit_notes.ReachedBound: fit_words.distance_from_prior,
     fit_notes.DependentPair: fit_words.determined_combination,
-    fit_notes.AdequacyFinding: fit_words.shown_by,
+    fit_notes.AdequacyFinding: fit_words.adequacy_finding_in_words,
     Adequacy: fit_words.adequacy_verdict,
     ResidualCluster: fit_words.residual_cluster,
     fit_results.CalibrationResult: lambda found: fit_words.adequacy_verdict(found.adequacy),

@@ -37,7 +37,7 @@ def left_out_reason(stretch: Stretch) -> str:
     return reason + (f" ({100 * stretch.size:.2g} %)" if stretch.size else "")
 
 
-def left_out(stretches: Iterable[Stretch], few: bool = False) -> list[tuple[str, int, int, str, str]]:
+def omitted_stretches(stretches: Iterable[Stretch], few: bool = False) -> list[tuple[str, int, int, str, str]]:
     """Reasons, each with its stretches, samples, rows of the longest one, and what to do.
 
     Args:
@@ -82,7 +82,7 @@ def levels_and_samples(found: Settled) -> str:
     )
 
 
-def too_few(found: Settled, fewest: int, loop: str) -> str:
+def sentence_on_few_settled_runs(found: Settled, fewest: int, loop: str) -> str:
     """Sentence for a log with too few settled runs: fit the log itself, empty where it has enough.
 
     Args:

@@ -102,7 +102,7 @@ def copied_channel(source: str, column: str, other: str, intercept: float, slope
     return f"{sentence}, so it is computed, not measured. Measure it, or remove it from the channels and the table"
 
 
-def ends_early(runs: Names, lasts: float, share: float) -> str:
+def sentence_on_short_histories(runs: Names, lasts: float, share: float) -> str:
     """Histories that end before the robot is under way."""
     at_speed = "" if math.isnan(share) else f", at {share:.0%} of the speed of steady travel"
     return (
@@ -125,7 +125,9 @@ def inherited_priors(part: str, changed: tuple[tuple[str, float, float], ...], k
     )
 
 
-def off_by(column: str, unit: str, factor: float, units: Names, others: Names, imposed: str) -> str:
+def sentence_on_implausible_readings(
+    column: str, unit: str, factor: float, units: Names, others: Names, imposed: str
+) -> str:
     """Readings that no robot like this one shows."""
     off, size = (factor, "large") if factor > 1 else (1 / factor, "small")
     subject = f"{column}: readings are about {float(f'{off:.2g}'):g} times too {size} for this robot"
@@ -172,7 +174,7 @@ SAID: dict[str, str | Callable[..., str]] = {
         )
         + " at the output) in the load's table of the robot file"
     ),
-    "ends_early": ends_early,
+    "ends_early": sentence_on_short_histories,
     "never_grips": lambda runs, share: (
         f"{_runs(runs, 'slides', 'slide')} to the end: the robot then travels at {share:.0%} of the speed of its "
         "tracks or wheels. Such runs do not measure the static friction of the ground"
@@ -189,7 +191,7 @@ SAID: dict[str, str | Callable[..., str]] = {
     "so a robot that should stand still creeps at a few mm/s. Leave out rows at rest if their readings are more "
     "exact than that",
     "inherited_priors": inherited_priors,
-    "off_by": off_by,
+    "off_by": sentence_on_implausible_readings,
     "slopes_in": "slope_deg: the current rises {rise:.2g} times as fast with the slope as for this robot; are "
     "the slopes in {unit}? expected degrees",
 }

@@ -588,8 +588,9 @@ def _update_verdict(
 
 
 def begin_climb(run: ClimbSystem, motion: ClimbMotion | None = None) -> tuple[ClimbMotion, Energy, VerdictState]:
-    """Initial motion (None: at rest before the obstacle), zero energy, and the initial verdict. The verdict is
-    `failed` if the levers would start below the ground. Otherwise the run continues.
+    """Initial motion (None: at rest before the obstacle), zero energy, and the initial verdict.
+
+    The verdict is `failed` if the levers would start below the ground. Otherwise the run continues.
     """
     angles, gear = _convert_lever_angles(*run.sequence.first), run.shape.gear
     under = roller_clearance(run.shape.main.first + gear.grouser_height, gear, angles) < -ON_GROUND

@@ -45,7 +45,9 @@ class GearLoadLoss(GearboxEffect):
 
 
 class GearQuadraticLoss(GearboxEffect):
-    """ΔM_r = a M_load²: the square of the torque at the output shaft. The gear loss grows faster than the load.
+    """ΔM_r = a M_load²: the square of the torque at the output shaft.
+
+    The gear loss grows faster than the load.
 
     Source: second-order term of the load-dependent mesh loss. The coefficient of friction grows with the tooth load
     (Ohlendorf, Verlustleistung und Erwärmung von Stirnrädern, 1958: μ ∝ load^0.2), and the planets tilt under load.

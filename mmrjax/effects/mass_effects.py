@@ -36,8 +36,9 @@ class MassError(MassEffect):
 
 
 class MassOffset(MassEffect):
-    """M = stated mass + a in the wheeled configuration, and the stated mass in the tracked one. One configuration has
-    additional mass. `configurations` may name others.
+    """M = stated mass + a in the wheeled configuration, and the stated mass in the tracked one.
+
+    One configuration has additional mass. `configurations` may name others.
 
     Source: Table A2 prints 13.1 kg for the wheeled robot, Table 7 states 11.5 kg. Weight, adhesion,
     guide load and inertia all follow from the mass, so it enters only there.

@@ -44,7 +44,9 @@ class Windage(MotorEffect):
 
 
 class StribeckMotor(MotorEffect):
-    """ΔM_df = a exp(-|ω_m| / ω_s) sign ω_m. The friction of brushes and bearings decreases with shaft speed.
+    """ΔM_df = a exp(-|ω_m| / ω_s) sign ω_m.
+
+    The friction of brushes and bearings decreases with shaft speed.
 
     Source: Tustin, The effects of backlash and of speed-dependent friction on the stability of closed-cycle
     control systems, J. IEE 94 (1947), the exponential law. Armstrong-Hélouvry, Dupont and Canudas de Wit

@@ -20,7 +20,7 @@ def amplitude_of(effect: Effect) -> Parameter:
     return next(p for p in params.walk_parameters(effect) if p.spec.amplitude)
 
 
-def shape_of(effect: Effect) -> Parameter | None:
+def free_shape_parameter(effect: Effect) -> Parameter | None:
     """The shape parameter that a fit frees: the first phase or scale after the amplitude, None without one."""
     for p in params.walk_parameters(effect):
         if not p.spec.amplitude and (p.name == "phase" or (p.spec.relative_sd and float(p.value) > 0)):
@@ -37,7 +37,7 @@ def scaled_effect(kind: type[Effect], factors: Factors) -> type[Effect]:
     sd, stretch, limits = factors
     effect = kind()
     fields = {amplitude_of(effect).name: _field(amplitude_of(effect), sd, limits)}
-    if (shape := shape_of(effect)) is not None and stretch != 1.0:
+    if (shape := free_shape_parameter(effect)) is not None and stretch != 1.0:
         fields[shape.name] = _field(shape, stretch, stretch)
     body: Mapping[str, object] = {
         "__annotations__": {**dict.fromkeys(fields, "Scalar"), "factors": ClassVar[Factors]},

@@ -20,8 +20,9 @@ class TrackEffect(Effect):
 
 
 class Churning(TrackEffect):
-    """ΔM_t = a ω_k |ω_k| at the pulley, for the track of one side. The loss of the track grows with the square of
-    speed.
+    """ΔM_t = a ω_k |ω_k| at the pulley, for the track of one side.
+
+    The loss of the track grows with the square of speed.
 
     Source: the next term after eq. (24). Impact of teeth and grousers transfers a momentum proportional to the
     speed, at a rate proportional to the speed (Merritt, The Evolution of a Tank Transmission, 1946).
@@ -64,8 +65,9 @@ class StribeckTrack(TrackEffect):
 
 
 class TensionFriction(TrackEffect):
-    """ΔM_t = a r_k |P_t|: the tension presses the tight side of the belt on pulleys and guides. Belt friction grows
-    with the traction that the belt carries.
+    """ΔM_t = a r_k |P_t|: the tension presses the tight side of the belt on pulleys and guides.
+
+    Belt friction grows with the traction that the belt carries.
 
     Source: Euler (1769) and Eytelwein (1808): normal force of a belt round a pulley in proportion to its
     tension. Merritt, The Evolution of a Tank Transmission (1946), track efficiency as a share of the

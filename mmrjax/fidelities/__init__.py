@@ -93,8 +93,9 @@ class FidelityFacts:
         return self.chunk if isinstance(self.chunk, int) else self.chunk[accelerator]
 
     def filled(self, runs: int) -> int:
-        """Number of runs to which a batch is padded, so that small batches share a compiled program. Computing the
-        additional steady runs takes less time than compiling another program.
+        """Number of runs to which a batch is padded, so that small batches share a compiled program.
+
+        Computing the additional steady runs takes less time than compiling another program.
         """
         return runs if self.rollout else max(runs, FEW)
 

@@ -184,7 +184,7 @@ def holds(robot: Robot, conditions: Conditions) -> Array:
     memory = {effect.name: none for effect in robot.remembering}
     rest = State(none, none, none, conditions.discharge, memory, distance=none, gap=none if robot.loose else None)
     settled = dataclasses.replace(rest, current=current_at_rest(robot, conditions, rest))
-    return jnp.asarray(jax.lax.stop_gradient(firmness(robot, conditions, settled)) >= 0)
+    return jnp.asarray(jax.lax.stop_gradient(holding_margin(robot, conditions, settled)) >= 0)
 
 
 def _ground_margin(forward: Signals, backward: Signals) -> Scalar:
@@ -195,7 +195,7 @@ def _ground_margin(forward: Signals, backward: Signals) -> Scalar:
     return (forward.adhesion_limit - along) / forward.normal
 
 
-def firmness(robot: Robot, conditions: Conditions, state: State) -> Scalar:
+def holding_margin(robot: Robot, conditions: Conditions, state: State) -> Scalar:
     """Margin of the friction that holds a robot at rest, negative if it cannot hold it [-].
 
     Its shafts rest if motors and gravity together cannot turn them against static friction, either by moving the
@@ -218,8 +218,8 @@ def _signals_both_ways(robot: Robot, conditions: Conditions, state: State) -> tu
 def shaft_direction(robot: Robot, conditions: Conditions, state: State) -> tuple[Array, Array]:
     """Direction in which shafts and a load that move as one turn, or leave rest, ±1 [-], and time until then [s].
 
-    `HELD` if they rest and friction holds them by the test of `firmness`, both now and at the later current at rest.
-    If friction holds them only now, they leave rest when the current, which lags exponentially, exceeds it. A clamp
+    `HELD` if they rest and friction holds them (`holding_margin`), both now and at the later current at rest. If
+    friction holds them only now, they leave rest when the current, which lags exponentially, exceeds it. A clamp
     holds them in any case. An imposed speed turns them in any case, 0 if it is 0.
     """
     conditions = balances.with_controller_duty(robot, conditions, state)

@@ -220,10 +220,11 @@ def steady(robot: Robot, conditions: Conditions) -> Result:
 
 @compiled
 def operating_point(robot: Robot, conditions: Conditions) -> tuple[Result, Array]:
-    """Same as `steady`, but with finite numbers at any status, so that a fit can return from there. If the robot
-    `slides`, the numbers follow from the balances with the contact at the sliding speed V_s. Current and motor speed
-    are those without sliding, the robot is V_s slower than r_k ω_k, and its speed has no derivative with respect to
-    μ_s.
+    """Same as `steady`, but with finite numbers at any status, so that a fit can return from there.
+
+    If the robot `slides`, the numbers follow from the balances with the contact at the sliding speed V_s. Current and
+    motor speed are those without sliding, the robot is V_s slower than r_k ω_k, and its speed has no derivative with
+    respect to μ_s.
 
     Returns:
         The result, and whether robot and conditions are sound (see `_conditions_are_sound`).

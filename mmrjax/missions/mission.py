@@ -70,8 +70,9 @@ class Totals(eqx.Module):
 
     @property
     def unaccounted(self) -> Scalar:
-        """Energy taken, minus losses and stored energy [J]: the error of the integration. The energy of a battery is
-        computed from its charge, so this error also includes errors of the charge.
+        """Energy taken, minus losses and stored energy [J]: the error of the integration.
+
+        The energy of a battery is computed from its charge, so this error also includes errors of the charge.
         """
         return self.given - sum(self.of[name] for name in energy.SINKS) - self.stored
 

@@ -180,8 +180,10 @@ def _holding_margins(
 
 
 def _holding_margin(law: MotionLaw, asked: SegmentInputs, y: Array, stands: Array) -> Array:
-    """Margin of the friction that would hold the robot at rest [-], see `rest.firmness`."""
-    return jnp.asarray(law.AT_REST.firmness(asked.robot, asked.conditions, law.state_of(asked.robot, y, stands)))
+    """Margin of the friction that would hold the robot at rest [-], see `rest.holding_margin`."""
+    return jnp.asarray(
+        law.AT_REST.holding_margin(asked.robot, asked.conditions, law.state_of(asked.robot, y, stands))
+    )
 
 
 class IntegrationState(NamedTuple):

@@ -213,7 +213,9 @@ def charge_drawn(robot: Robot, conditions: Conditions, total_current: Scalar) ->
 
 
 def electrical(robot: Robot, conditions: Conditions, signals: Signals) -> Signals:
-    """Voltage available to change the current [V]. With an imposed speed, the voltage that this speed needs. With an
+    """Voltage available to change the current [V].
+
+    With an imposed speed, the voltage that this speed needs. With an
     imposed current, the voltage of an amplifier that brings the current to its set value within the winding's time
     constant.
     """

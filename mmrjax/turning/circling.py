@@ -468,13 +468,13 @@ def current_at_rest(robot: Robot, conditions: Conditions, motion: PlaneMotion) -
     return jnp.asarray(jax.vmap(lambda c, s: rest.current_at_rest(robot, c, s))(sides, state))
 
 
-def firmness(robot: Robot, conditions: Conditions, motion: PlaneMotion) -> Scalar:
+def holding_margin(robot: Robot, conditions: Conditions, motion: PlaneMotion) -> Scalar:
     """Margin of the friction that holds the robot at rest at its heading, negative if it cannot hold it [-].
 
     The friction of each side has to hold its motor and its share of gravity. The ground has to hold all of gravity.
     """
     own, state = _sides_at_rest(robot, conditions, motion)
-    sides = jnp.asarray(jax.vmap(lambda c, s: rest.firmness(robot, c, s))(own, state))
+    sides = jnp.asarray(jax.vmap(lambda c, s: rest.holding_margin(robot, c, s))(own, state))
     chassis = robot.chassis(conditions.configuration)
     level = chassis.ground.friction.static * conditions.adhesion * balances.lateral_friction(conditions, chassis)
     aside = jnp.abs(jnp.tan(conditions.slope) * jnp.sin(motion.heading))
@@ -485,7 +485,7 @@ def holds(robot: Robot, conditions: Conditions) -> Array:
     """True if friction holds a standing robot at the currents one millisecond after the start."""
     motion = motion_of_unknowns(robot, turning_start(robot, conditions))
     settled = dataclasses.replace(motion, current=current_at_rest(robot, conditions, motion))
-    return jnp.asarray(jax.lax.stop_gradient(firmness(robot, conditions, settled)) >= 0)
+    return jnp.asarray(jax.lax.stop_gradient(holding_margin(robot, conditions, settled)) >= 0)
 
 
 def has_tipped(robot: Robot, travel: balances.Travel) -> Array:

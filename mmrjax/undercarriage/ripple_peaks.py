@@ -103,7 +103,7 @@ def period_pitch(pitch: float, speed_wheel: float, radius: float) -> float:
     return pitch / (speed_wheel * radius)
 
 
-def touchdowns(
+def touchdown_times(
     time: Series, grouser: Float[np.ndarray, "samples 24"], place: Float[np.ndarray, "samples 24"]
 ) -> Series:
     """Touchdown times of a grouser, in order [s]. Its position `place` tells the front arc from the rear

@@ -204,7 +204,7 @@ def _report_stored_stages(stages: Mapping[str, Any], folder: RunFolder, robot_na
     searches = [search for name, search in stages.items() if name.startswith("search")]
     if searches and (best := searches[-1][2].best) is not None:
         library = searches[-1][0].base.space.library
-        print_message(loop_words.so_far(best.effects, [library[n].family() for n in best.effects]))
+        print_message(loop_words.search_progress(best.effects, [library[n].family() for n in best.effects]))
     if "base" not in stages:
         return
     base = stages["base"][0].base

@@ -32,7 +32,7 @@ def execute(config: configuration.Settle, beside: configuration.SettledLog) -> i
         rolling=settling.rolling_readings(robot),
         loop=loop,
     )
-    few = settle_words.too_few(settled, SettledRuns.fewest, loop)
+    few = settle_words.sentence_on_few_settled_runs(settled, SettledRuns.fewest, loop)
     with open_folder("settle", config, robot, beside, runs) as folder:
         folder.write_table("settled.csv", settled.table())
         folder.write_table("stretches.csv", segments_table(settled))
@@ -76,8 +76,8 @@ def segments_table(found: Settled) -> Columns:
 
 
 def to_json(found: Settled, few: str = "") -> Json:
-    """`result.json`. `few` is the sentence of `words.too_few`."""
-    omitted = settle_words.left_out(found.stretches, bool(few))
+    """`result.json`. `few` is the sentence of `words.sentence_on_few_settled_runs`."""
+    omitted = settle_words.omitted_stretches(found.stretches, bool(few))
     return {
         "schema": "mmrjax.settle/1",
         "statement": settle_words.settle_statement(found),

@@ -26,7 +26,7 @@ from sweeps.pages import words
 from sweeps.points import axes, grid, run, scale, uncertainty
 from sweeps.points.job import prepare_job, showing_turns, store_layout
 from sweeps.points.sampled_design import Blocks
-from sweeps.points.tasks import task_of
+from sweeps.points.tasks import task_of_configuration
 from sweeps.points.zarr_store import STORE, Done, Identity, Layout, SweepStore, job_identity
 from sweeps.report import campaign_report, sweep_report
 from sweeps.report.document import Column, Table
@@ -95,7 +95,7 @@ def _sweep_into_store(config: Campaign, file: RobotFile, options: StoreOptions) 
         pool = cluster.connect_workers(options.scheduler)
     try:
         device = scale.device_kind() if pool is None else pool.device
-        task = task_of(config, robot)
+        task = task_of_configuration(config, robot)
         output_names = options.outputs or config.outputs or task.usual
         chunk = config.chunk or scale.default_chunk(task, None if pool is None else device)
         config = config.model_copy(update={"chunk": chunk, "outputs": output_names})

@@ -105,7 +105,7 @@ def export_format(
     return make(empty_export, runs, at, draws, seed)
 
 
-def notes_of(runs: ComparisonRuns) -> list[str]:
+def notes_for_file_head(runs: ComparisonRuns) -> list[str]:
     """Sentences for the head of every file."""
     command = runs.command
     return [
@@ -134,7 +134,7 @@ def _export_mujoco(begun: Export, runs: ComparisonRuns, at: str, draws: int, see
 
     def texts_of(drive: DriveJoint) -> dict[str, str]:
         return {
-            "drive.xml": mujoco.mjcf_fragment(drive, motor, about, notes_of(runs), name, at, volts),
+            "drive.xml": mujoco.mjcf_fragment(drive, motor, about, notes_for_file_head(runs), name, at, volts),
             "scene.xml": mujoco.mjcf_scene(
                 drive, mass, name, at, *((GOAL * motor.ratio, 0.0) if follows else middle)
             ),
@@ -189,7 +189,7 @@ def _start_difference(drive: DriveJoint, texts: Mapping[str, str], command: floa
 
 
 def _export_actuator(begun: Export, runs: ComparisonRuns, at: str, draws: int, seed: int) -> Export:
-    drive, constants, notes = begun.joint, begun.constants, notes_of(runs)
+    drive, constants, notes = begun.joint, begun.constants, notes_for_file_head(runs)
     law, effect_names = jax_actuator.actuator_law_function(runs, constants), jax_actuator.effects_in_actuator(drive)
     checks: dict[str, float] = {}
     if begun.format == "jax":
@@ -213,5 +213,5 @@ def _export_tables(begun: Export, runs: ComparisonRuns, at: str, draws: int, see
     law, effect_names = feed_forward.table_law_function(runs, constants), feed_forward.effects_in_tables(drive)
     fates: list[EffectFate] = feed_forward.fates_in_tables(drive, constants)
     compared = comparison.compare_format(runs, law, fates, effect_names, mujoco.approximated_terms)
-    files = feed_forward.table_files(drive, feed_forward.map_of_drive(runs, constants), notes_of(runs))
+    files = feed_forward.table_files(drive, feed_forward.map_of_drive(runs, constants), notes_for_file_head(runs))
     return dataclasses.replace(begun, files=files, comparison=compared)

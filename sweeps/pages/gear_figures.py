@@ -149,7 +149,7 @@ def draw_touchdowns(gear: GearRun, title: str = "grousers land (dotted)") -> Fig
     fig, grid = new_figure(2, 1, 5.0, sharex=True)
     last = gear.tail(SHOWN)
     time = 1e3 * (gear.time[last] - gear.time[last][0])
-    lands = ripple_peaks.touchdowns(time, gear.reactions.grouser[last], gear.reactions.place[last])
+    lands = ripple_peaks.touchdown_times(time, gear.reactions.grouser[last], gear.reactions.place[last])
     upper, lower = grid[:, 0]
     upper.plot(time, gear.signals.total_current[last], color=BLUE)
     upper.set(ylabel="total current [A]")

@@ -233,10 +233,10 @@ def simulate_starts(robot: Robot, voltage: float = 33.0, seconds: float = 1.5) -
     run = drive_batch(
         robot, batch_conditions(robot, shown_configurations(robot), voltage=voltage), jnp.asarray(times)
     )
-    return starts_of(robot, History(run.time, run.distance, run.signals, {}), run.result.status)
+    return starts_from_standstill(robot, History(run.time, run.distance, run.signals, {}), run.result.status)
 
 
-def starts_of(robot: Robot, history: Any, status: Any) -> list[StartRun]:
+def starts_from_standstill(robot: Robot, history: Any, status: Any) -> list[StartRun]:
     """Runs of the paper's configurations from standstill, of any fidelity that has histories.
 
     Args:

@@ -58,7 +58,7 @@ def gear_blocks(robot: Robot) -> Iterator[Block]:
         status_words = ", ".join(f"{g.name}: {words.short_status(g.status)}" for g in gears)
         yield catalogue.note("paper.gear-left-out", status_words)
         return
-    starts = data.starts_of(robot, run, run.result.status)
+    starts = data.starts_from_standstill(robot, run, run.result.status)
     yield catalogue.figure("paper.track_fig23_24_from_standstill", starts, data.FIG_23, data.FIG_24)
     yield catalogue.figure("paper.track_fig25_ripple", gears, "Fig. 25: {}")
     yield ripple_table(gears)

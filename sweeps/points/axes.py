@@ -26,7 +26,7 @@ from sweeps.config_campaign import Campaign
 from sweeps.options import parse_axis
 from sweeps.points import imposed
 from sweeps.points.sampled_design import DESIGNS, ROW, Design, DrawnSamples, JointDistribution, Samples, in_blocks
-from sweeps.points.tasks import task_of
+from sweeps.points.tasks import task_of_configuration
 
 CONFIGURATION, SURFACE = "configuration", "surface"
 #: Condition that is imposed, by `rig.IMPOSED`; those that act on a vehicle alone, and on a load on a shaft alone.
@@ -90,7 +90,7 @@ def plan_design(config: Campaign, robot: Robot, where: str) -> SweepPlan:
             name stated twice, and the like, one sentence.
     """
     data: list[str] = []
-    task = task_of(config, robot)
+    task = task_of_configuration(config, robot)
     extra = task.axes
     axes = {
         name: _axis_values(name, axis_text, robot, f"{where}, axes.{name}", extra)

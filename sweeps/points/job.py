@@ -23,7 +23,7 @@ from sweeps.config_campaign import Campaign
 from sweeps.console import print_message
 from sweeps.points import axes, scale
 from sweeps.points.sampled_design import Blocks
-from sweeps.points.tasks import Task, task_of
+from sweeps.points.tasks import Task, task_of_configuration
 from sweeps.points.zarr_store import ABSENT, Layout, Variable
 
 #: Points at which a fidelity is asked, before the first is simulated, whether it could bear them.
@@ -48,7 +48,7 @@ def prepare_job(config: Campaign, robot: Robot, plan: axes.SweepPlan, where: str
     name_clashes = [name for name in config.outputs if name in plan.design.names]
     if name_clashes:
         raise BadConfiguration(f"{where}, outputs: got {name_clashes[0]}, which is varied; expected outputs of a run")
-    task = task_of(config, robot, profile is not None and profile.turns)
+    task = task_of_configuration(config, robot, profile is not None and profile.turns)
     if unknown := [name for name in config.outputs if name not in task.attributes]:
         raise BadConfiguration(f"{where}, outputs: got {unknown[0]}; {allowed_words(unknown[0], task.attributes, 3)}")
     rests = {**{o.name: o.rests_on for o in outputs.output_table(robot.channels)}, **capabilities.RESTS_ON}

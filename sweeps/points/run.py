@@ -142,7 +142,7 @@ def compute_chunks(
     return {column: np.concatenate([part.pop(column) for part in results]) for column in tuple(results[0])}
 
 
-def job_of(robot: Robot, runs: Runs, config: FidelityPart, samples: DrawnSamples | None = None) -> Job:
+def job_of_run_table(robot: Robot, runs: Runs, config: FidelityPart, samples: DrawnSamples | None = None) -> Job:
     """Job for every output of the runs of a table, each combined with every sample if there are samples.
 
     Raises:
@@ -173,7 +173,7 @@ def evaluate_runs(
         advance: called with the number of runs done since its last call. Of a chunk under way, its share. None:
             a bar on stderr where it takes long.
     """
-    job = job_of(robot, runs, config)
+    job = job_of_run_table(robot, runs, config)
     slow = fidelities.fidelity_facts(config.model).slow or len(job.blocks) > 1
     with bar(len(runs), quiet=not slow or advance is not None) as progress_bar:
         chunks = compute_chunks(job, folder, "chunk", advance or progress_bar)

@@ -51,7 +51,7 @@ class Task:
     run: Callable[..., Json] | None = None
 
 
-def task_of(config: Campaign, robot: Robot, turns: bool = False) -> Task:
+def task_of_configuration(config: Campaign, robot: Robot, turns: bool = False) -> Task:
     """The task that a configuration states. `turns`: whether its profile drives the sides apart."""
     if config.obstacle is None:
         return run_task(config.model, config.options, robot, config.profile is not None, turns)

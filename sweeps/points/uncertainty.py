@@ -61,7 +61,7 @@ def simulate_draws(
         For every output's column its sd and the ends of its 95 % interval, NaN where fewer than two draws converge.
     """
     samples = DrawnSamples(tuple(posterior.names), posterior.draw(draws, SEED).T)
-    job = run.job_of(robot, runs, config, samples)
+    job = run.job_of_run_table(robot, runs, config, samples)
     slow = fidelities.fidelity_facts(config.model).slow or draws * len(runs) > 100_000
 
     def summary(found: run.Table) -> run.Table:

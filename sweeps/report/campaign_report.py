@@ -40,7 +40,7 @@ def campaign_document(file: RobotFile, layout: Layout, result: Json, store: Path
         f"Sweep of {count_noun(total, 'point')}",
         f"{count_noun(total, 'point')}: {reached:,} {verdict_words}.",
         (
-            run_tables.lead_note(file, model, f"All points are in `{STORE}`."),
+            run_tables.note_on_robot(file, model, f"All points are in `{STORE}`."),
             run_tables.endings_table(counts, "points", model),
         ),
         page_sections=lambda: _sections(store, layout, result["outputs"]),

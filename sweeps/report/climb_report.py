@@ -264,7 +264,7 @@ def climb_document(found: ClimbResult, file: RobotFile) -> Document:
     lead = f"**{found.configuration}**, {found.obstacle}, approached at a right angle."
     tried = ", ".join(f"{size:g} mm {VERDICTS[verdict][0]}" for size, verdict in found.tried)
     blocks: tuple[Block, ...] = (
-        run_tables.lead_note(file, more=lead),
+        run_tables.note_on_robot(file, more=lead),
         catalogue.figure("climb.silhouettes", found),
         catalogue.figure("climb.course", found),
     )

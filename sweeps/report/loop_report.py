@@ -10,6 +10,7 @@ import numpy as np
 
 from calibration.data import Columns, Names
 from calibration.data.columns import Layout
+from calibration.data.table import Runs
 from calibration.described import describe
 from calibration.discovery.result import DiscoveryResult
 from calibration.discovery.settings import WITHOUT_NAME
@@ -41,7 +42,7 @@ def loop_document(found: DiscoveryResult, robot_name: str, changes: Mapping[str,
         robot_name: name or file of the robot that it began with.
         changes: changes of settled runs by each effect.
     """
-    missing, table = found.verdict not in ("none", "undescribed"), rows_of(found)
+    missing, table = found.verdict not in ("none", "undescribed"), rows_for_figures(found)
     shifts, added = list(moved_parameters(found)), list(_effect_findings(found, changes))
     rise = loop_words.rising_errors_sentence(found.held_out_worse, found.predicted)
     return Document(
@@ -82,7 +83,7 @@ def _simulated_lines(found: DiscoveryResult) -> dict[str, str]:
     return {"after_": "simulated"} if found.refit_alone else {"after_": "with the effects found", "before_": "before"}
 
 
-def rows_of(found: DiscoveryResult) -> Columns:
+def rows_for_figures(found: DiscoveryResult) -> Columns:
     """Rows of the result as figures and page show them: of a rig each surface is a configuration of its own."""
     table = found.rows_table()
     if Layout.of(found.robot).crosses_zero:
@@ -102,7 +103,7 @@ def _effect_findings(found: DiscoveryResult, changes: Mapping[str, Change]) -> I
             size += f", which changes the {changes[e.name].channel.label} by {changes[e.name].rms:.2g} %"
         or_else = f" Or {other}." if other else ""
         kinds = ", or ".join(e.families)
-        sure = f"{_noise_alone(found).lower()}{loop_words.how_sure(found, e)}"
+        sure = f"{_noise_alone(found).lower()}{loop_words.standing_of_effect(found, e)}"
         yield f"**{kinds}** (`{e.name}`): {size}; {sure}.{or_else}"
 
 
@@ -210,7 +211,7 @@ def _advice(found: DiscoveryResult) -> Table:
         *against[:1],
     ]  # a sentence begins with a capital, a parameter does not
     rows = [
-        ("May I use it?", " ".join(loop_words.use_it(found)) or "No runs could be held out."),
+        ("May I use it?", " ".join(loop_words.errors_of_written_robot(found)) or "No runs could be held out."),
         (
             "What to check first",
             " ".join(
@@ -230,13 +231,14 @@ def _effects_in_words(found: DiscoveryResult) -> Iterable[Block]:
         effect = next((x for x in found.effects if x.name == e["name"]), None)
         plot_words = f"not in the library, plotted over {bases.variable_in_words(str(e.get('variable')))}"
         lowers, kinds = loop_words.misfit_text(e["score"]), ", or ".join(e["families"])
+        place = bases.place_in_words(e["balance"])
         if effect is None:
-            alike = ", ".join(b for b in e["balances_alike"] if b != e["balance"])
-            rows.append((e["name"], kinds, e["balance"], plot_words, "-", lowers, e["p_value"], "a curve", alike))
+            alike = ", ".join(bases.place_in_words(b) for b in e["balances_alike"] if b != e["balance"])
+            rows.append((e["name"], kinds, place, plot_words, "-", lowers, e["p_value"], "a curve", alike))
             continue
         rows.append(
             (
-                loop_words.effect_called(found, effect), kinds, e["balance"], e["equation"] or plot_words,
+                loop_words.effect_called(found, effect), kinds, place, e["equation"] or plot_words,
                 loop_words.effect_amplitude(effect), f"{lowers} ({100 * e['share']:.0f} %)", e["p_value"],
                 loop_words.tentative_reason(found, effect) or e["standing"],
                 loop_words.indistinguishable_effects(found, effect) or "nothing else of plausible size",
@@ -297,7 +299,10 @@ def _resolved(found: DiscoveryResult) -> Section:
 
 def _certainty_sections(found: DiscoveryResult, missing: bool) -> Iterable[Section]:
     """Sections on the certainty of the answer and its limits."""
-    reasons = {"standing": loop_words.support_sentence(found), "ruled_out": loop_words.ruled_out(found)}
+    reasons = {
+        "standing": loop_words.support_sentence(found),
+        "ruled_out": loop_words.sentence_on_ruled_out_effects(found),
+    }
     also = [loop_words.hidden_effects_sentence(found)] if found.hidden else []
     also += [loop_words.proposed_formula(found.unnamed)] if found.unnamed is not None else []
     also += [] if found.resolved is None else [found.resolved.statement, *found.resolved.notes]
@@ -309,7 +314,6 @@ def _certainty_sections(found: DiscoveryResult, missing: bool) -> Iterable[Secti
         *([Note(loop_words.cluster_sentence(found.cluster), name="cluster")] if found.cluster else []),
         *(Note(text, name=name, terminal=True) for name, text in reasons.items() if text),
         *remarks(also, "also"),
-        *([catalogue.note("loop.of-a-shaft")] if not found.robot.has_ground and found.effects else []),
         *_effects_in_words(found),
         _certainty(found, missing),
     ]
@@ -358,7 +362,10 @@ def _run_by_run(found: DiscoveryResult, table: Columns, changes: Mapping[str, Ch
     if isinstance(detail, TimeStatistics):
         some = f", of the first 8 of {detail.runs} runs" if detail.runs > 8 else ""
         yield catalogue.figure("loop.over_time", found.runs, table, found.channels, verdict, words=(some,))
-        yield fit_tables.fits_of_runs(table, found.channels, _simulated_lines(found))
+        lines = _simulated_lines(found)
+        yield fit_tables.fits_of_runs(table, found.channels, lines)
+        runs = Runs(found.runs.source, table, layout=Layout.of(found.robot))
+        yield from fit_tables.frequency_response(runs, found.channels, lines)
     elif changes or found.unnamed is not None:  # else it is the first figure
         yield catalogue.figure("loop.before_after", table, found.channels, verdict, words=("",))
 
@@ -402,7 +409,7 @@ def _closed(found: DiscoveryResult, table: Columns) -> str:
     """Equations that the channels close."""
     from sweeps.pages import loop_figures
 
-    sides = max(1, len(loop_figures.defects_of(table, "before", "track")))
+    sides = max(1, len(loop_figures.defects_by_side(table, "before", "track")))
     closed, of_sides = loop_figures.closed_equations(table), " of each side" if sides > 1 else ""
     if len(found.channels) < len(closed) * sides:
         return catalogue.text("loop.fewer", " of both sides" if sides > 1 else "")

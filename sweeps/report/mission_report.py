@@ -107,7 +107,7 @@ def missions_document(file: RobotFile, found: Missions) -> Document:
         f"Mission {source.source}" + ("" if len(names) > 1 else f" of {names[0]}"),
         answer,
         (
-            run_tables.lead_note(file, more=detail),
+            run_tables.note_on_robot(file, more=detail),
             Note(lead, terminal=True),
             *remarks(_exceeded_limits(found), "flags"),
             runs,

@@ -329,7 +329,7 @@ def resonance_document(found: ResonanceResult, file: RobotFile) -> Document:
         "Which speeds to avoid",
         first,
         (
-            run_tables.lead_note(file, "track", lead),
+            run_tables.note_on_robot(file, "track", lead),
             *remarks(others),
             figure if found.read.any() else catalogue.note("resonance.still"),
         ),

@@ -139,7 +139,7 @@ def reading_columns(shown: Iterable[Channel], kinds: Mapping[str, str]) -> list[
     ]
 
 
-def lead_note(file: RobotFile, model: str = "", more: str = "") -> Note:
+def note_on_robot(file: RobotFile, model: str = "", more: str = "") -> Note:
     """The line below the answer: robot, fidelity and a further sentence."""
     parts = [f"Robot: **{capabilities.displayed_name(file)}**.", f"Fidelity: **{model}**." * bool(model), more]
     return Note(" ".join(filter(None, parts)), "lead")

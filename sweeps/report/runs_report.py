@@ -58,7 +58,7 @@ def runs_document(
     shown_columns = (imposed_column(table), *_CONDITIONS, *(c.column for c in robot.channels), *_FURTHER)
     if not np.nan_to_num(table.get("voltage_cell_V", 0.0)).any():
         table.pop("voltage_cell_V", None)
-    blocks: list[Block] = [run_tables.lead_note(file, model, "From standstill." if histories is not None else "")]
+    blocks: list[Block] = [run_tables.note_on_robot(file, model, "From standstill." if histories is not None else "")]
     blocks += [run_tables.limits_table(limit_use, "this run"), catalogue.note("run.warming")] if limit_use else []
     shown_table = run_tables.quantity_table(
         "runs", table, shown_columns, first=[(Column("run"), names)], file="runs.csv", wide=len(names) > SIDE_BY_SIDE,

@@ -41,7 +41,7 @@ def sensitivity_document(found: SensitivityResult, file: RobotFile) -> Document:
         "Which parameters matter",
         found.statement(),
         (
-            run_tables.lead_note(file, found.model, method + ran),
+            run_tables.note_on_robot(file, found.model, method + ran),
             catalogue.table("sensitivity.leading", rows),
             overview,
             *remarks(said),

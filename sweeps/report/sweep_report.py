@@ -38,7 +38,7 @@ def sweep_document(file: RobotFile, model: str, runs: Columns, notes: Sequence[s
         f"Sweep of {count_noun(len(runs['status']), 'run')}",
         sweep_answer(runs),
         (
-            run_tables.lead_note(file, model, f"Varied: {axes}."),
+            run_tables.note_on_robot(file, model, f"Varied: {axes}."),
             run_tables.endings_table(
                 {s: statuses[s] for s in statuses_known}, beyond_a_limit=flagged_by_status, where=ranges_by_status
             ),

@@ -46,7 +46,7 @@ def turn_document(
         notes: further remarks.
     """
     robot, row = file.robot, {name: values[0] for name, values in run.items()}
-    sides, going = sides_table(robot, row), turn_words.is_going(row)
+    sides, going = sides_table(robot, row), turn_words.has_motion(row)
     sections = []
     if sides.rows and history is None:
         sections.append(Section("From above", (catalogue.figure("turn.circle", robot, row),)))
@@ -61,7 +61,7 @@ def turn_document(
         f"Turn of {run_headings(run)[0]}",
         turn_words.turn_answer(row, ended),
         (
-            run_tables.lead_note(file, model),
+            run_tables.note_on_robot(file, model),
             sides,
             *remarks([*(turn_words.turn_notes(robot, row) if going else []), *notes]),
         ),

@@ -14,7 +14,7 @@ import numpy as np
 
 from calibration.data import Columns, input_files
 from calibration.data.input_errors import BadData
-from calibration.data.sources.recorded_signals import Load, Signal, of_arrays, values_in_memory
+from calibration.data.sources.recorded_signals import Load, Signal, signals_of_arrays, values_in_memory
 
 #: Arrays by path: shape, type, and a function that returns the array.
 Arrays: TypeAlias = dict[str, tuple[tuple[int, ...], np.dtype, Load]]
@@ -24,7 +24,7 @@ _OBJECTS = np.dtype(object)
 COMPRESSED = 15
 
 
-def of_npz(path: Path, name: str) -> tuple[Signal, ...]:
+def signals_of_npz(path: Path, name: str) -> tuple[Signal, ...]:
     """Signals of an .npz archive. Arrays of Python objects are never loaded.
 
     Raises:
@@ -45,15 +45,15 @@ def of_npz(path: Path, name: str) -> tuple[Signal, ...]:
         with archive.open(member) as stream:
             shape, dtype = _read_npy_header(stream)
         arrays[array] = (shape, dtype, _member(archive, member))
-    return of_arrays(name, arrays)
+    return signals_of_arrays(name, arrays)
 
 
-def of_npy(path: Path, name: str) -> tuple[Signal, ...]:
+def signals_of_npy(path: Path, name: str) -> tuple[Signal, ...]:
     """Signals of an .npy file: columns of its array, or fields of its records."""
     with path.open("rb") as stream:
         shape, dtype = _read_npy_header(stream)
     loaded = functools.cache(lambda: np.load(path, allow_pickle=False))
-    signals = of_arrays(name, {path.stem: (shape, dtype, loaded)})
+    signals = signals_of_arrays(name, {path.stem: (shape, dtype, loaded)})
     fields = (dataclasses.replace(s, path=s.path.removeprefix(f"{path.stem}.")) for s in signals)
     return tuple(fields) if dtype.names else signals
 
@@ -73,7 +73,7 @@ def _member(archive: zipfile.ZipFile, member: str) -> Load:
     return functools.cache(load)
 
 
-def of_matlab(path: Path, name: str) -> tuple[Signal, ...]:
+def signals_of_matlab(path: Path, name: str) -> tuple[Signal, ...]:
     """Signals of a MATLAB file up to version 7. Fields of structures are named by path, `log.motor.speed`."""
     from scipy import io
 
@@ -88,7 +88,7 @@ def of_matlab(path: Path, name: str) -> tuple[Signal, ...]:
         else:
             dtype = np.dtype(float) if kind in plain - {"char"} else np.dtype(str) if kind == "char" else _OBJECTS
             arrays[variable] = (shape, dtype, _variable(loaded, variable))
-    return of_arrays(name, arrays)
+    return signals_of_arrays(name, arrays)
 
 
 def _check_matlab(path: Path, name: str) -> None:
@@ -127,7 +127,7 @@ def _structure_fields(path: str, value: np.ndarray) -> list[tuple[str, np.ndarra
     return fields
 
 
-def of_hdf5(path: Path, name: str) -> tuple[Signal, ...]:
+def signals_of_hdf5(path: Path, name: str) -> tuple[Signal, ...]:
     """Signals of an HDF5 file, or of a MATLAB file of version 7.3, by their path.
 
     Raises:
@@ -140,7 +140,7 @@ def of_hdf5(path: Path, name: str) -> tuple[Signal, ...]:
     with h5py.File(path, "r") as file:
         matlab = any("MATLAB_class" in file[key].attrs for key in file if _inside(file, key, name))
         _add_group(file, "", name, arrays, units, path, matlab, h5py, set())
-    return of_arrays(name, arrays, units)
+    return signals_of_arrays(name, arrays, units)
 
 
 def _inside(group: Any, key: str, name: str) -> bool:

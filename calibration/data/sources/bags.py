@@ -29,7 +29,7 @@ UNITS = {
 }
 
 
-def of_bag(path: Path, name: str) -> tuple[Signal, ...]:
+def signals_of_bag(path: Path, name: str) -> tuple[Signal, ...]:
     """Signals of a bag: `/topic.field.part[2]`, each with the time stamps of its topic.
 
     The time is the stamp of a message's header, or the time of recording if it has none.

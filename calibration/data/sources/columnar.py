@@ -17,7 +17,7 @@ MOST = 64
 _UNITS = (b"unit", b"units", b"Unit")
 
 
-def of_parquet(path: Path, name: str) -> tuple[Signal, ...]:
+def signals_of_parquet(path: Path, name: str) -> tuple[Signal, ...]:
     """Signals of a Parquet file, read column by column."""
     from pyarrow import parquet
 
@@ -27,12 +27,12 @@ def of_parquet(path: Path, name: str) -> tuple[Signal, ...]:
     input_files.check_declared(name, file.metadata.num_columns, size, path.stat().st_size)
 
     def column(field: str) -> Load:
-        return lambda: of_column(file.read([field], use_threads=True).column(0))
+        return lambda: values_of_arrow_column(file.read([field], use_threads=True).column(0))
 
     return tuple(s for field in schema for s in _signals(field, rows, column(field.name), file.read))
 
 
-def of_arrow(path: Path, name: str) -> tuple[Signal, ...]:
+def signals_of_arrow(path: Path, name: str) -> tuple[Signal, ...]:
     """Signals of a Feather or Arrow file, or an Arrow stream, read column by column.
 
     The file is not mapped into memory, since a file that is cut off while it is mapped ends the program.
@@ -54,7 +54,7 @@ def of_arrow(path: Path, name: str) -> tuple[Signal, ...]:
     rows = column(0).num_rows if len(schema) else 0
 
     def values(k: int) -> Load:
-        return lambda: of_column(column(k).column(0))
+        return lambda: values_of_arrow_column(column(k).column(0))
 
     def whole(k: int) -> Callable[[list[str]], Any]:
         return lambda names: column(k)
@@ -62,11 +62,11 @@ def of_arrow(path: Path, name: str) -> tuple[Signal, ...]:
     return tuple(s for k, field in enumerate(schema) for s in _signals(field, rows, values(k), whole(k)))
 
 
-def of_table(table: Any) -> tuple[Signal, ...]:
+def signals_of_arrow_table(table: Any) -> tuple[Signal, ...]:
     """Signals of a `pyarrow.Table`."""
 
     def column(field: str) -> Load:
-        return lambda: of_column(table.column(field))
+        return lambda: values_of_arrow_column(table.column(field))
 
     return tuple(
         s for field in table.schema for s in _signals(field, table.num_rows, column(field.name), table.select)
@@ -90,7 +90,7 @@ def _signals(field: Any, rows: int, load: Load, read: Callable[[list[str]], Any]
         return [Signal(field.name, rows, load, refused=why)]
 
     def element(k: int) -> Load:
-        return lambda: of_column(compute.list_element(column, k))
+        return lambda: values_of_arrow_column(compute.list_element(column, k))
 
     return [
         _signal(pa.field(f"{field.name}[{k}]", kind.value_type), rows, element(k))
@@ -112,7 +112,7 @@ def _signal(field: Any, rows: int, load: Load) -> Signal:
     return Signal(field.name, rows, load, unit, words=words, refused=refused)
 
 
-def of_column(column: Any) -> np.ndarray:
+def values_of_arrow_column(column: Any) -> np.ndarray:
     """Values of a `pyarrow.ChunkedArray`: numbers, NaN for a missing one, words, or `datetime64`."""
     import pyarrow as pa
     import pyarrow.types as kinds

@@ -14,8 +14,8 @@ from calibration.data.sources.recorded_signals import (
     Clock,
     Load,
     Signal,
-    of_arrays,
     refused_type,
+    signals_of_arrays,
     unit_of_clock,
     values_in_memory,
 )
@@ -25,7 +25,7 @@ EXPECTED = (
 )
 
 
-def of_object(source: Any) -> tuple[str, tuple[Signal, ...]]:
+def signals_of_object(source: Any) -> tuple[str, tuple[Signal, ...]]:
     """Kind of an object in memory, and its signals.
 
     Raises:
@@ -54,23 +54,25 @@ def of_object(source: Any) -> tuple[str, tuple[Signal, ...]]:
             frame = source.collect() if kind == "LazyFrame" else source
         except Exception as error:  # polars has errors of its own
             raise BadData(f"the LazyFrame: polars cannot evaluate it ({' '.join(str(error).split())})") from error
-        return "the DataFrame", columnar.of_table(frame.to_arrow())
+        return "the DataFrame", columnar.signals_of_arrow_table(frame.to_arrow())
     if library == "pyarrow" and kind in ("Table", "RecordBatch"):
         import pyarrow as pa
 
-        return "the Arrow table", columnar.of_table(source if kind == "Table" else pa.Table.from_batches([source]))
+        return "the Arrow table", columnar.signals_of_arrow_table(
+            source if kind == "Table" else pa.Table.from_batches([source])
+        )
     if library == "xarray" and kind in ("Dataset", "DataArray"):
         return f"the {kind}", _of_xarray(
             source if kind == "Dataset" else source.to_dataset(name=source.name or "values")
         )
     if isinstance(source, np.ndarray) and source.dtype.names:
-        return "the array", of_arrays(
+        return "the array", signals_of_arrays(
             "the array", {n: (source.shape, source.dtype[n], values_in_memory(source[n])) for n in source.dtype.names}
         )
     if isinstance(source, Mapping):
-        return "the dict", json_records.of_content(source, "the dict")
+        return "the dict", json_records.signals_of_json_content(source, "the dict")
     if isinstance(source, list | tuple) and source and all(isinstance(item, Mapping) for item in source):
-        return "the records", json_records.of_content(list(source), "the records")
+        return "the records", json_records.signals_of_json_content(list(source), "the records")
     raise BadData(f"the source: got {_called(source)}; expected {EXPECTED}")
 
 
@@ -118,7 +120,7 @@ def _of_xarray(dataset: Any) -> tuple[Signal, ...]:
             unit = str(dataset.coords[time].attrs.get("units", "")) or unit_of_clock(str(time)) or ""
             clock = Clock(str(time), _values(dataset.coords[time]), unit)
         shape, dtype = array.shape, array.dtype
-        signals = of_arrays(
+        signals = signals_of_arrays(
             "the Dataset", {str(name): (shape, dtype, _values(array))}, {str(name): str(array.attrs.get("units", ""))}
         )
         signals_found += [dataclasses.replace(s, clock=clock) for s in signals]

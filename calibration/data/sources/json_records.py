@@ -16,9 +16,9 @@ from calibration.data.sources.recorded_signals import (
     RUN,
     Signal,
     encodable_text,
-    of_arrays,
     parent_path,
     path_parts,
+    signals_of_arrays,
     unit_of_clock,
     values_in_memory,
 )
@@ -32,7 +32,7 @@ RATES = {
 }
 
 
-def of_json(path: Path, name: str) -> tuple[Signal, ...]:
+def signals_of_json(path: Path, name: str) -> tuple[Signal, ...]:
     """Signals of a JSON file, or of one with an object in each line.
 
     Raises:
@@ -51,7 +51,7 @@ def of_json(path: Path, name: str) -> tuple[Signal, ...]:
     except (ValueError, RecursionError) as error:
         why = "nested too deep" if isinstance(error, RecursionError) else error
         raise BadData(f"{name}: cannot be read as JSON ({why}); it may be cut off; export it again") from error
-    return of_content(found, name)
+    return signals_of_json_content(found, name)
 
 
 def _object(pairs: list[tuple[str, Any]]) -> Json:
@@ -67,7 +67,7 @@ def _object(pairs: list[tuple[str, Any]]) -> Json:
     return by_key
 
 
-def of_content(content: Any, name: str) -> tuple[Signal, ...]:
+def signals_of_json_content(content: Any, name: str) -> tuple[Signal, ...]:
     """Signals of lists and dicts of lists, numbers and arrays.
 
     Raises:
@@ -81,7 +81,7 @@ def of_content(content: Any, name: str) -> tuple[Signal, ...]:
             f"{name}: holds no list of records and no arrays; expected "
             '[{"time_s": 0.0, ...}, ...] or {"time_s": [...], ...}'
         )
-    return of_arrays(name, {path: (v.shape, v.dtype, values_in_memory(v)) for path, v in arrays.items()})
+    return signals_of_arrays(name, {path: (v.shape, v.dtype, values_in_memory(v)) for path, v in arrays.items()})
 
 
 def _collect(value: Any, at: str, arrays: Columns, name: str, depth: int) -> None:

@@ -13,7 +13,7 @@ import numpy as np
 from calibration.data.sources.recorded_signals import Clock, Load, Signal
 
 
-def of_mdf(path: Path, name: str) -> tuple[Signal, ...]:
+def signals_of_mdf(path: Path, name: str) -> tuple[Signal, ...]:
     """Signals of an MDF file by channel. Where groups have channels of one name, `group/channel`."""
     signals: list[Signal] = []
     with _opened(path) as file:

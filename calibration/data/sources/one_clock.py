@@ -86,7 +86,7 @@ def guessed_unit(raw: np.ndarray) -> str:
     return next((unit for unit, largest in _STEPS.items() if usual <= largest), "s")
 
 
-def on_one_grid(
+def signals_on_one_grid(
     name: str,
     chosen: Mapping[str, Signal],
     is_held: Callable[[str], bool],
@@ -151,7 +151,7 @@ def on_one_grid(
             values[column] = signal_values[np.maximum(np.searchsorted(times[key], on + alike, side="right") - 1, 0)]
             brought.setdefault("held", []).append(column)
         else:
-            values[column] = used_once(on, times[key], signal_values)
+            values[column] = readings_used_once(on, times[key], signal_values)
             brought.setdefault("interpolated", []).append(column)
     notes = []
     if brought:
@@ -181,7 +181,7 @@ def on_one_grid(
     return on - on[0], values, tuple(notes)
 
 
-def used_once(rows: np.ndarray, time: np.ndarray, values: np.ndarray) -> np.ndarray:
+def readings_used_once(rows: np.ndarray, time: np.ndarray, values: np.ndarray) -> np.ndarray:
     """Readings in the rows nearest to their samples, on the straight line between these, NaN in other rows.
 
     Args:

@@ -64,19 +64,19 @@ class Format:
             raise unreadable_file(name, self.kind, error) from error
 
 
-PARQUET = Format("a Parquet file", "columnar", "of_parquet")
-ARROW = Format("an Arrow file", "columnar", "of_arrow")
-HDF5 = Format("an HDF5 file", "arrays", "of_hdf5", "h5py")
-MATLAB = Format("a MATLAB file", "arrays", "of_matlab")
-NPZ = Format("an .npz archive", "arrays", "of_npz")
-NPY = Format("a NumPy file", "arrays", "of_npy")
-JSON = Format("a JSON file", "json_records", "of_json")
-BAG = Format("a ROS bag", "bags", "of_bag", "rosbags")
-MCAP = Format("an MCAP file", "bags", "of_bag", "rosbags")
-ULOG = Format("a ULog file", "ulog", "of_ulog", "pyulog")
-MDF = Format("an MDF file", "mdf", "of_mdf", "asammdf")
-WPILOG = Format("a WPILOG file", "wpilog", "of_wpilog")
-WORKBOOK = Format("a workbook", "workbook", "of_workbook", "python-calamine")
+PARQUET = Format("a Parquet file", "columnar", "signals_of_parquet")
+ARROW = Format("an Arrow file", "columnar", "signals_of_arrow")
+HDF5 = Format("an HDF5 file", "arrays", "signals_of_hdf5", "h5py")
+MATLAB = Format("a MATLAB file", "arrays", "signals_of_matlab")
+NPZ = Format("an .npz archive", "arrays", "signals_of_npz")
+NPY = Format("a NumPy file", "arrays", "signals_of_npy")
+JSON = Format("a JSON file", "json_records", "signals_of_json")
+BAG = Format("a ROS bag", "bags", "signals_of_bag", "rosbags")
+MCAP = Format("an MCAP file", "bags", "signals_of_bag", "rosbags")
+ULOG = Format("a ULog file", "ulog", "signals_of_ulog", "pyulog")
+MDF = Format("an MDF file", "mdf", "signals_of_mdf", "asammdf")
+WPILOG = Format("a WPILOG file", "wpilog", "signals_of_wpilog")
+WORKBOOK = Format("a workbook", "workbook", "signals_of_workbook", "python-calamine")
 
 #: First bytes of each format.
 BEGINNINGS = {
@@ -180,9 +180,9 @@ def open_object(source: Any) -> Source:
     """The signals of a table in memory.
 
     Raises:
-        BadData: for the same reasons as `in_memory.of_object`.
+        BadData: for the same reasons as `in_memory.signals_of_object`.
     """
-    kind, signals = in_memory.of_object(source)
+    kind, signals = in_memory.signals_of_object(source)
     return checked_source(kind, kind, signals)
 
 

@@ -336,7 +336,7 @@ def _on_a_grid(
 
     if not over_time:
         raise BadData(f"{source.name}: no signal has a column's name; {_how_to_name(source)}")
-    time, values, notes = one_clock.on_one_grid(source.name, over_time, is_held, is_measured, clock)
+    time, values, notes = one_clock.signals_on_one_grid(source.name, over_time, is_held, is_measured, clock)
     return {"time_s": time, **values, **_in_rows(source, others, len(time))}, notes
 
 

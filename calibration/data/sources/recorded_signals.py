@@ -172,7 +172,7 @@ def unit_of_clock(name: str) -> str | None:
     return None
 
 
-def of_arrays(
+def signals_of_arrays(
     source: str,
     arrays: Mapping[str, tuple[tuple[int, ...], np.dtype, Load]],
     units: Mapping[str, str] | None = None,

@@ -20,7 +20,7 @@ HEADER = 16
 _FIELD = re.compile(r"([^;\[\] ]+)(?:\[(\d+)\])? [^;]+")
 
 
-def of_ulog(path: Path, name: str) -> tuple[Signal, ...]:
+def signals_of_ulog(path: Path, name: str) -> tuple[Signal, ...]:
     """Signals of a ULog file, `topic.field`, of a second instance `topic[1].field`. Time counts from the boot.
 
     Raises:

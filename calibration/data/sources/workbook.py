@@ -20,7 +20,7 @@ OBJECTS = 4
 CELL = 100
 
 
-def of_workbook(path: Path, name: str) -> tuple[Signal, ...]:
+def signals_of_workbook(path: Path, name: str) -> tuple[Signal, ...]:
     """Columns of a workbook: by their names if one sheet has data, else `sheet/name`.
 
     The first row with a cell is the header. A row of units may follow.

@@ -50,7 +50,7 @@ class _Entry:
         return Signal(self.name, len(values), values_in_memory(values), "", clock, self.kind in WORDS)
 
 
-def of_wpilog(path: Path, name: str) -> tuple[Signal, ...]:
+def signals_of_wpilog(path: Path, name: str) -> tuple[Signal, ...]:
     """Signals of a WPILOG file of version 1, each with its stamps since the robot's start.
 
     Source: wpiutil/doc/datalog.adoc of github.com/wpilibsuite/allwpilib.

@@ -222,7 +222,7 @@ def command_sentence(found: Export) -> str:
     )
 
 
-def markdown(text: str) -> str:
+def escape_markdown(text: str) -> str:
     """A name of a user's in Markdown: it ends no line, cell or code, and begins no HTML."""
     words = " ".join(printable(text).split())
     return words.replace("`", "'").replace("|", "\\|").replace("<", "&lt;")
@@ -234,8 +234,8 @@ def law_text(found: Export) -> str:
     about = {"name": drive.name, "at": "drive", "armature": rotor_inertia(found)}
     verdicts = {HELD: "held by", APPROXIMATED: "approximated by", DROPPED: "dropped:"}
     constants = "\n".join(
-        f"| `{markdown(c.name)}` | {c.value:.6g} | {c.unit} | {c.interval or '–'} | {c.meaning} | "
-        f"{markdown(c.source)} |"
+        f"| `{escape_markdown(c.name)}` | {c.value:.6g} | {c.unit} | {c.interval or '–'} | {c.meaning} | "
+        f"{escape_markdown(c.source)} |"
         for c in found.constants
     )
     refitted = "\n".join(f"| {n} | {compared.translated[n]:.6g} | {v:.6g} |" for n, v in compared.refitted.items())
@@ -252,7 +252,7 @@ def law_text(found: Export) -> str:
     cited = any(re.search(r"\beqs?\.|\bTables? [A\d]", f"{c.meaning} {c.source}") for c in found.constants)
     paper = "\nNumbers of equations and tables are those of the paper that describes this robot.\n" if cited else ""
     bullets = lambda lines: "\n".join(f"* {line}" for line in lines)  # noqa: E731
-    origin = markdown(f"{drive.file.name}, {drive.configuration}")
+    origin = escape_markdown(f"{drive.file.name}, {drive.configuration}")
     return f"""# The law of this drive
 A motor with its gearbox on one joint: {origin}. A program, mmrjax {__version__},
 found its numbers from measurements or data sheets, and wrote it as {FORMATS[found.format]}. You need no other file of
@@ -282,7 +282,7 @@ Percentages compare currents and speeds of settled runs with and without the eff
 {errors}
 
 ## Conditions seen
-{bullets(map(markdown, conditions_seen(found)))}
+{bullets(map(escape_markdown, conditions_seen(found)))}
 
 ## Not tested
 {bullets(not_tested(found))}

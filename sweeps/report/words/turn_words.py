@@ -27,7 +27,7 @@ def unlike_sides_note(name: str, effects: Sequence[str], turns: str) -> str:
     return f"{name}: {STRAIGHT} ({', '.join(effects)}); {turns}"
 
 
-def by_itself(robot: Robot, found: Result, value: float) -> str:
+def turn_under_equal_commands(robot: Robot, found: Result, value: float) -> str:
     """Turn of a robot with both sides driven the same, by configuration, in words, empty if it travels straight.
 
     Args:
@@ -74,7 +74,7 @@ def turn_not_found_reason(speed: float, rate: float, speeds: np.ndarray, rates: 
     return f"which gives {' and '.join(told)}"
 
 
-def is_going(row: Json) -> bool:
+def has_motion(row: Json) -> bool:
     """True if a turn has a motion, settled or not."""
     return math.isfinite(float(row["yaw_rate_rad_s"])) and row["status"] in ("converged", "not_settled")
 
@@ -87,7 +87,7 @@ def turn_answer(row: Json, ended: Mapping[str, float] | None) -> str:
         ended: of a run over time `time_s`, `displacement_m` and `turned_deg` at its end. None: a settled turn.
     """
     status = str(row["status"])
-    if not is_going(row):
+    if not has_motion(row):
         unsettled = ended is None and status == STATUSES[NOT_SETTLED]
         return f"{status}: {words.NO_TURN if unsettled else words.STATUSES[status].why}"
     if ended is None:
