@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,6 @@ import numpy as np
 
 from calibration.data import Columns, Names
 from calibration.data.columns import Layout
-from calibration.data.table import Runs
 from calibration.described import describe
 from calibration.discovery.result import DiscoveryResult
 from calibration.discovery.settings import WITHOUT_NAME
@@ -364,7 +364,7 @@ def _run_by_run(found: DiscoveryResult, table: Columns, changes: Mapping[str, Ch
         yield catalogue.figure("loop.over_time", found.runs, table, found.channels, verdict, words=(some,))
         lines = _simulated_lines(found)
         yield fit_tables.fits_of_runs(table, found.channels, lines)
-        runs = Runs(found.runs.source, table, layout=Layout.of(found.robot))
+        runs = dataclasses.replace(found.runs, columns={**found.runs.columns, **table})
         yield from fit_tables.frequency_response(runs, found.channels, lines)
     elif changes or found.unnamed is not None:  # else it is the first figure
         yield catalogue.figure("loop.before_after", table, found.channels, verdict, words=("",))
