@@ -306,10 +306,10 @@ A law is fitted to all logs of a record but one. It predicts that one's voltage 
 `gear_load_loss`, by direction with `backdriving_loss`. Bristle is `bristle_load_loss` with
 `bristle_backdriving_loss` and `presliding`. LuGre is `presliding` with `stribeck_exponent`.
 
-These logs have no current. So a share lost while the motor drives looks like a smaller torque constant c, and rows
-that move show only the ratio of both directions: the two directions are not told apart. The arm's mass is not stated.
-The voltage of the XL330 is read. That of the others is computed from goal, angle and the law that bam states. Logs of
-MX-64 and MX-106 have no torque, and EMPS has no load. No data are copied here.
+These logs have no current, or one that is renewed each 0.9 s. So a share lost while the motor drives looks like a
+smaller torque constant c, and rows that move show only the ratio of both directions: the two directions are not told
+apart. The arm's mass is not stated. The voltage of the XL330 is read. That of the others is computed from goal, angle
+and the law that bam states. Logs of MX-64 and MX-106 have no torque, and EMPS has no load. No data are copied here.
 """
 
 

@@ -128,6 +128,18 @@ def test_a_motor_that_is_off_coasts(actuator, tmp_path):
     assert_allclose(held.voltage, 7.4)
 
 
+def test_a_current_limit_holds_the_motor_of_a_controller_and_coasting_releases_it(actuator):
+    """A start at the limited torque, and one without any."""
+    robot = actuator(old="[motor]", new="[driver]\ncurrent_limit = 0.3\n[motor]")
+    each = mm.Conditions(voltage=7.4, goal=np.ones(2), open=np.array([0.0, 1.0]))
+    run = drive.drive_batch(robot, each, jnp.asarray([0.0, 0.01, 0.02]))
+    v, currents = servo.TRUE, np.asarray(run.signals.current)
+    assert_allclose(currents[0, 1:], 0.3, rtol=5e-3)  # the limit is a steep slope of the voltage
+    rate = (v["ratio"] * v["constant"] * 0.3 - v["coulomb"]) / (v["load"] + v["ratio"] ** 2 * v["rotor"])
+    assert_allclose(run.signals.angle[0, 2], rate * 0.02**2 / 2, rtol=0.05)
+    assert_allclose([currents[1], run.signals.angle[1]], 0.0, atol=1e-12)
+
+
 def test_a_table_states_the_supply_where_the_file_does_not(actuator):
     robot = actuator(old="supply_voltage = 7.4\n")
     log = {"time_s": [0.0, 0.1], "goal_angle_rad": [0.0, 1.0], "output_angle_deg": [0.0, 1.0]}

@@ -15,9 +15,11 @@ from calibration.data import requirements_file, settling
 from calibration.data import runs as records
 from calibration.data.parts import packaged_cells
 from calibration.data.robot_file import RobotFile
+from calibration.inference.conduct import rows_after_steps
 from calibration.sizing import sheet
 from calibration.sizing.design_search import SizedDesign, SizingResult
 from calibration.sizing.part_options import drive_options
+from mmrjax.model import channels
 from mmrjax.model.paper_robots import nominal
 from sweeps import store
 from sweeps.inputs import recorded_fit
@@ -109,6 +111,25 @@ def comparison_two():
 def test_two_robots_are_compared_on_the_rows_that_both_reach():
     text = as_text(comparison_two())
     assert "This robot and found/robot.toml on the same 18 rows: total current 4.0 and 2.0 %" in text
+
+
+def test_fits_of_a_log_keep_the_samples_after_steps_apart():
+    """Readings taken before the command make a good model look hopeless."""
+    volts = np.repeat([0.0, 12.0, 6.0], 40)
+    runs = records.Runs("log.csv", {"time_s": 0.01 * np.arange(120), "supply_voltage_V": volts})
+    steps = np.logical_or(*rows_after_steps(runs))
+    assert np.flatnonzero(steps).tolist() == [40, 41, 80, 81]
+    speed = channels.find_channel("motor_speed")
+    table = {"time_s": runs["time_s"], speed.column: volts + np.sin(np.arange(120)), "status": np.full(120, "ended")}
+    table[f"simulated_{speed.column}"] = table[speed.column] + 9.0 * steps
+    table[f"error_{speed.name}_percent"] = 9.0 * steps
+    found = Comparison(
+        table, {"all": {speed.name: {"rows": 0}}}, (speed,), "log.csv", "drive", "ours", over={}, after_steps=steps
+    )
+    _, fits = comparison_report._over_time(found)[0].blocks
+    (_, every, with_steps), (_, rest, without) = fits.rows
+    assert (every, rest) == ("simulated", "simulated, without the two samples after each step")
+    assert with_steps < 75 and without == pytest.approx(100.0)
 
 
 def comparison_log():

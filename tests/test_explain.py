@@ -107,3 +107,9 @@ def test_near_words_have_the_word_as_a_part_whatever_its_capitals():
         and similar_words("xyzzy", outputs) == []
     )
     assert allowed_words("Motor_Speed", outputs).startswith("did you mean motor_speed? allowed: total_current")
+
+
+@pytest.mark.parametrize("name", ["established", "tentative", "held out", "noise", "voltage_limit"])
+def test_words_of_the_verdict_are_explained(name, mmrjax):
+    code, out, _ = mmrjax("explain", name)
+    assert code == 0 and words.GLOSSARY[name].split(".")[0][:40] in " ".join(out.split())

@@ -6,6 +6,7 @@ import json
 import re
 from pathlib import Path
 from types import SimpleNamespace
+from unittest.mock import ANY
 
 import jsonschema
 import numpy as np
@@ -39,6 +40,7 @@ from sweeps.pages import loop_figures
 from sweeps.pages import page as page_room
 from sweeps.pages.figure_style import figure_settings
 from sweeps.report import loop_report, page_renderer
+from sweeps.report.fit_tables import Change
 from sweeps.report.terminal_renderer import print_document
 from tests.commands import read_json
 
@@ -188,7 +190,7 @@ def test_the_page_opens_with_the_law_and_the_terminal_with_five_lines(shown, cap
     assert [head.index(f'id="{name}"') for name in ("answer", "law", "summary", "advice")] == sorted(
         head.index(f'id="{name}"') for name in ("answer", "law", "summary", "advice")
     )
-    assert "May I use it?" in head and "new law, 95 %" in head
+    assert "May I use it?" in head and "new law, band of 95 %" in head
     with figure_settings():
         (axes,) = loop_figures.draw_effect_laws(
             got.found, loop_report.rows_for_figures(got.found), room.changes_by_effect(got.found)
@@ -211,6 +213,73 @@ def test_the_page_opens_with_the_law_and_the_terminal_with_five_lines(shown, cap
         "Next",
     ]
     assert lines[1].index("motor.torque_constant is") < lines[1].index("Added: churning ")  # what moved comes first
+
+
+def drawn_law(table, x_column, law, sd=0.1):
+    """Axes and legend of the law of an effect of size 1 on the motor's speed, of which readings miss nothing."""
+    speed = channels.find_channel("motor_speed")
+    law = np.asarray(law) * speed.factor
+    zero = np.zeros((len(law), 1))
+    found = SimpleNamespace(
+        channels=(speed,), included=np.full(len(law), True),
+        readings_of_rows=SimpleNamespace(measured=law[:, None], before=zero, sd=zero + speed.factor),
+        effects=[SimpleNamespace(name="ours", parameters={"amplitude": SimpleNamespace(value=1.0, sd=sd)})],
+    )  # fmt: skip
+    change = {"ours": Change(speed, 1.0, 0 * law, law)}
+    with figure_settings():
+        fig = loop_figures.draw_effect_laws(found, table, change)
+    fig.canvas.draw()
+    legend = next(x for x in [*fig.legends, *(a.get_legend() for a in fig.axes)] if x)
+    assert fig.axes[0].get_xlabel() == x_column
+    return fig.axes[0], [text.get_text() for text in legend.get_texts()]
+
+
+def curves_of(axes, colour):
+    return [line for line in axes.lines if line.get_color() == colour and len(line.get_xdata()) > 2]
+
+
+def test_both_directions_of_a_law_have_their_own_line():
+    """Hollow dots are of backward runs, and no line crosses from one direction to the other."""
+    volts = np.r_[-24:0:3, 3:25:3].astype(float)
+    axes, names = drawn_law(
+        {"supply_voltage_V": volts, "configuration": np.full(16, "a")}, "supply voltage [V]", np.abs(volts)
+    )
+    assert names.count("backward") == 1 and len([n for n in names if n.startswith("new law")]) == 1
+    ways = [np.sign(line.get_xdata()) for line in curves_of(axes, loop_figures.BLUE)]
+    assert len(ways) == 2 and all(np.ptp(way) == 0 for way in ways)
+
+
+def test_a_law_over_two_quantities_is_a_line_for_each_level():
+    """One line over the current went up and down between the levels of the voltage."""
+    volts, torque = (x.ravel() for x in np.meshgrid([4.0, 8.0, 12.0], np.linspace(0.0, 3.0, 7)))
+    table = {"supply_voltage_V": volts, "load_torque_Nm": torque, "configuration": np.full(21, "a")}
+    axes, names = drawn_law(table, "load torque [N·m]", -torque * (1 + 4 / volts))
+    lines = curves_of(axes, loop_figures.BLUE)
+    assert len(lines) == 3 and all(np.all(np.diff(line.get_ydata()) < 0) for line in lines)
+    assert "new law at each supply voltage, band of 95 % (±20 %)" in names
+    band = axes.collections[-1].get_paths()[0].get_extents()
+    assert band.y0 == pytest.approx(1.196 * min(lines[-1].get_ydata()), rel=1e-3)
+
+
+def test_a_law_that_depends_on_more_has_a_mark_for_each_run():
+    volts = np.repeat([4.0, 8.0, 12.0], 7)
+    torque = np.random.default_rng(1).permutation(21) / 7
+    table = {"supply_voltage_V": volts, "load_torque_Nm": torque, "configuration": np.full(21, "a")}
+    jagged = np.random.default_rng(2).standard_normal(21)
+    assert not any(
+        len(x.get_xdata()) > 2 and x.get_linestyle() == "-" for x in drawn_law(table, ANY, jagged)[0].lines
+    )
+
+
+def test_the_proposed_set_of_effects_stands_out_in_the_figure_of_gains():
+    gains = [(("a",), SimpleNamespace(mean=0.2, se=0.05)), (("a", "b"), SimpleNamespace(mean=0.5, se=0.1))]
+    with figure_settings():
+        (axes,) = loop_figures.draw_gains(SimpleNamespace(gains=gains)).axes
+    dots = {float(x.get_xdata()[0]): x for x in axes.lines if x.get_marker() == "o"}
+    assert {n: float(dot.get_ydata()[0]) for n, dot in dots.items()} == {1.0: 0.2, 2.0: 0.5}
+    assert dots[2.0].get_markerfacecolor() == loop_figures.BLUE != dots[1.0].get_markerfacecolor()
+    bars = [segment for x in axes.collections for segment in x.get_segments()]
+    assert sorted(float(np.ptp(bar[:, 1])) for bar in bars) == pytest.approx([0.1, 0.2])  # a standard error each way
 
 
 def test_an_effect_of_the_listed_size_is_noticed_in_half_of_the_tables(shown, capsys):

@@ -24,6 +24,18 @@ SLOW, SLIDING = 0.7, 0.7
 STEP, MOST_ERROR, FEW_ROWS = 0.1, 0.5, 0.1
 
 
+def rows_after_steps(runs: Runs) -> np.ndarray:
+    """Rows with a step of the command, and the rows after them, shape (2, rows)."""
+    driven = applied_drive(runs)
+    largest = max(float(np.abs(driven).max(initial=0.0)), 1e-300)
+    with_step, after = both = np.zeros((2, len(runs)), bool)
+    for rows in runs.rows_by_run().values():
+        stepped = np.flatnonzero(np.abs(np.diff(driven[rows])) > STEP * largest) + 1
+        with_step[rows[stepped]] = True
+        after[rows[np.minimum(stepped + 1, len(rows) - 1)]] = True
+    return both
+
+
 def error_after_steps(runs: Runs, off: np.ndarray) -> list[Remark]:
     """Remarks on channels whose error is concentrated in the first sample at or after each step of the command.
 
@@ -32,17 +44,10 @@ def error_after_steps(runs: Runs, off: np.ndarray) -> list[Remark]:
     """
     if not observers.observer_kind(runs).axis:
         return []
-    driven = applied_drive(runs)
-    largest = max(float(np.abs(driven).max(initial=0.0)), 1e-300)
-    with_step, after = np.zeros((2, len(runs)), bool)
-    for rows in runs.rows_by_run().values():
-        stepped = np.flatnonzero(np.abs(np.diff(driven[rows])) > STEP * largest) + 1
-        with_step[rows[stepped]] = True
-        after[rows[np.minimum(stepped + 1, len(rows) - 1)]] = True
-    notes = []
+    notes, both = [], rows_after_steps(runs)
     for k, channel in enumerate(runs.channels):
         squares = np.nan_to_num(off[:, k]) ** 2
-        sums = {rows.tobytes(): (float(squares[rows].sum()), int(rows.sum())) for rows in (with_step, after)}
+        sums = {rows.tobytes(): (float(squares[rows].sum()), int(rows.sum())) for rows in both}
         most, count = max(sums.values())
         if 0 < count <= FEW_ROWS * len(runs) and most >= MOST_ERROR * squares.sum() > 0:
             notes.append(

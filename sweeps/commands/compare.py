@@ -14,7 +14,7 @@ from calibration.data.input_errors import BadConfiguration
 from calibration.data.robot_file import RobotFile
 from calibration.described import sentences
 from calibration.inference import preparation
-from calibration.inference.conduct import error_after_steps
+from calibration.inference.conduct import error_after_steps, rows_after_steps
 from calibration.inference.ranges import check_ranges
 from mmrjax import fidelities
 from mmrjax.model.channels import Channel
@@ -106,9 +106,10 @@ def _compare_histories(
             *missing_readings_notes(comparison, runs.channels),
             *sentences((*error_after_steps(runs, off), *ready.checked, *ready.begins, *ready.weighed)),
         )
+        after_steps = np.logical_or(*rows_after_steps(runs))
         result = Comparison(
             comparison, summary, runs.channels, Path(runs.source).name, HISTORIES, capabilities.displayed_name(file),
-            recorded_fit(file, runs), OVER, notes, _second_name(config, file, second),
+            recorded_fit(file, runs), OVER, notes, _second_name(config, file, second), after_steps,
         )  # fmt: skip
         return _write_result(folder, config, dataclasses.replace(file, robot=ready.robot), runs, table, result, notes)
 

@@ -17,7 +17,7 @@ from calibration.data.input_errors import BadConfiguration
 from calibration.data.rig_facts import DerivedFact, NumberOrigin
 from calibration.data.rig_file import FREE
 from calibration.data.runs import Runs
-from calibration.data.stated import EXAMPLE, EXAMPLE_SHARE, is_example
+from calibration.data.stated import EXAMPLE, EXAMPLE_SHARE, has_template_number, is_example
 from calibration.described import describe, sentences
 from calibration.inference import foresight, identifiability, priors
 from calibration.inference.fit_notes import Determination
@@ -47,7 +47,8 @@ class RigCheck:
     Attributes:
         file: file that was read.
         robot: robot of the file.
-        examples: lines of the file that still have a number of the template.
+        examples: lines of the file that still have a number of the template, marked as an example.
+        unmarked: other lines with the name and number of a template's example. 0 and 1 may be anyone's.
         origins: origins of its numbers.
         facts: values that follow from its numbers.
         runs: runs of the table, None without one.
@@ -58,6 +59,7 @@ class RigCheck:
     file: str
     robot: Robot
     examples: tuple[int, ...]
+    unmarked: tuple[int, ...]
     origins: tuple[NumberOrigin, ...]
     facts: tuple[DerivedFact, ...]
     runs: Runs | None = None
@@ -101,6 +103,10 @@ class RigCheck:
             count = count_noun(len(self.examples), "line")
             wide = f"a fit widens each ± among them to {100 * EXAMPLE_SHARE:g} %"
             notes.append(f"{count} with the template's example number ({EXAMPLE}): {lines}. {wide}")
+        if self.unmarked:
+            lines = ", ".join(map(str, self.unmarked))
+            count = count_noun(len(self.unmarked), "line")
+            notes.append(f"{count} with a number equal to the template's example: {lines}. Check that it is yours")
         notes += self.doubts
         if self.runs is not None and self.runs.has("duty") and self.runs.has("total_current_A"):
             notes.append(
@@ -310,9 +316,9 @@ def examine_rig_file(file: Path, data: str | None, effects: Names = (), columns:
     rig = load_robot(RobotPart(robot=str(file), effects=effects))
     lines, robot = rig.text.splitlines(), rig.robot
     examples = tuple(k for k, line in enumerate(lines, 1) if is_example(line))
-    check = RigCheck(
-        rig.name, robot, examples, tuple(rig_facts.number_origins(rig)), tuple(rig_facts.derived_facts(robot))
-    )
+    unmarked = tuple(k for k, line in enumerate(lines, 1) if has_template_number(line) and k not in examples)
+    origins, facts = tuple(rig_facts.number_origins(rig)), tuple(rig_facts.derived_facts(robot))
+    check = RigCheck(rig.name, robot, examples, unmarked, origins, facts)
     if data is None:
         return check
     runs = read_runs(data, robot, columns=columns, measured=True, series=True)

@@ -267,7 +267,7 @@ def draw_effect_scores(found: DiscoveryResult) -> Figure:
     level = found.before.kinds["single"].threshold
     axes.axvline(level, color=ORANGE, lw=1.6)
     axes.text(level, -0.6, f" threshold {level:.1f}", color=ORANGE, fontsize=8.5, va="bottom")
-    axes.set_yticks(range(len(rungs)), [f"{r.name}  ({r.balance})" for r in rungs])
+    axes.set_yticks(range(len(rungs)), [f"{r.name}  ({place_in_words(r.balance)})" for r in rungs])
     axes.set_ylim(len(rungs) - 0.4, -1.8)
     axes.grid(axis="y", visible=False)
     axes.set(xlabel="score: misfit that the effect alone explains, limited to a plausible size [σ]")
@@ -321,8 +321,9 @@ def draw_errors(found: DiscoveryResult) -> Figure:
 
 #: Of the range of a variable, over which the change by an effect is averaged when it is asked how smooth it runs.
 NEAR = 1 / 12
-#: Roughness up to which the change by an effect is drawn as a line over its variable.
-SMOOTH = 0.2
+#: Roughness up to which the change by an effect is drawn as one line over its variable, else as a line for each level
+#: of the imposed quantity.
+SMOOTH = 0.02
 
 
 def imposed_axis(table: Columns) -> tuple[np.ndarray, str]:
@@ -380,6 +381,11 @@ def driving_variable(table: Columns, change: np.ndarray, driver: str = "") -> tu
     return finite_columns[label], label
 
 
+def _turns_once(values: np.ndarray) -> bool:
+    """True if a sequence changes its direction at most once."""
+    return len(values) > 1 and int(np.count_nonzero(np.diff(np.sign(np.diff(values))))) <= 1
+
+
 def draw_effect_laws(found: DiscoveryResult, table: Columns, changes: Mapping[str, Change]) -> Figure:
     """Law of each effect found, plotted over its condition: readings minus those of the robot without the effect.
 
@@ -388,7 +394,8 @@ def draw_effect_laws(found: DiscoveryResult, table: Columns, changes: Mapping[st
     """
     fig, grid = new_figure(1, len(changes), 3.4)
     readings, is_included = found.readings_of_rows, found.included
-    backward = (table[imposed_column(table)] < 0)[is_included]
+    imposed, imposed_label = imposed_axis(table)
+    backward, imposed = (table[imposed_column(table)] < 0)[is_included], imposed[is_included]
     for axes, (name, change) in zip(grid[0], changes.items(), strict=True):
         c = change.channel
         effect = BY_NAME.get(name)
@@ -401,7 +408,8 @@ def draw_effect_laws(found: DiscoveryResult, table: Columns, changes: Mapping[st
             for values in (readings.measured[:, k], readings.before[:, k], change.with_it)
         )
         x, sd = x[is_included], readings.sd[is_included, k] / c.factor
-        band = 1.96 * abs(size.sd / size.value * law)
+        share = 196 * abs(size.sd / size.value)
+        band = share / 100 * abs(law)
         axes.axhline(0, color=FAINT, lw=0.8)
         for way, fill, words in ((~backward, ORANGE, "measured, ±2 sd"), (backward, "white", "backward")):
             if not way.any():
@@ -410,12 +418,18 @@ def draw_effect_laws(found: DiscoveryResult, table: Columns, changes: Mapping[st
             axes.errorbar(x[rows], measured[rows], 2 * sd[rows], fmt="o", ms=4.5, mfc=fill, color=ORANGE, lw=0.9,
                           label=words)  # fmt: skip
             axes.plot(x[rows], before[rows], "x", ms=5, color=INK, label="old law, refitted" if first else None)
-            if roughness(x[rows], law[rows]) < SMOOTH:
-                axes.plot(x[rows], law[rows], color=BLUE, label="new law, 95 %" if first else None)
-                axes.fill_between(x[rows], (law - band)[rows], (law + band)[rows], color=BLUE, alpha=0.2, lw=0)
-            else:
-                axes.errorbar(x[rows], law[rows], band[rows], fmt="_", ms=13, mew=2.2, color=BLUE, elinewidth=6,
-                              alpha=0.6, label="new law, 95 %" if first else None)  # fmt: skip
+            is_line = _turns_once(law[rows]) or roughness(x[rows], law[rows]) < SMOOTH
+            levels = np.zeros(len(rows)) if is_line else imposed[rows]
+            by_level = "" if is_line else f" at each {imposed_label.partition(' [')[0]}"
+            for line in (rows[levels == level] for level in np.unique(levels)):
+                law_words = f"new law{by_level}, band of 95 % (±{share:.2g} %)" if first else None
+                if not (is_line or _turns_once(law[line])):
+                    axes.errorbar(x[line], law[line], band[line], fmt="_", ms=13, mew=2.2, color=BLUE, elinewidth=6,
+                                  alpha=0.6, label=law_words)  # fmt: skip
+                else:
+                    axes.plot(x[line], law[line], color=BLUE, lw=1.2, label=law_words)
+                    axes.fill_between(x[line], (law - band)[line], (law + band)[line], color=BLUE, alpha=0.3, lw=0)
+                first = False
         axes.set(xlabel=label, ylabel=f"change of {c.label} [{c.unit}]", title=name)
     outer_legend(grid[0, 0], "upper left")
     return fig

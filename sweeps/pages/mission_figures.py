@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from scipy.integrate import cumulative_trapezoid
 
 from calibration.data import Columns, Json
 from mmrjax.model.channels import SIDES
@@ -110,21 +111,25 @@ def _draw_legend(axes: Axes, *others: Axes) -> None:
     axes.set_ylim(low, high + 0.22 * (high - low))  # room for it
 
 
-#: Turns of a curve's slope above which it is drawn as its envelope, and number of parts of the time then.
-TURNS, PARTS = 300, 200
+#: Turns of a curve's slope above which it is drawn as its envelope, and number of parts of the time then: long ones,
+#: so that the envelope has no gaps.
+TURNS, PARTS = 200, 40
 
 
 def _draw_curve(
     axes: Axes, time: np.ndarray, values: np.ndarray, colour: str, label: str, width: float = 1.0
 ) -> None:
-    """A curve over time, or from least to greatest in each part of the time if many cycles would fill the panel."""
+    """A curve over time, or its range and its mean over each part of the time if many cycles would fill the panel."""
     if np.count_nonzero(np.diff(np.sign(np.diff(values)))) <= TURNS:
         axes.plot(time, values, color=colour, lw=width, label=label)
         return
     parts = np.array_split(np.arange(len(time)), PARTS)
-    middle = [time[rows].mean() for rows in parts]
+    ends = np.linspace(time[0], time[-1], PARTS + 1)
+    means = np.diff(np.interp(ends, time, cumulative_trapezoid(values, time, initial=0))) / np.diff(ends)
     least, greatest = ([end(values[rows]) for rows in parts] for end in (np.min, np.max))
-    axes.fill_between(middle, least, greatest, color=colour, alpha=0.35, lw=0.6, label=f"{label}, range")
+    middle = [time[rows].mean() for rows in parts]
+    axes.fill_between(middle, least, greatest, color=colour, alpha=0.15, lw=0)
+    axes.plot((ends[1:] + ends[:-1]) / 2, means, color=colour, lw=width, label=label)
 
 
 def _draw_speed(axes: Axes, time: np.ndarray, rows: Columns, linear: bool, legend: bool) -> None:
@@ -181,7 +186,7 @@ def _draw_temperatures(axes: Axes, time: np.ndarray, rows: Columns, limit: float
         add_corner_note(axes, "not computed: the robot's file lacks\nthe thermal resistance of the windings")
         axes.set_yticks([])
         return
-    axes.plot(time, rows["winding_temperature_C"], color=VERMILION, lw=1.4, label="winding")
+    _draw_curve(axes, time, rows["winding_temperature_C"], VERMILION, "winding", 1.4)
     axes.plot(time, rows["housing_temperature_C"], color=ORANGE, lw=1.4, label="housing")
     top, bottom = float(np.max(rows["winding_temperature_C"])), float(np.min(rows["housing_temperature_C"]))
     if _limit_is_near(rows, limit):
@@ -209,7 +214,7 @@ def _draw_source(axes: Axes, time: np.ndarray, rows: Columns) -> None:
     if span > 0.05:
         axes.set_ylim(0, 105)
     beside = _right_axes(axes, "voltage [V]", BLUE)
-    beside.plot(time, volts, color=BLUE, lw=0.8, alpha=0.8)
+    _draw_curve(beside, time, volts, BLUE, "voltage", 0.8)
     for k in np.flatnonzero(rows["event"] == "below_cut_off")[-1:]:
         axes.axvline(time[k], color=VERMILION, lw=1.0, ls="--")
         add_corner_note(axes, "broken line: cells fall below their cut-off", x=0.02, y=0.06, va="bottom", color=FAINT)

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 
 from calibration.data.columns import Layout
-from calibration.data.courses import applied_drive
 from calibration.data.table import Runs
 from calibration.inference import blocks
 from calibration.inference.identifiability import HELD
@@ -19,9 +18,6 @@ from mmrjax.errors import count_noun
 from sweeps.pages import words
 from sweeps.report import catalogue, fit_tables, run_tables
 from sweeps.report.document import Block, Document, Note, Section, Table, remarks
-
-#: Least number of rows of a log for a frequency response.
-FREQUENCIES = 64
 
 
 def calibration_document(found: CalibrationResult, robot_name: str) -> Document:
@@ -109,9 +105,8 @@ def _over_rows(found: CalibrationResult, sized: bool) -> Iterable[Section]:
     if found.axis:
         lines = {"after_": "calibrated", "before_": "before"}
         runs = Runs(found.source, table, layout=Layout.of(found.robot))
-        swept = np.ptp(applied_drive(runs)) > 0 and len(runs) >= FREQUENCIES
-        response = [catalogue.figure("fit.frequency", runs, panels, lines)] * bool(swept)
-        yield Section("Histories", (catalogue.figure("fit.overlay", table, panels, lines, finding=answer), *response))
+        overlay = catalogue.figure("fit.overlay", table, panels, lines, finding=answer)
+        yield Section("Histories", (overlay, *fit_tables.frequency_response(runs, panels, lines)))
     unit = "the channel's unit; band: ±2 sd of the readings" if sized else f"percent of the {OF_SIZE}"
     along = {found.axis: "time [s]"} if found.axis else {}
     figures = (

@@ -39,6 +39,7 @@ class Comparison:
         over: further columns of histories for the axes of the errors, with their headings.
         notes: sentences on the table.
         against: name of a second robot, "" for none. Its readings are the columns `against_<column>` of the table.
+        after_steps: rows of histories at or after a step of the command.
     """
 
     table: Columns
@@ -51,6 +52,7 @@ class Comparison:
     over: Mapping[str, str] | None = None
     notes: Names = ()
     against: str = ""
+    after_steps: np.ndarray | None = None
 
     @property
     def rms_of_both(self) -> dict[str, tuple[int, float, float]]:
@@ -177,6 +179,11 @@ def _over_time(found: Comparison) -> tuple[Section, ...]:
         lines = {"simulated_": "simulated"}
     answer = comparison_answer(found)
     fits = fit_tables.fits_of_runs(found.table, found.channels, lines)
+    if found.after_steps is not None and 0 < np.count_nonzero(found.after_steps) < len(found.after_steps):
+        rest = {column: values[~found.after_steps] for column, values in found.table.items()}
+        apart = {prefix: f"{name}, without the two samples after each step" for prefix, name in lines.items()}
+        rows = [*fits.rows, *fit_tables.fits_of_runs(rest, found.channels, apart).rows]
+        fits = dataclasses.replace(fits, rows=sorted(rows, key=lambda row: row[0]))
     more = fit_tables.range_of_fits(fits, found.channels)
     overlay = catalogue.figure("fit.overlay", found.table, found.channels, lines, finding=answer, more=more)
     return (Section("Over time", (overlay, fits)),)

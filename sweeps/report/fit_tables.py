@@ -8,13 +8,17 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from calibration.data import Columns
+from calibration.data.courses import applied_drive
+from calibration.data.runs import Runs
 from calibration.inference.residual_clusters import ResidualCluster
 from calibration.inference.simulation_errors import r_squared
 from mmrjax.model.channels import Channel
 from sweeps.report import catalogue, run_tables
-from sweeps.report.document import Cell, Column, Section, Table, remarks
+from sweeps.report.document import Cell, Column, Figure, Section, Table, remarks
 from sweeps.report.run_tables import condition_formats
 
+#: Least number of rows of a log for a frequency response.
+FREQUENCIES = 64
 #: Names of fits that rms errors are of.
 FITS = {
     "before": "before", "after": "after", "held_out": "held out", "held_out_before": "before, held out",
@@ -83,6 +87,17 @@ def fits_of_runs(table: Columns, shown: Sequence[Channel], lines: Mapping[str, s
         for prefix, words in lines.items()
     ]  # fmt: skip
     return catalogue.table("fit.runs", fits, *(f"{c.label} | .1f" for c in shown))
+
+
+def frequency_response(runs: Runs, shown: Sequence[Channel], lines: Mapping[str, str]) -> list[Figure]:
+    """Figure of the response of each channel to the drive. None of a short log or a constant drive.
+
+    Args:
+        runs: runs with measured and simulated columns.
+        lines: prefixes of simulated columns and their names.
+    """
+    swept = len(runs) >= FREQUENCIES and np.ptp(applied_drive(runs)) > 0
+    return [catalogue.figure("fit.frequency", runs, shown, lines)] * bool(swept)
 
 
 def range_of_fits(fits: Table, shown: Sequence[Channel]) -> str:

@@ -10,6 +10,7 @@ import numpy as np
 
 from calibration.data import Columns, Names
 from calibration.data.columns import Layout
+from calibration.data.table import Runs
 from calibration.described import describe
 from calibration.discovery.result import DiscoveryResult
 from calibration.discovery.settings import WITHOUT_NAME
@@ -231,13 +232,14 @@ def _effects_in_words(found: DiscoveryResult) -> Iterable[Block]:
         effect = next((x for x in found.effects if x.name == e["name"]), None)
         plot_words = f"not in the library, plotted over {bases.variable_in_words(str(e.get('variable')))}"
         lowers, kinds = loop_words.misfit_text(e["score"]), ", or ".join(e["families"])
+        place = bases.place_in_words(e["balance"])
         if effect is None:
-            alike = ", ".join(b for b in e["balances_alike"] if b != e["balance"])
-            rows.append((e["name"], kinds, e["balance"], plot_words, "-", lowers, e["p_value"], "a curve", alike))
+            alike = ", ".join(bases.place_in_words(b) for b in e["balances_alike"] if b != e["balance"])
+            rows.append((e["name"], kinds, place, plot_words, "-", lowers, e["p_value"], "a curve", alike))
             continue
         rows.append(
             (
-                loop_words.effect_called(found, effect), kinds, e["balance"], e["equation"] or plot_words,
+                loop_words.effect_called(found, effect), kinds, place, e["equation"] or plot_words,
                 loop_words.effect_amplitude(effect), f"{lowers} ({100 * e['share']:.0f} %)", e["p_value"],
                 loop_words.tentative_reason(found, effect) or e["standing"],
                 loop_words.indistinguishable_effects(found, effect) or "nothing else of plausible size",
@@ -313,7 +315,6 @@ def _certainty_sections(found: DiscoveryResult, missing: bool) -> Iterable[Secti
         *([Note(loop_words.cluster_sentence(found.cluster), name="cluster")] if found.cluster else []),
         *(Note(text, name=name, terminal=True) for name, text in reasons.items() if text),
         *remarks(also, "also"),
-        *([catalogue.note("loop.of-a-shaft")] if not found.robot.has_ground and found.effects else []),
         *_effects_in_words(found),
         _certainty(found, missing),
     ]
@@ -362,7 +363,10 @@ def _run_by_run(found: DiscoveryResult, table: Columns, changes: Mapping[str, Ch
     if isinstance(detail, TimeStatistics):
         some = f", of the first 8 of {detail.runs} runs" if detail.runs > 8 else ""
         yield catalogue.figure("loop.over_time", found.runs, table, found.channels, verdict, words=(some,))
-        yield fit_tables.fits_of_runs(table, found.channels, _simulated_lines(found))
+        lines = _simulated_lines(found)
+        yield fit_tables.fits_of_runs(table, found.channels, lines)
+        runs = Runs(found.runs.source, table, layout=Layout.of(found.robot))
+        yield from fit_tables.frequency_response(runs, found.channels, lines)
     elif changes or found.unnamed is not None:  # else it is the first figure
         yield catalogue.figure("loop.before_after", table, found.channels, verdict, words=("",))
 
