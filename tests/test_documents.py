@@ -72,6 +72,13 @@ def size():
     return size_report.size_document(SizeResult(asked, robot, sizing, ("mass",), outcomes()), "nominal (PM)")
 
 
+def test_a_design_that_meets_all_that_can_be_met_is_not_red():
+    """Only a design that misses what others meet is."""
+    tables = {block.name: block for block in size().every_block if isinstance(block, Table)}
+    verdicts = [(cell.value, cell.tone) for name in ("best", "by_motor") for cell, *_ in tables[name].rows]
+    assert set(verdicts) == {("meets the others", "fair"), ("misses", "bad")}
+
+
 def above_the_bench(rise):
     """The bench's rows, and what compares them with a simulation 4 % above them, the first row without one."""
     measured = records.read_runs("measured")

@@ -157,6 +157,8 @@ def test_command_writes_constants_of_a_wpilog(tmp_path, mmrjax):
         records += [(e, stamp, struct.pack("<d", v)) for e, v in zip((2, 3, 4), values, strict=True)]
         if k + 1 == len(log.run) or log.run[k + 1] != name:
             records.append((1, stamp, b"none"))
+    records += [(5, 0, ("NT:/SystemStats/BatteryVoltage", "double"))]
+    records += [(5, stamp, struct.pack("<d", v)) for stamp, v in ((10, 12.5), (20, 9.8))]
     (tmp_path / "robot.wpilog").write_bytes(wpilog(*records))
     code, out, error = mmrjax("calibrate robot.wpilog --feedforward simple --out fit")
     assert code == 0 and "kS = " in out, error
@@ -165,4 +167,4 @@ def test_command_writes_constants_of_a_wpilog(tmp_path, mmrjax):
     assert_allclose(values, true, rtol=0.02)
     assert found["feedforward"]["kV"]["unit"] == "V·s/rotation" and found["feedback"]["velocity_kP"]["value"] > 0
     page = (tmp_path / "fit" / "report.html").read_text()
-    assert "Quasistatic" in page and "Dynamic" in page
+    assert "Quasistatic" in page and "Dynamic" in page and "battery sagged from 12.5 to 9.8 V" in page

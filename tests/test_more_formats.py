@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from calibration.data import delimited, presets_file, runs
+from calibration.data import contents, delimited, presets_file, runs
 from calibration.data.input_errors import BadData
 from calibration.data.sources import json_records, opening, reading
 from tests.commands import text_file
@@ -207,6 +207,8 @@ def test_files_of_a_pattern_are_runs_of_their_own(tmp_path):
     (tmp_path / "run1.csv").write_text(TABLE.format(25))
     assert reading.read_columns(str(tmp_path / "run*.csv"), runs.Layout.of(None)).arrays.digest != first
     assert len(runs.read_runs(tmp_path / "run*.csv")) == 2
+    shown = contents.inspect_source(str(tmp_path / "run*.csv"))  # it was "no such file"
+    assert len(shown.signals) == 6 and "2 files, each a run; these are the signals of run0.csv" in shown.notes[0]
 
 
 def test_files_of_a_pattern_have_the_same_columns(tmp_path):

@@ -199,6 +199,7 @@ def test_one_run_is_shown_with_its_readings_limits_and_power(tmp_path):
     assert used["adhesion"] == f"{100 * runs['adhesion_used'][0]:.0f} %"
     assert used["gearbox input speed"] == f"{runs['motor_speed_rpm'][0] / 80:.0f} %"  # of 8000 rpm
     assert page.count('class="bar over"') == 1  # and that one alone is exceeded
+    assert "endings" not in tables and 'class="card' not in page  # a run that settles needs no warning
 
 
 def test_run_without_numbers_says_why(tmp_path):

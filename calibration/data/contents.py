@@ -121,6 +121,10 @@ def inspect_source(source: str | Path | Any) -> FileContents:
 def _source(source: Any) -> Source:
     if not isinstance(source, str | Path):
         return opening.open_object(source)
+    if group := opening.files_of_group(str(source)):
+        first = _source(group[0])
+        note = f"{source}: {len(group)} files, each a run; these are the signals of {group[0].name}"
+        return dataclasses.replace(first, notes=(note, *first.notes))
     path, within = opening.split_source(str(source))
     name = path.name or str(source)
     if not path.exists():

@@ -116,8 +116,12 @@ def complete_columns(name: str, columns: Columns, rows: int, layout: Layout) -> 
     """Adds columns that a table may omit, and rejects values that contradict each other."""
     _add_default_columns(name, columns, rows, layout)
     _check_driving(name, columns)
-    is_clamped = columns.get("held", np.zeros(1)) > 0.5
-    for row in np.flatnonzero(is_clamped & (columns.get(LOAD, 0.0) != 0))[:1]:
+    held = columns.get("held", np.zeros(1))
+    for row in np.flatnonzero((held != 0) & (held != 1))[:1]:
+        raise BadData(
+            f"{name} row {row + 1}, held: got {held[row]:g}; expected 1 where a clamp holds the output, else 0"
+        )
+    for row in np.flatnonzero((held == 1) & (columns.get(LOAD, 0.0) != 0))[:1]:
         raise BadData(
             f"{name} row {row + 1}, {LOAD}: got {columns[LOAD][row]:g} although held is 1; expected 0, since the "
             "torque at a clamp is a reading: rename its column to output_torque"
