@@ -657,6 +657,8 @@ def test_error_without_data_is_that_of_mujoco_under_load_and_backward(rig):
 
 
 def test_command_leaves_the_files_the_law_and_a_page(mmrjax, rig):
+    import mujoco as library
+
     _, out, _ = ends(mmrjax("export", rig, "--to", "mujoco", "--out", "out", "--joint", "wheel"), code=0)
     assert "series_resistance" not in out
     folder = rig.parent / "out"
@@ -680,6 +682,12 @@ def test_command_leaves_the_files_the_law_and_a_page(mmrjax, rig):
         assert [s for s in symbols if not re.search(rf"\b{s}\b", text)] == []
     assert 'joint="wheel"' in (folder / "drive.xml").read_text()
     assert "thermal_drift" in (folder / "report.html").read_text()
+    assert "python -m mujoco.viewer --mjcf=scene.xml" in (folder / "report.html").read_text()
+    model = library.MjModel.from_xml_path(str(folder / "scene.xml"))
+    data = library.MjData(model)
+    library.mj_resetDataKeyframe(model, data, model.key("run").id)
+    library.mj_step(model, data, nstep=200)
+    assert abs(data.joint("wheel").qpos[0]) > 0.1  # the key frame turns the output at once
 
 
 def test_command_that_is_refused_leaves_nothing(mmrjax, rig):
