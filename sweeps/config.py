@@ -773,8 +773,8 @@ class Loop(RobotPart, DataPart, InferencePart, OutputPart):
     )
     prefer: Literal["fit", "held-out"] = option_field(
         "fit",
-        "Criterion for the first of several effects that these data cannot distinguish. held-out: the errors on "
-        "blocks left out of the fit",
+        "Criterion for the first of several effects that these data cannot distinguish. With held-out, it is the "
+        "error on blocks left out of the fit",
     )
     forbid: Names = option_field(
         (), "Experiment that you cannot do. May be repeated: stall, lifted, 'one motor', or a configuration"

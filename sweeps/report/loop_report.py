@@ -103,8 +103,9 @@ def _effect_findings(found: DiscoveryResult, changes: Mapping[str, Change]) -> I
             size += f", which changes the {changes[e.name].channel.label} by {changes[e.name].rms:.2g} %"
         or_else = f" Or {other}." if other else ""
         kinds = ", or ".join(e.families)
-        sure = f"{_noise_alone(found).lower()}{loop_words.standing_of_effect(found, e)}"
-        yield f"**{kinds}** (`{e.name}`): {size}; {sure}.{or_else}"
+        opening = _noise_alone(found)
+        sure = f"{opening}{'it' if opening else 'It'} is {loop_words.standing_of_effect(found, e)}"
+        yield f"**{kinds}** (`{e.name}`): {size}. {sure}.{or_else}"
 
 
 def _noise_alone(found: DiscoveryResult) -> str:
@@ -278,7 +279,7 @@ def _certainty(found: DiscoveryResult, missing: bool) -> Table:
         gain = f"log likelihood {found.gain.mean:+.2f}{spread} per held-out reading"
         robot = f"robot.toml contains {'what was found' if found.written else 'the refit'}"
         verb = "better" if better else "worse"
-        rows.append((Cell(f"predicts {verb} than the refit", "good" if better else "fair"), f"{gain}; {robot}"))
+        rows.append((Cell(f"predicts {verb} than the refit", "good" if better else "fair"), f"{gain}. {robot}"))
     return catalogue.table("loop.certainty", rows)
 
 

@@ -180,7 +180,7 @@ def mission_answer(run: Json, on_ground: bool = True) -> str:
         parts = [f"{label} {100 * shares[label]:.0f} %" for label in largest if shares[label] > 0]
         text += f" ({', '.join(parts)})"
     if np.isfinite(run["endurance_s"]):
-        text += f"; a full battery lasts {run['endurance_s'] / 60:.0f} min"
+        text += f". A full battery lasts {run['endurance_s'] / 60:.0f} min"
     status = str(run["status"])
     return text + ("." if status == "converged" else f". It ends early: {words.status_meaning(status)}.")
 

@@ -89,8 +89,8 @@ def runs_answer(runs: Columns, channels: Sequence[Channel], used: Sequence[Json]
     settled = np.isin(runs["status"], words.SETTLED)
     if len(settled) > 1:
         flagged_count = int((settled & (runs["flags"] != "")).sum())
-        beyond = f"{flagged_count} of them {'exceeds' if flagged_count == 1 else 'exceed'} a limit"
-        rest = f"; {beyond if flagged_count else 'all within every limit'}" if settled.any() else ""
+        beyond = f". {flagged_count} of them {'exceeds' if flagged_count == 1 else 'exceed'} a limit"
+        rest = (beyond if flagged_count else ", all within every limit") if settled.any() else ""
         return f"{settled.sum()} of {len(settled)} runs have an operating point{rest}."
     if not settled[0]:
         return f"No operating point: {words.status_meaning(str(runs['status'][0]))}."
@@ -101,7 +101,7 @@ def runs_answer(runs: Columns, channels: Sequence[Channel], used: Sequence[Json]
         return f"{readings}."
     nearest = max(judged, key=lambda limit: limit["percent"])
     verb = "exceeds its limit" if nearest["percent"] > 100 else "is the nearest limit"
-    return f"{readings}; {nearest['words']} {verb} ({nearest['percent']:.0f} % of {nearest['limit']})."
+    return f"{readings}. The {nearest['words']} {verb} ({nearest['percent']:.0f} % of {nearest['limit']})."
 
 
 def run_headings(runs: Columns) -> list[str]:

@@ -58,12 +58,12 @@ def sweep_answer(runs: Columns) -> str:
     verb = "has" if 1 in (total, settled.sum()) else "have"
     first = f"{settled.sum()} of {count_noun(total, 'run')} {verb} an operating point"
     if not is_flagged.any():
-        return f"{first}; all within every limit." if settled.any() else f"{first}."
+        return f"{first}, all within every limit." if settled.any() else f"{first}."
     raised = Counter(flag for flags in runs["flags"][is_flagged] for flag in str(flags).split(";"))
     most, times = raised.most_common(1)[0]
     return (
-        f"{first}; {is_flagged.sum()} of them {'exceeds' if is_flagged.sum() == 1 else 'exceed'} a limit, most "
-        f"often: {words.FLAGS.get(most, most)} ({count_noun(times, 'run')})."
+        f"{first}. {is_flagged.sum()} of them {'exceeds' if is_flagged.sum() == 1 else 'exceed'} a limit. Most "
+        f"often, {words.FLAGS.get(most, most)} ({count_noun(times, 'run')})."
     )
 
 

@@ -175,7 +175,7 @@ def posture_sentences(found: Postures) -> str:
     """One or two sentences on the posture of the first run and its geometric limits."""
     one, most = {c: values[0] for c, values in found.table.items()}, found.over.step_mm.max()
     return (
-        f"posture: pitch {one['pitch_deg']:z.1f}°, on {one['contact_mm']:.0f} mm, carried by {one['bears']}. Tips "
+        f"posture: pitch {one['pitch_deg']:z.1f}°, on {one['contact_mm']:.0f} mm, carried by {one['bears']}. It tips "
         f"on slopes of {one['tips_back_deg']:.1f}° uphill, {one['tips_forward_deg']:.1f}° downhill, "
         f"{one['tips_aside_deg']:.1f}° across. Its geometry allows steps up to {one['highest_step_mm']:.0f} mm "
         f"and gaps up to {one['widest_gap_mm']:.0f} mm. The highest step in any posture is {most:.0f} mm (front "
